@@ -1,0 +1,78 @@
+# ccatp: `make run` surveys a simulated mirror, `make test` checks everything. Needs python3 (3.11 or later) and make.
+#   make run ARGS="--mirror fyst-m2 --seed 2"     make test PYTEST_ARGS="-k danger"     make run PYTHON=python3.12
+
+PYTHON ?= python3
+VENV ?= .venv
+ARGS ?=
+PYTEST_ARGS ?=
+WORKERS ?= 2
+
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS)
+
+.PHONY: help run test test-slow lint format lock clean
+.DELETE_ON_ERROR:
+.SUFFIXES:
+
+help:
+	@echo "make run [ARGS=...]   survey a simulated mirror: ccatp run --sim"
+	@echo "make test             lint, types, import contract, tests"
+	@echo "make test-slow        the tests that take minutes"
+	@echo "make lint             lint, types, import contract"
+	@echo "make format           format the code"
+	@echo "make lock             pin the dependencies anew (needs uv)"
+	@echo "make clean            remove the environment and every cache; runs/ stays"
+
+run: $(VENV)/.installed
+	@$(BIN)/ccatp run --sim $(ARGS)
+
+test: lint
+	$(PYTEST) $(PYTEST_ARGS)
+
+test-slow: $(VENV)/.installed-dev
+	$(PYTEST) -m slow $(PYTEST_ARGS)
+
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy --strict
+	$(BIN)/lint-imports
+
+format: $(VENV)/.installed-dev
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+# The environment. Each stamp is younger than what it was made from; the package itself is installed editable, without
+# its dependencies, by the build backend out of the same lock file: nothing unpinned is downloaded.
+$(BIN)/python:
+	@command -v $(PYTHON) >/dev/null || { echo "ccatp: no $(PYTHON); install Python 3.11 or later, or name one: make PYTHON=/path/to/python3" >&2; exit 2; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "ccatp: $(PYTHON) is $$($(PYTHON) -V 2>&1); Python 3.11 or later is needed, name one: make PYTHON=python3.12" >&2; exit 2; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "ccatp: $(PYTHON) cannot make virtual environments; on Debian: apt install python3-venv" >&2; exit 2; }
+	@echo "ccatp: making $(VENV)"
+	@$(PYTHON) -m venv --clear $(VENV)
+
+$(VENV)/.installed: requirements.lock pyproject.toml | $(BIN)/python
+	@echo "ccatp: installing the pinned dependencies into $(VENV)"
+	@$(PIP) install --require-hashes --no-deps --prefer-binary -r requirements.lock
+	@$(PIP) install --no-deps --no-build-isolation --editable .
+	@touch $@
+
+$(VENV)/.installed-dev: requirements-dev.lock $(VENV)/.installed
+	@echo "ccatp: installing the pinned development tools into $(VENV)"
+	@$(PIP) install --require-hashes --no-deps --prefer-binary -r requirements-dev.lock
+	@touch $@
+
+# `make lock` keeps the versions that still fit; `make lock LOCK_ARGS=--upgrade` takes the newest.
+UV ?= uv
+LOCK_ARGS ?=
+UV_COMPILE = $(UV) pip compile --quiet --universal --generate-hashes --no-emit-index-url --no-emit-find-links \
+	--python-version 3.11 --custom-compile-command "make lock" $(LOCK_ARGS) --group build pyproject.toml
+
+lock:
+	$(UV_COMPILE) --output-file requirements.lock
+	$(UV_COMPILE) --group dev --extra plots --constraint requirements.lock --output-file requirements-dev.lock
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find ccatp tests -name __pycache__ -type d -prune -exec rm -rf {} +

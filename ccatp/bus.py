@@ -1,0 +1,100 @@
+"""Edge. State shared between the processes over ZeroMQ PUB and SUB: single frames of the topic table."""
+
+import time
+from collections.abc import Iterable
+
+import zmq
+
+from ccatp.wire.topics import BY_NAME, BadMessage, Message, pack, unpack
+
+MAX_MESSAGE_BYTES = 1 << 20
+# A lockstep run publishes some thousand frames a second; this is several seconds of them, about 100 MB at the worst.
+HIGH_WATER_MARK = 50_000
+# A subscriber comes up before its publisher; it should not miss the first messages for long.
+RECONNECT_MS = 10
+
+
+class Publisher:
+    """Publishes topics on one endpoint; never blocks, drops the newest when a subscriber is too slow.
+
+    Args:
+        context: ZeroMQ context of the process.
+        endpoint: where to bind.
+    """
+
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str) -> None:
+        """Bind the socket."""
+        self._socket = context.socket(zmq.XPUB)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.SNDHWM, HIGH_WATER_MARK)
+        self._socket.bind(endpoint)
+        self._subscribed: set[str] = set()
+
+    def send(self, name: str, message: Message) -> None:
+        """Publish one message."""
+        self._socket.send(pack(name, message), zmq.DONTWAIT)
+
+    def has_subscriber(self, name: str) -> bool:
+        """Whether somebody's subscription to a topic has arrived; what is published before is lost to them."""
+        while True:
+            try:
+                change = self._socket.recv(zmq.DONTWAIT)
+            except zmq.Again:
+                return name in self._subscribed
+            topic = change[1:].decode("ascii", "replace").strip()
+            (self._subscribed.add if change[:1] == b"\x01" else self._subscribed.discard)(topic)
+
+    def close(self) -> None:
+        """Close the socket; what was not delivered is dropped."""
+        self._socket.close()
+
+
+class Subscriber:
+    """Receives topics from one or more publishers.
+
+    Args:
+        context: ZeroMQ context of the process.
+        endpoints: where to connect (a publisher may come up later).
+        topics: names of the topic table.
+    """
+
+    def __init__(
+        self, context: zmq.Context[zmq.Socket[bytes]], endpoints: Iterable[str], topics: Iterable[str]
+    ) -> None:
+        """Connect and subscribe."""
+        self.socket = context.socket(zmq.SUB)
+        self.socket.setsockopt(zmq.LINGER, 0)
+        self.socket.setsockopt(zmq.RCVHWM, HIGH_WATER_MARK)
+        self.socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
+        self.socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS)
+        for name in topics:
+            self.socket.setsockopt(zmq.SUBSCRIBE, BY_NAME[name].name.encode() + b" ")
+        for endpoint in endpoints:
+            self.socket.connect(endpoint)
+        self.bad_messages = 0
+
+    def receive(self, timeout_s: float = 0.0) -> tuple[str, Message] | None:
+        """The next message, or ``None`` when none came within ``timeout_s``. Bad ones are counted and dropped."""
+        received = self.receive_raw(timeout_s)
+        return None if received is None else (received[0], received[2])
+
+    def receive_raw(self, timeout_s: float = 0.0) -> tuple[str, bytes, Message] | None:
+        """As ``receive``, with the JSON text in the middle."""
+        deadline: float | None = None
+        while True:
+            try:
+                frame = self.socket.recv(zmq.DONTWAIT)
+            except zmq.Again:
+                now = time.monotonic()
+                deadline = now + timeout_s if deadline is None else deadline
+                if now >= deadline or not self.socket.poll(max(1, int((deadline - now) * 1000))):
+                    return None
+                continue
+            try:
+                return unpack(frame)
+            except BadMessage:
+                self.bad_messages += 1
+
+    def close(self) -> None:
+        """Close the socket."""
+        self.socket.close()

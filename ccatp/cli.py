@@ -1,0 +1,284 @@
+"""Glue. The commands. Only click is imported here: ``--help`` and completion must be quick, so commands import late."""
+
+import json
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+import ccatp
+from ccatp.cli_frame import (
+    ADDRESS_OPTIONS,
+    CONFIG_OPTION,
+    RUNTIME_DIR_OPTION,
+    WORLD_OPTIONS,
+    SuggestingGroup,
+    ask_daemon,
+    complain,
+    example,
+    options,
+    overrides,
+    run_command_line,
+)
+
+EMERGENCY_KINDS = ("fire", "earthquake", "power", "weather", "operator")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    return run_command_line(cli, argv)
+
+
+@click.group(
+    cls=SuggestingGroup,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog=example("ccatp run --sim", "ccatp run --sim --mirror fyst-m2 --seed 2", "ccatp status --json"),
+)
+@click.version_option(ccatp.__version__, message="ccatp %(version)s")
+def cli() -> None:
+    """Survey telescope mirrors with a laser-tracked robot."""
+
+
+@cli.command(
+    epilog=example(
+        "ccatp run --sim --mirror fyst-m2 --panels 4", "ccatp run --config telescope.toml --run-dir runs/tonight"
+    )
+)
+@click.option("--sim", is_flag=True, help="Simulate robot and laser system on this machine.")
+@WORLD_OPTIONS
+@click.option("--panels", type=int, metavar="N", help="Only the first N panels of the traversal; 0 takes all.")
+@click.option("--filter", "filter_name", metavar="NAME", help="State estimator: kf.")
+@click.option("--realtime", is_flag=True, help="Pace the simulation on the wall clock.")
+@click.option(
+    "--run-dir", type=click.Path(path_type=Path), help="Where to write; runs/<time>-<mirror>-s<seed> if not given."
+)
+@click.option("--resume", is_flag=True, help="Carry on with the mission in --run-dir.")
+@click.option("--json", "json_output", is_flag=True, help="Summary as JSON on standard output, nothing else there.")
+@RUNTIME_DIR_OPTION
+def run(
+    sim: bool, config_file: Path | None, mirror: str | None, world: str | None, seed: int | None,
+    settings: Mapping[str, object], panels: int | None, filter_name: str | None, realtime: bool,
+    run_dir: Path | None, resume: bool, json_output: bool, runtime_dir: Path | None,
+) -> int:  # fmt: skip
+    """Survey the mirror of the configuration and end with a summary."""
+    if resume and run_dir is None:
+        raise click.UsageError("--resume carries on in a run directory; name it with --run-dir")
+    if resume and config_file is None and run_dir is not None:
+        config_file = run_dir / "config.toml"
+    if not sim and config_file is None:
+        raise click.UsageError("name the robot's configuration with --config FILE, or add --sim")
+    from ccatp.run_options import RunOptions
+    from ccatp.supervisor import run_survey
+
+    named = {
+        "run.mirror": mirror,
+        "run.world": world,
+        "run.seed": seed,
+        "run.panels": panels,
+        "run.filter": filter_name,
+    }
+    return int(
+        run_survey(
+            RunOptions(
+                sim=sim,
+                config_file=config_file,
+                overrides=overrides(settings, named),
+                realtime=realtime,
+                run_dir=run_dir,
+                resume=resume,
+                json_output=json_output,
+                runtime_dir=runtime_dir,
+            )
+        )
+    )
+
+
+def _daemon_options(command: Any) -> Any:
+    return options(
+        CONFIG_OPTION,
+        RUNTIME_DIR_OPTION,
+        click.option("--timeout", "timeout_s", type=float, default=10.0, show_default=True, help="Seconds to wait."),
+        click.option("--json", "json_output", is_flag=True, help="The daemon's answer as JSON on standard output."),
+    )(command)
+
+
+@cli.command(epilog=example("ccatp status", "ccatp status --json"))
+@_daemon_options
+def status(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
+    """Show what the running daemon is doing."""
+    _tell(_ask("status", config_file, runtime_dir, timeout_s), json_output)
+
+
+@cli.command(epilog=example("ccatp pause"))
+@_daemon_options
+def pause(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
+    """Stop the robot where it is, until resume."""
+    _tell(_ask("pause", config_file, runtime_dir, timeout_s), json_output)
+
+
+@cli.command(epilog=example("ccatp resume"))
+@_daemon_options
+def resume(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
+    """Carry on after pause."""
+    _tell(_ask("resume", config_file, runtime_dir, timeout_s), json_output)
+
+
+@cli.command(epilog=example("ccatp abort"))
+@_daemon_options
+def abort(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
+    """Give up the survey and drive the robot to its base."""
+    _tell(_ask("abort", config_file, runtime_dir, timeout_s), json_output)
+
+
+@cli.command(epilog=example("ccatp stop"))
+@_daemon_options
+def stop(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
+    """Hold the wheels where the robot is, save, and end the daemon."""
+    _tell(_ask("stop", config_file, runtime_dir, timeout_s), json_output)
+
+
+@cli.command(epilog=example("ccatp emergency fire --note 'smoke in the receiver cabin'"))
+@click.argument("kind", type=click.Choice(EMERGENCY_KINDS), metavar="KIND")
+@click.option("--note", default="", help="What happened, for the log.")
+@click.option("--id", "emergency_id", help="Identity of the emergency; sending the same one again is harmless.")
+@_daemon_options
+def emergency(
+    kind: str, note: str, emergency_id: str | None,
+    config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool,
+) -> None:  # fmt: skip
+    """Report an emergency: the robot goes to its base.
+
+    KIND is fire, earthquake, power, weather or operator.
+    """
+    payload: dict[str, object] = {
+        "cmd": "emergency",
+        "kind": kind,
+        "id": emergency_id or str(uuid.uuid4()),
+        "note": note,
+    }
+    _tell(ask_daemon(_folder(config_file, runtime_dir), "emergency", payload, timeout_s), json_output)
+
+
+@cli.group(cls=SuggestingGroup, epilog=example("ccatp sim robot --port 7010"))
+def sim() -> None:
+    """Stand-ins of robot and laser system, alone."""
+
+
+@sim.command(
+    "robot", epilog=example("ccatp sim robot --port 7010 --mirror fyst-m2", "ccatp sim robot --lockstep --seed 3")
+)
+@ADDRESS_OPTIONS
+@WORLD_OPTIONS
+@click.option("--realtime/--lockstep", default=True, show_default=True, help="Wall clock, or wait for each command.")
+def sim_robot(
+    host: str | None, port: int | None, config_file: Path | None, mirror: str | None, world: str | None,
+    seed: int | None, settings: Mapping[str, object], realtime: bool,
+) -> int:  # fmt: skip
+    """Run the simulated robot behind the robot link, for any controller."""
+    from ccatp.config.loader import load_config
+    from ccatp.processes.dataloop import run_alone
+
+    named = {"sim.robot.host": host, "sim.robot.port": port, "run.mirror": mirror, "run.world": world, "run.seed": seed}
+    return int(run_alone(load_config(config_file, overrides(settings, named)), lockstep=not realtime))
+
+
+@sim.command("etalon", epilog=example("ccatp sim etalon --port 2001 --puck 0.1 -0.5 3.4"))
+@ADDRESS_OPTIONS
+@WORLD_OPTIONS
+@click.option(
+    "--puck",
+    "puck_world_m",
+    type=(float, float, float),
+    metavar="X Y Z",
+    help="Where the puck stands: world frame, metres.",
+)
+@click.option("--truth", metavar="ENDPOINT", help="Follow the true puck that a simulated robot publishes there.")
+def sim_etalon(
+    host: str | None, port: int | None, config_file: Path | None, mirror: str | None, world: str | None,
+    seed: int | None, settings: Mapping[str, object],
+    puck_world_m: tuple[float, float, float] | None, truth: str | None,
+) -> int:  # fmt: skip
+    """Run the simulated MultiLine server; the puck stands at the base unless told otherwise."""
+    from ccatp.config.loader import load_config
+    from ccatp.processes.etalon import run_alone
+
+    if puck_world_m is not None and truth is not None:
+        raise click.UsageError("--puck and --truth exclude each other")
+    named = {
+        "sim.etalon.host": host,
+        "sim.etalon.port": port,
+        "run.mirror": mirror,
+        "run.world": world,
+        "run.seed": seed,
+    }
+    return int(run_alone(load_config(config_file, overrides(settings, named)), puck_world_m, truth))
+
+
+@cli.group(
+    cls=SuggestingGroup, epilog=example("ccatp config check telescope.toml", "ccatp config schema > ccatp.schema.json")
+)
+def config() -> None:
+    """Check and describe configurations."""
+
+
+@config.command("check", epilog=example("ccatp config check telescope.toml"))
+@click.argument("file", type=click.Path(path_type=Path))
+def config_check(file: Path) -> int:
+    """Check a configuration; each problem is one line with file, line and key."""
+    from ccatp.config.loader import load_config
+    from ccatp.errors import ConfigError
+
+    try:
+        cfg = load_config(file)
+    except ConfigError as error:
+        for problem in error.problems:
+            complain(problem, error.exit_status)
+        return error.exit_status
+    shown = f"mirror {cfg.mirror.name}, {cfg.mirror.panels.count} panels, world {cfg.world.name}, seed {cfg.run.seed}"
+    click.echo(f"{file}: ok: {shown}")
+    return 0
+
+
+@config.command("schema", epilog=example("ccatp config schema > ccatp.schema.json"))
+def config_schema() -> None:
+    """Print the JSON schema of a configuration file."""
+    from ccatp.config.loader import json_schema
+
+    click.echo(json.dumps(json_schema(), indent=2))
+
+
+def _ask(command: str, config_file: Path | None, runtime_dir: Path | None, timeout_s: float) -> dict[str, Any]:
+    return ask_daemon(_folder(config_file, runtime_dir), "control", {"cmd": command}, timeout_s)
+
+
+def _folder(config_file: Path | None, runtime_dir: Path | None) -> Path | None:
+    """The runtime directory that command line or configuration names."""
+    if runtime_dir is None and config_file is not None:
+        from ccatp.config.loader import load_config
+
+        configured = load_config(config_file).run.runtime_dir
+        return Path(configured) if configured else None
+    return runtime_dir
+
+
+def _tell(reply: Mapping[str, Any], json_output: bool) -> None:
+    if json_output:
+        click.echo(json.dumps(reply))
+        return
+    lines = list(_flat({key: value for key, value in reply.items() if key != "ok"}))
+    width = max((len(key) for key, _ in lines), default=0)
+    for key, value in lines:
+        click.echo(f"{key:<{width}}  {value}")
+    if not lines:
+        click.echo("ok")
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """``{"a": {"b": 1.5}}`` as ``a.b`` and ``1.5``."""
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, f"{value:.6g}" if isinstance(value, float) else "-" if value is None else str(value)

@@ -1,0 +1,168 @@
+"""Glue. What every command shares: suggestions, one-line errors, exit statuses, options, talk with a running daemon."""
+
+import difflib
+import os
+import sys
+import tomllib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ccatp.errors import CcatpError, ExitStatus, RefusedError, UnreachableError
+from ccatp.runtime_dir import runtime_dir_path
+
+Command = Callable[..., Any]
+
+
+class SuggestingGroup(click.Group):
+    """A group of commands that answers a misspelt one with the nearest."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command that ``args`` starts with.
+
+        Raises:
+            click.UsageError: there is none of that name.
+        """
+        name = args[0]
+        if self.get_command(ctx, name) is None and not name.startswith("-"):
+            near = difflib.get_close_matches(name, self.list_commands(ctx), n=1)
+            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(self.list_commands(ctx))}"
+            raise click.UsageError(f"no command {name!r}; {hint}", ctx)
+        return super().resolve_command(ctx, args)
+
+
+def run_command_line(group: click.Group, argv: Sequence[str] | None = None) -> int:
+    """Run a command line; expected errors become one line on standard error, never a traceback.
+
+    Args:
+        group: the commands.
+        argv: arguments without the program's name; those of the process if ``None``.
+
+    Returns:
+        The exit status.
+    """
+    try:
+        status = group.main(args=argv, prog_name="ccatp", standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message(), err=True)
+        return ExitStatus.USAGE
+    except click.UsageError as error:
+        where = f"; see {error.ctx.command_path} --help" if error.ctx else ""
+        return complain(error.format_message().rstrip(".") + where, ExitStatus.USAGE)
+    except click.ClickException as error:
+        return complain(error.format_message(), ExitStatus.USAGE)
+    except CcatpError as error:
+        return complain(str(error), error.exit_status)
+    except (click.Abort, KeyboardInterrupt):
+        return complain("interrupted", ExitStatus.INTERRUPTED)
+    except BrokenPipeError:  # the reader of our output has seen enough; keep the interpreter from flushing into it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return ExitStatus.REFUSED
+    return int(status or 0)
+
+
+def complain(message: str, status: int) -> int:
+    """One line on standard error; returns ``status``."""
+    click.echo(f"ccatp: {' '.join(message.split())}", err=True)
+    return int(status)
+
+
+def example(*lines: str) -> str:
+    """The epilog of a command's help."""
+    return "\b\nExample:\n" + "\n".join(f"  {line}" for line in lines)
+
+
+def options(*decorators: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    """Several options as one decorator, shown in the order given."""
+
+    def decorate(command: Command) -> Command:
+        for decorator in reversed(decorators):
+            command = decorator(command)
+        return command
+
+    return decorate
+
+
+def parse_setting(text: str) -> tuple[str, object]:
+    """``run.seed=2`` as ``("run.seed", 2)``. The value is TOML, or else text.
+
+    Raises:
+        ValueError: there is no key or no ``=``.
+    """
+    key, equals, value = text.partition("=")
+    key = key.strip()
+    if not equals or not all(key.split(".")):
+        raise ValueError(f"{text!r} is not KEY=VALUE, as in run.seed=2")
+    try:
+        return key, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key, value.strip()
+
+
+def _settings(_ctx: click.Context, _param: click.Parameter, values: Iterable[str]) -> dict[str, object]:
+    try:
+        return dict(parse_setting(value) for value in values)
+    except ValueError as error:
+        raise click.BadParameter(str(error)) from error
+
+
+CONFIG_OPTION = click.option("--config", "config_file", type=click.Path(path_type=Path), help="Configuration (TOML).")
+RUNTIME_DIR_OPTION = click.option(
+    "--runtime-dir", type=click.Path(path_type=Path), help="Folder of the sockets, if not the usual one."
+)
+WORLD_OPTIONS = options(
+    CONFIG_OPTION,
+    click.option("--mirror", metavar="NAME", help="fyst-m1, fyst-m2, thesis-m1, thesis-m2, or a .toml file."),
+    click.option("--world", metavar="NAME", help="Simulated world: thesis, thesis-x2, or a .toml file."),
+    click.option("--seed", type=int, metavar="N", help="Seed of every random draw."),
+    click.option(
+        "--set",
+        "settings",
+        multiple=True,
+        callback=_settings,
+        metavar="KEY=VALUE",
+        help="Any key of the configuration, as in limits.v_max_m_s=0.05. May be repeated.",
+    ),
+)
+ADDRESS_OPTIONS = options(
+    click.option("--host", help="Address to listen on."),
+    click.option("--port", type=int, help="Port to listen on; 0 takes any free one."),
+)
+
+
+def overrides(settings: Mapping[str, object], named: Mapping[str, object]) -> dict[str, object]:
+    """Command-line values by dotted key: the options that were given, and ``--set`` on top."""
+    return {**{key: value for key, value in named.items() if value is not None}, **settings}
+
+
+def ask_daemon(runtime_dir: Path | None, channel: str, payload: dict[str, object], timeout_s: float) -> dict[str, Any]:
+    """One request to a running daemon.
+
+    Args:
+        runtime_dir: its runtime directory, if not the usual one.
+        channel: ``control`` or ``emergency``.
+        payload: the request.
+        timeout_s: longest wait for the answer.
+
+    Raises:
+        UnreachableError: nobody listens there, or no answer came in time.
+        RefusedError: the daemon said no, and why.
+    """
+    folder = runtime_dir_path(str(runtime_dir or ""), os.environ)
+    if not (folder / channel).exists():
+        raise UnreachableError(
+            f"no daemon in {folder}; start one with ccatp run, or name its folder with --runtime-dir"
+        )
+    from ccatp.router import request
+
+    try:
+        reply: dict[str, Any] = request(f"ipc://{folder / channel}", payload, timeout_s)
+    except TimeoutError as error:
+        raise UnreachableError(f"the daemon in {folder} does not answer within {timeout_s:g} s") from error
+    if not reply.get("ok", False):
+        raise RefusedError(f"{payload.get('cmd')} refused: {reply.get('error', 'no reason given')}")
+    return reply

@@ -1,0 +1,187 @@
+"""Pure. What one value of the configuration demands of another, and values that look like another unit."""
+
+import math
+from collections.abc import Iterator
+from pathlib import PurePath
+
+from pydantic import BaseModel
+
+from ccatp.config.messages import Fault, choice_hint, slip_hint
+from ccatp.config.models import Config, LimitsConfig, MirrorConfig, PanelsConfig, RobotConfig
+from ccatp.config.toml_text import Key
+
+FILTERS = ("kf",)
+ORDERS = ("thesis",)
+
+MIN_COLLIMATORS = 4  # three unknowns and one length to spare, interface control document 2
+_LARGEST_LENGTH_M = 2.0  # no length outside the mirror's own files reaches it
+_LARGEST_ANGLE_RAD = 2.0 * math.pi
+_SMALLEST_PANEL_MM = 10.0
+_NEAREST_COLLIMATOR_MM = 100.0
+_PITCH_AGREEMENT_MM = 0.1  # the fitted pitches of the telescope differ by up to 0.012 mm
+_CORNERS = ((1, 1, "front-left"), (1, -1, "front-right"), (-1, 1, "rear-left"), (-1, -1, "rear-right"))
+
+
+def check_config(cfg: Config) -> list[Fault]:
+    """Everything wrong with a configuration whose values are each in range.
+
+    Args:
+        cfg: the configuration.
+    """
+    return [
+        *_check_names(cfg),
+        *_check_units(cfg),
+        *_check_wheels(cfg.robot, cfg.limits),
+        *_check_edge_sensors(cfg.robot),
+        *_check_panels(cfg.mirror.panels),
+        *_check_base(cfg.mirror),
+        *_check_collimators(cfg.mirror),
+    ]
+
+
+def is_file_name(name: str) -> bool:
+    """Whether ``run.mirror`` or ``run.world`` is the path of a file instead of a name."""
+    return name.endswith(".toml") or "/" in name
+
+
+def _check_names(cfg: Config) -> Iterator[Fault]:
+    if cfg.run.filter not in FILTERS:
+        yield Fault(("run", "filter"), f'= "{cfg.run.filter}" is no filter; {choice_hint(cfg.run.filter, FILTERS)}')
+    if cfg.run.order not in ORDERS:
+        yield Fault(
+            ("run", "order"), f'= "{cfg.run.order}" is no traversal order; {choice_hint(cfg.run.order, ORDERS)}'
+        )
+    gains, sets = cfg.control.gains, cfg.control.gain_sets
+    if gains not in sets:
+        yield Fault(("control", "gains"), f'= "{gains}" is no set of gains; {choice_hint(gains, sets)}')
+    for section, named, found in (
+        ("mirror", cfg.run.mirror, cfg.mirror.name),
+        ("world", cfg.run.world, cfg.world.name),
+    ):
+        if not is_file_name(named) and named != found:
+            what = f'= "{found}", but run.{section} = "{PurePath(named)}"; name the same in both'
+            yield Fault((section, "name"), what, (("run", section),))
+
+
+def _check_units(cfg: Config) -> Iterator[Fault]:
+    """Lengths and angles that have no limit of their own, but that nobody can have meant."""
+    for name in type(cfg).model_fields:
+        if name != "mirror":
+            yield from _slips(getattr(cfg, name), (name,))
+    yield from _slips(cfg.mirror.frame, ("mirror", "frame"))
+    yield from _slips(cfg.mirror.base, ("mirror", "base"))
+
+
+def _slips(value: object, key: Key) -> Iterator[Fault]:
+    if isinstance(value, BaseModel):
+        for name in type(value).model_fields:
+            yield from _slips(getattr(value, name), (*key, name))
+    elif isinstance(value, dict):
+        for name, item in value.items():
+            yield from _slips(item, (*key, name))
+    elif isinstance(value, tuple):
+        for index, item in enumerate(value):
+            yield from _slips(item, (*key, index))
+    elif isinstance(value, float):
+        name = next(part for part in reversed(key) if isinstance(part, str))
+        largest = {"rad": _LARGEST_ANGLE_RAD, "m": _LARGEST_LENGTH_M}.get(name.rsplit("_", 1)[-1], math.inf)
+        if abs(value) > largest:
+            yield Fault(key, f"= {value:g} must be at most {largest:.4g}{slip_hint(key, value)}")
+
+
+def _check_wheels(robot: RobotConfig, limits: LimitsConfig) -> Iterator[Fault]:
+    """The wheels must be able to give the motion that the limits allow."""
+    rim_m_s = robot.max_wheel_rad_s * robot.wheel_radius_m
+    formula = "max_wheel_rad_s * wheel_radius_m"
+    wheels: tuple[Key, ...] = (("robot", "max_wheel_rad_s"), ("robot", "wheel_radius_m"))
+    if limits.v_max_m_s > rim_m_s:
+        what = f"= {limits.v_max_m_s:g} is more than the wheels give: robot.{formula} = {rim_m_s:.4g}"
+        yield Fault(("limits", "v_max_m_s"), what, wheels)
+    turning_m_s = limits.omega_max_rad_s * robot.wheel_base_m / 2.0
+    if turning_m_s > rim_m_s:
+        most = 2.0 * rim_m_s / robot.wheel_base_m
+        what = f"= {limits.omega_max_rad_s:g} is more than the wheels give: 2 * {formula} / wheel_base_m = {most:.4g}"
+        yield Fault(("limits", "omega_max_rad_s"), what, (*wheels, ("robot", "wheel_base_m")))
+
+
+def _check_edge_sensors(robot: RobotConfig) -> Iterator[Fault]:
+    """Order front-left, front-right, rear-left, rear-right; x to the front, y to the left."""
+    for index, ((x, y), (sign_x, sign_y, corner)) in enumerate(zip(robot.edge_sensors_m, _CORNERS, strict=True)):
+        if x * sign_x <= 0.0 or y * sign_y <= 0.0:
+            what = (
+                f"= [{x:g}, {y:g}] is not {corner}, where x {'>' if sign_x > 0 else '<'} 0 "
+                f"and y {'>' if sign_y > 0 else '<'} 0; the order is front-left, front-right, rear-left, rear-right"
+            )
+            yield Fault(("robot", "edge_sensors_m", index), what)
+
+
+def _check_panels(panels: PanelsConfig) -> Iterator[Fault]:
+    root: Key = ("mirror", "panels")
+    for name in ("size_x_mm", "size_y_mm", "pitch_x_mm", "pitch_y_mm"):
+        value = getattr(panels, name)
+        if value < _SMALLEST_PANEL_MM:
+            yield Fault((*root, name), f"= {value:g} looks like metres: {value:g} m are {value * 1e3:g} mm")
+            return
+    rows: Key = (*root, "panels_per_row")
+    total = sum(panels.panels_per_row)
+    if total != panels.count:
+        what = f"= {panels.count}, but panels_per_row adds up to {total}; correct one of them"
+        yield Fault((*root, "count"), what, (rows,))
+    for row, n in enumerate(panels.panels_per_row):
+        if n > panels.cols or (panels.cols - n) % 2:
+            what = f"= {n} panels cannot be centred on cols = {panels.cols}; both even or both odd, and not more"
+            yield Fault((*rows, row), what, ((*root, "cols"),))
+    yield from _check_grid(panels, "x", root)
+    yield from _check_grid(panels, "y", root)
+
+
+def _check_grid(panels: PanelsConfig, axis: str, root: Key) -> Iterator[Fault]:
+    """Pitch and measurement points of one axis."""
+    size, pitch = getattr(panels, f"size_{axis}_mm"), getattr(panels, f"pitch_{axis}_mm")
+    size_key: Key = (*root, f"size_{axis}_mm")
+    if abs(pitch - size - panels.gap_mm) > _PITCH_AGREEMENT_MM:
+        what = f"= {pitch:g} must be size + gap = {size + panels.gap_mm:g}"
+        yield Fault((*root, f"pitch_{axis}_mm"), what, (size_key, (*root, "gap_mm")))
+    low, middle, high = getattr(panels, f"points_{axis}_mm")
+    if not -size / 2.0 < low < middle < high < size / 2.0:
+        what = f"= [{low:g}, {middle:g}, {high:g}] must ascend within the panel, {-size / 2.0:g} to {size / 2.0:g}"
+        yield Fault((*root, f"points_{axis}_mm"), what, (size_key,))
+
+
+def _check_base(mirror: MirrorConfig) -> Iterator[Fault]:
+    """The base must stand on a panel that exists."""
+    base, panels, root = mirror.base, mirror.panels, ("mirror", "base")
+    rows = len(panels.panels_per_row)
+    if base.row > rows:
+        yield Fault((*root, "row"), f"= {base.row}, but there are {rows} rows")
+        return
+    n = panels.panels_per_row[base.row - 1]
+    first = (panels.cols - n) // 2 + 1
+    if not first <= base.col < first + n:
+        what = f"= {base.col}: no panel stands there, row {base.row} has columns {first} to {first + n - 1}"
+        yield Fault((*root, "col"), what)
+    for axis in "xy":
+        value, half = getattr(base, f"{axis}_mm"), getattr(panels, f"size_{axis}_mm") / 2.0
+        if abs(value) >= half:
+            yield Fault(
+                (*root, f"{axis}_mm"), f"= {value:g} is off the panel, which reaches from {-half:g} to {half:g}"
+            )
+
+
+def _check_collimators(mirror: MirrorConfig) -> Iterator[Fault]:
+    channels, positions = mirror.collimators.channels, mirror.collimators.positions_world_mm
+    root: Key = ("mirror", "collimators")
+    if len(channels) < MIN_COLLIMATORS:
+        yield Fault((*root, "channels"), f"has {len(channels)}; a position needs at least {MIN_COLLIMATORS}")
+    if len(set(channels)) != len(channels):
+        yield Fault((*root, "channels"), f"= {list(channels)} names a channel twice")
+    if len(channels) != len(positions):
+        yield Fault(
+            (*root, "positions_world_mm"),
+            f"has {len(positions)} positions for {len(channels)} channels",
+            ((*root, "channels"),),
+        )
+    for index, position in enumerate(positions):
+        if math.hypot(*position) < _NEAREST_COLLIMATOR_MM:
+            what = f"= {list(position)} is {math.hypot(*position):.3g} mm from the world's origin; looks like metres"
+            yield Fault((*root, "positions_world_mm", index), what)

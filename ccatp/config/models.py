@@ -1,0 +1,291 @@
+"""Pure. Frozen configuration models. Values live in ``configs/``; nothing here has a default with a unit."""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0.0)]
+NonNegative = Annotated[float, Field(ge=0.0)]
+Port = Annotated[int, Field(ge=0, le=65535)]
+Pair = tuple[float, float]
+
+
+class Model(BaseModel):
+    """Base of every section: frozen, unknown keys refused, only finite numbers."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class RunConfig(Model):
+    """What to survey and how."""
+
+    mirror: str
+    world: str
+    seed: Annotated[int, Field(ge=0)]
+    filter: str
+    panels: Annotated[int, Field(ge=0)]  # 0 = the whole mirror
+    order: str
+    budget_s: Positive
+    runtime_dir: str  # empty = chosen from the environment
+
+
+class RobotConfig(Model):
+    """Address and geometry of the robot."""
+
+    host: str
+    port: Port
+    wheel_radius_m: Annotated[float, Field(gt=0.0, le=0.2)]
+    wheel_base_m: Annotated[float, Field(gt=0.0, le=0.6)]
+    edge_sensors_m: tuple[Pair, Pair, Pair, Pair]
+    puck_height_m: Annotated[float, Field(ge=0.0, le=0.5)]
+    max_wheel_rad_s: Positive
+    wheel_lag_s: NonNegative
+    fan_duty: tuple[Annotated[float, Field(ge=0.0, le=1.0)], Annotated[float, Field(ge=0.0, le=1.0)]]
+    key_file: str
+    connect_timeout_s: Positive
+    sensors_timeout_s: Positive
+
+
+class LimitsConfig(Model):
+    """Motion limits of the robot's origin."""
+
+    v_max_m_s: Annotated[float, Field(gt=0.0, le=0.3)]
+    a_max_m_s2: Annotated[float, Field(gt=0.0, le=2.0)]
+    omega_max_rad_s: Annotated[float, Field(gt=0.0, le=5.0)]
+    alpha_max_rad_s2: Annotated[float, Field(gt=0.0, le=20.0)]
+
+
+class PidConfig(Model):
+    """One PID controller, thesis eq. 3.4, in seconds and SI units of its error and output."""
+
+    kp: NonNegative
+    ki: NonNegative
+    kd: NonNegative
+    derivative_filter_s: NonNegative
+    integral_limit: NonNegative  # largest contribution of the integral term, in the unit of the output
+
+
+class GainsConfig(Model):
+    """A named set of gains: one controller for the forward speed, one for the angular rate."""
+
+    shaped: bool  # follow an acceleration-limited set point with feed-forward; False = the thesis's step set point
+    position_tolerance_m: Positive  # arrived: the stop is at most this far ahead or behind
+    heading_tolerance_rad: Positive  # turned: the bearing is at most this far off
+    forward: PidConfig
+    angular: PidConfig
+
+
+class ControlConfig(Model):
+    """Waypoint tracking."""
+
+    gains: str
+    straight_tolerance_rad: Positive
+    lookahead_m: Positive
+    settle_speed_m_s: Positive
+    settle_rate_rad_s: Positive
+    settle_time_s: NonNegative
+    leg_timeout_factor: Positive
+    gain_sets: dict[str, GainsConfig]
+
+
+class LocalizerConfig(Model):
+    """Noise model of the localizer; standard deviations."""
+
+    accelerometer_sigma_m_s2: Positive
+    gyroscope_sigma_rad_s: Positive
+    encoder_sigma_rad_s: Positive
+    jerk_density_m2_s5: Positive
+    angular_acceleration_density_rad2_s3: Positive
+    start_position_sigma_m: Positive
+    start_heading_sigma_rad: Positive
+    reset_speed_sigma_m_s: Positive
+    reset_acceleration_sigma_m_s2: Positive
+    reset_rate_sigma_rad_s: Positive
+    slip_fraction: NonNegative
+    crossing_time_sigma_s: Positive
+    crossing_max_rate_rad_s: Positive
+    crossing_min_speed_m_s: Positive
+    crossing_gate_sigma: Positive
+    history_s: Positive
+
+
+class EtalonConfig(Model):
+    """Address and use of the MultiLine server."""
+
+    host: str
+    port: Port
+    connect_timeout_s: Positive
+    request_timeout_s: Positive
+    retries: Annotated[int, Field(ge=0, le=10)]
+    reconnect_delay_s: Positive
+    measuring_time_s: Positive
+    length_sigma_m: Positive
+    length_sigma_per_m: NonNegative
+    max_residual_m: Positive
+    max_dop: Positive
+    max_distance_m: Positive
+
+
+class DangerConfig(Model):
+    """The edge rule and the ages the danger loop accepts (distances are sensor travel)."""
+
+    map_sigmas: Positive
+    map_margin_m: Positive
+    gap_tolerance_m: NonNegative
+    seam_extra_m: Positive
+    no_map_travel_m: Positive
+    max_crossing_angle_rad: Annotated[float, Field(gt=0.0, lt=1.5)]
+    turn_travel_limit_m: Positive
+    stale_after_s: Positive
+    estimate_stale_after_s: Positive
+    debounce_samples: Annotated[int, Field(ge=1, le=100)]
+    lifted_samples: Annotated[int, Field(ge=1, le=1000)]
+    outward_turn_limit_m: Positive
+    clear_samples: Annotated[int, Field(ge=1, le=10000)]
+
+
+class MissionConfig(Model):
+    """The survey as a sequence of states."""
+
+    leg_clearance_m: Positive
+    turn_clearance_m: NonNegative
+    backoff_m: Annotated[float, Field(gt=0.0, le=0.06)]
+    backoff_speed_m_s: Annotated[float, Field(gt=0.0, le=0.05)]
+    turn_away_rad: Positive
+    max_backoffs_per_stop: Annotated[int, Field(ge=1)]
+    verdict_timeout_s: Positive
+    measure_timeout_s: Positive
+    failed_points_before_hold: Annotated[int, Field(ge=1)]
+    progress_hz: Positive
+
+
+class SimRobotConfig(Model):
+    """The DataLoop: the robot's stand-in."""
+
+    host: str
+    port: Port
+    frame_hz: Annotated[float, Field(gt=0.0, le=1000.0)]
+    ttl_s: Positive
+    imu_hz: Annotated[float, Field(gt=0.0, le=100.0)]
+    encoder_hz: Annotated[float, Field(gt=0.0, le=1000.0)]
+    edge_hz: Annotated[float, Field(gt=0.0, le=1000.0)]
+    gravity_hz: Annotated[float, Field(gt=0.0, le=100.0)]
+    wheel_lag_s: Positive
+    fan_floor: Annotated[float, Field(ge=0.0, le=1.0)]  # used on an overhanging mirror
+    gravity_sigma_rad: NonNegative
+    fall_thrust_s: Positive
+
+
+class SimEtalonConfig(Model):
+    """The Etalon stand-in."""
+
+    host: str
+    port: Port
+    length_sigma_m: NonNegative
+    length_sigma_per_m: NonNegative
+    motion_tolerance_m: Positive
+
+
+class SimTruthConfig(Model):
+    """The simulated truth of the mirror."""
+
+    piston_sigma_m: NonNegative
+    tilt_sigma_rad: NonNegative
+
+
+class SimConfig(Model):
+    """Everything that exists only in simulation."""
+
+    robot: SimRobotConfig
+    etalon: SimEtalonConfig
+    truth: SimTruthConfig
+
+
+class WorldConfig(Model):
+    """One simulated world: sensor noise and start error, standard deviations."""
+
+    name: str
+    accelerometer_sigma_m_s2: NonNegative
+    gyroscope_sigma_rad_s: NonNegative
+    encoder_sigma_rad_s: NonNegative
+    start_position_sigma_m: NonNegative
+    start_heading_sigma_rad: NonNegative
+
+
+class SurfaceConfig(Model):
+    """Polynomial sag, thesis eq. 1.1; millimetres in the mirror frame."""
+
+    normalisation_radius_mm: Positive
+    terms: tuple[tuple[int, int, float], ...]  # (power of x, power of y, coefficient in mm)
+
+
+class FrameConfig(Model):
+    """Where the mirror frame stands in the world: p_mirror = R (p_world - origin)."""
+
+    origin_world_mm: tuple[float, float, float]
+    rotation_about_x_rad: float
+    reflecting_side_sign: Literal[-1, 1]
+
+
+class PanelsConfig(Model):
+    """Panel layout in the x-y projection of the mirror frame."""
+
+    count: Annotated[int, Field(ge=1)]
+    cols: Annotated[int, Field(ge=1)]
+    panels_per_row: tuple[Annotated[int, Field(ge=1)], ...]  # row 1 first, each row centred
+    size_x_mm: Positive
+    size_y_mm: Positive
+    pitch_x_mm: Positive
+    pitch_y_mm: Positive
+    gap_mm: Positive
+    y_offset_mm: float
+    points_x_mm: tuple[float, float, float]
+    points_y_mm: tuple[float, float, float]
+    adjusters_mm: dict[str, Pair]  # vertical adjusters, offsets in the panel's tangent plane
+
+
+class BaseConfig(Model):
+    """Where the robot starts and returns to, in a panel frame."""
+
+    row: Annotated[int, Field(ge=1)]
+    col: Annotated[int, Field(ge=1)]
+    x_mm: float
+    y_mm: float
+    heading_rad: float
+
+
+class CollimatorsConfig(Model):
+    """Surveyed collimator positions of the laser system, world frame."""
+
+    channels: tuple[Annotated[int, Field(ge=1, le=32)], ...]
+    positions_world_mm: tuple[tuple[float, float, float], ...]
+
+
+class MirrorConfig(Model):
+    """One mirror: surface, frame, panels, base, collimators."""
+
+    name: str
+    overhang: bool
+    provenance: tuple[str, ...]
+    unverified: tuple[str, ...]
+    surface: SurfaceConfig
+    frame: FrameConfig
+    panels: PanelsConfig
+    base: BaseConfig
+    collimators: CollimatorsConfig
+
+
+class Config(Model):
+    """The whole configuration of one run. ``mirror`` and ``world`` are the files that ``run`` names, read in."""
+
+    run: RunConfig
+    robot: RobotConfig
+    limits: LimitsConfig
+    control: ControlConfig
+    localizer: LocalizerConfig
+    etalon: EtalonConfig
+    danger: DangerConfig
+    mission: MissionConfig
+    sim: SimConfig
+    mirror: MirrorConfig
+    world: WorldConfig

@@ -1,0 +1,257 @@
+"""Pure. Heading from panel crossings, thesis 2.1.5: the entering angle seen by a pair of edge sensors."""
+
+from collections.abc import Sequence
+from math import atan2, hypot, inf, pi, sqrt
+from typing import NamedTuple
+
+from ccatp.angles import rotate
+from ccatp.config.models import LocalizerConfig, RobotConfig
+from ccatp.mirror.layout import Seam
+from ccatp.mirror.mirror import Mirror
+from ccatp.odometry import Odometer, Place
+from ccatp.samples import DeckPose, EdgeSample, PanelPose
+
+_PAIRS = ((0, 1), (2, 3))  # front, rear: (left, right) in the order of EdgeSample
+# An edge is taken for a seam where the sensor is expected within this part of a panel's size from one. Whatever else
+# an edge can be (the rim, the next seam) is at least ten times further.
+_REACH = 0.05
+_UNIFORM = 1.0 / 12.0  # variance of a uniform distribution over one interval
+
+
+class Transition(NamedTuple):
+    """One edge sensor changed its value.
+
+    Attributes:
+        t_s: middle between the last sample of the old value and the first of the new one.
+        interval_s: time between those two samples.
+        corner: index of the sensor: front-left, front-right, rear-left, rear-right.
+        is_on: the new value.
+    """
+
+    t_s: float
+    interval_s: float
+    corner: int
+    is_on: bool
+
+
+class EdgeScanner:
+    """Finds the transitions in the stream of edge samples. Samples that are not newer than the last are skipped."""
+
+    def __init__(self) -> None:
+        self._t_s = -inf
+        self._values: tuple[int, ...] = ()
+
+    def restart(self) -> None:
+        """Forget the last sample: the robot's clock has jumped."""
+        self._t_s = -inf
+        self._values = ()
+
+    def scan(self, edges: Sequence[EdgeSample]) -> list[Transition]:
+        """Transitions of a frame, oldest first; normally none."""
+        found: list[Transition] = []
+        last, values = self._t_s, self._values
+        for sample in edges:
+            t = sample[0]
+            if not last < t < inf:
+                continue
+            if sample[1:] != values:
+                if values:
+                    found.extend(_transitions(last, values, sample))
+                values = sample[1:]
+            last = t
+        self._t_s, self._values = last, values
+        return found
+
+
+def _transitions(last_s: float, values: tuple[int, ...], sample: EdgeSample) -> list[Transition]:
+    t = sample.t_s
+    return [
+        Transition(0.5 * (last_s + t), t - last_s, corner, bool(new))
+        for corner, (old, new) in enumerate(zip(values, sample[1:], strict=True))
+        if old != new
+    ]
+
+
+def heading_from_pair(
+    left: Place, right: Place, left_xy: tuple[float, float], right_xy: tuple[float, float], normal_rad: float
+) -> tuple[float, float, float]:
+    """Heading of the robot when two of its sensors have crossed the same straight line.
+
+    Both sensors stood on the line, so the vector between the two crossings, the sensors' own offset included, lies
+    along it. In the robot frame at the right sensor's crossing that vector is
+    ``u = R(turn) left_xy - right_xy + displacement``, and with the line's normal at angle phi::
+
+        theta + atan2(u_y, u_x) = phi + pi/2   (mod pi)
+
+    In pure translation u = (s_left - s_right, w) and this is ``theta = phi + atan((s_left - s_right)/w)``, thesis eq.
+    2.15 and 2.16 with a sign: positive travel is forward, so one formula holds for every edge, driven forward or in
+    reverse, whichever sensor is first. A turn between the two crossings is taken from the odometer.
+
+    Args:
+        left: odometer place at the crossing of the left sensor.
+        right: odometer place at the crossing of the right sensor.
+        left_xy: the left sensor in the robot frame, m.
+        right_xy: the right sensor in the robot frame, m.
+        normal_rad: phi, direction of the line's normal, either side.
+
+    Returns:
+        heading at the right sensor's crossing, rad, in the frame of ``normal_rad``, known modulo pi; |u|, m; and the
+        component of u across the robot, m.
+    """
+    turn = left.heading_rad - right.heading_rad
+    dx, dy = rotate(left.x_m - right.x_m, left.y_m - right.y_m, -right.heading_rad)
+    lx, ly = rotate(*left_xy, turn)
+    ux, uy = lx + dx - right_xy[0], ly + dy - right_xy[1]
+    return normal_rad + 0.5 * pi - atan2(uy, ux), hypot(ux, uy), abs(uy)
+
+
+class _Mark(NamedTuple):
+    """One sensor's last crossing of an edge of one kind."""
+
+    t_s: float
+    interval_s: float
+    place: Place
+    seam: Seam
+    x_m: float
+    y_m: float
+
+
+class HeadingFix(NamedTuple):
+    """A heading seen at a seam: how much it exceeds the estimate (rad) and its variance (rad^2)."""
+
+    innovation_rad: float
+    variance_rad2: float
+
+
+class CrossingDetector:
+    """Turns transitions of the edge sensors into headings.
+
+    Both edges of a gap and both pairs count: up to four headings per seam. A heading is only taken where both sensors
+    of a pair crossed the same seam in the same sense, and between the two the robot moved on in near-pure translation.
+
+    Args:
+        mirror: where the seams are.
+        robot: where the sensors are.
+        cfg: limits and timing of a crossing.
+    """
+
+    def __init__(self, mirror: Mirror, robot: RobotConfig, cfg: LocalizerConfig) -> None:
+        self._mirror = mirror
+        self._sensors = robot.edge_sensors_m
+        self._cfg = cfg
+        self._scanner = EdgeScanner()
+        self._marks: dict[tuple[int, bool], _Mark] = {}
+        self._disturbed_s = -inf
+        panel = next(iter(mirror.panels.values()))
+        self._reach_m = _REACH * 2.0 * min(panel.half_x_m, panel.half_y_m)
+
+    def restart(self) -> None:
+        """Forget everything seen: the robot's clock has jumped."""
+        self._scanner.restart()
+        self._marks.clear()
+        self._disturbed_s = -inf
+
+    def scan(self, t_s: float, v_m_s: float, omega_rad_s: float, edges: Sequence[EdgeSample]) -> list[Transition]:
+        """Note the motion at ``t_s`` and return the transitions of the frame, normally none."""
+        if abs(omega_rad_s) > self._cfg.crossing_max_rate_rad_s or abs(v_m_s) < self._cfg.crossing_min_speed_m_s:
+            self._disturbed_s = t_s
+        return self._scanner.scan(edges)
+
+    def headings(
+        self, transitions: Sequence[Transition], odometer: Odometer, pose: PanelPose, deck: DeckPose, v_m_s: float
+    ) -> list[HeadingFix]:
+        """Headings completed by these transitions.
+
+        Args:
+            transitions: of this frame.
+            odometer: advanced to this frame.
+            pose: estimated pose now.
+            deck: the same in the deck frame; decides which seam a sensor crossed.
+            v_m_s: forward speed.
+        """
+        found = []
+        for transition in transitions:
+            mark = self._mark(transition, odometer, deck)
+            if mark is None:
+                continue
+            self._marks[transition.corner, transition.is_on] = mark
+            fix = self._complete(_PAIRS[transition.corner // 2], transition.is_on, odometer.place, pose, v_m_s)
+            if fix is not None:
+                found.append(fix)
+        return found
+
+    def _complete(
+        self, pair: tuple[int, int], is_on: bool, now: Place, pose: PanelPose, v_m_s: float
+    ) -> HeadingFix | None:
+        left, right = self._marks.get((pair[0], is_on)), self._marks.get((pair[1], is_on))
+        if left is None or right is None or not self._belong_together(left, right):
+            return None
+        del self._marks[pair[0], is_on], self._marks[pair[1], is_on]
+        x, y = 0.5 * (left.x_m + right.x_m), 0.5 * (left.y_m + right.y_m)
+        normal = self._mirror.seam_normal_angle(pose.panel, left.seam.axis, x, y)
+        left_xy, right_xy = self._sensors[pair[0]], self._sensors[pair[1]]
+        heading, length, across = heading_from_pair(left.place, right.place, left_xy, right_xy, normal)
+        estimate = pose.heading_rad + right.place.heading_rad - now.heading_rad
+        innovation = (heading - estimate + 0.5 * pi) % pi - 0.5 * pi
+        travel = hypot(left.place.x_m - right.place.x_m, left.place.y_m - right.place.y_m)
+        timing = self._timing_variance(left) + self._timing_variance(right)
+        # An error e of the travel turns u by e * across / |u|^2.
+        variance = (v_m_s**2 * timing + (self._cfg.slip_fraction * travel) ** 2) * (across / length**2) ** 2
+        return HeadingFix(innovation, variance)
+
+    def _mark(self, transition: Transition, odometer: Odometer, pose: DeckPose) -> _Mark | None:
+        x, y = self._mirror.body_offset(pose, *self._sensors[transition.corner])
+        seam = self._mirror.nearest_seam(x, y)
+        if seam is None or abs(seam.distance_m) > self._reach_m:
+            return None
+        place = odometer.at(transition.t_s)
+        # The point on the seam, for the direction of its tangent: the crossed coordinate is known from the map.
+        on_seam = (seam.position_m, y) if seam.axis == "x" else (x, seam.position_m)
+        return _Mark(transition.t_s, transition.interval_s, place, seam, *on_seam)
+
+    def _belong_together(self, left: _Mark, right: _Mark) -> bool:
+        same = left.seam.axis == right.seam.axis and abs(left.seam.position_m - right.seam.position_m) < self._reach_m
+        return same and min(left.t_s, right.t_s) > self._disturbed_s
+
+    def _timing_variance(self, mark: _Mark) -> float:
+        """Variance of a transition's time, s^2: as configured, but never better than its sampling interval."""
+        return max(self._cfg.crossing_time_sigma_s**2, mark.interval_s**2 * _UNIFORM)
+
+
+class HeadingGate:
+    """Refuses a heading that does not fit the estimate, unless a second one bears it out.
+
+    A single false crossing is one that nothing agrees with. Two in a row that agree with each other show that the
+    estimate is wrong and its variance too small; without this a confident filter would refuse every true heading
+    from then on.
+
+    Args:
+        gate_sigma: largest deviation in common standard deviations.
+    """
+
+    def __init__(self, gate_sigma: float) -> None:
+        self._gate_sigma = gate_sigma
+        self._refused: HeadingFix | None = None
+
+    def extra_variance(self, seen: HeadingFix, prior_rad2: float) -> float | None:
+        """Variance (rad^2) by which the estimate has to be widened before it takes ``seen``; None = refused.
+
+        Args:
+            seen: heading against the estimate.
+            prior_rad2: variance of the estimate.
+        """
+        if self._is_within(seen.innovation_rad, seen.variance_rad2 + prior_rad2):
+            self._refused = None
+            return 0.0
+        before, self._refused = self._refused, seen
+        if before is None:
+            return None
+        apart = seen.innovation_rad - before.innovation_rad
+        # The estimate's own drift from one crossing to the next is part of what the two may differ by.
+        if not self._is_within(apart, seen.variance_rad2 + before.variance_rad2 + prior_rad2):
+            return None
+        self._refused = None
+        return seen.innovation_rad**2
+
+    def _is_within(self, deviation_rad: float, variance_rad2: float) -> bool:
+        return abs(deviation_rad) <= self._gate_sigma * sqrt(variance_rad2)

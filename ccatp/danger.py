@@ -1,0 +1,239 @@
+"""Pure. The danger loop's rules and their arbitration: from one sensors frame to one verdict (thesis 3.4).
+
+Permits are the conjunction of all rules. The code is that of the most urgent: an edge (1) outranks an abort (2), which
+outranks normal operation (0). The cause is that of the rule that takes the most away.
+
+* all four edge sensors off: code 1, nothing permitted (``ccatp.edge_rule``, rule h);
+* an edge declared: code 1, no motion towards a sensor that hangs over, no turn but back;
+* edge samples, encoder samples or the estimate missing or older than allowed: nothing permitted, no code of its own;
+  ends by itself as soon as they are fresh again;
+* an emergency: code 2, latched, motion permitted, because the robot shall drive home (``ccatp.abort_latch``).
+"""
+
+from collections.abc import Sequence
+from math import inf, isfinite
+from typing import NamedTuple, Protocol
+
+from ccatp.abort_latch import AbortLatch, EmergencyKind, is_at_base_or_held
+from ccatp.config.models import DangerConfig, RobotConfig
+from ccatp.edge_episode import Episode, Phase
+from ccatp.edge_map import EdgeMap, MirrorMap
+from ccatp.edge_rule import EdgeRule, PoseEstimate
+from ccatp.samples import Corner, EdgeSample, EventCode, Verdict, WheelSample
+
+CORNERS = tuple(Corner)
+NOWHERE = (False, False, False, False)
+EVERYWHERE = (True, True, True, True)
+
+
+class _Missing(NamedTuple):
+    """Data without which nothing is permitted: what, how old, against what age."""
+
+    signal: str
+    cause: str
+    age_s: float
+    limit_s: float
+
+
+class SensorsFrame(Protocol):
+    """The part of a sensors frame that the rules read."""
+
+    @property
+    def seq(self) -> int:
+        """Number of the frame."""
+
+    @property
+    def t(self) -> float:
+        """Robot time, s."""
+
+    @property
+    def enc(self) -> Sequence[WheelSample]:
+        """Encoder samples, oldest first."""
+
+    @property
+    def edge(self) -> list[EdgeSample]:
+        """Edge samples, oldest first."""
+
+
+class Estimate(PoseEstimate, Protocol):
+    """Main's estimate: pose and the state of the mission."""
+
+    @property
+    def state(self) -> str:
+        """Mission state."""
+
+
+class DangerMonitor:
+    """Judges sensors frames. Call ``step`` once per frame, ``stale`` when no frame came in time.
+
+    Args:
+        mirror: the map.
+        robot: wheels and sensor places.
+        cfg: the rules' limits.
+    """
+
+    def __init__(self, mirror: MirrorMap, robot: RobotConfig, cfg: DangerConfig) -> None:
+        """No frame judged yet: nothing is permitted until the first."""
+        self._edges = EdgeRule(EdgeMap(mirror), robot, cfg)
+        self._stale_after_s, self._estimate_stale_after_s = cfg.stale_after_s, cfg.estimate_stale_after_s
+        self.latch = AbortLatch()
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new session with the robot (its clock and numbers begin anew). Emergencies stay latched."""
+        self._edges.reset()
+        self._edge_t_s: float | None = None
+        self._state = ""
+        self.verdict = self.stale(-1, 0.0)
+
+    # -- emergencies ----------------------------------------------------------------------------------------------
+
+    def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
+        """Latch an emergency; returns why it was refused, or None. The same id again is harmless."""
+        return self.latch.raise_emergency(kind, emergency_id, note)
+
+    def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
+        """End an emergency; returns why it was refused, or None."""
+        return self.latch.clear(emergency_id, at_base_or_held)
+
+    def set_level(self, kind: EmergencyKind, active: bool) -> None:
+        """Whether a lasting cause is present; see ``AbortLatch.set_level``."""
+        self.latch.set_level(kind, active)
+
+    @property
+    def at_base_or_held(self) -> bool:
+        """Whether main's newest estimate, if it was fresh in the last frame, says so."""
+        return is_at_base_or_held(self._state)
+
+    @property
+    def code(self) -> EventCode:
+        """The event code now."""
+        if self._edges.is_lifted or self._declared() is not None:
+            return EventCode.NEAR_EDGE
+        return EventCode.ABORTED if self.latch.is_latched else EventCode.NORMAL
+
+    @property
+    def episodes_opened(self) -> dict[Corner, int]:
+        """How often each sensor left the panels."""
+        return dict(zip(CORNERS, self._edges.opened, strict=True))
+
+    @property
+    def edges_declared(self) -> dict[Corner, int]:
+        """How often each sensor declared an edge."""
+        return dict(zip(CORNERS, self._edges.declared, strict=True))
+
+    # -- frames ---------------------------------------------------------------------------------------------------
+
+    def step(self, sensors: SensorsFrame, estimate: Estimate | None) -> Verdict:
+        """The verdict on a frame.
+
+        Args:
+            sensors: the frame. One that is not newer than the last one judged changes nothing.
+            estimate: main's newest, usually that of the frame before; ``None`` without one.
+
+        Returns:
+            The verdict; for a frame that is not new, the last verdict again.
+        """
+        if sensors.seq <= self.verdict.seq:
+            return self.verdict
+        edges, t_s, samples = self._edges, sensors.t, sensors.edge
+        edges.track.push(sensors.enc)
+        is_known = estimate is not None and self._is_fresh(estimate, t_s)
+        self._state = estimate.state if estimate is not None and is_known else ""
+        if edges.is_idle and _are_all_on(samples):
+            edges.skip(samples)
+        else:
+            edges.step(samples, estimate if is_known else None)
+        if samples:
+            self._edge_t_s = samples[-1][0]
+        missing = self._missing(t_s, estimate, is_known)
+        if edges.is_idle and missing is None and not self.latch.is_latched:
+            self.verdict = Verdict(sensors.seq, t_s, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
+        else:
+            self.verdict = self._arbitrate(sensors.seq, t_s, missing)
+        return self.verdict
+
+    def stale(self, seq: int, t_s: float) -> Verdict:
+        """The verdict when no sensors frame came for ``stale_after_s``: nothing permitted.
+
+        Args:
+            seq: the last frame's number.
+            t_s: robot time as far as known, s.
+        """
+        limit_s = self._stale_after_s
+        return _denied(seq, t_s, self.code, _Missing("sensors", "no sensors frame", limit_s, limit_s))
+
+    def _is_fresh(self, estimate: Estimate, t_s: float) -> bool:
+        # Written so that a time that is not a number is not fresh.
+        return abs(t_s - estimate.t_s) <= self._estimate_stale_after_s and isfinite(
+            estimate.x_m + estimate.y_m + estimate.heading_rad + estimate.sigma_m
+        )
+
+    def _missing(self, t_s: float, estimate: Estimate | None, is_known: bool) -> _Missing | None:
+        age_s = inf if self._edge_t_s is None else abs(t_s - self._edge_t_s)
+        if not age_s <= self._stale_after_s:
+            return _Missing("edge", "edge samples stale", age_s, self._stale_after_s)
+        silent_s = self._edges.track.silence_s(t_s)
+        if silent_s > 0.0:
+            return _Missing("enc", "encoder samples stale", silent_s, self._stale_after_s)
+        if is_known:
+            return None
+        age_s = inf if estimate is None else abs(t_s - estimate.t_s)
+        return _Missing("estimate", "estimate stale", age_s, self._estimate_stale_after_s)
+
+    # -- arbitration ----------------------------------------------------------------------------------------------
+
+    def _declared(self) -> Episode | None:
+        """The first sensor's episode that is a declared edge."""
+        return next((e for e in self._edges.episodes if e is not None and e.phase is Phase.DECLARED), None)
+
+    def _arbitrate(self, seq: int, t_s: float, missing: _Missing | None) -> Verdict:
+        if self._edges.is_lifted:
+            return Verdict(
+                seq, t_s, EventCode.NEAR_EDGE, "lifted or fallen", "edge", 4.0, 3.0, False, False, False, EVERYWHERE
+            )
+        declared = self._declared()
+        if declared is not None:
+            return self._edge_verdict(seq, t_s, declared, missing)
+        if missing is not None:
+            return _denied(seq, t_s, self.code, missing)
+        newest = self.latch.newest
+        if newest is None:
+            return Verdict(seq, t_s, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
+        cause = f"emergency: {newest.kind}"
+        return Verdict(seq, t_s, EventCode.ABORTED, cause, f"emergency:{newest.kind}", 1.0, 0.0, True, True, True)
+
+    def _edge_verdict(self, seq: int, t_s: float, episode: Episode, missing: _Missing | None) -> Verdict:
+        front_left, front_right, rear_left, rear_right = off = self._declared_sensors()
+        turn = all(e is None or e.permits_turn for e in self._edges.episodes)
+        known = missing is None
+        return Verdict(
+            seq,
+            t_s,
+            EventCode.NEAR_EDGE,
+            str(episode.cause) if missing is None else f"{episode.cause}; {missing.cause}",
+            CORNERS[off.index(True)].value,
+            episode.value_m,
+            episode.limit_m,
+            known and not (front_left or front_right),
+            known and not (rear_left or rear_right),
+            known and turn,
+            off,
+        )
+
+    def _declared_sensors(self) -> tuple[bool, bool, bool, bool]:
+        a, b, c, d = (e is not None and e.phase is Phase.DECLARED for e in self._edges.episodes)
+        return a, b, c, d
+
+
+def _denied(seq: int, t_s: float, code: EventCode, missing: _Missing) -> Verdict:
+    signal, cause, age_s, limit_s = missing
+    return Verdict(seq, t_s, code, cause, signal, age_s, limit_s, False, False, False, NOWHERE)
+
+
+def _are_all_on(samples: Sequence[EdgeSample]) -> bool:
+    """Whether every sensor is on in every sample; anything but a clear 1 is off."""
+    for _, front_left, front_right, rear_left, rear_right in samples:
+        if not (front_left == 1 and front_right == 1 and rear_left == 1 and rear_right == 1):
+            return False
+    return True

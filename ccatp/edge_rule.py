@@ -1,0 +1,196 @@
+"""Pure. Edge or gap, by travelled distance with the map as prior: one episode per sensor that is off the panels.
+
+The rule, for a sensor that reads "off" (the travel is the sensor's own, its part from the robot's rotation included):
+
+a. the map has the rim ahead of it within ``map_margin_m``, give or take ``map_sigmas`` sigma: an edge at once;
+b. the map has a seam there: an edge when the sensor cannot be over the gap any more. Translation of the robot may carry
+   it ``(gap + tolerance) / cos(angle to the seam's normal) + extra``; what rotation adds counts across the seam only,
+   because a corner sensor that turns in place sweeps along a seam for up to 0.1 m without leaving it;
+c. the map has neither, or there is no estimate: an edge after ``no_map_travel_m``;
+d. standing still the episode is frozen, for ever; going back to where the sensor was on adds nothing;
+g. wheels unheard: the fastest that the sensor can move, times the time;
+h. all four off: lifted or fallen.
+
+An episode ends when the sensor has stood on a panel for ``clear_samples`` samples and has moved on by
+``no_map_travel_m``, so that a sensor that chatters does not begin anew again and again.
+"""
+
+from math import cos, hypot, sin
+from typing import Protocol
+
+from ccatp.config.models import DangerConfig, RobotConfig
+from ccatp.edge_episode import Episode, EpisodeLimits, Phase
+from ccatp.edge_map import EdgeMap
+from ccatp.samples import EdgeSample
+from ccatp.wheel_track import Odometry, WheelTrack, pose_at
+
+SENSORS = range(4)
+
+
+class PoseEstimate(Protocol):
+    """The localizer's pose, deck frame."""
+
+    @property
+    def t_s(self) -> float:
+        """Robot time of the pose."""
+
+    @property
+    def x_m(self) -> float:
+        """Deck x."""
+
+    @property
+    def y_m(self) -> float:
+        """Deck y."""
+
+    @property
+    def heading_rad(self) -> float:
+        """Deck heading."""
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the position."""
+
+
+class EdgeRule:
+    """The four sensors' episodes and what they declare.
+
+    Args:
+        edge_map: the mirror as the rule sees it.
+        robot: wheels and sensor places.
+        cfg: distances and counts.
+
+    Attributes:
+        episodes: one per sensor, in the order of the robot link.
+        is_lifted: all four sensors have been off (rule h), and have not been back on for ``clear_samples``.
+        opened, declared: episodes opened and edges declared per sensor since the start.
+    """
+
+    def __init__(self, edge_map: EdgeMap, robot: RobotConfig, cfg: DangerConfig) -> None:
+        """All sensors on."""
+        self._map = edge_map
+        self._offsets = robot.edge_sensors_m
+        reach_s = 2.0 * max(cfg.stale_after_s, cfg.estimate_stale_after_s)
+        self.track = WheelTrack(robot.wheel_radius_m, robot.wheel_base_m, cfg.stale_after_s, reach_s)
+        self._limits = EpisodeLimits(edge_map.gap_m, cfg)
+        self._half_base_m = 0.5 * robot.wheel_base_m
+        self._clear_samples, self._lifted_samples = cfg.clear_samples, cfg.lifted_samples
+        self._worst_m_s = tuple(_fastest(robot, offset) for offset in robot.edge_sensors_m)
+        self.opened, self.declared = [0, 0, 0, 0], [0, 0, 0, 0]
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget episodes, odometry and times: the robot's clock began anew."""
+        self.track.reset()
+        self.episodes: tuple[Episode | None, ...] = (None, None, None, None)
+        self._odometry: Odometry | None = None
+        self._last_t_s: float | None = None
+        self._all_off = self._all_on = 0
+        self.is_lifted = False
+
+    @property
+    def is_idle(self) -> bool:
+        """No episode is open: a frame in which all sensors are on needs no look."""
+        return self._odometry is None
+
+    def skip(self, samples: list[EdgeSample]) -> None:
+        """Take a frame's samples, all on, while idle."""
+        if samples:
+            self._last_t_s = samples[-1][0]
+
+    def step(self, samples: list[EdgeSample], estimate: PoseEstimate | None) -> None:
+        """Judge a frame's samples, oldest first. The frame's encoder samples must have been pushed to ``track``.
+
+        Args:
+            samples: edge samples; those that go back in time are dropped.
+            estimate: the newest pose, already found fresh and finite; None without one.
+        """
+        if not samples:
+            return
+        self.track.update(samples[-1][0])
+        if self._odometry is None:
+            self._odometry = Odometry(self.track, samples[0][0] if self._last_t_s is None else self._last_t_s)
+        self._tie_to_map(self._odometry, estimate)
+        for sample in samples:
+            if self._last_t_s is None or sample[0] > self._last_t_s:
+                self._sample(sample, self._odometry, estimate)
+                self._last_t_s = sample[0]
+        self._look_ahead()
+        if not any(self.episodes) and not self.is_lifted:
+            self._odometry = None
+
+    def _sample(self, sample: EdgeSample, odometry: Odometry, estimate: PoseEstimate | None) -> None:
+        t_s = sample[0]
+        dt_s = 0.0 if self._last_t_s is None else t_s - self._last_t_s
+        odometry.advance_to(t_s)
+        silent_s = self.track.silence_s(t_s)
+        c, s = cos(odometry.heading_rad), sin(odometry.heading_rad)
+        off = 0
+        for i in SENSORS:
+            # Anything but a clear "on" counts as off.
+            is_on = sample[i + 1] == 1
+            off += not is_on
+            episode = self.episodes[i]
+            if episode is None:
+                if is_on:
+                    continue
+                episode = self._open(i, odometry, dt_s, estimate)
+            ox, oy = self._offsets[i]
+            place = odometry.x_m + c * ox - s * oy, odometry.y_m + s * ox + c * oy
+            if is_on:
+                if episode.see_on(place):
+                    self._replace(i, None)
+            elif episode.see_off(odometry, place, silent_s * self._worst_m_s[i]):
+                self.declared[i] += 1
+        self._count_all(off)
+
+    def _tie_to_map(self, odometry: Odometry, estimate: PoseEstimate | None) -> None:
+        """Give a sensor that has stood off a panel since before the first estimate its place on the map."""
+        for i, episode in enumerate(self.episodes):
+            if episode is not None and episode.needs_map and estimate is not None:
+                self._place(episode, self._offsets[i], odometry, estimate)
+
+    def _place(
+        self, episode: Episode, offset_m: tuple[float, float], odometry: Odometry, estimate: PoseEstimate
+    ) -> None:
+        known = estimate.x_m, estimate.y_m, estimate.heading_rad
+        pose = pose_at(self.track, odometry.t_s, estimate.t_s, known)
+        episode.place_on_map(self._map.place(pose, offset_m), pose[2], estimate.sigma_m)
+
+    def _open(self, i: int, odometry: Odometry, dt_s: float, estimate: PoseEstimate | None) -> Episode:
+        ox, oy = self._offsets[i]
+        moved_m = (abs(odometry.v_m_s) + abs(odometry.omega_rad_s) * hypot(ox, oy)) * dt_s
+        episode = Episode(self._limits, self._map, odometry, ((ox, oy), moved_m), self._half_base_m)
+        if estimate is not None:
+            self._place(episode, (ox, oy), odometry, estimate)
+        self.opened[i] += 1
+        self._replace(i, episode)
+        return episode
+
+    def _replace(self, i: int, episode: Episode | None) -> None:
+        self.episodes = (*self.episodes[:i], episode, *self.episodes[i + 1 :])
+
+    def _count_all(self, off: int) -> None:
+        self._all_off = self._all_off + 1 if off == len(SENSORS) else 0
+        self._all_on = self._all_on + 1 if off == 0 else 0
+        if self._all_off >= self._lifted_samples:
+            self.is_lifted = True
+        elif self.is_lifted and self._all_on >= self._clear_samples:
+            self.reset_episodes()
+
+    def reset_episodes(self) -> None:
+        """Begin anew on the panels: the robot has been put back."""
+        self.is_lifted = False
+        self.episodes = (None, None, None, None)
+
+    def _look_ahead(self) -> None:
+        """Rule (a) again, once per frame, for what is off and moves: a seam may lead to the rim."""
+        for i, episode in enumerate(self.episodes):
+            if episode is not None and episode.phase is not Phase.DECLARED and episode.look_ahead():
+                self.declared[i] += 1
+
+
+def _fastest(robot: RobotConfig, offset_m: tuple[float, float]) -> float:
+    """Largest speed of a sensor, m/s: it is linear in the wheel rates, so it is taken at a corner of their range."""
+    edge_m_s = robot.wheel_radius_m * robot.max_wheel_rad_s
+    omega = 2.0 * edge_m_s / robot.wheel_base_m
+    return max(edge_m_s, omega * hypot(*offset_m))

@@ -1,0 +1,61 @@
+"""Pure. The errors that end a command: each is one line for the reader and an exit status for scripts."""
+
+from collections.abc import Sequence
+from enum import IntEnum
+
+
+class ExitStatus(IntEnum):
+    """What ``ccatp`` tells the shell."""
+
+    COMPLETE = 0
+    REFUSED = 1  # a running daemon refused the command, and said why
+    USAGE = 2  # usage or configuration
+    ABORTED = 3  # robot at base
+    HELD = 4  # held or faulted, robot not at base
+    UNREACHABLE = 5  # robot, laser system or daemon does not answer
+    INTERRUPTED = 130  # wheels held, state saved
+
+
+class CcatpError(Exception):
+    """An expected end: ``str(error)`` is one line that says what is wrong and what to do.
+
+    Subclasses set ``exit_status``.
+    """
+
+    exit_status: int = ExitStatus.HELD
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.split()))
+
+
+class ConfigError(CcatpError):
+    """A configuration that cannot be used.
+
+    Args:
+        problems: one line each, ``file:line: key: what is wrong; what to do``. The first is the message.
+    """
+
+    exit_status = ExitStatus.USAGE
+
+    def __init__(self, *problems: str) -> None:
+        self.problems: Sequence[str] = [" ".join(problem.split()) for problem in problems]
+        more = f" (and {len(problems) - 1} more: ccatp config check)" if len(problems) > 1 else ""
+        super().__init__(self.problems[0] + more)
+
+
+class RuntimeDirError(CcatpError):
+    """A runtime directory in which no socket can or may be made."""
+
+    exit_status = ExitStatus.USAGE
+
+
+class RefusedError(CcatpError):
+    """A running daemon refused a command."""
+
+    exit_status = ExitStatus.REFUSED
+
+
+class UnreachableError(CcatpError):
+    """A peer that does not answer."""
+
+    exit_status = ExitStatus.UNREACHABLE

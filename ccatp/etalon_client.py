@@ -1,0 +1,296 @@
+"""Edge. Client of the MultiLine server: lengths over TCP, multilaterated to the position of the puck.
+
+A connection that has failed a request in any way, or that has said something unasked, is closed: the next request
+makes another, so that a late reply can never answer it. A fix is a function of the replies and the arguments alone.
+"""
+
+import asyncio
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import asynccontextmanager, suppress
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import structlog
+from numpy.typing import NDArray
+
+from ccatp.config.models import EtalonConfig
+from ccatp.etalon_errors import (
+    BadSolution,
+    EtalonBadReply,
+    EtalonError,
+    EtalonServerError,
+    EtalonTimeout,
+    EtalonUnreachable,
+    TooFewChannels,
+)
+from ccatp.etalon_link import EtalonLink, PushQueue
+from ccatp.radio.multilateration import MultilaterationError
+from ccatp.radio.puck_fix import solve_fix
+from ccatp.samples import Fix, Vector3
+from ccatp.wire import multiline
+from ccatp.wire.multiline import (
+    ChannelData,
+    Command,
+    Connected,
+    Environment,
+    LaserReady,
+    Notice,
+    Remark,
+    Reply,
+    Request,
+)
+
+__all__ = [
+    "BadSolution",
+    "EtalonBadReply",
+    "EtalonClient",
+    "EtalonError",
+    "EtalonServerError",
+    "EtalonTimeout",
+    "EtalonUnreachable",
+    "Readiness",
+    "TooFewChannels",
+]
+
+_NEEDED_CHANNELS = 4
+
+_ReplyT = TypeVar("_ReplyT", Connected, LaserReady, Environment, ChannelData, Notice)
+_T = TypeVar("_T")
+_log = structlog.get_logger(__name__)
+
+
+class Readiness(NamedTuple):
+    """State of the server."""
+
+    connected: bool
+    laser_ready: bool
+    environment: Environment
+
+
+class EtalonClient:
+    """Measures where the puck is.
+
+    Attributes:
+        counts: connects, requests, retries, drained (connections closed for unasked or left-over bytes).
+    """
+
+    def __init__(self, cfg: EtalonConfig, channels: Sequence[int], collimators_m: NDArray[np.float64]) -> None:
+        """Set up without a connection.
+
+        Args:
+            cfg: address, deadlines, limits.
+            channels: channels to ask for, each once, length k >= 4.
+            collimators_m: where their beams start, world frame, shape (k, 3).
+
+        Raises:
+            ValueError: channels and collimators do not fit, or are too few.
+        """
+        if np.shape(collimators_m) != (len(set(channels)), 3) or len(set(channels)) < _NEEDED_CHANNELS:
+            raise ValueError(f"channels {tuple(channels)}, collimators {np.shape(collimators_m)}: need (k, 3), k >= 4")
+        self.counts: Counter[str] = Counter()
+        self._cfg = cfg
+        self._where = f"Etalon server {cfg.host}:{cfg.port}"
+        self._channels = tuple(channels)
+        self._collimators = dict(zip(self._channels, np.asarray(collimators_m, dtype=np.float64), strict=True))
+        self._request = Request(Command.LATEST_LENGTH_VALID, self._channels)
+        self._link: EtalonLink | None = None
+        self._turn = asyncio.Lock()
+
+    async def connect(self) -> None:
+        """Connect, unless connected.
+
+        Raises:
+            EtalonUnreachable: not within the configured number of tries.
+        """
+        async with self._turn:
+            await self._retry(self._usable_link)
+
+    async def close(self) -> None:
+        """Close the connection. A request under way ends first."""
+        async with self._turn:
+            self._drop()
+
+    async def isready(self) -> Readiness:
+        """Ask for lasers connected, lasers warm, and the air.
+
+        Raises:
+            EtalonError: see the subclasses.
+        """
+        async with self._turn:
+            return await self._retry(self._ask_readiness)
+
+    async def measure(self, t_s: float, expected_position_m: Vector3) -> Fix:
+        """Measure the puck of a robot that stands still.
+
+        Args:
+            t_s: robot time for which the position holds; it becomes the time of the fix, whenever the reply arrives.
+            expected_position_m: world frame; the solution starts here, and here decides which of two mirror images it
+                is where all collimators lie in one plane.
+
+        Raises:
+            EtalonUnreachable, EtalonTimeout, EtalonBadReply, EtalonServerError, TooFewChannels, BadSolution: after
+                the configured retries, the error of the last one.
+        """
+        async with self._turn:
+            return await self._retry(lambda: self._measure_once(t_s, expected_position_m))
+
+    @asynccontextmanager
+    async def stream(self) -> AsyncIterator[AsyncIterator[ChannelData]]:
+        """The server's continuous mode: yields an iterator over pushed records, on a connection of its own.
+
+        No request is sent while it runs. On leaving, the measurement is stopped and the connection closed.
+
+        Raises:
+            EtalonError: no start, or (from the iterator) no line within the deadline of a request.
+        """
+        async with self._turn:
+            self._drop()
+            link = await self._usable_link()
+            queue = link.start_stream()
+            try:
+                await self._command(link, queue, Command.START_MEASUREMENT, Notice.STARTED)
+                try:
+                    yield self._pushed(queue)
+                except BaseException:
+                    # The server must not go on measuring; the first error is the one to report.
+                    with suppress(EtalonError):
+                        await self._command(link, queue, Command.STOP_MEASUREMENT, Notice.STOPPED)
+                    raise
+                await self._command(link, queue, Command.STOP_MEASUREMENT, Notice.STOPPED)
+            finally:
+                self._drop()
+
+    async def _pushed(self, queue: PushQueue) -> AsyncIterator[ChannelData]:
+        while (reply := await self._next_pushed(queue)) is not Notice.FINISHED:
+            if isinstance(reply, ChannelData):
+                yield reply
+
+    async def _command(self, link: EtalonLink, queue: PushQueue, command: Command, awaited: Notice) -> None:
+        """Start or stop the stream; records that were already on their way are passed over."""
+        try:
+            link.send(Request(command))
+        except ConnectionError as error:
+            raise EtalonUnreachable(f"{self._where}: {error}; is it running?") from None
+        while (reply := await self._next_pushed(queue)) is not awaited:
+            self._refuse_remark(reply, command)
+
+    async def _next_pushed(self, queue: PushQueue) -> Reply:
+        try:
+            async with asyncio.timeout(self._cfg.request_timeout_s):
+                line = await queue.get()
+        except TimeoutError:
+            raise self._timeout("the push stream") from None
+        if line is None:
+            fault = self._link.fault if self._link else "closed"
+            raise EtalonUnreachable(f"{self._where}: {fault} in the push stream; is it running?")
+        try:
+            return multiline.parse_reply(line)
+        except multiline.BadReply as error:
+            raise EtalonBadReply(f"{self._where}: {error}; is this a MultiLine server?") from None
+
+    async def _retry(self, attempt: Callable[[], Awaitable[_T]]) -> _T:
+        """Try up to ``retries`` times more. What needs a new measurement waits for one, what needs a server for it."""
+        left = self._cfg.retries
+        while True:
+            try:
+                return await attempt()
+            except EtalonError as error:
+                if left == 0:
+                    raise
+                left -= 1
+                self.counts["retries"] += 1
+                _log.warning("etalon_retry", error=str(error), tries_left=left)
+                if isinstance(error, EtalonUnreachable | EtalonBadReply):
+                    await asyncio.sleep(self._cfg.reconnect_delay_s)
+                elif not isinstance(error, EtalonTimeout):
+                    await asyncio.sleep(self._cfg.measuring_time_s)
+
+    async def _usable_link(self) -> EtalonLink:
+        """The connection, or a new one where there is none that is free of leftovers."""
+        if self._link is not None:
+            # Two turns of the event loop: what lies in the socket by now is delivered, and seen here.
+            await asyncio.sleep(0)
+            await asyncio.sleep(0)
+            if self._link.is_clean:
+                return self._link
+            self.counts["drained"] += 1
+            self._drop()
+        try:
+            async with asyncio.timeout(self._cfg.connect_timeout_s):
+                _, self._link = await asyncio.get_running_loop().create_connection(
+                    EtalonLink, self._cfg.host, self._cfg.port
+                )
+        except (OSError, TimeoutError) as error:
+            reason = str(error) or f"no connection within {self._cfg.connect_timeout_s} s"
+            raise EtalonUnreachable(f"{self._where}: {reason}; is it running, are [etalon] host, port right?") from None
+        self.counts["connects"] += 1
+        return self._link
+
+    def _drop(self) -> None:
+        if self._link is not None:
+            self._link.abort()
+            self._link = None
+
+    async def _ask(self, request: Request, expected: type[_ReplyT]) -> _ReplyT:
+        """One request, one reply of the expected kind; whatever else happens, the connection is gone."""
+        link = await self._usable_link()
+        self.counts["requests"] += 1
+        try:
+            async with asyncio.timeout(self._cfg.request_timeout_s):
+                line = await link.ask(request)
+            reply = multiline.parse_reply(line)
+            if link.has_leftovers:
+                raise multiline.BadReply("more than one line in reply to one request")
+            self._refuse_remark(reply, request.command)
+            if not isinstance(reply, expected):
+                raise multiline.BadReply(f"{type(reply).__name__} in reply to {request.command}")
+        except TimeoutError:
+            self._drop()
+            raise self._timeout(request.command) from None
+        except (multiline.BadReply, multiline.LineTooLong) as error:
+            self._drop()
+            raise EtalonBadReply(f"{self._where}: {error}; is this a MultiLine server?") from None
+        except ConnectionError as error:
+            self._drop()
+            raise EtalonUnreachable(f"{self._where}: {error}; is it running?") from None
+        except BaseException:  # cancelled: the reply is still to come
+            self._drop()
+            raise
+        return reply
+
+    def _timeout(self, request: str) -> EtalonTimeout:
+        return EtalonTimeout(
+            f"{self._where}: no reply to {request} within {self._cfg.request_timeout_s} s; "
+            "restart its laser driver or raise [etalon] request_timeout_s"
+        )
+
+    def _refuse_remark(self, reply: Reply, request: str) -> None:
+        if isinstance(reply, Remark) and reply.name == "error":
+            raise EtalonServerError(f"{self._where}: refused {request}: {reply.text!r}; see its log", None)
+
+    async def _ask_readiness(self) -> Readiness:
+        connected = await self._ask(Request(Command.IS_CONNECTED), Connected)
+        laser_ready = await self._ask(Request(Command.LASER_READY), LaserReady)
+        environment = await self._ask(Request(Command.ENVIRONMENT_DATA), Environment)
+        return Readiness(connected.value, laser_ready.value, environment)
+
+    async def _measure_once(self, t_s: float, expected_m: Vector3) -> Fix:
+        data = await self._ask(self._request, ChannelData)
+        if data.server_error:
+            raise EtalonServerError(f"{self._where}: server error {data.server_error}; see its log", data.server_error)
+        lengths_m, reasons = multiline.valid_lengths(data, self._channels)
+        valid = tuple(lengths_m)
+        if len(valid) < _NEEDED_CHANNELS:
+            dropped = ", ".join(f"{channel}: {reason}" for channel, reason in reasons.items())
+            raise TooFewChannels(
+                f"{self._where}: {len(valid)} valid channels, {_NEEDED_CHANNELS} needed ({dropped}); clear the beams",
+                valid,
+                reasons,
+            )
+        try:
+            return solve_fix(self._cfg, t_s, expected_m, lengths_m, self._collimators)
+        except MultilaterationError as error:
+            raise BadSolution(
+                f"{self._where}: {error}; channels {valid}: check beams, collimators and [etalon] limits"
+            ) from error

@@ -1,0 +1,109 @@
+"""Pure. What every filter offers: the ``Filter`` protocol, the innovation of an update, its typed refusals."""
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+
+class FilterError(Exception):
+    """Base of every refusal of a filter. The state before the refused call stays in force."""
+
+
+class FilterShapeError(FilterError):
+    """An array does not fit the state: carries its name, its shape and the shape that was asked for."""
+
+    def __init__(self, name: str, shape: tuple[int, ...], wanted: str) -> None:
+        super().__init__(f"{name} has shape {shape}, wanted {wanted}")
+        self.name = name
+        self.shape = shape
+
+
+class FilterDiverged(FilterError):
+    """A mean, a covariance or a noise is no longer a finite Gaussian: what is wrong stands in the message."""
+
+
+class Innovation(NamedTuple):
+    """What one update learned.
+
+    Attributes:
+        residual: nu = z - H x with the predicted state, shape (m,).
+        nis: normalised innovation squared nu^T (H P H^T + R)^-1 nu; chi-squared with ``size`` degrees of freedom
+            when the filter is consistent.
+        size: m, the number of measurement rows.
+    """
+
+    residual: FloatArray
+    nis: float
+    size: int
+
+
+class Filter(Protocol):
+    """A Gaussian filter of n states, thesis fig. 2.8: the localizer is composed with one."""
+
+    mean: FloatArray
+    """State estimate, shape (n,)."""
+    covariance: FloatArray
+    """Its covariance, shape (n, n), symmetric positive semidefinite."""
+
+    def predict(self, F: FloatArray, Q: FloatArray) -> None:
+        """Advance the state by x <- F x, P <- F P F^T + Q (thesis eqs 2.5, 2.6).
+
+        Args:
+            F: transition, shape (n, n).
+            Q: covariance of the process noise, shape (n, n).
+
+        Raises:
+            FilterShapeError: a shape does not fit.
+            FilterDiverged: the prediction is not finite.
+        """
+
+    def update(self, z: FloatArray, H: FloatArray, R: FloatArray) -> Innovation:
+        """Condition the state on z = H x + noise (thesis eqs 2.7 to 2.10).
+
+        Args:
+            z: measurements, shape (m,); m = 0 leaves the prediction.
+            H: measurement model, shape (m, n).
+            R: variances of independent rows, shape (m,), or their covariance, shape (m, m).
+
+        Raises:
+            FilterShapeError: a shape does not fit.
+            FilterDiverged: the posterior is not finite, P is not positive semidefinite or R is not positive definite.
+        """
+
+    def reset(self, mean: FloatArray, covariance: FloatArray) -> None:
+        """Re-initialise with copies of a mean (n,) and a covariance (n, n), the thesis's resetFilter(mu, Sigma).
+
+        Raises:
+            FilterShapeError: a shape does not fit.
+            FilterDiverged: not finite, not symmetric or not positive semidefinite.
+        """
+
+
+def check_gaussian(mean: FloatArray, covariance: FloatArray) -> None:
+    """Refuse a mean (n,) and covariance (n, n) that are no Gaussian.
+
+    Raises:
+        FilterShapeError: a shape does not fit.
+        FilterDiverged: not finite, not symmetric or not positive semidefinite.
+    """
+    if mean.ndim != 1 or mean.size == 0:
+        raise FilterShapeError("mean", mean.shape, "(n,), n >= 1")
+    if covariance.shape != (mean.size, mean.size):
+        raise FilterShapeError("covariance", covariance.shape, f"({mean.size}, {mean.size})")
+    if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
+        raise FilterDiverged(f"mean or covariance is not finite: mean {mean.tolist()}")
+    scale = float(np.abs(covariance).max())
+    if float(np.abs(covariance - covariance.T).max()) > ASYMMETRY * scale:
+        raise FilterDiverged("covariance is not symmetric")
+    least = float(np.linalg.eigvalsh(covariance)[0])
+    if least < -NEGATIVITY * scale:
+        raise FilterDiverged(f"covariance is not positive semidefinite: least eigenvalue {least:.3g}")
+
+
+ASYMMETRY = 1e-9
+"""Largest relative asymmetry taken for rounding of the caller's arithmetic."""
+NEGATIVITY = 1e-9
+"""Largest negative eigenvalue, relative to the largest entry, taken for rounding."""

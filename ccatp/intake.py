@@ -1,0 +1,189 @@
+"""Pure. Which frames and samples are used: time stamps backward, twice, late, jumping or not finite.
+
+Nothing here looks at a clock: all times are the robot's, as delivered.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from enum import Enum
+from math import inf, isfinite
+
+from ccatp.measurements import WheelReading
+from ccatp.samples import ImuSample, WheelSample
+
+MAX_FRAME_STEP_S = 0.1
+"""A frame further than this from the last one is a jump of the robot's clock or a gap in the link."""
+BACKWARD_LIMIT = 5
+"""This many backward time stamps in a row ask for a hold."""
+_ROUNDING_S = 1e-6
+
+
+class FrameKind(Enum):
+    """What a frame's time makes of it."""
+
+    NEXT = "next"
+    STALE = "stale"  # not newer than the last one
+    SUSPECT = "suspect"  # a jump, not yet confirmed by a second frame
+    RESYNC = "resync"  # the first frame in a new time base
+
+
+class FrameClock:
+    """Orders frames by their time.
+
+    A single frame from elsewhere (replayed, corrupted) changes nothing; the second one in a row that continues it shows
+    that the robot's clock itself has jumped.
+    """
+
+    def __init__(self) -> None:
+        self.t_s = -inf
+        self.stale_run = 0
+        self._suspect_s: float | None = None
+
+    def admit(self, t_s: float) -> FrameKind:
+        """Judge a frame of time ``t_s``; ``self.t_s`` is the newest admitted time afterwards."""
+        step = t_s - self.t_s
+        if 0.0 < step <= MAX_FRAME_STEP_S:
+            self.stale_run = 0
+            return self._admitted(t_s, FrameKind.NEXT)
+        if not isfinite(t_s) or -MAX_FRAME_STEP_S <= step <= 0.0:
+            self.stale_run += 1
+            return FrameKind.STALE
+        suspect, self._suspect_s = self._suspect_s, t_s
+        if self.t_s == -inf or (suspect is not None and 0.0 < t_s - suspect <= MAX_FRAME_STEP_S):
+            self.stale_run = 0
+            return self._admitted(t_s, FrameKind.RESYNC)
+        return FrameKind.SUSPECT
+
+    def _admitted(self, t_s: float, kind: FrameKind) -> FrameKind:
+        self.t_s = t_s
+        self._suspect_s = None
+        return kind
+
+
+class Source:
+    """The time stamps of one sensor: each is used once, in increasing order.
+
+    Args:
+        name: of the sensor.
+
+    Attributes:
+        newest_s: newest time used.
+        backward_run: samples in a row that were older than the newest.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.newest_s = -inf
+        self.backward_run = 0
+        self._used: deque[Sequence[float]] = deque()
+
+    def use(self, times_s: Sequence[float]) -> None:
+        """Note the times of a batch of used samples, oldest first, not empty."""
+        self.newest_s = times_s[-1]
+        self.backward_run = 0
+        self._used.append(times_s)
+
+    def forget_before(self, t_s: float) -> None:
+        """Drop the batches that ended before ``t_s``: samples that old are refused anyway."""
+        while self._used and self._used[0][-1] < t_s:
+            self._used.popleft()
+
+    def refusal(self, t_s: float, frame_s: float, oldest_s: float) -> str | None:
+        """Why a sample of time ``t_s`` is refused (a key of the counts), or None."""
+        if t_s > frame_s + _ROUNDING_S:
+            return "ahead"
+        if t_s < oldest_s:
+            return "late"
+        if t_s > self.newest_s:
+            return None
+        if any(t_s in times for times in self._used):
+            return "duplicate"
+        self.backward_run += 1
+        return "backward"
+
+
+class SampleIntake:
+    """Picks the usable IMU and encoder samples of a frame and counts the others.
+
+    Args:
+        history_s: samples older than this before their frame are refused.
+        counts: where refusals are counted, by reason: ahead, late, duplicate, backward, nonfinite.
+
+    Attributes:
+        backward_source: name of a sensor that has sent ``BACKWARD_LIMIT`` backward time stamps in a row, or empty;
+            stays until someone empties it.
+    """
+
+    def __init__(self, history_s: float, counts: dict[str, int]) -> None:
+        self._history_s = history_s
+        self._counts = counts
+        self.backward_source = ""
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget every time stamp: the robot's clock has jumped."""
+        self._imu, self._right, self._left = Source("imu"), Source("right encoder"), Source("left encoder")
+
+    def are_clean(self, t_s: float, encoders: Sequence[WheelSample]) -> bool:
+        """Take the encoder samples whole if nothing is wrong with them: both wheels, finite, in order, new."""
+        if not encoders:
+            return True
+        newest = max(self._right.newest_s, self._left.newest_s, t_s - self._history_s)
+        total = 0.0
+        try:
+            for t, right, left in encoders:
+                if not newest < t:
+                    return False
+                newest = t
+                total += right + left  # type: ignore[operator]  # None raises, and is then sorted out one by one
+        except TypeError:
+            return False
+        if not (isfinite(total) and newest <= t_s + _ROUNDING_S):
+            return False
+        times = [sample[0] for sample in encoders]
+        for source in (self._right, self._left):
+            source.use(times)
+            source.forget_before(t_s - self._history_s)
+        return True
+
+    def wheels(self, t_s: float, encoders: Iterable[WheelSample]) -> tuple[list[WheelReading], list[WheelReading]]:
+        """The usable readings of the right and of the left wheel, each sample judged by itself."""
+        right: list[WheelReading] = []
+        left: list[WheelReading] = []
+        for sample in encoders:
+            if not all(isfinite(value) for value in sample if value is not None):
+                self._counts["nonfinite"] += 1
+                continue
+            for source, rate, kept in (
+                (self._right, sample.right_rad_s, right),
+                (self._left, sample.left_rad_s, left),
+            ):
+                if rate is not None and self._is_usable(source, sample.t_s, t_s):
+                    source.use((sample.t_s,))
+                    kept.append((sample.t_s, rate))
+        for source in (self._right, self._left):
+            source.forget_before(t_s - self._history_s)
+        return right, left
+
+    def imu(self, t_s: float, samples: Sequence[ImuSample]) -> Sequence[ImuSample]:
+        """The usable IMU samples."""
+        kept: list[ImuSample] = []
+        source = self._imu
+        for sample in samples:
+            t, ax, wz = sample
+            if not isfinite(t + ax + wz):
+                self._counts["nonfinite"] += 1
+            elif self._is_usable(source, t, t_s):
+                source.use((t,))
+                kept.append(sample)
+        source.forget_before(t_s - self._history_s)
+        return kept
+
+    def _is_usable(self, source: Source, sample_s: float, frame_s: float) -> bool:
+        refusal = source.refusal(sample_s, frame_s, frame_s - self._history_s)
+        if refusal is None:
+            return True
+        self._counts[refusal] += 1
+        if source.backward_run >= BACKWARD_LIMIT:
+            self.backward_source = source.name
+        return False

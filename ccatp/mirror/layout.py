@@ -1,0 +1,133 @@
+"""Pure. The grid of panels in the deck plane: which panel, seam or gap lies under a point."""
+
+from math import hypot
+from typing import Literal, NamedTuple
+
+from ccatp.config.models import PanelsConfig
+from ccatp.mirror.errors import LayoutError
+from ccatp.samples import PanelId
+
+GAP_AGREEMENT_MM = 0.1  # the fitted pitches of the telescope exceed size + gap by up to 0.012 mm
+
+
+class Seam(NamedTuple):
+    """A seam between two panels near a point.
+
+    Attributes:
+        axis: the deck coordinate that is constant along the seam.
+        position_m: its centre line.
+        distance_m: the point's coordinate minus the position.
+    """
+
+    axis: Literal["x", "y"]
+    position_m: float
+    distance_m: float
+
+
+class PanelGrid:
+    """Cells of one pitch by one pitch, each with a panel in its middle, rows centred (deck plane, m).
+
+    Centre of panel (r, c): ``x = (c - (cols+1)/2) pitch_x``, ``y = (r - (rows+1)/2) pitch_y + y_offset``.
+
+    Attributes:
+        rows, cols: size of the grid.
+        ids: the panels that exist, row by row.
+        half_x_m, half_y_m: half the size of a panel.
+    """
+
+    def __init__(self, cfg: PanelsConfig) -> None:
+        """Lay out the panels.
+
+        Raises:
+            LayoutError: if counts, sizes and rows contradict each other.
+        """
+        _check_layout(cfg)
+        self.rows, self.cols = len(cfg.panels_per_row), cfg.cols
+        self.half_x_m, self.half_y_m = cfg.size_x_mm * 5e-4, cfg.size_y_mm * 5e-4
+        self._pitch_x, self._pitch_y = cfg.pitch_x_mm * 1e-3, cfg.pitch_y_mm * 1e-3
+        self._per_x, self._per_y = 1.0 / self._pitch_x, 1.0 / self._pitch_y
+        self._y_offset = cfg.y_offset_mm * 1e-3
+        # Cell coordinates (u, v) count pitches from the lower left corner of the grid: integer part = column, row - 1.
+        self._u0, self._v0 = self.cols / 2.0, self.rows / 2.0 - self._y_offset * self._per_y
+        self._half_u, self._half_v = self.half_x_m * self._per_x, self.half_y_m * self._per_y
+        self._first = tuple((self.cols - n) // 2 for n in cfg.panels_per_row)
+        self._end = tuple(f + n for f, n in zip(self._first, cfg.panels_per_row, strict=True))
+        self._ids = tuple(tuple(PanelId(r + 1, c + 1) for c in range(self.cols)) for r in range(self.rows))
+        self.ids = tuple(self._ids[r][c] for r in range(self.rows) for c in range(self._first[r], self._end[r]))
+
+    def centre(self, panel: PanelId) -> tuple[float, float]:
+        """Centre of a cell of the grid, deck plane, m."""
+        x = (panel.col - (self.cols + 1) / 2.0) * self._pitch_x
+        return x, (panel.row - (self.rows + 1) / 2.0) * self._pitch_y + self._y_offset
+
+    def panel_at(self, x: float, y: float) -> PanelId | None:
+        """The panel whose cell (half gaps included) holds the point, or None outside every cell."""
+        u, v = x * self._per_x + self._u0, y * self._per_y + self._v0
+        if not (0.0 <= u < self.cols and 0.0 <= v < self.rows):  # NaN included
+            return None
+        r, c = int(v), int(u)
+        return self._ids[r][c] if self._first[r] <= c < self._end[r] else None
+
+    def is_on_panel(self, x: float, y: float) -> bool:
+        """Whether there is material at the point: inside a panel's own edges."""
+        u, v = x * self._per_x + self._u0, y * self._per_y + self._v0
+        if not (0.0 <= u < self.cols and 0.0 <= v < self.rows):  # NaN included
+            return False
+        r, c = int(v), int(u)
+        if not self._first[r] <= c < self._end[r]:
+            return False
+        return abs(u - c - 0.5) <= self._half_u and abs(v - r - 0.5) <= self._half_v
+
+    def nearest_panel(self, x: float, y: float) -> PanelId:
+        """The panel under the point, or the one whose cell is nearest to it."""
+        found = self.panel_at(x, y)
+        if found is not None:
+            return found
+        u, v = x * self._per_x + self._u0, y * self._per_y + self._v0
+        best, best_m = self.ids[0], float("inf")
+        for r in range(self.rows):
+            c = int(min(max(self._first[r], u), self._end[r] - 1))
+            du, dv = max(c - u, u - c - 1.0, 0.0), max(r - v, v - r - 1.0, 0.0)
+            distance = hypot(du * self._pitch_x, dv * self._pitch_y)
+            if distance < best_m:
+                best, best_m = self._ids[r][c], distance
+        return best
+
+    def nearest_seam(self, x: float, y: float) -> Seam | None:
+        """The nearest of the interior seams (panels on both sides) that bound the nearest cell; None without any."""
+        panel = self.nearest_panel(x, y)
+        r, c = panel.row - 1, panel.col - 1
+        x0, y0 = (c - self._u0) * self._pitch_x, (r - self._v0) * self._pitch_y
+        found: Seam | None = None
+        for exists, axis, position, distance in (
+            (c > self._first[r], "x", x0, x - x0),
+            (c + 1 < self._end[r], "x", x0 + self._pitch_x, x - x0 - self._pitch_x),
+            (self._has(r - 1, c), "y", y0, y - y0),
+            (self._has(r + 1, c), "y", y0 + self._pitch_y, y - y0 - self._pitch_y),
+        ):
+            if exists and (found is None or abs(distance) < abs(found.distance_m)):
+                found = Seam("x" if axis == "x" else "y", position, distance)
+        return found
+
+    def row_span(self, row: int) -> tuple[float, float, float]:
+        """Half width and the y edges (low, high) of the material of a row counted from 1, deck plane, m."""
+        count = self._end[row - 1] - self._first[row - 1]
+        y = (row - (self.rows + 1) / 2.0) * self._pitch_y + self._y_offset
+        return (count - 1) / 2.0 * self._pitch_x + self.half_x_m, y - self.half_y_m, y + self.half_y_m
+
+    def _has(self, r: int, c: int) -> bool:
+        return 0 <= r < self.rows and self._first[r] <= c < self._end[r]
+
+
+def _check_layout(cfg: PanelsConfig) -> None:
+    if sum(cfg.panels_per_row) != cfg.count:
+        raise LayoutError(f"panels_per_row adds up to {sum(cfg.panels_per_row)} panels, count says {cfg.count}")
+    for row, n in enumerate(cfg.panels_per_row, start=1):
+        if n > cfg.cols or (cfg.cols - n) % 2:
+            raise LayoutError(f"row {row} with {n} panels cannot be centred on {cfg.cols} columns")
+    for axis, size, pitch in (("x", cfg.size_x_mm, cfg.pitch_x_mm), ("y", cfg.size_y_mm, cfg.pitch_y_mm)):
+        if abs(pitch - size - cfg.gap_mm) > GAP_AGREEMENT_MM:
+            raise LayoutError(f"pitch_{axis}_mm {pitch} is not size {size} + gap {cfg.gap_mm}")
+    for axis, size, points in (("x", cfg.size_x_mm, cfg.points_x_mm), ("y", cfg.size_y_mm, cfg.points_y_mm)):
+        if not -size / 2.0 < points[0] < points[1] < points[2] < size / 2.0:
+            raise LayoutError(f"points_{axis}_mm {points} must ascend within the panel's +-{size / 2.0}")

@@ -1,0 +1,262 @@
+"""Pure. The mirror as the robot meets it: one object that joins surface, frames, panels, rim and poses."""
+
+from math import atan2, cos, pi, sin
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ccatp.angles import wrap_pi
+from ccatp.config.models import BaseConfig, CollimatorsConfig, MirrorConfig
+from ccatp.mirror.errors import LayoutError, UnknownPanelError
+from ccatp.mirror.frames import build_frames
+from ccatp.mirror.layout import PanelGrid, Seam
+from ccatp.mirror.panels import POINTS_PER_PANEL, POINTS_PER_ROW, Panel, build_panel
+from ccatp.mirror.rim import build_rim
+from ccatp.mirror.surface import Axes, build_surface
+from ccatp.samples import DeckPose, PanelId, PanelPose, PointId, Vector3
+
+FloatArray = NDArray[np.float64]
+
+_MIN_CHANNELS = 4
+
+
+class Mirror:
+    """A telescope mirror: geometry only, without state.
+
+    Points are ``Vector3`` in metres; the frames are those of ``ccatp.samples``.
+
+    Attributes:
+        name: name of the configuration.
+        overhang: the robot hangs and needs its fans.
+        drive_side: sign of the mirror frame's z on the robot's side.
+        gap_m: nominal gap between panels.
+        rows, cols: size of the panel grid.
+        surface: the ideal surface, deck frame.
+        grid: which panel lies where.
+        panels: every panel, rows then columns.
+        rim: outline of the mirror, deck plane.
+        frames: transforms between world, mirror and deck frame.
+        channels: laser channels, (k,).
+        collimators_m: their positions in the world frame, shape (k, 3).
+        base_panel_pose, base_pose: where the robot starts and returns to.
+    """
+
+    def __init__(self, cfg: MirrorConfig) -> None:
+        """Build the geometry.
+
+        Raises:
+            LayoutError: if the configuration contradicts itself.
+        """
+        self.name, self.overhang = cfg.name, cfg.overhang
+        self.drive_side: int = cfg.frame.reflecting_side_sign
+        self.gap_m = cfg.panels.gap_mm * 1e-3
+        self.surface = build_surface(cfg.surface, self.drive_side)
+        self.grid = PanelGrid(cfg.panels)
+        self.rows, self.cols = self.grid.rows, self.grid.cols
+        half = self.grid.half_x_m, self.grid.half_y_m
+        self.panels: dict[PanelId, Panel] = {
+            pid: build_panel(self.surface, pid, self.grid.centre(pid), half) for pid in self.grid.ids
+        }
+        self.rim = build_rim(self.grid)
+        self._points_x = tuple(x * 1e-3 for x in cfg.panels.points_x_mm)
+        self._points_y = tuple(y * 1e-3 for y in cfg.panels.points_y_mm)
+        self._adjusters = {
+            # The data give offsets along the axes of the mirror frame; the deck's x runs against them on M1.
+            name: (self.drive_side * x * 1e-3, y * 1e-3)
+            for name, (x, y) in cfg.panels.adjusters_mm.items()
+        }
+        self.channels, self.collimators_m = _collimators(cfg.collimators)
+        self.frames = build_frames(cfg.frame)
+        self.deck_from_mirror, self.mirror_from_deck = self.frames.deck_from_mirror, self.frames.mirror_from_deck
+        self.mirror_from_world, self.world_from_mirror = self.frames.mirror_from_world, self.frames.world_from_mirror
+        self.deck_from_world, self.world_from_deck = self.frames.deck_from_world, self.frames.world_from_deck
+        self.rotate_world_from_deck = self.frames.rotate_world_from_deck
+        self.rotate_deck_from_world = self.frames.rotate_deck_from_world
+        self.panel_at, self.is_on_panel = self.grid.panel_at, self.grid.is_on_panel
+        self.nearest_panel = self.grid.nearest_panel
+        self.base_panel_pose = _base(cfg.base, self.panels)
+        self.base_pose = self.deck_pose(self.base_panel_pose)
+
+    def panel(self, panel: PanelId) -> Panel:
+        """The panel of that row and column.
+
+        Raises:
+            UnknownPanelError: if the mirror has none there.
+        """
+        try:
+            return self.panels[panel]
+        except KeyError:
+            raise UnknownPanelError(f"{self.name} has no panel in row {panel[0]}, column {panel[1]}") from None
+
+    def nearest_seam(self, x: float, y: float) -> Seam | None:
+        """Nearest interior seam of the cell nearest to the deck point; None on a mirror of one panel."""
+        return self.grid.nearest_seam(x, y)
+
+    def surface_point(self, x: float, y: float) -> Vector3:
+        """Surface point over the deck point (x, y), deck frame, m."""
+        return self.surface.point(x, y)
+
+    def point_on_deck(self, pid: PointId) -> tuple[float, float]:
+        """Deck (x, y) of a measurement point, m.
+
+        The nominal offset in the panel's tangent plane is dropped on the surface along the panel's normal. Points are
+        numbered row by row from the panel's lower left (thesis fig. 2.2).
+
+        Raises:
+            UnknownPanelError: for a panel that does not exist or a number outside 1 to 9.
+        """
+        if not 1 <= pid.point <= POINTS_PER_PANEL:
+            raise UnknownPanelError(f"measurement point {pid.point} of panel {pid[:2]}: numbers run from 1 to 9")
+        j, i = divmod(pid.point - 1, POINTS_PER_ROW)
+        return self._dropped(self.panel(pid.panel), self._points_x[i], self._points_y[j])
+
+    def point_ids(self, panel: PanelId) -> tuple[PointId, ...]:
+        """The nine measurement points of a panel, in the order of their numbers."""
+        return tuple(PointId(panel.row, panel.col, k) for k in range(1, POINTS_PER_PANEL + 1))
+
+    def adjusters_on_deck(self, panel: PanelId) -> dict[str, tuple[float, float]]:
+        """Deck (x, y) of each vertical adjuster of a panel, m."""
+        p = self.panel(panel)
+        return {name: self._dropped(p, x, y) for name, (x, y) in self._adjusters.items()}
+
+    def deck_pose(self, p: PanelPose) -> DeckPose:
+        """Deck pose of a pose in a panel frame.
+
+        Raises:
+            UnknownPanelError: for a panel that does not exist.
+        """
+        panel = self.panel(p.panel)
+        x, y = self._dropped(panel, p.x_m, p.y_m)
+        e1, e2, n = self.surface.axes(x, y)
+        c, s = cos(p.heading_rad), sin(p.heading_rad)
+        # The heading lies in the tangent plane at the robot and projects on (c, s, 0) of the panel frame.
+        ux, uy, uz = panel.rotate_to_deck((c, s, 0.0))
+        zx, zy, zz = panel.axes[2]
+        lift = -_dot((ux, uy, uz), n) / _dot(panel.axes[2], n)
+        h = ux + lift * zx, uy + lift * zy, uz + lift * zz
+        return DeckPose(x, y, atan2(_dot(h, e2), _dot(h, e1)))
+
+    def panel_pose(self, panel: PanelId, p: DeckPose) -> PanelPose:
+        """Pose in the frame of ``panel`` (which need not be the one under the robot).
+
+        Raises:
+            UnknownPanelError: for a panel that does not exist.
+        """
+        found = self.panel(panel)
+        x, y, _ = found.from_deck(self.surface.point(p.x_m, p.y_m))
+        hx, hy, _ = found.rotate_from_deck(self.robot_axes(p)[0])
+        return PanelPose(panel, x, y, atan2(hy, hx))
+
+    def robot_axes(self, p: DeckPose) -> Axes:
+        """Axes (h, n x h, n) of the robot frame in the deck frame; ``h = cos(psi) e1 + sin(psi) e2``."""
+        (e1x, _, e1z), (e2x, e2y, e2z), n = self.surface.axes(p.x_m, p.y_m)
+        c, s = cos(p.heading_rad), sin(p.heading_rad)
+        return (c * e1x + s * e2x, s * e2y, c * e1z + s * e2z), (c * e2x - s * e1x, c * e2y, c * e2z - s * e1z), n
+
+    def deck_from_robot(self, p: DeckPose, v: Vector3) -> Vector3:
+        """Deck coordinates of a point given in the frame of a robot at ``p``, m."""
+        (hx, hy, hz), (lx, ly, lz), (nx, ny, nz) = self.robot_axes(p)
+        a, b, c = v
+        x, y, z = self.surface.point(p.x_m, p.y_m)
+        return x + a * hx + b * lx + c * nx, y + a * hy + b * ly + c * ny, z + a * hz + b * lz + c * nz
+
+    def robot_from_deck(self, p: DeckPose, v: Vector3) -> Vector3:
+        """Coordinates in the frame of a robot at ``p`` of a point given in the deck frame, m."""
+        x, y, z = self.surface.point(p.x_m, p.y_m)
+        h, left, n = self.robot_axes(p)
+        d = (v[0] - x, v[1] - y, v[2] - z)
+        return _dot(h, d), _dot(left, d), _dot(n, d)
+
+    def body_axes(self, p: DeckPose) -> tuple[float, float, float, float]:
+        """Deck-plane components (hx, hy, lx, ly) of the robot's x axis h and y axis l.
+
+        A point (ox, oy, 0) of the robot frame lies at deck ``(x + ox hx + oy lx, y + ox hy + oy ly)``.
+        """
+        e1, e2, _ = self.surface.axes(p.x_m, p.y_m)
+        c, s = cos(p.heading_rad), sin(p.heading_rad)
+        return c * e1[0] + s * e2[0], s * e2[1], c * e2[0] - s * e1[0], c * e2[1]
+
+    def body_offset(self, p: DeckPose, ox: float, oy: float) -> tuple[float, float]:
+        """Deck (x, y) of the robot-frame point (ox, oy, 0) on the tangent plane, m."""
+        hx, hy, lx, ly = self.body_axes(p)
+        return p.x_m + ox * hx + oy * lx, p.y_m + ox * hy + oy * ly
+
+    def puck_world(self, p: DeckPose, height_m: float) -> Vector3:
+        """World position of the puck's centre: surface point plus ``height_m`` along the normal, m."""
+        x, y, z = self.surface.point(p.x_m, p.y_m)
+        nx, ny, nz = self.surface.normal(p.x_m, p.y_m)
+        return self.world_from_deck((x + height_m * nx, y + height_m * ny, z + height_m * nz))
+
+    def foot_of_puck(self, world: Vector3, height_m: float) -> tuple[float, float, float]:
+        """Deck foot of a puck and its deviation from the ideal surface.
+
+        Args:
+            world: the puck's centre, world frame, m.
+            height_m: its nominal height along the normal.
+
+        Returns:
+            (x, y, deviation), m; deviation > 0 means too high above the surface on the drive side.
+
+        Raises:
+            ConvergenceError: for a point far from the mirror.
+        """
+        x, y, distance = self.surface.foot(self.deck_from_world(world))
+        return x, y, distance - height_m
+
+    def seam_normal_angle(self, panel: PanelId, axis: Literal["x", "y"], x: float, y: float) -> float:
+        """Angle in the frame of ``panel`` of the normal of a seam line through the deck point (x, y), rad.
+
+        The seam line is the curve ``axis`` = const on the surface. Its normal is its tangent, (0, 1, fy) or (1, 0, fx),
+        turned within the panel plane to the side on which ``axis`` grows.
+
+        Raises:
+            UnknownPanelError: for a panel that does not exist.
+        """
+        fx, fy = self.surface.gradient(x, y)
+        tangent = (0.0, 1.0, fy) if axis == "x" else (1.0, 0.0, fx)
+        tx, ty, _ = self.panel(panel).rotate_from_deck(tangent)
+        return wrap_pi(atan2(ty, tx) + (-pi / 2.0 if axis == "x" else pi / 2.0))
+
+    def gravity_in_robot(self, p: DeckPose) -> Vector3:
+        """Unit direction of gravity in the robot frame, telescope pointing to the zenith (gravity = world +z)."""
+        g = self.rotate_deck_from_world((0.0, 0.0, 1.0))
+        h, left, n = self.robot_axes(p)
+        return _dot(h, g), _dot(left, g), _dot(n, g)
+
+    def _dropped(self, panel: Panel, x: float, y: float) -> tuple[float, float]:
+        deck_x, deck_y, _ = self.surface.drop(panel.to_deck((x, y, 0.0)), panel.axes[2])
+        return deck_x, deck_y
+
+
+def _dot(a: Vector3, b: Vector3) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def build_mirror(cfg: MirrorConfig) -> Mirror:
+    """Geometry of a configured mirror.
+
+    Raises:
+        LayoutError: if the configuration contradicts itself.
+    """
+    return Mirror(cfg)
+
+
+def _base(cfg: BaseConfig, panels: dict[PanelId, Panel]) -> PanelPose:
+    panel = panels.get(PanelId(cfg.row, cfg.col))
+    if panel is None:
+        raise LayoutError(f"base: there is no panel in row {cfg.row}, column {cfg.col}")
+    x, y = cfg.x_mm * 1e-3, cfg.y_mm * 1e-3
+    if abs(x) >= panel.half_x_m or abs(y) >= panel.half_y_m:
+        raise LayoutError(f"base: ({cfg.x_mm}, {cfg.y_mm}) mm is not on panel ({cfg.row}, {cfg.col})")
+    return PanelPose(panel.id, x, y, cfg.heading_rad)
+
+
+def _collimators(cfg: CollimatorsConfig) -> tuple[tuple[int, ...], FloatArray]:
+    if len(cfg.channels) != len(cfg.positions_world_mm):
+        raise LayoutError(f"collimators: {len(cfg.channels)} channels, {len(cfg.positions_world_mm)} positions")
+    if len(set(cfg.channels)) != len(cfg.channels):
+        raise LayoutError(f"collimators: channels {cfg.channels} are not distinct")
+    if len(cfg.channels) < _MIN_CHANNELS:
+        raise LayoutError(f"collimators: {len(cfg.channels)} channels; a position needs at least {_MIN_CHANNELS}")
+    return cfg.channels, np.array(cfg.positions_world_mm, dtype=np.float64) * 1e-3

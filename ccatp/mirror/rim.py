@@ -1,0 +1,173 @@
+"""Pure. The rim: outline of the union of the panels with the seams filled, as a signed distance in the deck plane."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from math import hypot, inf, isfinite, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ccatp.mirror.errors import MirrorError
+from ccatp.mirror.layout import PanelGrid
+
+FloatArray = NDArray[np.float64]
+
+Box = tuple[float, float, float]
+Span = tuple[float, float, float]
+Point = tuple[float, float]
+
+_CLEARANCE_TOLERANCE_M = 1e-9
+
+
+class Rim:
+    """Rectilinear outline with stepped corners, mirror-symmetric about x = 0; deck plane, m.
+
+    The outline runs along the panels' own outer edges. Positive distances lie on the mirror.
+
+    Attributes:
+        vertices: corners counter-clockwise, shape (n, 2), m.
+    """
+
+    __slots__ = ("_boxes", "_edges", "_horizontal", "_vertical", "vertices")
+
+    def __init__(self, slabs: Sequence[Span]) -> None:
+        """Build the outline from stacked slabs.
+
+        Args:
+            slabs: (half width, low y, high y) from low to high y; each slab begins where the one before ends.
+        """
+        widths = [0.0, *(half for half, _, _ in slabs), 0.0]
+        levels = [slabs[0][1], *(high for _, _, high in slabs)]
+        # The right half of the outline: upright edges (x, low y, high y) and level edges (y, low x, high x).
+        self._vertical = tuple(slabs)
+        self._horizontal = tuple((y, min(a, b), max(a, b)) for y, (a, b) in zip(levels, pairwise(widths), strict=True))
+        self._boxes = _maximal_boxes(slabs)
+        right = [(half, y) for half, low, high in slabs for y in (low, high)]
+        corners = right + [(-x, y) for x, y in reversed(right)]
+        self.vertices: FloatArray = np.array(corners)
+        self._edges = tuple(zip(corners, [*corners[1:], corners[0]], strict=True))
+
+    def signed_distance_m(self, x: float, y: float) -> float:
+        """Distance to the rim: > 0 on the mirror, < 0 beyond it, m. Exact; -inf for a NaN."""
+        x = abs(x)  # the outline is symmetric: the nearest point lies on the point's own side
+        best = inf
+        inside = False
+        for half, low, high in self._vertical:
+            dx = x - half
+            if y < low:
+                d2 = dx * dx + (low - y) * (low - y)
+            elif y <= high:
+                d2 = dx * dx
+                inside = inside or dx <= 0.0
+            else:
+                d2 = dx * dx + (y - high) * (y - high)
+            best = min(best, d2)
+        for level, near, far in self._horizontal:
+            dy = y - level
+            d2 = dy * dy
+            if d2 < best:
+                if not near <= x <= far:
+                    dx = max(near - x, x - far)
+                    d2 += dx * dx
+                best = min(best, d2)
+        return sqrt(best) if inside else -sqrt(best)
+
+    def signed_distances_m(self, xs: FloatArray, ys: FloatArray) -> FloatArray:
+        """Signed distances of many points; ``xs`` and ``ys`` broadcast against each other, m."""
+        x, y = np.broadcast_arrays(np.abs(np.asarray(xs, dtype=np.float64)), np.asarray(ys, dtype=np.float64))
+        best = np.full(x.shape, inf)
+        inside = np.zeros(x.shape, dtype=np.bool_)
+        for half, low, high in self._vertical:
+            dy = np.maximum(np.maximum(low - y, y - high), 0.0)
+            np.minimum(best, np.hypot(x - half, dy), out=best)
+            inside |= (dy == 0.0) & (x <= half)
+        for level, near, far in self._horizontal:
+            dx = np.maximum(np.maximum(near - x, x - far), 0.0)
+            np.minimum(best, np.hypot(dx, y - level), out=best)
+        return np.where(inside, best, -best)
+
+    def segment_clearance_m(self, x0: float, y0: float, x1: float, y1: float) -> float:
+        """Least signed distance along the straight segment from (x0, y0) to (x1, y1), m, to 1 nm.
+
+        On the mirror this is the distance between the segment and the outline. Where the segment leaves the mirror it
+        is minus the largest distance beyond the rim.
+
+        Raises:
+            MirrorError: if a coordinate is not finite.
+        """
+        if not isfinite(x0 + y0 + x1 + y1):
+            raise MirrorError(f"segment from ({x0}, {y0}) to ({x1}, {y1}) is not finite")
+        beyond = self._largest_excess_m(x0, y0, x1, y1)
+        if beyond > _CLEARANCE_TOLERANCE_M:
+            return -beyond
+        return min(_segment_distance((x0, y0), (x1, y1), c, d) for c, d in self._edges)
+
+    def _largest_excess_m(self, x0: float, y0: float, x1: float, y1: float) -> float:
+        """Largest distance of a point of the segment from the mirror; 0 when the whole segment lies on it.
+
+        Branch and bound: the distance from one box is convex along the segment, so between two points the distance
+        from the union is at most the least over the boxes of the greater of the two end values.
+        """
+        start, end = self._box_distances(x0, y0), self._box_distances(x1, y1)
+        best = max(min(start), min(end))
+        pending = [(x0, y0, start, x1, y1, end)]
+        while pending:
+            ax, ay, a, bx, by, b = pending.pop()
+            bound = min(max(p, q) for p, q in zip(a, b, strict=True))
+            if bound <= best + _CLEARANCE_TOLERANCE_M:
+                continue
+            mx, my = 0.5 * (ax + bx), 0.5 * (ay + by)
+            middle = self._box_distances(mx, my)
+            best = max(best, min(middle))
+            pending.append((ax, ay, a, mx, my, middle))
+            pending.append((mx, my, middle, bx, by, b))
+        return best
+
+    def _box_distances(self, x: float, y: float) -> list[float]:
+        x = abs(x)
+        return [hypot(max(x - half, 0.0), max(low - y, y - high, 0.0)) for half, low, high in self._boxes]
+
+
+def build_rim(grid: PanelGrid) -> Rim:
+    """Rim of a panel grid.
+
+    Where a row is wider than its neighbour, the step lies on the wider row's own edge, so that the seam between the
+    two belongs to the mirror only where both have panels.
+    """
+    spans = [grid.row_span(row) for row in range(1, grid.rows + 1)]
+    slabs: list[Span] = []
+    low = spans[0][1]
+    for (half, _, high), (half_next, low_next, _) in pairwise(spans):
+        if half == half_next:
+            continue
+        step = high if half > half_next else low_next
+        slabs.append((half, low, step))
+        low = step
+    return Rim([*slabs, (spans[-1][0], low, spans[-1][2])])
+
+
+def _maximal_boxes(slabs: Sequence[Span]) -> tuple[Box, ...]:
+    """Largest boxes (half width, low, high) inside the outline; their union is the mirror."""
+    boxes: dict[Box, None] = {}  # as an ordered set: equal boxes of different slabs are one
+    for k, (half, _, _) in enumerate(slabs):
+        first = last = k
+        while first > 0 and slabs[first - 1][0] >= half:
+            first -= 1
+        while last + 1 < len(slabs) and slabs[last + 1][0] >= half:
+            last += 1
+        boxes[half, slabs[first][1], slabs[last][2]] = None
+    return tuple(boxes)
+
+
+def _segment_distance(a: Point, b: Point, c: Point, d: Point) -> float:
+    """Distance between the segments ab and cd that do not cross: least of the four end-to-segment distances."""
+    return min(_point_distance(a, c, d), _point_distance(b, c, d), _point_distance(c, a, b), _point_distance(d, a, b))
+
+
+def _point_distance(p: Point, a: Point, b: Point) -> float:
+    """Distance of the point p from the segment ab."""
+    ux, uy = b[0] - a[0], b[1] - a[1]
+    wx, wy = p[0] - a[0], p[1] - a[1]
+    length2 = ux * ux + uy * uy
+    t = 0.0 if length2 == 0.0 else min(max((wx * ux + wy * uy) / length2, 0.0), 1.0)
+    return hypot(wx - t * ux, wy - t * uy)

@@ -1,0 +1,198 @@
+"""Pure. The polynomial surface of a mirror in the deck frame, thesis eq. 1.1, with its derivatives and its normal."""
+
+from math import sqrt
+
+import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval2d
+from numpy.typing import NDArray
+
+from ccatp.config.models import SurfaceConfig
+from ccatp.mirror.errors import ConvergenceError
+from ccatp.samples import Vector3
+
+FloatArray = NDArray[np.float64]
+Axes = tuple[Vector3, Vector3, Vector3]
+Jet = tuple[float, float, float, float, float, float]
+
+_METRE_PER_MM = 1e-3
+_NEWTON_STEPS = 20
+_NEWTON_STEP_M = 1e-12  # Newton converges quadratically: a step this small leaves an error at rounding level
+
+
+class Surface:
+    """Height of the ideal mirror over the deck plane, ``f(x, y) = sum c_ij x^i y^j`` (thesis eq. 1.1, deck frame).
+
+    All arguments and results are metres in the deck frame. The scalar methods are nested Horner schemes in plain
+    floats, because they run several times per control frame; the methods in the plural take arrays.
+    """
+
+    __slots__ = ("_coefficients", "_rows")
+
+    def __init__(self, coefficients: FloatArray) -> None:
+        """Keep the coefficients.
+
+        Args:
+            coefficients: ``c_ij``, shape (powers of x, powers of y), in m^(1-i-j), deck frame.
+
+        Raises:
+            ValueError: if the array is not two-dimensional.
+        """
+        if coefficients.ndim != 2:
+            raise ValueError(f"surface coefficients need shape (i, j), got {coefficients.shape}")
+        self._coefficients = coefficients.astype(np.float64)
+        # Highest power first, as Horner's scheme consumes them; trailing zeros of each row are not stored.
+        self._rows = tuple(tuple(np.trim_zeros(row, "b")[::-1].tolist()) for row in self._coefficients[::-1])
+
+    def height_m(self, x: float, y: float) -> float:
+        """Height f(x, y) above the deck plane, m."""
+        f = 0.0
+        for row in self._rows:
+            q = 0.0
+            for c in row:
+                q = q * y + c
+            f = f * x + q
+        return f
+
+    def gradient(self, x: float, y: float) -> tuple[float, float]:
+        """Slopes (fx, fy), dimensionless."""
+        f = fx = fy = 0.0
+        for row in self._rows:
+            q = q1 = 0.0
+            for c in row:
+                q1 = q1 * y + q
+                q = q * y + c
+            fx = fx * x + f
+            f = f * x + q
+            fy = fy * x + q1
+        return fx, fy
+
+    def hessian(self, x: float, y: float) -> tuple[float, float, float]:
+        """Second derivatives (fxx, fxy, fyy), 1/m."""
+        return self.jet(x, y)[3:]
+
+    def jet(self, x: float, y: float) -> Jet:
+        """All of (f, fx, fy, fxx, fxy, fyy) in one pass."""
+        f = fx = fy = half_fxx = fxy = half_fyy = 0.0
+        for row in self._rows:
+            q = q1 = half_q2 = 0.0
+            for c in row:
+                half_q2 = half_q2 * y + q1
+                q1 = q1 * y + q
+                q = q * y + c
+            half_fxx = half_fxx * x + fx
+            fx = fx * x + f
+            f = f * x + q
+            fxy = fxy * x + fy
+            fy = fy * x + q1
+            half_fyy = half_fyy * x + half_q2
+        return f, fx, fy, 2.0 * half_fxx, fxy, 2.0 * half_fyy
+
+    def normal(self, x: float, y: float) -> Vector3:
+        """Unit normal on the drive side, ``n = (-fx, -fy, 1)/W``, deck frame."""
+        fx, fy = self.gradient(x, y)
+        w = sqrt(1.0 + fx * fx + fy * fy)
+        return -fx / w, -fy / w, 1.0 / w
+
+    def point(self, x: float, y: float) -> Vector3:
+        """Surface point (x, y, f(x, y)), deck frame, m."""
+        return x, y, self.height_m(x, y)
+
+    def axes(self, x: float, y: float) -> Axes:
+        """Orthonormal tangent frame (e1, e2, n) at (x, y), deck frame.
+
+        ``e1 = (1, 0, fx)/sqrt(1 + fx^2)`` is the tangent of the line y = const towards +x, n the normal, e2 = n x e1.
+        """
+        fx, fy = self.gradient(x, y)
+        s2 = 1.0 + fx * fx
+        s = sqrt(s2)
+        w = sqrt(s2 + fy * fy)
+        ws = w * s
+        return (1.0 / s, 0.0, fx / s), (-fx * fy / ws, s / w, fy / ws), (-fx / w, -fy / w, 1.0 / w)
+
+    def transport_rad(self, x: float, y: float, dx: float, dy: float) -> float:
+        """Change of the deck heading of a robot that drives (dx, dy) without turning about its own normal, rad.
+
+        ``dpsi = -fy (fxx dx + fxy dy) / ((1 + fx^2) W)``: a straight line on the surface (a geodesic) turns against
+        the tangents of the lines y = const. For steps that are short against the radius of curvature.
+        """
+        _, fx, fy, fxx, fxy, _ = self.jet(x, y)
+        s2 = 1.0 + fx * fx
+        return -fy * (fxx * dx + fxy * dy) / (s2 * sqrt(s2 + fy * fy))
+
+    def drop(self, start: Vector3, direction: Vector3) -> Vector3:
+        """Point where the line ``start + s direction`` meets the surface near s = 0, deck frame, m.
+
+        Raises:
+            ConvergenceError: if Newton's iteration does not settle.
+        """
+        x0, y0, z0 = start
+        ux, uy, uz = direction
+        s = 0.0
+        for _ in range(_NEWTON_STEPS):
+            x, y = x0 + s * ux, y0 + s * uy
+            f, fx, fy, _, _, _ = self.jet(x, y)
+            step = (f - z0 - s * uz) / (uz - fx * ux - fy * uy)
+            s += step
+            if abs(step) < _NEWTON_STEP_M:
+                return self.point(x0 + s * ux, y0 + s * uy)
+        raise ConvergenceError(f"no surface point on the line through {start} along {direction}")
+
+    def foot(self, p: Vector3) -> tuple[float, float, float]:
+        """Foot of the perpendicular from ``p`` on the surface and the signed distance along the normal.
+
+        Solves ``p = S(x, y) + d n(x, y)`` by Newton's iteration; unique while |d| is small against the radius of
+        curvature (more than 30 m on these mirrors).
+
+        Args:
+            p: point in the deck frame, m.
+
+        Returns:
+            (x, y, d), m; d > 0 on the drive side.
+
+        Raises:
+            ConvergenceError: if the iteration does not settle.
+        """
+        px, py, pz = p
+        x, y = px, py
+        for _ in range(_NEWTON_STEPS):
+            f, fx, fy, fxx, fxy, fyy = self.jet(x, y)
+            r = pz - f
+            gx, gy = px - x + r * fx, py - y + r * fy
+            jxx, jxy, jyy = r * fxx - 1.0 - fx * fx, r * fxy - fx * fy, r * fyy - 1.0 - fy * fy
+            det = jxx * jyy - jxy * jxy
+            dx, dy = (jxy * gy - jyy * gx) / det, (jxy * gx - jxx * gy) / det
+            x, y = x + dx, y + dy
+            if abs(dx) + abs(dy) < _NEWTON_STEP_M:
+                fx, fy = self.gradient(x, y)
+                return x, y, (pz - self.height_m(x, y)) * sqrt(1.0 + fx * fx + fy * fy)
+        raise ConvergenceError(f"no foot on the surface for the deck point {p}")
+
+    def heights_m(self, xs: FloatArray, ys: FloatArray) -> FloatArray:
+        """Heights of many points; ``xs`` and ``ys`` of equal shape, result of that shape, m."""
+        return np.asarray(polyval2d(xs, ys, self._coefficients), dtype=np.float64)
+
+    def gradients(self, xs: FloatArray, ys: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Slopes (fx, fy) of many points, each of the shape of ``xs``."""
+        return (
+            np.asarray(polyval2d(xs, ys, polyder(self._coefficients, axis=0)), dtype=np.float64),
+            np.asarray(polyval2d(xs, ys, polyder(self._coefficients, axis=1)), dtype=np.float64),
+        )
+
+
+def build_surface(cfg: SurfaceConfig, drive_side: int) -> Surface:
+    """Surface of a mirror in its deck frame.
+
+    The deck frame is the mirror frame turned by pi about y where the robot drives on the -z side, so that
+    ``f_deck(x, y) = s f_mirror(s x, y)`` with s = +1 or -1.
+
+    Args:
+        cfg: coefficients a_ij in mm over the normalisation radius, mirror frame (thesis eq. 1.1).
+        drive_side: sign of the mirror frame's z on the side of the robot.
+    """
+    size_x = 1 + max((i for i, _, _ in cfg.terms), default=0)
+    size_y = 1 + max((j for _, j, _ in cfg.terms), default=0)
+    coefficients = np.zeros((size_x, size_y))
+    radius_m = cfg.normalisation_radius_mm * _METRE_PER_MM
+    for i, j, a_mm in cfg.terms:
+        coefficients[i, j] += drive_side ** (i + 1) * a_mm * _METRE_PER_MM / radius_m ** (i + j)
+    return Surface(coefficients)

@@ -1,0 +1,353 @@
+"""Pure. The survey: from the pose and the danger loop's verdict to the velocity wanted next. Time is an argument."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from ccatp.angles import difference
+from ccatp.config.models import Config
+from ccatp.control.tracker import LegTracker, Phase
+from ccatp.journey import Journey, Motion
+from ccatp.mirror.mirror import Mirror
+from ccatp.mission_states import Event, Outcome, State, next_state
+from ccatp.retreat import Retreat, Step
+from ccatp.samples import DeckPose, EventCode, PointId, Stop, StopKind, Twist, Verdict
+
+STILL = Twist(0.0, 0.0)
+# Sums of frame periods are not exact: half a nanosecond must not cost a frame.
+TIME_EPSILON_S = 5e-10
+PlanHome = Callable[[DeckPose], tuple[Stop, ...]]
+
+
+@dataclass(slots=True)
+class Order:
+    """What the mission wants of the present frame.
+
+    Attributes:
+        twist: the velocity wanted until the next frame.
+        at_rest: the robot has come to rest in this frame.
+        arrived: the measurement point at which it did so.
+        measure: have the laser system measure now (of a point, or after a back-off to find itself again).
+    """
+
+    twist: Twist
+    at_rest: bool = False
+    arrived: PointId | None = None
+    measure: bool = False
+
+
+class Mission:
+    """A survey of the points of a route, with retreat from edges and the way home.
+
+    Call ``step`` once per sensors frame. The caller executes the order and reports the measurement it asked for by
+    ``fixed`` or ``not_fixed``.
+
+    Args:
+        cfg: the configuration.
+        mirror: the mirror surveyed.
+        stops: the stops of the survey, in order.
+        plan_home: gives the stops from a pose to base.
+    """
+
+    def __init__(self, cfg: Config, mirror: Mirror, stops: Sequence[Stop], plan_home: PlanHome) -> None:
+        """Idle at base."""
+        self._cfg, self._mirror, self._plan_home = cfg, mirror, plan_home
+        self._tracker = LegTracker(cfg.control, cfg.limits, cfg.robot.wheel_lag_s)
+        self.survey = self._journey(stops)
+        self._home: Journey | None = None
+        self.state = State.IDLE
+        self.outcome = Outcome.NONE
+        self.cause = ""
+        self.done: list[PointId] = []
+        self.skipped: list[PointId] = []
+        self._abort_cause: str | None = None
+        self._is_held_by_hand = False
+        self.is_faulted = False
+        self._retreat: Retreat | None = None
+        self._is_refixing = False
+        self._is_docking = False
+        self._backoffs = 0
+        self._failures = 0
+        self._quiet_since_s: float | None = None
+        self._measure_at_s = 0.0
+        self._is_asked = False
+
+    def _journey(self, stops: Sequence[Stop]) -> Journey:
+        return Journey(self._mirror, self._tracker, self._cfg.control.leg_timeout_factor, stops)
+
+    @property
+    def is_paused(self) -> bool:
+        """Held until somebody resumes."""
+        return self.state is State.HELD and self._is_held_by_hand
+
+    @property
+    def journey(self) -> Journey:
+        """The journey being made: the survey, or the way home."""
+        return self.survey if self._home is None else self._home
+
+    # -- commands: each returns why it was refused, or None -------------------------------------------------------
+
+    def pause(self, cause: str) -> str | None:
+        """Hold until ``resume``."""
+        if self.state is State.DONE:
+            return "the mission is over"
+        if self.state is State.BACKING_OFF:
+            return "backing off from the edge; try again when that is over"
+        self._hold(cause, by_hand=True)
+        return None
+
+    def resume(self) -> str | None:
+        """Go on after a hold."""
+        if self.state is not State.HELD:
+            return f"the mission is not held but {self.state}"
+        self._go_on()
+        return None
+
+    def abort(self, cause: str) -> str | None:
+        """Return to base and end there."""
+        if self.state is State.DONE:
+            return "the mission is over"
+        if self._abort_cause is None:
+            self._abort_cause = cause
+            # An edge outranks an abort: the retreat and its fix come first.
+            if self.state is not State.BACKING_OFF and not self._is_refixing:
+                self._go_on()
+        return None
+
+    def stop(self) -> str | None:
+        """Hold the wheels and end here."""
+        if self.state is State.DONE:
+            return "the mission is over"
+        self.outcome = Outcome.STOPPED
+        self._apply(Event.FINISHED)
+        return None
+
+    def fault(self, cause: str) -> None:
+        """Hold until an operator resumes, because something is wrong."""
+        self._hold(cause, by_hand=True)
+        self.is_faulted = True
+
+    def interrupt(self, cause: str) -> bool:
+        """Hold until frames and verdicts are fresh again; returns whether that was news."""
+        if self.state in (State.IDLE, State.HELD, State.DONE):
+            return False
+        self._hold(cause, by_hand=False)
+        return True
+
+    # -- measurements ---------------------------------------------------------------------------------------------
+
+    @property
+    def is_awaiting_fix(self) -> bool:
+        """Whether a measurement has been asked for and is still wanted."""
+        return self.state is State.MEASURING and self._is_asked
+
+    @property
+    def measuring_point(self) -> PointId | None:
+        """The point being measured; ``None`` for a fix that only serves to find the robot again."""
+        stop = self.survey.current
+        return None if self._is_refixing or stop is None else stop.point
+
+    def fixed(self, point: PointId | None) -> None:
+        """The measurement that was asked for is taken, fused and stored."""
+        self._failures = 0
+        self._leave_stop(point, self.done)
+
+    def not_fixed(self, point: PointId | None, cause: str) -> None:
+        """The measurement failed for good: the point is skipped; several in a row hold the robot."""
+        limit = self._cfg.mission.failed_points_before_hold
+        self._failures += 1
+        self._leave_stop(point, self.skipped)
+        if self._failures >= limit:
+            self._failures = 0
+            self.fault(f"{limit} measurements in a row failed: {cause}")
+
+    def _leave_stop(self, point: PointId | None, record: list[PointId]) -> None:
+        was_awaited = self.is_awaiting_fix
+        stop = self.survey.current
+        # A pause may come while the fix is being committed: the point counts all the same.
+        if point is not None and stop is not None and stop.point == point:
+            record.append(point)
+            self._backoffs = 0
+            self.survey.advance()
+        if was_awaited:
+            self._go_on()
+
+    # -- the frame ------------------------------------------------------------------------------------------------
+
+    def step(self, motion: Motion, verdict: Verdict | None) -> Order:
+        """One frame: react to the verdict, then do what the state says.
+
+        Args:
+            motion: time, pose and speed of the present frame.
+            verdict: the danger loop's verdict in force, ``None`` where there is none fresh enough.
+        """
+        self._react(motion, verdict)
+        if self.state in (State.TURNING, State.DRIVING):
+            return self._travel(motion)
+        if self.state is State.SETTLING:
+            return self._settle(motion)
+        if self.state is State.MEASURING:
+            return self._measure(motion)
+        if self.state is State.RETURNING:
+            return self._return(motion)
+        if self.state is State.BACKING_OFF and verdict is not None:
+            return self._back_off(motion, verdict)
+        return Order(STILL)
+
+    def _react(self, motion: Motion, verdict: Verdict | None) -> None:
+        if verdict is None or not (verdict.forward and verdict.reverse and verdict.turn):
+            if verdict is not None and verdict.code is EventCode.NEAR_EDGE:
+                self._meet_edge(motion, verdict)
+            else:
+                self.interrupt(verdict.cause if verdict is not None else "no fresh verdict from the danger loop")
+            return
+        if verdict.code is EventCode.NEAR_EDGE:
+            self._meet_edge(motion, verdict)
+            return
+        if verdict.code is EventCode.ABORTED:
+            self.abort(verdict.cause)
+        if self.state is State.IDLE or (self.state is State.HELD and not self._is_held_by_hand):
+            self._go_on()
+
+    def _meet_edge(self, motion: Motion, verdict: Verdict) -> None:
+        if self.state in (State.BACKING_OFF, State.IDLE, State.DONE):
+            return
+        if self.state is State.HELD and self._is_held_by_hand:
+            return
+        limit = self._cfg.mission.max_backoffs_per_stop
+        self._backoffs += 1
+        if self._backoffs > limit:
+            self._backoffs = 0
+            self.fault(f"at the edge again after {limit} back-offs: is an edge sensor dirty?")
+            return
+        self.cause = verdict.cause
+        self._interrupt()
+        self._apply(Event.EDGE)
+        self._retreat = Retreat(self._cfg.mission, self._tracker, verdict, motion.pose, motion.rate_rad_s)
+
+    def _apply(self, event: Event) -> None:
+        self.state = next_state(self.state, event)
+
+    def _interrupt(self) -> None:
+        """Forget where in a leg, a stop or a docking the robot was: it begins anew from where it is."""
+        self.journey.interrupt()
+        self._is_asked = self._is_docking = self._is_refixing = False
+        self._quiet_since_s = None
+
+    def _hold(self, cause: str, *, by_hand: bool) -> None:
+        self._interrupt()
+        self._apply(Event.HOLD)
+        self._is_held_by_hand = by_hand
+        self.cause = cause
+
+    def _go_on(self) -> None:
+        self._interrupt()
+        self.is_faulted = False
+        if self._abort_cause is not None:
+            self.cause = self._abort_cause
+            self._home = None  # planned anew from where the robot is now
+            self._apply(Event.GO_HOME)
+        elif self.survey.current is None:
+            self.outcome = Outcome.COMPLETE
+            self._apply(Event.FINISHED)
+        else:
+            self.cause = ""
+            self._apply(Event.GO_ON)
+
+    # -- moving and measuring -------------------------------------------------------------------------------------
+
+    def _follow(self, motion: Motion, journey: Journey, stop: Stop) -> Twist:
+        twist = journey.follow(motion, stop)
+        if journey.is_overdue(motion.t_s):
+            self.fault(f"the leg to ({stop.x_m:.3f}, {stop.y_m:.3f}) m is overdue: is a wheel blocked or slipping?")
+            return STILL
+        return twist
+
+    def _travel(self, motion: Motion) -> Order:
+        stop = self.survey.current
+        if stop is None:
+            self._go_on()
+            return Order(STILL)
+        twist = self._follow(motion, self.survey, stop)
+        if self.state is State.HELD:
+            return Order(STILL)
+        if self._tracker.phase is not Phase.DONE:
+            self._apply(Event.TURNED if self._tracker.phase is Phase.DRIVE else Event.REALIGN)
+            return Order(twist)
+        if stop.kind is StopKind.MEASURE:
+            self._apply(Event.ARRIVED)
+            return self._settle(motion)
+        self.survey.advance()
+        self._go_on()
+        return self._travel(motion)
+
+    def _is_quiet(self, motion: Motion) -> bool:
+        control = self._cfg.control
+        if abs(motion.speed_m_s) > control.settle_speed_m_s or abs(motion.rate_rad_s) > control.settle_rate_rad_s:
+            self._quiet_since_s = None
+            return False
+        if self._quiet_since_s is None:
+            self._quiet_since_s = motion.t_s
+        return motion.t_s - self._quiet_since_s >= control.settle_time_s - TIME_EPSILON_S
+
+    def _settle(self, motion: Motion) -> Order:
+        if not self._is_quiet(motion):
+            return Order(STILL)
+        self._apply(Event.SETTLED)
+        self._measure_at_s = motion.t_s + self._cfg.etalon.measuring_time_s - TIME_EPSILON_S
+        return Order(STILL, at_rest=True, arrived=self.measuring_point)
+
+    def _measure(self, motion: Motion) -> Order:
+        if self._is_asked or motion.t_s < self._measure_at_s:
+            return Order(STILL)
+        self._is_asked = True
+        return Order(STILL, measure=True)
+
+    # -- edge and home --------------------------------------------------------------------------------------------
+
+    def _back_off(self, motion: Motion, verdict: Verdict) -> Order:
+        retreat = self._retreat
+        if retreat is None:
+            self._go_on()
+            return Order(STILL)
+        twist = retreat.step(motion.pose, verdict, motion.dt_s)
+        if retreat.step_at is Step.STUCK:
+            self.fault("stuck at the edge: no motion away from it is permitted")
+            return Order(STILL)
+        if retreat.step_at is Step.OVER:
+            # An edge that the route did not foresee means that the pose is wrong: find it again before moving on.
+            self._is_refixing = True
+            self._apply(Event.RETREATED)
+            return Order(STILL)
+        return Order(twist)
+
+    def _return(self, motion: Motion) -> Order:
+        if self._home is None:
+            self._home = self._journey(self._plan_home(motion.deck))
+            return Order(STILL)
+        stop = self._home.current
+        if stop is None:
+            self.outcome = Outcome.AT_BASE
+            self._apply(Event.FINISHED)
+            return Order(STILL, at_rest=True)
+        if self._is_docking:
+            return self._dock(motion, stop)
+        twist = self._follow(motion, self._home, stop)
+        if self.state is not State.RETURNING:
+            return Order(STILL)
+        if self._tracker.phase is not Phase.DONE:
+            return Order(twist)
+        if stop.kind is StopKind.BASE:
+            self._is_docking = True
+            if stop.heading_rad is not None:
+                self._tracker.begin_turn(difference(stop.heading_rad, motion.deck.heading_rad))
+        else:
+            self._home.advance()
+        return Order(STILL)
+
+    def _dock(self, motion: Motion, stop: Stop) -> Order:
+        if stop.heading_rad is not None and self._tracker.phase is Phase.TURN:
+            remaining = difference(stop.heading_rad, motion.deck.heading_rad)
+            return Order(self._tracker.step_turn(remaining, motion.dt_s))
+        if self._is_quiet(motion) and self._home is not None:
+            self._home.advance()
+        return Order(STILL)

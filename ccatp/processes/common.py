@@ -1,0 +1,114 @@
+"""Glue. What every process does at its start: arguments, log file, dying with its parent, orderly signals."""
+
+import argparse
+import asyncio
+import ctypes
+import os
+import signal
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
+
+import structlog
+
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.errors import CcatpError
+
+PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoints:
+    """ZeroMQ endpoints of one run, all unix sockets in its runtime directory."""
+
+    runtime_dir: Path
+
+    def of(self, name: str) -> str:
+        """``ipc://`` endpoint of a name: main, danger, truth, puck, control, emergency."""
+        return f"ipc://{self.runtime_dir / name}"
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessArgs:
+    """What the supervisor tells a process.
+
+    Attributes:
+        config: the run's exact configuration, from its run directory.
+        run_dir: the run directory.
+        endpoints: where the others are.
+        listen_fd: an inherited listening socket, or ``None``.
+        is_realtime: stand-ins pace on the wall clock.
+        is_resuming: go on with a mission that stands in the run directory.
+    """
+
+    config: Config
+    run_dir: Path
+    endpoints: Endpoints
+    listen_fd: int | None
+    is_realtime: bool
+    is_resuming: bool
+
+
+def parse_args(argv: list[str] | None = None) -> ProcessArgs:
+    """Read the command line of a process and the configuration it names."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--run-dir", type=Path, required=True)
+    parser.add_argument("--runtime-dir", type=Path, required=True)
+    parser.add_argument("--listen-fd", type=int)
+    parser.add_argument("--realtime", action="store_true")
+    parser.add_argument("--resume", action="store_true")
+    args = parser.parse_args(argv)
+    config = load_config(args.run_dir / "config.toml")
+    return ProcessArgs(
+        config, args.run_dir, Endpoints(args.runtime_dir), args.listen_fd, args.realtime, args.resume
+    )
+
+
+def die_with_parent() -> None:
+    """Ask the kernel for SIGTERM when the parent dies: a plain child would survive its parent's ``kill -9``."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+        if os.getppid() == 1:  # it died before we asked
+            raise SystemExit(1)
+
+
+def open_log(path: Path, process: str) -> structlog.typing.FilteringBoundLogger:
+    """A logger that appends one JSON object per line to ``path``; several processes may share the file."""
+    stream: TextIO = path.open("a", buffering=1, encoding="utf-8")
+    structlog.configure(
+        processors=[
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True, key="wall"),
+            structlog.processors.dict_tracebacks,
+            structlog.processors.JSONRenderer(),
+        ],
+        logger_factory=structlog.WriteLoggerFactory(file=stream),
+    )
+    logger: structlog.typing.FilteringBoundLogger = structlog.get_logger().bind(process=process)
+    return logger
+
+
+def stop_on_signals(stop: asyncio.Event) -> None:
+    """Let SIGTERM and SIGINT set ``stop``."""
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop.set)
+
+
+def report(process: str, group: BaseExceptionGroup[CcatpError]) -> int:
+    """Print the expected refusals of a task group, one line each; returns the exit status of the gravest."""
+    status = 0
+    for error in leaves(group):
+        print(f"ccatp {process}: {error}", file=sys.stderr, flush=True)
+        status = max(status, int(error.exit_status))
+    return status
+
+
+def leaves(group: BaseExceptionGroup[CcatpError]) -> list[CcatpError]:
+    """All errors of a group of groups."""
+    found: list[CcatpError] = []
+    for error in group.exceptions:
+        found += leaves(error) if isinstance(error, BaseExceptionGroup) else [error]
+    return found

@@ -1,0 +1,192 @@
+"""Glue. The danger-loop process: judges every sensors frame, gives the robot its permit and main its verdict."""
+
+import asyncio
+import os
+import time
+from typing import Any
+
+import zmq
+import zmq.asyncio
+
+from ccatp.bus import Publisher, Subscriber
+from ccatp.danger import DangerMonitor
+from ccatp.errors import CcatpError
+from ccatp.mirror.mirror import build_mirror
+from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
+from ccatp.robot_link import RobotLink, read_key
+from ccatp.router import Router
+from ccatp.samples import EventCode, Verdict
+from ccatp.wire.channels import answer_observatory
+from ccatp.wire.robot import Sensors
+from ccatp.wire.topics import DangerEvent, Estimate, Presence, verdict_message
+
+PRESENCE_PERIOD_S = 0.1
+WAIT_PERIOD_S = 0.02
+# In lockstep simulated time stands still while we wait; longer than this main is gone and the frame is judged without.
+LOCKSTEP_WAIT_S = 2.0
+
+
+class DangerLoop:
+    """Wires the monitor to the robot link, the bus and the observatory channel.
+
+    Args:
+        args: configuration and endpoints.
+        context: ZeroMQ context of the process.
+    """
+
+    def __init__(self, args: ProcessArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
+        """Build the pure part and bind the sockets."""
+        cfg = args.config
+        self._cfg, self._endpoints, self._context = cfg, args.endpoints, context
+        self.log = open_log(args.run_dir / "log.jsonl", "danger")
+        self.monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger)
+        self._publisher = Publisher(context, args.endpoints.of("danger"))
+        self._subscriber = Subscriber(context, [args.endpoints.of("main")], ["estimate", "presence.main"])
+        self._estimate: Estimate | None = None
+        self._phase = "starting"
+        self._code = EventCode.NORMAL
+        self._cause = ""
+        self._seq = -1
+        self._t_s = 0.0
+        self._frame_wall_s = time.monotonic()
+        self._is_stale = False
+        self.link = RobotLink(
+            host=cfg.robot.host,
+            port=cfg.robot.port,
+            role="monitor",
+            client="danger",
+            key=read_key(cfg.robot.key_file),
+            on_sensors=self.on_sensors,
+            on_lost=self._on_lost,
+        )
+        self.lost = asyncio.Event()
+        self._is_lockstep = False
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Join the robot, then judge frames until ``stop`` is set or the link is lost."""
+        shadow = zmq.asyncio.Context.shadow(self._context)
+        async with (
+            Router(self._endpoints.of("emergency"), self._answer, shadow) as router,
+            asyncio.TaskGroup() as tasks,
+        ):
+            served = [tasks.create_task(work) for work in (router.serve(), self._beat())]
+            try:
+                await self._wait_for_main()
+                hello = await self.link.connect(self._cfg.robot.connect_timeout_s)
+                self._is_lockstep = hello.lockstep
+                self._phase = "joined"
+                self.log.info("joined", port=self._cfg.robot.port, lockstep=hello.lockstep)
+                waits = [tasks.create_task(stop.wait()), tasks.create_task(self.lost.wait())]
+                await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+                for wait in waits:
+                    wait.cancel()
+            finally:
+                for task in served:
+                    task.cancel()
+                self.link.close()
+        self.log.info("stopped", episodes=self.monitor.episodes_opened, edges=self.monitor.edges_declared)
+
+    def _answer(self, frame: bytes) -> bytes:
+        age_s = None if self._seq < 0 else time.monotonic() - self._frame_wall_s
+        at_rest = self.monitor.at_base_or_held
+        return answer_observatory(frame, self.monitor, at_base_or_held=at_rest, age_s=age_s)
+
+    async def _wait_for_main(self) -> None:
+        """Join the robot only when main's messages get through: no first estimate may be lost to a late subscription."""
+        while self._subscriber.receive() is None:
+            await asyncio.sleep(WAIT_PERIOD_S)
+
+    def on_sensors(self, sensors: Sensors, _raw: bytes) -> None:
+        """Judge one frame. In lockstep with main's estimate of the frame before, so that the run is repeatable."""
+        self._seq, self._t_s, self._frame_wall_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
+        self._take_estimates(sensors.seq - 1)
+        self._give(self.monitor.step(sensors, self._estimate), sensors.seq)
+
+    def _give(self, verdict: Verdict, ack: int) -> None:
+        self._publisher.send("verdict", verdict_message(verdict))
+        self.link.send_permit(ack, ack, verdict.forward, verdict.reverse, verdict.turn)
+        if verdict.code is not self._code or verdict.cause != self._cause:
+            self._announce(verdict)
+
+    def _announce(self, verdict: Verdict) -> None:
+        self._code, self._cause = verdict.code, verdict.cause
+        fields: dict[str, Any] = {
+            "code": int(verdict.code),
+            "cause": verdict.cause,
+            "signal": verdict.signal,
+            "value": verdict.value,
+            "limit": verdict.limit,
+        }
+        self._publisher.send("danger_event", DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, **fields))
+        self.log.info("verdict", seq=verdict.seq, t_s=verdict.t_s, **fields)
+
+    def _take_estimates(self, wanted_seq: int) -> None:
+        deadline = time.monotonic() + LOCKSTEP_WAIT_S
+        while True:
+            must_wait = self._is_lockstep and wanted_seq >= 0 and self._estimate_seq() < wanted_seq
+            received = self._subscriber.receive(max(0.0, deadline - time.monotonic()) if must_wait else 0.0)
+            if received is None:
+                return
+            if isinstance(received[1], Estimate):
+                self._estimate = received[1]
+            if must_wait and self._estimate_seq() >= wanted_seq:
+                return
+
+    def _estimate_seq(self) -> int:
+        return -1 if self._estimate is None else self._estimate.seq
+
+    async def _beat(self) -> None:
+        """Be seen alive; where frames stop coming, withhold the permit aloud."""
+        count = 0
+        while True:
+            self._publisher.send(
+                "presence.danger",
+                Presence(seq=count, t_s=time.monotonic(), process="danger", pid=os.getpid(), phase=self._phase),
+            )
+            count += 1
+            age_s = time.monotonic() - self._frame_wall_s
+            if self._phase == "joined" and not self._is_lockstep and age_s > self._cfg.danger.stale_after_s:
+                self._declare_stale(age_s)
+            await asyncio.sleep(PRESENCE_PERIOD_S)
+
+    def _declare_stale(self, age_s: float) -> None:
+        if not self._is_stale:
+            self._is_stale = True
+            self.log.warning("sensors stale", age_s=age_s)
+        self._give(self.monitor.stale(self._seq, self._t_s), self._seq)
+
+    def _on_lost(self, reason: str) -> None:
+        self.log.warning("robot link lost", reason=reason)
+        self.lost.set()
+
+    def close(self) -> None:
+        """Close the sockets."""
+        self._subscriber.close()
+        self._publisher.close()
+
+
+async def run(args: ProcessArgs) -> int:
+    """The process, from its arguments to its exit status."""
+    stop = asyncio.Event()
+    stop_on_signals(stop)
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    loop = DangerLoop(args, context)
+    status = 0
+    try:
+        await loop.run(stop)
+    except* CcatpError as group:
+        status = report("danger", group)
+    finally:
+        loop.close()
+        context.destroy(linger=0)
+    return status or (0 if stop.is_set() else 4)
+
+
+def main() -> int:
+    """Entry of ``python -m ccatp.processes.danger_loop``."""
+    die_with_parent()
+    return asyncio.run(run(parse_args()))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

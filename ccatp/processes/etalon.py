@@ -1,0 +1,85 @@
+"""Glue. The process of the Etalon stand-in: a MultiLine server over simulated lengths."""
+
+import asyncio
+import socket
+import sys
+
+import numpy as np
+
+from ccatp.config.models import Config
+from ccatp.etalon_standin import EtalonStandIn, FixedPuck, TruthSource, ZmqPuck
+from ccatp.mirror.mirror import build_mirror
+from ccatp.processes.common import die_with_parent, parse_args, stop_on_signals
+from ccatp.samples import Vector3
+
+# One stream of random numbers per stand-in, all from the one seed of the run.
+SEED_STREAM = 2
+
+
+async def _serve(cfg: Config, truth: TruthSource, listener: socket.socket | None, stop: asyncio.Event) -> None:
+    mirror = build_mirror(cfg.mirror)
+    server = EtalonStandIn(
+        cfg.sim.etalon,
+        mirror.channels,
+        mirror.collimators_m,
+        truth,
+        np.random.default_rng([cfg.run.seed, SEED_STREAM]),
+        measuring_time_s=cfg.etalon.measuring_time_s,
+    )
+    port = await server.start(cfg.sim.etalon.host, cfg.sim.etalon.port, listener)
+    if listener is None:
+        print(f"ccatp: MultiLine stand-in on {cfg.sim.etalon.host}:{port}", file=sys.stderr, flush=True)
+    try:
+        await stop.wait()
+    finally:
+        await server.close()
+
+
+def main() -> int:
+    """Entry of ``python -m ccatp.processes.etalon``."""
+    die_with_parent()
+    args = parse_args()
+
+    async def run() -> None:
+        stop = asyncio.Event()
+        stop_on_signals(stop)
+        truth = ZmqPuck(args.endpoints.of("puck"))
+        try:
+            await _serve(args.config, truth, socket.socket(fileno=args.listen_fd), stop)
+        finally:
+            truth.close()
+
+    asyncio.run(run())
+    return 0
+
+
+def run_alone(cfg: Config, puck_world_m: Vector3 | None, truth: str | None) -> int:
+    """The stand-in alone, for other people's controllers; ends on SIGINT or SIGTERM.
+
+    Args:
+        cfg: configuration.
+        puck_world_m: a puck that stands still there, world frame; at base where neither this nor ``truth`` is given.
+        truth: ZeroMQ endpoint of a DataLoop that knows where the puck is.
+    """
+
+    async def run() -> None:
+        stop = asyncio.Event()
+        stop_on_signals(stop)
+        if truth is not None:
+            source: ZmqPuck | FixedPuck = ZmqPuck(truth)
+        else:
+            mirror = build_mirror(cfg.mirror)
+            at_base = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m)
+            source = FixedPuck(puck_world_m or at_base, step_s=cfg.etalon.measuring_time_s)
+        try:
+            await _serve(cfg, source, None, stop)
+        finally:
+            if isinstance(source, ZmqPuck):
+                source.close()
+
+    asyncio.run(run())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

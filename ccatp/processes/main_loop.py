@@ -1,0 +1,360 @@
+"""Glue. The main-loop process: localizer, mission and gate behind the robot link, the bus and the laser system."""
+
+import asyncio
+import os
+import time
+
+import zmq
+import zmq.asyncio
+
+from ccatp.bus import Publisher, Subscriber
+from ccatp.control.gate import DriveGate
+from ccatp.errors import CcatpError, ExitStatus, UnreachableError
+from ccatp.etalon_client import EtalonClient, EtalonError
+from ccatp.journey import Motion
+from ccatp.localizer import Localizer
+from ccatp.mirror.mirror import Mirror
+from ccatp.mission import Mission, Order
+from ccatp.mission_states import Outcome, State
+from ccatp.processes.building import Parts, build_parts
+from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
+from ccatp.processes.measuring import MeasuringDesk, Request
+from ccatp.processes.operating import OperatorDesk
+from ccatp.processes.telling import Teller
+from ccatp.robot_link import RobotLink, read_key
+from ccatp.router import Router
+from ccatp.samples import Verdict
+from ccatp.store import MissionStore
+from ccatp.wire.robot import Hello, Sensors
+from ccatp.wire.topics import MissionStatus, Presence, VerdictMessage, verdict_of
+
+EXIT_STATUS = {
+    Outcome.COMPLETE: ExitStatus.COMPLETE,
+    Outcome.AT_BASE: ExitStatus.ABORTED,
+    Outcome.STOPPED: ExitStatus.HELD,
+    Outcome.NONE: ExitStatus.INTERRUPTED,
+}
+BEAT_PERIOD_S = 0.1
+WAIT_PERIOD_S = 0.02
+# In lockstep simulated time stands still while we wait; longer than this the danger loop is gone.
+LOCKSTEP_WAIT_S = 2.0
+# After the end the last messages must reach the supervisor, which then ends this process.
+FAREWELL_S = 5.0
+
+
+class MainLoop:
+    """One sensors frame after the other: localize, hear the verdict, decide, drive.
+
+    Args:
+        args: configuration and endpoints.
+        context: ZeroMQ context of the process.
+        parts: the pure parts, built from the configuration.
+        store: the mission's database.
+    """
+
+    def __init__(
+        self, args: ProcessArgs, context: zmq.Context[zmq.Socket[bytes]], parts: Parts, store: MissionStore
+    ) -> None:
+        """Bind the sockets and wire the parts."""
+        cfg = args.config
+        self._cfg, self._endpoints, self._store, self._context = cfg, args.endpoints, store, context
+        self._mirror: Mirror = parts.mirror
+        self._localizer: Localizer = parts.localizer
+        self._mission: Mission = parts.mission
+        self._gate: DriveGate = parts.gate
+        self._parts = parts
+        self._publisher = Publisher(context, args.endpoints.of("main"))
+        self._subscriber = Subscriber(context, [args.endpoints.of("danger")], ["verdict", "presence.danger"])
+        self._teller = Teller(self._publisher, parts.mirror, open_log(args.run_dir / "log.jsonl", "main"))
+        self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m)
+        self._measuring = MeasuringDesk(
+            self._etalon, parts.localizer, parts.mission, store, self._teller, self._answer_held_frame
+        )
+        self._link = RobotLink(
+            host=cfg.robot.host,
+            port=cfg.robot.port,
+            role="controller",
+            client="main",
+            key=read_key(cfg.robot.key_file),
+            on_sensors=self.on_sensors,
+            on_lost=self._on_lost,
+        )
+        self._hello: Hello | None = None
+        self._is_lockstep = False
+        self._phase = "starting"
+        self._verdict: Verdict | None = None
+        self._verdict_wall_s = 0.0
+        self._t_first_s: float | None = None
+        self._t_last_s = 0.0
+        self._frame_wall_s = time.monotonic()
+        self._seq = -1
+        self._unanswered: int | None = None
+        self._state = State.IDLE
+        self._arrival_error_m = 0.0
+        self.over = asyncio.Event()
+        self.exit_status = EXIT_STATUS[Outcome.NONE]
+
+    # -- the process ----------------------------------------------------------------------------------------------
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Join the robot when the danger loop has, then serve frames until the mission is over or ``stop`` is set."""
+        desk = OperatorDesk(self._mission, self._teller.say, self.status, self.settled, self._answer_held_frame)
+        shadow = zmq.asyncio.Context.shadow(self._context)
+        async with Router(self._endpoints.of("control"), desk.handle, shadow) as router, asyncio.TaskGroup() as tasks:
+            served = [tasks.create_task(work) for work in (router.serve(), self._beat(), self._measuring.run())]
+            try:
+                await self._join(stop)
+                waits = [tasks.create_task(stop.wait()), tasks.create_task(self.over.wait())]
+                await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+                self._hold_wheels()
+                if not stop.is_set():
+                    await self._farewell(stop)
+                for wait in waits:
+                    wait.cancel()
+            finally:
+                for task in served:
+                    task.cancel()
+                self._link.close()
+                await self._etalon.close()
+
+    async def _join(self, stop: asyncio.Event) -> None:
+        try:
+            await self._etalon.connect()
+        except EtalonError as error:
+            raise UnreachableError(str(error)) from error
+        self._phase = "ready"
+        while not (self._publisher.has_subscriber("track") and self._is_danger_joined()):
+            if stop.is_set():
+                return
+            await asyncio.sleep(WAIT_PERIOD_S)
+        hello = await self._link.connect(self._cfg.robot.connect_timeout_s)
+        self._parts.check_robot(hello)
+        self._hello, self._is_lockstep = hello, hello.lockstep
+        self._phase = "joined"
+        self._link.send_fans(1, self._cfg.robot.fan_duty)
+        self._teller.say("info", f"joined the robot at {self._cfg.robot.host}:{self._cfg.robot.port}")
+
+    def _is_danger_joined(self) -> bool:
+        """Its presence is repeated, so hearing it once after our own subscribers are there is enough."""
+        while (received := self._subscriber.receive()) is not None:
+            message = received[1]
+            if isinstance(message, Presence) and message.phase == "joined":
+                return True
+        return False
+
+    async def _farewell(self, stop: asyncio.Event) -> None:
+        """Keep telling the end until the supervisor has heard it and stops us."""
+        self._phase = "done"
+        try:
+            async with asyncio.timeout(FAREWELL_S):
+                await stop.wait()
+        except TimeoutError:
+            self._teller.log.warning("nobody acknowledged the end")
+
+    def _hold_wheels(self) -> None:
+        self._link.send_drive(self._seq + 1, self._seq, 0.0, 0.0)
+        self._teller.flush()
+        self._teller.status(self.status())
+
+    async def _beat(self) -> None:
+        """Be seen alive, flush batches, and hold where frames stop coming."""
+        count = 0
+        while True:
+            self._publisher.send(
+                "presence.main",
+                Presence(seq=count, t_s=time.monotonic(), process="main", pid=os.getpid(), phase=self._phase),
+            )
+            count += 1
+            self._teller.flush_if_due()
+            if self._phase != "starting":
+                self._teller.status(self.status())
+            self._check_age()
+            await asyncio.sleep(BEAT_PERIOD_S)
+
+    def _check_age(self) -> None:
+        age_s = time.monotonic() - self._frame_wall_s
+        if self._phase != "joined" or self._is_lockstep or age_s <= self._cfg.robot.sensors_timeout_s:
+            return
+        if self._mission.interrupt(f"no sensors frame for {age_s:.2f} s"):
+            self._teller.say("warning", self._mission.cause)
+            self._link.send_drive(self._seq + 1, self._seq, 0.0, 0.0)
+
+    def _on_lost(self, reason: str) -> None:
+        if not self.over.is_set():
+            self._teller.say("error", f"robot link lost: {reason}")
+            self._finish(ExitStatus.UNREACHABLE)
+
+    def _finish(self, status: ExitStatus) -> None:
+        self.exit_status = status
+        self._phase = "done"
+        self.over.set()
+
+    # -- the frame ------------------------------------------------------------------------------------------------
+
+    def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
+        """Serve one sensors frame."""
+        if self.over.is_set():
+            return
+        start = time.perf_counter()
+        t_s, seq = sensors.t, sensors.seq
+        dt_s = t_s - self._t_last_s if self._t_first_s is not None else self._frame_period_s()
+        if self._t_first_s is None:
+            self._t_first_s = t_s
+        self._t_last_s, self._seq, self._frame_wall_s = t_s, seq, time.monotonic()
+        localizer = self._localizer
+        localizer.step(t_s, sensors.imu, sensors.enc, sensors.edge)
+        waiting = time.perf_counter()
+        verdict = self._hear(seq)
+        heard = time.perf_counter()
+        motion = Motion(
+            t_s, dt_s, localizer.pose, localizer.deck_pose, localizer.speed_m_s, localizer.rate_rad_s
+        )
+        order = self._mission.step(motion, verdict)
+        right, left = self._gate.pass_through(order.twist, verdict, dt_s)
+        if order.at_rest or order.measure:
+            self._execute(order, motion)
+        self._teller.frame(seq, t_s, localizer, self._mission.state, raw)
+        if self._may_answer():
+            self._link.send_drive(seq, seq, right, left)
+        else:
+            self._unanswered = seq
+        if self._mission.state is not self._state:
+            self._on_state()
+        self._teller.tick(1e6 * (time.perf_counter() - heard + waiting - start))
+
+    def _frame_period_s(self) -> float:
+        return 1.0 / self._hello.frame_hz if self._hello is not None else 0.01
+
+    def _hear(self, seq: int) -> Verdict | None:
+        """The verdict in force: in lockstep that of this very frame, else the newest that is fresh."""
+        deadline = time.monotonic() + LOCKSTEP_WAIT_S
+        while True:
+            must_wait = self._is_lockstep and (self._verdict is None or self._verdict.seq < seq)
+            if self._is_lockstep and not must_wait:
+                break
+            received = self._subscriber.receive(deadline - time.monotonic() if must_wait else 0.0)
+            if received is None:
+                break
+            if isinstance(received[1], VerdictMessage):
+                self._verdict, self._verdict_wall_s = verdict_of(received[1]), time.monotonic()
+        verdict = self._verdict
+        if verdict is None:
+            return None
+        age_s = max((seq - verdict.seq) * self._frame_period_s(), 0.0)
+        if not self._is_lockstep:
+            age_s = max(age_s, time.monotonic() - self._verdict_wall_s)
+        return verdict if age_s <= self._cfg.mission.verdict_timeout_s else None
+
+    def _execute(self, order: Order, motion: Motion) -> None:
+        if order.at_rest:
+            self._localizer.rest()
+        if order.arrived is not None:
+            self._arrival_error_m = self._mission.journey.distance_m(motion.pose)
+            self._teller.arrival(order.arrived, self._arrival_error_m)
+            self._store.record_arrival(order.arrived, motion.t_s, self._arrival_error_m)
+        if order.measure and not self._measuring.is_busy:
+            pose = self._localizer.deck_pose
+            expected = self._mirror.puck_world(pose, self._cfg.robot.puck_height_m)
+            self._measuring.begin(Request(motion.t_s, self._mission.measuring_point, expected, pose))
+
+    def _is_quiet(self) -> bool:
+        control = self._cfg.control
+        return (
+            abs(self._localizer.speed_m_s) <= control.settle_speed_m_s
+            and abs(self._localizer.rate_rad_s) <= control.settle_rate_rad_s
+        )
+
+    def _may_answer(self) -> bool:
+        """In lockstep simulated time stands still while a measurement is under way, and while the robot is paused."""
+        if not self._is_lockstep:
+            return True
+        return not self._measuring.is_busy and not (self._mission.is_paused and self._is_quiet())
+
+    def _answer_held_frame(self) -> None:
+        """Let lockstep time go on after a measurement or a pause."""
+        seq, self._unanswered = self._unanswered, None
+        if seq is not None and self._may_answer():
+            self._link.send_drive(seq, seq, 0.0, 0.0)
+        else:
+            self._unanswered = seq
+        if self._mission.state is not self._state:
+            self._on_state()
+
+    def _on_state(self) -> None:
+        mission = self._mission
+        before, self._state = self._state, mission.state
+        self._teller.log.debug("state", seq=self._seq, before=before, after=mission.state, cause=mission.cause)
+        if mission.state in (State.HELD, State.BACKING_OFF) or before is State.HELD:
+            self._teller.say("warning", f"{mission.state}: {mission.cause}" if mission.cause else f"{mission.state}")
+        if mission.state is State.RETURNING and before is not State.BACKING_OFF:
+            self._teller.say("warning", f"returning to base: {mission.cause}")
+        if mission.state is State.DONE:
+            self._finish(EXIT_STATUS[mission.outcome])
+        elif mission.is_faulted and self._is_lockstep:
+            # Nobody can be waited for while simulated time runs at many times the wall clock.
+            self._finish(EXIT_STATUS[Outcome.STOPPED])
+
+    # -- for operators --------------------------------------------------------------------------------------------
+
+    async def settled(self) -> None:
+        """Wait until the robot is held at rest, or the mission is over."""
+        while not (self.over.is_set() or self._is_quiet()):
+            await asyncio.sleep(WAIT_PERIOD_S)
+
+    def status(self) -> MissionStatus:
+        """Where the mission stands."""
+        mission = self._mission
+        stop = mission.journey.current
+        point = stop.point if stop is not None else None
+        return MissionStatus(
+            seq=self._seq,
+            t_s=self._t_last_s,
+            state="ended" if self._phase == "done" and not mission.outcome else str(mission.state),
+            cause=mission.cause,
+            done=len(mission.done) + self._parts.already_done,
+            skipped=len(mission.skipped),
+            total=self._parts.total_points,
+            point=f"{point.row}-{point.col}-{point.point}" if point is not None else "",
+            elapsed_s=self._t_last_s - (self._t_first_s if self._t_first_s is not None else self._t_last_s),
+            eta_s=self._parts.route.remaining_s(mission.survey.index),
+            error_mm=1e3 * self._arrival_error_m,
+            code=0 if self._verdict is None else int(self._verdict.code),
+            outcome=str(mission.outcome),
+            lower_bound_s=self._parts.lower_bound_s,
+        )
+
+    def close(self) -> None:
+        """Close the sockets."""
+        self._subscriber.close()
+        self._publisher.close()
+
+
+async def run(args: ProcessArgs) -> int:
+    """The process, from its arguments to its exit status."""
+    stop = asyncio.Event()
+    stop_on_signals(stop)
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    status = 0
+    loop: MainLoop | None = None
+    try:
+        parts, store = build_parts(args)
+        with store:
+            loop = MainLoop(args, context, parts, store)
+            await loop.run(stop)
+    except* CcatpError as group:
+        status = report("main", group)
+    finally:
+        if loop is not None:
+            loop.close()
+        context.destroy(linger=0)
+    return status or int(loop.exit_status if loop is not None else ExitStatus.HELD)
+
+
+def main() -> int:
+    """Entry of ``python -m ccatp.processes.main_loop``."""
+    die_with_parent()
+    return asyncio.run(run(parse_args()))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,94 @@
+"""Glue. What a run shows on the terminal: progress where there is one, plain lines where there is none."""
+
+import json
+import sys
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from ccatp.config.models import Config
+from ccatp.summary import format_table
+from ccatp.wire.topics import MissionStatus, Track
+
+STYLES = {"info": "", "warning": "yellow", "error": "bold red"}
+
+
+class RunView:
+    """Progress and messages on standard error; the summary on standard output.
+
+    Args:
+        cfg: the run's configuration.
+        is_sim: mark it visibly as a simulation.
+        run_dir: where the run is written.
+    """
+
+    def __init__(self, cfg: Config, *, is_sim: bool, run_dir: Path) -> None:
+        """Say what runs."""
+        self._console = Console(stderr=True, highlight=False)
+        self._is_terminal = self._console.is_terminal
+        self._has_pose = False
+        self._told_tenths = 0
+        what = "SIMULATION" if is_sim else "survey"
+        world = f", world {cfg.world.name}, seed {cfg.run.seed}" if is_sim else ""
+        self._console.print(f"ccatp {what} of {cfg.mirror.name}{world}, filter {cfg.run.filter}; writing {run_dir}")
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[state]}"),
+            console=self._console,
+            auto_refresh=False,
+        )
+        self._task = self._progress.add_task("SIM" if is_sim else "points", total=None, state="starting")
+
+    def __enter__(self) -> "RunView":
+        if self._is_terminal:
+            self._progress.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._is_terminal:
+            self._progress.stop()
+
+    def say(self, level: str, text: str) -> None:
+        """One line for the operator."""
+        self._console.print(f"{level}: {text}", style=STYLES[level], markup=False, soft_wrap=True)
+
+    def pose(self, track: Track) -> None:
+        """The first pose shows that the robot is there."""
+        if not self._has_pose and track.rows:
+            self._has_pose = True
+            _, t_s, x, y, heading, *_ = track.rows[-1]
+            self.say("info", f"first pose at {t_s:.2f} s: x {x:.4f} m, y {y:.4f} m, heading {heading:.4f} rad")
+
+    def status(self, status: MissionStatus) -> None:
+        """Points done, state, ETA, error."""
+        text = (
+            f"{status.state} {status.point}  {_clock(status.elapsed_s)} elapsed, {_clock(status.eta_s)} to go, "
+            f"arrival {status.error_mm:.2f} mm"
+        )
+        if self._is_terminal:
+            self._progress.update(self._task, completed=status.done, total=status.total, state=text)
+            self._progress.refresh()
+            return
+        tenths = 10 * status.done // max(status.total, 1)
+        if tenths > self._told_tenths:
+            self._told_tenths = tenths
+            self._console.print(f"{10 * tenths} %: {status.done} of {status.total} points, {text}", soft_wrap=True)
+
+    def show_summary(self, summary: dict[str, Any], *, as_json: bool) -> None:
+        """The end: JSON alone on standard output, or a table."""
+        if as_json:
+            json.dump(summary, sys.stdout, indent=1)
+            sys.stdout.write("\n")
+        else:
+            sys.stdout.write(format_table(summary) + "\n")
+        sys.stdout.flush()
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02d}"

@@ -1,0 +1,102 @@
+"""Glue. What the main loop tells the others: its estimate every frame, the rest in batches and events."""
+
+import time
+
+import msgspec
+import structlog
+
+from ccatp.bus import Publisher
+from ccatp.localizer import Localizer
+from ccatp.mirror.mirror import Mirror
+from ccatp.samples import Fix, PointId
+from ccatp.wire.topics import Arrival, Estimate, FixMessage, Log, MissionStatus, SensorLines, Timing, Track
+
+# Frames per batch: a second of them, small enough for the bus and large enough that the cost per frame vanishes.
+BATCH_FRAMES = 100
+# A batch is sent after this much wall time even when it is not full, so that displays stay alive in real time.
+BATCH_WALL_S = 0.25
+
+
+class Teller:
+    """Publishes for the main loop.
+
+    Args:
+        publisher: main's publisher.
+        mirror: gives the 3-D point of an estimate.
+        log: the process's logger.
+    """
+
+    def __init__(self, publisher: Publisher, mirror: Mirror, log: structlog.typing.FilteringBoundLogger) -> None:
+        """Start with empty batches."""
+        self._publisher, self._mirror, self.log = publisher, mirror, log
+        self._track: list[tuple[int, float, float, float, float, float, float, float, float]] = []
+        self._lines: list[msgspec.Raw] = []
+        self._tick_us: list[float] = []
+        self._flushed_wall_s = time.monotonic()
+        self.seq = -1
+        self.t_s = 0.0
+
+    def frame(self, seq: int, t_s: float, localizer: Localizer, state: str, raw: bytes) -> None:
+        """Publish the estimate after frame ``seq`` and keep it, with the frame's line, for the batch."""
+        self.seq, self.t_s = seq, t_s
+        pose, sigma = localizer.deck_pose, localizer.position_sigma_m
+        x, y, heading = pose.x_m, pose.y_m, pose.heading_rad
+        self._publisher.send(
+            "estimate",
+            Estimate(seq=seq, t_s=t_s, x_m=x, y_m=y, heading_rad=heading, sigma_m=sigma, state=state),
+        )
+        self._track.append((seq, t_s, x, y, heading, x, y, self._mirror.surface.height_m(x, y), sigma))
+        self._lines.append(msgspec.Raw(raw))
+        if len(self._track) >= BATCH_FRAMES:
+            self.flush()
+
+    def tick(self, microseconds: float) -> None:
+        """Note the wall time of a tick."""
+        self._tick_us.append(microseconds)
+
+    def flush_if_due(self) -> None:
+        """Publish the batches where the last time is long ago."""
+        if time.monotonic() - self._flushed_wall_s >= BATCH_WALL_S:
+            self.flush()
+
+    def flush(self) -> None:
+        """Publish the batches."""
+        self._flushed_wall_s = time.monotonic()
+        if not self._track:
+            return
+        at = {"seq": self.seq, "t_s": self.t_s}
+        self._publisher.send("track", Track(rows=self._track, **at))  # type: ignore[arg-type]
+        self._publisher.send("sensors", SensorLines(lines=self._lines, **at))  # type: ignore[arg-type]
+        self._publisher.send("timing", Timing(tick_us=self._tick_us, **at))  # type: ignore[arg-type]
+        self._track, self._lines, self._tick_us = [], [], []
+
+    def arrival(self, point: PointId, error_m: float) -> None:
+        """The robot came to rest at a point for the first time."""
+        message = Arrival(
+            seq=self.seq, t_s=self.t_s, point=(point.row, point.col, point.point), error_mm=1e3 * error_m
+        )
+        self._publisher.send("arrival", message)
+
+    def fix(self, point: PointId, fix: Fix, jump_m: float) -> None:
+        """A point's fix is committed."""
+        message = FixMessage(
+            seq=self.seq,
+            t_s=fix.t_s,
+            point=(point.row, point.col, point.point),
+            position_m=fix.position_m,
+            covariance_m2=list(fix.covariance_m2),
+            dop=fix.dop,
+            residual_rms_m=fix.residual_rms_m,
+            channels=list(fix.channels),
+            jump_mm=1e3 * jump_m,
+        )
+        self._publisher.send("fix", message)
+
+    def status(self, message: MissionStatus) -> None:
+        """Publish the mission's status."""
+        self._publisher.send("mission", message)
+
+    def say(self, level: str, text: str) -> None:
+        """One line for the log file and for the operator's terminal."""
+        self.log.log({"info": 20, "warning": 30, "error": 40}[level], text, seq=self.seq, t_s=self.t_s)
+        self._publisher.send("log", Log(seq=self.seq, t_s=self.t_s, level=level, process="main", text=text))

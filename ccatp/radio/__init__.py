@@ -1,0 +1,1 @@
+"""Pure. Positions from ranges."""

@@ -1,0 +1,240 @@
+"""Edge. Telemetry of a run as an MCAP file: JSON messages, a JSON schema for every channel.
+
+Chunks are small and the file is not buffered, so a ``kill -9`` costs the last chunk at most; the reader takes a file
+that ends anywhere. Recording never disturbs a mission: the first write that fails ends it, with one report.
+"""
+
+import json
+import os
+import struct
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mcap.exceptions import McapError
+from mcap.records import Channel, Chunk, McapRecord, Message, Metadata
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.writer import Writer
+from zstandard import ZstdError
+
+CHUNK_BYTES = 16 * 1024
+FLUSH_AFTER_S = 1.0  # of message time: slow topics do not wait for a full chunk
+_METADATA = "ccatp"
+_SIMULATION = "simulation"
+_MAX_T_S = 1e9  # thirty years of uptime: anything beyond is not a time since boot
+_NS = 1e9
+
+# What the reader of the format raises on bytes that are not what they should be.
+_DAMAGE = (
+    McapError,
+    CRCValidationError,
+    ZstdError,
+    struct.error,
+    ValueError,
+    ArithmeticError,
+    LookupError,
+    MemoryError,
+)
+
+
+class RecordedMessage(NamedTuple):
+    """One message: topic, robot time (s), and the JSON as it was recorded."""
+
+    topic: str
+    t_s: float
+    payload: bytes
+
+
+class _RawFile:
+    """A file without a buffer that writes everything or raises.
+
+    The MCAP writer puts a buffer of its own around a plain unbuffered file; what lies in it dies with the process.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._position = 0
+
+    def write(self, data: bytes) -> int:
+        rest = memoryview(data)
+        while rest:
+            done = os.write(self._handle, rest)
+            self._position += done
+            rest = rest[done:]
+        return len(data)
+
+    def tell(self) -> int:
+        return self._position
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def close(self) -> None:
+        os.close(self._handle)
+
+
+class Recorder:
+    """Writes messages of a fixed set of topics to one MCAP file.
+
+    An existing file at ``path`` is kept: it is renamed ``<stem>.<n><suffix>`` (see ``recordings``).
+
+    Attributes:
+        path: the file.
+        is_recording: False after ``close`` or a failure.
+        dropped: messages not recorded: after a failure, of an unknown topic, or with a time that is none.
+
+    Args:
+        path: the file to write.
+        topics: name and JSON schema of each topic.
+        is_simulation: marks the file and every channel as simulation, or as real.
+        metadata: what tells runs apart (mirror, seed, ...), kept in the file.
+        on_failure: called once with the reason when recording ends early.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        topics: Iterable[tuple[str, Mapping[str, Any]]],
+        *,
+        is_simulation: bool,
+        metadata: Mapping[str, str] | None = None,
+        on_failure: Callable[[str], None] | None = None,
+    ) -> None:
+        """Make the file; a failure is reported like any later one."""
+        self.path = path
+        self.is_recording = False
+        self.dropped = 0
+        self._on_failure = on_failure
+        self._channels: dict[str, int] = {}
+        self._flushed_s = 0.0
+        self._sequence = 0
+        self._file: _RawFile | None = None
+        try:
+            _keep_existing(path)
+            self._file = _RawFile(path)
+            self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)  # type: ignore[arg-type]
+            self._begin(topics, {**(metadata or {}), _SIMULATION: str(is_simulation).lower()})
+            self.is_recording = True
+        except Exception as error:
+            self._fail(error)
+
+    def write(self, topic: str, t_s: float, payload: bytes) -> None:
+        """Record one message; never raises.
+
+        Args:
+            topic: one of the recorder's topics.
+            t_s: robot time, s since its boot; becomes the log time.
+            payload: JSON text of the topic's schema.
+        """
+        channel = self._channels.get(topic)
+        if channel is None or not self.is_recording or not 0.0 <= t_s < _MAX_T_S:
+            self.dropped += 1
+            return
+        time_ns = round(t_s * _NS)
+        self._sequence += 1
+        try:
+            self._writer.add_message(channel, time_ns, payload, time_ns, self._sequence)
+            if not 0.0 <= t_s - self._flushed_s < FLUSH_AFTER_S:
+                self._flushed_s = t_s
+                self._writer.flush()  # type: ignore[no-untyped-call]
+        except Exception as error:
+            # Whatever it is, the mission is worth more than its recording.
+            self.dropped += 1
+            self._fail(error)
+
+    def close(self) -> None:
+        """Write what is left and the index; again is harmless. Never raises."""
+        if self.is_recording:
+            self.is_recording = False
+            try:
+                self._writer.finish()  # type: ignore[no-untyped-call]
+            except Exception as error:
+                self._fail(error)
+        self._close_file()
+
+    def _begin(self, topics: Iterable[tuple[str, Mapping[str, Any]]], metadata: dict[str, str]) -> None:
+        self._writer.start(library="ccatp")
+        self._writer.add_metadata(_METADATA, metadata)
+        for name, schema in topics:
+            data = json.dumps(schema, separators=(",", ":")).encode()
+            schema_id = int(self._writer.register_schema(name=name, encoding="jsonschema", data=data))
+            channel_metadata = {_SIMULATION: metadata[_SIMULATION]}
+            self._channels[name] = self._writer.register_channel(name, "json", schema_id, channel_metadata)
+
+    def _fail(self, error: Exception) -> None:
+        self.is_recording = False
+        self._close_file()
+        if self._on_failure is not None:
+            self._on_failure(f"{self.path}: recording ended: {error}")
+
+    def _close_file(self) -> None:
+        if self._file is not None:
+            with suppress(OSError):
+                self._file.close()
+            self._file = None
+
+
+def recordings(path: Path) -> list[Path]:
+    """The files of a run that was resumed, oldest first: those kept by later recorders, then ``path`` itself."""
+    kept = {_part_number(p): p for p in path.parent.glob(f"{path.stem}.*{path.suffix}")}
+    parts = [kept[n] for n in sorted(n for n in kept if n > 0)]
+    return [*parts, path] if path.exists() else parts
+
+
+def iter_messages(path: Path, on_damage: Callable[[str], None] | None = None) -> Iterator[RecordedMessage]:
+    """All messages of a file, in the order of recording.
+
+    Args:
+        path: an MCAP file; it may end anywhere, as after a ``kill -9``.
+        on_damage: called with the reason where the file ends early or is damaged; nothing behind that is read.
+
+    Yields:
+        The messages up to the end, or to the first damage. A damaged chunk gives none of its messages.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    channels: dict[int, str] = {}
+    for record in _iter_records(path, on_damage):
+        if isinstance(record, Channel):
+            channels[record.id] = record.topic
+        elif isinstance(record, Message) and record.channel_id in channels:
+            yield RecordedMessage(channels[record.channel_id], record.log_time / _NS, record.data)
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    """What the recorder was told of the run; ``simulation`` is ``"true"`` or ``"false"``. Empty if there is none."""
+    for record in _iter_records(path, None):
+        if isinstance(record, Metadata) and record.name == _METADATA:
+            return dict(record.metadata)
+    return {}
+
+
+def _iter_records(path: Path, on_damage: Callable[[str], None] | None) -> Iterator[McapRecord]:
+    with path.open("rb") as file:
+        # No record is longer than the file; without this limit a flipped bit in a length asks for any amount of memory.
+        reader = StreamReader(file, emit_chunks=True, record_size_limit=path.stat().st_size)
+        records = iter(reader.records)
+        while True:
+            try:
+                record = next(records)
+                inner = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
+            except StopIteration:
+                return
+            except _DAMAGE as error:
+                if on_damage is not None:
+                    on_damage(f"{path}: damaged or cut off before byte {file.tell()}: {type(error).__name__} {error}")
+                return
+            yield from inner
+
+
+def _keep_existing(path: Path) -> None:
+    if path.exists():
+        number = 1 + max((_part_number(p) for p in recordings(path)), default=0)
+        path.rename(path.with_name(f"{path.stem}.{number}{path.suffix}"))
+
+
+def _part_number(path: Path) -> int:
+    number = Path(path.stem).suffix[1:]
+    return int(number) if number.isdecimal() else 0

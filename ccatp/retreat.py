@@ -1,0 +1,102 @@
+"""Pure. What the robot does at the mirror's edge: back off, turn away, stand still for a fix (thesis 3.4.1)."""
+
+from enum import StrEnum
+from math import copysign, hypot
+
+from ccatp.angles import difference
+from ccatp.config.models import MissionConfig
+from ccatp.control.tracker import LegTracker, Phase
+from ccatp.samples import EventCode, PanelPose, Twist, Verdict
+
+STILL = Twist(0.0, 0.0)
+# A turn that met the rim is undone by at most this; more would sweep the next corner.
+UNTURN_LIMIT_RAD = 0.8
+
+
+class Step(StrEnum):
+    """What the retreat is at."""
+
+    BACK = "back"
+    UNTURN = "unturn"
+    TURN_AWAY = "turn away"
+    OVER = "over"
+    STUCK = "stuck"
+
+
+class Retreat:
+    """One back-off: away from the edge along the track just driven, then a turn away from the side that hung over.
+
+    Args:
+        cfg: distances and speeds.
+        tracker: the leg tracker, borrowed for the turn.
+        verdict: the verdict that declared the edge.
+        pose: where the robot was then.
+        rate_rad_s: how it was turning then.
+    """
+
+    def __init__(
+        self, cfg: MissionConfig, tracker: LegTracker, verdict: Verdict, pose: PanelPose, rate_rad_s: float
+    ) -> None:
+        """Choose the way out from what the verdict permits."""
+        self._cfg, self._tracker = cfg, tracker
+        self._start, self._last = pose, pose
+        self._travel_m = self._turned_rad = 0.0
+        self._away_rad: float | None = None
+        front_left, front_right, rear_left, rear_right = verdict.off
+        front, rear = front_left or front_right, rear_left or rear_right
+        left, right = front_left or rear_left, front_right or rear_right
+        # Turning is to the side that stands on the mirror; where both or none do, to the left.
+        self._away = -cfg.turn_away_rad if left and not right else cfg.turn_away_rad
+        self._direction = -1.0 if front else 1.0
+        self._unturn = -copysign(1.0, rate_rad_s)
+        if verdict.turn and not (front and rear):
+            self.step_at = Step.UNTURN
+        elif front != rear:
+            self.step_at = Step.BACK
+        else:
+            self.step_at = Step.STUCK
+
+    def step(self, pose: PanelPose, verdict: Verdict, dt_s: float) -> Twist:
+        """The twist for the next ``dt_s``; ``step_at`` tells what it is at."""
+        if pose.panel == self._last.panel:
+            self._travel_m += hypot(pose.x_m - self._last.x_m, pose.y_m - self._last.y_m)
+            self._turned_rad += abs(difference(pose.heading_rad, self._last.heading_rad))
+        self._last = pose
+        is_clear = verdict.code is not EventCode.NEAR_EDGE
+        if self.step_at is Step.BACK:
+            return self._back(is_clear, verdict)
+        if self.step_at is Step.UNTURN:
+            return self._undo_turn(is_clear, verdict)
+        if self.step_at is Step.TURN_AWAY:
+            return self._turn_away(pose, is_clear, dt_s)
+        return STILL
+
+    def _back(self, is_clear: bool, verdict: Verdict) -> Twist:
+        if self._travel_m >= self._cfg.backoff_m or (is_clear and self._travel_m >= 0.5 * self._cfg.backoff_m):
+            self.step_at = Step.TURN_AWAY if is_clear else Step.STUCK
+            return STILL
+        if not (verdict.reverse if self._direction < 0.0 else verdict.forward):
+            self.step_at = Step.STUCK
+            return STILL
+        return Twist(self._direction * self._cfg.backoff_speed_m_s, 0.0)
+
+    def _undo_turn(self, is_clear: bool, verdict: Verdict) -> Twist:
+        if is_clear:
+            self.step_at = Step.OVER
+            return STILL
+        if self._turned_rad >= UNTURN_LIMIT_RAD or not verdict.turn:
+            self.step_at = Step.BACK
+            return STILL
+        return Twist(0.0, self._unturn * self._cfg.turn_away_rad)
+
+    def _turn_away(self, pose: PanelPose, is_clear: bool, dt_s: float) -> Twist:
+        if not is_clear:  # the turn sweeps a corner over the rim: stay with what has been gained
+            self.step_at = Step.OVER
+            return STILL
+        if self._away_rad is None:
+            self._away_rad = pose.heading_rad + self._away
+            self._tracker.begin_turn(self._away)
+        twist = self._tracker.step_turn(difference(self._away_rad, pose.heading_rad), dt_s)
+        if self._tracker.phase is Phase.DONE:
+            self.step_at = Step.OVER
+        return twist

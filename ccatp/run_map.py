@@ -1,0 +1,223 @@
+"""Edge. The map of a run as a picture: panels, rim, driven path, and each point coloured by its arrival error.
+
+Needs the extra ``plots`` (matplotlib), imported only when something is drawn.
+"""
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from math import ceil, cos, dist, sin
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ccatp.config.loader import load_config
+from ccatp.errors import CcatpError, ExitStatus
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.recorder import iter_messages, read_metadata, recordings
+from ccatp.samples import Fix, PointId
+from ccatp.store import MissionStore, StoreError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FloatArray = NDArray[np.float64]
+
+WIDTH_PX = 1600
+DPI = 160
+LIMIT_MM = 10.0  # arrivals beyond it miss the requirement; the colours end there
+MAX_PATH_POINTS = 40_000
+
+_INK, _QUIET, _PANEL, _SEAM, _PATH, _BAD = "#1f2933", "#6b7785", "#f1f4f7", "#c5ced8", "#8fa3b8", "#d64545"
+_COLOURS = "viridis_r"
+
+
+class RunMapError(CcatpError):
+    """A run that cannot be drawn."""
+
+    exit_code = ExitStatus.USAGE
+
+
+@dataclass(frozen=True, slots=True)
+class MapPoint:
+    """A measurement point on the map.
+
+    Attributes:
+        x_m, y_m: deck frame.
+        error_mm: arrival error; None where the point was not measured.
+        is_skipped: given up, not merely still to come.
+    """
+
+    x_m: float
+    y_m: float
+    error_mm: float | None = None
+    is_skipped: bool = False
+
+
+def draw_run_map(
+    mirror: Mirror, path_xy: FloatArray, points: Sequence[MapPoint], out: Path, title: str, subtitle: str = ""
+) -> None:
+    """Draw the map of a run into an image file.
+
+    Args:
+        mirror: where it took place.
+        path_xy: driven path, deck frame, shape (n, 2), m; rows of NaN part it.
+        points: the measurement points.
+        out: the file; its suffix tells the format (PNG, PDF, SVG).
+        title: first line: mirror, points, time.
+        subtitle: second line: seed, world, errors.
+
+    Raises:
+        RunMapError: matplotlib is not installed, or the file cannot be written.
+    """
+    try:
+        from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second, and belongs to an extra
+    except ImportError as error:
+        raise RunMapError("drawing needs matplotlib: install ccatp with its extra, ccatp[plots]") from error
+    low, high = mirror.rim.vertices.min(axis=0), mirror.rim.vertices.max(axis=0)
+    width = WIDTH_PX / DPI
+    # Margins of 0.25 m around the mirror; 1.5 inches beside it for colour bar and labels, 1.2 above and below.
+    height = (width - 1.5) * float((high[1] - low[1] + 0.5) / (high[0] - low[0] + 0.5)) + 1.2
+    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
+    axes = figure.add_axes((0.75 / width, 0.6 / height, (width - 1.5) / width, (height - 1.35) / height))
+    _draw_mirror(axes, mirror)
+    step = max(1, len(path_xy) // MAX_PATH_POINTS)
+    axes.plot(path_xy[::step, 0], path_xy[::step, 1], color=_PATH, linewidth=0.9, zorder=3, label="driven path")
+    _draw_base(axes, mirror)
+    _draw_points(figure, axes, points)
+    _dress(axes, low - 0.25, high + 0.25, title, subtitle)
+    try:
+        figure.savefig(out)
+    except (OSError, ValueError) as error:
+        raise RunMapError(f"{out}: cannot be written: {error}") from error
+
+
+def draw_from_run_dir(run_dir: Path, out: Path) -> None:
+    """Draw the map of a finished run from its run directory.
+
+    The arrival error is the distance from the puck's foot, as the laser system measured it, to the measurement point.
+
+    Raises:
+        RunMapError: the directory holds no run, or the map cannot be drawn.
+        ConfigError: its configuration cannot be read.
+    """
+    if not (run_dir / "config.toml").is_file():
+        raise RunMapError(f"{run_dir}: no config.toml there; name the directory of a run")
+    cfg = load_config(run_dir / "config.toml")
+    mirror = build_mirror(cfg.mirror)
+    parts = recordings(run_dir / "telemetry.mcap")
+    is_simulation = any(read_metadata(part).get("simulation") == "true" for part in parts)
+    points = _points(run_dir / "mission.sqlite", mirror, cfg.robot.puck_height_m)
+    errors = [p.error_mm for p in points if p.error_mm is not None]
+    title = f"{mirror.name}: {len(errors)} of {len(points)} points"
+    time_s = _mission_time_s(run_dir / "summary.json")
+    if time_s is not None:
+        title += f" in {int(time_s) // 60} min {int(time_s) % 60:02d} s"
+    where = [f"simulation, world {cfg.world.name}"] if is_simulation else []
+    figures = [f"arrival error: mean {np.mean(errors):.2f} mm, largest {max(errors):.2f} mm"] if errors else []
+    subtitle = "  ·  ".join([*where, f"seed {cfg.run.seed}", f"filter {cfg.run.filter}", *figures])
+    draw_run_map(mirror, _driven_path(parts), points, out, title, subtitle)
+
+
+def arrival_error_m(mirror: Mirror, point: PointId, fix: Fix, puck_height_m: float) -> float:
+    """Distance on the surface from the foot of a measured puck to its measurement point, m."""
+    x, y, _ = mirror.foot_of_puck(fix.position_m, puck_height_m)
+    return dist(mirror.surface_point(x, y), mirror.surface_point(*mirror.point_on_deck(point)))
+
+
+def _points(database: Path, mirror: Mirror, puck_height_m: float) -> list[MapPoint]:
+    try:
+        with MissionStore.open(database, mirror=mirror.name) as store:
+            rows, fixes = store.points(), {stored.point: stored.fix for stored in store.fixes()}
+    except StoreError as error:
+        raise RunMapError(str(error)) from error
+    points = []
+    for row in rows:
+        fix = fixes.get(row.point)
+        error_mm = None if fix is None else 1e3 * arrival_error_m(mirror, row.point, fix, puck_height_m)
+        points.append(MapPoint(*mirror.point_on_deck(row.point), error_mm, row.status == "skipped"))
+    return points
+
+
+def _driven_path(parts: Iterable[Path]) -> FloatArray:
+    """True path where there is one, else the estimated; shape (n, 2); the parts of a resumed run set apart by NaN."""
+    pieces: list[FloatArray] = []
+    for part in parts:
+        rows: dict[str, list[list[float]]] = {"truth": [], "track": []}
+        for message in iter_messages(part):
+            if message.topic in rows:
+                rows[message.topic] += [row[2:4] for row in json.loads(message.payload)["rows"]]
+        pieces += [np.array(rows["truth"] or rows["track"]).reshape(-1, 2), np.full((1, 2), np.nan)]
+    return np.concatenate(pieces) if pieces else np.empty((0, 2))
+
+
+def _mission_time_s(path: Path) -> float | None:
+    try:
+        return float(json.loads(path.read_text(encoding="utf-8"))["mission_time_s"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None  # a run that was killed has no summary; its map is worth the more
+
+
+def _draw_mirror(axes: "Axes", mirror: Mirror) -> None:
+    from matplotlib.collections import PatchCollection  # noqa: PLC0415 - see above
+    from matplotlib.patches import Polygon, Rectangle  # noqa: PLC0415
+
+    tiles = [
+        Rectangle((p.x_m - p.half_x_m, p.y_m - p.half_y_m), 2 * p.half_x_m, 2 * p.half_y_m)
+        for p in mirror.panels.values()
+    ]
+    axes.add_collection(PatchCollection(tiles, facecolor=_PANEL, edgecolor=_SEAM, linewidth=0.7, zorder=1))
+    axes.add_patch(Polygon(mirror.rim.vertices, closed=True, fill=False, edgecolor=_INK, linewidth=1.5, zorder=2))
+    small: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7.5, "color": _QUIET}
+    (low_x, low_y) = mirror.rim.vertices.min(axis=0)
+    for col, x in {p.id.col: p.x_m for p in mirror.panels.values()}.items():
+        axes.text(x, low_y - 0.12, f"column {col}" if col == 1 else f"{col}", **small)
+    for row, y in {p.id.row: p.y_m for p in mirror.panels.values()}.items():
+        axes.text(low_x - 0.12, y, f"row {row}" if row == 1 else f"{row}", rotation=90, **small)
+
+
+def _draw_base(axes: "Axes", mirror: Mirror) -> None:
+    base = mirror.base_pose
+    ahead = {"dx": 0.22 * cos(base.heading_rad), "dy": 0.22 * sin(base.heading_rad)}
+    shape = {"width": 0.035, "head_width": 0.13, "head_length": 0.11, "length_includes_head": True}
+    axes.arrow(base.x_m, base.y_m, **ahead, **shape, color=_INK, linewidth=0, zorder=6)
+    axes.plot(base.x_m, base.y_m, "o", color=_INK, markersize=9, zorder=6, linestyle="", label="base")
+
+
+def _draw_points(figure: "Figure", axes: "Axes", points: Sequence[MapPoint]) -> None:
+    measured = [p for p in points if p.error_mm is not None]
+    errors = np.array([p.error_mm for p in measured], dtype=np.float64)
+    largest = float(errors.max()) if len(errors) else 1.0
+    top = min(LIMIT_MM, ceil(largest * 10) / 10 or 0.1)
+    dots = axes.scatter(
+        [p.x_m for p in measured], [p.y_m for p in measured], c=errors, cmap=_COLOURS, vmin=0.0, vmax=top,
+        s=40, edgecolors="white", linewidths=0.7, zorder=5,
+    )  # fmt: skip
+    skipped = [p for p in points if p.is_skipped and p.error_mm is None]
+    to_come = [p for p in points if not p.is_skipped and p.error_mm is None]
+    for some, name, look in (
+        (skipped, "skipped", {"marker": "x", "color": _BAD, "s": 36, "linewidths": 1.6}),
+        (to_come, "not measured", {"marker": "o", "facecolors": "white", "edgecolors": _QUIET, "s": 26}),
+    ):
+        if some:
+            axes.scatter([p.x_m for p in some], [p.y_m for p in some], zorder=5, label=name, **look)
+    place = axes.get_position()
+    bar_axes = figure.add_axes((place.x1 + 0.006, place.y0 + 0.2 * place.height, 0.013, 0.6 * place.height))
+    bar = figure.colorbar(dots, cax=bar_axes, extend="max" if largest > top else "neither")
+    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.ax.tick_params(labelsize=8, color=_QUIET, labelcolor=_INK)
+    bar.set_label("arrival error, mm", fontsize=9, color=_INK)
+
+
+def _dress(axes: "Axes", low: FloatArray, high: FloatArray, title: str, subtitle: str) -> None:
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x, m (deck frame)", ylabel="y, m (deck frame)")
+    axes.set_aspect("equal")
+    axes.tick_params(labelsize=8, color=_QUIET, labelcolor=_INK)
+    for side in axes.spines.values():
+        side.set_visible(False)
+    axes.text(0.0, 1.045, title, transform=axes.transAxes, fontsize=15, fontweight="bold", color=_INK)
+    axes.text(0.0, 1.018, subtitle, transform=axes.transAxes, fontsize=9.5, color=_QUIET)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, frameon=False, fontsize=8.5, labelcolor=_INK)

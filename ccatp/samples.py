@@ -1,0 +1,198 @@
+"""Pure. The values that pass between rooms: sensor samples, poses, fixes, verdicts.
+
+Units are SI and stand in the field names. Times called ``t_s`` are the robot's own monotonic clock, seconds since
+its boot, unless a docstring says otherwise. Frames are defined in ``ccatp.mirror``:
+
+* *world*: inertial, origin at the intersection of the M1 boresight axis and the M2 elevation axis.
+* *mirror*: the frame in which eq. 1.1 of the thesis is written.
+* *deck*: the mirror frame turned so that +z points to the side on which the robot drives. x grows with the panel
+  column, y with the panel row. All planning and all map look-ups use its (x, y) projection.
+* *panel*: origin at the central measurement point of a panel, x along the row, y along the column, z along the normal.
+* *robot*: origin between the wheels on the surface, x along the heading, y to the left, z along the normal.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+from typing import NamedTuple
+
+Vector3 = tuple[float, float, float]
+
+
+class ImuSample(NamedTuple):
+    """One reading of the inertial unit: acceleration along robot x (gravity removed) and angular rate about robot z."""
+
+    t_s: float
+    ax_m_s2: float
+    wz_rad_s: float
+
+
+class WheelSample(NamedTuple):
+    """One reading of the wheel encoders. ``None`` marks a wheel that gave no sample."""
+
+    t_s: float
+    right_rad_s: float | None
+    left_rad_s: float | None
+
+
+class EdgeSample(NamedTuple):
+    """One reading of the edge sensors: 1 = panel under the sensor, 0 = none."""
+
+    t_s: float
+    front_left: int
+    front_right: int
+    rear_left: int
+    rear_right: int
+
+
+class GravitySample(NamedTuple):
+    """Unit direction of gravity in the robot frame."""
+
+    t_s: float
+    gx: float
+    gy: float
+    gz: float
+
+
+class PanelId(NamedTuple):
+    """Row and column of a panel, both counted from 1 as in the mirror's data file."""
+
+    row: int
+    col: int
+
+
+class PointId(NamedTuple):
+    """A measurement point: panel and number 1 to 9 (row by row from the panel's lower left, thesis fig. 2.2)."""
+
+    row: int
+    col: int
+    point: int
+
+    @property
+    def panel(self) -> PanelId:
+        """The panel on which the point lies."""
+        return PanelId(self.row, self.col)
+
+
+@dataclass(frozen=True, slots=True)
+class PanelPose:
+    """Pose in a panel frame, ``(x, y, theta)_p`` of the thesis."""
+
+    panel: PanelId
+    x_m: float
+    y_m: float
+    heading_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class DeckPose:
+    """Pose in the deck frame: (x, y) of the robot's origin and its heading.
+
+    ``heading_rad`` is measured in the local tangent plane from the tangent of the line y = const (towards +x).
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """A multilaterated position of the puck.
+
+    Attributes:
+        t_s: robot time to which the position belongs.
+        position_m: puck centre in the world frame, shape (3,).
+        covariance_m2: 3 x 3 covariance in the world frame, row-major, length 9.
+        dop: position dilution of precision, sqrt(trace((J^T J)^-1)), dimensionless.
+        channels: the laser channels that took part.
+        residual_rms_m: root mean square of the length residuals.
+    """
+
+    t_s: float
+    position_m: Vector3
+    covariance_m2: tuple[float, ...]
+    dop: float
+    channels: tuple[int, ...]
+    residual_rms_m: float
+
+
+class EventCode(IntEnum):
+    """Event codes of the thesis, table 3.2. Labels, not priorities."""
+
+    NORMAL = 0
+    NEAR_EDGE = 1
+    ABORTED = 2
+
+
+class Corner(StrEnum):
+    """Edge sensors, in the order of the robot link."""
+
+    FRONT_LEFT = "front_left"
+    FRONT_RIGHT = "front_right"
+    REAR_LEFT = "rear_left"
+    REAR_RIGHT = "rear_right"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the danger loop says about one sensor frame.
+
+    Attributes:
+        seq: the sensors frame judged.
+        t_s: its time.
+        code: event code.
+        cause: why, in one short phrase; empty when normal.
+        signal: the signal that gave cause (``"front_left"``, ``"estimate"``, ``"emergency:fire"``), or empty.
+        value: the signal's value in the unit of ``limit``.
+        limit: the limit it passed.
+        forward, reverse, turn: the motion permitted until the next verdict.
+        off: for each edge sensor whether it takes part in a declared edge.
+    """
+
+    seq: int
+    t_s: float
+    code: EventCode
+    cause: str
+    signal: str
+    value: float
+    limit: float
+    forward: bool
+    reverse: bool
+    turn: bool
+    off: tuple[bool, bool, bool, bool] = (False, False, False, False)
+
+
+@dataclass(frozen=True, slots=True)
+class Twist:
+    """Velocity of the robot's origin: forward speed and angular rate about its z axis."""
+
+    v_m_s: float
+    omega_rad_s: float
+
+
+class StopKind(StrEnum):
+    """What a stop on the path is for."""
+
+    MEASURE = "measure"
+    VIA = "via"
+    BASE = "base"
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """One stop of a path.
+
+    Attributes:
+        x_m, y_m: where the robot's origin shall stand, deck frame.
+        kind: what the stop is for.
+        point: the measurement point, where ``kind`` is ``MEASURE``.
+        reverse: the leg that ends here is driven backwards (the heading points away from the stop).
+        heading_rad: deck heading to turn to after arriving, where one is asked for (at base).
+    """
+
+    x_m: float
+    y_m: float
+    kind: StopKind
+    point: PointId | None = None
+    reverse: bool = False
+    heading_rad: float | None = None

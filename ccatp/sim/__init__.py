@@ -1,0 +1,1 @@
+"""Pure. The simulated world: the truth that stands in for robot, mirror and laser system."""

@@ -1,0 +1,216 @@
+"""Pure. Truth of the differential drive on the curved surface, deck frame.
+
+The wheel servos are first order, ``T dw/dt + w = u`` with the set point u constant within a step, so rates, wheel
+travel and acceleration are exact at every instant of it. The body moves by one midpoint step on the surface metric;
+its error per 10 ms step at 0.2 m/s and 1 rad/s is below 10 nm.
+"""
+
+from collections.abc import Sequence
+from math import cos, exp, sin, sqrt
+from typing import Protocol
+
+from ccatp.mirror.surface import Surface
+from ccatp.samples import DeckPose
+
+# A wheel this slow stands still: the exponential of the servo would never get there, and 1e-9 rad/s is 1 um in 9 h.
+_STANDSTILL_RAD_S = 1e-9
+
+
+class Disturbance(Protocol):
+    """What pushes the body besides its wheels: slip, creep, vibration."""
+
+    def displace(
+        self, t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float
+    ) -> tuple[float, float, float]:
+        """Body displacement of one step after this disturbance, from the one before it.
+
+        Args:
+            t_s: time at the start of the step.
+            dt_s: its length.
+            forward_m, left_m: displacement along robot x and y.
+            turn_rad: rotation about robot z.
+        """
+
+
+class Plant:
+    """State of the robot's body and wheels.
+
+    Attributes:
+        x_m, y_m, z_m: robot origin on the surface, deck frame.
+        heading_rad: deck heading (see ``DeckPose``), not wrapped.
+        right_rad_s, left_rad_s: wheel rates.
+        is_moving: the last step moved the body.
+        hx, hy, lx, ly: deck-plane components of the robot's x and y axes, as ``Mirror.body_axes``.
+        forward_m, turn_rad: displacement of the last step.
+    """
+
+    __slots__ = (
+        "_decay",
+        "_decay_dt_s",
+        "_disturbances",
+        "_fx",
+        "_fxx",
+        "_fxy",
+        "_fy",
+        "_fyy",
+        "_half_base_m",
+        "_left_0",
+        "_left_set",
+        "_radius_m",
+        "_right_0",
+        "_right_set",
+        "_surface",
+        "forward_m",
+        "heading_rad",
+        "hx",
+        "hy",
+        "is_moving",
+        "lag_s",
+        "left_rad_s",
+        "lx",
+        "ly",
+        "right_rad_s",
+        "turn_rad",
+        "x_m",
+        "y_m",
+        "z_m",
+    )
+
+    def __init__(
+        self,
+        surface: Surface,
+        start: DeckPose,
+        *,
+        wheel_radius_m: float,
+        wheel_base_m: float,
+        wheel_lag_s: float,
+        disturbances: Sequence[Disturbance] = (),
+    ) -> None:
+        """Stand still at ``start``.
+
+        Args:
+            surface: the surface driven on.
+            start: first pose.
+            wheel_radius_m, wheel_base_m: geometry of the drive.
+            wheel_lag_s: time constant T of the servos, > 0.
+            disturbances: applied in this order to each step.
+        """
+        self._surface = surface
+        self._radius_m, self._half_base_m = wheel_radius_m, wheel_base_m / 2.0
+        self.lag_s = wheel_lag_s
+        self._disturbances = tuple(disturbances)
+        self.x_m, self.y_m, self.heading_rad = start.x_m, start.y_m, start.heading_rad
+        self.z_m, self._fx, self._fy, self._fxx, self._fxy, self._fyy = surface.jet(start.x_m, start.y_m)
+        self.right_rad_s = self.left_rad_s = 0.0
+        self._right_set = self._left_set = self._right_0 = self._left_0 = 0.0
+        self.forward_m = self.turn_rad = 0.0
+        self.is_moving = False
+        self._decay_dt_s = self._decay = 0.0
+        self._turn_axes()
+
+    @property
+    def pose(self) -> DeckPose:
+        """Pose of the body."""
+        return DeckPose(self.x_m, self.y_m, self.heading_rad)
+
+    def step(self, t_s: float, dt_s: float, right_set_rad_s: float, left_set_rad_s: float) -> None:
+        """Advance by ``dt_s`` with constant wheel set points.
+
+        Wheel travel is ``u dt + (w - u) T (1 - exp(-dt/T))``. With s the forward displacement and d the rotation,
+        the deck displacement is s along ``h = cos(psi_m) e1 + sin(psi_m) e2`` at the middle of the step, and
+        ``dpsi = d - fy (fxx dx + fxy dy) / ((1 + fx^2) W)``, the transport of the heading along the surface.
+
+        Args:
+            t_s: time at the start of the step.
+            dt_s: length of the step.
+            right_set_rad_s, left_set_rad_s: wheel set points.
+        """
+        right, left = self.right_rad_s, self.left_rad_s
+        self._right_0, self._left_0 = right, left
+        self._right_set, self._left_set = right_set_rad_s, left_set_rad_s
+        if right == left == right_set_rad_s == left_set_rad_s == 0.0 and not self._disturbances:
+            self.is_moving = False
+            self.forward_m = self.turn_rad = 0.0
+            return
+        if dt_s != self._decay_dt_s:
+            self._decay_dt_s, self._decay = dt_s, exp(-dt_s / self.lag_s)
+        lagging_s = self.lag_s * (1.0 - self._decay)
+        right_rad = right_set_rad_s * dt_s + (right - right_set_rad_s) * lagging_s
+        left_rad = left_set_rad_s * dt_s + (left - left_set_rad_s) * lagging_s
+        self.right_rad_s = _settled(right_set_rad_s, right_set_rad_s + (right - right_set_rad_s) * self._decay)
+        self.left_rad_s = _settled(left_set_rad_s, left_set_rad_s + (left - left_set_rad_s) * self._decay)
+        forward = 0.5 * self._radius_m * (right_rad + left_rad)
+        turn = 0.5 * self._radius_m * (right_rad - left_rad) / self._half_base_m
+        sideways = 0.0
+        for disturbance in self._disturbances:
+            forward, sideways, turn = disturbance.displace(t_s, dt_s, forward, sideways, turn)
+        self._move(forward, sideways, turn)
+
+    def _move(self, forward_m: float, left_m: float, turn_rad: float) -> None:
+        """Displace the body by one midpoint step."""
+        self.is_moving = True
+        self.forward_m, self.turn_rad = forward_m, turn_rad
+        # Where the middle of the step will be, from the axes at its start: good to second order, which is all a
+        # derivative of the surface there needs.
+        x, y = self.x_m, self.y_m
+        mx = x + 0.5 * (forward_m * self.hx + left_m * self.lx)
+        my = y + 0.5 * (forward_m * self.hy + left_m * self.ly)
+        f, fx, fy, fxx, fxy, fyy = self._surface.jet(mx, my)
+        s2 = 1.0 + fx * fx
+        s = sqrt(s2)
+        w = sqrt(s2 + fy * fy)
+        middle = self.heading_rad + 0.5 * turn_rad
+        c, d = cos(middle), sin(middle)
+        # The chord of an arc is shorter than the arc by sin(a/2)/(a/2).
+        chord = 1.0 - turn_rad * turn_rad / 24.0
+        along_1 = chord * (forward_m * c - left_m * d)
+        along_2 = chord * (forward_m * d + left_m * c)
+        dx = (along_1 - along_2 * fx * fy / w) / s
+        dy = along_2 * s / w
+        self.x_m, self.y_m = x + dx, y + dy
+        self.heading_rad += turn_rad - fy * (fxx * dx + fxy * dy) / (s2 * w)
+        ex, ey = self.x_m - mx, self.y_m - my
+        self.z_m = f + fx * ex + fy * ey + 0.5 * (fxx * ex * ex + fyy * ey * ey) + fxy * ex * ey
+        self._fx, self._fy = fx + fxx * ex + fxy * ey, fy + fxy * ex + fyy * ey
+        self._turn_axes()
+
+    def _turn_axes(self) -> None:
+        fx, fy = self._fx, self._fy
+        s2 = 1.0 + fx * fx
+        s = sqrt(s2)
+        w = sqrt(s2 + fy * fy)
+        c, d = cos(self.heading_rad), sin(self.heading_rad)
+        e2x, e2y = -fx * fy / (w * s), s / w
+        self.hx, self.hy = c / s + d * e2x, d * e2y
+        self.lx, self.ly = c * e2x - d / s, c * e2y
+
+    def decays_at(self, taus_s: Sequence[float]) -> list[float]:
+        """``exp(-tau/T)`` for times after the start of a step; kept by those who sample the same instants each step."""
+        lag_s = self.lag_s
+        return [exp(-tau / lag_s) for tau in taus_s]
+
+    def rates_at(self, decays: Sequence[float]) -> list[tuple[float, float]]:
+        """(right, left) wheel rates within the last step, rad/s, at the instants of ``decays_at``."""
+        right_set, left_set = self._right_set, self._left_set
+        right, left = self._right_0 - right_set, self._left_0 - left_set
+        return [(right_set + right * e, left_set + left * e) for e in decays]
+
+    def acceleration_at(self, decay: float) -> float:
+        """Acceleration dv/dt along robot x within the last step, m/s^2."""
+        lag = self._right_set - self._right_0 + self._left_set - self._left_0
+        return 0.5 * self._radius_m * lag * decay / self.lag_s
+
+    def turn_rate_at(self, decay: float) -> float:
+        """Angular rate about robot z within the last step, rad/s."""
+        right_set, left_set = self._right_set, self._left_set
+        difference = right_set - left_set + (self._right_0 - right_set - self._left_0 + left_set) * decay
+        return 0.5 * self._radius_m * difference / self._half_base_m
+
+    def stop_dead(self) -> None:
+        """The wheels stop at once and for good (the robot fell)."""
+        self.right_rad_s = self.left_rad_s = self._right_0 = self._left_0 = self._right_set = self._left_set = 0.0
+        self.is_moving = False
+
+
+def _settled(set_point_rad_s: float, rate_rad_s: float) -> float:
+    return 0.0 if set_point_rad_s == 0.0 and abs(rate_rad_s) < _STANDSTILL_RAD_S else rate_rad_s

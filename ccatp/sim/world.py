@@ -1,0 +1,154 @@
+"""Pure. The truth of one run: where the robot really is, how the panels really lie, and whether it fell."""
+
+from collections import deque
+from collections.abc import Iterable
+from math import hypot, inf
+
+import numpy as np
+
+from ccatp.config.models import Config
+from ccatp.mirror.alignment import PanelMisalignment, misaligned_puck_world
+from ccatp.mirror.mirror import Mirror
+from ccatp.samples import PanelId, PanelPose, Vector3
+from ccatp.sim.plant import Plant
+
+# seq, t, x, y, psi, X, Y, Z (surface point, deck), clearance of the worst edge sensor, fallen, sensors beyond the rim
+TruthRow = tuple[int, float, float, float, float, float, float, float, float, int, int]
+
+NEAR_RIM_M = 0.25
+FAR_CLEARANCE_M = 1.0
+"""Stands for the clearance while the robot's origin is more than ``NEAR_RIM_M`` from the rim."""
+
+
+class World:
+    """Robot on mirror.
+
+    Attributes:
+        mirror: the ideal mirror.
+        plant: body and wheels.
+        misalignments: of each panel.
+        start_panel_pose, start_pose: where the robot really stands at boot.
+        is_fallen: it fell, for good.
+    """
+
+    def __init__(self, cfg: Config, mirror: Mirror, rng: np.random.Generator, window_frames: int) -> None:
+        """Draw the start errors and the misalignments.
+
+        Args:
+            cfg: robot, world and truth sections.
+            mirror: the mirror.
+            rng: parent of the generators; the draws of one kind do not depend on the others.
+            window_frames: length of the window of ``moved_m``, in frames.
+        """
+        start_rng, truth_rng = rng.spawn(2)
+        self.mirror = mirror
+        self.misalignments = draw_misalignments(mirror.panels, cfg, truth_rng)
+        self.start_panel_pose = draw_start(mirror.base_panel_pose, cfg, start_rng)
+        self.start_pose = mirror.deck_pose(self.start_panel_pose)
+        robot, sim = cfg.robot, cfg.sim.robot
+        self.plant = Plant(
+            mirror.surface,
+            self.start_pose,
+            wheel_radius_m=robot.wheel_radius_m,
+            wheel_base_m=robot.wheel_base_m,
+            wheel_lag_s=sim.wheel_lag_s,
+        )
+        self._puck_height_m = robot.puck_height_m
+        self._thrust_floor, self._fall_thrust_s = sim.fan_floor, sim.fall_thrust_s
+        self._weak_s = 0.0
+        self.is_fallen = False
+        self._places: deque[tuple[float, float]] = deque(maxlen=window_frames + 1)
+        self._places.append((self.plant.x_m, self.plant.y_m))
+        # The origin's distance to the rim is known to be at least this; it shrinks with the distance driven.
+        self._rim_bound_m = -inf
+        self._clearance_m, self._off_mask = FAR_CLEARANCE_M, 0
+
+    def step(self, t_s: float, dt_s: float, right_rad_s: float, left_rad_s: float, thrust: float) -> None:
+        """Advance by one frame.
+
+        The robot falls when its centre of mass (its origin) passes the rim, or on an overhanging mirror when the mean
+        thrust was below the floor for ``fall_thrust_s``.
+
+        Args:
+            t_s: time at the start of the frame.
+            dt_s: its length.
+            right_rad_s, left_rad_s: wheel set points.
+            thrust: mean thrust of the fans during the frame, 0 to 1.
+        """
+        plant = self.plant
+        if self.is_fallen:
+            return
+        plant.step(t_s, dt_s, right_rad_s, left_rad_s)
+        self._places.append((plant.x_m, plant.y_m))
+        if self.mirror.overhang:
+            self._weak_s = self._weak_s + dt_s if thrust < self._thrust_floor else 0.0
+            # Half a frame of slack: a sum of steps is not exact.
+            if self._weak_s >= self._fall_thrust_s - 0.5 * dt_s:
+                self._fall()
+        if plant.is_moving:
+            self._rim_bound_m -= abs(plant.forward_m)
+            if self._rim_bound_m < NEAR_RIM_M:
+                self._rim_bound_m = self.mirror.rim.signed_distance_m(plant.x_m, plant.y_m)
+                if self._rim_bound_m < 0.0:
+                    self._fall()
+
+    def _fall(self) -> None:
+        self.is_fallen = True
+        self.plant.stop_dead()
+
+    def look_at_rim(self, sensors: Iterable[tuple[float, float]]) -> None:
+        """Take note of the edge sensors' places (deck, m) for the truth rows."""
+        if self._rim_bound_m == -inf:
+            self._rim_bound_m = self.mirror.rim.signed_distance_m(self.plant.x_m, self.plant.y_m)
+        elif not self.plant.is_moving:
+            return
+        self._clearance_m, self._off_mask = FAR_CLEARANCE_M, 0
+        if self._rim_bound_m < NEAR_RIM_M:
+            for k, (x, y) in enumerate(sensors):
+                clearance_m = self.mirror.rim.signed_distance_m(x, y)
+                self._clearance_m = min(self._clearance_m, clearance_m)
+                self._off_mask |= (clearance_m < 0.0) << k
+
+    def truth_row(self, seq: int, t_s: float) -> TruthRow:
+        """The truth at a frame."""
+        p = self.plant
+        fallen = int(self.is_fallen)
+        x, y = p.x_m, p.y_m
+        return seq, t_s, x, y, p.heading_rad, x, y, p.z_m, self._clearance_m, fallen, self._off_mask
+
+    def puck_world(self) -> Vector3:
+        """Centre of the puck on the panel as it really lies, world frame, m."""
+        pose = self.plant.pose
+        panel = self.mirror.nearest_panel(pose.x_m, pose.y_m)
+        return misaligned_puck_world(self.mirror, panel, self.misalignments[panel], pose, self._puck_height_m)
+
+    def moved_m(self) -> float:
+        """Furthest the robot was from its present place within the last window, m."""
+        x, y = self._places[-1]
+        fx, fy = self.mirror.surface.gradient(x, y)
+        farthest = 0.0
+        for px, py in self._places:
+            dx, dy = px - x, py - y
+            farthest = max(farthest, hypot(dx, dy, fx * dx + fy * dy))
+        return farthest
+
+
+def draw_start(base: PanelPose, cfg: Config, rng: np.random.Generator) -> PanelPose:
+    """Where the robot is really put down: base plus normal errors in x, y and heading of the panel frame."""
+    dx, dy, turn = (float(n) for n in rng.standard_normal(3))
+    sigma_m, sigma_rad = cfg.world.start_position_sigma_m, cfg.world.start_heading_sigma_rad
+    return PanelPose(base.panel, base.x_m + sigma_m * dx, base.y_m + sigma_m * dy, base.heading_rad + sigma_rad * turn)
+
+
+def draw_misalignments(
+    panels: Iterable[PanelId], cfg: Config, rng: np.random.Generator
+) -> dict[PanelId, PanelMisalignment]:
+    """Normal piston, tip and tilt of each panel, in the order of ``panels``."""
+    truth = cfg.sim.truth
+    found: dict[PanelId, PanelMisalignment] = {}
+    for panel in panels:
+        piston, tip, tilt = (float(n) for n in rng.standard_normal(3))
+        found[panel] = PanelMisalignment(
+            truth.piston_sigma_m * piston, truth.tilt_sigma_rad * tip, truth.tilt_sigma_rad * tilt
+        )
+    return found

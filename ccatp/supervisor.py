@@ -1,0 +1,254 @@
+"""Glue. THE process table: what runs, in which order it starts and stops; and one run from its start to its summary."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from fcntl import LOCK_EX, LOCK_NB, flock
+from pathlib import Path
+from types import FrameType
+
+import zmq
+
+from ccatp.config.loader import dump_config, load_config
+from ccatp.config.models import Config
+from ccatp.errors import ConfigError, ExitStatus, RefusedError
+from ccatp.processes.common import Endpoints, open_log
+from ccatp.processes.run_collector import RunCollector
+from ccatp.processes.run_view import RunView
+from ccatp.run_options import RunOptions, default_run_dir
+from ccatp.runtime_dir import make_runtime_dir
+
+POLL_MS = 20
+STOP_TIMEOUT_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessSpec:
+    """One row of the process table.
+
+    Attributes:
+        name: as in logs.
+        module: run with ``python -m``.
+        is_stand_in: runs with ``--sim`` only.
+        listens: the configuration section with the host and port of its listening socket, bound by the supervisor.
+    """
+
+    name: str
+    module: str
+    is_stand_in: bool = False
+    listens: str = ""
+
+
+# In the order of starting; stopping is in the reverse order, so that main holds the wheels first.
+PROCESSES: tuple[ProcessSpec, ...] = (
+    ProcessSpec("dataloop", "ccatp.processes.dataloop", is_stand_in=True, listens="sim.robot"),
+    ProcessSpec("etalon", "ccatp.processes.etalon", is_stand_in=True, listens="sim.etalon"),
+    ProcessSpec("danger", "ccatp.processes.danger_loop"),
+    ProcessSpec("main", "ccatp.processes.main_loop"),
+)
+
+
+class Interrupted(Exception):
+    """SIGINT or SIGTERM arrived."""
+
+
+def run_survey(options: RunOptions) -> int:
+    """Run one survey to its end.
+
+    Args:
+        options: what the command line asked for.
+
+    Returns:
+        The exit status of ``cli.md``.
+
+    Raises:
+        CcatpError: the run could not begin.
+    """
+    overrides = dict(options.overrides)
+    cfg = load_config(options.config_file, overrides)
+    started = time.monotonic()
+    with ExitStack() as stack:
+        runtime_dir = make_runtime_dir(str(options.runtime_dir or cfg.run.runtime_dir), os.environ)
+        stack.enter_context(_lock(runtime_dir))
+        sockets = {p.name: stack.enter_context(_listen(cfg, p)) for p in _processes(options) if p.listens}
+        cfg = _with_addresses(cfg, sockets) if options.sim else cfg
+        run_dir = _make_run_dir(options, cfg)
+        (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
+        run = _Run(options, cfg, run_dir, Endpoints(runtime_dir), sockets, started)
+        return run.go()
+
+
+def _processes(options: RunOptions) -> list[ProcessSpec]:
+    return [p for p in PROCESSES if options.sim or not p.is_stand_in]
+
+
+@contextmanager
+def _lock(runtime_dir: Path) -> Iterator[None]:
+    with (runtime_dir / "lock").open("w") as file:
+        try:
+            flock(file, LOCK_EX | LOCK_NB)
+        except OSError as error:
+            raise RefusedError(
+                f"another ccatp runs in {runtime_dir}; stop it with 'ccatp stop', or give this one its own --runtime-dir"
+            ) from error
+        yield
+
+
+@contextmanager
+def _listen(cfg: Config, process: ProcessSpec) -> Iterator[socket.socket]:
+    section = cfg.sim.robot if process.listens == "sim.robot" else cfg.sim.etalon
+    with socket.socket() as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((section.host, section.port))
+        except OSError as error:
+            raise ConfigError(
+                f"{process.listens}.port: cannot listen on {section.host}:{section.port}: {error.strerror}; "
+                f"stop who uses it, or choose another with --set {process.listens}.port=0 (0 = any free port)"
+            ) from error
+        listener.listen(16)
+        yield listener
+
+
+def _with_addresses(cfg: Config, sockets: dict[str, socket.socket]) -> Config:
+    """The configuration with the addresses at which the stand-ins really listen."""
+
+    def at(process: str) -> dict[str, object]:
+        host, port = sockets[process].getsockname()
+        return {"host": host, "port": port}
+
+    robot, etalon = at("dataloop"), at("etalon")
+    sim = {
+        "robot": cfg.sim.robot.model_copy(update=robot),
+        "etalon": cfg.sim.etalon.model_copy(update=etalon),
+    }
+    return cfg.model_copy(
+        update={
+            "robot": cfg.robot.model_copy(update=robot),
+            "etalon": cfg.etalon.model_copy(update=etalon),
+            "sim": cfg.sim.model_copy(update=sim),
+        }
+    )
+
+
+def _make_run_dir(options: RunOptions, cfg: Config) -> Path:
+    run_dir = options.run_dir or default_run_dir(cfg.run.mirror, cfg.run.seed, datetime.now(UTC))
+    has_mission = (run_dir / "mission.sqlite").exists()
+    if has_mission and not options.resume:
+        raise ConfigError(f"--run-dir: {run_dir} holds a mission already; give --resume to go on with it, or another folder")
+    if options.resume and not has_mission:
+        raise ConfigError(f"--resume: no mission in {run_dir}; name the folder of the run with --run-dir")
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--run-dir: cannot make {run_dir}: {error.strerror}") from error
+    return run_dir.absolute()
+
+
+class _Run:
+    """The children of one run and what is collected from them."""
+
+    def __init__(
+        self,
+        options: RunOptions,
+        cfg: Config,
+        run_dir: Path,
+        endpoints: Endpoints,
+        sockets: dict[str, socket.socket],
+        started: float,
+    ) -> None:
+        self._options, self._cfg, self._run_dir, self._endpoints = options, cfg, run_dir, endpoints
+        self._sockets, self._started = sockets, started
+        self._children: dict[str, subprocess.Popen[bytes]] = {}
+        self._log = open_log(run_dir / "log.jsonl", "supervisor")
+
+    def go(self) -> int:
+        """Start, watch, collect, stop; returns the exit status."""
+        self._log.info("run", mirror=self._cfg.mirror.name, seed=self._cfg.run.seed, sim=self._options.sim)
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        previous = {n: signal.signal(n, _raise_interrupted) for n in (signal.SIGINT, signal.SIGTERM)}
+        collector = RunCollector(context, self._endpoints, self._cfg, self._run_dir, is_sim=self._options.sim)
+        view = RunView(self._cfg, is_sim=self._options.sim, run_dir=self._run_dir)
+        try:
+            with collector, view:
+                status = self._watch(collector, view)
+                self._stop_all(view)
+                wall_s = time.monotonic() - self._started
+                summary = collector.summary(wall_s)
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+            self._kill_all()
+            context.destroy(linger=0)
+        (self._run_dir / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+        self._log.info("end", status=int(status))
+        view.show_summary(summary, as_json=self._options.json_output)
+        return int(status)
+
+    def _watch(self, collector: RunCollector, view: RunView) -> ExitStatus:
+        try:
+            for process in _processes(self._options):
+                self._start(process)
+            while True:
+                collector.collect(POLL_MS, view)
+                if collector.is_over:
+                    collector.finish()
+                    return collector.exit_status
+                for name, child in self._children.items():
+                    if child.poll() is not None:
+                        return self._died(name, child.returncode, view)
+        except Interrupted:
+            view.say("warning", "interrupted: holding the wheels and saving")
+            return ExitStatus.INTERRUPTED
+
+    def _start(self, process: ProcessSpec) -> None:
+        command = [sys.executable, "-m", process.module]
+        command += ["--run-dir", str(self._run_dir), "--runtime-dir", str(self._endpoints.runtime_dir)]
+        command += ["--realtime"] if self._options.realtime else []
+        command += ["--resume"] if self._options.resume else []
+        fds: tuple[int, ...] = ()
+        if process.name in self._sockets:
+            fds = (self._sockets[process.name].fileno(),)
+            command += ["--listen-fd", str(fds[0])]
+        # Their own session: a Ctrl-C in the terminal reaches the supervisor alone, which stops them in order.
+        self._children[process.name] = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=sys.stderr, pass_fds=fds, start_new_session=True
+        )
+
+    def _died(self, name: str, code: int, view: RunView) -> ExitStatus:
+        self._log.error("process died", name=name, code=code)
+        known = {int(s) for s in ExitStatus if s is not ExitStatus.COMPLETE}
+        if code in known:
+            return ExitStatus(code)
+        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
+        view.say("error", f"process {name} {how}: run ended, wheels held; see {self._run_dir / 'log.jsonl'}")
+        return ExitStatus.HELD
+
+    def _stop_all(self, view: RunView) -> None:
+        for name, child in reversed(self._children.items()):
+            if child.poll() is None:
+                child.terminate()
+                try:
+                    child.wait(STOP_TIMEOUT_S)
+                except subprocess.TimeoutExpired:
+                    view.say("error", f"process {name} did not stop within {STOP_TIMEOUT_S} s and was killed")
+                    child.kill()
+                    child.wait()
+
+    def _kill_all(self) -> None:
+        for child in self._children.values():
+            if child.poll() is None:
+                child.kill()
+                child.wait()
+
+
+def _raise_interrupted(_number: int, _frame: FrameType | None) -> None:
+    raise Interrupted

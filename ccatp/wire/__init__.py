@@ -1,0 +1,1 @@
+"""Pure. Every message that crosses a border, and its codec."""

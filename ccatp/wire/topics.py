@@ -1,0 +1,243 @@
+"""Pure. THE topic table: everything the processes share over ZeroMQ, and its codec.
+
+A message is one ZeroMQ frame: topic name, one space, JSON. Liveness, recording and displays are derived from the table;
+a new topic is a row. Levels are repeated at the topic's rate; ``rate_hz`` 0 marks an event.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from ccatp.samples import EventCode, Verdict
+
+
+class Message(msgspec.Struct, kw_only=True):
+    """Base of all messages: every one carries a sequence number and a time."""
+
+    seq: int
+    t_s: float
+
+
+class Presence(Message):
+    """A process is alive, before and while frames flow.
+
+    ``phase``: starting, ready (may be joined to), joined, done.
+    """
+
+    process: str
+    pid: int
+    phase: str
+
+
+class Estimate(Message):
+    """The localizer's pose after frame ``seq``, deck frame."""
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+    sigma_m: float
+    state: str
+
+
+class VerdictMessage(Message):
+    """The danger loop's verdict on frame ``seq`` (fields as in ``ccatp.samples.Verdict``)."""
+
+    code: int
+    cause: str
+    signal: str
+    value: float
+    limit: float
+    forward: bool
+    reverse: bool
+    turn: bool
+    off: tuple[bool, bool, bool, bool]
+
+
+class MissionStatus(Message):
+    """Mission state for operators."""
+
+    state: str
+    cause: str
+    done: int
+    skipped: int
+    total: int
+    point: str
+    elapsed_s: float
+    eta_s: float
+    error_mm: float
+    code: int
+    outcome: str
+    lower_bound_s: float
+
+
+class Track(Message):
+    """A batch of estimates.
+
+    Rows: seq, t_s, x_m, y_m, heading_rad (deck), X, Y, Z (surface point, deck, m), sigma_m.
+    """
+
+    rows: list[tuple[int, float, float, float, float, float, float, float, float]]
+
+
+class SensorLines(Message):
+    """A batch of sensors lines as they came from the robot, each a JSON object of the robot link."""
+
+    lines: list[msgspec.Raw]
+
+
+class Arrival(Message):
+    """The robot came to rest at a measurement point for the first time; ``error_mm`` is the estimated distance."""
+
+    point: tuple[int, int, int]
+    error_mm: float
+
+
+class FixMessage(Message):
+    """A committed fix of a measurement point, world frame."""
+
+    point: tuple[int, int, int]
+    position_m: tuple[float, float, float]
+    covariance_m2: list[float]
+    dop: float
+    residual_rms_m: float
+    channels: list[int]
+    jump_mm: float
+
+
+class DangerEvent(Message):
+    """The verdict's code changed."""
+
+    code: int
+    cause: str
+    signal: str
+    value: float
+    limit: float
+    off: tuple[bool, bool, bool, bool]
+
+
+class Log(Message):
+    """One line for the operator's terminal."""
+
+    level: str
+    process: str
+    text: str
+
+
+class Timing(Message):
+    """Wall time of main-loop ticks, microseconds."""
+
+    tick_us: list[float]
+
+
+class Truth(Message):
+    """A batch of simulated truth (simulation only).
+
+    Rows: seq, t_s, x_m, y_m, heading_rad (deck), X, Y, Z (surface point, deck, m), clearance of the worst edge sensor
+    to the rim (m), fallen (0 or 1), mask of the edge sensors beyond the rim (bit 0 = front left).
+    """
+
+    rows: list[tuple[int, float, float, float, float, float, float, float, float, int, int]]
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One row of the table.
+
+    Attributes:
+        name: as it stands before the JSON.
+        message: the type.
+        publisher: the process that publishes it.
+        rate_hz: nominal rate; 0 for an event.
+        stale_after_s: a level older than this must not be used; 0 for events and batches.
+        recorded: goes to ``telemetry.mcap``.
+    """
+
+    name: str
+    message: type[Message]
+    publisher: str
+    rate_hz: float
+    stale_after_s: float
+    recorded: bool
+
+
+TOPICS: tuple[Topic, ...] = (
+    Topic("presence.main", Presence, "main", 10.0, 1.0, False),
+    Topic("presence.danger", Presence, "danger", 10.0, 1.0, False),
+    Topic("estimate", Estimate, "main", 100.0, 0.15, False),
+    Topic("verdict", VerdictMessage, "danger", 100.0, 0.15, False),
+    Topic("mission", MissionStatus, "main", 10.0, 1.0, True),
+    Topic("track", Track, "main", 1.0, 0.0, True),
+    Topic("sensors", SensorLines, "main", 1.0, 0.0, True),
+    Topic("arrival", Arrival, "main", 0.0, 0.0, True),
+    Topic("fix", FixMessage, "main", 0.0, 0.0, True),
+    Topic("danger_event", DangerEvent, "danger", 0.0, 0.0, True),
+    Topic("log", Log, "main", 0.0, 0.0, True),
+    Topic("timing", Timing, "main", 1.0, 0.0, False),
+    Topic("truth", Truth, "dataloop", 1.0, 0.0, True),
+)
+BY_NAME = {topic.name: topic for topic in TOPICS}
+_encoder = msgspec.json.Encoder()
+_decoders: dict[str, msgspec.json.Decoder[Any]] = {t.name: msgspec.json.Decoder(t.message) for t in TOPICS}
+_prefixes = {topic.name: topic.name.encode() + b" " for topic in TOPICS}
+
+
+class BadMessage(Exception):
+    """A frame on the bus that is not of the topic table."""
+
+
+def pack(name: str, message: Message) -> bytes:
+    """One frame: topic, space, JSON."""
+    return _prefixes[name] + _encoder.encode(message)
+
+
+def unpack(frame: bytes) -> tuple[str, bytes, Message]:
+    """The topic's name, JSON text and message of a frame; raises ``BadMessage``."""
+    name, _, body = frame.partition(b" ")
+    decoder = _decoders.get(name.decode("ascii", "replace"))
+    if decoder is None:
+        raise BadMessage(f"unknown topic {name[:40]!r}")
+    try:
+        message: Message = decoder.decode(body)
+    except msgspec.MsgspecError as error:
+        raise BadMessage(f"topic {name.decode()}: {error}") from error
+    return name.decode(), body, message
+
+
+def schema_of(name: str) -> dict[str, Any]:
+    """JSON schema of a topic's messages."""
+    return msgspec.json.schema(BY_NAME[name].message)
+
+
+def verdict_message(verdict: Verdict) -> VerdictMessage:
+    """The message that carries a verdict."""
+    return VerdictMessage(
+        seq=verdict.seq,
+        t_s=verdict.t_s,
+        code=int(verdict.code),
+        cause=verdict.cause,
+        signal=verdict.signal,
+        value=verdict.value,
+        limit=verdict.limit,
+        forward=verdict.forward,
+        reverse=verdict.reverse,
+        turn=verdict.turn,
+        off=verdict.off,
+    )
+
+
+def verdict_of(message: VerdictMessage) -> Verdict:
+    """The verdict in a message."""
+    return Verdict(
+        message.seq,
+        message.t_s,
+        EventCode(message.code),
+        message.cause,
+        message.signal,
+        message.value,
+        message.limit,
+        message.forward,
+        message.reverse,
+        message.turn,
+        message.off,
+    )

@@ -1,0 +1,79 @@
+"""Fixtures of all tests: nothing may outlive its test."""
+
+import asyncio
+import inspect
+import os
+import socket
+from collections.abc import AsyncIterator, Iterator
+
+import psutil
+import pytest
+
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+
+# Processes that end on their own after a test closed its side of them.
+GRACE_S = 2.0
+# Passes of the event loop that cancelled tasks and closing transports get to finish.
+GRACE_PASSES = 10
+
+
+@pytest.fixture(autouse=True)
+def nothing_leaks(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Fail a test that leaves a child process or an asyncio task behind."""
+    before = _children()
+    if inspect.iscoroutinefunction(getattr(request.function, "__wrapped__", request.function)):
+        request.getfixturevalue("no_task_leaks")
+    yield
+    if leaked := _children() - before:
+        shown = ", ".join(_describe(child) for child in leaked)
+        _, alive = psutil.wait_procs(leaked, timeout=GRACE_S)
+        if alive:
+            for child in alive:
+                child.kill()
+            psutil.wait_procs(alive, timeout=GRACE_S)
+            pytest.fail(f"child processes left behind: {shown}")
+
+
+@pytest.fixture
+async def no_task_leaks() -> AsyncIterator[None]:
+    """Fail when tasks are left in the event loop of the test. Set up for each asyncio test."""
+    before = asyncio.all_tasks()
+    yield
+    for _ in range(GRACE_PASSES):
+        leaked = asyncio.all_tasks() - before - {asyncio.current_task()}
+        if not leaked:
+            return
+        await asyncio.sleep(0)
+    pytest.fail(f"asyncio tasks left behind: {', '.join(sorted(map(repr, leaked)))}")
+
+
+def _children() -> set[psutil.Process]:
+    """Child processes of this one; multiprocessing keeps one helper of its own for good."""
+    return {
+        child
+        for child in psutil.Process(os.getpid()).children(recursive=True)
+        if "multiprocessing.resource_tracker" not in _describe(child)
+    }
+
+
+def _describe(child: psutil.Process) -> str:
+    try:
+        return f"{child.pid} {' '.join(child.cmdline()) or child.name()}"
+    except psutil.Error:  # it ended in between
+        return str(child.pid)
+
+
+@pytest.fixture
+def free_port() -> int:
+    """A TCP port of 127.0.0.1 that was free a moment ago. Prefer port 0 where the code under test can report its own."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+    return port
+
+
+@pytest.fixture(scope="session")
+def config() -> Config:
+    """The default configuration (frozen, so one serves all)."""
+    return load_config()

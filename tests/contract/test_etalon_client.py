@@ -1,0 +1,531 @@
+"""The Etalon client against a scripted server that misbehaves in every way, and against the stand-in."""
+
+import asyncio
+from collections import deque
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+
+import numpy as np
+import pytest
+
+from ccatp.config.models import EtalonConfig, SimEtalonConfig
+from ccatp.etalon_client import (
+    BadSolution,
+    EtalonBadReply,
+    EtalonClient,
+    EtalonError,
+    EtalonServerError,
+    EtalonTimeout,
+    EtalonUnreachable,
+    Readiness,
+    TooFewChannels,
+)
+from ccatp.etalon_standin import EtalonStandIn, FixedPuck
+from ccatp.samples import Fix, Vector3
+from ccatp.wire.multiline import (
+    FLAGS,
+    ChannelData,
+    ChannelRecord,
+    Connected,
+    Environment,
+    LaserReady,
+    Remark,
+    format_reply,
+)
+
+CHANNELS = (1, 2, 3, 4, 5, 6, 7, 8)
+COLLIMATORS = np.array([[x, y, z] for x in (-4.0, 5.0) for y in (-5.0, 4.0) for z in (-3.0, 6.0)])
+PUCK = (0.31, -1.13, 0.42)
+EXPECTED = (0.30, -1.10, 0.40)
+ELSEWHERE = (0.25, -1.05, 0.45)
+GOOD_ASK = b"latestlengthvalid,1,2,3,4,5,6,7,8\r\n"
+EXACT_M = 1e-8  # lengths without noise: the rest is rounding
+
+Action = bytes | Callable[[asyncio.StreamWriter], Awaitable[None]]
+
+
+def records(position: Vector3 = PUCK, channels: tuple[int, ...] = CHANNELS) -> list[ChannelRecord]:
+    lengths_mm = np.linalg.norm(COLLIMATORS - position, axis=1) * 1e3
+    return [ChannelRecord(channel, float(lengths_mm[channel - 1]), 400, 2000, 5.0, 525.0, 30.0) for channel in channels]
+
+
+def lengths(position: Vector3 = PUCK, channels: tuple[int, ...] = CHANNELS, server_error: int = 0) -> bytes:
+    return format_reply(ChannelData(tuple(records(position, channels)), server_error))
+
+
+class ScriptedServer:
+    """Answers each line, on whatever connection, with the next action of its script; then with good lengths."""
+
+    def __init__(self) -> None:
+        self.script: deque[Action] = deque()
+        self.asked: list[bytes] = []
+        self.connections = 0
+        self.greeting: deque[bytes] = deque()
+        self.port = 0
+        self._server: asyncio.Server | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    async def start(self) -> None:
+        self._server = await asyncio.start_server(self._serve, "127.0.0.1", self.port, reuse_address=True)
+        self.port = self._server.sockets[0].getsockname()[1]
+
+    async def stop(self) -> None:
+        assert self._server is not None
+        self._server.close()
+        tasks = tuple(self._tasks)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await self._server.wait_closed()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._tasks.add(task)
+        self.connections += 1
+        try:
+            if self.greeting:
+                writer.write(self.greeting.popleft())
+            while line := await reader.readline():
+                self.asked.append(line)
+                action = self.script.popleft() if self.script else lengths()
+                if isinstance(action, bytes):
+                    writer.write(action)
+                else:
+                    await action(writer)
+                await writer.drain()
+        except (ConnectionError, asyncio.CancelledError):
+            pass  # the latter by stop()
+        finally:
+            self._tasks.discard(task)
+            writer.transport.abort()
+
+
+async def silence(_: asyncio.StreamWriter) -> None:
+    """No reply."""
+
+
+async def hang_up(writer: asyncio.StreamWriter) -> None:
+    writer.close()
+
+
+async def cut_off(writer: asyncio.StreamWriter) -> None:
+    writer.write(lengths()[:100])
+    writer.close()
+
+
+async def flood(writer: asyncio.StreamWriter) -> None:
+    while True:
+        writer.write(b"1234,5678_" * 1000)
+        await writer.drain()
+
+
+@pytest.fixture
+async def server() -> AsyncIterator[ScriptedServer]:
+    scripted = ScriptedServer()
+    await scripted.start()
+    yield scripted
+    await scripted.stop()
+
+
+def config(port: int, **changes: float) -> EtalonConfig:
+    values = {
+        "connect_timeout_s": 1.0,
+        "request_timeout_s": 1.0,
+        "retries": 0,
+        "reconnect_delay_s": 0.001,
+        "measuring_time_s": 0.001,
+        "length_sigma_m": 1e-6,
+        "length_sigma_per_m": 2.5e-7,
+        "max_residual_m": 5e-4,
+        "max_dop": 20.0,
+        "max_distance_m": 0.5,
+    }
+    return EtalonConfig.model_validate({"host": "127.0.0.1", "port": port} | values | changes)
+
+
+@asynccontextmanager
+async def client_of(port: int, **changes: float) -> AsyncIterator[EtalonClient]:
+    client = EtalonClient(config(port, **changes), CHANNELS, COLLIMATORS)
+    try:
+        yield client
+    finally:
+        await client.close()
+
+
+def assert_at(fix: Fix, position: Vector3) -> None:
+    assert fix.position_m == pytest.approx(position, abs=EXACT_M)
+
+
+async def test_a_measurement_asks_once_and_gives_the_fix_at_the_time_of_standstill(server: ScriptedServer) -> None:
+    async with client_of(server.port) as client:
+        await client.connect()
+        fix = await client.measure(123.45, EXPECTED)
+    assert server.asked == [GOOD_ASK]
+    assert fix.t_s == 123.45
+    assert fix.channels == CHANNELS
+    assert_at(fix, PUCK)
+    assert fix.residual_rms_m < EXACT_M
+    covariance = np.array(fix.covariance_m2).reshape(3, 3)
+    # Lengths of some 7 m: sigma 2.75 um each, and eight of them.
+    assert np.all(np.linalg.eigvalsh(covariance) > 0.0)
+    assert np.sqrt(np.trace(covariance)) == pytest.approx(2.75e-6 * fix.dop, rel=0.2)  # lengths differ by 30 %
+
+
+async def test_the_same_replies_give_the_same_fix_to_the_bit(server: ScriptedServer) -> None:
+    async with client_of(server.port) as client, client_of(server.port) as other:
+        assert await client.measure(1.0, EXPECTED) == await other.measure(1.0, EXPECTED)
+
+
+async def test_four_channels_suffice_and_three_do_not(server: ScriptedServer) -> None:
+    server.script += [lengths(channels=(1, 4, 6, 8)), lengths(channels=(1, 4, 6))]
+    async with client_of(server.port) as client:
+        fix = await client.measure(0.0, EXPECTED)
+        assert fix.channels == (1, 4, 6, 8)
+        assert_at(fix, PUCK)
+        with pytest.raises(TooFewChannels, match=r"3 valid channels, 4 needed \(2: absent, 3: absent") as caught:
+            await client.measure(0.0, EXPECTED)
+        assert caught.value.valid == (1, 4, 6)
+        assert caught.value.reasons[8] == "absent"
+
+
+@pytest.mark.parametrize("flag", FLAGS)
+async def test_a_flagged_channel_takes_no_part(server: ScriptedServer, flag: str) -> None:
+    wrong = records()
+    wrong[2] = wrong[2]._replace(length_mm=1.0)._replace(**{flag: 1})
+    server.script.append(format_reply(ChannelData(tuple(wrong))))
+    async with client_of(server.port) as client:
+        fix = await client.measure(0.0, EXPECTED)
+    assert fix.channels == (1, 2, 4, 5, 6, 7, 8)
+    assert_at(fix, PUCK)
+
+
+@pytest.mark.parametrize("length_mm", [float("nan"), float("inf"), 0.0, -5.0])
+async def test_a_length_that_is_no_length_takes_no_part(server: ScriptedServer, length_mm: float) -> None:
+    wrong = records()
+    wrong[0] = wrong[0]._replace(length_mm=length_mm)
+    server.script.append(format_reply(ChannelData(tuple(wrong))))
+    async with client_of(server.port) as client:
+        fix = await client.measure(0.0, EXPECTED)
+    assert fix.channels == CHANNELS[1:]
+    assert_at(fix, PUCK)
+
+
+async def test_channels_that_were_not_asked_for_take_no_part(server: ScriptedServer) -> None:
+    server.script.append(format_reply(ChannelData((*records(), ChannelRecord(20, 1.0, 0, 0, 0.0, 0.0, 0.0)))))
+    async with client_of(server.port) as client:
+        fix = await client.measure(0.0, EXPECTED)
+    assert fix.channels == CHANNELS
+    assert_at(fix, PUCK)
+
+
+async def test_a_server_error_is_reported_with_its_code(server: ScriptedServer) -> None:
+    server.script += [lengths(server_error=3), format_reply(Remark("error", "busy"))]
+    async with client_of(server.port) as client:
+        with pytest.raises(EtalonServerError, match="server error 3; see its log") as caught:
+            await client.measure(0.0, EXPECTED)
+        assert caught.value.code == 3
+        with pytest.raises(EtalonServerError, match="refused latestlengthvalid: 'busy'") as caught:
+            await client.measure(0.0, EXPECTED)
+        assert caught.value.code is None
+        assert_at(await client.measure(0.0, EXPECTED), PUCK)
+
+
+async def test_a_late_reply_never_answers_the_next_request(server: ScriptedServer) -> None:
+    release = asyncio.Event()
+
+    async def late(writer: asyncio.StreamWriter) -> None:
+        await release.wait()
+        writer.write(lengths(ELSEWHERE))
+
+    server.script.append(late)
+    async with client_of(server.port, request_timeout_s=0.05) as client:
+        with pytest.raises(EtalonTimeout, match=r"no reply to latestlengthvalid within 0\.05 s"):
+            await client.measure(1.0, EXPECTED)
+        release.set()
+        assert_at(await client.measure(2.0, EXPECTED), PUCK)
+        assert client.counts["connects"] == server.connections == 2
+
+
+async def test_after_a_time_out_the_retry_is_made_on_another_connection(server: ScriptedServer) -> None:
+    server.script.append(silence)
+    async with client_of(server.port, request_timeout_s=0.05, retries=1) as client:
+        assert_at(await client.measure(1.0, EXPECTED), PUCK)
+        assert client.counts == {"connects": 2, "requests": 2, "retries": 1}
+
+
+async def test_a_cancelled_request_takes_its_connection_with_it(server: ScriptedServer) -> None:
+    server.script.append(silence)
+    async with client_of(server.port) as client:
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.05):
+                await client.measure(1.0, EXPECTED)
+        assert_at(await client.measure(2.0, EXPECTED), PUCK)
+        assert client.counts["connects"] == 2
+
+
+GARBAGE: list[Action] = [
+    b"\r\n",
+    b"\x00\xff\x00\xff\n",
+    b"HTTP/1.1 400 Bad Request\r\n",
+    b"channeldata_0_0_0\r\n",
+    lengths()[:-30] + b"\r\n",
+    lengths().replace(b".", b","),
+    b"isconnected_1\r\n",
+    b"measstarted\r\n",
+    b"defanadata_1,2,3\r\n",
+    lengths() + lengths(ELSEWHERE),
+    lengths() + b"x",
+    b"1" * 200_000,
+    b"1" * 200_000 + b"\r\n",
+    flood,
+]
+
+
+@pytest.mark.parametrize("action", GARBAGE)
+async def test_garbage_is_a_typed_error_and_the_next_request_is_clean(server: ScriptedServer, action: Action) -> None:
+    server.script.append(action)
+    async with client_of(server.port) as client:
+        with pytest.raises(EtalonBadReply, match=r"^Etalon server 127\.0\.0\.1:\d+: .*; is this a MultiLine server\?$"):
+            await client.measure(1.0, EXPECTED)
+        assert_at(await client.measure(2.0, EXPECTED), PUCK)
+        assert client.counts["connects"] == 2
+
+
+@pytest.mark.parametrize("action", [hang_up, cut_off])
+async def test_a_lost_connection_is_a_typed_error_and_made_anew(server: ScriptedServer, action: Action) -> None:
+    server.script.append(action)
+    async with client_of(server.port) as client:
+        with pytest.raises(EtalonUnreachable, match="closed the connection; is it running"):
+            await client.measure(1.0, EXPECTED)
+        assert_at(await client.measure(2.0, EXPECTED), PUCK)
+
+
+async def test_a_line_that_came_unasked_is_not_taken_for_the_reply(server: ScriptedServer) -> None:
+    server.greeting.append(lengths(ELSEWHERE))
+    async with client_of(server.port) as client:
+        await client.connect()
+        await server_has_spoken(client)
+        assert_at(await client.measure(1.0, EXPECTED), PUCK)
+        assert client.counts["drained"] == 1
+        assert server.asked == [GOOD_ASK]
+
+
+async def test_half_a_line_left_over_is_not_taken_for_the_reply(server: ScriptedServer) -> None:
+    server.greeting.append(b"channeldata_1,12")
+    async with client_of(server.port) as client:
+        await client.connect()
+        await server_has_spoken(client)
+        assert_at(await client.measure(1.0, EXPECTED), PUCK)
+        assert client.counts["drained"] == 1
+
+
+async def server_has_spoken(client: EtalonClient) -> None:
+    async with asyncio.timeout(1.0):
+        while client._link is not None and client._link.is_clean:  # noqa: ASYNC110 - the link tells nobody
+            await asyncio.sleep(0)
+
+
+async def test_a_server_that_restarts_is_found_again(server: ScriptedServer) -> None:
+    async with client_of(server.port) as client:
+        assert_at(await client.measure(1.0, EXPECTED), PUCK)
+        await server.stop()
+        with pytest.raises(EtalonUnreachable, match=r"is it running, are \[etalon\] host, port right\?"):
+            await client.measure(2.0, EXPECTED)
+        await server.start()
+        assert_at(await client.measure(3.0, EXPECTED), PUCK)
+
+
+async def test_connecting_is_tried_as_often_as_configured(server: ScriptedServer) -> None:
+    await server.stop()
+    async with client_of(server.port, retries=2) as client:
+        with pytest.raises(EtalonUnreachable, match="is it running"):
+            await client.connect()
+        assert client.counts["retries"] == 2
+    await server.start()
+
+
+@pytest.mark.parametrize(
+    "action", [lengths(channels=(1, 2)), lengths(server_error=1), b"junk\r\n", hang_up, lengths((9.0, 9.0, 9.0))]
+)
+async def test_every_failure_is_retried_as_often_as_configured(server: ScriptedServer, action: Action) -> None:
+    async with client_of(server.port, retries=2) as client:
+        server.script += [action, action]
+        assert_at(await client.measure(1.0, EXPECTED), PUCK)
+        server.script += [action, action, action]
+        with pytest.raises(EtalonError):
+            await client.measure(2.0, EXPECTED)
+        assert len(server.asked) == 6
+
+
+async def test_lengths_that_contradict_each_other_are_refused(server: ScriptedServer) -> None:
+    wrong = records()
+    wrong[5] = wrong[5]._replace(length_mm=wrong[5].length_mm + 2.0)
+    server.script.append(format_reply(ChannelData(tuple(wrong))))
+    async with client_of(server.port) as client:
+        with pytest.raises(BadSolution, match=r"largest residual 1\.\d+ mm exceeds 0\.5 mm; channels \(1, 2, 3, 4,"):
+            await client.measure(1.0, EXPECTED)
+
+
+async def test_a_position_far_from_the_expected_one_is_refused(server: ScriptedServer) -> None:
+    async with client_of(server.port) as client:
+        with pytest.raises(BadSolution, match=r"position 0\.6\d* m from the expected one exceeds 0\.5 m"):
+            await client.measure(1.0, (PUCK[0] + 0.6, PUCK[1], PUCK[2]))
+
+
+async def test_a_weak_geometry_is_refused(server: ScriptedServer) -> None:
+    async with client_of(server.port, max_dop=0.5) as client:
+        with pytest.raises(BadSolution, match=r"dilution of precision 1\.\d+ exceeds 0\.5"):
+            await client.measure(1.0, EXPECTED)
+
+
+async def test_a_geometry_that_determines_nothing_is_refused(server: ScriptedServer) -> None:
+    on_a_line = np.outer(np.arange(8.0), [1.0, 1.0, 2.0]) - 9.0
+    client = EtalonClient(config(server.port), CHANNELS, on_a_line)
+    lengths_mm = np.linalg.norm(on_a_line - PUCK, axis=1) * 1e3
+    faithful = [r._replace(length_mm=float(mm)) for r, mm in zip(records(), lengths_mm, strict=True)]
+    server.script.append(format_reply(ChannelData(tuple(faithful))))
+    with pytest.raises(BadSolution, match="leave a direction undetermined"):
+        await client.measure(1.0, EXPECTED)
+    await client.close()
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3, 1.0 / 25.4])
+async def test_lengths_in_another_unit_are_refused(server: ScriptedServer, factor: float) -> None:
+    scaled = [record._replace(length_mm=record.length_mm * factor) for record in records()]
+    server.script.append(format_reply(ChannelData(tuple(scaled))))
+    async with client_of(server.port) as client:
+        with pytest.raises(BadSolution, match=r"largest residual|no rest"):
+            await client.measure(1.0, EXPECTED)
+
+
+@pytest.mark.parametrize(("channels", "rows"), [((1, 2, 3), 3), ((1, 2, 3, 4), 8), ((1, 2, 3, 3), 4)])
+def test_channels_and_collimators_must_fit(channels: tuple[int, ...], rows: int) -> None:
+    with pytest.raises(ValueError, match=r"need \(k, 3\), k >= 4"):
+        EtalonClient(config(1), channels, COLLIMATORS[:rows])
+
+
+async def test_readiness_is_asked_in_three_requests(server: ScriptedServer) -> None:
+    air = Environment(5.0, 525.0, 30.0)
+    server.script += [format_reply(reply) for reply in (Connected(True), LaserReady(False), air)]
+    async with client_of(server.port) as client:
+        assert await client.isready() == Readiness(True, False, air)
+    assert server.asked == [b"isconnected\r\n", b"laserready\r\n", b"environmentdata\r\n"]
+
+
+async def test_two_measurements_at_a_time_take_turns(server: ScriptedServer) -> None:
+    server.script += [lengths(), lengths(ELSEWHERE)]
+    async with client_of(server.port) as client:
+        first, second = await asyncio.gather(client.measure(1.0, EXPECTED), client.measure(2.0, EXPECTED))
+    assert_at(first, PUCK)
+    assert_at(second, ELSEWHERE)
+    assert server.connections == 1
+
+
+async def test_the_stream_starts_pushes_and_stops(server: ScriptedServer) -> None:
+    async def push(writer: asyncio.StreamWriter) -> None:
+        # In one piece: the first record must not count as unasked.
+        writer.write(b"measstarted\r\n" + lengths() + b"defanadata_1,2\r\n" + lengths(ELSEWHERE))
+
+    server.script += [push, lengths() + b"measstopped\r\n"]
+    async with client_of(server.port) as client:
+        async with client.stream() as pushed:
+            assert [(await anext(pushed)).records for _ in range(2)] == [
+                tuple(records()),
+                tuple(records(ELSEWHERE)),
+            ]
+        assert server.asked == [b"startmeasnogui\r\n", b"stopmeasnogui\r\n"]
+        assert_at(await client.measure(1.0, EXPECTED), PUCK)
+        assert server.connections == 2
+
+
+async def test_the_stream_ends_when_the_server_has_finished(server: ScriptedServer) -> None:
+    server.script += [b"measstarted\r\n" + lengths() + b"measurementfinished\r\n", b"measstopped\r\n"]
+    async with client_of(server.port) as client, client.stream() as pushed:
+        assert [data.server_error async for data in pushed] == [0]
+
+
+async def test_a_slow_reader_of_the_stream_gets_the_newest_records(server: ScriptedServer) -> None:
+    server.script += [b"measstarted\r\n", b"measstopped\r\n"]
+    async with client_of(server.port) as client, client.stream() as pushed:
+        assert client._link is not None
+        for code in range(100):
+            client._link.data_received(format_reply(ChannelData((), code)))
+        assert [(await anext(pushed)).server_error for _ in range(64)] == list(range(36, 100))
+
+
+@pytest.mark.parametrize(
+    ("start", "error", "match"),
+    [
+        (b"error_busy\r\n", EtalonServerError, "refused startmeasnogui: 'busy'"),
+        (silence, EtalonTimeout, r"no reply to the push stream within 0\.05 s"),
+        (b"junk\r\n", EtalonBadReply, "bad reply 'junk'"),
+        (hang_up, EtalonUnreachable, "server closed the connection in the push stream"),
+        (flood, EtalonUnreachable, "line of more than 65536 bytes in the push stream"),
+    ],
+)
+async def test_a_stream_that_does_not_start_is_a_typed_error(
+    server: ScriptedServer, start: Action, error: type[EtalonError], match: str
+) -> None:
+    server.script.append(start)
+    async with client_of(server.port, request_timeout_s=0.05) as client:
+        with pytest.raises(error, match=match):
+            async with client.stream():
+                pass
+        assert_at(await client.measure(1.0, EXPECTED), PUCK)
+
+
+async def test_leaving_the_stream_by_an_error_still_stops_the_server(server: ScriptedServer) -> None:
+    server.script += [b"measstarted\r\n", b"measstopped\r\n"]
+    async with client_of(server.port) as client:
+        with pytest.raises(KeyError, match="mine"):
+            async with client.stream():
+                raise KeyError("mine")
+    assert server.asked[-1] == b"stopmeasnogui\r\n"
+
+
+async def stream_past_the_end_of(server: ScriptedServer, client: EtalonClient) -> None:
+    async with client.stream() as pushed:
+        await server.stop()
+        await anext(pushed)
+
+
+async def test_a_stream_whose_connection_is_lost_reports_it_first(server: ScriptedServer) -> None:
+    server.script += [b"measstarted\r\n"]
+    async with client_of(server.port, request_timeout_s=0.05) as client:
+        with pytest.raises(EtalonUnreachable, match="server closed the connection in the push stream"):
+            await stream_past_the_end_of(server, client)
+    await server.start()
+
+
+async def test_measurements_of_the_stand_in_scatter_as_the_fix_says() -> None:
+    sim = SimEtalonConfig(
+        host="127.0.0.1", port=0, length_sigma_m=1e-6, length_sigma_per_m=2.5e-7, motion_tolerance_m=1e-4
+    )
+    puck = FixedPuck(PUCK, step_s=0.5)
+    standin = EtalonStandIn(sim, CHANNELS, COLLIMATORS, puck, np.random.default_rng(4), measuring_time_s=0.5)
+    port = await standin.start("127.0.0.1", 0)
+    nees = 0.0
+    async with client_of(port) as client:
+        for _ in range(100):
+            fix = await client.measure(0.0, EXPECTED)
+            error = np.array(fix.position_m) - PUCK
+            nees += float(error @ np.linalg.solve(np.array(fix.covariance_m2).reshape(3, 3), error))
+        async with client.stream() as pushed:
+            assert len((await anext(pushed)).records) == 8
+    await standin.close()
+    # 300 degrees of freedom: 99.9 % band of chi-squared.
+    assert 223.0 < nees < 388.0
+
+
+async def test_a_moving_puck_gives_no_fix() -> None:
+    sim = SimEtalonConfig(
+        host="127.0.0.1", port=0, length_sigma_m=1e-6, length_sigma_per_m=2.5e-7, motion_tolerance_m=1e-4
+    )
+    puck = FixedPuck(PUCK, moved_m=2e-4)
+    standin = EtalonStandIn(sim, CHANNELS, COLLIMATORS, puck, np.random.default_rng(4), measuring_time_s=0.5)
+    port = await standin.start("127.0.0.1", 0)
+    async with client_of(port) as client:
+        with pytest.raises(TooFewChannels, match=r"0 valid channels.*1: motion_tolerance_error"):
+            await client.measure(0.0, EXPECTED)
+    await standin.close()

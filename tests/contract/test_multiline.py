@@ -1,0 +1,282 @@
+"""The MultiLine grammar to the byte, both directions."""
+
+import contextlib
+import itertools
+import math
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ccatp.wire.multiline import (
+    FLAGS,
+    BadReply,
+    BadRequest,
+    ChannelData,
+    ChannelRecord,
+    Command,
+    Connected,
+    Environment,
+    LaserReady,
+    LineSplitter,
+    LineTooLong,
+    Notice,
+    Remark,
+    Reply,
+    Request,
+    format_reply,
+    format_request,
+    parse_reply,
+    parse_request,
+    valid_lengths,
+)
+
+# The example lines of the published driver from which the grammar is known.
+EXAMPLE = (
+    b"channeldata_1,1234.5678,100,200,22.5,1013.25,45.0,0,0,0,0,0,0,0,0,0,0"
+    b"_2,1234.6789,150,250,22.5,1013.25,45.0,0,0,0,0,0,0,0,0,0,0_0"
+)
+EXAMPLE_ENVIRONMENT = b"environmentdata_22.5,1013.25,45.0"
+FIRST = ChannelRecord(1, 1234.5678, 100, 200, 22.5, 1013.25, 45.0)
+SECOND = ChannelRecord(2, 1234.6789, 150, 250, 22.5, 1013.25, 45.0)
+
+REQUESTS = [
+    (Request(Command.IS_CONNECTED), b"isconnected\r\n"),
+    (Request(Command.LASER_READY), b"laserready\r\n"),
+    (Request(Command.ENVIRONMENT_DATA), b"environmentdata\r\n"),
+    (Request(Command.LATEST_LENGTH_VALID, (3,)), b"latestlengthvalid,3\r\n"),
+    (Request(Command.LATEST_LENGTH_VALID, (1, 2, 32)), b"latestlengthvalid,1,2,32\r\n"),
+    (Request(Command.START_MEASUREMENT), b"startmeasnogui\r\n"),
+    (Request(Command.STOP_MEASUREMENT), b"stopmeasnogui\r\n"),
+]
+
+REPLIES: list[tuple[Reply, bytes]] = [
+    (Connected(True), b"isconnected_1\r\n"),
+    (Connected(False), b"isconnected_0\r\n"),
+    (LaserReady(True), b"laserready_1\r\n"),
+    (LaserReady(False), b"laserready_0\r\n"),
+    (Environment(22.5, 1013.25, 45.0), EXAMPLE_ENVIRONMENT + b"\r\n"),
+    (ChannelData((FIRST, SECOND)), EXAMPLE + b"\r\n"),
+    (ChannelData((FIRST._replace(beam_break=1, daq_error=3),), 7),
+     b"channeldata_1,1234.5678,100,200,22.5,1013.25,45.0,0,1,0,0,0,0,0,0,0,3_7\r\n"),
+    (ChannelData((), 1), b"channeldata_1\r\n"),
+    (Notice.STARTED, b"measstarted\r\n"),
+    (Notice.STOPPED, b"measstopped\r\n"),
+    (Notice.FINISHED, b"measurementfinished\r\n"),
+    (Remark("defanadata", "1,2,3_0"), b"defanadata_1,2,3_0\r\n"),
+    (Remark("error", "unknown-request"), b"error_unknown-request\r\n"),
+]  # fmt: skip
+
+BAD_REQUESTS = [
+    (b"", "unknown-request"),
+    (b" ", "unknown-request"),
+    (b"isconnected ", "unknown-request"),
+    (b"ISCONNECTED", "unknown-request"),
+    (b"measurelengthwithrawdata,1", "unknown-request"),
+    (b'{"type":"join"}', "unknown-request"),
+    (b"\x00\xff\xfe", "unknown-request"),
+    ("isconnectéd".encode(), "unknown-request"),
+    (b"isconnected,1", "bad-arguments"),
+    (b"stopmeasnogui,", "bad-arguments"),
+    (b"latestlengthvalid", "bad-arguments"),
+    (b"latestlengthvalid,", "bad-channel"),
+    (b"latestlengthvalid,0", "bad-channel"),
+    (b"latestlengthvalid,33", "bad-channel"),
+    (b"latestlengthvalid,-1", "bad-channel"),
+    (b"latestlengthvalid,1,1", "bad-channel"),
+    (b"latestlengthvalid,1,01", "bad-channel"),
+    (b"latestlengthvalid,1.0", "bad-channel"),
+    (b"latestlengthvalid, 1", "bad-channel"),
+    (b"latestlengthvalid,1,", "bad-channel"),
+    (b"latestlengthvalid,1,two", "bad-channel"),
+    (b"latestlengthvalid," + b"9" * 5000, "bad-channel"),
+    ("latestlengthvalid,\u0661".encode(), "bad-channel"),
+]
+
+BAD_REPLIES = [
+    b"",
+    b"\x00\x01\xff",
+    b"hello",
+    b"hello_1",
+    b"channeldata",
+    b"channeldata_",
+    b"channeldata_x",
+    b"channeldata_1,1234.5678_0",  # too few fields
+    EXAMPLE[:-2],  # the server error is cut off
+    EXAMPLE[:-20],  # cut within a record
+    EXAMPLE.replace(b"_0", b"_0.5"),
+    EXAMPLE.replace(b"1234.5678", b"1234,5678"),  # a decimal comma
+    EXAMPLE.replace(b"1234.5678", b"long"),
+    EXAMPLE.replace(b"1234.5678", b""),
+    EXAMPLE.replace(b"100", b"1e2"),
+    EXAMPLE.replace(b"100", b" 100"),
+    EXAMPLE.replace(b"100", b"9" * 5000),
+    EXAMPLE.replace(b"data_1,", b"data_0,"),
+    EXAMPLE.replace(b"data_1,", b"data_33,"),
+    EXAMPLE.replace(b"data_1,", b"data_2,"),  # channel 2 twice
+    EXAMPLE.replace(b"_2,", b",0_2,"),  # 18 fields
+    b"isconnected",
+    b"isconnected_",
+    b"isconnected_2",
+    b"isconnected_true",
+    b"laserready_01",
+    b"environmentdata",
+    b"environmentdata_22.5,1013.25",
+    b"environmentdata_22.5,1013.25,45.0,1",
+    b"environmentdata_22.5,nan,45.0",
+    b"environmentdata_22.5,1e999,45.0",
+    b"measstarted_",
+    b"measstarted ",
+]
+
+
+@pytest.mark.parametrize(("request_", "line"), REQUESTS)
+def test_requests_to_the_byte(request_: Request, line: bytes) -> None:
+    assert format_request(request_) == line
+    assert parse_request(line.rstrip(b"\r\n")) == request_
+
+
+@pytest.mark.parametrize(("reply", "line"), REPLIES)
+def test_replies_to_the_byte(reply: Reply, line: bytes) -> None:
+    assert format_reply(reply) == line
+    assert parse_reply(line.rstrip(b"\r\n")) == reply
+
+
+@pytest.mark.parametrize(("line", "reason"), BAD_REQUESTS)
+def test_a_line_that_is_no_request_is_refused_with_a_reason(line: bytes, reason: str) -> None:
+    with pytest.raises(BadRequest, match=f"not a MultiLine request: {reason}") as caught:
+        parse_request(line)
+    assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize("line", BAD_REPLIES)
+def test_a_line_that_is_no_reply_is_refused(line: bytes) -> None:
+    with pytest.raises(BadReply, match=r"^bad reply '"):
+        parse_reply(line)
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_give_a_message_or_the_typed_error(line: bytes) -> None:
+    with contextlib.suppress(BadReply):
+        parse_reply(line)
+    with contextlib.suppress(BadRequest):
+        parse_request(line)
+
+
+def test_the_error_about_a_long_line_is_short() -> None:
+    with pytest.raises(BadReply) as caught:
+        parse_reply(b"channeldata_" + b"9" * 60_000)
+    assert len(str(caught.value)) < 200
+
+
+@given(st.integers(0, len(EXAMPLE) - 1), st.binary(min_size=0, max_size=3))
+def test_any_damage_to_a_reply_gives_a_message_or_the_typed_error(at: int, insert: bytes) -> None:
+    with contextlib.suppress(BadReply):
+        assert isinstance(parse_reply(EXAMPLE[:at] + insert + EXAMPLE[at + 1 :]), ChannelData | Remark)
+
+
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+INTEGER = st.integers(-(10**9), 10**9)
+RECORD = st.builds(
+    ChannelRecord,
+    st.integers(1, 32),
+    FINITE | st.just(math.inf),
+    INTEGER,
+    INTEGER,
+    FINITE,
+    FINITE,
+    FINITE,
+    *([INTEGER] * len(FLAGS)),
+)
+
+
+@given(st.lists(RECORD, max_size=32, unique_by=lambda record: record.channel), INTEGER)
+def test_channel_data_survive_the_wire_exactly(records: list[ChannelRecord], server_error: int) -> None:
+    data = ChannelData(tuple(records), server_error)
+    assert parse_reply(format_reply(data).rstrip(b"\r\n")) == data
+
+
+def test_a_channel_is_valid_when_present_unflagged_finite_and_positive() -> None:
+    records = (
+        FIRST,
+        SECOND._replace(usb_error=1, dll_error=2),
+        FIRST._replace(channel=3, length_mm=math.nan),
+        FIRST._replace(channel=4, length_mm=math.inf),
+        FIRST._replace(channel=5, length_mm=0.0),
+        FIRST._replace(channel=6, length_mm=-1.0),
+        FIRST._replace(channel=8, temperature_c=math.nan),
+        FIRST._replace(channel=9),
+    )
+    lengths_m, reasons = valid_lengths(ChannelData(records), (8, 1, 2, 3, 4, 5, 6, 7))
+    assert list(lengths_m) == [8, 1]
+    assert list(lengths_m.values()) == pytest.approx([1.2345678, 1.2345678], rel=1e-15)  # one rounding of mm to m
+    assert reasons == {
+        2: "usb_error+dll_error",
+        3: "length nan mm",
+        4: "length inf mm",
+        5: "length 0.0 mm",
+        6: "length -1.0 mm",
+        7: "absent",
+    }
+
+
+@pytest.mark.parametrize("flag", FLAGS)
+@pytest.mark.parametrize("value", [1, -1, 250])
+def test_any_flag_that_is_not_zero_makes_a_length_invalid(flag: str, value: int) -> None:
+    lengths_m, reasons = valid_lengths(ChannelData((FIRST._replace(**{flag: value}), SECOND)), (1, 2))
+    assert (list(lengths_m), reasons) == ([2], {1: flag})
+
+
+def split(chunks: list[bytes], limit: int = 65536) -> list[bytes]:
+    splitter = LineSplitter(limit)
+    lines = []
+    for chunk in chunks:
+        splitter.feed(chunk)
+        while (line := splitter.next_line()) is not None:
+            lines.append(line)
+    return lines
+
+
+@given(st.lists(st.integers(0, 60), max_size=8))
+def test_lines_do_not_depend_on_how_the_stream_was_chopped(cuts: list[int]) -> None:
+    stream = b"isconnected\r\nlaserready\n\r\n\nlatestlengthvalid,1,2\r\nhalf a li"
+    edges = [0, *sorted(cuts), len(stream)]
+    chunks = [stream[a:b] for a, b in itertools.pairwise(edges)]
+    assert split(chunks) == [b"isconnected", b"laserready", b"", b"", b"latestlengthvalid,1,2"]
+
+
+def test_bytes_left_over_are_seen() -> None:
+    splitter = LineSplitter()
+    seen = [splitter.pending]
+    splitter.feed(b"a\r\nb")
+    assert splitter.next_line() == b"a"
+    seen.append(splitter.pending)
+    splitter.feed(b"\r\n")
+    assert splitter.next_line() == b"b"
+    seen.append(splitter.pending)
+    assert seen == [False, True, False]
+
+
+def split_one_by_one(stream: bytes, size: int) -> Iterator[bytes]:
+    splitter = LineSplitter(limit=64)
+    for at in range(0, len(stream), size):
+        splitter.feed(stream[at : at + size])
+        while (line := splitter.next_line()) is not None:
+            yield line
+
+
+@pytest.mark.parametrize("size", [1, 7, 64, 1000])
+def test_a_line_over_the_limit_is_refused_after_the_lines_before_it(size: int) -> None:
+    stream = b"ok\r\n" + b"x" * 65 + b"\r\nlater\r\n"
+    lines: list[bytes] = []
+    with pytest.raises(LineTooLong, match="line of more than 64 bytes"):
+        lines.extend(split_one_by_one(stream, size))
+    assert lines == [b"ok"]
+
+
+def test_a_line_of_the_limit_passes() -> None:
+    assert split([b"x" * 63 + b"\r\n"], limit=64) == [b"x" * 63]
+    assert split([b"x" * 65536 + b"\n"]) == [b"x" * 65536]
+    with pytest.raises(LineTooLong, match="65536"):
+        split([b"x" * 65537])

@@ -1,0 +1,172 @@
+"""Reading the configuration: what is laid over what, and where a complaint points to."""
+
+import json
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from ccatp.config.loader import available, dump_config, json_schema, load_config, shipped_config_dir
+from ccatp.config.models import Config
+from ccatp.errors import ConfigError
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("mirror", ["fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2"])
+@pytest.mark.parametrize("world", ["thesis", "thesis-x2"])
+def test_every_shipped_mirror_and_world_is_valid(mirror: str, world: str) -> None:
+    cfg = load_config(overrides={"run.mirror": mirror, "run.world": world})
+    assert (cfg.mirror.name, cfg.world.name) == (mirror, world)
+
+
+def test_the_shipped_names_are_those_of_the_contract() -> None:
+    assert available("mirror") == ["fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2"]
+    assert {"thesis", "thesis-x2"} <= set(available("world"))
+
+
+def test_a_file_needs_only_what_differs(tmp_path: Path, config: Config) -> None:
+    cfg = load_config(write(tmp_path / "mine.toml", "[limits]\nv_max_m_s = 0.05\n"))
+    assert cfg.limits.v_max_m_s == 0.05
+    assert cfg.model_copy(update={"limits": config.limits}) == config
+
+
+def test_the_command_line_is_stronger_than_the_file(tmp_path: Path) -> None:
+    file = write(tmp_path / "mine.toml", "[run]\nseed = 2\npanels = 3\n")
+    cfg = load_config(file, {"run.seed": 5, "run.panels": None})
+    assert (cfg.run.seed, cfg.run.panels) == (5, 3)
+
+
+def test_a_set_of_gains_may_be_added(tmp_path: Path) -> None:
+    pid = "{ kp = 1.0, ki = 0.0, kd = 0.0, derivative_filter_s = 0.0, integral_limit = 0.0 }"
+    text = (
+        '[control]\ngains = "mine"\n[control.gain_sets.mine]\nshaped = true\nposition_tolerance_m = 0.001\n'
+        f"heading_tolerance_rad = 0.01\nforward = {pid}\nangular = {pid}\n"
+    )
+    cfg = load_config(write(tmp_path / "mine.toml", text))
+    assert set(cfg.control.gain_sets) == {"mine", "shipped", "thesis"}
+    assert cfg.control.gain_sets["mine"].forward.kp == 1.0
+
+
+def test_single_keys_of_the_mirror_are_laid_over_the_named_one(tmp_path: Path) -> None:
+    file = write(tmp_path / "mine.toml", '[run]\nmirror = "fyst-m2"\n[mirror.base]\nrow = 2\n')
+    cfg = load_config(file)
+    assert cfg.mirror.base.row == 2
+    assert cfg.mirror.panels == load_config(overrides={"run.mirror": "fyst-m2"}).mirror.panels
+
+
+def test_a_mirror_may_be_a_file_beside_the_configuration(tmp_path: Path) -> None:
+    shipped = shipped_config_dir() / "mirrors" / "fyst-m1.toml"
+    write(tmp_path / "mine.toml", shipped.read_text(encoding="utf-8").replace('name = "fyst-m1"', 'name = "ours"'))
+    cfg = load_config(write(tmp_path / "config.toml", '[run]\nmirror = "mine.toml"\n'))
+    assert cfg.mirror.name == "ours"
+    assert cfg.mirror.panels.count == 77
+
+
+def test_a_fault_in_a_mirror_file_is_found_there(tmp_path: Path) -> None:
+    shipped = (shipped_config_dir() / "mirrors" / "fyst-m1.toml").read_text(encoding="utf-8")
+    mirror = write(tmp_path / "mine.toml", shipped.replace("count = 77", "count = 87"))
+    line = next(n for n, text in enumerate(shipped.splitlines(), start=1) if text.startswith("count = 77"))
+    with pytest.raises(ConfigError, match="panels_per_row adds up to 77") as caught:
+        load_config(overrides={"run.mirror": str(mirror)})
+    assert str(caught.value).startswith(f"{mirror}:{line}: mirror.panels.count = 87")
+
+
+@pytest.mark.parametrize("mirror", ["fyst-m1", "thesis-m2"])
+def test_what_is_written_loads_back_equal(tmp_path: Path, mirror: str) -> None:
+    cfg = load_config(overrides={"run.mirror": mirror, "run.seed": 7, "limits.v_max_m_s": 0.1 + 0.2 - 0.25})
+    assert load_config(write(tmp_path / "config.toml", dump_config(cfg))) == cfg
+
+
+def test_a_written_configuration_needs_no_mirror_file(tmp_path: Path) -> None:
+    shipped = shipped_config_dir() / "mirrors" / "fyst-m1.toml"
+    mirror = write(tmp_path / "gone.toml", shipped.read_text(encoding="utf-8"))
+    cfg = load_config(overrides={"run.mirror": str(mirror)})
+    file = write(tmp_path / "config.toml", dump_config(cfg))
+    mirror.unlink()
+    assert load_config(file) == cfg
+
+
+def test_another_mirror_replaces_the_one_written_in_full(tmp_path: Path, config: Config) -> None:
+    file = write(tmp_path / "config.toml", dump_config(config))
+    assert load_config(file, {"run.mirror": "fyst-m2"}).mirror.name == "fyst-m2"
+    assert load_config(file, {"run.mirror": "fyst-m1"}) == config
+
+
+def test_a_key_of_the_mirror_may_come_from_the_command_line(tmp_path: Path, config: Config) -> None:
+    file = write(tmp_path / "config.toml", dump_config(config))
+    assert load_config(file, {"mirror.base.row": 3}).mirror.base.row == 3
+    changed = load_config(file, {"run.mirror": "fyst-m2", "mirror.base.row": 3}).mirror
+    assert (changed.name, changed.base.row) == ("fyst-m2", 3)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "line"),
+    [
+        ({"run.mirror": "fyst-m"}, 'run.mirror = "fyst-m" is no mirror; did you mean'),
+        ({"run.sed": 2}, r"run.sed is unknown; did you mean run.seed\?"),
+        ({"robot.wheel_radius_m": 30}, r"robot.wheel_radius_m = 30 must be at most 0.2; looks like millimetres"),
+        ({"run": 3}, "run.mirror"),
+        ({"robot": 3, "robot.port": 4}, "robot.port: robot is given as a value already"),
+        ({"mirror": "fyst-m2"}, "mirror: must be a section; name a mirror with run.mirror"),
+    ],
+)
+def test_a_fault_of_the_command_line_names_it(overrides: dict[str, object], line: str) -> None:
+    with pytest.raises(ConfigError, match=f"^command line: {line}"):
+        load_config(overrides=overrides)
+
+
+def test_a_contradiction_points_to_what_the_user_wrote(tmp_path: Path) -> None:
+    file = write(tmp_path / "mine.toml", "[robot]\nwheel_radius_m = 0.01\n")
+    with pytest.raises(ConfigError, match="limits.v_max_m_s = 0.1 is more than the wheels give") as caught:
+        load_config(file)
+    assert str(caught.value).startswith(f"{file}:2: ")
+
+
+def test_several_faults_are_all_listed_and_the_first_one_told(tmp_path: Path) -> None:
+    file = write(tmp_path / "mine.toml", "[robot]\nport = -1\nwheel_radius = 0.03\n")
+    with pytest.raises(ConfigError, match=r"\(and 1 more: ccatp config check\)$") as caught:
+        load_config(file)
+    assert caught.value.problems == [
+        f"{file}:3: robot.wheel_radius is unknown; did you mean robot.wheel_radius_m?",
+        f"{file}:2: robot.port = -1 must be at least 0",
+    ]
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none.toml: no such file or directory; name a TOML file that exists"):
+        load_config(tmp_path / "none.toml")
+
+
+def test_a_folder_is_no_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="is a directory; name a TOML file"):
+        load_config(tmp_path)
+
+
+def test_a_file_in_another_encoding_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "latin.toml").write_bytes('[run]\nmirror = "Mirör"'.encode("latin-1"))
+    with pytest.raises(ConfigError, match=r"is not UTF-8 text \(byte 19\)"):
+        load_config(tmp_path / "latin.toml")
+
+
+def test_an_unfinished_file_points_to_its_end(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"mine.toml:2: is not TOML: "):
+        load_config(write(tmp_path / "mine.toml", "[run]\nseed ="))
+
+
+def test_the_schema_allows_what_the_loader_allows(tmp_path: Path) -> None:
+    schema = json_schema()
+    assert schema["title"] == "ccatp configuration"
+    assert schema["additionalProperties"] is False
+    assert set(schema["properties"]) == set(Config.model_fields)
+    assert "required" not in json.dumps(schema)  # a file needs only what differs
+    assert schema["$defs"]["RobotConfig"]["properties"]["wheel_radius_m"]["maximum"] == 0.2
+
+
+def test_the_default_file_says_unit_or_source_of_each_number() -> None:
+    text = (shipped_config_dir() / "ccatp.toml").read_text(encoding="utf-8")
+    assert tomllib.loads(text)["run"]["mirror"] == "fyst-m1"
+    assert "UNVERIFIED" in text

@@ -1,0 +1,163 @@
+"""Pure. The surface against the data files' reference values and against numerical differences."""
+
+from math import nan
+
+import numpy as np
+import pytest
+
+from ccatp.config.models import SurfaceConfig
+from ccatp.mirror.errors import ConvergenceError
+from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.surface import Surface, build_surface
+
+# (x, y, z) in mm in the mirror frame, evaluated from the published coefficient matrix by other means.
+CHECK_POINTS = {
+    1: [
+        (0.0, 0.0, 0.0),
+        (1000.0, -2000.0, -33.770855713),
+        (-1500.0, 2500.0, -55.976479163),
+        (2684.8, 35.0, -56.618463928),
+    ],
+    2: [
+        (0.0, 0.0, 0.0),
+        (1000.0, -2000.0, 57.524196479),
+        (-1500.0, 2500.0, 108.400719860),
+        (2684.8, 35.0, 94.395715843),
+    ],
+}
+PLACES = [(0.0, 0.0), (1.3, -2.1), (-2.7, 0.4), (0.02, 3.1), (-1.9, -2.8)]
+STEP_M = 1e-4
+
+
+def test_check_points_in_the_mirror_frame(mirror: Mirror) -> None:
+    for x, y, z in CHECK_POINTS[1 if mirror.drive_side < 0 else 2]:
+        deck_x, deck_y, _ = mirror.deck_from_mirror((x * 1e-3, y * 1e-3, 0.0))
+        found = mirror.mirror_from_deck(mirror.surface_point(deck_x, deck_y))
+        assert found == pytest.approx((x * 1e-3, y * 1e-3, z * 1e-3), abs=1e-9)  # 1 nm: the references' last digit
+
+
+def test_deck_turns_the_mirror_by_pi_about_y_on_m1_only(m1: Mirror, m2: Mirror) -> None:
+    assert m1.deck_from_mirror((1.0, 2.0, 3.0)) == (-1.0, 2.0, -3.0)
+    assert m2.deck_from_mirror((1.0, 2.0, 3.0)) == (1.0, 2.0, 3.0)
+
+
+def test_the_robot_drives_inside_a_bowl(mirror: Mirror) -> None:
+    # Both mirrors are concave on the reflecting side, which is +z of the deck frame.
+    assert all(mirror.surface.height_m(x, y) > 0.0 for x, y in PLACES[1:])
+
+
+@pytest.mark.parametrize(("x", "y"), PLACES)
+def test_gradient_and_hessian_against_central_differences(mirror: Mirror, x: float, y: float) -> None:
+    f, h = mirror.surface.height_m, STEP_M
+    fx = (f(x + h, y) - f(x - h, y)) / (2 * h)
+    fy = (f(x, y + h) - f(x, y - h)) / (2 * h)
+    fxx = (f(x + h, y) - 2 * f(x, y) + f(x - h, y)) / h**2
+    fyy = (f(x, y + h) - 2 * f(x, y) + f(x, y - h)) / h**2
+    fxy = (f(x + h, y + h) - f(x + h, y - h) - f(x - h, y + h) + f(x - h, y - h)) / (4 * h**2)
+    # Rounding of f (1e-17) over h and over h^2, and h^2 times the third derivative: 1e-10 and 1e-7.
+    assert mirror.surface.gradient(x, y) == pytest.approx((fx, fy), abs=1e-9)
+    assert mirror.surface.hessian(x, y) == pytest.approx((fxx, fxy, fyy), abs=1e-7)
+
+
+@pytest.mark.parametrize(("x", "y"), PLACES)
+def test_jet_is_height_gradient_and_hessian(mirror: Mirror, x: float, y: float) -> None:
+    surface = mirror.surface
+    jet = (surface.height_m(x, y), *surface.gradient(x, y), *surface.hessian(x, y))
+    assert surface.jet(x, y) == pytest.approx(jet, abs=1e-15)  # rounding
+
+
+@pytest.mark.parametrize(("x", "y"), PLACES)
+def test_normal_is_perpendicular_to_differences_along_the_surface(mirror: Mirror, x: float, y: float) -> None:
+    point, h = mirror.surface_point, STEP_M
+    along_x = np.subtract(point(x + h, y), point(x - h, y)) / (2 * h)
+    along_y = np.subtract(point(x, y + h), point(x, y - h)) / (2 * h)
+    expected = np.cross(along_x, along_y)
+    expected /= np.linalg.norm(expected)
+    assert mirror.surface.normal(x, y) == pytest.approx(tuple(expected), abs=1e-9)  # as for the gradient
+
+
+@pytest.mark.parametrize(("x", "y"), PLACES)
+def test_tangent_frame_is_right_handed_and_orthonormal(mirror: Mirror, x: float, y: float) -> None:
+    axes = np.array(mirror.surface.axes(x, y))
+    assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-15)
+    assert np.cross(axes[0], axes[1]) == pytest.approx(axes[2], abs=1e-15)
+    assert axes[0, 1] == 0.0  # e1 is the tangent of the line y = const ...
+    assert axes[0, 0] > 0.0  # ... towards +x
+
+
+def test_array_variants_agree_with_the_scalar_ones(mirror: Mirror) -> None:
+    xs, ys = np.array(PLACES).T
+    heights = [mirror.surface.height_m(x, y) for x, y in PLACES]
+    slopes = np.array([mirror.surface.gradient(x, y) for x, y in PLACES])
+    fx, fy = mirror.surface.gradients(xs, ys)
+    assert mirror.surface.heights_m(xs, ys) == pytest.approx(heights, abs=1e-15)
+    assert np.column_stack([fx, fy]) == pytest.approx(slopes, abs=1e-15)
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.7, 2.4, -1.3])
+@pytest.mark.parametrize(("x", "y"), PLACES[1:])
+def test_transported_heading_turns_along_the_normal_only(mirror: Mirror, x: float, y: float, heading: float) -> None:
+    # A geodesic's tangent changes along the surface normal and not within the tangent plane.
+    step = 1e-3
+    axes = np.array(mirror.surface.axes(x, y))
+    before = np.cos(heading) * axes[0] + np.sin(heading) * axes[1]
+    dx, dy = step * before[0], step * before[1]
+    turned = heading + mirror.surface.transport_rad(x, y, dx, dy)
+    after_axes = np.array(mirror.surface.axes(x + dx, y + dy))
+    after = np.cos(turned) * after_axes[0] + np.sin(turned) * after_axes[1]
+    sideways = (after - before) @ np.cross(axes[2], before)
+    # Second order in the step (curvature 0.03/m): 1e-9. Without the transport it is 1e-6 at these places.
+    assert sideways == pytest.approx(0.0, abs=3e-9)
+
+
+def test_polynomial_with_odd_powers_keeps_its_sense_in_the_deck_frame() -> None:
+    cfg = SurfaceConfig(normalisation_radius_mm=2000.0, terms=((1, 0, 10.0), (2, 1, 4.0), (3, 0, 2.0)))
+    up, down = build_surface(cfg, 1), build_surface(cfg, -1)
+    x, y = 0.6, -0.9
+    u, v = x / 2.0, y / 2.0
+    assert up.height_m(x, y) == pytest.approx(1e-3 * (10 * u + 4 * u * u * v + 2 * u**3), abs=1e-15)
+    assert down.height_m(x, y) == pytest.approx(-up.height_m(-x, y), abs=1e-15)
+
+
+def test_terms_of_equal_powers_add_up() -> None:
+    cfg = SurfaceConfig(normalisation_radius_mm=1000.0, terms=((0, 0, 1.0), (0, 0, 2.0)))
+    assert build_surface(cfg, 1).height_m(0.3, 0.4) == pytest.approx(3e-3, abs=1e-15)
+
+
+def test_drop_meets_the_surface_on_the_line(mirror: Mirror) -> None:
+    start, direction = (1.0, -1.5, 0.3), (0.05, -0.1, 0.99)
+    p = mirror.surface.drop(start, direction)
+    assert p[2] == pytest.approx(mirror.surface.height_m(p[0], p[1]), abs=1e-15)
+    assert np.cross(np.subtract(p, start), direction) == pytest.approx(np.zeros(3), abs=1e-12)
+
+
+def test_drop_along_a_line_that_misses_is_refused(mirror: Mirror) -> None:
+    with pytest.raises(ConvergenceError, match="no surface point on the line"):
+        mirror.surface.drop((0.0, 0.0, nan), (0.0, 0.0, 1.0))
+
+
+def test_foot_of_a_point_that_is_not_finite_is_refused(mirror: Mirror) -> None:
+    with pytest.raises(ConvergenceError, match="no foot on the surface"):
+        mirror.surface.foot((nan, 0.0, 0.0))
+
+
+def test_coefficients_need_two_indices() -> None:
+    with pytest.raises(ValueError, match=r"need shape \(i, j\), got \(3,\)"):
+        Surface(np.zeros(3))
+
+
+# Angle between the drive side's normal and straight up over all panels, zenith pointing, from the data files. The
+# thesis rounds the middle values to 30 and 20 deg.
+@pytest.mark.parametrize(("name", "low_deg", "high_deg"), [("m1", 24.20, 28.88), ("m2", 90.0 + 14.24, 90.0 + 23.34)])
+def test_inclination_over_the_panels(
+    name: str, low_deg: float, high_deg: float, request: pytest.FixtureRequest
+) -> None:
+    mirror: Mirror = request.getfixturevalue(name)
+    up = mirror.rotate_deck_from_world((0.0, 0.0, -1.0))
+    angles = [
+        np.degrees(np.arccos(np.dot(mirror.surface.normal(p.x_m + i * p.half_x_m, p.y_m + j * p.half_y_m), up)))
+        for p in mirror.panels.values()
+        for i in (-1.0, 0.0, 1.0)
+        for j in (-1.0, 0.0, 1.0)
+    ]
+    assert (min(angles), max(angles)) == pytest.approx((low_deg, high_deg), abs=0.01)  # last digit of the reference

@@ -1,0 +1,305 @@
+"""The command line: what reaches the rooms below, what the shell is told."""
+
+import importlib.metadata
+import json
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import click
+import pytest
+
+import ccatp
+from ccatp.cli import cli, main
+from ccatp.cli_frame import parse_setting
+from ccatp.config.models import Config
+from ccatp.errors import ConfigError, UnreachableError
+from ccatp.run_options import RunOptions
+
+Stub = Callable[[str, str, Any], list[tuple[Any, ...]]]
+
+
+@pytest.fixture
+def stub(monkeypatch: pytest.MonkeyPatch) -> Stub:
+    """Puts a module with one function in the place of a room below; returns the list of its calls."""
+
+    def put(module: str, name: str, answer: Any) -> list[tuple[Any, ...]]:
+        calls: list[tuple[Any, ...]] = []
+
+        def function(*args: Any, **kwargs: Any) -> Any:
+            calls.append((*args, kwargs) if kwargs else args)
+            if isinstance(answer, BaseException):
+                raise answer
+            return answer
+
+        stand_in = ModuleType(module)
+        setattr(stand_in, name, function)
+        monkeypatch.setitem(sys.modules, module, stand_in)
+        return calls
+
+    return put
+
+
+@pytest.fixture
+def daemon_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A runtime directory that looks as if a daemon had its sockets there."""
+    for name in ("control", "emergency"):
+        (tmp_path / name).touch()
+    monkeypatch.setenv("CCATP_RUNTIME_DIR", str(tmp_path))
+    return tmp_path
+
+
+def commands(group: click.Group, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    yield path
+    for name, command in group.commands.items():
+        if isinstance(command, click.Group):
+            yield from commands(command, (*path, name))
+        else:
+            yield (*path, name)
+
+
+@pytest.mark.parametrize("path", commands(cli), ids=lambda path: " ".join(path) or "ccatp")
+def test_every_help_shows_an_example(path: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*path, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "Example:" in text
+    assert f"    {' '.join(('ccatp', *path))}" in text
+
+
+def test_the_commands_are_those_of_the_contract() -> None:
+    assert {" ".join(path) for path in commands(cli) if path} == {
+        "run", "status", "pause", "resume", "abort", "stop", "emergency",
+        "sim", "sim robot", "sim etalon", "config", "config check", "config schema",
+    }  # fmt: skip
+
+
+def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"ccatp {ccatp.__version__}\n"
+    assert importlib.metadata.version("click")  # the only package that help and version need
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["rnu"], "ccatp: no command 'rnu'; did you mean run?; see ccatp --help\n"),
+        (["sim", "robto"], "ccatp: no command 'robto'; did you mean robot?; see ccatp sim --help\n"),
+        (["sim", "zzz"], "ccatp: no command 'zzz'; there are etalon, robot; see ccatp sim --help\n"),
+        (["run"], "ccatp: name the robot's configuration with --config FILE, or add --sim; see ccatp run --help\n"),
+        (
+            ["run", "--sim", "--resume"],
+            "ccatp: --resume carries on in a run directory; name it with --run-dir; see ccatp run --help\n",
+        ),
+        (["sim", "etalon", "--puck", "1", "2", "3", "--truth", "ipc://x"], "--puck and --truth exclude each other"),
+        (["run", "--sim", "--miror", "x"], "Did you mean '--mirror'?"),
+        (["run", "--sim", "--set", "seed"], "'seed' is not KEY=VALUE, as in run.seed=2"),
+        (["run", "--sim", "--seed", "one"], "'one' is not a valid integer"),
+        (["emergency", "fier"], "'fier' is not one of 'fire', 'earthquake', 'power', 'weather', 'operator'"),
+        (
+            ["config", "check", "none.toml"],
+            "ccatp: none.toml: no such file or directory; name a TOML file that exists\n",
+        ),
+    ],
+)
+def test_misuse_is_one_line_and_exit_2(argv: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(argv) == 2
+    out, err = capsys.readouterr()
+    assert message in err
+    assert err.startswith("ccatp: ")
+    assert err.count("\n") == 1
+    assert not out
+
+
+def test_no_command_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 2
+    assert "Usage: ccatp" in capsys.readouterr().err
+
+
+def test_run_hands_over_what_was_asked_for(stub: Stub, tmp_path: Path) -> None:
+    calls = stub("ccatp.supervisor", "run_survey", 3)
+    argv = "run --sim --mirror fyst-m2 --world thesis-x2 --filter kf --panels 4 --seed 2 --realtime --json"
+    more = ["--run-dir", str(tmp_path), "--runtime-dir", "/run/x", "--set", "limits.v_max_m_s=0.05"]
+    assert main([*argv.split(), *more]) == 3
+    overrides = {
+        "run.mirror": "fyst-m2", "run.world": "thesis-x2", "run.seed": 2, "run.panels": 4, "run.filter": "kf",
+        "limits.v_max_m_s": 0.05,
+    }  # fmt: skip
+    assert calls == [
+        (
+            RunOptions(
+                sim=True,
+                overrides=overrides,
+                realtime=True,
+                run_dir=tmp_path,
+                json_output=True,
+                runtime_dir=Path("/run/x"),
+            ),
+        )
+    ]
+
+
+def test_run_says_nothing_of_what_was_not_asked_for(stub: Stub) -> None:
+    calls = stub("ccatp.supervisor", "run_survey", 0)
+    assert main(["run", "--config", "mine.toml"]) == 0
+    assert calls == [(RunOptions(sim=False, config_file=Path("mine.toml")),)]
+
+
+def test_a_resumed_run_takes_the_configuration_of_its_directory(stub: Stub) -> None:
+    calls = stub("ccatp.supervisor", "run_survey", 0)
+    assert main(["run", "--sim", "--resume", "--run-dir", "runs/a"]) == 0
+    (options,) = calls[0]
+    assert (options.config_file, options.run_dir, options.resume) == (Path("runs/a/config.toml"), Path("runs/a"), True)
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "line"),
+    [
+        (ConfigError("a.toml:3: run.seed is odd"), 2, "ccatp: a.toml:3: run.seed is odd\n"),
+        (UnreachableError("robot 127.0.0.1:1 refuses"), 5, "ccatp: robot 127.0.0.1:1 refuses\n"),
+        (KeyboardInterrupt(), 130, "ccatp: interrupted\n"),
+    ],
+)
+def test_expected_errors_are_one_line_and_their_exit_status(
+    error: BaseException, status: int, line: str, stub: Stub, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stub("ccatp.supervisor", "run_survey", error)
+    assert main(["run", "--sim"]) == status
+    assert capsys.readouterr().err.lstrip("\n") == line
+
+
+@pytest.mark.parametrize("command", ["status", "pause", "resume", "abort", "stop"])
+def test_the_operator_commands_ask_the_daemon(
+    command: str, stub: Stub, daemon_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calls = stub("ccatp.router", "request", {"ok": True, "state": "driving", "points": {"done": 3}, "eta_s": None})
+    assert main([command, "--timeout", "3"]) == 0
+    assert calls == [(f"ipc://{daemon_dir}/control", {"cmd": command}, 3.0)]
+    assert capsys.readouterr().out == "state        driving\npoints.done  3\neta_s        -\n"
+
+
+def test_status_as_json_is_the_answer_and_nothing_else(
+    stub: Stub, daemon_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reply = {"ok": True, "state": "driving", "error_mm": 0.25}
+    stub("ccatp.router", "request", reply)
+    assert main(["status", "--json", "--runtime-dir", str(daemon_dir)]) == 0
+    assert json.loads(capsys.readouterr().out) == reply
+
+
+def test_an_answer_without_content_is_ok(stub: Stub, daemon_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    calls = stub("ccatp.router", "request", {"ok": True})
+    assert main(["pause"]) == 0
+    assert calls[0][0] == f"ipc://{daemon_dir}/control"
+    assert capsys.readouterr().out == "ok\n"
+
+
+def test_an_emergency_goes_to_the_danger_process(stub: Stub, daemon_dir: Path) -> None:
+    calls = stub("ccatp.router", "request", {"ok": True, "latched": True})
+    assert main(["emergency", "fire", "--note", "smoke", "--id", "e1"]) == 0
+    payload = {"cmd": "emergency", "kind": "fire", "id": "e1", "note": "smoke"}
+    assert calls == [(f"ipc://{daemon_dir}/emergency", payload, 10.0)]
+
+
+def test_each_emergency_has_its_own_id(stub: Stub, daemon_dir: Path) -> None:
+    calls = stub("ccatp.router", "request", {"ok": True})
+    assert main(["emergency", "power"]) == main(["emergency", "power"]) == 0
+    assert calls[0][0] == f"ipc://{daemon_dir}/emergency"
+    assert calls[0][1]["id"] != calls[1][1]["id"]
+
+
+def test_the_runtime_directory_may_come_from_the_configuration(stub: Stub, daemon_dir: Path, tmp_path: Path) -> None:
+    calls = stub("ccatp.router", "request", {"ok": True})
+    (tmp_path / "mine.toml").write_text(f'[run]\nruntime_dir = "{daemon_dir}"\n')
+    assert main(["status", "--config", str(tmp_path / "mine.toml")]) == 0
+    assert calls[0][0] == f"ipc://{daemon_dir}/control"
+
+
+def test_no_daemon_is_one_line_and_exit_5(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["status", "--runtime-dir", str(tmp_path)]) == 5
+    expected = f"ccatp: no daemon in {tmp_path}; start one with ccatp run, or name its folder with --runtime-dir\n"
+    assert capsys.readouterr().err == expected
+
+
+def test_a_silent_daemon_is_one_line_and_exit_5(
+    stub: Stub, daemon_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stub("ccatp.router", "request", TimeoutError())
+    assert main(["status", "--timeout", "0.5"]) == 5
+    assert capsys.readouterr().err == f"ccatp: the daemon in {daemon_dir} does not answer within 0.5 s\n"
+
+
+def test_a_refusal_tells_the_reason(stub: Stub, daemon_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    calls = stub("ccatp.router", "request", {"ok": False, "error": "not paused"})
+    assert main(["resume"]) == 1
+    assert calls[0][0].startswith(f"ipc://{daemon_dir}")
+    assert capsys.readouterr().err == "ccatp: resume refused: not paused\n"
+
+
+def test_the_robot_alone_gets_its_address(stub: Stub) -> None:
+    calls = stub("ccatp.processes.dataloop", "run_alone", 0)
+    assert main("sim robot --host 0.0.0.0 --port 0 --mirror fyst-m2 --seed 4 --lockstep".split()) == 0
+    cfg, options = calls[0]
+    assert isinstance(cfg, Config)
+    assert (cfg.sim.robot.host, cfg.sim.robot.port, cfg.mirror.name, cfg.run.seed) == ("0.0.0.0", 0, "fyst-m2", 4)
+    assert options == {"lockstep": True}
+
+
+def test_the_robot_alone_is_paced_unless_told_otherwise(stub: Stub) -> None:
+    calls = stub("ccatp.processes.dataloop", "run_alone", 0)
+    assert main(["sim", "robot"]) == 0
+    assert calls[0][1] == {"lockstep": False}
+
+
+def test_the_laser_system_alone_gets_its_puck(stub: Stub) -> None:
+    calls = stub("ccatp.processes.etalon", "run_alone", 0)
+    assert main("sim etalon --port 2002 --puck 0.1 -0.5 3.4 --set etalon.retries=1".split()) == 0
+    cfg, puck, truth = calls[0]
+    assert (cfg.sim.etalon.port, cfg.etalon.retries) == (2002, 1)
+    assert (puck, truth) == ((0.1, -0.5, 3.4), None)
+
+
+def test_a_good_configuration_is_called_ok(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text("[run]\nseed = 3\n")
+    assert main(["config", "check", str(file)]) == 0
+    assert capsys.readouterr().out == f"{file}: ok: mirror fyst-m1, 77 panels, world thesis, seed 3\n"
+
+
+def test_config_check_lists_every_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text("[run]\nseed = -3\nsed = 2\n")
+    assert main(["config", "check", str(file)]) == 2
+    out, err = capsys.readouterr()
+    assert not out
+    assert err.splitlines() == [
+        f"ccatp: {file}:3: run.sed is unknown; did you mean run.seed?",
+        f"ccatp: {file}:2: run.seed = -3 must be at least 0",
+    ]
+
+
+def test_the_schema_is_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["config", "schema"]) == 0
+    assert json.loads(capsys.readouterr().out)["title"] == "ccatp configuration"
+
+
+@pytest.mark.parametrize(
+    ("text", "setting"),
+    [
+        ("run.seed=2", ("run.seed", 2)),
+        (" limits.v_max_m_s = 5e-2", ("limits.v_max_m_s", 0.05)),
+        ("run.mirror=fyst-m2", ("run.mirror", "fyst-m2")),
+        ('run.mirror="fyst-m2"', ("run.mirror", "fyst-m2")),
+        ("robot.fan_duty=[0.7, 0.7]", ("robot.fan_duty", [0.7, 0.7])),
+        ("robot.key_file=", ("robot.key_file", "")),
+    ],
+)
+def test_settings_are_toml_or_text(text: str, setting: tuple[str, object]) -> None:
+    assert parse_setting(text) == setting
+
+
+@pytest.mark.parametrize("text", ["seed", "=2", "run.=2", ".seed=2"])
+def test_a_setting_needs_key_and_value(text: str) -> None:
+    with pytest.raises(ValueError, match="is not KEY=VALUE, as in run.seed=2"):
+        parse_setting(text)

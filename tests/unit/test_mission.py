@@ -1,0 +1,257 @@
+"""The mission as stories in virtual time: an ideal robot on one panel, verdicts as told."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
+from math import cos, exp, hypot, sin
+
+import pytest
+
+from ccatp.config.models import Config
+from ccatp.journey import Motion
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.mission import Mission, Order
+from ccatp.mission_states import MOVING, Event, Outcome, State, next_state
+from ccatp.samples import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Twist, Verdict
+
+DT, LAG = 0.01, 0.08
+PANEL = PanelId(5, 5)
+FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
+FRONT_OFF = replace(
+    FREE, code=EventCode.NEAR_EDGE, cause="rim", forward=False, turn=False, off=(True, True, False, False)
+)
+ABORT = replace(FREE, code=EventCode.ABORTED, cause="fire")
+
+
+class Story:
+    """A mission, an ideal robot, and what was ordered so far."""
+
+    def __init__(self, config: Config, mirror: Mirror) -> None:
+        self.mirror = mirror
+        self.stops = tuple(
+            Stop(*mirror.point_on_deck(PointId(5, 5, k)), StopKind.MEASURE, PointId(5, 5, k)) for k in (1, 2, 3)
+        )
+        self.mission = Mission(config, mirror, self.stops, self.plan_home)
+        start = mirror.point_on_deck(PointId(5, 5, 4))
+        pose = mirror.panel_pose(PANEL, DeckPose(*start, 0.0))
+        self.x, self.y, self.heading = pose.x_m, pose.y_m, pose.heading_rad
+        self.v = self.omega = self.t = 0.0
+        self.base = start
+        self.orders: list[Order] = []
+        self.auto_fix = True
+
+    def plan_home(self, _start: DeckPose) -> tuple[Stop, ...]:
+        return (Stop(*self.base, StopKind.BASE, heading_rad=1.0),)
+
+    def motion(self) -> Motion:
+        pose = PanelPose(PANEL, self.x, self.y, self.heading)
+        return Motion(self.t, DT, pose, self.mirror.deck_pose(pose), self.v, self.omega)
+
+    def frame(self, verdict: Verdict | None = FREE) -> Order:
+        order = self.mission.step(self.motion(), verdict)
+        self.orders.append(order)
+        if order.measure and self.auto_fix:
+            self.mission.fixed(self.mission.measuring_point)
+        self._drive(order.twist)
+        return order
+
+    def _drive(self, twist: Twist) -> None:
+        keep = exp(-DT / LAG)
+        v, omega = twist.v_m_s, twist.omega_rad_s
+        middle = self.heading + 0.5 * self.omega * DT
+        mean = v + (self.v - v) * LAG * (1.0 - keep) / DT
+        self.x += mean * DT * cos(middle)
+        self.y += mean * DT * sin(middle)
+        self.heading += (omega + (self.omega - omega) * LAG * (1.0 - keep) / DT) * DT
+        self.v, self.omega = v + (self.v - v) * keep, omega + (self.omega - omega) * keep
+        self.t += DT
+
+    def until(self, is_there: Callable[[], bool], verdict: Verdict | None = FREE, frames: int = 3000) -> None:
+        for _ in range(frames):
+            if is_there():
+                return
+            self.frame(verdict)
+        raise AssertionError(f"still {self.mission.state} ({self.mission.cause}) after {frames} frames")
+
+    def until_state(self, state: State, verdict: Verdict | None = FREE) -> None:
+        self.until(lambda: self.mission.state is state, verdict)
+
+
+@pytest.fixture(scope="module")
+def mirror(config: Config) -> Mirror:
+    return build_mirror(config.mirror)
+
+
+@pytest.fixture
+def story(config: Config, mirror: Mirror) -> Story:
+    return Story(config, mirror)
+
+
+def test_the_table_is_total_and_hold_is_one_event_away() -> None:
+    for state, event in product(State, Event):
+        assert next_state(state, event) in State
+    for state in set(State) - {State.DONE}:
+        assert next_state(state, Event.HOLD) is State.HELD
+    assert {next_state(State.DONE, event) for event in Event} == {State.DONE}
+    assert next_state(State.BACKING_OFF, Event.GO_HOME) is State.BACKING_OFF  # an edge outranks an abort
+
+
+def test_every_moving_state_can_meet_an_edge() -> None:
+    for state in MOVING - {State.BACKING_OFF}:
+        assert next_state(state, Event.EDGE) is State.BACKING_OFF
+
+
+def test_measures_every_point_once_and_is_complete(story: Story) -> None:
+    story.until_state(State.DONE)
+    assert story.mission.outcome is Outcome.COMPLETE
+    assert [p.point for p in story.mission.done] == [1, 2, 3]
+    arrived = [order.arrived for order in story.orders if order.arrived is not None]
+    assert [p.point for p in arrived] == [1, 2, 3]
+
+
+def test_measures_only_after_the_measuring_time_at_rest(story: Story, config: Config) -> None:
+    story.until(lambda: any(order.measure for order in story.orders))
+    at_rest = next(k for k, order in enumerate(story.orders) if order.at_rest)
+    measured = next(k for k, order in enumerate(story.orders) if order.measure)
+    assert (measured - at_rest) * DT == pytest.approx(config.etalon.measuring_time_s, abs=DT)
+    assert all(order.twist == Twist(0.0, 0.0) for order in story.orders[at_rest : measured + 1])
+
+
+@pytest.mark.parametrize("state", [State.TURNING, State.DRIVING, State.SETTLING, State.MEASURING])
+def test_pause_and_resume_from_every_state(story: Story, state: State) -> None:
+    story.until_state(state)
+    assert story.mission.pause("operator") is None
+    for _ in range(100):
+        assert story.frame().twist == Twist(0.0, 0.0)
+    assert story.mission.state is State.HELD
+    assert story.mission.is_paused
+    assert story.mission.resume() is None
+    story.until_state(State.DONE)
+    assert [p.point for p in story.mission.done] == [1, 2, 3]
+
+
+def test_resume_is_refused_where_nothing_is_held(story: Story) -> None:
+    story.until_state(State.DRIVING)
+    assert story.mission.resume() == "the mission is not held but driving"
+
+
+@pytest.mark.parametrize("state", [State.TURNING, State.DRIVING, State.SETTLING, State.MEASURING, State.HELD])
+def test_abort_goes_home_from_every_state(story: Story, state: State) -> None:
+    if state is State.HELD:
+        story.until_state(State.DRIVING)
+        story.mission.pause("operator")
+    else:
+        story.until_state(state)
+    story.until_state(State.DONE, ABORT)
+    assert story.mission.outcome is Outcome.AT_BASE
+    assert story.mission.cause == "fire"
+    x, y = story.motion().deck.x_m, story.motion().deck.y_m
+    assert hypot(x - story.base[0], y - story.base[1]) < 2e-3  # twice the arrival tolerance
+    assert story.motion().deck.heading_rad == pytest.approx(1.0, abs=0.011)  # heading tolerance and 1e-3 of frames
+
+
+def test_no_verdict_holds_and_comes_back_by_itself(story: Story) -> None:
+    story.until_state(State.DRIVING)
+    assert story.frame(None).twist == Twist(0.0, 0.0)
+    assert story.mission.state is State.HELD
+    story.until_state(State.DONE)
+    assert len(story.mission.done) == 3
+
+
+def test_withheld_permission_holds_with_its_cause(story: Story) -> None:
+    story.until_state(State.DRIVING)
+    story.frame(replace(FREE, forward=False, reverse=False, turn=False, cause="estimate stale"))
+    assert story.mission.state is State.HELD
+    assert story.mission.cause == "estimate stale"
+
+
+def test_edge_backs_off_at_most_60_mm_turns_away_fixes_and_resumes(story: Story, config: Config) -> None:
+    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    start = (story.x, story.y)
+    story.frame(FRONT_OFF)
+    assert story.mission.state is State.BACKING_OFF
+    for _ in range(60):
+        assert story.frame(FRONT_OFF).twist.v_m_s <= 0.0
+    backed = len(story.orders)
+    story.until(lambda: story.mission.state is not State.BACKING_OFF)
+    assert all(-config.mission.backoff_speed_m_s <= o.twist.v_m_s <= 0.0 for o in story.orders[backed:])
+    assert hypot(story.x - start[0], story.y - start[1]) <= config.mission.backoff_m + 0.01
+    assert story.mission.state is State.SETTLING
+    story.until(lambda: story.orders[-1].measure)
+    assert story.mission.done == []  # that fix was none of a point
+    story.until_state(State.DONE)
+    assert len(story.mission.done) == 3
+
+
+def test_an_edge_that_does_not_clear_faults(story: Story) -> None:
+    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    story.until_state(State.HELD, FRONT_OFF)
+    assert story.mission.is_faulted
+    assert "stuck at the edge" in story.mission.cause
+
+
+def test_abort_during_back_off_waits_for_the_retreat(story: Story) -> None:
+    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    story.frame(FRONT_OFF)
+    story.mission.abort("operator")
+    assert story.mission.state is State.BACKING_OFF
+    for _ in range(30):
+        assert story.frame(FRONT_OFF).twist.v_m_s <= 0.0
+    story.until_state(State.DONE, ABORT)
+    assert story.mission.outcome is Outcome.AT_BASE
+
+
+def test_pause_is_refused_while_backing_off(story: Story) -> None:
+    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    story.frame(FRONT_OFF)
+    assert "backing off" in (story.mission.pause("operator") or "")
+
+
+def test_failed_measurements_are_skipped_and_three_in_a_row_hold(story: Story) -> None:
+    story.auto_fix = False
+    for _ in range(3):
+        story.until(lambda: story.mission.is_awaiting_fix)
+        story.mission.not_fixed(story.mission.measuring_point, "no answer")
+    assert story.mission.is_faulted
+    assert "3 measurements in a row failed: no answer" in story.mission.cause
+    assert len(story.mission.skipped) == 3
+
+
+def test_a_fix_committed_during_a_pause_counts_once(story: Story) -> None:
+    story.auto_fix = False
+    story.until(lambda: story.mission.is_awaiting_fix)
+    point = story.mission.measuring_point
+    story.mission.pause("operator")
+    story.mission.fixed(point)
+    assert story.mission.state is State.HELD
+    story.auto_fix = True
+    story.mission.resume()
+    story.until_state(State.DONE)
+    assert [p.point for p in story.mission.done] == [1, 2, 3]
+
+
+def test_a_leg_that_does_not_end_faults(story: Story) -> None:
+    story.until_state(State.DRIVING)
+    x, y = story.x, story.y
+    for _ in range(3000):
+        story.frame()
+        story.x, story.y = x, y  # the wheels spin
+        if story.mission.state is State.HELD:
+            break
+    assert story.mission.is_faulted
+    assert "overdue" in story.mission.cause
+
+
+def test_stop_ends_where_the_robot_stands(story: Story) -> None:
+    story.until_state(State.DRIVING)
+    story.mission.stop()
+    assert story.mission.outcome is Outcome.STOPPED
+    assert story.frame().twist == Twist(0.0, 0.0)
+    assert story.mission.pause("late") == "the mission is over"
+    assert story.mission.abort("late") == "the mission is over"
+
+
+def test_interrupt_is_news_only_once(story: Story) -> None:
+    story.until_state(State.DRIVING)
+    assert story.mission.interrupt("no frames")
+    assert not story.mission.interrupt("no frames")

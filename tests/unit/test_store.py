@@ -1,0 +1,342 @@
+"""Tests of the mission database: what is acknowledged stays, what is damaged is noticed."""
+
+import asyncio
+import hashlib
+import random
+import sqlite3
+import subprocess
+import sys
+import threading
+from concurrent.futures import Future
+from pathlib import Path
+
+import pytest
+
+from ccatp import store, store_rows
+from ccatp.samples import DeckPose, Fix, PointId
+from ccatp.store import MissionStore, PlannedPoint, StoreError, StoreEvent, StoreRefusal
+from ccatp.store_rows import AlreadyMeasuredError, UnknownPointError
+
+PANEL = [PointId(1, 2, n) for n in range(1, 10)]
+POSE = DeckPose(0.1, 0.2, 0.3)
+
+
+def a_fix(t_s: float = 1.5) -> Fix:
+    return Fix(t_s, (1.0, 2.0 + t_s, 3.0), tuple(i * 1e-12 for i in range(9)), 1.7, (1, 2, 5, 8), 2e-6)
+
+
+def make(path: Path, reserve_bytes: int = 0, points: list[PointId] = PANEL) -> MissionStore:
+    plan = [PlannedPoint(p, 0.22, -0.25) for p in points]
+    return MissionStore.create(
+        path, mirror="fyst-m1", seed=1, config_toml="[run]\n", points=plan, reserve_bytes=reserve_bytes
+    )
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "mission.sqlite"
+
+
+def test_a_fix_comes_back_as_it_was(path: Path) -> None:
+    with make(path) as db:
+        assert db.record_fix(PANEL[4], a_fix(), POSE).result() == 1
+        assert db.measured_points() == {PANEL[4]}
+    with MissionStore.open(path, mirror="fyst-m1") as db:
+        (found,) = db.fixes()
+        assert (found.point, found.fix, found.estimate) == (PANEL[4], a_fix(), POSE)
+        rows = {row.point: row for row in db.points()}
+        assert rows[PANEL[4]].status == "measured"
+        assert rows[PANEL[4]].t_s == 1.5
+        assert rows[PANEL[0]].status == "planned"
+        assert (rows[PANEL[0]].x_m, rows[PANEL[0]].y_m) == (0.22, -0.25)
+        assert db.meta["seed"] == "1"
+        assert db.meta["config_sha256"] == hashlib.sha256(b"[run]\n").hexdigest()
+        assert db.damaged == ()
+
+
+async def test_a_fix_can_be_awaited(path: Path) -> None:
+    with make(path) as db:
+        assert await asyncio.wrap_future(db.record_fix(PANEL[0], a_fix(), POSE)) == 1
+
+
+def test_events_and_arrivals_come_back(path: Path) -> None:
+    event = StoreEvent(2.5, "danger", 1, "rim ahead", "front_left", 0.004, 0.005, "text")
+    with make(path) as db:
+        assert db.record_event(event)
+        assert db.record_arrival(PANEL[1], 3.5, 0.0004)
+        ((number, found, wall_utc),) = db.events()
+        assert (number, found) == (1, event)
+        assert wall_utc.endswith("+00:00")
+        assert db.arrivals() == [(PANEL[1], 3.5, 0.0004)]
+
+
+def test_a_measured_point_is_not_measured_again_unless_told(path: Path) -> None:
+    with make(path) as db:
+        db.record_fix(PANEL[0], a_fix(1.0), POSE).result()
+        with pytest.raises(AlreadyMeasuredError, match="1/2/1 has been measured"):
+            db.record_fix(PANEL[0], a_fix(2.0), POSE).result()
+        assert [f.fix.t_s for f in db.fixes()] == [1.0]
+        db.record_fix(PANEL[0], a_fix(3.0), POSE, remeasure=True).result()
+        assert [f.fix.t_s for f in db.fixes()] == [3.0]
+        assert [f.fix.t_s for f in db.fixes(history=True)] == [1.0, 3.0]
+
+
+def test_two_fixes_of_one_point_in_one_batch_leave_one(path: Path) -> None:
+    with make(path) as db:
+        gate = hold(db)
+        first, second = db.record_fix(PANEL[0], a_fix(), POSE), db.record_fix(PANEL[0], a_fix(), POSE)
+        gate.set()
+        assert first.result() == 1
+        with pytest.raises(AlreadyMeasuredError, match="not replaced"):
+            second.result()
+        assert len(db.fixes(history=True)) == 1
+
+
+def test_a_skipped_point_may_be_measured_later_and_not_the_other_way_round(path: Path) -> None:
+    with make(path) as db:
+        db.record_skipped(PANEL[0], 9.0).result()
+        assert [p.point for p in db.points() if p.status == "skipped"] == [PANEL[0]]
+        db.record_fix(PANEL[0], a_fix(), POSE).result()
+        with pytest.raises(AlreadyMeasuredError, match="cannot be skipped"):
+            db.record_skipped(PANEL[0], 10.0).result()
+
+
+def test_a_refused_request_harms_no_other_of_its_batch(path: Path) -> None:
+    with make(path) as db:
+        gate = hold(db)
+        unknown = db.record_fix(PointId(9, 9, 9), a_fix(), POSE)
+        not_finite = db.record_fix(PANEL[1], a_fix(float("nan")), POSE)
+        short = db.record_fix(PANEL[2], Fix(1.0, (0.0, 0.0, 0.0), (1.0,), 1.0, (1,), 0.0), POSE)
+        db.record_event(StoreEvent(1.0, None))  # type: ignore[arg-type]
+        good = db.record_fix(PANEL[0], a_fix(), POSE)
+        gate.set()
+        with pytest.raises(UnknownPointError, match="9/9/9 is not one"):
+            unknown.result()
+        with pytest.raises(StoreRefusal, match="1/2/2: a value is not finite"):
+            not_finite.result()
+        with pytest.raises(StoreRefusal, match="covariance is not of 9"):
+            short.result()
+        assert good.result() == 1
+        assert db.events() == []
+        assert db.events_dropped == 1
+        assert db.failure is None
+
+
+def test_a_request_the_database_cannot_hold_is_refused(path: Path) -> None:
+    with make(path) as db, pytest.raises(StoreRefusal, match="not storable"):
+        db.record_skipped(PANEL[0], object()).result()  # type: ignore[arg-type]
+
+
+def test_the_event_queue_is_bounded_and_counts_what_it_drops(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "EVENT_QUEUE", 3)
+    with make(path) as db:
+        gate = hold(db)
+        assert [db.record_event(StoreEvent(float(i), "x")) for i in range(5)] == [True, True, True, False, False]
+        assert db.queue_age_s > 0.0
+        gate.set()
+        assert len(db.events()) == 3
+        assert db.events_dropped == 2
+
+
+def test_a_cancelled_request_is_left_out(path: Path) -> None:
+    with make(path) as db:
+        gate = hold(db)
+        late = db.record_fix(PANEL[0], a_fix(), POSE)
+        assert late.cancel()
+        gate.set()
+        assert db.fixes() == []
+        assert db.queue_age_s < 5.0
+        assert db.measured_points() == set()
+
+
+def test_close_commits_what_is_queued_and_ends_the_store(path: Path) -> None:
+    db = make(path)
+    gate = hold(db)
+    waiting = db.record_fix(PANEL[0], a_fix(), POSE)
+    gate.set()
+    db.close()
+    db.close()
+    assert waiting.result() == 1
+    assert [p.name for p in path.parent.iterdir()] == ["mission.sqlite"]  # no journal is left behind
+    with pytest.raises(StoreError, match="is closed"):
+        db.record_fix(PANEL[1], a_fix(), POSE).result()
+    assert not db.record_event(StoreEvent(1.0, "x"))
+
+
+def test_close_says_when_the_writer_does_not_end(path: Path) -> None:
+    db = make(path)
+    gate = hold(db)
+    with pytest.raises(StoreError, match="writer still busy"):
+        db.close(timeout_s=0.0)
+    gate.set()
+    db.close()
+
+
+def test_create_refuses_an_existing_file_and_an_impossible_one(path: Path) -> None:
+    make(path).close()
+    with pytest.raises(StoreError, match="exists already"):
+        make(path)
+    with pytest.raises(StoreError, match="cannot be made"):
+        make(path.parent / "nowhere" / "mission.sqlite")
+
+
+def test_create_survives_the_leftovers_of_a_killed_one(path: Path) -> None:
+    path.with_name("mission.sqlite.new").write_bytes(b"half")
+    path.with_name("mission.sqlite.new-journal").write_bytes(b"half")
+    with make(path) as db:
+        assert len(db.points()) == 9
+
+
+def test_open_refuses_what_is_not_this_mission(path: Path) -> None:
+    with pytest.raises(StoreError, match="no such file"):
+        MissionStore.open(path, mirror="fyst-m1")
+    make(path).close()
+    with pytest.raises(StoreError, match="is a survey of fyst-m1, not of fyst-m2"):
+        MissionStore.open(path, mirror="fyst-m2")
+    alter(path, "UPDATE meta SET value = '99' WHERE key = 'schema_version'")
+    with pytest.raises(StoreError, match="schema version 99, this program has 1"):
+        MissionStore.open(path, mirror="fyst-m1")
+    other = path.with_name("other.sqlite")
+    other.write_bytes(b"something else entirely" * 100)
+    with pytest.raises(StoreError, match="not a mission store"):
+        MissionStore.open(other, mirror="fyst-m1")
+
+
+def test_open_notices_an_altered_target(path: Path) -> None:
+    make(path).close()
+    alter(path, "UPDATE points SET x_m = 0.23 WHERE point = 3")
+    with pytest.raises(StoreError, match="do not match their checksum"):
+        MissionStore.open(path, mirror="fyst-m1")
+
+
+def test_a_damaged_fix_makes_its_point_planned_again(path: Path) -> None:
+    with make(path) as db:
+        for point in PANEL[:2]:
+            db.record_fix(point, a_fix(), POSE).result()
+    alter(path, "UPDATE fixes SET z_m = z_m + 1e-9 WHERE id = 2")
+    with MissionStore.open(path, mirror="fyst-m1") as db:
+        assert db.damaged == (PANEL[1],)
+        assert db.measured_points() == {PANEL[0]}
+        assert db.record_fix(PANEL[1], a_fix(), POSE).result() == 3
+
+
+def test_no_flipped_bit_and_no_truncation_changes_a_fix_unnoticed(path: Path) -> None:
+    with make(path) as db:
+        for i, point in enumerate(PANEL):
+            db.record_fix(point, a_fix(float(i)), POSE).result()
+        truth = {f.point: f.fix for f in db.fixes()}
+    sound = path.read_bytes()
+    rng = random.Random(5)
+    cases = [(rng.randrange(len(sound)), 1 << rng.randrange(8)) for _ in range(150)]
+    variants = [sound[:at] + bytes([sound[at] ^ bit]) + sound[at + 1 :] for at, bit in cases]
+    variants += [sound[:at] for at in range(0, len(sound), 1021)]
+    noticed = 0
+    for content in variants:
+        path.write_bytes(content)
+        try:
+            with MissionStore.open(path, mirror="fyst-m1") as db:
+                fixes = {f.point: f.fix for f in db.fixes()}
+                assert fixes == {p: f for p, f in truth.items() if p not in db.damaged}
+                noticed += bool(db.damaged)
+        except StoreError:
+            noticed += 1
+    assert noticed > len(sound) // 1021  # all truncations and some of the flips (the others hit unused bytes)
+
+
+def test_events_give_way_to_fixes_when_the_disk_is_full(path: Path) -> None:
+    failures: list[StoreError] = []
+    make(path, reserve_bytes=20_000).close()
+    with MissionStore.open(path, mirror="fyst-m1", on_failure=failures.append) as db:
+        gate = hold(db, lambda c: c.execute("PRAGMA max_page_count = 1"))  # SQLite's "disk full": no further page
+        for _ in range(200):
+            db.record_event(StoreEvent(1.0, "x", text="y" * 1000))
+        fix = db.record_fix(PANEL[0], a_fix(), POSE)
+        gate.set()
+        assert fix.result() == 1
+        assert db.events_dropped >= 200
+        assert failures == []
+
+
+def test_a_disk_without_room_ends_the_store_loudly(path: Path) -> None:
+    failures: list[StoreError] = []
+    make(path).close()
+    with MissionStore.open(path, mirror="fyst-m1", on_failure=failures.append) as db:
+        gate = hold(db, lambda c: c.execute("PRAGMA max_page_count = 1"))
+        big = Fix(1.0, (0.0, 0.0, 0.0), (0.0,) * 9, 1.0, tuple(range(5000)), 0.0)
+        first = db.record_fix(PANEL[0], big, POSE)
+        gate.set()
+        with pytest.raises(StoreError, match=r"cannot write any more: .*full.*SQLITE_FULL"):
+            first.result()
+        with pytest.raises(StoreError, match="cannot write any more"):  # final, though this one would fit
+            db.record_fix(PANEL[1], a_fix(), POSE).result()
+        assert not db.record_event(StoreEvent(1.0, "x"))
+        assert db.measured_points() == set()
+        assert failures == [db.failure]
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_writer_that_dies_takes_its_requests_with_it(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def surprise(*_: object) -> int:
+        raise RuntimeError("surprise")
+
+    monkeypatch.setattr(store_rows, "insert_fix", surprise)
+    db = make(path)
+    with pytest.raises(StoreError, match="RuntimeError: surprise"):
+        db.record_fix(PANEL[0], a_fix(), POSE).result(timeout=5.0)
+    db.close()
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from ccatp.samples import DeckPose, Fix, PointId
+from ccatp.store import MissionStore, StoreEvent
+db = MissionStore.open(Path(sys.argv[1]), mirror="fyst-m1")
+for point in sorted({p.point for p in db.points()} - db.measured_points()):
+    db.record_event(StoreEvent(1.0, "x"))
+    fix = Fix(float(point.row), (1.0, 2.0, 3.0), (0.0,) * 9, 1.0, (1, 2, 3, 4), 0.0)
+    db.record_fix(point, fix, DeckPose(0.0, 0.0, 0.0)).result()
+    print(*point, flush=True)
+"""
+
+
+def test_what_was_acknowledged_survives_kill_9_at_any_instant(path: Path) -> None:
+    points = [PointId(row, 1, n) for row in range(1, 201) for n in range(1, 10)]
+    make(path, reserve_bytes=200_000, points=points).close()
+    rng = random.Random(3)
+    acknowledged: set[PointId] = set()
+    for run in range(1, 7):
+        with subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, text=True) as child:
+            assert child.stdout is not None
+            for _ in range(rng.randrange(1, 40)):
+                acknowledged.add(PointId(*map(int, child.stdout.readline().split())))
+            for _ in range(rng.randrange(20_000)):  # up to a millisecond: somewhere inside the next commit
+                pass
+            child.kill()
+            acknowledged |= {PointId(*map(int, line.split())) for line in child.stdout if line.endswith("\n")}
+        with MissionStore.open(path, mirror="fyst-m1") as db:  # checks integrity
+            assert db.damaged == ()
+            assert acknowledged <= db.measured_points()
+            assert len(db.measured_points() - acknowledged) <= run  # at most the one in flight of each run
+            assert {f.point for f in db.fixes()} == db.measured_points()
+
+
+def hold(db: MissionStore, then: object = None) -> threading.Event:
+    """Keep the writer thread busy until the event is set, so that what follows makes one batch."""
+    gate, began = threading.Event(), threading.Event()
+
+    def wait(connection: sqlite3.Connection) -> None:
+        began.set()
+        gate.wait(10.0)
+        if callable(then):
+            then(connection)
+
+    _held: Future[None] = db._submit(wait)
+    assert began.wait(10.0)
+    return gate
+
+
+def alter(path: Path, statement: str) -> None:
+    with sqlite3.connect(path) as connection:
+        connection.execute(statement)
+    connection.close()

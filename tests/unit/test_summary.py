@@ -1,0 +1,235 @@
+"""Tests of the summary against a plain recomputation, whatever the order and size of the batches."""
+
+import json
+import tomllib
+from dataclasses import replace
+from math import hypot, pi
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ccatp import summary as summary_module
+from ccatp.config.models import MirrorConfig
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.samples import DeckPose, PanelId, PointId
+from ccatp.summary import RunFacts, SummaryBuilder, format_table, puck_targets
+
+HEIGHT_M = 0.05
+POINT = PointId(5, 5, 3)
+FACTS = RunFacts("fyst-m1", "thesis", "kf", 1, 693, 3000.0, 3600.0, HEIGHT_M, True)
+CONFIGS = Path(__file__).parents[2] / "configs" / "mirrors"
+
+
+@pytest.fixture(scope="module")
+def mirror() -> Mirror:
+    return build_mirror(MirrorConfig.model_validate(tomllib.loads((CONFIGS / "fyst-m1.toml").read_text())))
+
+
+@pytest.fixture
+def builder(mirror: Mirror) -> SummaryBuilder:
+    return make(mirror)
+
+
+def make(mirror: Mirror, **changes: Any) -> SummaryBuilder:
+    facts = replace(FACTS, **changes)
+    return SummaryBuilder(facts, puck_targets(mirror, mirror.point_ids(PanelId(5, 5)), HEIGHT_M), mirror.surface.normal)
+
+
+def truth_row(
+    mirror: Mirror, seq: int, x: float = 0.0, y: float = 0.0, psi: float = 0.0, clearance: float = 1.0, fallen: int = 0
+) -> list[float]:
+    return [seq, seq / 100, x, y, psi, *mirror.surface.point(x, y), clearance, fallen, int(clearance < 0)]
+
+
+def tables(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    rng = np.random.default_rng(1)
+    seq = np.arange(count, dtype=np.float64)
+    truth: NDArray[np.float64] = np.column_stack((seq, seq / 100, rng.normal(size=(count, 6))))
+    truth = np.column_stack((truth, np.ones(count), np.zeros((count, 2))))
+    track: NDArray[np.float64] = truth[:, :9].copy()
+    track[:, 2:8] += rng.normal(scale=3e-3, size=(count, 6))
+    return truth, track
+
+
+def test_errors_are_those_of_a_plain_recomputation(builder: SummaryBuilder) -> None:
+    truth, track = tables(1000)
+    builder.add_truth(truth[:-10])  # the last frames have no truth, the first no estimate
+    builder.add_track(track[20:])
+    built = builder.build()
+    errors_mm = 1e3 * np.array([hypot(*(b - a)) for a, b in zip(truth[20:-10, 5:8], track[20:-10, 5:8], strict=True)])
+    found = built["localization_error_mm"]
+    # the summary is rounded to 1 um, six decimals for the fraction
+    assert found["mean"] == pytest.approx(sum(errors_mm) / 970, abs=6e-4)
+    assert found["max"] == pytest.approx(max(errors_mm), abs=6e-4)
+    ordered = sorted(errors_mm)
+    assert found["p50"] == pytest.approx((ordered[484] + ordered[485]) / 2, abs=6e-4)
+    assert ordered[958] <= found["p99"] + 6e-4
+    assert found["p99"] <= ordered[961] + 6e-4
+    assert found["within_10mm_fraction"] == pytest.approx(sum(e <= 10.0 for e in errors_mm) / 970, abs=6e-7)
+    assert 0.5 < found["within_10mm_fraction"] < 1.0
+    turns = track[20:-10, 4] - truth[20:-10, 4]
+    assert built["heading_error_mrad"]["rms"] == pytest.approx(1e3 * (sum(turns**2) / 970) ** 0.5, abs=6e-4)
+
+
+def test_batches_of_any_size_and_order_give_the_same_summary(mirror: Mirror) -> None:
+    truth, track = tables(900)
+    results = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        cuts = sorted(rng.integers(0, 900, size=12))
+        parts = [("truth", part) for part in np.split(truth, cuts)]
+        order = rng.permutation(13)
+        for position, part in zip(order, np.split(track, cuts), strict=True):
+            parts.insert(int(position) * 2, ("track", part))
+        made = make(mirror)
+        made.add_arrival(POINT, 450)
+        made.add_verdict_event(449, 1)
+        for kind, part in parts:
+            (made.add_truth if kind == "truth" else made.add_track)(part)
+        results.append(json.dumps(made.build()))
+    assert len(set(results)) == 1
+    assert json.loads(results[0])["localization_error_mm"]["mean"] > 1.0
+
+
+def test_heading_error_is_wrapped(builder: SummaryBuilder, mirror: Mirror) -> None:
+    builder.add_truth([truth_row(mirror, 1, psi=pi - 0.001)])
+    builder.add_track([truth_row(mirror, 1, psi=-pi + 0.002)])
+    assert builder.build()["heading_error_mrad"]["rms"] == 3.0
+
+
+@pytest.mark.parametrize("truth_first", [True, False])
+def test_arrival_error_is_that_of_the_puck_in_the_panel_plane(mirror: Mirror, truth_first: bool) -> None:
+    builder = make(mirror)
+    x, y = mirror.point_on_deck(POINT)
+    row = truth_row(mirror, 7, x + 3e-3, y - 4e-3)
+    row[7] += 5e-3  # along the normal, nearly: a misaligned panel is no arrival error
+    if truth_first:
+        builder.add_truth([row])
+    builder.add_arrival(POINT, 7)
+    if not truth_first:
+        assert builder.unresolved == 1
+        builder.add_truth([row])
+    assert builder.unresolved == 0
+    built = builder.build()
+    # 5 mm aside on the deck's projection; the slope (< 5 deg here) and the lift across it change it by at most 0.4 mm
+    assert built["arrival_error_mm"]["mean"] == pytest.approx(5.0, abs=0.4)
+    assert built["points"]["first_arrival_within_10mm"] == 1
+
+
+def test_arrival_at_the_target_has_no_error_and_only_the_first_counts(builder: SummaryBuilder, mirror: Mirror) -> None:
+    x, y = mirror.point_on_deck(POINT)
+    builder.add_truth([truth_row(mirror, 1, x, y), truth_row(mirror, 2, x + 0.02, y), truth_row(mirror, 3, x, y)])
+    builder.add_arrival(POINT, 1)
+    builder.add_arrival(POINT, 2)
+    builder.add_arrival(PointId(5, 5, 1), 2)
+    builder.add_arrival(PointId(5, 5, 2), 99)
+    assert builder.unresolved == 1
+    built = builder.build()
+    assert built["points"]["first_arrival_within_10mm"] == 1
+    assert built["arrival_error_mm"]["max"] > 100.0
+
+
+def test_target_is_where_the_mirror_puts_the_puck(mirror: Mirror) -> None:
+    target = puck_targets(mirror, [POINT], HEIGHT_M)[POINT]
+    x, y = mirror.point_on_deck(POINT)
+    assert mirror.world_from_deck(target.position_m) == pytest.approx(
+        mirror.puck_world(DeckPose(x, y, 1.0), HEIGHT_M),
+        abs=1e-12,  # rounding
+    )
+
+
+def test_an_arrival_is_found_long_after_its_frame(
+    builder: SummaryBuilder, mirror: Mirror, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(summary_module, "HISTORY_ROWS", 100)
+    for start in range(0, 300, 10):
+        builder.add_truth([truth_row(mirror, seq) for seq in range(start, start + 10)])
+    builder.add_arrival(POINT, 205)
+    assert builder.unresolved == 0
+    builder.add_arrival(PointId(5, 5, 1), 100)  # beyond what is kept: reported as unresolved, never guessed
+    assert builder.unresolved == 1
+
+
+def test_an_edge_is_true_where_a_sensor_was_beyond_the_rim(builder: SummaryBuilder, mirror: Mirror) -> None:
+    clearance = {20: -0.004, 33: -0.0021}
+    builder.add_verdict_event(17, 1)  # three frames before the truth's
+    builder.add_verdict_event(24, 1)  # four frames after
+    builder.add_truth([truth_row(mirror, seq, clearance=clearance.get(seq, 0.1)) for seq in range(30)])
+    builder.add_verdict_event(30, 1)  # its frames are not all there yet
+    assert builder.unresolved == 1
+    builder.add_truth([truth_row(mirror, seq, clearance=clearance.get(seq, 0.1)) for seq in range(30, 40)])
+    builder.add_verdict_event(39, 1)  # the run ends before its last frames
+    builder.add_verdict_event(20, 2)  # an abort is no edge
+    assert builder.build()["danger"] == {"true_edges": 2, "false_edges": 2, "falls": 0, "max_overrun_mm": 4.0}
+
+
+def test_falls_are_counted_once_each_across_batches(builder: SummaryBuilder, mirror: Mirror) -> None:
+    for batch in ([0, 1], [1, 1], [0, 0], [1]):
+        builder.add_truth([truth_row(mirror, i, fallen=f) for i, f in enumerate(batch)])
+    assert builder.build()["danger"]["falls"] == 2
+
+
+def test_panels_compare_fit_with_injected(builder: SummaryBuilder) -> None:
+    a, b, c = PanelId(1, 1), PanelId(1, 2), PanelId(1, 3)
+    fits = {a: (3e-6, 1e-6, 0.0), b: (4e-6, 0.0, 1e-6), c: (9.0, 9.0, 9.0)}
+    builder.set_panels(fits, {b: (0.0, 0.0, 0.0), a: (0.0, 0.0, 0.0)})
+    # sqrt((9 + 16) / 2) um; sqrt((1 + 0 + 0 + 1) / 4) urad; the third has no truth
+    assert builder.build()["panels"] == {"count": 3, "piston_rms_um": 3.536, "tilt_rms_urad": 0.707}
+
+
+def test_a_whole_summary_has_the_keys_of_the_contract_in_their_order(builder: SummaryBuilder) -> None:
+    builder.set_mission(690, 3, 3600.0)
+    builder.add_ticks([100.0, 110.0])
+    builder.add_ticks(np.array([120.0]))
+    builder.set_wall(60.0)
+    built = builder.build()
+    assert list(built) == [
+        *("mirror", "world", "filter", "seed", "points", "arrival_error_mm", "localization_error_mm"),
+        *("heading_error_mrad", "mission_time_s", "lower_bound_s", "within_budget", "danger", "panels", "wall"),
+    ]
+    assert list(built["points"]) == ["total", "measured", "first_arrival_within_10mm", "skipped"]
+    assert list(built["arrival_error_mm"]) == ["mean", "p50", "p99", "max"]
+    assert list(built["localization_error_mm"]) == ["mean", "p50", "p99", "max", "within_10mm_fraction"]
+    assert built["points"] == {"total": 693, "measured": 690, "first_arrival_within_10mm": 0, "skipped": 3}
+    assert built["within_budget"] is True
+    assert built["wall"] == {"time_s": 60.0, "realtime_factor": 60.0, "tick_us_p50": 110.0, "tick_us_p99": 119.8}
+    json.dumps(built, allow_nan=False)
+
+
+def test_a_real_robot_has_null_where_the_truth_is_needed(mirror: Mirror) -> None:
+    builder = make(mirror, has_truth=False, world=None)
+    builder.add_track(tables(10)[1])
+    builder.add_arrival(POINT, 3)
+    builder.add_verdict_event(3, 1)
+    builder.set_mission(693, 0, 3700.0)
+    builder.set_panels({PanelId(1, 1): (0.0, 0.0, 0.0)}, None)
+    built = builder.build()
+    assert built["world"] is None
+    assert built["points"]["first_arrival_within_10mm"] is None
+    assert set(built["danger"].values()) == {None}
+    assert {*built["arrival_error_mm"].values(), *built["localization_error_mm"].values()} == {None}
+    assert built["heading_error_mrad"]["rms"] is None
+    assert built["panels"] == {"count": 1, "piston_rms_um": None, "tilt_rms_urad": None}
+    assert built["within_budget"] is False
+    assert built["wall"]["time_s"] is None
+
+
+def test_a_diverged_estimate_gives_a_file_that_json_can_hold(builder: SummaryBuilder) -> None:
+    truth, track = tables(4)
+    track[2, 5] = np.nan
+    builder.add_truth(truth)
+    builder.add_track(track)
+    built = builder.build()["localization_error_mm"]
+    assert built["mean"] is None
+    assert built["within_10mm_fraction"] <= 0.75
+
+
+def test_the_table_is_short_and_has_every_figure(builder: SummaryBuilder) -> None:
+    text = format_table(builder.build())
+    assert len(text.splitlines()) == 8
+    assert "points                 total 693  measured 0" in text
+    assert "mean -" in text
+    assert "within_budget yes" in text
