@@ -142,10 +142,12 @@ def stop(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, j
 @cli.command(epilog=example("ccatp emergency fire --note 'smoke in the receiver cabin'"))
 @click.argument("kind", type=click.Choice(EMERGENCY_KINDS), metavar="KIND")
 @click.option("--note", default="", help="What happened, for the log.")
-@click.option("--id", "emergency_id", help="Identity of the emergency; sending the same one again is harmless.")
+@click.option(
+    "--id", "emergency_id", type=click.UUID, help="Identity of the emergency; sending the same one again is harmless."
+)
 @_daemon_options
 def emergency(
-    kind: str, note: str, emergency_id: str | None,
+    kind: str, note: str, emergency_id: uuid.UUID | None,
     config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool,
 ) -> None:  # fmt: skip
     """Report an emergency: the robot goes to its base.
@@ -155,7 +157,7 @@ def emergency(
     payload: dict[str, object] = {
         "cmd": "emergency",
         "kind": kind,
-        "id": emergency_id or str(uuid.uuid4()),
+        "id": str(emergency_id or uuid.uuid4()),
         "note": note,
     }
     _tell(ask_daemon(_folder(config_file, runtime_dir), "emergency", payload, timeout_s), json_output)

@@ -1,6 +1,7 @@
 """Glue. What every command shares: suggestions, one-line errors, exit statuses, options, talk with a running daemon."""
 
 import difflib
+import json
 import os
 import sys
 import tomllib
@@ -157,12 +158,12 @@ def ask_daemon(runtime_dir: Path | None, channel: str, payload: dict[str, object
         raise UnreachableError(
             f"no daemon in {folder}; start one with ccatp run, or name its folder with --runtime-dir"
         )
-    from ccatp.router import request
+    from ccatp.router import RequestFailed, request
 
     try:
-        reply: dict[str, Any] = request(f"ipc://{folder / channel}", payload, timeout_s)
-    except TimeoutError as error:
-        raise UnreachableError(f"the daemon in {folder} does not answer within {timeout_s:g} s") from error
+        reply = request(f"ipc://{folder / channel}", json.dumps(payload).encode(), timeout_s)
+    except RequestFailed as error:
+        raise UnreachableError(str(error)) from error
     if not reply.get("ok", False):
         raise RefusedError(f"{payload.get('cmd')} refused: {reply.get('error', 'no reason given')}")
     return reply

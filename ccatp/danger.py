@@ -5,6 +5,7 @@ outranks normal operation (0). The cause is that of the rule that takes the most
 
 * all four edge sensors off: code 1, nothing permitted (``ccatp.edge_rule``, rule h);
 * an edge declared: code 1, no motion towards a sensor that hangs over, no turn but back;
+* the robot's centre about to drive over the rim on the map: likewise (``ccatp.origin_rule``);
 * edge samples, encoder samples or the estimate missing or older than allowed: nothing permitted, no code of its own;
   ends by itself as soon as they are fresh again;
 * an emergency: code 2, latched, motion permitted, because the robot shall drive home (``ccatp.abort_latch``).
@@ -19,9 +20,11 @@ from ccatp.config.models import DangerConfig, RobotConfig
 from ccatp.edge_episode import Episode, Phase
 from ccatp.edge_map import EdgeMap, MirrorMap
 from ccatp.edge_rule import EdgeRule, PoseEstimate
+from ccatp.origin_rule import OriginRule
 from ccatp.samples import Corner, EdgeSample, EventCode, Verdict, WheelSample
 
 CORNERS = tuple(Corner)
+CENTRE = "the robot's centre is close to the rim on the map"
 NOWHERE = (False, False, False, False)
 EVERYWHERE = (True, True, True, True)
 
@@ -75,6 +78,7 @@ class DangerMonitor:
     def __init__(self, mirror: MirrorMap, robot: RobotConfig, cfg: DangerConfig) -> None:
         """No frame judged yet: nothing is permitted until the first."""
         self._edges = EdgeRule(EdgeMap(mirror), robot, cfg)
+        self._origin = OriginRule(mirror.rim, robot, cfg)
         self._stale_after_s, self._estimate_stale_after_s = cfg.stale_after_s, cfg.estimate_stale_after_s
         self.latch = AbortLatch()
         self.reset()
@@ -82,6 +86,7 @@ class DangerMonitor:
     def reset(self) -> None:
         """Begin a new session with the robot (its clock and numbers begin anew). Emergencies stay latched."""
         self._edges.reset()
+        self._origin.reset()
         self._edge_t_s: float | None = None
         self._state = ""
         self.verdict = self.stale(-1, 0.0)
@@ -108,7 +113,7 @@ class DangerMonitor:
     @property
     def code(self) -> EventCode:
         """The event code now."""
-        if self._edges.is_lifted or self._declared() is not None:
+        if self._edges.is_lifted or self._origin.direction or self._declared() is not None:
             return EventCode.NEAR_EDGE
         return EventCode.ABORTED if self.latch.is_latched else EventCode.NORMAL
 
@@ -139,7 +144,11 @@ class DangerMonitor:
         edges, t_s, samples = self._edges, sensors.t, sensors.edge
         edges.track.push(sensors.enc)
         is_known = estimate is not None and self._is_fresh(estimate, t_s)
-        self._state = estimate.state if estimate is not None and is_known else ""
+        if estimate is not None and is_known:
+            self._state = estimate.state
+            self._origin.step(t_s, estimate, sensors.enc)
+        else:
+            self._state = ""
         if edges.is_idle and _are_all_on(samples):
             edges.skip(samples)
         else:
@@ -147,7 +156,7 @@ class DangerMonitor:
         if samples:
             self._edge_t_s = samples[-1][0]
         missing = self._missing(t_s, estimate, is_known)
-        if edges.is_idle and missing is None and not self.latch.is_latched:
+        if edges.is_idle and missing is None and not self._origin.direction and not self.latch.is_latched:
             self.verdict = Verdict(sensors.seq, t_s, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
         else:
             self.verdict = self._arbitrate(sensors.seq, t_s, missing)
@@ -195,6 +204,8 @@ class DangerMonitor:
         declared = self._declared()
         if declared is not None:
             return self._edge_verdict(seq, t_s, declared, missing)
+        if self._origin.direction:
+            return self._origin_verdict(seq, t_s, missing)
         if missing is not None:
             return _denied(seq, t_s, self.code, missing)
         newest = self.latch.newest
@@ -206,7 +217,7 @@ class DangerMonitor:
     def _edge_verdict(self, seq: int, t_s: float, episode: Episode, missing: _Missing | None) -> Verdict:
         front_left, front_right, rear_left, rear_right = off = self._declared_sensors()
         turn = all(e is None or e.permits_turn for e in self._edges.episodes)
-        known = missing is None
+        known, barred = missing is None, self._origin.direction
         return Verdict(
             seq,
             t_s,
@@ -215,10 +226,20 @@ class DangerMonitor:
             CORNERS[off.index(True)].value,
             episode.value_m,
             episode.limit_m,
-            known and not (front_left or front_right),
-            known and not (rear_left or rear_right),
-            known and turn,
+            known and barred <= 0 and not (front_left or front_right),
+            known and barred >= 0 and not (rear_left or rear_right),
+            known and turn and not barred,
             off,
+        )
+
+    def _origin_verdict(self, seq: int, t_s: float, missing: _Missing | None) -> Verdict:
+        known, origin = missing is None, self._origin
+        front, rear = origin.direction > 0, origin.direction < 0
+        cause = CENTRE if missing is None else f"{CENTRE}; {missing.cause}"
+        off = front, front, rear, rear
+        values = origin.clearance_m, origin.limit_m
+        return Verdict(
+            seq, t_s, EventCode.NEAR_EDGE, cause, "estimate", *values, known and rear, known and front, False, off
         )
 
     def _declared_sensors(self) -> tuple[bool, bool, bool, bool]:

@@ -170,7 +170,7 @@ class _Session:
                     while (line := lines.next_line()) is not None:
                         await self._handle(line, group)
             finally:
-                await self._stop_stream()
+                self._stop_stream()
         self._writer.close()
         async with asyncio.timeout(_SEND_TIMEOUT_S):
             await self._writer.wait_closed()
@@ -193,7 +193,7 @@ class _Session:
         command = request.command
         reply: Reply = _BUSY
         if command is Command.STOP_MEASUREMENT:
-            await self._stop_stream()
+            self._stop_stream()
             reply = Notice.STOPPED
         elif self._push is not None:
             pass
@@ -214,11 +214,10 @@ class _Session:
             await self._send(await self._server.lengths(self._server.model.channels))
             await asyncio.sleep(1.0 / self._server.push_hz)
 
-    async def _stop_stream(self) -> None:
-        """End the stream for good: after this no record of it follows."""
+    def _stop_stream(self) -> None:
+        """End the stream: a record is written in one piece, so after this none follows."""
         if self._push is not None:
             self._push.cancel()
-            await asyncio.wait({self._push})
             self._push = None
         self._server.release_stream(self)
 

@@ -43,7 +43,7 @@ class Localizer:
         innovation: of the last filter update with samples, or None.
         hold_cause: why the mission should hold, or empty; stays until ``clear_hold``.
         is_frozen: the filter has diverged; the pose stands still until the next fix or reset.
-        fix_deviation_m: height of the last fix above the ideal surface, m.
+        fix_deviation_m: how far the last fix was above the ideal surface.
     """
 
     def __init__(
@@ -227,13 +227,12 @@ class Localizer:
         return self._builder.from_wheels(t_s, usable, *self._intake.wheels(t_s, encoders))
 
     def _advance(self, t_s: float, dt_s: float, z: FloatArray, H: FloatArray, R: FloatArray) -> None:
-        filter_ = self._filter
-        v0, _, theta0, _ = filter_.mean.tolist()
-        filter_.predict(*self._process.over(dt_s))
-        innovation = filter_.update(z, H, R)
+        v0, _, theta0, _ = self._filter.mean.tolist()
+        self._filter.predict(*self._process.over(dt_s))
+        innovation = self._filter.update(z, H, R)
         if innovation.size:
             self.innovation = innovation
-        v1, _, theta1, _ = filter_.mean.tolist()
+        v1, _, theta1, _ = self._filter.mean.tolist()
         v, turn = 0.5 * (v0 + v1), theta1 - theta0
         dx, dy = arc_step(v, theta0, turn, dt_s)
         self._x_m, self._y_m = self._x_m + dx, self._y_m + dy

@@ -8,6 +8,7 @@ from typing import Any, Self
 import zmq
 import zmq.asyncio
 
+from ccatp.errors import CcatpError, ExitStatus, UnreachableError
 from ccatp.wire.channels import BadRequest, format_error, parse_reply
 
 Handler = Callable[[bytes], bytes | Awaitable[bytes]]
@@ -21,11 +22,13 @@ BUSY = "too many requests are waiting for their answer"
 NOT_SINGLE = "a request is one frame"
 
 
-class RouterError(Exception):
+class RouterError(CcatpError):
     """The endpoint cannot be served."""
 
+    exit_status = ExitStatus.USAGE
 
-class RequestFailed(Exception):
+
+class RequestFailed(UnreachableError):
     """No usable answer within the deadline."""
 
 

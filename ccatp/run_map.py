@@ -28,17 +28,17 @@ FloatArray = NDArray[np.float64]
 
 WIDTH_PX = 1600
 DPI = 160
-LIMIT_MM = 10.0  # arrivals beyond it miss the requirement; the colours end there
+LIMIT_MM = 10.0  # arrivals beyond it miss the requirement; the colours end there at the latest
 MAX_PATH_POINTS = 40_000
 
 _INK, _QUIET, _PANEL, _SEAM, _PATH, _BAD = "#1f2933", "#6b7785", "#f1f4f7", "#c5ced8", "#8fa3b8", "#d64545"
-_COLOURS = "viridis_r"
+_COLOURS = ("#123f6d", "#1d8a99", "#f0b429")  # small to large; lightness tells the ends apart as well
 
 
 class RunMapError(CcatpError):
     """A run that cannot be drawn."""
 
-    exit_code = ExitStatus.USAGE
+    exit_status = ExitStatus.USAGE
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,10 +79,10 @@ def draw_run_map(
         raise RunMapError("drawing needs matplotlib: install ccatp with its extra, ccatp[plots]") from error
     low, high = mirror.rim.vertices.min(axis=0), mirror.rim.vertices.max(axis=0)
     width = WIDTH_PX / DPI
-    # Margins of 0.25 m around the mirror; 1.5 inches beside it for colour bar and labels, 1.2 above and below.
-    height = (width - 1.5) * float((high[1] - low[1] + 0.5) / (high[0] - low[0] + 0.5)) + 1.2
+    # Margins of 0.25 m around the mirror; 1.5 inches beside it for colour bar and labels, 1.5 above and below.
+    height = (width - 1.5) * float((high[1] - low[1] + 0.5) / (high[0] - low[0] + 0.5)) + 1.5
     figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
-    axes = figure.add_axes((0.75 / width, 0.6 / height, (width - 1.5) / width, (height - 1.35) / height))
+    axes = figure.add_axes((0.75 / width, 0.85 / height, (width - 1.5) / width, (height - 1.6) / height))
     _draw_mirror(axes, mirror)
     step = max(1, len(path_xy) // MAX_PATH_POINTS)
     axes.plot(path_xy[::step, 0], path_xy[::step, 1], color=_PATH, linewidth=0.9, zorder=3, label="driven path")
@@ -181,33 +181,36 @@ def _draw_mirror(axes: "Axes", mirror: Mirror) -> None:
 
 def _draw_base(axes: "Axes", mirror: Mirror) -> None:
     base = mirror.base_pose
-    ahead = {"dx": 0.22 * cos(base.heading_rad), "dy": 0.22 * sin(base.heading_rad)}
-    shape = {"width": 0.035, "head_width": 0.13, "head_length": 0.11, "length_includes_head": True}
+    ahead = {"dx": 0.18 * cos(base.heading_rad), "dy": 0.18 * sin(base.heading_rad)}
+    shape = {"width": 0.035, "head_width": 0.11, "head_length": 0.09, "length_includes_head": True}
     axes.arrow(base.x_m, base.y_m, **ahead, **shape, color=_INK, linewidth=0, zorder=6)
     axes.plot(base.x_m, base.y_m, "o", color=_INK, markersize=9, zorder=6, linestyle="", label="base")
 
 
 def _draw_points(figure: "Figure", axes: "Axes", points: Sequence[MapPoint]) -> None:
+    from matplotlib.colors import LinearSegmentedColormap  # noqa: PLC0415 - see above
+
     measured = [p for p in points if p.error_mm is not None]
     errors = np.array([p.error_mm for p in measured], dtype=np.float64)
-    largest = float(errors.max()) if len(errors) else 1.0
-    top = min(LIMIT_MM, ceil(largest * 10) / 10 or 0.1)
+    # A single far one must not make all others look alike.
+    usual, largest = np.percentile(errors, (98, 100)) if len(errors) else (1.0, 1.0)
+    top = min(LIMIT_MM, max(0.1, ceil(usual * 10) / 10))
+    colours = LinearSegmentedColormap.from_list("arrival error", _COLOURS)
     dots = axes.scatter(
-        [p.x_m for p in measured], [p.y_m for p in measured], c=errors, cmap=_COLOURS, vmin=0.0, vmax=top,
+        [p.x_m for p in measured], [p.y_m for p in measured], c=errors, cmap=colours, vmin=0.0, vmax=top,
         s=40, edgecolors="white", linewidths=0.7, zorder=5,
     )  # fmt: skip
     skipped = [p for p in points if p.is_skipped and p.error_mm is None]
     to_come = [p for p in points if not p.is_skipped and p.error_mm is None]
-    for some, name, look in (
-        (skipped, "skipped", {"marker": "x", "color": _BAD, "s": 36, "linewidths": 1.6}),
-        (to_come, "not measured", {"marker": "o", "facecolors": "white", "edgecolors": _QUIET, "s": 26}),
-    ):
+    crosses: dict[str, Any] = {"marker": "x", "color": _BAD, "s": 36, "linewidths": 1.6, "label": "skipped"}
+    rings: dict[str, Any] = {"facecolors": "white", "edgecolors": _QUIET, "s": 26, "label": "not measured"}
+    for some, look in ((skipped, crosses), (to_come, rings)):
         if some:
-            axes.scatter([p.x_m for p in some], [p.y_m for p in some], zorder=5, label=name, **look)
+            axes.scatter([p.x_m for p in some], [p.y_m for p in some], zorder=5, **look)
     place = axes.get_position()
     bar_axes = figure.add_axes((place.x1 + 0.006, place.y0 + 0.2 * place.height, 0.013, 0.6 * place.height))
     bar = figure.colorbar(dots, cax=bar_axes, extend="max" if largest > top else "neither")
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
     bar.ax.tick_params(labelsize=8, color=_QUIET, labelcolor=_INK)
     bar.set_label("arrival error, mm", fontsize=9, color=_INK)
 
@@ -220,4 +223,4 @@ def _dress(axes: "Axes", low: FloatArray, high: FloatArray, title: str, subtitle
         side.set_visible(False)
     axes.text(0.0, 1.045, title, transform=axes.transAxes, fontsize=15, fontweight="bold", color=_INK)
     axes.text(0.0, 1.018, subtitle, transform=axes.transAxes, fontsize=9.5, color=_QUIET)
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, frameon=False, fontsize=8.5, labelcolor=_INK)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.045), ncols=4, frameon=False, fontsize=8.5, labelcolor=_INK)

@@ -41,11 +41,9 @@ async def no_task_leaks() -> AsyncIterator[None]:
     before = asyncio.all_tasks()
     yield
     for _ in range(GRACE_PASSES):
-        leaked = asyncio.all_tasks() - before - {asyncio.current_task()}
-        if not leaked:
-            return
         await asyncio.sleep(0)
-    pytest.fail(f"asyncio tasks left behind: {', '.join(sorted(map(repr, leaked)))}")
+    if leaked := asyncio.all_tasks() - before - {asyncio.current_task()}:
+        pytest.fail(f"asyncio tasks left behind: {', '.join(sorted(map(repr, leaked)))}")
 
 
 def _children() -> set[psutil.Process]:
@@ -66,7 +64,7 @@ def _describe(child: psutil.Process) -> str:
 
 @pytest.fixture
 def free_port() -> int:
-    """A TCP port of 127.0.0.1 that was free a moment ago. Prefer port 0 where the code under test can report its own."""
+    """A TCP port of 127.0.0.1 that was free a moment ago; prefer port 0 where the code under test tells its port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]

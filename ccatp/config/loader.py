@@ -45,12 +45,14 @@ class Source:
     folder: Path = Path()
 
     def depth(self, key: Key) -> int:
-        """How many parts of a key this source holds."""
+        """How many parts of a key this source holds; all of them where it holds a value in place of a section."""
         if key[: len(self.root)] != self.root:
             return 0
         node: object = self.tree
         for depth, part in enumerate(key[len(self.root) :], start=len(self.root)):
-            if not isinstance(node, Mapping) or part not in node:
+            if not isinstance(node, Mapping):
+                break
+            if part not in node:
                 return depth
             node = node[part]
         return len(key)
@@ -96,7 +98,7 @@ def load_config(
         tree = _merged(tree, source.tree)
     for section in _SECTIONS:
         named = _named_section(section, tree, sources, config_dir)
-        tree[section] = _merged(named.tree, _overlay(section, user, command, tree))
+        tree[section] = _merged(named.tree, _overlay(section, tree, sources))
         sources.append(named)
     return _validated(tree, sources)
 
@@ -173,16 +175,16 @@ def _is_replaced(section: str, user: Source, command: Source) -> bool:
     return wanted is not None and wanted != _get(user.tree, "run", section)
 
 
-def _overlay(section: str, user: Source, command: Source, tree: Tree) -> Mapping[str, Any]:
+def _overlay(section: str, tree: Tree, sources: list[Source]) -> Mapping[str, Any]:
     """What file and command line say about the section itself."""
+    command, user = sources[:2]
     if _is_complete(section, user.tree.get(section)) and _is_replaced(section, user, command):
         overlay = command.tree.get(section, {})
     else:
         overlay = tree.get(section, {})
     if not isinstance(overlay, Mapping):
-        raise ConfigError(
-            f"{user.place((section,))}: {section}: must be a section; name a {section} with run.{section}"
-        )
+        place = _source_of((section,), sources).place((section,))
+        raise ConfigError(f"{place}: {section}: must be a section; name a {section} with run.{section}")
     return overlay
 
 
@@ -194,6 +196,8 @@ def _named_section(section: str, tree: Tree, sources: list[Source], config_dir: 
     key: Key = ("run", section)
     name = _get(tree, "run", section)
     source = _source_of(key, sources)
+    if not isinstance(tree["run"], Mapping):
+        raise ConfigError(f"{source.place(key)}: run = {format_value(tree['run'])} must be a section, not a value")
     if not isinstance(name, str) or not name:
         raise ConfigError(f"{source.place(key)}: run.{section} = {format_value(name)} must be the name of a {section}")
     folder = config_dir / _SECTIONS[section][0]

@@ -1,11 +1,13 @@
 """Pure. Bang-bang times: the least time that a path takes under the motion limits, turning in place at every stop."""
 
 from collections.abc import Sequence
-from math import atan2, cos, dist, hypot, pi, sin, sqrt
+from itertools import pairwise
+from math import dist, pi, sqrt
 
 from ccatp.angles import bearing, difference
 from ccatp.config.models import LimitsConfig
 from ccatp.mirror.mirror import Mirror
+from ccatp.planning.course import heading_of_course
 from ccatp.samples import DeckPose, Stop, StopKind
 
 # A leg that begins within this of the heading is steered for on the way and needs no turn in place; the points of a
@@ -49,13 +51,11 @@ def turn_time(angle_rad: float, limits: LimitsConfig, straight_rad: float = STRA
 def stop_times(stops: Sequence[Stop], start: DeckPose, limits: LimitsConfig, mirror: Mirror) -> list[float]:
     """Bang-bang time from each stop's predecessor (``start`` for the first) until the robot stands on the stop, s.
 
-    Length of a leg: chord between the surface points, which falls short of the arc by less than 0.1 mm in a metre.
     Turns are measured in the tangent plane where the robot stands, and go the short way.
     """
     times = []
     x, y, heading = start.x_m, start.y_m, start.heading_rad
-    for stop in stops:
-        length_m = dist(mirror.surface_point(x, y), mirror.surface_point(stop.x_m, stop.y_m))
+    for stop, length_m in zip(stops, leg_lengths(stops, start, mirror), strict=True):
         time_s = leg_time(length_m, limits)
         if length_m > 0.0:
             course = bearing(stop.x_m - x, stop.y_m - y) + (pi if stop.reverse else 0.0)
@@ -85,27 +85,16 @@ def path_time(
     return sum(stop_times(stops, start, limits, mirror)) + measurements * measuring_time_s
 
 
+def leg_lengths(stops: Sequence[Stop], start: DeckPose, mirror: Mirror) -> list[float]:
+    """Length of the leg to each stop on the surface, m.
+
+    It is the chord between the surface points, which falls short of the arc by less than 0.1 mm in a metre.
+    """
+    first = mirror.surface_point(start.x_m, start.y_m)
+    points = [first, *(mirror.surface_point(stop.x_m, stop.y_m) for stop in stops)]
+    return [dist(a, b) for a, b in pairwise(points)]
+
+
 def path_length(stops: Sequence[Stop], start: DeckPose, mirror: Mirror) -> float:
     """Length of a path on the surface, m."""
-    points = [mirror.surface_point(p.x_m, p.y_m) for p in (start, *stops)]
-    return sum(dist(a, b) for a, b in zip(points, points[1:], strict=False))
-
-
-def heading_of_course(mirror: Mirror, x: float, y: float, course_rad: float) -> float:
-    """Deck heading (in the tangent plane) of a robot whose heading projects on a course in the deck plane, rad."""
-    (ax, _, az), (bx, by, bz), _ = mirror.surface.axes(x, y)
-    fx, fy = mirror.surface.gradient(x, y)
-    c, s = cos(course_rad), sin(course_rad)
-    rise = fx * c + fy * s
-    return atan2(bx * c + by * s + bz * rise, ax * c + az * rise)
-
-
-def course_of_heading(mirror: Mirror, pose: DeckPose) -> float:
-    """Direction in the deck plane on which the robot's heading projects, rad."""
-    hx, hy, _, _ = mirror.body_axes(pose)
-    return bearing(hx, hy)
-
-
-def deck_distance(a: tuple[float, float], b: tuple[float, float]) -> float:
-    """Distance of two places in the deck plane, m."""
-    return hypot(b[0] - a[0], b[1] - a[1])
+    return sum(leg_lengths(stops, start, mirror))

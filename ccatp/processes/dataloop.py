@@ -1,32 +1,39 @@
 """Glue. The DataLoop's process: the robot's stand-in behind the robot link."""
 
 import asyncio
+import os
 import socket
 import sys
 
+import structlog
+
 from ccatp.config.models import Config
 from ccatp.dataloop import serve
-from ccatp.processes.common import die_with_parent, open_log, parse_args, stop_on_signals
+from ccatp.errors import ConfigError
+from ccatp.processes.common import Endpoints, die_with_parent, open_log, parse_args, stop_on_signals
+from ccatp.robot_link import read_key
+from ccatp.runtime_dir import make_runtime_dir
 
 
 def main() -> int:
     """Entry of ``python -m ccatp.processes.dataloop``."""
     die_with_parent()
     args = parse_args()
-    log = open_log(args.run_dir / "log.jsonl", "dataloop")
+    cfg = args.config
 
     async def run() -> None:
         stop = asyncio.Event()
         stop_on_signals(stop)
         await serve(
-            args.config,
+            cfg,
             lockstep=not args.is_realtime,
-            seed=args.config.run.seed,
+            seed=cfg.run.seed,
+            stop=stop,
             listen_sock=socket.socket(fileno=args.listen_fd),
             truth_rep=args.endpoints.of("puck"),
             truth_pub=args.endpoints.of("truth"),
-            stop=stop,
-            log=log,
+            key=read_key(cfg.robot.key_file),
+            log=open_log(args.run_dir / "log.jsonl", "dataloop"),
         )
 
     asyncio.run(run())
@@ -34,8 +41,42 @@ def main() -> int:
 
 
 def run_alone(cfg: Config, lockstep: bool) -> int:
-    """The stand-in alone, for other people's controllers; ends on SIGINT or SIGTERM."""
-    raise SystemExit("todo")
+    """The stand-in alone, for other people's controllers; ends on SIGINT or SIGTERM.
+
+    Its truth is at ``puck`` in the runtime directory, for ``ccatp sim etalon --truth``.
+
+    Args:
+        cfg: configuration; ``sim.robot`` holds the address.
+        lockstep: simulated time waits for the controller.
+    """
+    at = cfg.sim.robot
+    truth = Endpoints(make_runtime_dir(cfg.run.runtime_dir, os.environ)).of("puck")
+    try:
+        listener = socket.create_server((at.host, at.port), reuse_port=False)
+    except OSError as error:
+        raise ConfigError(
+            f"sim.robot.port: cannot listen on {at.host}:{at.port}: {error.strerror}; choose another with --port"
+        ) from error
+    host, port = listener.getsockname()[:2]
+    log: structlog.typing.FilteringBoundLogger = structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
+    print(f"ccatp: robot stand-in ({cfg.mirror.name}) on {host}:{port}, truth at {truth}", file=sys.stderr, flush=True)
+
+    async def run() -> None:
+        stop = asyncio.Event()
+        stop_on_signals(stop)
+        await serve(
+            cfg,
+            lockstep=lockstep,
+            seed=cfg.run.seed,
+            stop=stop,
+            listen_sock=listener,
+            truth_rep=truth,
+            key=read_key(cfg.robot.key_file),
+            log=log,
+        )
+
+    asyncio.run(run())
+    return 0
 
 
 if __name__ == "__main__":

@@ -203,6 +203,9 @@ class MainLoop:
         self._t_last_s, self._seq, self._frame_wall_s = t_s, seq, time.monotonic()
         localizer = self._localizer
         localizer.step(t_s, sensors.imu, sensors.enc, sensors.edge)
+        if localizer.hold_requested:
+            self._mission.fault(localizer.hold_cause)
+            localizer.clear_hold()
         waiting = time.perf_counter()
         verdict = self._hear(seq)
         heard = time.perf_counter()

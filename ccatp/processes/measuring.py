@@ -74,15 +74,22 @@ class MeasuringDesk:
         except EtalonError as error:
             self._teller.say("warning", f"measurement of {_name(request.point)} failed: {error}")
             if self._mission.is_awaiting_fix:
-                if request.point is not None:
-                    await asyncio.wrap_future(self._store.record_skipped(request.point, request.t_s))
-                self._mission.not_fixed(request.point, str(error))
+                await self._skip(request, str(error))
             return
         # A pause or an edge in between means that the robot may have moved: the lengths are worth nothing then.
         if not self._mission.is_awaiting_fix or self._mission.measuring_point != request.point:
             self._teller.say("info", f"measurement of {_name(request.point)} discarded: the robot was interrupted")
             return
         await self._accept(request, fix)
+
+    async def _skip(self, request: Request, cause: str) -> None:
+        if request.point is not None:
+            try:
+                await asyncio.wrap_future(self._store.record_skipped(request.point, request.t_s))
+            except StoreError as error:
+                self._mission.fault(f"that {_name(request.point)} is skipped cannot be stored: {error}")
+                return
+        self._mission.not_fixed(request.point, cause)
 
     async def _accept(self, request: Request, fix: Fix) -> None:
         if request.point is not None:

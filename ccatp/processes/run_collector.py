@@ -84,7 +84,9 @@ class RunCollector:
             [(topic.name, schema_of(topic.name)) for topic in TOPICS if topic.recorded],
             is_simulation=is_sim,
             metadata={"mirror": cfg.mirror.name, "seed": str(cfg.run.seed), "world": cfg.world.name},
+            on_failure=self._on_recorder_failure,
         )
+        self._view: View | None = None
         self._builder: SummaryBuilder | None = None
         self._early: list[Message] = []
         self._status: MissionStatus | None = None
@@ -112,6 +114,7 @@ class RunCollector:
 
     def collect(self, timeout_ms: int, view: View | None) -> None:
         """Take what came in, waiting at most ``timeout_ms`` for the first."""
+        self._view = view
         received = self._subscriber.receive_raw(timeout_ms / 1000.0)
         while received is not None:
             self._take(*received, view)
@@ -132,6 +135,10 @@ class RunCollector:
             self._early.append(message)
         else:
             self._add(self._builder, message)
+
+    def _on_recorder_failure(self, reason: str) -> None:
+        if self._view is not None:
+            self._view.say("error", f"recording ended, the survey goes on: {reason}")
 
     def _begin(self, status: MissionStatus) -> None:
         self._status = status
@@ -211,7 +218,10 @@ class RunCollector:
         return builder.build()
 
     def _fits(self) -> dict[PanelId, PanelFit]:
-        with MissionStore.open(self._run_dir / "mission.sqlite", mirror=self._mirror.name) as store:
+        path = self._run_dir / "mission.sqlite"
+        if not path.exists():  # main ended before it made one
+            return {}
+        with MissionStore.open(path, mirror=self._mirror.name) as store:
             fixes = store.fixes()
         fits = {}
         for panel in sorted({PanelId(stored.point.row, stored.point.col) for stored in fixes}):

@@ -11,7 +11,6 @@ FloatArray = NDArray[np.float64]
 _RANK_TOLERANCE = 1e-6  # smallest over largest singular value of H: below it the position is not determined
 _COPLANAR_TOLERANCE = 1e-9  # the same ratio for the anchors about their centroid: they lie in a plane (2-D: on a line)
 _FIRST_DAMPING = 1e-6  # of the mean diagonal of H^T W H: as good as Gauss-Newton, yet solvable where H loses rank
-_LARGEST_DAMPING = 1e12
 
 
 class MultilaterationError(ValueError):
@@ -192,7 +191,7 @@ def _iterate(problem: _Problem, max_iterations: int, tolerance_m: float) -> tupl
     residuals = (ranges - distances) / sigmas
     cost = float(residuals @ residuals)
     damping = _FIRST_DAMPING
-    iteration, step_m = 0, float("inf")
+    step_m = float("inf")
     identity = np.eye(start.size)
     for iteration in range(1, max_iterations + 1):
         weighted = directions / sigmas[:, None]
@@ -211,9 +210,9 @@ def _iterate(problem: _Problem, max_iterations: int, tolerance_m: float) -> tupl
             damping *= 10.0
         if step_m <= tolerance_m:
             return position, iteration
-        if damping > _LARGEST_DAMPING:
-            break
-    raise NoConvergence(f"no rest after {iteration} iterations: last step {step_m:.3g} m, limit {tolerance_m:.3g} m")
+    raise NoConvergence(
+        f"no rest after {max_iterations} iterations: last step {step_m:.3g} m, limit {tolerance_m:.3g} m"
+    )
 
 
 def _on_side_of(start: FloatArray, position: FloatArray, anchors: FloatArray) -> FloatArray:

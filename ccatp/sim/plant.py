@@ -27,7 +27,8 @@ class Disturbance(Protocol):
         Args:
             t_s: time at the start of the step.
             dt_s: its length.
-            forward_m, left_m: displacement along robot x and y.
+            forward_m: displacement along robot x.
+            left_m: displacement along robot y.
             turn_rad: rotation about robot z.
         """
 
@@ -91,7 +92,8 @@ class Plant:
         Args:
             surface: the surface driven on.
             start: first pose.
-            wheel_radius_m, wheel_base_m: geometry of the drive.
+            wheel_radius_m: radius of both wheels.
+            wheel_base_m: distance between them.
             wheel_lag_s: time constant T of the servos, > 0.
             disturbances: applied in this order to each step.
         """
@@ -123,7 +125,8 @@ class Plant:
         Args:
             t_s: time at the start of the step.
             dt_s: length of the step.
-            right_set_rad_s, left_set_rad_s: wheel set points.
+            right_set_rad_s: set point of the right wheel.
+            left_set_rad_s: set point of the left wheel.
         """
         right, left = self.right_rad_s, self.left_rad_s
         self._right_0, self._left_0 = right, left
@@ -184,19 +187,14 @@ class Plant:
         self.hx, self.hy = c / s + d * e2x, d * e2y
         self.lx, self.ly = c * e2x - d / s, c * e2y
 
-    def decays_at(self, taus_s: Sequence[float]) -> list[float]:
-        """``exp(-tau/T)`` for times after the start of a step; kept by those who sample the same instants each step."""
-        lag_s = self.lag_s
-        return [exp(-tau / lag_s) for tau in taus_s]
-
     def rates_at(self, decays: Sequence[float]) -> list[tuple[float, float]]:
-        """(right, left) wheel rates within the last step, rad/s, at the instants of ``decays_at``."""
+        """(right, left) wheel rates within the last step, rad/s, at the instants with these ``exp(-tau/T)``."""
         right_set, left_set = self._right_set, self._left_set
         right, left = self._right_0 - right_set, self._left_0 - left_set
         return [(right_set + right * e, left_set + left * e) for e in decays]
 
     def acceleration_at(self, decay: float) -> float:
-        """Acceleration dv/dt along robot x within the last step, m/s^2."""
+        """Acceleration dv/dt along robot x within the last step, where ``exp(-tau/T)`` is ``decay``, m/s^2."""
         lag = self._right_set - self._right_0 + self._left_set - self._left_0
         return 0.5 * self._radius_m * lag * decay / self.lag_s
 
@@ -209,7 +207,6 @@ class Plant:
     def stop_dead(self) -> None:
         """The wheels stop at once and for good (the robot fell)."""
         self.right_rad_s = self.left_rad_s = self._right_0 = self._left_0 = self._right_set = self._left_set = 0.0
-        self.is_moving = False
 
 
 def _settled(set_point_rad_s: float, rate_rad_s: float) -> float:

@@ -5,7 +5,7 @@ stream of its own, so that its noise depends on the seed alone, not on the rates
 """
 
 from collections.abc import Sequence
-from math import floor, hypot
+from math import exp, floor, hypot
 
 import numpy as np
 
@@ -20,6 +20,7 @@ GravityTuple = tuple[float, float, float, float]
 Rectangle = tuple[float, float, float, float]
 
 _BLOCK = 4096
+_SAME_RATIO = 1e-9  # rates this near to a whole ratio are meant to be one
 _PER_UNIT = 1e7  # resolution of rates and accelerations: far below every noise, short on the wire
 # A frame within which no sensor comes this near to a panel's edge needs no sub-samples. The arc that a sensor travels
 # in a frame departs from its chord by microns.
@@ -61,36 +62,43 @@ class SampleTimes:
         hz: rate of the sensor.
         frame_hz: rate of the frames.
         lag_s: time constant of the wheel servo, for ``decays``.
+
+    Attributes:
+        times_s: the instants of the frame entered last.
+        fractions: the same, as fractions of the frame, in (0, 1].
+        decays: ``exp(-tau/lag)`` at the same instants, tau counted from the start of the frame.
     """
 
-    __slots__ = ("_frame_hz", "_hz", "_lag_s", "_per_frame", "decays", "fractions", "times_s")
+    __slots__ = ("_every", "_frame_hz", "_hz", "_lag_s", "decays", "fractions", "times_s")
 
     def __init__(self, hz: float, frame_hz: float, lag_s: float) -> None:
         self._hz, self._frame_hz, self._lag_s = hz, frame_hz, lag_s
         ratio = hz / frame_hz
-        self._per_frame = round(ratio) if abs(ratio - round(ratio)) < 1e-9 * ratio else 0
+        count = round(ratio) if abs(ratio - round(ratio)) < _SAME_RATIO * ratio else 0
+        fractions = [(j + 1) / count for j in range(count)]
+        self._every = (count, fractions, self._decays(fractions))
         self.times_s: list[float] = []
         self.fractions: list[float] = []
         self.decays: list[float] = []
-        if self._per_frame:
-            self._place([(j + 1) / self._per_frame for j in range(self._per_frame)])
 
     def enter(self, frame: int) -> None:
-        """Set ``times_s``, ``fractions`` (of the frame) and ``decays`` (of the servo since its start) to a frame's."""
-        hz, per_frame = self._hz, self._per_frame
-        if per_frame:
-            last = frame * per_frame
-            self.times_s = [n / hz for n in range(last - per_frame + 1, last + 1)]
-            return
-        ratio = hz / self._frame_hz
-        first, last = floor((frame - 1) * ratio + 1e-9) + 1, floor(frame * ratio + 1e-9)
-        self.times_s = [n / hz for n in range(first, last + 1)]
-        self._place([n / ratio - (frame - 1) for n in range(first, last + 1)])
+        """Go on to a frame; frame 0 is the single instant of boot."""
+        hz = self._hz
+        count, self.fractions, self.decays = self._every
+        if frame == 0:
+            self.times_s, self.fractions, self.decays = [0.0], [1.0], [1.0]
+        elif count:
+            last = frame * count
+            self.times_s = [n / hz for n in range(last - count + 1, last + 1)]
+        else:
+            ratio = hz / self._frame_hz
+            first, last = floor((frame - 1) * ratio + _SAME_RATIO) + 1, floor(frame * ratio + _SAME_RATIO)
+            self.times_s = [n / hz for n in range(first, last + 1)]
+            self.fractions = [n / ratio - (frame - 1) for n in range(first, last + 1)]
+            self.decays = self._decays(self.fractions)
 
-    def _place(self, fractions: list[float]) -> None:
-        step_s = 1.0 / self._frame_hz
-        self.fractions = fractions
-        self.decays = [float(np.exp(-f * step_s / self._lag_s)) for f in fractions]
+    def _decays(self, fractions: Sequence[float]) -> list[float]:
+        return [exp(-f / (self._frame_hz * self._lag_s)) for f in fractions]
 
 
 class SensorSuite:
@@ -132,7 +140,7 @@ class SensorSuite:
         self.edges = EdgeSensors(mirror, edge_sensors_m)
 
     def enter(self, frame: int) -> None:
-        """Go on to the instants of frame ``frame`` (counted from 1; frame 0 is the instant of boot)."""
+        """Go on to the instants of a frame (counted from 1; frame 0 is the instant of boot)."""
         self._imu_times.enter(frame)
         self._encoder_times.enter(frame)
         self._edge_times.enter(frame)

@@ -6,6 +6,7 @@ from math import hypot, inf
 
 import numpy as np
 
+from ccatp.angles import wrap_pi
 from ccatp.config.models import Config
 from ccatp.mirror.alignment import PanelMisalignment, misaligned_puck_world
 from ccatp.mirror.mirror import Mirror
@@ -72,11 +73,13 @@ class World:
         Args:
             t_s: time at the start of the frame.
             dt_s: its length.
-            right_rad_s, left_rad_s: wheel set points.
+            right_rad_s: set point of the right wheel.
+            left_rad_s: set point of the left wheel.
             thrust: mean thrust of the fans during the frame, 0 to 1.
         """
         plant = self.plant
         if self.is_fallen:
+            plant.is_moving = False
             return
         plant.step(t_s, dt_s, right_rad_s, left_rad_s)
         self._places.append((plant.x_m, plant.y_m))
@@ -114,7 +117,7 @@ class World:
         p = self.plant
         fallen = int(self.is_fallen)
         x, y = p.x_m, p.y_m
-        return seq, t_s, x, y, p.heading_rad, x, y, p.z_m, self._clearance_m, fallen, self._off_mask
+        return seq, t_s, x, y, wrap_pi(p.heading_rad), x, y, p.z_m, self._clearance_m, fallen, self._off_mask
 
     def puck_world(self) -> Vector3:
         """Centre of the puck on the panel as it really lies, world frame, m."""

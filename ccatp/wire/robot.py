@@ -9,34 +9,74 @@ import hmac
 import json
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal, NoReturn
+from typing import Any, NoReturn
 
 import msgspec
-from msgspec import Meta
 
-from ccatp.samples import EdgeSample, GravitySample, ImuSample, WheelSample
 from ccatp.wire.lines import BadLineCounter, LineBuffer, LineTooLong
+from ccatp.wire.robot_messages import (
+    AUTH_HMAC,
+    AUTH_NONE,
+    MAX_ACCELERATION_M_S2,
+    MAX_RATE_RAD_S,
+    MAX_TIME_S,
+    PROTOCOL,
+    CommandEcho,
+    Drive,
+    Fans,
+    FromClient,
+    FromRobot,
+    Hello,
+    Join,
+    Joined,
+    Permit,
+    RefusalReason,
+    Refused,
+    RobotData,
+    RobotLinkMessage,
+    Role,
+    Sensors,
+    Unknown,
+)
 
-__all__ = ["BadLineCounter", "LineBuffer", "LineTooLong"]
+__all__ = [
+    "AUTH_HMAC",
+    "AUTH_NONE",
+    "MAX_ACCELERATION_M_S2",
+    "MAX_RATE_RAD_S",
+    "MAX_TIME_S",
+    "PROTOCOL",
+    "BadLine",
+    "BadLineCounter",
+    "CommandEcho",
+    "Drive",
+    "Fans",
+    "FromClient",
+    "FromRobot",
+    "Hello",
+    "Join",
+    "Joined",
+    "LineBuffer",
+    "LineTooLong",
+    "Permit",
+    "RefusalReason",
+    "Refused",
+    "RobotData",
+    "RobotLinkMessage",
+    "Role",
+    "Sensors",
+    "Unknown",
+    "decode_from_client",
+    "decode_from_robot",
+    "encode",
+    "encode_sensors",
+    "format_drive",
+    "format_permit",
+    "is_mac_right",
+    "join_mac",
+]
 
-PROTOCOL = "ccatp-robot/1"
-AUTH_NONE: Literal["none"] = "none"
-AUTH_HMAC: Literal["hmac-sha256"] = "hmac-sha256"
-
-MAX_TIME_S = 1e9  # some thirty years
-MAX_RATE_RAD_S = 1e4  # wheels and body; beyond every machine, so that squares stay finite
-MAX_ACCELERATION_M_S2 = 1e4
 _GRAVITY_NORM = (0.5, 1.5)  # a unit vector, however noisy
-
-Role = Literal["controller", "monitor"]
-RefusalReason = Literal["role taken", "bad mac", "bad join", "busy"]
-Sequence53 = Annotated[int, Meta(ge=0, le=2**53 - 1)]  # what every JSON reader keeps exact
-Time = Annotated[float, Meta(ge=0.0, le=MAX_TIME_S)]
-Rate = Annotated[float, Meta(ge=-MAX_RATE_RAD_S, le=MAX_RATE_RAD_S)]
-Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
-Length = Annotated[float, Meta(ge=-10.0, le=10.0)]
-Positive = Annotated[float, Meta(gt=0.0, le=1e6)]
-Name = Annotated[str, Meta(max_length=64)]
 
 
 class BadLine(ValueError):
@@ -51,118 +91,12 @@ class BadLine(ValueError):
         self.message_type = message_type
 
 
-class Unknown(msgspec.Struct, frozen=True):
-    """A well-formed message of a type that this side does not know."""
-
-    type: str
-
-
-class _Message(msgspec.Struct, tag_field="type", gc=False):
-    """Base of all messages; ``type`` is the tag."""
-
-
-class RobotData(msgspec.Struct):
-    """What the robot says of itself: lengths in m, robot frame; edge sensors in the order of ``EdgeSample``."""
-
-    wheel_radius_m: Positive
-    wheel_base_m: Positive
-    edge_sensors_m: tuple[tuple[Length, Length], tuple[Length, Length], tuple[Length, Length], tuple[Length, Length]]
-    puck_m: tuple[Length, Length, Length]
-    max_wheel_rad_s: Positive
-    fan_floor: Fraction
-
-
-class Hello(_Message, tag="hello"):
-    """First line of the robot on a new connection."""
-
-    protocol: Name
-    boot: Sequence53
-    nonce: Annotated[str, Meta(pattern="^[0-9a-f]{32}$")]
-    auth: Literal["none", "hmac-sha256"]
-    lockstep: bool
-    frame_hz: Positive
-    ttl_s: Positive
-    robot: RobotData
-
-
-class Join(_Message, tag="join", omit_defaults=True):
-    """Answer of a client to the hello; ``mac`` only where the robot asks for it."""
-
-    role: Role
-    client: Name
-    mac: Name = ""
-
-
-class Joined(_Message, tag="joined"):
-    """The client has the role."""
-
-    role: Role
-    session: Sequence53
-
-
-class Refused(_Message, tag="refused"):
-    """The client does not get the role; the robot closes."""
-
-    reason: Name
-
-
-class CommandEcho(msgspec.Struct, gc=False):
-    """The newest drive in force (seq -1: none), its age, the age of the newest permit, and whether wheels are held."""
-
-    seq: Annotated[int, Meta(ge=-1, le=2**53 - 1)]
-    age: Time
-    permit_age: Time
-    held: bool
-
-
-class Sensors(_Message, tag="sensors", gc=True):
-    """One frame of the robot: every sample taken since the one before, oldest first. Times are the robot's clock, s."""
-
-    seq: Sequence53
-    t: Time
-    imu: list[ImuSample]
-    enc: list[WheelSample]
-    edge: list[EdgeSample]
-    gravity: GravitySample | None
-    fans: tuple[Fraction, Fraction]
-    soc: Fraction
-    cmd: CommandEcho
-    faults: list[Name]
-
-
-class Drive(_Message, tag="drive"):
-    """Wheel angular-rate set points, rad/s; ``ack`` is the newest sensors frame they were computed from."""
-
-    seq: Sequence53
-    ack: Sequence53
-    wr: Rate
-    wl: Rate
-
-
-class Permit(_Message, tag="permit"):
-    """The motion that the monitor allows until the next permit."""
-
-    seq: Sequence53
-    ack: Sequence53
-    forward: bool
-    reverse: bool
-    turn: bool
-
-
-class Fans(_Message, tag="fans"):
-    """Fan duty (left, right); stays in force until changed."""
-
-    seq: Sequence53
-    duty: tuple[Fraction, Fraction]
-
-
-FromRobot = Hello | Joined | Refused | Sensors
-FromClient = Join | Drive | Permit | Fans
-
 # Number of keys of the messages whose keys are all required. When all of them are there, a line with exactly this many
 # colons has no other key and none twice: every key brings a colon of its own.
 _KEYS: dict[type, int] = {Sensors: 15, Drive: 5, Permit: 6, Fans: 3}
 _MAX_INTEGER_DIGITS = 400
+_FROM_ROBOT_TYPES = frozenset(("hello", "joined", "refused", "sensors"))
+_FROM_CLIENT_TYPES = frozenset(("join", "drive", "permit", "fans"))
 
 _robot_decoder: msgspec.json.Decoder[FromRobot] = msgspec.json.Decoder(FromRobot)
 _client_decoder: msgspec.json.Decoder[FromClient] = msgspec.json.Decoder(FromClient)
@@ -178,7 +112,7 @@ def decode_from_robot(line: bytes) -> FromRobot | Unknown:
     try:
         message = _robot_decoder.decode(line)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        return _unknown_or_bad(line, str(error), FROM_ROBOT_TYPES)
+        return _unknown_or_bad(line, str(error), _FROM_ROBOT_TYPES)
     if line.count(b":") != _KEYS.get(type(message)):
         _check_keys(line)
     if type(message) is Sensors:
@@ -195,7 +129,7 @@ def decode_from_client(line: bytes) -> FromClient | Unknown:
     try:
         message = _client_decoder.decode(line)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        return _unknown_or_bad(line, str(error), FROM_CLIENT_TYPES)
+        return _unknown_or_bad(line, str(error), _FROM_CLIENT_TYPES)
     if line.count(b":") != _KEYS.get(type(message)):
         _check_keys(line)
     return message
@@ -246,12 +180,12 @@ def encode_sensors(
     cmd: tuple[int, float, float, bool],
     faults: Sequence[str],
 ) -> bytes:
-    """A sensors frame as one line, from plain tuples in the order of the wire (finite numbers, seconds and SI units)."""
+    """A sensors frame as one line, from plain tuples in the order of the wire (finite numbers, SI units)."""
     frame = _SensorsOut(seq, t_s, imu, enc, edge, gravity, fans, soc, CommandEcho(*cmd), faults)
     return _encoder.encode(frame) + b"\n"
 
 
-class _SensorsOut(_Message, tag="sensors"):
+class _SensorsOut(RobotLinkMessage, tag="sensors"):
     """Sensors as they are encoded: plain tuples cost a tenth of named ones."""
 
     seq: int
@@ -274,10 +208,6 @@ def join_mac(key: bytes, nonce: str, role: str) -> str:
 def is_mac_right(key: bytes, nonce: str, join: Join) -> bool:
     """Whether a join carries the code that belongs to key, nonce and role; takes the same time for every wrong one."""
     return hmac.compare_digest(join_mac(key, nonce, join.role).encode(), join.mac.lower().encode())
-
-
-FROM_ROBOT_TYPES = frozenset(("hello", "joined", "refused", "sensors"))
-FROM_CLIENT_TYPES = frozenset(("join", "drive", "permit", "fans"))
 
 
 def _check_samples(frame: Sensors) -> None:

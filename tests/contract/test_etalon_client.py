@@ -306,6 +306,8 @@ async def test_a_line_that_came_unasked_is_not_taken_for_the_reply(server: Scrip
     async with client_of(server.port) as client:
         await client.connect()
         await server_has_spoken(client)
+        assert client._link is not None
+        assert client._link.fault == "server sent a line unasked"  # closed by now, a flood could not fill the memory
         assert_at(await client.measure(1.0, EXPECTED), PUCK)
         assert client.counts["drained"] == 1
         assert server.asked == [GOOD_ASK]
@@ -427,16 +429,17 @@ async def test_the_stream_starts_pushes_and_stops(server: ScriptedServer) -> Non
         # In one piece: the first record must not count as unasked.
         writer.write(b"measstarted\r\n" + lengths() + b"defanadata_1,2\r\n" + lengths(ELSEWHERE))
 
-    server.script += [push, lengths() + b"measstopped\r\n"]
+    server.script += [lengths(), push, lengths() + b"measstopped\r\n"]
     async with client_of(server.port) as client:
+        await client.measure(0.0, EXPECTED)
         async with client.stream() as pushed:
             assert [(await anext(pushed)).records for _ in range(2)] == [
                 tuple(records()),
                 tuple(records(ELSEWHERE)),
             ]
-        assert server.asked == [b"startmeasnogui\r\n", b"stopmeasnogui\r\n"]
+        assert server.asked[1:] == [b"startmeasnogui\r\n", b"stopmeasnogui\r\n"]
         assert_at(await client.measure(1.0, EXPECTED), PUCK)
-        assert server.connections == 2
+        assert server.connections == 3  # the stream has one of its own
 
 
 async def test_the_stream_ends_when_the_server_has_finished(server: ScriptedServer) -> None:

@@ -147,6 +147,27 @@ async def test_a_client_that_ends_its_side_still_gets_its_replies() -> None:
         assert server.counts == {"requests": 1}
 
 
+async def test_a_slow_client_that_ends_its_side_still_gets_every_reply() -> None:
+    # More replies than the socket buffers hold: the last ones are still with the server when the requests end.
+    with socket.socket() as bound, socket.socket() as small:
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        small.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        bound.bind(("127.0.0.1", 0))
+        server = standin()
+        await server.start("", 0, sock=bound)
+        small.connect(bound.getsockname())
+        reader, writer = await asyncio.open_connection(sock=small)
+        writer.write((b"latestlengthvalid," + b",".join(b"%d" % n for n in range(1, 33)) + b"\r\n") * 100)
+        writer.write_eof()
+        replies = 0
+        async with asyncio.timeout(5.0):
+            while line := await reader.readline():
+                replies += line.endswith(b"_0\r\n")
+        assert replies == 100
+        writer.transport.abort()
+        await server.close()
+
+
 async def test_a_line_of_one_megabyte_closes_its_connection_and_no_other() -> None:
     server = standin()
     async with running(server) as port, peer(port) as client, peer(port) as flooder:
@@ -220,7 +241,7 @@ async def test_lengths_do_not_depend_on_what_other_clients_ask() -> None:
 
 async def test_the_stream_pushes_every_channel_until_it_is_stopped() -> None:
     server = standin(FixedPuck((0.0, 0.0, 0.0), step_s=0.2), NOISY)
-    server.push_hz = 1000.0
+    server.push_hz = 10_000.0
     async with running(server) as port, peer(port) as client, peer(port) as other:
         assert await client.ask(b"startmeasnogui\r\n") == b"measstarted\r\n"
         pushed = [await client.line() for _ in range(3)]
@@ -240,7 +261,9 @@ async def test_the_stream_pushes_every_channel_until_it_is_stopped() -> None:
         async with asyncio.timeout(2.0):
             while (line := await client.line()) != b"measstopped\r\n":
                 assert line.startswith(b"channeldata_")
-        assert await client.line() == b"laserready_1\r\n"  # and no record after measstopped
+        assert await client.line() == b"laserready_1\r\n"
+        for _ in range(50):  # and no record after measstopped
+            assert await client.ask(b"laserready\r\n") == b"laserready_1\r\n"
         assert await other.ask(b"startmeasnogui\r\n") == b"measstarted\r\n"
 
 

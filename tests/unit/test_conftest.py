@@ -11,8 +11,9 @@ CONFTEST = Path(__file__).parents[1] / "conftest.py"
 
 def run(pytester: pytest.Pytester, test: str) -> pytest.RunResult:
     pytester.makeconftest(CONFTEST.read_text(encoding="utf-8").replace("GRACE_S = 2.0", "GRACE_S = 0.1"))
-    pytester.makepyfile(f"import asyncio, subprocess, sys\nkept = []\n{test}")
-    return pytester.runpytest_inprocess("-o", "asyncio_mode=auto", "-p", "no:cacheprovider")
+    pytester.makepyfile(f"import asyncio, os, subprocess, sys\nkept = []\n{test}")
+    settings = ["asyncio_mode=auto", "asyncio_default_fixture_loop_scope=function"]
+    return pytester.runpytest_inprocess("-p", "no:cacheprovider", *(word for text in settings for word in ("-o", text)))
 
 
 def test_a_leaked_task_fails_its_test(pytester: pytest.Pytester) -> None:
@@ -23,7 +24,7 @@ def test_a_leaked_task_fails_its_test(pytester: pytest.Pytester) -> None:
 
 def test_a_leaked_child_fails_its_test(pytester: pytest.Pytester) -> None:
     command = "[sys.executable, '-c', 'import time; time.sleep(60)']"
-    result = run(pytester, f"def test_it():\n    kept.append(subprocess.Popen({command}))\n")
+    result = run(pytester, f"def test_it():\n    os.posix_spawn(sys.executable, {command}, os.environ)\n")
     result.assert_outcomes(passed=1, errors=1)
     result.stdout.fnmatch_lines(["*child processes left behind: *time.sleep(60)*"])
 

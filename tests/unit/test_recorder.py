@@ -163,6 +163,14 @@ def test_a_full_disk_ends_recording_with_one_report(path: Path, monkeypatch: pyt
     assert len(found) > 50  # of the 50 kB that went through
 
 
+def test_a_system_that_writes_in_small_pieces_loses_nothing(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real_write = os.write
+    monkeypatch.setattr(os, "write", lambda handle, data: real_write(handle, data[:1000]))
+    record(path, 300).close()
+    monkeypatch.undo()
+    assert len(list(iter_messages(path, on_damage=pytest.fail))) == 300
+
+
 def test_a_full_disk_at_close_is_reported_and_does_not_raise(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reports: list[str] = []
     made = record(path, 3, on_failure=reports.append)

@@ -127,6 +127,17 @@ def test_a_request_the_database_cannot_hold_is_refused(path: Path) -> None:
         db.record_skipped(PANEL[0], object()).result()  # type: ignore[arg-type]
 
 
+def test_a_request_refused_half_way_leaves_nothing_behind(path: Path) -> None:
+    def half(connection: sqlite3.Connection) -> None:
+        connection.execute("INSERT INTO meta VALUES ('half', '1')")
+        connection.execute("INSERT INTO meta VALUES ('half', '2')")
+
+    with make(path) as db:
+        with pytest.raises(StoreRefusal, match="not storable: UNIQUE"):
+            db._submit(half).result()
+        assert db._submit(lambda c: c.execute("SELECT * FROM meta WHERE key = 'half'").fetchall()).result() == []
+
+
 def test_the_event_queue_is_bounded_and_counts_what_it_drops(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(store, "EVENT_QUEUE", 3)
     with make(path) as db:

@@ -1,0 +1,125 @@
+"""Pure. Straight legs against the rim, and the way around a stepped corner."""
+
+from math import atan2, cos, hypot, inf, sin
+
+from ccatp.mirror.mirror import Mirror
+from ccatp.planning.stance import Body, Place
+
+_ROUNDING_M = 1e-9
+
+
+class LegRules:
+    """Says which straight legs the robot may drive.
+
+    Args:
+        mirror: the mirror.
+        body: the robot and its clearances.
+    """
+
+    def __init__(self, mirror: Mirror, body: Body) -> None:
+        """Find the rim's re-entrant corners and the places from which the robot can drive around them."""
+        self._rim, self._body = mirror.rim, body
+        self._corners, self._nodes = _reentrant_corners(mirror, body)
+
+    def clearance_m(self, a: Place, b: Place) -> float:
+        """Clearance of the leg from ``a`` to ``b``: exact, or a lower bound that suffices for every rule, m."""
+        # The distance from the rim changes by at most the distance driven.
+        at_least = 0.5 * (a.depth_m + b.depth_m - hypot(b.x_m - a.x_m, b.y_m - a.y_m))
+        if at_least >= self._body.turning_depth_m:
+            return at_least
+        return self._rim.segment_clearance_m(a.x_m, a.y_m, b.x_m, b.y_m)
+
+    def is_enough(self, clearance_m: float) -> bool:
+        """Whether the robot's origin may pass the rim so near."""
+        return clearance_m >= self._body.leg_clearance_m - _ROUNDING_M
+
+    def is_clear(self, a: Place, b: Place) -> bool:
+        """Whether the robot's origin keeps the clearance of a leg from ``a`` to ``b``."""
+        return self.is_enough(self.clearance_m(a, b))
+
+    def are_sensors_clear(self, a: Place, b: Place, course_rad: float, clearance_m: float) -> bool:
+        """Whether the sensors of a robot that faces ``course_rad`` all the way keep their clearance between the ends.
+
+        Where no re-entrant corner is near, the mirror is convex, and a sensor is nearest to the rim at an end of its
+        straight track: the ends are the stances' affair.
+
+        Args:
+            a, b: ends of the leg.
+            course_rad: what the robot faces.
+            clearance_m: clearance of the leg itself, from ``clearance_m``.
+        """
+        body = self._body
+        if clearance_m >= body.reach_m + body.turn_clearance_m:
+            return True
+        if self._corner_distance_m(a, b) >= body.reach_m + body.turn_clearance_m:
+            return True
+        c, s = cos(course_rad), sin(course_rad)
+        return all(
+            self._rim.segment_clearance_m(
+                a.x_m + c * ox - s * oy, a.y_m + s * ox + c * oy, b.x_m + c * ox - s * oy, b.y_m + s * ox + c * oy
+            )
+            >= body.turn_clearance_m
+            for ox, oy in body.sensors_m.tolist()
+        )
+
+    def way_around(self, a: Place, b: Place) -> tuple[Place, ...]:
+        """Shortest chain of places that leads from ``a`` around stepped corners to ``b``, ends left out.
+
+        Dijkstra's algorithm on the visibility graph of the corners, inset by the clearance.
+
+        Returns:
+            The places between; none where the straight leg is clear, and where there is no way.
+        """
+        if self.is_clear(a, b):
+            return ()
+        places = [a, *self._nodes, b]
+        length = {0: 0.0}
+        before: dict[int, int] = {}
+        open_places = set(range(len(places)))
+        while open_places:
+            k = min(open_places, key=lambda i: length.get(i, inf))
+            if k not in length:
+                return ()
+            if k == len(places) - 1:
+                break
+            open_places.remove(k)
+            for i in open_places:
+                total = length[k] + hypot(places[i].x_m - places[k].x_m, places[i].y_m - places[k].y_m)
+                if total < length.get(i, inf) and self.is_clear(places[k], places[i]):
+                    length[i], before[i] = total, k
+        chain = []
+        k = len(places) - 1
+        while (k := before[k]) != 0:
+            chain.append(places[k])
+        return tuple(reversed(chain))
+
+    def _corner_distance_m(self, a: Place, b: Place) -> float:
+        return min((_segment_distance(corner, a, b) for corner in self._corners), default=inf)
+
+
+def _reentrant_corners(mirror: Mirror, body: Body) -> tuple[list[tuple[float, float]], list[Place]]:
+    """Corners of the rim at which the mirror has 270 degrees, and for each the place inset by the clearance."""
+    vertices = [(float(x), float(y)) for x, y in mirror.rim.vertices]
+    corners, nodes = [], []
+    for (x0, y0), (x1, y1), (x2, y2) in zip(
+        vertices[-1:] + vertices[:-1], vertices, vertices[1:] + vertices[:1], strict=True
+    ):
+        if (x1 - x0) * (y2 - y1) - (y1 - y0) * (x2 - x1) >= 0.0:
+            continue
+        corners.append((x1, y1))
+        # The bisector between coming from the last vertex and going on against the next points to the inside.
+        before, after = atan2(y1 - y0, x1 - x0), atan2(y1 - y2, x1 - x2)
+        inset = max(body.leg_clearance_m, body.turning_depth_m / 2**0.5) + _ROUNDING_M
+        x, y = x1 + inset * (cos(before) + cos(after)), y1 + inset * (sin(before) + sin(after))
+        depth = mirror.rim.signed_distance_m(x, y)
+        if depth >= body.turning_depth_m:
+            nodes.append(Place(x, y, depth))
+    return corners, nodes
+
+
+def _segment_distance(p: tuple[float, float], a: Place, b: Place) -> float:
+    ux, uy = b.x_m - a.x_m, b.y_m - a.y_m
+    wx, wy = p[0] - a.x_m, p[1] - a.y_m
+    length2 = ux * ux + uy * uy
+    t = 0.0 if length2 == 0.0 else min(max((wx * ux + wy * uy) / length2, 0.0), 1.0)
+    return hypot(wx - t * ux, wy - t * uy)

@@ -1,0 +1,157 @@
+"""Pure. The route of a survey: measurement points in their order and the stops that lead from each to the next."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+
+import numpy as np
+
+from ccatp.config.models import LimitsConfig, MissionConfig, RobotConfig
+from ccatp.mirror.mirror import Mirror
+from ccatp.planning.bound import leg_lengths, stop_times
+from ccatp.planning.course import course_of_heading
+from ccatp.planning.errors import OutsideMirrorError, UnreachableError
+from ccatp.planning.legs import LegRules
+from ccatp.planning.retreats import find_retreats
+from ccatp.planning.search import Arrival, Search, Target
+from ccatp.planning.stance import build_body, build_places
+from ccatp.samples import DeckPose, PointId, Stop, StopKind
+
+
+@dataclass(frozen=True, slots=True)
+class Route:
+    """The stops of a survey.
+
+    Attributes:
+        stops: in order; points to measure and stops on the way.
+        times_s: least time from before stop k to the end, shape (stops + 1,); the last is 0.
+        lengths_m: way from before stop k to the end, likewise.
+    """
+
+    stops: tuple[Stop, ...]
+    times_s: tuple[float, ...]
+    lengths_m: tuple[float, ...]
+
+    def remaining_s(self, index: int) -> float:
+        """Least time that is left while stop ``index`` is being approached, s; 0 behind the last."""
+        return self.times_s[min(index, len(self.stops))]
+
+    def remaining_m(self, index: int) -> float:
+        """Way that is left while stop ``index`` is being approached, m; 0 behind the last."""
+        return self.lengths_m[min(index, len(self.stops))]
+
+
+class RouteCursor:
+    """Keeps the current and the next stop of a route until all are exhausted (thesis 3.2).
+
+    Args:
+        route: the route.
+    """
+
+    __slots__ = ("index", "route")
+
+    def __init__(self, route: Route) -> None:
+        """Stand before the first stop."""
+        self.route, self.index = route, 0
+
+    @property
+    def current(self) -> Stop | None:
+        """The stop being approached; ``None`` when all are exhausted."""
+        return self.route.stops[self.index] if self.index < len(self.route.stops) else None
+
+    @property
+    def next(self) -> Stop | None:
+        """The stop after it, or ``None``."""
+        return self.route.stops[self.index + 1] if self.index + 1 < len(self.route.stops) else None
+
+    def advance(self) -> None:
+        """The current stop is done with."""
+        self.index = min(self.index + 1, len(self.route.stops))
+
+
+def plan_route(
+    mirror: Mirror,
+    points: Sequence[PointId],
+    robot: RobotConfig,
+    limits: LimitsConfig,
+    mission: MissionConfig,
+    start: DeckPose,
+    skip: Collection[PointId] = (),
+    measuring_time_s: float = 0.0,
+) -> Route:
+    """The fastest drivable sequence of stops through the points.
+
+    The robot turns in place and moves straight, forward or in reverse. On every leg its origin keeps
+    ``leg_clearance_m`` from the rim and all its edge sensors ``turn_clearance_m``, during turns too; where the thesis's
+    straight way does not, stops are put in between.
+
+    Args:
+        mirror: the mirror.
+        points: what to measure, in order.
+        robot, limits, mission: sensors, motion limits, clearances.
+        start: pose of the robot, deck frame.
+        skip: points already measured.
+        measuring_time_s: standstill at each point, for the remaining time only.
+
+    Raises:
+        OutsideMirrorError: if the start is not on the mirror.
+        UnreachableError: if a point cannot be reached with the clearances.
+    """
+    left = set(points).difference(skip)
+    wanted = [point for point in points if point in left]
+    stops = _stops(mirror, wanted, robot, limits, mission, start)
+    return _with_remains(mirror, stops, limits, start, measuring_time_s)
+
+
+def _stops(
+    mirror: Mirror,
+    points: list[PointId],
+    robot: RobotConfig,
+    limits: LimitsConfig,
+    mission: MissionConfig,
+    start: DeckPose,
+) -> tuple[Stop, ...]:
+    body = build_body(robot, mission)
+    xy = np.array([(start.x_m, start.y_m), *(mirror.point_on_deck(point) for point in points)])
+    places = build_places(mirror, body, xy[:, 0], xy[:, 1])
+    if not places[0].depth_m > 0.0:
+        raise OutsideMirrorError(
+            f"start ({start.x_m:.3f}, {start.y_m:.3f}) m is {-places[0].depth_m:.3f} m beyond the rim of {mirror.name}"
+        )
+    search = Search(LegRules(mirror, body), limits)
+    retreats = find_retreats(mirror, body, places)
+    arrivals = [Arrival(places[0], course_of_heading(mirror, start), 0.0)]
+    for k, point in enumerate(points, start=1):
+        arrivals = search.advance(arrivals, retreats[k - 1], Target(places[k], retreats[k]))
+        if not arrivals:
+            raise UnreachableError(
+                f"mission: no safe way to point {point.row}-{point.col}-{point.point} of {mirror.name}, "
+                f"{places[k].depth_m:.3f} m from the rim, with leg_clearance_m = {mission.leg_clearance_m} and "
+                f"turn_clearance_m = {mission.turn_clearance_m}"
+            )
+    point_of = dict(zip(places[1:], points, strict=True))
+    best = min(arrivals, key=lambda arrival: arrival.cost_s)
+    return tuple(
+        Stop(
+            arrival.place.x_m,
+            arrival.place.y_m,
+            StopKind.MEASURE if arrival.place in point_of else StopKind.VIA,
+            point_of.get(arrival.place),
+            arrival.reverse,
+        )
+        for arrival in best.path()
+    )
+
+
+def _with_remains(
+    mirror: Mirror, stops: tuple[Stop, ...], limits: LimitsConfig, start: DeckPose, measuring_time_s: float
+) -> Route:
+    times = [
+        time_s + (measuring_time_s if stop.kind is StopKind.MEASURE else 0.0)
+        for stop, time_s in zip(stops, stop_times(stops, start, limits, mirror), strict=True)
+    ]
+    return Route(stops, _sums_to_the_end(times), _sums_to_the_end(leg_lengths(stops, start, mirror)))
+
+
+def _sums_to_the_end(parts: list[float]) -> tuple[float, ...]:
+    return tuple(accumulate(reversed(parts), initial=0.0))[::-1]

@@ -1,0 +1,297 @@
+"""Pure. The robot's side of the robot link without sockets: sessions, roles, refusals, lockstep.
+
+Bytes and time are arguments, the transport is whatever has ``write`` and ``close``. Two clocks: ``now_s`` is any
+monotonic wall clock; the robot's own clock is the simulated one in lockstep and the wall clock since boot otherwise.
+
+Choices the interface leaves open:
+
+* Before the join a malformed line is dropped and counted as always; a wrong join and any other message are refused as
+  ``bad join``, and so is silence for ``JOIN_TIMEOUT_S``. ``busy`` means too many connections.
+* A message that does not belong to the sender's role is a bad line. Messages of unknown type keep no role alive.
+* The silence after which a role may be taken over is measured on the robot's clock: in lockstep, where a client may
+  hold its answer back for as long as it likes, nobody is silent while simulated time stands still.
+* Sequence numbers start anew with each session.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Protocol
+
+from ccatp.sim.robot import Robot
+from ccatp.wire.lines import BadLineCounter, LineBuffer, LineTooLong
+from ccatp.wire.robot import (
+    AUTH_HMAC,
+    AUTH_NONE,
+    BadLine,
+    Drive,
+    Fans,
+    FromClient,
+    Join,
+    Joined,
+    Permit,
+    RefusalReason,
+    Refused,
+    Role,
+    Unknown,
+    decode_from_client,
+    encode,
+    is_mac_right,
+)
+
+JOIN_TIMEOUT_S = 2.0
+SILENCE_S = 5.0
+STALL_S = 5.0
+MAX_LAG_S = 0.25
+MAX_SESSIONS = 32
+
+
+class Wire(Protocol):
+    """One connection."""
+
+    def write(self, data: bytes) -> None:
+        """Send without waiting."""
+
+    def close(self) -> None:
+        """Close when everything is sent; nothing is received any more."""
+
+
+class Session:
+    """One client.
+
+    Attributes:
+        wire, nonce: its connection, and the nonce of it.
+        role: what it joined as.
+        joined_s, heard_s: when it came (wall clock) and when it last sent something valid (the robot's clock).
+        is_open: not closed by us.
+    """
+
+    __slots__ = ("_bad", "_lines", "_server", "heard_s", "is_open", "joined_s", "nonce", "role", "wire")
+
+    def __init__(self, server: "RobotServer", wire: Wire, nonce: str, now_s: float) -> None:
+        self._server, self.wire, self.nonce = server, wire, nonce
+        self.role: Role | None = None
+        self.joined_s, self.heard_s = now_s, 0.0
+        self.is_open = True
+        self._lines = LineBuffer()
+        self._bad = BadLineCounter()
+
+    def receive(self, data: bytes, now_s: float) -> None:
+        """Take bytes as they come."""
+        is_too_long = False
+        try:
+            lines = self._lines.feed(data)
+        except LineTooLong as error:
+            lines, is_too_long = error.lines, True
+        for line in lines:
+            if self.is_open:
+                self._take(line, now_s)
+        if is_too_long and self.is_open:
+            self._server.counts["oversized_lines"] += 1
+            self._server.drop(self, "line over the limit")
+
+    def _take(self, line: bytes, now_s: float) -> None:
+        try:
+            message = decode_from_client(line)
+            if isinstance(message, Unknown):
+                self._server.counts["unknown_types"] += 1
+            elif self.role is None:
+                self._server.join(self, message, now_s)
+            elif not self._server.command(self, self.role, message, now_s):
+                raise BadLine("not for this role", type(message).__name__.lower())
+        except BadLine as error:
+            if self.role is None and error.message_type == "join":
+                self._server.refuse(self, "bad join")
+                return
+            self._server.counts["bad_lines"] += 1
+            if self._bad.add(now_s):
+                self._server.drop(self, "too many bad lines")
+
+
+class RobotServer:
+    """The robot behind its link.
+
+    Args:
+        robot: just booted.
+        lockstep: simulated time waits for the clients.
+        boot: number of this boot.
+        key: of the HMAC, or ``None`` for no authentication.
+        make_nonce: 32 fresh hex digits.
+        now_s: wall clock at boot.
+        note: takes one line for the log.
+        on_frame: called after each frame that was driven.
+
+    Attributes:
+        robot: the robot.
+        counts: bad_lines, unknown_types, oversized_lines, refused, stale (drives, permits and fans not newer),
+            slips (frames more than a period late).
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        lockstep: bool,
+        boot: int,
+        key: bytes | None,
+        make_nonce: Callable[[], str],
+        now_s: float,
+        note: Callable[[str], None],
+        on_frame: Callable[[], None],
+    ) -> None:
+        self.robot = robot
+        self.counts: Counter[str] = Counter()
+        self._is_lockstep, self._boot, self._key = lockstep, boot, key
+        self._make_nonce, self._note, self._on_frame = make_nonce, note, on_frame
+        self._boot_s = now_s
+        self._sessions: set[Session] = set()
+        self._holders: dict[Role, Session] = {}
+        self._last_session = 0
+        self._is_drive_acked = self._is_permit_acked = False
+        self._frame_wall_s = now_s
+        self._is_stall_noted = False
+
+    # -- connections ----------------------------------------------------------------------------------------------
+
+    def accept(self, wire: Wire, now_s: float) -> Session:
+        """A client connected."""
+        session = Session(self, wire, self._make_nonce(), now_s)
+        auth = AUTH_NONE if self._key is None else AUTH_HMAC
+        hello = self.robot.hello(boot=self._boot, nonce=session.nonce, auth=auth, lockstep=self._is_lockstep)
+        wire.write(encode(hello))
+        self._sessions.add(session)
+        if len(self._sessions) > MAX_SESSIONS:
+            self.refuse(session, "busy")
+        return session
+
+    def lost(self, session: Session) -> None:
+        """The connection of a session is gone (or shall be forgotten): its role is free, the wheels are held."""
+        session.is_open = False
+        self._sessions.discard(session)
+        role, session.role = session.role, None
+        if role is None or self._holders.get(role) is not session:
+            return
+        del self._holders[role]
+        if role == "controller":
+            self.robot.rules.lose_controller()
+            self._is_drive_acked = False
+        else:
+            self.robot.rules.lose_monitor()
+            self._is_permit_acked = False
+        self._note(f"{role} lost: wheels held")
+
+    def drop(self, session: Session, why: str) -> None:
+        """Close a session."""
+        self._note(f"{session.role or 'client'} dropped: {why}")
+        self.lost(session)
+        session.wire.close()
+
+    def refuse(self, session: Session, reason: RefusalReason) -> None:
+        """Tell a client that it gets no role, and close."""
+        self.counts["refused"] += 1
+        session.wire.write(encode(Refused(reason=reason)))
+        self.drop(session, f"refused: {reason}")
+
+    def check_time(self, now_s: float) -> None:
+        """Refuse those who do not join, report a stall. To be called a few times a second."""
+        for session in tuple(self._sessions):
+            if session.role is None and now_s - session.joined_s > JOIN_TIMEOUT_S:
+                self.refuse(session, "bad join")
+        if not self._is_lockstep or "controller" not in self._holders or self._is_stall_noted:
+            return
+        if now_s - self._frame_wall_s > STALL_S:
+            self._is_stall_noted = True
+            missing = "permit" if self._is_drive_acked else "drive"
+            self._note(f"stall: frame {self.robot.seq} waits for its {missing}")
+
+    # -- roles ----------------------------------------------------------------------------------------------------
+
+    def join(self, session: Session, message: FromClient, now_s: float) -> None:
+        """A session that has no role yet sent its first message."""
+        if not isinstance(message, Join):
+            self.refuse(session, "bad join")
+            return
+        if self._key is not None and not is_mac_right(self._key, session.nonce, message):
+            self.refuse(session, "bad mac")
+            return
+        robot_s = self._robot_time_s(now_s)
+        holder = self._holders.get(message.role)
+        if holder is not None:
+            if robot_s - holder.heard_s <= SILENCE_S:
+                self.refuse(session, "role taken")
+                return
+            self.drop(holder, "silent, taken over")
+        self._holders[message.role] = session
+        session.role, session.heard_s = message.role, robot_s
+        self._last_session += 1
+        session.wire.write(encode(Joined(role=message.role, session=self._last_session)))
+        self._note(f"{message.role} joined: {message.client}")
+        self._frame_wall_s, self._is_stall_noted = now_s, False
+        self._begin(session, message.role)
+
+    def _begin(self, session: Session, role: Role) -> None:
+        robot = self.robot
+        if role == "controller":
+            robot.rules.join_controller()
+            robot.fans.join_controller()
+            if self._is_lockstep:
+                self._send_frame()
+        else:
+            robot.rules.join_monitor()
+            if self._is_lockstep and "controller" in self._holders:
+                session.wire.write(robot.line)
+
+    def command(self, session: Session, role: Role, message: FromClient, now_s: float) -> bool:
+        """A message of a session that has a role; false when it is not for this role."""
+        robot_s = self._robot_time_s(now_s)
+        robot = self.robot
+        if role == "controller" and isinstance(message, Drive):
+            taken = robot.rules.drive(message.seq, message.wr, message.wl, robot_s)
+            self._is_drive_acked |= taken and message.ack == robot.seq
+        elif role == "monitor" and isinstance(message, Permit):
+            taken = robot.rules.permit(message.seq, message.forward, message.reverse, message.turn, robot_s)
+            self._is_permit_acked |= taken and message.ack == robot.seq
+        elif role == "controller" and isinstance(message, Fans):
+            taken = robot.fans.command(message.seq, *message.duty)
+        else:
+            return False
+        session.heard_s = robot_s
+        self.counts["stale"] += not taken
+        has_permit = self._is_permit_acked or not robot.rules.has_monitor_joined
+        if self._is_lockstep and self._is_drive_acked and has_permit:
+            self._advance(now_s)
+        return True
+
+    # -- frames ---------------------------------------------------------------------------------------------------
+
+    @property
+    def next_frame_s(self) -> float:
+        """Wall time at which the next frame is due (not in lockstep)."""
+        return self._boot_s + self.robot.next_t_s
+
+    def tick(self, now_s: float) -> None:
+        """Drive the frame that is due (not in lockstep). Late frames are made up for, one per call.
+
+        After a longer stop of this process the robot's clock goes on where it stood, as if it had been off.
+        """
+        late_s = now_s - self.next_frame_s
+        if late_s > self.robot.frame_s:
+            self.counts["slips"] += 1
+        if late_s > MAX_LAG_S:
+            self._boot_s += late_s
+        self._advance(now_s)
+
+    def _advance(self, now_s: float) -> None:
+        self._is_drive_acked = self._is_permit_acked = False
+        self._frame_wall_s, self._is_stall_noted = now_s, False
+        self.robot.advance()
+        self._on_frame()
+        self._send_frame()
+
+    def _send_frame(self) -> None:
+        line = self.robot.line
+        for session in self._holders.values():
+            session.wire.write(line)
+
+    def _robot_time_s(self, now_s: float) -> float:
+        robot_s = self.robot.t_s
+        return robot_s if self._is_lockstep else max(robot_s, now_s - self._boot_s)

@@ -1,0 +1,135 @@
+"""Pure. The messages of the robot link (interface control document 1) as types; their codec is ``ccatp.wire.robot``."""
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from ccatp.samples import EdgeSample, GravitySample, ImuSample, WheelSample
+
+PROTOCOL = "ccatp-robot/1"
+AUTH_NONE: Literal["none"] = "none"
+AUTH_HMAC: Literal["hmac-sha256"] = "hmac-sha256"
+
+MAX_TIME_S = 1e9  # some thirty years
+MAX_RATE_RAD_S = 1e4  # wheels and body; beyond every machine, so that squares stay finite
+MAX_ACCELERATION_M_S2 = 1e4
+
+Role = Literal["controller", "monitor"]
+RefusalReason = Literal["role taken", "bad mac", "bad join", "busy"]
+Sequence53 = Annotated[int, Meta(ge=0, le=2**53 - 1)]  # what every JSON reader keeps exact
+Time = Annotated[float, Meta(ge=0.0, le=MAX_TIME_S)]
+Rate = Annotated[float, Meta(ge=-MAX_RATE_RAD_S, le=MAX_RATE_RAD_S)]
+Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
+Length = Annotated[float, Meta(ge=-10.0, le=10.0)]
+Positive = Annotated[float, Meta(gt=0.0, le=1e6)]
+Name = Annotated[str, Meta(max_length=64)]
+
+
+class Unknown(msgspec.Struct, frozen=True):
+    """A well-formed message of a type that this side does not know."""
+
+    type: str
+
+
+class RobotLinkMessage(msgspec.Struct, tag_field="type", gc=False):
+    """Base of all messages; ``type`` is the tag."""
+
+
+class RobotData(msgspec.Struct):
+    """What the robot says of itself: lengths in m, robot frame; edge sensors in the order of ``EdgeSample``."""
+
+    wheel_radius_m: Positive
+    wheel_base_m: Positive
+    edge_sensors_m: tuple[tuple[Length, Length], tuple[Length, Length], tuple[Length, Length], tuple[Length, Length]]
+    puck_m: tuple[Length, Length, Length]
+    max_wheel_rad_s: Positive
+    fan_floor: Fraction
+
+
+class Hello(RobotLinkMessage, tag="hello"):
+    """First line of the robot on a new connection."""
+
+    protocol: Name
+    boot: Sequence53
+    nonce: Annotated[str, Meta(pattern="^[0-9a-f]{32}$")]
+    auth: Literal["none", "hmac-sha256"]
+    lockstep: bool
+    frame_hz: Positive
+    ttl_s: Positive
+    robot: RobotData
+
+
+class Join(RobotLinkMessage, tag="join", omit_defaults=True):
+    """Answer of a client to the hello; ``mac`` only where the robot asks for it."""
+
+    role: Role
+    client: Name
+    mac: Name = ""
+
+
+class Joined(RobotLinkMessage, tag="joined"):
+    """The client has the role."""
+
+    role: Role
+    session: Sequence53
+
+
+class Refused(RobotLinkMessage, tag="refused"):
+    """The client does not get the role; the robot closes."""
+
+    reason: Name
+
+
+class CommandEcho(msgspec.Struct, gc=False):
+    """The newest drive in force (seq -1: none), its age, the age of the newest permit, and whether wheels are held."""
+
+    seq: Annotated[int, Meta(ge=-1, le=2**53 - 1)]
+    age: Time
+    permit_age: Time
+    held: bool
+
+
+class Sensors(RobotLinkMessage, tag="sensors", gc=True):
+    """One frame of the robot: every sample taken since the one before, oldest first. Times are the robot's clock, s."""
+
+    seq: Sequence53
+    t: Time
+    imu: list[ImuSample]
+    enc: list[WheelSample]
+    edge: list[EdgeSample]
+    gravity: GravitySample | None
+    fans: tuple[Fraction, Fraction]
+    soc: Fraction
+    cmd: CommandEcho
+    faults: list[Name]
+
+
+class Drive(RobotLinkMessage, tag="drive"):
+    """Wheel angular-rate set points, rad/s; ``ack`` is the newest sensors frame they were computed from."""
+
+    seq: Sequence53
+    ack: Sequence53
+    wr: Rate
+    wl: Rate
+
+
+class Permit(RobotLinkMessage, tag="permit"):
+    """The motion that the monitor allows until the next permit."""
+
+    seq: Sequence53
+    ack: Sequence53
+    forward: bool
+    reverse: bool
+    turn: bool
+
+
+class Fans(RobotLinkMessage, tag="fans"):
+    """Fan duty (left, right); stays in force until changed."""
+
+    seq: Sequence53
+    duty: tuple[Fraction, Fraction]
+
+
+FromRobot = Hello | Joined | Refused | Sensors
+FromClient = Join | Drive | Permit | Fans

@@ -1,0 +1,186 @@
+"""Pure but for reading the shipped configuration. Every route and every way home, driven by brute force."""
+
+from collections.abc import Sequence
+from functools import cache
+from math import atan2, ceil, hypot, pi, radians, tau
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.planning.bound import path_time
+from ccatp.planning.route import plan_route
+from ccatp.planning.traversal import thesis_order
+from ccatp.planning.way_home import plan_way_home
+from ccatp.samples import DeckPose, Stop, StopKind
+
+NAMES = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
+ROUNDING_M = 1e-8  # the rim's segment clearance is exact to 1 nm
+# The planner looks along each turn in steps of one degree and allows 10 um for what lies between; so do we.
+SWEEP_M = 1e-5
+
+FloatArray = NDArray[np.float64]
+mirror_names = st.sampled_from(NAMES)
+
+
+@cache
+def load(name: str) -> tuple[Config, Mirror]:
+    cfg = load_config(overrides={"run.mirror": name})
+    return cfg, build_mirror(cfg.mirror)
+
+
+def sensor_depths(cfg: Config, mirror: Mirror, x: FloatArray, y: FloatArray, course: FloatArray) -> FloatArray:
+    """Distance to the rim of the worst sensor, from the tangent plane's own vectors."""
+    fx, fy = mirror.surface.gradients(x, y)
+    normal = np.stack((-fx, -fy, np.ones_like(fx)), axis=-1)
+    ahead = np.stack((np.cos(course), np.sin(course), fx * np.cos(course) + fy * np.sin(course)), axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
+    left = np.cross(normal, ahead)
+    tips = [ox * ahead + oy * left for ox, oy in cfg.robot.edge_sensors_m]
+    return np.min([mirror.rim.signed_distances_m(x + t[..., 0], y + t[..., 1]) for t in tips], axis=0)
+
+
+def course_of(mirror: Mirror, pose: DeckPose) -> float:
+    hx, hy, _, _ = mirror.body_axes(pose)
+    return atan2(hy, hx)
+
+
+def turn(x: float, y: float, course: float, angle: float) -> FloatArray:
+    """A turn in place in steps of at most one degree; poses of shape (n, 3)."""
+    n = max(1, ceil(abs(angle) / radians(1.0)))
+    return np.stack([np.array((x, y, course + angle * k / n)) for k in range(n + 1)])
+
+
+def drive(mirror: Mirror, start: DeckPose, stops: Sequence[Stop]) -> list[FloatArray]:
+    """All poses (x, y, course) of a path, per stop: turns by one degree, legs by 5 mm."""
+    x, y, course = start.x_m, start.y_m, course_of(mirror, start)
+    legs = []
+    for stop in stops:
+        length = hypot(stop.x_m - x, stop.y_m - y)
+        wanted = atan2(stop.y_m - y, stop.x_m - x) + (pi if stop.reverse else 0.0)
+        angle = (wanted - course + pi) % tau - pi
+        poses = [turn(x, y, course, angle)]
+        if abs(angle) > radians(176.0):  # which way round is up to the noise
+            poses.append(turn(x, y, course, angle - tau if angle > 0.0 else angle + tau))
+        s = np.linspace(0.0, 1.0, max(2, ceil(length / 0.005)))
+        poses.append(np.stack((x + s * (stop.x_m - x), y + s * (stop.y_m - y), np.full_like(s, wanted)), axis=-1))
+        x, y, course = stop.x_m, stop.y_m, wanted
+        if stop.heading_rad is not None:
+            final = course_of(mirror, DeckPose(x, y, stop.heading_rad))
+            poses.append(turn(x, y, course, (final - course + pi) % tau - pi))
+        legs.append(np.concatenate(poses))
+    return legs
+
+
+def worst_sensor(cfg: Config, mirror: Mirror, legs: Sequence[FloatArray]) -> float:
+    poses = np.concatenate(legs)
+    return float(sensor_depths(cfg, mirror, poses[:, 0], poses[:, 1], poses[:, 2]).min())
+
+
+def least_clearance(mirror: Mirror, start: DeckPose, stops: Sequence[Stop]) -> float:
+    ends = [(start.x_m, start.y_m), *((stop.x_m, stop.y_m) for stop in stops)]
+    return min(mirror.rim.segment_clearance_m(*a, *b) for a, b in zip(ends, ends[1:], strict=False))
+
+
+@given(mirror_names, st.integers(0, 120))
+def test_every_point_exactly_once(name: str, panels: int) -> None:
+    _, mirror = load(name)
+    points = thesis_order(mirror, panels)
+    whole = thesis_order(mirror)
+    assert len(set(points)) == len(points)
+    assert points == whole[: 9 * panels if panels else None]
+    assert set(whole) == {point for panel in mirror.panels for point in mirror.point_ids(panel)}
+
+
+def check_route(cfg: Config, mirror: Mirror, stops: Sequence[Stop]) -> None:
+    assert least_clearance(mirror, mirror.base_pose, stops) >= cfg.mission.leg_clearance_m - ROUNDING_M
+    assert worst_sensor(cfg, mirror, drive(mirror, mirror.base_pose, stops)) >= cfg.mission.turn_clearance_m - SWEEP_M
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_whole_survey_stays_on_the_mirror(name: str) -> None:
+    cfg, mirror = load(name)
+    points = thesis_order(mirror)
+    route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose)
+    check_route(cfg, mirror, route.stops)
+    measured = [stop for stop in route.stops if stop.kind is StopKind.MEASURE]
+    assert [stop.point for stop in measured] == points
+    assert [(stop.x_m, stop.y_m) for stop in measured] == [mirror.point_on_deck(point) for point in points]
+    assert all(stop.kind is StopKind.VIA and stop.point is None for stop in route.stops if stop not in measured)
+
+
+@settings(max_examples=15, deadline=None)
+@given(mirror_names, st.integers(1, 40), st.integers(0, 2**32), st.floats(0.0, 1.0))
+def test_any_rest_of_a_survey_stays_on_the_mirror(name: str, panels: int, seed: int, part: float) -> None:
+    cfg, mirror = load(name)
+    points = thesis_order(mirror, panels)
+    is_done = np.random.default_rng(seed).random(len(points)) < part
+    skip = {point for point, done in zip(points, is_done, strict=True) if done}
+    route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose, skip=skip)
+    assert [stop.point for stop in route.stops if stop.point] == [point for point in points if point not in skip]
+    if route.stops:
+        check_route(cfg, mirror, route.stops)
+
+
+def check_way_home(cfg: Config, mirror: Mirror, start: DeckPose) -> None:
+    """Every leg clear and every turn safe, but for the first move away from the rim, which only leads inward."""
+    base = mirror.base_pose
+    stops = plan_way_home(mirror, start, base, cfg.robot, cfg.limits, cfg.mission)
+    assert stops[-1] == Stop(base.x_m, base.y_m, StopKind.BASE, None, stops[-1].reverse, base.heading_rad)
+    assert all(stop.kind is StopKind.VIA and stop.heading_rad is None for stop in stops[:-1])
+    legs = drive(mirror, start, stops)
+    depth = mirror.rim.signed_distance_m(start.x_m, start.y_m)
+    if depth < 0.134:  # where a turn in place sweeps a sensor over the rim: 127.3 + 5 mm, and 1 mm to spare
+        away = mirror.rim.segment_clearance_m(start.x_m, start.y_m, stops[0].x_m, stops[0].y_m)
+        assert away >= depth - 1e-4  # the first leg leads inward; its samples are 10 mm apart
+        assert mirror.rim.signed_distance_m(stops[0].x_m, stops[0].y_m) >= 0.1323
+        middle = legs[0][-1]
+        start, stops, legs = DeckPose(middle[0], middle[1], 0.0), stops[1:], legs[1:]
+    assert least_clearance(mirror, start, stops) >= cfg.mission.leg_clearance_m - ROUNDING_M
+    assert worst_sensor(cfg, mirror, legs) >= cfg.mission.turn_clearance_m - SWEEP_M
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_home_from_every_point(name: str) -> None:
+    cfg, mirror = load(name)
+    for k, point in enumerate(thesis_order(mirror)):
+        x, y = mirror.point_on_deck(point)
+        if k % 4 == 0 or mirror.rim.signed_distance_m(x, y) < 0.134:
+            check_way_home(cfg, mirror, DeckPose(x, y, radians(37.0 * k)))
+
+
+@settings(max_examples=150, deadline=None)
+@given(mirror_names, st.floats(-4.0, 4.0), st.floats(-4.0, 4.0), st.floats(-7.0, 7.0))
+def test_home_from_anywhere(name: str, x: float, y: float, heading: float) -> None:
+    cfg, mirror = load(name)
+    if mirror.rim.signed_distance_m(x, y) > 0.0:
+        check_way_home(cfg, mirror, DeckPose(x, y, heading))
+
+
+@settings(max_examples=150, deadline=None)
+@given(mirror_names, st.integers(0, 1000), st.floats(0.0, 1.0), st.floats(1e-6, 0.13), st.floats(-7.0, 7.0))
+def test_home_from_the_rim(name: str, edge: int, along: float, depth: float, heading: float) -> None:
+    cfg, mirror = load(name)
+    corners = mirror.rim.vertices
+    a, b = corners[edge % len(corners)], corners[(edge + 1) % len(corners)]
+    u = (b - a) / np.linalg.norm(b - a)
+    x, y = a + along * (b - a) + depth * np.array((-u[1], u[0]))  # the outline runs counter-clockwise
+    if mirror.rim.signed_distance_m(float(x), float(y)) > 0.0:
+        check_way_home(cfg, mirror, DeckPose(float(x), float(y), heading))
+
+
+@given(mirror_names, st.integers(1, 6))
+def test_stops_on_the_way_cost_time_and_nothing_else(name: str, panels: int) -> None:
+    cfg, mirror = load(name)
+    points = thesis_order(mirror, panels)
+    route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose, measuring_time_s=0.5)
+    time_s = path_time(route.stops, mirror.base_pose, cfg.limits, mirror, 0.5)
+    assert route.remaining_s(0) == pytest.approx(time_s, abs=1e-6)  # two sums of some hundred terms
+    assert all(a > b for a, b in zip(route.times_s, route.times_s[1:], strict=False))
+    assert route.remaining_s(len(route.stops)) == route.remaining_s(10**6) == 0.0

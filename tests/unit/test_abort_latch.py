@@ -1,0 +1,97 @@
+"""Unit tests of the abort latch."""
+
+import pytest
+
+from ccatp.abort_latch import AT_BASE_OR_HELD, MAX_ACTIVE, MAX_CLEARED, AbortLatch, EmergencyKind, is_at_base_or_held
+from ccatp.mission_states import MOVING, State
+
+
+@pytest.mark.parametrize("kind", list(EmergencyKind))
+def test_each_kind_latches_until_cleared(kind: EmergencyKind) -> None:
+    latch = AbortLatch()
+    assert not latch.is_latched
+    assert latch.newest is None
+    assert latch.raise_emergency(kind.value, "a", "smoke") is None
+    assert latch.is_latched
+    assert latch.newest is not None
+    assert (latch.newest.kind, latch.newest.id, latch.newest.note) == (kind, "a", "smoke")
+    assert latch.clear("a", at_base_or_held=True) is None
+    assert not latch.is_latched
+
+
+def test_the_same_id_again_is_harmless_also_after_its_clear() -> None:
+    latch = AbortLatch()
+    latch.raise_emergency("fire", "a")
+    assert latch.raise_emergency("power", "a", "retransmitted") is None
+    assert latch.newest is not None
+    assert latch.newest.kind is EmergencyKind.FIRE
+    assert latch.clear("a", at_base_or_held=True) is None
+    assert latch.clear("a", at_base_or_held=False) is None
+    # a late retransmission must not abort the next survey
+    assert latch.raise_emergency("fire", "a") is None
+    assert not latch.is_latched
+
+
+def test_unknown_kind_and_unknown_id_change_nothing() -> None:
+    latch = AbortLatch()
+    assert latch.raise_emergency("flood", "a") == "unknown kind 'flood'"
+    assert latch.clear("a", at_base_or_held=True) == "no emergency with that id"
+    assert not latch.is_latched
+
+
+def test_clear_is_refused_while_the_robot_is_out_on_the_mirror() -> None:
+    latch = AbortLatch()
+    latch.raise_emergency("fire", "a")
+    assert latch.clear("a", at_base_or_held=False) == "the robot is neither at base nor held"
+    assert latch.is_latched
+
+
+def test_clear_is_refused_while_the_cause_persists() -> None:
+    latch = AbortLatch()
+    latch.raise_emergency("fire", "a")
+    latch.set_level(EmergencyKind.FIRE, True)
+    latch.set_level(EmergencyKind.POWER, True)
+    assert latch.clear("a", at_base_or_held=True) == "the cause persists: fire"
+    assert latch.is_latched
+    latch.set_level(EmergencyKind.FIRE, False)
+    assert latch.clear("a", at_base_or_held=True) is None
+
+
+def test_the_latch_opens_with_the_last_emergency() -> None:
+    latch = AbortLatch()
+    latch.raise_emergency("fire", "a")
+    latch.raise_emergency("power", "b")
+    assert latch.newest is not None
+    assert latch.newest.id == "b"
+    assert latch.clear("b", at_base_or_held=True) is None
+    assert latch.is_latched
+    assert latch.newest.id == "a"
+    assert latch.clear("a", at_base_or_held=True) is None
+    assert not latch.is_latched
+
+
+def test_a_flood_of_emergencies_is_bounded_and_stays_latched() -> None:
+    latch = AbortLatch()
+    for number in range(MAX_ACTIVE):
+        assert latch.raise_emergency("weather", str(number)) is None
+    assert latch.raise_emergency("weather", "one more") == (
+        f"{MAX_ACTIVE} emergencies are active already (the operation is aborted)"
+    )
+    assert latch.is_latched
+
+
+def test_memory_of_cleared_ids_is_bounded() -> None:
+    latch = AbortLatch()
+    for number in range(MAX_CLEARED + 1):
+        latch.raise_emergency("weather", str(number))
+        assert latch.clear(str(number), at_base_or_held=True) is None
+    # the oldest is forgotten: raised again it is a new one
+    latch.raise_emergency("weather", "0")
+    assert latch.is_latched
+
+
+def test_the_states_are_those_of_the_mission() -> None:
+    assert {state.value for state in State} - {state.value for state in MOVING} == AT_BASE_OR_HELD
+    assert is_at_base_or_held("held")
+    assert not is_at_base_or_held("driving")
+    assert not is_at_base_or_held("")

@@ -1,0 +1,652 @@
+"""Pure but for reading the shipped configuration. The localizer against a small truth of its own.
+
+The truth drives on the curved deck with given v(t) and omega(t), integrated in 1 ms midpoint steps; it shares the
+mirror's geometry with the localizer, and nothing else.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from math import atan, cos, hypot, inf, nan, pi, sin
+
+import numpy as np
+import pytest
+
+from ccatp.angles import difference
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.crossing import HeadingFix, HeadingGate, heading_from_pair
+from ccatp.filters import FILTERS, FilterDiverged, FilterShapeError, FloatArray, Innovation, KalmanFilter
+from ccatp.fixes import FixRefused
+from ccatp.localizer import Localizer
+from ccatp.measurements import ConstantAcceleration, MeasurementBuilder
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.odometry import Odometer, Place, arc_step
+from ccatp.position_sigma import PositionSigma
+from ccatp.samples import DeckPose, EdgeSample, Fix, ImuSample, PanelId, PanelPose, WheelSample
+
+Rate = Callable[[float], float]
+Frame = tuple[float, list[ImuSample], list[WheelSample], list[EdgeSample]]
+
+DT_S = 1e-3
+PER_FRAME = 10
+CENTRE = PanelPose(PanelId(5, 5), 0.0, 0.0, 0.3)
+
+
+@cache
+def config(mirror: str = "fyst-m1") -> Config:
+    return load_config(overrides={"run.mirror": mirror})
+
+
+@cache
+def mirror_of(name: str = "fyst-m1") -> Mirror:
+    return build_mirror(config(name).mirror)
+
+
+def still(_: float) -> float:
+    return 0.0
+
+
+def trapeze(begin_s: float, duration_s: float, top: float, ramp: float) -> Rate:
+    """A rate that rises with slope ``ramp``, stays at ``top`` and falls again."""
+
+    def at(t: float) -> float:
+        t -= begin_s
+        return top * max(0.0, min(1.0, t * ramp / abs(top), (duration_s - t) * ramp / abs(top)))
+
+    return at
+
+
+class Truth:
+    """The robot as it really moves, and what its sensors say; sigmas of the thesis's table 2.1 times ``noise``."""
+
+    def __init__(self, start: DeckPose, v: Rate, omega: Rate, noise: float = 0.0, mirror: str = "fyst-m1") -> None:
+        self.pose = start
+        self.v, self.omega = v, omega
+        self.mirror, self.robot = mirror_of(mirror), config(mirror).robot
+        self.noise, self.rng = noise, np.random.default_rng(1)
+        self.ticks = 0
+
+    @property
+    def t_s(self) -> float:
+        return self.ticks * DT_S
+
+    def move(self) -> None:
+        p = self.pose
+        v, omega = self.v(self.t_s + 0.5 * DT_S), self.omega(self.t_s + 0.5 * DT_S)
+        hx, hy, _, _ = self.mirror.body_axes(DeckPose(p.x_m, p.y_m, p.heading_rad + 0.5 * omega * DT_S))
+        dx, dy = v * DT_S * hx, v * DT_S * hy
+        turn = omega * DT_S + self.mirror.surface.transport_rad(p.x_m, p.y_m, dx, dy)
+        self.pose = DeckPose(p.x_m + dx, p.y_m + dy, p.heading_rad + turn)
+        self.ticks += 1
+
+    def frame(self) -> Frame:
+        imu, encoders, edges = [], [], []
+        r, half = self.robot.wheel_radius_m, 0.5 * self.robot.wheel_base_m
+        for _ in range(PER_FRAME):
+            self.move()
+            t = self.t_s
+            v, omega = self.v(t), self.omega(t)
+            n = (self.noise * self.rng.normal(size=4)).tolist()
+            encoders.append(
+                WheelSample(t, (v + half * omega) / r + 0.001 * n[0], (v - half * omega) / r + 0.001 * n[1])
+            )
+            seen = (self.mirror.body_offset(self.pose, *xy) for xy in self.robot.edge_sensors_m)
+            edges.append(EdgeSample(t, *(int(self.mirror.is_on_panel(*xy)) for xy in seen)))
+        ax = (self.v(t) - self.v(t - 1e-5)) / 1e-5
+        imu.append(ImuSample(t, ax + 0.0059 * n[2], omega + 0.0087 * n[3]))
+        return t, imu, encoders, edges
+
+    def frames(self, duration_s: float) -> list[Frame]:
+        return [self.frame() for _ in range(round(duration_s / (PER_FRAME * DT_S)))]
+
+    def fix(self, sigma_m: float = 1e-5) -> Fix:
+        c = sigma_m**2
+        puck = self.mirror.puck_world(self.pose, self.robot.puck_height_m)
+        return Fix(self.t_s, puck, (c, 0.0, 0.0, 0.0, c, 0.0, 0.0, 0.0, c), 1.5, (1, 2, 3, 4), 1e-6)
+
+
+def make(start: PanelPose = CENTRE, mirror: str = "fyst-m1", **changes: float) -> Localizer:
+    cfg = config(mirror)
+    localizer = cfg.localizer.model_copy(update=changes)
+    return Localizer(FILTERS["kf"](np.zeros(4), np.eye(4)), mirror_of(mirror), cfg.robot, localizer, start)
+
+
+def truth(start: PanelPose = CENTRE, v: Rate = still, omega: Rate = still, noise: float = 0.0) -> Truth:
+    return Truth(mirror_of().deck_pose(start), v, omega, noise)
+
+
+def errors(localizer: Localizer, pose: DeckPose) -> tuple[float, float]:
+    """Distance (m) and heading error (rad) of the estimate."""
+    found = localizer.deck_pose
+    return hypot(found.x_m - pose.x_m, found.y_m - pose.y_m), difference(found.heading_rad, pose.heading_rad)
+
+
+def run(localizer: Localizer, frames: list[Frame]) -> None:
+    for frame in frames:
+        localizer.step(*frame)
+
+
+# --- the whole drive -------------------------------------------------------------------------------------------------
+
+STRAIGHT = trapeze(0.1, 2.5, 0.1, 0.2)
+TURN = trapeze(2.8, 2.0, 0.8, 2.0)
+
+
+def there_and_round(t: float) -> float:
+    return STRAIGHT(t) if t < 2.7 else STRAIGHT(t - 4.8)
+
+
+@pytest.mark.parametrize(("noise", "limit_m", "limit_rad"), [(0.0, 5e-5, 1e-4), (1.0, 1e-4, 3e-4)])
+def test_a_drive_with_a_turn_from_a_known_start(noise: float, limit_m: float, limit_rad: float) -> None:
+    # Limits: without noise what remains is the frame of 10 ms against ramps that begin inside it; with noise the
+    # gyroscope and encoders add some 20 um. Both are far below the 1 cm that a measurement needs.
+    world = truth(v=there_and_round, omega=TURN, noise=noise)
+    localizer = make()
+    nis = []
+    while world.t_s < 7.6:
+        localizer.step(*world.frame())
+        assert localizer.innovation is not None
+        nis.append(localizer.innovation.nis / localizer.innovation.size)
+    distance, heading = errors(localizer, world.pose)
+    assert distance < limit_m
+    assert abs(heading) < limit_rad
+    assert localizer.t_s == world.t_s
+    if noise:
+        # 760 frames of 22 rows: the mean is 1 within 4 sqrt(2/16720) if the filter were exact; 0.2 allows for a process
+        # noise that is wider than what the robot does.
+        assert np.mean(nis) == pytest.approx(1.0, abs=0.2)
+
+
+def test_speed_and_rate_follow() -> None:
+    localizer = make()
+    world = truth(v=trapeze(0.05, 9.0, 0.1, 0.2), omega=trapeze(0.05, 9.0, 0.2, 2.0))
+    run(localizer, world.frames(2.0))
+    assert localizer.speed_m_s == pytest.approx(0.1, abs=1e-6)  # constant for 1.4 s and no noise
+    assert localizer.rate_rad_s == pytest.approx(0.2, abs=1e-6)
+
+
+def test_sigmas_cover_the_error_and_grow_with_the_way() -> None:
+    localizer = make()
+    assert localizer.position_sigma_m == pytest.approx(config().localizer.start_position_sigma_m)
+    assert localizer.heading_sigma_rad == pytest.approx(config().localizer.start_heading_sigma_rad)
+    run(localizer, truth(v=lambda _: 0.1).frames(2.0))
+    # 0.2 m at 0.01 rad and 0.2 % beside 2 mm
+    assert localizer.position_sigma_m == pytest.approx(hypot(0.002, 0.2 * 0.01, 0.2 * 0.002), rel=0.02)
+
+
+def test_handover_keeps_the_deck_pose() -> None:
+    # Along a row and along a column, over several panels; at each change of panel the deck pose of before, moved by the
+    # odometer's step, must agree to rounding: compared with the pose expressed in the panel left behind.
+    mirror = mirror_of()
+    for heading in (0.05, 1.6, -3.1, -1.5):
+        localizer = make(PanelPose(PanelId(5, 5), 0.1, 0.1, heading))
+        world = truth(PanelPose(PanelId(5, 5), 0.1, 0.1, heading), v=lambda _: 0.5)
+        before = localizer.pose
+        changes = 0
+        for frame in world.frames(2.5):
+            localizer.step(*frame[:3], [])
+            now = localizer.pose
+            if now.panel != before.panel:
+                changes += 1
+                back = mirror.panel_pose(before.panel, localizer.deck_pose)
+                step = 0.5 * 0.01
+                assert back.x_m == pytest.approx(
+                    before.x_m + step * cos(before.heading_rad), abs=2e-6
+                )  # sag of the step
+                assert back.y_m == pytest.approx(before.y_m + step * sin(before.heading_rad), abs=2e-6)
+                assert mirror.deck_pose(back).heading_rad == pytest.approx(localizer.deck_pose.heading_rad, abs=1e-9)
+            before = now
+        assert changes >= 1
+
+
+def test_handover_by_itself_is_continuous() -> None:
+    # A fix that lands 1 nm beyond the seam changes the panel and nothing else.
+    mirror = mirror_of()
+    start = mirror.panel_pose(PanelId(5, 5), DeckPose(mirror.panels[PanelId(5, 5)].x_m + 0.3356, 0.1, 0.2))
+    localizer = make(start)
+    localizer.step(0.0, [], [], [])
+    before = localizer.deck_pose
+    seam = mirror.nearest_seam(before.x_m, before.y_m)
+    assert seam is not None
+    target = DeckPose(seam.position_m + 1e-9, before.y_m, before.heading_rad)
+    world = Truth(target, still, still)
+    localizer.fuse_fix(world.fix(1e-9))
+    assert localizer.pose.panel == PanelId(5, 6)
+    distance, heading = errors(localizer, target)
+    assert distance < 1e-9
+    assert abs(heading) < 1e-9
+    assert localizer.heading_sigma_rad == pytest.approx(config().localizer.start_heading_sigma_rad)
+
+
+# --- measurement model -----------------------------------------------------------------------------------------------
+
+
+def test_rows_are_those_of_equation_2_12_and_not_of_2_3() -> None:
+    cfg = config()
+    z, H, R = MeasurementBuilder(cfg.robot, cfg.localizer).from_pairs(
+        1.0, [ImuSample(1.0, 0.1, 0.2)], [WheelSample(1.0, 3.0, 4.0)]
+    )
+    per_r, turn = 1.0 / 0.03, 0.15 / 0.06
+    np.testing.assert_allclose(z, [3.0, 4.0, 0.1, 0.2])
+    expected = [[per_r, 0, 0, turn], [per_r, 0, 0, -turn], [0, 1, 0, 0], [0, 0, 0, 1]]
+    np.testing.assert_allclose(H, expected)  # the last row as printed in 2.4 would be (0, 0, 1, 0)
+    np.testing.assert_allclose(R, np.square([0.001, 0.001, 0.0059, 0.0087]))
+
+
+def test_the_gyroscope_is_read_as_a_rate() -> None:
+    # Gyroscope alone, 0.2 rad/s for 1 s: the heading grows by it. Read as theta (printed 2.3) it would go to 0.2.
+    localizer = make(gyroscope_sigma_rad_s=1e-6)
+    start = localizer.pose.heading_rad
+    for k in range(101):
+        localizer.step(0.01 * k, [ImuSample(0.01 * k, 0.0, 0.2)], [], [])
+    assert localizer.pose.heading_rad - start == pytest.approx(0.2, abs=2e-4)  # one tenth of a frame's turn
+
+
+def test_samples_count_at_their_own_time() -> None:
+    cfg = config()
+    builder = MeasurementBuilder(cfg.robot, cfg.localizer)
+    times = [0.991, 0.994, 1.0]
+    speed = {t: 0.05 + 0.2 * (t - 1.0) for t in times}  # v = 0.05, a = 0.2 at t = 1
+    encoders = [WheelSample(t, speed[t] / 0.03, speed[t] / 0.03) for t in times]
+    z, H, _ = builder.from_pairs(1.0, [], encoders)
+    np.testing.assert_allclose(H @ np.array([0.05, 0.2, 0.0, 0.0]), z, rtol=1e-12)  # the model is exact here
+    right, left = [(s.t_s, s[1]) for s in encoders], [(s.t_s, s[2]) for s in encoders]
+    singly = builder.from_wheels(
+        1.0, [], [(t, float(w or 0.0)) for t, w in right], [(t, float(w or 0.0)) for t, w in left]
+    )
+    np.testing.assert_allclose(singly.H, H, rtol=1e-14)  # two orders of the same products
+    np.testing.assert_allclose(singly.z, z)
+
+
+def test_one_wheel_missing_is_used_with_the_other() -> None:
+    localizer = make()
+    for k in range(200):
+        t = 0.01 * k
+        right = WheelSample(t, 0.1 / 0.03, None) if k % 2 else WheelSample(t, None, 0.1 / 0.03)
+        localizer.step(t, [ImuSample(t, 0.0, 0.0)], [right], [])
+    assert localizer.speed_m_s == pytest.approx(0.1, abs=1e-3)  # 1 %: the rate splits over two alternating wheels
+    assert localizer.innovation is not None
+    assert localizer.innovation.size == 3
+
+
+def test_the_cache_of_templates_is_bounded() -> None:
+    cfg = config()
+    builder = MeasurementBuilder(cfg.robot, cfg.localizer)
+    for n in range(300):
+        assert builder.from_wheels(0.0, [], [(0.0, 1.0)] * n, []).z.size == n
+
+
+def test_process_noise_is_one_impulse_at_the_beginning() -> None:
+    F, Q = ConstantAcceleration(config().localizer).over(0.01)
+    assert F.tolist() == [[1, 0.01, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.01], [0, 0, 0, 1]]  # eq. 2.11
+    impulse = np.diag([0.0, 1.0 * 0.01, 0.0, 4.0 * 0.01])
+    np.testing.assert_allclose(Q, F @ impulse @ F.T, rtol=1e-12)  # rounding
+
+
+# --- equation 2.14 ---------------------------------------------------------------------------------------------------
+
+
+def printed_2_14(v: float, theta: float, dt: float) -> tuple[float, float]:
+    """The thesis as printed: the time step inside the cosine, and missing on the speed."""
+    return v * cos(theta * dt), v * sin(theta * dt)
+
+
+def test_the_step_is_2_14_as_meant_and_not_as_printed() -> None:
+    v, theta, dt = 0.1, 0.7, 0.01
+    step = arc_step(v, theta, 0.0, dt)
+    assert step == pytest.approx((v * dt * cos(theta), v * dt * sin(theta)), abs=1e-16)  # rounding
+    assert hypot(*step) == pytest.approx(v * dt, rel=1e-12)
+    assert step != pytest.approx(printed_2_14(v, theta, dt), rel=0.5)
+
+
+@pytest.mark.parametrize("turn", [-3.0, -0.1, -1.1e-4, -0.9e-4, 0.0, 0.9e-4, 1.1e-4, 0.5, 2.0])
+def test_the_step_is_the_chord_of_the_arc(turn: float) -> None:
+    v, theta, dt = 0.1, -2.0, 0.5
+    # Analytic integral of v (cos, sin)(theta + omega t), as complex numbers; its own series for a small turn.
+    rotor = (np.exp(1j * turn) - 1.0) / (1j * turn) if abs(turn) > 1e-3 else 1.0 + 0.5j * turn - turn**2 / 6.0
+    expected = v * dt * np.exp(1j * theta) * rotor
+    assert complex(*arc_step(v, theta, turn, dt)) == pytest.approx(expected, abs=1e-13)  # fault S29 asks for 1e-9
+
+
+# --- crossings -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("forward", [True, False])
+@pytest.mark.parametrize("entering", [0.0, 0.2, -0.4, 0.9])
+@pytest.mark.parametrize("normal", [0.0, pi / 2, pi, -pi / 2])
+def test_entering_angle_for_every_edge_and_direction(normal: float, entering: float, forward: bool) -> None:
+    # Line through the origin with that normal; the robot crosses it at ``entering`` to the normal. A sensor (a, b) of a
+    # robot at travel s is on the line where s = -(a cos e - b sin e)/cos e.
+    heading = normal + entering + (0.0 if forward else pi)
+    e = heading - normal
+    places = []
+    for b in (0.09, -0.09):
+        s = -(0.09 * cos(e) - b * sin(e)) / cos(e)
+        places.append(Place(s * 1.0, 0.0, 0.0))  # the odometer's x axis is the heading
+    found, length, across = heading_from_pair(places[0], places[1], (0.09, 0.09), (0.09, -0.09), normal)
+    assert (found - heading + pi / 2) % pi - pi / 2 == pytest.approx(0.0, abs=1e-12)  # rounding
+    assert across == pytest.approx(0.18)
+    assert length == pytest.approx(0.18 / abs(cos(e)))
+    travel = places[0].x_m - places[1].x_m
+    assert (normal + atan(travel / 0.18) - heading + pi / 2) % pi - pi / 2 == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_turn_between_the_two_sensors_is_taken_out() -> None:
+    # The left sensor crosses with the robot at heading 0.10, the right one at 0.13; both stand on the line x = 1.
+    def place_on_line(heading: float, ahead: float, aside: float, y: float) -> Place:
+        return Place(1.0 - ahead * cos(heading) + aside * sin(heading), y, heading)
+
+    left, right = place_on_line(0.10, 0.09, 0.09, 0.0), place_on_line(0.13, 0.09, -0.09, 0.002)
+    heading, _, _ = heading_from_pair(left, right, (0.09, 0.09), (0.09, -0.09), 0.0)
+    assert heading % pi == pytest.approx(0.13, abs=1e-12)  # exact geometry
+
+
+@pytest.mark.parametrize("backward", [False, True])
+@pytest.mark.parametrize("direction", [0.08, 1.5, -3.0, -1.7, 0.6, -0.5])
+def test_a_crossing_corrects_the_heading(direction: float, backward: bool) -> None:
+    # 5 mrad of start error; after front and rear pair have crossed one or two seams 1 mrad may remain: 1 kHz at 0.1 m/s
+    # places a sensor within 0.1 mm, 0.3 mrad of the 0.18 m between two sensors.
+    start = PanelPose(PanelId(5, 5), 0.05, -0.05, direction + (pi if backward else 0.0))
+    sign = -1.0 if backward else 1.0
+    world = truth(start, v=lambda t: sign * trapeze(0.1, 9.0, 0.1, 0.2)(t), noise=1.0)
+    localizer = make(PanelPose(start.panel, start.x_m + 0.001, start.y_m - 0.001, start.heading_rad + 0.005))
+    run(localizer, world.frames(8.0))
+    assert localizer.counts["crossings_used"] >= 4
+    assert localizer.counts["crossings_gated"] == 0
+    assert localizer.pose.panel != start.panel
+    _, heading = errors(localizer, world.pose)
+    assert abs(heading) < 0.001
+    assert localizer.heading_sigma_rad < 0.0005
+    assert abs(heading) < 4.0 * localizer.heading_sigma_rad
+
+
+def crossing_run(**changes: float) -> Localizer:
+    start = PanelPose(PanelId(5, 5), 0.15, 0.0, 0.1)
+    localizer = make(start, **changes)
+    run(localizer, truth(start, v=lambda _: 0.1).frames(3.5))
+    return localizer
+
+
+def test_crossings_need_speed_and_straightness() -> None:
+    assert crossing_run().counts["crossings_used"] == 4
+    assert crossing_run(crossing_min_speed_m_s=0.2).counts["crossings_used"] == 0
+    start = PanelPose(PanelId(5, 5), 0.15, 0.0, 0.0)
+    turning = make(start)
+    run(turning, truth(start, v=lambda _: 0.1, omega=lambda _: 0.05).frames(3.5))
+    assert turning.counts["crossings_used"] == 0
+
+
+def test_a_single_false_crossing_is_refused_and_a_confident_error_is_not_kept() -> None:
+    gate = HeadingGate(5.0)
+    false = HeadingFix(0.1, 1e-7)
+    assert gate.extra_variance(false, 1e-8) is None
+    assert gate.extra_variance(HeadingFix(0.0, 1e-7), 1e-8) == 0.0
+    assert gate.extra_variance(false, 1e-8) is None
+    assert gate.extra_variance(HeadingFix(-0.1, 1e-7), 1e-8) is None  # does not agree with the one before
+    assert gate.extra_variance(HeadingFix(-0.1002, 1e-7), 1e-8) == pytest.approx(0.1002**2)
+
+
+def test_a_heading_that_is_wrong_beyond_its_sigma_recovers_at_the_seam() -> None:
+    start = PanelPose(PanelId(5, 5), 0.15, 0.0, 0.1)
+    localizer = make(PanelPose(start.panel, start.x_m, start.y_m, 0.13), start_heading_sigma_rad=0.001)
+    world = truth(start, v=lambda _: 0.1)
+    run(localizer, world.frames(3.5))
+    assert localizer.counts["crossings_gated"] == 1
+    assert abs(errors(localizer, world.pose)[1]) < 0.001  # 1 kHz edges
+
+
+def test_an_edge_far_from_any_seam_is_no_crossing() -> None:
+    localizer = make()
+    world = truth(v=lambda _: 0.1)
+    for k, (t, imu, encoders, edges) in enumerate(world.frames(1.0)):
+        if k == 50:
+            edges = [EdgeSample(e.t_s, 0, 0, 1, 1) for e in edges]
+        localizer.step(t, imu, encoders, edges)
+    assert localizer.counts["crossings_used"] == localizer.counts["crossings_gated"] == 0
+
+
+# --- stops, fixes, resets --------------------------------------------------------------------------------------------
+
+
+def test_rest_leaves_a_consistent_covariance() -> None:
+    filter_ = KalmanFilter(np.zeros(4), np.eye(4))
+    cfg = config()
+    localizer = Localizer(filter_, mirror_of(), cfg.robot, cfg.localizer, CENTRE)
+    run(localizer, truth(v=lambda _: 0.1, omega=lambda _: 0.3).frames(0.5))
+    heading, variance = filter_.mean[2], filter_.covariance[2, 2]
+    pose = localizer.pose
+    localizer.rest()
+    assert (localizer.speed_m_s, localizer.rate_rad_s) == (0.0, 0.0)
+    assert localizer.pose == pose
+    assert filter_.mean.tolist() == [0.0, 0.0, heading, 0.0]
+    sigmas = [1e-4, 1e-3, np.sqrt(variance), 1e-4]
+    np.testing.assert_allclose(filter_.covariance, np.diag(np.square(sigmas)), rtol=1e-12)  # no correlation is left
+
+
+def test_reset_filter() -> None:
+    localizer = make()
+    localizer.reset_filter(np.array([0.02, 0.0, 1.0, 0.1]), np.diag([1e-4, 1e-2, 4e-4, 1e-4]))
+    assert (localizer.speed_m_s, localizer.pose.heading_rad, localizer.rate_rad_s) == (0.02, 1.0, 0.1)
+    assert localizer.heading_sigma_rad == pytest.approx(0.02)
+    with pytest.raises(FilterShapeError, match=r"mean has shape \(3,\)"):
+        localizer.reset_filter(np.zeros(3), np.eye(3))
+
+
+def test_a_fix_at_standstill() -> None:
+    world = truth()
+    localizer = make(PanelPose(CENTRE.panel, 0.003, -0.004, CENTRE.heading_rad))
+    run(localizer, world.frames(0.3))
+    assert localizer.fuse_fix(world.fix()) == pytest.approx(0.005, abs=1e-6)  # weight 1 - (10 um / 2 mm)^2
+    assert errors(localizer, world.pose)[0] < 1e-6
+    assert localizer.position_sigma_m == pytest.approx(1e-5, rel=1e-3)
+    assert localizer.fix_deviation_m == pytest.approx(0.0, abs=1e-9)
+    assert localizer.counts["fixes"] == 1
+
+
+def test_a_fix_is_weighed_against_the_pose() -> None:
+    world = truth()
+    localizer = make(PanelPose(CENTRE.panel, 0.003, 0.0, CENTRE.heading_rad))
+    run(localizer, world.frames(0.1))
+    assert localizer.fuse_fix(world.fix(0.002)) == pytest.approx(0.0015, rel=1e-3)  # equal sigmas: half way
+    assert localizer.position_sigma_m == pytest.approx(0.002 / 2**0.5, rel=1e-3)
+
+
+def test_a_late_fix_belongs_to_its_own_time() -> None:
+    # The fix is of the standstill one second ago; since then the robot has turned, driven and crossed a seam.
+    start = PanelPose(PanelId(5, 5), 0.32, 0.02, 0.1)
+    world = truth(start, v=trapeze(1.0, 9.0, 0.1, 2.0), omega=trapeze(1.0, 9.0, 0.2, 8.0))
+    localizer = make(PanelPose(start.panel, start.x_m + 0.002, start.y_m - 0.001, 0.1), history_s=0.3)
+    run(localizer, world.frames(0.5))
+    fix = world.fix()
+    run(localizer, world.frames(0.75))
+    assert localizer.pose.panel == PanelId(5, 6)
+    assert localizer.fuse_fix(fix) == pytest.approx(hypot(0.002, 0.001), rel=0.01)
+    assert errors(localizer, world.pose)[0] < 2e-5  # 20 um: the odometer's notion of standing still
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"t_s": -5.0}, "fix of -5.000 s is outside the known path"),
+        ({"t_s": 9.0}, "fix of 9.000 s is outside the known path"),
+        ({"t_s": nan}, "fix is not finite"),
+        ({"position_m": (nan, 0.0, 0.0)}, "fix is not finite"),
+        ({"position_m": (1e4, 0.0, -1e6)}, "has no foot on the mirror"),
+        ({"covariance_m2": (0.0,) * 9}, "fix has the variance 0 m"),
+        ({"covariance_m2": (inf,) * 9}, "fix is not finite"),
+    ],
+)
+def test_fixes_that_are_refused(change: dict[str, object], message: str) -> None:
+    world = truth()
+    localizer = make()
+    run(localizer, world.frames(0.5))
+    pose = localizer.pose
+    values = {f: getattr(world.fix(), f) for f in Fix.__slots__} | change
+    with pytest.raises(FixRefused, match=message):
+        localizer.fuse_fix(Fix(**values))
+    assert localizer.pose == pose
+
+
+def test_position_sigma() -> None:
+    sigma = PositionSigma(3e-3, 0.01)
+    sigma.travel(0.4, 0.0)
+    assert sigma.sigma_m == pytest.approx(5e-3)
+    sigma.widen(12e-3)
+    assert sigma.sigma_m == pytest.approx(13e-3)
+    assert sigma.fuse(13e-3**2) == pytest.approx(0.5)
+    assert sigma.sigma_m == pytest.approx(13e-3 / 2**0.5)
+    assert sigma.growth_m2(2.0, 0.0) == pytest.approx(0.02**2)
+
+
+def test_odometer_keeps_the_standstill_and_forgets_the_rest() -> None:
+    odometer = Odometer(0.2)
+    assert odometer.oldest_s == inf
+    assert odometer.at(1.0) == Place(0.0, 0.0, 0.0)
+    odometer.start(0.0)
+    for k in range(1, 1001):
+        odometer.advance(0.01 * k, 1e-7, 0.0, 0.01)
+    assert odometer.oldest_s == 0.0
+    for k in range(1001, 1101):
+        odometer.advance(0.01 * k, 0.1, 0.0, 0.01)
+    assert odometer.oldest_s == pytest.approx(10.79, abs=0.02)  # 0.2 s and the entry before
+    assert odometer.at(10.905).x_m == pytest.approx(0.0905, abs=2e-6)  # creep of the standstill
+    assert odometer.at(99.0) == odometer.place
+
+
+# --- faults ----------------------------------------------------------------------------------------------------------
+
+
+class Fragile:
+    """A filter that diverges when told to."""
+
+    def __init__(self) -> None:
+        self._kf = KalmanFilter(np.zeros(4), np.eye(4))
+        self.is_broken = False
+        self.mean, self.covariance = self._kf.mean, self._kf.covariance
+
+    def _copy(self) -> None:
+        self.mean, self.covariance = self._kf.mean, self._kf.covariance
+
+    def predict(self, F: FloatArray, Q: FloatArray) -> None:
+        self._kf.predict(F, Q)
+        self._copy()
+
+    def update(self, z: FloatArray, H: FloatArray, R: FloatArray) -> Innovation:
+        if self.is_broken:
+            raise FilterDiverged("broken for the test")
+        found = self._kf.update(z, H, R)
+        self._copy()
+        return found
+
+    def reset(self, mean: FloatArray, covariance: FloatArray) -> None:
+        self._kf.reset(mean, covariance)
+        self._copy()
+
+
+def test_a_diverged_filter_freezes_the_pose_until_the_next_fix() -> None:
+    cfg = config()
+    filter_ = Fragile()
+    localizer = Localizer(filter_, mirror_of(), cfg.robot, cfg.localizer, CENTRE)
+    world = truth(v=trapeze(0.0, 0.5, 0.02, 0.2))
+    run(localizer, world.frames(0.2))
+    filter_.is_broken = True
+    localizer.step(*world.frame())
+    assert localizer.is_frozen
+    assert localizer.hold_requested
+    assert localizer.hold_cause == "filter: broken for the test"
+    pose = localizer.pose
+    filter_.is_broken = False
+    run(localizer, world.frames(0.5))
+    localizer.rest()
+    assert localizer.pose == pose
+    assert localizer.counts["diverged"] == 1
+    localizer.fuse_fix(world.fix())
+    localizer.clear_hold()
+    assert not localizer.is_frozen
+    assert errors(localizer, world.pose)[0] < 1e-6
+    assert localizer.heading_sigma_rad == pytest.approx(0.01 * 2**0.5, rel=1e-3)  # the start's sigma on top
+    run(localizer, world.frames(0.2))
+    assert not localizer.hold_requested
+
+
+@pytest.mark.parametrize("bad", [nan, inf, -inf])
+def test_what_is_not_finite_never_reaches_the_filter(bad: float) -> None:
+    localizer, clean = make(), make()
+    for frame in truth(v=lambda _: 0.05, noise=1.0).frames(0.3):
+        t, imu, encoders, edges = frame
+        clean.step(*frame)
+        noisy = [WheelSample(t, bad, 1.0), WheelSample(bad, 1.0, 1.0), WheelSample(t, 1.0, bad)]
+        localizer.step(t, [*imu, ImuSample(t, bad, 0.0), ImuSample(bad, 0.0, 0.0)], [*encoders, *noisy], edges)
+    assert localizer.pose == clean.pose
+    assert localizer.counts["nonfinite"] == 30 * 5
+
+
+@pytest.mark.parametrize("shift", [-4294.967296, -0.15, 0.15, 4294.967296, 1e6])
+def test_a_jump_of_the_clock_does_not_move_the_pose(shift: float) -> None:
+    # S12: no step above 1 mm. One frame of 10 ms is lost while the jump is confirmed.
+    localizer = make()
+    world = truth(v=lambda _: 0.05)
+    run(localizer, world.frames(0.5))
+    before = localizer.deck_pose
+    later = world.frames(0.02)
+    for t, imu, encoders, edges in later:
+        localizer.step(
+            t + shift,
+            [s._replace(t_s=s.t_s + shift) for s in imu],
+            [s._replace(t_s=s.t_s + shift) for s in encoders],
+            [s._replace(t_s=s.t_s + shift) for s in edges],
+        )
+    assert localizer.counts["resyncs"] == 1
+    assert errors(localizer, before)[0] < 1e-6
+    assert localizer.t_s == later[-1][0] + shift
+    assert localizer.position_sigma_m > 0.05 * 0.1  # what may have happened meanwhile
+    fix = world.fix()
+    assert localizer.fuse_fix(Fix(fix.t_s + shift, *(getattr(fix, f) for f in list(Fix.__slots__)[1:]))) < 0.002
+
+
+def test_a_single_frame_from_elsewhere_is_ignored() -> None:
+    localizer, clean = make(), make()
+    frames = truth(v=lambda _: 0.05, noise=1.0).frames(0.3)
+    for k, frame in enumerate(frames):
+        clean.step(*frame)
+        localizer.step(*frame)
+        if k in (10, 20):
+            localizer.step(frame[0] + (1.0 if k == 10 else -0.5), *frame[1:])
+    assert localizer.pose == clean.pose
+    assert localizer.counts["suspect_frames"] == 2
+    assert localizer.counts["resyncs"] == 0
+
+
+def test_five_backward_frames_in_a_row_ask_for_a_hold() -> None:
+    localizer = make()
+    frames = truth().frames(0.2)
+    run(localizer, frames)
+    for k in range(5):
+        assert not localizer.hold_requested
+        localizer.step(*frames[-2 - k])
+    assert localizer.hold_cause == "time stamps of the frames run backward"
+
+
+@pytest.mark.parametrize("source", ["imu", "right encoder", "left encoder"])
+def test_five_backward_samples_in_a_row_ask_for_a_hold(source: str) -> None:
+    localizer = make()
+    run(localizer, truth().frames(0.2))
+    for k in range(5):
+        assert not localizer.hold_requested
+        t = 0.1505 - 0.001 * k
+        imu = [ImuSample(t, 0.0, 0.0)] if source == "imu" else []
+        right, left = (0.0 if source == name else None for name in ("right encoder", "left encoder"))
+        localizer.step(0.21 + 0.01 * k, imu, [] if imu else [WheelSample(t, right, left)], [])
+    assert localizer.hold_cause == f"time stamps of the {source} run backward"
+    assert localizer.counts["backward"] == 5
+    localizer.clear_hold()
+    assert not localizer.hold_requested
+
+
+def test_late_early_and_repeated_samples_are_counted() -> None:
+    localizer = make()
+    frames = truth().frames(0.5)
+    run(localizer, frames)
+    localizer.step(0.51, [ImuSample(0.2, 0.0, 0.0), ImuSample(0.6, 0.0, 0.0)], [*frames[-1][2][-2:]], [])
+    assert (localizer.counts["late"], localizer.counts["ahead"], localizer.counts["duplicate"]) == (1, 1, 4)
+    assert localizer.counts["backward"] == 0
