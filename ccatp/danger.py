@@ -12,7 +12,7 @@ outranks normal operation (0). The cause is that of the rule that takes the most
 """
 
 from collections.abc import Sequence
-from math import inf, isfinite
+from math import isfinite
 from typing import NamedTuple, Protocol
 
 from ccatp.abort_latch import AbortLatch, EmergencyKind, is_at_base_or_held
@@ -179,16 +179,26 @@ class DangerMonitor:
         )
 
     def _missing(self, t_s: float, estimate: Estimate | None, is_known: bool) -> _Missing | None:
-        age_s = inf if self._edge_t_s is None else abs(t_s - self._edge_t_s)
-        if not age_s <= self._stale_after_s:
-            return _Missing("edge", "edge samples stale", age_s, self._stale_after_s)
+        limit_s = self._stale_after_s
+        if self._edge_t_s is None:
+            return _Missing("edge", "no edge samples", limit_s, limit_s)
+        age_s = abs(t_s - self._edge_t_s)
+        if not age_s <= limit_s:
+            return _Missing("edge", "edge samples stale", age_s, limit_s)
         silent_s = self._edges.track.silence_s(t_s)
         if silent_s > 0.0:
-            return _Missing("enc", "encoder samples stale", silent_s, self._stale_after_s)
-        if is_known:
-            return None
-        age_s = inf if estimate is None else abs(t_s - estimate.t_s)
-        return _Missing("estimate", "estimate stale", age_s, self._estimate_stale_after_s)
+            return _Missing("enc", "encoder samples stale", silent_s, limit_s)
+        return None if is_known else self._estimate_missing(t_s, estimate)
+
+    def _estimate_missing(self, t_s: float, estimate: Estimate | None) -> _Missing:
+        # The values go out as JSON: an age that is not finite is no number there.
+        limit_s = self._estimate_stale_after_s
+        if estimate is None:
+            return _Missing("estimate", "no estimate", limit_s, limit_s)
+        age_s = abs(t_s - estimate.t_s)
+        if isfinite(age_s) and age_s > limit_s:
+            return _Missing("estimate", "estimate stale", age_s, limit_s)
+        return _Missing("estimate", "estimate not finite", limit_s, limit_s)
 
     # -- arbitration ----------------------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from enum import Enum
 from math import inf, isfinite
 
-from ccatp.measurements import WheelReading
+from ccatp.measurements import MeasurementBuilder, Stack, WheelReading
 from ccatp.samples import ImuSample, WheelSample
 
 MAX_FRAME_STEP_S = 0.1
@@ -119,6 +119,15 @@ class SampleIntake:
         self._counts = counts
         self.backward_source = ""
         self.restart()
+
+    def stack(
+        self, builder: MeasurementBuilder, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample]
+    ) -> Stack:
+        """z, H, R of the usable samples of a frame, for the state at ``t_s``."""
+        usable = self.imu(t_s, imu) if imu else imu
+        if self.are_clean(t_s, encoders):
+            return builder.from_pairs(t_s, usable, encoders)
+        return builder.from_wheels(t_s, usable, *self.wheels(t_s, encoders))
 
     def restart(self) -> None:
         """Forget every time stamp: the robot's clock has jumped."""

@@ -1,8 +1,8 @@
 """Pure. A series of stops and the leg being driven: the path planner of thesis 3.2 as the mission uses it."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from math import hypot
+from typing import NamedTuple
 
 from ccatp.control.tracker import LegTracker, Phase
 from ccatp.mirror.mirror import Mirror
@@ -11,16 +11,20 @@ from ccatp.samples import DeckPose, PanelId, PanelPose, Stop, Twist
 STILL = Twist(0.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Motion:
+class Motion(NamedTuple):
     """What the localizer says about the present frame."""
 
     t_s: float
     dt_s: float
     pose: PanelPose
-    deck: DeckPose
+    deck_of: Callable[[PanelPose], DeckPose]  # hardly ever asked for, and not cheap
     speed_m_s: float
     rate_rad_s: float
+
+    @property
+    def deck(self) -> DeckPose:
+        """The pose in the deck frame."""
+        return self.deck_of(self.pose)
 
 
 class Journey:

@@ -12,13 +12,14 @@ from ccatp.crossing import CrossingDetector, HeadingFix, HeadingGate, Transition
 from ccatp.filters.base import Filter, FilterDiverged, FloatArray, Innovation
 from ccatp.fixes import check_fix, foot_of_fix
 from ccatp.intake import BACKWARD_LIMIT, MAX_FRAME_STEP_S, FrameClock, FrameKind, SampleIntake
-from ccatp.measurements import OMEGA, STATES, THETA, ConstantAcceleration, MeasurementBuilder, V
+from ccatp.measurements import OMEGA, STATES, THETA, ConstantAcceleration, MeasurementBuilder, Stack, V
 from ccatp.mirror.mirror import Mirror
 from ccatp.odometry import Odometer, arc_step
 from ccatp.position_sigma import PositionSigma
 from ccatp.samples import DeckPose, EdgeSample, Fix, ImuSample, PanelId, PanelPose, WheelSample
 
 _NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under the robot is looked up
+_IMPOSSIBLE = 2.0  # an estimate of this many times the wheels' largest rate is no estimate
 _SELECT_HEADING = np.eye(STATES)[THETA : THETA + 1]
 
 
@@ -57,6 +58,8 @@ class Localizer:
         self._mirror = mirror
         self._cfg = cfg
         self._puck_height_m = robot.puck_height_m
+        self._v_limit_m_s = _IMPOSSIBLE * robot.wheel_radius_m * robot.max_wheel_rad_s
+        self._omega_limit_rad_s = 2.0 * self._v_limit_m_s / robot.wheel_base_m
         self._process = ConstantAcceleration(cfg)
         self._builder = MeasurementBuilder(robot, cfg)
         self._clock = FrameClock()
@@ -140,14 +143,14 @@ class Localizer:
             if self._clock.stale_run >= BACKWARD_LIMIT:
                 self._ask_to_hold("time stamps of the frames run backward")
             return
-        stack = self._measurements(t_s, imu, encoders)
+        stack = self._intake.stack(self._builder, t_s, imu, encoders)
         if self._intake.backward_source:
             self._ask_to_hold(f"time stamps of the {self._intake.backward_source} run backward")
             self._intake.backward_source = ""
         if self.is_frozen:
             return
         try:
-            self._advance(t_s, dt_s, *stack)
+            self._advance(t_s, dt_s, stack)
             transitions = self._crossings.scan(t_s, self.speed_m_s, self.rate_rad_s, edges)
             if transitions:
                 self._use_crossings(transitions)
@@ -218,21 +221,17 @@ class Localizer:
         self._hand_over()
         return gain * hypot(ex, ey)
 
-    def _measurements(
-        self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample]
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        usable = self._intake.imu(t_s, imu) if imu else imu
-        if self._intake.are_clean(t_s, encoders):
-            return self._builder.from_pairs(t_s, usable, encoders)
-        return self._builder.from_wheels(t_s, usable, *self._intake.wheels(t_s, encoders))
-
-    def _advance(self, t_s: float, dt_s: float, z: FloatArray, H: FloatArray, R: FloatArray) -> None:
-        v0, _, theta0, _ = self._filter.mean.tolist()
+    def _advance(self, t_s: float, dt_s: float, stack: Stack) -> None:
+        before = self._filter.mean, self._filter.covariance
         self._filter.predict(*self._process.over(dt_s))
-        innovation = self._filter.update(z, H, R)
+        innovation = self._filter.update(*stack)
         if innovation.size:
             self.innovation = innovation
-        v1, _, theta1, _ = self._filter.mean.tolist()
+        v0, _, theta0, _ = before[0].tolist()
+        v1, _, theta1, omega1 = self._filter.mean.tolist()
+        if abs(v1) > self._v_limit_m_s or abs(omega1) > self._omega_limit_rad_s:
+            self._filter.reset(*before)
+            raise FilterDiverged(f"{v1:.3g} m/s and {omega1:.3g} rad/s are more than the wheels can do")
         v, turn = 0.5 * (v0 + v1), theta1 - theta0
         dx, dy = arc_step(v, theta0, turn, dt_s)
         self._x_m, self._y_m = self._x_m + dx, self._y_m + dy

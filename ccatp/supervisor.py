@@ -27,6 +27,8 @@ from ccatp.run_options import RunOptions, default_run_dir
 from ccatp.runtime_dir import make_runtime_dir
 
 POLL_MS = 20
+# The matrices are 4 x 4: threads of the linear algebra would only fight the processes for the cores.
+ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 STOP_TIMEOUT_S = 5.0
 
 
@@ -220,7 +222,12 @@ class _Run:
             command += ["--listen-fd", str(fds[0])]
         # Their own session: a Ctrl-C in the terminal reaches the supervisor alone, which stops them in order.
         self._children[process.name] = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=sys.stderr, pass_fds=fds, start_new_session=True
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=sys.stderr,
+            pass_fds=fds,
+            start_new_session=True,
+            env={**os.environ, **ENVIRONMENT},
         )
 
     def _died(self, name: str, code: int, view: RunView) -> ExitStatus:

@@ -88,7 +88,12 @@ class WheelTrack:
             self.knots.append(Knot(t_s, v, self._radius_per_base * (self._right - self._left)))
 
     def silence_s(self, t_s: float) -> float:
-        """How long at ``t_s`` one of the wheels has been without a usable sample; 0 while the last one is held."""
+        """How long at ``t_s`` one of the wheels has been without a usable sample; 0 while the last one is held.
+
+        Never heard counts since the robot's boot, and as silent from the first.
+        """
+        if self._heard_t_s == -inf:
+            return max(t_s, self._hold_s)
         silent_s = t_s - self._heard_t_s
         return silent_s if silent_s > self._hold_s else 0.0
 

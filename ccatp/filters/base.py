@@ -41,7 +41,11 @@ class Innovation(NamedTuple):
 
 
 class Filter(Protocol):
-    """A Gaussian filter of n states, thesis fig. 2.8: the localizer is composed with one."""
+    """A Gaussian filter of n states, thesis fig. 2.8: the localizer is composed with one.
+
+    Each call replaces the arrays of ``mean`` and ``covariance`` and changes none in place: who keeps them keeps the
+    state.
+    """
 
     mean: FloatArray
     """State estimate, shape (n,)."""

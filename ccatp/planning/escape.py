@@ -11,10 +11,12 @@ from ccatp.planning.errors import UnreachableError
 from ccatp.planning.search import Arrival
 from ccatp.planning.stance import Body, FloatArray, Place, sensor_depths
 
-_TURNS_RAD = np.radians(np.arange(-180, 181, 3))
+_TURNS_RAD = np.radians(np.arange(-180, 181, 2))
 _NO_TURN = len(_TURNS_RAD) // 2
 # Further it would creep along the rim; straight away from it, or out of a corner, 0.2 m are enough.
 _DISTANCES_M = np.r_[0:401:10] * 1e-3
+# Half way between two turns a sensor at 0.13 m is at most 0.13 (1 - cos(1 deg)) = 20 um further out than in them.
+_BETWEEN_TURNS_M = 2e-5
 _ROUNDING_M = 1e-6
 _MILLIMETRE_M = 1e-3
 
@@ -41,19 +43,21 @@ def find_escape(mirror: Mirror, body: Body, start: Arrival, limits: LimitsConfig
     ys = y0 + _DISTANCES_M * np.sin(ways)[..., None]
     depths = mirror.rim.signed_distances_m(xs, ys)
     sensors = sensor_depths(mirror, body, xs, ys, courses[:, None, None])
-    least_depths = np.minimum.accumulate(depths, axis=2)
     least_sensors = np.minimum(np.minimum.accumulate(sensors, axis=2), _swept(sensors[:, 0, 0])[:, None, None])
-    allowed_m = min(body.turn_clearance_m, float(sensors[_NO_TURN, 0, 0])) - _ROUNDING_M
+    allowed_m = min(body.turn_clearance_m + _BETWEEN_TURNS_M, float(sensors[_NO_TURN, 0, 0])) - _ROUNDING_M
     best: tuple[int, float, Arrival] | None = None
     for turn, way in np.ndindex(ways.shape):
         free = depths[turn, way] >= body.turning_depth_m
         step = int(np.argmax(free))
-        if not free[step] or least_depths[turn, way, step] < start.place.depth_m - _ROUNDING_M:
+        if not free[step]:
             continue
         deficit_mm = ceil(max(allowed_m - float(least_sensors[turn, way, step]), 0.0) / _MILLIMETRE_M)
         cost_s = turn_time(float(_TURNS_RAD[turn]), limits) + leg_time(float(_DISTANCES_M[step]), limits)
-        if best is None or (deficit_mm, cost_s) < best[:2]:
-            place = Place(float(xs[turn, way, step]), float(ys[turn, way, step]), float(depths[turn, way, step]))
+        if best is not None and (deficit_mm, cost_s) >= best[:2]:
+            continue
+        place = Place(float(xs[turn, way, step]), float(ys[turn, way, step]), float(depths[turn, way, step]))
+        # Never outward, not even past a re-entrant corner.
+        if mirror.rim.segment_clearance_m(x0, y0, place.x_m, place.y_m) >= start.place.depth_m - _ROUNDING_M:
             best = deficit_mm, cost_s, Arrival(place, float(courses[turn]), cost_s, way == 1, start)
     if best is None:
         raise UnreachableError(

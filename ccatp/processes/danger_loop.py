@@ -18,7 +18,7 @@ from ccatp.router import Router
 from ccatp.samples import EventCode, Verdict
 from ccatp.wire.channels import answer_observatory
 from ccatp.wire.robot import Sensors
-from ccatp.wire.topics import DangerEvent, Estimate, Presence, verdict_message
+from ccatp.wire.topics import DangerEvent, Estimate, Presence, last_estimate_before, verdict_message
 
 PRESENCE_PERIOD_S = 0.1
 WAIT_PERIOD_S = 0.02
@@ -97,9 +97,9 @@ class DangerLoop:
             await asyncio.sleep(WAIT_PERIOD_S)
 
     def on_sensors(self, sensors: Sensors, _raw: bytes) -> None:
-        """Judge one frame. In lockstep with main's estimate of the frame before, so that the run is repeatable."""
+        """Judge one frame. In lockstep with a certain estimate of main's, so that the run is repeatable."""
         self._seq, self._t_s, self._frame_wall_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
-        self._take_estimates(sensors.seq - 1)
+        self._take_estimates(last_estimate_before(sensors.seq))
         self._give(self.monitor.step(sensors, self._estimate), sensors.seq)
 
     def _give(self, verdict: Verdict, ack: int) -> None:
@@ -121,9 +121,11 @@ class DangerLoop:
         self.log.info("verdict", seq=verdict.seq, t_s=verdict.t_s, **fields)
 
     def _take_estimates(self, wanted_seq: int) -> None:
+        if self._is_lockstep and self._estimate_seq() >= wanted_seq:
+            return
         deadline = time.monotonic() + LOCKSTEP_WAIT_S
         while True:
-            must_wait = self._is_lockstep and wanted_seq >= 0 and self._estimate_seq() < wanted_seq
+            must_wait = self._is_lockstep and self._estimate_seq() < wanted_seq
             received = self._subscriber.receive(max(0.0, deadline - time.monotonic()) if must_wait else 0.0)
             if received is None:
                 return

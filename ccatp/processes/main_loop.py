@@ -210,7 +210,7 @@ class MainLoop:
         verdict = self._hear(seq)
         heard = time.perf_counter()
         motion = Motion(
-            t_s, dt_s, localizer.pose, localizer.deck_pose, localizer.speed_m_s, localizer.rate_rad_s
+            t_s, dt_s, localizer.pose, self._mirror.deck_pose, localizer.speed_m_s, localizer.rate_rad_s
         )
         order = self._mission.step(motion, verdict)
         right, left = self._gate.pass_through(order.twist, verdict, dt_s)

@@ -7,9 +7,20 @@ import structlog
 
 from ccatp.bus import Publisher
 from ccatp.localizer import Localizer
+from ccatp.mirror.batches import deck_poses
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import Fix, PointId
-from ccatp.wire.topics import Arrival, Estimate, FixMessage, Log, MissionStatus, SensorLines, Timing, Track
+from ccatp.samples import Fix, PanelPose, PointId
+from ccatp.wire.topics import (
+    Arrival,
+    Estimate,
+    FixMessage,
+    Log,
+    MissionStatus,
+    SensorLines,
+    Timing,
+    Track,
+    is_estimate_due,
+)
 
 # Frames per batch: a second of them, small enough for the bus and large enough that the cost per frame vanishes.
 BATCH_FRAMES = 100
@@ -29,7 +40,8 @@ class Teller:
     def __init__(self, publisher: Publisher, mirror: Mirror, log: structlog.typing.FilteringBoundLogger) -> None:
         """Start with empty batches."""
         self._publisher, self._mirror, self.log = publisher, mirror, log
-        self._track: list[tuple[int, float, float, float, float, float, float, float, float]] = []
+        self._poses: list[PanelPose] = []
+        self._frames: list[tuple[int, float, float]] = []
         self._lines: list[msgspec.Raw] = []
         self._tick_us: list[float] = []
         self._flushed_wall_s = time.monotonic()
@@ -37,17 +49,19 @@ class Teller:
         self.t_s = 0.0
 
     def frame(self, seq: int, t_s: float, localizer: Localizer, state: str, raw: bytes) -> None:
-        """Publish the estimate after frame ``seq`` and keep it, with the frame's line, for the batch."""
+        """Keep the estimate after frame ``seq`` and the frame's line for the batch; publish it where it is due."""
         self.seq, self.t_s = seq, t_s
-        pose, sigma = localizer.deck_pose, localizer.position_sigma_m
-        x, y, heading = pose.x_m, pose.y_m, pose.heading_rad
-        self._publisher.send(
-            "estimate",
-            Estimate(seq=seq, t_s=t_s, x_m=x, y_m=y, heading_rad=heading, sigma_m=sigma, state=state),
-        )
-        self._track.append((seq, t_s, x, y, heading, x, y, self._mirror.surface.height_m(x, y), sigma))
+        pose, sigma = localizer.pose, localizer.position_sigma_m
+        if is_estimate_due(seq):
+            deck = localizer.deck_pose
+            x, y, heading = deck.x_m, deck.y_m, deck.heading_rad
+            self._publisher.send(
+                "estimate", Estimate(seq=seq, t_s=t_s, x_m=x, y_m=y, heading_rad=heading, sigma_m=sigma, state=state)
+            )
+        self._poses.append(pose)
+        self._frames.append((seq, t_s, sigma))
         self._lines.append(msgspec.Raw(raw))
-        if len(self._track) >= BATCH_FRAMES:
+        if len(self._frames) >= BATCH_FRAMES:
             self.flush()
 
     def tick(self, microseconds: float) -> None:
@@ -62,13 +76,18 @@ class Teller:
     def flush(self) -> None:
         """Publish the batches."""
         self._flushed_wall_s = time.monotonic()
-        if not self._track:
+        if not self._frames:
             return
-        at = {"seq": self.seq, "t_s": self.t_s}
-        self._publisher.send("track", Track(rows=self._track, **at))  # type: ignore[arg-type]
-        self._publisher.send("sensors", SensorLines(lines=self._lines, **at))  # type: ignore[arg-type]
-        self._publisher.send("timing", Timing(tick_us=self._tick_us, **at))  # type: ignore[arg-type]
-        self._track, self._lines, self._tick_us = [], [], []
+        seq, t_s = self.seq, self.t_s
+        on_deck = deck_poses(self._mirror, self._poses).tolist()
+        rows = [
+            (n, t, x, y, heading, x, y, z, sigma)
+            for (n, t, sigma), (x, y, heading, z) in zip(self._frames, on_deck, strict=True)
+        ]
+        self._publisher.send("track", Track(seq=seq, t_s=t_s, rows=rows))
+        self._publisher.send("sensors", SensorLines(seq=seq, t_s=t_s, lines=self._lines))
+        self._publisher.send("timing", Timing(seq=seq, t_s=t_s, tick_us=self._tick_us))
+        self._poses, self._frames, self._lines, self._tick_us = [], [], [], []
 
     def arrival(self, point: PointId, error_m: float) -> None:
         """The robot came to rest at a point for the first time."""

@@ -1,7 +1,7 @@
 """Property tests of the edge rule on the real mirrors, with a small kinematic robot in virtual time.
 
 The robot: first-order wheels (T = 0.08 s), sensors at 1 kHz, frames at 100 Hz, permits and drives in force two frames
-after the frame that they answer. Motion follows the tangent plane of the curved surface; the rule knows only a flat one.
+after the frame that they answer. Motion follows the tangent plane of the curved surface; the rule knows a flat one.
 """
 
 from collections import deque

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cache
+from itertools import pairwise
 from math import atan2, ceil, hypot, pi, radians, tau
 
 import numpy as np
@@ -43,7 +44,8 @@ def sensor_depths(cfg: Config, mirror: Mirror, x: FloatArray, y: FloatArray, cou
     ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
     left = np.cross(normal, ahead)
     tips = [ox * ahead + oy * left for ox, oy in cfg.robot.edge_sensors_m]
-    return np.min([mirror.rim.signed_distances_m(x + t[..., 0], y + t[..., 1]) for t in tips], axis=0)
+    depths = np.stack([mirror.rim.signed_distances_m(x + t[..., 0], y + t[..., 1]) for t in tips])
+    return np.asarray(depths.min(axis=0), dtype=np.float64)
 
 
 def course_of(mirror: Mirror, pose: DeckPose) -> float:
@@ -85,7 +87,7 @@ def worst_sensor(cfg: Config, mirror: Mirror, legs: Sequence[FloatArray]) -> flo
 
 def least_clearance(mirror: Mirror, start: DeckPose, stops: Sequence[Stop]) -> float:
     ends = [(start.x_m, start.y_m), *((stop.x_m, stop.y_m) for stop in stops)]
-    return min(mirror.rim.segment_clearance_m(*a, *b) for a, b in zip(ends, ends[1:], strict=False))
+    return min(mirror.rim.segment_clearance_m(*a, *b) for a, b in pairwise(ends))
 
 
 @given(mirror_names, st.integers(0, 120))
@@ -138,7 +140,7 @@ def check_way_home(cfg: Config, mirror: Mirror, start: DeckPose) -> None:
     depth = mirror.rim.signed_distance_m(start.x_m, start.y_m)
     if depth < 0.134:  # where a turn in place sweeps a sensor over the rim: 127.3 + 5 mm, and 1 mm to spare
         away = mirror.rim.segment_clearance_m(start.x_m, start.y_m, stops[0].x_m, stops[0].y_m)
-        assert away >= depth - 1e-4  # the first leg leads inward; its samples are 10 mm apart
+        assert away >= depth - 1e-5  # the first leg leads inward
         assert mirror.rim.signed_distance_m(stops[0].x_m, stops[0].y_m) >= 0.1323
         middle = legs[0][-1]
         start, stops, legs = DeckPose(middle[0], middle[1], 0.0), stops[1:], legs[1:]
@@ -153,6 +155,18 @@ def test_home_from_every_point(name: str) -> None:
         x, y = mirror.point_on_deck(point)
         if k % 4 == 0 or mirror.rim.signed_distance_m(x, y) < 0.134:
             check_way_home(cfg, mirror, DeckPose(x, y, radians(37.0 * k)))
+
+
+@pytest.mark.parametrize("off_axis_deg", [-4.0, 4.0])
+@pytest.mark.parametrize("name", NAMES)
+def test_home_from_a_point_at_the_rim_without_a_sweep(name: str, off_axis_deg: float) -> None:
+    """As a survey stands there, along the rim or across it, no sensor comes nearer to it than on a survey."""
+    cfg, mirror = load(name)
+    near = [xy for xy in map(mirror.point_on_deck, thesis_order(mirror)) if mirror.rim.signed_distance_m(*xy) < 0.1323]
+    for k, (x, y) in enumerate(near):
+        start = DeckPose(x, y, radians(90.0 * k + off_axis_deg))
+        stops = plan_way_home(mirror, start, mirror.base_pose, cfg.robot, cfg.limits, cfg.mission)
+        assert worst_sensor(cfg, mirror, drive(mirror, start, stops)) >= cfg.mission.turn_clearance_m - SWEEP_M
 
 
 @settings(max_examples=150, deadline=None)
@@ -182,5 +196,5 @@ def test_stops_on_the_way_cost_time_and_nothing_else(name: str, panels: int) -> 
     route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose, measuring_time_s=0.5)
     time_s = path_time(route.stops, mirror.base_pose, cfg.limits, mirror, 0.5)
     assert route.remaining_s(0) == pytest.approx(time_s, abs=1e-6)  # two sums of some hundred terms
-    assert all(a > b for a, b in zip(route.times_s, route.times_s[1:], strict=False))
+    assert all(a > b for a, b in pairwise(route.times_s))
     assert route.remaining_s(len(route.stops)) == route.remaining_s(10**6) == 0.0

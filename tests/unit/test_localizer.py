@@ -61,6 +61,7 @@ class Truth:
 
     def __init__(self, start: DeckPose, v: Rate, omega: Rate, noise: float = 0.0, mirror: str = "fyst-m1") -> None:
         self.pose = start
+        self.has_edges = False  # the edge sensors cost half the time
         self.v, self.omega = v, omega
         self.mirror, self.robot = mirror_of(mirror), config(mirror).robot
         self.noise, self.rng = noise, np.random.default_rng(1)
@@ -90,11 +91,17 @@ class Truth:
             encoders.append(
                 WheelSample(t, (v + half * omega) / r + 0.001 * n[0], (v - half * omega) / r + 0.001 * n[1])
             )
-            seen = (self.mirror.body_offset(self.pose, *xy) for xy in self.robot.edge_sensors_m)
-            edges.append(EdgeSample(t, *(int(self.mirror.is_on_panel(*xy)) for xy in seen)))
+            if self.has_edges:
+                edges.append(self.edges())
         ax = (self.v(t) - self.v(t - 1e-5)) / 1e-5
         imu.append(ImuSample(t, ax + 0.0059 * n[2], omega + 0.0087 * n[3]))
         return t, imu, encoders, edges
+
+    def edges(self) -> EdgeSample:
+        x, y = self.pose.x_m, self.pose.y_m
+        hx, hy, lx, ly = self.mirror.body_axes(self.pose)
+        seen = ((x + a * hx + b * lx, y + a * hy + b * ly) for a, b in self.robot.edge_sensors_m)
+        return EdgeSample(self.t_s, *(int(self.mirror.is_on_panel(*xy)) for xy in seen))
 
     def frames(self, duration_s: float) -> list[Frame]:
         return [self.frame() for _ in range(round(duration_s / (PER_FRAME * DT_S)))]
@@ -105,14 +112,18 @@ class Truth:
         return Fix(self.t_s, puck, (c, 0.0, 0.0, 0.0, c, 0.0, 0.0, 0.0, c), 1.5, (1, 2, 3, 4), 1e-6)
 
 
-def make(start: PanelPose = CENTRE, mirror: str = "fyst-m1", **changes: float) -> Localizer:
-    cfg = config(mirror)
+def make(start: PanelPose = CENTRE, **changes: float) -> Localizer:
+    cfg = config()
     localizer = cfg.localizer.model_copy(update=changes)
-    return Localizer(FILTERS["kf"](np.zeros(4), np.eye(4)), mirror_of(mirror), cfg.robot, localizer, start)
+    return Localizer(FILTERS["kf"](np.zeros(4), np.eye(4)), mirror_of(), cfg.robot, localizer, start)
 
 
-def truth(start: PanelPose = CENTRE, v: Rate = still, omega: Rate = still, noise: float = 0.0) -> Truth:
-    return Truth(mirror_of().deck_pose(start), v, omega, noise)
+def truth(
+    start: PanelPose = CENTRE, v: Rate = still, omega: Rate = still, noise: float = 0.0, has_edges: bool = False
+) -> Truth:
+    world = Truth(mirror_of().deck_pose(start), v, omega, noise)
+    world.has_edges = has_edges
+    return world
 
 
 def errors(localizer: Localizer, pose: DeckPose) -> tuple[float, float]:
@@ -152,9 +163,10 @@ def test_a_drive_with_a_turn_from_a_known_start(noise: float, limit_m: float, li
     assert abs(heading) < limit_rad
     assert localizer.t_s == world.t_s
     if noise:
-        # 760 frames of 22 rows: the mean is 1 within 4 sqrt(2/16720) if the filter were exact; 0.2 allows for a process
-        # noise that is wider than what the robot does.
-        assert np.mean(nis) == pytest.approx(1.0, abs=0.2)
+        # On the straight, 250 frames of 22 rows: 1 within 4 sqrt(2/5500) = 0.08 for an exact filter, and up to two rows
+        # of 22 less because the process noise is wider than what the robot does. In a turn the rate changes within a
+        # frame, which the four states do not know, and NIS is no measure.
+        assert np.mean(nis[15:265]) == pytest.approx(1.0 - 1.0 / 22.0, abs=0.12)
 
 
 def test_speed_and_rate_follow() -> None:
@@ -180,16 +192,16 @@ def test_handover_keeps_the_deck_pose() -> None:
     mirror = mirror_of()
     for heading in (0.05, 1.6, -3.1, -1.5):
         localizer = make(PanelPose(PanelId(5, 5), 0.1, 0.1, heading))
-        world = truth(PanelPose(PanelId(5, 5), 0.1, 0.1, heading), v=lambda _: 0.5)
+        world = truth(PanelPose(PanelId(5, 5), 0.1, 0.1, heading), v=lambda _: 0.4)
         before = localizer.pose
         changes = 0
-        for frame in world.frames(2.5):
-            localizer.step(*frame[:3], [])
+        for frame in world.frames(2.8):
+            localizer.step(*frame)
             now = localizer.pose
             if now.panel != before.panel:
                 changes += 1
                 back = mirror.panel_pose(before.panel, localizer.deck_pose)
-                step = 0.5 * 0.01
+                step = 0.4 * 0.01
                 assert back.x_m == pytest.approx(
                     before.x_m + step * cos(before.heading_rad), abs=2e-6
                 )  # sag of the step
@@ -228,7 +240,7 @@ def test_rows_are_those_of_equation_2_12_and_not_of_2_3() -> None:
     )
     per_r, turn = 1.0 / 0.03, 0.15 / 0.06
     np.testing.assert_allclose(z, [3.0, 4.0, 0.1, 0.2])
-    expected = [[per_r, 0, 0, turn], [per_r, 0, 0, -turn], [0, 1, 0, 0], [0, 0, 0, 1]]
+    expected = np.array([[per_r, 0, 0, turn], [per_r, 0, 0, -turn], [0, 1, 0, 0], [0, 0, 0, 1]])
     np.testing.assert_allclose(H, expected)  # the last row as printed in 2.4 would be (0, 0, 1, 0)
     np.testing.assert_allclose(R, np.square([0.001, 0.001, 0.0059, 0.0087]))
 
@@ -346,11 +358,14 @@ def test_a_turn_between_the_two_sensors_is_taken_out() -> None:
 def test_a_crossing_corrects_the_heading(direction: float, backward: bool) -> None:
     # 5 mrad of start error; after front and rear pair have crossed one or two seams 1 mrad may remain: 1 kHz at 0.1 m/s
     # places a sensor within 0.1 mm, 0.3 mrad of the 0.18 m between two sensors.
-    start = PanelPose(PanelId(5, 5), 0.05, -0.05, direction + (pi if backward else 0.0))
+    ahead = 0.2
+    start = PanelPose(
+        PanelId(5, 5), ahead * cos(direction), ahead * sin(direction), direction + (pi if backward else 0.0)
+    )
     sign = -1.0 if backward else 1.0
-    world = truth(start, v=lambda t: sign * trapeze(0.1, 9.0, 0.1, 0.2)(t), noise=1.0)
+    world = truth(start, v=lambda t: sign * trapeze(0.1, 9.0, 0.1, 0.2)(t), noise=1.0, has_edges=True)
     localizer = make(PanelPose(start.panel, start.x_m + 0.001, start.y_m - 0.001, start.heading_rad + 0.005))
-    run(localizer, world.frames(8.0))
+    run(localizer, world.frames(4.8))
     assert localizer.counts["crossings_used"] >= 4
     assert localizer.counts["crossings_gated"] == 0
     assert localizer.pose.panel != start.panel
@@ -363,7 +378,7 @@ def test_a_crossing_corrects_the_heading(direction: float, backward: bool) -> No
 def crossing_run(**changes: float) -> Localizer:
     start = PanelPose(PanelId(5, 5), 0.15, 0.0, 0.1)
     localizer = make(start, **changes)
-    run(localizer, truth(start, v=lambda _: 0.1).frames(3.5))
+    run(localizer, truth(start, v=lambda _: 0.1, has_edges=True).frames(3.5))
     return localizer
 
 
@@ -372,7 +387,7 @@ def test_crossings_need_speed_and_straightness() -> None:
     assert crossing_run(crossing_min_speed_m_s=0.2).counts["crossings_used"] == 0
     start = PanelPose(PanelId(5, 5), 0.15, 0.0, 0.0)
     turning = make(start)
-    run(turning, truth(start, v=lambda _: 0.1, omega=lambda _: 0.05).frames(3.5))
+    run(turning, truth(start, v=lambda _: 0.1, omega=lambda _: 0.05, has_edges=True).frames(3.5))
     assert turning.counts["crossings_used"] == 0
 
 
@@ -389,7 +404,7 @@ def test_a_single_false_crossing_is_refused_and_a_confident_error_is_not_kept() 
 def test_a_heading_that_is_wrong_beyond_its_sigma_recovers_at_the_seam() -> None:
     start = PanelPose(PanelId(5, 5), 0.15, 0.0, 0.1)
     localizer = make(PanelPose(start.panel, start.x_m, start.y_m, 0.13), start_heading_sigma_rad=0.001)
-    world = truth(start, v=lambda _: 0.1)
+    world = truth(start, v=lambda _: 0.1, has_edges=True)
     run(localizer, world.frames(3.5))
     assert localizer.counts["crossings_gated"] == 1
     assert abs(errors(localizer, world.pose)[1]) < 0.001  # 1 kHz edges
@@ -397,10 +412,10 @@ def test_a_heading_that_is_wrong_beyond_its_sigma_recovers_at_the_seam() -> None
 
 def test_an_edge_far_from_any_seam_is_no_crossing() -> None:
     localizer = make()
-    world = truth(v=lambda _: 0.1)
+    world = truth(v=lambda _: 0.1, has_edges=True)
     for k, (t, imu, encoders, edges) in enumerate(world.frames(1.0)):
         if k == 50:
-            edges = [EdgeSample(e.t_s, 0, 0, 1, 1) for e in edges]
+            edges[:] = [EdgeSample(e.t_s, 0, 0, 1, 1) for e in edges]
         localizer.step(t, imu, encoders, edges)
     assert localizer.counts["crossings_used"] == localizer.counts["crossings_gated"] == 0
 
@@ -460,8 +475,10 @@ def test_a_late_fix_belongs_to_its_own_time() -> None:
     fix = world.fix()
     run(localizer, world.frames(0.75))
     assert localizer.pose.panel == PanelId(5, 6)
-    assert localizer.fuse_fix(fix) == pytest.approx(hypot(0.002, 0.001), rel=0.01)
-    assert errors(localizer, world.pose)[0] < 2e-5  # 20 um: the odometer's notion of standing still
+    # The weight is 99 %: 20 mm at 0.01 rad since the fix beside 2 mm. 50 um: 1 % of the jump, and the 20 um within
+    # which the odometer takes a robot for standing still. At "now" the fix would be 20 mm off.
+    assert localizer.fuse_fix(fix) == pytest.approx(hypot(0.002, 0.001), rel=0.02)
+    assert errors(localizer, world.pose)[0] < 5e-5
 
 
 @pytest.mark.parametrize(
@@ -564,9 +581,23 @@ def test_a_diverged_filter_freezes_the_pose_until_the_next_fix() -> None:
     localizer.clear_hold()
     assert not localizer.is_frozen
     assert errors(localizer, world.pose)[0] < 1e-6
-    assert localizer.heading_sigma_rad == pytest.approx(0.01 * 2**0.5, rel=1e-3)  # the start's sigma on top
+    assert localizer.heading_sigma_rad == pytest.approx(0.01 * 2**0.5, rel=0.02)  # the start's sigma on top; one frame
     run(localizer, world.frames(0.2))
     assert not localizer.hold_requested
+
+
+@pytest.mark.parametrize(
+    "sample", [ImuSample(0.31, 1e7, 0.0), WheelSample(0.31, 1e6, 1e6), WheelSample(0.31, 1e3, -1e3)]
+)
+def test_an_impossible_speed_freezes_instead_of_moving(sample: ImuSample | WheelSample) -> None:
+    localizer = make()
+    run(localizer, truth(v=lambda _: 0.05).frames(0.3))
+    pose = localizer.pose
+    imu, encoders = ([sample], []) if isinstance(sample, ImuSample) else ([], [sample])
+    localizer.step(0.31, imu, encoders, [])
+    assert localizer.is_frozen
+    assert localizer.pose == pose
+    assert localizer.hold_cause.endswith("more than the wheels can do")
 
 
 @pytest.mark.parametrize("bad", [nan, inf, -inf])

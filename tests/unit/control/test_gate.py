@@ -29,11 +29,16 @@ def test_kinematics_round_trip() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wanted", "missing"), [(Twist(0.01, 0.0), "forward"), (Twist(-0.01, 0.0), "reverse"), (Twist(0.0, 0.1), "turn")]
+    ("wanted", "without"),
+    [
+        (Twist(0.01, 0.0), replace(FREE, forward=False)),
+        (Twist(-0.01, 0.0), replace(FREE, reverse=False)),
+        (Twist(0.0, 0.1), replace(FREE, turn=False)),
+    ],
 )
-def test_denies_what_is_not_permitted(wanted: Twist, missing: str) -> None:
+def test_denies_what_is_not_permitted(wanted: Twist, without: Verdict) -> None:
     assert gate().pass_through(wanted, FREE, DT) != (0.0, 0.0)
-    assert gate().pass_through(wanted, replace(FREE, **{missing: False}), DT) == (0.0, 0.0)
+    assert gate().pass_through(wanted, without, DT) == (0.0, 0.0)
     assert gate().pass_through(wanted, None, DT) == (0.0, 0.0)
 
 

@@ -1,0 +1,589 @@
+"""The DataLoop over real sockets: what a peer that only read the interface control document meets."""
+
+import asyncio
+import json
+import socket
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+import zmq.asyncio
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ccatp.config.models import Config
+from ccatp.dataloop import DataLoop, serve
+from ccatp.robot_link import RobotLink, RobotRefused
+from ccatp.wire.robot import Role, Sensors, join_mac
+from tests.contract.test_robot_wire import MALFORMED_FROM_CLIENT
+
+DEADLINE_S = 5.0  # what takes milliseconds in a good run may take this long on a loaded machine
+JOIN = b'{"type":"join","role":"controller","client":"peer"}\n'
+JOIN_MONITOR = b'{"type":"join","role":"monitor","client":"peer"}\n'
+
+
+def on_port_0(config: Config) -> Config:
+    robot = config.sim.robot.model_copy(update={"port": 0})
+    return config.model_copy(update={"sim": config.sim.model_copy(update={"robot": robot})})
+
+
+class Peer:
+    """A plain socket that talks lines."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.reader, self.writer = reader, writer
+
+    def send(self, data: bytes) -> None:
+        self.writer.write(data)
+
+    async def line(self) -> bytes:
+        """The next line; empty at the end."""
+        async with asyncio.timeout(DEADLINE_S):
+            try:
+                return await self.reader.readline()
+            except ConnectionError:
+                return b""
+
+    async def message(self) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(await self.line())
+        return found
+
+    async def expect(self, kind: str) -> dict[str, Any]:
+        """The next message, which has this type."""
+        message = await self.message()
+        assert message["type"] == kind, message
+        return message
+
+    async def is_closed(self) -> bool:
+        """Whether the robot closes, whatever it says before."""
+        while await self.line():
+            pass
+        return True
+
+    def drive(self, seq: int, ack: int, right: float = 3.0, left: float = 3.0) -> None:
+        self.send(b'{"type":"drive","seq":%d,"ack":%d,"wr":%r,"wl":%r}\n' % (seq, ack, right, left))
+
+    def permit(self, seq: int, ack: int, allowed: bytes = b"true") -> None:
+        line = b'{"type":"permit","seq":%d,"ack":%d,"forward":%b,"reverse":%b,"turn":%b}\n'
+        self.send(line % (seq, ack, allowed, allowed, allowed))
+
+
+class Notes:
+    """The log of a DataLoop."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self._more = asyncio.Event()
+
+    def info(self, event: str) -> None:
+        self.lines.append(event)
+        self._more.set()
+
+    async def until(self, line: str) -> None:
+        """Wait for a line, and forget it and all before it."""
+        async with asyncio.timeout(DEADLINE_S):
+            while line not in self.lines:
+                self._more.clear()
+                await self._more.wait()
+        del self.lines[: self.lines.index(line) + 1]
+
+
+class Rig:
+    """A running DataLoop."""
+
+    def __init__(self, loop: DataLoop, port: int, notes: Notes) -> None:
+        self.loop, self.port, self.notes = loop, port, notes
+        self._peers: list[Peer] = []
+
+    async def peer(self, first: bytes = b"") -> Peer:
+        peer = Peer(*await asyncio.open_connection("127.0.0.1", self.port))
+        self._peers.append(peer)
+        if first:
+            await peer.expect("hello")
+            peer.send(first)
+        return peer
+
+    async def close(self) -> None:
+        for peer in self._peers:
+            peer.writer.close()
+        for peer in self._peers:
+            try:
+                await peer.writer.wait_closed()
+            except ConnectionError:
+                continue
+
+
+@asynccontextmanager
+async def running(
+    config: Config, *, lockstep: bool = True, seed: int = 1, key: bytes | None = None
+) -> AsyncIterator[Rig]:
+    notes = Notes()
+    loop = DataLoop(on_port_0(config), lockstep, seed, key, notes)
+    stop = asyncio.Event()
+    rig = Rig(loop, await loop.start(), notes)
+    serving = asyncio.create_task(loop.run(stop))
+    try:
+        yield rig
+    finally:
+        await rig.close()
+        stop.set()
+        async with asyncio.timeout(DEADLINE_S):
+            await serving
+
+
+# -- session ----------------------------------------------------------------------------------------------------------
+
+
+async def test_hello_as_in_the_document(config: Config) -> None:
+    async with running(config, lockstep=False) as rig:
+        peer = await rig.peer()
+        hello = await peer.message()
+        other = await (await rig.peer()).message()
+    assert list(hello) == [
+        "type", "protocol", "boot", "nonce", "auth", "lockstep", "frame_hz", "ttl_s", "robot",
+    ]  # fmt: skip
+    assert (hello["type"], hello["protocol"], hello["auth"], hello["lockstep"]) == (
+        "hello", "ccatp-robot/1", "none", False,
+    )  # fmt: skip
+    assert hello["robot"] == {
+        "wheel_radius_m": 0.03,
+        "wheel_base_m": 0.15,
+        "edge_sensors_m": [[0.09, 0.09], [0.09, -0.09], [-0.09, 0.09], [-0.09, -0.09]],
+        "puck_m": [0.0, 0.0, 0.05],
+        "max_wheel_rad_s": 8.0,
+        "fan_floor": 0.0,
+    }
+    assert len(hello["nonce"]) == 32
+    int(hello["nonce"], 16)
+    assert other["boot"] == hello["boot"]
+    assert other["nonce"] != hello["nonce"]
+
+
+async def test_boot_changes_at_each_power_up(config: Config) -> None:
+    boots = []
+    for _ in range(2):
+        async with running(config) as rig:
+            boots.append((await (await rig.peer()).message())["boot"])
+    assert boots[0] != boots[1]
+
+
+async def test_a_frame_as_in_the_document(config: Config) -> None:
+    async with running(config) as rig:
+        peer = await rig.peer(JOIN)
+        assert await peer.message() == {"type": "joined", "role": "controller", "session": 1}
+        await peer.expect("sensors")
+        peer.drive(0, 0)
+        frame = await peer.message()
+    assert list(frame) == [
+        "type", "seq", "t", "imu", "enc", "edge", "gravity", "fans", "soc", "cmd", "faults",
+    ]  # fmt: skip
+    assert (frame["seq"], frame["t"], frame["gravity"], frame["faults"]) == (1, 0.01, None, [])
+    assert [len(frame[name]) for name in ("imu", "enc", "edge")] == [1, 10, 10]
+    assert [sample[0] for sample in frame["enc"]] == [k / 1000 for k in range(1, 11)]
+    assert frame["edge"] == [[k / 1000, 1, 1, 1, 1] for k in range(1, 11)]
+    assert frame["cmd"] == {"seq": 0, "age": 0.01, "permit_age": 0.01, "held": False}
+
+
+@pytest.mark.parametrize(
+    ("join", "reason"),
+    [
+        (b'{"type":"join","role":"king","client":"x"}\n', "bad join"),
+        (b'{"type":"join","role":"controller"}\n', "bad join"),
+        (b'{"type":"drive","seq":1,"ack":0,"wr":1,"wl":1}\n', "bad join"),
+        (JOIN, "role taken"),
+    ],
+)
+async def test_refusals_do_not_disturb_the_one_who_drives(config: Config, join: bytes, reason: str) -> None:
+    async with running(config) as rig:
+        holder = await rig.peer(JOIN)
+        await holder.expect("joined")
+        await holder.expect("sensors")
+        for k in range(30):
+            refused = await rig.peer(join)
+            assert await refused.message() == {"type": "refused", "reason": reason}
+            assert await refused.line() == b""  # and closes
+            holder.drive(k, k)
+            frame = await holder.expect("sensors")
+            assert (frame["seq"], frame["cmd"]["held"]) == (k + 1, False)
+
+
+async def test_a_role_is_free_again_when_its_holder_leaves(config: Config) -> None:
+    async with running(config) as rig:
+        for session in (1, 2, 3):
+            peer = await rig.peer(JOIN)
+            assert (await peer.expect("joined"))["session"] == session
+            peer.writer.close()
+            await rig.notes.until("controller lost: wheels held")
+
+
+async def test_hmac(config: Config) -> None:
+    async with running(config, key=b"secret") as rig:
+        peer = await rig.peer()
+        hello = await peer.expect("hello")
+        assert hello["auth"] == "hmac-sha256"
+        mac = join_mac(b"secret", hello["nonce"], "controller")
+        other = await rig.peer()
+        await other.expect("hello")
+        for client in (other, peer):  # the code of one connection is no good on another
+            client.send(b'{"type":"join","role":"controller","client":"x","mac":"%b"}\n' % mac.encode())
+        assert await other.message() == {"type": "refused", "reason": "bad mac"}
+        assert await other.line() == b""
+        await peer.expect("joined")
+
+
+async def test_our_own_client_with_and_without_the_right_key(config: Config) -> None:
+    async with running(config, key=b"secret") as rig:
+        for key in (b"secret", b"wrong"):
+            link = _link(rig.port, "monitor", key)
+            if key == b"secret":
+                assert (await link.connect(DEADLINE_S)).auth == "hmac-sha256"
+            else:
+                with pytest.raises(RobotRefused, match=r"bad mac; check robot\.key_file"):
+                    await link.connect(DEADLINE_S)
+            link.close()
+
+
+# -- malformed lines --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("chunk", range(4))
+async def test_every_malformed_line_is_counted_and_dropped_and_nothing_else(config: Config, chunk: int) -> None:
+    """Twenty bad lines at most per session; a clean run beside it must give the same bytes."""
+    corpus = MALFORMED_FROM_CLIENT[chunk::4]
+    assert len(corpus) <= 20
+    streams = []
+    for bad in (corpus, []):
+        async with running(config) as rig:
+            peer = await rig.peer(JOIN)
+            await peer.expect("joined")
+            lines = [await peer.line()]
+            for k in range(len(corpus)):
+                if bad:
+                    peer.send(bad[k] + b"\n")
+                peer.drive(k, k)
+                lines.append(await peer.line())
+            # An empty line is a bad line, too; UTF-16 holds no LF of its own here.
+            assert rig.loop.server.counts["bad_lines"] == len(bad)
+            assert rig.loop.server.counts["unknown_types"] == 0
+            streams.append(lines)
+    assert streams[0] == streams[1]
+
+
+async def test_more_than_twenty_bad_lines_a_second_close_the_session(config: Config) -> None:
+    async with running(config) as rig:
+        holder, rogue = await rig.peer(JOIN), await rig.peer(JOIN_MONITOR)
+        await rogue.expect("joined")
+        rogue.send(b"garbage\n" * 21)
+        assert await rogue.is_closed()
+        assert rig.loop.server.counts["bad_lines"] == 21
+        await holder.expect("joined")  # and is still there
+
+
+async def test_a_line_of_a_megabyte(config: Config) -> None:
+    async with running(config, lockstep=False) as rig:
+        holder = await rig.peer(JOIN)
+        await holder.expect("joined")
+        for first in (b"", JOIN_MONITOR):
+            rogue = await rig.peer(first)
+            rogue.send(b"x" * 1_000_000)
+            assert await rogue.is_closed()
+        assert rig.loop.server.counts["oversized_lines"] == 2
+        assert (await holder.expect("sensors"))["seq"] > 0
+
+
+async def test_unknown_types_are_ignored(config: Config) -> None:
+    async with running(config) as rig:
+        peer = await rig.peer(b'{"type":"dance"}\n' + JOIN)
+        await peer.expect("joined")
+        await peer.expect("sensors")
+        peer.send(b'{"type":"dance","seq":7}\n' * 50)
+        peer.drive(0, 0)
+        await peer.expect("sensors")
+        assert (rig.loop.server.counts["unknown_types"], rig.loop.server.counts["bad_lines"]) == (51, 0)
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(noise=st.lists(st.binary(max_size=200), max_size=20))
+def test_fuzz(config: Config, noise: list[bytes]) -> None:
+    """Random bytes between good commands: the good ones work, or the session is closed; the robot goes on."""
+
+    async def story() -> None:
+        async with running(config) as rig:
+            peer = await rig.peer(JOIN)
+            await peer.expect("joined")
+            await peer.expect("sensors")
+            for k, junk in enumerate(noise):
+                if peer.reader.at_eof():
+                    break
+                peer.send(junk.replace(b"\n", b"") + b"\n")
+                peer.drive(k, k)
+                line = await peer.line()
+                assert line == b"" or json.loads(line)["seq"] == k + 1
+            await rig.peer()
+
+    asyncio.run(story())
+
+
+async def test_a_stream_in_single_bytes(config: Config) -> None:
+    async with running(config) as rig:
+        peer = await rig.peer()
+        await peer.expect("hello")
+        for byte in JOIN + b'{"type":"drive","seq":0,"ack":0,"wr":1,"wl":1}\n':
+            peer.send(bytes([byte]))
+            await asyncio.sleep(0)
+        await peer.expect("joined")
+        assert [(await peer.expect("sensors"))["seq"] for _ in range(2)] == [0, 1]
+
+
+# -- keys, sessions, fans ---------------------------------------------------------------------------------------------
+
+
+async def test_two_keys(config: Config) -> None:
+    async with running(config) as rig:
+        controller = await rig.peer(JOIN)
+        await controller.expect("joined")
+        await controller.expect("sensors")
+        controller.drive(0, 0)
+        assert not (await controller.expect("sensors"))["cmd"]["held"]  # no monitor in this boot yet
+        monitor = await rig.peer(JOIN_MONITOR)
+        await monitor.expect("joined")
+        for k, allowed in ((1, b"true"), (2, b"false"), (3, b"true")):
+            assert (await monitor.expect("sensors"))["seq"] == k
+            controller.drive(k, k)
+            monitor.permit(k, k, allowed)
+            assert (await controller.expect("sensors"))["cmd"]["held"] is (allowed == b"false")
+
+
+async def test_frames_wait_for_both_acknowledgements(config: Config) -> None:
+    async with running(config) as rig:
+        controller, monitor = await rig.peer(JOIN), await rig.peer(JOIN_MONITOR)
+        for peer in (controller, monitor):
+            await peer.expect("joined")
+            assert (await peer.expect("sensors"))["seq"] == 0
+        controller.drive(0, 0)
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.05):
+                await monitor.reader.readline()
+        assert rig.loop.robot.seq == 0
+        monitor.permit(0, 0)
+        for peer in (controller, monitor):
+            assert (await peer.expect("sensors"))["seq"] == 1
+
+
+@pytest.mark.parametrize("how", ["FIN", "RST"])
+async def test_a_lost_session_holds_and_leaves_the_fans(config: Config, how: str) -> None:
+    async with running(config, lockstep=False) as rig:
+        controller, monitor = await rig.peer(JOIN), await rig.peer(JOIN_MONITOR)
+        await monitor.expect("joined")
+        controller.send(b'{"type":"fans","seq":1,"duty":[0.7,0.8]}\n')
+        frame: dict[str, Any] = {}
+        for k in range(1000):
+            frame = await monitor.expect("sensors")
+            if not frame["cmd"]["held"]:
+                break
+            monitor.permit(k, frame["seq"])
+            controller.drive(k, frame["seq"])
+        assert frame["fans"] == [0.7, 0.8]
+        if how == "RST":
+            linger = b"\x01\0\0\0\0\0\0\0"
+            controller.writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+            controller.writer.transport.abort()
+        else:
+            controller.writer.close()
+        await rig.notes.until("controller lost: wheels held")
+        gone = rig.loop.robot.t_s
+        while (frame := await monitor.expect("sensors"))["t"] <= gone:
+            pass
+        assert frame["t"] - gone <= 0.05
+        assert frame["cmd"]["held"]
+        assert frame["fans"] == [0.7, 0.8]
+
+
+async def test_time_to_live_on_the_wall_clock(config: Config) -> None:
+    async with running(config, lockstep=False) as rig:
+        controller = await rig.peer(JOIN)
+        await controller.expect("joined")
+        first = await controller.expect("sensors")
+        controller.drive(1, first["seq"])
+        moving: list[float] = []
+        while True:
+            cmd = (await controller.expect("sensors"))["cmd"]
+            if cmd["seq"] == 1 and cmd["held"]:
+                break
+            if cmd["seq"] == 1:
+                moving.append(cmd["age"])
+        assert moving
+        assert max(moving) <= 0.25
+
+
+async def test_fans_never_go_below_the_floor_on_an_overhang() -> None:
+    from ccatp.config.loader import load_config
+
+    async with running(load_config(overrides={"run.mirror": "fyst-m2"})) as rig:
+        peer = await rig.peer()
+        assert (await peer.expect("hello"))["robot"]["fan_floor"] == 0.6
+        peer.send(JOIN)
+        await peer.expect("joined")
+        assert (await peer.expect("sensors"))["fans"] == [0.6, 0.6]
+        peer.send(b'{"type":"fans","seq":1,"duty":[0.0,0.9]}\n')
+        peer.drive(0, 0)
+        frame = await peer.expect("sensors")
+        assert (frame["fans"], frame["faults"]) == ([0.6, 0.9], [])
+
+
+# -- determinism ------------------------------------------------------------------------------------------------------
+
+
+def _link(port: int, role: Role, key: bytes | None = None) -> RobotLink:
+    return RobotLink(
+        host="127.0.0.1",
+        port=port,
+        role=role,
+        client=role,
+        key=key,
+        on_sensors=lambda _sensors, _line: None,
+        on_lost=lambda _reason: None,
+    )
+
+
+async def _drive_through(config: Config, seed: int, frames: int) -> list[bytes]:
+    """Our own two clients, driving until frame ``frames``; every line of the controller."""
+    lines: list[bytes] = []
+    over = asyncio.Event()
+    async with running(config, seed=seed) as rig:
+        controller, monitor = _link(rig.port, "controller"), _link(rig.port, "monitor")
+
+        def on_frame(sensors: Sensors, line: bytes) -> None:
+            lines.append(line)
+            if sensors.seq == frames:
+                over.set()
+                return
+            speed = 3.0 if sensors.seq % 200 < 100 else -2.0
+            controller.send_drive(sensors.seq, sensors.seq, speed, speed - 0.1 * (sensors.seq % 7))
+
+        def on_monitored(sensors: Sensors, line: bytes) -> None:
+            monitor.send_permit(sensors.seq, sensors.seq, True, True, sensors.seq % 50 != 0)
+
+        controller._on_sensors, monitor._on_sensors = on_frame, on_monitored
+        await monitor.connect(DEADLINE_S)
+        await controller.connect(DEADLINE_S)
+        async with asyncio.timeout(DEADLINE_S):
+            await over.wait()
+        assert not controller.counts
+        assert not monitor.counts
+        controller.close()
+        monitor.close()
+    return lines
+
+
+async def test_the_same_seed_gives_the_same_bytes(config: Config) -> None:
+    first = await _drive_through(config, 1, 400)
+    assert len(first) == 401
+    assert await _drive_through(config, 1, 400) == first
+    assert await _drive_through(config, 2, 400) != first
+
+
+# -- truth ------------------------------------------------------------------------------------------------------------
+
+
+async def test_truth_leaves_by_its_own_sockets(config: Config, tmp_path: Path) -> None:
+    rep, pub = f"ipc://{tmp_path}/rep", f"ipc://{tmp_path}/pub"
+    listening = socket.create_server(("127.0.0.1", 0))
+    stop = asyncio.Event()
+    task = asyncio.create_task(
+        serve(config, lockstep=True, seed=1, stop=stop, listen_sock=listening, truth_rep=rep, truth_pub=pub)
+    )
+    context = zmq.asyncio.Context()
+    asking, listener = context.socket(zmq.REQ), context.socket(zmq.SUB)
+    asking.linger = 0
+    try:
+        async with asyncio.timeout(2 * DEADLINE_S):
+            listener.subscribe(b"truth ")
+            listener.connect(pub)
+            asking.connect(rep)
+
+            async def ask(request: bytes) -> dict[str, Any]:
+                await asking.send(request)
+                found: dict[str, Any] = json.loads(await asking.recv())
+                return found
+
+            at_start = await ask(b"puck")
+            assert (at_start["t"], at_start["moved_m"]) == (0.0, 0.0)
+            # A subscription takes effect some time after the connection: publish until something arrives.
+            while not await listener.poll(20):
+                await ask(b"flush")
+                peer = Peer(*await asyncio.open_connection("127.0.0.1", listening.getsockname()[1]))
+                await peer.expect("hello")
+                peer.send(JOIN)
+                await peer.expect("joined")
+                seq = (await peer.expect("sensors"))["seq"]
+                for k in range(seq, seq + 5):
+                    peer.drive(k, k)
+                    await peer.expect("sensors")
+                peer.writer.close()
+                await peer.writer.wait_closed()
+                await ask(b"flush")
+            topic, _, body = (await listener.recv()).partition(b" ")
+            assert topic == b"truth"
+            assert all(len(row) == 11 and row[9] == 0 for row in json.loads(body)["rows"])
+            told = await ask(b"misalignment")
+            assert len(told["panels"]) == 77
+            assert (await ask(b"nonsense"))["error"].startswith("unknown request")
+            last = await ask(b"puck")
+            assert last["t"] > 0.0
+            assert last["moved_m"] > 0.0
+    finally:
+        asking.close()
+        listener.close()
+        context.term()
+        stop.set()
+        await task
+
+
+async def test_a_port_in_use_is_an_error(config: Config) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        robot = config.sim.robot.model_copy(update={"port": taken.getsockname()[1]})
+        cfg = config.model_copy(update={"sim": config.sim.model_copy(update={"robot": robot})})
+        with pytest.raises(OSError, match="address already in use"):
+            await serve(cfg, lockstep=True, seed=1, stop=asyncio.Event())
+
+
+async def test_an_unforeseen_error_ends_the_loop_aloud(config: Config) -> None:
+    for lockstep in (True, False):
+        loop = DataLoop(on_port_0(config), lockstep, 1)
+        port = await loop.start()
+
+        def fail() -> None:
+            raise RuntimeError("surprise")
+
+        loop.robot.advance = fail  # type: ignore[method-assign]
+        _, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(JOIN + b'{"type":"drive","seq":0,"ack":0,"wr":1,"wl":1}\n')
+        with pytest.raises(RuntimeError, match="surprise"):
+            async with asyncio.timeout(DEADLINE_S):
+                await loop.run(asyncio.Event())
+        writer.close()
+        await writer.wait_closed()
+
+
+async def test_lines_for_the_log(config: Config) -> None:
+    async with running(config) as rig:
+        await rig.peer(JOIN)
+        await rig.notes.until("controller joined: peer")
+        await rig.peer(JOIN)
+        await rig.notes.until("client dropped: refused: role taken")
+
+
+async def test_a_client_that_does_not_read_is_left_out_and_finds_the_newest_later(config: Config) -> None:
+    async with running(config) as rig:
+        deaf = await rig.peer(JOIN_MONITOR)
+        await deaf.expect("joined")
+        connection = next(iter(rig.loop._connections))
+        connection.pause_writing()
+        connection.write(b"lost\n")
+        connection.resume_writing()
+        connection.write(b'{"type":"kept"}\n')
+        await deaf.expect("kept")

@@ -1,0 +1,190 @@
+"""Pure. Stops between the points, remaining time, refusals."""
+
+from itertools import pairwise
+from math import hypot
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ccatp.planning.bound import path_time
+from ccatp.planning.errors import OutsideMirrorError, PlanError, UnreachableError
+from ccatp.planning.legs import LegRules
+from ccatp.planning.route import Route, RouteCursor, plan_route
+from ccatp.planning.search import Arrival, Search, Target
+from ccatp.planning.stance import build_body, build_places
+from ccatp.planning.traversal import thesis_order
+from ccatp.samples import DeckPose, PointId, Stop, StopKind
+
+STEPS_OF_THESIS_M1 = ((1, 2), (2, 3), (7, 8), (8, 9))  # rows of 7, 9, 11, ..., 11, 9, 7 panels
+
+
+def plan(world: Any, points: list[PointId], **options: Any) -> Route:
+    cfg = world.cfg
+    return plan_route(world.mirror, points, cfg.robot, cfg.limits, cfg.mission, world.mirror.base_pose, **options)
+
+
+def bare(world: Any, points: list[PointId]) -> tuple[Stop, ...]:
+    return tuple(Stop(x, y, StopKind.MEASURE) for x, y in map(world.mirror.point_on_deck, points))
+
+
+def test_straight_legs_at_stepped_corners_come_too_near_the_rim(thesis: Any) -> None:
+    mirror = thesis.mirror
+    failing = [
+        (a.row, b.row)
+        for a, b in pairwise(thesis_order(mirror))
+        if mirror.rim.segment_clearance_m(*mirror.point_on_deck(a), *mirror.point_on_deck(b))
+        < thesis.cfg.mission.leg_clearance_m
+    ]
+    assert failing == list(STEPS_OF_THESIS_M1)
+    stops = plan(thesis, thesis_order(mirror)).stops
+    for low, high in STEPS_OF_THESIS_M1:
+        last = max(k for k, stop in enumerate(stops) if stop.point and stop.point.row == low)
+        first = min(k for k, stop in enumerate(stops) if stop.point and stop.point.row == high)
+        assert first > last + 1
+        assert all(stop.kind is StopKind.VIA for stop in stops[last + 1 : first])
+
+
+def test_some_straight_legs_leave_the_mirror(thesis: Any) -> None:
+    mirror = thesis.mirror
+    a, b = PointId(7, 11, 9), PointId(8, 10, 9)
+    assert mirror.rim.segment_clearance_m(*mirror.point_on_deck(a), *mirror.point_on_deck(b)) < 0.0
+
+
+def test_whole_surveys_fit_into_the_hour(world: Any) -> None:
+    points = thesis_order(world.mirror)
+    route = plan(world, points, measuring_time_s=0.5)
+    straight_s = path_time(bare(world, points), world.mirror.base_pose, world.cfg.limits, world.mirror, 0.5)
+    settled_s = route.remaining_s(0) + 0.15 * len(route.stops)  # the servo's lag and settling, each stop
+    assert settled_s < world.cfg.run.budget_s
+    assert straight_s < route.remaining_s(0) < 1.04 * straight_s  # measured: 1.019 to 1.036
+
+
+def test_largest_leg_of_thesis_m1(thesis: Any) -> None:
+    route = plan(thesis, thesis_order(thesis.mirror))
+    ends = [(stop.x_m, stop.y_m) for stop in route.stops]
+    legs = sorted(hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(ends))
+    # The four diagonals around the stepped corners: straight up and across would be 0.744 m, but 0.3 m more way.
+    assert legs[-1] == pytest.approx(0.824, abs=0.002)  # the retreats before and after lie on a grid of 5 mm
+    assert legs[-9] == pytest.approx(0.254, abs=0.012)  # else 744 - 490 mm, between two rows; a retreat may slant it
+
+
+def test_points_of_a_row_need_no_stops_between(thesis: Any) -> None:
+    points = [point for point in thesis_order(thesis.mirror) if (point.row, point.col) in {(5, 5), (5, 6)}]
+    stops = plan(thesis, points).stops
+    first = next(k for k, stop in enumerate(stops) if stop.kind is StopKind.MEASURE)
+    assert len(stops[first:]) == 18
+
+
+def test_done_points_are_left_out(thesis: Any) -> None:
+    points = thesis_order(thesis.mirror, 2)
+    route = plan(thesis, points, skip=points[3:12])
+    assert [stop.point for stop in route.stops if stop.point] == points[:3] + points[12:]
+    assert plan(thesis, points, skip=points) == Route((), (0.0,), (0.0,))
+    assert plan(thesis, []).remaining_s(0) == 0.0
+
+
+def test_remaining_time_and_way(thesis: Any) -> None:
+    points = thesis_order(thesis.mirror, 1)
+    route = plan(thesis, points, measuring_time_s=0.5)
+    base, cfg, mirror = thesis.mirror.base_pose, thesis.cfg, thesis.mirror
+    assert route.remaining_s(0) == pytest.approx(path_time(route.stops, base, cfg.limits, mirror, 0.5), rel=1e-12)
+    way = sum(
+        hypot(b[0] - a[0], b[1] - a[1])
+        for a, b in pairwise([(base.x_m, base.y_m), *((stop.x_m, stop.y_m) for stop in route.stops)])
+    )
+    assert route.remaining_m(0) == pytest.approx(way, rel=2e-3)  # slopes of 0.045 add a thousandth
+    last = len(route.stops) - 1
+    assert 0.5 < route.remaining_s(last) < 10.0
+    assert route.remaining_s(last + 1) == route.remaining_m(last + 1) == 0.0
+
+
+def test_the_route_is_the_same_every_time(thesis: Any) -> None:
+    points = thesis_order(thesis.mirror, 9)
+    assert plan(thesis, points) == plan(thesis, points)
+
+
+def test_cursor(thesis: Any) -> None:
+    route = plan(thesis, thesis_order(thesis.mirror, 1))
+    cursor = RouteCursor(route)
+    seen = []
+    while cursor.current is not None:
+        seen.append(cursor.current)
+        assert cursor.next == (route.stops[len(seen)] if len(seen) < len(route.stops) else None)
+        cursor.advance()
+    assert tuple(seen) == route.stops
+    cursor.advance()
+    assert cursor.index == len(route.stops)
+    assert cursor.next is None
+
+
+def test_start_beyond_the_rim(thesis: Any) -> None:
+    cfg = thesis.cfg
+    with pytest.raises(OutsideMirrorError, match=r"start \(9\.000, 0\.000\) m is 5\.\d+ m beyond the rim of thesis-m1"):
+        plan_route(thesis.mirror, [], cfg.robot, cfg.limits, cfg.mission, DeckPose(9.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("clearances", [{"leg_clearance_m": 0.13}, {"turn_clearance_m": 0.04}])
+def test_points_too_near_the_rim(clearances: dict[str, float], thesis: Any) -> None:
+    cfg = thesis.cfg
+    mission = cfg.mission.model_copy(update=clearances)
+    points = thesis_order(thesis.mirror, 1)
+    with pytest.raises(UnreachableError, match=r"no safe way to point 1-3-1 of thesis-m1, 0\.115 m from the rim") as e:
+        plan_route(thesis.mirror, points, cfg.robot, cfg.limits, mission, thesis.mirror.base_pose)
+    assert isinstance(e.value, PlanError)
+    for name, value in clearances.items():
+        assert f"{name} = {value}" in str(e.value)
+
+
+def test_way_around_several_corners(thesis: Any) -> None:
+    mirror, body = thesis.mirror, build_body(thesis.cfg.robot, thesis.cfg.mission)
+    rules = LegRules(mirror, body)
+    xs, ys = np.array([3.4, 2.2, -3.4, 0.0]), np.array([1.6, 3.2, -1.6, 0.0])
+    upper, top, lower, middle = build_places(mirror, body, xs, ys)
+    chain = [upper, *rules.way_around(upper, top), top]
+    assert len(chain) == 4
+    assert all(rules.is_clear(a, b) for a, b in pairwise(chain))
+    assert rules.way_around(lower, middle) == ()
+
+
+def test_no_way_to_a_place_in_the_clearance(thesis: Any) -> None:
+    mirror, body = thesis.mirror, build_body(thesis.cfg.robot, thesis.cfg.mission)
+    inner, near = build_places(mirror, body, np.array([0.0, 3.7]), np.array([0.0, 0.0]))
+    assert near.depth_m < 0.1
+    assert LegRules(mirror, body).way_around(inner, near) == ()
+
+
+def test_sensors_at_a_re_entrant_corner(thesis: Any) -> None:
+    """A leg that ends beside a stepped corner passes it at 0.1 m with its origin, but not with a sensor."""
+    mirror, body = thesis.mirror, build_body(thesis.cfg.robot, thesis.cfg.mission)
+    rules = LegRules(mirror, body)
+    corner_x, corner_y = 2.375, -2.599  # upper right corner of panel 1-9, below panel 2-10
+    assert mirror.rim.signed_distance_m(corner_x, corner_y) == pytest.approx(0.0, abs=1e-9)
+    a, b, deep = build_places(
+        mirror,
+        body,
+        np.array([corner_x - 0.09, corner_x - 0.09, corner_x - 0.30]),
+        np.array([corner_y - 0.40, corner_y - 0.05, corner_y - 0.05]),
+    )
+    clearance = rules.clearance_m(a, b)
+    upward = float(np.pi / 2.0)
+    assert not rules.are_sensors_clear(a, b, upward, clearance)
+    assert rules.are_sensors_clear(a, deep, upward, 1.0)
+    assert rules.are_sensors_clear(deep, deep, upward, rules.clearance_m(deep, deep))
+
+
+def test_no_leg_whose_sensors_clip_a_re_entrant_corner(thesis: Any) -> None:
+    """Slanting past the corner at 0.1002 m: all sensors are clear at both ends, the right front one is not between."""
+    mirror, body = thesis.mirror, build_body(thesis.cfg.robot, thesis.cfg.mission)
+    rules = LegRules(mirror, body)
+    search = Search(rules, thesis.cfg.limits)
+    course = float(np.pi / 4.0)
+    along, right = np.array((1.0, 1.0)) / np.sqrt(2.0), np.array((1.0, -1.0)) / np.sqrt(2.0)
+    for beside, passes in ((0.0868, False), (0.0960, True)):  # a sensor runs 0.09 m beside the origin, and keeps 5 mm
+        end = np.array((2.375, -2.599)) - 0.05 * along - beside * right
+        ends = np.stack((end - 0.3 * along, end))
+        a, b = build_places(mirror, body, ends[:, 0], ends[:, 1])
+        assert rules.is_clear(a, b)
+        assert a.can_face(course)
+        assert b.can_face(course)
+        assert bool(search.advance([Arrival(a, course, 0.0)], (), Target(b))) == passes

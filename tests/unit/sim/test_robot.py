@@ -1,0 +1,300 @@
+"""The whole simulated robot, frame by frame, in virtual time."""
+
+import json
+
+import numpy as np
+import pytest
+
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.samples import DeckPose, PanelId
+from ccatp.sim.robot import Robot
+from ccatp.sim.truth import TruthLog
+from ccatp.sim.world import TruthRow
+from ccatp.wire.lines import MAX_LINE_BYTES
+from ccatp.wire.robot import Sensors, decode_from_robot
+
+
+@pytest.fixture(scope="module")
+def mirror(config: Config) -> Mirror:
+    return build_mirror(config.mirror)
+
+
+@pytest.fixture(scope="module")
+def overhang() -> Config:
+    return load_config(overrides={"run.mirror": "fyst-m2"})
+
+
+def boot(config: Config, mirror: Mirror, seed: int = 1) -> Robot:
+    return Robot(config, mirror, np.random.default_rng(seed))
+
+
+def frame(robot: Robot) -> Sensors:
+    message = decode_from_robot(robot.line[:-1])
+    assert isinstance(message, Sensors)
+    return message
+
+
+def drive(robot: Robot, right: float, left: float, frames: int) -> None:
+    for _ in range(frames):
+        robot.rules.drive(robot.seq + 1, right, left, robot.t_s)
+        robot.advance()
+
+
+def test_boot_is_frame_zero(config: Config, mirror: Mirror) -> None:
+    sensors = frame(boot(config, mirror))
+    assert (sensors.seq, sensors.t, sensors.fans, sensors.faults) == (0, 0.0, (0.0, 0.0), [])
+    assert [sample.t_s for sample in sensors.imu] == [0.0]
+    assert [sample.t_s for sample in sensors.enc] == [0.0]
+    assert [sample[:] for sample in sensors.edge] == [(0.0, 1, 1, 1, 1)]
+    assert sensors.gravity is not None
+    assert (sensors.cmd.seq, sensors.cmd.age, sensors.cmd.held) == (-1, 0.0, True)
+
+
+def test_a_frame_holds_the_samples_since_the_one_before(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror)
+    drive(robot, 3.0, 2.0, 7)
+    sensors = frame(robot)
+    assert (sensors.seq, sensors.t) == (7, 0.07)
+    assert [sample.t_s for sample in sensors.enc] == [n / 1000.0 for n in range(61, 71)]
+    assert [sample.t_s for sample in sensors.edge] == [n / 1000.0 for n in range(61, 71)]
+    assert [sample.t_s for sample in sensors.imu] == [0.07]
+    assert sensors.gravity is None
+    assert (sensors.cmd.seq, sensors.cmd.age, sensors.cmd.permit_age, sensors.cmd.held) == (7, 0.01, 0.07, False)
+    # 5 sigma of the encoder's noise.
+    assert sensors.enc[-1].right_rad_s == pytest.approx(robot.world.plant.right_rad_s, abs=0.005)
+
+
+def test_the_same_seed_gives_the_same_bytes(config: Config, mirror: Mirror) -> None:
+    lines = []
+    for seed in (1, 1, 2):
+        robot = boot(config, mirror, seed)
+        found = [robot.line]
+        for k in range(300):
+            drive(robot, 3.0, 3.0 - 0.01 * k, 1)
+            found.append(robot.line)
+        lines.append(b"".join(found))
+    assert lines[0] == lines[1]
+    assert lines[0] != lines[2]
+
+
+def test_a_drive_ends_with_its_time_to_live(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror)
+    robot.rules.drive(1, 3.0, 3.0, 0.0)
+    held = []
+    for _ in range(60):
+        robot.advance()
+        held.append(frame(robot).cmd.held)
+    assert held == [False] * 25 + [True] * 35  # ttl_s = 0.25 at 100 Hz
+    # 25 frames at 0.09 m/s; first order in and out: v ttl in all, but for the rest after 4.4 time constants.
+    moved = np.hypot(
+        robot.world.plant.x_m - robot.world.start_pose.x_m, robot.world.plant.y_m - robot.world.start_pose.y_m
+    )
+    assert 0.018 < moved < 0.0226
+
+
+def test_hold_is_a_servo_at_zero_not_power_off(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror)
+    drive(robot, 3.0, 3.0, 100)
+    robot.rules.lose_controller()
+    rates = []
+    for _ in range(20):
+        robot.advance()
+        rates.append(robot.world.plant.right_rad_s)
+    expected = [3.0 * np.exp(-0.01 * (k + 1) / 0.08) for k in range(20)]
+    assert rates == pytest.approx(expected, abs=1e-4)  # the drive had come within 4e-6 of 3.0
+
+
+def test_puck_stands_on_the_misaligned_panel(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror)
+    world = robot.world
+    panel = mirror.nearest_panel(world.plant.x_m, world.plant.y_m)
+    nominal = np.array(mirror.puck_world(world.plant.pose, config.robot.puck_height_m))
+    offset = np.array(world.puck_world()) - nominal
+    n = np.array(mirror.rotate_world_from_deck(mirror.panels[panel].axes[2]))
+    pose = mirror.panel_pose(panel, world.plant.pose)
+    expected = world.misalignments[panel].displacement_m(pose.x_m, pose.y_m)
+    # Along the normal the displacement; sideways the tilt (some 100 urad) times the puck's height of 50 mm.
+    assert offset @ n == pytest.approx(expected, abs=1e-6)
+    assert np.linalg.norm(offset - (offset @ n) * n) < 3e-5
+
+
+def test_misalignment_and_start_have_the_configured_spread(config: Config, mirror: Mirror) -> None:
+    starts, pistons, tips, tilts = [], [], [], []
+    base = mirror.base_panel_pose
+    for seed in range(40):
+        world = boot(config, mirror, seed).world
+        start = world.start_panel_pose
+        starts.append((start.x_m - base.x_m, start.y_m - base.y_m, start.heading_rad - base.heading_rad))
+        for m in world.misalignments.values():
+            pistons.append(m.piston_m)
+            tips.append(m.tip_rad)
+            tilts.append(m.tilt_rad)
+    sigmas = np.array(starts).std(axis=0)
+    # 120 numbers of 40 draws: 4.5 standard errors are 50 %; some 3000 draws: 6 %.
+    assert sigmas == pytest.approx([0.002, 0.002, 0.01], rel=0.5)
+    truth = config.sim.truth
+    assert np.std(pistons) == pytest.approx(truth.piston_sigma_m, rel=0.06)
+    assert np.std(tips) == pytest.approx(truth.tilt_sigma_rad, rel=0.06)
+    assert np.std(tilts) == pytest.approx(truth.tilt_sigma_rad, rel=0.06)
+
+
+def test_moved_looks_back_over_one_measuring_time(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror)
+    assert robot.world.moved_m() == 0.0
+    drive(robot, 3.0, 3.0, 100)
+    # 50 frames at 0.09 m/s.
+    assert robot.world.moved_m() == pytest.approx(0.045, abs=1e-4)
+    drive(robot, 3.0, -3.0, 100)
+    drive(robot, 0.0, 0.0, 250)
+    assert robot.world.moved_m() < 1e-9
+    drive(robot, 3.0, 3.0, 10)
+    drive(robot, -3.0, -3.0, 10)
+    assert robot.world.moved_m() > 1e-3  # there and back counts
+
+
+# -- falling ----------------------------------------------------------------------------------------------------------
+
+
+def drive_off(robot: Robot, frames: int = 3000) -> list[TruthRow]:
+    rows = []
+    for _ in range(frames):
+        drive(robot, 3.0, 3.0, 1)
+        rows.append(robot.world.truth_row(robot.seq, robot.t_s))
+    return rows
+
+
+def test_it_falls_when_its_centre_passes_the_rim_and_never_moves_again(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror)
+    rows = drive_off(robot)
+    rim = mirror.rim
+    first = next(k for k, row in enumerate(rows) if row[9])
+    x, y = rows[first][2:4]
+    assert -0.001 <= rim.signed_distance_m(x, y) <= 0.0  # within a frame of 0.9 mm
+    assert all(rim.signed_distance_m(row[2], row[3]) >= 0.0 for row in rows[:first])
+    assert {row[2:8] for row in rows[first:]} == {rows[first][2:8]}
+    assert frame(robot).cmd.held
+    # The truth is never on the link.
+    assert frame(robot).faults == []
+
+
+def test_clearance_and_mask_of_the_truth_are_those_of_the_sensors(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror)
+    seen = set()
+    for row in drive_off(robot):
+        if row[9]:
+            break
+        pose = DeckPose(*row[2:5])
+        clearances = [
+            mirror.rim.signed_distance_m(*mirror.body_offset(pose, *offset)) for offset in config.robot.edge_sensors_m
+        ]
+        if mirror.rim.signed_distance_m(pose.x_m, pose.y_m) < 0.25:
+            assert row[8] == pytest.approx(min(clearances), abs=1e-8)
+            assert row[10] == sum((c < 0.0) << k for k, c in enumerate(clearances))
+            seen.add(row[10])
+        else:
+            assert (row[8], row[10]) == (1.0, 0)
+        assert row[7] == pytest.approx(mirror.surface.height_m(pose.x_m, pose.y_m), abs=1e-9)
+    assert len(seen) >= 2
+
+
+def test_on_an_overhang_thrust_below_the_floor_lets_it_fall(overhang: Config) -> None:
+    robot = boot(overhang, build_mirror(overhang.mirror))
+    assert frame(robot).fans == (0.6, 0.6)
+    drive(robot, 0.0, 0.0, 100)
+    robot.fans.command(1, 0.0, 0.0)
+    drive(robot, 0.0, 0.0, 100)
+    assert not robot.world.is_fallen  # clamped to the floor
+    robot.fans.health = (1.0, 0.5)
+    drive(robot, 0.0, 0.0, 19)
+    robot.fans.health = (1.0, 1.0)
+    drive(robot, 0.0, 0.0, 1)
+    robot.fans.health = (1.0, 0.5)
+    drive(robot, 0.0, 0.0, 19)
+    assert not robot.world.is_fallen
+    drive(robot, 0.0, 0.0, 1)
+    assert robot.world.is_fallen  # 0.2 s without a break
+    assert frame(robot).cmd.held
+
+
+def test_without_overhang_fans_do_not_matter(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror)
+    drive(robot, 0.0, 0.0, 50)
+    assert not robot.world.is_fallen
+
+
+# -- configuration ----------------------------------------------------------------------------------------------------
+
+
+def with_rates(config: Config, **rates: float) -> Config:
+    robot = config.sim.robot.model_copy(update=rates)
+    return config.model_copy(update={"sim": config.sim.model_copy(update={"robot": robot})})
+
+
+@pytest.mark.parametrize(
+    ("rates", "why"),
+    [
+        ({"frame_hz": 3.0}, r"a frame of 0.333333 s outlasts ttl_s 0.25"),
+        ({"frame_hz": 5.0}, r"frames at 5 Hz take up to \d+ bytes, a line holds 8192"),
+    ],
+)
+def test_rates_that_do_not_fit_the_link_are_refused(
+    config: Config, mirror: Mirror, rates: dict[str, float], why: str
+) -> None:
+    with pytest.raises(ValueError, match=why):
+        boot(with_rates(config, **rates), mirror)
+
+
+@pytest.mark.parametrize(
+    "rates", [{"frame_hz": 10.0}, {"frame_hz": 300.0}, {"frame_hz": 30.0, "encoder_hz": 333.0, "imu_hz": 7.0}]
+)
+def test_lines_stay_within_the_limit_and_readable(config: Config, mirror: Mirror, rates: dict[str, float]) -> None:
+    robot = boot(with_rates(config, **rates), mirror)
+    for _ in range(200):
+        drive(robot, 8.0, -8.0, 1)
+        assert len(robot.line) <= MAX_LINE_BYTES
+        frame(robot)
+
+
+# -- what the truth gives away ----------------------------------------------------------------------------------------
+
+
+def test_truth_comes_in_batches(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror)
+    truth = TruthLog(robot)
+    full = []
+    for k in range(250):
+        drive(robot, 3.0, 3.0, 1)
+        if truth.add():
+            full.append(k)
+            batch = truth.take()
+            assert batch is not None
+            assert [row[0] for row in batch.rows] == list(range(robot.seq - 99, robot.seq + 1))
+    assert full == [98, 198]
+    assert truth.answer(b"flush") == b'{"rows":200}'
+    rest = truth.take()
+    assert rest is not None
+    assert (rest.seq, rest.rows[0][0], rest.rows[-1][0]) == (250, 200, 250)
+    assert truth.take() is None
+    assert truth.answer(b"flush") == b'{"rows":251}'
+
+
+def test_a_fall_is_told_at_once(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror)
+    truth = TruthLog(robot)
+    while not robot.world.is_fallen:
+        truth.take()
+        drive(robot, 3.0, 3.0, 1)
+        assert truth.add() is robot.world.is_fallen
+
+
+def test_answers(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror)
+    truth = TruthLog(robot)
+    puck = json.loads(truth.answer(b"puck"))
+    assert (puck["t"], puck["moved_m"], tuple(puck["puck"])) == (0.0, 0.0, robot.world.puck_world())
+    told = json.loads(truth.answer(b"misalignment"))
+    assert [PanelId(*row[:2]) for row in told["panels"]] == list(mirror.panels)
+    assert told["start"][:2] == [robot.world.start_pose.x_m, robot.world.start_pose.y_m]
+    assert "unknown request" in json.loads(truth.answer(b"x" * 1000))["error"]

@@ -1,0 +1,662 @@
+"""Unit tests of the danger rules: stories in virtual time, with scripted samples, on thesis-m1 (10 mm seams)."""
+
+from dataclasses import dataclass, field
+from math import cos, inf, nan, pi, sin
+
+import pytest
+
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.danger import CENTRE, DangerMonitor
+from ccatp.edge_episode import Cause
+from ccatp.edge_map import EdgeMap
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.samples import Corner, EdgeSample, EventCode, Verdict, WheelSample
+from ccatp.wheel_track import KNOTS_KEPT, Odometry, WheelTrack, pose_at
+from ccatp.wire.topics import Estimate, pack, unpack, verdict_message
+
+FL, FR, RL, RR = ("front_left",), ("front_right",), ("rear_left",), ("rear_right",)
+FRONT, ALL = FL + FR, FL + FR + RL + RR
+NO_PERMIT, ANY_PERMIT = (False, False, False), (True, True, True)
+
+
+@dataclass(slots=True)
+class Frame:
+    seq: int
+    t: float
+    enc: list[WheelSample]
+    edge: list[EdgeSample]
+
+
+@pytest.fixture(scope="module")
+def cfg() -> Config:
+    return load_config(None, {"run.mirror": "thesis-m1"})
+
+
+@pytest.fixture(scope="module")
+def mirror(cfg: Config) -> Mirror:
+    return build_mirror(cfg.mirror)
+
+
+@dataclass
+class Story:
+    """Feeds frames of ten samples: the robot moves as told, the sensors are what they are told to be."""
+
+    cfg: Config
+    mirror: Mirror
+    pose: tuple[float, float, float]
+    sigma_m: float = 1e-4
+    state: str = "driving"
+    has_estimate: bool = True
+    has_wheels: bool = True
+    seq: int = 0
+    t: float = 0.0
+    monitor: DangerMonitor = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.monitor = DangerMonitor(self.mirror, self.cfg.robot, self.cfg.danger)
+
+    def frame(self, v: float = 0.0, omega: float = 0.0, off: tuple[str, ...] = (), flags: str = "1" * 10) -> Verdict:
+        """One frame at that velocity; ``flags``: per sample 0 where the sensors named in ``off`` are off."""
+        r, base = self.cfg.robot.wheel_radius_m, self.cfg.robot.wheel_base_m
+        right, left = (v + 0.5 * omega * base) / r, (v - 0.5 * omega * base) / r
+        estimate = Estimate(
+            seq=self.seq, t_s=self.t, x_m=self.pose[0], y_m=self.pose[1], heading_rad=self.pose[2],
+            sigma_m=self.sigma_m, state=self.state,
+        )  # fmt: skip
+        enc, edge = [], []
+        for k in range(10):
+            self.t += 1e-3
+            enc.append(WheelSample(self.t, right, left))
+            is_off = flags[k] == "0" if "0" in flags else bool(off)
+            edge.append(EdgeSample(self.t, *(int(not (is_off and c.value in off)) for c in Corner)))
+        self.seq += 1
+        track = WheelTrack(r, base, 1.0, 1.0)
+        track.push(enc)
+        track.update(self.t)
+        moved = Odometry(track, self.t - 0.01, self.pose)
+        moved.advance_to(self.t)
+        self.pose = moved.x_m, moved.y_m, moved.heading_rad
+        frame = Frame(self.seq, self.t, enc if self.has_wheels else [], edge)
+        return self.monitor.step(frame, estimate if self.has_estimate else None)
+
+    def run(self, frames: int, v: float = 0.0, omega: float = 0.0, off: tuple[str, ...] = ()) -> Verdict:
+        for _ in range(frames):
+            self.frame(v, omega, off)
+        return self.monitor.verdict
+
+
+@pytest.fixture
+def on_panel(cfg: Config, mirror: Mirror) -> Story:
+    """In the middle of a panel, far from seams and rim."""
+    panel = list(mirror.panels.values())[40]
+    return Story(cfg, mirror, (panel.x_m, panel.y_m, 0.0))
+
+
+@pytest.fixture
+def at_seam(cfg: Config, mirror: Mirror) -> Story:
+    """Heading +x, the front sensors 1 mm before a seam."""
+    panel = list(mirror.panels.values())[40]
+    return Story(cfg, mirror, (panel.x_m + panel.half_x_m - 0.091, panel.y_m, 0.0))
+
+
+@pytest.fixture
+def at_rim(cfg: Config, mirror: Mirror) -> Story:
+    """Heading +x in the middle row, the front sensors 1 mm before the rim."""
+    right = max(mirror.panels.values(), key=lambda panel: (panel.x_m, -abs(panel.y_m)))
+    return Story(cfg, mirror, (right.x_m + right.half_x_m - 0.091, right.y_m, 0.0))
+
+
+def permits(verdict: Verdict) -> tuple[bool, bool, bool]:
+    return verdict.forward, verdict.reverse, verdict.turn
+
+
+# -- normal operation -------------------------------------------------------------------------------------------------
+
+
+def test_normal_operation_permits_everything(on_panel: Story) -> None:
+    verdict = on_panel.run(3, v=0.1)
+    assert verdict == Verdict(3, verdict.t_s, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
+    assert on_panel.monitor.episodes_opened == dict.fromkeys(Corner, 0)
+
+
+def test_nothing_is_permitted_before_the_first_frame(on_panel: Story) -> None:
+    assert permits(on_panel.monitor.verdict) == NO_PERMIT
+
+
+# -- (a) rim ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_rim_is_an_edge_at_the_second_off_sample(at_rim: Story) -> None:
+    verdict = at_rim.frame(0.1, off=FRONT, flags="1111111100")
+    assert verdict.code is EventCode.NORMAL  # not moved far enough to have a direction
+    verdict = at_rim.frame(0.1, off=FRONT)
+    assert (verdict.code, verdict.cause, verdict.signal) == (EventCode.NEAR_EDGE, Cause.RIM.value, "front_left")
+    assert verdict.value < 0.0005  # m of travel: three samples at 0.1 m/s
+    assert permits(verdict) == (False, True, False)
+    assert verdict.off == (True, True, False, False)
+    assert at_rim.monitor.edges_declared[Corner.FRONT_LEFT] == 1
+
+
+def test_a_single_glitch_near_the_rim_is_no_edge(at_rim: Story) -> None:
+    assert at_rim.frame(0.1, off=FRONT, flags="1111101111").code is EventCode.NORMAL
+    assert at_rim.run(3, v=-0.1).code is EventCode.NORMAL
+
+
+def test_a_rear_sensor_over_the_rim_bars_reverse(at_rim: Story) -> None:
+    at_rim.pose = (*at_rim.pose[:2], pi)
+    verdict = at_rim.run(2, v=-0.1, off=RL)
+    assert permits(verdict) == (True, False, False)
+    assert verdict.off == (False, False, True, False)
+
+
+def test_front_and_rear_over_the_rim_bar_both(at_rim: Story) -> None:
+    at_rim.pose = (at_rim.pose[0] + 0.091, at_rim.pose[1], pi / 2)
+    verdict = at_rim.run(2, v=0.05, off=FR + RR)
+    assert permits(verdict) == NO_PERMIT
+    assert verdict.off == (False, True, False, True)
+
+
+def test_an_edge_is_over_after_twenty_samples_on(at_rim: Story) -> None:
+    at_rim.run(2, v=0.1, off=FRONT)
+    assert at_rim.frame(-0.05).code is EventCode.NEAR_EDGE
+    assert at_rim.frame(-0.05).code is EventCode.NORMAL
+    assert permits(at_rim.monitor.verdict) == ANY_PERMIT
+
+
+def test_a_sensor_over_a_gap_behind_does_not_keep_the_edge_alive(at_seam: Story) -> None:
+    at_seam.sigma_m = 10.0  # three sigma reach the rim: whatever is off is an edge
+    at_seam.run(2, v=0.1, off=FRONT)
+    assert at_seam.monitor.code is EventCode.NEAR_EDGE
+    at_seam.sigma_m = 1e-4
+    at_seam.pose = (at_seam.pose[0] + 0.184, *at_seam.pose[1:])  # now the rear sensors stand over the seam
+    at_seam.frame(-0.05, off=RL + RR)
+    assert at_seam.frame(-0.05, off=RL + RR).code is EventCode.NORMAL
+
+
+# -- (b) seam ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_seam_allows_its_width_and_then_is_an_edge(at_seam: Story) -> None:
+    verdict = at_seam.run(14, v=0.1, off=FRONT)  # 14 mm: gap 10 + tolerance 1 + extra 3, less the first sample
+    assert verdict.code is EventCode.NORMAL
+    verdict = at_seam.frame(0.1, off=FRONT)
+    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, Cause.SEAM.value)
+    assert verdict.limit == pytest.approx(0.014, abs=1e-6)  # m; the direction is along the normal to 1e-3 rad
+    assert verdict.value == pytest.approx(0.014, abs=2e-4)  # m; two samples at 0.1 m/s
+
+
+def test_a_seam_crossed_obliquely_allows_more(at_seam: Story) -> None:
+    panel = list(at_seam.mirror.panels.values())[40]
+    heading = 1.0  # 57 degrees
+    at_seam.pose = at_seam.mirror.panel_pose(panel.id, at_seam.mirror.base_pose).x_m, 0.0, heading
+    hx = 0.09 * 0.5403 + 0.09 * 0.8415  # front right: (0.09, -0.09) turned by 1 rad, x part
+    at_seam.pose = panel.x_m + panel.half_x_m - hx, panel.y_m, heading
+    assert at_seam.run(22, v=0.1, off=FR).code is EventCode.NORMAL  # 22 mm of 11 / cos(1) + 3 = 23.4
+    assert at_seam.run(3, v=0.1, off=FR).code is EventCode.NEAR_EDGE
+
+
+def test_standing_over_a_gap_is_no_edge_however_long(at_seam: Story) -> None:
+    at_seam.run(5, v=0.1, off=FRONT)
+    assert at_seam.run(6000, off=FRONT).code is EventCode.NORMAL  # a minute
+    assert at_seam.run(5, v=0.1, off=FRONT).code is EventCode.NORMAL
+    assert at_seam.run(2, v=0.1).code is EventCode.NORMAL
+    assert at_seam.monitor.episodes_opened[Corner.FRONT_LEFT] == 1
+
+
+def test_going_back_adds_nothing(at_seam: Story) -> None:
+    for _ in range(10):
+        at_seam.run(8, v=0.1, off=FRONT)
+        at_seam.run(8, v=-0.1, off=FRONT)
+    assert at_seam.run(30, v=-0.1, off=FRONT).code is EventCode.NORMAL  # 30 mm behind where it went off
+
+
+def test_chatter_at_rest_adds_nothing(at_seam: Story) -> None:
+    at_seam.run(1, v=0.1, off=FRONT)
+    for _ in range(500):
+        assert at_seam.frame(0.0, off=FRONT, flags="0101010011").code is EventCode.NORMAL
+
+
+def test_chatter_does_not_hide_an_edge(on_panel: Story) -> None:
+    for _ in range(6):
+        on_panel.frame(0.1, off=FRONT, flags="0101010101")
+    assert on_panel.monitor.verdict.code is EventCode.NEAR_EDGE  # 6 mm
+
+
+def test_an_episode_ends_once_the_sensor_has_moved_on(at_seam: Story) -> None:
+    at_seam.run(10, v=0.1, off=FRONT)
+    at_seam.run(3, v=0.1)
+    assert not at_seam.monitor._edges.is_idle
+    at_seam.run(4, v=0.1)  # 5 mm and 20 samples on
+    assert at_seam.monitor._edges.is_idle
+
+
+def test_an_episode_ends_at_rest_after_a_long_time_on(at_seam: Story) -> None:
+    at_seam.run(10, v=0.1, off=FRONT)
+    at_seam.run(21)
+    assert at_seam.monitor._edges.is_idle
+
+
+def test_the_rim_beyond_a_seam_is_seen_while_off(at_rim: Story) -> None:
+    # The map place is 13 mm before the rim: too far for the margin of 10 mm, until the sensor has come 3 mm closer.
+    at_rim.pose = (at_rim.pose[0] - 0.012, *at_rim.pose[1:])
+    at_rim.run(2, v=0.1, off=FRONT)
+    assert at_rim.monitor.verdict.code is EventCode.NORMAL
+    verdict = at_rim.run(2, v=0.1, off=FRONT)
+    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, Cause.RIM.value)
+
+
+# -- (c) no map -------------------------------------------------------------------------------------------------------
+
+
+def test_off_without_an_explanation_is_an_edge_after_5_mm(on_panel: Story) -> None:
+    assert on_panel.run(5, v=0.1, off=FL).code is EventCode.NORMAL
+    verdict = on_panel.frame(0.1, off=FL)
+    assert (verdict.code, verdict.cause, verdict.limit) == (EventCode.NEAR_EDGE, Cause.NO_MAP.value, 0.005)
+    assert permits(verdict) == (False, True, False)
+
+
+def test_without_an_estimate_a_seam_is_not_believed_and_nothing_is_permitted(at_seam: Story) -> None:
+    at_seam.has_estimate = False
+    verdict = at_seam.run(6, v=0.1, off=FRONT)
+    assert verdict.code is EventCode.NEAR_EDGE
+    assert verdict.cause == f"{Cause.NO_MAP}; no estimate"
+    assert permits(verdict) == NO_PERMIT
+
+
+def test_a_sensor_over_a_gap_since_before_the_first_estimate_is_explained_by_it(at_seam: Story) -> None:
+    at_seam.has_estimate = False
+    at_seam.pose = (at_seam.pose[0] + 0.002, *at_seam.pose[1:])
+    at_seam.run(10, off=FRONT)
+    at_seam.has_estimate = True
+    assert at_seam.run(9, v=0.1, off=FRONT).code is EventCode.NORMAL
+    assert at_seam.run(2, v=0.1).code is EventCode.NORMAL
+
+
+# -- (d) turns --------------------------------------------------------------------------------------------------------
+
+
+def test_an_edge_met_in_turning_may_be_turned_back(on_panel: Story) -> None:
+    on_panel.run(7, omega=0.5, off=FL)  # 4.4 mm of arc
+    verdict = on_panel.run(6, omega=0.1, off=FL)  # slowly, so that the declaration is fresh
+    assert verdict.code is EventCode.NEAR_EDGE
+    assert permits(verdict) == (False, True, True)
+    on_panel.run(3, omega=-0.5, off=FL)
+    assert on_panel.monitor.verdict.turn
+    on_panel.run(3, omega=-0.5)
+    assert permits(on_panel.monitor.verdict) == ANY_PERMIT
+
+
+def test_turning_on_outwards_bars_the_turn_until_the_sensor_is_on(on_panel: Story) -> None:
+    on_panel.run(20, omega=0.5, off=FL)  # 12.7 mm of arc: 5 to the declaration, 5 allowed
+    verdict = on_panel.run(1, omega=-0.5, off=FL)
+    assert permits(verdict) == (False, True, False)
+    on_panel.run(15, omega=-0.5, off=FL)  # back inside what is allowed: still latched
+    assert not on_panel.monitor.verdict.turn
+    on_panel.run(3, omega=-0.5)
+    assert permits(on_panel.monitor.verdict) == ANY_PERMIT
+
+
+def test_a_sweep_along_a_seam_is_no_edge(cfg: Config, mirror: Mirror) -> None:
+    panel = list(mirror.panels.values())[40]
+    # The corner sensor's circle of 127.3 mm touches the seam from 122 mm on and does not reach its far side.
+    story = Story(cfg, mirror, (panel.x_m, panel.y_m + panel.half_y_m - 0.122, 0.5))
+    # front left: entering at 73.4 deg from +x, leaving at 106.6; 45 deg of them are the heading's
+    story.pose = (*story.pose[:2], 1.281 - pi / 4)
+    assert story.run(57, omega=1.0, off=FL).code is EventCode.NORMAL  # 73 mm of arc
+
+
+def test_a_turn_across_a_seam_allows_its_width(cfg: Config, mirror: Mirror) -> None:
+    panel = list(mirror.panels.values())[40]
+    # Front right points along -y and moves along +x, across the seam that begins under it.
+    story = Story(cfg, mirror, (panel.x_m + panel.half_x_m + 1e-4, panel.y_m, -pi / 4))
+    assert story.run(10, omega=1.0, off=FR).code is EventCode.NORMAL  # 12.7 mm of arc
+    verdict = story.run(2, omega=1.0, off=FR)
+    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, Cause.SEAM.value)
+    assert verdict.limit == pytest.approx(0.014, abs=1e-9)  # m; 10 + 1 + 3 mm
+
+
+@pytest.mark.parametrize(("heading", "before_mm"), [(pi / 4, 9), (1.05, 12)])
+def test_a_path_out_of_one_seam_into_another_is_allowed_both_and_no_more(
+    cfg: Config, mirror: Mirror, heading: float, before_mm: int
+) -> None:
+    panel = list(mirror.panels.values())[40]
+    # Front right enters the seam x = const that many millimetres before the one y = const that crosses it.
+    x, y = panel.x_m + panel.half_x_m + 1e-4, panel.y_m + panel.half_y_m - 1e-3 * before_mm
+    lead_x, lead_y = 0.09 * (cos(heading) + sin(heading)), 0.09 * (sin(heading) - cos(heading))
+    story = Story(cfg, mirror, (x - lead_x, y - lead_y, heading))
+    # 27 mm: one seam alone allows 11 / cos + 3 = 18.6 mm at 45 deg and 25.1 mm at 60
+    assert story.run(27, v=0.1, off=FR).code is EventCode.NORMAL
+    verdict = story.run(12, v=0.1, off=FR)
+    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, Cause.SEAM.value)
+
+
+def test_a_turn_has_a_limit_even_along_a_seam(cfg: Config, mirror: Mirror) -> None:
+    short = with_danger(cfg, turn_travel_limit_m=0.05)
+    panel = list(mirror.panels.values())[40]
+    story = Story(short, mirror, (panel.x_m, panel.y_m + panel.half_y_m - 0.122, 1.281 - pi / 4))
+    assert story.run(39, omega=1.0, off=FL).code is EventCode.NORMAL  # 49.6 mm of arc
+    verdict = story.run(2, omega=1.0, off=FL)
+    assert (verdict.code, verdict.limit) == (EventCode.NEAR_EDGE, 0.05)
+
+
+def test_the_debounce_counts_samples(cfg: Config, mirror: Mirror, at_rim: Story) -> None:
+    slow = Story(with_danger(cfg, debounce_samples=25), mirror, at_rim.pose)
+    assert slow.run(2, v=0.1, off=FRONT).code is EventCode.NORMAL
+    assert slow.run(1, v=0.1, off=FRONT).code is EventCode.NEAR_EDGE
+
+
+def with_danger(cfg: Config, **values: float) -> Config:
+    return cfg.model_copy(update={"danger": cfg.danger.model_copy(update=values)})
+
+
+# -- (g) wheels -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [None, nan, inf])
+def test_a_silent_wheel_permits_nothing_and_counts_as_fastest(on_panel: Story, bad: float | None) -> None:
+    on_panel.run(2)
+    monitor, t = on_panel.monitor, on_panel.t
+    for k in range(1, 18):
+        t_s = t + 0.01 * k
+        enc = [WheelSample(t_s, bad, 0.0)]
+        estimate = Estimate(
+            seq=k, t_s=t_s, x_m=on_panel.pose[0], y_m=on_panel.pose[1], heading_rad=0.0, sigma_m=1e-4, state="driving"
+        )
+        verdict = monitor.step(Frame(100 + k, t_s, enc, [EdgeSample(t_s, 1, 1, 1, 1)]), estimate)
+        if k <= 14:
+            assert permits(verdict) == ANY_PERMIT  # the last sample is held for 150 ms
+    assert (verdict.code, verdict.cause, verdict.signal) == (EventCode.NORMAL, "encoder samples stale", "enc")
+    assert permits(verdict) == NO_PERMIT
+    assert verdict.value == pytest.approx(0.17, abs=1e-9)  # s; sums of time steps
+    t_s += 0.001
+    verdict = monitor.step(Frame(200, t_s, [], [EdgeSample(t_s, 0, 1, 1, 1), EdgeSample(t_s + 1e-3, 0, 1, 1, 1)]), None)
+    assert verdict.code is EventCode.NEAR_EDGE
+    assert verdict.cause.startswith(Cause.SILENT_WHEELS)
+    assert verdict.value > 0.06  # m: 0.17 s at the 0.41 m/s of a corner sensor with one wheel against the other
+
+
+# -- (h) lifted -------------------------------------------------------------------------------------------------------
+
+
+def test_all_four_off_is_lifted_or_fallen(on_panel: Story) -> None:
+    assert on_panel.frame(off=ALL, flags="1111111110").code is EventCode.NORMAL
+    verdict = on_panel.frame(off=ALL, flags="0111111111")
+    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, "lifted or fallen")
+    assert permits(verdict) == NO_PERMIT
+    assert verdict.off == (True, True, True, True)
+    assert on_panel.frame().code is EventCode.NEAR_EDGE
+    assert on_panel.run(2).code is EventCode.NORMAL
+
+
+# -- the centre -------------------------------------------------------------------------------------------------------
+
+
+def test_the_centre_may_not_drive_at_the_rim(at_rim: Story) -> None:
+    x, y, _ = at_rim.pose
+    at_rim.pose = (x + 0.045, y, 0.0)  # 46 mm from the rim, and the sensors see nothing
+    assert at_rim.frame(0.1).code is EventCode.NORMAL
+    verdict = at_rim.run(3, v=0.1)
+    assert (verdict.code, verdict.cause, verdict.signal) == (EventCode.NEAR_EDGE, CENTRE, "estimate")
+    assert permits(verdict) == (False, True, False)
+    assert verdict.off == (True, True, False, False)
+    assert verdict.value < verdict.limit == pytest.approx(0.0453, abs=1e-9)  # m; half the lead and three sigma
+    assert at_rim.run(15, v=-0.1).code is EventCode.NORMAL
+
+
+def test_the_centre_may_leave_the_rim_in_either_direction(at_rim: Story) -> None:
+    x, y, _ = at_rim.pose
+    at_rim.pose = (x + 0.06, y, pi)
+    assert at_rim.run(3, v=0.1).code is EventCode.NORMAL
+    assert at_rim.run(30).code is EventCode.NORMAL  # at rest
+    verdict = at_rim.run(3, v=-0.1)
+    assert permits(verdict) == (True, False, False)
+    assert verdict.off == (False, False, True, True)
+    at_rim.has_estimate = False
+    verdict = at_rim.run(20)
+    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, f"{CENTRE}; no estimate")
+    assert permits(verdict) == NO_PERMIT
+
+
+def test_the_centre_needs_wheels_to_tell_its_direction(at_rim: Story) -> None:
+    x, y, _ = at_rim.pose
+    at_rim.run(1)
+    at_rim.pose, at_rim.has_wheels = (x + 0.06, y, 0.0), False
+    assert at_rim.run(12, v=0.001).code is EventCode.NORMAL
+
+
+# -- stale data -------------------------------------------------------------------------------------------------------
+
+
+def test_a_stale_estimate_permits_nothing_and_ends_by_itself(on_panel: Story) -> None:
+    on_panel.run(2)
+    on_panel.has_estimate = False
+    verdict = on_panel.run(1)
+    assert (verdict.code, verdict.cause, verdict.signal) == (EventCode.NORMAL, "no estimate", "estimate")
+    assert permits(verdict) == NO_PERMIT
+    on_panel.has_estimate = True
+    assert permits(on_panel.run(1)) == ANY_PERMIT
+
+
+@pytest.mark.parametrize("field_name", ["t_s", "x_m", "y_m", "heading_rad", "sigma_m"])
+@pytest.mark.parametrize("value", [nan, inf, -inf])
+def test_an_estimate_that_is_not_finite_is_none(on_panel: Story, field_name: str, value: float) -> None:
+    on_panel.run(1)
+    fields = {"t_s": on_panel.t, "x_m": 0.0, "y_m": 0.0, "heading_rad": 0.0, "sigma_m": 1e-4, field_name: value}
+    estimate = Estimate(seq=1, state="held", **fields)
+    t_s = on_panel.t + 1e-3
+    frame = Frame(9, t_s, [WheelSample(t_s, 0.0, 0.0)], [EdgeSample(t_s, 1, 1, 1, 1)])
+    verdict = on_panel.monitor.step(frame, estimate)
+    assert (verdict.cause, verdict.value) == ("estimate not finite", 0.15)
+    assert permits(verdict) == NO_PERMIT
+    assert not on_panel.monitor.at_base_or_held
+
+
+@pytest.mark.parametrize(("age_s", "expected"), [(0.149, ANY_PERMIT), (0.151, NO_PERMIT), (-0.151, NO_PERMIT)])
+def test_the_age_of_an_estimate(on_panel: Story, age_s: float, expected: tuple[bool, bool, bool]) -> None:
+    on_panel.run(20)
+    x, y, heading = on_panel.pose
+    t_s = on_panel.t + 1e-3
+    estimate = Estimate(seq=1, t_s=t_s - age_s, x_m=x, y_m=y, heading_rad=heading, sigma_m=1e-4, state="driving")
+    frame = Frame(99, t_s, [WheelSample(t_s, 0.0, 0.0)], [EdgeSample(t_s, 1, 1, 1, 1)])
+    verdict = on_panel.monitor.step(frame, estimate)
+    assert permits(verdict) == expected
+    assert verdict.cause == ("" if expected[0] else "estimate stale")
+
+
+def test_every_value_is_finite_before_anything_is_heard(on_panel: Story) -> None:
+    edge = [EdgeSample(1e-3 * k, 0, 0, 0, 1) for k in range(1, 4)]
+    verdict = on_panel.monitor.step(Frame(1, 0.003, [], edge), None)
+    assert verdict.cause == f"{Cause.SILENT_WHEELS}; encoder samples stale"
+    assert verdict.value == pytest.approx(0.061, abs=1e-3)  # m: 0.15 s at 0.41 m/s
+    assert unpack(pack("verdict", verdict_message(verdict)))[1] == verdict_message(verdict)
+
+
+def test_edge_samples_that_stay_away_permit_nothing(on_panel: Story) -> None:
+    on_panel.run(1)
+    for k in range(1, 18):
+        t_s = on_panel.t + 0.01 * k
+        estimate = Estimate(seq=k, t_s=t_s, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-4, state="driving")
+        verdict = on_panel.monitor.step(Frame(100 + k, t_s, [WheelSample(t_s, 0.0, 0.0)], []), estimate)
+    assert (verdict.cause, verdict.signal) == ("edge samples stale", "edge")
+    assert permits(verdict) == NO_PERMIT
+
+
+def test_no_edge_sample_ever_permits_nothing(on_panel: Story) -> None:
+    estimate = Estimate(seq=0, t_s=0.0, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-4, state="driving")
+    verdict = on_panel.monitor.step(Frame(1, 0.01, [WheelSample(0.01, 0.0, 0.0)], []), estimate)
+    assert (verdict.cause, verdict.value) == ("no edge samples", 0.15)
+    assert permits(verdict) == NO_PERMIT
+
+
+def test_no_frame_permits_nothing_whatever_the_code(at_rim: Story) -> None:
+    verdict = at_rim.monitor.stale(7, 1.5)
+    assert (verdict.seq, verdict.t_s, verdict.code, verdict.cause) == (7, 1.5, EventCode.NORMAL, "no sensors frame")
+    assert permits(verdict) == NO_PERMIT
+    at_rim.monitor.emergency("fire", "a")
+    assert at_rim.monitor.stale(7, 1.5).code is EventCode.ABORTED
+    at_rim.run(2, v=0.1, off=FRONT)
+    assert at_rim.monitor.stale(7, 1.5).code is EventCode.NEAR_EDGE
+
+
+def test_a_frame_that_is_not_new_changes_nothing(at_rim: Story) -> None:
+    at_rim.run(2)
+    last = at_rim.monitor.verdict
+    t_s = at_rim.t
+    again = Frame(2, t_s, [WheelSample(t_s, 9.0, 9.0)], [EdgeSample(t_s + 1e-3 * k, 0, 0, 0, 0) for k in range(5)])
+    assert at_rim.monitor.step(again, None) is last
+    assert at_rim.monitor._edges.is_idle
+
+
+def test_edge_samples_that_go_back_in_time_are_dropped(on_panel: Story) -> None:
+    on_panel.run(2)
+    t_s = on_panel.t
+    old = [EdgeSample(t_s - 5e-3, 0, 0, 0, 0), EdgeSample(t_s - 4e-3, 0, 0, 0, 0)]
+    frame = Frame(9, t_s + 1e-3, [WheelSample(t_s + 1e-3, 0.0, 0.0)], [*old, EdgeSample(t_s + 1e-3, 1, 1, 1, 1)])
+    assert on_panel.monitor.step(frame, None).code is EventCode.NORMAL
+    assert on_panel.monitor.episodes_opened == dict.fromkeys(Corner, 0)
+
+
+def test_a_value_that_is_neither_0_nor_1_counts_as_off(on_panel: Story) -> None:
+    on_panel.run(1)
+    t_s = on_panel.t + 1e-3
+    on_panel.monitor.step(Frame(9, t_s, [WheelSample(t_s, 0.0, 0.0)], [EdgeSample(t_s, 2, 1, 1, 1)]), None)
+    assert on_panel.monitor.episodes_opened[Corner.FRONT_LEFT] == 1
+
+
+def test_reset_begins_a_new_session_and_keeps_the_abort(at_rim: Story) -> None:
+    at_rim.monitor.emergency("fire", "a")
+    at_rim.run(2, v=0.1, off=FRONT)
+    at_rim.monitor.reset()
+    assert at_rim.monitor.code is EventCode.ABORTED
+    assert permits(at_rim.monitor.verdict) == NO_PERMIT
+    at_rim.seq, at_rim.t = 0, 0.0
+    assert permits(at_rim.run(1)) == ANY_PERMIT
+
+
+# -- emergencies ------------------------------------------------------------------------------------------------------
+
+
+def test_an_emergency_is_code_2_with_motion_permitted(on_panel: Story) -> None:
+    assert on_panel.monitor.emergency("fire", "a", "smoke") is None
+    verdict = on_panel.run(1)
+    assert (verdict.code, verdict.cause, verdict.signal) == (EventCode.ABORTED, "emergency: fire", "emergency:fire")
+    assert permits(verdict) == ANY_PERMIT
+    assert on_panel.monitor.clear("a", at_base_or_held=True) is None
+    assert on_panel.run(1).code is EventCode.NORMAL
+
+
+def test_an_edge_outranks_an_abort(at_rim: Story) -> None:
+    at_rim.monitor.emergency("fire", "a")
+    verdict = at_rim.run(2, v=0.1, off=FRONT)
+    assert verdict.code is EventCode.NEAR_EDGE
+    assert permits(verdict) == (False, True, False)
+    verdict = at_rim.run(2, v=-0.1)
+    assert verdict.code is EventCode.ABORTED
+    assert permits(verdict) == ANY_PERMIT
+
+
+def test_a_stale_estimate_holds_an_aborted_robot_too(on_panel: Story) -> None:
+    on_panel.monitor.emergency("power", "a")
+    on_panel.has_estimate = False
+    verdict = on_panel.run(1)
+    assert (verdict.code, verdict.cause) == (EventCode.ABORTED, "no estimate")
+    assert permits(verdict) == NO_PERMIT
+
+
+def test_mains_state_tells_whether_an_emergency_may_be_cleared(on_panel: Story) -> None:
+    on_panel.run(1)
+    assert not on_panel.monitor.at_base_or_held
+    on_panel.state = "held"
+    on_panel.run(1)
+    assert on_panel.monitor.at_base_or_held
+    on_panel.has_estimate = False
+    on_panel.run(1)
+    assert not on_panel.monitor.at_base_or_held
+
+
+# -- map and odometry -------------------------------------------------------------------------------------------------
+
+
+def test_the_seams_are_those_of_the_mirror(mirror: Mirror) -> None:
+    edge_map = EdgeMap(mirror)
+    for panel in mirror.panels.values():
+        for dx, dy in ((1, 0.3), (-1, 0.3), (0.3, 1), (0.3, -1)):
+            x = panel.x_m + dx * (panel.half_x_m + 0.002 * (abs(dx) == 1))
+            y = panel.y_m + dy * (panel.half_y_m + 0.002 * (abs(dy) == 1))
+            expected = mirror.nearest_seam(x, y)
+            is_interior = mirror.rim.signed_distance_m(x, y) > 0.0
+            found = edge_map.seam_at((x, y), 0.001)
+            assert (found is not None) == is_interior
+            if found is not None and expected is not None:
+                assert found.axis == expected.axis
+                assert found.distance_m == pytest.approx(expected.distance_m, abs=1e-9)  # m; sums of millimetres
+            assert found is None or edge_map.seam_at((x, y), 0.001, not_axis=found.axis) is None
+
+
+def test_the_rim_is_ahead_only_in_the_direction_of_motion(mirror: Mirror) -> None:
+    edge_map = EdgeMap(mirror)
+    right = max(mirror.panels.values(), key=lambda panel: (panel.x_m, -abs(panel.y_m)))
+    place = right.x_m + right.half_x_m - 0.012, right.y_m
+    assert edge_map.is_rim_ahead(place, (1.0, 0.0), 0.013, 0.0)
+    assert not edge_map.is_rim_ahead(place, (1.0, 0.0), 0.011, 0.0)
+    assert not edge_map.is_rim_ahead(place, (0.0, 1.0), 0.013, 0.011)
+    assert edge_map.is_rim_ahead(place, (0.0, 1.0), 0.013, 0.0125)
+    assert not edge_map.is_rim_ahead((0.0, 0.0), (1.0, 0.0), 0.013, 0.0125)
+
+
+def test_odometry_of_an_arc_forwards_and_backwards() -> None:
+    track = WheelTrack(0.03, 0.15, 0.15, 10.0)
+    v, omega = 0.1, 0.5
+    right, left = (v + 0.5 * omega * 0.15) / 0.03, (v - 0.5 * omega * 0.15) / 0.03
+    track.push([WheelSample(k * 1e-3, right, left) for k in range(1001)])
+    track.update(1.0)
+    start = (1.0, 2.0, 0.3)
+    end = pose_at(track, 0.9004, 0.1003, start)
+    # chord of an arc: 2 R sin(angle / 2), R = v / omega
+    angle = omega * 0.8001
+
+    chord = 2.0 * v / omega * sin(0.5 * angle)
+    expected = (1.0 + chord * cos(0.3 + 0.5 * angle), 2.0 + chord * sin(0.3 + 0.5 * angle), 0.3 + angle)
+    assert end == pytest.approx(expected, abs=1e-9)  # midpoint headings over 1 ms are exact to 1e-8 of the path
+    assert pose_at(track, 0.1003, 0.9004, end) == pytest.approx(start, abs=1e-9)
+
+
+def test_odometry_interpolates_and_then_holds_the_velocity() -> None:
+    track = WheelTrack(0.03, 0.15, 0.15, 10.0)
+    track.push([WheelSample(0.0, 0.0, 0.0), WheelSample(0.1, 2.0, 2.0)])
+    track.update(0.1)
+    odometry = Odometry(track, 0.05)
+    odometry.advance_to(0.2)
+    # 0.03 m/s at 0.05 s, 0.06 at 0.1, held to 0.2
+    assert odometry.x_m == pytest.approx(0.045 * 0.05 + 0.06 * 0.1, abs=1e-12)  # exact but for rounding
+    assert (odometry.y_m, odometry.heading_rad) == (0.0, 0.0)
+
+
+def test_a_track_reads_each_wheel_on_its_own_and_forgets_the_distant_past() -> None:
+    track = WheelTrack(0.03, 0.15, 0.15, 0.3)
+    track.push([WheelSample(0.0, 1.0, None), WheelSample(0.001, None, 1.0), WheelSample(0.0005, 9.0, None)])
+    track.update(0.001)
+    assert [knot.v_m_s for knot in track.knots] == [pytest.approx(0.03)]
+    assert track.silence_s(0.15) == 0.0
+    assert track.silence_s(0.16) == pytest.approx(0.16)
+    for k in range(4 * KNOTS_KEPT):
+        track.push([WheelSample(1.0 + k * 1e-3, 1.0, 1.0)])
+        track.update(1.0 + k * 1e-3)
+    assert len(track.knots) <= 2 * KNOTS_KEPT
+    track.push([WheelSample(100.0, 1.0, 1.0)])
+    track.push([WheelSample(101.0, 1.0, 1.0)])
+    track.update(101.0)
+    assert track.knots[-2].t_s < 100.0  # beyond the reach: not read
+
+
+def test_odometry_survives_the_tracks_forgetting() -> None:
+    track = WheelTrack(0.03, 0.15, 0.15, 0.3)
+    track.push([WheelSample(0.0, 1.0, 1.0)])
+    track.update(0.0)
+    odometry = Odometry(track, 0.0)
+    for k in range(1, 5 * KNOTS_KEPT):
+        track.push([WheelSample(k * 1e-3, 1.0, 1.0)])
+        track.update(k * 1e-3)
+        odometry.advance_to(k * 1e-3)
+    assert odometry.x_m == pytest.approx(0.03 * 1e-3 * (5 * KNOTS_KEPT - 1), abs=1e-9)  # sums of 2,559 steps

@@ -1,0 +1,361 @@
+"""The client's end of the robot link against a scripted robot."""
+
+import asyncio
+import socket
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from ccatp.errors import ConfigError, ExitStatus
+from ccatp.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout, WrongProtocol, read_key
+from ccatp.wire.robot import Sensors, encode_sensors, join_mac
+
+NONCE = "ab" * 16
+HELLO = (
+    b'{"type":"hello","protocol":"ccatp-robot/1","boot":1,"nonce":"%b","auth":"none","lockstep":true,'
+    b'"frame_hz":100.0,"ttl_s":0.25,"robot":{"wheel_radius_m":0.03,"wheel_base_m":0.15,'
+    b'"edge_sensors_m":[[0.09,0.09],[0.09,-0.09],[-0.09,0.09],[-0.09,-0.09]],"puck_m":[0,0,0.05],'
+    b'"max_wheel_rad_s":8.0,"fan_floor":0.0}}\n' % NONCE.encode()
+)
+HELLO_HMAC = HELLO.replace(b'"none"', b'"hmac-sha256"')
+JOINED = b'{"type":"joined","role":"controller","session":1}\n'
+DEADLINE_S = 2.0  # what never happens in a good run may take this long in a bad one
+
+Script = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
+
+
+def frame(seq: int) -> bytes:
+    return encode_sensors(seq, seq / 100.0, (), (), (), None, (0.0, 0.0), 1.0, (-1, 0.0, 0.0, True), ())
+
+
+class Seen:
+    """What a link told."""
+
+    def __init__(self) -> None:
+        self.frames: list[int] = []
+        self.lines: list[bytes] = []
+        self.lost: list[str] = []
+        self.changed = asyncio.Event()
+
+    def on_sensors(self, sensors: Sensors, line: bytes) -> None:
+        self.frames.append(sensors.seq)
+        self.lines.append(line)
+        self.changed.set()
+
+    def on_lost(self, reason: str) -> None:
+        self.lost.append(reason)
+        self.changed.set()
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        async with asyncio.timeout(DEADLINE_S):
+            while not condition():
+                self.changed.clear()
+                await self.changed.wait()
+
+
+@asynccontextmanager
+async def robot(script: Script, *, key: bytes | None = None) -> AsyncIterator[tuple[RobotLink, Seen]]:
+    """A robot that runs ``script`` for the one client it gets, and a link to it."""
+    done: list[asyncio.Task[None]] = []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        done.append(task)
+        try:
+            await script(reader, writer)
+        finally:
+            writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    seen = Seen()
+    link = RobotLink(
+        host="127.0.0.1",
+        port=server.sockets[0].getsockname()[1],
+        role="controller",
+        client="test",
+        key=key,
+        on_sensors=seen.on_sensors,
+        on_lost=seen.on_lost,
+    )
+    try:
+        yield link, seen
+    finally:
+        link.close()
+        server.close()
+        await server.wait_closed()
+        for task in done:
+            task.cancel()
+        await asyncio.gather(*done, return_exceptions=True)
+
+
+def after_join(*pieces: bytes, then: Script | None = None, hello: bytes = HELLO, joined: bytes = JOINED) -> Script:
+    async def script(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(hello)
+        await reader.readline()
+        writer.write(joined)
+        for piece in pieces:
+            writer.write(piece)
+            await writer.drain()
+        if then is not None:
+            await then(reader, writer)
+        else:
+            await reader.read()
+
+    return script
+
+
+async def test_join_frames_and_commands() -> None:
+    received: asyncio.Queue[bytes] = asyncio.Queue()
+
+    async def listen(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while line := await reader.readline():
+            received.put_nowait(line)
+
+    async with robot(after_join(frame(0), frame(1), then=listen)) as (link, seen):
+        hello = await link.connect(DEADLINE_S)
+        assert (hello.boot, hello.lockstep, hello.robot.wheel_radius_m) == (1, True, 0.03)
+        await seen.until(lambda: seen.frames == [0, 1])
+        assert seen.lines == [frame(0)[:-1], frame(1)[:-1]]
+        link.send_drive(4, 1, 3.5, -0.25)
+        link.send_permit(5, 1, True, False, True)
+        link.send_fans(6, (0.8, 0.75))
+        link.send_raw(b"as it is\n")
+        async with asyncio.timeout(DEADLINE_S):
+            assert [await received.get() for _ in range(4)] == [
+                b'{"type":"drive","seq":4,"ack":1,"wr":3.5,"wl":-0.25}\n',
+                b'{"type":"permit","seq":5,"ack":1,"forward":true,"reverse":false,"turn":true}\n',
+                b'{"type":"fans","seq":6,"duty":[0.8,0.75]}\n',
+                b"as it is\n",
+            ]
+    assert seen.lost == []  # closed by us
+    link.send_drive(9, 1, 0.0, 0.0)  # after the end nothing happens
+
+
+async def test_socket_options() -> None:
+    async with robot(after_join()) as (link, _):
+        await link.connect(DEADLINE_S)
+        assert link._transport is not None
+        peer = link._transport.get_extra_info("socket")
+        assert peer.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+        assert peer.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+
+
+async def test_a_drive_that_is_not_finite_is_not_sent() -> None:
+    async with robot(after_join()) as (link, _):
+        await link.connect(DEADLINE_S)
+        with pytest.raises(ValueError, match="must be finite"):
+            link.send_drive(1, 1, float("nan"), 0.0)
+
+
+async def test_repeated_and_older_frames_are_dropped_and_counted() -> None:
+    pieces = [frame(k) for k in (0, 1, 1, 0, 3, 2, 4)]
+    async with robot(after_join(*pieces)) as (link, seen):
+        await link.connect(DEADLINE_S)
+        await seen.until(lambda: seen.frames == [0, 1, 3, 4])
+    assert link.counts["repeated_frames"] == 3
+
+
+async def test_bad_lines_and_unknown_types_are_counted_and_dropped() -> None:
+    bad = b'garbage\n{"type":"sensors","seq":1}\n{"type":"weather","t":1}\n'
+    async with robot(after_join(bad + frame(7), JOINED, frame(8))) as (link, seen):
+        await link.connect(DEADLINE_S)
+        await seen.until(lambda: seen.frames == [7, 8])
+    assert (link.counts["bad_lines"], link.counts["unknown_types"], link.counts["unexpected"]) == (2, 1, 1)
+
+
+async def test_frames_in_single_bytes() -> None:
+    stream = frame(0) + frame(1)
+    async with robot(after_join(*[bytes([byte]) for byte in stream])) as (link, seen):
+        await link.connect(DEADLINE_S)
+        await seen.until(lambda: seen.frames == [0, 1])
+
+
+@pytest.mark.parametrize(
+    ("flood", "reason"),
+    [(b"garbage\n" * 21, "too many bad lines"), (b"x" * 8193, "line over the limit")],
+)
+async def test_a_robot_that_talks_nonsense_is_left(flood: bytes, reason: str) -> None:
+    async with robot(after_join(frame(0) + flood + frame(1))) as (link, seen):
+        await link.connect(DEADLINE_S)
+        await seen.until(lambda: bool(seen.lost))
+        assert len(seen.lost) == 1
+        assert reason in seen.lost[0]
+        assert seen.frames == [0]
+
+
+async def test_a_lost_connection_is_told_once() -> None:
+    async def hang_up(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.close()
+
+    async with robot(after_join(frame(0), then=hang_up)) as (link, seen):
+        await link.connect(DEADLINE_S)
+        await seen.until(lambda: bool(seen.lost))
+        assert seen.lost == ["the robot closed the connection"]
+
+
+async def test_an_error_in_the_callback_ends_the_session_aloud() -> None:
+    async with robot(after_join(frame(0))) as (link, seen):
+        asyncio.get_running_loop().set_exception_handler(lambda *_: None)
+
+        def fail(sensors: Sensors, line: bytes) -> None:
+            raise RuntimeError("surprise")
+
+        link._on_sensors = fail
+        await link.connect(DEADLINE_S)
+        await seen.until(lambda: bool(seen.lost))
+        assert "surprise" in seen.lost[0]
+
+
+# -- joining that fails -----------------------------------------------------------------------------------------------
+
+
+async def test_nobody_listens(free_port: int) -> None:
+    seen = Seen()
+    link = RobotLink(
+        host="127.0.0.1",
+        port=free_port,
+        role="monitor",
+        client="test",
+        key=None,
+        on_sensors=seen.on_sensors,
+        on_lost=seen.on_lost,
+    )
+    with pytest.raises(
+        RobotLinkError, match=f"cannot reach the robot at 127.0.0.1:{free_port}.*is it running"
+    ) as caught:
+        await link.connect(DEADLINE_S)
+    assert caught.value.exit_status == ExitStatus.UNREACHABLE
+    assert seen.lost == []
+
+
+async def connect_error(script: Script, error: type[Exception], match: str, *, key: bytes | None = None) -> Exception:
+    async with robot(script, key=key) as (link, seen):
+        with pytest.raises(error, match=match) as caught:
+            await link.connect(0.3 if error is RobotTimeout else DEADLINE_S)
+        assert seen.lost == []
+        return caught.value
+
+
+async def say(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, text: bytes) -> None:
+    writer.write(text)
+    await writer.drain()
+
+
+@pytest.mark.parametrize("reason", ["role taken", "bad mac", "bad join", "busy", "full moon"])
+async def test_refused(reason: str) -> None:
+    refusal = b'{"type":"refused","reason":"%b"}\n' % reason.encode()
+    error = await connect_error(after_join(joined=refusal), RobotRefused, f"refused the role controller: {reason}")
+    assert isinstance(error, RobotRefused)
+    assert error.reason == reason
+
+
+async def test_refused_without_having_been_asked() -> None:
+    async def busy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await say(reader, writer, HELLO + b'{"type":"refused","reason":"busy"}\n')
+
+    await connect_error(busy, RobotRefused, "busy; too many connections")
+
+
+async def test_another_version() -> None:
+    script = after_join(hello=HELLO.replace(b"robot/1", b"robot/2"))
+    await connect_error(script, WrongProtocol, "speaks ccatp-robot/2, this program ccatp-robot/1")
+
+
+async def test_something_that_is_no_robot() -> None:
+    async def http(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await say(reader, writer, b"HTTP/1.1 400 Bad Request\r\nConnection: close\r\n\r\n")
+
+    await connect_error(http, WrongProtocol, "no robot answers")
+
+
+async def test_hung_up_on() -> None:
+    async def nothing(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        return
+
+    await connect_error(nothing, RobotLinkError, "did not let us join: the robot closed the connection")
+
+
+async def test_silence() -> None:
+    async def silence(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.read()
+
+    await connect_error(silence, RobotTimeout, "no answer from the robot at .* within 0.3 s")
+
+
+async def test_frames_before_the_join_is_over_are_not_served() -> None:
+    async with robot(after_join(frame(5), hello=HELLO + frame(4))) as (link, seen):
+        await link.connect(DEADLINE_S)
+        await seen.until(lambda: seen.frames == [5])
+    assert link.counts["unexpected"] == 1
+
+
+async def test_joined_for_another_role_does_not_count() -> None:
+    wrong = JOINED.replace(b"controller", b"monitor")
+    await connect_error(after_join(joined=wrong), RobotTimeout, "no answer")
+
+
+# -- the key ----------------------------------------------------------------------------------------------------------
+
+
+async def test_the_key_is_used_where_the_robot_asks_for_it() -> None:
+    joins: list[bytes] = []
+
+    async def script(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(HELLO_HMAC)
+        joins.append(await reader.readline())
+        writer.write(JOINED)
+        await reader.read()
+
+    async with robot(script, key=b"secret") as (link, _):
+        await link.connect(DEADLINE_S)
+    mac = join_mac(b"secret", NONCE, "controller")
+    assert joins == [b'{"type":"join","role":"controller","client":"test","mac":"%b"}\n' % mac.encode()]
+
+
+async def test_a_robot_that_asks_for_a_key_we_do_not_have() -> None:
+    await connect_error(after_join(hello=HELLO_HMAC), RobotLinkError, "asks for a key: name its file")
+
+
+def test_read_key(tmp_path: Path) -> None:
+    assert read_key("") is None
+    (tmp_path / "key").write_bytes(b" secret\n")
+    assert read_key(str(tmp_path / "key")) == b"secret"
+    (tmp_path / "empty").write_bytes(b"\n")
+    with pytest.raises(ConfigError, match=r"robot\.key_file: .*empty is empty"):
+        read_key(str(tmp_path / "empty"))
+    with pytest.raises(ConfigError, match=r"robot\.key_file: cannot read .*No such file"):
+        read_key(str(tmp_path / "none"))
+
+
+# -- a robot that does not read ---------------------------------------------------------------------------------------
+
+
+async def test_commands_do_not_pile_up() -> None:
+    resume = asyncio.Event()
+    lines: list[bytes] = []
+
+    async def stall(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        transport = writer.transport
+        assert isinstance(transport, asyncio.ReadTransport)
+        transport.pause_reading()
+        await resume.wait()
+        transport.resume_reading()
+        lines.extend((await reader.read()).splitlines())
+
+    async with robot(after_join(then=stall)) as (link, _):
+        await link.connect(DEADLINE_S)
+        await asyncio.sleep(0)  # let the robot stop reading
+        async with asyncio.timeout(10.0):
+            seq = 0
+            while link.counts["unsent"] < 1000:
+                link.send_drive(seq, 0, 1.0, 1.0)
+                link.send_permit(seq, 0, True, True, True)
+                seq += 1
+                if seq % 1000 == 0:
+                    await asyncio.sleep(0)
+        assert link._transport is not None
+        assert link._transport.get_write_buffer_size() < 3 * 4096
+        resume.set()
