@@ -210,8 +210,8 @@ async def _watch(
         is_over = main.held_frames > 60
         if is_over:
             _flush(context, endpoints)
-        # What is on its way when the robot stands must be heard too.
-        while (received := subscriber.receive(0.2 if is_over else 0.0)) is not None:
+            await asyncio.sleep(0.2)  # what is on its way when the robot stands must be heard too
+        while (received := subscriber.receive()) is not None:
             message = received[1]
             if isinstance(message, Truth):
                 rows.update({row[0]: (row[8], row[9]) for row in message.rows})

@@ -212,9 +212,12 @@ def test_handover_keeps_the_deck_pose() -> None:
 
 
 def test_handover_by_itself_is_continuous() -> None:
-    # A fix that lands 1 nm beyond the seam changes the panel and nothing else.
+    # A fix that lands 1 nm beyond the seam changes the panel and nothing else. Far from the mirror's centre, where the
+    # two panels' frames are turned against each other.
     mirror = mirror_of()
-    start = mirror.panel_pose(PanelId(5, 5), DeckPose(mirror.panels[PanelId(5, 5)].x_m + 0.3356, 0.1, 0.2))
+    panel = PanelId(2, 2)
+    found = mirror.panels[panel]
+    start = mirror.panel_pose(panel, DeckPose(found.x_m + 0.3356, found.y_m + 0.1, 0.2))
     localizer = make(start)
     localizer.step(0.0, [], [], [])
     before = localizer.deck_pose
@@ -223,10 +226,13 @@ def test_handover_by_itself_is_continuous() -> None:
     target = DeckPose(seam.position_m + 1e-9, before.y_m, before.heading_rad)
     world = Truth(target, still, still)
     localizer.fuse_fix(world.fix(1e-9))
-    assert localizer.pose.panel == PanelId(5, 6)
+    assert localizer.pose.panel == PanelId(2, 3)
     distance, heading = errors(localizer, target)
     assert distance < 1e-9
-    assert abs(heading) < 1e-9
+    # Before the hand-over the fix moves the robot 10 um along the old panel, whose heading turns by some 1e-8 against
+    # the deck's; the frames of the two panels differ by 1e-4.
+    assert abs(heading) < 1e-7
+    assert abs(difference(localizer.pose.heading_rad, start.heading_rad)) > 1e-5
     assert localizer.heading_sigma_rad == pytest.approx(config().localizer.start_heading_sigma_rad)
 
 
@@ -630,6 +636,9 @@ def test_a_jump_of_the_clock_does_not_move_the_pose(shift: float) -> None:
     assert localizer.counts["resyncs"] == 1
     assert errors(localizer, before)[0] < 1e-6
     assert localizer.t_s == later[-1][0] + shift
+    assert localizer.counts["backward"] == 0
+    assert localizer.innovation is not None
+    assert localizer.innovation.size == 22  # the samples of the new time base count
     assert localizer.position_sigma_m > 0.05 * 0.1  # what may have happened meanwhile
     fix = world.fix()
     assert localizer.fuse_fix(Fix(fix.t_s + shift, *(getattr(fix, f) for f in list(Fix.__slots__)[1:]))) < 0.002
@@ -681,3 +690,5 @@ def test_late_early_and_repeated_samples_are_counted() -> None:
     localizer.step(0.51, [ImuSample(0.2, 0.0, 0.0), ImuSample(0.6, 0.0, 0.0)], [*frames[-1][2][-2:]], [])
     assert (localizer.counts["late"], localizer.counts["ahead"], localizer.counts["duplicate"]) == (1, 1, 4)
     assert localizer.counts["backward"] == 0
+    localizer.step(0.52, [], [WheelSample(0.515, 0.0, 0.0), WheelSample(0.53, 0.0, 0.0)], [])
+    assert localizer.counts["ahead"] == 3  # both wheels

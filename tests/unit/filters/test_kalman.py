@@ -160,6 +160,15 @@ def test_covariance_stays_symmetric_positive_definite_where_the_printed_form_doe
     assert not np.array_equal(printed, printed.T) or np.linalg.eigvalsh(printed)[0] <= 0.0
 
 
+def test_prediction_is_symmetric_to_the_last_bit() -> None:
+    rng = np.random.default_rng(3)
+    F, Q = rng.normal(size=(4, 4)), 0.1 * np.eye(4)
+    kf = KalmanFilter(np.zeros(4), np.eye(4))
+    for _ in range(10):
+        kf.predict(F, Q)
+        np.testing.assert_array_equal(kf.covariance, kf.covariance.T)
+
+
 def test_consistency_of_the_normalised_innovation() -> None:
     # 400 updates of 2 rows: the mean NIS is 2 within 4 sigma = 4 * 2 / sqrt(400).
     rng = np.random.default_rng(7)

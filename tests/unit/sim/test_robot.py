@@ -179,6 +179,20 @@ def test_it_falls_when_its_centre_passes_the_rim_and_never_moves_again(config: C
     assert frame(robot).faults == []
 
 
+def test_the_distance_to_the_rim_is_never_missed_after_a_long_drive_inside(config: Config, mirror: Mirror) -> None:
+    """It is measured anew only when the distance driven could have brought it near."""
+    robot = boot(config, mirror)
+    plant = robot.world.plant
+    plant.x_m = plant.y_m = 0.0  # far from every rim
+    robot.world._rim_bound_m = mirror.rim.signed_distance_m(0.0, 0.0)
+    while not robot.world.is_fallen:
+        assert robot.t_s < 60.0
+        drive(robot, 8.0, 8.0, 1)
+        assert mirror.rim.signed_distance_m(plant.x_m, plant.y_m) > -0.003  # a frame of 2.4 mm
+    drive(robot, 8.0, 8.0, 2)
+    assert not plant.is_moving
+
+
 def test_clearance_and_mask_of_the_truth_are_those_of_the_sensors(config: Config, mirror: Mirror) -> None:
     robot = boot(config, mirror)
     seen = set()

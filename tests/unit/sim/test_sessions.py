@@ -304,12 +304,16 @@ def test_a_lost_session_holds_at_the_next_frame(rig: Callable[..., Rig]) -> None
 def test_sequence_numbers_start_anew_with_a_session(rig: Callable[..., Rig]) -> None:
     r = rig(lockstep=False)
     first = r.client(JOIN)
+    first.send(b'{"type":"fans","seq":5000,"duty":[0.5,0.5]}\n')
     first.drive(5000, 0)
     first.drive(4999, 0, -3.0, -3.0)
     assert r.server.counts["stale"] == 1
     r.server.lost(first.session)
     second = r.client(JOIN)
     second.drive(0, 0)
+    first_duty = r.robot.fans.duty
+    second.send(b'{"type":"fans","seq":0,"duty":[0.3,0.4]}\n')
+    assert first_duty != (0.3, 0.4) == r.robot.fans.duty
     r.run(0.01)
     assert second.messages[-1]["cmd"]["seq"] == 0
     assert not r.robot.rules.is_held
@@ -387,6 +391,13 @@ def test_a_lost_monitor_stops_simulated_time_until_another_joins(rig: Callable[.
     controller.drive(0, 0)
     r.server.lost(monitor.session)
     controller.drive(1, 1)
+    assert r.robot.seq == 1
+    half = r.client(JOIN_MONITOR)
+    r.server.lost(controller.session)
+    half.permit(0, 1)
+    r.server.lost(half.session)  # its answer goes with it
+    controller = r.client(JOIN)
+    controller.drive(0, 1)
     assert r.robot.seq == 1
     again = r.client(JOIN_MONITOR)
     assert again.kinds == ["hello", "joined", "1"]
