@@ -6,7 +6,7 @@ from enum import StrEnum
 # An observatory has a handful at a time; a peer that floods the latch must not fill the memory.
 MAX_ACTIVE = 256
 MAX_CLEARED = 1024
-# The mission's states (``ccatp.mission_states``) in which the robot stands at base or is held.
+# The mission's states (``ccatp.surveying.states``) in which the robot stands at base or is held.
 AT_BASE_OR_HELD = frozenset({"idle", "held", "done"})
 
 

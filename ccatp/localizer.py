@@ -8,14 +8,14 @@ import numpy as np
 
 from ccatp.angles import difference, rotate, wrap_pi
 from ccatp.config.models import LocalizerConfig, RobotConfig
-from ccatp.crossing import CrossingDetector, HeadingFix, HeadingGate, Transition
 from ccatp.filters.base import Filter, FilterDiverged, FloatArray, Innovation
-from ccatp.fixes import check_fix, foot_of_fix
-from ccatp.intake import BACKWARD_LIMIT, MAX_FRAME_STEP_S, FrameClock, FrameKind, SampleIntake
-from ccatp.measurements import OMEGA, STATES, THETA, ConstantAcceleration, MeasurementBuilder, Stack, V
+from ccatp.localization.crossing import CrossingDetector, HeadingFix, HeadingGate, Transition
+from ccatp.localization.fixes import check_fix, foot_of_fix
+from ccatp.localization.intake import BACKWARD_LIMIT, MAX_FRAME_STEP_S, FrameClock, FrameKind, SampleIntake
+from ccatp.localization.measurements import OMEGA, STATES, THETA, ConstantAcceleration, MeasurementBuilder, Stack, V
+from ccatp.localization.odometry import Odometer, arc_step
+from ccatp.localization.position_sigma import PositionSigma
 from ccatp.mirror.mirror import Mirror
-from ccatp.odometry import Odometer, arc_step
-from ccatp.position_sigma import PositionSigma
 from ccatp.samples import DeckPose, EdgeSample, Fix, ImuSample, PanelId, PanelPose, WheelSample
 
 _NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under the robot is looked up

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from ccatp.angles import difference
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegTracker, Phase
-from ccatp.journey import Journey, Motion
 from ccatp.mirror.mirror import Mirror
-from ccatp.mission_states import Event, Outcome, State, next_state
-from ccatp.retreat import Retreat, Step
+from ccatp.planning.errors import PlanError
 from ccatp.samples import DeckPose, EventCode, PointId, Stop, StopKind, Twist, Verdict
+from ccatp.surveying.journey import Journey, Motion
+from ccatp.surveying.retreat import Retreat, Step
+from ccatp.surveying.states import Event, Outcome, State, next_state
 
 STILL = Twist(0.0, 0.0)
 # Sums of frame periods are not exact: half a nanosecond must not cost a frame.
@@ -322,7 +323,10 @@ class Mission:
 
     def _return(self, motion: Motion) -> Order:
         if self._home is None:
-            self._home = self._journey(self._plan_home(motion.deck))
+            try:
+                self._home = self._journey(self._plan_home(motion.deck))
+            except PlanError as error:
+                self.fault(f"no way home: {error}")
             return Order(STILL)
         stop = self._home.current
         if stop is None:

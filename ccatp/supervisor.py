@@ -99,7 +99,7 @@ def _lock(runtime_dir: Path) -> Iterator[None]:
             flock(file, LOCK_EX | LOCK_NB)
         except OSError as error:
             raise RefusedError(
-                f"another ccatp runs in {runtime_dir}; stop it with 'ccatp stop', or give this one its own --runtime-dir"
+                f"another ccatp runs in {runtime_dir}; end it with 'ccatp stop', or give this one its own --runtime-dir"
             ) from error
         yield
 
@@ -145,7 +145,9 @@ def _make_run_dir(options: RunOptions, cfg: Config) -> Path:
     run_dir = options.run_dir or default_run_dir(cfg.run.mirror, cfg.run.seed, datetime.now(UTC))
     has_mission = (run_dir / "mission.sqlite").exists()
     if has_mission and not options.resume:
-        raise ConfigError(f"--run-dir: {run_dir} holds a mission already; give --resume to go on with it, or another folder")
+        raise ConfigError(
+            f"--run-dir: {run_dir} holds a mission already; give --resume to go on with it, or another folder"
+        )
     if options.resume and not has_mission:
         raise ConfigError(f"--resume: no mission in {run_dir}; name the folder of the run with --run-dir")
     try:
@@ -165,10 +167,10 @@ class _Run:
         run_dir: Path,
         endpoints: Endpoints,
         sockets: dict[str, socket.socket],
-        started: float,
+        started_s: float,
     ) -> None:
         self._options, self._cfg, self._run_dir, self._endpoints = options, cfg, run_dir, endpoints
-        self._sockets, self._started = sockets, started
+        self._sockets, self._started_s = sockets, started_s
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
 
@@ -183,7 +185,7 @@ class _Run:
             with collector, view:
                 status = self._watch(collector, view)
                 self._stop_all(view)
-                wall_s = time.monotonic() - self._started
+                wall_s = time.monotonic() - self._started_s
                 summary = collector.summary(wall_s)
         finally:
             for number, handler in previous.items():

@@ -41,34 +41,6 @@ class Route:
         return self.lengths_m[min(index, len(self.stops))]
 
 
-class RouteCursor:
-    """Keeps the current and the next stop of a route until all are exhausted (thesis 3.2).
-
-    Args:
-        route: the route.
-    """
-
-    __slots__ = ("index", "route")
-
-    def __init__(self, route: Route) -> None:
-        """Stand before the first stop."""
-        self.route, self.index = route, 0
-
-    @property
-    def current(self) -> Stop | None:
-        """The stop being approached; ``None`` when all are exhausted."""
-        return self.route.stops[self.index] if self.index < len(self.route.stops) else None
-
-    @property
-    def next(self) -> Stop | None:
-        """The stop after it, or ``None``."""
-        return self.route.stops[self.index + 1] if self.index + 1 < len(self.route.stops) else None
-
-    def advance(self) -> None:
-        """The current stop is done with."""
-        self.index = min(self.index + 1, len(self.route.stops))
-
-
 def plan_route(
     mirror: Mirror,
     points: Sequence[PointId],

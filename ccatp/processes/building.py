@@ -10,8 +10,8 @@ from ccatp.config.models import Config
 from ccatp.control.gate import DriveGate
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
 from ccatp.filters import FILTERS
+from ccatp.localization.measurements import STATES
 from ccatp.localizer import Localizer
-from ccatp.measurements import STATES
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.mission import Mission
 from ccatp.planning.bound import path_time
@@ -75,7 +75,9 @@ def build_parts(args: ProcessArgs) -> tuple[Parts, MissionStore]:
     except StoreError as error:
         raise StoreUnusable(str(error)) from error
     done = store.measured_points()
-    route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose, skip=done)
+    route = plan_route(
+        mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose, done, cfg.etalon.measuring_time_s
+    )
     # The localizer re-initialises it at once; what counts is its size.
     filter_ = FILTERS[cfg.run.filter](np.zeros(STATES), np.eye(STATES))
     mission = Mission(cfg, mirror, route.stops, _home_planner(cfg, mirror))

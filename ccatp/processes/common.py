@@ -61,9 +61,7 @@ def parse_args(argv: list[str] | None = None) -> ProcessArgs:
     parser.add_argument("--resume", action="store_true")
     args = parser.parse_args(argv)
     config = load_config(args.run_dir / "config.toml")
-    return ProcessArgs(
-        config, args.run_dir, Endpoints(args.runtime_dir), args.listen_fd, args.realtime, args.resume
-    )
+    return ProcessArgs(config, args.run_dir, Endpoints(args.runtime_dir), args.listen_fd, args.realtime, args.resume)
 
 
 def die_with_parent() -> None:

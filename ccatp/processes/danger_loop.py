@@ -92,8 +92,8 @@ class DangerLoop:
         return answer_observatory(frame, self.monitor, at_base_or_held=at_rest, age_s=age_s)
 
     async def _wait_for_main(self) -> None:
-        """Join the robot only when main's messages get through: no first estimate may be lost to a late subscription."""
-        while self._subscriber.receive() is None:
+        """Join the robot only when main's messages get through: its first estimate must not be lost."""
+        while self._subscriber.receive() is None:  # noqa: ASYNC110 - a socket outside the loop has no event
             await asyncio.sleep(WAIT_PERIOD_S)
 
     def on_sensors(self, sensors: Sensors, _raw: bytes) -> None:

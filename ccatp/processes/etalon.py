@@ -30,7 +30,10 @@ async def _serve(cfg: Config, truth: TruthSource, listener: socket.socket | None
     if listener is None:
         print(f"ccatp: MultiLine stand-in on {cfg.sim.etalon.host}:{port}", file=sys.stderr, flush=True)
     try:
-        await stop.wait()
+        async with asyncio.TaskGroup() as tasks:
+            serving = tasks.create_task(server.serve())
+            await stop.wait()
+            serving.cancel()
     finally:
         await server.close()
 

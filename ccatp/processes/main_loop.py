@@ -11,11 +11,9 @@ from ccatp.bus import Publisher, Subscriber
 from ccatp.control.gate import DriveGate
 from ccatp.errors import CcatpError, ExitStatus, UnreachableError
 from ccatp.etalon_client import EtalonClient, EtalonError
-from ccatp.journey import Motion
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror
 from ccatp.mission import Mission, Order
-from ccatp.mission_states import Outcome, State
 from ccatp.processes.building import Parts, build_parts
 from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
 from ccatp.processes.measuring import MeasuringDesk, Request
@@ -25,6 +23,8 @@ from ccatp.robot_link import RobotLink, read_key
 from ccatp.router import Router
 from ccatp.samples import Verdict
 from ccatp.store import MissionStore
+from ccatp.surveying.journey import Motion
+from ccatp.surveying.states import Outcome, State
 from ccatp.wire.robot import Hello, Sensors
 from ccatp.wire.topics import MissionStatus, Presence, VerdictMessage, verdict_of
 
@@ -209,9 +209,7 @@ class MainLoop:
         waiting = time.perf_counter()
         verdict = self._hear(seq)
         heard = time.perf_counter()
-        motion = Motion(
-            t_s, dt_s, localizer.pose, self._mirror.deck_pose, localizer.speed_m_s, localizer.rate_rad_s
-        )
+        motion = Motion(t_s, dt_s, localizer.pose, self._mirror.deck_pose, localizer.speed_m_s, localizer.rate_rad_s)
         order = self._mission.step(motion, verdict)
         right, left = self._gate.pass_through(order.twist, verdict, dt_s)
         if order.at_rest or order.measure:
@@ -301,7 +299,7 @@ class MainLoop:
 
     async def settled(self) -> None:
         """Wait until the robot is held at rest, or the mission is over."""
-        while not (self.over.is_set() or self._is_quiet()):
+        while not (self.over.is_set() or self._is_quiet()):  # noqa: ASYNC110 - frames are worth no event each
             await asyncio.sleep(WAIT_PERIOD_S)
 
     def status(self) -> MissionStatus:

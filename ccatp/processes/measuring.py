@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ccatp.etalon_client import EtalonClient, EtalonError
-from ccatp.fixes import FixRefused
+from ccatp.localization.fixes import FixRefused
 from ccatp.localizer import Localizer
 from ccatp.mission import Mission
 from ccatp.processes.telling import Teller
@@ -104,7 +104,9 @@ class MeasuringDesk:
             self._teller.say("warning", f"the fix at {_name(request.point)} is stored but not used: {refusal}")
             jump_m = 0.0
         if jump_m > NOTABLE_JUMP_M:
-            self._teller.say("warning", f"the fix at {_name(request.point)} moved the estimate by {1e3 * jump_m:.1f} mm")
+            self._teller.say(
+                "warning", f"the fix at {_name(request.point)} moved the estimate by {1e3 * jump_m:.1f} mm"
+            )
         if request.point is not None:
             self._teller.fix(request.point, fix, jump_m)
         self._mission.fixed(request.point)

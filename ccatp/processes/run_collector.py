@@ -14,13 +14,13 @@ from ccatp.errors import ExitStatus
 from ccatp.mirror.alignment import PanelFit, fit_panel
 from ccatp.mirror.errors import PanelFitError
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.mission_states import Outcome
 from ccatp.planning.traversal import ORDERS
 from ccatp.processes.common import Endpoints
 from ccatp.recorder import Recorder
 from ccatp.samples import PanelId, PointId
 from ccatp.store import MissionStore
 from ccatp.summary import RunFacts, SummaryBuilder, puck_targets
+from ccatp.surveying.states import Outcome
 from ccatp.wire.topics import (
     TOPICS,
     Arrival,
@@ -75,7 +75,13 @@ class RunCollector:
         is_sim: bool,
     ) -> None:
         """Subscribe before anybody publishes."""
-        self._context, self._endpoints, self._cfg, self._run_dir, self._is_sim = context, endpoints, cfg, run_dir, is_sim
+        self._context, self._endpoints, self._cfg, self._run_dir, self._is_sim = (
+            context,
+            endpoints,
+            cfg,
+            run_dir,
+            is_sim,
+        )
         self._mirror: Mirror = build_mirror(cfg.mirror)
         names = ("main", "danger", "truth") if is_sim else ("main", "danger")
         self._subscriber = Subscriber(context, [endpoints.of(name) for name in names], RECEIVED)

@@ -91,9 +91,7 @@ class Teller:
 
     def arrival(self, point: PointId, error_m: float) -> None:
         """The robot came to rest at a point for the first time."""
-        message = Arrival(
-            seq=self.seq, t_s=self.t_s, point=(point.row, point.col, point.point), error_mm=1e3 * error_m
-        )
+        message = Arrival(seq=self.seq, t_s=self.t_s, point=(point.row, point.col, point.point), error_mm=1e3 * error_m)
         self._publisher.send("arrival", message)
 
     def fix(self, point: PointId, fix: Fix, jump_m: float) -> None:

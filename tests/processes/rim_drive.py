@@ -59,7 +59,9 @@ def start_on(case: RimCase, mirror: Mirror) -> tuple[PanelId, float, float, floa
     dx, dy = round(cos(outward)), round(sin(outward))
     on_side = [p for p in mirror.panels if PanelId(p.row + dy, p.col + dx) not in mirror.panels]
     middle = PanelId((mirror.rows + 1) // 2, (mirror.cols + 1) // 2)
-    panel = min(on_side, key=lambda p: (abs(p.row - middle.row) if dx else abs(p.col - middle.col), -dx * p.col - dy * p.row))
+    panel = min(
+        on_side, key=lambda p: (abs(p.row - middle.row) if dx else abs(p.col - middle.col), -dx * p.col - dy * p.row)
+    )
     body = mirror.panels[panel]
     return panel, dx * (body.half_x_m - START_M), dy * (body.half_y_m - START_M), outward + case.angle_rad
 
@@ -78,7 +80,9 @@ def configure(case: RimCase) -> Config:
 class RecklessMain:
     """Stands in for the main loop: claims a pose, never listens to a verdict."""
 
-    def __init__(self, case: RimCase, cfg: Config, context: zmq.Context[zmq.Socket[bytes]], endpoints: Endpoints) -> None:
+    def __init__(
+        self, case: RimCase, cfg: Config, context: zmq.Context[zmq.Socket[bytes]], endpoints: Endpoints
+    ) -> None:
         self._case, self._cfg = case, cfg
         self._publisher = Publisher(context, endpoints.of("main"))
         self._mirror = build_mirror(cfg.mirror)

@@ -27,7 +27,9 @@ FEW = [
 
 async def check(case: RimCase, tmp_path: Path, runtime_dir: Path) -> None:
     result = await drive_off(case, tmp_path, runtime_dir)
-    print(f"{case}: overrun {1e3 * result.overrun_m:.1f} mm, after declaration {1e3 * result.after_declaration_m:.1f} mm")
+    print(
+        f"{case}: overrun {1e3 * result.overrun_m:.1f} mm, after declaration {1e3 * result.after_declaration_m:.1f} mm"
+    )
     assert not result.has_fallen
     assert result.declared
     # Invariant I5: at most 20 mm further once the edge is declared.

@@ -114,7 +114,10 @@ def test_pause_holds_resume_goes_on_stop_ends(start: Start) -> None:
     assert run.ask("status")["status"]["state"] == "held"
     assert not run.ask("pause", channel="control")["ok"] or run.ask("status")["status"]["state"] == "held"
     assert run.ask("resume")["ok"]
-    assert run.ask("resume") == {"ok": False, "error": "the mission is not held but turning"} or not run.ask("resume")["ok"]
+    assert (
+        run.ask("resume") == {"ok": False, "error": "the mission is not held but turning"}
+        or not run.ask("resume")["ok"]
+    )
     run.until(lambda status: status["done"] >= 1)
     assert run.ask("stop")["ok"]
     assert run.wait() == 4

@@ -12,9 +12,9 @@ from ccatp.angles import difference
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
 from ccatp.filters import FILTERS
+from ccatp.localization.odometry import arc_step
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.odometry import arc_step
 from ccatp.samples import EdgeSample, ImuSample, PanelId, PanelPose, WheelSample
 
 Frame = tuple[float, list[ImuSample], list[WheelSample], list[EdgeSample]]

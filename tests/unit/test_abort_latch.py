@@ -3,7 +3,7 @@
 import pytest
 
 from ccatp.abort_latch import AT_BASE_OR_HELD, MAX_ACTIVE, MAX_CLEARED, AbortLatch, EmergencyKind, is_at_base_or_held
-from ccatp.mission_states import MOVING, State
+from ccatp.surveying.states import MOVING, State
 
 
 @pytest.mark.parametrize("kind", list(EmergencyKind))

@@ -14,14 +14,14 @@ import pytest
 from ccatp.angles import difference
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
-from ccatp.crossing import HeadingFix, HeadingGate, heading_from_pair
 from ccatp.filters import FILTERS, FilterDiverged, FilterShapeError, FloatArray, Innovation, KalmanFilter
-from ccatp.fixes import FixRefused
+from ccatp.localization.crossing import HeadingFix, HeadingGate, heading_from_pair
+from ccatp.localization.fixes import FixRefused
+from ccatp.localization.measurements import ConstantAcceleration, MeasurementBuilder
+from ccatp.localization.odometry import Odometer, Place, arc_step
+from ccatp.localization.position_sigma import PositionSigma
 from ccatp.localizer import Localizer
-from ccatp.measurements import ConstantAcceleration, MeasurementBuilder
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.odometry import Odometer, Place, arc_step
-from ccatp.position_sigma import PositionSigma
 from ccatp.samples import DeckPose, EdgeSample, Fix, ImuSample, PanelId, PanelPose, WheelSample
 
 Rate = Callable[[float], float]

@@ -8,11 +8,11 @@ from math import cos, exp, hypot, sin
 import pytest
 
 from ccatp.config.models import Config
-from ccatp.journey import Motion
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.mission import Mission, Order
-from ccatp.mission_states import MOVING, Event, Outcome, State, next_state
 from ccatp.samples import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Twist, Verdict
+from ccatp.surveying.journey import Motion
+from ccatp.surveying.states import MOVING, Event, Outcome, State, next_state
 
 DT, LAG = 0.01, 0.08
 PANEL = PanelId(5, 5)

@@ -33,9 +33,7 @@ def test_limits_must_be_positive(v: float, a: float) -> None:
         Profile.rest_to_rest(1.0, v, a)
 
 
-@given(
-    st.floats(-5.0, 5.0), st.floats(0.01, 1.0), st.floats(0.05, 4.0), st.floats(0.0, 1.0), st.floats(1e-4, 0.02)
-)
+@given(st.floats(-5.0, 5.0), st.floats(0.01, 1.0), st.floats(0.05, 4.0), st.floats(0.0, 1.0), st.floats(1e-4, 0.02))
 def test_limits_hold_and_velocity_is_the_derivative(d: float, v: float, a: float, part: float, h: float) -> None:
     profile = Profile.rest_to_rest(d, v, a)
     t = part * profile.duration_s

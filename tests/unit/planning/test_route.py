@@ -10,7 +10,7 @@ import pytest
 from ccatp.planning.bound import path_time
 from ccatp.planning.errors import OutsideMirrorError, PlanError, UnreachableError
 from ccatp.planning.legs import LegRules
-from ccatp.planning.route import Route, RouteCursor, plan_route
+from ccatp.planning.route import Route, plan_route
 from ccatp.planning.search import Arrival, Search, Target
 from ccatp.planning.stance import build_body, build_places
 from ccatp.planning.traversal import thesis_order
@@ -102,20 +102,6 @@ def test_remaining_time_and_way(thesis: Any) -> None:
 def test_the_route_is_the_same_every_time(thesis: Any) -> None:
     points = thesis_order(thesis.mirror, 9)
     assert plan(thesis, points) == plan(thesis, points)
-
-
-def test_cursor(thesis: Any) -> None:
-    route = plan(thesis, thesis_order(thesis.mirror, 1))
-    cursor = RouteCursor(route)
-    seen = []
-    while cursor.current is not None:
-        seen.append(cursor.current)
-        assert cursor.next == (route.stops[len(seen)] if len(seen) < len(route.stops) else None)
-        cursor.advance()
-    assert tuple(seen) == route.stops
-    cursor.advance()
-    assert cursor.index == len(route.stops)
-    assert cursor.next is None
 
 
 def test_start_beyond_the_rim(thesis: Any) -> None:

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 from ccatp.angles import rotate
 from ccatp.config.models import LocalizerConfig, RobotConfig
+from ccatp.localization.odometry import Odometer, Place
 from ccatp.mirror.layout import Seam
 from ccatp.mirror.mirror import Mirror
-from ccatp.odometry import Odometer, Place
 from ccatp.samples import DeckPose, EdgeSample, PanelPose
 
 _PAIRS = ((0, 1), (2, 3))  # front, rear: (left, right) in the order of EdgeSample

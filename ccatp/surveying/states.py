@@ -61,9 +61,7 @@ TRANSITIONS = MappingProxyType(
     }
 )
 
-MOVING = frozenset(
-    {State.TURNING, State.DRIVING, State.SETTLING, State.MEASURING, State.BACKING_OFF, State.RETURNING}
-)
+MOVING = frozenset({State.TURNING, State.DRIVING, State.SETTLING, State.MEASURING, State.BACKING_OFF, State.RETURNING})
 
 
 def next_state(state: State, event: Event) -> State:

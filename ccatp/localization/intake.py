@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from enum import Enum
 from math import inf, isfinite
 
-from ccatp.measurements import MeasurementBuilder, Stack, WheelReading
+from ccatp.localization.measurements import MeasurementBuilder, Stack, WheelReading
 from ccatp.samples import ImuSample, WheelSample
 
 MAX_FRAME_STEP_S = 0.1

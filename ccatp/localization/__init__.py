@@ -1,0 +1,1 @@
+"""Pure. The parts of the localizer: samples taken in, odometry, seam crossings, fixes."""

@@ -1,0 +1,101 @@
+"""The main loop's parts: which robot they accept, what a plan holds."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ccatp.config.loader import dump_config, load_config
+from ccatp.config.models import Config
+from ccatp.errors import ConfigError
+from ccatp.processes.building import Parts, StoreUnusable, build_parts
+from ccatp.processes.common import Endpoints, ProcessArgs
+from ccatp.samples import DeckPose, StopKind
+from ccatp.wire.robot import Hello, RobotData
+
+
+def args(config: Config, folder: Path) -> ProcessArgs:
+    (folder / "config.toml").write_text(dump_config(config))
+    return ProcessArgs(config, folder, Endpoints(folder), None, False, False)
+
+
+@pytest.fixture
+def parts(tmp_path: Path) -> Parts:
+    built, store = build_parts(args(load_config(None, {"run.panels": 1}), tmp_path))
+    store.close()
+    return built
+
+
+def hello(config: Config, **changes: Any) -> Hello:
+    robot = config.robot
+    fields: dict[str, Any] = {
+        "wheel_radius_m": robot.wheel_radius_m,
+        "wheel_base_m": robot.wheel_base_m,
+        "edge_sensors_m": robot.edge_sensors_m,
+        "puck_m": (0.0, 0.0, robot.puck_height_m),
+        "max_wheel_rad_s": robot.max_wheel_rad_s,
+        "fan_floor": 0.0,
+    }
+    return Hello("ccatp-robot/1", 1, "0" * 32, "none", True, 100.0, 0.25, RobotData(**{**fields, **changes}))
+
+
+def test_a_plan_measures_every_point_once(parts: Parts) -> None:
+    points = [stop.point for stop in parts.route.stops if stop.kind is StopKind.MEASURE]
+    assert len(points) == len(set(points)) == parts.total_points == 9
+    assert parts.already_done == 0
+    assert 0.0 < parts.lower_bound_s < 60.0
+
+
+def test_the_robot_of_the_configuration_is_accepted(parts: Parts, config: Config) -> None:
+    parts.check_robot(hello(config))
+    parts.check_robot(hello(config, wheel_radius_m=config.robot.wheel_radius_m * 1.01))  # calibrated here
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"wheel_radius_m": 0.04}, r"wheel_radius_m is 0\.03 here and 0\.04 there"),
+        ({"wheel_base_m": 0.2}, r"wheel_base_m is 0\.15 here and 0\.2 there"),
+        ({"edge_sensors_m": ((0.09, 0.09), (0.09, -0.09), (-0.09, 0.09), (-0.1, -0.09))}, "an edge sensor is at"),
+        ({"puck_m": (0.0, 0.02, 0.05)}, "the puck is at"),
+    ],
+)
+def test_another_robot_is_refused(parts: Parts, config: Config, changes: dict[str, Any], why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        parts.check_robot(hello(config, **changes))
+
+
+def test_an_overhanging_mirror_needs_a_fan_floor(parts: Parts, config: Config) -> None:
+    overhanging = load_config(None, {"run.mirror": "fyst-m2", "run.panels": 1})
+    from ccatp.mirror.mirror import build_mirror
+
+    under_test = replace(parts, mirror=build_mirror(overhanging.mirror))
+    under_test.check_robot(hello(config, fan_floor=0.6))
+    with pytest.raises(ConfigError, match="the mirror overhangs and the robot has no fan floor"):
+        under_test.check_robot(hello(config))
+
+
+def test_a_store_that_exists_is_not_overwritten(tmp_path: Path) -> None:
+    where = args(load_config(None, {"run.panels": 1}), tmp_path)
+    build_parts(where)[1].close()
+    with pytest.raises(StoreUnusable, match="mission.sqlite"):
+        build_parts(where)
+
+
+def test_a_resumed_plan_leaves_out_what_is_measured(tmp_path: Path) -> None:
+    import numpy as np
+
+    from ccatp.samples import Fix
+
+    where = args(load_config(None, {"run.panels": 1}), tmp_path)
+    built, store = build_parts(where)
+    first = next(stop.point for stop in built.route.stops if stop.point is not None)
+    fix = Fix(1.0, (0.0, 0.0, 0.0), tuple(np.eye(3).ravel().tolist()), 1.0, (1, 2, 3, 4), 0.0)
+    store.record_fix(first, fix, DeckPose(0.0, 0.0, 0.0)).result(5.0)
+    store.close()
+    again, store = build_parts(replace(where, is_resuming=True))
+    store.close()
+    assert again.already_done == 1
+    assert first not in {stop.point for stop in again.route.stops}
+    assert again.total_points == 9

@@ -1,0 +1,58 @@
+"""What can be wrong before a run begins, and the process table."""
+
+import socket
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from ccatp.config.loader import load_config
+from ccatp.errors import ConfigError, RefusedError
+from ccatp.run_options import RunOptions
+from ccatp.supervisor import PROCESSES, _lock, _make_run_dir, run_survey
+
+
+def options(**fields: object) -> RunOptions:
+    return RunOptions(sim=True, **fields)  # type: ignore[arg-type]
+
+
+def test_the_table_names_real_modules_and_main_stops_first() -> None:
+    assert [p.name for p in PROCESSES] == ["dataloop", "etalon", "danger", "main"]
+    assert all(find_spec(p.module) is not None for p in PROCESSES)
+    assert PROCESSES[-1].name == "main"  # stopping is in the reverse order
+
+
+def test_a_port_in_use(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        wanted = options(overrides={"sim.robot.port": port}, runtime_dir=tmp_path / "rt", run_dir=tmp_path / "run")
+        with pytest.raises(ConfigError, match=rf"sim\.robot\.port: cannot listen on 127\.0\.0\.1:{port}: .*--set"):
+            run_survey(wanted)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_directory_with_a_mission_wants_resume(tmp_path: Path) -> None:
+    (tmp_path / "mission.sqlite").touch()
+    with pytest.raises(ConfigError, match="holds a mission already; give --resume"):
+        _make_run_dir(options(run_dir=tmp_path), load_config())
+    assert _make_run_dir(options(run_dir=tmp_path, resume=True), load_config()) == tmp_path
+
+
+def test_nothing_to_resume(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no mission in"):
+        _make_run_dir(options(run_dir=tmp_path, resume=True), load_config())
+
+
+def test_a_run_directory_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="cannot make"):
+        _make_run_dir(options(run_dir=tmp_path / "file" / "run"), load_config())
+
+
+def test_one_daemon_in_a_runtime_directory(tmp_path: Path) -> None:
+    with _lock(tmp_path), pytest.raises(RefusedError, match="another ccatp runs in"), _lock(tmp_path):
+        pass
+    with _lock(tmp_path):
+        pass

@@ -1,0 +1,91 @@
+"""The topic table and its codec."""
+
+import json
+
+import msgspec
+import pytest
+
+from ccatp.samples import EventCode, Verdict
+from ccatp.wire.topics import (
+    BY_NAME,
+    ESTIMATE_FRAMES,
+    TOPICS,
+    BadMessage,
+    Estimate,
+    SensorLines,
+    is_estimate_due,
+    last_estimate_before,
+    pack,
+    schema_of,
+    unpack,
+    verdict_message,
+    verdict_of,
+)
+
+ESTIMATE = Estimate(seq=5, t_s=0.05, x_m=1.0, y_m=-2.0, heading_rad=0.5, sigma_m=1e-3, state="driving")
+
+
+def test_golden_frame() -> None:
+    assert pack("estimate", ESTIMATE) == (
+        b'estimate {"x_m":1.0,"y_m":-2.0,"heading_rad":0.5,"sigma_m":0.001,"state":"driving","seq":5,"t_s":0.05}'
+    )
+
+
+def test_round_trip_with_the_text_in_the_middle() -> None:
+    name, body, message = unpack(pack("estimate", ESTIMATE))
+    assert (name, message) == ("estimate", ESTIMATE)
+    assert json.loads(body)["seq"] == 5
+
+
+def test_a_batch_of_lines_holds_them_as_they_came() -> None:
+    line = b'{"type":"sensors","seq":1}'
+    body = unpack(pack("sensors", SensorLines(seq=1, t_s=0.0, lines=[msgspec.Raw(line)])))[1]
+    assert line in body
+
+
+@pytest.mark.parametrize(
+    ("frame", "why"),
+    [
+        (b"", "unknown topic"),
+        (b"estimate", "topic estimate"),
+        (b"rumour {}", "unknown topic b'rumour'"),
+        (b"\xff\xfe {}", "unknown topic"),
+        (b'estimate {"seq":1}', "missing required field"),
+        (b'estimate {"seq":1.5,"t_s":0}', "Expected `int`"),
+        (b"estimate {", "topic estimate"),
+    ],
+)
+def test_what_is_not_of_the_table_is_refused(frame: bytes, why: str) -> None:
+    with pytest.raises(BadMessage, match=why):
+        unpack(frame)
+
+
+def test_names_are_unique_and_levels_have_an_age() -> None:
+    assert len(BY_NAME) == len(TOPICS)
+    for topic in TOPICS:
+        is_level = topic.rate_hz > 1.0
+        assert (topic.stale_after_s > 0.0) == is_level, topic.name
+        assert topic.stale_after_s == 0.0 or topic.stale_after_s >= 2.0 / topic.rate_hz  # one may be late
+
+
+def test_every_recorded_topic_has_a_schema() -> None:
+    for topic in TOPICS:
+        if topic.recorded:
+            assert "$ref" in schema_of(topic.name) or "properties" in schema_of(topic.name)
+
+
+def test_verdicts_survive_the_bus() -> None:
+    verdict = Verdict(
+        7, 0.07, EventCode.NEAR_EDGE, "rim", "front_left", 0.01, 0.005, False, True, False, (True, False, False, False)
+    )
+    name, _, message = unpack(pack("verdict", verdict_message(verdict)))
+    assert name == "verdict"
+    assert verdict_of(message) == verdict  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("seq", range(1, 30))
+def test_danger_waits_for_an_estimate_that_main_publishes(seq: int) -> None:
+    wanted = last_estimate_before(seq)
+    assert is_estimate_due(wanted)
+    assert 0 < seq - wanted <= ESTIMATE_FRAMES
+    assert last_estimate_before(0) < 0
