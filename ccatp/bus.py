@@ -1,10 +1,12 @@
 """Edge. State shared between the processes over ZeroMQ PUB and SUB: single frames of the topic table."""
 
+import os
 import time
 from collections.abc import Iterable
 
 import zmq
 
+from ccatp.samples import Verdict
 from ccatp.wire.topics import BY_NAME, BadMessage, Message, pack, unpack
 
 MAX_MESSAGE_BYTES = 1 << 20
@@ -12,6 +14,8 @@ MAX_MESSAGE_BYTES = 1 << 20
 HIGH_WATER_MARK = 50_000
 # A subscriber comes up before its publisher; it should not miss the first messages for long.
 RECONNECT_MS = 10
+# Waking a sleeping thread costs more than the wait for a verdict: spin for a while, politely.
+SPIN_S = 5e-4
 
 
 class Publisher:
@@ -30,7 +34,7 @@ class Publisher:
         self._socket.bind(endpoint)
         self._subscribed: set[str] = set()
 
-    def send(self, name: str, message: Message) -> None:
+    def send(self, name: str, message: Message | Verdict) -> None:
         """Publish one message."""
         self._socket.send(pack(name, message), zmq.DONTWAIT)
 
@@ -73,21 +77,25 @@ class Subscriber:
             self.socket.connect(endpoint)
         self.bad_messages = 0
 
-    def receive(self, timeout_s: float = 0.0) -> tuple[str, Message] | None:
+    def receive(self, timeout_s: float = 0.0) -> tuple[str, Message | Verdict] | None:
         """The next message, or ``None`` when none came within ``timeout_s``. Bad ones are counted and dropped."""
         received = self.receive_raw(timeout_s)
         return None if received is None else (received[0], received[2])
 
-    def receive_raw(self, timeout_s: float = 0.0) -> tuple[str, bytes, Message] | None:
+    def receive_raw(self, timeout_s: float = 0.0) -> tuple[str, bytes, Message | Verdict] | None:
         """As ``receive``, with the JSON text in the middle."""
         deadline: float | None = None
+        spin_until = 0.0
         while True:
             try:
                 frame = self.socket.recv(zmq.DONTWAIT)
             except zmq.Again:
                 now = time.monotonic()
-                deadline = now + timeout_s if deadline is None else deadline
-                if now >= deadline or not self.socket.poll(max(1, int((deadline - now) * 1000))):
+                if deadline is None:
+                    deadline, spin_until = now + timeout_s, now + min(SPIN_S, timeout_s)
+                if now < spin_until:
+                    os.sched_yield()
+                elif now >= deadline or not self.socket.poll(max(1, int((deadline - now) * 1000))):
                     return None
                 continue
             try:

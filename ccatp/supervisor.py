@@ -30,6 +30,8 @@ POLL_MS = 20
 # The matrices are 4 x 4: threads of the linear algebra would only fight the processes for the cores.
 ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 STOP_TIMEOUT_S = 5.0
+# In lockstep the three that answer each other keep both cores of a small machine busy: recording takes what they leave.
+LOCKSTEP_NICENESS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,6 +203,8 @@ class _Run:
         try:
             for process in _processes(self._options):
                 self._start(process)
+            if not self._options.realtime:
+                os.nice(LOCKSTEP_NICENESS)
             while True:
                 collector.collect(POLL_MS, view)
                 if collector.is_over:

@@ -58,8 +58,9 @@ class KalmanFilter:
         if Q.shape != shape:
             raise FilterShapeError("Q", Q.shape, str(shape))
         with np.errstate(over="ignore", invalid="ignore"):
-            x = F @ self.mean
-            P = F @ self.covariance @ F.T
+            # The method, not the operator: on matrices this small it costs half.
+            x = F.dot(self.mean)
+            P = F.dot(self.covariance).dot(F.T)
             P += Q
             P += P.T
             P *= 0.5
@@ -81,17 +82,17 @@ class KalmanFilter:
         if m == 0:
             return Innovation(np.empty(0), 0.0, 0)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            residual = z - H @ self.mean
+            residual = z - H.dot(self.mean)
             L = _square_root(self.covariance)
             rows = np.zeros((n + 1, n + m)).T  # column-major, so that LAPACK works in place
             rows[:n, :n] = self._identity
-            rows[n:, :n] = H @ L
+            rows[n:, :n] = H.dot(L)
             rows[n:, n] = residual
             _whiten(rows[n:], R)
             triangle = dgeqrf(rows, overwrite_a=1)[0]
             root = dtrtrs(triangle[:n, :n], L.T, lower=0, trans=1)[0]
-            x = self.mean + triangle[:n, n] @ root
-            P = root.T @ root
+            x = self.mean + triangle[:n, n].dot(root)
+            P = root.T.dot(root)
             nis = float(triangle[n, n] * triangle[n, n])
             size = _size(x, P)
         if not isfinite(nis + size):
@@ -102,7 +103,7 @@ class KalmanFilter:
 
 def _size(x: FloatArray, P: FloatArray) -> float:
     """A sum of squares: not finite if anything is not."""
-    return float(x @ x + np.vdot(P, P))
+    return float(x.dot(x) + np.vdot(P, P))
 
 
 def _square_root(P: FloatArray) -> FloatArray:

@@ -12,13 +12,14 @@ from ccatp.bus import Publisher, Subscriber
 from ccatp.danger import DangerMonitor
 from ccatp.errors import CcatpError
 from ccatp.mirror.mirror import build_mirror
+from ccatp.processes import spinning
 from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
 from ccatp.robot_link import RobotLink, read_key
 from ccatp.router import Router
 from ccatp.samples import EventCode, Verdict
 from ccatp.wire.channels import answer_observatory
 from ccatp.wire.robot import Sensors
-from ccatp.wire.topics import DangerEvent, Estimate, Presence, last_estimate_before, verdict_message
+from ccatp.wire.topics import DangerEvent, Estimate, Presence, last_estimate_before
 
 PRESENCE_PERIOD_S = 0.1
 WAIT_PERIOD_S = 0.02
@@ -103,7 +104,7 @@ class DangerLoop:
         self._give(self.monitor.step(sensors, self._estimate), sensors.seq)
 
     def _give(self, verdict: Verdict, ack: int) -> None:
-        self._publisher.send("verdict", verdict_message(verdict))
+        self._publisher.send("verdict", verdict)
         self.link.send_permit(ack, ack, verdict.forward, verdict.reverse, verdict.turn)
         if verdict.code is not self._code or verdict.cause != self._cause:
             self._announce(verdict)
@@ -187,7 +188,10 @@ async def run(args: ProcessArgs) -> int:
 def main() -> int:
     """Entry of ``python -m ccatp.processes.danger_loop``."""
     die_with_parent()
-    return asyncio.run(run(parse_args()))
+    args = parse_args()
+    if not args.is_realtime:
+        spinning.leave_a_core(os.getppid())
+    return spinning.run(run(args), is_spinning=not args.is_realtime)
 
 
 if __name__ == "__main__":

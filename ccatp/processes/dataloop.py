@@ -10,6 +10,7 @@ import structlog
 from ccatp.config.models import Config
 from ccatp.dataloop import serve
 from ccatp.errors import ConfigError
+from ccatp.processes import spinning
 from ccatp.processes.common import Endpoints, die_with_parent, open_log, parse_args, stop_on_signals
 from ccatp.robot_link import read_key
 from ccatp.runtime_dir import make_runtime_dir
@@ -20,8 +21,10 @@ def main() -> int:
     die_with_parent()
     args = parse_args()
     cfg = args.config
+    if not args.is_realtime:
+        spinning.leave_a_core(os.getppid())
 
-    async def run() -> None:
+    async def run() -> int:
         stop = asyncio.Event()
         stop_on_signals(stop)
         await serve(
@@ -35,9 +38,9 @@ def main() -> int:
             key=read_key(cfg.robot.key_file),
             log=open_log(args.run_dir / "log.jsonl", "dataloop"),
         )
+        return 0
 
-    asyncio.run(run())
-    return 0
+    return spinning.run(run(), is_spinning=not args.is_realtime)
 
 
 def run_alone(cfg: Config, lockstep: bool) -> int:

@@ -1,6 +1,7 @@
 """Glue. The process of the Etalon stand-in: a MultiLine server over simulated lengths."""
 
 import asyncio
+import os
 import socket
 import sys
 
@@ -9,6 +10,7 @@ import numpy as np
 from ccatp.config.models import Config
 from ccatp.etalon_standin import EtalonStandIn, FixedPuck, TruthSource, ZmqPuck
 from ccatp.mirror.mirror import build_mirror
+from ccatp.processes import spinning
 from ccatp.processes.common import die_with_parent, parse_args, stop_on_signals
 from ccatp.samples import Vector3
 
@@ -42,6 +44,8 @@ def main() -> int:
     """Entry of ``python -m ccatp.processes.etalon``."""
     die_with_parent()
     args = parse_args()
+    if not args.is_realtime:
+        spinning.leave_a_core(os.getppid())
 
     async def run() -> None:
         stop = asyncio.Event()

@@ -14,6 +14,7 @@ from ccatp.etalon_client import EtalonClient, EtalonError
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror
 from ccatp.mission import Mission, Order
+from ccatp.processes import spinning
 from ccatp.processes.building import Parts, build_parts
 from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
 from ccatp.processes.measuring import MeasuringDesk, Request
@@ -26,7 +27,7 @@ from ccatp.store import MissionStore
 from ccatp.surveying.journey import Motion
 from ccatp.surveying.states import Outcome, State
 from ccatp.wire.robot import Hello, Sensors
-from ccatp.wire.topics import MissionStatus, Presence, VerdictMessage, verdict_of
+from ccatp.wire.topics import MissionStatus, Presence
 
 EXIT_STATUS = {
     Outcome.COMPLETE: ExitStatus.COMPLETE,
@@ -65,7 +66,7 @@ class MainLoop:
         self._parts = parts
         self._publisher = Publisher(context, args.endpoints.of("main"))
         self._subscriber = Subscriber(context, [args.endpoints.of("danger")], ["verdict", "presence.danger"])
-        self._teller = Teller(self._publisher, parts.mirror, open_log(args.run_dir / "log.jsonl", "main"))
+        self._teller = Teller(self._publisher, open_log(args.run_dir / "log.jsonl", "main"))
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m)
         self._measuring = MeasuringDesk(
             self._etalon, parts.localizer, parts.mission, store, self._teller, self._answer_held_frame
@@ -236,8 +237,8 @@ class MainLoop:
             received = self._subscriber.receive(deadline - time.monotonic() if must_wait else 0.0)
             if received is None:
                 break
-            if isinstance(received[1], VerdictMessage):
-                self._verdict, self._verdict_wall_s = verdict_of(received[1]), time.monotonic()
+            if isinstance(received[1], Verdict):
+                self._verdict, self._verdict_wall_s = received[1], time.monotonic()
         verdict = self._verdict
         if verdict is None:
             return None
@@ -330,8 +331,8 @@ class MainLoop:
         self._publisher.close()
 
 
-async def run(args: ProcessArgs) -> int:
-    """The process, from its arguments to its exit status."""
+async def run(args: ProcessArgs, core: int | None) -> int:
+    """The process, from its arguments to its exit status; ``core`` is for the main thread alone."""
     stop = asyncio.Event()
     stop_on_signals(stop)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -341,6 +342,7 @@ async def run(args: ProcessArgs) -> int:
         parts, store = build_parts(args)
         with store:
             loop = MainLoop(args, context, parts, store)
+            spinning.take_core(core)  # now that the threads of ZeroMQ and of the store have been started elsewhere
             await loop.run(stop)
     except* CcatpError as group:
         status = report("main", group)
@@ -354,7 +356,9 @@ async def run(args: ProcessArgs) -> int:
 def main() -> int:
     """Entry of ``python -m ccatp.processes.main_loop``."""
     die_with_parent()
-    return asyncio.run(run(parse_args()))
+    args = parse_args()
+    core = None if args.is_realtime else spinning.leave_a_core(os.getppid())
+    return spinning.run(run(args, core), is_spinning=not args.is_realtime)
 
 
 if __name__ == "__main__":

@@ -12,12 +12,13 @@ from ccatp.bus import Subscriber
 from ccatp.config.models import Config
 from ccatp.errors import ExitStatus
 from ccatp.mirror.alignment import PanelFit, fit_panel
+from ccatp.mirror.batches import FloatArray, deck_poses
 from ccatp.mirror.errors import PanelFitError
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.planning.traversal import ORDERS
 from ccatp.processes.common import Endpoints
 from ccatp.recorder import Recorder
-from ccatp.samples import PanelId, PointId
+from ccatp.samples import PanelId, PanelPose, PointId
 from ccatp.store import MissionStore
 from ccatp.summary import RunFacts, SummaryBuilder, puck_targets
 from ccatp.surveying.states import Outcome
@@ -123,7 +124,9 @@ class RunCollector:
         self._view = view
         received = self._subscriber.receive_raw(timeout_ms / 1000.0)
         while received is not None:
-            self._take(*received, view)
+            name, body, message = received
+            if isinstance(message, Message):
+                self._take(name, body, message, view)
             received = self._subscriber.receive_raw()
 
     def _take(self, name: str, body: bytes, message: Message, view: View | None) -> None:
@@ -173,7 +176,7 @@ class RunCollector:
         if isinstance(message, Truth):
             builder.add_truth(message.rows)
         elif isinstance(message, Track):
-            builder.add_track(message.rows)
+            builder.add_track(self._on_deck(message))
         elif isinstance(message, Arrival):
             builder.add_arrival(PointId(*message.point), message.seq)
         elif isinstance(message, Timing):
@@ -184,6 +187,13 @@ class RunCollector:
             self._code = message.code
         elif isinstance(message, MissionStatus):
             builder.set_mission(message.done, message.skipped, message.elapsed_s)
+
+    def _on_deck(self, track: Track) -> FloatArray:
+        """Rows of seq, t_s, x, y, heading (deck), X, Y, Z of the surface point, as the truth has them."""
+        poses = [PanelPose(PanelId(row, col), x, y, heading) for _, _, row, col, x, y, heading, _ in track.rows]
+        x, y, heading, z = deck_poses(self._mirror, poses).T
+        seq, t_s = np.array([row[:2] for row in track.rows]).T
+        return np.column_stack([seq, t_s, x, y, heading, x, y, z])
 
     def finish(self) -> None:
         """Ask the simulated truth for its last rows and the injected misalignment, and wait for what is on its way."""

@@ -61,8 +61,9 @@ class RunView:
         """The first pose shows that the robot is there."""
         if not self._has_pose and track.rows:
             self._has_pose = True
-            _, t_s, x, y, heading, *_ = track.rows[-1]
-            self.say("info", f"first pose at {t_s:.2f} s: x {x:.4f} m, y {y:.4f} m, heading {heading:.4f} rad")
+            _, t_s, row, col, x, y, heading, _ = track.rows[-1]
+            where = f"panel {row}-{col}, x {x:.4f} m, y {y:.4f} m, heading {heading:.4f} rad"
+            self.say("info", f"first pose at {t_s:.2f} s: {where}")
 
     def status(self, status: MissionStatus) -> None:
         """Points done, state, ETA, error."""

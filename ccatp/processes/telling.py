@@ -7,9 +7,7 @@ import structlog
 
 from ccatp.bus import Publisher
 from ccatp.localizer import Localizer
-from ccatp.mirror.batches import deck_poses
-from ccatp.mirror.mirror import Mirror
-from ccatp.samples import Fix, PanelPose, PointId
+from ccatp.samples import Fix, PointId
 from ccatp.wire.topics import (
     Arrival,
     Estimate,
@@ -33,15 +31,13 @@ class Teller:
 
     Args:
         publisher: main's publisher.
-        mirror: gives the 3-D point of an estimate.
         log: the process's logger.
     """
 
-    def __init__(self, publisher: Publisher, mirror: Mirror, log: structlog.typing.FilteringBoundLogger) -> None:
+    def __init__(self, publisher: Publisher, log: structlog.typing.FilteringBoundLogger) -> None:
         """Start with empty batches."""
-        self._publisher, self._mirror, self.log = publisher, mirror, log
-        self._poses: list[PanelPose] = []
-        self._frames: list[tuple[int, float, float]] = []
+        self._publisher, self.log = publisher, log
+        self._track: list[tuple[int, float, int, int, float, float, float, float]] = []
         self._lines: list[msgspec.Raw] = []
         self._tick_us: list[float] = []
         self._flushed_wall_s = time.monotonic()
@@ -58,10 +54,10 @@ class Teller:
             self._publisher.send(
                 "estimate", Estimate(seq=seq, t_s=t_s, x_m=x, y_m=y, heading_rad=heading, sigma_m=sigma, state=state)
             )
-        self._poses.append(pose)
-        self._frames.append((seq, t_s, sigma))
+        row, col = pose.panel
+        self._track.append((seq, t_s, row, col, pose.x_m, pose.y_m, pose.heading_rad, sigma))
         self._lines.append(msgspec.Raw(raw))
-        if len(self._frames) >= BATCH_FRAMES:
+        if len(self._track) >= BATCH_FRAMES:
             self.flush()
 
     def tick(self, microseconds: float) -> None:
@@ -76,18 +72,13 @@ class Teller:
     def flush(self) -> None:
         """Publish the batches."""
         self._flushed_wall_s = time.monotonic()
-        if not self._frames:
+        if not self._track:
             return
         seq, t_s = self.seq, self.t_s
-        on_deck = deck_poses(self._mirror, self._poses).tolist()
-        rows = [
-            (n, t, x, y, heading, x, y, z, sigma)
-            for (n, t, sigma), (x, y, heading, z) in zip(self._frames, on_deck, strict=True)
-        ]
-        self._publisher.send("track", Track(seq=seq, t_s=t_s, rows=rows))
+        self._publisher.send("track", Track(seq=seq, t_s=t_s, rows=self._track))
         self._publisher.send("sensors", SensorLines(seq=seq, t_s=t_s, lines=self._lines))
         self._publisher.send("timing", Timing(seq=seq, t_s=t_s, tick_us=self._tick_us))
-        self._poses, self._frames, self._lines, self._tick_us = [], [], [], []
+        self._track, self._lines, self._tick_us = [], [], []
 
     def arrival(self, point: PointId, error_m: float) -> None:
         """The robot came to rest at a point for the first time."""

@@ -289,8 +289,10 @@ class RobotServer:
 
     def _send_frame(self) -> None:
         line = self.robot.line
-        for session in self._holders.values():
-            session.wire.write(line)
+        for role in ("controller", "monitor"):  # the controller has more to do
+            session = self._holders.get(role)
+            if session is not None:
+                session.wire.write(line)
 
     def _robot_time_s(self, now_s: float) -> float:
         robot_s = self.robot.t_s

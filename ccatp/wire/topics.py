@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from ccatp.samples import EventCode, Verdict
+from ccatp.samples import Verdict
 
 
 class Message(msgspec.Struct, kw_only=True):
@@ -40,20 +40,6 @@ class Estimate(Message):
     state: str
 
 
-class VerdictMessage(Message):
-    """The danger loop's verdict on frame ``seq`` (fields as in ``ccatp.samples.Verdict``)."""
-
-    code: int
-    cause: str
-    signal: str
-    value: float
-    limit: float
-    forward: bool
-    reverse: bool
-    turn: bool
-    off: tuple[bool, bool, bool, bool]
-
-
 class MissionStatus(Message):
     """Mission state for operators."""
 
@@ -74,10 +60,10 @@ class MissionStatus(Message):
 class Track(Message):
     """A batch of estimates.
 
-    Rows: seq, t_s, x_m, y_m, heading_rad (deck), X, Y, Z (surface point, deck, m), sigma_m.
+    Rows: seq, t_s, row and column of the panel, x_m, y_m, heading_rad (panel frame), sigma_m.
     """
 
-    rows: list[tuple[int, float, float, float, float, float, float, float, float]]
+    rows: list[tuple[int, float, int, int, float, float, float, float]]
 
 
 class SensorLines(Message):
@@ -154,7 +140,7 @@ class Topic:
     """
 
     name: str
-    message: type[Message]
+    message: type[Message] | type[Verdict]
     publisher: str
     rate_hz: float
     stale_after_s: float
@@ -165,7 +151,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("presence.main", Presence, "main", 10.0, 1.0, False),
     Topic("presence.danger", Presence, "danger", 10.0, 1.0, False),
     Topic("estimate", Estimate, "main", 20.0, 0.15, False),
-    Topic("verdict", VerdictMessage, "danger", 100.0, 0.15, False),
+    Topic("verdict", Verdict, "danger", 100.0, 0.15, False),
     Topic("mission", MissionStatus, "main", 10.0, 1.0, True),
     Topic("track", Track, "main", 1.0, 0.0, True),
     Topic("sensors", SensorLines, "main", 1.0, 0.0, True),
@@ -198,19 +184,19 @@ class BadMessage(Exception):
     """A frame on the bus that is not of the topic table."""
 
 
-def pack(name: str, message: Message) -> bytes:
+def pack(name: str, message: Message | Verdict) -> bytes:
     """One frame: topic, space, JSON."""
     return _prefixes[name] + _encoder.encode(message)
 
 
-def unpack(frame: bytes) -> tuple[str, bytes, Message]:
+def unpack(frame: bytes) -> tuple[str, bytes, Message | Verdict]:
     """The topic's name, JSON text and message of a frame; raises ``BadMessage``."""
     name, _, body = frame.partition(b" ")
     decoder = _decoders.get(name.decode("ascii", "replace"))
     if decoder is None:
         raise BadMessage(f"unknown topic {name[:40]!r}")
     try:
-        message: Message = decoder.decode(body)
+        message: Message | Verdict = decoder.decode(body)
     except msgspec.MsgspecError as error:
         raise BadMessage(f"topic {name.decode()}: {error}") from error
     return name.decode(), body, message
@@ -219,37 +205,3 @@ def unpack(frame: bytes) -> tuple[str, bytes, Message]:
 def schema_of(name: str) -> dict[str, Any]:
     """JSON schema of a topic's messages."""
     return msgspec.json.schema(BY_NAME[name].message)
-
-
-def verdict_message(verdict: Verdict) -> VerdictMessage:
-    """The message that carries a verdict."""
-    return VerdictMessage(
-        seq=verdict.seq,
-        t_s=verdict.t_s,
-        code=int(verdict.code),
-        cause=verdict.cause,
-        signal=verdict.signal,
-        value=verdict.value,
-        limit=verdict.limit,
-        forward=verdict.forward,
-        reverse=verdict.reverse,
-        turn=verdict.turn,
-        off=verdict.off,
-    )
-
-
-def verdict_of(message: VerdictMessage) -> Verdict:
-    """The verdict in a message."""
-    return Verdict(
-        message.seq,
-        message.t_s,
-        EventCode(message.code),
-        message.cause,
-        message.signal,
-        message.value,
-        message.limit,
-        message.forward,
-        message.reverse,
-        message.turn,
-        message.off,
-    )

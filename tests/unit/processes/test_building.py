@@ -79,7 +79,7 @@ def test_an_overhanging_mirror_needs_a_fan_floor(parts: Parts, config: Config) -
 def test_a_store_that_exists_is_not_overwritten(tmp_path: Path) -> None:
     where = args(load_config(None, {"run.panels": 1}), tmp_path)
     build_parts(where)[1].close()
-    with pytest.raises(StoreUnusable, match="mission.sqlite"):
+    with pytest.raises(StoreUnusable, match=r"mission\.sqlite"):
         build_parts(where)
 
 
