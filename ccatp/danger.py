@@ -3,24 +3,24 @@
 Permits are the conjunction of all rules. The code is that of the most urgent: an edge (1) outranks an abort (2), which
 outranks normal operation (0). The cause is that of the rule that takes the most away.
 
-* all four edge sensors off: code 1, nothing permitted (``ccatp.edge_rule``, rule h);
+* all four edge sensors off: code 1, nothing permitted (``ccatp.hazards.edge_rule``, rule h);
 * an edge declared: code 1, no motion towards a sensor that hangs over, no turn but back;
-* the robot's centre about to drive over the rim on the map: likewise (``ccatp.origin_rule``);
+* the robot's centre about to drive over the rim on the map: likewise (``ccatp.hazards.origin_rule``);
 * edge samples, encoder samples or the estimate missing or older than allowed: nothing permitted, no code of its own;
   ends by itself as soon as they are fresh again;
-* an emergency: code 2, latched, motion permitted, because the robot shall drive home (``ccatp.abort_latch``).
+* an emergency: code 2, latched, motion permitted, because the robot shall drive home (``ccatp.hazards.abort_latch``).
 """
 
 from collections.abc import Sequence
 from math import isfinite
 from typing import NamedTuple, Protocol
 
-from ccatp.abort_latch import AbortLatch, EmergencyKind, is_at_base_or_held
 from ccatp.config.models import DangerConfig, RobotConfig
-from ccatp.edge_episode import Episode, Phase
-from ccatp.edge_map import EdgeMap, MirrorMap
-from ccatp.edge_rule import EdgeRule, PoseEstimate
-from ccatp.origin_rule import OriginRule
+from ccatp.hazards.abort_latch import AbortLatch, EmergencyKind, is_at_base_or_held
+from ccatp.hazards.edge_episode import Episode, Phase
+from ccatp.hazards.edge_map import EdgeMap, MirrorMap
+from ccatp.hazards.edge_rule import EdgeRule, PoseEstimate
+from ccatp.hazards.origin_rule import OriginRule
 from ccatp.samples import Corner, EdgeSample, EventCode, Verdict, WheelSample
 
 CORNERS = tuple(Corner)

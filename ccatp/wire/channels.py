@@ -11,7 +11,7 @@ from uuid import UUID
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from ccatp.abort_latch import EmergencyKind
+from ccatp.hazards.abort_latch import EmergencyKind
 from ccatp.samples import EventCode
 
 T = TypeVar("T")

@@ -11,7 +11,7 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from ccatp.abort_latch import AbortLatch, EmergencyKind
+from ccatp.hazards.abort_latch import AbortLatch, EmergencyKind
 from ccatp.router import (
     BUSY,
     HIGH_WATER_MARK,

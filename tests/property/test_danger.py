@@ -265,7 +265,7 @@ def test_no_fall_without_an_estimate_even_where_only_edges_stop_the_robot(
 
 def is_straight_rim(robot: Robot) -> bool:
     """No inner corner of the rim within reach: there the tip of a notch passes between the sensors, and only the map
-    can tell (``ccatp.origin_rule``)."""
+    can tell (``ccatp.hazards.origin_rule``)."""
     x, y, _ = robot.pose
     return all(hypot(x - vx, y - vy) > 0.25 for vx, vy in inner_corners(robot.name))
 

@@ -2,7 +2,14 @@
 
 import pytest
 
-from ccatp.abort_latch import AT_BASE_OR_HELD, MAX_ACTIVE, MAX_CLEARED, AbortLatch, EmergencyKind, is_at_base_or_held
+from ccatp.hazards.abort_latch import (
+    AT_BASE_OR_HELD,
+    MAX_ACTIVE,
+    MAX_CLEARED,
+    AbortLatch,
+    EmergencyKind,
+    is_at_base_or_held,
+)
 from ccatp.surveying.states import MOVING, State
 
 

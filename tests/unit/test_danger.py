@@ -8,11 +8,11 @@ import pytest
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
 from ccatp.danger import CENTRE, DangerMonitor
-from ccatp.edge_episode import Cause
-from ccatp.edge_map import EdgeMap
+from ccatp.hazards.edge_episode import Cause
+from ccatp.hazards.edge_map import EdgeMap
+from ccatp.hazards.wheel_track import KNOTS_KEPT, Odometry, WheelTrack, pose_at
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.samples import Corner, EdgeSample, EventCode, Verdict, WheelSample
-from ccatp.wheel_track import KNOTS_KEPT, Odometry, WheelTrack, pose_at
 from ccatp.wire.topics import Estimate
 
 FL, FR, RL, RR = ("front_left",), ("front_right",), ("rear_left",), ("rear_right",)

@@ -4,8 +4,8 @@ from enum import Enum, StrEnum, auto
 from math import cos, hypot, inf, sin
 
 from ccatp.config.models import DangerConfig
-from ccatp.edge_map import Axis, EdgeMap
-from ccatp.wheel_track import Odometry
+from ccatp.hazards.edge_map import Axis, EdgeMap
+from ccatp.hazards.wheel_track import Odometry
 
 Place = tuple[float, float]
 

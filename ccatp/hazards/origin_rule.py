@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from math import cos, inf, sin
 
 from ccatp.config.models import DangerConfig, RobotConfig
-from ccatp.edge_map import RimMap
-from ccatp.edge_rule import PoseEstimate
+from ccatp.hazards.edge_map import RimMap
+from ccatp.hazards.edge_rule import PoseEstimate
 from ccatp.samples import WheelSample
 
 # Where the clearance is wide, it is looked up this often at least: a fix may move the estimate.

@@ -19,10 +19,10 @@ from math import cos, hypot, sin
 from typing import Protocol
 
 from ccatp.config.models import DangerConfig, RobotConfig
-from ccatp.edge_episode import Episode, EpisodeLimits, Phase
-from ccatp.edge_map import EdgeMap
+from ccatp.hazards.edge_episode import Episode, EpisodeLimits, Phase
+from ccatp.hazards.edge_map import EdgeMap
+from ccatp.hazards.wheel_track import Odometry, WheelTrack, pose_at
 from ccatp.samples import EdgeSample
-from ccatp.wheel_track import Odometry, WheelTrack, pose_at
 
 SENSORS = range(4)
 
