@@ -7,6 +7,9 @@ ARGS ?=
 PYTEST_ARGS ?=
 WORKERS ?= 2
 
+# Small matrices: threads of the linear algebra would only fight each other for the cores.
+export OPENBLAS_NUM_THREADS := 1
+
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS)

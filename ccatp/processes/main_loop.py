@@ -91,7 +91,6 @@ class MainLoop:
         self._seq = -1
         self._unanswered: int | None = None
         self._state = State.IDLE
-        self._arrival_error_m = 0.0
         self.over = asyncio.Event()
         self.exit_status = EXIT_STATUS[Outcome.NONE]
 
@@ -251,9 +250,9 @@ class MainLoop:
         if order.at_rest:
             self._localizer.rest()
         if order.arrived is not None:
-            self._arrival_error_m = self._mission.journey.distance_m(motion.pose)
-            self._teller.arrival(order.arrived, self._arrival_error_m)
-            self._store.record_arrival(order.arrived, motion.t_s, self._arrival_error_m)
+            error_m = self._mission.survey.distance_m(motion.pose)
+            self._teller.arrival(order.arrived, error_m)
+            self._store.record_arrival(order.arrived, motion.t_s, error_m)
         if order.measure and not self._measuring.is_busy:
             pose = self._localizer.deck_pose
             expected = self._mirror.puck_world(pose, self._cfg.robot.puck_height_m)
@@ -319,7 +318,7 @@ class MainLoop:
             point=f"{point.row}-{point.col}-{point.point}" if point is not None else "",
             elapsed_s=self._t_last_s - (self._t_first_s if self._t_first_s is not None else self._t_last_s),
             eta_s=self._parts.route.remaining_s(mission.survey.index),
-            error_mm=1e3 * self._arrival_error_m,
+            error_mm=1e3 * self._measuring.arrival_error_m,
             code=0 if self._verdict is None else int(self._verdict.code),
             outcome=str(mission.outcome),
             lower_bound_s=self._parts.lower_bound_s,

@@ -52,6 +52,7 @@ class MeasuringDesk:
         self._store, self._teller, self._on_over = store, teller, on_over
         self._requests: asyncio.Queue[Request] = asyncio.Queue(maxsize=1)
         self.is_busy = False
+        self.arrival_error_m = 0.0  # distance of the last fix from its point
 
     def begin(self, request: Request) -> None:
         """Take a measurement; ``is_busy`` until it is over."""
@@ -108,6 +109,7 @@ class MeasuringDesk:
                 "warning", f"the fix at {_name(request.point)} moved the estimate by {1e3 * jump_m:.1f} mm"
             )
         if request.point is not None:
+            self.arrival_error_m = self._mission.survey.distance_m(self._localizer.pose)
             self._teller.fix(request.point, fix, jump_m)
         self._mission.fixed(request.point)
 

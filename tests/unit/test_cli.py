@@ -90,8 +90,8 @@ def test_every_help_shows_an_example(path: tuple[str, ...], capsys: pytest.Captu
     assert f"    {' '.join(('ccatp', *path))}" in text
 
 
-def test_the_commands_are_those_of_the_contract() -> None:
-    assert {" ".join(path) for path in commands(cli) if path} == {
+def test_the_commands_are_those_of_the_contract_and_the_map() -> None:
+    assert {" ".join(path) for path in commands(cli) if path} - {"map"} == {
         "run", "status", "pause", "resume", "abort", "stop", "emergency",
         "sim", "sim robot", "sim etalon", "config", "config check", "config schema",
     }  # fmt: skip
@@ -303,6 +303,11 @@ def test_config_check_lists_every_problem(tmp_path: Path, capsys: pytest.Capture
         f"ccatp: {file}:3: run.sed is unknown; did you mean run.seed?",
         f"ccatp: {file}:2: run.seed = -3 must be at least 0",
     ]
+
+
+def test_a_map_of_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["map", str(tmp_path)]) == 2
+    assert "no config.toml there" in capsys.readouterr().err
 
 
 def test_the_schema_is_json(capsys: pytest.CaptureFixture[str]) -> None:
