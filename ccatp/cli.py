@@ -282,7 +282,10 @@ def _tell(reply: Mapping[str, Any], json_output: bool) -> None:
     if json_output:
         click.echo(json.dumps(reply))
         return
-    lines = list(_flat({key: value for key, value in reply.items() if key != "ok"}))
+    answer = {key: value for key, value in reply.items() if key != "ok"}
+    # The operator channel answers with the status alone: its own lines need no prefix, and no empty ones.
+    status = answer.get("status")
+    lines = [(k, v) for k, v in _flat(status if isinstance(status, Mapping) else answer) if v]
     width = max((len(key) for key, _ in lines), default=0)
     for key, value in lines:
         click.echo(f"{key:<{width}}  {value}")

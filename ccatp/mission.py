@@ -1,6 +1,6 @@
 """Pure. The survey: from the pose and the danger loop's verdict to the velocity wanted next. Time is an argument."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 from ccatp.angles import difference
@@ -8,6 +8,7 @@ from ccatp.config.models import Config
 from ccatp.control.tracker import LegTracker, Phase
 from ccatp.mirror.mirror import Mirror
 from ccatp.planning.errors import PlanError
+from ccatp.planning.route import Route
 from ccatp.samples import DeckPose, EventCode, PointId, Stop, StopKind, Twist, Verdict
 from ccatp.surveying.journey import Journey, Motion
 from ccatp.surveying.retreat import Retreat, Step
@@ -17,6 +18,7 @@ STILL = Twist(0.0, 0.0)
 # Sums of frame periods are not exact: half a nanosecond must not cost a frame.
 TIME_EPSILON_S = 5e-10
 PlanHome = Callable[[DeckPose], tuple[Stop, ...]]
+PlanRest = Callable[[DeckPose, Collection[PointId]], Route]
 
 
 @dataclass(slots=True)
@@ -45,15 +47,18 @@ class Mission:
     Args:
         cfg: the configuration.
         mirror: the mirror surveyed.
-        stops: the stops of the survey, in order.
+        route: the route of the survey.
         plan_home: gives the stops from a pose to base.
+        plan_rest: gives the route from a pose through the points that are left, given those that are not.
     """
 
-    def __init__(self, cfg: Config, mirror: Mirror, stops: Sequence[Stop], plan_home: PlanHome) -> None:
+    def __init__(self, cfg: Config, mirror: Mirror, route: Route, plan_home: PlanHome, plan_rest: PlanRest) -> None:
         """Idle at base."""
-        self._cfg, self._mirror, self._plan_home = cfg, mirror, plan_home
+        self._cfg, self._mirror, self._plan_home, self._plan_rest = cfg, mirror, plan_home, plan_rest
         self._tracker = LegTracker(cfg.control, cfg.limits, cfg.robot.wheel_lag_s)
-        self.survey = self._journey(stops)
+        self._route = route
+        self._is_off_route = False
+        self.survey = self._journey(route.stops)
         self._home: Journey | None = None
         self.state = State.IDLE
         self.outcome = Outcome.NONE
@@ -79,6 +84,11 @@ class Mission:
     def is_paused(self) -> bool:
         """Held until somebody resumes."""
         return self.state is State.HELD and self._is_held_by_hand
+
+    @property
+    def eta_s(self) -> float:
+        """Least time that the rest of the survey takes, s."""
+        return self._route.remaining_s(self.survey.index)
 
     @property
     def journey(self) -> Journey:
@@ -152,6 +162,12 @@ class Mission:
         self._failures = 0
         self._leave_stop(point, self.done)
 
+    def again(self) -> None:
+        """The fix shows the robot too far from its point, which has to be approached anew from where it really is."""
+        self._is_off_route = True
+        if self.is_awaiting_fix:
+            self._go_on()
+
     def not_fixed(self, point: PointId | None, cause: str) -> None:
         """The measurement failed for good: the point is skipped; several in a row hold the robot."""
         limit = self._cfg.mission.failed_points_before_hold
@@ -170,6 +186,8 @@ class Mission:
             self._backoffs = 0
             self.survey.advance()
         if was_awaited:
+            # Found again after a back-off, the robot stands where the route never led.
+            self._is_off_route |= self._is_refixing
             self._go_on()
 
     # -- the frame ------------------------------------------------------------------------------------------------
@@ -264,6 +282,8 @@ class Mission:
         return twist
 
     def _travel(self, motion: Motion) -> Order:
+        if self._is_off_route:
+            return self._find_route(motion)
         stop = self.survey.current
         if stop is None:
             self._go_on()
@@ -280,6 +300,17 @@ class Mission:
         self.survey.advance()
         self._go_on()
         return self._travel(motion)
+
+    def _find_route(self, motion: Motion) -> Order:
+        """Plan anew from where the robot is; one frame of standing still, however long that takes."""
+        try:
+            self._route = self._plan_rest(motion.deck, {*self.done, *self.skipped})
+        except PlanError as error:
+            self.fault(f"no way on: {error}")
+            return Order(STILL)
+        self._is_off_route = False
+        self.survey = self._journey(self._route.stops)
+        return Order(STILL)
 
     def _is_quiet(self, motion: Motion) -> bool:
         control = self._cfg.control

@@ -153,6 +153,8 @@ class MissionConfig(Model):
     backoff_speed_m_s: Annotated[float, Field(gt=0.0, le=0.05)]
     turn_away_rad: Positive
     max_backoffs_per_stop: Annotated[int, Field(ge=1)]
+    arrival_tolerance_m: Positive
+    max_approaches: Annotated[int, Field(ge=1)]
     verdict_timeout_s: Positive
     measure_timeout_s: Positive
     failed_points_before_hold: Annotated[int, Field(ge=1)]

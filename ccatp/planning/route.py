@@ -11,6 +11,7 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.planning.bound import leg_lengths, stop_times
 from ccatp.planning.course import course_of_heading
 from ccatp.planning.errors import OutsideMirrorError, UnreachableError
+from ccatp.planning.escape import find_escape
 from ccatp.planning.legs import LegRules
 from ccatp.planning.retreats import find_retreats
 from ccatp.planning.search import Arrival, Search, Target
@@ -92,7 +93,10 @@ def _stops(
         )
     search = Search(LegRules(mirror, body), limits)
     retreats = find_retreats(mirror, body, places)
-    arrivals = [Arrival(places[0], course_of_heading(mirror, start), 0.0)]
+    first = Arrival(places[0], course_of_heading(mirror, start), 0.0)
+    if places[0].stance is not None:  # too near the rim to turn: away from it first, as on the way home
+        first, retreats[0] = find_escape(mirror, body, first, limits), ()
+    arrivals = [first]
     for k, point in enumerate(points, start=1):
         arrivals = search.advance(arrivals, retreats[k - 1], Target(places[k], retreats[k]))
         if not arrivals:

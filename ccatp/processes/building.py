@@ -1,6 +1,6 @@
 """Glue. Builds the pure parts of the main loop from a configuration."""
 
-from collections.abc import Callable
+from collections.abc import Collection
 from dataclasses import dataclass
 from math import hypot
 
@@ -13,7 +13,7 @@ from ccatp.filters import FILTERS
 from ccatp.localization.measurements import STATES
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.mission import Mission
+from ccatp.mission import Mission, PlanHome, PlanRest
 from ccatp.planning.bound import path_time
 from ccatp.planning.route import Route, plan_route
 from ccatp.planning.traversal import ORDERS
@@ -75,12 +75,10 @@ def build_parts(args: ProcessArgs) -> tuple[Parts, MissionStore]:
     except StoreError as error:
         raise StoreUnusable(str(error)) from error
     done = store.measured_points()
-    route = plan_route(
-        mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose, done, cfg.etalon.measuring_time_s
-    )
+    route = _rest_planner(cfg, mirror, points, done)(mirror.base_pose, ())
     # The localizer re-initialises it at once; what counts is its size.
     filter_ = FILTERS[cfg.run.filter](np.zeros(STATES), np.eye(STATES))
-    mission = Mission(cfg, mirror, route.stops, _home_planner(cfg, mirror))
+    mission = Mission(cfg, mirror, route, _home_planner(cfg, mirror), _rest_planner(cfg, mirror, points, done))
     parts = Parts(
         cfg=cfg,
         mirror=mirror,
@@ -121,7 +119,16 @@ def _open_store(args: ProcessArgs, mirror: Mirror, points: list[PointId]) -> Mis
     return MissionStore.create(path, mirror=mirror.name, seed=cfg.run.seed, config_toml=text, points=planned)
 
 
-def _home_planner(cfg: Config, mirror: Mirror) -> Callable[[DeckPose], tuple[Stop, ...]]:
+def _rest_planner(cfg: Config, mirror: Mirror, points: list[PointId], done: set[PointId]) -> PlanRest:
+    def plan(start: DeckPose, skip: Collection[PointId]) -> Route:
+        left_out = done.union(skip)
+        measuring_s = cfg.etalon.measuring_time_s
+        return plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, start, left_out, measuring_s)
+
+    return plan
+
+
+def _home_planner(cfg: Config, mirror: Mirror) -> PlanHome:
     def plan(start: DeckPose) -> tuple[Stop, ...]:
         return plan_way_home(mirror, start, mirror.base_pose, cfg.robot, cfg.limits, cfg.mission)
 

@@ -69,7 +69,7 @@ class MainLoop:
         self._teller = Teller(self._publisher, open_log(args.run_dir / "log.jsonl", "main"))
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m)
         self._measuring = MeasuringDesk(
-            self._etalon, parts.localizer, parts.mission, store, self._teller, self._answer_held_frame
+            cfg.mission, self._etalon, parts.localizer, parts.mission, store, self._teller, self._answer_held_frame
         )
         self._link = RobotLink(
             host=cfg.robot.host,
@@ -317,7 +317,7 @@ class MainLoop:
             total=self._parts.total_points,
             point=f"{point.row}-{point.col}-{point.point}" if point is not None else "",
             elapsed_s=self._t_last_s - (self._t_first_s if self._t_first_s is not None else self._t_last_s),
-            eta_s=self._parts.route.remaining_s(mission.survey.index),
+            eta_s=mission.eta_s,
             error_mm=1e3 * self._measuring.arrival_error_m,
             code=0 if self._verdict is None else int(self._verdict.code),
             outcome=str(mission.outcome),

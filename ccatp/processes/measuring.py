@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ccatp.config.models import MissionConfig
 from ccatp.etalon_client import EtalonClient, EtalonError
 from ccatp.localization.fixes import FixRefused
 from ccatp.localizer import Localizer
@@ -11,9 +12,6 @@ from ccatp.mission import Mission
 from ccatp.processes.telling import Teller
 from ccatp.samples import DeckPose, Fix, PointId, Vector3
 from ccatp.store import MissionStore, StoreError
-
-# A fix that moves the estimate by more than this is worth a line to the operator: an arrival must be within 10 mm.
-NOTABLE_JUMP_M = 0.010
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +28,7 @@ class MeasuringDesk:
     """Takes the measurements that the mission orders.
 
     Args:
+        cfg: how near the robot has to come, and how often it may try.
         client: the laser system's client.
         localizer: takes the fix.
         mission: is told the result.
@@ -40,6 +39,7 @@ class MeasuringDesk:
 
     def __init__(
         self,
+        cfg: MissionConfig,
         client: EtalonClient,
         localizer: Localizer,
         mission: Mission,
@@ -48,6 +48,8 @@ class MeasuringDesk:
         on_over: Callable[[], None],
     ) -> None:
         """Nothing is wanted yet."""
+        self._tolerance_m, self._max_approaches = cfg.arrival_tolerance_m, cfg.max_approaches
+        self._approaches: tuple[PointId | None, int] = (None, 0)
         self._client, self._localizer, self._mission = client, localizer, mission
         self._store, self._teller, self._on_over = store, teller, on_over
         self._requests: asyncio.Queue[Request] = asyncio.Queue(maxsize=1)
@@ -93,25 +95,45 @@ class MeasuringDesk:
         self._mission.not_fixed(request.point, cause)
 
     async def _accept(self, request: Request, fix: Fix) -> None:
+        jump_m = self._fuse(request, fix)
         if request.point is not None:
+            self.arrival_error_m = self._mission.survey.distance_m(self._localizer.pose)
+            if self._is_too_far(request.point):
+                self._mission.again()
+                return
             try:
                 await asyncio.wrap_future(self._store.record_fix(request.point, fix, request.estimate))
             except StoreError as error:
                 self._mission.fault(f"the fix of {_name(request.point)} cannot be stored: {error}")
                 return
+            self._teller.fix(request.point, fix, jump_m)
+        self._mission.fixed(request.point)
+
+    def _fuse(self, request: Request, fix: Fix) -> float:
+        """Let the localizer have the fix; how far it moved the estimate, m."""
         try:
             jump_m = self._localizer.fuse_fix(fix)
         except FixRefused as refusal:
-            self._teller.say("warning", f"the fix at {_name(request.point)} is stored but not used: {refusal}")
-            jump_m = 0.0
-        if jump_m > NOTABLE_JUMP_M:
+            self._teller.say("warning", f"the fix at {_name(request.point)} is not used: {refusal}")
+            return 0.0
+        if jump_m > self._tolerance_m:
             self._teller.say(
                 "warning", f"the fix at {_name(request.point)} moved the estimate by {1e3 * jump_m:.1f} mm"
             )
-        if request.point is not None:
-            self.arrival_error_m = self._mission.survey.distance_m(self._localizer.pose)
-            self._teller.fix(request.point, fix, jump_m)
-        self._mission.fixed(request.point)
+        return jump_m
+
+    def _is_too_far(self, point: PointId) -> bool:
+        """Whether the point has to be approached again: what was measured there is not its alignment."""
+        count = self._approaches[1] + 1 if self._approaches[0] == point else 1
+        self._approaches = (point, count)
+        if self.arrival_error_m <= self._tolerance_m:
+            return False
+        what = f"{1e3 * self.arrival_error_m:.1f} mm from {_name(point)}"
+        if count >= self._max_approaches:
+            self._teller.say("warning", f"{what} after {count} approaches: measured there all the same")
+            return False
+        self._teller.say("warning", f"{what}: approaching it again")
+        return True
 
 
 def _name(point: PointId | None) -> str:

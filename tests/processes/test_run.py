@@ -178,6 +178,25 @@ def test_a_port_in_use_is_one_line_and_status_2(start: Start) -> None:
     assert "sim.robot.port" in run.stderr
 
 
+def test_a_robot_set_down_wrongly_meets_the_rim_finds_itself_and_measures_everything(start: Start) -> None:
+    # Seed 8 sets the robot down 0.1 m beside base, with a sensor almost over the rim.
+    run = start("--panels", "1", "--seed", "8", "--set", "world.start_position_sigma_m=0.08")
+    assert run.wait() == 0, run.stderr
+    assert "backing off" in run.stderr
+    assert run.summary["points"]["measured"] == 9
+    danger = run.summary["danger"]
+    assert (danger["true_edges"], danger["false_edges"], danger["falls"]) == (1, 0, 0)
+    assert 0.0 < danger["max_overrun_mm"] <= 20.0
+
+
+def test_a_point_missed_by_more_than_a_centimetre_is_approached_again(start: Start) -> None:
+    # Seed 2 sets the robot down 0.07 m beside base, away from the rim.
+    run = start("--panels", "1", "--seed", "2", "--set", "world.start_position_sigma_m=0.08")
+    assert run.wait() == 0, run.stderr
+    assert "approaching it again" in run.stderr
+    assert run.summary["points"] == {"total": 9, "measured": 9, "first_arrival_within_10mm": 8, "skipped": 0}
+
+
 def test_resume_goes_on_with_the_first_unmeasured_point(start: Start, tmp_path: Path) -> None:
     run = start("--panels", "2")
     run.until(lambda status: status["done"] >= 5)

@@ -1,6 +1,6 @@
 """The mission as stories in virtual time: an ideal robot on one panel, verdicts as told."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from itertools import product
 from math import cos, exp, hypot, sin
@@ -10,6 +10,8 @@ import pytest
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.mission import Mission, Order
+from ccatp.planning.errors import PlanError
+from ccatp.planning.route import Route
 from ccatp.samples import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Twist, Verdict
 from ccatp.surveying.journey import Motion
 from ccatp.surveying.states import MOVING, Event, Outcome, State, next_state
@@ -31,7 +33,8 @@ class Story:
         self.stops = tuple(
             Stop(*mirror.point_on_deck(PointId(5, 5, k)), StopKind.MEASURE, PointId(5, 5, k)) for k in (1, 2, 3)
         )
-        self.mission = Mission(config, mirror, self.stops, self.plan_home)
+        self.mission = Mission(config, mirror, self.route(self.stops), self.plan_home, self.plan_rest)
+        self.plans: list[DeckPose] = []
         start = mirror.point_on_deck(PointId(5, 5, 4))
         pose = mirror.panel_pose(PANEL, DeckPose(*start, 0.0))
         self.x, self.y, self.heading = pose.x_m, pose.y_m, pose.heading_rad
@@ -39,6 +42,15 @@ class Story:
         self.base = start
         self.orders: list[Order] = []
         self.auto_fix = True
+
+    @staticmethod
+    def route(stops: tuple[Stop, ...]) -> Route:
+        left = tuple(float(len(stops) - k) for k in range(len(stops) + 1))
+        return Route(stops, left, left)
+
+    def plan_rest(self, start: DeckPose, skip: Collection[PointId]) -> Route:
+        self.plans.append(start)
+        return self.route(tuple(stop for stop in self.stops if stop.point not in skip))
 
     def plan_home(self, _start: DeckPose) -> tuple[Stop, ...]:
         return (Stop(*self.base, StopKind.BASE, heading_rad=1.0),)
@@ -179,6 +191,8 @@ def test_edge_backs_off_at_most_60_mm_turns_away_fixes_and_resumes(story: Story,
     assert story.mission.state is State.SETTLING
     story.until(lambda: story.orders[-1].measure)
     assert story.mission.done == []  # that fix was none of a point
+    story.until(lambda: story.mission.state is State.DRIVING)
+    assert len(story.plans) == 1  # the route goes on from where the robot really is
     story.until_state(State.DONE)
     assert len(story.mission.done) == 3
 
@@ -255,3 +269,40 @@ def test_interrupt_is_news_only_once(story: Story) -> None:
     story.until_state(State.DRIVING)
     assert story.mission.interrupt("no frames")
     assert not story.mission.interrupt("no frames")
+
+
+def test_a_point_missed_is_approached_again(story: Story) -> None:
+    story.auto_fix = False
+    story.until(lambda: story.mission.is_awaiting_fix)
+    story.mission.again()
+    assert story.mission.done == []
+    story.until(lambda: story.mission.state is State.MEASURING)
+    assert len(story.plans) == 1
+    story.auto_fix = True
+    story.until_state(State.DONE)
+    assert [p.point for p in story.mission.done] == [1, 2, 3]
+
+
+def test_no_way_on_and_no_way_home_are_faults(config: Config, mirror: Mirror) -> None:
+    story = Story(config, mirror)
+
+    def refuse(*_: object) -> Route:
+        raise PlanError("walled in")
+
+    story.mission = Mission(config, mirror, story.route(story.stops), refuse, refuse)  # type: ignore[arg-type]
+    story.until_state(State.DRIVING)
+    story.mission.again()
+    story.mission.pause("operator")
+    story.mission.resume()
+    story.frame()
+    assert story.mission.is_faulted
+    assert story.mission.cause == "no way on: walled in"
+    story.mission.abort("fire")
+    story.frame()
+    assert story.mission.cause == "no way home: walled in"
+
+
+def test_eta_falls_as_stops_are_done(story: Story) -> None:
+    assert story.mission.eta_s == 3.0
+    story.until(lambda: len(story.mission.done) == 2)
+    assert story.mission.eta_s == 1.0
