@@ -3,13 +3,13 @@
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
-from ccatp.angles import difference
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegTracker, Phase
 from ccatp.mirror.mirror import Mirror
 from ccatp.planning.errors import PlanError
 from ccatp.planning.route import Route
 from ccatp.samples import DeckPose, EventCode, PointId, Stop, StopKind, Twist, Verdict
+from ccatp.surveying.homing import Homing
 from ccatp.surveying.journey import Journey, Motion
 from ccatp.surveying.retreat import Retreat, Step
 from ccatp.surveying.states import Event, Outcome, State, next_state
@@ -59,7 +59,7 @@ class Mission:
         self._route = route
         self._is_off_route = False
         self.survey = self._journey(route.stops)
-        self._home: Journey | None = None
+        self._home: Homing | None = None
         self.state = State.IDLE
         self.outcome = Outcome.NONE
         self.cause = ""
@@ -70,7 +70,6 @@ class Mission:
         self.is_faulted = False
         self._retreat: Retreat | None = None
         self._is_refixing = False
-        self._is_docking = False
         self._backoffs = 0
         self._failures = 0
         self._quiet_since_s: float | None = None
@@ -93,7 +92,7 @@ class Mission:
     @property
     def journey(self) -> Journey:
         """The journey being made: the survey, or the way home."""
-        return self.survey if self._home is None else self._home
+        return self.survey if self._home is None else self._home.journey
 
     # -- commands: each returns why it was refused, or None -------------------------------------------------------
 
@@ -248,8 +247,8 @@ class Mission:
 
     def _interrupt(self) -> None:
         """Forget where in a leg, a stop or a docking the robot was: it begins anew from where it is."""
-        self.journey.interrupt()
-        self._is_asked = self._is_docking = self._is_refixing = False
+        (self.survey if self._home is None else self._home).interrupt()
+        self._is_asked = self._is_refixing = False
         self._quiet_since_s = None
 
     def _hold(self, cause: str, *, by_hand: bool) -> None:
@@ -274,12 +273,13 @@ class Mission:
 
     # -- moving and measuring -------------------------------------------------------------------------------------
 
-    def _follow(self, motion: Motion, journey: Journey, stop: Stop) -> Twist:
-        twist = journey.follow(motion, stop)
-        if journey.is_overdue(motion.t_s):
-            self.fault(f"the leg to ({stop.x_m:.3f}, {stop.y_m:.3f}) m is overdue: is a wheel blocked or slipping?")
-            return STILL
-        return twist
+    def _is_overdue(self, motion: Motion) -> bool:
+        """Whether the leg takes so long that something must be wrong; that holds the robot."""
+        stop = self.journey.current
+        if stop is None or not self.journey.is_overdue(motion.t_s):
+            return False
+        self.fault(f"the leg to ({stop.x_m:.3f}, {stop.y_m:.3f}) m is overdue: is a wheel blocked or slipping?")
+        return True
 
     def _travel(self, motion: Motion) -> Order:
         if self._is_off_route:
@@ -288,8 +288,8 @@ class Mission:
         if stop is None:
             self._go_on()
             return Order(STILL)
-        twist = self._follow(motion, self.survey, stop)
-        if self.state is State.HELD:
+        twist = self.survey.follow(motion, stop)
+        if self._is_overdue(motion):
             return Order(STILL)
         if self._tracker.phase is not Phase.DONE:
             self._apply(Event.TURNED if self._tracker.phase is Phase.DRIVE else Event.REALIGN)
@@ -355,34 +355,13 @@ class Mission:
     def _return(self, motion: Motion) -> Order:
         if self._home is None:
             try:
-                self._home = self._journey(self._plan_home(motion.deck))
+                self._home = Homing(self._journey(self._plan_home(motion.deck)), self._tracker)
             except PlanError as error:
                 self.fault(f"no way home: {error}")
             return Order(STILL)
-        stop = self._home.current
-        if stop is None:
+        if self._home.is_at_base:
             self.outcome = Outcome.AT_BASE
             self._apply(Event.FINISHED)
             return Order(STILL, at_rest=True)
-        if self._is_docking:
-            return self._dock(motion, stop)
-        twist = self._follow(motion, self._home, stop)
-        if self.state is not State.RETURNING:
-            return Order(STILL)
-        if self._tracker.phase is not Phase.DONE:
-            return Order(twist)
-        if stop.kind is StopKind.BASE:
-            self._is_docking = True
-            if stop.heading_rad is not None:
-                self._tracker.begin_turn(difference(stop.heading_rad, motion.deck.heading_rad))
-        else:
-            self._home.advance()
-        return Order(STILL)
-
-    def _dock(self, motion: Motion, stop: Stop) -> Order:
-        if stop.heading_rad is not None and self._tracker.phase is Phase.TURN:
-            remaining = difference(stop.heading_rad, motion.deck.heading_rad)
-            return Order(self._tracker.step_turn(remaining, motion.dt_s))
-        if self._is_quiet(motion) and self._home is not None:
-            self._home.advance()
-        return Order(STILL)
+        twist = self._home.step(motion, self._is_quiet(motion))
+        return Order(STILL if self._is_overdue(motion) else twist)

@@ -7,7 +7,7 @@ import time
 import zmq
 import zmq.asyncio
 
-from ccatp.bus import Publisher, Subscriber
+from ccatp.bus import Publisher
 from ccatp.control.gate import DriveGate
 from ccatp.errors import CcatpError, ExitStatus, UnreachableError
 from ccatp.etalon_client import EtalonClient, EtalonError
@@ -17,12 +17,12 @@ from ccatp.mission import Mission, Order
 from ccatp.processes import spinning
 from ccatp.processes.building import Parts, build_parts
 from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
+from ccatp.processes.hearing import VerdictEar
 from ccatp.processes.measuring import MeasuringDesk, Request
 from ccatp.processes.operating import OperatorDesk
 from ccatp.processes.telling import Teller
 from ccatp.robot_link import RobotLink, read_key
 from ccatp.router import Router
-from ccatp.samples import Verdict
 from ccatp.store import MissionStore
 from ccatp.surveying.journey import Motion
 from ccatp.surveying.states import Outcome, State
@@ -37,8 +37,6 @@ EXIT_STATUS = {
 }
 BEAT_PERIOD_S = 0.1
 WAIT_PERIOD_S = 0.02
-# In lockstep simulated time stands still while we wait; longer than this the danger loop is gone.
-LOCKSTEP_WAIT_S = 2.0
 # After the end the last messages must reach the supervisor, which then ends this process.
 FAREWELL_S = 5.0
 
@@ -65,7 +63,7 @@ class MainLoop:
         self._gate: DriveGate = parts.gate
         self._parts = parts
         self._publisher = Publisher(context, args.endpoints.of("main"))
-        self._subscriber = Subscriber(context, [args.endpoints.of("danger")], ["verdict", "presence.danger"])
+        self._ear = VerdictEar(context, args.endpoints.of("danger"), cfg.mission.verdict_timeout_s)
         self._teller = Teller(self._publisher, open_log(args.run_dir / "log.jsonl", "main"))
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m)
         self._measuring = MeasuringDesk(
@@ -83,8 +81,6 @@ class MainLoop:
         self._hello: Hello | None = None
         self._is_lockstep = False
         self._phase = "starting"
-        self._verdict: Verdict | None = None
-        self._verdict_wall_s = 0.0
         self._t_first_s: float | None = None
         self._t_last_s = 0.0
         self._frame_wall_s = time.monotonic()
@@ -123,7 +119,7 @@ class MainLoop:
         except EtalonError as error:
             raise UnreachableError(str(error)) from error
         self._phase = "ready"
-        while not (self._publisher.has_subscriber("track") and self._is_danger_joined()):
+        while not (self._publisher.has_subscriber("track") and self._ear.is_danger_joined()):
             if stop.is_set():
                 return
             await asyncio.sleep(WAIT_PERIOD_S)
@@ -133,14 +129,6 @@ class MainLoop:
         self._phase = "joined"
         self._link.send_fans(1, self._cfg.robot.fan_duty)
         self._teller.say("info", f"joined the robot at {self._cfg.robot.host}:{self._cfg.robot.port}")
-
-    def _is_danger_joined(self) -> bool:
-        """Its presence is repeated, so hearing it once after our own subscribers are there is enough."""
-        while (received := self._subscriber.receive()) is not None:
-            message = received[1]
-            if isinstance(message, Presence) and message.phase == "joined":
-                return True
-        return False
 
     async def _farewell(self, stop: asyncio.Event) -> None:
         """Keep telling the end until the supervisor has heard it and stops us."""
@@ -207,7 +195,7 @@ class MainLoop:
             self._mission.fault(localizer.hold_cause)
             localizer.clear_hold()
         waiting = time.perf_counter()
-        verdict = self._hear(seq)
+        verdict = self._ear.hear(seq, self._frame_period_s(), is_lockstep=self._is_lockstep)
         heard = time.perf_counter()
         motion = Motion(t_s, dt_s, localizer.pose, self._mirror.deck_pose, localizer.speed_m_s, localizer.rate_rad_s)
         order = self._mission.step(motion, verdict)
@@ -225,26 +213,6 @@ class MainLoop:
 
     def _frame_period_s(self) -> float:
         return 1.0 / self._hello.frame_hz if self._hello is not None else 0.01
-
-    def _hear(self, seq: int) -> Verdict | None:
-        """The verdict in force: in lockstep that of this very frame, else the newest that is fresh."""
-        deadline = time.monotonic() + LOCKSTEP_WAIT_S
-        while True:
-            must_wait = self._is_lockstep and (self._verdict is None or self._verdict.seq < seq)
-            if self._is_lockstep and not must_wait:
-                break
-            received = self._subscriber.receive(deadline - time.monotonic() if must_wait else 0.0)
-            if received is None:
-                break
-            if isinstance(received[1], Verdict):
-                self._verdict, self._verdict_wall_s = received[1], time.monotonic()
-        verdict = self._verdict
-        if verdict is None:
-            return None
-        age_s = max((seq - verdict.seq) * self._frame_period_s(), 0.0)
-        if not self._is_lockstep:
-            age_s = max(age_s, time.monotonic() - self._verdict_wall_s)
-        return verdict if age_s <= self._cfg.mission.verdict_timeout_s else None
 
     def _execute(self, order: Order, motion: Motion) -> None:
         if order.at_rest:
@@ -319,14 +287,14 @@ class MainLoop:
             elapsed_s=self._t_last_s - (self._t_first_s if self._t_first_s is not None else self._t_last_s),
             eta_s=mission.eta_s,
             error_mm=1e3 * self._measuring.arrival_error_m,
-            code=0 if self._verdict is None else int(self._verdict.code),
+            code=0 if self._ear.verdict is None else int(self._ear.verdict.code),
             outcome=str(mission.outcome),
             lower_bound_s=self._parts.lower_bound_s,
         )
 
     def close(self) -> None:
         """Close the sockets."""
-        self._subscriber.close()
+        self._ear.close()
         self._publisher.close()
 
 
