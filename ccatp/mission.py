@@ -17,8 +17,10 @@ from ccatp.surveying.states import Event, Outcome, State, next_state
 STILL = Twist(0.0, 0.0)
 # Sums of frame periods are not exact: half a nanosecond must not cost a frame.
 TIME_EPSILON_S = 5e-10
+# Wheels stop within half a second: a robot that is not at rest after this long creeps, or its sensors say so.
+SETTLE_LIMIT_S = 10.0
 PlanHome = Callable[[DeckPose], tuple[Stop, ...]]
-PlanRest = Callable[[DeckPose, Collection[PointId]], Route]
+PlanRest = Callable[[Route, DeckPose, Collection[PointId]], Route]
 
 
 @dataclass(slots=True)
@@ -49,7 +51,7 @@ class Mission:
         mirror: the mirror surveyed.
         route: the route of the survey.
         plan_home: gives the stops from a pose to base.
-        plan_rest: gives the route from a pose through the points that are left, given those that are not.
+        plan_rest: gives the way back to a route from a pose, without the points that are done with.
     """
 
     def __init__(self, cfg: Config, mirror: Mirror, route: Route, plan_home: PlanHome, plan_rest: PlanRest) -> None:
@@ -69,12 +71,15 @@ class Mission:
         self._is_held_by_hand = False
         self.is_faulted = False
         self._retreat: Retreat | None = None
-        self._is_refixing = False
+        self._is_lost = False
         self._backoffs = 0
         self._failures = 0
         self._quiet_since_s: float | None = None
         self._measure_at_s = 0.0
         self._is_asked = False
+        self._emergency = ""
+        self._settle_by_s: float | None = None
+        self.request = 0
 
     def _journey(self, stops: Sequence[Stop]) -> Journey:
         return Journey(self._mirror, self._tracker, self._cfg.control.leg_timeout_factor, stops)
@@ -100,8 +105,6 @@ class Mission:
         """Hold until ``resume``."""
         if self.state is State.DONE:
             return "the mission is over"
-        if self.state is State.BACKING_OFF:
-            return "backing off from the edge; try again when that is over"
         self._hold(cause, by_hand=True)
         return None
 
@@ -116,11 +119,11 @@ class Mission:
         """Return to base and end there."""
         if self.state is State.DONE:
             return "the mission is over"
-        if self._abort_cause is None:
-            self._abort_cause = cause
-            # An edge outranks an abort: the retreat and its fix come first.
-            if self.state is not State.BACKING_OFF and not self._is_refixing:
-                self._go_on()
+        is_news = self._abort_cause is None
+        self._abort_cause = self._abort_cause or cause
+        # An edge outranks an abort: the retreat and its fix come first.
+        if self.state is State.HELD or (is_news and self.state is not State.BACKING_OFF and not self._is_lost):
+            self._go_on()
         return None
 
     def stop(self) -> str | None:
@@ -131,8 +134,11 @@ class Mission:
         self._apply(Event.FINISHED)
         return None
 
-    def fault(self, cause: str) -> None:
-        """Hold until an operator resumes, because something is wrong."""
+    def fault(self, cause: str, *, is_lost: bool = False) -> None:
+        """Hold until an operator resumes, because something is wrong; where the pose is, a fix comes first then."""
+        if self.state is State.DONE:
+            return
+        self._is_lost |= is_lost
         self._hold(cause, by_hand=True)
         self.is_faulted = True
 
@@ -147,18 +153,21 @@ class Mission:
 
     @property
     def is_awaiting_fix(self) -> bool:
-        """Whether a measurement has been asked for and is still wanted."""
+        """Whether the measurement asked for last, number ``request``, is still wanted."""
         return self.state is State.MEASURING and self._is_asked
 
     @property
     def measuring_point(self) -> PointId | None:
         """The point being measured; ``None`` for a fix that only serves to find the robot again."""
         stop = self.survey.current
-        return None if self._is_refixing or stop is None else stop.point
+        return None if self._is_lost or stop is None else stop.point
 
     def fixed(self, point: PointId | None) -> None:
         """The measurement that was asked for is taken, fused and stored."""
         self._failures = 0
+        if point is None:
+            # Found again, the robot stands where the route never led.
+            self._is_lost, self._is_off_route = False, True
         self._leave_stop(point, self.done)
 
     def again(self) -> None:
@@ -169,12 +178,17 @@ class Mission:
 
     def not_fixed(self, point: PointId | None, cause: str) -> None:
         """The measurement failed for good: the point is skipped; several in a row hold the robot."""
+        if point is None:
+            self.fault(f"the robot cannot be found again: {cause}")
+            return
         limit = self._cfg.mission.failed_points_before_hold
         self._failures += 1
+        if self._failures < limit:
+            self._leave_stop(point, self.skipped)
+            return
+        self._failures = 0
+        self.fault(f"{limit} measurements in a row failed: {cause}")
         self._leave_stop(point, self.skipped)
-        if self._failures >= limit:
-            self._failures = 0
-            self.fault(f"{limit} measurements in a row failed: {cause}")
 
     def _leave_stop(self, point: PointId | None, record: list[PointId]) -> None:
         was_awaited = self.is_awaiting_fix
@@ -185,8 +199,6 @@ class Mission:
             self._backoffs = 0
             self.survey.advance()
         if was_awaited:
-            # Found again after a back-off, the robot stands where the route never led.
-            self._is_off_route |= self._is_refixing
             self._go_on()
 
     # -- the frame ------------------------------------------------------------------------------------------------
@@ -221,13 +233,14 @@ class Mission:
         if verdict.code is EventCode.NEAR_EDGE:
             self._meet_edge(motion, verdict)
             return
-        if verdict.code is EventCode.ABORTED:
+        if verdict.code is EventCode.ABORTED and verdict.cause != self._emergency:
+            self._emergency = verdict.cause  # the level is repeated; what counts is that it is new
             self.abort(verdict.cause)
         if self.state is State.IDLE or (self.state is State.HELD and not self._is_held_by_hand):
             self._go_on()
 
     def _meet_edge(self, motion: Motion, verdict: Verdict) -> None:
-        if self.state in (State.BACKING_OFF, State.IDLE, State.DONE):
+        if self.state in (State.BACKING_OFF, State.DONE):
             return
         if self.state is State.HELD and self._is_held_by_hand:
             return
@@ -239,6 +252,8 @@ class Mission:
             return
         self.cause = verdict.cause
         self._interrupt()
+        # An edge that the route did not foresee means that the pose is wrong: it is found again before moving on.
+        self._is_lost = True
         self._apply(Event.EDGE)
         self._retreat = Retreat(self._cfg.mission, self._tracker, verdict, motion.pose, motion.rate_rad_s)
 
@@ -248,8 +263,8 @@ class Mission:
     def _interrupt(self) -> None:
         """Forget where in a leg, a stop or a docking the robot was: it begins anew from where it is."""
         (self.survey if self._home is None else self._home).interrupt()
-        self._is_asked = self._is_refixing = False
-        self._quiet_since_s = None
+        self._is_asked = False
+        self._quiet_since_s = self._settle_by_s = None
 
     def _hold(self, cause: str, *, by_hand: bool) -> None:
         self._interrupt()
@@ -260,7 +275,11 @@ class Mission:
     def _go_on(self) -> None:
         self._interrupt()
         self.is_faulted = False
-        if self._abort_cause is not None:
+        # Wherever a hold left the robot: the route's next turn may not be safe there.
+        self._is_off_route |= self.state is State.HELD
+        if self._is_lost:
+            self._apply(Event.FIND)
+        elif self._abort_cause is not None:
             self.cause = self._abort_cause
             self._home = None  # planned anew from where the robot is now
             self._apply(Event.GO_HOME)
@@ -304,7 +323,7 @@ class Mission:
     def _find_route(self, motion: Motion) -> Order:
         """Plan anew from where the robot is; one frame of standing still, however long that takes."""
         try:
-            self._route = self._plan_rest(motion.deck, {*self.done, *self.skipped})
+            self._route = self._plan_rest(self._route, motion.deck, {*self.done, *self.skipped})
         except PlanError as error:
             self.fault(f"no way on: {error}")
             return Order(STILL)
@@ -322,8 +341,15 @@ class Mission:
         return motion.t_s - self._quiet_since_s >= control.settle_time_s - TIME_EPSILON_S
 
     def _settle(self, motion: Motion) -> Order:
+        if self._settle_by_s is None:
+            self._settle_by_s = motion.t_s + SETTLE_LIMIT_S
         if not self._is_quiet(motion):
+            if motion.t_s > self._settle_by_s:
+                self.fault(
+                    f"the robot does not come to rest: {motion.speed_m_s:.4f} m/s, {motion.rate_rad_s:.4f} rad/s"
+                )
             return Order(STILL)
+        self._settle_by_s = None
         self._apply(Event.SETTLED)
         self._measure_at_s = motion.t_s + self._cfg.etalon.measuring_time_s - TIME_EPSILON_S
         return Order(STILL, at_rest=True, arrived=self.measuring_point)
@@ -332,6 +358,7 @@ class Mission:
         if self._is_asked or motion.t_s < self._measure_at_s:
             return Order(STILL)
         self._is_asked = True
+        self.request += 1
         return Order(STILL, measure=True)
 
     # -- edge and home --------------------------------------------------------------------------------------------
@@ -343,12 +370,10 @@ class Mission:
             return Order(STILL)
         twist = retreat.step(motion.pose, verdict, motion.dt_s)
         if retreat.step_at is Step.STUCK:
-            self.fault("stuck at the edge: no motion away from it is permitted")
+            self.fault("stuck at the edge: no motion away from it is permitted, or none helps")
             return Order(STILL)
         if retreat.step_at is Step.OVER:
-            # An edge that the route did not foresee means that the pose is wrong: find it again before moving on.
-            self._is_refixing = True
-            self._apply(Event.RETREATED)
+            self._apply(Event.FIND)
             return Order(STILL)
         return Order(twist)
 

@@ -20,7 +20,7 @@ import zmq
 from ccatp.config.loader import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.errors import ConfigError, ExitStatus, RefusedError
-from ccatp.processes.common import Endpoints, open_log
+from ccatp.processes.common import SUPERVISOR_PID, Endpoints, open_log
 from ccatp.processes.run_collector import RunCollector
 from ccatp.processes.run_view import RunView
 from ccatp.run_options import RunOptions, default_run_dir
@@ -58,10 +58,6 @@ PROCESSES: tuple[ProcessSpec, ...] = (
     ProcessSpec("danger", "ccatp.processes.danger_loop"),
     ProcessSpec("main", "ccatp.processes.main_loop"),
 )
-
-
-class Interrupted(Exception):
-    """SIGINT or SIGTERM arrived."""
 
 
 def run_survey(options: RunOptions) -> int:
@@ -152,11 +148,28 @@ def _make_run_dir(options: RunOptions, cfg: Config) -> Path:
         )
     if options.resume and not has_mission:
         raise ConfigError(f"--resume: no mission in {run_dir}; name the folder of the run with --run-dir")
+    if options.resume:
+        _check_resumed(run_dir, cfg)
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"--run-dir: cannot make {run_dir}: {error.strerror}") from error
     return run_dir.absolute()
+
+
+def _check_resumed(run_dir: Path, cfg: Config) -> None:
+    """A mission goes on with the points it was planned with."""
+    path = run_dir / "config.toml"
+    if not path.exists():
+        return
+    before = load_config(path)
+    for name, was, wanted in (
+        ("run.mirror", before.mirror.name, cfg.mirror.name),
+        ("run.order", before.run.order, cfg.run.order),
+        ("run.panels", before.run.panels, cfg.run.panels),
+    ):
+        if was != wanted:
+            raise ConfigError(f"--resume: {name} was {was} in {run_dir} and is {wanted} now; resume with what it was")
 
 
 class _Run:
@@ -174,19 +187,23 @@ class _Run:
         self._options, self._cfg, self._run_dir, self._endpoints = options, cfg, run_dir, endpoints
         self._sockets, self._started_s = sockets, started_s
         self._children: dict[str, subprocess.Popen[bytes]] = {}
+        self._is_interrupted = False
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
 
     def go(self) -> int:
         """Start, watch, collect, stop; returns the exit status."""
         self._log.info("run", mirror=self._cfg.mirror.name, seed=self._cfg.run.seed, sim=self._options.sim)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        previous = {n: signal.signal(n, _raise_interrupted) for n in (signal.SIGINT, signal.SIGTERM)}
+        # A flag and no exception: a signal must not be lost in somebody's handler of exceptions, nor end the ending.
+        previous = {n: signal.signal(n, self._interrupt) for n in (signal.SIGINT, signal.SIGTERM)}
         collector = RunCollector(context, self._endpoints, self._cfg, self._run_dir, is_sim=self._options.sim)
         view = RunView(self._cfg, is_sim=self._options.sim, run_dir=self._run_dir)
         try:
             with collector, view:
                 status = self._watch(collector, view)
+                collector.finish()
                 self._stop_all(view)
+                collector.collect(1, None)
                 wall_s = time.monotonic() - self._started_s
                 summary = collector.summary(wall_s)
         finally:
@@ -199,23 +216,24 @@ class _Run:
         view.show_summary(summary, as_json=self._options.json_output)
         return int(status)
 
+    def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
+        self._is_interrupted = True
+
     def _watch(self, collector: RunCollector, view: RunView) -> ExitStatus:
-        try:
-            for process in _processes(self._options):
-                self._start(process)
-            if not self._options.realtime:
-                os.nice(LOCKSTEP_NICENESS)
-            while True:
-                collector.collect(POLL_MS, view)
-                if collector.is_over:
-                    collector.finish()
-                    return collector.exit_status
-                for name, child in self._children.items():
-                    if child.poll() is not None:
-                        return self._died(name, child.returncode, view)
-        except Interrupted:
-            view.say("warning", "interrupted: holding the wheels and saving")
-            return ExitStatus.INTERRUPTED
+        for process in _processes(self._options):
+            self._start(process)
+        if not self._options.realtime:
+            os.nice(LOCKSTEP_NICENESS)
+        while not self._is_interrupted:
+            collector.collect(POLL_MS, view)
+            # A death comes first: what the others say of it is its consequence.
+            for name, child in self._children.items():
+                if child.poll() is not None:
+                    return self._died(name, child.returncode, view)
+            if collector.is_over:
+                return collector.exit_status
+        view.say("warning", "interrupted: holding the wheels and saving")
+        return ExitStatus.INTERRUPTED
 
     def _start(self, process: ProcessSpec) -> None:
         command = [sys.executable, "-m", process.module]
@@ -233,14 +251,13 @@ class _Run:
             stdout=sys.stderr,
             pass_fds=fds,
             start_new_session=True,
-            env={**os.environ, **ENVIRONMENT},
+            env={**os.environ, **ENVIRONMENT, SUPERVISOR_PID: str(os.getpid())},
         )
 
     def _died(self, name: str, code: int, view: RunView) -> ExitStatus:
         self._log.error("process died", name=name, code=code)
-        known = {int(s) for s in ExitStatus if s is not ExitStatus.COMPLETE}
-        if code in known:
-            return ExitStatus(code)
+        if code in (ExitStatus.USAGE, ExitStatus.UNREACHABLE):
+            return ExitStatus(code)  # it has said why
         how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
         view.say("error", f"process {name} {how}: run ended, wheels held; see {self._run_dir / 'log.jsonl'}")
         return ExitStatus.HELD
@@ -261,7 +278,3 @@ class _Run:
             if child.poll() is None:
                 child.kill()
                 child.wait()
-
-
-def _raise_interrupted(_number: int, _frame: FrameType | None) -> None:
-    raise Interrupted

@@ -103,6 +103,9 @@ class LegTracker:
             reverse: drive it backwards.
         """
         self._reverse = reverse
+        if hypot(target[0] - pose[0], target[1] - pose[1]) <= self._position_tolerance_m:
+            self.phase = Phase.DONE  # it is there, and the bearing of a stop so near is noise
+            return
         angle = self._bearing_error(pose, target)
         if abs(angle) > self._straight_rad:
             self.phase = Phase.TURN

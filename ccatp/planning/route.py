@@ -18,6 +18,8 @@ from ccatp.planning.search import Arrival, Search, Target
 from ccatp.planning.stance import build_body, build_places
 from ccatp.samples import DeckPose, PointId, Stop, StopKind
 
+_REPLANNED_POINTS = 4  # at least, before the old route is joined again
+
 
 @dataclass(frozen=True, slots=True)
 class Route:
@@ -74,6 +76,52 @@ def plan_route(
     wanted = [point for point in points if point in left]
     stops = _stops(mirror, wanted, robot, limits, mission, start)
     return _with_remains(mirror, stops, limits, start, measuring_time_s)
+
+
+def plan_rejoin(
+    mirror: Mirror,
+    route: Route,
+    robot: RobotConfig,
+    limits: LimitsConfig,
+    mission: MissionConfig,
+    start: DeckPose,
+    skip: Collection[PointId],
+    measuring_time_s: float = 0.0,
+) -> Route:
+    """The way from ``start`` back to a route: its next points planned anew, the rest as it was.
+
+    Planning a whole mirror anew takes longer than the robot's frames may wait. The new part ends at a point where the
+    robot can turn freely, so that it does not matter how it arrives there.
+
+    Args:
+        mirror: the mirror.
+        route: the route that was left.
+        robot, limits, mission: sensors, motion limits, clearances.
+        start: pose of the robot, deck frame.
+        skip: points that are done with.
+        measuring_time_s: standstill at each point, for the remaining time only.
+
+    Raises:
+        OutsideMirrorError: if the start is not on the mirror.
+        UnreachableError: if a point cannot be reached with the clearances.
+    """
+    body = build_body(robot, mission)
+    left = [k for k, stop in enumerate(route.stops) if stop.point is not None and stop.point not in skip]
+    free = (
+        n
+        for n, k in enumerate(left)
+        if n >= _REPLANNED_POINTS
+        and mirror.rim.signed_distance_m(route.stops[k].x_m, route.stops[k].y_m) >= body.turning_depth_m
+    )
+    count = next(free, len(left) - 1) + 1
+    points = [point for k in left[:count] if (point := route.stops[k].point) is not None]
+    head = plan_route(mirror, points, robot, limits, mission, start, (), measuring_time_s)
+    rest = left[count - 1] + 1 if left else len(route.stops)
+    return Route(
+        head.stops + route.stops[rest:],
+        tuple(t + route.times_s[rest] for t in head.times_s[:-1]) + route.times_s[rest:],
+        tuple(t + route.lengths_m[rest] for t in head.lengths_m[:-1]) + route.lengths_m[rest:],
+    )
 
 
 def _stops(

@@ -15,7 +15,7 @@ from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.mission import Mission, PlanHome, PlanRest
 from ccatp.planning.bound import path_time
-from ccatp.planning.route import Route, plan_route
+from ccatp.planning.route import Route, plan_rejoin, plan_route
 from ccatp.planning.traversal import ORDERS
 from ccatp.planning.way_home import plan_way_home
 from ccatp.processes.common import ProcessArgs
@@ -75,10 +75,11 @@ def build_parts(args: ProcessArgs) -> tuple[Parts, MissionStore]:
     except StoreError as error:
         raise StoreUnusable(str(error)) from error
     done = store.measured_points()
-    route = _rest_planner(cfg, mirror, points, done)(mirror.base_pose, ())
+    measuring_s = cfg.etalon.measuring_time_s
+    route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose, done, measuring_s)
     # The localizer re-initialises it at once; what counts is its size.
     filter_ = FILTERS[cfg.run.filter](np.zeros(STATES), np.eye(STATES))
-    mission = Mission(cfg, mirror, route, _home_planner(cfg, mirror), _rest_planner(cfg, mirror, points, done))
+    mission = Mission(cfg, mirror, route, _home_planner(cfg, mirror), _rest_planner(cfg, mirror))
     parts = Parts(
         cfg=cfg,
         mirror=mirror,
@@ -119,11 +120,10 @@ def _open_store(args: ProcessArgs, mirror: Mirror, points: list[PointId]) -> Mis
     return MissionStore.create(path, mirror=mirror.name, seed=cfg.run.seed, config_toml=text, points=planned)
 
 
-def _rest_planner(cfg: Config, mirror: Mirror, points: list[PointId], done: set[PointId]) -> PlanRest:
-    def plan(start: DeckPose, skip: Collection[PointId]) -> Route:
-        left_out = done.union(skip)
+def _rest_planner(cfg: Config, mirror: Mirror) -> PlanRest:
+    def plan(route: Route, start: DeckPose, skip: Collection[PointId]) -> Route:
         measuring_s = cfg.etalon.measuring_time_s
-        return plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, start, left_out, measuring_s)
+        return plan_rejoin(mirror, route, cfg.robot, cfg.limits, cfg.mission, start, skip, measuring_s)
 
     return plan
 

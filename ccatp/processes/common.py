@@ -17,6 +17,8 @@ from ccatp.config.models import Config
 from ccatp.errors import CcatpError
 
 PR_SET_PDEATHSIG = 1
+# In this variable the supervisor tells its children who it is.
+SUPERVISOR_PID = "CCATP_SUPERVISOR_PID"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +70,8 @@ def die_with_parent() -> None:
     """Ask the kernel for SIGTERM when the parent dies: a plain child would survive its parent's ``kill -9``."""
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-        if os.getppid() == 1:  # it died before we asked
-            raise SystemExit(1)
+        if os.environ.get(SUPERVISOR_PID, str(os.getppid())) != str(os.getppid()):
+            raise SystemExit("ccatp: the supervisor is gone")  # it died before we asked
 
 
 def open_log(path: Path, process: str) -> structlog.typing.FilteringBoundLogger:

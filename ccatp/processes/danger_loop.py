@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import sys
 import time
 from typing import Any
 
@@ -24,7 +25,7 @@ from ccatp.wire.topics import DangerEvent, Estimate, Presence, last_estimate_bef
 PRESENCE_PERIOD_S = 0.1
 WAIT_PERIOD_S = 0.02
 # In lockstep simulated time stands still while we wait; longer than this main is gone and the frame is judged without.
-LOCKSTEP_WAIT_S = 2.0
+LOCKSTEP_WAIT_S = 10.0
 
 
 class DangerLoop:
@@ -47,7 +48,8 @@ class DangerLoop:
         self._phase = "starting"
         self._code = EventCode.NORMAL
         self._cause = ""
-        self._seq = -1
+        self._seq = self._first_seq = -1
+        self._permit_seq = 0
         self._t_s = 0.0
         self._frame_wall_s = time.monotonic()
         self._is_stale = False
@@ -72,7 +74,7 @@ class DangerLoop:
         ):
             served = [tasks.create_task(work) for work in (router.serve(), self._beat())]
             try:
-                await self._wait_for_main()
+                await self._wait_for_main(stop)
                 hello = await self.link.connect(self._cfg.robot.connect_timeout_s)
                 self._is_lockstep = hello.lockstep
                 self._phase = "joined"
@@ -92,20 +94,33 @@ class DangerLoop:
         at_rest = self.monitor.at_base_or_held
         return answer_observatory(frame, self.monitor, at_base_or_held=at_rest, age_s=age_s)
 
-    async def _wait_for_main(self) -> None:
+    async def _wait_for_main(self, stop: asyncio.Event) -> None:
         """Join the robot only when main's messages get through: its first estimate must not be lost."""
-        while self._subscriber.receive() is None:  # noqa: ASYNC110 - a socket outside the loop has no event
+        while not stop.is_set() and self._subscriber.receive() is None:  # noqa: ASYNC110 - no event of the loop
             await asyncio.sleep(WAIT_PERIOD_S)
 
     def on_sensors(self, sensors: Sensors, _raw: bytes) -> None:
         """Judge one frame. In lockstep with a certain estimate of main's, so that the run is repeatable."""
         self._seq, self._t_s, self._frame_wall_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
-        self._take_estimates(last_estimate_before(sensors.seq))
-        self._give(self.monitor.step(sensors, self._estimate), sensors.seq)
+        if self._first_seq < 0:
+            self._first_seq = sensors.seq
+        wanted = last_estimate_before(sensors.seq)
+        self._take_estimates(wanted if wanted >= self._first_seq else -1)
+        try:
+            verdict = self.monitor.step(sensors, self._estimate)
+        except Exception as error:
+            # Without a verdict the robot's permit runs out: it holds by itself.
+            self.log.exception("surprise in a frame", seq=self._seq)
+            print(f"ccatp danger: internal error: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+            self.lost.set()
+            return
+        self._give(verdict, sensors.seq)
 
     def _give(self, verdict: Verdict, ack: int) -> None:
         self._publisher.send("verdict", verdict)
-        self.link.send_permit(ack, ack, verdict.forward, verdict.reverse, verdict.turn)
+        if ack >= 0:
+            self._permit_seq += 1
+            self.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
         if verdict.code is not self._code or verdict.cause != self._cause:
             self._announce(verdict)
 
@@ -160,6 +175,7 @@ class DangerLoop:
 
     def _on_lost(self, reason: str) -> None:
         self.log.warning("robot link lost", reason=reason)
+        print(f"ccatp danger: robot link lost: {reason}", file=sys.stderr, flush=True)
         self.lost.set()
 
     def close(self) -> None:

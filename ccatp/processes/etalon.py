@@ -8,6 +8,7 @@ import sys
 import numpy as np
 
 from ccatp.config.models import Config
+from ccatp.errors import ConfigError
 from ccatp.etalon_standin import EtalonStandIn, FixedPuck, TruthSource, ZmqPuck
 from ccatp.mirror.mirror import build_mirror
 from ccatp.processes import spinning
@@ -28,7 +29,13 @@ async def _serve(cfg: Config, truth: TruthSource, listener: socket.socket | None
         np.random.default_rng([cfg.run.seed, SEED_STREAM]),
         measuring_time_s=cfg.etalon.measuring_time_s,
     )
-    port = await server.start(cfg.sim.etalon.host, cfg.sim.etalon.port, listener)
+    try:
+        port = await server.start(cfg.sim.etalon.host, cfg.sim.etalon.port, listener)
+    except OSError as error:
+        at = f"{cfg.sim.etalon.host}:{cfg.sim.etalon.port}"
+        raise ConfigError(
+            f"sim.etalon.port: cannot listen on {at}: {error.strerror}; choose another with --port"
+        ) from error
     if listener is None:
         print(f"ccatp: MultiLine stand-in on {cfg.sim.etalon.host}:{port}", file=sys.stderr, flush=True)
     try:

@@ -9,7 +9,7 @@ from ccatp.samples import Verdict
 from ccatp.wire.topics import Presence
 
 # In lockstep simulated time stands still while we wait; longer than this the danger loop is gone.
-LOCKSTEP_WAIT_S = 2.0
+LOCKSTEP_WAIT_S = 10.0
 
 
 class VerdictEar:
@@ -46,7 +46,7 @@ class VerdictEar:
         """
         self._take(seq, is_lockstep)
         verdict = self.verdict
-        if verdict is None:
+        if verdict is None or (is_lockstep and verdict.seq < seq):
             return None
         age_s = max((seq - verdict.seq) * frame_s, 0.0)
         if not is_lockstep:

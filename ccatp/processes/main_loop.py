@@ -85,6 +85,7 @@ class MainLoop:
         self._t_last_s = 0.0
         self._frame_wall_s = time.monotonic()
         self._seq = -1
+        self._drive_seq = 0
         self._unanswered: int | None = None
         self._state = State.IDLE
         self.over = asyncio.Event()
@@ -139,8 +140,12 @@ class MainLoop:
         except TimeoutError:
             self._teller.log.warning("nobody acknowledged the end")
 
+    def _drive(self, ack: int, right: float, left: float) -> None:
+        self._drive_seq += 1
+        self._link.send_drive(self._drive_seq, max(ack, 0), right, left)
+
     def _hold_wheels(self) -> None:
-        self._link.send_drive(self._seq + 1, self._seq, 0.0, 0.0)
+        self._drive(self._seq, 0.0, 0.0)
         self._teller.flush()
         self._teller.status(self.status())
 
@@ -165,7 +170,7 @@ class MainLoop:
             return
         if self._mission.interrupt(f"no sensors frame for {age_s:.2f} s"):
             self._teller.say("warning", self._mission.cause)
-            self._link.send_drive(self._seq + 1, self._seq, 0.0, 0.0)
+            self._drive(self._seq, 0.0, 0.0)
 
     def _on_lost(self, reason: str) -> None:
         if not self.over.is_set():
@@ -180,9 +185,17 @@ class MainLoop:
     # -- the frame ------------------------------------------------------------------------------------------------
 
     def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
-        """Serve one sensors frame."""
+        """Serve one sensors frame. A surprise ends the process, held, and not just the connection."""
         if self.over.is_set():
             return
+        try:
+            self._serve(sensors, raw)
+        except Exception as error:
+            self._teller.log.exception("surprise in a frame", seq=self._seq)
+            self._teller.say("error", f"internal error, wheels held: {type(error).__name__}: {error}; see log.jsonl")
+            self._finish(ExitStatus.HELD)
+
+    def _serve(self, sensors: Sensors, raw: bytes) -> None:
         start = time.perf_counter()
         t_s, seq = sensors.t, sensors.seq
         dt_s = t_s - self._t_last_s if self._t_first_s is not None else self._frame_period_s()
@@ -192,8 +205,12 @@ class MainLoop:
         localizer = self._localizer
         localizer.step(t_s, sensors.imu, sensors.enc, sensors.edge)
         if localizer.hold_requested:
-            self._mission.fault(localizer.hold_cause)
+            # A filter that diverged is frozen until it has a fix.
+            self._mission.fault(localizer.hold_cause, is_lost=localizer.is_frozen)
             localizer.clear_hold()
+        if dt_s <= 0.0:  # counted by the localizer; a controller cannot go back in time
+            self._drive(seq, 0.0, 0.0)
+            return
         waiting = time.perf_counter()
         verdict = self._ear.hear(seq, self._frame_period_s(), is_lockstep=self._is_lockstep)
         heard = time.perf_counter()
@@ -204,7 +221,7 @@ class MainLoop:
             self._execute(order, motion)
         self._teller.frame(seq, t_s, localizer, self._mission.state, raw)
         if self._may_answer():
-            self._link.send_drive(seq, seq, right, left)
+            self._drive(seq, right, left)
         else:
             self._unanswered = seq
         if self._mission.state is not self._state:
@@ -221,10 +238,11 @@ class MainLoop:
             error_m = self._mission.survey.distance_m(motion.pose)
             self._teller.arrival(order.arrived, error_m)
             self._store.record_arrival(order.arrived, motion.t_s, error_m)
-        if order.measure and not self._measuring.is_busy:
+        if order.measure:
             pose = self._localizer.deck_pose
             expected = self._mirror.puck_world(pose, self._cfg.robot.puck_height_m)
-            self._measuring.begin(Request(motion.t_s, self._mission.measuring_point, expected, pose))
+            number, point = self._mission.request, self._mission.measuring_point
+            self._measuring.begin(Request(number, motion.t_s, point, expected, pose))
 
     def _is_quiet(self) -> bool:
         control = self._cfg.control
@@ -243,7 +261,7 @@ class MainLoop:
         """Let lockstep time go on after a measurement or a pause."""
         seq, self._unanswered = self._unanswered, None
         if seq is not None and self._may_answer():
-            self._link.send_drive(seq, seq, 0.0, 0.0)
+            self._drive(seq, 0.0, 0.0)
         else:
             self._unanswered = seq
         if self._mission.state is not self._state:
@@ -278,7 +296,7 @@ class MainLoop:
         return MissionStatus(
             seq=self._seq,
             t_s=self._t_last_s,
-            state="ended" if self._phase == "done" and not mission.outcome else str(mission.state),
+            state=str(mission.state),
             cause=mission.cause,
             done=len(mission.done) + self._parts.already_done,
             skipped=len(mission.skipped),
@@ -290,6 +308,7 @@ class MainLoop:
             code=0 if self._ear.verdict is None else int(self._ear.verdict.code),
             outcome=str(mission.outcome),
             lower_bound_s=self._parts.lower_bound_s,
+            exit_status=int(self.exit_status) if self.over.is_set() else -1,
         )
 
     def close(self) -> None:

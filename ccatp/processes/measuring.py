@@ -16,8 +16,9 @@ from ccatp.store import MissionStore, StoreError
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One measurement wanted: of a point, or (``None``) to find the robot again."""
+    """One measurement wanted: of a point, or (``None``) to find the robot again; ``number`` is the mission's."""
 
+    number: int
     t_s: float
     point: PointId | None
     expected_m: Vector3
@@ -52,38 +53,48 @@ class MeasuringDesk:
         self._approaches: tuple[PointId | None, int] = (None, 0)
         self._client, self._localizer, self._mission = client, localizer, mission
         self._store, self._teller, self._on_over = store, teller, on_over
-        self._requests: asyncio.Queue[Request] = asyncio.Queue(maxsize=1)
+        self._timeout_s = cfg.measure_timeout_s
+        self._wanted: Request | None = None
+        self._wakes = asyncio.Event()
         self.is_busy = False
         self.arrival_error_m = 0.0  # distance of the last fix from its point
 
     def begin(self, request: Request) -> None:
-        """Take a measurement; ``is_busy`` until it is over."""
+        """Take a measurement; ``is_busy`` until it is over. One that is under way is finished first, for nothing."""
         self.is_busy = True
-        self._requests.put_nowait(request)
+        self._wanted = request
+        self._wakes.set()
 
     async def run(self) -> None:
         """Serve requests for ever."""
         while True:
-            request = await self._requests.get()
-            try:
+            await self._wakes.wait()
+            self._wakes.clear()
+            request, self._wanted = self._wanted, None
+            if request is not None:
                 await self._serve(request)
-            finally:
+            if self._wanted is None:
                 self.is_busy = False
-            self._on_over()
+                self._on_over()
+
+    def _is_wanted(self, request: Request) -> bool:
+        """A pause or an edge in between means that the robot may have moved: the lengths are worth nothing then."""
+        return self._mission.is_awaiting_fix and self._mission.request == request.number
 
     async def _serve(self, request: Request) -> None:
         try:
-            fix = await self._client.measure(request.t_s, request.expected_m)
-        except EtalonError as error:
-            self._teller.say("warning", f"measurement of {_name(request.point)} failed: {error}")
-            if self._mission.is_awaiting_fix:
-                await self._skip(request, str(error))
+            async with asyncio.timeout(self._timeout_s):
+                fix = await self._client.measure(request.t_s, request.expected_m)
+        except (EtalonError, TimeoutError) as error:
+            why = str(error) or f"no fix within {self._timeout_s:g} s"
+            self._teller.say("warning", f"measurement of {_name(request.point)} failed: {why}")
+            if self._is_wanted(request):
+                await self._skip(request, why)
             return
-        # A pause or an edge in between means that the robot may have moved: the lengths are worth nothing then.
-        if not self._mission.is_awaiting_fix or self._mission.measuring_point != request.point:
+        if self._is_wanted(request):
+            await self._accept(request, fix)
+        else:
             self._teller.say("info", f"measurement of {_name(request.point)} discarded: the robot was interrupted")
-            return
-        await self._accept(request, fix)
 
     async def _skip(self, request: Request, cause: str) -> None:
         if request.point is not None:
@@ -95,7 +106,16 @@ class MeasuringDesk:
         self._mission.not_fixed(request.point, cause)
 
     async def _accept(self, request: Request, fix: Fix) -> None:
-        jump_m = self._fuse(request, fix)
+        try:
+            jump_m = self._localizer.fuse_fix(fix)
+        except FixRefused as refusal:
+            self._teller.say("warning", f"the fix at {_name(request.point)} is refused: {refusal}")
+            await self._skip(request, str(refusal))
+            return
+        if jump_m > self._tolerance_m:
+            self._teller.say(
+                "warning", f"the fix at {_name(request.point)} moved the estimate by {1e3 * jump_m:.1f} mm"
+            )
         if request.point is not None:
             self.arrival_error_m = self._mission.survey.distance_m(self._localizer.pose)
             if self._is_too_far(request.point):
@@ -108,19 +128,6 @@ class MeasuringDesk:
                 return
             self._teller.fix(request.point, fix, jump_m)
         self._mission.fixed(request.point)
-
-    def _fuse(self, request: Request, fix: Fix) -> float:
-        """Let the localizer have the fix; how far it moved the estimate, m."""
-        try:
-            jump_m = self._localizer.fuse_fix(fix)
-        except FixRefused as refusal:
-            self._teller.say("warning", f"the fix at {_name(request.point)} is not used: {refusal}")
-            return 0.0
-        if jump_m > self._tolerance_m:
-            self._teller.say(
-                "warning", f"the fix at {_name(request.point)} moved the estimate by {1e3 * jump_m:.1f} mm"
-            )
-        return jump_m
 
     def _is_too_far(self, point: PointId) -> bool:
         """Whether the point has to be approached again: what was measured there is not its alignment."""

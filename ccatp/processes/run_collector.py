@@ -21,7 +21,6 @@ from ccatp.recorder import Recorder
 from ccatp.samples import PanelId, PanelPose, PointId
 from ccatp.store import MissionStore
 from ccatp.summary import RunFacts, SummaryBuilder, puck_targets
-from ccatp.surveying.states import Outcome
 from ccatp.wire.topics import (
     TOPICS,
     Arrival,
@@ -37,9 +36,9 @@ from ccatp.wire.topics import (
 
 RECEIVED = tuple(topic.name for topic in TOPICS if topic.recorded or topic.name == "timing")
 FINISH_TIMEOUT_S = 5.0
+ASK_TIMEOUT_S = 1.0
 # A panel's plane has three parameters; the fit says so too, this saves the attempt.
 MIN_FIXES = 3
-STATUS_OF = {Outcome.COMPLETE: ExitStatus.COMPLETE, Outcome.AT_BASE: ExitStatus.ABORTED}
 
 
 class View(Protocol):
@@ -110,14 +109,13 @@ class RunCollector:
 
     @property
     def is_over(self) -> bool:
-        """Main has said how the mission ended, or that it holds for good."""
-        return self._status is not None and (self._status.outcome != "" or self._status.state == "ended")
+        """Main has said how the mission ended."""
+        return self._status is not None and self._status.exit_status >= 0
 
     @property
     def exit_status(self) -> ExitStatus:
-        """What the mission's outcome means to the shell."""
-        outcome = Outcome(self._status.outcome) if self._status is not None else Outcome.NONE
-        return STATUS_OF.get(outcome, ExitStatus.HELD)
+        """What main said the run ends with."""
+        return ExitStatus(self._status.exit_status) if self._status is not None else ExitStatus.HELD
 
     def collect(self, timeout_ms: int, view: View | None) -> None:
         """Take what came in, waiting at most ``timeout_ms`` for the first."""
@@ -217,8 +215,8 @@ class RunCollector:
             peer.setsockopt(zmq.LINGER, 0)
             peer.connect(self._endpoints.of("puck"))
             peer.send(request)
-            if not peer.poll(int(FINISH_TIMEOUT_S * 1000)):
-                return {}
+            if not peer.poll(int(ASK_TIMEOUT_S * 1000)):
+                return {}  # it is gone: what it published is all there is
             reply: dict[str, Any] = msgspec.json.decode(peer.recv())
             return reply
 

@@ -11,6 +11,8 @@ from ccatp.samples import EventCode, PanelPose, Twist, Verdict
 STILL = Twist(0.0, 0.0)
 # A turn that met the rim is undone by at most this; more would sweep the next corner.
 UNTURN_LIMIT_RAD = 0.8
+# 60 mm at 0.05 m/s and a turn take three seconds: after this long a wheel is blocked, or nothing is permitted.
+TIME_LIMIT_S = 15.0
 
 
 class Step(StrEnum):
@@ -39,7 +41,8 @@ class Retreat:
     ) -> None:
         """Choose the way out from what the verdict permits."""
         self._cfg, self._tracker = cfg, tracker
-        self._start, self._last = pose, pose
+        self._last = pose
+        self._time_s = 0.0
         self._travel_m = self._turned_rad = 0.0
         self._away_rad: float | None = None
         front_left, front_right, rear_left, rear_right = verdict.off
@@ -62,6 +65,11 @@ class Retreat:
             self._travel_m += hypot(pose.x_m - self._last.x_m, pose.y_m - self._last.y_m)
             self._turned_rad += abs(difference(pose.heading_rad, self._last.heading_rad))
         self._last = pose
+        self._time_s += dt_s
+        if self._time_s > TIME_LIMIT_S and self.step_at is not Step.OVER:
+            self.step_at = Step.STUCK
+        if not (verdict.forward or verdict.reverse or verdict.turn):
+            return STILL  # data are missing, which passes by itself
         is_clear = verdict.code is not EventCode.NEAR_EDGE
         if self.step_at is Step.BACK:
             return self._back(is_clear, verdict)

@@ -28,7 +28,7 @@ class Event(StrEnum):
     SETTLED = "settled"  # the robot is at rest there
     EDGE = "edge"  # code 1: near the mirror's edge
     GO_HOME = "go home"  # code 2, or the operator's abort
-    RETREATED = "retreated"  # the back-off is over; a fix comes first
+    FIND = "find"  # stand still for a fix: the pose is not to be trusted
     HOLD = "hold"  # pause, fault, or no permission to move
     FINISHED = "finished"  # all points done, at base after an abort, or stopped
 
@@ -48,20 +48,24 @@ _SURVEYING = _ANYWHERE | {Event.EDGE: State.BACKING_OFF, Event.GO_HOME: State.RE
 # (state, event) -> state. An edge outranks an abort: while backing off GO_HOME changes nothing. DONE is final.
 TRANSITIONS = MappingProxyType(
     {
-        State.IDLE: _ANYWHERE | {Event.GO_ON: State.TURNING, Event.GO_HOME: State.RETURNING},
+        State.IDLE: _ANYWHERE
+        | {Event.GO_ON: State.TURNING, Event.GO_HOME: State.RETURNING, Event.EDGE: State.BACKING_OFF},
         State.TURNING: _SURVEYING | {Event.TURNED: State.DRIVING, Event.ARRIVED: State.SETTLING},
         State.DRIVING: _SURVEYING | {Event.REALIGN: State.TURNING, Event.ARRIVED: State.SETTLING},
         State.SETTLING: _SURVEYING | {Event.SETTLED: State.MEASURING},
         State.MEASURING: _SURVEYING,
-        State.BACKING_OFF: _ANYWHERE | {Event.RETREATED: State.SETTLING},
+        State.BACKING_OFF: _ANYWHERE | {Event.FIND: State.SETTLING},
         State.RETURNING: _ANYWHERE | {Event.EDGE: State.BACKING_OFF},
         State.HELD: _ANYWHERE
-        | {Event.GO_ON: State.TURNING, Event.GO_HOME: State.RETURNING, Event.EDGE: State.BACKING_OFF},
+        | {
+            Event.GO_ON: State.TURNING,
+            Event.GO_HOME: State.RETURNING,
+            Event.EDGE: State.BACKING_OFF,
+            Event.FIND: State.SETTLING,
+        },
         State.DONE: {},
     }
 )
-
-MOVING = frozenset({State.TURNING, State.DRIVING, State.SETTLING, State.MEASURING, State.BACKING_OFF, State.RETURNING})
 
 
 def next_state(state: State, event: Event) -> State:

@@ -55,6 +55,7 @@ class MissionStatus(Message):
     code: int
     outcome: str
     lower_bound_s: float
+    exit_status: int  # what the run ends with; -1 while it goes on
 
 
 class Track(Message):

@@ -14,7 +14,7 @@ from ccatp.planning.errors import PlanError
 from ccatp.planning.route import Route
 from ccatp.samples import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Twist, Verdict
 from ccatp.surveying.journey import Motion
-from ccatp.surveying.states import MOVING, Event, Outcome, State, next_state
+from ccatp.surveying.states import Event, Outcome, State, next_state
 
 DT, LAG = 0.01, 0.08
 PANEL = PanelId(5, 5)
@@ -48,7 +48,7 @@ class Story:
         left = tuple(float(len(stops) - k) for k in range(len(stops) + 1))
         return Route(stops, left, left)
 
-    def plan_rest(self, start: DeckPose, skip: Collection[PointId]) -> Route:
+    def plan_rest(self, _route: Route, start: DeckPose, skip: Collection[PointId]) -> Route:
         self.plans.append(start)
         return self.route(tuple(stop for stop in self.stops if stop.point not in skip))
 
@@ -108,8 +108,8 @@ def test_the_table_is_total_and_hold_is_one_event_away() -> None:
     assert next_state(State.BACKING_OFF, Event.GO_HOME) is State.BACKING_OFF  # an edge outranks an abort
 
 
-def test_every_moving_state_can_meet_an_edge() -> None:
-    for state in MOVING - {State.BACKING_OFF}:
+def test_every_state_can_meet_an_edge() -> None:
+    for state in set(State) - {State.BACKING_OFF, State.DONE}:
         assert next_state(state, Event.EDGE) is State.BACKING_OFF
 
 
@@ -215,10 +215,108 @@ def test_abort_during_back_off_waits_for_the_retreat(story: Story) -> None:
     assert story.mission.outcome is Outcome.AT_BASE
 
 
-def test_pause_is_refused_while_backing_off(story: Story) -> None:
+def test_pause_while_backing_off_holds_and_resume_finds_the_robot_first(story: Story) -> None:
     story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
     story.frame(FRONT_OFF)
-    assert "backing off" in (story.mission.pause("operator") or "")
+    assert story.mission.pause("operator") is None
+    for _ in range(50):
+        assert story.frame(FRONT_OFF).twist == Twist(0.0, 0.0)
+    assert story.mission.resume() is None
+    story.until(lambda: story.orders[-1].measure)  # nothing but a fix comes first
+    assert all(order.twist == Twist(0.0, 0.0) for order in story.orders[-30:])
+    story.until_state(State.DONE)
+    assert len(story.mission.done) == 3
+
+
+def test_a_retreat_without_an_end_is_a_fault(story: Story) -> None:
+    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    x, y = story.x, story.y
+    for _ in range(2000):
+        story.frame(FRONT_OFF)
+        story.x, story.y = x, y  # a wheel is blocked
+        if story.mission.is_faulted:
+            break
+    assert "stuck at the edge" in story.mission.cause
+
+
+def test_missing_data_during_a_back_off_only_pause_it(story: Story) -> None:
+    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    story.frame(FRONT_OFF)
+    for _ in range(20):
+        assert story.frame(replace(FRONT_OFF, reverse=False)).twist == Twist(0.0, 0.0)
+    assert story.mission.state is State.BACKING_OFF
+    assert story.frame(FRONT_OFF).twist.v_m_s < 0.0
+
+
+def test_a_robot_that_cannot_be_found_does_not_drive(story: Story) -> None:
+    story.auto_fix = False
+    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    for _ in range(60):
+        story.frame(FRONT_OFF)
+    story.until(lambda: story.mission.is_awaiting_fix)
+    story.mission.not_fixed(story.mission.measuring_point, "no answer")
+    assert story.mission.is_faulted
+    assert "cannot be found again: no answer" in story.mission.cause
+    story.mission.resume()
+    story.until(lambda: story.mission.is_awaiting_fix)  # it tries again, and does not move before
+    assert all(order.twist == Twist(0.0, 0.0) for order in story.orders[-60:])
+
+
+def test_a_stale_verdict_while_being_found_does_not_make_it_forget(story: Story) -> None:
+    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    for _ in range(60):
+        story.frame(FRONT_OFF)
+    story.until_state(State.MEASURING)
+    story.frame(None)
+    assert story.mission.state is State.HELD
+    story.until(lambda: story.orders[-1].measure)
+    assert story.mission.measuring_point is not None or story.mission.done == []
+
+
+def test_a_robot_that_never_rests_is_a_fault(story: Story) -> None:
+    story.until_state(State.SETTLING)
+    for _ in range(1100):
+        story.v = 0.01
+        story.frame()
+        if story.mission.is_faulted:
+            break
+    assert "does not come to rest" in story.mission.cause
+
+
+def test_resume_beside_the_stop_does_not_turn_to_it(story: Story) -> None:
+    story.until_state(State.MEASURING)
+    story.x += 0.0004  # the bearing of a stop so near is noise
+    story.mission.pause("operator")
+    story.frame()
+    story.mission.resume()
+    before = len(story.orders)
+    story.until_state(State.MEASURING)
+    assert all(order.twist == Twist(0.0, 0.0) for order in story.orders[before:])
+
+
+def test_a_request_is_wanted_only_until_the_next(story: Story) -> None:
+    story.auto_fix = False
+    story.until(lambda: story.mission.is_awaiting_fix)
+    first = story.mission.request
+    story.frame(None)
+    assert not story.mission.is_awaiting_fix
+    story.until(lambda: story.mission.is_awaiting_fix)
+    assert story.mission.request == first + 1
+
+
+def test_abort_after_a_hold_goes_home_all_the_same(story: Story) -> None:
+    story.until_state(State.DRIVING)
+    story.mission.abort("operator")
+    story.frame()
+    story.mission.pause("operator")
+    assert story.mission.abort("operator") is None
+    states = [story.mission.state]
+    for _ in range(2):
+        story.mission.pause("operator")
+        story.frame(ABORT)
+        states.append(story.mission.state)
+    # An emergency that is new outranks the pause; its level, repeated, does not.
+    assert states == [State.RETURNING, State.RETURNING, State.HELD]
 
 
 def test_failed_measurements_are_skipped_and_three_in_a_row_hold(story: Story) -> None:
