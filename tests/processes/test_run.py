@@ -87,7 +87,7 @@ def children(run: Run) -> list[psutil.Process]:
 def test_a_child_that_dies_ends_the_run_with_a_line(start: Start, name: str, module: str) -> None:
     run = start("--panels", "1", "--realtime")
     run.until(lambda status: status["state"] == "driving")
-    victim = next(child for child in children(run) if any(module in word for word in child.cmdline()))
+    victim = next(child for child in children(run) if f"ccatp.processes.{module}" in child.cmdline())
     os.kill(victim.pid, signal.SIGKILL)
     assert run.wait() == 4
     assert "Traceback" not in run.stderr
