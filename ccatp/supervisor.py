@@ -77,10 +77,11 @@ def run_survey(options: RunOptions) -> int:
     started = time.monotonic()
     with ExitStack() as stack:
         runtime_dir = make_runtime_dir(str(options.runtime_dir or cfg.run.runtime_dir), os.environ)
-        stack.enter_context(_lock(runtime_dir))
+        stack.enter_context(_lock(runtime_dir / "lock", "--runtime-dir"))
         sockets = {p.name: stack.enter_context(_listen(cfg, p)) for p in _processes(options) if p.listens}
         cfg = _with_addresses(cfg, sockets) if options.sim else cfg
         run_dir = _make_run_dir(options, cfg)
+        stack.enter_context(_lock(run_dir / ".lock", "--run-dir"))
         (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
         run = _Run(options, cfg, run_dir, Endpoints(runtime_dir), sockets, started)
         return run.go()
@@ -91,13 +92,13 @@ def _processes(options: RunOptions) -> list[ProcessSpec]:
 
 
 @contextmanager
-def _lock(runtime_dir: Path) -> Iterator[None]:
-    with (runtime_dir / "lock").open("w") as file:
+def _lock(path: Path, option: str) -> Iterator[None]:
+    with path.open("w") as file:
         try:
             flock(file, LOCK_EX | LOCK_NB)
         except OSError as error:
             raise RefusedError(
-                f"another ccatp runs in {runtime_dir}; end it with 'ccatp stop', or give this one its own --runtime-dir"
+                f"another ccatp runs in {path.parent}; end it with 'ccatp stop', or give this one its own {option}"
             ) from error
         yield
 
@@ -195,7 +196,7 @@ class _Run:
         self._log.info("run", mirror=self._cfg.mirror.name, seed=self._cfg.run.seed, sim=self._options.sim)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         # A flag and no exception: a signal must not be lost in somebody's handler of exceptions, nor end the ending.
-        previous = {n: signal.signal(n, self._interrupt) for n in (signal.SIGINT, signal.SIGTERM)}
+        previous = {n: signal.signal(n, self._interrupt) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
         collector = RunCollector(context, self._endpoints, self._cfg, self._run_dir, is_sim=self._options.sim)
         view = RunView(self._cfg, is_sim=self._options.sim, run_dir=self._run_dir)
         try:

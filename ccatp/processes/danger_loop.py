@@ -189,14 +189,16 @@ async def run(args: ProcessArgs) -> int:
     stop = asyncio.Event()
     stop_on_signals(stop)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    loop = DangerLoop(args, context)
+    loop: DangerLoop | None = None
     status = 0
     try:
+        loop = DangerLoop(args, context)
         await loop.run(stop)
     except* CcatpError as group:
         status = report("danger", group)
     finally:
-        loop.close()
+        if loop is not None:
+            loop.close()
         context.destroy(linger=0)
     return status or (0 if stop.is_set() else 4)
 

@@ -162,6 +162,8 @@ class MainLoop:
             if self._phase != "starting":
                 self._teller.status(self.status())
             self._check_age()
+            if self._mission.is_paused and not self._measuring.is_busy:
+                self._release_frame()  # a frame now and then, so that an emergency is heard in a pause too
             await asyncio.sleep(BEAT_PERIOD_S)
 
     def _check_age(self) -> None:
@@ -252,20 +254,22 @@ class MainLoop:
         )
 
     def _may_answer(self) -> bool:
-        """In lockstep simulated time stands still while a measurement is under way, and while the robot is paused."""
+        """In lockstep simulated time stands still while a measurement is under way, and all but still in a pause."""
         if not self._is_lockstep:
             return True
         return not self._measuring.is_busy and not (self._mission.is_paused and self._is_quiet())
 
     def _answer_held_frame(self) -> None:
         """Let lockstep time go on after a measurement or a pause."""
-        seq, self._unanswered = self._unanswered, None
-        if seq is not None and self._may_answer():
-            self._drive(seq, 0.0, 0.0)
-        else:
-            self._unanswered = seq
+        if self._may_answer():
+            self._release_frame()
         if self._mission.state is not self._state:
             self._on_state()
+
+    def _release_frame(self) -> None:
+        seq, self._unanswered = self._unanswered, None
+        if seq is not None:
+            self._drive(seq, 0.0, 0.0)
 
     def _on_state(self) -> None:
         mission = self._mission

@@ -41,6 +41,25 @@ ASK_TIMEOUT_S = 1.0
 MIN_FIXES = 3
 
 
+NO_STATUS = MissionStatus(
+    seq=-1,
+    t_s=0.0,
+    state="",
+    cause="",
+    done=0,
+    skipped=0,
+    total=0,
+    point="",
+    elapsed_s=0.0,
+    eta_s=0.0,
+    error_mm=0.0,
+    code=0,
+    outcome="",
+    lower_bound_s=0.0,
+    exit_status=-1,
+)
+
+
 class View(Protocol):
     """Where progress is shown."""
 
@@ -137,7 +156,9 @@ class RunCollector:
         if view is not None:
             _show(message, view)
         if isinstance(message, MissionStatus):
-            self._begin(message)
+            self._status = message
+            if self._builder is None:
+                self._begin(message)
         if self._builder is None:
             self._early.append(message)
         else:
@@ -147,10 +168,7 @@ class RunCollector:
         if self._view is not None:
             self._view.say("error", f"recording ended, the survey goes on: {reason}")
 
-    def _begin(self, status: MissionStatus) -> None:
-        self._status = status
-        if self._builder is not None:
-            return
+    def _begin(self, status: MissionStatus) -> SummaryBuilder:
         cfg = self._cfg
         points = ORDERS[cfg.run.order](self._mirror, cfg.run.panels)
         facts = RunFacts(
@@ -165,10 +183,11 @@ class RunCollector:
             has_truth=self._is_sim,
         )
         targets = puck_targets(self._mirror, points, cfg.robot.puck_height_m)
-        self._builder = SummaryBuilder(facts, targets, self._mirror.surface.normal)
+        self._builder = builder = SummaryBuilder(facts, targets, self._mirror.surface.normal)
         for message in self._early:
-            self._add(self._builder, message)
+            self._add(builder, message)
         self._early.clear()
+        return builder
 
     def _add(self, builder: SummaryBuilder, message: Message) -> None:
         if isinstance(message, Truth):
@@ -222,9 +241,7 @@ class RunCollector:
 
     def summary(self, wall_s: float) -> dict[str, Any]:
         """``summary.json`` of what was collected; call it when main has closed the mission's database."""
-        builder = self._builder
-        if builder is None:
-            return {}
+        builder = self._builder or self._begin(NO_STATUS)  # where main never said where it stood
         builder.set_panels(
             {panel: (fit.piston_m, fit.tip_rad, fit.tilt_rad) for panel, fit in self._fits().items()}, self._injected
         )

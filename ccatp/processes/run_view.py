@@ -16,6 +16,20 @@ from ccatp.wire.topics import MissionStatus, Track
 STYLES = {"info": "", "warning": "yellow", "error": "bold red"}
 
 
+class _PatientConsole(Console):
+    """A terminal that may go away: the survey goes on without it."""
+
+    def on_broken_pipe(self) -> None:
+        """Say nothing more."""
+        self.quiet = True
+
+    def _check_buffer(self) -> None:
+        try:
+            super()._check_buffer()
+        except OSError:
+            self.quiet = True
+
+
 class RunView:
     """Progress and messages on standard error; the summary on standard output.
 
@@ -27,7 +41,7 @@ class RunView:
 
     def __init__(self, cfg: Config, *, is_sim: bool, run_dir: Path) -> None:
         """Say what runs."""
-        self._console = Console(stderr=True, highlight=False)
+        self._console: Console = _PatientConsole(stderr=True, highlight=False)
         self._is_terminal = self._console.is_terminal
         self._has_pose = False
         self._told_tenths = 0

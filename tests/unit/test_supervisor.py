@@ -52,7 +52,9 @@ def test_a_run_directory_that_cannot_be_made(tmp_path: Path) -> None:
 
 
 def test_one_daemon_in_a_runtime_directory(tmp_path: Path) -> None:
-    with _lock(tmp_path), pytest.raises(RefusedError, match="another ccatp runs in"), _lock(tmp_path):
-        pass
-    with _lock(tmp_path):
+    path = tmp_path / "lock"
+    with _lock(path, "--runtime-dir"), pytest.raises(RefusedError, match="another ccatp runs in"):  # noqa: SIM117
+        with _lock(path, "--runtime-dir"):
+            pass
+    with _lock(path, "--runtime-dir"):
         pass
