@@ -158,7 +158,6 @@ class MissionConfig(Model):
     verdict_timeout_s: Positive
     measure_timeout_s: Positive
     failed_points_before_hold: Annotated[int, Field(ge=1)]
-    progress_hz: Positive
 
 
 class SimRobotConfig(Model):
