@@ -74,7 +74,7 @@ UV_COMPILE = $(UV) pip compile --quiet --universal --generate-hashes --no-emit-i
 
 lock:
 	$(UV_COMPILE) --output-file requirements.lock
-	$(UV_COMPILE) --group dev --extra plots --constraint requirements.lock --output-file requirements-dev.lock
+	$(UV_COMPILE) --group dev --all-extras --constraint requirements.lock --output-file requirements-dev.lock
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

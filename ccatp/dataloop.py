@@ -3,7 +3,7 @@
 The sockets of the robot link carry what a real robot would say and nothing else. The truth leaves by ZeroMQ: a REP
 socket with the requests of ``ccatp.sim.truth``, and a PUB socket with batches of the topic ``truth``.
 
-Known limitations: the battery stays full, no sensor fails, the link has no delay but its own.
+Known limitations: the battery stays full, no sensor fails.
 """
 
 import asyncio

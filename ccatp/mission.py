@@ -9,14 +9,14 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.planning.errors import PlanError
 from ccatp.planning.route import Route
 from ccatp.samples import DeckPose, EventCode, PointId, Stop, StopKind, Twist, Verdict
+from ccatp.surveying.correction import Corrector
 from ccatp.surveying.homing import Homing
 from ccatp.surveying.journey import Journey, Motion
 from ccatp.surveying.retreat import Retreat, Step
+from ccatp.surveying.settling import TIME_EPSILON_S, Stillness
 from ccatp.surveying.states import Event, Outcome, State, next_state
 
 STILL = Twist(0.0, 0.0)
-# Sums of frame periods are not exact: half a nanosecond must not cost a frame.
-TIME_EPSILON_S = 5e-10
 # Wheels stop within half a second: a robot that is not at rest after this long creeps, or its sensors say so.
 SETTLE_LIMIT_S = 10.0
 PlanHome = Callable[[DeckPose], tuple[Stop, ...]]
@@ -30,7 +30,7 @@ class Order:
     Attributes:
         twist: the velocity wanted until the next frame.
         at_rest: the robot has come to rest in this frame.
-        arrived: the measurement point at which it did so.
+        arrived: the measurement point at which it did so for the first time; corrections are no arrivals.
         measure: have the laser system measure now (of a point, or after a back-off to find itself again).
     """
 
@@ -52,6 +52,9 @@ class Mission:
         route: the route of the survey.
         plan_home: gives the stops from a pose to base.
         plan_rest: gives the way back to a route from a pose, without the points that are done with.
+
+    Attributes:
+        corrections: correction moves begun.
     """
 
     def __init__(self, cfg: Config, mirror: Mirror, route: Route, plan_home: PlanHome, plan_rest: PlanRest) -> None:
@@ -71,10 +74,16 @@ class Mission:
         self._is_held_by_hand = False
         self.is_faulted = False
         self._retreat: Retreat | None = None
-        self._is_lost = False
+        self._is_lost = cfg.mission.fix_at_start
+        self._is_at_start = cfg.mission.fix_at_start
         self._backoffs = 0
         self._failures = 0
-        self._quiet_since_s: float | None = None
+        self._stillness = Stillness(cfg.control)
+        self._corrector = Corrector(mirror, cfg.robot, cfg.mission)
+        self._is_missed = False
+        self._corrected: Stop | None = None  # the stop at which the last correction was made, until the next leg
+        self._arrived_at: PointId | None = None
+        self.corrections = 0
         self._measure_at_s = 0.0
         self._is_asked = False
         self._emergency = ""
@@ -165,19 +174,28 @@ class Mission:
     def fixed(self, point: PointId | None) -> None:
         """The measurement that was asked for is taken, fused and stored."""
         self._failures = 0
+        if point is None and not self._is_lost:
+            self._leave_calibration()
+            return
         if point is None:
             # Found again, the robot stands where the route never led.
-            self._is_lost, self._is_off_route = False, True
+            # Unless it never left the start.
+            self._is_lost, self._is_off_route, self._is_at_start = False, not self._is_at_start, False
         self._leave_stop(point, self.done)
 
     def again(self) -> None:
         """The fix shows the robot too far from its point, which has to be approached anew from where it really is."""
-        self._is_off_route = True
-        if self.is_awaiting_fix:
-            self._go_on()
+        if not self.is_awaiting_fix:
+            self._is_off_route = True
+            return
+        self._go_on()
+        self._is_missed = True
 
     def not_fixed(self, point: PointId | None, cause: str) -> None:
         """The measurement failed for good: the point is skipped; several in a row hold the robot."""
+        if point is None and not self._is_lost:
+            self._leave_calibration()  # the survey can do without
+            return
         if point is None:
             self.fault(f"the robot cannot be found again: {cause}")
             return
@@ -189,6 +207,12 @@ class Mission:
         self._failures = 0
         self.fault(f"{limit} measurements in a row failed: {cause}")
         self._leave_stop(point, self.skipped)
+
+    def _leave_calibration(self) -> None:
+        stop = self.survey.current
+        if self.is_awaiting_fix and stop is not None and stop.kind is StopKind.CALIBRATE:
+            self.survey.advance()
+            self._go_on()
 
     def _leave_stop(self, point: PointId | None, record: list[PointId]) -> None:
         was_awaited = self.is_awaiting_fix
@@ -253,7 +277,7 @@ class Mission:
         self.cause = verdict.cause
         self._interrupt()
         # An edge that the route did not foresee means that the pose is wrong: it is found again before moving on.
-        self._is_lost = True
+        self._is_lost, self._is_at_start = True, False
         self._apply(Event.EDGE)
         self._retreat = Retreat(self._cfg.mission, self._tracker, verdict, motion.pose, motion.rate_rad_s)
 
@@ -263,8 +287,9 @@ class Mission:
     def _interrupt(self) -> None:
         """Forget where in a leg, a stop or a docking the robot was: it begins anew from where it is."""
         (self.survey if self._home is None else self._home).interrupt()
-        self._is_asked = False
-        self._quiet_since_s = self._settle_by_s = None
+        self._is_asked = self._is_missed = False
+        self._stillness.reset()
+        self._settle_by_s = None
 
     def _hold(self, cause: str, *, by_hand: bool) -> None:
         self._interrupt()
@@ -301,9 +326,11 @@ class Mission:
         return True
 
     def _travel(self, motion: Motion) -> Order:
+        stop = self.survey.current
+        if stop is not None:
+            self._leave_point(motion, stop)
         if self._is_off_route:
             return self._find_route(motion)
-        stop = self.survey.current
         if stop is None:
             self._go_on()
             return Order(STILL)
@@ -313,12 +340,27 @@ class Mission:
         if self._tracker.phase is not Phase.DONE:
             self._apply(Event.TURNED if self._tracker.phase is Phase.DRIVE else Event.REALIGN)
             return Order(twist)
-        if stop.kind is StopKind.MEASURE:
+        if stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE):
             self._apply(Event.ARRIVED)
             return self._settle(motion)
         self.survey.advance()
         self._go_on()
         return self._travel(motion)
+
+    def _leave_point(self, motion: Motion, stop: Stop) -> None:
+        """After a point was missed: correct it by a short move; after the correction: may the route be followed?"""
+        if self._is_missed:
+            self._is_missed = False
+            aim = self._corrector.aim(motion.pose, self.survey.target_in(motion.pose.panel, stop))
+            if aim is None:
+                self._is_off_route = True
+            else:
+                self.survey.correct(motion.pose.panel, aim)
+                self._corrected = stop
+                self.corrections += 1
+        elif self._corrected is not None and self._corrected is not stop:
+            self._corrected = None
+            self._is_off_route |= not self._corrector.can_go_on(motion.deck, stop)
 
     def _find_route(self, motion: Motion) -> Order:
         """Plan anew from where the robot is; one frame of standing still, however long that takes."""
@@ -332,13 +374,7 @@ class Mission:
         return Order(STILL)
 
     def _is_quiet(self, motion: Motion) -> bool:
-        control = self._cfg.control
-        if abs(motion.speed_m_s) > control.settle_speed_m_s or abs(motion.rate_rad_s) > control.settle_rate_rad_s:
-            self._quiet_since_s = None
-            return False
-        if self._quiet_since_s is None:
-            self._quiet_since_s = motion.t_s
-        return motion.t_s - self._quiet_since_s >= control.settle_time_s - TIME_EPSILON_S
+        return self._stillness.is_rest(motion.t_s, motion.dt_s, motion.speed_m_s, motion.rate_rad_s)
 
     def _settle(self, motion: Motion) -> Order:
         if self._settle_by_s is None:
@@ -352,7 +388,11 @@ class Mission:
         self._settle_by_s = None
         self._apply(Event.SETTLED)
         self._measure_at_s = motion.t_s + self._cfg.etalon.measuring_time_s - TIME_EPSILON_S
-        return Order(STILL, at_rest=True, arrived=self.measuring_point)
+        point = self.measuring_point
+        if point is not None and point == self._arrived_at:
+            return Order(STILL, at_rest=True)
+        self._arrived_at = point or self._arrived_at
+        return Order(STILL, at_rest=True, arrived=point)
 
     def _measure(self, motion: Motion) -> Order:
         if self._is_asked or motion.t_s < self._measure_at_s:
@@ -368,7 +408,7 @@ class Mission:
         if retreat is None:
             self._go_on()
             return Order(STILL)
-        twist = retreat.step(motion.pose, verdict, motion.dt_s)
+        twist = retreat.step(motion, verdict)
         if retreat.step_at is Step.STUCK:
             self.fault("stuck at the edge: no motion away from it is permitted, or none helps")
             return Order(STILL)

@@ -174,6 +174,7 @@ class StopKind(StrEnum):
     """What a stop on the path is for."""
 
     MEASURE = "measure"
+    CALIBRATE = "calibrate"
     VIA = "via"
     BASE = "base"
 

@@ -7,16 +7,25 @@ from pathlib import PurePath
 from pydantic import BaseModel
 
 from ccatp.config.messages import Fault, choice_hint, slip_hint
-from ccatp.config.models import Config, LimitsConfig, MirrorConfig, PanelsConfig, RobotConfig
+from ccatp.config.models import (
+    Config,
+    LimitsConfig,
+    MirrorConfig,
+    PanelsConfig,
+    RobotConfig,
+    SimRobotConfig,
+    WorldConfig,
+)
 from ccatp.config.toml_text import Key
 
-FILTERS = ("kf",)
-ORDERS = ("thesis",)
+FILTERS = ("kf", "ekf", "ukf")
+ORDERS = ("thesis", "optimised")
 
 MIN_COLLIMATORS = 4  # three unknowns and one length to spare, interface control document 2
 _LARGEST_LENGTH_M = 2.0  # no length outside the mirror's own files reaches it
 _LARGEST_ANGLE_RAD = 2.0 * math.pi
 _SMALLEST_PANEL_MM = 10.0
+_WHOLE_FRAMES = 1e-6  # decimal fractions of a second are not exact
 _NEAREST_COLLIMATOR_MM = 100.0
 _PITCH_AGREEMENT_MM = 0.1  # the fitted pitches of the telescope differ by up to 0.012 mm
 _CORNERS = ((1, 1, "front-left"), (1, -1, "front-right"), (-1, 1, "rear-left"), (-1, -1, "rear-right"))
@@ -33,6 +42,7 @@ def check_config(cfg: Config) -> list[Fault]:
         *_check_units(cfg),
         *_check_wheels(cfg.robot, cfg.limits),
         *_check_edge_sensors(cfg.robot),
+        *_check_world(cfg.world, cfg.sim.robot),
         *_check_panels(cfg.mirror.panels),
         *_check_base(cfg.mirror),
         *_check_collimators(cfg.mirror),
@@ -113,6 +123,23 @@ def _check_edge_sensors(robot: RobotConfig) -> Iterator[Fault]:
                 f"and y {'>' if sign_y > 0 else '<'} 0; the order is front-left, front-right, rear-left, rear-right"
             )
             yield Fault(("robot", "edge_sensors_m", index), what)
+
+
+def _check_world(world: WorldConfig, sim: SimRobotConfig) -> Iterator[Fault]:
+    """Slip has a range; a delay is a number of frames, and what it delays must not be too old when it arrives."""
+    if world.slip_min > world.slip_max:
+        what = f"= {world.slip_min:g} is more than slip_max = {world.slip_max:g}"
+        yield Fault(("world", "slip_min"), what, (("world", "slip_max"),))
+    frame_s = 1.0 / sim.frame_hz
+    for name in ("sensors_delay_s", "commands_delay_s"):
+        delay_s = getattr(world, name)
+        frames = delay_s * sim.frame_hz
+        if abs(frames - round(frames)) > _WHOLE_FRAMES:
+            what = f"= {delay_s:g} must be a whole number of frames of {frame_s:g} s"
+            yield Fault(("world", name), what, (("sim", "robot", "frame_hz"),))
+        elif delay_s and delay_s + frame_s > sim.ttl_s * (1.0 + _WHOLE_FRAMES):
+            what = f"= {delay_s:g} and a frame of {frame_s:g} s outlast sim.robot.ttl_s = {sim.ttl_s:g}"
+            yield Fault(("world", name), what, (("sim", "robot", "ttl_s"), ("sim", "robot", "frame_hz")))
 
 
 def _check_panels(panels: PanelsConfig) -> Iterator[Fault]:

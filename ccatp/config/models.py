@@ -81,11 +81,58 @@ class ControlConfig(Model):
     gains: str
     straight_tolerance_rad: Positive
     lookahead_m: Positive
+    cross_track_gain_rad_m2: NonNegative
+    heading_weight_1_s2: Positive
+    slip_time_s: Positive
+    slip_limit: Annotated[float, Field(ge=0.0, lt=0.5)]
+    stop_tolerance_m: Positive
+    stop_time_s: NonNegative
     settle_speed_m_s: Positive
     settle_rate_rad_s: Positive
     settle_time_s: NonNegative
+    settle_mean_time_s: Positive
     leg_timeout_factor: Positive
     gain_sets: dict[str, GainsConfig]
+
+
+class FullStateConfig(Model):
+    """Model of the full-state filters; standard deviations of what is not known before the first leg."""
+
+    jerk_density_m2_s5: Positive
+    angular_acceleration_density_rad2_s3: Positive
+    gyroscope_bias_sigma_rad_s: Positive
+    gyroscope_bias_walk_rad_s_sqrt_s: NonNegative
+    gyroscope_scale_sigma: Positive
+    accelerometer_bias_sigma_m_s2: Positive
+    accelerometer_bias_walk_m_s2_sqrt_s: NonNegative
+    acceleration_jump_m_s2: NonNegative
+    wheel_base_sigma: Positive
+    encoder_period_s: Positive
+    slip_mean: Annotated[float, Field(ge=0.0, lt=0.5)]
+    slip_sigma: Positive
+    slip_scatter: Positive
+    slip_scatter_max: Positive
+    slip_difference_sigma: Positive
+    creep_sigma: Positive
+    creep_scatter_share: NonNegative  # scatter from leg to leg, part of the creep itself
+    wander_fraction: NonNegative  # of the scatter from leg to leg: how much slip and creep wander within one
+    wander_time_s: Positive
+    edge_sigma_m: Positive
+    line_gate: Positive
+    rest_after_s: Positive
+    rest_rate_rad_s: Positive
+    rest_speed_sigma_m_s: Positive
+    rest_acceleration_sigma_m_s2: Positive
+    rest_turn_sigma_rad_s: Positive
+    gravity_sigma_rad: Positive
+    gravity_floor_rad: Positive
+    gravity_least_tilt: Positive
+    gravity_gate: Positive
+    fix_extra_sigma_m: NonNegative
+    fix_gate_nis: Positive
+    consistent_m: Positive
+    relocated_heading_sigma_rad: Positive
+    rewind_s: Positive
 
 
 class LocalizerConfig(Model):
@@ -107,6 +154,7 @@ class LocalizerConfig(Model):
     crossing_min_speed_m_s: Positive
     crossing_gate_sigma: Positive
     history_s: Positive
+    full_state: FullStateConfig
 
 
 class EtalonConfig(Model):
@@ -153,7 +201,12 @@ class MissionConfig(Model):
     backoff_speed_m_s: Annotated[float, Field(gt=0.0, le=0.05)]
     turn_away_rad: Positive
     max_backoffs_per_stop: Annotated[int, Field(ge=1)]
+    fix_at_start: bool
+    calibration_length_m: Annotated[float, Field(ge=0.0, le=0.5)]  # 0 = no calibration drive
     arrival_tolerance_m: Positive
+    correction_tolerance_m: Positive
+    correction_margin: Annotated[float, Field(gt=0.0, le=1.0)]
+    correction_reach_m: NonNegative
     max_approaches: Annotated[int, Field(ge=1)]
     verdict_timeout_s: Positive
     measure_timeout_s: Positive
@@ -203,14 +256,40 @@ class SimConfig(Model):
 
 
 class WorldConfig(Model):
-    """One simulated world: sensor noise and start error, standard deviations."""
+    """One simulated world: noise, errors and disturbances. 0 (delays, too) switches each of them off by itself.
+
+    Sigmas are standard deviations; ``walk`` names what changes with time: a random walk (per square root of a second)
+    or an Ornstein-Uhlenbeck process of that sigma and correlation time.
+    """
 
     name: str
     accelerometer_sigma_m_s2: NonNegative
+    accelerometer_bias_sigma_m_s2: NonNegative
+    accelerometer_bias_walk_m_s2_sqrt_s: NonNegative
     gyroscope_sigma_rad_s: NonNegative
-    encoder_sigma_rad_s: NonNegative
+    gyroscope_bias_sigma_rad_s: NonNegative
+    gyroscope_bias_walk_rad_s_sqrt_s: NonNegative
+    gyroscope_scale_sigma: Annotated[float, Field(ge=0.0, le=0.2)]
+    encoder_sigma_rad_s: NonNegative  # not added where counts are counted
+    encoder_counts_per_rev: Annotated[int, Field(ge=0, le=10_000_000)]  # 0 = the rate itself is read
     start_position_sigma_m: NonNegative
     start_heading_sigma_rad: NonNegative
+    slip_min: Annotated[float, Field(ge=0.0, le=0.5)]
+    slip_max: Annotated[float, Field(ge=0.0, le=0.5)]
+    slip_walk_sigma: Annotated[float, Field(ge=0.0, le=0.2)]
+    slip_walk_time_s: Positive
+    creep_fraction: Annotated[float, Field(ge=0.0, le=0.5)]
+    creep_walk_fraction: Annotated[float, Field(ge=0.0, le=1.0)]
+    creep_walk_time_s: Positive
+    vibration_rate_rad_s: NonNegative
+    vibration_speed_m_s: NonNegative
+    vibration_acceleration_m_s2: NonNegative
+    wheel_radius_sigma: Annotated[float, Field(ge=0.0, le=0.1)]
+    wheel_base_sigma: Annotated[float, Field(ge=0.0, le=0.1)]
+    wheel_lag_spread: Annotated[float, Field(ge=0.0, le=0.9)]
+    panel_edge_sigma_m: Annotated[float, Field(ge=0.0, le=0.01)]
+    sensors_delay_s: Annotated[float, Field(ge=0.0, le=1.0)]
+    commands_delay_s: Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 class SurfaceConfig(Model):

@@ -4,60 +4,16 @@ from enum import StrEnum
 from math import atan2, cos, hypot, pi, sin
 
 from ccatp.angles import wrap_pi
-from ccatp.config.models import ControlConfig, LimitsConfig, PidConfig
+from ccatp.config.models import ControlConfig, LimitsConfig
+from ccatp.control.axis import Axis, BareAxis, ProfiledAxis
 from ccatp.control.pid import Pid
-from ccatp.control.profile import Profile, lag_feed_forward
+from ccatp.control.steering import Line, crab, line_rate
 from ccatp.samples import Twist
 
 # Further off the bearing than this an unshaped drive stops and aligns again: the thesis aligns first, then heads on.
 REALIGN_RAD = 0.5
-
-
-class Axis:
-    """Brings one remaining quantity (a distance in m or an angle in rad) to zero.
-
-    Shaped: follows a rest-to-rest profile; the output is the lag-compensated planned speed plus the PID of
-    (planned position - reached position). Unshaped: the PID of the remaining quantity itself, as in the thesis.
-
-    Args:
-        gains: PID gains.
-        v_max, a_max: limits of the profile, in the quantity's unit per s and per s^2.
-        lag_s: time constant of the servo behind it.
-        shaped: follow a profile.
-    """
-
-    def __init__(self, gains: PidConfig, v_max: float, a_max: float, lag_s: float, shaped: bool) -> None:
-        """Start with nothing to do."""
-        self._pid = Pid(gains, v_max)
-        self._v_max, self._a_max, self._lag_s, self._shaped = v_max, a_max, lag_s, shaped
-        self._profile = Profile.rest_to_rest(0.0, v_max, a_max)
-        self._t_s = 0.0
-
-    def begin(self, remaining: float) -> None:
-        """Plan the motion over ``remaining`` from rest to rest."""
-        self._pid.reset()
-        self._profile = Profile.rest_to_rest(remaining, self._v_max, self._a_max)
-        self._t_s = 0.0
-
-    @property
-    def is_planned_out(self) -> bool:
-        """Whether the profile has come to its end (always, where there is none)."""
-        return not self._shaped or self._t_s >= self._profile.duration_s
-
-    @property
-    def duration_s(self) -> float:
-        """Bang-bang time of the motion begun last."""
-        return self._profile.duration_s
-
-    def step(self, remaining: float, dt_s: float) -> float:
-        """Speed command for the next ``dt_s``, given what remains now."""
-        if not self._shaped:
-            return self._pid.step(remaining, dt_s)
-        position, now = self._profile.at(self._t_s)
-        self._t_s += dt_s
-        after = self._profile.at(self._t_s)[1]
-        feedback = self._pid.step(remaining - (self._profile.distance - position), dt_s)
-        return lag_feed_forward(now, after, dt_s, self._lag_s) + feedback
+NO_CREEP = (0.0, 0.0)
+STILL = Twist(0.0, 0.0)
 
 
 class Phase(StrEnum):
@@ -72,7 +28,8 @@ class LegTracker:
     """Drives one leg: turn in place to the bearing of the target, then move to it, forward or in reverse.
 
     All poses are in one plane (the panel frame); the frame may change from step to step as long as pose and target
-    change together.
+    change together. A shaped set of gains drives along the line from where the drive begins; the thesis's heads for the
+    stop itself.
 
     Args:
         control: tolerances and gains.
@@ -83,30 +40,46 @@ class LegTracker:
     def __init__(self, control: ControlConfig, limits: LimitsConfig, wheel_lag_s: float) -> None:
         """Pick the named set of gains."""
         gains = control.gain_sets[control.gains]
-        self._shaped = gains.shaped
+        self._control, self._shaped = control, gains.shaped
         self._position_tolerance_m = gains.position_tolerance_m
         self._heading_tolerance_rad = gains.heading_tolerance_rad
         self._straight_rad = max(control.straight_tolerance_rad, gains.heading_tolerance_rad)
-        self._lookahead_m = control.lookahead_m if gains.shaped else 0.0
-        self._forward = Axis(gains.forward, limits.v_max_m_s, limits.a_max_m_s2, wheel_lag_s, gains.shaped)
-        self._angular = Axis(gains.angular, limits.omega_max_rad_s, limits.alpha_max_rad_s2, wheel_lag_s, gains.shaped)
-        self._steering = Pid(gains.angular, limits.omega_max_rad_s)
+        self._forward: Axis
+        self._angular: Axis
+        v, a, omega, alpha = limits.v_max_m_s, limits.a_max_m_s2, limits.omega_max_rad_s, limits.alpha_max_rad_s2
+        self._along = ProfiledAxis(gains.forward, control, v, a, wheel_lag_s)
+        if gains.shaped:
+            self._forward = self._along
+            self._angular = ProfiledAxis(gains.angular, control, omega, alpha, wheel_lag_s)
+        else:
+            self._forward, self._angular = BareAxis(gains.forward, v, a), BareAxis(gains.angular, omega, alpha)
+        self._steering = Pid(gains.angular, omega)
+        self._line = Line(control.lookahead_m)
+        self._steering_damping = gains.angular.kd
+        self._omega_max = omega
         self._reverse = False
         self.phase = Phase.DONE
 
-    def begin(self, pose: tuple[float, float, float], target: tuple[float, float], reverse: bool) -> None:
+    def begin(
+        self,
+        pose: tuple[float, float, float],
+        target: tuple[float, float],
+        reverse: bool,
+        creep: tuple[float, float] = NO_CREEP,
+    ) -> None:
         """Start a leg.
 
         Args:
             pose: (x, y, heading), m and rad.
             target: (x, y), m.
             reverse: drive it backwards.
+            creep: drift (dx, dy) per metre of travel.
         """
         self._reverse = reverse
         if hypot(target[0] - pose[0], target[1] - pose[1]) <= self._position_tolerance_m:
             self.phase = Phase.DONE  # it is there, and the bearing of a stop so near is noise
             return
-        angle = self._bearing_error(pose, target)
+        angle = self._bearing_error(pose, target, creep)
         if abs(angle) > self._straight_rad:
             self.phase = Phase.TURN
             self._angular.begin(angle)
@@ -123,59 +96,103 @@ class LegTracker:
         """Bang-bang time of the motion begun last."""
         return self._angular.duration_s if self.phase is Phase.TURN else self._forward.duration_s
 
-    def step_turn(self, remaining_rad: float, dt_s: float) -> Twist:
-        """One step of a turn in place; ``phase`` becomes DONE when it is over."""
-        if self._is_turned(remaining_rad):
+    def step_turn(self, remaining_rad: float, dt_s: float, rate_rad_s: float | None = None) -> Twist:
+        """One step of a turn in place; ``phase`` becomes DONE when it is over.
+
+        Args:
+            remaining_rad: what is left of it.
+            dt_s: time until the next step.
+            rate_rad_s: the present rate, where it is known.
+        """
+        if self._angular.is_over(remaining_rad, self._heading_tolerance_rad, rate_rad_s):
             self.phase = Phase.DONE
-            return Twist(0.0, 0.0)
-        return Twist(0.0, self._angular.step(remaining_rad, dt_s))
+            return STILL
+        return Twist(0.0, self._angular.step(remaining_rad, dt_s, rate_rad_s))
 
-    def step(self, pose: tuple[float, float, float], target: tuple[float, float], dt_s: float) -> Twist:
-        """One step of the leg: the twist for the next ``dt_s``; ``phase`` tells what it is at."""
+    def step(
+        self,
+        pose: tuple[float, float, float],
+        target: tuple[float, float],
+        dt_s: float,
+        twist: Twist | None = None,
+        creep: tuple[float, float] = NO_CREEP,
+    ) -> Twist:
+        """One step of the leg: the twist for the next ``dt_s``; ``phase`` tells what it is at.
+
+        Args:
+            pose: (x, y, heading) when the twist will take effect, m and rad.
+            target: (x, y) in the same plane, m.
+            dt_s: time until the next step.
+            twist: the speeds at that pose, where they are known.
+            creep: drift (dx, dy) per metre of travel in the same plane.
+        """
         if self.phase is Phase.TURN:
-            angle = self._bearing_error(pose, target)
-            if not self._is_turned(angle):
-                return Twist(0.0, self._angular.step(angle, dt_s))
+            angle = self._bearing_error(pose, target, creep)
+            rate = None if twist is None else twist.omega_rad_s
+            if not self._angular.is_over(angle, self._heading_tolerance_rad, rate):
+                return Twist(0.0, self._angular.step(angle, dt_s, rate))
             self._begin_drive(pose, target)
-        if self.phase is Phase.DRIVE:
-            return self._drive(pose, target, dt_s)
-        return Twist(0.0, 0.0)
-
-    def _is_turned(self, remaining_rad: float) -> bool:
-        return self._angular.is_planned_out and abs(remaining_rad) <= self._heading_tolerance_rad
+        if self.phase is Phase.DONE:
+            return STILL
+        return self._drive(pose, target, dt_s, twist, creep) if self._shaped else self._head_on(pose, target, dt_s)
 
     def _begin_drive(self, pose: tuple[float, float, float], target: tuple[float, float]) -> None:
         self.phase = Phase.DRIVE
-        self._forward.begin(self._ahead(pose, target)[0])
+        self._line.begin(pose, target, self._reverse)
+        self._forward.begin(hypot(target[0] - pose[0], target[1] - pose[1]))
         self._steering.reset()
 
-    def _ahead(self, pose: tuple[float, float, float], target: tuple[float, float]) -> tuple[float, float]:
-        """The target as seen from the robot: (along, to the left of) its direction of motion."""
+    def _bearing_error(
+        self, pose: tuple[float, float, float], target: tuple[float, float], creep: tuple[float, float]
+    ) -> float:
+        """Thesis eq. 3.2, e = beta - theta with beta = atan2(dy, dx); printed there with the arguments exchanged.
+
+        In reverse the tail has to point at the target; against a drift the robot points beside it.
+        """
+        beta = atan2(target[1] - pose[1], target[0] - pose[0])
+        beta += crab(beta, creep) if self._shaped else 0.0
+        return wrap_pi(beta - pose[2] - (pi if self._reverse else 0.0))
+
+    def _drive(
+        self,
+        pose: tuple[float, float, float],
+        target: tuple[float, float],
+        dt_s: float,
+        twist: Twist | None,
+        creep: tuple[float, float],
+    ) -> Twist:
+        """Along the line; at its end the along-track remainder is corrected for a bounded time, and no other."""
+        control, axis = self._control, self._along
+        sight = self._line.look(pose, target, creep)
+        sign = -1.0 if self._reverse else 1.0
+        speed = None if twist is None else sign * twist.v_m_s * sight.gain
+        axis.renew_if_far(sight.ahead_m)
+        if axis.is_over(sight.ahead_m, control.stop_tolerance_m, speed) or axis.overtime_s >= control.stop_time_s:
+            self.phase = Phase.DONE
+            return STILL
+        planned = axis.planned_speed
+        wanted = axis.step(sight.ahead_m, dt_s, speed) / sight.gain
+        rate = line_rate(sight, planned, control.cross_track_gain_rad_m2, control.heading_weight_1_s2)
+        if twist is not None:
+            rate += self._steering_damping * (rate - twist.omega_rad_s)
+        return Twist(sign * wanted, max(-self._omega_max, min(self._omega_max, rate)))
+
+    def _head_on(self, pose: tuple[float, float, float], target: tuple[float, float], dt_s: float) -> Twist:
+        """The thesis's drive: one PID on the distance, one on the bearing, eqs 3.1 to 3.4."""
         x, y, heading = pose
         dx, dy = target[0] - x, target[1] - y
         c, s = cos(heading), sin(heading)
         ahead, left = c * dx + s * dy, c * dy - s * dx
-        return (-ahead, -left) if self._reverse else (ahead, left)
-
-    def _bearing_error(self, pose: tuple[float, float, float], target: tuple[float, float]) -> float:
-        """Thesis eq. 3.2, e = beta - theta with beta = atan2(dy, dx); printed there with the arguments exchanged.
-
-        In reverse the tail has to point at the target.
-        """
-        beta = atan2(target[1] - pose[1], target[0] - pose[0])
-        return wrap_pi(beta - pose[2] - (pi if self._reverse else 0.0))
-
-    def _drive(self, pose: tuple[float, float, float], target: tuple[float, float], dt_s: float) -> Twist:
-        ahead, left = self._ahead(pose, target)
-        # Thesis eq. 3.1 takes the distance, which cannot tell before from behind; the profile needs the sign.
-        remaining = ahead if self._shaped else hypot(ahead, left)
-        if self._forward.is_planned_out and abs(remaining) <= self._position_tolerance_m:
+        if self._reverse:
+            ahead, left = -ahead, -left
+        remaining = hypot(ahead, left)
+        if self._forward.is_over(remaining, self._position_tolerance_m, None):
             self.phase = Phase.DONE
-            return Twist(0.0, 0.0)
-        steering_error = atan2(left, max(ahead, self._lookahead_m)) if self._shaped else atan2(left, ahead)
-        if not self._shaped and abs(steering_error) > REALIGN_RAD:
+            return STILL
+        error = atan2(left, ahead)
+        if abs(error) > REALIGN_RAD:
             self.phase = Phase.TURN
-            self._angular.begin(steering_error)
-            return Twist(0.0, 0.0)
-        speed = self._forward.step(remaining, dt_s)
-        return Twist(-speed if self._reverse else speed, self._steering.step(steering_error, dt_s))
+            self._angular.begin(error)
+            return STILL
+        speed = self._forward.step(remaining, dt_s, None)
+        return Twist(-speed if self._reverse else speed, self._steering.step(error, dt_s))

@@ -21,6 +21,15 @@ class FilterShapeError(FilterError):
         self.shape = shape
 
 
+class FilterModelError(FilterError):
+    """A nonlinear model was given to a filter of linear ones: carries the name of the model's class."""
+
+    def __init__(self, filter_name: str, model: object) -> None:
+        name = type(model).__name__
+        super().__init__(f"{filter_name} takes arrays, not the nonlinear {name}: linearise it, or choose ekf or ukf")
+        self.model = name
+
+
 class FilterDiverged(FilterError):
     """A mean, a covariance or a noise is no longer a finite Gaussian: what is wrong stands in the message."""
 
@@ -40,6 +49,33 @@ class Innovation(NamedTuple):
     size: int
 
 
+class Transition(Protocol):
+    """A nonlinear process model x <- f(x).
+
+    Angles are continuous in the state: nothing wraps. The arrays that come back are the model's work space: they hold
+    until its next call, and a filter neither changes nor keeps them.
+    """
+
+    def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """f(x), shape (n,), and its Jacobian df/dx at x, shape (n, n)."""
+
+    def through(self, X: FloatArray) -> FloatArray:
+        """Image f of each row of X (k, n), shape (k, n)."""
+
+
+class Observation(Protocol):
+    """A nonlinear measurement model z = h(x) + noise; its arrays are work space as those of ``Transition``.
+
+    It is prepared so that z - h(x) needs no wrapping for any x that the filter may try.
+    """
+
+    def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """h(x), shape (m,), and its Jacobian dh/dx at x, shape (m, n)."""
+
+    def through(self, X: FloatArray) -> FloatArray:
+        """Image h of each row of X (k, n), shape (k, m)."""
+
+
 class Filter(Protocol):
     """A Gaussian filter of n states, thesis fig. 2.8: the localizer is composed with one.
 
@@ -51,29 +87,34 @@ class Filter(Protocol):
     """State estimate, shape (n,)."""
     covariance: FloatArray
     """Its covariance, shape (n, n), symmetric positive semidefinite."""
+    transition: FloatArray
+    """F of the last prediction, shape (n, n): the matrix given, the Jacobian used, or the regression of f(x) on x by
+    sigma points; the identity before the first prediction and after a reset. What a smoother goes back by."""
 
-    def predict(self, F: FloatArray, Q: FloatArray) -> None:
-        """Advance the state by x <- F x, P <- F P F^T + Q (thesis eqs 2.5, 2.6).
+    def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
+        """Advance the state by x <- F x, P <- F P F^T + Q (thesis eqs 2.5, 2.6), or by x <- f(x) and what it does to P.
 
         Args:
-            F: transition, shape (n, n).
+            F: transition, shape (n, n), or a nonlinear model.
             Q: covariance of the process noise, shape (n, n).
 
         Raises:
             FilterShapeError: a shape does not fit.
+            FilterModelError: the model is nonlinear and the filter takes none.
             FilterDiverged: the prediction is not finite.
         """
 
-    def update(self, z: FloatArray, H: FloatArray, R: FloatArray) -> Innovation:
-        """Condition the state on z = H x + noise (thesis eqs 2.7 to 2.10).
+    def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
+        """Condition the state on z = H x + noise (thesis eqs 2.7 to 2.10), or on z = h(x) + noise.
 
         Args:
             z: measurements, shape (m,); m = 0 leaves the prediction.
-            H: measurement model, shape (m, n).
+            H: measurement model, shape (m, n), or a nonlinear model.
             R: variances of independent rows, shape (m,), or their covariance, shape (m, m).
 
         Raises:
             FilterShapeError: a shape does not fit.
+            FilterModelError: the model is nonlinear and the filter takes none.
             FilterDiverged: the posterior is not finite, P is not positive semidefinite or R is not positive definite.
         """
 
@@ -109,5 +150,7 @@ def check_gaussian(mean: FloatArray, covariance: FloatArray) -> None:
 
 ASYMMETRY = 1e-9
 """Largest relative asymmetry taken for rounding of the caller's arithmetic."""
+HUGE = 1e200
+"""Sums of squares beyond it count as not finite: no product of the numbers below overflows."""
 NEGATIVITY = 1e-9
 """Largest negative eigenvalue, relative to the largest entry, taken for rounding."""

@@ -10,9 +10,9 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.planning.course import heading_of_course
 from ccatp.samples import DeckPose, Stop, StopKind
 
-# A leg that begins within this of the heading is steered for on the way and needs no turn in place; the points of a
-# row are dropped on the curved surface and lie on a straight line only to some mrad.
-STRAIGHT_RAD = 0.02
+# A leg that begins within this of the heading is steered for on the way and needs no turn in place, by
+# control.straight_tolerance_rad; the points of a row, dropped on the curved surface, lie on a straight line to 10 mrad.
+STRAIGHT_RAD = 0.05
 
 
 def bang_bang_time(distance: float, v_max: float, a_max: float) -> float:
@@ -81,7 +81,7 @@ def path_time(
         mirror: gives the surface on which the legs lie.
         measuring_time_s: standstill at each measurement point.
     """
-    measurements = sum(stop.kind is StopKind.MEASURE for stop in stops)
+    measurements = sum(stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) for stop in stops)
     return sum(stop_times(stops, start, limits, mirror)) + measurements * measuring_time_s
 
 

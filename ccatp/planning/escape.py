@@ -25,7 +25,7 @@ def find_escape(mirror: Mirror, body: Body, start: Arrival, limits: LimitsConfig
     """The best single turn and straight leg, forward or in reverse, to a place where the robot can turn freely.
 
     Best is what brings no sensor nearer to the rim than ``turn_clearance_m``, or than it is already; of those the
-    fastest. Where a sensor has to come nearer, the one that brings it least far.
+    fastest, with the smallest turn. Where a sensor has to come nearer, the one that brings it least far.
 
     Args:
         mirror: the mirror.
@@ -45,26 +45,27 @@ def find_escape(mirror: Mirror, body: Body, start: Arrival, limits: LimitsConfig
     sensors = sensor_depths(mirror, body, xs, ys, courses[:, None, None])
     least_sensors = np.minimum(np.minimum.accumulate(sensors, axis=2), _swept(sensors[:, 0, 0])[:, None, None])
     allowed_m = min(body.turn_clearance_m + _BETWEEN_TURNS_M, float(sensors[_NO_TURN, 0, 0])) - _ROUNDING_M
-    best: tuple[int, float, Arrival] | None = None
+    best: tuple[int, float, float, Arrival] | None = None
     for turn, way in np.ndindex(ways.shape):
         free = depths[turn, way] >= body.turning_depth_m
         step = int(np.argmax(free))
         if not free[step]:
             continue
         deficit_mm = ceil(max(allowed_m - float(least_sensors[turn, way, step]), 0.0) / _MILLIMETRE_M)
-        cost_s = turn_time(float(_TURNS_RAD[turn]), limits) + leg_time(float(_DISTANCES_M[step]), limits)
-        if best is not None and (deficit_mm, cost_s) >= best[:2]:
+        turn_rad = abs(float(_TURNS_RAD[turn]))
+        cost_s = turn_time(turn_rad, limits) + leg_time(float(_DISTANCES_M[step]), limits)
+        if best is not None and (deficit_mm, cost_s, turn_rad) >= best[:3]:
             continue
         place = Place(float(xs[turn, way, step]), float(ys[turn, way, step]), float(depths[turn, way, step]))
         # Never outward, not even past a re-entrant corner.
         if mirror.rim.segment_clearance_m(x0, y0, place.x_m, place.y_m) >= start.place.depth_m - _ROUNDING_M:
-            best = deficit_mm, cost_s, Arrival(place, float(courses[turn]), cost_s, way == 1, start)
+            best = deficit_mm, cost_s, turn_rad, Arrival(place, float(courses[turn]), cost_s, way == 1, start)
     if best is None:
         raise UnreachableError(
             f"no place to turn within 0.4 m of ({x0:.3f}, {y0:.3f}) m, {start.place.depth_m:.3f} m from the rim of "
             f"{mirror.name}"
         )
-    return best[2]
+    return best[3]
 
 
 def _swept(at_turn: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ import numpy as np
 from ccatp.mirror.mirror import Mirror
 from ccatp.planning.stance import Body, FloatArray, Place
 
-# A shorter move would be steered by the error of the position: 0.4 mm on 20 mm are the 0.02 rad that need no turn.
+# A shorter move would be steered by the error of the position: 1 mm on 20 mm are the 0.05 rad that need no turn.
 _DISTANCES_M = np.r_[20:100:5, 100:301:10] * 1e-3
 _SLANTS_RAD = np.radians([0, 2, -2, 4, -4, 6, -6, 8, -8, 10, -10, 12, -12, 14, -14])
 _COURSES_RAD = np.radians([0, 90, 180, 270])[:, None] + _SLANTS_RAD  # (sides, slants)

@@ -78,6 +78,23 @@ def plan_route(
     return _with_remains(mirror, stops, limits, start, measuring_time_s)
 
 
+def with_prelude(
+    mirror: Mirror,
+    route: Route,
+    prelude: tuple[Stop, ...],
+    limits: LimitsConfig,
+    start: DeckPose,
+    measuring_time_s: float = 0.0,
+) -> Route:
+    """A route with stops before it that lead from its start back to its start."""
+    head = _with_remains(mirror, prelude, limits, start, measuring_time_s)
+    return Route(
+        prelude + route.stops,
+        tuple(t + route.times_s[0] for t in head.times_s[:-1]) + route.times_s,
+        tuple(t + route.lengths_m[0] for t in head.lengths_m[:-1]) + route.lengths_m,
+    )
+
+
 def plan_rejoin(
     mirror: Mirror,
     route: Route,
@@ -171,7 +188,7 @@ def _with_remains(
     mirror: Mirror, stops: tuple[Stop, ...], limits: LimitsConfig, start: DeckPose, measuring_time_s: float
 ) -> Route:
     times = [
-        time_s + (measuring_time_s if stop.kind is StopKind.MEASURE else 0.0)
+        time_s + (measuring_time_s if stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) else 0.0)
         for stop, time_s in zip(stops, stop_times(stops, start, limits, mirror), strict=True)
     ]
     return Route(stops, _sums_to_the_end(times), _sums_to_the_end(leg_lengths(stops, start, mirror)))

@@ -14,9 +14,7 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.processes import spinning
 from ccatp.processes.common import die_with_parent, parse_args, stop_on_signals
 from ccatp.samples import Vector3
-
-# One stream of random numbers per stand-in, all from the one seed of the run.
-SEED_STREAM = 2
+from ccatp.sim.etalon import SEED_STREAM
 
 
 async def _serve(cfg: Config, truth: TruthSource, listener: socket.socket | None, stop: asyncio.Event) -> None:

@@ -7,15 +7,18 @@ import time
 import zmq
 import zmq.asyncio
 
+from ccatp.assembly import Parts
 from ccatp.bus import Publisher
 from ccatp.control.gate import DriveGate
+from ccatp.control.kinematics import twist_of
+from ccatp.control.prediction import CommandPredictor
 from ccatp.errors import CcatpError, ExitStatus, UnreachableError
 from ccatp.etalon_client import EtalonClient, EtalonError
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror
 from ccatp.mission import Mission, Order
 from ccatp.processes import spinning
-from ccatp.processes.building import Parts, build_parts
+from ccatp.processes.building import build_parts
 from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
 from ccatp.processes.hearing import VerdictEar
 from ccatp.processes.measuring import MeasuringDesk, Request
@@ -66,6 +69,7 @@ class MainLoop:
         self._ear = VerdictEar(context, args.endpoints.of("danger"), cfg.mission.verdict_timeout_s)
         self._teller = Teller(self._publisher, open_log(args.run_dir / "log.jsonl", "main"))
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m)
+        self._predictor = CommandPredictor(cfg.robot.wheel_lag_s, 1.0 / cfg.sim.robot.frame_hz)
         self._measuring = MeasuringDesk(
             cfg.mission, self._etalon, parts.localizer, parts.mission, store, self._teller, self._answer_held_frame
         )
@@ -127,6 +131,7 @@ class MainLoop:
         hello = await self._link.connect(self._cfg.robot.connect_timeout_s)
         self._parts.check_robot(hello)
         self._hello, self._is_lockstep = hello, hello.lockstep
+        self._predictor = CommandPredictor(self._cfg.robot.wheel_lag_s, 1.0 / hello.frame_hz)
         self._phase = "joined"
         self._link.send_fans(1, self._cfg.robot.fan_duty)
         self._teller.say("info", f"joined the robot at {self._cfg.robot.host}:{self._cfg.robot.port}")
@@ -142,6 +147,8 @@ class MainLoop:
 
     def _drive(self, ack: int, right: float, left: float) -> None:
         self._drive_seq += 1
+        twist = twist_of(right, left, self._cfg.robot.wheel_radius_m, self._cfg.robot.wheel_base_m)
+        self._predictor.sent(self._drive_seq, twist.v_m_s, twist.omega_rad_s)
         self._link.send_drive(self._drive_seq, max(ack, 0), right, left)
 
     def _hold_wheels(self) -> None:
@@ -205,7 +212,7 @@ class MainLoop:
             self._t_first_s = t_s
         self._t_last_s, self._seq, self._frame_wall_s = t_s, seq, time.monotonic()
         localizer = self._localizer
-        localizer.step(t_s, sensors.imu, sensors.enc, sensors.edge)
+        localizer.step(t_s, sensors.imu, sensors.enc, sensors.edge, sensors.gravity)
         if localizer.hold_requested:
             # A filter that diverged is frozen until it has a fix.
             self._mission.fault(localizer.hold_cause, is_lost=localizer.is_frozen)
@@ -216,7 +223,7 @@ class MainLoop:
         waiting = time.perf_counter()
         verdict = self._ear.hear(seq, self._frame_period_s(), is_lockstep=self._is_lockstep)
         heard = time.perf_counter()
-        motion = Motion(t_s, dt_s, localizer.pose, self._mirror.deck_pose, localizer.speed_m_s, localizer.rate_rad_s)
+        motion = self._motion(sensors, dt_s)
         order = self._mission.step(motion, verdict)
         right, left = self._gate.pass_through(order.twist, verdict, dt_s)
         if order.at_rest or order.measure:
@@ -230,12 +237,21 @@ class MainLoop:
             self._on_state()
         self._teller.tick(1e6 * (time.perf_counter() - heard + waiting - start))
 
+    def _motion(self, sensors: Sensors, dt_s: float) -> Motion:
+        localizer, echo = self._localizer, sensors.cmd
+        pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
+        ahead = self._predictor.ahead(
+            (pose.x_m, pose.y_m, pose.heading_rad), v, omega, echo.seq, echo.age, echo.held, creep
+        )
+        return Motion(sensors.t, dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead)
+
     def _frame_period_s(self) -> float:
         return 1.0 / self._hello.frame_hz if self._hello is not None else 0.01
 
     def _execute(self, order: Order, motion: Motion) -> None:
         if order.at_rest:
             self._localizer.rest()
+            self._teller.rest(self._seq, motion.t_s)
         if order.arrived is not None:
             error_m = self._mission.survey.distance_m(motion.pose)
             self._teller.arrival(order.arrived, error_m)

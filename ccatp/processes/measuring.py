@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 from ccatp.config.models import MissionConfig
 from ccatp.etalon_client import EtalonClient, EtalonError
-from ccatp.localization.fixes import FixRefused
+from ccatp.localization.fixes import FixGated, FixRefused
 from ccatp.localizer import Localizer
 from ccatp.mission import Mission
 from ccatp.processes.telling import Teller
 from ccatp.samples import DeckPose, Fix, PointId, Vector3
 from ccatp.store import MissionStore, StoreError
+from ccatp.surveying.approaches import Approaches
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +50,8 @@ class MeasuringDesk:
         on_over: Callable[[], None],
     ) -> None:
         """Nothing is wanted yet."""
-        self._tolerance_m, self._max_approaches = cfg.arrival_tolerance_m, cfg.max_approaches
-        self._approaches: tuple[PointId | None, int] = (None, 0)
+        self._tolerance_m = cfg.arrival_tolerance_m
+        self._approaches = Approaches(cfg.correction_tolerance_m, cfg.max_approaches)
         self._client, self._localizer, self._mission = client, localizer, mission
         self._store, self._teller, self._on_over = store, teller, on_over
         self._timeout_s = cfg.measure_timeout_s
@@ -108,10 +109,21 @@ class MeasuringDesk:
     async def _accept(self, request: Request, fix: Fix) -> None:
         try:
             jump_m = self._localizer.fuse_fix(fix)
+        except FixGated as refusal:
+            # Measured again: a wrong fix will not repeat itself, and a wrong estimate gives way to three that agree.
+            self._teller.fix(request.point, fix, 0.0, is_fused=False)
+            self._teller.say("warning", f"the fix at {_name(request.point)} is doubted: {refusal}; measuring again")
+            self._wanted = request
+            self._wakes.set()
+            return
         except FixRefused as refusal:
             self._teller.say("warning", f"the fix at {_name(request.point)} is refused: {refusal}")
             await self._skip(request, str(refusal))
             return
+        self._teller.fix(request.point, fix, jump_m, is_fused=True)
+        for notice in self._localizer.notices:
+            self._teller.say("warning", notice)
+        self._localizer.notices.clear()
         if jump_m > self._tolerance_m:
             self._teller.say(
                 "warning", f"the fix at {_name(request.point)} moved the estimate by {1e3 * jump_m:.1f} mm"
@@ -126,22 +138,20 @@ class MeasuringDesk:
             except StoreError as error:
                 self._mission.fault(f"the fix of {_name(request.point)} cannot be stored: {error}")
                 return
-            self._teller.fix(request.point, fix, jump_m)
         self._mission.fixed(request.point)
 
     def _is_too_far(self, point: PointId) -> bool:
         """Whether the point has to be approached again: what was measured there is not its alignment."""
-        count = self._approaches[1] + 1 if self._approaches[0] == point else 1
-        self._approaches = (point, count)
-        if self.arrival_error_m <= self._tolerance_m:
-            return False
+        is_too_far = self._approaches.is_too_far(point, self.arrival_error_m)
         what = f"{1e3 * self.arrival_error_m:.1f} mm from {_name(point)}"
-        if count >= self._max_approaches:
-            self._teller.say("warning", f"{what} after {count} approaches: measured there all the same")
-            return False
-        self._teller.say("warning", f"{what}: approaching it again")
-        return True
+        if is_too_far:
+            self._teller.say("info", f"{what}: approaching it again")
+        elif self.arrival_error_m > self._tolerance_m:
+            self._teller.say(
+                "warning", f"{what} after {self._approaches.count} approaches: measured there all the same"
+            )
+        return is_too_far
 
 
 def _name(point: PointId | None) -> str:
-    return "the retreat" if point is None else f"point {point.row}-{point.col}-{point.point}"
+    return "the robot's place" if point is None else f"point {point.row}-{point.col}-{point.point}"

@@ -14,6 +14,7 @@ from ccatp.wire.topics import (
     FixMessage,
     Log,
     MissionStatus,
+    Rest,
     SensorLines,
     Timing,
     Track,
@@ -85,12 +86,17 @@ class Teller:
         message = Arrival(seq=self.seq, t_s=self.t_s, point=(point.row, point.col, point.point), error_mm=1e3 * error_m)
         self._publisher.send("arrival", message)
 
-    def fix(self, point: PointId, fix: Fix, jump_m: float) -> None:
-        """A point's fix is committed."""
+    def rest(self, seq: int, t_s: float) -> None:
+        """The mission takes the robot to be at rest from frame ``seq`` on."""
+        self._publisher.send("rest", Rest(seq=seq, t_s=t_s))
+
+    def fix(self, point: PointId | None, fix: Fix, jump_m: float, *, is_fused: bool) -> None:
+        """A fix was handed to the localizer after the last frame; ``None`` for one that only finds the robot."""
         message = FixMessage(
             seq=self.seq,
             t_s=fix.t_s,
-            point=(point.row, point.col, point.point),
+            point=(point.row, point.col, point.point) if point is not None else None,
+            is_fused=is_fused,
             position_m=fix.position_m,
             covariance_m2=list(fix.covariance_m2),
             dop=fix.dop,

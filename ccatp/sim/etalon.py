@@ -21,6 +21,8 @@ AIR = Environment(temperature_c=-5.0, pressure_hpa=525.0, humidity_pct=30.0)
 _INTENSITY = (400, 2000)  # least and largest counts of a good return; arbitrary units
 _LENGTH_DECIMALS = 6  # of a millimetre: a thousandth of the smallest noise that matters
 _WORD = 2**64 - 1
+SEED_STREAM = 2
+"""The laser's stream of random numbers: with the run's seed it makes the seed of its generator."""
 
 
 class PuckTruth(NamedTuple):

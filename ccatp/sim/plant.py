@@ -17,14 +17,15 @@ _STANDSTILL_RAD_S = 1e-9
 
 
 class Disturbance(Protocol):
-    """What pushes the body besides its wheels: slip, creep, vibration."""
+    """What pushes the body besides its wheels: creep, vibration."""
 
     def displace(
-        self, t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float
+        self, plant: "Plant", t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float
     ) -> tuple[float, float, float]:
         """Body displacement of one step after this disturbance, from the one before it.
 
         Args:
+            plant: at the start of the step.
             t_s: time at the start of the step.
             dt_s: its length.
             forward_m: displacement along robot x.
@@ -42,35 +43,45 @@ class Plant:
         right_rad_s, left_rad_s: wheel rates.
         is_moving: the last step moved the body.
         hx, hy, lx, ly: deck-plane components of the robot's x and y axes, as ``Mirror.body_axes``.
-        forward_m, turn_rad: displacement of the last step.
+        fx, fy: slopes of the surface under the robot.
+        forward_m, left_m, turn_rad: displacement of the last step.
+        right_angle_rad, left_angle_rad: wheel angles at the end of the last step, since boot.
+        right_scale, left_scale: travel of the body over travel of the nominal wheel; may be set before a step.
+        shake_rate_rad_s, shake_acceleration_m_s2: what vibration adds to the readings of the inertial unit.
     """
 
     __slots__ = (
         "_decay",
         "_decay_dt_s",
         "_disturbances",
-        "_fx",
-        "_fxx",
-        "_fxy",
-        "_fy",
-        "_fyy",
         "_half_base_m",
         "_left_0",
+        "_left_angle_0",
         "_left_set",
         "_radius_m",
         "_right_0",
+        "_right_angle_0",
         "_right_set",
         "_surface",
         "forward_m",
+        "fx",
+        "fy",
         "heading_rad",
         "hx",
         "hy",
         "is_moving",
         "lag_s",
+        "left_angle_rad",
+        "left_m",
         "left_rad_s",
+        "left_scale",
         "lx",
         "ly",
+        "right_angle_rad",
         "right_rad_s",
+        "right_scale",
+        "shake_acceleration_m_s2",
+        "shake_rate_rad_s",
         "turn_rad",
         "x_m",
         "y_m",
@@ -102,10 +113,13 @@ class Plant:
         self.lag_s = wheel_lag_s
         self._disturbances = tuple(disturbances)
         self.x_m, self.y_m, self.heading_rad = start.x_m, start.y_m, start.heading_rad
-        self.z_m, self._fx, self._fy, self._fxx, self._fxy, self._fyy = surface.jet(start.x_m, start.y_m)
+        self.z_m, self.fx, self.fy, *_ = surface.jet(start.x_m, start.y_m)
         self.right_rad_s = self.left_rad_s = 0.0
         self._right_set = self._left_set = self._right_0 = self._left_0 = 0.0
-        self.forward_m = self.turn_rad = 0.0
+        self.right_angle_rad = self.left_angle_rad = self._right_angle_0 = self._left_angle_0 = 0.0
+        self.right_scale = self.left_scale = 1.0
+        self.shake_rate_rad_s = self.shake_acceleration_m_s2 = 0.0
+        self.forward_m = self.left_m = self.turn_rad = 0.0
         self.is_moving = False
         self._decay_dt_s = self._decay = 0.0
         self._turn_axes()
@@ -114,6 +128,11 @@ class Plant:
     def pose(self) -> DeckPose:
         """Pose of the body."""
         return DeckPose(self.x_m, self.y_m, self.heading_rad)
+
+    @property
+    def are_wheels_still(self) -> bool:
+        """The wheels did not turn in the last step."""
+        return self._right_0 == self._left_0 == self._right_set == self._left_set == 0.0
 
     def step(self, t_s: float, dt_s: float, right_set_rad_s: float, left_set_rad_s: float) -> None:
         """Advance by ``dt_s`` with constant wheel set points.
@@ -128,31 +147,37 @@ class Plant:
             right_set_rad_s: set point of the right wheel.
             left_set_rad_s: set point of the left wheel.
         """
-        right, left = self.right_rad_s, self.left_rad_s
-        self._right_0, self._left_0 = right, left
+        self._right_0, self._left_0 = self.right_rad_s, self.left_rad_s
         self._right_set, self._left_set = right_set_rad_s, left_set_rad_s
-        if right == left == right_set_rad_s == left_set_rad_s == 0.0 and not self._disturbances:
-            self.is_moving = False
-            self.forward_m = self.turn_rad = 0.0
-            return
+        self._right_angle_0, self._left_angle_0 = self.right_angle_rad, self.left_angle_rad
+        forward = sideways = turn = 0.0
+        if not self.are_wheels_still:
+            forward, turn = self._turn_wheels(dt_s)
+        for disturbance in self._disturbances:
+            forward, sideways, turn = disturbance.displace(self, t_s, dt_s, forward, sideways, turn)
+        self.forward_m, self.left_m, self.turn_rad = forward, sideways, turn
+        self.is_moving = not forward == sideways == turn == 0.0
+        if self.is_moving:
+            self._move(forward, sideways, turn)
+
+    def _turn_wheels(self, dt_s: float) -> tuple[float, float]:
+        """Turn the wheels for a step; what the body would move by them alone: forward (m), turn (rad)."""
         if dt_s != self._decay_dt_s:
             self._decay_dt_s, self._decay = dt_s, exp(-dt_s / self.lag_s)
+        right, left, right_set, left_set = self._right_0, self._left_0, self._right_set, self._left_set
         lagging_s = self.lag_s * (1.0 - self._decay)
-        right_rad = right_set_rad_s * dt_s + (right - right_set_rad_s) * lagging_s
-        left_rad = left_set_rad_s * dt_s + (left - left_set_rad_s) * lagging_s
-        self.right_rad_s = _settled(right_set_rad_s, right_set_rad_s + (right - right_set_rad_s) * self._decay)
-        self.left_rad_s = _settled(left_set_rad_s, left_set_rad_s + (left - left_set_rad_s) * self._decay)
-        forward = 0.5 * self._radius_m * (right_rad + left_rad)
-        turn = 0.5 * self._radius_m * (right_rad - left_rad) / self._half_base_m
-        sideways = 0.0
-        for disturbance in self._disturbances:
-            forward, sideways, turn = disturbance.displace(t_s, dt_s, forward, sideways, turn)
-        self._move(forward, sideways, turn)
+        right_rad = right_set * dt_s + (right - right_set) * lagging_s
+        left_rad = left_set * dt_s + (left - left_set) * lagging_s
+        self.right_rad_s = _settled(right_set, right_set + (right - right_set) * self._decay)
+        self.left_rad_s = _settled(left_set, left_set + (left - left_set) * self._decay)
+        self.right_angle_rad += right_rad
+        self.left_angle_rad += left_rad
+        right_rad, left_rad = self.right_scale * right_rad, self.left_scale * left_rad
+        half_radius_m = 0.5 * self._radius_m
+        return half_radius_m * (right_rad + left_rad), half_radius_m * (right_rad - left_rad) / self._half_base_m
 
     def _move(self, forward_m: float, left_m: float, turn_rad: float) -> None:
         """Displace the body by one midpoint step."""
-        self.is_moving = True
-        self.forward_m, self.turn_rad = forward_m, turn_rad
         # Where the middle of the step will be, from the axes at its start: good to second order, which is all a
         # derivative of the surface there needs.
         x, y = self.x_m, self.y_m
@@ -174,11 +199,11 @@ class Plant:
         self.heading_rad += turn_rad - fy * (fxx * dx + fxy * dy) / (s2 * w)
         ex, ey = self.x_m - mx, self.y_m - my
         self.z_m = f + fx * ex + fy * ey + 0.5 * (fxx * ex * ex + fyy * ey * ey) + fxy * ex * ey
-        self._fx, self._fy = fx + fxx * ex + fxy * ey, fy + fxy * ex + fyy * ey
+        self.fx, self.fy = fx + fxx * ex + fxy * ey, fy + fxy * ex + fyy * ey
         self._turn_axes()
 
     def _turn_axes(self) -> None:
-        fx, fy = self._fx, self._fy
+        fx, fy = self.fx, self.fy
         s2 = 1.0 + fx * fx
         s = sqrt(s2)
         w = sqrt(s2 + fy * fy)
@@ -187,26 +212,35 @@ class Plant:
         self.hx, self.hy = c / s + d * e2x, d * e2y
         self.lx, self.ly = c * e2x - d / s, c * e2y
 
-    def rates_at(self, decays: Sequence[float]) -> list[tuple[float, float]]:
-        """(right, left) wheel rates within the last step, rad/s, at the instants with these ``exp(-tau/T)``."""
+    @property
+    def servo(self) -> tuple[float, float, float, float]:
+        """(right set point, right lag, left set point, left lag): a rate is ``set point + lag exp(-tau/T)``, rad/s."""
         right_set, left_set = self._right_set, self._left_set
-        right, left = self._right_0 - right_set, self._left_0 - left_set
-        return [(right_set + right * e, left_set + left * e) for e in decays]
+        return right_set, self._right_0 - right_set, left_set, self._left_0 - left_set
+
+    @property
+    def start_angles_rad(self) -> tuple[float, float]:
+        """(right, left) wheel angles at the start of the last step, since boot."""
+        return self._right_angle_0, self._left_angle_0
 
     def acceleration_at(self, decay: float) -> float:
-        """Acceleration dv/dt along robot x within the last step, where ``exp(-tau/T)`` is ``decay``, m/s^2."""
-        lag = self._right_set - self._right_0 + self._left_set - self._left_0
-        return 0.5 * self._radius_m * lag * decay / self.lag_s
+        """Acceleration along robot x within the last step, where ``exp(-tau/T)`` is ``decay``, m/s^2."""
+        r, q = self.right_scale, self.left_scale
+        lag = r * self._right_set - r * self._right_0 + q * self._left_set - q * self._left_0
+        return 0.5 * self._radius_m * lag * decay / self.lag_s + self.shake_acceleration_m_s2
 
     def turn_rate_at(self, decay: float) -> float:
         """Angular rate about robot z within the last step, rad/s."""
-        right_set, left_set = self._right_set, self._left_set
-        difference = right_set - left_set + (self._right_0 - right_set - self._left_0 + left_set) * decay
-        return 0.5 * self._radius_m * difference / self._half_base_m
+        r, q = self.right_scale, self.left_scale
+        right_set, left_set = r * self._right_set, q * self._left_set
+        difference = right_set - left_set + (r * self._right_0 - right_set - q * self._left_0 + left_set) * decay
+        return 0.5 * self._radius_m * difference / self._half_base_m + self.shake_rate_rad_s
 
     def stop_dead(self) -> None:
         """The wheels stop at once and for good (the robot fell)."""
         self.right_rad_s = self.left_rad_s = self._right_0 = self._left_0 = self._right_set = self._left_set = 0.0
+        self._right_angle_0, self._left_angle_0 = self.right_angle_rad, self.left_angle_rad
+        self.shake_rate_rad_s = self.shake_acceleration_m_s2 = 0.0
 
 
 def _settled(set_point_rad_s: float, rate_rad_s: float) -> float:

@@ -11,6 +11,9 @@ Choices the interface leaves open:
 * The silence after which a role may be taken over is measured on the robot's clock: in lockstep, where a client may
   hold its answer back for as long as it likes, nobody is silent while simulated time stands still.
 * Sequence numbers start anew with each session.
+* In lockstep a delay of the sensors keeps its length: each answer to the newest frame delivered drives one frame, and
+  delivers the next. What a client knows is old by the delay, as it is on a wall clock. The frames before the first
+  delivery run when the controller joins, held. Delays within the robot stand in for those of the whole link.
 """
 
 from collections import Counter
@@ -172,10 +175,10 @@ class RobotServer:
             return
         del self._holders[role]
         if role == "controller":
-            self.robot.rules.lose_controller()
+            self.robot.lose_controller()
             self._is_drive_acked = False
         else:
-            self.robot.rules.lose_monitor()
+            self.robot.lose_monitor()
             self._is_permit_acked = False
         self._note(f"{role} lost: wheels held")
 
@@ -201,7 +204,7 @@ class RobotServer:
         if now_s - self._frame_wall_s > STALL_S:
             self._is_stall_noted = True
             missing = "permit" if self._is_drive_acked else "drive"
-            self._note(f"stall: frame {self.robot.seq} waits for its {missing}")
+            self._note(f"stall: frame {self.robot.delivered_seq} waits for its {missing}")
 
     # -- roles ----------------------------------------------------------------------------------------------------
 
@@ -231,27 +234,33 @@ class RobotServer:
     def _begin(self, session: Session, role: Role) -> None:
         robot = self.robot
         if role == "controller":
-            robot.rules.join_controller()
-            robot.fans.join_controller()
+            robot.join_controller()
             if self._is_lockstep:
+                self._run_to_first_delivery()
                 self._send_frame()
         else:
-            robot.rules.join_monitor()
+            robot.join_monitor()
             if self._is_lockstep and "controller" in self._holders:
-                session.wire.write(robot.line)
+                session.wire.write(robot.delivered_line)
+
+    def _run_to_first_delivery(self) -> None:
+        """Nobody can answer what is still on its way: the frames until the first arrives run by themselves, held."""
+        while self.robot.delivered_seq < 0:
+            self.robot.advance()
+            self._on_frame()
 
     def command(self, session: Session, role: Role, message: FromClient, now_s: float) -> bool:
         """A message of a session that has a role; false when it is not for this role."""
         robot_s = self._robot_time_s(now_s)
         robot = self.robot
         if role == "controller" and isinstance(message, Drive):
-            taken = robot.rules.drive(message.seq, message.wr, message.wl, robot_s)
-            self._is_drive_acked |= taken and message.ack == robot.seq
+            taken = robot.drive(message.seq, message.wr, message.wl, robot_s)
+            self._is_drive_acked |= taken and message.ack == robot.delivered_seq
         elif role == "monitor" and isinstance(message, Permit):
-            taken = robot.rules.permit(message.seq, message.forward, message.reverse, message.turn, robot_s)
-            self._is_permit_acked |= taken and message.ack == robot.seq
+            taken = robot.permit(message.seq, message.forward, message.reverse, message.turn, robot_s)
+            self._is_permit_acked |= taken and message.ack == robot.delivered_seq
         elif role == "controller" and isinstance(message, Fans):
-            taken = robot.fans.command(message.seq, *message.duty)
+            taken = robot.command_fans(message.seq, *message.duty)
         else:
             return False
         session.heard_s = robot_s
@@ -288,7 +297,9 @@ class RobotServer:
         self._send_frame()
 
     def _send_frame(self) -> None:
-        line = self.robot.line
+        line = self.robot.delivered_line
+        if not line:
+            return
         for role in ("controller", "monitor"):  # the controller has more to do
             session = self._holders.get(role)
             if session is not None:

@@ -1,8 +1,9 @@
 """Pure. The truth of one run: where the robot really is, how the panels really lie, and whether it fell."""
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from math import hypot, inf
+from typing import Protocol
 
 import numpy as np
 
@@ -11,7 +12,8 @@ from ccatp.config.models import Config
 from ccatp.mirror.alignment import PanelMisalignment, misaligned_puck_world
 from ccatp.mirror.mirror import Mirror
 from ccatp.samples import PanelId, PanelPose, Vector3
-from ccatp.sim.plant import Plant
+from ccatp.sim.disturbances import Creep, Vibration, WheelSlip, draw_wheels
+from ccatp.sim.plant import Disturbance, Plant
 
 # seq, t, x, y, psi, X, Y, Z (surface point, deck), clearance of the worst edge sensor, fallen, sensors beyond the rim
 TruthRow = tuple[int, float, float, float, float, float, float, float, float, int, int]
@@ -21,19 +23,28 @@ FAR_CLEARANCE_M = 1.0
 """Stands for the clearance while the robot's origin is more than ``NEAR_RIM_M`` from the rim."""
 
 
+class Sensing(Protocol):
+    """Whoever knows where the edge sensors are."""
+
+    @property
+    def places(self) -> Sequence[tuple[float, float]]:
+        """Deck (x, y) of each now, m."""
+
+
 class World:
     """Robot on mirror.
 
     Attributes:
         mirror: the ideal mirror.
         plant: body and wheels.
+        wheels: true measures of the robot.
         misalignments: of each panel.
         start_panel_pose, start_pose: where the robot really stands at boot.
         is_fallen: it fell, for good.
     """
 
     def __init__(self, cfg: Config, mirror: Mirror, rng: np.random.Generator, window_frames: int) -> None:
-        """Draw the start errors and the misalignments.
+        """Draw the start errors, the misalignments and what disturbs the robot.
 
         Args:
             cfg: robot, world and truth sections.
@@ -42,18 +53,31 @@ class World:
             window_frames: length of the window of ``moved_m``, in frames.
         """
         start_rng, truth_rng = rng.spawn(2)
+        wheels_rng, slip_rng, creep_rng, vibration_rng = rng.spawn(4)
         self.mirror = mirror
         self.misalignments = draw_misalignments(mirror.panels, cfg, truth_rng)
         self.start_panel_pose = draw_start(mirror.base_panel_pose, cfg, start_rng)
         self.start_pose = mirror.deck_pose(self.start_panel_pose)
-        robot, sim = cfg.robot, cfg.sim.robot
+        robot, sim, world = cfg.robot, cfg.sim.robot, cfg.world
+        self.wheels = wheels = draw_wheels(robot, sim.wheel_lag_s, world, wheels_rng)
+        has_slip = world.slip_max > 0.0 or world.slip_walk_sigma > 0.0
+        self._slip = WheelSlip(world, slip_rng) if has_slip else None
+        has_vibration = world.vibration_rate_rad_s or world.vibration_speed_m_s or world.vibration_acceleration_m_s2
+        self._vibration = Vibration(world, 1.0 / sim.frame_hz, vibration_rng) if has_vibration else None
+        disturbances: list[Disturbance] = []
+        if world.creep_fraction > 0.0:
+            disturbances.append(Creep(mirror, world, creep_rng))
+        if self._vibration is not None:
+            disturbances.append(self._vibration)
         self.plant = Plant(
             mirror.surface,
             self.start_pose,
-            wheel_radius_m=robot.wheel_radius_m,
-            wheel_base_m=robot.wheel_base_m,
-            wheel_lag_s=sim.wheel_lag_s,
+            wheel_radius_m=wheels.radius_m,
+            wheel_base_m=wheels.base_m,
+            wheel_lag_s=wheels.lag_s,
+            disturbances=disturbances,
         )
+        self.plant.right_scale, self.plant.left_scale = wheels.right_scale, wheels.left_scale
         self._puck_height_m = robot.puck_height_m
         self._thrust_floor, self._fall_thrust_s = sim.fan_floor, sim.fall_thrust_s
         self._weak_s = 0.0
@@ -62,6 +86,8 @@ class World:
         self._places.append((self.plant.x_m, self.plant.y_m))
         # The origin's distance to the rim is known to be at least this; it shrinks with the distance driven.
         self._rim_bound_m = -inf
+        self._sensors: Sensing | None = None
+        self._has_looked = False
         self._clearance_m, self._off_mask = FAR_CLEARANCE_M, 0
 
     def step(self, t_s: float, dt_s: float, right_rad_s: float, left_rad_s: float, thrust: float) -> None:
@@ -81,6 +107,10 @@ class World:
         if self.is_fallen:
             plant.is_moving = False
             return
+        if self._slip is not None:
+            self._let_slip(t_s, dt_s, right_rad_s != 0.0 or left_rad_s != 0.0)
+        if self._vibration is not None:
+            self._vibration.is_thrusting = thrust > 0.0
         plant.step(t_s, dt_s, right_rad_s, left_rad_s)
         self._places.append((plant.x_m, plant.y_m))
         if self.mirror.overhang:
@@ -89,35 +119,52 @@ class World:
             if self._weak_s >= self._fall_thrust_s - 0.5 * dt_s:
                 self._fall()
         if plant.is_moving:
-            self._rim_bound_m -= abs(plant.forward_m)
-            if self._rim_bound_m < NEAR_RIM_M:
-                self._rim_bound_m = self.mirror.rim.signed_distance_m(plant.x_m, plant.y_m)
+            self._rim_bound_m -= abs(plant.forward_m) + abs(plant.left_m)
+            if self._rim_bound_m < 0.0:
+                self._measure_rim()
                 if self._rim_bound_m < 0.0:
                     self._fall()
+
+    def _let_slip(self, t_s: float, dt_s: float, is_ordered: bool) -> None:
+        plant, slip = self.plant, self._slip
+        if slip is None or not (is_ordered or plant.right_rad_s or plant.left_rad_s):
+            return
+        slip.step(t_s, dt_s, is_ordered)
+        plant.right_scale = self.wheels.right_scale * (1.0 - slip.right)
+        plant.left_scale = self.wheels.left_scale * (1.0 - slip.left)
 
     def _fall(self) -> None:
         self.is_fallen = True
         self.plant.stop_dead()
 
-    def look_at_rim(self, sensors: Iterable[tuple[float, float]]) -> None:
-        """Take note of the edge sensors' places (deck, m) for the truth rows."""
-        if self._rim_bound_m == -inf:
-            self._rim_bound_m = self.mirror.rim.signed_distance_m(self.plant.x_m, self.plant.y_m)
-        elif not self.plant.is_moving:
-            return
-        self._clearance_m, self._off_mask = FAR_CLEARANCE_M, 0
-        if self._rim_bound_m < NEAR_RIM_M:
-            for k, (x, y) in enumerate(sensors):
-                clearance_m = self.mirror.rim.signed_distance_m(x, y)
-                self._clearance_m = min(self._clearance_m, clearance_m)
-                self._off_mask |= (clearance_m < 0.0) << k
+    def look_at_rim(self, sensors: Sensing) -> None:
+        """Take note of who knows the edge sensors' places, for the truth rows."""
+        if self.plant.is_moving or self._sensors is None:
+            self._sensors, self._has_looked = sensors, False
 
     def truth_row(self, seq: int, t_s: float) -> TruthRow:
         """The truth at a frame."""
+        if not self._has_looked:
+            self._look()
         p = self.plant
         fallen = int(self.is_fallen)
         x, y = p.x_m, p.y_m
         return seq, t_s, x, y, wrap_pi(p.heading_rad), x, y, p.z_m, self._clearance_m, fallen, self._off_mask
+
+    def _look(self) -> None:
+        """Clearance and mask of the sensors: only when somebody asks, and only near the rim."""
+        self._has_looked = True
+        self._clearance_m, self._off_mask = FAR_CLEARANCE_M, 0
+        if self._rim_bound_m < NEAR_RIM_M:
+            self._measure_rim()
+        if self._rim_bound_m < NEAR_RIM_M:
+            for k, (x, y) in enumerate(self._sensors.places if self._sensors else ()):
+                clearance_m = self.mirror.rim.signed_distance_m(x, y)
+                self._clearance_m = min(self._clearance_m, clearance_m)
+                self._off_mask |= (clearance_m < 0.0) << k
+
+    def _measure_rim(self) -> None:
+        self._rim_bound_m = self.mirror.rim.signed_distance_m(self.plant.x_m, self.plant.y_m)
 
     def puck_world(self) -> Vector3:
         """Centre of the puck on the panel as it really lies, world frame, m."""

@@ -59,8 +59,8 @@ class Homing:
 
     def _dock(self, motion: Motion, stop: Stop, is_quiet: bool) -> Twist:
         if stop.heading_rad is not None and self._tracker.phase is Phase.TURN:
-            remaining = difference(stop.heading_rad, motion.deck.heading_rad)
-            return self._tracker.step_turn(remaining, motion.dt_s)
+            remaining = difference(stop.heading_rad, motion.deck.heading_rad + motion.lead_rad)
+            return self._tracker.step_turn(remaining, motion.dt_s, motion.steered.omega_rad_s)
         if is_quiet:
             self.journey.advance()
         return STILL

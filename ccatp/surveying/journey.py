@@ -4,15 +4,22 @@ from collections.abc import Callable, Sequence
 from math import hypot
 from typing import NamedTuple
 
+from ccatp.control.prediction import Predicted
 from ccatp.control.tracker import LegTracker, Phase
 from ccatp.mirror.mirror import Mirror
 from ccatp.samples import DeckPose, PanelId, PanelPose, Stop, Twist
+from ccatp.surveying.correction import Aim
 
 STILL = Twist(0.0, 0.0)
 
 
 class Motion(NamedTuple):
-    """What the localizer says about the present frame."""
+    """What the localizer says about the present frame.
+
+    ``creep`` is the drift (dx, dy) per metre of travel in the plane of ``pose``. ``ahead`` is where the robot will be,
+    in the same plane, when the twist decided now takes effect; ``None`` where that is at once. Whether it has arrived
+    and stands still is judged by ``pose``; it is steered by ``ahead``.
+    """
 
     t_s: float
     dt_s: float
@@ -20,6 +27,21 @@ class Motion(NamedTuple):
     deck_of: Callable[[PanelPose], DeckPose]  # hardly ever asked for, and not cheap
     speed_m_s: float
     rate_rad_s: float
+    creep: tuple[float, float] = (0.0, 0.0)
+    ahead: Predicted | None = None
+
+    @property
+    def steered(self) -> Predicted:
+        """The state that the next twist will meet."""
+        if self.ahead is not None:
+            return self.ahead
+        pose = self.pose
+        return Predicted((pose.x_m, pose.y_m, pose.heading_rad), self.speed_m_s, self.rate_rad_s)
+
+    @property
+    def lead_rad(self) -> float:
+        """How far the robot will have turned until then."""
+        return 0.0 if self.ahead is None else self.ahead.pose[2] - self.pose.heading_rad
 
     @property
     def deck(self) -> DeckPose:
@@ -45,6 +67,7 @@ class Journey:
         self._is_begun = False
         self._deadline_s = 0.0
         self._target: tuple[PanelId, Stop, tuple[float, float]] | None = None
+        self._aim: tuple[PanelId, Aim] | None = None
 
     @property
     def current(self) -> Stop | None:
@@ -59,22 +82,29 @@ class Journey:
     def advance(self) -> None:
         """The current stop is done with."""
         self.index += 1
-        self._is_begun = False
+        self._is_begun, self._aim = False, None
 
     def interrupt(self) -> None:
         """The robot stopped on the way: the leg begins anew, from wherever it is then."""
-        self._is_begun = False
+        self._is_begun, self._aim = False, None
+
+    def correct(self, panel: PanelId, aim: Aim) -> None:
+        """The leg to the current stop is a correction, as long as the robot stays on the panel."""
+        self._is_begun, self._aim = False, (panel, aim)
 
     def follow(self, motion: Motion, stop: Stop) -> Twist:
         """One frame of the leg to ``stop``: the twist until the next frame."""
-        pose = (motion.pose.x_m, motion.pose.y_m, motion.pose.heading_rad)
-        target = self._target_in(motion.pose.panel, stop)
+        state = motion.steered
+        target, reverse = self.target_in(motion.pose.panel, stop), stop.reverse
+        if self._aim is not None and self._aim[0] == motion.pose.panel:
+            x, y, reverse, _ = self._aim[1]
+            target = x, y
         if not self._is_begun:
             self._is_begun = True
-            self._tracker.begin(pose, target, stop.reverse)
+            self._tracker.begin(state.pose, target, reverse, motion.creep)
             self._set_deadline(motion.t_s)
         before = self._tracker.phase
-        twist = self._tracker.step(pose, target, motion.dt_s)
+        twist = self._tracker.step(state.pose, target, motion.dt_s, Twist(state.v_m_s, state.omega_rad_s), motion.creep)
         if self._tracker.phase is not before and self._tracker.phase is not Phase.DONE:
             self._set_deadline(motion.t_s)
         return twist
@@ -88,13 +118,14 @@ class Journey:
         stop = self.current
         if stop is None:
             return 0.0
-        x, y = self._target_in(pose.panel, stop)
+        x, y = self.target_in(pose.panel, stop)
         return hypot(x - pose.x_m, y - pose.y_m)
 
     def _set_deadline(self, t_s: float) -> None:
         self._deadline_s = t_s + 5.0 + self._timeout_factor * self._tracker.planned_s
 
-    def _target_in(self, panel: PanelId, stop: Stop) -> tuple[float, float]:
+    def target_in(self, panel: PanelId, stop: Stop) -> tuple[float, float]:
+        """The stop in the frame of a panel, (x, y), m."""
         cached = self._target
         if cached is not None and cached[0] == panel and cached[1] is stop:
             return cached[2]

@@ -7,6 +7,7 @@ from ccatp.angles import difference
 from ccatp.config.models import MissionConfig
 from ccatp.control.tracker import LegTracker, Phase
 from ccatp.samples import EventCode, PanelPose, Twist, Verdict
+from ccatp.surveying.journey import Motion
 
 STILL = Twist(0.0, 0.0)
 # A turn that met the rim is undone by at most this; more would sweep the next corner.
@@ -59,13 +60,14 @@ class Retreat:
         else:
             self.step_at = Step.STUCK
 
-    def step(self, pose: PanelPose, verdict: Verdict, dt_s: float) -> Twist:
-        """The twist for the next ``dt_s``; ``step_at`` tells what it is at."""
+    def step(self, motion: Motion, verdict: Verdict) -> Twist:
+        """The twist until the next frame; ``step_at`` tells what it is at."""
+        pose = motion.pose
         if pose.panel == self._last.panel:
             self._travel_m += hypot(pose.x_m - self._last.x_m, pose.y_m - self._last.y_m)
             self._turned_rad += abs(difference(pose.heading_rad, self._last.heading_rad))
         self._last = pose
-        self._time_s += dt_s
+        self._time_s += motion.dt_s
         if self._time_s > TIME_LIMIT_S and self.step_at is not Step.OVER:
             self.step_at = Step.STUCK
         if not (verdict.forward or verdict.reverse or verdict.turn):
@@ -76,7 +78,7 @@ class Retreat:
         if self.step_at is Step.UNTURN:
             return self._undo_turn(is_clear, verdict)
         if self.step_at is Step.TURN_AWAY:
-            return self._turn_away(pose, is_clear, dt_s)
+            return self._turn_away(motion, is_clear)
         return STILL
 
     def _back(self, is_clear: bool, verdict: Verdict) -> Twist:
@@ -97,14 +99,16 @@ class Retreat:
             return STILL
         return Twist(0.0, self._unturn * self._cfg.turn_away_rad)
 
-    def _turn_away(self, pose: PanelPose, is_clear: bool, dt_s: float) -> Twist:
+    def _turn_away(self, motion: Motion, is_clear: bool) -> Twist:
         if not is_clear:  # the turn sweeps a corner over the rim: stay with what has been gained
             self.step_at = Step.OVER
             return STILL
         if self._away_rad is None:
-            self._away_rad = pose.heading_rad + self._away
+            self._away_rad = motion.pose.heading_rad + self._away
             self._tracker.begin_turn(self._away)
-        twist = self._tracker.step_turn(difference(self._away_rad, pose.heading_rad), dt_s)
+        state = motion.steered
+        remaining = difference(self._away_rad, state.pose[2])
+        twist = self._tracker.step_turn(remaining, motion.dt_s, state.omega_rad_s)
         if self._tracker.phase is Phase.DONE:
             self.step_at = Step.OVER
         return twist

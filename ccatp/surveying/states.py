@@ -49,7 +49,12 @@ _SURVEYING = _ANYWHERE | {Event.EDGE: State.BACKING_OFF, Event.GO_HOME: State.RE
 TRANSITIONS = MappingProxyType(
     {
         State.IDLE: _ANYWHERE
-        | {Event.GO_ON: State.TURNING, Event.GO_HOME: State.RETURNING, Event.EDGE: State.BACKING_OFF},
+        | {
+            Event.GO_ON: State.TURNING,
+            Event.GO_HOME: State.RETURNING,
+            Event.EDGE: State.BACKING_OFF,
+            Event.FIND: State.SETTLING,
+        },
         State.TURNING: _SURVEYING | {Event.TURNED: State.DRIVING, Event.ARRIVED: State.SETTLING},
         State.DRIVING: _SURVEYING | {Event.REALIGN: State.TURNING, Event.ARRIVED: State.SETTLING},
         State.SETTLING: _SURVEYING | {Event.SETTLED: State.MEASURING},

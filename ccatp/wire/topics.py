@@ -81,15 +81,20 @@ class Arrival(Message):
 
 
 class FixMessage(Message):
-    """A committed fix of a measurement point, world frame."""
+    """A fix handed to the localizer after frame ``seq``, world frame; without a point it only finds the robot."""
 
-    point: tuple[int, int, int]
+    point: tuple[int, int, int] | None
+    is_fused: bool  # or doubted, and measured again
     position_m: tuple[float, float, float]
     covariance_m2: list[float]
     dop: float
     residual_rms_m: float
     channels: list[int]
     jump_mm: float
+
+
+class Rest(Message):
+    """The mission takes the robot to be at rest from frame ``seq`` on."""
 
 
 class DangerEvent(Message):
@@ -157,6 +162,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("track", Track, "main", 1.0, 0.0, True),
     Topic("sensors", SensorLines, "main", 1.0, 0.0, True),
     Topic("arrival", Arrival, "main", 0.0, 0.0, True),
+    Topic("rest", Rest, "main", 0.0, 0.0, True),
     Topic("fix", FixMessage, "main", 0.0, 0.0, True),
     Topic("danger_event", DangerEvent, "danger", 0.0, 0.0, True),
     Topic("log", Log, "main", 0.0, 0.0, True),

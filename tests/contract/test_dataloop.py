@@ -486,6 +486,38 @@ async def test_the_same_seed_gives_the_same_bytes(config: Config) -> None:
     assert await _drive_through(config, 2, 400) != first
 
 
+@pytest.mark.parametrize("world", ["hard", "extreme"])
+async def test_a_disturbed_world_in_lockstep(world: str) -> None:
+    from ccatp.config.loader import load_config
+
+    cfg = load_config(overrides={"run.world": world})
+    first = await _drive_through(cfg, 1, 300)
+    assert [json.loads(line)["seq"] for line in first] == list(range(301))
+    assert await _drive_through(cfg, 1, 300) == first
+    assert await _drive_through(cfg, 2, 300) != first
+
+
+async def test_a_disturbed_world_on_the_wall_clock() -> None:
+    from ccatp.config.loader import load_config
+
+    cfg = load_config(overrides={"run.world": "extreme"})
+    delay = round(cfg.world.sensors_delay_s * cfg.sim.robot.frame_hz)
+    async with running(cfg, lockstep=False) as rig:
+        controller, monitor = await rig.peer(JOIN), await rig.peer(JOIN_MONITOR)
+        await controller.expect("joined")
+        await monitor.expect("joined")
+        ages = []
+        for k in range(60):
+            frame = await controller.expect("sensors")
+            assert rig.loop.robot.seq - frame["seq"] >= delay
+            controller.drive(k, frame["seq"])
+            monitor.permit(k, frame["seq"])
+            if not frame["cmd"]["held"]:
+                ages.append(frame["cmd"]["age"])
+        assert ages
+        assert min(ages) > cfg.world.commands_delay_s  # at least the delay, and some of the frame that was driven
+
+
 # -- truth ------------------------------------------------------------------------------------------------------------
 
 

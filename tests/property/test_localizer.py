@@ -12,8 +12,8 @@ from ccatp.angles import difference
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
 from ccatp.filters import FILTERS
+from ccatp.localization.four_state import FourStateLocalizer as Localizer
 from ccatp.localization.odometry import arc_step
-from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.samples import EdgeSample, ImuSample, PanelId, PanelPose, WheelSample
 

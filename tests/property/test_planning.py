@@ -15,8 +15,8 @@ from ccatp.config.loader import load_config
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.planning.bound import path_time
-from ccatp.planning.route import plan_route
-from ccatp.planning.traversal import thesis_order
+from ccatp.planning.route import plan_rejoin, plan_route
+from ccatp.planning.traversal import ORDERS, thesis_order
 from ccatp.planning.way_home import plan_way_home
 from ccatp.samples import DeckPose, Stop, StopKind
 
@@ -27,6 +27,7 @@ SWEEP_M = 1e-5
 
 FloatArray = NDArray[np.float64]
 mirror_names = st.sampled_from(NAMES)
+order_names = st.sampled_from(sorted(ORDERS))
 
 
 @cache
@@ -90,13 +91,14 @@ def least_clearance(mirror: Mirror, start: DeckPose, stops: Sequence[Stop]) -> f
     return min(mirror.rim.segment_clearance_m(*a, *b) for a, b in pairwise(ends))
 
 
-@given(mirror_names, st.integers(0, 120))
-def test_every_point_exactly_once(name: str, panels: int) -> None:
+@settings(deadline=None)
+@given(mirror_names, order_names, st.integers(0, 120))
+def test_every_point_exactly_once(name: str, order: str, panels: int) -> None:
     _, mirror = load(name)
-    points = thesis_order(mirror, panels)
+    points = ORDERS[order](mirror, panels)
     whole = thesis_order(mirror)
     assert len(set(points)) == len(points)
-    assert points == whole[: 9 * panels if panels else None]
+    assert sorted(points) == sorted(whole[: 9 * panels if panels else None])
     assert set(whole) == {point for panel in mirror.panels for point in mirror.point_ids(panel)}
 
 
@@ -105,10 +107,11 @@ def check_route(cfg: Config, mirror: Mirror, stops: Sequence[Stop]) -> None:
     assert worst_sensor(cfg, mirror, drive(mirror, mirror.base_pose, stops)) >= cfg.mission.turn_clearance_m - SWEEP_M
 
 
+@pytest.mark.parametrize("order", sorted(ORDERS))
 @pytest.mark.parametrize("name", NAMES)
-def test_whole_survey_stays_on_the_mirror(name: str) -> None:
+def test_whole_survey_stays_on_the_mirror(name: str, order: str) -> None:
     cfg, mirror = load(name)
-    points = thesis_order(mirror)
+    points = ORDERS[order](mirror, 0)
     route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose)
     check_route(cfg, mirror, route.stops)
     measured = [stop for stop in route.stops if stop.kind is StopKind.MEASURE]
@@ -117,17 +120,34 @@ def test_whole_survey_stays_on_the_mirror(name: str) -> None:
     assert all(stop.kind is StopKind.VIA and stop.point is None for stop in route.stops if stop not in measured)
 
 
-@settings(max_examples=15, deadline=None)
-@given(mirror_names, st.integers(1, 40), st.integers(0, 2**32), st.floats(0.0, 1.0))
-def test_any_rest_of_a_survey_stays_on_the_mirror(name: str, panels: int, seed: int, part: float) -> None:
+@settings(max_examples=30, deadline=None)
+@given(mirror_names, order_names, st.integers(1, 90), st.integers(0, 2**32), st.floats(0.0, 1.0))
+def test_any_rest_of_a_survey_stays_on_the_mirror(name: str, order: str, panels: int, seed: int, part: float) -> None:
     cfg, mirror = load(name)
-    points = thesis_order(mirror, panels)
+    points = ORDERS[order](mirror, panels)
     is_done = np.random.default_rng(seed).random(len(points)) < part
     skip = {point for point, done in zip(points, is_done, strict=True) if done}
     route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose, skip=skip)
     assert [stop.point for stop in route.stops if stop.point] == [point for point in points if point not in skip]
     if route.stops:
         check_route(cfg, mirror, route.stops)
+
+
+@settings(max_examples=15, deadline=None)
+@given(mirror_names, order_names, st.data())
+def test_back_to_a_route_from_anywhere_on_it(name: str, order: str, data: st.DataObject) -> None:
+    """Off the route after any of its points, at any heading: the rest is driven safely, each point of it once."""
+    cfg, mirror = load(name)
+    points = ORDERS[order](mirror, 20)
+    route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose)
+    done = data.draw(st.integers(0, len(points) - 1))
+    # Well inside: how it leaves the rim is the way home's affair.
+    inner = [xy for xy in map(mirror.point_on_deck, points) if mirror.rim.signed_distance_m(*xy) > 0.2]
+    start = DeckPose(*data.draw(st.sampled_from(inner)), data.draw(st.floats(-7.0, 7.0)))
+    back = plan_rejoin(mirror, route, cfg.robot, cfg.limits, cfg.mission, start, set(points[:done]))
+    assert [stop.point for stop in back.stops if stop.point] == points[done:]
+    assert least_clearance(mirror, start, back.stops) >= cfg.mission.leg_clearance_m - ROUNDING_M
+    assert worst_sensor(cfg, mirror, drive(mirror, start, back.stops)) >= cfg.mission.turn_clearance_m - SWEEP_M
 
 
 def check_way_home(cfg: Config, mirror: Mirror, start: DeckPose) -> None:
@@ -146,6 +166,18 @@ def check_way_home(cfg: Config, mirror: Mirror, start: DeckPose) -> None:
         start, stops, legs = DeckPose(middle[0], middle[1], 0.0), stops[1:], legs[1:]
     assert least_clearance(mirror, start, stops) >= cfg.mission.leg_clearance_m - ROUNDING_M
     assert worst_sensor(cfg, mirror, legs) >= cfg.mission.turn_clearance_m - SWEEP_M
+
+
+@pytest.mark.parametrize("order", sorted(ORDERS))
+@pytest.mark.parametrize("name", NAMES)
+def test_home_from_the_end_of_a_survey(name: str, order: str) -> None:
+    """As it stands at the last stop, and at the last of the first few panels."""
+    cfg, mirror = load(name)
+    for panels in (0, 1, 2, 8):
+        points = ORDERS[order](mirror, panels)
+        last = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose).stops[-2:]
+        course = atan2(last[1].y_m - last[0].y_m, last[1].x_m - last[0].x_m) + (pi if last[1].reverse else 0.0)
+        check_way_home(cfg, mirror, DeckPose(last[1].x_m, last[1].y_m, course))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -189,10 +221,11 @@ def test_home_from_the_rim(name: str, edge: int, along: float, depth: float, hea
         check_way_home(cfg, mirror, DeckPose(float(x), float(y), heading))
 
 
-@given(mirror_names, st.integers(1, 6))
-def test_stops_on_the_way_cost_time_and_nothing_else(name: str, panels: int) -> None:
+@settings(deadline=None)
+@given(mirror_names, order_names, st.integers(1, 6))
+def test_stops_on_the_way_cost_time_and_nothing_else(name: str, order: str, panels: int) -> None:
     cfg, mirror = load(name)
-    points = thesis_order(mirror, panels)
+    points = ORDERS[order](mirror, panels)
     route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose, measuring_time_s=0.5)
     time_s = path_time(route.stops, mirror.base_pose, cfg.limits, mirror, 0.5)
     assert route.remaining_s(0) == pytest.approx(time_s, abs=1e-6)  # two sums of some hundred terms

@@ -17,10 +17,10 @@ from ccatp.config.models import Config
 from ccatp.filters import FILTERS, FilterDiverged, FilterShapeError, FloatArray, Innovation, KalmanFilter
 from ccatp.localization.crossing import HeadingFix, HeadingGate, heading_from_pair
 from ccatp.localization.fixes import FixRefused
+from ccatp.localization.four_state import FourStateLocalizer as Localizer
 from ccatp.localization.measurements import ConstantAcceleration, MeasurementBuilder
 from ccatp.localization.odometry import Odometer, Place, arc_step
 from ccatp.localization.position_sigma import PositionSigma
-from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.samples import DeckPose, EdgeSample, Fix, ImuSample, PanelId, PanelPose, WheelSample
 

@@ -8,11 +8,13 @@ from math import cos, exp, hypot, sin
 import pytest
 
 from ccatp.config.models import Config
+from ccatp.control.prediction import Predicted
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.mission import Mission, Order
 from ccatp.planning.errors import PlanError
 from ccatp.planning.route import Route
 from ccatp.samples import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Twist, Verdict
+from ccatp.surveying.correction import Corrector
 from ccatp.surveying.journey import Motion
 from ccatp.surveying.states import Event, Outcome, State, next_state
 
@@ -369,16 +371,134 @@ def test_interrupt_is_news_only_once(story: Story) -> None:
     assert not story.mission.interrupt("no frames")
 
 
-def test_a_point_missed_is_approached_again(story: Story) -> None:
+def miss(story: Story, ahead_m: float, left_m: float) -> None:
+    """The fix at the first point shows the robot beside it: the stop lies so far ahead of and left of it."""
     story.auto_fix = False
     story.until(lambda: story.mission.is_awaiting_fix)
+    c, s = cos(story.heading), sin(story.heading)
+    story.x -= c * ahead_m - s * left_m
+    story.y -= s * ahead_m + c * left_m
     story.mission.again()
     assert story.mission.done == []
-    story.until(lambda: story.mission.state is State.MEASURING)
-    assert len(story.plans) == 1
+
+
+def speeds_until_rest(story: Story) -> list[float]:
+    speeds = []
+    story.frame()
+    while not story.orders[-1].at_rest:
+        story.frame()
+        speeds.append(story.v)
+    return speeds
+
+
+def distance_m(story: Story) -> float:
+    return story.mission.survey.distance_m(story.motion().pose)
+
+
+@pytest.mark.parametrize("ahead_m", [0.02, -0.02])
+def test_a_point_missed_along_the_heading_is_approached_straight(story: Story, ahead_m: float) -> None:
+    miss(story, ahead_m, 0.004)
+    heading = story.heading
+    for speed in speeds_until_rest(story):
+        assert speed * ahead_m > -1e-5  # 0.5 mm/s: the end of the feed-forward may overshoot
+    assert story.heading == pytest.approx(heading, abs=1e-6)  # what lies beside is within tolerance
+    assert distance_m(story) == pytest.approx(0.004, abs=3e-4)  # stop tolerance
+    assert (story.plans, story.mission.corrections) == ([], 1)
+
+
+@pytest.mark.parametrize(("ahead_m", "sign"), [(0.01, 1.0), (-0.01, -1.0)])
+def test_a_point_missed_beside_the_heading_is_turned_to_by_the_smaller_angle(
+    story: Story, ahead_m: float, sign: float
+) -> None:
+    miss(story, ahead_m, 0.015)
+    heading = story.heading
+    assert all(speed * sign > -5e-4 for speed in speeds_until_rest(story))  # forward, or in reverse, all the way
+    assert story.heading - heading == pytest.approx(sign * 0.983, abs=0.02)  # atan(15/10), twice the heading tolerance
+    assert distance_m(story) < 5e-4  # stop tolerance, and the heading tolerance over 18 mm
+    assert (story.plans, story.mission.corrections) == ([], 1)
+
+
+def test_a_point_missed_by_far_is_reached_by_a_new_route(story: Story) -> None:
+    miss(story, 0.04, 0.04)
+    story.until(lambda: story.mission.is_awaiting_fix)
+    assert (len(story.plans), story.mission.corrections) == (1, 0)
+    assert distance_m(story) < 5e-4  # stop tolerance
+
+
+def test_a_corrected_point_has_arrived_once_and_the_survey_goes_on(story: Story) -> None:
+    miss(story, 0.02, 0.0)
     story.auto_fix = True
     story.until_state(State.DONE)
+    arrived = [order.arrived for order in story.orders if order.arrived is not None]
+    assert [p.point for p in arrived] == [1, 2, 3]
     assert [p.point for p in story.mission.done] == [1, 2, 3]
+    assert sum(order.at_rest for order in story.orders) == 4
+    assert story.plans == []
+
+
+def test_a_correction_that_is_interrupted_ends_in_a_new_route(story: Story) -> None:
+    miss(story, 0.03, 0.0)
+    story.frame()
+    story.mission.pause("operator")
+    story.frame()
+    story.mission.resume()
+    story.auto_fix = True
+    story.until_state(State.DONE)
+    assert len(story.plans) == 1
+    assert len(story.mission.done) == 3
+
+
+def test_a_miss_that_a_pause_overtakes_ends_in_a_new_route(story: Story) -> None:
+    miss(story, 0.03, 0.0)
+    story.frame(None)
+    story.auto_fix = True
+    story.until_state(State.DONE)
+    assert len(story.plans) == 1
+
+
+def test_after_a_correction_an_unsafe_turn_is_planned_anew(story: Story, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Corrector, "can_go_on", lambda *_: False)
+    miss(story, 0.02, 0.0)
+    story.auto_fix = True
+    story.until_state(State.DONE)
+    assert len(story.plans) == 1  # of the leg after the correction; the one after that is as planned
+    assert len(story.mission.done) == 3
+
+
+def test_the_robot_is_steered_by_where_it_will_be_and_judged_by_where_it_is(story: Story) -> None:
+    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    now = story.motion()
+    x, y, heading = now.steered.pose
+    assert (x, y, heading) == (story.x, story.y, story.heading)
+    aside = Predicted((x - 0.002 * sin(heading), y + 0.002 * cos(heading), heading + 0.05), story.v, story.omega)
+    seen = now._replace(ahead=aside)
+    assert seen.lead_rad == pytest.approx(0.05)
+    assert story.mission.step(seen, FREE).twist.omega_rad_s < -0.1  # it will be left of its line and heading off it
+
+
+def turned_ahead(story: Story, angle_rad: float) -> Motion:
+    now = story.motion()
+    x, y, heading = now.steered.pose
+    return now._replace(ahead=Predicted((x, y, heading + angle_rad), now.speed_m_s, now.rate_rad_s))
+
+
+def test_the_turn_at_base_is_steered_by_where_the_robot_will_be(story: Story) -> None:
+    story.mission.abort("operator")  # the story begins at base, and has only to turn there
+    story.until(lambda: story.omega > 0.5)
+    assert story.mission.state is State.RETURNING
+    rate = story.mission.step(story.motion(), FREE).twist.omega_rad_s
+    ahead = story.mission.step(turned_ahead(story, 0.02), FREE).twist.omega_rad_s
+    assert ahead < rate - 0.05  # proportional gain times 0.02 rad
+
+
+def test_the_turn_away_from_an_edge_is_steered_by_where_the_robot_will_be(story: Story) -> None:
+    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    for _ in range(60):
+        story.frame(FRONT_OFF)
+    story.until(lambda: story.omega > 0.5)
+    rate = story.mission.step(story.motion(), FREE).twist.omega_rad_s
+    ahead = story.mission.step(turned_ahead(story, 0.02), FREE).twist.omega_rad_s
+    assert ahead < rate - 0.05  # proportional gain times 0.02 rad
 
 
 def test_no_way_on_and_no_way_home_are_faults(config: Config, mirror: Mirror) -> None:

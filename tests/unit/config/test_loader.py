@@ -17,7 +17,7 @@ def write(path: Path, text: str) -> Path:
 
 
 @pytest.mark.parametrize("mirror", ["fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2"])
-@pytest.mark.parametrize("world", ["thesis", "thesis-x2"])
+@pytest.mark.parametrize("world", ["thesis", "thesis-x2", "hard", "extreme"])
 def test_every_shipped_mirror_and_world_is_valid(mirror: str, world: str) -> None:
     cfg = load_config(overrides={"run.mirror": mirror, "run.world": world})
     assert (cfg.mirror.name, cfg.world.name) == (mirror, world)
@@ -25,7 +25,23 @@ def test_every_shipped_mirror_and_world_is_valid(mirror: str, world: str) -> Non
 
 def test_the_shipped_names_are_those_of_the_contract() -> None:
     assert available("mirror") == ["fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2"]
-    assert {"thesis", "thesis-x2"} <= set(available("world"))
+    assert available("world") == ["extreme", "hard", "thesis", "thesis-x2"]
+
+
+@pytest.mark.parametrize("world", ["thesis", "thesis-x2"])
+def test_the_worlds_of_the_thesis_have_no_disturbance(world: str) -> None:
+    values = load_config(overrides={"run.world": world}).world.model_dump()
+    noise = {key for key, value in values.items() if value and not key.endswith("_walk_time_s")}
+    assert noise == {
+        "name", "accelerometer_sigma_m_s2", "gyroscope_sigma_rad_s", "encoder_sigma_rad_s",
+        "start_position_sigma_m", "start_heading_sigma_rad",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("world", ["hard", "extreme"])
+def test_the_disturbed_worlds_have_every_disturbance(world: str) -> None:
+    values = load_config(overrides={"run.world": world}).world.model_dump()
+    assert [key for key, value in values.items() if not value] == ["encoder_sigma_rad_s"]  # counts are counted
 
 
 def test_a_file_needs_only_what_differs(tmp_path: Path, config: Config) -> None:

@@ -106,3 +106,34 @@ def test_turn_in_place_ends_within_tolerance(tracker: LegTracker) -> None:
         if tracker.phase is Phase.DONE:
             break
     assert robot.heading == pytest.approx(-1.2, abs=0.01)  # heading tolerance
+
+
+# Carried to the right of +x by what 0.25 rad to the left make up for.
+DRIFT = (0.0, -sin(0.25))
+
+
+def test_against_a_drift_it_points_beside_the_bearing(tracker: LegTracker) -> None:
+    tracker.begin((0.0, 0.0, 0.25), (0.5, 0.0), False, DRIFT)
+    assert tracker.phase is Phase.DRIVE
+
+
+def test_against_a_drift_it_turns_off_the_bearing(tracker: LegTracker) -> None:
+    tracker.begin((0.0, 0.0, 0.0), (0.5, 0.0), False, DRIFT)
+    assert tracker.phase is Phase.TURN
+    assert tracker.step((0.0, 0.0, 0.0), (0.5, 0.0), DT, Twist(0.0, 0.0), DRIFT).omega_rad_s > 0.0
+
+
+def test_driven_against_the_drift_the_wheels_are_faster(tracker: LegTracker) -> None:
+    speeds = []
+    for along in (0.0, -0.05):
+        tracker.begin((0.0, 0.0, 0.0), (0.5, 0.0), False, (along, 0.0))
+        speeds.append(tracker.step((0.0, 0.0, 0.0), (0.5, 0.0), DT, Twist(0.0, 0.0), (along, 0.0)).v_m_s)
+    assert speeds[1] == pytest.approx(speeds[0] / 0.95)
+
+
+def test_steering_damps_a_rate_that_it_did_not_want(tracker: LegTracker, config: Config) -> None:
+    rates = []
+    for omega in (0.0, 0.1):
+        tracker.begin((0.0, 0.0, 0.0), (0.5, 0.0), False)
+        rates.append(tracker.step((0.0, 0.0, 0.0), (0.5, 0.0), DT, Twist(0.0, omega)).omega_rad_s)
+    assert rates[1] - rates[0] == pytest.approx(-0.1 * config.control.gain_sets["shipped"].angular.kd)

@@ -186,3 +186,12 @@ def test_consistency_of_the_normalised_innovation() -> None:
         kf.predict(F, Q)
         nis.append(kf.update(H @ x + np.sqrt(R) * rng.normal(size=2), H, R).nis)
     assert np.mean(nis) == pytest.approx(2.0, abs=0.4)
+
+
+def test_a_state_known_exactly_stays_so_beside_large_ones() -> None:
+    # More rows than states, so that the square root of a singular covariance is taken.
+    kf = KalmanFilter(np.zeros(3), np.array([[1e6, 0.0, 1e3], [0.0, 0.0, 0.0], [1e3, 0.0, 1.0]]))
+    kf.update(np.ones(4), np.array([[1.0, 1, 0], [0, 1, 1], [1, 1, 1], [0, 1, 0]]), np.ones(4))
+    assert kf.mean[1] == 0.0
+    assert not kf.covariance[1].any()
+    assert not kf.covariance[:, 1].any()

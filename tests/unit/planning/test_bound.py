@@ -6,7 +6,15 @@ from typing import Any
 import pytest
 
 from ccatp.control.profile import Profile
-from ccatp.planning.bound import bang_bang_time, leg_lengths, path_length, path_time, stop_times, turn_time
+from ccatp.planning.bound import (
+    STRAIGHT_RAD,
+    bang_bang_time,
+    leg_lengths,
+    path_length,
+    path_time,
+    stop_times,
+    turn_time,
+)
 from ccatp.planning.traversal import thesis_order
 from ccatp.samples import DeckPose, Stop, StopKind
 
@@ -42,8 +50,9 @@ def test_limits_must_be_positive(v: float, a: float) -> None:
 
 def test_small_turns_are_steered_on_the_way(thesis: Any) -> None:
     limits = thesis.cfg.limits
-    assert thesis.cfg.control.straight_tolerance_rad == 0.02  # what the tracker does
-    assert turn_time(0.0199, limits) == turn_time(-0.0199, limits) == 0.0
+    assert thesis.cfg.control.straight_tolerance_rad == STRAIGHT_RAD == 0.05  # what the tracker does
+    assert turn_time(0.0499, limits) == turn_time(-0.0499, limits) == 0.0
+    assert turn_time(0.0501, limits) == pytest.approx(2.0 * sqrt(0.0501 / 2.0))
     assert turn_time(-pi / 2.0, limits) == pytest.approx(pi / 2.0 + 0.5)
     assert turn_time(0.02, limits, straight_rad=0.01) == pytest.approx(2.0 * sqrt(0.01))
 

@@ -6,10 +6,11 @@ from typing import Any
 
 import pytest
 
+from ccatp.assembly import Parts
 from ccatp.config.loader import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.errors import ConfigError
-from ccatp.processes.building import Parts, StoreUnusable, build_parts
+from ccatp.processes.building import StoreUnusable, build_parts
 from ccatp.processes.common import Endpoints, ProcessArgs
 from ccatp.samples import DeckPose, StopKind
 from ccatp.wire.robot import Hello, RobotData

@@ -38,6 +38,11 @@ def drive(plant: Plant, right: float, left: float, steps: int) -> None:
         plant.step(k * DT_S, DT_S, right, left)
 
 
+def rates_at(plant: Plant, decays: list[float]) -> list[tuple[float, float]]:
+    right_set, right_lag, left_set, left_lag = plant.servo
+    return [(right_set + right_lag * e, left_set + left_lag * e) for e in decays]
+
+
 def integrate(mirror: Mirror, start: DeckPose, right: float, left: float, seconds: float) -> DeckPose:
     """Point p and heading h in space: p' = v h, h' = omega n x h + (what keeps h tangent); wheels of first order."""
     surface = mirror.surface
@@ -107,10 +112,10 @@ def test_wheels_are_first_order_within_a_step(mirror: Mirror) -> None:
     plant.step(0.03, DT_S, 4.0, 3.0)
     before = 2.0 * (1.0 - exp(-0.03 / LAG_S)), -1.0 * (1.0 - exp(-0.03 / LAG_S))
     decays = [exp(-tau / LAG_S) for tau in (0.0, 0.004, 0.01)]
-    for (right, left), e in zip(plant.rates_at(decays), decays, strict=True):
+    for (right, left), e in zip(rates_at(plant, decays), decays, strict=True):
         assert right == pytest.approx(4.0 + (before[0] - 4.0) * e, abs=1e-12)
         assert left == pytest.approx(3.0 + (before[1] - 3.0) * e, abs=1e-12)
-    assert plant.rates_at(decays)[-1] == pytest.approx((plant.right_rad_s, plant.left_rad_s), abs=1e-12)
+    assert rates_at(plant, decays)[-1] == pytest.approx((plant.right_rad_s, plant.left_rad_s), abs=1e-12)
 
 
 def test_acceleration_is_the_derivative_of_the_speed_and_turn_rate_that_of_the_wheels(mirror: Mirror) -> None:
@@ -120,12 +125,12 @@ def test_acceleration_is_the_derivative_of_the_speed_and_turn_rate_that_of_the_w
     tau, h = 0.006, 1e-6
     speeds = []
     for t in (tau - h, tau + h):
-        ((right, left),) = plant.rates_at([exp(-t / LAG_S)])
+        ((right, left),) = rates_at(plant, [exp(-t / LAG_S)])
         speeds.append(RADIUS_M * (right + left) / 2.0)
     decay = exp(-tau / LAG_S)
     # A central difference over 2 us of a function with a 80 ms time constant.
     assert plant.acceleration_at(decay) == pytest.approx((speeds[1] - speeds[0]) / (2.0 * h), rel=1e-7)
-    ((right, left),) = plant.rates_at([decay])
+    ((right, left),) = rates_at(plant, [decay])
     assert plant.turn_rate_at(decay) == pytest.approx(RADIUS_M * (right - left) / BASE_M, abs=1e-14)
 
 
@@ -152,13 +157,13 @@ def test_coasting_distance_is_speed_times_lag(mirror: Mirror) -> None:
 def test_disturbances_act_on_the_body_one_after_the_other(mirror: Mirror) -> None:
     class Creep:
         def displace(
-            self, t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float
+            self, plant: Plant, t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float
         ) -> tuple[float, float, float]:
             return forward_m, left_m + 0.01 * dt_s, turn_rad
 
     class Slip:
         def displace(
-            self, t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float
+            self, plant: Plant, t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float
         ) -> tuple[float, float, float]:
             return 0.5 * forward_m, 2.0 * left_m, turn_rad
 
@@ -177,6 +182,28 @@ def test_wheels_that_stop_dead(mirror: Mirror) -> None:
     plant = plant_on(mirror)
     drive(plant, 3.0, 2.0, 50)
     plant.stop_dead()
-    assert plant.rates_at([1.0, 0.5]) == [(0.0, 0.0), (0.0, 0.0)]
+    assert plant.servo == (0.0, 0.0, 0.0, 0.0)
     assert plant.acceleration_at(1.0) == 0.0
     assert plant.turn_rate_at(1.0) == 0.0
+
+
+def test_a_wheel_that_slips_turns_more_than_the_body_moves(mirror: Mirror) -> None:
+    plant, ideal = plant_on(mirror), plant_on(mirror)
+    plant.right_scale, plant.left_scale = 0.95, 0.98
+    plant.step(0.0, DT_S, 5.0, 4.0)
+    ideal.step(0.0, DT_S, 5.0, 4.0)
+    assert (plant.right_angle_rad, plant.left_angle_rad) == (ideal.right_angle_rad, ideal.left_angle_rad)
+    right_m, left_m = 0.95 * RADIUS_M * plant.right_angle_rad, 0.98 * RADIUS_M * plant.left_angle_rad
+    assert plant.forward_m == pytest.approx((right_m + left_m) / 2.0, rel=1e-12)
+    assert plant.turn_rad == pytest.approx((right_m - left_m) / BASE_M, rel=1e-12)
+    # The inertial unit feels the body: rates at the end of the step, and their derivative.
+    plant.step(DT_S, DT_S, -2.0, 1.0)
+    middle = exp(-0.004 / LAG_S)
+    ((right, left),) = rates_at(plant, [middle])
+    expected = RADIUS_M * (0.95 * right - 0.98 * left) / BASE_M
+    assert plant.turn_rate_at(middle) == pytest.approx(expected, rel=1e-12)
+    right, left = 0.95 * plant.right_rad_s, 0.98 * plant.left_rad_s
+    decay = exp(-DT_S / LAG_S)
+    assert plant.turn_rate_at(decay) == pytest.approx(RADIUS_M * (right - left) / BASE_M, rel=1e-12)
+    expected = RADIUS_M * (0.95 * -2.0 - right + 0.98 * 1.0 - left) / 2.0 / LAG_S
+    assert plant.acceleration_at(decay) == pytest.approx(expected, rel=1e-12)

@@ -31,7 +31,7 @@ def boot(config: Config, mirror: Mirror, seed: int = 1) -> Robot:
 
 
 def frame(robot: Robot) -> Sensors:
-    message = decode_from_robot(robot.line[:-1])
+    message = decode_from_robot(robot.delivered_line[:-1])
     assert isinstance(message, Sensors)
     return message
 
@@ -70,10 +70,10 @@ def test_the_same_seed_gives_the_same_bytes(config: Config, mirror: Mirror) -> N
     lines = []
     for seed in (1, 1, 2):
         robot = boot(config, mirror, seed)
-        found = [robot.line]
+        found = [robot.delivered_line]
         for k in range(300):
             drive(robot, 3.0, 3.0 - 0.01 * k, 1)
-            found.append(robot.line)
+            found.append(robot.delivered_line)
         lines.append(b"".join(found))
     assert lines[0] == lines[1]
     assert lines[0] != lines[2]
@@ -267,7 +267,7 @@ def test_lines_stay_within_the_limit_and_readable(config: Config, mirror: Mirror
     robot = boot(with_rates(config, **rates), mirror)
     for _ in range(200):
         drive(robot, 8.0, -8.0, 1)
-        assert len(robot.line) <= MAX_LINE_BYTES
+        assert len(robot.delivered_line) <= MAX_LINE_BYTES
         frame(robot)
 
 
@@ -312,3 +312,205 @@ def test_answers(config: Config, mirror: Mirror) -> None:
     assert [PanelId(*row[:2]) for row in told["panels"]] == list(mirror.panels)
     assert told["start"][:2] == [robot.world.start_pose.x_m, robot.world.start_pose.y_m]
     assert "unknown request" in json.loads(truth.answer(b"x" * 1000))["error"]
+
+
+# -- disturbed worlds -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def hard() -> Config:
+    return load_config(overrides={"run.world": "hard"})
+
+
+def with_world(config: Config, **values: float) -> Config:
+    return config.model_copy(update={"world": config.world.model_copy(update=values)})
+
+
+Row = tuple[object, ...]
+
+
+def survey(config: Config, mirror: Mirror, seed: int = 1, frames: int = 400) -> list[tuple[Row, Sensors | None]]:
+    """Turn, drive, stop, again and again, with the fans on: the truth and what is delivered, frame by frame."""
+    robot = boot(config, mirror, seed)
+    robot.join_controller()
+    robot.command_fans(0, 0.8, 0.8)
+    rows: list[tuple[Row, Sensors | None]] = []
+    for k in range(frames):
+        phase = k % 100
+        robot.drive(k, *((-2.0, 2.0) if phase < 20 else (3.0, 3.0) if phase < 60 else (0.0, 0.0)))
+        robot.advance()
+        rows.append((robot.world.truth_row(robot.seq, robot.t_s), robot.delivered))
+    return rows
+
+
+@pytest.mark.parametrize("world", ["thesis", "hard", "extreme"])
+def test_what_is_delivered_equals_its_line(mirror: Mirror, world: str) -> None:
+    cfg = load_config(overrides={"run.world": world})
+    robot = boot(cfg, mirror)
+    robot.join_controller()
+    robot.join_monitor()
+    seen = 0
+    for k in range(600):
+        robot.command_fans(k, 0.8, 0.7)
+        robot.permit(k, True, k % 100 < 90, True)
+        robot.drive(k, 5.0 * np.cos(0.1 * k), 5.0 * np.sin(0.07 * k))
+        robot.advance()
+        if robot.delivered is None:
+            assert (robot.delivered_line, robot.delivered_seq) == (b"", -1)
+            continue
+        assert decode_from_robot(robot.delivered_line[:-1]) == robot.delivered
+        # Equal is not enough: 1 == 1.0, and a named tuple equals a plain one.
+        assert repr(decode_from_robot(robot.delivered_line[:-1])) == repr(robot.delivered)
+        assert robot.delivered is robot.delivered
+        seen += 1
+    assert seen >= 598
+
+
+@pytest.mark.parametrize("frames", [0, 1, 2])
+def test_a_frame_is_delivered_when_the_clock_shows_its_time_and_the_delay(
+    config: Config, mirror: Mirror, frames: int
+) -> None:
+    at_once = survey(config, mirror)
+    late = survey(with_world(config, sensors_delay_s=0.01 * frames), mirror)
+    assert [row for row, _ in late] == [row for row, _ in at_once]  # only the news is late
+    for k in range(frames + 1, 300):
+        assert late[k][1] == at_once[k - frames][1]
+    boot_frame = late[frames - 1][1] if frames else None
+    assert [sensors is None for _, sensors in late[:frames]] == [True] * (frames - 1) + [False] * min(frames, 1)
+    assert boot_frame is None or boot_frame.seq == 0
+
+
+@pytest.mark.parametrize("frames", [0, 1, 2])
+def test_commands_take_effect_after_their_delay(config: Config, mirror: Mirror, frames: int) -> None:
+    robot = boot(with_world(config, commands_delay_s=0.01 * frames), mirror)
+    rates, echoes = [], []
+    for k in range(20):
+        if k >= 5:
+            robot.drive(k, 3.0, 3.0)
+        robot.advance()
+        rates.append(robot.world.plant.right_rad_s)
+        assert robot.delivered is not None
+        echoes.append(robot.delivered.cmd)
+    assert [rate > 0.0 for rate in rates] == [False] * (5 + frames) + [True] * (15 - frames)
+    assert [echo.held for echo in echoes] == [rate == 0.0 for rate in rates]
+    assert [echo.seq for echo in echoes[5 + frames :]] == list(range(5, 20 - frames))
+    assert {echo.age for echo in echoes[5 + frames :]} == {0.01 * (frames + 1)}
+
+
+@pytest.mark.parametrize("world", ["hard", "extreme"])
+def test_a_disturbed_world_is_a_function_of_its_seed(mirror: Mirror, world: str) -> None:
+    cfg = load_config(overrides={"run.world": world})
+    first, again, other = (survey(cfg, mirror, seed, 150) for seed in (1, 1, 2))
+    assert first == again
+    assert first != other
+
+
+KINDS = {
+    "encoders": ["encoder_counts_per_rev"],
+    "gyroscope": ["gyroscope_bias_sigma_rad_s", "gyroscope_bias_walk_rad_s_sqrt_s", "gyroscope_scale_sigma"],
+    "accelerometer": ["accelerometer_bias_sigma_m_s2", "accelerometer_bias_walk_m_s2_sqrt_s"],
+    "slip": ["slip_min", "slip_max", "slip_walk_sigma"],
+    "creep": ["creep_fraction"],
+    "vibration": ["vibration_rate_rad_s", "vibration_speed_m_s", "vibration_acceleration_m_s2"],
+    "wheels": ["wheel_radius_sigma", "wheel_base_sigma", "wheel_lag_spread"],
+    "edges": ["panel_edge_sigma_m"],
+}
+BODY = {"slip", "creep", "vibration", "wheels"}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_kind_alone_changes_what_is_its_own(config: Config, hard: Config, mirror: Mirror, kind: str) -> None:
+    """In an otherwise quiet world: a body that is pushed moves elsewhere, a sensor that errs does not move it."""
+    alone = with_world(config, **{key: getattr(hard.world, key) for key in KINDS[kind]})
+    quiet, found = survey(config, mirror), survey(alone, mirror)
+    assert ([row for row, _ in found] != [row for row, _ in quiet]) is (kind in BODY)
+
+    def column(rows: list[tuple[Row, Sensors | None]], name: str) -> list[object]:
+        return [getattr(sensors, name) for _, sensors in rows]
+
+    same = {name for name in ("imu", "enc", "gravity", "edge") if column(found, name) == column(quiet, name)}
+    expected = {
+        "encoders": {"imu", "gravity", "edge"},
+        "gyroscope": {"enc", "gravity", "edge"},
+        "accelerometer": {"enc", "gravity", "edge"},
+        "edges": {"imu", "enc", "gravity"},
+    }
+    assert same >= expected.get(kind, set())
+    assert ("enc" in same) is (kind not in {"encoders", "wheels"})  # a wheel never feels what the body does
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_draws_of_one_kind_do_not_depend_on_another(hard: Config, mirror: Mirror, kind: str) -> None:
+    """Switched off in a world that has everything: what the others drew at boot and for each frame is as before."""
+    off = with_world(hard, **dict.fromkeys(KINDS[kind], 0))
+    drawn = []
+    for cfg in (hard, off):
+        world = boot(cfg, mirror).world
+        drawn.append((world.start_pose, world.misalignments, world.wheels))
+    assert drawn[0][:2] == drawn[1][:2]
+    assert (drawn[0][2] == drawn[1][2]) is (kind != "wheels")
+    whole, without = survey(hard, mirror), survey(off, mirror)
+    if kind not in BODY:
+        assert [row for row, _ in whole] == [row for row, _ in without]
+    if kind in BODY - {"wheels"}:
+        assert [s.enc for _, s in whole if s] == [s.enc for _, s in without if s]
+
+
+def test_hello_stays_nominal(hard: Config, mirror: Mirror) -> None:
+    robot = boot(hard, mirror)
+    told = robot.hello(boot=1, nonce="0" * 32, auth="none", lockstep=True).robot
+    assert (told.wheel_radius_m, told.wheel_base_m) == (hard.robot.wheel_radius_m, hard.robot.wheel_base_m)
+    assert robot.world.wheels.base_m != hard.robot.wheel_base_m
+    assert robot.world.plant.lag_s != hard.sim.robot.wheel_lag_s
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_body_moves_by_the_true_wheels(config: Config, hard: Config, mirror: Mirror, seed: int) -> None:
+    errors = {key: getattr(hard.world, key) for key in ("slip_min", "slip_max")}
+    robot = boot(with_world(config, wheel_radius_sigma=0.1, **errors), mirror, seed)  # larger than any slip
+    robot.join_controller()
+    world, plant = robot.world, robot.world.plant
+    for k in range(100):
+        before = plant.right_angle_rad, plant.left_angle_rad
+        robot.drive(k, 3.0, 2.0)
+        robot.advance()
+        slips = 1.0 - plant.right_scale / world.wheels.right_scale, 1.0 - plant.left_scale / world.wheels.left_scale
+        assert 0.01 <= min(slips) < max(slips) <= 0.05
+        right_m = 0.03 * world.wheels.right_scale * (1.0 - slips[0]) * (plant.right_angle_rad - before[0])
+        left_m = 0.03 * world.wheels.left_scale * (1.0 - slips[1]) * (plant.left_angle_rad - before[1])
+        # Differences of angles of some radians, a thousandth of them long.
+        assert plant.forward_m == pytest.approx((right_m + left_m) / 2.0, rel=1e-9)
+        assert plant.turn_rad == pytest.approx((right_m - left_m) / world.wheels.base_m, rel=1e-9)
+    drawn = boot(with_world(config, wheel_radius_sigma=0.005), mirror, seed).world
+    assert (drawn.plant.right_scale, drawn.plant.left_scale) == drawn.wheels[1:3] != (1.0, 1.0)
+
+
+def test_wheels_slip_creep_and_shake_in_the_whole_robot(hard: Config, mirror: Mirror) -> None:
+    robot = boot(hard, mirror)
+    robot.join_controller()
+    plant = robot.world.plant
+    for k in range(100):
+        robot.drive(k, 3.0, 3.0)
+        robot.advance()
+    slip = 1.0 - plant.right_scale / robot.world.wheels.right_scale
+    assert -0.015 < slip < 0.075  # 1 to 5 per cent, and a walk of half a per cent, 5 sigma
+    assert plant.left_m != 0.0
+    assert plant.shake_rate_rad_s == 0.0  # no fans
+    robot.command_fans(0, 0.8, 0.8)
+    for k in range(100, 103):
+        robot.drive(k, 3.0, 3.0)
+        robot.advance()
+    assert plant.shake_rate_rad_s != 0.0
+
+
+def test_counted_rates_fit_the_line(hard: Config, mirror: Mirror) -> None:
+    fine = with_world(hard, encoder_counts_per_rev=7_919_333)  # rates of many digits
+    robot = boot(fine, mirror)
+    longest = 0
+    for k in range(100):
+        robot.drive(k, -8.0, -7.9)
+        robot.advance()
+        longest = max(longest, len(robot.delivered_line))
+    assert longest <= 420 + 48 + 10 * (64 + 26)  # what the check of the rates counts on
+    with pytest.raises(ValueError, match=r"frames at 8 Hz take up to \d+ bytes, a line holds 8192"):
+        boot(with_rates(fine, frame_hz=8.0), mirror)

@@ -8,8 +8,11 @@ import pytest
 from ccatp.config.models import Config, SimRobotConfig
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.samples import DeckPose
+from ccatp.sim.edge_sensors import EdgeSensors
+from ccatp.sim.noise import NoiseStream
 from ccatp.sim.plant import Plant
-from ccatp.sim.sensors import EdgeSensors, NoiseStream, SampleTimes, SensorSuite
+from ccatp.sim.sample_times import SampleTimes
+from ccatp.sim.sensors import SensorSuite
 
 OFFSETS = ((0.09, 0.09), (0.09, -0.09), (-0.09, 0.09), (-0.09, -0.09))
 DT_S = 0.01
@@ -26,7 +29,8 @@ def plant_at(mirror: Mirror, start: DeckPose) -> Plant:
 
 def suite(config: Config, mirror: Mirror, **rates: float) -> SensorSuite:
     cfg: SimRobotConfig = config.sim.robot.model_copy(update=rates)
-    return SensorSuite(mirror, cfg, config.world, OFFSETS, np.random.default_rng(1))
+    rng = np.random.default_rng(1)
+    return SensorSuite(mirror, cfg, config.world, OFFSETS, rng, panels=config.mirror.panels, lag_s=cfg.wheel_lag_s)
 
 
 # -- noise and times --------------------------------------------------------------------------------------------------

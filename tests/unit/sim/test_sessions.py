@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccatp.config.loader import load_config
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.sim.robot import Robot
@@ -483,3 +484,96 @@ def test_after_a_long_stop_the_clock_goes_on_where_it_stood(rig: Callable[..., R
     r.server.tick(r.now_s)
     assert r.server.next_frame_s == pytest.approx(r.now_s + 0.01, abs=1e-6)
     assert r.robot.seq == 11
+
+
+# -- delays -----------------------------------------------------------------------------------------------------------
+
+
+def delayed(config: Config, sensors: int, commands: int) -> Config:
+    delays = {"sensors_delay_s": 0.01 * sensors, "commands_delay_s": 0.01 * commands}
+    return config.model_copy(update={"world": config.world.model_copy(update=delays)})
+
+
+@pytest.mark.parametrize(("sensors", "commands"), [(1, 0), (0, 1), (1, 1), (2, 2)])
+def test_lockstep_with_delays(config: Config, mirror: Mirror, sensors: int, commands: int) -> None:
+    r = Rig(delayed(config, sensors, commands), mirror)
+    monitor = r.client(JOIN_MONITOR)
+    assert (monitor.kinds, r.robot.seq) == (["hello", "joined"], 0)
+    controller = r.client(JOIN)
+    # The frames before the first delivery ran by themselves.
+    assert (controller.kinds, monitor.kinds) == (["hello", "joined", "0"], ["0"])
+    assert (r.robot.seq, r.frames, r.robot.rules.is_held) == (sensors, sensors, True)
+    first = sensors + commands  # the first step that the drive sent on frame 0 moves
+    for k in range(12):
+        monitor.permit(k, k)
+        assert r.robot.seq == sensors + k
+        controller.drive(k, k)
+        frame = controller.messages[-1]
+        assert (frame["seq"], r.robot.seq) == (k + 1, sensors + k + 1)
+        assert r.robot.rules.is_held is (r.robot.seq - 1 < first)
+        assert frame["cmd"]["held"] is (frame["seq"] <= first)
+        if not frame["cmd"]["held"]:
+            assert frame["cmd"]["seq"] == frame["seq"] - 1 - first
+            assert frame["cmd"]["age"] == pytest.approx(0.01 * (commands + 1), abs=1e-6)  # in microseconds
+            assert frame["cmd"]["permit_age"] == frame["cmd"]["age"]
+
+
+def test_in_lockstep_the_newest_frame_delivered_is_to_be_acknowledged(config: Config, mirror: Mirror) -> None:
+    r = Rig(delayed(config, 2, 1), mirror)
+    controller = r.client(JOIN)
+    controller.drive(0, 2)  # the robot's own newest, which nobody can know
+    assert r.robot.seq == 2
+    controller.drive(1, 0)
+    assert r.robot.seq == 3
+    r.server.lost(controller.session)
+    again = r.client(JOIN)
+    assert again.kinds == ["hello", "joined", "1"]  # no frame is lost or driven by joining anew
+    assert r.robot.seq == 3
+
+
+def test_a_stall_names_the_frame_that_waits(config: Config, mirror: Mirror) -> None:
+    r = Rig(delayed(config, 2, 1), mirror)
+    r.client(JOIN)
+    r.server.check_time(r.now_s + 6.0)
+    assert r.notes[-1] == "stall: frame 0 waits for its drive"
+
+
+def test_delays_on_the_wall_clock(config: Config, mirror: Mirror) -> None:
+    r = Rig(delayed(config, 2, 1), mirror, lockstep=False)
+    controller = r.client(JOIN)
+    r.run(0.0101)
+    assert controller.kinds == ["hello", "joined"]  # frame 1 exists, frame 0 is on its way
+    r.run(0.01)
+    assert controller.kinds == ["0"]
+    r.run(0.003)
+    controller.drive(0, 0)  # arrives 3.1 ms after frame 2
+    held = []
+    for _ in range(8):
+        r.run(0.01)
+        held.append(controller.messages[-1])
+    # Driven from frame 3 on, so frame 4 is the first that tells; it is delivered 20 ms later.
+    assert [(m["seq"], m["cmd"]["held"]) for m in held] == [(k, k < 4) for k in range(1, 9)]
+    assert held[3]["cmd"]["age"] == pytest.approx(0.0169, abs=1e-5)
+
+
+def test_the_server_and_the_calls_give_the_same_frames(mirror: Mirror) -> None:
+    cfg = load_config(overrides={"run.world": "hard"})
+    r = Rig(cfg, mirror)
+    monitor, controller = r.client(JOIN_MONITOR), r.client(JOIN)
+    controller.send(b'{"type":"fans","seq":0,"duty":[0.8,0.8]}\n')
+    for k in range(200):
+        monitor.permit(k, k, b"true" if k % 50 < 40 else b"false")
+        controller.drive(k, k, 3.0, 2.5)
+    robot = Robot(cfg, mirror, np.random.default_rng(1))
+    robot.join_monitor()
+    robot.join_controller()
+    while robot.delivered is None:
+        robot.advance()
+    lines = [robot.delivered_line]
+    robot.command_fans(0, 0.8, 0.8)
+    for k in range(200):
+        robot.permit(k, *[k % 50 < 40] * 3)
+        robot.drive(k, 3.0, 2.5)
+        robot.advance()
+        lines.append(robot.delivered_line)
+    assert controller.wire.sent.splitlines(keepends=True)[2:] == lines

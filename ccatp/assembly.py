@@ -1,0 +1,111 @@
+"""Pure. Assembles the parts of a main loop from a configuration, for the daemon and for rehearsals alike."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from math import hypot
+
+from ccatp.config.models import Config
+from ccatp.control.gate import DriveGate
+from ccatp.errors import ConfigError
+from ccatp.localizer import FOUR_STATE, Localizer, build_localizer
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.mission import Mission, PlanHome, PlanRest
+from ccatp.planning.bound import path_time
+from ccatp.planning.calibration import plan_calibration
+from ccatp.planning.route import Route, plan_rejoin, plan_route, with_prelude
+from ccatp.planning.traversal import ORDERS
+from ccatp.planning.way_home import plan_way_home
+from ccatp.samples import DeckPose, PointId, Stop
+from ccatp.wire.robot import Hello
+
+# The configuration may be calibrated, the robot's own figures are nominal: this much apart they describe two robots.
+RADIUS_TOLERANCE = 0.05
+SENSOR_TOLERANCE_M = 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """The pure parts of a main loop, and what a summary needs to know of the plan."""
+
+    cfg: Config
+    mirror: Mirror
+    localizer: Localizer
+    mission: Mission
+    gate: DriveGate
+    route: Route
+    points: tuple[PointId, ...]
+    already_done: int
+    lower_bound_s: float
+
+    @property
+    def total_points(self) -> int:
+        """Points of the mission, measured or not."""
+        return len(self.points)
+
+    def check_robot(self, hello: Hello) -> None:
+        """Refuse a robot whose own geometry contradicts the configuration."""
+        robot, own = self.cfg.robot, hello.robot
+        problems = [
+            f"{name} is {ours} here and {theirs} there"
+            for name, ours, theirs in (
+                ("wheel_radius_m", robot.wheel_radius_m, own.wheel_radius_m),
+                ("wheel_base_m", robot.wheel_base_m, own.wheel_base_m),
+            )
+            if abs(ours - theirs) > RADIUS_TOLERANCE * theirs
+        ]
+        for ours, theirs in zip(robot.edge_sensors_m, own.edge_sensors_m, strict=True):
+            if hypot(ours[0] - theirs[0], ours[1] - theirs[1]) > SENSOR_TOLERANCE_M:
+                problems.append(f"an edge sensor is at {ours} here and at {tuple(theirs)} there")
+        puck = own.puck_m
+        if hypot(puck[0], puck[1], puck[2] - robot.puck_height_m) > SENSOR_TOLERANCE_M:
+            problems.append(f"the puck is at (0, 0, {robot.puck_height_m}) here and at {tuple(puck)} there")
+        if self.mirror.overhang and own.fan_floor <= 0.0:
+            problems.append("the mirror overhangs and the robot has no fan floor")
+        if problems:
+            raise ConfigError(f"robot: the configuration is not of this robot: {'; '.join(problems)}")
+
+
+def assemble(cfg: Config, done: Collection[PointId] = ()) -> Parts:
+    """All pure parts of a main loop, the robot standing at base.
+
+    Args:
+        cfg: the configuration.
+        done: points that are measured already.
+
+    Raises:
+        PlanError: a point cannot be reached.
+    """
+    mirror = build_mirror(cfg.mirror)
+    points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
+    measuring_s = cfg.etalon.measuring_time_s
+    route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose, done, measuring_s)
+    if cfg.run.filter not in FOUR_STATE:  # they have no states that the drive could calibrate
+        drive = plan_calibration(mirror, cfg.robot, cfg.mission, mirror.base_pose)
+        route = with_prelude(mirror, route, drive, cfg.limits, mirror.base_pose, measuring_s)
+    robot = cfg.robot
+    return Parts(
+        cfg=cfg,
+        mirror=mirror,
+        localizer=build_localizer(cfg, mirror),
+        mission=Mission(cfg, mirror, route, _home_planner(cfg, mirror), _rest_planner(cfg, mirror)),
+        gate=DriveGate(cfg.limits, robot.wheel_radius_m, robot.wheel_base_m, robot.max_wheel_rad_s, robot.wheel_lag_s),
+        route=route,
+        points=tuple(points),
+        already_done=len(set(done)),
+        lower_bound_s=path_time(route.stops, mirror.base_pose, cfg.limits, mirror, measuring_s),
+    )
+
+
+def _rest_planner(cfg: Config, mirror: Mirror) -> PlanRest:
+    def plan(route: Route, start: DeckPose, skip: Collection[PointId]) -> Route:
+        measuring_s = cfg.etalon.measuring_time_s
+        return plan_rejoin(mirror, route, cfg.robot, cfg.limits, cfg.mission, start, skip, measuring_s)
+
+    return plan
+
+
+def _home_planner(cfg: Config, mirror: Mirror) -> PlanHome:
+    def plan(start: DeckPose) -> tuple[Stop, ...]:
+        return plan_way_home(mirror, start, mirror.base_pose, cfg.robot, cfg.limits, cfg.mission)
+
+    return plan

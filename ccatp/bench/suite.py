@@ -1,0 +1,181 @@
+"""Glue. The benchmarks one after the other, as one result."""
+
+from collections.abc import Callable, Iterator, Sequence
+from math import sqrt
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from ccatp.bench.contenders import Contender, Result, our_filter, printed_filter
+from ccatp.bench.machine import machine
+from ccatp.bench.missions import BenchError, lockstep_case, rehearsal_case
+from ccatp.bench.peers import filterpy_extended, filterpy_linear, filterpy_unscented, stonesoup
+from ccatp.bench.problems import (
+    LINEAR_ROWS,
+    POSE_ROWS,
+    STEPS,
+    FilterProblem,
+    RangeProblem,
+    linear_problem,
+    mild,
+    pose_problem,
+    range_problem,
+)
+from ccatp.bench.race import Difference, Times, largest_difference, race
+from ccatp.config.models import Config
+from ccatp.filters.base import FloatArray
+from ccatp.filters.unscented import ALPHA, BETA, KURTOSIS
+from ccatp.radio.multilateration import multilaterate
+
+EQUAL_WITHIN = 1e-10  # every entry of mean and covariance, SI units, readings as in ``mild``
+ROUNDS, QUICK_ROUNDS = 40, 4
+PANELS, QUICK_PANELS = 4, 1
+SEED = 1
+_PRINTED = "eq. 2.13 in numpy"
+INSTALL = "pip install 'ccatp[peers]'"
+
+Peers = tuple[tuple[str, Callable[[FilterProblem], Contender]], ...]
+
+
+def run_bench(cfg: Config, *, quick: bool, run_args: Sequence[str] = (), missions: bool = True) -> dict[str, Any]:
+    """Run every benchmark.
+
+    Args:
+        cfg: the robot's measures and noise, the mirror, and the mission that is timed.
+        quick: a tenth of the repeats and a mission of one panel.
+        run_args: what else ``ccatp run`` needs to work on the same configuration.
+        missions: time missions as well as steps.
+
+    Returns:
+        ``{"machine", "cases"}``. A case holds name, us_p50, us_p99, peer, peer_us_p50 and ratio = ours / peer, None
+        without a peer; and what else is known of it: that both computed the same, or how to install the peer.
+
+    Raises:
+        BenchError: a peer's result differs, or a mission failed.
+    """
+    rounds, panels = (QUICK_ROUNDS, QUICK_PANELS) if quick else (ROUNDS, PANELS)
+    cases = []
+    if missions:
+        cases += [rehearsal_case(cfg, panels), lockstep_case(cfg, panels, run_args)]
+    cases = [*filter_cases(cfg, rounds), multilateration_case(cfg, rounds), *cases]
+    return {"machine": machine(), "equal_within": EQUAL_WITHIN, "cases": cases}
+
+
+def filter_cases(cfg: Config, rounds: int) -> Iterator[dict[str, Any]]:
+    """Predict and update of each filter against each peer."""
+    for rows in LINEAR_ROWS:
+        linear = linear_problem(cfg.robot, cfg.localizer, rows, SEED)
+        yield from _against("kf", linear, _LINEAR_PEERS, rounds)
+    for rows in POSE_ROWS:
+        pose = pose_problem(cfg.robot, cfg.localizer, rows, SEED)
+        yield from _against("ekf", pose, _EXTENDED_PEERS, rounds)
+        yield from _against("ukf", pose, _UNSCENTED_PEERS, rounds)
+
+
+def multilateration_case(cfg: Config, rounds: int) -> dict[str, Any]:
+    """A puck's position out of its lengths, against SciPy's Levenberg-Marquardt with the same Jacobian."""
+    problem = range_problem(cfg, SEED)
+    ours, peer = _our_position(problem), _scipy_position(problem)
+    name = f"multilaterate, {problem.anchors_m.shape[0]} lengths"
+    difference = _checked(name, "scipy.optimize.least_squares", largest_difference(ours, peer, STEPS))
+    return case(name, race(ours, peer, STEPS, rounds), "scipy.optimize.least_squares", difference)
+
+
+def case(name: str, times: Times, peer: str | None, difference: Difference | None = None) -> dict[str, Any]:
+    """The figures of one race."""
+    p50, p99 = np.percentile(times.ours_us, (50, 99))
+    found: dict[str, Any] = {"name": name, "us_p50": float(p50), "us_p99": float(p99), "peer": peer}
+    if times.peer_us is None:
+        return {**found, "peer_us_p50": None, "peer_us_p99": None, "ratio": None}
+    peer_p50, peer_p99 = np.percentile(times.peer_us, (50, 99))
+    found |= {"peer_us_p50": float(peer_p50), "peer_us_p99": float(peer_p99), "ratio": float(p50 / peer_p50)}
+    if difference is not None:
+        found |= {"largest_difference": difference.absolute, "rounding_sigmas": difference.sigmas}
+    return found
+
+
+def _against(filter_name: str, problem: FilterProblem, peers: Peers, rounds: int) -> Iterator[dict[str, Any]]:
+    name = f"{filter_name} predict + update, n = {problem.mean.size}, m = {problem.variances.size}"
+    for peer_name, build in peers:
+        ours = our_filter(filter_name, problem)
+        try:
+            peer = build(problem)
+        except ImportError:
+            note = f"{peer_name} is not installed: {INSTALL}"
+            yield {**case(name, race(ours, None, STEPS, rounds), None), "note": note}
+            continue
+        alike = largest_difference(our_filter(filter_name, mild(problem)), build(mild(problem)), STEPS)
+        difference = Difference(_checked(name, peer_name, alike).absolute, largest_difference(ours, peer, STEPS).sigmas)
+        yield case(name, race(ours, peer, STEPS, rounds), peer_name, difference)
+
+
+def _checked(name: str, peer: str, difference: Difference) -> Difference:
+    if not difference.absolute <= EQUAL_WITHIN:
+        raise BenchError(
+            f"{name}: results differ from those of {peer} by {difference.absolute:.2g}, more than {EQUAL_WITHIN:g}: "
+            "times of different computations cannot be compared"
+        )
+    return difference
+
+
+def _unscented(problem: FilterProblem) -> dict[str, float]:
+    """The parameters of our sigma points."""
+    return {"alpha": ALPHA, "beta": BETA, "kappa": max(KURTOSIS - problem.mean.size, 0.0)}
+
+
+_LINEAR_PEERS: Peers = (
+    (_PRINTED, printed_filter),
+    ("filterpy", filterpy_linear),
+    ("Stone Soup", lambda problem: stonesoup("Kalman", problem)),
+)
+_EXTENDED_PEERS: Peers = (
+    (_PRINTED, printed_filter),
+    ("filterpy", filterpy_extended),
+    ("Stone Soup", lambda problem: stonesoup("ExtendedKalman", problem)),
+)
+_UNSCENTED_PEERS: Peers = (
+    ("filterpy", lambda problem: filterpy_unscented(problem, **_unscented(problem))),
+    ("Stone Soup", lambda problem: stonesoup("UnscentedKalman", problem, **_unscented(problem))),
+)
+
+
+def _our_position(problem: RangeProblem) -> Contender:
+    solution: Result = (np.zeros(3), np.eye(3))
+
+    def step(i: int) -> None:
+        nonlocal solution
+        found = multilaterate(problem.anchors_m, problem.ranges_m[i], problem.sigmas_m[i], problem.expected_m[i])
+        solution = found.position_m, found.covariance_m2
+
+    return Contender(lambda: None, step, lambda: solution)
+
+
+def _scipy_position(problem: RangeProblem) -> Contender:
+    """The same weighted least squares, and the covariance out of its Jacobian."""
+    solution: Result = (np.zeros(3), np.eye(3))
+    tolerance = sqrt(np.finfo(np.float64).eps)  # quadratic convergence squares it
+
+    def step(i: int) -> None:
+        nonlocal solution
+        ranges, sigmas = problem.ranges_m[i], problem.sigmas_m[i]
+
+        def residuals(x: FloatArray) -> FloatArray:
+            offsets = x - problem.anchors_m
+            seen: FloatArray = (np.sqrt((offsets * offsets).sum(axis=1)) - ranges) / sigmas
+            return seen
+
+        def jacobian(x: FloatArray) -> FloatArray:
+            offsets = x - problem.anchors_m
+            slopes: FloatArray = offsets / (np.sqrt((offsets * offsets).sum(axis=1)) * sigmas)[:, None]
+            return slopes
+
+        found = least_squares(
+            residuals, problem.expected_m[i], jac=jacobian, method="lm",
+            xtol=tolerance, ftol=tolerance, gtol=tolerance,
+        )  # fmt: skip
+        slopes = np.asarray(found.jac, dtype=np.float64)
+        covariance = np.linalg.inv(slopes.T @ slopes).astype(np.float64)
+        solution = np.asarray(found.x), covariance
+
+    return Contender(lambda: None, step, lambda: solution)

@@ -1,0 +1,43 @@
+"""Pure. Extended Kalman filter: nonlinear models linearised at the mean, the rest as in ``KalmanFilter``."""
+
+import numpy as np
+from numpy import vdot
+
+from ccatp.filters.base import HUGE, FilterDiverged, FilterShapeError, FloatArray, Innovation, Observation, Transition
+from ccatp.filters.kalman import KalmanFilter
+
+
+class ExtendedKalmanFilter(KalmanFilter):
+    """The Kalman filter with F = df/dx and H = dh/dx at the mean (thesis eqs 2.5 to 2.10 with f and h in place).
+
+    predict:  x = f(x),  P = F P F^T + Q
+    update:   nu = z - h(x), the rest as in 2.8 to 2.10
+
+    Arrays are taken as the linear filter takes them, and cost and result are the same.
+    """
+
+    def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
+        """Advance by F, a matrix (n, n) or a model, and Q (n, n); see ``Filter.predict``."""
+        if isinstance(F, np.ndarray):
+            super().predict(F, Q)
+            return
+        x, jacobian = F.at(self.mean)
+        shape = self._P.shape
+        if x.shape != self.mean.shape:
+            raise FilterShapeError("f(x)", x.shape, str(self.mean.shape))
+        if jacobian.shape != shape:
+            raise FilterShapeError("df/dx", jacobian.shape, str(shape))
+        if not vdot(jacobian, jacobian) < HUGE:
+            raise FilterDiverged(f"prediction is not finite: df/dx {jacobian.tolist()}")
+        self._advance(x.copy(), jacobian.copy(), Q)
+
+    def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
+        """Condition on z (m,) with H, a matrix (m, n) or a model, and R (m,) or (m, m); see ``Filter.update``."""
+        if isinstance(H, np.ndarray):
+            return super().update(z, H, R)
+        expected, jacobian = H.at(self.mean)
+        if z.ndim != 1 or expected.shape != z.shape:
+            raise FilterShapeError("z", z.shape, f"{expected.shape} of h(x)")
+        if jacobian.shape != (z.size, self.mean.size):
+            raise FilterShapeError("dh/dx", jacobian.shape, f"({z.size}, {self.mean.size})")
+        return self._condition(z - expected, jacobian, R)

@@ -1,0 +1,148 @@
+"""Pure. The book of legs: what the legs driven so far say of the slip and the creep of the next one."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.config.models import FullStateConfig
+from ccatp.filters.base import FloatArray
+from ccatp.localization.population import Population
+from ccatp.localization.survey_model import SL, SR, C
+
+# A leg that has not narrowed the prior by more than rounding (variance after / before) has nothing to teach.
+_TAUGHT = 0.9999
+# var(s_R - s_L) over var((s_R + s_L)/2), both wheels drawing from one population.
+_DIFFERENCE = 4.0
+
+# Parameters (mean slip, difference of the slips, creep) out of the states (SR, SL, C), and back.
+_PARAMETERS = np.array([[0.5, 0.5, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+_STATES = np.linalg.inv(_PARAMETERS)
+_WHERE = [SR, SL, C]
+
+
+class Redraw(NamedTuple):
+    """Transition of (right slip, left slip, creep) from one leg to the next: ``s' = F (s - mean_before) + mean + e``.
+
+    Attributes:
+        F: what the next leg keeps of the deviations, shape (3, 3).
+        mean: the next leg's expectation, shape (3,).
+        Q: covariance of e, shape (3, 3).
+    """
+
+    F: FloatArray
+    mean: FloatArray
+    Q: FloatArray
+
+
+class _Parameter:
+    """One parameter: leg by leg it is m + d, the mean m unknown with variance v, d drawn anew with variance scatter."""
+
+    __slots__ = ("beta", "mean", "prior", "variance")
+
+    def __init__(self, mean: float, sigma: float) -> None:
+        self.mean, self.variance = mean, sigma * sigma
+        self.prior = (mean, sigma * sigma)
+        self.beta = 1.0
+
+    def pass_on(self, found: float, known: float, old_scatter: float, scatter: float) -> tuple[float, float]:
+        """From a leg's posterior (mean ``found``, variance ``known``) to the next leg's prior.
+
+        The leg's parameter tells of m by the share beta = v / (v + scatter) of what was not known of it.
+
+        Returns:
+            beta, and the variance of what the next leg's parameter has of its own.
+        """
+        beta = self.variance / (self.variance + old_scatter)
+        own = self.variance * (1.0 - beta)
+        self.mean += beta * (found - self.mean)
+        self.variance = own + beta * beta * known
+        self.beta = beta
+        self.prior = (self.mean, self.variance + scatter)
+        return beta, own + scatter
+
+
+class LegBook:
+    """Carries slip and creep from leg to leg.
+
+    Right and left slip are taken apart into their mean (what the distance shows) and their difference (what the
+    heading shows); both wheels draw from one population. Where legs hardly differ, the next leg keeps the state and
+    all its correlations; where each leg slips differently, it begins with the mean of all legs. How much they differ is
+    learned (``Population``); creep varies by a share of itself.
+
+    Args:
+        cfg: what is expected before the first leg.
+    """
+
+    def __init__(self, cfg: FullStateConfig) -> None:
+        self._slip_scatter = Population(cfg.slip_mean, cfg.slip_sigma, cfg.slip_scatter, cfg.slip_scatter_max)
+        self._parameters = (
+            _Parameter(cfg.slip_mean, cfg.slip_sigma),
+            _Parameter(0.0, cfg.slip_difference_sigma),
+            _Parameter(0.0, cfg.creep_sigma),
+        )
+        self._creep_share = cfg.creep_scatter_share**2
+        self._scatters = self._learned()
+        self._wander = cfg.wander_fraction**2 / cfg.wander_time_s
+        self._is_open = False
+
+    def _learned(self) -> tuple[float, float, float]:
+        slip, creep = self._slip_scatter.scatter, self._parameters[2]
+        return slip, _DIFFERENCE * slip, self._creep_share * (creep.mean * creep.mean + creep.variance)
+
+    @property
+    def scatter(self) -> tuple[float, float]:
+        """Learned standard deviation from leg to leg of the mean slip and of the creep."""
+        return self._scatters[0] ** 0.5, self._scatters[2] ** 0.5
+
+    def first(self) -> tuple[FloatArray, FloatArray]:
+        """Prior of (right slip, left slip, creep) before the first leg: mean (3,), covariance (3, 3)."""
+        self._is_open = True
+        means, variances = [], []
+        for parameter, scatter in zip(self._parameters, self._scatters, strict=True):
+            parameter.prior = (parameter.mean, parameter.variance + scatter)
+            means.append(parameter.mean)
+            variances.append(parameter.variance + scatter)
+        return _STATES.dot(np.array(means)), (_STATES * variances).dot(_STATES.T)
+
+    def begin(self, mean: FloatArray, covariance: FloatArray) -> Redraw:
+        """A leg begins; the state before it, mean (n,) and covariance (n, n), ends the last one."""
+        found = _PARAMETERS.dot(mean[_WHERE])
+        known = _PARAMETERS.dot(covariance[np.ix_(_WHERE, _WHERE)]).dot(_PARAMETERS.T).diagonal()
+        before, self._scatters = self._scatters, self._learned()
+        betas, owns = [], []
+        for k, parameter in enumerate(self._parameters):
+            beta, own = parameter.pass_on(float(found[k]), float(known[k]), before[k], self._scatters[k])
+            betas.append(beta)
+            owns.append(own)
+        self._is_open = True
+        means = np.array([parameter.mean for parameter in self._parameters])
+        return Redraw((_STATES * betas).dot(_PARAMETERS), _STATES.dot(means), (_STATES * owns).dot(_STATES.T))
+
+    def wander_variance(self, dt_s: float) -> tuple[float, float]:
+        """By how much slip (of each wheel) and creep wander within a leg, variance per step of ``dt_s``."""
+        per_step = self._wander * dt_s
+        return 2.0 * per_step * self._scatters[0], per_step * self._scatters[2]
+
+    def end(self, mean: FloatArray, covariance: FloatArray) -> None:
+        """A fix has ended the leg: learn how much legs differ from the state after it, (n,) and (n, n)."""
+        if not self._is_open:
+            return
+        self._is_open = False
+        found = _PARAMETERS.dot(mean[_WHERE])
+        known = _PARAMETERS.dot(covariance[np.ix_(_WHERE, _WHERE)]).dot(_PARAMETERS.T).diagonal()
+        alone = _leg_alone(self._parameters[0].prior, (float(found[0]), float(known[0])))
+        if alone is not None:
+            self._slip_scatter.learn(*alone)
+
+    def forget_leg(self) -> None:
+        """The leg's measurements are not to be trusted."""
+        self._is_open = False
+
+
+def _leg_alone(prior: tuple[float, float], posterior: tuple[float, float]) -> tuple[float, float] | None:
+    """What the leg alone says, (estimate, variance): the posterior divided by the prior, both Gaussian; or nothing."""
+    (m0, p0), (m1, p1) = prior, posterior
+    if not 0.0 < p1 < _TAUGHT * p0:
+        return None
+    information = 1.0 / p1 - 1.0 / p0
+    return (m1 / p1 - m0 / p0) / information, 1.0 / information

@@ -1,0 +1,1 @@
+"""Glue. Studies: campaigns and analyses that answer a question with a table, figures and a machine-readable result."""

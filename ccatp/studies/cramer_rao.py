@@ -1,0 +1,403 @@
+"""Pure. The posterior Cramér-Rao bound of the position at the stops of a rehearsal, computed from the truth.
+
+No estimator can have a smaller mean square error than the inverse of the Bayesian information, and for a Markov process
+the recursion of Tichavský, Muravchik and Nehorai (1998) carries that information from step to step. With Gaussian
+noises it is the recursion of an extended Kalman filter whose Jacobians are taken at the true state and whose
+covariances are those of the true world. What is known here is what the robot has: wheel angles, angular rate, the
+passes over seams, the fixes, and that wheels at rest stand. Nothing comes from an estimator's configuration.
+
+What is approximated:
+
+* the uniform distributions (slip of a leg, counts) count by their variance, as Gaussians;
+* the true way stands for the expectation over ways, one run for all runs with the same route;
+* the jitter of place and the curvature's transport of heading do not enter the Jacobians (1e-3 of their terms);
+* gravity is left out: with 2 degrees of noise on these slopes it says less of the heading than one pair of fixes;
+* the accelerometer is left out unless asked for: it measures the slip while the speed changes, and an estimator that
+  uses it can fall below the bound without;
+* the ``_SLOTS`` panel edges and tilts met last are remembered; one that is met again later counts as unknown.
+"""
+
+from collections import OrderedDict
+from collections.abc import Hashable
+from dataclasses import dataclass
+from math import exp, pi, sqrt
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from ccatp.config.models import Config, WorldConfig
+from ccatp.mirror.mirror import Mirror
+from ccatp.samples import PointId
+from ccatp.sim.disturbances import LEG_PAUSE_S, LEVEL_SLOPE
+from ccatp.studies import cramer_rao_record as way
+from ccatp.studies.cramer_rao_record import FloatArray, SeamPass, StopFix, TrueRecord
+
+(X, Y, PSI, BG, KG, BA, SR, SL, UR, UL, RR, RL, KL, C, ER, ER0, EL, EL0, J, J0, JA, JA0) = range(22)
+"""Order of the state.
+
+X, Y, PSI: pose. BG, KG, BA: gyroscope bias and scale, accelerometer bias. SR, SL: slip drawn for the leg. UR, UL: slip
+that wanders. RR, RL, KL: errors of the radii and of the base. C: wandering part of the creep. ER, EL: error of the
+measured wheel angle, ER0, EL0: a frame before. J, JA: jitter of the heading (rad) and of the speed's change (m/s^2),
+J0, JA0: a frame before.
+"""
+_OWN = 22
+_SLOTS = 12  # edges of the seams around one panel, and the tilts of two
+_STATES = _OWN + _SLOTS
+_UNIFORM = 1.0 / 12.0  # variance of a uniform distribution over one interval
+_Row = TypeVar("_Row", SeamPass, StopFix)
+
+_STILL_M = 1e-7  # a frame in which no wheel moves further is a frame at rest
+
+
+class StopBound(NamedTuple):
+    """The bound at one fix, before it is used.
+
+    Attributes:
+        t_s: time.
+        point: measured there, None where the fix was not for a point.
+        covariance_m2: bound of the covariance of (x, y), shape (2, 2).
+        heading_sigma_rad: bound of the heading's standard deviation.
+        error_m: what the estimator's error was there, (x, y).
+    """
+
+    t_s: float
+    point: PointId | None
+    covariance_m2: FloatArray
+    heading_sigma_rad: float
+    error_m: tuple[float, float]
+
+    @property
+    def rms_m(self) -> float:
+        """Bound of the root mean square distance between true and estimated position."""
+        return sqrt(float(np.trace(self.covariance_m2)))
+
+
+@dataclass(frozen=True, slots=True)
+class BoundSummary:
+    """All stops of a run.
+
+    Attributes:
+        stops: their number.
+        median_bound_m, rms_bound_m: median and root mean square of the bounds.
+        rms_error_m: root mean square of the estimator's errors.
+        ratio: root mean square of the errors in units of their own bound: 1 for an efficient estimator, but for the
+            scatter of a single run.
+    """
+
+    stops: int
+    median_bound_m: float
+    rms_bound_m: float
+    rms_error_m: float
+    ratio: float
+
+
+def summarise(bounds: list[StopBound]) -> BoundSummary:
+    """Figures over the stops, the first left out: until the second fix only the start errors count.
+
+    Raises:
+        ValueError: fewer than two stops.
+    """
+    if len(bounds) < 2:
+        raise ValueError(f"{len(bounds)} stops have no bound to speak of: survey at least two points")
+    kept = bounds[1:]
+    bound = np.array([stop.rms_m for stop in kept])
+    error = np.array([stop.error_m for stop in kept])
+    squares = np.array([e @ np.linalg.solve(s.covariance_m2, e) for e, s in zip(error, kept, strict=True)])
+    return BoundSummary(
+        len(kept),
+        float(np.median(bound)),
+        float(np.sqrt(np.mean(bound**2))),
+        float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
+        float(np.sqrt(np.mean(squares) / 2.0)),
+    )
+
+
+def bounds_of(cfg: Config, mirror: Mirror, record: TrueRecord, *, with_accelerometer: bool = False) -> list[StopBound]:
+    """The bound at each fix of a run.
+
+    Args:
+        cfg: the world's statistics and the robot's geometry.
+        mirror: the ideal mirror.
+        record: of the run.
+        with_accelerometer: count what it says of the slip, too.
+    """
+    return _Recursion(cfg, mirror, record, with_accelerometer).run()
+
+
+class _Wheels(NamedTuple):
+    """Travel of the body under its wheels per frame: right, left (m), forward (m), turn (rad), each shape (k,)."""
+
+    right: FloatArray
+    left: FloatArray
+    forward: FloatArray
+    turn: FloatArray
+    right_change: FloatArray
+    left_change: FloatArray
+
+
+class _Recursion:
+    """The covariance recursion along a record."""
+
+    def __init__(self, cfg: Config, mirror: Mirror, record: TrueRecord, with_accelerometer: bool) -> None:
+        world = cfg.world
+        self._cfg, self._world, self._record, self._with_accelerometer = cfg, world, record, with_accelerometer
+        self._sensors = cfg.robot.edge_sensors_m
+        self._radius_m, self._base_m = cfg.robot.wheel_radius_m, record.base_m
+        self._frame_s = 1.0 / cfg.sim.robot.frame_hz
+        self._wheels = _wheels_of(record, self._radius_m)
+        self._downhill = _downhill_of(mirror, record.way)
+        self._jitter_m = world.vibration_speed_m_s * self._frame_s / sqrt(2.0)
+        self._jitter_rad = world.vibration_rate_rad_s * self._frame_s / sqrt(2.0)
+        self._nuisance: OrderedDict[Hashable, int] = OrderedDict()
+        self._shift, self._fresh = _shift_of(world, cfg.sim.robot.encoder_hz, self._frame_s)
+        self._P = _start_of(world)
+        self._F = np.eye(_STATES)
+        self._ordered_s = -np.inf
+
+    def run(self) -> list[StopBound]:
+        record, wheels = self._record, self._wheels
+        passes = _by_frame(record.passes)
+        fixes = _by_frame(record.fixes)
+        still = (np.abs(wheels.right) < _STILL_M) & (np.abs(wheels.left) < _STILL_M)
+        resting = 0
+        found: list[StopBound] = []
+        for k in range(1, len(record.way)):
+            resting += bool(still[k])
+            if resting and (k in fixes or not still[k]):
+                self._rest(resting)
+                resting = 0
+            if not still[k]:
+                self._redraw_if_ordered(k)
+                self._advance(k)
+            for one in passes.get(k, ()):
+                self._cross(one)
+            for fix in fixes.get(k, ()):
+                found.append(self._bound(fix))
+                self._fix(fix)
+        return found
+
+    # -- motion -------------------------------------------------------------------------------------------------------
+
+    def _redraw_if_ordered(self, k: int) -> None:
+        row = self._record.way[k]
+        if not row[way.ORDERED]:
+            return
+        begun_s = float(row[way.T]) - self._frame_s
+        if begun_s - self._ordered_s >= LEG_PAUSE_S - 1e-6:
+            variance = (self._world.slip_max - self._world.slip_min) ** 2 * _UNIFORM
+            self._renew(SR, variance)
+            self._renew(SL, variance)
+        self._ordered_s = float(row[way.T])
+
+    def _advance(self, k: int) -> None:
+        """One frame in which the wheels turn, and what the inertial unit says at its end."""
+        self._P = self._shift.dot(self._P).dot(self._shift.T)
+        self._P.flat[:: _STATES + 1] += self._fresh
+        right, left, forward, turn, right_change, left_change = (float(values[k]) for values in self._wheels)
+        base_m, dt_s, radius_m = self._base_m, self._frame_s, self._radius_m
+        _, _, _, hx, hy, lx, ly, *_ = self._record.way[k].tolist()
+        gx, gy = self._downhill[k]
+        per_right = _per_parameter(right, radius_m, float(self._record.way[k, way.RIGHT_SCALE]))
+        per_left = _per_parameter(left, radius_m, float(self._record.way[k, way.LEFT_SCALE]))
+        # How forward way and turn depend on the parameters of each wheel, and the turn on the base.
+        ahead, swing = np.zeros(_STATES), np.zeros(_STATES)
+        for states, per, sign in ((_RIGHT_STATES, per_right, 1.0), (_LEFT_STATES, per_left, -1.0)):
+            ahead[states] = 0.5 * per
+            swing[states] = sign / base_m * per
+        swing[KL] = -turn
+        creep = self._world.creep_fraction if forward >= 0.0 else -self._world.creep_fraction
+        F = self._F
+        F[:3] = 0.0
+        F[X, X] = F[Y, Y] = F[PSI, PSI] = 1.0
+        F[X] += (hx + creep * gx) * ahead + 0.5 * forward * lx * swing
+        F[Y] += (hy + creep * gy) * ahead + 0.5 * forward * ly * swing
+        F[PSI] += swing
+        F[X, PSI] += forward * lx
+        F[Y, PSI] += forward * ly
+        F[X, C], F[Y, C] = abs(forward) * gx, abs(forward) * gy
+        rate = swing / dt_s
+        rate[BG], rate[KG] = 1.0, turn / dt_s
+        rate[J], rate[J0] = 1.0 / dt_s, -1.0 / dt_s
+        rows, variances = [rate], [self._world.gyroscope_sigma_rad_s**2]
+        if self._with_accelerometer:
+            rows.append(_acceleration_row(right_change, left_change, dt_s))
+            variances.append(self._world.accelerometer_sigma_m_s2**2)
+        # The rate's row refers to the parameters, which the motion leaves as they are, so it may follow it.
+        self._P = F.dot(self._P).dot(F.T)
+        for row, variance in zip(rows, variances, strict=True):
+            self._update(row, variance)
+
+    def _rest(self, frames: int) -> None:
+        """Frames at rest, taken together: slip wanders on, the inertial unit shows its biases."""
+        if not frames:
+            return
+        P, world, rest_s = self._P, self._world, frames * self._frame_s
+        for state, sigma, time_s in _wanderers(world):
+            keep = exp(-rest_s / time_s)
+            P[state, :] *= keep
+            P[:, state] *= keep
+            P[state, state] += sigma * sigma * (1.0 - keep * keep)
+        P[BG, BG] += world.gyroscope_bias_walk_rad_s_sqrt_s**2 * rest_s
+        P[BA, BA] += world.accelerometer_bias_walk_m_s2_sqrt_s**2 * rest_s
+        # A mean of differences of jitter: only the first and the last remain.
+        rate = np.zeros(_STATES)
+        rate[BG] = 1.0
+        jitter = 2.0 * (self._jitter_rad / rest_s) ** 2
+        self._update(rate, world.gyroscope_sigma_rad_s**2 / frames + jitter)
+        if self._with_accelerometer:
+            push = np.zeros(_STATES)
+            push[BA] = 1.0
+            self._update(push, world.accelerometer_sigma_m_s2**2 / frames + (_push_sigma(world) / frames) ** 2 * 2.0)
+
+    # -- measurements -------------------------------------------------------------------------------------------------
+
+    def _cross(self, one: SeamPass) -> None:
+        ahead, left = self._sensors[one.corner]
+        row = self._record.way[one.frame]
+        hx, hy, lx, ly = row[way.HX : way.LY + 1].tolist()
+        turned = ahead * (lx, ly)[one.axis] - left * (hx, hy)[one.axis]
+        moved_m = row[[way.X, way.Y]] - self._record.way[one.frame - 1][[way.X, way.Y]]
+        speed_m_s = (float(moved_m[one.axis]) + float(self._wheels.turn[one.frame]) * turned) / self._frame_s
+        H = np.zeros(_STATES)
+        H[X + one.axis], H[PSI] = 1.0, turned
+        H[self._slot(one.edge, self._world.panel_edge_sigma_m**2)] = -1.0
+        jitter = (self._jitter_rad * turned) ** 2 + (self._jitter_m * (hx, hy)[one.axis]) ** 2
+        self._update(H, (speed_m_s * one.interval_s) ** 2 * _UNIFORM + jitter)
+
+    def _bound(self, fix: StopFix) -> StopBound:
+        P, t_s = self._P, float(self._record.way[fix.frame, way.T])
+        return StopBound(t_s, fix.point, P[:2, :2].copy(), sqrt(float(P[PSI, PSI])), fix.error_m)
+
+    def _fix(self, fix: StopFix) -> None:
+        """Position of the puck's foot; the panel under it is tilted, and the puck stands above it."""
+        tilt = (self._cfg.robot.puck_height_m * self._cfg.sim.truth.tilt_sigma_rad) ** 2
+        H = np.zeros((2, _STATES))
+        H[0, X] = H[1, Y] = 1.0
+        H[0, self._slot(("tip", fix.panel), tilt)] = 1.0
+        H[1, self._slot(("tilt", fix.panel), tilt)] = 1.0
+        P = self._P
+        gain = np.linalg.solve(H.dot(P).dot(H.T) + fix.covariance_m2, H.dot(P)).T
+        keep = np.eye(_STATES) - gain.dot(H)
+        self._P = keep.dot(P).dot(keep.T) + gain.dot(fix.covariance_m2).dot(gain.T)
+
+    def _update(self, row: FloatArray, variance: float) -> None:
+        P = self._P
+        PH = P.dot(row)
+        P -= np.outer(PH / (float(row.dot(PH)) + variance), PH)
+
+    def _slot(self, key: Hashable, variance: float) -> int:
+        """The state of an edge or a tilt; a new one takes the place of the one that was used longest ago."""
+        known = self._nuisance
+        if key in known:
+            known.move_to_end(key)
+            return known[key]
+        state = _OWN + len(known) if len(known) < _SLOTS else known.popitem(last=False)[1]
+        known[key] = state
+        self._renew(state, variance)
+        return state
+
+    def _renew(self, state: int, variance: float) -> None:
+        self._P[state, :] = 0.0
+        self._P[:, state] = 0.0
+        self._P[state, state] = variance
+
+
+_RIGHT_STATES = [SR, UR, RR, ER, ER0]
+_LEFT_STATES = [SL, UL, RL, EL, EL0]
+
+
+def _per_parameter(travel_m: float, radius_m: float, scale: float) -> FloatArray:
+    """Change of a wheel's travel per unit of its slips, its radius error, and the errors of its two angles."""
+    nominal_m, m_per_rad = travel_m / scale, radius_m * scale
+    return np.array((-nominal_m, -nominal_m, travel_m, -m_per_rad, m_per_rad))
+
+
+def _acceleration_row(right_m_s2: float, left_m_s2: float, dt_s: float) -> FloatArray:
+    row = np.zeros(_STATES)
+    row[[SR, UR, RR]] = -0.5 * right_m_s2, -0.5 * right_m_s2, 0.5 * right_m_s2
+    row[[SL, UL, RL]] = -0.5 * left_m_s2, -0.5 * left_m_s2, 0.5 * left_m_s2
+    row[BA], row[JA], row[JA0] = 1.0, 1.0, -1.0
+    return row
+
+
+def _wheels_of(record: TrueRecord, radius_m: float) -> _Wheels:
+    rows, frame_s = record.way, float(record.way[1, way.T] - record.way[0, way.T])
+    zero = np.zeros(1)
+    right = np.concatenate([zero, np.diff(rows[:, way.RIGHT])]) * radius_m * rows[:, way.RIGHT_SCALE]
+    left = np.concatenate([zero, np.diff(rows[:, way.LEFT])]) * radius_m * rows[:, way.LEFT_SCALE]
+    changes = (np.concatenate([zero, np.diff(travel)]) / frame_s**2 for travel in (right, left))
+    return _Wheels(right, left, 0.5 * (right + left), (right - left) / record.base_m, *changes)
+
+
+def _downhill_of(mirror: Mirror, rows: FloatArray) -> FloatArray:
+    """Deck components of the unit vector downhill at each row, shape (k, 2)."""
+    gx, gy, gz = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
+    fx, fy = rows[:, way.FX], rows[:, way.FY]
+    along = (gz - fx * gx - fy * gy) / (1.0 + fx * fx + fy * fy)
+    tangent = np.column_stack([gx + along * fx, gy + along * fy, gz - along])
+    slope = np.sqrt(np.sum(tangent**2, axis=1))
+    unit: FloatArray = np.where(slope > LEVEL_SLOPE, 1.0 / np.maximum(slope, LEVEL_SLOPE), 0.0)[:, None] * tangent
+    return unit[:, :2]
+
+
+def _push_sigma(world: WorldConfig) -> float:
+    return world.vibration_acceleration_m_s2 / sqrt(2.0)
+
+
+def _count_variance(world: WorldConfig) -> float:
+    """Of an angle known to a count, rad^2."""
+    return (2.0 * pi / world.encoder_counts_per_rev) ** 2 * _UNIFORM
+
+
+def _wanderers(world: WorldConfig) -> tuple[tuple[int, float, float], ...]:
+    """State, stationary sigma and correlation time of what wanders."""
+    creep = world.creep_fraction * world.creep_walk_fraction
+    return (
+        (UR, world.slip_walk_sigma, world.slip_walk_time_s),
+        (UL, world.slip_walk_sigma, world.slip_walk_time_s),
+        (C, creep, world.creep_walk_time_s),
+    )
+
+
+def _shift_of(world: WorldConfig, encoder_hz: float, frame_s: float) -> tuple[FloatArray, FloatArray]:
+    """What a frame does to the parameters: transition (n, n) and the diagonal of its noise (n,)."""
+    S, fresh = np.eye(_STATES), np.zeros(_STATES)
+    for state, sigma, time_s in _wanderers(world):
+        keep = exp(-frame_s / time_s)
+        S[state, state], fresh[state] = keep, sigma * sigma * (1.0 - keep * keep)
+    fresh[BG] = world.gyroscope_bias_walk_rad_s_sqrt_s**2 * frame_s
+    fresh[BA] = world.accelerometer_bias_walk_m_s2_sqrt_s**2 * frame_s
+    counts = world.encoder_counts_per_rev
+    # A counted angle is wrong by a part of a count, whatever came before; a sum of noisy rates is wrong by all of them.
+    for state, before in ((ER, ER0), (EL, EL0)):
+        S[state, state] = S[before, before] = 0.0
+        S[before, state] = 1.0 if counts else 0.0
+        fresh[state] = _count_variance(world) if counts else world.encoder_sigma_rad_s**2 * frame_s / encoder_hz
+    for state, before, sigma in (
+        (J, J0, world.vibration_rate_rad_s * frame_s / sqrt(2.0)),
+        (JA, JA0, _push_sigma(world)),
+    ):
+        S[state, state] = S[before, before] = 0.0
+        S[before, state] = 1.0
+        fresh[state] = sigma * sigma
+    return S, fresh
+
+
+def _start_of(world: WorldConfig) -> FloatArray:
+    sigmas = np.zeros(_STATES)
+    sigmas[[X, Y]], sigmas[PSI] = world.start_position_sigma_m, world.start_heading_sigma_rad
+    sigmas[BG], sigmas[KG] = world.gyroscope_bias_sigma_rad_s, world.gyroscope_scale_sigma
+    sigmas[BA] = world.accelerometer_bias_sigma_m_s2
+    sigmas[[RR, RL]], sigmas[KL] = world.wheel_radius_sigma, world.wheel_base_sigma
+    if world.encoder_counts_per_rev:
+        sigmas[[ER, EL]] = sqrt(_count_variance(world))
+    for state, sigma, _ in _wanderers(world):
+        sigmas[state] = sigma
+    return np.diag(sigmas**2)
+
+
+def _by_frame(rows: tuple[_Row, ...]) -> dict[int, list[_Row]]:
+    found: dict[int, list[_Row]] = {}
+    for row in rows:
+        found.setdefault(row.frame, []).append(row)
+    return found

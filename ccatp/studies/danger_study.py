@@ -1,0 +1,163 @@
+"""Pure. The study `danger`: false edges and overrun of the thesis's edge rule and of the daemon's.
+
+A cell is a mirror (width of the gaps), a speed and a way of crossing: an angle to the seam's normal, or a quarter turn
+in place whose sensors move at that speed. Both rules judge the same transits; each stops its own drives to the rim.
+"""
+
+from collections.abc import Sequence
+from math import radians, sqrt
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ccatp.mirror.mirror import build_mirror
+from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
+from ccatp.studies.danger_drives import RULES, Errors, drive_to_rim, transit
+from ccatp.studies.danger_figures import draw_danger
+
+FloatArray = NDArray[np.float64]
+
+SPEEDS_M_S = (0.05, 0.10, 0.15, 0.20)
+CROSSINGS: tuple[int | str, ...] = (0, 15, 30, 45, 60, "turn")
+TURN = "turn"
+_DRIVES = 25  # of each kind in a job
+# What a good localizer gives the rules in a disturbed world.
+_ERRORS = Errors(position_m=1.5e-3, heading_rad=2e-3)
+_TRANSITS, _RIM = 3, 4  # streams of random numbers of a seed
+_Z_95 = 1.96  # quantiles of the normal distribution
+_RESAMPLES = 2000
+
+
+def cells() -> Sequence[Cell]:
+    """Speeds times ways of crossing; the engine crosses them with the mirrors."""
+    return [Cell({"speed_m_s": v_m_s, "crossing": way}) for v_m_s in SPEEDS_M_S for way in CROSSINGS]
+
+
+def run_job(job: Job) -> Outcome:
+    """So many transits, and as many drives to the rim for each rule."""
+    cfg, v_m_s, way = job.cfg, float(job.factors["speed_m_s"]), job.factors["crossing"]
+    mirror = build_mirror(cfg.mirror)
+    angle_rad = None if way == TURN else radians(float(way))
+    seed = cfg.run.seed
+    found = [
+        transit(mirror, cfg, v_m_s, angle_rad, _ERRORS, np.random.default_rng([seed, _TRANSITS, k]))
+        for k in range(_DRIVES)
+    ]
+    false_edges = np.sum(found, axis=0)
+    values: dict[str, Any] = {"transits": len(found)}
+    arrays: dict[str, FloatArray] = {}
+    for k, name in enumerate(RULES):
+        values[name] = {"false_edges": int(false_edges[k])}
+        if angle_rad is not None:
+            # The same draws for both rules: what differs is the rule.
+            drives = [
+                drive_to_rim(mirror, cfg, v_m_s, angle_rad, name, _ERRORS, np.random.default_rng([seed, _RIM, k]))
+                for k in range(_DRIVES)
+            ]
+            values[name]["falls"] = sum(drive.has_fallen for drive in drives)
+            arrays[f"{name}_overrun_m"] = np.array([drive.sensor_m for drive in drives])
+    return Outcome(values, arrays)
+
+
+def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
+    """Probability of a false edge per transit with its interval, and the distribution of the overrun."""
+    del factors
+    transits = sum(outcome.values["transits"] for outcome in outcomes)
+    values: dict[str, Any] = {"transits": transits}
+    arrays: dict[str, FloatArray] = {}
+    for name in RULES:
+        false_edges = sum(outcome.values[name]["false_edges"] for outcome in outcomes)
+        low, high = wilson(false_edges, transits)
+        values[name] = {
+            "false_edges": false_edges,
+            "false_edge_probability": false_edges / transits,
+            "false_edge_low": low,
+            "false_edge_high": high,
+        }
+        key = f"{name}_overrun_m"
+        kept = [outcome.arrays[key] for outcome in outcomes if key in outcome.arrays]
+        if kept:
+            arrays[key] = np.concatenate(kept)
+            values[name] |= _overrun_figures(arrays[key])
+            values[name]["falls"] = sum(outcome.values[name]["falls"] for outcome in outcomes)
+    return Outcome(values, arrays)
+
+
+def wilson(hits: int, of: int) -> tuple[float, float]:
+    """95 % interval of a probability after ``hits`` out of ``of`` (Wilson 1927); sensible for 0 hits, too.
+
+    Raises:
+        ValueError: no trials, or more hits than trials.
+    """
+    if not 0 <= hits <= of or of == 0:
+        raise ValueError(f"{hits} hits out of {of} trials have no probability: count again")
+    p, z2 = hits / of, _Z_95 * _Z_95
+    centre = (p + z2 / (2.0 * of)) / (1.0 + z2 / of)
+    half = _Z_95 / (1.0 + z2 / of) * sqrt(p * (1.0 - p) / of + z2 / (4.0 * of * of))
+    return max(centre - half, 0.0), min(centre + half, 1.0)
+
+
+def bootstrap(values: FloatArray, q: float) -> tuple[float, float]:
+    """95 % interval of a quantile by resampling with a fixed seed.
+
+    Args:
+        values: the sample, shape (k,).
+        q: the quantile, 0 to 1.
+    """
+    drawn = np.random.default_rng(0).choice(values, (_RESAMPLES, values.size))
+    low, high = np.quantile(np.quantile(drawn, q, axis=1), (0.025, 0.975)).tolist()
+    return low, high
+
+
+def _overrun_figures(overrun_m: FloatArray) -> dict[str, Any]:
+    low, high = bootstrap(overrun_m, 0.95)
+    return {
+        "overrun_mean_mm": 1e3 * float(np.mean(overrun_m)),
+        "overrun_p95_mm": 1e3 * float(np.quantile(overrun_m, 0.95)),
+        "overrun_p95_low_mm": 1e3 * low,
+        "overrun_p95_high_mm": 1e3 * high,
+        "overrun_max_mm": 1e3 * float(np.max(overrun_m)),
+        "drives": overrun_m.size,
+    }
+
+
+def draw(results: Sequence[CellResult], out: Path) -> None:
+    """Figures ``danger_false_edges_<mirror>`` and ``danger_overrun_<mirror>``."""
+    draw_danger(results, SPEEDS_M_S, CROSSINGS, out)
+
+
+def _columns() -> list[Column]:
+    columns = [
+        Column("mirror", "mirror"),
+        Column("speed, m/s", "speed_m_s", ".2f"),
+        Column("crossing, deg", "crossing"),
+        Column("transits", "transits"),
+    ]
+    for name in RULES:
+        columns += [
+            Column(f"{name}: false edges", f"{name}.false_edges"),
+            Column("per transit", f"{name}.false_edge_probability", ".3f"),
+            Column("95 % low", f"{name}.false_edge_low", ".3f"),
+            Column("high", f"{name}.false_edge_high", ".3f"),
+            Column("overrun mean, mm", f"{name}.overrun_mean_mm", ".1f"),
+            Column("95 % of drives, mm", f"{name}.overrun_p95_mm", ".1f"),
+            Column("max, mm", f"{name}.overrun_max_mm", ".1f"),
+            Column("falls", f"{name}.falls"),
+        ]
+    return columns
+
+
+STUDY = Study(
+    name="danger",
+    title="False edges and overrun of the thesis's edge rule and of the daemon's",
+    cells=cells,
+    run_job=run_job,
+    combine=combine,
+    columns=_columns(),
+    draw=draw,
+    defaults={"run.world": "hard"},
+    mirrors=("fyst-m1", "thesis-m1"),
+    runs=12,
+)

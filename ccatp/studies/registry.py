@@ -1,0 +1,46 @@
+"""Glue. THE table of studies: name, module, one line. A study is imported when it is asked for."""
+
+import difflib
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ccatp.config.models import Config
+from ccatp.studies.campaign import CampaignError, Study
+
+Analysis = Callable[[Config, Path], dict[str, Any]]
+"""A study without runs: a configuration and a directory, to what ``result.json`` holds."""
+
+
+class Entry(NamedTuple):
+    """A row: the module, the name in it of a ``Study`` or of an ``Analysis``, one line for the help."""
+
+    module: str
+    attribute: str
+    title: str
+
+
+STUDIES = {
+    "thesis": Entry("ccatp.studies.thesis_study", "STUDY", "the thesis's own simulation again, under several readings"),
+    "filters": Entry("ccatp.studies.filters_study", "STUDY", "filters in four worlds, over whole missions"),
+    "time": Entry("ccatp.studies.time_study", "STUDY", "order, speed and measuring time against the hour"),
+    "sensitivity": Entry("ccatp.studies.sensitivity_study", "STUDY", "what each disturbance of a hard world costs"),
+    "danger": Entry("ccatp.studies.danger_study", "STUDY", "false edges and overrun of two edge rules"),
+    "loops": Entry("ccatp.studies.loops", "run", "Bode plots, margins and root loci of the controllers"),
+}
+
+
+def find_study(name: str) -> Study | Analysis:
+    """The study of a name.
+
+    Raises:
+        CampaignError: there is none.
+    """
+    entry = STUDIES.get(name)
+    if entry is None:
+        near = difflib.get_close_matches(name, STUDIES, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(STUDIES)}"
+        raise CampaignError(f"no study {name!r}; {hint}")
+    found: Study | Analysis = getattr(import_module(entry.module), entry.attribute)
+    return found

@@ -1,0 +1,194 @@
+"""The Cramér-Rao bound against what linear regression finds in simulated draws, and on a run of the real chain."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.mirror.mirror import build_mirror
+from ccatp.samples import PanelId
+from ccatp.studies import cramer_rao_record as way
+from ccatp.studies.cramer_rao import StopBound, bounds_of, summarise
+from ccatp.studies.cramer_rao_record import SeamPass, StopFix, TrueRecord, rehearse_recorded
+
+HZ = 20.0
+REST, DRIVE = 20, 40  # frames
+LEG_M = 0.22
+PANEL = PanelId(5, 5)
+FIX_SIGMA_M = 1e-4
+EDGE_SIGMA_M = 3e-4
+TIMING_M = 2e-4  # of a sensor's place when it changes its value
+DRAWS = 6000
+
+
+def config(**world: object) -> Config:
+    """A world with slip and a gyroscope; everything else off unless asked for."""
+    values: dict[str, object] = {
+        "slip_min": 0.02, "slip_max": 0.04, "slip_walk_sigma": 0.005, "slip_walk_time_s": 1.0,
+        "gyroscope_sigma_rad_s": 0.002, "gyroscope_bias_sigma_rad_s": 0.01, "encoder_sigma_rad_s": 0.0,
+        "panel_edge_sigma_m": EDGE_SIGMA_M, **world,
+    }  # fmt: skip
+    overrides = {f"world.{key}": value for key, value in values.items()}
+    return load_config(
+        overrides={
+            "run.mirror": "thesis-m1", "run.world": "thesis", "sim.robot.frame_hz": HZ, "sim.truth.tilt_sigma_rad": 0.0,
+            **overrides,
+        }
+    )  # fmt: skip
+
+
+def straight(cfg: Config, *, sensor_passes: bool = False) -> TrueRecord:
+    """A rest with a fix at its end, a straight leg along the deck's x axis, a fix at its end."""
+    rows = np.zeros((1 + REST + DRIVE, way.COLUMNS))
+    rows[:, way.T] = np.arange(len(rows)) / HZ
+    rows[:, way.HX] = rows[:, way.LY] = 1.0
+    rows[:, way.RIGHT_SCALE] = rows[:, way.LEFT_SCALE] = 0.97
+    drive = slice(1 + REST, None)
+    rows[drive, way.ORDERED] = 1.0
+    turned = np.linspace(LEG_M / DRIVE, LEG_M, DRIVE) / (0.97 * cfg.robot.wheel_radius_m)
+    rows[drive, way.RIGHT] = rows[drive, way.LEFT] = turned
+    rows[drive, way.X] = np.linspace(LEG_M / DRIVE, LEG_M, DRIVE)
+    covariance = np.eye(2) * FIX_SIGMA_M**2
+    fixes = tuple(StopFix(k, None, PANEL, covariance, (0.0, 0.0)) for k in (REST, REST + DRIVE))
+    edge = (0, PANEL, True)
+    # One on either side, so that their levers count.
+    at = ((REST + DRIVE // 2, 0), (REST + DRIVE, 3))
+    interval_s = TIMING_M * np.sqrt(12.0) / (HZ * LEG_M / DRIVE)
+    passes = tuple(SeamPass(frame, corner, interval_s, 0, edge) for frame, corner in at) if sensor_passes else ()
+    return TrueRecord(rows, passes, fixes, cfg.robot.wheel_base_m)
+
+
+def walk(rng: np.random.Generator, sigma: float, time_s: float) -> np.ndarray:
+    keep = np.exp(-1.0 / (HZ * time_s))
+    values = np.empty((DRAWS, DRIVE))
+    x = sigma * rng.standard_normal(DRAWS)
+    for k in range(DRIVE):
+        x = keep * x + sigma * np.sqrt(1.0 - keep * keep) * rng.standard_normal(DRAWS)
+        values[:, k] = x
+    return values
+
+
+def drawn(cfg: Config, *, sensor_passes: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Final positions (draws, 2) and everything measured on the way (draws, m) of the same leg, all errors drawn."""
+    rng, world, base_m = np.random.default_rng(5), cfg.world, cfg.robot.wheel_base_m
+    x, y = world.start_position_sigma_m * rng.standard_normal((2, DRAWS))
+    psi = world.start_heading_sigma_rad * rng.standard_normal(DRAWS)
+    bias = world.gyroscope_bias_sigma_rad_s * rng.standard_normal(DRAWS)
+    gyro = world.gyroscope_sigma_rad_s
+    measured = [
+        x + FIX_SIGMA_M * rng.standard_normal(DRAWS),
+        y + FIX_SIGMA_M * rng.standard_normal(DRAWS),
+        bias + gyro / np.sqrt(REST) * rng.standard_normal(DRAWS),
+    ]
+    slips = [
+        rng.uniform(world.slip_min, world.slip_max, (DRAWS, 1))
+        + walk(rng, world.slip_walk_sigma, world.slip_walk_time_s)
+        for _ in range(2)
+    ]
+    wheel_m = LEG_M / DRIVE / 0.97
+    edge_m = EDGE_SIGMA_M * rng.standard_normal(DRAWS)
+    for k in range(DRIVE):
+        right, left = ((1.0 - slip[:, k]) * wheel_m for slip in slips)
+        turn = (right - left) / base_m
+        x = x + 0.5 * (right + left) * np.cos(psi + 0.5 * turn)
+        y = y + 0.5 * (right + left) * np.sin(psi + 0.5 * turn)
+        psi = psi + turn
+        measured.append(HZ * turn + bias + gyro * rng.standard_normal(DRAWS))
+        for at, ahead in ((DRIVE // 2, 0.09), (DRIVE, -0.09)):
+            if sensor_passes and k + 1 == at:
+                timing_m = TIMING_M * rng.standard_normal(DRAWS)
+                measured.append(x + ahead * np.cos(psi) - ahead * np.sin(psi) - edge_m + timing_m)
+    return np.column_stack([x, y]), np.column_stack(measured)
+
+
+def residual_covariance(wanted: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """What is left of ``wanted`` after the best linear guess from ``measured``."""
+    known = np.column_stack([np.ones(len(measured)), measured])
+    rest = wanted - known @ np.linalg.lstsq(known, wanted, rcond=None)[0]
+    covariance: np.ndarray = rest.T @ rest / (len(measured) - known.shape[1])
+    return covariance
+
+
+@pytest.mark.parametrize("sensor_passes", [False, True])
+def test_it_is_what_the_best_linear_estimate_leaves(sensor_passes: bool) -> None:
+    cfg = config()
+    bound = bounds_of(cfg, build_mirror(cfg.mirror), straight(cfg, sensor_passes=sensor_passes))[-1]
+    found = residual_covariance(*drawn(cfg, sensor_passes=sensor_passes))
+    # A variance out of 6000 draws is good to 1.8 %; the second order of the slip's difference adds as much.
+    assert np.diag(bound.covariance_m2) == pytest.approx(np.diag(found), rel=0.08)
+    expected, correlation = (c[0, 1] / np.sqrt(c[0, 0] * c[1, 1]) for c in (found, bound.covariance_m2))
+    assert correlation == pytest.approx(expected, abs=0.05)  # 6000 draws: 0.013
+
+
+def test_the_scatter_of_slip_is_the_floor_of_a_leg() -> None:
+    cfg = config(slip_walk_sigma=0.0, start_position_sigma_m=0.0, start_heading_sigma_rad=0.0)
+    bound = bounds_of(cfg, build_mirror(cfg.mirror), straight(cfg))[-1]
+    expected_m = LEG_M / 0.97 * 0.02 / np.sqrt(12.0) / np.sqrt(2.0)
+    assert np.sqrt(bound.covariance_m2[0, 0]) == pytest.approx(expected_m, rel=1e-3)  # the model is linear along x
+
+
+def test_less_noise_gives_a_lower_bound() -> None:
+    rms = []
+    for overrides in ({}, {"gyroscope_sigma_rad_s": 0.001}, {"slip_max": 0.03}, {"slip_walk_sigma": 0.0}):
+        cfg = config(**overrides)
+        rms.append(bounds_of(cfg, build_mirror(cfg.mirror), straight(cfg))[-1].rms_m)
+    assert all(value < rms[0] for value in rms[1:])
+
+
+def test_a_counted_angle_costs_a_part_of_a_count() -> None:
+    noiseless = {"slip_max": 0.02, "slip_walk_sigma": 0.0, "start_heading_sigma_rad": 0.0, "gyroscope_sigma_rad_s": 1.0}
+    plain, counted = (
+        bounds_of(cfg, build_mirror(cfg.mirror), straight(cfg))[-1].covariance_m2[0, 0]
+        for cfg in (config(**noiseless), config(**noiseless, encoder_counts_per_rev=1200))
+    )
+    count_m = 0.97 * 2.0 * np.pi / 1200.0 * 0.03
+    # Half a count's variance for the mean of two wheels, at the beginning of the leg and at its end.
+    assert counted - plain == pytest.approx(count_m**2 / 12.0, rel=0.02)  # the gyroscope says a little
+
+
+def test_the_accelerometer_can_only_help() -> None:
+    cfg = config(accelerometer_bias_sigma_m_s2=0.1)
+    record, mirror = straight(cfg), build_mirror(cfg.mirror)
+    without, with_it = (bounds_of(cfg, mirror, record, with_accelerometer=use)[-1].rms_m for use in (False, True))
+    assert with_it < without
+
+
+def test_one_stop_has_no_summary() -> None:
+    stop = StopBound(0.0, None, np.eye(2), 0.0, (0.0, 0.0))
+    with pytest.raises(ValueError, match=r"1 stops .* survey at least two points"):
+        summarise([stop])
+
+
+def test_a_summary_compares_errors_with_their_own_bounds() -> None:
+    stops = [StopBound(0.0, None, np.eye(2) * 1e-6 * k**2, 0.0, (k * 1e-3, -k * 1e-3)) for k in (9, 1, 2, 3)]
+    found = summarise(stops)
+    assert found.stops == 3
+    assert found.ratio == pytest.approx(1.0)
+    assert found.median_bound_m == pytest.approx(2e-3 * np.sqrt(2.0))
+
+
+@pytest.fixture(scope="module")
+def hard() -> tuple[Config, TrueRecord, Mapping[str, int]]:
+    cfg = load_config(
+        overrides={"run.mirror": "thesis-m1", "run.world": "hard", "run.filter": "ekf", "run.panels": 1, "run.seed": 3}
+    )
+    rehearsal, record = rehearse_recorded(cfg)
+    return cfg, record, rehearsal.counts
+
+
+def test_a_record_holds_the_whole_run(hard: tuple[Config, TrueRecord, Mapping[str, int]]) -> None:
+    _, record, counts = hard
+    assert np.diff(record.way[:, way.T]) == pytest.approx(0.01)
+    assert len(record.fixes) == counts["fixes"]
+    assert record.passes  # the base lies on another panel
+    assert len({one.edge for one in record.passes}) < len(record.passes)  # four sensors cross the same edge
+
+
+def test_an_estimator_does_not_beat_the_bound(hard: tuple[Config, TrueRecord, Mapping[str, int]]) -> None:
+    cfg, record, _ = hard
+    bounds = bounds_of(cfg, build_mirror(cfg.mirror), record)
+    found = summarise(bounds)
+    assert 0.5e-3 < found.median_bound_m < 3e-3  # the scatter of slip on legs of 0.22 and 0.245 m
+    assert found.ratio > 0.6  # eight stops: a chi-square of 16 degrees falls below half its mean once in 200 runs
