@@ -22,6 +22,7 @@ from ccatp.cli_frame import (
     overrides,
     run_command_line,
 )
+from ccatp.cli_study import study
 
 EMERGENCY_KINDS = ("fire", "earthquake", "power", "weather", "operator")
 
@@ -216,6 +217,9 @@ def sim_etalon(
         "run.seed": seed,
     }
     return int(run_alone(load_config(config_file, overrides(settings, named)), puck_world_m, truth))
+
+
+cli.add_command(study)
 
 
 @cli.command("map", epilog=example("ccatp map runs/20260101T000000Z-fyst-m1-s1 --out map.png"))

@@ -115,19 +115,20 @@ CONFIG_OPTION = click.option("--config", "config_file", type=click.Path(path_typ
 RUNTIME_DIR_OPTION = click.option(
     "--runtime-dir", type=click.Path(path_type=Path), help="Folder of the sockets, if not the usual one."
 )
+SETTINGS_OPTION = click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    callback=_settings,
+    metavar="KEY=VALUE",
+    help="Any key of the configuration, as in limits.v_max_m_s=0.05. May be repeated.",
+)
 WORLD_OPTIONS = options(
     CONFIG_OPTION,
     click.option("--mirror", metavar="NAME", help="fyst-m1, fyst-m2, thesis-m1, thesis-m2, or a .toml file."),
     click.option("--world", metavar="NAME", help="Simulated world: thesis, thesis-x2, or a .toml file."),
     click.option("--seed", type=int, metavar="N", help="Seed of every random draw."),
-    click.option(
-        "--set",
-        "settings",
-        multiple=True,
-        callback=_settings,
-        metavar="KEY=VALUE",
-        help="Any key of the configuration, as in limits.v_max_m_s=0.05. May be repeated.",
-    ),
+    SETTINGS_OPTION,
 )
 ADDRESS_OPTIONS = options(
     click.option("--host", help="Address to listen on."),

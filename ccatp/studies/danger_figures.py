@@ -12,6 +12,8 @@ from ccatp.studies.figures import colour, dress, new_figure, save
 
 _TITLES = {"thesis": "off for 0.1 s (thesis)", "shipped": "travel against the map (ours)"}
 
+_MARGIN_M_S = 0.02
+
 
 def draw_danger(
     results: Sequence[CellResult], speeds_m_s: Sequence[float], crossings: Sequence[int | str], out: Path
@@ -53,6 +55,7 @@ def _draw_false_edges(
         axes.set_title(_TITLES[rule], fontsize=10)
         axes.set_xlabel("speed of the robot, in turns of the sensors, m/s", fontsize=9)
         axes.set_xticks(list(speeds))
+        axes.set_xlim(min(speeds) - _MARGIN_M_S, max(speeds) + _MARGIN_M_S)
         axes.set_ylim(-0.03, 1.03)
     panels[0].set_ylabel("false edges per transit (95 %)", fontsize=9)
     figure.legend(
@@ -92,6 +95,7 @@ def _draw_overrun(
         axes.set_title(_TITLES[rule], fontsize=10)
         axes.set_xlabel("speed, m/s", fontsize=9)
         axes.set_xticks(list(speeds))
+        axes.set_xlim(min(speeds) - _MARGIN_M_S, max(speeds) + _MARGIN_M_S)
     panels[0].set_ylabel("furthest sensor beyond the rim, mm", fontsize=9)
     figure.legend(
         *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(angles), frameon=False, fontsize=8

@@ -129,12 +129,7 @@ def draw(results: Sequence[CellResult], out: Path) -> None:
 
 
 def _columns() -> list[Column]:
-    columns = [
-        Column("mirror", "mirror"),
-        Column("speed, m/s", "speed_m_s", ".2f"),
-        Column("crossing, deg", "crossing"),
-        Column("transits", "transits"),
-    ]
+    columns = [Column("transits", "transits")]
     for name in RULES:
         columns += [
             Column(f"{name}: false edges", f"{name}.false_edges"),

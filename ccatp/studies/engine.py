@@ -18,24 +18,13 @@ from threading import Thread
 from typing import Any
 
 from ccatp.errors import CcatpError
-from ccatp.studies.campaign import (
-    WHOLE,
-    CampaignError,
-    CellResult,
-    Job,
-    Load,
-    Outcome,
-    Shard,
-    Study,
-    cells_of,
-    jobs_of,
-)  # fmt: skip
+from ccatp.studies.campaign import CampaignError, CellResult, Job, Load, Outcome, Study
 from ccatp.studies.ledger import Ledger
+from ccatp.studies.plan import WHOLE, Shard, cells_of, jobs_of
 from ccatp.studies.progress import CampaignView
 from ccatp.studies.results import write_results
+from ccatp.studies.threads import limit_threads
 
-# Matrices are small: threads of the linear algebra cost more than they bring, and fight the workers for the cores.
-THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _CLUSTER_TIMEOUT_S = 20.0
 
 
@@ -67,12 +56,6 @@ class CampaignOptions:
     settings: Mapping[str, object] = field(default_factory=dict)
     with_figures: bool = True
     is_quiet: bool = False
-
-
-def limit_threads() -> None:
-    """One thread for the linear algebra of this process and its children; works before numpy is imported."""
-    for name in THREADS:
-        os.environ.setdefault(name, "1")
 
 
 def run_campaign(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
@@ -109,9 +92,7 @@ def _cell(study: Study, jobs: Sequence[Job], outcomes: Sequence[Outcome | None])
     return CellResult(jobs[0].factors, {"runs": len(there), **values}, arrays)
 
 
-def _run_jobs(
-    study: Study, jobs: Sequence[Job], ledger: Ledger, view: CampaignView, options: CampaignOptions
-) -> None:
+def _run_jobs(study: Study, jobs: Sequence[Job], ledger: Ledger, view: CampaignView, options: CampaignOptions) -> None:
     if not jobs:
         return
     if options.cluster is None and options.workers == 1:
@@ -187,11 +168,13 @@ def _cluster(address: str) -> Iterator[Executor]:
     except ImportError as error:
         raise CampaignError("--cluster needs distributed: install ccatp[cluster]") from error
     try:
-        client = Client(address, timeout=_CLUSTER_TIMEOUT_S, set_as_default=False)
+        client = Client(address, timeout=_CLUSTER_TIMEOUT_S, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
-        raise CampaignError(f"--cluster {address}: no scheduler answers there ({error}); start one, or correct the address") from error
+        raise CampaignError(
+            f"--cluster {address}: no scheduler answers there ({error}); start one, or correct the address"
+        ) from error
     with client:
-        executor = client.get_executor(pure=False)
+        executor = client.get_executor(pure=False)  # type: ignore[no-untyped-call]
         try:
             yield executor
         finally:

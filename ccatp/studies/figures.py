@@ -1,4 +1,4 @@
-"""Edge. The look that the figures of the studies share. Needs the extra ``plots`` (matplotlib), imported when drawing."""
+"""Edge. The look of the studies' figures. Needs the extra ``plots`` (matplotlib), imported when something is drawn."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -38,7 +38,7 @@ def dress(*panels: "Axes") -> None:
     for axes in panels:
         axes.grid(True, which="major", color=GRID, linewidth=0.6)
         axes.set_axisbelow(True)
-        axes.tick_params(labelsize=8, color=QUIET, labelcolor=INK)
+        axes.tick_params(which="both", labelsize=8, color=QUIET, labelcolor=INK)
         axes.title.set_fontsize(9)
         for label in (axes.xaxis.label, axes.yaxis.label):
             label.set_fontsize(9)

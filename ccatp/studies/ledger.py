@@ -16,7 +16,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ccatp.studies.campaign import WHOLE, Arrays, CampaignError, Job, Outcome, Shard, plain
+from ccatp.studies.campaign import Arrays, CampaignError, Job, Outcome, plain
+from ccatp.studies.plan import WHOLE, Shard
 
 PATTERN = "jobs*.jsonl"
 
@@ -43,7 +44,9 @@ class Ledger:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             self._file.close()
-            raise CampaignError(f"{out / name}: another campaign writes there; wait for it or choose another --out") from error
+            raise CampaignError(
+                f"{out / name}: another campaign writes there; wait for it or choose another --out"
+            ) from error
         _cut_torn_line(self._file)
         for folder in (out, *others):
             self._read_all(folder)

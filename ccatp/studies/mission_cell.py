@@ -52,7 +52,10 @@ def combine_missions(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
         },
         "counts": {name: sum(v["counts"].get(name, 0) for v in values) for name in values[0]["counts"]},
     }
-    arrays: dict[str, NDArray[Any]] = {**everywhere.to_arrays("localization"), **afterwards.to_arrays("localization_later")}
+    arrays: dict[str, NDArray[Any]] = {
+        **everywhere.to_arrays("localization"),
+        **afterwards.to_arrays("localization_later"),
+    }
     return Outcome(figures, {**arrays, "stops": np.column_stack([_runs(outcomes), stops])})
 
 
@@ -75,9 +78,10 @@ def of_spread(spread: Spread) -> dict[str, Any]:
     """The same of a pooled spread."""
     if not spread.count:
         return of_values(np.empty(0))
-    figures = {"mean": spread.mean, **{n: spread.quantile(q) for n, q in (("p50", 0.5), ("p99", 0.99), ("p99_9", 0.999))}}
+    shares = {"p50": 0.5, "p99": 0.99, "p99_9": 0.999}
+    quantiles = {name: _mm(spread.quantile(share)) for name, share in shares.items()}
     within = round(spread.within / spread.count, 6)
-    return {**{n: _mm(v) for n, v in figures.items()}, "max": _mm(spread.largest), "within_10mm_fraction": within}
+    return {"mean": _mm(spread.mean), **quantiles, "max": _mm(spread.largest), "within_10mm_fraction": within}
 
 
 def stop_errors(rows: FloatArray) -> dict[str, Any]:
@@ -108,7 +112,7 @@ def nees(rows: FloatArray, states: int) -> FloatArray:
 
 
 def nees_figures(rows: FloatArray) -> dict[str, Any]:
-    """Means (3 and 2 are consistent) and the share of stops within the 95 % bound of chi-square, for pose and position."""
+    """Means (3 and 2 are consistent) and the share of stops within the 95 % bound, for pose and position."""
     figures: dict[str, Any] = {}
     for name, states in (("pose", 3), ("position", 2)):
         found = nees(rows, states)
@@ -134,7 +138,8 @@ def after_corrections(runs: Sequence[FloatArray]) -> dict[str, Any]:
     last = np.concatenate(lasts)
     if not len(last):
         return {"max": None, "true_max": None}
-    return {"max": _mm(np.nanmax(last[:, COLUMN["fix_distance_m"]])), "true_max": _mm(last[:, COLUMN["distance_m"]].max())}
+    seen_m, true_m = (last[:, COLUMN[name]].max() for name in ("fix_distance_m", "distance_m"))
+    return {"max": _mm(seen_m), "true_max": _mm(true_m)}
 
 
 def times(values: Sequence[Any]) -> dict[str, Any]:

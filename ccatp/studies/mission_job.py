@@ -1,4 +1,4 @@
-"""Pure. The job that most studies share: one whole mission, and what it says about estimates, stops, time and danger."""
+"""Pure. The job that most studies share: a mission, and what it says about estimates, stops, time and danger."""
 
 from typing import Any
 

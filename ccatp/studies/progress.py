@@ -22,6 +22,7 @@ class CampaignView:
         """Say what is to do."""
         self._name, self._todo, self._count, self._told = name, todo, 0, 0
         self._console = Console(stderr=True, highlight=False, quiet=is_quiet)
+        self._is_live = self._console.is_terminal and todo > 0
         self._began_s = time.monotonic()
         self._progress = Progress(
             TextColumn("{task.description}"),
@@ -35,24 +36,26 @@ class CampaignView:
         self._say(f"study {name}: {todo} jobs to do{already}")
 
     def __enter__(self) -> "CampaignView":
-        if self._console.is_terminal and self._todo:
+        if self._is_live:
             self._progress.start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._progress.stop()
+        if self._is_live:
+            self._progress.stop()
 
     def done(self, key: str) -> None:
         """One more job is done."""
         self._count += 1
         left = time_left(time.monotonic() - self._began_s, self._count, self._todo)
-        if self._console.is_terminal:
+        if self._is_live:
             self._progress.update(self._task, completed=self._count, left=left)
             return
         tenths = 10 * self._count // self._todo
         if tenths > self._told:
             self._told = tenths
-            self._say(f"study {self._name}: {self._count} of {self._todo} jobs ({10 * tenths} %), {left}; last {key}")
+            share = f"{self._count} of {self._todo} jobs ({100 * self._count // self._todo} %)"
+            self._say(f"study {self._name}: {share}, {left}; last {key}")
 
     def end(self, missing: int, total: int, out: Path) -> None:
         """Say what there is now."""

@@ -1,0 +1,106 @@
+"""Glue. The command ``ccatp study``."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ccatp.cli_frame import CONFIG_OPTION, SETTINGS_OPTION, example, overrides
+
+
+class _StudyCommand(click.Command):
+    """A command whose help lists the studies, from their table, when it is asked for."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The studies, and the examples."""
+        from ccatp.studies.registry import STUDIES
+
+        with formatter.section("Studies"):
+            formatter.write_dl([(name, entry.title) for name, entry in STUDIES.items()])
+        super().format_epilog(ctx, formatter)
+
+
+@click.command(
+    cls=_StudyCommand,
+    epilog=example(
+        "ccatp study filters --runs 20 --out studies/filters",
+        "ccatp study filters --only world=hard,extreme --only filter=ekf --out studies/ekf",
+        "ccatp study time --mirror fyst-m1 --mirror fyst-m2 --out studies/time",
+    ),
+)
+@click.argument("name", metavar="NAME")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="Where to write, studies/NAME if not given; a campaign that was stopped goes on there.",
+)
+@click.option(
+    "--runs", type=click.IntRange(min=1), metavar="N", help="Seeds of each cell; else the study's own number."
+)
+@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes; one for each core if not given.")
+@click.option("--cluster", metavar="ADDRESS", help="Scheduler of dask.distributed that does the jobs instead.")
+@click.option("--shard", metavar="I/N", help="Only every N-th job, from the I-th on; without it all are put together.")
+@click.option(
+    "--from",
+    "others",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Take over the jobs that are done there. May be repeated.",
+)
+@click.option("--only", multiple=True, metavar="FACTOR=LEVEL[,LEVEL]", help="Only these cells. May be repeated.")
+@click.option("--mirror", "mirrors", multiple=True, metavar="NAME", help="In place of the study's. May be repeated.")
+@click.option("--panels", type=int, metavar="N", help="Only the first N panels of the traversal; 0 takes all.")
+@click.option("--seed", type=int, metavar="N", help="Seed of the first run.")
+@CONFIG_OPTION
+@SETTINGS_OPTION
+@click.option("--no-figures", is_flag=True, help="Tables only; needs no matplotlib.")
+@click.option("--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there.")
+def study(
+    name: str, out: Path | None, runs: int | None, workers: int | None, cluster: str | None, shard: str | None,
+    others: Sequence[Path], only: Sequence[str], mirrors: Sequence[str], panels: int | None, seed: int | None,
+    config_file: Path | None, settings: Mapping[str, object], no_figures: bool, json_output: bool,
+) -> int:  # fmt: skip
+    """Run the study NAME: many missions or an analysis, with tables, figures and a machine-readable result."""
+    from ccatp.studies.threads import limit_threads
+
+    limit_threads()  # before numpy is imported
+    from ccatp.config.loader import load_config
+    from ccatp.studies.campaign import CampaignError, Study
+    from ccatp.studies.engine import CampaignOptions, run_campaign
+    from ccatp.studies.plan import WHOLE, parse_choice, parse_shard
+    from ccatp.studies.registry import find_study
+
+    out = out or Path("studies") / name
+    given = overrides(settings, {"run.panels": panels, "run.seed": seed})
+    found = find_study(name)
+    if isinstance(found, Study):
+        options = CampaignOptions(
+            out=out,
+            runs=runs,
+            workers=workers,
+            cluster=cluster,
+            shard=parse_shard(shard) if shard else WHOLE,
+            others=tuple(others),
+            mirrors=tuple(mirrors),
+            only=dict(parse_choice(text) for text in only),
+            settings=given,
+            with_figures=not no_figures,
+        )
+        result = run_campaign(found, lambda keys: load_config(config_file, keys), options)
+    else:
+        idle = {"--runs": runs, "--cluster": cluster, "--shard": shard, "--from": others, "--only": only}
+        if surplus := [option for option, value in idle.items() if value]:
+            raise CampaignError(f"study {name} has no runs; leave {surplus[0]} out")
+        if len(mirrors) > 1:
+            raise CampaignError(f"study {name} takes one --mirror")
+        result = found(load_config(config_file, {**given, **({"run.mirror": mirrors[0]} if mirrors else {})}), out)
+    _tell(result, out, json_output)
+    return 0
+
+
+def _tell(result: dict[str, Any], out: Path, json_output: bool) -> None:
+    click.echo(json.dumps(result) if json_output else (out / "table.md").read_text(encoding="utf-8").rstrip())

@@ -1,0 +1,157 @@
+"""Pure. The study `thesis`: its five runs of 36 waypoints under four readings of its text, beside its own figures.
+
+The readings are the parameters of ``thesis_replica``; a cell with one of them off shows what that one does. The cells
+of the system ``ours`` are the same waypoints and the same noise with the daemon's own filter and control.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
+from ccatp.studies.mission_cell import of_spread, of_values
+from ccatp.studies.spread import Spread, pooled
+from ccatp.studies.thesis_figures import draw_thesis
+from ccatp.studies.thesis_replica import LIMIT_M, NOISES, POINTS, overrides_of, run_replica
+
+SYSTEMS = ("thesis", "ours")
+# Thesis 2.3.2 (one run for each noise) and 3.5 (five runs each): share below 1 cm, mean, largest, mm.
+PUBLISHED: dict[str, dict[str, dict[str, float]]] = {
+    "normal": {
+        "localization": {"within_10mm_fraction": 0.9621, "mean": 3.4, "max": 18.1},
+        "waypoint": {"within_10mm_fraction": 0.8889, "mean": 6.4, "max": 14.9},
+    },
+    "twice": {
+        "localization": {"within_10mm_fraction": 0.925, "mean": 3.9, "max": 31.7},
+        "waypoint": {"within_10mm_fraction": 0.8333, "mean": 7.1, "max": 42.9},
+    },
+}
+QUANTITIES = ("localization", "waypoint")
+_TRACK_STEP = 2  # a fifth of a second between points of the drawn track
+_SPREADS = 2.0  # a published figure this many standard deviations of a run away lies outside the spread
+
+
+def cells() -> Sequence[Cell]:
+    """Readings times noise for the thesis's system; for ours, which has no period error, noise and its reading."""
+    found = [
+        _cell("thesis", noise, is_variance, is_slow)
+        for is_variance, is_slow, noise in product((True, False), (True, False), NOISES)
+    ]
+    return found + [_cell("ours", noise, is_variance, False) for is_variance, noise in product((True, False), NOISES)]
+
+
+def _cell(system: str, noise: str, noise_is_variance: bool, period_error: bool) -> Cell:
+    return Cell(
+        {"system": system, "noise": noise, "noise_is_variance": noise_is_variance, "period_error": period_error},
+        overrides_of(noise, noise_is_variance=noise_is_variance, period_error=period_error, is_ours=system == "ours"),
+    )
+
+
+def run_job(job: Job) -> Outcome:
+    """One simulation run."""
+    run = run_replica(job.cfg, period_error=bool(job.factors["period_error"]))
+    values = {
+        "outcome": run.outcome,
+        "cause": run.cause,
+        "waypoints": run.waypoint_m.size,
+        "time_s": float(run.track[-1, 0]) if run.track.size else 0.0,
+        "localization": _of_run(run.localization_m),
+        "waypoint": _of_run(run.waypoint_m),
+    }
+    arrays: dict[str, NDArray[Any]] = {
+        "waypoint_m": run.waypoint_m,
+        "track": run.track[::_TRACK_STEP].astype(np.float32),
+        **Spread.of(run.localization_m, LIMIT_M).to_arrays("localization"),
+    }
+    return Outcome(values, arrays)
+
+
+def _of_run(errors_m: NDArray[np.float64]) -> dict[str, float]:
+    if not errors_m.size:
+        return {"within_10mm_fraction": float("nan"), "mean": float("nan"), "max": float("nan")}
+    return {
+        "within_10mm_fraction": float(np.mean(errors_m < LIMIT_M)),
+        "mean": 1e3 * float(np.mean(errors_m)),
+        "max": 1e3 * float(np.max(errors_m)),
+    }
+
+
+def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
+    """Pooled figures, their scatter from run to run, and the published ones beside them."""
+    values = [outcome.values for outcome in outcomes]
+    waypoint_m = np.concatenate([outcome.arrays["waypoint_m"] for outcome in outcomes])
+    localization = pooled([Spread.from_arrays(dict(outcome.arrays), "localization") for outcome in outcomes])
+    figures: dict[str, Any] = {
+        "complete": sum(v["outcome"] == "complete" and v["waypoints"] == POINTS for v in values),
+        "causes": sorted({v["cause"] for v in values if v["cause"]}),
+        "time_s": float(np.mean([v["time_s"] for v in values])),
+        "localization_error_mm": of_spread(localization),
+        "arrival_error_mm": of_values(waypoint_m),
+    }
+    published = PUBLISHED[str(factors["noise"])]
+    for quantity in QUANTITIES:
+        figures[quantity] = _beside(published[quantity], [v[quantity] for v in values])
+    arrays: dict[str, NDArray[Any]] = {
+        "waypoint_m": waypoint_m,
+        "track": outcomes[0].arrays["track"],
+        **localization.to_arrays("localization"),
+    }
+    return Outcome(figures, arrays)
+
+
+def _beside(published: Mapping[str, float], runs: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    """Mean and scatter of single runs for each figure, and how many scatters away the published one lies."""
+    found: dict[str, Any] = {"published": dict(published)}
+    for name, theirs in published.items():
+        ours = np.array([run[name] for run in runs])
+        mean = float(np.mean(ours))
+        spread = float(np.std(ours, ddof=1)) if ours.size > 1 else float("nan")
+        away = (theirs - mean) / spread if spread > 0.0 else float("nan")
+        found[name] = {
+            "mean": mean,
+            "run_to_run": spread,
+            "least": float(np.min(ours)),
+            "largest": float(np.max(ours)),
+            "published_minus_mean_in_spreads": away,
+            "is_published_within": bool(abs(away) <= _SPREADS) if np.isfinite(away) else None,
+        }
+    return found
+
+
+def draw(results: Sequence[CellResult], out: Path) -> None:
+    """Figures like 2.9 to 2.12, 3.10 and 3.11 of the thesis."""
+    draw_thesis(results, PUBLISHED, out)
+
+
+def _columns() -> list[Column]:
+    columns = [Column("complete", "complete")]
+    for quantity in QUANTITIES:
+        for name, heading, spec in (
+            ("within_10mm_fraction", "< 1 cm", ".3f"),
+            ("mean", "mean, mm", ".2f"),
+            ("max", "max, mm", ".1f"),
+        ):
+            columns += [
+                Column(f"{quantity} {heading}", f"{quantity}.{name}.mean", spec),
+                Column("± run", f"{quantity}.{name}.run_to_run", spec),
+                Column("published", f"{quantity}.published.{name}", spec),
+            ]
+        columns.append(Column("within", f"{quantity}.within_10mm_fraction.is_published_within"))
+    return columns
+
+
+STUDY = Study(
+    name="thesis",
+    title="The thesis's own simulation again, under several readings",
+    cells=cells,
+    run_job=run_job,
+    combine=combine,
+    columns=_columns(),
+    draw=draw,
+    mirrors=(),
+    runs=5,
+)

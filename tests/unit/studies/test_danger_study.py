@@ -1,0 +1,168 @@
+"""Edge rules over seams and at the rim: what the study `danger` counts."""
+
+from math import radians
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.samples import EdgeSample
+from ccatp.studies.campaign import CellResult, Job, Outcome
+from ccatp.studies.danger_drives import (
+    OFF_S,
+    RULES,
+    Errors,
+    Frame,
+    OffTimeRule,
+    build_rule,
+    drive_to_rim,
+    transit,
+)
+from ccatp.studies.danger_study import bootstrap, cells, combine, draw, run_job, wilson
+from ccatp.wire.topics import Estimate
+
+ERRORS = Errors(1e-3, 2e-3)
+NOWHERE = Estimate(seq=0, t_s=0.0, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-3, state="driving")
+
+
+def loaded(mirror: str, world: str = "thesis") -> tuple[Config, Mirror]:
+    cfg = load_config(overrides={"run.mirror": mirror, "run.world": world})
+    return cfg, build_mirror(cfg.mirror)
+
+
+def judged(pattern: str) -> bool:
+    """The thesis's rule on the front-left sensor's values, one per millisecond."""
+    rule = OffTimeRule(OFF_S)
+    samples = [EdgeSample(1e-3 * k, int(value), 1, 1, 1) for k, value in enumerate(pattern)]
+    return any(rule.judge(Frame(k, s.t_s, [], [s]), NOWHERE) for k, s in enumerate(samples))
+
+
+@pytest.mark.parametrize(
+    ("pattern", "is_edge"),
+    [
+        ("1" + "0" * 100, False),
+        ("1" + "0" * 102, True),
+        ("1" + "0" * 90 + "1" + "0" * 90, False),  # back on in between: the time begins anew
+    ],
+)
+def test_the_thesis_counts_the_time_that_one_sensor_is_off(pattern: str, is_edge: bool) -> None:
+    assert judged(pattern) is is_edge
+
+
+def test_an_unknown_rule_is_refused() -> None:
+    cfg, mirror = loaded("thesis-m1")
+    with pytest.raises(ValueError, match="no edge rule is called 'none': take one of thesis, shipped"):
+        build_rule("none", mirror, cfg, OFF_S)
+
+
+@pytest.mark.parametrize(
+    ("mirror_name", "v_m_s", "angle_deg", "expected"),
+    [
+        ("fyst-m1", 0.10, 0.0, (False, False)),  # 1.2 mm take 12 ms
+        ("thesis-m1", 0.05, 0.0, (True, False)),  # 10 mm take 0.2 s
+        ("thesis-m1", 0.20, 0.0, (False, False)),  # 50 ms
+        ("thesis-m1", 0.10, 60.0, (True, False)),  # 20 mm on the way
+    ],
+)
+def test_a_seam_is_an_edge_for_a_rule_that_counts_time(
+    mirror_name: str, v_m_s: float, angle_deg: float, expected: tuple[bool, bool]
+) -> None:
+    cfg, mirror = loaded(mirror_name, "hard")
+    found = transit(mirror, cfg, v_m_s, radians(angle_deg), ERRORS, np.random.default_rng(1))
+    assert found == expected
+
+
+def test_a_turn_in_place_sweeps_over_the_gap() -> None:
+    cfg, mirror = loaded("thesis-m1", "hard")
+    found = [transit(mirror, cfg, 0.05, None, ERRORS, np.random.default_rng(seed)) for seed in range(6)]
+    thesis, ours = np.sum(found, axis=0)
+    assert thesis > 0
+    assert ours == 0
+
+
+@pytest.mark.parametrize("v_m_s", [0.05, 0.10])
+def test_a_drive_ends_after_threshold_and_run_down(v_m_s: float) -> None:
+    cfg, mirror = loaded("fyst-m1")
+    found = drive_to_rim(mirror, cfg, v_m_s, 0.0, "thesis", ERRORS, np.random.default_rng(2))
+    expected_m = v_m_s * (OFF_S + cfg.sim.robot.wheel_lag_s)
+    # The verdict waits for the end of its frame, at most 10 ms, and one sample; 5 % for the slope of the surface.
+    assert 0.95 * expected_m < found.sensor_m < expected_m + v_m_s * 0.012
+    assert not found.has_fallen
+
+
+def test_the_delay_of_the_link_lets_it_go_further() -> None:
+    cfg, mirror = loaded("fyst-m1")
+    late = cfg.model_copy(update={"world": cfg.world.model_copy(update={"commands_delay_s": 0.1})})
+    near, far = (
+        drive_to_rim(mirror, one, 0.1, 0.0, "shipped", ERRORS, np.random.default_rng(3)).sensor_m for one in (cfg, late)
+    )
+    assert far - near == pytest.approx(0.01, abs=2e-4)  # 0.1 s at 0.1 m/s, on a surface that slopes by up to 10 %
+
+
+def test_blind_drives_fall() -> None:
+    cfg, mirror = loaded("fyst-m1")
+    late = cfg.model_copy(update={"world": cfg.world.model_copy(update={"commands_delay_s": 1.0})})
+    assert drive_to_rim(mirror, late, 0.2, 0.0, "thesis", ERRORS, np.random.default_rng(3)).has_fallen
+
+
+def test_wilson_is_that_of_the_tables() -> None:
+    assert wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
+    assert wilson(10, 20) == pytest.approx((0.2993, 0.7007), abs=1e-4)
+
+
+@pytest.mark.parametrize(("hits", "of"), [(1, 0), (3, 2), (-1, 5)])
+def test_impossible_counts_have_no_probability(hits: int, of: int) -> None:
+    with pytest.raises(ValueError, match=f"{hits} hits out of {of} trials .* count again"):
+        wilson(hits, of)
+
+
+def test_the_interval_of_a_quantile_holds_it_and_is_reproducible() -> None:
+    values = np.random.default_rng(4).normal(10.0, 1.0, 400)
+    low, high = bootstrap(values, 0.95)
+    assert low < 11.645 < high  # the quantile of the normal distribution
+    assert high - low < 1.0
+    assert bootstrap(values, 0.95) == (low, high)
+
+
+def outcome(false_edges: int, overrun_m: list[float]) -> Outcome:
+    figures = {"false_edges": false_edges, "falls": 1}
+    arrays = {f"{name}_overrun_m": np.array(overrun_m) for name in RULES}
+    return Outcome({"transits": 10, **dict.fromkeys(RULES, figures)}, arrays)
+
+
+def test_a_cell_pools_its_jobs() -> None:
+    values, arrays = combine({}, [outcome(2, [0.01, 0.02]), outcome(4, [0.03, 0.04])])
+    assert values["transits"] == 20
+    assert values["thesis"]["false_edge_probability"] == pytest.approx(0.3)
+    assert values["shipped"]["overrun_mean_mm"] == pytest.approx(25.0)
+    assert values["shipped"]["overrun_max_mm"] == pytest.approx(40.0)
+    assert values["shipped"]["falls"] == 2
+    assert arrays["thesis_overrun_m"].tolist() == [0.01, 0.02, 0.03, 0.04]
+
+
+def test_a_job_is_a_function_of_its_seed() -> None:
+    cfg, _ = loaded("fyst-m1", "hard")
+    job = Job("danger", {"mirror": "fyst-m1", "speed_m_s": 0.2, "crossing": 0}, cfg.run.seed, cfg)
+    first, again = run_job(job), run_job(job)
+    other = run_job(
+        Job("danger", job.factors, 9, cfg.model_copy(update={"run": cfg.run.model_copy(update={"seed": 9})}))
+    )
+    key = "shipped_overrun_m"
+    assert first.values == again.values
+    assert (first.arrays[key] == again.arrays[key]).all()
+    assert not (first.arrays[key] == other.arrays[key]).all()
+
+
+def test_turns_have_no_overrun_and_every_cell_can_be_drawn(tmp_path: Path) -> None:
+    results = []
+    for cell in cells():
+        made = outcome(1, [0.01, 0.02])
+        pooled = combine(cell.factors, [Outcome(made.values) if cell.factors["crossing"] == "turn" else made])
+        assert ("overrun_mean_mm" in pooled.values["thesis"]) is (cell.factors["crossing"] != "turn")
+        results.append(CellResult({"mirror": "fyst-m1", **cell.factors}, pooled.values, pooled.arrays))
+    draw(results, tmp_path)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {"danger_false_edges_fyst-m1.png", "danger_overrun_fyst-m1.pdf"} <= names
