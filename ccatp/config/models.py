@@ -91,13 +91,27 @@ class ControlConfig(Model):
     settle_rate_rad_s: Positive
     settle_time_s: NonNegative
     settle_mean_time_s: Positive
+    predicts_delay: bool
+    compensates_creep: bool
     leg_timeout_factor: Positive
     gain_sets: dict[str, GainsConfig]
+
+
+class TechniquesConfig(Model):
+    """What the full-state localizer uses; each may be switched off to see what it gives."""
+
+    zero_velocity: bool
+    rest_biases: bool
+    seams: bool
+    gravity: bool
+    slip_per_leg: bool
+    accelerometer: bool
 
 
 class FullStateConfig(Model):
     """Model of the full-state filters; standard deviations of what is not known before the first leg."""
 
+    update_period_s: Positive
     jerk_density_m2_s5: Positive
     angular_acceleration_density_rad2_s3: Positive
     gyroscope_bias_sigma_rad_s: Positive
@@ -133,6 +147,7 @@ class FullStateConfig(Model):
     consistent_m: Positive
     relocated_heading_sigma_rad: Positive
     rewind_s: Positive
+    use: TechniquesConfig
 
 
 class LocalizerConfig(Model):

@@ -7,10 +7,13 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from enum import Enum
 from math import inf, isfinite
+from operator import lt
 
 from ccatp.localization.measurements import MeasurementBuilder, Stack, WheelReading
 from ccatp.samples import ImuSample, WheelSample
 
+WheelColumns = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
+"""Times (s) and the rates (rad/s) of the right and of the left wheel."""
 MAX_FRAME_STEP_S = 0.1
 """A frame further than this from the last one is a jump of the robot's clock or a gap in the link."""
 BACKWARD_LIMIT = 5
@@ -135,25 +138,25 @@ class SampleIntake:
 
     def are_clean(self, t_s: float, encoders: Sequence[WheelSample]) -> bool:
         """Take the encoder samples whole if nothing is wrong with them: both wheels, finite, in order, new."""
-        if not encoders:
-            return True
-        newest = max(self._right.newest_s, self._left.newest_s, t_s - self._history_s)
-        total = 0.0
+        return not encoders or self.columns(t_s, encoders) is not None
+
+    def columns(self, t_s: float, encoders: Sequence[WheelSample]) -> WheelColumns | None:
+        """The same, not empty, as columns; None if anything is wrong, and they have to be judged one by one."""
+        times, right, left = zip(*encoders, strict=True)
         try:
-            for t, right, left in encoders:
-                if not newest < t:
-                    return False
-                newest = t
-                total += right + left  # type: ignore[operator]  # None raises, and is then sorted out one by one
-        except TypeError:
-            return False
-        if not (isfinite(total) and newest <= t_s + _ROUNDING_S):
-            return False
-        times = [sample[0] for sample in encoders]
+            total = sum(right) + sum(left)
+        except TypeError:  # a wheel gave no sample
+            return None
+        oldest_s = t_s - self._history_s
+        newest_s = max(self._right.newest_s, self._left.newest_s, oldest_s)
+        if not (newest_s < times[0] and times[-1] <= t_s + _ROUNDING_S and isfinite(total)):
+            return None
+        if not all(map(lt, times, times[1:])):
+            return None
         for source in (self._right, self._left):
             source.use(times)
-            source.forget_before(t_s - self._history_s)
-        return True
+            source.forget_before(oldest_s)
+        return times, right, left
 
     def wheels(self, t_s: float, encoders: Iterable[WheelSample]) -> tuple[list[WheelReading], list[WheelReading]]:
         """The usable readings of the right and of the left wheel, each sample judged by itself."""

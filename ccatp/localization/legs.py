@@ -21,14 +21,16 @@ _WHERE = [SR, SL, C]
 
 
 class Redraw(NamedTuple):
-    """Transition of (right slip, left slip, creep) from one leg to the next: ``s' = F (s - mean_before) + mean + e``.
+    """Transition of (right slip, left slip, creep) from one leg to the next: ``s' = F (s - found) + mean + e``.
 
     Attributes:
+        found: the last leg's expectation, shape (3,).
         F: what the next leg keeps of the deviations, shape (3, 3).
         mean: the next leg's expectation, shape (3,).
         Q: covariance of e, shape (3, 3).
     """
 
+    found: FloatArray
     F: FloatArray
     mean: FloatArray
     Q: FloatArray
@@ -106,7 +108,8 @@ class LegBook:
 
     def begin(self, mean: FloatArray, covariance: FloatArray) -> Redraw:
         """A leg begins; the state before it, mean (n,) and covariance (n, n), ends the last one."""
-        found = _PARAMETERS.dot(mean[_WHERE])
+        states = mean[_WHERE]
+        found = _PARAMETERS.dot(states)
         known = _PARAMETERS.dot(covariance[np.ix_(_WHERE, _WHERE)]).dot(_PARAMETERS.T).diagonal()
         before, self._scatters = self._scatters, self._learned()
         betas, owns = [], []
@@ -116,7 +119,8 @@ class LegBook:
             owns.append(own)
         self._is_open = True
         means = np.array([parameter.mean for parameter in self._parameters])
-        return Redraw((_STATES * betas).dot(_PARAMETERS), _STATES.dot(means), (_STATES * owns).dot(_STATES.T))
+        F, Q = (_STATES * betas).dot(_PARAMETERS), (_STATES * owns).dot(_STATES.T)
+        return Redraw(states, F, _STATES.dot(means), Q)
 
     def wander_variance(self, dt_s: float) -> tuple[float, float]:
         """By how much slip (of each wheel) and creep wander within a leg, variance per step of ``dt_s``."""

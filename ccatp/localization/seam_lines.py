@@ -1,6 +1,5 @@
 """Pure. Seams as position measurements: where an edge sensor changes its value, it stands over a panel's edge."""
 
-from collections.abc import Sequence
 from math import cos, sin, sqrt
 from typing import NamedTuple
 
@@ -8,11 +7,11 @@ import numpy as np
 
 from ccatp.config.models import RobotConfig
 from ccatp.filters.base import FloatArray
-from ccatp.localization.crossing import EdgeScanner, Transition
+from ccatp.localization.crossing import Transition
 from ccatp.localization.survey_model import E0, E1, PSI, STATES, A, V, W, X
 from ccatp.localization.terrain import Slope
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import EdgeSample, PanelId
+from ccatp.samples import PanelId
 
 # An edge is taken for a seam where the sensor is expected within this part of a panel's size from one; whatever else it
 # can be (the rim, the next seam) is at least ten times further.
@@ -66,23 +65,14 @@ class SeamLines:
     def __init__(self, mirror: Mirror, robot: RobotConfig) -> None:
         self._mirror = mirror
         self._sensors = robot.edge_sensors_m
-        self._scanner = EdgeScanner()
         panel = next(iter(mirror.panels.values()))
         self._reach_m = _REACH * 2.0 * min(panel.half_x_m, panel.half_y_m)
         self._half = {"x": panel.half_x_m, "y": panel.half_y_m}
         self._edges: dict[int, tuple[str, float, PanelId]] = {}
 
-    def restart(self) -> None:
-        """The robot's clock has jumped."""
-        self._scanner.restart()
-
     def forget(self) -> None:
         """The pose was found anew: the offsets belong to another one."""
         self._edges.clear()
-
-    def scan(self, edges: Sequence[EdgeSample]) -> list[Transition]:
-        """Transitions of a frame, oldest first; normally none."""
-        return self._scanner.scan(edges)
 
     def meet(self, transition: Transition, t_s: float, x: FloatArray, slope: Slope) -> Edge | None:
         """Which edge a transition belongs to; None where no seam is near.
@@ -130,7 +120,7 @@ class SeamLines:
         ox, oy = self._sensors[transition.corner]
         x_m, y_m, psi, v, a, w = x[:6].tolist()
         v -= a * late_s
-        hx, hy, lx, ly = _axes(slope, psi - w * late_s)
+        hx, hy, lx, ly = axes_on(slope, psi - w * late_s)
         # A point of the body moves by v h, and by w times its lever turned by a quarter.
         turn_x, turn_y = ox * lx - oy * hx, ox * ly - oy * hy
         place = x_m - v * late_s * hx + ox * hx + oy * lx, y_m - v * late_s * hy + ox * hy + oy * ly
@@ -147,7 +137,7 @@ class SeamLines:
         return centre - self._half[axis] if is_high else centre + self._half[axis], panel.id
 
 
-def _axes(slope: Slope, psi: float) -> tuple[float, float, float, float]:
+def axes_on(slope: Slope, psi: float) -> tuple[float, float, float, float]:
     """Deck components (hx, hy, lx, ly) of the robot's x and y axes, as ``Mirror.body_axes``."""
     fx, fy = slope[0], slope[1]
     s2 = 1.0 + fx * fx

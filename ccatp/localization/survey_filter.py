@@ -1,0 +1,361 @@
+"""Pure. What is done to the full-state filter: steps of the motion, rests, legs, seams, fixes; and done again."""
+
+from math import sqrt
+
+import numpy as np
+
+from ccatp.angles import difference
+from ccatp.config.models import LocalizerConfig, RobotConfig
+from ccatp.filters.base import Filter, FilterDiverged, FloatArray, Innovation
+from ccatp.localization.affine import Affine
+from ccatp.localization.block import Block
+from ccatp.localization.crossing import Transition
+from ccatp.localization.journal import Journal, Step
+from ccatp.localization.legs import LegBook, Redraw
+from ccatp.localization.rest import RestReading, heading_from_gravity
+from ccatp.localization.seam_lines import Edge, SeamLines, axes_on
+from ccatp.localization.survey_model import (
+    BA,
+    BG,
+    E0,
+    KG,
+    KL,
+    PL,
+    PR,
+    PSI,
+    SL,
+    SR,
+    STATES,
+    A,
+    C,
+    SensorRows,
+    SurveyMotion,
+    V,
+    W,
+    X,
+    Y,
+)
+from ccatp.localization.terrain import Slope, Terrain
+from ccatp.localization.wheel_angles import WheelAngle
+from ccatp.mirror.mirror import Mirror
+from ccatp.samples import DeckPose
+
+_STOP_ROWS = np.eye(STATES)[[V, A, W]]
+_DRAWN = [SR, SL, C]
+_WHERE_DRAWN = np.ix_(_DRAWN, _DRAWN)
+
+
+class SurveyFilter:
+    """The filter, the model and the journal. Each public method but the questions is one thing that happens to it.
+
+    Everything that changes the filter goes through ``_do``, which notes it for the replay after a late fix.
+
+    Args:
+        filter_: an extended or unscented filter of ``STATES`` states.
+        mirror: the mirror's geometry.
+        robot: wheel and sensor geometry.
+        cfg: noise model.
+        counts: of what was used and refused; counted on here.
+        start: deck pose at the first frame, at rest.
+    """
+
+    def __init__(
+        self,
+        filter_: Filter,
+        mirror: Mirror,
+        robot: RobotConfig,
+        cfg: LocalizerConfig,
+        counts: dict[str, int],
+        start: DeckPose,
+    ) -> None:
+        self.innovation: Innovation | None = None
+        self.journal = Journal(cfg.full_state.rewind_s)
+        self._filter, self._counts = filter_, counts
+        self._cfg, self._full = cfg, cfg.full_state
+        self._terrain = Terrain(mirror)
+        self._motion = SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m)
+        self._rows = SensorRows()
+        self._seams = SeamLines(mirror, robot)
+        self._legs = LegBook(self._full)
+        self._gravity_deck = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
+        self._start(start)
+
+    def _start(self, pose: DeckPose) -> None:
+        cfg, full = self._cfg, self._full
+        mean, sigma = np.zeros(STATES), np.zeros(STATES)
+        mean[[X, Y, PSI]] = pose.x_m, pose.y_m, pose.heading_rad
+        sigma[[X, Y]] = cfg.start_position_sigma_m
+        sigma[PSI] = cfg.start_heading_sigma_rad
+        sigma[[V, A, W]] = cfg.reset_speed_sigma_m_s, cfg.reset_acceleration_sigma_m_s2, cfg.reset_rate_sigma_rad_s
+        sigma[BG], sigma[KG] = full.gyroscope_bias_sigma_rad_s, full.gyroscope_scale_sigma
+        sigma[BA], sigma[KL] = full.accelerometer_bias_sigma_m_s2, full.wheel_base_sigma
+        sigma[[E0, E0 + 1]] = full.edge_sigma_m
+        P = np.diag(sigma**2)
+        mean[_DRAWN], P[_WHERE_DRAWN] = self._legs.first()
+        self._filter.reset(mean, P)
+
+    @property
+    def mean(self) -> FloatArray:
+        """Of the state, shape (n,); see ``survey_model``."""
+        return self._filter.mean
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of the state, shape (n, n)."""
+        return self._filter.covariance
+
+    def slope(self) -> Slope:
+        """The ground under the estimated position."""
+        mean = self._filter.mean
+        return self._terrain.at(float(mean[X]), float(mean[Y]))
+
+    def height_m(self, x_m: float, y_m: float) -> float:
+        """Height of the surface over a deck point."""
+        return self._terrain.height_m(x_m, y_m)
+
+    def begin(self, t_s: float, dt_s: float) -> None:
+        """Steps follow that bring the state to ``t_s``; the robot may have moved in the last ``dt_s`` of it."""
+        self.journal.begin(t_s, dt_s, self._filter)
+
+    def _do(self, step: Step) -> None:
+        self.journal.add(step)
+        step()
+
+    # -- motion -------------------------------------------------------------------------------------------------------
+
+    def move(self, block: Block, right: WheelAngle, left: WheelAngle, imu_variances: tuple[float, float]) -> None:
+        """A block of frames: predict, then update with wheel angles, angular rate and acceleration.
+
+        Args:
+            block: frames since the last step.
+            right: the wheel's angle at its end; no reading where its last frame brought none.
+            left: likewise.
+            imu_variances: of single samples: angular rate, acceleration.
+        """
+        dt_s = block.dt_s
+        if dt_s > 0.0:
+            scatter = self._legs.wander_variance(block.turning_s)
+            encoders = self.encoder_walk(right) * dt_s
+            self._do(lambda: self._predict(dt_s, scatter, encoders))
+        counts = None
+        if right.is_fresh or left.is_fresh:
+            gap_rad = right.take_gap() + left.take_gap()
+            variance = max(right.variance_rad2(), left.variance_rad2()) + gap_rad * gap_rad
+            counts = right.angle_rad, left.angle_rad, variance
+        rate = acceleration = None
+        if block.rate_rad_s is not None:
+            rate = block.rate_rad_s, imu_variances[0] / block.samples
+        if block.acceleration_m_s2 is not None and self._full.use.accelerometer:
+            # Set points jump, and the acceleration with them, anywhere between two samples.
+            jump = self._full.acceleration_jump_m_s2**2
+            acceleration = block.acceleration_m_s2, imu_variances[1] / block.samples + jump
+        self._do(lambda: self._sense(counts, rate, acceleration))
+
+    def _predict(self, dt_s: float, scatter: tuple[float, float], encoders: float) -> None:
+        full, mean = self._full, self._filter.mean
+        motion = self._motion.over(dt_s, self._terrain.at(float(mean[X]), float(mean[Y])))
+        slip, creep = scatter
+        impulses = np.array(
+            (full.jerk_density_m2_s5 * dt_s, full.angular_acceleration_density_rad2_s3 * dt_s, slip, slip, creep)
+        )
+        drift = np.zeros(STATES)
+        drift[BG] = full.gyroscope_bias_walk_rad_s_sqrt_s**2 * dt_s
+        drift[BA] = full.accelerometer_bias_walk_m_s2_sqrt_s**2 * dt_s
+        drift[PR] = drift[PL] = encoders
+        self._filter.predict(motion, motion.noise(mean, impulses, drift))
+
+    def encoder_walk(self, wheel: WheelAngle) -> float:
+        """Growth of the summed angle's error per second: white rate noise, none where a counter counts."""
+        found = wheel.noise_rad2_s2
+        variance = self._cfg.encoder_sigma_rad_s**2 if found is None else found
+        return variance * self._full.encoder_period_s
+
+    def _sense(
+        self,
+        counts: tuple[float, float, float] | None,
+        rate: tuple[float, float] | None,
+        acceleration: tuple[float, float] | None,
+    ) -> None:
+        rows = self._rows.take(counts, rate, acceleration)
+        if rows.z.size:
+            self._filter.update(rows.z, rows, rows.R)
+
+    # -- rest and legs ------------------------------------------------------------------------------------------------
+
+    def stop(self, angles: tuple[float, float]) -> None:
+        """The wheels stand, at these angles (rad): no speed, no acceleration, no rate; they count from here."""
+        full = self._full
+        sigma = full.rest_speed_sigma_m_s, full.rest_acceleration_sigma_m_s2, full.rest_turn_sigma_rad_s
+        R = np.square(sigma)
+        shift = np.zeros(STATES)
+        shift[PR], shift[PL] = -angles[0], -angles[1]
+        if full.use.zero_velocity:
+            self._do(lambda: self._update(np.zeros(3), _STOP_ROWS, R))
+        self._do(lambda: self._filter.predict(Affine.shift(shift), np.zeros((STATES, STATES))))
+
+    def _update(self, z: FloatArray, H: FloatArray, R: FloatArray) -> None:
+        self._filter.update(z, H, R)
+
+    def calibrate(self, reading: RestReading, rested_s: float, imu_variances: tuple[float, float]) -> None:
+        """Biases from the inertial unit's means over a rest of ``rested_s``, heading from gravity.
+
+        Args:
+            reading: the means.
+            rested_s: how long the biases have wandered.
+            imu_variances: of single samples: angular rate, acceleration.
+        """
+        full, n = self._full, reading.samples
+        Q = np.zeros((STATES, STATES))
+        Q[BG, BG] = full.gyroscope_bias_walk_rad_s_sqrt_s**2 * rested_s
+        Q[BA, BA] = full.accelerometer_bias_walk_m_s2_sqrt_s**2 * rested_s
+        self._do(lambda: self._filter.predict(np.eye(STATES), Q))
+        if full.use.rest_biases:
+            H = np.zeros((2, STATES))
+            # v, a and w stay what the stop made of them; the scale error acts on a rate of zero.
+            H[0, BG] = H[0, W] = H[1, BA] = H[1, A] = 1.0
+            z = np.array((reading.rate_rad_s, reading.acceleration_m_s2))
+            R = np.array((imu_variances[0] / n, imu_variances[1] / n))
+            self._do(lambda: self._update(z, H, R))
+        if reading.gravity_count and full.use.gravity:
+            self._do(lambda: self._feel_gravity(reading.bearing_rad, reading.gravity_count))
+
+    def _feel_gravity(self, bearing_rad: float, count: int) -> None:
+        mean, full = self._filter.mean, self._full
+        slope = self.slope()
+        tilt = self._tilt(slope.fx, slope.fy)
+        if tilt < full.gravity_least_tilt:
+            return
+        variance = (full.gravity_sigma_rad / tilt) ** 2 / count + full.gravity_floor_rad**2
+        residual = difference(heading_from_gravity(bearing_rad, slope), float(mean[PSI]))
+        prior = float(self._filter.covariance[PSI, PSI])
+        if residual * residual > full.gravity_gate**2 * (variance + prior):
+            self._counts["gravity_gated"] += 1
+            return
+        H = np.zeros((1, STATES))
+        H[0, PSI] = 1.0
+        self._update(np.array([float(mean[PSI]) + residual]), H, np.array([variance]))
+
+    def _tilt(self, fx: float, fy: float) -> float:
+        """Sine of the angle between the surface and the horizontal."""
+        gx, gy, gz = self._gravity_deck
+        along = (gz - fx * gx - fy * gy) / sqrt(1.0 + fx * fx + fy * fy)
+        return sqrt(max(1.0 - along * along, 0.0))
+
+    def begin_leg(self) -> None:
+        """Slip and creep of the coming leg, from the legs so far."""
+        if self._full.use.slip_per_leg:
+            redraw = self._legs.begin(self._filter.mean, self._filter.covariance)
+            self._do(lambda: self._redraw(redraw))
+
+    def _redraw(self, redraw: Redraw) -> None:
+        F, Q, offset = np.eye(STATES), np.zeros((STATES, STATES)), np.zeros(STATES)
+        F[_WHERE_DRAWN], Q[_WHERE_DRAWN] = redraw.F, redraw.Q
+        offset[_DRAWN] = redraw.mean - redraw.F.dot(redraw.found)
+        self._filter.predict(Affine(F, offset), Q)
+
+    def end_leg(self) -> None:
+        """A fix has been fused at the leg's end."""
+        self._legs.end(self._filter.mean, self._filter.covariance)
+
+    # -- seams --------------------------------------------------------------------------------------------------------
+
+    def cross(self, transition: Transition, t_s: float) -> None:
+        """An edge sensor has changed its value; the state belongs to ``t_s``."""
+        if not self._full.use.seams:
+            return
+        edge = self._seams.meet(transition, t_s, self._filter.mean, self.slope())
+        if edge is not None:
+            self._do(lambda: self._use_line(edge, transition, t_s))
+
+    def _use_line(self, edge: Edge, transition: Transition, t_s: float) -> None:
+        if edge.is_new:
+            self._renew_offset(edge.offset)
+        mean, P = self._filter.mean, self._filter.covariance
+        residual, H, variance = self._seams.line(edge, transition, t_s, mean, self.slope())
+        spread = variance + float(H[0].dot(P).dot(H[0]))
+        is_used = residual * residual <= self._full.line_gate**2 * spread
+        self._counts["crossings_used" if is_used else "crossings_gated"] += 1
+        if is_used:
+            self._update(H.dot(mean) + residual, H, np.array([variance]))
+
+    def _renew_offset(self, k: int) -> None:
+        """The state of an edge's offset is given to another edge: nothing known of it, nothing correlated."""
+        F, Q = np.eye(STATES), np.zeros((STATES, STATES))
+        F[k, k] = 0.0
+        Q[k, k] = self._full.edge_sigma_m**2
+        self._filter.predict(F, Q)
+
+    # -- fixes --------------------------------------------------------------------------------------------------------
+
+    def fix(self, t_s: float, z: FloatArray, variance: FloatArray) -> int:
+        """The robot's origin at ``t_s``, deck, m (2,), and its covariance (2, 2).
+
+        Returns:
+            how many steps were done again after it.
+        """
+        return self.journal.take(t_s, lambda late_s: self._use_fix(z, variance, late_s), self._filter)
+
+    def _use_fix(self, z: FloatArray, variance: FloatArray, late_s: float) -> None:
+        mean = self._filter.mean
+        residual, H = self._fix_row(z, mean, late_s)
+        self.innovation = self._filter.update(H.dot(mean) + residual, H, variance)
+
+    def _fix_row(self, z: FloatArray, mean: FloatArray, late_s: float) -> tuple[FloatArray, FloatArray]:
+        """Residual (2,) and row (2, n) of a position ``late_s`` before the state's time, in which V and W held."""
+        H = np.zeros((2, STATES))
+        H[0, X] = H[1, Y] = 1.0
+        if late_s == 0.0:
+            return z - mean[:2], H
+        v, w = float(mean[V]), float(mean[W])
+        slope = self._terrain.at(float(mean[X]), float(mean[Y]))
+        hx, hy, lx, ly = axes_on(slope, float(mean[PSI]) - 0.5 * w * late_s)
+        way = v * late_s
+        H[:, PSI] = -way * lx, -way * ly
+        H[:, V] = -late_s * hx, -late_s * hy
+        H[:, W] = -0.5 * late_s * H[:, PSI]
+        return z - (mean[:2] - way * np.array((hx, hy))), H
+
+    def fix_residual(self, t_s: float, z: FloatArray) -> FloatArray:
+        """How far a position (2,) lies from what the filter held for true at ``t_s``."""
+        mean, _, late_s = self.journal.look(t_s, self._filter)
+        return self._fix_row(z, mean, late_s)[0]
+
+    def is_gated(self, t_s: float, z: FloatArray, variance: FloatArray) -> bool:
+        """Whether a position contradicts the estimate of its own time."""
+        mean, P, late_s = self.journal.look(t_s, self._filter)
+        residual, H = self._fix_row(z, mean, late_s)
+        S = H.dot(P).dot(H.T) + variance
+        return float(residual.dot(np.linalg.solve(S, residual))) > self._full.fix_gate_nis
+
+    def relocate(self, t_s: float, z: FloatArray, variance: FloatArray) -> None:
+        """Begin anew from a position (2,) measured at ``t_s``, and its covariance (2, 2).
+
+        The heading loses its certainty, not its value. The way since then is taken from the estimate that was wrong:
+        wrong about where it began, not about what the wheels did.
+
+        Raises:
+            FilterDiverged: the state is not finite.
+        """
+        x, P = self._filter.mean.copy(), self._filter.covariance.copy()
+        if not (np.isfinite(x).all() and np.isfinite(P).all()):
+            raise FilterDiverged("the state is not finite")
+        heading_variance = float(P[PSI, PSI]) + self._full.relocated_heading_sigma_rad**2
+        then, _, _ = self.journal.look(t_s, self._filter)
+        since = x[:2] - then[:2]
+        pose = [X, Y, PSI]
+        P[pose, :] = 0.0
+        P[:, pose] = 0.0
+        P[:2, :2], P[PSI, PSI] = variance, heading_variance
+        x[:2] = z + since
+        x[[V, A, W]] = 0.0
+        self.journal.restart()
+        self._seams.forget()
+        self._legs.forget_leg()
+        self._filter.reset(x, P)
+
+    def lose(self, way_m: float, turn_rad: float) -> None:
+        """The robot may have gone this far, and turned, without anyone looking."""
+        Q = np.zeros((STATES, STATES))
+        Q[X, X] = Q[Y, Y] = way_m * way_m
+        Q[PSI, PSI] = turn_rad * turn_rad
+        self._filter.predict(np.eye(STATES), Q)
