@@ -22,6 +22,7 @@ from ccatp.cli_frame import (
     overrides,
     run_command_line,
 )
+from ccatp.cli_replay import replay
 from ccatp.cli_study import study
 
 EMERGENCY_KINDS = ("fire", "earthquake", "power", "weather", "operator")
@@ -220,6 +221,7 @@ def sim_etalon(
 
 
 cli.add_command(study)
+cli.add_command(replay)
 
 
 @cli.command("map", epilog=example("ccatp map runs/20260101T000000Z-fyst-m1-s1 --out map.png"))

@@ -115,14 +115,16 @@ CONFIG_OPTION = click.option("--config", "config_file", type=click.Path(path_typ
 RUNTIME_DIR_OPTION = click.option(
     "--runtime-dir", type=click.Path(path_type=Path), help="Folder of the sockets, if not the usual one."
 )
-SETTINGS_OPTION = click.option(
-    "--set",
-    "settings",
-    multiple=True,
-    callback=_settings,
-    metavar="KEY=VALUE",
-    help="Any key of the configuration, as in limits.v_max_m_s=0.05. May be repeated.",
-)
+
+
+def settings_option(which: str) -> Callable[[Command], Command]:
+    """``--set KEY=VALUE``; ``which`` tells what keys there are."""
+    return click.option(
+        "--set", "settings", multiple=True, callback=_settings, metavar="KEY=VALUE", help=f"{which} May be repeated."
+    )
+
+
+SETTINGS_OPTION = settings_option("Any key of the configuration, as in limits.v_max_m_s=0.05.")
 WORLD_OPTIONS = options(
     CONFIG_OPTION,
     click.option("--mirror", metavar="NAME", help="fyst-m1, fyst-m2, thesis-m1, thesis-m2, or a .toml file."),

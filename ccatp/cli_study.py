@@ -1,7 +1,7 @@
 """Glue. The command ``ccatp study``."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,14 +92,25 @@ def study(
         )
         result = run_campaign(found, lambda keys: load_config(config_file, keys), options)
     else:
-        idle = {"--runs": runs, "--cluster": cluster, "--shard": shard, "--from": others, "--only": only}
+        idle = {"--cluster": cluster, "--shard": shard, "--from": others, "--only": only, "--mirror": mirrors}
         if surplus := [option for option, value in idle.items() if value]:
-            raise CampaignError(f"study {name} has no runs; leave {surplus[0]} out")
-        if len(mirrors) > 1:
-            raise CampaignError(f"study {name} takes one --mirror")
-        result = found(load_config(config_file, {**given, **({"run.mirror": mirrors[0]} if mirrors else {})}), out)
+            raise CampaignError(f"study {name} has no runs to hand out; leave {surplus[0]} out")
+        if runs or workers:
+            click.echo(f"ccatp: study {name} is one analysis: --runs and --workers change nothing", err=True)
+        result = _analysed(found, load_config(config_file, given), out)
     _tell(result, out, json_output)
     return 0
+
+
+def _analysed(analysis: Callable[[Any, Path], dict[str, Any]], cfg: Any, out: Path) -> dict[str, Any]:
+    from ccatp.studies.campaign import CampaignFailed
+
+    try:
+        return analysis(cfg, out)
+    except OSError as error:
+        raise CampaignFailed(
+            f"{error.filename or out}: {error.strerror or error}; make room or choose another --out"
+        ) from error
 
 
 def _tell(result: dict[str, Any], out: Path, json_output: bool) -> None:

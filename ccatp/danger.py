@@ -27,6 +27,7 @@ CORNERS = tuple(Corner)
 CENTRE = "the robot's centre is close to the rim on the map"
 NOWHERE = (False, False, False, False)
 EVERYWHERE = (True, True, True, True)
+_NORMAL = EventCode.NORMAL  # a member looked up on its class in every frame costs more than the verdict made of it
 
 
 class _Missing(NamedTuple):
@@ -139,28 +140,26 @@ class DangerMonitor:
         Returns:
             The verdict; for a frame that is not new, the last verdict again.
         """
-        if sensors.seq <= self.verdict.seq:
+        seq, t_s, wheels, samples = sensors.seq, sensors.t, sensors.enc, sensors.edge
+        if seq <= self.verdict.seq:
             return self.verdict
-        edges, t_s, samples = self._edges, sensors.t, sensors.edge
-        edges.track.push(sensors.enc)
-        is_known = estimate is not None and self._is_fresh(estimate, t_s)
-        if estimate is not None and is_known:
-            self._state = estimate.state
-            self._origin.step(t_s, estimate, sensors.enc)
+        edges, origin = self._edges, self._origin
+        edges.track.push(wheels)
+        known = estimate if estimate is not None and self._is_fresh(estimate, t_s) else None
+        if known is not None:
+            self._state = known.state
+            origin.step(t_s, known, wheels)
         else:
             self._state = ""
-        if edges.is_idle and _are_all_on(samples):
-            edges.skip(samples)
-        else:
-            edges.step(samples, estimate if is_known else None)
+        edges.step(samples, known)
         if samples:
             self._edge_t_s = samples[-1][0]
-        missing = self._missing(t_s, estimate, is_known)
-        if edges.is_idle and missing is None and not self._origin.direction and not self.latch.is_latched:
-            self.verdict = Verdict(sensors.seq, t_s, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
+        missing = self._missing(t_s, estimate, known is not None)
+        if missing is None and edges.is_idle and not origin.direction and not self.latch.is_latched:
+            self.verdict = verdict = Verdict(seq, t_s, _NORMAL, "", "", 0.0, 0.0, True, True, True)
         else:
-            self.verdict = self._arbitrate(sensors.seq, t_s, missing)
-        return self.verdict
+            self.verdict = verdict = self._arbitrate(seq, t_s, missing)
+        return verdict
 
     def stale(self, seq: int, t_s: float) -> Verdict:
         """The verdict when no sensors frame came for ``stale_after_s``: nothing permitted.
@@ -260,11 +259,3 @@ class DangerMonitor:
 def _denied(seq: int, t_s: float, code: EventCode, missing: _Missing) -> Verdict:
     signal, cause, age_s, limit_s = missing
     return Verdict(seq, t_s, code, cause, signal, age_s, limit_s, False, False, False, NOWHERE)
-
-
-def _are_all_on(samples: Sequence[EdgeSample]) -> bool:
-    """Whether every sensor is on in every sample; anything but a clear 1 is off."""
-    for _, front_left, front_right, rear_left, rear_right in samples:
-        if not (front_left == 1 and front_right == 1 and rear_left == 1 and rear_right == 1):
-            return False
-    return True

@@ -1,12 +1,12 @@
 """Pure. The localizer: what the others may ask it, and which one a configuration asks for."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.filters import FILTERS, FloatArray, Innovation
+from ccatp.filters import FILTERS, Filter, FloatArray, Innovation
 from ccatp.localization import measurements, survey_model
 from ccatp.localization.four_state import FourStateLocalizer
 from ccatp.localization.full_state import FullStateLocalizer
@@ -22,14 +22,16 @@ class Localizer(Protocol):
 
     counts: dict[str, int]
     """What was refused or used, by name."""
-    innovation: Innovation | None
-    """Of the last update that says how well the filter fits, or None."""
     hold_cause: str
     """Why the mission should hold, or empty."""
     is_frozen: bool
     """The filter has diverged; the pose stands still until the next fix."""
     notices: list[str]
     """What an operator should read; whoever reads them empties the list."""
+
+    @property
+    def innovation(self) -> Innovation | None:
+        """Of the last update that says how well the filter fits, or None."""
 
     @property
     def pose(self) -> PanelPose:
@@ -91,13 +93,21 @@ class Localizer(Protocol):
         """Fuse a position of the puck; returns how far the pose jumped, m. Raises ``FixRefused``."""
 
 
-def build_localizer(cfg: Config, mirror: Mirror) -> Localizer:
-    """The localizer for ``run.filter``, the robot standing at base."""
+def build_localizer(
+    cfg: Config, mirror: Mirror, wrap: Callable[[Filter], Filter] = lambda filter_: filter_
+) -> Localizer:
+    """The localizer for ``run.filter``, the robot standing at base.
+
+    Args:
+        cfg: the configuration.
+        mirror: its mirror.
+        wrap: what to put around the filter, for those who want to look on.
+    """
     name = cfg.run.filter
     start = mirror.base_panel_pose
     # The localizer re-initialises its filter at once; what counts is its size.
     if name in FOUR_STATE:
         n = measurements.STATES
-        return FourStateLocalizer(FILTERS[name](np.zeros(n), np.eye(n)), mirror, cfg.robot, cfg.localizer, start)
+        return FourStateLocalizer(wrap(FILTERS[name](np.zeros(n), np.eye(n))), mirror, cfg.robot, cfg.localizer, start)
     n = survey_model.STATES
-    return FullStateLocalizer(FILTERS[name](np.zeros(n), np.eye(n)), mirror, cfg.robot, cfg.localizer, start)
+    return FullStateLocalizer(wrap(FILTERS[name](np.zeros(n), np.eye(n))), mirror, cfg.robot, cfg.localizer, start)

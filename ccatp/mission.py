@@ -1,43 +1,38 @@
 """Pure. The survey: from the pose and the danger loop's verdict to the velocity wanted next. Time is an argument."""
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
 
 from ccatp.config.models import Config
-from ccatp.control.tracker import LegTracker, Phase
+from ccatp.control.tracker import DONE, DRIVE, LegTracker
 from ccatp.mirror.mirror import Mirror
 from ccatp.planning.errors import PlanError
 from ccatp.planning.route import Route
-from ccatp.samples import DeckPose, EventCode, PointId, Stop, StopKind, Twist, Verdict
+from ccatp.samples import DeckPose, EventCode, PointId, Stop, StopKind, Verdict
 from ccatp.surveying.correction import Corrector
 from ccatp.surveying.homing import Homing
 from ccatp.surveying.journey import Journey, Motion
+from ccatp.surveying.missed_point import MissedPoint
+from ccatp.surveying.orders import STAND, Order
 from ccatp.surveying.retreat import Retreat, Step
-from ccatp.surveying.settling import TIME_EPSILON_S, Stillness
-from ccatp.surveying.states import Event, Outcome, State, next_state
+from ccatp.surveying.states import (
+    BACKING_OFF,
+    DRIVING,
+    HELD,
+    IDLE,
+    MEASURING,
+    RETURNING,
+    SETTLING,
+    TURNING,
+    Event,
+    Outcome,
+    State,
+    next_state,
+)
+from ccatp.surveying.stopover import Stopover
 
-STILL = Twist(0.0, 0.0)
-# Wheels stop within half a second: a robot that is not at rest after this long creeps, or its sensors say so.
-SETTLE_LIMIT_S = 10.0
+NORMAL, NEAR_EDGE, ABORTED = EventCode
 PlanHome = Callable[[DeckPose], tuple[Stop, ...]]
 PlanRest = Callable[[Route, DeckPose, Collection[PointId]], Route]
-
-
-@dataclass(slots=True)
-class Order:
-    """What the mission wants of the present frame.
-
-    Attributes:
-        twist: the velocity wanted until the next frame.
-        at_rest: the robot has come to rest in this frame.
-        arrived: the measurement point at which it did so for the first time; corrections are no arrivals.
-        measure: have the laser system measure now (of a point, or after a back-off to find itself again).
-    """
-
-    twist: Twist
-    at_rest: bool = False
-    arrived: PointId | None = None
-    measure: bool = False
 
 
 class Mission:
@@ -52,15 +47,13 @@ class Mission:
         route: the route of the survey.
         plan_home: gives the stops from a pose to base.
         plan_rest: gives the way back to a route from a pose, without the points that are done with.
-
-    Attributes:
-        corrections: correction moves begun.
     """
 
     def __init__(self, cfg: Config, mirror: Mirror, route: Route, plan_home: PlanHome, plan_rest: PlanRest) -> None:
         """Idle at base."""
         self._cfg, self._mirror, self._plan_home, self._plan_rest = cfg, mirror, plan_home, plan_rest
         self._tracker = LegTracker(cfg.control, cfg.limits, cfg.robot.wheel_lag_s)
+        self._is_steered_bare = not (cfg.control.predicts_delay and cfg.control.compensates_creep)
         self._route = route
         self._is_off_route = False
         self.survey = self._journey(route.stops)
@@ -78,17 +71,9 @@ class Mission:
         self._is_at_start = cfg.mission.fix_at_start
         self._backoffs = 0
         self._failures = 0
-        self._stillness = Stillness(cfg.control)
-        self._corrector = Corrector(mirror, cfg.robot, cfg.mission)
-        self._is_missed = False
-        self._corrected: Stop | None = None  # the stop at which the last correction was made, until the next leg
-        self._arrived_at: PointId | None = None
-        self.corrections = 0
-        self._measure_at_s = 0.0
-        self._is_asked = False
+        self._stopover = Stopover(cfg.control, cfg.etalon.measuring_time_s)
+        self._missed = MissedPoint(Corrector(mirror, cfg.robot, cfg.mission))
         self._emergency = ""
-        self._settle_by_s: float | None = None
-        self.request = 0
 
     def _journey(self, stops: Sequence[Stop]) -> Journey:
         return Journey(self._mirror, self._tracker, self._cfg.control.leg_timeout_factor, stops)
@@ -102,6 +87,11 @@ class Mission:
     def eta_s(self) -> float:
         """Least time that the rest of the survey takes, s."""
         return self._route.remaining_s(self.survey.index)
+
+    @property
+    def corrections(self) -> int:
+        """Correction moves begun."""
+        return self._missed.corrections
 
     @property
     def journey(self) -> Journey:
@@ -161,9 +151,14 @@ class Mission:
     # -- measurements ---------------------------------------------------------------------------------------------
 
     @property
+    def request(self) -> int:
+        """Number of the measurement that was asked for last."""
+        return self._stopover.request
+
+    @property
     def is_awaiting_fix(self) -> bool:
         """Whether the measurement asked for last, number ``request``, is still wanted."""
-        return self.state is State.MEASURING and self._is_asked
+        return self.state is MEASURING and self._stopover.is_asked
 
     @property
     def measuring_point(self) -> PointId | None:
@@ -189,7 +184,7 @@ class Mission:
             self._is_off_route = True
             return
         self._go_on()
-        self._is_missed = True
+        self._missed.miss()
 
     def not_fixed(self, point: PointId | None, cause: str) -> None:
         """The measurement failed for good: the point is skipped; several in a row hold the robot."""
@@ -234,33 +229,37 @@ class Mission:
             motion: time, pose and speed of the present frame.
             verdict: the danger loop's verdict in force, ``None`` where there is none fresh enough.
         """
+        if self._is_steered_bare:
+            control = self._cfg.control
+            motion = motion.with_only(ahead=control.predicts_delay, creep=control.compensates_creep)
         self._react(motion, verdict)
-        if self.state in (State.TURNING, State.DRIVING):
+        state = self.state
+        if state is DRIVING or state is TURNING:
             return self._travel(motion)
-        if self.state is State.SETTLING:
+        if state is MEASURING:
+            return Order(STAND.twist, measure=True) if self._stopover.is_due(motion.t_s) else STAND
+        if state is SETTLING:
             return self._settle(motion)
-        if self.state is State.MEASURING:
-            return self._measure(motion)
-        if self.state is State.RETURNING:
+        if state is RETURNING:
             return self._return(motion)
-        if self.state is State.BACKING_OFF and verdict is not None:
+        if state is BACKING_OFF and verdict is not None:
             return self._back_off(motion, verdict)
-        return Order(STILL)
+        return STAND
 
     def _react(self, motion: Motion, verdict: Verdict | None) -> None:
         if verdict is None or not (verdict.forward and verdict.reverse and verdict.turn):
-            if verdict is not None and verdict.code is EventCode.NEAR_EDGE:
+            if verdict is not None and verdict.code is NEAR_EDGE:
                 self._meet_edge(motion, verdict)
             else:
                 self.interrupt(verdict.cause if verdict is not None else "no fresh verdict from the danger loop")
             return
-        if verdict.code is EventCode.NEAR_EDGE:
+        if verdict.code is NEAR_EDGE:
             self._meet_edge(motion, verdict)
             return
-        if verdict.code is EventCode.ABORTED and verdict.cause != self._emergency:
+        if verdict.code is ABORTED and verdict.cause != self._emergency:
             self._emergency = verdict.cause  # the level is repeated; what counts is that it is new
             self.abort(verdict.cause)
-        if self.state is State.IDLE or (self.state is State.HELD and not self._is_held_by_hand):
+        if self.state is IDLE or (self.state is HELD and not self._is_held_by_hand):
             self._go_on()
 
     def _meet_edge(self, motion: Motion, verdict: Verdict) -> None:
@@ -287,9 +286,8 @@ class Mission:
     def _interrupt(self) -> None:
         """Forget where in a leg, a stop or a docking the robot was: it begins anew from where it is."""
         (self.survey if self._home is None else self._home).interrupt()
-        self._is_asked = self._is_missed = False
-        self._stillness.reset()
-        self._settle_by_s = None
+        self._stopover.interrupt()
+        self._missed.interrupt()
 
     def _hold(self, cause: str, *, by_hand: bool) -> None:
         self._interrupt()
@@ -319,48 +317,37 @@ class Mission:
 
     def _is_overdue(self, motion: Motion) -> bool:
         """Whether the leg takes so long that something must be wrong; that holds the robot."""
-        stop = self.journey.current
-        if stop is None or not self.journey.is_overdue(motion.t_s):
+        journey = self.journey
+        stop = journey.current
+        if stop is None or not journey.is_overdue(motion.t_s):
             return False
         self.fault(f"the leg to ({stop.x_m:.3f}, {stop.y_m:.3f}) m is overdue: is a wheel blocked or slipping?")
         return True
 
     def _travel(self, motion: Motion) -> Order:
-        stop = self.survey.current
-        if stop is not None:
-            self._leave_point(motion, stop)
+        survey = self.survey
+        stop = survey.current
+        if stop is not None and not self._missed.follows_route(motion, stop, survey):
+            self._is_off_route = True
         if self._is_off_route:
             return self._find_route(motion)
         if stop is None:
             self._go_on()
-            return Order(STILL)
-        twist = self.survey.follow(motion, stop)
+            return STAND
+        twist = survey.follow(motion, stop)
         if self._is_overdue(motion):
-            return Order(STILL)
-        if self._tracker.phase is not Phase.DONE:
-            self._apply(Event.TURNED if self._tracker.phase is Phase.DRIVE else Event.REALIGN)
+            return STAND
+        phase = self._tracker.phase
+        if phase is not DONE:
+            if (phase is DRIVE) is not (self.state is DRIVING):
+                self._apply(Event.TURNED if phase is DRIVE else Event.REALIGN)
             return Order(twist)
         if stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE):
             self._apply(Event.ARRIVED)
             return self._settle(motion)
-        self.survey.advance()
+        survey.advance()
         self._go_on()
         return self._travel(motion)
-
-    def _leave_point(self, motion: Motion, stop: Stop) -> None:
-        """After a point was missed: correct it by a short move; after the correction: may the route be followed?"""
-        if self._is_missed:
-            self._is_missed = False
-            aim = self._corrector.aim(motion.pose, self.survey.target_in(motion.pose.panel, stop))
-            if aim is None:
-                self._is_off_route = True
-            else:
-                self.survey.correct(motion.pose.panel, aim)
-                self._corrected = stop
-                self.corrections += 1
-        elif self._corrected is not None and self._corrected is not stop:
-            self._corrected = None
-            self._is_off_route |= not self._corrector.can_go_on(motion.deck, stop)
 
     def _find_route(self, motion: Motion) -> Order:
         """Plan anew from where the robot is; one frame of standing still, however long that takes."""
@@ -368,38 +355,19 @@ class Mission:
             self._route = self._plan_rest(self._route, motion.deck, {*self.done, *self.skipped})
         except PlanError as error:
             self.fault(f"no way on: {error}")
-            return Order(STILL)
+            return STAND
         self._is_off_route = False
         self.survey = self._journey(self._route.stops)
-        return Order(STILL)
-
-    def _is_quiet(self, motion: Motion) -> bool:
-        return self._stillness.is_rest(motion.t_s, motion.dt_s, motion.speed_m_s, motion.rate_rad_s)
+        return STAND
 
     def _settle(self, motion: Motion) -> Order:
-        if self._settle_by_s is None:
-            self._settle_by_s = motion.t_s + SETTLE_LIMIT_S
-        if not self._is_quiet(motion):
-            if motion.t_s > self._settle_by_s:
-                self.fault(
-                    f"the robot does not come to rest: {motion.speed_m_s:.4f} m/s, {motion.rate_rad_s:.4f} rad/s"
-                )
-            return Order(STILL)
-        self._settle_by_s = None
-        self._apply(Event.SETTLED)
-        self._measure_at_s = motion.t_s + self._cfg.etalon.measuring_time_s - TIME_EPSILON_S
-        point = self.measuring_point
-        if point is not None and point == self._arrived_at:
-            return Order(STILL, at_rest=True)
-        self._arrived_at = point or self._arrived_at
-        return Order(STILL, at_rest=True, arrived=point)
-
-    def _measure(self, motion: Motion) -> Order:
-        if self._is_asked or motion.t_s < self._measure_at_s:
-            return Order(STILL)
-        self._is_asked = True
-        self.request += 1
-        return Order(STILL, measure=True)
+        stopover = self._stopover
+        if stopover.has_settled(motion):
+            self._apply(Event.SETTLED)
+            return Order(STAND.twist, at_rest=True, arrived=stopover.arrival_at(self.measuring_point))
+        if stopover.is_restless(motion.t_s):
+            self.fault(f"the robot does not come to rest: {motion.speed_m_s:.4f} m/s, {motion.rate_rad_s:.4f} rad/s")
+        return STAND
 
     # -- edge and home --------------------------------------------------------------------------------------------
 
@@ -407,14 +375,14 @@ class Mission:
         retreat = self._retreat
         if retreat is None:
             self._go_on()
-            return Order(STILL)
+            return STAND
         twist = retreat.step(motion, verdict)
         if retreat.step_at is Step.STUCK:
             self.fault("stuck at the edge: no motion away from it is permitted, or none helps")
-            return Order(STILL)
+            return STAND
         if retreat.step_at is Step.OVER:
             self._apply(Event.FIND)
-            return Order(STILL)
+            return STAND
         return Order(twist)
 
     def _return(self, motion: Motion) -> Order:
@@ -423,10 +391,10 @@ class Mission:
                 self._home = Homing(self._journey(self._plan_home(motion.deck)), self._tracker)
             except PlanError as error:
                 self.fault(f"no way home: {error}")
-            return Order(STILL)
+            return STAND
         if self._home.is_at_base:
             self.outcome = Outcome.AT_BASE
             self._apply(Event.FINISHED)
-            return Order(STILL, at_rest=True)
-        twist = self._home.step(motion, self._is_quiet(motion))
-        return Order(STILL if self._is_overdue(motion) else twist)
+            return Order(STAND.twist, at_rest=True)
+        twist = self._home.step(motion, self._stopover.is_quiet(motion))
+        return STAND if self._is_overdue(motion) else Order(twist)

@@ -4,7 +4,7 @@ from typing import Protocol
 
 from ccatp.config.models import ControlConfig, PidConfig
 from ccatp.control.pid import Pid
-from ccatp.control.profile import Profile, lag_feed_forward
+from ccatp.control.profile import Profile, clamped, lag_feed_forward
 
 # What feedback may add to the planned speed, as part of the limit: more would outrun the gate's headroom.
 FEEDBACK_SHARE = 0.25
@@ -91,28 +91,31 @@ class ProfiledAxis:
     def begin(self, remaining: float) -> None:
         """Plan the motion over ``remaining``."""
         self._profile = Profile.rest_to_rest(remaining, self._v_max, self._a_max)
-        self._t_s = 0.0
-        self._slip = 0.0
+        self._duration_s = self._profile.duration_s
+        self._t_s = self._slip = 0.0
+        self._planned = self._profile.at(0.0)
 
     @property
     def duration_s(self) -> float:
         """Bang-bang time of the motion begun last."""
-        return self._profile.duration_s
+        return self._duration_s
 
     @property
     def planned_speed(self) -> float:
         """Speed that the plan has now."""
-        return self._profile.at(self._t_s)[1]
+        return self._planned[1]
 
     @property
     def overtime_s(self) -> float:
         """Time spent after the plan's end, s; negative before."""
-        return self._t_s - self._profile.duration_s
+        return self._t_s - self._duration_s
 
     def is_over(self, remaining: float, tolerance: float, speed: float | None) -> bool:
         """Whether the plan is out and what is left when the wheels have run down is within ``tolerance``."""
+        if self._t_s < self._duration_s:
+            return False
         coast = 0.0 if speed is None else speed * self._lag_s
-        return self._t_s >= self._profile.duration_s and abs(remaining - coast) <= tolerance
+        return abs(remaining - coast) <= tolerance
 
     def renew_if_far(self, remaining: float) -> None:
         """Plan another motion where the last one ended further off than feedback can bring it in time."""
@@ -122,14 +125,12 @@ class ProfiledAxis:
     def step(self, remaining: float, dt_s: float, speed: float | None) -> float:
         """Set point for the next ``dt_s``, in the unit of the quantity per s."""
         profile = self._profile
-        position, now = profile.at(self._t_s)
+        position, now = self._planned
         self._t_s += dt_s
-        after = profile.at(self._t_s)[1]
+        self._planned = profile.at(self._t_s)
         error = remaining - (profile.distance - position)
-        limit = self._feedback_limit
-        feedback = max(-limit, min(limit, self._kp * error))
-        slip = self._slip + self._slip_gain * feedback * now * dt_s
-        self._slip = slip = max(-self._slip_limit, min(self._slip_limit, slip))
+        feedback = clamped(self._kp * error, self._feedback_limit)
+        self._slip = slip = clamped(self._slip + self._slip_gain * feedback * now * dt_s, self._slip_limit)
         if speed is not None:
             feedback += self._kd * (now - speed)
-        return (1.0 + slip) * lag_feed_forward(now, after, dt_s, self._lag_s) + feedback
+        return (1.0 + slip) * lag_feed_forward(now, self._planned[1], dt_s, self._lag_s) + feedback

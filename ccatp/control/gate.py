@@ -49,23 +49,25 @@ class DriveGate:
             verdict: the danger loop's verdict in force; ``None`` when there is none fresh enough.
             dt_s: time since the last drive.
         """
-        allowed = self._limited(wanted, dt_s) if self._is_permitted(wanted, verdict) else HELD
-        self._last = allowed
+        v, omega = wanted.v_m_s, wanted.omega_rad_s
+        if (v == 0.0 and omega == 0.0) or not self._is_permitted(v, omega, verdict):
+            self._last = HELD
+            return 0.0, 0.0
+        last = self._last
+        v = _slewed(last.v_m_s, v, self._v_step + self._a * dt_s, self._v_max)
+        omega = _slewed(last.omega_rad_s, omega, self._omega_step + self._alpha * dt_s, self._omega_max)
+        self._last = allowed = Twist(v, omega)
         right, left = wheel_rates(allowed, self._radius, self._base)
         if abs(right) > self._max_wheel or abs(left) > self._max_wheel:
             scale = self._max_wheel / max(abs(right), abs(left))
             right, left = right * scale, left * scale
         return right, left
 
-    def _is_permitted(self, wanted: Twist, verdict: Verdict | None) -> bool:
-        v, omega = wanted.v_m_s, wanted.omega_rad_s
-        if not (isfinite(v) and isfinite(omega)):
-            self.denials += 1
-            return False
-        if v == 0.0 and omega == 0.0:
-            return True
+    def _is_permitted(self, v: float, omega: float, verdict: Verdict | None) -> bool:
         permitted = (
             verdict is not None
+            and isfinite(v)
+            and isfinite(omega)
             and (v <= 0.0 or verdict.forward)
             and (v >= 0.0 or verdict.reverse)
             and (omega == 0.0 or verdict.turn)
@@ -73,16 +75,11 @@ class DriveGate:
         self.denials += not permitted
         return permitted
 
-    def _limited(self, wanted: Twist, dt_s: float) -> Twist:
-        v = _slewed(self._last.v_m_s, wanted.v_m_s, self._v_step + self._a * dt_s, self._v_max)
-        omega = _slewed(
-            self._last.omega_rad_s, wanted.omega_rad_s, self._omega_step + self._alpha * dt_s, self._omega_max
-        )
-        return Twist(v, omega)
-
 
 def _slewed(last: float, wanted: float, step: float, limit: float) -> float:
     """``wanted`` clamped to the limit; away from zero it may change by ``step`` only, towards zero at once."""
-    wanted = max(-limit, min(limit, wanted))
-    low, high = min(last, 0.0) - step, max(last, 0.0) + step
-    return max(low, min(high, wanted))
+    if wanted > 0.0:
+        highest = last + step if last > 0.0 else step
+        return min(wanted, highest, limit)
+    lowest = last - step if last < 0.0 else -step
+    return max(wanted, lowest, -limit)

@@ -5,7 +5,8 @@ The delay is counted in the sequence numbers of the drives; no clock takes part.
 
 from collections import deque
 from math import cos, exp, sin
-from typing import NamedTuple
+
+import msgspec
 
 Pose = tuple[float, float, float]
 
@@ -15,7 +16,7 @@ ROUNDING = 1e-3
 REACH_S = 0.25
 
 
-class Predicted(NamedTuple):
+class Predicted(msgspec.Struct, frozen=True):
     """Pose in a plane, (x_m, y_m, heading_rad), and the speeds there."""
 
     pose: Pose
@@ -38,14 +39,14 @@ class CommandPredictor:
         frame_s: period of the frames.
     """
 
-    __slots__ = ("_frame_keep", "_frame_mean", "_frame_s", "_lag_s", "_sent")
+    __slots__ = ("_frame", "_frame_s", "_lag_s", "_sent")
 
     def __init__(self, wheel_lag_s: float, frame_s: float) -> None:
         """Nothing is on the way."""
         if frame_s <= 0.0:
             raise ValueError(f"frame_s = {frame_s}: the period of the frames must be positive")
         self._lag_s, self._frame_s = wheel_lag_s, frame_s
-        self._frame_keep, self._frame_mean = _servo(wheel_lag_s, frame_s)
+        self._frame = frame_s, *_servo(wheel_lag_s, frame_s)
         self._sent: deque[tuple[int, float, float]] = deque(maxlen=max(1, round(REACH_S / frame_s)))
 
     def reset(self) -> None:
@@ -78,24 +79,26 @@ class CommandPredictor:
             is_held: the robot held its wheels by its own rules: they run down, whatever has been sent.
             creep: drift per metre of travel in the plane of ``pose``.
         """
-        sent = self._sent
-        acting: tuple[int, float, float] | None = None
-        while sent and sent[0][0] <= echo_seq:
-            acting = sent[0]
-            if len(sent) == 1 or sent[1][0] > echo_seq:
-                break
+        sent, frame_s = self._sent, self._frame_s
+        while len(sent) > 1 and sent[1][0] <= echo_seq:
             sent.popleft()
-        state = Predicted(pose, v_m_s, omega_rad_s)
-        rest_s = self._frame_s - echo_age_s
-        if acting is not None and rest_s > ROUNDING * self._frame_s:
-            keep, mean = _servo(self._lag_s, rest_s)
-            v, omega = (0.0, 0.0) if is_held else acting[1:]
-            state = _rolled(state, v, omega, rest_s, keep, mean, creep)
-        for seq, *twist in sent:
+        (x, y, heading), v, omega = pose, v_m_s, omega_rad_s
+        creep_x, creep_y = creep
+        for seq, v_sent, omega_sent in sent:
             if seq > echo_seq:
-                v, omega = (0.0, 0.0) if is_held else twist
-                state = _rolled(state, v, omega, self._frame_s, self._frame_keep, self._frame_mean, creep)
-        return state
+                dt_s, keep, mean = self._frame
+            else:  # the one in force
+                dt_s = frame_s - echo_age_s
+                if dt_s <= ROUNDING * frame_s:
+                    continue
+                keep, mean = _servo(self._lag_s, dt_s)
+            v_set, omega_set = (0.0, 0.0) if is_held else (v_sent, omega_sent)
+            travel = (v_set + (v - v_set) * mean) * dt_s
+            turn = (omega_set + (omega - omega_set) * mean) * dt_s
+            middle, length = heading + 0.5 * turn, abs(travel)
+            x, y = x + travel * cos(middle) + length * creep_x, y + travel * sin(middle) + length * creep_y
+            heading, v, omega = heading + turn, v_set + (v - v_set) * keep, omega_set + (omega - omega_set) * keep
+        return Predicted((x, y, heading), v, omega)
 
 
 def _servo(lag_s: float, dt_s: float) -> tuple[float, float]:
@@ -104,15 +107,3 @@ def _servo(lag_s: float, dt_s: float) -> tuple[float, float]:
         return 0.0, 0.0
     keep = exp(-dt_s / lag_s)
     return keep, lag_s * (1.0 - keep) / dt_s
-
-
-def _rolled(
-    state: Predicted, v_set: float, omega_set: float, dt_s: float, keep: float, mean: float, creep: tuple[float, float]
-) -> Predicted:
-    (x, y, heading), v, omega = state
-    travel = (v_set + (v - v_set) * mean) * dt_s
-    turn = (omega_set + (omega - omega_set) * mean) * dt_s
-    middle = heading + 0.5 * turn
-    length = abs(travel)
-    pose = x + travel * cos(middle) + length * creep[0], y + travel * sin(middle) + length * creep[1], heading + turn
-    return Predicted(pose, v_set + (v - v_set) * keep, omega_set + (omega - omega_set) * keep)

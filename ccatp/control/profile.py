@@ -1,21 +1,21 @@
 """Pure. Rest-to-rest set points of bounded speed and acceleration; time is an argument."""
 
-from dataclasses import dataclass
 from math import copysign, exp, sqrt
+from typing import NamedTuple
 
 
-@dataclass(frozen=True, slots=True)
-class Profile:
+class Profile(NamedTuple):
     """Trapezoidal profile from rest to rest over a signed distance (m or rad).
 
     It is the time-optimal motion under the two limits: accelerate, cruise where there is room, decelerate.
 
     Attributes:
         distance: signed distance.
-        peak: largest speed reached, >= 0.
-        acceleration: magnitude of the acceleration.
+        peak: largest speed reached, with the sign of the distance.
+        acceleration: of the first ramp, with the sign of the distance.
         ramp_s: duration of each ramp.
         cruise_s: duration at ``peak``.
+        duration_s: time from rest to rest.
     """
 
     distance: float
@@ -23,6 +23,7 @@ class Profile:
     acceleration: float
     ramp_s: float
     cruise_s: float
+    duration_s: float
 
     @classmethod
     def rest_to_rest(cls, distance: float, v_max: float, a_max: float) -> "Profile":
@@ -32,27 +33,23 @@ class Profile:
         length = abs(distance)
         peak = min(v_max, sqrt(length * a_max))
         ramp_s = peak / a_max
-        cruise_s = (length - peak * ramp_s) / peak if peak > 0.0 else 0.0
-        return cls(distance, peak, a_max, ramp_s, max(cruise_s, 0.0))
-
-    @property
-    def duration_s(self) -> float:
-        """Time from rest to rest."""
-        return 2.0 * self.ramp_s + self.cruise_s
+        cruise_s = max((length - peak * ramp_s) / peak, 0.0) if peak > 0.0 else 0.0
+        duration_s = 2.0 * ramp_s + cruise_s
+        return cls(distance, copysign(peak, distance), copysign(a_max, distance), ramp_s, cruise_s, duration_s)
 
     def at(self, t_s: float) -> tuple[float, float]:
         """Position and velocity ``t_s`` seconds after the start, clamped to the start and the end."""
-        sign = copysign(1.0, self.distance)
+        distance, peak, acceleration, ramp_s, cruise_s, duration_s = self
         if t_s <= 0.0:
             return 0.0, 0.0
-        if t_s < self.ramp_s:
-            return sign * 0.5 * self.acceleration * t_s * t_s, sign * self.acceleration * t_s
-        if t_s < self.ramp_s + self.cruise_s:
-            return sign * self.peak * (t_s - 0.5 * self.ramp_s), sign * self.peak
-        left = self.duration_s - t_s
+        if t_s < ramp_s:
+            return 0.5 * acceleration * t_s * t_s, acceleration * t_s
+        if t_s < ramp_s + cruise_s:
+            return peak * (t_s - 0.5 * ramp_s), peak
+        left = duration_s - t_s
         if left <= 0.0:
-            return self.distance, 0.0
-        return self.distance - sign * 0.5 * self.acceleration * left * left, sign * self.acceleration * left
+            return distance, 0.0
+        return distance - 0.5 * acceleration * left * left, acceleration * left
 
 
 def lag_feed_forward(now: float, after: float, dt_s: float, lag_s: float) -> float:
@@ -63,3 +60,12 @@ def lag_feed_forward(now: float, after: float, dt_s: float, lag_s: float) -> flo
     if lag_s <= 0.0:
         return after
     return now + (after - now) / (1.0 - exp(-dt_s / lag_s))
+
+
+def clamped(value: float, limit: float) -> float:
+    """``value`` within [-limit, limit]; what is not a number stays so."""
+    if value > limit:
+        return limit
+    if value < -limit:
+        return -limit
+    return value

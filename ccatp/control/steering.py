@@ -4,6 +4,7 @@ from math import asin, atan2, cos, pi, sin, sqrt
 from typing import NamedTuple
 
 from ccatp.angles import wrap_pi
+from ccatp.control.profile import clamped
 
 # Drift per metre beyond which an estimate is nonsense: a robot carried off that fast has lost its wheels' grip.
 CREEP_LIMIT = 0.3
@@ -36,19 +37,20 @@ class Line:
         lookahead_m: nearer than this a stop's bearing is not to be trusted.
     """
 
-    __slots__ = ("_course_rad", "_lookahead_m", "_off_rad", "_reverse", "_target")
+    __slots__ = ("_cos", "_course_rad", "_lookahead_m", "_off_rad", "_reverse", "_sin", "_target")
 
     def __init__(self, lookahead_m: float) -> None:
         """No line yet: ``begin`` lays it."""
         self._lookahead_m = lookahead_m
         self._target = (0.0, 0.0)
-        self._course_rad = self._off_rad = 0.0
+        self._off_rad = 0.0
         self._reverse = False
+        self._lay(0.0)
 
     def begin(self, pose: tuple[float, float, float], target: tuple[float, float], reverse: bool) -> None:
         """Lay the line from the robot to the stop."""
         self._reverse, self._target = reverse, target
-        self._course_rad = atan2(target[1] - pose[1], target[0] - pose[0])
+        self._lay(atan2(target[1] - pose[1], target[0] - pose[0]))
         self._off_rad = 0.0
 
     def look(self, pose: tuple[float, float, float], target: tuple[float, float], creep: tuple[float, float]) -> Sight:
@@ -67,24 +69,26 @@ class Line:
         dx, dy = target[0] - x, target[1] - y
         if target != self._target:
             self._move_to(target, motion, dx, dy, crab(self._course_rad, creep))
-        course = self._course_rad
-        c, s = cos(course), sin(course)
-        angle = crab(course, creep)
-        off = wrap_pi(motion - course - angle)
-        self._off_rad = off
-        along = max(-CREEP_LIMIT, min(CREEP_LIMIT, c * creep[0] + s * creep[1]))
+        c, s = self._cos, self._sin
+        creep_x, creep_y = creep
+        angle = -asin(clamped(c * creep_y - s * creep_x, CREEP_LIMIT))
+        self._off_rad = off = wrap_pi(motion - self._course_rad - angle)
+        along = clamped(c * creep_x + s * creep_y, CREEP_LIMIT)
         return Sight(c * dx + s * dy, s * dx - c * dy, off, cos(angle) + along)
 
     def _move_to(self, target: tuple[float, float], motion: float, dx: float, dy: float, angle: float) -> None:
         self._target = target
         is_far = dx * dx + dy * dy > self._lookahead_m * self._lookahead_m
-        self._course_rad = atan2(dy, dx) if is_far else wrap_pi(motion - angle - self._off_rad)
+        self._lay(atan2(dy, dx) if is_far else wrap_pi(motion - angle - self._off_rad))
+
+    def _lay(self, course_rad: float) -> None:
+        self._course_rad, self._cos, self._sin = course_rad, cos(course_rad), sin(course_rad)
 
 
 def crab(course_rad: float, creep: tuple[float, float]) -> float:
     """Angle by which the body has to point beside a course so that it is not carried off it, rad."""
     across = cos(course_rad) * creep[1] - sin(course_rad) * creep[0]
-    return -asin(max(-CREEP_LIMIT, min(CREEP_LIMIT, across)))
+    return -asin(clamped(across, CREEP_LIMIT))
 
 
 def line_rate(sight: Sight, v_m_s: float, cross_gain_rad_m2: float, heading_weight_1_s2: float) -> float:

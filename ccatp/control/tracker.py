@@ -2,11 +2,13 @@
 
 from enum import StrEnum
 from math import atan2, cos, hypot, pi, sin
+from typing import Protocol
 
 from ccatp.angles import wrap_pi
 from ccatp.config.models import ControlConfig, LimitsConfig
 from ccatp.control.axis import Axis, BareAxis, ProfiledAxis
 from ccatp.control.pid import Pid
+from ccatp.control.profile import clamped
 from ccatp.control.steering import Line, crab, line_rate
 from ccatp.samples import Twist
 
@@ -22,6 +24,21 @@ class Phase(StrEnum):
     TURN = "turn"
     DRIVE = "drive"
     DONE = "done"
+
+
+TURN, DRIVE, DONE = Phase
+
+
+class Speeds(Protocol):
+    """Speeds of the robot's origin: a ``Twist``, or a state that has them."""
+
+    @property
+    def v_m_s(self) -> float:
+        """Forward speed."""
+
+    @property
+    def omega_rad_s(self) -> float:
+        """Angular rate."""
 
 
 class LegTracker:
@@ -58,7 +75,7 @@ class LegTracker:
         self._steering_damping = gains.angular.kd
         self._omega_max = omega
         self._reverse = False
-        self.phase = Phase.DONE
+        self.phase = DONE
 
     def begin(
         self,
@@ -77,24 +94,24 @@ class LegTracker:
         """
         self._reverse = reverse
         if hypot(target[0] - pose[0], target[1] - pose[1]) <= self._position_tolerance_m:
-            self.phase = Phase.DONE  # it is there, and the bearing of a stop so near is noise
+            self.phase = DONE  # it is there, and the bearing of a stop so near is noise
             return
         angle = self._bearing_error(pose, target, creep)
         if abs(angle) > self._straight_rad:
-            self.phase = Phase.TURN
+            self.phase = TURN
             self._angular.begin(angle)
         else:
             self._begin_drive(pose, target)
 
     def begin_turn(self, angle_rad: float) -> None:
         """Start a turn in place by ``angle_rad`` (use with ``step_turn``)."""
-        self.phase = Phase.TURN
+        self.phase = TURN
         self._angular.begin(angle_rad)
 
     @property
     def planned_s(self) -> float:
         """Bang-bang time of the motion begun last."""
-        return self._angular.duration_s if self.phase is Phase.TURN else self._forward.duration_s
+        return self._angular.duration_s if self.phase is TURN else self._forward.duration_s
 
     def step_turn(self, remaining_rad: float, dt_s: float, rate_rad_s: float | None = None) -> Twist:
         """One step of a turn in place; ``phase`` becomes DONE when it is over.
@@ -105,7 +122,7 @@ class LegTracker:
             rate_rad_s: the present rate, where it is known.
         """
         if self._angular.is_over(remaining_rad, self._heading_tolerance_rad, rate_rad_s):
-            self.phase = Phase.DONE
+            self.phase = DONE
             return STILL
         return Twist(0.0, self._angular.step(remaining_rad, dt_s, rate_rad_s))
 
@@ -114,7 +131,7 @@ class LegTracker:
         pose: tuple[float, float, float],
         target: tuple[float, float],
         dt_s: float,
-        twist: Twist | None = None,
+        speeds: Speeds | None = None,
         creep: tuple[float, float] = NO_CREEP,
     ) -> Twist:
         """One step of the leg: the twist for the next ``dt_s``; ``phase`` tells what it is at.
@@ -123,21 +140,21 @@ class LegTracker:
             pose: (x, y, heading) when the twist will take effect, m and rad.
             target: (x, y) in the same plane, m.
             dt_s: time until the next step.
-            twist: the speeds at that pose, where they are known.
+            speeds: those at that pose, where they are known.
             creep: drift (dx, dy) per metre of travel in the same plane.
         """
-        if self.phase is Phase.TURN:
+        if self.phase is TURN:
             angle = self._bearing_error(pose, target, creep)
-            rate = None if twist is None else twist.omega_rad_s
+            rate = None if speeds is None else speeds.omega_rad_s
             if not self._angular.is_over(angle, self._heading_tolerance_rad, rate):
                 return Twist(0.0, self._angular.step(angle, dt_s, rate))
             self._begin_drive(pose, target)
-        if self.phase is Phase.DONE:
+        if self.phase is DONE:
             return STILL
-        return self._drive(pose, target, dt_s, twist, creep) if self._shaped else self._head_on(pose, target, dt_s)
+        return self._drive(pose, target, dt_s, speeds, creep) if self._shaped else self._head_on(pose, target, dt_s)
 
     def _begin_drive(self, pose: tuple[float, float, float], target: tuple[float, float]) -> None:
-        self.phase = Phase.DRIVE
+        self.phase = DRIVE
         self._line.begin(pose, target, self._reverse)
         self._forward.begin(hypot(target[0] - pose[0], target[1] - pose[1]))
         self._steering.reset()
@@ -158,24 +175,26 @@ class LegTracker:
         pose: tuple[float, float, float],
         target: tuple[float, float],
         dt_s: float,
-        twist: Twist | None,
+        speeds: Speeds | None,
         creep: tuple[float, float],
     ) -> Twist:
         """Along the line; at its end the along-track remainder is corrected for a bounded time, and no other."""
         control, axis = self._control, self._along
         sight = self._line.look(pose, target, creep)
         sign = -1.0 if self._reverse else 1.0
-        speed = None if twist is None else sign * twist.v_m_s * sight.gain
-        axis.renew_if_far(sight.ahead_m)
-        if axis.is_over(sight.ahead_m, control.stop_tolerance_m, speed) or axis.overtime_s >= control.stop_time_s:
-            self.phase = Phase.DONE
-            return STILL
+        ahead_m, gain = sight.ahead_m, sight.gain
+        speed = None if speeds is None else sign * speeds.v_m_s * gain
+        if axis.overtime_s >= 0.0:
+            axis.renew_if_far(ahead_m)
+            if axis.is_over(ahead_m, control.stop_tolerance_m, speed) or axis.overtime_s >= control.stop_time_s:
+                self.phase = DONE
+                return STILL
         planned = axis.planned_speed
-        wanted = axis.step(sight.ahead_m, dt_s, speed) / sight.gain
+        wanted = axis.step(ahead_m, dt_s, speed) / gain
         rate = line_rate(sight, planned, control.cross_track_gain_rad_m2, control.heading_weight_1_s2)
-        if twist is not None:
-            rate += self._steering_damping * (rate - twist.omega_rad_s)
-        return Twist(sign * wanted, max(-self._omega_max, min(self._omega_max, rate)))
+        if speeds is not None:
+            rate += self._steering_damping * (rate - speeds.omega_rad_s)
+        return Twist(sign * wanted, clamped(rate, self._omega_max))
 
     def _head_on(self, pose: tuple[float, float, float], target: tuple[float, float], dt_s: float) -> Twist:
         """The thesis's drive: one PID on the distance, one on the bearing, eqs 3.1 to 3.4."""
@@ -187,11 +206,11 @@ class LegTracker:
             ahead, left = -ahead, -left
         remaining = hypot(ahead, left)
         if self._forward.is_over(remaining, self._position_tolerance_m, None):
-            self.phase = Phase.DONE
+            self.phase = DONE
             return STILL
         error = atan2(left, ahead)
         if abs(error) > REALIGN_RAD:
-            self.phase = Phase.TURN
+            self.phase = TURN
             self._angular.begin(error)
             return STILL
         speed = self._forward.step(remaining, dt_s, None)

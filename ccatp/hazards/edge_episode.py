@@ -151,8 +151,11 @@ class Episode:
             return False
         if worst_m > self._limits.no_map_m:
             return self._declare(Cause.SILENT_WHEELS, worst_m, self._limits.no_map_m)
-        self._moved = self._on_deck(place[0] - self._sensor0[0], place[1] - self._sensor0[1])
-        robot = self._on_deck(odometry.x_m - self._robot0[0], odometry.y_m - self._robot0[1])
+        c, s, sensor0, robot0 = self._cos, self._sin, self._sensor0, self._robot0
+        dx, dy = place[0] - sensor0[0], place[1] - sensor0[1]
+        self._moved = c * dx - s * dy, s * dx + c * dy
+        dx, dy = odometry.x_m - robot0[0], odometry.y_m - robot0[1]
+        robot = c * dx - s * dy, s * dx + c * dy
         if self.phase is Phase.FRESH:
             self._classify(robot)
         return self._judge(robot)
@@ -260,8 +263,9 @@ class Episode:
         travel = hypot(tx, ty)
         if travel < width:
             return travel, width
-        if hypot(*robot) > limits.crossing_m:
-            return hypot(*robot), limits.crossing_m
+        from_start = hypot(*robot)
+        if from_start > limits.crossing_m:
+            return from_start, limits.crossing_m
         cosine = max(abs((tx, ty)[k]) / travel, limits.min_cosine)
         return travel, width / cosine + limits.extra_m
 
@@ -288,6 +292,3 @@ class Episode:
         outward = self._turn_sign * (self._heading - self._declared_heading) * self._radius_m
         if outward > self._limits.outward_turn_m:
             self._is_turn_spent = True
-
-    def _on_deck(self, dx: float, dy: float) -> Place:
-        return self._cos * dx - self._sin * dy, self._sin * dx + self._cos * dy

@@ -24,7 +24,7 @@ from ccatp.hazards.edge_map import EdgeMap
 from ccatp.hazards.wheel_track import Odometry, WheelTrack, pose_at
 from ccatp.samples import EdgeSample
 
-SENSORS = range(4)
+SENSORS = 4
 
 
 class PoseEstimate(Protocol):
@@ -89,13 +89,8 @@ class EdgeRule:
 
     @property
     def is_idle(self) -> bool:
-        """No episode is open: a frame in which all sensors are on needs no look."""
+        """No episode is open, nor is the robot lifted."""
         return self._odometry is None
-
-    def skip(self, samples: list[EdgeSample]) -> None:
-        """Take a frame's samples, all on, while idle."""
-        if samples:
-            self._last_t_s = samples[-1][0]
 
     def step(self, samples: list[EdgeSample], estimate: PoseEstimate | None) -> None:
         """Judge a frame's samples, oldest first. The frame's encoder samples must have been pushed to ``track``.
@@ -105,6 +100,9 @@ class EdgeRule:
             estimate: the newest pose, already found fresh and finite; None without one.
         """
         if not samples:
+            return
+        if self._odometry is None and _are_all_on(samples):
+            self._last_t_s = samples[-1][0]
             return
         self.track.update(samples[-1][0])
         if self._odometry is None:
@@ -125,15 +123,13 @@ class EdgeRule:
         silent_s = self.track.silence_s(t_s)
         c, s = cos(odometry.heading_rad), sin(odometry.heading_rad)
         off = 0
-        for i in SENSORS:
+        for i, known in enumerate(self.episodes):
             # Anything but a clear "on" counts as off.
             is_on = sample[i + 1] == 1
+            if is_on and known is None:
+                continue
             off += not is_on
-            episode = self.episodes[i]
-            if episode is None:
-                if is_on:
-                    continue
-                episode = self._open(i, odometry, dt_s, estimate)
+            episode = known or self._open(i, odometry, dt_s, estimate)
             ox, oy = self._offsets[i]
             place = odometry.x_m + c * ox - s * oy, odometry.y_m + s * ox + c * oy
             if is_on:
@@ -170,7 +166,7 @@ class EdgeRule:
         self.episodes = (*self.episodes[:i], episode, *self.episodes[i + 1 :])
 
     def _count_all(self, off: int) -> None:
-        self._all_off = self._all_off + 1 if off == len(SENSORS) else 0
+        self._all_off = self._all_off + 1 if off == SENSORS else 0
         self._all_on = self._all_on + 1 if off == 0 else 0
         if self._all_off >= self._lifted_samples:
             self.is_lifted = True
@@ -187,6 +183,14 @@ class EdgeRule:
         for i, episode in enumerate(self.episodes):
             if episode is not None and episode.phase is not Phase.DECLARED and episode.look_ahead():
                 self.declared[i] += 1
+
+
+def _are_all_on(samples: list[EdgeSample]) -> bool:
+    """Whether every sensor is on in every sample; anything but a clear 1 is off."""
+    for _, front_left, front_right, rear_left, rear_right in samples:
+        if not (front_left == 1 and front_right == 1 and rear_left == 1 and rear_right == 1):
+            return False
+    return True
 
 
 def _fastest(robot: RobotConfig, offset_m: tuple[float, float]) -> float:

@@ -69,23 +69,23 @@ class WheelTrack:
         while frames:
             samples = frames.popleft()
             if samples[-1].t_s >= since_s:
-                for sample in samples:
-                    self._read(sample)
+                self._read(samples)
         if len(self.knots) > 2 * KNOTS_KEPT:
             self.dropped += len(self.knots) - KNOTS_KEPT
             del self.knots[:-KNOTS_KEPT]
 
-    def _read(self, sample: WheelSample) -> None:
-        t_s, right, left = sample
-        if t_s <= max(self._right_t_s, self._left_t_s):
-            return
-        if right is not None and right - right == 0.0:
-            self._right, self._right_t_s = right, t_s
-        if left is not None and left - left == 0.0:
-            self._left, self._left_t_s = left, t_s
-        if t_s - min(self._right_t_s, self._left_t_s) <= self._hold_s:
-            v = self._half_radius_m * (self._right + self._left)
-            self.knots.append(Knot(t_s, v, self._radius_per_base * (self._right - self._left)))
+    def _read(self, samples: Sequence[WheelSample]) -> None:
+        half_radius_m, radius_per_base, hold_s = self._half_radius_m, self._radius_per_base, self._hold_s
+        for t_s, right, left in samples:
+            if t_s <= self._right_t_s or t_s <= self._left_t_s:
+                continue
+            if right is not None and right - right == 0.0:
+                self._right, self._right_t_s = right, t_s
+            if left is not None and left - left == 0.0:
+                self._left, self._left_t_s = left, t_s
+            if t_s - self._right_t_s <= hold_s and t_s - self._left_t_s <= hold_s:
+                both, turning = self._right + self._left, self._right - self._left
+                self.knots.append(Knot(t_s, half_radius_m * both, radius_per_base * turning))
 
     def silence_s(self, t_s: float) -> float:
         """How long at ``t_s`` one of the wheels has been without a usable sample; 0 while the last one is held.
@@ -136,12 +136,15 @@ class Odometry:
 
     def advance_to(self, t_s: float) -> None:
         """Carry the pose to ``t_s``, trapezoid by trapezoid; a time before the pose's is ignored."""
-        knots = self._track.knots
-        following = max(self._next - self._track.dropped, 0)
-        while following < len(knots) and knots[following].t_s <= t_s:
-            self._move(*knots[following])
+        knots, dropped = self._track.knots, self._track.dropped
+        following, count = max(self._next - dropped, 0), len(knots)
+        while following < count:
+            knot = knots[following]
+            if knot[0] > t_s:
+                break
+            self._move(*knot)
             following += 1
-        self._next = following + self._track.dropped
+        self._next = following + dropped
         if t_s > self.t_s:
             here = Knot(self.t_s, self.v_m_s, self.omega_rad_s)
             self._move(t_s, *self._velocity_at(t_s, here, following))

@@ -64,7 +64,7 @@ class EdgeScanner:
 
 
 def _transitions(last_s: float, values: tuple[int, ...], sample: EdgeSample) -> list[Transition]:
-    t = sample.t_s
+    t = sample[0]
     return [
         Transition(0.5 * (last_s + t), t - last_s, corner, bool(new))
         for corner, (old, new) in enumerate(zip(values, sample[1:], strict=True))

@@ -80,16 +80,19 @@ class Source:
         self.backward_run = 0
         self._used: deque[Sequence[float]] = deque()
 
-    def use(self, times_s: Sequence[float]) -> None:
-        """Note the times of a batch of used samples, oldest first, not empty."""
+    def use(self, times_s: Sequence[float], oldest_s: float) -> None:
+        """Note the times of a batch of used samples, oldest first, not empty; forget those before ``oldest_s``.
+
+        Samples that old are refused anyway. Two may go where one comes, so the memory does not grow.
+        """
+        used = self._used
         self.newest_s = times_s[-1]
         self.backward_run = 0
-        self._used.append(times_s)
-
-    def forget_before(self, t_s: float) -> None:
-        """Drop the batches that ended before ``t_s``: samples that old are refused anyway."""
-        while self._used and self._used[0][-1] < t_s:
-            self._used.popleft()
+        used.append(times_s)
+        if used[0][-1] < oldest_s:
+            used.popleft()
+            if used[0][-1] < oldest_s:
+                used.popleft()
 
     def refusal(self, t_s: float, frame_s: float, oldest_s: float) -> str | None:
         """Why a sample of time ``t_s`` is refused (a key of the counts), or None."""
@@ -153,42 +156,42 @@ class SampleIntake:
             return None
         if not all(map(lt, times, times[1:])):
             return None
-        for source in (self._right, self._left):
-            source.use(times)
-            source.forget_before(oldest_s)
+        self._right.use(times, oldest_s)
+        self._left.use(times, oldest_s)
         return times, right, left
 
     def wheels(self, t_s: float, encoders: Iterable[WheelSample]) -> tuple[list[WheelReading], list[WheelReading]]:
         """The usable readings of the right and of the left wheel, each sample judged by itself."""
         right: list[WheelReading] = []
         left: list[WheelReading] = []
+        oldest_s = t_s - self._history_s
         for sample in encoders:
             if not all(isfinite(value) for value in sample if value is not None):
                 self._counts["nonfinite"] += 1
                 continue
-            for source, rate, kept in (
-                (self._right, sample.right_rad_s, right),
-                (self._left, sample.left_rad_s, left),
-            ):
-                if rate is not None and self._is_usable(source, sample.t_s, t_s):
-                    source.use((sample.t_s,))
-                    kept.append((sample.t_s, rate))
-        for source in (self._right, self._left):
-            source.forget_before(t_s - self._history_s)
+            sample_s, right_rad_s, left_rad_s = sample
+            for source, rate, kept in ((self._right, right_rad_s, right), (self._left, left_rad_s, left)):
+                if rate is not None and self._is_usable(source, sample_s, t_s):
+                    source.use((sample_s,), oldest_s)
+                    kept.append((sample_s, rate))
         return right, left
 
     def imu(self, t_s: float, samples: Sequence[ImuSample]) -> Sequence[ImuSample]:
         """The usable IMU samples."""
+        source, oldest_s = self._imu, t_s - self._history_s
+        if len(samples) == 1:  # nearly always, and nearly always good
+            t, ax, wz = samples[0]
+            if source.newest_s < t <= t_s and oldest_s <= t and isfinite(ax + wz):
+                source.use((t,), oldest_s)
+                return samples
         kept: list[ImuSample] = []
-        source = self._imu
         for sample in samples:
             t, ax, wz = sample
             if not isfinite(t + ax + wz):
                 self._counts["nonfinite"] += 1
             elif self._is_usable(source, t, t_s):
-                source.use((t,))
+                source.use((t,), oldest_s)
                 kept.append(sample)
-        source.forget_before(t_s - self._history_s)
         return kept
 
     def _is_usable(self, source: Source, sample_s: float, frame_s: float) -> bool:

@@ -5,7 +5,7 @@ from math import exp, log
 # Candidates for the scatter, from "does not change" to "anything goes"; a factor of sqrt(2) apart.
 _CANDIDATES = tuple(1e-6 * 2.0 ** (k / 2.0) for k in range(32))
 _FORGETTING = 0.99  # of the likelihoods per leg, so that a world that changes is noticed within a hundred legs
-_SHARPNESS = 1.0  # how fast the prior falls off, in powers of the ratio to what is expected
+_SHARPNESS = 0.5  # how fast the prior falls off, in powers of the ratio to what is expected
 _LEAST = 1e-14
 
 
@@ -26,7 +26,7 @@ class Population:
     Attributes:
         mean: expectation of the next leg's parameter.
         mean_variance: how well it is known.
-        scatter: sigma^2, the square of its posterior mean.
+        scatter: sigma^2, the square of its posterior geometric mean.
     """
 
     def __init__(self, mean: float, sigma: float, scatter_sigma: float, largest: float) -> None:
@@ -65,5 +65,6 @@ class Population:
         self.mean_variance = sum(
             w * (v + (m - self.mean) ** 2) for w, m, v in zip(weights, self._means, self._variances, strict=True)
         )
-        scatter = sum(w * s for w, s in zip(weights, self._sigmas, strict=True))
-        self.scatter = scatter * scatter
+        # The mean of the logarithms: where legs do not differ, every sigma below what a leg can resolve is as likely as
+        # the next, and their arithmetic mean would be the largest of them.
+        self.scatter = exp(2.0 * sum(w * log(s) for w, s in zip(weights, self._sigmas, strict=True)))

@@ -2,33 +2,33 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
-from math import hypot, inf, isfinite, sqrt
+from math import hypot, inf, isfinite
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ccatp.mirror.errors import MirrorError
 from ccatp.mirror.layout import PanelGrid
+from ccatp.mirror.outline import Outline, Span
 
 FloatArray = NDArray[np.float64]
 
 Box = tuple[float, float, float]
-Span = tuple[float, float, float]
 Point = tuple[float, float]
 
 _CLEARANCE_TOLERANCE_M = 1e-9
 
 
-class Rim:
-    """Rectilinear outline with stepped corners, mirror-symmetric about x = 0; deck plane, m.
+class Rim(Outline):
+    """Outline with stepped corners of a whole mirror, deck plane, m.
 
-    The outline runs along the panels' own outer edges. Positive distances lie on the mirror.
+    It runs along the panels' own outer edges. Positive distances lie on the mirror.
 
     Attributes:
         vertices: corners counter-clockwise, shape (n, 2), m.
     """
 
-    __slots__ = ("_boxes", "_edges", "_horizontal", "_vertical", "vertices")
+    __slots__ = ("_boxes", "_edges", "vertices")
 
     def __init__(self, slabs: Sequence[Span]) -> None:
         """Build the outline from stacked slabs.
@@ -38,50 +38,24 @@ class Rim:
         """
         widths = [0.0, *(half for half, _, _ in slabs), 0.0]
         levels = [slabs[0][1], *(high for _, _, high in slabs)]
-        # The right half of the outline: upright edges (x, low y, high y) and level edges (y, low x, high x).
-        self._vertical = tuple(slabs)
-        self._horizontal = tuple((y, min(a, b), max(a, b)) for y, (a, b) in zip(levels, pairwise(widths), strict=True))
+        steps = zip(levels, pairwise(widths), strict=True)
+        super().__init__(slabs, [(y, min(a, b), max(a, b)) for y, (a, b) in steps])
         self._boxes = _maximal_boxes(slabs)
         right = [(half, y) for half, low, high in slabs for y in (low, high)]
         corners = right + [(-x, y) for x, y in reversed(right)]
         self.vertices: FloatArray = np.array(corners)
         self._edges = tuple(zip(corners, [*corners[1:], corners[0]], strict=True))
 
-    def signed_distance_m(self, x: float, y: float) -> float:
-        """Distance to the rim: > 0 on the mirror, < 0 beyond it, m. Exact; -inf for a NaN."""
-        x = abs(x)  # the outline is symmetric: the nearest point lies on the point's own side
-        best = inf
-        inside = False
-        for half, low, high in self._vertical:
-            dx = x - half
-            if y < low:
-                d2 = dx * dx + (low - y) * (low - y)
-            elif y <= high:
-                d2 = dx * dx
-                inside = inside or dx <= 0.0
-            else:
-                d2 = dx * dx + (y - high) * (y - high)
-            best = min(best, d2)
-        for level, near, far in self._horizontal:
-            dy = y - level
-            d2 = dy * dy
-            if d2 < best:
-                if not near <= x <= far:
-                    dx = max(near - x, x - far)
-                    d2 += dx * dx
-                best = min(best, d2)
-        return sqrt(best) if inside else -sqrt(best)
-
     def signed_distances_m(self, xs: FloatArray, ys: FloatArray) -> FloatArray:
         """Signed distances of many points; ``xs`` and ``ys`` broadcast against each other, m."""
         x, y = np.broadcast_arrays(np.abs(np.asarray(xs, dtype=np.float64)), np.asarray(ys, dtype=np.float64))
         best = np.full(x.shape, inf)
         inside = np.zeros(x.shape, dtype=np.bool_)
-        for half, low, high in self._vertical:
+        for half, low, high in self._upright:
             dy = np.maximum(np.maximum(low - y, y - high), 0.0)
             np.minimum(best, np.hypot(x - half, dy), out=best)
             inside |= (dy == 0.0) & (x <= half)
-        for level, near, far in self._horizontal:
+        for level, near, far in self._level:
             dx = np.maximum(np.maximum(near - x, x - far), 0.0)
             np.minimum(best, np.hypot(dx, y - level), out=best)
         return np.where(inside, best, -best)

@@ -13,6 +13,7 @@ from ccatp.samples import Vector3
 FloatArray = NDArray[np.float64]
 Axes = tuple[Vector3, Vector3, Vector3]
 Jet = tuple[float, float, float, float, float, float]
+Third = tuple[float, float, float, float]
 
 _METRE_PER_MM = 1e-3
 _NEWTON_STEPS = 20
@@ -86,6 +87,28 @@ class Surface:
             fy = fy * x + q1
             half_fyy = half_fyy * x + half_q2
         return f, fx, fy, 2.0 * half_fxx, fxy, 2.0 * half_fyy
+
+    def third(self, x: float, y: float) -> Third:
+        """Third derivatives (fxxx, fxxy, fxyy, fyyy), 1/m^2."""
+        f = fx = fy = half_fxx = fxy = half_fyy = sixth_fxxx = half_fxxy = half_fxyy = sixth_fyyy = 0.0
+        for row in self._rows:
+            q = q1 = half_q2 = sixth_q3 = 0.0
+            for c in row:
+                sixth_q3 = sixth_q3 * y + half_q2
+                half_q2 = half_q2 * y + q1
+                q1 = q1 * y + q
+                q = q * y + c
+            sixth_fxxx = sixth_fxxx * x + half_fxx
+            half_fxx = half_fxx * x + fx
+            fx = fx * x + f
+            f = f * x + q
+            half_fxxy = half_fxxy * x + fxy
+            fxy = fxy * x + fy
+            fy = fy * x + q1
+            half_fxyy = half_fxyy * x + half_fyy
+            half_fyy = half_fyy * x + half_q2
+            sixth_fyyy = sixth_fyyy * x + sixth_q3
+        return 6.0 * sixth_fxxx, 2.0 * half_fxxy, 2.0 * half_fxyy, 6.0 * sixth_fyyy
 
     def normal(self, x: float, y: float) -> Vector3:
         """Unit normal on the drive side, ``n = (-fx, -fy, 1)/W``, deck frame."""

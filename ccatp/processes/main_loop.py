@@ -16,7 +16,7 @@ from ccatp.errors import CcatpError, ExitStatus, UnreachableError
 from ccatp.etalon_client import EtalonClient, EtalonError
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror
-from ccatp.mission import Mission, Order
+from ccatp.mission import Mission
 from ccatp.processes import spinning
 from ccatp.processes.building import build_parts
 from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
@@ -28,6 +28,7 @@ from ccatp.robot_link import RobotLink, read_key
 from ccatp.router import Router
 from ccatp.store import MissionStore
 from ccatp.surveying.journey import Motion
+from ccatp.surveying.orders import Order
 from ccatp.surveying.states import Outcome, State
 from ccatp.wire.robot import Hello, Sensors
 from ccatp.wire.topics import MissionStatus, Presence
@@ -133,7 +134,6 @@ class MainLoop:
         self._hello, self._is_lockstep = hello, hello.lockstep
         self._predictor = CommandPredictor(self._cfg.robot.wheel_lag_s, 1.0 / hello.frame_hz)
         self._phase = "joined"
-        self._link.send_fans(1, self._cfg.robot.fan_duty)
         self._teller.say("info", f"joined the robot at {self._cfg.robot.host}:{self._cfg.robot.port}")
 
     async def _farewell(self, stop: asyncio.Event) -> None:
@@ -210,6 +210,8 @@ class MainLoop:
         dt_s = t_s - self._t_last_s if self._t_first_s is not None else self._frame_period_s()
         if self._t_first_s is None:
             self._t_first_s = t_s
+            # Before the first drive and not on joining, so that in lockstep they start in a certain frame.
+            self._link.send_fans(1, self._cfg.robot.fan_duty)
         self._t_last_s, self._seq, self._frame_wall_s = t_s, seq, time.monotonic()
         localizer = self._localizer
         localizer.step(t_s, sensors.imu, sensors.enc, sensors.edge, sensors.gravity)
@@ -218,6 +220,7 @@ class MainLoop:
             self._mission.fault(localizer.hold_cause, is_lost=localizer.is_frozen)
             localizer.clear_hold()
         if dt_s <= 0.0:  # counted by the localizer; a controller cannot go back in time
+            self._teller.stale_frame(seq, raw)
             self._drive(seq, 0.0, 0.0)
             return
         waiting = time.perf_counter()
@@ -254,7 +257,7 @@ class MainLoop:
             self._teller.rest(self._seq, motion.t_s)
         if order.arrived is not None:
             error_m = self._mission.survey.distance_m(motion.pose)
-            self._teller.arrival(order.arrived, error_m)
+            self._teller.arrival(self._seq, motion.t_s, order.arrived, error_m)
             self._store.record_arrival(order.arrived, motion.t_s, error_m)
         if order.measure:
             pose = self._localizer.deck_pose

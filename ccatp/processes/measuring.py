@@ -117,6 +117,7 @@ class MeasuringDesk:
             self._wakes.set()
             return
         except FixRefused as refusal:
+            self._teller.fix(request.point, fix, 0.0, is_fused=False)
             self._teller.say("warning", f"the fix at {_name(request.point)} is refused: {refusal}")
             await self._skip(request, str(refusal))
             return

@@ -8,7 +8,9 @@ import msgspec
 import numpy as np
 import zmq
 
+import ccatp
 from ccatp.bus import Subscriber
+from ccatp.config.loader import dump_config
 from ccatp.config.models import Config
 from ccatp.errors import ExitStatus
 from ccatp.mirror.alignment import PanelFit, fit_panel
@@ -22,6 +24,7 @@ from ccatp.samples import PanelId, PanelPose, PointId
 from ccatp.store import MissionStore
 from ccatp.summary import RunFacts, SummaryBuilder, puck_targets
 from ccatp.wire.topics import (
+    RECORD_FORMAT,
     TOPICS,
     Arrival,
     DangerEvent,
@@ -108,7 +111,14 @@ class RunCollector:
             run_dir / "telemetry.mcap",
             [(topic.name, schema_of(topic.name)) for topic in TOPICS if topic.recorded],
             is_simulation=is_sim,
-            metadata={"mirror": cfg.mirror.name, "seed": str(cfg.run.seed), "world": cfg.world.name},
+            metadata={
+                "format": str(RECORD_FORMAT),
+                "ccatp": ccatp.__version__,
+                "mirror": cfg.mirror.name,
+                "seed": str(cfg.run.seed),
+                "world": cfg.world.name,
+                "config": dump_config(cfg),  # a later session in the same directory may have another
+            },
             on_failure=self._on_recorder_failure,
         )
         self._view: View | None = None

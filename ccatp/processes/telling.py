@@ -57,8 +57,16 @@ class Teller:
             )
         row, col = pose.panel
         self._track.append((seq, t_s, row, col, pose.x_m, pose.y_m, pose.heading_rad, sigma))
+        self._keep(raw)
+
+    def stale_frame(self, seq: int, raw: bytes) -> None:
+        """Keep the line of a frame that is not newer than the last one: the localizer has seen it."""
+        self.seq = seq
+        self._keep(raw)
+
+    def _keep(self, raw: bytes) -> None:
         self._lines.append(msgspec.Raw(raw))
-        if len(self._track) >= BATCH_FRAMES:
+        if len(self._lines) >= BATCH_FRAMES:
             self.flush()
 
     def tick(self, microseconds: float) -> None:
@@ -73,17 +81,18 @@ class Teller:
     def flush(self) -> None:
         """Publish the batches."""
         self._flushed_wall_s = time.monotonic()
-        if not self._track:
+        if not self._lines:
             return
         seq, t_s = self.seq, self.t_s
-        self._publisher.send("track", Track(seq=seq, t_s=t_s, rows=self._track))
+        if self._track:
+            self._publisher.send("track", Track(seq=seq, t_s=t_s, rows=self._track))
+            self._publisher.send("timing", Timing(seq=seq, t_s=t_s, tick_us=self._tick_us))
         self._publisher.send("sensors", SensorLines(seq=seq, t_s=t_s, lines=self._lines))
-        self._publisher.send("timing", Timing(seq=seq, t_s=t_s, tick_us=self._tick_us))
         self._track, self._lines, self._tick_us = [], [], []
 
-    def arrival(self, point: PointId, error_m: float) -> None:
-        """The robot came to rest at a point for the first time."""
-        message = Arrival(seq=self.seq, t_s=self.t_s, point=(point.row, point.col, point.point), error_mm=1e3 * error_m)
+    def arrival(self, seq: int, t_s: float, point: PointId, error_m: float) -> None:
+        """The robot came to rest in frame ``seq``, at a point for the first time."""
+        message = Arrival(seq=seq, t_s=t_s, point=(point.row, point.col, point.point), error_mm=1e3 * error_m)
         self._publisher.send("arrival", message)
 
     def rest(self, seq: int, t_s: float) -> None:

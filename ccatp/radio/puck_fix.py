@@ -30,7 +30,8 @@ def solve_fix(
     """
     ranges_m = np.array(tuple(lengths_m.values()))
     sigmas_m = cfg.length_sigma_m + cfg.length_sigma_per_m * ranges_m
-    solution = multilaterate([collimators_m[channel] for channel in lengths_m], ranges_m, sigmas_m, expected_m)
+    anchors_m = np.array([collimators_m[channel] for channel in lengths_m]).reshape(-1, 3)  # none is too few, too
+    solution = multilaterate(anchors_m, ranges_m, sigmas_m, expected_m)
     check_solution(
         solution,
         expected_m,

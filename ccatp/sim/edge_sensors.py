@@ -1,11 +1,10 @@
 """Pure. The edge sensors: whether there is panel material under each of them, sample by sample."""
 
 from collections.abc import Sequence
-from itertools import repeat
-from math import hypot
+from math import hypot, inf
 
 from ccatp.mirror.mirror import Mirror
-from ccatp.sim.panel_edges import PanelEdges, nominal_rectangles
+from ccatp.sim.panel_edges import PanelEdges, Rectangle, nominal_rectangles
 from ccatp.sim.plant import Plant
 
 EdgeTuple = tuple[float, int, int, int, int]
@@ -13,12 +12,13 @@ EdgeTuple = tuple[float, int, int, int, int]
 # A sensor is sampled along the chord of its way within a frame; the arc departs from it by microns. A chord whose ends
 # lie on one panel lies on it, and one whose ends lie beyond one side of it lies beyond, but for rounding.
 _ROUNDING_M = 1e-9
-_CHANGING = (-1, 0.0)
 # Way of a sensor in the deck plane over that of the body; the curvature turns the body's axes by less than this.
 _CURVED = 1.01
+_ALL_ON = (1, 1, 1, 1)
+_NOWHERE: Rectangle = (inf, -inf, inf, -inf)
 
-Point = tuple[float, float]
 _Body = tuple[float, float, float, float, float, float]
+_Line = tuple[int, float, float, float, float]
 
 
 class EdgeSensors:
@@ -28,7 +28,7 @@ class EdgeSensors:
     looked up.
     """
 
-    __slots__ = ("_body", "_is_on", "_material", "_offsets", "_panel_at", "_reach_m", "_slack_m", "_values")
+    __slots__ = ("_body", "_inner", "_is_on", "_offsets", "_panel_at", "_reach_m", "_slack_m", "_under", "_values")
 
     def __init__(
         self, mirror: Mirror, offsets_m: Sequence[tuple[float, float]], shifted: PanelEdges | None = None
@@ -42,17 +42,21 @@ class EdgeSensors:
         """
         self._panel_at = mirror.panel_at
         self._is_on = mirror.is_on_panel if shifted is None else shifted.is_on_panel
-        self._material = nominal_rectangles(mirror) if shifted is None else shifted.rectangles
+        material = nominal_rectangles(mirror) if shifted is None else shifted.rectangles
+        m = _ROUNDING_M
+        self._inner = {pid: (x0 + m, x1 - m, y0 + m, y1 - m) for pid, (x0, x1, y0, y1) in material.items()}
+        self._under = [_NOWHERE] * len(offsets_m)  # the inner rectangle on which each sensor was seen last
         self._offsets = [(float(x), float(y)) for x, y in offsets_m]
-        self._reach_m = max(hypot(x, y) for x, y in self._offsets)
-        self._values = (1, 1, 1, 1)
+        self._reach_m = _CURVED * max(hypot(x, y) for x, y in self._offsets)
+        self._values = _ALL_ON
         self._slack_m = 0.0
         self._body: _Body = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     @property
     def places(self) -> list[tuple[float, float]]:
         """Deck (x, y) of the sensors at the end of the last frame, m."""
-        return self._places(self._body)
+        x, y, hx, hy, lx, ly = self._body
+        return [(x + a * hx + b * lx, y + a * hy + b * ly) for a, b in self._offsets]
 
     def place(self, plant: Plant) -> None:
         """Put the sensors where the plant is."""
@@ -72,61 +76,57 @@ class EdgeSensors:
         if plant.is_moving:
             before = self._body
             self._body = plant.x_m, plant.y_m, plant.hx, plant.hy, plant.lx, plant.ly
-            moved_m = abs(plant.forward_m) + abs(plant.left_m) + self._reach_m * abs(plant.turn_rad)
-            self._slack_m -= _CURVED * moved_m
+            way_m = _CURVED * (abs(plant.forward_m) + abs(plant.left_m)) + self._reach_m * abs(plant.turn_rad)
+            self._slack_m -= way_m
             if self._slack_m <= 0.0:
-                return self._look(self._places(before), self.places, times_s, fractions)
+                changing = self._look(before)
+                if changing:
+                    return self._sample(changing, times_s, fractions)
         a, b, c, d = self._values
-        return list(zip(times_s, repeat(a), repeat(b), repeat(c), repeat(d), strict=False))
+        return [(t, a, b, c, d) for t in times_s]
 
-    def _places(self, body: _Body) -> list[tuple[float, float]]:
-        x, y, hx, hy, lx, ly = body
-        return [(x + a * hx + b * lx, y + a * hy + b * ly) for a, b in self._offsets]
+    def _look(self, before: _Body) -> list[_Line]:
+        """Values and slack of a frame in which an edge may be near; the chords of sensors whose value may change."""
+        x0, y0, hx0, hy0, lx0, ly0 = before
+        x1, y1, hx1, hy1, lx1, ly1 = self._body
+        values, changing, slack_m = list(self._values), [], inf
+        for k, (a, b) in enumerate(self._offsets):
+            u, v = x0 + a * hx0 + b * lx0, y0 + a * hy0 + b * ly0
+            x, y = x1 + a * hx1 + b * lx1, y1 + a * hy1 + b * ly1
+            west, east, south, north = self._under[k]
+            if west <= u <= east and south <= v <= north and west <= x <= east and south <= y <= north:
+                values[k] = 1
+                slack_m = min(slack_m, x - west, east - x, y - south, north - y)
+                continue
+            slack_m = 0.0
+            if self._is_beside(k, u, v, x, y):
+                values[k] = 0
+            else:
+                changing.append((k, u, v, x, y))
+        self._values, self._slack_m = (values[0], values[1], values[2], values[3]), slack_m
+        return changing
 
-    def _look(
-        self, before: Sequence[Point], after: Sequence[Point], times_s: Sequence[float], fractions: Sequence[float]
-    ) -> list[EdgeTuple]:
-        """Readings of a frame in which an edge may be near."""
-        found = [self._steady(*ends) for ends in zip(before, after, strict=True)]
-        self._slack_m = min(slack_m for _, slack_m in found)
-        values = [value for value, _ in found]
-        changing = [k for k, value in enumerate(values) if value < 0]
-        if changing:
-            return self._sample(values, before, after, changing, times_s, fractions)
-        self._values = a, b, c, d = values[0], values[1], values[2], values[3]
-        return list(zip(times_s, repeat(a), repeat(b), repeat(c), repeat(d), strict=False))
-
-    def _steady(self, before: Point, after: Point) -> tuple[int, float]:
-        """What a sensor reads throughout a frame, -1 where that may change, and how far it may go until it does."""
-        (u, v), (x, y) = before, after
+    def _is_beside(self, k: int, u: float, v: float, x: float, y: float) -> bool:
+        """Whether a sensor stays in the gap beside one side of a panel throughout its chord from (u, v) to (x, y)."""
         panel = self._panel_at(x, y)
-        if panel is None or self._panel_at(u, v) != panel:
-            return _CHANGING
-        x0, x1, y0, y1 = self._material[panel]
-        m = _ROUNDING_M
-        slack_m = min(x - x0, x1 - x, y - y0, y1 - y) - m
-        if slack_m >= 0.0 and min(u - x0, x1 - u, v - y0, y1 - v) >= m:
-            return 1, slack_m
-        beyond_m = max(min(x0 - x, x0 - u), min(x - x1, u - x1), min(y0 - y, y0 - v), min(y - y1, v - y1))
-        return (0, 0.0) if beyond_m > m else _CHANGING
+        if panel is None:
+            return False
+        self._under[k] = west, east, south, north = self._inner[panel]
+        if self._panel_at(u, v) != panel:
+            return False
+        m = 2.0 * _ROUNDING_M  # from the inner rectangle to beyond the outer one
+        return max(x, u) < west - m or min(x, u) > east + m or max(y, v) < south - m or min(y, v) > north + m
 
     def _sample(
-        self,
-        values: list[int],
-        before: Sequence[Point],
-        after: Sequence[Point],
-        changing: Sequence[int],
-        times_s: Sequence[float],
-        fractions: Sequence[float],
+        self, changing: Sequence[_Line], times_s: Sequence[float], fractions: Sequence[float]
     ) -> list[EdgeTuple]:
-        is_on = self._is_on
-        lines = [(k, *before[k], *after[k]) for k in changing]
+        is_on, values = self._is_on, list(self._values)
         found: list[EdgeTuple] = []
         for t, f in zip(times_s, fractions, strict=True):
-            for k, x0, y0, x1, y1 in lines:
+            for k, x0, y0, x1, y1 in changing:
                 values[k] = int(is_on(x0 + f * (x1 - x0), y0 + f * (y1 - y0)))
             found.append((t, values[0], values[1], values[2], values[3]))
-        for k, _, _, x1, y1 in lines:
+        for k, _, _, x1, y1 in changing:
             values[k] = int(is_on(x1, y1))
         self._values = values[0], values[1], values[2], values[3]
         return found

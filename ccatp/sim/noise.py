@@ -1,46 +1,43 @@
 """Pure. Random numbers of the simulated world: one stream per kind, each a function of the seed alone."""
 
+from collections.abc import Callable, Iterator
+from itertools import chain, islice
 from math import exp, sqrt
 
 import numpy as np
+from numpy.typing import NDArray
 
-_BLOCK = 4096
+FloatArray = NDArray[np.float64]
+
+WHOLE = 1.5 * 2.0**52
+"""``x + WHOLE - WHOLE`` is ``x`` rounded to a whole number while ``|x| < 2**51``: no call, no integer in between."""
+
+BLOCK = 4096
+"""Numbers drawn at a time: plain floats from a list are cheaper than calls to the generator."""
+
 _SAME_STEP_S = 1e-9  # differences of frame times are equal to within rounding
 
 
 class NoiseStream:
-    """Standard normal numbers of one kind, drawn in blocks: a function of the seed only.
+    """Standard normal numbers of one kind: a function of the seed only.
 
     Args:
         rng: the kind's own generator.
+
+    Attributes:
+        one: gives the next number.
     """
 
-    __slots__ = ("_block", "_next", "_rng")
+    __slots__ = ("_numbers", "one")
 
     def __init__(self, rng: np.random.Generator) -> None:
-        self._rng = rng
-        self._block: list[float] = []
-        self._next = 0
+        blocks: Iterator[list[float]] = iter(lambda: rng.standard_normal(BLOCK).tolist(), None)
+        self._numbers = chain.from_iterable(blocks)
+        self.one: Callable[[], float] = self._numbers.__next__
 
     def take(self, count: int) -> list[float]:
         """The next ``count`` numbers."""
-        start = self._next
-        self._next = end = start + count
-        if end <= len(self._block):
-            return self._block[start:end]
-        rest = self._block[start:]
-        while len(rest) < count:
-            rest += self._rng.standard_normal(_BLOCK).tolist()
-        self._block, self._next = rest, count
-        return rest[:count]
-
-    def one(self) -> float:
-        """The next number."""
-        at = self._next
-        if at < len(self._block):
-            self._next = at + 1
-            return self._block[at]
-        return self.take(1)[0]
+        return list(islice(self._numbers, count))
 
 
 class OrnsteinUhlenbeck:
@@ -50,7 +47,7 @@ class OrnsteinUhlenbeck:
     distribution. A time during which nobody asks costs nothing.
     """
 
-    __slots__ = ("_keep", "_kick", "_noise", "_sigma", "_step_s", "_t_s", "_time_s", "_value")
+    __slots__ = ("_keep", "_kick", "_one", "_sigma", "_step_s", "_t_s", "_time_s", "_value")
 
     def __init__(self, sigma: float, time_s: float, rng: np.random.Generator) -> None:
         """Draw the value at t = 0.
@@ -60,9 +57,9 @@ class OrnsteinUhlenbeck:
             time_s: correlation time T.
             rng: the process's own generator.
         """
-        self._noise = NoiseStream(rng)
+        self._one = NoiseStream(rng).one
         self._sigma, self._time_s = sigma, time_s
-        self._value = sigma * self._noise.one()
+        self._value = sigma * self._one()
         self._t_s = 0.0
         self._step_s, self._keep, self._kick = 0.0, 1.0, 0.0
 
@@ -75,8 +72,8 @@ class OrnsteinUhlenbeck:
             self._step_s, self._keep = step_s, exp(-step_s / self._time_s)
             self._kick = self._sigma * sqrt(1.0 - self._keep * self._keep)
         self._t_s = t_s
-        self._value = self._keep * self._value + self._kick * self._noise.one()
-        return self._value
+        self._value = value = self._keep * self._value + self._kick * self._one()
+        return value
 
 
 class DriftingBias:
@@ -85,24 +82,20 @@ class DriftingBias:
     Args:
         start: value at boot.
         walk: standard deviation of the change within one second; grows with the square root of the time.
+        step_s: dt, the time between two steps.
         rng: the bias's own generator.
-
-    Attributes:
-        value: the offset now.
     """
 
-    __slots__ = ("_noise", "_walk", "value")
+    __slots__ = ("_kick", "_rng", "_value")
 
-    def __init__(self, start: float, walk: float, rng: np.random.Generator) -> None:
-        self._noise, self._walk = NoiseStream(rng), walk
-        self.value = start
+    def __init__(self, start: float, walk: float, step_s: float, rng: np.random.Generator) -> None:
+        self._value, self._kick, self._rng = start, walk * sqrt(step_s), rng
 
-    @property
-    def is_drifting(self) -> bool:
-        """Whether it walks at all."""
-        return self._walk > 0.0
-
-    def step(self, dt_s: float) -> None:
-        """Go on by ``dt_s``."""
-        if self._walk:
-            self.value += self._walk * sqrt(dt_s) * self._noise.one()
+    def ahead(self, count: int) -> FloatArray:
+        """The offset after each of the next ``count`` steps, shape (count,)."""
+        if not self._kick:
+            return np.full(count, self._value)
+        kicks = self._kick * self._rng.standard_normal(count)
+        walk: FloatArray = np.cumsum(np.concatenate(([self._value], kicks)))
+        self._value = float(walk[-1])
+        return walk[1:]

@@ -10,10 +10,15 @@ from math import cos, exp, sin, sqrt
 from typing import Protocol
 
 from ccatp.mirror.surface import Surface
+from ccatp.mirror.surface_patch import SurfacePatch
 from ccatp.samples import DeckPose
 
 # A wheel this slow stands still: the exponential of the servo would never get there, and 1e-9 rad/s is 1 um in 9 h.
 _STANDSTILL_RAD_S = 1e-9
+_REACH_M = 5e-3  # of one expansion of the surface: its error turns the heading by less than 1e-9 rad on a metre's way
+
+BodyStep = tuple[float, float, float]
+"""Displacement along robot x and y, m, and rotation about robot z, rad."""
 
 
 class Disturbance(Protocol):
@@ -21,7 +26,7 @@ class Disturbance(Protocol):
 
     def displace(
         self, plant: "Plant", t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float
-    ) -> tuple[float, float, float]:
+    ) -> BodyStep:
         """Body displacement of one step after this disturbance, from the one before it.
 
         Args:
@@ -42,6 +47,7 @@ class Plant:
         heading_rad: deck heading (see ``DeckPose``), not wrapped.
         right_rad_s, left_rad_s: wheel rates.
         is_moving: the last step moved the body.
+        are_wheels_still: the wheels did not turn in it.
         hx, hy, lx, ly: deck-plane components of the robot's x and y axes, as ``Mirror.body_axes``.
         fx, fy: slopes of the surface under the robot.
         forward_m, left_m, turn_rad: displacement of the last step.
@@ -55,6 +61,7 @@ class Plant:
         "_decay_dt_s",
         "_disturbances",
         "_half_base_m",
+        "_jet",
         "_left_0",
         "_left_angle_0",
         "_left_set",
@@ -62,7 +69,7 @@ class Plant:
         "_right_0",
         "_right_angle_0",
         "_right_set",
-        "_surface",
+        "are_wheels_still",
         "forward_m",
         "fx",
         "fy",
@@ -108,7 +115,7 @@ class Plant:
             wheel_lag_s: time constant T of the servos, > 0.
             disturbances: applied in this order to each step.
         """
-        self._surface = surface
+        self._jet = SurfacePatch(surface, _REACH_M).jet
         self._radius_m, self._half_base_m = wheel_radius_m, wheel_base_m / 2.0
         self.lag_s = wheel_lag_s
         self._disturbances = tuple(disturbances)
@@ -120,7 +127,7 @@ class Plant:
         self.right_scale = self.left_scale = 1.0
         self.shake_rate_rad_s = self.shake_acceleration_m_s2 = 0.0
         self.forward_m = self.left_m = self.turn_rad = 0.0
-        self.is_moving = False
+        self.is_moving, self.are_wheels_still = False, True
         self._decay_dt_s = self._decay = 0.0
         self._turn_axes()
 
@@ -128,11 +135,6 @@ class Plant:
     def pose(self) -> DeckPose:
         """Pose of the body."""
         return DeckPose(self.x_m, self.y_m, self.heading_rad)
-
-    @property
-    def are_wheels_still(self) -> bool:
-        """The wheels did not turn in the last step."""
-        return self._right_0 == self._left_0 == self._right_set == self._left_set == 0.0
 
     def step(self, t_s: float, dt_s: float, right_set_rad_s: float, left_set_rad_s: float) -> None:
         """Advance by ``dt_s`` with constant wheel set points.
@@ -147,34 +149,39 @@ class Plant:
             right_set_rad_s: set point of the right wheel.
             left_set_rad_s: set point of the left wheel.
         """
-        self._right_0, self._left_0 = self.right_rad_s, self.left_rad_s
+        right, left = self.right_rad_s, self.left_rad_s
+        self._right_0, self._left_0 = right, left
         self._right_set, self._left_set = right_set_rad_s, left_set_rad_s
         self._right_angle_0, self._left_angle_0 = self.right_angle_rad, self.left_angle_rad
-        forward = sideways = turn = 0.0
-        if not self.are_wheels_still:
-            forward, turn = self._turn_wheels(dt_s)
+        self.are_wheels_still = is_still = right == left == right_set_rad_s == left_set_rad_s == 0.0
+        forward, sideways, turn = (0.0, 0.0, 0.0) if is_still else self._turn_wheels(dt_s)
         for disturbance in self._disturbances:
             forward, sideways, turn = disturbance.displace(self, t_s, dt_s, forward, sideways, turn)
         self.forward_m, self.left_m, self.turn_rad = forward, sideways, turn
-        self.is_moving = not forward == sideways == turn == 0.0
-        if self.is_moving:
+        self.is_moving = is_moving = not forward == sideways == turn == 0.0
+        if is_moving:
             self._move(forward, sideways, turn)
 
-    def _turn_wheels(self, dt_s: float) -> tuple[float, float]:
-        """Turn the wheels for a step; what the body would move by them alone: forward (m), turn (rad)."""
+    def _turn_wheels(self, dt_s: float) -> BodyStep:
+        """Turn the wheels for a step; what the body would move by them alone."""
         if dt_s != self._decay_dt_s:
             self._decay_dt_s, self._decay = dt_s, exp(-dt_s / self.lag_s)
-        right, left, right_set, left_set = self._right_0, self._left_0, self._right_set, self._left_set
-        lagging_s = self.lag_s * (1.0 - self._decay)
-        right_rad = right_set * dt_s + (right - right_set) * lagging_s
-        left_rad = left_set * dt_s + (left - left_set) * lagging_s
-        self.right_rad_s = _settled(right_set, right_set + (right - right_set) * self._decay)
-        self.left_rad_s = _settled(left_set, left_set + (left - left_set) * self._decay)
+        decay, right_set, left_set = self._decay, self._right_set, self._left_set
+        right, left = self._right_0 - right_set, self._left_0 - left_set
+        lagging_s = self.lag_s * (1.0 - decay)
+        right_rad = right_set * dt_s + right * lagging_s
+        left_rad = left_set * dt_s + left * lagging_s
         self.right_angle_rad += right_rad
         self.left_angle_rad += left_rad
+        right, left = right_set + right * decay, left_set + left * decay
+        if right_set == 0.0 and -_STANDSTILL_RAD_S < right < _STANDSTILL_RAD_S:
+            right = 0.0
+        if left_set == 0.0 and -_STANDSTILL_RAD_S < left < _STANDSTILL_RAD_S:
+            left = 0.0
+        self.right_rad_s, self.left_rad_s = right, left
         right_rad, left_rad = self.right_scale * right_rad, self.left_scale * left_rad
         half_radius_m = 0.5 * self._radius_m
-        return half_radius_m * (right_rad + left_rad), half_radius_m * (right_rad - left_rad) / self._half_base_m
+        return half_radius_m * (right_rad + left_rad), 0.0, half_radius_m * (right_rad - left_rad) / self._half_base_m
 
     def _move(self, forward_m: float, left_m: float, turn_rad: float) -> None:
         """Displace the body by one midpoint step."""
@@ -183,7 +190,7 @@ class Plant:
         x, y = self.x_m, self.y_m
         mx = x + 0.5 * (forward_m * self.hx + left_m * self.lx)
         my = y + 0.5 * (forward_m * self.hy + left_m * self.ly)
-        f, fx, fy, fxx, fxy, fyy = self._surface.jet(mx, my)
+        f, fx, fy, fxx, fxy, fyy = self._jet(mx, my)
         s2 = 1.0 + fx * fx
         s = sqrt(s2)
         w = sqrt(s2 + fy * fy)
@@ -240,8 +247,5 @@ class Plant:
         """The wheels stop at once and for good (the robot fell)."""
         self.right_rad_s = self.left_rad_s = self._right_0 = self._left_0 = self._right_set = self._left_set = 0.0
         self._right_angle_0, self._left_angle_0 = self.right_angle_rad, self.left_angle_rad
+        self.are_wheels_still = True
         self.shake_rate_rad_s = self.shake_acceleration_m_s2 = 0.0
-
-
-def _settled(set_point_rad_s: float, rate_rad_s: float) -> float:
-    return 0.0 if set_point_rad_s == 0.0 and abs(rate_rad_s) < _STANDSTILL_RAD_S else rate_rad_s

@@ -16,8 +16,9 @@ from collections import deque
 from collections.abc import Iterable
 from itertools import repeat
 from math import ceil
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
+import msgspec
 import numpy as np
 
 from ccatp.config.models import Config
@@ -40,18 +41,21 @@ _FRAME_BYTES, _IMU_BYTES, _ENCODER_BYTES, _COUNTER_BYTES, _EDGE_BYTES = 420, 48,
 _Row = TypeVar("_Row", ImuSample, WheelSample, EdgeSample)
 
 
-class _Frame(NamedTuple):
-    """A frame as it was read, in the order of ``encode_sensors``."""
+class Frame(msgspec.Struct, frozen=True, gc=False):
+    """A frame as it was read: what ``Sensors`` says, in the same places, with samples as plain tuples.
+
+    Making named tuples of twenty samples takes as long as reading them, so it waits until somebody asks for names.
+    """
 
     seq: int
-    t_s: float
+    t: float
     imu: list[ImuTuple]
-    encoders: list[WheelTuple]
-    edges: list[EdgeTuple]
+    enc: list[WheelTuple]
+    edge: list[EdgeTuple]
     gravity: GravityTuple | None
     fans: tuple[float, float]
     soc: float
-    cmd: tuple[int, float, float, bool]
+    cmd: CommandEcho
     faults: tuple[str, ...]
 
 
@@ -100,10 +104,10 @@ class Robot:
             lag_s=self.world.wheels.lag_s,
         )
         self._sensors.edges.place(self.world.plant)
-        self.world.look_at_rim(self._sensors.edges)
+        self.world.watch(self._sensors.edges)
         self.seq, self.t_s = 0, 0.0
         # The newest frame last; the first is delivered once the deque is full.
-        self._frames: deque[_Frame] = deque(maxlen=self.sensors_delay_frames + 1)
+        self._frames: deque[Frame] = deque(maxlen=self.sensors_delay_frames + 1)
         self._delivered: Sensors | None = None
         self._line = b""
         self._read()
@@ -182,17 +186,18 @@ class Robot:
 
     def advance(self) -> None:
         """Drive one frame and read the sensors."""
-        t_s = self.next_t_s
-        self._commands.release(self.seq)
+        before_s, self.seq = self.t_s, self.seq + 1
+        self.t_s = t_s = self.seq / self._frame_hz
+        self._commands.release(self.seq - 1)
         right, left = self.rules.set_points(t_s)
-        self.world.step(self.t_s, self.frame_s, right, left, self.fans.thrust)
-        self.seq, self.t_s = self.seq + 1, t_s
+        self.world.step(before_s, self.frame_s, right, left, self.fans.thrust)
         self._read()
 
     @property
     def delivered_seq(self) -> int:
         """Number of the frame that reached the clients at this instant; -1 while none has."""
-        return self._frames[0].seq if self._has_delivered else -1
+        frame = self.delivered_rows
+        return -1 if frame is None else frame.seq
 
     @property
     def delivered(self) -> Sensors | None:
@@ -201,58 +206,62 @@ class Robot:
         Equal in every number to decoding ``delivered_line``. Made when first asked for and then shared: leave it as it
         is.
         """
-        if self._delivered is None and self._has_delivered:
-            self._delivered = _as_message(self._frames[0])
+        if self._delivered is None:
+            frame = self.delivered_rows
+            self._delivered = None if frame is None else _as_message(frame)
         return self._delivered
+
+    @property
+    def delivered_rows(self) -> Frame | None:
+        """The same with plain tuples for samples, at no cost; leave it as it is."""
+        frames = self._frames
+        return frames[0] if len(frames) > self.sensors_delay_frames else None
 
     @property
     def delivered_line(self) -> bytes:
         """The same frame as a line with its LF; empty while none has reached the clients."""
-        if not self._line and self._has_delivered:
-            self._line = encode_sensors(*self._frames[0])
+        if not self._line:
+            frame = self.delivered_rows
+            self._line = b"" if frame is None else _as_line(frame)
         return self._line
 
-    @property
-    def _has_delivered(self) -> bool:
-        return len(self._frames) > self.sensors_delay_frames
-
     def _read(self) -> None:
-        seq, t_s, sensors, world = self.seq, self.t_s, self._sensors, self.world
-        plant = world.plant
+        seq, t_s, sensors, plant = self.seq, self.t_s, self._sensors, self.world.plant
         sensors.enter(seq)
-        edges = sensors.read_edges(plant)
-        world.look_at_rim(sensors.edges)
+        edges, imu, encoders = sensors.read_edges(plant), sensors.read_imu(plant), sensors.read_encoders(plant)
+        gravity = sensors.read_gravity(plant)
         drive_seq, age_s, permit_age_s, is_held = self.rules.echo(t_s)
-        cmd = drive_seq, _to_microseconds(age_s), _to_microseconds(permit_age_s), is_held or world.is_fallen
-        imu, encoders, gravity = sensors.read_imu(plant), sensors.read_encoders(plant), sensors.read_gravity(plant)
-        self._frames.append(_Frame(seq, t_s, imu, encoders, edges, gravity, self.fans.duty, 1.0, cmd, ()))
+        is_held = is_held or self.world.is_fallen
+        cmd = CommandEcho(drive_seq, round(age_s * 1e6) / 1e6, round(permit_age_s * 1e6) / 1e6, is_held)
+        self._frames.append(Frame(seq, t_s, imu, encoders, edges, gravity, self.fans.duty, 1.0, cmd, ()))
         self._delivered, self._line = None, b""
 
 
-def _as_message(frame: _Frame) -> Sensors:
+def _as_line(frame: Frame) -> bytes:
+    seq, t_s, imu, encoders, edges, gravity, fans, soc, cmd, faults = msgspec.structs.astuple(frame)
+    return encode_sensors(seq, t_s, imu, encoders, edges, gravity, fans, soc, msgspec.structs.astuple(cmd), faults)
+
+
+def _as_message(frame: Frame) -> Sensors:
     """The message that a client decodes from the frame's line."""
-    seq, t_s, imu, encoders, edges, gravity, fans, soc, cmd, faults = frame
+    gravity = frame.gravity
     return Sensors(
-        seq,
-        t_s,
-        _as(ImuSample, imu),
-        _as(WheelSample, encoders),
-        _as(EdgeSample, edges),
+        frame.seq,
+        frame.t,
+        _as(ImuSample, frame.imu),
+        _as(WheelSample, frame.enc),
+        _as(EdgeSample, frame.edge),
         None if gravity is None else GravitySample(*gravity),
-        fans,
-        soc,
-        CommandEcho(*cmd),
-        list(faults),
+        frame.fans,
+        frame.soc,
+        frame.cmd,
+        list(frame.faults),
     )
 
 
 def _as(kind: type[_Row], rows: Iterable[tuple[object, ...]]) -> list[_Row]:
     """The rows as named tuples; five times as fast as calling the class for each."""
     return list(map(tuple.__new__, repeat(kind), rows))
-
-
-def _to_microseconds(t_s: float) -> float:
-    return round(t_s * 1e6) / 1e6
 
 
 def _check_rates(cfg: Config) -> None:

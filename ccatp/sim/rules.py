@@ -6,6 +6,7 @@ Deny by default: a set point reaches the wheels only through ``MotionRules.set_p
 from math import isfinite
 
 HELD = (0.0, 0.0)
+_EVERYTHING = (True, True, True)
 
 
 class MotionRules:
@@ -65,13 +66,15 @@ class MotionRules:
 
     def drive(self, seq: int, right_rad_s: float, left_rad_s: float, now_s: float) -> bool:
         """Take a drive that arrived at ``now_s``; false for an old or equal ``seq`` and for numbers not finite."""
-        if seq <= self._drive_seq or not isfinite(right_rad_s) or not isfinite(left_rad_s):
+        if seq <= self._drive_seq:
             return False
-        fastest = max(abs(right_rad_s), abs(left_rad_s))
-        if fastest > self._max_wheel_rad_s:
-            scale = self._max_wheel_rad_s / fastest
+        limit = self._max_wheel_rad_s
+        if not (-limit <= right_rad_s <= limit and -limit <= left_rad_s <= limit):
+            if not isfinite(right_rad_s) or not isfinite(left_rad_s):
+                return False
+            scale = limit / max(abs(right_rad_s), abs(left_rad_s))
             right_rad_s, left_rad_s = scale * right_rad_s, scale * left_rad_s
-        self._drive = (right_rad_s, left_rad_s)
+        self._drive = (float(right_rad_s), float(left_rad_s))  # one number of numpy's would slow down all that follows
         self._drive_seq, self._drive_s = seq, now_s
         return True
 
@@ -85,20 +88,26 @@ class MotionRules:
 
     def set_points(self, until_s: float) -> tuple[float, float]:
         """(right, left) wheel set points of a step that ends at ``until_s``: both keys must last as long, rad/s."""
-        self.is_held = not self._may_move(until_s)
-        return HELD if self.is_held or self._drive is None else self._drive
+        drive = self._drive
+        if drive is None or not self._may_move(drive, until_s):
+            self.is_held = True
+            return HELD
+        self.is_held = False
+        return drive
 
-    def _may_move(self, until_s: float) -> bool:
+    def _may_move(self, drive: tuple[float, float], until_s: float) -> bool:
         # Times are multiples of the frame period: an age of exactly the time-to-live must not fail for its last bit.
         limit_s = self._ttl_s + 1e-9
-        if self._drive is None or until_s - self._drive_s > limit_s:
+        if until_s - self._drive_s > limit_s:
             return False
         if not self.has_monitor_joined:
             return True
-        if self._permit is None or until_s - self._permit_s > limit_s:
+        permit = self._permit
+        if permit is None or until_s - self._permit_s > limit_s:
             return False
-        right, left = self._drive
-        forward, reverse, turn = self._permit
+        if permit == _EVERYTHING:
+            return True
+        (right, left), (forward, reverse, turn) = drive, permit
         speed = right + left
         return (forward or speed <= 0.0) and (reverse or speed >= 0.0) and (turn or right == left)
 

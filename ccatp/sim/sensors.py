@@ -5,17 +5,17 @@ stream of its own, so that its noise depends on the seed alone, not on the rates
 """
 
 from collections.abc import Sequence
-from math import floor, hypot
+from math import hypot
 
 import numpy as np
 
 from ccatp.config.models import PanelsConfig, SimRobotConfig, WorldConfig
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import DeckPose
+from ccatp.samples import DeckPose, Vector3
 from ccatp.sim.edge_sensors import EdgeSensors, EdgeTuple
 from ccatp.sim.encoders import CountingEncoders, RateEncoders, WheelTuple
 from ccatp.sim.inertial import ImuTuple, InertialUnit
-from ccatp.sim.noise import NoiseStream
+from ccatp.sim.noise import WHOLE, NoiseStream
 from ccatp.sim.panel_edges import PanelEdges
 from ccatp.sim.plant import Plant
 from ccatp.sim.sample_times import SampleTimes
@@ -56,7 +56,8 @@ class SensorSuite:
         imu, encoders, gravity = rng.spawn(3)
         biases, counts, panel_edges = rng.spawn(3)
         self._mirror = mirror
-        self._gravity_noise = NoiseStream(gravity)
+        self._gravity_noise = NoiseStream(gravity).one
+        self._gravity_on_deck = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))  # the telescope points to the zenith
         self._gravity_pose: DeckPose | None = None
         self._gravity = (0.0, 0.0, 0.0)
         self._gravity_sigma = cfg.gravity_sigma_rad
@@ -100,12 +101,21 @@ class SensorSuite:
         times = self._gravity_times.times_s
         if not times:
             return None
-        sigma = self._gravity_sigma
-        noise = self._gravity_noise.take(3)
         pose = plant.pose
         if pose != self._gravity_pose:
-            self._gravity_pose, self._gravity = pose, self._mirror.gravity_in_robot(pose)
-        gx, gy, gz = (g + sigma * n for g, n in zip(self._gravity, noise, strict=True))
-        scale = _PER_UNIT / hypot(gx, gy, gz)
-        x, y, z = (floor(g * scale + 0.5) / _PER_UNIT for g in (gx, gy, gz))
-        return times[-1], x, y, z
+            self._gravity_pose, self._gravity = pose, self._gravity_at(pose)
+        sigma, noise, unit, whole = self._gravity_sigma, self._gravity_noise, _PER_UNIT, WHOLE
+        x, y, z = self._gravity
+        x, y, z = x + sigma * noise(), y + sigma * noise(), z + sigma * noise()
+        scale = unit / hypot(x, y, z)
+        return (
+            times[-1],
+            (x * scale + whole - whole) / unit,
+            (y * scale + whole - whole) / unit,
+            (z * scale + whole - whole) / unit,
+        )
+
+    def _gravity_at(self, pose: DeckPose) -> Vector3:
+        gx, gy, gz = self._gravity_on_deck
+        (hx, hy, hz), (lx, ly, lz), (nx, ny, nz) = self._mirror.robot_axes(pose)
+        return hx * gx + hy * gy + hz * gz, lx * gx + ly * gy + lz * gz, nx * gx + ny * gy + nz * gz

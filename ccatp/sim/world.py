@@ -11,6 +11,7 @@ from ccatp.angles import wrap_pi
 from ccatp.config.models import Config
 from ccatp.mirror.alignment import PanelMisalignment, misaligned_puck_world
 from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.outline import NearOutline
 from ccatp.samples import PanelId, PanelPose, Vector3
 from ccatp.sim.disturbances import Creep, Vibration, WheelSlip, draw_wheels
 from ccatp.sim.plant import Disturbance, Plant
@@ -84,6 +85,7 @@ class World:
         self.is_fallen = False
         self._places: deque[tuple[float, float]] = deque(maxlen=window_frames + 1)
         self._places.append((self.plant.x_m, self.plant.y_m))
+        self._overhang, self._rim = mirror.overhang, NearOutline(mirror.rim)
         # The origin's distance to the rim is known to be at least this; it shrinks with the distance driven.
         self._rim_bound_m = -inf
         self._sensors: Sensing | None = None
@@ -108,47 +110,46 @@ class World:
             plant.is_moving = False
             return
         if self._slip is not None:
-            self._let_slip(t_s, dt_s, right_rad_s != 0.0 or left_rad_s != 0.0)
+            self._let_slip(self._slip, t_s, dt_s, right_rad_s != 0.0 or left_rad_s != 0.0)
         if self._vibration is not None:
             self._vibration.is_thrusting = thrust > 0.0
         plant.step(t_s, dt_s, right_rad_s, left_rad_s)
         self._places.append((plant.x_m, plant.y_m))
-        if self.mirror.overhang:
+        if self._overhang:
             self._weak_s = self._weak_s + dt_s if thrust < self._thrust_floor else 0.0
             # Half a frame of slack: a sum of steps is not exact.
             if self._weak_s >= self._fall_thrust_s - 0.5 * dt_s:
                 self._fall()
         if plant.is_moving:
+            self._has_looked = False
             self._rim_bound_m -= abs(plant.forward_m) + abs(plant.left_m)
             if self._rim_bound_m < 0.0:
                 self._measure_rim()
                 if self._rim_bound_m < 0.0:
                     self._fall()
 
-    def _let_slip(self, t_s: float, dt_s: float, is_ordered: bool) -> None:
-        plant, slip = self.plant, self._slip
-        if slip is None or not (is_ordered or plant.right_rad_s or plant.left_rad_s):
-            return
-        slip.step(t_s, dt_s, is_ordered)
-        plant.right_scale = self.wheels.right_scale * (1.0 - slip.right)
-        plant.left_scale = self.wheels.left_scale * (1.0 - slip.left)
+    def _let_slip(self, slip: WheelSlip, t_s: float, dt_s: float, is_ordered: bool) -> None:
+        plant = self.plant
+        if is_ordered or plant.right_rad_s or plant.left_rad_s:
+            slip.step(t_s, dt_s, is_ordered)
+            plant.right_scale = self.wheels.right_scale * (1.0 - slip.right)
+            plant.left_scale = self.wheels.left_scale * (1.0 - slip.left)
 
     def _fall(self) -> None:
         self.is_fallen = True
         self.plant.stop_dead()
 
-    def look_at_rim(self, sensors: Sensing) -> None:
+    def watch(self, sensors: Sensing) -> None:
         """Take note of who knows the edge sensors' places, for the truth rows."""
-        if self.plant.is_moving or self._sensors is None:
-            self._sensors, self._has_looked = sensors, False
+        self._sensors = sensors
 
     def truth_row(self, seq: int, t_s: float) -> TruthRow:
         """The truth at a frame."""
         if not self._has_looked:
             self._look()
         p = self.plant
-        fallen = int(self.is_fallen)
         x, y = p.x_m, p.y_m
+        fallen = 1 if self.is_fallen else 0
         return seq, t_s, x, y, wrap_pi(p.heading_rad), x, y, p.z_m, self._clearance_m, fallen, self._off_mask
 
     def _look(self) -> None:
@@ -157,14 +158,15 @@ class World:
         self._clearance_m, self._off_mask = FAR_CLEARANCE_M, 0
         if self._rim_bound_m < NEAR_RIM_M:
             self._measure_rim()
-        if self._rim_bound_m < NEAR_RIM_M:
-            for k, (x, y) in enumerate(self._sensors.places if self._sensors else ()):
-                clearance_m = self.mirror.rim.signed_distance_m(x, y)
-                self._clearance_m = min(self._clearance_m, clearance_m)
-                self._off_mask |= (clearance_m < 0.0) << k
+        if self._rim_bound_m < NEAR_RIM_M and self._sensors is not None:
+            distance_m = self._rim.signed_distance_m
+            clearances_m = [distance_m(x, y) for x, y in self._sensors.places]
+            self._clearance_m = min(FAR_CLEARANCE_M, *clearances_m)
+            if self._clearance_m < 0.0:
+                self._off_mask = sum((clearance_m < 0.0) << k for k, clearance_m in enumerate(clearances_m))
 
     def _measure_rim(self) -> None:
-        self._rim_bound_m = self.mirror.rim.signed_distance_m(self.plant.x_m, self.plant.y_m)
+        self._rim_bound_m = self._rim.signed_distance_m(self.plant.x_m, self.plant.y_m)
 
     def puck_world(self) -> Vector3:
         """Centre of the puck on the panel as it really lies, world frame, m."""

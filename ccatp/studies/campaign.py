@@ -28,6 +28,24 @@ class CampaignError(CcatpError):
     exit_status = ExitStatus.USAGE
 
 
+class CampaignFailed(CampaignError):
+    """Jobs failed, a worker died, or the results cannot be written; what was done is kept."""
+
+    exit_status = ExitStatus.HELD
+
+
+class CampaignInterrupted(CampaignError):
+    """The user stopped it; what was done is kept."""
+
+    exit_status = ExitStatus.INTERRUPTED
+
+
+class ClusterUnreachable(CampaignError):
+    """No scheduler answers."""
+
+    exit_status = ExitStatus.UNREACHABLE
+
+
 @dataclass(frozen=True, slots=True)
 class Cell:
     """One combination of factors.
@@ -51,9 +69,14 @@ class Job:
     cfg: Config
 
     @property
+    def cell(self) -> str:
+        """``world=hard,filter=ekf``."""
+        return ",".join(f"{name}={value}" for name, value in self.factors.items())
+
+    @property
     def key(self) -> str:
         """``world=hard,filter=ekf,seed=3``."""
-        return ",".join(f"{name}={value}" for name, value in (*self.factors.items(), ("seed", self.seed)))
+        return f"{self.cell},seed={self.seed}"
 
     @property
     def fingerprint(self) -> str:

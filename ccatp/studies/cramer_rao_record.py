@@ -12,7 +12,8 @@ from ccatp.localization.crossing import EdgeScanner, Transition
 from ccatp.localization.fixes import deck_foot
 from ccatp.mirror.mirror import Mirror
 from ccatp.samples import Fix, PanelId, PointId
-from ccatp.studies.rehearsal import Rehearsal, _Rehearsing
+from ccatp.studies.rehearsal import Rehearsing
+from ccatp.studies.rehearsal_result import Rehearsal
 from ccatp.wire.robot import Sensors
 
 FloatArray = NDArray[np.float64]
@@ -80,11 +81,11 @@ class TrueRecord:
     base_m: float
 
 
-class RecordedRehearsing(_Rehearsing):
+class RecordedRehearsing(Rehearsing):
     """A rehearsal with its record; everything random stays as it is without."""
 
     def __init__(self, cfg: Config, *, with_track: bool = False) -> None:
-        super().__init__(cfg, with_track)
+        super().__init__(cfg, with_track=with_track)
         self._way = array("d")
         self._scanner = EdgeScanner()
         self._transitions: list[Transition] = []

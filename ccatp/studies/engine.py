@@ -1,31 +1,29 @@
-"""Glue. Runs the jobs of a campaign on whatever executor there is, and puts their outcomes together.
+"""Glue. Runs the jobs of a campaign wherever there is room, and puts their outcomes together.
 
 The outcome of a job does not depend on where or when it runs, and outcomes are combined in the order of the plan: the
 cells are the same whatever the number of workers.
 """
 
-import multiprocessing
-import os
-import signal
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from dataclasses import dataclass, field
-from multiprocessing.connection import wait
 from pathlib import Path
-from threading import Thread
+from traceback import format_exception
 from typing import Any
 
 from ccatp.errors import CcatpError
-from ccatp.studies.campaign import CampaignError, CellResult, Job, Load, Outcome, Study
+from ccatp.studies.campaign import CampaignFailed, CampaignInterrupted, CellResult, Job, Load, Outcome, Study
+from ccatp.studies.executors import Place, Timed, place_of, timed
 from ccatp.studies.ledger import Ledger
 from ccatp.studies.plan import WHOLE, Shard, cells_of, jobs_of
 from ccatp.studies.progress import CampaignView
 from ccatp.studies.results import write_results
-from ccatp.studies.threads import limit_threads
+from ccatp.studies.schedule import Schedule
 
-_CLUSTER_TIMEOUT_S = 20.0
+# One bad seed must not cost a night; what fails this often is wrong everywhere.
+_MOST_FAILURES = 5
+FAILURES = "failures.txt"
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,25 +63,54 @@ def run_campaign(study: Study, load: Load, options: CampaignOptions) -> dict[str
         What ``result.json`` holds. While jobs of other shards are missing it says how many, in ``missing``.
 
     Raises:
-        CampaignError: the campaign cannot be run as asked, a job failed, or a worker died; what is done is kept.
+        CampaignError: the campaign cannot be run as asked.
+        CampaignFailed: jobs failed, a worker died, or the directory cannot be written; what is done is kept.
+        CampaignInterrupted: Ctrl-C; what is done is kept.
+        ClusterUnreachable: no scheduler answers.
         ConfigError: a configuration cannot be used.
     """
+    try:
+        return _run(study, load, options)
+    except KeyboardInterrupt as error:
+        raise CampaignInterrupted(
+            f"interrupted; what is done is kept in {options.out}: the same command goes on from there"
+        ) from error
+    except OSError as error:
+        raise CampaignFailed(
+            f"{error.filename or options.out}: {error.strerror or error}; "
+            "make room or choose another --out: what is done is kept"
+        ) from error
+
+
+def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
     started_s = time.perf_counter()
     cells = cells_of(study, options.mirrors, options.only)
     plan = jobs_of(study, cells, load, options.settings, study.runs if options.runs is None else options.runs)
     with Ledger(options.out, options.shard, options.others) as ledger:
         jobs = [job for group in plan for job in group]
-        left = [job for job in jobs if ledger.outcome(job) is None]
         own = set(range(options.shard.number - 1, len(jobs), options.shard.of))
-        todo = [job for index, job in enumerate(jobs) if index in own and ledger.outcome(job) is None]
-        with CampaignView(study.name, len(todo), len(jobs) - len(left), options.is_quiet) as view:
-            _run_jobs(study, todo, ledger, view, options)
+        done = {job.key for job in jobs if ledger.outcome(job) is not None}
+        todo = [job for index, job in enumerate(jobs) if index in own and job.key not in done]
+        with CampaignView(study.name, len(todo), len(done), options.is_quiet) as view:
+            failures = _run_jobs(study, todo, ledger, view, options) if todo else []
         found = [[ledger.outcome(job) for job in group] for group in plan]
+        work_s = sum(ledger.took_s(job) for job in jobs)
     results = [_cell(study, group, outcomes) for group, outcomes in zip(plan, found, strict=True)]
     missing = sum(outcome is None for outcomes in found for outcome in outcomes)
+    about: dict[str, Any] = {
+        "wall_s": round(time.perf_counter() - started_s, 3),
+        "work_s": round(work_s, 3),
+        "settings": dict(options.settings),
+        **({"missing": missing} if missing else {}),
+    }
+    result = write_results(study, results, options.out, about, with_figures=options.with_figures)
+    if failures:
+        raise CampaignFailed(
+            f"{len(failures)} of {len(todo)} jobs failed, the first: {failures[0]}; see {options.out / FAILURES}; "
+            "the results are those of the others: the same command tries again"
+        )
     view.end(missing, len(jobs), options.out)
-    wall_s = time.perf_counter() - started_s
-    return write_results(study, results, options.out, wall_s, missing, with_figures=options.with_figures)
+    return result
 
 
 def _cell(study: Study, jobs: Sequence[Job], outcomes: Sequence[Outcome | None]) -> CellResult:
@@ -92,90 +119,59 @@ def _cell(study: Study, jobs: Sequence[Job], outcomes: Sequence[Outcome | None])
     return CellResult(jobs[0].factors, {"runs": len(there), **values}, arrays)
 
 
-def _run_jobs(study: Study, jobs: Sequence[Job], ledger: Ledger, view: CampaignView, options: CampaignOptions) -> None:
-    if not jobs:
-        return
-    if options.cluster is None and options.workers == 1:
-        for job in jobs:
-            _note(job, lambda job=job: study.run_job(job), ledger, view, options.out)  # type: ignore[misc]
-        return
-    with _executor(options, len(jobs)) as executor:
-        futures: dict[Future[Outcome], Job] = {executor.submit(study.run_job, job): job for job in jobs}
-        for future in as_completed(futures):
-            _note(futures[future], future.result, ledger, view, options.out)
+def _run_jobs(
+    study: Study, jobs: Sequence[Job], ledger: Ledger, view: CampaignView, options: CampaignOptions
+) -> list[str]:
+    """Do the jobs; what failed is told, a line each."""
+    schedule = Schedule(jobs, ledger.durations_s)
+    failures: list[str] = []
+    with place_of(options.workers, options.cluster, len(jobs)) as place:
+        under_way: dict[Future[Timed], Job] = {}
+        while schedule or under_way:
+            _hand_out(study, schedule, place, under_way)
+            for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+                job = under_way.pop(future)
+                try:
+                    outcome, took_s = _result(future, options.out)
+                except CcatpError:
+                    raise
+                except Exception as error:  # whatever a mission dies of, the others go on
+                    failures.append(_noted(job, error, options.out))
+                    if len(failures) == _MOST_FAILURES:
+                        raise CampaignFailed(
+                            f"{_MOST_FAILURES} jobs failed, the last: {failures[-1]}; see {options.out / FAILURES}; "
+                            f"what is done is kept in {options.out}"
+                        ) from error
+                    continue
+                ledger.add(job, outcome, took_s)
+                schedule.done(job, took_s)
+                view.done(job.key, schedule.done_s, schedule.left_s)
+    return failures
 
 
-def _note(job: Job, result: Callable[[], Outcome], ledger: Ledger, view: CampaignView, out: Path) -> None:
+def _hand_out(study: Study, schedule: Schedule, place: Place, under_way: dict[Future[Timed], Job]) -> None:
+    room = place.room()
+    while schedule and len(under_way) < room:
+        job = schedule.take()
+        under_way[place.executor.submit(timed, study.run_job, job)] = job
+
+
+def _result(future: Future[Timed], out: Path) -> Timed:
     try:
-        outcome = result()
+        return future.result()
     except BrokenExecutor as error:
-        raise CampaignError(
+        raise CampaignFailed(
             f"a worker died, perhaps for want of memory; what is done is kept in {out}: "
             "start again with the same options, or with fewer --workers"
         ) from error
-    except CcatpError:
-        raise
-    except Exception as error:
-        raise CampaignError(
-            f"job {job.key} failed: {type(error).__name__}: {error}; what is done is kept in {out}"
+    except CancelledError as error:
+        raise CampaignFailed(
+            f"the cluster has given up a job, perhaps its scheduler ended; what is done is kept in {out}: "
+            "start again with the same options"
         ) from error
-    ledger.add(job, outcome)
-    view.done(job.key)
 
 
-@contextmanager
-def _executor(options: CampaignOptions, jobs: int) -> Iterator[Executor]:
-    with _cluster(options.cluster) if options.cluster else _pool(options.workers, jobs) as executor:
-        yield executor
-
-
-@contextmanager
-def _pool(workers: int | None, jobs: int) -> Iterator[Executor]:
-    """Processes of this machine; on an error they are ended in the middle of their jobs."""
-    count = min(workers or len(os.sched_getaffinity(0)), jobs)
-    limit_threads()
-    before = set(multiprocessing.active_children())
-    context = multiprocessing.get_context("spawn")  # a fork would inherit threads and locks in any state
-    executor = ProcessPoolExecutor(count, mp_context=context, initializer=prepare_worker)
-    try:
-        yield executor
-    except BaseException:
-        executor.shutdown(wait=False, cancel_futures=True)
-        for child in set(multiprocessing.active_children()) - before:
-            child.terminate()
-        raise
-    finally:
-        executor.shutdown(wait=True)
-
-
-def prepare_worker() -> None:
-    """Leave Ctrl-C to the parent, and end with it however it ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
-
-
-def _end_with(sentinel: int) -> None:
-    wait([sentinel])
-    os._exit(1)
-
-
-@contextmanager
-def _cluster(address: str) -> Iterator[Executor]:
-    try:
-        from distributed import Client  # noqa: PLC0415 - belongs to an extra
-    except ImportError as error:
-        raise CampaignError("--cluster needs distributed: install ccatp[cluster]") from error
-    try:
-        client = Client(address, timeout=_CLUSTER_TIMEOUT_S, set_as_default=False)  # type: ignore[no-untyped-call]
-    except (OSError, ValueError) as error:
-        raise CampaignError(
-            f"--cluster {address}: no scheduler answers there ({error}); start one, or correct the address"
-        ) from error
-    with client:
-        executor = client.get_executor(pure=False)  # type: ignore[no-untyped-call]
-        try:
-            yield executor
-        finally:
-            executor.shutdown(wait=False, cancel_futures=True)
+def _noted(job: Job, error: BaseException, out: Path) -> str:
+    with (out / FAILURES).open("a", encoding="utf-8") as file:
+        file.write(f"{job.key}\n{''.join(format_exception(error))}\n")
+    return f"{job.key}: {type(error).__name__}: {error}"

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccatp.studies.campaign import CellResult
+from ccatp.studies.consistency import nees
 from ccatp.studies.figures import GRID, INK, LIMIT, QUIET, colour, dress, new_figure, save
-from ccatp.studies.mission_cell import COLUMN, first_arrivals, nees, spread_of
+from ccatp.studies.mission_cell import first_arrivals, spread_of
+from ccatp.studies.mission_job import COLUMN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -92,16 +94,19 @@ def _draw_bound(cells: Sequence[CellResult], stem: Path) -> None:
             continue
         index = filters.index(str(cell.factors["filter"]))
         at = worlds.index(str(cell.factors["world"])) + 0.22 * (index - 0.5 * (len(filters) - 1))
+        tight = bound["with_accelerometer"]["rms_mm"]
         axes.plot([at - 0.09, at + 0.09], [bound["rms_mm"]] * 2, color=INK, linewidth=1.5)
+        axes.plot([at - 0.09, at + 0.09], [tight] * 2, color=INK, linewidth=1.0, linestyle=":")
         axes.plot([at, at], [bound["rms_mm"], bound["error_rms_mm"]], color=GRID, linewidth=2.0, zorder=1)
         axes.plot(at, bound["error_rms_mm"], "o", color=colour(index), markersize=6)
         axes.annotate(
-            f"{bound['ratio']:.2f}", (at, max(bound["error_rms_mm"], bound["rms_mm"])), xytext=(0, 7),
-            textcoords="offset points", ha="center", fontsize=8, color=QUIET,
+            f"{bound['ratio']:.3g}", (at, max(bound["error_rms_mm"], bound["rms_mm"])), xytext=(0, 7),
+            textcoords="offset points", ha="center", fontsize=7, color=QUIET,
         )  # fmt: skip
     for index, name in enumerate(filters):
         axes.plot([], [], "o", color=colour(index), label=name)
     axes.plot([], [], color=INK, linewidth=1.5, label="posterior Cramér-Rao bound")
+    axes.plot([], [], color=INK, linewidth=1.0, linestyle=":", label="with the accelerometer")
     axes.set_yscale("log")
     known = [cell.values["bound"] for cell in cells if cell.values["bound"]["rms_mm"]]
     shown = [bound[name] for bound in known for name in ("rms_mm", "error_rms_mm")] or [1.0]
@@ -109,7 +114,7 @@ def _draw_bound(cells: Sequence[CellResult], stem: Path) -> None:
     axes.set_xticks(range(len(worlds)), worlds)
     axes.set(ylabel="rms position error at the stops, mm", title="Stop errors and the least possible; numbers: ratio")
     dress(axes)
-    axes.legend(frameon=False, fontsize=8, loc="upper left")
+    figure.legend(loc="outside lower center", ncols=len(filters) + 2, frameon=False, fontsize=8)
     save(figure, stem)
 
 

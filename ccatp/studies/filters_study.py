@@ -18,6 +18,7 @@ FloatArray = NDArray[np.float64]
 
 WORLDS = ("thesis", "thesis-x2", "hard", "extreme")
 FILTERS = ("kf", "ekf", "ukf")
+_BOUND_COLUMNS = 5
 COLUMNS = (
     Column("complete", "complete"),
     Column("localization mean, mm", "localization_error_mm.mean", ".3f"),
@@ -36,7 +37,10 @@ COLUMNS = (
     Column("stop error rms, mm", "bound.error_rms_mm", ".3f"),
     Column("bound rms, mm", "bound.rms_mm", ".3f"),
     Column("ratio", "bound.ratio", ".3f"),
+    Column("bound with accelerometer", "bound.with_accelerometer.rms_mm", ".3f"),
+    Column("ratio", "bound.with_accelerometer.ratio", ".3f"),
     Column("NEES pose (3)", "nees.pose.mean", ".2f"),
+    Column("95 % band", "nees.pose.band_95", ".2f"),
     Column("NEES position (2)", "nees.position.mean", ".2f"),
     Column("NIS of fixes (2)", "nis.mean", ".2f"),
     Column("corrections", "corrections"),
@@ -58,15 +62,17 @@ def cells() -> Sequence[Cell]:
 
 
 def run_job(job: Job) -> Outcome:
-    """One mission, and the bound along its true way."""
+    """One mission, and the bounds along its true way: without and with what the accelerometer tells of the slip."""
     rehearsal, record = rehearse_recorded(job.cfg, with_track=True)
     values, arrays = mission_outcome(job.cfg, rehearsal)
+    mirror = build_mirror(job.cfg.mirror)
+    without, with_it = (bounds_of(job.cfg, mirror, record, with_accelerometer=flag) for flag in (False, True))
     bounds = [
-        (stop.t_s, *stop.covariance_m2[np.triu_indices(2)].tolist(), *stop.error_m)
-        for stop in bounds_of(job.cfg, build_mirror(job.cfg.mirror), record)
+        (stop.t_s, float(np.trace(stop.covariance_m2)), float(np.trace(more.covariance_m2)), *stop.error_m)
+        for stop, more in zip(without, with_it, strict=True)
         if stop.point is not None
     ]
-    return Outcome(values, {**arrays, "bounds": np.array(bounds, dtype=np.float64).reshape(-1, 6)})
+    return Outcome(values, {**arrays, "bounds": np.array(bounds, dtype=np.float64).reshape(-1, _BOUND_COLUMNS)})
 
 
 def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
@@ -81,22 +87,32 @@ def bound_figures(bounds: FloatArray) -> dict[str, Any]:
     """Errors and bounds at the fixes.
 
     Args:
-        bounds: rows of t (s), the bound's xx, xy, yy (m^2), error x, y (m), shape (k, 6).
+        bounds: rows of t (s), the least mean square distance without and with the accelerometer (m^2), error x, y (m),
+            shape (k, 5).
 
     Returns:
-        ``rms_mm`` and ``p50_mm`` of the bound, ``error_rms_mm`` of the same fixes, their ``ratio``.
+        ``rms_mm`` and ``p50_mm`` of the bound, ``error_rms_mm`` of the same fixes, their ``ratio``; the bound with
+        ``with_accelerometer`` has its own.
     """
-    if not len(bounds):
-        return dict.fromkeys(("rms_mm", "p50_mm", "error_rms_mm", "ratio"))
-    least = bounds[:, 1] + bounds[:, 3]
-    squares = bounds[:, 4] ** 2 + bounds[:, 5] ** 2
-    rms, error = np.sqrt(least.mean()), np.sqrt(squares.mean())
+    error = np.sqrt(np.sum(bounds[:, 3:] ** 2, axis=1))
+    rms = _root_mean(error**2)
     return {
-        "rms_mm": round(float(rms) * 1e3, 4),
-        "p50_mm": round(float(np.sqrt(np.median(least))) * 1e3, 4),
-        "error_rms_mm": round(float(error) * 1e3, 4),
-        "ratio": round(float(error / rms), 4),
+        **_bound(bounds[:, 1], rms),
+        "error_rms_mm": rms,
+        "with_accelerometer": _bound(bounds[:, 2], rms),
     }
+
+
+def _bound(squares_m2: FloatArray, error_rms_mm: float | None) -> dict[str, float | None]:
+    rms = _root_mean(squares_m2)
+    if rms is None or error_rms_mm is None:
+        return dict.fromkeys(("rms_mm", "p50_mm", "ratio"))
+    median = round(1e3 * float(np.sqrt(np.median(squares_m2))), 4)
+    return {"rms_mm": rms, "p50_mm": median, "ratio": round(error_rms_mm / rms, 4)}
+
+
+def _root_mean(squares_m2: FloatArray) -> float | None:
+    return round(1e3 * float(np.sqrt(squares_m2.mean())), 4) if squares_m2.size else None
 
 
 STUDY = Study(

@@ -39,17 +39,16 @@ class Ledger:
         out.mkdir(parents=True, exist_ok=True)
         name = "jobs.jsonl" if shard == WHOLE else f"jobs-{shard.number}of{shard.of}.jsonl"
         self._done: dict[str, tuple[str, Path, Outcome]] = {}
+        self._took_s: dict[str, float] = {}
         self._file: BinaryIO = (out / name).open("a+b")
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+            _lock(self._file)
+            _cut_torn_line(self._file)
+            for folder in (out, *others):
+                self._read_all(folder)
+        except BaseException:
             self._file.close()
-            raise CampaignError(
-                f"{out / name}: another campaign writes there; wait for it or choose another --out"
-            ) from error
-        _cut_torn_line(self._file)
-        for folder in (out, *others):
-            self._read_all(folder)
+            raise
 
     def __enter__(self) -> "Ledger":
         return self
@@ -74,11 +73,24 @@ class Ledger:
             )
         return outcome
 
-    def add(self, job: Job, outcome: Outcome) -> None:
-        """Note a finished job, and return when it is on the disk."""
+    def took_s(self, job: Job) -> float:
+        """How long a job took its worker; 0 where it is still to do."""
+        return self._took_s.get(job.key, 0.0)
+
+    @property
+    def durations_s(self) -> dict[str, list[float]]:
+        """How long finished jobs took, by cell."""
+        found: dict[str, list[float]] = {}
+        for key, took_s in self._took_s.items():
+            found.setdefault(key.rpartition(",seed=")[0], []).append(took_s)
+        return found
+
+    def add(self, job: Job, outcome: Outcome, took_s: float = 0.0) -> None:
+        """Note a finished job and how long it took its worker, and return when it is on the disk."""
         record = {
             "key": job.key,
             "fingerprint": job.fingerprint,
+            "took_s": round(took_s, 3),
             "values": plain(outcome.values),
             "arrays": _packed(outcome.arrays),
         }
@@ -102,6 +114,16 @@ class Ledger:
     def _take(self, record: dict[str, Any], path: Path) -> None:
         outcome = Outcome(record["values"], _unpacked(record["arrays"]))
         self._done.setdefault(record["key"], (record["fingerprint"], path, outcome))
+        self._took_s.setdefault(record["key"], float(record["took_s"]))
+
+
+def _lock(file: BinaryIO) -> None:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        raise CampaignError(
+            f"{file.name}: another campaign writes there; wait for it or choose another --out"
+        ) from error
 
 
 def _cut_torn_line(file: BinaryIO) -> None:

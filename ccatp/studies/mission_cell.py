@@ -7,17 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccatp.studies.campaign import Arrays, Factors, Outcome
-from ccatp.studies.mission_job import STOP_COLUMNS
+from ccatp.studies.consistency import nees_figures, nis_figures
+from ccatp.studies.mission_job import COLUMN
 from ccatp.studies.spread import Spread, pooled
 from ccatp.summary import WITHIN_M
 
 FloatArray = NDArray[np.float64]
-
-COLUMN = {name: index for index, name in enumerate(STOP_COLUMNS)}
-# 95 % of chi-square with three and two degrees of freedom: consistent estimates stay below at this share of the stops.
-CHI2_95 = {"pose": 7.814728, "position": 5.991465}
-_POSE = [COLUMN["error_x_m"], COLUMN["error_y_m"], COLUMN["error_heading_rad"]]
-_UPPER = [COLUMN[name] for name in ("p_xx", "p_xy", "p_xh", "p_yy", "p_yh", "p_hh")]
 
 
 def combine_missions(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
@@ -86,50 +81,10 @@ def of_spread(spread: Spread) -> dict[str, Any]:
 
 def stop_errors(rows: FloatArray) -> dict[str, Any]:
     """Error of the estimated position at the stops, before the fix: rms and median, mm."""
-    squares = rows[:, _POSE[0]] ** 2 + rows[:, _POSE[1]] ** 2
+    squares = rows[:, COLUMN["error_x_m"]] ** 2 + rows[:, COLUMN["error_y_m"]] ** 2
     if not squares.size:
         return {"rms": None, "p50": None}
     return {"rms": _mm(np.sqrt(squares.mean())), "p50": _mm(np.sqrt(np.median(squares)))}
-
-
-def nees(rows: FloatArray, states: int) -> FloatArray:
-    """Normalised estimation error squared, e' P^-1 e, of the first ``states`` of x, y, heading, shape (k,).
-
-    NaN where the covariance is not positive definite.
-    """
-    full = np.empty((len(rows), 3, 3))
-    upper = np.triu_indices(3)
-    full[:, upper[0], upper[1]] = full[:, upper[1], upper[0]] = rows[:, _UPPER]
-    result = np.full(len(rows), np.nan)
-    for k, covariance in enumerate(full[:, :states, :states]):
-        error = rows[k, _POSE[:states]]
-        try:
-            half = np.linalg.solve(np.linalg.cholesky(covariance), error)
-        except np.linalg.LinAlgError:
-            continue
-        result[k] = half @ half
-    return result
-
-
-def nees_figures(rows: FloatArray) -> dict[str, Any]:
-    """Means (3 and 2 are consistent) and the share of stops within the 95 % bound, for pose and position."""
-    figures: dict[str, Any] = {}
-    for name, states in (("pose", 3), ("position", 2)):
-        found = nees(rows, states)
-        known = found[np.isfinite(found)]
-        figures[name] = {
-            "mean": round(float(known.mean()), 4) if known.size else None,
-            "p50": round(float(np.median(known)), 4) if known.size else None,
-            "within_95_fraction": round(float(np.mean(known <= CHI2_95[name])), 4) if known.size else None,
-        }
-    return figures
-
-
-def nis_figures(rows: FloatArray) -> dict[str, Any]:
-    """Mean normalised innovation squared of the fixes; 2 is consistent."""
-    known = rows[:, COLUMN["nis"]]
-    known = known[np.isfinite(known)]
-    return {"mean": round(float(known.mean()), 4) if known.size else None, "count": int(known.size)}
 
 
 def after_corrections(runs: Sequence[FloatArray]) -> dict[str, Any]:

@@ -9,7 +9,8 @@ from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.samples import PointId, Vector3
 from ccatp.studies.campaign import Job, Outcome
-from ccatp.studies.rehearsal import Rehearsal, StopRow, rehearse
+from ccatp.studies.rehearsal import rehearse
+from ccatp.studies.rehearsal_result import Rehearsal, StopRow
 from ccatp.studies.spread import Spread
 from ccatp.summary import WITHIN_M, PuckTarget, puck_targets
 
@@ -21,6 +22,7 @@ STOP_COLUMNS = (
     "t_s", "row", "col", "point", "approach", "error_x_m", "error_y_m", "error_heading_rad",
     "p_xx", "p_xy", "p_xh", "p_yy", "p_yh", "p_hh", "distance_m", "nis", "fix_distance_m", "arrival_m",
 )  # fmt: skip
+COLUMN = {name: index for index, name in enumerate(STOP_COLUMNS)}
 _T, _X, _Y, _HEADING, _EST_X, _EST_Y, _EST_HEADING = range(7)  # columns of a rehearsal's track
 
 

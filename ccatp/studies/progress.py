@@ -5,7 +5,7 @@ from pathlib import Path
 from types import TracebackType
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 
 class CampaignView:
@@ -28,6 +28,7 @@ class CampaignView:
             TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
+            TimeElapsedColumn(),
             TextColumn("{task.fields[left]}"),
             console=self._console,
         )
@@ -44,10 +45,16 @@ class CampaignView:
         if self._is_live:
             self._progress.stop()
 
-    def done(self, key: str) -> None:
-        """One more job is done."""
+    def done(self, key: str, done_s: float, left_s: float) -> None:
+        """One more job is done.
+
+        Args:
+            key: its name.
+            done_s: what all that are done took their workers.
+            left_s: what those still to come are expected to take.
+        """
         self._count += 1
-        left = time_left(time.monotonic() - self._began_s, self._count, self._todo)
+        left = time_left(time.monotonic() - self._began_s, done_s, left_s)
         if self._is_live:
             self._progress.update(self._task, completed=self._count, left=left)
             return
@@ -71,7 +78,7 @@ class CampaignView:
         self._console.print(f"ccatp: {text}", markup=False, soft_wrap=True)
 
 
-def time_left(elapsed_s: float, done: int, total: int) -> str:
-    """``1:02:03 left``, from the pace so far."""
-    seconds = round(elapsed_s / done * (total - done))
+def time_left(elapsed_s: float, done_s: float, left_s: float) -> str:
+    """``1:02:03 left``, from the pace so far: time that passed per time of workers."""
+    seconds = round(elapsed_s / done_s * left_s) if done_s > 0.0 else 0
     return f"{seconds // 3600}:{seconds // 60 % 60:02d}:{seconds % 60:02d} left"

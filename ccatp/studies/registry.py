@@ -26,6 +26,7 @@ STUDIES = {
     "filters": Entry("ccatp.studies.filters_study", "STUDY", "filters in four worlds, over whole missions"),
     "time": Entry("ccatp.studies.time_study", "STUDY", "order, speed and measuring time against the hour"),
     "sensitivity": Entry("ccatp.studies.sensitivity_study", "STUDY", "what each disturbance of a hard world costs"),
+    "ablation": Entry("ccatp.studies.ablation_study", "STUDY", "what each technique gives, one off at a time"),
     "danger": Entry("ccatp.studies.danger_study", "STUDY", "false edges and overrun of two edge rules"),
     "loops": Entry("ccatp.studies.loops", "run", "Bode plots, margins and root loci of the controllers"),
 }

@@ -12,7 +12,7 @@ from ccatp.studies.campaign import CellResult, Column, Study, plain
 
 
 def write_results(
-    study: Study, cells: Sequence[CellResult], out: Path, wall_s: float, missing: int, *, with_figures: bool
+    study: Study, cells: Sequence[CellResult], out: Path, about: Mapping[str, Any], *, with_figures: bool
 ) -> dict[str, Any]:
     """Write all files of a result.
 
@@ -20,24 +20,21 @@ def write_results(
         study: the study.
         cells: its cells; those without a run are left out of table and figures.
         out: directory.
-        wall_s: wall time of the campaign.
-        missing: jobs that other shards have to do; 0 is not written.
+        about: what else ``result.json`` says of the campaign: its wall time, jobs that are missing.
         with_figures: draw.
 
     Returns:
         What ``result.json`` holds.
     """
     rows = [plain({**cell.factors, **cell.values}) for cell in cells]
-    result: dict[str, Any] = {"study": study.name, "cells": rows, "wall_s": round(wall_s, 3)}
-    if missing:
-        result["missing"] = missing
+    result: dict[str, Any] = {"study": study.name, "cells": rows, **plain(about)}
     there = [cell for cell in cells if cell.values["runs"]]
     arrays = {f"{k}/{name}": array for k, cell in enumerate(cells) for name, array in cell.arrays.items()}
     np.savez_compressed(out / "result.npz", allow_pickle=False, **arrays)
     write_whole(out / "table.md", f"# {study.title}\n\n" + table([row for row in rows if row["runs"]], study.columns))
+    write_whole(out / "result.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
     if with_figures and there:
         study.draw(there, out)
-    write_whole(out / "result.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
     return result
 
 
@@ -67,6 +64,12 @@ def _text(row: Mapping[str, Any], column: Column) -> str:
     value: Any = row
     for part in column.key.split("."):
         value = value.get(part) if isinstance(value, Mapping) else None
-    if value is None:
+    if value is None or value == []:
         return "-"
-    return format(value, column.spec) if isinstance(value, int | float) and column.spec else str(value)
+    if isinstance(value, list):  # an interval, or remarks
+        return (" to " if column.spec else "; ").join(_number(part, column.spec) for part in value)
+    return _number(value, column.spec)
+
+
+def _number(value: Any, spec: str) -> str:
+    return format(value, spec) if isinstance(value, int | float) and spec else str(value)

@@ -34,7 +34,7 @@ def draw_thesis(
     """
     for noise, numbers in _NUMBERS.items():
         mine = [result for result in results if result.factors["noise"] == noise]
-        nearest = [r for r in mine if r.factors["noise_is_variance"] and r.factors["period_error"]]
+        nearest = [r for r in mine if r.factors["noise_is_variance"] and r.factors["period_error"]][:1]
         if mine:
             title = f"{noise} noise, as fig. {numbers[1]}"
             _draw_localization(mine, published[noise]["localization"], title, out / f"localization_{noise}")
@@ -60,7 +60,7 @@ def _draw_trajectory(result: CellResult, title: str, stem: Path) -> None:
 
 
 def _draw_localization(results: Sequence[CellResult], published: Mapping[str, float], title: str, stem: Path) -> None:
-    figure = new_figure(7.2, 4.4)
+    figure = new_figure(7.2, 5.2)
     axes = figure.subplots()
     for k, result in enumerate(results):
         values, beyond = Spread.from_arrays(dict(result.arrays), "localization").exceedance()
@@ -81,7 +81,7 @@ def _draw_localization(results: Sequence[CellResult], published: Mapping[str, fl
     axes.set_xlabel("distance between true and estimated position, mm")
     axes.set_ylabel("share of all instants below")
     axes.set_title(f"Localization error, {title}")
-    axes.legend(frameon=False, fontsize=7, loc="upper left")
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
     dress(axes)
     save(figure, stem)
 
@@ -118,4 +118,5 @@ def _mark(axes: "Axes", published: Mapping[str, float]) -> None:
 def _reading(factors: Mapping[str, Any]) -> str:
     who = "ekf, shipped control" if factors["system"] == "ours" else "kf, thesis's control"
     noise = "variances" if factors["noise_is_variance"] else "standard deviations"
-    return f"{who}: {noise}{', period 1.3 % long' if factors['period_error'] else ''}"
+    late = 100.0 * float(factors["period_error"])
+    return f"{who}: {noise}{f', period {late:.1f} % long' if late else ''}"

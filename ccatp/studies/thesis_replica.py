@@ -2,10 +2,11 @@
 
 * ``noise_is_variance``: eq. 2.17 calls sigma a variance; then a sensor's standard deviation is the root of what table
   2.1 lists. The filter's R follows, as the thesis adjusts it.
-* ``period_error``: the filter's time step is 10 ms, the loop takes 1.3 % longer. The true robot moves for longer than
-  the filter believes; control and rules keep the true time.
+* ``period_error``: the filter's time step is 10 ms, the loop takes longer by this part of it. The true robot moves for
+  longer than the filter believes; control and rules keep the true time.
 
-Both are properties of that simulation. A daemon that reads the time stamps of the samples has no period error.
+Both are properties of that simulation. A daemon that reads the time stamps of the samples has no period error. As in
+thesis 2.1.5 the angle at a seam replaces the heading here, however sure the filter is of another.
 """
 
 from collections.abc import Sequence
@@ -20,14 +21,15 @@ from ccatp.assembly import assemble
 from ccatp.config.models import Config
 from ccatp.danger import DangerMonitor, Estimate, SensorsFrame
 from ccatp.filters import FILTERS
+from ccatp.localization.crossing import Transition
 from ccatp.localization.four_state import FourStateLocalizer
-from ccatp.localization.measurements import STATES
+from ccatp.localization.measurements import STATES, THETA
 from ccatp.samples import EdgeSample, EventCode, Fix, GravitySample, ImuSample, Verdict, WheelSample
-from ccatp.studies.rehearsal import Rehearsal, _Rehearsing
+from ccatp.studies.rehearsal import Rehearsing
+from ccatp.studies.rehearsal_result import Rehearsal
 
-PERIOD_FACTOR = 1.013  # the loop's period over the filter's
 FRAME_HZ = 100.0
-POINTS = 36
+POINTS, PANELS = 36, 4
 LIMIT_M = 0.010
 NOISES = ("normal", "twice")
 # Accelerometer m/s^2, gyroscope rad/s, encoder rad/s: thesis table 2.1.
@@ -40,7 +42,6 @@ _SIDE = 6
 _LAYOUT: dict[str, object] = {
     "run.mirror": "thesis-m1",
     "run.order": "thesis",
-    "run.panels": 0,
     "mirror.panels.count": _SIDE * _SIDE,
     "mirror.panels.cols": _SIDE,
     "mirror.panels.panels_per_row": [_SIDE] * _SIDE,
@@ -50,14 +51,14 @@ _LAYOUT: dict[str, object] = {
 
 
 def overrides_of(
-    noise: str, *, noise_is_variance: bool, period_error: bool, is_ours: bool = False
+    noise: str, *, noise_is_variance: bool, period_error: float, is_ours: bool = False
 ) -> dict[str, object]:
     """Dotted configuration keys of one set-up.
 
     Args:
         noise: a name out of ``NOISES``.
         noise_is_variance: the table lists variances.
-        period_error: the loop takes longer than the filter's step.
+        period_error: by which part of the filter's step the loop takes longer.
         is_ours: the daemon's filter and control in the same set-up, all encoder samples included.
     """
     sigmas = [sqrt(value) if noise_is_variance else value for value in _TABLE[noise]]
@@ -66,7 +67,7 @@ def overrides_of(
         keys[f"world.{name}"] = keys[f"localizer.{name}"] = sigma
     if is_ours:
         return keys | {"run.filter": "ekf", "control.gains": "shipped"}
-    frame_hz = FRAME_HZ / PERIOD_FACTOR if period_error else FRAME_HZ
+    frame_hz = FRAME_HZ / (1.0 + period_error)
     return keys | {
         "run.filter": "kf",
         "control.gains": "thesis",
@@ -79,10 +80,14 @@ def overrides_of(
     }
 
 
-class FixedStepLocalizer(FourStateLocalizer):
-    """The four-state localizer with a clock of its own: a step of ``period_factor`` counts as one."""
+class ThesisLocalizer(FourStateLocalizer):
+    """The four-state localizer, closer to the letter of the thesis.
 
-    period_factor = PERIOD_FACTOR
+    Attributes:
+        period_factor: its clock is its own: a step of so many times 10 ms counts as 10 ms.
+    """
+
+    period_factor = 1.0
 
     def step(
         self,
@@ -106,6 +111,19 @@ class FixedStepLocalizer(FourStateLocalizer):
         """Fuse a fix; see ``FourStateLocalizer.fuse_fix``."""
         return super().fuse_fix(replace(fix, t_s=fix.t_s / self.period_factor))
 
+    def _use_crossings(self, transitions: Sequence[Transition]) -> None:
+        """Thesis 2.1.5: the angle at the seam is the heading from now on."""
+        filter_ = self._filter
+        theta = float(filter_.mean[THETA])
+        seen = self._crossings.headings(transitions, self._odometer, self.pose, self.deck_pose, self.speed_m_s)
+        for innovation, variance in seen:
+            mean, covariance = filter_.mean.copy(), filter_.covariance.copy()
+            mean[THETA] = theta + innovation
+            covariance[THETA, :] = covariance[:, THETA] = 0.0
+            covariance[THETA, THETA] = variance
+            self.reset_filter(mean, covariance)
+            self.counts["crossings_used"] += 1
+
 
 class _NoEdges(DangerMonitor):
     """Permits everything: far from the rim an edge that a rule sees is a false one, and would end the run."""
@@ -116,20 +134,25 @@ class _NoEdges(DangerMonitor):
         return Verdict(sensors.seq, sensors.t, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
 
 
-class _Replica(_Rehearsing):
-    """A rehearsal of the block's waypoints that may have the period error."""
+class _Replica(Rehearsing):
+    """A rehearsal of the block's waypoints that may have the period error; ``run.panels`` counts the block's."""
 
-    def __init__(self, cfg: Config, period_error: bool) -> None:
+    def __init__(self, cfg: Config, period_error: float) -> None:
+        panels = cfg.run.panels
+        cfg = cfg.model_copy(update={"run": cfg.run.model_copy(update={"panels": 0})})
         super().__init__(cfg, with_track=True)
-        outside = [p for p in self.parts.points if not (p.row in _BLOCK and p.col in _BLOCK)]
+        block = [p.panel for p in self.parts.points if p.row in _BLOCK and p.col in _BLOCK]
+        kept = list(dict.fromkeys(block))[: panels or None]
+        outside = [p for p in self.parts.points if p.panel not in kept]
         self.parts = parts = assemble(cfg, done=outside)
         self.monitor = _NoEdges(self.mirror, cfg.robot, cfg.danger)
         self.localizer, self.mission, self.gate = parts.localizer, parts.mission, parts.gate
-        if period_error:
-            n = STATES
+        if cfg.run.filter == "kf":
+            filter_ = FILTERS["kf"](np.zeros(STATES), np.eye(STATES))
             start = self.mirror.base_panel_pose
-            filter_ = FILTERS[cfg.run.filter](np.zeros(n), np.eye(n))
-            self.localizer = FixedStepLocalizer(filter_, self.mirror, cfg.robot, cfg.localizer, start)
+            localizer = ThesisLocalizer(filter_, self.mirror, cfg.robot, cfg.localizer, start)
+            localizer.period_factor = 1.0 + period_error
+            self.localizer = localizer
 
 
 class ReplicaRun(NamedTuple):
@@ -137,7 +160,7 @@ class ReplicaRun(NamedTuple):
 
     Attributes:
         localization_m: distance of true and estimated position, every frame until the last stop, shape (k,).
-        waypoint_m: distance of the robot's stop from its waypoint, shape (36,) if all were reached.
+        waypoint_m: distance of the robot's stop from its waypoint, shape (9 panels,) if all were reached.
         track: t, true x, y, estimated x, y, every tenth frame, shape (j, 5).
         outcome, cause: how the mission ended.
     """
@@ -149,12 +172,12 @@ class ReplicaRun(NamedTuple):
     cause: str
 
 
-def run_replica(cfg: Config, *, period_error: bool) -> ReplicaRun:
+def run_replica(cfg: Config, *, period_error: float) -> ReplicaRun:
     """One simulation run.
 
     Args:
         cfg: with the keys of ``overrides_of``.
-        period_error: the filter's step is shorter than the loop's period.
+        period_error: by which part of the filter's step the loop takes longer.
 
     Raises:
         ValueError: a period error for a filter that reads time stamps.

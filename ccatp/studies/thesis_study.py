@@ -6,6 +6,7 @@ of the system ``ours`` are the same waypoints and the same noise with the daemon
 
 from collections.abc import Mapping, Sequence
 from itertools import product
+from math import sqrt
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outco
 from ccatp.studies.mission_cell import of_spread, of_values
 from ccatp.studies.spread import Spread, pooled
 from ccatp.studies.thesis_figures import draw_thesis
-from ccatp.studies.thesis_replica import LIMIT_M, NOISES, POINTS, overrides_of, run_replica
+from ccatp.studies.thesis_replica import LIMIT_M, NOISES, PANELS, POINTS, overrides_of, run_replica
 
 SYSTEMS = ("thesis", "ours")
 # Thesis 2.3.2 (one run for each noise) and 3.5 (five runs each): share below 1 cm, mean, largest, mm.
@@ -31,20 +32,23 @@ PUBLISHED: dict[str, dict[str, dict[str, float]]] = {
     },
 }
 QUANTITIES = ("localization", "waypoint")
+RUNS = {"localization": 1, "waypoint": 5}  # behind the published figures
+# The first is what brings this replica closest to the published figures. How long that loop took is not known: another
+# simulation of the same text came closest with the second.
+PERIOD_ERRORS = (0.008, 0.013)
 _TRACK_STEP = 2  # a fifth of a second between points of the drawn track
-_SPREADS = 2.0  # a published figure this many standard deviations of a run away lies outside the spread
+_SCATTERS = 2.0  # a published figure further away than this many standard deviations lies outside the spread
 
 
 def cells() -> Sequence[Cell]:
     """Readings times noise for the thesis's system; for ours, which has no period error, noise and its reading."""
-    found = [
-        _cell("thesis", noise, is_variance, is_slow)
-        for is_variance, is_slow, noise in product((True, False), (True, False), NOISES)
-    ]
-    return found + [_cell("ours", noise, is_variance, False) for is_variance, noise in product((True, False), NOISES)]
+    nearest, other = PERIOD_ERRORS
+    readings = [(True, nearest), (True, 0.0), (False, nearest), (False, 0.0), (True, other)]
+    found = [_cell("thesis", noise, *reading) for reading in readings for noise in NOISES]
+    return found + [_cell("ours", noise, is_variance, 0.0) for is_variance, noise in product((True, False), NOISES)]
 
 
-def _cell(system: str, noise: str, noise_is_variance: bool, period_error: bool) -> Cell:
+def _cell(system: str, noise: str, noise_is_variance: bool, period_error: float) -> Cell:
     return Cell(
         {"system": system, "noise": noise, "noise_is_variance": noise_is_variance, "period_error": period_error},
         overrides_of(noise, noise_is_variance=noise_is_variance, period_error=period_error, is_ours=system == "ours"),
@@ -53,11 +57,12 @@ def _cell(system: str, noise: str, noise_is_variance: bool, period_error: bool) 
 
 def run_job(job: Job) -> Outcome:
     """One simulation run."""
-    run = run_replica(job.cfg, period_error=bool(job.factors["period_error"]))
+    run = run_replica(job.cfg, period_error=float(job.factors["period_error"]))
     values = {
         "outcome": run.outcome,
         "cause": run.cause,
         "waypoints": run.waypoint_m.size,
+        "wanted": POINTS * (job.cfg.run.panels or PANELS) // PANELS,
         "time_s": float(run.track[-1, 0]) if run.track.size else 0.0,
         "localization": _of_run(run.localization_m),
         "waypoint": _of_run(run.waypoint_m),
@@ -86,7 +91,7 @@ def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
     waypoint_m = np.concatenate([outcome.arrays["waypoint_m"] for outcome in outcomes])
     localization = pooled([Spread.from_arrays(dict(outcome.arrays), "localization") for outcome in outcomes])
     figures: dict[str, Any] = {
-        "complete": sum(v["outcome"] == "complete" and v["waypoints"] == POINTS for v in values),
+        "complete": sum(v["outcome"] == "complete" and v["waypoints"] == v["wanted"] for v in values),
         "causes": sorted({v["cause"] for v in values if v["cause"]}),
         "time_s": float(np.mean([v["time_s"] for v in values])),
         "localization_error_mm": of_spread(localization),
@@ -94,7 +99,7 @@ def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
     }
     published = PUBLISHED[str(factors["noise"])]
     for quantity in QUANTITIES:
-        figures[quantity] = _beside(published[quantity], [v[quantity] for v in values])
+        figures[quantity] = _beside(published[quantity], [v[quantity] for v in values], RUNS[quantity])
     arrays: dict[str, NDArray[Any]] = {
         "waypoint_m": waypoint_m,
         "track": outcomes[0].arrays["track"],
@@ -103,22 +108,31 @@ def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
     return Outcome(figures, arrays)
 
 
-def _beside(published: Mapping[str, float], runs: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Mean and scatter of single runs for each figure, and how many scatters away the published one lies."""
-    found: dict[str, Any] = {"published": dict(published)}
+def _beside(published: Mapping[str, float], runs: Sequence[Mapping[str, float]], published_runs: int) -> dict[str, Any]:
+    """Mean and scatter of single runs for each figure, and how many scatters away the published one lies.
+
+    The difference of a mean over n runs and one over m scatters by s sqrt(1/n + 1/m). The largest of m > 1 runs is no
+    mean: it is compared with the largest here, by eye.
+    """
+    found: dict[str, Any] = {"published": dict(published), "published_runs": published_runs}
     for name, theirs in published.items():
         ours = np.array([run[name] for run in runs])
         mean = float(np.mean(ours))
         spread = float(np.std(ours, ddof=1)) if ours.size > 1 else float("nan")
-        away = (theirs - mean) / spread if spread > 0.0 else float("nan")
+        scatter = spread * sqrt(1.0 / ours.size + 1.0 / published_runs)
+        is_comparable = ours.size > 1 and (name != "max" or published_runs == 1)
+        away = (theirs - mean) / scatter if is_comparable and scatter > 0.0 else float("nan")
         found[name] = {
             "mean": mean,
             "run_to_run": spread,
             "least": float(np.min(ours)),
             "largest": float(np.max(ours)),
-            "published_minus_mean_in_spreads": away,
-            "is_published_within": bool(abs(away) <= _SPREADS) if np.isfinite(away) else None,
+            "published_minus_mean_in_scatters": away,
+            "is_published_within": abs(theirs - mean) <= _SCATTERS * scatter if is_comparable else None,
         }
+    verdicts = [found[name]["is_published_within"] for name in published]
+    compared = [verdict for verdict in verdicts if verdict is not None]
+    found["is_published_within"] = all(compared) if compared else None
     return found
 
 
@@ -140,7 +154,7 @@ def _columns() -> list[Column]:
                 Column("± run", f"{quantity}.{name}.run_to_run", spec),
                 Column("published", f"{quantity}.published.{name}", spec),
             ]
-        columns.append(Column("within", f"{quantity}.within_10mm_fraction.is_published_within"))
+        columns.append(Column("within", f"{quantity}.is_published_within"))
     return columns
 
 

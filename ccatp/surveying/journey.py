@@ -5,12 +5,10 @@ from math import hypot
 from typing import NamedTuple
 
 from ccatp.control.prediction import Predicted
-from ccatp.control.tracker import LegTracker, Phase
+from ccatp.control.tracker import DONE, LegTracker
 from ccatp.mirror.mirror import Mirror
 from ccatp.samples import DeckPose, PanelId, PanelPose, Stop, Twist
 from ccatp.surveying.correction import Aim
-
-STILL = Twist(0.0, 0.0)
 
 
 class Motion(NamedTuple):
@@ -48,15 +46,32 @@ class Motion(NamedTuple):
         """The pose in the deck frame."""
         return self.deck_of(self.pose)
 
+    def with_only(self, *, ahead: bool, creep: bool) -> "Motion":
+        """The same without what steering is not to use: the prediction, the drift."""
+        return Motion(
+            self.t_s,
+            self.dt_s,
+            self.pose,
+            self.deck_of,
+            self.speed_m_s,
+            self.rate_rad_s,
+            self.creep if creep else (0.0, 0.0),
+            self.ahead if ahead else None,
+        )
+
 
 class Journey:
-    """Keeps the current and the next stop until all are exhausted, and drives the leg to the current one.
+    """Keeps the current stop until all are exhausted, and drives the leg to it.
 
     Args:
         mirror: gives the stops in the frame of the panel on which the robot is.
         tracker: the leg tracker.
         timeout_factor: a motion that takes longer than this times its bang-bang time plus 5 s is overdue.
         stops: the stops, in order.
+
+    Attributes:
+        current: the stop being tracked; ``None`` when all are exhausted.
+        index: its place among them.
     """
 
     def __init__(self, mirror: Mirror, tracker: LegTracker, timeout_factor: float, stops: Sequence[Stop]) -> None:
@@ -64,24 +79,16 @@ class Journey:
         self._mirror, self._tracker, self._timeout_factor = mirror, tracker, timeout_factor
         self.stops = tuple(stops)
         self.index = 0
+        self.current: Stop | None = self.stops[0] if self.stops else None
         self._is_begun = False
         self._deadline_s = 0.0
         self._target: tuple[PanelId, Stop, tuple[float, float]] | None = None
         self._aim: tuple[PanelId, Aim] | None = None
 
-    @property
-    def current(self) -> Stop | None:
-        """The stop being tracked; ``None`` when all are exhausted."""
-        return self.stops[self.index] if self.index < len(self.stops) else None
-
-    @property
-    def upcoming(self) -> Stop | None:
-        """The stop after the current one, or ``None``."""
-        return self.stops[self.index + 1] if self.index + 1 < len(self.stops) else None
-
     def advance(self) -> None:
         """The current stop is done with."""
         self.index += 1
+        self.current = self.stops[self.index] if self.index < len(self.stops) else None
         self._is_begun, self._aim = False, None
 
     def interrupt(self) -> None:
@@ -94,18 +101,19 @@ class Journey:
 
     def follow(self, motion: Motion, stop: Stop) -> Twist:
         """One frame of the leg to ``stop``: the twist until the next frame."""
-        state = motion.steered
-        target, reverse = self.target_in(motion.pose.panel, stop), stop.reverse
-        if self._aim is not None and self._aim[0] == motion.pose.panel:
+        state, panel = motion.steered, motion.pose.panel
+        target, reverse = self.target_in(panel, stop), stop.reverse
+        if self._aim is not None and self._aim[0] == panel:
             x, y, reverse, _ = self._aim[1]
             target = x, y
         if not self._is_begun:
             self._is_begun = True
             self._tracker.begin(state.pose, target, reverse, motion.creep)
             self._set_deadline(motion.t_s)
-        before = self._tracker.phase
-        twist = self._tracker.step(state.pose, target, motion.dt_s, Twist(state.v_m_s, state.omega_rad_s), motion.creep)
-        if self._tracker.phase is not before and self._tracker.phase is not Phase.DONE:
+        tracker = self._tracker
+        before = tracker.phase
+        twist = tracker.step(state.pose, target, motion.dt_s, state, motion.creep)
+        if tracker.phase is not before and tracker.phase is not DONE:
             self._set_deadline(motion.t_s)
         return twist
 

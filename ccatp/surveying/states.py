@@ -18,6 +18,9 @@ class State(StrEnum):
     DONE = "done"
 
 
+IDLE, TURNING, DRIVING, SETTLING, MEASURING, BACKING_OFF, RETURNING, HELD, DONE = State
+
+
 class Event(StrEnum):
     """What can happen to it. Every event has a meaning in every state; where the table is silent it changes nothing."""
 

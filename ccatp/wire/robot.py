@@ -74,6 +74,7 @@ __all__ = [
     "format_permit",
     "is_mac_right",
     "join_mac",
+    "set_point_on_wire",
 ]
 
 _GRAVITY_NORM = (0.5, 1.5)  # a unit vector, however noisy
@@ -155,6 +156,11 @@ def format_drive(seq: int, ack: int, wr: float, wl: float) -> bytes:
     if not math.isfinite(wr) or not math.isfinite(wl):
         raise ValueError(f"drive set points must be finite: wr {wr}, wl {wl}")
     return b'{"type":"drive","seq":%d,"ack":%d,"wr":%.9g,"wl":%.9g}\n' % (seq, ack, wr, wl)
+
+
+def set_point_on_wire(rate_rad_s: float) -> float:
+    """What arrives of a set point: the nine digits of ``format_drive``."""
+    return float(b"%.9g" % rate_rad_s) if rate_rad_s else rate_rad_s
 
 
 def format_permit(seq: int, ack: int, forward: bool, reverse: bool, turn: bool) -> bytes:

@@ -84,7 +84,7 @@ class FixMessage(Message):
     """A fix handed to the localizer after frame ``seq``, world frame; without a point it only finds the robot."""
 
     point: tuple[int, int, int] | None
-    is_fused: bool  # or doubted, and measured again
+    is_fused: bool  # or refused: doubted and measured again, or of no use
     position_m: tuple[float, float, float]
     covariance_m2: list[float]
     dop: float
@@ -169,6 +169,8 @@ TOPICS: tuple[Topic, ...] = (
     Topic("timing", Timing, "main", 1.0, 0.0, False),
     Topic("truth", Truth, "dataloop", 1.0, 0.0, True),
 )
+RECORD_FORMAT = 1
+"""Of a recording, kept in it; one more wherever an older reader would misunderstand what is recorded."""
 BY_NAME = {topic.name: topic for topic in TOPICS}
 # Danger carries a pose on by the wheels itself: a pose in five frames is fresh enough and costs a fifth.
 ESTIMATE_FRAMES = 5

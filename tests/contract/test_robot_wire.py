@@ -31,6 +31,7 @@ from ccatp.wire.robot import (
     format_permit,
     is_mac_right,
     join_mac,
+    set_point_on_wire,
 )
 
 NONCE = "00112233445566778899aabbccddeeff"
@@ -276,6 +277,13 @@ def test_a_drive_that_is_not_finite_is_never_encoded(value: float) -> None:
         encode(Drive(seq=1, ack=1, wr=value, wl=0.0))
     with pytest.raises(ValueError, match="must be finite"):
         encode(Drive(seq=1, ack=1, wr=0.0, wl=value))
+
+
+@given(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3))
+def test_what_arrives_of_a_set_point_is_known_beforehand(right: float, left: float) -> None:
+    arrived = decode_from_client(encode(Drive(seq=1, ack=1, wr=right, wl=left))[:-1])
+    assert arrived == Drive(seq=1, ack=1, wr=set_point_on_wire(right), wl=set_point_on_wire(left))
+    assert set_point_on_wire(right) == pytest.approx(right, rel=5e-9)  # nine digits
 
 
 @given(st.binary(max_size=300))

@@ -1,21 +1,22 @@
 """The mission as stories in virtual time: an ideal robot on one panel, verdicts as told."""
 
 from collections.abc import Callable, Collection
-from dataclasses import replace
 from itertools import product
 from math import cos, exp, hypot, sin
 
 import pytest
+from msgspec.structs import replace
 
 from ccatp.config.models import Config
 from ccatp.control.prediction import Predicted
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.mission import Mission, Order
+from ccatp.mission import Mission
 from ccatp.planning.errors import PlanError
 from ccatp.planning.route import Route
 from ccatp.samples import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Twist, Verdict
 from ccatp.surveying.correction import Corrector
 from ccatp.surveying.journey import Motion
+from ccatp.surveying.orders import Order
 from ccatp.surveying.states import Event, Outcome, State, next_state
 
 DT, LAG = 0.01, 0.08
@@ -92,6 +93,12 @@ class Story:
 
 
 @pytest.fixture(scope="module")
+def config(config: Config) -> Config:
+    """The stories begin with the first leg; one of them is about the fix before it."""
+    return config.model_copy(update={"mission": config.mission.model_copy(update={"fix_at_start": False})})
+
+
+@pytest.fixture(scope="module")
 def mirror(config: Config) -> Mirror:
     return build_mirror(config.mirror)
 
@@ -121,6 +128,16 @@ def test_measures_every_point_once_and_is_complete(story: Story) -> None:
     assert [p.point for p in story.mission.done] == [1, 2, 3]
     arrived = [order.arrived for order in story.orders if order.arrived is not None]
     assert [p.point for p in arrived] == [1, 2, 3]
+
+
+def test_a_fix_at_the_start_comes_before_the_first_leg_and_costs_no_route(config: Config, mirror: Mirror) -> None:
+    first = config.mission.model_copy(update={"fix_at_start": True})
+    story = Story(config.model_copy(update={"mission": first}), mirror)
+    story.until(lambda: story.orders != [] and story.orders[-1].measure)
+    assert (story.v, story.omega, story.mission.done) == (0.0, 0.0, [])
+    story.until_state(State.DONE)
+    assert [p.point for p in story.mission.done] == [1, 2, 3]
+    assert story.plans == []
 
 
 def test_measures_only_after_the_measuring_time_at_rest(story: Story, config: Config) -> None:
@@ -383,12 +400,15 @@ def miss(story: Story, ahead_m: float, left_m: float) -> None:
 
 
 def speeds_until_rest(story: Story) -> list[float]:
-    speeds = []
-    story.frame()
-    while not story.orders[-1].at_rest:
-        story.frame()
+    speeds: list[float] = []
+
+    def is_at_rest() -> bool:
         speeds.append(story.v)
-    return speeds
+        return story.orders[-1].at_rest
+
+    story.frame()
+    story.until(is_at_rest)
+    return speeds[1:]
 
 
 def distance_m(story: Story) -> float:
@@ -474,6 +494,25 @@ def test_the_robot_is_steered_by_where_it_will_be_and_judged_by_where_it_is(stor
     seen = now._replace(ahead=aside)
     assert seen.lead_rad == pytest.approx(0.05)
     assert story.mission.step(seen, FREE).twist.omega_rad_s < -0.1  # it will be left of its line and heading off it
+
+
+@pytest.mark.parametrize("key", ["predicts_delay", "compensates_creep"])
+def test_what_is_switched_off_does_not_steer(config: Config, mirror: Mirror, key: str) -> None:
+    control = config.control.model_copy(update={key: False})
+    story = Story(config.model_copy(update={"control": control}), mirror)
+    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    now = story.motion()
+    x, y, heading = now.steered.pose
+    ahead = Predicted((x, y, heading + 0.05), story.v, story.omega)
+    used = (
+        now._replace(ahead=ahead)
+        if key == "predicts_delay"
+        else now._replace(creep=(-0.1 * sin(heading), 0.1 * cos(heading)))
+    )
+    with_it, without = (Story(config, mirror), story)
+    with_it.until(lambda: with_it.mission.state is State.DRIVING and with_it.v > 0.09)
+    assert abs(without.mission.step(used, FREE).twist.omega_rad_s) < 1e-3  # all but on its line: little to steer
+    assert abs(with_it.mission.step(used, FREE).twist.omega_rad_s) > 0.1
 
 
 def turned_ahead(story: Story, angle_rad: float) -> Motion:

@@ -1,11 +1,11 @@
 """The last gate before the wheels."""
 
-from dataclasses import replace
 from math import inf, nan
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from ccatp.config.models import LimitsConfig
 from ccatp.control.gate import DriveGate

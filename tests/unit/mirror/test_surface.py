@@ -60,6 +60,16 @@ def test_gradient_and_hessian_against_central_differences(mirror: Mirror, x: flo
 
 
 @pytest.mark.parametrize(("x", "y"), PLACES)
+def test_third_derivatives_against_differences_of_the_second(mirror: Mirror, x: float, y: float) -> None:
+    hessian, h = mirror.surface.hessian, 1e-3
+    along_x = np.subtract(hessian(x + h, y), hessian(x - h, y)) / (2 * h)
+    along_y = np.subtract(hessian(x, y + h), hessian(x, y - h)) / (2 * h)
+    # h^2 / 6 times fifth derivatives below 1e-2 is 2e-9; rounding of the second derivatives (1e-17) over h is less.
+    assert mirror.surface.third(x, y) == pytest.approx((*along_x[:2], along_x[2], along_y[2]), abs=1e-8)
+    assert along_y[0] == pytest.approx(along_x[1], abs=1e-8)
+
+
+@pytest.mark.parametrize(("x", "y"), PLACES)
 def test_jet_is_height_gradient_and_hessian(mirror: Mirror, x: float, y: float) -> None:
     surface = mirror.surface
     jet = (surface.height_m(x, y), *surface.gradient(x, y), *surface.hessian(x, y))

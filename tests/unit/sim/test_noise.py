@@ -5,7 +5,7 @@ from math import exp, sqrt
 import numpy as np
 import pytest
 
-from ccatp.sim.noise import DriftingBias, NoiseStream, OrnsteinUhlenbeck
+from ccatp.sim.noise import WHOLE, DriftingBias, NoiseStream, OrnsteinUhlenbeck
 
 SIGMA, TIME_S, DT_S = 0.3, 2.0, 0.01
 
@@ -53,14 +53,19 @@ def test_nothing_moves_without_time_or_without_sigma() -> None:
 
 
 def test_a_bias_walks_with_the_root_of_time() -> None:
-    ends = []
-    for seed in range(400):
-        bias = DriftingBias(0.5, 0.02, np.random.default_rng(seed))
-        for _ in range(900):
-            bias.step(DT_S)
-        ends.append(bias.value)
+    ends = [DriftingBias(0.5, 0.02, DT_S, np.random.default_rng(seed)).ahead(900)[-1] for seed in range(400)]
     assert np.std(ends) == pytest.approx(0.02 * 3.0, rel=4.5 / sqrt(2 * 400))  # 9 s
     assert np.mean(ends) == pytest.approx(0.5, abs=4.5 * 0.06 / sqrt(400))
-    still = DriftingBias(0.5, 0.0, np.random.default_rng(1))
-    still.step(DT_S)
-    assert (still.value, still.is_drifting) == (0.5, False)
+    assert DriftingBias(0.5, 0.0, DT_S, np.random.default_rng(1)).ahead(3).tolist() == [0.5, 0.5, 0.5]
+
+
+def test_a_bias_walks_on_however_far_it_is_asked_for() -> None:
+    whole = DriftingBias(0.5, 0.02, DT_S, np.random.default_rng(1)).ahead(1000).tolist()
+    piecewise = DriftingBias(0.5, 0.02, DT_S, np.random.default_rng(1))
+    assert whole[0] != 0.5  # it has walked already
+    assert [value for count in (1, 99, 900) for value in piecewise.ahead(count).tolist()] == whole
+
+
+def test_rounding_by_a_large_number_is_that_to_the_nearest_whole_one() -> None:
+    numbers = [0.0, 0.49, 0.51, -0.49, -0.51, 1.5e9 + 0.25, -1.5e9 - 0.75, 2.0**50 + 0.25]
+    assert [x + WHOLE - WHOLE for x in numbers] == [round(x) for x in numbers]

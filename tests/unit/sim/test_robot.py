@@ -79,6 +79,21 @@ def test_the_same_seed_gives_the_same_bytes(config: Config, mirror: Mirror) -> N
     assert lines[0] != lines[2]
 
 
+def test_rows_line_and_message_say_the_same(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror)
+    for k in range(60):
+        drive(robot, 3.0, 3.0 - 0.1 * k, 1)
+        rows, message = robot.delivered_rows, robot.delivered
+        assert rows is not None
+        assert message == frame(robot)
+        assert [type(sample).__name__ for sample in (message.imu[0], message.enc[0], message.edge[0])] == [
+            "ImuSample", "WheelSample", "EdgeSample",
+        ]  # fmt: skip
+        for name in rows.__struct_fields__:
+            value = getattr(rows, name)
+            assert (list(value) if name == "faults" else value) == getattr(message, name)
+
+
 def test_a_drive_ends_with_its_time_to_live(config: Config, mirror: Mirror) -> None:
     robot = boot(config, mirror)
     robot.rules.drive(1, 3.0, 3.0, 0.0)

@@ -104,7 +104,7 @@ def test_every_key_of_the_configuration_is_in_the_fingerprint() -> None:
 
 def test_a_setting_that_is_a_factor_is_refused() -> None:
     study = a_study()
-    with pytest.raises(CampaignError, match=r"limits\.v_max_m_s is study trial's own to set; leave it out"):
+    with pytest.raises(CampaignError, match=r"limits\.v_max_m_s is set by study trial itself; leave it out, or"):
         jobs_of(study, cells_of(study), load, {"limits.v_max_m_s": 0.2}, 1)
 
 

@@ -1,0 +1,1 @@
+"""Replay of recorded runs: what was recorded goes through a localizer again."""

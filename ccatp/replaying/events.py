@@ -1,0 +1,88 @@
+"""Pure. What happened to the localizer in a run, and in which order."""
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from ccatp.samples import Fix
+from ccatp.wire.robot import Sensors
+from ccatp.wire.topics import FixMessage
+
+
+@dataclass(frozen=True, slots=True)
+class Marked:
+    """A frame was taken, and perhaps the mission took the robot to be at rest in it."""
+
+    sensors: Sensors
+    at_rest: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Fixed:
+    """A fix was handed over after the frame before it; ``was_fused`` tells whether it was taken then."""
+
+    fix: Fix
+    was_fused: bool
+
+
+Event = Marked | Fixed
+
+
+class Stood(NamedTuple):
+    """The mission takes the robot to be at rest from frame ``seq`` on."""
+
+    seq: int
+
+
+class FixGiven(NamedTuple):
+    """A fix was handed over after frame ``seq``."""
+
+    seq: int
+    fix: Fix
+    was_fused: bool
+
+
+Message = Sensors | Stood | FixGiven
+
+
+def fix_given(message: FixMessage) -> FixGiven:
+    """The recorded fix as it was handed to the localizer."""
+    fix = Fix(
+        t_s=message.t_s,
+        position_m=message.position_m,
+        covariance_m2=tuple(message.covariance_m2),
+        dop=message.dop,
+        channels=tuple(message.channels),
+        residual_rms_m=message.residual_rms_m,
+    )
+    return FixGiven(message.seq, fix, message.is_fused)
+
+
+def in_order(messages: Iterable[Message]) -> Iterator[Event]:
+    """Frames, rests and fixes in the order in which the localizer met them.
+
+    Frames are recorded in batches, rests and fixes at once and with the number of their frame: they come at any time
+    before the batch of the frame after it. A rest belongs into its frame, a fix behind it. What belongs behind a frame
+    beyond the end of the record is left out.
+
+    Args:
+        messages: in the order of recording; the numbers of the frames grow.
+    """
+    rests: set[int] = set()
+    fixes: deque[FixGiven] = deque()
+    last = -1
+    for message in messages:
+        if isinstance(message, Stood):
+            rests.add(message.seq)
+        elif isinstance(message, FixGiven):
+            fixes.append(message)
+        else:
+            while fixes and fixes[0].seq < message.seq:
+                yield Fixed(*fixes.popleft()[1:])
+            last = message.seq
+            at_rest = last in rests
+            rests.discard(last)
+            yield Marked(message, at_rest)
+    while fixes and fixes[0].seq <= last:
+        yield Fixed(*fixes.popleft()[1:])

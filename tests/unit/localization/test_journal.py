@@ -1,0 +1,287 @@
+"""Pure. A measurement that comes late is taken at its own time, and what followed is done again."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from ccatp.filters import KalmanFilter
+from ccatp.filters.base import FloatArray
+from ccatp.localization.fixes import FixRefused
+from ccatp.localization.full_state import FullStateLocalizer
+from ccatp.localization.journal import Journal
+from ccatp.localization.survey_model import A, V, W
+from ccatp.samples import Fix
+from tests.unit.localization.drive import FRAME_S, Errors, Rate, Robot, build, fix_at, trapeze
+
+F, Q = np.array([[1.0, 0.1], [0.0, 1.0]]), np.diag([1e-3, 2e-3])
+H, R = np.array([[1.0, 0.0]]), np.array([0.04])
+
+
+class Recorded:
+    """A linear filter of two states and its journal; a step every 0.1 s."""
+
+    def __init__(self, reach_s: float = 10.0) -> None:
+        self.filter, self.journal = KalmanFilter(np.zeros(2), np.eye(2)), Journal(reach_s)
+
+    def step(self, k: int) -> None:
+        self.journal.begin(0.1 * k, 0.1, self.filter)
+        for step in (lambda: self.filter.predict(F, Q), lambda: self.measure(0.3 * k, H)):
+            self.journal.add(step)
+            step()
+
+    def measure(self, z: float, row: FloatArray) -> None:
+        self.filter.update(np.array([z]), row, R)
+
+    def late(self, t_s: float, z: float) -> int:
+        return self.journal.take(t_s, lambda _: self.measure(z, np.array([[0.2, 1.0]])), self.filter)
+
+
+def same(one: Recorded, other: Recorded) -> None:
+    np.testing.assert_allclose(one.filter.mean, other.filter.mean, rtol=1e-13)  # rounding
+    np.testing.assert_allclose(one.filter.covariance, other.filter.covariance, rtol=1e-13)
+
+
+@pytest.mark.parametrize("back", [0, 1, 5, 9])
+def test_a_late_measurement_is_as_good_as_one_in_time(back: int) -> None:
+    in_time, late = Recorded(), Recorded()
+    for k in range(1, 11):
+        in_time.step(k)
+        late.step(k)
+        if k == 10 - back:
+            in_time.measure(2.0, np.array([[0.2, 1.0]]))
+    assert late.late(1.0 - 0.1 * back, 2.0) == back
+    same(late, in_time)
+
+
+@pytest.mark.parametrize("order", [(3, 6, 9), (9, 3, 6), (9, 6, 3), (6, 6, 3)])
+def test_late_measurements_in_any_order(order: tuple[int, ...]) -> None:
+    in_time, late = Recorded(), Recorded()
+    for k in range(1, 11):
+        in_time.step(k)
+        late.step(k)
+        for _ in range(order.count(k)):
+            in_time.measure(float(k), np.array([[0.2, 1.0]]))
+    for k in order:
+        late.late(0.1 * k, float(k))
+    same(late, in_time)
+
+
+def test_in_the_middle_of_a_step_it_is_told_by_how_much_it_is_late() -> None:
+    told: list[float] = []
+    found = Recorded()
+    for k in range(1, 4):
+        found.step(k)
+    for t_s in (0.13, 0.2, 0.3, 0.5):
+        found.journal.take(t_s, told.append, found.filter)
+    assert told == pytest.approx([0.07, 0.0, 0.0, 0.0], abs=1e-12)
+
+
+def test_of_a_standstill_before_a_step_nothing_is_lost() -> None:
+    found, told = Recorded(), []
+    found.step(1)
+    found.journal.begin(5.0, 0.0, found.filter)
+    found.journal.begin(5.1, 0.1, found.filter)
+    found.journal.take(3.0, told.append, found.filter)
+    found.journal.take(5.02, told.append, found.filter)
+    assert told == pytest.approx([0.0, 0.08], abs=1e-12)
+
+
+def test_a_look_back_changes_nothing() -> None:
+    found, means = Recorded(), []
+    for k in range(1, 5):
+        found.step(k)
+        means.append(found.filter.mean)
+    for t_s, index, late_s in ((0.1, 0, 0.0), (0.15, 1, 0.05), (0.2, 1, 0.0), (0.4, 3, 0.0), (9.0, 3, 0.0)):
+        mean, _, late = found.journal.look(t_s, found.filter)
+        assert mean is means[index]
+        assert late == pytest.approx(late_s, abs=1e-12)
+    assert found.filter.mean is means[-1]
+
+
+def test_how_far_back_it_reaches() -> None:
+    found = Recorded(reach_s=0.5)
+    assert found.journal.oldest_s == -np.inf
+    for k in range(1, 21):
+        found.step(k)
+    # The first entry kept is the last one that ended before the reach.
+    assert found.journal.oldest_s == pytest.approx(1.4)
+    found.journal.restart()
+    assert found.journal.oldest_s == -np.inf
+
+
+def test_a_standstill_longer_than_the_reach_keeps_its_beginning() -> None:
+    found = Recorded(reach_s=0.5)
+    found.step(1)
+    found.step(2)
+    found.journal.begin(9.0, 0.0, found.filter)
+    assert found.journal.oldest_s == pytest.approx(0.2)
+
+
+# -- in the localizer -------------------------------------------------------------------------------------------------
+
+Deliver = Callable[[FullStateLocalizer, int], None]
+WRONG = Errors(right_slip=0.02, left_slip=0.01, creep=0.02, gyro_bias=0.01, noise=1.0)
+
+
+def twice(*rates: Rate) -> Rate:
+    return lambda t: sum(rate(t) for rate in rates)
+
+
+STRAIGHT = trapeze(0.5, 1.5, 0.1, 0.2)
+CORNER = trapeze(2.05, 1.3, 0.8, 2.0)
+DRIVES = {
+    "straight on": (trapeze(0.5, 9.0, 0.1, 0.2), lambda _: 0.0, 3.0),
+    "round a corner": (twice(STRAIGHT, trapeze(3.4, 9.0, 0.1, 0.2)), CORNER, 4.0),
+    "a rest in between": (twice(STRAIGHT, trapeze(4.2, 1.5, 0.1, 0.2)), CORNER, 6.0),
+}
+
+
+class Story:
+    """A drive that several localizers hear of.
+
+    Attributes:
+        ends: frames after which the filter has taken a step, or the robot stood.
+        fixes: for each frame, taken at its end.
+    """
+
+    def __init__(self, name: str, filter_name: str = "ekf", **kwargs: object) -> None:
+        v, omega, duration_s = DRIVES[name]
+        robot, self._listener = Robot(v=v, omega=omega, errors=WRONG), lambda: build(filter_name, **kwargs)  # type: ignore[arg-type]
+        self.frames, self.fixes, self.ends = [], [], []
+        listener = self._listener()
+        for k in range(round(duration_s / FRAME_S)):
+            self.frames.append(robot.frame())
+            self.fixes.append(robot.fix())
+            before = listener.state[0]
+            listener.step(*self.frames[-1])
+            if listener.state[0] is not before or listener.is_resting:
+                self.ends.append(k)
+
+    def end_after(self, t_s: float) -> int:
+        return next(k for k in self.ends if k * FRAME_S >= t_s)
+
+    def tell(self, deliveries: dict[int, list[Fix]]) -> FullStateLocalizer:
+        """What a localizer finds that gets fixes after these frames."""
+        found = self._listener()
+        for k, frame in enumerate(self.frames):
+            found.step(*frame)
+            for fix in deliveries.get(k, []):
+                found.fuse_fix(fix)
+        return found
+
+
+def apart(one: FullStateLocalizer, other: FullStateLocalizer) -> tuple[float, float]:
+    """Largest difference of mean and covariance, in standard deviations; speeds at rest are known to nothing."""
+    (x, P), (y, S) = one.state, other.state
+    sigma = np.sqrt(P.diagonal()) + 1e-9
+    return float(np.max(np.abs(x - y) / sigma)), float(np.max(np.abs(P - S) / np.outer(sigma, sigma)))
+
+
+@pytest.mark.parametrize(
+    ("name", "taken_s", "told_s"),
+    [
+        ("straight on", 1.5, 1.6),
+        ("straight on", 1.5, 2.9),
+        ("round a corner", 1.8, 3.7),
+        ("a rest in between", 3.0, 4.5),
+        ("a rest in between", 3.6, 4.5),
+    ],
+)
+def test_a_late_fix_is_as_good_as_one_in_time(filter_name: str, name: str, taken_s: float, told_s: float) -> None:
+    """Without what a leg passes on to the next, which was passed on before the fix was known."""
+    story = Story(name, filter_name, use={"slip_per_leg": False}, rewind_s=3.0)
+    taken, told = story.end_after(taken_s), story.end_after(told_s)
+    fix = story.fixes[taken]
+    in_time, late = story.tell({taken: [fix]}), story.tell({told: [fix]})
+    assert (in_time.counts["late_fixes"], late.counts["late_fixes"]) == (0, 1)
+    mean, covariance = apart(in_time, late)
+    # The ground is looked up where the filter thought it was: slopes off by 1e-7 in some hundred steps. Sigma points
+    # lose half the digits of a covariance whose smallest variances are 1e-12 of its largest.
+    assert mean < 1e-5
+    assert covariance < 1e-4
+
+
+def test_what_a_leg_passes_on_knows_little_of_a_late_fix() -> None:
+    story = Story("a rest in between")
+    taken, told = story.end_after(3.0), story.end_after(4.5)
+    in_time, late = (story.tell({k: [story.fixes[taken]]}) for k in (taken, told))
+    mean, covariance = apart(in_time, late)
+    # The mean of the slip is corrected, but not the scatter between the legs that the fix would have taught.
+    assert mean < 0.01
+    assert covariance < 0.05
+
+
+def test_several_late_fixes_in_any_order() -> None:
+    story = Story("round a corner", rewind_s=3.0)
+    times = [story.end_after(t_s) for t_s in (1.2, 1.8, 2.6)]
+    told = story.end_after(3.7)
+    in_time = story.tell({k: [story.fixes[k]] for k in times})
+    for order in ((2, 0, 1), (1, 2, 0)):
+        late = story.tell({told: [story.fixes[times[k]] for k in order]})
+        mean, covariance = apart(in_time, late)
+        # Each is taken where the ones after it are not known yet: derivatives at means that are some 0.1 sigma apart.
+        assert mean < 1e-3
+        assert covariance < 1e-3
+
+
+@pytest.mark.parametrize("inside", [1, 2, 3])
+def test_a_fix_within_a_block_is_carried_to_its_end(inside: int) -> None:
+    """In time it ends the block, so the noise of the block is taken in other portions: that is what differs."""
+    story = Story("straight on")
+    end = story.end_after(1.8)
+    taken, told = end - inside, story.end_after(2.6)
+    in_time, late = (story.tell({k: [story.fixes[taken]]}) for k in (taken, told))
+    pose = [np.array([found.deck_pose.x_m, found.deck_pose.y_m]) for found in (in_time, late)]
+    # v times the time to the block's end would be 1 mm for each frame.
+    assert np.abs(pose[0] - pose[1]).max() < 5e-5
+    late_only = story.tell({})
+    assert np.abs(np.array([late_only.deck_pose.x_m, late_only.deck_pose.y_m]) - pose[0]).max() > 5e-4
+
+
+def test_in_time_within_a_block_it_is_where_it_says() -> None:
+    story = Story("straight on")
+    taken = story.end_after(1.8) - 2
+    found = build()
+    for frame in story.frames[: taken + 1]:
+        found.step(*frame)
+    jump_m = found.fuse_fix(story.fixes[taken])
+    robot_xy = story.fixes[taken]
+    assert jump_m > 1e-3
+    again = found.fuse_fix(robot_xy)
+    assert again < 1e-6  # a variance of 1e-10 against 1e-10: half of next to nothing
+
+
+def test_an_older_fix_than_the_path_is_refused() -> None:
+    story = Story("straight on", rewind_s=0.5)
+    found = story.tell({})
+    before = found.deck_pose, found.state[0]
+    with pytest.raises(FixRefused, match=r"fix of 2\.000 s is outside the known path, 2\.4\d0 s to 3\.100 s"):
+        found.fuse_fix(story.fixes[199])
+    assert (found.deck_pose, found.state[0]) == (before[0], pytest.approx(before[1], abs=0.0))
+    found.fuse_fix(story.fixes[280])
+
+
+def test_a_fix_from_the_future_is_refused() -> None:
+    story = Story("straight on")
+    found = story.tell({})
+    x_m, y_m = found.deck_pose.x_m, found.deck_pose.y_m
+    with pytest.raises(FixRefused, match=r"fix of 3\.110 s is outside the known path, \S+ s to 3\.100 s"):
+        found.fuse_fix(fix_at(3.11, (x_m, y_m)))
+    found.fuse_fix(fix_at(3.09, (x_m, y_m)))  # clocks may differ by a frame or ten
+
+
+def test_before_the_first_frame_there_is_no_path() -> None:
+    with pytest.raises(FixRefused, match="outside the known path"):
+        build().fuse_fix(Robot().fix())
+
+
+def test_a_fix_at_rest_leaves_the_robot_at_rest() -> None:
+    robot, found = Robot(v=STRAIGHT, errors=WRONG), build()
+    for frame in robot.frames(2.6):
+        found.step(*frame)
+    found.fuse_fix(robot.fix())
+    # What remains of the uncertainty at the stop.
+    assert found.state[0][[V, A, W]] == pytest.approx([0.0, 0.0, 0.0], abs=4e-3)
+    found.step(*robot.frame())
+    assert found.is_resting

@@ -1,0 +1,181 @@
+"""Pure. From one step of the filter to the next: frames gathered for it, and the pose carried on in between."""
+
+from math import sqrt
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ccatp.filters.base import FloatArray
+from ccatp.localization.block import Block, BlockBuilder
+from ccatp.localization.running_pose import RunningPose
+from ccatp.localization.survey_model import BG, KG, PL, PR, PSI, STATES, A, SurveyMotion, V, W, X, Y
+from ccatp.localization.terrain import Slope
+from ccatp.samples import ImuSample
+from tests.unit.localization.drive import config
+from tests.unit.localization.test_survey_model import LEVEL, slopes, states
+
+R_M, BASE_M = config().robot.wheel_radius_m, config().robot.wheel_base_m
+
+
+def running() -> RunningPose:
+    return RunningPose(R_M, BASE_M, 0.3)
+
+
+@settings(max_examples=60, deadline=None)
+@given(states(), slopes(), st.floats(1e-3, 0.1), st.integers(1, 5))
+def test_it_drives_the_filters_arc(x: FloatArray, slope: Slope, dt_s: float, steps: int) -> None:
+    """Given the wheel angles that the filter's motion predicts, the pose is the filter's."""
+    motion, pose = SurveyMotion(R_M, BASE_M).over(dt_s, slope), running()
+    pose.begin(x, slope, 0.0)
+    for _ in range(steps):
+        after = motion.at(x)[0].copy()
+        motion.over(dt_s, slope)
+        pose.advance(dt_s, float(after[PR] - x[PR]), float(after[PL] - x[PL]), None)
+        x = after
+        expected = x[[X, Y, PSI]].tolist()
+        # The wheel angles are differences of numbers up to 10.
+        assert [pose.x_m, pose.y_m, pose.heading_rad] == pytest.approx(expected, abs=1e-13)
+    assert pose.omega_rad_s == pytest.approx(float(x[W]), abs=1e-11)
+
+
+def test_speed_and_rate_begin_with_the_filters() -> None:
+    x, pose = np.zeros(STATES), running()
+    x[[V, A, W]] = 0.08, 0.2, 0.5
+    pose.begin(x, LEVEL, 0.02)
+    # The filter's speed is the mean over its last step, so it belongs to the middle.
+    assert (pose.v_m_s, pose.omega_rad_s) == pytest.approx((0.084, 0.5), abs=1e-15)
+    pose.stand()
+    assert (pose.v_m_s, pose.omega_rad_s) == (0.0, 0.0)
+    pose.advance(0.01, 0.0, 0.0, None)
+    assert pose.v_m_s == 0.0
+
+
+def trusted(angle_variance: float, rate_variance: float = 1e-4, dt_s: float = 0.01) -> RunningPose:
+    pose = running()
+    pose.begin(np.zeros(STATES), LEVEL, 0.0)
+    pose.trust(angle_variance, rate_variance, dt_s)
+    return pose
+
+
+@pytest.mark.parametrize("angle_variance", [1e-12, 1e-7, 1e-4])
+def test_the_observers_gain_is_that_of_a_kalman_filter_long_since_begun(angle_variance: float) -> None:
+    dt_s, prior = 0.01, 1.0
+    noise = 0.5 * (R_M / dt_s) ** 2 * angle_variance  # of the mean of two wheels
+    for _ in range(2000):
+        gain = prior / (prior + noise)
+        prior = (1.0 - gain) * prior + 0.3 * dt_s**3
+    pose = trusted(angle_variance)
+    pose.advance(dt_s, 1.0, 1.0, None)
+    assert pose.v_m_s == pytest.approx(gain * R_M / dt_s, rel=1e-9)  # a geometric series long since at rounding
+
+
+@pytest.mark.parametrize("rate_variance", [1e-6, 1e-4, 1.0])
+def test_wheels_and_gyroscope_are_weighted_by_their_noise(rate_variance: float) -> None:
+    dt_s, angle_variance = 0.01, 1e-5
+    pose = trusted(angle_variance, rate_variance)
+    of_wheels = 2.0 * (R_M / (BASE_M * dt_s)) ** 2 * angle_variance
+    pose.advance(dt_s, 0.0, 0.0, 1.0)
+    assert pose.omega_rad_s == pytest.approx(of_wheels / (of_wheels + rate_variance), rel=1e-12)
+
+
+def test_the_gyroscope_is_freed_of_its_errors() -> None:
+    x, pose = np.zeros(STATES), running()
+    x[[BG, KG]] = 0.05, 0.02
+    pose.begin(x, LEVEL, 0.0)
+    pose.trust(1.0, 1e-12, 0.01)  # nothing but the gyroscope counts
+    pose.advance(0.01, 0.0, 0.0, 0.05 + 1.02 * 0.4)
+    assert pose.omega_rad_s == pytest.approx(0.4, rel=1e-9)
+
+
+def test_a_steady_acceleration_leaves_no_lag() -> None:
+    x, pose = np.zeros(STATES), running()
+    x[A] = 0.2
+    pose.begin(x, LEVEL, 0.0)
+    pose.trust(1e-5, 1e-4, 0.01)
+    for k in range(100):
+        v = 0.2 * 0.01 * (k + 1)  # what the wheels show is the mean over the frame
+        pose.advance(0.01, (v - 0.001) * 0.01 / R_M, (v - 0.001) * 0.01 / R_M, None)
+    assert pose.v_m_s == pytest.approx(0.2, abs=1e-3)  # half a frame of the acceleration
+
+
+def test_a_frame_of_no_length_leaves_the_speeds() -> None:
+    x, pose = np.zeros(STATES), running()
+    x[[V, W]] = 0.1, 0.3
+    pose.begin(x, LEVEL, 0.0)
+    pose.advance(0.0, 0.0, 0.0, None)
+    assert (pose.v_m_s, pose.omega_rad_s) == (0.1, 0.3)
+
+
+def test_the_noise_of_a_frame_sets_the_gain_anew() -> None:
+    one, other = trusted(1e-5), trusted(1e-9)
+    other.trust(1e-5, 1e-4, 0.01)
+    for pose in (one, other):
+        pose.advance(0.01, 0.1, 0.1, None)
+    assert one.v_m_s == other.v_m_s
+
+
+# -- blocks -----------------------------------------------------------------------------------------------------------
+
+
+def fill(builder: BlockBuilder, times: list[float], rate: float = 1.0, jerk: float = 1.0) -> Block:
+    """Frames of 10 ms that end at ``times``; the angular rate is ``rate t^1``, the acceleration ``jerk t``."""
+    for t in times:
+        builder.add(0.01, is_turning=True, imu=[ImuSample(t - 0.005, 9.0, 9.0), ImuSample(t, jerk * t, rate * t)])
+    return builder.take()
+
+
+def test_means_over_a_block() -> None:
+    builder = BlockBuilder()
+    builder.stand([ImuSample(0.0, 0.0, 0.0)])
+    first = fill(builder, [0.01, 0.02, 0.03, 0.04])
+    assert (first.dt_s, first.turning_s, first.samples) == (pytest.approx(0.04), pytest.approx(0.04), 4)
+    assert first.rate_rad_s == pytest.approx(0.02, abs=1e-15)  # exact for a straight line
+    second = fill(builder, [0.05, 0.06, 0.07, 0.08])
+    assert second.rate_rad_s == pytest.approx(0.06, abs=1e-15)
+    # From the middle of the first block, 0.02 s, to that of the second.
+    assert second.acceleration_m_s2 == pytest.approx(0.04, abs=1e-15)
+
+
+def test_a_block_says_how_long_the_wheels_turned() -> None:
+    builder = BlockBuilder()
+    builder.add(0.01, is_turning=True, imu=[])
+    builder.add(0.02, is_turning=False, imu=[])
+    block = builder.take()
+    assert (block.dt_s, block.turning_s) == pytest.approx((0.03, 0.01))
+    assert (block.rate_rad_s, block.acceleration_m_s2, block.samples) == (None, None, 0)
+    assert builder.take().dt_s == 0.0
+
+
+def test_the_first_sample_begins_a_trapezoid_and_a_gap_ends_it() -> None:
+    builder = BlockBuilder()
+    assert fill(builder, [0.01]).samples == 0
+    assert fill(builder, [0.02]).rate_rad_s == pytest.approx(0.015, abs=1e-15)
+    builder.add(0.01, is_turning=True, imu=[])
+    block = fill(builder, [0.04, 0.05])
+    assert (block.samples, block.rate_rad_s) == (1, pytest.approx(0.045, abs=1e-15))
+
+
+def test_nothing_reaches_across_a_restart_or_a_rest() -> None:
+    for forget in (BlockBuilder.restart, lambda builder: builder.stand([])):
+        builder = BlockBuilder()
+        fill(builder, [0.01, 0.02])
+        forget(builder)
+        block = fill(builder, [5.01, 5.02])
+        assert (block.samples, block.rate_rad_s) == (1, pytest.approx(5.015, abs=1e-12))
+        assert block.acceleration_m_s2 == block.rate_rad_s  # none of before is averaged in
+    builder = BlockBuilder()
+    builder.add(0.01, is_turning=True, imu=[])
+    builder.restart()
+    assert builder.take().dt_s == 0.0
+
+
+def test_the_mean_of_white_noise_has_the_variance_of_its_samples() -> None:
+    rng, builder, found = np.random.default_rng(1), BlockBuilder(), []
+    for _ in range(4000):
+        for _ in range(4):
+            builder.add(0.01, is_turning=True, imu=[ImuSample(0.0, 0.0, float(rng.normal()))])
+        found.append(builder.take().rate_rad_s or 0.0)
+    # The trapezoid's two halves at the ends: (1/4 + 3 + 1/4)/16 in place of 1/4, 12 % less.
+    assert float(np.var(found)) == pytest.approx(3.5 / 16.0, rel=4.0 * sqrt(2.0 / 4000))

@@ -1,0 +1,152 @@
+"""Pure. Wheel angles out of rate samples, of encoders that count and of those that do not."""
+
+from math import floor, nextafter, pi, sin
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ccatp.localization.wheel_angles import WheelAngle
+
+DT_S = 1e-3
+COUNT_RAD = 2.0 * pi / 1024.0
+
+
+def feed(wheel: WheelAngle, angles: list[float], t0_s: float = 0.0, per_frame: int = 10) -> float:
+    """Counted angles at 1 kHz as the rates that an encoder makes of them; returns what the frames turned together."""
+    whole = [floor(angle / COUNT_RAD) for angle in angles]
+    rates = [(b - a) * COUNT_RAD / DT_S for a, b in zip(whole, whole[1:], strict=False)]
+    total = 0.0
+    for k in range(0, len(rates), per_frame):
+        part = rates[k : k + per_frame]
+        total += wheel.add([t0_s + (k + i + 1) * DT_S for i in range(len(part))], part)
+    return total
+
+
+def counter() -> WheelAngle:
+    wheel = WheelAngle()
+    feed(wheel, [0.1] * 21, t0_s=-0.02)
+    return wheel
+
+
+def test_zeros_at_rest_show_a_counter() -> None:
+    wheel = WheelAngle()
+    wheel.add([0.001 * k for k in range(7)], [0.0] * 7)
+    assert not wheel.is_counter
+    wheel.add([0.007], [0.0])
+    assert wheel.is_counter
+    assert wheel.noise_rad2_s2 == 0.0
+
+
+def test_noise_shows_that_it_is_none() -> None:
+    wheel, rng = WheelAngle(), np.random.default_rng(1)
+    for k in range(200):
+        times = [0.01 * k + DT_S * i for i in range(1, 11)]
+        rates = (0.001 * rng.normal(size=10)).tolist()
+        rates[k % 10] = 0.0  # by chance
+        wheel.add(times, rates)
+        wheel.rest(rates)
+    assert not wheel.is_counter
+    # Nine of ten samples have it; a mean that forgets with 1/50 scatters as that of 1000 of them, sqrt(2/1000).
+    assert wheel.noise_rad2_s2 == pytest.approx(0.9e-6, rel=4.0 * 0.045)
+
+
+paths = st.lists(st.tuples(st.floats(0.0, 3.0), st.floats(-6.0, 6.0)), min_size=1, max_size=4)
+
+
+@settings(max_examples=50, deadline=None)
+@given(paths, st.integers(1, 13), st.floats(0.0, 1000.0))
+def test_counts_telescope(pieces: list[tuple[float, float]], per_frame: int, t0_s: float) -> None:
+    """However it is driven, forward and back: the sum is never off by more than a count."""
+    angles, angle = [0.1], 0.1
+    for phase, rate in pieces:
+        for k in range(100):
+            angle += (rate + sin(phase + 0.1 * k)) * DT_S
+            angles.append(angle)
+    wheel = counter()
+    wheel.restart()
+    wheel.add([t0_s], [0.0])
+    total = feed(wheel, angles, t0_s, per_frame)
+    # A count, and a time stamp of up to 1000 s that is rounded to 1e-13 s.
+    assert abs(wheel.angle_rad - (angle - 0.1)) <= COUNT_RAD * 1.0001
+    assert total == pytest.approx(wheel.angle_rad, abs=1e-12)
+
+
+def test_the_smallest_step_is_the_quantum() -> None:
+    wheel = counter()
+    assert wheel.variance_rad2() == pytest.approx(1e-14)  # none seen yet
+    feed(wheel, [0.1 + 2.5 * DT_S * k for k in range(101)])
+    assert wheel.quantum_rad == pytest.approx(COUNT_RAD, rel=1e-9)  # rounding of the time stamps
+    assert wheel.variance_rad2() == pytest.approx(COUNT_RAD**2 / 12.0, rel=1e-9)
+    feed(wheel, [0.35 - 9.0 * DT_S * k for k in range(101)], t0_s=0.1)
+    assert wheel.quantum_rad == pytest.approx(COUNT_RAD, rel=1e-9)
+
+
+def test_rates_are_summed_by_trapezoids() -> None:
+    wheel, t = WheelAngle(), 0.0
+    wheel.add([0.0], [0.0])
+    for _ in range(20):
+        times = [t + DT_S * i for i in range(1, 11)]
+        t = times[-1]
+        wheel.add(times, [2.0 * s for s in times])
+    assert wheel.angle_rad == pytest.approx(t * t, rel=1e-12)  # exact for a rate that grows linearly
+    assert wheel.variance_rad2() == 1e-14
+
+
+def test_a_base_to_count_from() -> None:
+    wheel = WheelAngle()
+    wheel.add([0.0, 0.001], [1.0, 1.0])
+    wheel.rebase()
+    assert wheel.angle_rad == 0.0
+    assert wheel.add([0.002], [1.0]) == pytest.approx(0.001)
+    assert wheel.angle_rad == pytest.approx(0.001)
+
+
+def test_a_jump_of_the_clock_is_no_angle() -> None:
+    for wheel in (WheelAngle(), counter()):
+        wheel.add([1.0, 1.001], [3.0, 3.0])
+        before = wheel.angle_rad
+        wheel.restart()
+        wheel.add([900.0], [3.0])
+        assert wheel.angle_rad == before
+        wheel.add([900.001], [3.0])
+        assert wheel.angle_rad == pytest.approx(before + 0.003)
+
+
+def test_a_frame_without_samples_is_not_fresh() -> None:
+    wheel = WheelAngle()
+    assert not wheel.is_fresh
+    wheel.add([0.0], [1.0])
+    assert wheel.is_fresh
+    assert wheel.add([], []) == 0.0
+    assert not wheel.is_fresh
+
+
+@pytest.mark.parametrize("is_counter", [False, True])
+def test_a_gap_is_told_once(is_counter: bool) -> None:
+    wheel = counter() if is_counter else WheelAngle()
+    wheel.restart()
+    wheel.add([0.0, nextafter(0.02, 0.0)], [2.0, 2.0])
+    assert wheel.take_gap() == 0.0
+    wheel.add([0.12], [2.0])
+    assert wheel.take_gap() == pytest.approx(0.2)
+    assert wheel.take_gap() == 0.0
+
+
+def test_a_wheel_at_rest_forgets_its_last_motion() -> None:
+    wheel = WheelAngle()
+    wheel.rest([0.1])
+    assert wheel.noise_rad2_s2 == pytest.approx(0.01)
+    for _ in range(500):
+        wheel.rest([0.001, -0.001])
+    found = wheel.noise_rad2_s2
+    assert found == pytest.approx(1e-6 + 0.98**500 * (0.01 - 1e-6), rel=1e-9)
+    wheel.rest([])
+    assert wheel.noise_rad2_s2 == found
+
+
+def test_a_counter_has_no_noise_to_learn() -> None:
+    wheel = counter()
+    wheel.rest([5.0])
+    assert wheel.noise_rad2_s2 == 0.0

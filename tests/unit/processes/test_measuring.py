@@ -1,0 +1,72 @@
+"""The measuring desk and a localizer that refuses."""
+
+import asyncio
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from ccatp.config.models import Config
+from ccatp.etalon_client import EtalonClient
+from ccatp.localization.fixes import FixGated, FixRefused
+from ccatp.localizer import Localizer
+from ccatp.mission import Mission
+from ccatp.processes.measuring import MeasuringDesk, Request
+from ccatp.processes.telling import Teller
+from ccatp.samples import DeckPose, Fix
+from ccatp.store import MissionStore
+
+FIX = Fix(1.0, (0.0, 0.0, 0.0), (0.0,) * 9, 1.0, (1,), 0.0)
+
+
+class Refusing:
+    """A localizer that says the given things in turn and then takes the fix."""
+
+    def __init__(self, *refusals: Exception) -> None:
+        self.refusals = list(refusals)
+        self.notices: list[str] = []
+
+    def fuse_fix(self, fix: Fix) -> float:
+        if self.refusals:
+            raise self.refusals.pop(0)
+        return 0.0
+
+
+async def told_fixes(config: Config, *refusals: Exception) -> list[bool]:
+    told: list[bool] = []
+    over = asyncio.Event()
+
+    def fix(point: Any, fix: Fix, jump_m: float, *, is_fused: bool) -> None:
+        told.append(is_fused)
+
+    async def measure(t_s: float, expected_m: Any) -> Fix:
+        return FIX
+
+    mission = SimpleNamespace(
+        is_awaiting_fix=True, request=1, fixed=lambda point: None, not_fixed=lambda point, cause: None
+    )
+    desk = MeasuringDesk(
+        config.mission,
+        cast(EtalonClient, SimpleNamespace(measure=measure)),
+        cast(Localizer, Refusing(*refusals)),
+        cast(Mission, mission),
+        cast(MissionStore, SimpleNamespace()),
+        cast(Teller, SimpleNamespace(fix=fix, say=lambda level, text: None)),
+        over.set,
+    )
+    serving = asyncio.get_running_loop().create_task(desk.run())
+    desk.begin(Request(1, 1.0, None, (0.0, 0.0, 0.0), DeckPose(0.0, 0.0, 0.0)))
+    async with asyncio.timeout(10.0):
+        await over.wait()
+    serving.cancel()
+    return told
+
+
+@pytest.mark.parametrize(
+    ("refusals", "told"),
+    [([], [True]), ([FixGated("far")], [False, True]), ([FixRefused("too old")], [False])],
+)
+async def test_every_fix_that_the_localizer_saw_is_told(
+    refusals: list[Exception], told: list[bool], config: Config
+) -> None:
+    assert await told_fixes(config, *refusals) == told

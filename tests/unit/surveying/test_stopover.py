@@ -1,0 +1,57 @@
+"""From the end of a leg to the request for a measurement."""
+
+import pytest
+
+from ccatp.config.models import Config
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.samples import PanelId, PanelPose, PointId
+from ccatp.surveying.journey import Motion
+from ccatp.surveying.stopover import SETTLE_LIMIT_S, Stopover
+
+DT, MEASURING_S = 0.01, 0.5
+POINT = PointId(5, 5, 1)
+
+
+@pytest.fixture(scope="module")
+def mirror(config: Config) -> Mirror:
+    return build_mirror(config.mirror)
+
+
+@pytest.fixture
+def stopover(config: Config) -> Stopover:
+    return Stopover(config.control, MEASURING_S)
+
+
+def at(mirror: Mirror, frame: int, speed_m_s: float = 0.0) -> Motion:
+    return Motion(frame * DT, DT, PanelPose(PanelId(5, 5), 0.0, 0.0, 0.0), mirror.deck_pose, speed_m_s, 0.0)
+
+
+def test_asks_once_and_only_after_the_measuring_time_at_rest(stopover: Stopover, mirror: Mirror) -> None:
+    settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
+    asked = [k for k in range(settled, settled + 200) if stopover.is_due(k * DT)]
+    assert asked == [settled + round(MEASURING_S / DT)]
+    assert (stopover.request, stopover.is_asked) == (1, True)
+
+
+def test_an_interrupted_stop_begins_anew_and_asks_again(stopover: Stopover, mirror: Mirror) -> None:
+    for k in range(2):
+        settled = next(j for j in range(1000 * k, 1000 * k + 100) if stopover.has_settled(at(mirror, j)))
+        assert stopover.is_due(settled * DT + MEASURING_S)
+        stopover.interrupt()
+        assert not stopover.is_asked
+    assert stopover.request == 2
+
+
+def test_who_never_rests_is_restless_after_the_limit(stopover: Stopover, mirror: Mirror) -> None:
+    frames = round(SETTLE_LIMIT_S / DT)
+    for k in range(frames):
+        assert not stopover.has_settled(at(mirror, k, speed_m_s=0.01))
+    assert not stopover.is_restless((frames - 1) * DT)
+    assert stopover.is_restless((frames + 1) * DT)
+
+
+def test_a_point_is_arrived_at_once(stopover: Stopover) -> None:
+    assert stopover.arrival_at(POINT) == POINT
+    assert stopover.arrival_at(None) is None  # a fix that finds the robot again is no arrival
+    assert stopover.arrival_at(POINT) is None
+    assert stopover.arrival_at(POINT._replace(point=2)) == POINT._replace(point=2)

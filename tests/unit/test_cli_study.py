@@ -1,0 +1,107 @@
+"""``ccatp study``: what reaches the campaigns, what the shell is told."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ccatp.cli import main
+from tests.unit.studies import toy
+
+
+@pytest.fixture(autouse=True)
+def toy_study(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ccatp.studies.registry.find_study", lambda name: analysis if name == "one" else toy.STUDY)
+
+
+def analysis(cfg: Any, out: Path) -> dict[str, Any]:
+    """A study without runs."""
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "table.md").write_text(f"{cfg.limits.v_max_m_s}\n")
+    return {"study": "one", "cells": [], "wall_s": 0.0}
+
+
+def test_json_is_alone_on_standard_output(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert main(["study", "toy", "--runs", "2", "--workers", "1", "--seed", "5", "--out", str(out), "--json"]) == 0
+    told = capsys.readouterr()
+    result = json.loads(told.out)
+    assert [cell["mean"] for cell in result["cells"]] == pytest.approx([0.05 * 5.5, 0.1 * 5.5])
+    assert result["settings"] == {"run.seed": 5}
+    assert "ccatp: study toy: 4 jobs to do" in told.err
+    assert told.err.splitlines()[-1] == f"ccatp: study toy: all 4 jobs are done; results are in {out}"
+    assert (out / "figure.txt").exists()
+
+
+def test_without_json_the_table_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = ["--workers", "1", "--only", "speed_m_s=0.1", "--no-figures", "--panels", "2", "--set", "run.filter=ekf"]
+    assert main(["study", "toy", "--out", str(tmp_path), *args]) == 0
+    assert capsys.readouterr().out == "# A toy\n\n| speed_m_s | runs | mean |\n|---|---|---|\n| 0.1 | 3 | 0.20 |\n"
+    assert json.loads((tmp_path / "result.json").read_text())["settings"] == {"run.panels": 2, "run.filter": "ekf"}
+
+
+def test_the_directory_is_named_after_the_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["study", "toy", "--workers", "1", "--runs", "1"]) == 0
+    assert (tmp_path / "studies/toy/result.json").exists()
+
+
+def test_shards_are_told_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = ["study", "toy", "--workers", "1", "--out", str(tmp_path / "a")]
+    assert main([*args, "--shard", "1/2"]) == 0
+    told = capsys.readouterr().err
+    assert "3 of 6 jobs are done; the other shards, or the same command without --shard, do the 3 that are m" in told
+    assert main(["study", "toy", "--workers", "1", "--out", str(tmp_path / "b"), "--from", str(tmp_path / "a")]) == 0
+    assert "3 jobs to do, 3 done before" in capsys.readouterr().err
+
+
+def test_another_configuration_is_refused_with_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = ["study", "toy", "--workers", "1", "--out", str(tmp_path)]
+    assert main(args) == 0
+    capsys.readouterr()
+    assert main([*args, "--panels", "3"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "was done with another configuration or version; give the options of then, or another --out" in line
+
+
+def test_an_analysis_takes_what_every_study_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = ["study", "one", "--out", str(tmp_path / "a"), "--set", "limits.v_max_m_s=0.05"]
+    assert main([*args, "--runs", "3", "--panels", "1", "--json"]) == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out)["study"] == "one"
+    assert told.err == "ccatp: study one is one analysis: --runs and --workers change nothing\n"
+    assert main(args) == 0
+    assert capsys.readouterr().out == "0.05\n"
+
+
+@pytest.mark.parametrize(
+    "surplus", [("--cluster", "a:1"), ("--shard", "1/2"), ("--from", "x"), ("--only", "a=b"), ("--mirror", "fyst-m1")]
+)
+def test_an_analysis_has_nothing_to_hand_out(
+    surplus: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["study", "one", "--out", str(tmp_path), *surplus]) == 2
+    assert f"study one has no runs to hand out; leave {surplus[0]} out" in capsys.readouterr().err
+
+
+def test_an_analysis_that_cannot_write_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    assert main(["study", "one", "--out", str(tmp_path / "file/out")]) == 4
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("Not a directory; make room or choose another --out")
+
+
+def test_an_unknown_study_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()
+    assert main(["study", "filter", "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err == "ccatp: no study 'filter'; did you mean filters?\n"
+
+
+def test_help_lists_the_studies(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["study", "--help"]) == 0
+    told = capsys.readouterr().out
+    for name in ("thesis", "filters", "time", "sensitivity", "ablation", "danger", "loops"):
+        assert f"  {name} " in told

@@ -1,0 +1,236 @@
+"""Run directories: what is read, and what is refused."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from ccatp.cli import main
+from ccatp.config.loader import dump_config, load_config
+from ccatp.filters import FilterDiverged
+from ccatp.mirror.mirror import build_mirror
+from ccatp.recorder import Recorder
+from ccatp.replaying import player
+from ccatp.replaying.events import Stood
+from ccatp.run_reader import RunReadError, open_run
+from ccatp.wire.robot import Sensors, encode_sensors
+from ccatp.wire.topics import RECORD_FORMAT, TOPICS, Arrival, Message, Rest, SensorLines, Track, Truth, pack, schema_of
+
+
+def line_of(seq: int) -> bytes:
+    t_s = 0.01 * seq
+    still = (-1, 0.0, 0.0, False)
+    return encode_sensors(seq, t_s, [(t_s, 0.0, 0.0)], [], [], None, (0.0, 0.0), 1.0, still, ()).strip()
+
+
+def batch(*seqs: int) -> SensorLines:
+    return SensorLines(seq=seqs[-1], t_s=0.01 * seqs[-1], lines=[msgspec.Raw(line_of(seq)) for seq in seqs])
+
+
+def track(*seqs: int) -> Track:
+    rows = [(seq, 0.01 * seq, 1, 2, 0.001 * seq, 0.0, 0.0, 1e-3) for seq in seqs]
+    return Track(seq=seqs[-1], t_s=0.01 * seqs[-1], rows=rows)
+
+
+def record(run_dir: Path, messages: list[tuple[str, Message]], **metadata: str) -> Path:
+    run_dir.mkdir(exist_ok=True)
+    path = run_dir / "telemetry.mcap"
+    topics = [(topic.name, schema_of(topic.name)) for topic in TOPICS if topic.recorded]
+    recorder = Recorder(path, topics, is_simulation=True, metadata=metadata)
+    for name, message in messages:
+        recorder.write(name, message.t_s, pack(name, message).partition(b" ")[2])
+    recorder.close()
+    return path
+
+
+@pytest.fixture
+def config_text() -> str:
+    return dump_config(load_config(None, {"run.filter": "kf", "run.seed": 5}))
+
+
+def test_what_a_recording_holds(tmp_path: Path, config_text: str) -> None:
+    truth = Truth(seq=0, t_s=0.0, rows=[(0, 0.0, 1.0, 2.0, 0.5, 1.0, 2.0, 3.0, 0.1, 0, 0)])
+    record(
+        tmp_path,
+        [
+            ("rest", Rest(seq=1, t_s=0.01)),
+            ("arrival", Arrival(seq=1, t_s=0.01, point=(1, 2, 3), error_mm=1.0)),
+            ("track", track(0, 1)),
+            ("sensors", batch(0, 1)),
+            ("truth", truth),
+        ],
+        config=config_text,
+        format=str(RECORD_FORMAT),
+    )
+    (recording,) = open_run(tmp_path)
+    found = list(recording.messages())
+    assert isinstance(found[0], Stood)
+    assert [message.seq for message in found] == [1, 0, 1]
+    assert isinstance(found[2], Sensors)
+    assert found[2].imu[0].t_s == 0.01
+    cfg = recording.config({})
+    assert (cfg.run.seed, cfg.run.filter) == (5, "kf")
+    assert recording.recorded(build_mirror(cfg.mirror)).seq.tolist() == [0, 1]
+    known = recording.truth()
+    assert known is not None
+    assert known.pose.tolist() == [[1.0, 2.0, 0.5]]
+    assert known.height_m.tolist() == [3.0]
+    assert recording.arrival_frames().tolist() == [1]
+    assert recording.is_simulation
+    assert not recording.warnings
+
+
+def test_each_part_of_a_resumed_run_has_the_configuration_it_ran_with(tmp_path: Path, config_text: str) -> None:
+    record(tmp_path, [("sensors", batch(0))], config=config_text)
+    later = dump_config(load_config(None, {"run.filter": "ekf", "run.seed": 6}))
+    record(tmp_path, [("sensors", batch(0))], config=later)
+    (tmp_path / "config.toml").write_text(later)
+    parts = open_run(tmp_path)
+    assert [part.config({}).run.seed for part in parts] == [5, 6]
+    assert [part.config({"run.filter": "ukf"}).run.filter for part in parts] == ["ukf", "ukf"]
+
+
+def test_an_older_recording_is_read_with_the_configuration_beside_it(tmp_path: Path, config_text: str) -> None:
+    record(tmp_path, [("sensors", batch(0))])
+    (tmp_path / "config.toml").write_text(config_text)
+    assert open_run(tmp_path)[0].config({}).run.seed == 5
+
+
+def test_missing_frames_are_counted(tmp_path: Path, config_text: str) -> None:
+    record(tmp_path, [("sensors", batch(0, 1)), ("sensors", batch(4, 5, 9))], config=config_text)
+    (recording,) = open_run(tmp_path)
+    assert len(list(recording.messages())) == 5
+    assert recording.warnings == [f"{recording.path}: 5 frames are missing in between"]
+
+
+def test_what_cannot_be_read_is_left_out_and_told_once(tmp_path: Path, config_text: str) -> None:
+    bad = SensorLines(seq=1, t_s=0.01, lines=[msgspec.Raw(b'{"type":"sensors"}')])
+    record(tmp_path, [("sensors", batch(0)), ("sensors", bad), ("sensors", bad)], config=config_text)
+    (recording,) = open_run(tmp_path)
+    assert len(list(recording.messages())) == 1
+    (warning,) = recording.warnings
+    assert "what cannot be read is left out" in warning
+
+
+def test_a_torn_file_is_read_up_to_its_damage(tmp_path: Path, config_text: str) -> None:
+    batches: list[tuple[str, Message]] = [("sensors", batch(*range(k, k + 100))) for k in range(0, 3000, 100)]
+    path = record(tmp_path, batches, config=config_text)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    (recording,) = open_run(tmp_path)
+    frames = [message.seq for message in recording.messages()]
+    assert frames == list(range(len(frames)))
+    assert 100 <= len(frames) < 3000
+    (warning,) = recording.warnings
+    assert "damaged or cut off" in warning
+    assert f"its last frame is of {0.01 * frames[-1]:.2f} s" in warning
+
+
+def test_what_is_no_run(tmp_path: Path, config_text: str) -> None:
+    with pytest.raises(RunReadError, match="no such directory; name the directory of a run"):
+        open_run(tmp_path / "none")
+    with pytest.raises(RunReadError, match=r"no telemetry\.mcap there"):
+        open_run(tmp_path)
+    record(tmp_path, [])
+    with pytest.raises(RunReadError, match=r"no config\.toml there"):
+        open_run(tmp_path)
+
+
+@pytest.mark.parametrize("number", [str(RECORD_FORMAT + 1), "two"])
+def test_a_newer_format_is_refused(number: str, tmp_path: Path, config_text: str) -> None:
+    record(tmp_path, [], config=config_text, format=number, ccatp="9.9")
+    with pytest.raises(RunReadError, match=rf"recorded in format {number} by ccatp 9\.9, this one reads up to"):
+        open_run(tmp_path)
+
+
+def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "telemetry.mcap").mkdir()
+    with pytest.raises(RunReadError, match="cannot be read: Is a directory"):
+        open_run(tmp_path)
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+def replay(capsys: pytest.CaptureFixture[str], *argv: object) -> tuple[int, str, str]:
+    status = main(["replay", *map(str, argv)])
+    out, err = capsys.readouterr()
+    return status, out, err
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path, config_text: str) -> Path:
+    frames = range(200)
+    record(tmp_path / "run", [("sensors", batch(*frames)), ("track", track(*frames))], config=config_text)
+    return tmp_path / "run"
+
+
+def test_a_replay_as_json_and_nothing_else(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = replay(capsys, run_dir, "--json", "--filter", "ekf")
+    result: dict[str, Any] = json.loads(out)
+    assert (status, err) == (0, "")
+    assert result["frames"] == 200
+    assert result["filter"] == "ekf"
+    assert result["settings"] == {"run.filter": "ekf"}
+    assert result["reference"] == "recorded"
+    assert result["difference"]["position_mm"]["max"] > 1.0  # the record was made by hand
+
+
+def test_the_table_and_the_csv(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = replay(capsys, run_dir, "--out", tmp_path / "o.csv")
+    assert status == 0
+    assert "error against the recorded estimate" in out
+    assert "does not reproduce the recorded estimates" in out
+    assert len((tmp_path / "o.csv").read_text().splitlines()) == 201
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["--filter", "efk"], 'run.filter = "efk" is no filter; did you mean ekf? available: ekf, kf, ukf'),
+        (["--set", "localizer.slip_fractoin=1"], "is unknown; did you mean localizer.slip_fraction?"),
+        (["--set", "localizer.slip_fraction=-1"], "localizer.slip_fraction = -1 must be at least 0"),
+        (["--set", "control.gains=thesis"], "control.gains: has no effect on a replay"),
+        (["--smooth"], "--smooth: the pose is no state of filter kf; choose --filter ekf or ukf"),
+        (["--out", "/nowhere/o.csv"], "--out: no directory /nowhere; make it first"),
+        (["--out", "/proc/o.csv"], "--out: cannot write /proc/o.csv"),
+    ],
+)
+def test_misuse_is_one_line_and_exit_2(
+    argv: list[str], message: str, run_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, err = replay(capsys, run_dir, *argv)
+    assert (status, out) == (2, "")
+    assert message in err
+    assert err.startswith("ccatp: ")
+    assert err.count("\n") == 1
+
+
+def test_a_recording_without_frames_is_one_line(
+    tmp_path: Path, config_text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = record(tmp_path, [], config=config_text)
+    assert replay(capsys, tmp_path) == (2, "", f"ccatp: {path}: no sensors frames in it\n")
+
+
+def test_an_estimator_that_gives_up_is_one_line(
+    run_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def give_up(*_: object, **__: object) -> None:
+        raise FilterDiverged("smoothed states are not finite among 7 steps")
+
+    monkeypatch.setattr(player, "replay", give_up)
+    status, out, err = replay(capsys, run_dir)
+    assert (status, out) == (2, "")
+    why = "the estimator gave up: smoothed states are not finite among 7 steps; try other settings"
+    assert err == f"ccatp: {run_dir}/telemetry.mcap: {why}\n"
+
+
+def test_warnings_go_to_standard_error(tmp_path: Path, config_text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    record(tmp_path, [("sensors", batch(0, 1, 5))], config=config_text)
+    status, out, err = replay(capsys, tmp_path, "--json")
+    assert status == 0
+    assert err == f"ccatp: warning: {tmp_path}/telemetry.mcap: 3 frames are missing in between\n"
+    assert json.loads(out)["warnings"] == [err.removeprefix("ccatp: warning: ").rstrip()]
