@@ -237,7 +237,7 @@ class Mission:
         if state is DRIVING or state is TURNING:
             return self._travel(motion)
         if state is MEASURING:
-            return Order(STAND.twist, measure=True) if self._stopover.is_due(motion.t_s) else STAND
+            return Order(STAND.twist, measure=True) if self._stopover.is_due(motion) else STAND
         if state is SETTLING:
             return self._settle(motion)
         if state is RETURNING:

@@ -196,22 +196,35 @@ class FullStateLocalizer:
             return
         usable = self._intake.imu(t_s, imu) if imu else imu
         rates = self._take_wheels(t_s, encoders)
+        if kind is FrameKind.RESYNC:
+            self._leave_out_turn()
         if self._intake.backward_source:
             self._ask_to_hold(f"time stamps of the {self._intake.backward_source} run backward")
             self._intake.backward_source = ""
         if self.is_frozen:
             return
         try:
-            is_still = max(abs(self._turned[0]), abs(self._turned[1])) <= self._full.rest_rate_rad_s * max(dt_s, 1e-3)
+            right, left = self._turned
+            limit = self._full.rest_rate_rad_s * (dt_s or _NOMINAL_FRAME_S)
+            is_still = -limit <= right <= limit and -limit <= left <= limit
             if is_still and self._rest.is_resting:
                 self._stay(t_s, dt_s, usable, rates, gravity)
                 self._edges.scan(edges)
             else:
                 self._go(t_s, dt_s, usable, edges, is_still=is_still)
         except FilterDiverged as error:
-            self.is_frozen = True
-            self.counts["diverged"] += 1
-            self._ask_to_hold(f"filter: {error}")
+            self._freeze(error)
+
+    def _freeze(self, error: FilterDiverged) -> None:
+        self.is_frozen = True
+        self.counts["diverged"] += 1
+        self._ask_to_hold(f"filter: {error}")
+
+    def _leave_out_turn(self) -> None:
+        """What the wheels did in the frame that begins a new time base lies in the gap before it, for the filter."""
+        self._right.angle_rad -= self._turned[0]
+        self._left.angle_rad -= self._turned[1]
+        self._turned = (0.0, 0.0)
 
     def _take_wheels(self, t_s: float, encoders: Sequence[WheelSample]) -> tuple[Sequence[float], Sequence[float]]:
         """Add up the wheels' angles; the rates that went into them, right and left."""
@@ -239,7 +252,7 @@ class FullStateLocalizer:
         """A frame at rest."""
         for wheel, found in zip((self._right, self._left), rates, strict=True):
             wheel.rest(found)
-            wheel.rebase()  # what adds up meanwhile is noise
+        self._rebase()  # what adds up meanwhile is noise
         self._rested_s += dt_s
         self._block.stand(imu)
         self._rest.add(imu, gravity)
@@ -254,27 +267,31 @@ class FullStateLocalizer:
         if rest.is_resting:
             self._use_rest(t_s - dt_s)
             self._estimate.begin_leg()
-            self._carry_on(0.0)
         if not is_still:
+            is_start = rest.is_resting
             rest.moved()
+            if is_start:
+                self._carry_on(0.0)
         self._frame_s = dt_s or _NOMINAL_FRAME_S
         right, left = self._turned
         self._block.add(dt_s, is_turning=bool(right or left), imu=imu)
         self._running.advance(dt_s, right, left, imu[-1][2] if imu else None)
         transitions = self._edges.scan(edges)
-        is_stop = is_still and rest.stood(dt_s)
+        # Wheels that say nothing do not stand for that reason.
+        is_stop = is_still and self._right.is_fresh and self._left.is_fresh and rest.stood(dt_s)
         if transitions or is_stop or self._block.dt_s >= self._full.update_period_s - _ROUNDING_S:
             self._take_block(t_s)
             for transition in transitions:
                 self._estimate.cross(transition, t_s)
             if is_stop:
                 self._estimate.stop((self._right.angle_rad, self._left.angle_rad))
-                self._right.rebase()
-                self._left.rebase()
+                self._rebase()
             self._carry_on(self._half_s)
-            if is_stop:
-                self._running.stand()
         self._panel.hand_over(self._running.x_m, self._running.y_m)
+
+    def _rebase(self) -> None:
+        self._right.rebase()
+        self._left.rebase()
 
     def _take_block(self, t_s: float) -> None:
         block = self._block.take()
@@ -289,6 +306,9 @@ class FullStateLocalizer:
         """Dead reckoning begins again at the filter's state."""
         self._slope = self._estimate.slope()
         self._running.begin(self._estimate.mean, self._slope, half_s)
+        if self._rest.is_resting:
+            self._running.stand()
+            return
         frame_s = self._frame_s
         # The bounded errors at both ends of a frame, and what the noise of the rates adds up to in between.
         angle = 2.0 * self._right.variance_rad2() + self._estimate.encoder_walk(self._right) * frame_s
@@ -301,6 +321,7 @@ class FullStateLocalizer:
         if reading.samples:
             variances = self._gyro.variance, self._accelerometer.variance
             self._estimate.calibrate(reading, rested_s, variances)
+        self._carry_on(0.0)
 
     # -- fixes --------------------------------------------------------------------------------------------------------
 
@@ -323,22 +344,37 @@ class FullStateLocalizer:
         variance = foot.covariance_m2 + np.eye(2) * self._full.fix_extra_sigma_m**2
         z = np.array([foot.x_m, foot.y_m])
         before = self._running.x_m, self._running.y_m
-        if self._block.dt_s > 0.0 and not self.is_frozen:
-            self._take_block(t_s)
+        try:
+            if not self.is_frozen:
+                self._condition(fix.t_s, z, variance)
+        except FilterDiverged as error:
+            self._freeze(error)
         if self.is_frozen:
-            estimate.relocate(fix.t_s, z, variance)
-            self._block.restart()
+            self._relocate(fix.t_s, z, variance, is_lost=True)
             self.is_frozen = False
-        elif estimate.is_gated(fix.t_s, z, variance):
-            self._refuse(fix.t_s, z, variance)
-        else:
-            self._refused.clear()
-            self.counts["late_fixes"] += estimate.fix(fix.t_s, z, variance) > 0
-            estimate.end_leg()
         self.counts["fixes"] += 1
         self.fix_deviation_m = foot.deviation_m
         self._carry_on(0.0)
-        return self._jumped(before)
+        now = self._running
+        self._panel.hand_over(now.x_m, now.y_m)
+        return sqrt((now.x_m - before[0]) ** 2 + (now.y_m - before[1]) ** 2)
+
+    def _condition(self, t_s: float, z: FloatArray, variance: FloatArray) -> None:
+        """Update with a position (2,) of time ``t_s`` and its covariance (2, 2), if it does not contradict."""
+        estimate = self._estimate
+        if self._block.dt_s > 0.0:
+            self._take_block(self._clock.t_s)
+        if estimate.is_gated(t_s, z, variance):
+            self._refuse(t_s, z, variance)
+            return
+        self._refused.clear()
+        self.counts["late_fixes"] += estimate.fix(t_s, z, variance) > 0
+        estimate.end_leg()
+
+    def _relocate(self, t_s: float, z: FloatArray, variance: FloatArray, *, is_lost: bool) -> None:
+        self._estimate.relocate(t_s, z, variance, is_lost=is_lost)
+        self._block.restart()
+        self._rebase()
 
     def _refuse(self, t_s: float, z: FloatArray, variance: FloatArray) -> None:
         """Lock-out recovery: an estimate that is sure of itself and wrong would refuse every true fix from now on."""
@@ -350,16 +386,11 @@ class FullStateLocalizer:
         if len(self._refused) < _CONSISTENT:
             raise FixGated(f"fix is {distance_mm:.1f} mm from the estimate, sigma {1e3 * self.position_sigma_m:.2f} mm")
         self._refused.clear()
-        self._estimate.relocate(t_s, z, variance)
+        self._relocate(t_s, z, variance, is_lost=False)
         self.counts["reinitialised"] += 1
         self.notices.append(
             f"{_CONSISTENT} fixes in a row say that the pose is {distance_mm:.1f} mm wrong: it begins anew"
         )
-
-    def _jumped(self, before: tuple[float, float]) -> float:
-        now = self._running
-        self._panel.hand_over(now.x_m, now.y_m)
-        return sqrt((now.x_m - before[0]) ** 2 + (now.y_m - before[1]) ** 2)
 
     # -- time ---------------------------------------------------------------------------------------------------------
 
@@ -367,8 +398,8 @@ class FullStateLocalizer:
         """Go on in a new time base: the pose does not step, what may have happened meanwhile goes to the covariance."""
         self._right.restart()
         self._left.restart()
-        self._estimate.journal.restart()
         if not isfinite(last_s):
+            self._estimate.journal.restart()
             return
         self.counts["resyncs"] += 1
         self._intake.restart()
@@ -378,6 +409,7 @@ class FullStateLocalizer:
                 self._take_block(last_s)
             self._estimate.lose(self._running.v_m_s * MAX_FRAME_STEP_S, self._running.omega_rad_s * MAX_FRAME_STEP_S)
             self._carry_on(0.0)
+        self._estimate.journal.restart()
         self._block.restart()
 
     def _ask_to_hold(self, cause: str) -> None:

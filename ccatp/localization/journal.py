@@ -46,6 +46,9 @@ class Journal:
     def begin(self, t_s: float, dt_s: float, filter_: Filter) -> None:
         """Steps follow that bring the state to ``t_s``; the robot may have moved during the last ``dt_s`` of it."""
         entries = self._entries
+        if dt_s == 0.0 and entries and entries[-1].dt_s == 0.0:
+            entries[-1].t_s = t_s  # a standstill, however long, is one entry
+            return
         entries.append(_Entry(t_s, dt_s, filter_.mean, filter_.covariance))
         # Two entries at least: a standstill may outlast the reach, and its beginning is where its fix belongs.
         while len(entries) > 2 and entries[1].t_s < t_s - self._reach_s:

@@ -6,7 +6,7 @@ import numpy as np
 
 from ccatp.angles import difference
 from ccatp.config.models import LocalizerConfig, RobotConfig
-from ccatp.filters.base import Filter, FilterDiverged, FloatArray, Innovation
+from ccatp.filters.base import Filter, FloatArray, Innovation
 from ccatp.localization.affine import Affine
 from ccatp.localization.block import Block
 from ccatp.localization.crossing import Transition
@@ -41,6 +41,7 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.samples import DeckPose
 
 _STOP_ROWS = np.eye(STATES)[[V, A, W]]
+_UNKNOWN_SPEEDS = 0.1**2, 0.5**2, 1.0**2  # variances of v, a, w of a robot of which nothing is known
 _DRAWN = [SR, SL, C]
 _WHERE_DRAWN = np.ix_(_DRAWN, _DRAWN)
 
@@ -71,6 +72,7 @@ class SurveyFilter:
         self.innovation: Innovation | None = None
         self.journal = Journal(cfg.full_state.rewind_s)
         self._filter, self._counts = filter_, counts
+        self._is_again = False
         self._cfg, self._full = cfg, cfg.full_state
         self._terrain = Terrain(mirror)
         self._motion = SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m)
@@ -112,6 +114,10 @@ class SurveyFilter:
     def height_m(self, x_m: float, y_m: float) -> float:
         """Height of the surface over a deck point."""
         return self._terrain.height_m(x_m, y_m)
+
+    def _count(self, what: str) -> None:
+        """Count something, once: not when it is done again."""
+        self._counts[what] += not self._is_again
 
     def begin(self, t_s: float, dt_s: float) -> None:
         """Steps follow that bring the state to ``t_s``; the robot may have moved in the last ``dt_s`` of it."""
@@ -229,7 +235,7 @@ class SurveyFilter:
         residual = difference(heading_from_gravity(bearing_rad, slope), float(mean[PSI]))
         prior = float(self._filter.covariance[PSI, PSI])
         if residual * residual > full.gravity_gate**2 * (variance + prior):
-            self._counts["gravity_gated"] += 1
+            self._count("gravity_gated")
             return
         H = np.zeros((1, STATES))
         H[0, PSI] = 1.0
@@ -274,7 +280,7 @@ class SurveyFilter:
         residual, H, variance = self._seams.line(edge, transition, t_s, mean, self.slope())
         spread = variance + float(H[0].dot(P).dot(H[0]))
         is_used = residual * residual <= self._full.line_gate**2 * spread
-        self._counts["crossings_used" if is_used else "crossings_gated"] += 1
+        self._count("crossings_used" if is_used else "crossings_gated")
         if is_used:
             self._update(H.dot(mean) + residual, H, np.array([variance]))
 
@@ -293,12 +299,25 @@ class SurveyFilter:
         Returns:
             how many steps were done again after it.
         """
-        return self.journal.take(t_s, lambda late_s: self._use_fix(z, variance, late_s), self._filter)
+        found: list[Innovation] = []
 
-    def _use_fix(self, z: FloatArray, variance: FloatArray, late_s: float) -> None:
+        def step(late_s: float) -> None:
+            innovation = self._use_fix(z, variance, late_s)
+            if not found:
+                found.append(innovation)
+
+        self._is_again = True
+        try:
+            count = self.journal.take(t_s, step, self._filter)
+        finally:
+            self._is_again = False
+        self.innovation = found[0]
+        return count
+
+    def _use_fix(self, z: FloatArray, variance: FloatArray, late_s: float) -> Innovation:
         mean = self._filter.mean
         residual, H = self._fix_row(z, mean, late_s)
-        self.innovation = self._filter.update(H.dot(mean) + residual, H, variance)
+        return self._filter.update(H.dot(mean) + residual, H, variance)
 
     def _fix_row(self, z: FloatArray, mean: FloatArray, late_s: float) -> tuple[FloatArray, FloatArray]:
         """Residual (2,) and row (2, n) of a position ``late_s`` before the state's time, in which V and W held."""
@@ -327,30 +346,37 @@ class SurveyFilter:
         S = H.dot(P).dot(H.T) + variance
         return float(residual.dot(np.linalg.solve(S, residual))) > self._full.fix_gate_nis
 
-    def relocate(self, t_s: float, z: FloatArray, variance: FloatArray) -> None:
-        """Begin anew from a position (2,) measured at ``t_s``, and its covariance (2, 2).
+    def relocate(self, t_s: float, z: FloatArray, variance: FloatArray, *, is_lost: bool) -> None:
+        """Begin anew from a position (2,) measured at ``t_s``, and its covariance (2, 2); wheel angles count from here.
 
         The heading loses its certainty, not its value. The way since then is taken from the estimate that was wrong:
         wrong about where it began, not about what the wheels did.
 
+        Args:
+            t_s: time of the position.
+            z: deck, m.
+            variance: its covariance, m^2.
+            is_lost: the filter has stood still meanwhile; the speeds are not known either.
+
         Raises:
             FilterDiverged: the state is not finite.
         """
+        shift = self.fix_residual(t_s, z)
         x, P = self._filter.mean.copy(), self._filter.covariance.copy()
-        if not (np.isfinite(x).all() and np.isfinite(P).all()):
-            raise FilterDiverged("the state is not finite")
         heading_variance = float(P[PSI, PSI]) + self._full.relocated_heading_sigma_rad**2
-        then, _, _ = self.journal.look(t_s, self._filter)
-        since = x[:2] - then[:2]
-        pose = [X, Y, PSI]
-        P[pose, :] = 0.0
-        P[:, pose] = 0.0
+        new = [X, Y, PSI, PR, PL, *((V, A, W) if is_lost else ())]
+        P[new, :] = 0.0
+        P[:, new] = 0.0
         P[:2, :2], P[PSI, PSI] = variance, heading_variance
-        x[:2] = z + since
-        x[[V, A, W]] = 0.0
+        x[:2] += shift
+        x[[PR, PL]] = 0.0
+        if is_lost:
+            x[[V, A, W]] = 0.0
+            P[V, V], P[A, A], P[W, W] = _UNKNOWN_SPEEDS
         self.journal.restart()
         self._seams.forget()
         self._legs.forget_leg()
+        self.innovation = None
         self._filter.reset(x, P)
 
     def lose(self, way_m: float, turn_rad: float) -> None:

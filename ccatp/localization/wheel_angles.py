@@ -9,6 +9,8 @@ _COUNTER_NOISE = 1.0 / 12.0  # variance of a uniform distribution over one count
 _MIN_VARIANCE_RAD2 = 1e-14
 # A wheel that gave no sample for this long may have done anything meanwhile.
 _GAP_S = 0.02
+_LOST = 1.5  # periods between two samples of a counter beyond which one is missing
+_LATELY_S = 0.05
 
 
 class WheelAngle:
@@ -28,6 +30,8 @@ class WheelAngle:
 
     __slots__ = (
         "_gap_rad",
+        "_mean_rate",
+        "_period_s",
         "_rate",
         "_t_s",
         "_zeros",
@@ -42,6 +46,8 @@ class WheelAngle:
         self.angle_rad = 0.0
         self.is_fresh = False
         self._gap_rad = 0.0
+        self._mean_rate = 0.0
+        self._period_s = inf
         self._t_s = -inf
         self._rate = 0.0
         self._zeros = 0
@@ -81,19 +87,27 @@ class WheelAngle:
         return turned
 
     def _counted(self, t0: float, times_s: Sequence[float], rates_rad_s: Sequence[float]) -> float:
-        turned, least = 0.0, self.quantum_rad
+        turned, least, period, start = 0.0, self.quantum_rad, self._period_s, t0
         for t, rate in zip(times_s, rates_rad_s, strict=True):
+            dt = t - t0
+            if dt > _LOST * period:
+                # A rate tells of its own period only; what the wheel did before it is taken from what it did lately.
+                lost_s = dt - period
+                turned += self._mean_rate * lost_s
+                self._gap_rad += abs(self._mean_rate) * lost_s + (least if least < inf else 0.0)
+                dt = period
+            elif 0.0 < dt < period:
+                period = dt
             if rate:
-                dt = t - t0
-                if dt > _GAP_S:
-                    self._gap_rad += abs(rate) * dt
                 step = rate * dt
                 turned += step
-                if -least < step < least:
+                if -least < step < least and step:
                     least = abs(step)
             t0 = t
-        # No count where the clock stands still.
-        self.quantum_rad = least or self.quantum_rad
+        self.quantum_rad, self._period_s = least, period
+        elapsed = t0 - start
+        if elapsed > 0.0:
+            self._mean_rate += (turned - self._mean_rate * elapsed) / (elapsed + _LATELY_S)
         return turned
 
     def _is_counting(self, rates_rad_s: Sequence[float]) -> bool:

@@ -13,16 +13,17 @@ _STEP_M = 0.02
 
 
 def plan_calibration(mirror: Mirror, robot: RobotConfig, mission: MissionConfig, base: DeckPose) -> tuple[Stop, ...]:
-    """Four legs between base and a place behind or before it, which end at base with the heading of the start.
+    """Rounds of four legs between base and a place behind or before it, which end at base with the heading of the start.
 
     There and back along one line, once driven with the same heading and once with the opposite one: a wrong heading
     shifts the two ends against each other, creep shifts both downhill, slip shortens both legs, and two half turns tell
-    a wrong wheel base from a wrong gyroscope. So the first leg of the survey is driven with errors that are known.
+    a wrong wheel base from a wrong gyroscope. So the first leg of the survey is driven with errors that are known. A
+    second round shows whether slip and creep are the same again.
 
     Args:
         mirror: the mirror.
         robot: where the sensors are.
-        mission: clearances, and the length wanted (0 = no calibration).
+        mission: clearances, the length wanted (0 = no calibration), and how many rounds.
         base: where the robot stands.
 
     Returns:
@@ -38,12 +39,13 @@ def plan_calibration(mirror: Mirror, robot: RobotConfig, mission: MissionConfig,
         if way_m >= _SHORTEST_M:
             away = base.x_m + sign * way_m * cos(course), base.y_m + sign * way_m * sin(course)
             home = base.x_m, base.y_m
-            return (
+            drive = (
                 Stop(*away, StopKind.CALIBRATE, reverse=is_reverse),
                 Stop(*home, StopKind.CALIBRATE, reverse=not is_reverse),
                 Stop(*away, StopKind.CALIBRATE, reverse=not is_reverse),
                 Stop(*home, StopKind.CALIBRATE, reverse=not is_reverse),
             )
+            return drive * mission.calibration_rounds
     return ()
 
 

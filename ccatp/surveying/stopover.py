@@ -26,7 +26,7 @@ class Stopover:
         self._stillness = Stillness(control)
         self._measuring_time_s = measuring_time_s
         self._settle_by_s: float | None = None
-        self._measure_at_s = 0.0
+        self._measure_at_s = self._measure_by_s = 0.0
         self._arrived_at: PointId | None = None
         self.request = 0
         self.is_asked = False
@@ -49,6 +49,7 @@ class Stopover:
             return False
         self._settle_by_s = None
         self._measure_at_s = motion.t_s + self._measuring_time_s - TIME_EPSILON_S
+        self._measure_by_s = motion.t_s + SETTLE_LIMIT_S
         return True
 
     def is_restless(self, t_s: float) -> bool:
@@ -62,9 +63,17 @@ class Stopover:
         self._arrived_at = point
         return point
 
-    def is_due(self, t_s: float) -> bool:
-        """Whether to ask for the measurement now; true once at each stop."""
-        if self.is_asked or t_s < self._measure_at_s:
+    def is_due(self, motion: Motion) -> bool:
+        """Take a frame of the measuring time; whether to ask for the measurement now. True once at each stop.
+
+        A robot that moves once more after all spoils the measurement: its time begins anew, within reason.
+        """
+        if self.is_asked:
+            return False
+        t_s = motion.t_s
+        if not self.is_quiet(motion):
+            self._measure_at_s = min(t_s + self._measuring_time_s - TIME_EPSILON_S, self._measure_by_s)
+        if t_s < self._measure_at_s:
             return False
         self.is_asked = True
         self.request += 1

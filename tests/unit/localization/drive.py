@@ -59,9 +59,7 @@ def build(
     of_both = {key: value for key, value in changes.items() if hasattr(cfg, key) and key not in of_full}
     full = full.model_copy(update={"use": full.use.model_copy(update=use or {}), **of_full})
     cfg = cfg.model_copy(update={"full_state": full, **of_both})
-    return FullStateLocalizer(
-        FILTERS[name](np.zeros(STATES), np.eye(STATES)), mirror(), config().robot, cfg, start
-    )
+    return FullStateLocalizer(FILTERS[name](np.zeros(STATES), np.eye(STATES)), mirror(), config().robot, cfg, start)
 
 
 def nothing(_: float) -> float:

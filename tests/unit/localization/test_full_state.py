@@ -245,7 +245,7 @@ class Fragile:
 def fragile() -> tuple[FullStateLocalizer, Fragile]:
     filter_ = Fragile(FILTERS["ekf"](np.zeros(STATES), np.eye(STATES)))
     cfg = config()
-    return FullStateLocalizer(filter_, mirror(), cfg.robot, cfg.localizer, STEEP), filter_  # type: ignore[arg-type]
+    return FullStateLocalizer(filter_, mirror(), cfg.robot, cfg.localizer, STEEP), filter_
 
 
 def test_a_filter_that_diverges_freezes_the_pose_and_asks_to_hold() -> None:
@@ -268,7 +268,7 @@ def test_a_filter_that_diverges_freezes_the_pose_and_asks_to_hold() -> None:
 def test_a_fix_revives_it() -> None:
     """The filter breaks when the robot drives off and works again when it has been put back."""
     found, filter_ = fragile()
-    robot = rested(found)  # type: ignore[assignment]
+    robot = rested(found)
     run(found, robot.frames(0.8))
     filter_.is_broken = True
     run(found, robot.frames(0.2))
@@ -453,7 +453,8 @@ def test_seams_is_a_switch() -> None:
     with_, without = both("seams", Robot(start, v=across_it(), has_edges=True).frames(4.2), start)
     assert with_.counts["crossings_used"] == 8
     assert without.counts["crossings_used"] == without.counts["crossings_gated"] == 0
-    assert with_.state[1][X, X] < 4e-8 < 1e-6 < without.state[1][X, X]
+    assert with_.state[1][X, X] < 4e-8
+    assert without.state[1][X, X] > 1e-6
 
 
 def test_gravity_is_a_switch() -> None:
@@ -489,7 +490,9 @@ def test_a_robot_at_rest_does_not_crawl() -> None:
     run(found, robot.frames(0.5))
     before = found.pose
     run(found, robot.frames(20.0))
-    assert found.pose == before
+    now = found.pose
+    # What is learned of the biases moves what is correlated with them by rounding.
+    assert (now.x_m, now.y_m, now.heading_rad) == pytest.approx((before.x_m, before.y_m, before.heading_rad), abs=1e-9)
     assert found.speed_m_s == found.rate_rad_s == 0.0
 
 
@@ -523,15 +526,24 @@ def test_ekf_and_ukf_agree(wrong: Errors) -> None:
 
 
 def test_between_the_steps_of_the_filter_the_pose_is_carried_on() -> None:
-    """A perfect robot: each frame's pose, whether the filter has stepped or not."""
-    robot = Robot(v=L_SHAPED[0], omega=L_SHAPED[1])
-    found = build(slip_mean=0.0)
+    """An all but perfect robot, known to be one: each frame's pose, whether the filter has stepped or not."""
+    robot = Robot(
+        v=L_SHAPED[0], omega=L_SHAPED[1], errors=Errors(noise=1e-3)
+    )  # exact zeros would be those of a counter
+    found = build(
+        slip_mean=0.0,
+        slip_sigma=1e-6,
+        slip_scatter=1e-6,
+        slip_difference_sigma=1e-6,
+        creep_sigma=1e-6,
+        wheel_base_sigma=1e-6,
+    )
     for _ in range(500):
         found.step(*robot.frame())
         distance_m, heading_rad = errors_of(found, robot.pose)
-        # The servo's ramps are no steps of acceleration: some percent of slip for a moment.
-        assert distance_m < 2e-4
-        assert abs(heading_rad) < 1e-3
+        # The wheels' noise of 1 urad/s, and what of it the gyroscope's 9 urad/s are trusted.
+        assert distance_m < 1e-6
+        assert abs(heading_rad) < 1e-5
         assert found.t_s == robot.t_s
 
 
@@ -557,7 +569,9 @@ def test_creep_is_told_along_the_panels_axes() -> None:
     x = found.state[0]
     slope_x, slope_y = found.creep
     length = sqrt(slope_x**2 + slope_y**2)
-    assert length == pytest.approx(abs(float(x[12])), rel=1e-3)  # the downhill direction is a unit vector of the surface
+    assert length == pytest.approx(
+        abs(float(x[12])), rel=1e-3
+    )  # the downhill direction is a unit vector of the surface
 
 
 def test_sigmas_are_those_of_the_covariance() -> None:
@@ -574,6 +588,7 @@ def test_a_word_of_the_mission_is_no_rest() -> None:
     robot = driven(found)
     before = found.speed_m_s, found.state[0]
     found.rest()
-    assert (found.speed_m_s, found.state[0]) == (before[0], pytest.approx(before[1], abs=0.0))
+    assert found.speed_m_s == before[0]
+    assert np.array_equal(found.state[0], before[1])
     run(found, robot.frames(0.3))
     assert not found.is_resting

@@ -85,8 +85,15 @@ ordered = st.lists(times, max_size=6, unique=True).map(sorted)
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.lists(st.one_of(st.lists(st.tuples(times, rates, rates), max_size=5), ordered.map(
-    lambda found: [(t, 1.0, t) for t in found])), max_size=5))
+@given(
+    st.lists(
+        st.one_of(
+            st.lists(st.tuples(times, rates, rates), max_size=5),
+            ordered.map(lambda found: [(t, 1.0, t) for t in found]),
+        ),
+        max_size=5,
+    )
+)
 def test_quick_and_slow_use_and_count_the_same(frames: list[list[tuple[float, float | None, float | None]]]) -> None:
     quick, slow = intake(), intake()
     for k, rows in enumerate(frames):

@@ -32,7 +32,7 @@ def test_before_the_first_leg_it_is_what_was_expected() -> None:
     found = population()
     assert found.mean == pytest.approx(0.015, rel=1e-12)
     assert found.mean_variance == pytest.approx(0.015**2, rel=1e-12)
-    assert sqrt(found.scatter) == pytest.approx(0.008, rel=0.15)  # the mean of a prior that is even on both sides
+    assert 0.001 < sqrt(found.scatter) < 0.008  # the prior's peak; its lower side is longer than its upper one
     assert found.variance == found.scatter + found.mean_variance
 
 
@@ -155,7 +155,7 @@ def test_the_deviation_from_what_was_expected_passes_through(full: FullStateConf
     x, P = state(*book.first())
     redraw = book.begin(x + 0.01, P)
     assert redraw.found == pytest.approx(x[DRAWN] + 0.01)
-    assert redraw.Q == pytest.approx(redraw.Q.T)
+    assert np.abs(redraw.Q - redraw.Q.T).max() < 1e-18
     assert np.linalg.eigvalsh(redraw.Q)[0] > 0.0
 
 

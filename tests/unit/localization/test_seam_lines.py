@@ -1,5 +1,7 @@
 """Pure. An edge sensor over a panel's edge: what it says of the robot."""
 
+from collections.abc import Callable
+from functools import partial
 from math import hypot
 
 import numpy as np
@@ -28,9 +30,13 @@ def edges_of(k: int) -> tuple[float, float]:
     """Where the map has the two edges of the seam between HERE and its neighbour along axis k."""
     m = mirror()
     here, there = m.panel(HERE), m.panel(PanelId(HERE.row + k, HERE.col + 1 - k))
-    return (here.x_m + here.half_x_m, there.x_m - there.half_x_m) if k == 0 else (
-        here.y_m + here.half_y_m,
-        there.y_m - there.half_y_m,
+    return (
+        (here.x_m + here.half_x_m, there.x_m - there.half_x_m)
+        if k == 0
+        else (
+            here.y_m + here.half_y_m,
+            there.y_m - there.half_y_m,
+        )
     )
 
 
@@ -142,13 +148,17 @@ def test_the_two_edges_of_a_gap_have_an_offset_each(seams: SeamLines) -> None:
     left = Meeting(0, True, False, 0, 0.0, 0.1, 0.0, 0.0).meet(seams)
     reached = Meeting(0, True, True, 0, 0.0, 0.1, 0.0, 0.0).meet(seams)
     again = Meeting(0, True, False, 2, 0.0, 0.1, 0.0, 0.0).meet(seams)
-    assert left is not None and reached is not None and again is not None
+    assert left is not None
+    assert reached is not None
+    assert again is not None
     assert (left.offset, reached.offset, again.is_new) == (E0, E1, False)
     assert reached.position_m - left.position_m == pytest.approx(edges_of(0)[1] - edges_of(0)[0])
 
 
 def test_another_seam_or_a_pose_found_anew_begins_with_an_unknown_offset(seams: SeamLines) -> None:
-    for change in (lambda: Meeting(1, True, False, 0, 0.0, 0.1, 0.0, 0.0).meet(seams), seams.forget):
+    other = Meeting(1, True, False, 0, 0.0, 0.1, 0.0, 0.0)
+    changes: tuple[Callable[[], object], ...] = (partial(other.meet, seams), seams.forget)
+    for change in changes:
         Meeting(0, True, False, 0, 0.0, 0.1, 0.0, 0.0).meet(seams)
         change()
         edge = Meeting(0, True, False, 0, 0.0, 0.1, 0.0, 0.0).meet(seams)
@@ -211,10 +221,16 @@ def test_a_seam_places_the_robot(k: int, is_up: bool, forward: float, full: Full
 def test_what_the_map_does_not_know_goes_to_the_offsets() -> None:
     """The edges lie 0.4 mm from the map: the pose is off by that, but the heading is not."""
     robot = Robot(before_a_seam(0, True), across_it(), has_edges=True, shift_m=(4e-4, 0.0))
-    found = build(start=before_a_seam(0, True), start_position_sigma_m=1e-5, start_heading_sigma_rad=0.02, slip_sigma=1e-5,
-        slip_mean=0.0, slip_scatter=1e-5)
+    found = build(
+        start=before_a_seam(0, True),
+        start_position_sigma_m=1e-5,
+        start_heading_sigma_rad=0.02,
+        slip_sigma=1e-5,
+        slip_mean=0.0,
+        slip_scatter=1e-5,
+    )
     run(found, robot.frames(4.2))
-    mean, P = found.state
+    mean, _ = found.state
     assert found.counts["crossings_used"] == 8
     for offset in (E0, E1):
         # What remains is the way's own error: 10 um of the start, 1e-5 of slip on 0.2 m, 30 um of the timing.

@@ -1,7 +1,7 @@
 """Pure. The full-state model: its derivatives, and whether it describes a robot on a curved surface."""
 
 from itertools import product
-from math import hypot
+from math import cos, hypot, sin
 
 import numpy as np
 import pytest
@@ -48,7 +48,9 @@ def near(limit: float) -> st.SearchStrategy[float]:
 @st.composite
 def states(draw: st.DrawFn) -> FloatArray:
     """Any state of a robot that moves: |d| has no derivative at standstill."""
-    x = np.array([draw(near(limit)) for limit in (3, 3, 7, 0.0, 0.5, 2, 0.05, 0.05, 1, 0.05, 0.05, 0.05, 0.1, 9, 9, 1, 1)])
+    x = np.array(
+        [draw(near(limit)) for limit in (3, 3, 7, 0.0, 0.5, 2, 0.05, 0.05, 1, 0.05, 0.05, 0.05, 0.1, 9, 9, 1, 1)]
+    )
     x[V] = draw(st.sampled_from([-1.0, 1.0])) * draw(st.floats(0.06, 0.4))  # more than a dt takes away
     return x
 
@@ -57,8 +59,8 @@ def states(draw: st.DrawFn) -> FloatArray:
 def slopes(draw: st.DrawFn) -> Slope:
     """Steeper and more curved than any mirror."""
     angle = draw(near(4.0))
-    curvatures = [draw(near(0.2)) for _ in range(3)]
-    return Slope(draw(near(0.5)), draw(near(0.5)), *curvatures, np.cos(angle), np.sin(angle))
+    fx, fy, fxx, fxy, fyy = (draw(near(limit)) for limit in (0.5, 0.5, 0.2, 0.2, 0.2))
+    return Slope(fx, fy, fxx, fxy, fyy, cos(angle), sin(angle))
 
 
 durations = st.floats(1e-3, 0.1)
@@ -169,7 +171,9 @@ def test_rows_jacobian_is_their_derivative(given_rows: tuple[bool, bool, bool]) 
 
 def taken(has_counts: bool, has_rate: bool, has_acceleration: bool) -> SensorRows:
     return SensorRows().take(
-        (1.0, 2.0, 0.1) if has_counts else None, (3.0, 0.2) if has_rate else None, (4.0, 0.3) if has_acceleration else None
+        (1.0, 2.0, 0.1) if has_counts else None,
+        (3.0, 0.2) if has_rate else None,
+        (4.0, 0.3) if has_acceleration else None,
     )
 
 

@@ -100,9 +100,9 @@ def test_the_panel_changes_in_the_middle_of_the_gap(mirror: Mirror) -> None:
     for x, panel in ((here.x_m, here), (middle - 1e-6, here), (middle + 1e-6, there), (middle - 1e-6, here)):
         frame.hand_over(x, here.y_m)
         assert frame.panel == panel.id
-        assert frame.pose((panel.x_m, panel.y_m, 0.0), panel.origin[2], Terrain(mirror).at(panel.x_m, panel.y_m)).x_m == (
-            pytest.approx(0.0, abs=1e-15)
-        )
+        assert frame.pose(
+            (panel.x_m, panel.y_m, 0.0), panel.origin[2], Terrain(mirror).at(panel.x_m, panel.y_m)
+        ).x_m == (pytest.approx(0.0, abs=1e-15))
 
 
 def test_the_panel_changes_along_y_and_far_away(mirror: Mirror) -> None:

@@ -28,7 +28,7 @@ def at(mirror: Mirror, frame: int, speed_m_s: float = 0.0) -> Motion:
 
 def test_asks_once_and_only_after_the_measuring_time_at_rest(stopover: Stopover, mirror: Mirror) -> None:
     settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
-    asked = [k for k in range(settled, settled + 200) if stopover.is_due(k * DT)]
+    asked = [k for k in range(settled, settled + 200) if stopover.is_due(at(mirror, k))]
     assert asked == [settled + round(MEASURING_S / DT)]
     assert (stopover.request, stopover.is_asked) == (1, True)
 
@@ -36,10 +36,27 @@ def test_asks_once_and_only_after_the_measuring_time_at_rest(stopover: Stopover,
 def test_an_interrupted_stop_begins_anew_and_asks_again(stopover: Stopover, mirror: Mirror) -> None:
     for k in range(2):
         settled = next(j for j in range(1000 * k, 1000 * k + 100) if stopover.has_settled(at(mirror, j)))
-        assert stopover.is_due(settled * DT + MEASURING_S)
+        assert any(stopover.is_due(at(mirror, j)) for j in range(settled, settled + 60))
         stopover.interrupt()
         assert not stopover.is_asked
     assert stopover.request == 2
+
+
+def test_the_measuring_time_begins_anew_where_the_robot_moves_once_more(stopover: Stopover, mirror: Mirror) -> None:
+    settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
+    moves = range(settled + 20, settled + 30)
+    asked = [
+        k for k in range(settled, settled + 200) if stopover.is_due(at(mirror, k, speed_m_s=0.01 * (k in moves)))
+    ]
+    assert len(asked) == 1
+    assert asked[0] > moves[-1] + round(MEASURING_S / DT)  # the mean speed takes its time to forget the motion
+
+
+def test_who_moves_for_ever_is_measured_all_the_same(stopover: Stopover, mirror: Mirror) -> None:
+    settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
+    frames = range(settled + 1, settled + 2000)
+    asked = [k for k in frames if stopover.is_due(at(mirror, k, speed_m_s=0.01))]
+    assert asked == [settled + round(SETTLE_LIMIT_S / DT)]
 
 
 def test_who_never_rests_is_restless_after_the_limit(stopover: Stopover, mirror: Mirror) -> None:

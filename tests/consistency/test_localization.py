@@ -1,0 +1,170 @@
+"""Pure but for reading the shipped configuration. The full-state filter knows how wrong it is.
+
+Robots are drawn from the filter's own model: state before the first step, impulses, drifts, readings, fixes. The
+model's formulas are written out once more, so that a filter that is consistent with a wrong model of its own is not.
+"""
+
+from functools import cache
+from math import cos, sin, sqrt
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from ccatp.config.models import LocalizerConfig
+from ccatp.filters import FILTERS
+from ccatp.filters.base import FloatArray
+from ccatp.localization.block import Block
+from ccatp.localization.legs import LegBook
+from ccatp.localization.survey_filter import SurveyFilter
+from ccatp.localization.survey_model import (
+    BA,
+    BG,
+    KG,
+    KL,
+    PL,
+    PR,
+    PSI,
+    SL,
+    SR,
+    STATES,
+    A,
+    C,
+    V,
+    W,
+    X,
+    Y,
+)
+from ccatp.localization.wheel_angles import WheelAngle
+from ccatp.mirror.mirror import Mirror
+from ccatp.samples import PanelId, PanelPose
+from tests.unit.localization.drive import config, mirror
+
+SEEDS, STEPS, DT_S = 50, 50, 0.04
+FIX_STEPS, FIX_SIGMA_M = (20, 35, 50), 2e-5
+LOOKS = (10, 20, 21, 35, 50)  # steps after which the errors are looked at, after the fix where there is one
+QUANTUM_RAD = 2.0 * np.pi / 1200.0
+SAMPLES = 4  # of the inertial unit in a block
+START = PanelPose(PanelId(3, 7), 0.0, 0.0, 0.4)
+POSE = [X, Y, PSI]
+KNOWN = [X, Y, PSI, V, A, W, BG, KG, BA, SR, SL, KL, C]  # nothing but an offset to the encoders in the others
+# 5 looks at two sets of states and two sums of innovations: the band of each is that of 95 % for all twelve together.
+ALPHA = 0.05 / 12.0
+
+
+@cache
+def cfg() -> LocalizerConfig:
+    """As shipped, but a drive that the wheels can do: the shipped densities are those of a controller at work."""
+    shipped = config().localizer
+    full = shipped.full_state.model_copy(
+        update={"jerk_density_m2_s5": 1e-4, "angular_acceleration_density_rad2_s3": 1e-3}
+    )
+    return shipped.model_copy(update={"full_state": full, "reset_rate_sigma_rad_s": 0.1})
+
+
+def moved(m: Mirror, x: FloatArray) -> FloatArray:
+    """Thesis eqs 2.11 and 2.14 on the surface at the step's beginning, its axes and gravity from the mirror."""
+    robot, out = config().robot, x.copy()
+    out[V] = x[V] + x[A] * DT_S
+    d, turn = out[V] * DT_S, x[W] * DT_S
+    (e1x, _, _), (e2x, e2y, _), n = m.surface.axes(float(x[X]), float(x[Y]))
+    middle = float(x[PSI]) + 0.5 * float(turn)
+    g = np.array(m.rotate_deck_from_world((0.0, 0.0, 1.0)))
+    g = g - (g @ np.array(n)) * np.array(n)
+    g /= sqrt(g @ g)
+    dx = d * (cos(middle) * e1x + sin(middle) * e2x) + x[C] * abs(d) * g[0]
+    dy = d * sin(middle) * e2y + x[C] * abs(d) * g[1]
+    out[X], out[Y] = x[X] + dx, x[Y] + dy
+    out[PSI] = x[PSI] + turn + m.surface.transport_rad(float(x[X]), float(x[Y]), float(dx), float(dy))
+    side = turn * (1.0 + x[KL]) * 0.5 * robot.wheel_base_m
+    out[PR] = x[PR] + (d + side) / (robot.wheel_radius_m * (1.0 - x[SR]))
+    out[PL] = x[PL] + (d - side) / (robot.wheel_radius_m * (1.0 - x[SL]))
+    return out
+
+
+class Run(NamedTuple):
+    """Of one robot: normalised errors of the pose and of the state at the looks, of the innovations at the fixes."""
+
+    pose: list[float]
+    state: list[float]
+    nis: list[float]
+
+
+def nees(x: FloatArray, filter_: SurveyFilter, which: list[int]) -> float:
+    error = (x - filter_.mean)[which]
+    return float(error @ np.linalg.solve(filter_.covariance[np.ix_(which, which)], error))
+
+
+@cache
+def run(name: str, seed: int) -> Run:
+    rng, m, full = np.random.default_rng(seed), mirror(), cfg().full_state
+    inner = FILTERS[name](np.zeros(STATES), np.eye(STATES))
+    found = SurveyFilter(inner, m, config().robot, cfg(), {}, m.deck_pose(START))
+    mean, P = found.mean.copy(), found.covariance.copy()
+    mean[V] = 0.1
+    inner.reset(mean, P)
+    x = mean + np.linalg.cholesky(P + 1e-24 * np.eye(STATES)) @ rng.normal(size=STATES)
+    right, left = WheelAngle(), WheelAngle()
+    for wheel in (right, left):
+        wheel.is_counter, wheel.quantum_rad, wheel.is_fresh, wheel.noise_rad2_s2 = True, QUANTUM_RAD, True, 0.0
+    slip, creep = (full.wander_fraction**2 / full.wander_time_s * DT_S * v for v in scatters())
+    impulses = np.array(
+        [full.jerk_density_m2_s5 * DT_S, full.angular_acceleration_density_rad2_s3 * DT_S, slip, slip, creep]
+    )
+    gyro, accelerometer = cfg().gyroscope_sigma_rad_s ** 2, cfg().accelerometer_sigma_m_s2 ** 2
+    result = Run([], [], [])
+    for k in range(1, STEPS + 1):
+        x[[A, W, SR, SL, C]] += np.sqrt(impulses) * rng.normal(size=5)
+        x = moved(m, x)
+        x[BG] += full.gyroscope_bias_walk_rad_s_sqrt_s * sqrt(DT_S) * rng.normal()
+        x[BA] += full.accelerometer_bias_walk_m_s2_sqrt_s * sqrt(DT_S) * rng.normal()
+        right.angle_rad, left.angle_rad = (x[[PR, PL]] + QUANTUM_RAD / sqrt(12.0) * rng.normal(size=2)).tolist()
+        rate = (1.0 + x[KG]) * x[W] + x[BG] + sqrt(gyro / SAMPLES) * rng.normal()
+        jumps = accelerometer / SAMPLES + full.acceleration_jump_m_s2**2
+        block = Block(DT_S, DT_S, float(rate), float(x[A] + x[BA] + sqrt(jumps) * rng.normal()), SAMPLES)
+        found.begin(k * DT_S, DT_S)
+        found.move(block, right, left, (gyro, accelerometer))
+        if k in FIX_STEPS:
+            found.fix(k * DT_S, x[:2] + FIX_SIGMA_M * rng.normal(size=2), FIX_SIGMA_M**2 * np.eye(2))
+            assert found.innovation is not None
+            result.nis.append(found.innovation.nis)
+        if k in LOOKS:
+            result.pose.append(nees(x, found, POSE))
+            result.state.append(nees(x, found, KNOWN))
+    return result
+
+
+def scatters() -> tuple[float, float]:
+    """Variances from leg to leg of a wheel's slip, twice that of the mean of two, and of the creep; not yet learned."""
+    slip, creep = LegBook(cfg().full_state).scatter
+    return 2.0 * slip * slip, creep * creep
+
+
+def band(freedom: int) -> tuple[float, float]:
+    """The two-sided band of a chi-squared, as a share of its degrees of freedom."""
+    return float(chi2.ppf(0.5 * ALPHA, freedom)) / freedom, float(chi2.ppf(1.0 - 0.5 * ALPHA, freedom)) / freedom
+
+
+@pytest.mark.parametrize("name", ["ekf", "ukf"])
+def test_errors_are_as_large_as_the_covariance_says(name: str) -> None:
+    """At each look the robots are independent: the sum over the seeds is chi-squared with 50 times the states."""
+    runs = [run(name, seed) for seed in range(SEEDS)]
+    for states, values in ((POSE, [r.pose for r in runs]), (KNOWN, [r.state for r in runs])):
+        low, high = band(SEEDS * len(states))
+        for look, mean in zip(LOOKS, np.mean(values, axis=0) / len(states), strict=True):
+            assert low < mean < high, (look, len(states))
+
+
+@pytest.mark.parametrize("name", ["ekf", "ukf"])
+def test_fixes_are_as_far_off_as_expected(name: str) -> None:
+    """Innovations of a filter that fits are white, so those of one robot count as those of three."""
+    nis = np.array([run(name, seed).nis for seed in range(SEEDS)])
+    low, high = band(2 * nis.size)
+    assert low < nis.mean() / 2.0 < high
+
+
+def test_a_filter_that_trusts_itself_too_much_would_be_found() -> None:
+    """The band is narrow enough: sigmas that are 15 % (pose) or 10 % (state) too small leave it."""
+    for states, share in ((POSE, 0.15), (KNOWN, 0.1)):
+        assert band(SEEDS * len(states))[1] < 1.0 / (1.0 - share) ** 2
