@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 import ccatp
+from ccatp.cli_bench import bench
 from ccatp.cli_frame import (
     ADDRESS_OPTIONS,
     CONFIG_OPTION,
@@ -220,6 +221,7 @@ def sim_etalon(
     return int(run_alone(load_config(config_file, overrides(settings, named)), puck_world_m, truth))
 
 
+cli.add_command(bench)
 cli.add_command(study)
 cli.add_command(replay)
 

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.bench.problems import FilterProblem, pose_models
-from ccatp.filters import FILTERS, Filter
+from ccatp.bench.problems import FilterProblem, models
+from ccatp.filters import FILTERS
 from ccatp.filters.base import FloatArray
 
 Result = tuple[FloatArray, FloatArray]
@@ -29,18 +29,15 @@ class Contender(NamedTuple):
 
 def our_filter(name: str, problem: FilterProblem) -> Contender:
     """A filter of ``FILTERS``, given linear models as arrays and nonlinear ones as they are."""
-    F, H = _models(problem)
+    F, H = (problem.F, problem.H) if problem.F is not None and problem.H is not None else models(problem)
     Q, R, readings = problem.Q, problem.variances, problem.readings
-    ours: list[Filter] = [FILTERS[name](problem.mean, problem.covariance)]
-
-    def reset() -> None:
-        ours[0] = FILTERS[name](problem.mean, problem.covariance)
+    ours = FILTERS[name](problem.mean, problem.covariance)
 
     def step(i: int) -> None:
-        ours[0].predict(F, Q)  # type: ignore[arg-type] # an array or a model, as the filter takes them
-        ours[0].update(readings[i], H, R)  # type: ignore[arg-type] # the same
+        ours.predict(F, Q)
+        ours.update(readings[i], H, R)
 
-    return Contender(reset, step, lambda: (ours[0].mean, ours[0].covariance))
+    return Contender(lambda: ours.reset(problem.mean, problem.covariance), step, lambda: (ours.mean, ours.covariance))
 
 
 def printed_filter(problem: FilterProblem) -> Contender:
@@ -60,7 +57,7 @@ def printed_filter(problem: FilterProblem) -> Contender:
             x = F @ x
             expected = H @ x
         else:
-            motion, sight = pose_models(problem)
+            motion, sight = models(problem)
             x, F = motion.at(x)
             expected, H = sight.at(x)
         P = F @ P @ F.T + Q
@@ -71,7 +68,16 @@ def printed_filter(problem: FilterProblem) -> Contender:
     return Contender(reset, step, lambda: (x, P))
 
 
-def _models(problem: FilterProblem) -> tuple[object, object]:
-    if problem.F is not None:
-        return problem.F, problem.H
-    return problem.motion, problem.sight
+def played_back(contender: Contender, steps: int) -> Contender:
+    """A contender that does its ``steps`` now and only tells them later."""
+    contender.reset()
+    results, at = [], 0
+    for i in range(steps):
+        contender.step(i)
+        results.append(contender.result())
+
+    def step(i: int) -> None:
+        nonlocal at
+        at = i
+
+    return Contender(lambda: None, step, lambda: results[at])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ccatp.bench.contenders import Contender, Result
-from ccatp.bench.problems import DT_S, FilterProblem, pose_models
+from ccatp.bench.problems import DT_S, FilterProblem, models
 from ccatp.filters.base import FloatArray
 
 
@@ -40,21 +40,28 @@ def filterpy_extended(problem: FilterProblem) -> Contender:
     """
     from filterpy.kalman import ExtendedKalmanFilter  # noqa: PLC0415 - belongs to an extra
 
-    motion, sight = pose_models(problem)
+    motion, sight = models(problem)
 
     class Extended(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no types
         x: FloatArray
 
         def predict_x(self, u: object = 0) -> None:
-            self.F = motion.jacobian(self.x)
-            self.x = motion.value(self.x)
+            x, self.F = motion.at(self.x)
+            self.x = x.copy()
 
     peer = Extended(dim_x=problem.mean.size, dim_z=problem.variances.size)
     peer.Q, peer.R = problem.Q, np.diag(problem.variances)
+    expected = problem.readings[0]
+
+    def jacobian(x: FloatArray) -> FloatArray:
+        """Asked for before the value of the same state, which is kept: the model is evaluated once, as ours is."""
+        nonlocal expected
+        expected, H = sight.at(x)
+        return H
 
     def step(i: int) -> None:
         peer.predict()
-        peer.update(problem.readings[i], sight.jacobian, sight.value)
+        peer.update(problem.readings[i], jacobian, lambda _: expected)
 
     return Contender(lambda: _reset(peer, problem), step, lambda: (peer.x, peer.P))
 
@@ -67,10 +74,15 @@ def filterpy_unscented(problem: FilterProblem, alpha: float, beta: float, kappa:
     """
     from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter  # noqa: PLC0415 - belongs to an extra
 
-    n, (motion, sight) = problem.mean.size, pose_models(problem)
+    n, (motion, sight) = problem.mean.size, models(problem)
     points = MerweScaledSigmaPoints(n, alpha, beta, kappa)
     peer = UnscentedKalmanFilter(
-        n, problem.variances.size, DT_S, hx=sight.value, fx=lambda x, _dt: motion.value(x), points=points
+        n,
+        problem.variances.size,
+        DT_S,
+        points=points,
+        hx=lambda x: sight.through(x[None])[0],
+        fx=lambda x, _dt: motion.through(x[None])[0],
     )
     peer.Q, peer.R = problem.Q, np.diag(problem.variances)
 
@@ -144,12 +156,12 @@ def _stonesoup_nonlinear(problem: FilterProblem, noise: FloatArray) -> tuple[Any
     from stonesoup.models.transition.nonlinear import GaussianTransitionModel  # noqa: PLC0415
     from stonesoup.types.array import StateVector, StateVectors  # noqa: PLC0415
 
-    n, (motion, sight) = problem.mean.size, pose_models(problem)
+    n, (motion, sight) = problem.mean.size, models(problem)
 
     def mapped(model: Any, state: Any) -> Any:
         vector = np.asarray(state.state_vector, dtype=np.float64)
         if vector.shape[1] == 1:
-            return StateVector(model.value(vector[:, 0]))
+            return StateVector(model.at(vector[:, 0])[0].copy())
         return StateVectors(model.through(vector.T).T)
 
     class Motion(GaussianTransitionModel, TimeInvariantModel):  # type: ignore[misc] # Stone Soup has no types
@@ -162,7 +174,7 @@ def _stonesoup_nonlinear(problem: FilterProblem, noise: FloatArray) -> tuple[Any
             return mapped(motion, state)
 
         def jacobian(self, state: Any, **_: object) -> FloatArray:
-            return motion.jacobian(np.asarray(state.state_vector, dtype=np.float64)[:, 0])
+            return motion.at(np.asarray(state.state_vector, dtype=np.float64)[:, 0])[1]
 
     class Sight(NonLinearGaussianMeasurement):  # type: ignore[misc] # Stone Soup has no types
         @property
@@ -173,7 +185,7 @@ def _stonesoup_nonlinear(problem: FilterProblem, noise: FloatArray) -> tuple[Any
             return mapped(sight, state)
 
         def jacobian(self, state: Any, **_: object) -> FloatArray:
-            return sight.jacobian(np.asarray(state.state_vector, dtype=np.float64)[:, 0])
+            return sight.at(np.asarray(state.state_vector, dtype=np.float64)[:, 0])[1]
 
     return Motion(), Sight(ndim_state=n, mapping=tuple(range(n)), noise_covar=noise)
 

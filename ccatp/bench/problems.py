@@ -1,12 +1,36 @@
 """Pure. What the contenders are given to solve: drawn from a seed, the same for all of them."""
 
 from dataclasses import dataclass, replace
+from math import sqrt
 
 import numpy as np
 
 from ccatp.bench.pose_model import STATES, PoseMotion, PoseSight
 from ccatp.config.models import Config, LocalizerConfig, RobotConfig
-from ccatp.filters.base import FloatArray
+from ccatp.filters.base import FloatArray, Observation, Transition
+from ccatp.localization.survey_model import (
+    BA,
+    BG,
+    E0,
+    E1,
+    KG,
+    KL,
+    PL,
+    PR,
+    PSI,
+    SL,
+    SR,
+    A,
+    C,
+    SensorRows,
+    SurveyMotion,
+    V,
+    W,
+    X,
+    Y,
+)  # fmt: skip
+from ccatp.localization.survey_model import STATES as SURVEY_STATES
+from ccatp.localization.terrain import Terrain
 from ccatp.mirror.mirror import build_mirror
 from ccatp.samples import DeckPose
 
@@ -18,6 +42,8 @@ POSE_ROWS = {1: (6,), 4: (0, 1, 2, 3), 8: tuple(range(8))}  # a seam line; inert
 _SIGMA_LINE_M, _SIGMA_HEADING_RAD, _LINE_RAD = 2e-4, 0.035, 0.3
 _POSE_SIGMA = (2e-3, 2e-3, 0.01, 0.01, 0.05, 0.02, 0.0175, 0.3, 0.02, 0.02, 0.02, 0.02)
 _POSE_NOISE = (0.0, 0.0, 0.0, 1e-4, 0.05, 0.05, 3e-6, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4)  # standard deviations of a step
+_SURVEY_START = (0.3, -0.4, 0.5, 0.05, 0.1)  # on the mirror, under way and turning
+_ANGLE_RAD2 = 1e-6  # variance of a wheel's angle
 _POSE_START = (0.1, -0.2, 0.5, 0.08, 0.0, 0.1, 0.01, -0.1, 0.02, 0.03, 0.01, -0.01)
 
 
@@ -41,8 +67,8 @@ class FilterProblem:
     readings: FloatArray
     F: FloatArray | None = None
     H: FloatArray | None = None
-    motion: PoseMotion | None = None
-    sight: PoseSight | None = None
+    motion: Transition | None = None
+    sight: Observation | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +88,7 @@ class RangeProblem:
     expected_m: FloatArray
 
 
-def pose_models(problem: FilterProblem) -> tuple[PoseMotion, PoseSight]:
+def models(problem: FilterProblem) -> tuple[Transition, Observation]:
     """The nonlinear models of a problem.
 
     Raises:
@@ -77,7 +103,8 @@ def mild(problem: FilterProblem) -> FilterProblem:
     """The same with readings a hundred times less exact.
 
     An encoder's sigma of 0.001 rad/s against what a frame leaves unknown makes H P H^T + R so badly conditioned that
-    the forms with an inverse lose half their digits: a difference there is rounding. Here it would be a mistake.
+    forms with an inverse and (I - W H) P lose half their digits: a difference there may be rounding. Here it would be a
+    mistake.
     """
     return replace(problem, variances=MILDER * problem.variances)
 
@@ -124,6 +151,39 @@ def pose_problem(robot: RobotConfig, cfg: LocalizerConfig, rows: int, seed: int)
         readings[i] = sight.value(x) + sigma * rng.normal(size=rows)
     covariance = np.diag(np.square(_POSE_SIGMA))
     return FilterProblem(mean, covariance, np.diag(noise**2), sigma**2, readings, motion=motion, sight=sight)
+
+
+def survey_problem(cfg: Config, seed: int) -> FilterProblem:
+    """The full-state localizer's problem with its own models: n = 17, both wheels' angles, rate and acceleration."""
+    rng = np.random.default_rng((seed, SURVEY_STATES))
+    robot, full = cfg.robot, cfg.localizer.full_state
+    mean, sigma = np.zeros(SURVEY_STATES), np.zeros(SURVEY_STATES)
+    mean[[X, Y, PSI, V, W]] = _SURVEY_START
+    sigma[[X, Y]], sigma[PSI] = cfg.localizer.start_position_sigma_m, cfg.localizer.start_heading_sigma_rad
+    sigma[[V, A, W]] = 0.01, 0.05, 0.02
+    sigma[BG], sigma[KG] = full.gyroscope_bias_sigma_rad_s, full.gyroscope_scale_sigma
+    sigma[BA], sigma[KL] = full.accelerometer_bias_sigma_m_s2, full.wheel_base_sigma
+    sigma[[SR, SL]], sigma[C], sigma[[E0, E1]] = full.slip_sigma, full.creep_sigma, full.edge_sigma_m
+    sigma[[PR, PL]] = sqrt(_ANGLE_RAD2)
+    x = mean + 0.5 * sigma * rng.normal(size=SURVEY_STATES)
+    slope = Terrain(build_mirror(cfg.mirror)).at(float(mean[X]), float(mean[Y]))
+    motion = SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m).over(DT_S, slope)
+    slip = (full.slip_scatter * DT_S) ** 2
+    impulses = np.array(
+        (full.jerk_density_m2_s5 * DT_S, full.angular_acceleration_density_rad2_s3 * DT_S, slip, slip, slip)
+    )
+    drift = np.zeros(SURVEY_STATES)
+    drift[[PR, PL]] = cfg.localizer.encoder_sigma_rad_s**2 * full.encoder_period_s * DT_S
+    Q = motion.noise(mean, impulses, drift)
+    gyroscope, accelerometer = cfg.localizer.gyroscope_sigma_rad_s**2, cfg.localizer.accelerometer_sigma_m_s2**2
+    sight = SensorRows().take((0.0, 0.0, _ANGLE_RAD2), (0.0, gyroscope), (0.0, accelerometer))
+    variances, readings = sight.R, np.empty((STEPS, sight.R.size))
+    for i in range(STEPS):
+        x = x.copy()
+        x[[A, W, SR, SL, C]] += np.sqrt(impulses) * rng.normal(size=impulses.size)
+        x = motion.at(x)[0] + np.sqrt(drift) * rng.normal(size=drift.size)
+        readings[i] = sight.at(x)[0] + np.sqrt(variances) * rng.normal(size=variances.size)
+    return FilterProblem(mean, np.diag(sigma**2), Q, variances, readings, motion=motion, sight=sight)
 
 
 def range_problem(cfg: Config, seed: int) -> RangeProblem:

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 
+import numpy as np
+
 from ccatp.filters.base import (
     Filter,
     FilterDiverged,
@@ -14,12 +16,19 @@ from ccatp.filters.base import (
     Transition,
 )
 from ccatp.filters.extended import ExtendedKalmanFilter
+from ccatp.filters.four_states import STATES, FourStateFilter
 from ccatp.filters.kalman import KalmanFilter
 from ccatp.filters.smoother import Smoothed, Smoother, SmootherEmpty
 from ccatp.filters.unscented import UnscentedKalmanFilter
 
+
+def linear_filter(mean: FloatArray, covariance: FloatArray) -> Filter:
+    """The linear filter of a mean (n,) and a covariance (n, n): written out for the thesis's four states."""
+    return (FourStateFilter if np.size(mean) == STATES else KalmanFilter)(mean, covariance)
+
+
 FILTERS: dict[str, Callable[[FloatArray, FloatArray], Filter]] = {
-    "kf": KalmanFilter,
+    "kf": linear_filter,
     "ekf": ExtendedKalmanFilter,
     "ukf": UnscentedKalmanFilter,
 }
@@ -34,6 +43,7 @@ __all__ = [
     "FilterModelError",
     "FilterShapeError",
     "FloatArray",
+    "FourStateFilter",
     "Innovation",
     "KalmanFilter",
     "Observation",
@@ -42,4 +52,5 @@ __all__ = [
     "SmootherEmpty",
     "Transition",
     "UnscentedKalmanFilter",
+    "linear_filter",
 ]

@@ -34,15 +34,27 @@ class FilterDiverged(FilterError):
     """A mean, a covariance or a noise is no longer a finite Gaussian: what is wrong stands in the message."""
 
 
-class Innovation(NamedTuple):
-    """What one update learned.
+class Innovation(Protocol):
+    """What one update learned."""
 
-    Attributes:
-        residual: nu = z - H x with the predicted state, shape (m,).
-        nis: normalised innovation squared nu^T (H P H^T + R)^-1 nu; chi-squared with ``size`` degrees of freedom
-            when the filter is consistent.
-        size: m, the number of measurement rows.
-    """
+    @property
+    def residual(self) -> FloatArray:
+        """Z - H x with the predicted state, shape (m,)."""
+
+    @property
+    def nis(self) -> float:
+        """Normalised innovation squared nu^T (H P H^T + R)^-1 nu of all rows.
+
+        Chi-squared with ``size`` degrees of freedom when the filter is consistent.
+        """
+
+    @property
+    def size(self) -> int:
+        """m, the number of measurement rows."""
+
+
+class Learned(NamedTuple):
+    """An ``Innovation`` that is at hand."""
 
     residual: FloatArray
     nis: float
@@ -83,13 +95,21 @@ class Filter(Protocol):
     state.
     """
 
-    mean: FloatArray
-    """State estimate, shape (n,)."""
-    covariance: FloatArray
-    """Its covariance, shape (n, n), symmetric positive semidefinite."""
-    transition: FloatArray
-    """F of the last prediction, shape (n, n): the matrix given, the Jacobian used, or the regression of f(x) on x by
-    sigma points; the identity before the first prediction and after a reset. What a smoother goes back by."""
+    @property
+    def mean(self) -> FloatArray:
+        """State estimate, shape (n,)."""
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Its covariance, shape (n, n), symmetric positive semidefinite."""
+
+    @property
+    def transition(self) -> FloatArray:
+        """F of the last prediction, shape (n, n): what a smoother goes back by.
+
+        The matrix given, the Jacobian used, or the regression of f(x) on x by sigma points; the identity before the
+        first prediction and after a reset.
+        """
 
     def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
         """Advance the state by x <- F x, P <- F P F^T + Q (thesis eqs 2.5, 2.6), or by x <- f(x) and what it does to P.
@@ -127,17 +147,35 @@ class Filter(Protocol):
         """
 
 
-def check_gaussian(mean: FloatArray, covariance: FloatArray) -> None:
-    """Refuse a mean (n,) and covariance (n, n) that are no Gaussian.
+def check_rows(z: FloatArray, H: FloatArray, R: FloatArray, states: int) -> None:
+    """Refuse z (m,), H (m, n), R (m,) or (m, m) that do not fit each other or n ``states``.
+
+    Raises:
+        FilterShapeError: a shape does not fit.
+    """
+    m = z.size
+    if z.ndim != 1:
+        raise FilterShapeError("z", z.shape, "(m,)")
+    if H.shape != (m, states):
+        raise FilterShapeError("H", H.shape, f"({m}, {states})")
+    if R.shape not in ((m,), (m, m)):
+        raise FilterShapeError("R", R.shape, f"({m},) or ({m}, {m})")
+
+
+def checked_gaussian(mean: FloatArray, covariance: FloatArray, shape: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
+    """Copies of a mean (n,) and a covariance (n, n), symmetric to the last bit; ``shape`` is (n, n).
 
     Raises:
         FilterShapeError: a shape does not fit.
         FilterDiverged: not finite, not symmetric or not positive semidefinite.
     """
+    mean, covariance = np.array(mean, dtype=np.float64), np.array(covariance, dtype=np.float64)
     if mean.ndim != 1 or mean.size == 0:
         raise FilterShapeError("mean", mean.shape, "(n,), n >= 1")
     if covariance.shape != (mean.size, mean.size):
         raise FilterShapeError("covariance", covariance.shape, f"({mean.size}, {mean.size})")
+    if covariance.shape != shape:
+        raise FilterShapeError("mean", mean.shape, f"({shape[0]},)")
     if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
         raise FilterDiverged(f"mean or covariance is not finite: mean {mean.tolist()}")
     scale = float(np.abs(covariance).max())
@@ -146,6 +184,7 @@ def check_gaussian(mean: FloatArray, covariance: FloatArray) -> None:
     least = float(np.linalg.eigvalsh(covariance)[0])
     if least < -NEGATIVITY * scale:
         raise FilterDiverged(f"covariance is not positive semidefinite: least eigenvalue {least:.3g}")
+    return mean, 0.5 * (covariance + covariance.T)
 
 
 ASYMMETRY = 1e-9

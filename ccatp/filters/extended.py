@@ -1,9 +1,8 @@
 """Pure. Extended Kalman filter: nonlinear models linearised at the mean, the rest as in ``KalmanFilter``."""
 
 import numpy as np
-from numpy import vdot
 
-from ccatp.filters.base import HUGE, FilterDiverged, FilterShapeError, FloatArray, Innovation, Observation, Transition
+from ccatp.filters.base import FilterShapeError, FloatArray, Innovation, Observation, Transition
 from ccatp.filters.kalman import KalmanFilter
 
 
@@ -22,14 +21,11 @@ class ExtendedKalmanFilter(KalmanFilter):
             super().predict(F, Q)
             return
         x, jacobian = F.at(self.mean)
-        shape = self._P.shape
-        if x.shape != self.mean.shape:
-            raise FilterShapeError("f(x)", x.shape, str(self.mean.shape))
-        if jacobian.shape != shape:
-            raise FilterShapeError("df/dx", jacobian.shape, str(shape))
-        if not vdot(jacobian, jacobian) < HUGE:
-            raise FilterDiverged(f"prediction is not finite: df/dx {jacobian.tolist()}")
-        self._advance(x.copy(), jacobian.copy(), Q)
+        if x.shape != self._shape[:1]:
+            raise FilterShapeError("f(x)", x.shape, str(self._shape[:1]))
+        if jacobian.shape != self._shape:
+            raise FilterShapeError("df/dx", jacobian.shape, str(self._shape))
+        self._advance(x.copy(), jacobian, Q)
 
     def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
         """Condition on z (m,) with H, a matrix (m, n) or a model, and R (m,) or (m, m); see ``Filter.update``."""
@@ -38,6 +34,9 @@ class ExtendedKalmanFilter(KalmanFilter):
         expected, jacobian = H.at(self.mean)
         if z.ndim != 1 or expected.shape != z.shape:
             raise FilterShapeError("z", z.shape, f"{expected.shape} of h(x)")
-        if jacobian.shape != (z.size, self.mean.size):
-            raise FilterShapeError("dh/dx", jacobian.shape, f"({z.size}, {self.mean.size})")
+        m = z.size
+        if jacobian.shape != (m, self._shape[0]):
+            raise FilterShapeError("dh/dx", jacobian.shape, f"({m}, {self._shape[0]})")
+        if R.shape not in (z.shape, (m, m)):
+            raise FilterShapeError("R", R.shape, f"({m},) or ({m}, {m})")
         return self._condition(z - expected, jacobian, R)

@@ -1,7 +1,10 @@
 """Pure. Linear Kalman filter, thesis eqs 2.5 to 2.13."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy import vdot
+from scipy.linalg.blas import dgemm
 
 from ccatp.filters.base import (
     HUGE,
@@ -10,15 +13,17 @@ from ccatp.filters.base import (
     FilterShapeError,
     FloatArray,
     Innovation,
+    Learned,
     Observation,
     Transition,
-    check_gaussian,
+    check_rows,
+    checked_gaussian,
 )
 from ccatp.filters.conditioning import Conditioner, Posterior
 
 
 class KalmanFilter:
-    """The Kalman filter of thesis eq. 2.13.
+    """The Kalman filter of thesis eq. 2.13, for any number of states.
 
     predict:  x = F x,  P = F P F^T + Q                                      (2.5, 2.6; no input u)
     update:   nu = z - H x                                                   (2.7)
@@ -29,83 +34,66 @@ class KalmanFilter:
 
     Attributes:
         mean: x, shape (n,).
-        covariance: P, shape (n, n).
-        transition: F of the last prediction, shape (n, n).
+        covariance: P, shape (n, n), symmetric to the last bit.
     """
 
     def __init__(self, mean: FloatArray, covariance: FloatArray) -> None:
-        self.mean: FloatArray = np.empty(0)
-        self._P: FloatArray = np.empty((0, 0))
-        self._is_symmetric = True
+        self._shape: tuple[int, ...] = np.shape(covariance)
+        self._transition: FloatArray | Callable[[], FloatArray]
         self.reset(mean, covariance)
+        self._conditioner = Conditioner(self.mean.size)
 
     @property
-    def covariance(self) -> FloatArray:
-        """P, shape (n, n), symmetric to the last bit."""
-        if not self._is_symmetric:
-            P = self._P
-            self._P = 0.5 * (P + P.T)
-            self._is_symmetric = True
-        return self._P
-
-    @covariance.setter
-    def covariance(self, P: FloatArray) -> None:
-        self._P, self._is_symmetric = P, True
+    def transition(self) -> FloatArray:
+        """F of the last prediction, shape (n, n); see ``Filter.transition``."""
+        found = self._transition
+        if not isinstance(found, np.ndarray):
+            found = self._transition = found()
+        return found
 
     def reset(self, mean: FloatArray, covariance: FloatArray) -> None:
         """Re-initialise with copies of ``mean`` (n,) and ``covariance`` (n, n); see ``Filter.reset``."""
-        x = np.array(mean, dtype=np.float64)
-        P = np.array(covariance, dtype=np.float64)
-        check_gaussian(x, P)
-        if self.mean.size and x.size != self.mean.size:
-            raise FilterShapeError("mean", x.shape, f"({self.mean.size},)")
-        if not self.mean.size:
-            self._conditioner = Conditioner(x.size)
-        self.mean = x
-        self.covariance = 0.5 * (P + P.T)
-        self.transition: FloatArray = np.eye(x.size)
+        self.mean, self.covariance = checked_gaussian(mean, covariance, self._shape)
+        self._transition = np.eye(self.mean.size)
 
     def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
         """Advance by F (n, n) and Q (n, n), thesis eqs 2.5 and 2.6; see ``Filter.predict``."""
         if not isinstance(F, np.ndarray):
             raise FilterModelError("KalmanFilter", F)
-        if F.shape != self._P.shape:
-            raise FilterShapeError("F", F.shape, str(self._P.shape))
-        if not vdot(F, F) < HUGE:
-            raise FilterDiverged(f"prediction is not finite: transition {F.tolist()}")
-        # The method, not the operator: on matrices this small it costs half.
-        self._advance(F.dot(self.mean), F.copy(), Q)
+        if F.shape != self._shape:
+            raise FilterShapeError("F", F.shape, str(self._shape))
+        self._advance(None, F, Q)
 
     def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
         """Condition on z (m,) with H (m, n) and R (m,) or (m, m), thesis eqs 2.7 to 2.10; see ``Filter.update``."""
         if not isinstance(H, np.ndarray):
             raise FilterModelError("KalmanFilter", H)
-        if z.ndim != 1:
-            raise FilterShapeError("z", z.shape, "(m,)")
-        if H.shape != (z.size, self.mean.size):
-            raise FilterShapeError("H", H.shape, f"({z.size}, {self.mean.size})")
+        check_rows(z, H, R, self._shape[0])
         return self._condition(z - H.dot(self.mean), H, R)
 
-    def _advance(self, x: FloatArray, F: FloatArray, Q: FloatArray) -> None:
-        """Put x (n,) and F P F^T + Q in place; both arrays are the filter's from now on."""
-        P = F.dot(self._P).dot(F.T)
-        if Q.shape != P.shape:
-            raise FilterShapeError("Q", Q.shape, str(P.shape))
-        P += Q
-        self._take_prediction(x, P, F)
+    def _advance(self, x: FloatArray | None, F: FloatArray, Q: FloatArray) -> None:
+        """Predict: x <- the array given, which is kept, or F x; P <- F P F^T + Q."""
+        if Q.shape != self._shape:
+            raise FilterShapeError("Q", Q.shape, str(self._shape))
+        # One call of BLAS for F (P F^T) + Q, halved, and its transpose: symmetric to the last bit. Transposed views are
+        # what it takes without a copy. Unlike numpy it does not warn where something is not finite.
+        half = dgemm(1.0, F.T, dgemm(0.5, self.covariance.T, F.T), 0.5, Q.T, trans_a=1)
+        self._take_prediction(F.dot(self.mean) if x is None else x, half + half.T)
+        self._transition = F.copy()
 
-    def _take_prediction(self, x: FloatArray, P: FloatArray, F: FloatArray) -> None:
-        if not (vdot(x, x) < HUGE and vdot(P, P) < HUGE):
+    def _take_prediction(self, x: FloatArray, P: FloatArray) -> None:
+        """Put x and P in place; both arrays are the filter's from now on."""
+        # vdot, because it does not warn where it overflows.
+        if not vdot(x, x) + vdot(P, P) < HUGE:
             raise FilterDiverged(f"prediction is not finite: mean {x.tolist()}")
-        self.mean, self._P, self._is_symmetric, self.transition = x, P, False, F
+        self.mean, self.covariance = x, P
 
     def _condition(self, residual: FloatArray, H: FloatArray, R: FloatArray) -> Innovation:
         if residual.size == 0:
-            return Innovation(residual, 0.0, 0)
-        return self._take(residual, self._conditioner.on_rows(self._P, residual, H, R))
+            return Learned(residual, 0.0, 0)
+        return self._take(residual, self._conditioner.on_rows(self.covariance, residual, H, R))
 
     def _take(self, residual: FloatArray, posterior: Posterior) -> Innovation:
         change, P, nis = posterior
-        self.mean = self.mean + change
-        self._P, self._is_symmetric = P, True
-        return Innovation(residual, nis, residual.size)
+        self.mean, self.covariance = self.mean + change, P
+        return Learned(residual, nis, residual.size)

@@ -12,7 +12,7 @@ def condition_by_rows(
     """Condition N(., P) on m rows, thesis eqs 2.8 to 2.10, as the least-squares problem that they solve.
 
     With P = L L^T and x = x + L y the posterior is the solution of ``y = 0, A y = b`` with A = H L, b = nu, both
-    whitened by R. A QR factorisation of the stacked rows ``[I 0; A b]`` holds all of it: the triangle C with
+    whitened by R. A QR factorisation of the stacked rows ``[A b; I 0]`` holds all of it: the triangle C with
     C^T C = I + A^T A gives P = (C^-T L^T)^T (C^-T L^T), its last column gives y, and the corner squared is the
     normalised innovation. A prior far wider than the measurement costs no digits.
 
@@ -32,10 +32,12 @@ def condition_by_rows(
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         L = square_root(P)
         rows = np.zeros((n + 1, n + m)).T  # column-major, so that LAPACK works in place
-        rows[:n, :n] = np.eye(n)
-        rows[n:, :n] = H.dot(L)
-        rows[n:, n] = nu
-        whiten(rows[n:], R)
+        # The measurement, which may be far more exact than the prior, stands first: a reflection that took its rows
+        # into those of the prior would leave their rounding there.
+        rows[:m, :n] = H.dot(L)
+        rows[:m, n] = nu
+        whiten(rows[:m], R)
+        rows[m:, :n] = np.eye(n)
         triangle = dgeqrf(rows, overwrite_a=1)[0]
         root = dtrtrs(triangle[:n, :n], L.T, lower=0, trans=1)[0]
         return triangle[:n, n].dot(root), root.T.dot(root), float(triangle[n, n] * triangle[n, n])

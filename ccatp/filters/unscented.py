@@ -3,7 +3,16 @@
 import numpy as np
 from numpy import vdot
 
-from ccatp.filters.base import HUGE, FilterDiverged, FilterShapeError, FloatArray, Innovation, Observation, Transition
+from ccatp.filters.base import (
+    HUGE,
+    FilterDiverged,
+    FilterShapeError,
+    FloatArray,
+    Innovation,
+    Learned,
+    Observation,
+    Transition,
+)
 from ccatp.filters.kalman import KalmanFilter
 from ccatp.filters.square_root import square_root
 
@@ -32,10 +41,9 @@ class UnscentedKalmanFilter(KalmanFilter):
     linearisation; along a direction of no variance it is zero.
     """
 
-    def reset(self, mean: FloatArray, covariance: FloatArray) -> None:
-        """Re-initialise with copies of ``mean`` (n,) and ``covariance`` (n, n); see ``Filter.reset``."""
-        super().reset(mean, covariance)
-        n = self.mean.size
+    def __init__(self, mean: FloatArray, covariance: FloatArray) -> None:
+        super().__init__(mean, covariance)
+        n = self._shape[0]
         scale = ALPHA**2 * (n + max(KURTOSIS - n, 0.0))
         self._spread = float(np.sqrt(scale))
         self._mean_weights = np.full(2 * n + 1, 0.5 / scale)
@@ -55,13 +63,13 @@ class UnscentedKalmanFilter(KalmanFilter):
             raise FilterShapeError("f(X)", images.shape, f"({2 * n + 1}, {n})")
         if Q.shape != (n, n):
             raise FilterShapeError("Q", Q.shape, str((n, n)))
-        with np.errstate(over="ignore", invalid="ignore"):
-            x, deviations, P = self._moments(images)
-            P += Q
         if not vdot(images, images) < HUGE:
-            raise FilterDiverged(f"prediction is not finite: mean {x.tolist()}")
-        regression = _regression(self._cross(offsets, deviations), L)
-        self._take_prediction(x, P, regression)
+            raise FilterDiverged(f"prediction is not finite: images of the points {images.tolist()}")
+        x, deviations, P = self._moments(images)
+        P += Q
+        self._take_prediction(x, 0.5 * (P + P.T))
+        cross = self._cross(offsets, deviations)
+        self._transition = lambda: _regression(cross, L)
 
     def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
         """Condition on z (m,) with H, a matrix (m, n) or a model, and R (m,) or (m, m); see ``Filter.update``."""
@@ -75,17 +83,15 @@ class UnscentedKalmanFilter(KalmanFilter):
         if R.shape not in ((m,), (m, m)):
             raise FilterShapeError("R", R.shape, f"({m},) or ({m}, {m})")
         if m == 0:
-            return Innovation(np.empty(0), 0.0, 0)
+            return Learned(np.empty(0), 0.0, 0)
         noise = R if R.ndim == 2 else np.diag(R)
-        with np.errstate(over="ignore", invalid="ignore"):
-            expected, deviations, S = self._moments(images)
-            S += noise
-            residual = z - expected
-        if not (vdot(images, images) < HUGE and vdot(residual, residual) < HUGE and np.isfinite(noise).all()):
-            raise FilterDiverged(f"update is not finite: residual {residual.tolist()}")
+        if not (vdot(images, images) < HUGE and vdot(z, z) < HUGE and vdot(R, R) < HUGE):
+            raise FilterDiverged(f"update is not finite: readings {z.tolist()}, or their expectation or noise")
         _check_noise(R)
-        posterior = self._conditioner.on_moments(self._P, residual, self._cross(offsets, deviations), S)
-        return self._take(residual, posterior)
+        expected, deviations, S = self._moments(images)
+        S += noise
+        residual, cross = z - expected, self._cross(offsets, deviations)
+        return self._take(residual, self._conditioner.on_moments(self.covariance, residual, cross, S))
 
     def _offsets(self) -> tuple[FloatArray, FloatArray]:
         """Points less the mean, shape (2 n + 1, n), and the root L (n, n) that they are made of."""

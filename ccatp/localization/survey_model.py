@@ -189,12 +189,13 @@ class SensorRows:
         z: list[float] = []
         R: list[float] = []
         rows: tuple[int, ...] = ()
-        if counts is not None:
-            z, R, rows = [counts[0], counts[1]], [counts[2], counts[2]], (PR, PL)
+        # The rate before the angles: the other way round little is left of its variance, and digits go with the rest.
         if rate is not None:
-            z.append(rate[0])
-            R.append(rate[1])
-            rows += (W,)
+            z, R, rows = [rate[0]], [rate[1]], (W,)
+        if counts is not None:
+            z += counts[:2]
+            R += (counts[2], counts[2])
+            rows += (PR, PL)
         if acceleration is not None:
             z.append(acceleration[0])
             R.append(acceleration[1])
@@ -209,13 +210,12 @@ class SensorRows:
         if H is None:
             H = self._H[rows] = _pattern(rows)
         h: FloatArray = x[list(rows)]
-        if W in rows:
-            k = rows.index(W)
+        if rows[0] == W:
             w = float(x[W])
             scale = 1.0 + float(x[KG])
-            H[k, W], H[k, KG] = scale, w
-            h[k] = scale * w + float(x[BG])
-        if A in rows:
+            H[0, W], H[0, KG] = scale, w
+            h[0] = scale * w + float(x[BG])
+        if rows[-1] == A:
             h[-1] += x[BA]
         return h, H
 
@@ -223,9 +223,9 @@ class SensorRows:
         """Expected measurements (k, m) of the states (k, n)."""
         rows = self._rows
         h: FloatArray = points[:, list(rows)]
-        if W in rows:
-            h[:, rows.index(W)] = (1.0 + points[:, KG]) * points[:, W] + points[:, BG]
-        if A in rows:
+        if rows[0] == W:
+            h[:, 0] = (1.0 + points[:, KG]) * points[:, W] + points[:, BG]
+        if rows[-1] == A:
             h[:, -1] += points[:, BA]
         return h
 

@@ -6,11 +6,13 @@ from math import inf
 # Nothing but a counter gives exact zeros: this many samples in a row without another value.
 _ZEROS_OF_A_COUNTER = 8
 _COUNTER_NOISE = 1.0 / 12.0  # variance of a uniform distribution over one count
-_MIN_VARIANCE_RAD2 = 1e-14
+_MIN_VARIANCE_RAD2 = 1e-9  # a micrometre of travel: less would cost the filter digits and tell it nothing
 # A wheel that gave no sample for this long may have done anything meanwhile.
 _GAP_S = 0.02
 _LOST = 1.5  # periods between two samples of a counter beyond which one is missing
 _LATELY_S = 0.05
+_EVEN = 0.05  # of a period: what a frame's periods may be longer than the shortest, all together
+_ENOUGH = 200  # frames, or with a counter counts, after which the period and a count are known
 
 
 class WheelAngle:
@@ -33,6 +35,7 @@ class WheelAngle:
         "_mean_rate",
         "_period_s",
         "_rate",
+        "_seen",
         "_t_s",
         "_zeros",
         "angle_rad",
@@ -48,6 +51,7 @@ class WheelAngle:
         self._gap_rad = 0.0
         self._mean_rate = 0.0
         self._period_s = inf
+        self._seen = 0
         self._t_s = -inf
         self._rate = 0.0
         self._zeros = 0
@@ -68,26 +72,42 @@ class WheelAngle:
         self.is_fresh = bool(times_s)
         if not times_s:
             return 0.0
-        t0, before = self._t_s, self._rate
-        if t0 == -inf:
-            t0, before = times_s[0], rates_rad_s[0]
-        if self.is_counter or self._is_counting(rates_rad_s):
-            turned = self._counted(t0, times_s, rates_rad_s)
+        if self._t_s == -inf:
+            self._t_s, self._rate = times_s[0], rates_rad_s[0]
+        is_counter = self.is_counter or self._is_counting(rates_rad_s)
+        elapsed_s = times_s[-1] - self._t_s
+        if self._is_known and elapsed_s < (len(times_s) + _EVEN) * self._period_s:
+            # None is missing, and the periods are as even as the clock: their sum says it all.
+            total = sum(rates_rad_s)
+            turned = elapsed_s / len(times_s) * (total if is_counter else total + 0.5 * (self._rate - rates_rad_s[-1]))
         else:
-            turned = 0.0
-            for t, rate in zip(times_s, rates_rad_s, strict=True):
-                dt = t - t0
-                if dt > _GAP_S:
-                    self._gap_rad += abs(rate) * dt
-                turned += (before + rate) * dt
-                t0, before = t, rate
-            turned *= 0.5
+            turned = self._counted(times_s, rates_rad_s) if is_counter else self._integrated(times_s, rates_rad_s)
+        if elapsed_s > 0.0:
+            self._mean_rate += (turned - self._mean_rate * elapsed_s) / (elapsed_s + _LATELY_S)
         self._t_s, self._rate = times_s[-1], rates_rad_s[-1]
         self.angle_rad += turned
         return turned
 
-    def _counted(self, t0: float, times_s: Sequence[float], rates_rad_s: Sequence[float]) -> float:
-        turned, least, period, start = 0.0, self.quantum_rad, self._period_s, t0
+    @property
+    def _is_known(self) -> bool:
+        """The period has been seen often enough, and with a counter what a count is."""
+        return self._seen >= _ENOUGH
+
+    def _integrated(self, times_s: Sequence[float], rates_rad_s: Sequence[float]) -> float:
+        turned, t0, before = 0.0, self._t_s, self._rate
+        for t, rate in zip(times_s, rates_rad_s, strict=True):
+            dt = t - t0
+            if dt > _GAP_S:
+                self._gap_rad += abs(rate) * dt
+            if 0.0 < dt < self._period_s:
+                self._period_s = dt
+            turned += (before + rate) * dt
+            t0, before = t, rate
+        self._seen += 1
+        return 0.5 * turned
+
+    def _counted(self, times_s: Sequence[float], rates_rad_s: Sequence[float]) -> float:
+        turned, t0, least, period = 0.0, self._t_s, self.quantum_rad, self._period_s
         for t, rate in zip(times_s, rates_rad_s, strict=True):
             dt = t - t0
             if dt > _LOST * period:
@@ -101,13 +121,11 @@ class WheelAngle:
             if rate:
                 step = rate * dt
                 turned += step
+                self._seen += 1
                 if -least < step < least and step:
                     least = abs(step)
             t0 = t
         self.quantum_rad, self._period_s = least, period
-        elapsed = t0 - start
-        if elapsed > 0.0:
-            self._mean_rate += (turned - self._mean_rate * elapsed) / (elapsed + _LATELY_S)
         return turned
 
     def _is_counting(self, rates_rad_s: Sequence[float]) -> bool:
@@ -115,6 +133,7 @@ class WheelAngle:
             self._zeros = self._zeros + 1 if rate == 0.0 else 0
         if self._zeros >= _ZEROS_OF_A_COUNTER:
             self.is_counter, self.noise_rad2_s2 = True, 0.0
+            self._seen = 0
         return self.is_counter
 
     def take_gap(self) -> float:

@@ -13,7 +13,7 @@ _STEP_M = 0.02
 
 
 def plan_calibration(mirror: Mirror, robot: RobotConfig, mission: MissionConfig, base: DeckPose) -> tuple[Stop, ...]:
-    """Rounds of four legs between base and a place behind or before it, which end at base with the heading of the start.
+    """Rounds of four legs between base and a place behind or before it; they end at base with the heading of the start.
 
     There and back along one line, once driven with the same heading and once with the opposite one: a wrong heading
     shifts the two ends against each other, creep shifts both downhill, slip shortens both legs, and two half turns tell

@@ -84,7 +84,7 @@ rates = st.one_of(st.none(), st.sampled_from([0.0, 1.0, -2.5, nan, inf]))
 ordered = st.lists(times, max_size=6, unique=True).map(sorted)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     st.lists(
         st.one_of(

@@ -1,18 +1,31 @@
 """Pure. A measurement that comes late is taken at its own time, and what followed is done again."""
 
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
 
-from ccatp.filters import KalmanFilter
+from ccatp.filters import FILTERS, KalmanFilter
 from ccatp.filters.base import FloatArray
 from ccatp.localization.fixes import FixRefused
 from ccatp.localization.full_state import FullStateLocalizer
 from ccatp.localization.journal import Journal, Step
-from ccatp.localization.survey_model import A, V, W
+from ccatp.localization.survey_filter import SurveyFilter
+from ccatp.localization.survey_model import STATES, A, V, W
 from ccatp.samples import Fix
-from tests.unit.localization.drive import FRAME_S, STEEP, Errors, Frame, Rate, Robot, build, fix_at, trapeze
+from tests.unit.localization.drive import (
+    FRAME_S,
+    STEEP,
+    Errors,
+    Frame,
+    Rate,
+    Robot,
+    build,
+    config,
+    fix_at,
+    mirror,
+    trapeze,
+)
 
 F, Q = np.array([[1.0, 0.1], [0.0, 1.0]]), np.diag([1e-3, 2e-3])
 H, R = np.array([[1.0, 0.0]]), np.array([0.04])
@@ -114,10 +127,37 @@ def test_how_far_back_it_reaches() -> None:
 
 def test_a_standstill_longer_than_the_reach_keeps_its_beginning() -> None:
     found = Recorded(reach_s=0.5)
+    told: list[float] = []
     found.step(1)
     found.step(2)
     found.journal.begin(9.0, 0.0, found.filter)
     assert found.journal.oldest_s == pytest.approx(0.2)
+    found.journal.begin(9.1, 0.1, found.filter)  # it drives off
+    assert found.journal.oldest_s <= 9.0
+    found.journal.take(3.0, told.append, found.filter)
+    assert told == [0.0]
+
+
+@pytest.mark.parametrize("late_s", [0.01, 0.03])
+def test_the_row_of_a_late_fix_is_its_derivative(late_s: float) -> None:
+    found = SurveyFilter(
+        FILTERS["ekf"](np.zeros(STATES), np.eye(STATES)),
+        mirror(),
+        config().robot,
+        config().localizer,
+        {},
+        mirror().deck_pose(STEEP),
+    )
+    x, z, step = found.mean.copy(), found.mean[:2] + 1e-3, 1e-6
+    x[[V, W]] = 0.1, 0.5
+    _, row = found._fix_row(z, x, late_s)
+    residuals = [
+        [found._fix_row(z, x + sign * step * unit, late_s)[0] for sign in (-1.0, 1.0)] for unit in np.eye(STATES)
+    ]
+    numeric = np.array([(before - after) / (2.0 * step) for before, after in residuals]).T
+    # Rounding of metres over the step; that the slope under the robot moves with it is left out: f'' v late = 5e-5.
+    np.testing.assert_allclose(row, numeric, atol=1e-4)
+    assert abs(row[0, V]) > 0.9 * late_s * np.cos(0.3)
 
 
 # -- in the localizer -------------------------------------------------------------------------------------------------
@@ -138,6 +178,17 @@ DRIVES = {
 }
 
 
+@cache
+def driven(name: str) -> tuple[list[Frame], list[Fix]]:
+    """The frames of a drive, and a fix at the end of each."""
+    v, omega, duration_s = DRIVES[name]
+    robot, frames, fixes = Robot(v=v, omega=omega, errors=WRONG), [], []
+    for _ in range(round(duration_s / FRAME_S)):
+        frames.append(robot.frame())
+        fixes.append(robot.fix())
+    return frames, fixes
+
+
 class Story:
     """A drive that several localizers hear of.
 
@@ -149,18 +200,13 @@ class Story:
     def __init__(
         self, name: str, filter_name: str = "ekf", use: dict[str, bool] | None = None, **changes: float
     ) -> None:
-        v, omega, duration_s = DRIVES[name]
-        robot = Robot(v=v, omega=omega, errors=WRONG)
+        self.frames, self.fixes = driven(name)
         self._listener = partial(build, filter_name, STEEP, use, **changes)
-        self.frames: list[Frame] = []
-        self.fixes: list[Fix] = []
         self.ends: list[int] = []
         listener = self._listener()
-        for k in range(round(duration_s / FRAME_S)):
-            self.frames.append(robot.frame())
-            self.fixes.append(robot.fix())
+        for k, frame in enumerate(self.frames):
             before = listener.state[0]
-            listener.step(*self.frames[-1])
+            listener.step(*frame)
             if listener.state[0] is not before or listener.is_resting:
                 self.ends.append(k)
 

@@ -67,6 +67,14 @@ def test_a_world_that_changes_is_noticed() -> None:
     assert sqrt(found.scatter) > 0.004
 
 
+def test_a_world_that_calms_down_is_noticed_too() -> None:
+    found = taught(0.012, 300, 1)
+    for _ in range(300):
+        found.learn(0.03, 25e-8)
+    # Of the last 100 legs, which are remembered, 5 are of the time before: sqrt(0.05) 0.012 = 2.7e-3.
+    assert sqrt(found.scatter) < 0.004
+
+
 def test_a_leg_that_shows_nothing_teaches_nothing() -> None:
     found = population()
     before = found.mean, found.scatter
@@ -102,22 +110,24 @@ def test_the_first_leg_is_what_was_expected(full: FullStateConfig) -> None:
 
 
 class Told(NamedTuple):
-    """A parameter of one leg and of the next, given what was seen in the first: by Bayes, without a recursion."""
+    """A parameter of the next leg, given what was seen of the legs before: by Bayes, without a recursion."""
 
     mean: float
     variance: float
     correlation: float  # covariance of the next leg's parameter with that of the last
 
 
-def by_bayes(mean: float, sigma: float, scatter: float, seen: float, noise: float) -> Told:
-    """(m, s_1, s_2) with s_k = m + d_k; s_1 is measured as ``seen`` with the variance ``noise``."""
-    T = np.array([[1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
-    P = T @ np.diag([sigma**2, scatter, scatter]) @ T.T
-    H = np.array([[0.0, 1.0, 0.0]])
-    K = P @ H.T / (P[1, 1] + noise)
-    x = mean + K[:, 0] * (seen - mean)
+def by_bayes(mean: float, sigma: float, scatter: float, seen: list[float], noise: float) -> Told:
+    """(m, s_1 ... s_k) with s_i = m + d_i; each but the last is measured as ``seen`` with the variance ``noise``."""
+    k = len(seen)
+    T = np.eye(k + 2)
+    T[1:, 0] = 1.0
+    P = T @ np.diag([sigma**2] + [scatter] * (k + 1)) @ T.T
+    H = np.eye(k + 2)[1:-1]
+    K = np.linalg.solve(H @ P @ H.T + noise * np.eye(k), H @ P).T
+    x = mean + K @ (np.array(seen) - mean)
     P = P - K @ H @ P
-    return Told(float(x[2]), float(P[2, 2]), float(P[2, 1]))
+    return Told(float(x[-1]), float(P[-1, -1]), float(P[-1, -2]))
 
 
 def update(x: FloatArray, P: FloatArray, row: FloatArray, z: float, noise: float) -> tuple[FloatArray, FloatArray]:
@@ -126,27 +136,46 @@ def update(x: FloatArray, P: FloatArray, row: FloatArray, z: float, noise: float
 
 
 def test_the_next_leg_is_given_what_bayes_gives_it(full: FullStateConfig) -> None:
+    """Over four legs; creep, which scatters by a share of itself, only while that has not been learned."""
     book = LegBook(full)
     x, P = state(*book.first())
     scatters = [value**2 for value in (book.scatter[0], 2.0 * book.scatter[0], book.scatter[1])]
-    seen, noises = (0.031, -0.004, 0.012), (1e-6, 4e-6, 9e-6)
-    for k, (z, noise) in enumerate(zip(seen, noises, strict=True)):
-        row = np.zeros(STATES)
-        row[DRAWN] = TO_PARAMETERS[k]
-        x, P = update(x, P, row, z, noise)
-    redraw = book.begin(x, P)  # no fix has ended the leg: the scatter of the slip is as before
-    posterior = P[np.ix_(DRAWN, DRAWN)]
-    mean = redraw.mean + redraw.F @ (x[DRAWN] - redraw.found)
-    covariance = redraw.F @ posterior @ redraw.F.T + redraw.Q
-    cross = redraw.F @ posterior  # of the next leg's with the last one's
-    found = TO_PARAMETERS @ covariance @ TO_PARAMETERS.T
-    across = TO_PARAMETERS @ cross @ TO_PARAMETERS.T
     priors = ((full.slip_mean, full.slip_sigma), (0.0, full.slip_difference_sigma), (0.0, full.creep_sigma))
-    for k, prior in enumerate(priors):
-        told = by_bayes(*prior, scatters[k], seen[k], noises[k])
-        assert TO_PARAMETERS[k] @ mean == pytest.approx(told.mean, rel=1e-12)
-        assert across[k, k] == pytest.approx(told.correlation, rel=1e-9)
-        assert found[k, k] == pytest.approx(told.variance, rel=1e-9)
+    seen: list[list[float]] = [[], [], []]
+    noises = (1e-6, 4e-6, 9e-6)
+    for leg, values in enumerate([(0.031, -0.004, 0.012), (0.022, 0.003, 0.02), (0.04, 0.0, 0.01), (0.03, 0.01, 0.0)]):
+        for k, (z, noise) in enumerate(zip(values, noises, strict=True)):
+            row = np.zeros(STATES)
+            row[DRAWN] = TO_PARAMETERS[k]
+            x, P = update(x, P, row, z, noise)
+            seen[k].append(z)
+        redraw = book.begin(x, P)  # no fix has ended the leg: the scatter of the slip is as before
+        posterior = P[np.ix_(DRAWN, DRAWN)]
+        mean = redraw.mean + redraw.F @ (x[DRAWN] - redraw.found)
+        covariance = redraw.F @ posterior @ redraw.F.T + redraw.Q
+        found = TO_PARAMETERS @ covariance @ TO_PARAMETERS.T
+        across = TO_PARAMETERS @ redraw.F @ posterior @ TO_PARAMETERS.T  # of the next leg's with the last one's
+        for k in range(3 if leg == 0 else 2):
+            told = by_bayes(*priors[k], scatters[k], seen[k], noises[k])
+            assert TO_PARAMETERS[k] @ mean == pytest.approx(told.mean, rel=1e-9)  # rounding
+            assert across[k, k] == pytest.approx(told.correlation, rel=1e-9)
+            assert found[k, k] == pytest.approx(told.variance, rel=1e-9)
+        x[DRAWN], P[np.ix_(DRAWN, DRAWN)] = mean, covariance
+
+
+def test_a_leg_is_learned_from_without_what_was_expected_of_it(
+    full: FullStateConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[tuple[float, float]] = []
+    monkeypatch.setattr(Population, "learn", lambda _, value, variance: told.append((value, variance)))
+    book = LegBook(full)
+    x, P = state(*book.first())
+    for slip, z in ((SR, 0.05), (SL, 0.03)):
+        x, P = update(x, P, np.eye(STATES)[slip], z, 4e-4)  # as much as the prior: the posterior is half of each
+    book.end(x, P)
+    value, variance = told[0]
+    assert variance == pytest.approx(2e-4, rel=1e-9)  # of a mean of two
+    assert value == pytest.approx(0.04, rel=1e-9)
 
 
 def test_the_deviation_from_what_was_expected_passes_through(full: FullStateConfig) -> None:

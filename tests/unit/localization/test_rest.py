@@ -9,7 +9,7 @@ from ccatp.angles import difference, wrap_pi
 from ccatp.config.models import FullStateConfig
 from ccatp.localization.noise_floor import NoiseFloor
 from ccatp.localization.rest import RestWatch, heading_from_gravity
-from ccatp.localization.survey_model import BA, BG, PSI, W
+from ccatp.localization.survey_model import BA, BG, PSI, A, W
 from ccatp.localization.terrain import Terrain
 from ccatp.mirror.mirror import Mirror
 from ccatp.samples import DeckPose, GravitySample, ImuSample, PanelPose
@@ -153,8 +153,9 @@ def test_a_robot_that_drives_on_slowly_never_rests() -> None:
         assert not found.is_resting
 
 
-def test_biases_show_at_rest(filter_name: str) -> None:
-    wrong = Errors(gyro_bias=0.02, accelerometer_bias=-0.3, noise=1.0)
+@pytest.mark.parametrize("counts_per_turn", [0, 1200])
+def test_biases_show_at_rest(filter_name: str, counts_per_turn: int) -> None:
+    wrong = Errors(gyro_bias=0.02, accelerometer_bias=-0.3, noise=1.0, counts_per_turn=counts_per_turn)
     robot, found = Robot(errors=wrong), build(filter_name)
     run(found, robot.frames(0.25 + 8 * 1.0))
     mean, P = found.state
@@ -164,6 +165,17 @@ def test_biases_show_at_rest(filter_name: str) -> None:
     assert accelerometer < 1.5e-3
     assert abs(mean[BG] - 0.02) < 4.0 * gyro
     assert abs(mean[BA] + 0.3) < 4.0 * accelerometer
+
+
+def test_what_is_not_known_of_the_stop_is_not_taken_for_a_bias() -> None:
+    """Counts leave 1 mrad/s at the stop, which the gyroscope cannot tell from its bias: their sum is known."""
+    robot = Robot(v=trapeze(0.0, 1.5, 0.1, 0.2), errors=Errors(noise=1.0, counts_per_turn=1200))
+    found = build()
+    run(found, robot.frames(1.5 + 8.3))
+    P = found.state[1]
+    for bias, speed in ((BG, W), (BA, A)):
+        together = P[bias, bias] + 2.0 * P[bias, speed] + P[speed, speed]
+        assert together < 0.5 * P[bias, bias]
 
 
 def test_a_rest_is_used_when_the_robot_drives_off() -> None:
