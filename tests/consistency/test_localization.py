@@ -58,7 +58,7 @@ def cfg() -> LocalizerConfig:
     """As shipped, but a drive that the wheels can do: the shipped densities are those of a controller at work."""
     shipped = config().localizer
     full = shipped.full_state.model_copy(
-        update={"jerk_density_m2_s5": 1e-4, "angular_acceleration_density_rad2_s3": 1e-3}
+        update={"jerk_density_m2_s5": 1e-4, "angular_acceleration_density_rad2_s3": 0.05}
     )
     return shipped.model_copy(update={"full_state": full, "reset_rate_sigma_rad_s": 0.1})
 

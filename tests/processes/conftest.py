@@ -15,6 +15,8 @@ import pytest
 from ccatp.router import RequestFailed, request
 from ccatp.wire.channels import format_request
 
+# The calibration drive takes half a minute: on the wall clock only where it is what is tested.
+NO_CALIBRATION = ("--set", "mission.calibration_length_m=0")
 FREE_PORTS = ("--set", "sim.robot.port=0", "--set", "sim.etalon.port=0")
 
 
@@ -104,7 +106,8 @@ def start(tmp_path: Path, runtime_dir: Path) -> Iterator[Callable[..., Run]]:
     runs: list[Run] = []
 
     def begin(*args: str) -> Run:
-        run = Run(tmp_path / f"run{len(runs)}", runtime_dir, *args)
+        quick = NO_CALIBRATION if "--realtime" in args else ()
+        run = Run(tmp_path / f"run{len(runs)}", runtime_dir, *quick, *args)
         runs.append(run)
         return run
 

@@ -48,19 +48,21 @@ def test_the_registry_takes_it_for_four_states_only() -> None:
     m=st.sampled_from([1, 2, 3, 5, MANY, MANY + 1, 40]),
     zeros=st.sampled_from([(), (2,), (2, 0), (0, 1, 2), (1, 3), (0, 2, 3)]),
     is_chain=st.booleans(),
+    is_paired=st.booleans(),
 )
-def test_every_pattern_of_rows(seed: int, m: int, zeros: tuple[int, ...], is_chain: bool) -> None:
+def test_every_pattern_of_rows(seed: int, m: int, zeros: tuple[int, ...], is_chain: bool, is_paired: bool) -> None:
     rng = np.random.default_rng(seed)
     four, arrays = make(seed)
     H, R = rng.normal(size=(m, 4)), rng.uniform(0.1, 1.0, m)
     H[:, zeros] = 0.0
     H[rng.random(m) < 0.3, ORDER[0]] = 0.0
+    noise = Q if is_paired else Q + 0.1 * np.ones((4, 4))
     for k in range(3):
         A = F if is_chain else rng.normal(size=(4, 4))
         z = rng.normal(size=m)
         innovations = []
         for filter_ in (four, arrays):
-            filter_.predict(A, Q)
+            filter_.predict(A, noise)
             np.testing.assert_array_equal(filter_.transition, A)
             before = filter_.mean
             innovations.append(filter_.update(z, H * (k + 1), R))

@@ -176,7 +176,7 @@ def test_once_the_period_is_known_a_frame_is_summed_at_once_and_to_the_same(is_c
     angles = [0.02 + 3.3 * DT_S * k + 0.05 * sin(0.01 * k) for k in range(6001)]
     if is_counter:
         angles = [COUNT_RAD * floor(angle / COUNT_RAD) for angle in angles]
-    rates = [(b - a) / DT_S for a, b in zip(angles, angles[1:], strict=False)]
+    rates = [(b - a) / DT_S for a, b in pairwise(angles)]
     # A counter was fed up to zero; the sum of an analogue wheel begins with its first sample.
     one_by_one, before, t0 = 0.0, rates[0], 0.0 if is_counter else DT_S
     for k in range(0, 6000, 10):
