@@ -168,7 +168,7 @@ def survey_problem(cfg: Config, seed: int) -> FilterProblem:
     x = mean + 0.5 * sigma * rng.normal(size=SURVEY_STATES)
     slope = Terrain(build_mirror(cfg.mirror)).at(float(mean[X]), float(mean[Y]))
     motion = SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m).over(DT_S, slope)
-    slip = (full.slip_scatter * DT_S) ** 2
+    slip = (full.slip_scatter_max * DT_S) ** 2
     impulses = np.array(
         (full.jerk_density_m2_s5 * DT_S, full.angular_acceleration_density_rad2_s3 * DT_S, slip, slip, slip)
     )

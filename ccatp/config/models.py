@@ -124,7 +124,6 @@ class FullStateConfig(Model):
     encoder_period_s: Positive
     slip_mean: Annotated[float, Field(ge=0.0, lt=0.5)]
     slip_sigma: Positive
-    slip_scatter: Positive
     slip_scatter_max: Positive
     slip_difference_sigma: Positive
     creep_sigma: Positive

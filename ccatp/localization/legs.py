@@ -76,7 +76,7 @@ class LegBook:
     """
 
     def __init__(self, cfg: FullStateConfig) -> None:
-        self._slip_scatter = Population(cfg.slip_mean, cfg.slip_sigma, cfg.slip_scatter, cfg.slip_scatter_max)
+        self._slip_scatter = Population(cfg.slip_mean, cfg.slip_sigma, cfg.slip_scatter_max)
         self._parameters = (
             _Parameter(cfg.slip_mean, cfg.slip_sigma),
             _Parameter(0.0, cfg.slip_difference_sigma),

@@ -5,7 +5,7 @@ from math import exp, log
 # Candidates for the scatter, from "does not change" to "anything goes"; a factor of sqrt(2) apart.
 _CANDIDATES = tuple(1e-6 * 2.0 ** (k / 2.0) for k in range(32))
 _FORGETTING = 0.99  # of the likelihoods per leg, so that a world that changes is noticed within a hundred legs
-_SHARPNESS = 0.5  # how fast the prior falls off, in powers of the ratio to what is expected
+_ALIKE = 5.0  # prior weight of the smallest candidate, "does not change": floors on which wheels hold are common
 _LEAST = 1e-14
 
 
@@ -20,18 +20,18 @@ class Population:
     Args:
         mean: expectation before the first leg.
         sigma: standard deviation of that expectation.
-        scatter_sigma: the scatter expected before the first leg.
         largest: the largest scatter thought possible; candidates beyond it are left out.
 
     Attributes:
         mean: expectation of the next leg's parameter.
         mean_variance: how well it is known.
-        scatter: sigma^2, the square of its posterior geometric mean.
+        scatter: the expectation of sigma^2, which is what the next leg will show of it.
     """
 
-    def __init__(self, mean: float, sigma: float, scatter_sigma: float, largest: float) -> None:
+    def __init__(self, mean: float, sigma: float, largest: float) -> None:
         self._sigmas = [s for s in _CANDIDATES if s <= largest]
-        self._prior = [-_SHARPNESS * abs(log(s / scatter_sigma)) for s in self._sigmas]
+        # Of an unknown scale nothing is known but its limits: its logarithm is uniform.
+        self._prior = [log(_ALIKE), *[0.0] * (len(self._sigmas) - 1)]
         self._logs = [0.0] * len(self._sigmas)
         self._means = [mean] * len(self._sigmas)
         self._variances = [sigma * sigma] * len(self._sigmas)
@@ -65,6 +65,4 @@ class Population:
         self.mean_variance = sum(
             w * (v + (m - self.mean) ** 2) for w, m, v in zip(weights, self._means, self._variances, strict=True)
         )
-        # The mean of the logarithms: where legs do not differ, every sigma below what a leg can resolve is as likely as
-        # the next, and their arithmetic mean would be the largest of them.
-        self.scatter = exp(2.0 * sum(w * log(s) for w, s in zip(weights, self._sigmas, strict=True)))
+        self.scatter = sum(w * s * s for w, s in zip(weights, self._sigmas, strict=True))

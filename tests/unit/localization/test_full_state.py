@@ -534,7 +534,7 @@ def test_between_the_steps_of_the_filter_the_pose_is_carried_on() -> None:
     found = build(
         slip_mean=0.0,
         slip_sigma=1e-6,
-        slip_scatter=1e-6,
+        slip_scatter_max=1e-6,
         slip_difference_sigma=1e-6,
         creep_sigma=1e-6,
         wheel_base_sigma=1e-6,

@@ -17,7 +17,7 @@ STEP = 2.0**0.5  # from one candidate for the scatter to the next
 
 
 def population() -> Population:
-    return Population(0.015, 0.015, 0.008, 0.02)
+    return Population(0.015, 0.015, 0.02)
 
 
 def taught(scatter: float, legs: int, seed: int, sigma: float = 5e-4, mean: float = 0.03) -> Population:
@@ -32,7 +32,7 @@ def test_before_the_first_leg_it_is_what_was_expected() -> None:
     found = population()
     assert found.mean == pytest.approx(0.015, rel=1e-12)
     assert found.mean_variance == pytest.approx(0.015**2, rel=1e-12)
-    assert 0.001 < sqrt(found.scatter) < 0.008  # the prior's peak; its lower side is longer than its upper one
+    assert 0.001 < sqrt(found.scatter) < 0.008  # log-uniform: the largest candidates carry it
     assert found.variance == found.scatter + found.mean_variance
 
 
@@ -248,3 +248,19 @@ def test_slip_and_creep_wander_within_a_leg(full: FullStateConfig) -> None:
     share = full.wander_fraction**2 / full.wander_time_s * 0.5
     assert slip == pytest.approx(2.0 * share * book.scatter[0] ** 2)  # of a wheel: twice that of a mean of two
     assert creep == pytest.approx(share * book.scatter[1] ** 2)
+
+
+def test_what_it_expects_of_the_next_leg_is_what_the_next_leg_shows() -> None:
+    """Standardised by the book, a leg's parameter has unit variance over worlds drawn from the book's own prior."""
+    rng, prior = np.random.default_rng(1), population()
+    weights = np.exp(prior._prior)
+    weights /= weights.sum()
+    squares = []
+    for _ in range(2000):
+        book, mean = population(), 0.015 + 0.015 * float(rng.normal())
+        sigma = float(rng.choice(prior._sigmas, p=weights))
+        for _ in range(3):
+            book.learn(mean + sigma * float(rng.normal()) + 5e-4 * float(rng.normal()), 25e-8)
+        squares.append((mean + sigma * float(rng.normal()) - book.mean) ** 2 / book.variance)
+    spread = float(np.std(squares)) / sqrt(len(squares))
+    assert float(np.mean(squares)) == pytest.approx(1.0, abs=4.0 * spread)

@@ -227,7 +227,7 @@ def test_what_the_map_does_not_know_goes_to_the_offsets() -> None:
         start_heading_sigma_rad=0.02,
         slip_sigma=1e-5,
         slip_mean=0.0,
-        slip_scatter=1e-5,
+        slip_scatter_max=1e-5,
     )
     run(found, robot.frames(4.2))
     mean, _ = found.state
@@ -241,7 +241,7 @@ def test_what_the_map_does_not_know_goes_to_the_offsets() -> None:
 def test_an_edge_far_from_where_it_is_expected_is_gated() -> None:
     start = before_a_seam(0, True)
     off = PanelPose(start.panel, start.x_m + 0.02, start.y_m, start.heading_rad)
-    robot, found = Robot(off, across_it(), has_edges=True), build(start=start, slip_sigma=1e-3, slip_scatter=1e-3)
+    robot, found = Robot(off, across_it(), has_edges=True), build(start=start, slip_sigma=1e-3, slip_scatter_max=1e-3)
     run(found, robot.frames(4.2))
     # Ten sigmas of the start's 2 mm; nothing on the way makes it less certain.
     assert found.counts["crossings_used"] == 0

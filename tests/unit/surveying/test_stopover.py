@@ -45,9 +45,7 @@ def test_an_interrupted_stop_begins_anew_and_asks_again(stopover: Stopover, mirr
 def test_the_measuring_time_begins_anew_where_the_robot_moves_once_more(stopover: Stopover, mirror: Mirror) -> None:
     settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
     moves = range(settled + 20, settled + 30)
-    asked = [
-        k for k in range(settled, settled + 200) if stopover.is_due(at(mirror, k, speed_m_s=0.01 * (k in moves)))
-    ]
+    asked = [k for k in range(settled, settled + 200) if stopover.is_due(at(mirror, k, speed_m_s=0.01 * (k in moves)))]
     assert len(asked) == 1
     assert asked[0] > moves[-1] + round(MEASURING_S / DT)  # the mean speed takes its time to forget the motion
 
