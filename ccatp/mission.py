@@ -170,7 +170,7 @@ class Mission:
         """The measurement that was asked for is taken, fused and stored."""
         self._failures = 0
         if point is None and not self._is_lost:
-            self._leave_calibration()
+            self._leave_pointless()
             return
         if point is None:
             # Found again, the robot stands where the route never led.
@@ -189,7 +189,7 @@ class Mission:
     def not_fixed(self, point: PointId | None, cause: str) -> None:
         """The measurement failed for good: the point is skipped; several in a row hold the robot."""
         if point is None and not self._is_lost:
-            self._leave_calibration()  # the survey can do without
+            self._leave_pointless()  # the survey can do without
             return
         if point is None:
             self.fault(f"the robot cannot be found again: {cause}")
@@ -203,9 +203,9 @@ class Mission:
         self.fault(f"{limit} measurements in a row failed: {cause}")
         self._leave_stop(point, self.skipped)
 
-    def _leave_calibration(self) -> None:
+    def _leave_pointless(self) -> None:
         stop = self.survey.current
-        if self.is_awaiting_fix and stop is not None and stop.kind is StopKind.CALIBRATE:
+        if self.is_awaiting_fix and stop is not None and stop.kind in (StopKind.CALIBRATE, StopKind.VIA):
             self.survey.advance()
             self._go_on()
 
@@ -342,12 +342,16 @@ class Mission:
             if (phase is DRIVE) is not (self.state is DRIVING):
                 self._apply(Event.TURNED if phase is DRIVE else Event.REALIGN)
             return Order(twist)
-        if stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE):
+        if stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) or self._is_vague(motion, stop):
             self._apply(Event.ARRIVED)
             return self._settle(motion)
         survey.advance()
         self._go_on()
         return self._travel(motion)
+
+    def _is_vague(self, motion: Motion, stop: Stop) -> bool:
+        """Whether to measure at a via point: they lie near the rim, and the next turn needs what room the route left."""
+        return stop.kind is StopKind.VIA and motion.sigma_of() > self._cfg.mission.via_sigma_m
 
     def _find_route(self, motion: Motion) -> Order:
         """Plan anew from where the robot is; one frame of standing still, however long that takes."""

@@ -1,11 +1,18 @@
 """Pure. Straight legs against the rim, and the way around a stepped corner."""
 
+from collections.abc import Iterable, Sequence
 from math import atan2, cos, hypot, inf, sin
 
 from ccatp.mirror.mirror import Mirror
 from ccatp.planning.stance import Body, Place
+from ccatp.samples import PanelId
 
 _ROUNDING_M = 1e-9
+# A sensor whose track meets a seam more steeply than 30 degrees is over it soon; the danger rules know how soon.
+_STEEP = 0.5
+# Further than this from a seam's border a track that should pass beside it does.
+_BESIDE_M = 0.008
+_GRAZING_M = 2.0  # what a way may be longer for it
 
 
 class LegRules:
@@ -19,7 +26,10 @@ class LegRules:
     def __init__(self, mirror: Mirror, body: Body) -> None:
         """Find the rim's re-entrant corners and the places from which the robot can drive around them."""
         self._rim, self._body = mirror.rim, body
+        self._sensors: list[list[float]] = body.sensors_m.tolist()
         self._corners, self._nodes = _reentrant_corners(mirror, body)
+        self._seams = _seam_lines(mirror)
+        self._beside_m = 0.5 * mirror.gap_m + _BESIDE_M
 
     def clearance_m(self, a: Place, b: Place) -> float:
         """Clearance of the leg from ``a`` to ``b``: exact, or a lower bound that suffices for every rule, m."""
@@ -59,42 +69,99 @@ class LegRules:
                 a.x_m + c * ox - s * oy, a.y_m + s * ox + c * oy, b.x_m + c * ox - s * oy, b.y_m + s * ox + c * oy
             )
             >= body.turn_clearance_m
-            for ox, oy in body.sensors_m.tolist()
+            for ox, oy in self._sensors
         )
 
-    def way_around(self, a: Place, b: Place) -> tuple[Place, ...]:
-        """Shortest chain of places that leads from ``a`` around stepped corners to ``b``, ends left out.
+    def grazes_seam(self, a: Place, b: Place, course_rad: float) -> bool:
+        """Whether a sensor may run along a seam on the leg from ``a`` to ``b``, which looks like the mirror's edge.
 
-        Dijkstra's algorithm on the visibility graph of the corners, inset by the clearance.
+        Args:
+            a, b: ends of the leg.
+            course_rad: what the robot faces.
+        """
+        dx, dy = b.x_m - a.x_m, b.y_m - a.y_m
+        length = hypot(dx, dy)
+        c, s = cos(course_rad), sin(course_rad)
+        for start, way, lines, (p, q) in zip((a.x_m, a.y_m), (dx, dy), self._seams, ((c, -s), (s, c)), strict=True):
+            if abs(way) >= _STEEP * length:
+                continue
+            for ox, oy in self._sensors:
+                low = start + p * ox + q * oy
+                high = low + way
+                if low > high:
+                    low, high = high, low
+                if any(low - self._beside_m < line < high + self._beside_m for line in lines):
+                    return True
+        return False
+
+    def way_around(self, a: Place, b: Place) -> tuple[Place, ...]:
+        """Best chain of places that leads from ``a`` around stepped corners to ``b``, ends left out.
+
+        Dijkstra's algorithm on the visibility graph of the corners, inset by the clearance, and of the two elbows from
+        which both ends lie along the panels' rows and columns: on such legs no sensor runs along a seam.
 
         Returns:
-            The places between; none where the straight leg is clear, and where there is no way.
+            The places between; none where the straight leg is good, and where there is no way.
         """
-        if self.is_clear(a, b):
+        if self._is_good(a, b):
             return ()
-        places = [a, *self._nodes, b]
-        length = {0: 0.0}
+        places = [a, *self._nodes, *self._elbows(a, b), b]
+        cost = {0: 0.0}
         before: dict[int, int] = {}
         open_places = set(range(len(places)))
         while open_places:
-            k = min(open_places, key=lambda i: length.get(i, inf))
-            if k not in length:
+            k = min(open_places, key=lambda i: cost.get(i, inf))
+            if k not in cost:
                 return ()
             if k == len(places) - 1:
                 break
             open_places.remove(k)
             for i in open_places:
-                total = length[k] + hypot(places[i].x_m - places[k].x_m, places[i].y_m - places[k].y_m)
-                if total < length.get(i, inf) and self.is_clear(places[k], places[i]):
-                    length[i], before[i] = total, k
+                total = cost[k] + hypot(places[i].x_m - places[k].x_m, places[i].y_m - places[k].y_m)
+                if total < cost.get(i, inf) and self.is_clear(places[k], places[i]):
+                    total += _GRAZING_M if self._grazes_facing(places[k], places[i]) else 0.0
+                    if total < cost.get(i, inf):
+                        cost[i], before[i] = total, k
         chain = []
         k = len(places) - 1
         while (k := before[k]) != 0:
             chain.append(places[k])
         return tuple(reversed(chain))
 
+    def elbows(self, sources: Iterable[Place], targets: Sequence[Place]) -> list[Place]:
+        """Elbows between all places of two groups between which the straight leg is not good."""
+        return [elbow for a in sources for b in targets if not self._is_good(a, b) for elbow in self._elbows(a, b)]
+
+    def _is_good(self, a: Place, b: Place) -> bool:
+        return self.is_clear(a, b) and not self._grazes_facing(a, b)
+
+    def _grazes_facing(self, a: Place, b: Place) -> bool:
+        return self.grazes_seam(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m))
+
+    def _elbows(self, a: Place, b: Place) -> list[Place]:
+        """The corners of the rectangle over a and b at which the robot can turn."""
+        places = []
+        for x, y in ((a.x_m, b.y_m), (b.x_m, a.y_m)):
+            depth = self._rim.signed_distance_m(x, y)
+            if depth >= self._body.turning_depth_m:
+                places.append(Place(x, y, depth))
+        return places
+
     def _corner_distance_m(self, a: Place, b: Place) -> float:
         return min((_segment_distance(corner, a, b) for corner in self._corners), default=inf)
+
+
+def _seam_lines(mirror: Mirror) -> tuple[list[float], list[float]]:
+    """The deck x of the seams between columns, the deck y of those between rows."""
+    xs, ys = set(), set()
+    half_gap = 0.5 * mirror.gap_m
+    for panel in mirror.panels.values():
+        row, col = panel.id
+        if PanelId(row, col + 1) in mirror.panels:
+            xs.add(round(panel.x_m + panel.half_x_m + half_gap, 6))
+        if PanelId(row + 1, col) in mirror.panels:
+            ys.add(round(panel.y_m + panel.half_y_m + half_gap, 6))
+    return sorted(xs), sorted(ys)
 
 
 def _reentrant_corners(mirror: Mirror, body: Body) -> tuple[list[tuple[float, float]], list[Place]]:

@@ -15,6 +15,8 @@ from ccatp.planning.stance import Place
 STOP_S = 0.15
 # Of two ways that cost the same take the one driven forward.
 _REVERSE_S = 0.01
+# What it may cost that a sensor runs along a seam: an edge that is none, a retreat, a measurement, a new route.
+_GRAZING_S = 20.0
 
 
 class Target(NamedTuple):
@@ -81,6 +83,9 @@ class Search:
         here = arrivals[0].place
         frontier: Frontier = {here: list(arrivals)}
         frontier |= self._extend(frontier, retreats)
+        elbows = self._rules.elbows(frontier, (target.place, *target.retreats))
+        if elbows:
+            frontier = _merged(frontier, self._extend(frontier, elbows))
         around = frontier
         for corner in self._rules.way_around(here, target.place):
             around = self._extend(around, (corner,))
@@ -112,6 +117,8 @@ class Search:
             if best is not None and self._rules.are_sensors_clear(source, target, course, clearance_m):
                 turned_s, arrival = best
                 total_s = turned_s + cost_s + (_REVERSE_S if reverse else 0.0)
+                if self._rules.grazes_seam(source, target, course):
+                    total_s += _GRAZING_S
                 yield Arrival(target, course, total_s, reverse, arrival)
 
     def _cheapest_turn(self, place: Place, arrivals: list[Arrival], course: float) -> tuple[float, Arrival] | None:

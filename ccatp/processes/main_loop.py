@@ -63,6 +63,7 @@ class MainLoop:
         self._cfg, self._endpoints, self._store, self._context = cfg, args.endpoints, store, context
         self._mirror: Mirror = parts.mirror
         self._localizer: Localizer = parts.localizer
+        self._sigma_of = lambda: self._localizer.position_sigma_m
         self._mission: Mission = parts.mission
         self._gate: DriveGate = parts.gate
         self._parts = parts
@@ -246,7 +247,7 @@ class MainLoop:
         ahead = self._predictor.ahead(
             (pose.x_m, pose.y_m, pose.heading_rad), v, omega, echo.seq, echo.age, echo.held, creep
         )
-        return Motion(sensors.t, dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead)
+        return Motion(sensors.t, dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead, self._sigma_of)
 
     def _frame_period_s(self) -> float:
         return 1.0 / self._hello.frame_hz if self._hello is not None else 0.01

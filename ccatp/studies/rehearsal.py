@@ -65,6 +65,7 @@ class Rehearsing:
         self.states_s: defaultdict[State, float] = defaultdict(float)
         self.notices: list[str] = []
         self._published: Estimate | None = None
+        self._sigma_of = lambda: self.localizer.position_sigma_m
         self._code = EventCode.NORMAL
         self._drive_seq = 0
 
@@ -133,7 +134,7 @@ class Rehearsing:
         pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
         here = pose.x_m, pose.y_m, pose.heading_rad
         ahead = self.predictor.ahead(here, v, omega, echo.seq, echo.age, echo.held, creep)
-        return Motion(frame.t, dt_s, pose, self.mirror.deck_pose, v, omega, creep, ahead)
+        return Motion(frame.t, dt_s, pose, self.mirror.deck_pose, v, omega, creep, ahead, self._sigma_of)
 
     def _foresee(self, number: int, right: float, left: float) -> None:
         robot = self.cfg.robot

@@ -16,7 +16,8 @@ class Motion(NamedTuple):
 
     ``creep`` is the drift (dx, dy) per metre of travel in the plane of ``pose``. ``ahead`` is where the robot will be,
     in the same plane, when the twist decided now takes effect; ``None`` where that is at once. Whether it has arrived
-    and stands still is judged by ``pose``; it is steered by ``ahead``.
+    and stands still is judged by ``pose``; it is steered by ``ahead``. ``sigma_of`` says how well the position is
+    known, in its worst direction, m.
     """
 
     t_s: float
@@ -27,6 +28,7 @@ class Motion(NamedTuple):
     rate_rad_s: float
     creep: tuple[float, float] = (0.0, 0.0)
     ahead: Predicted | None = None
+    sigma_of: Callable[[], float] = float  # hardly ever asked for either
 
     @property
     def steered(self) -> Predicted:
@@ -57,6 +59,7 @@ class Motion(NamedTuple):
             self.rate_rad_s,
             self.creep if creep else (0.0, 0.0),
             self.ahead if ahead else None,
+            self.sigma_of,
         )
 
 
