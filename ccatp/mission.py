@@ -350,7 +350,7 @@ class Mission:
         return self._travel(motion)
 
     def _is_vague(self, motion: Motion, stop: Stop) -> bool:
-        """Whether to measure at a via point: they lie near the rim, and the next turn needs what room the route left."""
+        """Whether to measure at a via point: they lie near the rim, and the next turn needs the room the route left."""
         return stop.kind is StopKind.VIA and motion.sigma_of() > self._cfg.mission.via_sigma_m
 
     def _find_route(self, motion: Motion) -> Order:

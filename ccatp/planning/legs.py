@@ -12,7 +12,7 @@ _ROUNDING_M = 1e-9
 _STEEP = 0.5
 # Further than this from a seam's border a track that should pass beside it does.
 _BESIDE_M = 0.008
-_GRAZING_M = 2.0  # what a way may be longer for it
+_GRAZING_M = 0.4  # what a way may be longer for it
 
 
 class LegRules:

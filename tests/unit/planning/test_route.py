@@ -1,7 +1,7 @@
 """Pure. Stops between the points, remaining time, refusals."""
 
 from itertools import pairwise
-from math import hypot
+from math import atan2, hypot
 from typing import Any
 
 import numpy as np
@@ -64,8 +64,8 @@ def test_largest_leg_of_thesis_m1(thesis: Any) -> None:
     route = plan(thesis, thesis_order(thesis.mirror))
     ends = [(stop.x_m, stop.y_m) for stop in route.stops]
     legs = sorted(hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(ends))
-    # The four diagonals around the stepped corners: straight up and across would be 0.744 m, but 0.3 m more way.
-    assert legs[-1] == pytest.approx(0.824, abs=0.002)  # the retreats before and after lie on a grid of 5 mm
+    # Around the stepped corners straight up and across: on the diagonals, shorter by 0.3 m, a sensor runs along a seam.
+    assert legs[-1] == pytest.approx(0.733, abs=0.002)  # the retreats before and after lie on a grid of 5 mm
     assert legs[-9] == pytest.approx(0.254, abs=0.012)  # else 744 - 490 mm, between two rows; a retreat may slant it
 
 
@@ -128,7 +128,7 @@ def test_way_around_several_corners(thesis: Any) -> None:
     xs, ys = np.array([3.4, 2.2, -3.4, 0.0]), np.array([1.6, 3.2, -1.6, 0.0])
     upper, top, lower, middle = build_places(mirror, body, xs, ys)
     chain = [upper, *rules.way_around(upper, top), top]
-    assert len(chain) == 4
+    assert len(chain) == 3  # by the elbow, along rows and columns
     assert all(rules.is_clear(a, b) for a, b in pairwise(chain))
     assert rules.way_around(lower, middle) == ()
 
@@ -174,3 +174,40 @@ def test_no_leg_whose_sensors_clip_a_re_entrant_corner(thesis: Any) -> None:
         assert a.can_face(course)
         assert b.can_face(course)
         assert bool(search.advance([Arrival(a, course, 0.0)], (), Target(b))) == passes
+
+
+def test_no_sensor_runs_along_a_seam(thesis: Any) -> None:
+    """A robot a few millimetres beside its way would take the seam for the rim."""
+    body = build_body(thesis.cfg.robot, thesis.cfg.mission)
+    rules = LegRules(thesis.mirror, body)
+    stops = plan(thesis, thesis_order(thesis.mirror)).stops
+    places = build_places(thesis.mirror, body, *np.array([(stop.x_m, stop.y_m) for stop in stops]).T)
+    grazing = [
+        (stop.x_m, stop.y_m)
+        for (a, b), stop in zip(pairwise(places), stops[1:], strict=True)
+        if rules.grazes_seam(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m))
+    ]
+    assert grazing == []
+
+
+@pytest.mark.parametrize(
+    ("from_m", "to_m", "grazes"),
+    [
+        ((-0.34, 0.0), (-0.34, 0.2), False),  # beside it: the sensors at -0.25 and -0.43, the seam at -0.34
+        ((-0.25, 0.0), (-0.25, 0.2), True),  # the left sensors over it all the way
+        ((-0.27, 0.0), (-0.23, 0.2), True),  # across it, but so slanted that they stay over it for long
+        ((-0.40, 0.0), (-0.28, 0.02), False),  # straight across
+    ],
+)
+def test_which_legs_graze_a_seam(
+    thesis: Any, from_m: tuple[float, float], to_m: tuple[float, float], grazes: bool
+) -> None:
+    body = build_body(thesis.cfg.robot, thesis.cfg.mission)
+    rules = LegRules(thesis.mirror, body)
+    seam = thesis.mirror.nearest_seam(-0.34, 0.05)
+    shift = seam.position_m + 0.34
+    a, b = build_places(
+        thesis.mirror, body, np.array([from_m[0] + shift, to_m[0] + shift]), np.array([from_m[1], to_m[1]])
+    )
+    assert seam.axis == "x"
+    assert rules.grazes_seam(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m)) is grazes
