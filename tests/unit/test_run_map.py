@@ -67,7 +67,7 @@ def test_a_run_directory_becomes_a_png(tmp_path: Path, mirror: Mirror, monkeypat
     assert int.from_bytes(content[16:20], "big") == run_map.WIDTH_PX
     ((path_xy, points, title, subtitle),) = shown
     assert title == "fyst-m1: 4 of 9 points in 2 min 05 s"
-    assert "simulation, world thesis  ·  seed 1  ·  filter kf" in subtitle
+    assert "simulation, world thesis  ·  seed 1  ·  filter ekf" in subtitle
     assert path_xy.shape == (8, 2)  # the true path, not the estimated, of both recordings, each with a row of NaN
     np.testing.assert_array_equal(path_xy[:3], [[0.0, 0.5], [0.01, 0.5], [0.02, 0.5]])
     assert np.isnan(path_xy[[3, 7]]).all()

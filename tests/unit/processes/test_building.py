@@ -45,7 +45,7 @@ def test_a_plan_measures_every_point_once(parts: Parts) -> None:
     points = [stop.point for stop in parts.route.stops if stop.kind is StopKind.MEASURE]
     assert len(points) == len(set(points)) == parts.total_points == 9
     assert parts.already_done == 0
-    assert 0.0 < parts.lower_bound_s < 60.0
+    assert 0.0 < parts.lower_bound_s < 100.0  # 40 s of it are the calibration drive
 
 
 def test_the_robot_of_the_configuration_is_accepted(parts: Parts, config: Config) -> None:
