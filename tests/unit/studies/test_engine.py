@@ -109,7 +109,7 @@ def test_an_interruption_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setenv(FAULTS, "speed_m_s=0.1,seed=3:interrupt")
     with pytest.raises(CampaignInterrupted, match=f"interrupted; what is done is kept in {tmp_path}: the same comm"):
         campaign(tmp_path)
-    # One job of each of the two cells goes first; how many of the other four follow before it depends on what took long.
+    # One job of each of the two cells goes first; how many of the other four follow depends on what took how long.
     assert 2 <= jobs_done(tmp_path) <= 5
     assert CampaignInterrupted("").exit_status == 130
 
