@@ -21,7 +21,7 @@ PYTEST := $(BIN)/python -m pytest -n $(WORKERS)
 help:
 	@echo "make run [ARGS=...]   survey a simulated mirror: ccatp run --sim"
 	@echo "make test             lint, types, import contract, tests"
-	@echo "make test-slow        the tests that take minutes"
+	@echo "make test-slow        the tests that take minutes, and new random examples"
 	@echo "make lint             lint, types, import contract"
 	@echo "make format           format the code"
 	@echo "make lock             pin the dependencies anew (needs uv)"
@@ -35,6 +35,7 @@ test: lint
 
 test-slow: $(VENV)/.installed-dev
 	$(PYTEST) -m slow $(PYTEST_ARGS)
+	$(PYTEST) tests/property tests/oracle --hypothesis-profile=explore
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check

@@ -8,9 +8,15 @@ from collections.abc import AsyncIterator, Iterator
 
 import psutil
 import pytest
+from hypothesis import settings
 
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
+
+# A change is judged by the same examples each time; `make test-slow` looks for new ones.
+settings.register_profile("repeatable", derandomize=True)
+settings.register_profile("explore", derandomize=False, print_blob=True)
+settings.load_profile("repeatable")
 
 # Processes that end on their own after a test closed its side of them.
 GRACE_S = 2.0

@@ -1,6 +1,5 @@
 """Pure. The localizer of thesis chapter 2: four states in a filter, the pose integrated in a panel frame beside it."""
 
-from collections import Counter
 from collections.abc import Sequence
 from math import hypot, isfinite, sqrt
 
@@ -11,10 +10,11 @@ from ccatp.config.models import LocalizerConfig, RobotConfig
 from ccatp.filters.base import Filter, FilterDiverged, FloatArray, Innovation
 from ccatp.localization.crossing import CrossingDetector, HeadingFix, HeadingGate, Transition
 from ccatp.localization.fixes import check_fix, foot_of_fix
-from ccatp.localization.intake import BACKWARD_LIMIT, MAX_FRAME_STEP_S, FrameClock, FrameKind, SampleIntake
+from ccatp.localization.intake import MAX_FRAME_STEP_S
 from ccatp.localization.measurements import OMEGA, STATES, THETA, ConstantAcceleration, MeasurementBuilder, Stack, V
 from ccatp.localization.odometry import Odometer, arc_step
 from ccatp.localization.position_sigma import PositionSigma
+from ccatp.localization.receiver import FrameReceiver
 from ccatp.mirror.mirror import Mirror
 from ccatp.samples import DeckPose, EdgeSample, Fix, GravitySample, ImuSample, PanelId, PanelPose, WheelSample
 
@@ -23,7 +23,7 @@ _IMPOSSIBLE = 2.0  # an estimate of this many times the wheels' largest rate is 
 _SELECT_HEADING = np.eye(STATES)[THETA : THETA + 1]
 
 
-class FourStateLocalizer:
+class FourStateLocalizer(FrameReceiver[Stack]):
     """Estimates the pose (x, y, theta)_p (thesis 2.1, fig. 2.5).
 
     Each frame: the filter predicts over the time since the last frame and is updated with every usable sample at its
@@ -40,22 +40,16 @@ class FourStateLocalizer:
         start: pose at the first frame, at rest.
 
     Attributes:
-        counts: what was refused or used, by name.
         innovation: of the last filter update with samples, or None.
-        hold_cause: why the mission should hold, or empty; stays until ``clear_hold``.
-        is_frozen: the filter has diverged; the pose stands still until the next fix or reset.
         fix_deviation_m: how far the last fix was above the ideal surface.
-        notices: what an operator should read; whoever reads them empties the list.
     """
 
     def __init__(
         self, filter_: Filter, mirror: Mirror, robot: RobotConfig, cfg: LocalizerConfig, start: PanelPose
     ) -> None:
-        self.counts: dict[str, int] = Counter()
+        super().__init__(cfg.history_s)
         self.innovation: Innovation | None = None
-        self.hold_cause = ""
         self.fix_deviation_m = 0.0
-        self.notices: list[str] = []
         self._filter = filter_
         self._mirror = mirror
         self._cfg = cfg
@@ -64,13 +58,10 @@ class FourStateLocalizer:
         self._omega_limit_rad_s = 2.0 * self._v_limit_m_s / robot.wheel_base_m
         self._process = ConstantAcceleration(cfg)
         self._builder = MeasurementBuilder(robot, cfg)
-        self._clock = FrameClock()
-        self._intake = SampleIntake(cfg.history_s, self.counts)
         self._odometer = Odometer(cfg.history_s)
         self._crossings = CrossingDetector(mirror, robot, cfg)
         self._gate = HeadingGate(cfg.crossing_gate_sigma)
         self._sigma = PositionSigma(cfg.start_position_sigma_m, cfg.slip_fraction)
-        self.is_frozen = False
         self._deck: DeckPose | None = None
         self._x_m, self._y_m = start.x_m, start.y_m
         self._enter(start.panel)
@@ -87,11 +78,6 @@ class FourStateLocalizer:
         if self._deck is None:
             self._deck = self._mirror.deck_pose(self.pose)
         return self._deck
-
-    @property
-    def t_s(self) -> float:
-        """Robot time to which the pose belongs: that of the last frame used; -inf before the first."""
-        return self._clock.t_s
 
     @property
     def speed_m_s(self) -> float:
@@ -123,59 +109,21 @@ class FourStateLocalizer:
         """Estimated drift per metre of travel: none in this model."""
         return 0.0, 0.0
 
-    @property
-    def hold_requested(self) -> bool:
-        """Whether the mission should hold."""
-        return bool(self.hold_cause)
+    def _take(self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample]) -> Stack:
+        return self._intake.stack(self._builder, t_s, imu, encoders)
 
-    def clear_hold(self) -> None:
-        """Forget the cause for a hold; one that persists comes back."""
-        self.hold_cause = ""
-
-    def step(
+    def _use(
         self,
         t_s: float,
-        imu: Sequence[ImuSample],
-        encoders: Sequence[WheelSample],
+        dt_s: float,
+        taken: Stack,
         edges: Sequence[EdgeSample],
-        gravity: GravitySample | None = None,
+        gravity: GravitySample | None,  # the thesis does without
     ) -> None:
-        """Take one sensors frame.
-
-        Any number of samples of each kind, each with its own time, oldest first. Unusable ones are dropped and counted;
-        a frame that is not newer than the last one changes nothing.
-
-        Args:
-            t_s: the frame's time, robot clock, s; the pose belongs to it afterwards.
-            imu: samples of the inertial unit since the last frame.
-            encoders: samples of the wheel encoders since the last frame.
-            edges: samples of the edge sensors since the last frame.
-            gravity: not used by the thesis's localizer.
-        """
-        last_s, kind = self._clock.t_s, self._clock.admit(t_s)
-        dt_s = t_s - last_s if kind is FrameKind.NEXT else 0.0
-        if kind is FrameKind.RESYNC:
-            self._resync(t_s, is_first=not isfinite(last_s))
-        elif kind is not FrameKind.NEXT:
-            self.counts[f"{kind.value}_frames"] += 1
-            if self._clock.stale_run >= BACKWARD_LIMIT:
-                self._ask_to_hold("time stamps of the frames run backward")
-            return
-        stack = self._intake.stack(self._builder, t_s, imu, encoders)
-        if self._intake.backward_source:
-            self._ask_to_hold(f"time stamps of the {self._intake.backward_source} run backward")
-            self._intake.backward_source = ""
-        if self.is_frozen:
-            return
-        try:
-            self._advance(t_s, dt_s, stack)
-            transitions = self._crossings.scan(t_s, self.speed_m_s, self.rate_rad_s, edges)
-            if transitions:
-                self._use_crossings(transitions)
-        except FilterDiverged as error:
-            self.is_frozen = True
-            self.counts["diverged"] += 1
-            self._ask_to_hold(f"filter: {error}")
+        self._advance(t_s, dt_s, taken)
+        transitions = self._crossings.scan(t_s, self.speed_m_s, self.rate_rad_s, edges)
+        if transitions:
+            self._use_crossings(transitions)
 
     def reset_filter(self, mu: FloatArray, sigma: FloatArray) -> None:
         """Re-initialise the filter, the thesis's ``resetFilter``.
@@ -301,10 +249,10 @@ class FourStateLocalizer:
         variances = (speed**2, cfg.reset_acceleration_sigma_m_s2**2, variance_rad2, rate**2)
         self.reset_filter(np.array([0.0, 0.0, heading_rad, 0.0]), np.diag(variances))
 
-    def _resync(self, t_s: float, is_first: bool) -> None:
+    def _resync(self, t_s: float, last_s: float) -> None:
         """Go on in a new time base: the pose does not step, what may have happened meanwhile goes to the sigmas."""
         self._odometer.start(t_s)
-        if is_first:
+        if not isfinite(last_s):
             return
         self.counts["resyncs"] += 1
         self._intake.restart()
@@ -312,6 +260,3 @@ class FourStateLocalizer:
         self._sigma.widen(abs(self.speed_m_s) * MAX_FRAME_STEP_S)
         if not self.is_frozen:
             self._filter.predict(np.eye(STATES), self._process.over(MAX_FRAME_STEP_S)[1])
-
-    def _ask_to_hold(self, cause: str) -> None:
-        self.hold_cause = self.hold_cause or cause

@@ -1,8 +1,8 @@
 """Pure. The full-state localizer: pose, speeds and the sensors' own errors in one filter, on the curved surface."""
 
-from collections import Counter
 from collections.abc import Sequence
 from math import isfinite, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,9 +12,10 @@ from ccatp.filters.base import Filter, FilterDiverged, FloatArray, Innovation
 from ccatp.localization.block import BlockBuilder
 from ccatp.localization.crossing import EdgeScanner
 from ccatp.localization.fixes import FixGated, check_fix, deck_foot
-from ccatp.localization.intake import BACKWARD_LIMIT, MAX_FRAME_STEP_S, FrameClock, FrameKind, SampleIntake
+from ccatp.localization.intake import MAX_FRAME_STEP_S
 from ccatp.localization.noise_floor import NoiseFloor
 from ccatp.localization.panel_frame import PanelFrame
+from ccatp.localization.receiver import FrameReceiver
 from ccatp.localization.rest import RestWatch
 from ccatp.localization.running_pose import RunningPose
 from ccatp.localization.survey_filter import SurveyFilter
@@ -30,7 +31,14 @@ _ROUNDING_S = 1e-6
 _NOMINAL_FRAME_S = 0.01
 
 
-class FullStateLocalizer:
+class _Moved(NamedTuple):
+    """Usable samples of a frame: of the inertial unit, and the rates of the right and of the left wheel."""
+
+    imu: Sequence[ImuSample]
+    rates_rad_s: tuple[Sequence[float], Sequence[float]]
+
+
+class FullStateLocalizer(FrameReceiver[_Moved]):
     """Estimates pose, speeds, sensor errors, slip and creep with one filter (``survey_model``), deck frame.
 
     Frames are gathered into blocks; the filter takes a block in one step, and dead reckoning carries the pose from
@@ -47,27 +55,18 @@ class FullStateLocalizer:
         start: pose at the first frame, at rest.
 
     Attributes:
-        counts: what was refused or used, by name.
-        hold_cause: why the mission should hold, or empty; stays until ``clear_hold``.
-        is_frozen: the filter has diverged; the pose stands still until the next fix.
         fix_deviation_m: how far the last fix was above the ideal surface.
-        notices: what an operator should read; whoever reads them empties the list.
     """
 
     def __init__(
         self, filter_: Filter, mirror: Mirror, robot: RobotConfig, cfg: LocalizerConfig, start: PanelPose
     ) -> None:
-        self.counts: dict[str, int] = Counter()
-        self.hold_cause = ""
+        super().__init__(cfg.history_s)
         self.fix_deviation_m = 0.0
-        self.is_frozen = False
-        self.notices: list[str] = []
         self._mirror, self._full = mirror, cfg.full_state
         self._puck_height_m = robot.puck_height_m
         self._v_limit_m_s = _IMPOSSIBLE * robot.wheel_radius_m * robot.max_wheel_rad_s
         self._omega_limit_rad_s = 2.0 * self._v_limit_m_s / robot.wheel_base_m
-        self._clock = FrameClock()
-        self._intake = SampleIntake(cfg.history_s, self.counts)
         self._right, self._left = WheelAngle(), WheelAngle()
         self._gyro = NoiseFloor(cfg.gyroscope_sigma_rad_s**2)
         self._accelerometer = NoiseFloor(cfg.accelerometer_sigma_m_s2**2)
@@ -79,6 +78,7 @@ class FullStateLocalizer:
         self._running = RunningPose(robot.wheel_radius_m, robot.wheel_base_m, self._full.jerk_density_m2_s5)
         self._panel = PanelFrame(mirror, start.panel)
         self._refused: list[FloatArray] = []
+        self._is_new_base = False
         self._turned = (0.0, 0.0)
         self._half_s = 0.0
         self._frame_s = _NOMINAL_FRAME_S
@@ -98,11 +98,6 @@ class FullStateLocalizer:
         now = self._running
         height_m = self._estimate.height_m(now.x_m, now.y_m)
         return self._panel.pose((now.x_m, now.y_m, now.heading_rad), height_m, self._slope)
-
-    @property
-    def t_s(self) -> float:
-        """Robot time to which the pose belongs: that of the last frame used; -inf before the first."""
-        return self._clock.t_s
 
     @property
     def speed_m_s(self) -> float:
@@ -151,74 +146,30 @@ class FullStateLocalizer:
         """The wheels have stood long enough to be sure."""
         return self._rest.is_resting
 
-    @property
-    def hold_requested(self) -> bool:
-        """Whether the mission should hold."""
-        return bool(self.hold_cause)
-
-    def clear_hold(self) -> None:
-        """Forget the cause for a hold; one that persists comes back."""
-        self.hold_cause = ""
-
     def rest(self) -> None:
         """The mission takes the robot to be at rest; the wheels themselves say here when it really is."""
 
     # -- frames -------------------------------------------------------------------------------------------------------
 
-    def step(
-        self,
-        t_s: float,
-        imu: Sequence[ImuSample],
-        encoders: Sequence[WheelSample],
-        edges: Sequence[EdgeSample],
-        gravity: GravitySample | None = None,
-    ) -> None:
-        """Take one sensors frame.
-
-        Any number of samples of each kind, each with its own time, oldest first. Unusable ones are dropped and counted;
-        a frame that is not newer than the last one changes nothing.
-
-        Args:
-            t_s: the frame's time, robot clock, s; the pose belongs to it afterwards.
-            imu: samples of the inertial unit since the last frame.
-            encoders: samples of the wheel encoders since the last frame.
-            edges: samples of the edge sensors since the last frame.
-            gravity: direction of gravity in the robot frame, where it was read.
-        """
-        last_s, kind = self._clock.t_s, self._clock.admit(t_s)
-        dt_s = t_s - last_s if kind is FrameKind.NEXT else 0.0
-        if kind is FrameKind.RESYNC:
-            self._resync(last_s)
-        elif kind is not FrameKind.NEXT:
-            self.counts[f"{kind.value}_frames"] += 1
-            if self._clock.stale_run >= BACKWARD_LIMIT:
-                self._ask_to_hold("time stamps of the frames run backward")
-            return
+    def _take(self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample]) -> _Moved:
         usable = self._intake.imu(t_s, imu) if imu else imu
         rates = self._take_wheels(t_s, encoders)
-        if kind is FrameKind.RESYNC:
+        if self._is_new_base:
+            self._is_new_base = False
             self._leave_out_turn()
-        if self._intake.backward_source:
-            self._ask_to_hold(f"time stamps of the {self._intake.backward_source} run backward")
-            self._intake.backward_source = ""
-        if self.is_frozen:
-            return
-        try:
-            right, left = self._turned
-            limit = self._full.rest_rate_rad_s * (dt_s or _NOMINAL_FRAME_S)
-            is_still = -limit <= right <= limit and -limit <= left <= limit
-            if is_still and self._rest.is_resting:
-                self._stay(t_s, dt_s, usable, rates, gravity)
-                self._edges.scan(edges)
-            else:
-                self._go(t_s, dt_s, usable, edges, is_still=is_still)
-        except FilterDiverged as error:
-            self._freeze(error)
+        return _Moved(usable, rates)
 
-    def _freeze(self, error: FilterDiverged) -> None:
-        self.is_frozen = True
-        self.counts["diverged"] += 1
-        self._ask_to_hold(f"filter: {error}")
+    def _use(
+        self, t_s: float, dt_s: float, taken: _Moved, edges: Sequence[EdgeSample], gravity: GravitySample | None
+    ) -> None:
+        right, left = self._turned
+        limit = self._full.rest_rate_rad_s * (dt_s or _NOMINAL_FRAME_S)
+        is_still = -limit <= right <= limit and -limit <= left <= limit
+        if is_still and self._rest.is_resting:
+            self._stay(t_s, dt_s, taken, gravity)
+            self._edges.scan(edges)
+        else:
+            self._go(t_s, dt_s, taken.imu, edges, is_still=is_still)
 
     def _leave_out_turn(self) -> None:
         """What the wheels did in the frame that begins a new time base lies in the gap before it, for the filter."""
@@ -241,16 +192,10 @@ class FullStateLocalizer:
         )
         return rates
 
-    def _stay(
-        self,
-        t_s: float,
-        dt_s: float,
-        imu: Sequence[ImuSample],
-        rates: tuple[Sequence[float], Sequence[float]],
-        gravity: GravitySample | None,
-    ) -> None:
+    def _stay(self, t_s: float, dt_s: float, taken: _Moved, gravity: GravitySample | None) -> None:
         """A frame at rest."""
-        for wheel, found in zip((self._right, self._left), rates, strict=True):
+        imu = taken.imu
+        for wheel, found in zip((self._right, self._left), taken.rates_rad_s, strict=True):
             wheel.rest(found)
         self._rebase()  # what adds up meanwhile is noise
         self._rested_s += dt_s
@@ -394,8 +339,9 @@ class FullStateLocalizer:
 
     # -- time ---------------------------------------------------------------------------------------------------------
 
-    def _resync(self, last_s: float) -> None:
+    def _resync(self, t_s: float, last_s: float) -> None:
         """Go on in a new time base: the pose does not step, what may have happened meanwhile goes to the covariance."""
+        self._is_new_base = True
         self._right.restart()
         self._left.restart()
         if not isfinite(last_s):
@@ -411,6 +357,3 @@ class FullStateLocalizer:
             self._carry_on(0.0)
         self._estimate.journal.restart()
         self._block.restart()
-
-    def _ask_to_hold(self, cause: str) -> None:
-        self.hold_cause = self.hold_cause or cause

@@ -6,7 +6,7 @@ Nothing here looks at a clock: all times are the robot's, as delivered.
 from collections import deque
 from collections.abc import Iterable, Sequence
 from enum import Enum
-from math import inf, isfinite
+from math import hypot, inf, isfinite
 from operator import lt
 
 from ccatp.localization.measurements import MeasurementBuilder, Stack, WheelReading
@@ -19,6 +19,7 @@ MAX_FRAME_STEP_S = 0.1
 BACKWARD_LIMIT = 5
 """This many backward time stamps in a row ask for a hold."""
 _ROUNDING_S = 1e-6
+_READABLE = 1e6  # rad/s or m/s^2: beyond what any sensor here can show; squares and products of it stay finite
 
 
 class FrameKind(Enum):
@@ -113,7 +114,8 @@ class SampleIntake:
 
     Args:
         history_s: samples older than this before their frame are refused.
-        counts: where refusals are counted, by reason: ahead, late, duplicate, backward, nonfinite.
+        counts: where refusals are counted, by reason: ahead, late, duplicate, backward, nonfinite
+            (or larger than any sensor can show).
 
     Attributes:
         backward_source: name of a sensor that has sent ``BACKWARD_LIMIT`` backward time stamps in a row, or empty;
@@ -140,19 +142,19 @@ class SampleIntake:
         self._imu, self._right, self._left = Source("imu"), Source("right encoder"), Source("left encoder")
 
     def are_clean(self, t_s: float, encoders: Sequence[WheelSample]) -> bool:
-        """Take the encoder samples whole if nothing is wrong with them: both wheels, finite, in order, new."""
+        """Take the encoder samples whole if nothing is wrong with them: both wheels, readable, in order, new."""
         return not encoders or self.columns(t_s, encoders) is not None
 
     def columns(self, t_s: float, encoders: Sequence[WheelSample]) -> WheelColumns | None:
         """The same, not empty, as columns; None if anything is wrong, and they have to be judged one by one."""
         times, right, left = zip(*encoders, strict=True)
         try:
-            total = sum(right) + sum(left)
+            size = hypot(*right, *left)  # not a number as soon as one of them is none
         except TypeError:  # a wheel gave no sample
             return None
         oldest_s = t_s - self._history_s
         newest_s = max(self._right.newest_s, self._left.newest_s, oldest_s)
-        if not (newest_s < times[0] and times[-1] <= t_s + _ROUNDING_S and isfinite(total)):
+        if not (newest_s < times[0] and times[-1] <= t_s + _ROUNDING_S and size < _READABLE):
             return None
         if not all(map(lt, times, times[1:])):
             return None
@@ -166,10 +168,10 @@ class SampleIntake:
         left: list[WheelReading] = []
         oldest_s = t_s - self._history_s
         for sample in encoders:
-            if not all(isfinite(value) for value in sample if value is not None):
+            sample_s, right_rad_s, left_rad_s = sample
+            if not (isfinite(sample_s) and hypot(right_rad_s or 0.0, left_rad_s or 0.0) < _READABLE):
                 self._counts["nonfinite"] += 1
                 continue
-            sample_s, right_rad_s, left_rad_s = sample
             for source, rate, kept in ((self._right, right_rad_s, right), (self._left, left_rad_s, left)):
                 if rate is not None and self._is_usable(source, sample_s, t_s):
                     source.use((sample_s,), oldest_s)
@@ -181,13 +183,13 @@ class SampleIntake:
         source, oldest_s = self._imu, t_s - self._history_s
         if len(samples) == 1:  # nearly always, and nearly always good
             t, ax, wz = samples[0]
-            if source.newest_s < t <= t_s and oldest_s <= t and isfinite(ax + wz):
+            if source.newest_s < t <= t_s and oldest_s <= t and hypot(ax, wz) < _READABLE:
                 source.use((t,), oldest_s)
                 return samples
         kept: list[ImuSample] = []
         for sample in samples:
             t, ax, wz = sample
-            if not isfinite(t + ax + wz):
+            if not (isfinite(t) and hypot(ax, wz) < _READABLE):
                 self._counts["nonfinite"] += 1
             elif self._is_usable(source, t, t_s):
                 source.use((t,), oldest_s)

@@ -166,7 +166,10 @@ def drive(plan: list[tuple[float, list[int]]], seed: int) -> list[Step]:
 def test_any_subset_of_the_robots_measurements(
     name: str, plan: list[tuple[float, list[int]]], seed: int, vector_R: bool
 ) -> None:
-    check(name, MEAN, COVARIANCE, drive(plan, seed), vector_R)
+    # A wheel knows the speed's variance several thousand times better than the prediction, with which the acceleration
+    # is correlated (0.99): a filter that carries a covariance, not its root, loses those digits in P - K S K^T. The
+    # worst of 10,000 searched plans lost to 8e-12.
+    check(name, MEAN, COVARIANCE, drive(plan, seed), vector_R, tolerance=1e-10)
 
 
 @EVERY_FILTER

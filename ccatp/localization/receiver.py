@@ -1,0 +1,110 @@
+"""Pure. What every localizer does with a frame before it looks inside: order of time, holds, divergence."""
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Sequence
+from typing import Generic, TypeVar
+
+from ccatp.filters.base import FilterDiverged
+from ccatp.localization.intake import BACKWARD_LIMIT, FrameClock, FrameKind, SampleIntake
+from ccatp.samples import EdgeSample, GravitySample, ImuSample, WheelSample
+
+Taken = TypeVar("Taken")
+
+
+class FrameReceiver(ABC, Generic[Taken]):
+    """Admits frames in their order, asks to hold where they or the filter go wrong.
+
+    Args:
+        history_s: samples older than this before their frame are refused.
+
+    Attributes:
+        counts: what was refused or used, by name.
+        hold_cause: why the mission should hold, or empty; stays until ``clear_hold``.
+        is_frozen: the filter has diverged; the pose stands still until the next fix.
+        notices: what an operator should read; whoever reads them empties the list.
+    """
+
+    def __init__(self, history_s: float) -> None:
+        self.counts: dict[str, int] = Counter()
+        self.hold_cause = ""
+        self.is_frozen = False
+        self.notices: list[str] = []
+        self._clock = FrameClock()
+        self._intake = SampleIntake(history_s, self.counts)
+
+    @property
+    def t_s(self) -> float:
+        """Robot time to which the pose belongs: that of the last frame used; -inf before the first."""
+        return self._clock.t_s
+
+    @property
+    def hold_requested(self) -> bool:
+        """Whether the mission should hold."""
+        return bool(self.hold_cause)
+
+    def clear_hold(self) -> None:
+        """Forget the cause for a hold; one that persists comes back."""
+        self.hold_cause = ""
+
+    def step(
+        self,
+        t_s: float,
+        imu: Sequence[ImuSample],
+        encoders: Sequence[WheelSample],
+        edges: Sequence[EdgeSample],
+        gravity: GravitySample | None = None,
+    ) -> None:
+        """Take one sensors frame.
+
+        Any number of samples of each kind, each with its own time, oldest first. Unusable ones are dropped and counted;
+        a frame that is not newer than the last one changes nothing.
+
+        Args:
+            t_s: the frame's time, robot clock, s; the pose belongs to it afterwards.
+            imu: samples of the inertial unit since the last frame.
+            encoders: samples of the wheel encoders since the last frame.
+            edges: samples of the edge sensors since the last frame.
+            gravity: direction of gravity in the robot frame, where it was read; the thesis's localizer does without.
+        """
+        last_s, kind = self._clock.t_s, self._clock.admit(t_s)
+        dt_s = t_s - last_s if kind is FrameKind.NEXT else 0.0
+        if kind is FrameKind.RESYNC:
+            self._resync(t_s, last_s)
+        elif kind is not FrameKind.NEXT:
+            self.counts[f"{kind.value}_frames"] += 1
+            if self._clock.stale_run >= BACKWARD_LIMIT:
+                self._ask_to_hold("time stamps of the frames run backward")
+            return
+        taken = self._take(t_s, imu, encoders)
+        if self._intake.backward_source:
+            self._ask_to_hold(f"time stamps of the {self._intake.backward_source} run backward")
+            self._intake.backward_source = ""
+        if self.is_frozen:
+            return
+        try:
+            self._use(t_s, dt_s, taken, edges, gravity)
+        except FilterDiverged as error:
+            self._freeze(error)
+
+    def _freeze(self, error: FilterDiverged) -> None:
+        self.is_frozen = True
+        self.counts["diverged"] += 1
+        self._ask_to_hold(f"filter: {error}")
+
+    def _ask_to_hold(self, cause: str) -> None:
+        self.hold_cause = self.hold_cause or cause
+
+    @abstractmethod
+    def _resync(self, t_s: float, last_s: float) -> None:
+        """Go on in a new time base that begins at ``t_s``; ``last_s`` is the end of the old one, -inf at the start."""
+
+    @abstractmethod
+    def _take(self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample]) -> Taken:
+        """The usable samples of a frame; wheels are counted even while the filter is frozen."""
+
+    @abstractmethod
+    def _use(
+        self, t_s: float, dt_s: float, taken: Taken, edges: Sequence[EdgeSample], gravity: GravitySample | None
+    ) -> None:
+        """Bring the filter to ``t_s``, ``dt_s`` after the last frame (0 in a new time base). May diverge."""
