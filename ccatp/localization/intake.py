@@ -19,7 +19,7 @@ MAX_FRAME_STEP_S = 0.1
 BACKWARD_LIMIT = 5
 """This many backward time stamps in a row ask for a hold."""
 _ROUNDING_S = 1e-6
-_READABLE = 1e6  # rad/s or m/s^2: beyond what any sensor here can show; squares and products of it stay finite
+_READABLE = 1e9  # rad/s or m/s^2: far beyond what any sensor shows; squares and products of it stay finite
 
 
 class FrameKind(Enum):
