@@ -20,6 +20,8 @@ from ccatp.localization.survey_model import (
     PSI,
     SL,
     SR,
+    TX,
+    TY,
     A,
     C,
     SensorRows,
@@ -154,7 +156,7 @@ def pose_problem(robot: RobotConfig, cfg: LocalizerConfig, rows: int, seed: int)
 
 
 def survey_problem(cfg: Config, seed: int) -> FilterProblem:
-    """The full-state localizer's problem with its own models: n = 17, both wheels' angles, rate and acceleration."""
+    """The full-state localizer's problem with its own models: n = 19, both wheels' angles, rate and acceleration."""
     rng = np.random.default_rng((seed, SURVEY_STATES))
     robot, full = cfg.robot, cfg.localizer.full_state
     mean, sigma = np.zeros(SURVEY_STATES), np.zeros(SURVEY_STATES)
@@ -164,7 +166,7 @@ def survey_problem(cfg: Config, seed: int) -> FilterProblem:
     sigma[BG], sigma[KG] = full.gyroscope_bias_sigma_rad_s, full.gyroscope_scale_sigma
     sigma[BA], sigma[KL] = full.accelerometer_bias_sigma_m_s2, full.wheel_base_sigma
     sigma[[SR, SL]], sigma[C], sigma[[E0, E1]] = full.slip_sigma, full.creep_sigma, full.edge_sigma_m
-    sigma[[PR, PL]] = sqrt(_ANGLE_RAD2)
+    sigma[[PR, PL]], sigma[[TX, TY]] = sqrt(_ANGLE_RAD2), robot.puck_height_m * full.panel_tilt_sigma_rad
     x = mean + 0.5 * sigma * rng.normal(size=SURVEY_STATES)
     slope = Terrain(build_mirror(cfg.mirror)).at(float(mean[X]), float(mean[Y]))
     motion = SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m).over(DT_S, slope)

@@ -141,7 +141,7 @@ class FullStateConfig(Model):
     gravity_floor_rad: Positive
     gravity_least_tilt: Positive
     gravity_gate: Positive
-    fix_extra_sigma_m: NonNegative
+    panel_tilt_sigma_rad: Positive
     fix_gate_nis: Positive
     consistent_m: Positive
     relocated_heading_sigma_rad: Positive

@@ -286,8 +286,7 @@ class FullStateLocalizer(FrameReceiver[_Moved]):
         estimate, t_s = self._estimate, self._clock.t_s
         check_fix(fix, estimate.journal.oldest_s, t_s + MAX_FRAME_STEP_S)
         foot = deck_foot(self._mirror, fix, self._puck_height_m)
-        variance = foot.covariance_m2 + np.eye(2) * self._full.fix_extra_sigma_m**2
-        z = np.array([foot.x_m, foot.y_m])
+        z, variance = np.array([foot.x_m, foot.y_m]), foot.covariance_m2
         before = self._running.x_m, self._running.y_m
         try:
             if not self.is_frozen:

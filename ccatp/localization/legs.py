@@ -85,6 +85,7 @@ class LegBook:
         self._creep_share = cfg.creep_scatter_share**2
         self._scatters = self._learned()
         self._wander = cfg.wander_fraction**2 / cfg.wander_time_s
+        self._wandered = 0.0  # variance of the mean slip's wander in this leg, part of the scatter
         self._is_open = False
 
     def _learned(self) -> tuple[float, float, float]:
@@ -98,7 +99,7 @@ class LegBook:
 
     def first(self) -> tuple[FloatArray, FloatArray]:
         """Prior of (right slip, left slip, creep) before the first leg: mean (3,), covariance (3, 3)."""
-        self._is_open = True
+        self._open()
         means, variances = [], []
         for parameter, scatter in zip(self._parameters, self._scatters, strict=True):
             parameter.prior = (parameter.mean, parameter.variance + scatter)
@@ -117,14 +118,19 @@ class LegBook:
             beta, own = parameter.pass_on(float(found[k]), float(known[k]), before[k], self._scatters[k])
             betas.append(beta)
             owns.append(own)
-        self._is_open = True
+        self._open()
         means = np.array([parameter.mean for parameter in self._parameters])
         F, Q = (_STATES * betas).dot(_PARAMETERS), (_STATES * owns).dot(_STATES.T)
         return Redraw(states, F, _STATES.dot(means), Q)
 
-    def wander_variance(self, dt_s: float) -> tuple[float, float]:
-        """By how much slip (of each wheel) and creep wander within a leg, variance per step of ``dt_s``."""
+    def _open(self) -> None:
+        self._is_open = True
+        self._wandered = 0.0
+
+    def wander(self, dt_s: float) -> tuple[float, float]:
+        """Slip (of each wheel) and creep wander within the leg for a step of ``dt_s``: by which variance."""
         per_step = self._wander * dt_s
+        self._wandered += per_step
         return 2.0 * per_step * self._scatters[0], per_step * self._scatters[2]
 
     def end(self, mean: FloatArray, covariance: FloatArray) -> None:
@@ -134,9 +140,11 @@ class LegBook:
         self._is_open = False
         found = _PARAMETERS.dot(mean[_WHERE])
         known = _PARAMETERS.dot(covariance[np.ix_(_WHERE, _WHERE)]).dot(_PARAMETERS.T).diagonal()
-        alone = _leg_alone(self._parameters[0].prior, (float(found[0]), float(known[0])))
+        mean_slip, variance = self._parameters[0].prior
+        prior = mean_slip, variance + self._wandered * self._scatters[0]
+        alone = _leg_alone(prior, (float(found[0]), float(known[0])))
         if alone is not None:
-            self._slip_scatter.learn(*alone)
+            self._slip_scatter.learn(*alone, 1.0 + self._wandered)
 
     def forget_leg(self) -> None:
         """The leg's measurements are not to be trusted."""

@@ -43,11 +43,17 @@ class Population:
         """Variance of the next leg's parameter: scatter plus what is not known of the mean."""
         return self.scatter + self.mean_variance
 
-    def learn(self, value: float, variance: float) -> None:
-        """Take a leg's estimate and the variance that the leg's own measurements give it, without the prior."""
+    def learn(self, value: float, variance: float, share: float = 1.0) -> None:
+        """Take a leg's estimate of its parameter.
+
+        Args:
+            value: the estimate.
+            variance: what the leg's own measurements give it, without the prior.
+            share: of the scatter's variance in it: more than one where the parameter also wanders within the leg.
+        """
         for k, sigma in enumerate(self._sigmas):
             known, e = self._variances[k], value - self._means[k]
-            total = known + sigma * sigma + variance
+            total = known + share * sigma * sigma + variance
             self._logs[k] = _FORGETTING * self._logs[k] - 0.5 * (e * e / total + log(total))
             self._means[k] += known / total * e
             self._variances[k] = max(known * (1.0 - known / total), _LEAST)

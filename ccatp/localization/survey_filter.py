@@ -18,6 +18,7 @@ from ccatp.localization.survey_model import (
     BA,
     BG,
     E0,
+    E1,
     KG,
     KL,
     PL,
@@ -26,6 +27,8 @@ from ccatp.localization.survey_model import (
     SL,
     SR,
     STATES,
+    TX,
+    TY,
     A,
     C,
     SensorRows,
@@ -38,7 +41,7 @@ from ccatp.localization.survey_model import (
 from ccatp.localization.terrain import Slope, Terrain
 from ccatp.localization.wheel_angles import WheelAngle
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import DeckPose
+from ccatp.samples import DeckPose, PanelId
 
 _STOP_ROWS = np.eye(STATES)[[V, A, W]]
 _UNKNOWN_SPEEDS = 0.1**2, 0.5**2, 1.0**2  # variances of v, a, w of a robot of which nothing is known
@@ -74,11 +77,12 @@ class SurveyFilter:
         self._filter, self._counts = filter_, counts
         self._is_again = False
         self._cfg, self._full = cfg, cfg.full_state
-        self._terrain = Terrain(mirror)
+        self._mirror, self._terrain = mirror, Terrain(mirror)
         self._motion = SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m)
         self._rows = SensorRows()
         self._seams = SeamLines(mirror, robot)
         self._legs = LegBook(self._full)
+        self._tilt_sigma_m = robot.puck_height_m * cfg.full_state.panel_tilt_sigma_rad
         self._gravity_deck = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
         self._start(start)
 
@@ -91,10 +95,11 @@ class SurveyFilter:
         sigma[[V, A, W]] = cfg.reset_speed_sigma_m_s, cfg.reset_acceleration_sigma_m_s2, cfg.reset_rate_sigma_rad_s
         sigma[BG], sigma[KG] = full.gyroscope_bias_sigma_rad_s, full.gyroscope_scale_sigma
         sigma[BA], sigma[KL] = full.accelerometer_bias_sigma_m_s2, full.wheel_base_sigma
-        sigma[[E0, E0 + 1]] = full.edge_sigma_m
+        sigma[[E0, E1]], sigma[[TX, TY]] = full.edge_sigma_m, self._tilt_sigma_m
         P = np.diag(sigma**2)
         mean[_DRAWN], P[_WHERE_DRAWN] = self._legs.first()
         self._filter.reset(mean, P)
+        self._panel = self._panel_below()
 
     @property
     def mean(self) -> FloatArray:
@@ -140,7 +145,7 @@ class SurveyFilter:
         """
         dt_s = block.dt_s
         if dt_s > 0.0:
-            scatter = self._legs.wander_variance(block.turning_s)
+            scatter = self._legs.wander(block.turning_s)
             encoders = self.encoder_walk(right) * dt_s
             self._do(lambda: self._predict(dt_s, scatter, encoders))
         counts = None
@@ -156,6 +161,18 @@ class SurveyFilter:
             jump = self._full.acceleration_jump_m_s2**2
             acceleration = block.acceleration_m_s2, imu_variances[1] / block.samples + jump
         self._do(lambda: self._sense(counts, rate, acceleration))
+        self._enter()
+
+    def _enter(self) -> None:
+        """The tilt belongs to the panel under the robot."""
+        panel = self._panel_below()
+        if panel != self._panel:
+            self._panel = panel
+            self._do(lambda: self._renew([TX, TY], self._tilt_sigma_m))
+
+    def _panel_below(self) -> PanelId:
+        mean = self._filter.mean
+        return self._mirror.nearest_panel(float(mean[X]), float(mean[Y]))
 
     def _predict(self, dt_s: float, scatter: tuple[float, float], encoders: float) -> None:
         full, mean = self._full, self._filter.mean
@@ -275,7 +292,7 @@ class SurveyFilter:
 
     def _use_line(self, edge: Edge, transition: Transition, t_s: float) -> None:
         if edge.is_new:
-            self._renew_offset(edge.offset)
+            self._renew([edge.offset], self._full.edge_sigma_m)
         mean, P = self._filter.mean, self._filter.covariance
         residual, H, variance = self._seams.line(edge, transition, t_s, mean, self.slope())
         spread = variance + float(H[0].dot(P).dot(H[0]))
@@ -284,11 +301,11 @@ class SurveyFilter:
         if is_used:
             self._update(H.dot(mean) + residual, H, np.array([variance]))
 
-    def _renew_offset(self, k: int) -> None:
-        """The state of an edge's offset is given to another edge: nothing known of it, nothing correlated."""
+    def _renew(self, states: list[int], sigma: float) -> None:
+        """States are given to other edges or panels: nothing known of them, nothing correlated."""
         F, Q = np.eye(STATES), np.zeros((STATES, STATES))
-        F[k, k] = 0.0
-        Q[k, k] = self._full.edge_sigma_m**2
+        F[states, states] = 0.0
+        Q[states, states] = sigma * sigma
         self._filter.predict(F, Q)
 
     # -- fixes --------------------------------------------------------------------------------------------------------
@@ -322,9 +339,10 @@ class SurveyFilter:
     def _fix_row(self, z: FloatArray, mean: FloatArray, late_s: float) -> tuple[FloatArray, FloatArray]:
         """Residual (2,) and row (2, n) of a position ``late_s`` before the state's time, in which V and W held."""
         H = np.zeros((2, STATES))
-        H[0, X] = H[1, Y] = 1.0
+        H[0, X] = H[1, Y] = H[0, TX] = H[1, TY] = 1.0
+        residual = z - mean[[X, Y]] - mean[[TX, TY]]
         if late_s == 0.0:
-            return z - mean[:2], H
+            return residual, H
         v, w = float(mean[V]), float(mean[W])
         slope = self._terrain.at(float(mean[X]), float(mean[Y]))
         hx, hy, lx, ly = axes_on(slope, float(mean[PSI]) - 0.5 * w * late_s)
@@ -332,7 +350,7 @@ class SurveyFilter:
         H[:, PSI] = -way * lx, -way * ly
         H[:, V] = -late_s * hx, -late_s * hy
         H[:, W] = -0.5 * late_s * H[:, PSI]
-        return z - (mean[:2] - way * np.array((hx, hy))), H
+        return residual + way * np.array((hx, hy)), H
 
     def fix_residual(self, t_s: float, z: FloatArray) -> FloatArray:
         """How far a position (2,) lies from what the filter held for true at ``t_s``."""
@@ -364,12 +382,15 @@ class SurveyFilter:
         shift = self.fix_residual(t_s, z)
         x, P = self._filter.mean.copy(), self._filter.covariance.copy()
         heading_variance = float(P[PSI, PSI]) + self._full.relocated_heading_sigma_rad**2
-        new = [X, Y, PSI, PR, PL, *((V, A, W) if is_lost else ())]
+        new = [X, Y, PSI, PR, PL, TX, TY, *((V, A, W) if is_lost else ())]
         P[new, :] = 0.0
         P[:, new] = 0.0
         P[:2, :2], P[PSI, PSI] = variance, heading_variance
-        x[:2] += shift
-        x[[PR, PL]] = 0.0
+        tilt = self._tilt_sigma_m**2
+        P[[X, Y, TX, TY], [X, Y, TX, TY]] += tilt
+        P[[X, Y, TX, TY], [TX, TY, X, Y]] -= tilt
+        x[:2] += shift + x[[TX, TY]]
+        x[[PR, PL, TX, TY]] = 0.0
         if is_lost:
             x[[V, A, W]] = 0.0
             P[V, V], P[A, A], P[W, W] = _UNKNOWN_SPEEDS
@@ -378,6 +399,7 @@ class SurveyFilter:
         self._legs.forget_leg()
         self.innovation = None
         self._filter.reset(x, P)
+        self._panel = self._panel_below()
 
     def lose(self, way_m: float, turn_rad: float) -> None:
         """The robot may have gone this far, and turned, without anyone looking."""

@@ -12,7 +12,7 @@ import numpy as np
 from ccatp.filters.base import FloatArray
 from ccatp.localization.terrain import Slope
 
-X, Y, PSI, V, A, W, BG, KG, BA, SR, SL, KL, C, PR, PL, E0, E1 = range(17)
+X, Y, PSI, V, A, W, BG, KG, BA, SR, SL, KL, C, PR, PL, E0, E1, TX, TY = range(19)
 """Order of the state.
 
 X, Y: robot origin, deck frame, m. PSI: deck heading, rad, not wrapped. V: speed that the wheels give the body over the
@@ -20,9 +20,10 @@ last step, m/s. A: its rate of change, m/s^2. W: rate about the normal over the 
 rad/s. KG: gyroscope scale error. BA: accelerometer bias, m/s^2. SR, SL: slip of the right and of the left wheel, the
 part of its travel that the body does not follow (an error of the radius included). KL: relative error of the wheel
 base. C: downhill creep, part of |V|. PR, PL: angle of the right and of the left wheel since the last rest, rad. E0, E1:
-how far the two edges of the seam crossed last lie from where the map has them, m.
+how far the two edges of the seam crossed last lie from where the map has them, m. TX, TY: by how much the puck is off
+its place over the robot because the panel under it is tilted, deck frame, m.
 """
-STATES = 17
+STATES = 19
 _NOISY = np.array([A, W, SR, SL, C])  # whose noise enters at the beginning of a step and is carried through it
 
 
@@ -63,7 +64,7 @@ class SurveyMotion:
         if x is self._of:  # the same arrays again: the filter asks for what the noise has asked for already
             return self._x, self._F
         self._of = x
-        x_m, y_m, psi, v, a, w, bg, kg, ba, s_r, s_l, kl, c, p_r, p_l, e_0, e_1 = x.tolist()
+        x_m, y_m, psi, v, a, w, bg, kg, ba, s_r, s_l, kl, c, p_r, p_l, *offsets = x.tolist()
         dt, (fx, fy, fxx, fxy, _, gx, gy) = self._dt_s, self._slope
         v += a * dt
         d, turn = v * dt, w * dt
@@ -96,8 +97,7 @@ class SurveyMotion:
             c,
             p_r + right * per_r,
             p_l + left * per_l,
-            e_0,
-            e_1,
+            *offsets,
         )
         sign = c if d >= 0.0 else -c
         xv, yv = dt * (hx + sign * gx), dt * (hy + sign * gy)
@@ -124,7 +124,7 @@ class SurveyMotion:
     def through(self, points: FloatArray) -> FloatArray:
         """The states (k, n) after the step, one for each row."""
         dt, (fx, fy, fxx, fxy, _, gx, gy) = self._dt_s, self._slope
-        x_m, y_m, psi, v, a, w, _, _, _, s_r, s_l, kl, c, p_r, p_l, _, _ = points.T
+        x_m, y_m, psi, v, a, w, _, _, _, s_r, s_l, kl, c, p_r, p_l, *_ = points.T
         v = v + a * dt
         d, turn = v * dt, w * dt
         s2 = 1.0 + fx * fx

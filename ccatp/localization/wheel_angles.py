@@ -6,7 +6,7 @@ from math import inf
 # Nothing but a counter gives exact zeros: this many samples in a row without another value.
 _ZEROS_OF_A_COUNTER = 8
 _COUNTER_NOISE = 1.0 / 12.0  # variance of a uniform distribution over one count
-_MIN_VARIANCE_RAD2 = 1e-9  # a micrometre of travel: less would cost the filter digits and tell it nothing
+_MIN_VARIANCE_RAD2 = 1e-10  # a third of a micrometre of travel: less would cost the filter digits and tell it nothing
 # A wheel that gave no sample for this long may have done anything meanwhile.
 _GAP_S = 0.02
 _LOST = 1.5  # periods between two samples of a counter beyond which one is missing

@@ -10,7 +10,7 @@ from ccatp.filters.smoother import ROUNDING, Smoother
 
 # Calls that may still be taken back. A late fix reaches back some seconds, which are a few hundred.
 REACH = 2000
-# Steps in one smoother: some 30 MB at 17 states, so that going back needs little more memory than the record itself.
+# Steps in one smoother: some 30 MB at 19 states, so that going back needs little more memory than the record itself.
 CHAPTER = 4096
 
 
@@ -51,7 +51,7 @@ class RecordingFilter:
     after is forgotten. From a state in which nothing was recorded yet: the beginning. Anything else is a transition of
     its own (``transition_of_reset``).
 
-    The record costs ``Smoother``'s memory, 7 kB a transition at 17 states.
+    The record costs ``Smoother``'s memory, 9 kB a transition at 19 states.
 
     Args:
         filter_: does the work.

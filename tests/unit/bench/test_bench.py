@@ -76,7 +76,7 @@ def test_the_exact_answer_on_a_case_done_by_hand() -> None:
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
 def test_the_full_state_model_is_filtered_exactly(cfg: Config, name: str) -> None:
     problem = survey_problem(cfg, 1)
-    assert (problem.mean.size, problem.variances.size) == (17, 4)
+    assert (problem.mean.size, problem.variances.size) == (19, 4)
     exact = exact_filter(problem, unscented=name == "ukf")
     assert largest_difference(our_filter(name, problem), exact, 4).absolute < 1e-13  # rounding
     peers = (filterpy_extended,) if name == "ekf" else (lambda p: filterpy_unscented(p, ALPHA, BETA, 0.0),)

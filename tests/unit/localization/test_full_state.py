@@ -11,7 +11,7 @@ from ccatp.filters import FILTERS, Filter, FilterDiverged, FloatArray
 from ccatp.localization.fixes import FixGated, FixRefused
 from ccatp.localization.full_state import FullStateLocalizer
 from ccatp.localization.intake import MAX_FRAME_STEP_S
-from ccatp.localization.survey_model import BG, PSI, SL, SR, STATES, A, V, W, X, Y
+from ccatp.localization.survey_model import BG, PSI, SL, SR, STATES, TX, A, V, W, X, Y
 from ccatp.samples import DeckPose, Fix, GravitySample, PanelId, PanelPose
 from tests.unit.localization.drive import (
     FRAME_S,
@@ -97,7 +97,7 @@ def test_where_the_gate_is(off_sigmas: float) -> None:
     found = build()
     robot = rested(found)
     x, P = found.state
-    sigma = sqrt(P[X, X] + 1e-10 + 2.5e-11)
+    sigma = sqrt(P[X, X] + P[TX, TX] + 2.0 * P[X, TX] + 1e-10)
     fix = fix_at(robot.t_s, (float(x[X]) + off_sigmas * sigma, float(x[Y])))
     if off_sigmas < sqrt(50.0):
         found.fuse_fix(fix)

@@ -166,16 +166,36 @@ def test_the_next_leg_is_given_what_bayes_gives_it(full: FullStateConfig) -> Non
 def test_a_leg_is_learned_from_without_what_was_expected_of_it(
     full: FullStateConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[tuple[float, float]] = []
-    monkeypatch.setattr(Population, "learn", lambda _, value, variance: told.append((value, variance)))
+    told: list[tuple[float, float, float]] = []
+    monkeypatch.setattr(Population, "learn", lambda _, value, variance, share: told.append((value, variance, share)))
     book = LegBook(full)
     x, P = state(*book.first())
     for slip, z in ((SR, 0.05), (SL, 0.03)):
         x, P = update(x, P, np.eye(STATES)[slip], z, 4e-4)  # as much as the prior: the posterior is half of each
     book.end(x, P)
-    value, variance = told[0]
+    value, variance, share = told[0]
     assert variance == pytest.approx(2e-4, rel=1e-9)  # of a mean of two
     assert value == pytest.approx(0.04, rel=1e-9)
+    assert share == 1.0
+
+
+def test_what_wandered_within_a_leg_is_no_knowledge_lost(
+    full: FullStateConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The leg's own variance is that of its measurements; the wander counts with the scatter of which it is a share."""
+    told: list[tuple[float, float, float]] = []
+    monkeypatch.setattr(Population, "learn", lambda _, value, variance, share: told.append((value, variance, share)))
+    book = LegBook(full)
+    x, P = state(*book.first())
+    slip, creep = book.wander(2.0)
+    P[[SR, SL, C], [SR, SL, C]] += slip, slip, creep
+    for wheel, z in ((SR, 0.05), (SL, 0.03)):
+        x, P = update(x, P, np.eye(STATES)[wheel], z, 4e-4)
+    book.end(x, P)
+    value, variance, share = told[0]
+    assert variance == pytest.approx(2e-4, rel=1e-9)
+    assert value == pytest.approx(0.04, rel=1e-9)
+    assert share == pytest.approx(1.0 + full.wander_fraction**2 / full.wander_time_s * 2.0)
 
 
 def test_the_deviation_from_what_was_expected_passes_through(full: FullStateConfig) -> None:
@@ -244,7 +264,7 @@ def test_a_leg_that_showed_nothing_new_does_not_count(full: FullStateConfig) -> 
 
 def test_slip_and_creep_wander_within_a_leg(full: FullStateConfig) -> None:
     book = LegBook(full)
-    slip, creep = book.wander_variance(0.5)
+    slip, creep = book.wander(0.5)
     share = full.wander_fraction**2 / full.wander_time_s * 0.5
     assert slip == pytest.approx(2.0 * share * book.scatter[0] ** 2)  # of a wheel: twice that of a mean of two
     assert creep == pytest.approx(share * book.scatter[1] ** 2)

@@ -49,7 +49,7 @@ def near(limit: float) -> st.SearchStrategy[float]:
 def states(draw: st.DrawFn) -> FloatArray:
     """Any state of a robot that moves: |d| has no derivative at standstill."""
     x = np.array(
-        [draw(near(limit)) for limit in (3, 3, 7, 0.0, 0.5, 2, 0.05, 0.05, 1, 0.05, 0.05, 0.05, 0.1, 9, 9, 1, 1)]
+        [draw(near(limit)) for limit in (3, 3, 7, 0.0, 0.5, 2, 0.05, 0.05, 1, 0.05, 0.05, 0.05, 0.1, 9, 9, 1, 1, 1, 1)]
     )
     x[V] = draw(st.sampled_from([-1.0, 1.0])) * draw(st.floats(0.06, 0.4))  # more than a dt takes away
     return x

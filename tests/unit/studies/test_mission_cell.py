@@ -83,8 +83,9 @@ def test_a_real_mission_says_the_same_as_its_summary() -> None:
     cfg = load_config(None, {"run.mirror": "thesis-m1", "run.panels": 1, "run.filter": "ekf", "run.world": "hard"})
     outcome = run_mission(Job("trial", {}, cfg.run.seed, cfg))
     values, _ = combine_missions({}, [outcome])
-    # A summary is rounded to 1 um; between its stop and the end of the measurement the fans shake the robot a little.
-    for name, tolerance_mm in (("localization_error_mm", 1e-3), ("arrival_error_mm", 0.02)):
+    # A summary is rounded to 1 um. Between its stop and the end of the measurement the fans shake the robot: by 7 um
+    # rms at either time (1 mm/s over a frame), so by 10 um between the two, of which four sigmas are allowed.
+    for name, tolerance_mm in (("localization_error_mm", 1e-3), ("arrival_error_mm", 0.04)):
         summary = outcome.values[name]
         assert values[name]["mean"] == pytest.approx(summary["mean"], abs=tolerance_mm)
         assert values[name]["max"] == pytest.approx(summary["max"], abs=tolerance_mm)
