@@ -5,7 +5,7 @@ from math import exp, log
 # Candidates for the scatter, from "does not change" to "anything goes"; a factor of sqrt(2) apart.
 _CANDIDATES = tuple(1e-6 * 2.0 ** (k / 2.0) for k in range(32))
 _FORGETTING = 0.99  # of the likelihoods per leg, so that a world that changes is noticed within a hundred legs
-_ALIKE = 5.0  # prior weight of the smallest candidate, "does not change": floors on which wheels hold are common
+_ALIKE = 10.0  # prior weight of the smallest candidate, "does not change": floors on which wheels hold are common
 _LEAST = 1e-14
 
 
