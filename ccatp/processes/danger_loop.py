@@ -117,10 +117,10 @@ class DangerLoop:
         self._give(verdict, sensors.seq)
 
     def _give(self, verdict: Verdict, ack: int) -> None:
-        self._publisher.send("verdict", verdict)
-        if ack >= 0:
+        if ack >= 0:  # the robot first: what it may do does not wait for anyone to read why
             self._permit_seq += 1
             self.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
+        self._publisher.send("verdict", verdict)
         if verdict.code is not self._code or verdict.cause != self._cause:
             self._announce(verdict)
 

@@ -224,19 +224,19 @@ class MainLoop:
             self._teller.stale_frame(seq, raw)
             self._drive(seq, 0.0, 0.0)
             return
+        motion = self._motion(sensors, dt_s)
         waiting = time.perf_counter()
         verdict = self._ear.hear(seq, self._frame_period_s(), is_lockstep=self._is_lockstep)
         heard = time.perf_counter()
-        motion = self._motion(sensors, dt_s)
         order = self._mission.step(motion, verdict)
         right, left = self._gate.pass_through(order.twist, verdict, dt_s)
         if order.at_rest or order.measure:
             self._execute(order, motion)
-        self._teller.frame(seq, t_s, localizer, self._mission.state, raw)
         if self._may_answer():
             self._drive(seq, right, left)
         else:
             self._unanswered = seq
+        self._teller.frame(seq, t_s, localizer, self._mission.state, raw)
         if self._mission.state is not self._state:
             self._on_state()
         self._teller.tick(1e6 * (time.perf_counter() - heard + waiting - start))
