@@ -62,6 +62,34 @@ def test_a_fix_places_the_robot_and_shows_its_heading_after_a_way(filter_name: s
     assert found.counts["fixes"] == 2
 
 
+def test_fixes_of_a_panel_share_its_tilt() -> None:
+    """A puck 0.1 mm off its place at both ends of a base line of 0.135 m turns nothing; by chance it would by 1 mrad."""
+    certain = dict.fromkeys(("creep_sigma", "slip_difference_sigma", "slip_scatter_max", "wheel_base_sigma"), 1e-6)
+    found = build(panel_tilt_sigma_rad=2e-3, **certain)  # the wheels tell no heading, but they keep it
+    robot = Robot(v=lambda t: STRAIGHT(t) + STRAIGHT(t - 3.0), errors=Errors(noise=1.0))
+    run(found, robot.frames(2.6))
+    found.fuse_fix(robot.fix(sigma_m=1e-6, off_m=(1e-4, 1e-4)))
+    run(found, robot.frames(2.9))
+    found.fuse_fix(robot.fix(sigma_m=1e-6, off_m=(1e-4, 1e-4)))
+    assert found.heading_sigma_rad < 2e-4
+    assert abs(errors_of(found, robot.pose)[1]) < 4.0 * found.heading_sigma_rad
+    assert found.position_sigma_m == pytest.approx(1e-4, rel=0.2)  # the tilt itself cannot be told from the place
+
+
+def test_another_panel_has_a_tilt_of_its_own() -> None:
+    found = build(start=PanelPose(PanelId(2, 7), 0.25, 0.0, 0.0))
+    robot = Robot(PanelPose(PanelId(2, 7), 0.25, 0.0, 0.0), v=STRAIGHT)
+    prior = found.state[1][TX, TX]
+    run(found, robot.frames(0.4))
+    found.fuse_fix(robot.fix(sigma_m=1e-6))
+    assert abs(found.state[1][X, TX]) > 0.5 * prior  # the fix ties it to the place
+    run(found, robot.frames(2.2))
+    P = found.state[1]
+    assert found.pose.panel == PanelId(2, 8)
+    assert P[TX, TX] == pytest.approx(prior)
+    assert not np.delete(P[TX], TX).any()
+
+
 def test_how_far_the_fix_is_above_the_surface() -> None:
     found = build()
     robot = rested(found)
