@@ -63,9 +63,14 @@ def test_a_fix_places_the_robot_and_shows_its_heading_after_a_way(filter_name: s
 
 
 def test_fixes_of_a_panel_share_its_tilt() -> None:
-    """A puck 0.1 mm off its place at both ends of a base line of 0.135 m turns nothing; by chance it would by 1 mrad."""
-    certain = dict.fromkeys(("creep_sigma", "slip_difference_sigma", "slip_scatter_max", "wheel_base_sigma"), 1e-6)
-    found = build(panel_tilt_sigma_rad=2e-3, **certain)  # the wheels tell no heading, but they keep it
+    """A puck 0.1 mm off its place at both ends of a base line of 0.135 m turns nothing; chance would, 1 mrad."""
+    found = build(  # the wheels tell no heading, but they keep it
+        panel_tilt_sigma_rad=2e-3,
+        creep_sigma=1e-6,
+        slip_difference_sigma=1e-6,
+        slip_scatter_max=1e-6,
+        wheel_base_sigma=1e-6,
+    )
     robot = Robot(v=lambda t: STRAIGHT(t) + STRAIGHT(t - 3.0), errors=Errors(noise=1.0))
     run(found, robot.frames(2.6))
     found.fuse_fix(robot.fix(sigma_m=1e-6, off_m=(1e-4, 1e-4)))
