@@ -10,10 +10,11 @@ from ccatp.filters.base import Filter, FloatArray, Innovation
 from ccatp.localization.affine import Affine
 from ccatp.localization.block import Block
 from ccatp.localization.crossing import Transition
+from ccatp.localization.fix_rows import begun_anew, fix_row
 from ccatp.localization.journal import Journal, Step
 from ccatp.localization.legs import LegBook, Redraw
 from ccatp.localization.rest import RestReading, heading_from_gravity
-from ccatp.localization.seam_lines import Edge, SeamLines, axes_on
+from ccatp.localization.seam_lines import Edge, SeamLines
 from ccatp.localization.survey_model import (
     BA,
     BG,
@@ -44,7 +45,6 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.samples import DeckPose, PanelId
 
 _STOP_ROWS = np.eye(STATES)[[V, A, W]]
-_UNKNOWN_SPEEDS = 0.1**2, 0.5**2, 1.0**2  # variances of v, a, w of a robot of which nothing is known
 _DRAWN = [SR, SL, C]
 _WHERE_DRAWN = np.ix_(_DRAWN, _DRAWN)
 
@@ -337,20 +337,7 @@ class SurveyFilter:
         return self._filter.update(H.dot(mean) + residual, H, variance)
 
     def _fix_row(self, z: FloatArray, mean: FloatArray, late_s: float) -> tuple[FloatArray, FloatArray]:
-        """Residual (2,) and row (2, n) of a position ``late_s`` before the state's time, in which V and W held."""
-        H = np.zeros((2, STATES))
-        H[0, X] = H[1, Y] = H[0, TX] = H[1, TY] = 1.0
-        residual = z - mean[[X, Y]] - mean[[TX, TY]]
-        if late_s == 0.0:
-            return residual, H
-        v, w = float(mean[V]), float(mean[W])
-        slope = self._terrain.at(float(mean[X]), float(mean[Y]))
-        hx, hy, lx, ly = axes_on(slope, float(mean[PSI]) - 0.5 * w * late_s)
-        way = v * late_s
-        H[:, PSI] = -way * lx, -way * ly
-        H[:, V] = -late_s * hx, -late_s * hy
-        H[:, W] = -0.5 * late_s * H[:, PSI]
-        return residual + way * np.array((hx, hy)), H
+        return fix_row(z, mean, self._terrain.at(float(mean[X]), float(mean[Y])), late_s)
 
     def fix_residual(self, t_s: float, z: FloatArray) -> FloatArray:
         """How far a position (2,) lies from what the filter held for true at ``t_s``."""
@@ -365,35 +352,15 @@ class SurveyFilter:
         return float(residual.dot(np.linalg.solve(S, residual))) > self._full.fix_gate_nis
 
     def relocate(self, t_s: float, z: FloatArray, variance: FloatArray, *, is_lost: bool) -> None:
-        """Begin anew from a position (2,) measured at ``t_s``, and its covariance (2, 2); wheel angles count from here.
-
-        The heading loses its certainty, not its value. The way since then is taken from the estimate that was wrong:
-        wrong about where it began, not about what the wheels did.
-
-        Args:
-            t_s: time of the position.
-            z: deck, m.
-            variance: its covariance, m^2.
-            is_lost: the filter has stood still meanwhile; the speeds are not known either.
+        """Begin anew from a position (2,) measured at ``t_s``, and its covariance (2, 2); see ``begun_anew``.
 
         Raises:
             FilterDiverged: the state is not finite.
         """
-        shift = self.fix_residual(t_s, z)
-        x, P = self._filter.mean.copy(), self._filter.covariance.copy()
-        heading_variance = float(P[PSI, PSI]) + self._full.relocated_heading_sigma_rad**2
-        new = [X, Y, PSI, PR, PL, TX, TY, *((V, A, W) if is_lost else ())]
-        P[new, :] = 0.0
-        P[:, new] = 0.0
-        P[:2, :2], P[PSI, PSI] = variance, heading_variance
-        tilt = self._tilt_sigma_m**2
-        P[[X, Y, TX, TY], [X, Y, TX, TY]] += tilt
-        P[[X, Y, TX, TY], [TX, TY, X, Y]] -= tilt
-        x[:2] += shift + x[[TX, TY]]
-        x[[PR, PL, TX, TY]] = 0.0
-        if is_lost:
-            x[[V, A, W]] = 0.0
-            P[V, V], P[A, A], P[W, W] = _UNKNOWN_SPEEDS
+        residual = self.fix_residual(t_s, z)
+        mean, P = self._filter.mean, self._filter.covariance
+        heading_rad2 = self._full.relocated_heading_sigma_rad**2
+        x, P = begun_anew(mean, P, residual, variance, self._tilt_sigma_m**2, heading_rad2, is_lost=is_lost)
         self.journal.restart()
         self._seams.forget()
         self._legs.forget_leg()
