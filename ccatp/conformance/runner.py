@@ -1,5 +1,6 @@
 """Glue. Runs the checks against one server, from the first connection to the last."""
 
+import time
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from typing import Any
@@ -115,8 +116,9 @@ class Conformance:
             reason = error.strerror or str(error)
             raise NoRobot(f"no server at {self._where}: {reason}; start it first") from error
         try:
-            if not link.lines and not link.is_ended:
-                receive_any([link], self._timeout_s)
+            deadline_s = time.monotonic() + self._timeout_s
+            while not link.lines and not link.is_ended and (left_s := deadline_s - time.monotonic()) > 0.0:
+                receive_any([link], left_s)
             line = link.lines[0] if link.lines else b""
         finally:
             link.close()

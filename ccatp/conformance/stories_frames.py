@@ -9,7 +9,7 @@ from ccatp.conformance.stage import Stage
 from ccatp.conformance.verdict import require
 from ccatp.wire.lines import MAX_LINE_BYTES
 
-FRAMES = 60
+FRAMES = 40
 JoinedFrames = Sequence[Message]
 
 

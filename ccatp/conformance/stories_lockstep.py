@@ -47,6 +47,7 @@ def one_step(stage: Stage) -> str:
     """One frame for each pair of answers, one period on."""
     pair = Pair(stage)
     before = pair.steady()
+    require(not pair.pause(LOOK_S), "a second frame on one drive and one permit")
     pair.drive()
     pair.permit()
     frames = pair.pause(LOOK_S)

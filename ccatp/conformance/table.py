@@ -37,7 +37,7 @@ class Check(NamedTuple):
 
 
 _AGAIN = "one, an older one, and one more of the same number"
-_FRAMES = "60 frames, each answered by a drive and a permit"
+_FRAMES = "40 frames, each answered by a drive and a permit"
 _FORWARD, _REVERSE, _TURN = (True, False, False), (False, True, False), (False, False, True)
 _BAD = {
     "no-json": ("a line that is no JSON is dropped", "a drive without its last brace"),
