@@ -148,13 +148,17 @@ class Stage:
             raise Broken(f"{shorten(line)} instead of joined or refused")
         return message
 
-    def join(self, role: Role) -> Link:
+    def join(self, role: Role, patience_s: float | None = None) -> Link:
         """A session. The one before may not have ended yet, so a role that is taken is asked for again.
+
+        Args:
+            role: what to join as.
+            patience_s: how long it is asked for; the time-out by default.
 
         Raises:
             Broken: refused.
         """
-        deadline_s = time.monotonic() + self.timeout_s
+        deadline_s = time.monotonic() + (self.timeout_s if patience_s is None else patience_s)
         while True:
             link, hello = self.greet()
             link.send(self.join_line(hello, role))

@@ -189,7 +189,8 @@ def take_over(stage: Stage) -> str:
         raise NotApplicable("the server or this machine is too slow to tell")
     _be_noisy(pair, silent_s + TAKEN_S)
     try:
-        link = stage.join("controller")
+        # Not for long: now the holder is silent altogether.
+        link = stage.join("controller", patience_s=0.2 * SILENCE_S)
     except Broken as broken:
         raise Broken(f"{broken} after {pair.newest.t_s - silent_s:.2f} s without a valid line of its holder") from None
     return f"refused at {STILL_HELD_S:g} s of silence, joined at {TAKEN_S:g} s"

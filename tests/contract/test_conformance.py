@@ -21,7 +21,7 @@ from tests.contract.crooked import HONEST, Crooked, checked, serving
 
 KEY = b"secret"
 PATIENT_S = 10.0  # an answer takes milliseconds; a loaded machine may take this long
-PARTS = 5  # run side by side, each on a robot of its own
+PARTS = 4  # run side by side, each on a robot of its own
 NEEDS = {check.check_id: check.needs for check in CHECKS}
 
 

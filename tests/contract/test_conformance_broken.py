@@ -10,10 +10,11 @@ import pytest
 
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
-from ccatp.conformance import stories_frames
+from ccatp.conformance import stories_frames, stories_session
 from ccatp.conformance.stories_input import BAD_DRIVES
 from ccatp.conformance.table import CHECKS
 from ccatp.dataloop import DataLoop
+from ccatp.sim import sessions
 from ccatp.sim.rules import Fans, MotionRules
 from ccatp.wire.lines import BadLineCounter, LineBuffer
 from ccatp.wire.robot import Drive, join_mac
@@ -575,7 +576,11 @@ async def test_fans_over_an_overhang() -> None:
     await judge(load_config(overrides={"run.mirror": "fyst-m2"}), FLOORS, lockstep=True)
 
 
-async def test_on_the_wall_clock(config: Config) -> None:
+async def test_on_the_wall_clock(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Roles may be taken over after one second instead of five; that it is five the honest robot shows.
+    monkeypatch.setattr(sessions, "SILENCE_S", 1.0)
+    for name, value_s in (("SILENCE_S", 1.0), ("STILL_HELD_S", 0.7), ("TAKEN_S", 1.3)):
+        monkeypatch.setattr(stories_session, name, value_s)
     await judge(config, REALTIME, lockstep=False)
 
 
