@@ -10,6 +10,7 @@ import click
 
 import ccatp
 from ccatp.cli_bench import bench
+from ccatp.cli_conformance import conformance
 from ccatp.cli_frame import (
     ADDRESS_OPTIONS,
     CONFIG_OPTION,
@@ -224,6 +225,7 @@ def sim_etalon(
 cli.add_command(bench)
 cli.add_command(study)
 cli.add_command(replay)
+cli.add_command(conformance)
 
 
 @cli.command("map", epilog=example("ccatp map runs/20260101T000000Z-fyst-m1-s1 --out map.png"))

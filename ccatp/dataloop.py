@@ -183,6 +183,11 @@ class _Connection(asyncio.Protocol):
         except Exception as error:
             self._owner.fail(error)
 
+    def eof_received(self) -> None:
+        # The transport closes only when the client has taken what waits for it; the session ends here and now.
+        if self._session is not None:
+            self._owner.server.lost(self._session)
+
     def connection_lost(self, exc: Exception | None) -> None:
         if self._session is not None:
             self._owner.closed(self, self._session)

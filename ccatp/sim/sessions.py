@@ -210,7 +210,8 @@ class RobotServer:
 
     def join(self, session: Session, message: FromClient, now_s: float) -> None:
         """A session that has no role yet sent its first message."""
-        if not isinstance(message, Join):
+        # The round of `check_time` may come later than this message: the limit holds all the same.
+        if not isinstance(message, Join) or now_s - session.joined_s > JOIN_TIMEOUT_S:
             self.refuse(session, "bad join")
             return
         if self._key is not None and not is_mac_right(self._key, session.nonce, message):
@@ -282,12 +283,18 @@ class RobotServer:
 
         After a longer stop of this process the robot's clock goes on where it stood, as if it had been off.
         """
-        late_s = now_s - self.next_frame_s
-        if late_s > self.robot.frame_s:
+        if self._skip_stop(now_s) > self.robot.frame_s:
             self.counts["slips"] += 1
-        if late_s > MAX_LAG_S:
-            self._boot_s += late_s
         self._advance(now_s)
+
+    def _skip_stop(self, now_s: float) -> float:
+        """Set the robot's clock back to where it stood before a longer stop; by how much the next frame is late, s."""
+        late_s = now_s - self.next_frame_s
+        if late_s <= MAX_LAG_S:
+            return late_s
+        self.counts["slips"] += 1
+        self._boot_s += late_s
+        return 0.0
 
     def _advance(self, now_s: float) -> None:
         self._is_drive_acked = self._is_permit_acked = False
@@ -307,4 +314,8 @@ class RobotServer:
 
     def _robot_time_s(self, now_s: float) -> float:
         robot_s = self.robot.t_s
-        return robot_s if self._is_lockstep else max(robot_s, now_s - self._boot_s)
+        if self._is_lockstep:
+            return robot_s
+        # A command that is read before the first frame after a stop must not count as one of the time to come.
+        self._skip_stop(now_s)
+        return max(robot_s, now_s - self._boot_s)

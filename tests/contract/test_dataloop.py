@@ -210,6 +210,17 @@ async def test_refusals_do_not_disturb_the_one_who_drives(config: Config, join: 
             assert (frame["seq"], frame["cmd"]["held"]) == (k + 1, False)
 
 
+async def test_a_join_after_two_seconds_is_refused_whenever_it_is_looked_for(config: Config) -> None:
+    async with running(config) as rig:
+        peer = await rig.peer()
+        await peer.expect("hello")
+        session = next(iter(rig.loop.server._sessions))
+        rig.loop.server.check_time(session.joined_s + 2.0)  # just in time; the next round comes after the join
+        session.receive(JOIN, session.joined_s + 2.01)
+        assert await peer.message() == {"type": "refused", "reason": "bad join"}
+        assert await peer.line() == b""
+
+
 async def test_a_role_is_free_again_when_its_holder_leaves(config: Config) -> None:
     async with running(config) as rig:
         for session in (1, 2, 3):
@@ -400,6 +411,17 @@ async def test_a_lost_session_holds_and_leaves_the_fans(config: Config, how: str
         assert frame["t"] - gone <= 0.05
         assert frame["cmd"]["held"]
         assert frame["fans"] == [0.7, 0.8]
+
+
+async def test_a_session_is_lost_with_its_fin_however_much_its_client_has_not_read(config: Config) -> None:
+    async with running(config) as rig:
+        peer = await rig.peer(JOIN)
+        await peer.expect("joined")
+        next(iter(rig.loop._connections)).write(
+            b"x" * 20_000_000
+        )  # more than the kernel keeps for a client that is deaf
+        peer.writer.write_eof()
+        await rig.notes.until("controller lost: wheels held")
 
 
 async def test_time_to_live_on_the_wall_clock(config: Config) -> None:

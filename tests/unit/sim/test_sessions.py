@@ -474,6 +474,19 @@ def test_late_frames_are_made_up_for(rig: Callable[..., Rig]) -> None:
     assert r.server.next_frame_s == pytest.approx(1000.0 + (r.robot.seq + 1) * 0.01, abs=1e-9)
 
 
+def test_a_drive_read_first_after_a_long_stop_lives_no_longer_than_any_other(rig: Callable[..., Rig]) -> None:
+    r = rig(lockstep=False)
+    controller = r.client(JOIN)
+    r.run(0.1)
+    r.now_s += 20.0
+    controller.drive(1, 10)  # before the frame that is late
+    r.run(0.2)
+    assert not controller.messages[-1]["cmd"]["held"]
+    r.run(0.1)
+    assert controller.messages[-1]["cmd"]["held"]
+    assert r.server.counts["slips"] == 1
+
+
 def test_after_a_long_stop_the_clock_goes_on_where_it_stood(rig: Callable[..., Rig]) -> None:
     r = rig(lockstep=False)
     controller = r.client(JOIN)

@@ -1,0 +1,237 @@
+"""Our own robot keeps every promise of the interface page, and the command that says so."""
+
+import asyncio
+import json
+import re
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ccatp.cli import main
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.conformance.runner import Conformance
+from ccatp.conformance.table import CHECKS, check_ids
+from ccatp.conformance.verdict import Result
+from ccatp.dataloop import DataLoop
+from tests.contract.crooked import HONEST, Crooked, checked, serving
+
+KEY = b"secret"
+PATIENT_S = 10.0  # an answer takes milliseconds; a loaded machine may take this long
+PARTS = 4  # run side by side, each on a robot of its own
+NEEDS = {check.check_id: check.needs for check in CHECKS}
+
+
+def expected(lockstep: bool, key: bytes | None, floor: bool) -> set[str]:
+    """The checks that do not apply."""
+    lacking = {"real time" if lockstep else "lockstep", *(() if key else ("hmac",))}
+    return {name for name, needs in NEEDS.items() if lacking & set(needs)} | (set() if floor else {"fan-floor"})
+
+
+def judge(results: list[Result], not_applicable: set[str]) -> None:
+    assert [result for result in results if result.outcome == "fail"] == []
+    assert {result.check_id for result in results if result.outcome == "not applicable"} == not_applicable
+
+
+async def both_robots(lockstep: bool) -> None:
+    """A plain robot without a key and a delayed one with fan floor and key, each part of the checks on its own."""
+    slow = ["take-over", "join-late"]  # the longest, by themselves
+    others = [name for name in check_ids() if name not in slow]
+    parts = [*([name] for name in slow), *(others[k::PARTS] for k in range(PARTS))]
+    overhanging = load_config(overrides={"run.mirror": "fyst-m2", "run.world": "extreme"})
+    robots = [(load_config(), None), (overhanging, KEY)]
+    runs = [
+        checked(cfg, part, lockstep=lockstep, timeout_s=PATIENT_S, key=key) for cfg, key in robots for part in parts
+    ]
+    found = await asyncio.gather(*runs)
+    for (config, key), of_robot in zip(robots, (found[: len(parts)], found[len(parts) :]), strict=True):
+        results = [result for part in of_robot for result in part]
+        assert sorted(result.check_id for result in results) == sorted(check_ids())
+        judge(results, expected(lockstep, key, config is overhanging))
+
+
+async def test_our_robots_in_lockstep() -> None:
+    await both_robots(lockstep=True)
+
+
+async def test_our_robots_on_the_wall_clock() -> None:
+    await both_robots(lockstep=False)
+
+
+async def run_on(port: int, motion: bool, only: tuple[str, ...] = ()) -> list[Result]:
+    """Results of the checks on a robot that is there already."""
+    return await asyncio.to_thread(
+        lambda: Conformance(("127.0.0.1", port), None, PATIENT_S).run(motion=motion, only=only)
+    )
+
+
+async def test_the_robot_is_left_held_and_its_fans_as_they_were(config: Config) -> None:
+    loops: list[DataLoop] = []
+    crooked = Crooked("seen from within", frozenset(), (), twist=loops.append)
+    async with serving(config, lockstep=False, crooked=crooked) as port:
+        robot = loops[0].robot
+        robot.fans.duty = (0.31, 0.33)
+        results = await run_on(port, True, ("fans", "fans-rst", "newest-fans", "move-turn"))
+        robot.advance()
+        assert robot.rules.is_held
+        assert robot.fans.duty == pytest.approx((0.31, 0.33))
+    assert [result.outcome for result in results] == ["pass"] * 4
+
+
+async def test_no_motion_turns_no_wheel(config: Config) -> None:
+    heard: list[bytes] = []
+
+    def hears(data: bytes, _: object) -> bytes:
+        heard.append(data)
+        return data
+
+    listening = Crooked("heard", frozenset(), (), hears=hears)
+    drives = ("echo", "newest-drive", "fans-rst", "no-json", "nan", "many-lines", "single-bytes", "lockstep-drive")
+    only = (*drives, *(name for name, needs in NEEDS.items() if "motion" in needs))
+    async with serving(config, lockstep=True, crooked=listening) as port:
+        results = await run_on(port, False, only)
+    sent = b"".join(heard)
+    assert sent.count(b'"drive"') > 100
+    assert not re.search(rb'"w[rl]":"?-?[0.]*[1-9]', sent)
+    left_out = [result for result in results if "motion" in NEEDS[result.check_id]]
+    assert {(result.outcome, result.detail) for result in left_out} == {("not applicable", "--no-motion")}
+
+
+async def test_a_hello_of_no_use_fails_its_check_and_stops_the_others(config: Config) -> None:
+    def says(message: dict[str, object], _: object) -> dict[str, object]:
+        if message["type"] == "hello":
+            message["ttl_s"] = "0.25"
+        return message
+
+    crooked = Crooked("ttl as text", frozenset(), (), says=says)
+    results = await checked(config, lockstep=True, timeout_s=PATIENT_S, crooked=crooked)
+    assert [(r.check_id, r.detail) for r in results if r.outcome == "fail"] == [("hello", "ttl_s = '0.25'")]
+    assert [r.check_id for r in results if r.outcome == "pass"] == ["hello-robot"]
+    assert results[2].detail == "the hello is of no use: ttl_s = '0.25'"
+
+
+# -- the command ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def robot(config: Config) -> Iterator[str]:
+    """A robot in lockstep, in a thread of its own; its address."""
+    yield from _in_a_thread(config, HONEST, None)
+
+
+@pytest.fixture
+def locked(config: Config) -> Iterator[str]:
+    """The same with a key."""
+    yield from _in_a_thread(config, HONEST, KEY)
+
+
+@pytest.fixture
+def broken(config: Config) -> Iterator[str]:
+    """A robot with faults of its own."""
+
+    def says(message: dict[str, object], _: object) -> dict[str, object]:
+        return message | {"faults": ["on_fire"]} if message["type"] == "sensors" else message
+
+    yield from _in_a_thread(config, Crooked("on fire", frozenset(), (), says=says), None)
+
+
+def _in_a_thread(config: Config, crooked: Crooked, key: bytes | None) -> Iterator[str]:
+    ready, over = threading.Event(), threading.Event()
+    port = 0
+
+    async def serve() -> None:
+        nonlocal port
+        async with serving(config, lockstep=True, crooked=crooked, key=key) as port:
+            ready.set()
+            await asyncio.to_thread(over.wait)
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve()))
+    thread.start()
+    try:
+        assert ready.wait(PATIENT_S)
+        yield f"127.0.0.1:{port}"
+    finally:
+        over.set()
+        thread.join()
+
+
+def test_json_alone_on_standard_output(robot: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["conformance", robot, "--json", "--only", "hello", "--only", "move-turn", "--only", "mac"]) == 0
+    captured = capsys.readouterr()
+    result = json.loads(captured.out)
+    assert (result["server"], result["passed"], result["failed"]) == (robot, 2, 0)
+    assert [list(check) for check in result["checks"]] == [["id", "promise", "result", "detail"]] * 3
+    assert [(check["id"], check["result"]) for check in result["checks"]] == [
+        ("hello", "pass"), ("mac", "not applicable"), ("move-turn", "pass"),
+    ]  # fmt: skip
+    assert "wheels will turn in 1 checks, each at most 0.5 rad/s (15 mm/s)" in captured.err
+
+
+def test_the_table(broken: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["conformance", broken, "--no-motion", "--only", "boot", "--only", "frames-faults"]) == 1
+    captured = capsys.readouterr()
+    boot, faults, last = captured.out.splitlines()
+    assert re.fullmatch(r"boot +ok +boot \d+ on 8 connections", boot)
+    promised = "promised: faults holds names out of the page's list"
+    assert re.fullmatch(rf"frames-faults +FAIL +seen: fault 'on_fire'; {promised}", faults)
+    assert last == "1 passed, 1 failed, 0 not applicable"
+    assert captured.err == ""
+
+
+def test_a_key(locked: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["conformance", locked, "--no-motion"]) == 2
+    assert "asks for a key: name its file with --key" in capsys.readouterr().err
+    assert main(["conformance", locked, "--key", str(tmp_path / "none")]) == 2
+    assert "--key: cannot read" in capsys.readouterr().err
+    key_file = tmp_path / "key"
+    key_file.write_bytes(KEY + b"\n")
+    assert main(["conformance", locked, "--key", str(key_file), "--only", "mac", "--only", "mac-wrong"]) == 0
+
+
+def test_another_program_drives(robot: str, capsys: pytest.CaptureFixture[str]) -> None:
+    host, _, port = robot.partition(":")
+    with socket.create_connection((host, int(port))) as other, other.makefile("rb") as lines:
+        lines.readline()
+        other.sendall(b'{"type":"join","role":"controller","client":"main"}\n')
+        assert b"joined" in lines.readline()
+        assert main(["conformance", robot, "--no-motion", "--timeout", "0.3"]) == 5
+    assert "another program drives the robot" in capsys.readouterr().err
+
+
+def test_nobody_there(free_port: int, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["conformance", f"127.0.0.1:{free_port}"]) == 5
+    assert f"no server at 127.0.0.1:{free_port}: Connection refused" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("first", "said"), [(b"SSH-2.0-OpenSSH\n", "says 'SSH-2.0-OpenSSH'"), (b"", "says nothing")])
+def test_another_kind_of_server(first: bytes, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def greet() -> None:
+            peer, _ = listener.accept()
+            with peer:
+                peer.sendall(first)
+
+        thread = threading.Thread(target=greet)
+        thread.start()
+        assert main(["conformance", f"127.0.0.1:{listener.getsockname()[1]}"]) == 5
+        thread.join()
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["7010"], "'7010' is not HOST:PORT, as in 127.0.0.1:7010"),
+        (["host:70100"], "'host:70100' is not HOST:PORT"),
+        (["127.0.0.1:7010", "--only", "ttl-drve"], "no check 'ttl-drve'; did you mean ttl-drive?"),
+        (["127.0.0.1:7010", "--only", "zzz"], "no check 'zzz'; there are hello,"),
+        (["127.0.0.1:7010", "--timeout", "0"], "--timeout 0 is no time to wait"),
+    ],
+)
+def test_usage(args: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["conformance", *args]) == 2
+    assert said in capsys.readouterr().err

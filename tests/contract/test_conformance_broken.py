@@ -1,0 +1,590 @@
+"""Servers that break the page in one place each: just the checks meant for that place fail."""
+
+import asyncio
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.conformance import stories_frames, stories_session
+from ccatp.conformance.stories_input import BAD_DRIVES
+from ccatp.conformance.table import CHECKS
+from ccatp.dataloop import DataLoop
+from ccatp.sim import sessions
+from ccatp.sim.rules import Fans, MotionRules
+from ccatp.wire.lines import BadLineCounter, LineBuffer
+from ccatp.wire.robot import Drive, join_mac
+from ccatp.wire.robot import Fans as FansMessage
+from tests.contract.crooked import Crooked, Message, Middle, failures
+
+AT_ONCE = 8  # servers
+KEY = b"secret"
+IDS = [check.check_id for check in CHECKS]
+HELLO = tuple(IDS[: IDS.index("join")])
+JOIN = ("join", "join-role", "join-client", "join-first", "role-taken", "refused-harmless")
+MAC = tuple(name for name in IDS if name.startswith("mac"))
+FRAMES = (*(name for name in IDS if name.startswith("frames")), "echo")
+NEWEST = ("newest-drive", "newest-permit", "role-drive", "newest-fans", "role-fans")
+FANS = ("fans", "newest-fans", "role-fans", "fans-stop", "fans-fin", "fans-rst", "fan-floor")
+LINES = tuple(IDS[IDS.index("no-json") : IDS.index("lockstep-drive")])
+LOCKSTEP = tuple(name for name in IDS if name.startswith("lockstep"))
+MOVES = tuple(name for name in IDS if name.startswith("move"))
+TIMED = ("no-permit", "no-drive", "ttl-drive", "ttl-permit", "ttl-noise", *(n for n in IDS if n.startswith("lost")))
+
+
+def of(kind: str, change: Callable[[Message, Middle], object]) -> Callable[[Message, Middle], Message]:
+    """Change messages of one type in place."""
+
+    def says(message: Message, middle: Middle) -> Message:
+        if message["type"] == kind:
+            change(message, middle)
+        return message
+
+    return says
+
+
+def put(kind: str, **values: Any) -> Callable[[Message, Middle], Message]:
+    """Other values in messages of one type."""
+    return of(kind, lambda message, _: message.update(values))
+
+
+def swap(old: bytes, new: bytes) -> Callable[[bytes, Middle], bytes]:
+    """Something else in what clients send."""
+    return lambda data, _: data.replace(old, new)
+
+
+def rules(**methods: Any) -> Callable[[DataLoop], None]:
+    """Other rules of motion."""
+    return lambda loop: setattr(
+        loop.robot.rules, "__class__", type("Other", (MotionRules,), {"__slots__": (), **methods})
+    )
+
+
+def fans(**methods: Any) -> Callable[[DataLoop], None]:
+    """Other rules of the fans."""
+    return lambda loop: setattr(loop.robot.fans, "__class__", type("Other", (Fans,), {"__slots__": (), **methods}))
+
+
+# -- hello and join ---------------------------------------------------------------------------------------------------
+
+
+def _edges(hello: Message, _: Middle) -> None:
+    edges = hello["robot"]["edge_sensors_m"]
+    edges[0], edges[1] = edges[1], edges[0]
+
+
+def _boots(hello: Message, middle: Middle) -> None:
+    middle.owner.server.counts["boots"] += 1
+    hello["boot"] = middle.owner.server.counts["boots"]
+
+
+def _throw_out(loop: DataLoop) -> None:
+    join = loop.server.join
+
+    def crooked(session: Any, message: Any, now_s: float) -> None:
+        holder = loop.server._holders.get(getattr(message, "role", "controller"))
+        if holder is not None:
+            loop.server.drop(holder, "thrown out")
+        join(session, message, now_s)
+
+    loop.server.join = crooked  # type: ignore[method-assign]
+
+
+def _disturb(loop: DataLoop) -> None:
+    refuse = loop.server.refuse
+
+    def crooked(session: Any, reason: Any) -> None:
+        for holder in list(loop.server._holders.values()):
+            holder.wire.close()
+        refuse(session, reason)
+
+    loop.server.refuse = crooked  # type: ignore[method-assign]
+
+
+def _patient(loop: DataLoop, extra_s: float) -> None:
+    accept = loop.server.accept
+
+    def crooked(wire: Any, now_s: float) -> Any:
+        session = accept(wire, now_s)
+        session.joined_s += extra_s
+        return session
+
+    loop.server.accept = crooked  # type: ignore[method-assign]
+
+
+def _join_by_drive(data: bytes, middle: Middle) -> bytes:
+    if middle.session.role is None and b"drive" in data:
+        return b'{"type":"join","role":"controller","client":"x"}\n'
+    return data
+
+
+def _mac(is_good: Callable[[Message, Middle], bool]) -> Callable[[bytes, Middle], bytes]:
+    """Macs that are not right, and taken."""
+
+    def hears(data: bytes, middle: Middle) -> bytes:
+        if b'"join"' not in data:
+            return data
+        join = json.loads(data)
+        if is_good(join, middle):
+            join["mac"] = join_mac(KEY, middle.hello["nonce"], join["role"])
+        return json.dumps(join).encode() + b"\n"
+
+    return hears
+
+
+def _mac_of_any(join: Message, middle: Middle) -> bool:
+    nonces = middle.owner.__dict__.setdefault("nonces", [])
+    others = [connection for connection in middle.owner._connections if isinstance(connection, Middle)]
+    nonces.extend(connection.hello["nonce"] for connection in others if connection.hello)
+    return any(join.get("mac") == join_mac(KEY, nonce, join["role"]) for nonce in nonces)
+
+
+def _mac_of_any_role(join: Message, middle: Middle) -> bool:
+    return join.get("mac") in {join_mac(KEY, middle.hello["nonce"], role) for role in ("controller", "monitor")}
+
+
+SESSIONS = [
+    Crooked("protocol of another version", frozenset({"hello"}), HELLO, says=put("hello", protocol="ccatp-robot/2")),
+    Crooked("boot as text", frozenset({"hello"}), HELLO, says=put("hello", boot="417")),
+    Crooked("edge sensors in another order", frozenset({"hello-robot"}), HELLO, says=of("hello", _edges)),
+    Crooked("a repeated nonce", frozenset({"nonce"}), HELLO, says=put("hello", nonce="0" * 32)),
+    Crooked("a boot per connection", frozenset({"boot"}), HELLO, says=of("hello", _boots)),
+    Crooked("joined without session", frozenset({"join"}), JOIN,
+            says=of("joined", lambda joined, _: joined.pop("session"))),
+    Crooked("an unknown role taken for monitor", frozenset({"join-role"}), JOIN[:5], hears=swap(b"king", b"monitor")),
+    Crooked("a join without client", frozenset({"join-client"}), JOIN,
+            hears=swap(b'"controller"}', b'"controller","client":"x"}')),
+    Crooked("joined by a drive", frozenset({"join-first"}), JOIN, hears=_join_by_drive),
+    Crooked("the last to come has the role", frozenset({"role-taken", "refused-harmless"}), JOIN, twist=_throw_out),
+    Crooked("a refusal closes the holders, too", frozenset({"role-taken", "refused-harmless"}), JOIN, twist=_disturb),
+    Crooked("waits for joins for ever", frozenset({"join-late"}), ("join-late", "join"),
+            twist=lambda loop: _patient(loop, 60.0)),
+    Crooked("waits for joins half a second", frozenset({"join-late", "join-in-time"}),
+            ("join-late", "join-in-time", "join"), twist=lambda loop: _patient(loop, -1.5)),
+]  # fmt: skip
+MACS = [
+    Crooked("takes every mac", frozenset(MAC[1:]), MAC, hears=_mac(lambda *_: True)),
+    Crooked("takes a bad mac", frozenset({"mac-wrong", "mac-nonce", "mac-role"}), MAC,
+            hears=_mac(lambda join, _: "mac" in join)),
+    Crooked("takes no mac", frozenset({"mac-missing"}), MAC, hears=_mac(lambda join, _: "mac" not in join)),
+    Crooked("takes a mac of any connection", frozenset({"mac-nonce"}), MAC, hears=_mac(_mac_of_any)),
+    Crooked("takes a mac of any role", frozenset({"mac-role"}), MAC, hears=_mac(_mac_of_any_role)),
+    Crooked("says bad join of a bad mac", frozenset({"mac-wrong", "mac-nonce", "mac-role"}), MAC,
+            says=put("refused", reason="bad join")),
+]  # fmt: skip
+
+# -- frames -----------------------------------------------------------------------------------------------------------
+
+
+def _each(change: Callable[[Message], object]) -> Callable[[Message, Middle], Message]:
+    return of("sensors", lambda frame, _: change(frame))
+
+
+def _thrice(frame: Message) -> None:
+    frame["imu"] = [[t - back, ax, wz] for t, ax, wz in frame["imu"] for back in (0.006, 0.003, 0.0)]
+
+
+def _not_each_to_the_monitor(message: Message, middle: Middle) -> Message | None:
+    is_left_out = message["type"] == "sensors" and middle.session.role == "monitor" and message["seq"] % 7 == 0
+    return None if is_left_out else message
+
+
+def _to_all(loop: DataLoop) -> None:
+    send = loop.server._send_frame
+
+    def crooked() -> None:
+        send()
+        if len(loop.server._holders) == 2:
+            for session in loop.server._sessions:
+                if session.role is None:
+                    session.wire.write(loop.robot.delivered_line)
+
+    loop.server._send_frame = crooked  # type: ignore[method-assign]
+
+
+def _key_twice(message: Message, _: Middle) -> Message | bytes:
+    if message["type"] != "sensors":
+        return message
+    return json.dumps(message).encode().replace(b'"soc"', b'"soc": 1.0, "soc"') + b"\n"
+
+
+def _fix(name: str, frame: Message, place: int, value: float) -> None:
+    for sample in frame[name]:
+        sample[place] = value
+
+
+STREAMS = [
+    Crooked("a key twice", frozenset({"frames-lines"}), FRAMES, says=_key_twice),
+    Crooked("another rate than the hello's", frozenset({"frames-clock"}), FRAMES, says=put("hello", frame_hz=60.0)),
+    Crooked("samples of two", frozenset({"frames-samples"}), FRAMES,
+            says=_each(lambda frame: frame.update(imu=[sample[:2] for sample in frame["imu"]]))),
+    Crooked("newest samples first", frozenset({"frames-times"}), FRAMES, says=_each(lambda f: f["enc"].reverse())),
+    Crooked("samples of the frame before", frozenset({"frames-times"}), FRAMES,
+            says=_each(lambda f: [sample.__setitem__(0, sample[0] - 0.015) for sample in f["imu"]])),
+    Crooked("three times as many", frozenset({"frames-rates"}), FRAMES, says=_each(_thrice)),
+    Crooked("an edge of two", frozenset({"frames-edge"}), FRAMES, says=_each(lambda f: _fix("edge", f, 3, 2))),
+    Crooked("gravity in m/s2", frozenset({"frames-gravity"}), FRAMES, says=_each(
+        lambda f: f["gravity"] and f.update(gravity=[f["gravity"][0], 0.0, 0.0, -9.81]))),
+    Crooked("charge in per cent", frozenset({"frames-state"}), FRAMES, says=put("sensors", soc=93.0)),
+    Crooked("a fault of its own", frozenset({"frames-faults"}), FRAMES, says=put("sensors", faults=["on_fire"])),
+    Crooked("ages below zero", frozenset({"frames-cmd"}), FRAMES,
+            says=_each(lambda frame: frame["cmd"].update(age=frame["cmd"]["age"] - 0.02))),
+    Crooked("a monitor that misses frames", frozenset({"frames-all"}), FRAMES, says=_not_each_to_the_monitor),
+    Crooked("frames for all who connect", frozenset({"frames-joined"}), FRAMES, twist=_to_all),
+    Crooked("an echo that jumps", frozenset({"echo"}), FRAMES,
+            says=_each(lambda frame: frame["seq"] % 5 or frame["cmd"].update(seq=7))),
+]  # fmt: skip
+
+# -- what is newest, fans, lines --------------------------------------------------------------------------------------
+
+
+def _take_drive(is_taken: Callable[[int, int], bool]) -> Any:
+    def drive(self: MotionRules, seq: int, right_rad_s: float, left_rad_s: float, now_s: float) -> bool:
+        if is_taken(seq, self._drive_seq):
+            self._drive_seq = -1
+        return MotionRules.drive(self, seq, right_rad_s, left_rad_s, now_s)
+
+    return rules(drive=drive)
+
+
+def _take_permit(is_taken: Callable[[int, int], bool]) -> Any:
+    def permit(self: MotionRules, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float) -> bool:
+        if is_taken(seq, self._permit_seq):
+            self._permit_seq = -1
+        return MotionRules.permit(self, seq, forward, reverse, turn, now_s)
+
+    return rules(permit=permit)
+
+
+def _take_fans(is_taken: Callable[[int, int], bool]) -> Any:
+    def command(self: Fans, seq: int, left: float, right: float) -> bool:
+        if is_taken(seq, self._seq):
+            self._seq = -1
+        return Fans.command(self, seq, left, right)
+
+    return fans(command=command)
+
+
+def _obey(kind: type[Drive] | type[FansMessage]) -> Callable[[DataLoop], None]:
+    """Messages of one kind from whatever role."""
+
+    def twist(loop: DataLoop) -> None:
+        command = loop.server.command
+
+        def crooked(session: Any, role: Any, message: Any, now_s: float) -> bool:
+            return command(session, "controller" if isinstance(message, kind) else role, message, now_s)
+
+        loop.server.command = crooked  # type: ignore[method-assign]
+
+    return twist
+
+
+def _fans_off_when_lost(loop: DataLoop) -> None:
+    lose = loop.robot.lose_controller
+
+    def crooked() -> None:
+        lose()
+        loop.robot.fans.duty = (0.0, 0.0)
+
+    loop.robot.lose_controller = crooked  # type: ignore[method-assign]
+
+
+def _fans_off_when_denied(loop: DataLoop) -> None:
+    permit = loop.robot.permit
+
+    def crooked(seq: int, forward: bool, reverse: bool, turn: bool, now_s: float | None = None) -> bool:
+        if not (forward or reverse or turn):
+            loop.robot.fans.duty = (0.0, 0.0)
+        return permit(seq, forward, reverse, turn, now_s)
+
+    loop.robot.permit = crooked  # type: ignore[method-assign]
+
+
+def _each_session(change: Callable[[Any], object]) -> Callable[[DataLoop], None]:
+    def twist(loop: DataLoop) -> None:
+        accept = loop.server.accept
+
+        def crooked(wire: Any, now_s: float) -> Any:
+            session = accept(wire, now_s)
+            change(session)
+            return session
+
+        loop.server.accept = crooked  # type: ignore[method-assign]
+
+    return twist
+
+
+def _no_buffer(data: bytes, middle: Middle) -> bytes:
+    middle.session._lines = LineBuffer()
+    return data
+
+
+MENDED = {
+    "no-json": swap(b'"wl":0.0\n', b'"wl":0.0}\n'),
+    "key-twice": swap(b'"wr":0.0,"wr":0.0', b'"wr":0.0'),
+    "nan": swap(b"NaN", b"0.0"),
+    "infinity": swap(b"Infinity", b"0.0"),
+    "overflow": swap(b"1e999", b"0.0"),
+    "key-missing": swap(b'"wr":0.0}', b'"wr":0.0,"wl":0.0}'),
+    "text-for-number": swap(b'"0.0"', b"0.0"),
+    "no-utf-8": swap(b"\xff", b"?"),
+}
+COMMANDS = [
+    Crooked("obeys old drives", frozenset({"newest-drive"}), NEWEST, twist=_take_drive(lambda seq, last: seq < last)),
+    Crooked("obeys a drive twice", frozenset({"newest-drive"}), NEWEST,
+            twist=_take_drive(lambda seq, last: seq == last)),
+    Crooked("obeys old permits", frozenset({"newest-permit"}), NEWEST,
+            twist=_take_permit(lambda seq, last: seq < last)),
+    Crooked("obeys a permit twice", frozenset({"newest-permit"}), NEWEST,
+            twist=_take_permit(lambda seq, last: seq == last)),
+    Crooked("obeys old fans", frozenset({"newest-fans"}), NEWEST, twist=_take_fans(lambda seq, last: seq < last)),
+    Crooked("obeys fans twice", frozenset({"newest-fans"}), NEWEST, twist=_take_fans(lambda seq, last: seq == last)),
+    Crooked("obeys drives of the monitor", frozenset({"role-drive"}), NEWEST, twist=_obey(Drive)),
+    Crooked("obeys fans of the monitor", frozenset({"role-fans"}), NEWEST, twist=_obey(FansMessage)),
+    Crooked("has no fans", frozenset({"fans"}), ("fans",), hears=swap(b'"fans"', b'"sails"')),
+    Crooked("stops fans at a lost session", frozenset({"fans-fin", "fans-rst"}), FANS, twist=_fans_off_when_lost),
+    Crooked("stops fans at a stop", frozenset({"fans-stop"}), FANS, twist=_fans_off_when_denied),
+    *(Crooked(f"takes {kind}", frozenset({kind}), tuple(BAD_DRIVES), hears=MENDED[kind]) for kind in BAD_DRIVES),
+    Crooked("refuses unknown keys", frozenset({"unknown-key"}), LINES, hears=swap(b'"colour":', b'"colour",')),
+    Crooked("counts unknown types as bad", frozenset({"unknown-type"}), LINES, hears=swap(b'"dance","s', b'dance",s')),
+    Crooked("closes after five bad lines", frozenset({"bad-lines-few"}), LINES,
+            twist=_each_session(lambda session: setattr(session, "_bad", BadLineCounter(5)))),
+    Crooked("bears any number of bad lines", frozenset({"bad-lines-many"}), LINES,
+            twist=_each_session(lambda session: setattr(session, "_bad", BadLineCounter(10_000)))),
+    Crooked("knows short lines only", frozenset({"line-longest"}), LINES,
+            twist=_each_session(lambda session: setattr(session, "_lines", LineBuffer(4096)))),
+    Crooked("knows endless lines", frozenset({"line-too-long"}), LINES,
+            twist=_each_session(lambda session: setattr(session, "_lines", LineBuffer(1 << 20)))),
+    Crooked("takes segments for lines", frozenset({"single-bytes"}), LINES, hears=_no_buffer),
+    Crooked("reads one line of a segment", frozenset({"many-lines", "glued-lines"}),
+            ("many-lines", "glued-lines", "unknown-key"), hears=lambda data, _: data.partition(b"\n")[0] + b"\n"),
+]  # fmt: skip
+FLOORS = [
+    Crooked("goes below the floor", frozenset({"fan-floor"}), FANS,
+            twist=lambda loop: setattr(loop.robot.fans, "_floor", 0.0)),
+    Crooked("calls a clamped duty a fault", frozenset({"fan-floor"}), FANS,
+            says=_each(lambda frame: 0.6 in frame["fans"] and frame.update(faults=["fan_left"]))),
+]  # fmt: skip
+
+# -- lockstep and motion ----------------------------------------------------------------------------------------------
+
+
+def _never_waits(flag: str) -> Callable[[DataLoop], None]:
+    def twist(loop: DataLoop) -> None:
+        command = loop.server.command
+
+        def crooked(session: Any, role: Any, message: Any, now_s: float) -> bool:
+            setattr(loop.server, flag, True)
+            return command(session, role, message, now_s)
+
+        loop.server.command = crooked  # type: ignore[method-assign]
+
+    return twist
+
+
+def _any_ack(loop: DataLoop) -> None:
+    command = loop.server.command
+
+    def crooked(session: Any, role: Any, message: Any, now_s: float) -> bool:
+        if hasattr(message, "ack"):
+            message.ack = loop.robot.delivered_seq
+        return command(session, role, message, now_s)
+
+    loop.server.command = crooked  # type: ignore[method-assign]
+
+
+def _two_steps(loop: DataLoop) -> None:
+    advance = loop.server._advance
+
+    def crooked(now_s: float) -> None:
+        advance(now_s)
+        advance(now_s)
+
+    loop.server._advance = crooked  # type: ignore[method-assign]
+
+
+def _wall_ages(frame: Message, middle: Middle) -> None:
+    """Ages that go on while time stands still."""
+    now_s = time.monotonic()
+    before_s = middle.owner.__dict__.setdefault("frame_s", {}).setdefault(frame["seq"] - 1, now_s)
+    middle.owner.__dict__["frame_s"][frame["seq"]] = now_s
+    frame["cmd"]["permit_age"] += now_s - before_s
+
+
+def _allowing(**forced: bool) -> Callable[[DataLoop], None]:
+    """Directions that are allowed, or denied, whatever a permit says."""
+
+    def permit(self: MotionRules, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float) -> bool:
+        allowed = {"forward": forward, "reverse": reverse, "turn": turn, **forced}
+        return MotionRules.permit(self, seq, **allowed, now_s=now_s)
+
+    return rules(permit=permit)
+
+
+def _lie(self: MotionRules, until_s: float) -> tuple[float, float]:
+    """Say held, and turn."""
+    MotionRules.set_points(self, until_s)
+    return self._drive or (0.0, 0.0)
+
+
+def _sides(frame: Message) -> None:
+    frame["enc"] = [[t, left, right] for t, right, left in frame["enc"]]
+
+
+STEPS = [
+    Crooked("does not wait for drives", frozenset({"lockstep-drive"}), LOCKSTEP[:2],
+            twist=_never_waits("_is_drive_acked")),
+    Crooked("does not wait for permits", frozenset({"lockstep-permit"}), LOCKSTEP[:2],
+            twist=_never_waits("_is_permit_acked")),
+    Crooked("takes any ack", frozenset({"lockstep-ack"}), LOCKSTEP, twist=_any_ack),
+    Crooked("takes two steps", frozenset({"lockstep-step"}), LOCKSTEP[3:4], twist=_two_steps),
+    Crooked("measures ages on the wall clock", frozenset({"lockstep-ages"}), LOCKSTEP, says=of("sensors", _wall_ages)),
+    Crooked("drives forward without permit", frozenset({"move-forward"}), MOVES, twist=_allowing(forward=True)),
+    Crooked("reverses without permit", frozenset({"move-reverse", "move-curve-back"}), MOVES,
+            twist=_allowing(reverse=True)),
+    Crooked("turns without permit", frozenset({"move-turn", "move-turn-back", "move-curve"}), MOVES,
+            twist=_allowing(turn=True)),
+    Crooked("never reverses", frozenset({"move-reverse", "move-curve-back"}), MOVES, twist=_allowing(reverse=False)),
+    Crooked("says held and turns", frozenset(MOVES), MOVES, twist=rules(set_points=_lie)),
+    Crooked("encoders on the wrong side", frozenset({"move-turn", "move-turn-back"}), MOVES, says=_each(_sides)),
+]  # fmt: skip
+
+# -- on the wall clock ------------------------------------------------------------------------------------------------
+
+
+def _ageless(key: str) -> Callable[[DataLoop], None]:
+    """Rules that take one key for new for ever."""
+
+    def may_move(self: MotionRules, drive: tuple[float, float], until_s: float) -> bool:
+        kept = self._drive_s, self._permit_s
+        if key == "drive":
+            self._drive_s = until_s
+        elif self._permit is not None:
+            self._permit_s = until_s
+        result = MotionRules._may_move(self, drive, until_s)
+        self._drive_s, self._permit_s = kept
+        return result
+
+    return rules(_may_move=may_move)
+
+
+def _one_key(self: MotionRules, drive: tuple[float, float], until_s: float) -> bool:
+    self.has_monitor_joined = False
+    return MotionRules._may_move(self, drive, until_s)
+
+
+def _free_without_drive(self: MotionRules, until_s: float) -> tuple[float, float]:
+    found = MotionRules.set_points(self, until_s)
+    self.is_held = self.is_held and self._drive is not None
+    return found
+
+
+def _short_lived(loop: DataLoop) -> None:
+    loop.robot.rules._ttl_s = 0.1
+
+
+def _noise_refreshes(data: bytes, middle: Middle) -> bytes:
+    if b'"wl":"0"' in data:
+        middle.owner.robot.rules._drive_s = middle.owner.robot.t_s
+    return data
+
+
+def _noise_keeps_the_role(data: bytes, middle: Middle) -> bytes:
+    middle.session.heard_s = max(middle.session.heard_s, middle.owner.robot.t_s)
+    return data
+
+
+def _soon_taken_over(loop: DataLoop) -> None:
+    command = loop.server.command
+
+    def crooked(session: Any, role: Any, message: Any, now_s: float) -> bool:
+        result = command(session, role, message, now_s)
+        session.heard_s -= 3.0
+        return result
+
+    loop.server.command = crooked  # type: ignore[method-assign]
+
+
+def _fans_stop_with_wheels(loop: DataLoop) -> None:
+    set_points = loop.robot.rules.set_points
+
+    def crooked(_: MotionRules, until_s: float) -> tuple[float, float]:
+        found = set_points(until_s)
+        if loop.robot.rules._drive is not None and loop.robot.rules.is_held:
+            loop.robot.fans.duty = (0.0, 0.0)
+        return found
+
+    rules(set_points=crooked)(loop)
+
+
+def _forgets(method: str) -> Callable[[DataLoop], None]:
+    return lambda loop: setattr(loop.robot, method, lambda: None)
+
+
+LOST = {role: frozenset({f"lost-{role}-fin", f"lost-{role}-rst"}) for role in ("controller", "monitor")}
+REALTIME = [
+    Crooked("keeps a role for bad lines", frozenset({"take-over"}), ("take-over",), hears=_noise_keeps_the_role),
+    Crooked("gives roles away too soon", frozenset({"take-over"}), ("take-over",), twist=_soon_taken_over),
+    Crooked("ignores the age of drives", frozenset({"ttl-drive", "ttl-noise"}), TIMED, twist=_ageless("drive")),
+    Crooked("ignores the age of permits", frozenset({"ttl-permit"}), TIMED, twist=_ageless("permit")),
+    Crooked("needs one key only", frozenset({"no-permit", "ttl-permit"}) | LOST["monitor"], TIMED,
+            twist=rules(_may_move=_one_key)),
+    Crooked("is not held without a drive", frozenset({"no-drive"}) | LOST["controller"], TIMED,
+            twist=rules(set_points=_free_without_drive)),
+    Crooked("forgets commands too soon", frozenset({"ttl-drive", "ttl-permit", "ttl-noise"}), TIMED[:5],
+            twist=_short_lived),
+    Crooked("lives on bad lines", frozenset({"ttl-noise"}), TIMED, hears=_noise_refreshes),
+    Crooked("goes on without its controller", LOST["controller"], TIMED, twist=_forgets("lose_controller")),
+    Crooked("goes on without its monitor", LOST["monitor"], TIMED, twist=_forgets("lose_monitor")),
+    Crooked("stops fans with the wheels", frozenset({"fans-ttl"}), ("fans-ttl", "fans", "fans-stop"),
+            twist=_fans_stop_with_wheels),
+    Crooked("frames with numbers of their own", frozenset({"frames-seq"}), FRAMES[:2],
+            says=_each(lambda frame: frame["seq"] % 10 or frame.update(seq=frame["seq"] - 1))),
+    Crooked("says held and turns", frozenset({"wheels-ttl", "wheels-lost"}), ("wheels-ttl", "wheels-lost"),
+            twist=lambda loop: (rules(set_points=_lie)(loop), _forgets("lose_controller")(loop))),
+]  # fmt: skip
+
+
+async def judge(config: Config, table: list[Crooked], *, lockstep: bool, key: bytes | None = None) -> None:
+    """Each server of a table fails the checks meant for it, and no others."""
+    room = asyncio.Semaphore(AT_ONCE)
+
+    async def one(crooked: Crooked) -> dict[str, str]:
+        async with room:
+            return await failures(config, crooked, lockstep=lockstep, key=key)
+
+    seen = await asyncio.gather(*map(one, table))
+    wrong = {c.name: (sorted(c.fails), s) for c, s in zip(table, seen, strict=True) if set(s) != c.fails}
+    assert not wrong, json.dumps(wrong, indent=1)
+
+
+@pytest.mark.parametrize("table", [SESSIONS, STREAMS, COMMANDS, STEPS], ids=["sessions", "frames", "commands", "steps"])
+async def test_in_lockstep(config: Config, table: list[Crooked], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stories_frames, "FRAMES", 15)  # whatever is wrong with them is wrong with the first
+    await judge(config, table, lockstep=True)
+
+
+async def test_macs(config: Config) -> None:
+    await judge(config, MACS, lockstep=True, key=KEY)
+
+
+async def test_fans_over_an_overhang() -> None:
+    await judge(load_config(overrides={"run.mirror": "fyst-m2"}), FLOORS, lockstep=True)
+
+
+async def test_on_the_wall_clock(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Roles may be taken over after one second instead of five; that it is five the honest robot shows.
+    monkeypatch.setattr(sessions, "SILENCE_S", 1.0)
+    for name, value_s in (("SILENCE_S", 1.0), ("STILL_HELD_S", 0.7), ("TAKEN_S", 1.3)):
+        monkeypatch.setattr(stories_session, name, value_s)
+    await judge(config, REALTIME, lockstep=False)
+
+
+def test_every_check_has_its_broken_server() -> None:
+    tables = (SESSIONS, MACS, STREAMS, COMMANDS, FLOORS, STEPS, REALTIME)
+    found = {name for table in tables for crooked in table for name in crooked.fails}
+    assert set(IDS) - found == {"mac"}  # a server that refuses the right mac lets no check begin

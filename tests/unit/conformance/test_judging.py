@@ -1,0 +1,142 @@
+"""The judges of frames and hellos, where no whole server is needed to see them fail."""
+
+from typing import Any
+
+import pytest
+
+from ccatp.conformance import judge_frames, judge_hello
+from ccatp.conformance.judge_rules import judge_lost, judge_newest, judge_once, judge_ttl, mean_rates
+from ccatp.conformance.reading import Frame, fault_of_line, parse_frame, read_message
+from ccatp.conformance.report import last_line, table_line
+from ccatp.conformance.verdict import Broken, NotApplicable, Result
+
+TTL_S, FRAME_S = 0.25, 0.01
+CMD: dict[str, Any] = {"seq": 1, "age": 0.01, "permit_age": 0.02, "held": False}
+SENSORS: dict[str, Any] = {
+    "type": "sensors",
+    "seq": 5,
+    "t": 0.05,
+    "enc": [[0.05, 1.0, 2.0]],
+    "fans": [0, 1],
+    "cmd": CMD,
+}
+
+
+def frame(t_s: float, age_s: float = 0.01, permit_age_s: float = 0.01, held: bool = False, seq: int = 1) -> Frame:
+    return Frame(round(100 * t_s), t_s, seq, age_s, permit_age_s, held, (0.0, 0.0), ())
+
+
+def ageing(held_from_s: float, until_s: float = 0.5) -> list[Frame]:
+    """A drive of t = 0 that gets older, held from some age on."""
+    times_s = [k * FRAME_S for k in range(1, round(until_s / FRAME_S))]
+    return [frame(t_s, age_s=t_s, held=t_s >= held_from_s) for t_s in times_s]
+
+
+@pytest.mark.parametrize(
+    ("line", "fault"),
+    [
+        (b'{"a":1.5,"b":[null,true]}', None),
+        (b'{"a":1,"a":2}', "a key stands twice"),
+        (b'{"a":{"b":1,"b":2}}', "a key stands twice"),
+        (b'{"a":NaN}', "NaN is no number of JSON"),
+        (b'{"a":-Infinity}', "-Infinity is no number of JSON"),
+        (b'{"a":1e999}', "number 1e999 is not finite"),
+        (b"[1]", "no object: [1]"),
+        (b"\xff", "invalid start byte"),
+        (b'{"a":"' + b"x" * 100 + b'"}', "a line of 108 bytes"),
+    ],
+)
+def test_lines(line: bytes, fault: str | None) -> None:
+    found = fault_of_line(line, 100)
+    assert found is None if fault is None else fault in str(found)
+
+
+def test_lenient_reading() -> None:
+    assert read_message(b'{"a":NaN,"a":1}') == {"a": 1}
+    assert read_message(b"[]") is read_message(b"{") is None
+
+
+def test_a_frame() -> None:
+    found = parse_frame(SENSORS)
+    assert (found.seq, found.fans, found.enc) == (5, (0, 1), ((0.05, 1.0, 2.0),))
+    assert (found.drive_arrival_s, found.permit_arrival_s) == pytest.approx((0.04, 0.03))
+
+
+@pytest.mark.parametrize(
+    ("change", "seen"),
+    [
+        ({"cmd": None}, "cmd = None"),
+        ({"seq": 1.5}, "seq = 1.5"),
+        ({"t": True}, "t = True"),
+        ({"fans": [0.1]}, r"fans = \[0.1\]"),
+        ({"enc": {}}, r"enc = \{\}"),
+        ({"cmd": CMD | {"held": 0}}, "cmd.held = 0"),
+        ({"cmd": CMD | {"age": None}}, "cmd.age = None"),
+    ],
+)
+def test_a_frame_of_no_use(change: dict[str, Any], seen: str) -> None:
+    with pytest.raises(Broken, match=seen):
+        parse_frame(SENSORS | change)
+
+
+def test_time_to_live() -> None:
+    assert judge_ttl(ageing(0.26), "drive", TTL_S, FRAME_S) == "held at a drive age of 0.260 s, ttl_s 0.25"
+    for held_from_s, seen in ((0.15, "held at a drive age of 0.150"), (0.4, "not held at a drive age of 0.290")):
+        with pytest.raises(Broken, match=seen):
+            judge_ttl(ageing(held_from_s), "drive", TTL_S, FRAME_S)
+    with pytest.raises(Broken, match=r"not held 0\.48 s after the last drive, its age said to be 0\.010 s"):
+        judge_ttl([frame(k * FRAME_S) for k in range(49)], "drive", TTL_S, FRAME_S)
+
+
+def test_held_for_want_of_the_other_key_is_not_too_early() -> None:
+    frames = [frame(0.1), frame(0.11, permit_age_s=0.3, held=True), *ageing(0.26)[12:]]
+    assert "held at" in judge_ttl(frames, "drive", TTL_S, FRAME_S)
+
+
+def test_a_lost_session() -> None:
+    def after(delay_s: float) -> list[Frame]:
+        return [frame(t / 100, permit_age_s=t / 100 - 0.1, held=t / 100 > 0.1 + delay_s) for t in range(11, 30)]
+
+    assert judge_lost(after(0.03), "permit", TTL_S, FRAME_S) == "held 40 ms after the end of the session"
+    with pytest.raises(Broken, match="not held 70 ms after the end of the session"):
+        judge_lost(after(0.08), "permit", TTL_S, FRAME_S)
+    assert judge_lost(after(0.03)[:3], "permit", TTL_S, FRAME_S) is None  # no frame yet that tells
+    with pytest.raises(NotApplicable, match=r"ttl_s 0\.08 holds the wheels as soon"):
+        judge_lost(after(0.03), "permit", 0.08, FRAME_S)
+
+
+def test_drives_that_come_into_force() -> None:
+    judge_newest([frame(0.1, seq=9), frame(0.11, seq=12)], 9, 8)
+    with pytest.raises(Broken, match="drive 8 came into force after 9"):
+        judge_newest([frame(0.1, seq=9), frame(0.11, seq=8)], 9, 8)
+    with pytest.raises(Broken, match="drive 9 never came into force"):
+        judge_newest([frame(0.1, seq=12)], 9, 8)
+    judge_once([frame(0.1, 0.01), frame(0.2, 0.11)], 1, FRAME_S)
+    with pytest.raises(Broken, match="a second drive 1 came into force 100 ms after the first"):
+        judge_once([frame(0.1, 0.01), frame(0.2, 0.01)], 1, FRAME_S)
+    assert mean_rates([frame(0.1)]) is None
+
+
+def test_judges_of_frames_without_what_they_judge() -> None:
+    with pytest.raises(NotApplicable, match="no edge samples"):
+        judge_frames.judge_edges([{"edge": []}])
+    with pytest.raises(Broken, match="a frame without gravity"):
+        judge_frames.judge_gravity([{}])
+    with pytest.raises(Broken, match="frame 2 reached one session only"):
+        judge_frames.judge_both([{"seq": k} for k in (1, 2, 3)], [{"seq": k} for k in (1, 3)])
+    with pytest.raises(Broken, match="t 1 after 1"):
+        judge_frames.judge_clock([{"seq": k, "t": 1} for k in range(3)], 100.0)
+
+
+def test_a_hello_without_robot() -> None:
+    with pytest.raises(Broken, match="robot = None"):
+        judge_hello.judge_robot({})
+    with pytest.raises(Broken, match="no protocol"):
+        judge_hello.judge_fields({})
+
+
+def test_the_lines_of_a_table() -> None:
+    results = [Result("a", "what is promised", "fail", "what was seen"), Result("b", "p", "not applicable", "why")]
+    assert table_line(results[0]) == f"{'a':<21}FAIL  seen: what was seen; promised: what is promised"
+    assert table_line(results[1]) == f"{'b':<21}-     why"
+    assert last_line(results) == "0 passed, 1 failed, 1 not applicable"
