@@ -3,7 +3,7 @@
 The sockets of the robot link carry what a real robot would say and nothing else. The truth leaves by ZeroMQ: a REP
 socket with the requests of ``ccatp.sim.truth``, and a PUB socket with batches of the topic ``truth``.
 
-Known limitations: the battery stays full, no sensor fails.
+Known limitations: the battery stays full, and nothing fails by itself; a fault plan lets it (``ccatp.sim.faults``).
 """
 
 import asyncio
@@ -18,6 +18,8 @@ import zmq.asyncio
 from ccatp.bus import Publisher
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import build_mirror
+from ccatp.sim.faults.plan import FaultPlan
+from ccatp.sim.faults.record import Injected
 from ccatp.sim.robot import Robot
 from ccatp.sim.sessions import RobotServer, Session
 from ccatp.sim.truth import TruthLog
@@ -31,8 +33,8 @@ MAX_REQUEST_BYTES = 4096
 class Log(Protocol):
     """A structlog logger, or whatever has this method."""
 
-    def info(self, event: str) -> object:
-        """Take one line."""
+    def info(self, event: str, **fields: object) -> object:
+        """Take one line, and what belongs to it."""
 
 
 class DataLoop:
@@ -44,6 +46,7 @@ class DataLoop:
         seed: of every random draw.
         key: key of the robot link, ``None`` for no authentication.
         log: takes its lines.
+        faults: what shall go wrong with the robot; each is logged when it begins and with what it did.
 
     Attributes:
         robot: the robot.
@@ -51,12 +54,18 @@ class DataLoop:
     """
 
     def __init__(
-        self, cfg: Config, lockstep: bool, seed: int, key: bytes | None = None, log: Log | None = None
+        self,
+        cfg: Config,
+        lockstep: bool,
+        seed: int,
+        key: bytes | None = None,
+        log: Log | None = None,
+        faults: FaultPlan | None = None,
     ) -> None:
         self._address = cfg.sim.robot.host, cfg.sim.robot.port
         self._is_lockstep = lockstep
         self._log = log
-        self.robot = Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(seed))
+        self.robot = Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(seed), faults)
         self._boot = secrets.randbits(31)
         self._key = key
         self.truth: TruthOutlet | None = None
@@ -117,6 +126,9 @@ class DataLoop:
             connection.close()
         if self.truth is not None:
             self.truth.flush()
+        if self.robot.injector is not None:
+            for injected in self.robot.injector.injected:
+                self._log_fault("injected", injected)
         if self._listener is not None:
             await self._listener.wait_closed()
             self._listener = None
@@ -151,6 +163,13 @@ class DataLoop:
     def _on_frame(self) -> None:
         if self.truth is not None:
             self.truth.add()
+        if self.robot.injector is not None:
+            for what, injected in self.robot.injector.news(self.robot.t_s):
+                self._log_fault(what, injected)
+
+    def _log_fault(self, what: str, injected: Injected) -> None:
+        if self._log is not None:
+            self._log.info(f"fault {what}: {injected.signal} {injected.type}", **injected._asdict())
 
     def _note(self, text: str) -> None:
         if self._log is not None:
@@ -260,6 +279,7 @@ async def serve(
     truth_pub: str | None = None,
     key: bytes | None = None,
     log: Log | None = None,
+    faults: FaultPlan | None = None,
 ) -> None:
     """Run a DataLoop until ``stop`` is set.
 
@@ -273,12 +293,13 @@ async def serve(
         truth_pub: endpoint of the truth's PUB socket.
         key: key of the robot link, ``None`` for no authentication.
         log: takes its lines.
+        faults: what shall go wrong with the robot.
 
     Raises:
         OSError: the address cannot be had.
         zmq.ZMQError: an endpoint cannot be had.
     """
-    data_loop = DataLoop(cfg, lockstep, seed, key, log)
+    data_loop = DataLoop(cfg, lockstep, seed, key, log, faults)
     data_loop.truth = outlet = TruthOutlet(TruthLog(data_loop.robot), truth_rep, truth_pub)
     try:
         await data_loop.start(listen_sock)
