@@ -9,6 +9,7 @@ Known limitations: the battery stays full, and nothing fails by itself; a fault 
 import asyncio
 import secrets
 import socket
+from contextlib import AsyncExitStack
 from typing import Protocol, cast
 
 import numpy as np
@@ -17,6 +18,8 @@ import zmq.asyncio
 
 from ccatp.bus import Publisher
 from ccatp.config.models import Config
+from ccatp.fault_proxy.proxy import FaultProxy
+from ccatp.link_faults import LinkFaults
 from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.faults.plan import FaultPlan
 from ccatp.sim.faults.record import Injected
@@ -51,6 +54,8 @@ class DataLoop:
     Attributes:
         robot: the robot.
         server: its link.
+        truth: who gives the truth away.
+        link_faults: who rules the proxy before the link by the robot's clock.
     """
 
     def __init__(
@@ -69,6 +74,7 @@ class DataLoop:
         self._boot = secrets.randbits(31)
         self._key = key
         self.truth: TruthOutlet | None = None
+        self.link_faults: LinkFaults | None = None
         self._listener: asyncio.Server | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._connections: set[_Connection] = set()
@@ -129,6 +135,10 @@ class DataLoop:
         if self.robot.injector is not None:
             for injected in self.robot.injector.injected:
                 self._log_fault("injected", injected)
+        if self.link_faults is not None:
+            self.link_faults.tick(self.robot.t_s)  # what happened since the last frame
+            for injected in self.link_faults.injected:
+                self._log_fault("injected", injected)
         if self._listener is not None:
             await self._listener.wait_closed()
             self._listener = None
@@ -165,6 +175,9 @@ class DataLoop:
             self.truth.add()
         if self.robot.injector is not None:
             for what, injected in self.robot.injector.news(self.robot.t_s):
+                self._log_fault(what, injected)
+        if self.link_faults is not None:
+            for what, injected in self.link_faults.tick(self.robot.t_s):
                 self._log_fault(what, injected)
 
     def _log_fault(self, what: str, injected: Injected) -> None:
@@ -293,7 +306,7 @@ async def serve(
         truth_pub: endpoint of the truth's PUB socket.
         key: key of the robot link, ``None`` for no authentication.
         log: takes its lines.
-        faults: what shall go wrong with the robot.
+        faults: what shall go wrong with the robot and its link; for the link a proxy listens in the robot's place.
 
     Raises:
         OSError: the address cannot be had.
@@ -302,10 +315,26 @@ async def serve(
     data_loop = DataLoop(cfg, lockstep, seed, key, log, faults)
     data_loop.truth = outlet = TruthOutlet(TruthLog(data_loop.robot), truth_rep, truth_pub)
     try:
-        await data_loop.start(listen_sock)
-        async with asyncio.TaskGroup() as tasks:
-            answering = tasks.create_task(outlet.serve())
-            await data_loop.run(stop)
-            answering.cancel()
+        async with AsyncExitStack() as stack:
+            if faults is not None and faults.link:
+                listen_sock = await _put_proxy_before(data_loop, faults, cfg, listen_sock, stack)
+            await data_loop.start(listen_sock)
+            async with asyncio.TaskGroup() as tasks:
+                answering = tasks.create_task(outlet.serve())
+                await data_loop.run(stop)
+                answering.cancel()
     finally:
         outlet.close()
+
+
+async def _put_proxy_before(
+    data_loop: DataLoop, faults: FaultPlan, cfg: Config, listen_sock: socket.socket | None, stack: AsyncExitStack
+) -> socket.socket:
+    """Let a proxy listen where the robot was to; the socket on which the robot listens instead."""
+    behind = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+    at = cfg.sim.robot
+    before = listen_sock or stack.enter_context(socket.create_server((at.host, at.port)))
+    proxy = FaultProxy(*behind.getsockname()[:2], seed=cfg.run.seed, listener=before)
+    await stack.enter_async_context(proxy)
+    data_loop.link_faults = LinkFaults(faults.link, proxy)
+    return behind

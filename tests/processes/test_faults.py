@@ -37,3 +37,20 @@ def test_a_stuck_gyroscope_is_in_the_log_and_the_run_ends_as_defined(start: Star
     assert last["changed"] > 0
     assert (run.run_dir / "faults.toml").read_text() == STUCK_GYROSCOPE
     assert run.summary["danger"]["falls"] == 0
+
+
+def test_a_link_that_is_reset_ends_the_run_with_status_5(start: Start, tmp_path: Path) -> None:
+    plan = tmp_path / "plan.toml"
+    plan.write_text('[[link]]\ntype = "fragment"\ndirection = "both"\nat_s = 0.5\nfor_s = 0.2\nwrite_bytes = 50\n'
+                    '[[link]]\ntype = "reset"\nat_s = 12.0\n')  # fmt: skip
+    run = start("--panels", "1", "--faults", str(plan))
+    assert run.wait() == 5, run.stderr
+    assert "robot link lost" in run.stderr
+    assert "Traceback" not in run.stderr
+    injected = [entry for entry in log_of(run) if entry["event"].startswith("fault injected")]
+    assert [(entry["signal"], entry["type"], entry["from_s"]) for entry in injected] == [
+        ("link", "fragment", 0.5),
+        ("link", "reset", 12.0),
+    ]
+    assert injected[0]["samples"] > 20
+    assert injected[1]["samples"] == 2  # the controller's connection and the monitor's

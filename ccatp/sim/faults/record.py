@@ -10,7 +10,7 @@ class Injected(NamedTuple):
 
     Attributes:
         signal, type: of the fault.
-        at_s: when it was to begin.
+        at_s: when it was to begin; ``None`` for a fault of the link that waits for something else.
         from_s, until_s: the first and last sample, frame or step that it acted on, robot time; ``None``: none yet.
         samples: how many it acted on.
         changed: how many of them came out different, or not at all.
@@ -18,7 +18,7 @@ class Injected(NamedTuple):
 
     signal: str
     type: str
-    at_s: float
+    at_s: float | None
     from_s: float | None
     until_s: float | None
     samples: int

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from ccatp.cli import main
 from ccatp.config.loader import shipped_config_dir
 from ccatp.errors import ConfigError
 from ccatp.fault_plan import read_plan
@@ -122,3 +123,15 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "latin.toml").write_bytes(b"# \xe9")
     with pytest.raises(ConfigError, match=r"latin\.toml: is not UTF-8 text \(byte 2\); save it as UTF-8"):
         read_plan(tmp_path / "latin.toml", lockstep=True)
+
+
+@pytest.mark.parametrize("command", [["run", "--sim"], ["sim", "robot", "--lockstep"]])
+def test_the_commands_refuse_it_before_anything_starts(
+    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "plan.toml"
+    file.write_text(LINK + 'type = "stall"\ndirection = "both"')
+    assert main([*command, "--faults", str(file)]) == 2
+    error = capsys.readouterr().err
+    assert 'link[0].type = "stall" makes no sense in lockstep' in error
+    assert error.count("\n") == 1
