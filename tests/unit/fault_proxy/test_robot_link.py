@@ -122,7 +122,7 @@ def pairs(frames: list[int]) -> list[tuple[int, int]]:
 def plan_of(kind: str, trigger: str, keys: Keys) -> str:
     rows = {"type": kind, **keys}
     if "direction" in keys:
-        rows["for_s"] = 0.3
+        rows["for_s"] = 0.2
     return "[[link]]\n" + trigger + "\n" + "\n".join(f"{key} = {json.dumps(value)}" for key, value in rows.items())
 
 
@@ -133,10 +133,10 @@ def test_the_table_knows_every_type() -> None:
 @pytest.mark.parametrize("kind", TABLE)
 async def test_on_the_wall_clock_each_fault_reaches_the_client_and_the_log(kind: str) -> None:
     keys, seen = TABLE[kind]
-    client, log = await drive(plan_of(kind, "at_s = 0.2", keys), reached(70), lockstep=False)
+    client, log = await drive(plan_of(kind, "at_s = 0.1", keys), reached(40), lockstep=False)
     assert seen(client), (client.frames, client.lost, client.link.counts)
     (began,) = log.of("begins")
-    assert (began["type"], began["at_s"], began["from_s"]) == (kind, 0.2, 0.2)
+    assert (began["type"], began["at_s"], began["from_s"]) == (kind, 0.1, 0.1)
     (record,) = log.of("injected")
     assert (record["signal"], record["type"]) == ("link", kind)
     count = record["samples"]
@@ -144,7 +144,7 @@ async def test_on_the_wall_clock_each_fault_reaches_the_client_and_the_log(kind:
     assert count > 0
     if "direction" in keys:
         (ended,) = log.of("ended")
-        assert ended["until_s"] == pytest.approx(0.5, abs=0.011)
+        assert ended["until_s"] == pytest.approx(0.3, abs=0.011)
 
 
 @pytest.mark.parametrize("kind", LOCKSTEP_TYPES)
