@@ -12,6 +12,7 @@ from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.sim.faults.models import SENSOR_SIGNALS, TYPES
 from ccatp.sim.faults.plan import FaultPlan, parse_plan
+from ccatp.sim.faults.sensing import make_sensor_fault
 from ccatp.sim.robot import Robot
 from ccatp.wire.lines import MAX_LINE_BYTES
 from ccatp.wire.robot import BadLine, decode_from_robot
@@ -268,6 +269,35 @@ def test_the_echo_of_the_fans_is_late(config: Config, mirror: Mirror) -> None:
         assert robot.delivered is not None
         found.append(robot.delivered.fans[0])
     assert found.index(0.5) == pytest.approx(31 + 10 - 1, abs=1)
+
+
+@pytest.mark.parametrize("kind", ["off", "stuck"])
+def test_an_echo_without_a_new_reading_repeats_the_last(config: Config, mirror: Mirror, kind: str) -> None:
+    robot = Robot(config, mirror, np.random.default_rng(1), plan_of("fans", kind))
+    found = []
+    for k in range(1, 70):
+        if k in {10, 31}:
+            robot.command_fans(k, 0.01 * k, 0.5)
+        robot.advance()
+        assert robot.delivered is not None
+        found.append(robot.delivered.fans[0])
+    assert found == [0.0] * 9 + [0.1] * 50 + [0.31] * 10
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ({"sign": -1}, [0, 1, 0]),
+        ({"offset": 1.0}, [1, 1, 1]),
+        ({"factor": 0.0}, [0, 0, 0]),
+        ({"factor": 0.5}, [1, 0, 1]),
+        ({"sign": -1, "factor": 0.4}, [0, 0, 0]),
+    ],
+)
+def test_a_wrong_edge_sensor_knows_light_and_dark(keys: dict[str, object], expected: list[int]) -> None:
+    (fault,) = plan_of("edge_rear_right", "wrong", **keys).faults
+    rows = make_sensor_fault(fault, np.random.default_rng(1)).apply([(0.3, 1, 1, 1, k) for k in (1, 0, 1)], 0.3)
+    assert [row[4] for row in rows] == expected
 
 
 def test_both_encoders_off_leave_no_row(config: Config, mirror: Mirror) -> None:
