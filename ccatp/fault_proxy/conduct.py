@@ -1,4 +1,4 @@
-"""Pure. How one direction of the proxy treats what passes: what is switched on, and what it does to lines."""
+"""Edge. How one direction of the proxy treats what passes: what is switched on, and what it does to lines."""
 
 import random
 from collections import Counter
