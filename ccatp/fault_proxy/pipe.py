@@ -39,7 +39,7 @@ class Pipe:
         self._waiting: deque[tuple[float, bytes]] = deque()
         self._waiting_bytes = 0
         self._due_s = 0.0
-        self._is_at_end = False
+        self._is_at_end = self._is_shut = False
         self._changed = asyncio.Event()
 
     def wake(self) -> None:
@@ -48,7 +48,7 @@ class Pipe:
 
     def put(self, data: bytes) -> None:
         """Let something wait for its time to go out; what is over the limit is lost."""
-        if not data or self._waiting_bytes + len(data) > 2 * MAX_WAITING_BYTES:
+        if not data or self._is_shut or self._waiting_bytes + len(data) > 2 * MAX_WAITING_BYTES:
             return
         conduct, now_s = self._conduct, asyncio.get_running_loop().time()
         late_s = conduct.delay_s + conduct.jitter_s * self._rng.random() if conduct.jitter_s else conduct.delay_s
@@ -57,6 +57,14 @@ class Pipe:
         self._due_s = max(self._due_s, now_s + late_s)
         self._waiting.append((self._due_s, data))
         self._waiting_bytes += len(data)
+        self.wake()
+
+    def shut(self) -> None:
+        """Send the end now; nothing goes out any more."""
+        self._is_shut = True
+        self._waiting.clear()
+        self._waiting_bytes = 0
+        self._send_end()
         self.wake()
 
     def flood(self, lines: int) -> None:
@@ -87,6 +95,10 @@ class Pipe:
             if data is None:
                 break
             await self._write(data)
+        if not self._is_shut:
+            self._send_end()
+
+    def _send_end(self) -> None:
         if self._writer.can_write_eof() and not self._writer.is_closing():
             self._writer.write_eof()
 
@@ -123,7 +135,7 @@ class Pipe:
         return found
 
     async def _write(self, data: bytes) -> None:
-        while data:
+        while data and not self._is_shut:
             conduct = self._conduct
             size = 1 if conduct.bytes_per_s else conduct.write_bytes or len(data)
             part = self._may_write(data[:size])

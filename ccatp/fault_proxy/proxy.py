@@ -33,10 +33,14 @@ class _Connection:
             writer.transport.abort()
         self.wake()
 
+    def shut(self) -> None:
+        """FIN to both. What they still send is read and forgotten: a socket closed over unread bytes sends RST."""
+        for pipe in self.pipes.values():
+            pipe.shut()
+
     def close(self) -> None:
         for writer in (self.client, self.server):
             writer.close()
-        self.wake()
 
     def wake(self) -> None:
         for pipe in self.pipes.values():
@@ -122,7 +126,7 @@ class FaultProxy:
         """End every connection by FIN, on both sides, after what is on its way out of the proxy."""
         self.counts["close"] += len(self._connections)
         for connection in tuple(self._connections):
-            connection.close()
+            connection.shut()
 
     # -- faults that last -----------------------------------------------------------------------------------------
 

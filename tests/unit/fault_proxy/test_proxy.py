@@ -166,6 +166,22 @@ async def test_close_ends_both_sides_in_order() -> None:
         await r.connect()  # the next one is served
 
 
+async def test_close_over_bytes_on_their_way_is_no_reset() -> None:
+    async with rig() as r:
+        reader, writer = await r.connect()
+        r.proxy.stall("to_server")
+        writer.write(TEXT)
+        await passes(lambda: r.proxy.counts["stall"] > 0)
+        writer.write(TEXT)
+        r.server.writers[0].write(TEXT)
+        r.proxy.close()
+        assert (await rest(reader))[1] == "FIN"
+        await r.server.until(lambda: r.server.ends == ["FIN"])
+        assert r.server.pieces == []
+        writer.close()
+        await passes(lambda: not r.proxy.connections)
+
+
 async def test_a_black_hole_one_way_swallows_data_and_the_end() -> None:
     async with rig() as r:
         reader, writer = await r.connect()

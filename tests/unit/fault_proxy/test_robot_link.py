@@ -166,6 +166,17 @@ async def test_a_reset_after_so_many_bytes_is_exact_to_the_line() -> None:
     assert 0 < len(shorter.frames) < len(client.frames)
 
 
+@pytest.mark.parametrize("direction", ["to_client", "to_robot", "both"])
+async def test_a_fault_goes_the_way_that_it_names(direction: str) -> None:
+    plan = plan_of("duplicate", "at_s = 0.2", {"direction": direction, "every": 1})
+    client, log = await drive(plan, reached(60), lockstep=True)
+    frames = 0 if direction == "to_robot" else 20
+    drives = 0 if direction == "to_client" else 20
+    assert client.link.counts["repeated_frames"] == pytest.approx(frames, abs=2)
+    (record,) = log.of("injected")
+    assert record["samples"] == pytest.approx(frames + drives, abs=4)
+
+
 async def test_a_fault_that_never_began_says_so() -> None:
     client, log = await drive('[[link]]\ntype = "reset"\nat_s = 99.0', reached(20), lockstep=True)
     assert not client.lost
