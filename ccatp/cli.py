@@ -14,6 +14,7 @@ from ccatp.cli_conformance import conformance
 from ccatp.cli_frame import (
     ADDRESS_OPTIONS,
     CONFIG_OPTION,
+    FAULTS_OPTION,
     RUNTIME_DIR_OPTION,
     WORLD_OPTIONS,
     SuggestingGroup,
@@ -60,13 +61,18 @@ def cli() -> None:
 )
 @click.option("--resume", is_flag=True, help="Carry on with the mission in --run-dir.")
 @click.option("--json", "json_output", is_flag=True, help="Summary as JSON on standard output, nothing else there.")
+@FAULTS_OPTION
 @RUNTIME_DIR_OPTION
 def run(
     sim: bool, config_file: Path | None, mirror: str | None, world: str | None, seed: int | None,
     settings: Mapping[str, object], panels: int | None, filter_name: str | None, realtime: bool,
-    run_dir: Path | None, resume: bool, json_output: bool, runtime_dir: Path | None,
+    run_dir: Path | None, resume: bool, json_output: bool, faults_file: Path | None, runtime_dir: Path | None,
 ) -> int:  # fmt: skip
     """Survey the mirror of the configuration and end with a summary."""
+    if faults_file is not None and not sim:
+        raise click.UsageError(
+            "--faults goes with --sim alone: faults are for the simulated robot, never for a real one"
+        )
     if resume and run_dir is None:
         raise click.UsageError("--resume carries on in a run directory; name it with --run-dir")
     if resume and config_file is None and run_dir is not None:
@@ -76,6 +82,10 @@ def run(
     from ccatp.run_options import RunOptions
     from ccatp.supervisor import run_survey
 
+    if faults_file is not None:
+        from ccatp.fault_plan import read_plan
+
+        read_plan(faults_file, lockstep=not realtime)  # its mistakes are told before anything is started
     named = {
         "run.mirror": mirror,
         "run.world": world,
@@ -94,6 +104,7 @@ def run(
                 resume=resume,
                 json_output=json_output,
                 runtime_dir=runtime_dir,
+                faults_file=faults_file,
             )
         )
     )
@@ -178,16 +189,20 @@ def sim() -> None:
 @ADDRESS_OPTIONS
 @WORLD_OPTIONS
 @click.option("--realtime/--lockstep", default=True, show_default=True, help="Wall clock, or wait for each command.")
+@FAULTS_OPTION
 def sim_robot(
     host: str | None, port: int | None, config_file: Path | None, mirror: str | None, world: str | None,
-    seed: int | None, settings: Mapping[str, object], realtime: bool,
+    seed: int | None, settings: Mapping[str, object], realtime: bool, faults_file: Path | None,
 ) -> int:  # fmt: skip
     """Run the simulated robot behind the robot link, for any controller."""
     from ccatp.config.loader import load_config
+    from ccatp.fault_plan import read_plan
     from ccatp.processes.dataloop import run_alone
 
     named = {"sim.robot.host": host, "sim.robot.port": port, "run.mirror": mirror, "run.world": world, "run.seed": seed}
-    return int(run_alone(load_config(config_file, overrides(settings, named)), lockstep=not realtime))
+    cfg = load_config(config_file, overrides(settings, named))
+    plan = None if faults_file is None else read_plan(faults_file, lockstep=not realtime)
+    return int(run_alone(cfg, lockstep=not realtime, faults=plan))
 
 
 @sim.command("etalon", epilog=example("ccatp sim etalon --port 2001 --puck 0.1 -0.5 3.4"))

@@ -115,6 +115,9 @@ CONFIG_OPTION = click.option("--config", "config_file", type=click.Path(path_typ
 RUNTIME_DIR_OPTION = click.option(
     "--runtime-dir", type=click.Path(path_type=Path), help="Folder of the sockets, if not the usual one."
 )
+FAULTS_OPTION = click.option(
+    "--faults", "faults_file", type=click.Path(path_type=Path), help="Fault plan (TOML) for the simulated robot."
+)
 
 
 def settings_option(which: str) -> Callable[[Command], Command]:

@@ -3,12 +3,13 @@
 The sockets of the robot link carry what a real robot would say and nothing else. The truth leaves by ZeroMQ: a REP
 socket with the requests of ``ccatp.sim.truth``, and a PUB socket with batches of the topic ``truth``.
 
-Known limitations: the battery stays full, no sensor fails.
+Known limitations: the battery stays full, and nothing fails by itself; a fault plan lets it (``ccatp.sim.faults``).
 """
 
 import asyncio
 import secrets
 import socket
+from contextlib import AsyncExitStack
 from typing import Protocol, cast
 
 import numpy as np
@@ -17,7 +18,11 @@ import zmq.asyncio
 
 from ccatp.bus import Publisher
 from ccatp.config.models import Config
+from ccatp.fault_proxy.proxy import FaultProxy
+from ccatp.link_faults import LinkFaults
 from ccatp.mirror.mirror import build_mirror
+from ccatp.sim.faults.plan import FaultPlan
+from ccatp.sim.faults.record import Injected
 from ccatp.sim.robot import Robot
 from ccatp.sim.sessions import RobotServer, Session
 from ccatp.sim.truth import TruthLog
@@ -31,8 +36,8 @@ MAX_REQUEST_BYTES = 4096
 class Log(Protocol):
     """A structlog logger, or whatever has this method."""
 
-    def info(self, event: str) -> object:
-        """Take one line."""
+    def info(self, event: str, **fields: object) -> object:
+        """Take one line, and what belongs to it."""
 
 
 class DataLoop:
@@ -44,22 +49,32 @@ class DataLoop:
         seed: of every random draw.
         key: key of the robot link, ``None`` for no authentication.
         log: takes its lines.
+        faults: what shall go wrong with the robot; each is logged when it begins and with what it did.
 
     Attributes:
         robot: the robot.
         server: its link.
+        truth: who gives the truth away.
+        link_faults: who rules the proxy before the link by the robot's clock.
     """
 
     def __init__(
-        self, cfg: Config, lockstep: bool, seed: int, key: bytes | None = None, log: Log | None = None
+        self,
+        cfg: Config,
+        lockstep: bool,
+        seed: int,
+        key: bytes | None = None,
+        log: Log | None = None,
+        faults: FaultPlan | None = None,
     ) -> None:
         self._address = cfg.sim.robot.host, cfg.sim.robot.port
         self._is_lockstep = lockstep
         self._log = log
-        self.robot = Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(seed))
+        self.robot = Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(seed), faults)
         self._boot = secrets.randbits(31)
         self._key = key
         self.truth: TruthOutlet | None = None
+        self.link_faults: LinkFaults | None = None
         self._listener: asyncio.Server | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._connections: set[_Connection] = set()
@@ -117,6 +132,13 @@ class DataLoop:
             connection.close()
         if self.truth is not None:
             self.truth.flush()
+        if self.robot.injector is not None:
+            for injected in self.robot.injector.injected:
+                self._log_fault("injected", injected)
+        if self.link_faults is not None:
+            self.link_faults.tick(self.robot.t_s)  # what happened since the last frame
+            for injected in self.link_faults.injected:
+                self._log_fault("injected", injected)
         if self._listener is not None:
             await self._listener.wait_closed()
             self._listener = None
@@ -151,6 +173,16 @@ class DataLoop:
     def _on_frame(self) -> None:
         if self.truth is not None:
             self.truth.add()
+        if self.robot.injector is not None:
+            for what, injected in self.robot.injector.news(self.robot.t_s):
+                self._log_fault(what, injected)
+        if self.link_faults is not None:
+            for what, injected in self.link_faults.tick(self.robot.t_s):
+                self._log_fault(what, injected)
+
+    def _log_fault(self, what: str, injected: Injected) -> None:
+        if self._log is not None:
+            self._log.info(f"fault {what}: {injected.signal} {injected.type}", **injected._asdict())
 
     def _note(self, text: str) -> None:
         if self._log is not None:
@@ -265,6 +297,7 @@ async def serve(
     truth_pub: str | None = None,
     key: bytes | None = None,
     log: Log | None = None,
+    faults: FaultPlan | None = None,
 ) -> None:
     """Run a DataLoop until ``stop`` is set.
 
@@ -278,18 +311,35 @@ async def serve(
         truth_pub: endpoint of the truth's PUB socket.
         key: key of the robot link, ``None`` for no authentication.
         log: takes its lines.
+        faults: what shall go wrong with the robot and its link; for the link a proxy listens in the robot's place.
 
     Raises:
         OSError: the address cannot be had.
         zmq.ZMQError: an endpoint cannot be had.
     """
-    data_loop = DataLoop(cfg, lockstep, seed, key, log)
+    data_loop = DataLoop(cfg, lockstep, seed, key, log, faults)
     data_loop.truth = outlet = TruthOutlet(TruthLog(data_loop.robot), truth_rep, truth_pub)
     try:
-        await data_loop.start(listen_sock)
-        async with asyncio.TaskGroup() as tasks:
-            answering = tasks.create_task(outlet.serve())
-            await data_loop.run(stop)
-            answering.cancel()
+        async with AsyncExitStack() as stack:
+            if faults is not None and faults.link:
+                listen_sock = await _put_proxy_before(data_loop, faults, cfg, listen_sock, stack)
+            await data_loop.start(listen_sock)
+            async with asyncio.TaskGroup() as tasks:
+                answering = tasks.create_task(outlet.serve())
+                await data_loop.run(stop)
+                answering.cancel()
     finally:
         outlet.close()
+
+
+async def _put_proxy_before(
+    data_loop: DataLoop, faults: FaultPlan, cfg: Config, listen_sock: socket.socket | None, stack: AsyncExitStack
+) -> socket.socket:
+    """Let a proxy listen where the robot was to; the socket on which the robot listens instead."""
+    behind = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+    at = cfg.sim.robot
+    before = listen_sock or stack.enter_context(socket.create_server((at.host, at.port)))
+    proxy = FaultProxy(*behind.getsockname()[:2], seed=cfg.run.seed, listener=before)
+    await stack.enter_async_context(proxy)
+    data_loop.link_faults = LinkFaults(faults.link, proxy)
+    return behind

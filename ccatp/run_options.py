@@ -19,6 +19,7 @@ class RunOptions:
         resume: carry on with the mission in ``run_dir``.
         json_output: the summary goes to standard output as JSON, and nothing else does.
         runtime_dir: folder of the unix sockets given on the command line, or ``None``.
+        faults_file: plan of faults for the stand-ins, or ``None``; a copy goes into the run directory.
     """
 
     sim: bool
@@ -29,6 +30,7 @@ class RunOptions:
     resume: bool = False
     json_output: bool = False
     runtime_dir: Path | None = None
+    faults_file: Path | None = None
 
 
 def default_run_dir(mirror: str, seed: int, now_utc: datetime, parent: Path = Path("runs")) -> Path:

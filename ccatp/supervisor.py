@@ -20,7 +20,7 @@ import zmq
 from ccatp.config.loader import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.errors import ConfigError, ExitStatus, RefusedError
-from ccatp.processes.common import SUPERVISOR_PID, Endpoints, open_log
+from ccatp.processes.common import FAULTS_FILE, SUPERVISOR_PID, Endpoints, open_log
 from ccatp.processes.run_collector import RunCollector
 from ccatp.processes.run_view import RunView
 from ccatp.run_options import RunOptions, default_run_dir
@@ -83,6 +83,8 @@ def run_survey(options: RunOptions) -> int:
         run_dir = _make_run_dir(options, cfg)
         stack.enter_context(_lock(run_dir / ".lock", "--run-dir"))
         (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
+        if options.faults_file is not None:
+            (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
         run = _Run(options, cfg, run_dir, Endpoints(runtime_dir), sockets, started)
         return run.go()
 
@@ -241,6 +243,7 @@ class _Run:
         command += ["--run-dir", str(self._run_dir), "--runtime-dir", str(self._endpoints.runtime_dir)]
         command += ["--realtime"] if self._options.realtime else []
         command += ["--resume"] if self._options.resume else []
+        command += ["--faults"] if process.is_stand_in and self._options.faults_file is not None else []
         fds: tuple[int, ...] = ()
         if process.name in self._sockets:
             fds = (self._sockets[process.name].fileno(),)

@@ -17,6 +17,8 @@ from ccatp.config.models import Config
 from ccatp.errors import CcatpError
 
 PR_SET_PDEATHSIG = 1
+# The copy of the fault plan in the run directory.
+FAULTS_FILE = "faults.toml"
 # In this variable the supervisor tells its children who it is.
 SUPERVISOR_PID = "CCATP_SUPERVISOR_PID"
 
@@ -43,6 +45,7 @@ class ProcessArgs:
         listen_fd: an inherited listening socket, or ``None``.
         is_realtime: stand-ins pace on the wall clock.
         is_resuming: go on with a mission that stands in the run directory.
+        has_faults: a fault plan stands in the run directory; stand-ins only.
     """
 
     config: Config
@@ -51,6 +54,7 @@ class ProcessArgs:
     listen_fd: int | None
     is_realtime: bool
     is_resuming: bool
+    has_faults: bool = False
 
 
 def parse_args(argv: list[str] | None = None) -> ProcessArgs:
@@ -61,9 +65,12 @@ def parse_args(argv: list[str] | None = None) -> ProcessArgs:
     parser.add_argument("--listen-fd", type=int)
     parser.add_argument("--realtime", action="store_true")
     parser.add_argument("--resume", action="store_true")
+    parser.add_argument("--faults", action="store_true")
     args = parser.parse_args(argv)
     config = load_config(args.run_dir / "config.toml")
-    return ProcessArgs(config, args.run_dir, Endpoints(args.runtime_dir), args.listen_fd, args.realtime, args.resume)
+    return ProcessArgs(
+        config, args.run_dir, Endpoints(args.runtime_dir), args.listen_fd, args.realtime, args.resume, args.faults
+    )
 
 
 def die_with_parent() -> None:

@@ -10,10 +10,12 @@ import structlog
 from ccatp.config.models import Config
 from ccatp.dataloop import serve
 from ccatp.errors import ConfigError
+from ccatp.fault_plan import read_plan
 from ccatp.processes import spinning
-from ccatp.processes.common import Endpoints, die_with_parent, open_log, parse_args, stop_on_signals
+from ccatp.processes.common import FAULTS_FILE, Endpoints, die_with_parent, open_log, parse_args, stop_on_signals
 from ccatp.robot_link import read_key
 from ccatp.runtime_dir import make_runtime_dir
+from ccatp.sim.faults.plan import FaultPlan
 
 
 def main() -> int:
@@ -21,6 +23,7 @@ def main() -> int:
     die_with_parent()
     args = parse_args()
     cfg = args.config
+    faults = read_plan(args.run_dir / FAULTS_FILE, lockstep=not args.is_realtime) if args.has_faults else None
     if not args.is_realtime:
         spinning.leave_a_core(os.getppid())
 
@@ -37,13 +40,14 @@ def main() -> int:
             truth_pub=args.endpoints.of("truth"),
             key=read_key(cfg.robot.key_file),
             log=open_log(args.run_dir / "log.jsonl", "dataloop"),
+            faults=faults,
         )
         return 0
 
     return spinning.run(run(), is_spinning=not args.is_realtime)
 
 
-def run_alone(cfg: Config, lockstep: bool) -> int:
+def run_alone(cfg: Config, lockstep: bool, faults: FaultPlan | None = None) -> int:
     """The stand-in alone, for other people's controllers; ends on SIGINT or SIGTERM.
 
     Its truth is at ``puck`` in the runtime directory, for ``ccatp sim etalon --truth``.
@@ -51,6 +55,7 @@ def run_alone(cfg: Config, lockstep: bool) -> int:
     Args:
         cfg: configuration; ``sim.robot`` holds the address.
         lockstep: simulated time waits for the controller.
+        faults: what shall go wrong.
     """
     at = cfg.sim.robot
     truth = Endpoints(make_runtime_dir(cfg.run.runtime_dir, os.environ)).of("puck")
@@ -76,6 +81,7 @@ def run_alone(cfg: Config, lockstep: bool) -> int:
             truth_rep=truth,
             key=read_key(cfg.robot.key_file),
             log=log,
+            faults=faults,
         )
 
     asyncio.run(run())

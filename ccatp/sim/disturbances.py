@@ -105,10 +105,32 @@ class WheelSlip:
         self.left = self._base[1] + self._walks[1].at(t_s)
 
 
+class Downhill:
+    """Where downhill is under the robot.
+
+    Args:
+        mirror: knows the direction of gravity.
+    """
+
+    __slots__ = ("_gx", "_gy", "_gz")
+
+    def __init__(self, mirror: Mirror) -> None:
+        self._gx, self._gy, self._gz = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
+
+    def of(self, plant: Plant) -> tuple[float, float, float]:
+        """Gravity's part in the tangent plane along robot x and y, and its length: the slope."""
+        gx, gy, gz = self._gx, self._gy, self._gz
+        hx, hy, lx, ly, fx, fy = plant.hx, plant.hy, plant.lx, plant.ly, plant.fx, plant.fy
+        # Both axes are tangents of the surface, so their third component is the slope along them.
+        ahead = gx * hx + gy * hy + gz * (fx * hx + fy * hy)
+        aside = gx * lx + gy * ly + gz * (fx * lx + fy * ly)
+        return ahead, aside, sqrt(ahead * ahead + aside * aside)
+
+
 class Creep:
     """The body glides downhill while it drives."""
 
-    __slots__ = ("_fraction", "_gx", "_gy", "_gz", "_walk")
+    __slots__ = ("_downhill", "_fraction", "_walk")
 
     def __init__(self, mirror: Mirror, world: WorldConfig, rng: np.random.Generator) -> None:
         """Set up.
@@ -118,7 +140,7 @@ class Creep:
             world: size and walk of the creep.
             rng: generator of the walk.
         """
-        self._gx, self._gy, self._gz = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
+        self._downhill = Downhill(mirror)
         self._fraction = world.creep_fraction
         self._walk = OrnsteinUhlenbeck(world.creep_walk_fraction, world.creep_walk_time_s, rng)
 
@@ -128,12 +150,7 @@ class Creep:
         """Add ``creep_fraction |v| (1 + walk) dt`` along the unit vector downhill."""
         if forward_m == 0.0:
             return forward_m, left_m, turn_rad
-        gx, gy, gz = self._gx, self._gy, self._gz
-        hx, hy, lx, ly, fx, fy = plant.hx, plant.hy, plant.lx, plant.ly, plant.fx, plant.fy
-        # Both axes are tangents of the surface, so their third component is the slope along them.
-        ahead = gx * hx + gy * hy + gz * (fx * hx + fy * hy)
-        aside = gx * lx + gy * ly + gz * (fx * lx + fy * ly)
-        slope = sqrt(ahead * ahead + aside * aside)
+        ahead, aside, slope = self._downhill.of(plant)
         if slope < LEVEL_SLOPE:
             return forward_m, left_m, turn_rad
         glide = self._fraction * abs(forward_m) * (1.0 + self._walk.at(t_s)) / slope

@@ -243,6 +243,19 @@ class Plant:
         difference = right_set - left_set + (r * self._right_0 - right_set - q * self._left_0 + left_set) * decay
         return 0.5 * self._radius_m * difference / self._half_base_m + self.shake_rate_rad_s
 
+    def place(self, x_m: float, y_m: float, heading_rad: float) -> None:
+        """Put the body elsewhere on the surface, deck frame; the wheels know nothing of it."""
+        self.x_m, self.y_m, self.heading_rad = x_m, y_m, heading_rad
+        self.z_m, self.fx, self.fy, *_ = self._jet(x_m, y_m)
+        self._turn_axes()
+
+    def block(self, *, right: bool, left: bool) -> bool:
+        """Stop wheels at once; whether any of them turned."""
+        was = bool((right and self.right_rad_s) or (left and self.left_rad_s))
+        self.right_rad_s = 0.0 if right else self.right_rad_s
+        self.left_rad_s = 0.0 if left else self.left_rad_s
+        return was
+
     def stop_dead(self) -> None:
         """The wheels stop at once and for good (the robot fell)."""
         self.right_rad_s = self.left_rad_s = self._right_0 = self._left_0 = self._right_set = self._left_set = 0.0

@@ -9,54 +9,30 @@ Choices the interface leaves open:
   the boot.
 * The link's delays are whole frames. The frame read at t is delivered when the clock shows t + the sensors' delay,
   the truth is that of the clock. Commands wait in ``ccatp.sim.command_delay``.
-* The battery stays full, ``faults`` stays empty.
+* The battery stays full, ``faults`` stays empty, nothing fails, unless a fault plan says so (``ccatp.sim.faults``).
+* A reboot by plan takes no time. On the link, clock and frames count from it; ``seq`` and ``t_s`` here, the truth and
+  the times of the plan go on.
 """
 
 from collections import deque
-from collections.abc import Iterable
-from itertools import repeat
 from math import ceil
-from typing import TypeVar
 
-import msgspec
 import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import EdgeSample, GravitySample, ImuSample, WheelSample
 from ccatp.sim.command_delay import CommandDelay
-from ccatp.sim.edge_sensors import EdgeTuple
-from ccatp.sim.encoders import WheelTuple
-from ccatp.sim.inertial import ImuTuple
+from ccatp.sim.faults.injector import Injector
+from ccatp.sim.faults.plan import FaultPlan
+from ccatp.sim.frame import Frame, as_line, as_message
 from ccatp.sim.rules import Fans, MotionRules
-from ccatp.sim.sensors import GravityTuple, SensorSuite
+from ccatp.sim.sensors import SensorSuite
 from ccatp.sim.world import World
 from ccatp.wire.lines import MAX_LINE_BYTES
-from ccatp.wire.robot import PROTOCOL, CommandEcho, Hello, RobotData, Sensors, encode_sensors
+from ccatp.wire.robot import PROTOCOL, CommandEcho, Hello, RobotData, Sensors
 
 # Worst case of a frame's line: fixed part, and bytes per sample of each list. Counted rates have all their digits.
 _FRAME_BYTES, _IMU_BYTES, _ENCODER_BYTES, _COUNTER_BYTES, _EDGE_BYTES = 420, 48, 44, 64, 26
-
-
-_Row = TypeVar("_Row", ImuSample, WheelSample, EdgeSample)
-
-
-class Frame(msgspec.Struct, frozen=True, gc=False):
-    """A frame as it was read: what ``Sensors`` says, in the same places, with samples as plain tuples.
-
-    Making named tuples of twenty samples takes as long as reading them, so it waits until somebody asks for names.
-    """
-
-    seq: int
-    t: float
-    imu: list[ImuTuple]
-    enc: list[WheelTuple]
-    edge: list[EdgeTuple]
-    gravity: GravityTuple | None
-    fans: tuple[float, float]
-    soc: float
-    cmd: CommandEcho
-    faults: tuple[str, ...]
 
 
 class Robot:
@@ -68,15 +44,18 @@ class Robot:
         seq, t_s: newest frame and its time on the robot's clock.
         frame_s: period of the frames.
         sensors_delay_frames, commands_delay_frames: delays of the link.
+        injector: the plan at work, if there is one.
+        reboots: how often it started anew.
     """
 
-    def __init__(self, cfg: Config, mirror: Mirror, rng: np.random.Generator) -> None:
+    def __init__(self, cfg: Config, mirror: Mirror, rng: np.random.Generator, faults: FaultPlan | None = None) -> None:
         """Boot.
 
         Args:
             cfg: robot, world, sim and etalon sections.
             mirror: the mirror it stands on.
             rng: parent of every random draw.
+            faults: what shall go wrong.
 
         Raises:
             ValueError: the rates put more samples in a frame than a line may hold, or a frame outlasts the TTL.
@@ -93,7 +72,11 @@ class Robot:
         self.sensors_delay_frames = round(cfg.world.sensors_delay_s * sim.frame_hz)
         self.commands_delay_frames = round(cfg.world.commands_delay_s * sim.frame_hz)
         self._commands = CommandDelay(self.rules, self.fans, self.commands_delay_frames)
-        self.world = World(cfg, mirror, world_rng, max(1, round(cfg.etalon.measuring_time_s * sim.frame_hz)))
+        self.injector = None if faults is None else Injector(faults, mirror, rng.spawn(1)[0])
+        self.reboots = 0
+        window_frames = max(1, round(cfg.etalon.measuring_time_s * sim.frame_hz))
+        pushes = () if self.injector is None else self.injector.body.drifts
+        self.world = World(cfg, mirror, world_rng, window_frames, pushes)
         self._sensors = SensorSuite(
             mirror,
             sim,
@@ -186,16 +169,44 @@ class Robot:
 
     def advance(self) -> None:
         """Drive one frame and read the sensors."""
-        before_s, self.seq = self.t_s, self.seq + 1
+        before_s = self.t_s
+        if self.injector is not None and self.injector.is_rebooting(before_s):
+            self._reboot(self.injector)
+        self.seq += 1
         self.t_s = t_s = self.seq / self._frame_hz
         self._commands.release(self.seq - 1)
         right, left = self.rules.set_points(t_s)
+        if self.injector is not None and not self.world.is_fallen:
+            right, left = self._act(self.injector, before_s, (right, left))
         self.world.step(before_s, self.frame_s, right, left, self.fans.thrust)
         self._read()
 
+    def _act(self, injector: Injector, t_s: float, set_points_rad_s: tuple[float, float]) -> tuple[float, float]:
+        """Let the faults of the body act."""
+        plant = self.world.plant
+        before = plant.pose
+        found = injector.body.act(self.world, self.fans, t_s, set_points_rad_s)
+        if plant.pose != before:
+            self._sensors.edges.place(plant)  # they do not see the way of a body that was put elsewhere
+        return found
+
+    def _reboot(self, injector: Injector) -> None:
+        """Nothing of the boot before is known; the fans go to their floor."""
+        sim, health = self._cfg.sim.robot, self.fans.health
+        self.reboots += 1
+        self.rules = MotionRules(sim.ttl_s, self._cfg.robot.max_wheel_rad_s, self.t_s)
+        self.fans = Fans(self._floor)
+        self.fans.health = health
+        self._commands = CommandDelay(self.rules, self.fans, self.commands_delay_frames)
+        self._frames.clear()
+        injector.reboot(self.seq, self.t_s)
+
     @property
     def delivered_seq(self) -> int:
-        """Number of the frame that reached the clients at this instant; -1 while none has."""
+        """Number of the frame that reached the clients at this instant; -1 while none has, or a fault took it."""
+        if self.injector is not None:
+            message = self.injector.outgoing.message
+            return -1 if message is None else message.seq
         frame = self.delivered_rows
         return -1 if frame is None else frame.seq
 
@@ -206,23 +217,30 @@ class Robot:
         Equal in every number to decoding ``delivered_line``. Made when first asked for and then shared: leave it as it
         is.
         """
+        if self.injector is not None:
+            return self.injector.outgoing.message
         if self._delivered is None:
             frame = self.delivered_rows
-            self._delivered = None if frame is None else _as_message(frame)
+            self._delivered = None if frame is None else as_message(frame)
         return self._delivered
 
     @property
     def delivered_rows(self) -> Frame | None:
-        """The same with plain tuples for samples, at no cost; leave it as it is."""
+        """The same with plain tuples for samples, at no cost, before the faults of its delivery; leave it as it is."""
         frames = self._frames
         return frames[0] if len(frames) > self.sensors_delay_frames else None
 
     @property
     def delivered_line(self) -> bytes:
-        """The same frame as a line with its LF; empty while none has reached the clients."""
+        """The same frame as a line with its LF; empty while none has reached the clients.
+
+        With faults it is whatever leaves the robot at this instant: nothing, a line that none may take, several lines.
+        """
+        if self.injector is not None:
+            return self.injector.outgoing.line
         if not self._line:
             frame = self.delivered_rows
-            self._line = b"" if frame is None else _as_line(frame)
+            self._line = b"" if frame is None else as_line(frame)
         return self._line
 
     def _read(self) -> None:
@@ -233,35 +251,12 @@ class Robot:
         drive_seq, age_s, permit_age_s, is_held = self.rules.echo(t_s)
         is_held = is_held or self.world.is_fallen
         cmd = CommandEcho(drive_seq, round(age_s * 1e6) / 1e6, round(permit_age_s * 1e6) / 1e6, is_held)
-        self._frames.append(Frame(seq, t_s, imu, encoders, edges, gravity, self.fans.duty, 1.0, cmd, ()))
+        frame = Frame(seq, t_s, imu, encoders, edges, gravity, self.fans.duty, 1.0, cmd, ())
+        injector = self.injector
+        self._frames.append(frame if injector is None else injector.sense(frame))
         self._delivered, self._line = None, b""
-
-
-def _as_line(frame: Frame) -> bytes:
-    seq, t_s, imu, encoders, edges, gravity, fans, soc, cmd, faults = msgspec.structs.astuple(frame)
-    return encode_sensors(seq, t_s, imu, encoders, edges, gravity, fans, soc, msgspec.structs.astuple(cmd), faults)
-
-
-def _as_message(frame: Frame) -> Sensors:
-    """The message that a client decodes from the frame's line."""
-    gravity = frame.gravity
-    return Sensors(
-        frame.seq,
-        frame.t,
-        _as(ImuSample, frame.imu),
-        _as(WheelSample, frame.enc),
-        _as(EdgeSample, frame.edge),
-        None if gravity is None else GravitySample(*gravity),
-        frame.fans,
-        frame.soc,
-        frame.cmd,
-        list(frame.faults),
-    )
-
-
-def _as(kind: type[_Row], rows: Iterable[tuple[object, ...]]) -> list[_Row]:
-    """The rows as named tuples; five times as fast as calling the class for each."""
-    return list(map(tuple.__new__, repeat(kind), rows))
+        if injector is not None:
+            injector.deliver(t_s, self.delivered_rows)
 
 
 def _check_rates(cfg: Config) -> None:

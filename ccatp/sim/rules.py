@@ -19,6 +19,7 @@ class MotionRules:
     Args:
         ttl_s: time-to-live of drive and permit, s.
         max_wheel_rad_s: limit of a wheel; a faster drive is slowed down as a whole, so that its path stays the same.
+        boot_s: time of the boot, from which ages count.
 
     Attributes:
         has_monitor_joined: at least once in this boot.
@@ -38,12 +39,12 @@ class MotionRules:
         "is_held",
     )
 
-    def __init__(self, ttl_s: float, max_wheel_rad_s: float) -> None:
+    def __init__(self, ttl_s: float, max_wheel_rad_s: float, boot_s: float = 0.0) -> None:
         self._ttl_s, self._max_wheel_rad_s = ttl_s, max_wheel_rad_s
         self._drive: tuple[float, float] | None = None
         self._permit: tuple[bool, bool, bool] | None = None
         self._drive_seq = self._permit_seq = -1
-        self._drive_s = self._permit_s = 0.0  # as old as the boot
+        self._drive_s = self._permit_s = boot_s  # as old as the boot
         self.has_monitor_joined = False
         self.is_held = True
 

@@ -14,6 +14,9 @@ Choices the interface leaves open:
 * In lockstep a delay of the sensors keeps its length: each answer to the newest frame delivered drives one frame, and
   delivers the next. What a client knows is old by the delay, as it is on a wall clock. The frames before the first
   delivery run when the controller joins, held. Delays within the robot stand in for those of the whole link.
+* In lockstep a frame that a fault took away, or that no client may take, waits for nobody: simulated time goes on to
+  the next that can be answered, for at most ``DEAF_S``; then the sessions are closed.
+* A reboot by plan closes every session.
 """
 
 from collections import Counter
@@ -45,6 +48,7 @@ JOIN_TIMEOUT_S = 2.0
 SILENCE_S = 5.0
 STALL_S = 5.0
 MAX_LAG_S = 0.25
+DEAF_S = 60.0
 MAX_SESSIONS = 32
 
 
@@ -152,6 +156,7 @@ class RobotServer:
         self._is_drive_acked = self._is_permit_acked = False
         self._frame_wall_s = now_s
         self._is_stall_noted = False
+        self._reboots = robot.reboots
 
     # -- connections ----------------------------------------------------------------------------------------------
 
@@ -159,7 +164,9 @@ class RobotServer:
         """A client connected."""
         session = Session(self, wire, self._make_nonce(), now_s)
         auth = AUTH_NONE if self._key is None else AUTH_HMAC
-        hello = self.robot.hello(boot=self._boot, nonce=session.nonce, auth=auth, lockstep=self._is_lockstep)
+        hello = self.robot.hello(
+            boot=self._boot + self._reboots, nonce=session.nonce, auth=auth, lockstep=self._is_lockstep
+        )
         wire.write(encode(hello))
         self._sessions.add(session)
         if len(self._sessions) > MAX_SESSIONS:
@@ -237,18 +244,24 @@ class RobotServer:
         if role == "controller":
             robot.join_controller()
             if self._is_lockstep:
-                self._run_to_first_delivery()
+                self._run_to_delivery()
                 self._send_frame()
         else:
             robot.join_monitor()
             if self._is_lockstep and "controller" in self._holders:
                 session.wire.write(robot.delivered_line)
 
-    def _run_to_first_delivery(self) -> None:
-        """Nobody can answer what is still on its way: the frames until the first arrives run by themselves, held."""
-        while self.robot.delivered_seq < 0:
-            self.robot.advance()
+    def _run_to_delivery(self) -> None:
+        """Nobody can answer what is still on its way, or lost: the frames until one arrives run by themselves."""
+        robot, since_s = self.robot, self.robot.t_s
+        while robot.delivered_seq < 0 and "controller" in self._holders:
+            if robot.t_s - since_s > DEAF_S:
+                self._drop_all(f"no frame could be delivered for {DEAF_S:g} s")
+                return
+            self._send_frame()
+            robot.advance()
             self._on_frame()
+            self._heed_reboot()
 
     def command(self, session: Session, role: Role, message: FromClient, now_s: float) -> bool:
         """A message of a session that has a role; false when it is not for this role."""
@@ -301,7 +314,19 @@ class RobotServer:
         self._frame_wall_s, self._is_stall_noted = now_s, False
         self.robot.advance()
         self._on_frame()
+        self._heed_reboot()
+        if self._is_lockstep:
+            self._run_to_delivery()
         self._send_frame()
+
+    def _heed_reboot(self) -> None:
+        if self.robot.reboots != self._reboots:
+            self._reboots = self.robot.reboots
+            self._drop_all("the robot rebooted")
+
+    def _drop_all(self, why: str) -> None:
+        for session in tuple(self._sessions):
+            self.drop(session, why)
 
     def _send_frame(self) -> None:
         line = self.robot.delivered_line

@@ -20,6 +20,7 @@ from ccatp.sim.plant import Disturbance, Plant
 TruthRow = tuple[int, float, float, float, float, float, float, float, float, int, int]
 
 NEAR_RIM_M = 0.25
+FULL_GRIP = (1.0, 1.0)
 FAR_CLEARANCE_M = 1.0
 """Stands for the clearance while the robot's origin is more than ``NEAR_RIM_M`` from the rim."""
 
@@ -42,9 +43,18 @@ class World:
         misalignments: of each panel.
         start_panel_pose, start_pose: where the robot really stands at boot.
         is_fallen: it fell, for good.
+        grip: share of its travel that each wheel gives to the body, right and left, besides its slip; may be set
+            before a step.
     """
 
-    def __init__(self, cfg: Config, mirror: Mirror, rng: np.random.Generator, window_frames: int) -> None:
+    def __init__(
+        self,
+        cfg: Config,
+        mirror: Mirror,
+        rng: np.random.Generator,
+        window_frames: int,
+        pushes: Iterable[Disturbance] = (),
+    ) -> None:
         """Draw the start errors, the misalignments and what disturbs the robot.
 
         Args:
@@ -52,6 +62,7 @@ class World:
             mirror: the mirror.
             rng: parent of the generators; the draws of one kind do not depend on the others.
             window_frames: length of the window of ``moved_m``, in frames.
+            pushes: what moves the body besides the disturbances of the configuration.
         """
         start_rng, truth_rng = rng.spawn(2)
         wheels_rng, slip_rng, creep_rng, vibration_rng = rng.spawn(4)
@@ -76,13 +87,15 @@ class World:
             wheel_radius_m=wheels.radius_m,
             wheel_base_m=wheels.base_m,
             wheel_lag_s=wheels.lag_s,
-            disturbances=disturbances,
+            disturbances=[*disturbances, *pushes],
         )
         self.plant.right_scale, self.plant.left_scale = wheels.right_scale, wheels.left_scale
         self._puck_height_m = robot.puck_height_m
         self._thrust_floor, self._fall_thrust_s = sim.fan_floor, sim.fall_thrust_s
         self._weak_s = 0.0
         self.is_fallen = False
+        self.grip = FULL_GRIP
+        self._full_scales: tuple[float, float] | None = None  # while the wheels have less grip
         self._places: deque[tuple[float, float]] = deque(maxlen=window_frames + 1)
         self._places.append((self.plant.x_m, self.plant.y_m))
         self._overhang, self._rim = mirror.overhang, NearOutline(mirror.rim)
@@ -109,8 +122,14 @@ class World:
         if self.is_fallen:
             plant.is_moving = False
             return
+        if self._full_scales is not None:
+            (plant.right_scale, plant.left_scale), self._full_scales = self._full_scales, None
         if self._slip is not None:
             self._let_slip(self._slip, t_s, dt_s, right_rad_s != 0.0 or left_rad_s != 0.0)
+        if self.grip != FULL_GRIP:
+            right_grip, left_grip = self.grip
+            self._full_scales = right_scale, left_scale = plant.right_scale, plant.left_scale
+            plant.right_scale, plant.left_scale = right_grip * right_scale, left_grip * left_scale
         if self._vibration is not None:
             self._vibration.is_thrusting = thrust > 0.0
         plant.step(t_s, dt_s, right_rad_s, left_rad_s)
@@ -134,6 +153,15 @@ class World:
             slip.step(t_s, dt_s, is_ordered)
             plant.right_scale = self.wheels.right_scale * (1.0 - slip.right)
             plant.left_scale = self.wheels.left_scale * (1.0 - slip.left)
+
+    def displace(self, dx_m: float, dy_m: float, dheading_rad: float) -> None:
+        """Put the robot elsewhere: deck frame, relative to where it is. Beyond the rim it falls."""
+        plant = self.plant
+        plant.place(plant.x_m + dx_m, plant.y_m + dy_m, plant.heading_rad + dheading_rad)
+        self._has_looked = False
+        self._measure_rim()
+        if self._rim_bound_m < 0.0:
+            self._fall()
 
     def _fall(self) -> None:
         self.is_fallen = True

@@ -78,7 +78,7 @@ class Notes:
         self.lines: list[str] = []
         self._more = asyncio.Event()
 
-    def info(self, event: str) -> None:
+    def info(self, event: str, **fields: object) -> None:
         self.lines.append(event)
         self._more.set()
 

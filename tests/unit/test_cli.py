@@ -118,6 +118,18 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
         (["run", "--sim", "--miror", "x"], "Did you mean '--mirror'?"),
         (["run", "--sim", "--set", "seed"], "'seed' is not KEY=VALUE, as in run.seed=2"),
         (["run", "--sim", "--seed", "one"], "'one' is not a valid integer"),
+        (
+            ["run", "--config", "telescope.toml", "--faults", "plan.toml"],
+            "--faults goes with --sim alone: faults are for the simulated robot, never for a real one",
+        ),
+        (
+            ["run", "--sim", "--faults", "none.toml"],
+            "ccatp: none.toml: no such file or directory; name a TOML file that",
+        ),
+        (
+            ["sim", "robot", "--faults", "none.toml"],
+            "ccatp: none.toml: no such file or directory; name a TOML file that",
+        ),
         (["emergency", "fier"], "'fier' is not one of 'fire', 'earthquake', 'power', 'weather', 'operator'"),
         (
             ["config", "check", "none.toml"],
@@ -268,13 +280,13 @@ def test_the_robot_alone_gets_its_address(stub: Stub) -> None:
     cfg, options = calls[0]
     assert isinstance(cfg, Config)
     assert (cfg.sim.robot.host, cfg.sim.robot.port, cfg.mirror.name, cfg.run.seed) == ("0.0.0.0", 0, "fyst-m2", 4)
-    assert options == {"lockstep": True}
+    assert options == {"lockstep": True, "faults": None}
 
 
 def test_the_robot_alone_is_paced_unless_told_otherwise(stub: Stub) -> None:
     calls = stub("ccatp.processes.dataloop", "run_alone", 0)
     assert main(["sim", "robot"]) == 0
-    assert calls[0][1] == {"lockstep": False}
+    assert calls[0][1] == {"lockstep": False, "faults": None}
 
 
 def test_the_laser_system_alone_gets_its_puck(stub: Stub) -> None:

@@ -1,0 +1,1 @@
+"""Edge. A TCP proxy that misbehaves on purpose, for tests and for simulated runs with a fault plan."""

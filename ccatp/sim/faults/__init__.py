@@ -1,0 +1,1 @@
+"""Pure. Faults of the simulated robot by a timed plan, and the record of what was really injected."""

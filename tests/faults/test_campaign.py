@@ -1,0 +1,33 @@
+"""Random faults that pass by: whatever a mission makes of them, the robot does not fall, and every fault was real."""
+
+import pytest
+
+from tests.faults.campaign import random_plan, single, survey
+
+MISSIONS = 40
+
+
+def test_plans_are_of_their_seed() -> None:
+    assert random_plan(3) == random_plan(3)
+    assert random_plan(3) != random_plan(4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(MISSIONS))
+def test_nobody_falls(seed: int) -> None:
+    ending = survey(seed, random_plan(seed))
+    assert ending.result.summary["danger"]["falls"] == 0, ending.line
+    assert ending.result.outcome in {"complete", "stopped", "aborted, at base"}, ending.line
+    time_s = ending.result.summary["mission_time_s"]
+    for record in ending.injected:
+        assert record.at_s is not None
+        # A second before the end a sensor of 20 Hz, too, has been read.
+        assert record.samples > 0 or record.at_s > time_s - 1.0, (record, ending.line)
+
+
+@pytest.mark.slow
+def test_a_fault_long_after_the_mission_changes_nothing() -> None:
+    without = survey(5, single('signal = "imu_wz"\ntype = "off"\nat_s = 9000.0'))
+    with_one = survey(5, single('signal = "soc"\ntype = "stuck"\nat_s = 9000.0'))
+    assert without.result.summary == with_one.result.summary
+    assert without.injected[0].samples == 0

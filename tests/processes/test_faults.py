@@ -1,0 +1,56 @@
+"""``ccatp run --sim --faults``: what goes wrong really does, the log names it, the run ends as defined."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tests.processes.conftest import NO_CALIBRATION, Run
+
+Start = Callable[..., Run]
+
+STUCK_GYROSCOPE = """
+[[fault]]
+signal = "imu_wz"
+type = "stuck"
+at_s = 6.0
+for_s = 0.5
+"""
+
+
+def log_of(run: Run) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (run.run_dir / "log.jsonl").read_text().splitlines()]
+
+
+def test_a_stuck_gyroscope_is_in_the_log_and_the_run_ends_as_defined(start: Start, tmp_path: Path) -> None:
+    plan = tmp_path / "plan.toml"
+    plan.write_text(STUCK_GYROSCOPE)
+    run = start("--panels", "1", *NO_CALIBRATION, "--faults", str(plan))
+    assert run.wait() == 0, run.stderr
+    assert "Traceback" not in run.stderr
+    told = [entry for entry in log_of(run) if entry["event"].startswith("fault ")]
+    events = [f"fault {what}: imu_wz stuck" for what in ("begins", "ended", "injected")]
+    assert [entry["event"] for entry in told] == events
+    assert {entry["process"] for entry in told} == {"dataloop"}
+    last = told[-1]
+    assert (last["at_s"], last["from_s"], last["until_s"], last["samples"]) == (6.0, 6.0, 6.49, 50)
+    assert last["changed"] > 0
+    assert (run.run_dir / "faults.toml").read_text() == STUCK_GYROSCOPE
+    assert run.summary["danger"]["falls"] == 0
+
+
+def test_a_link_that_is_reset_ends_the_run_with_status_5(start: Start, tmp_path: Path) -> None:
+    plan = tmp_path / "plan.toml"
+    plan.write_text('[[link]]\ntype = "fragment"\ndirection = "both"\nat_s = 0.5\nfor_s = 0.2\nwrite_bytes = 50\n'
+                    '[[link]]\ntype = "reset"\nat_s = 3.0\n')  # fmt: skip
+    run = start("--panels", "1", "--faults", str(plan))
+    assert run.wait() == 5, run.stderr
+    assert "robot link lost" in run.stderr
+    assert "Traceback" not in run.stderr
+    injected = [entry for entry in log_of(run) if entry["event"].startswith("fault injected")]
+    assert [(entry["signal"], entry["type"], entry["from_s"]) for entry in injected] == [
+        ("link", "fragment", 0.5),
+        ("link", "reset", 3.0),
+    ]
+    assert injected[0]["samples"] > 20
+    assert injected[1]["samples"] == 2  # the controller's connection and the monitor's

@@ -1,0 +1,428 @@
+"""Every fault of the proxy, observed on both ends of loopback connections."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import pytest
+
+from ccatp.fault_proxy import pipe
+from ccatp.fault_proxy.proxy import FaultProxy
+
+DEADLINE_S = 5.0  # what never happens in a good run may take this long in a bad one
+LINES = [b"line %d of some length\n" % k for k in range(40)]
+TEXT = b"".join(LINES)
+
+
+class Server:
+    """Keeps what it gets, piece by piece, and sends what it is told."""
+
+    def __init__(self) -> None:
+        self.pieces: list[bytes] = []
+        self.ends: list[str] = []
+        self.writers: list[asyncio.StreamWriter] = []
+        self.changed = asyncio.Event()
+        self.is_echo = False
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.writers.append(writer)
+        self.changed.set()
+        try:
+            while data := await reader.read(65536):
+                self.pieces.append(data)
+                self.changed.set()
+                if self.is_echo:
+                    writer.write(data)
+            self.ends.append("FIN")
+        except ConnectionResetError:
+            self.ends.append("RST")
+        except ConnectionError:
+            self.ends.append("lost")
+        finally:
+            self.changed.set()
+            writer.close()
+
+    @property
+    def text(self) -> bytes:
+        return b"".join(self.pieces)
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        async with asyncio.timeout(DEADLINE_S):
+            while not condition():
+                self.changed.clear()
+                await self.changed.wait()
+
+
+class Rig:
+    """A server behind a proxy."""
+
+    def __init__(self, server: Server, proxy: FaultProxy) -> None:
+        self.server, self.proxy = server, proxy
+        self.writers: list[asyncio.StreamWriter] = []
+
+    async def connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        """A client; the server has it, too."""
+        before = len(self.server.writers)
+        reader, writer = await asyncio.open_connection("127.0.0.1", self.proxy.port)
+        self.writers.append(writer)
+        await self.server.until(lambda: len(self.server.writers) > before)
+        return reader, writer
+
+
+@asynccontextmanager
+async def rig(seed: int = 1) -> AsyncIterator[Rig]:
+    server = Server()
+    listening = await asyncio.start_server(server.serve, "127.0.0.1", 0)
+    try:
+        async with FaultProxy("127.0.0.1", listening.sockets[0].getsockname()[1], seed=seed) as proxy:
+            found = Rig(server, proxy)
+            try:
+                yield found
+            finally:
+                for writer in (*found.writers, *server.writers):
+                    writer.close()
+                    with contextlib.suppress(ConnectionError):
+                        await writer.wait_closed()
+    finally:
+        listening.close()
+        await listening.wait_closed()
+
+
+async def passes(condition: Callable[[], bool]) -> None:
+    """Let the event loop turn until the condition holds."""
+    for _ in range(100_000):
+        if condition():
+            return
+        await asyncio.sleep(0)
+    pytest.fail("it never came true")
+
+
+async def read(reader: asyncio.StreamReader, count: int) -> bytes:
+    async with asyncio.timeout(DEADLINE_S):
+        return await reader.readexactly(count)
+
+
+async def rest(reader: asyncio.StreamReader) -> tuple[bytes, str]:
+    """What comes until the end, and how it ends."""
+    found = b""
+    async with asyncio.timeout(DEADLINE_S):
+        try:
+            while data := await reader.read(65536):
+                found += data
+        except ConnectionResetError:
+            return found, "RST"
+    return found, "FIN"
+
+
+async def test_without_faults_everything_passes_and_so_does_the_end() -> None:
+    async with rig() as r:
+        reader, writer = await r.connect()
+        writer.write(TEXT)
+        await r.server.until(lambda: r.server.text == TEXT)
+        r.server.writers[0].write(TEXT[::-1])
+        assert await read(reader, len(TEXT)) == TEXT[::-1]
+        assert r.proxy.passed_bytes == len(TEXT)
+        assert r.proxy.passed_lines == len(LINES)
+        writer.close()
+        await r.server.until(lambda: r.server.ends == ["FIN"])
+        assert r.proxy.counts == {"connections": 1}
+
+
+async def test_a_server_that_is_not_there_ends_the_connection(free_port: int) -> None:
+    async with FaultProxy("127.0.0.1", free_port, seed=1) as proxy:
+        reader, writer = await asyncio.open_connection("127.0.0.1", proxy.port)
+        assert (await rest(reader))[0] == b""
+        assert proxy.counts["refused"] == 1
+        writer.close()
+
+
+async def test_reset_is_felt_on_both_sides() -> None:
+    async with rig() as r:
+        reader, _ = await r.connect()
+        r.proxy.reset()
+        assert (await rest(reader))[1] == "RST"
+        await r.server.until(lambda: r.server.ends == ["RST"])
+        assert r.proxy.counts["reset"] == 1
+
+
+@pytest.mark.parametrize("count", [1, 23, 24, 100, len(TEXT) - 1])
+async def test_reset_after_exactly_so_many_bytes(count: int) -> None:
+    async with rig() as r:
+        reader, _ = await r.connect()
+        r.proxy.reset_after(count)
+        r.server.writers[0].write(TEXT)
+        assert await rest(reader) == (TEXT[:count], "RST")
+        assert r.proxy.counts["reset"] == 1
+
+
+async def test_close_ends_both_sides_in_order() -> None:
+    async with rig() as r:
+        reader, _ = await r.connect()
+        r.proxy.close()
+        assert await rest(reader) == (b"", "FIN")
+        await r.server.until(lambda: r.server.ends == ["FIN"])
+        assert r.proxy.counts["close"] == 1
+        await r.connect()  # the next one is served
+
+
+async def test_close_over_bytes_on_their_way_is_no_reset() -> None:
+    async with rig() as r:
+        reader, writer = await r.connect()
+        r.proxy.stall("to_server")
+        writer.write(TEXT)
+        await passes(lambda: r.proxy.counts["stall"] > 0)
+        writer.write(TEXT)
+        r.server.writers[0].write(TEXT)
+        r.proxy.close()
+        assert (await rest(reader))[1] == "FIN"
+        await r.server.until(lambda: r.server.ends == ["FIN"])
+        assert r.server.pieces == []
+        writer.close()
+        await passes(lambda: not r.proxy.connections)
+
+
+async def test_a_black_hole_one_way_swallows_data_and_the_end() -> None:
+    async with rig() as r:
+        reader, writer = await r.connect()
+        r.proxy.black_hole("to_server")
+        writer.write(TEXT)
+        r.server.writers[0].write(b"still here\n")
+        assert await read(reader, 11) == b"still here\n"  # the other way is open
+        await passes(lambda: r.proxy.counts["black_hole"] == len(TEXT))
+        writer.write_eof()
+        r.server.writers[0].write(b"half-open\n")
+        assert await read(reader, 10) == b"half-open\n"
+        assert r.server.pieces == []
+        assert r.server.ends == []
+        r.proxy.heal("to_server")
+        await r.server.until(lambda: r.server.ends == ["FIN"])  # now it knows
+        assert r.server.pieces == []
+
+
+async def test_a_black_hole_both_ways_swallows_both_and_a_reset_ends_it() -> None:
+    async with rig() as r:
+        reader, writer = await r.connect()
+        r.proxy.black_hole("both")
+        writer.write(TEXT)
+        r.server.writers[0].write(TEXT)
+        await passes(lambda: r.proxy.counts["black_hole"] == 2 * len(TEXT))
+        assert r.server.pieces == []
+        r.proxy.reset()
+        assert await rest(reader) == (b"", "RST")
+        await passes(lambda: not r.proxy.connections)
+
+
+async def test_a_stall_ends_in_one_burst() -> None:
+    async with rig() as r:
+        reader, writer = await r.connect()
+        r.proxy.stall("to_server")
+        for line in LINES:
+            writer.write(line)
+            await writer.drain()
+            await asyncio.sleep(0)
+        r.server.writers[0].write(b"other way\n")
+        assert await read(reader, 10) == b"other way\n"
+        assert r.server.pieces == []
+        r.proxy.heal("to_server", "stall")
+        await r.server.until(lambda: r.server.text == TEXT)
+        assert r.server.pieces == [TEXT]
+        assert r.proxy.counts["stall"] >= 1
+
+
+async def test_a_delay_with_jitter_keeps_the_order_and_takes_its_time() -> None:
+    async with rig() as r:
+        _, writer = await r.connect()
+        r.proxy.delay("to_server", 0.05, 0.02)
+        clock = asyncio.get_running_loop().time
+        start_s = clock()
+        for line in LINES:
+            writer.write(line)
+            await writer.drain()
+            await asyncio.sleep(0)
+        await r.server.until(lambda: bool(r.server.pieces))
+        assert clock() - start_s >= 0.05
+        await r.server.until(lambda: r.server.text == TEXT)
+        assert r.proxy.counts["delay"] >= 1
+
+
+async def test_lines_are_reordered() -> None:
+    async with rig() as r:
+        _, writer = await r.connect()
+        r.proxy.reorder("to_server", every=4)
+        writer.write(TEXT)
+        await r.server.until(lambda: len(r.server.text) == len(TEXT))
+        lines = r.server.text.splitlines(keepends=True)
+        assert lines != LINES
+        assert sorted(lines) == sorted(LINES)
+        assert lines[:5] == [LINES[0], LINES[1], LINES[2], LINES[4], LINES[3]]
+        assert r.proxy.counts["reorder"] == 8
+
+
+async def test_a_withheld_line_is_not_lost_when_it_is_over() -> None:
+    async with rig() as r:
+        _, writer = await r.connect()
+        r.proxy.reorder("to_server", every=2)
+        writer.write(LINES[0] + LINES[1])
+        await r.server.until(lambda: r.server.text == LINES[0])
+        r.proxy.heal()
+        writer.write(LINES[2])
+        await r.server.until(lambda: r.server.text == LINES[0] + LINES[2] + LINES[1])
+        r.proxy.reorder("to_server", every=1)
+        writer.write(LINES[3])
+        writer.close()
+        await r.server.until(lambda: r.server.ends == ["FIN"])
+        assert r.server.text.endswith(LINES[3])
+
+
+async def test_lines_are_duplicated() -> None:
+    async with rig() as r:
+        _, writer = await r.connect()
+        r.proxy.duplicate("to_server", every=10)
+        writer.write(TEXT)
+        await r.server.until(lambda: len(r.server.text.splitlines()) == 44)
+        lines = r.server.text.splitlines(keepends=True)
+        assert lines[9] == lines[10] == LINES[9]
+        assert r.proxy.counts["duplicate"] == 4
+
+
+@pytest.mark.parametrize("size", [1, 7])
+async def test_fragments_are_the_same_bytes_in_many_writes(size: int) -> None:
+    async with rig() as r:
+        reader, _ = await r.connect()
+        r.proxy.fragment("to_client", size)
+        r.server.writers[0].write(TEXT)
+        assert await read(reader, len(TEXT)) == TEXT
+        assert r.proxy.counts["fragment"] == -(-len(TEXT) // size)
+
+
+async def test_a_flood_of_garbage_comes_between_whole_lines() -> None:
+    async with rig() as r:
+        reader, _ = await r.connect()
+        r.proxy.flood("to_client", 2000.0, "garbage")
+        found: list[bytes] = []
+        async with asyncio.timeout(DEADLINE_S):
+            for line in LINES:
+                r.server.writers[0].write(line[:10])
+                await asyncio.sleep(0)
+                r.server.writers[0].write(line[10:])
+                while not found or found[-1] != line:
+                    found.append(await reader.readline())
+            while len(found) < 100:
+                found.append(await reader.readline())
+        assert [line for line in found if line in LINES] == LINES
+        assert r.proxy.counts["flood"] >= 60
+        r.proxy.heal()
+
+
+async def test_a_flood_of_copies_looks_valid() -> None:
+    async with rig() as r:
+        reader, _ = await r.connect()
+        r.proxy.flood("to_client", 2000.0, "copies")
+        r.server.writers[0].write(LINES[7])
+        async with asyncio.timeout(DEADLINE_S):
+            while await reader.readline() != LINES[7]:
+                pass
+            assert {await reader.readline() for _ in range(50)} == {LINES[7]}
+
+
+async def test_slowloris_writes_single_bytes() -> None:
+    async with rig() as r:
+        _, writer = await r.connect()
+        r.proxy.slowloris("to_server", 1000.0)
+        writer.write(LINES[0])
+        await r.server.until(lambda: r.server.text == LINES[0])
+        assert len(r.server.pieces) > 5
+        assert r.proxy.counts["slowloris"] == len(LINES[0])
+
+
+async def test_slowloris_that_is_over_lets_the_rest_go() -> None:
+    async with rig() as r:
+        _, writer = await r.connect()
+        r.proxy.slowloris("to_server", 20.0)
+        writer.write(TEXT)
+        await r.server.until(lambda: bool(r.server.pieces))
+        r.proxy.heal()
+        await r.server.until(lambda: r.server.text == TEXT)  # at 20 bytes a second it would take 48 s
+
+
+async def test_garbage_comes_as_lines_of_its_own() -> None:
+    async with rig() as r:
+        _, writer = await r.connect()
+        r.proxy.garbage("to_server", garbage_bytes=30, every=5)
+        writer.write(TEXT)
+        await r.server.until(lambda: len(r.server.text) == len(TEXT) + 8 * 31)
+        lines = r.server.text.split(b"\n")[:-1]
+        assert [line + b"\n" for line in lines if line + b"\n" in LINES] == LINES
+        assert [len(line) for line in lines if line + b"\n" not in LINES] == [30] * 8
+        assert r.proxy.counts["garbage"] == 8
+
+
+async def test_one_byte_of_a_line_is_corrupted() -> None:
+    texts = []
+    for seed in (1, 1, 2):
+        async with rig(seed) as r:
+            _, writer = await r.connect()
+            r.proxy.corrupt("to_server", every=8)
+            writer.write(TEXT)
+            await r.server.until(lambda: len(r.server.text) == len(TEXT))
+            lines = r.server.text.split(b"\n")[:-1]
+            wrong = [k for k, line in enumerate(lines) if line + b"\n" != LINES[k]]
+            assert wrong == [7, 15, 23, 31, 39]
+            assert all(sum(a != b for a, b in zip(lines[k] + b"\n", LINES[k], strict=True)) == 1 for k in wrong)
+            assert r.proxy.counts["corrupt"] == 5
+            texts.append(r.server.text)
+    assert texts[0] == texts[1]  # of the seed
+    assert texts[0] != texts[2]
+
+
+async def test_an_empty_line_cannot_be_corrupted() -> None:
+    async with rig() as r:
+        _, writer = await r.connect()
+        r.proxy.corrupt("to_server", every=1)
+        writer.write(b"\n\n")
+        await r.server.until(lambda: r.server.text == b"\n\n")
+
+
+async def test_lines_end_in_lf_alone() -> None:
+    async with rig() as r:
+        _, writer = await r.connect()
+        r.proxy.duplicate("to_server", every=1)
+        writer.write(b"a\rb\r\n")
+        await r.server.until(lambda: r.server.text == b"a\rb\r\na\rb\r\n")
+
+
+async def test_heal_ends_one_fault_in_one_direction() -> None:
+    async with rig() as r:
+        r.server.is_echo = True
+        reader, writer = await r.connect()
+        r.proxy.duplicate("both", every=1)
+        r.proxy.garbage("to_server", garbage_bytes=3, every=1)
+        r.proxy.heal("to_client", "duplicate")
+        r.proxy.heal("to_server", "garbage")
+        writer.write(LINES[0])
+        assert await read(reader, 2 * len(LINES[0])) == 2 * LINES[0]
+        r.proxy.heal()
+        writer.write(LINES[1])
+        assert await read(reader, len(LINES[1])) == LINES[1]
+        assert r.proxy.counts["duplicate"] == 1
+
+
+async def test_who_does_not_take_is_felt_by_who_sends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipe, "MAX_WAITING_BYTES", 1 << 16)
+    blocks = 64
+    async with rig() as r:
+        _, writer = await r.connect()
+        r.proxy.stall("to_server")
+
+        async def send() -> None:
+            for _ in range(blocks):
+                writer.write(bytes(1 << 18))
+                await writer.drain()
+
+        sending = asyncio.create_task(send())
+        done, _ = await asyncio.wait({sending}, timeout=0.3)
+        assert not done  # nobody takes any more
+        r.proxy.heal()
+        await sending
+        await r.server.until(lambda: sum(map(len, r.server.pieces)) == blocks << 18)

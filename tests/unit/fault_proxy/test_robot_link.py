@@ -1,0 +1,197 @@
+"""Every fault of the proxy between the client's end of the robot link and a simulated robot, by the robot's clock."""
+
+import asyncio
+import json
+import socket
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from ccatp.config.loader import load_config
+from ccatp.dataloop import serve
+from ccatp.robot_link import RobotLink
+from ccatp.sim.faults.link_models import LINK_TYPES, LOCKSTEP_TYPES
+from ccatp.sim.faults.plan import parse_plan
+from ccatp.wire.robot import Sensors
+
+DEADLINE_S = 20.0
+
+
+class Log:
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.entries: list[tuple[str, dict[str, object]]] = []
+
+    def info(self, event: str, **fields: object) -> None:
+        self.entries.append((event, fields))
+
+    def of(self, what: str) -> list[dict[str, object]]:
+        return [fields for event, fields in self.entries if event.startswith(f"fault {what}: link ")]
+
+
+class Client:
+    """Joins through the link, answers frames, and tells what it saw."""
+
+    def __init__(self, port: int) -> None:
+        self.frames: list[int] = []
+        self.lost = ""
+        self.changed = asyncio.Event()
+        self.link = RobotLink(
+            host="127.0.0.1",
+            port=port,
+            role="controller",
+            client="test",
+            key=None,
+            on_sensors=self._on_sensors,
+            on_lost=self._on_lost,
+        )
+
+    def _on_sensors(self, frame: Sensors, line: bytes) -> None:
+        self.frames.append(frame.seq)
+        self.link.send_drive(frame.seq + 1, frame.seq, 1.0, 1.0)
+        self.changed.set()
+
+    def _on_lost(self, reason: str) -> None:
+        self.lost = reason
+        self.changed.set()
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        async with asyncio.timeout(DEADLINE_S):
+            while not condition():
+                self.changed.clear()
+                await self.changed.wait()
+
+
+async def drive(plan: str, is_over: Callable[[Client], bool], *, lockstep: bool) -> tuple[Client, Log]:
+    """Join a robot with a plan, drive until a condition holds; what the client saw and the robot's log."""
+    cfg = load_config(overrides={"run.seed": 3})
+    log, stop = Log(), asyncio.Event()
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        faults = parse_plan(plan, "plan")
+        client = Client(listener.getsockname()[1])
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(
+                serve(cfg, lockstep=lockstep, seed=3, stop=stop, listen_sock=listener, log=log, faults=faults)
+            )
+            try:
+                await client.link.connect(DEADLINE_S)
+                await client.until(lambda: is_over(client))
+            finally:
+                client.link.close()
+                stop.set()
+    return client, log
+
+
+def reached(seq: int) -> Callable[[Client], bool]:
+    return lambda client: bool(client.lost or (client.frames and client.frames[-1] >= seq))
+
+
+Keys = dict[str, Any]
+BOTH = {"direction": "both"}
+TO_CLIENT = {"direction": "to_client"}
+# type: keys, what the client must have seen
+TABLE: dict[str, tuple[Keys, Callable[[Client], bool]]] = {
+    "reset": ({}, lambda c: "reset" in c.lost.lower()),
+    "close": ({}, lambda c: "closed" in c.lost),
+    "duplicate": ({**BOTH, "every": 2}, lambda c: c.link.counts["repeated_frames"] >= 5),
+    "fragment": ({**BOTH, "write_bytes": 40}, lambda c: not c.link.counts),
+    "garbage": ({**TO_CLIENT, "garbage_bytes": 20, "every": 4}, lambda c: c.link.counts["bad_lines"] >= 3),
+    "black_hole": (TO_CLIENT, lambda c: max(b - a for a, b in pairs(c.frames)) > 5),
+    "stall": (TO_CLIENT, lambda c: max(b - a for a, b in pairs(c.frames)) == 1),
+    "delay": (
+        {**TO_CLIENT, "delay_s": 0.03, "jitter_s": 0.01},
+        lambda c: max(b - a for a, b in pairs(c.frames)) == 1 and not c.link.counts,
+    ),
+    "reorder": ({**TO_CLIENT, "every": 3}, lambda c: c.link.counts["repeated_frames"] >= 2),
+    "flood": (
+        {**TO_CLIENT, "rate_hz": 300.0, "lines": "copies"},
+        lambda c: c.link.counts["repeated_frames"] >= 10,
+    ),
+    "slowloris": ({"direction": "to_robot", "bytes_per_s": 400.0}, lambda c: not c.link.counts),
+    "corrupt": ({**TO_CLIENT, "every": 5}, lambda c: c.link.counts["bad_lines"] >= 1),
+}
+
+
+def pairs(frames: list[int]) -> list[tuple[int, int]]:
+    return list(pairwise(frames))
+
+
+def plan_of(kind: str, trigger: str, keys: Keys) -> str:
+    rows = {"type": kind, **keys}
+    if "direction" in keys:
+        rows["for_s"] = 0.2
+    return "[[link]]\n" + trigger + "\n" + "\n".join(f"{key} = {json.dumps(value)}" for key, value in rows.items())
+
+
+def test_the_table_knows_every_type() -> None:
+    assert set(TABLE) == set(LINK_TYPES)
+
+
+@pytest.mark.parametrize("kind", TABLE)
+async def test_on_the_wall_clock_each_fault_reaches_the_client_and_the_log(kind: str) -> None:
+    keys, seen = TABLE[kind]
+    client, log = await drive(plan_of(kind, "at_s = 0.1", keys), reached(40), lockstep=False)
+    assert seen(client), (client.frames, client.lost, client.link.counts)
+    (began,) = log.of("begins")
+    assert (began["type"], began["at_s"], began["from_s"]) == (kind, 0.1, 0.1)
+    (record,) = log.of("injected")
+    assert (record["signal"], record["type"]) == ("link", kind)
+    count = record["samples"]
+    assert isinstance(count, int)
+    assert count > 0
+    if "direction" in keys:
+        (ended,) = log.of("ended")
+        assert ended["until_s"] == pytest.approx(0.3, abs=0.011)
+
+
+@pytest.mark.parametrize("kind", LOCKSTEP_TYPES)
+@pytest.mark.parametrize("trigger", ["at_s = 0.2", "after_lines = 20", "after_bytes = 20000"])
+async def test_in_lockstep_each_fault_that_makes_sense_there(kind: str, trigger: str) -> None:
+    keys, seen = TABLE[kind]
+    client, log = await drive(plan_of(kind, trigger, keys), reached(100), lockstep=True)
+    assert seen(client), (client.frames, client.lost, client.link.counts)
+    assert client.frames == list(range(len(client.frames)))  # simulated time waited for each
+    (record,) = log.of("injected")
+    assert isinstance(record["samples"], int)
+    assert record["samples"] > 0
+
+
+async def test_a_reset_after_so_many_bytes_is_exact_to_the_line() -> None:
+    client, _ = await drive('[[link]]\ntype = "reset"\nafter_bytes = 3000', reached(100), lockstep=True)
+    shorter, _ = await drive('[[link]]\ntype = "reset"\nafter_bytes = 2000', reached(100), lockstep=True)
+    assert client.frames == list(range(len(client.frames)))
+    assert 0 < len(shorter.frames) < len(client.frames)
+
+
+@pytest.mark.parametrize("direction", ["to_client", "to_robot", "both"])
+async def test_a_fault_goes_the_way_that_it_names(direction: str) -> None:
+    plan = plan_of("duplicate", "at_s = 0.2", {"direction": direction, "every": 1})
+    client, log = await drive(plan, reached(60), lockstep=True)
+    frames = 0 if direction == "to_robot" else 20
+    drives = 0 if direction == "to_client" else 20
+    assert client.link.counts["repeated_frames"] == pytest.approx(frames, abs=2)
+    (record,) = log.of("injected")
+    assert record["samples"] == pytest.approx(frames + drives, abs=4)
+
+
+async def test_a_fault_that_never_began_says_so() -> None:
+    client, log = await drive('[[link]]\ntype = "reset"\nat_s = 99.0', reached(20), lockstep=True)
+    assert not client.lost
+    assert log.of("begins") == []
+    (record,) = log.of("injected")
+    assert (record["from_s"], record["samples"]) == (None, 0)
+
+
+async def test_faults_of_robot_and_link_in_one_plan() -> None:
+    plan = '[[fault]]\nsignal = "frames"\ntype = "drop"\nevery = 2\nat_s = 0.1\nfor_s = 0.1\n'
+    client, log = await drive(
+        plan + plan_of("fragment", "at_s = 0.1", TABLE["fragment"][0]), reached(60), lockstep=True
+    )
+    assert len(client.frames) == len(range(client.frames[-1] + 1)) - 5
+    assert [event for event, _ in log.entries if event.startswith("fault injected")] == [
+        "fault injected: frames drop",
+        "fault injected: link fragment",
+    ]

@@ -1,0 +1,287 @@
+"""Faults of body, wheels, fans, clock, frames and robot: in the truth, in the frames, in the record."""
+
+import json
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.sim.faults.effects import make_effect
+from ccatp.sim.faults.models import TYPES, Drift
+from ccatp.sim.faults.plan import FaultPlan, parse_plan
+from ccatp.sim.faults.record import Injected
+from ccatp.sim.faults.signals import SIGNALS
+from ccatp.sim.robot import Robot
+
+
+@pytest.fixture(scope="module")
+def mirror(config: Config) -> Mirror:
+    return build_mirror(config.mirror)
+
+
+def plan_of(**values: object) -> FaultPlan:
+    rows = {"at_s": 0.5, **values}
+    return parse_plan("[[fault]]\n" + "\n".join(f"{key} = {json.dumps(value)}" for key, value in rows.items()), "plan")
+
+
+def boot(config: Config, mirror: Mirror, **values: object) -> Robot:
+    robot = Robot(config, mirror, np.random.default_rng(1), plan_of(**values) if values else None)
+    robot.join_controller()
+    return robot
+
+
+def drive(robot: Robot, right: float, left: float, until_s: float) -> list[dict[str, Any]]:
+    """Drive to a time; the frames in the raw lines."""
+    lines = b""
+    while robot.t_s < until_s - 1e-9:
+        robot.drive(robot.seq + 1, right, left)
+        robot.advance()
+        lines += robot.delivered_line
+    return [json.loads(line) for line in lines.splitlines()]
+
+
+def record(robot: Robot) -> Injected:
+    assert robot.injector is not None
+    (found,) = robot.injector.injected
+    return found
+
+
+def test_the_tables_are_complete() -> None:
+    assert {signal for signal, types in TYPES.items() if "stuck" in types} == set(SIGNALS)
+
+
+def test_an_effect_that_is_none_is_refused() -> None:
+    drift = Drift(signal="body", type="drift", at_s=0.0, speed_m_s=0.1)
+    with pytest.raises(TypeError, match="no effect on readings: Drift"):
+        make_effect(drift, SIGNALS["soc"], np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_blocked_wheel_stands_and_its_encoder_says_so(config: Config, mirror: Mirror, side: str) -> None:
+    robot = boot(config, mirror, signal=f"{side}_wheel", type="blocked", for_s=0.5)
+    frames = drive(robot, 3.0, 3.0, 0.9)
+    column, other = (1, 2) if side == "right" else (2, 1)
+    assert all(abs(row[column]) < 0.01 for row in frames[-1]["enc"])
+    assert all(row[other] == pytest.approx(3.0, abs=0.05) for row in frames[-1]["enc"])
+    turned = robot.world.plant.turn_rate_at(0.0)
+    assert turned == pytest.approx(0.6 if side == "left" else -0.6, abs=0.01)  # r w / b
+    drive(robot, 3.0, 3.0, 2.0)
+    assert robot.world.plant.right_rad_s == pytest.approx(3.0, abs=1e-3)
+    assert robot.world.plant.left_rad_s == pytest.approx(3.0, abs=1e-3)
+    assert record(robot)[2:] == (0.5, 0.5, 0.99, 50, 50)
+
+
+def test_a_runaway_wheel_turns_while_the_robot_holds(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror, signal="left_wheel", type="runaway", rate_rad_s=-2.0, for_s=0.5)
+    frames = drive(robot, 0.0, 0.0, 0.99)
+    assert frames[40]["enc"][-1][2] == pytest.approx(0.0, abs=0.01)
+    assert frames[-1]["enc"][-1][2] == pytest.approx(-2.0, abs=0.02)
+    assert robot.world.plant.right_rad_s == 0.0
+    assert record(robot).changed == 49
+
+
+@pytest.mark.parametrize("world", ["thesis", "hard"])
+@pytest.mark.parametrize("signal", ["body", "right_wheel", "left_wheel"])
+def test_slip_takes_way_from_the_body_and_not_from_the_wheels(world: str, signal: str) -> None:
+    cfg = load_config(overrides={"run.world": world})
+    deck = build_mirror(cfg.mirror)
+    ways, angles, rates = [], [], []
+    for faults in ({}, {"signal": signal, "type": "slip", "factor": 0.5, "for_s": 0.5}):
+        robot = boot(cfg, deck, **faults)
+        frames = drive(robot, 3.0, 3.0, 0.98)
+        ways.append(robot.world.plant.forward_m)
+        rates.append(frames[-1]["imu"][-1][2])
+        angles.append((robot.world.plant.right_angle_rad, robot.world.plant.left_angle_rad))
+        scales = []
+        drive(robot, 0.0, 0.0, 1.4)
+        drive(robot, 3.0, 3.0, 2.0)
+        scales.append((robot.world.plant.right_scale, robot.world.plant.left_scale))
+    assert angles[0] == angles[1]
+    half = 0.5 if signal == "body" else 0.75
+    assert ways[1] == pytest.approx(half * ways[0], rel=0.02)
+    # One wheel with half its way turns the body by r w / (2 b), and the gyroscope feels it.
+    turning = {"body": 0.0, "right_wheel": -0.3, "left_wheel": 0.3}[signal]
+    assert rates[1] - rates[0] == pytest.approx(turning, abs=0.02)
+    assert robot.world.plant.right_scale == scales[0][0]
+    assert 0.9 < robot.world.plant.right_scale < 1.1  # full grip again
+    assert record(robot).changed == 50
+
+
+def test_drift_is_downhill_while_the_wheels_stand_and_no_sensor_of_the_wheels_sees_it(
+    config: Config, mirror: Mirror
+) -> None:
+    robot = boot(config, mirror, signal="body", type="drift", speed_m_s=0.02, for_s=1.0)
+    before, z_0 = robot.world.plant.pose, robot.world.puck_world()[2]
+    frames = drive(robot, 0.0, 0.0, 2.0)
+    after = robot.world.plant.pose
+    fx, fy = mirror.surface.gradient(before.x_m, before.y_m)
+    dx, dy = after.x_m - before.x_m, after.y_m - before.y_m
+    assert np.hypot(np.hypot(dx, dy), fx * dx + fy * dy) == pytest.approx(0.02, rel=1e-3)
+    up = mirror.rotate_deck_from_world((0.0, 0.0, -1.0))
+    assert dx * up[0] + dy * up[1] + (fx * dx + fy * dy) * up[2] < 0.0
+    assert robot.world.puck_world()[2] != z_0
+    assert max(abs(row[1]) for frame in frames for row in frame["enc"]) < 0.01
+    assert record(robot).changed == 100
+    still = boot(config, mirror, signal="body", type="drift", speed_m_s=0.02, at_s=0.5, for_s=1.0)
+    moving = drive(still, 1.0, 1.0, 1.5)
+    assert moving
+    assert record(still).samples == 0  # it is a fault of holding
+
+
+@pytest.mark.parametrize("is_driving", [False, True])
+def test_a_kidnap_moves_the_body_and_its_edge_sensors(config: Config, mirror: Mirror, is_driving: bool) -> None:
+    rate = 1.0 if is_driving else 0.0
+    there = boot(config, mirror, signal="body", type="kidnap", dx_m=0.25, dy_m=-0.1, dheading_rad=0.3)
+    here = boot(config, mirror)
+    drive(there, rate, rate, 0.5)
+    drive(here, rate, rate, 0.5)
+    assert there.world.plant.pose == here.world.plant.pose
+    there.advance()
+    here.advance()
+    a, b = there.world.plant.pose, here.world.plant.pose
+    assert (a.x_m - b.x_m, a.y_m - b.y_m) == pytest.approx((0.25, -0.1), abs=1e-3)
+    assert a.heading_rad - b.heading_rad == pytest.approx(0.3, abs=1e-3)
+    row = there.world.truth_row(there.seq, there.t_s)
+    assert row[2] == a.x_m
+    assert there.world.plant.z_m == pytest.approx(mirror.surface.jet(a.x_m, a.y_m)[0], abs=1e-9)
+    drive(there, rate, rate, 1.0)
+    assert record(there)[3:] == (0.5, 0.5, 1, 1)  # once
+
+
+def test_edge_sensors_read_the_panels_of_the_new_place(config: Config, mirror: Mirror) -> None:
+    here = boot(config, mirror).world.plant.pose
+    panel = mirror.panels[mirror.nearest_panel(here.x_m, here.y_m)]
+    seam_x_m = panel.x_m + panel.half_x_m + 0.0006  # the middle of a gap of 1.2 mm
+    values = {"dx_m": seam_x_m - 0.09 - here.x_m, "dy_m": panel.y_m - here.y_m, "dheading_rad": -here.heading_rad}
+    robot = boot(config, mirror, signal="body", type="kidnap", **values)
+    assert drive(robot, 0.0, 0.0, 0.5)[-1]["edge"][-1][1:] == [1, 1, 1, 1]
+    assert drive(robot, 0.0, 0.0, 0.52)[-1]["edge"][-1][1:] == [0, 0, 1, 1]
+
+
+def test_who_is_put_beyond_the_rim_falls(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror, signal="body", type="kidnap", dx_m=9.0, dy_m=0.0, dheading_rad=0.0)
+    drive(robot, 0.0, 0.0, 0.5)
+    assert not robot.world.is_fallen
+    drive(robot, 0.0, 0.0, 0.6)
+    assert robot.world.is_fallen
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_weak_fan_echoes_its_duty_and_lets_the_robot_fall_from_an_overhang(side: str) -> None:
+    cfg = load_config(overrides={"run.mirror": "fyst-m2"})
+    robot = boot(cfg, build_mirror(cfg.mirror), signal=f"{side}_fan", type="weak", share=0.25, for_s=0.1)
+    frames = drive(robot, 0.0, 0.0, 0.55)
+    assert robot.fans.health == ((0.25, 1.0) if side == "left" else (1.0, 0.25))
+    assert frames[-1]["fans"] == frames[0]["fans"]
+    drive(robot, 0.0, 0.0, 0.7)
+    assert robot.fans.health == (1.0, 1.0)
+    assert not robot.world.is_fallen  # too short to fall
+    longer = boot(cfg, build_mirror(cfg.mirror), signal=f"{side}_fan", type="weak", share=0.25)
+    drive(longer, 0.0, 0.0, 1.0)
+    assert longer.world.is_fallen
+    assert record(longer).changed >= 20
+
+
+@pytest.mark.parametrize("by_s", [3.0, -0.2])
+def test_a_jump_of_the_clock_shifts_every_time(config: Config, mirror: Mirror, by_s: float) -> None:
+    robot = boot(config, mirror, signal="clock", type="jump", by_s=by_s, for_s=0.3)
+    frames = drive(robot, 1.0, 1.0, 1.0)
+    for frame in frames:
+        offset = by_s if 50 <= frame["seq"] < 80 else 0.0
+        assert frame["t"] == pytest.approx(frame["seq"] / 100.0 + offset)
+        for name in ("imu", "enc", "edge"):
+            assert frame[name][-1][0] == pytest.approx(frame["t"])
+    assert record(robot)[3:] == (0.5, 0.79, 30, 30)
+
+
+def test_a_clock_that_wraps(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror, signal="clock", type="wrap", modulo_s=0.75, at_s=0.0)
+    times = [frame["t"] for frame in drive(robot, 1.0, 1.0, 1.0)]
+    assert max(times) < 0.75
+    assert times[-1] == pytest.approx(0.25)
+    assert record(robot).changed == 26
+
+
+def test_a_time_before_the_boot_is_taken_by_nobody(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror, signal="clock", type="jump", by_s=-5.0)
+    frames = drive(robot, 1.0, 1.0, 0.6)
+    assert frames[-1]["t"] < 0.0
+    assert robot.delivered is None
+
+
+def test_frames_that_are_lost(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror, signal="frames", type="drop", every=3, for_s=0.3)
+    numbers = [frame["seq"] for frame in drive(robot, 1.0, 1.0, 1.0)]
+    assert numbers == [k for k in range(1, 101) if not (50 <= k < 80 and (k - 49) % 3 == 0)]
+    assert record(robot)[3:] == (0.5, 0.79, 30, 10)
+
+
+def test_frames_that_come_twice(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror, signal="frames", type="duplicate", every=10, for_s=0.3)
+    frames = drive(robot, 1.0, 1.0, 1.0)
+    twice = [a["seq"] for a, b in pairwise(frames) if a == b]
+    assert twice == [59, 69, 79]
+    assert robot.delivered_seq == 100
+
+
+def test_frames_out_of_order(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror, signal="frames", type="reorder", every=4, for_s=0.1)
+    numbers = [frame["seq"] for frame in drive(robot, 1.0, 1.0, 0.7)]
+    assert sorted(numbers) == list(range(1, 71))
+    assert numbers[51:60] == [52, 54, 53, 55, 56, 58, 57, 59, 60]
+    assert record(robot).changed == 2
+
+
+def test_a_frame_withheld_last_comes_after_the_end(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror, signal="frames", type="reorder", every=2, for_s=0.02)
+    assert [frame["seq"] for frame in drive(robot, 1.0, 1.0, 0.55)][48:] == [49, 50, 52, 51, 53, 54, 55]
+
+
+def test_names_that_the_robot_raises(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror, signal="faults", type="raise", names=["stall", "edge", "stall"], for_s=0.2)
+    found = [frame["faults"] for frame in drive(robot, 1.0, 1.0, 1.0)]
+    assert found == [["stall", "edge"] if 50 <= k < 70 else [] for k in range(1, 101)]
+
+
+def test_a_reboot_counts_anew_forgets_and_leaves_the_body_where_it_is(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror, signal="robot", type="reboot")
+    robot.join_monitor()
+    robot.permit(1, True, True, True)
+    robot.command_fans(1, 0.5, 0.5)
+    drive(robot, 1.0, 1.0, 0.5)
+    place, frames = robot.world.plant.pose, []
+    robot.advance()
+    frames.append(json.loads(robot.delivered_line))
+    assert (frames[0]["seq"], frames[0]["fans"]) == (1, [0.0, 0.0])
+    assert frames[0]["t"] == pytest.approx(0.01)
+    assert frames[0]["enc"][0][0] == pytest.approx(0.001)
+    assert frames[0]["cmd"] == {"seq": -1, "age": 0.01, "permit_age": 0.01, "held": True}
+    assert not robot.rules.has_monitor_joined
+    assert (robot.reboots, robot.seq, robot.t_s) == (1, 51, 0.51)  # the truth goes on
+    assert robot.world.plant.pose.x_m == pytest.approx(place.x_m, abs=1e-3)
+    robot.advance()
+    assert robot.reboots == 1
+    assert record(robot)[3:] == (0.5, 0.5, 1, 1)
+
+
+def test_a_reboot_with_late_sensors_delivers_nothing_of_the_boot_before() -> None:
+    cfg = load_config(overrides={"run.world": "hard"})
+    robot = boot(cfg, build_mirror(cfg.mirror), signal="robot", type="reboot")
+    assert robot.sensors_delay_frames > 0
+    drive(robot, 1.0, 1.0, 0.5)
+    first = drive(robot, 1.0, 1.0, 0.6)[0]
+    assert first["seq"] == 1
+
+
+def test_news_tell_each_beginning_and_end_once(config: Config, mirror: Mirror) -> None:
+    robot = boot(config, mirror, signal="imu_wz", type="off", for_s=0.2)
+    assert robot.injector is not None
+    heard = []
+    for _ in range(100):
+        robot.advance()
+        heard += [(what, robot.seq, injected.samples) for what, injected in robot.injector.news(robot.t_s)]
+    assert heard == [("begins", 50, 1), ("ended", 70, 20)]
