@@ -21,6 +21,7 @@ from ccatp.config.loader import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.errors import ConfigError, ExitStatus, RefusedError
 from ccatp.processes.common import SUPERVISOR_PID, Endpoints, open_log
+from ccatp.processes.observing import check_observatory
 from ccatp.processes.run_collector import RunCollector
 from ccatp.processes.run_view import RunView
 from ccatp.run_options import RunOptions, default_run_dir
@@ -74,6 +75,7 @@ def run_survey(options: RunOptions) -> int:
     """
     overrides = dict(options.overrides)
     cfg = load_config(options.config_file, overrides)
+    check_observatory(cfg.observatory)
     started = time.monotonic()
     with ExitStack() as stack:
         runtime_dir = make_runtime_dir(str(options.runtime_dir or cfg.run.runtime_dir), os.environ)

@@ -206,6 +206,14 @@ class DangerConfig(Model):
     clear_samples: Annotated[int, Field(ge=1, le=10000)]
 
 
+class ObservatoryConfig(Model):
+    """The observatory channel over TCP, beside the unix socket that is always there."""
+
+    endpoint: str  # empty = none
+    key_file: str
+    clients_file: str
+
+
 class MissionConfig(Model):
     """The survey as a sequence of states."""
 
@@ -266,6 +274,7 @@ class SimTruthConfig(Model):
 class SimConfig(Model):
     """Everything that exists only in simulation."""
 
+    open_to_network: bool
     robot: SimRobotConfig
     etalon: SimEtalonConfig
     truth: SimTruthConfig
@@ -381,6 +390,7 @@ class Config(Model):
     localizer: LocalizerConfig
     etalon: EtalonConfig
     danger: DangerConfig
+    observatory: ObservatoryConfig
     mission: MissionConfig
     sim: SimConfig
     mirror: MirrorConfig
