@@ -68,7 +68,6 @@ def make_runtime_dir(configured: str, environ: Mapping[str, str]) -> Path:
         )
     if info.st_mode & (stat.S_IRWXG | stat.S_IRWXO):  # whoever reaches its sockets commands the robot
         raise RuntimeDirError(
-            f"runtime directory {path}: is open to others (mode {stat.S_IMODE(info.st_mode):04o}); "
-            f"chmod 700 {path}"
+            f"runtime directory {path}: is open to others (mode {stat.S_IMODE(info.st_mode):04o}); chmod 700 {path}"
         )
     return path

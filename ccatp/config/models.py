@@ -27,6 +27,7 @@ class RunConfig(Model):
     order: str
     budget_s: Positive
     runtime_dir: str  # empty = chosen from the environment
+    realtime_priority: Annotated[int, Field(ge=0, le=99)]  # 0 = ordinary scheduling
 
 
 class RobotConfig(Model):

@@ -13,7 +13,7 @@ from ccatp.bus import Publisher, Subscriber
 from ccatp.danger import DangerMonitor
 from ccatp.errors import CcatpError
 from ccatp.mirror.mirror import build_mirror
-from ccatp.processes import spinning
+from ccatp.processes import realtime, spinning
 from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
 from ccatp.processes.observing import Observatory, ObservatoryDesk
 from ccatp.robot_link import RobotLink, read_key
@@ -76,6 +76,8 @@ class DangerLoop:
                 hello = await self.link.connect(self._cfg.robot.connect_timeout_s)
                 self._is_lockstep = hello.lockstep
                 self._phase = "joined"
+                if not hello.lockstep:
+                    realtime.enter(self._cfg.run.realtime_priority, self.log)
                 self.log.info("joined", port=self._cfg.robot.port, lockstep=hello.lockstep)
                 waits = [tasks.create_task(stop.wait()), tasks.create_task(self.lost.wait())]
                 await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
@@ -155,7 +157,14 @@ class DangerLoop:
         while True:
             self._publisher.send(
                 "presence.danger",
-                Presence(seq=count, t_s=time.monotonic(), process="danger", pid=os.getpid(), phase=self._phase),
+                Presence(
+                    seq=count,
+                    t_s=time.monotonic(),
+                    process="danger",
+                    pid=os.getpid(),
+                    phase=self._phase,
+                    frame_age_s=self._age_s(),
+                ),
             )
             count += 1
             age_s = time.monotonic() - self._frame_wall_s
