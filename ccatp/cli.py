@@ -19,12 +19,14 @@ from ccatp.cli_frame import (
     WORLD_OPTIONS,
     SuggestingGroup,
     ask_daemon,
+    ask_over_tcp,
     complain,
     example,
     options,
     overrides,
     run_command_line,
 )
+from ccatp.cli_keys import keys
 from ccatp.cli_replay import replay
 from ccatp.cli_study import study
 
@@ -154,15 +156,32 @@ def stop(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, j
     _tell(_ask("stop", config_file, runtime_dir, timeout_s), json_output)
 
 
-@cli.command(epilog=example("ccatp emergency fire --note 'smoke in the receiver cabin'"))
+def _observatory_options(command: Any) -> Any:
+    return options(
+        click.option("--endpoint", metavar="tcp://HOST:PORT", help="A daemon on another machine, by its TCP endpoint."),
+        click.option("--server-key", type=click.Path(path_type=Path), help="With --endpoint: the daemon's NAME.key."),
+        click.option(
+            "--key", "key_file", type=click.Path(path_type=Path), help="With --endpoint: our NAME.key_secret."
+        ),
+        _daemon_options,
+    )(command)
+
+
+@cli.command(
+    epilog=example(
+        "ccatp emergency fire --note 'smoke in the receiver cabin'",
+        "ccatp emergency fire --endpoint tcp://m1:7020 --server-key ccatp.key --key observatory.key_secret",
+    )
+)
 @click.argument("kind", type=click.Choice(EMERGENCY_KINDS), metavar="KIND")
 @click.option("--note", default="", help="What happened, for the log.")
 @click.option(
     "--id", "emergency_id", type=click.UUID, help="Identity of the emergency; sending the same one again is harmless."
 )
-@_daemon_options
+@_observatory_options
 def emergency(
     kind: str, note: str, emergency_id: uuid.UUID | None,
+    endpoint: str | None, server_key: Path | None, key_file: Path | None,
     config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool,
 ) -> None:  # fmt: skip
     """Report an emergency: the robot goes to its base.
@@ -175,7 +194,39 @@ def emergency(
         "id": str(emergency_id or uuid.uuid4()),
         "note": note,
     }
-    _tell(ask_daemon(_folder(config_file, runtime_dir), "emergency", payload, timeout_s), json_output)
+    folder = _folder(config_file, runtime_dir)
+    _tell(_ask_observatory(endpoint, server_key, key_file, folder, payload, timeout_s), json_output)
+
+
+@cli.command(epilog=example("ccatp clear 6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"))
+@click.argument("emergency_id", type=click.UUID, metavar="ID")
+@_observatory_options
+def clear(
+    emergency_id: uuid.UUID, endpoint: str | None, server_key: Path | None, key_file: Path | None,
+    config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool,
+) -> None:  # fmt: skip
+    """End the emergency ID, whose cause is gone.
+
+    ID is what ccatp emergency told. The robot must be at base or held; over TCP, our key needs the role clear.
+    """
+    payload: dict[str, object] = {"cmd": "clear", "id": str(emergency_id)}
+    folder = _folder(config_file, runtime_dir)
+    _tell(_ask_observatory(endpoint, server_key, key_file, folder, payload, timeout_s), json_output)
+
+
+def _ask_observatory(
+    endpoint: str | None, server_key: Path | None, key_file: Path | None,
+    folder: Path | None, payload: dict[str, object], timeout_s: float,
+) -> dict[str, Any]:  # fmt: skip
+    if endpoint is None:
+        if server_key is not None or key_file is not None:
+            raise click.UsageError("--server-key and --key go with --endpoint tcp://HOST:PORT")
+        return ask_daemon(folder, "emergency", payload, timeout_s)
+    if not endpoint.startswith("tcp://"):
+        raise click.UsageError(f"--endpoint {endpoint!r} is not tcp://HOST:PORT; a daemon here has --runtime-dir")
+    if server_key is None or key_file is None:
+        raise click.UsageError("--endpoint needs --server-key and --key; make keys with ccatp keys generate")
+    return ask_over_tcp(endpoint, server_key, key_file, payload, timeout_s)
 
 
 @cli.group(cls=SuggestingGroup, epilog=example("ccatp sim robot --port 7010"))
@@ -238,6 +289,7 @@ def sim_etalon(
 
 
 cli.add_command(bench)
+cli.add_command(keys)
 cli.add_command(study)
 cli.add_command(replay)
 cli.add_command(conformance)

@@ -170,6 +170,35 @@ def ask_daemon(runtime_dir: Path | None, channel: str, payload: dict[str, object
         reply = request(f"ipc://{folder / channel}", json.dumps(payload).encode(), timeout_s)
     except RequestFailed as error:
         raise UnreachableError(str(error)) from error
+    return _accepted(reply, payload)
+
+
+def ask_over_tcp(
+    endpoint: str, server_key: Path, key: Path, payload: dict[str, object], timeout_s: float
+) -> dict[str, Any]:
+    """One request to the observatory channel of a daemon elsewhere.
+
+    Args:
+        endpoint: ``tcp://HOST:PORT``.
+        server_key: file with the daemon's public key.
+        key: file with our own secret key.
+        payload: the request.
+        timeout_s: longest wait for the answer.
+
+    Raises:
+        ConfigError: a key file cannot be used.
+        UnreachableError: nobody listens there, or no answer came in time; a daemon does not answer who is not listed.
+        RefusedError: the daemon said no, and why.
+    """
+    from ccatp.curve_keys import read_pair, read_public
+    from ccatp.router import CurveClient, request
+
+    pair = read_pair(key, "--key")
+    curve = CurveClient(read_public(server_key, "--server-key"), pair.public, pair.secret)
+    return _accepted(request(endpoint, json.dumps(payload).encode(), timeout_s, curve), payload)
+
+
+def _accepted(reply: dict[str, Any], payload: Mapping[str, object]) -> dict[str, Any]:
     if not reply.get("ok", False):
         raise RefusedError(f"{payload.get('cmd')} refused: {reply.get('error', 'no reason given')}")
     return reply

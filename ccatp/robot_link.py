@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+import stat
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -68,14 +69,18 @@ def read_key(key_file: str) -> bytes | None:
     """Key of the robot link: the file's bytes without white space around them; ``None`` when no file is named.
 
     Raises:
-        ConfigError: the file cannot be read or is empty.
+        ConfigError: the file cannot be read, others may read it, or it is empty.
     """
     if not key_file:
         return None
     try:
+        mode = Path(key_file).stat().st_mode
         key = Path(key_file).read_bytes().strip()
     except OSError as error:
         raise ConfigError(f"robot.key_file: cannot read {key_file}: {error.strerror}") from error
+    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+        mode = stat.S_IMODE(mode)
+        raise ConfigError(f"robot.key_file: {key_file} is open to others (mode {mode:04o}); chmod go= {key_file}")
     if not key:
         raise ConfigError(f"robot.key_file: {key_file} is empty")
     return key

@@ -1,12 +1,16 @@
 """Edge. Request and reply over ZeroMQ: a ROUTER in the event loop, and a client with a deadline."""
 
 import asyncio
+import contextlib
+import os
+import socket
 from collections.abc import Awaitable, Callable
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import zmq
 import zmq.asyncio
+from zmq.utils.monitor import parse_monitor_message
 
 from ccatp.errors import CcatpError, ExitStatus, UnreachableError
 from ccatp.wire.channels import BadRequest, format_error, parse_reply
@@ -14,10 +18,15 @@ from ccatp.wire.channels import BadRequest, format_error, parse_reply
 Handler = Callable[[bytes], bytes | Awaitable[bytes]]
 
 # libzmq cuts off a peer whose frame is longer than this; what lies between it and the limit of a request is answered.
-MAX_FRAME_BYTES = 1 << 16
+MAX_FRAME_BYTES = 1 << 13
 MAX_REPLY_BYTES = 1 << 20
 HIGH_WATER_MARK = 64
 MAX_PENDING = 32
+# Peers at a time; newcomers beyond are turned away, those who are in stay.
+MAX_CONNECTIONS = 32
+BACKLOG = 16
+# Who has not shown by then that they speak the protocol, with their key where one is wanted, loses the connection.
+HANDSHAKE_MS = 2000
 BUSY = "too many requests are waiting for their answer"
 NOT_SINGLE = "a request is one frame"
 
@@ -42,13 +51,25 @@ class Router:
         endpoint: where to bind, ``ipc://`` or ``inproc://``. Plain ``tcp://`` is refused: it has no keys.
         handler: what answers. An exception that it raises ends ``serve``.
         context: ZeroMQ context of the process.
+
+    Attributes:
+        refused: requests that never reached the handler.
+        turned_away: connections beyond the limit.
     """
 
     def __init__(self, endpoint: str, handler: Handler, context: zmq.asyncio.Context) -> None:
         self._endpoint, self._handler, self._context = endpoint, handler, context
         self._socket: zmq.asyncio.Socket | None = None
+        self._monitor: zmq.asyncio.Socket | None = None
+        self._bound = ""
         self._pending: set[asyncio.Task[None]] = set()
-        self.refused = 0
+        self._connections: set[int] = set()
+        self.refused = self.turned_away = 0
+
+    @property
+    def bound(self) -> str:
+        """The endpoint as bound, with its port."""
+        return self._bound
 
     async def __aenter__(self) -> Self:
         """Bind.
@@ -56,49 +77,88 @@ class Router:
         Raises:
             RouterError: if the endpoint may not or cannot be bound.
         """
+        self._check_endpoint()
+        router = self._context.socket(zmq.ROUTER)
+        self._configure(router)
+        self._socket = router
+        self._monitor = router.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
+        try:
+            router.bind(self._endpoint)
+        except zmq.ZMQError as error:
+            self._close()
+            raise RouterError(f"{self._endpoint}: {error.strerror}") from error
+        self._bound = router.getsockopt_string(zmq.LAST_ENDPOINT)
+        return self
+
+    def _check_endpoint(self) -> None:
         if not self._endpoint.startswith(("ipc://", "inproc://")):
             raise RouterError(f"{self._endpoint}: only ipc:// and inproc:// are served without keys")
-        socket = self._context.socket(zmq.ROUTER)
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.RCVHWM, HIGH_WATER_MARK)
-        socket.setsockopt(zmq.SNDHWM, HIGH_WATER_MARK)
-        socket.setsockopt(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
-        try:
-            socket.bind(self._endpoint)
-        except zmq.ZMQError as error:
-            socket.close()
-            raise RouterError(f"{self._endpoint}: {error.strerror}") from error
-        self._socket = socket
-        return self
+
+    def _configure(self, router: zmq.asyncio.Socket) -> None:
+        """Limits, before binding."""
+        router.setsockopt(zmq.LINGER, 0)
+        router.setsockopt(zmq.RCVHWM, HIGH_WATER_MARK)
+        router.setsockopt(zmq.SNDHWM, HIGH_WATER_MARK)
+        router.setsockopt(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
+        router.setsockopt(zmq.BACKLOG, BACKLOG)
+        router.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close; what was not delivered is dropped."""
-        if self._socket is not None:
+        self._close()
+
+    def _close(self) -> None:
+        if self._socket is not None and self._monitor is not None:
+            self._socket.disable_monitor()
+            self._monitor.close()
             self._socket.close()
-            self._socket = None
+            self._socket = self._monitor = None
 
     async def serve(self) -> None:
         """Answer requests until cancelled."""
         if self._socket is None:
             raise RouterError(f"{self._endpoint}: not bound")
         async with asyncio.TaskGroup() as later:
-            while True:
-                frames = await self._socket.recv_multipart()
+            later.create_task(self._limit_connections())
+            while (router := self._socket) is not None:
+                frames, user_id = await self._receive(router)
                 envelope, payload = split_envelope(frames)
                 if payload is None:
                     await self._refuse(envelope, NOT_SINGLE)
                 elif len(self._pending) >= MAX_PENDING:
                     await self._refuse(envelope, BUSY)
                 else:
-                    answer = self._handler(payload)
+                    answer = self._ask(payload, user_id)
                     if isinstance(answer, bytes):
                         await self._send(envelope, answer)
                     else:
                         task = later.create_task(self._answer_later(envelope, answer))
                         self._pending.add(task)
                         task.add_done_callback(self._pending.discard)
+                # Where requests wait already, receiving never gives way: others have their turn here.
+                await asyncio.sleep(0)
+
+    async def _receive(self, router: zmq.asyncio.Socket) -> tuple[list[bytes], str]:
+        """The frames of the next message, and who sent it where that is known."""
+        return await router.recv_multipart(), ""
+
+    def _ask(self, payload: bytes, user_id: str) -> bytes | Awaitable[bytes]:
+        del user_id  # whoever reaches a socket in the runtime directory is its owner
+        return self._handler(payload)
+
+    async def _limit_connections(self) -> None:
+        """Count the peers, and turn away those that are too many."""
+        while (monitor := self._monitor) is not None:
+            event = parse_monitor_message(await monitor.recv_multipart())
+            if event["event"] == zmq.EVENT_DISCONNECTED:
+                self._connections.discard(event["value"])
+            elif len(self._connections) < MAX_CONNECTIONS:
+                self._connections.add(event["value"])
+            elif turn_away(event["value"], self._bound):
+                self.turned_away += 1
+            await asyncio.sleep(0)
 
     async def _answer_later(self, envelope: list[bytes], answer: Awaitable[bytes]) -> None:
         await self._send(envelope, await answer)
@@ -111,6 +171,29 @@ class Router:
         # A ROUTER never waits for a peer: what a peer that is gone or too slow does not take is dropped.
         if self._socket is not None:
             await self._socket.send_multipart([*envelope, reply])
+
+
+def turn_away(descriptor: int, endpoint: str) -> bool:
+    """End a connection that libzmq has accepted; libzmq takes it as one that the peer has ended.
+
+    Args:
+        descriptor: its number, as the monitor told it. It may stand for something else by now, or for nothing.
+        endpoint: where it was accepted; what was not is left alone.
+    """
+    with contextlib.suppress(OSError):  # it is gone, or no socket
+        own = os.dup(descriptor)  # this one stays the same thing until it is closed
+        try:
+            connection = socket.socket(fileno=own)
+        except OSError:
+            os.close(own)
+            raise
+        with connection:
+            name = connection.getsockname()
+            is_ours = f"ipc://{name}" == endpoint if isinstance(name, str) else endpoint.endswith(f":{name[1]}")
+            if is_ours:
+                connection.shutdown(socket.SHUT_RDWR)
+                return True
+    return False
 
 
 def split_envelope(frames: list[bytes]) -> tuple[list[bytes], bytes | None]:
@@ -131,13 +214,22 @@ def split_envelope(frames: list[bytes]) -> tuple[list[bytes], bytes | None]:
     return envelope, rest[0] if len(rest) == 1 else None
 
 
-def request(endpoint: str, payload: bytes, timeout_s: float) -> dict[str, Any]:
+class CurveClient(NamedTuple):
+    """Keys of a client, each 40 characters of Z85."""
+
+    server: bytes
+    public: bytes
+    secret: bytes
+
+
+def request(endpoint: str, payload: bytes, timeout_s: float, curve: CurveClient | None = None) -> dict[str, Any]:
     """Ask once and wait for the answer.
 
     Args:
         endpoint: where a ``Router`` serves.
         payload: the request.
         timeout_s: how long to wait in all, s.
+        curve: the keys, where the endpoint is ``tcp://``.
 
     Returns:
         The reply.
@@ -145,17 +237,24 @@ def request(endpoint: str, payload: bytes, timeout_s: float) -> dict[str, Any]:
     Raises:
         RequestFailed: no answer in time, an endpoint that cannot be, or an answer that is no reply.
     """
-    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.MAXMSGSIZE, MAX_REPLY_BYTES)
+    with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
+        peer.setsockopt(zmq.LINGER, 0)
+        peer.setsockopt(zmq.MAXMSGSIZE, MAX_REPLY_BYTES)
+        if curve is not None:
+            peer.setsockopt(zmq.CURVE_SERVERKEY, curve.server)
+            peer.setsockopt(zmq.CURVE_PUBLICKEY, curve.public)
+            peer.setsockopt(zmq.CURVE_SECRETKEY, curve.secret)
         try:
-            socket.connect(endpoint)
+            peer.connect(endpoint)
         except zmq.ZMQError as error:
             raise RequestFailed(f"{endpoint}: {error.strerror}") from error
-        socket.send_multipart([b"", payload])
-        if not socket.poll(max(1, round(timeout_s * 1000.0))):
-            raise RequestFailed(f"no answer from {endpoint} within {timeout_s:g} s: is ccatp running?")
-        *_, reply = socket.recv_multipart()
+        peer.send_multipart([b"", payload])
+        if not peer.poll(max(1, round(timeout_s * 1000.0))):
+            hint = (
+                "is ccatp running?" if curve is None else "is ccatp running there, with this server key and you listed?"
+            )
+            raise RequestFailed(f"no answer from {endpoint} within {timeout_s:g} s: {hint}")
+        *_, reply = peer.recv_multipart()
     try:
         return parse_reply(reply)
     except BadRequest as error:

@@ -21,10 +21,14 @@ from ccatp.config.loader import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.errors import ConfigError, ExitStatus, RefusedError
 from ccatp.processes.common import FAULTS_FILE, SUPERVISOR_PID, Endpoints, open_log
+from ccatp.processes.observing import check_observatory
 from ccatp.processes.run_collector import RunCollector
 from ccatp.processes.run_view import RunView
+from ccatp.processes.service import Service
+from ccatp.robot_link import read_key
 from ccatp.run_options import RunOptions, default_run_dir
 from ccatp.runtime_dir import make_runtime_dir
+from ccatp.service_notify import take_from
 
 POLL_MS = 20
 # The matrices are 4 x 4: threads of the linear algebra would only fight the processes for the cores.
@@ -74,6 +78,8 @@ def run_survey(options: RunOptions) -> int:
     """
     overrides = dict(options.overrides)
     cfg = load_config(options.config_file, overrides)
+    check_observatory(cfg.observatory)
+    read_key(cfg.robot.key_file)  # the processes read it again; here it is refused before anything has begun
     started = time.monotonic()
     with ExitStack() as stack:
         runtime_dir = make_runtime_dir(str(options.runtime_dir or cfg.run.runtime_dir), os.environ)
@@ -191,6 +197,7 @@ class _Run:
         self._sockets, self._started_s = sockets, started_s
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._is_interrupted = False
+        self._service = Service(*take_from(os.environ))
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
 
     def go(self) -> int:
@@ -199,11 +206,19 @@ class _Run:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         # A flag and no exception: a signal must not be lost in somebody's handler of exceptions, nor end the ending.
         previous = {n: signal.signal(n, self._interrupt) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-        collector = RunCollector(context, self._endpoints, self._cfg, self._run_dir, is_sim=self._options.sim)
+        collector = RunCollector(
+            context,
+            self._endpoints,
+            self._cfg,
+            self._run_dir,
+            is_sim=self._options.sim,
+            on_presence=self._service.heard,
+        )
         view = RunView(self._cfg, is_sim=self._options.sim, run_dir=self._run_dir)
         try:
             with collector, view:
                 status = self._watch(collector, view)
+                self._service.stopping()
                 collector.finish()
                 self._stop_all(view)
                 collector.collect(1, None)
@@ -229,6 +244,7 @@ class _Run:
             os.nice(LOCKSTEP_NICENESS)
         while not self._is_interrupted:
             collector.collect(POLL_MS, view)
+            self._service.beat(time.monotonic(), collector.status)
             # A death comes first: what the others say of it is its consequence.
             for name, child in self._children.items():
                 if child.poll() is not None:

@@ -1,6 +1,8 @@
 """Pure. What one value of the configuration demands of another, and values that look like another unit."""
 
+import ipaddress
 import math
+import re
 from collections.abc import Iterator
 from pathlib import PurePath
 
@@ -11,6 +13,7 @@ from ccatp.config.models import (
     Config,
     LimitsConfig,
     MirrorConfig,
+    ObservatoryConfig,
     PanelsConfig,
     RobotConfig,
     SimRobotConfig,
@@ -28,6 +31,8 @@ _SMALLEST_PANEL_MM = 10.0
 _WHOLE_FRAMES = 1e-6  # decimal fractions of a second are not exact
 _NEAREST_COLLIMATOR_MM = 100.0
 _PITCH_AGREEMENT_MM = 0.1  # the fitted pitches of the telescope differ by up to 0.012 mm
+_TCP_ENDPOINT = re.compile(r"tcp://[^\s/@;]+:(\d{1,5})")
+_LARGEST_PORT = 65535
 _CORNERS = ((1, 1, "front-left"), (1, -1, "front-right"), (-1, 1, "rear-left"), (-1, -1, "rear-right"))
 
 
@@ -43,6 +48,8 @@ def check_config(cfg: Config) -> list[Fault]:
         *_check_wheels(cfg.robot, cfg.limits),
         *_check_edge_sensors(cfg.robot),
         *_check_world(cfg.world, cfg.sim.robot),
+        *_check_observatory(cfg.observatory),
+        *_check_stand_ins(cfg),
         *_check_panels(cfg.mirror.panels),
         *_check_base(cfg.mirror),
         *_check_collimators(cfg.mirror),
@@ -140,6 +147,43 @@ def _check_world(world: WorldConfig, sim: SimRobotConfig) -> Iterator[Fault]:
         elif delay_s and delay_s + frame_s > sim.ttl_s * (1.0 + _WHOLE_FRAMES):
             what = f"= {delay_s:g} and a frame of {frame_s:g} s outlast sim.robot.ttl_s = {sim.ttl_s:g}"
             yield Fault(("world", name), what, (("sim", "robot", "ttl_s"), ("sim", "robot", "frame_hz")))
+
+
+def _check_observatory(observatory: ObservatoryConfig) -> Iterator[Fault]:
+    """TCP only with a key and a list of clients."""
+    root = "observatory"
+    if not observatory.endpoint:
+        return
+    matched = _TCP_ENDPOINT.fullmatch(observatory.endpoint)
+    if matched is None or int(matched[1]) > _LARGEST_PORT:
+        what = f'= "{observatory.endpoint}" must be tcp://ADDRESS:PORT, or empty for the unix socket alone'
+        yield Fault((root, "endpoint"), what)
+        return
+    for name in ("key_file", "clients_file"):
+        if not getattr(observatory, name):
+            what = f'= "", but endpoint = "{observatory.endpoint}" wants keys and a list; see ccatp keys generate'
+            yield Fault((root, name), what, ((root, "endpoint"),))
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is this machine's own; names other than localhost may be anything."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _check_stand_ins(cfg: Config) -> Iterator[Fault]:
+    """Whoever reaches a stand-in may command it, unless there is a key."""
+    if cfg.sim.open_to_network:
+        return
+    hint = "set sim.open_to_network if anybody there may command it"
+    if not (is_loopback(cfg.sim.robot.host) or cfg.robot.key_file):
+        what = f'= "{cfg.sim.robot.host}" is beyond this machine; name a key in robot.key_file, or {hint}'
+        yield Fault(("sim", "robot", "host"), what)
+    if not is_loopback(cfg.sim.etalon.host):
+        what = f'= "{cfg.sim.etalon.host}" is beyond this machine, and its protocol has no keys; {hint}'
+        yield Fault(("sim", "etalon", "host"), what)
 
 
 def _check_panels(panels: PanelsConfig) -> Iterator[Fault]:

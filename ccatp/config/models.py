@@ -27,6 +27,7 @@ class RunConfig(Model):
     order: str
     budget_s: Positive
     runtime_dir: str  # empty = chosen from the environment
+    realtime_priority: Annotated[int, Field(ge=0, le=99)]  # 0 = ordinary scheduling
 
 
 class RobotConfig(Model):
@@ -206,6 +207,14 @@ class DangerConfig(Model):
     clear_samples: Annotated[int, Field(ge=1, le=10000)]
 
 
+class ObservatoryConfig(Model):
+    """The observatory channel over TCP, beside the unix socket that is always there."""
+
+    endpoint: str  # empty = none
+    key_file: str
+    clients_file: str
+
+
 class MissionConfig(Model):
     """The survey as a sequence of states."""
 
@@ -266,6 +275,7 @@ class SimTruthConfig(Model):
 class SimConfig(Model):
     """Everything that exists only in simulation."""
 
+    open_to_network: bool
     robot: SimRobotConfig
     etalon: SimEtalonConfig
     truth: SimTruthConfig
@@ -381,6 +391,7 @@ class Config(Model):
     localizer: LocalizerConfig
     etalon: EtalonConfig
     danger: DangerConfig
+    observatory: ObservatoryConfig
     mission: MissionConfig
     sim: SimConfig
     mirror: MirrorConfig

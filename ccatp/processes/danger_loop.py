@@ -13,12 +13,11 @@ from ccatp.bus import Publisher, Subscriber
 from ccatp.danger import DangerMonitor
 from ccatp.errors import CcatpError
 from ccatp.mirror.mirror import build_mirror
-from ccatp.processes import spinning
+from ccatp.processes import realtime, spinning
 from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
+from ccatp.processes.observing import Observatory, ObservatoryDesk
 from ccatp.robot_link import RobotLink, read_key
-from ccatp.router import Router
 from ccatp.samples import EventCode, Verdict
-from ccatp.wire.channels import answer_observatory
 from ccatp.wire.robot import Sensors
 from ccatp.wire.topics import DangerEvent, Estimate, Presence, last_estimate_before
 
@@ -62,22 +61,23 @@ class DangerLoop:
             on_sensors=self.on_sensors,
             on_lost=self._on_lost,
         )
+        desk = ObservatoryDesk(self.monitor, self._age_s, self.log)
+        self._observatory = Observatory(args.endpoints.of("emergency"), cfg.observatory, desk)
         self.lost = asyncio.Event()
         self._is_lockstep = False
 
     async def run(self, stop: asyncio.Event) -> None:
         """Join the robot, then judge frames until ``stop`` is set or the link is lost."""
         shadow = zmq.asyncio.Context.shadow(self._context)
-        async with (
-            Router(self._endpoints.of("emergency"), self._answer, shadow) as router,
-            asyncio.TaskGroup() as tasks,
-        ):
-            served = [tasks.create_task(work) for work in (router.serve(), self._beat())]
+        async with asyncio.TaskGroup() as tasks:
+            served = [tasks.create_task(work) for work in (self._observatory.serve(shadow), self._beat())]
             try:
                 await self._wait_for_main(stop)
                 hello = await self.link.connect(self._cfg.robot.connect_timeout_s)
                 self._is_lockstep = hello.lockstep
                 self._phase = "joined"
+                if not hello.lockstep:
+                    realtime.enter(self._cfg.run.realtime_priority, self.log)
                 self.log.info("joined", port=self._cfg.robot.port, lockstep=hello.lockstep)
                 waits = [tasks.create_task(stop.wait()), tasks.create_task(self.lost.wait())]
                 await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
@@ -89,10 +89,8 @@ class DangerLoop:
                 self.link.close()
         self.log.info("stopped", episodes=self.monitor.episodes_opened, edges=self.monitor.edges_declared)
 
-    def _answer(self, frame: bytes) -> bytes:
-        age_s = None if self._seq < 0 else time.monotonic() - self._frame_wall_s
-        at_rest = self.monitor.at_base_or_held
-        return answer_observatory(frame, self.monitor, at_base_or_held=at_rest, age_s=age_s)
+    def _age_s(self) -> float | None:
+        return None if self._seq < 0 else time.monotonic() - self._frame_wall_s
 
     async def _wait_for_main(self, stop: asyncio.Event) -> None:
         """Join the robot only when main's messages get through: its first estimate must not be lost."""
@@ -159,7 +157,14 @@ class DangerLoop:
         while True:
             self._publisher.send(
                 "presence.danger",
-                Presence(seq=count, t_s=time.monotonic(), process="danger", pid=os.getpid(), phase=self._phase),
+                Presence(
+                    seq=count,
+                    t_s=time.monotonic(),
+                    process="danger",
+                    pid=os.getpid(),
+                    phase=self._phase,
+                    frame_age_s=self._age_s(),
+                ),
             )
             count += 1
             age_s = time.monotonic() - self._frame_wall_s

@@ -17,7 +17,7 @@ from ccatp.etalon_client import EtalonClient, EtalonError
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror
 from ccatp.mission import Mission
-from ccatp.processes import spinning
+from ccatp.processes import realtime, spinning
 from ccatp.processes.building import build_parts
 from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
 from ccatp.processes.hearing import VerdictEar
@@ -135,6 +135,8 @@ class MainLoop:
         self._hello, self._is_lockstep = hello, hello.lockstep
         self._predictor = CommandPredictor(self._cfg.robot.wheel_lag_s, 1.0 / hello.frame_hz)
         self._phase = "joined"
+        if not hello.lockstep:
+            realtime.enter(self._cfg.run.realtime_priority, self._teller.log)
         self._teller.say("info", f"joined the robot at {self._cfg.robot.host}:{self._cfg.robot.port}")
 
     async def _farewell(self, stop: asyncio.Event) -> None:
@@ -163,7 +165,14 @@ class MainLoop:
         while True:
             self._publisher.send(
                 "presence.main",
-                Presence(seq=count, t_s=time.monotonic(), process="main", pid=os.getpid(), phase=self._phase),
+                Presence(
+                    seq=count,
+                    t_s=time.monotonic(),
+                    process="main",
+                    pid=os.getpid(),
+                    phase=self._phase,
+                    frame_age_s=None if self._t_first_s is None else time.monotonic() - self._frame_wall_s,
+                ),
             )
             count += 1
             self._teller.flush_if_due()

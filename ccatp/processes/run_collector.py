@@ -1,5 +1,6 @@
 """Glue. Collects a run from the bus: recording, progress, and what the summary needs."""
 
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
@@ -31,13 +32,14 @@ from ccatp.wire.topics import (
     Log,
     Message,
     MissionStatus,
+    Presence,
     Timing,
     Track,
     Truth,
     schema_of,
 )
 
-RECEIVED = tuple(topic.name for topic in TOPICS if topic.recorded or topic.name == "timing")
+RECEIVED = tuple(topic.name for topic in TOPICS if topic.recorded or topic.message in (Timing, Presence))
 FINISH_TIMEOUT_S = 5.0
 ASK_TIMEOUT_S = 1.0
 # A panel's plane has three parameters; the fit says so too, this saves the attempt.
@@ -85,6 +87,7 @@ class RunCollector:
         cfg: the run's configuration.
         run_dir: the recording and the mission's database are there.
         is_sim: the simulated truth can be asked for.
+        on_presence: told that a process is there.
     """
 
     def __init__(
@@ -95,6 +98,7 @@ class RunCollector:
         run_dir: Path,
         *,
         is_sim: bool,
+        on_presence: Callable[[Presence], None],
     ) -> None:
         """Subscribe before anybody publishes."""
         self._context, self._endpoints, self._cfg, self._run_dir, self._is_sim = (
@@ -104,6 +108,7 @@ class RunCollector:
             run_dir,
             is_sim,
         )
+        self._on_presence = on_presence
         self._mirror: Mirror = build_mirror(cfg.mirror)
         names = ("main", "danger", "truth") if is_sim else ("main", "danger")
         self._subscriber = Subscriber(context, [endpoints.of(name) for name in names], RECEIVED)
@@ -137,6 +142,11 @@ class RunCollector:
         self._subscriber.close()
 
     @property
+    def status(self) -> MissionStatus | None:
+        """Where the mission stands, once main has said so."""
+        return self._status
+
+    @property
     def is_over(self) -> bool:
         """Main has said how the mission ended."""
         return self._status is not None and self._status.exit_status >= 0
@@ -157,6 +167,9 @@ class RunCollector:
             received = self._subscriber.receive_raw()
 
     def _take(self, name: str, body: bytes, message: Message, view: View | None) -> None:
+        if isinstance(message, Presence):
+            self._on_presence(message)
+            return
         if name != "timing":
             self._recorder.write(name, max(message.t_s, 0.0), body)
         if isinstance(message, Truth):

@@ -137,7 +137,9 @@ class EmergencyDesk(Protocol):
         """Clear; returns why it was refused, or None."""
 
 
-def answer_observatory(frame: bytes, desk: EmergencyDesk, *, at_base_or_held: bool, age_s: float | None) -> bytes:
+def answer_observatory(
+    frame: bytes, desk: EmergencyDesk, *, at_base_or_held: bool, age_s: float | None, may_clear: bool = True
+) -> bytes:
     """Serve one request of the observatory channel.
 
     Args:
@@ -145,6 +147,7 @@ def answer_observatory(frame: bytes, desk: EmergencyDesk, *, at_base_or_held: bo
         desk: where emergencies are latched.
         at_base_or_held: whether the robot is at base or held, by a fresh estimate.
         age_s: age of the last verdict, s; ``None`` before the first.
+        may_clear: whether this peer may end emergencies.
 
     Returns:
         The reply.
@@ -159,6 +162,8 @@ def answer_observatory(frame: bytes, desk: EmergencyDesk, *, at_base_or_held: bo
         refusal = desk.emergency(request.kind.value, request.id, request.note)
         # An edge may hide the abort's code until the robot is off it; the answer is about the latch.
         accepted = format_ok(id=request.id, latched=True, code=int(EventCode.ABORTED))
+    elif not may_clear:
+        refusal, accepted = "this client may raise emergencies, not clear them", b""
     else:
         refusal = desk.clear(request.id, at_base_or_held)
         accepted = format_ok(id=request.id, code=int(desk.code))

@@ -22,12 +22,14 @@ class Message(msgspec.Struct, kw_only=True):
 class Presence(Message):
     """A process is alive, before and while frames flow.
 
-    ``phase``: starting, ready (may be joined to), joined, done.
+    ``phase``: starting, ready (may be joined to), joined, done. ``frame_age_s``: wall time since the process served its
+    newest sensors frame, ``None`` before the first. ``t_s`` is of the machine's monotonic clock.
     """
 
     process: str
     pid: int
     phase: str
+    frame_age_s: float | None = None
 
 
 class Estimate(Message):

@@ -94,6 +94,7 @@ def test_the_commands_are_those_of_the_contract_and_the_map() -> None:
     assert {" ".join(path) for path in commands(cli) if path} - {"map"} == {
         "run", "status", "pause", "resume", "abort", "stop", "emergency",
         "sim", "sim robot", "sim etalon", "config", "config check", "config schema", "study", "replay", "bench",
+        "keys", "keys generate", "keys show-public", "clear",
     }  # fmt: skip
 
 
@@ -275,7 +276,7 @@ def test_a_refusal_tells_the_reason(router: Router, daemon_dir: Path, capsys: py
 
 def test_the_robot_alone_gets_its_address(stub: Stub) -> None:
     calls = stub("ccatp.processes.dataloop", "run_alone", 0)
-    argv = "sim robot --host 0.0.0.0 --port 0 --mirror fyst-m2 --seed 4 --lockstep"
+    argv = "sim robot --host 0.0.0.0 --port 0 --mirror fyst-m2 --seed 4 --lockstep --set sim.open_to_network=true"
     assert main(argv.split()) == 0
     cfg, options = calls[0]
     assert isinstance(cfg, Config)

@@ -321,6 +321,8 @@ async def test_a_robot_that_asks_for_a_key_we_do_not_have() -> None:
 
 def test_read_key(tmp_path: Path) -> None:
     assert read_key("") is None
+    for name in ("key", "empty"):
+        (tmp_path / name).touch(mode=0o600)
     (tmp_path / "key").write_bytes(b" secret\n")
     assert read_key(str(tmp_path / "key")) == b"secret"
     (tmp_path / "empty").write_bytes(b"\n")
@@ -328,6 +330,9 @@ def test_read_key(tmp_path: Path) -> None:
         read_key(str(tmp_path / "empty"))
     with pytest.raises(ConfigError, match=r"robot\.key_file: cannot read .*No such file"):
         read_key(str(tmp_path / "none"))
+    (tmp_path / "key").chmod(0o604)
+    with pytest.raises(ConfigError, match=r"key is open to others \(mode 0604\); chmod go= .*key$"):
+        read_key(str(tmp_path / "key"))
 
 
 # -- a robot that does not read ---------------------------------------------------------------------------------------

@@ -44,11 +44,12 @@ def test_a_link_is_refused(tmp_path: Path) -> None:
         make_runtime_dir(str(tmp_path / "link"), {})
 
 
-def test_a_folder_that_others_may_write_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("mode", [0o777, 0o755, 0o710, 0o701])
+def test_a_folder_that_others_may_enter_is_refused(tmp_path: Path, mode: int) -> None:
     path = tmp_path / "open"
     path.mkdir()
-    path.chmod(0o777)
-    with pytest.raises(RuntimeDirError, match=r"others may write there \(mode 0777\); chmod 700"):
+    path.chmod(mode)
+    with pytest.raises(RuntimeDirError, match=rf"is open to others \(mode {mode:04o}\); chmod 700"):
         make_runtime_dir(str(path), {})
 
 

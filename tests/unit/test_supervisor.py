@@ -58,3 +58,16 @@ def test_one_daemon_in_a_runtime_directory(tmp_path: Path) -> None:
             pass
     with _lock(path, "--runtime-dir"):
         pass
+
+
+def test_a_list_of_clients_that_cannot_be_used_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+    keys = {"key_file": str(tmp_path / "k"), "clients_file": str(tmp_path / "none.toml")}
+    observatory = {f"observatory.{name}": value for name, value in keys.items()}
+    wanted = options(
+        overrides={"observatory.endpoint": "tcp://127.0.0.1:0", **observatory},
+        runtime_dir=tmp_path / "rt",
+        run_dir=tmp_path / "run",
+    )
+    with pytest.raises(ConfigError, match=r"observatory\.clients_file: cannot read .*none\.toml: No such file"):
+        run_survey(wanted)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,164 @@
+"""Glue. Answers the observatory: at the unix socket, and over TCP for those who are listed."""
+
+import asyncio
+import time
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Protocol
+
+import structlog
+import zmq.asyncio
+
+from ccatp.config.models import ObservatoryConfig
+from ccatp.curve_keys import ClientsFile, KeyPair, read_clients, read_pair
+from ccatp.curve_router import CurveRouter, ZapHandler
+from ccatp.router import Router
+from ccatp.wire.access import Client, Role
+from ccatp.wire.channels import EmergencyDesk, answer_observatory, format_error, parse_reply
+
+KEY_FILE, CLIENTS_FILE = "observatory.key_file", "observatory.clients_file"
+# Whoever reaches the unix socket has the daemon's own user: it might as well stop the daemon.
+LOCAL = Client("local", Role.CLEAR)
+# Somebody who asks over and over must not fill the log.
+LOGGED_LINES, LOGGED_PERIOD_S = 10, 60.0
+
+
+class Monitor(EmergencyDesk, Protocol):
+    """What is asked and told; ``ccatp.danger.DangerMonitor`` is one."""
+
+    @property
+    def at_base_or_held(self) -> bool:
+        """Whether the robot is at base or held, by a fresh estimate."""
+
+
+class LineBudget:
+    """So many lines in a period, and a count of those that were left out.
+
+    Args:
+        lines: at most so many ...
+        period_s: ... in this time.
+    """
+
+    def __init__(self, lines: int, period_s: float) -> None:
+        self._lines, self._period_s = lines, period_s
+        self._begun_s, self._used, self._left_out = float("-inf"), 0, 0
+
+    def take(self, now_s: float) -> int | None:
+        """Ask for a line: how many were left out since the last one, or ``None`` when this one is left out, too."""
+        if now_s - self._begun_s >= self._period_s:
+            self._begun_s, self._used = now_s, 0
+        if self._used >= self._lines:
+            self._left_out += 1
+            return None
+        self._used += 1
+        left_out, self._left_out = self._left_out, 0
+        return left_out
+
+
+class ObservatoryDesk:
+    """Hands the requests of the observatory to the danger rules, and tells the log.
+
+    Args:
+        monitor: latches and clears.
+        age_s: age of the last frame, ``None`` before the first.
+        log: the process's logger.
+    """
+
+    def __init__(
+        self, monitor: Monitor, age_s: Callable[[], float | None], log: structlog.typing.FilteringBoundLogger
+    ) -> None:
+        """Nothing asked yet."""
+        self._monitor, self._age_s, self._log = monitor, age_s, log
+        self._accepted = LineBudget(LOGGED_LINES, LOGGED_PERIOD_S)
+        self._refused = LineBudget(LOGGED_LINES, LOGGED_PERIOD_S)
+
+    def answer(self, frame: bytes, client: Client = LOCAL) -> bytes:
+        """The reply to a request of a client."""
+        reply = answer_observatory(
+            frame,
+            self._monitor,
+            at_base_or_held=self._monitor.at_base_or_held,
+            age_s=self._age_s(),
+            may_clear=client.role is Role.CLEAR,
+        )
+        told = parse_reply(reply)
+        if not told["ok"]:
+            self.refuse(client.name, told["error"])
+        elif "id" in told:
+            left_out = self._accepted.take(time.monotonic())
+            if left_out is not None:
+                text = frame.decode("utf-8", "replace")
+                self._log.warning("observatory", client=client.name, request=text, code=told["code"], left_out=left_out)
+        return reply
+
+    def refuse(self, client: str, why: str) -> None:
+        """Note that somebody was refused."""
+        left_out = self._refused.take(time.monotonic())
+        if left_out is not None:
+            self._log.warning("observatory: refused", client=client, why=why, left_out=left_out)
+
+    def note(self, text: str, **fields: object) -> None:
+        """A line for the log."""
+        self._log.info(text, **fields)
+
+
+class Observatory:
+    """The observatory channel: a unix socket, and TCP where it is configured.
+
+    Args:
+        local_endpoint: the unix socket.
+        cfg: TCP endpoint and its keys.
+        desk: what answers.
+
+    Raises:
+        ConfigError: the keys or the list of clients cannot be used.
+    """
+
+    def __init__(self, local_endpoint: str, cfg: ObservatoryConfig, desk: ObservatoryDesk) -> None:
+        """Read the keys; nothing is bound yet."""
+        self._local_endpoint, self._cfg, self._desk = local_endpoint, cfg, desk
+        self._keys = check_observatory(cfg)
+        self._clients = ClientsFile(Path(cfg.clients_file), CLIENTS_FILE)
+
+    async def serve(self, context: zmq.asyncio.Context) -> None:
+        """Bind, and answer until cancelled; whatever fails ends all of it.
+
+        Raises:
+            RouterError: an endpoint cannot be bound.
+        """
+        async with AsyncExitStack() as stack:
+            local = await stack.enter_async_context(Router(self._local_endpoint, self._desk.answer, context))
+            work = [local.serve()]
+            if self._keys is not None:
+                zap = ZapHandler(context, lambda: self._clients.clients, self._on_locked_out)
+                remote = CurveRouter(self._cfg.endpoint, self._answer_remote, context, self._keys)
+                work.append((await stack.enter_async_context(zap)).serve())
+                work.append((await stack.enter_async_context(remote)).serve())
+                self._desk.note("observatory channel", endpoint=remote.bound, clients=len(self._clients.clients))
+            async with asyncio.TaskGroup() as tasks:
+                for coroutine in work:
+                    tasks.create_task(coroutine)
+
+    def _answer_remote(self, frame: bytes, user_id: str) -> bytes:
+        """Whoever is taken off the list loses their rights at once, connected or not."""
+        client = self._clients.clients.get(bytes.fromhex(user_id))
+        if client is None:
+            self._on_locked_out(f"key {user_id} is not on the list any more")
+            return format_error("this client is not on the list any more")
+        return self._desk.answer(frame, client)
+
+    def _on_locked_out(self, why: str) -> None:
+        self._desk.refuse("unknown", f"{why}; {self._clients.trouble}" if self._clients.trouble else why)
+
+
+def check_observatory(cfg: ObservatoryConfig) -> KeyPair | None:
+    """The server's keys, ``None`` where TCP is not configured.
+
+    Raises:
+        ConfigError: the keys or the list of clients cannot be used.
+    """
+    if not cfg.endpoint:
+        return None
+    read_clients(Path(cfg.clients_file), CLIENTS_FILE)
+    return read_pair(Path(cfg.key_file), KEY_FILE)

@@ -1,0 +1,66 @@
+"""Glue. Real-time scheduling and locked memory for the loops, where the system permits it.
+
+The bounds on reaction times hold under load only with it: a loop that shares its core with others waits for its turn,
+and a page that was swapped out waits for the disk. Only for robots that go by the wall clock: in
+lockstep the loops spin.
+"""
+
+import ctypes
+import os
+import resource
+import sys
+from pathlib import Path
+
+import structlog
+
+MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
+# libzmq's threads that move messages; those that write to disk or compute on the side stay behind.
+IO_THREADS = "ZMQbg/IO"
+WITHOUT = "reaction times hold while the machine has a core to spare; the robot's own time-to-live holds in any case"
+
+
+def enter(priority: int, log: structlog.typing.FilteringBoundLogger) -> None:
+    """Take real-time scheduling for this thread and libzmq's, and lock memory; one warning where that is not permitted.
+
+    Args:
+        priority: of SCHED_FIFO; 0 leaves everything as it is.
+        log: the process's logger.
+    """
+    if not priority:
+        return
+    missing = [reason for reason in (_schedule(priority), _lock_memory()) if reason]
+    if missing:
+        log.warning("no real time", missing=missing, without=WITHOUT)
+    else:
+        log.info("real time", policy="SCHED_FIFO", priority=priority)
+
+
+def _schedule(priority: int) -> str:
+    if not hasattr(os, "sched_setscheduler"):
+        return f"SCHED_FIFO: not on {sys.platform}"
+    try:
+        for thread in (0, *_io_threads()):
+            os.sched_setscheduler(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+    except OSError as error:
+        return f"SCHED_FIFO {priority}: {error.strerror}; the unit grants it with LimitRTPRIO"
+    return ""
+
+
+def _io_threads() -> list[int]:
+    names = {int(task.name): (task / "comm").read_text() for task in Path("/proc/self/task").iterdir()}
+    return [thread for thread, name in names.items() if name.startswith(IO_THREADS)]
+
+
+def _lock_memory() -> str:
+    """Lock what is used and what will be. With a limit, that would let an allocation fail some day: then not at all."""
+    if sys.platform != "linux":
+        return f"mlockall: not on {sys.platform}"
+    _, most = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    try:
+        resource.setrlimit(resource.RLIMIT_MEMLOCK, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    except (OSError, ValueError):
+        return f"mlockall: only {most} bytes may be locked; the unit grants it with LimitMEMLOCK=infinity"
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT):
+        return f"mlockall: {os.strerror(ctypes.get_errno())}"
+    return ""

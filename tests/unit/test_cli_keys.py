@@ -1,0 +1,209 @@
+"""``ccatp keys``: what is written, and what is never shown."""
+
+import json
+import os
+import stat
+import tomllib
+from pathlib import Path
+
+import pytest
+import zmq
+import zmq.auth
+
+from ccatp.cli import main
+from ccatp.config.loader import dump_config, load_config
+from ccatp.curve_keys import ClientsFile, read_clients, read_pair, read_public
+from ccatp.errors import ConfigError
+from ccatp.robot_link import read_key
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "keys"
+
+
+def generate(folder: Path, *more: str) -> int:
+    return main(["keys", "generate", "--dir", str(folder), *more])
+
+
+def mode(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def test_the_keys_of_a_daemon(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    old = os.umask(0)  # the modes are ours, not those of the shell
+    try:
+        assert generate(folder) == 0
+    finally:
+        os.umask(old)
+    names = {path.name: mode(path) for path in folder.iterdir()}
+    assert names == {
+        "ccatp.key": 0o644,
+        "ccatp.key_secret": 0o600,
+        "ccatp-robot.key_secret": 0o600,
+        "ccatp-clients.toml": 0o600,
+    }
+    assert mode(folder) == 0o700
+    pair = read_pair(folder / "ccatp.key_secret", "--key")
+    assert zmq.auth.load_certificate(str(folder / "ccatp.key_secret")) == tuple(pair)
+    assert zmq.auth.load_certificate(str(folder / "ccatp.key")) == (pair.public, None)
+    link = read_key(str(folder / "ccatp-robot.key_secret"))
+    assert link is not None
+    assert len(bytes.fromhex(link.decode())) == 32
+    out, err = capsys.readouterr()
+    for secret in (pair.secret.decode(), link.decode()):
+        assert secret not in out + err
+    assert str(folder / "ccatp.key_secret") in out
+    assert pair.secret.decode() not in repr(pair)
+
+
+def test_what_is_printed_is_a_configuration_without_secrets(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert generate(folder) == 0
+    text = capsys.readouterr().out.split("at theirs):\n\n")[1]
+    (folder / "mine.toml").write_text(text)
+    cfg = load_config(folder / "mine.toml")
+    assert cfg.observatory.key_file == str(folder / "ccatp.key_secret")
+    dumped = dump_config(cfg)
+    for file in folder.glob("*_secret"):
+        assert file.name in dumped
+    assert read_pair(folder / "ccatp.key_secret", "x").secret.decode() not in dumped
+    assert (folder / "ccatp-robot.key_secret").read_text().strip() not in dumped
+
+
+def test_the_keys_of_a_client_and_its_lines_for_the_list(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert generate(folder, "--client", "--name", "observatory") == 0
+    assert {path.name for path in folder.iterdir()} == {"observatory.key", "observatory.key_secret"}
+    out = capsys.readouterr().out
+    lines = "[clients" + out.split("[clients")[1].split("\n\n")[0]
+    key = read_public(folder / "observatory.key", "x").decode()
+    assert tomllib.loads(lines) == {"clients": {"observatory": {"public_key": key, "role": "raise"}}}
+    (folder / "list.toml").write_text(lines)
+    assert [client.name for client in read_clients(folder / "list.toml", "x").values()] == ["observatory"]
+
+
+def test_keys_are_replaced_by_force_alone_and_the_list_never(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert generate(folder) == 0
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    capsys.readouterr()
+    assert generate(folder) == 2
+    out, err = capsys.readouterr()
+    assert (out, err) == (
+        "", f"ccatp: --dir: {folder}/ccatp.key exists; choose another --name, or replace it with --force\n"
+    )  # fmt: skip
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    (folder / "ccatp-clients.toml").write_text("# mine\n")
+    assert generate(folder, "--force") == 0
+    after = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert after.pop("ccatp-clients.toml") == b"# mine\n"
+    assert all(after[name] != before[name] for name in after)
+    assert mode(folder / "ccatp.key_secret") == 0o600
+
+
+def test_one_of_the_files_is_enough_to_refuse_all(folder: Path) -> None:
+    folder.mkdir(mode=0o700)
+    (folder / "ccatp-robot.key_secret").write_text("mine")
+    assert generate(folder) == 2
+    assert [path.name for path in folder.iterdir()] == ["ccatp-robot.key_secret"]
+    assert (folder / "ccatp-robot.key_secret").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["", "a b", "../a", "a.b", "-a", "x" * 64])
+def test_names_that_are_no_names(folder: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert generate(folder, f"--name={name}") == 2
+    assert "letters, digits, - and _ only" in capsys.readouterr().err
+    assert not folder.exists()
+
+
+def test_a_folder_open_to_others_is_refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder.mkdir()
+    folder.chmod(0o750)
+    assert generate(folder) == 2
+    assert f"{folder} is open to others (mode 0750); chmod 700 {folder}\n" in capsys.readouterr().err
+    folder.chmod(0o700)
+    owner = folder.stat().st_uid
+    monkeypatch.setattr(os, "getuid", lambda: owner + 1)
+    assert generate(folder) == 2
+    assert f"belongs to user {owner}, not to {owner + 1}" in capsys.readouterr().err
+    (folder / "file").touch()
+    assert generate(folder / "file") == 2
+    assert "cannot make" in capsys.readouterr().err
+    assert {path.name for path in folder.iterdir()} == {"file"}
+
+
+def test_a_folder_that_takes_no_files(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert generate(folder) == 2
+    assert "ccatp.key: No space left on device\n" in capsys.readouterr().err
+    assert list(folder.iterdir()) == []
+
+
+def test_show_public_shows_public_keys(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert generate(folder, "--name", "a") == generate(folder, "--name", "bcd") == 0
+    capsys.readouterr()
+    keys = {name: read_public(folder / f"{name}.key", "x").decode() for name in ("a", "bcd")}
+    assert main(["keys", "show-public", "--dir", str(folder)]) == 0
+    assert capsys.readouterr().out == f"a    {keys['a']}\nbcd  {keys['bcd']}\n"
+    assert main(["keys", "show-public", "--dir", str(folder), "--name", "a", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"a": keys["a"]}
+    assert main(["keys", "show-public", "--dir", str(folder), "--name", "c"]) == 2
+    assert "no c.key in" in capsys.readouterr().err
+
+
+def test_secret_files_that_are_refused(folder: Path) -> None:
+    assert generate(folder) == 0
+    secret, public = folder / "ccatp.key_secret", folder / "ccatp.key"
+    with pytest.raises(ConfigError, match=r"--key: cannot read .*none: No such file or directory; make keys with"):
+        read_pair(folder / "none", "--key")
+    public.chmod(0o600)
+    with pytest.raises(ConfigError, match=r"--key: .* holds no secret key; name the file that ends in \.key_secret"):
+        read_pair(public, "--key")
+    secret.chmod(0o640)
+    with pytest.raises(ConfigError, match=r"is open to others \(mode 0640\); chmod go= "):
+        read_pair(secret, "--key")
+    text = secret.read_text()
+    broken = folder / "broken"
+    broken.touch(mode=0o600)
+    with pytest.raises(ConfigError, match=r"holds no public key; name the file that ends in \.key"):
+        read_public(broken, "--server-key")
+    broken.write_text(text.replace('secret-key = "', 'secret-key = "x'))
+    with pytest.raises(ConfigError, match=r"a key has 40 characters of Z85, this one 41$"):
+        read_pair(broken, "--key")
+    broken.write_text(text.replace(read_public(public, "x").decode(), zmq.curve_keypair()[0].decode()))
+    with pytest.raises(ConfigError, match="public and secret key are no pair"):
+        read_pair(broken, "--key")
+    broken.write_bytes(b"x" * 300_000)
+    with pytest.raises(ConfigError, match="is longer than 262144 bytes"):
+        read_pair(broken, "--key")
+
+
+def test_the_list_is_read_anew_and_a_bad_one_names_nobody(folder: Path) -> None:
+    assert generate(folder) == 0
+    path = folder / "ccatp-clients.toml"
+    with pytest.raises(ConfigError, match="lists nobody; add a table"):
+        read_clients(path, "observatory.clients_file")
+    listed = ClientsFile(path, "observatory.clients_file")
+    assert not listed.clients
+    assert "lists nobody" in listed.trouble
+    key = read_public(folder / "ccatp.key", "x").decode()
+    path.write_text(f'[clients.a]\npublic_key = "{key}"\nrole = "clear"\n')
+    assert [client.name for client in listed.clients.values()] == ["a"]
+    assert listed.trouble == ""
+    path.chmod(0o666)
+    assert not listed.clients
+    assert "open to others" in listed.trouble
+    path.chmod(0o600)
+    assert listed.clients
+    path.write_text("[clients.a]\n")
+    assert not listed.clients
+    with pytest.raises(ConfigError, match=r"observatory\.clients_file: .*clients\.a must have"):
+        read_clients(path, "observatory.clients_file")
+    path.unlink()
+    assert not listed.clients
+    assert "observatory.clients_file: cannot read" in listed.trouble

@@ -1,0 +1,307 @@
+"""The daemon as a service: what systemd is told, and when; the unit file."""
+
+import configparser
+import os
+import re
+import resource
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import structlog
+
+from ccatp.liveness import Liveness
+from ccatp.processes import realtime
+from ccatp.processes.run_collector import NO_STATUS
+from ccatp.processes.service import Service
+from ccatp.service_notify import Notifier, take_from, watchdog_period_s
+from ccatp.wire.topics import Presence
+
+ROOT = Path(__file__).parents[2]
+UNIT = ROOT / "packaging" / "ccatp.service"
+
+
+class Manager:
+    """A service manager's end of the notification socket."""
+
+    def __init__(self, address: str) -> None:
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.bind("\0" + address[1:] if address.startswith("@") else address)
+        self.socket.setblocking(False)
+
+    def heard(self) -> list[str]:
+        told = []
+        while True:
+            try:
+                told.append(self.socket.recv(4096).decode())
+            except BlockingIOError:
+                return told
+
+
+@pytest.fixture(params=["path", "abstract"])
+def manager(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Manager, str]]:
+    address = str(tmp_path / "notify") if request.param == "path" else f"@ccatp-test-{os.getpid()}"
+    manager = Manager(address)
+    yield manager, address
+    manager.socket.close()
+
+
+def presence(name: str, t_s: float, phase: str = "joined", frame_age_s: float | None = 0.01) -> Presence:
+    return Presence(seq=0, t_s=t_s, process=name, pid=1, phase=phase, frame_age_s=frame_age_s)
+
+
+def test_lines_reach_the_service_manager(manager: tuple[Manager, str]) -> None:
+    ear, address = manager
+    Notifier(address).send("READY=1", "STATUS=well")
+    assert ear.heard() == ["READY=1\nSTATUS=well"]
+
+
+def test_a_service_manager_that_is_gone_or_deaf_holds_nobody_up(tmp_path: Path) -> None:
+    Notifier("").send("READY=1")
+    Notifier(str(tmp_path / "none")).send("READY=1")
+    deaf = Manager(str(tmp_path / "notify"))
+    for _ in range(10_000):  # more than its queue holds
+        Notifier(str(tmp_path / "notify")).send("WATCHDOG=1")
+    deaf.socket.close()
+
+
+@pytest.mark.parametrize(
+    ("environ", "period_s"),
+    [
+        ({}, None),
+        ({"WATCHDOG_USEC": "2000000"}, 2.0),
+        ({"WATCHDOG_USEC": "2000000", "WATCHDOG_PID": str(os.getpid())}, 2.0),
+        ({"WATCHDOG_USEC": "2000000", "WATCHDOG_PID": "1"}, None),
+        ({"WATCHDOG_USEC": "0"}, None),
+        ({"WATCHDOG_USEC": "-2"}, None),
+        ({"WATCHDOG_USEC": "x"}, None),
+    ],
+)
+def test_the_watchdog_is_for_the_process_it_names(environ: dict[str, str], period_s: float | None) -> None:
+    assert watchdog_period_s(environ) == period_s
+
+
+def test_children_do_not_inherit_the_service_manager() -> None:
+    environ = {"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "2000000", "PATH": "/bin"}
+    notifier, period_s = take_from(environ)
+    assert (notifier.is_heard, period_s, environ) == (True, 2.0, {"PATH": "/bin"})
+
+
+# -- what is alive ----------------------------------------------------------------------------------------------------
+
+
+def test_both_loops_must_have_joined() -> None:
+    liveness = Liveness(1.0)
+    assert not liveness.has_joined
+    liveness.heard(presence("main", 0.0))
+    assert not liveness.has_joined
+    liveness.heard(presence("danger", 0.0, "starting"))
+    assert not liveness.has_joined
+    liveness.heard(presence("danger", 0.0))
+    assert liveness.has_joined
+
+
+@pytest.mark.parametrize(
+    ("main", "danger", "trouble"),
+    [
+        (presence("main", 9.5), presence("danger", 9.5), ""),
+        (presence("main", 8.9), presence("danger", 9.5), "main was last heard of 1.1 s ago"),
+        (presence("main", 9.5), presence("danger", 8.0), "danger was last heard of 2.0 s ago"),
+        (presence("main", 9.5, frame_age_s=0.6), presence("danger", 9.5), "main had its last frame .* 1.1 s ago"),
+        (presence("main", 9.5), presence("danger", 9.5, frame_age_s=None), "danger has had no frame .*"),
+        (presence("main", 9.5, "done", 7.0), presence("danger", 9.5), ""),
+        (presence("main", 9.5), None, "danger was never heard of"),
+    ],
+)
+def test_trouble(main: Presence, danger: Presence | None, trouble: str) -> None:
+    liveness = Liveness(1.0)
+    liveness.heard(main)
+    if danger is not None:
+        liveness.heard(danger)
+    found = liveness.trouble(10.0)
+    assert re.fullmatch(trouble, found)
+
+
+def test_a_service_from_its_start_to_its_end(manager: tuple[Manager, str]) -> None:
+    ear, address = manager
+    service = Service(Notifier(address), 2.0)
+    service.beat(0.0, None)
+    service.heard(presence("main", 0.0))
+    service.beat(0.1, None)
+    assert ear.heard() == []  # danger has not joined
+    service.heard(presence("danger", 0.1))
+    service.beat(0.2, None)
+    assert ear.heard() == ["READY=1"]
+    for tick in range(3, 33):
+        now_s = 0.1 * tick
+        for name in ("main", "danger"):
+            service.heard(presence(name, now_s))
+        service.beat(now_s, NO_STATUS)
+    told = ear.heard()
+    assert told.count("WATCHDOG=1") == 6  # every half second
+    assert [line for line in told if line.startswith("STATUS")] == ["STATUS=, 0 of 0 points"]
+    service.heard(presence("main", 6.0))  # danger was last heard of at 3.2 s
+    service.beat(6.0, NO_STATUS)
+    service.beat(6.6, NO_STATUS)
+    assert ear.heard() == ["STATUS=trouble: danger was last heard of 2.8 s ago"]
+    for name in ("main", "danger"):
+        service.heard(presence(name, 6.7))
+    service.beat(6.7, NO_STATUS)
+    assert ear.heard() == ["WATCHDOG=1", "STATUS=, 0 of 0 points"]
+    service.stopping()
+    assert ear.heard() == ["STOPPING=1\nSTATUS=holding the wheels and saving"]
+
+
+def test_silence_counts_well_before_a_short_watchdog_bites(manager: tuple[Manager, str]) -> None:
+    ear, address = manager
+    service = Service(Notifier(address), 0.4)
+    for name in ("main", "danger"):
+        service.heard(presence(name, 0.0))
+    service.beat(0.0, None)
+    service.beat(0.19, None)
+    service.beat(0.3, None)
+    assert ear.heard() == [
+        "READY=1", "WATCHDOG=1", "STATUS=joined the robot", "STATUS=trouble: main was last heard of 0.3 s ago"
+    ]  # fmt: skip
+
+
+def test_without_a_watchdog_none_is_stroked(manager: tuple[Manager, str]) -> None:
+    ear, address = manager
+    service = Service(Notifier(address), None)
+    for name in ("main", "danger"):
+        service.heard(presence(name, 0.0))
+    service.beat(0.0, None)
+    service.beat(0.5, None)
+    assert ear.heard() == ["READY=1", "STATUS=joined the robot"]
+
+
+# -- real time --------------------------------------------------------------------------------------------------------
+
+
+def logger(lines: list[dict[str, Any]]) -> structlog.typing.FilteringBoundLogger:
+    def keep(_logger: object, method: str, event: Any) -> Any:
+        lines.append({"level": method, **event})
+        raise structlog.DropEvent
+
+    log: structlog.typing.FilteringBoundLogger = structlog.wrap_logger(None, processors=[keep])
+    return log
+
+
+def test_without_permission_there_is_one_warning_that_says_what_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(resource, "setrlimit", refuse)
+    lines: list[dict[str, Any]] = []
+    realtime.enter(40, logger(lines))
+    (line,) = lines
+    assert line["level"] == "warning"
+    assert line["missing"][0] == "SCHED_FIFO 40: Operation not permitted; the unit grants it with LimitRTPRIO"
+    assert "the unit grants it with LimitMEMLOCK=infinity" in line["missing"][1]
+    assert "time-to-live" in line["without"]
+
+
+def test_priority_0_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_setscheduler", lambda *_: pytest.fail("called"))
+    lines: list[dict[str, Any]] = []
+    realtime.enter(0, logger(lines))
+    assert lines == []
+
+
+REALTIME = """
+import os, sys, structlog, zmq
+from ccatp.processes import realtime
+context = zmq.Context()
+peer = context.socket(zmq.PUB)
+realtime.enter(7, structlog.wrap_logger(structlog.PrintLogger(), processors=[structlog.processors.KeyValueRenderer()]))
+threads = [int(t) for t in os.listdir("/proc/self/task")]
+fifo = [os.sched_getscheduler(t) & 3 == os.SCHED_FIFO for t in threads]
+locked = next(int(l.split()[1]) for l in open("/proc/self/status") if l.startswith("VmLck"))
+print(os.sched_getscheduler(0) & 3 == os.SCHED_FIFO, sum(fifo), len(threads), locked > 0)
+peer.close(); context.term()
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="SCHED_FIFO and mlockall are Linux's here")
+def test_real_time_is_taken_where_it_is_permitted() -> None:
+    result = subprocess.run([sys.executable, "-c", REALTIME], capture_output=True, text=True, timeout=60, check=True)
+    said, state = result.stdout.splitlines()
+    if "SCHED_FIFO 7: " not in said:
+        # the caller and libzmq's I/O thread, not its reaper nor a thread of the linear algebra
+        assert state.split()[:2] == ["True", "2"]
+    else:
+        assert state.split()[:2] == ["False", "0"]
+    assert state.split()[3] == str("mlockall: " not in said)
+
+
+# -- the unit ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Path:
+    """The unit with a program that exists here in the place of the installed one."""
+    path = tmp_path / UNIT.name
+    path.write_text(UNIT.read_text().replace("/opt/ccatp/bin/ccatp", sys.executable))
+    return path
+
+
+def analyze(*args: str) -> subprocess.CompletedProcess[str]:
+    program = shutil.which("systemd-analyze")
+    assert program is not None
+    return subprocess.run([program, *args], capture_output=True, text=True, timeout=60, check=False)
+
+
+def settings() -> dict[str, list[str]]:
+    """The settings of [Service], each with all its values."""
+    found: dict[str, list[str]] = {}
+    section = ""
+    for line in UNIT.read_text().splitlines():
+        if line.startswith("["):
+            section = line
+        elif line and not line.startswith("#"):
+            key, equals, value = line.partition("=")
+            assert equals, line
+            assert section, line
+            if section == "[Service]":
+                found.setdefault(key, []).append(value)
+    return found
+
+
+def test_systemd_has_nothing_to_say_about_the_unit(unit: Path) -> None:
+    if shutil.which("systemd-analyze") is None:  # then at least it is a unit file, without unknown sections
+        parser = configparser.ConfigParser(strict=False, interpolation=None)
+        parser.read(UNIT)
+        assert parser.sections() == ["Unit", "Service", "Install"]
+        return
+    result = analyze("verify", str(unit))
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+
+
+def test_the_unit_exposes_little(unit: Path) -> None:
+    if shutil.which("systemd-analyze") is None:  # then at least the settings that weigh most
+        for key in ("NoNewPrivileges", "PrivateDevices", "PrivateUsers", "ProtectKernelModules", "RestrictNamespaces"):
+            assert settings()[key] == ["yes"]
+        assert settings()["CapabilityBoundingSet"] == [""]
+        return
+    # In tenths: 15 is an exposure of 1.5.
+    result = analyze("security", "--offline=true", "--no-pager", "--threshold=15", str(unit))
+    assert result.returncode == 0, result.stdout
+
+
+def test_the_unit_grants_what_the_loops_ask_for() -> None:
+    found = settings()
+    assert found["Type"] == ["notify"]
+    assert found["LimitMEMLOCK"] == ["infinity"]
+    from ccatp.config.loader import load_config
+
+    assert int(found["LimitRTPRIO"][0]) >= load_config().run.realtime_priority > 0
+    assert found["RestrictRealtime"] == ["no"]
+    assert found["RuntimeDirectoryMode"] == ["0700"]
+    assert "--runtime-dir /run/ccatp" in found["ExecStart"][0]
+    assert found["Restart"] == ["no"]
