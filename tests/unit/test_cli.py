@@ -90,8 +90,8 @@ def test_every_help_shows_an_example(path: tuple[str, ...], capsys: pytest.Captu
     assert f"    {' '.join(('ccatp', *path))}" in text
 
 
-def test_the_commands_are_those_of_the_contract_and_the_map() -> None:
-    assert {" ".join(path) for path in commands(cli) if path} - {"map"} == {
+def test_the_commands_are_those_of_the_contract_the_map_and_the_conformance() -> None:
+    assert {" ".join(path) for path in commands(cli) if path} - {"map", "conformance"} == {
         "run", "status", "pause", "resume", "abort", "stop", "emergency",
         "sim", "sim robot", "sim etalon", "config", "config check", "config schema", "study", "replay", "bench",
         "keys", "keys generate", "keys show-public", "clear",

@@ -8,6 +8,8 @@ from ccatp.conformance import judge_frames, judge_hello
 from ccatp.conformance.judge_rules import judge_lost, judge_newest, judge_once, judge_ttl, mean_rates
 from ccatp.conformance.reading import Frame, fault_of_line, parse_frame, read_message
 from ccatp.conformance.report import last_line, table_line
+from ccatp.conformance.stage import Facts, Stage
+from ccatp.conformance.stories_fans import _other as other_duty
 from ccatp.conformance.verdict import Broken, NotApplicable, Result
 
 TTL_S, FRAME_S = 0.25, 0.01
@@ -140,3 +142,21 @@ def test_the_lines_of_a_table() -> None:
     assert table_line(results[0]) == f"{'a':<21}FAIL  seen: what was seen; promised: what is promised"
     assert table_line(results[1]) == f"{'b':<21}-     why"
     assert last_line(results) == "0 passed, 1 failed, 1 not applicable"
+
+
+def test_duties_to_change_to() -> None:
+    assert other_duty((0.6, 0.98), 0.6) == pytest.approx((0.65, 0.93))
+    with pytest.raises(NotApplicable, match=r"a floor of 0\.98 leaves no room"):
+        other_duty((0.99, 0.99), 0.98)
+
+
+def test_a_mac_without_a_key() -> None:
+    facts = Facts(False, 100.0, TTL_S, True, 0.03, 0.15, 8.0, 0.0)
+    with pytest.raises(NotApplicable, match="asks for a mac, and there is no key"):
+        Stage(("127.0.0.1", 1), facts, None, 1.0, 0).join_line({"nonce": "0"}, "monitor")
+
+
+def test_a_server_that_accepts_no_more(free_port: int) -> None:
+    facts = Facts(False, 100.0, TTL_S, False, 0.03, 0.15, 8.0, 0.0)
+    with pytest.raises(Broken, match="connection not accepted: Connection refused"):
+        Stage(("127.0.0.1", free_port), facts, None, 1.0, 0).greet()
