@@ -94,7 +94,7 @@ def _befall(record: Record, step: _Step, plant: Plant, fans: Fans, t_s: float) -
 
 
 class _Gliding:
-    """A disturbance of the plant: downhill while the wheels stand still."""
+    """A disturbance of the plant: downhill while the wheels are held at zero."""
 
     def __init__(self, record: Record, fault: Drift, mirror: Mirror) -> None:
         self._record, self._fault, self._downhill = record, fault, Downhill(mirror)
@@ -102,7 +102,8 @@ class _Gliding:
     def displace(
         self, plant: Plant, t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float
     ) -> BodyStep:
-        if not plant.are_wheels_still or not self._fault.is_active(t_s):
+        right_set, _, left_set, _ = plant.servo
+        if right_set or left_set or not self._fault.is_active(t_s):
             return forward_m, left_m, turn_rad
         ahead, aside, slope = self._downhill.of(plant)
         is_level = slope < LEVEL_SLOPE

@@ -147,7 +147,7 @@ class Kidnap(Fault):
 
 
 class Drift(LastingFault):
-    """The body glides downhill while the wheels stand still; level ground has no downhill."""
+    """The body glides downhill while the wheels are held at zero; level ground has no downhill."""
 
     speed_m_s: Positive
 

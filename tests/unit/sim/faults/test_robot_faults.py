@@ -126,10 +126,11 @@ def test_drift_is_downhill_while_the_wheels_stand_and_no_sensor_of_the_wheels_se
     assert robot.world.puck_world()[2] != z_0
     assert max(abs(row[1]) for frame in frames for row in frame["enc"]) < 0.01
     assert record(robot).changed == 100
-    still = boot(config, mirror, signal="body", type="drift", speed_m_s=0.02, at_s=0.5, for_s=1.0)
-    moving = drive(still, 1.0, 1.0, 1.5)
-    assert moving
-    assert record(still).samples == 0  # it is a fault of holding
+    driven = boot(config, mirror, signal="body", type="drift", speed_m_s=0.02, at_s=0.5, for_s=1.0)
+    drive(driven, 1.0, 1.0, 1.0)
+    assert record(driven).samples == 0  # it is a fault of holding
+    drive(driven, 0.0, 0.0, 2.0)
+    assert record(driven)[3:5] == (1.0, 1.49)  # from the command on, not from the wheels' last turn
 
 
 @pytest.mark.parametrize("is_driving", [False, True])
