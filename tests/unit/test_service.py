@@ -218,13 +218,16 @@ REALTIME = """
 import os, sys, structlog, zmq
 from ccatp.processes import realtime
 context = zmq.Context()
-peer = context.socket(zmq.PUB)
+ends = context.socket(zmq.PAIR), context.socket(zmq.PAIR)
+ends[1].connect(f"tcp://127.0.0.1:{ends[0].bind_to_random_port('tcp://127.0.0.1')}")
+ends[1].send(b"libzmq's thread is there and has its name")
+ends[0].recv()
 realtime.enter(7, structlog.wrap_logger(structlog.PrintLogger(), processors=[structlog.processors.KeyValueRenderer()]))
 threads = [int(t) for t in os.listdir("/proc/self/task")]
 fifo = [os.sched_getscheduler(t) & 3 == os.SCHED_FIFO for t in threads]
 locked = next(int(l.split()[1]) for l in open("/proc/self/status") if l.startswith("VmLck"))
 print(os.sched_getscheduler(0) & 3 == os.SCHED_FIFO, sum(fifo), len(threads), locked > 0)
-peer.close(); context.term()
+context.destroy(linger=0)
 """
 
 
