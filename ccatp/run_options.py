@@ -32,6 +32,11 @@ class RunOptions:
     runtime_dir: Path | None = None
     faults_file: Path | None = None
 
+    @property
+    def is_paced(self) -> bool:
+        """The robot's clock is that of the wall: there is time to sleep between frames."""
+        return self.realtime or not self.sim
+
 
 def default_run_dir(mirror: str, seed: int, now_utc: datetime, parent: Path = Path("runs")) -> Path:
     """Where a run is written when nobody said: ``runs/<UTC time>-<mirror>-s<seed>``.

@@ -240,7 +240,7 @@ class _Run:
     def _watch(self, collector: RunCollector, view: RunView) -> ExitStatus:
         for process in _processes(self._options):
             self._start(process)
-        if not self._options.realtime:
+        if not self._options.is_paced:
             os.nice(LOCKSTEP_NICENESS)
         while not self._is_interrupted:
             collector.collect(POLL_MS, view)
@@ -257,7 +257,7 @@ class _Run:
     def _start(self, process: ProcessSpec) -> None:
         command = [sys.executable, "-m", process.module]
         command += ["--run-dir", str(self._run_dir), "--runtime-dir", str(self._endpoints.runtime_dir)]
-        command += ["--realtime"] if self._options.realtime else []
+        command += ["--realtime"] if self._options.is_paced else []
         command += ["--resume"] if self._options.resume else []
         command += ["--faults"] if process.is_stand_in and self._options.faults_file is not None else []
         fds: tuple[int, ...] = ()
