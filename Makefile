@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 ARGS ?=
 PYTEST_ARGS ?=
-WORKERS ?= 2
+WORKERS ?= 3
 
 # Small matrices: threads of the linear algebra would only fight each other for the cores.
 export OPENBLAS_NUM_THREADS := 1

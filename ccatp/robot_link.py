@@ -65,11 +65,15 @@ _HINTS = {
 }
 
 
-def read_key(key_file: str) -> bytes | None:
+def read_key(key_file: str, *, must_be_private: bool = False) -> bytes | None:
     """Key of the robot link: the file's bytes without white space around them; ``None`` when no file is named.
 
+    Args:
+        key_file: path, or empty.
+        must_be_private: refuse a file that others may read; the key of a stand-in is no secret.
+
     Raises:
-        ConfigError: the file cannot be read, others may read it, or it is empty.
+        ConfigError: the file cannot be read, is empty, or is not private.
     """
     if not key_file:
         return None
@@ -78,7 +82,7 @@ def read_key(key_file: str) -> bytes | None:
         key = Path(key_file).read_bytes().strip()
     except OSError as error:
         raise ConfigError(f"robot.key_file: cannot read {key_file}: {error.strerror}") from error
-    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+    if must_be_private and mode & (stat.S_IRWXG | stat.S_IRWXO):
         mode = stat.S_IMODE(mode)
         raise ConfigError(f"robot.key_file: {key_file} is open to others (mode {mode:04o}); chmod go= {key_file}")
     if not key:

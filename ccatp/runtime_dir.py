@@ -49,7 +49,7 @@ def make_runtime_dir(configured: str, environ: Mapping[str, str]) -> Path:
     """The folder, made with mode 0700 when it is missing, and checked to be the caller's own.
 
     Raises:
-        RuntimeDirError: it cannot be made, is not a folder, belongs to somebody else or is open to others.
+        RuntimeDirError: it cannot be made, is not a folder, belongs to somebody else or is writable for others.
     """
     path = runtime_dir_path(configured, environ)
     try:
@@ -66,8 +66,9 @@ def make_runtime_dir(configured: str, environ: Mapping[str, str]) -> Path:
             f"runtime directory {path}: belongs to user {info.st_uid}, not to {os.getuid()}; "
             "choose another with --runtime-dir"
         )
-    if info.st_mode & (stat.S_IRWXG | stat.S_IRWXO):  # whoever reaches its sockets commands the robot
+    if info.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise RuntimeDirError(
-            f"runtime directory {path}: is open to others (mode {stat.S_IMODE(info.st_mode):04o}); chmod 700 {path}"
+            f"runtime directory {path}: others may write there (mode {stat.S_IMODE(info.st_mode):04o}); "
+            f"chmod 700 {path}"
         )
     return path

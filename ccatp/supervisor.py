@@ -79,7 +79,8 @@ def run_survey(options: RunOptions) -> int:
     overrides = dict(options.overrides)
     cfg = load_config(options.config_file, overrides)
     check_observatory(cfg.observatory)
-    read_key(cfg.robot.key_file)  # the processes read it again; here it is refused before anything has begun
+    # The processes read it again; here it is refused before anything has begun.
+    read_key(cfg.robot.key_file, must_be_private=not options.sim)
     started = time.monotonic()
     with ExitStack() as stack:
         runtime_dir = make_runtime_dir(str(options.runtime_dir or cfg.run.runtime_dir), os.environ)

@@ -58,7 +58,8 @@ class ProcessArgs:
 
 
 def parse_args(argv: list[str] | None = None) -> ProcessArgs:
-    """Read the command line of a process and the configuration it names."""
+    """Read the command line of a process and the configuration it names; sockets that it makes are its user's alone."""
+    os.umask(os.umask(0o077) | 0o022)  # to connect to a socket takes the right to write to it
     parser = argparse.ArgumentParser()
     parser.add_argument("--run-dir", type=Path, required=True)
     parser.add_argument("--runtime-dir", type=Path, required=True)

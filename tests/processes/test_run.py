@@ -128,6 +128,7 @@ def test_pause_holds_resume_goes_on_stop_ends(start: Start) -> None:
     assert measured_in_store(run) >= 1
 
 
+@pytest.mark.slow
 def test_pauses_at_the_points_do_no_harm(start: Start) -> None:
     # At a point beside the rim a turn that the route did not plan would sweep a sensor over it.
     run = start("--panels", "1", "--realtime")

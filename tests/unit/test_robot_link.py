@@ -331,8 +331,9 @@ def test_read_key(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"robot\.key_file: cannot read .*No such file"):
         read_key(str(tmp_path / "none"))
     (tmp_path / "key").chmod(0o604)
+    assert read_key(str(tmp_path / "key")) == b"secret"
     with pytest.raises(ConfigError, match=r"key is open to others \(mode 0604\); chmod go= .*key$"):
-        read_key(str(tmp_path / "key"))
+        read_key(str(tmp_path / "key"), must_be_private=True)
 
 
 # -- a robot that does not read ---------------------------------------------------------------------------------------
