@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from ccatp.studies.campaign import CampaignError, ClusterUnreachable, Job, Outcome
 from ccatp.studies.threads import limit_threads
 
-_CLUSTER_TIMEOUT_S = 10.0
+_CLUSTER_TIMEOUT_S = 5.0
 
 
 class Timed(NamedTuple):

@@ -153,6 +153,8 @@ def test_without_python_control(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_without_matplotlib(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    one = loop(FORWARD, "true")
+    known = margins(one)  # by python-control, which is there only with matplotlib
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(LoopsError, match=r"install ccatp\[plots\]"):
-        loop_figures.draw_bode([loop(FORWARD, "true")], [margins(loop(FORWARD, "true"))], tmp_path)
+        loop_figures.draw_bode([one], [known], tmp_path)
