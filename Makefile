@@ -5,14 +5,14 @@ PYTHON ?= python3
 VENV ?= .venv
 ARGS ?=
 PYTEST_ARGS ?=
-WORKERS ?= 3
+WORKERS ?= 2
 
 # Small matrices: threads of the linear algebra would only fight each other for the cores.
 export OPENBLAS_NUM_THREADS := 1
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
-PYTEST := $(BIN)/python -m pytest -n $(WORKERS)
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
 .PHONY: help run test test-slow lint format lock clean
 .DELETE_ON_ERROR:

@@ -20,6 +20,13 @@ NO_CALIBRATION = ("--set", "mission.calibration_length_m=0")
 FREE_PORTS = ("--set", "sim.robot.port=0", "--set", "sim.etalon.port=0")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Runs one after the other, beside all other tests: two lockstep runs at once would fight for the cores."""
+    for item in items:
+        if Path(__file__).parent in item.path.parents:
+            item.add_marker(pytest.mark.xdist_group("processes"))
+
+
 class Run:
     """One ``ccatp run --sim`` in a process of its own.
 
