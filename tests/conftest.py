@@ -4,7 +4,7 @@ import asyncio
 import inspect
 import os
 import socket
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 
 import psutil
 import pytest
@@ -81,3 +81,13 @@ def free_port() -> int:
 def config() -> Config:
     """The default configuration (frozen, so one serves all)."""
     return load_config()
+
+
+@pytest.fixture
+def measured(record_property: Callable[[str, object], None]) -> Callable[[str, float], None]:
+    """Notes what a test measured for a row of the fault table, in the unit of that row's bound."""
+
+    def note(row: str, value: float) -> None:
+        record_property(f"fault:{row}", value)
+
+    return note
