@@ -45,6 +45,8 @@ class RobotConfig(Model):
     key_file: str
     connect_timeout_s: Positive
     sensors_timeout_s: Positive
+    slip_after_s: Positive
+    lag_limit_s: Positive
 
 
 class LimitsConfig(Model):
