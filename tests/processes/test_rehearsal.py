@@ -17,7 +17,6 @@ from ccatp.studies.rehearsal import rehearse
 from tests.faults.linking import Measured
 from tests.processes.conftest import Run
 
-
 # Read by every process of the run at its start: the wall clock is an hour early or an hour late, anew at each look.
 RESTLESS_CLOCK = """
 import datetime, itertools, time
