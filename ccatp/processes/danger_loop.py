@@ -114,7 +114,7 @@ class DangerLoop:
             print(f"ccatp danger: internal error: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
             self.lost.set()
             return
-        if not self._is_lockstep and self._lag.served(sensors.t, self._frame_wall_s) > self._cfg.danger.stale_after_s:
+        if not self._is_lockstep and self._lag.served(sensors.t, time.monotonic()) > self._cfg.danger.stale_after_s:
             verdict = self.monitor.stale(sensors.seq, sensors.t)  # it saw the past: no permit for the present
         self._give(verdict, sensors.seq)
 

@@ -258,7 +258,7 @@ class MainLoop:
 
     def _is_late(self, t_s: float) -> bool:
         """Whether the frame is too late to move on: then the mission pauses until frames are prompt again."""
-        lag_s = 0.0 if self._is_lockstep else self._lag.served(t_s, self._frame_wall_s)
+        lag_s = 0.0 if self._is_lockstep else self._lag.served(t_s, time.monotonic())
         if lag_s <= self._cfg.robot.lag_limit_s:
             return False
         if self._mission.interrupt(f"a frame was served {1e3 * lag_s:.0f} ms late"):

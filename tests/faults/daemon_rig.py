@@ -24,9 +24,11 @@ from ccatp.processes.common import Endpoints, ProcessArgs
 from ccatp.processes.danger_loop import DangerLoop
 from ccatp.processes.main_loop import MainLoop
 from ccatp.puck_truth import ZmqPuck
+from ccatp.robot_link import RobotLink
 from ccatp.sim.truth import TruthLog
 
 DEADLINE_S = 60.0
+SEND_DRIVE = RobotLink.send_drive
 
 
 class Executed:
@@ -65,13 +67,8 @@ class Daemon:
         self._watch_drives()
 
     def _watch_drives(self) -> None:
-        link, rules, clock = self.main._link, self.robot.robot.rules, asyncio.get_running_loop().time
-        send, step = link.send_drive, rules.set_points
-
-        def send_drive(seq: int, ack: int, wr_rad_s: float, wl_rad_s: float) -> None:
-            if wr_rad_s or wl_rad_s:
-                self.sent[seq] = clock()
-            send(seq, ack, wr_rad_s, wl_rad_s)
+        rules, clock = self.robot.robot.rules, asyncio.get_running_loop().time
+        step = rules.set_points
 
         def set_points(until_s: float) -> tuple[float, float]:
             found = step(until_s)
@@ -79,9 +76,14 @@ class Daemon:
                 self.executed.append(Executed(rules._drive_seq, clock()))
             return found
 
-        link.send_drive = send_drive  # type: ignore[method-assign]
         watched = _Watched(rules, set_points)
         self.robot.robot.rules = watched  # type: ignore[assignment]
+
+    def send_drive(self, link: RobotLink, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float) -> None:
+        """In place of the link's own method."""
+        if wr_rad_s or wl_rad_s:
+            self.sent[seq] = asyncio.get_running_loop().time()
+        SEND_DRIVE(link, seq, ack, wr_rad_s, wl_rad_s)
 
     async def until(self, condition: Callable[[], bool]) -> None:
         """Wait for something; the loops go on meanwhile."""
@@ -169,19 +171,21 @@ async def running_daemon(cfg: Config) -> AsyncIterator[Daemon]:
                 listener.connect(endpoints.of("main"))
                 listener.subscribe("track")
                 try:
-                    async with asyncio.TaskGroup() as tasks:
-                        peers = robot.run(robot_stop), outlet.serve(), laser.serve()
-                        serving = [tasks.create_task(work) for work in peers]
-                        daemon.loops = [tasks.create_task(work) for work in (main.run(stop), danger.run(stop))]
-                        daemon.stop = stop
-                        try:
-                            yield daemon
-                        finally:
-                            stop.set()
-                            await asyncio.wait(daemon.loops)
-                            robot_stop.set()
-                            for task in serving[1:]:
-                                task.cancel()
+                    watching = patch.object(RobotLink, "send_drive", _seen_by(daemon))
+                    with watching:
+                        async with asyncio.TaskGroup() as tasks:
+                            peers = robot.run(robot_stop), outlet.serve(), laser.serve()
+                            serving = [tasks.create_task(work) for work in peers]
+                            daemon.loops = [tasks.create_task(work) for work in (main.run(stop), danger.run(stop))]
+                            daemon.stop = stop
+                            try:
+                                yield daemon
+                            finally:
+                                stop.set()
+                                await asyncio.wait(daemon.loops)
+                                robot_stop.set()
+                                for task in serving[1:]:
+                                    task.cancel()
                 finally:
                     main.close()
                     danger.close()
@@ -190,6 +194,15 @@ async def running_daemon(cfg: Config) -> AsyncIterator[Daemon]:
         puck.close()
         outlet.close()
         context.destroy(linger=0)
+
+
+def _seen_by(daemon: Daemon) -> Callable[[RobotLink, int, int, float, float], None]:
+    """A method of the link: a bound method would not get the link itself."""
+
+    def send_drive(link: RobotLink, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float) -> None:
+        daemon.send_drive(link, seq, ack, wr_rad_s, wl_rad_s)
+
+    return send_drive
 
 
 def _at(cfg: Config, robot_port: int, laser_port: int) -> Config:
