@@ -24,7 +24,9 @@ async def moving_again(daemon: Daemon, since_s: float) -> None:
 async def test_stalls_and_blocks(measured: Measured) -> None:
     clock = asyncio.get_running_loop().time
     async with running_daemon(configuration()) as daemon:
+        await daemon.until(lambda: daemon.is_driving)
         found: list[int] = []
+        tasks = len(asyncio.all_tasks())
         for proxy, direction in (
             (daemon.to_main, "to_client"),
             (daemon.to_main, "to_server"),
@@ -42,6 +44,7 @@ async def test_stalls_and_blocks(measured: Measured) -> None:
             await moving_again(daemon, healed_s)  # a pause that resumes by itself
             found += stale(daemon, begun_s + LONG_S / 2, healed_s)
         measured("L3", len(found))
+        assert len(asyncio.all_tasks()) == tasks
 
         slips, told = daemon.main.status().slips, len(daemon.events("late frame"))
         await daemon.until(lambda: daemon.is_driving)

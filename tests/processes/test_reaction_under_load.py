@@ -6,15 +6,14 @@ own. ``CCATP_REACTIONS`` says how often each fault is made.
 
 import asyncio
 import contextlib
-import json
 import os
 import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 from unittest.mock import patch
 
@@ -22,7 +21,7 @@ import numpy as np
 import psutil
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.loader import dump_config, load_config
 from ccatp.dataloop import DataLoop, TruthOutlet
 from ccatp.etalon_standin import EtalonStandIn
 from ccatp.fault_proxy.pipe import Pipe
@@ -43,6 +42,7 @@ while True:
     os.fsync(file.fileno())
     file.seek(0)
 """
+ROBOTS_PRIORITY = 60  # above the daemon's
 PATIENT_S = 90.0
 STOPPED_S = 0.6  # so long a process is stopped, or the link silent: longer than every time-out
 EVIDENCE_S = 0.15  # data of this age are the first evidence that somebody is silent
@@ -142,45 +142,52 @@ class Survey:
 @asynccontextmanager
 async def survey(folder: Path, runtime_dir: Path) -> AsyncIterator[Survey]:
     """A survey that begins at base; the daemon is ended at the end."""
-    cfg = load_config(overrides={"sim.robot.port": 0, "run.mirror": "fyst-m2"})
-    mirror = build_mirror(cfg.mirror)
-    robot = DataLoop(cfg, False, 1)
-    puck_at = f"ipc://{runtime_dir / 'puck'}"
-    robot.truth = outlet = TruthOutlet(TruthLog(robot.robot), puck_at, None)
-    port, stop = await robot.start(), asyncio.Event()
-    puck = ZmqPuck(puck_at)
-    laser = EtalonStandIn(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, np.random.default_rng(1),
-                          measuring_time_s=cfg.etalon.measuring_time_s)  # fmt: skip
-    laser_port = await laser.start("127.0.0.1", 0)
-    wire, read = Wire(robot), Pipe._read
-    async with FaultProxy("127.0.0.1", port, seed=1) as proxy:
-        to_server = proxy._conducts["to_server"]
+    settings = {"sim.robot.port": 0, "run.mirror": "fyst-m2", "run.filter": "kf", "run.panels": 3,
+                "mission.calibration_length_m": 0}  # fmt: skip
+    cfg = load_config(overrides=settings)
+    mirror, stop = build_mirror(cfg.mirror), asyncio.Event()
+    async with AsyncExitStack() as stack:
+        robot = DataLoop(cfg, False, 1)
+        puck_at = f"ipc://{runtime_dir / 'puck'}"
+        robot.truth = outlet = TruthOutlet(TruthLog(robot.robot), puck_at, None)
+        stack.callback(outlet.close)
+        wire = Wire(robot)
+        port = await robot.start()
+        puck = ZmqPuck(puck_at)
+        stack.callback(puck.close)
+        laser = EtalonStandIn(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, np.random.default_rng(1),
+                              measuring_time_s=cfg.etalon.measuring_time_s)  # fmt: skip
+        laser_port = await laser.start("127.0.0.1", 0)
+        stack.push_async_callback(laser.close)
+        proxy = await stack.enter_async_context(FaultProxy("127.0.0.1", port, seed=1))
+        stack.enter_context(patch.object(Pipe, "_read", _tapped(wire, proxy)))
+        at = load_config(overrides={**settings, "robot.port": proxy.port, "etalon.port": laser_port})
+        (folder / "config.toml").write_text(dump_config(at), encoding="utf-8")
+        said = stack.enter_context((folder / "said").open("w"))
+        tasks = await stack.enter_async_context(asyncio.TaskGroup())
+        serving = [tasks.create_task(work) for work in (robot.run(stop), outlet.serve(), laser.serve())]
+        command = [sys.executable, "-m", "ccatp", "run", "--config", str(folder / "config.toml")]
+        command += ["--run-dir", str(folder / "run"), "--runtime-dir", str(runtime_dir)]
+        daemon = subprocess.Popen(command, stdout=said, stderr=said, text=True)  # noqa: ASYNC220 - takes milliseconds
+        try:
+            yield Survey(wire, proxy, daemon, folder / "said")
+        finally:
+            await asyncio.to_thread(end, daemon)
+            stop.set()
+            for task in serving[1:]:
+                task.cancel()
 
-        async def tapped(pipe: Pipe) -> bytes:
-            data = await read(pipe)
-            if pipe._conduct is to_server:
-                wire.heard(data)
-            return data
 
-        settings = {"robot.port": proxy.port, "etalon.port": laser_port, "run.mirror": "fyst-m2", "run.filter": "kf",
-                    "mission.calibration_length_m": 0}  # fmt: skip
-        command = [sys.executable, "-m", "ccatp", "run", "--panels", "3", "--run-dir", str(folder / "run")]
-        command += ["--runtime-dir", str(runtime_dir)]
-        command += [part for key, value in settings.items() for part in ("--set", f"{key}={json.dumps(value)}")]
-        with (folder / "said").open("w") as said, patch.object(Pipe, "_read", tapped):
-            daemon = subprocess.Popen(command, stdout=said, stderr=said, text=True)  # noqa: ASYNC220 - it takes milliseconds
-            async with asyncio.TaskGroup() as tasks:
-                serving = [tasks.create_task(work) for work in (robot.run(stop), outlet.serve(), laser.serve())]
-                try:
-                    yield Survey(wire, proxy, daemon, folder / "said")
-                finally:
-                    await asyncio.to_thread(end, daemon)
-                    stop.set()
-                    for task in serving[1:]:
-                        task.cancel()
-    await laser.close()
-    puck.close()
-    outlet.close()
+def _tapped(wire: Wire, proxy: FaultProxy) -> Callable[[Pipe], Awaitable[bytes]]:
+    read, to_server = Pipe._read, proxy._conducts["to_server"]
+
+    async def tapped(pipe: Pipe) -> bytes:
+        data = await read(pipe)
+        if pipe._conduct is to_server:
+            wire.heard(data)
+        return data
+
+    return tapped
 
 
 def end(daemon: subprocess.Popen[str]) -> None:
@@ -225,13 +232,11 @@ FAULTS: dict[str, tuple[Callable[[Survey], None], float]] = {
 
 @pytest.fixture
 def preferred() -> Iterator[None]:
-    """This process before the others where that is permitted."""
-    before = os.getpriority(os.PRIO_PROCESS, 0)
+    """This process before all others, where that is permitted."""
     with contextlib.suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, 0, -15)
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(ROBOTS_PRIORITY))
     yield
-    with contextlib.suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, 0, before)
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 @pytest.mark.slow
