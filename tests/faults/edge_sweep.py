@@ -4,7 +4,7 @@ The real danger rules judge frame by frame, with the estimate and the delays of 
 the same number is the same drive.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from math import atan2, ceil, cos, hypot, pi, radians, sin
@@ -324,7 +324,7 @@ def _start_at_seam(name: str, angle_rad: float, v_m_s: float, rng: np.random.Gen
 # -- running ----------------------------------------------------------------------------------------------------------
 
 
-def sweep(case: Callable[[int], tuple[str, Callable[[], Tally]]], numbers: Iterator[int] | range) -> Tally:
+def sweep(case: Callable[[int], tuple[str, Callable[[], Tally]]], numbers: Iterable[int]) -> Tally:
     """Run cases by number; the names of those that went wrong are kept."""
     tally = Tally()
     for number in numbers:
