@@ -248,4 +248,4 @@ def _topic(frame: bytes) -> Hashable:
 
 def _plan(data: bytes) -> Hashable:
     plan = parse_plan(data.decode("utf-8", "replace"), "plan.toml")
-    return tuple(sorted(f.type for f in (*plan.faults, *plan.link)))
+    return tuple(sorted(type(f).__name__ for f in (*plan.faults, *plan.link)))

@@ -11,8 +11,9 @@ MAX_INPUT = 20_000
 FRESH = 0.1  # share of inputs that are mutations of a seed and not of what grew from it
 
 NUMBERS = (
-    b"0 -0 1 -1 2 3 7 9 255 256 65535 2147483648 4294967296 9223372036854775807 9223372036854775808 18446744073709551616 "
-    b"1e9 1e308 1e309 -1e309 5e-324 1e-400 0.1 .5 5. 00 01 0x10 1_000 NaN nan Infinity -Infinity inf null true false +1 "
+    b"0 -0 1 -1 2 3 7 9 255 256 65535 2147483648 4294967296 9223372036854775807 9223372036854775808 "
+    b"18446744073709551616 1e9 1e308 1e309 -1e309 5e-324 1e-400 0.1 .5 5. 00 01 0x10 1_000 NaN nan Infinity -Infinity "
+    b"inf null true false +1 "
     b'"" [] {} "a"'
 ).split()
 TOKENS = (

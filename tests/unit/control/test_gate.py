@@ -17,7 +17,7 @@ from ccatp.processes.gate_watch import GateWatch
 from ccatp.samples import EventCode, Twist, Verdict
 from ccatp.surveying.states import PURPOSES, State
 
-LIMITS = LimitsConfig(v_max_m_s=0.1, a_max_m_s2=0.2, omega_max_rad_s=1.0, alpha_max_rad_s2=2.0)
+LIMITS = LimitsConfig(v_max_m_s=0.1, a_max_m_s2=0.2, omega_max_rad_s=0.8, alpha_max_rad_s2=2.0)
 FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
 R, L, DT = 0.03, 0.15, 0.01
 VERDICT_S, FRAME_S = 0.15, 0.12
