@@ -48,6 +48,8 @@ class RobotConfig(Model):
     key_file: str
     connect_timeout_s: Positive
     sensors_timeout_s: Freshness
+    slip_after_s: Positive
+    lag_limit_s: Freshness
 
 
 class LimitsConfig(Model):

@@ -12,6 +12,7 @@ import zmq.asyncio
 from ccatp.bus import Publisher, Subscriber
 from ccatp.danger import DangerMonitor
 from ccatp.errors import CcatpError
+from ccatp.frame_lag import FrameLag
 from ccatp.mirror.mirror import build_mirror
 from ccatp.processes import realtime, spinning
 from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
@@ -52,6 +53,7 @@ class DangerLoop:
         self._t_s = 0.0
         self._frame_wall_s = time.monotonic()
         self._is_stale = False
+        self._lag = FrameLag(cfg.robot.slip_after_s)
         self.link = RobotLink(
             host=cfg.robot.host,
             port=cfg.robot.port,
@@ -112,6 +114,8 @@ class DangerLoop:
             print(f"ccatp danger: internal error: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
             self.lost.set()
             return
+        if not self._is_lockstep and self._lag.served(sensors.t, self._frame_wall_s) > self._cfg.danger.stale_after_s:
+            verdict = self.monitor.stale(sensors.seq, sensors.t)  # it saw the past: no permit for the present
         self._give(verdict, sensors.seq)
 
     def _give(self, verdict: Verdict, ack: int) -> None:

@@ -10,12 +10,12 @@ import zmq.asyncio
 from ccatp.assembly import Parts
 from ccatp.bus import Publisher
 from ccatp.control.fan_gate import FanGate
-from ccatp.control.frame_age import FrameAge
 from ccatp.control.gate import DriveGate
 from ccatp.control.kinematics import twist_of
 from ccatp.control.prediction import CommandPredictor
 from ccatp.errors import CcatpError, ExitStatus, UnreachableError
 from ccatp.etalon_client import EtalonClient, EtalonError
+from ccatp.frame_lag import FrameLag
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror
 from ccatp.mission import Mission
@@ -31,7 +31,8 @@ from ccatp.robot_link import RobotLink, read_key
 from ccatp.router import Router
 from ccatp.store import MissionStore
 from ccatp.surveying.journey import Motion
-from ccatp.surveying.orders import Order
+from ccatp.surveying.mirror_check import MirrorCheck
+from ccatp.surveying.orders import STAND, Order
 from ccatp.surveying.states import PURPOSES, Outcome, State
 from ccatp.wire.robot import Hello, Sensors
 from ccatp.wire.topics import MissionStatus, Presence
@@ -75,7 +76,7 @@ class MainLoop:
         self._teller = Teller(self._publisher, open_log(args.run_dir / "log.jsonl", "main"))
         self._watch = GateWatch(self._gate, self._teller.say)
         self._fan_gate = FanGate(0.0)
-        self._frame_age = FrameAge()
+        self._lag_s = 0.0
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m)
         self._predictor = CommandPredictor(cfg.robot.wheel_lag_s, 1.0 / cfg.sim.robot.frame_hz)
         self._measuring = MeasuringDesk(
@@ -98,6 +99,8 @@ class MainLoop:
         self._frame_wall_s = time.monotonic()
         self._seq = -1
         self._drive_seq = 0
+        self._lag = FrameLag(cfg.robot.slip_after_s)
+        self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
         self._unanswered: int | None = None
         self._state = State.IDLE
         self.over = asyncio.Event()
@@ -245,10 +248,11 @@ class MainLoop:
         waiting = time.perf_counter()
         verdict = self._ear.hear(seq, self._frame_period_s(), is_lockstep=self._is_lockstep)
         heard = time.perf_counter()
-        order = self._mission.step(motion, verdict)
-        right, left = self._gate.pass_through(
-            order.twist, verdict, dt_s, t_s, self._age_s(t_s), PURPOSES[self._mission.state]
-        )
+        if self._is_late(t_s):
+            verdict = None
+        order = self._mission.step(motion, verdict) if self._is_on_mirror(sensors) else STAND
+        purpose = PURPOSES[self._mission.state]
+        right, left = self._gate.pass_through(order.twist, verdict, dt_s, t_s, self._lag_s, purpose)
         self._watch.look(t_s)
         if order.at_rest or order.measure:
             self._execute(order, motion)
@@ -270,9 +274,33 @@ class MainLoop:
             self._teller.say("error", refusal)
             self._mission.fault(refusal)
 
-    def _age_s(self, t_s: float) -> float:
-        """Age of the frame served; in lockstep simulated time waits for the answer."""
-        return 0.0 if self._is_lockstep else self._frame_age.of(t_s, self._frame_wall_s)
+    def _is_late(self, t_s: float) -> bool:
+        """Whether the frame is too late to move on: then the mission pauses until frames are prompt again."""
+        self._lag_s = lag_s = 0.0 if self._is_lockstep else self._lag.served(t_s, self._frame_wall_s)
+        if lag_s <= self._cfg.robot.lag_limit_s:
+            return False
+        if self._mission.interrupt(f"a frame was served {1e3 * lag_s:.0f} ms late"):
+            self._teller.log.warning("late frame", seq=self._seq, lag_s=lag_s, limit_s=self._cfg.robot.lag_limit_s)
+        return True
+
+    def _is_on_mirror(self, sensors: Sensors) -> bool:
+        """Whether the robot may move, as far as gravity knows: it stands on the mirror of the configuration.
+
+        In lockstep the mission begins at once, and ends when gravity contradicts: nothing real can be harmed, and a run
+        stays the same function of its seed.
+        """
+        check = self._mirror_check
+        if check is None:
+            return True
+        if check.hear(sensors.t, sensors.gravity, self._localizer.deck_pose):
+            self._mirror_check = None
+            if check.warning:
+                self._teller.say("warning", check.warning)
+        if check.contradiction:
+            self._teller.say("error", check.contradiction)
+            self._finish(ExitStatus.USAGE)
+            return False
+        return self._mirror_check is None or self._is_lockstep
 
     def _motion(self, sensors: Sensors, dt_s: float) -> Motion:
         localizer, echo = self._localizer, sensors.cmd
@@ -366,6 +394,8 @@ class MainLoop:
             outcome=str(mission.outcome),
             lower_bound_s=self._parts.lower_bound_s,
             exit_status=int(self.exit_status) if self.over.is_set() else -1,
+            slips=self._lag.slips,
+            lag_ms=1e3 * self._lag.worst_s,
         )
 
     def close(self) -> None:

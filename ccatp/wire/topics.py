@@ -58,6 +58,8 @@ class MissionStatus(Message):
     outcome: str
     lower_bound_s: float
     exit_status: int  # what the run ends with; -1 while it goes on
+    slips: int = 0  # frames that were served late, in real time
+    lag_ms: float = 0.0  # ... the latest of them
 
 
 class Track(Message):

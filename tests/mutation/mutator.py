@@ -94,27 +94,43 @@ def _put(tree: ast.Module, place: _Place, change: Callable[[ast.AST], ast.AST]) 
 
 
 def _changes(node: ast.AST) -> Iterator[Change]:
+    if isinstance(node, ast.Compare | ast.BoolOp):
+        yield from _logical(node)
+    elif isinstance(node, ast.Constant):
+        yield from _constant(node)
+    else:
+        yield from _other(node)
+
+
+def _logical(node: ast.Compare | ast.BoolOp) -> Iterator[Change]:
+    if isinstance(node, ast.Compare):
+        for k, op in enumerate(node.ops):
+            for other in _COMPARISONS[type(op)]:
+                yield f"{type(op).__name__} -> {other.__name__} [{k}]", _comparison(k, other)
+        return
+    other_bool = ast.Or if isinstance(node.op, ast.And) else ast.And
+    yield f"{type(node.op).__name__} -> {other_bool.__name__}", _field("op", other_bool)
+    for k in range(len(node.values)):
+        yield f"operand {k} dropped", _dropped(k)
+
+
+def _constant(node: ast.Constant) -> Iterator[Change]:
+    value = node.value
+    if isinstance(value, bool):
+        yield "constant flipped", lambda _: ast.Constant(not value)
+    elif isinstance(value, int | float):
+        yield "constant + 1", lambda _: ast.Constant(value + 1)
+        if value:
+            yield "constant halved", lambda _: ast.Constant(value / 2)
+
+
+def _other(node: ast.AST) -> Iterator[Change]:
     match node:
-        case ast.Compare():
-            for k, op in enumerate(node.ops):
-                for other in _COMPARISONS[type(op)]:
-                    yield f"{type(op).__name__} -> {other.__name__} [{k}]", _comparison(k, other)
-        case ast.BoolOp():
-            other_bool = ast.Or if isinstance(node.op, ast.And) else ast.And
-            yield f"{type(node.op).__name__} -> {other_bool.__name__}", _field("op", other_bool)
-            for k in range(len(node.values)):
-                yield f"operand {k} dropped", _dropped(k)
         case ast.UnaryOp(op=ast.Not() | ast.USub()):
             yield f"{type(node.op).__name__} dropped", lambda n: n.operand  # type: ignore[attr-defined]
         case ast.BinOp() | ast.AugAssign() if type(node.op) in _OPERATORS:
             other_op = _OPERATORS[type(node.op)]
             yield f"{type(node.op).__name__} -> {other_op.__name__}", _field("op", other_op)
-        case ast.Constant(value=bool()):
-            yield "constant flipped", lambda n: ast.Constant(not n.value)  # type: ignore[attr-defined]
-        case ast.Constant(value=int() | float()):
-            yield "constant + 1", lambda n: ast.Constant(n.value + 1)  # type: ignore[attr-defined]
-            if node.value:
-                yield "constant halved", lambda n: ast.Constant(n.value / 2)  # type: ignore[attr-defined]
         case ast.Return(value=ast.expr()) if not _is_none(node.value):
             yield "returns None", lambda _: ast.Return(ast.Constant(None))
         case ast.Call(func=ast.Name(id=name)) if name in _CALLS:

@@ -63,7 +63,7 @@ class Stage(Rehearsing):
 
     def __init__(self, cfg: Config) -> None:
         super().__init__(cfg, with_track=False)
-        self.robot: SpyRobot = SpyRobot(cfg, self.mirror, np.random.default_rng(cfg.run.seed))  # type: ignore[misc]
+        self.robot: SpyRobot = SpyRobot(cfg, self.mirror, np.random.default_rng(cfg.run.seed))
         self.laser = LaserDesk(cfg, self.mirror, self.robot)
         self.fans = FanGate(self.cfg.sim.robot.fan_floor if self.mirror.overhang else 0.0)
         self.trouble = Trouble()

@@ -10,7 +10,6 @@ from msgspec.structs import replace
 
 from ccatp.config.models import LimitsConfig
 from ccatp.control.fan_gate import FanGate
-from ccatp.control.frame_age import FrameAge
 from ccatp.control.gate import Denial, DriveGate, Purpose
 from ccatp.control.kinematics import twist_of, wheel_rates
 from ccatp.processes.gate_watch import GateWatch
@@ -254,24 +253,3 @@ def test_fans_below_their_floor_are_refused(bad: float) -> None:
 
 def test_without_an_overhang_there_is_no_floor() -> None:
     assert FanGate(0.0).refusal(0.0, 0.0) is None
-
-
-def test_age_of_frames_in_a_burst() -> None:
-    age = FrameAge()
-    assert [age.of(0.01 * k, 5.0 + 0.01 * k) for k in range(10)] == pytest.approx([0.0] * 10, abs=1e-4)
-    # A stall of 0.3 s, then everything at once.
-    burst = [age.of(0.1 + 0.01 * k, 5.4) for k in range(30)]
-    assert burst[0] == pytest.approx(0.3, abs=1e-3)
-    assert burst[-1] == pytest.approx(0.01, abs=1e-3)
-
-
-def test_age_begins_anew_with_the_robots_clock_and_forgives_drift() -> None:
-    age = FrameAge()
-    age.of(100.0, 5.0)
-    assert age.of(0.0, 6.0) == 0.0
-    assert age.of(0.1, 6.3) == pytest.approx(0.2, abs=1e-3)
-    slow = FrameAge()
-    assert max(slow.of(float(k), 1.0001 * k) for k in range(10_000)) < 1e-3
-    # ... and a clock that jumped forward makes nothing old for ever.
-    assert age.of(10.1, 6.4) == 0.0
-    assert age.of(10.2, 6.5) == pytest.approx(0.0, abs=1e-3)
