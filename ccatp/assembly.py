@@ -82,17 +82,30 @@ def assemble(cfg: Config, done: Collection[PointId] = ()) -> Parts:
     if cfg.run.filter not in FOUR_STATE:  # they have no states that the drive could calibrate
         drive = plan_calibration(mirror, cfg.robot, cfg.mission, mirror.base_pose)
         route = with_prelude(mirror, route, drive, cfg.limits, mirror.base_pose, measuring_s)
-    robot = cfg.robot
     return Parts(
         cfg=cfg,
         mirror=mirror,
         localizer=build_localizer(cfg, mirror),
         mission=Mission(cfg, mirror, route, _home_planner(cfg, mirror), _rest_planner(cfg, mirror)),
-        gate=DriveGate(cfg.limits, robot.wheel_radius_m, robot.wheel_base_m, robot.max_wheel_rad_s, robot.wheel_lag_s),
+        gate=build_gate(cfg),
         route=route,
         points=tuple(points),
         already_done=len(set(done)),
         lower_bound_s=path_time(route.stops, mirror.base_pose, cfg.limits, mirror, measuring_s),
+    )
+
+
+def build_gate(cfg: Config) -> DriveGate:
+    """The last gate before the wheels."""
+    robot = cfg.robot
+    return DriveGate(
+        cfg.limits,
+        robot.wheel_radius_m,
+        robot.wheel_base_m,
+        robot.max_wheel_rad_s,
+        robot.wheel_lag_s,
+        cfg.mission.verdict_timeout_s,
+        robot.sensors_timeout_s,
     )
 
 

@@ -9,6 +9,7 @@ import zmq.asyncio
 
 from ccatp.assembly import Parts
 from ccatp.bus import Publisher
+from ccatp.control.fan_gate import FanGate
 from ccatp.control.gate import DriveGate
 from ccatp.control.kinematics import twist_of
 from ccatp.control.prediction import CommandPredictor
@@ -21,6 +22,7 @@ from ccatp.mission import Mission
 from ccatp.processes import realtime, spinning
 from ccatp.processes.building import build_parts
 from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
+from ccatp.processes.gate_watch import GateWatch
 from ccatp.processes.hearing import VerdictEar
 from ccatp.processes.measuring import MeasuringDesk, Request
 from ccatp.processes.operating import OperatorDesk
@@ -31,7 +33,7 @@ from ccatp.store import MissionStore
 from ccatp.surveying.journey import Motion
 from ccatp.surveying.mirror_check import MirrorCheck
 from ccatp.surveying.orders import STAND, Order
-from ccatp.surveying.states import Outcome, State
+from ccatp.surveying.states import PURPOSES, Outcome, State
 from ccatp.wire.robot import Hello, Sensors
 from ccatp.wire.topics import MissionStatus, Presence
 
@@ -72,6 +74,9 @@ class MainLoop:
         self._publisher = Publisher(context, args.endpoints.of("main"))
         self._ear = VerdictEar(context, args.endpoints.of("danger"), cfg.mission.verdict_timeout_s)
         self._teller = Teller(self._publisher, open_log(args.run_dir / "log.jsonl", "main"))
+        self._watch = GateWatch(self._gate, self._teller.say)
+        self._fan_gate = FanGate(0.0)
+        self._lag_s = 0.0
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m)
         self._predictor = CommandPredictor(cfg.robot.wheel_lag_s, 1.0 / cfg.sim.robot.frame_hz)
         self._measuring = MeasuringDesk(
@@ -137,6 +142,7 @@ class MainLoop:
         hello = await self._link.connect(self._cfg.robot.connect_timeout_s)
         self._parts.check_robot(hello)
         self._hello, self._is_lockstep = hello, hello.lockstep
+        self._fan_gate = FanGate(hello.robot.fan_floor if self._mirror.overhang else 0.0)
         self._predictor = CommandPredictor(self._cfg.robot.wheel_lag_s, 1.0 / hello.frame_hz)
         self._phase = "joined"
         if not hello.lockstep:
@@ -160,6 +166,7 @@ class MainLoop:
 
     def _hold_wheels(self) -> None:
         self._drive(self._seq, 0.0, 0.0)
+        self._teller.log.info("gate", denied=self._watch.counts, fans_refused=self._fan_gate.refused)
         self._teller.flush()
         self._teller.status(self.status())
 
@@ -225,7 +232,7 @@ class MainLoop:
         if self._t_first_s is None:
             self._t_first_s = t_s
             # Before the first drive and not on joining, so that in lockstep they start in a certain frame.
-            self._link.send_fans(1, self._cfg.robot.fan_duty)
+            self._send_fans()
         self._t_last_s, self._seq, self._frame_wall_s = t_s, seq, time.monotonic()
         localizer = self._localizer
         localizer.step(t_s, sensors.imu, sensors.enc, sensors.edge, sensors.gravity)
@@ -244,7 +251,9 @@ class MainLoop:
         if self._is_late(t_s):
             verdict = None
         order = self._mission.step(motion, verdict) if self._is_on_mirror(sensors) else STAND
-        right, left = self._gate.pass_through(order.twist, verdict, dt_s)
+        purpose = PURPOSES[self._mission.state]
+        right, left = self._gate.pass_through(order.twist, verdict, dt_s, t_s, self._lag_s, purpose)
+        self._watch.look(t_s)
         if order.at_rest or order.measure:
             self._execute(order, motion)
         if self._may_answer():
@@ -256,9 +265,18 @@ class MainLoop:
             self._on_state()
         self._teller.tick(1e6 * (time.perf_counter() - heard + waiting - start))
 
+    def _send_fans(self) -> None:
+        duty = self._cfg.robot.fan_duty
+        refusal = self._fan_gate.refusal(*duty)
+        if refusal is None:
+            self._link.send_fans(1, duty)
+        else:
+            self._teller.say("error", refusal)
+            self._mission.fault(refusal)
+
     def _is_late(self, t_s: float) -> bool:
         """Whether the frame is too late to move on: then the mission pauses until frames are prompt again."""
-        lag_s = 0.0 if self._is_lockstep else self._lag.served(t_s, time.monotonic())
+        self._lag_s = lag_s = 0.0 if self._is_lockstep else self._lag.served(t_s, time.monotonic())
         if lag_s <= self._cfg.robot.lag_limit_s:
             return False
         if self._mission.interrupt(f"a frame was served {1e3 * lag_s:.0f} ms late"):

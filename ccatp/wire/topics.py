@@ -210,7 +210,7 @@ def unpack(frame: bytes) -> tuple[str, bytes, Message | Verdict]:
         raise BadMessage(f"unknown topic {name[:40]!r}")
     try:
         message: Message | Verdict = decoder.decode(body)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise BadMessage(f"topic {name.decode()}: {error}") from error
     return name.decode(), body, message
 

@@ -140,13 +140,18 @@ def _logging_to(entries: list[dict[str, Any]]) -> Iterator[None]:
 
 
 @asynccontextmanager
-async def running_daemon(cfg: Config) -> AsyncIterator[Daemon]:
-    """A survey under way, from its beginning; it is stopped at the end."""
+async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncIterator[Daemon]:
+    """A survey under way, from its beginning; it is stopped at the end.
+
+    Args:
+        cfg: the daemon's configuration.
+        robot_cfg: that of the stand-ins, if it is another one.
+    """
     entries: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory(prefix="ccatp-") as folder, _logging_to(entries):
         run_dir = Path(folder)
         endpoints = Endpoints(run_dir)
-        robot = DataLoop(cfg, False, cfg.run.seed)
+        robot = DataLoop(robot_cfg or cfg, False, cfg.run.seed)
         robot.truth = outlet = TruthOutlet(TruthLog(robot.robot), endpoints.of("puck"), endpoints.of("truth"))
         port = await robot.start()
         mirror = build_mirror(cfg.mirror)
