@@ -28,6 +28,10 @@ class RunConfig(Model):
     budget_s: Positive
     runtime_dir: str  # empty = chosen from the environment
     realtime_priority: Annotated[int, Field(ge=0, le=99)]  # 0 = ordinary scheduling
+    hang_timeout_s: Positive
+    start_timeout_s: Positive
+    restart_limit: Annotated[int, Field(ge=0)]
+    restart_window_s: Positive
 
 
 class RobotConfig(Model):
@@ -45,6 +49,8 @@ class RobotConfig(Model):
     key_file: str
     connect_timeout_s: Positive
     sensors_timeout_s: Positive
+    silence_timeout_s: Positive
+    reconnect_timeout_s: Positive
 
 
 class LimitsConfig(Model):
@@ -236,6 +242,8 @@ class MissionConfig(Model):
     verdict_timeout_s: Positive
     measure_timeout_s: Positive
     failed_points_before_hold: Annotated[int, Field(ge=1)]
+    heading_doubt_rad: Positive
+    alignment_leg_m: Annotated[float, Field(gt=0.0, le=0.5)]
 
 
 class SimRobotConfig(Model):
