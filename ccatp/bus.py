@@ -114,6 +114,13 @@ class Subscriber:
             except BadMessage:
                 self.bad_messages += 1
 
+    def tend(self) -> None:
+        """To be called now and then where nothing is received for long: a publisher that is new learns what we want.
+
+        The library tells it from the thread that owns the socket, and only when that calls.
+        """
+        self.socket.getsockopt(zmq.EVENTS)
+
     @property
     def is_cut(self) -> bool:
         """The publisher was there and is gone, as when its process has died."""

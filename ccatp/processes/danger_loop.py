@@ -178,6 +178,7 @@ class DangerLoop:
         """Where frames stop coming, withhold the permit aloud; make a connection anew that is open and silent."""
         while True:
             await asyncio.sleep(WAIT_PERIOD_S)
+            self._subscriber.tend()
             age_s = self._pulse.frame_age_s
             if self._pulse.phase != "joined" or self._is_lockstep or age_s is None:
                 continue

@@ -70,6 +70,10 @@ class VerdictEar:
                 return True
         return False
 
+    def tend(self) -> None:
+        """Keep the connection up where nothing is heard for long."""
+        self._subscriber.tend()
+
     def forget(self) -> None:
         """The robot's frames count anew: the verdict in force is of another time."""
         self.verdict = None

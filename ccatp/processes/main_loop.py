@@ -223,6 +223,7 @@ class MainLoop:
         robot, pulse = self._cfg.robot, self._pulse
         while True:
             await asyncio.sleep(WAIT_PERIOD_S)
+            self._ear.tend()
             age_s = pulse.frame_age_s
             if pulse.phase != "joined" or self._is_lockstep or age_s is None or age_s <= robot.sensors_timeout_s:
                 continue
@@ -284,7 +285,11 @@ class MainLoop:
             return
         motion = self._motion(sensors, dt_s)
         waiting = time.perf_counter()
-        verdict = self._ear.hear(seq, self._frame_period_s(), is_lockstep=self._is_lockstep)
+        # Danger may have judged this frame before this session began, and does so once: the next one will do.
+        is_unjudged = is_first and (self._is_taking_over or self._link.sessions > 1)
+        verdict = (
+            None if is_unjudged else self._ear.hear(seq, self._frame_period_s(), is_lockstep=self._is_lockstep)
+        )
         heard = time.perf_counter()
         order = self._mission.step(motion, verdict)
         right, left = self._gate.pass_through(order.twist, verdict, dt_s)
