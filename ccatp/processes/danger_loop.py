@@ -114,8 +114,7 @@ class DangerLoop:
 
     def on_sensors(self, sensors: Sensors, _raw: bytes) -> None:
         """Judge one frame. In lockstep with a certain estimate of main's, so that the run is repeatable."""
-        now_s = time.monotonic()
-        self._seq, self._t_s, self._pulse.frame_s, self._is_stale = sensors.seq, sensors.t, now_s, False
+        self._seq, self._t_s, self._pulse.frame_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
         if self._first_seq < 0:
             self._first_seq = sensors.seq
         wanted = last_estimate_before(sensors.seq)
@@ -128,7 +127,7 @@ class DangerLoop:
             print(f"ccatp danger: internal error: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
             self.lost.set()
             return
-        if not self._is_lockstep and self._lag.served(sensors.t, now_s) > self._cfg.danger.stale_after_s:
+        if not self._is_lockstep and self._lag.served(sensors.t, time.monotonic()) > self._cfg.danger.stale_after_s:
             verdict = self.monitor.stale(sensors.seq, sensors.t)  # it saw the past: no permit for the present
         self._give(verdict, sensors.seq)
 

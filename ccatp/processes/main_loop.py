@@ -281,8 +281,7 @@ class MainLoop:
             self._begin_session(dt_s)
         if self._t_first_s is None:
             self._t_first_s = t_s
-        now_s = time.monotonic()
-        self._t_last_s, self._seq, self._pulse.frame_s = t_s, seq, now_s
+        self._t_last_s, self._seq, self._pulse.frame_s = t_s, seq, time.monotonic()
         localizer = self._localizer
         localizer.step(t_s, sensors.imu, sensors.enc, sensors.edge, sensors.gravity)
         if localizer.hold_requested:
@@ -302,7 +301,7 @@ class MainLoop:
         is_unjudged = is_first and (self._is_taking_over or self._link.sessions > 1)
         verdict = None if is_unjudged else self._ear.hear(seq, self._frame_period_s(), is_lockstep=self._is_lockstep)
         heard = time.perf_counter()
-        if self._is_late(t_s, now_s):
+        if self._is_late(t_s):
             verdict = None
         order = self._mission.step(motion, verdict) if self._is_on_mirror(sensors) else STAND
         purpose = PURPOSES[self._mission.state]
@@ -338,9 +337,9 @@ class MainLoop:
             self._teller.say("error", refusal)
             self._mission.fault(refusal)
 
-    def _is_late(self, t_s: float, now_s: float) -> bool:
+    def _is_late(self, t_s: float) -> bool:
         """Whether the frame is too late to move on: then the mission pauses until frames are prompt again."""
-        self._lag_s = lag_s = 0.0 if self._is_lockstep else self._lag.served(t_s, now_s)
+        self._lag_s = lag_s = 0.0 if self._is_lockstep else self._lag.served(t_s, time.monotonic())
         if lag_s <= self._cfg.robot.lag_limit_s:
             return False
         if self._mission.interrupt(f"a frame was served {1e3 * lag_s:.0f} ms late"):

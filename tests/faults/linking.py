@@ -1,9 +1,10 @@
 """Holds the fault table and the tests against each other, as a plugin of pytest.
 
-A test names its rows with ``@pytest.mark.fault("S1")`` and notes with the fixture ``measured`` what it measured. At the
-end of a full run every row has to be shown by a test that passed, and every mark has to name a row of the table. With a
-selection of tests (paths, ``-k``, ``--lf`` and the like) only the marks are checked. What passed and what was measured
-goes to ``.faults.json``, from which ``make faults`` makes the page.
+A test names its rows with ``@pytest.mark.fault("S1")`` and notes with the fixture ``measured`` what it measured. Rows
+of which the robot keeps a part by itself need a test of that part, too: ``@pytest.mark.fault("L1", part="robot")``. At
+the end of a full run every row has to be shown by a test that passed, and every mark has to name a row of the table.
+With a selection of tests (paths, ``-k``, ``--lf`` and the like) only the marks are checked. What passed and what was
+measured goes to ``.faults.json``, from which ``make faults`` makes the page.
 
 With pytest-xdist the workers know the marks and the controller hears the reports: marks travel in the properties of
 the reports and, for tests that a run deselects, in the workers' last message.
@@ -35,6 +36,7 @@ class Seen:
 
     Attributes:
         rows: that it is marked for.
+        of_robot: those of them of which it shows the robot's own part.
         is_slow: whether ``make test`` leaves it out.
         passed: whether it ran to its end and passed.
         failed: whether any part of it failed.
@@ -46,6 +48,7 @@ class Seen:
     passed: bool = False
     failed: bool = False
     values: dict[str, float] = field(default_factory=dict)
+    of_robot: tuple[str, ...] = ()
 
     @property
     def is_shown(self) -> bool:
@@ -82,7 +85,13 @@ def judge(table: Table, tests: dict[str, Seen], kind: str | None) -> Judgement:
         if row.open is not None:
             shown = "; a test shows it by now" if any(test.is_shown for test in marked.values()) else ""
             open_rows.append(f"{row_id} ({row.open}){shown}")
-        elif problem := _unshown(row.slow, marked, kind or ""):
+            continue
+        ours = {name: test for name, test in marked.items() if row_id not in test.of_robot}
+        robots = {name: test for name, test in marked.items() if row_id in test.of_robot}
+        problem = _unshown(row.slow, ours, kind or "")
+        if not problem and row.conformance and (problem := _unshown(False, robots, kind or "")):
+            problem = f"of the robot's part {problem}"
+        if problem:
             problems.append(f"{row_id} ({row.fault}): {problem}")
     return Judgement(problems, open_rows)
 
@@ -141,26 +150,28 @@ class Linking:
             if not marks:
                 continue
             rows = tuple(dict.fromkeys(str(row) for mark in marks for row in mark.args))
-            item.user_properties.append((ROWS, list(rows)))
+            of_robot = tuple(str(row) for mark in marks for row in mark.args if mark.kwargs.get("part") == "robot")
+            item.user_properties.append((ROWS, [list(rows), list(of_robot)]))
             is_slow = item.get_closest_marker("slow") is not None
-            self._tests[name_of(item.nodeid)] = Seen(rows, is_slow)
+            self._tests[name_of(item.nodeid)] = Seen(rows, is_slow, of_robot=of_robot)
         if self._is_worker:
-            marked = {name: [list(test.rows), test.is_slow] for name, test in self._tests.items()}
+            marked = {n: [list(test.rows), list(test.of_robot), test.is_slow] for n, test in self._tests.items()}
             self._config.workeroutput[COLLECTED] = marked  # type: ignore[attr-defined]
 
     # -- where reports arrive -------------------------------------------------------------------------------------
 
     def pytest_testnodedown(self, node: Any) -> None:
         """Take a worker's marks."""
-        for name, (rows, is_slow) in getattr(node, "workeroutput", {}).get(COLLECTED, {}).items():
-            self._tests.setdefault(name, Seen(tuple(rows), is_slow)).is_slow = is_slow
+        for name, (rows, of_robot, is_slow) in getattr(node, "workeroutput", {}).get(COLLECTED, {}).items():
+            self._tests.setdefault(name, Seen(tuple(rows), is_slow, of_robot=tuple(of_robot))).is_slow = is_slow
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Take what became of a part of a test."""
         properties: dict[str, Any] = dict(report.user_properties)
         if self._is_worker or ROWS not in properties:
             return
-        test = self._tests.setdefault(name_of(report.nodeid), Seen(tuple(properties[ROWS]), False))
+        rows, of_robot = map(tuple, properties[ROWS])
+        test = self._tests.setdefault(name_of(report.nodeid), Seen(rows, False, of_robot=of_robot))
         test.failed |= report.failed
         if report.when == "call":
             test.passed = report.passed

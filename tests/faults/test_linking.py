@@ -200,6 +200,21 @@ def test_one_test_of_several_is_enough_and_a_failing_one_spoils_it() -> None:
     assert judge(table, {"one": passed, "two": other}, "default").problems == [f"A1 ({table['A1'].fault}): two failed"]
 
 
+def test_what_the_robot_keeps_by_itself_needs_a_test_of_its_own() -> None:
+    table = {"L1": load_table()["L1"].model_copy(update={"open": None})}
+    ours = Seen(("L1",), is_slow=False, passed=True)
+    robots = Seen(("L1",), is_slow=False, passed=True, of_robot=("L1",))
+    assert judge(table, {"ours": ours, "robots": robots}, "default").problems == []
+    (problem,) = judge(table, {"ours": ours}, "default").problems
+    assert "of the robot's part no test is marked for it" in problem
+    (problem,) = judge(table, {"robots": robots}, "default").problems
+    assert problem == f"L1 ({table['L1'].fault}): no test is marked for it"
+    robots.passed = False
+    (problem,) = judge(table, {"ours": ours, "robots": robots}, "default").problems
+    assert "of the robot's part robots did not pass" in problem
+    assert judge(table, {"ours": ours, "robots": robots}, "slow").problems == []
+
+
 ROW = {"fault": "what", "detection": "how", "reaction": "then", "bound": "when", "severity": "hold"}
 
 
