@@ -110,6 +110,7 @@ class RobotLink(asyncio.Protocol):
         key: of the HMAC, where the robot asks for it.
         on_sensors: called with each frame and its line (without LF), within the event loop's read.
         on_lost: called once with the reason when a joined session ends, unless ``close`` ended it.
+        on_joined: called with the robot's hello when the session begins, before its first frame.
 
     Attributes:
         counts: bad_lines, unknown_types, unexpected, repeated_frames, unsent.
@@ -125,9 +126,10 @@ class RobotLink(asyncio.Protocol):
         key: bytes | None,
         on_sensors: Callable[[Sensors, bytes], None],
         on_lost: Callable[[str], None],
+        on_joined: Callable[[Hello], None] = lambda _hello: None,
     ) -> None:
         self._host, self._port, self._role, self._client, self._key = host, port, role, client, key
-        self._on_sensors, self._on_lost = on_sensors, on_lost
+        self._on_sensors, self._on_lost, self._on_joined = on_sensors, on_lost, on_joined
         self.counts: Counter[str] = Counter()
         self._transport: asyncio.Transport | None = None
         self._hello: Hello | None = None
@@ -253,6 +255,7 @@ class RobotLink(asyncio.Protocol):
                 rate_hz = self._hello.frame_hz
                 self._budget = LineBudget(BACKLOG_S * rate_hz, FLOOD_FACTOR * rate_hz)
             joining.set_result(self._hello)
+            self._on_joined(self._hello)
         else:
             self.counts["unexpected"] += 1
 
@@ -280,6 +283,10 @@ class RobotLink(asyncio.Protocol):
         self._why = self._why or why
         if self._transport is not None:
             self._transport.abort()
+
+    def abort(self, why: str) -> None:
+        """Break the connection at once, whatever waits to be sent; ``on_lost`` is called with ``why``."""
+        self._end(why)
 
     def send_drive(self, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float) -> None:
         """Send wheel set points.

@@ -31,6 +31,10 @@ class RunConfig(Model):
     budget_s: Positive
     runtime_dir: str  # empty = chosen from the environment
     realtime_priority: Annotated[int, Field(ge=0, le=99)]  # 0 = ordinary scheduling
+    hang_timeout_s: Positive
+    start_timeout_s: Positive
+    restart_limit: Annotated[int, Field(ge=0)]
+    restart_window_s: Positive
 
 
 class RobotConfig(Model):
@@ -50,6 +54,8 @@ class RobotConfig(Model):
     sensors_timeout_s: Freshness
     slip_after_s: Positive
     lag_limit_s: Freshness
+    silence_timeout_s: Positive
+    reconnect_timeout_s: Positive
 
 
 class LimitsConfig(Model):
@@ -241,6 +247,8 @@ class MissionConfig(Model):
     verdict_timeout_s: Freshness
     measure_timeout_s: Positive
     failed_points_before_hold: Annotated[int, Field(ge=1)]
+    heading_doubt_rad: Positive
+    alignment_leg_m: Annotated[float, Field(gt=0.0, le=0.5)]
 
 
 class SimRobotConfig(Model):
