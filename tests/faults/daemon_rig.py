@@ -29,7 +29,7 @@ from ccatp.sim.truth import TruthLog
 
 DEADLINE_S = 60.0
 SEND_DRIVE, SEND_PERMIT = RobotLink.send_drive, RobotLink.send_permit
-LATE_FRAMES = 20  # of 10 ms: data are too old after 150 ms
+LATE_FRAMES = 16  # of 10 ms: data are too old after 150 ms
 
 
 class Executed:
