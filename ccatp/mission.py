@@ -84,6 +84,11 @@ class Mission:
         return self.state is State.HELD and self._is_held_by_hand
 
     @property
+    def is_lost(self) -> bool:
+        """The pose is known to be wrong, and is to be found again; at the start it is only to be confirmed."""
+        return self._is_lost and not self._is_at_start
+
+    @property
     def eta_s(self) -> float:
         """Least time that the rest of the survey takes, s."""
         return self._route.remaining_s(self.survey.index)

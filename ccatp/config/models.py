@@ -181,12 +181,17 @@ class EtalonConfig(Model):
     request_timeout_s: Positive
     retries: Annotated[int, Field(ge=0, le=10)]
     reconnect_delay_s: Positive
+    reconnect_for_s: NonNegative
     measuring_time_s: Positive
     length_sigma_m: Positive
     length_sigma_per_m: NonNegative
     max_residual_m: Positive
     max_dop: Positive
     max_distance_m: Positive
+    max_surface_residual_m: Positive
+    doubt_nis: Positive
+    repeat_m: Positive
+    start_distance_m: Positive
 
 
 class DangerConfig(Model):

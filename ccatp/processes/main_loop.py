@@ -15,6 +15,7 @@ from ccatp.control.prediction import CommandPredictor
 from ccatp.errors import CcatpError, ExitStatus, UnreachableError
 from ccatp.etalon_client import EtalonClient, EtalonError
 from ccatp.localizer import Localizer
+from ccatp.metrology.scrutiny import Scrutiny
 from ccatp.mirror.mirror import Mirror
 from ccatp.mission import Mission
 from ccatp.processes import realtime, spinning
@@ -73,7 +74,15 @@ class MainLoop:
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m)
         self._predictor = CommandPredictor(cfg.robot.wheel_lag_s, 1.0 / cfg.sim.robot.frame_hz)
         self._measuring = MeasuringDesk(
-            cfg.mission, self._etalon, parts.localizer, parts.mission, store, self._teller, self._answer_held_frame
+            cfg.mission,
+            self._etalon,
+            Scrutiny(parts.mirror, cfg),
+            parts.localizer,
+            parts.mission,
+            store,
+            self._teller,
+            self._answer_held_frame,
+            lambda: 0.0 if self._is_lockstep else cfg.etalon.measuring_time_s,  # lockstep time stands still meanwhile
         )
         self._link = RobotLink(
             host=cfg.robot.host,
