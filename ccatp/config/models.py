@@ -241,6 +241,11 @@ class MissionConfig(Model):
     verdict_timeout_s: Positive
     measure_timeout_s: Positive
     failed_points_before_hold: Annotated[int, Field(ge=1)]
+    holds_to_budget: bool
+    alarm_period_s: Positive
+    battery_endurance_s: Positive
+    battery_reserve: Annotated[float, Field(ge=0.0, lt=1.0)]
+    return_energy_factor: Annotated[float, Field(ge=1.0)]
 
 
 class SimRobotConfig(Model):

@@ -28,9 +28,12 @@ from ccatp.processes.telling import Teller
 from ccatp.robot_link import RobotLink, read_key
 from ccatp.router import Router
 from ccatp.store import MissionStore
+from ccatp.surveying.budget import home_time_s
 from ccatp.surveying.journey import Motion
+from ccatp.surveying.leftovers import by_reason
 from ccatp.surveying.orders import Order
 from ccatp.surveying.states import Outcome, State
+from ccatp.surveying.vigil import Call, Vigil
 from ccatp.wire.robot import Hello, Sensors
 from ccatp.wire.topics import MissionStatus, Presence
 
@@ -42,6 +45,7 @@ EXIT_STATUS = {
 }
 BEAT_PERIOD_S = 0.1
 WAIT_PERIOD_S = 0.02
+FULL_FANS = (1.0, 1.0)
 # After the end the last messages must reach the supervisor, which then ends this process.
 FAREWELL_S = 5.0
 
@@ -103,6 +107,8 @@ class MainLoop:
         self._drive_seq = 0
         self._unanswered: int | None = None
         self._state = State.IDLE
+        self._vigil = Vigil(cfg.mission, falls=parts.mirror.overhang)
+        self._has_full_fans = False
         self.over = asyncio.Event()
         self.exit_status = EXIT_STATUS[Outcome.NONE]
 
@@ -247,6 +253,11 @@ class MainLoop:
         verdict = self._ear.hear(seq, self._frame_period_s(), is_lockstep=self._is_lockstep)
         heard = time.perf_counter()
         order = self._mission.step(motion, verdict)
+        if self._mission.wants_full_fans is not self._has_full_fans:
+            self._has_full_fans = True
+            self._link.send_fans(2, FULL_FANS)  # pressed on first, held then
+        if self._mission.is_faulted:
+            self._watch(sensors)
         right, left = self._gate.pass_through(order.twist, verdict, dt_s)
         if order.at_rest or order.measure:
             self._execute(order, motion)
@@ -266,6 +277,19 @@ class MainLoop:
             (pose.x_m, pose.y_m, pose.heading_rad), v, omega, echo.seq, echo.age, echo.held, creep
         )
         return Motion(sensors.t, dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead, self._sigma_of)
+
+    def _watch(self, sensors: Sensors) -> None:
+        """A fault that nobody looks after: an alarm now and then, and home before the battery is too low for it."""
+        mission, vigil, pose = self._mission, self._vigil, self._localizer.deck_pose
+        knows_place = not (mission.is_lost or self._localizer.is_frozen)
+        home_s = home_time_s(self._mirror.base_pose, self._cfg.limits, pose.x_m, pose.y_m) if knows_place else None
+        call = vigil.watch(sensors.t, sensors.soc, home_s)
+        if call is Call.REMIND:
+            self._teller.say(
+                "error", f"held for {vigil.held_s(sensors.t):.0f} s, waiting for an operator: {mission.cause}"
+            )
+        elif call is Call.RETURN:
+            mission.abort(f"nobody came, and the battery ({sensors.soc:.0%}) lasts for little more than the way home")
 
     def _frame_period_s(self) -> float:
         return 1.0 / self._hello.frame_hz if self._hello is not None else 0.01
@@ -312,6 +336,8 @@ class MainLoop:
     def _on_state(self) -> None:
         mission = self._mission
         before, self._state = self._state, mission.state
+        if not mission.is_faulted:
+            self._vigil.over()
         self._teller.log.debug("state", seq=self._seq, before=before, after=mission.state, cause=mission.cause)
         if mission.state in (State.HELD, State.BACKING_OFF) or before is State.HELD:
             self._teller.say("warning", f"{mission.state}: {mission.cause}" if mission.cause else f"{mission.state}")
@@ -351,6 +377,7 @@ class MainLoop:
             outcome=str(mission.outcome),
             lower_bound_s=self._parts.lower_bound_s,
             exit_status=int(self.exit_status) if self.over.is_set() else -1,
+            left_out=by_reason(mission.left_out),
         )
 
     def close(self) -> None:

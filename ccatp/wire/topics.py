@@ -58,6 +58,7 @@ class MissionStatus(Message):
     outcome: str
     lower_bound_s: float
     exit_status: int  # what the run ends with; -1 while it goes on
+    left_out: dict[str, list[str]] = {}  # points skipped, or not measured any more, by the reason
 
 
 class Track(Message):
