@@ -256,7 +256,7 @@ class Mission:
             self._go_on()
 
     def _leave_stop(self, point: PointId | None, record: list[PointId]) -> None:
-        was_awaited = self.is_awaiting_fix
+        goes_on = self.is_awaiting_fix
         stop = self.survey.current
         # A pause may come while the fix is being committed: the point counts all the same.
         if point is not None and stop is not None and stop.point == point:
@@ -268,7 +268,9 @@ class Mission:
             self._is_review_due = self._budget is not None
             self._backoffs = 0
             self.survey.advance()
-        if was_awaited:
+            # So it does where the robot was pushed meanwhile and waits to be measured anew: there is no need any more.
+            goes_on |= self.state in (SETTLING, MEASURING)
+        if goes_on:
             self._go_on()
 
     # -- the frame ------------------------------------------------------------------------------------------------
@@ -290,7 +292,7 @@ class Mission:
         if state is DRIVING or state is TURNING:
             return self._travel(motion)
         if state is MEASURING:
-            return Order(STAND.twist, measure=True) if self._stopover.is_due(motion) else STAND
+            return self._stand(motion)
         if state is SETTLING:
             return self._settle(motion)
         if state is RETURNING:
@@ -467,9 +469,18 @@ class Mission:
         if stopover.has_settled(motion):
             self._apply(Event.SETTLED)
             return Order(STAND.twist, at_rest=True, arrived=stopover.arrival_at(self.measuring_point))
-        if stopover.is_restless(motion.t_s):
-            self.fault(f"the robot does not come to rest: {motion.speed_m_s:.4f} m/s, {motion.rate_rad_s:.4f} rad/s")
+        self._check_rest(motion)
         return STAND
+
+    def _stand(self, motion: Motion) -> Order:
+        if self._stopover.is_due(motion):
+            return Order(STAND.twist, measure=True)
+        self._check_rest(motion)
+        return STAND
+
+    def _check_rest(self, motion: Motion) -> None:
+        if self._stopover.is_restless(motion.t_s):
+            self.fault(f"the robot does not come to rest: {motion.speed_m_s:.4f} m/s, {motion.rate_rad_s:.4f} rad/s")
 
     # -- edge and home --------------------------------------------------------------------------------------------
 

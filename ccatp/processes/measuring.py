@@ -136,7 +136,7 @@ class MeasuringDesk:
         if finding.refusal:
             raise FrameRefused(finding.refusal)
         if doubt:
-            self._teller.say("warning", f"the fix at {_name(request.point)} is doubted: {doubt}")
+            self._teller.say("info", f"the fix at {_name(request.point)} is doubted: {doubt}")
             return doubt
         for notice in localizer.notices:
             self._teller.say("warning", notice)
