@@ -555,7 +555,7 @@ def test_nothing_counts_that_was_measured_while_the_robot_moved(config: Config, 
             for _ in range(6000):
                 if story.mission.state is State.DONE:
                     break
-                if story.mission.state is State.MEASURING and rng.random() < 0.004:
+                if story.mission.state is State.MEASURING and rng.random() < 0.012:
                     story.v, bumps = 0.02, bumps + 1
                 if abs(story.v) > cfg.control.settle_speed_m_s:
                     motion_s.append(story.t)
