@@ -192,12 +192,17 @@ class EtalonConfig(Model):
     request_timeout_s: Positive
     retries: Annotated[int, Field(ge=0, le=10)]
     reconnect_delay_s: Positive
+    reconnect_for_s: NonNegative
     measuring_time_s: Positive
     length_sigma_m: Positive
     length_sigma_per_m: NonNegative
     max_residual_m: Positive
     max_dop: Positive
     max_distance_m: Positive
+    max_surface_residual_m: Positive
+    doubt_nis: Positive
+    repeat_m: Positive
+    start_distance_m: Positive
 
 
 class DangerConfig(Model):
@@ -249,6 +254,11 @@ class MissionConfig(Model):
     failed_points_before_hold: Annotated[int, Field(ge=1)]
     heading_doubt_rad: Positive
     alignment_leg_m: Annotated[float, Field(gt=0.0, le=0.5)]
+    holds_to_budget: bool
+    alarm_period_s: Positive
+    battery_endurance_s: Positive
+    battery_reserve: Annotated[float, Field(ge=0.0, lt=1.0)]
+    return_energy_factor: Annotated[float, Field(ge=1.0)]
 
 
 class SimRobotConfig(Model):

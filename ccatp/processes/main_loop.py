@@ -17,6 +17,7 @@ from ccatp.errors import CcatpError, ConfigError, ExitStatus, UnreachableError
 from ccatp.etalon_client import EtalonClient, EtalonError
 from ccatp.frame_lag import FrameLag
 from ccatp.localizer import Localizer
+from ccatp.metrology.scrutiny import Scrutiny
 from ccatp.mirror.mirror import Mirror
 from ccatp.mission import Mission
 from ccatp.processes import realtime, spinning
@@ -31,11 +32,15 @@ from ccatp.processes.operating import OperatorDesk
 from ccatp.processes.pulse import PERIOD_S, Pulse
 from ccatp.processes.telling import Teller
 from ccatp.router import Router
+from ccatp.samples import Verdict
 from ccatp.store import MissionStore
+from ccatp.surveying.budget import home_time_s
 from ccatp.surveying.journey import Motion
+from ccatp.surveying.leftovers import by_reason
 from ccatp.surveying.mirror_check import MirrorCheck
 from ccatp.surveying.orders import STAND, Order
 from ccatp.surveying.states import PURPOSES, Outcome, State
+from ccatp.surveying.vigil import Call, Vigil
 from ccatp.wire.robot import Hello, Sensors
 from ccatp.wire.topics import MissionStatus
 
@@ -48,6 +53,7 @@ EXIT_STATUS = {
 WAIT_PERIOD_S = 0.02
 # Of a robot that moved nobody knows where it is when the samples of more frames than this are missing.
 UNSEEN_S = 0.1
+FULL_FANS = (1.0, 1.0)
 # After the end the last messages must reach the supervisor, which then ends this process.
 FAREWELL_S = 5.0
 
@@ -92,7 +98,15 @@ class MainLoop:
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m)
         self._predictor = CommandPredictor(cfg.robot.wheel_lag_s, 1.0 / cfg.sim.robot.frame_hz)
         self._measuring = MeasuringDesk(
-            cfg.mission, self._etalon, parts.localizer, parts.mission, store, self._teller, self._answer_held_frame
+            cfg.mission,
+            self._etalon,
+            Scrutiny(parts.mirror, cfg),
+            parts.localizer,
+            parts.mission,
+            store,
+            self._teller,
+            self._answer_held_frame,
+            lambda: 0.0 if self._is_lockstep else cfg.etalon.measuring_time_s,  # lockstep time stands still meanwhile
         )
         self._link = LastingLink(
             cfg.robot,
@@ -116,6 +130,8 @@ class MainLoop:
         self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
         self._unanswered: int | None = None
         self._state = State.IDLE
+        self._vigil = Vigil(cfg.mission, falls=parts.mirror.overhang)
+        self._has_full_fans = False
         self.over = asyncio.Event()
         self.exit_status = EXIT_STATUS[Outcome.NONE]
 
@@ -301,12 +317,7 @@ class MainLoop:
         is_unjudged = is_first and (self._is_taking_over or self._link.sessions > 1)
         verdict = None if is_unjudged else self._ear.hear(seq, self._frame_period_s(), is_lockstep=self._is_lockstep)
         heard = time.perf_counter()
-        if self._is_late(t_s):
-            verdict = None
-        order = self._mission.step(motion, verdict) if self._is_on_mirror(sensors) else STAND
-        purpose = PURPOSES[self._mission.state]
-        right, left = self._gate.pass_through(order.twist, verdict, dt_s, t_s, self._lag_s, purpose)
-        self._gate_watch.look(t_s)
+        order, right, left = self._decide(sensors, motion, None if self._is_late(t_s) else verdict)
         if order.at_rest or order.measure:
             self._execute(order, motion)
         if self._may_answer():
@@ -319,6 +330,21 @@ class MainLoop:
             self._on_state()
         self._teller.tick(1e6 * (time.perf_counter() - heard + waiting - start))
 
+    def _decide(self, sensors: Sensors, motion: Motion, verdict: Verdict | None) -> tuple[Order, float, float]:
+        """What the mission wants, and the wheel rates (right, left), rad/s, that the gate lets through."""
+        mission = self._mission
+        order = mission.step(motion, verdict) if self._is_on_mirror(sensors) else STAND
+        if mission.wants_full_fans and not self._has_full_fans:
+            self._has_full_fans = True
+            self._send_fans()  # pressed on first, held then
+        if mission.is_faulted:
+            self._keep_vigil(sensors)
+        right, left = self._gate.pass_through(
+            order.twist, verdict, motion.dt_s, motion.t_s, self._lag_s, PURPOSES[mission.state]
+        )
+        self._gate_watch.look(motion.t_s)
+        return order, right, left
+
     def _begin_session(self, dt_s: float) -> None:
         """Before the first drive and not on joining, so that in lockstep the fans start in a certain frame."""
         self._is_new_session = False
@@ -328,7 +354,7 @@ class MainLoop:
             self._mission.lose_sight()
 
     def _send_fans(self) -> None:
-        duty = self._cfg.robot.fan_duty
+        duty = FULL_FANS if self._has_full_fans else self._cfg.robot.fan_duty
         refusal = self._fan_gate.refusal(*duty)
         if refusal is None:
             self._fans_seq += 1
@@ -372,6 +398,19 @@ class MainLoop:
             (pose.x_m, pose.y_m, pose.heading_rad), v, omega, echo.seq, echo.age, echo.held, creep
         )
         return Motion(sensors.t, dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead, self._sigma_of)
+
+    def _keep_vigil(self, sensors: Sensors) -> None:
+        """A fault that nobody looks after: an alarm now and then, and home before the battery is too low for it."""
+        mission, vigil, pose = self._mission, self._vigil, self._localizer.deck_pose
+        knows_place = not (mission.is_lost or self._localizer.is_frozen)
+        home_s = home_time_s(self._mirror.base_pose, self._cfg.limits, pose.x_m, pose.y_m) if knows_place else None
+        call = vigil.watch(sensors.t, sensors.soc, home_s)
+        if call is Call.REMIND:
+            self._teller.say(
+                "error", f"held for {vigil.held_s(sensors.t):.0f} s, waiting for an operator: {mission.cause}"
+            )
+        elif call is Call.RETURN:
+            mission.abort(f"nobody came, and the battery ({sensors.soc:.0%}) lasts for little more than the way home")
 
     def _frame_period_s(self) -> float:
         return 1.0 / self._hello.frame_hz if self._hello is not None else 0.01
@@ -419,6 +458,8 @@ class MainLoop:
     def _on_state(self) -> None:
         mission = self._mission
         before, self._state = self._state, mission.state
+        if not mission.is_faulted:
+            self._vigil.over()
         self._teller.log.debug("state", seq=self._seq, before=before, after=mission.state, cause=mission.cause)
         if mission.state in (State.HELD, State.BACKING_OFF) or before is State.HELD:
             self._teller.say("warning", f"{mission.state}: {mission.cause}" if mission.cause else f"{mission.state}")
@@ -460,6 +501,7 @@ class MainLoop:
             exit_status=int(self.exit_status) if self.over.is_set() else -1,
             slips=self._lag.slips,
             lag_ms=1e3 * self._lag.worst_s,
+            left_out=by_reason(mission.left_out),
         )
 
     def close(self) -> None:

@@ -60,6 +60,7 @@ class MissionStatus(Message):
     exit_status: int  # what the run ends with; -1 while it goes on
     slips: int = 0  # frames that were served late, in real time
     lag_ms: float = 0.0  # ... the latest of them
+    left_out: dict[str, list[str]] = {}  # points skipped, or not measured any more, by the reason
 
 
 class Track(Message):

@@ -20,6 +20,7 @@ import pytest
 from ccatp.config.models import Config
 from ccatp.etalon_client import EtalonClient
 from ccatp.localizer import Localizer
+from ccatp.metrology.scrutiny import Finding, Scrutiny
 from ccatp.mission import Mission
 from ccatp.processes import measuring
 from ccatp.processes.common import open_log
@@ -184,11 +185,13 @@ class Desk:
         self.desk = MeasuringDesk(
             config.mission,
             cast(EtalonClient, SimpleNamespace(measure=measure)),
+            cast(Scrutiny, SimpleNamespace(begin=lambda: None, review=lambda *_, **__: Finding())),
             cast(Localizer, localizer),
             cast(Mission, mission),
             store,
             cast(Teller, teller),
             self.over.set,
+            lambda: 0.0,
         )
 
     def _fault(self, cause: str) -> None:

@@ -155,7 +155,8 @@ def test_the_map_is_asked_at_the_sensors_place_along_its_way(danger: DangerConfi
 def test_a_direction_takes_some_travel(danger: DangerConfig) -> None:
     sensor = Sensor(danger, Map(is_rim=True))
     assert not sensor.off(0.9 * DIRECTION_TRAVEL_M)
-    assert sensor.episode.phase is Phase.FRESH
+    before: Phase = sensor.episode.phase
+    assert before is Phase.FRESH
     assert sensor.off(0.2 * DIRECTION_TRAVEL_M)
     assert sensor.episode.phase is Phase.DECLARED
 
