@@ -14,6 +14,7 @@ from ccatp.control.kinematics import twist_of
 from ccatp.control.prediction import CommandPredictor
 from ccatp.errors import CcatpError, ConfigError, ExitStatus, UnreachableError
 from ccatp.etalon_client import EtalonClient, EtalonError
+from ccatp.liveness import FrameAge
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror
 from ccatp.mission import Mission
@@ -103,6 +104,7 @@ class MainLoop:
         self._t_last_s = 0.0
         self._elapsed_s = parts.elapsed_s  # before ``_t_first_s``
         self._failure: Exception | None = None
+        self._age = FrameAge()
         self._seq = -1
         self._drive_seq = self._fans_seq = 0
         self._unanswered: int | None = None
@@ -165,12 +167,14 @@ class MainLoop:
         self._is_new_session, self._keeper.boot = True, hello.boot
         self._predictor = CommandPredictor(self._cfg.robot.wheel_lag_s, 1.0 / hello.frame_hz)
         self._pulse.phase, self._pulse.frame_s = "joined", time.monotonic()
+        self._age.restart()
         where = f"the robot at {self._cfg.robot.host}:{self._cfg.robot.port}"
         if before is None or before.boot == hello.boot:
             self._teller.say("info", f"joined {where}{'' if before is None else ' again'}")
             return
         self._teller.say("warning", f"{where} has started anew: it is found again before it moves")
         self._ear.forget()
+        self._teller.count_on()
         self._elapsed_s, self._t_first_s = self._elapsed_total_s(), None
         self._mission.lose_sight()
 
@@ -288,7 +292,9 @@ class MainLoop:
         # Danger may have judged this frame before this session began, and does so once: the next one will do.
         is_unjudged = is_first and (self._is_taking_over or self._link.sessions > 1)
         verdict = (
-            None if is_unjudged else self._ear.hear(seq, self._frame_period_s(), is_lockstep=self._is_lockstep)
+            None
+            if is_unjudged or self._is_old(t_s)
+            else self._ear.hear(seq, self._frame_period_s(), is_lockstep=self._is_lockstep)
         )
         heard = time.perf_counter()
         order = self._mission.step(motion, verdict)
@@ -304,6 +310,10 @@ class MainLoop:
         if self._mission.state is not self._state:
             self._on_state()
         self._teller.tick(1e6 * (time.perf_counter() - heard + waiting - start))
+
+    def _is_old(self, t_s: float) -> bool:
+        """Whether a frame has waited for us, or on its way: what is decided by it would come too late."""
+        return not self._is_lockstep and (self._age.age_s(t_s, time.monotonic()) > self._cfg.robot.sensors_timeout_s)
 
     def _begin_session(self, dt_s: float) -> None:
         """Before the first drive and not on joining, so that in lockstep the fans start in a certain frame."""
@@ -391,6 +401,8 @@ class MainLoop:
         mission = self._mission
         stop = mission.journey.current
         point = stop.point if stop is not None else None
+        if mission.is_paused:
+            point = mission.survey.next_point
         return MissionStatus(
             seq=self._seq,
             t_s=self._t_last_s,
