@@ -10,11 +10,8 @@ import zmq.asyncio
 from ccatp.assembly import Parts
 from ccatp.bus import Publisher
 from ccatp.control.gate import DriveGate
-from ccatp.control.kinematics import twist_of
-from ccatp.control.prediction import CommandPredictor
 from ccatp.errors import CcatpError, ConfigError, ExitStatus, UnreachableError
 from ccatp.etalon_client import EtalonClient, EtalonError
-from ccatp.liveness import FrameAge
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror
 from ccatp.mission import Mission
@@ -27,6 +24,7 @@ from ccatp.processes.keeping import Keeper
 from ccatp.processes.measuring import MeasuringDesk, Request
 from ccatp.processes.operating import OperatorDesk
 from ccatp.processes.pulse import PERIOD_S, Pulse
+from ccatp.processes.seat import Seat
 from ccatp.processes.telling import Teller
 from ccatp.router import Router
 from ccatp.store import MissionStore
@@ -84,7 +82,6 @@ class MainLoop:
         )
         self._teller = Teller(self._publisher, open_log(args.run_dir / "log.jsonl", "main"))
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m)
-        self._predictor = CommandPredictor(cfg.robot.wheel_lag_s, 1.0 / cfg.sim.robot.frame_hz)
         self._measuring = MeasuringDesk(
             cfg.mission, self._etalon, parts.localizer, parts.mission, store, self._teller, self._answer_held_frame
         )
@@ -97,16 +94,14 @@ class MainLoop:
             on_joined=self._on_joined,
         )
         self._is_taking_over = args.is_taking_over
+        self._seat = Seat(cfg.robot, self._link, is_taking_over=self._is_taking_over, frame_hz=cfg.sim.robot.frame_hz)
         self._keeper = Keeper(args.run_dir, parts.localizer, parts.mission, is_patient=not args.is_realtime)
-        self._hello: Hello | None = None
-        self._is_lockstep = self._is_new_session = self._was_quiet = False
+        self._was_quiet = False
         self._t_first_s: float | None = None
         self._t_last_s = 0.0
         self._elapsed_s = parts.elapsed_s  # before ``_t_first_s``
         self._failure: Exception | None = None
-        self._age = FrameAge()
         self._seq = -1
-        self._drive_seq = self._fans_seq = 0
         self._unanswered: int | None = None
         self._state = State.IDLE
         self.over = asyncio.Event()
@@ -153,7 +148,7 @@ class MainLoop:
                 return
             await asyncio.sleep(WAIT_PERIOD_S)
         await self._link.join(is_patient=self._is_taking_over)
-        if not self._is_lockstep:
+        if not self._seat.is_lockstep:
             realtime.enter(self._cfg.run.realtime_priority, self._teller.log)
 
     def _on_joined(self, hello: Hello) -> None:
@@ -163,20 +158,17 @@ class MainLoop:
         except ConfigError as error:
             self._fail(error)
             return
-        before, self._hello, self._is_lockstep = self._hello, hello, hello.lockstep
-        self._is_new_session, self._keeper.boot = True, hello.boot
-        self._predictor = CommandPredictor(self._cfg.robot.wheel_lag_s, 1.0 / hello.frame_hz)
+        has_booted = self._seat.has_booted(hello)
+        text = self._seat.begin(hello)
+        self._keeper.boot = hello.boot
         self._pulse.phase, self._pulse.frame_s = "joined", time.monotonic()
-        self._age.restart()
-        where = f"the robot at {self._cfg.robot.host}:{self._cfg.robot.port}"
-        if before is None or before.boot == hello.boot:
-            self._teller.say("info", f"joined {where}{'' if before is None else ' again'}")
-            return
-        self._teller.say("warning", f"{where} has started anew: it is found again before it moves")
-        self._ear.forget()
-        self._teller.count_on()
-        self._elapsed_s, self._t_first_s = self._elapsed_total_s(), None
-        self._mission.lose_sight()
+        self._teller.say("info", text)
+        if has_booted:
+            self._teller.say("warning", "the robot has started anew: it is found again before it moves")
+            self._ear.forget()
+            self._teller.count_on()
+            self._elapsed_s, self._t_first_s = self._elapsed_total_s(), None
+            self._mission.lose_sight()
 
     def _fail(self, error: Exception) -> None:
         """End this process, held; who starts it anew is the supervisor's business."""
@@ -195,14 +187,8 @@ class MainLoop:
         except TimeoutError:
             self._teller.log.warning("nobody acknowledged the end")
 
-    def _drive(self, ack: int, right: float, left: float) -> None:
-        self._drive_seq += 1
-        twist = twist_of(right, left, self._cfg.robot.wheel_radius_m, self._cfg.robot.wheel_base_m)
-        self._predictor.sent(self._drive_seq, twist.v_m_s, twist.omega_rad_s)
-        self._link.link.send_drive(self._drive_seq, max(ack, 0), right, left)
-
     def _hold_wheels(self) -> None:
-        self._drive(self._seq, 0.0, 0.0)
+        self._seat.drive(self._seq, 0.0, 0.0)
         self._keep()
         self._teller.flush()
         self._teller.status(self.status())
@@ -229,11 +215,11 @@ class MainLoop:
             await asyncio.sleep(WAIT_PERIOD_S)
             self._ear.tend()
             age_s = pulse.frame_age_s
-            if pulse.phase != "joined" or self._is_lockstep or age_s is None or age_s <= robot.sensors_timeout_s:
+            if pulse.phase != "joined" or self._seat.is_lockstep or age_s is None or age_s <= robot.sensors_timeout_s:
                 continue
             if self._mission.interrupt(f"no sensors frame for {age_s:.2f} s"):
                 self._teller.say("warning", self._mission.cause)
-                self._drive(self._seq, 0.0, 0.0)
+                self._seat.drive(self._seq, 0.0, 0.0)
             if age_s > robot.silence_timeout_s:
                 self._link.give_up(f"no sensors frame for {age_s:.2f} s")
 
@@ -267,8 +253,8 @@ class MainLoop:
     def _serve(self, sensors: Sensors, raw: bytes) -> None:
         start = time.perf_counter()
         t_s, seq = sensors.t, sensors.seq
-        dt_s = t_s - self._t_last_s if self._t_first_s is not None else self._frame_period_s()
-        is_first = self._is_new_session
+        dt_s = t_s - self._t_last_s if self._t_first_s is not None else self._seat.frame_period_s
+        is_first, is_unjudged = self._seat.is_new_session, self._seat.is_unjudged
         if is_first:
             self._begin_session(dt_s)
         if self._t_first_s is None:
@@ -283,18 +269,16 @@ class MainLoop:
         if dt_s <= 0.0:  # counted by the localizer; a controller cannot go back in time
             self._teller.stale_frame(seq, raw)
             if self._may_answer():
-                self._drive(seq, 0.0, 0.0)
+                self._seat.drive(seq, 0.0, 0.0)
             else:
                 self._unanswered = seq
             return
         motion = self._motion(sensors, dt_s)
         waiting = time.perf_counter()
-        # Danger may have judged this frame before this session began, and does so once: the next one will do.
-        is_unjudged = is_first and (self._is_taking_over or self._link.sessions > 1)
         verdict = (
             None
-            if is_unjudged or self._is_old(t_s)
-            else self._ear.hear(seq, self._frame_period_s(), is_lockstep=self._is_lockstep)
+            if is_unjudged or self._seat.is_old(t_s)
+            else self._ear.hear(seq, self._seat.frame_period_s, is_lockstep=self._seat.is_lockstep)
         )
         heard = time.perf_counter()
         order = self._mission.step(motion, verdict)
@@ -302,7 +286,7 @@ class MainLoop:
         if order.at_rest or order.measure:
             self._execute(order, motion)
         if self._may_answer():
-            self._drive(seq, right, left)
+            self._seat.drive(seq, right, left)
         else:
             self._unanswered = seq
         self._teller.frame(seq, t_s, localizer, self._mission.state, raw, is_first=is_first)
@@ -311,15 +295,10 @@ class MainLoop:
             self._on_state()
         self._teller.tick(1e6 * (time.perf_counter() - heard + waiting - start))
 
-    def _is_old(self, t_s: float) -> bool:
-        """Whether a frame has waited for us, or on its way: what is decided by it would come too late."""
-        return not self._is_lockstep and (self._age.age_s(t_s, time.monotonic()) > self._cfg.robot.sensors_timeout_s)
-
     def _begin_session(self, dt_s: float) -> None:
         """Before the first drive and not on joining, so that in lockstep the fans start in a certain frame."""
-        self._is_new_session = False
-        self._fans_seq += 1
-        self._link.link.send_fans(self._fans_seq, self._cfg.robot.fan_duty)
+        self._seat.is_new_session = False
+        self._seat.start_fans()
         if self._t_first_s is not None and dt_s > UNSEEN_S and not self._was_quiet:
             self._teller.say("warning", f"the robot moved and was out of sight for {dt_s:.2f} s: it is found again")
             self._mission.lose_sight()
@@ -327,13 +306,10 @@ class MainLoop:
     def _motion(self, sensors: Sensors, dt_s: float) -> Motion:
         localizer, echo = self._localizer, sensors.cmd
         pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
-        ahead = self._predictor.ahead(
+        ahead = self._seat.predictor.ahead(
             (pose.x_m, pose.y_m, pose.heading_rad), v, omega, echo.seq, echo.age, echo.held, creep
         )
         return Motion(sensors.t, dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead, self._sigma_of)
-
-    def _frame_period_s(self) -> float:
-        return 1.0 / self._hello.frame_hz if self._hello is not None else 0.01
 
     def _execute(self, order: Order, motion: Motion) -> None:
         if order.at_rest:
@@ -358,7 +334,7 @@ class MainLoop:
 
     def _may_answer(self) -> bool:
         """In lockstep simulated time stands still while a measurement is under way, and all but still in a pause."""
-        if not self._is_lockstep:
+        if not self._seat.is_lockstep:
             return True
         return not self._measuring.is_busy and not (self._mission.is_paused and self._is_quiet())
 
@@ -373,7 +349,7 @@ class MainLoop:
     def _release_frame(self) -> None:
         seq, self._unanswered = self._unanswered, None
         if seq is not None:
-            self._drive(seq, 0.0, 0.0)
+            self._seat.drive(seq, 0.0, 0.0)
 
     def _on_state(self) -> None:
         mission = self._mission
@@ -385,7 +361,7 @@ class MainLoop:
             self._teller.say("warning", f"returning to base: {mission.cause}")
         if mission.state is State.DONE:
             self._finish(EXIT_STATUS[mission.outcome])
-        elif mission.is_faulted and self._is_lockstep:
+        elif mission.is_faulted and self._seat.is_lockstep:
             # Nobody can be waited for while simulated time runs at many times the wall clock.
             self._finish(EXIT_STATUS[Outcome.STOPPED])
 

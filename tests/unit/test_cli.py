@@ -116,7 +116,7 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
             "ccatp: --resume carries on in a run directory; name it with --run-dir; see ccatp run --help\n",
         ),
         (["sim", "etalon", "--puck", "1", "2", "3", "--truth", "ipc://x"], "--puck and --truth exclude each other"),
-        (["run", "--sim", "--miror", "x"], "Did you mean '--mirror'?"),
+        (["run", "--sim", "--miror", "x"], "Did you mean one of: '--mirror'"),
         (["run", "--sim", "--set", "seed"], "'seed' is not KEY=VALUE, as in run.seed=2"),
         (["run", "--sim", "--seed", "one"], "'one' is not a valid integer"),
         (
