@@ -41,11 +41,16 @@ def log_of(run: Run) -> list[dict[str, Any]]:
     return [json.loads(line) for line in lines]
 
 
+def wall_s(entry: dict[str, Any]) -> float:
+    """Wall time of a line."""
+    return datetime.fromisoformat(entry["wall"]).timestamp()
+
+
 def first_after(run: Run, at_s: float, process: str, event: str) -> float:
     """Seconds from a wall time to the first line of a process that begins so."""
     for entry in log_of(run):
         if entry["process"] == process and entry["event"].startswith(event):
-            after_s = datetime.fromisoformat(entry["wall"]).timestamp() - at_s
+            after_s = wall_s(entry) - at_s
             if after_s >= 0.0:
                 return after_s
     raise AssertionError(f"{process} has not said {event!r}")

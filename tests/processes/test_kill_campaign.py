@@ -48,7 +48,6 @@ def campaign(rng: random.Random, run: Run, kills: int, figures: dict[str, Any]) 
             figures["kills"] += 1
             if name == "main" and not is_hung:
                 figures["held_ms"].append(1e3 * first_after(run, at_s, "dataloop", "controller lost"))
-            if name == "main":
                 figures["mains"].append(at_s)
         figures["acknowledged"] = acknowledged
 

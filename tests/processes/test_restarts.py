@@ -11,7 +11,7 @@ import psutil
 import pytest
 
 from tests.processes.conftest import NO_CALIBRATION, Run
-from tests.processes.killing import child, first_after, log_of, robot_record, send
+from tests.processes.killing import child, first_after, log_of, robot_record, send, wall_s
 
 Start = Callable[..., Run]
 Measured = Callable[[str, float], None]
@@ -63,6 +63,7 @@ def test_main_and_danger_are_killed_and_the_survey_goes_on(start: Start, measure
     measured("P1", 1e3 * first_after(run, main_s, "dataloop", "controller lost"))
 
 
+@pytest.mark.slow
 @pytest.mark.fault("E6")
 def test_the_laser_system_is_killed_and_the_survey_goes_on(start: Start) -> None:
     run = start("--panels", "1", *NO_CALIBRATION)
@@ -98,6 +99,7 @@ def test_a_main_loop_that_is_stopped_and_goes_on_decides_nothing_by_old_frames(
     measured("P6", 1e3 * first_after(run, at_s, "danger", "verdict"))
 
 
+@pytest.mark.slow
 @pytest.mark.fault("P7")
 def test_a_main_loop_that_hangs_is_killed_and_another_one_goes_on(start: Start) -> None:
     run = start("--panels", "1", *NO_CALIBRATION)
@@ -123,7 +125,8 @@ def test_a_main_loop_that_always_dies_ends_the_run_held(start: Start) -> None:
     assert "Traceback" not in run.stderr
 
 
-@pytest.mark.fault("P1", "O3")
+@pytest.mark.slow
+@pytest.mark.fault("P1")
 def test_an_abort_and_a_pause_survive(start: Start) -> None:
     run = start("--panels", "4", *NO_CALIBRATION)
     run.until(lambda status: status["done"] >= 2)
@@ -138,6 +141,39 @@ def test_an_abort_and_a_pause_survive(start: Start) -> None:
     send(run, "main")
     until_another(run, "danger", danger_pid)
     assert run.wait() == 3, run.stderr
+
+
+HALF_OPEN = """
+[[link]]
+type = "black_hole"
+direction = "both"
+at_s = 4.0
+for_s = 1.0
+
+[[link]]
+type = "black_hole"
+direction = "to_client"
+at_s = 16.0
+for_s = 1.0
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.fault("L2", "L14")
+def test_a_link_that_is_open_and_dead_is_joined_again(start: Start, tmp_path: Path, measured: Measured) -> None:
+    plan = tmp_path / "plan.toml"
+    plan.write_text(HALF_OPEN)
+    run = start("--panels", "1", "--realtime", "--faults", str(plan))
+    assert run.wait(180.0) == 0, run.stderr
+    assert run.stderr.count("robot link lost: no sensors frame for") == 2
+    assert run.stderr.count("again") >= 2
+    assert run.summary["points"]["measured"] == 9
+    assert run.summary["danger"]["falls"] == 0
+    log = log_of(run)
+    begun_s = next(wall_s(e) for e in log if e["event"].startswith("fault begins: link black_hole"))
+    noticed_s = next(wall_s(e) for e in log if e["process"] == "danger" and e["event"] == "sensors stale")
+    assert all(e["samples"] > 0 for e in log if e["event"].startswith("fault injected"))
+    measured("L2", 1e3 * (noticed_s - begun_s))
 
 
 @pytest.fixture
@@ -186,7 +222,9 @@ def test_a_service_that_is_started_anew_waits_for_an_operator(
 
 
 @pytest.mark.fault("P23")
-@pytest.mark.parametrize("state", ["driving", "measuring", "held"])
+@pytest.mark.parametrize(
+    "state", ["driving", *(pytest.param(state, marks=pytest.mark.slow) for state in ("measuring", "held", "turning"))]
+)
 def test_terminated_in_each_state(start: Start, measured: Measured, state: str) -> None:
     run = start("--panels", "1", "--realtime")
     until_driving(run, 0)
