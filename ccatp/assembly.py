@@ -1,6 +1,6 @@
 """Pure. Assembles the parts of a main loop from a configuration, for the daemon and for rehearsals alike."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from math import hypot
 
@@ -9,7 +9,7 @@ from ccatp.control.gate import DriveGate
 from ccatp.errors import ConfigError
 from ccatp.localizer import FOUR_STATE, Localizer, build_localizer
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.mission import Mission, PlanHome, PlanRest
+from ccatp.mission import Mission, PlanHome, PlanPoints, PlanRest
 from ccatp.planning.bound import path_time
 from ccatp.planning.calibration import plan_calibration
 from ccatp.planning.route import Route, plan_rejoin, plan_route, with_prelude
@@ -85,11 +85,10 @@ def assemble(cfg: Config, done: Collection[PointId] = (), recovery: Recovery | N
     if recovery is None and cfg.run.filter not in FOUR_STATE:  # they have no states that the drive could calibrate
         drive = plan_calibration(mirror, cfg.robot, cfg.mission, mirror.base_pose)
         route = with_prelude(mirror, route, drive, cfg.limits, mirror.base_pose, measuring_s)
-    robot = cfg.robot
     localizer = _build_localizer(cfg, mirror, recovery)
     # No drive shows the four states their heading: the fix does not reach it.
     heading_sigma_of = float if cfg.run.filter in FOUR_STATE else lambda: localizer.heading_sigma_rad
-    planners = _home_planner(cfg, mirror), _rest_planner(cfg, mirror)
+    planners = _home_planner(cfg, mirror), _rest_planner(cfg, mirror), _points_planner(cfg, mirror)
     mission = Mission(cfg, mirror, route, *planners, heading_sigma_of)
     if recovery is not None:
         mission.take_over(recovery)
@@ -98,12 +97,26 @@ def assemble(cfg: Config, done: Collection[PointId] = (), recovery: Recovery | N
         mirror=mirror,
         localizer=localizer,
         mission=mission,
-        gate=DriveGate(cfg.limits, robot.wheel_radius_m, robot.wheel_base_m, robot.max_wheel_rad_s, robot.wheel_lag_s),
+        gate=build_gate(cfg),
         route=route,
         points=tuple(points),
         already_done=len(set(done)),
         elapsed_s=0.0 if recovery is None else recovery.elapsed_s,
         lower_bound_s=path_time(route.stops, mirror.base_pose, cfg.limits, mirror, measuring_s),
+    )
+
+
+def build_gate(cfg: Config) -> DriveGate:
+    """The last gate before the wheels."""
+    robot = cfg.robot
+    return DriveGate(
+        cfg.limits,
+        robot.wheel_radius_m,
+        robot.wheel_base_m,
+        robot.max_wheel_rad_s,
+        robot.wheel_lag_s,
+        cfg.mission.verdict_timeout_s,
+        robot.sensors_timeout_s,
     )
 
 
@@ -123,6 +136,14 @@ def _rest_planner(cfg: Config, mirror: Mirror) -> PlanRest:
     def plan(route: Route, start: DeckPose, skip: Collection[PointId]) -> Route:
         measuring_s = cfg.etalon.measuring_time_s
         return plan_rejoin(mirror, route, cfg.robot, cfg.limits, cfg.mission, start, skip, measuring_s)
+
+    return plan
+
+
+def _points_planner(cfg: Config, mirror: Mirror) -> PlanPoints:
+    def plan(start: DeckPose, points: Sequence[PointId]) -> Route:
+        measuring_s = cfg.etalon.measuring_time_s
+        return plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, start, (), measuring_s)
 
     return plan
 

@@ -1,10 +1,8 @@
-"""Pure. Whether a run is alive: both loops are heard of, have joined the robot, and get its frames, and fresh ones."""
+"""Pure. Whether a run is alive: both loops are heard of, have joined the robot, and get its frames."""
 
 from ccatp.wire.topics import BY_NAME, Presence
 
 LOOPS = ("main", "danger")
-# Quartz clocks differ by some 1e-5; a hundred times that hides no stall.
-CLOCK_DRIFT = 1e-3
 STALE_AFTER_S = min(BY_NAME[f"presence.{name}"].stale_after_s for name in LOOPS)
 
 
@@ -48,35 +46,3 @@ class Liveness:
                 if presence.frame_age_s + age_s > self._stale_after_s:
                     return f"{name} had its last frame from the robot {presence.frame_age_s + age_s:.1f} s ago"
         return ""
-
-
-class FrameAge:
-    """How old frames are when they are served, by the clocks of both ends.
-
-    The quickest frame so far is taken for fresh. A process that was stopped, or a link that was stalled, finds frames
-    waiting that come one after the other and are all old: no decision may rest on them.
-    """
-
-    def __init__(self) -> None:
-        """No frame yet."""
-        self._offset_s: float | None = None
-        self._t_s = 0.0
-
-    def restart(self) -> None:
-        """The robot's clock counts anew."""
-        self._offset_s = None
-
-    def age_s(self, t_s: float, now_s: float) -> float:
-        """Age of a frame.
-
-        Args:
-            t_s: its time by the robot's clock.
-            now_s: time of the machine's monotonic clock.
-        """
-        offset_s = now_s - t_s
-        known_s = self._offset_s
-        # The two clocks may drift apart: what was quickest an hour ago says little.
-        slack_s = CLOCK_DRIFT * max(t_s - self._t_s, 0.0)
-        self._t_s = t_s
-        self._offset_s = best_s = offset_s if known_s is None else min(offset_s, known_s + slack_s)
-        return offset_s - best_s

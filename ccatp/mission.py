@@ -9,9 +9,11 @@ from ccatp.planning.errors import PlanError
 from ccatp.planning.route import Route
 from ccatp.samples import DeckPose, EventCode, PointId, Stop, StopKind, Verdict
 from ccatp.surveying.alignment import Aligner
+from ccatp.surveying.budget import TimeBudget
 from ccatp.surveying.correction import Corrector
 from ccatp.surveying.homing import Homing
 from ccatp.surveying.journey import Journey, Motion
+from ccatp.surveying.leftovers import Leftovers
 from ccatp.surveying.missed_point import MissedPoint
 from ccatp.surveying.orders import STAND, Order
 from ccatp.surveying.recovery import Recovery
@@ -35,6 +37,9 @@ from ccatp.surveying.stopover import Stopover
 NORMAL, NEAR_EDGE, ABORTED = EventCode
 PlanHome = Callable[[DeckPose], tuple[Stop, ...]]
 PlanRest = Callable[[Route, DeckPose, Collection[PointId]], Route]
+PlanPoints = Callable[[DeckPose, Sequence[PointId]], Route]
+# Nothing moves while the ground shakes.
+EARTHQUAKE = "emergency:earthquake"
 
 
 class Mission:
@@ -49,7 +54,11 @@ class Mission:
         route: the route of the survey.
         plan_home: gives the stops from a pose to base.
         plan_rest: gives the way back to a route from a pose, without the points that are done with.
+        plan_points: gives a route through points from a pose; without it what failed once is not tried again.
         heading_sigma_of: how well the heading is known, rad; asked after the robot was out of sight.
+
+    Attributes:
+        wants_full_fans: something happened after which the robot shall be pressed on with all that the fans have.
     """
 
     def __init__(
@@ -59,10 +68,21 @@ class Mission:
         route: Route,
         plan_home: PlanHome,
         plan_rest: PlanRest,
+        plan_points: PlanPoints | None = None,
         heading_sigma_of: Callable[[], float] = float,
     ) -> None:
         """Idle at base."""
         self._cfg, self._mirror, self._plan_home, self._plan_rest = cfg, mirror, plan_home, plan_rest
+        self._plan_points = plan_points
+        self._points = tuple(stop.point for stop in route.stops if stop.point is not None)
+        self._leftovers = Leftovers()
+        measuring_s = cfg.etalon.measuring_time_s
+        self._budget = (
+            TimeBudget(cfg.run.budget_s, mirror, cfg.limits, measuring_s) if cfg.mission.holds_to_budget else None
+        )
+        self._is_review_due = False
+        self._bar = ""
+        self.wants_full_fans = False
         self._tracker = LegTracker(cfg.control, cfg.limits, cfg.robot.wheel_lag_s)
         self._is_steered_bare = not (cfg.control.predicts_delay and cfg.control.compensates_creep)
         self._route = route
@@ -92,13 +112,27 @@ class Mission:
 
     @property
     def is_paused(self) -> bool:
-        """Held until somebody resumes."""
-        return self.state is State.HELD and self._is_held_by_hand
+        """Held until somebody resumes, or says that an earthquake is over."""
+        return self.state is State.HELD and (self._is_held_by_hand or bool(self._bar))
+
+    @property
+    def is_lost(self) -> bool:
+        """The pose is known to be wrong, and is to be found again; at the start it is only to be confirmed."""
+        return self._is_lost and not self._is_at_start
 
     @property
     def eta_s(self) -> float:
         """Least time that the rest of the survey takes, s."""
         return self._route.remaining_s(self.survey.index)
+
+    @property
+    def left_out(self) -> dict[PointId, str]:
+        """Points that are skipped, or that will not be measured any more, and why."""
+        out = dict(self._leftovers.causes)
+        if self.state is State.DONE:
+            why, over = self.cause or str(self.outcome), {*self.done, *out}
+            out |= {point: why for point in self._points if point not in over}
+        return out
 
     @property
     def corrections(self) -> int:
@@ -145,6 +179,8 @@ class Mission:
         """Go on after a hold."""
         if self.state is not State.HELD:
             return f"the mission is not held but {self.state}"
+        if self._bar:
+            return f"{self._bar}: nothing moves until that is cleared"
         self._go_on()
         return None
 
@@ -154,6 +190,8 @@ class Mission:
             return "the mission is over"
         is_news = self._abort_cause is None
         self._abort_cause = self._abort_cause or cause
+        if self._bar:
+            return None  # home, but not before the robot may move
         # An edge outranks an abort: the retreat and its fix come first.
         if self.state is State.HELD or (is_news and self.state is not State.BACKING_OFF and not self._is_lost):
             self._go_on()
@@ -232,6 +270,7 @@ class Mission:
         if point is None:
             self.fault(f"the robot cannot be found again: {cause}")
             return
+        self._leftovers.failed(point, cause)
         limit = self._cfg.mission.failed_points_before_hold
         self._failures += 1
         if self._failures < limit:
@@ -248,14 +287,21 @@ class Mission:
             self._go_on()
 
     def _leave_stop(self, point: PointId | None, record: list[PointId]) -> None:
-        was_awaited = self.is_awaiting_fix
+        goes_on = self.is_awaiting_fix
         stop = self.survey.current
         # A pause may come while the fix is being committed: the point counts all the same.
         if point is not None and stop is not None and stop.point == point:
+            if point in self.skipped:
+                self.skipped.remove(point)
             record.append(point)
+            if record is self.done:
+                self._leftovers.measured(point)
+            self._is_review_due = self._budget is not None
             self._backoffs = 0
             self.survey.advance()
-        if was_awaited:
+            # So it does where the robot was pushed meanwhile and waits to be measured anew: there is no need any more.
+            goes_on |= self.state in (SETTLING, MEASURING)
+        if goes_on:
             self._go_on()
 
     # -- the frame ------------------------------------------------------------------------------------------------
@@ -270,12 +316,14 @@ class Mission:
         if self._is_steered_bare:
             control = self._cfg.control
             motion = motion.with_only(ahead=control.predicts_delay, creep=control.compensates_creep)
+        if self._budget is not None:
+            self._budget.begin(motion.t_s)
         self._react(motion, verdict)
         state = self.state
         if state is DRIVING or state is TURNING:
             return self._travel(motion)
         if state is MEASURING:
-            return Order(STAND.twist, measure=True) if self._stopover.is_due(motion) else STAND
+            return self._stand(motion)
         if state is SETTLING:
             return self._settle(motion)
         if state is RETURNING:
@@ -285,6 +333,10 @@ class Mission:
         return STAND
 
     def _react(self, motion: Motion, verdict: Verdict | None) -> None:
+        if verdict is not None and verdict.signal == EARTHQUAKE:
+            self._stand_fast(verdict.cause)
+            return
+        self._bar = ""
         if verdict is None or not (verdict.forward and verdict.reverse and verdict.turn):
             if verdict is not None and verdict.code is NEAR_EDGE:
                 self._meet_edge(motion, verdict)
@@ -299,6 +351,16 @@ class Mission:
             self.abort(verdict.cause)
         if self.state is IDLE or (self.state is HELD and not self._is_held_by_hand):
             self._go_on()
+
+    def _stand_fast(self, cause: str) -> None:
+        """An earthquake: pressed on, held, and home when it is over; a pose from before is not to be trusted then."""
+        self.wants_full_fans = True
+        if self._bar or self.state is State.DONE:
+            return
+        self._bar = self._emergency = cause
+        self._abort_cause = self._abort_cause or cause
+        self._is_lost, self._is_at_start = True, False
+        self._hold(cause, by_hand=self.state is State.HELD and self._is_held_by_hand)
 
     def _meet_edge(self, motion: Motion, verdict: Verdict) -> None:
         if self.state in (State.BACKING_OFF, State.DONE):
@@ -345,12 +407,20 @@ class Mission:
             self.cause = self._abort_cause
             self._home = None  # planned anew from where the robot is now
             self._apply(Event.GO_HOME)
-        elif self.survey.current is None:
+        elif self.survey.current is None and not self._has_more():
             self.outcome = Outcome.COMPLETE
             self._apply(Event.FINISHED)
         else:
             self.cause = ""
             self._apply(Event.GO_ON)
+
+    def _has_more(self) -> bool:
+        """Whether points are due away from the planned route: those that failed once, or a thinned rest."""
+        if self._plan_points is None:
+            return False
+        self._leftovers.begin_second_round()
+        self._is_off_route |= bool(self._leftovers.due)
+        return bool(self._leftovers.due)
 
     # -- moving and measuring -------------------------------------------------------------------------------------
 
@@ -366,6 +436,8 @@ class Mission:
     def _travel(self, motion: Motion) -> Order:
         if self._is_lost:
             return self._align(motion)
+        if self._is_review_due and self._is_out_of_time(motion):
+            return STAND
         survey = self.survey
         stop = survey.current
         if stop is not None and not self._missed.follows_route(motion, stop, survey):
@@ -414,8 +486,12 @@ class Mission:
 
     def _find_route(self, motion: Motion) -> Order:
         """Plan anew from where the robot is; one frame of standing still, however long that takes."""
+        due = self._leftovers.chunk
         try:
-            self._route = self._plan_rest(self._route, motion.deck, {*self.done, *self.skipped})
+            if due and self._plan_points is not None:
+                self._route = self._plan_points(motion.deck, due)
+            else:
+                self._route = self._plan_rest(self._route, motion.deck, {*self.done, *self.skipped})
         except PlanError as error:
             self.fault(f"no way on: {error}")
             return STAND
@@ -423,14 +499,40 @@ class Mission:
         self.survey = self._journey(self._route.stops)
         return STAND
 
+    def _is_out_of_time(self, motion: Motion) -> bool:
+        """Review the budget after a point: whether it is time to go home; what does not fit is left out."""
+        self._is_review_due = False
+        if self._budget is None:
+            return False
+        stops = self.survey.stops[self.survey.index :]
+        left = self._leftovers.due or [stop.point for stop in stops if stop.point is not None]
+        going_on = self._budget.review(motion.t_s, motion.deck, left)
+        if going_on is None:
+            self._abort_cause = self._abort_cause or f"the time budget of {self._budget.budget_s:g} s is used up"
+            self._go_on()
+            return True
+        if going_on is not left:
+            self._leftovers.thin_out(left, going_on, "no time for it")
+            self._is_off_route = True
+        return False
+
     def _settle(self, motion: Motion) -> Order:
         stopover = self._stopover
         if stopover.has_settled(motion):
             self._apply(Event.SETTLED)
             return Order(STAND.twist, at_rest=True, arrived=stopover.arrival_at(self.measuring_point))
-        if stopover.is_restless(motion.t_s):
-            self.fault(f"the robot does not come to rest: {motion.speed_m_s:.4f} m/s, {motion.rate_rad_s:.4f} rad/s")
+        self._check_rest(motion)
         return STAND
+
+    def _stand(self, motion: Motion) -> Order:
+        if self._stopover.is_due(motion):
+            return Order(STAND.twist, measure=True)
+        self._check_rest(motion)
+        return STAND
+
+    def _check_rest(self, motion: Motion) -> None:
+        if self._stopover.is_restless(motion.t_s):
+            self.fault(f"the robot does not come to rest: {motion.speed_m_s:.4f} m/s, {motion.rate_rad_s:.4f} rad/s")
 
     # -- edge and home --------------------------------------------------------------------------------------------
 
@@ -440,6 +542,8 @@ class Mission:
             self._go_on()
             return STAND
         twist = retreat.step(motion, verdict)
+        if retreat.step_at is Step.TURN_AWAY and self._abort_cause is not None:
+            retreat.step_at = Step.OVER  # there is no route to turn to; the way home begins from here
         if retreat.step_at is Step.STUCK:
             self.fault("stuck at the edge: no motion away from it is permitted, or none helps")
             return STAND

@@ -18,6 +18,7 @@ from ccatp.wire.robot import (
     Hello,
     Join,
     Joined,
+    LineBudget,
     LineBuffer,
     LineTooLong,
     Refused,
@@ -35,6 +36,10 @@ from ccatp.wire.robot import Fans as FansMessage
 # Commands wait in the kernel or not at all: what piles up here is stale before it arrives.
 MAX_UNSENT_BYTES = 4096
 # A dead peer is noticed within seconds: unacknowledged data for 1000 ms, or silence for 1 s and 3 probes of 1 s.
+# A robot in real time that sends more lines than this is flooding us. What piles up while the link is stuck may come at
+# once: half a minute of frames, which is as long as a stall may last; then three times what it should send.
+BACKLOG_S = 30.0
+FLOOD_FACTOR = 3.0
 LINUX_OPTIONS = {"TCP_USER_TIMEOUT": 1000, "TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
 
 
@@ -132,6 +137,7 @@ class RobotLink(asyncio.Protocol):
         self._is_joined = self._is_closing = self._is_paused = False
         self._lines = LineBuffer()
         self._bad = BadLineCounter()
+        self._budget: LineBudget | None = None
         self._last_seq = -1
         self._why = ""
 
@@ -186,6 +192,8 @@ class RobotLink(asyncio.Protocol):
             lines = self._lines.feed(data)
         except LineTooLong as error:
             lines, is_too_long = error.lines, True
+        if self._budget is not None and not self._budget.take(len(lines), asyncio.get_running_loop().time()):
+            self._end("a flood of lines from the robot")
         for line in lines:
             if self._is_closing or self._why:
                 return
@@ -243,6 +251,9 @@ class RobotLink(asyncio.Protocol):
             self._answer(message, joining)
         elif isinstance(message, Joined) and self._hello is not None and message.role == self._role:
             self._is_joined = True
+            if not self._hello.lockstep:  # there it is we who set the pace
+                rate_hz = self._hello.frame_hz
+                self._budget = LineBudget(BACKLOG_S * rate_hz, FLOOD_FACTOR * rate_hz)
             joining.set_result(self._hello)
             self._on_joined(self._hello)
         else:

@@ -8,13 +8,14 @@ import signal
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
+from typing import TextIO, cast
 
 import structlog
 
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
 from ccatp.errors import CcatpError
+from ccatp.processes.log_stream import LogStream
 
 PR_SET_PDEATHSIG = 1
 # The copy of the fault plan in the run directory.
@@ -102,7 +103,7 @@ def die_with_parent() -> None:
 
 def open_log(path: Path, process: str) -> structlog.typing.FilteringBoundLogger:
     """A logger that appends one JSON object per line to ``path``; several processes may share the file."""
-    stream: TextIO = path.open("a", buffering=1, encoding="utf-8")
+    stream = cast(TextIO, LogStream(path, process))
     structlog.configure(
         processors=[
             structlog.processors.add_log_level,

@@ -12,7 +12,7 @@ import zmq.asyncio
 from ccatp.bus import Publisher, Subscriber
 from ccatp.danger import DangerMonitor
 from ccatp.errors import CcatpError
-from ccatp.liveness import FrameAge
+from ccatp.frame_lag import FrameLag
 from ccatp.mirror.mirror import build_mirror
 from ccatp.processes import realtime, spinning
 from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
@@ -57,9 +57,9 @@ class DangerLoop:
         self._permit_seq = 0
         self._t_s = 0.0
         self._is_stale = False
+        self._lag = FrameLag(cfg.robot.slip_after_s)
         self._is_taking_over = args.is_taking_over
         self._hello: Hello | None = None
-        self._age = FrameAge()
         self.lasting = LastingLink(
             cfg.robot,
             role="monitor",
@@ -108,8 +108,8 @@ class DangerLoop:
         if before is not None and before.boot != hello.boot:
             self.monitor.reset()
             self._estimate, self._seq, self._first_seq = None, -1, -1
+        self._lag.forget()
         self._pulse.phase, self._pulse.frame_s = "joined", time.monotonic()
-        self._age.restart()
         self.log.info("joined", port=self._cfg.robot.port, lockstep=hello.lockstep, session=self.lasting.sessions)
 
     def on_sensors(self, sensors: Sensors, _raw: bytes) -> None:
@@ -128,8 +128,8 @@ class DangerLoop:
             print(f"ccatp danger: internal error: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
             self.lost.set()
             return
-        if not self._is_lockstep and self._age.age_s(sensors.t, time.monotonic()) > self._cfg.danger.stale_after_s:
-            verdict = self.monitor.stale(sensors.seq, sensors.t)  # it has waited for us, or on its way
+        if not self._is_lockstep and self._lag.served(sensors.t, time.monotonic()) > self._cfg.danger.stale_after_s:
+            verdict = self.monitor.stale(sensors.seq, sensors.t)  # it saw the past: no permit for the present
         self._give(verdict, sensors.seq)
 
     def _give(self, verdict: Verdict, ack: int) -> None:

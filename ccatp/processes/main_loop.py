@@ -9,15 +9,19 @@ import zmq.asyncio
 
 from ccatp.assembly import Parts
 from ccatp.bus import Publisher
+from ccatp.control.fan_gate import FanGate
 from ccatp.control.gate import DriveGate
 from ccatp.errors import CcatpError, ConfigError, ExitStatus, UnreachableError
 from ccatp.etalon_client import EtalonClient, EtalonError
+from ccatp.frame_lag import FrameLag
 from ccatp.localizer import Localizer
+from ccatp.metrology.scrutiny import Scrutiny
 from ccatp.mirror.mirror import Mirror
 from ccatp.mission import Mission
 from ccatp.processes import realtime, spinning
 from ccatp.processes.building import build_parts
 from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
+from ccatp.processes.gate_watch import GateWatch
 from ccatp.processes.hearing import VerdictEar
 from ccatp.processes.joining import LastingLink
 from ccatp.processes.keeping import Keeper
@@ -27,10 +31,15 @@ from ccatp.processes.pulse import PERIOD_S, Pulse
 from ccatp.processes.seat import Seat
 from ccatp.processes.telling import Teller
 from ccatp.router import Router
+from ccatp.samples import Verdict
 from ccatp.store import MissionStore
+from ccatp.surveying.budget import home_time_s
 from ccatp.surveying.journey import Motion
-from ccatp.surveying.orders import Order
-from ccatp.surveying.states import Outcome, State
+from ccatp.surveying.leftovers import by_reason
+from ccatp.surveying.mirror_check import MirrorCheck
+from ccatp.surveying.orders import STAND, Order
+from ccatp.surveying.states import PURPOSES, Outcome, State
+from ccatp.surveying.vigil import Call, Vigil
 from ccatp.wire.robot import Hello, Sensors
 from ccatp.wire.topics import MissionStatus
 
@@ -43,6 +52,7 @@ EXIT_STATUS = {
 WAIT_PERIOD_S = 0.02
 # Of a robot that moved nobody knows where it is when the samples of more frames than this are missing.
 UNSEEN_S = 0.1
+FULL_FANS = (1.0, 1.0)
 # After the end the last messages must reach the supervisor, which then ends this process.
 FAREWELL_S = 5.0
 
@@ -81,9 +91,22 @@ class MainLoop:
             context, args.endpoints.of("danger"), cfg.mission.verdict_timeout_s, self._pulse.tell_if_due
         )
         self._teller = Teller(self._publisher, open_log(args.run_dir / "log.jsonl", "main"))
+        self._gate_watch = GateWatch(self._gate, self._teller.say)
+        self._fan_gate = FanGate(0.0)
+        self._lag_s = 0.0
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m)
         self._measuring = MeasuringDesk(
-            cfg.mission, self._etalon, parts.localizer, parts.mission, store, self._teller, self._answer_held_frame
+            cfg.mission,
+            self._etalon,
+            Scrutiny(parts.mirror, cfg),
+            parts.localizer,
+            parts.mission,
+            store,
+            self._teller,
+            self._answer_held_frame,
+            lambda: (
+                0.0 if self._seat.is_lockstep else cfg.etalon.measuring_time_s
+            ),  # lockstep time stands still meanwhile
         )
         self._link = LastingLink(
             cfg.robot,
@@ -102,8 +125,12 @@ class MainLoop:
         self._elapsed_s = parts.elapsed_s  # before ``_t_first_s``
         self._failure: Exception | None = None
         self._seq = -1
+        self._lag = FrameLag(cfg.robot.slip_after_s)
+        self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
         self._unanswered: int | None = None
         self._state = State.IDLE
+        self._vigil = Vigil(cfg.mission, falls=parts.mirror.overhang)
+        self._has_full_fans = False
         self.over = asyncio.Event()
         self.exit_status = EXIT_STATUS[Outcome.NONE]
 
@@ -161,6 +188,8 @@ class MainLoop:
         has_booted = self._seat.has_booted(hello)
         text = self._seat.begin(hello)
         self._keeper.boot = hello.boot
+        self._fan_gate = FanGate(hello.robot.fan_floor if self._mirror.overhang else 0.0)
+        self._lag.forget()
         self._pulse.phase, self._pulse.frame_s = "joined", time.monotonic()
         self._teller.say("info", text)
         if has_booted:
@@ -189,6 +218,7 @@ class MainLoop:
 
     def _hold_wheels(self) -> None:
         self._seat.drive(self._seq, 0.0, 0.0)
+        self._teller.log.info("gate", denied=self._gate_watch.counts, fans_refused=self._fan_gate.refused)
         self._keep()
         self._teller.flush()
         self._teller.status(self.status())
@@ -275,14 +305,11 @@ class MainLoop:
             return
         motion = self._motion(sensors, dt_s)
         waiting = time.perf_counter()
-        verdict = (
-            None
-            if is_unjudged or self._seat.is_old(t_s)
-            else self._ear.hear(seq, self._seat.frame_period_s, is_lockstep=self._seat.is_lockstep)
-        )
+        verdict = None
+        if not is_unjudged:
+            verdict = self._ear.hear(seq, self._seat.frame_period_s, is_lockstep=self._seat.is_lockstep)
         heard = time.perf_counter()
-        order = self._mission.step(motion, verdict)
-        right, left = self._gate.pass_through(order.twist, verdict, dt_s)
+        order, right, left = self._decide(sensors, motion, None if self._is_late(t_s) else verdict)
         if order.at_rest or order.measure:
             self._execute(order, motion)
         if self._may_answer():
@@ -295,13 +322,65 @@ class MainLoop:
             self._on_state()
         self._teller.tick(1e6 * (time.perf_counter() - heard + waiting - start))
 
+    def _decide(self, sensors: Sensors, motion: Motion, verdict: Verdict | None) -> tuple[Order, float, float]:
+        """What the mission wants, and the wheel rates (right, left), rad/s, that the gate lets through."""
+        mission = self._mission
+        order = mission.step(motion, verdict) if self._is_on_mirror(sensors) else STAND
+        if mission.wants_full_fans and not self._has_full_fans:
+            self._has_full_fans = True
+            self._send_fans()  # pressed on first, held then
+        if mission.is_faulted:
+            self._keep_vigil(sensors)
+        right, left = self._gate.pass_through(
+            order.twist, verdict, motion.dt_s, motion.t_s, self._lag_s, PURPOSES[mission.state]
+        )
+        self._gate_watch.look(motion.t_s)
+        return order, right, left
+
     def _begin_session(self, dt_s: float) -> None:
         """Before the first drive and not on joining, so that in lockstep the fans start in a certain frame."""
         self._seat.is_new_session = False
-        self._seat.start_fans()
+        self._send_fans()
         if self._t_first_s is not None and dt_s > UNSEEN_S and not self._was_quiet:
             self._teller.say("warning", f"the robot moved and was out of sight for {dt_s:.2f} s: it is found again")
             self._mission.lose_sight()
+
+    def _send_fans(self) -> None:
+        duty = FULL_FANS if self._has_full_fans else self._cfg.robot.fan_duty
+        refusal = self._fan_gate.refusal(*duty)
+        if refusal is None:
+            self._seat.send_fans(duty)
+        else:
+            self._teller.say("error", refusal)
+            self._mission.fault(refusal)
+
+    def _is_late(self, t_s: float) -> bool:
+        """Whether the frame is too late to move on: then the mission pauses until frames are prompt again."""
+        self._lag_s = lag_s = 0.0 if self._seat.is_lockstep else self._lag.served(t_s, time.monotonic())
+        if lag_s <= self._cfg.robot.lag_limit_s:
+            return False
+        if self._mission.interrupt(f"a frame was served {1e3 * lag_s:.0f} ms late"):
+            self._teller.log.warning("late frame", seq=self._seq, lag_s=lag_s, limit_s=self._cfg.robot.lag_limit_s)
+        return True
+
+    def _is_on_mirror(self, sensors: Sensors) -> bool:
+        """Whether the robot may move, as far as gravity knows: it stands on the mirror of the configuration.
+
+        In lockstep the mission begins at once, and ends when gravity contradicts: nothing real can be harmed, and a run
+        stays the same function of its seed.
+        """
+        check = self._mirror_check
+        if check is None:
+            return True
+        if check.hear(sensors.t, sensors.gravity, self._localizer.deck_pose):
+            self._mirror_check = None
+            if check.warning:
+                self._teller.say("warning", check.warning)
+        if check.contradiction:
+            self._teller.say("error", check.contradiction)
+            self._finish(ExitStatus.USAGE)
+            return False
+        return self._mirror_check is None or self._seat.is_lockstep
 
     def _motion(self, sensors: Sensors, dt_s: float) -> Motion:
         localizer, echo = self._localizer, sensors.cmd
@@ -310,6 +389,19 @@ class MainLoop:
             (pose.x_m, pose.y_m, pose.heading_rad), v, omega, echo.seq, echo.age, echo.held, creep
         )
         return Motion(sensors.t, dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead, self._sigma_of)
+
+    def _keep_vigil(self, sensors: Sensors) -> None:
+        """A fault that nobody looks after: an alarm now and then, and home before the battery is too low for it."""
+        mission, vigil, pose = self._mission, self._vigil, self._localizer.deck_pose
+        knows_place = not (mission.is_lost or self._localizer.is_frozen)
+        home_s = home_time_s(self._mirror.base_pose, self._cfg.limits, pose.x_m, pose.y_m) if knows_place else None
+        call = vigil.watch(sensors.t, sensors.soc, home_s)
+        if call is Call.REMIND:
+            self._teller.say(
+                "error", f"held for {vigil.held_s(sensors.t):.0f} s, waiting for an operator: {mission.cause}"
+            )
+        elif call is Call.RETURN:
+            mission.abort(f"nobody came, and the battery ({sensors.soc:.0%}) lasts for little more than the way home")
 
     def _execute(self, order: Order, motion: Motion) -> None:
         if order.at_rest:
@@ -354,6 +446,8 @@ class MainLoop:
     def _on_state(self) -> None:
         mission = self._mission
         before, self._state = self._state, mission.state
+        if not mission.is_faulted:
+            self._vigil.over()
         self._teller.log.debug("state", seq=self._seq, before=before, after=mission.state, cause=mission.cause)
         if mission.state in (State.HELD, State.BACKING_OFF) or before is State.HELD:
             self._teller.say("warning", f"{mission.state}: {mission.cause}" if mission.cause else f"{mission.state}")
@@ -395,6 +489,9 @@ class MainLoop:
             outcome=str(mission.outcome),
             lower_bound_s=self._parts.lower_bound_s,
             exit_status=int(self.exit_status) if self.over.is_set() else -1,
+            slips=self._lag.slips,
+            lag_ms=1e3 * self._lag.worst_s,
+            left_out=by_reason(mission.left_out),
         )
 
     def close(self) -> None:

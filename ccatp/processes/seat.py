@@ -1,11 +1,8 @@
 """Glue. The controller's seat at the robot: the session, its numbers, its clock, and the drives on their way."""
 
-import time
-
 from ccatp.config.models import RobotConfig
 from ccatp.control.kinematics import twist_of
 from ccatp.control.prediction import CommandPredictor
-from ccatp.liveness import FrameAge
 from ccatp.processes.joining import LastingLink
 from ccatp.wire.robot import Hello
 
@@ -30,7 +27,6 @@ class Seat:
         self._cfg, self._link, self._is_taking_over = cfg, link, is_taking_over
         self.predictor = CommandPredictor(cfg.wheel_lag_s, 1.0 / frame_hz)
         self._hello: Hello | None = None
-        self._age = FrameAge()
         self._drive_seq = self._fans_seq = 0
         self.is_lockstep = self.is_new_session = False
 
@@ -39,7 +35,6 @@ class Seat:
         before, self._hello, self.is_lockstep = self._hello, hello, hello.lockstep
         self.is_new_session = True
         self.predictor = CommandPredictor(self._cfg.wheel_lag_s, 1.0 / hello.frame_hz)
-        self._age.restart()
         where = f"the robot at {self._cfg.host}:{self._cfg.port}"
         return f"joined {where}{'' if before is None else ' again'}"
 
@@ -57,10 +52,6 @@ class Seat:
         """Danger may have judged the first frame before this session began, and does so once: the next one will do."""
         return self.is_new_session and (self._is_taking_over or self._link.sessions > 1)
 
-    def is_old(self, t_s: float) -> bool:
-        """Whether a frame has waited for us, or on its way: what is decided by it would come too late."""
-        return not self.is_lockstep and self._age.age_s(t_s, time.monotonic()) > self._cfg.sensors_timeout_s
-
     def drive(self, ack: int, right: float, left: float) -> None:
         """Send wheel rates, rad/s, computed from frame ``ack``."""
         self._drive_seq += 1
@@ -68,7 +59,7 @@ class Seat:
         self.predictor.sent(self._drive_seq, twist.v_m_s, twist.omega_rad_s)
         self._link.link.send_drive(self._drive_seq, max(ack, 0), right, left)
 
-    def start_fans(self) -> None:
-        """Send the fans' duties of the configuration."""
+    def send_fans(self, duty: tuple[float, float]) -> None:
+        """Send the fans' duties."""
         self._fans_seq += 1
-        self._link.link.send_fans(self._fans_seq, self._cfg.fan_duty)
+        self._link.link.send_fans(self._fans_seq, duty)

@@ -102,7 +102,9 @@ class Teller:
 
     def arrival(self, seq: int, t_s: float, point: PointId, error_m: float) -> None:
         """The robot came to rest in frame ``seq``, at a point for the first time."""
-        message = Arrival(seq=seq, t_s=t_s, point=(point.row, point.col, point.point), error_mm=1e3 * error_m)
+        message = Arrival(
+            seq=seq + self._frames_before, t_s=t_s, point=(point.row, point.col, point.point), error_mm=1e3 * error_m
+        )
         self._publisher.send("arrival", message)
 
     def rest(self, seq: int, t_s: float) -> None:

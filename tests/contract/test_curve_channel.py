@@ -166,6 +166,7 @@ def plain(peer: zmq.asyncio.Socket) -> None:
     peer.setsockopt_string(zmq.PLAIN_PASSWORD, "secret")
 
 
+@pytest.mark.fault("O5")
 async def test_the_listed_get_answers_and_nobody_else_gets_in(site: Site) -> None:
     async with served(site):
         assert await site.ask("observatory") == {"ok": True, "code": 0, "age_s": 0.01}
@@ -198,6 +199,7 @@ async def test_garbage_and_silence_lose_the_connection_and_harm_nobody(site: Sit
         assert (await site.ask("observatory"))["ok"]
 
 
+@pytest.mark.fault("O6")
 async def test_raising_needs_a_place_on_the_list_and_clearing_the_role(site: Site) -> None:
     async with served(site):
         fire = format_request("emergency", kind="fire", id=ID)
@@ -224,6 +226,7 @@ async def test_over_long_requests_are_refused(site: Site) -> None:
         assert reply == {"ok": False, "error": "request of 5000 bytes; at most 4096"}
 
 
+@pytest.mark.fault("O5")
 @pytest.mark.parametrize("ruin", ["", "[clients", "gone"])
 async def test_a_list_that_is_empty_or_unreadable_lets_nobody_in(site: Site, ruin: str) -> None:
     path = site.folder / "clients.toml"

@@ -140,6 +140,11 @@ def config(port: int, **changes: float) -> EtalonConfig:
         "max_residual_m": 5e-4,
         "max_dop": 20.0,
         "max_distance_m": 0.5,
+        "reconnect_for_s": 0.0,
+        "max_surface_residual_m": 0.005,
+        "doubt_nis": 13.8,
+        "repeat_m": 0.001,
+        "start_distance_m": 0.05,
     }
     return EtalonConfig.model_validate({"host": "127.0.0.1", "port": port} | values | changes)
 
