@@ -7,6 +7,8 @@ import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.filters import FILTERS, Filter, FloatArray, Innovation
+from ccatp.health.imu_gate import ImuGate
+from ccatp.health.look import WheelMeans, largest_rate_rad_s
 from ccatp.localization import measurements, survey_model
 from ccatp.localization.four_state import FourStateLocalizer
 from ccatp.localization.full_state import FullStateLocalizer
@@ -106,8 +108,12 @@ def build_localizer(
     name = cfg.run.filter
     start = mirror.base_panel_pose
     # The localizer re-initialises its filter at once; what counts is its size.
+    made: FourStateLocalizer | FullStateLocalizer
     if name in FOUR_STATE:
         n = measurements.STATES
-        return FourStateLocalizer(wrap(FILTERS[name](np.zeros(n), np.eye(n))), mirror, cfg.robot, cfg.localizer, start)
-    n = survey_model.STATES
-    return FullStateLocalizer(wrap(FILTERS[name](np.zeros(n), np.eye(n))), mirror, cfg.robot, cfg.localizer, start)
+        made = FourStateLocalizer(wrap(FILTERS[name](np.zeros(n), np.eye(n))), mirror, cfg.robot, cfg.localizer, start)
+    else:
+        n = survey_model.STATES
+        made = FullStateLocalizer(wrap(FILTERS[name](np.zeros(n), np.eye(n))), mirror, cfg.robot, cfg.localizer, start)
+    made.guard(ImuGate(cfg.health), WheelMeans(cfg.robot), largest_rate_rad_s(cfg.robot))
+    return made

@@ -3,16 +3,17 @@
 from collections.abc import Callable, Collection, Sequence
 
 from ccatp.config.models import Config
-from ccatp.control.tracker import DONE, DRIVE, LegTracker
+from ccatp.control.tracker import DONE, DRIVE
 from ccatp.mirror.mirror import Mirror
 from ccatp.planning.errors import PlanError
 from ccatp.planning.route import Route
-from ccatp.samples import DeckPose, EventCode, PointId, Stop, StopKind, Verdict
+from ccatp.samples import DeckPose, EventCode, PointId, Severity, Stop, StopKind, Verdict
 from ccatp.surveying.correction import Corrector
 from ccatp.surveying.homing import Homing
 from ccatp.surveying.journey import Journey, Motion
 from ccatp.surveying.missed_point import MissedPoint
 from ccatp.surveying.orders import STAND, Order
+from ccatp.surveying.pace import PacedTracker
 from ccatp.surveying.retreat import Retreat, Step
 from ccatp.surveying.states import (
     BACKING_OFF,
@@ -31,6 +32,7 @@ from ccatp.surveying.states import (
 from ccatp.surveying.stopover import Stopover
 
 NORMAL, NEAR_EDGE, ABORTED = EventCode
+NONE, SLOW, HOLD, RETURN, FAULT = Severity.NONE, Severity.SLOW, Severity.HOLD, Severity.RETURN, Severity.FAULT
 PlanHome = Callable[[DeckPose], tuple[Stop, ...]]
 PlanRest = Callable[[Route, DeckPose, Collection[PointId]], Route]
 
@@ -52,7 +54,7 @@ class Mission:
     def __init__(self, cfg: Config, mirror: Mirror, route: Route, plan_home: PlanHome, plan_rest: PlanRest) -> None:
         """Idle at base."""
         self._cfg, self._mirror, self._plan_home, self._plan_rest = cfg, mirror, plan_home, plan_rest
-        self._tracker = LegTracker(cfg.control, cfg.limits, cfg.robot.wheel_lag_s)
+        self._tracker = PacedTracker(cfg.control, cfg.limits, cfg.health, cfg.robot.wheel_lag_s)
         self._is_steered_bare = not (cfg.control.predicts_delay and cfg.control.compensates_creep)
         self._route = route
         self._is_off_route = False
@@ -74,6 +76,10 @@ class Mission:
         self._stopover = Stopover(cfg.control, cfg.etalon.measuring_time_s)
         self._missed = MissedPoint(Corrector(mirror, cfg.robot, cfg.mission))
         self._emergency = ""
+        self._severity = NONE
+        self._recoveries_s: list[float] = []
+        self._stuck_s: float | None = None
+        self.wants_full_fans = False
 
     def _journey(self, stops: Sequence[Stop]) -> Journey:
         return Journey(self._mirror, self._tracker, self._cfg.control.leg_timeout_factor, stops)
@@ -108,9 +114,11 @@ class Mission:
         return None
 
     def resume(self) -> str | None:
-        """Go on after a hold."""
+        """Go on after a hold. What holds the robot must be gone."""
         if self.state is not State.HELD:
             return f"the mission is not held but {self.state}"
+        if self._severity >= HOLD and self._severity is not RETURN:
+            return f"the cause persists: {self.cause}"
         self._go_on()
         return None
 
@@ -140,6 +148,23 @@ class Mission:
         self._is_lost |= is_lost
         self._hold(cause, by_hand=True)
         self.is_faulted = True
+
+    def recover(self, cause: str, t_s: float) -> None:
+        """Hold, and go on with a fix; what comes again and again is a fault.
+
+        Args:
+            cause: why.
+            t_s: now.
+        """
+        if self.state is State.DONE or (self.state is HELD and self._is_held_by_hand):
+            return
+        health = self._cfg.health
+        self._recoveries_s = [since_s for since_s in self._recoveries_s if t_s - since_s <= health.retry_window_s]
+        self._recoveries_s.append(t_s)
+        if len(self._recoveries_s) > 1 + health.retries:
+            self.fault(cause, is_lost=True)
+        else:
+            self._await_recovery(cause)
 
     def interrupt(self, cause: str) -> bool:
         """Hold until frames and verdicts are fresh again; returns whether that was news."""
@@ -247,6 +272,12 @@ class Mission:
         return STAND
 
     def _react(self, motion: Motion, verdict: Verdict | None) -> None:
+        if verdict is not None and (verdict.severity is not NONE or self._severity is not NONE):
+            self._severity = verdict.severity
+            if self._obey(verdict):
+                return
+        if self._stuck_s is not None and self._waits_at_edge(motion.t_s, verdict):
+            return
         if verdict is None or not (verdict.forward and verdict.reverse and verdict.turn):
             if verdict is not None and verdict.code is NEAR_EDGE:
                 self._meet_edge(motion, verdict)
@@ -261,6 +292,53 @@ class Mission:
             self.abort(verdict.cause)
         if self.state is IDLE or (self.state is HELD and not self._is_held_by_hand):
             self._go_on()
+
+    def _obey(self, verdict: Verdict) -> bool:
+        """Do what a finding of the monitors demands; whether that is all for this frame."""
+        severity = verdict.severity
+        self.wants_full_fans |= verdict.full_fans
+        is_denied = not (verdict.forward or verdict.reverse or verdict.turn)
+        if severity is FAULT:
+            if not (self.state is HELD and self.is_faulted):
+                self.fault(verdict.cause, is_lost=True)
+            return True
+        if is_denied and severity >= HOLD:
+            self._await_recovery(verdict.cause)
+            return True
+        self._pace(is_slow=severity in (SLOW, RETURN))
+        if severity is RETURN and verdict.code is not NEAR_EDGE and verdict.cause != self._emergency:
+            self._emergency = verdict.cause
+            self.abort(verdict.cause)
+        return False
+
+    def _await_recovery(self, cause: str) -> None:
+        """Hold until the cause is gone, and then find out where the robot is before moving on."""
+        if self.state is State.DONE or (self.state is HELD and self._is_held_by_hand):
+            return
+        self._is_lost, self._is_at_start = True, False
+        if not self.interrupt(cause):
+            self.cause = cause
+
+    def _pace(self, *, is_slow: bool) -> None:
+        """Drive at the usual or at the reduced speed from now on; the leg begins anew where that changes it."""
+        if is_slow is self._tracker.is_slow:
+            return
+        self._tracker.is_slow = is_slow
+        if self.state in (DRIVING, TURNING, RETURNING):
+            (self.survey if self._home is None else self._home).interrupt()
+
+    def _waits_at_edge(self, t_s: float, verdict: Verdict | None) -> bool:
+        """After a retreat that led nowhere: whether to go on waiting until no sensor hangs over any more."""
+        if self.state is not HELD or self._is_held_by_hand or self._stuck_s is None:
+            self._stuck_s = None
+            return False
+        if verdict is not None and verdict.code is not NEAR_EDGE:
+            self._stuck_s = None
+            return False
+        if t_s - self._stuck_s > self._cfg.health.hold_limit_s:
+            self._stuck_s = None
+            self.fault(self.cause)
+        return True
 
     def _meet_edge(self, motion: Motion, verdict: Verdict) -> None:
         if self.state in (State.BACKING_OFF, State.DONE):
@@ -382,7 +460,8 @@ class Mission:
             return STAND
         twist = retreat.step(motion, verdict)
         if retreat.step_at is Step.STUCK:
-            self.fault("stuck at the edge: no motion away from it is permitted, or none helps")
+            self._hold("stuck at the edge: no motion away from it is permitted, or none helps", by_hand=False)
+            self._stuck_s = motion.t_s
             return STAND
         if retreat.step_at is Step.OVER:
             self._apply(Event.FIND)

@@ -14,6 +14,8 @@ from ccatp.control.kinematics import twist_of
 from ccatp.control.prediction import CommandPredictor
 from ccatp.errors import CcatpError, ExitStatus, UnreachableError
 from ccatp.etalon_client import EtalonClient, EtalonError
+from ccatp.health.commanded import CommandSpan
+from ccatp.health.steady_time import SteadyTime
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror
 from ccatp.mission import Mission
@@ -31,7 +33,7 @@ from ccatp.surveying.journey import Motion
 from ccatp.surveying.orders import Order
 from ccatp.surveying.states import Outcome, State
 from ccatp.wire.robot import Hello, Sensors
-from ccatp.wire.topics import MissionStatus, Presence
+from ccatp.wire.topics import MissionStatus, Presence, is_estimate_due
 
 EXIT_STATUS = {
     Outcome.COMPLETE: ExitStatus.COMPLETE,
@@ -43,6 +45,7 @@ BEAT_PERIOD_S = 0.1
 WAIT_PERIOD_S = 0.02
 # After the end the last messages must reach the supervisor, which then ends this process.
 FAREWELL_S = 5.0
+FULL_FANS = (1.0, 1.0)
 
 
 class MainLoop:
@@ -87,6 +90,10 @@ class MainLoop:
         self._hello: Hello | None = None
         self._is_lockstep = False
         self._phase = "starting"
+        self._time = SteadyTime(cfg.health.clock_jump_s)
+        self._span = CommandSpan()
+        self._driven = (0.0, 0.0)
+        self._has_full_fans = False
         self._t_first_s: float | None = None
         self._t_last_s = 0.0
         self._frame_wall_s = time.monotonic()
@@ -150,6 +157,8 @@ class MainLoop:
 
     def _drive(self, ack: int, right: float, left: float) -> None:
         self._drive_seq += 1
+        self._driven = right, left
+        self._span.add(right, left)
         twist = twist_of(right, left, self._cfg.robot.wheel_radius_m, self._cfg.robot.wheel_base_m)
         self._predictor.sent(self._drive_seq, twist.v_m_s, twist.omega_rad_s)
         self._link.send_drive(self._drive_seq, max(ack, 0), right, left)
@@ -217,17 +226,20 @@ class MainLoop:
     def _serve(self, sensors: Sensors, raw: bytes) -> None:
         start = time.perf_counter()
         t_s, seq = sensors.t, sensors.seq
-        dt_s = t_s - self._t_last_s if self._t_first_s is not None else self._frame_period_s()
+        # What counts durations goes by a time that does not jump; everything else by the robot's own.
+        steady_s = self._time.at(seq, t_s) if seq > self._seq else self._t_last_s
+        dt_s = steady_s - self._t_last_s if self._t_first_s is not None else self._frame_period_s()
         if self._t_first_s is None:
             self._t_first_s = t_s
             # Before the first drive and not on joining, so that in lockstep they start in a certain frame.
             self._link.send_fans(1, self._cfg.robot.fan_duty)
-        self._t_last_s, self._seq, self._frame_wall_s = t_s, seq, time.monotonic()
+        self._t_last_s, self._frame_wall_s = steady_s, time.monotonic()
+        self._seq = max(seq, self._seq)
         localizer = self._localizer
         localizer.step(t_s, sensors.imu, sensors.enc, sensors.edge, sensors.gravity)
         if localizer.hold_requested:
             # A filter that diverged is frozen until it has a fix.
-            self._mission.fault(localizer.hold_cause, is_lost=localizer.is_frozen)
+            self._mission.recover(localizer.hold_cause, steady_s)
             localizer.clear_hold()
         if dt_s <= 0.0:  # counted by the localizer; a controller cannot go back in time
             self._teller.stale_frame(seq, raw)
@@ -238,14 +250,18 @@ class MainLoop:
         verdict = self._ear.hear(seq, self._frame_period_s(), is_lockstep=self._is_lockstep)
         heard = time.perf_counter()
         order = self._mission.step(motion, verdict)
+        if self._mission.wants_full_fans and not self._has_full_fans:
+            self._has_full_fans = True
+            self._link.send_fans(2, FULL_FANS)
         right, left = self._gate.pass_through(order.twist, verdict, dt_s)
         if order.at_rest or order.measure:
             self._execute(order, motion)
+        told = (self._span.take(*self._driven), self._drive_seq) if is_estimate_due(seq) else None
         if self._may_answer():
             self._drive(seq, right, left)
         else:
             self._unanswered = seq
-        self._teller.frame(seq, t_s, localizer, self._mission.state, raw)
+        self._teller.frame(seq, t_s, localizer, self._mission.state, raw, told)
         if self._mission.state is not self._state:
             self._on_state()
         self._teller.tick(1e6 * (time.perf_counter() - heard + waiting - start))
@@ -256,7 +272,7 @@ class MainLoop:
         ahead = self._predictor.ahead(
             (pose.x_m, pose.y_m, pose.heading_rad), v, omega, echo.seq, echo.age, echo.held, creep
         )
-        return Motion(sensors.t, dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead, self._sigma_of)
+        return Motion(self._t_last_s, dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead, self._sigma_of)
 
     def _frame_period_s(self) -> float:
         return 1.0 / self._hello.frame_hz if self._hello is not None else 0.01
@@ -272,8 +288,10 @@ class MainLoop:
         if order.measure:
             pose = self._localizer.deck_pose
             expected = self._mirror.puck_world(pose, self._cfg.robot.puck_height_m)
+            # The localizer dates a fix by the robot's own clock.
+            t_s = motion.t_s - self._time.offset_s
             number, point = self._mission.request, self._mission.measuring_point
-            self._measuring.begin(Request(number, motion.t_s, point, expected, pose))
+            self._measuring.begin(Request(number, t_s, point, expected, pose))
 
     def _is_quiet(self) -> bool:
         control = self._cfg.control
