@@ -91,6 +91,9 @@ class Localizer(Protocol):
     def rest(self) -> None:
         """The mission takes the robot to be at rest."""
 
+    def doubt(self, way_m: float, turn_rad: float) -> None:
+        """The pose may be wrong by this much: it stays, its certainty goes."""
+
     def fuse_fix(self, fix: Fix) -> float:
         """Fuse a position of the puck; returns how far the pose jumped, m. Raises ``FixRefused``."""
 

@@ -7,7 +7,7 @@ from ccatp.control.tracker import DONE, DRIVE
 from ccatp.mirror.mirror import Mirror
 from ccatp.planning.errors import PlanError
 from ccatp.planning.route import Route
-from ccatp.samples import DeckPose, EventCode, PointId, Severity, Stop, StopKind, Verdict
+from ccatp.samples import Corner, DeckPose, EventCode, PointId, Severity, Stop, StopKind, Verdict
 from ccatp.surveying.correction import Corrector
 from ccatp.surveying.homing import Homing
 from ccatp.surveying.journey import Journey, Motion
@@ -33,6 +33,7 @@ from ccatp.surveying.stopover import Stopover
 
 NORMAL, NEAR_EDGE, ABORTED = EventCode
 NONE, SLOW, HOLD, RETURN, FAULT = Severity.NONE, Severity.SLOW, Severity.HOLD, Severity.RETURN, Severity.FAULT
+_CORNERS = frozenset(Corner)
 PlanHome = Callable[[DeckPose], tuple[Stop, ...]]
 PlanRest = Callable[[Route, DeckPose, Collection[PointId]], Route]
 
@@ -80,6 +81,7 @@ class Mission:
         self._recoveries_s: list[float] = []
         self._stuck_s: float | None = None
         self.wants_full_fans = False
+        self.doubts_pose = False
 
     def _journey(self, stops: Sequence[Stop]) -> Journey:
         return Journey(self._mirror, self._tracker, self._cfg.control.leg_timeout_factor, stops)
@@ -303,7 +305,7 @@ class Mission:
                 self.fault(verdict.cause, is_lost=True)
             return True
         if is_denied and severity >= HOLD:
-            self._await_recovery(verdict.cause)
+            self._await_recovery(verdict.cause, is_pose_doubted=verdict.signal not in _CORNERS)
             return True
         self._pace(is_slow=severity in (SLOW, RETURN))
         if severity is RETURN and verdict.code is not NEAR_EDGE and verdict.cause != self._emergency:
@@ -311,11 +313,13 @@ class Mission:
             self.abort(verdict.cause)
         return False
 
-    def _await_recovery(self, cause: str) -> None:
+    def _await_recovery(self, cause: str, *, is_pose_doubted: bool = False) -> None:
         """Hold until the cause is gone, and then find out where the robot is before moving on."""
         if self.state is State.DONE or (self.state is HELD and self._is_held_by_hand):
             return
         self._is_lost, self._is_at_start = True, False
+        if self.cause != cause:
+            self.doubts_pose |= is_pose_doubted
         if not self.interrupt(cause):
             self.cause = cause
 
@@ -351,6 +355,8 @@ class Mission:
             self._backoffs = 0
             self.fault(f"at the edge again after {limit} back-offs: is an edge sensor dirty?")
             return
+        # Back at an edge right after a fix of the place: then it is the heading that is wrong.
+        self.doubts_pose |= self._backoffs > 1
         self.cause = verdict.cause
         self._interrupt()
         # An edge that the route did not foresee means that the pose is wrong: it is found again before moving on.

@@ -212,6 +212,9 @@ class HealthConfig(Model):
 
     slow_speed_m_s: Positive
     slow_rate_rad_s: Positive
+    doubt_position_m: Positive
+    doubt_heading_rad: Positive
+    gap_s: Positive
     pause_limit_s: Positive
     hold_limit_s: Positive
     lifted_limit_s: Positive

@@ -125,13 +125,14 @@ class HealthBoard:
         fastest = robot.wheel_radius_m * robot.max_wheel_rad_s
         self.seams = SeamMonitor(cfg, ground, robot.edge_sensors_m, danger.map_sigmas, fastest)
         self.flicker = FlickerMonitor(cfg, is_explained)
-        self._clock = Alarm(cfg.imu_quarantine_s)
+        self._clock, self._gap = Alarm(cfg.imu_quarantine_s), Alarm(cfg.imu_quarantine_s)
         self._alarms = (
             self._wheels.alarm,
             self._yaw.alarm,
             self._fans.alarm,
             self._latency.alarm,
             self._clock,
+            self._gap,
             self.flicker.chatter,
             self.flicker.flash,
         )
@@ -146,7 +147,7 @@ class HealthBoard:
             window.reset()
         for monitor in (
             self._wheels, self._yaw, self._rates, self._latency, self._fans, self._battery, self._own,
-            self.seams, self.flicker, self._clock,
+            self.seams, self.flicker, self._clock, self._gap,
         ):  # fmt: skip
             monitor.reset()
         self._estimate_seq = -1
@@ -183,6 +184,10 @@ class HealthBoard:
         """
         dt_s = 0.0 if self._t_s is None else t_s - self._t_s
         self._t_s = t_s
+        if dt_s > self._cfg.gap_s:
+            cause = "frames were lost: nobody saw where the robot went"
+            self._gap.see(t_s, Finding(Severity.HOLD, cause, "frames", dt_s, self._cfg.gap_s))
+        self._gap.settle(t_s)
         means, imu = self._means, frame.imu
         means.take(wheels, dt_s)
         self._sums = now = self._added(imu, dt_s)

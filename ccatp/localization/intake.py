@@ -16,6 +16,8 @@ WheelColumns = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
 """Times (s) and the rates (rad/s) of the right and of the left wheel."""
 MAX_FRAME_STEP_S = 0.1
 """A frame further than this from the last one is a jump of the robot's clock or a gap in the link."""
+LONGEST_GAP_S = 0.4
+"""After so long without a drive the robot stands, whatever it was told: its time-to-live and the wheels' run-down."""
 BACKWARD_LIMIT = 5
 """This many backward time stamps in a row ask for a hold."""
 _ROUNDING_S = 1e-6

@@ -250,6 +250,9 @@ class MainLoop:
         verdict = self._ear.hear(seq, self._frame_period_s(), is_lockstep=self._is_lockstep)
         heard = time.perf_counter()
         order = self._mission.step(motion, verdict)
+        if self._mission.doubts_pose:
+            self._mission.doubts_pose = False
+            localizer.doubt(self._cfg.health.doubt_position_m, self._cfg.health.doubt_heading_rad)
         if self._mission.wants_full_fans and not self._has_full_fans:
             self._has_full_fans = True
             self._link.send_fans(2, FULL_FANS)

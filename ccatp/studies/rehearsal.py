@@ -120,6 +120,9 @@ class Rehearsing:
             localizer.clear_hold()
         motion = self._motion(frame, dt_s)
         order = mission.step(motion, verdict)
+        if mission.doubts_pose:
+            mission.doubts_pose = False
+            localizer.doubt(self.cfg.health.doubt_position_m, self.cfg.health.doubt_heading_rad)
         if mission.wants_full_fans and not self._has_full_fans:
             self._has_full_fans = True
             robot.command_fans(2, 1.0, 1.0)
