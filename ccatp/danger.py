@@ -257,7 +257,9 @@ class DangerMonitor:
         """Findings of the rules here: data that are missing, the robot lifted, a sensor off for no reason."""
         found = []
         if missing is not None:
-            found.append(Finding(_STALE, missing.cause, missing.signal, missing.age_s, missing.limit_s))
+            # Without its wheels nobody knows where the robot went meanwhile.
+            severity = Severity.HOLD if missing.signal == "enc" else _STALE
+            found.append(Finding(severity, missing.cause, missing.signal, missing.age_s, missing.limit_s))
         if self._health is None:
             return found
         if self._edges.is_lifted:

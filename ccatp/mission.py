@@ -162,6 +162,8 @@ class Mission:
             return
         health = self._cfg.health
         self._recoveries_s = [since_s for since_s in self._recoveries_s if t_s - since_s <= health.retry_window_s]
+        if self._recoveries_s and t_s - self._recoveries_s[-1] <= health.pause_limit_s:
+            self._recoveries_s.pop()  # still the same: frame by frame it is asked for again
         self._recoveries_s.append(t_s)
         if len(self._recoveries_s) > 1 + health.retries:
             self.fault(cause, is_lost=True)
@@ -324,11 +326,11 @@ class Mission:
             self.cause = cause
 
     def _pace(self, *, is_slow: bool) -> None:
-        """Drive at the usual or at the reduced speed from now on; the leg begins anew where that changes it."""
+        """Drive at the reduced speed from now on, or at the usual one from the next leg on."""
         if is_slow is self._tracker.is_slow:
             return
         self._tracker.is_slow = is_slow
-        if self.state in (DRIVING, TURNING, RETURNING):
+        if is_slow and self.state in (DRIVING, TURNING, RETURNING):
             (self.survey if self._home is None else self._home).interrupt()
 
     def _waits_at_edge(self, t_s: float, verdict: Verdict | None) -> bool:

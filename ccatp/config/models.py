@@ -234,6 +234,8 @@ class HealthConfig(Model):
     yaw_time_s: Positive
     identical_samples: Annotated[int, Field(ge=2, le=1000)]
     imu_rate_rad_s: Positive
+    imu_jump_rad_s: Positive
+    imu_largest_rad_s: Positive
     imu_rate_share: Annotated[float, Field(ge=0.0, le=1.0)]
     imu_acceleration_m_s2: Positive
     imu_quarantine_s: Positive

@@ -12,7 +12,9 @@ _STILL_RAD_S = 0.02  # yaw rate of wheels that stand
 class ImuGate:
     """Leaves out the inertial unit while its readings are impossible.
 
-    * An acceleration beyond what the robot can do, or an angular rate too far from what the wheels do.
+    * An acceleration or an angular rate beyond what the robot can do.
+    * An angular rate that jumps away from what the wheels do. One that glides away from it, or has been elsewhere all
+      along, may be right, and the wheels' encoders wrong: that is for ``ccatp.health.yaw`` to find.
     * A reading that repeats itself exactly: a unit that has shown noise at rest never does. One without noise may.
 
     After an impossible reading the unit stays out for the quarantine, because garbage is plausible now and then.
@@ -29,6 +31,7 @@ class ImuGate:
     def __init__(self, cfg: HealthConfig) -> None:
         """Believed, until it says something impossible."""
         self._rate, self._share = cfg.imu_rate_rad_s, cfg.imu_rate_share
+        self._largest, self._jump = cfg.imu_largest_rad_s, cfg.imu_jump_rad_s
         self._acceleration, self._identical = cfg.imu_acceleration_m_s2, cfg.identical_samples
         self._quarantine_s = cfg.imu_quarantine_s
         self.reset()
@@ -54,14 +57,17 @@ class ImuGate:
         for t_s, ax, wz in samples:
             if ax == self._ax or wz == self._wz or not self._is_noisy:
                 self._compare(ax, wz, yaw_rad_s)
+            off, jump, largest = wz - yaw_rad_s, wz - self._wz, self._largest
             self._same_ax = self._same_ax + 1 if ax == self._ax else 0
             self._same_wz = self._same_wz + 1 if wz == self._wz else 0
             self._ax, self._wz = ax, wz
-            if (
-                not (-limit <= wz - yaw_rad_s <= limit and -self._acceleration <= ax <= self._acceleration)
-                or self._is_repeating()
-            ):
-                self._blame(t_s, wz - yaw_rad_s, ax, limit)
+            if not -largest <= wz <= largest or (not -limit <= off <= limit and not -self._jump <= jump <= self._jump):
+                self._blame(t_s, "the gyroscope's rate is impossible", off, limit)
+            elif not -self._acceleration <= ax <= self._acceleration:
+                self._blame(t_s, "the acceleration is impossible", ax, self._acceleration)
+            elif self._is_repeating():
+                repeats = max(self._same_ax, self._same_wz) + 1
+                self._blame(t_s, "the inertial unit repeats itself", repeats, self._identical)
             if -self._quarantine_s < t_s - self._bad_s < self._quarantine_s:
                 is_good = False
             elif self.cause:
@@ -80,15 +86,7 @@ class ImuGate:
         # The first reading is not a repetition.
         return self._is_noisy and max(self._same_ax, self._same_wz) >= self._identical - 1
 
-    def _blame(self, t_s: float, off_rad_s: float, ax: float, limit: float) -> None:
+    def _blame(self, t_s: float, cause: str, value: float, limit: float) -> None:
         self._bad_s = t_s
-        if self.cause:
-            return
-        self.out_since_s = t_s
-        if not -limit <= off_rad_s <= limit:
-            self.cause, self.value, self.limit = "the gyroscope's rate is impossible", off_rad_s, limit
-        elif not -self._acceleration <= ax <= self._acceleration:
-            self.cause, self.value, self.limit = "the acceleration is impossible", ax, self._acceleration
-        else:
-            repeats = float(max(self._same_ax, self._same_wz) + 1)
-            self.cause, self.value, self.limit = "the inertial unit repeats itself", repeats, float(self._identical)
+        if not self.cause:
+            self.cause, self.value, self.limit, self.out_since_s = cause, float(value), float(limit), t_s

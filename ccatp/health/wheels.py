@@ -190,10 +190,12 @@ class WheelMonitor:
         for k, side in enumerate(_SIDES):
             speed_m_s, crept_m = abs(moved[1 + k]) / moved.t_s, abs(now[1 + k] - stood[1 + k])
             creeps = crept_m > cfg.creep_m and speed_m_s > _STILL_M_S
-            lasts_s = self._creeping[k].lasts(t_s, creeps)
-            if not creeps and speed_m_s <= cfg.stop_speed_m_s:
+            is_moving = creeps or speed_m_s > cfg.stop_speed_m_s
+            broken = _what_is_broken(samples, k) if is_moving else ""
+            lasts_s = self._creeping[k].lasts(t_s, creeps and not broken)
+            if not is_moving:
                 continue
-            if broken := _what_is_broken(samples, k):
+            if broken:
                 finding = Finding(
                     HOLD, f"the {side} encoder {broken}", f"encoder_{side}", speed_m_s, cfg.stop_speed_m_s
                 )

@@ -15,6 +15,7 @@ from ccatp.control.prediction import CommandPredictor
 from ccatp.errors import CcatpError, ExitStatus, UnreachableError
 from ccatp.etalon_client import EtalonClient, EtalonError
 from ccatp.health.commanded import CommandSpan
+from ccatp.health.fan_gate import FanGate
 from ccatp.health.steady_time import SteadyTime
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror
@@ -88,6 +89,7 @@ class MainLoop:
             on_lost=self._on_lost,
         )
         self._hello: Hello | None = None
+        self._fan_gate = FanGate(0.0)
         self._is_lockstep = False
         self._phase = "starting"
         self._time = SteadyTime(cfg.health.clock_jump_s)
@@ -140,6 +142,7 @@ class MainLoop:
         hello = await self._link.connect(self._cfg.robot.connect_timeout_s)
         self._parts.check_robot(hello)
         self._hello, self._is_lockstep = hello, hello.lockstep
+        self._fan_gate = FanGate(hello.robot.fan_floor)
         self._predictor = CommandPredictor(self._cfg.robot.wheel_lag_s, 1.0 / hello.frame_hz)
         self._phase = "joined"
         if not hello.lockstep:
@@ -232,7 +235,7 @@ class MainLoop:
         if self._t_first_s is None:
             self._t_first_s = t_s
             # Before the first drive and not on joining, so that in lockstep they start in a certain frame.
-            self._link.send_fans(1, self._cfg.robot.fan_duty)
+            self._send_fans(1, self._cfg.robot.fan_duty)
         self._t_last_s, self._frame_wall_s = steady_s, time.monotonic()
         self._seq = max(seq, self._seq)
         localizer = self._localizer
@@ -255,7 +258,7 @@ class MainLoop:
             localizer.doubt(self._cfg.health.doubt_position_m, self._cfg.health.doubt_heading_rad)
         if self._mission.wants_full_fans and not self._has_full_fans:
             self._has_full_fans = True
-            self._link.send_fans(2, FULL_FANS)
+            self._send_fans(2, FULL_FANS)
         right, left = self._gate.pass_through(order.twist, verdict, dt_s)
         if order.at_rest or order.measure:
             self._execute(order, motion)
@@ -268,6 +271,13 @@ class MainLoop:
         if self._mission.state is not self._state:
             self._on_state()
         self._teller.tick(1e6 * (time.perf_counter() - heard + waiting - start))
+
+    def _send_fans(self, number: int, duty: tuple[float, float]) -> None:
+        """Send what the gate lets through; what it does not is a fault, and the fans keep what they have."""
+        if self._fan_gate.pass_through(duty) is None:
+            self._mission.fault(f"fan duties {duty} are below the robot's floor: raise robot.fan_duty")
+        else:
+            self._link.send_fans(number, duty)
 
     def _motion(self, sensors: Sensors, dt_s: float) -> Motion:
         localizer, echo = self._localizer, sensors.cmd
