@@ -82,6 +82,7 @@ class Mission:
         self._stuck_s: float | None = None
         self.wants_full_fans = False
         self.doubts_pose = False
+        self._is_hold_deaf = self._is_finding = False
 
     def _journey(self, stops: Sequence[Stop]) -> Journey:
         return Journey(self._mirror, self._tracker, self._cfg.control.leg_timeout_factor, stops)
@@ -90,6 +91,11 @@ class Mission:
     def is_paused(self) -> bool:
         """Held until somebody resumes."""
         return self.state is State.HELD and self._is_held_by_hand
+
+    @property
+    def ignores_motion(self) -> bool:
+        """Held because wheels or inertial unit are not to be believed: whatever they say, the robot stands."""
+        return self.state is HELD and self._is_hold_deaf
 
     @property
     def eta_s(self) -> float:
@@ -320,10 +326,10 @@ class Mission:
         if self.state is State.DONE or (self.state is HELD and self._is_held_by_hand):
             return
         self._is_lost, self._is_at_start = True, False
-        if self.cause != cause:
-            self.doubts_pose |= is_pose_doubted
+        was_deaf = self.ignores_motion
         if not self.interrupt(cause):
             self.cause = cause
+        self._is_hold_deaf = was_deaf or is_pose_doubted
 
     def _pace(self, *, is_slow: bool) -> None:
         """Drive at the reduced speed from now on, or at the usual one from the next leg on."""
@@ -348,6 +354,10 @@ class Mission:
 
     def _meet_edge(self, motion: Motion, verdict: Verdict) -> None:
         if self.state in (State.BACKING_OFF, State.DONE):
+            return
+        if self.ignores_motion:
+            self._go_on()  # where the edge is, is not known before a fix; standing still for it is safe anywhere
+        if self._is_finding and self.state in (SETTLING, MEASURING):
             return
         if self.state is State.HELD and self._is_held_by_hand:
             return
@@ -379,10 +389,13 @@ class Mission:
         self._interrupt()
         self._apply(Event.HOLD)
         self._is_held_by_hand = by_hand
+        self._is_hold_deaf = False
         self.cause = cause
 
     def _go_on(self) -> None:
         self._interrupt()
+        self._is_finding = self.ignores_motion
+        self.doubts_pose |= self._is_finding
         self.is_faulted = False
         # Wherever a hold left the robot: the route's next turn may not be safe there.
         self._is_off_route |= self.state is State.HELD

@@ -105,6 +105,11 @@ class WheelMeans:
         return sum(usable) / len(usable) if usable else None
 
 
+def as_standing(samples: Sequence[WheelSample]) -> list[WheelSample]:
+    """What the encoders would say of wheels that stand: for a robot that is held and whose encoders are in doubt."""
+    return [WheelSample(sample.t_s, 0.0, 0.0) for sample in samples]
+
+
 def largest_rate_rad_s(robot: RobotConfig) -> float:
     """No wheel turns faster, rad/s: an encoder that says so is wrong. A count more per sample is no contradiction."""
     return 3.0 * robot.max_wheel_rad_s

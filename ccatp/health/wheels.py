@@ -196,6 +196,7 @@ class WheelMonitor:
             if not is_moving:
                 continue
             if broken:
+                self._stood = now  # what it says it went, it did not
                 finding = Finding(
                     HOLD, f"the {side} encoder {broken}", f"encoder_{side}", speed_m_s, cfg.stop_speed_m_s
                 )

@@ -340,6 +340,9 @@ class FullStateLocalizer(FrameReceiver[_Moved]):
         """The pose may be wrong by this much, because what it was made of was: the pose stays, its certainty goes."""
         if self.is_frozen:
             return
+        # What the wheels may have done while nobody listened is part of the doubt.
+        self._right.restart()
+        self._left.restart()
         if self._block.dt_s > 0.0:
             self._take_block(self._clock.t_s)
         self._estimate.lose(way_m, turn_rad)

@@ -16,6 +16,7 @@ from ccatp.errors import CcatpError, ExitStatus, UnreachableError
 from ccatp.etalon_client import EtalonClient, EtalonError
 from ccatp.health.commanded import CommandSpan
 from ccatp.health.fan_gate import FanGate
+from ccatp.health.look import as_standing
 from ccatp.health.steady_time import SteadyTime
 from ccatp.localizer import Localizer
 from ccatp.mirror.mirror import Mirror
@@ -239,7 +240,9 @@ class MainLoop:
         self._t_last_s, self._frame_wall_s = steady_s, time.monotonic()
         self._seq = max(seq, self._seq)
         localizer = self._localizer
-        localizer.step(t_s, sensors.imu, sensors.enc, sensors.edge, sensors.gravity)
+        is_deaf = self._mission.ignores_motion
+        imu, enc = ((), as_standing(sensors.enc)) if is_deaf else (sensors.imu, sensors.enc)
+        localizer.step(t_s, imu, enc, sensors.edge, sensors.gravity)
         if localizer.hold_requested:
             # A filter that diverged is frozen until it has a fix.
             self._mission.recover(localizer.hold_cause, steady_s)

@@ -14,6 +14,7 @@ from ccatp.control.kinematics import twist_of
 from ccatp.control.prediction import CommandPredictor
 from ccatp.danger import DangerMonitor
 from ccatp.health.commanded import CommandSpan
+from ccatp.health.look import as_standing
 from ccatp.health.steady_time import SteadyTime
 from ccatp.localization.fixes import FixGated, FixRefused
 from ccatp.localizer import Localizer
@@ -114,7 +115,9 @@ class Rehearsing:
         if verdict.code is not self._code:
             self._code = verdict.code
             self.book.builder.add_verdict_event(seq, verdict.code)
-        localizer.step(t_s, frame.imu, frame.enc, frame.edge, frame.gravity)
+        is_deaf = mission.ignores_motion
+        imu, enc = ((), as_standing(frame.enc)) if is_deaf else (frame.imu, frame.enc)
+        localizer.step(t_s, imu, enc, frame.edge, frame.gravity)
         if localizer.hold_requested:
             mission.recover(localizer.hold_cause, t_s + self._time.offset_s)
             localizer.clear_hold()

@@ -1,6 +1,7 @@
 """Faults of wheels, link and battery: injected, real at the robot, answered in time."""
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import pytest
 
@@ -20,7 +21,7 @@ def held(one: Seen) -> bool:
 
 
 def holds(seen: list[Seen]) -> int:
-    return sum(a.state is not State.HELD and b.state is State.HELD for a, b in zip(seen, seen[1:], strict=False))
+    return sum(a.state is not State.HELD and b.state is State.HELD for a, b in pairwise(seen))
 
 
 @pytest.mark.fault("F8")

@@ -1,4 +1,4 @@
-"""Faults of sensors: each is injected, is real at the robot, and is answered in time; what passes by is recovered from."""
+"""Faults of sensors: each is injected, real at the robot and answered in time; what passes by is recovered from."""
 
 from collections.abc import Callable
 from itertools import pairwise
