@@ -1,4 +1,4 @@
-"""Faults of the laser system: what a mission makes of a server that is silent, gone, wrong, or looks at a wrong frame."""
+"""Faults of the laser system: a server that is silent, gone or wrong, that lies about its frame, or a robot that moves."""
 
 import asyncio
 import random
