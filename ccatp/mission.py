@@ -8,6 +8,7 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.planning.errors import PlanError
 from ccatp.planning.route import Route
 from ccatp.samples import DeckPose, EventCode, PointId, Stop, StopKind, Verdict
+from ccatp.surveying.alignment import Aligner
 from ccatp.surveying.budget import TimeBudget
 from ccatp.surveying.correction import Corrector
 from ccatp.surveying.homing import Homing
@@ -15,6 +16,7 @@ from ccatp.surveying.journey import Journey, Motion
 from ccatp.surveying.leftovers import Leftovers
 from ccatp.surveying.missed_point import MissedPoint
 from ccatp.surveying.orders import STAND, Order
+from ccatp.surveying.recovery import Recovery
 from ccatp.surveying.retreat import Retreat, Step
 from ccatp.surveying.states import (
     BACKING_OFF,
@@ -53,6 +55,7 @@ class Mission:
         plan_home: gives the stops from a pose to base.
         plan_rest: gives the way back to a route from a pose, without the points that are done with.
         plan_points: gives a route through points from a pose; without it what failed once is not tried again.
+        heading_sigma_of: how well the heading is known, rad; asked after the robot was out of sight.
 
     Attributes:
         wants_full_fans: something happened after which the robot shall be pressed on with all that the fans have.
@@ -66,6 +69,7 @@ class Mission:
         plan_home: PlanHome,
         plan_rest: PlanRest,
         plan_points: PlanPoints | None = None,
+        heading_sigma_of: Callable[[], float] = float,
     ) -> None:
         """Idle at base."""
         self._cfg, self._mirror, self._plan_home, self._plan_rest = cfg, mirror, plan_home, plan_rest
@@ -101,6 +105,7 @@ class Mission:
         self._stopover = Stopover(cfg.control, cfg.etalon.measuring_time_s)
         self._missed = MissedPoint(Corrector(mirror, cfg.robot, cfg.mission))
         self._emergency = ""
+        self._aligner = Aligner(mirror, cfg.robot, cfg.mission, heading_sigma_of, self._journey)
 
     def _journey(self, stops: Sequence[Stop]) -> Journey:
         return Journey(self._mirror, self._tracker, self._cfg.control.leg_timeout_factor, stops)
@@ -136,8 +141,30 @@ class Mission:
 
     @property
     def journey(self) -> Journey:
-        """The journey being made: the survey, or the way home."""
+        """The journey being made: the survey, the way home, or a leg that shows the heading."""
+        if self._aligner.journey is not None:
+            return self._aligner.journey
         return self.survey if self._home is None else self._home.journey
+
+    @property
+    def abort_cause(self) -> str:
+        """Why the survey was given up, or empty."""
+        return self._abort_cause or ""
+
+    # -- beginnings in mid-survey ---------------------------------------------------------------------------------
+
+    def take_over(self, recovery: Recovery) -> None:
+        """Go on with what another process began; before the first frame. The robot is found before it moves."""
+        self.lose_sight()
+        self.skipped += recovery.skipped
+        self._abort_cause = recovery.abort_cause or None
+        if recovery.held_cause:
+            self._hold(recovery.held_cause, by_hand=True)
+
+    def lose_sight(self) -> None:
+        """The robot may have moved while nobody looked: it does not drive on before a fix, and a sure heading."""
+        self._is_lost, self._is_at_start = True, False
+        self._aligner.doubt()
 
     # -- commands: each returns why it was refused, or None -------------------------------------------------------
 
@@ -216,6 +243,10 @@ class Mission:
         self._failures = 0
         if point is None and not self._is_lost:
             self._leave_pointless()
+            return
+        if point is None and self._aligner.wants_leg:
+            self._interrupt()
+            self._apply(Event.GO_ON)
             return
         if point is None:
             # Found again, the robot stands where the route never led.
@@ -357,6 +388,7 @@ class Mission:
         (self.survey if self._home is None else self._home).interrupt()
         self._stopover.interrupt()
         self._missed.interrupt()
+        self._aligner.interrupt()
 
     def _hold(self, cause: str, *, by_hand: bool) -> None:
         self._interrupt()
@@ -404,6 +436,8 @@ class Mission:
     def _travel(self, motion: Motion) -> Order:
         if self._is_review_due and self._is_out_of_time(motion):
             return STAND
+        if self._is_lost:
+            return self._align(motion)
         survey = self.survey
         stop = survey.current
         if stop is not None and not self._missed.follows_route(motion, stop, survey):
@@ -413,20 +447,38 @@ class Mission:
         if stop is None:
             self._go_on()
             return STAND
-        twist = survey.follow(motion, stop)
-        if self._is_overdue(motion):
-            return STAND
-        phase = self._tracker.phase
-        if phase is not DONE:
-            if (phase is DRIVE) is not (self.state is DRIVING):
-                self._apply(Event.TURNED if phase is DRIVE else Event.REALIGN)
-            return Order(twist)
+        order = self._follow(survey, motion, stop)
+        if order is not None:
+            return order
         if stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) or self._is_vague(motion, stop):
             self._apply(Event.ARRIVED)
             return self._settle(motion)
         survey.advance()
         self._go_on()
         return self._travel(motion)
+
+    def _follow(self, journey: Journey, motion: Motion, stop: Stop) -> Order | None:
+        """One frame of the leg to a stop; ``None`` when it is reached."""
+        twist = journey.follow(motion, stop)
+        if self._is_overdue(motion):
+            return STAND
+        phase = self._tracker.phase
+        if phase is DONE:
+            return None
+        if (phase is DRIVE) is not (self.state is DRIVING):
+            self._apply(Event.TURNED if phase is DRIVE else Event.REALIGN)
+        return Order(twist)
+
+    def _align(self, motion: Motion) -> Order:
+        """One frame of a leg that shows the heading; a fix follows."""
+        leg = self._aligner.leg(motion.deck)
+        stop = None if leg is None else leg.current
+        order = None if leg is None or stop is None else self._follow(leg, motion, stop)
+        if order is not None:
+            return order
+        self._aligner.interrupt()
+        self._apply(Event.ARRIVED)
+        return self._settle(motion)
 
     def _is_vague(self, motion: Motion, stop: Stop) -> bool:
         """Whether to measure at a via point: they lie near the rim, and the next turn needs the room the route left."""

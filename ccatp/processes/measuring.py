@@ -2,7 +2,9 @@
 
 import asyncio
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
+from typing import Any
 
 from ccatp.config.models import MissionConfig
 from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
@@ -15,6 +17,9 @@ from ccatp.samples import DeckPose, Fix, PointId, Vector3
 from ccatp.store import MissionStore, StoreError
 from ccatp.surveying.approaches import Approaches
 
+# A commit takes milliseconds, on a busy disk a second. One that takes longer is told, and much longer holds the robot.
+SLOW_DISK_S = 2.0
+STALLED_DISK_S = 30.0
 # A fix that is doubted is measured again this often; who is doubted then is not believed.
 REPEATS = 2
 
@@ -163,7 +168,7 @@ class MeasuringDesk:
     async def _skip(self, request: Request, cause: str) -> None:
         if request.point is not None:
             try:
-                await asyncio.wrap_future(self._store.record_skipped(request.point, request.t_s))
+                await self._stored(self._store.record_skipped(request.point, request.t_s), request.point)
             except StoreError as error:
                 self._mission.fault(f"that {_name(request.point)} is skipped cannot be stored: {error}")
                 return
@@ -177,11 +182,30 @@ class MeasuringDesk:
                 self._mission.again()
                 return
             try:
-                await asyncio.wrap_future(self._store.record_fix(request.point, fix, request.estimate))
+                await self._stored(self._store.record_fix(request.point, fix, request.estimate), request.point)
             except StoreError as error:
                 self._mission.fault(f"the fix of {_name(request.point)} cannot be stored: {error}")
                 return
         self._mission.fixed(request.point)
+
+    async def _stored(self, commit: "Future[Any]", point: PointId) -> None:
+        """Wait for a commit. On a disk that stalls the robot stands here, and after a while is held for an operator.
+
+        Raises:
+            StoreError: it will not be committed.
+        """
+        waiting = asyncio.wrap_future(commit)
+        try:
+            await asyncio.wait([waiting], timeout=SLOW_DISK_S)
+            if not waiting.done():
+                self._teller.say("warning", f"the disk is slow: {_name(point)} waits for its commit")
+                await asyncio.wait([waiting], timeout=STALLED_DISK_S - SLOW_DISK_S)
+            if not waiting.done():
+                self._mission.fault(f"the disk stalls: {_name(point)} is not stored after {STALLED_DISK_S:g} s")
+                self._on_over()
+            await waiting
+        finally:
+            waiting.cancel()
 
     def _is_too_far(self, point: PointId) -> bool:
         """Whether the point has to be approached again: what was measured there is not its alignment."""

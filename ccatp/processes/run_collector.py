@@ -1,6 +1,6 @@
 """Glue. Collects a run from the bus: recording, progress, and what the summary needs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
@@ -155,6 +155,13 @@ class RunCollector:
     def exit_status(self) -> ExitStatus:
         """What main said the run ends with."""
         return ExitStatus(self._status.exit_status) if self._status is not None else ExitStatus.HELD
+
+    def wait(self, timeout_ms: int, fds: Sequence[int] = ()) -> None:
+        """Wait until something came in, or a file descriptor is readable, at most ``timeout_ms``."""
+        poller = zmq.Poller()
+        for waited_for in (self._subscriber.socket, *fds):
+            poller.register(waited_for, zmq.POLLIN)
+        poller.poll(timeout_ms)
 
     def collect(self, timeout_ms: int, view: View | None) -> None:
         """Take what came in, waiting at most ``timeout_ms`` for the first."""

@@ -45,11 +45,16 @@ class Teller:
         self.seq = -1
         self.t_s = 0.0
 
-    def frame(self, seq: int, t_s: float, localizer: Localizer, state: str, raw: bytes) -> None:
-        """Keep the estimate after frame ``seq`` and the frame's line for the batch; publish it where it is due."""
+    def frame(
+        self, seq: int, t_s: float, localizer: Localizer, state: str, raw: bytes, *, is_first: bool = False
+    ) -> None:
+        """Keep the estimate after frame ``seq`` and the frame's line for the batch; publish it where it is due.
+
+        The first one of a session is always due: the danger loop may wait for it.
+        """
         self.seq, self.t_s = seq, t_s
         pose, sigma = localizer.pose, localizer.position_sigma_m
-        if is_estimate_due(seq):
+        if is_first or is_estimate_due(seq):
             deck = localizer.deck_pose
             x, y, heading = deck.x_m, deck.y_m, deck.heading_rad
             self._publisher.send(

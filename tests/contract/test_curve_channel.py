@@ -226,6 +226,7 @@ async def test_over_long_requests_are_refused(site: Site) -> None:
         assert reply == {"ok": False, "error": "request of 5000 bytes; at most 4096"}
 
 
+@pytest.mark.fault("O5")
 @pytest.mark.parametrize("ruin", ["", "[clients", "gone"])
 async def test_a_list_that_is_empty_or_unreadable_lets_nobody_in(site: Site, ruin: str) -> None:
     path = site.folder / "clients.toml"

@@ -1,4 +1,4 @@
-"""Faults of the laser system: a server that is silent, gone or wrong, that lies about its frame, or a robot that moves."""
+"""Faults of the laser system: silent, gone, wrong, in another frame; and a robot that moves while it is measured."""
 
 import asyncio
 import random
