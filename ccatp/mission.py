@@ -380,8 +380,11 @@ class Mission:
         if verdict is None or not (verdict.forward and verdict.reverse and verdict.turn):
             if verdict is not None and verdict.code is NEAR_EDGE:
                 self._meet_edge(motion, verdict)
-            else:
-                self.interrupt(verdict.cause if verdict is not None else "no fresh verdict from the danger loop")
+            elif verdict is None:
+                self.interrupt("no fresh verdict from the danger loop")
+            elif not (self._is_lost and self.state in (SETTLING, MEASURING)):
+                # A robot that stands to be found needs no permission, and without a pose gets none before it is.
+                self.interrupt(verdict.cause)
             return
         if verdict.code is NEAR_EDGE:
             self._meet_edge(motion, verdict)
@@ -532,10 +535,10 @@ class Mission:
         return True
 
     def _travel(self, motion: Motion) -> Order:
-        if self._is_lost:
-            return self._align(motion)
         if self._is_review_due and self._is_out_of_time(motion):
             return STAND
+        if self._is_lost:
+            return self._align(motion)
         survey = self.survey
         stop = survey.current
         if stop is not None and not self._missed.follows_route(motion, stop, survey):

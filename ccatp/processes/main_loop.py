@@ -335,19 +335,24 @@ class MainLoop:
         """What the mission wants, and the wheel rates (right, left), rad/s, that the gate lets through."""
         mission = self._mission
         order = mission.step(motion, verdict) if self._is_on_mirror(sensors) else STAND
-        if mission.doubts_pose:
-            mission.doubts_pose = False
-            self._localizer.doubt(self._cfg.health.doubt_position_m, self._cfg.health.doubt_heading_rad)
-        if mission.wants_full_fans and not self._has_full_fans:
-            self._has_full_fans = True
-            self._send_fans()  # pressed on first, held then
-        if mission.is_faulted:
-            self._keep_vigil(sensors)
+        self._heed(sensors)
         right, left = self._gate.pass_through(
             order.twist, verdict, motion.dt_s, motion.t_s, self._lag_s, PURPOSES[mission.state]
         )
         self._gate_watch.look(motion.t_s)
         return order, right, left
+
+    def _heed(self, sensors: Sensors) -> None:
+        """What the mission wants besides the drive, before that is sent."""
+        mission, health = self._mission, self._cfg.health
+        if mission.doubts_pose:
+            mission.doubts_pose = False
+            self._localizer.doubt(health.doubt_position_m, health.doubt_heading_rad)
+        if mission.wants_full_fans and not self._has_full_fans:
+            self._has_full_fans = True
+            self._send_fans()  # pressed on first, held then
+        if mission.is_faulted:
+            self._keep_vigil(sensors)
 
     def _begin_session(self, dt_s: float) -> None:
         """Before the first drive and not on joining, so that in lockstep the fans start in a certain frame."""

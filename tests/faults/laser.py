@@ -3,6 +3,7 @@
 import asyncio
 import selectors
 from collections.abc import Callable, Coroutine
+from concurrent.futures import Future, wait
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, TypeVar, cast
@@ -17,6 +18,7 @@ from ccatp.metrology.judge import nis_of
 from ccatp.metrology.scrutiny import Scrutiny
 from ccatp.processes.measuring import MeasuringDesk, Request
 from ccatp.processes.telling import Teller
+from ccatp.radio.multilateration import MultilaterationError
 from ccatp.samples import Fix, PointId, Vector3
 from ccatp.sim.faults.plan import FaultPlan, parse_plan
 from ccatp.store import MissionStore, PlannedPoint
@@ -60,6 +62,28 @@ def run_virtual(work: Coroutine[Any, Any, T]) -> tuple[T, float]:
     with asyncio.Runner(loop_factory=VirtualLoop) as runner:
         result = runner.run(work)
         return result, runner.get_loop().time()
+
+
+class PatientStore:
+    """A store whose caller waits for the commit: virtual time must not pass while a disk turns."""
+
+    def __init__(self, store: MissionStore) -> None:
+        self._store = store
+
+    def record_fix(self, *args: Any) -> "Future[int]":
+        return self._waited(self._store.record_fix(*args))
+
+    def record_skipped(self, *args: Any) -> "Future[None]":
+        return self._waited(self._store.record_skipped(*args))
+
+    @staticmethod
+    def _waited(commit: "Future[T]") -> "Future[T]":
+        wait([commit])
+        return commit
+
+
+def patient(store: MissionStore) -> MissionStore:
+    return cast(MissionStore, PatientStore(store))
 
 
 class Measured:
@@ -118,7 +142,7 @@ class DeskRehearsal(FaultyRehearsal):
                 Scrutiny(self.mirror, self.cfg),
                 self.localizer,
                 self.mission,
-                store,
+                patient(store),
                 cast(Teller, teller),
                 self._over.set,
                 lambda: 0.5,
@@ -149,14 +173,21 @@ class DeskRehearsal(FaultyRehearsal):
         self._over.clear()
         serving = asyncio.get_running_loop().create_task(self.desk.run())
         self.desk.begin(request)
-        await self._over.wait()
+        over = asyncio.get_running_loop().create_task(self._over.wait())
+        await asyncio.wait([serving, over], return_when=asyncio.FIRST_COMPLETED)
+        if serving.done():
+            over.cancel()
+            serving.result()  # raises what ended it
         serving.cancel()
-        await asyncio.wait([serving])
+        await asyncio.wait([serving, over])
 
     async def _ask(self, t_s: float, expected_m: Vector3) -> Fix:
         measured = Measured(len(self.asked), t_s, self._request.point)
         self.asked.append(measured)
-        true = self.laser.fix(t_s, self.localizer.deck_pose)
+        try:
+            true = self.laser.fix(t_s, self.localizer.deck_pose)
+        except MultilaterationError as error:
+            raise BadSolution(str(error), {}) from error
         fix = self._scripted(measured, true)
         measured.offset_m = float(np.linalg.norm(np.subtract(fix.position_m, true.position_m)))
         distance_m = float(np.linalg.norm(np.subtract(fix.position_m, expected_m)))

@@ -1,4 +1,4 @@
-"""Faults of the laser system: what a mission makes of a server that is silent, gone or wrong."""
+"""Faults of the laser system: silent, gone, wrong, in another frame; and a robot that moves while it is measured."""
 
 import asyncio
 import random
@@ -43,7 +43,7 @@ from tests.contract.test_etalon_client import (
     silence,
 )
 from tests.faults.campaign import single
-from tests.faults.laser import DeskRehearsal, Laser, Measured, failing, honest, moved, run_virtual
+from tests.faults.laser import DeskRehearsal, Laser, Measured, failing, honest, moved, patient, run_virtual
 from tests.unit.test_mission import FREE, Story
 
 Note = Callable[[str, float], None]
@@ -142,7 +142,7 @@ class Desk:
             cast(Scrutiny, scrutiny),
             cast(Any, localizer),
             cast(Mission, mission),
-            self.store,
+            patient(self.store),
             cast(Teller, SimpleNamespace(fix=lambda *_, **__: None, say=lambda *_: None)),
             self.over.set,
             lambda: config.etalon.measuring_time_s,
@@ -545,7 +545,7 @@ def test_nothing_counts_that_was_measured_while_the_robot_moved(config: Config, 
                 ),
                 cast(Any, stub),
                 story.mission,
-                store,
+                patient(store),
                 cast(Teller, SimpleNamespace(fix=lambda *_, **__: None, say=lambda *_: None)),
                 lambda: None,
                 lambda: 0.0,
