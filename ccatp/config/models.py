@@ -252,13 +252,13 @@ class MissionConfig(Model):
     verdict_timeout_s: Freshness
     measure_timeout_s: Positive
     failed_points_before_hold: Annotated[int, Field(ge=1)]
+    heading_doubt_rad: Positive
+    alignment_leg_m: Annotated[float, Field(gt=0.0, le=0.5)]
     holds_to_budget: bool
     alarm_period_s: Positive
     battery_endurance_s: Positive
     battery_reserve: Annotated[float, Field(ge=0.0, lt=1.0)]
     return_energy_factor: Annotated[float, Field(ge=1.0)]
-    heading_doubt_rad: Positive
-    alignment_leg_m: Annotated[float, Field(gt=0.0, le=0.5)]
 
 
 class SimRobotConfig(Model):

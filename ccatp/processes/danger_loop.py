@@ -116,7 +116,8 @@ class DangerLoop:
         """Judge one frame. In lockstep with a certain estimate of main's, so that the run is repeatable."""
         self._seq, self._t_s, self._pulse.frame_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
         if self._first_seq < 0:
-            self._first_seq = sensors.seq
+            # Of the frame that it meets, a process that takes over may have missed main's estimate.
+            self._first_seq = sensors.seq + self._is_taking_over
         wanted = last_estimate_before(sensors.seq)
         self._take_estimates(wanted if wanted >= self._first_seq else -1)
         try:

@@ -42,6 +42,7 @@ class Teller:
         self._lines: list[msgspec.Raw] = []
         self._tick_us: list[float] = []
         self._flushed_wall_s = time.monotonic()
+        self._frames_before = 0
         self.seq = -1
         self.t_s = 0.0
 
@@ -61,8 +62,12 @@ class Teller:
                 "estimate", Estimate(seq=seq, t_s=t_s, x_m=x, y_m=y, heading_rad=heading, sigma_m=sigma, state=state)
             )
         row, col = pose.panel
-        self._track.append((seq, t_s, row, col, pose.x_m, pose.y_m, pose.heading_rad, sigma))
+        self._track.append((seq + self._frames_before, t_s, row, col, pose.x_m, pose.y_m, pose.heading_rad, sigma))
         self._keep(raw)
+
+    def count_on(self) -> None:
+        """The robot's frames count anew: what is recorded counts on, as far as we know how many there were."""
+        self._frames_before += max(self.seq, 0)
 
     def stale_frame(self, seq: int, raw: bytes) -> None:
         """Keep the line of a frame that is not newer than the last one: the localizer has seen it."""
@@ -97,7 +102,9 @@ class Teller:
 
     def arrival(self, seq: int, t_s: float, point: PointId, error_m: float) -> None:
         """The robot came to rest in frame ``seq``, at a point for the first time."""
-        message = Arrival(seq=seq, t_s=t_s, point=(point.row, point.col, point.point), error_mm=1e3 * error_m)
+        message = Arrival(
+            seq=seq + self._frames_before, t_s=t_s, point=(point.row, point.col, point.point), error_mm=1e3 * error_m
+        )
         self._publisher.send("arrival", message)
 
     def rest(self, seq: int, t_s: float) -> None:

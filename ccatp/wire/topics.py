@@ -58,9 +58,9 @@ class MissionStatus(Message):
     outcome: str
     lower_bound_s: float
     exit_status: int  # what the run ends with; -1 while it goes on
-    left_out: dict[str, list[str]] = {}  # points skipped, or not measured any more, by the reason
     slips: int = 0  # frames that were served late, in real time
     lag_ms: float = 0.0  # ... the latest of them
+    left_out: dict[str, list[str]] = {}  # points skipped, or not measured any more, by the reason
 
 
 class Track(Message):

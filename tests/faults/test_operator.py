@@ -5,8 +5,9 @@ import random
 import threading
 import time
 from collections.abc import Callable
-from math import inf
+from math import ceil, inf, log
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import pytest
@@ -32,7 +33,7 @@ from tests.faults.campaign import single
 from tests.faults.laser import FULL, DeskRehearsal
 from tests.unit.test_mission import DT, FREE, FRONT_OFF, Story
 
-Note = Callable[[str, float], None]
+Note = Callable[..., None]
 SURVEYING = (State.TURNING, State.DRIVING, State.SETTLING, State.MEASURING)
 TABLE_ROWS = [(kind, level, held) for kind in EmergencyKind for level in (False, True) for held in (False, True)]
 
@@ -194,7 +195,8 @@ def test_repeated_aborts_change_nothing(config: Config, mirror: Mirror, again: l
             trace.append(story.frame())
         return trace
 
-    assert drive(again) == drive([])
+    once, often = drive([]), drive(again)
+    assert often == once
 
 
 @pytest.mark.fault("O3")
@@ -264,10 +266,23 @@ def test_an_emergency_is_told_until_it_is_heard(measured: Note) -> None:
     assert relay.lost > 20
     assert min(repeats) >= 1
     assert max(repeats) > 1  # an answer was lost, and asked for again
-    # So many of these periods fit into the second; all their messages lost has this probability.
-    unheard = 0.5 ** (1.0 / REPEAT_S)
-    measured("O4", 1.0 - unheard)
-    assert unheard <= 1e-4
+    # After so many periods fewer than one in 10,000 have been lost each time.
+    delivered_s = REPEAT_S * ceil(log(1e-4) / log(0.5))
+    measured("O4", delivered_s, "s")
+    assert delivered_s <= 1.0
+
+
+@pytest.mark.fault("O4")
+def test_an_emergency_is_acknowledged_at_once(measured: Note) -> None:
+    relay = LossyRelay(0)
+    relay._is_lost = lambda: False  # type: ignore[method-assign]
+    took_ms = []
+    for _ in range(9):
+        begun_s = time.monotonic()
+        assert request(relay.endpoint, b"fire", 5.0, repeats=True)["ok"]
+        took_ms.append(1e3 * (time.monotonic() - begun_s))
+    relay.close()
+    measured("O4", median(took_ms), "ms")  # of what the machine had to do besides, nothing is said
 
 
 @pytest.mark.fault("O4")
@@ -288,7 +303,7 @@ def test_what_must_not_be_asked_twice_is_asked_once() -> None:
 @pytest.mark.fault("O7")
 @pytest.mark.parametrize(("kind", "level", "held"), TABLE_ROWS)
 def test_a_clear_is_refused_with_a_reason_while_the_cause_persists(
-    kind: EmergencyKind, level: bool, held: bool
+    kind: EmergencyKind, level: bool, held: bool, measured: Note
 ) -> None:
     latch = AbortLatch()
     latch.raise_emergency(kind.value, "a")
@@ -299,6 +314,7 @@ def test_a_clear_is_refused_with_a_reason_while_the_cause_persists(
         assert refusal == f"the cause persists: {kind}"
     else:
         assert refusal == (None if held else "the robot is neither at base nor held")
+    measured("O7", 100.0)
 
 
 # -- O8: nobody there -------------------------------------------------------------------------------------------------
@@ -329,7 +345,7 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
     measured("F6", 100.0 * at_dock)
     assert story.mission.state is State.RETURNING
     assert at_dock >= cfg.battery_reserve
-    assert (soc - cfg.battery_reserve) / (home_s * drain) >= 1.5 - 0.1  # a frame of this story is half a second
+    assert (soc - cfg.battery_reserve) / (home_s * drain) >= 1.5
     assert len(reminders) >= 20
     assert all(b - a == pytest.approx(60.0, abs=1.0) for a, b in itertools.pairwise(reminders))
 

@@ -176,18 +176,16 @@ class Desk:
         mission = SimpleNamespace(
             is_awaiting_fix=True,
             request=1,
-            is_lost=True,
             fixed=self.measured.append,
             fault=self._fault,
             survey=SimpleNamespace(distance_m=lambda pose: 0.0),
         )
-        localizer = SimpleNamespace(fuse_fix=lambda fix: 0.0, notices=[], pose=None, pose_covariance=None)
-        sure = SimpleNamespace(begin=lambda: None, review=lambda *_, **__: Finding())
+        localizer = SimpleNamespace(fuse_fix=lambda fix: 0.0, notices=[], pose=None)
         teller = SimpleNamespace(fix=lambda *_, **__: None, say=lambda level, text: self.said.append(text))
         self.desk = MeasuringDesk(
             config.mission,
             cast(EtalonClient, SimpleNamespace(measure=measure)),
-            cast(Scrutiny, sure),
+            cast(Scrutiny, SimpleNamespace(begin=lambda: None, review=lambda *_, **__: Finding())),
             cast(Localizer, localizer),
             cast(Mission, mission),
             store,

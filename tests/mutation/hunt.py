@@ -16,7 +16,7 @@ import pytest
 from tests.mutation.mutator import Mutant, applied, module_of, mutants
 
 PATIENCE_S = 120.0  # a mutant that runs longer hangs, which is noticed
-ARGUMENTS = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-p", "no:randomly", "--no-header", "--no-summary"]
+ARGUMENTS = ["-x", "-q", "-p", "no:cacheprovider", "--noconftest", "--no-header", "--no-summary"]
 
 
 class _HangsError(BaseException):

@@ -131,7 +131,7 @@ def _other(node: ast.AST) -> Iterator[Change]:
         case ast.BinOp() | ast.AugAssign() if type(node.op) in _OPERATORS:
             other_op = _OPERATORS[type(node.op)]
             yield f"{type(node.op).__name__} -> {other_op.__name__}", _field("op", other_op)
-        case ast.Return(value=ast.expr()) if not _is_none(node.value):
+        case ast.Return(value=ast.expr()) if not _is_falsy(node.value):
             yield "returns None", lambda _: ast.Return(ast.Constant(None))
         case ast.Call(func=ast.Name(id=name)) if name in _CALLS:
             yield f"{name} -> {_CALLS[name]}", _field("func", lambda: ast.Name(_CALLS[name], ast.Load()))
@@ -141,8 +141,8 @@ def _other(node: ast.AST) -> Iterator[Change]:
             pass
 
 
-def _is_none(node: ast.expr | None) -> bool:
-    return isinstance(node, ast.Constant) and node.value is None
+def _is_falsy(node: ast.expr | None) -> bool:
+    return isinstance(node, ast.Constant) and not node.value
 
 
 def _comparison(k: int, other: type[ast.cmpop]) -> Callable[[ast.AST], ast.AST]:

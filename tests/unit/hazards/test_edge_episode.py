@@ -155,9 +155,9 @@ def test_the_map_is_asked_at_the_sensors_place_along_its_way(danger: DangerConfi
 def test_a_direction_takes_some_travel(danger: DangerConfig) -> None:
     sensor = Sensor(danger, Map(is_rim=True))
     assert not sensor.off(0.9 * DIRECTION_TRAVEL_M)
-    assert sensor.episode.phase is Phase.FRESH
+    assert sensor.map.asked_rim == []
     assert sensor.off(0.2 * DIRECTION_TRAVEL_M)
-    assert sensor.episode.phase is Phase.DECLARED
+    assert len(sensor.map.asked_rim) == 1
 
 
 def test_the_rim_counts_from_the_debounced_sample_on(danger: DangerConfig) -> None:
@@ -229,15 +229,17 @@ def test_a_seam_allows_its_width_across(danger: DangerConfig, axis: Axis, k: int
 
 
 @pytest.mark.parametrize("angle", [0.3, -0.6, 1.0, 1.3])
-def test_a_seam_allows_more_to_an_oblique_way(danger: DangerConfig, angle: float) -> None:
+@pytest.mark.parametrize("turn", [0.0, 0.6])
+def test_a_seam_allows_more_to_an_oblique_way(danger: DangerConfig, angle: float, turn: float) -> None:
     width = GAP_M + danger.gap_tolerance_m
     cosine = max(cos(angle), cos(danger.max_crossing_angle_rad))
     limit = width / cosine + danger.seam_extra_m
     # Across, the seam ends earlier where the way is steep.
     limit = min(limit, (width + danger.seam_extra_m) / cos(angle))
-    sensor = Sensor(danger, Map(seams=("x",)))
-    assert not sensor.walk((limit - 2 * UM) * cos(angle), (limit - 2 * UM) * sin(angle), 40)
-    assert sensor.walk(4 * UM * cos(angle), 4 * UM * sin(angle), 2)
+    sensor = Sensor(danger, Map(seams=("x",)), turn=turn)
+    way = angle - turn  # in the odometry's frame
+    assert not sensor.walk((limit - 2 * UM) * cos(way), (limit - 2 * UM) * sin(way), 40)
+    assert sensor.walk(4 * UM * cos(way), 4 * UM * sin(way), 2)
 
 
 def test_back_over_the_seam_is_no_way_across(danger: DangerConfig) -> None:
@@ -255,6 +257,15 @@ def test_a_way_along_the_seam_has_a_limit_both_ways(danger: DangerConfig) -> Non
         sensor.off(0.0, 0.001)
         assert not sensor.walk(sign * (limit - 0.003), steps=3)
         assert sensor.walk(sign * 0.004, steps=4)
+
+
+@pytest.mark.parametrize(("cosine", "is_told"), [(0.2, False), (0.4, True)])
+def test_the_side_is_told_by_a_way_that_is_steep_enough(danger: DangerConfig, cosine: float, is_told: bool) -> None:
+    limit = GAP_M + danger.gap_tolerance_m + danger.seam_extra_m
+    sensor = Sensor(danger, Map(seams=("x",)))
+    sensor.off(0.001 * cosine, 0.001 * (1.0 - cosine * cosine) ** 0.5)
+    # Back across: no way over the seam for who came from there, one for who came from nowhere.
+    assert sensor.walk(-limit - 0.002, steps=30) is not is_told
 
 
 def test_more_than_both_chords_is_no_crossing(danger: DangerConfig) -> None:
@@ -350,12 +361,23 @@ def test_a_seam_may_lead_to_the_rim(danger: DangerConfig) -> None:
     assert sensor.episode.value_m == pytest.approx(hypot(0.002, 1.1 * DIRECTION_TRAVEL_M))
 
 
+def test_looking_ahead_goes_by_the_way_since_the_last_look(danger: DangerConfig) -> None:
+    sensor = Sensor(danger, Map(seams=("x",)))
+    for dx, dy in ((0.001, 0.002), (0.0, 0.001), (0.001, 0.0), (-0.003, 0.004)):
+        sensor.off(dx, dy)
+        sensor.map.asked_rim.clear()
+        assert not sensor.episode.look_ahead()
+        assert sensor.map.asked_rim[0][1] == pytest.approx((dx / hypot(dx, dy), dy / hypot(dx, dy)))
+
+
 def test_no_looking_ahead_while_on_or_without_a_place(danger: DangerConfig) -> None:
     sensor = Sensor(danger, Map(seams=("x",)))
+    sensor.off(0.001)
     sensor.off(0.001)
     sensor.map.is_rim = True
     assert not sensor.on(0.001)
     assert not sensor.episode.look_ahead()
+    assert sensor.episode.cause is None
     lost = Sensor(danger, Map(is_rim=True), has_map=False)
     lost.off(0.001)
     lost.off(0.001)
@@ -385,6 +407,13 @@ def test_an_episode_ends_on_the_panel_after_some_way(danger: DangerConfig) -> No
     assert not near.stay(clear)
     assert not near.on(danger.no_map_travel_m - UM)
     assert near.on(2 * UM)
+
+
+def test_the_way_on_the_panel_counts_from_the_first_sample_on(danger: DangerConfig) -> None:
+    episode, there = Sensor(danger, Map()).episode, (danger.no_map_travel_m, 0.0)
+    assert not episode.see_on((0.0, 0.0))
+    ended = [episode.see_on(there) for _ in range(danger.clear_samples - 1)]
+    assert ended == [False] * (danger.clear_samples - 2) + [True]
 
 
 def test_an_episode_ends_at_rest_after_a_long_time(danger: DangerConfig) -> None:

@@ -137,7 +137,9 @@ def test_an_estimate_of_the_past_is_carried_to_the_sample(rule: Rule) -> None:
     assert offset_m == rule.cfg.robot.edge_sensors_m[0]
 
 
-def test_the_track_reaches_back_as_far_as_an_estimate_may_be_old(rule: Rule) -> None:
+@pytest.mark.parametrize("key", ["stale_after_s", "estimate_stale_after_s"])
+def test_the_track_reaches_back_as_far_as_data_may_be_old(cfg: Config, key: str) -> None:
+    rule = Rule(cfg.model_copy(update={"danger": cfg.danger.model_copy(update={key: 0.08})}))
     for _ in range(40):
         rule.feed([ON] * 10, v=0.1)
     assert rule.rule.track.knots == []  # nothing is read while nothing is off
