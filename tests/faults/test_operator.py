@@ -25,6 +25,7 @@ from ccatp.planning.way_home import plan_way_home
 from ccatp.router import REPEAT_S, RequestFailed, request
 from ccatp.samples import DeckPose, EventCode
 from ccatp.surveying.budget import home_time_s
+from ccatp.surveying.orders import Order
 from ccatp.surveying.states import State
 from ccatp.surveying.vigil import Call, Vigil
 from ccatp.wire.channels import format_ok
@@ -182,21 +183,28 @@ def test_an_abort_during_a_back_off_never_drives_forward_and_is_home_bound_soon(
     assert story.mission.done == []
 
 
-@settings(max_examples=15, deadline=None)
-@given(st.lists(st.integers(0, 250), max_size=6))
+def drive(config: Config, mirror: Mirror, aborts: list[int]) -> list[Order]:
+    """A mission aborted in these frames, to its end."""
+    story = Story(config, mirror)
+    for k in range(900):
+        if k in aborts:
+            story.mission.abort("fire")
+        story.frame()
+    return story.orders
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.lists(st.integers(61, 400), max_size=6))
 @pytest.mark.fault("O3")
 def test_repeated_aborts_change_nothing(config: Config, mirror: Mirror, again: list[int]) -> None:
-    def drive(repeats: list[int]) -> list[object]:
-        story = Story(config, mirror)
-        trace: list[object] = []
-        for k in range(400):
-            if k == 60 or (k > 60 and k - 60 in repeats):
-                story.mission.abort("fire")
-            trace.append(story.frame())
-        return trace
+    assert drive(config, mirror, [60, *again]) == drive(config, mirror, [60])
 
-    once, often = drive([]), drive(again)
-    assert often == once
+
+@pytest.mark.fault("O3")
+def test_an_abort_in_every_frame_is_one_abort(config: Config, mirror: Mirror, measured: Note) -> None:
+    once, always = drive(config, mirror, [60]), drive(config, mirror, list(range(60, 900)))
+    measured("O3", sum(a != b for a, b in zip(once, always, strict=True)))
+    assert drive(config, mirror, []) != once
 
 
 @pytest.mark.fault("O3")
