@@ -66,7 +66,7 @@ class Aborted(DeskRehearsal):
         super().__init__(cfg, folder)
         self._at, self._kind, self._clear_after_s = state, kind, clear_after_s
         self.raised_s = self.zero_s = self.cleared_s = inf
-        self.moved_while_held = False
+        self.moved_while_held = self.was_permitted = False
 
     def look(self, frame: Sensors) -> None:
         if self.raised_s == inf and self.mission.done and self.mission.state is self._at:
@@ -82,6 +82,9 @@ class Aborted(DeskRehearsal):
         assert frame is not None
         if self.raised_s <= frame.t and right == left == 0.0:
             self.zero_s = min(self.zero_s, frame.t)
+        if self.raised_s <= frame.t < self.cleared_s:
+            verdict = self.monitor.verdict
+            self.was_permitted |= verdict.forward or verdict.reverse or verdict.turn
         if self.zero_s < frame.t < self.cleared_s:
             self.moved_while_held |= not right == left == 0.0
 
@@ -115,6 +118,7 @@ def test_an_earthquake_presses_on_holds_and_leads_home_when_it_is_over(
     assert run.fans == [(run.raised_s, FULL)]  # in the same frame
     assert run.cleared_s < inf
     assert not run.moved_while_held
+    assert not run.was_permitted  # danger holds it, too
     assert result.outcome == "aborted, at base"
     assert result.summary["danger"]["falls"] == 0
     after = [m for m in run.asked if m.t_s > run.cleared_s]
