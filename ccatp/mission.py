@@ -3,11 +3,11 @@
 from collections.abc import Callable, Collection, Sequence
 
 from ccatp.config.models import Config
-from ccatp.control.tracker import DONE, DRIVE, LegTracker
+from ccatp.control.tracker import DONE, DRIVE
 from ccatp.mirror.mirror import Mirror
 from ccatp.planning.errors import PlanError
 from ccatp.planning.route import Route
-from ccatp.samples import DeckPose, EventCode, PointId, Stop, StopKind, Verdict
+from ccatp.samples import Corner, DeckPose, EventCode, PointId, Severity, Stop, StopKind, Verdict
 from ccatp.surveying.alignment import Aligner
 from ccatp.surveying.budget import TimeBudget
 from ccatp.surveying.correction import Corrector
@@ -16,6 +16,7 @@ from ccatp.surveying.journey import Journey, Motion
 from ccatp.surveying.leftovers import Leftovers
 from ccatp.surveying.missed_point import MissedPoint
 from ccatp.surveying.orders import STAND, Order
+from ccatp.surveying.pace import PacedTracker
 from ccatp.surveying.recovery import Recovery
 from ccatp.surveying.retreat import Retreat, Step
 from ccatp.surveying.states import (
@@ -35,6 +36,8 @@ from ccatp.surveying.states import (
 from ccatp.surveying.stopover import Stopover
 
 NORMAL, NEAR_EDGE, ABORTED = EventCode
+NONE, SLOW, HOLD, RETURN, FAULT = Severity.NONE, Severity.SLOW, Severity.HOLD, Severity.RETURN, Severity.FAULT
+_CORNERS = frozenset(Corner)
 PlanHome = Callable[[DeckPose], tuple[Stop, ...]]
 PlanRest = Callable[[Route, DeckPose, Collection[PointId]], Route]
 PlanPoints = Callable[[DeckPose, Sequence[PointId]], Route]
@@ -83,7 +86,7 @@ class Mission:
         self._is_review_due = False
         self._bar = ""
         self.wants_full_fans = False
-        self._tracker = LegTracker(cfg.control, cfg.limits, cfg.robot.wheel_lag_s)
+        self._tracker = PacedTracker(cfg.control, cfg.limits, cfg.health, cfg.robot.wheel_lag_s)
         self._is_steered_bare = not (cfg.control.predicts_delay and cfg.control.compensates_creep)
         self._route = route
         self._is_off_route = False
@@ -106,6 +109,11 @@ class Mission:
         self._missed = MissedPoint(Corrector(mirror, cfg.robot, cfg.mission))
         self._emergency = ""
         self._aligner = Aligner(mirror, cfg.robot, cfg.mission, heading_sigma_of, self._journey)
+        self._severity = NONE
+        self._recoveries_s: list[float] = []
+        self._stuck_s: float | None = None
+        self.doubts_pose = False
+        self._is_hold_deaf = self._is_finding = False
 
     def _journey(self, stops: Sequence[Stop]) -> Journey:
         return Journey(self._mirror, self._tracker, self._cfg.control.leg_timeout_factor, stops)
@@ -119,6 +127,11 @@ class Mission:
     def is_lost(self) -> bool:
         """The pose is known to be wrong, and is to be found again; at the start it is only to be confirmed."""
         return self._is_lost and not self._is_at_start
+
+    @property
+    def ignores_motion(self) -> bool:
+        """Held because wheels or inertial unit are not to be believed: whatever they say, the robot stands."""
+        return self.state is HELD and self._is_hold_deaf
 
     @property
     def eta_s(self) -> float:
@@ -176,11 +189,13 @@ class Mission:
         return None
 
     def resume(self) -> str | None:
-        """Go on after a hold."""
+        """Go on after a hold. What holds the robot must be gone."""
         if self.state is not State.HELD:
             return f"the mission is not held but {self.state}"
         if self._bar:
             return f"{self._bar}: nothing moves until that is cleared"
+        if self._severity >= HOLD and self._severity is not RETURN:
+            return f"the cause persists: {self.cause}"
         self._go_on()
         return None
 
@@ -212,6 +227,25 @@ class Mission:
         self._is_lost |= is_lost
         self._hold(cause, by_hand=True)
         self.is_faulted = True
+
+    def recover(self, cause: str, t_s: float) -> None:
+        """Hold, and go on with a fix; what comes again and again is a fault.
+
+        Args:
+            cause: why.
+            t_s: now.
+        """
+        if self.state is State.DONE or (self.state is HELD and self._is_held_by_hand):
+            return
+        health = self._cfg.health
+        self._recoveries_s = [since_s for since_s in self._recoveries_s if t_s - since_s <= health.retry_window_s]
+        if self._recoveries_s and t_s - self._recoveries_s[-1] <= health.pause_limit_s:
+            self._recoveries_s.pop()  # still the same: frame by frame it is asked for again
+        self._recoveries_s.append(t_s)
+        if len(self._recoveries_s) > 1 + health.retries:
+            self.fault(cause, is_lost=True)
+        else:
+            self._await_recovery(cause)
 
     def interrupt(self, cause: str) -> bool:
         """Hold until frames and verdicts are fresh again; returns whether that was news."""
@@ -337,6 +371,12 @@ class Mission:
             self._stand_fast(verdict.cause)
             return
         self._bar = ""
+        if verdict is not None and (verdict.severity is not NONE or self._severity is not NONE):
+            self._severity = verdict.severity
+            if self._obey(verdict):
+                return
+        if self._stuck_s is not None and self._waits_at_edge(motion.t_s, verdict):
+            return
         if verdict is None or not (verdict.forward and verdict.reverse and verdict.turn):
             if verdict is not None and verdict.code is NEAR_EDGE:
                 self._meet_edge(motion, verdict)
@@ -365,8 +405,61 @@ class Mission:
         self._is_lost, self._is_at_start = True, False
         self._hold(cause, by_hand=self.state is State.HELD and self._is_held_by_hand)
 
+    def _obey(self, verdict: Verdict) -> bool:
+        """Do what a finding of the monitors demands; whether that is all for this frame."""
+        severity = verdict.severity
+        self.wants_full_fans |= verdict.full_fans
+        is_denied = not (verdict.forward or verdict.reverse or verdict.turn)
+        if severity is FAULT:
+            if not (self.state is HELD and self.is_faulted):
+                self.fault(verdict.cause, is_lost=True)
+            return True
+        if is_denied and severity >= HOLD:
+            self._await_recovery(verdict.cause, is_pose_doubted=verdict.signal not in _CORNERS)
+            return True
+        self._pace(is_slow=severity in (SLOW, RETURN))
+        if severity is RETURN and verdict.code is not NEAR_EDGE and verdict.cause != self._emergency:
+            self._emergency = verdict.cause
+            self.abort(verdict.cause)
+        return False
+
+    def _await_recovery(self, cause: str, *, is_pose_doubted: bool = False) -> None:
+        """Hold until the cause is gone, and then find out where the robot is before moving on."""
+        if self.state is State.DONE or (self.state is HELD and self._is_held_by_hand):
+            return
+        self._is_lost, self._is_at_start = True, False
+        was_deaf = self.ignores_motion
+        if not self.interrupt(cause):
+            self.cause = cause
+        self._is_hold_deaf = was_deaf or is_pose_doubted
+
+    def _pace(self, *, is_slow: bool) -> None:
+        """Drive at the reduced speed from now on, or at the usual one from the next leg on."""
+        if is_slow is self._tracker.is_slow:
+            return
+        self._tracker.is_slow = is_slow
+        if is_slow and self.state in (DRIVING, TURNING, RETURNING):
+            (self.survey if self._home is None else self._home).interrupt()
+
+    def _waits_at_edge(self, t_s: float, verdict: Verdict | None) -> bool:
+        """After a retreat that led nowhere: whether to go on waiting until no sensor hangs over any more."""
+        if self.state is not HELD or self._is_held_by_hand or self._stuck_s is None:
+            self._stuck_s = None
+            return False
+        if verdict is not None and verdict.code is not NEAR_EDGE:
+            self._stuck_s = None
+            return False
+        if t_s - self._stuck_s > self._cfg.health.hold_limit_s:
+            self._stuck_s = None
+            self.fault(self.cause)
+        return True
+
     def _meet_edge(self, motion: Motion, verdict: Verdict) -> None:
         if self.state in (State.BACKING_OFF, State.DONE):
+            return
+        if self.ignores_motion:
+            self._go_on()  # where the edge is, is not known before a fix; standing still for it is safe anywhere
+        if self._is_finding and self.state in (SETTLING, MEASURING):
             return
         if self.state is State.HELD and self._is_held_by_hand:
             return
@@ -376,6 +469,8 @@ class Mission:
             self._backoffs = 0
             self.fault(f"at the edge again after {limit} back-offs: is an edge sensor dirty?")
             return
+        # Back at an edge right after a fix of the place: then it is the heading that is wrong.
+        self.doubts_pose |= self._backoffs > 1
         self.cause = verdict.cause
         self._interrupt()
         # An edge that the route did not foresee means that the pose is wrong: it is found again before moving on.
@@ -397,10 +492,13 @@ class Mission:
         self._interrupt()
         self._apply(Event.HOLD)
         self._is_held_by_hand = by_hand
+        self._is_hold_deaf = False
         self.cause = cause
 
     def _go_on(self) -> None:
         self._interrupt()
+        self._is_finding = self.ignores_motion
+        self.doubts_pose |= self._is_finding
         self.is_faulted = False
         # Wherever a hold left the robot: the route's next turn may not be safe there.
         self._is_off_route |= self.state is State.HELD
@@ -548,7 +646,8 @@ class Mission:
         if retreat.step_at is Step.TURN_AWAY and self._abort_cause is not None:
             retreat.step_at = Step.OVER  # there is no route to turn to; the way home begins from here
         if retreat.step_at is Step.STUCK:
-            self.fault("stuck at the edge: no motion away from it is permitted, or none helps")
+            self._hold("stuck at the edge: no motion away from it is permitted, or none helps", by_hand=False)
+            self._stuck_s = motion.t_s
             return STAND
         if retreat.step_at is Step.OVER:
             self._apply(Event.FIND)

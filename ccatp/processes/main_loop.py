@@ -14,6 +14,8 @@ from ccatp.control.gate import DriveGate
 from ccatp.errors import CcatpError, ConfigError, ExitStatus, UnreachableError
 from ccatp.etalon_client import EtalonClient, EtalonError
 from ccatp.frame_lag import FrameLag
+from ccatp.health.look import as_standing
+from ccatp.health.steady_time import SteadyTime
 from ccatp.localizer import Localizer
 from ccatp.metrology.scrutiny import Scrutiny
 from ccatp.mirror.mirror import Mirror
@@ -41,7 +43,7 @@ from ccatp.surveying.orders import STAND, Order
 from ccatp.surveying.states import PURPOSES, Outcome, State
 from ccatp.surveying.vigil import Call, Vigil
 from ccatp.wire.robot import Hello, Sensors
-from ccatp.wire.topics import MissionStatus
+from ccatp.wire.topics import MissionStatus, is_estimate_due
 
 EXIT_STATUS = {
     Outcome.COMPLETE: ExitStatus.COMPLETE,
@@ -120,6 +122,7 @@ class MainLoop:
         self._seat = Seat(cfg.robot, self._link, is_taking_over=self._is_taking_over, frame_hz=cfg.sim.robot.frame_hz)
         self._keeper = Keeper(args.run_dir, parts.localizer, parts.mission, is_patient=not args.is_realtime)
         self._was_quiet = False
+        self._time = SteadyTime(cfg.health.clock_jump_s)
         self._t_first_s: float | None = None
         self._t_last_s = 0.0
         self._elapsed_s = parts.elapsed_s  # before ``_t_first_s``
@@ -196,7 +199,8 @@ class MainLoop:
             self._teller.say("warning", "the robot has started anew: it is found again before it moves")
             self._ear.forget()
             self._teller.count_on()
-            self._elapsed_s, self._t_first_s = self._elapsed_total_s(), None
+            self._elapsed_s, self._t_first_s, self._seq = self._elapsed_total_s(), None, -1
+            self._time = SteadyTime(self._cfg.health.clock_jump_s)
             self._mission.lose_sight()
 
     def _fail(self, error: Exception) -> None:
@@ -283,18 +287,22 @@ class MainLoop:
     def _serve(self, sensors: Sensors, raw: bytes) -> None:
         start = time.perf_counter()
         t_s, seq = sensors.t, sensors.seq
-        dt_s = t_s - self._t_last_s if self._t_first_s is not None else self._seat.frame_period_s
+        # What counts durations goes by a time that does not jump; everything else by the robot's own.
+        steady_s = self._time.at(seq, t_s) if seq > self._seq else self._t_last_s
+        dt_s = steady_s - self._t_last_s if self._t_first_s is not None else self._seat.frame_period_s
         is_first, is_unjudged = self._seat.is_new_session, self._seat.is_unjudged
         if is_first:
             self._begin_session(dt_s)
         if self._t_first_s is None:
-            self._t_first_s = t_s
-        self._t_last_s, self._seq, self._pulse.frame_s = t_s, seq, time.monotonic()
+            self._t_first_s = steady_s
+        self._t_last_s, self._seq, self._pulse.frame_s = steady_s, max(seq, self._seq), time.monotonic()
         localizer = self._localizer
-        localizer.step(t_s, sensors.imu, sensors.enc, sensors.edge, sensors.gravity)
+        is_deaf = self._mission.ignores_motion
+        imu, enc = ((), as_standing(sensors.enc)) if is_deaf else (sensors.imu, sensors.enc)
+        localizer.step(t_s, imu, enc, sensors.edge, sensors.gravity)
         if localizer.hold_requested:
             # A filter that diverged is frozen until it has a fix.
-            self._mission.fault(localizer.hold_cause, is_lost=localizer.is_frozen)
+            self._mission.recover(localizer.hold_cause, steady_s)
             localizer.clear_hold()
         if dt_s <= 0.0:  # counted by the localizer; a controller cannot go back in time
             self._teller.stale_frame(seq, raw)
@@ -312,11 +320,12 @@ class MainLoop:
         order, right, left = self._decide(sensors, motion, None if self._is_late(t_s) else verdict)
         if order.at_rest or order.measure:
             self._execute(order, motion)
+        told = self._seat.told() if is_first or is_estimate_due(seq) else None
         if self._may_answer():
             self._seat.drive(seq, right, left)
         else:
             self._unanswered = seq
-        self._teller.frame(seq, t_s, localizer, self._mission.state, raw, is_first=is_first)
+        self._teller.frame(seq, t_s, localizer, self._mission.state, raw, told, is_first=is_first)
         self._keeper.frame(seq, t_s, self._elapsed_total_s())
         if self._mission.state is not self._state:
             self._on_state()
@@ -326,16 +335,24 @@ class MainLoop:
         """What the mission wants, and the wheel rates (right, left), rad/s, that the gate lets through."""
         mission = self._mission
         order = mission.step(motion, verdict) if self._is_on_mirror(sensors) else STAND
-        if mission.wants_full_fans and not self._has_full_fans:
-            self._has_full_fans = True
-            self._send_fans()  # pressed on first, held then
-        if mission.is_faulted:
-            self._keep_vigil(sensors)
+        self._heed(sensors)
         right, left = self._gate.pass_through(
             order.twist, verdict, motion.dt_s, motion.t_s, self._lag_s, PURPOSES[mission.state]
         )
         self._gate_watch.look(motion.t_s)
         return order, right, left
+
+    def _heed(self, sensors: Sensors) -> None:
+        """What the mission wants besides the drive, before that is sent."""
+        mission, health = self._mission, self._cfg.health
+        if mission.doubts_pose:
+            mission.doubts_pose = False
+            self._localizer.doubt(health.doubt_position_m, health.doubt_heading_rad)
+        if mission.wants_full_fans and not self._has_full_fans:
+            self._has_full_fans = True
+            self._send_fans()  # pressed on first, held then
+        if mission.is_faulted:
+            self._keep_vigil(sensors)
 
     def _begin_session(self, dt_s: float) -> None:
         """Before the first drive and not on joining, so that in lockstep the fans start in a certain frame."""
@@ -388,7 +405,7 @@ class MainLoop:
         ahead = self._seat.predictor.ahead(
             (pose.x_m, pose.y_m, pose.heading_rad), v, omega, echo.seq, echo.age, echo.held, creep
         )
-        return Motion(sensors.t, dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead, self._sigma_of)
+        return Motion(self._t_last_s, dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead, self._sigma_of)
 
     def _keep_vigil(self, sensors: Sensors) -> None:
         """A fault that nobody looks after: an alarm now and then, and home before the battery is too low for it."""
@@ -414,8 +431,10 @@ class MainLoop:
         if order.measure:
             pose = self._localizer.deck_pose
             expected = self._mirror.puck_world(pose, self._cfg.robot.puck_height_m)
+            # The localizer dates a fix by the robot's own clock.
+            t_s = motion.t_s - self._time.offset_s
             number, point = self._mission.request, self._mission.measuring_point
-            self._measuring.begin(Request(number, motion.t_s, point, expected, pose))
+            self._measuring.begin(Request(number, t_s, point, expected, pose))
 
     def _is_quiet(self) -> bool:
         control = self._cfg.control

@@ -3,6 +3,7 @@
 from ccatp.config.models import RobotConfig
 from ccatp.control.kinematics import twist_of
 from ccatp.control.prediction import CommandPredictor
+from ccatp.health.commanded import CommandSpan
 from ccatp.processes.joining import LastingLink
 from ccatp.wire.robot import Hello
 
@@ -28,6 +29,7 @@ class Seat:
         self.predictor = CommandPredictor(cfg.wheel_lag_s, 1.0 / frame_hz)
         self._hello: Hello | None = None
         self._drive_seq = self._fans_seq = 0
+        self._span, self._driven = CommandSpan(), (0.0, 0.0)
         self.is_lockstep = self.is_new_session = False
 
     def begin(self, hello: Hello) -> str:
@@ -55,9 +57,15 @@ class Seat:
     def drive(self, ack: int, right: float, left: float) -> None:
         """Send wheel rates, rad/s, computed from frame ``ack``."""
         self._drive_seq += 1
+        self._driven = right, left
+        self._span.add(right, left)
         twist = twist_of(right, left, self._cfg.wheel_radius_m, self._cfg.wheel_base_m)
         self.predictor.sent(self._drive_seq, twist.v_m_s, twist.omega_rad_s)
         self._link.link.send_drive(self._drive_seq, max(ack, 0), right, left)
+
+    def told(self) -> tuple[tuple[float, float, float, float], int]:
+        """Span of the set points since it was asked for last, rad/s, and the number of the newest drive."""
+        return self._span.take(*self._driven), self._drive_seq
 
     def send_fans(self, duty: tuple[float, float]) -> None:
         """Send the fans' duties."""

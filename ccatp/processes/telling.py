@@ -47,20 +47,44 @@ class Teller:
         self.t_s = 0.0
 
     def frame(
-        self, seq: int, t_s: float, localizer: Localizer, state: str, raw: bytes, *, is_first: bool = False
+        self,
+        seq: int,
+        t_s: float,
+        localizer: Localizer,
+        state: str,
+        raw: bytes,
+        told: tuple[tuple[float, float, float, float], int] | None = None,
+        *,
+        is_first: bool = False,
     ) -> None:
         """Keep the estimate after frame ``seq`` and the frame's line for the batch; publish it where it is due.
 
-        The first one of a session is always due: the danger loop may wait for it.
+        Args:
+            seq, t_s: the frame.
+            localizer: has the estimate.
+            state: of the mission.
+            raw: the frame's line.
+            told: span of the set points since the last estimate, rad/s, and the number of the newest drive.
+            is_first: of a session; it is always due, because the danger loop may wait for it.
         """
         self.seq, self.t_s = seq, t_s
         pose, sigma = localizer.pose, localizer.position_sigma_m
         if is_first or is_estimate_due(seq):
             deck = localizer.deck_pose
             x, y, heading = deck.x_m, deck.y_m, deck.heading_rad
-            self._publisher.send(
-                "estimate", Estimate(seq=seq, t_s=t_s, x_m=x, y_m=y, heading_rad=heading, sigma_m=sigma, state=state)
+            commanded, drive_seq = told if told is not None else (None, -1)
+            message = Estimate(
+                seq=seq,
+                t_s=t_s,
+                x_m=x,
+                y_m=y,
+                heading_rad=heading,
+                sigma_m=sigma,
+                state=state,
+                commanded=commanded,
+                drive_seq=drive_seq,
             )
+            self._publisher.send("estimate", message)
         row, col = pose.panel
         self._track.append((seq + self._frames_before, t_s, row, col, pose.x_m, pose.y_m, pose.heading_rad, sigma))
         self._keep(raw)

@@ -175,43 +175,45 @@ async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncI
         laser_port = await laser.start("127.0.0.1", 0)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         stop, robot_stop = asyncio.Event(), asyncio.Event()
-        async with FaultProxy("127.0.0.1", port, seed=1) as one, FaultProxy("127.0.0.1", port, seed=2) as two:
-            main_args, danger_args = (
-                ProcessArgs(_at(cfg, proxy.port, laser_port), run_dir, endpoints, None, True, False)
-                for proxy in (one, two)
-            )
-            (run_dir / "config.toml").write_text(dump_config(main_args.config), encoding="utf-8")
-            parts, store = build_parts(main_args)
-            with store:
-                main, danger = MainLoop(main_args, context, parts, store), DangerLoop(danger_args, context)
-                daemon = Daemon(main, danger, robot, (one, two))
-                daemon.log = entries
-                listener = context.socket(zmq.SUB)
-                listener.connect(endpoints.of("main"))
-                listener.subscribe("track")
-                try:
-                    with _seen_by(daemon):
-                        async with asyncio.TaskGroup() as tasks:
-                            peers = robot.run(robot_stop), outlet.serve(), laser.serve()
-                            serving = [tasks.create_task(work) for work in peers]
-                            daemon.loops = [tasks.create_task(work) for work in (main.run(stop), danger.run(stop))]
-                            daemon.stop = stop
-                            try:
-                                yield daemon
-                            finally:
-                                stop.set()
-                                await asyncio.wait(daemon.loops)
-                                robot_stop.set()
-                                for task in serving[1:]:
-                                    task.cancel()
-                finally:
-                    main.close()
-                    danger.close()
-                    listener.close(linger=0)
-        await laser.close()
-        puck.close()
-        outlet.close()
-        context.destroy(linger=0)
+        try:
+            async with FaultProxy("127.0.0.1", port, seed=1) as one, FaultProxy("127.0.0.1", port, seed=2) as two:
+                main_args, danger_args = (
+                    ProcessArgs(_at(cfg, proxy.port, laser_port), run_dir, endpoints, None, True, False)
+                    for proxy in (one, two)
+                )
+                (run_dir / "config.toml").write_text(dump_config(main_args.config), encoding="utf-8")
+                parts, store = build_parts(main_args)
+                with store:
+                    main, danger = MainLoop(main_args, context, parts, store), DangerLoop(danger_args, context)
+                    daemon = Daemon(main, danger, robot, (one, two))
+                    daemon.log = entries
+                    listener = context.socket(zmq.SUB)
+                    listener.connect(endpoints.of("main"))
+                    listener.subscribe("track")
+                    try:
+                        with _seen_by(daemon):
+                            async with asyncio.TaskGroup() as tasks:
+                                peers = robot.run(robot_stop), outlet.serve(), laser.serve()
+                                serving = [tasks.create_task(work) for work in peers]
+                                daemon.loops = [tasks.create_task(work) for work in (main.run(stop), danger.run(stop))]
+                                daemon.stop = stop
+                                try:
+                                    yield daemon
+                                finally:
+                                    stop.set()
+                                    await asyncio.wait(daemon.loops)
+                                    robot_stop.set()
+                                    for task in serving[1:]:
+                                        task.cancel()
+                    finally:
+                        main.close()
+                        danger.close()
+                        listener.close(linger=0)
+        finally:
+            await laser.close()
+            puck.close()
+            outlet.close()
+            context.destroy(linger=0)
 
 
 @contextmanager

@@ -212,6 +212,11 @@ def rim_case(number: int) -> tuple[str, Callable[[], Tally]]:
     return text, run
 
 
+def speed_of(number: int) -> float:
+    """Speed of a drive over the rim, m/s."""
+    return SPEEDS_M_S[number % len(SPEEDS_M_S)]
+
+
 def turn_case(number: int) -> tuple[str, Callable[[], Tally]]:
     """A turn in place beside the rim."""
     k, turn = divmod(number, len(TURNS_RAD_S))

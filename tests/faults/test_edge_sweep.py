@@ -6,19 +6,31 @@
 
 import os
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import pytest
 
 from tests.faults import edge_sweep
-from tests.faults.edge_sweep import OVERRUN_M, Tally, rim_case, rim_cases, seam_case, sweep, turn_case, turn_cases
+from tests.faults.edge_sweep import (
+    OVERRUN_M,
+    Tally,
+    rim_case,
+    rim_cases,
+    seam_case,
+    speed_of,
+    sweep,
+    turn_case,
+    turn_cases,
+)
 
 SHARD, SHARDS = map(int, os.environ.get("CCATP_SWEEP_SHARD", "5/96").split("/"))
 SEAMS = 1_000_000  # of the whole sweep
 MIN_DRIVEN = 0.25
 PERMIT_S = 0.1  # S22, S24
 
-Measured = Callable[[str, float], None]
+Measured = Callable[..., None]
+# Slower than this the way that tells a direction, 0.2 mm and more, takes longer than the bound in time.
+SLOW_M_S = 0.02
 
 
 def check(tally: Tally) -> None:
@@ -27,6 +39,23 @@ def check(tally: Tally) -> None:
     assert not tally.unseen, "\n".join(tally.worst)
     assert tally.after_m <= OVERRUN_M, "\n".join(tally.worst)
     assert not tally.false_edges, "\n".join(tally.worst)
+
+
+def check_rim(numbers: Iterable[int], measured: Measured) -> None:
+    """All drives count for falls and overrun; the time to the permit is that of those that are not slow."""
+    tally, late_s = Tally(), 0.0
+    count = 0
+    for number in numbers:
+        one = sweep(rim_case, [number])
+        tally.add(one)
+        count += 1
+        if speed_of(number) >= SLOW_M_S:
+            late_s = max(late_s, one.late_s)
+    check(tally)
+    assert tally.drives > count * MIN_DRIVEN
+    measured("S22", 1e3 * tally.after_m, "mm")
+    measured("S22", 1e3 * late_s, "ms")
+    measured("S22", tally.falls, "falls")
 
 
 def test_a_number_is_a_drive() -> None:
@@ -41,10 +70,7 @@ def test_a_number_is_a_drive() -> None:
 @pytest.mark.fault("S22")
 def test_a_sample_of_the_rim(measured: Measured) -> None:
     rng = random.Random(20)
-    tally = sweep(rim_case, [rng.randrange(rim_cases()) for _ in range(160)])
-    check(tally)
-    assert tally.drives > 160 * MIN_DRIVEN
-    measured("S22", 1e3 * tally.after_m)
+    check_rim([rng.randrange(rim_cases()) for _ in range(160)], measured)
 
 
 @pytest.mark.fault("S24")
@@ -71,9 +97,7 @@ def test_a_sample_of_ways_and_stops_over_seams(measured: Measured) -> None:
 @pytest.mark.fault("S22")
 @pytest.mark.parametrize("part", range(4))
 def test_the_rim(part: int, measured: Measured) -> None:
-    tally = sweep(rim_case, range(SHARD + SHARDS * part, rim_cases(), 4 * SHARDS))
-    check(tally)
-    measured("S22", 1e3 * tally.after_m)
+    check_rim(range(SHARD + SHARDS * part, rim_cases(), 4 * SHARDS), measured)
 
 
 @pytest.mark.slow

@@ -145,19 +145,21 @@ def stall(store: MissionStore) -> threading.Event:
 
 
 @pytest.mark.fault("P14")
-def test_nobody_waits_for_a_stalled_disk(tmp_path: Path) -> None:
+def test_nobody_waits_for_a_stalled_disk(tmp_path: Path, measured: Measured) -> None:
     with make(tmp_path / "mission.sqlite", POINTS[:9]) as store:
         release = stall(store)
-        begun_s = time.thread_time()
-        futures = [store.record_fix(point, FIX, POSE) for point in POINTS[:9]]
-        assert all(store.record_event(StoreEvent(1.0, "mission")) for _ in range(500))
-        assert store.record_arrival(POINTS[0], 1.0, 0.001)
-        spent_s = time.thread_time() - begun_s
+        futures, longest_s = list[Future[int]](), 0.0
+        for point in POINTS[:9]:  # what a pass of the control loop does at a stop, and more
+            begun_s = time.thread_time()
+            futures.append(store.record_fix(point, FIX, POSE))
+            assert all(store.record_event(StoreEvent(1.0, "mission")) for _ in range(50))
+            assert store.record_arrival(point, 1.0, 0.001)
+            longest_s = max(longest_s, time.thread_time() - begun_s)
         # All of it came back while the writer was stuck: it cannot have waited.
         assert not release.is_set()
         assert not any(future.done() for future in futures)
         assert store.queue_age_s > 0.0
-        assert spent_s < 1.0
+        measured("P14", 1e3 * longest_s)
         release.set()
         assert [future.result(timeout=30.0) for future in futures] == list(range(1, 10))
 
@@ -176,16 +178,18 @@ class Desk:
         mission = SimpleNamespace(
             is_awaiting_fix=True,
             request=1,
+            is_lost=True,
             fixed=self.measured.append,
             fault=self._fault,
             survey=SimpleNamespace(distance_m=lambda pose: 0.0),
         )
-        localizer = SimpleNamespace(fuse_fix=lambda fix: 0.0, notices=[], pose=None)
+        localizer = SimpleNamespace(fuse_fix=lambda fix: 0.0, notices=[], pose=None, pose_covariance=None)
+        sure = SimpleNamespace(begin=lambda: None, review=lambda *_, **__: Finding())
         teller = SimpleNamespace(fix=lambda *_, **__: None, say=lambda level, text: self.said.append(text))
         self.desk = MeasuringDesk(
             config.mission,
             cast(EtalonClient, SimpleNamespace(measure=measure)),
-            cast(Scrutiny, SimpleNamespace(begin=lambda: None, review=lambda *_, **__: Finding())),
+            cast(Scrutiny, sure),
             cast(Localizer, localizer),
             cast(Mission, mission),
             store,

@@ -31,7 +31,7 @@ TOKENS = (
     "\u0661\u00b2".encode(),
 )
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
-_VARYING = re.compile(r"\d+|'[^']*'|\"[^\"]*\"|\bnan\b|\binf\b")
+_VARYING = re.compile(r"\d+|'.*'|\".*\"|\bnan\b|\binf\b")
 
 
 @dataclass(frozen=True, slots=True)

@@ -75,12 +75,10 @@ def test_the_laser_system_is_killed_and_the_survey_goes_on(start: Start) -> None
 
 
 @pytest.mark.fault("P6")
-def test_a_main_loop_that_is_stopped_and_goes_on_decides_nothing_by_old_frames(
-    start: Start, measured: Measured
-) -> None:
+def test_a_main_loop_that_is_stopped_and_goes_on_decides_nothing_by_old_frames(start: Start) -> None:
     run = start("--panels", "1", "--realtime")
     until_driving(run, 0)
-    pid, at_s = send(run, "main", signal.SIGSTOP)
+    pid, _ = send(run, "main", signal.SIGSTOP)
     time.sleep(1.0)  # of frames that wait for it
     os.kill(pid, signal.SIGCONT)
     run.until(lambda status: status["done"] >= 1)
@@ -96,7 +94,6 @@ def test_a_main_loop_that_is_stopped_and_goes_on_decides_nothing_by_old_frames(
         and entry["cause"] == "estimate stale"
     ]  # fmt: skip
     assert withheld
-    measured("P6", 1e3 * first_after(run, at_s, "danger", "verdict"))
 
 
 @pytest.mark.slow
