@@ -535,10 +535,10 @@ class Mission:
         return True
 
     def _travel(self, motion: Motion) -> Order:
-        if self._is_review_due and self._is_out_of_time(motion):
-            return STAND
         if self._is_lost:
             return self._align(motion)
+        if self._is_review_due and self._is_out_of_time(motion):
+            return STAND
         survey = self.survey
         stop = survey.current
         if stop is not None and not self._missed.follows_route(motion, stop, survey):

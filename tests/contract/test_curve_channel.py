@@ -167,7 +167,7 @@ def plain(peer: zmq.asyncio.Socket) -> None:
 
 
 @pytest.mark.fault("O5")
-async def test_the_listed_get_answers_and_nobody_else_gets_in(site: Site) -> None:
+async def test_the_listed_get_answers_and_nobody_else_gets_in(site: Site, measured: Callable[..., None]) -> None:
     async with served(site):
         assert await site.ask("observatory") == {"ok": True, "code": 0, "age_s": 0.01}
         strangers: dict[str, Setup] = {
@@ -182,6 +182,7 @@ async def test_the_listed_get_answers_and_nobody_else_gets_in(site: Site) -> Non
         assert (await site.ask("weather"))["ok"]  # the server lives on
         stranger = decode_key(site.pair("stranger").public.decode()).hex()
         assert f"127.0.0.1: key {stranger} is not on the list" in site.refusals()
+    measured("O5", site.monitor.latch.is_latched)
 
 
 async def test_garbage_and_silence_lose_the_connection_and_harm_nobody(site: Site) -> None:
@@ -200,7 +201,9 @@ async def test_garbage_and_silence_lose_the_connection_and_harm_nobody(site: Sit
 
 
 @pytest.mark.fault("O6")
-async def test_raising_needs_a_place_on_the_list_and_clearing_the_role(site: Site) -> None:
+async def test_raising_needs_a_place_on_the_list_and_clearing_the_role(
+    site: Site, measured: Callable[..., None]
+) -> None:
     async with served(site):
         fire = format_request("emergency", kind="fire", id=ID)
         clear = format_request("clear", id=ID)
@@ -208,6 +211,7 @@ async def test_raising_needs_a_place_on_the_list_and_clearing_the_role(site: Sit
         refused = {"ok": False, "id": ID, "error": "this client may raise emergencies, not clear them"}
         assert await site.ask("weather", clear) == refused
         assert site.monitor.latch.is_latched
+        measured("O6", not site.monitor.latch.is_latched)
         assert await site.ask("observatory", clear) == {"ok": True, "id": ID, "code": 0}
         assert not site.monitor.latch.is_latched
         assert [line["client"] for line in site.logged] == ["weather", "weather", "observatory"]

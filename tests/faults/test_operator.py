@@ -5,8 +5,9 @@ import random
 import threading
 import time
 from collections.abc import Callable
-from math import inf
+from math import ceil, inf, log
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import pytest
@@ -24,6 +25,7 @@ from ccatp.planning.way_home import plan_way_home
 from ccatp.router import REPEAT_S, RequestFailed, request
 from ccatp.samples import DeckPose, EventCode
 from ccatp.surveying.budget import home_time_s
+from ccatp.surveying.orders import Order
 from ccatp.surveying.states import State
 from ccatp.surveying.vigil import Call, Vigil
 from ccatp.wire.channels import format_ok
@@ -32,7 +34,7 @@ from tests.faults.campaign import single
 from tests.faults.laser import FULL, DeskRehearsal
 from tests.unit.test_mission import DT, FREE, FRONT_OFF, Story
 
-Note = Callable[[str, float], None]
+Note = Callable[..., None]
 SURVEYING = (State.TURNING, State.DRIVING, State.SETTLING, State.MEASURING)
 TABLE_ROWS = [(kind, level, held) for kind in EmergencyKind for level in (False, True) for held in (False, True)]
 
@@ -64,7 +66,7 @@ class Aborted(DeskRehearsal):
         super().__init__(cfg, folder)
         self._at, self._kind, self._clear_after_s = state, kind, clear_after_s
         self.raised_s = self.zero_s = self.cleared_s = inf
-        self.moved_while_held = False
+        self.moved_while_held = self.was_permitted = False
 
     def look(self, frame: Sensors) -> None:
         if self.raised_s == inf and self.mission.done and self.mission.state is self._at:
@@ -80,6 +82,9 @@ class Aborted(DeskRehearsal):
         assert frame is not None
         if self.raised_s <= frame.t and right == left == 0.0:
             self.zero_s = min(self.zero_s, frame.t)
+        if self.raised_s <= frame.t < self.cleared_s:
+            verdict = self.monitor.verdict
+            self.was_permitted |= verdict.forward or verdict.reverse or verdict.turn
         if self.zero_s < frame.t < self.cleared_s:
             self.moved_while_held |= not right == left == 0.0
 
@@ -113,6 +118,7 @@ def test_an_earthquake_presses_on_holds_and_leads_home_when_it_is_over(
     assert run.fans == [(run.raised_s, FULL)]  # in the same frame
     assert run.cleared_s < inf
     assert not run.moved_while_held
+    assert not run.was_permitted  # danger holds it, too
     assert result.outcome == "aborted, at base"
     assert result.summary["danger"]["falls"] == 0
     after = [m for m in run.asked if m.t_s > run.cleared_s]
@@ -181,20 +187,28 @@ def test_an_abort_during_a_back_off_never_drives_forward_and_is_home_bound_soon(
     assert story.mission.done == []
 
 
-@settings(max_examples=15, deadline=None)
-@given(st.lists(st.integers(0, 250), max_size=6))
+def drive(config: Config, mirror: Mirror, aborts: list[int]) -> list[Order]:
+    """A mission aborted in these frames, to its end."""
+    story = Story(config, mirror)
+    for k in range(900):
+        if k in aborts:
+            story.mission.abort("fire")
+        story.frame()
+    return story.orders
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.lists(st.integers(61, 400), max_size=6))
 @pytest.mark.fault("O3")
 def test_repeated_aborts_change_nothing(config: Config, mirror: Mirror, again: list[int]) -> None:
-    def drive(repeats: list[int]) -> list[object]:
-        story = Story(config, mirror)
-        trace: list[object] = []
-        for k in range(400):
-            if k == 60 or (k > 60 and k - 60 in repeats):
-                story.mission.abort("fire")
-            trace.append(story.frame())
-        return trace
+    assert drive(config, mirror, [60, *again]) == drive(config, mirror, [60])
 
-    assert drive(again) == drive([])
+
+@pytest.mark.fault("O3")
+def test_an_abort_in_every_frame_is_one_abort(config: Config, mirror: Mirror, measured: Note) -> None:
+    once, always = drive(config, mirror, [60]), drive(config, mirror, list(range(60, 900)))
+    measured("O3", sum(a != b for a, b in zip(once, always, strict=True)))
+    assert drive(config, mirror, []) != once
 
 
 @pytest.mark.fault("O3")
@@ -264,10 +278,23 @@ def test_an_emergency_is_told_until_it_is_heard(measured: Note) -> None:
     assert relay.lost > 20
     assert min(repeats) >= 1
     assert max(repeats) > 1  # an answer was lost, and asked for again
-    # So many of these periods fit into the second; all their messages lost has this probability.
-    unheard = 0.5 ** (1.0 / REPEAT_S)
-    measured("O4", 1.0 - unheard)
-    assert unheard <= 1e-4
+    # After so many periods fewer than one in 10,000 have been lost each time.
+    delivered_s = REPEAT_S * ceil(log(1e-4) / log(0.5))
+    measured("O4", delivered_s, "s")
+    assert delivered_s <= 1.0
+
+
+@pytest.mark.fault("O4")
+def test_an_emergency_is_acknowledged_at_once(measured: Note) -> None:
+    relay = LossyRelay(0)
+    relay._is_lost = lambda: False  # type: ignore[method-assign]
+    took_ms = []
+    for _ in range(9):
+        begun_s = time.monotonic()
+        assert request(relay.endpoint, b"fire", 5.0, repeats=True)["ok"]
+        took_ms.append(1e3 * (time.monotonic() - begun_s))
+    relay.close()
+    measured("O4", median(took_ms), "ms")  # of what the machine had to do besides, nothing is said
 
 
 @pytest.mark.fault("O4")
@@ -288,7 +315,7 @@ def test_what_must_not_be_asked_twice_is_asked_once() -> None:
 @pytest.mark.fault("O7")
 @pytest.mark.parametrize(("kind", "level", "held"), TABLE_ROWS)
 def test_a_clear_is_refused_with_a_reason_while_the_cause_persists(
-    kind: EmergencyKind, level: bool, held: bool
+    kind: EmergencyKind, level: bool, held: bool, measured: Note
 ) -> None:
     latch = AbortLatch()
     latch.raise_emergency(kind.value, "a")
@@ -299,6 +326,7 @@ def test_a_clear_is_refused_with_a_reason_while_the_cause_persists(
         assert refusal == f"the cause persists: {kind}"
     else:
         assert refusal == (None if held else "the robot is neither at base nor held")
+    measured("O7", 100.0)
 
 
 # -- O8: nobody there -------------------------------------------------------------------------------------------------
@@ -329,7 +357,7 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
     measured("F6", 100.0 * at_dock)
     assert story.mission.state is State.RETURNING
     assert at_dock >= cfg.battery_reserve
-    assert (soc - cfg.battery_reserve) / (home_s * drain) >= 1.5 - 0.1  # a frame of this story is half a second
+    assert (soc - cfg.battery_reserve) / (home_s * drain) >= 1.5
     assert len(reminders) >= 20
     assert all(b - a == pytest.approx(60.0, abs=1.0) for a, b in itertools.pairwise(reminders))
 

@@ -303,6 +303,18 @@ def test_a_stale_verdict_while_being_found_does_not_make_it_forget(story: Story)
     assert story.mission.measuring_point is not None or story.mission.done == []
 
 
+def test_a_robot_that_stands_to_be_found_needs_no_permission(story: Story) -> None:
+    story.until_state(State.DRIVING)
+    story.mission.fault("filter: not finite", is_lost=True)
+    story.mission.resume()
+    denied = replace(FREE, forward=False, reverse=False, turn=False, cause="estimate not finite")
+    story.until(lambda: story.orders[-1].measure, denied)
+    story.frame(denied)
+    assert story.mission.state is State.HELD  # found, and waits for the permission to move
+    story.until_state(State.DONE)
+    assert len(story.mission.done) == 3
+
+
 def test_a_robot_that_never_rests_is_a_fault(story: Story) -> None:
     story.until_state(State.SETTLING)
     for _ in range(1100):
