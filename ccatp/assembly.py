@@ -1,6 +1,6 @@
 """Pure. Assembles the parts of a main loop from a configuration, for the daemon and for rehearsals alike."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from math import hypot
 
@@ -9,7 +9,7 @@ from ccatp.control.gate import DriveGate
 from ccatp.errors import ConfigError
 from ccatp.localizer import FOUR_STATE, Localizer, build_localizer
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.mission import Mission, PlanHome, PlanRest
+from ccatp.mission import Mission, PlanHome, PlanPoints, PlanRest
 from ccatp.planning.bound import path_time
 from ccatp.planning.calibration import plan_calibration
 from ccatp.planning.route import Route, plan_rejoin, plan_route, with_prelude
@@ -88,7 +88,7 @@ def assemble(cfg: Config, done: Collection[PointId] = (), recovery: Recovery | N
     localizer = _build_localizer(cfg, mirror, recovery)
     # No drive shows the four states their heading: the fix does not reach it.
     heading_sigma_of = float if cfg.run.filter in FOUR_STATE else lambda: localizer.heading_sigma_rad
-    planners = _home_planner(cfg, mirror), _rest_planner(cfg, mirror)
+    planners = _home_planner(cfg, mirror), _rest_planner(cfg, mirror), _points_planner(cfg, mirror)
     mission = Mission(cfg, mirror, route, *planners, heading_sigma_of)
     if recovery is not None:
         mission.take_over(recovery)
@@ -136,6 +136,14 @@ def _rest_planner(cfg: Config, mirror: Mirror) -> PlanRest:
     def plan(route: Route, start: DeckPose, skip: Collection[PointId]) -> Route:
         measuring_s = cfg.etalon.measuring_time_s
         return plan_rejoin(mirror, route, cfg.robot, cfg.limits, cfg.mission, start, skip, measuring_s)
+
+    return plan
+
+
+def _points_planner(cfg: Config, mirror: Mirror) -> PlanPoints:
+    def plan(start: DeckPose, points: Sequence[PointId]) -> Route:
+        measuring_s = cfg.etalon.measuring_time_s
+        return plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, start, (), measuring_s)
 
     return plan
 

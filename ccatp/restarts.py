@@ -1,6 +1,6 @@
 """Pure. Whether a process that died, or hangs, is started anew: what it ended with, and how often it has happened."""
 
-from collections import deque
+from collections import defaultdict, deque
 from enum import Enum
 from typing import NamedTuple
 
@@ -33,14 +33,14 @@ class RestartPolicy:
     """Decides over the processes of one run.
 
     Args:
-        limit: so many may be started anew ...
+        limit: each may be started anew so many times ...
         window_s: ... in this time.
     """
 
     def __init__(self, limit: int, window_s: float) -> None:
         """Nothing has died."""
         self._limit, self._window_s = limit, window_s
-        self._restarts_s: deque[float] = deque()
+        self._restarts_s: defaultdict[str, deque[float]] = defaultdict(deque)
 
     def died(self, name: str, code: int, now_s: float, *, is_replaceable: bool = True, why: str = "") -> Decision:
         """A process has died.
@@ -57,12 +57,13 @@ class RestartPolicy:
             return Decision(Fate.END, f"process {name} {how}")
         if not is_replaceable:
             return Decision(Fate.HELD, f"process {name} {how}: run ended, wheels held")
-        while self._restarts_s and now_s - self._restarts_s[0] > self._window_s:
-            self._restarts_s.popleft()
-        if len(self._restarts_s) >= self._limit:
-            often = f"more than {self._limit} within {self._window_s:g} s"
-            return Decision(Fate.HELD, f"process {name} {how}; {often} have died: run ended, wheels held")
-        self._restarts_s.append(now_s)
+        restarts_s = self._restarts_s[name]
+        while restarts_s and now_s - restarts_s[0] > self._window_s:
+            restarts_s.popleft()
+        if len(restarts_s) >= self._limit:
+            often = f"more than {self._limit} times within {self._window_s:g} s"
+            return Decision(Fate.HELD, f"process {name} {how}, {often}: run ended, wheels held")
+        restarts_s.append(now_s)
         return Decision(Fate.RESTART, f"process {name} {how}: starting it anew, wheels held meanwhile")
 
 

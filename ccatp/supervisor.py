@@ -7,6 +7,7 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from fcntl import LOCK_EX, LOCK_NB, flock
 from pathlib import Path
@@ -28,6 +29,7 @@ from ccatp.robot_link import read_key
 from ccatp.run_options import RunOptions, default_run_dir
 from ccatp.runtime_dir import make_runtime_dir
 from ccatp.service_notify import take_from
+from ccatp.unfinished import find_unfinished, forget_finished, note_unfinished
 from ccatp.wire.topics import Presence
 
 POLL_MS = 20
@@ -56,6 +58,8 @@ def run_survey(options: RunOptions) -> int:
     Raises:
         CcatpError: the run could not begin.
     """
+    if options.recover:
+        return _recover(options)
     overrides = dict(options.overrides)
     cfg = load_config(options.config_file, overrides)
     check_observatory(cfg.observatory)
@@ -74,6 +78,22 @@ def run_survey(options: RunOptions) -> int:
             (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
         run = _Run(options, cfg, run_dir, Endpoints(runtime_dir), sockets, started)
         return run.go()
+
+
+def _recover(options: RunOptions) -> int:
+    """Go on, held, with the run that did not finish; else begin a new one that may be recovered."""
+    options = replace(options, recover=False)
+    found = find_unfinished()
+    if found is not None:
+        options = replace(options, run_dir=found, resume=True, held=True)
+    else:
+        cfg = load_config(options.config_file, dict(options.overrides))
+        run_dir = default_run_dir(cfg.run.mirror, cfg.run.seed, datetime.now(UTC)).absolute()
+        options = replace(options, run_dir=run_dir)
+        note_unfinished(run_dir)
+    status = run_survey(options)
+    forget_finished(status)
+    return status
 
 
 def _processes(options: RunOptions) -> list[ProcessSpec]:

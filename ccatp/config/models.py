@@ -192,12 +192,17 @@ class EtalonConfig(Model):
     request_timeout_s: Positive
     retries: Annotated[int, Field(ge=0, le=10)]
     reconnect_delay_s: Positive
+    reconnect_for_s: NonNegative
     measuring_time_s: Positive
     length_sigma_m: Positive
     length_sigma_per_m: NonNegative
     max_residual_m: Positive
     max_dop: Positive
     max_distance_m: Positive
+    max_surface_residual_m: Positive
+    doubt_nis: Positive
+    repeat_m: Positive
+    start_distance_m: Positive
 
 
 class DangerConfig(Model):
@@ -216,6 +221,57 @@ class DangerConfig(Model):
     lifted_samples: Annotated[int, Field(ge=1, le=1000)]
     outward_turn_limit_m: Positive
     clear_samples: Annotated[int, Field(ge=1, le=10000)]
+
+
+class HealthConfig(Model):
+    """What the monitors of sensors, wheels, fans and link take for a fault, and how long they are patient."""
+
+    slow_speed_m_s: Positive
+    slow_rate_rad_s: Positive
+    doubt_position_m: Positive
+    doubt_heading_rad: Positive
+    gap_s: Positive
+    pause_limit_s: Positive
+    hold_limit_s: Positive
+    lifted_limit_s: Positive
+    retries: Annotated[int, Field(ge=0, le=10)]
+    retry_after_s: Positive
+    retry_window_s: Positive
+    stall_command_m_s: Positive
+    stall_speed_m_s: Positive
+    stall_time_s: Positive
+    stop_time_s: Positive
+    stop_speed_m_s: Positive
+    creep_m: Positive
+    runaway_m_s: Positive
+    runaway_time_s: Positive
+    yaw_limit_rad: Positive
+    yaw_share: Annotated[float, Field(ge=0.0, le=1.0)]
+    yaw_time_s: Positive
+    identical_samples: Annotated[int, Field(ge=2, le=1000)]
+    imu_rate_rad_s: Positive
+    imu_jump_rad_s: Positive
+    imu_largest_rad_s: Positive
+    imu_rate_share: Annotated[float, Field(ge=0.0, le=1.0)]
+    imu_acceleration_m_s2: Positive
+    imu_quarantine_s: Positive
+    rate_share: Annotated[float, Field(gt=0.0, lt=1.0)]
+    rate_time_s: Positive
+    latency_slow_s: Positive
+    latency_pause_s: Positive
+    clock_jump_s: Positive
+    seam_margin_m: Positive
+    seams_suspect: Annotated[int, Field(ge=1, le=10)]
+    seams_failed: Annotated[int, Field(ge=1, le=10)]
+    stuck_off_m: Annotated[float, Field(gt=0.0, le=0.06)]
+    chatter_transitions: Annotated[int, Field(ge=1, le=1000)]
+    chatter_time_s: Positive
+    fan_share: Annotated[float, Field(gt=0.0, lt=1.0)]
+    fan_time_s: Positive
+    battery_life_s: Positive
+    battery_reserve: Annotated[float, Field(ge=0.0, lt=1.0)]
+    battery_margin: Annotated[float, Field(ge=1.0, le=10.0)]
+    battery_time_s: Positive
 
 
 class ObservatoryConfig(Model):
@@ -249,6 +305,11 @@ class MissionConfig(Model):
     failed_points_before_hold: Annotated[int, Field(ge=1)]
     heading_doubt_rad: Positive
     alignment_leg_m: Annotated[float, Field(gt=0.0, le=0.5)]
+    holds_to_budget: bool
+    alarm_period_s: Positive
+    battery_endurance_s: Positive
+    battery_reserve: Annotated[float, Field(ge=0.0, lt=1.0)]
+    return_energy_factor: Annotated[float, Field(ge=1.0)]
 
 
 class SimRobotConfig(Model):
@@ -404,6 +465,7 @@ class Config(Model):
     localizer: LocalizerConfig
     etalon: EtalonConfig
     danger: DangerConfig
+    health: HealthConfig
     observatory: ObservatoryConfig
     mission: MissionConfig
     sim: SimConfig

@@ -22,7 +22,7 @@ from ccatp.processes.latching import FILE as EMERGENCIES_FILE
 from ccatp.processes.latching import DurableLatch
 from ccatp.processes.observing import Observatory, ObservatoryDesk
 from ccatp.processes.pulse import PERIOD_S, Pulse
-from ccatp.samples import EventCode, Verdict
+from ccatp.samples import EventCode, Severity, Verdict
 from ccatp.wire.robot import Hello, Sensors
 from ccatp.wire.topics import DangerEvent, Estimate, Message, last_estimate_before
 
@@ -44,15 +44,14 @@ class DangerLoop:
         cfg = args.config
         self._cfg, self._endpoints, self._context = cfg, args.endpoints, context
         self.log = open_log(args.run_dir / "log.jsonl", "danger")
-        self.monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger)
+        self.monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger, cfg.health)
         self.monitor.latch = DurableLatch(args.run_dir / EMERGENCIES_FILE, self.log)
         self._publisher = Publisher(context, args.endpoints.of("danger"))
         self._pulse = Pulse(self._publisher, "danger")
         main = args.endpoints.of("main")
         self._subscriber = Subscriber(context, [main], ["estimate", "presence.main"], is_watching=True)
         self._estimate: Estimate | None = None
-        self._code = EventCode.NORMAL
-        self._cause = ""
+        self._told = (EventCode.NORMAL, "", Severity.NONE)
         self._seq = self._first_seq = -1
         self._permit_seq = 0
         self._t_s = 0.0
@@ -116,7 +115,8 @@ class DangerLoop:
         """Judge one frame. In lockstep with a certain estimate of main's, so that the run is repeatable."""
         self._seq, self._t_s, self._pulse.frame_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
         if self._first_seq < 0:
-            self._first_seq = sensors.seq
+            # Of the frame that it meets, a process that takes over may have missed main's estimate.
+            self._first_seq = sensors.seq + self._is_taking_over
         wanted = last_estimate_before(sensors.seq)
         self._take_estimates(wanted if wanted >= self._first_seq else -1)
         try:
@@ -136,17 +136,18 @@ class DangerLoop:
             self._permit_seq += 1
             self.lasting.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
         self._publisher.send("verdict", verdict)
-        if verdict.code is not self._code or verdict.cause != self._cause:
+        if (verdict.code, verdict.cause, verdict.severity) != self._told:
             self._announce(verdict)
 
     def _announce(self, verdict: Verdict) -> None:
-        self._code, self._cause = verdict.code, verdict.cause
+        self._told = verdict.code, verdict.cause, verdict.severity
         fields: dict[str, Any] = {
             "code": int(verdict.code),
             "cause": verdict.cause,
             "signal": verdict.signal,
             "value": verdict.value,
             "limit": verdict.limit,
+            "severity": int(verdict.severity),
         }
         self._publisher.send("danger_event", DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, **fields))
         self.log.info("verdict", seq=verdict.seq, t_s=verdict.t_s, **fields)

@@ -37,7 +37,7 @@ class Keeper:
         self._in_force = ("", "")
         self._left = 1
         self.boot = -1
-        self.last_fix = ""
+        self._last_fix = "" if before is None else before.last_fix
 
     def frame(self, seq: int, t_s: float, elapsed_s: float) -> None:
         """A frame was served; now and then it is written down."""
@@ -51,6 +51,8 @@ class Keeper:
         self._left = PERIOD_FRAMES
         in_force = in_force_of(mission)
         is_news, self._in_force = in_force != self._in_force, in_force
+        if mission.done:
+            self._last_fix = "{}-{}-{}".format(*mission.done[-1])
         pose = localizer.deck_pose
         numbers = (pose.x_m, pose.y_m, pose.heading_rad, localizer.position_sigma_m, localizer.heading_sigma_rad)
         if not all(map(math.isfinite, numbers)):
@@ -72,7 +74,7 @@ class Keeper:
             abort_cause=in_force[0],
             held_cause=in_force[1],
             elapsed_s=elapsed_s,
-            last_fix=self.last_fix,
+            last_fix=self._last_fix,
         )
         self._file.write(record, is_durable=is_news)
 

@@ -233,7 +233,7 @@ class RunCollector:
                 builder.add_verdict_event(message.seq, message.code)
             self._code = message.code
         elif isinstance(message, MissionStatus):
-            builder.set_mission(message.done, message.skipped, message.elapsed_s)
+            builder.set_mission(message.done, message.skipped, message.elapsed_s, message.left_out)
 
     def _on_deck(self, track: Track) -> FloatArray:
         """Rows of seq, t_s, x, y, heading (deck), X, Y, Z of the surface point, as the truth has them."""

@@ -241,6 +241,7 @@ async def test_a_list_that_is_empty_or_unreadable_lets_nobody_in(site: Site, rui
         assert (await site.ask("observatory"))["ok"]  # mended, without a restart
 
 
+@pytest.mark.fault("O6")
 async def test_who_is_taken_off_the_list_loses_their_rights_while_connected(site: Site) -> None:
     async with served(site) as context:
         with context.socket(zmq.DEALER) as peer:
@@ -254,6 +255,7 @@ async def test_who_is_taken_off_the_list_loses_their_rights_while_connected(site
         assert not site.monitor.latch.is_latched
 
 
+@pytest.mark.fault("O5", "O6")
 async def test_without_its_handler_nobody_gets_in(site: Site) -> None:
     # Left to itself libzmq would let in everybody who knows the server's key.
     context = zmq.asyncio.Context()
@@ -458,6 +460,7 @@ def test_lines_of_the_log_have_a_budget() -> None:
     assert [budget.take(t) for t in (60.0, 61.0, 62.0)] == [2, 0, None]
 
 
+@pytest.mark.fault("O5")
 async def test_refusals_do_not_fill_the_log(site: Site) -> None:
     desk = desk_of(site)
     for _ in range(1000):

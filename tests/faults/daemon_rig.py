@@ -28,7 +28,8 @@ from ccatp.robot_link import RobotLink
 from ccatp.sim.truth import TruthLog
 
 DEADLINE_S = 60.0
-SEND_DRIVE = RobotLink.send_drive
+SEND_DRIVE, SEND_PERMIT = RobotLink.send_drive, RobotLink.send_permit
+LATE_FRAMES = 16  # of 10 ms: data are too old after 150 ms
 
 
 class Executed:
@@ -49,6 +50,7 @@ class Daemon:
         to_main, to_danger: the proxies before it, one for each loop.
         log: what the loops logged.
         sent: wall time of each drive that was not zero, by its number.
+        late: commands to move, drives or permits, that were computed from a frame of more than ``LATE_FRAMES`` ago.
         executed: the steps in which the wheels turned.
         loops: the tasks of main and danger.
         stop: ends both.
@@ -61,6 +63,7 @@ class Daemon:
         self.to_main, self.to_danger = proxies
         self.log: list[dict[str, Any]] = []
         self.sent: dict[int, float] = {}
+        self.late: list[str] = []
         self.executed: list[Executed] = []
         self.loops: list[asyncio.Task[None]] = []
         self.stop = asyncio.Event()
@@ -83,7 +86,18 @@ class Daemon:
         """In place of the link's own method."""
         if wr_rad_s or wl_rad_s:
             self.sent[seq] = asyncio.get_running_loop().time()
+            self._note_late("drive", ack)
         SEND_DRIVE(link, seq, ack, wr_rad_s, wl_rad_s)
+
+    def send_permit(self, link: RobotLink, seq: int, ack: int, allowed: tuple[bool, bool, bool]) -> None:
+        """In place of the link's own method."""
+        if any(allowed):
+            self._note_late("permit", ack)
+        SEND_PERMIT(link, seq, ack, *allowed)
+
+    def _note_late(self, kind: str, ack: int) -> None:
+        if self.robot.robot.seq - ack > LATE_FRAMES:
+            self.late.append(f"{kind} on frame {ack} at frame {self.robot.robot.seq}")
 
     async def until(self, condition: Callable[[], bool]) -> None:
         """Wait for something; the loops go on meanwhile."""
@@ -176,8 +190,7 @@ async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncI
                 listener.connect(endpoints.of("main"))
                 listener.subscribe("track")
                 try:
-                    watching = patch.object(RobotLink, "send_drive", _seen_by(daemon))
-                    with watching:
+                    with _seen_by(daemon):
                         async with asyncio.TaskGroup() as tasks:
                             peers = robot.run(robot_stop), outlet.serve(), laser.serve()
                             serving = [tasks.create_task(work) for work in peers]
@@ -201,13 +214,18 @@ async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncI
         context.destroy(linger=0)
 
 
-def _seen_by(daemon: Daemon) -> Callable[[RobotLink, int, int, float, float], None]:
-    """A method of the link: a bound method would not get the link itself."""
+@contextmanager
+def _seen_by(daemon: Daemon) -> Iterator[None]:
+    """Functions in place of the link's methods: bound methods would not get the link itself."""
 
     def send_drive(link: RobotLink, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float) -> None:
         daemon.send_drive(link, seq, ack, wr_rad_s, wl_rad_s)
 
-    return send_drive
+    def send_permit(link: RobotLink, seq: int, ack: int, forward: bool, reverse: bool, turn: bool) -> None:
+        daemon.send_permit(link, seq, ack, (forward, reverse, turn))
+
+    with patch.object(RobotLink, "send_drive", send_drive), patch.object(RobotLink, "send_permit", send_permit):
+        yield
 
 
 def _at(cfg: Config, robot_port: int, laser_port: int) -> Config:

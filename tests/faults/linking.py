@@ -19,7 +19,7 @@ import pytest
 
 from tests.faults import record
 from tests.faults.realtime import is_realtime_permitted
-from tests.faults.table import PATH, Table, load_table
+from tests.faults.table import PATH, Row, Table, load_table
 
 ROWS, MEASURED = "fault_rows", "fault"
 COLLECTED = "fault_marks"
@@ -82,18 +82,23 @@ def judge(table: Table, tests: dict[str, Seen], kind: str | None) -> Judgement:
     open_rows = []
     for row_id, row in table.items() if kind is not None else ():
         marked = {name: test for name, test in tests.items() if row_id in test.rows}
+        problem = _missing(row_id, row, marked, kind or "")
         if row.open is not None:
-            shown = "; a test shows it by now" if any(test.is_shown for test in marked.values()) else ""
-            open_rows.append(f"{row_id} ({row.open}){shown}")
-            continue
-        ours = {name: test for name, test in marked.items() if row_id not in test.of_robot}
-        robots = {name: test for name, test in marked.items() if row_id in test.of_robot}
-        problem = _unshown(row.slow, ours, kind or "")
-        if not problem and row.conformance and (problem := _unshown(False, robots, kind or "")):
-            problem = f"of the robot's part {problem}"
-        if problem:
+            open_rows.append(f"{row_id} ({row.open}){'' if problem else '; tests show it by now'}")
+        elif problem:
             problems.append(f"{row_id} ({row.fault}): {problem}")
     return Judgement(problems, open_rows)
+
+
+def _missing(row_id: str, row: Row, marked: dict[str, Seen], kind: str) -> str:
+    """What is missing for a row, on our side or on the robot's; empty if nothing is."""
+    ours = {name: test for name, test in marked.items() if row_id not in test.of_robot}
+    robots = {name: test for name, test in marked.items() if row_id in test.of_robot}
+    problem = _unshown(row.slow, ours, kind)
+    if problem or not row.conformance:
+        return problem
+    problem = _unshown(False, robots, kind)
+    return f"of the robot's part {problem}" if problem else ""
 
 
 def _unshown(needs_slow: bool, marked: dict[str, Seen], kind: str) -> str:

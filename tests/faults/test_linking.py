@@ -172,7 +172,7 @@ def test_open_rows_are_told_and_do_no_harm(pytester: pytest.Pytester) -> None:
     open_rows = TABLE.replace("[A1]", '[A1]\nopen = "not built"').replace("[A2]", '[A2]\nopen = "nor this"')
     status, said = project(pytester, SHOWN.replace('fault("A2")', "slow"), open_rows).run()
     assert status == 0
-    assert "2 rows open: A1 (not built); a test shows it by now, A2 (nor this)" in said
+    assert "2 rows open: A1 (not built); tests show it by now, A2 (nor this)" in said
 
 
 def test_a_run_that_was_stopped_is_not_judged(pytester: pytest.Pytester) -> None:

@@ -20,6 +20,7 @@ import pytest
 from ccatp.config.models import Config
 from ccatp.etalon_client import EtalonClient
 from ccatp.localizer import Localizer
+from ccatp.metrology.scrutiny import Finding, Scrutiny
 from ccatp.mission import Mission
 from ccatp.processes import measuring
 from ccatp.processes.common import open_log
@@ -177,20 +178,24 @@ class Desk:
         mission = SimpleNamespace(
             is_awaiting_fix=True,
             request=1,
+            is_lost=True,
             fixed=self.measured.append,
             fault=self._fault,
             survey=SimpleNamespace(distance_m=lambda pose: 0.0),
         )
-        localizer = SimpleNamespace(fuse_fix=lambda fix: 0.0, notices=[], pose=None)
+        localizer = SimpleNamespace(fuse_fix=lambda fix: 0.0, notices=[], pose=None, pose_covariance=None)
+        sure = SimpleNamespace(begin=lambda: None, review=lambda *_, **__: Finding())
         teller = SimpleNamespace(fix=lambda *_, **__: None, say=lambda level, text: self.said.append(text))
         self.desk = MeasuringDesk(
             config.mission,
             cast(EtalonClient, SimpleNamespace(measure=measure)),
+            cast(Scrutiny, sure),
             cast(Localizer, localizer),
             cast(Mission, mission),
             store,
             cast(Teller, teller),
             self.over.set,
+            lambda: 0.0,
         )
 
     def _fault(self, cause: str) -> None:

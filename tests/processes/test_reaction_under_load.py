@@ -68,7 +68,6 @@ class Wire:
     """What the host sends, and what the robot's wheels do.
 
     Attributes:
-        zero_s: when the host last said that the wheels have to stand: a drive of zeros, a denied permit, the end.
         turned_s: when a step ended in which the wheels turned.
         stale: steps in which they turned by a drive that had been sent long ago.
         duties: every fan duty that there was.
@@ -79,7 +78,8 @@ class Wire:
         self.turned_s = 0.0
         self.stale = 0
         self.duties: list[tuple[float, float]] = []
-        self._zeros_s: list[float] = []
+        self._zeros_s: dict[int, list[float]] = {}
+        self._last_go_s: dict[int, float] = {}
         self._sent_s = 0.0
         on_frame = robot._on_frame
 
@@ -97,23 +97,29 @@ class Wire:
             self.turned_s = now_s
             self.stale += now_s - self._sent_s > STALE_S
 
-    def heard(self, data: bytes) -> None:
+    def heard(self, source: int, data: bytes) -> None:
         """What came from one of the loops; nothing is the end of its session."""
         now_s = time.monotonic()
         drives = DRIVE.findall(data)
         if drives:
             self._sent_s = now_s
         if not data or DENIED in data or any(float(right) == float(left) == 0.0 for right, left in drives):
-            self._zeros_s.append(now_s)
+            self._zeros_s.setdefault(source, []).append(now_s)
+        elif data:
+            self._last_go_s[source] = now_s
 
-    def first_zero_after(self, instant_s: float) -> float | None:
-        """When the host said so first."""
-        return next((zero_s for zero_s in self._zeros_s if zero_s >= instant_s), None)
+    def zero_after(self, instant_s: float) -> float | None:
+        """When one of the loops said for good that the wheels have to stand: zeros, a denied permit, its end."""
+        firsts = [
+            next((zero_s for zero_s in zeros_s if zero_s >= max(instant_s, self._last_go_s.get(source, 0.0))), None)
+            for source, zeros_s in self._zeros_s.items()
+        ]
+        return min((first_s for first_s in firsts if first_s is not None), default=None)
 
     @property
     def is_driving(self) -> bool:
         """Whether the wheels have turned just now, without a word against it."""
-        last_s = self._zeros_s[-1] if self._zeros_s else 0.0
+        last_s = max((zeros_s[-1] for zeros_s in self._zeros_s.values()), default=0.0)
         return time.monotonic() - self.turned_s < 0.05 and time.monotonic() - last_s > 0.3
 
 
@@ -184,7 +190,7 @@ def _tapped(wire: Wire, proxy: FaultProxy) -> Callable[[Pipe], Awaitable[bytes]]
     async def tapped(pipe: Pipe) -> bytes:
         data = await read(pipe)
         if pipe._conduct is to_server:
-            wire.heard(data)
+            wire.heard(id(pipe), data)
         return data
 
     return tapped
@@ -253,7 +259,7 @@ async def test_reaction(kind: str, time_: int, tmp_path: Path, runtime_dir: Path
             begun_s = time.monotonic()
             make(it)
             await asyncio.sleep(STOPPED_S)
-            turned_s, zero_s = it.wire.turned_s, it.wire.first_zero_after(begun_s)
+            turned_s, zero_s = it.wire.turned_s, it.wire.zero_after(begun_s)
             assert zero_s is not None, "the host never said so"
             measured("P19", 1e3 * max(zero_s - begun_s - evidence_s, 0.0))
             measured("P19", 1e3 * (zero_s - begun_s), "from_event_ms")
