@@ -189,16 +189,33 @@ def _check(db: sqlite3.Connection, path: Path, mirror: str) -> None:
     verdict = db.execute("PRAGMA integrity_check(1)").fetchone()[0]
     if verdict != "ok":
         raise StoreError(f"{path}: damaged: {verdict}")
+    pages, page_bytes = (db.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "page_size"))
+    if path.stat().st_size < pages * page_bytes:  # SQLite fills up a page that is cut off
+        raise StoreError(f"{path}: damaged: cut off at {path.stat().st_size} of {pages * page_bytes} bytes")
     meta = dict(db.execute("SELECT key, value FROM meta"))
     version = meta.get("schema_version")
     if version != str(SCHEMA_VERSION):
         raise StoreError(
             f"{path}: schema version {version}, this program has {SCHEMA_VERSION}; use a new run directory"
         )
+    if _tables(db) != _expected_tables():
+        raise StoreError(f"{path}: damaged: its tables are not those of schema version {SCHEMA_VERSION}")
     if meta.get(_CRC_KEY) != str(_plan_crc(db)):
         raise StoreError(f"{path}: damaged: meta data or targets do not match their checksum")
     if meta.get("mirror") != mirror:
         raise StoreError(f"{path}: is a survey of {meta.get('mirror')}, not of {mirror}; use a new run directory")
+
+
+def _tables(db: sqlite3.Connection) -> list[tuple[str, str]]:
+    # Ballast is gone in a sound file; where dropping it was cut short the file was never complete.
+    rows = db.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL AND name <> 'ballast' ORDER BY name")
+    return [(str(name), str(sql)) for name, sql in rows]
+
+
+def _expected_tables() -> list[tuple[str, str]]:
+    with closing(sqlite3.connect(":memory:")) as db:
+        db.executescript(_SCHEMA)
+        return _tables(db)
 
 
 def replan_damaged(db: sqlite3.Connection) -> list[PointId]:

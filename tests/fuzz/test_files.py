@@ -177,7 +177,7 @@ def is_refused(path: Path) -> bool:
 @pytest.mark.fault("P16")
 def test_some_cuts_and_flipped_bits_of_the_database(folder: Path, measured: Callable[[str, float], None]) -> None:
     sound = sound_store(folder)
-    flips = random.Random(16).sample(range(8 * len(sound)), 500)
+    flips = random.Random(16).sample(range(8 * len(sound)), 800)
     check_damage(folder, range(0, len(sound), 211), flips, sound, measured)
 
 

@@ -351,3 +351,26 @@ def alter(path: Path, statement: str) -> None:
     with sqlite3.connect(path) as connection:
         connection.execute(statement)
     connection.close()
+
+
+def test_open_notices_a_last_page_that_is_cut_off(path: Path) -> None:
+    make(path).close()
+    sound = path.read_bytes()
+    path.write_bytes(sound[:-100])
+    with pytest.raises(StoreError, match=rf"cut off at {len(sound) - 100} of {len(sound)} bytes"):
+        MissionStore.open(path, mirror="fyst-m1")
+
+
+def test_open_notices_an_altered_table(path: Path) -> None:
+    make(path).close()
+    alter(path, "ALTER TABLE events RENAME COLUMN cause TO clause")
+    with pytest.raises(StoreError, match="its tables are not those of schema version 1"):
+        MissionStore.open(path, mirror="fyst-m1")
+
+
+def test_a_text_that_is_no_text_any_more_fails_its_checksum(path: Path) -> None:
+    with make(path) as db:
+        db.record_fix(PANEL[0], a_fix(), POSE).result()
+    alter(path, "UPDATE fixes SET channels = CAST(x'a0' AS TEXT)")
+    with MissionStore.open(path, mirror="fyst-m1") as db:
+        assert db.damaged == (PANEL[0],)

@@ -29,6 +29,7 @@ class Map:
     """A map without seams and rim that keeps what it was asked."""
 
     gap_m: float = 0.01
+    is_rim: bool = False
     placed: list[tuple[Any, ...]] = field(default_factory=list)
     slacks_m: list[float] = field(default_factory=list)
 
@@ -37,7 +38,7 @@ class Map:
         return 5.0, 6.0
 
     def is_rim_ahead(self, *_: Any) -> bool:
-        return False
+        return self.is_rim
 
     def seam_at(self, place: Any, slack_m: float, not_axis: Any = None) -> None:
         self.slacks_m.append(slack_m)
@@ -200,3 +201,13 @@ def test_put_back_the_episodes_begin_anew(rule: Rule) -> None:
     assert rule.rule.episodes[0].phase is Phase.DECLARED
     rule.rule.reset_episodes()
     assert rule.rule.episodes == (None,) * 4
+
+
+def test_an_edge_seen_ahead_is_counted_once(rule: Rule) -> None:
+    rule.feed([ON] * 10, v=0.05)
+    rule.feed([OFF_FL] * 20, v=0.05, estimate=rule.estimate())
+    assert rule.rule.declared == [0, 0, 0, 0]
+    rule.map.is_rim = True
+    for _ in range(3):
+        rule.feed([OFF_FL] * 10, v=0.05)
+        assert rule.rule.declared == [1, 0, 0, 0]
