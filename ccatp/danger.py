@@ -8,7 +8,8 @@ outranks normal operation (0). The cause is that of the rule that takes the most
 * the robot's centre about to drive over the rim on the map: likewise (``ccatp.hazards.origin_rule``);
 * edge samples, encoder samples or the estimate missing or older than allowed: nothing permitted, no code of its own;
   ends by itself as soon as they are fresh again;
-* an emergency: code 2, latched, motion permitted, because the robot shall drive home (``ccatp.hazards.abort_latch``).
+* an emergency: code 2, latched, motion permitted, because the robot shall drive home (``ccatp.hazards.abort_latch``);
+  in an earthquake nothing is permitted until it is cleared.
 
 Beside these the monitors of ``ccatp.health`` look at every frame. What they find has a severity; the gravest wins and
 gives the verdict its cause, and any finding that holds the wheels withholds the permit, whatever else is going on. An
@@ -363,8 +364,10 @@ class DangerMonitor:
         newest = self.latch.newest
         if newest is None:
             return Verdict(seq, t_s, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
-        cause = f"emergency: {newest.kind}"
-        return Verdict(seq, t_s, EventCode.ABORTED, cause, f"emergency:{newest.kind}", 1.0, 0.0, True, True, True)
+        # Whoever drives while the ground shakes slips; the others are fled from.
+        kind, may_move = (EmergencyKind.EARTHQUAKE, False) if self.latch.is_shaking else (newest.kind, True)
+        cause, signal = f"emergency: {kind}", f"emergency:{kind}"
+        return Verdict(seq, t_s, EventCode.ABORTED, cause, signal, 1.0, 0.0, may_move, may_move, may_move)
 
     def _edge_verdict(self, seq: int, t_s: float, episode: Episode, missing: _Missing | None) -> Verdict:
         front_left, front_right, rear_left, rear_right = off = self._declared_sensors()

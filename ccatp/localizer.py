@@ -99,17 +99,21 @@ class Localizer(Protocol):
 
 
 def build_localizer(
-    cfg: Config, mirror: Mirror, wrap: Callable[[Filter], Filter] = lambda filter_: filter_
+    cfg: Config,
+    mirror: Mirror,
+    wrap: Callable[[Filter], Filter] = lambda filter_: filter_,
+    start: PanelPose | None = None,
 ) -> Localizer:
-    """The localizer for ``run.filter``, the robot standing at base.
+    """The localizer for ``run.filter``, the robot standing at base or at ``start``.
 
     Args:
         cfg: the configuration.
         mirror: its mirror.
         wrap: what to put around the filter, for those who want to look on.
+        start: where the robot stands, as well as ``localizer.start_..._sigma`` says.
     """
     name = cfg.run.filter
-    start = mirror.base_panel_pose
+    start = mirror.base_panel_pose if start is None else start
     # The localizer re-initialises its filter at once; what counts is its size.
     made: FourStateLocalizer | FullStateLocalizer
     if name in FOUR_STATE:

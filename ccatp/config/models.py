@@ -4,8 +4,11 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-Positive = Annotated[float, Field(gt=0.0)]
-NonNegative = Annotated[float, Field(ge=0.0)]
+# No quantity of this project is larger, in whatever unit its key names.
+Positive = Annotated[float, Field(gt=0.0, le=1e6)]
+NonNegative = Annotated[float, Field(ge=0.0, le=1e6)]
+# No decision is made on data older than 150 ms.
+Freshness = Annotated[float, Field(gt=0.0, le=0.15)]
 Port = Annotated[int, Field(ge=0, le=65535)]
 Pair = tuple[float, float]
 
@@ -28,6 +31,10 @@ class RunConfig(Model):
     budget_s: Positive
     runtime_dir: str  # empty = chosen from the environment
     realtime_priority: Annotated[int, Field(ge=0, le=99)]  # 0 = ordinary scheduling
+    hang_timeout_s: Positive
+    start_timeout_s: Positive
+    restart_limit: Annotated[int, Field(ge=0)]
+    restart_window_s: Positive
 
 
 class RobotConfig(Model):
@@ -44,7 +51,11 @@ class RobotConfig(Model):
     fan_duty: tuple[Annotated[float, Field(ge=0.0, le=1.0)], Annotated[float, Field(ge=0.0, le=1.0)]]
     key_file: str
     connect_timeout_s: Positive
-    sensors_timeout_s: Positive
+    sensors_timeout_s: Freshness
+    slip_after_s: Positive
+    lag_limit_s: Freshness
+    silence_timeout_s: Positive
+    reconnect_timeout_s: Positive
 
 
 class LimitsConfig(Model):
@@ -181,12 +192,17 @@ class EtalonConfig(Model):
     request_timeout_s: Positive
     retries: Annotated[int, Field(ge=0, le=10)]
     reconnect_delay_s: Positive
+    reconnect_for_s: NonNegative
     measuring_time_s: Positive
     length_sigma_m: Positive
     length_sigma_per_m: NonNegative
     max_residual_m: Positive
     max_dop: Positive
     max_distance_m: Positive
+    max_surface_residual_m: Positive
+    doubt_nis: Positive
+    repeat_m: Positive
+    start_distance_m: Positive
 
 
 class DangerConfig(Model):
@@ -199,8 +215,8 @@ class DangerConfig(Model):
     no_map_travel_m: Positive
     max_crossing_angle_rad: Annotated[float, Field(gt=0.0, lt=1.5)]
     turn_travel_limit_m: Positive
-    stale_after_s: Positive
-    estimate_stale_after_s: Positive
+    stale_after_s: Freshness
+    estimate_stale_after_s: Freshness
     debounce_samples: Annotated[int, Field(ge=1, le=100)]
     lifted_samples: Annotated[int, Field(ge=1, le=1000)]
     outward_turn_limit_m: Positive
@@ -284,9 +300,16 @@ class MissionConfig(Model):
     correction_margin: Annotated[float, Field(gt=0.0, le=1.0)]
     correction_reach_m: NonNegative
     max_approaches: Annotated[int, Field(ge=1)]
-    verdict_timeout_s: Positive
+    verdict_timeout_s: Freshness
     measure_timeout_s: Positive
     failed_points_before_hold: Annotated[int, Field(ge=1)]
+    heading_doubt_rad: Positive
+    alignment_leg_m: Annotated[float, Field(gt=0.0, le=0.5)]
+    holds_to_budget: bool
+    alarm_period_s: Positive
+    battery_endurance_s: Positive
+    battery_reserve: Annotated[float, Field(ge=0.0, lt=1.0)]
+    return_energy_factor: Annotated[float, Field(ge=1.0)]
 
 
 class SimRobotConfig(Model):
@@ -395,7 +418,7 @@ class PanelsConfig(Model):
     pitch_x_mm: Positive
     pitch_y_mm: Positive
     gap_mm: Positive
-    y_offset_mm: float
+    y_offset_mm: Annotated[float, Field(ge=-1e5, le=1e5)]
     points_x_mm: tuple[float, float, float]
     points_y_mm: tuple[float, float, float]
     adjusters_mm: dict[str, Pair]  # vertical adjusters, offsets in the panel's tangent plane

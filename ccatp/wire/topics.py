@@ -64,6 +64,9 @@ class MissionStatus(Message):
     outcome: str
     lower_bound_s: float
     exit_status: int  # what the run ends with; -1 while it goes on
+    slips: int = 0  # frames that were served late, in real time
+    lag_ms: float = 0.0  # ... the latest of them
+    left_out: dict[str, list[str]] = {}  # points skipped, or not measured any more, by the reason
 
 
 class Track(Message):
@@ -215,7 +218,7 @@ def unpack(frame: bytes) -> tuple[str, bytes, Message | Verdict]:
         raise BadMessage(f"unknown topic {name[:40]!r}")
     try:
         message: Message | Verdict = decoder.decode(body)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise BadMessage(f"topic {name.decode()}: {error}") from error
     return name.decode(), body, message
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.health.fan_gate import FanGate
+from ccatp.control.fan_gate import FanGate
 from ccatp.samples import Severity
 from tests.faults.campaign import Seen, short_survey, was_real, watched
 
@@ -66,14 +66,14 @@ def test_where_nothing_hangs_a_weak_fan_is_only_told() -> None:
 def test_no_sequence_of_commands_undercuts_the_floor(commands: list[tuple[float, float]]) -> None:
     gate, duty = FanGate(0.6), (0.6, 0.6)
     for command in commands:
-        duty = gate.pass_through(command) or duty
+        duty = command if gate.refusal(*command) is None else duty
         assert 0.6 <= min(duty) <= max(duty) <= 1.0
 
 
 @pytest.mark.parametrize("duty", [(nan, 0.8), (0.8, inf), (0.59, 0.8), (0.8, 1.01), (-1.0, 0.8)])
 def test_a_refused_command_is_counted(duty: tuple[float, float]) -> None:
     gate = FanGate(0.6)
-    assert gate.pass_through(duty) is None
-    assert gate.refusals == 1
-    assert gate.pass_through((0.6, 1.0)) == (0.6, 1.0)
-    assert gate.refusals == 1
+    assert gate.refusal(*duty)
+    assert gate.refused == 1
+    assert gate.refusal(0.6, 1.0) is None
+    assert gate.refused == 1
