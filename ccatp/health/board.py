@@ -17,6 +17,7 @@ from ccatp.health.yaw import GyroscopeBias, YawMonitor, imu_finding
 from ccatp.samples import EdgeSample, ImuSample, Severity, WheelSample
 
 _STANDS_RAD_S = 0.02  # a wheel's mean over a frame below which it stands: 0.6 mm/s
+_LOOK_FRAMES = 2  # the monitors judge one frame in so many while nothing is wrong; sums are kept in every one
 _SLOW_LOOK_FRAMES = 10  # what changes slowly is looked at this often
 
 
@@ -99,6 +100,9 @@ class HealthBoard:
         base_m: where base is, deck frame.
         overhang: whether the robot falls without its fans.
         is_explained: whether the map has an edge of a panel near a sensor.
+
+    Attributes:
+        findings: everything found, as it is now.
     """
 
     def __init__(
@@ -154,6 +158,10 @@ class HealthBoard:
         self._opened = (0, 0, 0, 0)
         self._home_m = 0.0
         self._frames = 0
+        self._counts = [0, 0, 0]
+        self._is_free = True
+        self._speed_m_s = 0.0
+        self.findings: list[Finding] = []
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
@@ -162,6 +170,7 @@ class HealthBoard:
         limit_s = self._cfg.clock_jump_s
         self._clock.see(t_s, Finding(Severity.PAUSE, "the robot's clock has jumped", "clock", by_s, limit_s))
         self._gate.reset()
+        self.findings = self._found()
 
     def step(
         self,
@@ -184,34 +193,48 @@ class HealthBoard:
         """
         dt_s = 0.0 if self._t_s is None else t_s - self._t_s
         self._t_s = t_s
-        if dt_s > self._cfg.gap_s:
+        is_gap = dt_s > self._cfg.gap_s
+        if is_gap:
             cause = "frames were lost: nobody saw where the robot went"
             self._gap.see(t_s, Finding(Severity.HOLD, cause, "frames", dt_s, self._cfg.gap_s))
-        self._gap.settle(t_s)
-        means, imu = self._means, frame.imu
-        means.take(wheels, dt_s)
-        self._sums = now = self._added(imu, dt_s)
+        imu = frame.imu
+        self._means.take(wheels, dt_s)
+        self._sums = self._added(imu, dt_s)
+        self._counts[0] += len(imu)
+        self._counts[1] += len(wheels)
+        self._counts[2] += len(edges)
+        self._is_free = self._is_free and is_permitted and not frame.cmd.held
+        is_flickering = is_any_off or not self.flicker.is_quiet
+        self._frames += 1
+        if self._frames % _LOOK_FRAMES == 0 or is_flickering or is_gap or frame.faults or self.findings:
+            self._judge(t_s, frame, wheels)
+            if is_flickering:
+                self.flicker.step(t_s, edges, self._speed_m_s)
+            self.findings = self._found()
+
+    def _judge(self, t_s: float, frame: Frame, wheels: Sequence[WheelSample]) -> None:
+        """What need not be looked at in every frame while nothing is wrong."""
+        now = self._sums
         shortly, stalling = self._shortly.push(now), self._stalling.push(now)
         turning = self._turning.push(now)
-        is_free = is_permitted and not frame.cmd.held
-        self._wheels.step(now, shortly, stalling, is_free=is_free, samples=wheels)
+        self._wheels.step(now, shortly, stalling, is_free=self._is_free, samples=wheels)
+        self._is_free = True
+        self._speed_m_s = 0.0
+        if shortly is not None:
+            self._speed_m_s = max(abs(shortly.right_m), abs(shortly.left_m)) / shortly.t_s
         if turning is not None:
             self._yaw.step(t_s, turning)
         self._yaw.alarm.settle(t_s)
-        if is_any_off or not self.flicker.is_quiet:
-            speed_m_s = 0.0
-            if shortly is not None:
-                speed_m_s = max(abs(shortly.right_m), abs(shortly.left_m)) / shortly.t_s
-            self.flicker.step(t_s, edges, speed_m_s)
-        self._rates.step(t_s, len(imu), len(wheels), len(edges))
+        self._rates.step(t_s, *self._counts)
+        self._counts = [0, 0, 0]
         self._latency.step(t_s, frame.cmd.seq)
         self._clock.settle(t_s)
-        self._frames += 1
+        self._gap.settle(t_s)
         faults = frame.faults
         if faults or self._own.alarms:
             self._own.step(t_s, faults)
         self._fans.step(t_s, frame.fans, faults)
-        if self._frames % _SLOW_LOOK_FRAMES == 0:
+        if self._frames % _SLOW_LOOK_FRAMES < _LOOK_FRAMES:
             self._battery.step(t_s, frame.soc, "battery_low" in faults, self._home_m)
 
     def _added(self, imu: Sequence[ImuSample], dt_s: float) -> Moved:
@@ -260,11 +283,10 @@ class HealthBoard:
         self.seams.step(t_s, (x, y, estimate.heading_rad), estimate.sigma_m)
         self._home_m = hypot(x - self._base_m[0], y - self._base_m[1])
 
-    @property
-    def findings(self) -> list[Finding]:
-        """Everything found, as it is now."""
+    def _found(self) -> list[Finding]:
         found = [alarm.finding for alarm in self._alarms if alarm.finding is not None]
         others = imu_finding(self._gate), self._rates.finding, self._battery.finding, self.seams.finding
         found += [finding for finding in others if finding is not None]
-        found += [alarm.finding for alarm in self._own.alarms.values() if alarm.finding is not None]
+        if self._own.alarms:
+            found += [alarm.finding for alarm in self._own.alarms.values() if alarm.finding is not None]
         return found
