@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 import ccatp
+from ccatp.cli_align import align
 from ccatp.cli_bench import bench
 from ccatp.cli_conformance import conformance
 from ccatp.cli_frame import (
@@ -288,6 +289,7 @@ def sim_etalon(
     return int(run_alone(load_config(config_file, overrides(settings, named)), puck_world_m, truth))
 
 
+cli.add_command(align)
 cli.add_command(bench)
 cli.add_command(keys)
 cli.add_command(study)

@@ -1,0 +1,82 @@
+"""Pure. Which points of a panel are outliers, and whether the panel is bent: the cheapest explanation of its deviations.
+
+Each explanation is a fit, rigid or with curvatures, to all points but a few. It costs its chi-square, and besides a
+price for every point left out and a price for the curvatures; the cheapest one holds. Leaving a point out is the same
+as giving it a shift of its own (mean-shift model), so its price is the chi-square of one degree of freedom that noise
+reaches only with the agreed probability, shared by all points of the mirror. Baarda's data snooping asks the same of
+one point at a time; a bent panel would make it throw good points away.
+"""
+
+from collections.abc import Iterator
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from ccatp.aligning.deviations import Deviations
+from ccatp.aligning.modes import BoolArray, Modes, fit_modes, quadratic, rigid
+
+_CURVATURES = 3
+_MAX_OUTLIERS = 3  # of nine points; with more, nobody can say which ones are right
+
+
+class Prices(NamedTuple):
+    """Chi-square that has to be gained by leaving a point out, and by the three curvatures of a panel."""
+
+    outlier: float
+    shape: float
+
+
+class Explanation(NamedTuple):
+    """Points that count, and whether the curvatures are significant."""
+
+    is_kept: BoolArray
+    has_shape: bool
+
+
+def prices(false_alarm: float, points: int, panels: int) -> Prices:
+    """What an explanation costs.
+
+    Args:
+        false_alarm: probability that noise alone makes an outlier anywhere on the mirror, and as much for a shape.
+        points: measured points of the mirror.
+        panels: panels with measured points.
+    """
+    return Prices(
+        float(chdtri(1, false_alarm / max(points, 1))), float(chdtri(_CURVATURES, false_alarm / max(panels, 1)))
+    )
+
+
+def explain(deviations: Deviations, price: Prices) -> Explanation:
+    """The cheapest explanation of a panel's deviations.
+
+    One degree of freedom has to remain, or any explanation would do; panels that cannot be fitted keep all points.
+    """
+    count = len(deviations.points)
+    best, lowest = Explanation(np.ones(count, dtype=np.bool_), has_shape=False), np.inf
+    for modes, needed in ((rigid, 3), (quadratic, 6)):
+        has_shape = modes is quadratic
+        extra = price.shape if has_shape else 0.0
+        for is_kept in _subsets(count, min(_MAX_OUTLIERS, count - needed - 1)):
+            cost = extra + price.outlier * int(np.count_nonzero(~is_kept))
+            if cost >= lowest:
+                continue
+            cost += _chi2(deviations, modes, is_kept)
+            if cost < lowest:
+                best, lowest = Explanation(is_kept, has_shape), cost
+    return best
+
+
+def _subsets(count: int, most: int) -> Iterator[BoolArray]:
+    for left_out in range(most + 1):
+        for some in combinations(range(count), left_out):
+            is_kept = np.ones(count, dtype=np.bool_)
+            is_kept[list(some)] = False
+            yield is_kept
+
+
+def _chi2(deviations: Deviations, modes: Modes, is_kept: BoolArray) -> float:
+    design = deviations.lever[:, None] * modes(deviations.places_m)
+    fit = fit_modes(design[is_kept], deviations.values_m[is_kept], deviations.sigmas_m[is_kept])
+    return np.inf if fit is None else fit.chi2
