@@ -18,14 +18,16 @@ from ccatp.run_map import RunMapError, draw_panels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Colormap, Normalize
     from matplotlib.figure import Figure
+
+    Colours = tuple[Colormap, Normalize]
 
 WIDTH_PX = 2400
 DPI = 200
 _CELLS = 12  # along each side of a panel
 _INK, _QUIET, _BAD = "#1f2933", "#6b7785", "#d64545"
-_COLOURS = ("#2f5d8c", "#9cc3dd", "#f7f7f5", "#f2b880", "#b5482a")  # below, ideal, above
+_COLOURS = ("#5a8fc4", "#a9cbe3", "#f7f7f5", "#f3c08c", "#d5703f")  # below, ideal, above; figures stay legible on each
 _MICRO = 1e6
 
 
@@ -55,7 +57,7 @@ def draw_alignment(mirror: Mirror, result: SurveyResult, out: Path, title: str, 
     figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
     axes = figure.add_axes((0.75 / width, 0.7 / height, (width - 1.75) / width, (height - 1.6) / height))
     draw_panels(axes, mirror)
-    colours = _scale(result)
+    colours = _colours(result)
     for panel in result.panels:
         _draw_panel(axes, mirror, panel, colours)
     _draw_bar(figure, axes, colours)
@@ -82,32 +84,33 @@ def _half_wavefront(result: SurveyResult) -> str:
     return f", half-wavefront error {before:.1f} um rms, {after:.1f} after the moves"
 
 
-def _scale(result: SurveyResult) -> "ScalarMappable":
-    from matplotlib.cm import ScalarMappable  # noqa: PLC0415 - see above
-    from matplotlib.colors import LinearSegmentedColormap, Normalize  # noqa: PLC0415
+def _colours(result: SurveyResult) -> "Colours":
+    from matplotlib.colors import LinearSegmentedColormap, Normalize  # noqa: PLC0415 - see above
 
     values = [np.abs(p.deviations.values_m[p.is_kept]) for p in result.panels]
     # A single far point must not make all others look alike.
     usual = float(np.percentile(np.concatenate(values), 99)) * _MICRO if values else 1.0
     top = max(1.0, float(ceil(usual)))
-    return ScalarMappable(Normalize(-top, top), LinearSegmentedColormap.from_list("deviation", _COLOURS))
+    return LinearSegmentedColormap.from_list("deviation", _COLOURS), Normalize(-top, top)
 
 
-def _draw_panel(axes: "Axes", mirror: Mirror, panel: PanelResult, colours: "ScalarMappable") -> None:
-    body, found = mirror.panel(panel.panel), panel.deviations
+def _draw_panel(axes: "Axes", mirror: Mirror, panel: PanelResult, colours: "Colours") -> None:
+    from matplotlib.patches import Rectangle  # noqa: PLC0415 - see above
+
+    body, found, (cmap, norm) = mirror.panel(panel.panel), panel.deviations, colours
     x = np.linspace(body.x_m - body.half_x_m, body.x_m + body.half_x_m, _CELLS + 1)
     y = np.linspace(body.y_m - body.half_y_m, body.y_m + body.half_y_m, _CELLS + 1)
     middle_x, middle_y = np.meshgrid((x[1:] + x[:-1]) / 2.0, (y[1:] + y[:-1]) / 2.0)
     deck = np.column_stack([middle_x.ravel(), middle_y.ravel()]).tolist()
     places = np.array([body.from_deck(mirror.surface.point(*place))[:2] for place in deck])
     values = _displacement(panel, places).reshape(_CELLS, _CELLS)
-    axes.pcolormesh(x, y, values * _MICRO, cmap=colours.cmap, norm=colours.norm, zorder=1.5, rasterized=True)
-    kept = panel.is_kept
-    marks: dict[str, Any] = {"cmap": colours.cmap, "norm": colours.norm, "s": 22, "zorder": 5}
-    dots = found.deck_m[kept]
-    axes.scatter(*dots.T, c=found.values_m[kept] * _MICRO, edgecolors=_QUIET, linewidths=0.3, **marks)
-    if not kept.all():
-        axes.scatter(*found.deck_m[~kept].T, marker="x", color=_BAD, s=36, linewidths=1.6, zorder=6)
+    axes.pcolormesh(x, y, values * _MICRO, cmap=cmap, norm=norm, zorder=2, rasterized=True)
+    size = 2.0 * body.half_x_m, 2.0 * body.half_y_m
+    axes.add_patch(Rectangle((x[0], y[0]), *size, fill=False, edgecolor=_QUIET, linewidth=0.7, zorder=3))
+    (dots_x, dots_y), heights = found.deck_m[panel.is_kept].T, found.values_m[panel.is_kept] * _MICRO
+    axes.scatter(dots_x, dots_y, c=heights, cmap=cmap, norm=norm, s=22, edgecolors=_QUIET, linewidths=0.3, zorder=5)
+    crosses_x, crosses_y = found.deck_m[~panel.is_kept].T
+    axes.scatter(crosses_x, crosses_y, marker="x", color=_BAD, s=36, linewidths=1.6, zorder=6)
     small: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 5.5, "color": _INK, "zorder": 6}
     names, adjusters = adjuster_places(mirror, panel.panel)
     for name, place, move in zip(names, adjusters.tolist(), panel.rigid.moves.values_m, strict=True):
@@ -124,10 +127,13 @@ def _displacement(panel: PanelResult, places: FloatArray) -> FloatArray:
     return np.asarray(found)
 
 
-def _draw_bar(figure: "Figure", axes: "Axes", colours: "ScalarMappable") -> None:
+def _draw_bar(figure: "Figure", axes: "Axes", colours: "Colours") -> None:
+    from matplotlib.cm import ScalarMappable  # noqa: PLC0415 - see above
+
+    cmap, norm = colours
     place = axes.get_position()
     bar_axes = figure.add_axes((place.x1 + 0.006, place.y0 + 0.15 * place.height, 0.013, 0.7 * place.height))
-    bar = figure.colorbar(colours, cax=bar_axes, extend="both")
+    bar = figure.colorbar(ScalarMappable(norm, cmap), cax=bar_axes, extend="both")
     bar.outline.set_visible(False)
     bar.ax.tick_params(labelsize=8, color=_QUIET, labelcolor=_INK)
     bar.set_label("deviation along the normal, um, > 0 towards the robot", fontsize=9, color=_INK)

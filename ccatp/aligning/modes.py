@@ -18,7 +18,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Modes = Callable[[FloatArray], FloatArray]
 
-_MAX_CONDITION = 1e4  # of columns of unit length; nine points of a panel give less than 10, points on a line infinity
+MAX_CONDITION = 1e4  # of columns of unit length; nine points of a panel give less than 10, points on a line infinity
 _NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(4)  # exact for the products of quadratics
 
 
@@ -83,7 +83,7 @@ def fit_modes(design: FloatArray, values_m: FloatArray, sigmas_m: FloatArray) ->
         return None
     whitened = design / sigmas_m[:, None]
     scales = np.linalg.norm(whitened, axis=0)
-    if not (scales > 0.0).all() or not np.linalg.cond(whitened / scales) < _MAX_CONDITION:
+    if not (scales > 0.0).all() or not np.linalg.cond(whitened / scales) < MAX_CONDITION:
         return None
     q, r = np.linalg.qr(whitened)
     target = values_m / sigmas_m

@@ -1,4 +1,4 @@
-"""Pure. Which points of a panel are outliers, and whether the panel is bent: the cheapest explanation of its deviations.
+"""Pure. Outliers among the points of a panel, and whether it is bent: the cheapest explanation of its deviations.
 
 Each explanation is a fit, rigid or with curvatures, to all points but a few. It costs its chi-square, and besides a
 price for every point left out and a price for the curvatures; the cheapest one holds. Leaving a point out is the same
@@ -15,10 +15,11 @@ import numpy as np
 from scipy.special import chdtri
 
 from ccatp.aligning.deviations import Deviations
-from ccatp.aligning.modes import BoolArray, Modes, fit_modes, quadratic, rigid
+from ccatp.aligning.modes import MAX_CONDITION, BoolArray, FloatArray, quadratic, rigid
 
 _CURVATURES = 3
-_MAX_OUTLIERS = 3  # of nine points; with more, nobody can say which ones are right
+# Points beyond those that a fit takes, for each that is left out. With fewer, some choice of points always fits.
+REDUNDANCY = 3
 
 
 class Prices(NamedTuple):
@@ -51,18 +52,21 @@ def prices(false_alarm: float, points: int, panels: int) -> Prices:
 def explain(deviations: Deviations, price: Prices) -> Explanation:
     """The cheapest explanation of a panel's deviations.
 
-    One degree of freedom has to remain, or any explanation would do; panels that cannot be fitted keep all points.
+    A panel that cannot be fitted, or has hardly more points than it takes, keeps all of them.
     """
     count = len(deviations.points)
+    target = deviations.values_m / deviations.sigmas_m
     best, lowest = Explanation(np.ones(count, dtype=np.bool_), has_shape=False), np.inf
     for modes, needed in ((rigid, 3), (quadratic, 6)):
         has_shape = modes is quadratic
         extra = price.shape if has_shape else 0.0
-        for is_kept in _subsets(count, min(_MAX_OUTLIERS, count - needed - 1)):
+        whitened = modes(deviations.places_m) * (deviations.lever / deviations.sigmas_m)[:, None]
+        whitened /= np.linalg.norm(whitened, axis=0)
+        for is_kept in _subsets(count, (count - needed) // REDUNDANCY):
             cost = extra + price.outlier * int(np.count_nonzero(~is_kept))
             if cost >= lowest:
                 continue
-            cost += _chi2(deviations, modes, is_kept)
+            cost += _chi2(whitened[is_kept], target[is_kept])
             if cost < lowest:
                 best, lowest = Explanation(is_kept, has_shape), cost
     return best
@@ -76,7 +80,8 @@ def _subsets(count: int, most: int) -> Iterator[BoolArray]:
             yield is_kept
 
 
-def _chi2(deviations: Deviations, modes: Modes, is_kept: BoolArray) -> float:
-    design = deviations.lever[:, None] * modes(deviations.places_m)
-    fit = fit_modes(design[is_kept], deviations.values_m[is_kept], deviations.sigmas_m[is_kept])
-    return np.inf if fit is None else fit.chi2
+def _chi2(whitened: FloatArray, target: FloatArray) -> float:
+    """What least squares leave; infinite where the points do not determine the coefficients."""
+    solution, _, rank, _ = np.linalg.lstsq(whitened, target, rcond=1.0 / MAX_CONDITION)
+    left = target - whitened @ solution
+    return float(left @ left) if rank == whitened.shape[1] else np.inf
