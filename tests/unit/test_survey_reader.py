@@ -166,6 +166,16 @@ def test_a_recording_that_does_not_tell_the_truth_is_no_hindrance(topic: str, ru
     assert (found.injected, found.is_simulation) == (None, True)
 
 
+def test_only_the_beginning_of_a_recording_is_searched(run_dir: Path) -> None:
+    # One made before the truth of the panels was recorded may hold hours of other messages.
+    (run_dir / "telemetry.mcap").unlink()
+    recorder = Recorder(run_dir / "telemetry.mcap", [("truth", {}), ("misalignment", {})], is_simulation=True)
+    recorder.write("truth", 1.0, b'{"seq":0,"t_s":0.0,"rows":[]}')
+    recorder.write("misalignment", 2.0, b'{"seq":0,"t_s":0.0,"panels":[[3,7,1e-5,0.0,0.0]]}')
+    recorder.close()
+    assert read_run(run_dir, {}).injected is None
+
+
 def test_a_resumed_run_has_the_truth_of_its_sessions_where_it_is_one(run_dir: Path) -> None:
     record_truth(run_dir, {PANEL: LIES})
     assert read_run(run_dir, {}).injected == {PANEL: (1e-5, 2e-5, -3e-5)}

@@ -82,6 +82,16 @@ def test_a_tilted_panel_has_the_mean_square_of_a_plane(m1: Mirror) -> None:
     half = half_size_m(body)
     own = panel_wavefront(body, 1.0, fit, gram(rigid, half), np.full(9, 1e-9))
     assert sqrt(own.fitted_m2) == pytest.approx(1e-4 * half[0] / sqrt(3), rel=1e-9)
+    assert own.weight_m2 == pytest.approx(4.0 * half[0] * half[1])
+
+
+def test_a_panel_weighs_its_area_across_the_beam(m1: Mirror) -> None:
+    fit = fit_modes(rigid(GRID_M), np.zeros(9), np.full(9, 1e-9))
+    assert fit is not None
+    body = m1.panel(MIDDLE)
+    weights = [panel_wavefront(body, c, fit, np.eye(3), np.full(9, 1e-9)).weight_m2 for c in (1.0, 0.8)]
+    # 0.67 m x 0.75 m in the deck plane.
+    assert weights == pytest.approx([0.67 * 0.75, 0.8 * 0.67 * 0.75], rel=1e-3)
 
 
 def test_panels_count_with_their_area_across_the_beam() -> None:
