@@ -86,7 +86,7 @@ def draw_run_map(
     draw_panels(axes, mirror)
     step = max(1, len(path_xy) // MAX_PATH_POINTS)
     axes.plot(path_xy[::step, 0], path_xy[::step, 1], color=_PATH, linewidth=0.9, zorder=3, label="driven path")
-    _draw_base(axes, mirror)
+    draw_base(axes, mirror)
     _draw_points(figure, axes, points)
     _dress(axes, low - 0.25, high + 0.25, title, subtitle)
     try:
@@ -180,7 +180,8 @@ def draw_panels(axes: "Axes", mirror: Mirror) -> None:
         axes.text(low_x - 0.12, y, f"row {row}" if row == 1 else f"{row}", rotation=90, **small)
 
 
-def _draw_base(axes: "Axes", mirror: Mirror) -> None:
+def draw_base(axes: "Axes", mirror: Mirror) -> None:
+    """Draw where the robot starts, and its heading."""
     base = mirror.base_pose
     ahead = {"dx": 0.18 * cos(base.heading_rad), "dy": 0.18 * sin(base.heading_rad)}
     shape = {"width": 0.035, "head_width": 0.11, "head_length": 0.09, "length_includes_head": True}
