@@ -14,7 +14,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
-.PHONY: help run test test-slow lint format lock clean
+.PHONY: help run test test-slow faults lint format lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -22,6 +22,7 @@ help:
 	@echo "make run [ARGS=...]   survey a simulated mirror: ccatp run --sim"
 	@echo "make test             lint, types, import contract, tests"
 	@echo "make test-slow        the tests that take minutes, and new random examples"
+	@echo "make faults           docs/fault_table.md from what the last test runs showed and measured"
 	@echo "make lint             lint, types, import contract"
 	@echo "make format           format the code"
 	@echo "make lock             pin the dependencies anew (needs uv)"
@@ -36,6 +37,9 @@ test: lint
 test-slow: $(VENV)/.installed-dev
 	$(PYTEST) -m slow $(PYTEST_ARGS)
 	$(PYTEST) tests/property tests/oracle --hypothesis-profile=explore
+
+faults: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.faults.page
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check

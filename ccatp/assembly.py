@@ -9,13 +9,14 @@ from ccatp.control.gate import DriveGate
 from ccatp.errors import ConfigError
 from ccatp.localizer import FOUR_STATE, Localizer, build_localizer
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.mission import Mission, PlanHome, PlanRest
+from ccatp.mission import Mission, PlanHome, PlanPoints, PlanRest
 from ccatp.planning.bound import path_time
 from ccatp.planning.calibration import plan_calibration
 from ccatp.planning.route import Route, plan_rejoin, plan_route, with_prelude
 from ccatp.planning.traversal import ORDERS
 from ccatp.planning.way_home import plan_way_home
 from ccatp.samples import DeckPose, PointId, Stop
+from ccatp.surveying.recovery import Recovery
 from ccatp.wire.robot import Hello
 
 # The configuration may be calibrated, the robot's own figures are nominal: this much apart they describe two robots.
@@ -36,6 +37,7 @@ class Parts:
     points: tuple[PointId, ...]
     already_done: int
     lower_bound_s: float
+    elapsed_s: float = 0.0
 
     @property
     def total_points(self) -> int:
@@ -65,29 +67,37 @@ class Parts:
             raise ConfigError(f"robot: the configuration is not of this robot: {'; '.join(problems)}")
 
 
-def assemble(cfg: Config, done: Collection[PointId] = ()) -> Parts:
-    """All pure parts of a main loop, the robot standing at base.
+def assemble(cfg: Config, done: Collection[PointId] = (), recovery: Recovery | None = None) -> Parts:
+    """All pure parts of a main loop, the robot standing at base or where another main loop left it.
 
     Args:
         cfg: the configuration.
         done: points that are measured already.
+        recovery: what the other one left, if there was one.
 
     Raises:
         PlanError: a point cannot be reached.
     """
     mirror = build_mirror(cfg.mirror)
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
-    route = plan_survey(cfg, mirror, points, done)
-    robot = cfg.robot
+    route = plan_survey(cfg, mirror, points, done, calibrates=recovery is None)
+    localizer = _build_localizer(cfg, mirror, recovery)
+    # No drive shows the four states their heading: the fix does not reach it.
+    heading_sigma_of = float if cfg.run.filter in FOUR_STATE else lambda: localizer.heading_sigma_rad
+    planners = _home_planner(cfg, mirror), _rest_planner(cfg, mirror), _points_planner(cfg, mirror)
+    mission = Mission(cfg, mirror, route, *planners, heading_sigma_of)
+    if recovery is not None:
+        mission.take_over(recovery)
     return Parts(
         cfg=cfg,
         mirror=mirror,
-        localizer=build_localizer(cfg, mirror),
-        mission=Mission(cfg, mirror, route, _home_planner(cfg, mirror), _rest_planner(cfg, mirror)),
-        gate=DriveGate(cfg.limits, robot.wheel_radius_m, robot.wheel_base_m, robot.max_wheel_rad_s, robot.wheel_lag_s),
+        localizer=localizer,
+        mission=mission,
+        gate=build_gate(cfg),
         route=route,
         points=tuple(points),
         already_done=len(set(done)),
+        elapsed_s=0.0 if recovery is None else recovery.elapsed_s,
         lower_bound_s=path_time(route.stops, mirror.base_pose, cfg.limits, mirror, cfg.etalon.measuring_time_s),
     )
 
@@ -98,8 +108,10 @@ def plan_survey(
     points: Sequence[PointId],
     done: Collection[PointId] = (),
     out_of_reach: list[PointId] | None = None,
+    *,
+    calibrates: bool = True,
 ) -> Route:
-    """The route of a survey from base, with the calibration drive before it where the localizer has a use for it.
+    """The route of a survey from base, with the calibration drive before it.
 
     Args:
         cfg: the configuration.
@@ -107,22 +119,57 @@ def plan_survey(
         points: in the order of measuring.
         done: points that are measured already.
         out_of_reach: takes the points that cannot be reached, and the route goes without them.
+        calibrates: drive a calibration first, where the localizer has a use for it.
 
     Raises:
         PlanError: a point cannot be reached and there is no ``out_of_reach``, or base is not on the mirror.
     """
     limits, start, measuring_s = cfg.limits, mirror.base_pose, cfg.etalon.measuring_time_s
     route = plan_route(mirror, points, cfg.robot, limits, cfg.mission, start, done, measuring_s, out_of_reach)
-    if cfg.run.filter in FOUR_STATE:  # they have no states that the drive could calibrate
+    if not calibrates or cfg.run.filter in FOUR_STATE:  # they have no states that the drive could calibrate
         return route
     drive = plan_calibration(mirror, cfg.robot, cfg.mission, start)
     return with_prelude(mirror, route, drive, limits, start, measuring_s)
+
+
+def build_gate(cfg: Config) -> DriveGate:
+    """The last gate before the wheels."""
+    robot = cfg.robot
+    return DriveGate(
+        cfg.limits,
+        robot.wheel_radius_m,
+        robot.wheel_base_m,
+        robot.max_wheel_rad_s,
+        robot.wheel_lag_s,
+        cfg.mission.verdict_timeout_s,
+        robot.sensors_timeout_s,
+    )
+
+
+def _build_localizer(cfg: Config, mirror: Mirror, recovery: Recovery | None) -> Localizer:
+    if recovery is None:
+        return build_localizer(cfg, mirror)
+    sigmas = {
+        "start_position_sigma_m": recovery.position_sigma_m,
+        "start_heading_sigma_rad": recovery.heading_sigma_rad,
+    }
+    doubting = cfg.model_copy(update={"localizer": cfg.localizer.model_copy(update=sigmas)})
+    pose = recovery.pose
+    return build_localizer(doubting, mirror, start=mirror.panel_pose(mirror.nearest_panel(pose.x_m, pose.y_m), pose))
 
 
 def _rest_planner(cfg: Config, mirror: Mirror) -> PlanRest:
     def plan(route: Route, start: DeckPose, skip: Collection[PointId]) -> Route:
         measuring_s = cfg.etalon.measuring_time_s
         return plan_rejoin(mirror, route, cfg.robot, cfg.limits, cfg.mission, start, skip, measuring_s)
+
+    return plan
+
+
+def _points_planner(cfg: Config, mirror: Mirror) -> PlanPoints:
+    def plan(start: DeckPose, points: Sequence[PointId]) -> Route:
+        measuring_s = cfg.etalon.measuring_time_s
+        return plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, start, (), measuring_s)
 
     return plan
 

@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterable
 
 import zmq
+from zmq.utils.monitor import parse_monitor_message
 
 from ccatp.samples import Verdict
 from ccatp.wire.topics import BY_NAME, BadMessage, Message, pack, unpack
@@ -60,10 +61,16 @@ class Subscriber:
         context: ZeroMQ context of the process.
         endpoints: where to connect (a publisher may come up later).
         topics: names of the topic table.
+        is_watching: watch the connection, for ``is_cut``; of one publisher only.
     """
 
     def __init__(
-        self, context: zmq.Context[zmq.Socket[bytes]], endpoints: Iterable[str], topics: Iterable[str]
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoints: Iterable[str],
+        topics: Iterable[str],
+        *,
+        is_watching: bool = False,
     ) -> None:
         """Connect and subscribe."""
         self.socket = context.socket(zmq.SUB)
@@ -71,6 +78,10 @@ class Subscriber:
         self.socket.setsockopt(zmq.RCVHWM, HIGH_WATER_MARK)
         self.socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
         self.socket.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS)
+        self._monitor = (
+            self.socket.get_monitor_socket(zmq.EVENT_CONNECTED | zmq.EVENT_DISCONNECTED) if is_watching else None
+        )
+        self._is_cut = False
         for name in topics:
             self.socket.setsockopt(zmq.SUBSCRIBE, BY_NAME[name].name.encode() + b" ")
         for endpoint in endpoints:
@@ -103,6 +114,24 @@ class Subscriber:
             except BadMessage:
                 self.bad_messages += 1
 
+    def tend(self) -> None:
+        """To be called now and then where nothing is received for long: a publisher that is new learns what we want.
+
+        The library tells it from the thread that owns the socket, and only when that calls.
+        """
+        self.socket.getsockopt(zmq.EVENTS)
+
+    @property
+    def is_cut(self) -> bool:
+        """The publisher was there and is gone, as when its process has died."""
+        while self._monitor is not None and self._monitor.poll(0):
+            event = parse_monitor_message(self._monitor.recv_multipart())["event"]
+            self._is_cut = event == zmq.EVENT_DISCONNECTED
+        return self._is_cut
+
     def close(self) -> None:
         """Close the socket."""
+        if self._monitor is not None:
+            self.socket.disable_monitor()
+            self._monitor.close()
         self.socket.close()

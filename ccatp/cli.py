@@ -64,19 +64,26 @@ def cli() -> None:
     "--run-dir", type=click.Path(path_type=Path), help="Where to write; runs/<time>-<mirror>-s<seed> if not given."
 )
 @click.option("--resume", is_flag=True, help="Carry on with the mission in --run-dir.")
+@click.option("--held", is_flag=True, help="With --resume: nothing moves until ccatp resume.")
+@click.option("--recover", is_flag=True, help="For services: carry on, held, with the run that did not finish, if any.")
 @click.option("--json", "json_output", is_flag=True, help="Summary as JSON on standard output, nothing else there.")
 @FAULTS_OPTION
 @RUNTIME_DIR_OPTION
 def run(
     sim: bool, config_file: Path | None, mirror: str | None, world: str | None, seed: int | None,
     settings: Mapping[str, object], panels: int | None, filter_name: str | None, realtime: bool,
-    run_dir: Path | None, resume: bool, json_output: bool, faults_file: Path | None, runtime_dir: Path | None,
+    run_dir: Path | None, resume: bool, held: bool, recover: bool, json_output: bool,
+    faults_file: Path | None, runtime_dir: Path | None,
 ) -> int:  # fmt: skip
     """Survey the mirror of the configuration and end with a summary."""
     if faults_file is not None and not sim:
         raise click.UsageError(
             "--faults goes with --sim alone: faults are for the simulated robot, never for a real one"
         )
+    if held and not resume:
+        raise click.UsageError("--held goes with --resume; --recover holds by itself")
+    if recover and (resume or run_dir is not None):
+        raise click.UsageError("--recover finds the run by itself: leave out --resume and --run-dir")
     if resume and run_dir is None:
         raise click.UsageError("--resume carries on in a run directory; name it with --run-dir")
     if resume and config_file is None and run_dir is not None:
@@ -106,6 +113,8 @@ def run(
                 realtime=realtime,
                 run_dir=run_dir,
                 resume=resume,
+                held=held,
+                recover=recover,
                 json_output=json_output,
                 runtime_dir=runtime_dir,
                 faults_file=faults_file,

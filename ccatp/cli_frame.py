@@ -167,7 +167,8 @@ def ask_daemon(runtime_dir: Path | None, channel: str, payload: dict[str, object
     from ccatp.router import RequestFailed, request
 
     try:
-        reply = request(f"ipc://{folder / channel}", json.dumps(payload).encode(), timeout_s)
+        endpoint, is_emergency = f"ipc://{folder / channel}", channel == "emergency"
+        reply = request(endpoint, json.dumps(payload).encode(), timeout_s, repeats=is_emergency)
     except RequestFailed as error:
         raise UnreachableError(str(error)) from error
     return _accepted(reply, payload)
@@ -195,7 +196,7 @@ def ask_over_tcp(
 
     pair = read_pair(key, "--key")
     curve = CurveClient(read_public(server_key, "--server-key"), pair.public, pair.secret)
-    return _accepted(request(endpoint, json.dumps(payload).encode(), timeout_s, curve), payload)
+    return _accepted(request(endpoint, json.dumps(payload).encode(), timeout_s, curve, repeats=True), payload)
 
 
 def _accepted(reply: dict[str, Any], payload: Mapping[str, object]) -> dict[str, Any]:

@@ -8,25 +8,37 @@ outranks normal operation (0). The cause is that of the rule that takes the most
 * the robot's centre about to drive over the rim on the map: likewise (``ccatp.hazards.origin_rule``);
 * edge samples, encoder samples or the estimate missing or older than allowed: nothing permitted, no code of its own;
   ends by itself as soon as they are fresh again;
-* an emergency: code 2, latched, motion permitted, because the robot shall drive home (``ccatp.hazards.abort_latch``).
+* an emergency: code 2, latched, motion permitted, because the robot shall drive home (``ccatp.hazards.abort_latch``);
+  in an earthquake nothing is permitted until it is cleared.
+
+Beside these the monitors of ``ccatp.health`` look at every frame. What they find has a severity; the gravest wins and
+gives the verdict its cause, and any finding that holds the wheels withholds the permit, whatever else is going on. An
+edge that is to be left keeps its code and its cause as long as nothing holds the wheels.
 """
 
 from collections.abc import Sequence
 from math import isfinite
 from typing import NamedTuple, Protocol
 
-from ccatp.config.models import DangerConfig, RobotConfig
+from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
 from ccatp.hazards.abort_latch import AbortLatch, EmergencyKind, is_at_base_or_held
 from ccatp.hazards.edge_episode import Episode, Phase
 from ccatp.hazards.edge_map import EdgeMap, MirrorMap
 from ccatp.hazards.edge_rule import EdgeRule, PoseEstimate
 from ccatp.hazards.origin_rule import OriginRule
-from ccatp.samples import Corner, EdgeSample, EventCode, Verdict, WheelSample
+from ccatp.health.board import Commanded, Frame, HealthBoard
+from ccatp.health.findings import Finding
+from ccatp.health.ladder import Ladder, denies, gravest
+from ccatp.health.seams import Ground
+from ccatp.health.steady_time import SteadyTime
+from ccatp.samples import Corner, EdgeSample, EventCode, Severity, Verdict, WheelSample
 
 CORNERS = tuple(Corner)
+CLOCK_JUMP_S = 0.1
 CENTRE = "the robot's centre is close to the rim on the map"
 NOWHERE = (False, False, False, False)
 EVERYWHERE = (True, True, True, True)
+_STALE = Severity.PAUSE
 _NORMAL = EventCode.NORMAL  # a member looked up on its class in every frame costs more than the verdict made of it
 
 
@@ -39,7 +51,7 @@ class _Missing(NamedTuple):
     limit_s: float
 
 
-class SensorsFrame(Protocol):
+class SensorsFrame(Frame, Protocol):
     """The part of a sensors frame that the rules read."""
 
     @property
@@ -59,8 +71,22 @@ class SensorsFrame(Protocol):
         """Edge samples, oldest first."""
 
 
-class Estimate(PoseEstimate, Protocol):
-    """Main's estimate: pose and the state of the mission."""
+class _Shifted(NamedTuple):
+    """An estimate in steady time."""
+
+    seq: int
+    t_s: float
+    x_m: float
+    y_m: float
+    heading_rad: float
+    sigma_m: float
+    state: str
+    commanded: tuple[float, float, float, float] | None
+    drive_seq: int
+
+
+class Estimate(PoseEstimate, Commanded, Protocol):
+    """Main's estimate: pose, the state of the mission, what the wheels were told."""
 
     @property
     def state(self) -> str:
@@ -74,11 +100,25 @@ class DangerMonitor:
         mirror: the map.
         robot: wheels and sensor places.
         cfg: the rules' limits.
+        health: limits of the monitors; without them the rules of edges, ages and emergencies stand alone.
     """
 
-    def __init__(self, mirror: MirrorMap, robot: RobotConfig, cfg: DangerConfig) -> None:
+    def __init__(
+        self, mirror: MirrorMap, robot: RobotConfig, cfg: DangerConfig, health: HealthConfig | None = None
+    ) -> None:
         """No frame judged yet: nothing is permitted until the first."""
-        self._edges = EdgeRule(EdgeMap(mirror), robot, cfg)
+        self._cfg, self._sensors_m, self._health = cfg, robot.edge_sensors_m, health
+        self._map = EdgeMap(mirror)
+        self._edges = EdgeRule(self._map, robot, cfg)
+        self._board: HealthBoard | None = None
+        if health is not None:
+            base = mirror.base_pose
+            ground = Ground(dict(mirror.panels), mirror.nearest_panel, self._map.place)
+            self._board = HealthBoard(
+                health, cfg, robot, ground, (base.x_m, base.y_m), mirror.overhang, self._is_explained
+            )
+            self._ladder = Ladder(health)
+        self._time = SteadyTime(CLOCK_JUMP_S if health is None else health.clock_jump_s)
         self._origin = OriginRule(mirror.rim, robot, cfg)
         self._stale_after_s, self._estimate_stale_after_s = cfg.stale_after_s, cfg.estimate_stale_after_s
         self.latch = AbortLatch()
@@ -90,6 +130,12 @@ class DangerMonitor:
         self._origin.reset()
         self._edge_t_s: float | None = None
         self._state = ""
+        self._known: Estimate | None = None
+        self._time.reset()
+        self._is_climbing = False
+        if self._board is not None:
+            self._board.reset()
+            self._ladder.reset()
         self.verdict = self.stale(-1, 0.0)
 
     # -- emergencies ----------------------------------------------------------------------------------------------
@@ -140,12 +186,18 @@ class DangerMonitor:
         Returns:
             The verdict; for a frame that is not new, the last verdict again.
         """
-        seq, t_s, wheels, samples = sensors.seq, sensors.t, sensors.enc, sensors.edge
+        seq = sensors.seq
+        wheels: Sequence[WheelSample] = sensors.enc
+        samples = sensors.edge
         if seq <= self.verdict.seq:
             return self.verdict
-        edges, origin = self._edges, self._origin
+        edges, origin, time = self._edges, self._origin, self._time
+        t_s = time.at(seq, sensors.t)
+        if time.offset_s or time.jump is not None:
+            wheels, samples = time.of_samples(wheels, t_s), time.of_samples(samples, t_s)
+            estimate = self._shifted(estimate)
         edges.track.push(wheels)
-        known = estimate if estimate is not None and self._is_fresh(estimate, t_s) else None
+        self._known = known = estimate if estimate is not None and self._is_fresh(estimate, t_s) else None
         if known is not None:
             self._state = known.state
             origin.step(t_s, known, wheels)
@@ -155,11 +207,103 @@ class DangerMonitor:
         if samples:
             self._edge_t_s = samples[-1][0]
         missing = self._missing(t_s, estimate, known is not None)
-        if missing is None and edges.is_idle and not origin.direction and not self.latch.is_latched:
-            self.verdict = verdict = Verdict(seq, t_s, _NORMAL, "", "", 0.0, 0.0, True, True, True)
+        found = self._look(sensors, t_s, wheels, samples) if self._board is not None else ()
+        if not found and missing is None and edges.is_idle and not origin.direction and not self.latch.is_latched:
+            self.verdict = verdict = Verdict(seq, sensors.t, _NORMAL, "", "", 0.0, 0.0, True, True, True)
+            if self._is_climbing:
+                self._climb(t_s, [])
         else:
-            self.verdict = verdict = self._arbitrate(seq, t_s, missing)
+            verdict = self._arbitrate(seq, sensors.t, missing)
+            if self._board is not None:
+                verdict = self._weigh(verdict, self._climb(t_s, [*found, *self._own_findings(missing)]))
+            self.verdict = verdict
         return verdict
+
+    def _shifted(self, estimate: Estimate | None) -> Estimate | None:
+        if estimate is None:
+            return None
+        e, t_s = estimate, self._time.of(estimate.seq, estimate.t_s)
+        return _Shifted(e.seq, t_s, e.x_m, e.y_m, e.heading_rad, e.sigma_m, e.state, e.commanded, e.drive_seq)
+
+    # -- monitors -------------------------------------------------------------------------------------------------
+
+    def _look(
+        self, sensors: SensorsFrame, t_s: float, wheels: Sequence[WheelSample], samples: list[EdgeSample]
+    ) -> Sequence[Finding]:
+        """What the monitors find in the frame."""
+        board, known, jump = self._board, self._known, self._time.jump
+        if board is None:
+            return ()
+        if jump is not None and jump.seq == sensors.seq:
+            board.jumped(t_s, jump.by_s)
+        if known is not None:
+            episodes = self._edges.episodes
+            board.learn(known.t_s, known, self._edges.opened, [e is not None for e in episodes])
+        last = self.verdict
+        is_permitted = last.forward and last.reverse and last.turn
+        board.step(t_s, sensors, wheels, samples, is_permitted=is_permitted, is_any_off=not self._edges.is_idle)
+        return board.findings
+
+    def _is_explained(self, sensor: int) -> bool:
+        """Whether the map has an edge of a panel near a sensor, as far as the estimate tells."""
+        known = self._known
+        if known is None:
+            return True
+        pose = known.x_m, known.y_m, known.heading_rad
+        cfg = self._cfg
+        slack_m = cfg.gap_tolerance_m + cfg.seam_extra_m + cfg.map_sigmas * known.sigma_m
+        return self._map.has_edge_near(self._map.place(pose, self._sensors_m[sensor]), slack_m)
+
+    def _own_findings(self, missing: _Missing | None) -> list[Finding]:
+        """Findings of the rules here: data that are missing, the robot lifted, a sensor off for no reason."""
+        found = []
+        if missing is not None:
+            # Without its wheels nobody knows where the robot went meanwhile.
+            severity = Severity.HOLD if missing.signal == "enc" else _STALE
+            found.append(Finding(severity, missing.cause, missing.signal, missing.age_s, missing.limit_s))
+        if self._health is None:
+            return found
+        if self._edges.is_lifted:
+            limit_s = self._health.lifted_limit_s
+            cause = "all edge sensors off: lifted or fallen"
+            found.append(Finding(Severity.HOLD, cause, "edge", 4.0, 3.0, full_fans=True, patience_s=limit_s))
+        for i, episode in enumerate(self._edges.episodes):
+            if episode is not None and self._stays_off(episode):
+                cause = "an edge sensor stays off though it was moved back and the others are on"
+                limit_m = self._health.stuck_off_m
+                found.append(Finding(Severity.HOLD, cause, CORNERS[i].value, episode.retreat_m, limit_m))
+        return found
+
+    def _stays_off(self, episode: Episode) -> bool:
+        """Once that is so, it stays so until the sensor has been on for long enough to end the episode."""
+        if episode.phase is not Phase.DECLARED or self._health is None:
+            return False
+        if not episode.is_doubted and episode.retreat_m >= self._health.stuck_off_m:
+            others = (e is None or e is episode or e.is_on for e in self._edges.episodes)
+            episode.is_doubted = all(others)
+        return episode.is_doubted
+
+    def _climb(self, t_s: float, found: list[Finding]) -> list[Finding]:
+        self._is_climbing = bool(found)
+        return self._ladder.climb(t_s, found)
+
+    def _weigh(self, verdict: Verdict, found: list[Finding]) -> Verdict:
+        """The verdict of the rules with what was found."""
+        top = gravest(found)
+        if top is None:
+            return verdict
+        holds = denies(found)
+        forward, reverse, turn = (False, False, False) if holds else (verdict.forward, verdict.reverse, verdict.turn)
+        shown = verdict.cause, verdict.signal, verdict.value, verdict.limit
+        is_kept = verdict.code is EventCode.NEAR_EDGE or (
+            verdict.code is EventCode.ABORTED and top.severity < Severity.RETURN
+        )
+        if not verdict.cause or not is_kept or (holds and top.severity > _STALE):
+            shown = top.cause, top.signal, float(top.value), float(top.limit)
+        return Verdict(
+            verdict.seq, verdict.t_s, verdict.code, *shown, forward, reverse, turn, verdict.off,
+            top.severity, any(finding.full_fans for finding in found),
+        )  # fmt: skip
 
     def stale(self, seq: int, t_s: float) -> Verdict:
         """The verdict when no sensors frame came for ``stale_after_s``: nothing permitted.
@@ -220,8 +364,10 @@ class DangerMonitor:
         newest = self.latch.newest
         if newest is None:
             return Verdict(seq, t_s, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
-        cause = f"emergency: {newest.kind}"
-        return Verdict(seq, t_s, EventCode.ABORTED, cause, f"emergency:{newest.kind}", 1.0, 0.0, True, True, True)
+        # Whoever drives while the ground shakes slips; the others are fled from.
+        kind, may_move = (EmergencyKind.EARTHQUAKE, False) if self.latch.is_shaking else (newest.kind, True)
+        cause, signal = f"emergency: {kind}", f"emergency:{kind}"
+        return Verdict(seq, t_s, EventCode.ABORTED, cause, signal, 1.0, 0.0, may_move, may_move, may_move)
 
     def _edge_verdict(self, seq: int, t_s: float, episode: Episode, missing: _Missing | None) -> Verdict:
         front_left, front_right, rear_left, rear_right = off = self._declared_sensors()
@@ -258,4 +404,4 @@ class DangerMonitor:
 
 def _denied(seq: int, t_s: float, code: EventCode, missing: _Missing) -> Verdict:
     signal, cause, age_s, limit_s = missing
-    return Verdict(seq, t_s, code, cause, signal, age_s, limit_s, False, False, False, NOWHERE)
+    return Verdict(seq, t_s, code, cause, signal, age_s, limit_s, False, False, False, NOWHERE, _STALE)

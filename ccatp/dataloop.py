@@ -10,17 +10,20 @@ import asyncio
 import secrets
 import socket
 from contextlib import AsyncExitStack
+from pathlib import Path
 from typing import Protocol, cast
 
 import numpy as np
 import zmq
 import zmq.asyncio
 
+from ccatp.body_file import BodyFile
 from ccatp.bus import Publisher
 from ccatp.config.models import Config
 from ccatp.fault_proxy.proxy import FaultProxy
 from ccatp.link_faults import LinkFaults
 from ccatp.mirror.mirror import build_mirror
+from ccatp.samples import DeckPose
 from ccatp.sim.faults.plan import FaultPlan
 from ccatp.sim.faults.record import Injected
 from ccatp.sim.robot import Robot
@@ -50,6 +53,7 @@ class DataLoop:
         key: key of the robot link, ``None`` for no authentication.
         log: takes its lines.
         faults: what shall go wrong with the robot; each is logged when it begins and with what it did.
+        start: where the robot stands, if not at base.
 
     Attributes:
         robot: the robot.
@@ -66,11 +70,13 @@ class DataLoop:
         key: bytes | None = None,
         log: Log | None = None,
         faults: FaultPlan | None = None,
+        start: DeckPose | None = None,
     ) -> None:
         self._address = cfg.sim.robot.host, cfg.sim.robot.port
         self._is_lockstep = lockstep
         self._log = log
-        self.robot = Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(seed), faults)
+        self.robot = Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(seed), faults, start)
+        self.body: BodyFile | None = None
         self._boot = secrets.randbits(31)
         self._key = key
         self.truth: TruthOutlet | None = None
@@ -132,6 +138,9 @@ class DataLoop:
             connection.close()
         if self.truth is not None:
             self.truth.flush()
+        if self._log is not None and self._listener is not None:
+            counts = {"fan_changes": self.server.fan_changes, "oldest_ack_frames": self.server.oldest_ack_frames}
+            self._log.info("robot", **counts, **self.server.counts)
         if self.robot.injector is not None:
             for injected in self.robot.injector.injected:
                 self._log_fault("injected", injected)
@@ -171,6 +180,8 @@ class DataLoop:
         self._timer = loop.call_at(self.server.next_frame_s, self._tick)
 
     def _on_frame(self) -> None:
+        if self.body is not None:
+            self.body.keep(self.robot)
         if self.truth is not None:
             self.truth.add()
         if self.robot.injector is not None:
@@ -303,6 +314,8 @@ async def serve(
     key: bytes | None = None,
     log: Log | None = None,
     faults: FaultPlan | None = None,
+    body_file: Path | None = None,
+    is_resuming: bool = False,
 ) -> None:
     """Run a DataLoop until ``stop`` is set.
 
@@ -317,12 +330,17 @@ async def serve(
         key: key of the robot link, ``None`` for no authentication.
         log: takes its lines.
         faults: what shall go wrong with the robot and its link; for the link a proxy listens in the robot's place.
+        body_file: keeps where the robot stands while nobody simulates it.
+        is_resuming: the robot stands where the file says.
 
     Raises:
         OSError: the address cannot be had.
         zmq.ZMQError: an endpoint cannot be had.
     """
-    data_loop = DataLoop(cfg, lockstep, seed, key, log, faults)
+    body = None if body_file is None else BodyFile(body_file)
+    start = body.read() if body is not None and is_resuming else None
+    data_loop = DataLoop(cfg, lockstep, seed, key, log, faults, start)
+    data_loop.body = body
     data_loop.truth = outlet = TruthOutlet(TruthLog(data_loop.robot), truth_rep, truth_pub)
     try:
         async with AsyncExitStack() as stack:
@@ -335,6 +353,8 @@ async def serve(
                 answering.cancel()
     finally:
         outlet.close()
+        if body is not None:
+            body.close()
 
 
 async def _put_proxy_before(

@@ -8,6 +8,7 @@ import asyncio
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
+from math import dist
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -22,6 +23,7 @@ from ccatp.etalon_errors import (
     EtalonServerError,
     EtalonTimeout,
     EtalonUnreachable,
+    StaleLengths,
     TooFewChannels,
 )
 from ccatp.etalon_link import EtalonLink, PushQueue
@@ -50,10 +52,12 @@ __all__ = [
     "EtalonTimeout",
     "EtalonUnreachable",
     "Readiness",
+    "StaleLengths",
     "TooFewChannels",
 ]
 
 _NEEDED_CHANNELS = 4
+_MOVED_M = 0.005  # further apart than this two places have different lengths
 
 _ReplyT = TypeVar("_ReplyT", Connected, LaserReady, Environment, ChannelData, Notice)
 _T = TypeVar("_T")
@@ -96,6 +100,7 @@ class EtalonClient:
         self._request = Request(Command.LATEST_LENGTH_VALID, self._channels)
         self._link: EtalonLink | None = None
         self._turn = asyncio.Lock()
+        self._last: tuple[dict[int, float], Vector3] | None = None  # lengths of the last fix, and where it was expected
 
     async def connect(self) -> None:
         """Connect, unless connected.
@@ -129,8 +134,8 @@ class EtalonClient:
                 is where all collimators lie in one plane.
 
         Raises:
-            EtalonUnreachable, EtalonTimeout, EtalonBadReply, EtalonServerError, TooFewChannels, BadSolution: after
-                the configured retries, the error of the last one.
+            EtalonUnreachable, EtalonTimeout, EtalonBadReply, EtalonServerError, TooFewChannels, StaleLengths,
+                BadSolution: after the configured retries, the error of the last one.
         """
         async with self._turn:
             return await self._retry(lambda: self._measure_once(t_s, expected_position_m))
@@ -190,15 +195,22 @@ class EtalonClient:
             raise EtalonBadReply(f"{self._where}: {error}; is this a MultiLine server?") from None
 
     async def _retry(self, attempt: Callable[[], Awaitable[_T]]) -> _T:
-        """Try up to ``retries`` times more. What needs a new measurement waits for one, what needs a server for it."""
+        """Try up to ``retries`` times more. What needs a new measurement waits for one, what needs a server for it.
+
+        A server that is not there, because it is started anew, is waited for: that costs time and no try.
+        """
         left = self._cfg.retries
+        clock = asyncio.get_running_loop().time
+        wait_until_s: float | None = None
         while True:
             try:
                 return await attempt()
             except EtalonError as error:
-                if left == 0:
+                if isinstance(error, EtalonUnreachable) and wait_until_s is None:
+                    wait_until_s = clock() + self._cfg.reconnect_for_s
+                if left == 0 and not (isinstance(error, EtalonUnreachable) and clock() < (wait_until_s or 0.0)):
                     raise
-                left -= 1
+                left = max(left - 1, 0)
                 self.counts["retries"] += 1
                 _log.warning("etalon_retry", error=str(error), tries_left=left)
                 if isinstance(error, EtalonUnreachable | EtalonBadReply):
@@ -288,9 +300,28 @@ class EtalonClient:
                 valid,
                 reasons,
             )
+        self._refuse_old(lengths_m, expected_m)
         try:
-            return solve_fix(self._cfg, t_s, expected_m, lengths_m, self._collimators)
+            fix = solve_fix(self._cfg, t_s, expected_m, lengths_m, self._collimators)
         except MultilaterationError as error:
             raise BadSolution(
-                f"{self._where}: {error}; channels {valid}: check beams, collimators and [etalon] limits"
+                f"{self._where}: {error}; channels {valid}: check beams, collimators and [etalon] limits", lengths_m
             ) from error
+        self._last = lengths_m, expected_m
+        return fix
+
+    def _refuse_old(self, lengths_m: dict[int, float], expected_m: Vector3) -> None:
+        """Lengths have noise: where all come once more, to the last digit, and the robot has moved, nobody measured.
+
+        Raises:
+            StaleLengths: they are.
+        """
+        if self._last is None:
+            return
+        before_m, there_m = self._last
+        moved_m = dist(there_m, expected_m)
+        if before_m == lengths_m and moved_m > _MOVED_M:
+            raise StaleLengths(
+                f"{self._where}: the lengths are those of the last place, {1e3 * moved_m:.0f} mm from here, to the "
+                "last digit; restart its laser driver"
+            )

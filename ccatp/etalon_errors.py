@@ -38,5 +38,16 @@ class TooFewChannels(EtalonError):
         self.reasons = reasons
 
 
+class StaleLengths(EtalonError):
+    """The server repeats the lengths of a place that the robot has left."""
+
+
 class BadSolution(EtalonError):
-    """The lengths give no position that can be trusted; ``__cause__`` is the error of the multilateration."""
+    """The lengths give no position that can be trusted; ``__cause__`` is the error of the multilateration.
+
+    ``lengths_m`` are the lengths by channel.
+    """
+
+    def __init__(self, message: str, lengths_m: dict[int, float]) -> None:
+        super().__init__(message)
+        self.lengths_m = lengths_m

@@ -7,6 +7,8 @@ import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.filters import FILTERS, Filter, FloatArray, Innovation
+from ccatp.health.imu_gate import ImuGate
+from ccatp.health.look import WheelMeans, largest_rate_rad_s
 from ccatp.localization import measurements, survey_model
 from ccatp.localization.four_state import FourStateLocalizer
 from ccatp.localization.full_state import FullStateLocalizer
@@ -89,25 +91,36 @@ class Localizer(Protocol):
     def rest(self) -> None:
         """The mission takes the robot to be at rest."""
 
+    def doubt(self, way_m: float, turn_rad: float) -> None:
+        """The pose may be wrong by this much: it stays, its certainty goes."""
+
     def fuse_fix(self, fix: Fix) -> float:
         """Fuse a position of the puck; returns how far the pose jumped, m. Raises ``FixRefused``."""
 
 
 def build_localizer(
-    cfg: Config, mirror: Mirror, wrap: Callable[[Filter], Filter] = lambda filter_: filter_
+    cfg: Config,
+    mirror: Mirror,
+    wrap: Callable[[Filter], Filter] = lambda filter_: filter_,
+    start: PanelPose | None = None,
 ) -> Localizer:
-    """The localizer for ``run.filter``, the robot standing at base.
+    """The localizer for ``run.filter``, the robot standing at base or at ``start``.
 
     Args:
         cfg: the configuration.
         mirror: its mirror.
         wrap: what to put around the filter, for those who want to look on.
+        start: where the robot stands, as well as ``localizer.start_..._sigma`` says.
     """
     name = cfg.run.filter
-    start = mirror.base_panel_pose
+    start = mirror.base_panel_pose if start is None else start
     # The localizer re-initialises its filter at once; what counts is its size.
+    made: FourStateLocalizer | FullStateLocalizer
     if name in FOUR_STATE:
         n = measurements.STATES
-        return FourStateLocalizer(wrap(FILTERS[name](np.zeros(n), np.eye(n))), mirror, cfg.robot, cfg.localizer, start)
-    n = survey_model.STATES
-    return FullStateLocalizer(wrap(FILTERS[name](np.zeros(n), np.eye(n))), mirror, cfg.robot, cfg.localizer, start)
+        made = FourStateLocalizer(wrap(FILTERS[name](np.zeros(n), np.eye(n))), mirror, cfg.robot, cfg.localizer, start)
+    else:
+        n = survey_model.STATES
+        made = FullStateLocalizer(wrap(FILTERS[name](np.zeros(n), np.eye(n))), mirror, cfg.robot, cfg.localizer, start)
+    made.guard(ImuGate(cfg.health), WheelMeans(cfg.robot), largest_rate_rad_s(cfg.robot))
+    return made

@@ -18,6 +18,7 @@ from ccatp.wire.robot import (
     Hello,
     Join,
     Joined,
+    LineBudget,
     LineBuffer,
     LineTooLong,
     Refused,
@@ -35,6 +36,10 @@ from ccatp.wire.robot import Fans as FansMessage
 # Commands wait in the kernel or not at all: what piles up here is stale before it arrives.
 MAX_UNSENT_BYTES = 4096
 # A dead peer is noticed within seconds: unacknowledged data for 1000 ms, or silence for 1 s and 3 probes of 1 s.
+# A robot in real time that sends more lines than this is flooding us. What piles up while the link is stuck may come at
+# once: half a minute of frames, which is as long as a stall may last; then three times what it should send.
+BACKLOG_S = 30.0
+FLOOD_FACTOR = 3.0
 LINUX_OPTIONS = {"TCP_USER_TIMEOUT": 1000, "TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
 
 
@@ -105,6 +110,7 @@ class RobotLink(asyncio.Protocol):
         key: of the HMAC, where the robot asks for it.
         on_sensors: called with each frame and its line (without LF), within the event loop's read.
         on_lost: called once with the reason when a joined session ends, unless ``close`` ended it.
+        on_joined: called with the robot's hello when the session begins, before its first frame.
 
     Attributes:
         counts: bad_lines, unknown_types, unexpected, repeated_frames, unsent.
@@ -120,9 +126,10 @@ class RobotLink(asyncio.Protocol):
         key: bytes | None,
         on_sensors: Callable[[Sensors, bytes], None],
         on_lost: Callable[[str], None],
+        on_joined: Callable[[Hello], None] = lambda _hello: None,
     ) -> None:
         self._host, self._port, self._role, self._client, self._key = host, port, role, client, key
-        self._on_sensors, self._on_lost = on_sensors, on_lost
+        self._on_sensors, self._on_lost, self._on_joined = on_sensors, on_lost, on_joined
         self.counts: Counter[str] = Counter()
         self._transport: asyncio.Transport | None = None
         self._hello: Hello | None = None
@@ -130,6 +137,7 @@ class RobotLink(asyncio.Protocol):
         self._is_joined = self._is_closing = self._is_paused = False
         self._lines = LineBuffer()
         self._bad = BadLineCounter()
+        self._budget: LineBudget | None = None
         self._last_seq = -1
         self._why = ""
 
@@ -184,6 +192,8 @@ class RobotLink(asyncio.Protocol):
             lines = self._lines.feed(data)
         except LineTooLong as error:
             lines, is_too_long = error.lines, True
+        if self._budget is not None and not self._budget.take(len(lines), asyncio.get_running_loop().time()):
+            self._end("a flood of lines from the robot")
         for line in lines:
             if self._is_closing or self._why:
                 return
@@ -241,7 +251,11 @@ class RobotLink(asyncio.Protocol):
             self._answer(message, joining)
         elif isinstance(message, Joined) and self._hello is not None and message.role == self._role:
             self._is_joined = True
+            if not self._hello.lockstep:  # there it is we who set the pace
+                rate_hz = self._hello.frame_hz
+                self._budget = LineBudget(BACKLOG_S * rate_hz, FLOOD_FACTOR * rate_hz)
             joining.set_result(self._hello)
+            self._on_joined(self._hello)
         else:
             self.counts["unexpected"] += 1
 
@@ -269,6 +283,10 @@ class RobotLink(asyncio.Protocol):
         self._why = self._why or why
         if self._transport is not None:
             self._transport.abort()
+
+    def abort(self, why: str) -> None:
+        """Break the connection at once, whatever waits to be sent; ``on_lost`` is called with ``why``."""
+        self._end(why)
 
     def send_drive(self, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float) -> None:
         """Send wheel set points.

@@ -17,6 +17,8 @@ class RunOptions:
         realtime: pace the stand-ins on the wall clock instead of in lockstep.
         run_dir: where the run is written; ``None`` asks for ``default_run_dir``.
         resume: carry on with the mission in ``run_dir``.
+        held: begin held, until an operator resumes.
+        recover: carry on, held, with the run that did not finish, or else begin one that may be recovered.
         json_output: the summary goes to standard output as JSON, and nothing else does.
         runtime_dir: folder of the unix sockets given on the command line, or ``None``.
         faults_file: plan of faults for the stand-ins, or ``None``; a copy goes into the run directory.
@@ -28,6 +30,8 @@ class RunOptions:
     realtime: bool = False
     run_dir: Path | None = None
     resume: bool = False
+    held: bool = False
+    recover: bool = False
     json_output: bool = False
     runtime_dir: Path | None = None
     faults_file: Path | None = None

@@ -126,6 +126,18 @@ class EventCode(IntEnum):
     ABORTED = 2
 
 
+class Severity(IntEnum):
+    """How grave a finding is; of several the gravest counts."""
+
+    NONE = 0
+    INFORM = 1  # is told, and nothing else
+    SLOW = 2  # go on at reduced speed
+    PAUSE = 3  # hold the wheels, go on as soon as it is over
+    HOLD = 4  # hold the wheels, go on when it is over and a fix was had
+    RETURN = 5  # home, at reduced speed
+    FAULT = 6  # hold the wheels until an operator resumes
+
+
 class Corner(StrEnum):
     """Edge sensors, in the order of the robot link."""
 
@@ -148,6 +160,8 @@ class Verdict(msgspec.Struct, frozen=True):
         limit: the limit it passed.
         forward, reverse, turn: the motion permitted until the next verdict.
         off: for each edge sensor whether it takes part in a declared edge.
+        severity: how grave what gave cause is. An edge has none: what to do about it is in its code and permits.
+        full_fans: the fans shall give all they can.
     """
 
     seq: int
@@ -161,6 +175,8 @@ class Verdict(msgspec.Struct, frozen=True):
     reverse: bool
     turn: bool
     off: tuple[bool, bool, bool, bool] = (False, False, False, False)
+    severity: Severity = Severity.NONE
+    full_fans: bool = False
 
 
 class Twist(msgspec.Struct, frozen=True):

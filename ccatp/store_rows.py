@@ -163,6 +163,8 @@ def open_file(path: Path, mirror: str) -> sqlite3.Connection:
 def _connect(path: Path) -> sqlite3.Connection:
     # The connection is handed to the writer thread once and never shared.
     db = sqlite3.connect(path, timeout=BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False)
+    # A damaged text comes back damaged, and fails its checksum, instead of ending the program.
+    db.text_factory = lambda raw: raw.decode("utf-8", "surrogateescape")
     db.execute("PRAGMA synchronous = FULL")
     db.execute("PRAGMA journal_mode = PERSIST")
     return db

@@ -7,6 +7,7 @@ the rows were cut into batches: the same run gives the same file. What needs the
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -86,6 +87,7 @@ class SummaryBuilder:
         """Nothing has happened yet."""
         self._facts, self._targets, self._normal_at = facts, targets, normal_at
         self._measured = self._skipped = 0
+        self._left_out: Mapping[str, Sequence[str]] = {}
         self._mission_time_s = 0.0
         self._wall_s: float | None = None
         self._ticks_us: list[FloatArray] = []
@@ -153,9 +155,16 @@ class SummaryBuilder:
         """Add wall times of main-loop ticks, microseconds."""
         self._ticks_us.append(np.array(tick_us, dtype=np.float64, ndmin=1))
 
-    def set_mission(self, measured: int, skipped: int, mission_time_s: float) -> None:
-        """Points measured and skipped, and the robot's time from start to end."""
+    def set_mission(
+        self,
+        measured: int,
+        skipped: int,
+        mission_time_s: float,
+        left_out: Mapping[str, Sequence[str]] = MappingProxyType({}),
+    ) -> None:
+        """Points measured and skipped, the robot's time from start to end, and points left out, by the reason."""
         self._measured, self._skipped, self._mission_time_s = measured, skipped, mission_time_s
+        self._left_out = left_out
 
     def set_panels(self, fits: PanelFits, injected: PanelFits | None) -> None:
         """Misalignment of panels as fitted, and as simulated (None on a real robot)."""
@@ -188,6 +197,7 @@ class SummaryBuilder:
                 "measured": self._measured,
                 "first_arrival_within_10mm": int(np.count_nonzero(arrivals <= WITHIN_M)) if has_truth else None,
                 "skipped": self._skipped,
+                **({"left_out": {why: list(names) for why, names in self._left_out.items()}} if self._left_out else {}),
             },
             "arrival_error_mm": _distribution(arrivals),
             "localization_error_mm": {

@@ -4,12 +4,10 @@ import json
 import os
 import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from datetime import UTC, datetime
 from fcntl import LOCK_EX, LOCK_NB, flock
 from pathlib import Path
@@ -20,47 +18,31 @@ import zmq
 from ccatp.config.loader import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.errors import ConfigError, ExitStatus, RefusedError
-from ccatp.processes.common import FAULTS_FILE, SUPERVISOR_PID, Endpoints, open_log
+from ccatp.processes.children import Children, ProcessSpec
+from ccatp.processes.common import FAULTS_FILE, Endpoints, open_log
 from ccatp.processes.observing import check_observatory
 from ccatp.processes.run_collector import RunCollector
 from ccatp.processes.run_view import RunView
 from ccatp.processes.service import Service
+from ccatp.restarts import Decision, Fate
 from ccatp.robot_link import read_key
 from ccatp.run_options import RunOptions, default_run_dir
 from ccatp.runtime_dir import make_runtime_dir
 from ccatp.service_notify import take_from
+from ccatp.unfinished import find_unfinished, forget_finished, note_unfinished
+from ccatp.wire.topics import Presence
 
 POLL_MS = 20
-# The matrices are 4 x 4: threads of the linear algebra would only fight the processes for the cores.
-ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-STOP_TIMEOUT_S = 5.0
 # In lockstep the three that answer each other keep both cores of a small machine busy: recording takes what they leave.
 LOCKSTEP_NICENESS = 10
 
 
-@dataclass(frozen=True, slots=True)
-class ProcessSpec:
-    """One row of the process table.
-
-    Attributes:
-        name: as in logs.
-        module: run with ``python -m``.
-        is_stand_in: runs with ``--sim`` only.
-        listens: the configuration section with the host and port of its listening socket, bound by the supervisor.
-    """
-
-    name: str
-    module: str
-    is_stand_in: bool = False
-    listens: str = ""
-
-
 # In the order of starting; stopping is in the reverse order, so that main holds the wheels first.
 PROCESSES: tuple[ProcessSpec, ...] = (
-    ProcessSpec("dataloop", "ccatp.processes.dataloop", is_stand_in=True, listens="sim.robot"),
+    ProcessSpec("dataloop", "ccatp.processes.dataloop", is_stand_in=True, listens="sim.robot", is_replaceable=False),
     ProcessSpec("etalon", "ccatp.processes.etalon", is_stand_in=True, listens="sim.etalon"),
-    ProcessSpec("danger", "ccatp.processes.danger_loop"),
-    ProcessSpec("main", "ccatp.processes.main_loop"),
+    ProcessSpec("danger", "ccatp.processes.danger_loop", is_loop=True),
+    ProcessSpec("main", "ccatp.processes.main_loop", is_loop=True),
 )
 
 
@@ -76,6 +58,8 @@ def run_survey(options: RunOptions) -> int:
     Raises:
         CcatpError: the run could not begin.
     """
+    if options.recover:
+        return _recover(options)
     overrides = dict(options.overrides)
     cfg = load_config(options.config_file, overrides)
     check_observatory(cfg.observatory)
@@ -94,6 +78,22 @@ def run_survey(options: RunOptions) -> int:
             (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
         run = _Run(options, cfg, run_dir, Endpoints(runtime_dir), sockets, started)
         return run.go()
+
+
+def _recover(options: RunOptions) -> int:
+    """Go on, held, with the run that did not finish; else begin a new one that may be recovered."""
+    options = replace(options, recover=False)
+    found = find_unfinished()
+    if found is not None:
+        options = replace(options, run_dir=found, resume=True, held=True)
+    else:
+        cfg = load_config(options.config_file, dict(options.overrides))
+        run_dir = default_run_dir(cfg.run.mirror, cfg.run.seed, datetime.now(UTC)).absolute()
+        options = replace(options, run_dir=run_dir)
+        note_unfinished(run_dir)
+    status = run_survey(options)
+    forget_finished(status)
+    return status
 
 
 def _processes(options: RunOptions) -> list[ProcessSpec]:
@@ -196,7 +196,8 @@ class _Run:
     ) -> None:
         self._options, self._cfg, self._run_dir, self._endpoints = options, cfg, run_dir, endpoints
         self._sockets, self._started_s = sockets, started_s
-        self._children: dict[str, subprocess.Popen[bytes]] = {}
+        self._view: RunView | None = None
+        self._children = Children(cfg.run, self._command_of, self._say)
         self._is_interrupted = False
         self._service = Service(*take_from(os.environ))
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
@@ -213,22 +214,22 @@ class _Run:
             self._cfg,
             self._run_dir,
             is_sim=self._options.sim,
-            on_presence=self._service.heard,
+            on_presence=self._heard,
         )
-        view = RunView(self._cfg, is_sim=self._options.sim, run_dir=self._run_dir)
+        self._view = view = RunView(self._cfg, is_sim=self._options.sim, run_dir=self._run_dir)
         try:
             with collector, view:
                 status = self._watch(collector, view)
                 self._service.stopping()
                 collector.finish()
-                self._stop_all(view)
+                self._children.stop_all()
                 collector.collect(1, None)
                 wall_s = time.monotonic() - self._started_s
                 summary = collector.summary(wall_s)
         finally:
             for number, handler in previous.items():
                 signal.signal(number, handler)
-            self._kill_all()
+            self._children.kill_all()
             context.destroy(linger=0)
         (self._run_dir / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
         self._log.info("end", status=int(status))
@@ -240,62 +241,50 @@ class _Run:
 
     def _watch(self, collector: RunCollector, view: RunView) -> ExitStatus:
         for process in _processes(self._options):
-            self._start(process)
+            self._children.start(process)
         if not self._options.is_paced:
             os.nice(LOCKSTEP_NICENESS)
         while not self._is_interrupted:
-            collector.collect(POLL_MS, view)
-            self._service.beat(time.monotonic(), collector.status)
+            collector.wait(POLL_MS, self._children.fds)
+            collector.collect(0, view)
+            now_s = time.monotonic()
+            self._service.beat(now_s, collector.status, is_recovering=self._children.is_recovering(now_s))
             # A death comes first: what the others say of it is its consequence.
-            for name, child in self._children.items():
-                if child.poll() is not None:
-                    return self._died(name, child.returncode, view)
+            if (end := self._children.look(now_s)) is not None:
+                return self._died(*end)
             if collector.is_over:
                 return collector.exit_status
         view.say("warning", "interrupted: holding the wheels and saving")
         return ExitStatus.INTERRUPTED
 
-    def _start(self, process: ProcessSpec) -> None:
-        command = [sys.executable, "-m", process.module]
-        command += ["--run-dir", str(self._run_dir), "--runtime-dir", str(self._endpoints.runtime_dir)]
-        command += ["--realtime"] if self._options.is_paced else []
-        command += ["--resume"] if self._options.resume else []
-        command += ["--faults"] if process.is_stand_in and self._options.faults_file is not None else []
-        fds: tuple[int, ...] = ()
-        if process.name in self._sockets:
-            fds = (self._sockets[process.name].fileno(),)
-            command += ["--listen-fd", str(fds[0])]
-        # Their own session: a Ctrl-C in the terminal reaches the supervisor alone, which stops them in order.
-        self._children[process.name] = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=sys.stderr,
-            pass_fds=fds,
-            start_new_session=True,
-            env={**os.environ, **ENVIRONMENT, SUPERVISOR_PID: str(os.getpid())},
-        )
+    def _heard(self, presence: Presence) -> None:
+        self._children.heard(presence)
+        self._service.heard(presence)
 
-    def _died(self, name: str, code: int, view: RunView) -> ExitStatus:
+    def _say(self, level: str, text: str) -> None:
+        self._log.log({"info": 20, "warning": 30, "error": 40}[level], text)
+        if self._view is not None:
+            self._view.say(level, text)
+
+    def _command_of(self, process: ProcessSpec, is_restarted: bool) -> tuple[list[str], tuple[int, ...]]:
+        options = self._options
+        arguments = ["--run-dir", str(self._run_dir), "--runtime-dir", str(self._endpoints.runtime_dir)]
+        flags = {
+            "--realtime": options.is_paced,
+            "--resume": options.resume,
+            "--restarted": is_restarted,
+            "--held": options.held and not is_restarted,
+            "--faults": process.is_stand_in and options.faults_file is not None,
+        }
+        arguments += [flag for flag, is_given in flags.items() if is_given]
+        if process.name not in self._sockets:
+            return arguments, ()
+        fd = self._sockets[process.name].fileno()
+        return [*arguments, "--listen-fd", str(fd)], (fd,)
+
+    def _died(self, name: str, code: int, decision: Decision) -> ExitStatus:
         self._log.error("process died", name=name, code=code)
-        if code in (ExitStatus.USAGE, ExitStatus.UNREACHABLE):
+        if decision.fate is Fate.END:
             return ExitStatus(code)  # it has said why
-        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
-        view.say("error", f"process {name} {how}: run ended, wheels held; see {self._run_dir / 'log.jsonl'}")
+        self._say("error", f"{decision.text}; see {self._run_dir / 'log.jsonl'}")
         return ExitStatus.HELD
-
-    def _stop_all(self, view: RunView) -> None:
-        for name, child in reversed(self._children.items()):
-            if child.poll() is None:
-                child.terminate()
-                try:
-                    child.wait(STOP_TIMEOUT_S)
-                except subprocess.TimeoutExpired:
-                    view.say("error", f"process {name} did not stop within {STOP_TIMEOUT_S} s and was killed")
-                    child.kill()
-                    child.wait()
-
-    def _kill_all(self) -> None:
-        for child in self._children.values():
-            if child.poll() is None:
-                child.kill()
-                child.wait()

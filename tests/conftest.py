@@ -4,7 +4,7 @@ import asyncio
 import inspect
 import os
 import socket
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 
 import psutil
 import pytest
@@ -12,6 +12,8 @@ from hypothesis import settings
 
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
+
+pytest_plugins = ["pytester", "tests.faults.linking"]
 
 # A change is judged by the same examples each time; `make test-slow` looks for new ones.
 settings.register_profile("repeatable", derandomize=True)
@@ -81,13 +83,3 @@ def free_port() -> int:
 def config() -> Config:
     """The default configuration (frozen, so one serves all)."""
     return load_config()
-
-
-@pytest.fixture
-def measured(record_property: Callable[[str, object], None]) -> Callable[[str, float], None]:
-    """Notes what a test measured for a row of the fault table, in the unit of that row's bound."""
-
-    def note(row: str, value: float) -> None:
-        record_property(f"fault:{row}", value)
-
-    return note

@@ -30,6 +30,7 @@ _LARGEST_LENGTH_M = 2.0  # no length outside the mirror's own files reaches it
 _LARGEST_ANGLE_RAD = 2.0 * math.pi
 _SMALLEST_PANEL_MM = 10.0
 _WHOLE_FRAMES = 1e-6  # decimal fractions of a second are not exact
+_LEAST_STANDSTILL_S = 0.2
 _NEAREST_COLLIMATOR_MM = 100.0
 _PITCH_AGREEMENT_MM = 0.1  # the fitted pitches of the telescope differ by up to 0.012 mm
 _TCP_ENDPOINT = re.compile(r"tcp://[^\s/@;]+:(\d{1,5})")
@@ -52,6 +53,7 @@ def check_config(cfg: Config) -> list[Fault]:
         *_check_light(cfg.align),
         *_check_observatory(cfg.observatory),
         *_check_stand_ins(cfg),
+        *_check_standstill(cfg),
         *_check_panels(cfg.mirror.panels),
         *_check_base(cfg.mirror),
         *_check_collimators(cfg.mirror),
@@ -186,6 +188,17 @@ def _check_stand_ins(cfg: Config) -> Iterator[Fault]:
     if not is_loopback(cfg.sim.etalon.host):
         what = f'= "{cfg.sim.etalon.host}" is beyond this machine, and its protocol has no keys; {hint}'
         yield Fault(("sim", "etalon", "host"), what)
+
+
+def _check_standstill(cfg: Config) -> Iterator[Fault]:
+    """Nothing is measured before the robot has stood still for long enough."""
+    time_s = cfg.control.settle_time_s + cfg.etalon.measuring_time_s
+    if time_s < _LEAST_STANDSTILL_S:
+        what = (
+            f"= {cfg.etalon.measuring_time_s:g} is too short: with control.settle_time_s = "
+            f"{cfg.control.settle_time_s:g} the robot must stand still for {_LEAST_STANDSTILL_S:g} s"
+        )
+        yield Fault(("etalon", "measuring_time_s"), what, (("control", "settle_time_s"),))
 
 
 def _check_panels(panels: PanelsConfig) -> Iterator[Fault]:

@@ -133,7 +133,7 @@ def _read(path: Path, root: Key = ()) -> Source:
         raise ConfigError(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
     try:
         return Source(str(path), text, tomllib.loads(text), root, path.parent)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
         at = re.search(r" \(at line (\d+), column (\d+)\)", str(error))
         line = int(at[1]) if at else max(1, len(text.splitlines()))
         what = re.sub(r" \(at .*\)$", "", str(error))

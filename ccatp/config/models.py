@@ -4,8 +4,11 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-Positive = Annotated[float, Field(gt=0.0)]
-NonNegative = Annotated[float, Field(ge=0.0)]
+# No quantity of this project is larger, in whatever unit its key names.
+Positive = Annotated[float, Field(gt=0.0, le=1e6)]
+NonNegative = Annotated[float, Field(ge=0.0, le=1e6)]
+# No decision is made on data older than 150 ms.
+Freshness = Annotated[float, Field(gt=0.0, le=0.15)]
 Port = Annotated[int, Field(ge=0, le=65535)]
 Pair = tuple[float, float]
 
@@ -28,6 +31,10 @@ class RunConfig(Model):
     budget_s: Positive
     runtime_dir: str  # empty = chosen from the environment
     realtime_priority: Annotated[int, Field(ge=0, le=99)]  # 0 = ordinary scheduling
+    hang_timeout_s: Positive
+    start_timeout_s: Positive
+    restart_limit: Annotated[int, Field(ge=0)]
+    restart_window_s: Positive
 
 
 class RobotConfig(Model):
@@ -44,7 +51,11 @@ class RobotConfig(Model):
     fan_duty: tuple[Annotated[float, Field(ge=0.0, le=1.0)], Annotated[float, Field(ge=0.0, le=1.0)]]
     key_file: str
     connect_timeout_s: Positive
-    sensors_timeout_s: Positive
+    sensors_timeout_s: Freshness
+    slip_after_s: Positive
+    lag_limit_s: Freshness
+    silence_timeout_s: Positive
+    reconnect_timeout_s: Positive
 
 
 class LimitsConfig(Model):
@@ -181,12 +192,17 @@ class EtalonConfig(Model):
     request_timeout_s: Positive
     retries: Annotated[int, Field(ge=0, le=10)]
     reconnect_delay_s: Positive
+    reconnect_for_s: NonNegative
     measuring_time_s: Positive
     length_sigma_m: Positive
     length_sigma_per_m: NonNegative
     max_residual_m: Positive
     max_dop: Positive
     max_distance_m: Positive
+    max_surface_residual_m: Positive
+    doubt_nis: Positive
+    repeat_m: Positive
+    start_distance_m: Positive
 
 
 class DangerConfig(Model):
@@ -199,8 +215,8 @@ class DangerConfig(Model):
     no_map_travel_m: Positive
     max_crossing_angle_rad: Annotated[float, Field(gt=0.0, lt=1.5)]
     turn_travel_limit_m: Positive
-    stale_after_s: Positive
-    estimate_stale_after_s: Positive
+    stale_after_s: Freshness
+    estimate_stale_after_s: Freshness
     debounce_samples: Annotated[int, Field(ge=1, le=100)]
     lifted_samples: Annotated[int, Field(ge=1, le=1000)]
     outward_turn_limit_m: Positive
@@ -221,6 +237,57 @@ class AlignConfig(Model):
     puck_height_sigma_m: NonNegative
     false_alarm: Annotated[float, Field(gt=0.0, lt=1.0)]
     light: dict[str, LightConfig]  # by mirror name
+
+
+class HealthConfig(Model):
+    """What the monitors of sensors, wheels, fans and link take for a fault, and how long they are patient."""
+
+    slow_speed_m_s: Positive
+    slow_rate_rad_s: Positive
+    doubt_position_m: Positive
+    doubt_heading_rad: Positive
+    gap_s: Positive
+    pause_limit_s: Positive
+    hold_limit_s: Positive
+    lifted_limit_s: Positive
+    retries: Annotated[int, Field(ge=0, le=10)]
+    retry_after_s: Positive
+    retry_window_s: Positive
+    stall_command_m_s: Positive
+    stall_speed_m_s: Positive
+    stall_time_s: Positive
+    stop_time_s: Positive
+    stop_speed_m_s: Positive
+    creep_m: Positive
+    runaway_m_s: Positive
+    runaway_time_s: Positive
+    yaw_limit_rad: Positive
+    yaw_share: Annotated[float, Field(ge=0.0, le=1.0)]
+    yaw_time_s: Positive
+    identical_samples: Annotated[int, Field(ge=2, le=1000)]
+    imu_rate_rad_s: Positive
+    imu_jump_rad_s: Positive
+    imu_largest_rad_s: Positive
+    imu_rate_share: Annotated[float, Field(ge=0.0, le=1.0)]
+    imu_acceleration_m_s2: Positive
+    imu_quarantine_s: Positive
+    rate_share: Annotated[float, Field(gt=0.0, lt=1.0)]
+    rate_time_s: Positive
+    latency_slow_s: Positive
+    latency_pause_s: Positive
+    clock_jump_s: Positive
+    seam_margin_m: Positive
+    seams_suspect: Annotated[int, Field(ge=1, le=10)]
+    seams_failed: Annotated[int, Field(ge=1, le=10)]
+    stuck_off_m: Annotated[float, Field(gt=0.0, le=0.06)]
+    chatter_transitions: Annotated[int, Field(ge=1, le=1000)]
+    chatter_time_s: Positive
+    fan_share: Annotated[float, Field(gt=0.0, lt=1.0)]
+    fan_time_s: Positive
+    battery_life_s: Positive
+    battery_reserve: Annotated[float, Field(ge=0.0, lt=1.0)]
+    battery_margin: Annotated[float, Field(ge=1.0, le=10.0)]
+    battery_time_s: Positive
 
 
 class ObservatoryConfig(Model):
@@ -249,9 +316,16 @@ class MissionConfig(Model):
     correction_margin: Annotated[float, Field(gt=0.0, le=1.0)]
     correction_reach_m: NonNegative
     max_approaches: Annotated[int, Field(ge=1)]
-    verdict_timeout_s: Positive
+    verdict_timeout_s: Freshness
     measure_timeout_s: Positive
     failed_points_before_hold: Annotated[int, Field(ge=1)]
+    heading_doubt_rad: Positive
+    alignment_leg_m: Annotated[float, Field(gt=0.0, le=0.5)]
+    holds_to_budget: bool
+    alarm_period_s: Positive
+    battery_endurance_s: Positive
+    battery_reserve: Annotated[float, Field(ge=0.0, lt=1.0)]
+    return_energy_factor: Annotated[float, Field(ge=1.0)]
 
 
 class SimRobotConfig(Model):
@@ -360,7 +434,7 @@ class PanelsConfig(Model):
     pitch_x_mm: Positive
     pitch_y_mm: Positive
     gap_mm: Positive
-    y_offset_mm: float
+    y_offset_mm: Annotated[float, Field(ge=-1e5, le=1e5)]
     points_x_mm: tuple[float, float, float]
     points_y_mm: tuple[float, float, float]
     adjusters_mm: dict[str, Pair]  # vertical adjusters, offsets in the panel's tangent plane
@@ -408,6 +482,7 @@ class Config(Model):
     etalon: EtalonConfig
     danger: DangerConfig
     align: AlignConfig
+    health: HealthConfig
     observatory: ObservatoryConfig
     mission: MissionConfig
     sim: SimConfig

@@ -1,14 +1,50 @@
-"""Pure. The last gate before the wheels: every drive goes through it; it denies by default."""
+"""Pure. The last gate before the wheels: every drive goes through it; it denies by default.
 
+What stands in the way is told by a reason. The danger loop denies for its own reasons by its permit; the gate trusts
+neither the mission nor the verdict's flags alone: a verdict that names an edge sensor bars that direction whatever its
+permits say, and a survey moves under a normal verdict only.
+"""
+
+from enum import Enum, StrEnum
 from math import isfinite
 
 from ccatp.config.models import LimitsConfig
 from ccatp.control.kinematics import wheel_rates
-from ccatp.samples import Twist, Verdict
+from ccatp.samples import EventCode, Twist, Verdict
 
 HELD = Twist(0.0, 0.0)
 # The feed-forward of the wheel lag adds T a to the speed; a tenth covers it and the feedback.
 HEADROOM = 1.25
+# A frame that comes after a longer silence allows no larger step than this one.
+MAX_STEP_S = 0.1
+_NORMAL, _NEAR_EDGE, _ABORTED = EventCode
+
+
+class Purpose(Enum):
+    """What a motion is for."""
+
+    STAND = "stand"
+    SURVEY = "survey"
+    RETREAT = "retreat"
+    HOMEWARD = "homeward"
+
+
+_STAND, _SURVEY, _RETREAT = Purpose.STAND, Purpose.SURVEY, Purpose.RETREAT
+
+
+class Denial(StrEnum):
+    """Why a drive became zero."""
+
+    NOT_FINITE = "the set point is not finite"
+    STATE = "the mission's state allows no motion"
+    NO_TIME = "no time has passed since the last drive"
+    OLD_FRAME = "the sensors frame is too old"
+    NO_VERDICT = "there is no verdict"
+    OLD_VERDICT = "the verdict is too old"
+    EDGE = "it leads towards a declared edge"
+    AT_EDGE = "the survey waits while an edge is declared"
+    ABORTED = "the survey waits while an emergency is latched"
+    NOT_PERMITTED = "the verdict does not permit the direction"
 
 
 class DriveGate:
@@ -21,6 +57,12 @@ class DriveGate:
         max_wheel_rad_s: the robot's own limit.
         wheel_lag_s: time constant of the wheel servo; the feed-forward may step the set point by T times the
             acceleration limit.
+        verdict_timeout_s: a verdict that is this far from the frame in time is none.
+        frame_timeout_s: no decision is made on a frame older than this.
+
+    Attributes:
+        denied: how often each reason stood in the way.
+        denial: the reason of the last call; None where the drive was passed or nothing was wanted.
     """
 
     def __init__(
@@ -30,6 +72,8 @@ class DriveGate:
         wheel_base_m: float,
         max_wheel_rad_s: float,
         wheel_lag_s: float,
+        verdict_timeout_s: float,
+        frame_timeout_s: float,
     ) -> None:
         """Copy the limits; nothing has been driven yet."""
         self._v_max = HEADROOM * limits.v_max_m_s
@@ -38,22 +82,39 @@ class DriveGate:
         self._omega_step = 2.0 * HEADROOM * limits.alpha_max_rad_s2 * wheel_lag_s
         self._a, self._alpha = HEADROOM * limits.a_max_m_s2, HEADROOM * limits.alpha_max_rad_s2
         self._radius, self._base, self._max_wheel = wheel_radius_m, wheel_base_m, max_wheel_rad_s
+        self._verdict_timeout_s, self._frame_timeout_s = verdict_timeout_s, frame_timeout_s
         self._last = HELD
-        self.denials = 0
+        self.denied = dict.fromkeys(Denial, 0)
+        self.denial: Denial | None = None
 
-    def pass_through(self, wanted: Twist, verdict: Verdict | None, dt_s: float) -> tuple[float, float]:
+    @property
+    def denials(self) -> int:
+        """How many drives were denied."""
+        return sum(self.denied.values())
+
+    def pass_through(
+        self, wanted: Twist, verdict: Verdict | None, dt_s: float, t_s: float, age_s: float, purpose: Purpose
+    ) -> tuple[float, float]:
         """Wheel rates (right, left), rad/s, for the wanted twist, as far as it may be driven.
 
         Args:
             wanted: velocity asked for by the mission.
             verdict: the danger loop's verdict in force; ``None`` when there is none fresh enough.
             dt_s: time since the last drive.
+            t_s: robot time of the frame that is answered.
+            age_s: how old that frame is.
+            purpose: what the mission's state moves for.
         """
         v, omega = wanted.v_m_s, wanted.omega_rad_s
-        if (v == 0.0 and omega == 0.0) or not self._is_permitted(v, omega, verdict):
+        if v == 0.0 and omega == 0.0:
+            self._last, self.denial = HELD, None
+            return 0.0, 0.0
+        self.denial = denial = self._judge(v, omega, verdict, dt_s, t_s, age_s, purpose)
+        if denial is not None:
+            self.denied[denial] += 1
             self._last = HELD
             return 0.0, 0.0
-        last = self._last
+        dt_s, last = min(dt_s, MAX_STEP_S), self._last
         v = _slewed(last.v_m_s, v, self._v_step + self._a * dt_s, self._v_max)
         omega = _slewed(last.omega_rad_s, omega, self._omega_step + self._alpha * dt_s, self._omega_max)
         self._last = allowed = Twist(v, omega)
@@ -63,17 +124,36 @@ class DriveGate:
             right, left = right * scale, left * scale
         return right, left
 
-    def _is_permitted(self, v: float, omega: float, verdict: Verdict | None) -> bool:
-        permitted = (
-            verdict is not None
-            and isfinite(v)
-            and isfinite(omega)
-            and (v <= 0.0 or verdict.forward)
-            and (v >= 0.0 or verdict.reverse)
-            and (omega == 0.0 or verdict.turn)
-        )
-        self.denials += not permitted
-        return permitted
+    def _judge(
+        self, v: float, omega: float, verdict: Verdict | None, dt_s: float, t_s: float, age_s: float, purpose: Purpose
+    ) -> Denial | None:
+        """What stands in the way. Comparisons are written so that what is not a number does not pass."""
+        if not (isfinite(v) and isfinite(omega)):
+            return Denial.NOT_FINITE
+        if purpose is _STAND:
+            return Denial.STATE
+        if not dt_s > 0.0:
+            return Denial.NO_TIME
+        if not age_s <= self._frame_timeout_s:
+            return Denial.OLD_FRAME
+        if verdict is None:
+            return Denial.NO_VERDICT
+        if not abs(t_s - verdict.t_s) <= self._verdict_timeout_s:
+            return Denial.OLD_VERDICT
+        return _judge_direction(v, omega, verdict, purpose)
+
+
+def _judge_direction(v: float, omega: float, verdict: Verdict, purpose: Purpose) -> Denial | None:
+    if purpose is not _RETREAT and verdict.code is not _NORMAL:
+        if verdict.code is _NEAR_EDGE:
+            return Denial.AT_EDGE
+        if purpose is _SURVEY:
+            return Denial.ABORTED
+    front_left, front_right, rear_left, rear_right = verdict.off
+    if (v > 0.0 and (front_left or front_right)) or (v < 0.0 and (rear_left or rear_right)):
+        return Denial.EDGE
+    forward, reverse, turn = v <= 0.0 or verdict.forward, v >= 0.0 or verdict.reverse, omega == 0.0 or verdict.turn
+    return None if forward and reverse and turn else Denial.NOT_PERMITTED
 
 
 def _slewed(last: float, wanted: float, step: float, limit: float) -> float:

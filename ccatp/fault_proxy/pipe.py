@@ -1,6 +1,7 @@
 """Edge. One direction of one connection through the proxy: a reader, what waits, and a writer."""
 
 import asyncio
+import contextlib
 import random
 from collections import Counter, deque
 from collections.abc import Callable
@@ -100,7 +101,8 @@ class Pipe:
 
     def _send_end(self) -> None:
         if self._writer.can_write_eof() and not self._writer.is_closing():
-            self._writer.write_eof()
+            with contextlib.suppress(OSError):  # it may be gone without us having heard
+                self._writer.write_eof()
 
     async def _read(self) -> bytes:
         try:

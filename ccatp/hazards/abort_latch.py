@@ -54,6 +54,11 @@ class AbortLatch:
         return bool(self._active)
 
     @property
+    def is_shaking(self) -> bool:
+        """Whether an earthquake is active: nothing may move until it is cleared, whatever else there is."""
+        return any(emergency.kind is EmergencyKind.EARTHQUAKE for emergency in self._active.values())
+
+    @property
     def newest(self) -> Emergency | None:
         """The emergency raised last among the active ones."""
         return next(reversed(self._active.values())) if self._active else None

@@ -72,6 +72,8 @@ class Episode:
     Attributes:
         phase: what is known.
         cause, value_m, limit_m: the declared edge: why, and the travel against its limit.
+        retreat_m: how far the sensor has been moved since it was declared, while it stayed off.
+        is_doubted: the sensor is to blame, and no edge.
     """
 
     def __init__(
@@ -107,7 +109,10 @@ class Episode:
         self._off_samples = self._on_samples = 0
         self._on_place: Place = self._sensor0
         self._declared_heading = 0.0
+        self._declared_place: Place = self._sensor0
         self._is_turn_spent = False
+        self.retreat_m = 0.0
+        self.is_doubted = False
         self.phase = Phase.FRESH
         self.cause: Cause | None = None
         self.value_m = self.limit_m = 0.0
@@ -148,7 +153,9 @@ class Episode:
         self._heading = odometry.heading_rad
         if self.phase is Phase.DECLARED:
             self._watch_turn()
+            self.retreat_m = hypot(place[0] - self._declared_place[0], place[1] - self._declared_place[1])
             return False
+        self._declared_place = place
         if worst_m > self._limits.no_map_m:
             return self._declare(Cause.SILENT_WHEELS, worst_m, self._limits.no_map_m)
         c, s, sensor0, robot0 = self._cos, self._sin, self._sensor0, self._robot0
@@ -171,6 +178,11 @@ class Episode:
             return False
         self.phase = Phase.RIM
         return self._off_samples >= self._limits.debounce and self._declare_rim()
+
+    @property
+    def is_on(self) -> bool:
+        """The sensor is on at present: the episode may be about to end."""
+        return self._on_samples > 0
 
     @property
     def permits_turn(self) -> bool:

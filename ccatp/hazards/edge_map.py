@@ -34,6 +34,14 @@ class MirrorMap(Protocol):
         """The outline."""
 
     @property
+    def overhang(self) -> bool:
+        """The robot hangs and needs its fans."""
+
+    @property
+    def base_pose(self) -> DeckPose:
+        """Where the robot starts and returns to."""
+
+    @property
     def nearest_panel(self) -> "NearestPanel":
         """The panel whose cell is nearest to a deck point."""
 
@@ -84,6 +92,10 @@ class EdgeMap:
             return False
         ahead = x + reach_m * direction[0], y + reach_m * direction[1]
         return self._rim.segment_clearance_m(x, y, *ahead) <= slack_m
+
+    def has_edge_near(self, place: tuple[float, float], slack_m: float) -> bool:
+        """Whether a panel may end within ``slack_m`` of a place: at a seam or at the rim."""
+        return self._rim.signed_distance_m(*place) <= slack_m or self.seam_at(place, slack_m) is not None
 
     def seam_at(self, place: tuple[float, float], slack_m: float, not_axis: Axis | None = None) -> SeamNear | None:
         """The nearest interior seam whose gap, widened by ``slack_m`` on both sides, holds the place.

@@ -22,6 +22,7 @@ from ccatp.config.models import DangerConfig, RobotConfig
 from ccatp.hazards.edge_episode import Episode, EpisodeLimits, Phase
 from ccatp.hazards.edge_map import EdgeMap
 from ccatp.hazards.wheel_track import Odometry, WheelTrack, pose_at
+from ccatp.health.look import largest_rate_rad_s
 from ccatp.samples import EdgeSample
 
 SENSORS = 4
@@ -70,7 +71,9 @@ class EdgeRule:
         self._map = edge_map
         self._offsets = robot.edge_sensors_m
         reach_s = 2.0 * max(cfg.stale_after_s, cfg.estimate_stale_after_s)
-        self.track = WheelTrack(robot.wheel_radius_m, robot.wheel_base_m, cfg.stale_after_s, reach_s)
+        self.track = WheelTrack(
+            robot.wheel_radius_m, robot.wheel_base_m, cfg.stale_after_s, reach_s, largest_rate_rad_s(robot)
+        )
         self._limits = EpisodeLimits(edge_map.gap_m, cfg)
         self._half_base_m = 0.5 * robot.wheel_base_m
         self._clear_samples, self._lifted_samples = cfg.clear_samples, cfg.lifted_samples

@@ -10,6 +10,7 @@ from ccatp.samples import WheelSample
 # A frame may be as short as an encoder period; this many of them reach back further than any estimate that is used.
 HISTORY_FRAMES = 256
 KNOTS_KEPT = 512
+LARGEST = 1e9  # rad/s: finite, at least
 
 
 class Knot(NamedTuple):
@@ -31,10 +32,14 @@ class WheelTrack:
         wheel_base_m: L.
         hold_s: a wheel's last sample is good for this long.
         reach_s: how far back ``update`` reads.
+        limit_rad_s: no wheel is faster; what says so, or is not a number, is no sample.
     """
 
-    def __init__(self, wheel_radius_m: float, wheel_base_m: float, hold_s: float, reach_s: float) -> None:
+    def __init__(
+        self, wheel_radius_m: float, wheel_base_m: float, hold_s: float, reach_s: float, limit_rad_s: float = LARGEST
+    ) -> None:
         """Nothing known yet."""
+        self._limit_rad_s = limit_rad_s
         self._half_radius_m = 0.5 * wheel_radius_m
         self._radius_per_base = wheel_radius_m / wheel_base_m
         self._hold_s, self._reach_s = hold_s, reach_s
@@ -54,8 +59,8 @@ class WheelTrack:
             return
         self._frames.append(samples)
         t_s, right, left = samples[-1]
-        # x - x is zero only for finite numbers.
-        if right is None or left is None or right - right != 0.0 or left - left != 0.0:
+        limit = self._limit_rad_s
+        if right is None or left is None or not (-limit <= right <= limit and -limit <= left <= limit):
             self.update(t_s)
             t_s = min(self._right_t_s, self._left_t_s)
         self._heard_t_s = max(self._heard_t_s, t_s)
@@ -76,12 +81,13 @@ class WheelTrack:
 
     def _read(self, samples: Sequence[WheelSample]) -> None:
         half_radius_m, radius_per_base, hold_s = self._half_radius_m, self._radius_per_base, self._hold_s
+        limit = self._limit_rad_s
         for t_s, right, left in samples:
             if t_s <= self._right_t_s or t_s <= self._left_t_s:
                 continue
-            if right is not None and right - right == 0.0:
+            if right is not None and -limit <= right <= limit:
                 self._right, self._right_t_s = right, t_s
-            if left is not None and left - left == 0.0:
+            if left is not None and -limit <= left <= limit:
                 self._left, self._left_t_s = left, t_s
             if t_s - self._right_t_s <= hold_s and t_s - self._left_t_s <= hold_s:
                 both, turning = self._right + self._left, self._right - self._left

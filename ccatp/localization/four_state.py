@@ -249,6 +249,15 @@ class FourStateLocalizer(FrameReceiver[Stack]):
         variances = (speed**2, cfg.reset_acceleration_sigma_m_s2**2, variance_rad2, rate**2)
         self.reset_filter(np.array([0.0, 0.0, heading_rad, 0.0]), np.diag(variances))
 
+    def doubt(self, way_m: float, turn_rad: float) -> None:
+        """The pose may be wrong by this much, because what it was made of was: the pose stays, its certainty goes."""
+        if self.is_frozen:
+            return
+        self._sigma.widen(way_m)
+        wider = np.zeros((STATES, STATES))
+        wider[THETA, THETA] = turn_rad * turn_rad
+        self._filter.predict(np.eye(STATES), wider)
+
     def _resync(self, t_s: float, last_s: float) -> None:
         """Go on in a new time base: the pose does not step, what may have happened meanwhile goes to the sigmas."""
         self._odometer.start(t_s)

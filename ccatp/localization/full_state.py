@@ -12,7 +12,7 @@ from ccatp.filters.base import Filter, FilterDiverged, FloatArray, Innovation
 from ccatp.localization.block import BlockBuilder
 from ccatp.localization.crossing import EdgeScanner
 from ccatp.localization.fixes import FixGated, check_fix, deck_foot
-from ccatp.localization.intake import MAX_FRAME_STEP_S
+from ccatp.localization.intake import LONGEST_GAP_S, MAX_FRAME_STEP_S
 from ccatp.localization.noise_floor import NoiseFloor
 from ccatp.localization.panel_frame import PanelFrame
 from ccatp.localization.receiver import FrameReceiver
@@ -336,6 +336,20 @@ class FullStateLocalizer(FrameReceiver[_Moved]):
             f"{_CONSISTENT} fixes in a row say that the pose is {distance_mm:.1f} mm wrong: it begins anew"
         )
 
+    def doubt(self, way_m: float, turn_rad: float) -> None:
+        """The pose may be wrong by this much, because what it was made of was: the pose stays, its certainty goes."""
+        if self.is_frozen:
+            return
+        # What the wheels may have done while nobody listened is part of the doubt.
+        self._right.restart()
+        self._left.restart()
+        if self._block.dt_s > 0.0:
+            self._take_block(self._clock.t_s)
+        self._estimate.lose(way_m, turn_rad)
+        self._carry_on(self._half_s)
+        self._estimate.journal.restart()
+        self._block.restart()
+
     # -- time ---------------------------------------------------------------------------------------------------------
 
     def _resync(self, t_s: float, last_s: float) -> None:
@@ -352,7 +366,9 @@ class FullStateLocalizer(FrameReceiver[_Moved]):
         if not self.is_frozen:
             if self._block.dt_s > 0.0:
                 self._take_block(last_s)
-            self._estimate.lose(self._running.v_m_s * MAX_FRAME_STEP_S, self._running.omega_rad_s * MAX_FRAME_STEP_S)
+            # A gap without frames, if it is one and no jump of the clock, ends with the robot's own time-to-live.
+            lost_s = min(max(t_s - last_s, MAX_FRAME_STEP_S), LONGEST_GAP_S)
+            self._estimate.lose(self._running.v_m_s * lost_s, self._running.omega_rad_s * lost_s)
             self._carry_on(0.0)
         self._estimate.journal.restart()
         self._block.restart()

@@ -16,6 +16,8 @@ WheelColumns = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
 """Times (s) and the rates (rad/s) of the right and of the left wheel."""
 MAX_FRAME_STEP_S = 0.1
 """A frame further than this from the last one is a jump of the robot's clock or a gap in the link."""
+LONGEST_GAP_S = 0.4
+"""After so long without a drive the robot stands, whatever it was told: its time-to-live and the wheels' run-down."""
 BACKWARD_LIMIT = 5
 """This many backward time stamps in a row ask for a hold."""
 _ROUNDING_S = 1e-6
@@ -115,9 +117,10 @@ class SampleIntake:
     Args:
         history_s: samples older than this before their frame are refused.
         counts: where refusals are counted, by reason: ahead, late, duplicate, backward, nonfinite
-            (or larger than any sensor can show).
+            (or larger than any sensor can show), too_fast.
 
     Attributes:
+        largest_rate_rad_s: no wheel is faster; a sample that says so is refused.
         backward_source: name of a sensor that has sent ``BACKWARD_LIMIT`` backward time stamps in a row, or empty;
             stays until someone empties it.
     """
@@ -126,6 +129,7 @@ class SampleIntake:
         self._history_s = history_s
         self._counts = counts
         self.backward_source = ""
+        self.largest_rate_rad_s = _READABLE
         self.restart()
 
     def stack(
@@ -156,6 +160,10 @@ class SampleIntake:
         newest_s = max(self._right.newest_s, self._left.newest_s, oldest_s)
         if not (newest_s < times[0] and times[-1] <= t_s + _ROUNDING_S and size < _READABLE):
             return None
+        largest = self.largest_rate_rad_s
+        # The length of a vector is at least its largest number, so that hardly any frame has to be looked at closely.
+        if size > largest and max(*right, *left, -min(right), -min(left)) > largest:
+            return None
         if not all(map(lt, times, times[1:])):
             return None
         self._right.use(times, oldest_s)
@@ -173,7 +181,9 @@ class SampleIntake:
                 self._counts["nonfinite"] += 1
                 continue
             for source, rate, kept in ((self._right, right_rad_s, right), (self._left, left_rad_s, left)):
-                if rate is not None and self._is_usable(source, sample_s, t_s):
+                if rate is not None and abs(rate) > self.largest_rate_rad_s:
+                    self._counts["too_fast"] += 1
+                elif rate is not None and self._is_usable(source, sample_s, t_s):
                     source.use((sample_s,), oldest_s)
                     kept.append((sample_s, rate))
         return right, left

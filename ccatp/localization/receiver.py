@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from typing import Generic, TypeVar
 
 from ccatp.filters.base import FilterDiverged
+from ccatp.health.imu_gate import ImuGate
+from ccatp.health.look import WheelMeans
 from ccatp.localization.intake import BACKWARD_LIMIT, FrameClock, FrameKind, SampleIntake
 from ccatp.samples import EdgeSample, GravitySample, ImuSample, WheelSample
 
@@ -32,6 +34,12 @@ class FrameReceiver(ABC, Generic[Taken]):
         self.notices: list[str] = []
         self._clock = FrameClock()
         self._intake = SampleIntake(history_s, self.counts)
+        self._guard: tuple[ImuGate, WheelMeans] | None = None
+
+    def guard(self, gate: ImuGate, means: WheelMeans, largest_rate_rad_s: float) -> None:
+        """From now on leave out inertial samples that the gate does not believe, and wheels faster than any is."""
+        self._guard = gate, means
+        self._intake.largest_rate_rad_s = largest_rate_rad_s
 
     @property
     def t_s(self) -> float:
@@ -70,12 +78,16 @@ class FrameReceiver(ABC, Generic[Taken]):
         last_s, kind = self._clock.t_s, self._clock.admit(t_s)
         dt_s = t_s - last_s if kind is FrameKind.NEXT else 0.0
         if kind is FrameKind.RESYNC:
+            if self._guard is not None:
+                self._guard[0].reset()
             self._resync(t_s, last_s)
         elif kind is not FrameKind.NEXT:
             self.counts[f"{kind.value}_frames"] += 1
             if self._clock.stale_run >= BACKWARD_LIMIT:
                 self._ask_to_hold("time stamps of the frames run backward")
             return
+        if self._guard is not None:
+            imu = self._believed(imu, encoders, dt_s)
         taken = self._take(t_s, imu, encoders)
         if self._intake.backward_source:
             self._ask_to_hold(f"time stamps of the {self._intake.backward_source} run backward")
@@ -86,6 +98,16 @@ class FrameReceiver(ABC, Generic[Taken]):
             self._use(t_s, dt_s, taken, edges, gravity)
         except FilterDiverged as error:
             self._freeze(error)
+
+    def _believed(self, imu: Sequence[ImuSample], encoders: Sequence[WheelSample], dt_s: float) -> Sequence[ImuSample]:
+        if self._guard is None:
+            return imu
+        gate, means = self._guard
+        means.take(encoders, dt_s)
+        believed = gate.admit(imu, means.yaw_rad_s) if imu else imu
+        if len(believed) != len(imu):
+            self.counts["imu_doubted"] += len(imu)
+        return believed
 
     def _freeze(self, error: FilterDiverged) -> None:
         self.is_frozen = True

@@ -1,4 +1,4 @@
-"""Glue. The main loop's parts and the mission's database, new or resumed."""
+"""Glue. The main loop's parts and the mission's database, new, resumed, or taken over from a main loop that died."""
 
 from collections.abc import Sequence
 
@@ -7,8 +7,10 @@ from ccatp.errors import CcatpError, ExitStatus
 from ccatp.mirror.mirror import build_mirror
 from ccatp.planning.traversal import ORDERS
 from ccatp.processes.common import ProcessArgs
+from ccatp.processes.keeping import recovery_from
 from ccatp.samples import PointId
 from ccatp.store import MissionStore, PlannedPoint, StoreError
+from ccatp.surveying.recovery import Recovery
 
 
 class StoreUnusable(CcatpError):
@@ -26,12 +28,35 @@ def build_parts(args: ProcessArgs) -> tuple[Parts, MissionStore]:
         store = _open_store(args, mirror.name, points)
     except StoreError as error:
         raise StoreUnusable(str(error)) from error
-    return assemble(cfg, store.measured_points()), store
+    done = store.measured_points()
+    recovery = _recovery(args, store, points, done)
+    parts = assemble(cfg, done, recovery)
+    if recovery is None and args.is_held:
+        parts.mission.pause(_why_held(len(done), points))
+    return parts, store
+
+
+def _recovery(args: ProcessArgs, store: MissionStore, points: Sequence[PointId], done: set[PointId]) -> Recovery | None:
+    if not args.is_taking_over:
+        return None
+    # A run that is resumed tries again what was skipped; a main loop that takes over does not.
+    skipped = tuple(p.point for p in store.points() if p.status == "skipped") if args.is_restarted else ()
+    left = [point for point in points if point not in done and point not in skipped]
+    recovery = recovery_from(
+        args.run_dir, args.config.limits, skipped, _why_held(len(done), left) if args.is_held else ""
+    )
+    return recovery if recovery is None or args.is_restarted else recovery._replace(elapsed_s=0.0)
+
+
+def _why_held(done: int, left: Sequence[PointId]) -> str:
+    goes_on = f"goes on with point {left[0].row}-{left[0].col}-{left[0].point}" if left else "ends it"
+    measured = f"{done} points are measured and will be left out, {len(left)} are to do"
+    return f"started anew: {measured}; 'ccatp resume' {goes_on}"
 
 
 def _open_store(args: ProcessArgs, mirror: str, points: Sequence[PointId]) -> MissionStore:
     path = args.run_dir / "mission.sqlite"
-    if args.is_resuming:
+    if args.is_resuming or (args.is_restarted and path.exists()):
         return MissionStore.open(path, mirror=mirror)
     cfg = args.config
     grid = cfg.mirror.panels

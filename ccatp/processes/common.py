@@ -8,13 +8,14 @@ import signal
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
+from typing import TextIO, cast
 
 import structlog
 
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
 from ccatp.errors import CcatpError
+from ccatp.processes.log_stream import LogStream
 
 PR_SET_PDEATHSIG = 1
 # The copy of the fault plan in the run directory.
@@ -46,6 +47,8 @@ class ProcessArgs:
         is_realtime: stand-ins pace on the wall clock.
         is_resuming: go on with a mission that stands in the run directory.
         has_faults: a fault plan stands in the run directory; stand-ins only.
+        is_restarted: another process of this run has died, and this one takes its place.
+        is_held: begin held, until an operator resumes.
     """
 
     config: Config
@@ -55,6 +58,13 @@ class ProcessArgs:
     is_realtime: bool
     is_resuming: bool
     has_faults: bool = False
+    is_restarted: bool = False
+    is_held: bool = False
+
+    @property
+    def is_taking_over(self) -> bool:
+        """Somebody else has been at it before."""
+        return self.is_resuming or self.is_restarted
 
 
 def parse_args(argv: list[str] | None = None) -> ProcessArgs:
@@ -67,10 +77,19 @@ def parse_args(argv: list[str] | None = None) -> ProcessArgs:
     parser.add_argument("--realtime", action="store_true")
     parser.add_argument("--resume", action="store_true")
     parser.add_argument("--faults", action="store_true")
+    parser.add_argument("--restarted", action="store_true")
+    parser.add_argument("--held", action="store_true")
     args = parser.parse_args(argv)
-    config = load_config(args.run_dir / "config.toml")
     return ProcessArgs(
-        config, args.run_dir, Endpoints(args.runtime_dir), args.listen_fd, args.realtime, args.resume, args.faults
+        load_config(args.run_dir / "config.toml"),
+        args.run_dir,
+        Endpoints(args.runtime_dir),
+        args.listen_fd,
+        is_realtime=args.realtime,
+        is_resuming=args.resume,
+        has_faults=args.faults,
+        is_restarted=args.restarted,
+        is_held=args.held,
     )
 
 
@@ -84,7 +103,7 @@ def die_with_parent() -> None:
 
 def open_log(path: Path, process: str) -> structlog.typing.FilteringBoundLogger:
     """A logger that appends one JSON object per line to ``path``; several processes may share the file."""
-    stream: TextIO = path.open("a", buffering=1, encoding="utf-8")
+    stream = cast(TextIO, LogStream(path, process))
     structlog.configure(
         processors=[
             structlog.processors.add_log_level,

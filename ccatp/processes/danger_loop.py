@@ -12,23 +12,27 @@ import zmq.asyncio
 from ccatp.bus import Publisher, Subscriber
 from ccatp.danger import DangerMonitor
 from ccatp.errors import CcatpError
+from ccatp.frame_lag import FrameLag
 from ccatp.mirror.mirror import build_mirror
 from ccatp.processes import realtime, spinning
 from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
+from ccatp.processes.hearing import MOST_AHEAD, await_message
+from ccatp.processes.joining import LastingLink
+from ccatp.processes.latching import FILE as EMERGENCIES_FILE
+from ccatp.processes.latching import DurableLatch
 from ccatp.processes.observing import Observatory, ObservatoryDesk
-from ccatp.robot_link import RobotLink, read_key
-from ccatp.samples import EventCode, Verdict
-from ccatp.wire.robot import Sensors
-from ccatp.wire.topics import DangerEvent, Estimate, Presence, last_estimate_before
+from ccatp.processes.pulse import PERIOD_S, Pulse
+from ccatp.samples import EventCode, Severity, Verdict
+from ccatp.wire.robot import Hello, Sensors
+from ccatp.wire.topics import DangerEvent, Estimate, Message, last_estimate_before
 
-PRESENCE_PERIOD_S = 0.1
 WAIT_PERIOD_S = 0.02
-# In lockstep simulated time stands still while we wait; longer than this main is gone and the frame is judged without.
-LOCKSTEP_WAIT_S = 10.0
 
 
 class DangerLoop:
     """Wires the monitor to the robot link, the bus and the observatory channel.
+
+    A process that is started anew finds the latch as it was.
 
     Args:
         args: configuration and endpoints.
@@ -40,28 +44,30 @@ class DangerLoop:
         cfg = args.config
         self._cfg, self._endpoints, self._context = cfg, args.endpoints, context
         self.log = open_log(args.run_dir / "log.jsonl", "danger")
-        self.monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger)
+        self.monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger, cfg.health)
+        self.monitor.latch = DurableLatch(args.run_dir / EMERGENCIES_FILE, self.log)
         self._publisher = Publisher(context, args.endpoints.of("danger"))
-        self._subscriber = Subscriber(context, [args.endpoints.of("main")], ["estimate", "presence.main"])
+        self._pulse = Pulse(self._publisher, "danger")
+        main = args.endpoints.of("main")
+        self._subscriber = Subscriber(context, [main], ["estimate", "presence.main"], is_watching=True)
         self._estimate: Estimate | None = None
-        self._phase = "starting"
-        self._code = EventCode.NORMAL
-        self._cause = ""
+        self._told = (EventCode.NORMAL, "", Severity.NONE)
         self._seq = self._first_seq = -1
         self._permit_seq = 0
         self._t_s = 0.0
-        self._frame_wall_s = time.monotonic()
         self._is_stale = False
-        self.link = RobotLink(
-            host=cfg.robot.host,
-            port=cfg.robot.port,
+        self._lag = FrameLag(cfg.robot.slip_after_s)
+        self._is_taking_over = args.is_taking_over
+        self._hello: Hello | None = None
+        self.lasting = LastingLink(
+            cfg.robot,
             role="monitor",
             client="danger",
-            key=read_key(cfg.robot.key_file),
             on_sensors=self.on_sensors,
             on_lost=self._on_lost,
+            on_joined=self._on_joined,
         )
-        desk = ObservatoryDesk(self.monitor, self._age_s, self.log)
+        desk = ObservatoryDesk(self.monitor, lambda: self._pulse.frame_age_s if self._seq >= 0 else None, self.log)
         self._observatory = Observatory(args.endpoints.of("emergency"), cfg.observatory, desk)
         self.lost = asyncio.Event()
         self._is_lockstep = False
@@ -70,15 +76,14 @@ class DangerLoop:
         """Join the robot, then judge frames until ``stop`` is set or the link is lost."""
         shadow = zmq.asyncio.Context.shadow(self._context)
         async with asyncio.TaskGroup() as tasks:
-            served = [tasks.create_task(work) for work in (self._observatory.serve(shadow), self._beat())]
+            work = self._observatory.serve(shadow), self._beat(), self._watch(), self.lasting.serve()
+            served = [tasks.create_task(one) for one in work]
             try:
                 await self._wait_for_main(stop)
-                hello = await self.link.connect(self._cfg.robot.connect_timeout_s)
-                self._is_lockstep = hello.lockstep
-                self._phase = "joined"
-                if not hello.lockstep:
-                    realtime.enter(self._cfg.run.realtime_priority, self.log)
-                self.log.info("joined", port=self._cfg.robot.port, lockstep=hello.lockstep)
+                if not stop.is_set():
+                    await self.lasting.join(is_patient=self._is_taking_over)
+                    if not self._is_lockstep:
+                        realtime.enter(self._cfg.run.realtime_priority, self.log)
                 waits = [tasks.create_task(stop.wait()), tasks.create_task(self.lost.wait())]
                 await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
                 for wait in waits:
@@ -86,22 +91,32 @@ class DangerLoop:
             finally:
                 for task in served:
                     task.cancel()
-                self.link.close()
+                self.lasting.close()
         self.log.info("stopped", episodes=self.monitor.episodes_opened, edges=self.monitor.edges_declared)
 
-    def _age_s(self) -> float | None:
-        return None if self._seq < 0 else time.monotonic() - self._frame_wall_s
-
     async def _wait_for_main(self, stop: asyncio.Event) -> None:
-        """Join the robot only when main's messages get through: its first estimate must not be lost."""
-        while not stop.is_set() and self._subscriber.receive() is None:  # noqa: ASYNC110 - no event of the loop
+        """Join the robot only when messages get through, both ways: the first ones must not be lost."""
+        is_heard = False
+        while not stop.is_set() and not (is_heard and self._publisher.has_subscriber("verdict")):
             await asyncio.sleep(WAIT_PERIOD_S)
+            is_heard = is_heard or self._subscriber.receive() is not None
+
+    def _on_joined(self, hello: Hello) -> None:
+        """A session begins; its first frame comes next."""
+        before, self._hello, self._is_lockstep = self._hello, hello, hello.lockstep
+        if before is not None and before.boot != hello.boot:
+            self.monitor.reset()
+            self._estimate, self._seq, self._first_seq = None, -1, -1
+        self._lag.forget()
+        self._pulse.phase, self._pulse.frame_s = "joined", time.monotonic()
+        self.log.info("joined", port=self._cfg.robot.port, lockstep=hello.lockstep, session=self.lasting.sessions)
 
     def on_sensors(self, sensors: Sensors, _raw: bytes) -> None:
         """Judge one frame. In lockstep with a certain estimate of main's, so that the run is repeatable."""
-        self._seq, self._t_s, self._frame_wall_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
+        self._seq, self._t_s, self._pulse.frame_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
         if self._first_seq < 0:
-            self._first_seq = sensors.seq
+            # Of the frame that it meets, a process that takes over may have missed main's estimate.
+            self._first_seq = sensors.seq + self._is_taking_over
         wanted = last_estimate_before(sensors.seq)
         self._take_estimates(wanted if wanted >= self._first_seq else -1)
         try:
@@ -112,65 +127,71 @@ class DangerLoop:
             print(f"ccatp danger: internal error: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
             self.lost.set()
             return
+        if not self._is_lockstep and self._lag.served(sensors.t, time.monotonic()) > self._cfg.danger.stale_after_s:
+            verdict = self.monitor.stale(sensors.seq, sensors.t)  # it saw the past: no permit for the present
         self._give(verdict, sensors.seq)
 
     def _give(self, verdict: Verdict, ack: int) -> None:
         if ack >= 0:  # the robot first: what it may do does not wait for anyone to read why
             self._permit_seq += 1
-            self.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
+            self.lasting.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
         self._publisher.send("verdict", verdict)
-        if verdict.code is not self._code or verdict.cause != self._cause:
+        if (verdict.code, verdict.cause, verdict.severity) != self._told:
             self._announce(verdict)
 
     def _announce(self, verdict: Verdict) -> None:
-        self._code, self._cause = verdict.code, verdict.cause
+        self._told = verdict.code, verdict.cause, verdict.severity
         fields: dict[str, Any] = {
             "code": int(verdict.code),
             "cause": verdict.cause,
             "signal": verdict.signal,
             "value": verdict.value,
             "limit": verdict.limit,
+            "severity": int(verdict.severity),
         }
         self._publisher.send("danger_event", DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, **fields))
         self.log.info("verdict", seq=verdict.seq, t_s=verdict.t_s, **fields)
 
     def _take_estimates(self, wanted_seq: int) -> None:
-        if self._is_lockstep and self._estimate_seq() >= wanted_seq:
+        if not self._is_lockstep:
+            while (received := self._subscriber.receive()) is not None:
+                self._take_estimate(received[1])
             return
-        deadline = time.monotonic() + LOCKSTEP_WAIT_S
-        while True:
-            must_wait = self._is_lockstep and self._estimate_seq() < wanted_seq
-            received = self._subscriber.receive(max(0.0, deadline - time.monotonic()) if must_wait else 0.0)
-            if received is None:
-                return
-            if isinstance(received[1], Estimate):
-                self._estimate = received[1]
-            if must_wait and self._estimate_seq() >= wanted_seq:
-                return
+        if self._estimate_seq() < wanted_seq:
+            await_message(
+                self._subscriber,
+                lambda message: self._take_estimate(message) and self._estimate_seq() >= wanted_seq,
+                self._pulse.tell_if_due,
+            )
+
+    def _take_estimate(self, message: Message | Verdict) -> bool:
+        # One of a frame that we have not seen is of the robot's last boot.
+        is_ours = isinstance(message, Estimate) and message.seq <= self._seq + MOST_AHEAD
+        if isinstance(message, Estimate) and is_ours:
+            self._estimate = message
+        return is_ours
 
     def _estimate_seq(self) -> int:
         return -1 if self._estimate is None else self._estimate.seq
 
     async def _beat(self) -> None:
-        """Be seen alive; where frames stop coming, withhold the permit aloud."""
-        count = 0
+        """Be seen alive."""
         while True:
-            self._publisher.send(
-                "presence.danger",
-                Presence(
-                    seq=count,
-                    t_s=time.monotonic(),
-                    process="danger",
-                    pid=os.getpid(),
-                    phase=self._phase,
-                    frame_age_s=self._age_s(),
-                ),
-            )
-            count += 1
-            age_s = time.monotonic() - self._frame_wall_s
-            if self._phase == "joined" and not self._is_lockstep and age_s > self._cfg.danger.stale_after_s:
+            self._pulse.tell()
+            await asyncio.sleep(PERIOD_S)
+
+    async def _watch(self) -> None:
+        """Where frames stop coming, withhold the permit aloud; make a connection anew that is open and silent."""
+        while True:
+            await asyncio.sleep(WAIT_PERIOD_S)
+            self._subscriber.tend()
+            age_s = self._pulse.frame_age_s
+            if self._pulse.phase != "joined" or self._is_lockstep or age_s is None:
+                continue
+            if age_s > self._cfg.danger.stale_after_s:
                 self._declare_stale(age_s)
-            await asyncio.sleep(PRESENCE_PERIOD_S)
+            if age_s > self._cfg.robot.silence_timeout_s:
+                self.lasting.give_up(f"no sensors frame for {age_s:.2f} s")
 
     def _declare_stale(self, age_s: float) -> None:
         if not self._is_stale:
@@ -179,9 +200,9 @@ class DangerLoop:
         self._give(self.monitor.stale(self._seq, self._t_s), self._seq)
 
     def _on_lost(self, reason: str) -> None:
+        self._pulse.phase = "rejoining"
         self.log.warning("robot link lost", reason=reason)
-        print(f"ccatp danger: robot link lost: {reason}", file=sys.stderr, flush=True)
-        self.lost.set()
+        self._give(self.monitor.stale(self._seq, self._t_s), -1)
 
     def close(self) -> None:
         """Close the sockets."""

@@ -7,6 +7,7 @@ import sys
 
 import structlog
 
+from ccatp.body_file import FILE
 from ccatp.config.models import Config
 from ccatp.dataloop import serve
 from ccatp.errors import ConfigError
@@ -41,6 +42,8 @@ def main() -> int:
             key=read_key(cfg.robot.key_file),
             log=open_log(args.run_dir / "log.jsonl", "dataloop"),
             faults=faults,
+            body_file=args.run_dir / FILE,
+            is_resuming=args.is_resuming,
         )
         return 0
 

@@ -2,17 +2,30 @@
 
 import asyncio
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
+from typing import Any
 
 from ccatp.config.models import MissionConfig
-from ccatp.etalon_client import EtalonClient, EtalonError
-from ccatp.localization.fixes import FixGated, FixRefused
+from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
+from ccatp.localization.fixes import FixRefused
 from ccatp.localizer import Localizer
+from ccatp.metrology.scrutiny import Scrutiny
 from ccatp.mission import Mission
 from ccatp.processes.telling import Teller
 from ccatp.samples import DeckPose, Fix, PointId, Vector3
 from ccatp.store import MissionStore, StoreError
 from ccatp.surveying.approaches import Approaches
+
+# A commit takes milliseconds, on a busy disk a second. One that takes longer is told, and much longer holds the robot.
+SLOW_DISK_S = 2.0
+STALLED_DISK_S = 30.0
+# A fix that is doubted is measured again this often; who is doubted then is not believed.
+REPEATS = 2
+
+
+class FrameRefused(EtalonError):
+    """The laser system measures in another frame or unit than ours: it is of no use for this mission."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,28 +45,33 @@ class MeasuringDesk:
     Args:
         cfg: how near the robot has to come, and how often it may try.
         client: the laser system's client.
+        scrutiny: looks at a fix before the localizer gets it.
         localizer: takes the fix.
         mission: is told the result.
         store: keeps it; a point counts only when it is committed.
         teller: tells the others.
         on_over: called after each measurement, good or bad.
+        between_s: how long to wait for new lengths before measuring again at the same place.
     """
 
     def __init__(
         self,
         cfg: MissionConfig,
         client: EtalonClient,
+        scrutiny: Scrutiny,
         localizer: Localizer,
         mission: Mission,
         store: MissionStore,
         teller: Teller,
         on_over: Callable[[], None],
+        between_s: Callable[[], float],
     ) -> None:
         """Nothing is wanted yet."""
         self._tolerance_m = cfg.arrival_tolerance_m
         self._approaches = Approaches(cfg.correction_tolerance_m, cfg.max_approaches)
         self._client, self._localizer, self._mission = client, localizer, mission
-        self._store, self._teller, self._on_over = store, teller, on_over
+        self._store, self._teller, self._on_over, self._between_s = store, teller, on_over, between_s
+        self._scrutiny = scrutiny
         self._timeout_s = cfg.measure_timeout_s
         self._wanted: Request | None = None
         self._wakes = asyncio.Event()
@@ -83,63 +101,111 @@ class MeasuringDesk:
         return self._mission.is_awaiting_fix and self._mission.request == request.number
 
     async def _serve(self, request: Request) -> None:
+        """Measure, again where the fix is doubted, all within the time that a point may take."""
+        self._scrutiny.begin()
         try:
             async with asyncio.timeout(self._timeout_s):
-                fix = await self._client.measure(request.t_s, request.expected_m)
+                fix, doubt = await self._measure(request)
+                for _ in range(REPEATS):
+                    if doubt and self._is_wanted(request):
+                        await asyncio.sleep(self._between_s())
+                        fix, doubt = await self._measure(request)
         except (EtalonError, TimeoutError) as error:
-            why = str(error) or f"no fix within {self._timeout_s:g} s"
-            self._teller.say("warning", f"measurement of {_name(request.point)} failed: {why}")
-            if self._is_wanted(request):
-                await self._skip(request, why)
+            await self._fail(request, str(error) or f"no fix within {self._timeout_s:g} s", error)
             return
-        if self._is_wanted(request):
-            await self._accept(request, fix)
-        else:
+        if not self._is_wanted(request):
             self._teller.say("info", f"measurement of {_name(request.point)} discarded: the robot was interrupted")
+        elif doubt:
+            await self._fail(request, doubt, None)
+        else:
+            await self._keep(request, fix)
+
+    async def _measure(self, request: Request) -> tuple[Fix, str]:
+        """One fix, handed to the localizer if it is still wanted, and why it is doubted."""
+        fix = await self._client.measure(request.t_s, request.expected_m)
+        return fix, self._try(request, fix) if self._is_wanted(request) else ""
+
+    def _try(self, request: Request, fix: Fix) -> str:
+        """Hand a fix to the localizer, unless it is doubted; why it is, or empty."""
+        localizer = self._localizer
+        finding = self._scrutiny.review(
+            fix, request.expected_m, request.estimate, localizer.pose_covariance, is_lost=self._mission.is_lost
+        )
+        doubt, jump_m = finding.doubt or finding.refusal, 0.0
+        if not doubt:
+            try:
+                jump_m = localizer.fuse_fix(fix)
+            except FixRefused as refusal:
+                doubt = str(refusal)
+        self._teller.fix(request.point, fix, jump_m, is_fused=not doubt)
+        if finding.refusal:
+            raise FrameRefused(finding.refusal)
+        if doubt:
+            self._teller.say("info", f"the fix at {_name(request.point)} is doubted: {doubt}")
+            return doubt
+        for notice in localizer.notices:
+            self._teller.say("warning", notice)
+        localizer.notices.clear()
+        if jump_m > self._tolerance_m:
+            self._teller.say(
+                "warning", f"the fix at {_name(request.point)} moved the estimate by {1e3 * jump_m:.1f} mm"
+            )
+        return ""
+
+    async def _fail(self, request: Request, why: str, error: Exception | None) -> None:
+        if isinstance(error, BadSolution):
+            refusal = self._scrutiny.refusal_of(error.lengths_m, request.expected_m)
+            error = FrameRefused(refusal) if refusal else error
+        if isinstance(error, FrameRefused):
+            self._teller.say("error", str(error))
+            if self._is_wanted(request):
+                self._mission.fault(str(error))
+            return
+        self._teller.say("warning", f"measurement of {_name(request.point)} failed: {why}")
+        if self._is_wanted(request):
+            await self._skip(request, why)
 
     async def _skip(self, request: Request, cause: str) -> None:
         if request.point is not None:
             try:
-                await asyncio.wrap_future(self._store.record_skipped(request.point, request.t_s))
+                await self._stored(self._store.record_skipped(request.point, request.t_s), request.point)
             except StoreError as error:
                 self._mission.fault(f"that {_name(request.point)} is skipped cannot be stored: {error}")
                 return
         self._mission.not_fixed(request.point, cause)
 
-    async def _accept(self, request: Request, fix: Fix) -> None:
-        try:
-            jump_m = self._localizer.fuse_fix(fix)
-        except FixGated as refusal:
-            # Measured again: a wrong fix will not repeat itself, and a wrong estimate gives way to three that agree.
-            self._teller.fix(request.point, fix, 0.0, is_fused=False)
-            self._teller.say("warning", f"the fix at {_name(request.point)} is doubted: {refusal}; measuring again")
-            self._wanted = request
-            self._wakes.set()
-            return
-        except FixRefused as refusal:
-            self._teller.fix(request.point, fix, 0.0, is_fused=False)
-            self._teller.say("warning", f"the fix at {_name(request.point)} is refused: {refusal}")
-            await self._skip(request, str(refusal))
-            return
-        self._teller.fix(request.point, fix, jump_m, is_fused=True)
-        for notice in self._localizer.notices:
-            self._teller.say("warning", notice)
-        self._localizer.notices.clear()
-        if jump_m > self._tolerance_m:
-            self._teller.say(
-                "warning", f"the fix at {_name(request.point)} moved the estimate by {1e3 * jump_m:.1f} mm"
-            )
+    async def _keep(self, request: Request, fix: Fix) -> None:
+        """The localizer has taken the fix: store it where the robot is near enough to the point."""
         if request.point is not None:
             self.arrival_error_m = self._mission.survey.distance_m(self._localizer.pose)
             if self._is_too_far(request.point):
                 self._mission.again()
                 return
             try:
-                await asyncio.wrap_future(self._store.record_fix(request.point, fix, request.estimate))
+                await self._stored(self._store.record_fix(request.point, fix, request.estimate), request.point)
             except StoreError as error:
                 self._mission.fault(f"the fix of {_name(request.point)} cannot be stored: {error}")
                 return
         self._mission.fixed(request.point)
+
+    async def _stored(self, commit: "Future[Any]", point: PointId) -> None:
+        """Wait for a commit. On a disk that stalls the robot stands here, and after a while is held for an operator.
+
+        Raises:
+            StoreError: it will not be committed.
+        """
+        waiting = asyncio.wrap_future(commit)
+        try:
+            await asyncio.wait([waiting], timeout=SLOW_DISK_S)
+            if not waiting.done():
+                self._teller.say("warning", f"the disk is slow: {_name(point)} waits for its commit")
+                await asyncio.wait([waiting], timeout=STALLED_DISK_S - SLOW_DISK_S)
+            if not waiting.done():
+                self._mission.fault(f"the disk stalls: {_name(point)} is not stored after {STALLED_DISK_S:g} s")
+                self._on_over()
+            await waiting
+        finally:
+            waiting.cancel()
 
     def _is_too_far(self, point: PointId) -> bool:
         """Whether the point has to be approached again: what was measured there is not its alignment."""

@@ -1,6 +1,6 @@
 """Glue. Collects a run from the bus: recording, progress, and what the summary needs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
@@ -156,6 +156,13 @@ class RunCollector:
         """What main said the run ends with."""
         return ExitStatus(self._status.exit_status) if self._status is not None else ExitStatus.HELD
 
+    def wait(self, timeout_ms: int, fds: Sequence[int] = ()) -> None:
+        """Wait until something came in, or a file descriptor is readable, at most ``timeout_ms``."""
+        poller = zmq.Poller()
+        for waited_for in (self._subscriber.socket, *fds):
+            poller.register(waited_for, zmq.POLLIN)
+        poller.poll(timeout_ms)
+
     def collect(self, timeout_ms: int, view: View | None) -> None:
         """Take what came in, waiting at most ``timeout_ms`` for the first."""
         self._view = view
@@ -226,7 +233,7 @@ class RunCollector:
                 builder.add_verdict_event(message.seq, message.code)
             self._code = message.code
         elif isinstance(message, MissionStatus):
-            builder.set_mission(message.done, message.skipped, message.elapsed_s)
+            builder.set_mission(message.done, message.skipped, message.elapsed_s, message.left_out)
 
     def _on_deck(self, track: Track) -> FloatArray:
         """Rows of seq, t_s, x, y, heading (deck), X, Y, Z of the surface point, as the truth has them."""

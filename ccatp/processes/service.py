@@ -29,12 +29,13 @@ class Service:
         """A loop is there."""
         self._liveness.heard(presence)
 
-    def beat(self, now_s: float, status: MissionStatus | None) -> None:
+    def beat(self, now_s: float, status: MissionStatus | None, *, is_recovering: bool = False) -> None:
         """Tell what is due.
 
         Args:
             now_s: time of the machine's monotonic clock.
             status: where the mission stands, once it is known.
+            is_recovering: the supervisor has just started a process anew; the manager is not to end all of it.
         """
         if not self._notifier.is_heard:
             return
@@ -44,7 +45,8 @@ class Service:
                 self._notifier.send("READY=1")
             return
         trouble = self._liveness.trouble(now_s)
-        if self._watchdog_s is not None and not trouble and now_s - self._stroked_s >= self._watchdog_s / STROKES:
+        may_stroke = is_recovering or not trouble
+        if self._watchdog_s is not None and may_stroke and now_s - self._stroked_s >= self._watchdog_s / STROKES:
             self._stroked_s = now_s
             self._notifier.send("WATCHDOG=1")
         has_turned, self._is_troubled = bool(trouble) != self._is_troubled, bool(trouble)

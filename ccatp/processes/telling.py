@@ -42,22 +42,56 @@ class Teller:
         self._lines: list[msgspec.Raw] = []
         self._tick_us: list[float] = []
         self._flushed_wall_s = time.monotonic()
+        self._frames_before = 0
         self.seq = -1
         self.t_s = 0.0
 
-    def frame(self, seq: int, t_s: float, localizer: Localizer, state: str, raw: bytes) -> None:
-        """Keep the estimate after frame ``seq`` and the frame's line for the batch; publish it where it is due."""
+    def frame(
+        self,
+        seq: int,
+        t_s: float,
+        localizer: Localizer,
+        state: str,
+        raw: bytes,
+        told: tuple[tuple[float, float, float, float], int] | None = None,
+        *,
+        is_first: bool = False,
+    ) -> None:
+        """Keep the estimate after frame ``seq`` and the frame's line for the batch; publish it where it is due.
+
+        Args:
+            seq, t_s: the frame.
+            localizer: has the estimate.
+            state: of the mission.
+            raw: the frame's line.
+            told: span of the set points since the last estimate, rad/s, and the number of the newest drive.
+            is_first: of a session; it is always due, because the danger loop may wait for it.
+        """
         self.seq, self.t_s = seq, t_s
         pose, sigma = localizer.pose, localizer.position_sigma_m
-        if is_estimate_due(seq):
+        if is_first or is_estimate_due(seq):
             deck = localizer.deck_pose
             x, y, heading = deck.x_m, deck.y_m, deck.heading_rad
-            self._publisher.send(
-                "estimate", Estimate(seq=seq, t_s=t_s, x_m=x, y_m=y, heading_rad=heading, sigma_m=sigma, state=state)
+            commanded, drive_seq = told if told is not None else (None, -1)
+            message = Estimate(
+                seq=seq,
+                t_s=t_s,
+                x_m=x,
+                y_m=y,
+                heading_rad=heading,
+                sigma_m=sigma,
+                state=state,
+                commanded=commanded,
+                drive_seq=drive_seq,
             )
+            self._publisher.send("estimate", message)
         row, col = pose.panel
-        self._track.append((seq, t_s, row, col, pose.x_m, pose.y_m, pose.heading_rad, sigma))
+        self._track.append((seq + self._frames_before, t_s, row, col, pose.x_m, pose.y_m, pose.heading_rad, sigma))
         self._keep(raw)
+
+    def count_on(self) -> None:
+        """The robot's frames count anew: what is recorded counts on, as far as we know how many there were."""
+        self._frames_before += max(self.seq, 0)
 
     def stale_frame(self, seq: int, raw: bytes) -> None:
         """Keep the line of a frame that is not newer than the last one: the localizer has seen it."""
@@ -92,7 +126,9 @@ class Teller:
 
     def arrival(self, seq: int, t_s: float, point: PointId, error_m: float) -> None:
         """The robot came to rest in frame ``seq``, at a point for the first time."""
-        message = Arrival(seq=seq, t_s=t_s, point=(point.row, point.col, point.point), error_mm=1e3 * error_m)
+        message = Arrival(
+            seq=seq + self._frames_before, t_s=t_s, point=(point.row, point.col, point.point), error_mm=1e3 * error_m
+        )
         self._publisher.send("arrival", message)
 
     def rest(self, seq: int, t_s: float) -> None:

@@ -21,6 +21,7 @@ import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror
+from ccatp.samples import DeckPose
 from ccatp.sim.command_delay import CommandDelay
 from ccatp.sim.faults.injector import Injector
 from ccatp.sim.faults.plan import FaultPlan
@@ -48,7 +49,14 @@ class Robot:
         reboots: how often it started anew.
     """
 
-    def __init__(self, cfg: Config, mirror: Mirror, rng: np.random.Generator, faults: FaultPlan | None = None) -> None:
+    def __init__(
+        self,
+        cfg: Config,
+        mirror: Mirror,
+        rng: np.random.Generator,
+        faults: FaultPlan | None = None,
+        start: DeckPose | None = None,
+    ) -> None:
         """Boot.
 
         Args:
@@ -56,6 +64,7 @@ class Robot:
             mirror: the mirror it stands on.
             rng: parent of every random draw.
             faults: what shall go wrong.
+            start: where it stands, if not at base.
 
         Raises:
             ValueError: the rates put more samples in a frame than a line may hold, or a frame outlasts the TTL.
@@ -76,7 +85,7 @@ class Robot:
         self.reboots = 0
         window_frames = max(1, round(cfg.etalon.measuring_time_s * sim.frame_hz))
         pushes = () if self.injector is None else self.injector.body.drifts
-        self.world = World(cfg, mirror, world_rng, window_frames, pushes)
+        self.world = World(cfg, mirror, world_rng, window_frames, pushes, start)
         self._sensors = SensorSuite(
             mirror,
             sim,

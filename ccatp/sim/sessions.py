@@ -131,6 +131,8 @@ class RobotServer:
         robot: the robot.
         counts: bad_lines, unknown_types, oversized_lines, refused, stale (drives, permits and fans not newer),
             slips (frames more than a period late).
+        oldest_ack_frames: how many frames a drive that moves the robot was behind at most (not in lockstep).
+        fan_changes: how often the duties changed.
     """
 
     def __init__(
@@ -147,6 +149,7 @@ class RobotServer:
     ) -> None:
         self.robot = robot
         self.counts: Counter[str] = Counter()
+        self.oldest_ack_frames = self.fan_changes = 0
         self._is_lockstep, self._boot, self._key = lockstep, boot, key
         self._make_nonce, self._note, self._on_frame = make_nonce, note, on_frame
         self._boot_s = now_s
@@ -270,11 +273,15 @@ class RobotServer:
         if role == "controller" and isinstance(message, Drive):
             taken = robot.drive(message.seq, message.wr, message.wl, robot_s)
             self._is_drive_acked |= taken and message.ack == robot.delivered_seq
+            if taken and (message.wr or message.wl) and robot.delivered_seq - message.ack > self.oldest_ack_frames:
+                self.oldest_ack_frames = robot.delivered_seq - message.ack
         elif role == "monitor" and isinstance(message, Permit):
             taken = robot.permit(message.seq, message.forward, message.reverse, message.turn, robot_s)
             self._is_permit_acked |= taken and message.ack == robot.delivered_seq
         elif role == "controller" and isinstance(message, Fans):
+            before = robot.fans.duty
             taken = robot.command_fans(message.seq, *message.duty)
+            self.fan_changes += robot.fans.duty != before
         else:
             return False
         session.heard_s = robot_s

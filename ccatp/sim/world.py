@@ -12,7 +12,7 @@ from ccatp.config.models import Config
 from ccatp.mirror.alignment import PanelMisalignment, misaligned_puck_world
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.outline import NearOutline
-from ccatp.samples import PanelId, PanelPose, Vector3
+from ccatp.samples import DeckPose, PanelId, PanelPose, Vector3
 from ccatp.sim.disturbances import Creep, Vibration, WheelSlip, draw_wheels
 from ccatp.sim.plant import Disturbance, Plant
 
@@ -54,6 +54,7 @@ class World:
         rng: np.random.Generator,
         window_frames: int,
         pushes: Iterable[Disturbance] = (),
+        start: DeckPose | None = None,
     ) -> None:
         """Draw the start errors, the misalignments and what disturbs the robot.
 
@@ -63,13 +64,14 @@ class World:
             rng: parent of the generators; the draws of one kind do not depend on the others.
             window_frames: length of the window of ``moved_m``, in frames.
             pushes: what moves the body besides the disturbances of the configuration.
+            start: where the robot stands; at base, with an error, by default.
         """
         start_rng, truth_rng = rng.spawn(2)
         wheels_rng, slip_rng, creep_rng, vibration_rng = rng.spawn(4)
         self.mirror = mirror
         self.misalignments = draw_misalignments(mirror.panels, cfg, truth_rng)
         self.start_panel_pose = draw_start(mirror.base_panel_pose, cfg, start_rng)
-        self.start_pose = mirror.deck_pose(self.start_panel_pose)
+        self.start_pose = mirror.deck_pose(self.start_panel_pose) if start is None else start
         robot, sim, world = cfg.robot, cfg.sim.robot, cfg.world
         self.wheels = wheels = draw_wheels(robot, sim.wheel_lag_s, world, wheels_rng)
         has_slip = world.slip_max > 0.0 or world.slip_walk_sigma > 0.0

@@ -16,9 +16,10 @@ from ccatp.config.models import Config
 from ccatp.danger import DangerMonitor
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.panels import Panel
-from ccatp.samples import DeckPose, EdgeSample, EventCode, PanelId, WheelSample
+from ccatp.samples import DeckPose, EdgeSample, EventCode, ImuSample, PanelId, WheelSample
 from ccatp.sim.plant import Plant
 from ccatp.sim.sensors import SensorSuite
+from ccatp.wire.robot import CommandEcho
 from ccatp.wire.topics import Estimate, is_estimate_due
 
 RULES = ("thesis", "shipped")
@@ -52,6 +53,11 @@ class Frame(NamedTuple):
     t: float
     enc: list[WheelSample]
     edge: list[EdgeSample]
+    imu: Sequence[ImuSample] = ()
+    fans: tuple[float, float] = (0.0, 0.0)
+    soc: float = 1.0
+    cmd: CommandEcho = CommandEcho(0, 0.0, 0.0, False)
+    faults: Sequence[str] = ()
 
 
 class Rule(Protocol):

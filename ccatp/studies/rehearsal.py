@@ -13,6 +13,9 @@ from ccatp.config.models import Config
 from ccatp.control.kinematics import twist_of
 from ccatp.control.prediction import CommandPredictor
 from ccatp.danger import DangerMonitor
+from ccatp.health.commanded import CommandSpan
+from ccatp.health.look import as_standing
+from ccatp.health.steady_time import SteadyTime
 from ccatp.localization.fixes import FixGated, FixRefused
 from ccatp.localizer import Localizer
 from ccatp.radio.multilateration import MultilaterationError
@@ -22,7 +25,7 @@ from ccatp.studies.rehearsal_book import RunBook
 from ccatp.studies.rehearsal_laser import LaserDesk
 from ccatp.studies.rehearsal_result import Rehearsal
 from ccatp.surveying.journey import Motion
-from ccatp.surveying.states import DONE, Outcome, State
+from ccatp.surveying.states import DONE, PURPOSES, Outcome, State
 from ccatp.wire.robot import Sensors, set_point_on_wire
 from ccatp.wire.topics import Estimate, is_estimate_due
 
@@ -58,7 +61,7 @@ class Rehearsing:
         self.localizer: Localizer = parts.localizer
         self.mission, self.gate = parts.mission, parts.gate
         self.robot = Robot(cfg, self.mirror, np.random.default_rng(cfg.run.seed))
-        self.monitor = DangerMonitor(self.mirror, cfg.robot, cfg.danger)
+        self.monitor = DangerMonitor(self.mirror, cfg.robot, cfg.danger, cfg.health)
         self.predictor = CommandPredictor(cfg.robot.wheel_lag_s, self.robot.frame_s)
         self.laser = LaserDesk(cfg, self.mirror, self.robot)
         self.book = RunBook(parts, with_track=with_track)
@@ -68,6 +71,10 @@ class Rehearsing:
         self._sigma_of = lambda: self.localizer.position_sigma_m
         self._code = EventCode.NORMAL
         self._drive_seq = 0
+        self._driven = (0.0, 0.0)
+        self._span = CommandSpan()
+        self._time = SteadyTime(cfg.health.clock_jump_s)
+        self._has_full_fans = False
 
     def run(self) -> Rehearsal:
         """From the first frame to the end of the mission."""
@@ -79,12 +86,13 @@ class Rehearsing:
             robot.advance()
             self._note_truth()
         robot.command_fans(1, *self.cfg.robot.fan_duty)
-        first_s = t_s = robot.delivered.t
+        first_s = t_s = self._time.at(robot.delivered.seq, robot.delivered.t)
         last_s = first_s - robot.frame_s
         limit_s = _ENDLESS * self.parts.lower_bound_s + 600.0
         while mission.state is not DONE:
             frame = robot.delivered
-            t_s = frame.t
+            is_news = frame.seq > self.monitor.verdict.seq
+            t_s = self._time.at(frame.seq, frame.t) if is_news else last_s
             self._serve(frame, t_s - last_s)
             last_s = t_s
             if mission.is_faulted or t_s - first_s > limit_s:
@@ -107,13 +115,21 @@ class Rehearsing:
         if verdict.code is not self._code:
             self._code = verdict.code
             self.book.builder.add_verdict_event(seq, verdict.code)
-        localizer.step(t_s, frame.imu, frame.enc, frame.edge, frame.gravity)
+        is_deaf = mission.ignores_motion
+        imu, enc = ((), as_standing(frame.enc)) if is_deaf else (frame.imu, frame.enc)
+        localizer.step(t_s, imu, enc, frame.edge, frame.gravity)
         if localizer.hold_requested:
-            mission.fault(localizer.hold_cause, is_lost=localizer.is_frozen)
+            mission.recover(localizer.hold_cause, t_s + self._time.offset_s)
             localizer.clear_hold()
         motion = self._motion(frame, dt_s)
         order = mission.step(motion, verdict)
-        right, left = self.gate.pass_through(order.twist, verdict, dt_s)
+        if mission.doubts_pose:
+            mission.doubts_pose = False
+            localizer.doubt(self.cfg.health.doubt_position_m, self.cfg.health.doubt_heading_rad)
+        if mission.wants_full_fans and not self._has_full_fans:
+            self._has_full_fans = True
+            robot.command_fans(2, 1.0, 1.0)
+        right, left = self.gate.pass_through(order.twist, verdict, dt_s, t_s, 0.0, PURPOSES[mission.state])
         if order.at_rest:
             localizer.rest()
             if order.arrived is not None:
@@ -134,10 +150,14 @@ class Rehearsing:
         pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
         here = pose.x_m, pose.y_m, pose.heading_rad
         ahead = self.predictor.ahead(here, v, omega, echo.seq, echo.age, echo.held, creep)
-        return Motion(frame.t, dt_s, pose, self.mirror.deck_pose, v, omega, creep, ahead, self._sigma_of)
+        return Motion(
+            frame.t + self._time.offset_s, dt_s, pose, self.mirror.deck_pose, v, omega, creep, ahead, self._sigma_of
+        )
 
     def _foresee(self, number: int, right: float, left: float) -> None:
         robot = self.cfg.robot
+        self._driven = right, left
+        self._span.add(right, left)
         twist = twist_of(right, left, robot.wheel_radius_m, robot.wheel_base_m)
         self.predictor.sent(number, twist.v_m_s, twist.omega_rad_s)
 
@@ -147,7 +167,15 @@ class Rehearsing:
             deck, sigma_m = self.localizer.deck_pose, self.localizer.position_sigma_m
             x_m, y_m, heading_rad = deck.x_m, deck.y_m, deck.heading_rad
             self._published = Estimate(
-                seq=seq, t_s=t_s, x_m=x_m, y_m=y_m, heading_rad=heading_rad, sigma_m=sigma_m, state=state
+                seq=seq,
+                t_s=t_s,
+                x_m=x_m,
+                y_m=y_m,
+                heading_rad=heading_rad,
+                sigma_m=sigma_m,
+                state=state,
+                commanded=self._span.take(*self._driven),
+                drive_seq=self._drive_seq,
             )
 
     # -- a measurement, as in processes.measuring ---------------------------------------------------------------------

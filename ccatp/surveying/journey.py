@@ -7,7 +7,7 @@ from typing import NamedTuple
 from ccatp.control.prediction import Predicted
 from ccatp.control.tracker import DONE, LegTracker
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import DeckPose, PanelId, PanelPose, Stop, Twist
+from ccatp.samples import DeckPose, PanelId, PanelPose, PointId, Stop, Twist
 from ccatp.surveying.correction import Aim
 
 
@@ -87,6 +87,11 @@ class Journey:
         self._deadline_s = 0.0
         self._target: tuple[PanelId, Stop, tuple[float, float]] | None = None
         self._aim: tuple[PanelId, Aim] | None = None
+
+    @property
+    def next_point(self) -> PointId | None:
+        """The point to be measured next, at the current stop or a later one."""
+        return next((stop.point for stop in self.stops[self.index :] if stop.point is not None), None)
 
     def advance(self) -> None:
         """The current stop is done with."""

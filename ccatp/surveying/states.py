@@ -3,6 +3,8 @@
 from enum import StrEnum
 from types import MappingProxyType
 
+from ccatp.control.gate import Purpose
+
 
 class State(StrEnum):
     """What the mission is at."""
@@ -72,6 +74,22 @@ TRANSITIONS = MappingProxyType(
             Event.FIND: State.SETTLING,
         },
         State.DONE: {},
+    }
+)
+
+
+# What the last gate lets a state move for.
+PURPOSES = MappingProxyType(
+    {
+        State.IDLE: Purpose.STAND,
+        State.TURNING: Purpose.SURVEY,
+        State.DRIVING: Purpose.SURVEY,
+        State.SETTLING: Purpose.STAND,
+        State.MEASURING: Purpose.STAND,
+        State.BACKING_OFF: Purpose.RETREAT,
+        State.RETURNING: Purpose.HOMEWARD,
+        State.HELD: Purpose.STAND,
+        State.DONE: Purpose.STAND,
     }
 )
 

@@ -25,8 +25,8 @@ class Stopover:
         """Nothing asked yet."""
         self._stillness = Stillness(control)
         self._measuring_time_s = measuring_time_s
-        self._settle_by_s: float | None = None
-        self._measure_at_s = self._measure_by_s = 0.0
+        self._rest_by_s: float | None = None
+        self._measure_at_s = 0.0
         self._arrived_at: PointId | None = None
         self.request = 0
         self.is_asked = False
@@ -35,7 +35,7 @@ class Stopover:
         """The robot moves, or may have moved: the stop begins anew."""
         self.is_asked = False
         self._stillness.reset()
-        self._settle_by_s = None
+        self._rest_by_s = None
 
     def is_quiet(self, motion: Motion) -> bool:
         """Take the speeds of a frame; whether the robot has been at rest for the settling time."""
@@ -43,18 +43,21 @@ class Stopover:
 
     def has_settled(self, motion: Motion) -> bool:
         """One frame of coming to rest; whether that is over, and the measuring time begins."""
-        if self._settle_by_s is None:
-            self._settle_by_s = motion.t_s + SETTLE_LIMIT_S
+        if self._rest_by_s is None:
+            self._rest_by_s = motion.t_s + SETTLE_LIMIT_S
         if not self.is_quiet(motion):
             return False
-        self._settle_by_s = None
-        self._measure_at_s = motion.t_s + self._measuring_time_s - TIME_EPSILON_S
-        self._measure_by_s = motion.t_s + SETTLE_LIMIT_S
+        self._begin(motion.t_s)
         return True
 
+    def _begin(self, t_s: float) -> None:
+        """The measuring time begins, and with it the time until which the robot has to stand still."""
+        self._measure_at_s = t_s + self._measuring_time_s - TIME_EPSILON_S
+        self._rest_by_s = t_s + SETTLE_LIMIT_S
+
     def is_restless(self, t_s: float) -> bool:
-        """Whether coming to rest takes far longer than it should."""
-        return self._settle_by_s is not None and t_s > self._settle_by_s
+        """Whether coming to rest, or standing still for a measurement, takes far longer than it should."""
+        return self._rest_by_s is not None and t_s > self._rest_by_s
 
     def arrival_at(self, point: PointId | None) -> PointId | None:
         """The point, where the robot has come to rest there for the first time."""
@@ -66,15 +69,18 @@ class Stopover:
     def is_due(self, motion: Motion) -> bool:
         """Take a frame of the measuring time; whether to ask for the measurement now. True once at each stop.
 
-        A robot that moves once more after all spoils the measurement: its time begins anew, within reason.
+        A robot that moves once more after all spoils the measurement, and one that is under way as well: the time
+        begins anew, and what was asked for is not wanted any more.
         """
-        if self.is_asked:
-            return False
         t_s = motion.t_s
         if not self.is_quiet(motion):
-            self._measure_at_s = min(t_s + self._measuring_time_s - TIME_EPSILON_S, self._measure_by_s)
-        if t_s < self._measure_at_s:
+            if self.is_asked:
+                self.is_asked = False
+                self._begin(t_s)
+            self._measure_at_s = t_s + self._measuring_time_s - TIME_EPSILON_S
+        if self.is_asked or t_s < self._measure_at_s:
             return False
+        self._rest_by_s = None
         self.is_asked = True
         self.request += 1
         return True

@@ -78,7 +78,7 @@ def parse_clients(text: str) -> Clients:
     """
     try:
         tree = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
         raise BadAccess(f"is not TOML: {error}") from error
     if unknown := tree.keys() - {"clients"}:
         raise BadAccess(f"has {min(unknown)}, but only tables [clients.NAME] may stand there")

@@ -49,6 +49,28 @@ class LineBuffer:
         return lines
 
 
+class LineBudget:
+    """So many lines at once, so many a second in the long run; more is a flood.
+
+    Args:
+        lines: taken at once.
+        rate_hz: at which lines may come in the long run.
+    """
+
+    __slots__ = ("_left", "_lines", "_rate_hz", "_then_s")
+
+    def __init__(self, lines: float, rate_hz: float) -> None:
+        self._lines = self._left = lines
+        self._rate_hz = rate_hz
+        self._then_s = 0.0
+
+    def take(self, lines: int, now_s: float) -> bool:
+        """Take lines at ``now_s``; false when there are not so many left."""
+        self._left = min(self._lines, self._left + self._rate_hz * (now_s - self._then_s)) - lines
+        self._then_s = now_s
+        return self._left >= 0.0
+
+
 class BadLineCounter:
     """Counts bad lines and tells when there are too many of them in a window of time.
 

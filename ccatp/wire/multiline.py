@@ -291,7 +291,7 @@ def valid_lengths(data: ChannelData, channels: Sequence[int]) -> tuple[dict[int,
             reasons[channel] = "absent"
         elif record.errors:
             reasons[channel] = "+".join(record.errors)
-        elif not math.isfinite(record.length_mm) or record.length_mm <= 0.0:
+        elif not math.isfinite(record.length_mm) or record.length_mm * 1e-3 <= 0.0:  # the smallest numbers vanish
             reasons[channel] = f"length {record.length_mm} mm"
         else:
             lengths_m[channel] = record.length_mm * 1e-3

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 
 import msgspec
 
-from ccatp.wire.lines import BadLineCounter, LineBuffer, LineTooLong
+from ccatp.wire.lines import BadLineCounter, LineBudget, LineBuffer, LineTooLong
 from ccatp.wire.robot_messages import (
     AUTH_HMAC,
     AUTH_NONE,
@@ -56,6 +56,7 @@ __all__ = [
     "Hello",
     "Join",
     "Joined",
+    "LineBudget",
     "LineBuffer",
     "LineTooLong",
     "Permit",

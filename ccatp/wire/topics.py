@@ -33,13 +33,19 @@ class Presence(Message):
 
 
 class Estimate(Message):
-    """The localizer's pose after frame ``seq``, deck frame."""
+    """The localizer's pose after frame ``seq``, deck frame, and what main had the wheels do.
+
+    ``commanded``: lowest and highest set point of the right wheel, then of the left one, rad/s, over the drives sent
+    since the last estimate. ``drive_seq``: number of the newest of them.
+    """
 
     x_m: float
     y_m: float
     heading_rad: float
     sigma_m: float
     state: str
+    commanded: tuple[float, float, float, float] | None = None
+    drive_seq: int = -1
 
 
 class MissionStatus(Message):
@@ -58,6 +64,9 @@ class MissionStatus(Message):
     outcome: str
     lower_bound_s: float
     exit_status: int  # what the run ends with; -1 while it goes on
+    slips: int = 0  # frames that were served late, in real time
+    lag_ms: float = 0.0  # ... the latest of them
+    left_out: dict[str, list[str]] = {}  # points skipped, or not measured any more, by the reason
 
 
 class Track(Message):
@@ -100,7 +109,7 @@ class Rest(Message):
 
 
 class DangerEvent(Message):
-    """The verdict's code changed."""
+    """The verdict's code, cause or severity changed; without a cause all is well again."""
 
     code: int
     cause: str
@@ -108,6 +117,7 @@ class DangerEvent(Message):
     value: float
     limit: float
     off: tuple[bool, bool, bool, bool]
+    severity: int = 0
 
 
 class Log(Message):
@@ -215,7 +225,7 @@ def unpack(frame: bytes) -> tuple[str, bytes, Message | Verdict]:
         raise BadMessage(f"unknown topic {name[:40]!r}")
     try:
         message: Message | Verdict = decoder.decode(body)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise BadMessage(f"topic {name.decode()}: {error}") from error
     return name.decode(), body, message
 

@@ -18,6 +18,7 @@ from ccatp.conformance.table import CHECKS, check_ids
 from ccatp.conformance.verdict import Result
 from ccatp.dataloop import DataLoop
 from tests.contract.crooked import HONEST, Crooked, checked, serving
+from tests.faults.table import conformance_rows, load_table
 
 KEY = b"secret"
 PATIENT_S = 10.0  # an answer takes milliseconds; a loaded machine may take this long
@@ -53,10 +54,12 @@ async def both_robots(lockstep: bool) -> None:
         judge(results, expected(lockstep, key, config is overhanging))
 
 
+@pytest.mark.fault(*conformance_rows(load_table()), part="robot")
 async def test_our_robots_in_lockstep() -> None:
     await both_robots(lockstep=True)
 
 
+@pytest.mark.fault(*conformance_rows(load_table()), part="robot")
 async def test_our_robots_on_the_wall_clock() -> None:
     await both_robots(lockstep=False)
 

@@ -166,6 +166,7 @@ def plain(peer: zmq.asyncio.Socket) -> None:
     peer.setsockopt_string(zmq.PLAIN_PASSWORD, "secret")
 
 
+@pytest.mark.fault("O5")
 async def test_the_listed_get_answers_and_nobody_else_gets_in(site: Site) -> None:
     async with served(site):
         assert await site.ask("observatory") == {"ok": True, "code": 0, "age_s": 0.01}
@@ -198,6 +199,7 @@ async def test_garbage_and_silence_lose_the_connection_and_harm_nobody(site: Sit
         assert (await site.ask("observatory"))["ok"]
 
 
+@pytest.mark.fault("O6")
 async def test_raising_needs_a_place_on_the_list_and_clearing_the_role(site: Site) -> None:
     async with served(site):
         fire = format_request("emergency", kind="fire", id=ID)
@@ -224,6 +226,7 @@ async def test_over_long_requests_are_refused(site: Site) -> None:
         assert reply == {"ok": False, "error": "request of 5000 bytes; at most 4096"}
 
 
+@pytest.mark.fault("O5")
 @pytest.mark.parametrize("ruin", ["", "[clients", "gone"])
 async def test_a_list_that_is_empty_or_unreadable_lets_nobody_in(site: Site, ruin: str) -> None:
     path = site.folder / "clients.toml"
@@ -238,6 +241,7 @@ async def test_a_list_that_is_empty_or_unreadable_lets_nobody_in(site: Site, rui
         assert (await site.ask("observatory"))["ok"]  # mended, without a restart
 
 
+@pytest.mark.fault("O6")
 async def test_who_is_taken_off_the_list_loses_their_rights_while_connected(site: Site) -> None:
     async with served(site) as context:
         with context.socket(zmq.DEALER) as peer:
@@ -251,6 +255,7 @@ async def test_who_is_taken_off_the_list_loses_their_rights_while_connected(site
         assert not site.monitor.latch.is_latched
 
 
+@pytest.mark.fault("O5", "O6")
 async def test_without_its_handler_nobody_gets_in(site: Site) -> None:
     # Left to itself libzmq would let in everybody who knows the server's key.
     context = zmq.asyncio.Context()
@@ -455,6 +460,7 @@ def test_lines_of_the_log_have_a_budget() -> None:
     assert [budget.take(t) for t in (60.0, 61.0, 62.0)] == [2, 0, None]
 
 
+@pytest.mark.fault("O5")
 async def test_refusals_do_not_fill_the_log(site: Site) -> None:
     desk = desk_of(site)
     for _ in range(1000):

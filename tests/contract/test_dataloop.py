@@ -187,6 +187,7 @@ async def test_a_frame_as_in_the_document(config: Config) -> None:
     assert frame["cmd"] == {"seq": 0, "age": 0.01, "permit_age": 0.01, "held": False}
 
 
+@pytest.mark.fault("L8")
 @pytest.mark.parametrize(
     ("join", "reason"),
     [
@@ -230,6 +231,7 @@ async def test_a_role_is_free_again_when_its_holder_leaves(config: Config) -> No
             await rig.notes.until("controller lost: wheels held")
 
 
+@pytest.mark.fault("L9")
 async def test_hmac(config: Config) -> None:
     async with running(config, key=b"secret") as rig:
         peer = await rig.peer()
@@ -293,6 +295,7 @@ async def test_more_than_twenty_bad_lines_a_second_close_the_session(config: Con
         await holder.expect("joined")  # and is still there
 
 
+@pytest.mark.fault("L7")
 async def test_a_line_of_a_megabyte(config: Config) -> None:
     async with running(config, lockstep=False) as rig:
         holder = await rig.peer(JOIN)

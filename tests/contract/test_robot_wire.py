@@ -286,6 +286,7 @@ def test_what_arrives_of_a_set_point_is_known_beforehand(right: float, left: flo
     assert set_point_on_wire(right) == pytest.approx(right, rel=5e-9)  # nine digits
 
 
+@pytest.mark.fault("S15")
 @given(st.binary(max_size=300))
 def test_random_bytes_are_refused_or_of_an_unknown_type_and_nothing_else_happens(line: bytes) -> None:
     for decode in (decode_from_client, decode_from_robot):
@@ -297,6 +298,7 @@ def test_random_bytes_are_refused_or_of_an_unknown_type_and_nothing_else_happens
         assert json.loads(line)["type"] == message.type
 
 
+@pytest.mark.fault("S15")
 @given(st.sampled_from([DRIVE_LINE, PERMIT_LINE, FANS_LINE, JOIN_LINE]), st.data())
 def test_a_damaged_line_gives_a_message_or_a_bad_line(golden: bytes, data: st.DataObject) -> None:
     line = bytearray(golden[:-1])
@@ -317,6 +319,7 @@ def _no_duplicates(pairs: list[tuple[str, object]]) -> dict[str, object]:
     return dict(pairs)
 
 
+@pytest.mark.fault("S4")
 @given(st.dictionaries(st.sampled_from(["type", "seq", "ack", "wr", "wl"]), st.floats() | st.booleans() | st.none()))
 def test_floats_of_every_kind(values: dict[str, object]) -> None:
     line = json.dumps({"type": "drive", "seq": 1, "ack": 1, "wr": 0.0, "wl": 0.0} | values).encode()
@@ -342,6 +345,7 @@ def test_mac() -> None:
 # -- lines ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.fault("L5")
 @given(st.lists(st.binary(max_size=40).map(lambda b: b.replace(b"\n", b"")), max_size=8), st.data())
 def test_lines_do_not_depend_on_how_the_stream_is_chopped(lines: list[bytes], data: st.DataObject) -> None:
     stream = b"".join(line + b"\n" for line in lines) + b"rest"
@@ -361,6 +365,7 @@ def test_a_line_at_the_limit_passes_and_one_over_it_does_not() -> None:
     assert caught.value.lines == [b"ok"]
 
 
+@pytest.mark.fault("L7")
 def test_an_unfinished_line_is_not_kept_beyond_the_limit() -> None:
     buffer = LineBuffer(10)
     assert buffer.feed(b"0123456789") == []

@@ -1,10 +1,14 @@
 """Random faults that pass by: whatever a mission makes of them, the robot does not fall, and every fault was real."""
 
+import os
+
 import pytest
 
 from tests.faults.campaign import random_plan, single, survey
 
-MISSIONS = 40
+MISSIONS = int(os.environ.get("CCATP_FAULT_PLANS", "40"))
+# Of missions whose faults all pass by, this share has to be completed.
+LEAST_COMPLETE = 0.99
 
 
 def test_plans_are_of_their_seed() -> None:
@@ -13,16 +17,20 @@ def test_plans_are_of_their_seed() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(MISSIONS))
-def test_nobody_falls(seed: int) -> None:
-    ending = survey(seed, random_plan(seed))
-    assert ending.result.summary["danger"]["falls"] == 0, ending.line
-    assert ending.result.outcome in {"complete", "stopped", "aborted, at base"}, ending.line
-    time_s = ending.result.summary["mission_time_s"]
-    for record in ending.injected:
-        assert record.at_s is not None
-        # A second before the end a sensor of 20 Hz, too, has been read.
-        assert record.samples > 0 or record.at_s > time_s - 1.0, (record, ending.line)
+def test_nobody_falls_and_what_passes_by_is_survived() -> None:
+    incomplete = []
+    for seed in range(MISSIONS):
+        ending = survey(seed, random_plan(seed))
+        assert ending.result.summary["danger"]["falls"] == 0, ending.line
+        assert ending.result.outcome in {"complete", "stopped", "aborted, at base"}, ending.line
+        time_s = ending.result.summary["mission_time_s"]
+        for record in ending.injected:
+            assert record.at_s is not None
+            # A second before the end a sensor of 20 Hz, too, has been read.
+            assert record.samples > 0 or record.at_s > time_s - 1.0, (record, ending.line)
+        if ending.result.outcome != "complete":
+            incomplete.append(ending.line)
+    assert len(incomplete) <= max(1, (1.0 - LEAST_COMPLETE) * MISSIONS), "\n".join(incomplete)
 
 
 @pytest.mark.slow

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from tests.processes.conftest import NO_CALIBRATION, Run
 
 Start = Callable[..., Run]
@@ -39,18 +41,25 @@ def test_a_stuck_gyroscope_is_in_the_log_and_the_run_ends_as_defined(start: Star
     assert run.summary["danger"]["falls"] == 0
 
 
-def test_a_link_that_is_reset_ends_the_run_with_status_5(start: Start, tmp_path: Path) -> None:
+@pytest.mark.fault("L1", "L11")
+def test_a_survey_goes_on_through_resets_of_the_link_and_a_reboot_of_the_robot(start: Start, tmp_path: Path) -> None:
     plan = tmp_path / "plan.toml"
     plan.write_text('[[link]]\ntype = "fragment"\ndirection = "both"\nat_s = 0.5\nfor_s = 0.2\nwrite_bytes = 50\n'
-                    '[[link]]\ntype = "reset"\nat_s = 3.0\n')  # fmt: skip
-    run = start("--panels", "1", "--faults", str(plan))
-    assert run.wait() == 5, run.stderr
-    assert "robot link lost" in run.stderr
+                    '[[link]]\ntype = "reset"\nat_s = 3.0\n[[link]]\ntype = "close"\nat_s = 9.0\n'
+                    '[[fault]]\nsignal = "robot"\ntype = "reboot"\nat_s = 14.0\n')  # fmt: skip
+    run = start("--panels", "1", *NO_CALIBRATION, "--faults", str(plan))
+    assert run.wait() == 0, run.stderr
+    assert run.stderr.count("robot link lost") >= 3
+    assert "the robot has started anew: it is found again before it moves" in run.stderr
     assert "Traceback" not in run.stderr
-    injected = [entry for entry in log_of(run) if entry["event"].startswith("fault injected")]
+    points = {"total": 9, "measured": 9, "first_arrival_within_10mm": 9, "skipped": 0}
+    assert run.summary["points"] == points
+    assert run.summary["danger"]["falls"] == 0
+    injected = [entry for entry in log_of(run) if entry["event"].startswith("fault injected: link")]
     assert [(entry["signal"], entry["type"], entry["from_s"]) for entry in injected] == [
         ("link", "fragment", 0.5),
         ("link", "reset", 3.0),
+        ("link", "close", 9.0),
     ]
     assert injected[0]["samples"] > 20
     assert injected[1]["samples"] == 2  # the controller's connection and the monitor's

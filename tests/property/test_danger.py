@@ -17,7 +17,8 @@ from ccatp.config.loader import load_config
 from ccatp.config.models import Config
 from ccatp.danger import DangerMonitor
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose, EdgeSample, EventCode, PanelId, PointId, Verdict, WheelSample
+from ccatp.samples import DeckPose, EdgeSample, EventCode, ImuSample, PanelId, PointId, Verdict, WheelSample
+from ccatp.wire.robot import CommandEcho
 
 MIRRORS = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
 LAG_S = 0.08  # the robot's wheel servo, worlds.md
@@ -40,6 +41,11 @@ class Frame:
     t: float
     enc: list[WheelSample]
     edge: list[EdgeSample]
+    imu: list[ImuSample] = field(default_factory=list)
+    fans: tuple[float, float] = (0.8, 0.8)
+    soc: float = 1.0
+    cmd: CommandEcho = field(default_factory=lambda: CommandEcho(0, 0.0, 0.0, False))
+    faults: list[str] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -51,6 +57,8 @@ class Pose:
     heading_rad: float
     sigma_m: float
     state: str = "driving"
+    commanded: tuple[float, float, float, float] | None = None
+    drive_seq: int = -1
 
 
 @dataclass

@@ -116,8 +116,10 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
             "ccatp: --resume carries on in a run directory; name it with --run-dir; see ccatp run --help\n",
         ),
         (["sim", "etalon", "--puck", "1", "2", "3", "--truth", "ipc://x"], "--puck and --truth exclude each other"),
-        (["run", "--sim", "--miror", "x"], "Did you mean '--mirror'?"),
+        (["run", "--sim", "--miror", "x"], "Did you mean one of: '--mirror'"),
         (["run", "--sim", "--set", "seed"], "'seed' is not KEY=VALUE, as in run.seed=2"),
+        (["run", "--sim", "--held"], "--held goes with --resume; --recover holds by itself"),
+        (["run", "--sim", "--recover", "--resume"], "--recover finds the run by itself: leave out --resume"),
         (["run", "--sim", "--seed", "one"], "'one' is not a valid integer"),
         (
             ["run", "--config", "telescope.toml", "--faults", "plan.toml"],

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from math import cos, inf, nan, pi, sin
+from typing import Any
 
 import pytest
 
@@ -12,7 +13,8 @@ from ccatp.hazards.edge_episode import Cause
 from ccatp.hazards.edge_map import EdgeMap
 from ccatp.hazards.wheel_track import KNOTS_KEPT, Odometry, WheelTrack, pose_at
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import Corner, EdgeSample, EventCode, Verdict, WheelSample
+from ccatp.samples import Corner, EdgeSample, EventCode, ImuSample, Verdict, WheelSample
+from ccatp.wire.robot import CommandEcho
 from ccatp.wire.topics import Estimate
 
 FL, FR, RL, RR = ("front_left",), ("front_right",), ("rear_left",), ("rear_right",)
@@ -26,6 +28,11 @@ class Frame:
     t: float
     enc: list[WheelSample]
     edge: list[EdgeSample]
+    imu: list[ImuSample] = field(default_factory=list)
+    fans: tuple[float, float] = (0.8, 0.8)
+    soc: float = 1.0
+    cmd: CommandEcho = field(default_factory=lambda: CommandEcho(0, 0.0, 0.0, False))
+    faults: list[str] = field(default_factory=list)
 
 
 @pytest.fixture(scope="module")
@@ -442,7 +449,14 @@ def test_a_stale_estimate_permits_nothing_and_ends_by_itself(on_panel: Story) ->
 @pytest.mark.parametrize("value", [nan, inf, -inf])
 def test_an_estimate_that_is_not_finite_is_none(on_panel: Story, field_name: str, value: float) -> None:
     on_panel.run(1)
-    fields = {"t_s": on_panel.t, "x_m": 0.0, "y_m": 0.0, "heading_rad": 0.0, "sigma_m": 1e-4, field_name: value}
+    fields: dict[str, Any] = {
+        "t_s": on_panel.t,
+        "x_m": 0.0,
+        "y_m": 0.0,
+        "heading_rad": 0.0,
+        "sigma_m": 1e-4,
+        field_name: value,
+    }
     estimate = Estimate(seq=1, state="held", **fields)
     t_s = on_panel.t + 1e-3
     frame = Frame(9, t_s, [WheelSample(t_s, 0.0, 0.0)], [EdgeSample(t_s, 1, 1, 1, 1)])

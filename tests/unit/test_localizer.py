@@ -310,6 +310,7 @@ def printed_2_14(v: float, theta: float, dt: float) -> tuple[float, float]:
     return v * cos(theta * dt), v * sin(theta * dt)
 
 
+@pytest.mark.fault("S29")
 def test_the_step_is_2_14_as_meant_and_not_as_printed() -> None:
     v, theta, dt = 0.1, 0.7, 0.01
     step = arc_step(v, theta, 0.0, dt)
@@ -318,6 +319,7 @@ def test_the_step_is_2_14_as_meant_and_not_as_printed() -> None:
     assert step != pytest.approx(printed_2_14(v, theta, dt), rel=0.5)
 
 
+@pytest.mark.fault("S29")
 @pytest.mark.parametrize("turn", [-3.0, -0.1, -1.1e-4, -0.9e-4, 0.0, 0.9e-4, 1.1e-4, 0.5, 2.0])
 def test_the_step_is_the_chord_of_the_arc(turn: float) -> None:
     v, theta, dt = 0.1, -2.0, 0.5
@@ -330,6 +332,7 @@ def test_the_step_is_the_chord_of_the_arc(turn: float) -> None:
 # --- crossings -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.fault("S29")
 @pytest.mark.parametrize("forward", [True, False])
 @pytest.mark.parametrize("entering", [0.0, 0.2, -0.4, 0.9])
 @pytest.mark.parametrize("normal", [0.0, pi / 2, pi, -pi / 2])
@@ -551,6 +554,7 @@ class Fragile(KalmanFilter):
         return super().update(z, H, R)
 
 
+@pytest.mark.fault("S27")
 def test_a_diverged_filter_freezes_the_pose_until_the_next_fix() -> None:
     cfg = config()
     filter_ = Fragile(np.zeros(4), np.eye(4))
@@ -591,6 +595,7 @@ def test_an_impossible_speed_freezes_instead_of_moving(sample: ImuSample | Wheel
     assert localizer.hold_cause.endswith("more than the wheels can do")
 
 
+@pytest.mark.fault("S4")
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
 def test_what_is_not_finite_never_reaches_the_filter(bad: float) -> None:
     localizer, clean = make(), make()
@@ -642,6 +647,7 @@ def test_a_single_frame_from_elsewhere_is_ignored() -> None:
     assert localizer.counts["resyncs"] == 0
 
 
+@pytest.mark.fault("S11")
 def test_five_backward_frames_in_a_row_ask_for_a_hold() -> None:
     localizer = make()
     frames = truth().frames(0.2)
@@ -652,6 +658,7 @@ def test_five_backward_frames_in_a_row_ask_for_a_hold() -> None:
     assert localizer.hold_cause == "time stamps of the frames run backward"
 
 
+@pytest.mark.fault("S11")
 @pytest.mark.parametrize("source", ["imu", "right encoder", "left encoder"])
 def test_five_backward_samples_in_a_row_ask_for_a_hold(source: str) -> None:
     localizer = make()

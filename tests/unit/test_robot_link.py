@@ -134,6 +134,7 @@ async def test_join_frames_and_commands() -> None:
     link.send_drive(9, 1, 0.0, 0.0)  # after the end nothing happens
 
 
+@pytest.mark.fault("L10")
 async def test_socket_options() -> None:
     async with robot(after_join()) as (link, _):
         await link.connect(DEADLINE_S)
@@ -173,6 +174,7 @@ async def test_frames_in_single_bytes() -> None:
         await seen.until(lambda: seen.frames == [0, 1])
 
 
+@pytest.mark.fault("S15")
 @pytest.mark.parametrize(
     ("flood", "reason"),
     [(b"garbage\n" * 21, "too many bad lines"), (b"x" * 8193, "line over the limit")],
@@ -278,6 +280,7 @@ async def test_hung_up_on() -> None:
     await connect_error(nothing, RobotLinkError, "did not let us join: the robot closed the connection")
 
 
+@pytest.mark.fault("L6")
 async def test_silence() -> None:
     async def silence(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.read()
@@ -339,6 +342,7 @@ def test_read_key(tmp_path: Path) -> None:
 # -- a robot that does not read ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.fault("L3")
 async def test_commands_do_not_pile_up() -> None:
     resume = asyncio.Event()
     lines: list[bytes] = []

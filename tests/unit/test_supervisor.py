@@ -9,7 +9,7 @@ import pytest
 from ccatp.config.loader import load_config
 from ccatp.errors import ConfigError, RefusedError
 from ccatp.run_options import RunOptions
-from ccatp.supervisor import PROCESSES, _lock, _make_run_dir, run_survey
+from ccatp.supervisor import PROCESSES, _lock, _make_run_dir, _recover, run_survey
 
 
 def options(**fields: object) -> RunOptions:
@@ -71,3 +71,23 @@ def test_a_list_of_clients_that_cannot_be_used_is_refused_before_anything_is_mad
     with pytest.raises(ConfigError, match=r"observatory\.clients_file: cannot read .*none\.toml: No such file"):
         run_survey(wanted)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_service_goes_on_with_the_run_that_did_not_finish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[RunOptions] = []
+
+    def run(wanted: RunOptions) -> int:
+        asked.append(wanted)
+        assert wanted.run_dir is not None
+        wanted.run_dir.mkdir(parents=True, exist_ok=True)
+        (wanted.run_dir / "mission.sqlite").touch()
+        return 4 if len(asked) == 1 else 0
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("ccatp.supervisor.run_survey", run)
+    assert [_recover(options(recover=True)) for _ in range(2)] == [4, 0]
+    first, second = asked
+    assert (first.resume, first.held) == (False, False)
+    assert (second.resume, second.held, second.run_dir) == (True, True, first.run_dir)
+    assert _recover(options(recover=True)) == 0
+    assert not asked[2].resume  # the second one finished

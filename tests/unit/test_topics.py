@@ -25,7 +25,8 @@ ESTIMATE = Estimate(seq=5, t_s=0.05, x_m=1.0, y_m=-2.0, heading_rad=0.5, sigma_m
 
 def test_golden_frame() -> None:
     assert pack("estimate", ESTIMATE) == (
-        b'estimate {"x_m":1.0,"y_m":-2.0,"heading_rad":0.5,"sigma_m":0.001,"state":"driving","seq":5,"t_s":0.05}'
+        b'estimate {"x_m":1.0,"y_m":-2.0,"heading_rad":0.5,"sigma_m":0.001,"state":"driving","commanded":null,'
+        b'"drive_seq":-1,"seq":5,"t_s":0.05}'
     )
 
 

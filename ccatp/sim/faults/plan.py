@@ -43,7 +43,7 @@ def parse_plan(text: str, name: str) -> FaultPlan:
     """
     try:
         tree = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
         raise ConfigError(f"{name}: is not TOML: {error}") from error
     problems = [
         f"{_place(name, text, section, 0, '')}: {section} is unknown; {choice_hint(section, _SECTIONS)}"

@@ -15,6 +15,7 @@ def test_there_are_bad_configs() -> None:
     assert len(FILES) > 50
 
 
+@pytest.mark.fault("P20")
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_the_fault_is_told_in_one_line(file: Path) -> None:
     expected = file.read_text().splitlines()[0].removeprefix("# fault: ").replace("<folder>", str(FOLDER))

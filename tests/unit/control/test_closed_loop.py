@@ -10,8 +10,9 @@ from math import cos, exp, hypot, pi, sin
 import numpy as np
 import pytest
 
+from ccatp.assembly import build_gate
 from ccatp.config.models import Config
-from ccatp.control.gate import DriveGate
+from ccatp.control.gate import Purpose
 from ccatp.control.kinematics import twist_of
 from ccatp.control.prediction import CommandPredictor
 from ccatp.control.tracker import LegTracker, Phase
@@ -44,7 +45,7 @@ class Rig:
         self.wheels = [0.0, 0.0]
         self.slip, self.creep, self.lag_s = slip, creep, lag * robot.wheel_lag_s
         self.predictor = CommandPredictor(robot.wheel_lag_s, DT)
-        self.gate = DriveGate(config.limits, self.r, self.base, robot.max_wheel_rad_s, robot.wheel_lag_s)
+        self.gate = build_gate(config)
         self.tracker = LegTracker(config.control, config.limits, robot.wheel_lag_s)
         self.link: deque[tuple[int, float, float]] = deque([(-1, 0.0, 0.0)] * delay)
         self.echo, self.seq = -1, 0
@@ -74,7 +75,7 @@ class Rig:
         return seen.pose, Twist(seen.v_m_s, seen.omega_rad_s)
 
     def drive(self, wanted: Twist) -> None:
-        right, left = self.gate.pass_through(wanted, FREE, DT)
+        right, left = self.gate.pass_through(wanted, FREE, DT, FREE.t_s, 0.0, Purpose.SURVEY)
         self.seq += 1
         twist = twist_of(right, left, self.r, self.base)
         self.predictor.sent(self.seq, twist.v_m_s, twist.omega_rad_s)

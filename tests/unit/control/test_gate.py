@@ -1,5 +1,6 @@
-"""The last gate before the wheels."""
+"""The last gate before the wheels, and that before the fans."""
 
+from itertools import product
 from math import inf, nan
 
 import pytest
@@ -8,17 +9,51 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from ccatp.config.models import LimitsConfig
-from ccatp.control.gate import DriveGate
+from ccatp.control.fan_gate import FanGate
+from ccatp.control.gate import Denial, DriveGate, Purpose
 from ccatp.control.kinematics import twist_of, wheel_rates
+from ccatp.processes.gate_watch import GateWatch
 from ccatp.samples import EventCode, Twist, Verdict
+from ccatp.surveying.states import PURPOSES, State
 
-LIMITS = LimitsConfig(v_max_m_s=0.1, a_max_m_s2=0.2, omega_max_rad_s=1.0, alpha_max_rad_s2=2.0)
+LIMITS = LimitsConfig(v_max_m_s=0.1, a_max_m_s2=0.2, omega_max_rad_s=0.8, alpha_max_rad_s2=2.0)
 FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
 R, L, DT = 0.03, 0.15, 0.01
+VERDICT_S, FRAME_S = 0.15, 0.12
+ZERO = 0.0, 0.0
+# What one frame allows: twice the feed-forward of the lag and a frame of acceleration, with the headroom of a quarter.
+STEP_M_S = 1.25 * LIMITS.a_max_m_s2 * (2.0 * 0.08 + DT)
+STEP_RAD_S = 1.25 * LIMITS.alpha_max_rad_s2 * (2.0 * 0.08 + DT)
+SLOW = Twist(0.01, 0.0)
 
 
-def gate() -> DriveGate:
-    return DriveGate(LIMITS, R, L, 8.0, 0.08)
+def gate(max_wheel_rad_s: float = 8.0) -> DriveGate:
+    return DriveGate(LIMITS, R, L, max_wheel_rad_s, 0.08, VERDICT_S, FRAME_S)
+
+
+def drive(
+    under_test: DriveGate,
+    wanted: Twist,
+    verdict: Verdict | None = FREE,
+    *,
+    dt_s: float = DT,
+    t_s: float = 0.0,
+    age_s: float = 0.0,
+    purpose: Purpose = Purpose.SURVEY,
+) -> Twist:
+    right, left = under_test.pass_through(wanted, verdict, dt_s, t_s, age_s, purpose)
+    return twist_of(right, left, R, L)
+
+
+def denial(wanted: Twist, verdict: Verdict | None = FREE, **rest: object) -> Denial | None:
+    """The reason; the drive is zero if and only if there is one, and it is counted once."""
+    under_test = gate()
+    passed = drive(under_test, wanted, verdict, **rest)  # type: ignore[arg-type]
+    reason = under_test.denial
+    assert (passed == Twist(0.0, 0.0)) is (reason is not None)
+    assert under_test.denied == {each: int(each is reason) for each in Denial}
+    assert under_test.denials == int(reason is not None)
+    return reason
 
 
 def test_kinematics_round_trip() -> None:
@@ -34,27 +69,143 @@ def test_kinematics_round_trip() -> None:
         (Twist(0.01, 0.0), replace(FREE, forward=False)),
         (Twist(-0.01, 0.0), replace(FREE, reverse=False)),
         (Twist(0.0, 0.1), replace(FREE, turn=False)),
+        (Twist(0.0, -0.1), replace(FREE, turn=False)),
+        (Twist(0.01, 0.1), replace(FREE, turn=False)),
+        (Twist(0.01, 0.1), replace(FREE, forward=False)),
     ],
 )
 def test_denies_what_is_not_permitted(wanted: Twist, without: Verdict) -> None:
-    assert gate().pass_through(wanted, FREE, DT) != (0.0, 0.0)
-    assert gate().pass_through(wanted, without, DT) == (0.0, 0.0)
-    assert gate().pass_through(wanted, None, DT) == (0.0, 0.0)
+    assert denial(wanted) is None
+    assert denial(wanted, without) is Denial.NOT_PERMITTED
+    assert denial(wanted, None) is Denial.NO_VERDICT
+
+
+def test_a_permit_is_for_its_own_direction() -> None:
+    only_forward = replace(FREE, reverse=False, turn=False)
+    only_reverse = replace(FREE, forward=False, turn=False)
+    only_turn = replace(FREE, forward=False, reverse=False)
+    assert denial(Twist(0.01, 0.0), only_forward) is None
+    assert denial(Twist(-0.01, 0.0), only_reverse) is None
+    assert denial(Twist(0.0, 0.1), only_turn) is None
 
 
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
 def test_denies_what_is_not_finite(bad: float) -> None:
-    under_test = gate()
-    assert under_test.pass_through(Twist(bad, 0.0), FREE, DT) == (0.0, 0.0)
-    assert under_test.pass_through(Twist(0.0, bad), FREE, DT) == (0.0, 0.0)
-    assert under_test.denials == 2
+    assert denial(Twist(bad, 0.0)) is Denial.NOT_FINITE
+    assert denial(Twist(0.0, bad)) is Denial.NOT_FINITE
+    assert denial(Twist(0.05, bad)) is Denial.NOT_FINITE
 
 
-def test_stops_at_once() -> None:
+def test_every_state_has_a_purpose_and_those_that_stand_deny() -> None:
+    assert set(PURPOSES) == set(State)
+    moving = {state for state, purpose in PURPOSES.items() if denial(SLOW, purpose=purpose) is None}
+    assert moving == {State.TURNING, State.DRIVING, State.BACKING_OFF, State.RETURNING}
+    assert denial(SLOW, purpose=Purpose.STAND) is Denial.STATE
+
+
+@pytest.mark.parametrize("t_s", [VERDICT_S, -VERDICT_S])
+def test_a_verdict_of_another_time_is_none(t_s: float) -> None:
+    assert denial(SLOW, t_s=t_s) is None
+    assert denial(SLOW, t_s=t_s * 1.001) is Denial.OLD_VERDICT
+    assert denial(SLOW, replace(FREE, t_s=1.0 - 0.9 * t_s), t_s=1.0) is None
+    assert denial(SLOW, replace(FREE, t_s=nan)) is Denial.OLD_VERDICT
+    assert denial(SLOW, t_s=nan) is Denial.OLD_VERDICT
+
+
+def test_nothing_is_decided_on_an_old_frame() -> None:
+    assert denial(SLOW, age_s=FRAME_S) is None
+    assert denial(SLOW, age_s=FRAME_S * 1.001) is Denial.OLD_FRAME
+    assert denial(SLOW, age_s=nan) is Denial.OLD_FRAME
+
+
+@pytest.mark.parametrize("dt_s", [0.0, -0.01, nan])
+def test_no_time_no_motion(dt_s: float) -> None:
+    assert denial(SLOW, dt_s=dt_s) is Denial.NO_TIME
+
+
+OFF = list(product((False, True), repeat=4))
+RETREAT = Purpose.RETREAT
+
+
+@pytest.mark.parametrize("off", OFF)
+def test_invariant_i4_whatever_is_permitted(off: tuple[bool, bool, bool, bool]) -> None:
+    at_edge = replace(FREE, code=EventCode.NEAR_EDGE, off=off)
+    front, rear = off[0] or off[1], off[2] or off[3]
+    assert denial(Twist(0.01, 0.0), at_edge, purpose=RETREAT) is (Denial.EDGE if front else None)
+    assert denial(Twist(-0.01, 0.0), at_edge, purpose=RETREAT) is (Denial.EDGE if rear else None)
+    assert denial(Twist(0.0, 0.1), at_edge, purpose=RETREAT) is None
+    assert denial(Twist(0.01, 0.0), replace(FREE, off=off)) is (Denial.EDGE if front else None)
+
+
+def test_what_may_move_under_which_code() -> None:
+    at_edge, aborted = (replace(FREE, code=code) for code in (EventCode.NEAR_EDGE, EventCode.ABORTED))
+    survey, retreat, homeward = Purpose.SURVEY, Purpose.RETREAT, Purpose.HOMEWARD
+    assert [denial(SLOW, at_edge, purpose=p) for p in (survey, retreat, homeward)] == [
+        Denial.AT_EDGE,
+        None,
+        Denial.AT_EDGE,
+    ]
+    assert [denial(SLOW, aborted, purpose=p) for p in (survey, retreat, homeward)] == [Denial.ABORTED, None, None]
+    assert [denial(SLOW, FREE, purpose=p) for p in (survey, retreat, homeward)] == [None, None, None]
+
+
+def test_stops_at_once_and_that_is_no_denial() -> None:
     under_test = gate()
     for _ in range(100):
-        under_test.pass_through(Twist(0.1, 0.0), FREE, DT)
-    assert under_test.pass_through(Twist(0.0, 0.0), FREE, DT) == (0.0, 0.0)
+        drive(under_test, Twist(0.1, 0.0))
+    assert under_test.pass_through(Twist(0.0, 0.0), None, nan, nan, inf, Purpose.STAND) == ZERO
+    assert under_test.denial is None
+    assert under_test.denials == 0
+    # It begins anew from rest.
+    assert drive(under_test, Twist(0.1, 0.0)).v_m_s == pytest.approx(STEP_M_S)
+
+
+def test_a_denial_stops_and_the_next_drive_begins_at_rest() -> None:
+    under_test = gate()
+    for _ in range(100):
+        drive(under_test, Twist(0.1, 0.0))
+    assert drive(under_test, Twist(0.1, 0.0), None) == Twist(0.0, 0.0)
+    assert under_test.denial is Denial.NO_VERDICT
+    assert drive(under_test, Twist(0.1, 0.0)).v_m_s == pytest.approx(STEP_M_S)
+    assert under_test.denial is None
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_exact_steps_of_value_and_rate(sign: float) -> None:
+    under_test = gate()
+    first = drive(under_test, Twist(sign * 0.3, 0.0))
+    assert first.v_m_s == pytest.approx(sign * STEP_M_S)
+    second = drive(under_test, Twist(sign * 0.3, 0.0))
+    assert second.v_m_s == pytest.approx(sign * 2.0 * STEP_M_S)
+    for _ in range(10):
+        last = drive(under_test, Twist(sign * 0.3, 0.0))
+    assert last.v_m_s == pytest.approx(sign * 1.25 * LIMITS.v_max_m_s)
+    # Slower at once, and through zero one step only.
+    assert drive(under_test, Twist(sign * 0.01, 0.0)).v_m_s == pytest.approx(sign * 0.01)
+    assert drive(under_test, Twist(-sign * 0.3, 0.0)).v_m_s == pytest.approx(-sign * STEP_M_S)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_exact_steps_of_turning(sign: float) -> None:
+    under_test = gate()
+    turned = [drive(under_test, Twist(0.0, sign * 9.0)).omega_rad_s for _ in range(12)]
+    assert turned[:2] == pytest.approx([sign * STEP_RAD_S, sign * 2.0 * STEP_RAD_S])
+    assert turned[-1] == pytest.approx(sign * 1.25 * LIMITS.omega_max_rad_s)
+
+
+def test_a_long_silence_allows_no_larger_step() -> None:
+    allowed = 1.25 * LIMITS.a_max_m_s2 * (2.0 * 0.08 + 0.1)
+    assert drive(gate(), Twist(0.1, 0.0), dt_s=0.1).v_m_s == pytest.approx(allowed)
+    assert drive(gate(), Twist(0.1, 0.0), dt_s=60.0).v_m_s == pytest.approx(allowed)
+
+
+def test_wheels_over_their_limit_are_slowed_down_as_a_whole() -> None:
+    for twist in (Twist(0.04, 0.4), Twist(-0.04, 0.4), Twist(0.04, -0.4), Twist(0.01, 0.4)):
+        right, left = wheel_rates(twist, R, L)
+        limit = 0.5 * max(abs(right), abs(left))
+        got = gate(limit).pass_through(twist, FREE, DT, 0.0, 0.0, Purpose.SURVEY)
+        assert got == pytest.approx((0.5 * right, 0.5 * left))
+        assert max(map(abs, got)) == pytest.approx(limit)
 
 
 @given(st.lists(st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)), min_size=1, max_size=30))
@@ -62,12 +213,43 @@ def test_value_and_rate_are_limited(wanted: list[tuple[float, float]]) -> None:
     under_test = gate()
     last = Twist(0.0, 0.0)
     for v, omega in wanted:
-        right, left = under_test.pass_through(Twist(v, omega), FREE, DT)
+        right, left = under_test.pass_through(Twist(v, omega), FREE, DT, 0.0, 0.0, Purpose.SURVEY)
         assert abs(right) <= 8.0 + 1e-12
         assert abs(left) <= 8.0 + 1e-12
         now = twist_of(right, left, R, L)
         assert abs(now.v_m_s) <= 1.25 * LIMITS.v_max_m_s + 1e-12
-        # Twice the feed-forward of the lag plus one frame of acceleration, each with the headroom of a quarter.
-        step = 1.25 * LIMITS.a_max_m_s2 * (2.0 * 0.08 + DT) + 1e-9
-        assert abs(now.v_m_s) <= abs(last.v_m_s) + step
+        assert abs(now.v_m_s) <= abs(last.v_m_s) + STEP_M_S + 1e-9
         last = now
+
+
+def test_denials_are_told_once_a_second_and_counted() -> None:
+    under_test, told = gate(), []
+    watch = GateWatch(under_test, lambda level, text: told.append((level, text)))
+    for k in range(250):
+        drive(under_test, SLOW, None)
+        watch.look(0.01 * k)
+    assert [level for level, _ in told] == ["warning"] * 3
+    assert told[1][1] == "drive denied: there is no verdict (101 so far)"
+    drive(under_test, SLOW, purpose=Purpose.STAND)
+    watch.look(2.5)
+    assert "state allows no motion" in told[3][1]
+    drive(under_test, SLOW, None)
+    watch.look(0.0)  # the robot's clock began anew
+    assert len(told) == 5
+    drive(under_test, SLOW)
+    watch.look(9.0)
+    assert len(told) == 5
+    assert watch.counts == {"no_verdict": 251, "state": 1}
+
+
+@pytest.mark.parametrize("bad", [0.59, 0.0, -0.1, 1.01, nan, inf])
+def test_fans_below_their_floor_are_refused(bad: float) -> None:
+    fans = FanGate(0.6)
+    assert fans.refusal(0.6, 1.0) is None
+    assert "left fan" in str(fans.refusal(bad, 0.8))
+    assert "right fan" in str(fans.refusal(0.8, bad))
+    assert fans.refused == 2
+
+
+def test_without_an_overhang_there_is_no_floor() -> None:
+    assert FanGate(0.0).refusal(0.0, 0.0) is None

@@ -4,12 +4,14 @@ import asyncio
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from ccatp.config.models import Config
 from ccatp.etalon_client import EtalonClient
 from ccatp.localization.fixes import FixGated, FixRefused
 from ccatp.localizer import Localizer
+from ccatp.metrology.scrutiny import Finding, Scrutiny
 from ccatp.mission import Mission
 from ccatp.processes.measuring import MeasuringDesk, Request
 from ccatp.processes.telling import Teller
@@ -25,6 +27,7 @@ class Refusing:
     def __init__(self, *refusals: Exception) -> None:
         self.refusals = list(refusals)
         self.notices: list[str] = []
+        self.pose_covariance = np.eye(3)
 
     def fuse_fix(self, fix: Fix) -> float:
         if self.refusals:
@@ -43,16 +46,19 @@ async def told_fixes(config: Config, *refusals: Exception) -> list[bool]:
         return FIX
 
     mission = SimpleNamespace(
-        is_awaiting_fix=True, request=1, fixed=lambda point: None, not_fixed=lambda point, cause: None
+        is_awaiting_fix=True, request=1, is_lost=True, fixed=lambda point: None, not_fixed=lambda point, cause: None
     )
+    sure = SimpleNamespace(begin=lambda: None, review=lambda *_, **__: Finding())
     desk = MeasuringDesk(
         config.mission,
         cast(EtalonClient, SimpleNamespace(measure=measure)),
+        cast(Scrutiny, sure),
         cast(Localizer, Refusing(*refusals)),
         cast(Mission, mission),
         cast(MissionStore, SimpleNamespace()),
         cast(Teller, SimpleNamespace(fix=fix, say=lambda level, text: None)),
         over.set,
+        lambda: 0.0,
     )
     serving = asyncio.get_running_loop().create_task(desk.run())
     desk.begin(Request(1, 1.0, None, (0.0, 0.0, 0.0), DeckPose(0.0, 0.0, 0.0)))
@@ -64,7 +70,7 @@ async def told_fixes(config: Config, *refusals: Exception) -> list[bool]:
 
 @pytest.mark.parametrize(
     ("refusals", "told"),
-    [([], [True]), ([FixGated("far")], [False, True]), ([FixRefused("too old")], [False])],
+    [([], [True]), ([FixGated("far")], [False, True]), ([FixRefused("too old")] * 4, [False] * 3)],
 )
 async def test_every_fix_that_the_localizer_saw_is_told(
     refusals: list[Exception], told: list[bool], config: Config

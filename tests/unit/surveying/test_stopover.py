@@ -50,11 +50,27 @@ def test_the_measuring_time_begins_anew_where_the_robot_moves_once_more(stopover
     assert asked[0] > moves[-1] + round(MEASURING_S / DT)  # the mean speed takes its time to forget the motion
 
 
-def test_who_moves_for_ever_is_measured_all_the_same(stopover: Stopover, mirror: Mirror) -> None:
+@pytest.mark.fault("E9")
+def test_who_moves_for_ever_is_never_measured_and_restless(stopover: Stopover, mirror: Mirror) -> None:
     settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
     frames = range(settled + 1, settled + 2000)
-    asked = [k for k in frames if stopover.is_due(at(mirror, k, speed_m_s=0.01))]
-    assert asked == [settled + round(SETTLE_LIMIT_S / DT)]
+    assert [k for k in frames if stopover.is_due(at(mirror, k, speed_m_s=0.01))] == []
+    limit = settled + round(SETTLE_LIMIT_S / DT)
+    assert not stopover.is_restless((limit - 1) * DT)
+    assert stopover.is_restless((limit + 1) * DT)
+
+
+@pytest.mark.fault("E9")
+def test_a_measurement_during_which_the_robot_moves_is_not_wanted(stopover: Stopover, mirror: Mirror) -> None:
+    settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
+    asked = next(k for k in range(settled, settled + 200) if stopover.is_due(at(mirror, k)))
+    assert not stopover.is_due(at(mirror, asked + 1))
+    assert stopover.is_asked
+    stopover.is_due(at(mirror, asked + 2, speed_m_s=0.01))
+    assert not stopover.is_asked
+    again = next(k for k in range(asked + 3, asked + 400) if stopover.is_due(at(mirror, k)))
+    assert again > asked + 2 + round(MEASURING_S / DT)
+    assert stopover.request == 2
 
 
 def test_who_never_rests_is_restless_after_the_limit(stopover: Stopover, mirror: Mirror) -> None:

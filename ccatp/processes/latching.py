@@ -1,0 +1,71 @@
+"""Glue. The latch of emergencies in a file: a danger loop that is started anew knows what the last one was told."""
+
+import json
+import os
+from pathlib import Path
+
+import structlog
+
+from ccatp.hazards.abort_latch import AbortLatch, Emergency, EmergencyKind
+
+FILE = "emergencies.json"
+
+
+class DurableLatch(AbortLatch):
+    """A latch that is on the disk before anybody is told that it is latched.
+
+    Args:
+        path: the file; one that is there is read.
+        log: told when the file cannot be read or written; the latch holds all the same.
+    """
+
+    def __init__(self, path: Path, log: structlog.typing.FilteringBoundLogger) -> None:
+        """Latched as the file says."""
+        super().__init__()
+        self._path, self._log = path, log
+        try:
+            kept = json.loads(path.read_text(encoding="utf-8"))
+            self._active = {e["id"]: Emergency(EmergencyKind(e["kind"]), e["id"], e["note"]) for e in kept["active"]}
+            self._cleared = dict.fromkeys(map(str, kept["cleared"]))
+        except FileNotFoundError:
+            return
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            # What it held is not known: the survey is aborted rather than driven on.
+            log.error("emergencies unreadable: taken for an emergency", file=str(path), error=str(error))
+            super().raise_emergency(EmergencyKind.OPERATOR, "unreadable", f"{path.name} cannot be read")
+        if self._active:
+            log.warning("emergencies of before", active=sorted(self._active))
+
+    def raise_emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
+        """As ``AbortLatch``, and on the disk."""
+        before = len(self._active)
+        refusal = super().raise_emergency(kind, emergency_id, note)
+        if len(self._active) != before:
+            self._save()
+        return refusal
+
+    def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
+        """As ``AbortLatch``, and on the disk."""
+        before = len(self._active)
+        refusal = super().clear(emergency_id, at_base_or_held)
+        if len(self._active) != before:
+            self._save()
+        return refusal
+
+    def _save(self) -> None:
+        active = [{"id": e.id, "kind": e.kind, "note": e.note} for e in self._active.values()]
+        text = json.dumps({"active": active, "cleared": list(self._cleared)})
+        new = self._path.with_name(f"{self._path.name}.new")
+        try:
+            with new.open("w", encoding="utf-8") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            new.replace(self._path)
+            folder = os.open(self._path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+        except OSError as error:
+            self._log.error("emergencies cannot be kept: lost if this process dies", error=str(error))

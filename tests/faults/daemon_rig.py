@@ -1,0 +1,240 @@
+"""Both loops of the daemon and their peers in one event loop, in real time: what happens can be seen from within."""
+
+import asyncio
+import json
+import tempfile
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import structlog
+import zmq
+
+from ccatp.config.loader import dump_config, load_config
+from ccatp.config.models import Config
+from ccatp.dataloop import DataLoop, TruthOutlet
+from ccatp.etalon_standin import EtalonStandIn
+from ccatp.fault_proxy.proxy import FaultProxy
+from ccatp.mirror.mirror import build_mirror
+from ccatp.processes.building import build_parts
+from ccatp.processes.common import Endpoints, ProcessArgs
+from ccatp.processes.danger_loop import DangerLoop
+from ccatp.processes.main_loop import MainLoop
+from ccatp.puck_truth import ZmqPuck
+from ccatp.robot_link import RobotLink
+from ccatp.sim.truth import TruthLog
+
+DEADLINE_S = 60.0
+SEND_DRIVE, SEND_PERMIT = RobotLink.send_drive, RobotLink.send_permit
+LATE_FRAMES = 16  # of 10 ms: data are too old after 150 ms
+
+
+class Executed:
+    """One step in which the robot's wheels turned by a drive: its number, and when it was."""
+
+    __slots__ = ("at_s", "seq")
+
+    def __init__(self, seq: int, at_s: float) -> None:
+        self.seq, self.at_s = seq, at_s
+
+
+class Daemon:
+    """What a test sees of it.
+
+    Attributes:
+        main, danger: the loops.
+        robot: the stand-in.
+        to_main, to_danger: the proxies before it, one for each loop.
+        log: what the loops logged.
+        sent: wall time of each drive that was not zero, by its number.
+        late: commands to move, drives or permits, that were computed from a frame of more than ``LATE_FRAMES`` ago.
+        executed: the steps in which the wheels turned.
+        loops: the tasks of main and danger.
+        stop: ends both.
+    """
+
+    def __init__(
+        self, main: MainLoop, danger: DangerLoop, robot: DataLoop, proxies: tuple[FaultProxy, FaultProxy]
+    ) -> None:
+        self.main, self.danger, self.robot = main, danger, robot
+        self.to_main, self.to_danger = proxies
+        self.log: list[dict[str, Any]] = []
+        self.sent: dict[int, float] = {}
+        self.late: list[str] = []
+        self.executed: list[Executed] = []
+        self.loops: list[asyncio.Task[None]] = []
+        self.stop = asyncio.Event()
+        self._watch_drives()
+
+    def _watch_drives(self) -> None:
+        rules, clock = self.robot.robot.rules, asyncio.get_running_loop().time
+        step = rules.set_points
+
+        def set_points(until_s: float) -> tuple[float, float]:
+            found = step(until_s)
+            if any(found):
+                self.executed.append(Executed(rules._drive_seq, clock()))
+            return found
+
+        watched = _Watched(rules, set_points)
+        self.robot.robot.rules = watched  # type: ignore[assignment]
+
+    def send_drive(self, link: RobotLink, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float) -> None:
+        """In place of the link's own method."""
+        if wr_rad_s or wl_rad_s:
+            self.sent[seq] = asyncio.get_running_loop().time()
+            self._note_late("drive", ack)
+        SEND_DRIVE(link, seq, ack, wr_rad_s, wl_rad_s)
+
+    def send_permit(self, link: RobotLink, seq: int, ack: int, allowed: tuple[bool, bool, bool]) -> None:
+        """In place of the link's own method."""
+        if any(allowed):
+            self._note_late("permit", ack)
+        SEND_PERMIT(link, seq, ack, *allowed)
+
+    def _note_late(self, kind: str, ack: int) -> None:
+        if self.robot.robot.seq - ack > LATE_FRAMES:
+            self.late.append(f"{kind} on frame {ack} at frame {self.robot.robot.seq}")
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        """Wait for something; the loops go on meanwhile."""
+        async with asyncio.timeout(DEADLINE_S):
+            while not condition():  # noqa: ASYNC110 - frames are worth no event each
+                await asyncio.sleep(0.005)
+
+    @property
+    def is_driving(self) -> bool:
+        """Whether the wheels turned within the last tenth of a second."""
+        return bool(self.executed) and asyncio.get_running_loop().time() - self.executed[-1].at_s < 0.1
+
+    def events(self, event: str) -> list[dict[str, Any]]:
+        """What was logged under a name."""
+        return [entry for entry in self.log if entry["event"] == event]
+
+
+class _Watched:
+    """The robot's rules, with one method looked at."""
+
+    def __init__(self, rules: object, set_points: Callable[[float], tuple[float, float]]) -> None:
+        object.__setattr__(self, "_rules", rules)
+        object.__setattr__(self, "set_points", set_points)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(object.__getattribute__(self, "_rules"), name)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        setattr(object.__getattribute__(self, "_rules"), name, value)
+
+
+def configuration(**overrides: object) -> Config:
+    """A survey of one panel, which begins to drive as soon as gravity is known."""
+    return load_config(
+        overrides={
+            "run.panels": 1, "run.filter": "kf", "run.seed": 5, "run.realtime_priority": 0, "sim.robot.port": 0,
+            "mission.calibration_length_m": 0, **overrides,
+        }
+    )  # fmt: skip
+
+
+@contextmanager
+def _logging_to(entries: list[dict[str, Any]]) -> Iterator[None]:
+    def keep(_: object, __: str, fields: Any) -> Any:
+        entries.append(dict(fields))
+        raise structlog.DropEvent
+
+    logger = structlog.wrap_logger(None, processors=[structlog.processors.add_log_level, keep])
+    with (
+        patch("ccatp.processes.main_loop.open_log", lambda _, name: logger.bind(process=name)),
+        patch("ccatp.processes.danger_loop.open_log", lambda _, name: logger.bind(process=name)),
+    ):
+        yield
+
+
+@asynccontextmanager
+async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncIterator[Daemon]:
+    """A survey under way, from its beginning; it is stopped at the end.
+
+    Args:
+        cfg: the daemon's configuration.
+        robot_cfg: that of the stand-ins, if it is another one.
+    """
+    entries: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory(prefix="ccatp-") as folder, _logging_to(entries):
+        run_dir = Path(folder)
+        endpoints = Endpoints(run_dir)
+        robot = DataLoop(robot_cfg or cfg, False, cfg.run.seed)
+        robot.truth = outlet = TruthOutlet(TruthLog(robot.robot), endpoints.of("puck"), endpoints.of("truth"))
+        port = await robot.start()
+        mirror = build_mirror(cfg.mirror)
+        puck = ZmqPuck(endpoints.of("puck"))
+        laser = EtalonStandIn(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, np.random.default_rng(1),
+                              measuring_time_s=cfg.etalon.measuring_time_s)  # fmt: skip
+        laser_port = await laser.start("127.0.0.1", 0)
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        stop, robot_stop = asyncio.Event(), asyncio.Event()
+        try:
+            async with FaultProxy("127.0.0.1", port, seed=1) as one, FaultProxy("127.0.0.1", port, seed=2) as two:
+                main_args, danger_args = (
+                    ProcessArgs(_at(cfg, proxy.port, laser_port), run_dir, endpoints, None, True, False)
+                    for proxy in (one, two)
+                )
+                (run_dir / "config.toml").write_text(dump_config(main_args.config), encoding="utf-8")
+                parts, store = build_parts(main_args)
+                with store:
+                    main, danger = MainLoop(main_args, context, parts, store), DangerLoop(danger_args, context)
+                    daemon = Daemon(main, danger, robot, (one, two))
+                    daemon.log = entries
+                    listener = context.socket(zmq.SUB)
+                    listener.connect(endpoints.of("main"))
+                    listener.subscribe("track")
+                    try:
+                        with _seen_by(daemon):
+                            async with asyncio.TaskGroup() as tasks:
+                                peers = robot.run(robot_stop), outlet.serve(), laser.serve()
+                                serving = [tasks.create_task(work) for work in peers]
+                                daemon.loops = [tasks.create_task(work) for work in (main.run(stop), danger.run(stop))]
+                                daemon.stop = stop
+                                try:
+                                    yield daemon
+                                finally:
+                                    stop.set()
+                                    await asyncio.wait(daemon.loops)
+                                    robot_stop.set()
+                                    for task in serving[1:]:
+                                        task.cancel()
+                    finally:
+                        main.close()
+                        danger.close()
+                        listener.close(linger=0)
+        finally:
+            await laser.close()
+            puck.close()
+            outlet.close()
+            context.destroy(linger=0)
+
+
+@contextmanager
+def _seen_by(daemon: Daemon) -> Iterator[None]:
+    """Functions in place of the link's methods: bound methods would not get the link itself."""
+
+    def send_drive(link: RobotLink, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float) -> None:
+        daemon.send_drive(link, seq, ack, wr_rad_s, wl_rad_s)
+
+    def send_permit(link: RobotLink, seq: int, ack: int, forward: bool, reverse: bool, turn: bool) -> None:
+        daemon.send_permit(link, seq, ack, (forward, reverse, turn))
+
+    with patch.object(RobotLink, "send_drive", send_drive), patch.object(RobotLink, "send_permit", send_permit):
+        yield
+
+
+def _at(cfg: Config, robot_port: int, laser_port: int) -> Config:
+    robot = cfg.robot.model_copy(update={"port": robot_port})
+    return cfg.model_copy(update={"robot": robot, "etalon": cfg.etalon.model_copy(update={"port": laser_port})})
+
+
+def tell(daemon: Daemon) -> str:
+    """For a test that failed."""
+    return json.dumps(daemon.log[-20:], default=str, indent=1)

@@ -1,0 +1,341 @@
+"""Drives over the rim, turns beside it and stops over seams, all round a mirror, on the simulated plant.
+
+The real danger rules judge frame by frame, with the estimate and the delays of a disturbed world. A case is a number:
+the same number is the same drive.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from math import atan2, ceil, cos, hypot, pi, radians, sin
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.danger import DangerMonitor
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.samples import DeckPose, EventCode, PanelId, Verdict
+from ccatp.studies.danger_drives import Errors, Rig
+
+MIRRORS = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
+SPACING_M = 0.01
+HEADINGS = range(0, 360, 5)
+SPEEDS_M_S = (0.005, 0.02, 0.05, 0.1, 0.15)
+TURNS_RAD_S = (-1.0, -0.2, 0.2, 1.0)
+ERRORS = Errors(position_m=1.5e-3, heading_rad=2e-3)
+OVERRUN_M = 0.020  # invariant I5
+SLOWEST_COSINE = cos(radians(85.5))  # a way that is closer to the rim's direction than this does not lead over it
+RUN_UP_M = 0.004  # of the first sensor to the rim: the rules have a track before it goes off
+REACH_M = 1.2  # how far back a start is looked for: at 85 degrees to the normal all sensors are on from there
+REST_M = 1e-4  # what a robot still rolls when it counts as standing
+TURN_CLEARANCE_M = (0.100, 0.115, 0.125)  # of the centre: all four sensors on at some heading, a corner off at others
+
+
+class Place(NamedTuple):
+    """A point of the rim and the direction of the outward normal there."""
+
+    x_m: float
+    y_m: float
+    normal_rad: float
+
+
+@dataclass(slots=True)
+class Tally:
+    """What became of the drives."""
+
+    drives: int = 0
+    impossible: int = 0  # the robot cannot stand anywhere on the way
+    falls: int = 0
+    unseen: int = 0  # went over the rim, and no edge was declared
+    after_m: float = 0.0  # furthest way of a sensor after the declaration
+    beyond_m: float = 0.0  # furthest sensor beyond the rim
+    late_s: float = 0.0  # longest from the first sensor beyond the rim to the withheld permit
+    transits: int = 0
+    over_gap: int = 0  # stops with a sensor over the gap
+    false_edges: int = 0
+    worst: list[str] = field(default_factory=list)
+
+    def add(self, other: "Tally") -> None:
+        self.drives += other.drives
+        self.impossible += other.impossible
+        self.falls += other.falls
+        self.unseen += other.unseen
+        self.after_m = max(self.after_m, other.after_m)
+        self.beyond_m = max(self.beyond_m, other.beyond_m)
+        self.late_s = max(self.late_s, other.late_s)
+        self.transits += other.transits
+        self.over_gap += other.over_gap
+        self.false_edges += other.false_edges
+        self.worst += other.worst
+
+    @property
+    def line(self) -> str:
+        return (
+            f"{self.drives} drives ({self.impossible} without a place to stand), {self.falls} falls, {self.unseen} "
+            f"unseen, {1e3 * self.after_m:.1f} mm after the declaration, {1e3 * self.beyond_m:.1f} mm beyond the rim, "
+            f"{1e3 * self.late_s:.0f} ms to the permit; {self.transits} transits, {self.over_gap} stops over a gap, "
+            f"{self.false_edges} false edges"
+        )
+
+
+@lru_cache
+def world(name: str) -> tuple[Config, Mirror]:
+    cfg = load_config(None, {"run.mirror": name, "run.world": "hard"})
+    return cfg, build_mirror(cfg.mirror)
+
+
+@lru_cache
+def places(name: str) -> tuple[Place, ...]:
+    """The rim of a mirror, centimetre by centimetre."""
+    vertices = world(name)[1].rim.vertices.tolist()
+    found = []
+    for a, b in zip(vertices, vertices[1:] + vertices[:1], strict=True):
+        length = hypot(b[0] - a[0], b[1] - a[1])
+        if length == 0.0:
+            continue
+        ux, uy = (b[0] - a[0]) / length, (b[1] - a[1]) / length
+        count = ceil(length / SPACING_M)
+        # The outline runs counter-clockwise: outward is to the right.
+        found += [
+            Place(a[0] + (k + 0.5) / count * length * ux, a[1] + (k + 0.5) / count * length * uy, atan2(-ux, uy))
+            for k in range(count)
+        ]
+    return tuple(found)
+
+
+def start_before(name: str, place: Place, heading_rad: float, sign: float) -> DeckPose | None:
+    """Where a robot that drives at the place last stands with all its sensors on the mirror; None for nowhere."""
+    cfg, mirror = world(name)
+    sensors = np.array(cfg.robot.edge_sensors_m)
+    c, s = cos(heading_rad), sin(heading_rad)
+    ox, oy = sensors[:, 0] * c - sensors[:, 1] * s, sensors[:, 0] * s + sensors[:, 1] * c
+    back = np.arange(0.0, REACH_M, 0.002)[:, None]
+    xs, ys = place.x_m - sign * back * c, place.y_m - sign * back * s
+    inside = mirror.rim.signed_distances_m(xs + ox, ys + oy).min(axis=1) > RUN_UP_M * abs(cos(heading_rad))
+    inside &= mirror.rim.signed_distances_m(xs[:, 0], ys[:, 0]) > 0.05
+    if not inside.any():
+        return None
+    k = int(np.argmax(inside))
+    return DeckPose(float(xs[k, 0]), float(ys[k, 0]), heading_rad)
+
+
+class _Drive:
+    """A robot that does what it is told until the danger rules forbid it."""
+
+    def __init__(self, name: str, start: DeckPose, rng: np.random.Generator) -> None:
+        self.cfg, self.mirror = world(name)
+        self.rig = Rig(self.mirror, self.cfg, start, ERRORS, rng)
+        self.monitor = DangerMonitor(self.mirror, self.cfg.robot, self.cfg.danger)
+        self.hz = self.cfg.sim.robot.frame_hz
+        self.delay = round((self.cfg.world.sensors_delay_s + self.cfg.world.commands_delay_s) * self.hz)
+        self.has_edge = False
+
+    def frame(self, right: float, left: float) -> Verdict:
+        seen = self.rig.frame(right, left)
+        verdict = self.monitor.step(*seen)
+        self.has_edge |= verdict.code is EventCode.NEAR_EDGE
+        return verdict
+
+    def beyond_m(self) -> list[float]:
+        return [-self.mirror.rim.signed_distance_m(x, y) for x, y in self.rig.places]
+
+    @property
+    def rolls_m(self) -> float:
+        """What the wheels still travel without a set point."""
+        plant, robot = self.rig.plant, self.cfg.robot
+        return (
+            robot.wheel_radius_m * self.cfg.sim.robot.wheel_lag_s * max(abs(plant.right_rad_s), abs(plant.left_rad_s))
+        )
+
+
+def run_off(name: str, start: DeckPose, v_m_s: float, omega_rad_s: float, rng: np.random.Generator) -> Tally:
+    """Drive, or turn, until an edge is declared, and on until the robot stands."""
+    drive = _Drive(name, start, rng)
+    rig, hz = drive.rig, drive.hz
+    set_points = rig.at_speed(v_m_s, omega_rad_s, drive.cfg)
+    speed = max(abs(v_m_s), abs(omega_rad_s) * hypot(*drive.cfg.robot.edge_sensors_m[0]))
+    frames = ceil((REACH_M + 0.05 if v_m_s else 2.0 * pi * 0.13) / speed * hz)
+    late = drive.delay
+    off_frame = declared_frame = -1
+    at_declaration = [0.0] * 4
+    after_m = most_m = 0.0
+    has_fallen = False
+    for k in range(frames + 300):
+        if declared_frame >= 0:
+            late -= 1
+        is_driven = declared_frame < 0 or late >= 0
+        verdict = drive.frame(*(set_points if is_driven else (0.0, 0.0)))
+        is_off = not all(_on(rig))
+        beyond = drive.beyond_m() if is_off or drive.has_edge or declared_frame >= 0 else [0.0] * 4
+        if off_frame < 0 and is_off and max(beyond) > 0.0:
+            off_frame = k
+        if declared_frame < 0 and _is_barred(verdict, v_m_s):
+            declared_frame, at_declaration = k, [max(b, 0.0) for b in beyond]
+        if declared_frame >= 0:
+            after_m = max(after_m, *(now - then for now, then in zip(beyond, at_declaration, strict=True)))
+        most_m = max(most_m, *beyond)
+        has_fallen = has_fallen or drive.mirror.rim.signed_distance_m(rig.plant.x_m, rig.plant.y_m) < 0.0
+        if has_fallen or (not is_driven and drive.rolls_m < REST_M) or (declared_frame < 0 and k >= frames):
+            break
+    is_unseen = declared_frame < 0 and most_m > 0.0
+    late_s = max(declared_frame - off_frame, 0) / hz if declared_frame >= 0 and off_frame >= 0 else 0.0
+    return Tally(1, 0, int(has_fallen), int(is_unseen), after_m, most_m, late_s)
+
+
+def _on(rig: Rig) -> tuple[int, ...]:
+    return rig._sensors.edges._values
+
+
+def _is_barred(verdict: Verdict, v_m_s: float) -> bool:
+    """Whether the motion is over: an edge, or its direction is not permitted any more."""
+    return verdict.code is EventCode.NEAR_EDGE or not (verdict.forward if v_m_s > 0.0 else verdict.reverse)
+
+
+def rim_case(number: int) -> tuple[str, Callable[[], Tally]]:
+    """The drive of a number: mirror, place, heading, speed."""
+    k, speed = divmod(number, len(SPEEDS_M_S))
+    k, heading = divmod(k, len(HEADINGS))
+    name, place = _place(k)
+    v_m_s, heading_rad = SPEEDS_M_S[speed], radians(HEADINGS[heading])
+    text = f"rim {number}: {name} at ({place.x_m:.3f}, {place.y_m:.3f}) heading {HEADINGS[heading]} {v_m_s} m/s"
+
+    def run() -> Tally:
+        cosine = cos(heading_rad - place.normal_rad)
+        sign = 1.0 if cosine > 0.0 else -1.0
+        start = start_before(name, place, heading_rad, sign) if abs(cosine) > SLOWEST_COSINE else None
+        if start is None:
+            return Tally(impossible=1)
+        return run_off(name, start, sign * v_m_s, 0.0, np.random.default_rng([number, 1]))
+
+    return text, run
+
+
+def speed_of(number: int) -> float:
+    """Speed of a drive over the rim, m/s."""
+    return SPEEDS_M_S[number % len(SPEEDS_M_S)]
+
+
+def turn_case(number: int) -> tuple[str, Callable[[], Tally]]:
+    """A turn in place beside the rim."""
+    k, turn = divmod(number, len(TURNS_RAD_S))
+    k, depth = divmod(k, len(TURN_CLEARANCE_M))
+    name, place = _place(k)
+    rng = np.random.default_rng([number, 2])
+    heading_rad, inside_m = float(rng.uniform(-pi, pi)), TURN_CLEARANCE_M[depth]
+    text = f"turn {number}: {name} at ({place.x_m:.3f}, {place.y_m:.3f}) {inside_m} m inside {TURNS_RAD_S[turn]} rad/s"
+
+    def run() -> Tally:
+        x, y = place.x_m - inside_m * cos(place.normal_rad), place.y_m - inside_m * sin(place.normal_rad)
+        drive_start = DeckPose(x, y, heading_rad)
+        cfg, mirror = world(name)
+        c, s = cos(heading_rad), sin(heading_rad)
+        sensors = [(x + a * c - b * s, y + a * s + b * c) for a, b in cfg.robot.edge_sensors_m]
+        if min(mirror.rim.signed_distance_m(*p) for p in sensors) < RUN_UP_M:
+            return Tally(impossible=1)
+        return run_off(name, drive_start, 0.0, TURNS_RAD_S[turn], rng)
+
+    return text, run
+
+
+@lru_cache
+def _ends() -> tuple[int, ...]:
+    return tuple(np.cumsum([len(places(name)) for name in MIRRORS]).tolist())
+
+
+def _place(k: int) -> tuple[str, Place]:
+    ends = _ends()
+    which = int(np.searchsorted(ends, k, side="right"))
+    return MIRRORS[which], places(MIRRORS[which])[k - (ends[which - 1] if which else 0)]
+
+
+def rim_cases() -> int:
+    """How many drives over the rim there are."""
+    return _ends()[-1] * len(HEADINGS) * len(SPEEDS_M_S)
+
+
+def turn_cases() -> int:
+    """How many turns beside it."""
+    return _ends()[-1] * len(TURN_CLEARANCE_M) * len(TURNS_RAD_S)
+
+
+# -- seams ------------------------------------------------------------------------------------------------------------
+
+
+def seam_case(number: int) -> tuple[str, Callable[[], Tally]]:
+    """A way over a seam, or a stop over it: mirror, seam, angle, speed and length of the stop drawn by number."""
+    rng = np.random.default_rng([number, 3])
+    name = MIRRORS[number % len(MIRRORS)]
+    is_stop = bool(number // len(MIRRORS) % 2)
+    v_m_s = float(rng.choice(SPEEDS_M_S) if is_stop else rng.uniform(SPEEDS_M_S[0], SPEEDS_M_S[-1]))
+    angle_rad = float(rng.uniform(-1.0, 1.0)) * radians(60.0)
+    stop_s = float(60.0 ** rng.uniform(-1.0, 1.0)) if is_stop else 0.0
+    text = f"seam {number}: {name} {v_m_s:.3f} m/s at {angle_rad:.3f} rad, stop {stop_s:.2f} s"
+    return text, lambda: cross(name, v_m_s, angle_rad, stop_s, rng)
+
+
+def cross(name: str, v_m_s: float, angle_rad: float, stop_s: float, rng: np.random.Generator) -> Tally:
+    """Carry the leading sensors over a seam, and stop with one of them over the gap where that is asked for."""
+    _, mirror = world(name)
+    start, course_sign = _start_at_seam(name, angle_rad, v_m_s, rng)
+    drive = _Drive(name, start, rng)
+    set_points = drive.rig.at_speed(course_sign * v_m_s, 0.0, drive.cfg)
+    lag_m = v_m_s * drive.cfg.sim.robot.wheel_lag_s
+    way_m = 0.02 + (lag_m + 0.5 * mirror.gap_m / cos(angle_rad)) + 0.01 / cos(angle_rad)
+    stop_at_m = 0.02 + 0.5 * mirror.gap_m / cos(angle_rad)
+    tally = Tally(transits=1)
+    has_stopped = stop_s == 0.0
+    x0, y0 = start.x_m, start.y_m
+    for _ in range(ceil((way_m + mirror.gap_m / cos(angle_rad) + 0.05) / v_m_s * 1.06 * drive.hz)):
+        drive.frame(*set_points)
+        gone = hypot(drive.rig.plant.x_m - x0, drive.rig.plant.y_m - y0)
+        if not has_stopped and gone >= stop_at_m:
+            has_stopped = True
+            for _ in range(ceil((stop_s + 0.3) * drive.hz)):
+                drive.frame(0.0, 0.0)
+            tally.over_gap = int(not all(_on(drive.rig)))
+    tally.false_edges = int(drive.has_edge)
+    return tally
+
+
+def _start_at_seam(name: str, angle_rad: float, v_m_s: float, rng: np.random.Generator) -> tuple[DeckPose, float]:
+    """A pose whose first sensor comes to the middle of a seam's gap after 20 mm, the way of running down left out."""
+    cfg, mirror = world(name)
+    around = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1)]
+    inner = [
+        p
+        for p in mirror.panels.values()
+        if all(PanelId(p.id.row + r, p.id.col + c) in mirror.panels for r, c in around)
+    ]
+    panel = inner[int(rng.integers(len(inner)))]
+    is_x, side, sign = bool(rng.integers(2)), int(rng.choice((-1, 1))), float(rng.choice((-1.0, 1.0)))
+    course = (0.0 if side > 0 else pi) if is_x else side * pi / 2
+    course += angle_rad
+    heading = course if sign > 0.0 else course + pi
+    lead = max(
+        (a * cos(heading) - b * sin(heading)) * (cos(course - angle_rad))
+        + (a * sin(heading) + b * cos(heading)) * sin(course - angle_rad)
+        for a, b in cfg.robot.edge_sensors_m
+    )
+    half, across = (panel.half_x_m, panel.half_y_m) if is_x else (panel.half_y_m, panel.half_x_m)
+    along = float(rng.uniform(-1.0, 1.0)) * (across - 0.2)
+    before = lead + (0.02 + v_m_s * cfg.sim.robot.wheel_lag_s) * cos(angle_rad)
+    to_seam = side * (half + 0.5 * mirror.gap_m - before)
+    x, y = (to_seam, along) if is_x else (along, to_seam)
+    return DeckPose(panel.x_m + x, panel.y_m + y, heading), sign
+
+
+# -- running ----------------------------------------------------------------------------------------------------------
+
+
+def sweep(case: Callable[[int], tuple[str, Callable[[], Tally]]], numbers: Iterable[int]) -> Tally:
+    """Run cases by number; the names of those that went wrong are kept."""
+    tally = Tally()
+    for number in numbers:
+        text, run = case(number)
+        one = run()
+        tally.add(one)
+        if one.falls or one.unseen or one.false_edges or one.after_m > OVERRUN_M:
+            tally.worst.append(f"{text}: {one.line}")
+    return tally

@@ -1,0 +1,78 @@
+"""The fault table as data: one row per fault, read from ``table.toml``."""
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from ccatp.conformance.table import check_ids
+
+PATH = Path(__file__).with_name("table.toml")
+# Rows of each kind in the list that the project works from; a row may be added, none may be lost.
+ROWS = {"S": 29, "L": 14, "P": 23, "E": 10, "O": 10, "F": 10}
+
+Text = Annotated[str, Field(min_length=3)]
+Severity = Literal["inform", "slow", "pause", "hold", "return", "fault", "refuse"]
+
+
+class Row(BaseModel):
+    """One fault: how it shows, what happens then, and what a test may measure. Keys as the head of the table tells."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    fault: Text
+    detection: Text
+    reaction: Text
+    bound: Text
+    severity: Severity
+    at_most: dict[str, float] = {}
+    at_least: dict[str, float] = {}
+    without_realtime: dict[str, float] = {}
+    slow: bool = False
+    hardware: Text | None = None
+    conformance: tuple[str, ...] = Field(default=(), strict=False)
+    open: Text | None = None
+
+    @model_validator(mode="after")
+    def _fits(self) -> "Row":
+        if (self.hardware is None) != (not self.conformance):
+            raise ValueError("hardware and conformance belong together")
+        if unknown := set(self.conformance) - set(check_ids()):
+            raise ValueError(f"ccatp conformance has no check {sorted(unknown)}")
+        if set(self.at_most) & set(self.at_least):
+            raise ValueError("a unit is in at_most and in at_least")
+        if unknown := set(self.without_realtime) - set(self.at_most):
+            raise ValueError(f"without_realtime has {sorted(unknown)}, at_most has not")
+        return self
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """What can be measured for the row; the first is meant where none is named."""
+        return (*self.at_most, *self.at_least)
+
+    def limit(self, unit: str, *, is_realtime: bool) -> tuple[str, float]:
+        """How and by what a measurement is limited."""
+        if unit in self.at_least:
+            return "at least", self.at_least[unit]
+        relaxed = {} if is_realtime else self.without_realtime
+        return "at most", relaxed.get(unit, self.at_most[unit])
+
+    def allows(self, unit: str, value: float, *, is_realtime: bool) -> bool:
+        """Whether a measurement keeps its limit; what is no number does not."""
+        how, limit = self.limit(unit, is_realtime=is_realtime)
+        return value >= limit if how == "at least" else value <= limit
+
+
+Table = Mapping[str, Row]
+
+
+def load_table(path: Path = PATH) -> Table:
+    """The rows by id, in the order of the file."""
+    return {row_id: Row.model_validate(row) for row_id, row in tomllib.loads(path.read_text(encoding="utf-8")).items()}
+
+
+def conformance_rows(table: Table) -> tuple[str, ...]:
+    """Rows of which the robot itself keeps a part that ``ccatp conformance`` asks for."""
+    return tuple(row_id for row_id, row in table.items() if row.conformance)

@@ -1,0 +1,61 @@
+"""Frames and drives that come late: whatever blocks or stalls, no old drive turns the wheels."""
+
+import asyncio
+import time
+
+import pytest
+
+from tests.faults.daemon_rig import Daemon, configuration, running_daemon, tell
+from tests.faults.linking import Measured
+
+LONG_S = 0.4  # longer than the robot's time-to-live, and than any age at which data still count
+
+
+def stale(daemon: Daemon, since_s: float, until_s: float) -> list[int]:
+    """Drives of before ``since_s`` that turned the wheels after ``until_s``."""
+    return [step.seq for step in daemon.executed if step.at_s > until_s and daemon.sent[step.seq] < since_s]
+
+
+async def moving_again(daemon: Daemon, since_s: float) -> None:
+    await daemon.until(lambda: bool(daemon.executed) and daemon.executed[-1].at_s > since_s)
+
+
+@pytest.mark.fault("L3", "P8")
+async def test_stalls_and_blocks(measured: Measured) -> None:
+    clock = asyncio.get_running_loop().time
+    async with running_daemon(configuration()) as daemon:
+        await daemon.until(lambda: daemon.is_driving)
+        assert daemon.robot.robot.t_s > 1.5  # gravity had to agree first
+        found: list[int] = []
+        tasks = len(asyncio.all_tasks())
+        both = daemon.to_main, daemon.to_danger
+        for proxies, direction in (
+            (both[:1], "to_client"),
+            (both[:1], "to_server"),
+            (both[1:], "to_client"),
+            (both[1:], "to_server"),
+            (both, "to_client"),
+        ):
+            await daemon.until(lambda: daemon.is_driving)
+            begun_s = clock()
+            for proxy in proxies:
+                proxy.stall(direction)  # type: ignore[arg-type]
+            await asyncio.sleep(LONG_S)
+            assert not daemon.is_driving, tell(daemon)  # held by the robot itself, or by zero drives
+            healed_s = clock()
+            for proxy in proxies:
+                proxy.heal()
+            await moving_again(daemon, healed_s)  # a pause that resumes by itself
+            found += stale(daemon, begun_s + LONG_S / 2, healed_s)
+        measured("L3", len(found) + len(daemon.late))
+        assert len(asyncio.all_tasks()) == tasks
+
+        slips, told = daemon.main.status().slips, len(daemon.events("late frame"))
+        await daemon.until(lambda: daemon.is_driving)
+        begun_s = clock()
+        time.sleep(0.12)  # noqa: ASYNC251 - this is what must not happen
+        await moving_again(daemon, clock() + 0.05)
+        status = daemon.main.status()
+        measured("P8", 0 if status.slips > slips and len(daemon.events("late frame")) > told else 1)
+        assert status.lag_ms >= 60.0
+        assert not stale(daemon, begun_s, begun_s + 0.2)

@@ -1,0 +1,447 @@
+"""What a bad link or a bad peer does to the daemon's end of the robot link, and to the robot's."""
+
+import asyncio
+import random
+import socket
+import statistics
+import threading
+import time
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+
+import numpy as np
+import pytest
+
+from ccatp.config.loader import load_config
+from ccatp.dataloop import DataLoop
+from ccatp.mirror.mirror import build_mirror
+from ccatp.robot_link import BACKLOG_S, FLOOD_FACTOR, RobotLink, RobotTimeout, WrongProtocol
+from ccatp.samples import PanelPose
+from ccatp.sim.robot import Robot
+from ccatp.sim.sessions import RobotServer
+from ccatp.wire.lines import LineBudget, LineBuffer
+from ccatp.wire.robot import PROTOCOL, Hello, RobotData, Sensors, decode_from_robot, encode, encode_sensors
+from tests.faults.link_rig import DEADLINE_S, Driver, robot_behind_proxy
+from tests.faults.linking import Measured
+
+FRAMES = 60
+KEY = b"secret"
+HELLO = Hello(
+    protocol=PROTOCOL, boot=1, nonce="ab" * 16, auth="none", lockstep=False, frame_hz=100.0, ttl_s=0.25,
+    robot=RobotData(wheel_radius_m=0.03, wheel_base_m=0.15,
+                    edge_sensors_m=((0.09, 0.09), (0.09, -0.09), (-0.09, 0.09), (-0.09, -0.09)),
+                    puck_m=(0.0, 0.0, 0.05), max_wheel_rad_s=8.0, fan_floor=0.0),
+)  # fmt: skip
+JOINED = b'{"type":"joined","role":"controller","session":1}\n'
+
+
+def frame(seq: int, samples: int = 10) -> bytes:
+    t_s = seq / 100.0
+    wheels = [(t_s + 1e-3 * k, 1.0 + 1e-9 * seq, 1.0) for k in range(samples)]
+    return encode_sensors(seq, t_s, [(t_s, 0.1, 0.2)], wheels, (), None, (0.8, 0.8), 1.0, (seq, 0.0, 0.0, False), ())
+
+
+async def driven(disturb: Callable[..., None] = lambda proxy: None, frames: int = FRAMES) -> tuple[Driver, PanelPose]:
+    """A drive in lockstep through a proxy that is told to misbehave."""
+    async with robot_behind_proxy(lockstep=True) as (_, proxy):
+        driver = Driver(proxy.port)
+        disturb(proxy)
+        await driver.link.connect(DEADLINE_S)
+        await driver.drive(frames)
+        driver.link.close()
+    assert not driver.lost
+    return driver, driver.pose
+
+
+# -- what TCP or a proxy may do to whole messages ---------------------------------------------------------------------
+
+
+@pytest.mark.fault("S14")
+async def test_frames_that_come_twice_leave_the_pose_as_it_is(measured: Measured) -> None:
+    _, clean = await driven()
+    twice, pose = await driven(lambda proxy: proxy.duplicate("both", 1))
+    assert twice.link.counts["repeated_frames"] >= FRAMES - 1
+    assert twice.seqs == list(range(len(twice.seqs)))
+    assert pose == clean
+    measured("S14", pose != clean)
+
+
+@pytest.mark.fault("S14")
+async def test_frames_out_of_order_never_reach_the_localizer() -> None:
+    async with robot_behind_proxy(lockstep=False) as (_, proxy):
+        driver = Driver(proxy.port)
+        await driver.link.connect(DEADLINE_S)
+        proxy.reorder("to_client", 3)
+        await driver.drive(FRAMES)
+        assert proxy.counts["reorder"] >= 5
+        assert driver.link.counts["repeated_frames"] >= 5
+        assert driver.seqs == sorted(set(driver.seqs))
+        assert driver.localizer.counts["stale_frames"] == 0
+        driver.link.close()
+
+
+@pytest.mark.fault("S15")
+async def test_a_damaged_line_costs_itself_alone(measured: Measured) -> None:
+    async with robot_behind_proxy(lockstep=False) as (_, proxy):
+        driver = Driver(proxy.port)
+        await driver.link.connect(DEADLINE_S)
+        proxy.corrupt("to_client", 10)  # ten a second; more than twenty would end the session
+        await driver.drive(2 * FRAMES)
+        assert not driver.lost
+        assert proxy.counts["corrupt"] >= 8
+        assert driver.link.counts["bad_lines"] >= 5  # a digit may have become another digit: a valid line
+        gaps = [b - a - 1 for a, b in zip(driver.seqs, driver.seqs[1:], strict=False)]
+        measured("S15", max(gaps))
+        assert sum(gaps) <= proxy.counts["corrupt"]
+        driver.link.close()
+
+
+@pytest.mark.fault("L5")
+async def test_single_bytes_make_no_difference() -> None:
+    _, clean = await driven(frames=10)
+    chopped, pose = await driven(lambda proxy: proxy.fragment("both", 1), frames=10)
+    assert not chopped.link.counts
+    assert pose == clean
+
+
+@pytest.mark.fault("L5")
+def test_wherever_the_stream_is_cut_the_messages_are_the_same(measured: Measured) -> None:
+    lines = [frame(k) for k in range(10_000)]
+    stream, rng = b"".join(lines), random.Random(5)
+    at, buffer, found = 0, LineBuffer(), 0
+    while at < len(stream):
+        size = rng.choice((1, 2, 3, 50, 700, 3000))
+        for line in buffer.feed(stream[at : at + size]):
+            assert line == lines[found][:-1]
+            found += 1
+        at += size
+    assert found == len(lines)
+    three = b"".join(lines[:3])
+    expected = [decode_from_robot(line[:-1]) for line in lines[:3]]
+    differences = 0
+    for cut in range(len(three) + 1):
+        buffer = LineBuffer()
+        seen = [decode_from_robot(line) for part in (three[:cut], three[cut:]) for line in buffer.feed(part)]
+        differences += seen != expected
+    measured("L5", differences)
+
+
+# -- floods and trickles ----------------------------------------------------------------------------------------------
+
+
+class Timed(RobotLink):
+    """Notes the processor time of each pass of the event loop that serves the link."""
+
+    passes_s: list[float]
+
+    def data_received(self, data: bytes) -> None:
+        begun = time.thread_time()
+        super().data_received(data)
+        self.passes_s.append(time.thread_time() - begun)
+
+
+@contextmanager
+def flooding_robot() -> Iterator[int]:
+    """A robot that sends valid frames as fast as the client takes them, from a thread of its own."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.settimeout(DEADLINE_S)
+
+        def flood() -> None:
+            peer, _ = listener.accept()
+            with peer:
+                peer.settimeout(DEADLINE_S)
+                try:
+                    peer.sendall(encode(HELLO))
+                    peer.recv(4096)
+                    peer.sendall(JOINED)
+                    for block in range(8000):
+                        peer.sendall(b"".join(frame(25 * block + k) for k in range(25)))
+                except ConnectionError:
+                    return
+
+        thread = threading.Thread(target=flood)
+        thread.start()
+        try:
+            yield listener.getsockname()[1]
+        finally:
+            thread.join(DEADLINE_S)
+            assert not thread.is_alive()
+
+
+async def flooded(kind: type[RobotLink]) -> tuple[RobotLink, list[int], str]:
+    """A flooded link, the frames that came through, and why it ended."""
+    seqs: list[int] = []
+    over: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+    with flooding_robot() as port:
+        link = kind(host="127.0.0.1", port=port, role="controller", client="test", key=None,
+                    on_sensors=lambda sensors, _: seqs.append(sensors.seq), on_lost=over.set_result)  # fmt: skip
+        if isinstance(link, Timed):
+            link.passes_s = []
+        await link.connect(DEADLINE_S)
+        async with asyncio.timeout(DEADLINE_S):
+            why = await over
+    return link, seqs, why
+
+
+@pytest.mark.fault("L4")
+async def test_a_flood_ends_its_session_and_the_event_loop_keeps_its_turns(measured: Measured) -> None:
+    link, seqs, why = await flooded(Timed)
+    assert "flood" in why
+    assert isinstance(link, Timed)
+    limit = BACKLOG_S * HELLO.frame_hz
+    assert 0 < len(seqs) <= limit * 1.5
+    measured("L4", 1e3 * float(np.quantile(link.passes_s, 0.999)))
+
+
+@pytest.mark.fault("L4")
+async def test_a_flood_takes_no_memory(measured: Measured) -> None:
+    tracemalloc.start()
+    try:
+        before, _ = tracemalloc.get_traced_memory()
+        await flooded(RobotLink)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    # The flooder's own block and the socket's buffer are in it.
+    measured("L4", (peak - before) / (1 << 20), "MiB")
+
+
+def test_what_piled_up_in_half_a_minute_is_no_flood() -> None:
+    budget = LineBudget(30.0 * 100.0, 3.0 * 100.0)
+    assert budget.take(2999, 100.0)  # at once, after a stall
+    assert all(budget.take(1, 100.0 + 0.01 * k) for k in range(1000))
+    assert all(budget.take(3, 110.0 + 0.01 * k) for k in range(3000))
+    assert not budget.take(3001, 1000.0)
+    assert not budget.take(1, 1000.0)
+    assert FLOOD_FACTOR == 3.0
+
+
+class Wire:
+    """The robot's side of a connection."""
+
+    def __init__(self) -> None:
+        self.sent, self.is_closed = b"", False
+
+    def write(self, data: bytes) -> None:
+        self.sent += data
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+@cache
+def joined_line(role: str) -> bytes:
+    return b'{"type":"join","role":"%s","client":"test"}\n' % role.encode()
+
+
+def server(*, key: bytes | None = None, lockstep: bool = False) -> RobotServer:
+    """The robot's end of the link without sockets, at second 0."""
+    cfg = load_config()
+    return RobotServer(
+        Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(1)),
+        lockstep=lockstep, boot=1, key=key, make_nonce=lambda: f"{random.getrandbits(128):032x}", now_s=0.0,
+        note=lambda _: None, on_frame=lambda: None,
+    )  # fmt: skip
+
+
+@pytest.mark.fault("L6")
+def test_a_client_that_trickles_is_closed_in_time_and_nobody_else_notices(measured: Measured) -> None:
+    robot = server()
+    driver, trickler = Wire(), Wire()
+    session = robot.accept(driver, 0.0)
+    session.receive(joined_line("controller"), 0.0)
+    slow = robot.accept(trickler, 0.0)
+    text, closed_s, frames = joined_line("monitor"), None, 0
+    for k in range(1, 400):
+        now_s = 0.01 * k
+        while robot.next_frame_s <= now_s:
+            robot.tick(robot.next_frame_s)
+            frames += 1
+            session.receive(b'{"type":"drive","seq":%d,"ack":0,"wr":1.0,"wl":1.0}\n' % k, now_s)
+        if not trickler.is_closed and k % 100 == 0:
+            slow.receive(text[k // 100 : k // 100 + 1], now_s)  # a byte a second
+        if k % 25 == 0:
+            robot.check_time(now_s)
+        if trickler.is_closed and closed_s is None:
+            closed_s = now_s
+    assert closed_s is not None
+    measured("L6", closed_s)
+    assert b"bad join" in trickler.sent
+    assert driver.sent.count(b'"type":"sensors"') == frames > 300
+    assert not robot.robot.rules.is_held
+
+
+@pytest.mark.fault("L6")
+async def test_a_robot_that_trickles_is_given_up() -> None:
+    over = asyncio.Event()
+
+    async def trickle(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        for k in range(len(encode(HELLO))):
+            writer.write(encode(HELLO)[k : k + 1])
+            if reader.at_eof() or over.is_set():
+                break
+            await asyncio.sleep(0.02)
+        writer.close()
+        over.set()
+
+    listening = await asyncio.start_server(trickle, "127.0.0.1", 0)
+    link = RobotLink(host="127.0.0.1", port=listening.sockets[0].getsockname()[1], role="controller", client="test",
+                     key=None, on_sensors=lambda *_: None, on_lost=lambda _: None)  # fmt: skip
+    try:
+        with pytest.raises(RobotTimeout, match="no answer from the robot"):
+            await link.connect(0.2)
+    finally:
+        listening.close()
+        async with asyncio.timeout(DEADLINE_S):
+            await over.wait()
+        await listening.wait_closed()
+
+
+# -- who is not who they should be ------------------------------------------------------------------------------------
+
+
+@pytest.mark.fault("L8")
+def test_a_thousand_others_do_not_disturb_who_drives(measured: Measured) -> None:
+    """Every frame and every set point is as without them; what they cost is their own processor time."""
+    costs_s: list[float] = []
+
+    def drive(rogues: int) -> bytes:
+        robot, wire = server(lockstep=True), Wire()
+        session = robot.accept(wire, 0.0)
+        session.receive(joined_line("controller"), 0.0)
+        for k in range(100):
+            begun = time.thread_time()
+            for _ in range(rogues):
+                rogue = robot.accept(Wire(), 0.01 * k)
+                rogue.receive(random.choice((joined_line("controller"), b"\xff\n", b"GET / HTTP/1.1\r\n")), 0.01 * k)
+                robot.lost(rogue)
+            costs_s.append(time.thread_time() - begun)
+            ack = robot.robot.delivered_seq
+            session.receive(b'{"type":"drive","seq":%d,"ack":%d,"wr":1.0,"wl":0.9}\n' % (k, ack), 0.01 * k)
+        return wire.sent.partition(b"\n")[2]
+
+    alone, crowded = drive(0), drive(10)  # of 10 ms each: 1000 a second
+    assert alone == crowded
+    assert crowded.count(b'"type":"sensors"') == 101
+    measured("L8", 1e3 * float(np.quantile(costs_s, 0.99)) / 10)
+
+
+@pytest.mark.fault("L9")
+async def test_a_recorded_session_opens_no_door(measured: Measured) -> None:
+    accepted = 0
+    async with robot_behind_proxy(lockstep=True, key=KEY) as (loop, proxy):
+        driver = Driver(proxy.port, KEY)
+        recorded: list[bytes] = []
+        send = driver.link.send_raw
+
+        def send_and_keep(data: bytes) -> None:
+            recorded.append(data)
+            send(data)
+
+        driver.link.send_raw = send_and_keep  # type: ignore[method-assign]
+        await driver.link.connect(DEADLINE_S)
+        await driver.drive(20)
+        driver.link.close()
+        assert b'"mac"' in recorded[0]
+        session = b"".join(recorded)
+        guesses = [session, session.replace(b'"controller"', b'"monitor"'), session.replace(b'"mac":"', b'"mac":"0')]
+        guesses += [b"".join(recorded[1:]), recorded[0].replace(b'"test"', b'"main"')]
+        while not loop.robot.rules.is_held or proxy.connections:
+            await asyncio.sleep(0.001)  # the last of its drives and its end are on their way
+            loop.robot.rules.set_points(loop.robot.t_s)
+        before = loop.server.counts["refused"], loop.robot.seq
+        for guess in guesses:
+            reader, writer = await asyncio.open_connection("127.0.0.1", proxy.port)
+            writer.write(guess)
+            async with asyncio.timeout(DEADLINE_S):
+                answer = await reader.read()
+            accepted += b'"joined"' in answer
+            assert b'"refused"' in answer
+            writer.close()
+            await writer.wait_closed()
+        assert loop.server.counts["refused"] == before[0] + len(guesses)
+        assert loop.robot.seq == before[1]
+    measured("L9", accepted)
+
+
+@pytest.mark.fault("L9")
+async def test_commands_that_come_again_are_dropped() -> None:
+    async with robot_behind_proxy(lockstep=True) as (loop, proxy):
+        driver = Driver(proxy.port)
+        await driver.link.connect(DEADLINE_S)
+        proxy.duplicate("to_server", 1)
+        await driver.drive(FRAMES)
+        assert loop.server.counts["stale"] >= FRAMES - 5
+        driver.link.close()
+
+
+@pytest.mark.fault("L12")
+@pytest.mark.parametrize(
+    "protocol",
+    ["ccatp-robot/2", "ccatp-robot/0", "ccatp-robot/10", "ccatp-robot/1.1", "ccatp-robot", "CCATP-ROBOT/1", "other/1",
+     "", " ccatp-robot/1", "ccatp-robot/1\u200b"],
+)  # fmt: skip
+async def test_no_other_version_is_joined(protocol: str, measured: Measured) -> None:
+    heard: list[bytes] = []
+
+    async def speak(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        hello = encode(HELLO).replace(PROTOCOL.encode(), protocol.encode())
+        writer.write(hello)
+        heard.append(await reader.read())
+        writer.close()
+
+    listening = await asyncio.start_server(speak, "127.0.0.1", 0)
+    link = RobotLink(host="127.0.0.1", port=listening.sockets[0].getsockname()[1], role="controller", client="test",
+                     key=None, on_sensors=lambda *_: None, on_lost=lambda _: None)  # fmt: skip
+    with pytest.raises(WrongProtocol, match="this program ccatp-robot/1"):
+        await link.connect(DEADLINE_S)
+    async with asyncio.timeout(DEADLINE_S):
+        while not heard:  # noqa: ASYNC110 - the server's task has no event
+            await asyncio.sleep(0)
+    listening.close()
+    await listening.wait_closed()
+    assert heard == [b""]  # no join, no command
+    measured("L12", 100.0 if heard == [b""] else 0.0)
+
+
+# -- small messages ---------------------------------------------------------------------------------------------------
+
+
+async def round_trips(count: int) -> list[float]:
+    """Times from a frame to the next one in lockstep: our answer's way, the robot's step, the frame's way."""
+    times_s: list[float] = []
+    cfg = load_config(overrides={"sim.robot.port": 0})
+    robot, stop = DataLoop(cfg, True, 1), asyncio.Event()
+    port = await robot.start()
+    async with asyncio.TaskGroup() as tasks:
+        tasks.create_task(robot.run(stop))
+        done = asyncio.Event()
+
+        def on_sensors(frame: Sensors, _: bytes) -> None:
+            times_s.append(time.perf_counter())
+            link.send_drive(frame.seq + 1, frame.seq, 0.0, 0.0)
+            if len(times_s) > count:
+                done.set()
+
+        link = RobotLink(host="127.0.0.1", port=port, role="controller", client="test", key=None,
+                         on_sensors=on_sensors, on_lost=lambda _: done.set())  # fmt: skip
+        await link.connect(DEADLINE_S)
+        async with asyncio.timeout(DEADLINE_S):
+            await done.wait()
+        link.close()
+        stop.set()
+    return list(np.diff(times_s))
+
+
+@pytest.mark.fault("L10")
+async def test_answers_do_not_wait_for_more_to_send(measured: Measured) -> None:
+    """With small messages held back each round trip would take 40 ms; the median does not mind a busy machine."""
+    measured("L10", 1e3 * statistics.median(await round_trips(200)))
+
+
+@pytest.mark.slow
+@pytest.mark.fault("L10")
+async def test_99_of_100_round_trips(measured: Measured) -> None:
+    measured("L10", 1e3 * float(np.quantile(await round_trips(5000), 0.99)))

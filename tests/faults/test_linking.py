@@ -1,0 +1,243 @@
+"""The machinery that holds fault table and tests against each other notices every way in which they can differ."""
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from tests.faults.linking import Seen, judge
+from tests.faults.table import PATH, ROWS, Row, conformance_rows, load_table
+
+ROOT = PATH.parents[2]
+TABLE = """
+[A1]
+fault = "what breaks"
+detection = "how it shows"
+reaction = "what then"
+bound = "by when"
+severity = "hold"
+at_most = { ms = 100, mm = 30 }
+at_least = { percent = 20 }
+
+[A2]
+fault = "another"
+detection = "how it shows"
+reaction = "what then"
+bound = "by when"
+severity = "hold"
+"""
+SHOWN = """
+import pytest
+
+@pytest.mark.fault("A1")
+def test_one(measured):
+    measured("A1", 80)
+    measured("A1", 90.5)
+    measured("A1", 20)
+    measured("A1", 20, "percent")
+
+@pytest.mark.fault("A2")
+@pytest.mark.parametrize("case", ["a@b", "c"])
+@pytest.mark.xdist_group("together")
+def test_two(case):
+    pass
+"""
+
+
+class Project:
+    """A project of one test file and a table; ``run`` gives what pytest printed, and the record."""
+
+    def __init__(self, pytester: pytest.Pytester, tests: str, table: str) -> None:
+        self._pytester, self.record = pytester, pytester.path / "record.json"
+        pytester.makepyfile(test_it=tests)
+        pytester.makeini(
+            "[pytest]\ntestpaths = .\naddopts = -m 'not slow'\nmarkers = slow: takes minutes\n"
+            "asyncio_default_fixture_loop_scope = function"
+        )
+        (pytester.path / "table.toml").write_text(table)
+
+    def run(self, *args: str, in_process: bool = True) -> tuple[int, str]:
+        """Exit status and output."""
+        options = ["-p", "tests.faults.linking", "-p", "no:cacheprovider", "--fault-table=table.toml"]
+        run = self._pytester.runpytest_inprocess if in_process else self._pytester.runpytest_subprocess
+        result = run(*options, f"--fault-record={self.record}", *args)
+        return int(result.ret), result.stdout.str()
+
+
+def project(pytester: pytest.Pytester, tests: str = SHOWN, table: str = TABLE) -> Project:
+    return Project(pytester, tests, table)
+
+
+def test_the_table_holds_every_row() -> None:
+    table = load_table()
+    assert list(table) == [f"{kind}{number}" for kind, count in ROWS.items() for number in range(1, count + 1)]
+    assert len({row.fault for row in table.values()}) == len(table)
+    assert set(conformance_rows(table)) == {row_id for row_id, row in table.items() if row.hardware}
+    assert Counter(row.severity for row in table.values())["fault"] >= 5
+
+
+def test_all_shown(pytester: pytest.Pytester) -> None:
+    it = project(pytester)
+    status, said = it.run()
+    assert (status, "fault table" in said) == (0, False), said
+    kept = json.loads(it.record.read_text())["test_it.py::test_one"]
+    assert kept["values"] == {"A1:ms": 90.5, "A1:percent": 20.0}
+    assert (kept["rows"], kept["slow"]) == (["A1"], False)
+
+
+def test_all_shown_by_workers(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    slow = TABLE + '\n[A3]\nfault = "slow one"\ndetection = "how"\nreaction = "what"\nbound = "when"\n'
+    slow += 'severity = "hold"\nslow = true\n'
+    it = project(pytester, SHOWN + '\n@pytest.mark.slow\n@pytest.mark.fault("A3", "A7")\ndef test_slow(): pass\n', slow)
+    status, said = it.run("-n1", "--dist=loadgroup", in_process=False)
+    # The workers have told of the test that they did not run: its row is shown elsewhere, its mistake found.
+    assert status == 1
+    assert "test_it.py::test_slow is marked for A7, which is no row of the table" in said
+    assert "slow one" not in said
+    assert sorted(json.loads(it.record.read_text())) == [
+        "test_it.py::test_one", "test_it.py::test_two[a@b]", "test_it.py::test_two[c]",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (('@pytest.mark.fault("A2")\n', ""), "A2 (another): no test is marked for it"),
+        (('fault("A2")', 'fault("A2", "B9")'), "test_it.py::test_two[c] is marked for B9, which is no row"),
+        (('fault("A2")', "fault()"), "test_it.py::test_two[c] is marked, but for no row"),
+        (("    pass", "    assert case == 'c'"), "A2 (another): test_it.py::test_two[a@b] failed"),
+        (("    pass", "    pytest.skip('no')"), "A2 (another): test_it.py::test_two[a@b] did not pass"),
+        (("    pass", "    pytest.xfail('no')"), "A2 (another): test_it.py::test_two[a@b] did not pass"),
+        (('fault("A2")', 'fault("A2")\n@pytest.mark.slow'), "A2 (another): no test is marked for it"),
+        (("90.5", "100.1"), "A1: measured 100.1 ms, at most 100 allowed"),
+        (("90.5", 'float("nan")'), "A1: measured nan ms, at most 100 allowed"),
+        (('20, "percent"', '19, "percent"'), "A1: measured 19 percent, at least 20 allowed"),
+        (('20, "percent"', '20, "km"'), "measured('A1'): the row has no limit in km"),
+        (('measured("A1", 20)', 'measured("A2", 20)'), "measured('A2'): the test is not marked for that row"),
+    ],
+)  # fmt: skip
+def test_what_differs_fails(pytester: pytest.Pytester, change: tuple[str, str], problem: str) -> None:
+    assert change[0] in SHOWN
+    status, said = project(pytester, SHOWN.replace(*change)).run()
+    assert status == 1
+    assert problem in said
+    # A broken measurement fails its test, and with it its row.
+    assert ("A1 (what breaks): test_it.py::test_one failed" in said) == problem.startswith(("A1:", "measured"))
+
+
+def test_a_teardown_that_fails_shows_nothing(pytester: pytest.Pytester) -> None:
+    broken = "\n@pytest.fixture\ndef breaks():\n    yield\n    raise OSError\n"
+    it = project(
+        pytester, SHOWN.replace("import pytest\n", "import pytest\n" + broken).replace("(case)", "(case, breaks)")
+    )
+    status, said = it.run()
+    assert status == 1
+    assert "A2 (another): test_it.py::test_two[a@b] failed" in said
+    assert list(json.loads(it.record.read_text())) == ["test_it.py::test_one"]
+
+
+def test_a_selection_stands_aside_but_for_wrong_marks(pytester: pytest.Pytester) -> None:
+    it = project(pytester)
+    for args in (("-k", "one"), ("test_it.py::test_one",), ("--deselect", "test_it.py::test_two")):
+        status, said = it.run(*args)
+        assert (status, "fault table" in said) == (0, False), said
+    it = project(pytester, SHOWN.replace('fault("A2")', 'fault("B9")'))
+    status, said = it.run("-k", "one")
+    assert status == 1
+    assert "B9, which is no row" in said
+
+
+def test_slow_rows_are_shown_by_slow_runs(pytester: pytest.Pytester) -> None:
+    slow_row = TABLE.replace("[A2]", "[A2]\nslow = true")
+    slow_test = SHOWN.replace('fault("A2")', 'fault("A2")\n@pytest.mark.slow')
+    it = project(pytester, slow_test, slow_row)
+    assert it.run()[0] == 0  # the test is there
+    assert it.run("-m", "slow")[0] == 0
+    # Both runs are in the record.
+    assert len(json.loads(it.record.read_text())) == 3
+    status, said = project(pytester, SHOWN, slow_row).run()
+    assert status == 1
+    assert "A2 (another): no slow test is marked for it" in said
+    it = project(pytester, slow_test.replace("    pass", "    raise OSError"), slow_row)
+    assert it.run()[0] == 0
+    status, said = it.run("-m", "slow")
+    assert status == 1
+    assert "A2 (another): test_it.py::test_two[a@b] failed" in said
+
+
+def test_open_rows_are_told_and_do_no_harm(pytester: pytest.Pytester) -> None:
+    open_rows = TABLE.replace("[A1]", '[A1]\nopen = "not built"').replace("[A2]", '[A2]\nopen = "nor this"')
+    status, said = project(pytester, SHOWN.replace('fault("A2")', "slow"), open_rows).run()
+    assert status == 0
+    assert "2 rows open: A1 (not built); tests show it by now, A2 (nor this)" in said
+
+
+def test_a_run_that_was_stopped_is_not_judged(pytester: pytest.Pytester) -> None:
+    status, said = project(pytester, SHOWN.replace("measured(", "assert 0, (", 1)).run("-x")
+    assert status == 1
+    assert "no test is marked" not in said
+    assert "A2" not in said
+
+
+def test_without_real_time_other_limits_hold() -> None:
+    row = load_table()["P1"]
+    assert row.allows("ms", 100.0, is_realtime=True)
+    assert not row.allows("ms", 100.1, is_realtime=True)
+    assert row.allows("ms", 250.0, is_realtime=False)
+    assert not row.allows("ms", 250.1, is_realtime=False)
+    assert row.limit("s", is_realtime=False) == ("at most", 3.0)
+
+
+def test_one_test_of_several_is_enough_and_a_failing_one_spoils_it() -> None:
+    table = {"A1": load_table()["S1"].model_copy(update={"open": None})}
+    passed = Seen(("A1",), is_slow=False, passed=True)
+    other = Seen(("A1",), is_slow=True)
+    assert judge(table, {"one": passed, "two": other}, "default").problems == []
+    other.failed = True
+    assert judge(table, {"one": passed, "two": other}, "default").problems == [f"A1 ({table['A1'].fault}): two failed"]
+
+
+def test_what_the_robot_keeps_by_itself_needs_a_test_of_its_own() -> None:
+    table = {"L1": load_table()["L1"].model_copy(update={"open": None})}
+    ours = Seen(("L1",), is_slow=False, passed=True)
+    robots = Seen(("L1",), is_slow=False, passed=True, of_robot=("L1",))
+    assert judge(table, {"ours": ours, "robots": robots}, "default").problems == []
+    (problem,) = judge(table, {"ours": ours}, "default").problems
+    assert "of the robot's part no test is marked for it" in problem
+    (problem,) = judge(table, {"robots": robots}, "default").problems
+    assert problem == f"L1 ({table['L1'].fault}): no test is marked for it"
+    robots.passed = False
+    (problem,) = judge(table, {"ours": ours, "robots": robots}, "default").problems
+    assert "of the robot's part robots did not pass" in problem
+    assert judge(table, {"ours": ours, "robots": robots}, "slow").problems == []
+
+
+ROW = {"fault": "what", "detection": "how", "reaction": "then", "bound": "when", "severity": "hold"}
+
+
+@pytest.mark.parametrize(
+    ("keys", "why"),
+    [
+        ({"severity": "bad"}, "severity"),
+        ({"bund": "x"}, "bund"),
+        ({"bound": ""}, "bound"),
+        ({"open": ""}, "open"),
+        ({"hardware": "the robot"}, "hardware and conformance belong together"),
+        ({"conformance": ["mac"]}, "hardware and conformance belong together"),
+        ({"hardware": "the robot", "conformance": ["mac", "mc"]}, "no check \\['mc'\\]"),
+        ({"at_most": {"ms": 1}, "at_least": {"ms": 1}}, "at_most and in at_least"),
+        ({"without_realtime": {"ms": 1}}, "without_realtime has \\['ms'\\], at_most has not"),
+    ],
+)
+def test_rows_that_are_none(keys: dict[str, object], why: str) -> None:
+    Row.model_validate(ROW)
+    with pytest.raises(ValidationError, match=why):
+        Row.model_validate(ROW | keys)
+
+
+def test_the_table_is_read_from_any_file(tmp_path: Path) -> None:
+    (tmp_path / "table.toml").write_text(TABLE)
+    assert list(load_table(tmp_path / "table.toml")) == ["A1", "A2"]

@@ -1,0 +1,427 @@
+"""Operator and observatory: aborts in every state, by whatever way they come, and a robot that nobody looks after."""
+
+import itertools
+import random
+import threading
+import time
+from collections.abc import Callable
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.hazards.abort_latch import AbortLatch, EmergencyKind
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.planning.bound import path_time
+from ccatp.planning.way_home import plan_way_home
+from ccatp.router import REPEAT_S, RequestFailed, request
+from ccatp.samples import DeckPose, EventCode
+from ccatp.surveying.budget import home_time_s
+from ccatp.surveying.states import State
+from ccatp.surveying.vigil import Call, Vigil
+from ccatp.wire.channels import format_ok
+from ccatp.wire.robot import Sensors
+from tests.faults.campaign import single
+from tests.faults.laser import FULL, DeskRehearsal
+from tests.unit.test_mission import DT, FREE, FRONT_OFF, Story
+
+Note = Callable[[str, float], None]
+SURVEYING = (State.TURNING, State.DRIVING, State.SETTLING, State.MEASURING)
+TABLE_ROWS = [(kind, level, held) for kind in EmergencyKind for level in (False, True) for held in (False, True)]
+
+
+def one_panel(**changes: Any) -> Config:
+    short: dict[str, Any] = {"run.world": "thesis", "mission.calibration_length_m": 0.0}
+    return load_config(overrides={"run.panels": 1, "run.seed": 3} | short | changes)
+
+
+@pytest.fixture(scope="module")
+def config(config: Config) -> Config:
+    return config.model_copy(update={"mission": config.mission.model_copy(update={"fix_at_start": False})})
+
+
+@pytest.fixture(scope="module")
+def mirror(config: Config) -> Mirror:
+    return build_mirror(config.mirror)
+
+
+@pytest.fixture
+def story(config: Config, mirror: Mirror) -> Story:
+    return Story(config, mirror)
+
+
+class Aborted(DeskRehearsal):
+    """An emergency in a given state of the mission, and how long it took until the wheels were told to stand."""
+
+    def __init__(self, cfg: Config, folder: Path, state: State, kind: str, clear_after_s: float = inf) -> None:
+        super().__init__(cfg, folder)
+        self._at, self._kind, self._clear_after_s = state, kind, clear_after_s
+        self.raised_s = self.zero_s = self.cleared_s = inf
+        self.moved_while_held = False
+
+    def look(self, frame: Sensors) -> None:
+        if self.raised_s == inf and self.mission.done and self.mission.state is self._at:
+            self.raised_s = frame.t
+            assert self.monitor.emergency(self._kind, "e") is None
+        if self.cleared_s == inf and frame.t - self.raised_s >= self._clear_after_s:
+            self.cleared_s = frame.t
+            assert self.monitor.clear("e", at_base_or_held=self.mission.state is State.HELD) is None
+
+    def _foresee(self, number: int, right: float, left: float) -> None:
+        super()._foresee(number, right, left)
+        frame = self.robot.delivered
+        assert frame is not None
+        if self.raised_s <= frame.t and right == left == 0.0:
+            self.zero_s = min(self.zero_s, frame.t)
+        if self.zero_s < frame.t < self.cleared_s:
+            self.moved_while_held |= not right == left == 0.0
+
+
+# -- O1: aborts -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.fault("O1")
+@pytest.mark.parametrize("state", [State.DRIVING, State.TURNING, State.MEASURING])
+def test_a_fire_stops_the_wheels_and_leads_home(state: State, tmp_path: Path, measured: Note) -> None:
+    run = Aborted(one_panel(), tmp_path, state, "fire")
+    result = run.run()
+    measured("O1", 1e3 * (run.zero_s - run.raised_s))
+    assert run.zero_s - run.raised_s <= 0.1
+    assert (result.outcome, result.cause) == ("aborted, at base", "emergency: fire")
+    assert run.fans == []
+    left_out = run.mission.left_out
+    assert len(left_out) + len(run.mission.done) == 9
+    assert set(left_out.values()) == {"emergency: fire"}
+
+
+@pytest.mark.fault("O1")
+@pytest.mark.parametrize("state", [State.DRIVING, State.TURNING])
+def test_an_earthquake_presses_on_holds_and_leads_home_when_it_is_over(
+    state: State, tmp_path: Path, measured: Note
+) -> None:
+    run = Aborted(one_panel(**{"run.mirror": "fyst-m2"}), tmp_path, state, "earthquake", clear_after_s=5.0)
+    result = run.run()
+    measured("O1", 1e3 * (run.zero_s - run.raised_s))
+    assert run.zero_s - run.raised_s <= 0.1
+    assert run.fans == [(run.raised_s, FULL)]  # in the same frame
+    assert run.cleared_s < inf
+    assert not run.moved_while_held
+    assert result.outcome == "aborted, at base"
+    assert result.summary["danger"]["falls"] == 0
+    after = [m for m in run.asked if m.t_s > run.cleared_s]
+    assert [m.point for m in after] == [None]  # where it stands is not known any more, and only that is asked
+
+
+@pytest.mark.fault("O1")
+def test_during_an_earthquake_nobody_resumes(story: Story) -> None:
+    quake = replace(
+        FREE,
+        code=EventCode.ABORTED,
+        cause="emergency: earthquake",
+        signal="emergency:earthquake",
+        forward=False,
+        reverse=False,
+        turn=False,
+    )
+    story.until_state(State.DRIVING)
+    story.frame(quake)
+    assert story.mission.is_paused
+    assert story.mission.resume() == "emergency: earthquake: nothing moves until that is cleared"
+    assert story.mission.abort("operator") is None
+    assert story.mission.state is State.HELD
+    story.until_state(State.DONE)  # it is over
+    assert story.mission.done == []
+
+
+@pytest.mark.fault("O1")
+def test_the_way_home_is_planned_before_the_robot_misses_it(measured: Note) -> None:
+    longest_s = 0.0
+    for name in ("fyst-m1", "fyst-m2"):
+        cfg = load_config(overrides={"run.mirror": name})
+        mirror = build_mirror(cfg.mirror)
+        for panel in list(mirror.panels)[::6]:
+            x, y = mirror.point_on_deck(mirror.point_ids(panel)[0])
+            tries = []
+            for _ in range(2):
+                begun_s = time.process_time()
+                plan_way_home(mirror, DeckPose(x, y, 1.0), mirror.base_pose, cfg.robot, cfg.limits, cfg.mission)
+                tries.append(time.process_time() - begun_s)
+            longest_s = max(longest_s, min(tries))
+    assert longest_s <= 0.2
+
+
+# -- O2, O3: back-off, repetition -------------------------------------------------------------------------------------
+
+
+@pytest.mark.fault("O2")
+@pytest.mark.parametrize("frames", [0, 1, 10, 40, 80])
+def test_an_abort_during_a_back_off_never_drives_forward_and_is_home_bound_soon(
+    frames: int, story: Story, measured: Note
+) -> None:
+    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    story.frame(FRONT_OFF)
+    for _ in range(frames):
+        story.frame(FRONT_OFF)
+    story.mission.abort("fire")
+    begun_s, first = story.t, len(story.orders)
+    for _ in range(20):
+        story.frame(FRONT_OFF)
+    story.until_state(State.RETURNING)
+    measured("O2", story.t - begun_s)
+    assert story.t - begun_s <= 2.0
+    assert all(order.twist.v_m_s <= 0.0 for order in story.orders[first:])
+    story.until_state(State.DONE)
+    assert story.mission.done == []
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.lists(st.integers(0, 250), max_size=6))
+@pytest.mark.fault("O3")
+def test_repeated_aborts_change_nothing(config: Config, mirror: Mirror, again: list[int]) -> None:
+    def drive(repeats: list[int]) -> list[object]:
+        story = Story(config, mirror)
+        trace: list[object] = []
+        for k in range(400):
+            if k == 60 or (k > 60 and k - 60 in repeats):
+                story.mission.abort("fire")
+            trace.append(story.frame())
+        return trace
+
+    assert drive(again) == drive([])
+
+
+@pytest.mark.fault("O3")
+@given(st.lists(st.tuples(st.sampled_from(["a", "b"]), st.sampled_from(["raise", "clear"])), max_size=12))
+def test_an_id_counts_once(events: list[tuple[str, str]]) -> None:
+    latch = AbortLatch()
+    raised, cleared = set(), set()
+    for name, what in events:
+        if what == "raise":
+            assert latch.raise_emergency("fire", name) is None
+            raised.add(name)
+        elif latch.clear(name, at_base_or_held=True) is None:
+            cleared.add(name)
+        assert latch.is_latched is bool(raised - cleared)
+
+
+# -- O4: lost messages ------------------------------------------------------------------------------------------------
+
+
+class LossyRelay:
+    """Carries requests to a desk that answers each, and loses half of all messages, both ways."""
+
+    def __init__(self, seed: int) -> None:
+        self._rng = random.Random(seed)
+        self.lost = 0
+        self.heard: list[tuple[bytes, float]] = []
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.ROUTER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self.endpoint = f"tcp://127.0.0.1:{self._socket.bind_to_random_port('tcp://127.0.0.1')}"
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _is_lost(self) -> bool:
+        is_lost = self._rng.random() < 0.5
+        self.lost += is_lost
+        return is_lost
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            if not self._socket.poll(5):
+                continue
+            *envelope, payload = self._socket.recv_multipart()
+            if self._is_lost():
+                continue
+            self.heard.append((payload, time.monotonic()))
+            if not self._is_lost():
+                self._socket.send_multipart([*envelope, format_ok()])
+
+    def close(self) -> None:
+        self._stopping.set()
+        self._thread.join()
+        self._socket.close()
+        self._context.term()
+
+
+@pytest.mark.fault("O4")
+def test_an_emergency_is_told_until_it_is_heard(measured: Note) -> None:
+    relay = LossyRelay(3)
+    repeats = []
+    for k in range(20):
+        payload = f"{k}".encode()
+        assert request(relay.endpoint, payload, 10.0, repeats=True)["ok"]
+        repeats.append(sum(heard == payload for heard, _ in relay.heard))
+    relay.close()
+    assert relay.lost > 20
+    assert min(repeats) >= 1
+    assert max(repeats) > 1  # an answer was lost, and asked for again
+    # So many of these periods fit into the second; all their messages lost has this probability.
+    unheard = 0.5 ** (1.0 / REPEAT_S)
+    measured("O4", 1.0 - unheard)
+    assert unheard <= 1e-4
+
+
+@pytest.mark.fault("O4")
+def test_what_must_not_be_asked_twice_is_asked_once() -> None:
+    relay = LossyRelay(0)
+    relay._is_lost = lambda: False  # type: ignore[method-assign]
+    assert request(relay.endpoint, b"resume", 5.0)["ok"]
+    relay._is_lost = lambda: True  # type: ignore[method-assign]
+    with pytest.raises(RequestFailed, match=r"no answer from .* within 0\.3 s"):
+        request(relay.endpoint, b"resume", 0.3)
+    relay.close()
+    assert [payload for payload, _ in relay.heard] == [b"resume"]
+
+
+# -- O7: clear --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.fault("O7")
+@pytest.mark.parametrize(("kind", "level", "held"), TABLE_ROWS)
+def test_a_clear_is_refused_with_a_reason_while_the_cause_persists(
+    kind: EmergencyKind, level: bool, held: bool
+) -> None:
+    latch = AbortLatch()
+    latch.raise_emergency(kind.value, "a")
+    latch.set_level(kind, level)
+    refusal = latch.clear("a", at_base_or_held=held)
+    assert latch.is_latched is (level or not held)
+    if level:
+        assert refusal == f"the cause persists: {kind}"
+    else:
+        assert refusal == (None if held else "the robot is neither at base nor held")
+
+
+# -- O8: nobody there -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.fault("O8", "F6")
+@pytest.mark.parametrize("home_s", [30.0, 120.0, 400.0])
+def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
+    home_s: float, story: Story, config: Config, measured: Note
+) -> None:
+    cfg = config.mission
+    story.until_state(State.DRIVING)
+    story.mission.fault("leg overdue")
+    vigil = Vigil(cfg, falls=True)
+    reminders: list[float] = []
+    soc, drain = 0.5, 1.0 / cfg.battery_endurance_s
+    while story.mission.is_faulted:
+        story.frame()
+        soc -= 50.0 * DT * drain
+        t_s = 50.0 * story.t
+        call = vigil.watch(t_s, soc, home_s)
+        if call is Call.REMIND:
+            reminders.append(t_s)
+        elif call is Call.RETURN:
+            story.mission.abort("nobody came")
+    at_dock = soc - home_s * drain
+    measured("O8", (soc - cfg.battery_reserve) / (home_s * drain))
+    measured("F6", 100.0 * at_dock)
+    assert story.mission.state is State.RETURNING
+    assert at_dock >= cfg.battery_reserve
+    assert (soc - cfg.battery_reserve) / (home_s * drain) >= 1.5 - 0.1  # a frame of this story is half a second
+    assert len(reminders) >= 20
+    assert all(b - a == pytest.approx(60.0, abs=1.0) for a, b in itertools.pairwise(reminders))
+
+
+@pytest.mark.fault("O8")
+def test_who_does_not_know_where_it_is_stays_and_reminds(config: Config) -> None:
+    vigil = Vigil(config.mission, falls=True)
+    calls = [vigil.watch(float(t), 0.01, None) for t in range(200)]
+    assert [t for t, call in enumerate(calls) if call is not Call.NOTHING] == [60, 120, 180]
+    assert set(calls) == {Call.NOTHING, Call.REMIND}
+
+
+@pytest.mark.fault("O8")
+def test_a_return_is_tried_once_and_only_where_the_robot_would_fall(config: Config) -> None:
+    vigil = Vigil(config.mission, falls=True)
+    assert [vigil.watch(t, 0.1, 30.0) for t in (0.0, 1.0, 61.0)] == [Call.RETURN, Call.NOTHING, Call.REMIND]
+    vigil.over()
+    assert vigil.held_s(100.0) == 0.0
+    assert vigil.watch(100.0, 0.1, 30.0) is Call.NOTHING
+    safe = Vigil(config.mission, falls=False)
+    assert {safe.watch(float(t), 0.0, 30.0) for t in range(50)} == {Call.NOTHING}
+
+
+# -- O9: the way home -------------------------------------------------------------------------------------------------
+
+
+def check_ways_home(step: int) -> tuple[int, int]:
+    """Ways home from every ``step``-th point of both mirrors of the thesis: how many, and how many are not valid."""
+    count = invalid = 0
+    rng = random.Random(9)
+    for name in ("thesis-m1", "thesis-m2"):
+        cfg = load_config(overrides={"run.mirror": name})
+        mirror = build_mirror(cfg.mirror)
+        base, least_m = mirror.base_pose, cfg.mission.leg_clearance_m - 1e-9
+        points = [point for panel in mirror.panels for point in mirror.point_ids(panel)]
+        for point in points[::step]:
+            count += 1
+            x, y = mirror.point_on_deck(point)
+            start = DeckPose(x, y, rng.uniform(-3.14, 3.14))
+            stops = plan_way_home(mirror, start, base, cfg.robot, cfg.limits, cfg.mission)
+            ends = [(stop.x_m, stop.y_m) for stop in stops]
+            legs = list(zip([(x, y), *ends], ends, strict=False))
+            # The first leg may begin nearer to the rim than legs keep to it, but leads away from it.
+            own_m = min(least_m, mirror.rim.signed_distance_m(x, y) - 1e-9)
+            clear_m = [mirror.rim.segment_clearance_m(*a, *b) for a, b in legs]
+            is_valid = clear_m[0] >= own_m and all(c >= least_m for c in clear_m[1:])
+            takes_s = path_time(stops, start, cfg.limits, mirror, 0.0)
+            invalid += not (is_valid and takes_s <= home_time_s(base, cfg.limits, x, y))
+    return count, invalid
+
+
+@pytest.mark.fault("O9")
+def test_the_way_home_stays_on_the_mirror_and_takes_no_longer_than_thought(measured: Note) -> None:
+    count, invalid = check_ways_home(9)
+    measured("O9", invalid)
+    assert (count, invalid) == (87 + 78, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.fault("O9")
+def test_the_way_home_from_every_point(measured: Note) -> None:
+    count, invalid = check_ways_home(1)
+    measured("O9", invalid)
+    assert (count, invalid) == (1485, 0)
+
+
+# -- O10: the budget --------------------------------------------------------------------------------------------------
+
+SLOW = 'signal = "body"\ntype = "slip"\nat_s = 20.0\nfor_s = 20.0\nfactor = 0.8'
+
+
+@pytest.mark.fault("O10")
+@pytest.mark.parametrize("budget_s", [45.0, 70.0])
+def test_what_does_not_fit_into_the_budget_is_left_out(budget_s: float, tmp_path: Path, measured: Note) -> None:
+    cfg = one_panel(**{"run.panels": 2, "run.budget_s": budget_s, "mission.holds_to_budget": True})
+    run = DeskRehearsal(cfg, tmp_path, plan=single(SLOW))
+    result = run.run()
+    points = result.summary["points"]
+    # The same share of an hour.
+    measured("O10", 3600.0 * result.mission_time_s / budget_s)
+    assert result.mission_time_s <= budget_s
+    assert result.outcome in {"complete", "aborted, at base"}
+    assert 0 < points["measured"] < 18
+    assert len(run.mission.left_out) == 18 - points["measured"]
+    assert set(run.mission.left_out.values()) <= {"no time for it", f"the time budget of {budget_s:g} s is used up"}
+
+
+@pytest.mark.fault("O10")
+def test_a_budget_that_suffices_changes_nothing(tmp_path: Path) -> None:
+    with_it, without = tmp_path / "with", tmp_path / "without"
+    with_it.mkdir()
+    without.mkdir()
+    held = DeskRehearsal(one_panel(**{"mission.holds_to_budget": True}), with_it).run()
+    assert held.summary == DeskRehearsal(one_panel(), without).run().summary
+    assert held.outcome == "complete"

@@ -1,0 +1,78 @@
+"""A main loop that takes over from one that was killed: found again before it moves, every point measured once."""
+
+import random
+
+import pytest
+
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.samples import Twist
+from ccatp.surveying.states import State
+from tests.faults.restarting import RestartingRehearsal
+
+MISSIONS = 30
+
+
+def config(seed: int, **overrides: object) -> Config:
+    mirror = ("fyst-m1", "fyst-m2")[seed // 2 % 2]
+    named = {"run.world": ("thesis", "hard")[seed % 2], "run.mirror": mirror, "run.seed": seed, "run.panels": 1}
+    return load_config(overrides={**named, **overrides})
+
+
+def check(rehearsal: RestartingRehearsal) -> None:
+    result = rehearsal.run()
+    measured = rehearsal.measured
+    assert result.outcome == "complete", result.cause
+    assert rehearsal.states, "nobody was killed"
+    assert len(measured) == len(set(measured)) == 9
+    assert result.summary["danger"]["falls"] == 0
+    assert result.summary["points"]["skipped"] == 0
+
+
+@pytest.mark.fault("P17")
+@pytest.mark.parametrize("seed", [2, 5])
+def test_killed_while_turning_and_driving(seed: int) -> None:
+    rehearsal = RestartingRehearsal(config(seed, **{"mission.calibration_length_m": 0.0}), {350, 1480})
+    check(rehearsal)
+    # The record says how far the robot may be from it, with room to spare.
+    assert max(rehearsal.first_moves_m) < 2.0
+
+
+@pytest.mark.slow
+@pytest.mark.fault("P17")
+@pytest.mark.parametrize("seed", range(MISSIONS))
+def test_killed_at_random_instants(seed: int) -> None:
+    rng = random.Random(seed)
+    check(RestartingRehearsal(config(seed), {rng.randrange(100, 7000) for _ in range(3)}))
+
+
+class Watching(RestartingRehearsal):
+    """Notes whether wheels were asked to turn before the first fix of a main loop that takes over."""
+
+    early: list[Twist]
+
+    def _take_over(self) -> None:
+        super()._take_over()
+        self.early, mission = [], self.mission
+        step, self._has_fix = mission.step, False
+        fixed = mission.fixed
+
+        def watch(motion, verdict):  # type: ignore[no-untyped-def]
+            order = step(motion, verdict)
+            if not self._has_fix and (order.twist.v_m_s or order.twist.omega_rad_s):
+                self.early.append(order.twist)
+            return order
+
+        def note(point):  # type: ignore[no-untyped-def]
+            self._has_fix = True
+            fixed(point)
+
+        mission.step, mission.fixed = watch, note  # type: ignore[method-assign]
+
+
+@pytest.mark.fault("P11", "P17")
+def test_nothing_moves_before_it_is_found() -> None:
+    rehearsal = Watching(config(1, **{"mission.calibration_length_m": 0.0}), {350})
+    check(rehearsal)
+    assert rehearsal.states[0] in (State.TURNING, State.DRIVING)
+    assert rehearsal.early == []

@@ -1,0 +1,341 @@
+"""Storage that fails: full, slow, broken. Measurements survive, or the run holds with a clear message."""
+
+import asyncio
+import os
+import resource
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from ccatp.config.models import Config
+from ccatp.etalon_client import EtalonClient
+from ccatp.localizer import Localizer
+from ccatp.metrology.scrutiny import Finding, Scrutiny
+from ccatp.mission import Mission
+from ccatp.processes import measuring
+from ccatp.processes.common import open_log
+from ccatp.processes.log_stream import LogStream
+from ccatp.processes.measuring import MeasuringDesk, Request
+from ccatp.processes.telling import Teller
+from ccatp.recorder import Recorder, iter_messages
+from ccatp.samples import DeckPose, Fix, PointId
+from ccatp.store import MissionStore, PlannedPoint, StoreError, StoreEvent
+
+Measured = Callable[[str, float], None]
+POINTS = [PointId(row, col, n) for row in range(1, 10) for col in range(1, 9) for n in range(1, 10)][: 77 * 9]
+FIX = Fix(1.5, (1.0, 2.0, 3.0), (1e-12,) * 9, 1.7, (1, 2, 5, 8), 2e-6)
+POSE = DeckPose(0.1, 0.2, 0.3)
+
+
+def make(
+    path: Path, points: list[PointId] = POINTS, on_failure: Callable[[StoreError], None] | None = None
+) -> MissionStore:
+    plan = [PlannedPoint(p, 0.22, -0.25) for p in points]
+    return MissionStore.create(path, mirror="fyst-m1", seed=1, config_toml="", points=plan, on_failure=on_failure)
+
+
+@pytest.fixture
+def nothing_may_grow() -> Iterator[Callable[[int], None]]:
+    """Lets no file of this process grow beyond a size: the kernel refuses, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+
+    def limit(size: int) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+
+    yield limit
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    signal.signal(signal.SIGXFSZ, handler)
+
+
+# -- P13: a disk that is full -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.fault("P13")
+def test_a_whole_mirror_is_measured_on_a_disk_that_gives_nothing_more(
+    tmp_path: Path, nothing_may_grow: Callable[[int], None], measured: Measured
+) -> None:
+    path = tmp_path / "mission.sqlite"
+    with make(path) as store:
+        nothing_may_grow(path.stat().st_size)
+        with pytest.raises(OSError, match="File too large"):  # the limit is real
+            (tmp_path / "probe").write_bytes(bytes(2 * path.stat().st_size))
+        for k, point in enumerate(POINTS):
+            store.record_event(StoreEvent(float(k), "mission", text="driving"))
+            store.record_arrival(point, float(k), 0.001)
+            store.record_fix(point, FIX, POSE).result(timeout=30.0)
+        assert store.events_dropped == 0
+    with MissionStore.open(path, mirror="fyst-m1") as store:
+        lost = set(POINTS) - {fix.point for fix in store.fixes()}
+    measured("P13", len(lost))
+    assert not lost
+
+
+@pytest.mark.fault("P13")
+def test_a_recording_on_a_full_disk_ends_with_one_alarm(
+    tmp_path: Path, nothing_may_grow: Callable[[int], None]
+) -> None:
+    path, alarms = tmp_path / "telemetry.mcap", list[str]()
+    recorder = Recorder(path, [("log", {"type": "object"})], is_simulation=True, on_failure=alarms.append)
+    nothing_may_grow(200_000)
+    payloads = [b'{"seq":%d,"text":"%s"}' % (k, os.urandom(200).hex().encode()) for k in range(3000)]
+    for k, payload in enumerate(payloads):
+        recorder.write("log", 0.1 * k, payload)
+    recorder.close()
+    assert len(alarms) == 1
+    assert "recording ended" in alarms[0]
+    kept = [message.payload for message in iter_messages(path)]
+    assert kept == payloads[: len(kept)]
+    assert 100 < len(kept) < len(payloads)
+    assert recorder.dropped > 0
+
+
+@pytest.mark.fault("P13")
+def test_a_log_on_a_full_disk_drops_lines_and_says_so_once(
+    tmp_path: Path, nothing_may_grow: Callable[[int], None], capfd: pytest.CaptureFixture[str]
+) -> None:
+    log = open_log(tmp_path / "log.jsonl", "main")
+    nothing_may_grow(4096)
+    for k in range(500):
+        log.warning("held", cause="no fresh verdict", seq=k)
+    complaint = capfd.readouterr().err
+    assert complaint.count("\n") == 1
+    assert "ccatp main" in complaint
+    assert "lines are dropped" in complaint
+
+
+def test_a_log_goes_on_where_there_is_room_again(tmp_path: Path, nothing_may_grow: Callable[[int], None]) -> None:
+    path = tmp_path / "log.jsonl"
+    with LogStream(path, "main") as stream:
+        nothing_may_grow(100)
+        for k in range(20):
+            stream.write(f'{{"line": {k}}}\n')
+        nothing_may_grow(1_000_000)
+        stream.write('{"line": "last"}\n')
+        assert stream.dropped > 5
+    lines = path.read_text().splitlines()
+    assert lines[-1] == '{"line": "last"}'
+    assert lines[:7] == [f'{{"line": {k}}}' for k in range(7)]
+
+
+# -- P14: a disk that is slow -----------------------------------------------------------------------------------------
+
+
+def stall(store: MissionStore) -> threading.Event:
+    """Keep the writer thread where an fsync would keep it, until the event is set."""
+    release, began = threading.Event(), threading.Event()
+
+    def wait(_: sqlite3.Connection) -> None:
+        began.set()
+        release.wait(30.0)
+
+    _held: Future[None] = store._submit(wait)
+    assert began.wait(10.0)
+    return release
+
+
+@pytest.mark.fault("P14")
+def test_nobody_waits_for_a_stalled_disk(tmp_path: Path, measured: Measured) -> None:
+    with make(tmp_path / "mission.sqlite", POINTS[:9]) as store:
+        release = stall(store)
+        futures, longest_s = list[Future[int]](), 0.0
+        for point in POINTS[:9]:  # what a pass of the control loop does at a stop, and more
+            begun_s = time.thread_time()
+            futures.append(store.record_fix(point, FIX, POSE))
+            assert all(store.record_event(StoreEvent(1.0, "mission")) for _ in range(50))
+            assert store.record_arrival(point, 1.0, 0.001)
+            longest_s = max(longest_s, time.thread_time() - begun_s)
+        # All of it came back while the writer was stuck: it cannot have waited.
+        assert not release.is_set()
+        assert not any(future.done() for future in futures)
+        assert store.queue_age_s > 0.0
+        measured("P14", 1e3 * longest_s)
+        release.set()
+        assert [future.result(timeout=30.0) for future in futures] == list(range(1, 10))
+
+
+class Desk:
+    """A measuring desk on a real store; mission and laser system are only there to be asked."""
+
+    def __init__(self, config: Config, store: MissionStore) -> None:
+        self.faults, self.said, self.measured = list[str](), list[str](), list[PointId | None]()
+        self.over = asyncio.Event()
+        self.faulted = asyncio.Event()
+
+        async def measure(t_s: float, expected_m: Any) -> Fix:
+            return FIX
+
+        mission = SimpleNamespace(
+            is_awaiting_fix=True,
+            request=1,
+            is_lost=True,
+            fixed=self.measured.append,
+            fault=self._fault,
+            survey=SimpleNamespace(distance_m=lambda pose: 0.0),
+        )
+        localizer = SimpleNamespace(fuse_fix=lambda fix: 0.0, notices=[], pose=None, pose_covariance=None)
+        sure = SimpleNamespace(begin=lambda: None, review=lambda *_, **__: Finding())
+        teller = SimpleNamespace(fix=lambda *_, **__: None, say=lambda level, text: self.said.append(text))
+        self.desk = MeasuringDesk(
+            config.mission,
+            cast(EtalonClient, SimpleNamespace(measure=measure)),
+            cast(Scrutiny, sure),
+            cast(Localizer, localizer),
+            cast(Mission, mission),
+            store,
+            cast(Teller, teller),
+            self.over.set,
+            lambda: 0.0,
+        )
+
+    def _fault(self, cause: str) -> None:
+        self.faults.append(cause)
+        self.faulted.set()
+
+    def begin(self, point: PointId) -> None:
+        self.over.clear()
+        self.desk.begin(Request(1, 1.0, point, (0.0, 0.0, 0.0), POSE))
+
+
+@pytest.mark.fault("P14")
+async def test_the_robot_is_held_where_the_disk_stalls_and_the_point_counts_once_it_is_stored(
+    tmp_path: Path, config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(measuring, "SLOW_DISK_S", 0.05)
+    monkeypatch.setattr(measuring, "STALLED_DISK_S", 0.15)
+    with make(tmp_path / "mission.sqlite", POINTS[:9]) as store:
+        desk = Desk(config, store)
+        serving = asyncio.get_running_loop().create_task(desk.desk.run())
+        release = stall(store)
+        desk.begin(POINTS[0])
+        async with asyncio.timeout(20.0):
+            await desk.faulted.wait()
+        assert any("the disk is slow: point 1-1-1" in text for text in desk.said)
+        assert "the disk stalls: point 1-1-1 is not stored" in desk.faults[0]
+        assert desk.measured == []
+        desk.over.clear()
+        release.set()
+        async with asyncio.timeout(20.0):
+            await desk.over.wait()
+        assert desk.measured == [POINTS[0]]
+        assert store.measured_points() == {POINTS[0]}
+        serving.cancel()
+
+
+# -- P15: a disk that is broken ---------------------------------------------------------------------------------------
+
+
+class Broken:
+    """A connection whose commits fail as SQLite says it when fsync returns EIO; afterwards it would work again."""
+
+    def __init__(self, db: sqlite3.Connection, name: str) -> None:
+        self._db, self._name, self.is_armed, self.commits = db, name, False, 0
+
+    def execute(self, sql: str, *parameters: Any) -> Any:
+        if sql == "COMMIT":
+            self.commits += 1
+            if self.is_armed:
+                self.is_armed = False
+                error = sqlite3.OperationalError("disk I/O error")
+                error.sqlite_errorname = self._name
+                raise error
+        return self._db.execute(sql, *parameters)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._db, name)
+
+
+ERRORS = ("SQLITE_IOERR_FSYNC", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_DIR_FSYNC", "SQLITE_CORRUPT", "SQLITE_READONLY")
+
+
+@pytest.mark.fault("P15")
+@pytest.mark.parametrize("name", ERRORS)
+def test_after_an_error_nothing_is_acknowledged(tmp_path: Path, name: str, measured: Measured) -> None:
+    failures: list[StoreError] = []
+    path = tmp_path / "mission.sqlite"
+    with make(path, POINTS[:9], failures.append) as store:
+        broken = Broken(store._db, name)
+        store._db = cast(sqlite3.Connection, broken)
+        assert store.record_fix(POINTS[0], FIX, POSE).result(timeout=10.0) == 1
+        broken.is_armed = True
+        with pytest.raises(StoreError, match=rf"cannot write any more: disk I/O error \({name}\)"):
+            store.record_fix(POINTS[1], FIX, POSE).result(timeout=10.0)
+        commits = broken.commits
+        late = [store.record_fix(point, FIX, POSE) for point in POINTS[2:9]]
+        acknowledged = sum(future.exception(timeout=10.0) is None for future in late)
+        assert not store.record_event(StoreEvent(1.0, "x"))
+        assert broken.commits == commits  # it is not even tried
+        assert store.measured_points() == {POINTS[0]}
+        assert failures == [store.failure]
+    measured("P15", acknowledged)
+    assert acknowledged == 0
+    with MissionStore.open(path, mirror="fyst-m1") as store:
+        assert store.measured_points() == {POINTS[0]}
+
+
+@pytest.mark.fault("P15")
+async def test_a_broken_disk_holds_the_robot_with_the_reason(tmp_path: Path, config: Config) -> None:
+    with make(tmp_path / "mission.sqlite", POINTS[:9]) as store:
+        broken = Broken(store._db, "SQLITE_IOERR_FSYNC")
+        store._db = cast(sqlite3.Connection, broken)
+        desk = Desk(config, store)
+        serving = asyncio.get_running_loop().create_task(desk.desk.run())
+        broken.is_armed = True
+        for point in POINTS[:2]:
+            desk.begin(point)
+            async with asyncio.timeout(20.0):
+                await desk.over.wait()
+        serving.cancel()
+    assert desk.measured == []
+    assert len(desk.faults) == 2
+    assert "the fix of point 1-1-1 cannot be stored" in desk.faults[0]
+    assert "SQLITE_IOERR_FSYNC" in desk.faults[1]
+
+
+WRITER = """
+import resource, signal, sys
+from pathlib import Path
+from ccatp.samples import DeckPose, Fix, PointId
+from ccatp.store import MissionStore, StoreError
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+path = Path(sys.argv[1])
+with MissionStore.open(path, mirror="fyst-m1") as store:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size, resource.RLIM_INFINITY))
+    big = Fix(1.0, (1.0, 2.0, 3.0), (0.0,) * 9, 1.0, tuple(range(1, 4000)), 0.0)
+    for point in sorted(p.point for p in store.points()):
+        try:
+            store.record_fix(point, big, DeckPose(0.0, 0.0, 0.0)).result()
+        except StoreError as error:
+            print("refused", *point, error, flush=True)
+        else:
+            print("stored", *point, flush=True)
+"""
+
+
+@pytest.mark.fault("P15")
+def test_a_write_that_the_kernel_refuses_is_final(tmp_path: Path) -> None:
+    path = tmp_path / "mission.sqlite"
+    plan = [PlannedPoint(p, 0.22, -0.25) for p in POINTS[:45]]
+    MissionStore.create(path, mirror="fyst-m1", seed=1, config_toml="", points=plan, reserve_bytes=200_000).close()
+    done = subprocess.run([sys.executable, "-c", WRITER, str(path)], capture_output=True, text=True, check=True)
+    words = [line.split() for line in done.stdout.splitlines()]
+    said = [word[0] for word in words]
+    assert len(said) == 45
+    stored = said.index("refused")
+    assert 0 < stored < 45
+    # Once refused, for ever refused.
+    assert set(said[stored:]) == {"refused"}
+    with MissionStore.open(path, mirror="fyst-m1") as store:
+        acknowledged = {PointId(*map(int, word[1:4])) for word in words[:stored]}
+        assert store.measured_points() == acknowledged
+        assert store.damaged == ()

@@ -1,0 +1,277 @@
+"""Reaction times of the daemon as it runs, while six programs want the processors and a seventh the disk.
+
+The robot is a stand-in in this process, which is preferred where the system permits it: a real one is a machine of its
+own. ``CCATP_REACTIONS`` says how often each fault is made.
+"""
+
+import asyncio
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+import psutil
+import pytest
+
+from ccatp.config.loader import dump_config, load_config
+from ccatp.dataloop import DataLoop, TruthOutlet
+from ccatp.etalon_standin import EtalonStandIn
+from ccatp.fault_proxy.pipe import Pipe
+from ccatp.fault_proxy.proxy import FaultProxy
+from ccatp.mirror.mirror import build_mirror
+from ccatp.puck_truth import ZmqPuck
+from ccatp.sim.truth import TruthLog
+from tests.faults.linking import Measured
+
+TIMES = int(os.environ.get("CCATP_REACTIONS", "3"))
+HOGS = 6
+HOG = "while True: pass"
+FSYNC = """
+import os, sys
+file = open(sys.argv[1], "wb", buffering=0)
+while True:
+    file.write(bytes(65536))
+    os.fsync(file.fileno())
+    file.seek(0)
+"""
+ROBOTS_PRIORITY = 60  # above the daemon's
+PATIENT_S = 90.0
+STOPPED_S = 0.6  # so long a process is stopped, or the link silent: longer than every time-out
+EVIDENCE_S = 0.15  # data of this age are the first evidence that somebody is silent
+STALE_S = 0.3  # longer than the robot's time-to-live: a drive that turns the wheels so long after it was sent is stale
+DRIVE = re.compile(rb'"type":"drive","seq":\d+,"ack":\d+,"wr":([^,]+),"wl":([^}]+)}')
+DENIED = b'"forward":false,"reverse":false,"turn":false'
+
+
+@contextmanager
+def load(folder: Path) -> Iterator[None]:
+    """Six programs that want the processors, one that wants the disk."""
+    programs = [subprocess.Popen([sys.executable, "-c", HOG]) for _ in range(HOGS)]
+    programs.append(subprocess.Popen([sys.executable, "-c", FSYNC, str(folder / "busy")]))
+    try:
+        yield
+    finally:
+        for program in programs:
+            program.kill()
+            program.wait()
+
+
+class Wire:
+    """What the host sends, and what the robot's wheels do.
+
+    Attributes:
+        turned_s: when a step ended in which the wheels turned.
+        stale: steps in which they turned by a drive that had been sent long ago.
+        duties: every fan duty that there was.
+    """
+
+    def __init__(self, robot: DataLoop) -> None:
+        self._robot = robot.robot
+        self.turned_s = 0.0
+        self.stale = 0
+        self.duties: list[tuple[float, float]] = []
+        self._zeros_s: dict[int, list[float]] = {}
+        self._last_go_s: dict[int, float] = {}
+        self._sent_s = 0.0
+        on_frame = robot._on_frame
+
+        def watch() -> None:
+            on_frame()
+            self._step()
+
+        robot._on_frame = watch  # type: ignore[method-assign]
+
+    def _step(self) -> None:
+        now_s, rules = time.monotonic(), self._robot.rules
+        if self._robot.fans.duty not in self.duties:
+            self.duties.append(self._robot.fans.duty)
+        if not rules.is_held and rules._drive is not None and any(rules._drive):
+            self.turned_s = now_s
+            self.stale += now_s - self._sent_s > STALE_S
+
+    def heard(self, source: int, data: bytes) -> None:
+        """What came from one of the loops; nothing is the end of its session."""
+        now_s = time.monotonic()
+        drives = DRIVE.findall(data)
+        if drives:
+            self._sent_s = now_s
+        if not data or DENIED in data or any(float(right) == float(left) == 0.0 for right, left in drives):
+            self._zeros_s.setdefault(source, []).append(now_s)
+        elif data:
+            self._last_go_s[source] = now_s
+
+    def zero_after(self, instant_s: float) -> float | None:
+        """When one of the loops said for good that the wheels have to stand: zeros, a denied permit, its end."""
+        firsts = [
+            next((zero_s for zero_s in zeros_s if zero_s >= max(instant_s, self._last_go_s.get(source, 0.0))), None)
+            for source, zeros_s in self._zeros_s.items()
+        ]
+        return min((first_s for first_s in firsts if first_s is not None), default=None)
+
+    @property
+    def is_driving(self) -> bool:
+        """Whether the wheels have turned just now, without a word against it."""
+        last_s = max((zeros_s[-1] for zeros_s in self._zeros_s.values()), default=0.0)
+        return time.monotonic() - self.turned_s < 0.05 and time.monotonic() - last_s > 0.3
+
+
+class Survey:
+    """A robot, and the daemon that drives it."""
+
+    def __init__(self, wire: Wire, proxy: FaultProxy, daemon: subprocess.Popen[str], log: Path) -> None:
+        self.wire, self.proxy, self.daemon, self._log = wire, proxy, daemon, log
+
+    def pid_of(self, name: str) -> int:
+        """Process id of one of the loops."""
+        for child in psutil.Process(self.daemon.pid).children(recursive=True):
+            if any(part.endswith(f"{name}_loop") for part in child.cmdline()):
+                return child.pid
+        raise AssertionError(f"no {name} loop")
+
+    async def driving(self) -> None:
+        """Wait until the robot drives."""
+        deadline_s = time.monotonic() + PATIENT_S
+        while not self.wire.is_driving:
+            assert self.daemon.poll() is None, self._log.read_text()[-3000:]
+            assert time.monotonic() < deadline_s, self._log.read_text()[-3000:]
+            await asyncio.sleep(0.01)
+
+
+@asynccontextmanager
+async def survey(folder: Path, runtime_dir: Path) -> AsyncIterator[Survey]:
+    """A survey that begins at base; the daemon is ended at the end."""
+    settings = {"sim.robot.port": 0, "run.mirror": "fyst-m2", "run.filter": "kf", "run.panels": 3,
+                "mission.calibration_length_m": 0}  # fmt: skip
+    cfg = load_config(overrides=settings)
+    mirror, stop = build_mirror(cfg.mirror), asyncio.Event()
+    async with AsyncExitStack() as stack:
+        robot = DataLoop(cfg, False, 1)
+        puck_at = f"ipc://{runtime_dir / 'puck'}"
+        robot.truth = outlet = TruthOutlet(TruthLog(robot.robot), puck_at, None)
+        stack.callback(outlet.close)
+        wire = Wire(robot)
+        port = await robot.start()
+        puck = ZmqPuck(puck_at)
+        stack.callback(puck.close)
+        laser = EtalonStandIn(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, np.random.default_rng(1),
+                              measuring_time_s=cfg.etalon.measuring_time_s)  # fmt: skip
+        laser_port = await laser.start("127.0.0.1", 0)
+        stack.push_async_callback(laser.close)
+        proxy = await stack.enter_async_context(FaultProxy("127.0.0.1", port, seed=1))
+        stack.enter_context(patch.object(Pipe, "_read", _tapped(wire, proxy)))
+        at = load_config(overrides={**settings, "robot.port": proxy.port, "etalon.port": laser_port})
+        (folder / "config.toml").write_text(dump_config(at), encoding="utf-8")
+        said = stack.enter_context((folder / "said").open("w"))
+        tasks = await stack.enter_async_context(asyncio.TaskGroup())
+        serving = [tasks.create_task(work) for work in (robot.run(stop), outlet.serve(), laser.serve())]
+        command = [sys.executable, "-m", "ccatp", "run", "--config", str(folder / "config.toml")]
+        command += ["--run-dir", str(folder / "run"), "--runtime-dir", str(runtime_dir)]
+        daemon = subprocess.Popen(command, stdout=said, stderr=said, text=True)  # noqa: ASYNC220 - takes milliseconds
+        try:
+            yield Survey(wire, proxy, daemon, folder / "said")
+        finally:
+            await asyncio.to_thread(end, daemon)
+            stop.set()
+            for task in serving[1:]:
+                task.cancel()
+
+
+def _tapped(wire: Wire, proxy: FaultProxy) -> Callable[[Pipe], Awaitable[bytes]]:
+    read, to_server = Pipe._read, proxy._conducts["to_server"]
+
+    async def tapped(pipe: Pipe) -> bytes:
+        data = await read(pipe)
+        if pipe._conduct is to_server:
+            wire.heard(id(pipe), data)
+        return data
+
+    return tapped
+
+
+def end(daemon: subprocess.Popen[str]) -> None:
+    """End a daemon and what it started, stopped or not."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        for child in psutil.Process(daemon.pid).children(recursive=True):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                child.resume()
+    daemon.terminate()
+    try:
+        daemon.wait(20.0)
+    except subprocess.TimeoutExpired:
+        daemon.kill()
+        daemon.wait()
+
+
+def kill(name: str) -> Callable[[Survey], None]:
+    return lambda it: os.kill(it.pid_of(name), signal.SIGKILL)
+
+
+def halt(name: str) -> Callable[[Survey], None]:
+    return lambda it: os.kill(it.pid_of(name), signal.SIGSTOP)
+
+
+def kill_all(it: Survey) -> None:
+    """The host is dead."""
+    host = psutil.Process(it.daemon.pid)
+    for process in [*host.children(recursive=True), host]:
+        process.kill()
+
+
+# What is done, and after how long there is the first evidence of it: a session that ends is seen at once.
+FAULTS: dict[str, tuple[Callable[[Survey], None], float]] = {
+    "kill main": (kill("main"), 0.0),
+    "kill danger": (kill("danger"), 0.0),
+    "kill all": (kill_all, 0.0),
+    "stop main": (halt("main"), EVIDENCE_S),
+    "stop danger": (halt("danger"), EVIDENCE_S),
+    "black hole": (lambda it: it.proxy.black_hole("both"), EVIDENCE_S),
+}
+
+
+@pytest.fixture
+def preferred() -> Iterator[None]:
+    """This process before all others, where that is permitted."""
+    with contextlib.suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(ROBOTS_PRIORITY))
+    yield
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+@pytest.mark.slow
+@pytest.mark.fault("P19")
+@pytest.mark.parametrize("kind", FAULTS)
+@pytest.mark.parametrize("time_", range(TIMES))
+@pytest.mark.usefixtures("preferred")
+async def test_reaction(kind: str, time_: int, tmp_path: Path, runtime_dir: Path, measured: Measured) -> None:
+    make, evidence_s = FAULTS[kind]
+    async with survey(tmp_path, runtime_dir) as it:
+        with load(tmp_path):
+            await it.driving()
+            await asyncio.sleep(0.037 * (time_ % 10))
+            begun_s = time.monotonic()
+            make(it)
+            await asyncio.sleep(STOPPED_S)
+            turned_s, zero_s = it.wire.turned_s, it.wire.zero_after(begun_s)
+            assert zero_s is not None, "the host never said so"
+            measured("P19", 1e3 * max(zero_s - begun_s - evidence_s, 0.0))
+            measured("P19", 1e3 * (zero_s - begun_s), "from_event_ms")
+            if kind == "kill all":
+                measured("P19", 1e3 * max(turned_s - begun_s, 0.0), "stopped_ms")
+            if evidence_s:  # back again: what was due meanwhile must not be done now
+                assert turned_s - begun_s < STOPPED_S - 0.1
+                it.proxy.heal()
+                for name in ("main", "danger"):
+                    with contextlib.suppress(AssertionError, ProcessLookupError):
+                        os.kill(it.pid_of(name), signal.SIGCONT)
+                await asyncio.sleep(STOPPED_S)
+            measured("P19", it.wire.stale, "stale_drives")
+            duties = [duty for duty in it.wire.duties if duty != it.wire.duties[0]]
+            measured("P19", max(len(duties) - 1, 0), "fan_changes")  # one is the daemon's own at its start

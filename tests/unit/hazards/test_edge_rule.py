@@ -1,0 +1,202 @@
+"""The edge rule's own part: which samples count, what an episode is opened with, lifted and put back."""
+
+from dataclasses import dataclass, field
+from math import cos, hypot, sin
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.hazards.edge_episode import Phase
+from ccatp.hazards.edge_map import EdgeMap
+from ccatp.hazards.edge_rule import EdgeRule, PoseEstimate
+from ccatp.samples import EdgeSample, WheelSample
+
+MS = 1e-3
+OFF_FL = (0, 1, 1, 1)
+ON, OFF = (1, 1, 1, 1), (0, 0, 0, 0)
+
+
+@pytest.fixture(scope="module")
+def cfg() -> Config:
+    return load_config()
+
+
+@dataclass
+class Map:
+    """A map without seams and rim that keeps what it was asked."""
+
+    gap_m: float = 0.01
+    placed: list[tuple[Any, ...]] = field(default_factory=list)
+    slacks_m: list[float] = field(default_factory=list)
+
+    def place(self, pose: Any, offset_m: Any) -> tuple[float, float]:
+        self.placed.append((pose, offset_m))
+        return 5.0, 6.0
+
+    def is_rim_ahead(self, *_: Any) -> bool:
+        return False
+
+    def seam_at(self, place: Any, slack_m: float, not_axis: Any = None) -> None:
+        self.slacks_m.append(slack_m)
+
+
+class Rule:
+    """The rule, fed with a sample per millisecond at a constant velocity."""
+
+    def __init__(self, cfg: Config) -> None:
+        self.cfg, self.map = cfg, Map()
+        self.rule = EdgeRule(cast(EdgeMap, self.map), cfg.robot, cfg.danger)
+        self.t_s = 0.0
+
+    def feed(self, values: list[tuple[int, int, int, int]], v: float = 0.0, omega: float = 0.0, **rest: Any) -> None:
+        robot = self.cfg.robot
+        half = 0.5 * omega * robot.wheel_base_m
+        right, left = (v + half) / robot.wheel_radius_m, (v - half) / robot.wheel_radius_m
+        wheels, samples = [], []
+        for a, b, c, d in values:
+            self.t_s += MS
+            wheels.append(WheelSample(self.t_s, right, left))
+            samples.append(EdgeSample(self.t_s, a, b, c, d))
+        self.rule.track.push(wheels)
+        self.rule.step(samples, rest.get("estimate"))
+
+    def estimate(self, age_s: float = 0.0) -> PoseEstimate:
+        pose = SimpleNamespace(t_s=self.t_s - age_s, x_m=1.0, y_m=2.0, heading_rad=0.5, sigma_m=0.001)
+        return cast(PoseEstimate, pose)
+
+
+@pytest.fixture
+def rule(cfg: Config) -> Rule:
+    return Rule(cfg)
+
+
+def test_a_new_rule_is_idle(rule: Rule) -> None:
+    under_test = rule.rule
+    assert under_test.is_idle
+    assert not under_test.is_lifted
+    assert under_test.episodes == (None,) * 4
+    assert under_test.opened == under_test.declared == [0, 0, 0, 0]
+    rule.feed([])
+    rule.feed([ON] * 10)
+    assert under_test.is_idle
+
+
+@pytest.mark.parametrize("k", range(4))
+def test_each_sensor_opens_its_own_episode_and_declares_its_own_edge(rule: Rule, k: int) -> None:
+    values = tuple(int(i != k) for i in range(4))
+    rule.feed([cast(Any, values)] * 10, v=0.1 if k < 2 else -0.1)
+    only = [int(i == k) for i in range(4)]
+    assert rule.rule.opened == only
+    assert [episode is not None for episode in rule.rule.episodes] == [bool(i) for i in only]
+    assert rule.rule.declared == [0, 0, 0, 0]
+    # 5 mm off without an explanation
+    rule.feed([cast(Any, values)] * 60, v=0.1 if k < 2 else -0.1)
+    assert rule.rule.declared == only
+
+
+def test_the_sensor_may_have_gone_off_as_early_as_the_sample_before(rule: Rule) -> None:
+    rule.feed([ON] * 10, v=0.1, omega=0.2)
+    rule.feed([OFF_FL] * 10, v=0.1, omega=0.2, estimate=rule.estimate())
+    danger, (ox, oy) = rule.cfg.danger, rule.cfg.robot.edge_sensors_m[0]
+    moved_m = (0.1 + 0.2 * hypot(ox, oy)) * MS
+    slack_m = danger.gap_tolerance_m + danger.seam_extra_m + danger.map_sigmas * 0.001 + moved_m
+    assert rule.map.slacks_m[0] == pytest.approx(slack_m, rel=1e-9)
+
+
+def test_without_a_sample_before_nothing_is_known_of_its_way(rule: Rule) -> None:
+    rule.feed([OFF_FL] * 10, v=0.1, estimate=rule.estimate())
+    danger = rule.cfg.danger
+    slack_m = danger.gap_tolerance_m + danger.seam_extra_m + danger.map_sigmas * 0.001
+    assert rule.map.slacks_m[0] == pytest.approx(slack_m, rel=1e-9)
+
+
+@pytest.mark.parametrize("omega", [0.5, -0.5])
+def test_turning_in_place_is_told_by_half_the_wheel_base(rule: Rule, omega: float) -> None:
+    half_m = 0.5 * rule.cfg.robot.wheel_base_m
+    for share, is_turn in ((0.95, True), (1.05, False)):
+        one = Rule(rule.cfg)
+        one.feed([ON] * 10, v=share * half_m * abs(omega), omega=omega)
+        one.feed([OFF_FL] * 10, v=share * half_m * abs(omega), omega=omega)
+        episode = one.rule.episodes[0]
+        assert episode is not None
+        assert episode.is_from_turn is is_turn
+
+
+def test_an_estimate_of_the_past_is_carried_to_the_sample(rule: Rule) -> None:
+    for _ in range(14):
+        rule.feed([ON] * 10, v=0.1)
+    rule.feed([OFF_FL] * 10, v=0.1, estimate=rule.estimate(age_s=0.1))
+    (x_m, y_m, heading_rad), offset_m = rule.map.placed[0]
+    # The estimate of 0.1 s before the frame, and a millisecond to the first sample off.
+    way_m = 0.1 * 0.101
+    assert (x_m, y_m) == pytest.approx((1.0 + way_m * cos(0.5), 2.0 + way_m * sin(0.5)), abs=1e-6)
+    assert heading_rad == pytest.approx(0.5)
+    assert offset_m == rule.cfg.robot.edge_sensors_m[0]
+
+
+@pytest.mark.parametrize("key", ["stale_after_s", "estimate_stale_after_s"])
+def test_the_track_reaches_back_as_far_as_data_may_be_old(cfg: Config, key: str) -> None:
+    rule = Rule(cfg.model_copy(update={"danger": cfg.danger.model_copy(update={key: 0.08})}))
+    for _ in range(40):
+        rule.feed([ON] * 10, v=0.1)
+    assert rule.rule.track.knots == []  # nothing is read while nothing is off
+    rule.feed([OFF_FL] * 10, v=0.1)
+    oldest_s = rule.rule.track.knots[0].t_s
+    reach_s = 2.0 * max(rule.cfg.danger.stale_after_s, rule.cfg.danger.estimate_stale_after_s)
+    assert rule.t_s - oldest_s == pytest.approx(reach_s, abs=0.011)
+
+
+def test_a_sample_counts_once(rule: Rule) -> None:
+    rule.feed([ON] * 10, v=0.01)
+    rule.feed([OFF_FL], v=0.01)
+    again = EdgeSample(rule.t_s, *OFF)
+    for _ in range(5):
+        rule.rule.step([again], None)
+    assert rule.rule.opened == [1, 0, 0, 0]
+    assert not rule.rule.is_lifted
+
+
+def test_lifted_needs_as_many_samples_in_a_row_and_so_does_being_put_back(rule: Rule) -> None:
+    danger, under_test = rule.cfg.danger, rule.rule
+    assert danger.lifted_samples == 2
+    rule.feed([OFF, OFF_FL, OFF])
+    assert not under_test.is_lifted
+    rule.feed([OFF])
+    assert under_test.is_lifted
+    assert under_test.opened == [1, 1, 1, 1]
+    rule.feed([ON] * (danger.clear_samples - 1))
+    rule.feed([OFF_FL])
+    rule.feed([ON] * (danger.clear_samples - 1))
+    assert under_test.is_lifted
+    assert not under_test.is_idle
+    rule.feed([ON])
+    assert not under_test.is_lifted
+    assert under_test.episodes == (None,) * 4
+    assert under_test.is_idle
+
+
+def test_lifted_keeps_the_rule_awake_without_an_episode(rule: Rule) -> None:
+    rule.feed([OFF] * 3)
+    rule.rule.episodes = (None, None, None, None)
+    rule.feed([ON])
+    assert not rule.rule.is_idle
+
+
+def test_a_reset_forgets_all_but_the_counts(rule: Rule) -> None:
+    rule.feed([OFF], v=0.1)
+    rule.rule.reset()
+    rule.t_s = 0.0
+    rule.feed([OFF], v=0.1)
+    assert not rule.rule.is_lifted  # one before the reset and one after it are not two in a row
+    assert rule.rule.opened == [2, 2, 2, 2]
+
+
+def test_put_back_the_episodes_begin_anew(rule: Rule) -> None:
+    rule.feed([OFF_FL] * 80, v=0.1)
+    assert rule.rule.episodes[0] is not None
+    assert rule.rule.episodes[0].phase is Phase.DECLARED
+    rule.rule.reset_episodes()
+    assert rule.rule.episodes == (None,) * 4

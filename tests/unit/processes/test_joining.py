@@ -1,0 +1,113 @@
+"""A link to the robot that lasts: resets, refusals, a robot that stays away."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import pytest
+
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.dataloop import DataLoop
+from ccatp.processes.joining import FIRST_DELAY_S, LONGEST_DELAY_S, LastingLink, delay_s
+from ccatp.robot_link import RobotTimeout
+from ccatp.wire.robot import Hello, Sensors
+
+
+def test_the_delay_grows_and_is_spread() -> None:
+    assert [delay_s(n, 1.0) for n in (0, 1, 2)] == [0.05, 0.1, 0.2]
+    assert delay_s(99, 1.0) == LONGEST_DELAY_S
+    assert delay_s(99, 0.0) == 0.5 * LONGEST_DELAY_S
+    assert delay_s(0, 0.0) == FIRST_DELAY_S
+
+
+class Client:
+    """A controller that answers every frame with zeros."""
+
+    def __init__(self, cfg: Config) -> None:
+        self.hellos: list[Hello] = []
+        self.frames: list[int] = []
+        self.losses: list[str] = []
+        self.changed = asyncio.Event()
+        self.lasting = LastingLink(
+            cfg.robot,
+            role="controller",
+            client="test",
+            on_sensors=self._take,
+            on_lost=self.losses.append,
+            on_joined=self.hellos.append,
+        )
+
+    def _take(self, sensors: Sensors, _line: bytes) -> None:
+        self.frames.append(sensors.seq)
+        self.changed.set()
+
+    async def until(self, is_there: Callable[[], bool]) -> None:
+        async with asyncio.timeout(20.0):
+            while not is_there():
+                self.changed.clear()
+                await self.changed.wait()
+
+
+async def with_robot(story: Callable[[Config, DataLoop], Coroutine[Any, Any, None]]) -> None:
+    cfg = load_config(overrides={"sim.robot.port": 0, "robot.reconnect_timeout_s": 10.0})
+    robot = DataLoop(cfg, lockstep=True, seed=1)
+    port = await robot.start()
+    cfg = cfg.model_copy(update={"robot": cfg.robot.model_copy(update={"port": port})})
+    try:
+        await story(cfg, robot)
+    finally:
+        await robot.close()
+
+
+@pytest.mark.fault("L1")
+async def test_a_lost_session_is_followed_by_another_one_with_the_same_frame() -> None:
+    async def story(cfg: Config, robot: DataLoop) -> None:
+        client = Client(cfg)
+        await client.lasting.join(is_patient=False)
+        serving = asyncio.create_task(client.lasting.serve())
+        await client.until(lambda: len(client.frames) == 1)
+        for session in range(1, 4):
+            robot.server._drop_all("reset")
+            await client.until(lambda session=session: len(client.frames) == session + 1)  # type: ignore[misc]
+        assert client.frames == [0, 0, 0, 0]  # nobody answered: time stood still
+        assert len(client.losses) == 3
+        assert len({hello.nonce for hello in client.hellos}) == 4
+        client.lasting.give_up("silent")
+        await client.until(lambda: len(client.frames) == 5)
+        assert client.losses[-1] == "silent"
+        serving.cancel()
+        client.lasting.close()
+        await asyncio.gather(serving, return_exceptions=True)
+
+    await with_robot(story)
+
+
+@pytest.mark.fault("L1")
+async def test_a_robot_that_stays_away_ends_it() -> None:
+    async def story(cfg: Config, robot: DataLoop) -> None:
+        quick = cfg.model_copy(update={"robot": cfg.robot.model_copy(update={"reconnect_timeout_s": 0.3})})
+        client = Client(quick)
+        await client.lasting.join(is_patient=True)
+        serving = asyncio.create_task(client.lasting.serve())
+        await robot.close()
+        with pytest.raises(RobotTimeout, match=r"did not come back within 0\.3 s: cannot reach the robot"):
+            await serving
+
+    await with_robot(story)
+
+
+async def test_a_role_that_is_taken_is_tried_again_by_who_takes_over_and_not_by_others() -> None:
+    async def story(cfg: Config, robot: DataLoop) -> None:
+        first, second = Client(cfg), Client(cfg)
+        await first.lasting.join(is_patient=False)
+        joining = asyncio.create_task(second.lasting.join(is_patient=True))
+        async with asyncio.timeout(20.0):
+            while not robot.server.counts["refused"]:  # noqa: ASYNC110 - the server has no event for it
+                await asyncio.sleep(0.005)
+        first.lasting.close()
+        await joining
+        assert len(second.hellos) == 1
+        second.lasting.close()
+
+    await with_robot(story)

@@ -1,0 +1,60 @@
+"""The latch of emergencies survives its process."""
+
+from io import StringIO
+from pathlib import Path
+
+import pytest
+import structlog
+
+from ccatp.processes.latching import FILE, DurableLatch
+
+Log = structlog.typing.FilteringBoundLogger
+
+
+@pytest.fixture
+def told() -> StringIO:
+    return StringIO()
+
+
+@pytest.fixture
+def log(told: StringIO) -> Log:
+    logger: Log = structlog.wrap_logger(structlog.PrintLogger(told))
+    return logger
+
+
+@pytest.mark.fault("P2")
+def test_an_emergency_is_there_after_a_restart_until_it_is_cleared(tmp_path: Path, log: Log) -> None:
+    path = tmp_path / FILE
+    latch = DurableLatch(path, log)
+    assert not latch.is_latched
+    assert latch.raise_emergency("fire", "a", "smoke") is None
+    assert latch.raise_emergency("power", "b") is None
+    assert latch.clear("b", at_base_or_held=True) is None
+    again = DurableLatch(path, log)
+    assert again.newest == latch.newest
+    assert again.raise_emergency("power", "b") is None  # cleared is cleared
+    assert again.newest == latch.newest
+    assert again.clear("a", at_base_or_held=True) is None
+    assert not DurableLatch(path, log).is_latched
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"active": [{"id": "a"}], "cleared": []}', '{"active": 3}'])
+def test_a_file_that_cannot_be_read_counts_as_an_emergency(tmp_path: Path, log: Log, text: str) -> None:
+    (tmp_path / FILE).write_text(text)
+    latch = DurableLatch(tmp_path / FILE, log)
+    assert latch.is_latched
+    assert latch.clear("unreadable", at_base_or_held=True) is None
+    assert not DurableLatch(tmp_path / FILE, log).is_latched
+
+
+def test_a_disk_that_refuses_does_not_keep_an_emergency_from_being_latched(
+    tmp_path: Path, log: Log, told: StringIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    latch = DurableLatch(tmp_path / FILE, log)
+    monkeypatch.setattr("os.fsync", refuse)
+    assert latch.raise_emergency("fire", "a") is None
+    assert latch.is_latched
+    assert "emergencies cannot be kept" in told.getvalue()

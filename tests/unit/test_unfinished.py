@@ -1,0 +1,50 @@
+"""Which run a service goes on with."""
+
+from pathlib import Path
+
+import pytest
+
+from ccatp.errors import ConfigError, ExitStatus
+from ccatp.unfinished import FILE, find_unfinished, forget_finished, note_unfinished
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def begin(tmp_path: Path) -> Path:
+    run_dir = tmp_path / "runs" / "one"
+    run_dir.mkdir(parents=True)
+    (run_dir / "mission.sqlite").touch()
+    note_unfinished(run_dir)
+    return run_dir
+
+
+def test_a_run_is_found_until_it_has_finished(tmp_path: Path) -> None:
+    assert find_unfinished() is None
+    run_dir = begin(tmp_path)
+    for status in (ExitStatus.HELD, ExitStatus.INTERRUPTED, ExitStatus.UNREACHABLE):
+        forget_finished(status)
+        assert find_unfinished() == run_dir
+    forget_finished(ExitStatus.COMPLETE)
+    assert find_unfinished() is None
+
+
+def test_a_run_that_never_began_is_none(tmp_path: Path) -> None:
+    (begin(tmp_path) / "mission.sqlite").unlink()
+    assert find_unfinished() is None
+    FILE.write_text("")
+    assert find_unfinished() is None
+
+
+def test_a_note_that_cannot_be_read_or_written(tmp_path: Path) -> None:
+    FILE.parent.mkdir()
+    FILE.mkdir()
+    with pytest.raises(ConfigError, match="--recover: cannot read"):
+        find_unfinished()
+    FILE.rmdir()
+    FILE.parent.rmdir()
+    FILE.parent.write_text("")
+    with pytest.raises(ConfigError, match="--recover: cannot write"):
+        note_unfinished(tmp_path)
