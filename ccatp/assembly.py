@@ -80,11 +80,7 @@ def assemble(cfg: Config, done: Collection[PointId] = (), recovery: Recovery | N
     """
     mirror = build_mirror(cfg.mirror)
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
-    measuring_s = cfg.etalon.measuring_time_s
-    route = plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, mirror.base_pose, done, measuring_s)
-    if recovery is None and cfg.run.filter not in FOUR_STATE:  # they have no states that the drive could calibrate
-        drive = plan_calibration(mirror, cfg.robot, cfg.mission, mirror.base_pose)
-        route = with_prelude(mirror, route, drive, cfg.limits, mirror.base_pose, measuring_s)
+    route = plan_survey(cfg, mirror, points, done, calibrates=recovery is None)
     localizer = _build_localizer(cfg, mirror, recovery)
     # No drive shows the four states their heading: the fix does not reach it.
     heading_sigma_of = float if cfg.run.filter in FOUR_STATE else lambda: localizer.heading_sigma_rad
@@ -102,8 +98,38 @@ def assemble(cfg: Config, done: Collection[PointId] = (), recovery: Recovery | N
         points=tuple(points),
         already_done=len(set(done)),
         elapsed_s=0.0 if recovery is None else recovery.elapsed_s,
-        lower_bound_s=path_time(route.stops, mirror.base_pose, cfg.limits, mirror, measuring_s),
+        lower_bound_s=path_time(route.stops, mirror.base_pose, cfg.limits, mirror, cfg.etalon.measuring_time_s),
     )
+
+
+def plan_survey(
+    cfg: Config,
+    mirror: Mirror,
+    points: Sequence[PointId],
+    done: Collection[PointId] = (),
+    out_of_reach: list[PointId] | None = None,
+    *,
+    calibrates: bool = True,
+) -> Route:
+    """The route of a survey from base, with the calibration drive before it.
+
+    Args:
+        cfg: the configuration.
+        mirror: its mirror.
+        points: in the order of measuring.
+        done: points that are measured already.
+        out_of_reach: takes the points that cannot be reached, and the route goes without them.
+        calibrates: drive a calibration first, where the localizer has a use for it.
+
+    Raises:
+        PlanError: a point cannot be reached and there is no ``out_of_reach``, or base is not on the mirror.
+    """
+    limits, start, measuring_s = cfg.limits, mirror.base_pose, cfg.etalon.measuring_time_s
+    route = plan_route(mirror, points, cfg.robot, limits, cfg.mission, start, done, measuring_s, out_of_reach)
+    if not calibrates or cfg.run.filter in FOUR_STATE:  # they have no states that the drive could calibrate
+        return route
+    drive = plan_calibration(mirror, cfg.robot, cfg.mission, start)
+    return with_prelude(mirror, route, drive, limits, start, measuring_s)
 
 
 def build_gate(cfg: Config) -> DriveGate:

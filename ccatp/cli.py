@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 import ccatp
+from ccatp.cli_align import align
 from ccatp.cli_bench import bench
 from ccatp.cli_conformance import conformance
 from ccatp.cli_frame import (
@@ -27,6 +28,7 @@ from ccatp.cli_frame import (
     run_command_line,
 )
 from ccatp.cli_keys import keys
+from ccatp.cli_plan import plan
 from ccatp.cli_replay import replay
 from ccatp.cli_study import study
 
@@ -297,8 +299,10 @@ def sim_etalon(
     return int(run_alone(load_config(config_file, overrides(settings, named)), puck_world_m, truth))
 
 
+cli.add_command(align)
 cli.add_command(bench)
 cli.add_command(keys)
+cli.add_command(plan)
 cli.add_command(study)
 cli.add_command(replay)
 cli.add_command(conformance)

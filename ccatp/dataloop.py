@@ -263,6 +263,7 @@ class TruthOutlet:
         self._truth = truth
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._publisher = Publisher(self._context, pub) if pub else None
+        self._has_told = False
         self._rep = zmq.asyncio.Context.shadow(self._context).socket(zmq.REP) if rep else None
         if self._rep is not None and rep:
             self._rep.setsockopt(zmq.LINGER, 0)
@@ -277,8 +278,12 @@ class TruthOutlet:
     def flush(self) -> None:
         """Publish the pending rows."""
         batch = self._truth.take()
-        if batch is not None and self._publisher is not None:
-            self._publisher.send("truth", batch)
+        if batch is None or self._publisher is None:
+            return
+        if not self._has_told:  # before the first batch: whoever records one has the other, however the run ends
+            self._has_told = True
+            self._publisher.send("misalignment", self._truth.misalignment())
+        self._publisher.send("truth", batch)
 
     async def serve(self) -> None:
         """Answer requests for ever."""

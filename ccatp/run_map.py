@@ -83,10 +83,10 @@ def draw_run_map(
     height = (width - 1.5) * float((high[1] - low[1] + 0.5) / (high[0] - low[0] + 0.5)) + 1.5
     figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
     axes = figure.add_axes((0.75 / width, 0.85 / height, (width - 1.5) / width, (height - 1.6) / height))
-    _draw_mirror(axes, mirror)
+    draw_panels(axes, mirror)
     step = max(1, len(path_xy) // MAX_PATH_POINTS)
     axes.plot(path_xy[::step, 0], path_xy[::step, 1], color=_PATH, linewidth=0.9, zorder=3, label="driven path")
-    _draw_base(axes, mirror)
+    draw_base(axes, mirror)
     _draw_points(figure, axes, points)
     _dress(axes, low - 0.25, high + 0.25, title, subtitle)
     try:
@@ -161,7 +161,8 @@ def _mission_time_s(path: Path) -> float | None:
         return None  # a run that was killed has no summary; its map is worth the more
 
 
-def _draw_mirror(axes: "Axes", mirror: Mirror) -> None:
+def draw_panels(axes: "Axes", mirror: Mirror) -> None:
+    """Draw panels and rim, deck frame, with the numbers of columns and rows."""
     from matplotlib.collections import PatchCollection  # noqa: PLC0415 - see above
     from matplotlib.patches import Polygon, Rectangle  # noqa: PLC0415
 
@@ -179,7 +180,8 @@ def _draw_mirror(axes: "Axes", mirror: Mirror) -> None:
         axes.text(low_x - 0.12, y, f"row {row}" if row == 1 else f"{row}", rotation=90, **small)
 
 
-def _draw_base(axes: "Axes", mirror: Mirror) -> None:
+def draw_base(axes: "Axes", mirror: Mirror) -> None:
+    """Draw where the robot starts, and its heading."""
     base = mirror.base_pose
     ahead = {"dx": 0.18 * cos(base.heading_rad), "dy": 0.18 * sin(base.heading_rad)}
     shape = {"width": 0.035, "head_width": 0.11, "head_length": 0.09, "length_includes_head": True}

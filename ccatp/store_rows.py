@@ -148,7 +148,7 @@ def open_file(path: Path, mirror: str) -> sqlite3.Connection:
     db: sqlite3.Connection | None = None
     try:
         db = _connect(path)
-        _check(db, path, mirror)
+        check_file(db, path, mirror)
         # Touches so many pages that the journal keeps the room which later commits need.
         db.execute("UPDATE reserve SET used = used + 1")
     except (sqlite3.Error, UnicodeDecodeError, StoreError) as error:
@@ -185,7 +185,8 @@ def _fill(db: sqlite3.Connection, points: Iterable[PlannedPoint], meta: Mapping[
     db.execute("DROP TABLE ballast")
 
 
-def _check(db: sqlite3.Connection, path: Path, mirror: str) -> None:
+def check_file(db: sqlite3.Connection, path: Path, mirror: str) -> None:
+    """Raises ``StoreError``, or ``sqlite3.Error``, unless the file is a sound store of this schema and mirror."""
     verdict = db.execute("PRAGMA integrity_check(1)").fetchone()[0]
     if verdict != "ok":
         raise StoreError(f"{path}: damaged: {verdict}")
@@ -220,12 +221,19 @@ def _expected_tables() -> list[tuple[str, str]]:
 
 def replan_damaged(db: sqlite3.Connection) -> list[PointId]:
     """Plan again the points whose fix is missing or does not match its checksum; returns them."""
+    damaged = damaged_points(db)
+    for point in damaged:
+        db.execute(_SET_STATUS, ("planned", None, None, *point))
+    return damaged
+
+
+def damaged_points(db: sqlite3.Connection) -> list[PointId]:
+    """The points whose fix is missing or does not match its checksum."""
     damaged = []
     for key in db.execute("SELECT row, col, point, fix_id, t_s FROM points WHERE fix_id IS NOT NULL").fetchall():
         fix = db.execute("SELECT * FROM fixes WHERE id = ?", (key[3],)).fetchone()
         if fix is None or fix[1:5] != (*key[:3], key[4]) or fix[-1] != _crc(fix[1:-1]):
             damaged.append(PointId(*key[:3]))
-            db.execute(_SET_STATUS, ("planned", None, None, *key[:3]))
     return damaged
 
 

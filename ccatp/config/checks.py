@@ -10,6 +10,7 @@ from pydantic import BaseModel
 
 from ccatp.config.messages import Fault, choice_hint, slip_hint
 from ccatp.config.models import (
+    AlignConfig,
     Config,
     LimitsConfig,
     MirrorConfig,
@@ -49,6 +50,7 @@ def check_config(cfg: Config) -> list[Fault]:
         *_check_wheels(cfg.robot, cfg.limits),
         *_check_edge_sensors(cfg.robot),
         *_check_world(cfg.world, cfg.sim.robot),
+        *_check_light(cfg.align),
         *_check_observatory(cfg.observatory),
         *_check_stand_ins(cfg),
         *_check_standstill(cfg),
@@ -250,6 +252,12 @@ def _check_base(mirror: MirrorConfig) -> Iterator[Fault]:
             yield Fault(
                 (*root, f"{axis}_mm"), f"= {value:g} is off the panel, which reaches from {-half:g} to {half:g}"
             )
+
+
+def _check_light(align: AlignConfig) -> Iterator[Fault]:
+    for name, light in align.light.items():
+        if not any(light.direction_world):
+            yield Fault(("align", "light", name, "direction_world"), "= [0, 0, 0] is no direction")
 
 
 def _check_collimators(mirror: MirrorConfig) -> Iterator[Fault]:

@@ -223,6 +223,22 @@ class DangerConfig(Model):
     clear_samples: Annotated[int, Field(ge=1, le=10000)]
 
 
+class LightConfig(Model):
+    """How light meets a mirror, world frame."""
+
+    direction_world: tuple[float, float, float]  # in which it goes, at the origin of the mirror frame; any length
+    vergence_1_m: NonNegative  # 1 over the distance from that origin to where its rays meet; 0 = parallel light
+
+
+class AlignConfig(Model):
+    """The alignment result of a survey."""
+
+    point_floor_m: NonNegative
+    puck_height_sigma_m: NonNegative
+    false_alarm: Annotated[float, Field(gt=0.0, lt=1.0)]
+    light: dict[str, LightConfig]  # by mirror name
+
+
 class HealthConfig(Model):
     """What the monitors of sensors, wheels, fans and link take for a fault, and how long they are patient."""
 
@@ -465,6 +481,7 @@ class Config(Model):
     localizer: LocalizerConfig
     etalon: EtalonConfig
     danger: DangerConfig
+    align: AlignConfig
     health: HealthConfig
     observatory: ObservatoryConfig
     mission: MissionConfig

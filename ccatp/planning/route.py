@@ -53,6 +53,7 @@ def plan_route(
     start: DeckPose,
     skip: Collection[PointId] = (),
     measuring_time_s: float = 0.0,
+    out_of_reach: list[PointId] | None = None,
 ) -> Route:
     """The fastest drivable sequence of stops through the points.
 
@@ -67,14 +68,15 @@ def plan_route(
         start: pose of the robot, deck frame.
         skip: points already measured.
         measuring_time_s: standstill at each point, for the remaining time only.
+        out_of_reach: takes the points that cannot be reached, and the route goes without them.
 
     Raises:
         OutsideMirrorError: if the start is not on the mirror.
-        UnreachableError: if a point cannot be reached with the clearances.
+        UnreachableError: if a point cannot be reached with the clearances, and there is no ``out_of_reach``.
     """
     left = set(points).difference(skip)
     wanted = [point for point in points if point in left]
-    stops = _stops(mirror, wanted, robot, limits, mission, start)
+    stops = _stops(mirror, wanted, robot, limits, mission, start, out_of_reach)
     return _with_remains(mirror, stops, limits, start, measuring_time_s)
 
 
@@ -148,6 +150,7 @@ def _stops(
     limits: LimitsConfig,
     mission: MissionConfig,
     start: DeckPose,
+    out_of_reach: list[PointId] | None,
 ) -> tuple[Stop, ...]:
     body = build_body(robot, mission)
     xy = np.array([(start.x_m, start.y_m), *(mirror.point_on_deck(point) for point in points)])
@@ -161,10 +164,14 @@ def _stops(
     first = Arrival(places[0], course_of_heading(mirror, start), 0.0)
     if places[0].stance is not None:  # too near the rim to turn: away from it first, as on the way home
         first, retreats[0] = find_escape(mirror, body, first, limits), ()
-    arrivals = [first]
+    arrivals, before = [first], 0
     for k, point in enumerate(points, start=1):
-        arrivals = search.advance(arrivals, retreats[k - 1], Target(places[k], retreats[k]))
-        if not arrivals:
+        found = search.advance(arrivals, retreats[before], Target(places[k], retreats[k]))
+        if found:
+            arrivals, before = found, k
+        elif out_of_reach is not None:
+            out_of_reach.append(point)
+        else:
             raise UnreachableError(
                 f"mission: no safe way to point {point.row}-{point.col}-{point.point} of {mirror.name}, "
                 f"{places[k].depth_m:.3f} m from the rim, with leg_clearance_m = {mission.leg_clearance_m} and "

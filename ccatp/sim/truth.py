@@ -4,7 +4,7 @@ import msgspec
 
 from ccatp.sim.robot import Robot
 from ccatp.sim.world import TruthRow
-from ccatp.wire.topics import Truth
+from ccatp.wire.topics import Misalignment, Truth
 
 BATCH_ROWS = 100
 
@@ -45,6 +45,14 @@ class TruthLog:
         self._taken += len(rows)
         return Truth(seq=self._robot.seq, t_s=self._robot.t_s, rows=rows) if rows else None
 
+    def misalignment(self) -> Misalignment:
+        """How the panels lie, as a message of the topic table."""
+        return Misalignment(seq=self._robot.seq, t_s=self._robot.t_s, panels=self._panels())
+
+    def _panels(self) -> list[tuple[int, int, float, float, float]]:
+        found = self._robot.world.misalignments.items()
+        return [(*panel, m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in found]
+
     def answer(self, request: bytes) -> bytes:
         """The reply to a request."""
         world = self._robot.world
@@ -55,8 +63,7 @@ class TruthLog:
             reply = {"rows": self._taken}
         elif request == b"misalignment":
             start = world.start_pose
-            panels = [(*p, m.piston_m, m.tip_rad, m.tilt_rad) for p, m in world.misalignments.items()]
-            reply = {"panels": panels, "start": (start.x_m, start.y_m, start.heading_rad)}
+            reply = {"panels": self._panels(), "start": (start.x_m, start.y_m, start.heading_rad)}
         else:
             reply = {"error": "unknown request; known are puck, misalignment, flush"}
         return msgspec.json.encode(reply)

@@ -144,6 +144,12 @@ class Truth(Message):
     rows: list[tuple[int, float, float, float, float, float, float, float, float, int, int]]
 
 
+class Misalignment(Message):
+    """How the simulated panels really lie (simulation only): row, column, piston_m, tip_rad, tilt_rad."""
+
+    panels: list[tuple[int, int, float, float, float]]
+
+
 @dataclass(frozen=True, slots=True)
 class Topic:
     """One row of the table.
@@ -179,6 +185,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("danger_event", DangerEvent, "danger", 0.0, 0.0, True),
     Topic("log", Log, "main", 0.0, 0.0, True),
     Topic("timing", Timing, "main", 1.0, 0.0, False),
+    Topic("misalignment", Misalignment, "dataloop", 0.0, 0.0, True),
     Topic("truth", Truth, "dataloop", 1.0, 0.0, True),
 )
 RECORD_FORMAT = 1

@@ -71,6 +71,17 @@ def test_the_same_filter_reproduces_the_run(hard_run: Run) -> None:
     assert not result["warnings"]
 
 
+def test_its_panel_lies_as_it_was_simulated(hard_run: Run) -> None:
+    command = [sys.executable, "-m", "ccatp", "align", str(hard_run.run_dir), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    result = json.loads(done.stdout)
+    assert (len(result["panels"]), result["points"]["measured"]) == (1, 9)
+    assert result["truth"]["agrees"]
+    # The supervisor asks the truth itself; both round to nanometres.
+    assert result["truth"]["piston_rms_um"] == pytest.approx(hard_run.summary["panels"]["piston_rms_um"], abs=2e-3)
+
+
 @pytest.mark.parametrize("name", ["kf", "ukf"])
 def test_the_other_filters_reproduce_theirs(name: str, start: Start) -> None:
     run = stopped(start("--panels", "1", "--world", "thesis", "--filter", name), points=2)

@@ -111,6 +111,22 @@ def test_start_beyond_the_rim(thesis: Any) -> None:
         plan_route(thesis.mirror, [], cfg.robot, cfg.limits, cfg.mission, DeckPose(9.0, 0.0, 0.0))
 
 
+def test_points_out_of_reach_may_be_left_out(thesis: Any) -> None:
+    cfg, mirror = thesis.cfg, thesis.mirror
+    mission = cfg.mission.model_copy(update={"leg_clearance_m": 0.13})
+    points = thesis_order(mirror, 1)
+    lost: list[PointId] = []
+    x, y = mirror.point_on_deck(PointId(1, 3, 5))
+    start = DeckPose(x, y, 0.0)
+    route = plan_route(mirror, points, cfg.robot, cfg.limits, mission, start, (), 0.0, lost)
+    # The panel in the lower left corner: a point is 115 mm from either side of it that is a rim.
+    assert sorted(point.point for point in lost) == [1, 2, 3, 4, 7]
+    reached = [stop.point for stop in route.stops if stop.point is not None]
+    assert reached == [point for point in points if point not in lost]
+    # The way is that of a survey of the others alone.
+    assert route == plan_route(mirror, reached, cfg.robot, cfg.limits, mission, start)
+
+
 @pytest.mark.parametrize("clearances", [{"leg_clearance_m": 0.13}, {"turn_clearance_m": 0.04}])
 def test_points_too_near_the_rim(clearances: dict[str, float], thesis: Any) -> None:
     cfg = thesis.cfg

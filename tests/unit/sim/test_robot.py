@@ -325,6 +325,7 @@ def test_answers(config: Config, mirror: Mirror) -> None:
     assert (puck["t"], puck["moved_m"], tuple(puck["puck"])) == (0.0, 0.0, robot.world.puck_world())
     told = json.loads(truth.answer(b"misalignment"))
     assert [PanelId(*row[:2]) for row in told["panels"]] == list(mirror.panels)
+    assert [list(row) for row in truth.misalignment().panels] == told["panels"]
     assert told["start"][:2] == [robot.world.start_pose.x_m, robot.world.start_pose.y_m]
     assert "unknown request" in json.loads(truth.answer(b"x" * 1000))["error"]
 

@@ -1,0 +1,139 @@
+"""Edge. The alignment of a mirror as a picture: deviations in colour, and the moves of the adjusters in figures.
+
+Needs the extra ``plots`` (matplotlib), imported only when something is drawn.
+"""
+
+from math import ceil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ccatp.aligning.modes import FloatArray, quadratic, rigid
+from ccatp.aligning.moves import adjuster_places
+from ccatp.aligning.panel_result import PanelResult
+from ccatp.aligning.survey_result import SurveyResult
+from ccatp.mirror.mirror import Mirror
+from ccatp.run_map import RunMapError, draw_panels
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap, Normalize
+    from matplotlib.figure import Figure
+
+    Colours = tuple[Colormap, Normalize]
+
+WIDTH_PX = 2400
+DPI = 200
+_CELLS = 12  # along each side of a panel
+_INK, _QUIET, _BAD = "#1f2933", "#6b7785", "#d64545"
+_COLOURS = ("#5a8fc4", "#a9cbe3", "#f7f7f5", "#f3c08c", "#d5703f")  # below, ideal, above; figures stay legible on each
+_MICRO = 1e6
+
+
+def draw_alignment(mirror: Mirror, result: SurveyResult, out: Path, title: str, subtitle: str = "") -> None:
+    """Draw the alignment into an image file.
+
+    Each panel shows its fitted displacement, with its curvatures where they are significant; a dot shows what was
+    measured at its place in the same colours, so that it vanishes where the fit agrees with it; a cross is an outlier.
+
+    Args:
+        mirror: the mirror.
+        result: its alignment.
+        out: the file; its suffix tells the format (PNG, PDF, SVG).
+        title: first line.
+        subtitle: second line.
+
+    Raises:
+        RunMapError: matplotlib is not installed, or the file cannot be written.
+    """
+    try:
+        from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second, and belongs to an extra
+    except ImportError as error:
+        raise RunMapError("drawing needs matplotlib: install ccatp with its extra, ccatp[plots]") from error
+    low, high = mirror.rim.vertices.min(axis=0), mirror.rim.vertices.max(axis=0)
+    width = WIDTH_PX / DPI
+    height = (width - 1.6) * float((high[1] - low[1] + 0.5) / (high[0] - low[0] + 0.5)) + 1.6
+    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
+    axes = figure.add_axes((0.75 / width, 0.7 / height, (width - 1.75) / width, (height - 1.6) / height))
+    draw_panels(axes, mirror)
+    colours = _colours(result)
+    for panel in result.panels:
+        _draw_panel(axes, mirror, panel, colours)
+    _draw_bar(figure, axes, colours)
+    axes.set(xlim=(low[0] - 0.25, high[0] + 0.25), ylim=(low[1] - 0.25, high[1] + 0.25))
+    axes.set(xlabel="x, m (deck frame)", ylabel="y, m (deck frame)", aspect="equal")
+    axes.tick_params(labelsize=8, color=_QUIET, labelcolor=_INK)
+    for side in axes.spines.values():
+        side.set_visible(False)
+    axes.text(0.0, 1.05, title + _half_wavefront(result), transform=axes.transAxes, fontsize=15, color=_INK)
+    legend = "figures: moves of the vertical adjusters, um, > 0 towards the robot; dots: measured points"
+    axes.text(
+        0.0, 1.022, "  ·  ".join(filter(None, (subtitle, legend))), transform=axes.transAxes, fontsize=9, color=_QUIET
+    )
+    try:
+        figure.savefig(out)
+    except (OSError, ValueError) as error:
+        raise RunMapError(f"{out}: cannot be written: {error}") from error
+
+
+def _half_wavefront(result: SurveyResult) -> str:
+    if result.wavefront is None:
+        return ""
+    before, after = result.wavefront.before_m * _MICRO, result.wavefront.after_m * _MICRO
+    return f", half-wavefront error {before:.1f} um rms, {after:.1f} after the moves"
+
+
+def _colours(result: SurveyResult) -> "Colours":
+    from matplotlib.colors import LinearSegmentedColormap, Normalize  # noqa: PLC0415 - see above
+
+    values = [np.abs(p.deviations.values_m[p.is_kept]) for p in result.panels]
+    # A single far point must not make all others look alike.
+    usual = float(np.percentile(np.concatenate(values), 99)) * _MICRO if values else 1.0
+    top = max(1.0, float(ceil(usual)))
+    return LinearSegmentedColormap.from_list("deviation", _COLOURS), Normalize(-top, top)
+
+
+def _draw_panel(axes: "Axes", mirror: Mirror, panel: PanelResult, colours: "Colours") -> None:
+    from matplotlib.patches import Rectangle  # noqa: PLC0415 - see above
+
+    body, found, (cmap, norm) = mirror.panel(panel.panel), panel.deviations, colours
+    x = np.linspace(body.x_m - body.half_x_m, body.x_m + body.half_x_m, _CELLS + 1)
+    y = np.linspace(body.y_m - body.half_y_m, body.y_m + body.half_y_m, _CELLS + 1)
+    middle_x, middle_y = np.meshgrid((x[1:] + x[:-1]) / 2.0, (y[1:] + y[:-1]) / 2.0)
+    deck = np.column_stack([middle_x.ravel(), middle_y.ravel()]).tolist()
+    places = np.array([body.from_deck(mirror.surface.point(*place))[:2] for place in deck])
+    values = _displacement(panel, places).reshape(_CELLS, _CELLS)
+    axes.pcolormesh(x, y, values * _MICRO, cmap=cmap, norm=norm, zorder=2, rasterized=True)
+    size = 2.0 * body.half_x_m, 2.0 * body.half_y_m
+    axes.add_patch(Rectangle((x[0], y[0]), *size, fill=False, edgecolor=_QUIET, linewidth=0.7, zorder=3))
+    (dots_x, dots_y), heights = found.deck_m[panel.is_kept].T, found.values_m[panel.is_kept] * _MICRO
+    axes.scatter(dots_x, dots_y, c=heights, cmap=cmap, norm=norm, s=22, edgecolors=_QUIET, linewidths=0.3, zorder=5)
+    crosses_x, crosses_y = found.deck_m[~panel.is_kept].T
+    axes.scatter(crosses_x, crosses_y, marker="x", color=_BAD, s=36, linewidths=1.6, zorder=6)
+    small: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 5.5, "color": _INK, "zorder": 6}
+    names, adjusters = adjuster_places(mirror, panel.panel)
+    for name, place, move in zip(names, adjusters.tolist(), panel.rigid.moves.values_m, strict=True):
+        deck_x, deck_y, _ = body.to_deck((*place, 0.0))
+        axes.text(deck_x, deck_y - 0.025, f"{name} {_MICRO * move:+.0f}", **small)
+
+
+def _displacement(panel: PanelResult, places: FloatArray) -> FloatArray:
+    found = rigid(places) @ panel.fit.values
+    if panel.shape is not None and panel.shape.is_significant:
+        # The rigid fit has taken the mean of the curvatures' part away; so does what is drawn.
+        bend = quadratic(places)[:, 3:] @ panel.shape.values_1_m
+        found += bend - bend.mean()
+    return np.asarray(found)
+
+
+def _draw_bar(figure: "Figure", axes: "Axes", colours: "Colours") -> None:
+    from matplotlib.cm import ScalarMappable  # noqa: PLC0415 - see above
+
+    cmap, norm = colours
+    place = axes.get_position()
+    bar_axes = figure.add_axes((place.x1 + 0.006, place.y0 + 0.15 * place.height, 0.013, 0.7 * place.height))
+    bar = figure.colorbar(ScalarMappable(norm, cmap), cax=bar_axes, extend="both")
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(labelsize=8, color=_QUIET, labelcolor=_INK)
+    bar.set_label("deviation along the normal, um, > 0 towards the robot", fontsize=9, color=_INK)

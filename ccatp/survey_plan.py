@@ -1,0 +1,140 @@
+"""Pure. A survey before anything moves: its order, way, least time, and the points that cannot be reached."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+from ccatp.assembly import plan_survey
+from ccatp.config.models import Config
+from ccatp.mirror.mirror import Mirror
+from ccatp.planning.bound import leg_lengths, leg_time, stop_times
+from ccatp.planning.tour_bound import tour_bound
+from ccatp.planning.traversal import ORDERS
+from ccatp.samples import PanelId, PointId, Stop, StopKind
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyPlan:
+    """What a survey would do.
+
+    Attributes:
+        points: in the order of measuring, those out of reach included.
+        out_of_reach: no safe way leads there with the configured clearances; a run would be refused.
+        stops: where the robot would stand, one after the other.
+        times_s: since the start, when it stands at each stop, before what it measures there.
+        length_m: of the whole way.
+        driving_s, turning_s, measuring_s: least times, rest to rest; their sum is the survey's lower bound.
+        any_order_s: no order of the points takes less.
+    """
+
+    points: tuple[PointId, ...]
+    out_of_reach: tuple[PointId, ...]
+    stops: tuple[Stop, ...]
+    times_s: tuple[float, ...]
+    length_m: float
+    driving_s: float
+    turning_s: float
+    measuring_s: float
+    any_order_s: float
+
+    @property
+    def least_s(self) -> float:
+        """Lower bound of the survey's time along this way."""
+        return self.driving_s + self.turning_s + self.measuring_s
+
+
+def make_plan(cfg: Config, mirror: Mirror) -> SurveyPlan:
+    """Plan the survey of a configuration as a run would.
+
+    Raises:
+        PlanError: base is not on the mirror, or the robot cannot get away from there.
+    """
+    points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
+    out_of_reach: list[PointId] = []
+    stops = plan_survey(cfg, mirror, points, (), out_of_reach).stops
+    legs_s = [leg_time(length, cfg.limits) for length in leg_lengths(stops, mirror.base_pose, mirror)]
+    times_s = stop_times(stops, mirror.base_pose, cfg.limits, mirror)
+    rests_s = [cfg.etalon.measuring_time_s * _is_measured(stop) for stop in stops]
+    clock_s, arrivals_s = 0.0, []
+    for time_s, rest_s in zip(times_s, rests_s, strict=True):
+        arrivals_s.append(clock_s + time_s)
+        clock_s += time_s + rest_s
+    reached = [point for point in points if point not in set(out_of_reach)]
+    return SurveyPlan(
+        points=tuple(points),
+        out_of_reach=tuple(out_of_reach),
+        stops=stops,
+        times_s=tuple(arrivals_s),
+        length_m=sum(leg_lengths(stops, mirror.base_pose, mirror)),
+        driving_s=sum(legs_s),
+        turning_s=sum(times_s) - sum(legs_s),
+        measuring_s=sum(rests_s),
+        any_order_s=tour_bound(mirror, reached, cfg.limits, cfg.etalon.measuring_time_s),
+    )
+
+
+def _is_measured(stop: Stop) -> bool:
+    return stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE)
+
+
+def plan_data(cfg: Config, plan: SurveyPlan) -> dict[str, Any]:
+    """The plan as data: lengths in m, times in s, points as [row, column, number]."""
+    kinds = [stop.kind for stop in plan.stops]
+    return {
+        "mirror": cfg.mirror.name,
+        "order": cfg.run.order,
+        "filter": cfg.run.filter,
+        "points": {"total": len(plan.points), "reached": len(plan.points) - len(plan.out_of_reach)},
+        "out_of_reach": [list(point) for point in plan.out_of_reach],
+        "length_m": round(plan.length_m, 3),
+        "lower_bound_s": round(plan.least_s, 3),
+        "driving_s": round(plan.driving_s, 3),
+        "turning_s": round(plan.turning_s, 3),
+        "measuring_s": round(plan.measuring_s, 3),
+        "any_order_bound_s": round(plan.any_order_s, 3),
+        "budget_s": cfg.run.budget_s,
+        "fits_budget": plan.least_s <= cfg.run.budget_s,
+        "via_stops": kinds.count(StopKind.VIA),
+        "stops": [
+            {
+                "t_s": round(time_s, 3),
+                "x_m": round(stop.x_m, 4),
+                "y_m": round(stop.y_m, 4),
+                "kind": stop.kind.value,
+                "point": None if stop.point is None else list(stop.point),
+                "reverse": stop.reverse,
+            }
+            for stop, time_s in zip(plan.stops, plan.times_s, strict=True)
+        ],
+    }
+
+
+def plan_lines(cfg: Config, plan: SurveyPlan) -> Iterator[str]:
+    """The plan for a terminal."""
+    vias = sum(stop.kind is StopKind.VIA for stop in plan.stops)
+    panels = [panel for panel, _ in groupby(point.panel for point in plan.points)]
+    limits = cfg.limits
+    yield f"{cfg.mirror.name}: {len(plan.points)} points of {len(set(panels))} panels, order {cfg.run.order}"
+    yield f"first panels    {_names(panels)}"
+    yield f"way             {plan.length_m:.1f} m, {len(plan.stops)} stops, {vias} of them only on the way"
+    yield (
+        f"least time      {_clock(plan.least_s)}: {plan.driving_s:.0f} s driving, {plan.turning_s:.0f} s turning, "
+        f"{plan.measuring_s:.0f} s measuring"
+    )
+    at = f"at {limits.v_max_m_s:g} m/s and {limits.omega_max_rad_s:g} rad/s"
+    yield f"                {at}; simulated surveys take 1 to 10 % more"
+    yield f"any order       {_clock(plan.any_order_s)} at least, through the points that can be reached"
+    word = "within" if plan.least_s <= cfg.run.budget_s else "BEYOND"
+    yield f"budget          {_clock(cfg.run.budget_s)}: the least time is {word} it"
+    lost = " ".join("/".join(map(str, point)) for point in plan.out_of_reach)
+    yield f"out of reach    {f'{len(plan.out_of_reach)} points: {lost}' if lost else 'none'}"
+
+
+def _names(panels: list[PanelId]) -> str:
+    shown = " ".join(f"{panel.row}/{panel.col}" for panel in panels[:9])
+    return shown + (" ..." if len(panels) > 9 else "")
+
+
+def _clock(time_s: float) -> str:
+    return f"{int(time_s) // 60} min {int(time_s) % 60:02d} s"

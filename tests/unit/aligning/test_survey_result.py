@@ -1,0 +1,199 @@
+"""Whole mirrors without a robot: recovered against injected, moves applied, and what cannot be fitted."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ccatp.aligning.comparison import compare
+from ccatp.aligning.deviations import Measured
+from ccatp.aligning.panel_result import PanelResult
+from ccatp.aligning.survey_result import survey_result
+from ccatp.config.models import Config
+from ccatp.mirror.alignment import PanelMisalignment
+from ccatp.mirror.mirror import Mirror
+from ccatp.samples import PanelId, PointId, Vector3
+from tests.unit.aligning.conftest import HEIGHT_M, Truth, exact_fix, load, misaligned, survey
+
+CFG, M1 = load("fyst-m1")
+PANEL = PanelId(3, 7)
+TRUTH = PanelMisalignment(piston_m=73e-6, tip_rad=-140e-6, tilt_rad=95e-6)
+
+
+def injected(truth: Truth) -> dict[PanelId, Vector3]:
+    return {panel: (m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in truth.items()}
+
+
+def moved(truth: Truth, panels: tuple[PanelResult, ...], mirror: Mirror) -> dict[PanelId, PanelMisalignment]:
+    """The panels after somebody has turned the five adjusters by the moves: a rigid body on five points."""
+    found = {}
+    for result in panels:
+        body, before = mirror.panel(result.panel), truth[result.panel]
+        places = np.array([
+            body.from_deck(mirror.surface_point(x, y))[:2]
+            for x, y in mirror.adjusters_on_deck(result.panel).values()
+        ])  # fmt: skip
+        plane = np.column_stack([np.ones(5), places[:, 1], places[:, 0]])
+        piston, tip, tilt = np.linalg.lstsq(plane, result.rigid.moves.values_m, rcond=None)[0].tolist()
+        found[result.panel] = PanelMisalignment(before.piston_m + piston, before.tip_rad + tip, before.tilt_rad + tilt)
+    return found
+
+
+def true_rms_m(truth: Truth, panels: tuple[PanelResult, ...], mirror: Mirror) -> float:
+    """Half-wavefront error of the true panels: their planes at a grid of places, weighted by area across the beam."""
+    total = weights = 0.0
+    for result in panels:
+        body, lies = mirror.panel(result.panel), truth[result.panel]
+        half_x, half_y = body.half_x_m / body.axes[0][0], body.half_y_m / body.axes[1][1]
+        grid = np.linspace(-1.0, 1.0, 41)[:-1] + 0.025
+        x, y = np.meshgrid(half_x * grid, half_y * grid)
+        plane = lies.piston_m + lies.tilt_rad * x + lies.tip_rad * y
+        weight = half_x * half_y * result.cos_i
+        total += weight * float(np.mean((plane * result.cos_i) ** 2))
+        weights += weight
+    return float(np.sqrt(total / weights))
+
+
+def test_a_whole_mirror_is_recovered_and_its_moves_align_it(each: tuple[Config, Mirror]) -> None:
+    cfg, mirror = each
+    rng = np.random.default_rng(21)
+    truth = misaligned(cfg, mirror.panels, rng)
+    result = survey_result(mirror, cfg.align, HEIGHT_M, survey(cfg, mirror, truth, rng), mirror.panels)
+    assert len(result.panels) == len(mirror.panels)
+    assert (result.undetermined, result.warnings) == ((), ())
+    found = compare(result.panels, injected(truth))
+    assert found is not None
+    assert found.dof == 3 * len(mirror.panels)
+    assert found.low < found.chi2 < found.high
+    assert found.agrees
+    assert found.piston_rms_m < 1e-6
+    chi2, dof = sum(p.fit.chi2 for p in result.panels), sum(p.fit.dof for p in result.panels)
+    assert chi2 == pytest.approx(dof, abs=4.0 * (2 * dof) ** 0.5)
+    # Before: that of the panels as they really lie. After: as predicted, when the moves are made.
+    assert result.wavefront is not None
+    assert result.wavefront.before_m == pytest.approx(true_rms_m(truth, result.panels, mirror), rel=0.01)
+    aligned = moved(truth, result.panels, mirror)
+    left = true_rms_m(aligned, result.panels, mirror)
+    # The mean square of 200 parameters is known to 10 %, its root to 5 %; four sigmas.
+    assert left == pytest.approx(result.wavefront.after_m, rel=0.25)
+    assert left < 0.02 * result.wavefront.before_m
+    # A second survey shows nothing but noise.
+    again = survey_result(mirror, cfg.align, HEIGHT_M, survey(cfg, mirror, aligned, rng), mirror.panels)
+    assert again.wavefront is not None
+    assert again.wavefront.before_m < 2.0 * result.wavefront.after_m
+
+
+def test_without_noise_a_panel_is_recovered(each: tuple[Config, Mirror]) -> None:
+    cfg, mirror = each
+    measured = [exact_fix(mirror, point, TRUTH) for panel in mirror.panels for point in mirror.point_ids(panel)]
+    result = survey_result(mirror, cfg.align, HEIGHT_M, measured, mirror.panels)
+    for panel in result.panels:
+        # Second order in the angles: a tilted puck leans sideways by 7 um.
+        assert panel.fit.values == pytest.approx([TRUTH.piston_m, TRUTH.tip_rad, TRUTH.tilt_rad], abs=1e-8)
+        assert panel.shape is not None
+        assert not panel.shape.is_significant
+        assert panel.probability > 0.99
+
+
+def test_an_outlier_is_left_out_with_a_warning() -> None:
+    measured = [exact_fix(M1, point, TRUTH) for point in M1.point_ids(PANEL)]
+    measured[3] = shifted(measured[3], 80e-6)
+    result = survey_result(M1, CFG.align, HEIGHT_M, measured, [PANEL])
+    (panel,) = result.panels
+    assert panel.outliers == (PointId(3, 7, 4),)
+    assert (panel.fit.dof, len(panel.deviations.points)) == (5, 9)
+    assert panel.fit.values == pytest.approx([TRUTH.piston_m, TRUTH.tip_rad, TRUTH.tilt_rad], abs=1e-8)
+    assert result.warnings == ("panel 3/7: left out as outliers: 3/7/4; measure them again",)
+
+
+def shifted(one: Measured, shift_m: float) -> Measured:
+    """The same fix, off along the normal of its panel."""
+    normal = M1.rotate_world_from_deck(M1.panel(one.point.panel).axes[2])
+    x, y, z = (p + shift_m * n for p, n in zip(one.fix.position_m, normal, strict=True))
+    return Measured(one.point, replace(one.fix, position_m=(x, y, z)))
+
+
+def test_contradictions_beyond_outliers_are_told() -> None:
+    rng = np.random.default_rng(4)
+    measured = [shifted(exact_fix(M1, p, TRUTH), float(rng.normal()) * 60e-6) for p in M1.point_ids(PANEL)]
+    result = survey_result(M1, CFG.align, HEIGHT_M, measured, [PANEL])
+    assert any("contradict each other by more than they are uncertain" in line for line in result.warnings)
+    # A floor that says so makes them agree.
+    floor = CFG.align.model_copy(update={"point_floor_m": 60e-6})
+    result = survey_result(M1, floor, HEIGHT_M, measured, [PANEL])
+    assert result.warnings == ()
+    assert result.panels[0].fit.sigma[0] == pytest.approx(20e-6, rel=0.01)
+
+
+def test_a_wrong_puck_height_shifts_all_pistons_and_nothing_else() -> None:
+    panels = [PanelId(1, 5), PANEL, PanelId(9, 5)]
+    measured = [exact_fix(M1, point, TRUTH) for panel in panels for point in M1.point_ids(panel)]
+    result = survey_result(M1, CFG.align, HEIGHT_M - 10e-6, measured, panels)
+    for panel in result.panels:
+        assert panel.fit.values == pytest.approx([TRUTH.piston_m + 10e-6, TRUTH.tip_rad, TRUTH.tilt_rad], abs=2e-8)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_points_determine_nothing(count: int) -> None:
+    measured = [exact_fix(M1, point, TRUTH) for point in M1.point_ids(PANEL)[:count]]
+    result = survey_result(M1, CFG.align, HEIGHT_M, measured, [PANEL])
+    assert result.panels == ()
+    assert result.wavefront is None
+    (one,) = result.undetermined
+    assert one == (PANEL, count, f"{count} of 3 points that it takes")
+
+
+def test_points_on_a_line_determine_nothing() -> None:
+    measured = [exact_fix(M1, point, TRUTH) for point in M1.point_ids(PANEL)[:3]]
+    result = survey_result(M1, CFG.align, HEIGHT_M, measured, [PANEL])
+    assert result.undetermined[0].why == "its points lie on one line"
+
+
+def test_three_points_determine_a_plane_without_shape_and_bending() -> None:
+    points = M1.point_ids(PANEL)
+    measured = [exact_fix(M1, points[k], TRUTH) for k in (0, 2, 7)]
+    result = survey_result(M1, CFG.align, HEIGHT_M, measured, [PANEL])
+    (panel,) = result.panels
+    assert (panel.fit.dof, panel.shape, panel.bending, panel.probability) == (0, None, None, 1.0)
+    assert result.wavefront_bent is None
+    assert panel.fit.values == pytest.approx([TRUTH.piston_m, TRUTH.tip_rad, TRUTH.tilt_rad], abs=1e-8)
+
+
+def test_a_fix_that_is_none_does_not_stop_the_others() -> None:
+    good = [exact_fix(M1, point, TRUTH) for point in M1.point_ids(PANEL)]
+    far = [exact_fix(M1, point, TRUTH) for point in M1.point_ids(PanelId(2, 2))]
+    far[0] = Measured(far[0].point, replace(far[0].fix, position_m=(1e3, 1e3, 1e3)))
+    exact = [exact_fix(M1, point, TRUTH, sigma_m=0.0) for point in M1.point_ids(PanelId(2, 3))]
+    result = survey_result(M1, CFG.align, HEIGHT_M, [*good, *far, *exact], [])
+    assert [panel.panel for panel in result.panels] == [PANEL]
+    assert [one.panel for one in result.undetermined] == [(2, 2), (2, 3)]
+    assert result.undetermined[0].why.startswith("a fix is far from the mirror: ")
+    assert result.undetermined[1].why == "a fix claims to be exact: its covariance is not positive"
+
+
+def test_a_mirror_without_light_is_told() -> None:
+    dark = CFG.align.model_copy(update={"light": {}})
+    measured = [exact_fix(M1, point, TRUTH) for point in M1.point_ids(PANEL)]
+    result = survey_result(M1, dark, HEIGHT_M, measured, [PANEL])
+    assert result.warnings == (
+        "no light is configured for fyst-m1 (align.light): its angle of incidence is taken as 0",
+    )
+    assert result.panels[0].cos_i == 1.0
+
+
+def test_stated_uncertainties_that_are_too_small_do_not_agree() -> None:
+    rng = np.random.default_rng(2)
+    truth = misaligned(CFG, list(M1.panels)[:20], rng)
+    measured = [
+        Measured(one.point, replace(one.fix, covariance_m2=tuple(0.5 * c for c in one.fix.covariance_m2)))
+        for one in survey(CFG, M1, truth, rng)
+    ]
+    found = compare(survey_result(M1, CFG.align, HEIGHT_M, measured, []).panels, injected(truth))
+    assert found is not None
+    assert not found.agrees
+    assert found.chi2 > found.high
+
+
+def test_nothing_known_of_the_truth_is_no_comparison() -> None:
+    measured = [exact_fix(M1, point, TRUTH) for point in M1.point_ids(PANEL)]
+    assert compare(survey_result(M1, CFG.align, HEIGHT_M, measured, []).panels, {}) is None
