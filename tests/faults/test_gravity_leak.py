@@ -43,6 +43,6 @@ def test_innovations_stay_within_their_band() -> None:
         rehearsal = Leaking(load_config(overrides=overrides), with_track=False)
         found += [stop.nis for stop in rehearsal.run().stops]
         assert rehearsal.largest_m_s2 > 0.1
-    low, high = chi2.ppf((0.025, 0.975), 2 * len(found)) / len(found)
+    low, high = (chi2.ppf(share, 2 * len(found)) / len(found) for share in (0.025, 0.975))
     assert len(found) == 9 * len(SEEDS)
     assert low < np.mean(found) < high
