@@ -301,12 +301,16 @@ class Mission:
         if point is None and not self._is_lost:
             self._leave_pointless()  # the survey can do without
             return
+        limit = self._cfg.mission.failed_points_before_hold
+        self._failures += 1
         if point is None:
+            if self._failures < limit:
+                self._stopover.repeat()  # it may not have stood quite still, and cannot do without
+                return
+            self._failures = 0
             self.fault(f"the robot cannot be found again: {cause}")
             return
         self._leftovers.failed(point, cause)
-        limit = self._cfg.mission.failed_points_before_hold
-        self._failures += 1
         if self._failures < limit:
             self._leave_stop(point, self.skipped)
             return

@@ -323,9 +323,6 @@ class MissionConfig(Model):
     alignment_leg_m: Annotated[float, Field(gt=0.0, le=0.5)]
     holds_to_budget: bool
     alarm_period_s: Positive
-    battery_endurance_s: Positive
-    battery_reserve: Annotated[float, Field(ge=0.0, lt=1.0)]
-    return_energy_factor: Annotated[float, Field(ge=1.0)]
 
 
 class SimRobotConfig(Model):

@@ -132,7 +132,7 @@ class MainLoop:
         self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
         self._unanswered: int | None = None
         self._state = State.IDLE
-        self._vigil = Vigil(cfg.mission, falls=parts.mirror.overhang)
+        self._vigil = Vigil(cfg, falls=parts.mirror.overhang)
         self._has_full_fans = False
         self.over = asyncio.Event()
         self.exit_status = EXIT_STATUS[Outcome.NONE]

@@ -28,12 +28,13 @@ class Stopover:
         self._rest_by_s: float | None = None
         self._measure_at_s = 0.0
         self._arrived_at: PointId | None = None
+        self._is_anew = False
         self.request = 0
         self.is_asked = False
 
     def interrupt(self) -> None:
         """The robot moves, or may have moved: the stop begins anew."""
-        self.is_asked = False
+        self.is_asked = self._is_anew = False
         self._stillness.reset()
         self._rest_by_s = None
 
@@ -66,6 +67,10 @@ class Stopover:
         self._arrived_at = point
         return point
 
+    def repeat(self) -> None:
+        """The measurement failed: it is asked for once more, after another measuring time."""
+        self.is_asked, self._is_anew = False, True
+
     def is_due(self, motion: Motion) -> bool:
         """Take a frame of the measuring time; whether to ask for the measurement now. True once at each stop.
 
@@ -73,6 +78,9 @@ class Stopover:
         begins anew, and what was asked for is not wanted any more.
         """
         t_s = motion.t_s
+        if self._is_anew:
+            self._is_anew = False
+            self._begin(t_s)
         if not self.is_quiet(motion):
             if self.is_asked:
                 self.is_asked = False

@@ -337,12 +337,12 @@ def test_a_clear_is_refused_with_a_reason_while_the_cause_persists(
 def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
     home_s: float, story: Story, config: Config, measured: Note
 ) -> None:
-    cfg = config.mission
+    cfg = config.health
     story.until_state(State.DRIVING)
     story.mission.fault("leg overdue")
-    vigil = Vigil(cfg, falls=True)
+    vigil = Vigil(config, falls=True)
     reminders: list[float] = []
-    soc, drain = 0.5, 1.0 / cfg.battery_endurance_s
+    soc, drain = 0.5, 1.0 / cfg.battery_life_s
     while story.mission.is_faulted:
         story.frame()
         soc -= 50.0 * DT * drain
@@ -364,7 +364,7 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
 
 @pytest.mark.fault("O8")
 def test_who_does_not_know_where_it_is_stays_and_reminds(config: Config) -> None:
-    vigil = Vigil(config.mission, falls=True)
+    vigil = Vigil(config, falls=True)
     calls = [vigil.watch(float(t), 0.01, None) for t in range(200)]
     assert [t for t, call in enumerate(calls) if call is not Call.NOTHING] == [60, 120, 180]
     assert set(calls) == {Call.NOTHING, Call.REMIND}
@@ -372,12 +372,12 @@ def test_who_does_not_know_where_it_is_stays_and_reminds(config: Config) -> None
 
 @pytest.mark.fault("O8")
 def test_a_return_is_tried_once_and_only_where_the_robot_would_fall(config: Config) -> None:
-    vigil = Vigil(config.mission, falls=True)
+    vigil = Vigil(config, falls=True)
     assert [vigil.watch(t, 0.1, 30.0) for t in (0.0, 1.0, 61.0)] == [Call.RETURN, Call.NOTHING, Call.REMIND]
     vigil.over()
     assert vigil.held_s(100.0) == 0.0
     assert vigil.watch(100.0, 0.1, 30.0) is Call.NOTHING
-    safe = Vigil(config.mission, falls=False)
+    safe = Vigil(config, falls=False)
     assert {safe.watch(float(t), 0.0, 30.0) for t in range(50)} == {Call.NOTHING}
 
 
