@@ -131,7 +131,8 @@ def test_numbers_that_are_none_never_reach_the_filter(token: str, measured: Meas
     assert first.verdict.severity is Severity.HOLD
     assert all(abs(x) < 10.0 for one in run.seen for x in one.estimate)
     assert any(one.state is State.MEASURING for one in run.since(first.t_s))
-    measured("S4", 0.0)
+    moved = [one.t_s for one in run.since(DRIVING_S) if one.t_s < first.t_s and not one.is_zero]
+    measured("S4", 1e3 * (max(moved, default=DRIVING_S) - DRIVING_S))
 
 
 @pytest.mark.fault("S5")
@@ -154,7 +155,8 @@ def test_a_wheel_that_slips_holds_and_a_fix_follows(factor: float, measured: Mea
     assert first.verdict.signal == "imu_wz"
     assert any(one.state is State.MEASURING for one in run.since(first.t_s))
     assert run.way_m(DRIVING_S, first.t_s) < 0.05
-    measured("S6", 1.0)  # flagged before the next point
+    before = [one for one in run.since(DRIVING_S) if one.t_s < first.t_s]
+    measured("S6", float(changes(before, State.SETTLING, State.MEASURING)))
 
 
 @pytest.mark.fault("S8")
@@ -319,7 +321,7 @@ def test_a_flash_of_light_aborts_nothing(at_s: float, measured: Measured) -> Non
     assert all(map(was_real, run.injected))
     assert not run.mission.is_faulted
     assert any(one.state in (State.DRIVING, State.TURNING) for one in run.since(at_s + 2.0))
-    measured("S26", 0.0)
+    measured("S26", float(run.mission.is_faulted))
 
 
 @pytest.mark.fault("S28")
