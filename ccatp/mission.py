@@ -1,6 +1,7 @@
 """Pure. The survey: from the pose and the danger loop's verdict to the velocity wanted next. Time is an argument."""
 
 from collections.abc import Callable, Collection, Sequence
+from math import inf
 
 from ccatp.config.models import Config
 from ccatp.control.tracker import DONE, DRIVE
@@ -111,6 +112,7 @@ class Mission:
         self._aligner = Aligner(mirror, cfg.robot, cfg.mission, heading_sigma_of, self._journey)
         self._severity = NONE
         self._recoveries_s: list[float] = []
+        self._waits_until_s = -inf
         self._stuck_s: float | None = None
         self.doubts_pose = False
         self._is_hold_deaf = self._is_finding = False
@@ -246,6 +248,9 @@ class Mission:
             self.fault(cause, is_lost=True)
         else:
             self._await_recovery(cause)
+            self._waits_until_s = (
+                t_s + health.retry_after_s
+            )  # a filter that is frozen cannot tell when the robot stands
 
     def interrupt(self, cause: str) -> bool:
         """Hold until frames and verdicts are fresh again; returns whether that was news."""
@@ -396,7 +401,8 @@ class Mission:
         if verdict.code is ABORTED and verdict.cause != self._emergency:
             self._emergency = verdict.cause  # the level is repeated; what counts is that it is new
             self.abort(verdict.cause)
-        if self.state is IDLE or (self.state is HELD and not self._is_held_by_hand):
+        is_waiting = self.state is HELD and (self._is_held_by_hand or motion.t_s < self._waits_until_s)
+        if self.state is IDLE or (self.state is HELD and not is_waiting):
             self._go_on()
 
     def _stand_fast(self, cause: str) -> None:

@@ -282,6 +282,7 @@ class HealthConfig(Model):
     stuck_off_m: Annotated[float, Field(gt=0.0, le=0.06)]
     chatter_transitions: Annotated[int, Field(ge=1, le=1000)]
     chatter_time_s: Positive
+    fan_early_share: Annotated[float, Field(gt=0.0, lt=1.0)]
     fan_share: Annotated[float, Field(gt=0.0, lt=1.0)]
     fan_time_s: Positive
     battery_life_s: Positive

@@ -206,7 +206,14 @@ class HealthBoard:
         self._is_free = self._is_free and is_permitted and not frame.cmd.held
         is_flickering = is_any_off or not self.flicker.is_quiet
         self._frames += 1
-        if self._frames % _LOOK_FRAMES == 0 or is_flickering or is_gap or frame.faults or self.findings:
+        if (
+            self._frames % _LOOK_FRAMES == 0
+            or is_flickering
+            or is_gap
+            or frame.faults
+            or self.findings
+            or self._gate.cause
+        ):
             self._judge(t_s, frame, wheels)
             if is_flickering:
                 self.flicker.step(t_s, edges, self._speed_m_s)

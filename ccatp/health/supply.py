@@ -38,6 +38,7 @@ class FanMonitor:
     def __init__(self, cfg: HealthConfig, duty: tuple[float, float], overhang: bool) -> None:
         """Nothing found."""
         self._cfg, self._overhang = cfg, overhang
+        self._enough = cfg.fan_early_share * duty[0], cfg.fan_early_share * duty[1]
         self._least = cfg.fan_share * duty[0], cfg.fan_share * duty[1]
         self.alarm = Alarm(cfg.retry_after_s)
         self.reset()
@@ -45,7 +46,7 @@ class FanMonitor:
     def reset(self) -> None:
         """The robot has booted: its fans wait for their command."""
         self.alarm.reset()
-        self._low, self._first_s = Since(), None
+        self._low, self._weak, self._first_s = Since(), Since(), None
         self._was_right = False
 
     _first_s: float | None
@@ -63,6 +64,13 @@ class FanMonitor:
             k = 0 if fans[0] / left < fans[1] / right else 1
             cause = f"the {('left', 'right')[k]} fan gives too little"
             self._see(t_s, cause, _FANS[k], fans[k], self._least[k])
+        elif self._overhang:
+            is_weak = fans[0] < self._enough[0] or fans[1] < self._enough[1]
+            if self._weak.lasts(t_s, is_weak and is_due) >= self._cfg.fan_time_s - 1e-6:
+                k = 0 if fans[0] - self._enough[0] < fans[1] - self._enough[1] else 1
+                cause = f"the {('left', 'right')[k]} fan gets weak"
+                finding = Finding(Severity.RETURN, cause, _FANS[k], fans[k], self._enough[k], full_fans=True)
+                self.alarm.see(t_s, finding)
         for name in faults:
             if name in _FANS:
                 self._see(t_s, f"the robot reports a fault of its {name[4:]} fan", name, 1.0, 0.0)

@@ -35,7 +35,7 @@ def test_a_blocked_wheel_gets_one_retry(side: str, at_s: float, measured: Measur
     assert run.mission.is_faulted
     assert 2 <= holds(run.seen) <= 3
     assert not run.robot.world.is_fallen
-    measured("F8", time_s)
+    measured("F8", 1e3 * time_s)
 
 
 @pytest.mark.fault("F8")
@@ -54,7 +54,7 @@ def test_a_robot_that_is_snagged_holds(measured: Measured) -> None:
     assert all(map(was_real, run.injected))
     time_s = run.time_to_zero_s(DRIVING_S)
     assert time_s <= 0.3
-    measured("F10", time_s)
+    measured("F10", 1e3 * time_s)
 
 
 @pytest.mark.fault("F9")
@@ -67,7 +67,7 @@ def test_a_wheel_that_runs_away(rate: float, at_s: float, measured: Measured) ->
     time_s = run.time_to_zero_s(at_s)
     assert time_s <= 0.1
     assert run.first(at_s, held).verdict.signal in {"left_wheel", "encoder_left"}
-    measured("F9", time_s)
+    measured("F9", 1e3 * time_s)
 
 
 @pytest.mark.fault("S7")
@@ -83,12 +83,12 @@ def test_wheels_that_creep_while_they_are_held(speed_m_s: float, measured: Measu
     assert run.seen[-1].verdict.cause == "the right wheel turns while it is held"
     assert run.mission.wants_full_fans
     assert run.mission.is_faulted
-    measured("S7", max(first.t_s - moved_2_mm_s, 0.0))
+    measured("S7", 1e3 * max(first.t_s - moved_2_mm_s, 0.0))
 
 
 @pytest.mark.fault("F6")
 @pytest.mark.parametrize(
-    "fault", ['"soc"\ntype = "stuck"\nvalue = 0.15', '"faults"\ntype = "raise"\nnames = ["battery_low"]']
+    "fault", ['"soc"\ntype = "stuck"\nvalue = 0.2', '"faults"\ntype = "raise"\nnames = ["battery_low"]']
 )
 def test_a_low_battery_sends_the_robot_home(fault: str, measured: Measured) -> None:
     run = watched(f"signal = {fault}\nat_s = 3.0", HARD, lambda _: False)
@@ -96,7 +96,8 @@ def test_a_low_battery_sends_the_robot_home(fault: str, measured: Measured) -> N
     home = run.first(3.0, lambda one: one.state is State.RETURNING)
     assert home.t_s - 3.0 < 5.5
     assert run.mission.outcome is Outcome.AT_BASE
-    measured("F6", 0.2)
+    # The stand-in's charge stays what it was, so this is what is left at base, too.
+    measured("F6", 100.0 * (0.2 if "soc" in fault else 1.0))
 
 
 def test_a_battery_that_seems_low_for_a_moment_does_not() -> None:
@@ -123,6 +124,7 @@ def test_a_late_link_slows_the_robot_and_then_holds_it(delay_s: float, severity:
     fastest = max(0.015 * abs(sum(one.drive)) for one in run.since(0.8))
     if severity:
         assert fastest <= 0.07
-        # What it still drives while nobody knows, and braking: no further than with 40 ms at full speed.
-        assert fastest * 2.0 * delay_s + fastest**2 / 0.4 <= 0.1 * 0.04 + 0.1**2 / 0.4
-    measured("L13", fastest)
+    # What it still drives while nobody knows yet, and while the wheels run down.
+    way_mm = 1e3 * fastest * (2.0 * delay_s + HARD.sim.robot.wheel_lag_s)
+    assert way_mm <= 20.0
+    measured("L13", way_mm)
