@@ -4,7 +4,7 @@ from itertools import product
 from math import inf, nan
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -208,6 +208,7 @@ def test_wheels_over_their_limit_are_slowed_down_as_a_whole() -> None:
         assert max(map(abs, got)) == pytest.approx(limit)
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)), min_size=1, max_size=30))
 def test_value_and_rate_are_limited(wanted: list[tuple[float, float]]) -> None:
     under_test = gate()
