@@ -53,7 +53,7 @@ def router(monkeypatch: pytest.MonkeyPatch) -> Router:
     def put(answer: dict[str, Any]) -> list[tuple[str, Any]]:
         calls: list[tuple[str, Any]] = []
 
-        def request(endpoint: str, payload: bytes, timeout_s: float) -> dict[str, Any]:
+        def request(endpoint: str, payload: bytes, timeout_s: float, *, repeats: bool = False) -> dict[str, Any]:
             assert timeout_s in {3.0, 10.0}  # as asked for, and as the default
             calls.append((endpoint, json.loads(payload)))
             return answer
