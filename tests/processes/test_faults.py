@@ -41,7 +41,7 @@ def test_a_stuck_gyroscope_is_in_the_log_and_the_run_ends_as_defined(start: Star
     assert run.summary["danger"]["falls"] == 0
 
 
-@pytest.mark.fault("L1", "L11")
+@pytest.mark.fault("L1", "L11", "F7")
 def test_a_survey_goes_on_through_resets_of_the_link_and_a_reboot_of_the_robot(start: Start, tmp_path: Path) -> None:
     plan = tmp_path / "plan.toml"
     plan.write_text('[[link]]\ntype = "fragment"\ndirection = "both"\nat_s = 0.5\nfor_s = 0.2\nwrite_bytes = 50\n'

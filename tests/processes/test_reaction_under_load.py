@@ -246,7 +246,7 @@ def preferred() -> Iterator[None]:
 
 
 @pytest.mark.slow
-@pytest.mark.fault("P19")
+@pytest.mark.fault("P6", "P19")
 @pytest.mark.parametrize("kind", FAULTS)
 @pytest.mark.parametrize("time_", range(TIMES))
 @pytest.mark.usefixtures("preferred")
@@ -263,6 +263,8 @@ async def test_reaction(kind: str, time_: int, tmp_path: Path, runtime_dir: Path
             assert zero_s is not None, "the host never said so"
             measured("P19", 1e3 * max(zero_s - begun_s - evidence_s, 0.0))
             measured("P19", 1e3 * (zero_s - begun_s), "from_event_ms")
+            if kind.startswith("stop"):
+                measured("P6", 1e3 * max(zero_s - begun_s - evidence_s, 0.0))
             if kind == "kill all":
                 measured("P19", 1e3 * max(turned_s - begun_s, 0.0), "stopped_ms")
             if evidence_s:  # back again: what was due meanwhile must not be done now
