@@ -574,3 +574,13 @@ def test_on_and_the_way_back_from_an_edge_are_told(danger: DangerConfig) -> None
     assert sensor.episode.is_on
     sensor.off()
     assert not sensor.episode.is_on
+
+
+def test_behind_a_switch_an_oblique_way_has_no_side_either(danger: DangerConfig) -> None:
+    limit = GAP_M + danger.gap_tolerance_m + danger.seam_extra_m
+    sensor = Sensor(danger, Map(seams=("x", "y")))
+    sensor.off(0.0008, 0.0006)
+    assert not sensor.walk(limit, 0.0, 60)
+    assert sensor.map.asked_seam[-1][2] == "x"
+    assert sensor.walk(0.0, -limit - 0.002, 60)
+    assert sensor.episode.value_m < limit + 0.001
