@@ -116,6 +116,9 @@ def test_a_new_episode(danger: DangerConfig) -> None:
     assert episode.cause is None
     assert (episode.value_m, episode.limit_m) == (0.0, 0.0)
     assert not episode.is_from_turn
+    assert not episode.is_doubted
+    assert not episode.is_on
+    assert episode.retreat_m == 0.0
     assert episode.permits_turn
     assert episode.needs_map
     episode.place_on_map(MAP0, 0.0, SIGMA_M)
@@ -448,3 +451,136 @@ def test_an_unknown_position_makes_every_seam_possible(danger: DangerConfig) -> 
     sensor.off(0.001)
     assert sensor.map.asked_seam[0][1] == inf
     assert sensor.episode.phase is Phase.NO_MAP
+
+
+# -- what counts across, from both sides ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("heading", [0.0, 3.0])
+def test_what_a_turn_adds_counts_across_the_seam(danger: DangerConfig, sign: float, heading: float) -> None:
+    """The robot drives on to the seam and then turns: the sensor goes on across it without the robot."""
+    limit = GAP_M + danger.gap_tolerance_m + danger.seam_extra_m
+    sensor = Sensor(danger, Map(seams=("x",)), (0.0, 0.0, heading), -heading)
+    c, s = cos(heading), sin(heading)
+    for _ in range(2):
+        assert not sensor.off(sign * 0.0005 * c, sign * 0.0005 * s)
+    # About the deck's z axis the sensor at (0.09, -0.07) moves towards +x with a turn to the left.
+    across, turned = sign * 0.001, 0.0
+    while abs(across) < limit - 1e-4:
+        turned += sign * 1e-4
+        across = sign * 0.001 + OFFSET[0] * (cos(turned) - 1.0) - OFFSET[1] * sin(turned)
+        assert not sensor.off(turn=sign * 1e-4)
+    assert sensor.walk(0.0, turn=sign * 0.01)
+    assert sensor.episode.value_m == pytest.approx(limit, abs=1e-4)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_turn_away_from_the_seam_adds_nothing(danger: DangerConfig, sign: float) -> None:
+    sensor = Sensor(danger, Map(seams=("x",)))
+    sensor.off(sign * 0.001)
+    assert not sensor.walk(0.0, turn=-sign * 0.4)
+
+
+def test_a_sensor_about_which_the_robot_turns_does_not_move(danger: DangerConfig) -> None:
+    sensor = Sensor(danger, Map(seams=("x",)))
+    x, y = sensor.place
+    for k in range(1, 60):
+        heading = 0.01 * k
+        c, s = cos(heading), sin(heading)
+        sensor.pose = x - c * OFFSET[0] + s * OFFSET[1], y - s * OFFSET[0] - c * OFFSET[1], heading
+        assert not sensor.off()
+
+
+def test_a_sensor_that_a_turn_brought_there_has_no_side(danger: DangerConfig) -> None:
+    limit = GAP_M + danger.gap_tolerance_m + danger.seam_extra_m
+    sensor = Sensor(danger, Map(seams=("x",)), (1.0, 2.0, 0.5), -0.5)
+    sensor.off(turn=0.005)
+    assert sensor.episode.is_from_turn
+    # Back across, to where a driving robot came from: without a side that is a way over the seam.
+    assert sensor.walk(-(limit + 0.002) * cos(0.5), -(limit + 0.002) * sin(0.5))
+
+
+def test_the_way_along_a_seam_counts_in_either_direction(danger: DangerConfig) -> None:
+    width = GAP_M + danger.gap_tolerance_m
+    limit = width / cos(danger.max_crossing_angle_rad) + danger.seam_extra_m
+    sensor = Sensor(danger, Map(seams=("x",)))
+    sensor.off(0.0, 0.001)
+    assert not sensor.walk(0.0, -limit, 40)
+    assert sensor.walk(0.0, -0.002, 4)
+
+
+def test_another_seam_is_asked_for_once_at_the_sensors_place(danger: DangerConfig) -> None:
+    limit = GAP_M + danger.gap_tolerance_m + danger.seam_extra_m
+    sensor = Sensor(danger, Map(seams=("x", "y")))
+    sensor.off(0.001, 0.0003)
+    sensor.walk(limit, 0.3 * limit, 60)
+    sensor.walk(0.05, steps=100)
+    asked = [place for place, _, axis in sensor.map.asked_seam if axis is not None]
+    assert len(asked) == 1
+    x, y = asked[0]
+    assert x > MAP0[0] + 0.010
+    assert y - MAP0[1] == pytest.approx(0.3 * (x - MAP0[0]), rel=0.05)
+
+
+def test_behind_a_switch_the_way_begins_anew_and_has_no_side(danger: DangerConfig) -> None:
+    width = GAP_M + danger.gap_tolerance_m
+    limit = width + danger.seam_extra_m
+    crossing = EpisodeLimits(GAP_M, danger).crossing_m
+    sensor = Sensor(danger, Map(seams=("x", "y")))
+    sensor.off(0.001)
+    assert not sensor.walk(limit, 0.0, 60)
+    # Along the other seam, beside the first way: its width once more, to either side.
+    for side in (1.0, -1.0):
+        one = Sensor(danger, Map(seams=("x", "y")))
+        one.off(0.001)
+        one.walk(limit, 0.0, 60)
+        assert not one.walk(0.0, side * (limit - 0.001), 60)
+        assert hypot(limit, limit) < crossing
+        assert one.walk(0.0, side * 0.002, 10)
+
+
+def test_no_switch_beyond_the_crossing(danger: DangerConfig) -> None:
+    crossing = EpisodeLimits(GAP_M, danger).crossing_m
+    sensor = Sensor(danger, Map(seams=("x", "y")))
+    sensor.off(0.001)
+    assert sensor.off(0.0, crossing + 0.001)
+    assert [axis for *_, axis in sensor.map.asked_seam] == [None]
+
+
+def test_a_look_ahead_declares_at_the_debounced_sample(danger: DangerConfig) -> None:
+    sensor = Sensor(danger, Map(seams=("x",)))
+    for _ in range(danger.debounce_samples):
+        sensor.off(0.001)
+    sensor.map.is_rim = True
+    assert sensor.episode.look_ahead()
+
+
+@pytest.mark.parametrize("heading", [0.5, -2.0])
+def test_an_edge_met_in_turning_is_told_at_every_heading(danger: DangerConfig, heading: float) -> None:
+    sensor = Sensor(danger, Map(is_rim=True), (1.0, 2.0, heading))
+    sensor.off(HALF_BASE_M * 0.01 * 1.05, turn=0.01)
+    assert not sensor.episode.is_from_turn
+
+
+def test_on_and_the_way_back_from_an_edge_are_told(danger: DangerConfig) -> None:
+    sensor = Sensor(danger, Map(is_rim=True))
+    sensor.off(0.001)
+    assert sensor.off(0.001)
+    sensor.off(-0.003, -0.004)
+    assert sensor.episode.retreat_m == pytest.approx(0.005)
+    assert not sensor.episode.is_on
+    sensor.on()
+    assert sensor.episode.is_on
+    sensor.off()
+    assert not sensor.episode.is_on
+
+
+def test_behind_a_switch_an_oblique_way_has_no_side_either(danger: DangerConfig) -> None:
+    limit = GAP_M + danger.gap_tolerance_m + danger.seam_extra_m
+    sensor = Sensor(danger, Map(seams=("x", "y")))
+    sensor.off(0.0008, 0.0006)
+    assert not sensor.walk(limit, 0.0, 60)
+    assert sensor.map.asked_seam[-1][2] == "x"
+    assert sensor.walk(0.0, -limit - 0.002, 60)
+    assert sensor.episode.value_m < limit + 0.001
