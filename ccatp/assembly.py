@@ -7,7 +7,7 @@ from math import hypot
 from ccatp.config.models import Config
 from ccatp.control.gate import DriveGate
 from ccatp.errors import ConfigError
-from ccatp.localizer import FOUR_STATE, Localizer, build_localizer
+from ccatp.localizer import FOUR_STATE, Localizer, build_doubting, build_localizer
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.mission import Mission, PlanHome, PlanPoints, PlanRest
 from ccatp.planning.bound import path_time
@@ -38,6 +38,7 @@ class Parts:
     already_done: int
     lower_bound_s: float
     elapsed_s: float = 0.0
+    recovery: Recovery | None = None
 
     @property
     def total_points(self) -> int:
@@ -98,6 +99,7 @@ def assemble(cfg: Config, done: Collection[PointId] = (), recovery: Recovery | N
         points=tuple(points),
         already_done=len(set(done)),
         elapsed_s=0.0 if recovery is None else recovery.elapsed_s,
+        recovery=recovery,
         lower_bound_s=path_time(route.stops, mirror.base_pose, cfg.limits, mirror, cfg.etalon.measuring_time_s),
     )
 
@@ -149,13 +151,7 @@ def build_gate(cfg: Config) -> DriveGate:
 def _build_localizer(cfg: Config, mirror: Mirror, recovery: Recovery | None) -> Localizer:
     if recovery is None:
         return build_localizer(cfg, mirror)
-    sigmas = {
-        "start_position_sigma_m": recovery.position_sigma_m,
-        "start_heading_sigma_rad": recovery.heading_sigma_rad,
-    }
-    doubting = cfg.model_copy(update={"localizer": cfg.localizer.model_copy(update=sigmas)})
-    pose = recovery.pose
-    return build_localizer(doubting, mirror, start=mirror.panel_pose(mirror.nearest_panel(pose.x_m, pose.y_m), pose))
+    return build_doubting(cfg, mirror, recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad))
 
 
 def _rest_planner(cfg: Config, mirror: Mirror) -> PlanRest:

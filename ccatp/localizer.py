@@ -124,3 +124,24 @@ def build_localizer(
         made = FullStateLocalizer(wrap(FILTERS[name](np.zeros(n), np.eye(n))), mirror, cfg.robot, cfg.localizer, start)
     made.guard(ImuGate(cfg.health), WheelMeans(cfg.robot), largest_rate_rad_s(cfg.robot))
     return made
+
+
+def build_doubting(
+    cfg: Config,
+    mirror: Mirror,
+    pose: DeckPose,
+    sigmas: tuple[float, float],
+    wrap: Callable[[Filter], Filter] = lambda filter_: filter_,
+) -> Localizer:
+    """The localizer for ``run.filter``, the robot standing where it was seen last.
+
+    Args:
+        cfg: the configuration.
+        mirror: its mirror.
+        pose: where that was, deck frame.
+        sigmas: standard deviations of place (m) and heading (rad).
+        wrap: as in ``build_localizer``.
+    """
+    start = {"start_position_sigma_m": sigmas[0], "start_heading_sigma_rad": sigmas[1]}
+    doubting = cfg.model_copy(update={"localizer": cfg.localizer.model_copy(update=start)})
+    return build_localizer(doubting, mirror, wrap, mirror.panel_pose(mirror.nearest_panel(pose.x_m, pose.y_m), pose))

@@ -24,6 +24,7 @@ from ccatp.wire.topics import (
     Rest,
     SensorLines,
     Track,
+    Treatment,
     Truth,
     unpack,
 )
@@ -32,7 +33,7 @@ _T = TypeVar("_T")
 TELEMETRY = "telemetry.mcap"
 CONFIG = "config.toml"
 # What a replay reads; the others of the topic table would only be decoded for nothing.
-READ = frozenset(("sensors", "rest", "fix", "track", "truth", "arrival"))
+READ = frozenset(("sensors", "rest", "treatment", "fix", "track", "truth", "arrival"))
 
 
 class RunReadError(CcatpError):
@@ -109,6 +110,8 @@ class Recording:
             return [frame for frame in frames if isinstance(frame, Sensors)]
         if isinstance(message, Rest):
             return [Stood(message.seq)]
+        if isinstance(message, Treatment):
+            return [message]
         if isinstance(message, FixMessage):
             return [fix_given(message)]
         if isinstance(message, Track):

@@ -121,7 +121,8 @@ class MainLoop:
         self._is_taking_over = args.is_taking_over
         self._seat = Seat(cfg.robot, self._link, is_taking_over=self._is_taking_over, frame_hz=cfg.sim.robot.frame_hz)
         self._keeper = Keeper(args.run_dir, parts.localizer, parts.mission, is_patient=not args.is_realtime)
-        self._was_quiet = False
+        self._was_quiet = self._is_deaf = False
+        self._recovery = parts.recovery
         self._time = SteadyTime(cfg.health.clock_jump_s)
         self._t_first_s: float | None = None
         self._t_last_s = 0.0
@@ -295,11 +296,10 @@ class MainLoop:
             self._begin_session(dt_s)
         if self._t_first_s is None:
             self._t_first_s = steady_s
+            self._tell_beginning(seq, t_s)
         self._t_last_s, self._seq, self._pulse.frame_s = steady_s, max(seq, self._seq), time.monotonic()
         localizer = self._localizer
-        is_deaf = self._mission.ignores_motion
-        imu, enc = ((), as_standing(sensors.enc)) if is_deaf else (sensors.imu, sensors.enc)
-        localizer.step(t_s, imu, enc, sensors.edge, sensors.gravity)
+        self._listen(sensors)
         if localizer.hold_requested:
             # A filter that diverged is frozen until it has a fix.
             self._mission.recover(localizer.hold_cause, steady_s)
@@ -342,12 +342,30 @@ class MainLoop:
         self._gate_watch.look(motion.t_s)
         return order, right, left
 
+    def _tell_beginning(self, seq: int, t_s: float) -> None:
+        """Where the localizer of a loop that takes over begins: who replays the run has to know."""
+        recovery, self._recovery = self._recovery, None
+        if recovery is not None:
+            pose, sigmas = recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad)
+            self._teller.treatment(seq, t_s, "begun", (pose.x_m, pose.y_m, pose.heading_rad, *sigmas))
+
+    def _listen(self, sensors: Sensors) -> None:
+        """The frame's samples go to the localizer, or as much of them as is to be believed."""
+        is_deaf = self._mission.ignores_motion
+        if is_deaf is not self._is_deaf:
+            self._is_deaf = is_deaf
+            self._teller.treatment(sensors.seq, sensors.t, "deaf" if is_deaf else "hearing")
+        imu, enc = ((), as_standing(sensors.enc)) if is_deaf else (sensors.imu, sensors.enc)
+        self._localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
+
     def _heed(self, sensors: Sensors) -> None:
         """What the mission wants besides the drive, before that is sent."""
         mission, health = self._mission, self._cfg.health
         if mission.doubts_pose:
             mission.doubts_pose = False
-            self._localizer.doubt(health.doubt_position_m, health.doubt_heading_rad)
+            doubt = health.doubt_position_m, health.doubt_heading_rad
+            self._localizer.doubt(*doubt)
+            self._teller.treatment(sensors.seq, sensors.t, "doubted", doubt)
         if mission.wants_full_fans and not self._has_full_fans:
             self._has_full_fans = True
             self._send_fans()  # pressed on first, held then

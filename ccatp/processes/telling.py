@@ -18,6 +18,8 @@ from ccatp.wire.topics import (
     SensorLines,
     Timing,
     Track,
+    Treatment,
+    TreatmentKind,
     is_estimate_due,
 )
 
@@ -134,6 +136,10 @@ class Teller:
     def rest(self, seq: int, t_s: float) -> None:
         """The mission takes the robot to be at rest from frame ``seq`` on."""
         self._publisher.send("rest", Rest(seq=seq, t_s=t_s))
+
+    def treatment(self, seq: int, t_s: float, kind: TreatmentKind, values: tuple[float, ...] = ()) -> None:
+        """The localizer is treated in frame ``seq``; see ``Treatment``."""
+        self._publisher.send("treatment", Treatment(seq=seq, t_s=t_s, kind=kind, values=values))
 
     def fix(self, point: PointId | None, fix: Fix, jump_m: float, *, is_fused: bool) -> None:
         """A fix was handed to the localizer after the last frame; ``None`` for one that only finds the robot."""

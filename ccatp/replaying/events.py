@@ -7,15 +7,26 @@ from typing import NamedTuple
 
 from ccatp.samples import Fix
 from ccatp.wire.robot import Sensors
-from ccatp.wire.topics import FixMessage
+from ccatp.wire.topics import FixMessage, Treatment
 
 
 @dataclass(frozen=True, slots=True)
 class Marked:
-    """A frame was taken, and perhaps the mission took the robot to be at rest in it."""
+    """A frame was taken, and what else was done to the localizer in it.
+
+    Attributes:
+        sensors: the frame.
+        at_rest: the mission took the robot to be at rest.
+        begun: before the frame the localizer began anew, with these values of ``Treatment``.
+        is_deaf: whatever wheels and inertial unit say, the robot stands.
+        doubted: after the samples its pose was doubted by this much, m and rad.
+    """
 
     sensors: Sensors
     at_rest: bool
+    begun: tuple[float, ...] | None = None
+    is_deaf: bool = False
+    doubted: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +54,7 @@ class FixGiven(NamedTuple):
     was_fused: bool
 
 
-Message = Sensors | Stood | FixGiven
+Message = Sensors | Stood | FixGiven | Treatment
 
 
 def fix_given(message: FixMessage) -> FixGiven:
@@ -60,16 +71,18 @@ def fix_given(message: FixMessage) -> FixGiven:
 
 
 def in_order(messages: Iterable[Message]) -> Iterator[Event]:
-    """Frames, rests and fixes in the order in which the localizer met them.
+    """Frames, rests, treatments and fixes in the order in which the localizer met them.
 
     Frames are recorded in batches, rests and fixes at once and with the number of their frame: they come at any time
     before the batch of the frame after it. A rest belongs into its frame, a fix behind it. What belongs behind a frame
-    beyond the end of the record is left out.
+    beyond the end of the record is left out. A treatment belongs into its frame, too.
 
     Args:
         messages: in the order of recording; the numbers of the frames grow.
     """
     rests: set[int] = set()
+    treatments: dict[tuple[int, str], tuple[float, ...]] = {}
+    is_deaf = False
     fixes: deque[FixGiven] = deque()
     last = -1
     for message in messages:
@@ -77,12 +90,17 @@ def in_order(messages: Iterable[Message]) -> Iterator[Event]:
             rests.add(message.seq)
         elif isinstance(message, FixGiven):
             fixes.append(message)
+        elif isinstance(message, Treatment):
+            treatments[message.seq, message.kind] = message.values
         else:
             while fixes and fixes[0].seq < message.seq:
                 yield Fixed(*fixes.popleft()[1:])
             last = message.seq
             at_rest = last in rests
             rests.discard(last)
-            yield Marked(message, at_rest)
+            begun = treatments.pop((last, "begun"), None)
+            if (last, "deaf") in treatments or (last, "hearing") in treatments or begun is not None:
+                is_deaf = (last, "deaf") in treatments
+            yield Marked(message, at_rest, begun, is_deaf, treatments.pop((last, "doubted"), None))
     while fixes and fixes[0].seq <= last:
         yield Fixed(*fixes.popleft()[1:])

@@ -8,14 +8,16 @@ import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.filters.base import Filter, FilterError
+from ccatp.health.look import as_standing
 from ccatp.localization.fixes import FixRefused
-from ccatp.localizer import FOUR_STATE, Localizer, build_localizer
+from ccatp.localizer import FOUR_STATE, Localizer, build_doubting, build_localizer
 from ccatp.mirror.batches import FloatArray
 from ccatp.mirror.errors import MirrorError
 from ccatp.mirror.mirror import Mirror
 from ccatp.replaying.events import Event, Fixed, Marked
 from ccatp.replaying.recording_filter import RecordingFilter
 from ccatp.replaying.trace import IntArray, Trace, TraceBuilder
+from ccatp.samples import DeckPose
 
 # Wheels that turn faster than this move the robot: ten times the noise of an encoder that gives rates.
 TURNING_RAD_S = 0.01
@@ -69,7 +71,7 @@ def replay(
 
     Raises:
         ValueError: the filter has no smoother.
-        FilterError: the smoothed state is not finite.
+        FilterError: the smoothed state is not finite, or the smoother would have to go across a restart.
     """
     if smooth and not has_smoother(cfg):
         raise ValueError(f"no smoother for filter {cfg.run.filter}: the pose is not in it")
@@ -78,10 +80,10 @@ def replay(
 
 class _Player:
     def __init__(self, cfg: Config, mirror: Mirror, smooth: bool) -> None:
-        self._mirror, self._puck_height_m = mirror, cfg.robot.puck_height_m
+        self._cfg, self._mirror, self._puck_height_m = cfg, mirror, cfg.robot.puck_height_m
         self._recording: RecordingFilter | None = None
-        wrap: Callable[[Filter], Filter] = self._record if smooth else lambda filter_: filter_
-        self._localizer: Localizer = build_localizer(cfg, mirror, wrap)
+        self._wrap: Callable[[Filter], Filter] = self._record if smooth else lambda filter_: filter_
+        self._localizer: Localizer = build_localizer(cfg, mirror, self._wrap)
         self._builder = TraceBuilder()
         self._steps = array("q")  # transitions of the filter up to each frame
         self._states = array("d")  # and x, y, heading after them
@@ -115,12 +117,25 @@ class _Player:
             counts=dict(self._localizer.counts),
         )
 
+    def _begin(self, values: tuple[float, ...]) -> None:
+        """A main loop that took over from another one began where the robot was seen last."""
+        if self._recording is not None and self._seq >= 0:
+            raise FilterError("the main loop was started anew within this recording, and no smoother goes across that")
+        x_m, y_m, heading_rad, *sigmas = values
+        pose = DeckPose(x_m, y_m, heading_rad)
+        self._localizer = build_doubting(self._cfg, self._mirror, pose, (sigmas[0], sigmas[1]), self._wrap)
+
     def _take_frame(self, event: Marked) -> None:
         """As the main loop does."""
+        if event.begun is not None:
+            self._begin(event.begun)
         localizer, sensors = self._localizer, event.sensors
-        localizer.step(sensors.t, sensors.imu, sensors.enc, sensors.edge, sensors.gravity)
+        imu, enc = ((), as_standing(sensors.enc)) if event.is_deaf else (sensors.imu, sensors.enc)
+        localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
         if localizer.hold_requested:
             localizer.clear_hold()
+        if event.doubted is not None:
+            localizer.doubt(*event.doubted)
         if event.at_rest:
             localizer.rest()
         self._seq = sensors.seq

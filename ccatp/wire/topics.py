@@ -5,7 +5,7 @@ a new topic is a row. Levels are repeated at the topic's rate; ``rate_hz`` 0 mar
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -108,6 +108,24 @@ class Rest(Message):
     """The mission takes the robot to be at rest from frame ``seq`` on."""
 
 
+TreatmentKind = Literal["begun", "doubted", "deaf", "hearing"]
+
+
+class Treatment(Message):
+    """What the localizer is treated with from frame ``seq`` on, besides samples and fixes.
+
+    Attributes:
+        kind: ``begun``: it begins anew before this frame, values are x (m), y (m), heading (rad), deck frame, and the
+            standard deviations of place (m) and heading (rad); ``doubted``: after the samples of this frame its pose
+            may be wrong by so much, m and rad; ``deaf``, ``hearing``: whatever wheels and inertial unit say, the robot
+            stands, or not any more.
+        values: see there.
+    """
+
+    kind: TreatmentKind
+    values: tuple[float, ...] = ()
+
+
 class DangerEvent(Message):
     """The verdict's code, cause or severity changed; without a cause all is well again."""
 
@@ -181,6 +199,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("sensors", SensorLines, "main", 1.0, 0.0, True),
     Topic("arrival", Arrival, "main", 0.0, 0.0, True),
     Topic("rest", Rest, "main", 0.0, 0.0, True),
+    Topic("treatment", Treatment, "main", 0.0, 0.0, True),
     Topic("fix", FixMessage, "main", 0.0, 0.0, True),
     Topic("danger_event", DangerEvent, "danger", 0.0, 0.0, True),
     Topic("log", Log, "main", 0.0, 0.0, True),

@@ -99,6 +99,8 @@ class RecklessMain:
     def on_sensors(self, link: RobotLink, sensors: Sensors) -> None:
         """Dead-reckon, claim the pose, drive on."""
         robot = self._cfg.robot
+        if not self.frames:
+            link.send_fans(1, robot.fan_duty)
         for sample in sensors.enc:
             right, left = sample.right_rad_s, sample.left_rad_s
             if right is None or left is None:
@@ -162,7 +164,9 @@ async def drive_off(case: RimCase, run_dir: Path, runtime_dir: Path) -> RimResul
     endpoints = Endpoints(runtime_dir)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     subscriber = Subscriber(
-        context, [endpoints.of("truth"), endpoints.of("danger")], ["truth", "danger_event", "presence.danger"]
+        context,
+        [endpoints.of("truth"), endpoints.of("danger")],
+        ["truth", "danger_event", "presence.danger", "verdict"],
     )
     try:
         with processes(configure(case), case, run_dir, endpoints) as cfg:
