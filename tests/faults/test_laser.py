@@ -490,13 +490,13 @@ def test_a_place_that_no_exchange_explains() -> None:
 @pytest.mark.fault("E5")
 def test_a_mission_in_a_wrong_frame_does_not_begin(tmp_path: Path) -> None:
     def turned(_m: Measured, fix: Fix) -> Fix:
-        return moved(fix, (0.1, 0.0, 0.0))
+        return moved(fix, (0.3, 0.0, 0.0))
 
     run = DeskRehearsal(one_panel(), tmp_path, turned)
     run.run()
     assert run.mission.is_faulted
     assert run.mission.cause == (
-        "the laser system sees the robot 0.10 m from its base: no exchange of axes or units explains it; is it at "
+        "the laser system sees the robot 0.30 m from its base: no exchange of axes or units explains it; is it at "
         "base, and is this the mirror?"
     )
     assert not run.states_s.get(State.DRIVING, 0.0)
