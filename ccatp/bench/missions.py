@@ -10,6 +10,7 @@ from typing import Any
 
 from ccatp.config.models import Config
 from ccatp.errors import CcatpError
+from ccatp.studies.garbage import settle
 from ccatp.studies.rehearsal import rehearse
 
 PEER = "the wall clock"  # one frame takes it the frame's period
@@ -27,6 +28,7 @@ def rehearsal_case(cfg: Config, panels: int) -> dict[str, Any]:
         BenchError: the mission was not completed.
     """
     part = cfg.model_copy(update={"run": cfg.run.model_copy(update={"panels": panels})})
+    settle()
     started_s = time.perf_counter()
     done = rehearse(part)
     wall_s = time.perf_counter() - started_s

@@ -5,6 +5,7 @@ of the daemon with the same configuration and seed go through the same states.
 """
 
 from collections import defaultdict
+from typing import cast
 
 import numpy as np
 
@@ -68,6 +69,8 @@ class Rehearsing:
         self._sigma_of = lambda: self.localizer.position_sigma_m
         self._code = EventCode.NORMAL
         self._drive_seq = 0
+        self._state, self._state_s = State.IDLE, 0.0
+        self._wheels_m = cfg.robot.wheel_radius_m, cfg.robot.wheel_base_m
 
     def run(self) -> Rehearsal:
         """From the first frame to the end of the mission."""
@@ -75,15 +78,14 @@ class Rehearsing:
         robot.join_monitor()
         robot.join_controller()
         self._note_truth()
-        while robot.delivered is None:
+        while (frame := self._arrived()) is None:
             robot.advance()
             self._note_truth()
         robot.command_fans(1, *self.cfg.robot.fan_duty)
-        first_s = t_s = robot.delivered.t
+        first_s = t_s = frame.t
         last_s = first_s - robot.frame_s
         limit_s = _ENDLESS * self.parts.lower_bound_s + 600.0
         while mission.state is not DONE:
-            frame = robot.delivered
             t_s = frame.t
             self._serve(frame, t_s - last_s)
             last_s = t_s
@@ -91,7 +93,17 @@ class Rehearsing:
                 break
             robot.advance()
             self._note_truth()
+            frame = self._arrived() or frame
         return self._result(t_s - first_s)
+
+    def _arrived(self) -> Sensors | None:
+        """The frame that reaches the processes now.
+
+        Without faults its samples are plain tuples, in the order of the named ones: to name them costs as much as to
+        read the sensors, and nobody who takes a frame asks for names.
+        """
+        robot = self.robot
+        return robot.delivered if robot.injector is not None else cast(Sensors | None, robot.delivered_rows)
 
     def _note_truth(self) -> None:
         robot = self.robot
@@ -119,7 +131,9 @@ class Rehearsing:
             if order.arrived is not None:
                 self.book.builder.add_arrival(order.arrived, seq)
         state = mission.state
-        self.states_s[state] += dt_s
+        if state is not self._state:
+            self._note_state(state)
+        self._state_s += dt_s
         self._publish(seq, t_s, motion.pose, state)
         if order.measure:
             self._measure(frame)
@@ -137,9 +151,13 @@ class Rehearsing:
         return Motion(frame.t, dt_s, pose, self.mirror.deck_pose, v, omega, creep, ahead, self._sigma_of)
 
     def _foresee(self, number: int, right: float, left: float) -> None:
-        robot = self.cfg.robot
-        twist = twist_of(right, left, robot.wheel_radius_m, robot.wheel_base_m)
+        twist = twist_of(right, left, *self._wheels_m)
         self.predictor.sent(number, twist.v_m_s, twist.omega_rad_s)
+
+    def _note_state(self, state: State) -> None:
+        """Another state begins, or the mission is over in it."""
+        self.states_s[self._state] = self._state_s
+        self._state, self._state_s = state, self.states_s[state]
 
     def _publish(self, seq: int, t_s: float, pose: PanelPose, state: State) -> None:
         self.book.note_estimate(seq, t_s, pose)
@@ -184,6 +202,7 @@ class Rehearsing:
 
     def _result(self, mission_time_s: float) -> Rehearsal:
         mission, misalignments = self.mission, self.robot.world.misalignments
+        self._note_state(self._state)
         return Rehearsal(
             summary=self.book.summary(mission, mission_time_s, self.laser.panel_fits(), misalignments),
             stops=self.laser.stops,
