@@ -20,6 +20,7 @@ import zmq
 from ccatp.config.loader import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.errors import ConfigError, ExitStatus, RefusedError
+from ccatp.package import child_environment
 from ccatp.processes.common import FAULTS_FILE, SUPERVISOR_PID, Endpoints, open_log
 from ccatp.processes.observing import check_observatory
 from ccatp.processes.run_collector import RunCollector
@@ -272,7 +273,7 @@ class _Run:
             stdout=sys.stderr,
             pass_fds=fds,
             start_new_session=True,
-            env={**os.environ, **ENVIRONMENT, SUPERVISOR_PID: str(os.getpid())},
+            env={**child_environment(os.environ), **ENVIRONMENT, SUPERVISOR_PID: str(os.getpid())},
         )
 
     def _died(self, name: str, code: int, view: RunView) -> ExitStatus:

@@ -16,6 +16,8 @@
 
 /* As in ccatp/filters/base.py and conditioning.py. */
 static const double HUGE_SQUARES = 1e200, STRONGEST = 1e6, LEAST_PIVOT = 1e-3;
+/* Beyond it numpy's square root is asked: a gain that errs by 1e-16 of itself no longer leaves enough digits. */
+static const double TOO_STRONG = 1e8;
 
 /* The numbers of a C-ordered array of doubles of this shape (columns < 0: one axis), or NULL. */
 static const double *numbers(PyObject *object, npy_intp rows, npy_intp columns)
@@ -107,9 +109,12 @@ static PyObject *spread(PyObject *Py_UNUSED(module), PyObject *const *args, Py_s
     return (PyObject *)result;
 }
 
-/* Cholesky factor of S (m, m) in place, lower; 0 where a row is too strong or repeats those before it. */
-static int factored(double S[ROWS][ROWS], const double *R, int m)
+enum strength { REFUSED, WEAK, STRONG };
+
+/* Cholesky factor of S (m, m) in place, lower; refused where a row is too strong or repeats those before it. */
+static enum strength factored(double S[ROWS][ROWS], const double *R, int m)
 {
+    enum strength found = WEAK;
     for (int i = 0; i < m; i++) {
         const double total = S[i][i];
         for (int j = 0; j <= i; j++) {
@@ -119,12 +124,52 @@ static int factored(double S[ROWS][ROWS], const double *R, int m)
                 S[i][j] = sum / S[j][j];
             } else {
                 /* One row leaves its whole variance: R <= S says that P is no covariance where it does not hold. */
-                if (!(R[i] > 0.0 && total < STRONGEST * R[i] && sum > LEAST_PIVOT * total && total >= R[i])) return 0;
+                if (!(R[i] > 0.0 && total < TOO_STRONG * R[i] && sum > LEAST_PIVOT * total && total >= R[i])) return REFUSED;
+                if (!(total < STRONGEST * R[i])) found = STRONG;
                 S[i][i] = sqrt(sum);
             }
         }
     }
-    return 1;
+    return found;
+}
+
+/* The posterior of strong rows, Joseph's form: A P A^T + W R W^T with A = I - W H and W = P H^T S^-1. No covariances are
+   subtracted, and what W errs by enters squared. V and the factor of S as in condition. */
+static void join(double *out, const double *P, const double *H, const double *R, double V[ROWS][STATES],
+                 double S[ROWS][ROWS], int n, int m)
+{
+    double W[ROWS][STATES], A[STATES][STATES], AP[STATES][STATES];
+    int seen[STATES], is_seen[STATES], count = 0;
+    for (int k = 0; k < n; k++) {
+        is_seen[k] = 0;
+        for (int a = 0; a < m; a++) is_seen[k] |= H[a * n + k] != 0.0;
+        if (is_seen[k]) seen[count++] = k;
+    }
+    for (int a = m - 1; a >= 0; a--) {
+        for (int i = 0; i < n; i++) {
+            double w = V[a][i];
+            for (int b = a + 1; b < m; b++) w -= S[b][a] * W[b][i];
+            W[a][i] = w / S[a][a];
+        }
+    }
+    for (int i = 0; i < n; i++) {
+        for (int j = 0; j < n; j++) AP[i][j] = is_seen[i] ? 0.0 : P[i * n + j];
+        for (int s = 0; s < count; s++) {
+            const int k = seen[s];
+            double entry = i == k;
+            for (int a = 0; a < m; a++) entry -= W[a][i] * H[a * n + k];
+            A[i][k] = entry;
+            for (int j = 0; j < n; j++) AP[i][j] += entry * P[k * n + j];
+        }
+    }
+    for (int i = 0; i < n; i++) {
+        for (int j = 0; j <= i; j++) {
+            double sum = is_seen[j] ? 0.0 : AP[i][j];
+            for (int s = 0; s < count; s++) sum += AP[i][seen[s]] * A[j][seen[s]];
+            for (int a = 0; a < m; a++) sum += W[a][i] * R[a] * W[a][j];
+            out[i * n + j] = out[j * n + i] = sum;
+        }
+    }
 }
 
 /* condition(P, nu, H, R): (change of the mean, covariance, normalised innovation squared) of N(., P) on z = H x + noise
@@ -159,7 +204,8 @@ static PyObject *condition(PyObject *Py_UNUSED(module), PyObject *const *args, P
             S[a][b] = sum;
         }
     }
-    if (!factored(S, R, m)) Py_RETURN_NONE;
+    const enum strength strength = factored(S, R, m);
+    if (strength == REFUSED) Py_RETURN_NONE;
     for (int a = 0; a < m; a++) {
         y[a] = nu[a];
         for (int b = 0; b < a; b++) {
@@ -190,8 +236,9 @@ static PyObject *condition(PyObject *Py_UNUSED(module), PyObject *const *args, P
             for (int a = 0; a < m; a++) sum += V[a][i] * V[a][j];
             out[i * n + j] = P[i * n + j] - sum;
         }
-        least = fmin(least, out[i * n + i]);
     }
+    if (strength == STRONG) join(out, P, H, R, V, S, n, m);
+    for (int i = 0; i < n; i++) least = fmin(least, out[i * n + i]);
     if (!(least >= 0.0 && nis < HUGE_SQUARES)) {
         Py_DECREF(change);
         Py_DECREF(covariance);
