@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
+MESSAGES = re.compile(r"^class [^:]*(?:Struct|BaseModel|=)", re.MULTILINE)  # a class with a keyword is one of theirs
 IGNORED = shutil.ignore_patterns("__pycache__", "*.so", "*.pyc")
 # Types are checked by `make lint`, with everything installed that they need; here they only say what to compile to.
 MYPY = "[mypy]\nplugins = pydantic.mypy\nignore_missing_imports = True\n"
@@ -32,14 +33,20 @@ def missing_tool() -> str | None:
 
 
 def module_paths(tree: Path) -> Iterator[str]:
-    """The files to compile, relative to the tree, and nothing that is not there any more."""
+    """The files to compile, relative to the tree.
+
+    Not those that define messages: compiled, a class loses the keywords and the annotations by which msgspec and
+    pydantic know it, and a frame would leave the robot under another name.
+    """
     for line in (HERE / "modules.txt").read_text(encoding="utf-8").splitlines():
         if not line or line.startswith("#"):
             continue
         found = sorted((tree / line).glob("*.py")) if (tree / line).is_dir() else [tree / line]
         if not found or not found[0].is_file():
             raise SystemExit(f"ccatp: modules.txt names {line}, which is not there")
-        yield from (str(path.relative_to(tree)) for path in found if path.name != "__init__.py")
+        for path in found:
+            if path.name != "__init__.py" and not MESSAGES.search(path.read_text(encoding="utf-8")):
+                yield str(path.relative_to(tree))
 
 
 def copy_of(source: Path, tree: Path) -> dict[str, Any]:
