@@ -31,6 +31,7 @@ from ccatp.cli_keys import keys
 from ccatp.cli_plan import plan
 from ccatp.cli_replay import replay
 from ccatp.cli_study import study
+from ccatp.package import COMPILED, build
 
 EMERGENCY_KINDS = ("fire", "earthquake", "power", "weather", "operator")
 
@@ -45,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     epilog=example("ccatp run --sim", "ccatp run --sim --mirror fyst-m2 --seed 2", "ccatp status --json"),
 )
-@click.version_option(ccatp.__version__, message="ccatp %(version)s")
+@click.version_option(ccatp.__version__, message="ccatp %(version)s" + (" compiled" if build() == COMPILED else ""))
 def cli() -> None:
     """Survey telescope mirrors with a laser-tracked robot."""
 

@@ -186,6 +186,14 @@ class Twist(msgspec.Struct, frozen=True):
     omega_rad_s: float
 
 
+class Predicted(msgspec.Struct, frozen=True):
+    """Where the robot will be: a pose in a plane, (x_m, y_m, heading_rad), and the speeds there."""
+
+    pose: Vector3
+    v_m_s: float
+    omega_rad_s: float
+
+
 class StopKind(StrEnum):
     """What a stop on the path is for."""
 

@@ -5,12 +5,14 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from ccatp.package import build
+
 PACKAGES = ("ccatp", "numpy", "scipy", "filterpy", "stonesoup")
 CPU_INFO = Path("/proc/cpuinfo")
 
 
 def machine(cpu_info: Path = CPU_INFO) -> dict[str, object]:
-    """Processor, cores that this process may use, Python, versions of what takes part, linear algebra's threads."""
+    """Processor, usable cores, Python, build and versions of what takes part, threads of the linear algebra."""
     try:
         cores = len(os.sched_getaffinity(0))
     except AttributeError:  # not on every system
@@ -19,6 +21,7 @@ def machine(cpu_info: Path = CPU_INFO) -> dict[str, object]:
         "cpu": cpu_model(cpu_info),
         "cores": cores,
         "python": platform.python_version(),
+        "build": build(),
         **{name: _version(name) for name in PACKAGES},
         "blas_threads": os.environ.get("OPENBLAS_NUM_THREADS"),
     }

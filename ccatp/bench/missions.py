@@ -1,6 +1,7 @@
 """Glue. Missions against the wall clock: in one process, and the daemon's processes in lockstep over their sockets."""
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -10,6 +11,8 @@ from typing import Any
 
 from ccatp.config.models import Config
 from ccatp.errors import CcatpError
+from ccatp.package import child_environment
+from ccatp.studies.garbage import settle
 from ccatp.studies.rehearsal import rehearse
 
 PEER = "the wall clock"  # one frame takes it the frame's period
@@ -27,6 +30,7 @@ def rehearsal_case(cfg: Config, panels: int) -> dict[str, Any]:
         BenchError: the mission was not completed.
     """
     part = cfg.model_copy(update={"run": cfg.run.model_copy(update={"panels": panels})})
+    settle()
     started_s = time.perf_counter()
     done = rehearse(part)
     wall_s = time.perf_counter() - started_s
@@ -47,7 +51,14 @@ def lockstep_case(cfg: Config, panels: int, run_args: Sequence[str] = ()) -> dic
         command += ["--run-dir", f"{folder}/run", "--runtime-dir", f"{folder}/rt"]
         started_s = time.perf_counter()
         try:
-            done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=TIMEOUT_S)
+            done = subprocess.run(
+                command,
+                capture_output=True,
+                text=True,
+                check=False,
+                timeout=TIMEOUT_S,
+                env=child_environment(os.environ),
+            )
         except subprocess.TimeoutExpired as error:
             raise BenchError(f"the mission in lockstep was not over after {TIMEOUT_S:g} s") from error
         wall_s = time.perf_counter() - started_s

@@ -75,7 +75,8 @@ def terminal_lines(result: Mapping[str, Any]) -> list[str]:
 def machine_line(machine: Mapping[str, Any]) -> str:
     """The machine in one line."""
     packages = [f"{name} {machine[name]}" for name in ("numpy", "scipy", "filterpy", "stonesoup") if machine[name]]
-    return ", ".join([machine["cpu"], f"{machine['cores']} cores", f"Python {machine['python']}", *packages])
+    build = f"ccatp {machine['build']}"
+    return ", ".join([machine["cpu"], f"{machine['cores']} cores", f"Python {machine['python']}", build, *packages])
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

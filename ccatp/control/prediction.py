@@ -6,7 +6,7 @@ The delay is counted in the sequence numbers of the drives; no clock takes part.
 from collections import deque
 from math import cos, exp, sin
 
-import msgspec
+from ccatp.samples import Predicted
 
 Pose = tuple[float, float, float]
 
@@ -14,14 +14,6 @@ Pose = tuple[float, float, float]
 ROUNDING = 1e-3
 # A robot whose echo is older than its own time-to-live holds its wheels: beyond that nothing is on the way any more.
 REACH_S = 0.25
-
-
-class Predicted(msgspec.Struct, frozen=True):
-    """Pose in a plane, (x_m, y_m, heading_rad), and the speeds there."""
-
-    pose: Pose
-    v_m_s: float
-    omega_rad_s: float
 
 
 class CommandPredictor:

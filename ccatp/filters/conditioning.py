@@ -8,6 +8,7 @@ from numpy import vdot
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from ccatp.filters.base import HUGE, FilterDiverged, FloatArray
+from ccatp.filters.block_kernel import condition
 from ccatp.filters.square_root import condition_by_rows, noise_root
 
 STRONGEST = 1e6
@@ -64,6 +65,9 @@ class Conditioner:
         Raises:
             FilterDiverged: the posterior is not finite, P is not positive semidefinite or R is not positive definite.
         """
+        done = condition(P, nu, H, R)
+        if done is not None:
+            return Posterior(*done)
         m = nu.size
         # vdot, because it does not warn where it overflows: what passes cannot overflow in the products below.
         if not vdot(H, H) < HUGE:

@@ -19,6 +19,7 @@ from ccatp.filters.base import (
     check_rows,
     checked_gaussian,
 )
+from ccatp.filters.block_kernel import advance
 from ccatp.filters.conditioning import Conditioner, Posterior
 
 
@@ -75,10 +76,13 @@ class KalmanFilter:
         """Predict: x <- the array given, which is kept, or F x; P <- F P F^T + Q."""
         if Q.shape != self._shape:
             raise FilterShapeError("Q", Q.shape, str(self._shape))
-        # One call of BLAS for F (P F^T) + Q, halved, and its transpose: symmetric to the last bit. Transposed views are
-        # what it takes without a copy. Unlike numpy it does not warn where something is not finite.
-        half = dgemm(1.0, F.T, dgemm(0.5, self.covariance.T, F.T), 0.5, Q.T, trans_a=1)
-        self._take_prediction(F.dot(self.mean) if x is None else x, half + half.T)
+        P = advance(self.covariance, F, Q)
+        if P is None:
+            # One call of BLAS for F (P F^T) + Q, halved, and its transpose: symmetric to the last bit. Transposed views
+            # are what it takes without a copy. Unlike numpy it does not warn where something is not finite.
+            half = dgemm(1.0, F.T, dgemm(0.5, self.covariance.T, F.T), 0.5, Q.T, trans_a=1)
+            P = half + half.T
+        self._take_prediction(F.dot(self.mean) if x is None else x, P)
         self._transition = F.copy()
 
     def _take_prediction(self, x: FloatArray, P: FloatArray) -> None:

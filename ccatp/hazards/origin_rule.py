@@ -72,9 +72,10 @@ class OriginRule:
             self.direction = 0
 
     def _judge(self, estimate: PoseEstimate, wheels: Sequence[WheelSample]) -> None:
-        if not wheels or wheels[-1].right_rad_s is None or wheels[-1].left_rad_s is None:
+        _, right, left = wheels[-1] if wheels else (0.0, None, None)
+        if right is None or left is None:
             return
-        total = wheels[-1].right_rad_s + wheels[-1].left_rad_s
+        total = right + left
         if abs(total) < MOVING_RAD_S:
             return
         direction = 1 if total > 0.0 else -1

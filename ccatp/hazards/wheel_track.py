@@ -73,7 +73,7 @@ class WheelTrack:
         frames, since_s = self._frames, t_s - self._reach_s
         while frames:
             samples = frames.popleft()
-            if samples[-1].t_s >= since_s:
+            if samples[-1][0] >= since_s:
                 self._read(samples)
         if len(self.knots) > 2 * KNOTS_KEPT:
             self.dropped += len(self.knots) - KNOTS_KEPT

@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from enum import Enum
 from math import hypot, inf, isfinite
-from operator import lt
 
 from ccatp.localization.measurements import MeasurementBuilder, Stack, WheelReading
 from ccatp.samples import ImuSample, WheelSample
@@ -158,14 +157,17 @@ class SampleIntake:
             return None
         oldest_s = t_s - self._history_s
         newest_s = max(self._right.newest_s, self._left.newest_s, oldest_s)
-        if not (newest_s < times[0] and times[-1] <= t_s + _ROUNDING_S and size < _READABLE):
+        if not (times[-1] <= t_s + _ROUNDING_S and size < _READABLE):
             return None
         largest = self.largest_rate_rad_s
         # The length of a vector is at least its largest number, so that hardly any frame has to be looked at closely.
         if size > largest and max(*right, *left, -min(right), -min(left)) > largest:
             return None
-        if not all(map(lt, times, times[1:])):
-            return None
+        before_s = newest_s
+        for sample_s in times:
+            if not before_s < sample_s:
+                return None
+            before_s = sample_s
         self._right.use(times, oldest_s)
         self._left.use(times, oldest_s)
         return times, right, left

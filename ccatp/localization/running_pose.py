@@ -32,7 +32,8 @@ class RunningPose:
 
     def begin(self, mean: FloatArray, slope: Slope, half_s: float) -> None:
         """The filter has taken a step of which ``half_s`` is half the length; its mean speed belongs to the middle."""
-        x, y, psi, v, a, w, self._bias, scale, _, s_r, s_l, k_l, c = mean[: C + 1].tolist()
+        state: list[float] = mean[: C + 1].tolist()
+        x, y, psi, v, a, w, self._bias, scale, _, s_r, s_l, k_l, c = state
         self.x_m, self.y_m, self.heading_rad = x, y, psi
         self._a = a
         self.v_m_s, self.omega_rad_s = v + a * half_s, w

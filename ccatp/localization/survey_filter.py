@@ -80,6 +80,7 @@ class SurveyFilter:
         self._mirror, self._terrain = mirror, Terrain(mirror)
         self._motion = SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m)
         self._rows = SensorRows()
+        self._drift = np.zeros(STATES)
         self._seams = SeamLines(mirror, robot)
         self._legs = LegBook(self._full)
         self._tilt_sigma_m = robot.puck_height_m * cfg.full_state.panel_tilt_sigma_rad
@@ -178,10 +179,9 @@ class SurveyFilter:
         full, mean = self._full, self._filter.mean
         motion = self._motion.over(dt_s, self._terrain.at(float(mean[X]), float(mean[Y])))
         slip, creep = scatter
-        impulses = np.array(
-            (full.jerk_density_m2_s5 * dt_s, full.angular_acceleration_density_rad2_s3 * dt_s, slip, slip, creep)
-        )
-        drift = np.zeros(STATES)
+        jerk, twist = full.jerk_density_m2_s5 * dt_s, full.angular_acceleration_density_rad2_s3 * dt_s
+        impulses = np.array((jerk, twist, slip, slip, creep))
+        drift = self._drift  # work space, of which the model keeps nothing
         drift[BG] = full.gyroscope_bias_walk_rad_s_sqrt_s**2 * dt_s
         drift[BA] = full.accelerometer_bias_walk_m_s2_sqrt_s**2 * dt_s
         drift[PR] = drift[PL] = encoders

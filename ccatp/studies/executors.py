@@ -12,6 +12,7 @@ from threading import Thread
 from typing import Any, NamedTuple
 
 from ccatp.studies.campaign import CampaignError, ClusterUnreachable, Job, Outcome
+from ccatp.studies.garbage import settle
 from ccatp.studies.threads import limit_threads
 
 _CLUSTER_TIMEOUT_S = 5.0
@@ -51,6 +52,7 @@ class _Here(Executor):
 
 def timed(run_job: Callable[[Job], Outcome], job: Job) -> Timed:
     """Do a job."""
+    settle()
     started_s = time.perf_counter()
     outcome = run_job(job)
     return Timed(outcome, time.perf_counter() - started_s)

@@ -75,6 +75,8 @@ class Rehearsing:
         self._span = CommandSpan()
         self._time = SteadyTime(cfg.health.clock_jump_s)
         self._has_full_fans = False
+        self._state, self._state_s = State.IDLE, 0.0
+        self._wheels_m = cfg.robot.wheel_radius_m, cfg.robot.wheel_base_m
 
     def run(self) -> Rehearsal:
         """From the first frame to the end of the mission."""
@@ -135,7 +137,9 @@ class Rehearsing:
             if order.arrived is not None:
                 self.book.builder.add_arrival(order.arrived, seq)
         state = mission.state
-        self.states_s[state] += dt_s
+        if state is not self._state:
+            self._note_state(state)
+        self._state_s += dt_s
         self._publish(seq, t_s, motion.pose, state)
         if order.measure:
             self._measure(frame)
@@ -155,11 +159,15 @@ class Rehearsing:
         )
 
     def _foresee(self, number: int, right: float, left: float) -> None:
-        robot = self.cfg.robot
         self._driven = right, left
         self._span.add(right, left)
-        twist = twist_of(right, left, robot.wheel_radius_m, robot.wheel_base_m)
+        twist = twist_of(right, left, *self._wheels_m)
         self.predictor.sent(number, twist.v_m_s, twist.omega_rad_s)
+
+    def _note_state(self, state: State) -> None:
+        """Another state begins, or the mission is over in it."""
+        self.states_s[self._state] = self._state_s
+        self._state, self._state_s = state, self.states_s[state]
 
     def _publish(self, seq: int, t_s: float, pose: PanelPose, state: State) -> None:
         self.book.note_estimate(seq, t_s, pose)
@@ -212,6 +220,7 @@ class Rehearsing:
 
     def _result(self, mission_time_s: float) -> Rehearsal:
         mission, misalignments = self.mission, self.robot.world.misalignments
+        self._note_state(self._state)
         return Rehearsal(
             summary=self.book.summary(mission, mission_time_s, self.laser.panel_fits(), misalignments),
             stops=self.laser.stops,

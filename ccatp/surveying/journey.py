@@ -4,10 +4,9 @@ from collections.abc import Callable, Sequence
 from math import hypot
 from typing import NamedTuple
 
-from ccatp.control.prediction import Predicted
 from ccatp.control.tracker import DONE, LegTracker
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import DeckPose, PanelId, PanelPose, PointId, Stop, Twist
+from ccatp.samples import DeckPose, PanelId, PanelPose, PointId, Predicted, Stop, Twist
 from ccatp.surveying.correction import Aim
 
 

@@ -8,12 +8,11 @@ import pytest
 from msgspec.structs import replace
 
 from ccatp.config.models import Config
-from ccatp.control.prediction import Predicted
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.mission import Mission
 from ccatp.planning.errors import PlanError
 from ccatp.planning.route import Route
-from ccatp.samples import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Twist, Verdict
+from ccatp.samples import DeckPose, EventCode, PanelId, PanelPose, PointId, Predicted, Stop, StopKind, Twist, Verdict
 from ccatp.surveying.correction import Corrector
 from ccatp.surveying.journey import Motion
 from ccatp.surveying.orders import Order

@@ -242,3 +242,4 @@ def test_the_machine(tmp_path: Path) -> None:
     assert cpu_model(info) == "Some CPU @ 1 GHz"
     assert cpu_model(tmp_path / "none") != "Some CPU @ 1 GHz"
     assert f"Python {sys.version_info.major}." in report.machine_line(machine(info))
+    assert "ccatp interpreted" in report.machine_line(machine(info))

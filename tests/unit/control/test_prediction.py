@@ -4,7 +4,8 @@ from math import cos, exp, sin
 
 import pytest
 
-from ccatp.control.prediction import CommandPredictor, Predicted
+from ccatp.control.prediction import CommandPredictor
+from ccatp.samples import Predicted
 
 DT, LAG = 0.01, 0.08
 POSE = (0.1, -0.2, 0.7)

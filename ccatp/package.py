@@ -1,0 +1,33 @@
+"""Edge. This package: which build of it runs, and how a child process gets the very same."""
+
+import os
+import sys
+from collections.abc import Mapping
+from importlib.machinery import EXTENSION_SUFFIXES
+from pathlib import Path
+
+COMPILED, INTERPRETED = "compiled", "interpreted"
+ROOT = Path(__file__).resolve().parent
+
+
+def build(root: Path = ROOT) -> str:
+    """``compiled`` where the frame path is machine code (``make fast``), else ``interpreted``.
+
+    Args:
+        root: the package's folder.
+    """
+    return COMPILED if any((root / f"mission{suffix}").is_file() for suffix in EXTENSION_SUFFIXES) else INTERPRETED
+
+
+def child_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    """The environment in which ``python -m ccatp...`` runs this package, whatever lies in the working directory.
+
+    Args:
+        environment: of this process.
+    """
+    changed = {**environment, "PYTHONSAFEPATH": "1"}
+    above = str(ROOT.parent)
+    if above not in sys.path[1:]:  # neither installed nor in PYTHONPATH: it was found in the working directory
+        others = environment.get("PYTHONPATH")
+        changed["PYTHONPATH"] = above if not others else os.pathsep.join((above, others))
+    return changed
