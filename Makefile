@@ -99,7 +99,7 @@ UV_COMPILE = $(UV) pip compile --quiet --universal --generate-hashes --no-emit-i
 lock:
 	$(UV_COMPILE) --output-file requirements.lock
 	$(UV_COMPILE) --group dev --all-extras --constraint requirements.lock --output-file requirements-dev.lock
-	$(UV_COMPILE) --group compiled --all-extras --constraint requirements-dev.lock --output-file requirements-compiled.lock
+	$(UV_COMPILE) --group compiled --extra plots --extra tune --extra cluster --extra peers --constraint requirements-dev.lock --output-file requirements-compiled.lock
 
 clean:
 	rm -rf $(VENV) $(FAST_VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
