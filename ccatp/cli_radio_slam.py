@@ -25,5 +25,5 @@ def slam(path: Path, data_format: str | None, robot: int | None) -> int:
     from ccatp.radio_data.reader import read_run
 
     run = read_run(path, data_format, robot)
-    click.echo(f"{run.name}: {len(run.odometry.distance_m)} odometry steps, {len(run.readings.times_s)} readings")
+    click.echo(f"{run.name}: {len(run.steps.distance_m)} odometry steps, {len(run.readings.times_s)} readings")
     return 0

@@ -1,7 +1,6 @@
 """Edge. Tables of numbers in text files, plain or gzipped: comments skipped, each fault told with file and line."""
 
 import gzip
-import math
 import zlib
 from pathlib import Path
 from typing import NamedTuple
@@ -58,22 +57,19 @@ def content_lines(text: str) -> list[tuple[int, str]]:
 
 
 def number(file: Path, line: int, text: str, what: str) -> float:
-    """A finite number.
+    """A number, which may be NaN or infinite: who reads rows leaves those out and says so.
 
     Raises:
         RadioDataError: it is none.
     """
     try:
-        value = float(text)
+        return float(text)
     except ValueError as error:
         raise RadioDataError(file, f"{what} is {text!r}, not a number", line) from error
-    if not math.isfinite(value):
-        raise RadioDataError(file, f"{what} is {text}: not finite; remove the line", line)
-    return value
 
 
-def read_table(file: Path, names: tuple[str, ...], more: bool = False) -> Table:
-    """A table of numbers between white space or commas.
+def read_table(file: Path, names: tuple[str, ...], *, more: bool = False) -> Table:
+    """A table of numbers between white space or commas; a first line of words is a header.
 
     Args:
         file: plain or gzipped text.
@@ -87,7 +83,7 @@ def read_table(file: Path, names: tuple[str, ...], more: bool = False) -> Table:
     lines: list[int] = []
     for line, content in content_lines(read_text(file)):
         words = content.replace(",", " ").split()
-        if not lines and not rows and not _is_number(words[0]):
+        if not rows and not any(_is_number(word) for word in words):
             continue  # a header without a comment sign
         if len(words) != len(names) and not (more and len(words) > len(names)):
             raise RadioDataError(file, f"{len(words)} columns, wanted {len(names)}: {', '.join(names)}", line)
