@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from ccatp.config.cricket_models import CricketConfig
 from ccatp.config.models import Model, NonNegative, Pair, Positive
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -248,3 +249,4 @@ class RadioConfig(Model):
     follow: FollowConfig
     avoidance: AvoidanceConfig
     sim: RadioSimConfig
+    cricket: CricketConfig
