@@ -130,7 +130,7 @@ class HealthBoard:
         self.seams = SeamMonitor(cfg, ground, robot.edge_sensors_m, danger.map_sigmas, fastest)
         self.flicker = FlickerMonitor(cfg, is_explained)
         self._clock, self._gap = Alarm(cfg.imu_quarantine_s), Alarm(cfg.imu_quarantine_s)
-        self._garbled = Alarm(cfg.imu_quarantine_s)
+        self._garbled = Alarm(cfg.retry_after_s)
         self._alarms = (
             self._wheels.alarm,
             self._yaw.alarm,
