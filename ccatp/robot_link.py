@@ -293,13 +293,13 @@ class RobotLink(asyncio.Protocol):
         """Break the connection at once, whatever waits to be sent; ``on_lost`` is called with ``why``."""
         self._end(why)
 
-    def send_drive(self, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float) -> None:
-        """Send wheel set points.
+    def send_drive(self, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float, steer_rad: float | None = None) -> None:
+        """Send wheel set points, and the steering angle of a robot that has one.
 
         Raises:
             ValueError: a set point that is not finite.
         """
-        self._send_fresh(format_drive(seq, ack, wr_rad_s, wl_rad_s))
+        self._send_fresh(format_drive(seq, ack, wr_rad_s, wl_rad_s, steer_rad))
 
     def send_permit(self, seq: int, ack: int, forward: bool, reverse: bool, turn: bool) -> None:
         """Send what motion is allowed."""

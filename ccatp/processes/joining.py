@@ -4,7 +4,7 @@ import asyncio
 import random
 from collections.abc import Callable
 
-from ccatp.config.models import RobotConfig
+from ccatp.config.models import LinkConfig
 from ccatp.errors import UnreachableError
 from ccatp.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout, read_key
 from ccatp.wire.robot import Hello, Role, Sensors
@@ -44,7 +44,7 @@ class LastingLink:
 
     def __init__(
         self,
-        cfg: RobotConfig,
+        cfg: LinkConfig,
         *,
         role: Role,
         client: str,

@@ -20,6 +20,7 @@ RefusalReason = Literal["role taken", "bad mac", "bad join", "busy"]
 Sequence53 = Annotated[int, Meta(ge=0, le=2**53 - 1)]  # what every JSON reader keeps exact
 Time = Annotated[float, Meta(ge=0.0, le=MAX_TIME_S)]
 Rate = Annotated[float, Meta(ge=-MAX_RATE_RAD_S, le=MAX_RATE_RAD_S)]
+Steer = Annotated[float, Meta(ge=-1.6, le=1.6)]
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 Length = Annotated[float, Meta(ge=-10.0, le=10.0)]
 Positive = Annotated[float, Meta(gt=0.0, le=1e6)]
@@ -106,12 +107,16 @@ class Sensors(RobotLinkMessage, tag="sensors", gc=True):
 
 
 class Drive(RobotLinkMessage, tag="drive"):
-    """Wheel angular-rate set points, rad/s; ``ack`` is the newest sensors frame they were computed from."""
+    """Wheel angular-rate set points, rad/s; ``ack`` is the newest sensors frame they were computed from.
+
+    ``steer``: angle of the steered wheel, rad, left positive; for robots that have one, the others ignore it.
+    """
 
     seq: Sequence53
     ack: Sequence53
     wr: Rate
     wl: Rate
+    steer: Steer | None = None
 
 
 class Permit(RobotLinkMessage, tag="permit"):
