@@ -111,6 +111,7 @@ class RobotLink(asyncio.Protocol):
         on_sensors: called with each frame and its line (without LF), within the event loop's read.
         on_lost: called once with the reason when a joined session ends, unless ``close`` ended it.
         on_joined: called with the robot's hello when the session begins, before its first frame.
+        on_bad_line: called after each line of a joined session that fails a check.
 
     Attributes:
         counts: bad_lines, unknown_types, unexpected, repeated_frames, unsent.
@@ -127,9 +128,11 @@ class RobotLink(asyncio.Protocol):
         on_sensors: Callable[[Sensors, bytes], None],
         on_lost: Callable[[str], None],
         on_joined: Callable[[Hello], None] = lambda _hello: None,
+        on_bad_line: Callable[[], None] = lambda: None,
     ) -> None:
         self._host, self._port, self._role, self._client, self._key = host, port, role, client, key
         self._on_sensors, self._on_lost, self._on_joined = on_sensors, on_lost, on_joined
+        self._on_bad_line = on_bad_line
         self.counts: Counter[str] = Counter()
         self._transport: asyncio.Transport | None = None
         self._hello: Hello | None = None
@@ -278,6 +281,8 @@ class RobotLink(asyncio.Protocol):
         self.counts["bad_lines"] += 1
         if self._bad.add(asyncio.get_running_loop().time()):
             self._end("too many bad lines from the robot")
+        elif self._is_joined:
+            self._on_bad_line()
 
     def _end(self, why: str) -> None:
         self._why = self._why or why

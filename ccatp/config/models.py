@@ -257,6 +257,8 @@ class HealthConfig(Model):
     doubt_position_m: Positive
     doubt_heading_rad: Positive
     gap_s: Positive
+    garbled_lines: Annotated[int, Field(ge=1, le=20)]
+    garbled_window_s: Positive
     pause_limit_s: Positive
     hold_limit_s: Positive
     lifted_limit_s: Positive
