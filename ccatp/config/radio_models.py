@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ccatp.config.models import Model, NonNegative, Pair, Positive
+from ccatp.config.models import Model, NonNegative, Pair, PidConfig, Positive
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
@@ -121,14 +121,6 @@ class FuzzyConfig(Model):
     rules: Annotated[tuple[FuzzyRuleConfig, ...], Field(min_length=1)]
 
 
-class SpeedPiConfig(Model):
-    """PI control of the speed by the distance left."""
-
-    kp_1_s: NonNegative
-    ki_1_s2: NonNegative
-    integral_limit_m_s: NonNegative
-
-
 class RadioControlConfig(Model):
     """Steering and speed."""
 
@@ -136,7 +128,7 @@ class RadioControlConfig(Model):
     steering_gain: Positive
     constant_speed_m_s: Positive
     arrival_radius_m: Positive
-    pi: SpeedPiConfig
+    pi: PidConfig
     fuzzy: FuzzyConfig
 
 
@@ -147,6 +139,7 @@ class FollowConfig(Model):
     target: Name
     safe_distance_m: Positive
     band_m: Positive
+    back_speed_m_s: Positive
     lost_after_s: Positive
 
 
@@ -158,7 +151,11 @@ class AvoidanceConfig(Model):
     range_max_m: Positive
     influence_m: Positive
     stop_m: Positive
-    gain: NonNegative
+    margin_m: NonNegative
+    memory_s: Positive
+    back_speed_m_s: Positive
+    back_time_s: Positive
+    directions: Annotated[int, Field(ge=8, le=720)]
 
 
 class SimBeaconConfig(Model):
