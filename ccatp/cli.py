@@ -29,6 +29,7 @@ from ccatp.cli_frame import (
 )
 from ccatp.cli_keys import keys
 from ccatp.cli_plan import plan
+from ccatp.cli_radio import radio
 from ccatp.cli_replay import replay
 from ccatp.cli_study import study
 from ccatp.package import COMPILED, build
@@ -304,6 +305,7 @@ cli.add_command(align)
 cli.add_command(bench)
 cli.add_command(keys)
 cli.add_command(plan)
+cli.add_command(radio)
 cli.add_command(study)
 cli.add_command(replay)
 cli.add_command(conformance)
