@@ -71,7 +71,7 @@ class OdometryConfig(Model):
     steer_sigma_rad: NonNegative
     turn_rate_sigma_rad_s: NonNegative
     heading_drift_sigma_rad_s: NonNegative
-    speed_scale_sigma: NonNegative
+    slip_sigma: NonNegative
 
 
 class PathLossConfig(Model):
@@ -103,9 +103,11 @@ class ObservationConfig(Model):
 class EstimatorConfig(Model):
     """What the filter assumes and estimates besides poses and positions."""
 
-    estimates_shadowing: bool
+    shadowing: Literal["none", "white", "map"]
+    shadowing_grid_m: Positive
     gate_probability: Annotated[float, Field(gt=0.5, lt=1.0)]
     target_speed_sigma_m_s: Positive
+    target_course_time_s: Positive
 
 
 class FuzzyInputConfig(Model):
