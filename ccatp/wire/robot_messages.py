@@ -37,7 +37,16 @@ class RobotLinkMessage(msgspec.Struct, tag_field="type", gc=False):
     """Base of all messages; ``type`` is the tag."""
 
 
-class RobotData(msgspec.Struct):
+class VehicleData(msgspec.Struct):
+    """What a robot among beacons says besides: its kind, and its distance sensors, rad, left of the heading."""
+
+    kind: Literal["ackermann", "differential"]
+    axle_distance_m: Positive
+    steer_max_rad: Steer
+    distance_sensors_rad: list[Annotated[float, Meta(ge=-6.3, le=6.3)]]
+
+
+class RobotData(msgspec.Struct, omit_defaults=True):
     """What the robot says of itself: lengths in m, robot frame; edge sensors in the order of ``EdgeSample``."""
 
     wheel_radius_m: Positive
@@ -46,6 +55,7 @@ class RobotData(msgspec.Struct):
     puck_m: tuple[Length, Length, Length]
     max_wheel_rad_s: Positive
     fan_floor: Fraction
+    vehicle: VehicleData | None = None
 
 
 class Hello(RobotLinkMessage, tag="hello"):

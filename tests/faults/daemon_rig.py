@@ -15,7 +15,7 @@ import zmq
 
 from ccatp.config.loader import dump_config, load_config
 from ccatp.config.models import Config
-from ccatp.dataloop import DataLoop, TruthOutlet
+from ccatp.dataloop import DataLoop
 from ccatp.etalon_standin import EtalonStandIn
 from ccatp.fault_proxy.proxy import FaultProxy
 from ccatp.mirror.mirror import build_mirror
@@ -25,6 +25,7 @@ from ccatp.processes.main_loop import MainLoop, open_work
 from ccatp.puck_truth import ZmqPuck
 from ccatp.robot_link import RobotLink
 from ccatp.sim.truth import TruthLog
+from ccatp.truth_outlet import TruthOutlet
 
 DEADLINE_S = 60.0
 SEND_DRIVE, SEND_PERMIT = RobotLink.send_drive, RobotLink.send_permit
