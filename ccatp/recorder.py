@@ -86,7 +86,7 @@ class Recorder:
 
     Args:
         path: the file to write.
-        topics: name and JSON schema of each topic.
+        topics: name and JSON schema of each topic; the schema's title is what viewers know it by.
         is_simulation: marks the file and every channel as simulation, or as real.
         metadata: what tells runs apart (mirror, seed, ...), kept in the file.
         on_failure: called once with the reason when recording ends early.
@@ -158,7 +158,8 @@ class Recorder:
         self._writer.add_metadata(_METADATA, metadata)
         for name, schema in topics:
             data = json.dumps(schema, separators=(",", ":")).encode()
-            schema_id = int(self._writer.register_schema(name=name, encoding="jsonschema", data=data))
+            title = str(schema.get("title", name))
+            schema_id = int(self._writer.register_schema(name=title, encoding="jsonschema", data=data))
             channel_metadata = {_SIMULATION: metadata[_SIMULATION]}
             self._channels[name] = self._writer.register_channel(name, "json", schema_id, channel_metadata)
 

@@ -1,0 +1,274 @@
+"""Pure. What viewers are shown of a run beside the raw topics: one table of views, and their derivation from messages.
+
+A view is a topic of its own, named ``view/...``, at a tenth of the frame rate at most: a recording with views is little
+larger, and a live stream of them small. What stays as it is (frames, the panels' map) is latched: whoever comes late is
+told again.
+"""
+
+from collections.abc import Iterator, Sequence
+from math import cos, hypot, sin
+from typing import Any, NamedTuple
+
+import msgspec
+
+from ccatp.angles import wrap_pi
+from ccatp.mirror.batches import deck_poses
+from ccatp.mirror.mirror import Mirror
+from ccatp.samples import DeckPose, PanelId, PanelPose, PointId
+from ccatp.viewing.foxglove import (
+    LEVELS,
+    FrameTransform,
+    Pose,
+    PoseInFrame,
+    SceneUpdate,
+    Vector3,
+    time_of,
+)
+from ccatp.viewing.foxglove import Log as FoxgloveLog
+from ccatp.viewing.panel_scene import DECK, panel_scene, point_scene, quaternion, robot_rotation
+from ccatp.viewing.plain_schema import plain_schema
+from ccatp.wire.topics import TOPICS, FixMessage, Log, Message, SensorLines, Track, Truth, schema_of
+
+WORLD, ROBOT, TRUE_ROBOT = "world", "robot", "true robot"
+EVERY_FRAMES = 10
+# All points are told again this often, for whoever jumps into the middle of a recording.
+POINTS_AGAIN_S = 60.0
+_KEPT_ESTIMATES = 1000
+
+
+class RobotView(msgspec.Struct, frozen=True):
+    """Scalars to plot, of every tenth frame: the estimate on the deck, and the frame's own values."""
+
+    t_s: float
+    seq: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    sigma_m: float
+
+
+class SensorView(msgspec.Struct, frozen=True):
+    """Scalars to plot, of every tenth frame: the newest sample of each sensor; ages as the robot echoes them."""
+
+    t_s: float
+    seq: int
+    wheel_right_rad_s: float | None
+    wheel_left_rad_s: float | None
+    acceleration_m_s2: float | None
+    yaw_rate_rad_s: float | None
+    edge_front_left: int | None
+    edge_front_right: int | None
+    edge_rear_left: int | None
+    edge_rear_right: int | None
+    fan_left: float
+    fan_right: float
+    battery: float
+    drive_age_s: float
+    permit_age_s: float
+    held: bool
+
+
+class ErrorView(msgspec.Struct, frozen=True):
+    """Estimate against the simulated truth, every tenth frame (simulation only); along and across the true heading."""
+
+    t_s: float
+    seq: int
+    position_mm: float
+    along_mm: float
+    across_mm: float
+    heading_mrad: float
+
+
+class View(NamedTuple):
+    """One row of the table of views.
+
+    Attributes:
+        name: the topic.
+        message: its type.
+        schema_name: what viewers know it by.
+        is_latched: the last message holds until another one comes.
+    """
+
+    name: str
+    message: type[msgspec.Struct]
+    schema_name: str
+    is_latched: bool = False
+
+
+class Shown(NamedTuple):
+    """A message of a view: topic, robot time (s), JSON."""
+
+    topic: str
+    t_s: float
+    payload: bytes
+
+
+VIEWS = (
+    View("view/frames", FrameTransform, "foxglove.FrameTransform", True),
+    View("view/panels", SceneUpdate, "foxglove.SceneUpdate", True),
+    View("view/points", SceneUpdate, "foxglove.SceneUpdate"),
+    View("view/robot_frame", FrameTransform, "foxglove.FrameTransform"),
+    View("view/pose", PoseInFrame, "foxglove.PoseInFrame"),
+    View("view/true_pose", PoseInFrame, "foxglove.PoseInFrame"),
+    View("view/log", FoxgloveLog, "foxglove.Log"),
+    View("view/robot", RobotView, "ccatp.Robot"),
+    View("view/sensors", SensorView, "ccatp.Sensors"),
+    View("view/error", ErrorView, "ccatp.Error"),
+)
+_encode = msgspec.json.Encoder().encode
+
+
+class _Echo(msgspec.Struct):
+    age: float | None = None
+    permit_age: float | None = None
+    held: bool = False
+
+
+class _Line(msgspec.Struct):
+    """The part of a sensors line that is shown; what it lacks is no fault of ours to judge."""
+
+    seq: int
+    t: float
+    imu: list[tuple[float, float, float]]
+    enc: list[tuple[float, float, float]]
+    edge: list[tuple[float, int, int, int, int]]
+    fans: tuple[float, float]
+    soc: float
+    cmd: _Echo
+
+
+_line_decoder = msgspec.json.Decoder(_Line)
+
+
+def recorded_schemas() -> list[tuple[str, dict[str, Any]]]:
+    """Name and schema of every channel of a recording: the recorded topics, and the views of them."""
+    raw = [(t.name, plain_schema(schema_of(t.name), f"ccatp.{t.message.__name__}")) for t in TOPICS if t.recorded]
+    return [*raw, *view_schemas()]
+
+
+def view_schemas() -> list[tuple[str, dict[str, Any]]]:
+    """Name and schema of every view."""
+    return [(view.name, plain_schema(msgspec.json.schema(view.message), view.schema_name)) for view in VIEWS]
+
+
+class Views:
+    """Derives the views of one run.
+
+    Args:
+        mirror: where it takes place.
+        puck_height_m: above the surface along its normal.
+    """
+
+    def __init__(self, mirror: Mirror, puck_height_m: float) -> None:
+        """Nothing seen yet."""
+        self._mirror, self._puck_height_m = mirror, puck_height_m
+        self._deviations_m: dict[PointId, float] = {}
+        self._estimates: dict[int, DeckPose] = {}
+        self._points_told_s = 0.0
+        self._has_begun = False
+
+    def begin(self, t_s: float = 0.0) -> Iterator[Shown]:
+        """What is latched: the world's frame and the panels' map."""
+        self._has_begun = True
+        mirror, now = self._mirror, time_of(t_s)
+        origin = Vector3(*mirror.world_from_deck((0.0, 0.0, 0.0)))
+        x, y, z = (mirror.rotate_world_from_deck(axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+        yield _shown("view/frames", t_s, FrameTransform(now, WORLD, DECK, origin, quaternion((x, y, z))))
+        yield _shown("view/panels", t_s, panel_scene(mirror, now))
+
+    def of(self, message: Message) -> Iterator[Shown]:
+        """The views of one message."""
+        if not self._has_begun:
+            yield from self.begin(max(message.t_s, 0.0))
+        if isinstance(message, Track):
+            yield from self._of_track(message)
+        elif isinstance(message, SensorLines):
+            yield from _of_lines(message.lines)
+        elif isinstance(message, Truth):
+            yield from self._of_truth(message)
+        elif isinstance(message, FixMessage):
+            yield from self._of_fix(message)
+        elif isinstance(message, Log):
+            log = FoxgloveLog(
+                time_of(max(message.t_s, 0.0)), LEVELS.get(message.level, 0), message.text, message.process
+            )
+            yield _shown("view/log", message.t_s, log)
+
+    def all_points(self, t_s: float) -> Iterator[Shown]:
+        """Every measured point so far."""
+        panels = dict.fromkeys(point.panel for point in self._deviations_m)
+        if panels:
+            yield _shown("view/points", t_s, point_scene(self._mirror, panels, self._deviations_m, time_of(t_s)))
+
+    def _of_track(self, track: Track) -> Iterator[Shown]:
+        rows = [row for row in track.rows if row[0] % EVERY_FRAMES == 0]
+        if not rows:
+            return
+        poses = [PanelPose(PanelId(row, col), x, y, heading) for _, _, row, col, x, y, heading, _ in rows]
+        for row, place in zip(rows, deck_poses(self._mirror, poses).tolist(), strict=True):
+            seq, t_s, sigma_m = row[0], row[1], row[7]
+            pose = DeckPose(*place[:3])
+            self._keep(seq, pose)
+            now, shown = time_of(t_s), self._pose_of(pose, place[3])
+            yield _shown("view/pose", t_s, PoseInFrame(now, DECK, shown))
+            frame = FrameTransform(now, DECK, ROBOT, shown.position, shown.orientation)
+            yield _shown("view/robot_frame", t_s, frame)
+            yield _shown("view/robot", t_s, RobotView(t_s, seq, pose.x_m, pose.y_m, pose.heading_rad, sigma_m))
+
+    def _of_truth(self, truth: Truth) -> Iterator[Shown]:
+        for seq, t_s, x, y, heading, _x, _y, z, *_ in truth.rows:
+            if seq % EVERY_FRAMES:
+                continue
+            pose = DeckPose(x, y, heading)
+            yield _shown("view/true_pose", t_s, PoseInFrame(time_of(t_s), DECK, self._pose_of(pose, z)))
+            estimate = self._estimates.pop(seq, None)
+            if estimate is not None:
+                yield _shown("view/error", t_s, _error(seq, t_s, estimate, pose))
+
+    def _of_fix(self, fix: FixMessage) -> Iterator[Shown]:
+        if fix.point is None or not fix.is_fused:
+            return
+        point = PointId(*fix.point)
+        *_, self._deviations_m[point] = self._mirror.foot_of_puck(fix.position_m, self._puck_height_m)
+        if fix.t_s - self._points_told_s >= POINTS_AGAIN_S:
+            self._points_told_s = fix.t_s
+            yield from self.all_points(fix.t_s)
+            return
+        scene = point_scene(self._mirror, (point.panel,), self._deviations_m, time_of(fix.t_s))
+        yield _shown("view/points", fix.t_s, scene)
+
+    def _pose_of(self, pose: DeckPose, z_m: float) -> Pose:
+        return Pose(Vector3(pose.x_m, pose.y_m, z_m), robot_rotation(self._mirror, pose))
+
+    def _keep(self, seq: int, pose: DeckPose) -> None:
+        """For the truth, which comes a little earlier or later; where there is none, not for ever."""
+        self._estimates[seq] = pose
+        if len(self._estimates) > _KEPT_ESTIMATES:
+            del self._estimates[next(iter(self._estimates))]
+
+
+def _of_lines(lines: Sequence[msgspec.Raw]) -> Iterator[Shown]:
+    for raw in lines[::EVERY_FRAMES]:
+        try:
+            line = _line_decoder.decode(raw)
+        except msgspec.MsgspecError:
+            continue
+        _, right, left = line.enc[-1] if line.enc else (0.0, None, None)
+        _, acceleration, rate = line.imu[-1] if line.imu else (0.0, None, None)
+        edges = line.edge[-1][1:] if line.edge else (None,) * 4
+        ages = (-1.0 if age is None else age for age in (line.cmd.age, line.cmd.permit_age))
+        view = SensorView(
+            line.t, line.seq, right, left, acceleration, rate, *edges, *line.fans, line.soc, *ages, line.cmd.held
+        )
+        yield _shown("view/sensors", line.t, view)
+
+
+def _error(seq: int, t_s: float, estimate: DeckPose, truth: DeckPose) -> ErrorView:
+    dx, dy = estimate.x_m - truth.x_m, estimate.y_m - truth.y_m
+    c, s = cos(truth.heading_rad), sin(truth.heading_rad)
+    turn = wrap_pi(estimate.heading_rad - truth.heading_rad)
+    return ErrorView(t_s, seq, 1e3 * hypot(dx, dy), 1e3 * (c * dx + s * dy), 1e3 * (c * dy - s * dx), 1e3 * turn)
+
+
+def _shown(topic: str, t_s: float, message: msgspec.Struct) -> Shown:
+    return Shown(topic, max(t_s, 0.0), _encode(message))
