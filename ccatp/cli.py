@@ -28,6 +28,7 @@ from ccatp.cli_frame import (
     run_command_line,
 )
 from ccatp.cli_keys import keys
+from ccatp.cli_log import log
 from ccatp.cli_plan import plan
 from ccatp.cli_replay import replay
 from ccatp.cli_study import study
@@ -303,6 +304,7 @@ def sim_etalon(
 cli.add_command(align)
 cli.add_command(bench)
 cli.add_command(keys)
+cli.add_command(log)
 cli.add_command(plan)
 cli.add_command(study)
 cli.add_command(replay)

@@ -173,6 +173,7 @@ class RunCollector:
             if isinstance(message, Message):
                 self._take(name, body, message, view)
             received = self._subscriber.receive_raw()
+        self._recorder.tend()
 
     def _take(self, name: str, body: bytes, message: Message, view: View | None) -> None:
         if isinstance(message, Presence):

@@ -55,7 +55,9 @@ def point_scene(
         measured = [point for point in mirror.point_ids(panel) if point in deviations_m]
         spheres = tuple(_sphere(mirror, point, deviations_m[point]) for point in measured)
         facts = tuple(KeyValue(f"point {p.point}", f"{1e6 * deviations_m[p]:.1f} um") for p in measured)
-        entities.append(Entity(timestamp, DECK, f"points {panel.row}-{panel.col}", False, (), facts, spheres))
+        entities.append(
+            Entity(timestamp, DECK, f"points {panel.row}-{panel.col}", False, metadata=facts, spheres=spheres)
+        )
     return SceneUpdate((), entities)
 
 

@@ -10,6 +10,7 @@ from math import cos, hypot, sin
 from typing import Any, NamedTuple
 
 import msgspec
+from msgspec import UNSET
 
 from ccatp.angles import wrap_pi
 from ccatp.mirror.batches import deck_poses
@@ -33,7 +34,7 @@ WORLD, ROBOT, TRUE_ROBOT = "world", "robot", "true robot"
 EVERY_FRAMES = 10
 # All points are told again this often, for whoever jumps into the middle of a recording.
 POINTS_AGAIN_S = 60.0
-_KEPT_ESTIMATES = 1000
+_KEPT = 1000
 
 
 class RobotView(msgspec.Struct, frozen=True):
@@ -48,23 +49,26 @@ class RobotView(msgspec.Struct, frozen=True):
 
 
 class SensorView(msgspec.Struct, frozen=True):
-    """Scalars to plot, of every tenth frame: the newest sample of each sensor; ages as the robot echoes them."""
+    """Scalars to plot, of every tenth frame: the newest sample of each sensor; ages as the robot echoes them.
+
+    What a frame does not hold is left out: viewers plot no nulls.
+    """
 
     t_s: float
     seq: int
-    wheel_right_rad_s: float | None
-    wheel_left_rad_s: float | None
-    acceleration_m_s2: float | None
-    yaw_rate_rad_s: float | None
-    edge_front_left: int | None
-    edge_front_right: int | None
-    edge_rear_left: int | None
-    edge_rear_right: int | None
+    wheel_right_rad_s: float | msgspec.UnsetType
+    wheel_left_rad_s: float | msgspec.UnsetType
+    acceleration_m_s2: float | msgspec.UnsetType
+    yaw_rate_rad_s: float | msgspec.UnsetType
+    edge_front_left: int | msgspec.UnsetType
+    edge_front_right: int | msgspec.UnsetType
+    edge_rear_left: int | msgspec.UnsetType
+    edge_rear_right: int | msgspec.UnsetType
     fan_left: float
     fan_right: float
     battery: float
-    drive_age_s: float
-    permit_age_s: float
+    drive_age_s: float | msgspec.UnsetType
+    permit_age_s: float | msgspec.UnsetType
     held: bool
 
 
@@ -163,7 +167,9 @@ class Views:
         """Nothing seen yet."""
         self._mirror, self._puck_height_m = mirror, puck_height_m
         self._deviations_m: dict[PointId, float] = {}
+        # Of one frame either may come first; what has no partner is not kept for ever.
         self._estimates: dict[int, DeckPose] = {}
+        self._truths: dict[int, DeckPose] = {}
         self._points_told_s = 0.0
         self._has_begun = False
 
@@ -208,7 +214,7 @@ class Views:
         for row, place in zip(rows, deck_poses(self._mirror, poses).tolist(), strict=True):
             seq, t_s, sigma_m = row[0], row[1], row[7]
             pose = DeckPose(*place[:3])
-            self._keep(seq, pose)
+            yield from self._compared(seq, t_s, self._estimates, pose)
             now, shown = time_of(t_s), self._pose_of(pose, place[3])
             yield _shown("view/pose", t_s, PoseInFrame(now, DECK, shown))
             frame = FrameTransform(now, DECK, ROBOT, shown.position, shown.orientation)
@@ -221,9 +227,15 @@ class Views:
                 continue
             pose = DeckPose(x, y, heading)
             yield _shown("view/true_pose", t_s, PoseInFrame(time_of(t_s), DECK, self._pose_of(pose, z)))
-            estimate = self._estimates.pop(seq, None)
-            if estimate is not None:
-                yield _shown("view/error", t_s, _error(seq, t_s, estimate, pose))
+            yield from self._compared(seq, t_s, self._truths, pose)
+
+    def _compared(self, seq: int, t_s: float, own: dict[int, DeckPose], pose: DeckPose) -> Iterator[Shown]:
+        """The error of a frame, once estimate and truth are both there."""
+        own[seq] = pose
+        if seq in self._estimates and seq in self._truths:
+            yield _shown("view/error", t_s, _error(seq, t_s, self._estimates.pop(seq), self._truths.pop(seq)))
+        elif len(own) > _KEPT:
+            del own[next(iter(own))]
 
     def _of_fix(self, fix: FixMessage) -> Iterator[Shown]:
         if fix.point is None or not fix.is_fused:
@@ -240,12 +252,6 @@ class Views:
     def _pose_of(self, pose: DeckPose, z_m: float) -> Pose:
         return Pose(Vector3(pose.x_m, pose.y_m, z_m), robot_rotation(self._mirror, pose))
 
-    def _keep(self, seq: int, pose: DeckPose) -> None:
-        """For the truth, which comes a little earlier or later; where there is none, not for ever."""
-        self._estimates[seq] = pose
-        if len(self._estimates) > _KEPT_ESTIMATES:
-            del self._estimates[next(iter(self._estimates))]
-
 
 def _of_lines(lines: Sequence[msgspec.Raw]) -> Iterator[Shown]:
     for raw in lines[::EVERY_FRAMES]:
@@ -253,12 +259,26 @@ def _of_lines(lines: Sequence[msgspec.Raw]) -> Iterator[Shown]:
             line = _line_decoder.decode(raw)
         except msgspec.MsgspecError:
             continue
-        _, right, left = line.enc[-1] if line.enc else (0.0, None, None)
-        _, acceleration, rate = line.imu[-1] if line.imu else (0.0, None, None)
-        edges = line.edge[-1][1:] if line.edge else (None,) * 4
-        ages = (-1.0 if age is None else age for age in (line.cmd.age, line.cmd.permit_age))
+        _, right, left = line.enc[-1] if line.enc else (0.0, UNSET, UNSET)
+        _, acceleration, rate = line.imu[-1] if line.imu else (0.0, UNSET, UNSET)
+        edges: Sequence[int | msgspec.UnsetType] = line.edge[-1][1:] if line.edge else (UNSET,) * 4
         view = SensorView(
-            line.t, line.seq, right, left, acceleration, rate, *edges, *line.fans, line.soc, *ages, line.cmd.held
+            t_s=line.t,
+            seq=line.seq,
+            wheel_right_rad_s=right,
+            wheel_left_rad_s=left,
+            acceleration_m_s2=acceleration,
+            yaw_rate_rad_s=rate,
+            edge_front_left=edges[0],
+            edge_front_right=edges[1],
+            edge_rear_left=edges[2],
+            edge_rear_right=edges[3],
+            fan_left=line.fans[0],
+            fan_right=line.fans[1],
+            battery=line.soc,
+            drive_age_s=UNSET if line.cmd.age is None else line.cmd.age,
+            permit_age_s=UNSET if line.cmd.permit_age is None else line.cmd.permit_age,
+            held=line.cmd.held,
         )
         yield _shown("view/sensors", line.t, view)
 
