@@ -144,6 +144,16 @@ def overrides(settings: Mapping[str, object], named: Mapping[str, object]) -> di
     return {**{key: value for key, value in named.items() if value is not None}, **settings}
 
 
+def configured_folder(config_file: Path | None, runtime_dir: Path | None) -> Path | None:
+    """The runtime directory that command line or configuration names."""
+    if runtime_dir is None and config_file is not None:
+        from ccatp.config.loader import load_config
+
+        configured = load_config(config_file).run.runtime_dir
+        return Path(configured) if configured else None
+    return runtime_dir
+
+
 def ask_daemon(runtime_dir: Path | None, channel: str, payload: dict[str, object], timeout_s: float) -> dict[str, Any]:
     """One request to a running daemon.
 

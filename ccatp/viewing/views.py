@@ -28,7 +28,7 @@ from ccatp.viewing.foxglove import (
 from ccatp.viewing.foxglove import Log as FoxgloveLog
 from ccatp.viewing.panel_scene import DECK, panel_scene, point_scene, quaternion, robot_rotation
 from ccatp.viewing.plain_schema import plain_schema
-from ccatp.wire.topics import TOPICS, FixMessage, Log, Message, SensorLines, Track, Truth, schema_of
+from ccatp.wire.topics import TOPICS, Estimate, FixMessage, Log, Message, SensorLines, Track, Truth, schema_of
 
 WORLD, ROBOT, TRUE_ROBOT = "world", "robot", "true robot"
 EVERY_FRAMES = 10
@@ -186,7 +186,9 @@ class Views:
         """The views of one message."""
         if not self._has_begun:
             yield from self.begin(max(message.t_s, 0.0))
-        if isinstance(message, Track):
+        if isinstance(message, Estimate):
+            yield from self._of_estimate(message)
+        elif isinstance(message, Track):
             yield from self._of_track(message)
         elif isinstance(message, SensorLines):
             yield from _of_lines(message.lines)
@@ -206,27 +208,33 @@ class Views:
         if panels:
             yield _shown("view/points", t_s, point_scene(self._mirror, panels, self._deviations_m, time_of(t_s)))
 
+    def _of_estimate(self, estimate: Estimate) -> Iterator[Shown]:
+        pose = DeckPose(estimate.x_m, estimate.y_m, estimate.heading_rad)
+        yield from self._of_pose(estimate.seq, estimate.t_s, pose, estimate.sigma_m)
+
     def _of_track(self, track: Track) -> Iterator[Shown]:
         rows = [row for row in track.rows if row[0] % EVERY_FRAMES == 0]
         if not rows:
             return
         poses = [PanelPose(PanelId(row, col), x, y, heading) for _, _, row, col, x, y, heading, _ in rows]
         for row, place in zip(rows, deck_poses(self._mirror, poses).tolist(), strict=True):
-            seq, t_s, sigma_m = row[0], row[1], row[7]
-            pose = DeckPose(*place[:3])
+            yield from self._of_pose(row[0], row[1], DeckPose(*place[:3]), row[7])
+
+    def _of_pose(self, seq: int, t_s: float, pose: DeckPose, sigma_m: float) -> Iterator[Shown]:
+        if seq % EVERY_FRAMES == 0:
             yield from self._compared(seq, t_s, self._estimates, pose)
-            now, shown = time_of(t_s), self._pose_of(pose, place[3])
-            yield _shown("view/pose", t_s, PoseInFrame(now, DECK, shown))
-            frame = FrameTransform(now, DECK, ROBOT, shown.position, shown.orientation)
-            yield _shown("view/robot_frame", t_s, frame)
-            yield _shown("view/robot", t_s, RobotView(t_s, seq, pose.x_m, pose.y_m, pose.heading_rad, sigma_m))
+        now, shown = time_of(t_s), self._pose_of(pose)
+        yield _shown("view/pose", t_s, PoseInFrame(now, DECK, shown))
+        frame = FrameTransform(now, DECK, ROBOT, shown.position, shown.orientation)
+        yield _shown("view/robot_frame", t_s, frame)
+        yield _shown("view/robot", t_s, RobotView(t_s, seq, pose.x_m, pose.y_m, pose.heading_rad, sigma_m))
 
     def _of_truth(self, truth: Truth) -> Iterator[Shown]:
-        for seq, t_s, x, y, heading, _x, _y, z, *_ in truth.rows:
+        for seq, t_s, x, y, heading, *_ in truth.rows:
             if seq % EVERY_FRAMES:
                 continue
             pose = DeckPose(x, y, heading)
-            yield _shown("view/true_pose", t_s, PoseInFrame(time_of(t_s), DECK, self._pose_of(pose, z)))
+            yield _shown("view/true_pose", t_s, PoseInFrame(time_of(t_s), DECK, self._pose_of(pose)))
             yield from self._compared(seq, t_s, self._truths, pose)
 
     def _compared(self, seq: int, t_s: float, own: dict[int, DeckPose], pose: DeckPose) -> Iterator[Shown]:
@@ -249,8 +257,8 @@ class Views:
         scene = point_scene(self._mirror, (point.panel,), self._deviations_m, time_of(fix.t_s))
         yield _shown("view/points", fix.t_s, scene)
 
-    def _pose_of(self, pose: DeckPose, z_m: float) -> Pose:
-        return Pose(Vector3(pose.x_m, pose.y_m, z_m), robot_rotation(self._mirror, pose))
+    def _pose_of(self, pose: DeckPose) -> Pose:
+        return Pose(Vector3(*self._mirror.surface_point(pose.x_m, pose.y_m)), robot_rotation(self._mirror, pose))
 
 
 def _of_lines(lines: Sequence[msgspec.Raw]) -> Iterator[Shown]:
