@@ -19,7 +19,7 @@ from ccatp.config.loader import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.errors import ConfigError, ExitStatus, RefusedError
 from ccatp.processes.children import Children, ProcessSpec
-from ccatp.processes.common import FAULTS_FILE, Endpoints, open_log
+from ccatp.processes.common import FAULTS_FILE, RUN_DIR_FILE, Endpoints, open_log
 from ccatp.processes.observing import check_observatory
 from ccatp.processes.run_collector import RunCollector
 from ccatp.processes.run_view import RunView
@@ -74,6 +74,7 @@ def run_survey(options: RunOptions) -> int:
         run_dir = _make_run_dir(options, cfg)
         stack.enter_context(_lock(run_dir / ".lock", "--run-dir"))
         (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
+        (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
         run = _Run(options, cfg, run_dir, Endpoints(runtime_dir), sockets, started)
