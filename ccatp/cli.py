@@ -30,6 +30,7 @@ from ccatp.cli_frame import (
 from ccatp.cli_keys import keys
 from ccatp.cli_plan import plan
 from ccatp.cli_replay import replay
+from ccatp.cli_report import report
 from ccatp.cli_study import study
 from ccatp.package import COMPILED, build
 
@@ -306,6 +307,7 @@ cli.add_command(keys)
 cli.add_command(plan)
 cli.add_command(study)
 cli.add_command(replay)
+cli.add_command(report)
 cli.add_command(conformance)
 
 
