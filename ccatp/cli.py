@@ -30,7 +30,7 @@ from ccatp.cli_frame import (
 from ccatp.cli_keys import keys
 from ccatp.cli_plan import plan
 from ccatp.cli_replay import replay
-from ccatp.cli_report import report
+from ccatp.cli_report import compare, report
 from ccatp.cli_study import study
 from ccatp.package import COMPILED, build
 
@@ -308,6 +308,7 @@ cli.add_command(plan)
 cli.add_command(study)
 cli.add_command(replay)
 cli.add_command(report)
+cli.add_command(compare)
 cli.add_command(conformance)
 
 

@@ -6,10 +6,11 @@ from ccatp.drawing.shapes import Picture
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.picture_file import PictureError, write_figures, write_svg
 from ccatp.report_reader import read_record
+from ccatp.reporting.compare_page import Pair, compare_figures, compare_page, pair_of
 from ccatp.reporting.findings import Findings, findings_of
 from ccatp.reporting.run_page import run_figures, run_page
 
-REPORT = "report.html"
+REPORT, COMPARISON = "report.html", "compare.html"
 
 
 class ReportError(CcatpError):
@@ -41,6 +42,24 @@ def report_run(run_dir: Path, out: Path | None = None, figures: Path | None = No
     if figures is not None:
         write_pictures(run_figures(found), figures)
     return path, found
+
+
+def compare_runs(run_a: Path, run_b: Path, out: Path, figures: Path | None = None) -> Pair:
+    """Write two runs beside each other.
+
+    Args:
+        run_a, run_b: their directories.
+        out: the page.
+        figures: a directory for the figures; none are written if not given.
+
+    Raises:
+        CcatpError: as ``report_run``.
+    """
+    pair = pair_of(findings_of(read_record(run_a)), findings_of(read_record(run_b)))
+    write_page(compare_page(pair), out)
+    if figures is not None:
+        write_pictures(compare_figures(pair), figures)
+    return pair
 
 
 def write_page(markup: str, path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from math import ceil
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +14,18 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.reporting.map_frame import MapFrame
 
 _CELLS_WIDE, _CELLS_NARROW = 8, 5
+_LABEL = "deviation along the normal, \u00b5m (> 0 towards the robot)"
 _MICRO = 1e6
+# A single far point must not make all others look alike.
+_USUAL_PERCENT = 99.0
+
+
+class PanelCells(NamedTuple):
+    """Values in a grid of cells over a panel: edges along deck x and y, shape (c + 1,), values (m), shape (c, c)."""
+
+    x_m: FloatArray
+    y_m: FloatArray
+    values_m: FloatArray
 
 
 def surface_figure(mirror: Mirror, panels: Sequence[PanelResult], title: str, width: float) -> Picture:
@@ -26,45 +38,50 @@ def surface_figure(mirror: Mirror, panels: Sequence[PanelResult], title: str, wi
         width: of the picture, pixels.
     """
     frame = MapFrame(mirror, width)
-    frame.draw_panels()
-    scale = _scale(panels)
-    cells, levels = _cells(mirror, panels, scale, _CELLS_WIDE if frame.is_wide else _CELLS_NARROW)
-    palette = scale.palette()
-    for level in range(LEVELS):
-        if (levels == level).any():
-            frame.shapes.append(Boxes(_whole(frame.boxes(cells[levels == level])), palette[level]))
-    frame.draw_seams()
-    frame.draw_rim()
+    scale = _scale([panel.deviations.values_m[panel.is_kept] for panel in panels])
+    count = _CELLS_WIDE if frame.is_wide else _CELLS_NARROW
+    _draw_cells(frame, [PanelCells(*on_grid_m(mirror, panel, count)) for panel in panels], scale)
     keys: list[tuple[str, Shape]] = []
     if panels:
         _draw_measured(frame, panels, scale)
-        keys.append(("measured point", Dots(np.zeros((1, 2)), 3.4, palette[LEVELS // 2], edge=QUIET)))
+        keys.append(("measured point", Dots(np.zeros((1, 2)), 3.4, scale.colour(0.0), edge=QUIET)))
     outliers = [panel.deviations.deck_m[~panel.is_kept] for panel in panels if not panel.is_kept.all()]
     if outliers:
         frame.shapes.append(Dots(frame.pixels(np.concatenate(outliers)), 4.0, BAD, "cross"))
         keys.append(("outlier, left out", Dots(np.zeros((1, 2)), 4.0, BAD, "cross")))
-    return frame.finish(scale, "deviation along the normal, \u00b5m (> 0 towards the robot)", keys, title)
+    return frame.finish(scale, _LABEL, keys, title)
 
 
-def _scale(panels: Sequence[PanelResult]) -> ColourScale:
-    values = [np.abs(panel.deviations.values_m[panel.is_kept]) for panel in panels]
-    # A single far point must not make all others look alike.
-    usual = float(np.percentile(np.concatenate(values), 99)) * _MICRO if values else 1.0
+def cells_figure(mirror: Mirror, cells: Sequence[PanelCells], label: str, title: str, width: float) -> Picture:
+    """Draw values without measured points; ``label`` is what they are, with their unit, um."""
+    frame = MapFrame(mirror, width)
+    scale = _scale([one.values_m.ravel() for one in cells])
+    _draw_cells(frame, cells, scale)
+    return frame.finish(scale, label, [], title)
+
+
+def _scale(values_m: Sequence[FloatArray]) -> ColourScale:
+    usual = float(np.percentile(np.abs(np.concatenate(values_m)), _USUAL_PERCENT)) * _MICRO if values_m else 1.0
     top = max(1.0, float(ceil(usual)))
     return ColourScale(-top, top, BELOW_TO_ABOVE)
 
 
-def _cells(
-    mirror: Mirror, panels: Sequence[PanelResult], scale: ColourScale, count: int
-) -> tuple[FloatArray, "np.ndarray[tuple[int, ...], np.dtype[np.int64]]"]:
+def _draw_cells(frame: MapFrame, cells: Sequence[PanelCells], scale: ColourScale) -> None:
+    """Panels, their values in colour, seams and rim."""
+    frame.draw_panels()
     corners, values = [np.empty((0, 4))], [np.empty(0)]
-    for panel in panels:
-        x, y, found = on_grid_m(mirror, panel, count)
+    for x, y, found in cells:
         left, low = np.meshgrid(x[:-1], y[:-1])
         right, high = np.meshgrid(x[1:], y[1:])
         corners.append(np.column_stack([part.ravel() for part in (left, low, right, high)]))
         values.append(found.ravel() * _MICRO)
-    return np.concatenate(corners), scale.levels(np.concatenate(values))
+    boxes, levels = _whole(frame.boxes(np.concatenate(corners))), scale.levels(np.concatenate(values))
+    palette = scale.palette()
+    frame.shapes += [
+        Boxes(boxes[levels == level], palette[level]) for level in range(LEVELS) if (levels == level).any()
+    ]
+    frame.draw_seams()
+    frame.draw_rim()
 
 
 def _whole(boxes: FloatArray) -> FloatArray:
