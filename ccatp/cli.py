@@ -33,6 +33,7 @@ from ccatp.cli_log import log
 from ccatp.cli_plan import plan
 from ccatp.cli_radio import radio
 from ccatp.cli_replay import replay
+from ccatp.cli_report import compare, report
 from ccatp.cli_stream import stream
 from ccatp.cli_study import study
 from ccatp.package import COMPILED, build
@@ -313,6 +314,8 @@ cli.add_command(plan)
 cli.add_command(radio)
 cli.add_command(study)
 cli.add_command(replay)
+cli.add_command(report)
+cli.add_command(compare)
 cli.add_command(conformance)
 
 

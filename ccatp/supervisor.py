@@ -235,7 +235,21 @@ class _Run:
         (self._run_dir / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
         self._log.info("end", status=int(status))
         view.show_summary(summary, as_json=self._options.json_output)
+        view.show_report(self._report(status))
         return int(status)
+
+    def _report(self, status: ExitStatus) -> Path | None:
+        """The run's report, where there is time to write one; it never fails the run."""
+        if status is ExitStatus.INTERRUPTED:
+            return None  # somebody is waiting for the end
+        from ccatp.report_writer import report_run  # noqa: PLC0415 - nothing of it is needed while the robot moves
+
+        try:
+            return report_run(self._run_dir)[0]
+        except Exception as error:
+            # Whatever it is, the survey is done and its record is on the disk.
+            self._log.error("report", error=str(error))
+            return None
 
     def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
         self._is_interrupted = True
