@@ -7,6 +7,7 @@ import structlog
 
 from ccatp.bus import Publisher
 from ccatp.localizer import Localizer
+from ccatp.processes.painting import Painter
 from ccatp.samples import Fix, PointId
 from ccatp.wire.topics import (
     Arrival,
@@ -40,6 +41,7 @@ class Teller:
     def __init__(self, publisher: Publisher, log: structlog.typing.FilteringBoundLogger) -> None:
         """Start with empty batches."""
         self._publisher, self.log = publisher, log
+        self._painter = Painter(publisher)
         self._track: list[tuple[int, float, int, int, float, float, float, float]] = []
         self._lines: list[msgspec.Raw] = []
         self._tick_us: list[float] = []
@@ -70,6 +72,7 @@ class Teller:
             is_first: of a session; it is always due, because the danger loop may wait for it.
         """
         self.seq, self.t_s = seq, t_s
+        self._painter.sees(localizer, raw)
         pose, sigma = localizer.pose, localizer.position_sigma_m
         if is_first or is_estimate_due(seq):
             deck = localizer.deck_pose
@@ -158,8 +161,9 @@ class Teller:
         self._publisher.send("fix", message)
 
     def status(self, message: MissionStatus) -> None:
-        """Publish the mission's status."""
+        """Publish the mission's status, and a picture of all that is newest for whoever looks on."""
         self._publisher.send("mission", message)
+        self._painter.tell_if_wanted(self.seq, self.t_s)
 
     def say(self, level: str, text: str) -> None:
         """One line for the log file and for the operator's terminal."""
