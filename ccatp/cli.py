@@ -12,6 +12,7 @@ import ccatp
 from ccatp.cli_align import align
 from ccatp.cli_bench import bench
 from ccatp.cli_conformance import conformance
+from ccatp.cli_dashboard import dashboard
 from ccatp.cli_frame import (
     ADDRESS_OPTIONS,
     CONFIG_OPTION,
@@ -307,6 +308,7 @@ def sim_etalon(
 
 cli.add_command(align)
 cli.add_command(bench)
+cli.add_command(dashboard)
 cli.add_command(keys)
 cli.add_command(log)
 cli.add_command(stream)

@@ -51,6 +51,7 @@ class ProcessArgs:
         has_faults: a fault plan stands in the run directory; stand-ins only.
         is_restarted: another process of this run has died, and this one takes its place.
         is_held: begin held, until an operator resumes.
+        is_sim: robot and laser system are stand-ins.
     """
 
     config: Config
@@ -62,6 +63,7 @@ class ProcessArgs:
     has_faults: bool = False
     is_restarted: bool = False
     is_held: bool = False
+    is_sim: bool = False
 
     @property
     def is_taking_over(self) -> bool:
@@ -81,6 +83,7 @@ def parse_args(argv: list[str] | None = None) -> ProcessArgs:
     parser.add_argument("--faults", action="store_true")
     parser.add_argument("--restarted", action="store_true")
     parser.add_argument("--held", action="store_true")
+    parser.add_argument("--sim", action="store_true")
     args = parser.parse_args(argv)
     return ProcessArgs(
         load_config(args.run_dir / "config.toml"),
@@ -92,6 +95,7 @@ def parse_args(argv: list[str] | None = None) -> ProcessArgs:
         has_faults=args.faults,
         is_restarted=args.restarted,
         is_held=args.held,
+        is_sim=args.sim,
     )
 
 

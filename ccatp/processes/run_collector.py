@@ -110,7 +110,7 @@ class RunCollector:
         )
         self._on_presence = on_presence
         self._mirror: Mirror = build_mirror(cfg.mirror)
-        names = ("main", "danger", "truth") if is_sim else ("main", "danger")
+        names = ("main", "danger", "dashboard", "truth") if is_sim else ("main", "danger", "dashboard")
         self._subscriber = Subscriber(context, [endpoints.of(name) for name in names], RECEIVED)
         self._recorder = Recorder(
             run_dir / "telemetry.mcap",
