@@ -6,6 +6,8 @@ from ccatp.config.cricket_checks import check_cricket
 from ccatp.config.messages import Fault, choice_hint
 from ccatp.config.radio_models import FuzzyConfig, RadioConfig
 
+FUZZY_INPUTS = ("distance_m", "heading_error_rad")
+
 
 def check_radio_config(cfg: RadioConfig) -> list[Fault]:
     """Everything wrong with a configuration whose values are each in range.
@@ -24,6 +26,9 @@ def check_radio_config(cfg: RadioConfig) -> list[Fault]:
 
 def _check_fuzzy(fuzzy: FuzzyConfig) -> Iterator[Fault]:
     root = ("control", "fuzzy")
+    for name in fuzzy.inputs:
+        if name not in FUZZY_INPUTS:
+            yield Fault((*root, "inputs", name), f"is no input of the speed; {choice_hint(name, FUZZY_INPUTS)}")
     for name, given in fuzzy.inputs.items():
         for term, corners in given.terms.items():
             if list(corners) != sorted(corners):

@@ -4,8 +4,16 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from ccatp.config.beacon_models import (
+    BeaconDangerConfig,
+    BeaconMissionConfig,
+    BeaconRobotConfig,
+    IncidentConfig,
+    ListenerConfig,
+    SimBeaconRobotConfig,
+)
 from ccatp.config.cricket_models import CricketConfig
-from ccatp.config.models import Model, NonNegative, Pair, Positive
+from ccatp.config.models import Model, NonNegative, ObservatoryConfig, Pair, PidConfig, Positive, ProcessesConfig
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
@@ -64,7 +72,7 @@ class OdometryConfig(Model):
     steer_sigma_rad: NonNegative
     turn_rate_sigma_rad_s: NonNegative
     heading_drift_sigma_rad_s: NonNegative
-    speed_scale_sigma: NonNegative
+    slip_sigma: NonNegative
 
 
 class PathLossConfig(Model):
@@ -96,9 +104,11 @@ class ObservationConfig(Model):
 class EstimatorConfig(Model):
     """What the filter assumes and estimates besides poses and positions."""
 
-    estimates_shadowing: bool
+    shadowing: Literal["none", "white", "map"]
+    shadowing_grid_m: Positive
     gate_probability: Annotated[float, Field(gt=0.5, lt=1.0)]
     target_speed_sigma_m_s: Positive
+    target_course_time_s: Positive
 
 
 class FuzzyInputConfig(Model):
@@ -122,14 +132,6 @@ class FuzzyConfig(Model):
     rules: Annotated[tuple[FuzzyRuleConfig, ...], Field(min_length=1)]
 
 
-class SpeedPiConfig(Model):
-    """PI control of the speed by the distance left."""
-
-    kp_1_s: NonNegative
-    ki_1_s2: NonNegative
-    integral_limit_m_s: NonNegative
-
-
 class RadioControlConfig(Model):
     """Steering and speed."""
 
@@ -137,7 +139,7 @@ class RadioControlConfig(Model):
     steering_gain: Positive
     constant_speed_m_s: Positive
     arrival_radius_m: Positive
-    pi: SpeedPiConfig
+    pi: PidConfig
     fuzzy: FuzzyConfig
 
 
@@ -148,6 +150,7 @@ class FollowConfig(Model):
     target: Name
     safe_distance_m: Positive
     band_m: Positive
+    back_speed_m_s: Positive
     lost_after_s: Positive
 
 
@@ -159,7 +162,11 @@ class AvoidanceConfig(Model):
     range_max_m: Positive
     influence_m: Positive
     stop_m: Positive
-    gain: NonNegative
+    margin_m: NonNegative
+    memory_s: Positive
+    back_speed_m_s: Positive
+    back_time_s: Positive
+    directions: Annotated[int, Field(ge=8, le=720)]
 
 
 class SimBeaconConfig(Model):
@@ -230,6 +237,8 @@ class RadioSimConfig(Model):
     target: SimTargetConfig
     obstacles: tuple[SimObstacleConfig, ...]
     range_sigma_m: NonNegative
+    robot: SimBeaconRobotConfig
+    incidents: tuple[IncidentConfig, ...]
 
 
 class RadioConfig(Model):
@@ -248,5 +257,11 @@ class RadioConfig(Model):
     control: RadioControlConfig
     follow: FollowConfig
     avoidance: AvoidanceConfig
+    listener: ListenerConfig
+    mission: BeaconMissionConfig
+    danger: BeaconDangerConfig
+    robot: BeaconRobotConfig
+    processes: ProcessesConfig
+    observatory: ObservatoryConfig
     sim: RadioSimConfig
     cricket: CricketConfig

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import cos, pi, sin
+from math import cos, sin
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from ccatp.filters.base import FloatArray
 from ccatp.filters.ekf_slam import Columns, EkfSlam, Update, columns_of
 from ccatp.radio.joining import Waiting, widened
 from ccatp.radio.motion import POSE, Odometry, Pose
-from ccatp.radio.readings import BeaconId, RangeBearingReading, RangeReading, Reading, RssiReading
+from ccatp.radio.readings import BeaconId, RangeReading, Reading, RssiReading
 from ccatp.radio.sightings import Row, bearing_row, range_row, rssi_row
 from ccatp.radio.slam_settings import SlamSettings
 
