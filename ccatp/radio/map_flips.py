@@ -13,6 +13,8 @@ from ccatp.radio.rigid_alignment import best_motion
 CLOSE = 9.0  # a mirror image that fits worse by less, in units of chi-squared, is as likely as not to be the truth
 _ROUNDS = 10
 _TRIALS = 400  # sets of motes looked at by whole fits; single motes are looked at by themselves
+_CONTRADICTED = 2.0  # cost per degree of freedom of a map that is folded somewhere
+_CLOSE_BY = 0.25  # of the median range: motes nearer than this to each other are a group
 _LOCAL_STEPS = 12
 _SKETCH_STEPS = 15  # of a fit from a mirror image, before it is known to lead anywhere
 _HOPELESS = 20.0  # times the best cost: such a fit ends in a worse fold
@@ -147,7 +149,7 @@ def _turn_sets(
     model: MapModel, fit: BatchFit, settings: BatchSettings, mirrors: Sequence[tuple[Sequence[int], Sequence[int]]]
 ) -> tuple[BatchFit, int, dict[tuple[int, ...], float]]:
     turned, near = 0, dict[tuple[int, ...], float]()
-    for trial, (separator, motes) in enumerate(_sets(model.network, mirrors)):
+    for trial, (separator, motes) in enumerate(_sets(model, fit, mirrors)):
         if trial >= _TRIALS:
             break
         for image in _images(fit.state.positions_m[list(motes)], fit.state.positions_m[list(separator)]):
@@ -179,20 +181,39 @@ def _tried(model: MapModel, start: MapState, settings: BatchSettings, best: floa
 
 
 def _sets(
-    network: RangeNetwork, mirrors: Sequence[tuple[Sequence[int], Sequence[int]]]
+    model: MapModel, fit: BatchFit, mirrors: Sequence[tuple[Sequence[int], Sequence[int]]]
 ) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
-    """Separators and what they part: those known, then each body and every part of the graph without it."""
+    """Separators and what they part: those known, then each group and every part of the graph without it."""
+    network = model.network
     yield from ((separator, motes) for separator, motes in mirrors if len(separator) >= network.dimension)
     pairs = graph_pairs(network)
-    for body in network.bodies:
-        kept = ~np.isin(pairs, body.motes).any(axis=1)
+    for group in _groups(model, fit):
+        kept = ~np.isin(pairs, group).any(axis=1)
         labels = components(network.count, pairs[kept])
-        labels[list(body.motes)] = -1
+        labels[list(group)] = -1
         for label in np.unique(labels[labels >= 0]):
             side = np.flatnonzero(labels == label)
             if 2 * len(side) <= network.count:
-                yield body.motes, tuple(side.tolist())
-        yield body.motes, body.motes
+                yield group, tuple(side.tolist())
+                yield group, (*side.tolist(), *group)
+        yield group, group
+
+
+def _groups(model: MapModel, fit: BatchFit) -> list[tuple[int, ...]]:
+    """Bodies; where the map contradicts its ranges, motes that stand close together, too.
+
+    Seen from afar a few motes close together are one point: what is fixed to them turns about them almost freely.
+    """
+    network = model.network
+    groups = [body.motes for body in network.bodies]
+    if fit.cost < _CONTRADICTED * max(len(network.ranges_m) - model.size, 1):
+        return groups
+    places = fit.state.positions_m
+    ways = places[:, None] - places[None]
+    near = np.sqrt((ways**2).sum(axis=2)) < _CLOSE_BY * float(np.median(network.ranges_m))
+    labels = components(network.count, np.column_stack(np.nonzero(near)))
+    close = [tuple(np.flatnonzero(labels == label).tolist()) for label in np.unique(labels)]
+    return groups + [group for group in close if 1 < len(group) < network.count // 2 and group not in groups]
 
 
 def _images(points: FloatArray, through: FloatArray) -> Iterator[FloatArray]:

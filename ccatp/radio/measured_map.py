@@ -29,6 +29,7 @@ from ccatp.radio.self_mapping import MapperSettings, MoteMapper, run_phase_two
 from ccatp.radio.tdoa import MoteRange
 
 _TELLING = 12.0  # a drop of chi-squared that chance gives one offset in two thousand
+_CONTRADICTED = 3.0  # chi-squared for each degree of freedom
 _WIDER = 1e4  # of variances: what a range that is used twice adds by its first use is then a ten-thousandth
 
 Places = Mapping[str, tuple[float, ...]]
@@ -172,6 +173,11 @@ def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Any) -> _Found:
         f"(chi-squared {fold.cost_gap:.1f} more)"
         for fold in found.folds[:5]
     ]
+    if factor == 1.0 and found.variance_factor > _CONTRADICTED:
+        warnings.append(
+            f"the map contradicts its ranges: chi-squared {found.variance_factor:.1f} for each degree of freedom; "
+            "it is folded, or the sigmas are too small"
+        )
     if factor > 1.5:
         warnings.append(f"ranges scatter by {1e3 * found.sigma_m:.3g} mm, {factor:.1f} times what they were taken for")
     if found.outliers:

@@ -1,23 +1,19 @@
 """Pure. The batch map from ranges alone: starts, the robust fit, a look for folds, covariance."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccatp.radio.map_batch import BatchFit, BatchSettings, fit_from_afar, position_covariance
+from ccatp.radio.map_batch import BatchFit, BatchSettings, fit_from_afar, fit_map, position_covariance
 from ccatp.radio.map_flips import Fold, unfold
-from ccatp.radio.map_model import MapModel
-from ccatp.radio.map_patches import stitched
+from ccatp.radio.map_model import MapModel, MapState
 from ccatp.radio.map_repair import repaired
-from ccatp.radio.pair_means import PairMeans
-from ccatp.radio.range_network import FloatArray, IntArray, RangeNetwork
-from ccatp.radio.rigid_alignment import best_motion
-from ccatp.radio.unfolding import unfolded
+from ccatp.radio.map_starts import FEW, map_starts
+from ccatp.radio.range_network import FloatArray, RangeNetwork
 
-_SMALL = 130  # motes up to which the whole map is unfolded at once; beyond, it is stitched from patches
 _NORMAL_MAD = 1.4826  # standard deviation over the median absolute deviation of a normal distribution
 _SURE = 2.0  # a map whose cost per degree of freedom is less needs no other start
+_SAME = 1e-6  # relative difference of costs that are the same minimum's
 _CORRECTIONS = 3  # times that the unfolding is repeated with ranges corrected by the offset found
 
 
@@ -87,41 +83,53 @@ def map_motes(
         mirrors: sets of motes that the graph lets fold, from ``find_fold_over``.
         finds_sigma: the sigmas are right up to a factor, which the residuals of a first map without robust loss tell.
     """
-    if not finds_sigma:
-        return _mapped(network, settings, with_offset, with_scale, start_m, mirrors)
-    first = _mapped(network, settings._replace(robust_scale=float("inf")), with_offset, with_scale, start_m, mirrors)
-    share = np.sqrt(len(network.ranges_m) / max(first.dof, 1))
-    factor = share * _NORMAL_MAD * float(np.median(np.abs(first.residuals_m) / network.sigmas_m))
-    scaled = replace(network, sigmas_m=network.sigmas_m * max(factor, 1e-9))
-    return _mapped(scaled, settings, with_offset, with_scale, first.positions_m, mirrors)
-
-
-def _mapped(
-    network: RangeNetwork,
-    settings: BatchSettings,
-    with_offset: bool,
-    with_scale: bool,
-    start_m: FloatArray | None,
-    mirrors: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...],
-) -> MoteMap:
     model = MapModel(network, with_offset=with_offset, with_scale=with_scale)
-    fits: list[BatchFit] = []
-    for start in _starts(network, start_m):
-        fits.append(fit_from_afar(model, model.state(start), settings))
-        if _is_sure(model, fits[-1]):
-            break
-    for _ in range(_CORRECTIONS if with_offset or with_scale else 0):
+    if finds_sigma:
+        plain = settings._replace(robust_scale=float("inf"))
+        first = min(_all_fits(model, start_m, plain), key=lambda fit: fit.cost)
+        share = np.sqrt(len(network.ranges_m) / max(len(network.ranges_m) - model.size, 1))
+        factor = share * _NORMAL_MAD * float(np.median(np.abs(first.residuals_m) / network.sigmas_m))
+        network = replace(network, sigmas_m=network.sigmas_m * max(factor, 1e-9))
+        model = MapModel(network, with_offset=with_offset, with_scale=with_scale)
+        fits = [fit_from_afar(model, first.state, settings)]
+        if not _is_sure(model, fits[0]):
+            fits += _all_fits(model, first.state.positions_m, settings)
+    else:
+        fits = _all_fits(model, start_m, settings)
+    return _unfolded_map(model, fits, settings, mirrors)
+
+
+def _all_fits(model: MapModel, start_m: FloatArray | None, settings: BatchSettings) -> list[BatchFit]:
+    """Fits from all starts that it takes, with an offset or a scale known better and better."""
+    network = model.network
+    fits = _fits(model, network, start_m, settings)
+    for _ in range(_CORRECTIONS if model.with_offset or model.with_scale else 0):
         best = min(fits, key=lambda fit: fit.cost)
         if _is_sure(model, best):
             break
         # An offset bends the map that the unfolding begins with: once more, with what is known of it by now.
         ranges_m = np.maximum((network.ranges_m - best.state.offset_m) / (1.0 + best.state.scale), 0.0)
-        for start in _starts(replace(network, ranges_m=ranges_m), None):
-            state = model.state(start, best.state.offset_m, best.state.scale)
-            fits.append(fit_from_afar(model, state, settings))
+        fits += _fits(model, replace(network, ranges_m=ranges_m), None, settings, best.state)
+    return fits
+
+
+def _unfolded_map(
+    model: MapModel,
+    fits: list[BatchFit],
+    settings: BatchSettings,
+    mirrors: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...],
+) -> MoteMap:
+    """The best of some fits, looked through for folds, with its covariance."""
+    network = model.network
     best = min(fits, key=lambda fit: fit.cost)
     steps = sum(fit.iterations for fit in fits)
-    found = unfold(model, repaired(model, best, settings), settings, mirrors)
+    best = repaired(model, best, settings)
+    if not _is_sure(model, best) and np.isfinite(settings.robust_scale):
+        # To a robust loss a folded map is a good one with a few outliers: look for folds by least squares first.
+        plain = settings._replace(robust_scale=float("inf"))
+        open_map = unfold(model, fit_map(model, best.state, plain), plain, mirrors).fit
+        best = min(best, fit_map(model, open_map.state, settings), key=lambda fit: fit.cost)
+    found = unfold(model, best, settings, mirrors)
     fit = found.fit
     covariance, free = position_covariance(model, fit)
     dof = len(network.ranges_m) - (model.size - free)
@@ -142,52 +150,34 @@ def _mapped(
     )
 
 
+def _fits(
+    model: MapModel,
+    network: RangeNetwork,
+    start_m: FloatArray | None,
+    settings: BatchSettings,
+    at: MapState | None = None,
+) -> list[BatchFit]:
+    """Fits from one start after the other, until one is sure, or where there are many motes, came out twice.
+
+    Args:
+        model: what is fitted.
+        network: what the starts are made of: the model's own, or with corrected ranges.
+        start_m: a start of the caller's.
+        settings: of the fits.
+        at: offset and scale to begin with.
+    """
+    fits: list[BatchFit] = []
+    offset_m, scale = (0.0, 0.0) if at is None else (at.offset_m, at.scale)
+    for images in map_starts(network, start_m):
+        ends = [fit_from_afar(model, model.state(image, offset_m, scale), settings) for image in images]
+        before = min((fit.cost for fit in fits), default=float("inf"))
+        found = min(ends, key=lambda fit: fit.cost)
+        fits += ends
+        is_repeated = network.count > FEW and abs(found.cost - before) <= _SAME * before < float("inf")
+        if _is_sure(model, found) or is_repeated:
+            break
+    return fits
+
+
 def _is_sure(model: MapModel, fit: BatchFit) -> bool:
     return fit.cost < _SURE * max(len(model.network.ranges_m) - model.size, 1)
-
-
-def _starts(network: RangeNetwork, given_m: FloatArray | None) -> Iterator[FloatArray]:
-    """Places to begin, the most promising first."""
-    means = PairMeans(network)
-    if network.count > _SMALL and not network.bodies:
-        yield _filled(stitched(network.count, means, network.dimension), means)
-    pairs, distances_m, sigmas_m = _with_bodies(network, means)
-    whole = unfolded(network.count, pairs, distances_m, sigmas_m, network.dimension)
-    flip = np.ones(network.dimension)
-    flip[0] = -1.0
-    known = np.isfinite(network.known_m).all(axis=1)
-    if known.sum() > network.dimension:
-        yield best_motion(whole[known], network.known_m[known], mirrors=True).apply(whole)
-    else:
-        yield whole
-        yield whole * flip
-    if given_m is not None:
-        yield _filled(given_m, means)
-
-
-def _filled(places_m: FloatArray, means: PairMeans) -> FloatArray:
-    """Places with those that are missing put where their partners are on the average."""
-    places = places_m.copy()
-    for _ in range(len(places)):
-        missing = np.flatnonzero(np.isnan(places[:, 0]))
-        if missing.size == 0:
-            break
-        for mote in missing.tolist():
-            partners = places[means.partners(mote)]
-            known = partners[np.isfinite(partners[:, 0])] if len(partners) else partners
-            if len(known):
-                # Beside the mean: two motes in one place would have no direction between them.
-                places[mote] = known.mean(axis=0) + 1e-3 * (1.0 + mote % 7)
-    return np.nan_to_num(places)
-
-
-def _with_bodies(network: RangeNetwork, means: PairMeans) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Pairs, distances and sigmas, the pairs of bodies among them as ranges of the best sigma there is."""
-    pairs, distances, sigmas = [means.pairs], [means.ranges_m], [means.sigmas_m]
-    for body in network.bodies:
-        motes = np.array(body.motes, dtype=np.intp)
-        a, b = np.triu_indices(len(motes), 1)
-        pairs.append(np.column_stack([motes[a], motes[b]]))
-        distances.append(np.linalg.norm(body.local_m[a] - body.local_m[b], axis=1))
-        sigmas.append(np.full(len(a), float(means.sigmas_m.min())))
-    return np.concatenate(pairs), np.concatenate(distances), np.concatenate(sigmas)

@@ -24,13 +24,14 @@ def unfolded(
     dimension: int,
     *,
     squeezes: Sequence[float] = _SQUEEZES,
+    rng: np.random.Generator | None = None,
 ) -> FloatArray:
     """Places of n points from some of their distances, shape (n, d); as ranges do, it leaves frame and mirror open.
 
     The missing distances are taken as the shortest way along known ones (Shang et al., MDS-MAP, 2003), classical
     scaling (Torgerson 1952) gives places in d + 2 dimensions, and weighted least squares on the known distances alone
     go on from there, while a weight on the spare dimensions grows until the points lie in d. A map that is folded over
-    in d dimensions has a way down through the spare ones.
+    in d dimensions often has a way down through the spare ones.
 
     Args:
         count: n.
@@ -39,8 +40,13 @@ def unfolded(
         sigmas_m: shape (e,).
         dimension: d.
         squeezes: weights of the spare dimensions one after the other, in units of the median weight of a distance.
+        rng: draws the places to begin with, where those by classical scaling led astray.
     """
-    points = classical_scaling(completed(count, pairs, distances_m), dimension + _SPARE)
+    wide = dimension + _SPARE
+    if rng is None:
+        points = classical_scaling(completed(count, pairs, distances_m), wide)
+    else:
+        points = rng.normal(0.0, float(np.median(distances_m)), (count, wide))
     weights = 1.0 / sigmas_m**2
     # Weights that differ by orders of magnitude would freeze the strong ones before the weak ones have turned.
     weights = np.minimum(weights / np.median(weights), 25.0)

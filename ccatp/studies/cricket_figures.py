@@ -12,9 +12,9 @@ from ccatp.studies.figures import INK, LIMIT, QUIET, colour, dress, new_figure, 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_POOR = ("zigzag, as printed", "zigzag, P0 = 99", "zigzag, pooled")
-_FULL = ("adjacent, as printed", "all, as printed", "all, P0 = 99", "all, pooled")
-_MAPS = (("zigzag, as printed", "figures 9, 10: five pairs"), ("all, as printed", "figure 13: fifteen pairs"))
+_POOR = ("zigzag-printed", "zigzag-p0-99", "zigzag-pooled")
+_FULL = ("adjacent-printed", "all-printed", "all-p0-99", "all-pooled")
+_MAPS = (("zigzag-printed", "figures 9, 10: five pairs"), ("all-printed", "figure 13: fifteen pairs"))
 _CLOUD = 200  # runs shown as dots
 
 

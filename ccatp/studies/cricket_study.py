@@ -57,19 +57,19 @@ def _batch(repeats: int, *, shapes: bool = True, second: bool = False) -> dict[s
 
 
 CASES = {
-    "zigzag, as printed": Case("10 to 12", "ekf", {**_filter("zigzag"), **_PLAIN}),
-    "zigzag, P0 = 99": Case("eq. 25", "ekf", {**_filter("zigzag"), **_PLAIN, "cricket.phase2.prior": "printed"}),
-    "zigzag, pooled": Case("better", "ekf", _filter("zigzag")),
-    "adjacent, as printed": Case("13, 14", "ekf", {**_filter("adjacent"), **_PLAIN}),
-    "all, as printed": Case("13, 14", "ekf", {**_filter("all"), **_PLAIN}),
-    "all, P0 = 99": Case("eq. 25", "ekf", {**_filter("all"), **_PLAIN, "cricket.phase2.prior": "printed"}),
-    "all, pooled": Case("better", "ekf", _filter("all")),
-    "batch, 45 ranges once": Case("better", "batch", _batch(1)),
-    "batch, 45 ranges 60 times": Case("better", "batch", _batch(60)),
-    "batch, 45 ranges 60 times, no shapes": Case("better", "batch", _batch(60, shapes=False)),
-    "batch, 45 ranges 60 times, 15 pairs": Case("better", "batch", _batch(60, second=True)),
-    "batch, 10 cm late": Case("fault", "batch", {**_batch(60, second=True), **_LATE}),
-    "batch, 10 cm late, offset": Case(
+    "zigzag-printed": Case("10 to 12", "ekf", {**_filter("zigzag"), **_PLAIN}),
+    "zigzag-p0-99": Case("eq. 25", "ekf", {**_filter("zigzag"), **_PLAIN, "cricket.phase2.prior": "printed"}),
+    "zigzag-pooled": Case("better", "ekf", _filter("zigzag")),
+    "adjacent-printed": Case("13, 14", "ekf", {**_filter("adjacent"), **_PLAIN}),
+    "all-printed": Case("13, 14", "ekf", {**_filter("all"), **_PLAIN}),
+    "all-p0-99": Case("eq. 25", "ekf", {**_filter("all"), **_PLAIN, "cricket.phase2.prior": "printed"}),
+    "all-pooled": Case("better", "ekf", _filter("all")),
+    "batch-45-once": Case("better", "batch", _batch(1)),
+    "batch-45": Case("better", "batch", _batch(60)),
+    "batch-45-no-shapes": Case("better", "batch", _batch(60, shapes=False)),
+    "batch-45-and-15": Case("better", "batch", _batch(60, second=True)),
+    "batch-late": Case("fault", "batch", {**_batch(60, second=True), **_LATE}),
+    "batch-late-offset": Case(
         "better", "batch", {**_batch(60, second=True), **_LATE, "cricket.batch.estimates_offset": True}
     ),
 }
