@@ -1,0 +1,268 @@
+"""Pure. The least-squares problem of a whole run: residuals, Jacobians and normal equations of odometry and readings."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ccatp.filters.base import FloatArray
+from ccatp.radio.batch.arrow import ArrowSystem
+from ccatp.radio.batch.reckoning import CALIBRATION, Reckoning
+from ccatp.radio.batch.settings import BatchPriors, BatchSettings, RadioNoise
+from ccatp.radio.recording import Readings, Steps
+
+IntArray = npt.NDArray[np.int64]
+SHARED = (*CALIBRATION, "range_scale", "range_offset_m", "bearing_offset_rad")
+"""Unknowns that are neither pose nor beacon, in the order of the state."""
+RANGE_SCALE, RANGE_OFFSET, BEARING_OFFSET = (SHARED.index(name) for name in SHARED[len(CALIBRATION) :])
+BEACON = 3  # x_m, y_m, and the offset of its ranges, m
+LEAST_RANGE_M = 1e-3
+
+
+@dataclass(slots=True)
+class State:
+    """What is estimated.
+
+    Attributes:
+        poses: x_m, y_m, heading_rad at each instant, shape (n, 3).
+        shared: by ``SHARED``, shape (7,).
+        beacons: x_m, y_m, range offset by beacon, shape (b, 3).
+    """
+
+    poses: FloatArray
+    shared: FloatArray
+    beacons: FloatArray
+
+    def moved(self, poses: FloatArray, shared: FloatArray) -> "State":
+        """The state after a step, the shared part of it shape (7 + 3 b,)."""
+        split = len(SHARED)
+        beacons = self.beacons + shared[split:].reshape(-1, BEACON)
+        return State(self.poses + poses, self.shared + shared[:split], beacons)
+
+
+@dataclass(slots=True)
+class Residuals:
+    """What remains at a state; readings as rows of (range, bearing), zero where there is none.
+
+    Attributes:
+        odometry: shape (n - 1, 3).
+        odometry_information: shape (n - 1, 3, 3).
+        readings: predicted less read, shape (m, 2).
+        information: of each, zero where there is no reading, shape (m, 2).
+    """
+
+    odometry: FloatArray
+    odometry_information: FloatArray
+    readings: FloatArray
+    information: FloatArray
+
+    @property
+    def chi2(self) -> FloatArray:
+        """Of each reading, shape (m,)."""
+        total: FloatArray = (self.readings**2 * self.information).sum(axis=1)
+        return total
+
+
+class BatchProblem:
+    """Odometry and readings of a run up to an instant.
+
+    Args:
+        steps: of dead reckoning.
+        readings: those whose time is one of ``times_s``.
+        times_s: instants of the poses, the first one the first odometry time, shape (n,).
+        first_pose: x_m, y_m, heading_rad.
+        beacons: how many beacons there are.
+        settings: priors and noise.
+        used: which beacons take part, shape (b,); readings of others count nothing.
+    """
+
+    def __init__(
+        self,
+        steps: Steps,
+        readings: Readings,
+        times_s: FloatArray,
+        first_pose: tuple[float, float, float],
+        settings: BatchSettings,
+        used: npt.NDArray[np.bool_],
+    ) -> None:
+        self.reckoning = Reckoning(steps, times_s)
+        self.readings = readings
+        self.at: IntArray = np.searchsorted(times_s, readings.times_s)
+        self.first_pose = np.array(first_pose)
+        self.settings = settings
+        self.radio: RadioNoise = settings.radio
+        self.odometry = settings.odometry
+        self.used = used
+        self.has_range = np.isfinite(readings.range_m) & used[readings.beacon]
+        self.has_bearing = np.isfinite(readings.bearing_rad) & used[readings.beacon]
+        self.sizes: FloatArray = self.has_range.astype(np.float64) + self.has_bearing
+        self._range_m = np.where(self.has_range, readings.range_m, 0.0)
+        self._bearing_rad = np.where(self.has_bearing, readings.bearing_rad, 0.0)
+        sigmas = _prior_sigmas(settings.priors, used)
+        self.free = sigmas > 0.0
+        self.prior_information = np.where(self.free, 1.0 / np.where(self.free, sigmas, 1.0) ** 2, 0.0)
+        self.prior_information[np.isinf(sigmas)] = 0.0
+        p = settings.priors
+        self._last: tuple[State, tuple[Any, ...]] | None = None
+        self.first_information = np.array((p.pose_m**-2, p.pose_m**-2, p.heading_rad**-2))
+
+    def residuals(self, state: State) -> Residuals:
+        """At a state."""
+        return self._evaluated(state)[0]
+
+    def range_variance(self, range_m: FloatArray) -> FloatArray:
+        """Of ranges, m^2."""
+        variance: FloatArray = self.radio.range_sigma_m**2 + (self.radio.range_sigma_per_m * range_m) ** 2
+        return variance
+
+    def prior_cost(self, state: State) -> float:
+        """Half the sum of squares of the priors."""
+        shared = np.concatenate([state.shared, state.beacons.ravel()])
+        first = state.poses[0] - self.first_pose
+        return float(0.5 * (shared**2 @ self.prior_information + first**2 @ self.first_information))
+
+    def normal_equations(self, state: State, weights: FloatArray, odometry_weights: FloatArray) -> ArrowSystem:
+        """Gauss-Newton at a state, readings and steps weighted, for the free unknowns.
+
+        Args:
+            state: where the residuals are linearised.
+            weights: of each reading, shape (m,).
+            odometry_weights: of each step, shape (n - 1,).
+        """
+        residuals, by_pose, by_shared, by_beacon, increments = self._evaluated(state)
+        n, size = len(state.poses), self.free.size
+        system = ArrowSystem(
+            np.zeros((n, 3, 3)), np.zeros((n - 1, 3, 3)), np.zeros((n, 3, size)), np.zeros((size, size)),
+            np.zeros((n, 3)), np.zeros(size),
+        )  # fmt: skip
+        self._add_odometry(system, state, residuals, increments, odometry_weights)
+        self._add_readings(system, residuals, (by_pose, by_shared, by_beacon), weights)
+        shared = np.concatenate([state.shared, state.beacons.ravel()])
+        system.corner[range(size), range(size)] += self.prior_information
+        system.shared_side -= self.prior_information * shared
+        system.diagonal[0] += np.diag(self.first_information)
+        system.pose_side[0] -= self.first_information * (state.poses[0] - self.first_pose)
+        free = np.flatnonzero(self.free)
+        system.border = system.border[:, :, free]
+        system.corner = system.corner[np.ix_(free, free)]
+        system.shared_side = system.shared_side[free]
+        return system
+
+    def spread(self, shared: FloatArray) -> FloatArray:
+        """A step of the free shared unknowns as one of all, zero for the others."""
+        whole = np.zeros(self.free.size)
+        whole[self.free] = shared
+        return whole
+
+    def _evaluated(
+        self, state: State
+    ) -> tuple[Residuals, FloatArray, FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
+        if self._last is not None and self._last[0] is state:
+            return self._last[1]
+        found = self._linearised(state)
+        self._last = (state, found)
+        return found
+
+    def _linearised(
+        self, state: State
+    ) -> tuple[Residuals, FloatArray, FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
+        increments = self.reckoning.increments(state.shared[: len(CALIBRATION)], self.odometry)
+        a, b = state.poses[:-1], state.poses[1:]
+        c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+        dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
+        local = np.column_stack([c * dx + s * dy, -s * dx + c * dy, b[:, 2] - a[:, 2]])
+        odometry = local - increments.motion
+        odometry_information = np.linalg.inv(increments.covariance)
+
+        pose, beacon = state.poses[self.at], state.beacons[self.readings.beacon]
+        ux, uy = beacon[:, 0] - pose[:, 0], beacon[:, 1] - pose[:, 1]
+        r = np.maximum(np.hypot(ux, uy), LEAST_RANGE_M)
+        ux, uy = ux / r, uy / r
+        scale = 1.0 + state.shared[RANGE_SCALE]
+        range_error = scale * r + state.shared[RANGE_OFFSET] + beacon[:, 2] - self._range_m
+        angle = np.arctan2(uy, ux) - pose[:, 2] + state.shared[BEARING_OFFSET] - self._bearing_rad
+        bearing_error = (angle + np.pi) % (2.0 * np.pi) - np.pi
+        errors = np.column_stack([range_error * self.has_range, bearing_error * self.has_bearing])
+        # By the range read, not the one predicted: a variance that moves with the state would draw it outwards.
+        information = np.column_stack(
+            [
+                self.has_range / self.range_variance(self._range_m),
+                self.has_bearing / self.radio.bearing_sigma_rad**2,
+            ]
+        )
+        m = len(r)
+        by_pose, by_beacon = np.zeros((m, 2, 3)), np.zeros((m, 2, BEACON))
+        by_pose[:, 0, 0], by_pose[:, 0, 1] = -scale * ux, -scale * uy
+        by_pose[:, 1, 0], by_pose[:, 1, 1], by_pose[:, 1, 2] = uy / r, -ux / r, -1.0
+        by_beacon[:, :, :2] = -by_pose[:, :, :2]
+        by_beacon[:, 0, 2] = 1.0
+        by_shared = np.zeros((m, 2, 3))  # of the readings' own three
+        by_shared[:, 0, 0], by_shared[:, 0, 1], by_shared[:, 1, 2] = r, 1.0, 1.0
+        found = Residuals(odometry, odometry_information, errors, information)
+        return found, by_pose, by_shared, by_beacon, (local, increments.by_calibration)
+
+    def _add_odometry(
+        self,
+        system: ArrowSystem,
+        state: State,
+        residuals: Residuals,
+        increments: tuple[FloatArray, FloatArray],
+        weights: FloatArray,
+    ) -> None:
+        local, by_calibration = increments
+        n = len(local)
+        c, s = np.cos(state.poses[:-1, 2]), np.sin(state.poses[:-1, 2])
+        Ja, Jb = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
+        Jb[:, 0, 0] = Jb[:, 1, 1] = c
+        Jb[:, 0, 1], Jb[:, 1, 0], Jb[:, 2, 2] = s, -s, 1.0
+        Ja[:] = -Jb
+        Ja[:, 0, 2], Ja[:, 1, 2] = local[:, 1], -local[:, 0]
+        W = residuals.odometry_information * weights[:, None, None]
+        WJa, WJb, WJc = W @ Ja, W @ Jb, W @ -by_calibration
+        We = np.einsum("kij,kj->ki", W, residuals.odometry)
+        JaT, JbT, JcT = Ja.transpose(0, 2, 1), Jb.transpose(0, 2, 1), -by_calibration.transpose(0, 2, 1)
+        k = len(CALIBRATION)
+        system.diagonal[:-1] += JaT @ WJa
+        system.diagonal[1:] += JbT @ WJb
+        system.below += JbT @ WJa
+        system.border[:-1, :, :k] += JaT @ WJc
+        system.border[1:, :, :k] += JbT @ WJc
+        system.corner[:k, :k] += (JcT @ WJc).sum(axis=0)
+        system.pose_side[:-1] -= np.einsum("kij,kj->ki", JaT, We)
+        system.pose_side[1:] -= np.einsum("kij,kj->ki", JbT, We)
+        system.shared_side[:k] -= np.einsum("kij,kj->i", JcT, We)
+
+    def _add_readings(
+        self,
+        system: ArrowSystem,
+        residuals: Residuals,
+        jacobians: tuple[FloatArray, FloatArray, FloatArray],
+        weights: FloatArray,
+    ) -> None:
+        by_pose, by_shared, by_beacon = jacobians
+        by_rest = np.concatenate([by_shared, by_beacon], axis=2)  # (m, 2, 6)
+        W = residuals.information * weights[:, None]
+        WJp, WJr, We = by_pose * W[:, :, None], by_rest * W[:, :, None], residuals.readings * W
+        own = np.arange(len(CALIBRATION), len(SHARED))
+        places = len(SHARED) + BEACON * self.readings.beacon[:, None] + np.arange(BEACON)
+        columns = np.concatenate([np.broadcast_to(own, (len(places), own.size)), places], axis=1)
+        JpT, JrT = by_pose.transpose(0, 2, 1), by_rest.transpose(0, 2, 1)
+        three = np.arange(3)
+        np.add.at(system.diagonal, self.at, JpT @ WJp)
+        np.add.at(system.border, (self.at[:, None, None], three[None, :, None], columns[:, None, :]), JpT @ WJr)
+        np.add.at(system.corner, (columns[:, :, None], columns[:, None, :]), JrT @ WJr)
+        np.add.at(system.pose_side, self.at, -np.einsum("kij,kj->ki", JpT, We))
+        np.add.at(system.shared_side, columns, -np.einsum("kij,kj->ki", JrT, We))
+
+
+def _prior_sigmas(priors: BatchPriors, used: npt.NDArray[np.bool_]) -> FloatArray:
+    """Of the shared unknowns and the beacons, shape (7 + 3 b,): 0 fixes one, infinity tells nothing of it."""
+    p = priors
+    shared = (
+        p.distance_scale, p.turn_scale, p.turn_per_m, p.turn_bias_rad_s, p.range_scale, p.range_offset_m,
+        p.bearing_offset_rad,
+    )  # fmt: skip
+    beacons = np.zeros((len(used), BEACON))
+    beacons[used] = (np.inf, np.inf, p.beacon_offset_m)
+    return np.concatenate([shared, beacons.ravel()])
