@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.filters.base import FloatArray
-from ccatp.radio.batch.arrow import Factored, LinAlgError
+from ccatp.radio.batch.arrow import ArrowSystem, Factored, LinAlgError
 from ccatp.radio.batch.problem import BatchProblem, Residuals, State
 
 LEAST_DAMPING = 1e-9
@@ -63,36 +63,37 @@ def descend(
         enough: relative gain below which the cost counts as converged.
     """
     damping = 1e-6
-    residuals = problem.residuals(state)
-    cost = _cost(problem, state, residuals, softness, odometry_freedom)
+
+    def tried_cost(tried: State) -> float:
+        return _cost(problem, tried, problem.residuals(tried), softness, odometry_freedom)
+
+    residuals, cost = problem.residuals(state), tried_cost(state)
     for iteration in range(1, most + 1):
         weights = t_weights(residuals.chi2, problem.sizes, problem.radio.freedom, softness)
         system = problem.normal_equations(state, weights, _odometry_weights(residuals, odometry_freedom))
-        while True:
-            try:
-                poses, shared = Factored(system, damping).solution()
-                tried = state.moved(poses, problem.spread(shared))
-                tried_residuals = problem.residuals(tried)
-                tried_cost = _cost(problem, tried, tried_residuals, softness, odometry_freedom)
-            except LinAlgError:
-                tried_cost = np.inf
-            if tried_cost <= cost:
-                break
+        while (tried := _step(problem, state, system, damping)) is None or tried_cost(tried) > cost:
             damping = max(damping, LEAST_DAMPING) * 10.0
             if damping > MOST_DAMPING:
                 return Descent(state, cost, iteration, True)
-        gain = cost - tried_cost
-        state, residuals, cost = tried, tried_residuals, tried_cost
+        gain, state = cost - tried_cost(tried), tried
+        residuals, cost = problem.residuals(state), cost - gain
         damping = max(damping * 0.1, LEAST_DAMPING)
         if gain <= enough * max(abs(cost), 1.0):
             return Descent(state, cost, iteration, True)
     return Descent(state, cost, most, False)
 
 
+def _step(problem: BatchProblem, state: State, system: ArrowSystem, damping: float) -> State | None:
+    """The state a damped step further; None where the system is not positive definite."""
+    try:
+        poses, shared = Factored(system, damping).solution()
+    except LinAlgError:
+        return None
+    return state.moved(poses, problem.spread(shared))
+
+
 def _odometry_chi2(residuals: Residuals) -> FloatArray:
-    chi2: FloatArray = np.einsum(
-        "ki,kij,kj->k", residuals.odometry, residuals.odometry_information, residuals.odometry
-    )
+    chi2: FloatArray = np.einsum("ki,kij,kj->k", residuals.odometry, residuals.odometry_information, residuals.odometry)
     return chi2
 
 
@@ -108,7 +109,9 @@ def _cost(
 ) -> float:
     chi2 = _odometry_chi2(residuals)
     odometry = (
-        0.5 * float(chi2.sum()) if np.isinf(odometry_freedom) else t_cost(chi2, np.full(chi2.size, 3.0), odometry_freedom)
+        0.5 * float(chi2.sum())
+        if np.isinf(odometry_freedom)
+        else t_cost(chi2, np.full(chi2.size, 3.0), odometry_freedom)
     )
     readings = t_cost(residuals.chi2, problem.sizes, problem.radio.freedom, softness)
     return problem.prior_cost(state) + odometry + readings

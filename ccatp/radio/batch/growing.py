@@ -1,4 +1,4 @@
-"""Pure. A start for the smoother: the run is solved up to ever later instants, and beacons join as they can be placed."""
+"""Pure. A start for the smoother: ever longer beginnings of the run, which beacons join as they can be placed."""
 
 from typing import NamedTuple
 
@@ -7,9 +7,9 @@ import numpy.typing as npt
 
 from ccatp.filters.base import FloatArray
 from ccatp.radio.batch.descent import descend
-from ccatp.radio.batch.placing import Placement, place_by_bearing, place_by_ranges
+from ccatp.radio.batch.placing import APART, place_by_bearings, place_by_distances
 from ccatp.radio.batch.problem import BEACON, SHARED, BatchProblem, State
-from ccatp.radio.batch.reckoning import CALIBRATION, Reckoning, carried_on, chained
+from ccatp.radio.batch.reckoning import CALIBRATION, Reckoning, chained
 from ccatp.radio.batch.settings import BatchSettings
 from ccatp.radio.recording import Readings, Steps
 
@@ -22,6 +22,8 @@ ROUGHLY = 1e-3
 """Relative gain of the cost that is good enough for a beginning of the run."""
 SURE_MARGIN = 8.0
 """Half a chi-squared by which a beacon's best place must beat the next one before it joins."""
+LEAST_READINGS = 4
+"""Of a beacon that joins without bearings."""
 SURE_SPREAD = 0.15
 """Largest standard deviation of a beacon that joins, over its distance."""
 
@@ -65,7 +67,7 @@ def grown(
     n, known = len(times_s), 1
     while known < n:
         n_now = min(n, max(FIRST, int(known * GROWTH) + 1))
-        now = Readings(*(column[at < n_now] for column in readings))
+        now = readings.where(at < n_now)
         motion = whole.increments(state.shared[: len(CALIBRATION)], settings.odometry).motion[known - 1 : n_now - 1]
         state = State(np.concatenate([state.poses[:-1], chained(state.poses[-1], motion)]), state.shared, state.beacons)
         for _ in range(2):  # what is on the map draws the new poses right, then new beacons are placed by them
@@ -108,33 +110,26 @@ def _join(
     readings = problem.readings
     for beacon in range(len(used)):
         rows = np.flatnonzero(readings.beacon == beacon)
-        pointed = rows[np.isfinite(readings.bearing_rad[rows]) & np.isfinite(readings.range_m[rows])]
+        rows = rows[np.isfinite(readings.range_m[rows]) | np.isfinite(readings.rssi_dbm[rows])]
+        pointed = rows[np.isfinite(readings.bearing_rad[rows])]
         if pointed.size:
-            if used[beacon]:
-                continue
-            chosen = Readings(*(column[pointed] for column in readings))
-            state.beacons[beacon, :2] = place_by_bearing(state.poses[problem.at[pointed]], chosen, state.shared)
-            used[beacon] = changed = True
+            if not used[beacon]:
+                poses, bearing = state.poses[problem.at[pointed]], readings.bearing_rad[pointed]
+                distance, _ = problem.distances(state, pointed)
+                state.beacons[beacon, :2] = place_by_bearings(poses, distance, bearing, state.shared)
+                used[beacon] = changed = True
             continue
-        ranged = rows[np.isfinite(readings.range_m[rows])]
-        if ranged.size < 3:
+        if rows.size < LEAST_READINGS:
             continue
-        found = _by_ranges(problem, state, ranged)
+        distance, variance = problem.distances(state, rows)
+        found = place_by_distances(state.poses[problem.at[rows]], distance, variance)
         sure = found.margin > SURE_MARGIN and found.spread < SURE_SPREAD
         doubtful[beacon] = not sure
         if not sure and (used[beacon] or not last):
             continue
         away = np.hypot(found.x_m - state.beacons[beacon, 0], found.y_m - state.beacons[beacon, 1])
-        if used[beacon] and away < 0.3 * float(readings.range_m[ranged].min() + 1.0):
+        if used[beacon] and away < APART * distance.max():
             continue
         state.beacons[beacon, :2] = found.x_m, found.y_m
         used[beacon] = changed = True
     return changed
-
-
-def _by_ranges(problem: BatchProblem, state: State, rows: npt.NDArray[np.int64]) -> Placement:
-    range_m = problem.readings.range_m[rows]
-    return place_by_ranges(state.poses[problem.at[rows]], range_m, problem.range_variance(range_m), state.shared)
-
-
-__all__ = ["Start", "carried_on", "grown"]

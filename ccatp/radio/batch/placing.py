@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.filters.base import FloatArray
-from ccatp.radio.batch.problem import BEARING_OFFSET, RANGE_OFFSET, RANGE_SCALE
-from ccatp.radio.recording import Readings
+from ccatp.radio.batch.problem import BEARING_OFFSET
 
 STARTS = 48
 """Directions, around the place of a range's reading, from which a beacon is sought."""
@@ -37,35 +36,34 @@ class Placement(NamedTuple):
     cost: float
 
 
-def place_by_bearing(poses: FloatArray, readings: Readings, shared: FloatArray) -> tuple[float, float]:
-    """Median of the places that ranges with bearings point at.
+def place_by_bearings(
+    poses: FloatArray, distance_m: FloatArray, bearing_rad: FloatArray, shared: FloatArray
+) -> tuple[float, float]:
+    """Median of the places that distances with bearings point at.
 
     Args:
         poses: of the readings, shape (m, 3).
-        readings: of one beacon, each with range and bearing.
+        distance_m: to one beacon, shape (m,).
+        bearing_rad: of the same readings, shape (m,).
         shared: calibration by ``problem.SHARED``.
     """
-    distance = np.maximum((readings.range_m - shared[RANGE_OFFSET]) / (1.0 + shared[RANGE_SCALE]), 0.0)
-    way = poses[:, 2] + readings.bearing_rad - shared[BEARING_OFFSET]
-    x, y = poses[:, 0] + distance * np.cos(way), poses[:, 1] + distance * np.sin(way)
+    way = poses[:, 2] + bearing_rad - shared[BEARING_OFFSET]
+    x, y = poses[:, 0] + distance_m * np.cos(way), poses[:, 1] + distance_m * np.sin(way)
     return float(np.median(x)), float(np.median(y))
 
 
-def place_by_ranges(poses: FloatArray, range_m: FloatArray, variance: FloatArray, shared: FloatArray) -> Placement:
-    """Best of the minima of the robust range cost, sought from all around the nearest reading.
+def place_by_distances(poses: FloatArray, distance_m: FloatArray, variance: FloatArray) -> Placement:
+    """Best of the minima of the robust cost of distances, sought from all around the nearest reading.
 
     A straight path leaves two mirror images that cost the same; ``margin`` tells.
 
     Args:
         poses: of the readings, shape (m, 3).
-        range_m: of one beacon, shape (m,).
-        variance: of the ranges, path errors included, m^2, shape (m,).
-        shared: calibration by ``problem.SHARED``.
+        distance_m: to one beacon, shape (m,).
+        variance: of the distances, m^2, shape (m,).
     """
-    thin = max(1, -(-len(range_m) // MOST_READINGS))
-    x, y = poses[::thin, 0], poses[::thin, 1]
-    distance = np.maximum((range_m[::thin] - shared[RANGE_OFFSET]) / (1.0 + shared[RANGE_SCALE]), 1e-3)
-    information = (1.0 + shared[RANGE_SCALE]) ** 2 / variance[::thin]
+    thin = max(1, -(-len(distance_m) // MOST_READINGS))
+    x, y, distance, information = poses[::thin, 0], poses[::thin, 1], distance_m[::thin], 1.0 / variance[::thin]
     nearest = int(np.argmin(distance))
     angle = 2.0 * np.pi * np.arange(STARTS) / STARTS
     bx = x[nearest] + distance[nearest] * np.cos(angle)

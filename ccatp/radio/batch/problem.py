@@ -1,4 +1,4 @@
-"""Pure. The least-squares problem of a whole run: residuals, Jacobians and normal equations of odometry and readings."""
+"""Pure. The least-squares problem of a run: residuals, Jacobians, normal equations of odometry and readings."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,11 +13,13 @@ from ccatp.radio.batch.settings import BatchPriors, BatchSettings, RadioNoise
 from ccatp.radio.recording import Readings, Steps
 
 IntArray = npt.NDArray[np.int64]
-SHARED = (*CALIBRATION, "range_scale", "range_offset_m", "bearing_offset_rad")
-"""Unknowns that are neither pose nor beacon, in the order of the state."""
-RANGE_SCALE, RANGE_OFFSET, BEARING_OFFSET = (SHARED.index(name) for name in SHARED[len(CALIBRATION) :])
-BEACON = 3  # x_m, y_m, and the offset of its ranges, m
+OF_READINGS = ("range_scale", "range_offset_m", "bearing_offset_rad", "rssi_reference_db", "rssi_exponent")
+SHARED = (*CALIBRATION, *OF_READINGS)
+"""Unknowns that are neither pose nor beacon, in the order of the state: corrections, zero where all is as it should."""
+RANGE_SCALE, RANGE_OFFSET, BEARING_OFFSET, RSSI_REFERENCE, RSSI_EXPONENT = (SHARED.index(name) for name in OF_READINGS)
+BEACON = 4  # x_m, y_m, the offset of its ranges, m, and of its P_ref, dB
 LEAST_RANGE_M = 1e-3
+DB = 10.0 / np.log(10.0)
 
 
 @dataclass(slots=True)
@@ -26,8 +28,8 @@ class State:
 
     Attributes:
         poses: x_m, y_m, heading_rad at each instant, shape (n, 3).
-        shared: by ``SHARED``, shape (7,).
-        beacons: x_m, y_m, range offset by beacon, shape (b, 3).
+        shared: by ``SHARED``, shape (9,).
+        beacons: x_m, y_m, range_offset_m, reference_db by beacon, shape (b, 4).
     """
 
     poses: FloatArray
@@ -35,7 +37,7 @@ class State:
     beacons: FloatArray
 
     def moved(self, poses: FloatArray, shared: FloatArray) -> "State":
-        """The state after a step, the shared part of it shape (7 + 3 b,)."""
+        """The state after a step, the shared part of it shape (9 + 4 b,)."""
         split = len(SHARED)
         beacons = self.beacons + shared[split:].reshape(-1, BEACON)
         return State(self.poses + poses, self.shared + shared[:split], beacons)
@@ -43,13 +45,13 @@ class State:
 
 @dataclass(slots=True)
 class Residuals:
-    """What remains at a state; readings as rows of (range, bearing), zero where there is none.
+    """What remains at a state; readings as rows of (range, bearing, signal strength), zero where there is none.
 
     Attributes:
         odometry: shape (n - 1, 3).
         odometry_information: shape (n - 1, 3, 3).
-        readings: predicted less read, shape (m, 2).
-        information: of each, zero where there is no reading, shape (m, 2).
+        readings: predicted less read, shape (m, 3).
+        information: of each, zero where there is no reading, shape (m, 3).
     """
 
     odometry: FloatArray
@@ -94,11 +96,10 @@ class BatchProblem:
         self.radio: RadioNoise = settings.radio
         self.odometry = settings.odometry
         self.used = used
-        self.has_range = np.isfinite(readings.range_m) & used[readings.beacon]
-        self.has_bearing = np.isfinite(readings.bearing_rad) & used[readings.beacon]
-        self.sizes: FloatArray = self.has_range.astype(np.float64) + self.has_bearing
-        self._range_m = np.where(self.has_range, readings.range_m, 0.0)
-        self._bearing_rad = np.where(self.has_bearing, readings.bearing_rad, 0.0)
+        read = np.column_stack([readings.range_m, readings.bearing_rad, readings.rssi_dbm])
+        self.there = np.isfinite(read) & used[readings.beacon][:, None]
+        self.sizes: FloatArray = self.there.sum(axis=1).astype(np.float64)
+        self._read = np.where(self.there, read, 0.0)
         sigmas = _prior_sigmas(settings.priors, used)
         self.free = sigmas > 0.0
         self.prior_information = np.where(self.free, 1.0 / np.where(self.free, sigmas, 1.0) ** 2, 0.0)
@@ -115,6 +116,24 @@ class BatchProblem:
         """Of ranges, m^2."""
         variance: FloatArray = self.radio.range_sigma_m**2 + (self.radio.range_sigma_per_m * range_m) ** 2
         return variance
+
+    def distances(self, state: State, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """What readings say of the distance, m, and its variance, m^2: by the range, or by the signal strength.
+
+        Args:
+            state: its calibration is used.
+            rows: readings, each with a range or a signal strength.
+        """
+        read, beacon = self.readings, state.beacons[self.readings.beacon[rows]]
+        scale, exponent = 1.0 + state.shared[RANGE_SCALE], self.radio.rssi_exponent + state.shared[RSSI_EXPONENT]
+        reference = self.radio.rssi_reference_dbm + state.shared[RSSI_REFERENCE] + beacon[:, 3]
+        by_range = (read.range_m[rows] - state.shared[RANGE_OFFSET] - beacon[:, 2]) / scale
+        by_rssi = 10.0 ** ((reference - read.rssi_dbm[rows]) / (10.0 * exponent))
+        ranged = np.isfinite(read.range_m[rows])
+        distance = np.maximum(np.where(ranged, by_range, by_rssi), LEAST_RANGE_M)
+        range_variance = self.range_variance(np.where(ranged, read.range_m[rows], 0.0)) / scale**2
+        rssi_variance = (distance * self.radio.rssi_sigma_db / (DB * exponent)) ** 2
+        return distance, np.where(ranged, range_variance, rssi_variance)
 
     def prior_cost(self, state: State) -> float:
         """Half the sum of squares of the priors."""
@@ -179,26 +198,33 @@ class BatchProblem:
         ux, uy = beacon[:, 0] - pose[:, 0], beacon[:, 1] - pose[:, 1]
         r = np.maximum(np.hypot(ux, uy), LEAST_RANGE_M)
         ux, uy = ux / r, uy / r
-        scale = 1.0 + state.shared[RANGE_SCALE]
-        range_error = scale * r + state.shared[RANGE_OFFSET] + beacon[:, 2] - self._range_m
-        angle = np.arctan2(uy, ux) - pose[:, 2] + state.shared[BEARING_OFFSET] - self._bearing_rad
-        bearing_error = (angle + np.pi) % (2.0 * np.pi) - np.pi
-        errors = np.column_stack([range_error * self.has_range, bearing_error * self.has_bearing])
-        # By the range read, not the one predicted: a variance that moves with the state would draw it outwards.
-        information = np.column_stack(
+        scale, exponent = 1.0 + state.shared[RANGE_SCALE], self.radio.rssi_exponent + state.shared[RSSI_EXPONENT]
+        reference = self.radio.rssi_reference_dbm + state.shared[RSSI_REFERENCE]
+        decades = np.log10(r)
+        errors = np.column_stack(
             [
-                self.has_range / self.range_variance(self._range_m),
-                self.has_bearing / self.radio.bearing_sigma_rad**2,
+                scale * r + state.shared[RANGE_OFFSET] + beacon[:, 2],
+                np.arctan2(uy, ux) - pose[:, 2] + state.shared[BEARING_OFFSET],
+                reference + beacon[:, 3] - 10.0 * exponent * decades,
             ]
         )
+        errors = (errors - self._read) * self.there
+        errors[:, 1] = (errors[:, 1] + np.pi) % (2.0 * np.pi) - np.pi
         m = len(r)
-        by_pose, by_beacon = np.zeros((m, 2, 3)), np.zeros((m, 2, BEACON))
+        by_pose, by_beacon = np.zeros((m, 3, 3)), np.zeros((m, 3, BEACON))
         by_pose[:, 0, 0], by_pose[:, 0, 1] = -scale * ux, -scale * uy
         by_pose[:, 1, 0], by_pose[:, 1, 1], by_pose[:, 1, 2] = uy / r, -ux / r, -1.0
+        by_pose[:, 2, 0], by_pose[:, 2, 1] = DB * exponent * ux / r, DB * exponent * uy / r
         by_beacon[:, :, :2] = -by_pose[:, :, :2]
-        by_beacon[:, 0, 2] = 1.0
-        by_shared = np.zeros((m, 2, 3))  # of the readings' own three
+        by_beacon[:, 0, 2] = by_beacon[:, 2, 3] = 1.0
+        by_shared = np.zeros((m, 3, len(OF_READINGS)))
         by_shared[:, 0, 0], by_shared[:, 0, 1], by_shared[:, 1, 2] = r, 1.0, 1.0
+        by_shared[:, 2, 3], by_shared[:, 2, 4] = 1.0, -10.0 * decades
+        # By the range read, not the one predicted: a variance that moves with the state would draw it outwards.
+        variances = np.empty_like(errors)
+        variances[:, 0] = self.range_variance(self._read[:, 0])
+        variances[:, 1:] = self.radio.bearing_sigma_rad**2, self.radio.rssi_sigma_db**2
+        information: FloatArray = self.there / variances
         found = Residuals(odometry, odometry_information, errors, information)
         return found, by_pose, by_shared, by_beacon, (local, increments.by_calibration)
 
@@ -241,7 +267,7 @@ class BatchProblem:
         weights: FloatArray,
     ) -> None:
         by_pose, by_shared, by_beacon = jacobians
-        by_rest = np.concatenate([by_shared, by_beacon], axis=2)  # (m, 2, 6)
+        by_rest = np.concatenate([by_shared, by_beacon], axis=2)  # (m, 3, 5 + 4)
         W = residuals.information * weights[:, None]
         WJp, WJr, We = by_pose * W[:, :, None], by_rest * W[:, :, None], residuals.readings * W
         own = np.arange(len(CALIBRATION), len(SHARED))
@@ -257,12 +283,12 @@ class BatchProblem:
 
 
 def _prior_sigmas(priors: BatchPriors, used: npt.NDArray[np.bool_]) -> FloatArray:
-    """Of the shared unknowns and the beacons, shape (7 + 3 b,): 0 fixes one, infinity tells nothing of it."""
+    """Of the shared unknowns and the beacons, shape (9 + 4 b,): 0 fixes one, infinity tells nothing of it."""
     p = priors
     shared = (
         p.distance_scale, p.turn_scale, p.turn_per_m, p.turn_bias_rad_s, p.range_scale, p.range_offset_m,
-        p.bearing_offset_rad,
+        p.bearing_offset_rad, p.rssi_reference_db, p.rssi_exponent,
     )  # fmt: skip
     beacons = np.zeros((len(used), BEACON))
-    beacons[used] = (np.inf, np.inf, p.beacon_offset_m)
+    beacons[used] = (np.inf, np.inf, p.beacon_offset_m, p.beacon_reference_db)
     return np.concatenate([shared, beacons.ravel()])

@@ -1,4 +1,4 @@
-"""Pure. Odometry between the instants that readings were taken at: increment, what calibration does to it, its noise."""
+"""Pure. Odometry between the instants of readings: the increment, what calibration does to it, its noise."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from ccatp.radio.motion import DifferentialNoise
 from ccatp.radio.recording import Steps
 
 CALIBRATION = ("distance_scale", "turn_scale", "turn_per_m", "turn_bias_rad_s")
-"""What odometry is calibrated by: d = (1 + distance_scale) d_o, w = (1 + turn_scale) w_o + turn_per_m d_o - turn_bias t.
+"""What odometry is calibrated by: d = (1 + distance_scale) d_o, w = (1 + turn_scale) w_o + turn_per_m d_o - bias t.
 
 Scales are what corrects, not what the odometry reads too much; ``turn_per_m`` is what wheels of unequal size do.
 """
@@ -67,9 +67,7 @@ class Reckoning:
         """
         way, side = (1.0 + calibration[0]) * self.distance_m, self.lateral_m
         turn = (
-            (1.0 + calibration[1]) * self.turn_rad
-            + calibration[2] * self.distance_m
-            - calibration[3] * self.interval_s
+            (1.0 + calibration[1]) * self.turn_rad + calibration[2] * self.distance_m - calibration[3] * self.interval_s
         )
         before = np.concatenate([[0.0], np.cumsum(turn)])
         heading = before[:-1] + 0.5 * turn - np.repeat(before[self._starts], self._lengths)

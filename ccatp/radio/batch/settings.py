@@ -13,12 +13,18 @@ class RadioNoise:
         range_sigma_m: standard deviation of a range.
         range_sigma_per_m: what a metre of range adds to it, in squares: var = sigma^2 + (sigma_per_m r)^2.
         bearing_sigma_rad: standard deviation of a bearing.
-        freedom: degrees of freedom of Student's t, the law of the noise: few for readings with outliers, many for Gaussian.
+        rssi_sigma_db: standard deviation of a signal strength.
+        rssi_reference_dbm: signal strength at 1 m, P_ref.
+        rssi_exponent: eta of the log-distance model z = P_ref - 10 eta log10(r / 1 m).
+        freedom: degrees of freedom of Student's t, the law of the noise: few for outliers, many for Gaussian noise.
     """
 
     range_sigma_m: float
     range_sigma_per_m: float
     bearing_sigma_rad: float
+    rssi_sigma_db: float
+    rssi_reference_dbm: float
+    rssi_exponent: float
     freedom: float
 
 
@@ -34,7 +40,10 @@ class BatchPriors:
         range_scale: relative error that all ranges share.
         range_offset_m: error that all ranges share.
         bearing_offset_rad: error that all bearings share.
+        rssi_reference_db: error of P_ref that all beacons share.
+        rssi_exponent: error of eta, which all beacons share.
         beacon_offset_m: error of a beacon's ranges beside the shared one.
+        beacon_reference_db: error of a beacon's P_ref beside the shared one.
         pose_m: of the first position.
         heading_rad: of the first heading.
     """
@@ -46,7 +55,10 @@ class BatchPriors:
     range_scale: float
     range_offset_m: float
     bearing_offset_rad: float
+    rssi_reference_db: float
+    rssi_exponent: float
     beacon_offset_m: float
+    beacon_reference_db: float
     pose_m: float
     heading_rad: float
 
