@@ -100,6 +100,7 @@ class BatchProblem:
         self.there = np.isfinite(read) & used[readings.beacon][:, None]
         self.sizes: FloatArray = self.there.sum(axis=1).astype(np.float64)
         self._read = np.where(self.there, read, 0.0)
+        self.repeats = repeats(readings, settings.radio.correlation_s)
         sigmas = _prior_sigmas(settings.priors, used)
         self.free = sigmas > 0.0
         self.prior_information = np.where(self.free, 1.0 / np.where(self.free, sigmas, 1.0) ** 2, 0.0)
@@ -224,8 +225,8 @@ class BatchProblem:
         variances = np.empty_like(errors)
         variances[:, 0] = self.range_variance(self._read[:, 0])
         variances[:, 1:] = self.radio.bearing_sigma_rad**2, self.radio.rssi_sigma_db**2
-        information: FloatArray = self.there / variances
-        found = Residuals(odometry, odometry_information, errors, information)
+        information: FloatArray = self.there / (variances * self.repeats[:, None])
+        found = Residuals(odometry, np.asarray(odometry_information), errors, information)
         return found, by_pose, by_shared, by_beacon, (local, increments.by_calibration)
 
     def _add_odometry(
@@ -280,6 +281,21 @@ class BatchProblem:
         np.add.at(system.corner, (columns[:, :, None], columns[:, None, :]), JrT @ WJr)
         np.add.at(system.pose_side, self.at, -np.einsum("kij,kj->ki", JpT, We))
         np.add.at(system.shared_side, columns, -np.einsum("kij,kj->ki", JrT, We))
+
+
+def repeats(readings: Readings, correlation_s: float) -> FloatArray:
+    """How many readings of the same beacon lie within ``correlation_s`` round each, itself among them, shape (m,).
+
+    Errors that last (a camera's, a reflection's) do not average out: with its variance times that number each stretch
+    of readings weighs as one, whatever the rate.
+    """
+    counts = np.ones(len(readings.times_s))
+    for beacon in np.unique(readings.beacon) if correlation_s > 0.0 else ():
+        rows = np.flatnonzero(readings.beacon == beacon)
+        t = readings.times_s[rows]
+        half = 0.5 * correlation_s
+        counts[rows] = np.searchsorted(t, t + half, "right") - np.searchsorted(t, t - half, "left")
+    return counts
 
 
 def _prior_sigmas(priors: BatchPriors, used: npt.NDArray[np.bool_]) -> FloatArray:

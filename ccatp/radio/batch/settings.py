@@ -17,6 +17,7 @@ class RadioNoise:
         rssi_reference_dbm: signal strength at 1 m, P_ref.
         rssi_exponent: eta of the log-distance model z = P_ref - 10 eta log10(r / 1 m).
         freedom: degrees of freedom of Student's t, the law of the noise: few for outliers, many for Gaussian noise.
+        correlation_s: readings of a beacon within it share their error: together they count as one.
     """
 
     range_sigma_m: float
@@ -26,6 +27,7 @@ class RadioNoise:
     rssi_reference_dbm: float
     rssi_exponent: float
     freedom: float
+    correlation_s: float
 
 
 @dataclass(frozen=True, slots=True)
