@@ -63,7 +63,7 @@ def grown(
     used, doubtful = np.zeros(beacons, dtype=bool), np.zeros(beacons, dtype=bool)
     state = State(np.array([first_pose]), np.zeros(len(SHARED)), np.zeros((beacons, BEACON)))
     at = np.searchsorted(times_s, readings.times_s)
-    whole = Reckoning(steps, times_s)
+    whole = Reckoning(steps, times_s, delayed=False)
     n, known = len(times_s), 1
     while known < n:
         n_now = min(n, max(FIRST, int(known * GROWTH) + 1))

@@ -28,7 +28,7 @@ class State:
 
     Attributes:
         poses: x_m, y_m, heading_rad at each instant, shape (n, 3).
-        shared: by ``SHARED``, shape (9,).
+        shared: by ``SHARED``, shape (10,).
         beacons: x_m, y_m, range_offset_m, reference_db by beacon, shape (b, 4).
     """
 
@@ -37,7 +37,7 @@ class State:
     beacons: FloatArray
 
     def moved(self, poses: FloatArray, shared: FloatArray) -> "State":
-        """The state after a step, the shared part of it shape (9 + 4 b,)."""
+        """The state after a step, the shared part of it shape (10 + 4 b,)."""
         split = len(SHARED)
         beacons = self.beacons + shared[split:].reshape(-1, BEACON)
         return State(self.poses + poses, self.shared + shared[:split], beacons)
@@ -88,7 +88,7 @@ class BatchProblem:
         settings: BatchSettings,
         used: npt.NDArray[np.bool_],
     ) -> None:
-        self.reckoning = Reckoning(steps, times_s)
+        self.reckoning = Reckoning(steps, times_s, delayed=settings.priors.delay_s > 0.0)
         self.readings = readings
         self.at: IntArray = np.searchsorted(times_s, readings.times_s)
         self.first_pose = np.array(first_pose)
@@ -299,10 +299,10 @@ def repeats(readings: Readings, correlation_s: float) -> FloatArray:
 
 
 def _prior_sigmas(priors: BatchPriors, used: npt.NDArray[np.bool_]) -> FloatArray:
-    """Of the shared unknowns and the beacons, shape (9 + 4 b,): 0 fixes one, infinity tells nothing of it."""
+    """Of the shared unknowns and the beacons, shape (10 + 4 b,): 0 fixes one, infinity tells nothing of it."""
     p = priors
     shared = (
-        p.distance_scale, p.turn_scale, p.turn_per_m, p.turn_bias_rad_s, p.range_scale, p.range_offset_m,
+        p.distance_scale, p.turn_scale, p.turn_per_m, p.turn_bias_rad_s, p.delay_s, p.range_scale, p.range_offset_m,
         p.bearing_offset_rad, p.rssi_reference_db, p.rssi_exponent,
     )  # fmt: skip
     beacons = np.zeros((len(used), BEACON))

@@ -8,14 +8,16 @@ from ccatp.filters.base import FloatArray
 from ccatp.radio.motion import DifferentialNoise
 from ccatp.radio.recording import Steps
 
-CALIBRATION = ("distance_scale", "turn_scale", "turn_per_m", "turn_bias_rad_s")
+CALIBRATION = ("distance_scale", "turn_scale", "turn_per_m", "turn_bias_rad_s", "delay_s")
 """What odometry is calibrated by: d = (1 + distance_scale) d_o, w = (1 + turn_scale) w_o + turn_per_m d_o - bias t.
 
-Scales are what corrects, not what the odometry reads too much; ``turn_per_m`` is what wheels of unequal size do.
+Scales are what corrects, not what the odometry reads too much; ``turn_per_m`` is what wheels of unequal size do;
+``delay_s`` is by how much the vehicle does later what its odometry says (commands that are taken for odometry).
 """
 STILL_M = 1e-4
 """Standard deviation of what happens in any interval, even at rest: keeps the covariance regular."""
 STILL_RAD = 1e-4
+DELAY_STEP_S = 0.05
 FINEST_S = 0.1
 """Steps shorter than that are put together: within it a vehicle turns so little that the chord is the arc."""
 
@@ -25,7 +27,7 @@ class Increments(NamedTuple):
 
     Attributes:
         motion: x_m, y_m, heading_rad, shape (n, 3).
-        by_calibration: derivatives by ``CALIBRATION``, shape (n, 3, 4).
+        by_calibration: derivatives by ``CALIBRATION``, shape (n, 3, 5).
         covariance: shape (n, 3, 3).
     """
 
@@ -40,21 +42,35 @@ class Reckoning:
     Args:
         steps: of dead reckoning.
         times_s: the instants, shape (n + 1,), rising, within the steps.
+        delayed: derivatives by the delay are wanted; they are zero otherwise.
     """
 
-    def __init__(self, steps: Steps, times_s: FloatArray) -> None:
+    def __init__(self, steps: Steps, times_s: FloatArray, *, delayed: bool = True) -> None:
+        self._delayed = delayed
         inside = (steps.times_s > times_s[0]) & (steps.times_s < times_s[-1])
         fine_s = np.union1d(_spaced(steps.times_s[inside]), times_s)
         self._starts = np.searchsorted(fine_s, times_s)[:-1]
         self._lengths = np.diff(np.append(self._starts, fine_s.size - 1))
         self.interval_s = np.diff(fine_s)
 
-        def shares(amounts: FloatArray) -> FloatArray:
-            total = np.concatenate([[0.0], np.cumsum(amounts)])
-            return np.diff(np.interp(fine_s, steps.times_s, total))
+        self._fine_s, self._steps_s = fine_s, steps.times_s
+        amounts = (steps.distance_m, steps.turn_rad, steps.lateral_m)
+        self._totals = [np.concatenate([[0.0], np.cumsum(amount)]) for amount in amounts]
+        self._cut(0.0)
 
-        self.distance_m, self.turn_rad = shares(steps.distance_m), shares(steps.turn_rad)
-        self.lateral_m = shares(steps.lateral_m)
+    def _cut(self, delay_s: float) -> None:
+        """The odometry of each fine step if the vehicle lags by ``delay_s``."""
+        self._delay_s = delay_s
+        self.distance_m, self.turn_rad, self.lateral_m = (self._shares(total, delay_s) for total in self._totals)
+
+    def _shares(self, total: FloatArray, delay_s: float) -> FloatArray:
+        shares: FloatArray = np.diff(np.interp(self._fine_s - delay_s, self._steps_s, total))
+        return shares
+
+    def _by_delay(self, total: FloatArray) -> FloatArray:
+        """What a second more of delay adds to each fine step, by differences wide enough to see across commands."""
+        later, sooner = (self._shares(total, self._delay_s + sign * DELAY_STEP_S) for sign in (1.0, -1.0))
+        return (later - sooner) / (2.0 * DELAY_STEP_S)
 
     def increments(self, calibration: FloatArray, noise: DifferentialNoise) -> Increments:
         """Motion of each interval, with the lever by which each of its steps moves the interval's end.
@@ -62,9 +78,11 @@ class Reckoning:
         A turn error e at a step swings the rest of the interval: d(x, y) = e (-(y_end - y), x_end - x).
 
         Args:
-            calibration: by ``CALIBRATION``, shape (4,).
+            calibration: by ``CALIBRATION``, shape (5,).
             noise: random walks of the odometry.
         """
+        if calibration[4] != self._delay_s:
+            self._cut(float(calibration[4]))
         way, side = (1.0 + calibration[0]) * self.distance_m, self.lateral_m
         turn = (
             (1.0 + calibration[1]) * self.turn_rad + calibration[2] * self.distance_m - calibration[3] * self.interval_s
@@ -86,6 +104,13 @@ class Reckoning:
             by[:, 0, k] = self._sum(lever_x * amount)
             by[:, 1, k] = self._sum(lever_y * amount)
             by[:, 2, k] = self._sum(amount)
+        if self._delayed:
+            way_by, turn_by, side_by = (self._by_delay(total) for total in self._totals)
+            turn_by = (1.0 + calibration[1]) * turn_by + calibration[2] * way_by
+            way_by = (1.0 + calibration[0]) * way_by
+            by[:, 0, 4] = self._sum(way_by * c - side_by * s + lever_x * turn_by)
+            by[:, 1, 4] = self._sum(way_by * s + side_by * c + lever_y * turn_by)
+            by[:, 2, 4] = self._sum(turn_by)
         return Increments(motion, by, self._covariance(noise, (c, s), (lever_x, lever_y)))
 
     def _covariance(

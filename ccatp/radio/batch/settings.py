@@ -39,6 +39,7 @@ class BatchPriors:
         turn_scale: relative error of turns.
         turn_per_m: turning of a vehicle that believes to go straight, rad/m.
         turn_bias_rad_s: constant error of the turn rate.
+        delay_s: by how much the vehicle does later what its odometry says.
         range_scale: relative error that all ranges share.
         range_offset_m: error that all ranges share.
         bearing_offset_rad: error that all bearings share.
@@ -54,6 +55,7 @@ class BatchPriors:
     turn_scale: float
     turn_per_m: float
     turn_bias_rad_s: float
+    delay_s: float
     range_scale: float
     range_offset_m: float
     bearing_offset_rad: float
