@@ -212,7 +212,7 @@ def _unlike(
     own = np.diag(miss)
     if not np.isfinite(own).any():
         return
-    usual = float(np.nanmedian(own))
+    usual = float(np.nanquantile(own, 0.25))  # most may be wrong
     strange = [k for k in range(count) if own[k] > max(STRANGER_M, STRANGER_RATIO * usual)]
     fits = {k: int(np.nanargmin(miss[k])) for k in strange if np.nanmin(miss[k]) < 0.3 * own[k]}
     for k in strange:

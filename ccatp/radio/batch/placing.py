@@ -76,7 +76,8 @@ def place_by_distances(poses: FloatArray, distance_m: FloatArray, variance: Floa
         e, ux, uy = r - distance, dx / r, dy / r
         w = information * (FREEDOM + 1.0) / (FREEDOM + e * e * information)
         xx, yy, xy = (w * ux * ux).sum(1), (w * uy * uy).sum(1), (w * ux * uy).sum(1)
-        xx, yy = xx * 1.001, yy * 1.001  # a straight path that points at the beacon says nothing across
+        little = 1e-3 * (xx + yy)  # a straight path that points at the beacon says nothing across
+        xx, yy = xx + little, yy + little
         gx, gy = (w * ux * e).sum(1), (w * uy * e).sum(1)
         determinant = xx * yy - xy * xy
         sx, sy = (yy * gx - xy * gy) / determinant, (xx * gy - xy * gx) / determinant

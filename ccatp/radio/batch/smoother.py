@@ -19,7 +19,7 @@ from ccatp.radio.track import BeaconFix, Calibrated, Track
 SPACING_S = 0.5
 """There is a pose at least that often, whether something was heard or not."""
 ITERATIONS = 40
-WIDENINGS = 3
+WIDENINGS = 8
 WIDER = 1.05
 """Noise is widened where the residuals are larger than it by that factor."""
 LITTLE = 0.1
