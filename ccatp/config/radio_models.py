@@ -4,7 +4,15 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ccatp.config.models import Model, NonNegative, Pair, PidConfig, Positive
+from ccatp.config.beacon_models import (
+    BeaconDangerConfig,
+    BeaconMissionConfig,
+    BeaconRobotConfig,
+    IncidentConfig,
+    ListenerConfig,
+    SimBeaconRobotConfig,
+)
+from ccatp.config.models import Model, NonNegative, ObservatoryConfig, Pair, PidConfig, Positive, ProcessesConfig
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
@@ -63,7 +71,7 @@ class OdometryConfig(Model):
     steer_sigma_rad: NonNegative
     turn_rate_sigma_rad_s: NonNegative
     heading_drift_sigma_rad_s: NonNegative
-    speed_scale_sigma: NonNegative
+    slip_sigma: NonNegative
 
 
 class PathLossConfig(Model):
@@ -95,9 +103,11 @@ class ObservationConfig(Model):
 class EstimatorConfig(Model):
     """What the filter assumes and estimates besides poses and positions."""
 
-    estimates_shadowing: bool
+    shadowing: Literal["none", "white", "map"]
+    shadowing_grid_m: Positive
     gate_probability: Annotated[float, Field(gt=0.5, lt=1.0)]
     target_speed_sigma_m_s: Positive
+    target_course_time_s: Positive
 
 
 class FuzzyInputConfig(Model):
@@ -226,6 +236,8 @@ class RadioSimConfig(Model):
     target: SimTargetConfig
     obstacles: tuple[SimObstacleConfig, ...]
     range_sigma_m: NonNegative
+    robot: SimBeaconRobotConfig
+    incidents: tuple[IncidentConfig, ...]
 
 
 class RadioConfig(Model):
@@ -244,4 +256,10 @@ class RadioConfig(Model):
     control: RadioControlConfig
     follow: FollowConfig
     avoidance: AvoidanceConfig
+    listener: ListenerConfig
+    mission: BeaconMissionConfig
+    danger: BeaconDangerConfig
+    robot: BeaconRobotConfig
+    processes: ProcessesConfig
+    observatory: ObservatoryConfig
     sim: RadioSimConfig

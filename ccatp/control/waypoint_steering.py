@@ -81,7 +81,7 @@ class Driver:
         return self._turning(self._speed(aim, interval_s), aim.error_rad)
 
     def back(self, speed_m_s: float, error_rad: float) -> Drive:
-        """Set points that back off and turn to what lies at ``error_rad``; wheels that steer do so the other way round."""
+        """Set points that back off and turn to what lies at ``error_rad``; steered wheels do so the other way round."""
         backwards_m_s = -min(speed_m_s, self._vehicle.speed_max_m_s)
         return self._turning(backwards_m_s, -error_rad if self._vehicle.kind == "ackermann" else error_rad)
 
