@@ -3,6 +3,7 @@
 import click
 
 from ccatp.cli_frame import SuggestingGroup, example
+from ccatp.cli_radio_compare import compare
 from ccatp.cli_radio_slam import slam
 
 
@@ -12,3 +13,4 @@ def radio() -> None:
 
 
 radio.add_command(slam)
+radio.add_command(compare)

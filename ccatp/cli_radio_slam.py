@@ -12,7 +12,7 @@ from ccatp.cli_frame import CONFIG_OPTION, complain, example, overrides, setting
 from ccatp.errors import CcatpError, ExitStatus
 
 if TYPE_CHECKING:
-    from ccatp.config.recording_models import RecordingConfig
+    from ccatp.config.recording_models import RecordingsConfig
     from ccatp.radio.recording import RecordedRun
     from ccatp.radio.track import Track
 
@@ -46,10 +46,11 @@ class SlamCommandError(CcatpError):
     "--figure", "figure_file", type=click.Path(path_type=Path, dir_okay=False),
     help="Draw map and path (PNG, PDF or SVG; needs matplotlib).",
 )  # fmt: skip
+@click.option("--peers", is_flag=True, help="All our estimators and GTSAM's side by side; needs ccatp[peers].")
 @click.option("--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there.")
 def slam(
     path: Path, data_format: str | None, robot: int | None, filter_name: str, config_file: Path | None,
-    settings: Mapping[str, object], figure_file: Path | None, json_output: bool,
+    settings: Mapping[str, object], figure_file: Path | None, peers: bool, json_output: bool,
 ) -> int:  # fmt: skip
     """Map the beacons of a recorded run and find the vehicle's path on that map.
 
@@ -67,7 +68,7 @@ def slam(
     run = read_run(path, data_format, robot)
     for warning in run.warnings:
         complain(f"warning: {warning}", 0)
-    track = _estimate(run, getattr(assumed, run.kind), filter_name)
+    track = estimate(run, assumed, filter_name)
     for warning in track.warnings:
         complain(f"warning: {warning}", 0)
     judged = judge(track, run)
@@ -76,19 +77,35 @@ def slam(
         from ccatp.slam_map import draw_slam
 
         draw_slam(run, track, judged, figure_file, f"{run.name}, {filter_name}")
+    if peers:
+        data["peers"] = _side_by_side(run, assumed)
     if json_output:
         click.echo(json.dumps(data, allow_nan=False))
         return 0
     for line in table_lines(run, data):
         click.echo(line)
+    if peers:
+        from ccatp.radio.comparison import markdown
+
+        for line in ("", *markdown(data["peers"])):
+            click.echo(line)
     return 0
 
 
-def _estimate(run: "RecordedRun", cfg: "RecordingConfig", filter_name: str) -> "Track":
+def _side_by_side(run: "RecordedRun", assumed: "RecordingsConfig") -> list[dict[str, Any]]:
+    from ccatp.cli_radio_compare import compared
+
+    return compared(run, assumed, peers=True)
+
+
+def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) -> "Track":
+    """A run through one of ``FILTERS``."""
     from time import perf_counter
 
+    from ccatp.config.recording_models import RecordingConfig
     from ccatp.radio.assumed import batch_settings, slam_settings
 
+    cfg: RecordingConfig = getattr(assumed, run.kind)
     if filter_name == "smoother":
         from ccatp.radio.batch import smooth
 
