@@ -311,6 +311,20 @@ class ObservatoryConfig(Model):
     clients_file: str
 
 
+class DashboardConfig(Model):
+    """The operator's web page, and the commands over HTTP."""
+
+    enabled: bool
+    host: str
+    port: Port
+    token_file: str  # empty = none
+    host_names: tuple[str, ...]
+    rate_hz: Annotated[float, Field(gt=0.0, le=50.0)]
+    max_connections: Annotated[int, Field(ge=2, le=512)]
+    slow_client_s: Positive
+    command_timeout_s: Positive
+
+
 class MissionConfig(Model):
     """The survey as a sequence of states."""
 
@@ -494,6 +508,7 @@ class Config(Model):
     align: AlignConfig
     health: HealthConfig
     observatory: ObservatoryConfig
+    dashboard: DashboardConfig
     mission: MissionConfig
     sim: SimConfig
     mirror: MirrorConfig

@@ -178,7 +178,7 @@ class HealthBoard:
         """Too many lines that are no frames came since the last frame; what is found stays until frames come again."""
         cfg = self._cfg
         cause, lines = "lines of the robot were no frames", float(cfg.garbled_lines)
-        finding = Finding(Severity.HOLD, cause, "frames", lines, lines)
+        finding = Finding(Severity.HOLD, cause, "lines", lines, lines)
         self._garbled.see(self._t_s or 0.0, finding)
         self.findings = self._found()
         return finding

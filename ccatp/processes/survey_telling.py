@@ -4,6 +4,7 @@ import structlog
 
 from ccatp.bus import Publisher
 from ccatp.localizer import Localizer
+from ccatp.processes.painting import Painter
 from ccatp.processes.telling import Teller
 from ccatp.samples import Fix, PointId
 from ccatp.wire.topics import (
@@ -11,6 +12,7 @@ from ccatp.wire.topics import (
     Estimate,
     FixMessage,
     Message,
+    MissionStatus,
     Rest,
     Track,
     Treatment,
@@ -30,6 +32,7 @@ class SurveyTeller(Teller):
     def __init__(self, publisher: Publisher, log: structlog.typing.FilteringBoundLogger) -> None:
         """Start with empty batches."""
         super().__init__(publisher, log)
+        self._painter = Painter(publisher)
         self._track: list[tuple[int, float, int, int, float, float, float, float]] = []
 
     def frame(
@@ -54,6 +57,7 @@ class SurveyTeller(Teller):
             is_first: of a session; it is always due, because the danger loop may wait for it.
         """
         self.seq, self.t_s = seq, t_s
+        self._painter.sees(localizer, raw)
         pose, sigma = localizer.pose, localizer.position_sigma_m
         if is_first or is_estimate_due(seq):
             deck = localizer.deck_pose
@@ -110,3 +114,8 @@ class SurveyTeller(Teller):
             jump_mm=1e3 * jump_m,
         )
         self._publisher.send("fix", message)
+
+    def status(self, message: MissionStatus) -> None:
+        """Publish the mission's status, and a picture of all that is newest for whoever looks on."""
+        super().status(message)
+        self._painter.tell_if_wanted(self.seq, self.t_s)

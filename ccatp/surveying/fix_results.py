@@ -72,7 +72,15 @@ class FixResults:
         stop = standing.survey.current
         if standing.is_awaiting_fix and stop is not None and stop.kind in (StopKind.CALIBRATE, StopKind.VIA):
             standing.survey.advance()
+            self._doubt_heading()
             standing.go_on()
+
+    def _doubt_heading(self) -> None:
+        """Where the fix showed that the pose was wrong, the heading is found before the robot drives on."""
+        standing = self._standing
+        if standing.aligner.is_needed and not standing.is_at_start:
+            standing.aligner.doubt()
+            standing.is_lost = True
 
     def _leave_stop(self, point: PointId | None, record: list[PointId]) -> None:
         standing = self._standing
@@ -88,6 +96,7 @@ class FixResults:
             standing.is_review_due = self._has_budget
             standing.backoffs = 0
             standing.survey.advance()
+            self._doubt_heading()
             # So it does where the robot was pushed meanwhile and waits to be measured anew: there is no need any more.
             goes_on |= standing.state in (SETTLING, MEASURING)
         if goes_on:
