@@ -3,7 +3,6 @@
 from ccatp.beacon_mission.mission import BeaconMission
 from ccatp.beacon_mission.navigator import Navigator
 from ccatp.beacon_mission.radio_navigator import RadioNavigator
-from ccatp.beacon_summary import BeaconFacts
 from ccatp.config.radio_models import RadioConfig
 from ccatp.errors import ConfigError
 from ccatp.wire.robot import Hello
@@ -21,20 +20,6 @@ def assemble_beacons(cfg: RadioConfig) -> BeaconMission:
 def build_navigator(cfg: RadioConfig) -> Navigator:
     """What finds the robot: radios mapped on the way, or motes that map themselves first."""
     return RadioNavigator(cfg)
-
-
-def beacon_facts(cfg: RadioConfig, *, is_sim: bool) -> BeaconFacts:
-    """What the summary has to know of a run."""
-    is_following = cfg.follow.is_active
-    return BeaconFacts(
-        system=cfg.system,
-        seed=cfg.run.seed,
-        waypoints=0 if is_following else cfg.mission.laps * len(cfg.workspace.waypoints_m),
-        safe_distance_m=cfg.follow.safe_distance_m if is_following else None,
-        target=cfg.follow.target,
-        settled_s=cfg.observation.every_steps * cfg.run.step_s,
-        has_truth=is_sim,
-    )
 
 
 def track_row(seq: int, t_s: float, navigator: Navigator) -> TrackRow:

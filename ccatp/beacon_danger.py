@@ -11,7 +11,7 @@ Every rule looks at what the robot itself senses; of main's estimate only its un
 * an emergency: code 2, latched (``ccatp.hazards.abort_latch``); in an earthquake nothing is permitted.
 """
 
-from collections import deque
+from collections import Counter, deque
 from math import inf, isfinite, log, sqrt
 
 from ccatp.config.radio_models import RadioConfig
@@ -39,6 +39,7 @@ class BeaconDanger:
         self._danger, self._follow, self._loss = cfg.danger, cfg.follow, cfg.path_loss
         self._ahead = [abs(angle) <= cfg.danger.ahead_rad for angle in cfg.avoidance.sensors_rad]
         self.latch = AbortLatch()
+        self._denials: Counter[str] = Counter()
         self.reset()
 
     def reset(self) -> None:
@@ -90,12 +91,23 @@ class BeaconDanger:
             self._held_since_s = None
             verdict = self._near(sensors, extras)
         self._code = verdict.code
+        if verdict.signal:
+            self._denials[verdict.signal] += 1
         return verdict
 
     def stale(self, seq: int, t_s: float) -> Verdict:
         """The verdict when no frame came for ``stale_after_s``: nothing permitted."""
         limit_s = self._danger.stale_after_s
         return self._denied(seq, t_s, "no sensors frame", "sensors", limit_s, limit_s, Severity.PAUSE)
+
+    def garbled(self, seq: int, t_s: float, _at_s: float) -> Verdict | None:
+        """A line of the robot was no frame: nothing permitted until the next one."""
+        return self.stale(seq, t_s)
+
+    @property
+    def counts(self) -> dict[str, object]:
+        """Frames on which motion was denied, by signal."""
+        return {"denied": dict(self._denials)}
 
     def _hear(self, t_s: float, extras: BeaconFrame) -> None:
         names = {sample.beacon for sample in extras.radio}

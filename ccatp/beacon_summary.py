@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ccatp.config.radio_models import RadioConfig
 from ccatp.radio.rigid_alignment import best_motion
 
 FloatArray = NDArray[np.float64]
@@ -35,6 +36,20 @@ class BeaconFacts(NamedTuple):
     target: str
     settled_s: float
     has_truth: bool
+
+
+def beacon_facts(cfg: RadioConfig, *, is_sim: bool) -> BeaconFacts:
+    """What the summary has to know of a run."""
+    is_following = cfg.follow.is_active
+    return BeaconFacts(
+        system=cfg.system,
+        seed=cfg.run.seed,
+        waypoints=0 if is_following else cfg.mission.laps * len(cfg.workspace.waypoints_m),
+        safe_distance_m=cfg.follow.safe_distance_m if is_following else None,
+        target=cfg.follow.target,
+        settled_s=cfg.observation.every_steps * cfg.run.step_s,
+        has_truth=is_sim,
+    )
 
 
 class Reached(NamedTuple):

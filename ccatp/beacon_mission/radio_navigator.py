@@ -35,7 +35,8 @@ class RadioNavigator:
     @property
     def belief(self) -> Belief:
         """Of the robot."""
-        return Belief(tuple(self.slam.pose), self.slam.pose_covariance)
+        x_m, y_m, heading_rad = self.slam.pose
+        return Belief((x_m, y_m, heading_rad), self.slam.pose_covariance)
 
     @property
     def reckoned_m(self) -> tuple[float, float]:
