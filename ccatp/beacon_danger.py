@@ -2,7 +2,8 @@
 
 Every rule looks at what the robot itself senses; of main's estimate only its uncertainty and its age count.
 
-* obstacle: a distance sensor that looks ahead reads less than ``obstacle_m``: no forward motion, code 1;
+* obstacle: something that the distance sensors see, or saw lately, is nearer than ``obstacle_m`` within ``ahead_rad`` of
+  the course: no forward motion, code 1; likewise behind, and no reverse;
 * target: the mean level of the radio that is followed says that it is nearer than ``target_m``, by one standard
   deviation of that mean: no forward motion, code 1;
 * silence: neither a static radio nor a mote was heard for ``radio_timeout_s``: hold;
@@ -12,10 +13,11 @@ Every rule looks at what the robot itself senses; of main's estimate only its un
 """
 
 from collections import Counter, deque
-from math import inf, isfinite, log, sqrt
+from math import inf, isfinite, log, sin, sqrt
 
 from ccatp.config.radio_models import RadioConfig
 from ccatp.hazards.abort_latch import AbortLatch, EmergencyKind, is_at_base_or_held
+from ccatp.hazards.echo_memory import EchoMemory
 from ccatp.samples import EventCode, Severity, Verdict
 from ccatp.wire.beacon_frame import BeaconFrame
 from ccatp.wire.robot import Sensors
@@ -37,7 +39,7 @@ class BeaconDanger:
     def __init__(self, cfg: RadioConfig) -> None:
         """Nothing heard yet."""
         self._danger, self._follow, self._loss = cfg.danger, cfg.follow, cfg.path_loss
-        self._ahead = [abs(angle) <= cfg.danger.ahead_rad for angle in cfg.avoidance.sensors_rad]
+        self._avoidance, self._vehicle, self._radius_m = cfg.avoidance, cfg.vehicle, cfg.robot.wheel_radius_m
         self.latch = AbortLatch()
         self._denials: Counter[str] = Counter()
         self.reset()
@@ -46,6 +48,10 @@ class BeaconDanger:
         """The robot has booted: its clock counts anew. Emergencies stay latched."""
         self._heard_s: float | None = None
         self._levels: deque[tuple[float, float]] = deque()
+        avoidance = self._avoidance
+        self._echoes = EchoMemory(avoidance.sensors_rad, avoidance.influence_m, self._danger.memory_s)
+        self._rolled_to_s: float | None = None
+        self._steer_rad = 0.0
         self._held_since_s: float | None = None
         self._is_vague = False
         self._state = "idle"
@@ -82,6 +88,8 @@ class BeaconDanger:
             estimate: main's newest.
         """
         self._hear(sensors.t, extras)
+        self._roll(sensors, extras)
+        self._echoes.see(sensors.t, extras.distances)
         if estimate is not None:
             self._state = estimate.state
         hold = self._hold(sensors.t, estimate)
@@ -89,7 +97,7 @@ class BeaconDanger:
             verdict = self._held(sensors, *hold)
         else:
             self._held_since_s = None
-            verdict = self._near(sensors, extras)
+            verdict = self._near(sensors)
         self._code = verdict.code
         if verdict.signal:
             self._denials[verdict.signal] += 1
@@ -123,6 +131,25 @@ class BeaconDanger:
         while self._levels and t_s - self._levels[0][0] > self._danger.target_window_s:
             self._levels.popleft()
 
+    def _roll(self, sensors: Sensors, extras: BeaconFrame) -> None:
+        """Carry the echoes on by the wheels; each sample stands for the time since the one before."""
+        steering, vehicle = {sample.t_s: sample.steer_rad for sample in extras.steer}, self._vehicle
+        for t_s, right, left in sensors.enc:
+            before_s = sensors.t if self._rolled_to_s is None else self._rolled_to_s
+            if right is None or left is None or t_s <= before_s:
+                continue
+            interval_s, self._rolled_to_s = t_s - before_s, t_s
+            way_m = 0.5 * self._radius_m * (right + left) * interval_s
+            if vehicle.kind == "ackermann":
+                self._steer_rad = steering.get(t_s, self._steer_rad)
+                turn_rad = way_m * sin(self._steer_rad) / vehicle.wheelbase_m
+                self._echoes.roll(way_m, self._steer_rad, turn_rad)
+            else:
+                turn_rad = self._radius_m * (right - left) / vehicle.track_m * interval_s
+                self._echoes.roll(way_m, 0.5 * turn_rad, turn_rad)
+        if self._rolled_to_s is None:
+            self._rolled_to_s = sensors.t
+
     def _hold(self, t_s: float, estimate: Estimate | None) -> tuple[str, str, float, float] | None:
         """Why nothing is permitted: cause, signal, value, limit."""
         danger = self._danger
@@ -155,22 +182,24 @@ class BeaconDanger:
         code = _ABORTED if self.latch.is_latched else _NORMAL
         return Verdict(seq, t_s, code, cause, signal, value, limit, False, False, False, severity=severity)
 
-    def _near(self, sensors: Sensors, extras: BeaconFrame) -> Verdict:
+    def _near(self, sensors: Sensors) -> Verdict:
         seq, t_s, danger = sensors.seq, sensors.t, self._danger
         emergency = self._emergency(seq, t_s)
         if emergency is not None and not emergency.forward:
             return emergency
-        ahead_m = min((d for d, looks in zip(extras.distances, self._ahead, strict=False) if looks), default=inf)
-        found: tuple[str, str, float, float] | None = None
+        ahead_m = self._echoes.nearest_m(self._steer_rad, danger.ahead_rad)
+        behind_m = self._echoes.behind_m(self._steer_rad, danger.ahead_rad)
+        target_m = self._nearest_target_m()
+        forward, reverse = ahead_m >= danger.obstacle_m and target_m >= danger.target_m, behind_m >= danger.obstacle_m
         if ahead_m < danger.obstacle_m:
             found = "an obstacle ahead", "obstacle", ahead_m, danger.obstacle_m
+        elif target_m < danger.target_m:
+            found = "the target is too near", "target", target_m, danger.target_m
+        elif behind_m < danger.obstacle_m:
+            found = "an obstacle behind", "obstacle", behind_m, danger.obstacle_m
         else:
-            target_m = self._nearest_target_m()
-            if target_m < danger.target_m:
-                found = "the target is too near", "target", target_m, danger.target_m
-        if found is not None:
-            return Verdict(seq, t_s, _NEAR, *found, False, True, True)
-        return emergency or Verdict(seq, t_s, _NORMAL, "", "", 0.0, 0.0, True, True, True)
+            return emergency or Verdict(seq, t_s, _NORMAL, "", "", 0.0, 0.0, True, True, True)
+        return Verdict(seq, t_s, _NEAR, *found, forward, reverse, True)
 
     def _nearest_target_m(self) -> float:
         """The target is at least this far, by one standard deviation of its mean level; infinite without a level."""

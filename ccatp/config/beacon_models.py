@@ -37,7 +37,8 @@ class BeaconDangerConfig(Model):
     """When the danger loop denies motion; distances from the vehicle's origin."""
 
     obstacle_m: Positive  # no forward motion with anything ahead that is nearer
-    ahead_rad: Positive  # ahead: within this of the heading
+    ahead_rad: Positive  # ahead: within this of the course
+    memory_s: Positive  # what was seen is believed for this long
     target_m: Positive  # no motion towards the target when it is nearer
     target_window_s: Positive  # its levels are averaged over this time
     target_level_sigma_db: Positive  # of the white noise of its level
