@@ -1,6 +1,7 @@
 """Pure. Assembles the parts of a mission among beacons from a configuration, for the daemon and rehearsals alike."""
 
 from ccatp.beacon_mission.mission import BeaconMission
+from ccatp.beacon_mission.mote_navigator import MoteNavigator
 from ccatp.beacon_mission.navigator import Navigator
 from ccatp.beacon_mission.radio_navigator import RadioNavigator
 from ccatp.config.radio_models import RadioConfig
@@ -19,7 +20,7 @@ def assemble_beacons(cfg: RadioConfig) -> BeaconMission:
 
 def build_navigator(cfg: RadioConfig) -> Navigator:
     """What finds the robot: radios mapped on the way, or motes that map themselves first."""
-    return RadioNavigator(cfg)
+    return MoteNavigator(cfg) if cfg.system == "cricket" else RadioNavigator(cfg)
 
 
 def track_row(seq: int, t_s: float, navigator: Navigator) -> TrackRow:

@@ -123,6 +123,10 @@ class BeaconSummary:
         truth = np.array(rows, dtype=np.float64).reshape(-1, 8)
         _, i, j = np.intersect1d(track[:, _SEQ], truth[:, _SEQ], return_indices=True)
         track, true = track[i] if facts.has_truth else track, truth[j]
+        # A robot that stands until motes have mapped themselves navigates from then on.
+        is_navigating = track[:, _T] >= self._notes.get("map_time_s", 0.0)
+        if facts.has_truth and is_navigating.any():
+            track, true = track[is_navigating], true[is_navigating]
         known = facts.has_truth and len(true) > 0
         return {
             "system": facts.system,

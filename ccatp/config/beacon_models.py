@@ -54,8 +54,8 @@ class ListenerConfig(Model):
     """How the robot hears ultrasonic motes."""
 
     name: RadioName  # of the robot's own listener, in readings
-    pings_per_frame: Annotated[int, Field(ge=1, le=100)]  # motes that send in one frame, one after the other
-    bursts_per_frame: Annotated[int, Field(ge=1, le=100)]  # pairs that range in a frame during mapping
+    pulses_per_frame: Annotated[int, Field(ge=1, le=20)]  # motes that send in one frame, one after the other
+    mapping_rounds: Annotated[int, Field(ge=1, le=10_000)]  # in which motes report what they hear of each other
     gate_probability: Annotated[float, Field(gt=0.5, lt=1.0)]  # a range less likely than this is not used
 
 
