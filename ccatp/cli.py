@@ -98,7 +98,7 @@ def run(
     if not sim and config_file is None:
         raise click.UsageError("name the robot's configuration with --config FILE, or add --sim")
     from ccatp.run_options import RunOptions
-    from ccatp.supervisor import run_survey
+    from ccatp.supervisor import run as run_to_the_end
 
     if faults_file is not None:
         from ccatp.fault_plan import read_plan
@@ -112,7 +112,7 @@ def run(
         "run.filter": filter_name,
     }
     return int(
-        run_survey(
+        run_to_the_end(
             RunOptions(
                 sim=sim,
                 config_file=config_file,

@@ -12,6 +12,7 @@ from ccatp.config.beacon_models import (
     ListenerConfig,
     SimBeaconRobotConfig,
 )
+from ccatp.config.cricket_models import CricketConfig
 from ccatp.config.models import Model, NonNegative, ObservatoryConfig, Pair, PidConfig, Positive, ProcessesConfig
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -263,3 +264,4 @@ class RadioConfig(Model):
     processes: ProcessesConfig
     observatory: ObservatoryConfig
     sim: RadioSimConfig
+    cricket: CricketConfig

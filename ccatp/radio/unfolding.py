@@ -1,5 +1,7 @@
 """Pure. A first map of a few dozen motes: multidimensional scaling, unfolded in more dimensions than there are."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import coo_array
@@ -8,11 +10,19 @@ from scipy.sparse.csgraph import shortest_path
 from ccatp.radio.range_network import FloatArray, IntArray
 
 _SPARE = 2  # dimensions more than the map has, in which what is folded can turn over
-_SQUEEZES = np.geomspace(1e-3, 1e3, 7)  # weight of the spare dimensions, in units of the mean weight of a range
+_SQUEEZES = tuple(np.geomspace(1e-3, 1e3, 7).tolist())  # weight of the spare dimensions, in units of the mean weight of a range
 _STEPS = 25  # of each squeeze; the last fit of all is left to others
 
 
-def unfolded(count: int, pairs: IntArray, distances_m: FloatArray, sigmas_m: FloatArray, dimension: int) -> FloatArray:
+def unfolded(
+    count: int,
+    pairs: IntArray,
+    distances_m: FloatArray,
+    sigmas_m: FloatArray,
+    dimension: int,
+    *,
+    squeezes: Sequence[float] = _SQUEEZES,
+) -> FloatArray:
     """Places of n points from some of their distances, shape (n, d); as ranges do, it leaves frame and mirror open.
 
     The missing distances are taken as the shortest way along known ones (Shang et al., MDS-MAP, 2003), classical scaling
@@ -26,12 +36,13 @@ def unfolded(count: int, pairs: IntArray, distances_m: FloatArray, sigmas_m: Flo
         distances_m: shape (e,).
         sigmas_m: shape (e,).
         dimension: d.
+        squeezes: weights of the spare dimensions one after the other, in units of the median weight of a distance.
     """
     points = classical_scaling(completed(count, pairs, distances_m), dimension + _SPARE)
     weights = 1.0 / sigmas_m**2
     # Weights that differ by orders of magnitude would freeze the strong ones before the weak ones have turned.
     weights = np.minimum(weights / np.median(weights), 25.0)
-    for squeeze in _SQUEEZES:
+    for squeeze in squeezes:
         points = _relaxed(points, pairs, distances_m, weights, squeeze, dimension)
         points = _turned(points)
     return np.ascontiguousarray(points[:, :dimension])

@@ -36,6 +36,12 @@ class MovingTarget:
         elif self._cfg.motion == "waypoints" and self._cfg.waypoints_m:
             self._walk(self._cfg.speed_m_s * interval_s)
 
+    def approach(self, place_m: Point, travel_m: float) -> None:
+        """Go straight at a place, so far."""
+        dx_m, dy_m = place_m[0] - self.position_m[0], place_m[1] - self.position_m[1]
+        share = min(1.0, travel_m / max(hypot(dx_m, dy_m), 1e-9))
+        self.position_m = (self.position_m[0] + share * dx_m, self.position_m[1] + share * dy_m)
+
     def _wander(self, interval_s: float) -> None:
         self._course_rad += self._cfg.turn_sigma_rad_sqrt_s * sqrt(interval_s) * self._rng.standard_normal()
         travel_m = self._cfg.speed_m_s * interval_s
