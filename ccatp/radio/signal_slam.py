@@ -2,11 +2,10 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import cos, hypot, log, log10, sin, sqrt
+from math import cos, hypot, sin, sqrt
 
 import numpy as np
 
-from ccatp.angles import wrap_pi
 from ccatp.filters.base import FloatArray
 from ccatp.filters.ekf_slam import Columns, EkfSlam, Update, columns_of
 from ccatp.radio.motion import POSE, MotionModel, Odometry, Pose
@@ -14,16 +13,16 @@ from ccatp.radio.moving_radio import MovingRadio
 from ccatp.radio.path_loss import PathLoss
 from ccatp.radio.readings import BeaconId, RssiReading
 from ccatp.radio.shadowing_map import ShadowingMap
+from ccatp.radio.signal_newcomers import Guess, Newcomers, PoseKey, Record
+from ccatp.radio.signal_rows import PLACE, Rows, Sight, rows_of
 from ccatp.radio.slam import BeaconEstimate, Learned
 
-PLACE = 2  # x_m, y_m: the first states of a radio
 _ITERATIONS = 4
 _FIRST_ITERATIONS = 10
 _WIDE = 10.0  # spread of a radio before its first reading, in ranges of that reading
-_NEAREST_M = 0.02  # nearer than that neither level nor bearing has a derivative worth the name
-_DB_PER_NEPER = 10.0 / log(10.0)
-
-Linearise = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+_NEAREST_M = 0.02  # nearer than that a distance has no derivative worth the name
+_PLACED = 0.15  # of the range: a place that is this sure bends the model by about 1 % (second order)
+_MOST_WAITING = 16  # scans; each keeps three states until the radio joins
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +74,8 @@ class SignalSlam:
         P[range(POSE, v), range(POSE, v)] = sigmas**2
         self.engine = EkfSlam(mean, P)
         self.learned: list[Learned] = []
+        self.newcomers = Newcomers(self.engine)
+        self._guesses: dict[BeaconId, BeaconEstimate] = {}
 
     @property
     def pose(self) -> Pose:
@@ -89,7 +90,7 @@ class SignalSlam:
     @property
     def beacons(self) -> dict[BeaconId, BeaconEstimate]:
         """The map: places alone, x_m and y_m."""
-        return {beacon: self._place(beacon) for beacon in self._names()}
+        return {**self._guesses, **{beacon: self._place(beacon) for beacon in self._names()}}
 
     @property
     def calibration(self) -> dict[str, tuple[float, float]]:
@@ -109,18 +110,21 @@ class SignalSlam:
             moving.predict(self.engine, odometry.interval_s, travel_m)
 
     def observe(self, readings: Iterable[RssiReading]) -> list[Learned]:
-        """Take readings of any radios, one after the other; new ones join at their first bearing.
+        """Take readings of any radios, one after the other; new ones are placed when their readings suffice.
 
         A new radio of which no bearing is known is not used: a level alone is a circle.
         """
         self.learned = []
+        waiting = []
         for reading in readings:
             if reading.beacon in self.engine:
-                found = self._update(reading, _ITERATIONS, gated=True)
+                found = self._update(reading)
                 self.learned.append(Learned(reading.beacon, found.residual, found.nis, found.size, found.accepted))
+            elif not self._is_moving(reading.beacon):
+                waiting.append(reading)
             elif reading.bearing_rad is not None:
-                self._join(reading, reading.bearing_rad)
-                self._update(reading, _FIRST_ITERATIONS, gated=False)
+                self._meet(reading, reading.bearing_rad)
+        self._wait(waiting)
         return self.learned
 
     def remove(self, beacon: BeaconId) -> None:
@@ -129,6 +133,10 @@ class SignalSlam:
         Raises:
             BlockError: it is not on the map.
         """
+        if beacon in self._guesses:
+            self.newcomers.drop(beacon)
+            del self._guesses[beacon]
+            return
         self.engine.remove(beacon)
 
     def distance(self, beacon: BeaconId) -> tuple[float, float]:
@@ -159,68 +167,101 @@ class SignalSlam:
     def _is_moving(self, beacon: BeaconId) -> bool:
         return self.settings.moving is not None and beacon == self.settings.moving.beacon
 
-    def _join(self, reading: RssiReading, bearing_rad: float) -> None:
-        """At range and bearing, spread so widely that the reading alone places it."""
-        settings, pose = self.settings, self.pose
+    def _prior(self, reading: RssiReading, bearing_rad: float, pose: Sequence[float]) -> tuple[FloatArray, FloatArray]:
+        """Mean and standard deviations of a radio at a range and bearing, spread so widely that readings place it."""
+        settings = self.settings
         range_m = self.path_loss_of(reading.beacon).median_range_m(reading.rssi_dbm)
-        way_rad = pose.heading_rad + bearing_rad
-        place = [pose.x_m + range_m * cos(way_rad), pose.y_m + range_m * sin(way_rad)]
+        way_rad = pose[2] + bearing_rad
         spread = [_WIDE * range_m] * PLACE
         if self._is_moving(reading.beacon) and settings.moving is not None:
             spread += settings.moving.prior_sigmas
         elif settings.shadowing is not None:
             spread += [1.0] * settings.shadowing.size
         mean = np.zeros(len(spread))
-        mean[:PLACE] = place
+        mean[:PLACE] = pose[0] + range_m * cos(way_rad), pose[1] + range_m * sin(way_rad)
+        return mean, np.array(spread)
+
+    def _augment(self, beacon: BeaconId, mean: FloatArray, spread: FloatArray) -> None:
         none: Columns = np.empty(0, dtype=np.intp)
-        self.engine.augment(
-            reading.beacon, mean, none, np.zeros((mean.size, 0)), np.eye(mean.size), np.diag(np.square(spread))
+        covariance = np.diag(spread**2)
+        self.engine.augment(beacon, mean, none, np.zeros((mean.size, 0)), np.eye(mean.size), covariance)
+
+    def _meet(self, reading: RssiReading, bearing_rad: float) -> None:
+        """The radio that moves joins at once: it would be elsewhere later."""
+        self._augment(reading.beacon, *self._prior(reading, bearing_rad, self.pose))
+        rows = self._rows([self._sight(reading, 0)], reading.beacon, self.engine.block(reading.beacon))
+        self.engine.update_iterated(rows.columns, rows.linearise, rows.variances, _FIRST_ITERATIONS)
+
+    def _wait(self, readings: list[RssiReading]) -> None:
+        """Readings of static radios that are not on the map yet."""
+        if not readings:
+            return
+        pose = self.newcomers.keep_pose()
+        for reading in readings:
+            self.newcomers.add(reading, pose)
+        for reading in readings:
+            records = self.newcomers.records(reading.beacon)
+            first = next((record for record in records if record.reading.bearing_rad is not None), None)
+            if first is None:
+                continue  # a level alone is a circle
+            start, spread = self._start(first)
+            guess = self.newcomers.guess(reading.beacon, start, spread, self._rows_at)
+            self._guesses[reading.beacon] = BeaconEstimate(guess.mean[:PLACE], guess.covariance[:PLACE, :PLACE])
+            if len(records) >= _MOST_WAITING or self._is_placed(reading.beacon):
+                self._settle(reading.beacon, start, spread, guess)
+
+    def _start(self, first: Record) -> tuple[FloatArray, FloatArray]:
+        bearing_rad = first.reading.bearing_rad or 0.0
+        return self._prior(first.reading, bearing_rad, self.engine.mean[self.engine.block(first.pose)].tolist())
+
+    def _is_placed(self, beacon: BeaconId) -> bool:
+        """Whether the place is so sure that its error does not bend the model."""
+        estimate, pose = self._guesses[beacon], self.pose
+        range_m = hypot(estimate.mean[0] - pose.x_m, estimate.mean[1] - pose.y_m)
+        return float(np.linalg.eigvalsh(estimate.covariance)[-1]) < (_PLACED * range_m) ** 2
+
+    def _settle(self, beacon: BeaconId, start: FloatArray, spread: FloatArray, guess: Guess) -> None:
+        """A radio joins the map with all that waits of it; the rest of the state learns from it, too.
+
+        The model is linearised at the guess: from the prior the way there is long, and not safe without its damping.
+        """
+        self._augment(beacon, start, spread)
+        rows = self._rows_at(
+            self.newcomers.records(beacon), lambda key: self.engine.block(key).start, self.engine.block(beacon)
         )
+        prior, x = self.engine.mean, self.engine.mean.copy()
+        x[guess.poses], x[self.engine.block(beacon)] = guess.poses_mean, guess.mean
+        residual, H = rows.linearise(x)
+        self.engine.update(rows.columns, H, residual + H @ (x - prior)[rows.columns], rows.variances)
+        self.newcomers.drop(beacon)
+        del self._guesses[beacon]
 
-    def _update(self, reading: RssiReading, iterations: int, *, gated: bool) -> Update:
-        block = self.engine.block(reading.beacon)
-        shadow, rest_db2 = self._shadow(reading.beacon)
-        of_radio = range(block.start, block.start + PLACE)
-        columns = columns_of(range(POSE), of_radio, range(block.stop - shadow.size, block.stop))
-        path_loss = self.path_loss_of(reading.beacon)
-        variances = [path_loss.sigma_db**2 + rest_db2]
-        if reading.bearing_rad is not None:
-            variances.append(self.settings.bearing_sigma_rad**2)
-        gate = self.settings.gates[len(variances) - 1] if gated else np.inf
-        linearise = _linearised(reading, path_loss, columns, shadow)
-        return self.engine.update_iterated(columns, linearise, np.array(variances), iterations, gate)
+    def _update(self, reading: RssiReading) -> Update:
+        rows = self._rows([self._sight(reading, 0)], reading.beacon, self.engine.block(reading.beacon))
+        gate = self.settings.gates[rows.variances.size - 1]
+        return self.engine.update_iterated(rows.columns, rows.linearise, rows.variances, _ITERATIONS, gate)
 
-    def _shadow(self, beacon: BeaconId) -> tuple[FloatArray, float]:
+    def _rows_at(self, records: list[Record], pose_at: Callable[[PoseKey], int], radio: slice) -> Rows:
+        sights = []
+        for record in records:
+            place = self.engine.block(record.pose).start
+            sights.append(self._sight(record.reading, place)._replace(pose=pose_at(record.pose)))
+        return self._rows(sights, records[0].reading.beacon, radio)
+
+    def _rows(self, sights: list[Sight], beacon: BeaconId, radio: slice) -> Rows:
+        return rows_of(sights, radio, self.path_loss_of(beacon), self.settings.bearing_sigma_rad)
+
+    def _sight(self, reading: RssiReading, pose: int) -> Sight:
+        """A reading taken at the pose that begins at a column."""
+        x_m, y_m = self.engine.mean[pose : pose + PLACE].tolist()
+        shadow, rest_db2 = self._shadow(reading.beacon, x_m, y_m)
+        return Sight(reading, pose, shadow, self.path_loss_of(reading.beacon).sigma_db ** 2 + rest_db2)
+
+    def _shadow(self, beacon: BeaconId, x_m: float, y_m: float) -> tuple[FloatArray, float]:
         """Derivatives of a level by the shadowing states, which end a radio's block, and the variance of the rest."""
         settings = self.settings
         if self._is_moving(beacon) and settings.moving is not None:
             return settings.moving.shadowing_row, 0.0
         if settings.shadowing is None:
             return np.empty(0), settings.shadowing_sigma_db**2
-        pose = self.pose
-        return settings.shadowing.row(pose.x_m, pose.y_m)
-
-
-def _linearised(reading: RssiReading, path_loss: PathLoss, columns: Columns, shadow: FloatArray) -> Linearise:
-    """Residual and Jacobian of a reading over pose, place and shadowing, as functions of the state."""
-    slope = _DB_PER_NEPER * path_loss.exponent
-    size = columns.size
-
-    def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        values = x.take(columns)
-        px, py, heading, bx, by = values[: POSE + PLACE].tolist()
-        dx, dy = bx - px, by - py
-        r = max(hypot(dx, dy), _NEAREST_M)
-        q = r * r
-        expected = path_loss.reference_dbm - 10.0 * path_loss.exponent * log10(r)
-        expected += float(shadow @ values[POSE + PLACE :])
-        H = np.zeros((1 if reading.bearing_rad is None else 2, size))
-        H[0, : POSE + PLACE] = slope * dx / q, slope * dy / q, 0.0, -slope * dx / q, -slope * dy / q
-        H[0, POSE + PLACE :] = shadow
-        if reading.bearing_rad is None:
-            return np.array((reading.rssi_dbm - expected,)), H
-        H[1, : POSE + PLACE] = dy / q, -dx / q, -1.0, -dy / q, dx / q
-        off_rad = wrap_pi(reading.bearing_rad - (np.arctan2(dy, dx) - heading))
-        return np.array((reading.rssi_dbm - expected, off_rad)), H
-
-    return linearise
+        return settings.shadowing.row(x_m, y_m)
