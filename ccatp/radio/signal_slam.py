@@ -13,16 +13,15 @@ from ccatp.radio.moving_radio import MovingRadio
 from ccatp.radio.path_loss import PathLoss
 from ccatp.radio.readings import BeaconId, RssiReading
 from ccatp.radio.shadowing_map import ShadowingMap
-from ccatp.radio.signal_newcomers import Guess, Newcomers, PoseKey, Record
+from ccatp.radio.signal_newcomers import Newcomers, PoseKey, Prior, Record
 from ccatp.radio.signal_rows import PLACE, Rows, Sight, rows_of
 from ccatp.radio.slam import BeaconEstimate, Learned
 
+_POSE_COLUMNS = columns_of(range(POSE))
 _ITERATIONS = 4
 _FIRST_ITERATIONS = 10
 _WIDE = 10.0  # spread of a radio before its first reading, in ranges of that reading
 _NEAREST_M = 0.02  # nearer than that a distance has no derivative worth the name
-_PLACED = 0.15  # of the range: a place that is this sure bends the model by about 1 % (second order)
-_MOST_WAITING = 16  # scans; each keeps three states until the radio joins
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +36,8 @@ class SignalSettings:
         shadowing_sigma_db: standard deviation of static shadowing; 0: none.
         shadowing: its map, for static radios; None: what there is of it counts as white noise.
         moving: the radio that moves; None without one.
+        placed_share: a new static radio joins when its place is this sure, as a share of its range ...
+        waiting_scans: ... or when as many readings wait; each scan keeps three states until then.
         gates: largest normalised innovation squared that is used, of one row and of two.
     """
 
@@ -47,6 +48,8 @@ class SignalSettings:
     shadowing_sigma_db: float
     shadowing: ShadowingMap | None
     moving: MovingRadio | None
+    placed_share: float
+    waiting_scans: int
     gates: tuple[float, float]
 
 
@@ -75,22 +78,25 @@ class SignalSlam:
         self.engine = EkfSlam(mean, P)
         self.learned: list[Learned] = []
         self.newcomers = Newcomers(self.engine)
-        self._guesses: dict[BeaconId, BeaconEstimate] = {}
 
     @property
     def pose(self) -> Pose:
         """The vehicle; the heading does not wrap."""
-        return Pose(*self.engine.mean[:POSE].tolist())
+        return Pose(*self.newcomers.conditioned(_POSE_COLUMNS)[0].tolist())
 
     @property
     def pose_covariance(self) -> FloatArray:
         """Of x_m, y_m, heading_rad, shape (3, 3)."""
-        return self.engine.covariance[:POSE, :POSE].copy()
+        return self.newcomers.conditioned(_POSE_COLUMNS)[1]
 
     @property
     def beacons(self) -> dict[BeaconId, BeaconEstimate]:
         """The map: places alone, x_m and y_m."""
-        return {**self._guesses, **{beacon: self._place(beacon) for beacon in self._names()}}
+        found = {
+            beacon: BeaconEstimate(guess.mean[:PLACE], guess.covariance[:PLACE, :PLACE])
+            for beacon, guess in self.newcomers.guesses.items()
+        }
+        return found | {beacon: self._place(beacon) for beacon in self._names()}
 
     @property
     def calibration(self) -> dict[str, tuple[float, float]]:
@@ -133,9 +139,8 @@ class SignalSlam:
         Raises:
             BlockError: it is not on the map.
         """
-        if beacon in self._guesses:
+        if beacon in self.newcomers.names:
             self.newcomers.drop(beacon)
-            del self._guesses[beacon]
             return
         self.engine.remove(beacon)
 
@@ -147,10 +152,11 @@ class SignalSlam:
         """
         start = self.engine.block(beacon).start
         columns = columns_of(range(PLACE), range(start, start + PLACE))
-        x, y, bx, by = self.engine.mean.take(columns).tolist()
+        mean, covariance = self.newcomers.conditioned(columns)
+        x, y, bx, by = mean.tolist()
         r = max(hypot(bx - x, by - y), _NEAREST_M)
-        ux, uy = (bx - x) / r, (by - y) / r
-        return r, sqrt(max(self.engine.spread(columns, np.array((-ux, -uy, ux, uy))), 0.0))
+        h = np.array((x - bx, y - by, bx - x, by - y)) / r
+        return r, sqrt(max(float(h @ covariance @ h), 0.0))
 
     def path_loss_of(self, beacon: BeaconId) -> PathLoss:
         """The calibration of a radio."""
@@ -161,14 +167,13 @@ class SignalSlam:
 
     def _place(self, beacon: BeaconId) -> BeaconEstimate:
         start = self.engine.block(beacon).start
-        place = slice(start, start + PLACE)
-        return BeaconEstimate(self.engine.mean[place].copy(), self.engine.covariance[place, place].copy())
+        return BeaconEstimate(*self.newcomers.conditioned(columns_of(range(start, start + PLACE))))
 
     def _is_moving(self, beacon: BeaconId) -> bool:
         return self.settings.moving is not None and beacon == self.settings.moving.beacon
 
-    def _prior(self, reading: RssiReading, bearing_rad: float, pose: Sequence[float]) -> tuple[FloatArray, FloatArray]:
-        """Mean and standard deviations of a radio at a range and bearing, spread so widely that readings place it."""
+    def _prior(self, reading: RssiReading, bearing_rad: float, pose: Sequence[float]) -> Prior:
+        """A radio at a range and bearing, spread so widely that readings alone place it."""
         settings = self.settings
         range_m = self.path_loss_of(reading.beacon).median_range_m(reading.rssi_dbm)
         way_rad = pose[2] + bearing_rad
@@ -179,16 +184,16 @@ class SignalSlam:
             spread += [1.0] * settings.shadowing.size
         mean = np.zeros(len(spread))
         mean[:PLACE] = pose[0] + range_m * cos(way_rad), pose[1] + range_m * sin(way_rad)
-        return mean, np.array(spread)
+        return Prior(mean, np.array(spread))
 
-    def _augment(self, beacon: BeaconId, mean: FloatArray, spread: FloatArray) -> None:
+    def _augment(self, beacon: BeaconId, prior: Prior) -> None:
         none: Columns = np.empty(0, dtype=np.intp)
-        covariance = np.diag(spread**2)
-        self.engine.augment(beacon, mean, none, np.zeros((mean.size, 0)), np.eye(mean.size), covariance)
+        size = prior.mean.size
+        self.engine.augment(beacon, prior.mean, none, np.zeros((size, 0)), np.eye(size), np.diag(prior.sigmas**2))
 
     def _meet(self, reading: RssiReading, bearing_rad: float) -> None:
         """The radio that moves joins at once: it would be elsewhere later."""
-        self._augment(reading.beacon, *self._prior(reading, bearing_rad, self.pose))
+        self._augment(reading.beacon, self._prior(reading, bearing_rad, self.engine.mean[:POSE].tolist()))
         rows = self._rows([self._sight(reading, 0)], reading.beacon, self.engine.block(reading.beacon))
         self.engine.update_iterated(rows.columns, rows.linearise, rows.variances, _FIRST_ITERATIONS)
 
@@ -199,42 +204,44 @@ class SignalSlam:
         pose = self.newcomers.keep_pose()
         for reading in readings:
             self.newcomers.add(reading, pose)
-        for reading in readings:
-            records = self.newcomers.records(reading.beacon)
-            first = next((record for record in records if record.reading.bearing_rad is not None), None)
-            if first is None:
-                continue  # a level alone is a circle
-            start, spread = self._start(first)
-            guess = self.newcomers.guess(reading.beacon, start, spread, self._rows_at)
-            self._guesses[reading.beacon] = BeaconEstimate(guess.mean[:PLACE], guess.covariance[:PLACE, :PLACE])
-            if len(records) >= _MOST_WAITING or self._is_placed(reading.beacon):
-                self._settle(reading.beacon, start, spread, guess)
+        priors = {}
+        for beacon in self.newcomers.names:
+            with_bearing = (r for r in self.newcomers.records(beacon) if r.reading.bearing_rad is not None)
+            if first := next(with_bearing, None):  # a level alone is a circle
+                at = self.engine.mean[self.engine.block(first.pose)].tolist()
+                priors[beacon] = self._prior(first.reading, first.reading.bearing_rad or 0.0, at)
+        if not priors:
+            return
+        self.newcomers.solve(priors, self._rows_at)
+        ready = [beacon for beacon in priors if self._is_ready(beacon)]
+        for beacon in ready:
+            self._settle(beacon, priors[beacon])
+        if left := {beacon: prior for beacon, prior in priors.items() if beacon not in ready and ready}:
+            self.newcomers.solve(left, self._rows_at)
 
-    def _start(self, first: Record) -> tuple[FloatArray, FloatArray]:
-        bearing_rad = first.reading.bearing_rad or 0.0
-        return self._prior(first.reading, bearing_rad, self.engine.mean[self.engine.block(first.pose)].tolist())
+    def _is_ready(self, beacon: BeaconId) -> bool:
+        """Whether a place is so sure that its error does not bend the model, or enough waits."""
+        if len(self.newcomers.records(beacon)) >= self.settings.waiting_scans:
+            return True
+        guess, pose = self.newcomers.guesses[beacon], self.engine.mean
+        range_m = hypot(guess.mean[0] - pose[0], guess.mean[1] - pose[1])
+        largest = float(np.linalg.eigvalsh(guess.covariance[:PLACE, :PLACE])[-1])
+        return largest < (self.settings.placed_share * range_m) ** 2
 
-    def _is_placed(self, beacon: BeaconId) -> bool:
-        """Whether the place is so sure that its error does not bend the model."""
-        estimate, pose = self._guesses[beacon], self.pose
-        range_m = hypot(estimate.mean[0] - pose.x_m, estimate.mean[1] - pose.y_m)
-        return float(np.linalg.eigvalsh(estimate.covariance)[-1]) < (_PLACED * range_m) ** 2
-
-    def _settle(self, beacon: BeaconId, start: FloatArray, spread: FloatArray, guess: Guess) -> None:
+    def _settle(self, beacon: BeaconId, prior: Prior) -> None:
         """A radio joins the map with all that waits of it; the rest of the state learns from it, too.
 
         The model is linearised at the guess: from the prior the way there is long, and not safe without its damping.
         """
-        self._augment(beacon, start, spread)
+        self._augment(beacon, prior)
         rows = self._rows_at(
             self.newcomers.records(beacon), lambda key: self.engine.block(key).start, self.engine.block(beacon)
         )
-        prior, x = self.engine.mean, self.engine.mean.copy()
-        x[guess.poses], x[self.engine.block(beacon)] = guess.poses_mean, guess.mean
+        x = self.newcomers.linearisation(beacon)
         residual, H = rows.linearise(x)
-        self.engine.update(rows.columns, H, residual + H @ (x - prior)[rows.columns], rows.variances)
+        off = residual + H @ (x - self.engine.mean)[rows.columns]
+        self.engine.update(rows.columns, H, off, rows.variances)
         self.newcomers.drop(beacon)
-        del self._guesses[beacon]
 
     def _update(self, reading: RssiReading) -> Update:
         rows = self._rows([self._sight(reading, 0)], reading.beacon, self.engine.block(reading.beacon))
