@@ -4,7 +4,15 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ccatp.config.models import Model, NonNegative, Pair, PidConfig, Positive
+from ccatp.config.beacon_models import (
+    BeaconDangerConfig,
+    BeaconMissionConfig,
+    BeaconRobotConfig,
+    IncidentConfig,
+    ListenerConfig,
+    SimBeaconRobotConfig,
+)
+from ccatp.config.models import Model, NonNegative, ObservatoryConfig, Pair, PidConfig, Positive, ProcessesConfig
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
@@ -230,6 +238,8 @@ class RadioSimConfig(Model):
     target: SimTargetConfig
     obstacles: tuple[SimObstacleConfig, ...]
     range_sigma_m: NonNegative
+    robot: SimBeaconRobotConfig
+    incidents: tuple[IncidentConfig, ...]
 
 
 class RadioConfig(Model):
@@ -248,4 +258,10 @@ class RadioConfig(Model):
     control: RadioControlConfig
     follow: FollowConfig
     avoidance: AvoidanceConfig
+    listener: ListenerConfig
+    mission: BeaconMissionConfig
+    danger: BeaconDangerConfig
+    robot: BeaconRobotConfig
+    processes: ProcessesConfig
+    observatory: ObservatoryConfig
     sim: RadioSimConfig
