@@ -1,6 +1,6 @@
 """Pure. Static radios that are not on the map yet: their readings wait, with the poses they were taken at."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +9,7 @@ from ccatp.filters.base import FloatArray
 from ccatp.filters.ekf_slam import Columns, EkfSlam, columns_of
 from ccatp.radio.motion import POSE
 from ccatp.radio.readings import BeaconId, RssiReading
-from ccatp.radio.signal_rows import PLACE, Rows
+from ccatp.radio.signal_rows import Rows
 
 _ITERATIONS = 12
 _SETTLED_M = 1e-3
@@ -139,19 +139,16 @@ class Newcomers:
         }
         means = {b: self.guesses[b].mean if b in self.guesses else prior.mean for b, prior in priors.items()}
         poses = c
-        for _ in range(_ITERATIONS):
+        for _ in range(_ITERATIONS - 1):
             shares = {b: _eliminated(rows[b], poses, means[b], prior) for b, prior in priors.items()}
-            stack = np.vstack([_whitened(share) for share in shares.values()])
-            poses, covariance = _conditioned(c, P, stack)
-            moved_m = 0.0
-            for beacon, share in shares.items():
-                step = priors[beacon].mean + share.gain @ (share.y - share.H @ poses) - means[beacon]
-                far_m = float(np.hypot(*step[:PLACE]))
-                means[beacon] = means[beacon] + step * min(1.0, _FARTHEST_STEP_M / max(far_m, 1e-9))
-                moved_m = max(moved_m, far_m)
-            if moved_m < _SETTLED_M:
+            poses, _ = _conditioned(c, P, _stacked(shares.values()))
+            if _advance(means, shares, priors, poses) < _SETTLED_M:
                 break
-        self._poses, self._rows = poses, np.linalg.qr(stack, mode="r") if len(stack) > c.size else stack
+        shares = {b: _eliminated(rows[b], poses, means[b], prior) for b, prior in priors.items()}
+        stack = _stacked(shares.values())
+        poses, covariance = _conditioned(c, P, stack)
+        _advance(means, shares, priors, poses)
+        self._poses, self._rows = poses, _compressed(stack)
         for beacon, share in shares.items():
             carried = share.gain @ share.H
             spread = share.covariance + carried @ covariance @ carried.T
@@ -198,12 +195,34 @@ def _eliminated(rows: Rows, poses: FloatArray, mean: FloatArray, prior: Prior) -
     gain = np.linalg.solve(S, G * variances).T
     y = residual + H @ poses + G @ (mean - prior.mean)
     covariance = np.diag(variances) - gain @ (G * variances)
-    return _Share(H, y, root, gain, covariance)
+    return _Share(H, y, np.asarray(root), np.asarray(gain), covariance)
 
 
-def _whitened(share: _Share) -> FloatArray:
-    """H and, last, y with noise of unit variance, shape (m, p + 1)."""
-    return np.linalg.solve(share.root, np.column_stack([share.H, share.y]))
+def _advance(
+    means: dict[BeaconId, FloatArray], shares: Mapping[BeaconId, _Share], priors: Mapping[BeaconId, Prior],
+    poses: FloatArray,
+) -> float:  # fmt: skip
+    """Move the radios to where they are most probable for the poses; the longest of their ways, m."""
+    farthest_m = 0.0
+    for beacon, share in shares.items():
+        step = priors[beacon].mean + share.gain @ (share.y - share.H @ poses) - means[beacon]
+        way_m = float(np.hypot(step[0], step[1]))
+        means[beacon] = means[beacon] + step * min(1.0, _FARTHEST_STEP_M / max(way_m, 1e-9))
+        farthest_m = max(farthest_m, way_m)
+    return farthest_m
+
+
+def _stacked(shares: Iterable[_Share]) -> FloatArray:
+    """H and, last, y of all radios with noise of unit variance, shape (m, p + 1)."""
+    parts = [np.linalg.solve(share.root, np.column_stack([share.H, share.y])) for share in shares]
+    return np.asarray(np.vstack(parts), dtype=np.float64)
+
+
+def _compressed(stack: FloatArray) -> FloatArray:
+    """No more rows than columns that say the same."""
+    if stack.shape[0] <= stack.shape[1]:
+        return stack
+    return np.asarray(np.linalg.qr(stack, mode="r"), dtype=np.float64)
 
 
 def _conditioned(c: FloatArray, P: FloatArray, stack: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -211,4 +230,4 @@ def _conditioned(c: FloatArray, P: FloatArray, stack: FloatArray) -> tuple[Float
     H, y = stack[:, :-1], stack[:, -1]
     cross = P @ H.T
     gain = np.linalg.solve(H @ cross + np.eye(len(y)), cross.T).T
-    return c + gain @ (y - H @ c), P - gain @ cross.T
+    return np.asarray(c + gain @ (y - H @ c)), np.asarray(P - gain @ cross.T)
