@@ -3,6 +3,9 @@
 import click
 
 from ccatp.cli_frame import SuggestingGroup, example
+from ccatp.cli_radio_calibrate import calibrate
+from ccatp.cli_radio_fix import fix
+from ccatp.cli_radio_fuzzy import fuzzy
 from ccatp.cli_radio_slam import slam
 
 
@@ -12,3 +15,6 @@ def radio() -> None:
 
 
 radio.add_command(slam)
+radio.add_command(calibrate)
+radio.add_command(fix)
+radio.add_command(fuzzy)
