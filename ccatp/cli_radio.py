@@ -6,6 +6,7 @@ from ccatp.cli_frame import SuggestingGroup, example
 from ccatp.cli_radio_calibrate import calibrate
 from ccatp.cli_radio_fix import fix
 from ccatp.cli_radio_fuzzy import fuzzy
+from ccatp.cli_radio_map import radio_map
 from ccatp.cli_radio_slam import slam
 
 
@@ -18,3 +19,4 @@ radio.add_command(slam)
 radio.add_command(calibrate)
 radio.add_command(fix)
 radio.add_command(fuzzy)
+radio.add_command(radio_map)

@@ -186,5 +186,5 @@ def _check_connected(network: RangeNetwork) -> None:
 
 def _parts_known(network: RangeNetwork, labels: IntArray) -> bool:
     """Whether every part has known coordinates of its own to hang on."""
-    has_known = np.isfinite(network.known_m).all(axis=1)
-    return all(bool(has_known[labels == part].sum() >= network.dimension) for part in range(labels.max() + 1))
+    known = np.flatnonzero(np.isfinite(network.known_m).all(axis=1))
+    return bool((np.bincount(labels[known], minlength=int(labels.max()) + 1) >= network.dimension).all())

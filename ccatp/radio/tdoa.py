@@ -74,8 +74,8 @@ def range_sigma(
 ) -> float:
     """Standard deviation of the mean of repeated ranges.
 
-    sigma^2 = sigma_1^2 / n + (d sigma_T / (2 T))^2: repeating lessens the noise of a reading, not what a wrong thermometer
-    does, dc/c = dT / (2 T).
+    sigma^2 = sigma_1^2 / n + (d sigma_T / (2 T))^2: repeating lessens the noise of a reading, not what a wrong
+    thermometer does, dc/c = dT / (2 T).
 
     Args:
         sigma_m: of one reading.
