@@ -234,7 +234,8 @@ class _Run:
             context.destroy(linger=0)
         (self._run_dir / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
         self._log.info("end", status=int(status))
-        view.show_summary(summary, as_json=self._options.json_output)
+        if self._options.shows_summary:
+            view.show_summary(summary, as_json=self._options.json_output)
         return int(status)
 
     def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
