@@ -12,6 +12,7 @@ import ccatp
 from ccatp.cli_align import align
 from ccatp.cli_bench import bench
 from ccatp.cli_calibrate import calibrate
+from ccatp.cli_check import check
 from ccatp.cli_conformance import conformance
 from ccatp.cli_frame import (
     ADDRESS_OPTIONS,
@@ -308,6 +309,7 @@ cli.add_command(align)
 cli.add_command(bench)
 cli.add_command(keys)
 cli.add_command(calibrate)
+cli.add_command(check)
 cli.add_command(log)
 cli.add_command(stream)
 cli.add_command(plan)

@@ -69,8 +69,8 @@ def run_survey(options: RunOptions) -> int:
     with ExitStack() as stack:
         runtime_dir = make_runtime_dir(str(options.runtime_dir or cfg.run.runtime_dir), os.environ)
         stack.enter_context(_lock(runtime_dir / "lock", "--runtime-dir"))
-        sockets = {p.name: stack.enter_context(_listen(cfg, p)) for p in _processes(options) if p.listens}
-        cfg = _with_addresses(cfg, sockets) if options.sim else cfg
+        sockets = {p.name: stack.enter_context(listen(cfg, p)) for p in _processes(options) if p.listens}
+        cfg = with_addresses(cfg, sockets) if options.sim else cfg
         run_dir = _make_run_dir(options, cfg)
         stack.enter_context(_lock(run_dir / ".lock", "--run-dir"))
         (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
@@ -114,7 +114,12 @@ def _lock(path: Path, option: str) -> Iterator[None]:
 
 
 @contextmanager
-def _listen(cfg: Config, process: ProcessSpec) -> Iterator[socket.socket]:
+def listen(cfg: Config, process: ProcessSpec) -> Iterator[socket.socket]:
+    """The listening socket of a stand-in, which inherits it.
+
+    Raises:
+        ConfigError: the port is taken.
+    """
     section = cfg.sim.robot if process.listens == "sim.robot" else cfg.sim.etalon
     with socket.socket() as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -129,7 +134,7 @@ def _listen(cfg: Config, process: ProcessSpec) -> Iterator[socket.socket]:
         yield listener
 
 
-def _with_addresses(cfg: Config, sockets: dict[str, socket.socket]) -> Config:
+def with_addresses(cfg: Config, sockets: dict[str, socket.socket]) -> Config:
     """The configuration with the addresses at which the stand-ins really listen."""
 
     def at(process: str) -> dict[str, object]:

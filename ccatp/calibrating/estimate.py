@@ -187,7 +187,7 @@ class _Problem:
             rows, residuals = self._whitened(x, carried, slip_sigma)
             step, *_ = np.linalg.lstsq(rows, residuals, rcond=None)
             left = residuals - rows @ step
-            return float(np.sum(left**2)) - (rows.shape[0] - rows.shape[1])
+            return float(np.sum(left**2)) - int(rows.shape[0] - rows.shape[1])
 
         if excess(0.0) <= 0.0:
             return 0.0

@@ -97,7 +97,7 @@ def test_the_commands_are_those_of_the_contract_the_map_and_the_conformance() ->
         "run", "status", "pause", "resume", "abort", "stop", "emergency",
         "sim", "sim robot", "sim etalon", "config", "config check", "config schema", "study", "replay", "bench",
         "keys", "keys generate", "keys show-public", "clear", "align", "plan",
-        "log", "log info", "log recover", "stream", "calibrate",
+        "log", "log info", "log recover", "stream", "calibrate", "check",
     }  # fmt: skip
 
 
