@@ -44,7 +44,7 @@ def test_somebody_else_there() -> None:
 
         thread = threading.Thread(target=greet)
         thread.start()
-        cfg = load_config(None, {"robot.port": server.getsockname()[1], "robot.connect_timeout_s": 2.0})
+        cfg = load_config(None, {"robot.port": server.getsockname()[1], "robot.connect_timeout_s": 0.5})
         robot = by_name(asyncio.run(probe_robot(cfg, build_mirror(cfg.mirror))))
         thread.join()
     assert robot["robot link"].outcome is Outcome.FAIL
