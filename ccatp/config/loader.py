@@ -10,12 +10,12 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-import ccatp
 from ccatp.config.checks import check_config, is_file_name
 from ccatp.config.messages import Fault, choice_hint, faults_of
 from ccatp.config.models import Config, MirrorConfig, WorldConfig
 from ccatp.config.toml_text import Key, find_line, format_key, format_toml, format_value
 from ccatp.errors import ConfigError
+from ccatp.package import configs_dir
 
 Tree = dict[str, Any]
 
@@ -64,10 +64,8 @@ class Source:
 
 
 def shipped_config_dir() -> Path:
-    """The folder of the configurations that come with ccatp: in the package once installed, beside it in a checkout."""
-    package = Path(ccatp.__file__).resolve().parent
-    inside = package / "configs"
-    return inside if inside.is_dir() else package.parent / "configs"
+    """The folder of the configurations that come with ccatp."""
+    return configs_dir()
 
 
 def load_config(
