@@ -101,6 +101,17 @@ def test_levels_are_there_each_time(view: View) -> None:
         }  # fmt: skip
 
 
+def test_the_next_point_is_known_on_the_way_to_other_stops_too(view: View, mirror: Mirror) -> None:
+    view.hear(mission(point="1-2-9"), 1.0)
+    assert view.news(1.0)["mission"]["next_point"] == "1-2-9"
+    view.hear(mission(point=""), 1.1)
+    assert view.news(1.1)["mission"]["next_point"] == "1-2-7"
+    view.hear(fix_at(mirror, view.points[0], 0.0), 1.2)
+    assert view.news(1.2)["mission"]["next_point"] == "1-2-8"
+    view.hear(mission(point="", outcome="stopped"), 1.3)
+    assert view.news(1.3)["mission"]["next_point"] == ""
+
+
 def test_a_status_gets_stale(view: View) -> None:
     view.hear(mission(), 1.0)
     assert not view.news(1.9)["mission"]["is_stale"]
