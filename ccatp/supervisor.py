@@ -20,7 +20,7 @@ from ccatp.config.models import Config
 from ccatp.dashboard.token_file import read_token
 from ccatp.errors import ConfigError, ExitStatus, RefusedError
 from ccatp.processes.children import Children, ProcessSpec
-from ccatp.processes.common import FAULTS_FILE, Endpoints, open_log
+from ccatp.processes.common import FAULTS_FILE, RUN_DIR_FILE, Endpoints, open_log
 from ccatp.processes.observing import check_observatory
 from ccatp.processes.page_socket import PageSocket, note_run_dir, open_page_socket
 from ccatp.processes.run_collector import RunCollector
@@ -92,6 +92,7 @@ def run_survey(options: RunOptions) -> int:
         run_dir = _make_run_dir(options, cfg)
         stack.enter_context(_lock(run_dir / ".lock", "--run-dir"))
         (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
+        (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
         note_run_dir(runtime_dir, run_dir)
@@ -250,7 +251,21 @@ class _Run:
         (self._run_dir / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
         self._log.info("end", status=int(status))
         view.show_summary(summary, as_json=self._options.json_output)
+        view.show_report(self._report(status))
         return int(status)
+
+    def _report(self, status: ExitStatus) -> Path | None:
+        """The run's report, where there is time to write one; it never fails the run."""
+        if status is ExitStatus.INTERRUPTED:
+            return None  # somebody is waiting for the end
+        from ccatp.report_writer import report_run  # noqa: PLC0415 - nothing of it is needed while the robot moves
+
+        try:
+            return report_run(self._run_dir)[0]
+        except Exception as error:
+            # Whatever it is, the survey is done and its record is on the disk.
+            self._log.error("report", error=str(error))
+            return None
 
     def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
         self._is_interrupted = True

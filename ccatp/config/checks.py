@@ -24,7 +24,7 @@ from ccatp.config.models import (
 from ccatp.config.toml_text import Key
 
 FILTERS = ("kf", "ekf", "ukf")
-ORDERS = ("thesis", "optimised")
+ORDERS = ("thesis", "optimised", "calibration")
 
 MIN_COLLIMATORS = 4  # three unknowns and one length to spare, interface control document 2
 _LARGEST_LENGTH_M = 2.0  # no length outside the mirror's own files reaches it

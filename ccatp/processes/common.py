@@ -20,6 +20,8 @@ from ccatp.processes.log_stream import LogStream
 PR_SET_PDEATHSIG = 1
 # The copy of the fault plan in the run directory.
 FAULTS_FILE = "faults.toml"
+# In the runtime directory: the run directory of the run that goes on there, or of the last one.
+RUN_DIR_FILE = "run_dir"
 # In this variable the supervisor tells its children who it is.
 SUPERVISOR_PID = "CCATP_SUPERVISOR_PID"
 

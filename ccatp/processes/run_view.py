@@ -43,6 +43,7 @@ class RunView:
         """Say what runs."""
         self._console: Console = _PatientConsole(stderr=True, highlight=False)
         self._is_terminal = self._console.is_terminal
+        self._run_dir = run_dir
         self._has_pose = False
         self._told_tenths = 0
         what = "SIMULATION" if is_sim else "survey"
@@ -102,6 +103,11 @@ class RunView:
         else:
             sys.stdout.write(format_table(summary) + "\n")
         sys.stdout.flush()
+
+    def show_report(self, path: Path | None) -> None:
+        """Where the report is, or how to make it; on standard error, so that JSON stays alone."""
+        where = f"report  {path}" if path is not None else f"report  none; make it with: ccatp report {self._run_dir}"
+        self._console.print(where, soft_wrap=True, markup=False)
 
 
 def _clock(seconds: float) -> str:
