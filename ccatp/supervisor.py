@@ -22,6 +22,7 @@ from ccatp.processes.children import Children, ProcessSpec
 from ccatp.processes.common import FAULTS_FILE, Endpoints, open_log
 from ccatp.processes.observing import check_observatory
 from ccatp.processes.run_collector import RunCollector
+from ccatp.processes.run_report import write_run_report
 from ccatp.processes.run_view import RunView
 from ccatp.processes.service import Service
 from ccatp.restarts import Decision, Fate
@@ -234,21 +235,8 @@ class _Run:
         (self._run_dir / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
         self._log.info("end", status=int(status))
         view.show_summary(summary, as_json=self._options.json_output)
-        view.show_report(self._report(status))
+        view.show_report(write_run_report(self._run_dir, status, self._log))
         return int(status)
-
-    def _report(self, status: ExitStatus) -> Path | None:
-        """The run's report, where there is time to write one; it never fails the run."""
-        if status is ExitStatus.INTERRUPTED:
-            return None  # somebody is waiting for the end
-        from ccatp.report_writer import report_run  # noqa: PLC0415 - nothing of it is needed while the robot moves
-
-        try:
-            return report_run(self._run_dir)[0]
-        except Exception as error:
-            # Whatever it is, the survey is done and its record is on the disk.
-            self._log.error("report", error=str(error))
-            return None
 
     def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
         self._is_interrupted = True
