@@ -12,6 +12,7 @@ import ccatp
 from ccatp.cli_align import align
 from ccatp.cli_bench import bench
 from ccatp.cli_conformance import conformance
+from ccatp.cli_dashboard import dashboard
 from ccatp.cli_frame import (
     ADDRESS_OPTIONS,
     CONFIG_OPTION,
@@ -22,15 +23,19 @@ from ccatp.cli_frame import (
     ask_daemon,
     ask_over_tcp,
     complain,
+    configured_folder,
     example,
     options,
     overrides,
     run_command_line,
 )
 from ccatp.cli_keys import keys
+from ccatp.cli_log import log
 from ccatp.cli_plan import plan
+from ccatp.cli_radio import radio
 from ccatp.cli_replay import replay
 from ccatp.cli_report import compare, report
+from ccatp.cli_stream import stream
 from ccatp.cli_study import study
 from ccatp.package import COMPILED, build
 
@@ -207,7 +212,7 @@ def emergency(
         "id": str(emergency_id or uuid.uuid4()),
         "note": note,
     }
-    folder = _folder(config_file, runtime_dir)
+    folder = configured_folder(config_file, runtime_dir)
     _tell(_ask_observatory(endpoint, server_key, key_file, folder, payload, timeout_s), json_output)
 
 
@@ -223,7 +228,7 @@ def clear(
     ID is what ccatp emergency told. The robot must be at base or held; over TCP, our key needs the role clear.
     """
     payload: dict[str, object] = {"cmd": "clear", "id": str(emergency_id)}
-    folder = _folder(config_file, runtime_dir)
+    folder = configured_folder(config_file, runtime_dir)
     _tell(_ask_observatory(endpoint, server_key, key_file, folder, payload, timeout_s), json_output)
 
 
@@ -303,8 +308,12 @@ def sim_etalon(
 
 cli.add_command(align)
 cli.add_command(bench)
+cli.add_command(dashboard)
 cli.add_command(keys)
+cli.add_command(log)
+cli.add_command(stream)
 cli.add_command(plan)
+cli.add_command(radio)
 cli.add_command(study)
 cli.add_command(replay)
 cli.add_command(report)
@@ -359,17 +368,7 @@ def config_schema() -> None:
 
 
 def _ask(command: str, config_file: Path | None, runtime_dir: Path | None, timeout_s: float) -> dict[str, Any]:
-    return ask_daemon(_folder(config_file, runtime_dir), "control", {"cmd": command}, timeout_s)
-
-
-def _folder(config_file: Path | None, runtime_dir: Path | None) -> Path | None:
-    """The runtime directory that command line or configuration names."""
-    if runtime_dir is None and config_file is not None:
-        from ccatp.config.loader import load_config
-
-        configured = load_config(config_file).run.runtime_dir
-        return Path(configured) if configured else None
-    return runtime_dir
+    return ask_daemon(configured_folder(config_file, runtime_dir), "control", {"cmd": command}, timeout_s)
 
 
 def _tell(reply: Mapping[str, Any], json_output: bool) -> None:

@@ -1,7 +1,6 @@
 """Glue. What every command shares: suggestions, one-line errors, exit statuses, options, talk with a running daemon."""
 
 import difflib
-import json
 import os
 import sys
 import tomllib
@@ -11,8 +10,7 @@ from typing import Any
 
 import click
 
-from ccatp.errors import CcatpError, ExitStatus, RefusedError, UnreachableError
-from ccatp.runtime_dir import runtime_dir_path
+from ccatp.errors import CcatpError, ExitStatus
 
 Command = Callable[..., Any]
 
@@ -146,6 +144,16 @@ def overrides(settings: Mapping[str, object], named: Mapping[str, object]) -> di
     return {**{key: value for key, value in named.items() if value is not None}, **settings}
 
 
+def configured_folder(config_file: Path | None, runtime_dir: Path | None) -> Path | None:
+    """The runtime directory that command line or configuration names."""
+    if runtime_dir is None and config_file is not None:
+        from ccatp.config.loader import load_config
+
+        configured = load_config(config_file).run.runtime_dir
+        return Path(configured) if configured else None
+    return runtime_dir
+
+
 def ask_daemon(runtime_dir: Path | None, channel: str, payload: dict[str, object], timeout_s: float) -> dict[str, Any]:
     """One request to a running daemon.
 
@@ -159,19 +167,10 @@ def ask_daemon(runtime_dir: Path | None, channel: str, payload: dict[str, object
         UnreachableError: nobody listens there, or no answer came in time.
         RefusedError: the daemon said no, and why.
     """
-    folder = runtime_dir_path(str(runtime_dir or ""), os.environ)
-    if not (folder / channel).exists():
-        raise UnreachableError(
-            f"no daemon in {folder}; start one with ccatp run, or name its folder with --runtime-dir"
-        )
-    from ccatp.router import RequestFailed, request
+    from ccatp.client import Client
 
-    try:
-        endpoint, is_emergency = f"ipc://{folder / channel}", channel == "emergency"
-        reply = request(endpoint, json.dumps(payload).encode(), timeout_s, repeats=is_emergency)
-    except RequestFailed as error:
-        raise UnreachableError(str(error)) from error
-    return _accepted(reply, payload)
+    daemon = Client(runtime_dir, timeout_s)
+    return daemon.ask(str(payload["cmd"])) if channel == "control" else daemon.observatory.ask(payload)
 
 
 def ask_over_tcp(
@@ -191,15 +190,10 @@ def ask_over_tcp(
         UnreachableError: nobody listens there, or no answer came in time; a daemon does not answer who is not listed.
         RefusedError: the daemon said no, and why.
     """
+    from ccatp.client import exchange
     from ccatp.curve_keys import read_pair, read_public
-    from ccatp.router import CurveClient, request
+    from ccatp.router import CurveClient
 
     pair = read_pair(key, "--key")
     curve = CurveClient(read_public(server_key, "--server-key"), pair.public, pair.secret)
-    return _accepted(request(endpoint, json.dumps(payload).encode(), timeout_s, curve, repeats=True), payload)
-
-
-def _accepted(reply: dict[str, Any], payload: Mapping[str, object]) -> dict[str, Any]:
-    if not reply.get("ok", False):
-        raise RefusedError(f"{payload.get('cmd')} refused: {reply.get('error', 'no reason given')}")
-    return reply
+    return exchange(endpoint, payload, timeout_s, curve, repeats=True)

@@ -1,12 +1,14 @@
 """Edge. Telemetry of a run as an MCAP file: JSON messages, a JSON schema for every channel.
 
-Chunks are small and the file is not buffered, so a ``kill -9`` costs the last chunk at most; the reader takes a file
-that ends anywhere. Recording never disturbs a mission: the first write that fails ends it, with one report.
+Chunks are small, none is held back for long, and the file is not buffered, so a ``kill -9`` costs the last moment at
+most; the reader takes a file that ends anywhere. Recording never disturbs a mission: the first write that fails ends
+it, with one report.
 """
 
 import json
 import os
 import struct
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -20,6 +22,7 @@ from zstandard import ZstdError
 
 CHUNK_BYTES = 16 * 1024
 FLUSH_AFTER_S = 1.0  # of message time: slow topics do not wait for a full chunk
+HELD_BACK_S = 0.25  # of the machine's time: nor does anything else
 _METADATA = "ccatp"
 _SIMULATION = "simulation"
 _MAX_T_S = 1e9  # thirty years of uptime: anything beyond is not a time since boot
@@ -86,7 +89,7 @@ class Recorder:
 
     Args:
         path: the file to write.
-        topics: name and JSON schema of each topic.
+        topics: name and JSON schema of each topic; the schema's title is what viewers know it by.
         is_simulation: marks the file and every channel as simulation, or as real.
         metadata: what tells runs apart (mirror, seed, ...), kept in the file.
         on_failure: called once with the reason when recording ends early.
@@ -108,6 +111,7 @@ class Recorder:
         self._on_failure = on_failure
         self._channels: dict[str, int] = {}
         self._flushed_s = 0.0
+        self._waiting_since_s: float | None = None
         self._sequence = 0
         self._file: _RawFile | None = None
         try:
@@ -136,12 +140,27 @@ class Recorder:
         try:
             self._writer.add_message(channel, time_ns, payload, time_ns, self._sequence)
             if not 0.0 <= t_s - self._flushed_s < FLUSH_AFTER_S:
-                self._flushed_s = t_s
-                self._writer.flush()  # type: ignore[no-untyped-call]
+                self._flush(t_s)
+            elif self._waiting_since_s is None:
+                self._waiting_since_s = time.monotonic()
         except Exception as error:
             # Whatever it is, the mission is worth more than its recording.
             self.dropped += 1
             self._fail(error)
+
+    def tend(self) -> None:
+        """To be called several times a second: what waits for a full chunk does not wait for long. Never raises."""
+        if self._waiting_since_s is None or not self.is_recording:
+            return
+        if time.monotonic() - self._waiting_since_s >= HELD_BACK_S:
+            try:
+                self._flush(self._flushed_s)
+            except Exception as error:
+                self._fail(error)
+
+    def _flush(self, t_s: float) -> None:
+        self._flushed_s, self._waiting_since_s = t_s, None
+        self._writer.flush()  # type: ignore[no-untyped-call]
 
     def close(self) -> None:
         """Write what is left and the index; again is harmless. Never raises."""
@@ -158,7 +177,8 @@ class Recorder:
         self._writer.add_metadata(_METADATA, metadata)
         for name, schema in topics:
             data = json.dumps(schema, separators=(",", ":")).encode()
-            schema_id = int(self._writer.register_schema(name=name, encoding="jsonschema", data=data))
+            title = str(schema.get("title", name))
+            schema_id = int(self._writer.register_schema(name=title, encoding="jsonschema", data=data))
             channel_metadata = {_SIMULATION: metadata[_SIMULATION]}
             self._channels[name] = self._writer.register_channel(name, "json", schema_id, channel_metadata)
 

@@ -17,10 +17,12 @@ import zmq
 
 from ccatp.config.loader import dump_config, load_config
 from ccatp.config.models import Config
+from ccatp.dashboard.token_file import read_token
 from ccatp.errors import ConfigError, ExitStatus, RefusedError
 from ccatp.processes.children import Children, ProcessSpec
-from ccatp.processes.common import FAULTS_FILE, Endpoints, open_log
+from ccatp.processes.common import FAULTS_FILE, RUN_DIR_FILE, Endpoints, open_log
 from ccatp.processes.observing import check_observatory
+from ccatp.processes.page_socket import PageSocket, note_run_dir, open_page_socket
 from ccatp.processes.run_collector import RunCollector
 from ccatp.processes.run_report import write_run_report
 from ccatp.processes.run_view import RunView
@@ -40,6 +42,16 @@ LOCKSTEP_NICENESS = 10
 
 # In the order of starting; stopping is in the reverse order, so that main holds the wheels first.
 PROCESSES: tuple[ProcessSpec, ...] = (
+    # First, so that it is there for the end of the others. It gets what time they leave, so it has a minute to speak.
+    ProcessSpec(
+        "dashboard",
+        "ccatp.processes.dashboard",
+        listens="dashboard",
+        is_loop=True,
+        is_needed=False,
+        niceness=15,
+        patience_s=60.0,
+    ),
     ProcessSpec("dataloop", "ccatp.processes.dataloop", is_stand_in=True, listens="sim.robot", is_replaceable=False),
     ProcessSpec("etalon", "ccatp.processes.etalon", is_stand_in=True, listens="sim.etalon"),
     ProcessSpec("danger", "ccatp.processes.danger_loop", is_loop=True),
@@ -66,18 +78,26 @@ def run_survey(options: RunOptions) -> int:
     check_observatory(cfg.observatory)
     # The processes read it again; here it is refused before anything has begun.
     read_key(cfg.robot.key_file, must_be_private=not options.sim)
+    read_token(cfg.dashboard)
     started = time.monotonic()
     with ExitStack() as stack:
         runtime_dir = make_runtime_dir(str(options.runtime_dir or cfg.run.runtime_dir), os.environ)
         stack.enter_context(_lock(runtime_dir / "lock", "--runtime-dir"))
-        sockets = {p.name: stack.enter_context(_listen(cfg, p)) for p in _processes(options) if p.listens}
+        stand_ins = [p for p in PROCESSES if p.is_stand_in and p.listens and options.sim]
+        sockets = {p.name: stack.enter_context(_listen(cfg, p)) for p in stand_ins}
         cfg = _with_addresses(cfg, sockets) if options.sim else cfg
+        page = open_page_socket(cfg.dashboard)
+        if page.socket is not None:
+            sockets["dashboard"] = stack.enter_context(page.socket)
+            cfg = cfg.model_copy(update={"dashboard": page.config})
         run_dir = _make_run_dir(options, cfg)
         stack.enter_context(_lock(run_dir / ".lock", "--run-dir"))
         (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
+        (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
-        run = _Run(options, cfg, run_dir, Endpoints(runtime_dir), sockets, started)
+        note_run_dir(runtime_dir, run_dir)
+        run = _Run(options, cfg, run_dir, Endpoints(runtime_dir), sockets, page, started)
         return run.go()
 
 
@@ -95,10 +115,6 @@ def _recover(options: RunOptions) -> int:
     status = run_survey(options)
     forget_finished(status)
     return status
-
-
-def _processes(options: RunOptions) -> list[ProcessSpec]:
-    return [p for p in PROCESSES if options.sim or not p.is_stand_in]
 
 
 @contextmanager
@@ -193,10 +209,11 @@ class _Run:
         run_dir: Path,
         endpoints: Endpoints,
         sockets: dict[str, socket.socket],
+        page: PageSocket,
         started_s: float,
     ) -> None:
         self._options, self._cfg, self._run_dir, self._endpoints = options, cfg, run_dir, endpoints
-        self._sockets, self._started_s = sockets, started_s
+        self._sockets, self._page, self._started_s = sockets, page, started_s
         self._view: RunView | None = None
         self._children = Children(cfg.run, self._command_of, self._say)
         self._is_interrupted = False
@@ -242,8 +259,12 @@ class _Run:
         self._is_interrupted = True
 
     def _watch(self, collector: RunCollector, view: RunView) -> ExitStatus:
-        for process in _processes(self._options):
-            self._children.start(process)
+        if self._page.text:
+            self._say(self._page.level, self._page.text)
+        for process in PROCESSES:
+            # Who listens has a socket, if it is to run at all.
+            if process.name in self._sockets or not process.listens:
+                self._children.start(process)
         if not self._options.is_paced:
             os.nice(LOCKSTEP_NICENESS)
         while not self._is_interrupted:
@@ -276,6 +297,7 @@ class _Run:
             "--resume": options.resume,
             "--restarted": is_restarted,
             "--held": options.held and not is_restarted,
+            "--sim": options.sim,
             "--faults": process.is_stand_in and options.faults_file is not None,
         }
         arguments += [flag for flag, is_given in flags.items() if is_given]

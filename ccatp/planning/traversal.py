@@ -69,4 +69,10 @@ def optimised_order(mirror: Mirror, panels: int = 0, limits: LimitsConfig = NOMI
     return fastest_serpentine(mirror, thesis_order(mirror, panels), limits)
 
 
-ORDERS: dict[str, Order] = {"thesis": thesis_order, "optimised": optimised_order}
+def no_points(mirror: Mirror, panels: int = 0) -> list[PointId]:
+    """None: a drive that consists of its calibration alone."""
+    del mirror, panels
+    return []
+
+
+ORDERS: dict[str, Order] = {"thesis": thesis_order, "optimised": optimised_order, "calibration": no_points}

@@ -20,6 +20,8 @@ from ccatp.processes.log_stream import LogStream
 PR_SET_PDEATHSIG = 1
 # The copy of the fault plan in the run directory.
 FAULTS_FILE = "faults.toml"
+# In the runtime directory: the run directory of the run that goes on there, or of the last one.
+RUN_DIR_FILE = "run_dir"
 # In this variable the supervisor tells its children who it is.
 SUPERVISOR_PID = "CCATP_SUPERVISOR_PID"
 
@@ -49,6 +51,7 @@ class ProcessArgs:
         has_faults: a fault plan stands in the run directory; stand-ins only.
         is_restarted: another process of this run has died, and this one takes its place.
         is_held: begin held, until an operator resumes.
+        is_sim: robot and laser system are stand-ins.
     """
 
     config: Config
@@ -60,6 +63,7 @@ class ProcessArgs:
     has_faults: bool = False
     is_restarted: bool = False
     is_held: bool = False
+    is_sim: bool = False
 
     @property
     def is_taking_over(self) -> bool:
@@ -79,6 +83,7 @@ def parse_args(argv: list[str] | None = None) -> ProcessArgs:
     parser.add_argument("--faults", action="store_true")
     parser.add_argument("--restarted", action="store_true")
     parser.add_argument("--held", action="store_true")
+    parser.add_argument("--sim", action="store_true")
     args = parser.parse_args(argv)
     return ProcessArgs(
         load_config(args.run_dir / "config.toml"),
@@ -90,6 +95,7 @@ def parse_args(argv: list[str] | None = None) -> ProcessArgs:
         has_faults=args.faults,
         is_restarted=args.restarted,
         is_held=args.held,
+        is_sim=args.sim,
     )
 
 

@@ -53,6 +53,7 @@ class DangerLoop:
         self._estimate: Estimate | None = None
         self._told = (EventCode.NORMAL, "", Severity.NONE)
         self._seq = self._first_seq = -1
+        self._bad_lines = 0
         self._permit_seq = 0
         self._t_s = 0.0
         self._is_stale = False
@@ -66,6 +67,7 @@ class DangerLoop:
             on_sensors=self.on_sensors,
             on_lost=self._on_lost,
             on_joined=self._on_joined,
+            on_bad_line=self._on_bad_line,
         )
         desk = ObservatoryDesk(self.monitor, lambda: self._pulse.frame_age_s if self._seq >= 0 else None, self.log)
         self._observatory = Observatory(args.endpoints.of("emergency"), cfg.observatory, desk)
@@ -114,6 +116,7 @@ class DangerLoop:
     def on_sensors(self, sensors: Sensors, _raw: bytes) -> None:
         """Judge one frame. In lockstep with a certain estimate of main's, so that the run is repeatable."""
         self._seq, self._t_s, self._pulse.frame_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
+        self._bad_lines = 0
         if self._first_seq < 0:
             # Of the frame that it meets, a process that takes over may have missed main's estimate.
             self._first_seq = sensors.seq + self._is_taking_over
@@ -130,6 +133,16 @@ class DangerLoop:
         if not self._is_lockstep and self._lag.served(sensors.t, time.monotonic()) > self._cfg.danger.stale_after_s:
             verdict = self.monitor.stale(sensors.seq, sensors.t)  # it saw the past: no permit for the present
         self._give(verdict, sensors.seq)
+
+    def _on_bad_line(self) -> None:
+        """A line was no frame. In lockstep each stands for a frame's time, so that the run is repeatable."""
+        self._bad_lines += 1
+        hello = self._hello
+        is_timed = hello is not None and hello.lockstep
+        at_s = self._t_s + self._bad_lines / hello.frame_hz if hello and is_timed else time.monotonic()
+        verdict = self.monitor.garbled(self._seq, self._t_s, at_s)
+        if verdict is not None:
+            self._give(verdict, self._seq)
 
     def _give(self, verdict: Verdict, ack: int) -> None:
         if ack >= 0:  # the robot first: what it may do does not wait for anyone to read why

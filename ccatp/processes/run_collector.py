@@ -24,6 +24,7 @@ from ccatp.recorder import Recorder
 from ccatp.samples import PanelId, PanelPose, PointId
 from ccatp.store import MissionStore
 from ccatp.summary import RunFacts, SummaryBuilder, puck_targets
+from ccatp.viewing.views import Views, recorded_schemas
 from ccatp.wire.topics import (
     RECORD_FORMAT,
     TOPICS,
@@ -36,7 +37,6 @@ from ccatp.wire.topics import (
     Timing,
     Track,
     Truth,
-    schema_of,
 )
 
 RECEIVED = tuple(topic.name for topic in TOPICS if topic.recorded or topic.message in (Timing, Presence))
@@ -110,11 +110,11 @@ class RunCollector:
         )
         self._on_presence = on_presence
         self._mirror: Mirror = build_mirror(cfg.mirror)
-        names = ("main", "danger", "truth") if is_sim else ("main", "danger")
+        names = ("main", "danger", "dashboard", "truth") if is_sim else ("main", "danger", "dashboard")
         self._subscriber = Subscriber(context, [endpoints.of(name) for name in names], RECEIVED)
         self._recorder = Recorder(
             run_dir / "telemetry.mcap",
-            [(topic.name, schema_of(topic.name)) for topic in TOPICS if topic.recorded],
+            recorded_schemas(),
             is_simulation=is_sim,
             metadata={
                 "format": str(RECORD_FORMAT),
@@ -126,6 +126,7 @@ class RunCollector:
             },
             on_failure=self._on_recorder_failure,
         )
+        self._views: Views | None = Views(self._mirror, cfg.robot.puck_height_m)
         self._view: View | None = None
         self._builder: SummaryBuilder | None = None
         self._early: list[Message] = []
@@ -172,6 +173,7 @@ class RunCollector:
             if isinstance(message, Message):
                 self._take(name, body, message, view)
             received = self._subscriber.receive_raw()
+        self._recorder.tend()
 
     def _take(self, name: str, body: bytes, message: Message, view: View | None) -> None:
         if isinstance(message, Presence):
@@ -179,6 +181,7 @@ class RunCollector:
             return
         if name != "timing":
             self._recorder.write(name, max(message.t_s, 0.0), body)
+            self._record_views(message)
         if isinstance(message, Truth):
             self._truth_rows += len(message.rows)
         elif isinstance(message, Track):
@@ -193,6 +196,17 @@ class RunCollector:
             self._early.append(message)
         else:
             self._add(self._builder, message)
+
+    def _record_views(self, message: Message) -> None:
+        """What viewers get beside the topics; nothing that goes wrong there may end the run."""
+        if self._views is None:
+            return
+        try:
+            for shown in self._views.of(message):
+                self._recorder.write(*shown)
+        except Exception as error:  # the raw topics hold all of it
+            self._views = None
+            self._on_recorder_failure(f"views for Foxglove and PlotJuggler: {type(error).__name__}: {error}")
 
     def _on_recorder_failure(self, reason: str) -> None:
         if self._view is not None:

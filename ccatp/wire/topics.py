@@ -69,6 +69,58 @@ class MissionStatus(Message):
     left_out: dict[str, list[str]] = {}  # points skipped, or not measured any more, by the reason
 
 
+class Picture(Message):
+    """The newest of everything that a display shows, told only while somebody has asked for it.
+
+    Attributes:
+        x_m, y_m, heading_rad: pose, deck frame.
+        covariance_m2: of x and y: xx, xy, yy.
+        heading_sigma_rad: standard deviation of the heading.
+        nis, size: normalised innovation squared of the filter's last update, and its degrees of freedom; 0 for none.
+        line: the newest sensors line, as it came from the robot.
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+    covariance_m2: tuple[float, float, float]
+    heading_sigma_rad: float
+    nis: float
+    size: int
+    line: msgspec.Raw
+
+
+class Shape(msgspec.Struct, omit_defaults=True):
+    """One thing on the map, in the plane of the pose.
+
+    Attributes:
+        id: the same thing has the same one in the next message.
+        kind: how it looks: ``beacon``, ``obstacle``, ``target``, ``robot``, ``trail``; a display draws others plainly.
+        x_m, y_m: where it is.
+        covariance_m2: of x and y: xx, xy, yy; drawn as its ellipse.
+        heading_rad: for what points somewhere.
+        radius_m: for what is round.
+        outline_m: for what is neither: a line, closed where the first point comes again.
+        label: what is written beside it.
+    """
+
+    id: str
+    kind: str
+    x_m: float
+    y_m: float
+    covariance_m2: tuple[float, float, float] | None = None
+    heading_rad: float | None = None
+    radius_m: float | None = None
+    outline_m: list[tuple[float, float]] = []
+    label: str = ""
+
+
+class Scene(Message):
+    """What is on the map besides the mirror and the robot; each message has all of it."""
+
+    shapes: list[Shape]
+
+
 class Track(Message):
     """A batch of estimates.
 
@@ -192,6 +244,9 @@ class Topic:
 TOPICS: tuple[Topic, ...] = (
     Topic("presence.main", Presence, "main", 10.0, 1.0, False),
     Topic("presence.danger", Presence, "danger", 10.0, 1.0, False),
+    Topic("presence.dashboard", Presence, "dashboard", 2.0, 5.0, False),
+    Topic("picture", Picture, "main", 10.0, 0.8, False),
+    Topic("scene", Scene, "main", 2.0, 5.0, False),
     Topic("estimate", Estimate, "main", 20.0, 0.15, False),
     Topic("verdict", Verdict, "danger", 100.0, 0.15, False),
     Topic("mission", MissionStatus, "main", 10.0, 1.0, True),

@@ -53,12 +53,14 @@ def router(monkeypatch: pytest.MonkeyPatch) -> Router:
     def put(answer: dict[str, Any]) -> list[tuple[str, Any]]:
         calls: list[tuple[str, Any]] = []
 
-        def request(endpoint: str, payload: bytes, timeout_s: float, *, repeats: bool = False) -> dict[str, Any]:
+        def request(
+            endpoint: str, payload: bytes, timeout_s: float, curve: object, *, repeats: bool = False
+        ) -> dict[str, Any]:
             assert timeout_s in {3.0, 10.0}  # as asked for, and as the default
             calls.append((endpoint, json.loads(payload)))
             return answer
 
-        monkeypatch.setattr("ccatp.router.request", request)
+        monkeypatch.setattr("ccatp.client.request", request)
         return calls
 
     return put
@@ -95,6 +97,7 @@ def test_the_commands_are_those_of_the_contract_the_map_and_the_conformance() ->
         "run", "status", "pause", "resume", "abort", "stop", "emergency",
         "sim", "sim robot", "sim etalon", "config", "config check", "config schema", "study", "replay", "bench",
         "keys", "keys generate", "keys show-public", "clear", "align", "plan", "report", "compare",
+        "log", "log info", "log recover", "stream",
     }  # fmt: skip
 
 

@@ -1,0 +1,1 @@
+"""Pure. Wheel radii, wheel base and gyroscope bias out of a drive between fixes."""

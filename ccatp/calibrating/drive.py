@@ -1,0 +1,222 @@
+"""Pure. A recorded drive, cut into segments from fix to fix: what the wheels turned and the gyroscope summed up."""
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from statistics import median
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ccatp.localization.wheel_angles import WheelAngle
+from ccatp.mirror.mirror import Mirror
+from ccatp.samples import Fix
+from ccatp.wire.robot import Sensors
+
+FloatArray = NDArray[np.float64]
+
+# A frame in which no wheel turns further than this, and this many times what its noise sums up to, is one of rest.
+REST_RAD = 2e-6
+REST_SIGMAS = 6.0
+# Shorter rests than this part no motions.
+REST_FRAMES = 5
+# Of normally distributed differences: their median size over their standard deviation, and that over a sample's.
+_MEDIAN_TO_SIGMA = 1.0 / (0.6745 * 2.0**0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a fix saw the robot, deck frame.
+
+    Attributes:
+        x_m, y_m: foot of the puck.
+        covariance_m2: of both, shape (2, 2).
+    """
+
+    x_m: float
+    y_m: float
+    covariance_m2: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """From one fix to the next.
+
+    Attributes:
+        right_rad, left_rad: what each wheel turned, frame by frame, shape (n,).
+        motions: first and last (exclusive) frame of each motion between two rests.
+        gyro_rad: sum of the gyroscope's rates times their periods.
+        gyro_s: over this time.
+        gyro_samples: so many.
+        duration_s: from fix to fix.
+    """
+
+    right_rad: FloatArray
+    left_rad: FloatArray
+    motions: tuple[tuple[int, int], ...]
+    gyro_rad: float
+    gyro_s: float
+    gyro_samples: int
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """A whole drive.
+
+    Attributes:
+        places: k + 1 fixes.
+        segments: k.
+        encoder_sigma_rad_s: noise of a rate sample; 0 of a counter.
+        encoder_period_s: between two samples.
+        quantum_rad: step of a counter; 0 where the rate itself is read.
+        gyro_sigma_rad_s: noise of a gyroscope sample.
+    """
+
+    places: tuple[Place, ...]
+    segments: tuple[Segment, ...]
+    encoder_sigma_rad_s: float
+    encoder_period_s: float
+    quantum_rad: float
+    gyro_sigma_rad_s: float
+
+
+@dataclass(slots=True)
+class _Open:
+    """The segment that is being driven."""
+
+    right: list[float] = field(default_factory=list)
+    left: list[float] = field(default_factory=list)
+    gyro_rad: float = 0.0
+    gyro_s: float = 0.0
+    gyro_samples: int = 0
+    begun_s: float = 0.0
+
+
+class DriveBuilder:
+    """Takes a drive as it comes: frames and fixes, in their order.
+
+    Args:
+        mirror: where it takes place.
+        puck_height_m: above the surface along its normal.
+    """
+
+    def __init__(self, mirror: Mirror, puck_height_m: float) -> None:
+        self._mirror, self._puck_height_m = mirror, puck_height_m
+        self._wheels = WheelAngle(), WheelAngle()
+        self._places: list[Place] = []
+        self._segments: list[Segment] = []
+        self._open = _Open()
+        self._scatters: list[float] = []
+        self._periods: list[float] = []
+        self._samples = 0
+        self._gyro_steps: list[float] = []
+        self._gyro: tuple[float, float] | None = None
+        self._last_seq = -1
+        self._t_s = 0.0
+
+    def frame(self, sensors: Sensors) -> None:
+        """Take a frame; one that is not newer is left out."""
+        if sensors.seq <= self._last_seq:
+            return
+        self._last_seq, self._t_s = sensors.seq, sensors.t
+        times = [row[0] for row in sensors.enc]
+        rates = [[row[i] for row in sensors.enc] for i in (1, 2)]
+        right, left = (wheel.add(times, found) for wheel, found in zip(self._wheels, rates, strict=True))
+        self._open.right.append(right)
+        self._open.left.append(left)
+        if len(times) > 1:
+            self._scatters.append(float(np.std(rates[0], ddof=1)))
+            self._periods.append((times[-1] - times[0]) / (len(times) - 1))
+            self._samples = len(times)
+        for t_s, _, rate in sensors.imu:
+            self._feel(t_s, rate)
+
+    def _feel(self, t_s: float, rate_rad_s: float) -> None:
+        if self._gyro is not None:
+            period_s = t_s - self._gyro[0]
+            self._open.gyro_rad += rate_rad_s * period_s
+            self._open.gyro_s += period_s
+            self._open.gyro_samples += 1
+            self._gyro_steps.append(abs(rate_rad_s - self._gyro[1]))
+        self._gyro = t_s, rate_rad_s
+
+    def fix(self, fix: Fix) -> None:
+        """Take a fix of the robot at rest; a second one at the same place replaces the first."""
+        place = self._place(fix)
+        done, self._open = self._open, _Open(begun_s=self._t_s)
+        if not self._places:
+            self._places.append(place)
+            return
+        right, left = np.array(done.right), np.array(done.left)
+        motions = _motions(right, left, self._rest_rad())
+        if not motions:
+            self._places[-1] = place
+            self._join(done)
+            return
+        self._places.append(place)
+        duration_s = self._t_s - done.begun_s
+        self._segments.append(Segment(right, left, motions, done.gyro_rad, done.gyro_s, done.gyro_samples, duration_s))
+
+    def _rest_rad(self) -> float:
+        if not self._scatters or self._wheels[0].is_counter:  # a counter at rest says nothing
+            return REST_RAD
+        noise_rad = median(self._scatters) * median(self._periods) * self._samples**0.5
+        return max(REST_RAD, REST_SIGMAS * noise_rad)
+
+    def _join(self, rest: _Open) -> None:
+        """A rest between two fixes at one place shows the gyroscope's bias like any other; no segment knows it."""
+        self._open.gyro_rad, self._open.gyro_s = rest.gyro_rad, rest.gyro_s
+        self._open.gyro_samples, self._open.begun_s = rest.gyro_samples, rest.begun_s
+
+    def _place(self, fix: Fix) -> Place:
+        x, y, _ = self._mirror.foot_of_puck(fix.position_m, self._puck_height_m)
+        turn = np.array([self._mirror.rotate_deck_from_world(axis) for axis in np.eye(3).tolist()]).T
+        covariance = turn @ np.array(fix.covariance_m2).reshape(3, 3) @ turn.T
+        # The foot follows the puck along the surface; what it rises by the slope moves it sideways.
+        fx, fy = self._mirror.surface.gradient(x, y)
+        normal = np.array([-fx, -fy, 1.0]) / np.sqrt(1.0 + fx * fx + fy * fy)
+        along = (np.eye(3) - np.outer(normal, normal))[:2]
+        return Place(x, y, along @ covariance @ along.T)
+
+    def build(self) -> Drive:
+        """The drive so far."""
+        right, left = self._wheels
+        is_counter = right.is_counter or left.is_counter
+        quantum = min(right.quantum_rad, left.quantum_rad) if is_counter else 0.0
+        return Drive(
+            tuple(self._places),
+            tuple(self._segments),
+            0.0 if is_counter or not self._scatters else median(self._scatters),
+            median(self._periods) if self._periods else 0.0,
+            quantum,
+            median(self._gyro_steps) * _MEDIAN_TO_SIGMA if self._gyro_steps else 0.0,
+        )
+
+
+def _motions(right: FloatArray, left: FloatArray, rest_rad: float) -> tuple[tuple[int, int], ...]:
+    """Stretches of frames in which a wheel turns, parted by rests; a turn in place and a way are two motions."""
+    moving = np.flatnonzero((np.abs(right) > rest_rad) | (np.abs(left) > rest_rad))
+    if not len(moving):
+        return ()
+    is_turn = np.abs(right - left) > np.abs(right + left)
+    spans = []
+    for run in np.split(moving, np.flatnonzero(np.diff(moving) > REST_FRAMES) + 1):
+        spans += _same_kind(is_turn, int(run[0]), int(run[-1]) + 1)
+    return tuple(spans)
+
+
+def _same_kind(is_turn: NDArray[np.bool_], first: int, last: int) -> list[tuple[int, int]]:
+    """Parts of a motion; what lasts for a few frames only belongs to what goes before it."""
+    cuts = [first]
+    for at in range(first + 1, last):
+        if is_turn[at] != is_turn[at - 1]:
+            cuts.append(at)
+    cuts.append(last)
+    spans: list[tuple[int, int]] = []
+    for begin, end in pairwise(cuts):
+        is_same = bool(spans) and is_turn[spans[-1][0]] == is_turn[begin]
+        if spans and (end - begin <= REST_FRAMES or is_same):
+            spans[-1] = (spans[-1][0], end)
+        else:
+            spans.append((begin, end))
+    return spans

@@ -1,0 +1,135 @@
+"""Tests of the client: what it asks over real sockets, and what it makes of the answers."""
+
+import asyncio
+import json
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zmq.asyncio
+
+from ccatp.client import Client, Latched, Pong, StillWaiting
+from ccatp.errors import RefusedError, UnreachableError
+from ccatp.processes.run_collector import NO_STATUS
+from ccatp.router import Router
+
+Answer = Callable[[dict[str, Any]], dict[str, Any]]
+
+
+@contextmanager
+def serving(folder: Path, channel: str, answer: Answer) -> Iterator[list[dict[str, Any]]]:
+    """A real ROUTER in a thread of its own; yields what it was asked."""
+    asked: list[dict[str, Any]] = []
+    ready, loop = threading.Event(), asyncio.new_event_loop()
+
+    def handle(frame: bytes) -> bytes:
+        asked.append(json.loads(frame))
+        return json.dumps(answer(asked[-1])).encode()
+
+    async def serve() -> None:
+        context = zmq.asyncio.Context()
+        try:
+            async with Router(f"ipc://{folder / channel}", handle, context) as router:
+                ready.set()
+                await router.serve()
+        finally:
+            context.destroy(linger=0)
+
+    task = loop.create_task(serve())
+
+    def run() -> None:
+        try:
+            loop.run_until_complete(task)
+        except asyncio.CancelledError:
+            pass
+        finally:
+            loop.close()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    assert ready.wait(10.0)
+    try:
+        yield asked
+    finally:
+        loop.call_soon_threadsafe(task.cancel)
+        thread.join()
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="ccatp-") as path:  # short: unix sockets take no long one
+        yield Path(path)
+
+
+def status(**fields: object) -> dict[str, Any]:
+    return {"ok": True, "status": {**msgspec.to_builtins(NO_STATUS), **fields}}
+
+
+def test_commands_and_typed_answers(folder: Path) -> None:
+    with serving(folder, "control", lambda request: status(state=request["cmd"], done=3)) as asked:
+        daemon = Client(folder)
+        for order in (daemon.status, daemon.pause, daemon.resume, daemon.abort, daemon.stop):
+            found = order()
+            assert (found.state, found.done) == (order.__name__, 3)
+    assert [request["cmd"] for request in asked] == ["status", "pause", "resume", "abort", "stop"]
+
+
+def test_a_refusal_says_why(folder: Path) -> None:
+    with (
+        serving(folder, "control", lambda _: {"ok": False, "error": "nothing is paused"}),
+        pytest.raises(RefusedError, match="resume refused: nothing is paused"),
+    ):
+        Client(folder).resume()
+
+
+def test_nobody_there(folder: Path) -> None:
+    with pytest.raises(UnreachableError, match=r"no daemon in .*; start one with ccatp run"):
+        Client(folder).status()
+    (folder / "control").touch()
+    with pytest.raises(UnreachableError, match=r"no answer from .* within 0\.1 s"):
+        Client(folder, timeout_s=0.1).status()
+
+
+def test_an_answer_of_another_shape_is_told(folder: Path) -> None:
+    with (
+        serving(folder, "control", lambda _: {"ok": True, "status": {"state": 7}}),
+        pytest.raises(UnreachableError, match="not what was asked for"),
+    ):
+        Client(folder).status()
+
+
+def test_waiting(folder: Path) -> None:
+    done = iter(range(100))
+    with serving(folder, "control", lambda _: status(done=next(done), total=9, state="driving")):
+        daemon = Client(folder)
+        assert daemon.wait(lambda found: found.done >= 3, timeout_s=20.0, period_s=0.001).done == 3
+        begin = time.monotonic()
+        with pytest.raises(StillWaiting, match=r"not within 0\.05 s: the mission is driving, \d+ points done"):
+            daemon.wait(lambda _: False, timeout_s=0.05, period_s=0.01)
+        assert time.monotonic() - begin >= 0.05
+
+
+def test_observatory(folder: Path) -> None:
+    def answer(request: dict[str, Any]) -> dict[str, Any]:
+        if request["cmd"] == "ping":
+            return {"ok": True, "code": 1, "age_s": None}
+        if request["cmd"] == "clear":
+            return {"ok": False, "id": request["id"], "error": "the robot moves"}
+        return {"ok": True, "id": request["id"], "latched": True, "code": 2}
+
+    with serving(folder, "emergency", answer) as asked:
+        observatory = Client(folder).observatory
+        assert observatory.ping() == Pong(1, None)
+        latched = observatory.emergency("fire", "smoke")
+        assert latched == Latched(latched.id, 2)
+        assert observatory.emergency("fire", emergency_id=latched.id).id == latched.id
+        with pytest.raises(RefusedError, match="clear refused: the robot moves"):
+            observatory.clear(latched.id)
+    kinds = [(request["kind"], request["note"]) for request in asked if request["cmd"] == "emergency"]
+    assert kinds[0] == ("fire", "smoke")

@@ -1,0 +1,174 @@
+"""Tests of the live streams with real subscribers: ZeroMQ as PlotJuggler's plugin, a WebSocket as Foxglove."""
+
+import json
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import zmq
+
+from ccatp.cli import main
+from ccatp.live_streams import FoxgloveStream, PlotJugglerStream, Stream, StreamError, check_host
+from ccatp.processes.streaming import RUN, streamed_schemas
+from ccatp.viewing.views import Shown
+from tests.web_socket import WebSocket
+
+PANELS = Shown("view/panels", 0.0, b'{"deletions":[],"entities":[]}')
+ROBOT = Shown("view/robot", 1.25, b'{"t_s":1.25,"seq":125,"x_m":0.5,"y_m":0.0,"heading_rad":0.0,"sigma_m":0.001}')
+PROTOCOL = "foxglove.sdk.v1"
+
+
+@pytest.fixture
+def context() -> Iterator[zmq.Context[zmq.Socket[bytes]]]:
+    with zmq.Context() as made:
+        yield made
+
+
+@pytest.fixture
+def plotjuggler(context: zmq.Context[zmq.Socket[bytes]]) -> Iterator[PlotJugglerStream]:
+    stream = PlotJugglerStream(context, "127.0.0.1", 0)
+    yield stream
+    stream.close()
+
+
+@pytest.fixture
+def foxglove() -> Iterator[FoxgloveStream]:
+    stream = FoxgloveStream("ccatp", "127.0.0.1", 0, streamed_schemas())
+    yield stream
+    stream.close()
+
+
+class Tending:
+    """Serves a stream in a thread, as the process would; messages may be sent meanwhile."""
+
+    def __init__(self, stream: Stream, *messages: Callable[[], None]) -> None:
+        self._stream, self._is_over, self._todo = stream, False, list(messages)
+        self._thread = threading.Thread(target=self._run)
+
+    def _run(self) -> None:
+        while not self._is_over:
+            self._stream.tend()
+            for message in self._todo:
+                message()
+            time.sleep(0.005)
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._is_over = True
+        self._thread.join()
+
+
+def subscribed(context: zmq.Context[zmq.Socket[bytes]], where: str, prefix: bytes) -> zmq.Socket[bytes]:
+    peer = context.socket(zmq.SUB)
+    peer.setsockopt(zmq.LINGER, 0)
+    peer.setsockopt(zmq.RCVTIMEO, 10_000)
+    peer.setsockopt(zmq.SUBSCRIBE, prefix)
+    peer.connect(where)
+    return peer
+
+
+def test_plotjuggler_gets_topic_json_and_seconds(
+    context: zmq.Context[zmq.Socket[bytes]], plotjuggler: PlotJugglerStream
+) -> None:
+    with Tending(plotjuggler, lambda: plotjuggler.send(ROBOT)), subscribed(context, plotjuggler.where, b"") as peer:
+        topic, payload, t_s = peer.recv_multipart()
+    assert topic == b"view/robot"
+    assert json.loads(payload)["x_m"] == 0.5
+    assert float(t_s) == 1.25
+    assert t_s.decode().isascii()
+
+
+def test_a_late_subscriber_gets_what_is_latched(
+    context: zmq.Context[zmq.Socket[bytes]], plotjuggler: PlotJugglerStream
+) -> None:
+    plotjuggler.send(PANELS, is_latched=True)
+    plotjuggler.send(ROBOT)
+    with Tending(plotjuggler):
+        for prefix in (b"view/panels", b"", b""):
+            with subscribed(context, plotjuggler.where, prefix) as peer:
+                assert peer.recv_multipart()[0] == b"view/panels"
+
+
+def test_a_port_that_is_taken_is_told(context: zmq.Context[zmq.Socket[bytes]]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(
+            StreamError, match=f"PlotJuggler: cannot listen on 127.0.0.1:{port}: Address already in use"
+        ):
+            PlotJugglerStream(context, "127.0.0.1", port)
+        with pytest.raises(StreamError, match=rf"Foxglove: cannot listen on .*:{port}: .*choose another"):
+            FoxgloveStream("ccatp", "127.0.0.1", port, [])
+
+
+def next_of(peer: WebSocket, operation: str) -> dict[str, Any]:
+    while True:
+        message = peer.receive()
+        if isinstance(message, dict) and message["op"] == operation:
+            return message
+
+
+def advertised(peer: WebSocket, count: int) -> dict[str, dict[str, Any]]:
+    channels: dict[str, dict[str, Any]] = {}
+    while len(channels) < count:
+        channels |= {channel["topic"]: channel for channel in next_of(peer, "advertise")["channels"]}
+    return channels
+
+
+def test_foxglove_gets_channels_schemas_and_messages(foxglove: FoxgloveStream) -> None:
+    schemas = dict(streamed_schemas())
+    port = int(foxglove.where.rpartition(":")[2])
+    foxglove.send(PANELS, is_latched=True)
+    with WebSocket(port, PROTOCOL) as peer:
+        assert next_of(peer, "serverInfo")["name"] == "ccatp"
+        channels = advertised(peer, len(schemas))
+        assert channels.keys() == schemas.keys()
+        panels = channels["view/panels"]
+        assert (panels["schemaName"], panels["encoding"]) == ("foxglove.SceneUpdate", "json")
+        assert json.loads(panels["schema"]) == json.loads(json.dumps(schemas["view/panels"]))
+        wanted = {7: channels["view/panels"]["id"], 8: channels["view/robot"]["id"]}
+        peer.send({"op": "subscribe", "subscriptions": [{"id": k, "channelId": v} for k, v in wanted.items()]})
+        with Tending(foxglove, lambda: foxglove.send(ROBOT)):
+            found: dict[int, tuple[int, bytes]] = {}
+            while len(found) < 2:
+                message = peer.receive()
+                if isinstance(message, bytes):
+                    opcode, subscription, log_time = struct.unpack_from("<BIQ", message)
+                    assert opcode == 1
+                    found[subscription] = (log_time, message[13:])
+    # The map was sent before anybody was there.
+    assert found[7] == (0, PANELS.payload)
+    assert found[8] == (1_250_000_000, ROBOT.payload)
+
+
+def test_foxglove_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "foxglove", None)
+    with pytest.raises(StreamError, match=r"install ccatp with its extra, ccatp\[foxglove\]"):
+        FoxgloveStream("ccatp", "127.0.0.1", 0, [])
+
+
+def test_a_network_is_served_only_when_told_to() -> None:
+    check_host("127.0.0.1", is_open=False)
+    check_host("localhost", is_open=False)
+    check_host("0.0.0.0", is_open=True)
+    for host in ("0.0.0.0", "192.0.2.1", "telescope"):
+        with pytest.raises(StreamError, match="anybody there could watch; say so with --open-to-network"):
+            check_host(host, is_open=False)
+
+
+def test_misuse(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stream", "--no-plotjuggler"]) == 2
+    assert "nothing to serve" in capsys.readouterr().err
+    assert main(["stream", "--host", "0.0.0.0"]) == 2
+    assert "--open-to-network" in capsys.readouterr().err
+
+
+def test_what_runs_comes_first() -> None:
+    assert streamed_schemas()[0][0] == RUN
