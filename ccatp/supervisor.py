@@ -26,6 +26,7 @@ from ccatp.processes.common import FAULTS_FILE, RUN_DIR_FILE, Endpoints, open_lo
 from ccatp.processes.observing import check_observatory
 from ccatp.processes.page_socket import PageSocket, note_run_dir, open_page_socket
 from ccatp.processes.run_kinds import BeaconRun, RunKind, SurveyRun
+from ccatp.processes.run_report import write_run_report
 from ccatp.processes.run_view import RunView
 from ccatp.processes.service import Service
 from ccatp.restarts import Decision, Fate
@@ -317,19 +318,8 @@ class _Run:
         self._log.info("end", status=int(status))
         if self._options.shows_summary:
             view.show_summary(summary, as_json=self._options.json_output)
-            view.show_report(self._report(status))
+            view.show_report(write_run_report(self._run_dir, status, self._log))
         return int(status)
-
-    def _report(self, status: ExitStatus) -> Path | None:
-        """The run's report, where there is time to write one; it never fails the run."""
-        if status is ExitStatus.INTERRUPTED:
-            return None  # somebody is waiting for the end
-        try:
-            return self._kind.report(self._run_dir)
-        except Exception as error:
-            # Whatever it is, the survey is done and its record is on the disk.
-            self._log.error("report", error=str(error))
-            return None
 
     def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
         self._is_interrupted = True
