@@ -160,7 +160,9 @@ def list_names(names: Sequence[str]) -> str:
 def _check_row(row: MoteRange, index: dict[str, int]) -> None:
     for name in (row.first, row.second):
         if name not in index:
-            raise UnknownMote(f"range {row.first} to {row.second}: no mote {name!r}; there are {list_names(list(index))}")
+            raise UnknownMote(
+                f"range {row.first} to {row.second}: no mote {name!r}; there are {list_names(list(index))}"
+            )
     if row.first == row.second:
         raise BadRange(f"range {row.first} to {row.second}: from a mote to itself; leave it out")
     if not 0.0 <= row.range_m < float("inf"):

@@ -72,7 +72,10 @@ def _relaxed(
     frame = np.arange(wide)
     i, j = pairs[:, 0], pairs[:, 1]
     at = np.concatenate([i[:, None] * wide + frame, j[:, None] * wide + frame], axis=1)
-    rows, cols = np.broadcast_to(at[:, :, None], (*at.shape, 2 * wide)), np.broadcast_to(at[:, None, :], (*at.shape, 2 * wide))
+    rows, cols = (
+        np.broadcast_to(at[:, :, None], (*at.shape, 2 * wide)),
+        np.broadcast_to(at[:, None, :], (*at.shape, 2 * wide)),
+    )
     flat = (rows * (count * wide) + cols).ravel()
     damping = 1e-2
 
@@ -88,7 +91,9 @@ def _relaxed(
         rows_of = np.concatenate([u, -u], axis=1)
         blocks = weights[:, None, None] * rows_of[:, :, None] * rows_of[:, None, :]
         normal = np.bincount(flat, blocks.ravel(), (count * wide) ** 2).reshape(count * wide, count * wide)
-        gradient = np.bincount(at.ravel(), (weights * errors)[:, None].repeat(2 * wide, 1).ravel() * rows_of.ravel(), count * wide)
+        gradient = np.bincount(
+            at.ravel(), (weights * errors)[:, None].repeat(2 * wide, 1).ravel() * rows_of.ravel(), count * wide
+        )
         gradient -= (points * penalty).ravel()
         normal[np.diag_indices_from(normal)] += np.tile(penalty, count) + damping
         step = cho_solve(cho_factor(normal, check_finite=False), gradient, check_finite=False).reshape(count, wide)
