@@ -36,7 +36,7 @@ class Run:
         args: further command line arguments.
     """
 
-    free_ports = FREE_PORTS
+    free_ports: tuple[str, ...] = FREE_PORTS
 
     def __init__(self, run_dir: Path, runtime_dir: Path, *args: str) -> None:
         self.run_dir, self.runtime_dir = run_dir, runtime_dir

@@ -10,10 +10,10 @@ from tests.unit.beacon_mission.stories import beacon_config, target_distances
 SURE = 0.9999  # both tails of a band together miss once in ten thousand
 
 
-def band(dof: int) -> tuple[float, float]:
+def band(dof: int, sure: float = SURE) -> tuple[float, float]:
     """Where a sum of that many squared standard normals lies."""
-    low, high = chi2.ppf((0.5 - 0.5 * SURE, 0.5 + 0.5 * SURE), dof)
-    return float(low), float(high)
+    low, high = (float(chi2.ppf(share, dof)) for share in (0.5 - 0.5 * sure, 0.5 + 0.5 * sure))
+    return low, high
 
 
 def nees_at(found: BeaconRehearsal, t_s: float) -> float:
@@ -90,7 +90,7 @@ def test_the_target_is_followed_at_its_distance_and_the_obstacle_left_alone() ->
 @pytest.mark.slow
 def test_fifty_missions_by_motes_are_consistent() -> None:
     runs = [rehearse_beacons(beacon_config("cricket", run__seed=seed)) for seed in range(100, 150)]
-    low, high = chi2.ppf((0.025, 0.975), 3 * len(runs))
+    low, high = band(3 * len(runs), 0.95)
     assert low < sum(nees_at(found, 60.0) for found in runs) < high
     reached = sum(found.summary["waypoints"]["within_3_sigma"] for found in runs)
     assert reached >= 0.97 * 6 * len(runs)  # 98.9 % of a plane's errors lie within 3 sigma
