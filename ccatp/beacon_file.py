@@ -12,7 +12,7 @@ from ccatp.config.toml_text import format_toml
 from ccatp.radio.range_network import MappingError
 
 FloatArray = NDArray[np.float64]
-_HEAD = "# Beacons, mapped by ccatp radio map. Positions in m; the covariance, m^2, is of all coordinates in their order.\n\n"
+_HEAD = "# Beacons, mapped by ccatp radio map: m, and the covariance of all coordinates in their order, m^2.\n\n"
 
 
 class BeaconFileError(MappingError):
@@ -35,7 +35,9 @@ class BeaconMap(NamedTuple):
     frame: str
 
 
-def write_beacons(path: Path, names: Sequence[str], positions_m: FloatArray, covariance_m2: FloatArray, frame: str) -> None:
+def write_beacons(
+    path: Path, names: Sequence[str], positions_m: FloatArray, covariance_m2: FloatArray, frame: str
+) -> None:
     """Write a map.
 
     Args:

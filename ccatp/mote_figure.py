@@ -98,11 +98,18 @@ def draw_places(axes: "Axes", picture: MapPicture) -> None:
         axes.plot(*picture.true_m[:, :2].T, "o", color=TRUE, markersize=7, fillstyle="none", label="true", zorder=3)
     axes.plot(*places.T, "x", color=FOUND, markersize=6, label="mapped", zorder=4)
     if len(picture.doubtful):
-        axes.plot(*places[list(picture.doubtful)].T, "s", color=DOUBT, markersize=11, fillstyle="none", label="may be elsewhere")
+        axes.plot(
+            *places[list(picture.doubtful)].T,
+            "s",
+            color=DOUBT,
+            markersize=11,
+            fillstyle="none",
+            label="may be elsewhere",
+        )
     if len(picture.names) <= _LABELLED:
         for name, place in zip(picture.names, places, strict=True):
             axes.annotate(name, place, textcoords="offset points", xytext=(6, 5), fontsize=7, color=QUIET)
-    larger = f", ellipses × {grown:g}" if grown > 1.0 else ", 90 % ellipses"
+    larger = f", ellipses {grown:g} times larger" if grown > 1.0 else ", 90 % ellipses"
     axes.set_title(picture.title + larger, fontsize=10, color=INK)
     axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     axes.margins(0.1)
@@ -116,9 +123,13 @@ def draw_traces(axes: "Axes", traces: Traces, label: str = "", shade: str = FOUN
     axes.fill_between(updates, traces.low_m, traces.high_m, color=shade, alpha=0.18, linewidth=0)
     axes.plot(updates, traces.middle_m, color=shade, linewidth=1.6, label=f"{label}error, median and 10 to 90 %")
     expected = np.arange(len(traces.expected_m))
-    axes.plot(expected, traces.expected_m, color=shade, linewidth=1.0, linestyle="--", label=f"{label}expected by the filter")
+    axes.plot(
+        expected, traces.expected_m, color=shade, linewidth=1.0, linestyle="--", label=f"{label}expected by the filter"
+    )
     if traces.bound_m is not None:
-        axes.axhline(traces.bound_m, color=QUIET, linewidth=0.9, linestyle=":", label=f"{label}Cramér-Rao bound, all updates")
+        axes.axhline(
+            traces.bound_m, color=QUIET, linewidth=0.9, linestyle=":", label=f"{label}Cramér-Rao bound, all updates"
+        )
     axes.set_yscale("log")
     axes.set(xlabel="updates", ylabel="root mean square error, m")
     axes.set_title(f"{traces.runs} runs", fontsize=10, color=INK)
@@ -142,7 +153,9 @@ def _ellipses(axes: "Axes", picture: MapPicture) -> float:
     for place, half, (_, vectors) in zip(places, halves, spread, strict=True):
         angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
         size = 2.0 * grown * half
-        axes.add_patch(Ellipse(place, size[1], size[0], angle=angle, facecolor=FOUND, alpha=0.18, edgecolor=FOUND, zorder=2))
+        axes.add_patch(
+            Ellipse(place, size[1], size[0], angle=angle, facecolor=FOUND, alpha=0.18, edgecolor=FOUND, zorder=2)
+        )
     return grown
 
 

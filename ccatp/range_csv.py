@@ -49,13 +49,17 @@ def read_ranges(path: Path, sigma_m: float) -> RangeFile:
     if set(SESSION) <= set(header):
         return _session(path, rows, sigma_m)
     if not set(PLAIN) <= set(header):
-        raise RangeFileError(f"{path}:1: columns {','.join(header)}; wanted {','.join(PLAIN)}[,sigma_m], or {','.join(SESSION)}")
+        raise RangeFileError(
+            f"{path}:1: columns {','.join(header)}; wanted {','.join(PLAIN)}[,sigma_m], or {','.join(SESSION)}"
+        )
     readings = []
     for line, row in rows:
         own = row.get("sigma_m") or ""
         sigma = _number(path, line, "sigma_m", own) if own.strip() else sigma_m
         first, second = (_name(path, line, key, row[key]) for key in PLAIN[:2])
-        readings.append(_checked(path, line, MoteRange(first, second, _number(path, line, "range_m", row["range_m"]), sigma)))
+        readings.append(
+            _checked(path, line, MoteRange(first, second, _number(path, line, "range_m", row["range_m"]), sigma))
+        )
     if not readings:
         raise RangeFileError(f"{path}: has no ranges, only a header")
     return RangeFile(tuple(readings), {}, {})
@@ -100,7 +104,9 @@ def _table(path: Path) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
             reader.fieldnames = header
             return header, list(_lines(reader))
     except OSError as error:
-        raise RangeFileError(f"{path}: {(error.strerror or str(error)).lower()}; name a CSV file that exists") from error
+        raise RangeFileError(
+            f"{path}: {(error.strerror or str(error)).lower()}; name a CSV file that exists"
+        ) from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise RangeFileError(f"{path}: is no CSV text: {error}") from error
 

@@ -26,6 +26,7 @@ from ccatp.processes.common import FAULTS_FILE, RUN_DIR_FILE, Endpoints, open_lo
 from ccatp.processes.observing import check_observatory
 from ccatp.processes.page_socket import PageSocket, note_run_dir, open_page_socket
 from ccatp.processes.run_kinds import BeaconRun, RunKind, SurveyRun
+from ccatp.processes.run_report import write_run_report
 from ccatp.processes.run_view import RunView
 from ccatp.processes.service import Service
 from ccatp.restarts import Decision, Fate
@@ -92,7 +93,7 @@ def run_beacons(options: RunOptions) -> int:
         sockets: dict[str, socket.socket] = {}
         if options.sim:
             at = cfg.sim.robot
-            sockets["dataloop"] = listener = stack.enter_context(_listen("sim.robot", at.host, at.port))
+            sockets["dataloop"] = listener = stack.enter_context(listen("sim.robot", at.host, at.port))
             host, port = listener.getsockname()
             cfg = cfg.model_copy(update={"robot": cfg.robot.model_copy(update={"host": host, "port": port})})
         run_dir = _new_run_dir(options, cfg.system, cfg.run.seed)
@@ -128,10 +129,9 @@ def run_survey(options: RunOptions) -> int:
         runtime_dir = make_runtime_dir(str(options.runtime_dir or cfg.run.runtime_dir), os.environ)
         stack.enter_context(_lock(runtime_dir / "lock", "--runtime-dir"))
         stand_ins = [p for p in PROCESSES if p.is_stand_in and p.listens and options.sim]
-        robot, etalon = cfg.sim.robot, cfg.sim.etalon
-        places = {"sim.robot": (robot.host, robot.port), "sim.etalon": (etalon.host, etalon.port)}
-        sockets = {p.name: stack.enter_context(_listen(p.listens, *places[p.listens])) for p in stand_ins}
-        cfg = _with_addresses(cfg, sockets) if options.sim else cfg
+        places = places_of(cfg)
+        sockets = {p.name: stack.enter_context(listen(p.listens, *places[p.listens])) for p in stand_ins}
+        cfg = with_addresses(cfg, sockets) if options.sim else cfg
         page = open_page_socket(cfg.dashboard)
         if page.socket is not None:
             sockets["dashboard"] = stack.enter_context(page.socket)
@@ -176,7 +176,16 @@ def _lock(path: Path, option: str) -> Iterator[None]:
 
 
 @contextmanager
-def _listen(section: str, host: str, port: int) -> Iterator[socket.socket]:
+def listen(section: str, host: str, port: int) -> Iterator[socket.socket]:
+    """A listening socket for a process that inherits it.
+
+    Args:
+        section: of the configuration that names the address.
+        host, port: the address; port 0 takes any that is free.
+
+    Raises:
+        ConfigError: the port is taken.
+    """
     with socket.socket() as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -190,7 +199,13 @@ def _listen(section: str, host: str, port: int) -> Iterator[socket.socket]:
         yield listener
 
 
-def _with_addresses(cfg: Config, sockets: dict[str, socket.socket]) -> Config:
+def places_of(cfg: Config) -> dict[str, tuple[str, int]]:
+    """Where the stand-ins shall listen, (host, port) by the section of the configuration."""
+    robot, etalon = cfg.sim.robot, cfg.sim.etalon
+    return {"sim.robot": (robot.host, robot.port), "sim.etalon": (etalon.host, etalon.port)}
+
+
+def with_addresses(cfg: Config, sockets: dict[str, socket.socket]) -> Config:
     """The configuration with the addresses at which the stand-ins really listen."""
 
     def at(process: str) -> dict[str, object]:
@@ -301,20 +316,10 @@ class _Run:
             context.destroy(linger=0)
         (self._run_dir / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
         self._log.info("end", status=int(status))
-        view.show_summary(summary, as_json=self._options.json_output)
-        view.show_report(self._report(status))
+        if self._options.shows_summary:
+            view.show_summary(summary, as_json=self._options.json_output)
+            view.show_report(write_run_report(self._run_dir, status, self._log))
         return int(status)
-
-    def _report(self, status: ExitStatus) -> Path | None:
-        """The run's report, where there is time to write one; it never fails the run."""
-        if status is ExitStatus.INTERRUPTED:
-            return None  # somebody is waiting for the end
-        try:
-            return self._kind.report(self._run_dir)
-        except Exception as error:
-            # Whatever it is, the survey is done and its record is on the disk.
-            self._log.error("report", error=str(error))
-            return None
 
     def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
         self._is_interrupted = True

@@ -78,6 +78,7 @@ class BatchConfig(Model):
     """Least squares over all ranges."""
 
     uses_shapes: bool
+    uses_phase2: bool
     estimates_offset: bool
     estimates_scale: bool
     robust_scale: Positive

@@ -41,9 +41,6 @@ class RunKind(Protocol):
     def view(self, run_dir: Path) -> RunView:
         """Who shows it."""
 
-    def report(self, run_dir: Path) -> Path:
-        """Write the report."""
-
 
 class SurveyRun:
     """The survey of a mirror.
@@ -66,10 +63,6 @@ class SurveyRun:
     def view(self, run_dir: Path) -> RunView:
         """Who shows it."""
         return RunView(survey_title(self._cfg, is_sim=self._is_sim), is_sim=self._is_sim, run_dir=run_dir)
-
-    def report(self, run_dir: Path) -> Path:
-        """Write the report."""
-        return _report(run_dir)
 
 
 class BeaconRun:
@@ -98,13 +91,3 @@ class BeaconRun:
         title = f"ccatp {'SIMULATION' if self._is_sim else 'mission'} among beacons: {cfg.system}, {what}{seed}"
         goals = "seconds" if cfg.follow.is_active else "waypoints"
         return BeaconView(title, is_sim=self._is_sim, run_dir=run_dir, goals=goals)
-
-    def report(self, run_dir: Path) -> Path:
-        """Write the report."""
-        return _report(run_dir)
-
-
-def _report(run_dir: Path) -> Path:
-    from ccatp.report_writer import report_run  # noqa: PLC0415 - nothing of it is needed while the robot moves
-
-    return report_run(run_dir)[0]

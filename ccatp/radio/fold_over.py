@@ -80,7 +80,9 @@ def _stress(pairs: IntArray, points: FloatArray, rng: np.random.Generator) -> tu
     axis = np.arange(d)
     at = np.concatenate([i[:, None] * d + axis, j[:, None] * d + axis], axis=1)
     rows = np.repeat(np.arange(len(pairs)), 2 * d)
-    R = coo_array((np.concatenate([ways, -ways], axis=1).ravel(), (rows, at.ravel())), shape=(len(pairs), count * d)).tocsr()
+    R = coo_array(
+        (np.concatenate([ways, -ways], axis=1).ravel(), (rows, at.ravel())), shape=(len(pairs), count * d)
+    ).tocsr()
     values, vectors = np.linalg.eigh((R.T @ R).toarray())
     seen = values > _NULL * values[-1]
     # Orthonormal basis of the column space of R; what a random vector has across it is an equilibrium stress.

@@ -41,7 +41,9 @@ class Unfolded(NamedTuple):
     doubtful: tuple[Fold, ...]
 
 
-def unfold(model: MapModel, fit: BatchFit, settings: BatchSettings, mirrors: Sequence[tuple[Sequence[int], Sequence[int]]] = ()) -> Unfolded:
+def unfold(
+    model: MapModel, fit: BatchFit, settings: BatchSettings, mirrors: Sequence[tuple[Sequence[int], Sequence[int]]] = ()
+) -> Unfolded:
     """Mirror motes one at a time, and sets of motes across the body or the pair that joins them to the rest.
 
     Ranges see a mote whose partners stand nearly in line almost equally well on both sides of it; a fit that began on

@@ -52,7 +52,9 @@ def stitched(count: int, means: PairMeans, dimension: int) -> FloatArray:
         return places
     turns = _turns(patches, count, dimension)
     kept = [number for number in range(len(patches)) if turns[number] is not None]
-    return _shifted([patches[number] for number in kept], np.array([turns[number] for number in kept]), count, dimension)
+    return _shifted(
+        [patches[number] for number in kept], np.array([turns[number] for number in kept]), count, dimension
+    )
 
 
 def _patch(centre: int, means: PairMeans, dimension: int) -> Patch | None:
@@ -135,8 +137,8 @@ def _synchronised(ends: IntArray, blocks: FloatArray, weights: FloatArray, size:
 def _leading(matrix: csr_array, half: FloatArray, dimension: int) -> FloatArray:
     """Blocks of the d leading eigenvectors of D^-1/2 A D^-1/2, times D^-1/2, shape (p, d, d).
 
-    By inverse iteration of the whole subspace: where the relations agree its eigenvalues coincide, and a Lanczos method,
-    which starts from one vector, may miss one of them.
+    By inverse iteration of the whole subspace: where the relations agree its eigenvalues coincide, and a Lanczos
+    method, which starts from one vector, may miss one of them.
     """
     scaled = diags_array(half) @ matrix @ diags_array(half)
     n = matrix.shape[0]

@@ -56,9 +56,7 @@ def _contradicted(network: RangeNetwork, fit: BatchFit) -> list[IntArray]:
     return [group for group in groups if len(group) <= _LARGEST]
 
 
-def _mapped_anew(
-    network: RangeNetwork, fit: BatchFit, motes: IntArray, settings: BatchSettings
-) -> FloatArray | None:
+def _mapped_anew(network: RangeNetwork, fit: BatchFit, motes: IntArray, settings: BatchSettings) -> FloatArray | None:
     """All places with some motes unfolded between their partners; None where too little holds them."""
     d = network.dimension
     pairs = np.column_stack([network.first, network.second])

@@ -12,8 +12,8 @@ def pinned_map(
     """The map moved so that a point and the direction to another are as known; in the plane.
 
     The error of a map in a frame is its shape's error less the rigid motion that keeps what is known without error:
-    C' = S C S^T, S = I - G (K G)^-1 K, G the rigid motions of the map, K the rows of the known coordinates (S-transform,
-    Baarda 1973).
+    C' = S C S^T, S = I - G (K G)^-1 K, G the rigid motions of the map, K the rows of the known coordinates
+    (S-transform, Baarda 1973).
 
     Args:
         positions_m: shape (n, 2).
@@ -27,7 +27,9 @@ def pinned_map(
     whole = np.flatnonzero(is_known.all(axis=1))
     part = np.flatnonzero(is_known.sum(axis=1) == 1)
     if positions_m.shape[1] != 2 or len(whole) != 1 or len(part) != 1:
-        raise ValueError(f"{int(is_known.sum())} known coordinates, wanted both of one mote and one of another in the plane")
+        raise ValueError(
+            f"{int(is_known.sum())} known coordinates, wanted both of one mote and one of another in the plane"
+        )
     first, second = int(whole[0]), int(part[0])
     axis = int(np.flatnonzero(is_known[second])[0])
     motion = _onto(positions_m, known_m, first, second, axis)

@@ -106,16 +106,13 @@ def _mapped(
     model = MapModel(network, with_offset=with_offset, with_scale=with_scale)
     plain = model if not (with_offset or with_scale) else MapModel(network)
     dof_guess = max(len(network.ranges_m) - plain.size, 1)
-    best: BatchFit | None = None
-    steps = 0
+    fits: list[BatchFit] = []
     for start in _starts(network, start_m):
-        fit = fit_map(plain, plain.state(start), settings)
-        steps += fit.iterations
-        if best is None or fit.cost < best.cost:
-            best = fit
-        if best.cost < _SURE * dof_guess:
+        fits.append(fit_map(plain, plain.state(start), settings))
+        if fits[-1].cost < _SURE * dof_guess:
             break
-    assert best is not None  # there is always a start
+    best = min(fits, key=lambda fit: fit.cost)
+    steps = sum(fit.iterations for fit in fits)
     if plain is not model:
         best = fit_map(model, best.state, settings)
         steps += best.iterations

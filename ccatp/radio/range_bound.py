@@ -14,7 +14,7 @@ def bound_rms_m(model: MapModel, true_m: FloatArray, motes: Sequence[int], *, al
     """sqrt(tr C / n) of some motes, C = (J^T Sigma^-1 J)^-1 at the true places.
 
     Args:
-        model: network, and what else is unknown: bodies and known coordinates lower the bound, offset and scale raise it.
+        model: network, and what else is unknown: bodies and known coordinates lower the bound, an offset raises it.
         true_m: places of all motes, shape (n, d).
         motes: those whose error counts.
         aligned: of the error after the rigid motion of these motes that makes it least, for maps without a frame.

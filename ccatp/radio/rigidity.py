@@ -169,7 +169,7 @@ def _steps_from(base: Sequence[int], network: RangeNetwork) -> FloatArray:
 
 
 def _echelon(rows: FloatArray, steps: FloatArray, d: int) -> list[FloatArray]:
-    """Directions by elimination, motes few ranges from the base first: each row moves fewer motes than the one before."""
+    """Directions by elimination, motes near the base first: each row moves fewer motes than the one before."""
     order = (np.argsort(steps, kind="stable")[:, None] * d + np.arange(d)).ravel()
     left = [row.copy() for row in rows]
     found = []

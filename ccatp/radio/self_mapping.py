@@ -36,10 +36,11 @@ class MapperSettings(NamedTuple):
 class MoteMapper:
     """The filter of Patil et al., eqs 18 to 38: motes stand still, each distance corrects the places of both ends.
 
-    Where pairs determine little, the map wanders along what they leave free, and a filter that takes each new reading of a
-    pair along a new line of sight believes to have seen that too. With ``pools`` the posterior is computed from the prior
-    and the mean ranges of all pairs, linearised together (Bell and Cathey 1993), so that repeats teach nothing but the
-    length of a line. Its cost grows with the pairs: beyond ``_POOLED`` of them each reading is filtered as it comes.
+    Where pairs determine little, the map wanders along what they leave free, and a filter that takes each new reading
+    of a pair along a new line of sight believes to have seen that too. With ``pools`` the posterior is computed from
+    the prior and the mean ranges of all pairs, linearised together (Bell and Cathey 1993), so that repeats teach
+    nothing but the length of a line. Beyond ``_POOLED`` pairs, that costs too much, each reading is filtered as it
+    comes.
 
     z = (1 + s) |p_i - p_j| + o;  H has the unit vector from j to i at i, its negative at j, distance and 1 at s and o.
     What is known has neither variance nor covariance; the prior of all else is the caller's, and is conditioned on what
@@ -64,13 +65,14 @@ class MoteMapper:
     ) -> None:
         count, self._dimension = positions_m.shape
         if covariance_m2.shape != (positions_m.size, positions_m.size):
-            raise MappingError(f"covariance of shape {covariance_m2.shape} for {count} motes in {self._dimension} dimensions")
+            raise MappingError(
+                f"covariance of shape {covariance_m2.shape} for {count} motes in {self._dimension} dimensions"
+            )
         if not np.isfinite(positions_m).all():
             raise MappingError("a mote has no place to begin with; phase 2 starts from a place for each")
         mean, covariance = positions_m.ravel(), covariance_m2
         if known_m is not None:
             mean, covariance = conditioned(mean, covariance, known_m.ravel())
-        calibration = np.diag((settings.offset_sigma_m**2, settings.scale_sigma**2))
         self._prior = mean.copy(), covariance.copy(), np.diag((settings.offset_sigma_m**2, settings.scale_sigma**2))
         self._filter = self._at_prior()
         self._settings = settings
@@ -216,7 +218,9 @@ class PhaseTwo(NamedTuple):
     reached: bool
 
 
-def run_phase_two(mapper: MoteMapper, readings: Iterable[tuple[int, int, float, float]], target_rms_m: float) -> PhaseTwo:
+def run_phase_two(
+    mapper: MoteMapper, readings: Iterable[tuple[int, int, float, float]], target_rms_m: float
+) -> PhaseTwo:
     """Observe one distance after the other until the expected error is small enough, or there are no more.
 
     Args:

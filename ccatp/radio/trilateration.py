@@ -66,8 +66,8 @@ class Sketch:
     def linearise_at(self, motes: Sequence[int], places_m: FloatArray) -> None:
         """Take the derivatives of later steps at better places than those found, shape (k, d).
 
-        The error of a place from a small stand is far larger than that of a range: on a stand whose motes came out wider
-        apart than they are, the next ones look better determined than they are.
+        The error of a place from a small stand is far larger than that of a range: on a stand whose motes came out
+        wider apart than they are, the next ones look better determined than they are.
         """
         self._seen_m[list(motes)] = places_m
 
@@ -93,7 +93,7 @@ class Sketch:
             MissingRange: a range to A or B is missing.
             DegenerateStep: the mote is on the axis, or nearly.
         """
-        (a, sigma_a), (b, sigma_b), (c, sigma_c) = (
+        (a, sigma_a), (b, sigma_b), (c, _) = (
             self._range(origin, mote),
             self._range(axis, mote),
             self._range(origin, axis),
@@ -151,13 +151,13 @@ class Sketch:
     def _solve(self, mote: int, references: Sequence[int], ranges: Sequence[tuple[float, float]]) -> Solution:
         anchors = self.positions_m[list(references)]
         values, sigmas = np.array(ranges).T
-        found = []
+        found, refusal = [], ""
         for start in _starts(anchors, values):
             try:
                 # A hundredth of a sigma is rest enough: errors of the references are larger.
                 found.append(multilaterate(anchors, values, sigmas, start, tolerance_m=1e-2 * float(sigmas.min())))
             except MultilaterationError as error:
-                refusal = error
+                refusal = str(error)
         if not found:
             raise DegenerateStep(f"{self._names[mote]} from {self._listed(references)}: {refusal}")
         return min(found, key=lambda solution: solution.chi_squared)
@@ -201,5 +201,7 @@ def _starts(anchors: FloatArray, ranges: FloatArray) -> list[FloatArray]:
     height = float(linear @ normal)
     # The differences tell little of the height above nearly flat references; one range tells how much is missing.
     flat = linear - height * normal
-    missing = float(np.sqrt(max(float(np.mean(ranges**2)) - float(flat @ flat) - float(np.mean((offsets**2).sum(axis=1))), 1e-12)))
+    missing = float(
+        np.sqrt(max(float(np.mean(ranges**2)) - float(flat @ flat) - float(np.mean((offsets**2).sum(axis=1))), 1e-12))
+    )
     return [centre + flat + missing * normal, centre + flat - missing * normal]

@@ -1,6 +1,7 @@
 """Pure. Self-mapping of one simulated field by filter or batch, and its error against the truth."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,11 +12,12 @@ from ccatp.radio.map_model import MapModel
 from ccatp.radio.mote_frame import pinned_map
 from ccatp.radio.mote_map import MoteMap, map_motes
 from ccatp.radio.phase_one import FirstMap, map_as_possible, map_by_plan
-from ccatp.radio.range_bound import bound_rms_m
+from ccatp.radio.range_bound import bound_rms_m, map_rms_m
 from ccatp.radio.range_network import FloatArray, MappingError, RangeNetwork
 from ccatp.radio.rigid_alignment import aligned_rms_m, best_motion, rms_m
 from ccatp.radio.rigidity import Freedom, find_freedom, generic_state
 from ccatp.radio.self_mapping import MapperSettings, MoteMapper, printed_prior, run_phase_two
+from ccatp.radio.stands import complete_stands
 from ccatp.studies.mote_field import SimulatedField
 
 _OFFSET_SIGMA_M, _SCALE_SIGMA = 0.5, 0.05  # of the filter's priors, where an offset or a scale is estimated
@@ -37,6 +39,7 @@ class MoteRun:
         is_aligned: whether the frame was free.
         offset_m, scale: of the ranges, where they were estimated.
         nis: of each update of the filter.
+        whole: the map with all motes of the stands, by name; the same motes where there are no others.
     """
 
     names: tuple[str, ...]
@@ -53,6 +56,15 @@ class MoteRun:
     offset_m: float
     scale: float
     nis: FloatArray
+    whole: "NamedMap"
+
+
+class NamedMap(NamedTuple):
+    """Motes with names: what a beacon file holds."""
+
+    names: tuple[str, ...]
+    positions_m: FloatArray
+    covariance_m2: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +134,18 @@ def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
         offset_m=mapper.offset_m,
         scale=mapper.scale,
         nis=went.nis,
+        whole=_whole(field, first, mapper),
     )
+
+
+def _whole(field: SimulatedField, first: FirstMap, mapper: MoteMapper) -> NamedMap:
+    """All motes of the stands, from their heads."""
+    plan = field.plan
+    if not plan.networks:
+        return NamedMap(plan.names, mapper.positions_m, mapper.covariance_m2)
+    whole = complete_stands(plan, first.positions_m, first.covariance_m2, mapper.positions_m, mapper.covariance_m2)
+    names = tuple(plan.names[mote] for mote in whole.motes)
+    return NamedMap(names, whole.positions_m, whole.covariance_m2)
 
 
 def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | None = None) -> MoteRun:
@@ -159,9 +182,10 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
     d = plan.dimension
     at = (np.array(motes)[:, None] * d + np.arange(d)).ravel()
     error_m = aligned_rms_m(positions[motes], true_m, mirrors=not plan.bodies)
-    expected_m = float(np.sqrt(np.trace(found.covariance_m2[np.ix_(at, at)]) / len(motes)))
+    expected_m = map_rms_m(found.covariance_m2, found.positions_m, motes, aligned=True)
+    names = tuple(plan.names[mote] for mote in motes)
     return MoteRun(
-        names=tuple(plan.names[mote] for mote in motes),
+        names=names,
         positions_m=positions[motes],
         covariance_m2=covariance[np.ix_(at, at)],
         true_m=true_m,
@@ -175,12 +199,13 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
         offset_m=found.offset_m,
         scale=found.scale,
         nis=np.zeros(0),
+        whole=NamedMap(names, positions[motes], covariance[np.ix_(at, at)]),
     )
 
 
 def batch_network(cfg: CricketConfig, field: SimulatedField) -> RangeNetwork:
-    """The graph that the batch uses: all ranges, and the shapes of the stands where the configuration says so."""
-    return field.network(with_second=True, with_shapes=cfg.batch.uses_shapes)
+    """The graph that the batch uses: ranges of phases 1 and 2 and shapes of the stands, as the configuration says."""
+    return field.network(with_second=cfg.batch.uses_phase2, with_shapes=cfg.batch.uses_shapes)
 
 
 def batch_settings(cfg: CricketConfig) -> BatchSettings:
@@ -252,7 +277,14 @@ def _with_known(field: SimulatedField, updates: int | None) -> RangeNetwork:
     cut = SimulatedField(field.plan, field.true_m, field.first, field.second[:updates])
     whole = cut.network(with_second=True)
     return RangeNetwork(
-        whole.names, whole.dimension, whole.first, whole.second, whole.ranges_m, whole.sigmas_m, (), field.plan.surveyed_m
+        whole.names,
+        whole.dimension,
+        whole.first,
+        whole.second,
+        whole.ranges_m,
+        whole.sigmas_m,
+        (),
+        field.plan.surveyed_m,
     )
 
 

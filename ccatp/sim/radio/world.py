@@ -33,7 +33,7 @@ class RadioWorld:
         self._incidents = Incidents(cfg.sim.incidents)
         self.obstacles = list(cfg.sim.obstacles)
         self._vehicle = TrueVehicle(cfg.vehicle, cfg.sim.vehicle, _true_start(cfg, seed), _stream(seed, _WHEELS))
-        self._target = MovingTarget(cfg.sim.target, cfg.workspace.size_m, _stream(seed, _TARGET))
+        self._target = MovingTarget(cfg.sim.target, cfg.workspace.size_m, cfg.sim.obstacles, _stream(seed, _TARGET))
         self._distances = _stream(seed, _DISTANCES)
         references = {name: beacon.reference_dbm for name, beacon in cfg.sim.beacons.items()}
         if cfg.sim.target.motion != "none":
