@@ -109,7 +109,7 @@ class SignalSlam:
         """Carry the vehicle and the moving radio on."""
         before = self.engine.mean[:PLACE].tolist()
         step = self.settings.motion.step(self.engine.mean[: self.engine.vehicle_size], odometry)
-        self.engine.predict(*step)
+        self.engine.predict(step.mean, step.F, step.Q)
         moving = self.settings.moving
         if moving is not None and moving.beacon in self.engine:
             travel_m = hypot(step.mean[0] - before[0], step.mean[1] - before[1])
