@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccatp.aligning.modes import FloatArray, quadratic, rigid
+from ccatp.aligning.displacement import on_grid_m
 from ccatp.aligning.moves import adjuster_places
 from ccatp.aligning.panel_result import PanelResult
 from ccatp.aligning.survey_result import SurveyResult
@@ -98,12 +98,7 @@ def _draw_panel(axes: "Axes", mirror: Mirror, panel: PanelResult, colours: "Colo
     from matplotlib.patches import Rectangle  # noqa: PLC0415 - see above
 
     body, found, (cmap, norm) = mirror.panel(panel.panel), panel.deviations, colours
-    x = np.linspace(body.x_m - body.half_x_m, body.x_m + body.half_x_m, _CELLS + 1)
-    y = np.linspace(body.y_m - body.half_y_m, body.y_m + body.half_y_m, _CELLS + 1)
-    middle_x, middle_y = np.meshgrid((x[1:] + x[:-1]) / 2.0, (y[1:] + y[:-1]) / 2.0)
-    deck = np.column_stack([middle_x.ravel(), middle_y.ravel()]).tolist()
-    places = np.array([body.from_deck(mirror.surface.point(*place))[:2] for place in deck])
-    values = _displacement(panel, places).reshape(_CELLS, _CELLS)
+    x, y, values = on_grid_m(mirror, panel, _CELLS)
     axes.pcolormesh(x, y, values * _MICRO, cmap=cmap, norm=norm, zorder=2, rasterized=True)
     size = 2.0 * body.half_x_m, 2.0 * body.half_y_m
     axes.add_patch(Rectangle((x[0], y[0]), *size, fill=False, edgecolor=_QUIET, linewidth=0.7, zorder=3))
@@ -116,15 +111,6 @@ def _draw_panel(axes: "Axes", mirror: Mirror, panel: PanelResult, colours: "Colo
     for name, place, move in zip(names, adjusters.tolist(), panel.rigid.moves.values_m, strict=True):
         deck_x, deck_y, _ = body.to_deck((*place, 0.0))
         axes.text(deck_x, deck_y - 0.025, f"{name} {_MICRO * move:+.0f}", **small)
-
-
-def _displacement(panel: PanelResult, places: FloatArray) -> FloatArray:
-    found = rigid(places) @ panel.fit.values
-    if panel.shape is not None and panel.shape.is_significant:
-        # The rigid fit has taken the mean of the curvatures' part away; so does what is drawn.
-        bend = quadratic(places)[:, 3:] @ panel.shape.values_1_m
-        found += bend - bend.mean()
-    return np.asarray(found)
 
 
 def _draw_bar(figure: "Figure", axes: "Axes", colours: "Colours") -> None:

@@ -62,6 +62,8 @@ class Subscriber:
         endpoints: where to connect (a publisher may come up later).
         topics: names of the topic table.
         is_watching: watch the connection, for ``is_cut``; of one publisher only.
+        is_onlooking: a publisher that waits for its subscribers does not count this one (``has_subscriber``).
+        keeps_newest: of messages that wait only the newest is kept, whatever its topic.
     """
 
     def __init__(
@@ -71,6 +73,8 @@ class Subscriber:
         topics: Iterable[str],
         *,
         is_watching: bool = False,
+        is_onlooking: bool = False,
+        keeps_newest: bool = False,
     ) -> None:
         """Connect and subscribe."""
         self.socket = context.socket(zmq.SUB)
@@ -82,8 +86,11 @@ class Subscriber:
             self.socket.get_monitor_socket(zmq.EVENT_CONNECTED | zmq.EVENT_DISCONNECTED) if is_watching else None
         )
         self._is_cut = False
+        if keeps_newest:
+            self.socket.setsockopt(zmq.CONFLATE, 1)
         for name in topics:
-            self.socket.setsockopt(zmq.SUBSCRIBE, BY_NAME[name].name.encode() + b" ")
+            # Every message is an object: with its brace the prefix fits as well, and is not the one that is waited for.
+            self.socket.setsockopt(zmq.SUBSCRIBE, BY_NAME[name].name.encode() + (b" {" if is_onlooking else b" "))
         for endpoint in endpoints:
             self.socket.connect(endpoint)
         self.bad_messages = 0

@@ -15,6 +15,7 @@ from ccatp.cli_calibrate import calibrate
 from ccatp.cli_check import check
 from ccatp.cli_completion import completion
 from ccatp.cli_conformance import conformance
+from ccatp.cli_dashboard import dashboard
 from ccatp.cli_frame import (
     ADDRESS_OPTIONS,
     CONFIG_OPTION,
@@ -36,7 +37,9 @@ from ccatp.cli_frame import (
 from ccatp.cli_keys import keys
 from ccatp.cli_log import log
 from ccatp.cli_plan import plan
+from ccatp.cli_radio import radio
 from ccatp.cli_replay import replay
+from ccatp.cli_report import compare, report
 from ccatp.cli_status import status
 from ccatp.cli_stream import stream
 from ccatp.cli_study import study
@@ -101,7 +104,7 @@ def run(
     if not sim and config_file is None:
         raise click.UsageError("name the robot's configuration with --config FILE, or add --sim")
     from ccatp.run_options import RunOptions
-    from ccatp.supervisor import run_survey
+    from ccatp.supervisor import run as run_to_the_end
 
     if faults_file is not None:
         from ccatp.fault_plan import read_plan
@@ -115,7 +118,7 @@ def run(
         "run.filter": filter_name,
     }
     return int(
-        run_survey(
+        run_to_the_end(
             RunOptions(
                 sim=sim,
                 config_file=config_file,
@@ -304,6 +307,7 @@ def sim_etalon(
 
 cli.add_command(align)
 cli.add_command(bench)
+cli.add_command(dashboard)
 cli.add_command(keys)
 cli.add_command(calibrate)
 cli.add_command(completion)
@@ -312,8 +316,11 @@ cli.add_command(log)
 cli.add_command(status)
 cli.add_command(stream)
 cli.add_command(plan)
+cli.add_command(radio)
 cli.add_command(study)
 cli.add_command(replay)
+cli.add_command(report)
+cli.add_command(compare)
 cli.add_command(conformance)
 
 

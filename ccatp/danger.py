@@ -28,6 +28,7 @@ from ccatp.hazards.edge_rule import EdgeRule, PoseEstimate
 from ccatp.hazards.origin_rule import OriginRule
 from ccatp.health.board import Commanded, Frame, HealthBoard
 from ccatp.health.findings import Finding
+from ccatp.health.garbled import GarbledLines
 from ccatp.health.ladder import Ladder, denies, gravest
 from ccatp.health.seams import Ground
 from ccatp.health.steady_time import SteadyTime
@@ -118,6 +119,7 @@ class DangerMonitor:
                 health, cfg, robot, ground, (base.x_m, base.y_m), mirror.overhang, self._is_explained
             )
             self._ladder = Ladder(health)
+            self._garbled = GarbledLines(health.garbled_lines, health.garbled_window_s)
         self._time = SteadyTime(CLOCK_JUMP_S if health is None else health.clock_jump_s)
         self._origin = OriginRule(mirror.rim, robot, cfg)
         self._stale_after_s, self._estimate_stale_after_s = cfg.stale_after_s, cfg.estimate_stale_after_s
@@ -163,6 +165,11 @@ class DangerMonitor:
         if self._edges.is_lifted or self._origin.direction or self._declared() is not None:
             return EventCode.NEAR_EDGE
         return EventCode.ABORTED if self.latch.is_latched else EventCode.NORMAL
+
+    @property
+    def counts(self) -> dict[str, object]:
+        """For the log, at the end of a run."""
+        return {"episodes": self.episodes_opened, "edges": self.edges_declared}
 
     @property
     def episodes_opened(self) -> dict[Corner, int]:
@@ -315,6 +322,20 @@ class DangerMonitor:
         limit_s = self._stale_after_s
         return _denied(seq, t_s, self.code, _Missing("sensors", "no sensors frame", limit_s, limit_s))
 
+    def garbled(self, seq: int, t_s: float, at_s: float) -> Verdict | None:
+        """A line of the robot was no frame. The verdict where there were too many: nothing permitted.
+
+        Args:
+            seq: the last frame's number.
+            t_s: robot time as far as known, s.
+            at_s: when it came, on any clock that runs on, s.
+        """
+        if self._board is None or not self._garbled.add(at_s):
+            return None
+        finding = self._board.garbled()
+        denied = _Missing(finding.signal, finding.cause, finding.value, finding.limit)
+        return _denied(seq, t_s, self.code, denied, finding.severity)
+
     def _is_fresh(self, estimate: Estimate, t_s: float) -> bool:
         # Written so that a time that is not a number is not fresh.
         return abs(t_s - estimate.t_s) <= self._estimate_stale_after_s and isfinite(
@@ -402,6 +423,6 @@ class DangerMonitor:
         return a, b, c, d
 
 
-def _denied(seq: int, t_s: float, code: EventCode, missing: _Missing) -> Verdict:
+def _denied(seq: int, t_s: float, code: EventCode, missing: _Missing, severity: Severity = _STALE) -> Verdict:
     signal, cause, age_s, limit_s = missing
-    return Verdict(seq, t_s, code, cause, signal, age_s, limit_s, False, False, False, NOWHERE, _STALE)
+    return Verdict(seq, t_s, code, cause, signal, age_s, limit_s, False, False, False, NOWHERE, severity)

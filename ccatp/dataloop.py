@@ -7,43 +7,27 @@ Known limitations: the battery stays full, and nothing fails by itself; a fault 
 """
 
 import asyncio
-import secrets
 import socket
 from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import Protocol, cast
 
 import numpy as np
-import zmq
-import zmq.asyncio
 
 from ccatp.body_file import BodyFile
-from ccatp.bus import Publisher
 from ccatp.config.models import Config
 from ccatp.fault_proxy.proxy import FaultProxy
 from ccatp.link_faults import LinkFaults
+from ccatp.link_server import LinkServer, Log
 from ccatp.mirror.mirror import build_mirror
 from ccatp.samples import DeckPose
 from ccatp.sim.faults.plan import FaultPlan
 from ccatp.sim.faults.record import Injected
 from ccatp.sim.robot import Robot
-from ccatp.sim.sessions import RobotServer, Session
 from ccatp.sim.truth import TruthLog
-
-HOUSEKEEPING_S = 0.25
-# A client that does not read gets no more frames once this much waits for it; it finds the newest when it reads on.
-MAX_UNSENT_BYTES = 1 << 18
-MAX_REQUEST_BYTES = 4096
+from ccatp.truth_outlet import TruthOutlet
 
 
-class Log(Protocol):
-    """A structlog logger, or whatever has this method."""
-
-    def info(self, event: str, **fields: object) -> object:
-        """Take one line, and what belongs to it."""
-
-
-class DataLoop:
+class DataLoop(LinkServer):
     """The server.
 
     Args:
@@ -72,75 +56,16 @@ class DataLoop:
         faults: FaultPlan | None = None,
         start: DeckPose | None = None,
     ) -> None:
-        self._address = cfg.sim.robot.host, cfg.sim.robot.port
-        self._is_lockstep = lockstep
-        self._log = log
         self.robot = Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(seed), faults, start)
+        super().__init__(self.robot, (cfg.sim.robot.host, cfg.sim.robot.port), lockstep=lockstep, key=key, log=log)
         self.body: BodyFile | None = None
-        self._boot = secrets.randbits(31)
-        self._key = key
         self.truth: TruthOutlet | None = None
         self.link_faults: LinkFaults | None = None
-        self._listener: asyncio.Server | None = None
-        self._timer: asyncio.TimerHandle | None = None
-        self._connections: set[_Connection] = set()
-        self._failure: asyncio.Future[None]
 
-    async def start(self, sock: socket.socket | None = None) -> int:
-        """Boot and listen on the configured address (port 0 = any free port) or on a bound socket; return the port.
-
-        Raises:
-            OSError: the address cannot be had.
-        """
-        loop = asyncio.get_running_loop()
-        self._failure = loop.create_future()
-        self.server = RobotServer(
-            self.robot,
-            lockstep=self._is_lockstep,
-            boot=self._boot,
-            key=self._key,
-            make_nonce=lambda: secrets.token_hex(16),
-            now_s=loop.time(),
-            note=self._note,
-            on_frame=self._on_frame,
-        )
-        if sock is None:
-            self._listener = await loop.create_server(self._connection, *self._address)
-        else:
-            self._listener = await loop.create_server(self._connection, sock=sock)
-        if not self._is_lockstep:
-            self._timer = loop.call_at(self.server.next_frame_s, self._tick)
-        return int(self._listener.sockets[0].getsockname()[1])
-
-    async def run(self, stop: asyncio.Event) -> None:
-        """Serve until ``stop`` is set; ``start`` first unless it was called. An unforeseen error is raised here."""
-        if self._listener is None:
-            await self.start()
-        failure = self._failure
-        stopped = asyncio.ensure_future(stop.wait())
-        try:
-            while not (stopped.done() or failure.done()):
-                self.server.check_time(asyncio.get_running_loop().time())
-                await asyncio.wait((stopped, failure), timeout=HOUSEKEEPING_S, return_when="FIRST_COMPLETED")
-            if failure.done():
-                failure.result()
-        finally:
-            stopped.cancel()
-            await self.close()
-
-    async def close(self) -> None:
-        """Stop: no timer, no listener, no session, the last truth published."""
-        if self._timer is not None:
-            self._timer.cancel()
-        if self._listener is not None:
-            self._listener.close()
-        for connection in tuple(self._connections):
-            connection.close()
+    def on_close(self) -> None:
+        """The last truth published, and what became of the faults."""
         if self.truth is not None:
             self.truth.flush()
-        if self._log is not None and self._listener is not None:
-            counts = {"fan_changes": self.server.fan_changes, "oldest_ack_frames": self.server.oldest_ack_frames}
-            self._log.info("robot", **counts, **self.server.counts)
         if self.robot.injector is not None:
             for injected in self.robot.injector.injected:
                 self._log_fault("injected", injected)
@@ -148,38 +73,9 @@ class DataLoop:
             self.link_faults.tick(self.robot.t_s)  # what happened since the last frame
             for injected in self.link_faults.injected:
                 self._log_fault("injected", injected)
-        if self._listener is not None:
-            await self._listener.wait_closed()
-            self._listener = None
 
-    def _connection(self) -> "_Connection":
-        return _Connection(self)
-
-    def opened(self, connection: "_Connection") -> Session:
-        """A client connected."""
-        self._connections.add(connection)
-        return self.server.accept(connection, asyncio.get_running_loop().time())
-
-    def closed(self, connection: "_Connection", session: Session) -> None:
-        """A client is gone."""
-        self._connections.discard(connection)
-        self.server.lost(session)
-
-    def fail(self, error: Exception) -> None:
-        """End ``run`` with an error that nobody foresaw."""
-        if not self._failure.done():
-            self._failure.set_exception(error)
-
-    def _tick(self) -> None:
-        loop = asyncio.get_running_loop()
-        try:
-            self.server.tick(loop.time())
-        except Exception as error:
-            self.fail(error)
-            return
-        self._timer = loop.call_at(self.server.next_frame_s, self._tick)
-
-    def _on_frame(self) -> None:
+    def on_frame(self) -> None:
+        """Keep the pose and the truth; faults begin and end."""
         if self.body is not None:
             self.body.keep(self.robot)
         if self.truth is not None:
@@ -194,112 +90,6 @@ class DataLoop:
     def _log_fault(self, what: str, injected: Injected) -> None:
         if self._log is not None:
             self._log.info(f"fault {what}: {injected.signal} {injected.type}", **injected._asdict())
-
-    def _note(self, text: str) -> None:
-        if self._log is not None:
-            self._log.info(text)
-
-
-class _Connection(asyncio.Protocol):
-    """Bytes in and out of one connection."""
-
-    def __init__(self, owner: DataLoop) -> None:
-        self._owner = owner
-        self._transport: asyncio.Transport | None = None
-        self._session: Session | None = None
-        self._is_paused = False
-        self._clock = asyncio.get_running_loop().time
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast(asyncio.Transport, transport)  # a TCP connection has no other
-        self._transport.set_write_buffer_limits(high=MAX_UNSENT_BYTES)
-        peer = self._transport.get_extra_info("socket")
-        peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        self._session = self._owner.opened(self)
-
-    def data_received(self, data: bytes) -> None:
-        if self._session is None:
-            return
-        try:
-            self._session.receive(data, self._clock())
-        except Exception as error:
-            self._owner.fail(error)
-
-    def eof_received(self) -> None:
-        # The transport closes only when the client has taken what waits for it; the session ends here and now.
-        if self._session is not None:
-            self._owner.server.lost(self._session)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        if self._session is not None:
-            self._owner.closed(self, self._session)
-
-    def pause_writing(self) -> None:
-        self._is_paused = True
-
-    def resume_writing(self) -> None:
-        self._is_paused = False
-
-    def write(self, data: bytes) -> None:
-        if not self._is_paused and self._transport is not None:
-            self._transport.write(data)
-
-    def close(self) -> None:
-        if self._transport is not None:
-            self._transport.close()
-
-
-class TruthOutlet:
-    """Gives the truth away by ZeroMQ.
-
-    Args:
-        truth: what there is to give.
-        rep: endpoint of the REP socket, if any.
-        pub: endpoint of the PUB socket, if any.
-    """
-
-    def __init__(self, truth: TruthLog, rep: str | None, pub: str | None) -> None:
-        self._truth = truth
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._publisher = Publisher(self._context, pub) if pub else None
-        self._has_told = False
-        self._rep = zmq.asyncio.Context.shadow(self._context).socket(zmq.REP) if rep else None
-        if self._rep is not None and rep:
-            self._rep.setsockopt(zmq.LINGER, 0)
-            self._rep.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
-            self._rep.bind(rep)
-
-    def add(self) -> None:
-        """Take the row of the newest frame."""
-        if self._truth.add():
-            self.flush()
-
-    def flush(self) -> None:
-        """Publish the pending rows."""
-        batch = self._truth.take()
-        if batch is None or self._publisher is None:
-            return
-        if not self._has_told:  # before the first batch: whoever records one has the other, however the run ends
-            self._has_told = True
-            self._publisher.send("misalignment", self._truth.misalignment())
-        self._publisher.send("truth", batch)
-
-    async def serve(self) -> None:
-        """Answer requests for ever."""
-        while self._rep is not None:
-            request = await self._rep.recv()
-            if request == b"flush":
-                self.flush()
-            await self._rep.send(self._truth.answer(request))
-
-    def close(self) -> None:
-        """Release the sockets."""
-        if self._rep is not None:
-            self._rep.close()
-        if self._publisher is not None:
-            self._publisher.close()
-        self._context.destroy(linger=0)
 
 
 async def serve(

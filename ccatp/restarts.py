@@ -20,6 +20,7 @@ class Fate(Enum):
     RESTART = "restart"
     END = "end"  # with the status of the process
     HELD = "held"  # with status 4
+    WITHOUT = "without"  # it goes on without the process
 
 
 class Decision(NamedTuple):
@@ -42,7 +43,9 @@ class RestartPolicy:
         self._limit, self._window_s = limit, window_s
         self._restarts_s: defaultdict[str, deque[float]] = defaultdict(deque)
 
-    def died(self, name: str, code: int, now_s: float, *, is_replaceable: bool = True, why: str = "") -> Decision:
+    def died(
+        self, name: str, code: int, now_s: float, *, is_replaceable: bool = True, is_needed: bool = True, why: str = ""
+    ) -> Decision:
         """A process has died.
 
         Args:
@@ -50,10 +53,13 @@ class RestartPolicy:
             code: exit status, or minus the number of the signal that killed it.
             now_s: time of any monotonic clock.
             is_replaceable: another one can take its place.
+            is_needed: a run without it is none.
             why: why we killed it, if we did.
         """
         how = why or (f"was killed by {_signal(-code)}" if code < 0 else f"ended with status {code}")
         if code in FINAL:
+            if not is_needed:
+                return Decision(Fate.WITHOUT, f"process {name} {how}: the survey goes on without it")
             return Decision(Fate.END, f"process {name} {how}")
         if not is_replaceable:
             return Decision(Fate.HELD, f"process {name} {how}: run ended, wheels held")
@@ -62,9 +68,12 @@ class RestartPolicy:
             restarts_s.popleft()
         if len(restarts_s) >= self._limit:
             often = f"more than {self._limit} times within {self._window_s:g} s"
+            if not is_needed:
+                return Decision(Fate.WITHOUT, f"process {name} {how}, {often}: the survey goes on without it")
             return Decision(Fate.HELD, f"process {name} {how}, {often}: run ended, wheels held")
         restarts_s.append(now_s)
-        return Decision(Fate.RESTART, f"process {name} {how}: starting it anew, wheels held meanwhile")
+        meanwhile = "wheels held meanwhile" if is_needed else "the survey goes on"
+        return Decision(Fate.RESTART, f"process {name} {how}: starting it anew, {meanwhile}")
 
 
 def _signal(number: int) -> str:

@@ -111,6 +111,7 @@ class RobotLink(asyncio.Protocol):
         on_sensors: called with each frame and its line (without LF), within the event loop's read.
         on_lost: called once with the reason when a joined session ends, unless ``close`` ended it.
         on_joined: called with the robot's hello when the session begins, before its first frame.
+        on_bad_line: called after each line of a joined session that fails a check.
 
     Attributes:
         counts: bad_lines, unknown_types, unexpected, repeated_frames, unsent.
@@ -127,9 +128,11 @@ class RobotLink(asyncio.Protocol):
         on_sensors: Callable[[Sensors, bytes], None],
         on_lost: Callable[[str], None],
         on_joined: Callable[[Hello], None] = lambda _hello: None,
+        on_bad_line: Callable[[], None] = lambda: None,
     ) -> None:
         self._host, self._port, self._role, self._client, self._key = host, port, role, client, key
         self._on_sensors, self._on_lost, self._on_joined = on_sensors, on_lost, on_joined
+        self._on_bad_line = on_bad_line
         self.counts: Counter[str] = Counter()
         self._transport: asyncio.Transport | None = None
         self._hello: Hello | None = None
@@ -278,6 +281,8 @@ class RobotLink(asyncio.Protocol):
         self.counts["bad_lines"] += 1
         if self._bad.add(asyncio.get_running_loop().time()):
             self._end("too many bad lines from the robot")
+        elif self._is_joined:
+            self._on_bad_line()
 
     def _end(self, why: str) -> None:
         self._why = self._why or why
@@ -288,13 +293,13 @@ class RobotLink(asyncio.Protocol):
         """Break the connection at once, whatever waits to be sent; ``on_lost`` is called with ``why``."""
         self._end(why)
 
-    def send_drive(self, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float) -> None:
-        """Send wheel set points.
+    def send_drive(self, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float, steer_rad: float | None = None) -> None:
+        """Send wheel set points, and the steering angle of a robot that has one.
 
         Raises:
             ValueError: a set point that is not finite.
         """
-        self._send_fresh(format_drive(seq, ack, wr_rad_s, wl_rad_s))
+        self._send_fresh(format_drive(seq, ack, wr_rad_s, wl_rad_s, steer_rad))
 
     def send_permit(self, seq: int, ack: int, forward: bool, reverse: bool, turn: bool) -> None:
         """Send what motion is allowed."""

@@ -6,7 +6,7 @@ Needs the extra ``plots`` (matplotlib), imported only when something is drawn.
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from math import ceil, cos, dist, sin
+from math import ceil, cos, sin
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ from ccatp.config.loader import load_config
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.recorder import iter_messages, read_metadata, recordings
-from ccatp.samples import Fix, PointId
+from ccatp.reporting.points import arrival_error_m
 from ccatp.store import MissionStore, StoreError
 
 if TYPE_CHECKING:
@@ -120,12 +120,6 @@ def draw_from_run_dir(run_dir: Path, out: Path) -> None:
     figures = [f"arrival error: mean {np.mean(errors):.2f} mm, largest {max(errors):.2f} mm"] if errors else []
     subtitle = "  ·  ".join([*where, f"seed {cfg.run.seed}", f"filter {cfg.run.filter}", *figures])
     draw_run_map(mirror, _driven_path(parts), points, out, title, subtitle)
-
-
-def arrival_error_m(mirror: Mirror, point: PointId, fix: Fix, puck_height_m: float) -> float:
-    """Distance on the surface from the foot of a measured puck to its measurement point, m."""
-    x, y, _ = mirror.foot_of_puck(fix.position_m, puck_height_m)
-    return dist(mirror.surface_point(x, y), mirror.surface_point(*mirror.point_on_deck(point)))
 
 
 def _points(database: Path, mirror: Mirror, puck_height_m: float) -> list[MapPoint]:

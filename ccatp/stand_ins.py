@@ -13,7 +13,7 @@ from ccatp.config.models import Config
 from ccatp.package import child_environment
 from ccatp.processes.children import ENVIRONMENT
 from ccatp.processes.common import SUPERVISOR_PID
-from ccatp.supervisor import PROCESSES, listen, with_addresses
+from ccatp.supervisor import PROCESSES, listen, places_of, with_addresses
 
 STOP_TIMEOUT_S = 5.0
 
@@ -36,7 +36,8 @@ def stand_ins(cfg: Config) -> Iterator[Config]:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ccatp-")))
         any_port = {part: getattr(cfg.sim, part).model_copy(update={"port": 0}) for part in ("robot", "etalon")}
         cfg = cfg.model_copy(update={"sim": cfg.sim.model_copy(update=any_port)})
-        sockets = {process.name: stack.enter_context(listen(cfg, process)) for process in processes}
+        places = places_of(cfg)
+        sockets = {p.name: stack.enter_context(listen(p.listens, *places[p.listens])) for p in processes}
         cfg = with_addresses(cfg, sockets)
         (folder / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
         for process in processes:

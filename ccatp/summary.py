@@ -45,6 +45,19 @@ def puck_targets(mirror: Mirror, points: Iterable[PointId], puck_height_m: float
     return targets
 
 
+def arrival_error_m(target: PuckTarget, place_m: FloatArray, normal: Vector3, puck_height_m: float) -> float:
+    """Distance of the puck from its target in the tangent plane of the target's panel, m.
+
+    Args:
+        target: where the puck shall be.
+        place_m: surface point under the robot, deck frame, shape (3,).
+        normal: of the surface there.
+        puck_height_m: puck centre above the surface.
+    """
+    offset, across = place_m + puck_height_m * np.array(normal) - target.position_m, np.array(target.normal)
+    return float(np.linalg.norm(offset - (offset @ across) * across))
+
+
 @dataclass(frozen=True, slots=True)
 class RunFacts:
     """What is known of a run before it starts.
@@ -272,11 +285,8 @@ class SummaryBuilder:
         return np.concatenate(found) if found else np.empty((0, 11))
 
     def _arrival_error_m(self, point: PointId, truth: FloatArray) -> float:
-        target = self._targets[point]
         normal = self._normal_at(float(truth[_X]), float(truth[_Y]))
-        puck = truth[_SURFACE] + self._facts.puck_height_m * np.array(normal)
-        offset, across = puck - target.position_m, np.array(target.normal)
-        return float(np.linalg.norm(offset - (offset @ across) * across))
+        return arrival_error_m(self._targets[point], truth[_SURFACE], normal, self._facts.puck_height_m)
 
 
 def format_table(summary: Mapping[str, Any]) -> str:

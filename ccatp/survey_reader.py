@@ -62,7 +62,7 @@ def read_run(run_dir: Path, overrides: Mapping[str, object]) -> Survey:
         f"point {point_name(point)}: its stored fix is damaged and left out; measure it again"
         for point in stored.damaged
     ]
-    injected, is_simulation = _truth(run_dir, warnings)
+    injected, is_simulation = read_truth(run_dir, warnings)
     return Survey(
         cfg=cfg,
         planned=tuple(row.point for row in stored.points),
@@ -73,8 +73,8 @@ def read_run(run_dir: Path, overrides: Mapping[str, object]) -> Survey:
     )
 
 
-def _truth(run_dir: Path, warnings: list[str]) -> tuple[Injected | None, bool | None]:
-    """How the panels were simulated to lie, and whether they were."""
+def read_truth(run_dir: Path, warnings: list[str]) -> tuple[Injected | None, bool | None]:
+    """How the panels were simulated to lie, and whether they were; what cannot be read is told in ``warnings``."""
     found: list[Injected] = []
     is_simulation: bool | None = None
     for path in recordings(run_dir / TELEMETRY):

@@ -12,6 +12,7 @@ from ccatp.config.messages import Fault, choice_hint, slip_hint
 from ccatp.config.models import (
     AlignConfig,
     Config,
+    DashboardConfig,
     LimitsConfig,
     MirrorConfig,
     ObservatoryConfig,
@@ -52,6 +53,7 @@ def check_config(cfg: Config) -> list[Fault]:
         *_check_world(cfg.world, cfg.sim.robot),
         *_check_light(cfg.align),
         *_check_observatory(cfg.observatory),
+        *_check_dashboard(cfg.dashboard),
         *_check_stand_ins(cfg),
         *_check_standstill(cfg),
         *_check_panels(cfg.mirror.panels),
@@ -167,6 +169,13 @@ def _check_observatory(observatory: ObservatoryConfig) -> Iterator[Fault]:
         if not getattr(observatory, name):
             what = f'= "", but endpoint = "{observatory.endpoint}" wants keys and a list; see ccatp keys generate'
             yield Fault((root, name), what, ((root, "endpoint"),))
+
+
+def _check_dashboard(dashboard: DashboardConfig) -> Iterator[Fault]:
+    """Whoever reaches the page may stop the robot, unless there is a token."""
+    if not (is_loopback(dashboard.host) or dashboard.token_file):
+        what = f'= "{dashboard.host}" is beyond this machine; name a file with a token in dashboard.token_file'
+        yield Fault(("dashboard", "host"), what, (("dashboard", "token_file"),))
 
 
 def is_loopback(host: str) -> bool:

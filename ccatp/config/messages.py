@@ -87,16 +87,21 @@ def slip_hint(key: Key, value: float, limit: float = math.inf) -> str:
     return ""
 
 
-def faults_of(errors: Iterable[Mapping[str, Any]]) -> list[Fault]:
-    """The findings of ``ValidationError.errors()`` as faults, misspelt keys first: they also cause missing ones."""
+def faults_of(errors: Iterable[Mapping[str, Any]], root: type[BaseModel] = Config) -> list[Fault]:
+    """The findings of ``ValidationError.errors()`` as faults, misspelt keys first: they also cause missing ones.
+
+    Args:
+        errors: the findings.
+        root: the model that was validated.
+    """
     ordered = sorted(errors, key=lambda error: error["type"] != "extra_forbidden")
-    return [Fault(tuple(error["loc"]), _what(error)) for error in ordered]
+    return [Fault(tuple(error["loc"]), _what(error, root)) for error in ordered]
 
 
-def _what(error: Mapping[str, Any]) -> str:
+def _what(error: Mapping[str, Any], root: type[BaseModel]) -> str:
     kind, key, value = error["type"], tuple(error["loc"]), error["input"]
     if kind == "extra_forbidden":
-        return _unknown(key)
+        return _unknown(key, root)
     if kind == "missing":
         return "is missing"
     if kind == "too_long":
@@ -113,21 +118,21 @@ def _what(error: Mapping[str, Any]) -> str:
     return f"= {shown} {_TYPES.get(kind, error['msg'])}"
 
 
-def _unknown(key: Key) -> str:
+def _unknown(key: Key, root: type[BaseModel]) -> str:
     """A key that no model has: the nearest one beside it, else one of the same name in another section."""
     name = str(key[-1])
-    siblings = list(_fields(key[:-1]))
+    siblings = list(_fields(key[:-1], root))
     if near := nearest(name, siblings):
         return f"is unknown; did you mean {format_key((*key[:-1], near))}?"
-    everywhere = {path[-1]: format_key(path) for path in _paths(Config, ())}
+    everywhere = {path[-1]: format_key(path) for path in _paths(root, ())}
     if near := nearest(name, everywhere):
         return f"is unknown; did you mean {everywhere[near]}?"
     return f"is unknown; known here: {', '.join(siblings)}"
 
 
-def _fields(path: Key) -> Mapping[str, Any]:
+def _fields(path: Key, root: type[BaseModel]) -> Mapping[str, Any]:
     """The fields of the model at a path of the configuration; empty where there is no model."""
-    model: Any = Config
+    model: Any = root
     for part in path:
         fields = getattr(model, "model_fields", None)
         if fields is not None:

@@ -19,7 +19,18 @@ class Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class RunConfig(Model):
+class ProcessesConfig(Model):
+    """The processes of a run: where they meet, and when one hangs."""
+
+    runtime_dir: str  # empty = chosen from the environment
+    realtime_priority: Annotated[int, Field(ge=0, le=99)]  # 0 = ordinary scheduling
+    hang_timeout_s: Positive
+    start_timeout_s: Positive
+    restart_limit: Annotated[int, Field(ge=0)]
+    restart_window_s: Positive
+
+
+class RunConfig(ProcessesConfig):
     """What to survey and how."""
 
     mirror: str
@@ -29,26 +40,13 @@ class RunConfig(Model):
     panels: Annotated[int, Field(ge=0)]  # 0 = the whole mirror
     order: str
     budget_s: Positive
-    runtime_dir: str  # empty = chosen from the environment
-    realtime_priority: Annotated[int, Field(ge=0, le=99)]  # 0 = ordinary scheduling
-    hang_timeout_s: Positive
-    start_timeout_s: Positive
-    restart_limit: Annotated[int, Field(ge=0)]
-    restart_window_s: Positive
 
 
-class RobotConfig(Model):
-    """Address and geometry of the robot."""
+class LinkConfig(Model):
+    """The robot link: where the robot is, and when what it says is too old."""
 
     host: str
     port: Port
-    wheel_radius_m: Annotated[float, Field(gt=0.0, le=0.2)]
-    wheel_base_m: Annotated[float, Field(gt=0.0, le=0.6)]
-    edge_sensors_m: tuple[Pair, Pair, Pair, Pair]
-    puck_height_m: Annotated[float, Field(ge=0.0, le=0.5)]
-    max_wheel_rad_s: Positive
-    wheel_lag_s: NonNegative
-    fan_duty: tuple[Annotated[float, Field(ge=0.0, le=1.0)], Annotated[float, Field(ge=0.0, le=1.0)]]
     key_file: str
     connect_timeout_s: Positive
     sensors_timeout_s: Freshness
@@ -56,6 +54,18 @@ class RobotConfig(Model):
     lag_limit_s: Freshness
     silence_timeout_s: Positive
     reconnect_timeout_s: Positive
+
+
+class RobotConfig(LinkConfig):
+    """Address and geometry of the robot."""
+
+    wheel_radius_m: Annotated[float, Field(gt=0.0, le=0.2)]
+    wheel_base_m: Annotated[float, Field(gt=0.0, le=0.6)]
+    edge_sensors_m: tuple[Pair, Pair, Pair, Pair]
+    puck_height_m: Annotated[float, Field(ge=0.0, le=0.5)]
+    max_wheel_rad_s: Positive
+    wheel_lag_s: NonNegative
+    fan_duty: tuple[Annotated[float, Field(ge=0.0, le=1.0)], Annotated[float, Field(ge=0.0, le=1.0)]]
 
 
 class LimitsConfig(Model):
@@ -248,6 +258,8 @@ class HealthConfig(Model):
     doubt_position_m: Positive
     doubt_heading_rad: Positive
     gap_s: Positive
+    garbled_lines: Annotated[int, Field(ge=1, le=20)]
+    garbled_window_s: Positive
     pause_limit_s: Positive
     hold_limit_s: Positive
     lifted_limit_s: Positive
@@ -298,6 +310,20 @@ class ObservatoryConfig(Model):
     endpoint: str  # empty = none
     key_file: str
     clients_file: str
+
+
+class DashboardConfig(Model):
+    """The operator's web page, and the commands over HTTP."""
+
+    enabled: bool
+    host: str
+    port: Port
+    token_file: str  # empty = none
+    host_names: tuple[str, ...]
+    rate_hz: Annotated[float, Field(gt=0.0, le=50.0)]
+    max_connections: Annotated[int, Field(ge=2, le=512)]
+    slow_client_s: Positive
+    command_timeout_s: Positive
 
 
 class MissionConfig(Model):
@@ -483,6 +509,7 @@ class Config(Model):
     align: AlignConfig
     health: HealthConfig
     observatory: ObservatoryConfig
+    dashboard: DashboardConfig
     mission: MissionConfig
     sim: SimConfig
     mirror: MirrorConfig

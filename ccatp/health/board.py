@@ -130,6 +130,7 @@ class HealthBoard:
         self.seams = SeamMonitor(cfg, ground, robot.edge_sensors_m, danger.map_sigmas, fastest)
         self.flicker = FlickerMonitor(cfg, is_explained)
         self._clock, self._gap = Alarm(cfg.imu_quarantine_s), Alarm(cfg.imu_quarantine_s)
+        self._garbled = Alarm(cfg.retry_after_s)
         self._alarms = (
             self._wheels.alarm,
             self._yaw.alarm,
@@ -137,6 +138,7 @@ class HealthBoard:
             self._latency.alarm,
             self._clock,
             self._gap,
+            self._garbled,
             self.flicker.chatter,
             self.flicker.flash,
         )
@@ -151,7 +153,7 @@ class HealthBoard:
             window.reset()
         for monitor in (
             self._wheels, self._yaw, self._rates, self._latency, self._fans, self._battery, self._own,
-            self.seams, self.flicker, self._clock, self._gap,
+            self.seams, self.flicker, self._clock, self._gap, self._garbled,
         ):  # fmt: skip
             monitor.reset()
         self._estimate_seq = -1
@@ -171,6 +173,15 @@ class HealthBoard:
         self._clock.see(t_s, Finding(Severity.PAUSE, "the robot's clock has jumped", "clock", by_s, limit_s))
         self._gate.reset()
         self.findings = self._found()
+
+    def garbled(self) -> Finding:
+        """Too many lines that are no frames came since the last frame; what is found stays until frames come again."""
+        cfg = self._cfg
+        cause, lines = "lines of the robot were no frames", float(cfg.garbled_lines)
+        finding = Finding(Severity.HOLD, cause, "lines", lines, lines)
+        self._garbled.see(self._t_s or 0.0, finding)
+        self.findings = self._found()
+        return finding
 
     def step(
         self,
@@ -237,6 +248,7 @@ class HealthBoard:
         self._latency.step(t_s, frame.cmd.seq)
         self._clock.settle(t_s)
         self._gap.settle(t_s)
+        self._garbled.settle(t_s)
         faults = frame.faults
         if faults or self._own.alarms:
             self._own.step(t_s, faults)

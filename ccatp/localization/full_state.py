@@ -1,7 +1,7 @@
 """Pure. The full-state localizer: pose, speeds and the sensors' own errors in one filter, on the curved surface."""
 
 from collections.abc import Sequence
-from math import isfinite, sqrt
+from math import hypot, isfinite, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +29,7 @@ _CHUNK = 100  # samples at rest after which their mean is used, however long the
 _CONSISTENT = 3  # this many refused fixes that agree with each other are right, and the pose is wrong
 _ROUNDING_S = 1e-6
 _NOMINAL_FRAME_S = 0.01
+_SHORTEST_LEG_M, _LARGEST_DOUBT_RAD = 0.02, 0.5  # of a heading, from where a leg ended instead
 
 
 class _Moved(NamedTuple):
@@ -78,6 +79,8 @@ class FullStateLocalizer(FrameReceiver[_Moved]):
         self._running = RunningPose(robot.wheel_radius_m, robot.wheel_base_m, self._full.jerk_density_m2_s5)
         self._panel = PanelFrame(mirror, start.panel)
         self._refused: list[FloatArray] = []
+        self._fixed_m: FloatArray | None = None  # where the last fix that counted was
+        self._is_anew = False  # no fix has agreed since it began anew
         self._is_new_base = False
         self._turned = (0.0, 0.0)
         self._half_s = 0.0
@@ -312,13 +315,24 @@ class FullStateLocalizer(FrameReceiver[_Moved]):
             self._refuse(t_s, z, variance)
             return
         self._refused.clear()
+        self._fixed_m, self._is_anew = z, False
         self.counts["late_fixes"] += estimate.fix(t_s, z, variance) > 0
         estimate.end_leg()
 
     def _relocate(self, t_s: float, z: FloatArray, variance: FloatArray, *, is_lost: bool) -> None:
-        self._estimate.relocate(t_s, z, variance, is_lost=is_lost)
+        turn_rad = self._turn_to(z, self._estimate.fix_residual(t_s, z))
+        self._estimate.relocate(t_s, z, variance, is_lost=is_lost, turn_rad=turn_rad, again=self._is_anew)
+        self._is_anew = True
+        self._fixed_m = z
         self._block.restart()
         self._rebase()
+
+    def _turn_to(self, z: FloatArray, residual: FloatArray) -> float:
+        """How wrong the heading has been, if that alone led the robot to ``z`` on the leg since the last fix."""
+        if self._fixed_m is None:
+            return 0.0
+        leg_m, off_m = hypot(*(z - residual - self._fixed_m)), hypot(*residual)
+        return min(_LARGEST_DOUBT_RAD, off_m / leg_m) if leg_m > _SHORTEST_LEG_M else 0.0
 
     def _refuse(self, t_s: float, z: FloatArray, variance: FloatArray) -> None:
         """Lock-out recovery: an estimate that is sure of itself and wrong would refuse every true fix from now on."""

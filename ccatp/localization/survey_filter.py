@@ -88,6 +88,11 @@ class SurveyFilter:
         self._start(start)
 
     def _start(self, pose: DeckPose) -> None:
+        self._filter.reset(*self._first(pose))
+        self._panel = self._panel_below()
+
+    def _first(self, pose: DeckPose) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance of who knows a pose and nothing else."""
         cfg, full = self._cfg, self._full
         mean, sigma = np.zeros(STATES), np.zeros(STATES)
         mean[[X, Y, PSI]] = pose.x_m, pose.y_m, pose.heading_rad
@@ -100,8 +105,7 @@ class SurveyFilter:
         sigma[[E0, E1]], sigma[[TX, TY]] = full.edge_sigma_m, self._tilt_sigma_m
         P = np.diag(sigma**2)
         mean[_DRAWN], P[_WHERE_DRAWN] = self._legs.first()
-        self._filter.reset(mean, P)
-        self._panel = self._panel_below()
+        return mean, P
 
     @property
     def mean(self) -> FloatArray:
@@ -352,20 +356,39 @@ class SurveyFilter:
         S = H.dot(P).dot(H.T) + variance
         return float(residual.dot(np.linalg.solve(S, residual))) > self._full.fix_gate_nis
 
-    def relocate(self, t_s: float, z: FloatArray, variance: FloatArray, *, is_lost: bool) -> None:
+    def relocate(
+        self,
+        t_s: float,
+        z: FloatArray,
+        variance: FloatArray,
+        *,
+        is_lost: bool,
+        turn_rad: float = 0.0,
+        again: bool = False,
+    ) -> None:
         """Begin anew from a position (2,) measured at ``t_s``, and its covariance (2, 2); see ``begun_anew``.
+
+        The heading is doubted by ``turn_rad``, and never by less than a set angle. ``again``: what was learned of the
+        sensors and of slip has led astray since it began anew the last time, and is forgotten, too.
 
         Raises:
             FilterDiverged: the state is not finite.
         """
         residual = self.fix_residual(t_s, z)
         mean, P = self._filter.mean, self._filter.covariance
-        heading_rad2 = self._full.relocated_heading_sigma_rad**2
+        heading_rad2 = max(self._full.relocated_heading_sigma_rad, turn_rad) ** 2
         x, P = begun_anew(mean, P, residual, variance, self._tilt_sigma_m**2, heading_rad2, is_lost=is_lost)
         self.journal.restart()
         self._seams.forget()
         self._legs.forget_leg()
         self.innovation = None
+        if again:
+            self._legs = LegBook(self._full)
+            first, P_first = self._first(DeckPose(float(x[X]), float(x[Y]), float(x[PSI])))
+            P_first[:2, :2], P_first[PSI, PSI] = P[:2, :2], P[PSI, PSI]
+            for i in (TX, TY):
+                P_first[i, :2] = P_first[:2, i] = P[i, :2]
+            x, P = first, P_first
         self._filter.reset(x, P)
         self._panel = self._panel_below()
 

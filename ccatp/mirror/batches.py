@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from itertools import groupby
-from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.panels import Panel
 from ccatp.mirror.surface import Surface
-from ccatp.samples import PanelPose
+from ccatp.samples import PanelId, PanelPose
 
 FloatArray = NDArray[np.float64]
 
@@ -29,11 +28,26 @@ def deck_poses(mirror: Mirror, poses: Sequence[PanelPose]) -> FloatArray:
     Returns:
         Rows of deck x, y (m), heading (rad) and height of the surface there (m), shape (k, 4).
     """
-    rows = np.empty((len(poses), 4))
     places = np.array([[p.x_m for p in poses], [p.y_m for p in poses], [p.heading_rad for p in poses]]).T
+    return _by_runs(mirror, [p.panel for p in poses], places)
+
+
+def deck_rows(mirror: Mirror, panels: NDArray[np.int64], places: FloatArray) -> FloatArray:
+    """The same of poses that are arrays already.
+
+    Args:
+        mirror: the mirror.
+        panels: row and column of each, shape (k, 2).
+        places: x, y (m) and heading (rad) in the frames of these panels, shape (k, 3).
+    """
+    return _by_runs(mirror, [PanelId(row, col) for row, col in panels.tolist()], places)
+
+
+def _by_runs(mirror: Mirror, panels: Sequence[PanelId], places: FloatArray) -> FloatArray:
+    rows = np.empty((len(panels), 4))
     start = 0
-    for panel, run in groupby(map(attrgetter("panel"), poses)):
-        end = start + len(list(run))
+    for panel, run in groupby(panels):
+        end = start + sum(1 for _ in run)
         rows[start:end] = _on_panel(mirror.surface, mirror.panel(panel), places[start:end])
         start = end
     return rows

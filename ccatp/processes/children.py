@@ -1,5 +1,6 @@
 """Glue. The child processes of a run: started, watched by file descriptors of the kernel, started anew, stopped."""
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -7,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ccatp.config.models import RunConfig
+from ccatp.config.models import ProcessesConfig
 from ccatp.package import child_environment
 from ccatp.processes.common import SUPERVISOR_PID
 from ccatp.restarts import Decision, Fate, RestartPolicy, SilenceWatch
@@ -32,6 +33,9 @@ class ProcessSpec:
         listens: the configuration section with the host and port of its listening socket, bound by the supervisor.
         is_replaceable: another one can take its place when it dies; the simulated robot has no other.
         is_loop: it tells its presence, and hangs when it does not.
+        is_needed: the survey does not go on without it.
+        niceness: added to the supervisor's.
+        patience_s: says nothing for this long before it hangs, where that is not ``run.hang_timeout_s``.
     """
 
     name: str
@@ -40,6 +44,9 @@ class ProcessSpec:
     listens: str = ""
     is_replaceable: bool = True
     is_loop: bool = False
+    is_needed: bool = True
+    niceness: int = 0
+    patience_s: float | None = None
 
 
 @dataclass(slots=True)
@@ -62,7 +69,10 @@ class Children:
     """
 
     def __init__(
-        self, cfg: RunConfig, command_of: Callable[[ProcessSpec, bool], tuple[list[str], tuple[int, ...]]], say: Say
+        self,
+        cfg: ProcessesConfig,
+        command_of: Callable[[ProcessSpec, bool], tuple[list[str], tuple[int, ...]]],
+        say: Say,
     ) -> None:
         """None yet."""
         self._cfg, self._command_of, self._say = cfg, command_of, say
@@ -93,7 +103,10 @@ class Children:
             env={**child_environment(os.environ), **ENVIRONMENT, SUPERVISOR_PID: str(os.getpid())},
         )
         pidfd = os.pidfd_open(process.pid) if hasattr(os, "pidfd_open") else -1
-        watch = SilenceWatch(self._cfg.start_timeout_s, self._cfg.hang_timeout_s) if spec.is_loop else None
+        if spec.niceness:
+            _be_nice(process.pid, spec.niceness)
+        hang_timeout_s = spec.patience_s or self._cfg.hang_timeout_s
+        watch = SilenceWatch(max(self._cfg.start_timeout_s, hang_timeout_s), hang_timeout_s) if spec.is_loop else None
         self._children[spec.name] = _Child(spec, process, pidfd, watch)
 
     def heard(self, presence: Presence) -> None:
@@ -115,16 +128,26 @@ class Children:
                     child.process.kill()  # also one that is stopped dies of it, and is found dead at the next look
                 continue
             code = child.process.returncode
+            spec = child.spec
             decision = self._policy.died(
-                name, code, now_s, is_replaceable=child.spec.is_replaceable, why=child.why_killed
+                name,
+                code,
+                now_s,
+                is_replaceable=spec.is_replaceable,
+                is_needed=spec.is_needed,
+                why=child.why_killed,
             )
-            if decision.fate is not Fate.RESTART:
+            if decision.fate not in (Fate.RESTART, Fate.WITHOUT):
                 return name, code, decision
             self._say("warning", decision.text)
             self._forget(child)
+            if decision.fate is Fate.WITHOUT:
+                del self._children[name]
+                continue
             self.restarts += 1
-            self._is_recovering_until_s = now_s + self._cfg.hang_timeout_s + RECOVERY_S
-            self.start(child.spec, is_restarted=True)
+            if spec.is_needed:
+                self._is_recovering_until_s = now_s + self._cfg.hang_timeout_s + RECOVERY_S
+            self.start(spec, is_restarted=True)
         return None
 
     def _forget(self, child: _Child) -> None:
@@ -154,3 +177,9 @@ class Children:
                 child.process.kill()
                 child.process.wait()
             self._forget(child)
+
+
+def _be_nice(pid: int, niceness: int) -> None:
+    """From outside, so that it holds before the process has read its first module."""
+    with contextlib.suppress(OSError):  # it has ended already
+        os.setpriority(os.PRIO_PROCESS, pid, os.getpriority(os.PRIO_PROCESS, 0) + niceness)

@@ -4,7 +4,7 @@ import asyncio
 import random
 from collections.abc import Callable
 
-from ccatp.config.models import RobotConfig
+from ccatp.config.models import LinkConfig
 from ccatp.errors import UnreachableError
 from ccatp.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout, read_key
 from ccatp.wire.robot import Hello, Role, Sensors
@@ -36,6 +36,7 @@ class LastingLink:
         on_sensors: called with each frame and its line; in lockstep a new session begins with the last frame again.
         on_lost: called with the reason when a session ends.
         on_joined: called with the robot's hello when a session begins, before its first frame.
+        on_bad_line: called after each line that fails a check.
 
     Attributes:
         link: the present session, or the last one.
@@ -43,18 +44,20 @@ class LastingLink:
 
     def __init__(
         self,
-        cfg: RobotConfig,
+        cfg: LinkConfig,
         *,
         role: Role,
         client: str,
         on_sensors: Callable[[Sensors, bytes], None],
         on_lost: Callable[[str], None],
         on_joined: Callable[[Hello], None],
+        on_bad_line: Callable[[], None] = lambda: None,
     ) -> None:
         """Read the key; nothing is connected yet."""
         self._cfg, self._role, self._client = cfg, role, client
         self._key = read_key(cfg.key_file)
         self._on_sensors, self._on_lost, self._on_joined = on_sensors, on_lost, on_joined
+        self._on_bad_line = on_bad_line
         self._lost = asyncio.Event()
         self._is_joined = False
         self.sessions = 0
@@ -70,6 +73,7 @@ class LastingLink:
             on_sensors=self._on_sensors,
             on_lost=self._heed_loss,
             on_joined=self._heed_join,
+            on_bad_line=self._on_bad_line,
         )
 
     async def join(self, *, is_patient: bool) -> None:

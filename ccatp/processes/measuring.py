@@ -12,7 +12,7 @@ from ccatp.localization.fixes import FixRefused
 from ccatp.localizer import Localizer
 from ccatp.metrology.scrutiny import Scrutiny
 from ccatp.mission import Mission
-from ccatp.processes.telling import Teller
+from ccatp.processes.survey_telling import SurveyTeller
 from ccatp.samples import DeckPose, Fix, PointId, Vector3
 from ccatp.store import MissionStore, StoreError
 from ccatp.surveying.approaches import Approaches
@@ -62,7 +62,7 @@ class MeasuringDesk:
         localizer: Localizer,
         mission: Mission,
         store: MissionStore,
-        teller: Teller,
+        teller: SurveyTeller,
         on_over: Callable[[], None],
         between_s: Callable[[], float],
     ) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Awaitable, Callable
 
 import msgspec
 
-from ccatp.mission import Mission
+from ccatp.processes.work import Obeying
 from ccatp.wire.channels import BadRequest, OperatorCommand, format_error, format_ok, parse_operator
 from ccatp.wire.topics import MissionStatus
 
@@ -27,7 +27,7 @@ class OperatorDesk:
 
     def __init__(
         self,
-        mission: Mission,
+        mission: Obeying,
         say: Callable[[str, str], None],
         status: Callable[[], MissionStatus],
         settled: Callable[[], Awaitable[None]],

@@ -154,8 +154,15 @@ class Robot:
         self._commands.lose_monitor()
         self.rules.lose_monitor()
 
-    def drive(self, seq: int, right_rad_s: float, left_rad_s: float, now_s: float | None = None) -> bool:
-        """Take a drive; false for an old or equal ``seq`` and for numbers not finite.
+    def drive(
+        self,
+        seq: int,
+        right_rad_s: float,
+        left_rad_s: float,
+        now_s: float | None = None,
+        _steer_rad: float | None = None,
+    ) -> bool:
+        """Take a drive; false for an old or equal ``seq`` and for numbers not finite. There is nothing to steer.
 
         Args:
             seq: its number.

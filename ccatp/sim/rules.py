@@ -30,6 +30,7 @@ class MotionRules:
         "_drive",
         "_drive_s",
         "_drive_seq",
+        "_is_steered",
         "_max_wheel_rad_s",
         "_permit",
         "_permit_s",
@@ -45,7 +46,7 @@ class MotionRules:
         self._permit: tuple[bool, bool, bool] | None = None
         self._drive_seq = self._permit_seq = -1
         self._drive_s = self._permit_s = boot_s  # as old as the boot
-        self.has_monitor_joined = False
+        self._is_steered = self.has_monitor_joined = False
         self.is_held = True
 
     def join_controller(self) -> None:
@@ -65,8 +66,15 @@ class MotionRules:
         """The monitor's session is gone: hold."""
         self._permit = None
 
-    def drive(self, seq: int, right_rad_s: float, left_rad_s: float, now_s: float) -> bool:
-        """Take a drive that arrived at ``now_s``; false for an old or equal ``seq`` and for numbers not finite."""
+    def drive(self, seq: int, right_rad_s: float, left_rad_s: float, now_s: float, *, is_steered: bool = False) -> bool:
+        """Take a drive that arrived at ``now_s``; false for an old or equal ``seq`` and for numbers not finite.
+
+        Args:
+            seq: its number.
+            right_rad_s, left_rad_s: set points.
+            now_s: its arrival.
+            is_steered: wheels beside these two make a turn of it.
+        """
         if seq <= self._drive_seq:
             return False
         limit = self._max_wheel_rad_s
@@ -76,7 +84,7 @@ class MotionRules:
             scale = limit / max(abs(right_rad_s), abs(left_rad_s))
             right_rad_s, left_rad_s = scale * right_rad_s, scale * left_rad_s
         self._drive = (float(right_rad_s), float(left_rad_s))  # one number of numpy's would slow down all that follows
-        self._drive_seq, self._drive_s = seq, now_s
+        self._drive_seq, self._drive_s, self._is_steered = seq, now_s, is_steered
         return True
 
     def permit(self, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float) -> bool:
@@ -110,7 +118,8 @@ class MotionRules:
             return True
         (right, left), (forward, reverse, turn) = drive, permit
         speed = right + left
-        return (forward or speed <= 0.0) and (reverse or speed >= 0.0) and (turn or right == left)
+        turns = right != left or (self._is_steered and speed != 0.0)
+        return (forward or speed <= 0.0) and (reverse or speed >= 0.0) and (turn or not turns)
 
     def echo(self, now_s: float) -> tuple[int, float, float, bool]:
         """(seq, age, permit age, held) of the drive in force: seq -1 without one; ages count from the boot at most."""

@@ -23,15 +23,15 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
 
-from ccatp.sim.robot import Robot
+from ccatp.sim.rules import Fans, MotionRules
 from ccatp.wire.lines import BadLineCounter, LineBuffer, LineTooLong
 from ccatp.wire.robot import (
     AUTH_HMAC,
     AUTH_NONE,
     BadLine,
     Drive,
-    Fans,
     FromClient,
+    Hello,
     Join,
     Joined,
     Permit,
@@ -43,6 +43,7 @@ from ccatp.wire.robot import (
     encode,
     is_mac_right,
 )
+from ccatp.wire.robot import Fans as FansMessage
 
 JOIN_TIMEOUT_S = 2.0
 SILENCE_S = 5.0
@@ -60,6 +61,69 @@ class Wire(Protocol):
 
     def close(self) -> None:
         """Close when everything is sent; nothing is received any more."""
+
+
+class ServedRobot(Protocol):
+    """A robot that can be served; ``ccatp.sim.robot.Robot`` is one.
+
+    Attributes:
+        rules, fans: what it enforces, and its fan duties.
+        frame_s: period of the frames.
+        t_s: time of the newest frame, on the robot's clock.
+        reboots: how often it started anew.
+    """
+
+    rules: MotionRules
+    fans: Fans
+    frame_s: float
+    t_s: float
+    reboots: int
+
+    @property
+    def next_t_s(self) -> float:
+        """Time of the next frame."""
+
+    @property
+    def delivered_seq(self) -> int:
+        """Number of the frame that reached the clients at this instant; -1 while none has."""
+
+    @property
+    def delivered_line(self) -> bytes:
+        """That frame as a line with its LF."""
+
+    def hello(self, *, boot: int, nonce: str, auth: str, lockstep: bool) -> Hello:
+        """The first message on a connection."""
+
+    def join_controller(self) -> None:
+        """A new session holds the controller's role."""
+
+    def join_monitor(self) -> None:
+        """A new session holds the monitor's role."""
+
+    def lose_controller(self) -> None:
+        """The controller's session is gone."""
+
+    def lose_monitor(self) -> None:
+        """The monitor's session is gone."""
+
+    def drive(
+        self,
+        seq: int,
+        right_rad_s: float,
+        left_rad_s: float,
+        now_s: float | None = None,
+        steer_rad: float | None = None,
+    ) -> bool:
+        """Take a drive; false for one that is not newer."""
+
+    def permit(self, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float | None = None) -> bool:
+        """Take a permit; false for one that is not newer."""
+
+    def command_fans(self, seq: int, left: float, right: float) -> bool:
+        """Take fan duties; false for those that are not newer."""
+
+    def advance(self) -> None:
+        """Drive one frame and read the sensors."""
 
 
 class Session:
@@ -137,7 +201,7 @@ class RobotServer:
 
     def __init__(
         self,
-        robot: Robot,
+        robot: ServedRobot,
         *,
         lockstep: bool,
         boot: int,
@@ -271,14 +335,14 @@ class RobotServer:
         robot_s = self._robot_time_s(now_s)
         robot = self.robot
         if role == "controller" and isinstance(message, Drive):
-            taken = robot.drive(message.seq, message.wr, message.wl, robot_s)
+            taken = robot.drive(message.seq, message.wr, message.wl, robot_s, message.steer)
             self._is_drive_acked |= taken and message.ack == robot.delivered_seq
             if taken and (message.wr or message.wl) and robot.delivered_seq - message.ack > self.oldest_ack_frames:
                 self.oldest_ack_frames = robot.delivered_seq - message.ack
         elif role == "monitor" and isinstance(message, Permit):
             taken = robot.permit(message.seq, message.forward, message.reverse, message.turn, robot_s)
             self._is_permit_acked |= taken and message.ack == robot.delivered_seq
-        elif role == "controller" and isinstance(message, Fans):
+        elif role == "controller" and isinstance(message, FansMessage):
             before = robot.fans.duty
             taken = robot.command_fans(message.seq, *message.duty)
             self.fan_changes += robot.fans.duty != before

@@ -45,6 +45,15 @@ class TruthLog:
         self._taken += len(rows)
         return Truth(seq=self._robot.seq, t_s=self._robot.t_s, rows=rows) if rows else None
 
+    def batch(self) -> tuple[str, Truth] | None:
+        """The same with its topic."""
+        rows = self.take()
+        return None if rows is None else ("truth", rows)
+
+    def preface(self) -> tuple[str, Misalignment]:
+        """How the panels lie, with its topic."""
+        return "misalignment", self.misalignment()
+
     def misalignment(self) -> Misalignment:
         """How the panels lie, as a message of the topic table."""
         return Misalignment(seq=self._robot.seq, t_s=self._robot.t_s, panels=self._panels())

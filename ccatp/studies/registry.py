@@ -28,6 +28,10 @@ STUDIES = {
     "sensitivity": Entry("ccatp.studies.sensitivity_study", "STUDY", "what each disturbance of a hard world costs"),
     "ablation": Entry("ccatp.studies.ablation_study", "STUDY", "what each technique gives, one off at a time"),
     "danger": Entry("ccatp.studies.danger_study", "STUDY", "false edges and overrun of two edge rules"),
+    "cricket": Entry(
+        "ccatp.studies.cricket_study", "STUDY", "self-mapping of motes: the published figures, better ways"
+    ),
+    "mote-sizes": Entry("ccatp.studies.mote_sizes", "run", "time of self-mapping against the number of motes"),
     "loops": Entry("ccatp.studies.loops", "run", "Bode plots, margins and root loci of the controllers"),
 }
 

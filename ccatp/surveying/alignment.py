@@ -19,6 +19,8 @@ _SHORTEST_M = 0.04
 _SIGMAS = 2.0
 # Of the way at least this part must lead away from the rim.
 _LEAVING = 0.5
+# A heading that so many times the limit is wrong leads a leg of the survey astray.
+_LOST = 2.0
 
 
 class Aligner:
@@ -55,6 +57,11 @@ class Aligner:
     def doubt(self) -> None:
         """The robot may have turned while nobody looked."""
         self._legs_left, self.journey = _MOST_LEGS, None
+
+    @property
+    def is_needed(self) -> bool:
+        """Whether the heading is known so badly that no leg of the survey should begin with it."""
+        return self._sigma_of() > _LOST * self._limit_rad
 
     @property
     def wants_leg(self) -> bool:

@@ -144,18 +144,22 @@ def encode(message: FromRobot | FromClient) -> bytes:
         ValueError: a drive that is not finite (JSON has no such number).
     """
     if isinstance(message, Drive):
-        return format_drive(message.seq, message.ack, message.wr, message.wl)
+        return format_drive(message.seq, message.ack, message.wr, message.wl, message.steer)
     return _encoder.encode(message) + b"\n"
 
 
-def format_drive(seq: int, ack: int, wr: float, wl: float) -> bytes:
-    """A drive as one line.
+def format_drive(seq: int, ack: int, wr: float, wl: float, steer: float | None = None) -> bytes:
+    """A drive as one line; the key ``steer`` only where there is an angle.
 
     Raises:
         ValueError: a set point that is not finite.
     """
     if not math.isfinite(wr) or not math.isfinite(wl):
         raise ValueError(f"drive set points must be finite: wr {wr}, wl {wl}")
+    if steer is not None:
+        if not math.isfinite(steer):
+            raise ValueError(f"drive set points must be finite: steer {steer}")
+        return b'{"type":"drive","seq":%d,"ack":%d,"wr":%.9g,"wl":%.9g,"steer":%.9g}\n' % (seq, ack, wr, wl, steer)
     return b'{"type":"drive","seq":%d,"ack":%d,"wr":%.9g,"wl":%.9g}\n' % (seq, ack, wr, wl)
 
 

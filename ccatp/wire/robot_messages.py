@@ -20,6 +20,7 @@ RefusalReason = Literal["role taken", "bad mac", "bad join", "busy"]
 Sequence53 = Annotated[int, Meta(ge=0, le=2**53 - 1)]  # what every JSON reader keeps exact
 Time = Annotated[float, Meta(ge=0.0, le=MAX_TIME_S)]
 Rate = Annotated[float, Meta(ge=-MAX_RATE_RAD_S, le=MAX_RATE_RAD_S)]
+Steer = Annotated[float, Meta(ge=-1.6, le=1.6)]
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 Length = Annotated[float, Meta(ge=-10.0, le=10.0)]
 Positive = Annotated[float, Meta(gt=0.0, le=1e6)]
@@ -36,7 +37,16 @@ class RobotLinkMessage(msgspec.Struct, tag_field="type", gc=False):
     """Base of all messages; ``type`` is the tag."""
 
 
-class RobotData(msgspec.Struct):
+class VehicleData(msgspec.Struct):
+    """What a robot among beacons says besides: its kind, and its distance sensors, rad, left of the heading."""
+
+    kind: Literal["ackermann", "differential"]
+    axle_distance_m: Positive
+    steer_max_rad: Steer
+    distance_sensors_rad: list[Annotated[float, Meta(ge=-6.3, le=6.3)]]
+
+
+class RobotData(msgspec.Struct, omit_defaults=True):
     """What the robot says of itself: lengths in m, robot frame; edge sensors in the order of ``EdgeSample``."""
 
     wheel_radius_m: Positive
@@ -45,6 +55,7 @@ class RobotData(msgspec.Struct):
     puck_m: tuple[Length, Length, Length]
     max_wheel_rad_s: Positive
     fan_floor: Fraction
+    vehicle: VehicleData | None = None
 
 
 class Hello(RobotLinkMessage, tag="hello"):
@@ -106,12 +117,16 @@ class Sensors(RobotLinkMessage, tag="sensors", gc=True):
 
 
 class Drive(RobotLinkMessage, tag="drive"):
-    """Wheel angular-rate set points, rad/s; ``ack`` is the newest sensors frame they were computed from."""
+    """Wheel angular-rate set points, rad/s; ``ack`` is the newest sensors frame they were computed from.
+
+    ``steer``: angle of the steered wheel, rad, left positive; for robots that have one, the others ignore it.
+    """
 
     seq: Sequence53
     ack: Sequence53
     wr: Rate
     wl: Rate
+    steer: Steer | None = None
 
 
 class Permit(RobotLinkMessage, tag="permit"):

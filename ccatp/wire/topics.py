@@ -69,6 +69,58 @@ class MissionStatus(Message):
     left_out: dict[str, list[str]] = {}  # points skipped, or not measured any more, by the reason
 
 
+class Picture(Message):
+    """The newest of everything that a display shows, told only while somebody has asked for it.
+
+    Attributes:
+        x_m, y_m, heading_rad: pose, deck frame.
+        covariance_m2: of x and y: xx, xy, yy.
+        heading_sigma_rad: standard deviation of the heading.
+        nis, size: normalised innovation squared of the filter's last update, and its degrees of freedom; 0 for none.
+        line: the newest sensors line, as it came from the robot.
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+    covariance_m2: tuple[float, float, float]
+    heading_sigma_rad: float
+    nis: float
+    size: int
+    line: msgspec.Raw
+
+
+class Shape(msgspec.Struct, omit_defaults=True):
+    """One thing on the map, in the plane of the pose.
+
+    Attributes:
+        id: the same thing has the same one in the next message.
+        kind: how it looks: ``beacon``, ``obstacle``, ``target``, ``robot``, ``trail``; a display draws others plainly.
+        x_m, y_m: where it is.
+        covariance_m2: of x and y: xx, xy, yy; drawn as its ellipse.
+        heading_rad: for what points somewhere.
+        radius_m: for what is round.
+        outline_m: for what is neither: a line, closed where the first point comes again.
+        label: what is written beside it.
+    """
+
+    id: str
+    kind: str
+    x_m: float
+    y_m: float
+    covariance_m2: tuple[float, float, float] | None = None
+    heading_rad: float | None = None
+    radius_m: float | None = None
+    outline_m: list[tuple[float, float]] = []
+    label: str = ""
+
+
+class Scene(Message):
+    """What is on the map besides the mirror and the robot; each message has all of it."""
+
+    shapes: list[Shape]
+
+
 class Track(Message):
     """A batch of estimates.
 
@@ -168,6 +220,74 @@ class Misalignment(Message):
     panels: list[tuple[int, int, float, float, float]]
 
 
+class BeaconTrack(Message):
+    """A batch of estimates of a robot among beacons, in the frame of its start.
+
+    Rows: seq, t_s, x_m, y_m, heading_rad; covariance of these: xx, xy, yy, xh, yh, hh; dead reckoning: x_m, y_m.
+    """
+
+    rows: list[tuple[int, float, float, float, float, float, float, float, float, float, float, float, float]]
+
+
+BeaconEllipse = tuple[float, float, float, float, float]
+
+
+class BeaconMap(Message):
+    """The map of a robot among beacons, for displays and reports; positions in m.
+
+    Attributes:
+        system: zigbee, follow, cricket.
+        pose: x_m, y_m, heading_rad.
+        pose_ellipse: x, y, and their covariance xx, xy, yy, m2.
+        beacons: of each radio or mote on the map, the same.
+        target: of the radio that is followed, the same; ``None`` before it was heard.
+        obstacles: points in the room that the distance sensors saw lately.
+        waypoints: all of them, in order; ``next_waypoint`` is the number of the one driven to, -1 for none.
+        distances: of the distance sensors, m.
+        nis_sum, nis_size, refused: of all readings so far: normalised innovations squared, their degrees of freedom,
+            and how many readings the gate refused.
+        notes: what the mission has to say of the map: phases, errors expected.
+    """
+
+    system: str
+    pose: tuple[float, float, float]
+    pose_ellipse: BeaconEllipse
+    beacons: dict[str, BeaconEllipse]
+    target: BeaconEllipse | None
+    obstacles: list[tuple[float, float]]
+    waypoints: list[tuple[float, float]]
+    next_waypoint: int
+    distances: list[float]
+    nis_sum: float
+    nis_size: int
+    refused: int
+    notes: dict[str, float]
+
+
+class BeaconArrival(Message):
+    """A waypoint is reached, by the estimate: number in the loop and lap, both from 0, its place, the estimate."""
+
+    waypoint: int
+    lap: int
+    place: tuple[float, float]
+    estimate: BeaconEllipse
+
+
+class BeaconTruth(Message):
+    """A batch of simulated truth of a robot among beacons (simulation only).
+
+    Rows: seq, t_s, x_m, y_m, heading_rad; the moving radio: x_m, y_m; clearance of the body to the nearest obstacle, m.
+    """
+
+    rows: list[tuple[int, float, float, float, float, float | None, float | None, float | None]]
+
+
+class BeaconPlaces(Message):
+    """Where radios and motes really are (simulation only), m."""
+
+    places: dict[str, tuple[float, float]]
+
+
 @dataclass(frozen=True, slots=True)
 class Topic:
     """One row of the table.
@@ -192,6 +312,9 @@ class Topic:
 TOPICS: tuple[Topic, ...] = (
     Topic("presence.main", Presence, "main", 10.0, 1.0, False),
     Topic("presence.danger", Presence, "danger", 10.0, 1.0, False),
+    Topic("presence.dashboard", Presence, "dashboard", 2.0, 5.0, False),
+    Topic("picture", Picture, "main", 10.0, 0.8, False),
+    Topic("scene", Scene, "main", 2.0, 5.0, False),
     Topic("estimate", Estimate, "main", 20.0, 0.15, False),
     Topic("verdict", Verdict, "danger", 100.0, 0.15, False),
     Topic("mission", MissionStatus, "main", 10.0, 1.0, True),
@@ -206,6 +329,11 @@ TOPICS: tuple[Topic, ...] = (
     Topic("timing", Timing, "main", 1.0, 0.0, False),
     Topic("misalignment", Misalignment, "dataloop", 0.0, 0.0, True),
     Topic("truth", Truth, "dataloop", 1.0, 0.0, True),
+    Topic("beacon_track", BeaconTrack, "main", 1.0, 0.0, True),
+    Topic("beacon_map", BeaconMap, "main", 2.0, 2.0, True),
+    Topic("beacon_arrival", BeaconArrival, "main", 0.0, 0.0, True),
+    Topic("beacon_places", BeaconPlaces, "dataloop", 0.0, 0.0, True),
+    Topic("beacon_truth", BeaconTruth, "dataloop", 1.0, 0.0, True),
 )
 RECORD_FORMAT = 1
 """Of a recording, kept in it; one more wherever an older reader would misunderstand what is recorded."""

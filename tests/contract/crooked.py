@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 from ccatp.config.models import Config
 from ccatp.conformance.runner import Conformance
 from ccatp.conformance.verdict import Result
-from ccatp.dataloop import DataLoop, _Connection
+from ccatp.dataloop import DataLoop
+from ccatp.link_server import _Connection
 
 Message = dict[str, Any]
 STOP_S = 10.0

@@ -39,15 +39,28 @@ class FaultyRehearsal(Rehearsing):
         super().__init__(cfg, with_track=False)
         self.robot = Robot(cfg, self.mirror, np.random.default_rng(cfg.run.seed), plan)
         self.laser = LaserDesk(cfg, self.mirror, self.robot)
+        self.denied_s: list[float] = []  # when lines that were no frames took the permit away
 
     def _note_truth(self) -> None:
         super()._note_truth()
         for _ in range(LOST_FRAMES):
             if self.robot.delivered is not None:
                 return
+            self._hear_garbled()
             self.robot.advance()
             super()._note_truth()
         raise AssertionError("no frame arrives any more")
+
+    def _hear_garbled(self) -> None:
+        """As the danger loop on a line that no client may take."""
+        last = self.monitor.verdict
+        if not self.robot.delivered_line or last.seq < 0:
+            return
+        verdict = self.monitor.garbled(last.seq, last.t_s, self.robot.t_s)
+        if verdict is not None:
+            self.denied_s.append(self.robot.t_s)
+            self._drive_seq += 1  # numbers drives and permits alike here
+            self.robot.permit(self._drive_seq, verdict.forward, verdict.reverse, verdict.turn)
 
     def _serve(self, frame: Sensors, dt_s: float) -> None:
         if dt_s > 0.0:

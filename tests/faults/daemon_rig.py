@@ -15,17 +15,17 @@ import zmq
 
 from ccatp.config.loader import dump_config, load_config
 from ccatp.config.models import Config
-from ccatp.dataloop import DataLoop, TruthOutlet
+from ccatp.dataloop import DataLoop
 from ccatp.etalon_standin import EtalonStandIn
 from ccatp.fault_proxy.proxy import FaultProxy
 from ccatp.mirror.mirror import build_mirror
-from ccatp.processes.building import build_parts
-from ccatp.processes.common import Endpoints, ProcessArgs
+from ccatp.processes.common import EitherArgs, Endpoints, ProcessArgs
 from ccatp.processes.danger_loop import DangerLoop
-from ccatp.processes.main_loop import MainLoop
+from ccatp.processes.main_loop import MainLoop, open_work
 from ccatp.puck_truth import ZmqPuck
 from ccatp.robot_link import RobotLink
 from ccatp.sim.truth import TruthLog
+from ccatp.truth_outlet import TruthOutlet
 
 DEADLINE_S = 60.0
 SEND_DRIVE, SEND_PERMIT = RobotLink.send_drive, RobotLink.send_permit
@@ -182,9 +182,10 @@ async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncI
                     for proxy in (one, two)
                 )
                 (run_dir / "config.toml").write_text(dump_config(main_args.config), encoding="utf-8")
-                parts, store = build_parts(main_args)
-                with store:
-                    main, danger = MainLoop(main_args, context, parts, store), DangerLoop(danger_args, context)
+                hosting, opening = open_work(EitherArgs(main_args, None))
+                with opening as make_work:
+                    main = MainLoop(main_args, context, hosting, make_work)
+                    danger = DangerLoop(danger_args, context)
                     daemon = Daemon(main, danger, robot, (one, two))
                     daemon.log = entries
                     listener = context.socket(zmq.SUB)

@@ -17,7 +17,7 @@ from ccatp.localization.fixes import FixRefused, deck_foot
 from ccatp.metrology.judge import nis_of
 from ccatp.metrology.scrutiny import Scrutiny
 from ccatp.processes.measuring import MeasuringDesk, Request
-from ccatp.processes.telling import Teller
+from ccatp.processes.survey_telling import SurveyTeller
 from ccatp.radio.multilateration import MultilaterationError
 from ccatp.samples import Fix, PointId, Vector3
 from ccatp.sim.faults.plan import FaultPlan, parse_plan
@@ -143,7 +143,7 @@ class DeskRehearsal(FaultyRehearsal):
                 self.localizer,
                 self.mission,
                 patient(store),
-                cast(Teller, teller),
+                cast(SurveyTeller, teller),
                 self._over.set,
                 lambda: 0.5,
             )

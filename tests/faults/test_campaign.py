@@ -16,6 +16,15 @@ def test_plans_are_of_their_seed() -> None:
     assert random_plan(3) != random_plan(4)
 
 
+@pytest.mark.parametrize("seed", [19, 45])
+def test_a_slip_in_the_calibration_drive_does_not_mislead_for_good(seed: int) -> None:
+    # The body slips in a turn; what the filter learns of it, wheel base and gyroscope, would be wrong ever after.
+    ending = survey(seed, random_plan(seed))
+    assert any(record.signal == "body" and record.changed for record in ending.injected)
+    assert ending.result.outcome == "complete", ending.line
+    assert ending.result.summary["points"]["measured"] == ending.result.summary["points"]["total"]
+
+
 @pytest.mark.slow
 def test_nobody_falls_and_what_passes_by_is_survived() -> None:
     incomplete = []

@@ -7,8 +7,8 @@ import pytest
 from tests.faults.campaign import FaultyRehearsal, short_survey, single, was_real
 from tests.faults.linking import Measured
 
-# The first panel lies at a corner. Of these some meet the rim in front, some behind, some with two sides of the robot.
-SEEDS = (0, 2, 3, 5)
+# The first panel lies at a corner. These meet the rim, one of them twice; most others find themselves before.
+SEEDS = (0, 22, 23, 52)
 
 
 def carried_off(seed: int) -> FaultyRehearsal:
@@ -38,4 +38,4 @@ def test_no_retreat_falls_at_a_corner(measured: Measured) -> None:
         measured("S23", danger["falls"])
         edges += danger["true_edges"]
         assert result.outcome == "complete" or result.cause  # held, and it is said why
-    assert edges >= 3
+    assert edges >= 4

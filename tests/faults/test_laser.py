@@ -23,7 +23,7 @@ from ccatp.metrology.scrutiny import Scrutiny
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.mission import Mission
 from ccatp.processes.measuring import MeasuringDesk, Request
-from ccatp.processes.telling import Teller
+from ccatp.processes.survey_telling import SurveyTeller
 from ccatp.radio.multilateration import MultilaterationError
 from ccatp.radio.puck_fix import solve_fix
 from ccatp.samples import Fix, PointId
@@ -143,7 +143,7 @@ class Desk:
             cast(Any, localizer),
             cast(Mission, mission),
             patient(self.store),
-            cast(Teller, SimpleNamespace(fix=lambda *_, **__: None, say=lambda *_: None)),
+            cast(SurveyTeller, SimpleNamespace(fix=lambda *_, **__: None, say=lambda *_: None)),
             self.over.set,
             lambda: config.etalon.measuring_time_s,
         )
@@ -547,7 +547,7 @@ def test_nothing_counts_that_was_measured_while_the_robot_moved(config: Config, 
                 cast(Any, stub),
                 story.mission,
                 patient(store),
-                cast(Teller, SimpleNamespace(fix=lambda *_, **__: None, say=lambda *_: None)),
+                cast(SurveyTeller, SimpleNamespace(fix=lambda *_, **__: None, say=lambda *_: None)),
                 lambda: None,
                 lambda: 0.0,
             )

@@ -135,6 +135,29 @@ def test_numbers_that_are_none_never_reach_the_filter(token: str, measured: Meas
     measured("S4", 1e3 * (max(moved, default=DRIVING_S) - DRIVING_S))
 
 
+@pytest.mark.fault("S4")
+def test_three_lines_that_are_no_frames_within_a_tenth_of_a_second_hold(measured: Measured) -> None:
+    # Four frames: no gap that would hold by itself.
+    fault = f'signal = "encoder_right"\ntype = "non_finite"\nat_s = {DRIVING_S}\nfor_s = 0.035\ntoken = "NaN"'
+    run = watched(fault, HARD, after(DRIVING_S + 4.0))
+    assert was_real(run.injected[0])
+    assert run.denied_s, "the permit stands"
+    assert run.denied_s[0] <= DRIVING_S + 0.1
+    first = run.first(DRIVING_S, held(Severity.HOLD))
+    assert first.verdict.cause == "lines of the robot were no frames"
+    assert first.is_zero
+    assert any(one.state is State.MEASURING for one in run.since(first.t_s))
+    measured("S4", 1e3 * (run.denied_s[0] - DRIVING_S))
+
+
+def test_two_lines_that_are_no_frames_cost_nothing() -> None:
+    fault = f'signal = "encoder_right"\ntype = "non_finite"\nat_s = {DRIVING_S}\nfor_s = 0.005\ntoken = "NaN"'
+    run = watched(fault, HARD, after(DRIVING_S + 0.5))
+    assert was_real(run.injected[0])
+    assert not run.denied_s
+    assert all(one.verdict.severity < Severity.HOLD for one in run.seen)
+
+
 @pytest.mark.fault("S5")
 @pytest.mark.parametrize("kind", ['type = "wrong"\noffset = 400.0', 'type = "garbage"\nbeyond = 0.0'])
 def test_no_reading_of_an_encoder_makes_the_pose_jump(kind: str, measured: Measured) -> None:

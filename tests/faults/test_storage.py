@@ -26,7 +26,7 @@ from ccatp.processes import measuring
 from ccatp.processes.common import open_log
 from ccatp.processes.log_stream import LogStream
 from ccatp.processes.measuring import MeasuringDesk, Request
-from ccatp.processes.telling import Teller
+from ccatp.processes.survey_telling import SurveyTeller
 from ccatp.recorder import Recorder, iter_messages
 from ccatp.samples import DeckPose, Fix, PointId
 from ccatp.store import MissionStore, PlannedPoint, StoreError, StoreEvent
@@ -193,7 +193,7 @@ class Desk:
             cast(Localizer, localizer),
             cast(Mission, mission),
             store,
-            cast(Teller, teller),
+            cast(SurveyTeller, teller),
             self.over.set,
             lambda: 0.0,
         )

@@ -17,7 +17,7 @@ from ccatp.wire.channels import format_request
 
 # The calibration drive takes half a minute: on the wall clock only where it is what is tested.
 NO_CALIBRATION = ("--set", "mission.calibration_length_m=0")
-FREE_PORTS = ("--set", "sim.robot.port=0", "--set", "sim.etalon.port=0")
+FREE_PORTS = ("--set", "sim.robot.port=0", "--set", "sim.etalon.port=0", "--set", "dashboard.enabled=false")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

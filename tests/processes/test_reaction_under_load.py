@@ -22,13 +22,14 @@ import psutil
 import pytest
 
 from ccatp.config.loader import dump_config, load_config
-from ccatp.dataloop import DataLoop, TruthOutlet
+from ccatp.dataloop import DataLoop
 from ccatp.etalon_standin import EtalonStandIn
 from ccatp.fault_proxy.pipe import Pipe
 from ccatp.fault_proxy.proxy import FaultProxy
 from ccatp.mirror.mirror import build_mirror
 from ccatp.puck_truth import ZmqPuck
 from ccatp.sim.truth import TruthLog
+from ccatp.truth_outlet import TruthOutlet
 from tests.faults.linking import Measured
 
 TIMES = int(os.environ.get("CCATP_REACTIONS", "3"))
@@ -81,13 +82,13 @@ class Wire:
         self._zeros_s: dict[int, list[float]] = {}
         self._last_go_s: dict[int, float] = {}
         self._sent_s = 0.0
-        on_frame = robot._on_frame
+        on_frame = robot.on_frame
 
         def watch() -> None:
             on_frame()
             self._step()
 
-        robot._on_frame = watch  # type: ignore[method-assign]
+        robot.on_frame = watch  # type: ignore[method-assign]
 
     def _step(self) -> None:
         now_s, rules = time.monotonic(), self._robot.rules

@@ -38,7 +38,9 @@ class SpyRobot(Robot):
 
     sent = (0.0, 0.0)
 
-    def drive(self, seq: int, right_rad_s: float, left_rad_s: float, now_s: float | None = None) -> bool:
+    def drive(
+        self, seq: int, right_rad_s: float, left_rad_s: float, now_s: float | None = None, _: float | None = None
+    ) -> bool:
         self.sent = right_rad_s, left_rad_s
         return super().drive(seq, right_rad_s, left_rad_s, now_s)
 

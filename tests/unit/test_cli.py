@@ -93,10 +93,10 @@ def test_every_help_shows_an_example(path: tuple[str, ...], capsys: pytest.Captu
 
 
 def test_the_commands_are_those_of_the_contract_the_map_and_the_conformance() -> None:
-    assert {" ".join(path) for path in commands(cli) if path} - {"map", "conformance"} == {
+    assert {" ".join(path) for path in commands(cli) if path} - {"map", "conformance", "dashboard"} == {
         "run", "status", "pause", "resume", "abort", "stop", "emergency",
         "sim", "sim robot", "sim etalon", "config", "config check", "config schema", "study", "replay", "bench",
-        "keys", "keys generate", "keys show-public", "clear", "align", "plan",
+        "keys", "keys generate", "keys show-public", "clear", "align", "plan", "report", "compare",
         "log", "log info", "log recover", "stream", "calibrate", "check", "completion",
     }  # fmt: skip
 

@@ -37,12 +37,16 @@ class Seen:
         self.frames: list[int] = []
         self.lines: list[bytes] = []
         self.lost: list[str] = []
+        self.bad_lines = 0
         self.changed = asyncio.Event()
 
     def on_sensors(self, sensors: Sensors, line: bytes) -> None:
         self.frames.append(sensors.seq)
         self.lines.append(line)
         self.changed.set()
+
+    def on_bad_line(self) -> None:
+        self.bad_lines += 1
 
     def on_lost(self, reason: str) -> None:
         self.lost.append(reason)
@@ -79,6 +83,7 @@ async def robot(script: Script, *, key: bytes | None = None) -> AsyncIterator[tu
         key=key,
         on_sensors=seen.on_sensors,
         on_lost=seen.on_lost,
+        on_bad_line=seen.on_bad_line,
     )
     try:
         yield link, seen
@@ -165,6 +170,7 @@ async def test_bad_lines_and_unknown_types_are_counted_and_dropped() -> None:
         await link.connect(DEADLINE_S)
         await seen.until(lambda: seen.frames == [7, 8])
     assert (link.counts["bad_lines"], link.counts["unknown_types"], link.counts["unexpected"]) == (2, 1, 1)
+    assert seen.bad_lines == 2
 
 
 async def test_frames_in_single_bytes() -> None:

@@ -13,7 +13,8 @@ from ccatp import run_map
 from ccatp.config.loader import dump_config, load_config
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.recorder import Recorder
-from ccatp.run_map import MapPoint, RunMapError, arrival_error_m, draw_from_run_dir, draw_run_map
+from ccatp.reporting.points import arrival_error_m
+from ccatp.run_map import MapPoint, RunMapError, draw_from_run_dir, draw_run_map
 from ccatp.samples import DeckPose, Fix, PanelId, PointId
 from ccatp.store import MissionStore, PlannedPoint
 

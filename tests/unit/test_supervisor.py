@@ -17,7 +17,7 @@ def options(**fields: object) -> RunOptions:
 
 
 def test_the_table_names_real_modules_and_main_stops_first() -> None:
-    assert [p.name for p in PROCESSES] == ["dataloop", "etalon", "danger", "main"]
+    assert [p.name for p in PROCESSES] == ["dashboard", "dataloop", "etalon", "danger", "main"]
     assert all(find_spec(p.module) is not None for p in PROCESSES)
     assert PROCESSES[-1].name == "main"  # stopping is in the reverse order
 

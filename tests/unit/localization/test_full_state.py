@@ -1,7 +1,7 @@
 """Pure. The full-state localizer: fixes that contradict it, divergence, time stamps, and each of its techniques."""
 
 from dataclasses import replace
-from math import inf, nan, sqrt
+from math import hypot, inf, nan, sqrt
 from typing import Any
 
 import numpy as np
@@ -165,6 +165,37 @@ def test_three_fixes_that_agree_are_right(filter_name: str, full: Any) -> None:
     assert found.deck_pose.heading_rad == pytest.approx(heading, abs=1e-12)
     assert found.state[1][PSI, PSI] == pytest.approx(variance + full.relocated_heading_sigma_rad**2)
     assert found.position_sigma_m < 1.3e-5
+
+
+def begin_anew(found: FullStateLocalizer, robot: Robot, off_m: tuple[float, float]) -> None:
+    for _ in range(2):
+        with pytest.raises(FixGated):
+            found.fuse_fix(robot.fix(off_m=off_m))
+    found.fuse_fix(robot.fix(off_m=off_m))
+
+
+def test_a_leg_that_ended_elsewhere_puts_the_heading_in_doubt() -> None:
+    found = build()
+    robot = rested(found)
+    start = found.deck_pose
+    run(found, robot.frames(2.9))
+    end, before = found.deck_pose, float(found.state[1][PSI, PSI])
+    leg_m = hypot(end.x_m - start.x_m, end.y_m - start.y_m)
+    begin_anew(found, robot, (0.03, 0.03))
+    doubt_rad = sqrt(float(found.state[1][PSI, PSI]) - before)
+    assert doubt_rad == pytest.approx(hypot(0.03, 0.03) / leg_m, rel=0.02)  # the estimate is some 0.1 mm off
+
+
+def test_who_begins_anew_twice_in_a_row_forgets_what_was_learned() -> None:
+    found = build()
+    robot = rested(found)
+    run(found, robot.frames(2.9))
+    learned = found.state[1][BG, BG]
+    begin_anew(found, robot, (0.0, 0.03))
+    assert found.state[1][BG, BG] == pytest.approx(learned)
+    begin_anew(found, robot, (0.0, 0.06))
+    assert found.state[1][BG, BG] > 10.0 * learned
+    assert found.deck_pose.y_m == pytest.approx(robot.y_m + 0.06, abs=1e-4)
 
 
 @pytest.mark.parametrize(

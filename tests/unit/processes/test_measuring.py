@@ -14,7 +14,7 @@ from ccatp.localizer import Localizer
 from ccatp.metrology.scrutiny import Finding, Scrutiny
 from ccatp.mission import Mission
 from ccatp.processes.measuring import MeasuringDesk, Request
-from ccatp.processes.telling import Teller
+from ccatp.processes.survey_telling import SurveyTeller
 from ccatp.samples import DeckPose, Fix
 from ccatp.store import MissionStore
 
@@ -56,7 +56,7 @@ async def told_fixes(config: Config, *refusals: Exception) -> list[bool]:
         cast(Localizer, Refusing(*refusals)),
         cast(Mission, mission),
         cast(MissionStore, SimpleNamespace()),
-        cast(Teller, SimpleNamespace(fix=fix, say=lambda level, text: None)),
+        cast(SurveyTeller, SimpleNamespace(fix=fix, say=lambda level, text: None)),
         over.set,
         lambda: 0.0,
     )

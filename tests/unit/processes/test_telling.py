@@ -8,7 +8,8 @@ import structlog
 
 from ccatp.bus import Publisher
 from ccatp.localizer import Localizer
-from ccatp.processes.telling import BATCH_FRAMES, Teller
+from ccatp.processes.survey_telling import SurveyTeller
+from ccatp.processes.telling import BATCH_FRAMES
 from ccatp.samples import DeckPose, Fix, PanelId, PanelPose
 from ccatp.wire.topics import FixMessage, Message, SensorLines, Track
 
@@ -26,9 +27,9 @@ class Listener:
         return [message for topic, message in self.heard if topic == name]
 
 
-def teller() -> tuple[Teller, Listener]:
+def teller() -> tuple[SurveyTeller, Listener]:
     listener = Listener()
-    return Teller(cast(Publisher, listener), structlog.get_logger()), listener
+    return SurveyTeller(cast(Publisher, listener), structlog.get_logger()), listener
 
 
 def localizer() -> Localizer:

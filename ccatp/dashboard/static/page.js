@@ -1,0 +1,230 @@
+// The page: hears the state, shows it, and says when nothing is heard.
+import { Commands } from "./commands.js";
+import { MapView } from "./map.js";
+import { Plots } from "./plots.js";
+
+const SILENCE_MS = 800;
+const RETRY_MS = 1500;
+const MAX_LINES = 200;
+const CODES = ["normal operation", "near the mirror's edge", "operation aborted"];
+const LEVELS = { held: "bad", "backing off": "warn", returning: "warn", idle: "", done: "" };
+const SEVERITIES = ["", "inform", "slow", "pause", "hold", "return", "fault"];
+
+const $ = (id) => document.getElementById(id);
+const text = (id, value) => {
+  const node = $(id);
+  if (node.textContent !== value) node.textContent = value;
+};
+const clock = (s) => {
+  if (s === null || s === undefined || !Number.isFinite(s)) return "–";
+  const all = Math.max(0, Math.round(s));
+  const two = (n) => String(n).padStart(2, "0");
+  return all >= 3600
+    ? `${Math.floor(all / 3600)}:${two(Math.floor(all / 60) % 60)}:${two(all % 60)}`
+    : `${Math.floor(all / 60)}:${two(all % 60)}`;
+};
+const age = (s) => (s === null ? "" : s < 9.95 ? `${s.toFixed(1)} s` : s < 120 ? `${Math.round(s)} s` : `${Math.round(s / 60)} min`);
+
+const map = new MapView($("map"), $("legend"));
+const plots = new Plots({ arrival: $("plot-arrival"), error: $("plot-error"), jump: $("plot-jump"), nis: $("plot-nis") });
+const commands = new Commands();
+
+let source = null;
+let heardAt = performance.now();
+let isEnded = false;
+let isConnecting = false;
+
+// -- the stream ---------------------------------------------------------------------------------------------------
+
+async function connect() {
+  if (isConnecting) return;
+  isConnecting = true;
+  try {
+    const answer = await fetch("ground", { cache: "no-store" });
+    if (!answer.ok) throw new Error(`ground: ${answer.status}`);
+    begin(await answer.json());
+    source?.close();
+    source = new EventSource("events");
+    source.addEventListener("all", (event) => hear(JSON.parse(event.data), true));
+    source.addEventListener("news", (event) => hear(JSON.parse(event.data), false));
+    source.addEventListener("end", (event) => end(JSON.parse(event.data)));
+    source.onerror = () => {
+      source.close(); // what is missed meanwhile is told anew
+      setTimeout(connect, RETRY_MS);
+    };
+  } catch {
+    setTimeout(connect, RETRY_MS);
+  } finally {
+    isConnecting = false;
+  }
+}
+
+function begin(ground) {
+  text("title", ground.title);
+  text("subtitle", ground.subtitle);
+  document.title = `${ground.is_sim ? "SIM " : ""}${ground.title} – ccatp`;
+  $("simulation").hidden = !ground.is_sim;
+  $("token-row").hidden = !ground.needs_token;
+  map.begin(ground);
+}
+
+function hear(state, isAll) {
+  heardAt = performance.now();
+  isEnded = false;
+  $("ended").hidden = true;
+  show(state, isAll);
+}
+
+function end(state) {
+  source.close();
+  show(state, true);
+  isEnded = true;
+  const mission = state.mission;
+  const how = mission?.outcome || (mission ? `while ${mission.state}` : "before it began");
+  text("ended", `The daemon has ended: ${how}${mission ? `, ${mission.done} of ${mission.total} points measured` : ""}.`);
+  $("ended").hidden = false;
+  alarm([]);
+  commands.end();
+  setTimeout(connect, RETRY_MS); // the next survey may begin at the same place
+}
+
+setInterval(() => {
+  const silent = performance.now() - heardAt;
+  if (!isEnded && silent > SILENCE_MS) alarm([["the dashboard does not answer", silent / 1000]]);
+}, 100);
+
+// -- what is shown ------------------------------------------------------------------------------------------------
+
+function alarm(losses) {
+  const node = $("alarm");
+  node.hidden = losses.length === 0;
+  document.body.classList.toggle("lost", losses.length > 0);
+  if (losses.length === 0) return;
+  text("alarm-text", losses.map(([what]) => what).join("; "));
+  text("alarm-age", `${losses[0][1].toFixed(1)} s`);
+}
+
+function show(state, isAll) {
+  alarm(state.losses);
+  showMission(state);
+  showVerdict(state.verdict);
+  showRobot(state.robot, state.pose);
+  showLinks(state);
+  showLog(state.log, isAll);
+  map.hear(state, isAll);
+  plots.hear(state.series, isAll);
+  commands.hear(state);
+}
+
+function showMission({ mission, losses }) {
+  if (!mission) {
+    text("state", "waiting for the main loop");
+    return;
+  }
+  const cause = mission.cause ? `: ${mission.cause}` : "";
+  text("state", mission.outcome ? `done: ${mission.outcome}` : mission.state + cause);
+  const isBad = losses.length > 0 || (mission.state === "done" && mission.exit_status > 0);
+  $("state").dataset.level = isBad ? "bad" : (LEVELS[mission.state] ?? "good");
+  $("state").classList.toggle("stale", mission.is_stale);
+  text("done", String(mission.done));
+  text("total", String(mission.total));
+  $("progress").max = Math.max(mission.total, 1);
+  $("progress").value = mission.done;
+  text("elapsed", clock(mission.elapsed_s));
+  text("eta", clock(mission.eta_s));
+  text("point", mission.next_point || "–");
+  text("arrival", mission.done ? `${mission.error_mm.toFixed(2)} mm` : "–");
+  text("skipped", String(mission.skipped));
+  text("slips", mission.slips ? `${mission.slips}, worst ${mission.lag_ms.toFixed(0)} ms` : "0");
+}
+
+function showVerdict(verdict) {
+  if (!verdict) return;
+  const unit = verdict.cause ? ` (${verdict.signal} ${verdict.value.toPrecision(3)}, limit ${verdict.limit.toPrecision(3)})` : "";
+  const grave = SEVERITIES[verdict.severity] ? `, ${SEVERITIES[verdict.severity]}` : "";
+  text("verdict", `${verdict.code} ${CODES[verdict.code] ?? ""}${grave}${verdict.cause ? `: ${verdict.cause}${unit}` : ""}`);
+  $("verdict").dataset.level = verdict.code === 2 || verdict.severity >= 4 ? "bad" : verdict.code || verdict.severity ? "warn" : "";
+  $("verdict").classList.toggle("stale", Boolean(verdict.is_stale));
+  for (const way of ["forward", "reverse", "turn"]) {
+    const is = verdict.permits?.[way];
+    $(`permit-${way}`).dataset.on = is === undefined ? "" : is && !verdict.is_stale ? "yes" : "no";
+  }
+}
+
+function showRobot(robot, pose) {
+  const edges = robot?.edges ?? [];
+  const names = ["front left", "front right", "rear left", "rear right"];
+  names.forEach((name, k) => ($(`edge-${k}`).dataset.on = edges.length ? (edges[k] ? "yes" : "no") : ""));
+  const off = names.filter((_, k) => edges.length && !edges[k]);
+  const said = !edges.length ? "Edge sensors: not known" : off.length ? `Edge sensors off the panel: ${off.join(", ")}` : "Edge sensors: all on a panel";
+  if ($("edges").getAttribute("aria-label") !== said) $("edges").setAttribute("aria-label", said);
+  text("fans", robot ? robot.fans.map((duty) => `${Math.round(100 * duty)} %`).join(", ") : "–");
+  text("charge", robot ? `${Math.round(100 * robot.charge)} %` : "–");
+  text("held", robot ? (robot.is_held ? "held by the robot" : "free") : "–");
+  text("ages", robot ? `${Math.round(1000 * robot.drive_age_s)}, ${Math.round(1000 * robot.permit_age_s)} ms` : "–");
+  $("faults").hidden = !robot?.faults.length;
+  text("faults", robot?.faults.length ? `Robot reports: ${robot.faults.join(", ")}` : "");
+  text("pose-xy", pose ? `${pose.x_m.toFixed(3)}, ${pose.y_m.toFixed(3)} m` : "–");
+  text("pose-heading", pose ? `${((pose.heading_rad * 180) / Math.PI).toFixed(1)}°` : "–");
+  const [xx, , yy] = pose?.covariance_m2 ?? [0, 0, 0];
+  text("pose-sigma", pose ? `${(3000 * Math.sqrt(Math.max(xx, yy, 0))).toFixed(2)} mm` : "–");
+}
+
+function showLinks({ links, restarts }) {
+  const list = $("links");
+  while (list.children.length < links.length) {
+    const row = document.createElement("li");
+    row.append(document.createElement("b"), document.createElement("span"));
+    list.append(row);
+  }
+  links.forEach((link, k) => {
+    const row = list.children[k];
+    const again = link.name === "main loop" ? restarts.main : link.name === "danger loop" ? restarts.danger : 0;
+    row.dataset.well = link.is_well ? "yes" : "no";
+    row.children[0].textContent = link.name;
+    row.children[1].textContent = `${link.phase} ${age(link.age_s)}${again ? ` (started anew ${again}×)` : ""}`;
+  });
+}
+
+function showLog(lines, isAll) {
+  const list = $("log");
+  if (isAll) list.replaceChildren();
+  for (const [t, level, line] of lines) {
+    const row = document.createElement("li");
+    const time = document.createElement("time");
+    time.textContent = `${t.toFixed(1)} s`;
+    const body = document.createElement("span");
+    body.textContent = line;
+    row.dataset.level = level;
+    row.append(time, body);
+    list.prepend(row);
+  }
+  while (list.children.length > MAX_LINES) list.lastChild.remove();
+}
+
+// -- keys ---------------------------------------------------------------------------------------------------------
+
+document.addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input")) return;
+  const act = {
+    p: () => commands.press("pause"),
+    r: () => commands.press("resume"),
+    a: () => commands.arm(),
+    s: () => $("stop").focus(),
+    f: () => map.toggleFollow(),
+    "+": () => map.zoom(1.5),
+    "-": () => map.zoom(1 / 1.5),
+    0: () => map.fit(),
+    Escape: () => commands.disarm(),
+  }[event.key.length === 1 ? event.key.toLowerCase() : event.key];
+  if (act && !event.repeat) {
+    act();
+    event.preventDefault();
+  }
+});
+$("zoom-in").onclick = () => map.zoom(1.5);
+$("zoom-out").onclick = () => map.zoom(1 / 1.5);
+$("fit").onclick = () => map.fit();
+$("follow").onclick = () => map.toggleFollow();
+
+connect();

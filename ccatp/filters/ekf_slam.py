@@ -1,0 +1,380 @@
+"""Pure. Extended Kalman filter over a vehicle, a shared calibration and a map that grows and shrinks, on arrays."""
+
+from collections.abc import Callable, Hashable, Sequence
+from math import inf, sqrt
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ccatp.filters.base import HUGE, FilterDiverged, FilterError, FilterShapeError, FloatArray, checked_gaussian
+
+Columns = npt.NDArray[np.intp]
+BlockId = Hashable
+Linearise = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+
+STRONG = 1e6
+"""Ratio of a row's variance to its noise beyond which P - K S K^T would lose digits: there the Joseph form is used."""
+ROOM = 16
+"""States that are laid out beyond those in use; doubled when they are used up."""
+
+
+class BlockError(FilterError):
+    """A block that is not there, or is there already: carries its identifier."""
+
+    def __init__(self, block: BlockId, what: str) -> None:
+        super().__init__(f"block {block!r} {what}")
+        self.block = block
+
+
+class Update(NamedTuple):
+    """An ``Innovation``, and whether it was used.
+
+    Attributes:
+        residual: z - h(x) as it was given, shape (m,).
+        nis: nu^T S^-1 nu.
+        size: m.
+        accepted: False where the gate refused it; the state is then unchanged.
+        spread: diagonal of S, shape (m,).
+    """
+
+    residual: FloatArray
+    nis: float
+    size: int
+    accepted: bool
+    spread: FloatArray
+
+
+class EkfSlam:
+    """EKF-SLAM: x = (vehicle | calibration | one block for each landmark), P = cov(x).
+
+    predict:  P_rr <- F P_rr F^T + Q,  P_rb <- F P_rb (b: all that is not the vehicle)
+    update:   S = H P H^T + R,  K = P H^T S^-1,  x <- x + K nu,  P <- P - K S K^T
+    augment:  b = g(x, z):  P_bx = G_x P,  P_bb = G_x P G_x^T + G_z R G_z^T
+
+    Hevrdejs and Knoll 2017, eqs 1 and 2. H is sparse: a row names the columns that it touches, so an update costs one
+    product with those columns and one rank-m subtraction: n^2. P lives in a square array with room to spare; ``mean``
+    and ``covariance`` are views of it, which the next call changes.
+
+    Args:
+        vehicle_mean: shape (v,).
+        vehicle_covariance: shape (v, v).
+        calibration_mean: shape (c,); empty where nothing is shared.
+        calibration_covariance: shape (c, c).
+
+    Raises:
+        FilterShapeError: a shape does not fit.
+        FilterDiverged: not finite, not symmetric or not positive semidefinite.
+    """
+
+    def __init__(
+        self,
+        vehicle_mean: FloatArray,
+        vehicle_covariance: FloatArray,
+        calibration_mean: FloatArray | None = None,
+        calibration_covariance: FloatArray | None = None,
+    ) -> None:
+        x, P = checked_gaussian(vehicle_mean, vehicle_covariance, np.shape(vehicle_covariance))
+        self.vehicle_size = v = x.size
+        c = 0 if calibration_mean is None else int(np.size(calibration_mean))
+        self.calibration_size = c
+        self._blocks: dict[BlockId, slice] = {}
+        self._n = v + c
+        self._x, self._P = np.zeros(v + c + ROOM), np.zeros((v + c + ROOM, v + c + ROOM))
+        self._x[:v], self._P[:v, :v] = x, P
+        if calibration_mean is not None and c > 0:
+            given = np.zeros((c, c)) if calibration_covariance is None else np.asarray(calibration_covariance)
+            x, P = checked_gaussian(calibration_mean, given, given.shape)
+            self._x[v : v + c], self._P[v : v + c, v : v + c] = x, P
+        self._view()
+
+    def _view(self) -> None:
+        n, v = self._n, self.vehicle_size
+        self.mean = self._x[:n]
+        self.covariance = self._P[:n, :n]
+        self._rows, self._columns = self.covariance[:v], self.covariance[:, :v]
+        self._corner, self._vehicle = self.covariance[:v, :v], self.mean[:v]
+
+    @property
+    def size(self) -> int:
+        """n, the number of states."""
+        return self._n
+
+    @property
+    def blocks(self) -> tuple[BlockId, ...]:
+        """Identifiers of the landmarks, in the order of the state."""
+        return tuple(self._blocks)
+
+    def __contains__(self, block: BlockId) -> bool:
+        return block in self._blocks
+
+    def block(self, block: BlockId) -> slice:
+        """Where a landmark stands in the state; it moves when one before it is removed.
+
+        Raises:
+            BlockError: there is none.
+        """
+        try:
+            return self._blocks[block]
+        except KeyError:
+            raise BlockError(block, "is not in the state") from None
+
+    def predict(self, vehicle_mean: FloatArray, F: FloatArray, Q: FloatArray) -> None:
+        """Advance the vehicle: its new mean (v,), F = d(new)/d(old) (v, v), and Q (v, v).
+
+        Raises:
+            FilterShapeError: a shape does not fit.
+            FilterDiverged: the prediction is not finite.
+        """
+        v = self.vehicle_size
+        for name, array, shape in (("vehicle_mean", vehicle_mean, (v,)), ("F", F, (v, v)), ("Q", Q, (v, v))):
+            if array.shape != shape:
+                raise FilterShapeError(name, array.shape, str(shape))
+        rows = F.dot(self._rows)
+        corner = rows[:, :v].dot(F.T)
+        corner += Q
+        if not np.vdot(corner, corner) + np.vdot(vehicle_mean, vehicle_mean) < HUGE:
+            raise FilterDiverged(f"prediction is not finite: vehicle {vehicle_mean.tolist()}")
+        self._rows[:] = rows
+        self._columns[:] = rows.T
+        self._corner[:] = corner
+        self._corner += corner.T
+        self._corner *= 0.5
+        self._vehicle[:] = vehicle_mean
+
+    def spread(self, columns: Columns, h: FloatArray) -> float:
+        """H P H^T of one row, h (k,) over its ``columns`` (k,)."""
+        return float(h.dot(self.covariance[np.ix_(columns, columns)]).dot(h))
+
+    def relax(self, index: int, factor: float, variance: float) -> None:
+        """One state forgets: x <- factor x + noise, as a Gauss-Markov process does that nothing else depends on.
+
+        Args:
+            index: of the state.
+            factor: 0 to 1.
+            variance: of what comes anew.
+        """
+        P = self.covariance
+        self.mean[index] *= factor
+        P[index] *= factor
+        P[:, index] *= factor
+        P[index, index] += variance
+
+    def update_row(
+        self, columns: Columns, h: FloatArray, residual: float, r: float, gate: float = inf, knee: float = inf
+    ) -> Update:
+        """Condition on one row.
+
+        Args:
+            columns: of the state that it touches, shape (k,), each once.
+            h: its derivatives by them, shape (k,).
+            residual: z - h(x), wrapped where it is an angle.
+            r: variance of its noise.
+            gate: largest normalised innovation squared that is used.
+            knee: innovations beyond that many sigmas get a noise so much larger that they weigh as those at the knee
+                (Huber's loss, by one step of reweighting). The NIS is then that with the larger noise.
+
+        Raises:
+            FilterDiverged: the update is not finite, or the noise is not positive.
+        """
+        P = self.covariance
+        cross = h.dot(P.take(columns, axis=0))
+        s = float(h.dot(cross.take(columns))) + r
+        if not (r > 0.0 and r <= s * (1.0 + 1e-9) and s < HUGE and residual * residual < HUGE):
+            raise FilterDiverged(f"update is not finite: residual {residual:.6g}, noise {r:.3g}, variance {s:.3g}")
+        nis = residual * residual / s
+        if nis > gate:
+            return Update(np.array((residual,)), nis, 1, False, np.array((s,)))
+        if nis > knee * knee:
+            larger = s * sqrt(nis) / knee
+            r += larger - s
+            s, nis = larger, residual * residual / larger
+        learned = Update(np.array((residual,)), nis, 1, True, np.array((s,)))
+        if s < STRONG * r:
+            v = cross * (1.0 / sqrt(s))
+            P -= v[:, None] * v
+        else:
+            self._joseph(columns, h[None, :], cross[:, None] / s, np.array(((r,),)))
+        cross *= residual / s
+        self.mean += cross
+        return learned
+
+    def update(self, columns: Columns, H: FloatArray, residual: FloatArray, R: FloatArray, gate: float = inf) -> Update:
+        """Condition on m rows at once.
+
+        Args:
+            columns: of the state that they touch, shape (k,), each once.
+            H: shape (m, k).
+            residual: shape (m,), wrapped where it is an angle.
+            R: covariance of the noise, shape (m, m), or variances (m,).
+            gate: largest normalised innovation squared that is used.
+
+        Raises:
+            FilterShapeError: a shape does not fit.
+            FilterDiverged: the update is not finite, or H P H^T + R is not positive definite.
+        """
+        R = _checked_rows(columns, H, residual, R)
+        cross, S = self._moments(columns, H, R)
+        root = _root(S, residual)
+        y = np.linalg.solve(root, residual)
+        nis = float(y.dot(y))
+        learned = Update(residual, nis, residual.size, nis <= gate, S.diagonal().copy())
+        if not learned.accepted:
+            return learned
+        V = np.linalg.solve(root, cross.T).T
+        self.mean += V.dot(y)
+        if bool((S.diagonal() < STRONG * R.diagonal()).all()):
+            self.covariance -= V.dot(V.T)
+        else:
+            self._joseph(columns, H, np.linalg.solve(root.T, V.T).T, R)
+        return learned
+
+    def update_iterated(
+        self, columns: Columns, linearise: Linearise, R: FloatArray, iterations: int, gate: float = inf
+    ) -> Update:
+        """Condition on m rows, linearised anew at each estimate: Gauss-Newton on the posterior (Bell and Cathey 1993).
+
+        Args:
+            columns: of the state that they touch, shape (k,), each once.
+            linearise: x (n,) -> (z - h(x), shape (m,), wrapped where it is an angle; H at x, shape (m, k)).
+            R: covariance of the noise, shape (m, m), or variances (m,).
+            iterations: most linearisations.
+            gate: largest normalised innovation squared, at the last linearisation, that is used.
+
+        Raises:
+            FilterShapeError: a shape does not fit.
+            FilterDiverged: the update is not finite, or H P H^T + R is not positive definite.
+        """
+        prior = self.mean.copy()
+        x = prior
+        residual, H = linearise(prior)
+        for _ in range(iterations - 1):
+            rows = _checked_rows(columns, H, residual, R)
+            cross, S = self._moments(columns, H, rows)
+            nu = residual + H.dot((x - prior)[columns])
+            new = prior + cross.dot(np.linalg.solve(S, nu))
+            moved = np.abs(new - x) / (np.sqrt(self.covariance.diagonal()) + 1e-12)
+            x = new
+            residual, H = linearise(x)
+            if float(moved.max()) < 1e-3:
+                break
+        return self.update(columns, H, residual + H.dot((x - prior)[columns]), R, gate)
+
+    def augment(
+        self,
+        block: BlockId,
+        mean: FloatArray,
+        columns: Columns,
+        J_state: FloatArray,
+        J_z: FloatArray | None = None,
+        R: FloatArray | None = None,
+    ) -> None:
+        """A landmark joins by the inverse measurement model b = g(x, z).
+
+        Args:
+            block: its identifier.
+            mean: g, shape (b,).
+            columns: of the state that g touches, shape (k,).
+            J_state: dg/dx over them, shape (b, k).
+            J_z: dg/dz, shape (b, m); None where nothing was measured (a copy of states).
+            R: covariance of z, shape (m, m).
+
+        Raises:
+            BlockError: the landmark is there already.
+            FilterShapeError: a shape does not fit.
+            FilterDiverged: the landmark is not finite.
+        """
+        if block in self._blocks:
+            raise BlockError(block, "is in the state already")
+        n, b = self._n, mean.size
+        if J_state.shape != (b, columns.size):
+            raise FilterShapeError("J_state", J_state.shape, f"({b}, {columns.size})")
+        across = J_state.dot(self.covariance[columns])
+        own = across[:, columns].dot(J_state.T)
+        if J_z is not None and R is not None:
+            if J_z.shape != (b, R.shape[0]) or R.shape != (R.shape[0], R.shape[0]):
+                raise FilterShapeError("J_z", J_z.shape, f"({b}, {R.shape[0]}), R {R.shape}")
+            own = own + J_z.dot(R).dot(J_z.T)
+        if not float(np.vdot(own, own) + np.vdot(mean, mean)) < HUGE:
+            raise FilterDiverged(f"block {block!r} is not finite: mean {mean.tolist()}")
+        self._grow(n + b)
+        self._x[n : n + b] = mean
+        self._P[n : n + b, :n], self._P[:n, n : n + b] = across, across.T
+        self._P[n : n + b, n : n + b] = 0.5 * (own + own.T)
+        self._blocks[block] = slice(n, n + b)
+        self._n = n + b
+        self._view()
+
+    def remove(self, block: BlockId) -> None:
+        """Forget a landmark: its rows and columns go, which is what marginalising it means.
+
+        Raises:
+            BlockError: there is none.
+        """
+        gone = self.block(block)
+        n, b = self._n, gone.stop - gone.start
+        keep = np.r_[0 : gone.start, gone.stop : n]
+        self._x[: n - b] = self._x[keep]
+        self._P[: n - b, : n - b] = self._P[np.ix_(keep, keep)]
+        del self._blocks[block]
+        for name, place in self._blocks.items():
+            if place.start > gone.start:
+                self._blocks[name] = slice(place.start - b, place.stop - b)
+        self._n = n - b
+        self._view()
+
+    def _grow(self, n: int) -> None:
+        if n <= self._x.size:
+            return
+        room = max(n, 2 * self._x.size)
+        x, P = np.zeros(room), np.zeros((room, room))
+        x[: self._n], P[: self._n, : self._n] = self.mean, self.covariance
+        self._x, self._P = x, P
+
+    def _moments(self, columns: Columns, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+        cross = H.dot(self.covariance[columns]).T
+        return cross, H.dot(cross[columns]) + R
+
+    def _joseph(self, columns: Columns, H: FloatArray, K: FloatArray, R: FloatArray) -> None:
+        """P <- (I - K H) P (I - K H)^T + K R K^T, multiplied out from the left and then from the right."""
+        P = self.covariance
+        half = P - K.dot(H.dot(P[columns]))
+        full = half - half[:, columns].dot(H.T).dot(K.T) + K.dot(R).dot(K.T)
+        P[:] = 0.5 * (full + full.T)
+
+
+def columns_of(*parts: slice | Sequence[int]) -> Columns:
+    """Column numbers of slices and sequences, one after the other."""
+    numbers: list[int] = []
+    for part in parts:
+        numbers += range(part.start, part.stop) if isinstance(part, slice) else part
+    return np.array(numbers, dtype=np.intp)
+
+
+def _checked_rows(columns: Columns, H: FloatArray, residual: FloatArray, R: FloatArray) -> FloatArray:
+    """R as a matrix (m, m).
+
+    Raises:
+        FilterShapeError: a shape does not fit.
+    """
+    m = residual.size
+    if H.shape != (m, columns.size):
+        raise FilterShapeError("H", H.shape, f"({m}, {columns.size})")
+    if R.shape not in ((m,), (m, m)):
+        raise FilterShapeError("R", R.shape, f"({m},) or ({m}, {m})")
+    return np.diag(R) if R.ndim == 1 else R
+
+
+def _root(S: FloatArray, residual: FloatArray) -> FloatArray:
+    """Lower Cholesky factor of S.
+
+    Raises:
+        FilterDiverged: not finite or not positive definite.
+    """
+    if not float(np.vdot(S, S) + np.vdot(residual, residual)) < HUGE:
+        raise FilterDiverged(f"update is not finite: residuals {residual.tolist()}")
+    try:
+        root = np.linalg.cholesky(S).astype(np.float64, copy=False)
+    except np.linalg.LinAlgError:
+        raise FilterDiverged("update is not finite, or H P H^T + R is not positive definite") from None
+    return root

@@ -1,0 +1,52 @@
+"""Glue. A dashboard beside a daemon that runs already: ``ccatp dashboard``."""
+
+import asyncio
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from ccatp.config.loader import load_config
+from ccatp.errors import ConfigError, UnreachableError
+from ccatp.processes.common import Endpoints, open_log
+from ccatp.processes.dashboard import run_dashboard
+from ccatp.processes.page_socket import RUN_LINK, open_page_socket
+from ccatp.recorder import read_metadata
+from ccatp.runtime_dir import runtime_dir_path
+
+ROOT = "dashboard."
+
+
+def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callable[[str], None]) -> int:
+    """Serve until SIGINT or SIGTERM.
+
+    Args:
+        runtime_dir: of the daemon, if not the usual one.
+        settings: keys of ``dashboard`` that are not those of the run.
+        say: tells where the page is.
+
+    Raises:
+        UnreachableError: no daemon runs there.
+        ConfigError: a setting that is none of the page's, a token that cannot be read, or no address to listen on.
+    """
+    for key in settings:
+        if not key.startswith(ROOT):
+            raise ConfigError(f"--set: {key} is no key of the page; the daemon runs with what it has, see {ROOT}*")
+    folder = runtime_dir_path(str(runtime_dir or ""), os.environ)
+    run_dir = folder / RUN_LINK
+    if not (folder / "control").exists() or not (run_dir / "config.toml").exists():
+        raise UnreachableError(
+            f"no daemon in {folder}; start one with ccatp run, or name its folder with --runtime-dir"
+        )
+    run_dir = run_dir.resolve()
+    cfg = load_config(run_dir / "config.toml", {**settings, f"{ROOT}enabled": True})
+    page = open_page_socket(cfg.dashboard)
+    if page.socket is None:
+        raise ConfigError(page.text)
+    is_sim = read_metadata(run_dir / "telemetry.mcap").get("simulation") == "true"
+    log = open_log(run_dir / "log.jsonl", "dashboard")
+    with page.socket:
+        say(page.text)
+        asyncio.run(
+            run_dashboard(cfg, run_dir, Endpoints(folder), page.socket, is_sim=is_sim, log=log, has_pulse=False)
+        )
+    return 0

@@ -1,0 +1,153 @@
+"""Glue. One sensors frame after the other, in the order that lockstep needs: listen, hear, decide, drive."""
+
+import asyncio
+import time
+from collections.abc import Callable
+
+from ccatp.config.models import LinkConfig
+from ccatp.errors import CcatpError, ExitStatus
+from ccatp.frame_lag import FrameLag
+from ccatp.processes.frame_clock import FrameClock
+from ccatp.processes.hearing import VerdictEar
+from ccatp.processes.pulse import Pulse
+from ccatp.processes.seat import Seat
+from ccatp.processes.work import STILL, Drive, Served, Work
+from ccatp.samples import Verdict
+from ccatp.wire.robot import Sensors
+
+# Of a robot that moved nobody knows where it is when the samples of more frames than this are missing.
+UNSEEN_S = 0.1
+
+
+class Surprise(CcatpError):
+    """An error that nobody foresaw; the log has it all. The process is started anew."""
+
+    exit_status = ExitStatus.HELD
+
+
+class FrameService:
+    """Serves the frames of the robot with the decisions of a mission.
+
+    Args:
+        cfg: the robot link.
+        work: the mission.
+        seat: where drives go out.
+        clock: of the frames.
+        ear: hears the danger loop.
+        pulse: shows that frames are served.
+        on_surprise: told of an error that ends the process.
+
+    Attributes:
+        lag: how late frames are served.
+        over: set when the mission is over, and no frame is served any more.
+    """
+
+    def __init__(
+        self,
+        cfg: LinkConfig,
+        work: Work,
+        seat: Seat,
+        clock: FrameClock,
+        ear: VerdictEar,
+        pulse: Pulse,
+        *,
+        on_surprise: Callable[[Exception], None],
+    ) -> None:
+        """No frame yet."""
+        self._cfg, self._work, self._seat, self._clock, self._ear, self._pulse = cfg, work, seat, clock, ear, pulse
+        self._teller, self._on_surprise = work.teller, on_surprise
+        self.lag = FrameLag(cfg.slip_after_s)
+        self.over = asyncio.Event()
+        self._lag_s = 0.0
+        self._was_quiet = False
+        self._unanswered: int | None = None
+
+    def begin_session(self) -> None:
+        """A session begins; its first frame comes next."""
+        self.lag.forget()
+        self._pulse.phase, self._pulse.frame_s = "joined", time.monotonic()
+
+    def lose(self) -> None:
+        """The session is gone; held by the robot itself."""
+        # What it did since the last frame shows in the next one, if that comes soon.
+        self._was_quiet = self._work.is_quiet
+        self._pulse.phase, self._unanswered = "rejoining", None
+
+    def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
+        """Serve one sensors frame. A surprise ends the process, held, and not just the connection."""
+        if self.over.is_set():
+            return
+        try:
+            self._serve(sensors, raw)
+        except Exception as error:
+            self._teller.log.exception("surprise in a frame", seq=self._clock.seq)
+            self._teller.say("error", f"internal error, wheels held: {type(error).__name__}: {error}; see log.jsonl")
+            self._on_surprise(Surprise(f"internal error: {type(error).__name__}: {error}"))
+
+    def _serve(self, sensors: Sensors, raw: bytes) -> None:
+        start = time.perf_counter()
+        seat, work = self._seat, self._work
+        steady_s, dt_s = self._clock.look(sensors.seq, sensors.t, seat.frame_period_s)
+        frame = Served(sensors, raw, steady_s, dt_s, seat.is_new_session)
+        is_unjudged = seat.is_unjudged
+        if frame.is_first:
+            self._greet(dt_s)
+        self._clock.serve(sensors.seq, steady_s)
+        self._pulse.frame_s = time.monotonic()
+        work.listen(frame)
+        if dt_s <= 0.0:  # counted by the localizer; a controller cannot go back in time
+            self._teller.stale_frame(sensors.seq, raw)
+            self._answer(sensors.seq, STILL)
+            return
+        waiting = time.perf_counter()
+        verdict = None if is_unjudged else self._hear(sensors.seq)
+        heard = time.perf_counter()
+        drive = work.decide(frame, None if self._is_late(sensors.t) else verdict, self._lag_s)
+        self._answer(sensors.seq, drive)
+        work.tell(frame)
+        self._teller.tick(1e6 * (time.perf_counter() - heard + waiting - start))
+
+    def _hear(self, seq: int) -> Verdict | None:
+        return self._ear.hear(seq, self._seat.frame_period_s, is_lockstep=self._seat.is_lockstep)
+
+    def _greet(self, dt_s: float) -> None:
+        """Before the first drive and not on joining, so that in lockstep the robot is told in a certain frame."""
+        self._seat.is_new_session = False
+        self._work.greet()
+        if self._clock.has_begun and dt_s > UNSEEN_S and not self._was_quiet:
+            self._teller.say("warning", f"the robot moved and was out of sight for {dt_s:.2f} s: it is found again")
+            self._work.lose_sight()
+
+    def _is_late(self, t_s: float) -> bool:
+        """Whether the frame is too late to move on: then the mission pauses until frames are prompt again."""
+        self._lag_s = lag_s = 0.0 if self._seat.is_lockstep else self.lag.served(t_s, time.monotonic())
+        if lag_s <= self._cfg.lag_limit_s:
+            return False
+        if self._work.interrupt(f"a frame was served {1e3 * lag_s:.0f} ms late"):
+            self._teller.log.warning("late frame", seq=self._clock.seq, lag_s=lag_s, limit_s=self._cfg.lag_limit_s)
+        return True
+
+    # -- answers --------------------------------------------------------------------------------------------------
+
+    def _may_answer(self) -> bool:
+        """In lockstep simulated time stands still while a peer is waited for, and all but still in a pause."""
+        if not self._seat.is_lockstep:
+            return True
+        return not self._work.is_busy and not (self._work.is_paused and self._work.is_quiet)
+
+    def _answer(self, seq: int, drive: Drive) -> None:
+        if self._may_answer():
+            self._seat.drive(seq, *drive)
+        else:
+            self._unanswered = seq
+
+    def answer_held(self) -> None:
+        """Answer the frame that waits, if nothing stands against it any more."""
+        if self._may_answer():
+            self.release()
+
+    def release(self) -> None:
+        """Answer the frame that waits, standing."""
+        seq, self._unanswered = self._unanswered, None
+        if seq is not None:
+            self._seat.drive(seq, *STILL)

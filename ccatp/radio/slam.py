@@ -1,0 +1,240 @@
+"""Pure. A vehicle among beacons that places them on a map while it finds itself on it: EKF-SLAM over readings."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from math import hypot, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.filters.base import FloatArray
+from ccatp.filters.ekf_slam import BlockError, EkfSlam, Update
+from ccatp.radio.beacon_map import BeaconMap, Entry
+from ccatp.radio.dead_reckoning import DeadReckoning
+from ccatp.radio.doubts import Doubts
+from ccatp.radio.motion import POSE, Odometry, Pose
+from ccatp.radio.newcomers import Newcomers
+from ccatp.radio.noise_level import NoiseLevel
+from ccatp.radio.readings import BeaconId, Reading
+from ccatp.radio.settling import derivatives, wrapped
+from ccatp.radio.sightings import Sensors, bearing_of, kind_of, strength_of
+from ccatp.radio.slam_settings import SlamSettings
+
+DELAY = "odometry_delay_s"
+
+
+@dataclass(frozen=True, slots=True)
+class BeaconEstimate:
+    """A beacon on the map.
+
+    Attributes:
+        mean: x_m, y_m and, where they are estimated, reference_dbm and exponent, shape (b,).
+        covariance: shape (b, b).
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+
+
+class Learned(NamedTuple):
+    """What one reading did: an ``Innovation`` with the beacon it came from.
+
+    Attributes:
+        beacon: which one.
+        residual: z - h(x) of the bearing, if there is one, and of the range or the strength, shape (m,).
+        nis: nu^T S^-1 nu, with the larger noise where a reading was beyond the knee.
+        size: m; a reading whose bearing is refused has its range left out.
+        accepted: False where it was refused; the state is then as before, or has taken the bearing alone.
+    """
+
+    beacon: BeaconId
+    residual: FloatArray
+    nis: float
+    size: int
+    accepted: bool
+
+
+class BeaconSlam:
+    """EKF-SLAM of a vehicle among beacons, by ``EkfSlam``; docs/slam.md has the models.
+
+    Args:
+        settings: vehicle and radios.
+        pose0: where the vehicle begins; it defines the frame of the map.
+        P0: covariance of that, shape (3, 3).
+        known: beacons with a prior: mean (b,) and covariance (b, b).
+
+    Attributes:
+        engine: the state: vehicle | calibration | beacons, wandering errors and places where readings wait.
+        learned: what the readings of the last ``observe`` did.
+        waiting: beacons that were heard and are not on the map yet, with the candidates for their places.
+        levels: what the noise of each sensor and of the motion is, relative to the settings, in variance.
+        jumps: how often the pose was doubted.
+    """
+
+    def __init__(
+        self,
+        settings: SlamSettings,
+        pose0: Pose | Sequence[float],
+        P0: FloatArray,
+        known: Mapping[BeaconId, BeaconEstimate] | None = None,
+    ) -> None:
+        self.settings = settings
+        self._motion, self._sensors, trust = settings.motion, Sensors(settings), settings.trust
+        delay = (settings.delay_sigma_s,) if settings.delay_sigma_s > 0.0 else ()
+        own, shared = self._motion.prior_sigmas, (*self._sensors.prior_sigmas, *delay)
+        v, self._ranges = POSE + len(own), len(self._sensors.names)
+        mean, P = np.zeros(v), np.zeros((v, v))
+        mean[:POSE], P[:POSE, :POSE] = pose0, P0
+        P[range(POSE, v), range(POSE, v)] = np.square(own)
+        self.engine = EkfSlam(mean, P, np.zeros(len(shared)), np.diag(np.square(shared)))
+        self._shared = slice(v, v + len(shared))
+        self._delay = v + len(shared) - 1 if delay else -1
+        self._names: tuple[str, ...] = (*self._motion.names, *self._sensors.names, *((DELAY,) if delay else ()))
+        self._clock = DeadReckoning(is_delayed=bool(delay))
+        self._map = BeaconMap(self.engine, self._shared)
+        self.levels = {
+            k: NoiseLevel(trust.learn_prior, trust.learn_memory) for k in ("range", "bearing", "rssi", "motion")
+        }
+        self._learns = trust.learn_memory > 0.0
+        self._fresh = np.zeros((POSE, POSE))  # process noise since the last update
+        self._doubts, self.jumps = Doubts(trust.doubt_pose_after), 0
+        self._way_m = 0.0
+        self._newcomers = Newcomers(
+            self.engine, self._sensors, self._map, self._clock, self.levels, self._shared, self._delay
+        )
+        self.waiting = self._newcomers.waiting
+        self.learned: list[Learned] = []
+        for beacon, estimate in (known or {}).items():
+            self._map.join(beacon, estimate.mean, estimate.covariance)
+
+    @property
+    def pose(self) -> Pose:
+        """The vehicle after the last odometry; the heading does not wrap."""
+        return Pose(*self.engine.mean[:POSE].tolist())
+
+    @property
+    def pose_covariance(self) -> FloatArray:
+        """Of x_m, y_m, heading_rad, shape (3, 3)."""
+        return self.engine.covariance[:POSE, :POSE].copy()
+
+    @property
+    def beacons(self) -> dict[BeaconId, BeaconEstimate]:
+        """The map."""
+        x, P, place = self.engine.mean, self.engine.covariance, self.engine.block
+        return {b: BeaconEstimate(x[place(b)].copy(), P[place(b), place(b)].copy()) for b in self._map}
+
+    @property
+    def calibration(self) -> dict[str, tuple[float, float]]:
+        """Mean and standard deviation of what is calibrated on the way, by name."""
+        mean, variances = self.engine.mean.tolist(), self.engine.covariance.diagonal().tolist()
+        return {name: (mean[POSE + i], sqrt(variances[POSE + i])) for i, name in enumerate(self._names)}
+
+    def predict(self, odometry: Odometry) -> None:
+        """Carry the vehicle on.
+
+        Raises:
+            TypeError: the odometry is of another kind of vehicle.
+        """
+        delay_s = float(self.engine.mean[self._delay]) if self._delay >= 0 else 0.0
+        for step in self._clock.due(odometry, delay_s):
+            self._step(step)
+
+    def _step(self, odometry: Odometry) -> None:
+        engine = self.engine
+        before = engine.mean[: engine.vehicle_size].copy()
+        mean, F, Q, rest = self._motion.step(before, odometry)
+        if self._learns:
+            Q = Q * self.levels["motion"].factor
+            turned = F[:POSE, :POSE]
+            self._fresh = turned.dot(self._fresh).dot(turned.T) + Q[:POSE, :POSE]
+        engine.predict(mean, F, Q)
+        self._clock.took(odometry, before, mean)
+        self._way_m += hypot(mean[0] - before[0], mean[1] - before[1])
+        if rest is not None:
+            residual = rest.value - float(engine.mean[rest.column])
+            engine.update_row(np.array((rest.column,)), np.ones(1), residual, rest.variance)
+
+    def observe(self, readings: Iterable[Reading]) -> list[Learned]:
+        """Take readings of any beacons, one after the other; those of new ones begin their place on the map.
+
+        Raises:
+            SensorError: the settings have no model of a reading.
+        """
+        self.learned = []
+        for reading in readings:
+            if reading.beacon in self._map:
+                self.learned.append(self._update(reading, self._map[reading.beacon]))
+            else:
+                self._newcomers.meet(reading)
+        return self.learned
+
+    def remove(self, beacon: BeaconId) -> None:
+        """Forget a beacon; one that is heard again begins anew.
+
+        Raises:
+            BlockError: nothing was heard of it.
+        """
+        if self._newcomers.forget(beacon):
+            return
+        if beacon not in self._map:
+            raise BlockError(beacon, "is not on the map")
+        self._map.leave(beacon)
+
+    def _update(self, reading: Reading, entry: Entry) -> Learned:
+        """Bearing first, which says whether it is the beacon at all; then the range or the strength."""
+        model = self._sensors.wander(reading)
+        if model is not None:
+            self._map.wander_to(reading.beacon, model, self._way_m, reading.time_s)
+        found = []
+        if bearing_of(reading) is not None:
+            found.append(self._take(reading, entry, "bearing"))
+        if not found or found[0].accepted:
+            found.append(self._take(reading, entry, kind_of(reading)))
+        if self._learns:
+            self._fresh = np.zeros((POSE, POSE))
+        accepted = found[-1].accepted
+        self._judge(reading.beacon, entry, accepted=accepted)
+        residual = np.concatenate([update.residual for update in found])
+        return Learned(reading.beacon, residual, sum(update.nis for update in found), len(found), accepted)
+
+    def _take(self, reading: Reading, entry: Entry, kind: str) -> Update:
+        """One scalar of a reading."""
+        engine, trust, level = self.engine, self.settings.trust, self.levels[kind]
+        x = engine.mean.take(entry.columns).tolist()
+        split = POSE + self._shared.stop - self._shared.start
+        beacon = x[split : split + entry.size]
+        at = self._newcomers.carried(engine.mean, reading)
+        is_angle = kind == "bearing"
+        if is_angle:
+            row, z = self._sensors.bearing(at.pose, beacon), bearing_of(reading)
+        else:
+            row, z = self._sensors.row(reading, at.pose, x[POSE : POSE + self._ranges], beacon), strength_of(reading)
+        h = [*derivatives(row, at, delayed=self._delay >= 0), *row.beacon]
+        expected, r = row.expected, row.variance * level.factor
+        if entry.wander >= 0:
+            model = None if is_angle else self._sensors.wander(reading)
+            share = 0.0 if model is None else model.share
+            h.append(sqrt(share * r))
+            expected += h[-1] * x[-1]
+            r *= 1.0 - share
+        residual = wrapped(z or 0.0, expected, is_angle=is_angle)
+        found = engine.update_row(entry.columns, np.array(h), residual, r, trust.gate_sigmas**2, trust.knee_sigmas)
+        if found.accepted and self._learns:
+            s = found.spread.item()
+            level.learn(found.nis, r / s)
+            by_pose = np.array(h[:POSE])
+            self.levels["motion"].learn(found.nis, float(by_pose.dot(self._fresh).dot(by_pose)) / s)
+        return found
+
+    def _judge(self, beacon: BeaconId, entry: Entry, *, accepted: bool) -> None:
+        """Refusals accuse the pose, or a beacon that alone is refused: the one is loosened, the other begins anew."""
+        entry.refused = 0 if accepted else entry.refused + 1
+        trust = self.settings.trust
+        if self._doubts.take(accepted=accepted):
+            v = self.engine.vehicle_size
+            jump = np.zeros(v)
+            jump[:POSE] = trust.jump_m, trust.jump_m, trust.jump_rad
+            self.engine.predict(self.engine.mean[:v].copy(), np.eye(v), np.diag(jump**2))
+            self.jumps += 1
+        if entry.refused >= trust.doubt_beacon_after:
+            self._map.leave(beacon)

@@ -1,0 +1,91 @@
+"""Edge. Writes the report of a run, and the one of two runs beside each other: a page, and figures where asked for."""
+
+from pathlib import Path
+
+from ccatp.drawing.shapes import Picture
+from ccatp.errors import CcatpError, ExitStatus
+from ccatp.picture_file import PictureError, write_figures, write_svg
+from ccatp.report_reader import read_record
+from ccatp.reporting.compare_page import Pair, compare_figures, compare_page, pair_of
+from ccatp.reporting.findings import Findings, findings_of
+from ccatp.reporting.run_page import run_figures, run_page
+
+REPORT, COMPARISON = "report.html", "compare.html"
+
+
+class ReportError(CcatpError):
+    """A report that cannot be written."""
+
+    exit_status = ExitStatus.USAGE
+
+
+def report_run(run_dir: Path, out: Path | None = None, figures: Path | None = None) -> tuple[Path, Findings]:
+    """Write the report of a run.
+
+    Args:
+        run_dir: its directory.
+        out: the page; ``report.html`` in the run directory if not given.
+        figures: a directory for the figures as SVG, PNG and PDF; none are written if not given.
+
+    Returns:
+        The page's path, and what is in it.
+
+    Raises:
+        RunReadError: no run there.
+        ConfigError: its configuration cannot be used.
+        ReportError: the page cannot be written.
+        PictureError: a figure cannot be written, or matplotlib is not installed.
+    """
+    found = findings_of(read_record(run_dir))
+    path = out or run_dir / REPORT
+    write_page(run_page(found), path)
+    if figures is not None:
+        write_pictures(run_figures(found), figures)
+    return path, found
+
+
+def compare_runs(run_a: Path, run_b: Path, out: Path, figures: Path | None = None) -> Pair:
+    """Write two runs beside each other.
+
+    Args:
+        run_a, run_b: their directories.
+        out: the page.
+        figures: a directory for the figures; none are written if not given.
+
+    Raises:
+        CcatpError: as ``report_run``.
+    """
+    pair = pair_of(findings_of(read_record(run_a)), findings_of(read_record(run_b)))
+    write_page(compare_page(pair), out)
+    if figures is not None:
+        write_pictures(compare_figures(pair), figures)
+    return pair
+
+
+def write_page(markup: str, path: Path) -> None:
+    """Write a page, complete or not at all.
+
+    Raises:
+        ReportError: it cannot be written.
+    """
+    new = path.with_name(path.name + ".new")
+    try:
+        new.write_text(markup, encoding="utf-8")
+        new.replace(path)
+    except OSError as error:
+        raise ReportError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def write_pictures(pictures: dict[str, Picture], folder: Path) -> None:
+    """Write figures as SVG, PNG and PDF.
+
+    Raises:
+        PictureError: one cannot be written, or matplotlib is not installed.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise PictureError(f"{folder}: cannot be made: {error.strerror or error}") from error
+    for name, picture in pictures.items():
+        write_svg(picture, folder / f"{name}.svg")
+        write_figures(picture, folder / name)

@@ -1,0 +1,86 @@
+"""Pure. The page around the sections of a report: one HTML file that asks nobody for anything."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from ccatp.reporting.html import text
+
+# Nothing is loaded, run, sent or embedded; what the page shows stands in it.
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
+STYLE = """
+:root{--ink:#1f2933;--quiet:#5f6c7b;--line:#d5dce4;--soft:#f4f6f9;--bad:#c93f3f;--good:#1d7a55;--mid:#a8641a}
+*{box-sizing:border-box}
+html{-webkit-text-size-adjust:100%}
+body{margin:0 auto;max-width:960px;padding:20px 20px 60px;color:var(--ink);background:#fff;
+font:15px/1.5 system-ui,"Segoe UI","DejaVu Sans",Helvetica,Arial,sans-serif;overflow-wrap:break-word}
+h1{font-size:26px;line-height:1.2;margin:6px 0 2px}
+h2{font-size:19px;margin:38px 0 10px;padding-top:10px;border-top:1px solid var(--line)}
+h3{font-size:15px;margin:22px 0 6px}
+p{margin:6px 0}a{color:#123f6d}.quiet,figcaption{color:var(--quiet);font-size:13.5px}
+.chip{display:inline-block;border-radius:4px;padding:1px 9px;margin:0 6px 6px 0;font-size:13px;font-weight:600;
+border:1px solid currentColor}
+.good{color:var(--good)}.bad{color:var(--bad)}.mid{color:var(--mid)}.sim{background:#fff3cd;color:#6b4e00}
+nav{margin:14px 0 0;font-size:14px;display:flex;flex-wrap:wrap;gap:2px 16px}
+.box{border-left:4px solid var(--mid);background:#fdf6ec;padding:8px 14px;margin:14px 0}
+.box ul{margin:4px 0;padding-left:18px}
+dl{display:grid;grid-template-columns:repeat(auto-fill,minmax(210px,1fr));gap:8px;margin:14px 0}
+dl div{background:var(--soft);border-radius:6px;padding:8px 12px}
+dt{color:var(--quiet);font-size:12.5px}dd{margin:0;font-size:17px;font-variant-numeric:tabular-nums}
+dd small{font-size:13px;color:var(--quiet)}
+figure{margin:12px 0}figure svg{display:block;width:100%;height:auto;max-width:880px}.narrow{display:none}
+.narrow svg{max-width:480px}
+.scroll{overflow-x:auto;margin:8px 0}
+table{border-collapse:collapse;font-size:13.5px;font-variant-numeric:tabular-nums}
+th,td{padding:3px 9px;text-align:right;white-space:nowrap;border-bottom:1px solid var(--line)}
+thead th{position:sticky;top:0;background:#fff;border-bottom:2px solid var(--line);color:var(--quiet);font-weight:600}
+tbody th{text-align:left;font-weight:600;position:sticky;left:0;background:#fff}
+table.texts td,table.texts thead th{text-align:left;white-space:normal;vertical-align:top}
+table.texts td:last-child{min-width:240px}
+table.dense{font-size:12.5px}table.dense th,table.dense td{padding:3px 6px}
+td.pass{color:var(--good)}td.fail,td.skipped{color:#fff;background:var(--bad)}td.corrected{background:#fbe3c4}
+td.open{color:var(--quiet)}td.far{background:#fbe3c4}
+table.log tbody th{font-weight:400}
+details{margin:10px 0}summary{cursor:pointer;color:#123f6d}
+pre{background:var(--soft);padding:12px;overflow-x:auto;font-size:12.5px;line-height:1.4}
+footer{margin-top:40px;padding-top:10px;border-top:1px solid var(--line);color:var(--quiet);font-size:13px}
+@media (max-width:640px){body{padding:12px 12px 40px;font-size:15px}h1{font-size:22px}.wide{display:none}
+.narrow{display:block}dl{grid-template-columns:1fr 1fr}dd{font-size:15px}
+.log :is(th,td):nth-child(2){display:none}th,td{padding:3px 6px}}
+@media print{@page{margin:14mm}body{max-width:none;padding:0;font-size:10.5pt}nav,details:not([open]){display:none}
+h2{break-after:avoid}figure,dl,tr{break-inside:avoid}thead{display:table-header-group}
+thead th,tbody th{position:static}.scroll{overflow:visible}.wide{display:block!important}.narrow{display:none!important}
+figure svg{max-height:235mm}table{font-size:8pt}th,td{padding:1.5px 5px}
+*{-webkit-print-color-adjust:exact;print-color-adjust:exact}}
+"""
+
+
+class Section(NamedTuple):
+    """A part of the page: its anchor, its heading, and what stands under it, as markup."""
+
+    anchor: str
+    title: str
+    body: str
+
+
+def page(title: str, head: str, sections: Sequence[Section], foot: str) -> str:
+    """The whole file.
+
+    Args:
+        title: of the window.
+        head: what stands above the sections, as markup.
+        sections: in their order.
+        foot: the last line, as markup.
+    """
+    links = "".join(f'<a href="#{text(section.anchor)}">{text(section.title)}</a>' for section in sections)
+    parts = "".join(
+        f'<section id="{text(section.anchor)}"><h2>{text(section.title)}</h2>{section.body}</section>'
+        for section in sections
+    )
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        '<meta name="referrer" content="no-referrer"><link rel="icon" href="data:,">'
+        f"<title>{text(title)}</title><style>{STYLE}</style></head><body>"
+        f"<header>{head}<nav>{links}</nav></header><main>{parts}</main><footer>{foot}</footer></body></html>\n"
+    )

@@ -1,0 +1,150 @@
+"""Pure. Where the time of a run went - turning, driving, settling, measuring, waiting - against the least it takes."""
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.assembly import plan_survey
+from ccatp.planning.bound import leg_lengths, leg_time, stop_times
+from ccatp.planning.errors import PlanError
+from ccatp.planning.traversal import ORDERS
+from ccatp.reporting.record import RunRecord, Session
+from ccatp.samples import PointId, StopKind
+
+KINDS = ("turn", "drive", "settle", "measure", "wait", "back off", "home")
+_KIND_OF = {
+    "turning": "turn",
+    "driving": "drive",
+    "settling": "settle",
+    "measuring": "measure",
+    "backing off": "back off",
+    "returning": "home",
+}
+_OVER = "done"
+_NEVER_BEGUN = "idle"
+
+
+class Spell(NamedTuple):
+    """The mission was in a state for some time."""
+
+    state: str
+    duration_s: float
+
+
+class TimeBudget(NamedTuple):
+    """Times of a run, s.
+
+    Attributes:
+        spent_s: by kind, in the order of ``KINDS``; kinds that did not occur are left out.
+        least_s: by kind, of the same way from rest to rest; None where the way is not known.
+        visits: how often the robot turned, drove, settled, measured, ...
+        is_exact: from the log, frame by frame; else sampled from the status.
+        covers: what the least time covers, for the reader.
+    """
+
+    spent_s: dict[str, float]
+    least_s: dict[str, float] | None
+    visits: dict[str, int]
+    is_exact: bool
+    covers: str
+
+    @property
+    def total_s(self) -> float:
+        """Time of the mission."""
+        return sum(self.spent_s.values())
+
+    @property
+    def bound_s(self) -> float | None:
+        """The least time of the same way."""
+        return None if self.least_s is None else sum(self.least_s.values())
+
+
+def time_budget(record: RunRecord) -> TimeBudget | None:
+    """The budget of a run; None where nothing tells its states."""
+    spells, is_exact = list[Spell](), True
+    for session in record.sessions:
+        exact = spells_of(session)
+        is_exact = is_exact and exact is not None
+        spells += sampled_spells(session) if exact is None else exact
+    if not spells:
+        return None
+    spent, visits = _booked(spells, record.cfg.etalon.measuring_time_s)
+    least, covers = least_times(record)
+    return TimeBudget(spent, least, visits, is_exact, covers)
+
+
+def spells_of(session: Session) -> list[Spell] | None:
+    """Spells between the changes that the log tells; None where it does not, or the frames are not known.
+
+    What a main loop that died was at is not told; the time until its successor speaks counts as waiting.
+    """
+    track = session.track
+    if not session.changes or not len(track.seq):
+        return None
+    at = np.clip(np.searchsorted(track.seq, [change.seq for change in session.changes]), 0, len(track.seq) - 1)
+    times = [float(track.t_s[0]), *track.t_s[at].tolist()]
+    spells = [
+        Spell(change.before, end - start) for change, (start, end) in zip(session.changes, pairwise(times), strict=True)
+    ]
+    last = session.changes[-1].after
+    spells.append(Spell(last, float(track.t_s[-1]) - times[-1]))
+    return [spell for spell in spells if spell.duration_s > 0.0 and spell.state != _OVER]
+
+
+def sampled_spells(session: Session) -> list[Spell]:
+    """Spells as the status shows them: each lasts until the next."""
+    said = session.statuses
+    return [
+        Spell(one.state, later.t_s - one.t_s)
+        for one, later in pairwise(said)
+        if one.state != _OVER and later.t_s > one.t_s
+    ]
+
+
+def _booked(spells: Iterable[Spell], measuring_s: float) -> tuple[dict[str, float], dict[str, int]]:
+    """Spells by kind. A measurement that takes longer than its time was repeated, or waited for the laser."""
+    spent, visits = defaultdict[str, float](float), defaultdict[str, int](int)
+    for state, duration_s in spells:
+        kind = _KIND_OF.get(state, "wait")
+        visits[kind] += state != _NEVER_BEGUN
+        if kind == "measure" and duration_s > measuring_s:
+            spent["wait"] += duration_s - measuring_s
+            spent[kind] += measuring_s
+        else:
+            spent[kind] += duration_s
+    # Sums of a hundredth of a second do not come out at 0.
+    kinds = [kind for kind in KINDS if spent[kind] > 1e-6]
+    return {kind: spent[kind] for kind in kinds}, {kind: visits[kind] for kind in kinds}
+
+
+def least_times(record: RunRecord) -> tuple[dict[str, float] | None, str]:
+    """Least times of the planned way, up to the last point that was measured, and what that covers.
+
+    Bang-bang times from rest to rest, turning in place at every stop (``ccatp.planning.bound``), as ``lower_bound_s``
+    of ``summary.json``, which is their sum for a mission that is complete and was not resumed.
+    """
+    cfg, mirror = record.cfg, record.mirror
+    points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
+    try:
+        stops = plan_survey(cfg, mirror, points, (), []).stops
+    except PlanError:
+        return None, ""
+    measured = {one.point for one in record.measured}
+    count = _driven([stop.point for stop in stops], measured)
+    if not count:
+        return None, ""
+    lengths = leg_lengths(stops, mirror.base_pose, mirror)[:count]
+    legs_s = sum(leg_time(length, cfg.limits) for length in lengths)
+    times_s = sum(stop_times(stops, mirror.base_pose, cfg.limits, mirror)[:count])
+    measurements = sum(stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) for stop in stops[:count])
+    least = {"turn": times_s - legs_s, "drive": legs_s, "measure": measurements * cfg.etalon.measuring_time_s}
+    whole = len(measured) >= len(points)
+    return least, "the whole mission" if whole else "the planned way to the last measured point"
+
+
+def _driven(points: Sequence[PointId | None], measured: set[PointId]) -> int:
+    """Stops up to the last measured one."""
+    return max((i + 1 for i, point in enumerate(points) if point in measured), default=0)

@@ -1,0 +1,1 @@
+"""Pure. The true world of a robot among radio beacons."""

@@ -1,0 +1,111 @@
+"""Edge. The log of a run, ``log.jsonl``: lines for a reader, and when the mission changed its state."""
+
+import json
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ccatp.reporting.record import LogLine, StateChange
+
+# Fields of every line; the others say more of what happened.
+_OWN = frozenset(("process", "event", "level", "wall", "seq", "t_s"))
+_DEBUG = "debug"
+
+
+class ReadLine(NamedTuple):
+    """A line of the log.
+
+    Attributes:
+        shown: what a reader is shown; None for what was said for debugging.
+        change: what it tells of the mission's state.
+        begins: a session begins with it.
+    """
+
+    shown: LogLine | None
+    change: StateChange | None
+    begins: bool
+
+
+def read_log(path: Path, warnings: list[str]) -> Iterator[ReadLine]:
+    """The lines of a log, oldest first; a log that is not there has none.
+
+    Args:
+        path: the file; its last line may be torn, as after a ``kill -9``.
+        warnings: takes one line where something cannot be read.
+    """
+    bad = 0
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            for text in file:
+                line = _parsed(text)
+                if line is None:
+                    bad += 1
+                else:
+                    yield line
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        warnings.append(f"{path.name}: cannot be read: {error.strerror or error}")
+    if bad:
+        warnings.append(f"{path.name}: {bad} lines cannot be read and are left out")
+
+
+def _parsed(text: str) -> ReadLine | None:
+    try:
+        fields = json.loads(text)
+    except ValueError:
+        return None
+    if not isinstance(fields, dict) or not isinstance(fields.get("event"), str):
+        return None
+    begins = fields["event"] == "run" and fields.get("process") == "supervisor"
+    if fields.get("level") == _DEBUG:
+        return ReadLine(None, _change(fields), begins)
+    more = "  ".join(f"{key}={_shown(value)}" for key, value in fields.items() if key not in _OWN)
+    t_s = fields.get("t_s")
+    line = LogLine(
+        wall=str(fields.get("wall", "")),
+        t_s=float(t_s) if isinstance(t_s, int | float) else None,
+        level=str(fields.get("level", "")),
+        process=str(fields.get("process", "")),
+        text=f"{fields['event']}  {more}" if more else fields["event"],
+    )
+    return ReadLine(line, None, begins)
+
+
+def _change(fields: dict[str, Any]) -> StateChange | None:
+    seq, before, after = (fields.get(key) for key in ("seq", "before", "after"))
+    if fields["event"] != "state" or not isinstance(seq, int):
+        return None
+    return StateChange(seq, str(before), str(after))
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return value if isinstance(value, str) and value else json.dumps(value)
+
+
+def changes_of(lines: Iterable[ReadLine], sessions: int) -> list[tuple[StateChange, ...]]:
+    """The changes of state in each session.
+
+    They are numbered by the robot's frames. Where these count anew within a session, because the robot booted, or where
+    the log does not hold as many sessions as there are recordings, their times are not known: then there are none.
+
+    Args:
+        lines: of the log.
+        sessions: recordings of the run.
+    """
+    parts: list[list[StateChange]] = []
+    for line in lines:
+        if line.begins:
+            parts.append([])
+        elif line.change is not None and parts:
+            parts[-1].append(line.change)
+    if len(parts) != sessions:
+        return [()] * sessions
+    return [tuple(part) if _is_in_order(part) else () for part in parts]
+
+
+def _is_in_order(part: list[StateChange]) -> bool:
+    return all(a.seq <= b.seq for a, b in pairwise(part))
