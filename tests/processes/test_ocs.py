@@ -94,7 +94,13 @@ def test_survey_status_abort_from_an_ocs_client(tmp_path: Path, runtime_dir: Pat
         assert fed["running"]
         block = published(client_options)
         assert block["data"]["total"][0] == 18
-        assert block["data"]["state"][0] in ("held", "turning", "driving", "settling", "measuring")  # of the last second
+        assert block["data"]["state"][0] in (
+            "held",
+            "turning",
+            "driving",
+            "settling",
+            "measuring",
+        )  # of the last second
         assert client.abort().session["success"]
         ended = client.survey.wait(timeout=120)
         assert "aborted, the robot is at base" in str(ended.session["messages"])
