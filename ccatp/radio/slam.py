@@ -211,17 +211,19 @@ class BeaconSlam:
             row, z = self._sensors.row(reading, at.pose, x[POSE : POSE + self._ranges], beacon), strength_of(reading)
         h = [*derivatives(row, at, delayed=self._delay >= 0), *row.beacon]
         expected, r = row.expected, row.variance * level.factor
+        own = r
         if entry.wander >= 0:
             model = None if is_angle else self._sensors.wander(reading)
             share = 0.0 if model is None else model.share
             h.append(sqrt(share * r))
             expected += h[-1] * x[-1]
             r *= 1.0 - share
+            own = r + entry.fresh * h[-1] * h[-1]
         residual = wrapped(z or 0.0, expected, is_angle=is_angle)
         found = engine.update_row(entry.columns, np.array(h), residual, r, trust.gate_sigmas**2, trust.knee_sigmas)
         if found.accepted and self._learns:
             s = found.spread.item()
-            level.learn(found.nis, r / s)
+            level.learn(found.nis, own / s)
             by_pose = np.array(h[:POSE])
             self.levels["motion"].learn(found.nis, float(by_pose.dot(self._fresh).dot(by_pose)) / s)
         return found
