@@ -15,7 +15,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
-.PHONY: help run test test-slow faults docs lint format fast lock clean
+.PHONY: help run test test-slow chromium faults docs lint format fast lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -34,8 +34,14 @@ help:
 run: $(VENV)/.installed
 	@$(BIN)/ccatp run --sim $(ARGS)
 
-test: lint
+test: lint chromium
 	$(PYTEST) $(PYTEST_ARGS)
+
+# The page is tried in a real browser where there is one.
+chromium:
+	@command -v chromium >/dev/null || { test "$$(id -u)" = 0 && command -v apt-get >/dev/null && echo "ccatp: installing chromium" && \
+		{ apt-get install -y -qq chromium || { apt-get update -qq && apt-get install -y -qq chromium; }; } >/dev/null 2>&1; } || \
+		echo "ccatp: no chromium, so the tests of the page in a browser are skipped; on Debian: apt install chromium"
 
 test-slow: $(VENV)/.installed-dev
 	$(PYTEST) -m slow $(PYTEST_ARGS)

@@ -252,7 +252,13 @@ class View:
             return None
         shown: dict[str, Any] = msgspec.to_builtins(self.status)
         shown["is_stale"] = now_s - self._status_s > STATUS_STALE_S and not self.links.is_over
+        shown["next_point"] = self.status.point or self._first_to_do()
         return shown
+
+    def _first_to_do(self) -> str:
+        """On the way to a stop that is no point the mission names none."""
+        done = (self.status is not None and self.status.outcome != "") or TODO not in self._states
+        return "" if done else point_name(self.points[self._states.index(TODO)])
 
     def _pose(self) -> dict[str, Any] | None:
         p = self.picture

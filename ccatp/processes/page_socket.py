@@ -75,4 +75,5 @@ def _told(listener: socket.socket, cfg: DashboardConfig, level: str, before: str
 
 
 def _without(cfg: DashboardConfig, error: OSError) -> str:
-    return f"no dashboard: cannot listen on {cfg.host}:{cfg.port}: {error.strerror}; choose another dashboard.host"
+    why = str(error.strerror).partition(" (while")[0]  # Python appends the address once more
+    return f"no dashboard: cannot listen on {cfg.host}:{cfg.port}: {why}; choose another dashboard.host"
