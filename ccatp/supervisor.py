@@ -22,7 +22,7 @@ from ccatp.errors import ConfigError, ExitStatus, RefusedError
 from ccatp.processes.children import Children, ProcessSpec
 from ccatp.processes.common import FAULTS_FILE, RUN_DIR_FILE, Endpoints, open_log
 from ccatp.processes.observing import check_observatory
-from ccatp.processes.page_socket import PageSocket, note_run_dir, open_page_socket
+from ccatp.processes.page_socket import PageSocket, open_page_socket
 from ccatp.processes.run_collector import RunCollector
 from ccatp.processes.run_view import RunView
 from ccatp.processes.service import Service
@@ -95,7 +95,6 @@ def run_survey(options: RunOptions) -> int:
         (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
-        note_run_dir(runtime_dir, run_dir)
         run = _Run(options, cfg, run_dir, Endpoints(runtime_dir), sockets, page, started)
         return run.go()
 
