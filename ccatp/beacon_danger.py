@@ -2,10 +2,10 @@
 
 Every rule looks at what the robot itself senses; of main's estimate only its uncertainty and its age count.
 
-* obstacle: something that the distance sensors see, or saw lately, is nearer than ``obstacle_m`` within ``ahead_rad`` of
-  the course: no forward motion, code 1; likewise behind, and no reverse;
-* target: the mean level of the radio that is followed says that it is nearer than ``target_m``, by one standard
-  deviation of that mean: no forward motion, code 1;
+* obstacle: something that the distance sensors see, or saw lately, is nearer than ``obstacle_m`` within ``ahead_rad``
+  of the course: no forward motion, code 1; likewise behind, and no reverse;
+* target: by the mean level of the radio that is followed, less one standard deviation of that mean, it is nearer than
+  ``target_m``: no forward motion, code 1;
 * silence: neither a static radio nor a mote was heard for ``radio_timeout_s``: hold;
 * estimate: too old, or its standard deviation above ``position_sigma_m`` (until below ``position_clear_m``): hold;
 * a hold that lasts ``hold_limit_s`` is a fault;

@@ -121,6 +121,8 @@ class BeaconSummary:
         track = np.array(self._track, dtype=np.float64).reshape(-1, 13)
         rows = [[np.nan if value is None else value for value in row] for row in self._truth]
         truth = np.array(rows, dtype=np.float64).reshape(-1, 8)
+        if len(track):  # the last drive may have been driven, or not
+            truth = truth[truth[:, _SEQ] <= track[-1, _SEQ]]
         _, i, j = np.intersect1d(track[:, _SEQ], truth[:, _SEQ], return_indices=True)
         track, true = track[i] if facts.has_truth else track, truth[j]
         # A robot that stands until motes have mapped themselves navigates from then on.

@@ -102,7 +102,8 @@ class MoteNavigator:
         motion, state = self._motion, self._filter
         for wheels in senses.wheels:
             odometry = odometry_of(self._cfg, wheels.end_s, wheels)
-            state.predict(*motion.step(state.mean[: state.vehicle_size], odometry))
+            step = motion.step(state.mean[: state.vehicle_size], odometry)
+            state.predict(step.mean, step.F, step.Q)
             self._reckoned = motion.step(self._reckoned, odometry).mean
         for burst in senses.motes:
             if burst.listener == self._cfg.listener.name:

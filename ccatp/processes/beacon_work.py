@@ -49,6 +49,7 @@ class BeaconWork:
         self._senses: Senses | None = None
         self._speed_m_s = 0.0
         self._state: State = IDLE
+        self._was_faulted = False
         self._told_arrivals = 0
         # An operator's commands are the mission's; so is what holds it.
         self.pause, self.resume, self.abort, self.stop = mission.pause, mission.resume, mission.abort, mission.stop
@@ -124,10 +125,10 @@ class BeaconWork:
 
     def settle(self) -> None:
         """Tell a state that is new, and end where that is the end."""
-        mission, before = self._mission, self._state
-        if mission.state is before:
+        mission, before, was_faulted = self._mission, self._state, self._was_faulted
+        if mission.state is before and mission.is_faulted is was_faulted:
             return
-        self._state = mission.state
+        self._state, self._was_faulted = mission.state, mission.is_faulted
         self._teller.log.debug("state", seq=self._host.clock.seq, before=before, after=mission.state)
         if HELD in (mission.state, before) or mission.state is RETURNING:
             text = f"{mission.state}: {mission.cause}" if mission.cause else f"{mission.state}"

@@ -109,7 +109,7 @@ class SignalSlam:
         """Carry the vehicle and the moving radio on."""
         before = self.engine.mean[:PLACE].tolist()
         step = self.settings.motion.step(self.engine.mean[: self.engine.vehicle_size], odometry)
-        self.engine.predict(*step)
+        self.engine.predict(step.mean, step.F, step.Q)
         moving = self.settings.moving
         if moving is not None and moving.beacon in self.engine:
             travel_m = hypot(step.mean[0] - before[0], step.mean[1] - before[1])
@@ -157,6 +157,16 @@ class SignalSlam:
         r = max(hypot(bx - x, by - y), _NEAREST_M)
         h = np.array((x - bx, y - by, bx - x, by - y)) / r
         return r, sqrt(max(float(h @ covariance @ h), 0.0))
+
+    def joint(self, beacons: Sequence[BeaconId]) -> tuple[FloatArray, FloatArray]:
+        """Pose and the places of some radios on the map together: mean (3 + 2 k,) and covariance.
+
+        Raises:
+            BlockError: one is not on the map.
+        """
+        starts = [self.engine.block(beacon).start for beacon in beacons]
+        columns = columns_of(range(POSE), *(range(start, start + PLACE) for start in starts))
+        return self.newcomers.conditioned(columns)
 
     def path_loss_of(self, beacon: BeaconId) -> PathLoss:
         """The calibration of a radio."""

@@ -12,7 +12,7 @@ from ccatp.filters.ekf_slam import BlockError, EkfSlam, Update
 from ccatp.radio.beacon_map import BeaconMap, Entry
 from ccatp.radio.dead_reckoning import DeadReckoning
 from ccatp.radio.doubts import Doubts
-from ccatp.radio.motion import POSE, Odometry, Pose
+from ccatp.radio.motion import POSE, DifferentialDrive, Odometry, Pose
 from ccatp.radio.newcomers import Newcomers
 from ccatp.radio.noise_level import NoiseLevel
 from ccatp.radio.readings import BeaconId, Reading
@@ -142,7 +142,7 @@ class BeaconSlam:
     def _step(self, odometry: Odometry) -> None:
         engine = self.engine
         before = engine.mean[: engine.vehicle_size].copy()
-        mean, F, Q, rest = self._motion.step(before, odometry)
+        mean, F, Q = self._motion.step(before, odometry)
         if self._learns:
             Q = Q * self.levels["motion"].factor
             turned = F[:POSE, :POSE]
@@ -150,6 +150,7 @@ class BeaconSlam:
         engine.predict(mean, F, Q)
         self._clock.took(odometry, before, mean)
         self._way_m += hypot(mean[0] - before[0], mean[1] - before[1])
+        rest = self._motion.at_rest(odometry) if isinstance(self._motion, DifferentialDrive) else None
         if rest is not None:
             residual = rest.value - float(engine.mean[rest.column])
             engine.update_row(np.array((rest.column,)), np.ones(1), residual, rest.variance)

@@ -8,7 +8,7 @@ import pytest
 from ccatp.errors import ExitStatus
 from ccatp.processes.common import open_log
 from ccatp.processes.run_report import write_run_report
-from ccatp.processes.run_view import RunView
+from ccatp.processes.run_view import RunView, survey_title
 from tests.unit.aligning.conftest import load
 from tests.unit.run_folder import make_run
 
@@ -44,7 +44,7 @@ def test_whatever_goes_wrong_is_logged_and_no_more(run_dir: Path, monkeypatch: p
 
 
 def test_the_run_ends_by_naming_it_on_standard_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    view = RunView(CFG, is_sim=True, run_dir=tmp_path)
+    view = RunView(survey_title(CFG, is_sim=True), is_sim=True, run_dir=tmp_path)
     view.show_summary({"mirror": "fyst-m1"}, as_json=True)
     view.show_report(tmp_path / "report.html")
     view.show_report(None)
