@@ -4,10 +4,10 @@ import click
 
 from ccatp.cli_frame import SuggestingGroup, example
 from ccatp.cli_radio_calibrate import calibrate
+from ccatp.cli_radio_compare import compare
 from ccatp.cli_radio_fix import fix
 from ccatp.cli_radio_fuzzy import fuzzy
 from ccatp.cli_radio_map import radio_map
-from ccatp.cli_radio_compare import compare
 from ccatp.cli_radio_slam import slam
 
 

@@ -57,7 +57,6 @@ def radio_map(
     if ranges_file is not None and seeds > 1:
         raise click.UsageError("--seeds is for simulated ranges; --ranges has been measured once")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads would only fight over them
-    from ccatp.config.loader import shipped_config_dir
     from ccatp.config.radio_loader import load_radio_config
     from ccatp.radio.range_network import MappingError
 
@@ -65,11 +64,13 @@ def radio_map(
         if file is not None and not file.parent.is_dir():
             raise MappingError(f"{option}: no directory {file.parent}; make it first")
     named: dict[str, object] = {
+        "run.seed": seed,
         "cricket.batch.estimates_offset": offset or None,
         "cricket.batch.estimates_scale": scale or None,
     }
-    config = config_file or shipped_config_dir() / "cricket.toml"
-    cfg = load_radio_config(config, overrides(settings, {**named, "run.seed": seed}))
+    if config_file is None:
+        named["system"] = "cricket"
+    cfg = load_radio_config(config_file, overrides(settings, named))
     if ranges_file is None:
         data = _simulated(cfg.cricket, method, range(cfg.run.seed, cfg.run.seed + seeds), out_file, figure_file)
     else:
@@ -89,35 +90,16 @@ def radio_map(
 def _simulated(
     cfg: "CricketConfig", method: str, seeds: range, out_file: Path | None, figure_file: Path | None
 ) -> dict[str, Any]:
-    import numpy as np
-
-    from ccatp.mote_figure import MapPicture, Traces, draw_mote_map
-    from ccatp.studies.mote_summary import campaign_data, run_campaign, traces_of
+    from ccatp.mote_figure import draw_mote_map
+    from ccatp.studies.mote_pictures import pictured
+    from ccatp.studies.mote_summary import campaign_data, run_campaign
 
     campaign = run_campaign(cfg, method, seeds, _progress(len(seeds)))
-    data, run = campaign_data(campaign), campaign.runs[0]
     if out_file is not None:
-        _write(out_file, *run.whole, cfg.layout)
+        _write(out_file, *campaign.runs[0].whole, cfg.layout)
     if figure_file is not None:
-        index = {name: row for row, name in enumerate(run.names)}
-        names = campaign.field.plan.names
-        listed = (
-            campaign.field.second
-            if method == "ekf"
-            else [(*pair, 0.0, 0.0) for pair in campaign.field.plan.phase1_pairs]
-        )
-        ends = {(names[row[0]], names[row[1]]) for row in listed}
-        pairs = [(index[a], index[b]) for a, b in ends if a in index and b in index] if len(names) < 100 else []
-        traces = None
-        if method == "ekf":
-            errors, expected = traces_of(campaign.runs)
-            low, middle, high = np.percentile(errors, (10, 50, 90), axis=0)
-            traces = Traces(low, middle, high, np.median(expected, axis=0), data["crlb_m"], len(campaign.runs))
-        title = f"{method}, {len(run.names)} motes, seed {seeds[0]}, error {1e3 * run.rms_m:.3g} mm"
-        shown = _shown(run.positions_m, run.true_m, run.covariance_m2, run.is_aligned)
-        picture = MapPicture(run.names, *shown, np.array(sorted(pairs), dtype=np.intp).reshape(-1, 2), (), title)
-        draw_mote_map(picture, traces, figure_file)
-    return data
+        draw_mote_map(*pictured(campaign, seeds[0]), figure_file)
+    return campaign_data(campaign)
 
 
 def _measured(
@@ -129,8 +111,8 @@ def _measured(
 ) -> dict[str, Any]:
     import numpy as np
 
-    from ccatp.measured_map import map_measured
     from ccatp.mote_figure import MapPicture, draw_mote_map
+    from ccatp.radio.measured_map import map_measured
     from ccatp.range_csv import read_places, read_ranges
 
     ranges_file, tags_file, truth_file = files
@@ -150,19 +132,6 @@ def _measured(
         picture = MapPicture(found.names, found.positions_m, found.covariance_m2, found.true_m, nothing, (), title)
         draw_mote_map(picture, None, figure_file)
     return found.data
-
-
-def _shown(positions_m: Any, true_m: Any, covariance_m2: Any, is_aligned: bool) -> tuple[Any, Any, Any]:
-    """The map moved onto the truth, where its frame is free, for the eye."""
-    import numpy as np
-
-    from ccatp.radio.rigid_alignment import best_motion
-
-    if not is_aligned:
-        return positions_m, covariance_m2, true_m
-    motion = best_motion(positions_m, true_m, mirrors=True)
-    turn = np.kron(np.eye(len(positions_m)), motion.rotation)
-    return motion.apply(positions_m), turn @ covariance_m2 @ turn.T, true_m
 
 
 def _write(path: Path, names: tuple[str, ...], positions_m: Any, covariance_m2: Any, layout: str) -> None:

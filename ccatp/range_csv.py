@@ -3,8 +3,8 @@
 import csv
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
+from ccatp.radio.measured_map import MeasuredRanges
 from ccatp.radio.range_network import MappingError
 from ccatp.radio.tdoa import MoteRange
 
@@ -17,21 +17,7 @@ class RangeFileError(MappingError):
     """A file of ranges or places that cannot be used: file, line, what is wrong."""
 
 
-class RangeFile(NamedTuple):
-    """Ranges of a file.
-
-    Attributes:
-        readings: in their order.
-        groups: names of motes that move together, by the name of their pose: tags of a trolley that stood there.
-        tags: the tag that each of those motes is.
-    """
-
-    readings: tuple[MoteRange, ...]
-    groups: Mapping[str, tuple[str, ...]]
-    tags: Mapping[str, str]
-
-
-def read_ranges(path: Path, sigma_m: float) -> RangeFile:
+def read_ranges(path: Path, sigma_m: float) -> MeasuredRanges:
     """Ranges of a CSV file with a header.
 
     Two forms are read. ``first,second,range_m`` with ``sigma_m`` where ranges differ in quality: one range a line.
@@ -62,7 +48,7 @@ def read_ranges(path: Path, sigma_m: float) -> RangeFile:
         )
     if not readings:
         raise RangeFileError(f"{path}: has no ranges, only a header")
-    return RangeFile(tuple(readings), {}, {})
+    return MeasuredRanges(tuple(readings), {}, {})
 
 
 def read_places(path: Path) -> dict[str, tuple[float, ...]]:
@@ -81,7 +67,7 @@ def read_places(path: Path) -> dict[str, tuple[float, ...]]:
     }
 
 
-def _session(path: Path, rows: Iterable[tuple[int, Mapping[str, str]]], sigma_m: float) -> RangeFile:
+def _session(path: Path, rows: Iterable[tuple[int, Mapping[str, str]]], sigma_m: float) -> MeasuredRanges:
     readings, groups, tags = [], dict[str, dict[str, None]](), dict[str, str]()
     for line, row in rows:
         pose = f"{row['pos']}/{row['deg']}"
@@ -92,7 +78,7 @@ def _session(path: Path, rows: Iterable[tuple[int, Mapping[str, str]]], sigma_m:
         tags[tag] = f"tag{row['tag']}"
     if not readings:
         raise RangeFileError(f"{path}: has no ranges, only a header")
-    return RangeFile(tuple(readings), {pose: tuple(motes) for pose, motes in groups.items()}, tags)
+    return MeasuredRanges(tuple(readings), {pose: tuple(motes) for pose, motes in groups.items()}, tags)
 
 
 def _table(path: Path) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:

@@ -62,6 +62,23 @@ class RecordingConfig(Model):
     priors: PriorsConfig
 
 
+class SlamFilterConfig(Model):
+    """How the filter takes readings, of whatever format."""
+
+    knee_sigmas: Positive
+    learn_memory: NonNegative
+    learn_prior: Positive
+    doubt_pose_after: Annotated[int, Field(ge=1)]
+    doubt_beacon_after: Annotated[int, Field(ge=1)]
+    jump_m: Positive
+    jump_rad: Positive
+    wander_share: Annotated[float, Field(ge=0.0, lt=1.0)]
+    wander_length_m: Positive
+    rest_speed_m_s: NonNegative
+    rest_turn_rad_s: NonNegative
+    turn_bias_walk_rad_s_sqrt_s: NonNegative
+
+
 class RecordingsConfig(Model):
     """All formats."""
 
@@ -69,3 +86,4 @@ class RecordingsConfig(Model):
     mrclam: RecordingConfig
     labyrinth: RecordingConfig
     csv: RecordingConfig
+    filter: SlamFilterConfig

@@ -35,7 +35,7 @@ class Update(NamedTuple):
         nis: nu^T S^-1 nu.
         size: m.
         accepted: False where the gate refused it; the state is then unchanged.
-        spread: diagonal of S, shape (m,).
+        spread: diagonal of S with the noise as it was given, shape (m,).
     """
 
     residual: FloatArray
@@ -185,11 +185,12 @@ class EkfSlam:
         nis = residual * residual / s
         if nis > gate:
             return Update(np.array((residual,)), nis, 1, False, np.array((s,)))
+        spread = np.array((s,))
         if nis > knee * knee:
             larger = s * sqrt(nis) / knee
             r += larger - s
             s, nis = larger, residual * residual / larger
-        learned = Update(np.array((residual,)), nis, 1, True, np.array((s,)))
+        learned = Update(np.array((residual,)), nis, 1, True, spread)
         if s < STRONG * r:
             v = cross * (1.0 / sqrt(s))
             P -= v[:, None] * v

@@ -24,6 +24,7 @@ class Entry:
         size: of the beacon's block.
         wander: column of the wandering error; -1: none.
         way_m, time_s: of the vehicle when the wandering error was last looked at.
+        fresh: variance of what is new in the wandering error, in sigmas squared.
         refused: readings in a row that were not believed.
     """
 
@@ -32,6 +33,7 @@ class Entry:
     wander: int = -1
     way_m: float = 0.0
     time_s: float = 0.0
+    fresh: float = 1.0
     refused: int = 0
 
 
@@ -93,7 +95,8 @@ class BeaconMap:
             self.renumber()
         else:
             phi = exp(-(way_m - entry.way_m) / model.length_m - max(time_s - entry.time_s, 0.0) / model.time_s)
-            self._engine.relax(entry.wander, phi, 1.0 - phi * phi)
+            entry.fresh = 1.0 - phi * phi
+            self._engine.relax(entry.wander, phi, entry.fresh)
         entry.way_m, entry.time_s = way_m, time_s
 
     def _append(self, block: object, mean: FloatArray, covariance: FloatArray) -> None:

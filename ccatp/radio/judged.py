@@ -11,7 +11,9 @@ from ccatp.radio.recording import RecordedRun, Truth
 from ccatp.radio.track import BeaconFix, Track
 
 LONGEST_GAP_S = 0.5
-"""The truth is taken as known between two of its rows that lie no further apart."""
+"""The truth is taken as known between two of its rows that lie no further apart,"""
+USUAL_GAPS = 3.0
+"""or no further than that many of its usual intervals."""
 
 
 class Judgement(NamedTuple):
@@ -76,7 +78,8 @@ def truth_at(truth: Truth, times_s: FloatArray) -> FloatArray:
     columns = [np.interp(times_s, truth.times_s, column) for column in truth[1:]]
     after = np.searchsorted(truth.times_s, times_s).clip(1, len(truth.times_s) - 1)
     gap = truth.times_s[after] - truth.times_s[after - 1]
-    inside = (times_s >= truth.times_s[0]) & (times_s <= truth.times_s[-1]) & (gap <= LONGEST_GAP_S)
+    longest_s = max(LONGEST_GAP_S, USUAL_GAPS * float(np.median(np.diff(truth.times_s))))
+    inside = (times_s >= truth.times_s[0]) & (times_s <= truth.times_s[-1]) & (gap <= longest_s)
     return np.where(inside[:, None], np.column_stack(columns), np.nan)
 
 

@@ -81,13 +81,11 @@ class MotionStep(NamedTuple):
         mean: shape (v,).
         F: d(mean)/d(states before), shape (v, v); work space, as Q: it holds until the next step.
         Q: covariance of what the odometry does not say, shape (v, v).
-        rest: what the odometry shows of its own calibration because the vehicle stands; mostly nothing.
     """
 
     mean: FloatArray
     F: FloatArray
     Q: FloatArray
-    rest: RestReading | None = None
 
 
 class MotionModel(Protocol):
@@ -196,10 +194,12 @@ class DifferentialDrive:
         if self._way_scale >= 0:
             F[0, self._way_scale], F[1, self._way_scale] = -dx / scaled, -dy / scaled
         Q = self._spread(odometry, (c, s), (x_turn, y_turn), chord, 0.0 if is_at_rest else 1.0)
-        return MotionStep(mean, F, Q, self._shown(odometry) if is_at_rest else None)
+        return MotionStep(mean, F, Q)
 
-    def _shown(self, odometry: Increment) -> RestReading:
-        """At rest the turn is the bias, by the gyroscope's angle random walk."""
+    def at_rest(self, odometry: Odometry) -> RestReading | None:
+        """At rest the turn that is told is the bias, by the gyroscope's angle random walk; None while it drives."""
+        if self._bias < 0 or not isinstance(odometry, Increment) or not self._rests(odometry):
+            return None
         dt = odometry.interval_s
         return RestReading(self._bias, odometry.turn_rad / dt, self.noise.turn_per_sqrt_s**2 / dt)
 

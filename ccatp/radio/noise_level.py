@@ -1,25 +1,32 @@
 """Pure. The noise of a sensor, learned from what its innovations leave."""
 
+from math import exp
+
 
 class NoiseLevel:
-    """A factor f on the variances of a sensor's noise, by maximum likelihood on the way.
+    """A factor f on the variances of a noise, by maximum likelihood on the way (Fisher scoring).
 
-    After an innovation of variance S = H P H^T + f r the expected noise squared, given the innovation, is
-    f r [1 + (f r / S)(nis - 1)] (the step of expectation maximisation, Shumway and Stoffer 1982). f follows the mean of
-    it, each innovation weighted by f r / S, the share of it that is noise.
+    An innovation of variance S, of which the share a = f r / S is this noise, has the log-likelihood
+    -(ln S + nu^2 / S) / 2: its derivative by ln f is a (nis - 1) / 2, its Fisher information a^2 / 2. So
+    J <- J + a^2, ln f <- ln f + a (nis - 1) / J.
 
     Args:
-        prior: innovations that the starting value counts for.
-        memory: innovations after which older ones fade; 0: the factor stays one.
+        prior: J at the start, the innovations that the starting value counts for.
+        memory: largest J: older innovations fade; 0: the factor stays one.
     """
 
     def __init__(self, prior: float, memory: float) -> None:
         self.factor = 1.0
-        self._seen, self._memory = prior, memory
+        self._information, self._memory = prior, memory
 
     def learn(self, nis: float, share: float) -> None:
-        """Take an innovation: its normalised square, and f r / S."""
+        """Take an innovation: its normalised square, and the share of this noise in its variance."""
         if self._memory <= 0.0:
             return
-        self._seen = min(self._seen + share, self._memory)
-        self.factor *= 1.0 + share * (nis - 1.0) / self._seen
+        self._information = min(self._information + share * share, self._memory)
+        change = share * (nis - 1.0) / self._information
+        self.factor *= exp(max(-LARGEST, min(LARGEST, change)))
+
+
+LARGEST = 0.3
+"""Most that one innovation may change the logarithm of the factor."""

@@ -158,6 +158,16 @@ class SignalSlam:
         h = np.array((x - bx, y - by, bx - x, by - y)) / r
         return r, sqrt(max(float(h @ covariance @ h), 0.0))
 
+    def joint(self, beacons: Sequence[BeaconId]) -> tuple[FloatArray, FloatArray]:
+        """Pose and the places of some radios on the map together: mean (3 + 2 k,) and covariance.
+
+        Raises:
+            BlockError: one is not on the map.
+        """
+        starts = [self.engine.block(beacon).start for beacon in beacons]
+        columns = columns_of(range(POSE), *(range(start, start + PLACE) for start in starts))
+        return self.newcomers.conditioned(columns)
+
     def path_loss_of(self, beacon: BeaconId) -> PathLoss:
         """The calibration of a radio."""
         return self.settings.path_loss.get(beacon, self.settings.default)

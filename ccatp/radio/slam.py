@@ -12,7 +12,7 @@ from ccatp.filters.ekf_slam import BlockError, EkfSlam, Update
 from ccatp.radio.beacon_map import BeaconMap, Entry
 from ccatp.radio.dead_reckoning import DeadReckoning
 from ccatp.radio.doubts import Doubts
-from ccatp.radio.motion import POSE, Odometry, Pose
+from ccatp.radio.motion import POSE, DifferentialDrive, Odometry, Pose
 from ccatp.radio.newcomers import Newcomers
 from ccatp.radio.noise_level import NoiseLevel
 from ccatp.radio.readings import BeaconId, Reading
@@ -142,7 +142,7 @@ class BeaconSlam:
     def _step(self, odometry: Odometry) -> None:
         engine = self.engine
         before = engine.mean[: engine.vehicle_size].copy()
-        mean, F, Q, rest = self._motion.step(before, odometry)
+        mean, F, Q = self._motion.step(before, odometry)
         if self._learns:
             Q = Q * self.levels["motion"].factor
             turned = F[:POSE, :POSE]
@@ -150,6 +150,7 @@ class BeaconSlam:
         engine.predict(mean, F, Q)
         self._clock.took(odometry, before, mean)
         self._way_m += hypot(mean[0] - before[0], mean[1] - before[1])
+        rest = self._motion.at_rest(odometry) if isinstance(self._motion, DifferentialDrive) else None
         if rest is not None:
             residual = rest.value - float(engine.mean[rest.column])
             engine.update_row(np.array((rest.column,)), np.ones(1), residual, rest.variance)
@@ -211,17 +212,19 @@ class BeaconSlam:
             row, z = self._sensors.row(reading, at.pose, x[POSE : POSE + self._ranges], beacon), strength_of(reading)
         h = [*derivatives(row, at, delayed=self._delay >= 0), *row.beacon]
         expected, r = row.expected, row.variance * level.factor
+        own = r
         if entry.wander >= 0:
             model = None if is_angle else self._sensors.wander(reading)
             share = 0.0 if model is None else model.share
             h.append(sqrt(share * r))
             expected += h[-1] * x[-1]
             r *= 1.0 - share
+            own = r + entry.fresh * h[-1] * h[-1]
         residual = wrapped(z or 0.0, expected, is_angle=is_angle)
         found = engine.update_row(entry.columns, np.array(h), residual, r, trust.gate_sigmas**2, trust.knee_sigmas)
         if found.accepted and self._learns:
             s = found.spread.item()
-            level.learn(found.nis, r / s)
+            level.learn(found.nis, own / s)
             by_pose = np.array(h[:POSE])
             self.levels["motion"].learn(found.nis, float(by_pose.dot(self._fresh).dot(by_pose)) / s)
         return found

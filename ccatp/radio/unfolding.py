@@ -28,9 +28,9 @@ def unfolded(
     """Places of n points from some of their distances, shape (n, d); as ranges do, it leaves frame and mirror open.
 
     The missing distances are taken as the shortest way along known ones (Shang et al., MDS-MAP, 2003), classical
-    scaling (Torgerson 1952) gives places in d + 2 dimensions, and weighted least squares on the known distances alone go
-    on from there, while a weight on the spare dimensions grows until the points lie in d. A map that is folded over in d
-    dimensions has a way down through the spare ones.
+    scaling (Torgerson 1952) gives places in d + 2 dimensions, and weighted least squares on the known distances alone
+    go on from there, while a weight on the spare dimensions grows until the points lie in d. A map that is folded over
+    in d dimensions has a way down through the spare ones.
 
     Args:
         count: n.
@@ -102,7 +102,8 @@ class _Stress:
         rows = np.concatenate([units, -units], axis=1)
         weighted = self._weights[:, None] * rows
         blocks = weighted[:, :, None] * rows[:, None, :]
-        normal = np.bincount(self._cells, blocks.ravel(), self._size**2).reshape(self._size, self._size)
+        summed = np.bincount(self._cells, blocks.ravel(), self._size**2)
+        normal: FloatArray = summed.reshape(self._size, self._size)
         pull = np.bincount(self._at, (errors[:, None] * weighted).ravel(), self._size)
         normal[np.diag_indices_from(normal)] += np.tile(self._penalty, self._count) + damping
         gradient = pull - (places * self._penalty).ravel()

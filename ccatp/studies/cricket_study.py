@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.config.loader import shipped_config_dir
 from ccatp.config.radio_loader import load_radio_config
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
 from ccatp.studies.cricket_figures import draw_cricket
@@ -79,7 +78,7 @@ CASES = {
 def run_job(job: Job) -> Outcome:
     """One field of one case."""
     case = CASES[str(job.factors["case"])]
-    cfg = load_radio_config(shipped_config_dir() / "cricket.toml", case.keys).cricket
+    cfg = load_radio_config(None, {"system": "cricket", **case.keys}).cricket
     field = simulate_field(cfg, job.seed)
     began_s = time.perf_counter()
     run = run_filter(cfg, field) if case.method == "ekf" else run_batch(cfg, field)

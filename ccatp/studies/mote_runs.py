@@ -9,7 +9,7 @@ from ccatp.config.cricket_models import CricketConfig
 from ccatp.radio.fold_over import FoldOver, find_fold_over
 from ccatp.radio.map_batch import BatchSettings
 from ccatp.radio.map_model import MapModel
-from ccatp.radio.mote_frame import pinned_map
+from ccatp.radio.mote_frame import pinned_map, plain_frame
 from ccatp.radio.mote_map import MoteMap, map_motes
 from ccatp.radio.phase_one import FirstMap, map_as_possible, map_by_plan
 from ccatp.radio.range_bound import bound_rms_m, map_rms_m
@@ -39,6 +39,7 @@ class MoteRun:
         is_aligned: whether the frame was free.
         offset_m, scale: of the ranges, where they were estimated.
         nis: of each update of the filter.
+        doubtful: rows of motes whose mirror image fits as well, or that hang on too few ranges.
         whole: the map with all motes of the stands, by name; the same motes where there are no others.
     """
 
@@ -56,6 +57,7 @@ class MoteRun:
     offset_m: float
     scale: float
     nis: FloatArray
+    doubtful: tuple[int, ...]
     whole: "NamedMap"
 
 
@@ -134,6 +136,7 @@ def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
         offset_m=mapper.offset_m,
         scale=mapper.scale,
         nis=went.nis,
+        doubtful=(),
         whole=_whole(field, first, mapper),
     )
 
@@ -199,8 +202,16 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
         offset_m=found.offset_m,
         scale=found.scale,
         nis=np.zeros(0),
+        doubtful=_doubtful(found, outlook, motes),
         whole=NamedMap(names, positions[motes], covariance[np.ix_(at, at)]),
     )
+
+
+def _doubtful(found: MoteMap, outlook: MoteOutlook | None, motes: list[int]) -> tuple[int, ...]:
+    sets = [fold.motes for fold in found.folds]
+    sets += [moved for _, moved in outlook.folds.mirrors] if outlook is not None else []
+    lost = {mote for moved in sets for mote in moved}
+    return tuple(row for row, mote in enumerate(motes) if mote in lost)
 
 
 def batch_network(cfg: CricketConfig, field: SimulatedField) -> RangeNetwork:
@@ -292,7 +303,9 @@ def _in_field(cfg: CricketConfig, field: SimulatedField, found: MoteMap) -> tupl
     """The map in the field's frame, as far as the operator knows it."""
     plan = field.plan
     if not plan.anchors:
-        return found.positions_m, found.covariance_m2
+        motion = plain_frame(found.positions_m)
+        turn = np.kron(np.eye(len(plan.names)), motion.rotation)
+        return motion.apply(found.positions_m), turn @ found.covariance_m2 @ turn.T
     up = plan.axes_m[1] / np.linalg.norm(plan.axes_m[1])
     origin, axis = plan.anchors
     way = found.positions_m[axis] - found.positions_m[origin]

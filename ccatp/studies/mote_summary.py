@@ -7,6 +7,7 @@ import numpy as np
 
 from ccatp.config.cricket_models import CricketConfig
 from ccatp.radio.range_network import FloatArray
+from ccatp.radio.rigid_alignment import aligned_rms_m, rms_m
 from ccatp.studies.mote_field import SimulatedField, simulate_field
 from ccatp.studies.mote_runs import MoteOutlook, MoteRun, look_ahead, run_batch, run_filter
 
@@ -74,12 +75,23 @@ def campaign_data(campaign: MoteCampaign) -> dict[str, Any]:
         "motes": len(runs[0].names),
         "frame": "aligned" if runs[0].is_aligned else "surveyed",
         "rms_of_all_m": float(np.sqrt(np.mean([run.rms_m**2 for run in runs]))),
+        "motes_in_doubt": int(np.median([len(run.doubtful) for run in runs])),
+        "rms_of_others_m": float(np.median([sure_rms_m(run) for run in runs])),
         "expected_rms_m": float(np.median([run.expected_rms_m for run in runs])),
         "offset_m": float(np.median([run.offset_m for run in runs])),
         "scale": 1.0 + float(np.median([run.scale for run in runs])),
         "free_directions": [*outlook.freedom.frame, *outlook.freedom.flexes, *outlook.freedom.calibration],
         "warnings": list(outlook.folds.warnings),
     }
+
+
+def sure_rms_m(run: MoteRun) -> float:
+    """Error of the motes that are not in doubt, in the frame of the run; not a number where there are too few."""
+    sure = [row for row in range(len(run.names)) if row not in run.doubtful]
+    found, true = run.positions_m[sure], run.true_m[sure]
+    if not run.is_aligned:
+        return rms_m(found, true)
+    return aligned_rms_m(found, true, mirrors=True) if len(sure) > true.shape[1] else float("nan")
 
 
 def percentiles(values: Sequence[float]) -> dict[str, float]:

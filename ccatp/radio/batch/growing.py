@@ -119,7 +119,8 @@ def _join(
                 state.beacons[beacon, :2] = place_by_bearings(poses, distance, bearing, state.shared)
                 used[beacon] = changed = True
             continue
-        if rows.size < LEAST_READINGS:
+        # one that is surely placed is looked at again at the end, by all readings
+        if rows.size < LEAST_READINGS or (used[beacon] and not doubtful[beacon] and not last):
             continue
         distance, variance = problem.distances(state, rows)
         found = place_by_distances(state.poses[problem.at[rows]], distance, variance)

@@ -9,10 +9,10 @@ from ccatp.radio.batch.problem import BEARING_OFFSET
 
 STARTS = 48
 """Directions, around the place of a range's reading, from which a beacon is sought."""
-ITERATIONS = 25
+ITERATIONS = 20
 FREEDOM = 4.0
 """Of Student's t by which outliers are bounded."""
-MOST_READINGS = 400
+MOST_READINGS = 200
 """Of one beacon; more are thinned, since first places need no more."""
 APART = 0.1
 """Two minima are different places if they lie further apart than that part of the beacon's distance."""

@@ -63,10 +63,12 @@ def test_squares_of_gaussian_errors_lie_in_the_band_and_others_do_not() -> None:
 
 
 def test_truth_is_unknown_outside_and_in_its_gaps() -> None:
-    t = np.array([0.0, 0.4, 2.0, 2.4])
-    found = truth_at(Truth(t, t, -t, 2.0 * t), np.array([-0.1, 0.2, 1.0, 2.2, 2.5]))
+    t = np.array([0.0, 0.4, 2.0, 2.4, 2.8])
+    found = truth_at(Truth(t, t, -t, 2.0 * t), np.array([-0.1, 0.2, 1.0, 2.2, 2.9]))
     assert np.isnan(found[[0, 2, 4]]).all()
     assert found[[1, 3]] == pytest.approx(np.array([(0.2, -0.2, 0.4), (2.2, -2.2, 4.4)]))
+    slow = np.array([0.0, 1.0, 2.0, 3.0, 9.0])  # a reference of a hertz is no gap
+    assert np.isfinite(truth_at(Truth(slow, slow, slow, slow), np.array([0.5, 5.0]))[:, 0]).tolist() == [True, False]
 
 
 def track_of(turned: RigidMotion, *, beacons: bool = True) -> Track:

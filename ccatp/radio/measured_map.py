@@ -1,16 +1,16 @@
 """Pure. A map from measured ranges: graph, outlook, filter or batch, and the error where the truth is known."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ccatp.config.cricket_models import CricketConfig
 from ccatp.radio.fold_over import find_fold_over
-from ccatp.radio.map_batch import BatchSettings
+from ccatp.radio.map_batch import BatchSettings, fit_map
 from ccatp.radio.map_model import MapModel
 from ccatp.radio.mote_frame import plain_frame
-from ccatp.radio.mote_map import map_motes
+from ccatp.radio.mote_map import MoteMap, map_motes
 from ccatp.radio.phase_one import map_as_possible
 from ccatp.radio.range_bound import bound_rms_m, map_rms_m
 from ccatp.radio.range_network import (
@@ -26,11 +26,26 @@ from ccatp.radio.range_network import (
 from ccatp.radio.rigid_alignment import aligned_rms_m, best_motion
 from ccatp.radio.rigidity import find_freedom, generic_state
 from ccatp.radio.self_mapping import MapperSettings, MoteMapper, run_phase_two
-from ccatp.range_csv import RangeFile
+from ccatp.radio.tdoa import MoteRange
 
+_TELLING = 20.0  # a drop of chi-squared that chance gives one offset in a hundred thousand
 _WIDER = 1e4  # of variances: what a range that is used twice adds by its first use is then a ten-thousandth
 
 Places = Mapping[str, tuple[float, ...]]
+
+
+class MeasuredRanges(NamedTuple):
+    """Ranges as they were recorded.
+
+    Attributes:
+        readings: in their order.
+        groups: names of motes that move together, by the name of their pose: tags of a trolley that stood there.
+        tags: the tag that each of those motes is.
+    """
+
+    readings: tuple[MoteRange, ...]
+    groups: Mapping[str, tuple[str, ...]]
+    tags: Mapping[str, str]
 
 
 class MeasuredMap(NamedTuple):
@@ -60,7 +75,7 @@ class _Found(NamedTuple):
 
 
 def map_measured(
-    cfg: CricketConfig, method: str, file: RangeFile, tags_m: Places | None, truth_m: Places | None
+    cfg: CricketConfig, method: str, file: MeasuredRanges, tags_m: Places | None, truth_m: Places | None
 ) -> MeasuredMap:
     """Map what a file of ranges holds.
 
@@ -109,7 +124,7 @@ def map_measured(
     return MeasuredMap(names, places, covariance, true_m, data)
 
 
-def _network(cfg: CricketConfig, file: RangeFile, tags_m: Places | None) -> RangeNetwork:
+def _network(cfg: CricketConfig, file: MeasuredRanges, tags_m: Places | None) -> RangeNetwork:
     names = tuple(dict.fromkeys(name for row in file.readings for name in (row.first, row.second)))
     if tags_m is None:
         return build_network(file.readings, cfg.dimension, names)
@@ -151,7 +166,8 @@ def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Any) -> _Found:
         network.names, network.dimension, network.first, network.second,
         network.ranges_m, network.sigmas_m * factor, network.bodies, network.known_m,
     )  # fmt: skip
-    warnings = [
+    warnings = [*_hidden_offset(found, scaled, settings)] if not cfg.batch.estimates_offset else []
+    warnings += [
         f"{list_names([network.names[mote] for mote in fold.motes])}: the mirror image fits almost as well "
         f"(chi-squared {fold.cost_gap:.1f} more)"
         for fold in found.folds[:5]
@@ -165,6 +181,19 @@ def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Any) -> _Found:
     return _Found(
         found.positions_m, found.covariance_m2, scaled, found.offset_m, found.scale, found.iterations, tuple(warnings)
     )
+
+
+def _hidden_offset(found: MoteMap, network: RangeNetwork, settings: BatchSettings) -> Iterator[str]:
+    """A word on an offset that the ranges show, where none is estimated."""
+    model = MapModel(network, with_offset=True)
+    state = model.state(found.positions_m, 0.0, found.scale)
+    without = fit_map(MapModel(network), state, settings)
+    shown = fit_map(model, state, settings)
+    if without.cost - shown.cost > _TELLING and len(network.ranges_m) > model.size:
+        yield (
+            f"all ranges look {1e3 * shown.state.offset_m:.0f} mm long in common (chi-squared {without.cost:.0f} without, "
+            f"{shown.cost:.0f} with an offset); --offset estimates it"
+        )
 
 
 def _filter(cfg: CricketConfig, network: RangeNetwork) -> _Found:
