@@ -129,5 +129,6 @@ def _summary(path: Path, missing: list[str], warnings: list[str]) -> Mapping[str
 
 def _files(run_dir: Path) -> Iterator[tuple[str, int]]:
     for path in sorted(run_dir.iterdir()):
-        if path.is_file() and not path.name.startswith("."):
+        # The report is no part of the run: it is the same when it is made again.
+        if path.is_file() and not path.name.startswith(".") and path.suffix != ".html":
             yield path.name, path.stat().st_size

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from ccatp.config.cricket_checks import check_cricket
 from ccatp.config.messages import Fault, choice_hint
 from ccatp.config.radio_models import FuzzyConfig, RadioConfig
 
@@ -14,7 +15,13 @@ def check_radio_config(cfg: RadioConfig) -> list[Fault]:
     Args:
         cfg: the configuration.
     """
-    return [*_check_fuzzy(cfg.control.fuzzy), *_check_follow(cfg), *_check_avoidance(cfg), *_check_room(cfg)]
+    return [
+        *_check_fuzzy(cfg.control.fuzzy),
+        *_check_follow(cfg),
+        *_check_avoidance(cfg),
+        *_check_room(cfg),
+        *check_cricket(cfg.cricket),
+    ]
 
 
 def _check_fuzzy(fuzzy: FuzzyConfig) -> Iterator[Fault]:

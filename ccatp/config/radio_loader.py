@@ -17,7 +17,13 @@ from ccatp.errors import ConfigError
 BASE_FILE = "radio.toml"
 SYSTEMS = ("zigbee", "follow", "cricket")
 # A file that names its own beacons means these and no others; on the command line one may be moved.
-_WHOLE: tuple[Key, ...] = (("sim", "beacons"), ("path_loss", "reference_dbm_of"))
+_WHOLE: tuple[Key, ...] = (
+    ("sim", "beacons"),
+    ("path_loss", "reference_dbm_of"),
+    ("cricket", "networks"),
+    ("cricket", "motes"),
+    ("cricket", "anchors"),
+)
 
 
 def load_radio_config(

@@ -12,6 +12,7 @@ from ccatp.config.beacon_models import (
     ListenerConfig,
     SimBeaconRobotConfig,
 )
+from ccatp.config.cricket_models import CricketConfig
 from ccatp.config.models import Model, NonNegative, ObservatoryConfig, Pair, PidConfig, Positive, ProcessesConfig
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -105,6 +106,8 @@ class EstimatorConfig(Model):
 
     shadowing: Literal["none", "white", "map"]
     shadowing_grid_m: Positive
+    placed_share: Annotated[float, Field(gt=0.0, le=1.0)]
+    waiting_scans: Annotated[int, Field(ge=1, le=200)]
     gate_probability: Annotated[float, Field(gt=0.5, lt=1.0)]
     target_speed_sigma_m_s: Positive
     target_course_time_s: Positive
@@ -263,3 +266,4 @@ class RadioConfig(Model):
     processes: ProcessesConfig
     observatory: ObservatoryConfig
     sim: RadioSimConfig
+    cricket: CricketConfig

@@ -35,7 +35,7 @@ class Update(NamedTuple):
         nis: nu^T S^-1 nu.
         size: m.
         accepted: False where the gate refused it; the state is then unchanged.
-        spread: diagonal of S, shape (m,).
+        spread: diagonal of S with the noise as it was given, shape (m,).
     """
 
     residual: FloatArray
@@ -83,8 +83,8 @@ class EkfSlam:
         self._x, self._P = np.zeros(v + c + ROOM), np.zeros((v + c + ROOM, v + c + ROOM))
         self._x[:v], self._P[:v, :v] = x, P
         if calibration_mean is not None and c > 0:
-            shape = np.shape(calibration_covariance)
-            x, P = checked_gaussian(calibration_mean, np.asarray(calibration_covariance), shape)
+            given = np.zeros((c, c)) if calibration_covariance is None else np.asarray(calibration_covariance)
+            x, P = checked_gaussian(calibration_mean, given, given.shape)
             self._x[v : v + c], self._P[v : v + c, v : v + c] = x, P
         self._view()
 
@@ -146,7 +146,23 @@ class EkfSlam:
         """H P H^T of one row, h (k,) over its ``columns`` (k,)."""
         return float(h.dot(self.covariance[np.ix_(columns, columns)]).dot(h))
 
-    def update_row(self, columns: Columns, h: FloatArray, residual: float, r: float, gate: float = inf) -> Update:
+    def relax(self, index: int, factor: float, variance: float) -> None:
+        """One state forgets: x <- factor x + noise, as a Gauss-Markov process does that nothing else depends on.
+
+        Args:
+            index: of the state.
+            factor: 0 to 1.
+            variance: of what comes anew.
+        """
+        P = self.covariance
+        self.mean[index] *= factor
+        P[index] *= factor
+        P[:, index] *= factor
+        P[index, index] += variance
+
+    def update_row(
+        self, columns: Columns, h: FloatArray, residual: float, r: float, gate: float = inf, knee: float = inf
+    ) -> Update:
         """Condition on one row.
 
         Args:
@@ -155,6 +171,8 @@ class EkfSlam:
             residual: z - h(x), wrapped where it is an angle.
             r: variance of its noise.
             gate: largest normalised innovation squared that is used.
+            knee: innovations beyond that many sigmas get a noise so much larger that they weigh as those at the knee
+                (Huber's loss, by one step of reweighting). The NIS is then that with the larger noise.
 
         Raises:
             FilterDiverged: the update is not finite, or the noise is not positive.
@@ -165,9 +183,14 @@ class EkfSlam:
         if not (r > 0.0 and r <= s * (1.0 + 1e-9) and s < HUGE and residual * residual < HUGE):
             raise FilterDiverged(f"update is not finite: residual {residual:.6g}, noise {r:.3g}, variance {s:.3g}")
         nis = residual * residual / s
-        learned = Update(np.array((residual,)), nis, 1, nis <= gate, np.array((s,)))
-        if not learned.accepted:
-            return learned
+        if nis > gate:
+            return Update(np.array((residual,)), nis, 1, False, np.array((s,)))
+        spread = np.array((s,))
+        if nis > knee * knee:
+            larger = s * sqrt(nis) / knee
+            r += larger - s
+            s, nis = larger, residual * residual / larger
+        learned = Update(np.array((residual,)), nis, 1, True, spread)
         if s < STRONG * r:
             v = cross * (1.0 / sqrt(s))
             P -= v[:, None] * v
@@ -352,6 +375,7 @@ def _root(S: FloatArray, residual: FloatArray) -> FloatArray:
     if not float(np.vdot(S, S) + np.vdot(residual, residual)) < HUGE:
         raise FilterDiverged(f"update is not finite: residuals {residual.tolist()}")
     try:
-        return np.linalg.cholesky(S)
+        root = np.linalg.cholesky(S).astype(np.float64, copy=False)
     except np.linalg.LinAlgError:
         raise FilterDiverged("update is not finite, or H P H^T + R is not positive definite") from None
+    return root

@@ -7,13 +7,22 @@ import sys
 
 import structlog
 
+from ccatp.beacon_server import serve_beacons
 from ccatp.body_file import FILE
 from ccatp.config.models import Config
 from ccatp.dataloop import serve
 from ccatp.errors import ConfigError
 from ccatp.fault_plan import read_plan
 from ccatp.processes import spinning
-from ccatp.processes.common import FAULTS_FILE, Endpoints, die_with_parent, open_log, parse_args, stop_on_signals
+from ccatp.processes.common import (
+    FAULTS_FILE,
+    BeaconArgs,
+    Endpoints,
+    die_with_parent,
+    open_log,
+    parse_either,
+    stop_on_signals,
+)
 from ccatp.robot_link import read_key
 from ccatp.runtime_dir import make_runtime_dir
 from ccatp.sim.faults.plan import FaultPlan
@@ -22,7 +31,10 @@ from ccatp.sim.faults.plan import FaultPlan
 def main() -> int:
     """Entry of ``python -m ccatp.processes.dataloop``."""
     die_with_parent()
-    args = parse_args()
+    either = parse_either()
+    if either.survey is None:
+        return _among_beacons(either.one_of_beacons)
+    args = either.survey
     cfg = args.config
     faults = read_plan(args.run_dir / FAULTS_FILE, lockstep=not args.is_realtime) if args.has_faults else None
     if not args.is_realtime:
@@ -44,6 +56,28 @@ def main() -> int:
             faults=faults,
             body_file=args.run_dir / FILE,
             is_resuming=args.is_resuming,
+        )
+        return 0
+
+    return spinning.run(run(), is_spinning=not args.is_realtime)
+
+
+def _among_beacons(args: BeaconArgs) -> int:
+    if not args.is_realtime:
+        spinning.leave_a_core(os.getppid())
+
+    async def run() -> int:
+        stop = asyncio.Event()
+        stop_on_signals(stop)
+        await serve_beacons(
+            args.config,
+            lockstep=not args.is_realtime,
+            stop=stop,
+            listen_sock=socket.socket(fileno=args.listen_fd),
+            truth_rep=args.endpoints.of("puck"),
+            truth_pub=args.endpoints.of("truth"),
+            key=read_key(args.config.robot.key_file),
+            log=open_log(args.run_dir / "log.jsonl", "dataloop"),
         )
         return 0
 

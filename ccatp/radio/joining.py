@@ -1,147 +1,249 @@
-"""Pure. Beacons whose direction nobody hears: readings wait, with the places they were taken at, until they say where."""
+"""Pure. Beacons whose direction nobody hears: readings wait, with where they were taken, until they say where."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import cos, hypot, pi, sin
+from math import cos, hypot, pi, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
 from ccatp.filters.base import FloatArray
-from ccatp.filters.ekf_slam import BlockId, EkfSlam
-from ccatp.radio.readings import Reading, RssiReading
-from ccatp.radio.sightings import Row
-from ccatp.radio.slam_settings import SlamSettings
+from ccatp.filters.ekf_slam import BlockId, Columns, EkfSlam, columns_of
+from ccatp.radio.readings import BeaconId, Reading
+from ccatp.radio.sightings import Row, strength_of
 
-Rows = Callable[[Reading, list[float], list[float], list[float]], list[Row]]
+RowOf = Callable[[Reading, list[float], list[float], list[float]], Row]
 
 MOST = 24
+"""Readings of a beacon that are kept; beyond, every other one goes, and they are taken twice as far apart."""
 LEAST = 5
-STARTS = 16
+"""Readings without which a beacon is not looked for: two more than its place and an error that all share need."""
+SPACING = 0.01
+"""Way between readings that are kept, at first, relative to the range."""
+STARTS = 24
+"""Directions about the vehicle in which a beacon is looked for."""
+TIGHT = 0.1
+"""Largest standard deviation, across the line of sight, of a beacon that joins, relative to its distance."""
+LOOSEST = 2.5
+"""How many times that is borne at last, in proportion to the readings: the vehicle strays while beacons wait."""
+DEEP = 0.3
+"""The same along it, where ranges are all but linear: a scale that all share may be that uncertain."""
 MARGIN = 14.0
-TIGHT = 0.15
+"""How much worse the second best place, chi-squared: odds of a thousand to one that it is not a mirror image."""
+APART = 0.02
+"""Places nearer to each other than that, relative to the distance, are one."""
+KNEE = 3.0
+"""Residuals beyond that many sigmas weigh no more than those at it: readings round a corner are too long."""
+FIT = 6.0
+"""Sigmas by which chi-squared may exceed its expectation."""
 
 
 class Record(NamedTuple):
+    """A reading that waits, and the block of the state that holds the place (x_m, y_m) where it was taken."""
+
     reading: Reading
     place: BlockId
 
 
 class Candidate(NamedTuple):
+    """A place where a beacon may be.
+
+    Attributes:
+        mean: states of the beacon, shape (b,).
+        covariance: shape (b, b).
+        cost: chi-squared of the readings.
+        variances: of the readings' noise, larger where they look too far off, shape (m,).
+    """
+
     mean: FloatArray
     covariance: FloatArray
     cost: float
+    variances: FloatArray
+
+
+class Prior(NamedTuple):
+    """What is known of a beacon before its readings: all but nothing of its place.
+
+    Attributes:
+        mean: x_m, y_m and what else is estimated of it, shape (b,).
+        covariance: shape (b, b).
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+
+
+class Clone(NamedTuple):
+    """The vehicle's place as a function of the state.
+
+    Attributes:
+        mean: x_m, y_m, shape (2,).
+        columns: of the state that it depends on, shape (k,).
+        jacobian: shape (2, k).
+    """
+
+    mean: FloatArray
+    columns: Columns
+    jacobian: FloatArray
+
+
+PriorAt = Callable[[float, float], Prior]
 
 
 @dataclass(slots=True)
 class Waiting:
-    """Readings of a beacon that is not on the map yet."""
+    """Readings of a beacon that is not on the map yet.
 
+    The vehicle's place at each of them is kept in the state as a clone (Mourikis and Roumeliotis 2007), so that what
+    they say of the beacon comes with the right correlations, however long they wait. With H the derivatives by clones
+    and calibration, S = H P H^T + R, each candidate minimises e^T S^-1 e.
+
+    Attributes:
+        beacon: which one.
+        records: the readings, oldest first.
+        candidates: where it may be, best first; two as long as a mirror image is possible.
+    """
+
+    beacon: BeaconId
     records: list[Record] = field(default_factory=list)
-    spacing_m: float = 0.0
     candidates: list[Candidate] = field(default_factory=list)
+    spacing_m: float = 0.0
     count: int = 0
 
-    def take(self, engine: EkfSlam, reading: Reading, range_m: float) -> None:
-        x, y = engine.mean[:2].tolist()
+    @property
+    def is_ready(self) -> bool:
+        """Whether there are enough readings to look for it."""
+        return len(self.records) >= LEAST
+
+    def take(self, engine: EkfSlam, reading: Reading, place: Clone, range_m: float) -> bool:
+        """Keep a reading, if the vehicle has moved since the last one that was kept."""
+        x, y = place.mean.tolist()
         if not self.records:
-            self.spacing_m = 0.01 * range_m
+            self.spacing_m = SPACING * range_m
         else:
-            bx, by = engine.mean[engine.block(self.records[-1].place)].tolist()
-            if hypot(x - bx, y - by) < self.spacing_m:
-                return
-        place = ("place", reading.beacon, self.count)
+            last_x, last_y = engine.mean[engine.block(self.records[-1].place)].tolist()
+            if hypot(x - last_x, y - last_y) < self.spacing_m:
+                return False
+        block = ("place", self.beacon, self.count)
         self.count += 1
-        engine.augment(place, engine.mean[:2].copy(), np.array((0, 1)), np.eye(2))
-        self.records.append(Record(reading, place))
+        engine.augment(block, place.mean, place.columns, place.jacobian)
+        self.records.append(Record(reading, block))
         if len(self.records) > MOST:
             self.spacing_m *= 2.0
             for record in self.records[1::2]:
                 engine.remove(record.place)
             self.records = self.records[::2]
+        return True
 
-    def solve(
-        self, engine: EkfSlam, rows: Rows, calibration: slice, settings: SlamSettings
-    ) -> tuple[FloatArray, FloatArray] | None:
-        if len(self.records) < LEAST:
+    def drop(self, engine: EkfSlam) -> None:
+        """Forget the readings."""
+        for record in self.records:
+            engine.remove(record.place)
+        self.records = []
+
+    def look(self, engine: EkfSlam, row_of: RowOf, shared: slice, prior_at: PriorAt, reach_m: float) -> None:
+        """Look for the beacon: sets ``candidates``.
+
+        Args:
+            engine: holds the places and the calibration.
+            row_of: what a reading should be (the row without bearing).
+            shared: the calibration's place in the state.
+            prior_at: prior of a beacon at x_m, y_m.
+            reach_m: how far it is from the last place, roughly.
+        """
+        problem = _problem(engine, self.records, row_of, shared, reach_m)
+        x, y = problem.places[-1]
+        ring = [(x + reach_m * cos(a), y + reach_m * sin(a)) for a in (2.0 * pi * k / STARTS for k in range(STARTS))]
+        costs = [problem.rough(prior_at(*point)) for point in ring]
+        starts = [prior_at(*ring[k]) for k in range(STARTS) if costs[k] <= min(costs[k - 1], costs[(k + 1) % STARTS])]
+        starts += [Prior(c.mean, prior_at(*c.mean[:2].tolist()).covariance) for c in self.candidates]
+        found = sorted((c for c in map(problem.refine, starts) if c is not None), key=lambda c: c.cost)
+        apart: list[Candidate] = []
+        for candidate in found:
+            if all(hypot(*(candidate.mean - c.mean)[:2].tolist()) > APART * reach_m for c in apart):
+                apart.append(candidate)
+        self.candidates = apart[:2]
+
+    def found(self, engine: EkfSlam) -> Candidate | None:
+        """The beacon's place, if there is only one, well enough known to be linearised at, and the readings agree."""
+        if not self.candidates:
             return None
-        z = np.array(
-            [r.reading.rssi_dbm if isinstance(r.reading, RssiReading) else r.reading.range_m for r in self.records]
-        )
-        places = np.array([engine.mean[engine.block(r.place)] for r in self.records])
-        columns = np.concatenate([np.r_[engine.block(r.place)] for r in self.records] + [np.r_[calibration]]).astype(
-            np.intp
-        )
-        P = engine.covariance[np.ix_(columns, columns)]
-        cal = engine.mean[calibration].tolist()
-        m, c = z.size, len(cal)
-        first = self.records[-1].reading
-        distance = _distance(settings, first)
-        found: list[Candidate] = []
-        for k in range(STARTS):
-            angle = 2.0 * pi * k / STARTS
-            mean, spread = widened(
-                settings, places[-1, 0] + distance * cos(angle), places[-1, 1] + distance * sin(angle), distance, first
-            )
-            prior = mean.copy()
-            Wp = np.linalg.inv(spread)
-            b = mean.copy()
-            cost = np.inf
-            for _ in range(12):
-                H, G, e = np.zeros((m, columns.size)), np.zeros((m, b.size)), np.zeros(m)
-                R = np.zeros(m)
-                for i, record in enumerate(self.records):
-                    row = rows(record.reading, [*places[i].tolist(), 0.0], cal, b.tolist())[0]
-                    e[i] = z[i] - row.expected
-                    H[i, 2 * i : 2 * i + 2] = row.pose[:2]
-                    H[i, columns.size - c :] = row.calibration
-                    G[i] = row.beacon
-                    R[i] = row.variance
-                S = H @ P @ H.T + np.diag(R)
-                WG = np.linalg.solve(S, G)
-                A = G.T @ WG + Wp
-                step = np.linalg.solve(A, WG.T @ e + Wp @ (prior - b))
-                size = hypot(step[0], step[1])
-                if size > 0.5 * distance:
-                    step *= 0.5 * distance / size
-                b = b + step
-                if size < 1e-4 * distance:
-                    break
-            cost = float(e @ np.linalg.solve(S, e))
-            if not np.isfinite(cost):
-                continue
-            if all(hypot(*(b[:2] - o.mean[:2])) > 0.02 * distance for o in found):
-                found.append(Candidate(b, np.linalg.inv(A), cost))
-        found.sort(key=lambda f: f.cost)
-        self.candidates = found[:2]
-        if not found:
+        best = self.candidates[0]
+        x, y = engine.mean[engine.block(self.records[-1].place)].tolist()
+        sight = best.mean[:2] - (x, y)
+        distance = hypot(*sight.tolist())
+        along, across = sight / distance, np.array((-sight[1], sight[0])) / distance
+        C = best.covariance[:2, :2]
+        tight = TIGHT * min(max(self.count / MOST, 1.0), LOOSEST)
+        if across.dot(C).dot(across) > (tight * distance) ** 2 or along.dot(C).dot(along) > (DEEP * distance) ** 2:
             return None
-        best = found[0]
-        sigma = float(np.sqrt(np.linalg.eigvalsh(best.covariance[:2, :2])[-1]))
-        if sigma > TIGHT * hypot(*(best.mean[:2] - places[-1])):
+        if any(other.cost - best.cost < MARGIN for other in self.candidates[1:]):
             return None
-        if len(found) > 1 and found[1].cost - best.cost < MARGIN:
+        m = len(self.records)
+        return best if best.cost < m + FIT * sqrt(2.0 * m) else None
+
+
+class _Problem(NamedTuple):
+    """Find b in z = h(places, calibration, b)."""
+
+    readings: list[Reading]
+    z: FloatArray
+    places: list[list[float]]
+    calibration: list[float]
+    P: FloatArray
+    row_of: RowOf
+    reach_m: float
+
+    def rough(self, prior: Prior) -> float:
+        """Chi-squared at a guess, places and calibration as they are."""
+        b = prior.mean.tolist()
+        cost = 0.0
+        for reading, z, place in zip(self.readings, self.z.tolist(), self.places, strict=True):
+            row = self.row_of(reading, [*place, 0.0], self.calibration, b)
+            cost += (z - row.expected) ** 2 / row.variance
+        return cost
+
+    def refine(self, prior: Prior, iterations: int = 12) -> Candidate | None:
+        """Gauss-Newton; None where it leads nowhere."""
+        b, W, stride = prior.mean.copy(), np.linalg.inv(prior.covariance), 0.5 * self.reach_m
+        variances, A, S, e = None, W, self.P, self.z
+        for k in range(iterations):
+            H, G, e, R = self._linear(b)
+            variances = R
+            spread = H.dot(self.P).dot(H.T)
+            if k > 2:
+                scale = np.sqrt(spread.diagonal() + R)
+                variances = R + scale**2 * np.maximum(np.abs(e) / (KNEE * scale) - 1.0, 0.0)
+            S = spread + np.diag(variances)
+            SG = np.linalg.solve(S, G)
+            A = G.T.dot(SG) + W
+            step = np.linalg.solve(A, SG.T.dot(e) + W.dot(prior.mean - b))
+            size = hypot(step[0], step[1])
+            b = b + step * min(1.0, stride / max(size, 1e-12))
+            if size < 1e-3 * stride and k > 3:
+                break
+        cost = float(e.dot(np.linalg.solve(S, e)))
+        if variances is None or not (np.isfinite(cost) and np.isfinite(b).all()):
             return None
-        return widened(settings, best.mean[0], best.mean[1], distance, first)
+        return Candidate(b, np.linalg.inv(A), cost, variances)
+
+    def _linear(self, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        m, c = self.z.size, len(self.calibration)
+        H, G, e, R = np.zeros((m, 2 * m + c)), np.zeros((m, b.size)), np.zeros(m), np.zeros(m)
+        values = b.tolist()
+        for i, (reading, place) in enumerate(zip(self.readings, self.places, strict=True)):
+            row = self.row_of(reading, [*place, 0.0], self.calibration, values)
+            H[i, 2 * i : 2 * i + 2] = row.pose[:2]
+            H[i, 2 * m : 2 * m + len(row.calibration)] = row.calibration
+            G[i], R[i], e[i] = row.beacon, row.variance, self.z[i] - row.expected
+        return H, G, e, R
 
 
-def _distance(s: SlamSettings, reading: Reading) -> float:
-    if isinstance(reading, RssiReading):
-        assert s.rssi is not None
-        return float(10.0 ** ((s.rssi.reference_dbm - reading.rssi_dbm) / (10.0 * s.rssi.exponent)))
-    return max(reading.range_m, 0.0)
-
-
-def widened(
-    settings: SlamSettings, x_m: float, y_m: float, range_m: float, reading: Reading
-) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance of a beacon about which nothing but its readings is known."""
-    mean, sigma = [x_m, y_m], [100.0 * (range_m + 0.1)] * 2
-    if isinstance(reading, RssiReading) and settings.rssi is not None:
-        if settings.rssi.reference_sigma_db > 0.0:
-            mean.append(settings.rssi.reference_dbm)
-            sigma.append(settings.rssi.reference_sigma_db)
-        if settings.rssi.exponent_sigma > 0.0:
-            mean.append(settings.rssi.exponent)
-            sigma.append(settings.rssi.exponent_sigma)
-    return np.array(mean), np.diag(np.square(sigma))
+def _problem(engine: EkfSlam, records: list[Record], row_of: RowOf, shared: slice, reach_m: float) -> _Problem:
+    readings = [record.reading for record in records]
+    z = np.array([strength_of(r) for r in readings])
+    blocks = [engine.block(record.place) for record in records]
+    columns = columns_of(*blocks, shared)
+    P = engine.covariance[np.ix_(columns, columns)]
+    places = [engine.mean[block].tolist() for block in blocks]
+    return _Problem(readings, z, places, engine.mean[shared].tolist(), P, row_of, reach_m)

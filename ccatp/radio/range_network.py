@@ -160,7 +160,9 @@ def list_names(names: Sequence[str]) -> str:
 def _check_row(row: MoteRange, index: dict[str, int]) -> None:
     for name in (row.first, row.second):
         if name not in index:
-            raise UnknownMote(f"range {row.first} to {row.second}: no mote {name!r}; there are {list_names(list(index))}")
+            raise UnknownMote(
+                f"range {row.first} to {row.second}: no mote {name!r}; there are {list_names(list(index))}"
+            )
     if row.first == row.second:
         raise BadRange(f"range {row.first} to {row.second}: from a mote to itself; leave it out")
     if not 0.0 <= row.range_m < float("inf"):
@@ -184,5 +186,5 @@ def _check_connected(network: RangeNetwork) -> None:
 
 def _parts_known(network: RangeNetwork, labels: IntArray) -> bool:
     """Whether every part has known coordinates of its own to hang on."""
-    has_known = np.isfinite(network.known_m).all(axis=1)
-    return all(bool(has_known[labels == part].sum() >= network.dimension) for part in range(labels.max() + 1))
+    known = np.flatnonzero(np.isfinite(network.known_m).all(axis=1))
+    return bool((np.bincount(labels[known], minlength=int(labels.max()) + 1) >= network.dimension).all())

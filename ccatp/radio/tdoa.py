@@ -50,9 +50,7 @@ def sound_speed(air: Air, temperature_c: float) -> float:
     """
     if not COLDEST_C <= temperature_c <= HOTTEST_C:
         raise TdoaError(f"temperature of {temperature_c:g} C is outside {COLDEST_C:g} to {HOTTEST_C:g} C")
-    return air.sound_speed_m_s * sqrt(
-        (temperature_c - ABSOLUTE_ZERO_C) / (air.temperature_c - ABSOLUTE_ZERO_C)
-    )
+    return air.sound_speed_m_s * sqrt((temperature_c - ABSOLUTE_ZERO_C) / (air.temperature_c - ABSOLUTE_ZERO_C))
 
 
 def range_from_delay(air: Air, delay_s: float, temperature_c: float) -> float:
@@ -71,11 +69,13 @@ def range_from_delay(air: Air, delay_s: float, temperature_c: float) -> float:
     return sound_speed(air, temperature_c) * delay_s
 
 
-def range_sigma(sigma_m: float, range_m: float, temperature_sigma_c: float, temperature_c: float, repeats: int) -> float:
+def range_sigma(
+    sigma_m: float, range_m: float, temperature_sigma_c: float, temperature_c: float, repeats: int
+) -> float:
     """Standard deviation of the mean of repeated ranges.
 
-    sigma^2 = sigma_1^2 / n + (d sigma_T / (2 T))^2: repeating lessens the noise of a reading, not what a wrong thermometer
-    does, dc/c = dT / (2 T).
+    sigma^2 = sigma_1^2 / n + (d sigma_T / (2 T))^2: repeating lessens the noise of a reading, not what a wrong
+    thermometer does, dc/c = dT / (2 T).
 
     Args:
         sigma_m: of one reading.

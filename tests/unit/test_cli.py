@@ -96,8 +96,8 @@ def test_the_commands_are_those_of_the_contract_the_map_and_the_conformance() ->
     assert {" ".join(path) for path in commands(cli) if path} - {"map", "conformance", "dashboard"} == {
         "run", "status", "pause", "resume", "abort", "stop", "emergency",
         "sim", "sim robot", "sim etalon", "config", "config check", "config schema", "study", "replay", "bench",
-        "keys", "keys generate", "keys show-public", "clear", "align", "plan",
-        "log", "log info", "log recover", "stream",
+        "keys", "keys generate", "keys show-public", "clear", "align", "plan", "report", "compare",
+        "log", "log info", "log recover", "stream", "calibrate", "check", "completion",
     }  # fmt: skip
 
 
@@ -136,7 +136,7 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
             ["sim", "robot", "--faults", "none.toml"],
             "ccatp: none.toml: no such file or directory; name a TOML file that",
         ),
-        (["emergency", "fier"], "'fier' is not one of 'fire', 'earthquake', 'power', 'weather', 'operator'"),
+        (["emergency", "fier"], "'fier' is none of fire, earthquake, power, weather, operator; did you mean fire?"),
         (
             ["config", "check", "none.toml"],
             "ccatp: none.toml: no such file or directory; name a TOML file that exists\n",

@@ -1,0 +1,146 @@
+"""Pure. A first map by trilateration: stand after stand as a plan says, or mote after mote as the ranges allow."""
+
+from itertools import combinations, pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.radio.map_batch import BatchSettings, fit_map, position_covariance
+from ccatp.radio.map_model import MapModel
+from ccatp.radio.mote_plan import MotePlan
+from ccatp.radio.pair_means import PairMeans
+from ccatp.radio.range_network import FloatArray, MappingError, RangeNetwork, build_network
+from ccatp.radio.rigid_alignment import best_motion
+from ccatp.radio.tdoa import MoteRange
+from ccatp.radio.trilateration import DegenerateStep, Sketch, Step
+from ccatp.radio.unfolding import classical_scaling
+
+_CLIQUES = 4000  # first motes looked at; the best of them begins the map
+
+
+class FirstMap(NamedTuple):
+    """What phase 1 gives.
+
+    Attributes:
+        positions_m: nan for motes without a place, shape (n, d).
+        covariance_m2: of all coordinates, zero for motes without a place, shape (n d, n d).
+        steps: in their order.
+        unplaced: motes that no step reached.
+    """
+
+    positions_m: FloatArray
+    covariance_m2: FloatArray
+    steps: tuple[Step, ...]
+    unplaced: tuple[int, ...]
+
+
+def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float) -> FirstMap:
+    """Phase 1 of Patil et al., figure 8, in the field's frame.
+
+    A is the origin, B on the second axis, the first stand follows by the law of cosines, every other one by
+    trilateration from all motes of the stand before it.
+
+    Args:
+        plan: anchors, stands, the frame.
+        network: ranges of ``plan.phase1_pairs``.
+        max_dop: dilution of precision that no step may exceed.
+
+    Raises:
+        MissingRange, DegenerateStep: a step that cannot be made; the message names its motes.
+    """
+    sketch = Sketch(plan.names, PairMeans(network), plan.dimension, max_dop)
+    origin, axis = plan.anchors
+    sketch.set_axes(origin, axis)
+    for mote in plan.networks[0]:
+        sketch.add_by_cosines(mote, origin, axis)
+    for (stand, before), (_, after) in pairwise(zip(plan.bodies, plan.networks, strict=True)):
+        shape = best_motion(stand.local_m, sketch.positions_m[list(before)]).apply(stand.local_m)
+        sketch.linearise_at(before, shape)
+        for mote in after:
+            sketch.add_by_ranges(mote, before)
+    up = plan.axes_m[1] / np.linalg.norm(plan.axes_m[1])
+    field_from_map = np.column_stack([(up[1], -up[0]), up])
+    positions = sketch.positions_m @ field_from_map.T + plan.axes_m[0]
+    turn = np.kron(np.eye(len(plan.names)), field_from_map)
+    return FirstMap(positions, turn @ sketch.covariance_m2 @ turn.T, tuple(sketch.steps), ())
+
+
+def map_as_possible(network: RangeNetwork, max_dop: float) -> FirstMap:
+    """A trilateration without a plan: a good triangle (tetrahedron) of motes begins, whoever has most ranges follows.
+
+    Motes that cannot be placed well enough, from d + 1 others at least, are left out.
+
+    Args:
+        network: the ranges.
+        max_dop: dilution of precision that no step may exceed.
+
+    Raises:
+        DegenerateStep: there is no triangle (tetrahedron) to begin with.
+    """
+    means = PairMeans(network)
+    sketch = Sketch(network.names, means, network.dimension, max_dop)
+    _seed(network, means, sketch)
+    refused: set[int] = set()
+    while True:
+        reach = {
+            mote: [partner for partner in means.partners(mote) if sketch.is_placed(partner)]
+            for mote in range(network.count)
+            if mote not in refused and not sketch.is_placed(mote)
+        }
+        ready = [mote for mote, references in reach.items() if len(references) > network.dimension]
+        if not ready:
+            break
+        mote = max(ready, key=lambda candidate: len(reach[candidate]))
+        try:
+            sketch.add_by_ranges(mote, reach[mote])
+            refused.clear()  # what was refused for want of references may have one more now
+        except DegenerateStep:
+            refused.add(mote)
+    unplaced = tuple(mote for mote in range(network.count) if not sketch.is_placed(mote))
+    return FirstMap(sketch.positions_m, sketch.covariance_m2, tuple(sketch.steps), unplaced)
+
+
+def _seed(network: RangeNetwork, means: PairMeans, sketch: Sketch) -> None:
+    d = network.dimension
+    best, best_height_m, seen = None, 0.0, 0
+    for i, j in means.pairs.tolist():
+        common = sorted(set(means.partners(i)) & set(means.partners(j)))
+        for rest in combinations([mote for mote in common if mote > j], d - 1):
+            if not means.are_all_linked(rest):
+                continue
+            seen += 1
+            height_m = _height(means, (i, j, *rest))
+            if height_m > best_height_m:
+                best, best_height_m = (i, j, *rest), height_m
+        if seen > _CLIQUES:
+            break
+    if best is None:
+        shape = "triangle" if d == 2 else "tetrahedron"
+        raise DegenerateStep(f"no {shape} of motes with ranges between all of them: trilateration has no beginning")
+    names = [network.names[mote] for mote in best]
+    rows = [MoteRange(names[a], names[b], *_between(means, best[a], best[b])) for a, b in combinations(range(d + 1), 2)]
+    model = MapModel(build_network(rows, d, names))
+    start = classical_scaling(_distances(means, best), d)
+    fit = fit_map(model, model.state(start), BatchSettings())
+    covariance, _ = position_covariance(model, fit)
+    sketch.add_seed(best, fit.state.positions_m, covariance)
+
+
+def _height(means: PairMeans, motes: tuple[int, ...]) -> float:
+    """Least width of a simplex, m: its smallest extent along a principal axis."""
+    points = classical_scaling(_distances(means, motes), len(motes) - 1)
+    return float(np.linalg.svd(points, compute_uv=False)[-1])
+
+
+def _distances(means: PairMeans, motes: tuple[int, ...]) -> FloatArray:
+    matrix = np.zeros((len(motes), len(motes)))
+    for a, b in combinations(range(len(motes)), 2):
+        matrix[a, b] = matrix[b, a] = _between(means, motes[a], motes[b])[0]
+    return matrix
+
+
+def _between(means: PairMeans, first: int, second: int) -> tuple[float, float]:
+    found = means.between(first, second)
+    if found is None:
+        raise MappingError(f"no range between motes {first} and {second}")
+    return found

@@ -1,0 +1,125 @@
+"""Edge. Reads ranges between motes, and known places of motes, from CSV files."""
+
+import csv
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+from ccatp.radio.measured_map import MeasuredRanges
+from ccatp.radio.range_network import MappingError
+from ccatp.radio.tdoa import MoteRange
+
+PLAIN = ("first", "second", "range_m")
+SESSION = ("session", "pos", "deg", "anchor", "tag", "mean_m")
+PLACES = ("name", "x_m", "y_m")
+
+
+class RangeFileError(MappingError):
+    """A file of ranges or places that cannot be used: file, line, what is wrong."""
+
+
+def read_ranges(path: Path, sigma_m: float) -> MeasuredRanges:
+    """Ranges of a CSV file with a header.
+
+    Two forms are read. ``first,second,range_m`` with ``sigma_m`` where ranges differ in quality: one range a line.
+    ``session,pos,deg,anchor,tag,n,mean_m,...``: a trolley with tags among anchors, one line for the mean range of an
+    anchor to a tag while the trolley stood at a position with a heading; tags of one standstill move together.
+
+    Args:
+        path: the file.
+        sigma_m: of ranges without one of their own.
+
+    Raises:
+        RangeFileError: it cannot be read, or a line is no range.
+    """
+    header, rows = _table(path)
+    if set(SESSION) <= set(header):
+        return _session(path, rows, sigma_m)
+    if not set(PLAIN) <= set(header):
+        raise RangeFileError(
+            f"{path}:1: columns {','.join(header)}; wanted {','.join(PLAIN)}[,sigma_m], or {','.join(SESSION)}"
+        )
+    readings = []
+    for line, row in rows:
+        own = row.get("sigma_m") or ""
+        sigma = _number(path, line, "sigma_m", own) if own.strip() else sigma_m
+        first, second = (_name(path, line, key, row[key]) for key in PLAIN[:2])
+        readings.append(
+            _checked(path, line, MoteRange(first, second, _number(path, line, "range_m", row["range_m"]), sigma))
+        )
+    if not readings:
+        raise RangeFileError(f"{path}: has no ranges, only a header")
+    return MeasuredRanges(tuple(readings), {}, {})
+
+
+def read_places(path: Path) -> dict[str, tuple[float, ...]]:
+    """Places of motes by name: CSV with ``name,x_m,y_m`` and, in space, ``z_m``.
+
+    Raises:
+        RangeFileError: it cannot be read, or a line is no place.
+    """
+    header, rows = _table(path)
+    if not set(PLACES) <= set(header):
+        raise RangeFileError(f"{path}:1: columns {','.join(header)}; wanted {','.join(PLACES)}[,z_m]")
+    axes = [axis for axis in ("x_m", "y_m", "z_m") if axis in header]
+    return {
+        _name(path, line, "name", row["name"]): tuple(_number(path, line, axis, row[axis]) for axis in axes)
+        for line, row in rows
+    }
+
+
+def _session(path: Path, rows: Iterable[tuple[int, Mapping[str, str]]], sigma_m: float) -> MeasuredRanges:
+    readings, groups, tags = [], dict[str, dict[str, None]](), dict[str, str]()
+    for line, row in rows:
+        pose = f"{row['pos']}/{row['deg']}"
+        tag = f"{pose}/tag{row['tag']}"
+        range_m = _number(path, line, "mean_m", row["mean_m"])
+        readings.append(_checked(path, line, MoteRange(f"anchor{row['anchor']}", tag, range_m, sigma_m)))
+        groups.setdefault(pose, {})[tag] = None
+        tags[tag] = f"tag{row['tag']}"
+    if not readings:
+        raise RangeFileError(f"{path}: has no ranges, only a header")
+    return MeasuredRanges(tuple(readings), {pose: tuple(motes) for pose, motes in groups.items()}, tags)
+
+
+def _table(path: Path) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
+    """Header, and the lines with their numbers."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.DictReader(file, restkey="", restval="")
+            header = [name.strip() for name in reader.fieldnames or []]
+            reader.fieldnames = header
+            return header, list(_lines(reader))
+    except OSError as error:
+        raise RangeFileError(
+            f"{path}: {(error.strerror or str(error)).lower()}; name a CSV file that exists"
+        ) from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise RangeFileError(f"{path}: is no CSV text: {error}") from error
+
+
+def _lines(reader: "csv.DictReader[str]") -> Iterator[tuple[int, dict[str, str]]]:
+    for row in reader:
+        yield reader.line_num, {key: value for key, value in row.items() if isinstance(value, str)}
+
+
+def _number(path: Path, line: int, key: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise RangeFileError(f"{path}:{line}: {key} = {text!r} is no number") from None
+
+
+def _name(path: Path, line: int, key: str, text: str) -> str:
+    if not (name := text.strip()):
+        raise RangeFileError(f"{path}:{line}: {key} is empty; every mote needs a name")
+    return name
+
+
+def _checked(path: Path, line: int, reading: MoteRange) -> MoteRange:
+    if not 0.0 <= reading.range_m < float("inf"):
+        raise RangeFileError(f"{path}:{line}: range of {reading.range_m:g} m is no distance")
+    if not 0.0 < reading.sigma_m < float("inf"):
+        raise RangeFileError(f"{path}:{line}: sigma of {reading.sigma_m:g} m, must be positive")
+    if reading.first == reading.second:
+        raise RangeFileError(f"{path}:{line}: from {reading.first} to itself; leave it out")
+    return reading
