@@ -308,6 +308,16 @@ async def test_who_sends_no_whole_request_is_dropped(rig: Rig, sent: bytes) -> N
     writer.close()
 
 
+async def test_a_second_request_that_never_ends_is_dropped_as_well(rig: Rig) -> None:
+    reader, writer = await asyncio.open_connection("127.0.0.1", rig.port)
+    writer.write(b"GET /healthz HTTP/1.1\r\nhost: localhost\r\n\r\n")
+    async with asyncio.timeout(DEADLINE_S):
+        await reader.readuntil(b"}\n")
+    writer.write(b"GET /healthz HTTP")  # from here on no keep-alive of the server's own counts
+    assert await closed(reader) == b""
+    writer.close()
+
+
 async def test_who_takes_nothing_is_dropped(rig: Rig) -> None:
     await rig.until("/healthz", lambda reply: reply.code == 200)
     lazy = socket.socket()
