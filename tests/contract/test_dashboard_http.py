@@ -298,9 +298,7 @@ async def closed(reader: asyncio.StreamReader) -> bytes:
             return b""
 
 
-@pytest.mark.parametrize(
-    "sent", [b"", b"GET / HTTP/1.1\r\nhost: local", b"GET /ground HTTP/1.1\r\nhost: localhost\r\n\r\nGET"]
-)
+@pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nhost: local"])
 async def test_who_sends_no_whole_request_is_dropped(rig: Rig, sent: bytes) -> None:
     reader, writer = await asyncio.open_connection("127.0.0.1", rig.port)
     writer.write(sent)
