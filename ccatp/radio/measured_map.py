@@ -191,8 +191,8 @@ def _hidden_offset(found: MoteMap, network: RangeNetwork, settings: BatchSetting
     shown = fit_map(model, state, settings)
     if without.cost - shown.cost > _TELLING and len(network.ranges_m) > model.size:
         yield (
-            f"all ranges look {1e3 * shown.state.offset_m:.0f} mm long in common (chi-squared {without.cost:.0f} without, "
-            f"{shown.cost:.0f} with an offset); --offset estimates it"
+            f"all ranges look {1e3 * shown.state.offset_m:.0f} mm long in common "
+            f"(chi-squared {without.cost:.0f} without, {shown.cost:.0f} with an offset); --offset estimates it"
         )
 
 
