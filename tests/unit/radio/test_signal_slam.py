@@ -20,7 +20,10 @@ from ccatp.radio.slipping_vehicle import SlippingVehicle, WheelNoise
 from ccatp.studies.radio_run import run_radio
 
 NOISE = WheelNoise(0.01, 0.02, 0.01, 0.05)
-ODOMETRY: dict[str, Steering | Increment] = {"ackermann": Steering(0.1, 0.1, 0.15, 0.3), "differential": Increment(0.1, 0.1, 0.015, 0.02)}
+ODOMETRY: dict[str, Steering | Increment] = {
+    "ackermann": Steering(0.1, 0.1, 0.15, 0.3),
+    "differential": Increment(0.1, 0.1, 0.015, 0.02),
+}
 
 
 def config(**keys: object) -> RadioConfig:
