@@ -266,10 +266,12 @@ def sim_robot(
     from ccatp.config.loader import load_config
     from ccatp.config.radio_loader import is_radio_file, load_radio_config
     from ccatp.fault_plan import read_plan
-    from ccatp.processes.dataloop import run_alone, run_beacons_alone
+    from ccatp.processes.dataloop import run_alone
 
     named = {"sim.robot.host": host, "sim.robot.port": port, "run.mirror": mirror, "run.world": world, "run.seed": seed}
     if config_file is not None and is_radio_file(config_file):
+        from ccatp.processes.dataloop import run_beacons_alone
+
         among_beacons = load_radio_config(config_file, overrides(settings, named))
         return int(run_beacons_alone(among_beacons, lockstep=not realtime))
     cfg = load_config(config_file, overrides(settings, named))
