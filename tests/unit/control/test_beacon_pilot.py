@@ -92,9 +92,10 @@ def test_a_target_that_comes_nearer_is_backed_off_from() -> None:
 def test_uncertainty_of_the_target_keeps_the_robot_away() -> None:
     pilot = BeaconPilot(config(follow__is_active=True))
     pilot.drive(0.0, 0.1, (0.0, 0.0, 0.0), TargetSight((0.8, 0.0), 0.0, 0.0), ())
-    assert pilot.follower.state is FollowState.APPROACHING
+    states = [pilot.follower.state]
     pilot.drive(0.1, 0.1, (0.0, 0.0, 0.0), TargetSight((0.8, 0.0), 0.25, 0.0), ())
-    assert pilot.follower.state is FollowState.HOLDING
+    states.append(pilot.follower.state)
+    assert states == [FollowState.APPROACHING, FollowState.HOLDING]
 
 
 @pytest.mark.parametrize("target", [None, TargetSight((3.0, 0.0), 0.0, 11.0)])
