@@ -9,18 +9,19 @@ from scipy.stats import chi2
 from ccatp.config.radio_loader import load_radio_config
 from ccatp.config.radio_models import RadioConfig
 from ccatp.filters.ekf_slam import BlockError, EkfSlam
-from ccatp.radio.motion import Increment, Steering
+from ccatp.radio.motion import Increment, Odometry, Steering
 from ccatp.radio.moving_radio import MovingRadio
 from ccatp.radio.path_loss import PathLoss
 from ccatp.radio.readings import RssiReading
 from ccatp.radio.shadowing_map import ShadowingMap
 from ccatp.radio.signal_rows import Sight, rows_of
 from ccatp.radio.signal_settings import new_slam, vehicle_of
+from ccatp.radio.signal_slam import SignalSlam
 from ccatp.radio.slipping_vehicle import SlippingVehicle, WheelNoise
 from ccatp.studies.radio_run import run_radio
 
 NOISE = WheelNoise(0.01, 0.02, 0.01, 0.05)
-ODOMETRY: dict[str, Steering | Increment] = {
+ODOMETRY: dict[str, Odometry] = {
     "ackermann": Steering(0.1, 0.1, 0.15, 0.3),
     "differential": Increment(0.1, 0.1, 0.015, 0.02),
 }
@@ -49,7 +50,7 @@ def test_motion_noise_is_that_of_its_readings(kind: str) -> None:
     drawn = []
     for speed, turn in rng.standard_normal((4000, 2)).tolist():
         if kind == "ackermann":
-            odometry: Steering | Increment = Steering(0.1, 0.1, 0.15 + 0.01 * speed, 0.3 + 0.02 * turn)
+            odometry: Odometry = Steering(0.1, 0.1, 0.15 + 0.01 * speed, 0.3 + 0.02 * turn)
         else:
             odometry = Increment(0.1, 0.1, 0.1 * (0.15 + 0.01 * speed), 0.1 * (0.2 + 0.02 * turn))
         drawn.append(model.step(x, odometry).mean[:3])
@@ -144,7 +145,7 @@ def test_a_velocity_is_carried_into_the_place() -> None:
     assert float(np.linalg.eigvalsh(engine.covariance)[0]) > -1e-12
 
 
-def heard(slam_cfg: RadioConfig, scans: int) -> tuple[object, float]:
+def heard(slam_cfg: RadioConfig, scans: int) -> tuple[SignalSlam, float]:
     slam = new_slam(slam_cfg)
     loss = slam.path_loss_of("b")
     for k in range(scans):
@@ -159,12 +160,12 @@ def heard(slam_cfg: RadioConfig, scans: int) -> tuple[object, float]:
 
 def test_a_new_radio_waits_and_is_on_the_map_all_the_same() -> None:
     slam, error_m = heard(config(), 1)
-    assert "b" not in slam.engine  # type: ignore[attr-defined]
+    assert "b" not in slam.engine
     assert error_m < 0.01
     slam, error_m = heard(config(estimator__waiting_scans=4), 5)
-    assert "b" in slam.engine  # type: ignore[attr-defined]
+    assert "b" in slam.engine
     assert error_m < 0.02
-    assert not [b for b in slam.engine.blocks if not isinstance(b, str)]  # type: ignore[attr-defined]
+    assert not [b for b in slam.engine.blocks if not isinstance(b, str)]
 
 
 def test_a_radio_without_a_bearing_is_not_placed_and_removal_forgets() -> None:
