@@ -71,8 +71,8 @@ def command_lines() -> Iterator[tuple[str, str]]:
     for path in SOURCES:
         for body in blocks(path, "", "console", "sh"):
             for line in body.splitlines():
-                words = line.removeprefix("$ ").split("  #")[0].strip()
-                if re.match(r"(\S*/)?ccatp [a-z]", words) and "..." not in words and "\u2026" not in words:
+                words = re.split(r"\s#\s|\s{3,}", line.removeprefix("$ ").strip())[0]  # the rest is a remark
+                if re.match(r"(\S*/)?ccatp [a-z]", words) and not re.search(r"\.\.\.|\u2026|\[--", words):
                     yield path.stem, words
 
 
