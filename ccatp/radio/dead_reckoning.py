@@ -36,12 +36,13 @@ class Carried(NamedTuple):
 
 
 class DeadReckoning:
-    """Odometry that lags behind the readings by a delay, which may be an estimate.
+    """Odometry that tells what the vehicle will have done after a delay, which may be an estimate.
 
-    Steps wait until they are due: the state is the pose at t - delay by odometry's clock, which is the pose at t by
-    that of the readings. What is left, less than an interval, the pose is carried over at constant speed, and the
-    derivative by the delay is that speed (Li and Mourikis 2014). So readings between two steps are taken at their own
-    time even where no delay is asked for.
+    Commanded speeds run ahead of the wheels; stamps of readings may come late or early. Steps wait until they are due:
+    the state is the pose at t - delay by odometry's clock, which is the pose at t by that of the readings. Of a
+    negative delay, odometry that comes late, only an interval can be made up for. What is left, less than an interval,
+    the pose is carried over at constant speed, and the derivative by the delay is that speed (Li and Mourikis 2014).
+    So readings between two steps are taken at their own time even where no delay is asked for.
 
     Args:
         is_delayed: False: every step is due at once.

@@ -2,7 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import cos, hypot, pi, sin, sqrt
+from math import cos, hypot, inf, isfinite, log1p, pi, sin, sqrt
+from statistics import median
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +17,8 @@ RowOf = Callable[[Reading, list[float], list[float], list[float]], Row]
 
 MOST = 24
 """Readings of a beacon that are kept; beyond, every other one goes, and they are taken twice as far apart."""
-LEAST = 5
-"""Readings without which a beacon is not looked for: two more than its place and an error that all share need."""
+LEAST = 8
+"""Readings without which a beacon is not looked for: what its place needs, four times over."""
 SPACING = 0.01
 """Way between readings that are kept, at first, relative to the range."""
 STARTS = 24
@@ -28,21 +29,37 @@ LOOSEST = 2.5
 """How many times that is borne at last, in proportion to the readings: the vehicle strays while beacons wait."""
 DEEP = 0.3
 """The same along it, where ranges are all but linear: a scale that all share may be that uncertain."""
-MARGIN = 14.0
-"""How much worse the second best place, chi-squared: odds of a thousand to one that it is not a mirror image."""
-APART = 0.02
+APART = 0.05
 """Places nearer to each other than that, relative to the distance, are one."""
 KNEE = 3.0
-"""Residuals beyond that many sigmas weigh no more than those at it: readings round a corner are too long."""
+"""Residuals beyond that many sigmas first weigh no more than those at it (Huber), at last nothing: readings round a
+corner are too long. Each then costs what one at the knee does, so that places can be compared."""
+MEDIAN_TO_SIGMA = 1.4826
+"""Standard deviation of a Gaussian over the median of its absolute value."""
+OUT = 100.0
+"""What a residual squared is taken times for the variance of a reading that is left out."""
+PLAIN, ROBUST, ITERATIONS = 3, 7, 14
+"""Steps of Gauss-Newton without weights, until those of Huber end, and at most."""
+MARGIN = 14.0 + 2.0 * KNEE**2
+"""How much worse the second best place must be, chi-squared, so that the best is no mirror image: odds of a thousand to
+one, though two readings were off."""
 FIT = 6.0
-"""Sigmas by which chi-squared may exceed its expectation."""
+"""Sigmas by which chi-squared may exceed its expectation; if it stays beyond, the noise is taken for that much larger
+(Birge's ratio): with less noise in the settings than there is, no beacon would ever join."""
 
 
 class Record(NamedTuple):
-    """A reading that waits, and the block of the state that holds the place (x_m, y_m) where it was taken."""
+    """A reading that waits.
+
+    Attributes:
+        reading: as it was taken.
+        place: block of the state that holds the place (x_m, y_m) where it was taken.
+        distance_m: what it says of the distance, roughly.
+    """
 
     reading: Reading
     place: BlockId
+    distance_m: float
 
 
 class Candidate(NamedTuple):
@@ -127,7 +144,7 @@ class Waiting:
         block = ("place", self.beacon, self.count)
         self.count += 1
         engine.augment(block, place.mean, place.columns, place.jacobian)
-        self.records.append(Record(reading, block))
+        self.records.append(Record(reading, block, range_m))
         if len(self.records) > MOST:
             self.spacing_m *= 2.0
             for record in self.records[1::2]:
@@ -152,17 +169,25 @@ class Waiting:
             reach_m: how far it is from the last place, roughly.
         """
         problem = _problem(engine, self.records, row_of, shared, reach_m)
-        x, y = problem.places[-1]
-        ring = [(x + reach_m * cos(a), y + reach_m * sin(a)) for a in (2.0 * pi * k / STARTS for k in range(STARTS))]
-        costs = [problem.rough(prior_at(*point)) for point in ring]
-        starts = [prior_at(*ring[k]) for k in range(STARTS) if costs[k] <= min(costs[k - 1], costs[(k + 1) % STARTS])]
+        starts: list[Prior] = []
+        for radius_m in {reach_m, self._usual_m(reach_m)}:
+            starts += problem.around(prior_at, radius_m)
         starts += [Prior(c.mean, prior_at(*c.mean[:2].tolist()).covariance) for c in self.candidates]
-        found = sorted((c for c in map(problem.refine, starts) if c is not None), key=lambda c: c.cost)
+        found = [candidate for candidate in map(problem.refine, starts) if candidate is not None]
+        best = min(found, key=lambda c: c.cost, default=None)
+        if best is not None:
+            mirrored = problem.refine(prior_at(*problem.mirrored(best.mean[:2])))
+            found += [] if mirrored is None else [mirrored]
+        found.sort(key=lambda c: c.cost)
         apart: list[Candidate] = []
         for candidate in found:
             if all(hypot(*(candidate.mean - c.mean)[:2].tolist()) > APART * reach_m for c in apart):
                 apart.append(candidate)
         self.candidates = apart[:2]
+
+    def _usual_m(self, reach_m: float) -> float:
+        """Median distance that the readings tell: the last one may have gone round a corner."""
+        return median([record.distance_m for record in self.records]) if self.records else reach_m
 
     def found(self, engine: EkfSlam) -> Candidate | None:
         """The beacon's place, if there is only one, well enough known to be linearised at, and the readings agree."""
@@ -177,10 +202,13 @@ class Waiting:
         tight = TIGHT * min(max(self.count / MOST, 1.0), LOOSEST)
         if across.dot(C).dot(across) > (tight * distance) ** 2 or along.dot(C).dot(along) > (DEEP * distance) ** 2:
             return None
-        if any(other.cost - best.cost < MARGIN for other in self.candidates[1:]):
-            return None
         m = len(self.records)
-        return best if best.cost < m + FIT * sqrt(2.0 * m) else None
+        excess = max(1.0, best.cost / (m - best.mean.size))
+        if best.cost > m + FIT * sqrt(2.0 * m) and self.count <= MOST:
+            return None
+        if any(other.cost - best.cost < MARGIN * excess for other in self.candidates[1:]):
+            return None
+        return best._replace(variances=excess * best.variances)
 
 
 class _Problem(NamedTuple):
@@ -194,37 +222,50 @@ class _Problem(NamedTuple):
     row_of: RowOf
     reach_m: float
 
+    def around(self, prior_at: PriorAt, radius_m: float) -> list[Prior]:
+        """Where to begin: the best directions on a circle about the last place."""
+        x, y = self.places[-1]
+        angles = [2.0 * pi * k / STARTS for k in range(STARTS)]
+        ring = [prior_at(x + radius_m * cos(angle), y + radius_m * sin(angle)) for angle in angles]
+        costs = [self.rough(prior) for prior in ring]
+        return [ring[k] for k in range(STARTS) if costs[k] <= min(costs[k - 1], costs[(k + 1) % STARTS])]
+
+    def mirrored(self, point: FloatArray) -> tuple[float, float]:
+        """The image of a point (2,) on the other side of the way, which ranges tell apart last."""
+        places = np.array(self.places)
+        middle = places.mean(axis=0)
+        along = np.linalg.svd(places - middle)[2][0]
+        x, y = middle + 2.0 * along * along.dot(point - middle) - (point - middle)
+        return float(x), float(y)
+
     def rough(self, prior: Prior) -> float:
-        """Chi-squared at a guess, places and calibration as they are."""
+        """How badly a guess fits, places and calibration as they are; a reading that is off counts little (Cauchy)."""
         b = prior.mean.tolist()
         cost = 0.0
         for reading, z, place in zip(self.readings, self.z.tolist(), self.places, strict=True):
             row = self.row_of(reading, [*place, 0.0], self.calibration, b)
-            cost += (z - row.expected) ** 2 / row.variance
+            cost += log1p((z - row.expected) ** 2 / row.variance)
         return cost
 
-    def refine(self, prior: Prior, iterations: int = 12) -> Candidate | None:
-        """Gauss-Newton; None where it leads nowhere."""
+    def refine(self, prior: Prior) -> Candidate | None:
+        """Gauss-Newton with weights; None where it leads nowhere."""
         b, W, stride = prior.mean.copy(), np.linalg.inv(prior.covariance), 0.5 * self.reach_m
-        variances, A, S, e = None, W, self.P, self.z
-        for k in range(iterations):
+        variances, A, cost = self.z, W, inf
+        for k in range(ITERATIONS):
             H, G, e, R = self._linear(b)
-            variances = R
             spread = H.dot(self.P).dot(H.T)
-            if k > 2:
-                scale = np.sqrt(spread.diagonal() + R)
-                variances = R + scale**2 * np.maximum(np.abs(e) / (KNEE * scale) - 1.0, 0.0)
+            variances, left_out = _weighed(e, spread.diagonal() + R, R, k)
             S = spread + np.diag(variances)
             SG = np.linalg.solve(S, G)
             A = G.T.dot(SG) + W
             step = np.linalg.solve(A, SG.T.dot(e) + W.dot(prior.mean - b))
             size = hypot(step[0], step[1])
-            b = b + step * min(1.0, stride / max(size, 1e-12))
-            if size < 1e-3 * stride and k > 3:
+            cost = float(e.dot(np.linalg.solve(S, e))) + left_out
+            if not (isfinite(cost) and isfinite(size)):
+                return None
+            if size < 1e-3 * stride and k > ROBUST:
                 break
-        cost = float(e.dot(np.linalg.solve(S, e)))
-        if variances is None or not (np.isfinite(cost) and np.isfinite(b).all()):
-            return None
+            b = b + step * min(1.0, stride / max(size, 1e-12))
         return Candidate(b, np.linalg.inv(A), cost, variances)
 
     def _linear(self, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -237,6 +278,26 @@ class _Problem(NamedTuple):
             H[i, 2 * m : 2 * m + len(row.calibration)] = row.calibration
             G[i], R[i], e[i] = row.beacon, row.variance, self.z[i] - row.expected
         return H, G, e, R
+
+
+def _weighed(e: FloatArray, S: FloatArray, R: FloatArray, step: int) -> tuple[FloatArray, float]:
+    """Variances of the readings at a step of the iteration, and what those that are left out cost.
+
+    Args:
+        e: residuals, shape (m,).
+        S: their variances by all that is unknown, shape (m,).
+        R: those of the readings, shape (m,).
+        step: how many went before.
+    """
+    if step < PLAIN:
+        return R, 0.0
+    sigmas = np.abs(e) / np.sqrt(S)
+    if step < ROBUST:
+        return R + S * np.maximum(sigmas / KNEE - 1.0, 0.0), 0.0
+    # by the usual residual, not by the noise that was promised: or a bad place could leave out what speaks against it
+    limit = KNEE * max(1.0, MEDIAN_TO_SIGMA * float(np.median(sigmas)))
+    is_out = sigmas > limit
+    return R + np.where(is_out, OUT * e * e, 0.0), limit**2 * float(is_out.sum())
 
 
 def _problem(engine: EkfSlam, records: list[Record], row_of: RowOf, shared: slice, reach_m: float) -> _Problem:

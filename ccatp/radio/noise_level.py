@@ -25,8 +25,11 @@ class NoiseLevel:
             return
         self._information = min(self._information + share * share, self._memory)
         change = share * (nis - 1.0) / self._information
-        self.factor *= exp(max(-LARGEST, min(LARGEST, change)))
+        factor = self.factor * exp(max(-LARGEST, min(LARGEST, change)))
+        self.factor = max(1.0 / FURTHEST, min(FURTHEST, factor))
 
 
 LARGEST = 0.3
 """Most that one innovation may change the logarithm of the factor."""
+FURTHEST = 100.0
+"""Largest factor, and one over the least: a sensor ten times worse than promised is not one to be believed."""

@@ -108,7 +108,8 @@ class SlamSettings:
         range: of range and range-bearing readings; None where there are none.
         bearing: of readings with a bearing; None where there are none.
         rssi: of RSSI readings; None where there are none.
-        delay_sigma_s: prior of the time by which odometry lags behind the readings; 0: not estimated.
+        delay_sigma_s: prior of the time after which the vehicle has done what its odometry tells, by the stamps of the
+            readings: commands that take a while to be followed, stamps that come late; 0: not estimated.
     """
 
     motion: MotionModel
