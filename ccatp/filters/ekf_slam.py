@@ -127,19 +127,16 @@ class EkfSlam:
             FilterDiverged: the prediction is not finite.
         """
         v = self.vehicle_size
-        for name, array, shape in (("vehicle_mean", vehicle_mean, (v,)), ("F", F, (v, v)), ("Q", Q, (v, v))):
-            if array.shape != shape:
-                raise FilterShapeError(name, array.shape, str(shape))
+        if vehicle_mean.shape != (v,) or F.shape != (v, v) or Q.shape != (v, v):
+            raise _misfit(v, vehicle_mean, F, Q)
         rows = F.dot(self._rows)
         corner = rows[:, :v].dot(F.T)
         corner += Q
         if not np.vdot(corner, corner) + np.vdot(vehicle_mean, vehicle_mean) < HUGE:
             raise FilterDiverged(f"prediction is not finite: vehicle {vehicle_mean.tolist()}")
+        rows[:, :v] = 0.5 * (corner + corner.T)
         self._rows[:] = rows
         self._columns[:] = rows.T
-        self._corner[:] = corner
-        self._corner += corner.T
-        self._corner *= 0.5
         self._vehicle[:] = vehicle_mean
 
     def spread(self, columns: Columns, h: FloatArray) -> float:
@@ -350,6 +347,13 @@ def columns_of(*parts: slice | Sequence[int]) -> Columns:
     for part in parts:
         numbers += range(part.start, part.stop) if isinstance(part, slice) else part
     return np.array(numbers, dtype=np.intp)
+
+
+def _misfit(v: int, vehicle_mean: FloatArray, F: FloatArray, Q: FloatArray) -> FilterShapeError:
+    """Which of a prediction's arrays does not fit."""
+    wanted = (("vehicle_mean", vehicle_mean, (v,)), ("F", F, (v, v)), ("Q", Q, (v, v)))
+    name, array, shape = next(each for each in wanted if each[1].shape != each[2])
+    return FilterShapeError(name, array.shape, str(shape))
 
 
 def _checked_rows(columns: Columns, H: FloatArray, residual: FloatArray, R: FloatArray) -> FloatArray:

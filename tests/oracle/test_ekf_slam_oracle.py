@@ -113,15 +113,15 @@ def test_prediction_is_f_p_ft_and_reaches_the_map() -> None:
 @pytest.mark.parametrize("as_row", [True, False])
 def test_a_reading_far_more_exact_than_the_state_leaves_a_covariance(as_row: bool) -> None:
     """P - K S K^T would leave rounding of the prior, 1e-4, where 1e-10 is right."""
-    ours = EkfSlam(np.zeros(2), np.diag((1e12, 1.0)))
-    columns, h = np.arange(2), np.array((1.0, 0.5))
+    ours = EkfSlam(np.zeros(2), np.diag((3.7e12, 1.0)))
+    columns, h = np.arange(2), np.array((1.1, 0.7))
     if as_row:
         ours.update_row(columns, h, 3.0, 1e-10)
     else:
         ours.update(columns, h[None, :], np.array((3.0,)), np.array((1e-10,)))
     assert np.linalg.eigvalsh(ours.covariance)[0] > 0.0
     assert ours.covariance[1, 1] == pytest.approx(1.0)
-    assert ours.covariance[0, 0] == pytest.approx(0.25, rel=1e-3)
+    assert ours.covariance[0, 0] == pytest.approx((0.7 / 1.1) ** 2, rel=1e-3)
 
 
 def test_iterated_update_comes_to_rest_at_the_most_likely_state() -> None:
