@@ -15,7 +15,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
-.PHONY: help run test test-slow chromium faults lint format fast lock clean
+.PHONY: help run test test-slow chromium faults docs lint format fast lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -24,6 +24,7 @@ help:
 	@echo "make test             lint, types, import contract, tests"
 	@echo "make test-slow        the tests that take minutes, and new random examples"
 	@echo "make faults           docs/fault_table.md from what the last test runs showed and measured"
+	@echo "make docs             build/docs/index.html, and the parts of docs/ that are made from the code"
 	@echo "make lint             lint, types, import contract"
 	@echo "make format           format the code"
 	@echo "make fast             a compiled build beside it, for campaigns: $(FAST_VENV)/bin/ccatp; needs a C compiler"
@@ -48,6 +49,11 @@ test-slow: $(VENV)/.installed-dev
 
 faults: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.faults.page
+
+docs: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.docs.generated
+	$(BIN)/python -m sphinx -W -q -b html docs build/docs
+	@echo "ccatp: build/docs/index.html"
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check

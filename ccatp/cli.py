@@ -264,10 +264,16 @@ def sim_robot(
 ) -> int:  # fmt: skip
     """Run the simulated robot behind the robot link, for any controller."""
     from ccatp.config.loader import load_config
+    from ccatp.config.radio_loader import is_radio_file, load_radio_config
     from ccatp.fault_plan import read_plan
     from ccatp.processes.dataloop import run_alone
 
     named = {"sim.robot.host": host, "sim.robot.port": port, "run.mirror": mirror, "run.world": world, "run.seed": seed}
+    if config_file is not None and is_radio_file(config_file):
+        from ccatp.processes.dataloop import run_beacons_alone
+
+        among_beacons = load_radio_config(config_file, overrides(settings, named))
+        return int(run_beacons_alone(among_beacons, lockstep=not realtime))
     cfg = load_config(config_file, overrides(settings, named))
     plan = None if faults_file is None else read_plan(faults_file, lockstep=not realtime)
     return int(run_alone(cfg, lockstep=not realtime, faults=plan))
@@ -349,9 +355,14 @@ def config() -> None:
 def config_check(file: Path) -> int:
     """Check a configuration; each problem is one line with file, line and key."""
     from ccatp.config.loader import load_config
+    from ccatp.config.radio_loader import is_radio_file, load_radio_config
     from ccatp.errors import ConfigError
 
     try:
+        if is_radio_file(file):
+            beacons = load_radio_config(file)
+            click.echo(f"{file}: ok: system {beacons.system}, seed {beacons.run.seed}")
+            return 0
         cfg = load_config(file)
     except ConfigError as error:
         for problem in error.problems:

@@ -181,8 +181,11 @@ def configured_folder(config_file: Path | None, runtime_dir: Path | None) -> Pat
     """The runtime directory that command line or configuration names."""
     if runtime_dir is None and config_file is not None:
         from ccatp.config.loader import load_config
+        from ccatp.config.radio_loader import is_radio_file, load_radio_config
 
-        configured = load_config(config_file).run.runtime_dir
+        among_beacons = is_radio_file(config_file)
+        processes = load_radio_config(config_file).processes if among_beacons else load_config(config_file).run
+        configured = processes.runtime_dir
         return Path(configured) if configured else None
     return runtime_dir
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -145,7 +146,7 @@ def _write(path: Path, names: tuple[str, ...], positions_m: Any, covariance_m2: 
 
 def _progress(total: int) -> Callable[[int], None]:
     """A counter on a terminal, a line for each tenth elsewhere, on standard error; nothing for a single run."""
-    is_live = click.get_text_stream("stderr").isatty()
+    is_live = sys.stderr.isatty()
 
     def tell(done: int) -> None:
         if total == 1:

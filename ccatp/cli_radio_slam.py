@@ -112,6 +112,5 @@ def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) 
         return smooth(run, batch_settings(cfg), perf_counter)
     from ccatp.radio.causal import filter_run
 
-    return filter_run(
-        run, slam_settings(cfg, assumed.filter), (cfg.priors.pose_m, cfg.priors.heading_rad), perf_counter
-    )
+    first_sigmas = (cfg.priors.pose_m, cfg.priors.heading_rad)
+    return filter_run(run, slam_settings(cfg, assumed.filter), first_sigmas, perf_counter)

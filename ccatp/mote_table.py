@@ -24,8 +24,8 @@ def report_lines(data: dict[str, Any]) -> Iterator[str]:
     rms = data["rms_m"]
     yield f"  error, median (10 to 90 %)         {_mm(rms['p50'])} ({_mm(rms['p10'])} to {_mm(rms['p90'])})"
     if data.get("motes_in_doubt"):
-        others = _mm(data["rms_of_others_m"])
-        yield f"  without the {data['motes_in_doubt']} motes in doubt{'':<{12 - len(str(data['motes_in_doubt']))}}{others}"
+        yield f"  motes in doubt                     {data['motes_in_doubt']}"
+        yield f"  error of the others                {_mm(data['rms_of_others_m'])}"
     yield f"  expected by the estimator          {_mm(data['expected_rms_m'])}"
     yield f"  updates or steps                   {data['iterations']}"
     if data["offset_m"]:

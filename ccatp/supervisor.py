@@ -24,7 +24,7 @@ from ccatp.processes.children import Children, ProcessSpec
 from ccatp.processes.collecting import Collector
 from ccatp.processes.common import FAULTS_FILE, RUN_DIR_FILE, Endpoints, open_log
 from ccatp.processes.observing import check_observatory
-from ccatp.processes.page_socket import PageSocket, note_run_dir, open_page_socket
+from ccatp.processes.page_socket import PageSocket, open_page_socket
 from ccatp.processes.run_kinds import BeaconRun, RunKind, SurveyRun
 from ccatp.processes.run_report import write_run_report
 from ccatp.processes.run_view import RunView
@@ -99,7 +99,7 @@ def run_beacons(options: RunOptions) -> int:
         run_dir = _new_run_dir(options, cfg.system, cfg.run.seed)
         stack.enter_context(_lock(run_dir / ".lock", "--run-dir"))
         (run_dir / "config.toml").write_text(dump_radio_config(cfg), encoding="utf-8")
-        note_run_dir(runtime_dir, run_dir)
+        (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
         kind = BeaconRun(cfg, BEACON_PROCESSES, is_sim=options.sim)
         return _Run(options, kind, run_dir, Endpoints(runtime_dir), sockets, None, started).go()
 
@@ -142,7 +142,6 @@ def run_survey(options: RunOptions) -> int:
         (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
-        note_run_dir(runtime_dir, run_dir)
         kind = SurveyRun(cfg, PROCESSES, is_sim=options.sim)
         return _Run(options, kind, run_dir, Endpoints(runtime_dir), sockets, page, started).go()
 

@@ -46,7 +46,7 @@ class Segment:
 
     Attributes:
         right_rad, left_rad: what each wheel turned, frame by frame, shape (n,).
-        motions: first and last (exclusive) frame of each motion between two rests.
+        motions: first and last (exclusive) frame of each motion; together all frames.
         gyro_rad: sum of the gyroscope's rates times their periods.
         gyro_s: over this time.
         gyro_samples: so many.
@@ -201,7 +201,10 @@ class DriveBuilder:
 
 
 def _motions(right: FloatArray, left: FloatArray, rest_rad: float) -> tuple[tuple[int, int], ...]:
-    """Stretches of frames in which a wheel turns, parted by rests; a turn in place and a way are two motions."""
+    """The frames, parted into motions: by rests, and a turn in place from a way.
+
+    Together they cover all frames: wheels run down long after they seem to stand, by some micrometres in all.
+    """
     moving = np.flatnonzero((np.abs(right) > rest_rad) | (np.abs(left) > rest_rad))
     if not len(moving):
         return ()
@@ -209,7 +212,8 @@ def _motions(right: FloatArray, left: FloatArray, rest_rad: float) -> tuple[tupl
     spans = []
     for run in np.split(moving, np.flatnonzero(np.diff(moving) > REST_FRAMES) + 1):
         spans += _same_kind(is_turn, int(run[0]), int(run[-1]) + 1)
-    return tuple(spans)
+    begins = [0, *(begin for begin, _ in spans[1:])]
+    return tuple(zip(begins, [*begins[1:], len(right)], strict=True))
 
 
 def _same_kind(is_turn: NDArray[np.bool_], first: int, last: int) -> list[tuple[int, int]]:

@@ -42,7 +42,7 @@ class Endpoints:
 C = TypeVar("C", Config, RadioConfig)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)  # no slots: an alias with its type filled in notes that on the instance
 class ArgsOf(Generic[C]):
     """What the supervisor tells a process.
 

@@ -10,6 +10,7 @@ import structlog
 from ccatp.beacon_server import serve_beacons
 from ccatp.body_file import FILE
 from ccatp.config.models import Config
+from ccatp.config.radio_models import RadioConfig
 from ccatp.dataloop import serve
 from ccatp.errors import ConfigError
 from ccatp.fault_plan import read_plan
@@ -94,17 +95,9 @@ def run_alone(cfg: Config, lockstep: bool, faults: FaultPlan | None = None) -> i
         lockstep: simulated time waits for the controller.
         faults: what shall go wrong.
     """
-    at = cfg.sim.robot
     truth = Endpoints(make_runtime_dir(cfg.run.runtime_dir, os.environ)).of("puck")
-    try:
-        listener = socket.create_server((at.host, at.port), reuse_port=False)
-    except OSError as error:
-        raise ConfigError(
-            f"sim.robot.port: cannot listen on {at.host}:{at.port}: {error.strerror}; choose another with --port"
-        ) from error
-    host, port = listener.getsockname()[:2]
-    log: structlog.typing.FilteringBoundLogger = structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
-    print(f"ccatp: robot stand-in ({cfg.mirror.name}) on {host}:{port}, truth at {truth}", file=sys.stderr, flush=True)
+    listener = _listener(cfg.sim.robot.host, cfg.sim.robot.port)
+    _say_where(cfg.mirror.name, listener, truth)
 
     async def run() -> None:
         stop = asyncio.Event()
@@ -117,12 +110,47 @@ def run_alone(cfg: Config, lockstep: bool, faults: FaultPlan | None = None) -> i
             listen_sock=listener,
             truth_rep=truth,
             key=read_key(cfg.robot.key_file),
-            log=log,
+            log=_plain_log(),
             faults=faults,
         )
 
     asyncio.run(run())
     return 0
+
+
+def run_beacons_alone(cfg: RadioConfig, lockstep: bool) -> int:
+    """The same of a robot among beacons."""
+    truth = Endpoints(make_runtime_dir(cfg.processes.runtime_dir, os.environ)).of("puck")
+    listener = _listener(cfg.sim.robot.host, cfg.sim.robot.port)
+    _say_where(cfg.system, listener, truth)
+
+    async def run() -> None:
+        stop = asyncio.Event()
+        stop_on_signals(stop)
+        key, log = read_key(cfg.robot.key_file), _plain_log()
+        await serve_beacons(cfg, lockstep=lockstep, stop=stop, listen_sock=listener, truth_rep=truth, key=key, log=log)
+
+    asyncio.run(run())
+    return 0
+
+
+def _listener(host: str, port: int) -> socket.socket:
+    try:
+        return socket.create_server((host, port), reuse_port=False)
+    except OSError as error:
+        raise ConfigError(
+            f"sim.robot.port: cannot listen on {host}:{port}: {error.strerror}; choose another with --port"
+        ) from error
+
+
+def _say_where(what: str, listener: socket.socket, truth: str) -> None:
+    host, port = listener.getsockname()[:2]
+    print(f"ccatp: robot stand-in ({what}) on {host}:{port}, truth at {truth}", file=sys.stderr, flush=True)
+
+
+def _plain_log() -> structlog.typing.FilteringBoundLogger:
+    log: structlog.typing.FilteringBoundLogger = structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
+    return log
 
 
 if __name__ == "__main__":

@@ -1,16 +1,12 @@
 """Glue. Where the dashboard listens: bound by the supervisor, so that one that is started anew is found there again."""
 
-import contextlib
 import errno
 import socket
-from pathlib import Path
 from typing import NamedTuple
 
 from ccatp.config.models import DashboardConfig
 
 BACKLOG = 64
-# In the runtime directory, a link to the run directory of the daemon that runs, or ran last.
-RUN_LINK = "run"
 
 
 class PageSocket(NamedTuple):
@@ -53,15 +49,6 @@ def open_page_socket(cfg: DashboardConfig) -> PageSocket:
 def page_url(host: str, port: int) -> str:
     """The page's address."""
     return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
-
-
-def note_run_dir(runtime_dir: Path, run_dir: Path) -> None:
-    """Leave word in the runtime directory where the run is written, for displays that come later."""
-    new = runtime_dir / f"{RUN_LINK}.new"
-    with contextlib.suppress(OSError):
-        new.unlink(missing_ok=True)
-        new.symlink_to(run_dir)
-        new.replace(runtime_dir / RUN_LINK)
 
 
 def _listen(host: str, port: int) -> socket.socket:

@@ -44,7 +44,6 @@ class RunView:
         """Say what runs."""
         self._console: Console = _PatientConsole(stderr=True, highlight=False)
         self._is_terminal = self._console.is_terminal
-        self._run_dir = run_dir
         self._has_pose = False
         self._told_tenths = 0
         self._goals = goals
@@ -108,10 +107,9 @@ class RunView:
             sys.stdout.write(format_table(summary) + "\n")
         sys.stdout.flush()
 
-    def show_report(self, path: Path | None) -> None:
-        """Where the report is, or how to make it; on standard error, so that JSON stays alone."""
-        where = f"report  {path}" if path is not None else f"report  none; make it with: ccatp report {self._run_dir}"
-        self._console.print(where, soft_wrap=True, markup=False)
+    def show_report(self, where: str) -> None:
+        """Where the report is, or why there is none; on standard error, so that JSON stays alone."""
+        self._console.print(f"report  {where}", soft_wrap=True, markup=False)
 
 
 def survey_title(cfg: Config, *, is_sim: bool) -> str:

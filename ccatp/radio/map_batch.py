@@ -85,6 +85,18 @@ def fit_map(model: MapModel, start: MapState, settings: BatchSettings) -> BatchF
     return BatchFit(state, cost, weights, residuals, settings.max_iterations, False)
 
 
+def fit_from_afar(model: MapModel, start: MapState, settings: BatchSettings) -> BatchFit:
+    """The same from a start that may be metres off: by least squares first.
+
+    To a robust loss all ranges of a mote that is far from its place are outliers, and nothing pulls it there.
+    """
+    if not np.isfinite(settings.robust_scale):
+        return fit_map(model, start, settings)
+    near = fit_map(model, start, settings._replace(robust_scale=float("inf")))
+    fit = fit_map(model, near.state, settings)
+    return fit._replace(iterations=near.iterations + fit.iterations)
+
+
 def position_covariance(model: MapModel, fit: BatchFit, *, variance_factor: float = 1.0) -> tuple[FloatArray, int]:
     """Covariance of all positions and how many directions of the unknowns no range sees.
 
@@ -101,7 +113,7 @@ def position_covariance(model: MapModel, fit: BatchFit, *, variance_factor: floa
         Covariance (n d, n d), and the number of directions without information, the frame's included.
     """
     normal, _ = _normal(model, fit.state, fit.residuals_m, np.where(fit.weights > 0.5, 1.0, 0.0))
-    dense = normal.toarray()
+    dense = normal if isinstance(normal, np.ndarray) else normal.toarray()
     scale = 1.0 / np.sqrt(np.maximum(dense.diagonal(), 1e-300))
     values, vectors = np.linalg.eigh(dense * np.outer(scale, scale))
     is_seen = values > _NULL * values[-1]
@@ -123,20 +135,25 @@ def _loss(scaled: FloatArray, robust_scale: float) -> tuple[float, FloatArray]:
 
 def _normal(
     model: MapModel, state: MapState, residuals: FloatArray, weights: FloatArray
-) -> tuple[csr_array, FloatArray]:
-    J = model.jacobian(state)
+) -> tuple[csr_array | FloatArray, FloatArray]:
+    """J^T W J, a full array where the map is small, and J^T W r."""
     W = weights / model.network.sigmas_m**2
-    weighted = diags_array(W) @ J
-    return csr_array(J.T @ weighted), np.asarray(weighted.T @ residuals)
+    if model.size <= _DENSE:
+        J = model.dense_jacobian(state)
+        weighted = J * W[:, None]
+        return J.T @ weighted, residuals @ weighted
+    sparse = model.jacobian(state)
+    heavy = diags_array(W) @ sparse
+    return csr_array(sparse.T @ heavy), np.asarray(heavy.T @ residuals)
 
 
-def _solved(normal: csr_array, gradient: FloatArray, damping: float) -> FloatArray:
+def _solved(normal: csr_array | FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
     diagonal = normal.diagonal()
     # Unknowns that no range sees still get a damping, so that they stay where they are.
     floor = np.maximum(diagonal, 1e-6 * float(diagonal.max()))
-    if len(gradient) <= _DENSE:
-        dense = normal.toarray()
-        dense[np.diag_indices_from(dense)] += damping * floor
-        return np.asarray(cho_solve(cho_factor(dense, check_finite=False), gradient, check_finite=False))
-    damped = (normal + diags_array(damping * floor)).tocsc()
-    return np.asarray(splu(damped, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(gradient))
+    if isinstance(normal, np.ndarray):
+        damped = normal.copy()
+        damped[np.diag_indices_from(damped)] += damping * floor
+        return np.asarray(cho_solve(cho_factor(damped, check_finite=False), gradient, check_finite=False))
+    sparse = (normal + diags_array(damping * floor)).tocsc()
+    return np.asarray(splu(sparse, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(gradient))

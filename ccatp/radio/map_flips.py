@@ -5,14 +5,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.radio.map_batch import BatchFit, BatchSettings, fit_map
-from ccatp.radio.map_model import MapModel
+from ccatp.radio.map_batch import BatchFit, BatchSettings, fit_from_afar, fit_map
+from ccatp.radio.map_model import MapModel, MapState
 from ccatp.radio.range_network import FloatArray, RangeNetwork, components, graph_pairs
+from ccatp.radio.rigid_alignment import best_motion
 
 CLOSE = 9.0  # a mirror image that fits worse by less, in units of chi-squared, is as likely as not to be the truth
 _ROUNDS = 10
 _TRIALS = 400  # sets of motes looked at by whole fits; single motes are looked at by themselves
 _LOCAL_STEPS = 12
+_SKETCH_STEPS = 15  # of a fit from a mirror image, before it is known to lead anywhere
+_HOPELESS = 20.0  # times the best cost: such a fit ends in a worse fold
 
 
 class Fold(NamedTuple):
@@ -150,14 +153,29 @@ def _turn_sets(
         for image in _images(fit.state.positions_m[list(motes)], fit.state.positions_m[list(separator)]):
             places = fit.state.positions_m.copy()
             places[list(motes)] = image
-            other = fit_map(model, model.state(places, fit.state.offset_m, fit.state.scale), settings)
+            other = _tried(model, model.state(places, fit.state.offset_m, fit.state.scale), settings, fit.cost)
             gap = other.cost - fit.cost
-            moved = np.abs(other.state.positions_m - fit.state.positions_m).max()
+            moved_m = _moved_m(model.network, other.state.positions_m, fit.state.positions_m)
             if gap < -1e-6 * max(1.0, fit.cost):
                 fit, turned = other, turned + 1
-            elif gap < CLOSE and moved > 3.0 * float(model.network.sigmas_m.max()):
+            elif gap < CLOSE and moved_m > 3.0 * float(model.network.sigmas_m.max()):
                 near[tuple(motes)] = gap
     return fit, turned, near
+
+
+def _moved_m(network: RangeNetwork, one_m: FloatArray, other_m: FloatArray) -> float:
+    """The largest distance between two maps once one is laid on the other, as its own frame allows."""
+    if np.isnan(network.known_m).all():
+        one_m = best_motion(one_m, other_m, mirrors=not network.bodies).apply(one_m)
+    return float(np.linalg.norm(one_m - other_m, axis=1).max())
+
+
+def _tried(model: MapModel, start: MapState, settings: BatchSettings, best: float) -> BatchFit:
+    """A fit that is given up where its first steps do not bring it near the best cost so far."""
+    sketch = fit_from_afar(model, start, settings._replace(max_iterations=_SKETCH_STEPS))
+    if sketch.is_at_rest or sketch.cost > _HOPELESS * (best + CLOSE):
+        return sketch
+    return fit_map(model, sketch.state, settings)
 
 
 def _sets(

@@ -1,5 +1,6 @@
 """Pure. What the ranges of a network depend on: places of loose motes, poses of bodies, an offset and a scale."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,6 +49,9 @@ class MapModel:
         rows, axes = np.nonzero(is_free)
         self._loose_at: IntArray = loose[rows] * d + axes  # flat coordinate of each unknown of a loose mote
         self.body_size = d + d * (d - 1) // 2
+        self._body_at = [
+            (np.array(body.motes, dtype=np.intp)[:, None] * d + np.arange(d)).ravel() for body in network.bodies
+        ]
         self._bodies_from = len(self._loose_at)
         self.coordinates = self._bodies_from + self.body_size * len(network.bodies)
         self.size = self.coordinates + int(with_offset) + int(with_scale)
@@ -85,6 +89,25 @@ class MapModel:
             parts.append(csr_array(distances[:, None]))
         return csr_array(hstack(parts)) if len(parts) > 1 else csr_array(parts[0])
 
+    def dense_jacobian(self, state: MapState) -> FloatArray:
+        """The same as a full array: for small maps, where sparse arrays cost more than their zeros."""
+        distances, u = self._distances(state)
+        m, coordinates = len(u), self.network.count * self.network.dimension
+        rows = np.zeros((m, coordinates))
+        rows[np.arange(m)[:, None], self._indices.reshape(m, -1)] = (1.0 + state.scale) * np.concatenate(
+            [u, -u], axis=1
+        )
+        B = np.zeros((coordinates, self.coordinates))
+        for (at, cols), values in self._position_blocks(state):
+            B[at, cols] = values
+        J = np.empty((m, self.size))
+        J[:, : self.coordinates] = rows @ B
+        if self.with_offset:
+            J[:, self.coordinates] = 1.0
+        if self.with_scale:
+            J[:, -1] = distances
+        return J
+
     def range_rows(self, state: MapState, directions: FloatArray | None = None) -> csr_array:
         """dz/dp, the rigidity matrix with rows of unit length times 1 + s, shape (m, n d)."""
         u = self._distances(state)[1] if directions is None else directions
@@ -94,18 +117,21 @@ class MapModel:
 
     def position_jacobian(self, state: MapState) -> csr_array:
         """dp/dq without offset and scale, shape (n d, coordinates)."""
-        d = self.network.dimension
-        rows, cols, values = [self._loose_at], [np.arange(self._bodies_from)], [np.ones(self._bodies_from)]
-        for number, body in enumerate(self.network.bodies):
-            motes = np.array(body.motes, dtype=np.intp)
+        blocks = list(self._position_blocks(state))
+        rows = np.concatenate([at for (at, _), _ in blocks])
+        cols = np.concatenate([cols for (_, cols), _ in blocks])
+        values = np.concatenate([values for _, values in blocks])
+        shape = (self.network.count * self.network.dimension, self.coordinates)
+        return coo_array((values, (rows, cols)), shape=shape).tocsr()
+
+    def _position_blocks(self, state: MapState) -> Iterator[tuple[tuple[IntArray, IntArray], FloatArray]]:
+        """Rows, columns and values of dp/dq: of all loose motes, then of each body."""
+        yield (self._loose_at, np.arange(self._bodies_from)), np.ones(self._bodies_from)
+        for number, (body, at) in enumerate(zip(self.network.bodies, self._body_at, strict=True)):
             block = _body_block(body.local_m @ state.rotations[number].T)
-            at = (motes[:, None] * d + np.arange(d)).ravel()
             start = self._bodies_from + number * self.body_size
-            rows.append(np.repeat(at, self.body_size))
-            cols.append(np.tile(start + np.arange(self.body_size), len(at)))
-            values.append(block.ravel())
-        shape = (self.network.count * d, self.coordinates)
-        return coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))), shape=shape).tocsr()
+            cols = np.tile(start + np.arange(self.body_size), len(at))
+            yield (np.repeat(at, self.body_size), cols), block.ravel()
 
     def moved(self, state: MapState, step: FloatArray) -> MapState:
         """The state after a step of the unknowns, shape (size,)."""

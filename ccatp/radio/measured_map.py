@@ -28,7 +28,7 @@ from ccatp.radio.rigidity import find_freedom, generic_state
 from ccatp.radio.self_mapping import MapperSettings, MoteMapper, run_phase_two
 from ccatp.radio.tdoa import MoteRange
 
-_TELLING = 20.0  # a drop of chi-squared that chance gives one offset in a hundred thousand
+_TELLING = 12.0  # a drop of chi-squared that chance gives one offset in two thousand
 _WIDER = 1e4  # of variances: what a range that is used twice adds by its first use is then a ten-thousandth
 
 Places = Mapping[str, tuple[float, ...]]
@@ -187,11 +187,11 @@ def _hidden_offset(found: MoteMap, network: RangeNetwork, settings: BatchSetting
     """A word on an offset that the ranges show, where none is estimated."""
     model = MapModel(network, with_offset=True)
     state = model.state(found.positions_m, 0.0, found.scale)
-    without = fit_map(MapModel(network), state, settings)
-    shown = fit_map(model, state, settings)
+    plain = settings._replace(robust_scale=float("inf"))
+    without, shown = fit_map(MapModel(network), state, plain), fit_map(model, state, plain)
     if without.cost - shown.cost > _TELLING and len(network.ranges_m) > model.size:
         yield (
-            f"all ranges look {1e3 * shown.state.offset_m:.0f} mm long in common (chi-squared {without.cost:.0f} without, "
+            f"all ranges look {1e3 * shown.state.offset_m:.0f} mm long in common (chi-squared {without.cost:.0f}, "
             f"{shown.cost:.0f} with an offset); --offset estimates it"
         )
 

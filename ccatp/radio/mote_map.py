@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ccatp.radio.map_batch import BatchFit, BatchSettings, fit_map, position_covariance
+from ccatp.radio.map_batch import BatchFit, BatchSettings, fit_from_afar, position_covariance
 from ccatp.radio.map_flips import Fold, unfold
 from ccatp.radio.map_model import MapModel
 from ccatp.radio.map_patches import stitched
@@ -18,6 +18,7 @@ from ccatp.radio.unfolding import unfolded
 _SMALL = 130  # motes up to which the whole map is unfolded at once; beyond, it is stitched from patches
 _NORMAL_MAD = 1.4826  # standard deviation over the median absolute deviation of a normal distribution
 _SURE = 2.0  # a map whose cost per degree of freedom is less needs no other start
+_CORRECTIONS = 3  # times that the unfolding is repeated with ranges corrected by the offset found
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,18 +105,22 @@ def _mapped(
     mirrors: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...],
 ) -> MoteMap:
     model = MapModel(network, with_offset=with_offset, with_scale=with_scale)
-    plain = model if not (with_offset or with_scale) else MapModel(network)
-    dof_guess = max(len(network.ranges_m) - plain.size, 1)
     fits: list[BatchFit] = []
     for start in _starts(network, start_m):
-        fits.append(fit_map(plain, plain.state(start), settings))
-        if fits[-1].cost < _SURE * dof_guess:
+        fits.append(fit_from_afar(model, model.state(start), settings))
+        if _is_sure(model, fits[-1]):
             break
+    for _ in range(_CORRECTIONS if with_offset or with_scale else 0):
+        best = min(fits, key=lambda fit: fit.cost)
+        if _is_sure(model, best):
+            break
+        # An offset bends the map that the unfolding begins with: once more, with what is known of it by now.
+        ranges_m = np.maximum((network.ranges_m - best.state.offset_m) / (1.0 + best.state.scale), 0.0)
+        for start in _starts(replace(network, ranges_m=ranges_m), None):
+            state = model.state(start, best.state.offset_m, best.state.scale)
+            fits.append(fit_from_afar(model, state, settings))
     best = min(fits, key=lambda fit: fit.cost)
     steps = sum(fit.iterations for fit in fits)
-    if plain is not model:
-        best = fit_map(model, best.state, settings)
-        steps += best.iterations
     found = unfold(model, repaired(model, best, settings), settings, mirrors)
     fit = found.fit
     covariance, free = position_covariance(model, fit)
@@ -135,6 +140,10 @@ def _mapped(
         free=free,
         folds=found.doubtful,
     )
+
+
+def _is_sure(model: MapModel, fit: BatchFit) -> bool:
+    return fit.cost < _SURE * max(len(model.network.ranges_m) - model.size, 1)
 
 
 def _starts(network: RangeNetwork, given_m: FloatArray | None) -> Iterator[FloatArray]:

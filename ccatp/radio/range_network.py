@@ -172,19 +172,15 @@ def _check_row(row: MoteRange, index: dict[str, int]) -> None:
 
 
 def _check_connected(network: RangeNetwork) -> None:
-    labels = components(network.count, graph_pairs(network))
-    if labels.max() == 0 or _parts_known(network, labels):
-        return
+    # Motes whose places are known hang together without any range.
+    known = np.flatnonzero(np.isfinite(network.known_m).all(axis=1))
+    linked = np.concatenate([graph_pairs(network), np.column_stack([known[:-1], known[1:]])])
+    labels = components(network.count, linked)
     sizes = np.bincount(labels)
-    least = int(np.argmin(sizes))
-    lost = [network.names[mote] for mote in np.flatnonzero(labels == least)]
+    if len(sizes) == 1:
+        return
+    lost = [network.names[mote] for mote in np.flatnonzero(labels == sizes.argmin())]
     raise Disconnected(
         f"the motes fall into {len(sizes)} parts with no range between them: {list_names(lost)} on one side; "
         "measure a range across, or map the parts one by one"
     )
-
-
-def _parts_known(network: RangeNetwork, labels: IntArray) -> bool:
-    """Whether every part has known coordinates of its own to hang on."""
-    known = np.flatnonzero(np.isfinite(network.known_m).all(axis=1))
-    return bool((np.bincount(labels[known], minlength=int(labels.max()) + 1) >= network.dimension).all())

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -103,11 +104,23 @@ def rigid_parts(moves: FloatArray, points: FloatArray, extra: int) -> tuple[tupl
     covered = np.eye(count, dtype=bool)
     for i in range(count):
         for j in np.flatnonzero(holds[i] & ~covered[i]):
-            members = np.flatnonzero(holds[i] & holds[j])
+            if covered[i, j]:
+                continue
+            members = _clique(holds, i, int(j))
             covered[np.ix_(members, members)] = True
-            parts.append(tuple(members.tolist()))
+            parts.append(tuple(members))
     alone = [(mote,) for mote in range(count) if not any(mote in part for part in parts)]
     return tuple(sorted({*parts, *alone}, key=lambda part: (-len(part), part)))
+
+
+def _clique(holds: NDArray[np.bool_], first: int, second: int) -> list[int]:
+    """Motes that keep all their distances, two given ones among them: in space two alone do not tell the others."""
+    left, chosen = holds[first] & holds[second], [first, second]
+    while (rest := np.setdiff1d(np.flatnonzero(left), chosen)).size:
+        chosen.append(int(rest[0]))
+        left = left & holds[rest[0]]
+        left[chosen] = True
+    return sorted(chosen)
 
 
 def _null_space(model: MapModel, state: MapState) -> FloatArray:

@@ -96,6 +96,7 @@ def _moving(cfg: RadioConfig, sigma_db: float) -> MovingRadio:
         estimator.target_course_time_s,
         sigma_db,
         cfg.path_loss.shadowing_length_m,
+        cfg.workspace.size_m,
     )
 
 

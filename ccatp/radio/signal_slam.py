@@ -19,7 +19,6 @@ from ccatp.radio.slam import BeaconEstimate, Learned
 
 _POSE_COLUMNS = columns_of(range(POSE))
 _ITERATIONS = 4
-_FIRST_ITERATIONS = 10
 _WIDE = 10.0  # spread of a radio before its first reading, in ranges of that reading
 _NEAREST_M = 0.02  # nearer than that a distance has no derivative worth the name
 
@@ -123,13 +122,13 @@ class SignalSlam:
         self.learned = []
         waiting = []
         for reading in readings:
-            if reading.beacon in self.engine:
-                found = self._update(reading)
-                self.learned.append(Learned(reading.beacon, found.residual, found.nis, found.size, found.accepted))
-            elif not self._is_moving(reading.beacon):
+            is_known = reading.beacon in self.engine
+            if is_known or self._is_moving(reading.beacon):
+                found = self._update_moving(reading) if self._is_moving(reading.beacon) else self._update(reading)
+                if found is not None and is_known:
+                    self.learned.append(Learned(reading.beacon, found.residual, found.nis, found.size, found.accepted))
+            else:
                 waiting.append(reading)
-            elif reading.bearing_rad is not None:
-                self._meet(reading, reading.bearing_rad)
         self._wait(waiting)
         return self.learned
 
@@ -188,9 +187,7 @@ class SignalSlam:
         range_m = self.path_loss_of(reading.beacon).median_range_m(reading.rssi_dbm)
         way_rad = pose[2] + bearing_rad
         spread = [_WIDE * range_m] * PLACE
-        if self._is_moving(reading.beacon) and settings.moving is not None:
-            spread += settings.moving.prior_sigmas
-        elif settings.shadowing is not None:
+        if settings.shadowing is not None:
             spread += [1.0] * settings.shadowing.size
         mean = np.zeros(len(spread))
         mean[:PLACE] = pose[0] + range_m * cos(way_rad), pose[1] + range_m * sin(way_rad)
@@ -200,12 +197,6 @@ class SignalSlam:
         none: Columns = np.empty(0, dtype=np.intp)
         size = prior.mean.size
         self.engine.augment(beacon, prior.mean, none, np.zeros((size, 0)), np.eye(size), np.diag(prior.sigmas**2))
-
-    def _meet(self, reading: RssiReading, bearing_rad: float) -> None:
-        """The radio that moves joins at once: it would be elsewhere later."""
-        self._augment(reading.beacon, self._prior(reading, bearing_rad, self.engine.mean[:POSE].tolist()))
-        rows = self._rows([self._sight(reading, 0)], reading.beacon, self.engine.block(reading.beacon))
-        self.engine.update_iterated(rows.columns, rows.linearise, rows.variances, _FIRST_ITERATIONS)
 
     def _wait(self, readings: list[RssiReading]) -> None:
         """Readings of static radios that are not on the map yet."""
@@ -258,6 +249,18 @@ class SignalSlam:
         gate = self.settings.gates[rows.variances.size - 1]
         return self.engine.update_iterated(rows.columns, rows.linearise, rows.variances, _ITERATIONS, gate)
 
+    def _update_moving(self, reading: RssiReading) -> Update | None:
+        """The radio that moves joins at its first bearing: it would be elsewhere later."""
+        settings, moving = self.settings, self.settings.moving
+        if moving is None:
+            return None
+        if reading.beacon not in self.engine:
+            if reading.bearing_rad is None:
+                return None
+            moving.join(self.engine, reading.bearing_rad)
+        path_loss = self.path_loss_of(reading.beacon)
+        return moving.update(self.engine, reading, path_loss, settings.bearing_sigma_rad, settings.gates)
+
     def _rows_at(self, records: list[Record], pose_at: Callable[[PoseKey], int], radio: slice) -> Rows:
         sights = []
         for record in records:
@@ -277,8 +280,6 @@ class SignalSlam:
     def _shadow(self, beacon: BeaconId, x_m: float, y_m: float) -> tuple[FloatArray, float]:
         """Derivatives of a level by the shadowing states, which end a radio's block, and the variance of the rest."""
         settings = self.settings
-        if self._is_moving(beacon) and settings.moving is not None:
-            return settings.moving.shadowing_row, 0.0
         if settings.shadowing is None:
             return np.empty(0), settings.shadowing_sigma_db**2
         return settings.shadowing.row(x_m, y_m)

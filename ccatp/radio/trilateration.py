@@ -9,6 +9,9 @@ from ccatp.radio.multilateration import MultilaterationError, Solution, multilat
 from ccatp.radio.pair_means import PairMeans
 from ccatp.radio.range_network import FloatArray, MappingError, list_names
 
+_APART = 10.0  # sigmas between two solutions that are not the same one
+_ALIKE = 9.0  # difference of chi-squared up to which a mirror image may as well be the truth
+
 
 class DegenerateStep(MappingError):
     """A step of phase 1 whose geometry does not determine a mote well enough."""
@@ -160,7 +163,15 @@ class Sketch:
                 refusal = str(error)
         if not found:
             raise DegenerateStep(f"{self._names[mote]} from {self._listed(references)}: {refusal}")
-        return min(found, key=lambda solution: solution.chi_squared)
+        best, *others = sorted(found, key=lambda solution: solution.chi_squared)
+        for other in others:
+            apart_m = float(np.linalg.norm(other.position_m - best.position_m))
+            if apart_m > _APART * float(sigmas.max()) and other.chi_squared - best.chi_squared < _ALIKE:
+                raise DegenerateStep(
+                    f"{self._names[mote]} from {self._listed(references)}: the mirror image across them, "
+                    f"{apart_m:.3g} m away, fits as well; spread the motes it is measured from"
+                )
+        return best
 
     def _insert(self, mote: int, place: FloatArray, own: FloatArray, inherited: FloatArray) -> None:
         """A place with its own covariance (d, d) and its derivatives by all coordinates before it (d, n d)."""
@@ -192,16 +203,17 @@ class Sketch:
 
 
 def _starts(anchors: FloatArray, ranges: FloatArray) -> list[FloatArray]:
-    """Where to begin: the solution of the differences of squared ranges, and its mirror image across the references."""
+    """Where to begin: the solution of the differences of squared ranges, on both sides of the references.
+
+    The differences tell little of the height above references that are nearly flat; the mean of the squared ranges
+    tells how much is missing.
+    """
     centre = anchors.mean(axis=0)
     offsets = anchors - centre
-    squares = ranges**2 - (offsets**2).sum(axis=1)
+    arms = (offsets**2).sum(axis=1)
+    squares = ranges**2 - arms
     linear = np.linalg.lstsq(-2.0 * offsets, squares - squares.mean(), rcond=1e-6)[0]
     normal = np.linalg.svd(offsets)[2][-1]
-    height = float(linear @ normal)
-    # The differences tell little of the height above nearly flat references; one range tells how much is missing.
-    flat = linear - height * normal
-    missing = float(
-        np.sqrt(max(float(np.mean(ranges**2)) - float(flat @ flat) - float(np.mean((offsets**2).sum(axis=1))), 1e-12))
-    )
-    return [centre + flat + missing * normal, centre + flat - missing * normal]
+    flat = linear - float(linear @ normal) * normal
+    height = float(np.sqrt(max(float(np.mean(squares)) - float(flat @ flat), 1e-12)))
+    return [centre + flat + height * normal, centre + flat - height * normal]

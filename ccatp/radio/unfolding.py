@@ -102,8 +102,8 @@ class _Stress:
         rows = np.concatenate([units, -units], axis=1)
         weighted = self._weights[:, None] * rows
         blocks = weighted[:, :, None] * rows[:, None, :]
-        summed = np.bincount(self._cells, blocks.ravel(), self._size**2)
-        normal: FloatArray = summed.reshape(self._size, self._size)
+        summed = np.asarray(np.bincount(self._cells, blocks.ravel(), self._size**2), dtype=np.float64)
+        normal = summed.reshape(self._size, self._size)
         pull = np.bincount(self._at, (errors[:, None] * weighted).ravel(), self._size)
         normal[np.diag_indices_from(normal)] += np.tile(self._penalty, self._count) + damping
         gradient = pull - (places * self._penalty).ravel()

@@ -159,9 +159,7 @@ STUDY = Study(
     run_job=run_job,
     combine=combine,
     columns=(
-        Column("case", "case"),
         Column("figure", "figure"),
-        Column("runs", "runs"),
         Column("after phase 1, m", "phase1_rms_m", ".4f"),
         Column("p10, m", "rms_m.p10", ".4f"),
         Column("median, m", "rms_m.p50", ".4f"),

@@ -66,7 +66,7 @@ def outcome_of(cfg: RadioConfig, run: RadioRun) -> Outcome:
         "heading_rad": _rms(np.array(run.pose_errors)[:, 2]),
         "nis": [sum(nis for nis, _ in run.nis), sum(size for _, size in run.nis)],
         "nees": list(run.joint_nees),
-        "clearance_m": min(run.clearances_m),
+        "collided": min(run.clearances_m) < 0.0,
     }
     arrays = {"beacons_m": _curve(np.array([_from_first(run.beacon_errors_m[name], len(truth)) for name in names]))}
     if run.targets:
@@ -100,7 +100,7 @@ def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
         "nis_band": _band(rows),
         "nees": nees / max(states, 1.0),
         "nees_band": _band(states),
-        "collisions": sum(run["clearance_m"] < 0.0 for run in runs),
+        "collisions": sum(run["collided"] for run in runs),
     }
     if "target_m" in runs[0]:
         values |= {

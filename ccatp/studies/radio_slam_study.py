@@ -7,9 +7,9 @@ from ccatp.studies.campaign import Cell, CellResult, Study
 from ccatp.studies.radio_cell import COLUMNS, combine, run_job
 from ccatp.studies.radio_figures import draw_errors
 
-SLIP = {"sim.vehicle.slip": 0.05, "odometry.slip_sigma": 0.05}
-DRIFT = {"sim.vehicle.heading_drift_rad_s": 0.0087, "odometry.heading_drift_sigma_rad_s": 0.01}
-SHADOW = {"sim.radio.shadowing_sigma_db": 5.0, "path_loss.shadowing_sigma_db": 5.0}
+SLIP: dict[str, object] = {"sim.vehicle.slip": 0.05, "odometry.slip_sigma": 0.05}
+DRIFT: dict[str, object] = {"sim.vehicle.heading_drift_rad_s": 0.0087, "odometry.heading_drift_sigma_rad_s": 0.01}
+SHADOW: dict[str, object] = {"sim.radio.shadowing_sigma_db": 5.0, "path_loss.shadowing_sigma_db": 5.0}
 CONDITIONS: dict[str, dict[str, object]] = {
     "white": {},
     "slip 5 %": SLIP,

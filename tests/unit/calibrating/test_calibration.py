@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,10 @@ def test_a_drive_has_a_segment_for_each_leg(drive: Drive) -> None:
     assert drive.encoder_sigma_rad_s == pytest.approx(0.001, rel=0.1)  # of the world
     assert drive.encoder_period_s == pytest.approx(0.001)
     assert drive.gyro_sigma_rad_s == pytest.approx(0.0087, rel=0.15)
+    for segment in drive.segments:  # no frame is left out
+        assert segment.motions[0][0] == 0
+        assert segment.motions[-1][1] == len(segment.right_rad)
+        assert all(one[1] == other[0] for one, other in pairwise(segment.motions))
     # a turn in place and the way behind it are parted
     assert max(len(segment.motions) for segment in drive.segments) >= 2
 
@@ -158,10 +163,14 @@ def test_misuse(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_over_many_robots_errors_are_as_large_as_stated(
     world: str, changes: dict[str, object], mean_slip: float
 ) -> None:
-    found = []
+    found, offsets = [], []
     for seed in range(1, 25):
         one = CalibrationDrive(seed, world, 3, changes)
-        found.append(nees(calibrate(one.mirror, one.drive, priors(one.cfg)), one.truth(mean_slip)))
+        result, truth = calibrate(one.mirror, one.drive, priors(one.cfg)), one.truth(mean_slip)
+        found.append(nees(result, truth))
+        offsets.append((np.array((result.radius_m, result.base_m, result.bias_rad_s)) - truth) / result.sigmas)
     low, high = float(chi2.ppf(0.001, 3 * len(found))), float(chi2.ppf(0.999, 3 * len(found)))
     print(f"{world}: NEES mean {np.mean(found):.2f} of 3, allowed {low / len(found):.2f} to {high / len(found):.2f}")
     assert low < sum(found) < high
+    # One way or the other: an error common to all drives, as of a wheel's last run-down left out, is no noise.
+    assert np.abs(np.mean(offsets, axis=0)) == pytest.approx(0.0, abs=3.5 / np.sqrt(len(offsets)))

@@ -6,7 +6,7 @@ import pytest
 
 from ccatp.config.loader import load_config
 from ccatp.dashboard.metrics import metrics_text
-from ccatp.dashboard.view import View
+from ccatp.dashboard.survey_view import SurveyView
 from ccatp.mirror.mirror import build_mirror
 from tests.unit.dashboard.prometheus import parse
 
@@ -64,7 +64,7 @@ def test_a_name_with_everything_that_has_to_be_escaped() -> None:
 
 def test_the_state_of_a_real_view() -> None:
     cfg = load_config(None, {"run.panels": 1})
-    view = View(build_mirror(cfg.mirror), cfg, is_sim=True)
+    view = SurveyView(build_mirror(cfg.mirror), cfg, is_sim=True)
     assert parse(metrics_text(view.status_data(1.0), "fyst-m1", 0))["ccatp_up"].samples == {"": 0.0}
 
 

@@ -1,13 +1,12 @@
 """Where the dashboard listens, and what is said when it cannot."""
 
 import socket
-from pathlib import Path
 
 import pytest
 
 from ccatp.config.models import Config
 from ccatp.processes import page_socket
-from ccatp.processes.page_socket import note_run_dir, open_page_socket, page_url
+from ccatp.processes.page_socket import open_page_socket, page_url
 
 
 def test_none_is_wanted(config: Config) -> None:
@@ -56,12 +55,3 @@ def test_no_port_at_all(config: Config, monkeypatch: pytest.MonkeyPatch) -> None
 def test_addresses() -> None:
     assert page_url("127.0.0.1", 7080) == "http://127.0.0.1:7080/"
     assert page_url("::1", 7080) == "http://[::1]:7080/"
-
-
-def test_the_word_left_in_the_runtime_directory(tmp_path: Path) -> None:
-    for name in ("first", "second"):
-        (tmp_path / name).mkdir()
-        note_run_dir(tmp_path, tmp_path / name)
-        assert (tmp_path / "run").resolve() == (tmp_path / name).resolve()
-    assert {path.name for path in tmp_path.iterdir()} == {"first", "run", "second"}
-    note_run_dir(tmp_path / "nowhere", tmp_path)  # a display less, and no survey

@@ -73,6 +73,8 @@ def test_the_page_of_a_whole_run(page: str) -> None:
     assert markup.outside == []
     assert markup.anchors == ALL
     assert f'content="{POLICY}"' in page
+    assert POLICY.startswith("default-src 'none';")
+    assert "script-src" not in POLICY
     assert "url(" not in page
     assert "@import" not in page
     assert "SIMULATION, world hard, seed 1" in page

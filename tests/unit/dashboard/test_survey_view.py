@@ -11,7 +11,7 @@ import pytest
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
 from ccatp.dashboard.ground import ARRIVED, MEASURED, SKIPPED, ground
-from ccatp.dashboard.view import View
+from ccatp.dashboard.survey_view import SurveyView
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.samples import DeckPose, EventCode, PanelId, PanelPose, PointId, Severity, Verdict
 from ccatp.wire.topics import (
@@ -44,8 +44,8 @@ def mirror(cfg: Config) -> Mirror:
 
 
 @pytest.fixture
-def view(mirror: Mirror, cfg: Config) -> View:
-    return View(mirror, cfg, is_sim=True)
+def view(mirror: Mirror, cfg: Config) -> SurveyView:
+    return SurveyView(mirror, cfg, is_sim=True)
 
 
 def mission(**fields: Any) -> MissionStatus:
@@ -80,14 +80,14 @@ def encoded(state: dict[str, Any]) -> dict[str, Any]:
     return told
 
 
-def test_before_anything_was_heard(view: View) -> None:
+def test_before_anything_was_heard(view: SurveyView) -> None:
     state = encoded(view.news(0.0))
     assert state["mission"] is state["pose"] is state["verdict"] is state["robot"] is None
     assert state["points"] == state["path"] == state["log"] == []
     assert state["is_sim"] is True
 
 
-def test_levels_are_there_each_time(view: View) -> None:
+def test_levels_are_there_each_time(view: SurveyView) -> None:
     view.hear(mission(), 1.0)
     view.hear(picture(), 1.0)
     for _ in range(2):
@@ -101,7 +101,7 @@ def test_levels_are_there_each_time(view: View) -> None:
         }  # fmt: skip
 
 
-def test_the_next_point_is_known_on_the_way_to_other_stops_too(view: View, mirror: Mirror) -> None:
+def test_the_next_point_is_known_on_the_way_to_other_stops_too(view: SurveyView, mirror: Mirror) -> None:
     view.hear(mission(point="1-2-9"), 1.0)
     assert view.news(1.0)["mission"]["next_point"] == "1-2-9"
     view.hear(mission(point=""), 1.1)
@@ -112,7 +112,7 @@ def test_the_next_point_is_known_on_the_way_to_other_stops_too(view: View, mirro
     assert view.news(1.3)["mission"]["next_point"] == ""
 
 
-def test_a_status_gets_stale(view: View) -> None:
+def test_a_status_gets_stale(view: SurveyView) -> None:
     view.hear(mission(), 1.0)
     assert not view.news(1.9)["mission"]["is_stale"]
     assert view.news(2.1)["mission"]["is_stale"]
@@ -120,7 +120,7 @@ def test_a_status_gets_stale(view: View) -> None:
     assert not view.news(9.0)["mission"]["is_stale"]
 
 
-def test_a_point_from_arrival_to_measured(view: View, mirror: Mirror) -> None:
+def test_a_point_from_arrival_to_measured(view: SurveyView, mirror: Mirror) -> None:
     point = view.points[0]
     view.hear(Arrival(seq=8, t_s=2.0, point=(point.row, point.col, point.point), error_mm=0.3), 2.0)
     assert view.news(2.0)["points"] == [[0, ARRIVED, None]]
@@ -136,21 +136,21 @@ def test_a_point_from_arrival_to_measured(view: View, mirror: Mirror) -> None:
     assert view.news(2.2)["points"] == []  # measured stays measured
 
 
-def test_a_fix_that_is_refused_measures_nothing(view: View, mirror: Mirror) -> None:
+def test_a_fix_that_is_refused_measures_nothing(view: SurveyView, mirror: Mirror) -> None:
     view.hear(fix_at(mirror, view.points[0], 0.0, is_fused=False), 2.0)
     state = view.news(2.0)
     assert state["points"] == []
     assert state["series"] == {}
 
 
-def test_a_fix_without_a_point_finds_the_robot_only(view: View, mirror: Mirror) -> None:
+def test_a_fix_without_a_point_finds_the_robot_only(view: SurveyView, mirror: Mirror) -> None:
     view.hear(fix_at(mirror, None, 0.0), 2.0)
     state = view.news(2.0)
     assert state["points"] == []
     assert set(state["series"]) == {"jump"}
 
 
-def test_a_fix_far_from_the_mirror_has_no_error(view: View, mirror: Mirror) -> None:
+def test_a_fix_far_from_the_mirror_has_no_error(view: SurveyView, mirror: Mirror) -> None:
     fix = msgspec.structs.replace(fix_at(mirror, view.points[0], 0.0), position_m=(1e3, 1e3, 1e3))
     view.hear(fix, 2.0)
     state = view.news(2.0)
@@ -158,14 +158,14 @@ def test_a_fix_far_from_the_mirror_has_no_error(view: View, mirror: Mirror) -> N
     assert "arrival" not in state["series"]
 
 
-def test_points_left_out(view: View, mirror: Mirror) -> None:
+def test_points_left_out(view: SurveyView, mirror: Mirror) -> None:
     view.hear(fix_at(mirror, view.points[1], 0.0), 2.0)
     names = [f"{p.row}-{p.col}-{p.point}" for p in view.points[:2]]
     view.hear(mission(left_out={"no fix": names, "other": ["99-9-9"]}), 2.0)
     assert [row[:2] for row in view.news(2.0)["points"]] == [[0, SKIPPED], [1, MEASURED]]
 
 
-def test_the_path_as_it_is_driven_and_in_simulation_against_the_truth(view: View, mirror: Mirror) -> None:
+def test_the_path_as_it_is_driven_and_in_simulation_against_the_truth(view: SurveyView, mirror: Mirror) -> None:
     view.is_tracking = True
     rows, truths = [], []
     for k in range(300):
@@ -182,13 +182,13 @@ def test_the_path_as_it_is_driven_and_in_simulation_against_the_truth(view: View
 
 
 def test_without_a_truth_sigma_alone_is_shown(mirror: Mirror, cfg: Config) -> None:
-    view = View(mirror, cfg, is_sim=False)
+    view = SurveyView(mirror, cfg, is_sim=False)
     rows = [(k, 0.01 * k, 1, 2, 0.0, 0.0, 0.0, 0.002) for k in range(250)]
     view.hear(Track(seq=249, t_s=2.5, rows=rows), 2.5)
     assert view.news(2.5)["series"]["error"] == [(0.0, None, 6.0), (1.0, None, 6.0), (2.0, None, 6.0)]
 
 
-def test_stops_are_the_path_where_nobody_looked(view: View, mirror: Mirror) -> None:
+def test_stops_are_the_path_where_nobody_looked(view: SurveyView, mirror: Mirror) -> None:
     for k in (0, 1):
         view.hear(fix_at(mirror, view.points[k], 0.0, t_s=float(k)), float(k))
     assert len(view.news(2.0)["path"]) == 2
@@ -197,14 +197,14 @@ def test_stops_are_the_path_where_nobody_looked(view: View, mirror: Mirror) -> N
     assert view.news(3.0)["path"] == []
 
 
-def test_innovations_are_told_when_they_change(view: View) -> None:
+def test_innovations_are_told_when_they_change(view: SurveyView) -> None:
     view.hear(picture(1.0, nis=2.0), 1.0)
     view.hear(picture(1.1, nis=2.0), 1.1)
     view.hear(picture(1.2, nis=3.5), 1.2)
     assert view.news(1.2)["series"]["nis"] == [(1.0, 2.0, 2), (1.2, 3.5, 2)]
 
 
-def test_a_picture_before_the_first_frame(view: View) -> None:
+def test_a_picture_before_the_first_frame(view: SurveyView) -> None:
     view.hear(picture(line=b"null"), 1.0)
     state = view.news(1.0)
     assert state["robot"] is None
@@ -213,7 +213,7 @@ def test_a_picture_before_the_first_frame(view: View) -> None:
     assert view.news(1.1)["pose"] is None
 
 
-def test_the_verdict_and_its_cause(view: View) -> None:
+def test_the_verdict_and_its_cause(view: SurveyView) -> None:
     verdict = Verdict(
         seq=4, t_s=1.0, code=EventCode.NEAR_EDGE, cause="edge", signal="front_left", value=0.006, limit=0.005,
         forward=False, reverse=True, turn=False, off=(True, False, False, False), severity=Severity.NONE,
@@ -227,7 +227,7 @@ def test_the_verdict_and_its_cause(view: View) -> None:
     assert view.news(2.5)["verdict"]["is_stale"]
 
 
-def test_a_danger_event_is_a_line_as_well(view: View) -> None:
+def test_a_danger_event_is_a_line_as_well(view: SurveyView) -> None:
     event = DangerEvent(
         seq=4, t_s=1.25, code=2, cause="fire", signal="emergency:fire", value=1.0, limit=0.0, off=(False,) * 4,
         severity=5,
@@ -241,7 +241,7 @@ def test_a_danger_event_is_a_line_as_well(view: View) -> None:
     assert view.news(2.0)["log"] == [(2.0, "info", "joined")]
 
 
-def test_other_things_on_the_map(view: View) -> None:
+def test_other_things_on_the_map(view: SurveyView) -> None:
     assert "shapes" not in view.news(1.0)
     beacon = Shape(id="b1", kind="beacon", x_m=1.0, y_m=2.0, covariance_m2=(0.1, 0.0, 0.1), label="b1")
     wall = Shape(id="w", kind="obstacle", x_m=0.0, y_m=0.0, outline_m=[(0.0, 0.0), (1.0, 0.0), (0.0, 0.0)])
@@ -254,7 +254,7 @@ def test_other_things_on_the_map(view: View) -> None:
     assert len(view.everything(1.1)["shapes"]) == 2
 
 
-def test_everything_is_the_sum_of_the_news(view: View, mirror: Mirror) -> None:
+def test_everything_is_the_sum_of_the_news(view: SurveyView, mirror: Mirror) -> None:
     points: dict[int, list[Any]] = {}
     path: list[Any] = []
     arrivals: list[Any] = []
@@ -270,7 +270,7 @@ def test_everything_is_the_sum_of_the_news(view: View, mirror: Mirror) -> None:
     assert everything["series"]["arrival"] == arrivals
 
 
-def test_what_was_measured_before_is_there(view: View, mirror: Mirror) -> None:
+def test_what_was_measured_before_is_there(view: SurveyView, mirror: Mirror) -> None:
     fixes = [fix_at(mirror, view.points[k], 0.001, t_s=10.0 - k) for k in range(3)]
     measured = [(view.points[k], fix.t_s, fix.position_m) for k, fix in enumerate(fixes)]
     elsewhere = (PointId(5, 5, 5), 1.0, fixes[0].position_m)
