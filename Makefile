@@ -15,7 +15,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
-.PHONY: help run test test-slow faults lint format fast lock clean
+.PHONY: help run test test-slow chromium faults docs lint format fast lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -24,6 +24,7 @@ help:
 	@echo "make test             lint, types, import contract, tests"
 	@echo "make test-slow        the tests that take minutes, and new random examples"
 	@echo "make faults           docs/fault_table.md from what the last test runs showed and measured"
+	@echo "make docs             build/docs/index.html, and the parts of docs/ that are made from the code"
 	@echo "make lint             lint, types, import contract"
 	@echo "make format           format the code"
 	@echo "make fast             a compiled build beside it, for campaigns: $(FAST_VENV)/bin/ccatp; needs a C compiler"
@@ -33,8 +34,14 @@ help:
 run: $(VENV)/.installed
 	@$(BIN)/ccatp run --sim $(ARGS)
 
-test: lint
+test: lint chromium
 	$(PYTEST) $(PYTEST_ARGS)
+
+# The page is tried in a real browser where there is one.
+chromium:
+	@command -v chromium >/dev/null || { test "$$(id -u)" = 0 && command -v apt-get >/dev/null && echo "ccatp: installing chromium" && \
+		{ apt-get install -y -qq chromium || { apt-get update -qq && apt-get install -y -qq chromium; }; } >/dev/null 2>&1; } || \
+		echo "ccatp: no chromium, so the tests of the page in a browser are skipped; on Debian: apt install chromium"
 
 test-slow: $(VENV)/.installed-dev
 	$(PYTEST) -m slow $(PYTEST_ARGS)
@@ -42,6 +49,11 @@ test-slow: $(VENV)/.installed-dev
 
 faults: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.faults.page
+
+docs: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.docs.generated
+	$(BIN)/python -m sphinx -W -q -b html docs build/docs
+	@echo "ccatp: build/docs/index.html"
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check

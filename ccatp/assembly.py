@@ -47,23 +47,7 @@ class Parts:
 
     def check_robot(self, hello: Hello) -> None:
         """Refuse a robot whose own geometry contradicts the configuration."""
-        robot, own = self.cfg.robot, hello.robot
-        problems = [
-            f"{name} is {ours} here and {theirs} there"
-            for name, ours, theirs in (
-                ("wheel_radius_m", robot.wheel_radius_m, own.wheel_radius_m),
-                ("wheel_base_m", robot.wheel_base_m, own.wheel_base_m),
-            )
-            if abs(ours - theirs) > RADIUS_TOLERANCE * theirs
-        ]
-        for ours, theirs in zip(robot.edge_sensors_m, own.edge_sensors_m, strict=True):
-            if hypot(ours[0] - theirs[0], ours[1] - theirs[1]) > SENSOR_TOLERANCE_M:
-                problems.append(f"an edge sensor is at {ours} here and at {tuple(theirs)} there")
-        puck = own.puck_m
-        if hypot(puck[0], puck[1], puck[2] - robot.puck_height_m) > SENSOR_TOLERANCE_M:
-            problems.append(f"the puck is at (0, 0, {robot.puck_height_m}) here and at {tuple(puck)} there")
-        if self.mirror.overhang and own.fan_floor <= 0.0:
-            problems.append("the mirror overhangs and the robot has no fan floor")
+        problems = robot_problems(self.cfg, self.mirror, hello)
         if problems:
             raise ConfigError(f"robot: the configuration is not of this robot: {'; '.join(problems)}")
 
@@ -146,6 +130,28 @@ def build_gate(cfg: Config) -> DriveGate:
         cfg.mission.verdict_timeout_s,
         robot.sensors_timeout_s,
     )
+
+
+def robot_problems(cfg: Config, mirror: Mirror, hello: Hello) -> list[str]:
+    """In what the robot's own geometry contradicts the configuration; empty where it does not."""
+    robot, own = cfg.robot, hello.robot
+    problems = [
+        f"{name} is {ours} here and {theirs} there"
+        for name, ours, theirs in (
+            ("wheel_radius_m", robot.wheel_radius_m, own.wheel_radius_m),
+            ("wheel_base_m", robot.wheel_base_m, own.wheel_base_m),
+        )
+        if abs(ours - theirs) > RADIUS_TOLERANCE * theirs
+    ]
+    for ours, theirs in zip(robot.edge_sensors_m, own.edge_sensors_m, strict=True):
+        if hypot(ours[0] - theirs[0], ours[1] - theirs[1]) > SENSOR_TOLERANCE_M:
+            problems.append(f"an edge sensor is at {ours} here and at {tuple(theirs)} there")
+    puck = own.puck_m
+    if hypot(puck[0], puck[1], puck[2] - robot.puck_height_m) > SENSOR_TOLERANCE_M:
+        problems.append(f"the puck is at (0, 0, {robot.puck_height_m}) here and at {tuple(puck)} there")
+    if mirror.overhang and own.fan_floor <= 0.0:
+        problems.append("the mirror overhangs and the robot has no fan floor")
+    return problems
 
 
 def _build_localizer(cfg: Config, mirror: Mirror, recovery: Recovery | None) -> Localizer:

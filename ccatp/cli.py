@@ -2,7 +2,7 @@
 
 import json
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,9 @@ import click
 import ccatp
 from ccatp.cli_align import align
 from ccatp.cli_bench import bench
+from ccatp.cli_calibrate import calibrate
+from ccatp.cli_check import check
+from ccatp.cli_completion import completion
 from ccatp.cli_conformance import conformance
 from ccatp.cli_dashboard import dashboard
 from ccatp.cli_frame import (
@@ -19,6 +22,7 @@ from ccatp.cli_frame import (
     FAULTS_OPTION,
     RUNTIME_DIR_OPTION,
     WORLD_OPTIONS,
+    NearestChoice,
     SuggestingGroup,
     ask_daemon,
     ask_over_tcp,
@@ -28,6 +32,7 @@ from ccatp.cli_frame import (
     options,
     overrides,
     run_command_line,
+    tell,
 )
 from ccatp.cli_keys import keys
 from ccatp.cli_log import log
@@ -35,6 +40,7 @@ from ccatp.cli_plan import plan
 from ccatp.cli_radio import radio
 from ccatp.cli_replay import replay
 from ccatp.cli_report import compare, report
+from ccatp.cli_status import status
 from ccatp.cli_stream import stream
 from ccatp.cli_study import study
 from ccatp.package import COMPILED, build
@@ -98,7 +104,7 @@ def run(
     if not sim and config_file is None:
         raise click.UsageError("name the robot's configuration with --config FILE, or add --sim")
     from ccatp.run_options import RunOptions
-    from ccatp.supervisor import run_survey
+    from ccatp.supervisor import run as run_to_the_end
 
     if faults_file is not None:
         from ccatp.fault_plan import read_plan
@@ -112,7 +118,7 @@ def run(
         "run.filter": filter_name,
     }
     return int(
-        run_survey(
+        run_to_the_end(
             RunOptions(
                 sim=sim,
                 config_file=config_file,
@@ -139,39 +145,32 @@ def _daemon_options(command: Any) -> Any:
     )(command)
 
 
-@cli.command(epilog=example("ccatp status", "ccatp status --json"))
-@_daemon_options
-def status(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
-    """Show what the running daemon is doing."""
-    _tell(_ask("status", config_file, runtime_dir, timeout_s), json_output)
-
-
 @cli.command(epilog=example("ccatp pause"))
 @_daemon_options
 def pause(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
     """Stop the robot where it is, until resume."""
-    _tell(_ask("pause", config_file, runtime_dir, timeout_s), json_output)
+    tell(_ask("pause", config_file, runtime_dir, timeout_s), json_output)
 
 
 @cli.command(epilog=example("ccatp resume"))
 @_daemon_options
 def resume(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
     """Carry on after pause."""
-    _tell(_ask("resume", config_file, runtime_dir, timeout_s), json_output)
+    tell(_ask("resume", config_file, runtime_dir, timeout_s), json_output)
 
 
 @cli.command(epilog=example("ccatp abort"))
 @_daemon_options
 def abort(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
     """Give up the survey and drive the robot to its base."""
-    _tell(_ask("abort", config_file, runtime_dir, timeout_s), json_output)
+    tell(_ask("abort", config_file, runtime_dir, timeout_s), json_output)
 
 
 @cli.command(epilog=example("ccatp stop"))
 @_daemon_options
 def stop(config_file: Path | None, runtime_dir: Path | None, timeout_s: float, json_output: bool) -> None:
     """Hold the wheels where the robot is, save, and end the daemon."""
-    _tell(_ask("stop", config_file, runtime_dir, timeout_s), json_output)
+    tell(_ask("stop", config_file, runtime_dir, timeout_s), json_output)
 
 
 def _observatory_options(command: Any) -> Any:
@@ -191,7 +190,7 @@ def _observatory_options(command: Any) -> Any:
         "ccatp emergency fire --endpoint tcp://m1:7020 --server-key ccatp.key --key observatory.key_secret",
     )
 )
-@click.argument("kind", type=click.Choice(EMERGENCY_KINDS), metavar="KIND")
+@click.argument("kind", type=NearestChoice(EMERGENCY_KINDS), metavar="KIND")
 @click.option("--note", default="", help="What happened, for the log.")
 @click.option(
     "--id", "emergency_id", type=click.UUID, help="Identity of the emergency; sending the same one again is harmless."
@@ -213,7 +212,7 @@ def emergency(
         "note": note,
     }
     folder = configured_folder(config_file, runtime_dir)
-    _tell(_ask_observatory(endpoint, server_key, key_file, folder, payload, timeout_s), json_output)
+    tell(_ask_observatory(endpoint, server_key, key_file, folder, payload, timeout_s), json_output)
 
 
 @cli.command(epilog=example("ccatp clear 6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"))
@@ -229,7 +228,7 @@ def clear(
     """
     payload: dict[str, object] = {"cmd": "clear", "id": str(emergency_id)}
     folder = configured_folder(config_file, runtime_dir)
-    _tell(_ask_observatory(endpoint, server_key, key_file, folder, payload, timeout_s), json_output)
+    tell(_ask_observatory(endpoint, server_key, key_file, folder, payload, timeout_s), json_output)
 
 
 def _ask_observatory(
@@ -265,10 +264,16 @@ def sim_robot(
 ) -> int:  # fmt: skip
     """Run the simulated robot behind the robot link, for any controller."""
     from ccatp.config.loader import load_config
+    from ccatp.config.radio_loader import is_radio_file, load_radio_config
     from ccatp.fault_plan import read_plan
     from ccatp.processes.dataloop import run_alone
 
     named = {"sim.robot.host": host, "sim.robot.port": port, "run.mirror": mirror, "run.world": world, "run.seed": seed}
+    if config_file is not None and is_radio_file(config_file):
+        from ccatp.processes.dataloop import run_beacons_alone
+
+        among_beacons = load_radio_config(config_file, overrides(settings, named))
+        return int(run_beacons_alone(among_beacons, lockstep=not realtime))
     cfg = load_config(config_file, overrides(settings, named))
     plan = None if faults_file is None else read_plan(faults_file, lockstep=not realtime)
     return int(run_alone(cfg, lockstep=not realtime, faults=plan))
@@ -310,7 +315,11 @@ cli.add_command(align)
 cli.add_command(bench)
 cli.add_command(dashboard)
 cli.add_command(keys)
+cli.add_command(calibrate)
+cli.add_command(completion)
+cli.add_command(check)
 cli.add_command(log)
+cli.add_command(status)
 cli.add_command(stream)
 cli.add_command(plan)
 cli.add_command(radio)
@@ -346,9 +355,14 @@ def config() -> None:
 def config_check(file: Path) -> int:
     """Check a configuration; each problem is one line with file, line and key."""
     from ccatp.config.loader import load_config
+    from ccatp.config.radio_loader import is_radio_file, load_radio_config
     from ccatp.errors import ConfigError
 
     try:
+        if is_radio_file(file):
+            beacons = load_radio_config(file)
+            click.echo(f"{file}: ok: system {beacons.system}, seed {beacons.run.seed}")
+            return 0
         cfg = load_config(file)
     except ConfigError as error:
         for problem in error.problems:
@@ -369,27 +383,3 @@ def config_schema() -> None:
 
 def _ask(command: str, config_file: Path | None, runtime_dir: Path | None, timeout_s: float) -> dict[str, Any]:
     return ask_daemon(configured_folder(config_file, runtime_dir), "control", {"cmd": command}, timeout_s)
-
-
-def _tell(reply: Mapping[str, Any], json_output: bool) -> None:
-    if json_output:
-        click.echo(json.dumps(reply))
-        return
-    answer = {key: value for key, value in reply.items() if key != "ok"}
-    # The operator channel answers with the status alone: its own lines need no prefix, and no empty ones.
-    status = answer.get("status")
-    lines = [(k, v) for k, v in _flat(status if isinstance(status, Mapping) else answer) if v]
-    width = max((len(key) for key, _ in lines), default=0)
-    for key, value in lines:
-        click.echo(f"{key:<{width}}  {value}")
-    if not lines:
-        click.echo("ok")
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """``{"a": {"b": 1.5}}`` as ``a.b`` and ``1.5``."""
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, f"{value:.6g}" if isinstance(value, float) else "-" if value is None else str(value)

@@ -1,18 +1,31 @@
 """Glue. What every command shares: suggestions, one-line errors, exit statuses, options, talk with a running daemon."""
 
 import difflib
+import json
 import os
 import sys
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
 from ccatp.errors import CcatpError, ExitStatus
+from ccatp.package import configs_dir
 
 Command = Callable[..., Any]
+
+
+class NearestChoice(click.Choice[str]):
+    """A choice that answers a misspelt one with the nearest."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """As ``click.Choice.convert``."""
+        near = difflib.get_close_matches(str(value), [str(choice) for choice in self.choices], n=1)
+        if near and value not in self.choices:
+            self.fail(f"{value!r} is none of {', '.join(self.choices)}; did you mean {near[0]}?", param, ctx)
+        return super().convert(value, param, ctx)
 
 
 class SuggestingGroup(click.Group):
@@ -109,6 +122,16 @@ def _settings(_ctx: click.Context, _param: click.Parameter, values: Iterable[str
         raise click.BadParameter(str(error)) from error
 
 
+def names_of(folder: str) -> Callable[[click.Context, click.Parameter, str], list[str]]:
+    """Completes the names of shipped configurations in a folder; a path of a file is the shell's own business."""
+
+    def complete(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
+        names = (path.stem for path in (configs_dir() / folder).glob("*.toml"))
+        return sorted(name for name in names if name.startswith(incomplete))
+
+    return complete
+
+
 CONFIG_OPTION = click.option("--config", "config_file", type=click.Path(path_type=Path), help="Configuration (TOML).")
 RUNTIME_DIR_OPTION = click.option(
     "--runtime-dir", type=click.Path(path_type=Path), help="Folder of the sockets, if not the usual one."
@@ -128,8 +151,18 @@ def settings_option(which: str) -> Callable[[Command], Command]:
 SETTINGS_OPTION = settings_option("Any key of the configuration, as in limits.v_max_m_s=0.05.")
 WORLD_OPTIONS = options(
     CONFIG_OPTION,
-    click.option("--mirror", metavar="NAME", help="fyst-m1, fyst-m2, thesis-m1, thesis-m2, or a .toml file."),
-    click.option("--world", metavar="NAME", help="Simulated world: thesis, thesis-x2, or a .toml file."),
+    click.option(
+        "--mirror",
+        metavar="NAME",
+        shell_complete=names_of("mirrors"),
+        help="fyst-m1, fyst-m2, thesis-m1, thesis-m2, or a .toml file.",
+    ),
+    click.option(
+        "--world",
+        metavar="NAME",
+        shell_complete=names_of("worlds"),
+        help="Simulated world: thesis, thesis-x2, or a .toml file.",
+    ),
     click.option("--seed", type=int, metavar="N", help="Seed of every random draw."),
     SETTINGS_OPTION,
 )
@@ -148,8 +181,11 @@ def configured_folder(config_file: Path | None, runtime_dir: Path | None) -> Pat
     """The runtime directory that command line or configuration names."""
     if runtime_dir is None and config_file is not None:
         from ccatp.config.loader import load_config
+        from ccatp.config.radio_loader import is_radio_file, load_radio_config
 
-        configured = load_config(config_file).run.runtime_dir
+        among_beacons = is_radio_file(config_file)
+        processes = load_radio_config(config_file).processes if among_beacons else load_config(config_file).run
+        configured = processes.runtime_dir
         return Path(configured) if configured else None
     return runtime_dir
 
@@ -197,3 +233,28 @@ def ask_over_tcp(
     pair = read_pair(key, "--key")
     curve = CurveClient(read_public(server_key, "--server-key"), pair.public, pair.secret)
     return exchange(endpoint, payload, timeout_s, curve, repeats=True)
+
+
+def tell(reply: Mapping[str, Any], json_output: bool) -> None:
+    """A daemon's answer on standard output."""
+    if json_output:
+        click.echo(json.dumps(reply))
+        return
+    answer = {key: value for key, value in reply.items() if key != "ok"}
+    # The operator channel answers with the status alone: its own lines need no prefix, and no empty ones.
+    status = answer.get("status")
+    lines = [(k, v) for k, v in _flat(status if isinstance(status, Mapping) else answer) if v]
+    width = max((len(key) for key, _ in lines), default=0)
+    for key, value in lines:
+        click.echo(f"{key:<{width}}  {value}")
+    if not lines:
+        click.echo("ok")
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """``{"a": {"b": 1.5}}`` as ``a.b`` and ``1.5``."""
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, f"{value:.6g}" if isinstance(value, float) else "-" if value is None else str(value)

@@ -3,6 +3,10 @@
 import click
 
 from ccatp.cli_frame import SuggestingGroup, example
+from ccatp.cli_radio_calibrate import calibrate
+from ccatp.cli_radio_compare import compare
+from ccatp.cli_radio_fix import fix
+from ccatp.cli_radio_fuzzy import fuzzy
 from ccatp.cli_radio_map import radio_map
 from ccatp.cli_radio_slam import slam
 
@@ -13,4 +17,8 @@ def radio() -> None:
 
 
 radio.add_command(slam)
+radio.add_command(calibrate)
+radio.add_command(fix)
+radio.add_command(fuzzy)
 radio.add_command(radio_map)
+radio.add_command(compare)

@@ -1,29 +1,116 @@
 """Glue. The command ``ccatp radio slam``."""
 
+import json
+import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.cli_frame import example
+from ccatp.cli_frame import CONFIG_OPTION, complain, example, overrides, settings_option
+from ccatp.errors import CcatpError, ExitStatus
+
+if TYPE_CHECKING:
+    from ccatp.config.recording_models import RecordingsConfig
+    from ccatp.radio.recording import RecordedRun
+    from ccatp.radio.track import Track
 
 FORMATS = ("plaza", "mrclam", "labyrinth", "csv")
+FILTERS = ("ekf-slam", "smoother")
+
+
+class SlamCommandError(CcatpError):
+    """A result that cannot be written, or a part that is not installed."""
+
+    exit_status = ExitStatus.USAGE
 
 
 @click.command(
     epilog=example(
         "ccatp radio slam recordings/Plaza2_.mat",
         "ccatp radio slam recordings/MRCLAM_Dataset7 --robot 2 --filter smoother --json",
+        "ccatp radio slam mine.csv --set csv.radio.range_sigma_m=0.3 --figure map.png",
     )
 )
 @click.argument("path", type=click.Path(path_type=Path))
 @click.option("--format", "data_format", type=click.Choice(FORMATS), help="Format of the data; found out if not given.")
+@click.option("--robot", type=click.IntRange(min=1), metavar="N", help="Robot of an MRCLAM set; else the first there.")
 @click.option(
-    "--robot", type=click.IntRange(min=1), metavar="N", help="Which robot of a set of several; 1 if not given."
-)
-def slam(path: Path, data_format: str | None, robot: int | None) -> int:
-    """Map the beacons of a recorded run and find the vehicle's path on that map."""
+    "--filter", "filter_name", type=click.Choice(FILTERS), default=FILTERS[0], show_default=True,
+    help="ekf-slam: at each instant from readings up to it; smoother: from all of them.",
+)  # fmt: skip
+@CONFIG_OPTION
+@settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
+@click.option(
+    "--figure", "figure_file", type=click.Path(path_type=Path, dir_okay=False),
+    help="Draw map and path (PNG, PDF or SVG; needs matplotlib).",
+)  # fmt: skip
+@click.option("--peers", is_flag=True, help="All our estimators and GTSAM's side by side; needs ccatp[peers].")
+@click.option("--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there.")
+def slam(
+    path: Path, data_format: str | None, robot: int | None, filter_name: str, config_file: Path | None,
+    settings: Mapping[str, object], figure_file: Path | None, peers: bool, json_output: bool,
+) -> int:  # fmt: skip
+    """Map the beacons of a recorded run and find the vehicle's path on that map.
+
+    PATH is a file or folder of the formats Plaza, MRCLAM, Labyrinth, or a CSV of events (docs/radio_data.md).
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads would only fight over them
+    from ccatp.config.recording_loader import load_recordings_config
+    from ccatp.radio.judged import judge
+    from ccatp.radio.slam_report import result_data, table_lines
     from ccatp.radio_data.reader import read_run
 
+    if figure_file is not None and not figure_file.parent.is_dir():
+        raise SlamCommandError(f"--figure: no directory {figure_file.parent}; make it first")
+    assumed = load_recordings_config(config_file, overrides(settings, {}))
     run = read_run(path, data_format, robot)
-    click.echo(f"{run.name}: {len(run.steps.distance_m)} odometry steps, {len(run.readings.times_s)} readings")
+    for warning in run.warnings:
+        complain(f"warning: {warning}", 0)
+    track = estimate(run, assumed, filter_name)
+    for warning in track.warnings:
+        complain(f"warning: {warning}", 0)
+    judged = judge(track, run)
+    data: dict[str, Any] = result_data(run, filter_name, track, judged)
+    if figure_file is not None:
+        from ccatp.slam_map import draw_slam
+
+        draw_slam(run, track, judged, figure_file, f"{run.name}, {filter_name}")
+    if peers:
+        data["peers"] = _side_by_side(run, assumed)
+    if json_output:
+        click.echo(json.dumps(data, allow_nan=False))
+        return 0
+    for line in table_lines(run, data):
+        click.echo(line)
+    if peers:
+        from ccatp.radio.comparison import markdown
+
+        for line in ("", *markdown(data["peers"])):
+            click.echo(line)
     return 0
+
+
+def _side_by_side(run: "RecordedRun", assumed: "RecordingsConfig") -> list[dict[str, Any]]:
+    from ccatp.cli_radio_compare import compared
+
+    return compared(run, assumed, peers=True)
+
+
+def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) -> "Track":
+    """A run through one of ``FILTERS``."""
+    from time import perf_counter
+
+    from ccatp.config.recording_models import RecordingConfig
+    from ccatp.radio.assumed import batch_settings, slam_settings
+
+    cfg: RecordingConfig = getattr(assumed, run.kind)
+    if filter_name == "smoother":
+        from ccatp.radio.batch import smooth
+
+        return smooth(run, batch_settings(cfg), perf_counter)
+    from ccatp.radio.causal import filter_run
+
+    first_sigmas = (cfg.priors.pose_m, cfg.priors.heading_rad)
+    return filter_run(run, slam_settings(cfg, assumed.filter), first_sigmas, perf_counter)

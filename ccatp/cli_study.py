@@ -69,6 +69,7 @@ def study(
 
     limit_threads()  # before numpy is imported
     from ccatp.config.loader import load_config
+    from ccatp.config.radio_loader import load_radio_config
     from ccatp.studies.campaign import CampaignError, Study
     from ccatp.studies.engine import CampaignOptions, run_campaign
     from ccatp.studies.plan import WHOLE, parse_choice, parse_shard
@@ -90,7 +91,8 @@ def study(
             settings=given,
             with_figures=not no_figures,
         )
-        result = run_campaign(found, lambda keys: load_config(config_file, keys), options)
+        load = load_radio_config if found.is_radio else load_config
+        result = run_campaign(found, lambda keys: load(config_file, keys), options)
     else:
         idle = {"--cluster": cluster, "--shard": shard, "--from": others, "--only": only, "--mirror": mirrors}
         if surplus := [option for option, value in idle.items() if value]:

@@ -167,6 +167,11 @@ class DangerMonitor:
         return EventCode.ABORTED if self.latch.is_latched else EventCode.NORMAL
 
     @property
+    def counts(self) -> dict[str, object]:
+        """For the log, at the end of a run."""
+        return {"episodes": self.episodes_opened, "edges": self.edges_declared}
+
+    @property
     def episodes_opened(self) -> dict[Corner, int]:
         """How often each sensor left the panels."""
         return dict(zip(CORNERS, self._edges.opened, strict=True))

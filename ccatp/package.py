@@ -19,6 +19,16 @@ def build(root: Path = ROOT) -> str:
     return COMPILED if any((root / f"mission{suffix}").is_file() for suffix in EXTENSION_SUFFIXES) else INTERPRETED
 
 
+def configs_dir(root: Path = ROOT) -> Path:
+    """The folder of the configurations that come with ccatp: in the package once installed, beside it in a checkout.
+
+    Args:
+        root: the package's folder.
+    """
+    inside = root / "configs"
+    return inside if inside.is_dir() else root.parent / "configs"
+
+
 def child_environment(environment: Mapping[str, str]) -> dict[str, str]:
     """The environment in which ``python -m ccatp...`` runs this package, whatever lies in the working directory.
 

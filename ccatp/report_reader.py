@@ -12,6 +12,7 @@ from typing import Any
 from ccatp.aligning.deviations import Measured
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
+from ccatp.config.radio_loader import is_radio_file
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.recorder import read_metadata, recordings
 from ccatp.reporting.record import PlannedRow, RunRecord, Session, changed_keys
@@ -29,13 +30,15 @@ def read_record(run_dir: Path) -> RunRecord:
     """Everything that a report tells of a run.
 
     Raises:
-        RunReadError: no such directory, or no run in it.
+        RunReadError: no such directory, no run in it, or none of a survey.
         ConfigError: its configuration cannot be used.
     """
     if not run_dir.is_dir():
         raise RunReadError(f"{run_dir}: no such directory; name the directory of a run")
     if not (run_dir / CONFIG).is_file():
         raise RunReadError(f"{run_dir}: no {CONFIG} there; name the directory of a run")
+    if is_radio_file(run_dir / CONFIG):
+        raise RunReadError(f"{run_dir}: a mission among beacons; reports are of surveys, its figures are in {SUMMARY}")
     cfg = load_config(run_dir / CONFIG)
     mirror = build_mirror(cfg.mirror)
     missing: list[str] = []
@@ -129,5 +132,6 @@ def _summary(path: Path, missing: list[str], warnings: list[str]) -> Mapping[str
 
 def _files(run_dir: Path) -> Iterator[tuple[str, int]]:
     for path in sorted(run_dir.iterdir()):
-        if path.is_file() and not path.name.startswith("."):
+        # The report is no part of the run: it is the same when it is made again.
+        if path.is_file() and not path.name.startswith(".") and path.suffix != ".html":
             yield path.name, path.stat().st_size

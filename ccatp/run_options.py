@@ -22,6 +22,7 @@ class RunOptions:
         json_output: the summary goes to standard output as JSON, and nothing else does.
         runtime_dir: folder of the unix sockets given on the command line, or ``None``.
         faults_file: plan of faults for the stand-ins, or ``None``; a copy goes into the run directory.
+        shows_summary: the summary goes to standard output at the end.
     """
 
     sim: bool
@@ -35,6 +36,7 @@ class RunOptions:
     json_output: bool = False
     runtime_dir: Path | None = None
     faults_file: Path | None = None
+    shows_summary: bool = True
 
     @property
     def is_paced(self) -> bool:

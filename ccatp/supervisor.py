@@ -17,13 +17,16 @@ import zmq
 
 from ccatp.config.loader import dump_config, load_config
 from ccatp.config.models import Config
+from ccatp.config.radio_loader import dump_radio_config, is_radio_file, load_radio_config
 from ccatp.dashboard.token_file import read_token
 from ccatp.errors import ConfigError, ExitStatus, RefusedError
 from ccatp.processes.children import Children, ProcessSpec
+from ccatp.processes.collecting import Collector
 from ccatp.processes.common import FAULTS_FILE, RUN_DIR_FILE, Endpoints, open_log
 from ccatp.processes.observing import check_observatory
-from ccatp.processes.page_socket import PageSocket, note_run_dir, open_page_socket
-from ccatp.processes.run_collector import RunCollector
+from ccatp.processes.page_socket import PageSocket, open_page_socket
+from ccatp.processes.run_kinds import BeaconRun, RunKind, SurveyRun
+from ccatp.processes.run_report import write_run_report
 from ccatp.processes.run_view import RunView
 from ccatp.processes.service import Service
 from ccatp.restarts import Decision, Fate
@@ -58,6 +61,49 @@ PROCESSES: tuple[ProcessSpec, ...] = (
 )
 
 
+# No laser system: what is measured is measured by radio. A main loop that dies takes the map with it: held, and over.
+BEACON_PROCESSES: tuple[ProcessSpec, ...] = (
+    ProcessSpec("dataloop", "ccatp.processes.dataloop", is_stand_in=True, listens="sim.robot", is_replaceable=False),
+    ProcessSpec("danger", "ccatp.processes.danger_loop", is_loop=True),
+    ProcessSpec("main", "ccatp.processes.main_loop", is_loop=True, is_replaceable=False),
+)
+
+
+def run(options: RunOptions) -> int:
+    """Run what the configuration is of: a survey, or a mission among beacons; arguments as of ``run_survey``."""
+    if options.config_file is not None and is_radio_file(options.config_file):
+        return run_beacons(options)
+    return run_survey(options)
+
+
+def run_beacons(options: RunOptions) -> int:
+    """Run one mission among beacons to its end; arguments, status and errors as of ``run_survey``."""
+    if options.resume or options.recover:
+        flag = "--resume" if options.resume else "--recover"
+        raise ConfigError(f"{flag}: a mission among beacons has nothing to go on with, its map is not kept; begin anew")
+    if options.faults_file is not None:
+        raise ConfigError("--faults: plans are for surveys; sim.incidents of the configuration holds those of beacons")
+    cfg = load_radio_config(options.config_file, dict(options.overrides))
+    check_observatory(cfg.observatory)
+    read_key(cfg.robot.key_file, must_be_private=not options.sim)
+    started = time.monotonic()
+    with ExitStack() as stack:
+        runtime_dir = make_runtime_dir(str(options.runtime_dir or cfg.processes.runtime_dir), os.environ)
+        stack.enter_context(_lock(runtime_dir / "lock", "--runtime-dir"))
+        sockets: dict[str, socket.socket] = {}
+        if options.sim:
+            at = cfg.sim.robot
+            sockets["dataloop"] = listener = stack.enter_context(listen("sim.robot", at.host, at.port))
+            host, port = listener.getsockname()
+            cfg = cfg.model_copy(update={"robot": cfg.robot.model_copy(update={"host": host, "port": port})})
+        run_dir = _new_run_dir(options, cfg.system, cfg.run.seed)
+        stack.enter_context(_lock(run_dir / ".lock", "--run-dir"))
+        (run_dir / "config.toml").write_text(dump_radio_config(cfg), encoding="utf-8")
+        (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
+        kind = BeaconRun(cfg, BEACON_PROCESSES, is_sim=options.sim)
+        return _Run(options, kind, run_dir, Endpoints(runtime_dir), sockets, None, started).go()
+
+
 def run_survey(options: RunOptions) -> int:
     """Run one survey to its end.
 
@@ -83,8 +129,9 @@ def run_survey(options: RunOptions) -> int:
         runtime_dir = make_runtime_dir(str(options.runtime_dir or cfg.run.runtime_dir), os.environ)
         stack.enter_context(_lock(runtime_dir / "lock", "--runtime-dir"))
         stand_ins = [p for p in PROCESSES if p.is_stand_in and p.listens and options.sim]
-        sockets = {p.name: stack.enter_context(_listen(cfg, p)) for p in stand_ins}
-        cfg = _with_addresses(cfg, sockets) if options.sim else cfg
+        places = places_of(cfg)
+        sockets = {p.name: stack.enter_context(listen(p.listens, *places[p.listens])) for p in stand_ins}
+        cfg = with_addresses(cfg, sockets) if options.sim else cfg
         page = open_page_socket(cfg.dashboard)
         if page.socket is not None:
             sockets["dashboard"] = stack.enter_context(page.socket)
@@ -95,9 +142,8 @@ def run_survey(options: RunOptions) -> int:
         (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
-        note_run_dir(runtime_dir, run_dir)
-        run = _Run(options, cfg, run_dir, Endpoints(runtime_dir), sockets, page, started)
-        return run.go()
+        kind = SurveyRun(cfg, PROCESSES, is_sim=options.sim)
+        return _Run(options, kind, run_dir, Endpoints(runtime_dir), sockets, page, started).go()
 
 
 def _recover(options: RunOptions) -> int:
@@ -129,22 +175,36 @@ def _lock(path: Path, option: str) -> Iterator[None]:
 
 
 @contextmanager
-def _listen(cfg: Config, process: ProcessSpec) -> Iterator[socket.socket]:
-    section = cfg.sim.robot if process.listens == "sim.robot" else cfg.sim.etalon
+def listen(section: str, host: str, port: int) -> Iterator[socket.socket]:
+    """A listening socket for a process that inherits it.
+
+    Args:
+        section: of the configuration that names the address.
+        host, port: the address; port 0 takes any that is free.
+
+    Raises:
+        ConfigError: the port is taken.
+    """
     with socket.socket() as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            listener.bind((section.host, section.port))
+            listener.bind((host, port))
         except OSError as error:
             raise ConfigError(
-                f"{process.listens}.port: cannot listen on {section.host}:{section.port}: {error.strerror}; "
-                f"stop who uses it, or choose another with --set {process.listens}.port=0 (0 = any free port)"
+                f"{section}.port: cannot listen on {host}:{port}: {error.strerror}; "
+                f"stop who uses it, or choose another with --set {section}.port=0 (0 = any free port)"
             ) from error
         listener.listen(16)
         yield listener
 
 
-def _with_addresses(cfg: Config, sockets: dict[str, socket.socket]) -> Config:
+def places_of(cfg: Config) -> dict[str, tuple[str, int]]:
+    """Where the stand-ins shall listen, (host, port) by the section of the configuration."""
+    robot, etalon = cfg.sim.robot, cfg.sim.etalon
+    return {"sim.robot": (robot.host, robot.port), "sim.etalon": (etalon.host, etalon.port)}
+
+
+def with_addresses(cfg: Config, sockets: dict[str, socket.socket]) -> Config:
     """The configuration with the addresses at which the stand-ins really listen."""
 
     def at(process: str) -> dict[str, object]:
@@ -165,6 +225,22 @@ def _with_addresses(cfg: Config, sockets: dict[str, socket.socket]) -> Config:
     )
 
 
+def _new_run_dir(options: RunOptions, name: str, seed: int) -> Path:
+    """The folder of a run that begins anew."""
+    run_dir = options.run_dir or default_run_dir(name, seed, datetime.now(UTC))
+    if (run_dir / "mission.sqlite").exists():
+        raise ConfigError(f"--run-dir: {run_dir} holds a mission already; name another folder")
+    return _made(run_dir)
+
+
+def _made(run_dir: Path) -> Path:
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--run-dir: cannot make {run_dir}: {error.strerror}") from error
+    return run_dir.absolute()
+
+
 def _make_run_dir(options: RunOptions, cfg: Config) -> Path:
     run_dir = options.run_dir or default_run_dir(cfg.run.mirror, cfg.run.seed, datetime.now(UTC))
     has_mission = (run_dir / "mission.sqlite").exists()
@@ -176,11 +252,7 @@ def _make_run_dir(options: RunOptions, cfg: Config) -> Path:
         raise ConfigError(f"--resume: no mission in {run_dir}; name the folder of the run with --run-dir")
     if options.resume:
         _check_resumed(run_dir, cfg)
-    try:
-        run_dir.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"--run-dir: cannot make {run_dir}: {error.strerror}") from error
-    return run_dir.absolute()
+    return _made(run_dir)
 
 
 def _check_resumed(run_dir: Path, cfg: Config) -> None:
@@ -204,36 +276,29 @@ class _Run:
     def __init__(
         self,
         options: RunOptions,
-        cfg: Config,
+        kind: RunKind,
         run_dir: Path,
         endpoints: Endpoints,
         sockets: dict[str, socket.socket],
-        page: PageSocket,
+        page: PageSocket | None,
         started_s: float,
     ) -> None:
-        self._options, self._cfg, self._run_dir, self._endpoints = options, cfg, run_dir, endpoints
+        self._options, self._kind, self._run_dir, self._endpoints = options, kind, run_dir, endpoints
         self._sockets, self._page, self._started_s = sockets, page, started_s
         self._view: RunView | None = None
-        self._children = Children(cfg.run, self._command_of, self._say)
+        self._children = Children(kind.processes, self._command_of, self._say)
         self._is_interrupted = False
         self._service = Service(*take_from(os.environ))
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
 
     def go(self) -> int:
         """Start, watch, collect, stop; returns the exit status."""
-        self._log.info("run", mirror=self._cfg.mirror.name, seed=self._cfg.run.seed, sim=self._options.sim)
+        self._log.info("run", **self._kind.facts)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         # A flag and no exception: a signal must not be lost in somebody's handler of exceptions, nor end the ending.
         previous = {n: signal.signal(n, self._interrupt) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-        collector = RunCollector(
-            context,
-            self._endpoints,
-            self._cfg,
-            self._run_dir,
-            is_sim=self._options.sim,
-            on_presence=self._heard,
-        )
-        self._view = view = RunView(self._cfg, is_sim=self._options.sim, run_dir=self._run_dir)
+        collector = self._kind.collector(context, self._endpoints, self._run_dir, self._heard)
+        self._view = view = self._kind.view(self._run_dir)
         try:
             with collector, view:
                 status = self._watch(collector, view)
@@ -250,30 +315,18 @@ class _Run:
             context.destroy(linger=0)
         (self._run_dir / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
         self._log.info("end", status=int(status))
-        view.show_summary(summary, as_json=self._options.json_output)
-        view.show_report(self._report(status))
+        if self._options.shows_summary:
+            view.show_summary(summary, as_json=self._options.json_output)
+            view.show_report(write_run_report(self._run_dir, status, self._log))
         return int(status)
-
-    def _report(self, status: ExitStatus) -> Path | None:
-        """The run's report, where there is time to write one; it never fails the run."""
-        if status is ExitStatus.INTERRUPTED:
-            return None  # somebody is waiting for the end
-        from ccatp.report_writer import report_run  # noqa: PLC0415 - nothing of it is needed while the robot moves
-
-        try:
-            return report_run(self._run_dir)[0]
-        except Exception as error:
-            # Whatever it is, the survey is done and its record is on the disk.
-            self._log.error("report", error=str(error))
-            return None
 
     def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
         self._is_interrupted = True
 
-    def _watch(self, collector: RunCollector, view: RunView) -> ExitStatus:
-        if self._page.text:
+    def _watch(self, collector: Collector, view: RunView) -> ExitStatus:
+        if self._page is not None and self._page.text:
             self._say(self._page.level, self._page.text)
-        for process in PROCESSES:
+        for process in self._kind.rows:
             # Who listens has a socket, if it is to run at all.
             if process.name in self._sockets or not process.listens:
                 self._children.start(process)

@@ -25,6 +25,7 @@ from ccatp.bench.problems import (
     survey_problem,
 )
 from ccatp.bench.race import Difference, Times, largest_difference, race
+from ccatp.bench.slam_race import BEACONS, DENSE_BEACONS, dense_slam, our_slam, slam_problem
 from ccatp.config.models import Config
 from ccatp.filters.base import FloatArray
 from ccatp.filters.unscented import ALPHA, BETA, KURTOSIS
@@ -35,6 +36,8 @@ ROUNDS, QUICK_ROUNDS = 40, 4
 PANELS, QUICK_PANELS = 4, 1
 SEED = 1
 _PRINTED = "eq. 2.13 in numpy"
+_WHOLE = "whole matrices in numpy"
+MOST_DENSE_ROUNDS = 10
 INSTALL = "pip install 'ccatp[peers]'"
 
 Peers = tuple[tuple[str, Callable[[FilterProblem], Contender]], ...]
@@ -60,7 +63,7 @@ def run_bench(cfg: Config, *, quick: bool, run_args: Sequence[str] = (), mission
     cases = []
     if missions:
         cases += [rehearsal_case(cfg, panels), lockstep_case(cfg, panels, run_args)]
-    cases = [*filter_cases(cfg, rounds), multilateration_case(cfg, rounds), *cases]
+    cases = [*filter_cases(cfg, rounds), *slam_cases(rounds), multilateration_case(cfg, rounds), *cases]
     return {"machine": machine(), "equal_within": EQUAL_WITHIN, "cases": cases}
 
 
@@ -85,6 +88,20 @@ def multilateration_case(cfg: Config, rounds: int) -> dict[str, Any]:
     name = f"multilaterate, {problem.anchors_m.shape[0]} lengths"
     difference = _checked(name, "scipy.optimize.least_squares", largest_difference(ours, peer, STEPS))
     return case(name, race(ours, peer, STEPS, rounds), "scipy.optimize.least_squares", difference)
+
+
+def slam_cases(rounds: int) -> Iterator[dict[str, Any]]:
+    """Range SLAM, a prediction and a scalar update a step, against whole matrices where that is bearable."""
+    for beacons in BEACONS:
+        problem = slam_problem(beacons, STEPS, SEED)
+        name, ours = f"ekf-slam, {beacons} beacons, n = {problem.mean.size}", our_slam(problem)
+        if beacons > DENSE_BEACONS:
+            note = f"ekf-slam: whole matrices take n^3, too long to race against beyond {DENSE_BEACONS} beacons"
+            yield {**case(name, race(ours, None, STEPS, rounds), None), "note": note}
+            continue
+        dense = dense_slam(problem)
+        difference = _checked(name, _WHOLE, largest_difference(ours, dense, STEPS))
+        yield case(name, race(ours, dense, STEPS, min(rounds, MOST_DENSE_ROUNDS)), _WHOLE, difference)
 
 
 def case(name: str, times: Times, peer: str | None, difference: Difference | None = None) -> dict[str, Any]:

@@ -103,6 +103,8 @@ def _drive(
         for begin in range(first, last, STEP_FRAMES):
             end = min(begin + STEP_FRAMES, last)
             phi_r, phi_l = float(segment.right_rad[begin:end].sum()), float(segment.left_rad[begin:end].sum())
+            if phi_r == phi_l == 0.0:  # a counter at rest
+                continue
             right, left = right_m * phi_r, left_m * phi_l
             for column, motion_first, motion_last in grips:
                 if motion_first <= begin < motion_last:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from itertools import pairwise
+from math import sqrt
 from statistics import median
 
 import numpy as np
@@ -17,6 +18,8 @@ FloatArray = NDArray[np.float64]
 # A frame in which no wheel turns further than this, and this many times what its noise sums up to, is one of rest.
 REST_RAD = 2e-6
 REST_SIGMAS = 6.0
+# A frame in which a wheel turns less than this shows the noise of its encoder.
+SLOW_RAD = 3e-5
 # Shorter rests than this part no motions.
 REST_FRAMES = 5
 # Of normally distributed differences: their median size over their standard deviation, and that over a sample's.
@@ -43,7 +46,7 @@ class Segment:
 
     Attributes:
         right_rad, left_rad: what each wheel turned, frame by frame, shape (n,).
-        motions: first and last (exclusive) frame of each motion between two rests.
+        motions: first and last (exclusive) frame of each motion; together all frames.
         gyro_rad: sum of the gyroscope's rates times their periods.
         gyro_s: over this time.
         gyro_samples: so many.
@@ -119,13 +122,16 @@ class DriveBuilder:
         if sensors.seq <= self._last_seq:
             return
         self._last_seq, self._t_s = sensors.seq, sensors.t
-        times = [row[0] for row in sensors.enc]
-        rates = [[row[i] for row in sensors.enc] for i in (1, 2)]
-        right, left = (wheel.add(times, found) for wheel, found in zip(self._wheels, rates, strict=True))
-        self._open.right.append(right)
-        self._open.left.append(left)
-        if len(times) > 1:
-            self._scatters.append(float(np.std(rates[0], ddof=1)))
+        right = [(row[0], row[1]) for row in sensors.enc if row[1] is not None]
+        left = [(row[0], row[2]) for row in sensors.enc if row[2] is not None]
+        for wheel, samples, turned in zip(
+            self._wheels, (right, left), (self._open.right, self._open.left), strict=True
+        ):
+            turned.append(wheel.add([t for t, _ in samples], [rate for _, rate in samples]))
+        if len(right) > 1:
+            times = [t for t, _ in right]
+            if abs(self._open.right[-1]) < SLOW_RAD:  # motion is no noise
+                self._scatters.append(float(np.std([rate for _, rate in right], ddof=1)))
             self._periods.append((times[-1] - times[0]) / (len(times) - 1))
             self._samples = len(times)
         for t_s, _, rate in sensors.imu:
@@ -160,7 +166,7 @@ class DriveBuilder:
     def _rest_rad(self) -> float:
         if not self._scatters or self._wheels[0].is_counter:  # a counter at rest says nothing
             return REST_RAD
-        noise_rad = median(self._scatters) * median(self._periods) * self._samples**0.5
+        noise_rad = median(self._scatters) * median(self._periods) * sqrt(self._samples)
         return max(REST_RAD, REST_SIGMAS * noise_rad)
 
     def _join(self, rest: _Open) -> None:
@@ -170,7 +176,8 @@ class DriveBuilder:
 
     def _place(self, fix: Fix) -> Place:
         x, y, _ = self._mirror.foot_of_puck(fix.position_m, self._puck_height_m)
-        turn = np.array([self._mirror.rotate_deck_from_world(axis) for axis in np.eye(3).tolist()]).T
+        axes = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+        turn = np.array([self._mirror.rotate_deck_from_world(axis) for axis in axes]).T
         covariance = turn @ np.array(fix.covariance_m2).reshape(3, 3) @ turn.T
         # The foot follows the puck along the surface; what it rises by the slope moves it sideways.
         fx, fy = self._mirror.surface.gradient(x, y)
@@ -194,7 +201,10 @@ class DriveBuilder:
 
 
 def _motions(right: FloatArray, left: FloatArray, rest_rad: float) -> tuple[tuple[int, int], ...]:
-    """Stretches of frames in which a wheel turns, parted by rests; a turn in place and a way are two motions."""
+    """The frames, parted into motions: by rests, and a turn in place from a way.
+
+    Together they cover all frames: wheels run down long after they seem to stand, by some micrometres in all.
+    """
     moving = np.flatnonzero((np.abs(right) > rest_rad) | (np.abs(left) > rest_rad))
     if not len(moving):
         return ()
@@ -202,7 +212,8 @@ def _motions(right: FloatArray, left: FloatArray, rest_rad: float) -> tuple[tupl
     spans = []
     for run in np.split(moving, np.flatnonzero(np.diff(moving) > REST_FRAMES) + 1):
         spans += _same_kind(is_turn, int(run[0]), int(run[-1]) + 1)
-    return tuple(spans)
+    begins = [0, *(begin for begin, _ in spans[1:])]
+    return tuple(zip(begins, [*begins[1:], len(right)], strict=True))
 
 
 def _same_kind(is_turn: NDArray[np.bool_], first: int, last: int) -> list[tuple[int, int]]:

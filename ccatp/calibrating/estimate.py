@@ -85,7 +85,7 @@ class Calibration:
     @property
     def sigmas(self) -> tuple[float, float, float]:
         """Standard deviations of radius (m), base (m) and bias (rad/s)."""
-        radius, base, bias = np.sqrt(np.diag(self.covariance)).tolist()
+        radius, base, bias = (sqrt(variance) for variance in np.diag(self.covariance))
         return radius, base, bias
 
 
@@ -187,7 +187,7 @@ class _Problem:
             rows, residuals = self._whitened(x, carried, slip_sigma)
             step, *_ = np.linalg.lstsq(rows, residuals, rcond=None)
             left = residuals - rows @ step
-            return float(left @ left) - (rows.shape[0] - rows.shape[1])
+            return float(np.sum(left**2)) - int(rows.shape[0] - rows.shape[1])
 
         if excess(0.0) <= 0.0:
             return 0.0

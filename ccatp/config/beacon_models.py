@@ -37,7 +37,8 @@ class BeaconDangerConfig(Model):
     """When the danger loop denies motion; distances from the vehicle's origin."""
 
     obstacle_m: Positive  # no forward motion with anything ahead that is nearer
-    ahead_rad: Positive  # ahead: within this of the heading
+    ahead_rad: Positive  # ahead: within this of the course
+    memory_s: Positive  # what was seen is believed for this long
     target_m: Positive  # no motion towards the target when it is nearer
     target_window_s: Positive  # its levels are averaged over this time
     target_level_sigma_db: Positive  # of the white noise of its level
@@ -53,8 +54,8 @@ class ListenerConfig(Model):
     """How the robot hears ultrasonic motes."""
 
     name: RadioName  # of the robot's own listener, in readings
-    pings_per_frame: Annotated[int, Field(ge=1, le=100)]  # motes that send in one frame, one after the other
-    bursts_per_frame: Annotated[int, Field(ge=1, le=100)]  # pairs that range in a frame during mapping
+    pulses_per_frame: Annotated[int, Field(ge=1, le=20)]  # motes that send in one frame, one after the other
+    mapping_rounds: Annotated[int, Field(ge=1, le=10_000)]  # in which motes report what they hear of each other
     gate_probability: Annotated[float, Field(gt=0.5, lt=1.0)]  # a range less likely than this is not used
 
 

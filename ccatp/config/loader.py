@@ -7,13 +7,13 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-import ccatp
 from ccatp.config.checks import check_config, is_file_name
 from ccatp.config.messages import choice_hint, faults_of
 from ccatp.config.models import Config, MirrorConfig, WorldConfig
 from ccatp.config.sources import Source, Tree, fault_line, merged, nested, read_source, source_of
 from ccatp.config.toml_text import Key, format_toml, format_value
 from ccatp.errors import ConfigError
+from ccatp.package import configs_dir
 
 DEFAULT_FILE = "ccatp.toml"
 _SECTIONS: dict[str, tuple[str, type[BaseModel]]] = {
@@ -23,10 +23,8 @@ _SECTIONS: dict[str, tuple[str, type[BaseModel]]] = {
 
 
 def shipped_config_dir() -> Path:
-    """The folder of the configurations that come with ccatp: in the package once installed, beside it in a checkout."""
-    package = Path(ccatp.__file__).resolve().parent
-    inside = package / "configs"
-    return inside if inside.is_dir() else package.parent / "configs"
+    """The folder of the configurations that come with ccatp."""
+    return configs_dir()
 
 
 def load_config(

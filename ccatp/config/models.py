@@ -176,6 +176,7 @@ class LocalizerConfig(Model):
 
     accelerometer_sigma_m_s2: Positive
     gyroscope_sigma_rad_s: Positive
+    gyroscope_bias_rad_s: Annotated[float, Field(ge=-1.0, le=1.0)]
     encoder_sigma_rad_s: Positive
     jerk_density_m2_s5: Positive
     angular_acceleration_density_rad2_s3: Positive

@@ -80,6 +80,16 @@ class ObstacleAvoider:
             return Way(aim, 0.0, True, nearest_m)
         return Way(Aim(aim.distance_m, error_rad), self._speed_factor(near), False, nearest_m)
 
+    def clear_m(self, pose: PlanarPose, direction_rad: float) -> float:
+        """Distance to the nearest remembered obstacle in the way of a body that moves in a direction, m.
+
+        Args:
+            pose: x m, y m, heading rad.
+            direction_rad: of the motion, left of the heading: 0 forwards, pi backwards.
+        """
+        in_way = (d for d, angle_rad in self._near(pose) if abs(wrap_pi(angle_rad - direction_rad)) < _AHEAD_RAD)
+        return min(in_way, default=inf)
+
     def _near(self, pose: PlanarPose) -> Iterator[tuple[float, float]]:
         for echo in self._echoes:
             dx_m, dy_m = echo.x_m - pose[0], echo.y_m - pose[1]

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from enum import StrEnum
+from math import pi
 
 from ccatp.config.radio_models import RadioConfig
 from ccatp.control.avoidance import ObstacleAvoider, Way
@@ -67,13 +68,13 @@ class BeaconPilot:
             return self._without_obstacles(aim, interval_s)
         self._avoider.see(time_s, pose, distances_m)
         if time_s < self._escapes_until_s:
-            return self._escape(aim)
+            return self._held(pose, self._escape())
         if aim is None:
-            return self._without_obstacles(aim, interval_s)
+            return self._held(pose, self._without_obstacles(aim, interval_s))
         way = self._avoider.way(pose, aim)
         if way.is_blocked or way.speed_factor <= 0.0:
             self._escapes_until_s = time_s + self._cfg.avoidance.back_time_s
-            return self._escape(way.aim)
+            return self._held(pose, self._escape())
         return self._round(aim, way, interval_s)
 
     def _aim(self, pose: PlanarPose, target: TargetSight | None) -> Aim | None:
@@ -98,7 +99,14 @@ class BeaconPilot:
         found = self._driver.drive(way.aim, interval_s)
         return found._replace(speed_m_s=found.speed_m_s * way.speed_factor)
 
-    def _escape(self, aim: Aim | None) -> Drive:
+    def _held(self, pose: PlanarPose, drive: Drive) -> Drive:
+        """No motion towards something that stands too near in its direction."""
+        if not drive.speed_m_s:
+            return drive
+        clear_m = self._avoider.clear_m(pose, 0.0 if drive.speed_m_s > 0.0 else pi)
+        return drive._replace(speed_m_s=0.0) if clear_m < self._cfg.avoidance.stop_m else drive
+
+    def _escape(self) -> Drive:
         self.state = PilotState.ESCAPING
         self._driver.reset()
-        return self._driver.back(self._cfg.avoidance.back_speed_m_s, 0.0 if aim is None else aim.error_rad)
+        return self._driver.away(self._cfg.avoidance.back_speed_m_s, 0.0)

@@ -74,7 +74,7 @@ class Follower:
         if self._sight is None:
             return HALT
         if self.state is FollowState.BACKING:
-            return self._driver.back(self._cfg.back_speed_m_s, self._sight.error_rad)
+            return self._driver.away(self._cfg.back_speed_m_s, self._sight.error_rad)
         return self._driver.face(self._sight.error_rad)
 
     def _next_state(self, left_m: float) -> FollowState:

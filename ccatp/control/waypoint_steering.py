@@ -1,7 +1,7 @@
 """Pure. Driving to a point: P control of the steering, fuzzy, PI or constant speed; and a loop of such points."""
 
 from collections.abc import Sequence
-from math import cos, hypot
+from math import cos, hypot, pi
 from typing import NamedTuple
 
 from ccatp.angles import bearing, wrap_pi
@@ -80,10 +80,15 @@ class Driver:
         """Set points for the next interval, s."""
         return self._turning(self._speed(aim, interval_s), aim.error_rad)
 
-    def back(self, speed_m_s: float, error_rad: float) -> Drive:
-        """Set points that back off and turn to what lies at ``error_rad``; steered wheels do so the other way round."""
-        backwards_m_s = -min(speed_m_s, self._vehicle.speed_max_m_s)
-        return self._turning(backwards_m_s, -error_rad if self._vehicle.kind == "ackermann" else error_rad)
+    def away(self, speed_m_s: float, error_rad: float) -> Drive:
+        """Set points that get away from what lies at ``error_rad``: backwards from what is ahead, else forwards.
+
+        Wheels that steer turn the vehicle the other way round when it rolls backwards.
+        """
+        speed_m_s = min(speed_m_s, self._vehicle.speed_max_m_s)
+        if abs(error_rad) > pi / 2.0:
+            return self._turning(speed_m_s, -wrap_pi(pi - error_rad))
+        return self._turning(-speed_m_s, -error_rad if self._vehicle.kind == "ackermann" else error_rad)
 
     def face(self, error_rad: float) -> Drive:
         """Set points that turn to an aim without going there; an Ackermann vehicle cannot, and stands."""

@@ -45,7 +45,10 @@ class GuardedProtocol(H11Protocol):
     def data_received(self, data: bytes) -> None:
         """Part of a request; the rest of it has to follow."""
         super().data_received(data)
-        if self._slow is None and self._is_without_request():
+        if not self._is_without_request():
+            if not self.flow.write_paused:
+                self._unwatch()  # between requests the server's own patience counts
+        elif self._slow is None:
             self._watch(self._drop_without_request)
 
     def pause_writing(self) -> None:

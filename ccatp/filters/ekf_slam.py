@@ -35,7 +35,7 @@ class Update(NamedTuple):
         nis: nu^T S^-1 nu.
         size: m.
         accepted: False where the gate refused it; the state is then unchanged.
-        spread: diagonal of S, shape (m,).
+        spread: diagonal of S with the noise as it was given, shape (m,).
     """
 
     residual: FloatArray
@@ -83,8 +83,8 @@ class EkfSlam:
         self._x, self._P = np.zeros(v + c + ROOM), np.zeros((v + c + ROOM, v + c + ROOM))
         self._x[:v], self._P[:v, :v] = x, P
         if calibration_mean is not None and c > 0:
-            shape = np.shape(calibration_covariance)
-            x, P = checked_gaussian(calibration_mean, np.asarray(calibration_covariance), shape)
+            given = np.zeros((c, c)) if calibration_covariance is None else np.asarray(calibration_covariance)
+            x, P = checked_gaussian(calibration_mean, given, given.shape)
             self._x[v : v + c], self._P[v : v + c, v : v + c] = x, P
         self._view()
 
@@ -127,26 +127,39 @@ class EkfSlam:
             FilterDiverged: the prediction is not finite.
         """
         v = self.vehicle_size
-        for name, array, shape in (("vehicle_mean", vehicle_mean, (v,)), ("F", F, (v, v)), ("Q", Q, (v, v))):
-            if array.shape != shape:
-                raise FilterShapeError(name, array.shape, str(shape))
+        if vehicle_mean.shape != (v,) or F.shape != (v, v) or Q.shape != (v, v):
+            raise _misfit(v, vehicle_mean, F, Q)
         rows = F.dot(self._rows)
         corner = rows[:, :v].dot(F.T)
         corner += Q
         if not np.vdot(corner, corner) + np.vdot(vehicle_mean, vehicle_mean) < HUGE:
             raise FilterDiverged(f"prediction is not finite: vehicle {vehicle_mean.tolist()}")
+        rows[:, :v] = 0.5 * (corner + corner.T)
         self._rows[:] = rows
         self._columns[:] = rows.T
-        self._corner[:] = corner
-        self._corner += corner.T
-        self._corner *= 0.5
         self._vehicle[:] = vehicle_mean
 
     def spread(self, columns: Columns, h: FloatArray) -> float:
         """H P H^T of one row, h (k,) over its ``columns`` (k,)."""
         return float(h.dot(self.covariance[np.ix_(columns, columns)]).dot(h))
 
-    def update_row(self, columns: Columns, h: FloatArray, residual: float, r: float, gate: float = inf) -> Update:
+    def relax(self, index: int, factor: float, variance: float) -> None:
+        """One state forgets: x <- factor x + noise, as a Gauss-Markov process does that nothing else depends on.
+
+        Args:
+            index: of the state.
+            factor: 0 to 1.
+            variance: of what comes anew.
+        """
+        P = self.covariance
+        self.mean[index] *= factor
+        P[index] *= factor
+        P[:, index] *= factor
+        P[index, index] += variance
+
+    def update_row(
+        self, columns: Columns, h: FloatArray, residual: float, r: float, gate: float = inf, knee: float = inf
+    ) -> Update:
         """Condition on one row.
 
         Args:
@@ -155,6 +168,8 @@ class EkfSlam:
             residual: z - h(x), wrapped where it is an angle.
             r: variance of its noise.
             gate: largest normalised innovation squared that is used.
+            knee: innovations beyond that many sigmas get a noise so much larger that they weigh as those at the knee
+                (Huber's loss, by one step of reweighting). The NIS is then that with the larger noise.
 
         Raises:
             FilterDiverged: the update is not finite, or the noise is not positive.
@@ -165,9 +180,14 @@ class EkfSlam:
         if not (r > 0.0 and r <= s * (1.0 + 1e-9) and s < HUGE and residual * residual < HUGE):
             raise FilterDiverged(f"update is not finite: residual {residual:.6g}, noise {r:.3g}, variance {s:.3g}")
         nis = residual * residual / s
-        learned = Update(np.array((residual,)), nis, 1, nis <= gate, np.array((s,)))
-        if not learned.accepted:
-            return learned
+        if nis > gate:
+            return Update(np.array((residual,)), nis, 1, False, np.array((s,)))
+        spread = np.array((s,))
+        if nis > knee * knee:
+            larger = s * sqrt(nis) / knee
+            r += larger - s
+            s, nis = larger, residual * residual / larger
+        learned = Update(np.array((residual,)), nis, 1, True, spread)
         if s < STRONG * r:
             v = cross * (1.0 / sqrt(s))
             P -= v[:, None] * v
@@ -329,6 +349,13 @@ def columns_of(*parts: slice | Sequence[int]) -> Columns:
     return np.array(numbers, dtype=np.intp)
 
 
+def _misfit(v: int, vehicle_mean: FloatArray, F: FloatArray, Q: FloatArray) -> FilterShapeError:
+    """Which of a prediction's arrays does not fit."""
+    wanted = (("vehicle_mean", vehicle_mean, (v,)), ("F", F, (v, v)), ("Q", Q, (v, v)))
+    name, array, shape = next(each for each in wanted if each[1].shape != each[2])
+    return FilterShapeError(name, array.shape, str(shape))
+
+
 def _checked_rows(columns: Columns, H: FloatArray, residual: FloatArray, R: FloatArray) -> FloatArray:
     """R as a matrix (m, m).
 
@@ -352,6 +379,7 @@ def _root(S: FloatArray, residual: FloatArray) -> FloatArray:
     if not float(np.vdot(S, S) + np.vdot(residual, residual)) < HUGE:
         raise FilterDiverged(f"update is not finite: residuals {residual.tolist()}")
     try:
-        return np.linalg.cholesky(S)
+        root = np.linalg.cholesky(S).astype(np.float64, copy=False)
     except np.linalg.LinAlgError:
         raise FilterDiverged("update is not finite, or H P H^T + R is not positive definite") from None
+    return root

@@ -56,6 +56,7 @@ class MeasurementBuilder:
         self._turn = 0.5 * robot.wheel_base_m / robot.wheel_radius_m
         self._var_ax = cfg.accelerometer_sigma_m_s2**2
         self._var_wz = cfg.gyroscope_sigma_rad_s**2
+        self._bias_wz = cfg.gyroscope_bias_rad_s
         self._var_wheel = cfg.encoder_sigma_rad_s**2
         self._cache: dict[tuple[int, int, int], Stack] = {}
 
@@ -79,7 +80,7 @@ class MeasurementBuilder:
             H[:k, A] = H[k : 2 * k, A] = samples[:, 0]
             z[:k] = samples[:, 1]
             z[k : 2 * k] = samples[:, 2]
-        _fill_imu(z, 2 * k, imu)
+        _fill_imu(z, 2 * k, imu, self._bias_wz)
         return stack
 
     def from_wheels(
@@ -91,7 +92,7 @@ class MeasurementBuilder:
         for i, (t, rate) in enumerate((*right, *left)):
             H[i, A] = (t - t_s) * self._per_radius
             z[i] = rate
-        _fill_imu(z, len(right) + len(left), imu)
+        _fill_imu(z, len(right) + len(left), imu, self._bias_wz)
         return stack
 
     def _template(self, right: int, left: int, imu: int) -> Stack:
@@ -119,11 +120,11 @@ class MeasurementBuilder:
         return Stack(np.zeros(m), H, R)
 
 
-def _fill_imu(z: FloatArray, start: int, imu: Sequence[ImuSample]) -> None:
+def _fill_imu(z: FloatArray, start: int, imu: Sequence[ImuSample], bias_rad_s: float) -> None:
     n = len(imu)
     for i, (_, ax, wz) in enumerate(imu, start):
         z[i] = ax
-        z[i + n] = wz
+        z[i + n] = wz - bias_rad_s
 
 
 class ConstantAcceleration:

@@ -96,6 +96,7 @@ class SurveyFilter:
         cfg, full = self._cfg, self._full
         mean, sigma = np.zeros(STATES), np.zeros(STATES)
         mean[[X, Y, PSI]] = pose.x_m, pose.y_m, pose.heading_rad
+        mean[BG] = cfg.gyroscope_bias_rad_s
         sigma[[X, Y]] = cfg.start_position_sigma_m
         sigma[PSI] = cfg.start_heading_sigma_rad
         sigma[[V, A, W]] = cfg.reset_speed_sigma_m_s, cfg.reset_acceleration_sigma_m_s2, cfg.reset_rate_sigma_rad_s

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from ccatp.config.loader import load_config
 from ccatp.errors import ConfigError, UnreachableError
-from ccatp.processes.common import Endpoints, open_log
+from ccatp.processes.common import RUN_DIR_FILE, Endpoints, open_log
 from ccatp.processes.dashboard import run_dashboard
-from ccatp.processes.page_socket import RUN_LINK, open_page_socket
+from ccatp.processes.page_socket import open_page_socket
 from ccatp.recorder import read_metadata
 from ccatp.runtime_dir import runtime_dir_path
 
@@ -32,12 +32,7 @@ def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callab
         if not key.startswith(ROOT):
             raise ConfigError(f"--set: {key} is no key of the page; the daemon runs with what it has, see {ROOT}*")
     folder = runtime_dir_path(str(runtime_dir or ""), os.environ)
-    run_dir = folder / RUN_LINK
-    if not (folder / "control").exists() or not (run_dir / "config.toml").exists():
-        raise UnreachableError(
-            f"no daemon in {folder}; start one with ccatp run, or name its folder with --runtime-dir"
-        )
-    run_dir = run_dir.resolve()
+    run_dir = _run_dir_of(folder)
     cfg = load_config(run_dir / "config.toml", {**settings, f"{ROOT}enabled": True})
     page = open_page_socket(cfg.dashboard)
     if page.socket is None:
@@ -50,3 +45,16 @@ def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callab
             run_dashboard(cfg, run_dir, Endpoints(folder), page.socket, is_sim=is_sim, log=log, has_pulse=False)
         )
     return 0
+
+
+def _run_dir_of(runtime_dir: Path) -> Path:
+    """Where the daemon of a runtime directory writes."""
+    try:
+        run_dir = Path((runtime_dir / RUN_DIR_FILE).read_text(encoding="utf-8").strip())
+    except OSError:
+        run_dir = None
+    if run_dir is None or not (runtime_dir / "control").exists():
+        raise UnreachableError(
+            f"no daemon in {runtime_dir}; start one with ccatp run, or name its folder with --runtime-dir"
+        )
+    return run_dir

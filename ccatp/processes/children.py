@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ccatp.config.models import RunConfig
+from ccatp.config.models import ProcessesConfig
 from ccatp.package import child_environment
 from ccatp.processes.common import SUPERVISOR_PID
 from ccatp.restarts import Decision, Fate, RestartPolicy, SilenceWatch
@@ -69,7 +69,10 @@ class Children:
     """
 
     def __init__(
-        self, cfg: RunConfig, command_of: Callable[[ProcessSpec, bool], tuple[list[str], tuple[int, ...]]], say: Say
+        self,
+        cfg: ProcessesConfig,
+        command_of: Callable[[ProcessSpec, bool], tuple[list[str], tuple[int, ...]]],
+        say: Say,
     ) -> None:
         """None yet."""
         self._cfg, self._command_of, self._say = cfg, command_of, say

@@ -8,12 +8,14 @@ import signal
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO, cast
+from typing import Any, Generic, NamedTuple, TextIO, TypeVar, cast
 
 import structlog
 
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
+from ccatp.config.radio_loader import is_radio_file, load_radio_config
+from ccatp.config.radio_models import RadioConfig
 from ccatp.errors import CcatpError
 from ccatp.processes.log_stream import LogStream
 
@@ -37,8 +39,11 @@ class Endpoints:
         return f"ipc://{self.runtime_dir / name}"
 
 
-@dataclass(frozen=True, slots=True)
-class ProcessArgs:
+C = TypeVar("C", Config, RadioConfig)
+
+
+@dataclass(frozen=True)  # no slots: an alias with its type filled in notes that on the instance
+class ArgsOf(Generic[C]):
     """What the supervisor tells a process.
 
     Attributes:
@@ -54,7 +59,7 @@ class ProcessArgs:
         is_sim: robot and laser system are stand-ins.
     """
 
-    config: Config
+    config: C
     run_dir: Path
     endpoints: Endpoints
     listen_fd: int | None
@@ -71,8 +76,48 @@ class ProcessArgs:
         return self.is_resuming or self.is_restarted
 
 
+ProcessArgs = ArgsOf[Config]
+BeaconArgs = ArgsOf[RadioConfig]
+
+
+class EitherArgs(NamedTuple):
+    """What a process serves: the survey of a mirror or a mission among beacons; the other one is ``None``."""
+
+    survey: ProcessArgs | None
+    beacons: BeaconArgs | None
+
+    @property
+    def one_of_beacons(self) -> BeaconArgs:
+        """Of a mission among beacons, where there is no survey."""
+        return cast(BeaconArgs, self.beacons)
+
+    @property
+    def one(self) -> ProcessArgs | BeaconArgs:
+        """Whichever it is."""
+        return self.survey or self.one_of_beacons
+
+    @property
+    def is_realtime(self) -> bool:
+        """Stand-ins pace on the wall clock."""
+        return self.one.is_realtime
+
+
+def parse_either(argv: list[str] | None = None) -> EitherArgs:
+    """As ``parse_args``, for processes that serve missions among beacons, too."""
+    run_dir, rest = _split(_parse(argv))
+    path = run_dir / "config.toml"
+    if is_radio_file(path):
+        return EitherArgs(None, ArgsOf(load_radio_config(path), run_dir, **rest))
+    return EitherArgs(ArgsOf(load_config(path), run_dir, **rest), None)
+
+
 def parse_args(argv: list[str] | None = None) -> ProcessArgs:
     """Read the command line of a process and the configuration it names; sockets that it makes are its user's alone."""
+    run_dir, rest = _split(_parse(argv))
+    return ArgsOf(load_config(run_dir / "config.toml"), run_dir, **rest)
+
+
+def _parse(argv: list[str] | None) -> argparse.Namespace:
     os.umask(os.umask(0o077) | 0o022)  # to connect to a socket takes the right to write to it
     parser = argparse.ArgumentParser()
     parser.add_argument("--run-dir", type=Path, required=True)
@@ -84,19 +129,21 @@ def parse_args(argv: list[str] | None = None) -> ProcessArgs:
     parser.add_argument("--restarted", action="store_true")
     parser.add_argument("--held", action="store_true")
     parser.add_argument("--sim", action="store_true")
-    args = parser.parse_args(argv)
-    return ProcessArgs(
-        load_config(args.run_dir / "config.toml"),
-        args.run_dir,
-        Endpoints(args.runtime_dir),
-        args.listen_fd,
-        is_realtime=args.realtime,
-        is_resuming=args.resume,
-        has_faults=args.faults,
-        is_restarted=args.restarted,
-        is_held=args.held,
-        is_sim=args.sim,
-    )
+    return parser.parse_args(argv)
+
+
+def _split(args: argparse.Namespace) -> tuple[Path, dict[str, Any]]:
+    """The run directory, and the fields behind it."""
+    return args.run_dir, {
+        "endpoints": Endpoints(args.runtime_dir),
+        "listen_fd": args.listen_fd,
+        "is_realtime": args.realtime,
+        "is_resuming": args.resume,
+        "has_faults": args.faults,
+        "is_restarted": args.restarted,
+        "is_held": args.held,
+        "is_sim": args.sim,
+    }
 
 
 def die_with_parent() -> None:

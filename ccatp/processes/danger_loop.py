@@ -10,12 +10,19 @@ import zmq
 import zmq.asyncio
 
 from ccatp.bus import Publisher, Subscriber
-from ccatp.danger import DangerMonitor
 from ccatp.errors import CcatpError
 from ccatp.frame_lag import FrameLag
-from ccatp.mirror.mirror import build_mirror
 from ccatp.processes import realtime, spinning
-from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
+from ccatp.processes.common import (
+    BeaconArgs,
+    ProcessArgs,
+    die_with_parent,
+    open_log,
+    parse_either,
+    report,
+    stop_on_signals,
+)
+from ccatp.processes.danger_duty import duty_of
 from ccatp.processes.hearing import MOST_AHEAD, await_message
 from ccatp.processes.joining import LastingLink
 from ccatp.processes.latching import FILE as EMERGENCIES_FILE
@@ -39,12 +46,12 @@ class DangerLoop:
         context: ZeroMQ context of the process.
     """
 
-    def __init__(self, args: ProcessArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
+    def __init__(self, args: ProcessArgs | BeaconArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
         """Build the pure part and bind the sockets."""
-        cfg = args.config
-        self._cfg, self._endpoints, self._context = cfg, args.endpoints, context
+        self._duty = duty = duty_of(args.config)
+        self._endpoints, self._context = args.endpoints, context
         self.log = open_log(args.run_dir / "log.jsonl", "danger")
-        self.monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger, cfg.health)
+        self.monitor = duty.monitor
         self.monitor.latch = DurableLatch(args.run_dir / EMERGENCIES_FILE, self.log)
         self._publisher = Publisher(context, args.endpoints.of("danger"))
         self._pulse = Pulse(self._publisher, "danger")
@@ -57,11 +64,11 @@ class DangerLoop:
         self._permit_seq = 0
         self._t_s = 0.0
         self._is_stale = False
-        self._lag = FrameLag(cfg.robot.slip_after_s)
+        self._lag = FrameLag(duty.link.slip_after_s)
         self._is_taking_over = args.is_taking_over
         self._hello: Hello | None = None
         self.lasting = LastingLink(
-            cfg.robot,
+            duty.link,
             role="monitor",
             client="danger",
             on_sensors=self.on_sensors,
@@ -70,7 +77,7 @@ class DangerLoop:
             on_bad_line=self._on_bad_line,
         )
         desk = ObservatoryDesk(self.monitor, lambda: self._pulse.frame_age_s if self._seq >= 0 else None, self.log)
-        self._observatory = Observatory(args.endpoints.of("emergency"), cfg.observatory, desk)
+        self._observatory = Observatory(args.endpoints.of("emergency"), duty.observatory, desk)
         self.lost = asyncio.Event()
         self._is_lockstep = False
 
@@ -85,7 +92,7 @@ class DangerLoop:
                 if not stop.is_set():
                     await self.lasting.join(is_patient=self._is_taking_over)
                     if not self._is_lockstep:
-                        realtime.enter(self._cfg.run.realtime_priority, self.log)
+                        realtime.enter(self._duty.realtime_priority, self.log)
                 waits = [tasks.create_task(stop.wait()), tasks.create_task(self.lost.wait())]
                 await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
                 for wait in waits:
@@ -94,7 +101,7 @@ class DangerLoop:
                 for task in served:
                     task.cancel()
                 self.lasting.close()
-        self.log.info("stopped", episodes=self.monitor.episodes_opened, edges=self.monitor.edges_declared)
+        self.log.info("stopped", **self.monitor.counts)
 
     async def _wait_for_main(self, stop: asyncio.Event) -> None:
         """Join the robot only when messages get through, both ways: the first ones must not be lost."""
@@ -111,9 +118,9 @@ class DangerLoop:
             self._estimate, self._seq, self._first_seq = None, -1, -1
         self._lag.forget()
         self._pulse.phase, self._pulse.frame_s = "joined", time.monotonic()
-        self.log.info("joined", port=self._cfg.robot.port, lockstep=hello.lockstep, session=self.lasting.sessions)
+        self.log.info("joined", port=self._duty.link.port, lockstep=hello.lockstep, session=self.lasting.sessions)
 
-    def on_sensors(self, sensors: Sensors, _raw: bytes) -> None:
+    def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
         """Judge one frame. In lockstep with a certain estimate of main's, so that the run is repeatable."""
         self._seq, self._t_s, self._pulse.frame_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
         self._bad_lines = 0
@@ -123,14 +130,14 @@ class DangerLoop:
         wanted = last_estimate_before(sensors.seq)
         self._take_estimates(wanted if wanted >= self._first_seq else -1)
         try:
-            verdict = self.monitor.step(sensors, self._estimate)
+            verdict = self._duty.judge(sensors, raw, self._estimate)
         except Exception as error:
             # Without a verdict the robot's permit runs out: it holds by itself.
             self.log.exception("surprise in a frame", seq=self._seq)
             print(f"ccatp danger: internal error: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
             self.lost.set()
             return
-        if not self._is_lockstep and self._lag.served(sensors.t, time.monotonic()) > self._cfg.danger.stale_after_s:
+        if not self._is_lockstep and self._lag.served(sensors.t, time.monotonic()) > self._duty.stale_after_s:
             verdict = self.monitor.stale(sensors.seq, sensors.t)  # it saw the past: no permit for the present
         self._give(verdict, sensors.seq)
 
@@ -201,9 +208,9 @@ class DangerLoop:
             age_s = self._pulse.frame_age_s
             if self._pulse.phase != "joined" or self._is_lockstep or age_s is None:
                 continue
-            if age_s > self._cfg.danger.stale_after_s:
+            if age_s > self._duty.stale_after_s:
                 self._declare_stale(age_s)
-            if age_s > self._cfg.robot.silence_timeout_s:
+            if age_s > self._duty.link.silence_timeout_s:
                 self.lasting.give_up(f"no sensors frame for {age_s:.2f} s")
 
     def _declare_stale(self, age_s: float) -> None:
@@ -223,7 +230,7 @@ class DangerLoop:
         self._publisher.close()
 
 
-async def run(args: ProcessArgs) -> int:
+async def run(args: ProcessArgs | BeaconArgs) -> int:
     """The process, from its arguments to its exit status."""
     stop = asyncio.Event()
     stop_on_signals(stop)
@@ -245,10 +252,10 @@ async def run(args: ProcessArgs) -> int:
 def main() -> int:
     """Entry of ``python -m ccatp.processes.danger_loop``."""
     die_with_parent()
-    args = parse_args()
+    args = parse_either()
     if not args.is_realtime:
         spinning.leave_a_core(os.getppid())
-    return spinning.run(run(args), is_spinning=not args.is_realtime)
+    return spinning.run(run(args.one), is_spinning=not args.is_realtime)
 
 
 if __name__ == "__main__":

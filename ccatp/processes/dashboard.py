@@ -19,8 +19,8 @@ from ccatp.dashboard.feed import Feed
 from ccatp.dashboard.ground import ground
 from ccatp.dashboard.hub import Hub
 from ccatp.dashboard.server import serve
+from ccatp.dashboard.survey_view import SurveyView
 from ccatp.dashboard.token_file import read_token
-from ccatp.dashboard.view import View
 from ccatp.mirror.mirror import build_mirror
 from ccatp.processes import spinning
 from ccatp.processes.common import Endpoints, die_with_parent, open_log, parse_args, stop_on_signals
@@ -52,7 +52,7 @@ class Dashboard:
         self._cfg, self._log, self._endpoints = cfg, log, endpoints
         token = read_token(cfg.dashboard)
         mirror = build_mirror(cfg.mirror)
-        view = View(mirror, cfg, is_sim=is_sim)
+        view = SurveyView(mirror, cfg, is_sim=is_sim)
         _remember(view, run_dir, mirror.name)
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._feed = Feed(self._context, endpoints.of, view, is_sim=is_sim)
@@ -119,7 +119,7 @@ async def run_dashboard(
         dashboard.close()
 
 
-def _remember(view: View, run_dir: Path, mirror: str) -> None:
+def _remember(view: SurveyView, run_dir: Path, mirror: str) -> None:
     """What stands in the mission's database is on the page, whoever measured it; without one there is nothing yet."""
     try:
         survey = read_survey(run_dir / "mission.sqlite", mirror)

@@ -7,13 +7,23 @@ import sys
 
 import structlog
 
+from ccatp.beacon_server import serve_beacons
 from ccatp.body_file import FILE
 from ccatp.config.models import Config
+from ccatp.config.radio_models import RadioConfig
 from ccatp.dataloop import serve
 from ccatp.errors import ConfigError
 from ccatp.fault_plan import read_plan
 from ccatp.processes import spinning
-from ccatp.processes.common import FAULTS_FILE, Endpoints, die_with_parent, open_log, parse_args, stop_on_signals
+from ccatp.processes.common import (
+    FAULTS_FILE,
+    BeaconArgs,
+    Endpoints,
+    die_with_parent,
+    open_log,
+    parse_either,
+    stop_on_signals,
+)
 from ccatp.robot_link import read_key
 from ccatp.runtime_dir import make_runtime_dir
 from ccatp.sim.faults.plan import FaultPlan
@@ -22,7 +32,10 @@ from ccatp.sim.faults.plan import FaultPlan
 def main() -> int:
     """Entry of ``python -m ccatp.processes.dataloop``."""
     die_with_parent()
-    args = parse_args()
+    either = parse_either()
+    if either.survey is None:
+        return _among_beacons(either.one_of_beacons)
+    args = either.survey
     cfg = args.config
     faults = read_plan(args.run_dir / FAULTS_FILE, lockstep=not args.is_realtime) if args.has_faults else None
     if not args.is_realtime:
@@ -50,6 +63,28 @@ def main() -> int:
     return spinning.run(run(), is_spinning=not args.is_realtime)
 
 
+def _among_beacons(args: BeaconArgs) -> int:
+    if not args.is_realtime:
+        spinning.leave_a_core(os.getppid())
+
+    async def run() -> int:
+        stop = asyncio.Event()
+        stop_on_signals(stop)
+        await serve_beacons(
+            args.config,
+            lockstep=not args.is_realtime,
+            stop=stop,
+            listen_sock=socket.socket(fileno=args.listen_fd),
+            truth_rep=args.endpoints.of("puck"),
+            truth_pub=args.endpoints.of("truth"),
+            key=read_key(args.config.robot.key_file),
+            log=open_log(args.run_dir / "log.jsonl", "dataloop"),
+        )
+        return 0
+
+    return spinning.run(run(), is_spinning=not args.is_realtime)
+
+
 def run_alone(cfg: Config, lockstep: bool, faults: FaultPlan | None = None) -> int:
     """The stand-in alone, for other people's controllers; ends on SIGINT or SIGTERM.
 
@@ -60,17 +95,9 @@ def run_alone(cfg: Config, lockstep: bool, faults: FaultPlan | None = None) -> i
         lockstep: simulated time waits for the controller.
         faults: what shall go wrong.
     """
-    at = cfg.sim.robot
     truth = Endpoints(make_runtime_dir(cfg.run.runtime_dir, os.environ)).of("puck")
-    try:
-        listener = socket.create_server((at.host, at.port), reuse_port=False)
-    except OSError as error:
-        raise ConfigError(
-            f"sim.robot.port: cannot listen on {at.host}:{at.port}: {error.strerror}; choose another with --port"
-        ) from error
-    host, port = listener.getsockname()[:2]
-    log: structlog.typing.FilteringBoundLogger = structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
-    print(f"ccatp: robot stand-in ({cfg.mirror.name}) on {host}:{port}, truth at {truth}", file=sys.stderr, flush=True)
+    listener = _listener(cfg.sim.robot.host, cfg.sim.robot.port)
+    _say_where(cfg.mirror.name, listener, truth)
 
     async def run() -> None:
         stop = asyncio.Event()
@@ -83,12 +110,47 @@ def run_alone(cfg: Config, lockstep: bool, faults: FaultPlan | None = None) -> i
             listen_sock=listener,
             truth_rep=truth,
             key=read_key(cfg.robot.key_file),
-            log=log,
+            log=_plain_log(),
             faults=faults,
         )
 
     asyncio.run(run())
     return 0
+
+
+def run_beacons_alone(cfg: RadioConfig, lockstep: bool) -> int:
+    """The same of a robot among beacons."""
+    truth = Endpoints(make_runtime_dir(cfg.processes.runtime_dir, os.environ)).of("puck")
+    listener = _listener(cfg.sim.robot.host, cfg.sim.robot.port)
+    _say_where(cfg.system, listener, truth)
+
+    async def run() -> None:
+        stop = asyncio.Event()
+        stop_on_signals(stop)
+        key, log = read_key(cfg.robot.key_file), _plain_log()
+        await serve_beacons(cfg, lockstep=lockstep, stop=stop, listen_sock=listener, truth_rep=truth, key=key, log=log)
+
+    asyncio.run(run())
+    return 0
+
+
+def _listener(host: str, port: int) -> socket.socket:
+    try:
+        return socket.create_server((host, port), reuse_port=False)
+    except OSError as error:
+        raise ConfigError(
+            f"sim.robot.port: cannot listen on {host}:{port}: {error.strerror}; choose another with --port"
+        ) from error
+
+
+def _say_where(what: str, listener: socket.socket, truth: str) -> None:
+    host, port = listener.getsockname()[:2]
+    print(f"ccatp: robot stand-in ({what}) on {host}:{port}, truth at {truth}", file=sys.stderr, flush=True)
+
+
+def _plain_log() -> structlog.typing.FilteringBoundLogger:
+    log: structlog.typing.FilteringBoundLogger = structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
+    return log
 
 
 if __name__ == "__main__":

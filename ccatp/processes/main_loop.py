@@ -10,7 +10,17 @@ import zmq.asyncio
 from ccatp.bus import Publisher
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
 from ccatp.processes import realtime, spinning
-from ccatp.processes.common import ProcessArgs, die_with_parent, open_log, parse_args, report, stop_on_signals
+from ccatp.processes.beacon_work import hosting_of_beacons, open_beacons
+from ccatp.processes.common import (
+    BeaconArgs,
+    EitherArgs,
+    ProcessArgs,
+    die_with_parent,
+    open_log,
+    parse_either,
+    report,
+    stop_on_signals,
+)
 from ccatp.processes.frame_clock import FrameClock
 from ccatp.processes.frame_service import FrameService
 from ccatp.processes.hearing import VerdictEar
@@ -40,7 +50,11 @@ class MainLoop:
     """
 
     def __init__(
-        self, args: ProcessArgs, context: zmq.Context[zmq.Socket[bytes]], hosting: Hosting, make_work: MakeWork
+        self,
+        args: ProcessArgs | BeaconArgs,
+        context: zmq.Context[zmq.Socket[bytes]],
+        hosting: Hosting,
+        make_work: MakeWork,
     ) -> None:
         """Bind the sockets and wire the parts."""
         self._hosting, self._endpoints, self._context = hosting, args.endpoints, context
@@ -248,12 +262,14 @@ class MainLoop:
         )
 
 
-def open_work(args: ProcessArgs) -> tuple[Hosting, AbstractContextManager[MakeWork]]:
-    """The mission that the configuration is of, and what the process needs to host it."""
-    return hosting_of(args.config), open_survey(args)
+def open_work(args: EitherArgs) -> tuple[Hosting, AbstractContextManager[MakeWork]]:
+    """THE table of missions: which one the configuration is of, and what the process needs to host it."""
+    if args.survey is not None:
+        return hosting_of(args.survey.config), open_survey(args.survey)
+    return hosting_of_beacons(args.one_of_beacons.config), open_beacons(args.one_of_beacons)
 
 
-async def run(args: ProcessArgs, core: int | None) -> int:
+async def run(args: EitherArgs, core: int | None) -> int:
     """The process, from its arguments to its exit status; ``core`` is for the main thread alone."""
     stop = asyncio.Event()
     stop_on_signals(stop)
@@ -263,7 +279,7 @@ async def run(args: ProcessArgs, core: int | None) -> int:
     try:
         hosting, opening = open_work(args)
         with opening as make_work:
-            loop = MainLoop(args, context, hosting, make_work)
+            loop = MainLoop(args.one, context, hosting, make_work)
             spinning.take_core(core)  # now that the threads of ZeroMQ and of the store have been started elsewhere
             await loop.run(stop)
     except* CcatpError as group:
@@ -278,7 +294,7 @@ async def run(args: ProcessArgs, core: int | None) -> int:
 def main() -> int:
     """Entry of ``python -m ccatp.processes.main_loop``."""
     die_with_parent()
-    args = parse_args()
+    args = parse_either()
     core = None if args.is_realtime else spinning.leave_a_core(os.getppid())
     return spinning.run(run(args, core), is_spinning=not args.is_realtime)
 

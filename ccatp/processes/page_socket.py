@@ -1,16 +1,12 @@
 """Glue. Where the dashboard listens: bound by the supervisor, so that one that is started anew is found there again."""
 
-import contextlib
 import errno
 import socket
-from pathlib import Path
 from typing import NamedTuple
 
 from ccatp.config.models import DashboardConfig
 
 BACKLOG = 64
-# In the runtime directory, a link to the run directory of the daemon that runs, or ran last.
-RUN_LINK = "run"
 
 
 class PageSocket(NamedTuple):
@@ -55,15 +51,6 @@ def page_url(host: str, port: int) -> str:
     return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
 
 
-def note_run_dir(runtime_dir: Path, run_dir: Path) -> None:
-    """Leave word in the runtime directory where the run is written, for displays that come later."""
-    new = runtime_dir / f"{RUN_LINK}.new"
-    with contextlib.suppress(OSError):
-        new.unlink(missing_ok=True)
-        new.symlink_to(run_dir)
-        new.replace(runtime_dir / RUN_LINK)
-
-
 def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     return socket.create_server((host, port), family=family, backlog=BACKLOG)
@@ -75,4 +62,5 @@ def _told(listener: socket.socket, cfg: DashboardConfig, level: str, before: str
 
 
 def _without(cfg: DashboardConfig, error: OSError) -> str:
-    return f"no dashboard: cannot listen on {cfg.host}:{cfg.port}: {error.strerror}; choose another dashboard.host"
+    why = str(error.strerror).partition(" (while")[0]  # Python appends the address once more
+    return f"no dashboard: cannot listen on {cfg.host}:{cfg.port}: {why}; choose another dashboard.host"

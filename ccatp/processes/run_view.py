@@ -34,21 +34,20 @@ class RunView:
     """Progress and messages on standard error; the summary on standard output.
 
     Args:
-        cfg: the run's configuration.
+        title: what runs.
         is_sim: mark it visibly as a simulation.
         run_dir: where the run is written.
+        goals: what there are so many of to be done.
     """
 
-    def __init__(self, cfg: Config, *, is_sim: bool, run_dir: Path) -> None:
+    def __init__(self, title: str, *, is_sim: bool, run_dir: Path, goals: str = "points") -> None:
         """Say what runs."""
         self._console: Console = _PatientConsole(stderr=True, highlight=False)
         self._is_terminal = self._console.is_terminal
-        self._run_dir = run_dir
         self._has_pose = False
         self._told_tenths = 0
-        what = "SIMULATION" if is_sim else "survey"
-        world = f", world {cfg.world.name}, seed {cfg.run.seed}" if is_sim else ""
-        self._console.print(f"ccatp {what} of {cfg.mirror.name}{world}, filter {cfg.run.filter}; writing {run_dir}")
+        self._goals = goals
+        self._console.print(f"{title}; writing {run_dir}")
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -57,7 +56,7 @@ class RunView:
             console=self._console,
             auto_refresh=False,
         )
-        self._task = self._progress.add_task("SIM" if is_sim else "points", total=None, state="starting")
+        self._task = self._progress.add_task("SIM" if is_sim else goals, total=None, state="starting")
 
     def __enter__(self) -> "RunView":
         if self._is_terminal:
@@ -82,10 +81,7 @@ class RunView:
 
     def status(self, status: MissionStatus) -> None:
         """Points done, state, ETA, error."""
-        text = (
-            f"{status.state} {status.point}  {_clock(status.elapsed_s)} elapsed, {_clock(status.eta_s)} to go, "
-            f"arrival {status.error_mm:.2f} mm"
-        )
+        text = self.text_of(status)
         if self._is_terminal:
             self._progress.update(self._task, completed=status.done, total=status.total, state=text)
             self._progress.refresh()
@@ -93,7 +89,14 @@ class RunView:
         tenths = 10 * status.done // max(status.total, 1)
         if tenths > self._told_tenths:
             self._told_tenths = tenths
-            self._console.print(f"{10 * tenths} %: {status.done} of {status.total} points, {text}", soft_wrap=True)
+            self._console.print(
+                f"{10 * tenths} %: {status.done} of {status.total} {self._goals}, {text}", soft_wrap=True
+            )
+
+    def text_of(self, status: MissionStatus) -> str:
+        """State, place, times, error."""
+        times = f"{_clock(status.elapsed_s)} elapsed, {_clock(status.eta_s)} to go"
+        return f"{status.state} {status.point}  {times}, arrival {status.error_mm:.2f} mm"
 
     def show_summary(self, summary: dict[str, Any], *, as_json: bool) -> None:
         """The end: JSON alone on standard output, or a table."""
@@ -104,10 +107,26 @@ class RunView:
             sys.stdout.write(format_table(summary) + "\n")
         sys.stdout.flush()
 
-    def show_report(self, path: Path | None) -> None:
-        """Where the report is, or how to make it; on standard error, so that JSON stays alone."""
-        where = f"report  {path}" if path is not None else f"report  none; make it with: ccatp report {self._run_dir}"
-        self._console.print(where, soft_wrap=True, markup=False)
+    def show_report(self, where: str) -> None:
+        """Where the report is, or why there is none; on standard error, so that JSON stays alone."""
+        self._console.print(f"report  {where}", soft_wrap=True, markup=False)
+
+
+def survey_title(cfg: Config, *, is_sim: bool) -> str:
+    """What runs, of a survey."""
+    what = "SIMULATION" if is_sim else "survey"
+    world = f", world {cfg.world.name}, seed {cfg.run.seed}" if is_sim else ""
+    return f"ccatp {what} of {cfg.mirror.name}{world}, filter {cfg.run.filter}"
+
+
+class BeaconView(RunView):
+    """The same of a mission among beacons."""
+
+    def text_of(self, status: MissionStatus) -> str:
+        """State, place, time, uncertainty."""
+        cause = f" ({status.cause})" if status.cause else ""
+        where = f"{status.state}{cause} {status.point}  {_clock(status.elapsed_s)} elapsed"
+        return f"{where}, position known to {0.1 * status.error_mm:.1f} cm"
 
 
 def _clock(seconds: float) -> str:

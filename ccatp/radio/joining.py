@@ -1,147 +1,310 @@
-"""Pure. Beacons whose direction nobody hears: readings wait, with the places they were taken at, until they say where."""
+"""Pure. Beacons whose direction nobody hears: readings wait, with where they were taken, until they say where."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import cos, hypot, pi, sin
+from math import cos, hypot, inf, isfinite, log1p, pi, sin, sqrt
+from statistics import median
 from typing import NamedTuple
 
 import numpy as np
 
 from ccatp.filters.base import FloatArray
-from ccatp.filters.ekf_slam import BlockId, EkfSlam
-from ccatp.radio.readings import Reading, RssiReading
-from ccatp.radio.sightings import Row
-from ccatp.radio.slam_settings import SlamSettings
+from ccatp.filters.ekf_slam import BlockId, Columns, EkfSlam, columns_of
+from ccatp.radio.readings import BeaconId, Reading
+from ccatp.radio.sightings import Row, strength_of
 
-Rows = Callable[[Reading, list[float], list[float], list[float]], list[Row]]
+RowOf = Callable[[Reading, list[float], list[float], list[float]], Row]
 
 MOST = 24
-LEAST = 5
-STARTS = 16
-MARGIN = 14.0
-TIGHT = 0.15
+"""Readings of a beacon that are kept; beyond, every other one goes, and they are taken twice as far apart."""
+LEAST = 8
+"""Readings without which a beacon is not looked for: what its place needs, four times over."""
+SPACING = 0.01
+"""Way between readings that are kept, at first, relative to the range."""
+STARTS = 24
+"""Directions about the vehicle in which a beacon is looked for."""
+TIGHT = 0.1
+"""Largest standard deviation, across the line of sight, of a beacon that joins, relative to its distance."""
+LOOSEST = 2.5
+"""How many times that is borne at last, in proportion to the readings: the vehicle strays while beacons wait."""
+DEEP = 0.3
+"""The same along it, where ranges are all but linear: a scale that all share may be that uncertain."""
+APART = 0.05
+"""Places nearer to each other than that, relative to the distance, are one."""
+KNEE = 3.0
+"""Residuals beyond that many sigmas first weigh no more than those at it (Huber), at last nothing: readings round a
+corner are too long. Each then costs what one at the knee does, so that places can be compared."""
+MEDIAN_TO_SIGMA = 1.4826
+"""Standard deviation of a Gaussian over the median of its absolute value."""
+OUT = 100.0
+"""What a residual squared is taken times for the variance of a reading that is left out."""
+PLAIN, ROBUST, ITERATIONS = 3, 7, 14
+"""Steps of Gauss-Newton without weights, until those of Huber end, and at most."""
+MARGIN = 14.0 + 2.0 * KNEE**2
+"""How much worse the second best place must be, chi-squared, so that the best is no mirror image: odds of a thousand to
+one, though two readings were off."""
+FIT = 6.0
+"""Sigmas by which chi-squared may exceed its expectation; if it stays beyond, the noise is taken for that much larger
+(Birge's ratio): with less noise in the settings than there is, no beacon would ever join."""
 
 
 class Record(NamedTuple):
+    """A reading that waits.
+
+    Attributes:
+        reading: as it was taken.
+        place: block of the state that holds the place (x_m, y_m) where it was taken.
+        distance_m: what it says of the distance, roughly.
+    """
+
     reading: Reading
     place: BlockId
+    distance_m: float
 
 
 class Candidate(NamedTuple):
+    """A place where a beacon may be.
+
+    Attributes:
+        mean: states of the beacon, shape (b,).
+        covariance: shape (b, b).
+        cost: chi-squared of the readings.
+        variances: of the readings' noise, larger where they look too far off, shape (m,).
+    """
+
     mean: FloatArray
     covariance: FloatArray
     cost: float
+    variances: FloatArray
+
+
+class Prior(NamedTuple):
+    """What is known of a beacon before its readings: all but nothing of its place.
+
+    Attributes:
+        mean: x_m, y_m and what else is estimated of it, shape (b,).
+        covariance: shape (b, b).
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+
+
+class Clone(NamedTuple):
+    """The vehicle's place as a function of the state.
+
+    Attributes:
+        mean: x_m, y_m, shape (2,).
+        columns: of the state that it depends on, shape (k,).
+        jacobian: shape (2, k).
+    """
+
+    mean: FloatArray
+    columns: Columns
+    jacobian: FloatArray
+
+
+PriorAt = Callable[[float, float], Prior]
 
 
 @dataclass(slots=True)
 class Waiting:
-    """Readings of a beacon that is not on the map yet."""
+    """Readings of a beacon that is not on the map yet.
 
+    The vehicle's place at each of them is kept in the state as a clone (Mourikis and Roumeliotis 2007), so that what
+    they say of the beacon comes with the right correlations, however long they wait. With H the derivatives by clones
+    and calibration, S = H P H^T + R, each candidate minimises e^T S^-1 e.
+
+    Attributes:
+        beacon: which one.
+        records: the readings, oldest first.
+        candidates: where it may be, best first; two as long as a mirror image is possible.
+    """
+
+    beacon: BeaconId
     records: list[Record] = field(default_factory=list)
-    spacing_m: float = 0.0
     candidates: list[Candidate] = field(default_factory=list)
+    spacing_m: float = 0.0
     count: int = 0
 
-    def take(self, engine: EkfSlam, reading: Reading, range_m: float) -> None:
-        x, y = engine.mean[:2].tolist()
+    @property
+    def is_ready(self) -> bool:
+        """Whether there are enough readings to look for it."""
+        return len(self.records) >= LEAST
+
+    def take(self, engine: EkfSlam, reading: Reading, place: Clone, range_m: float) -> bool:
+        """Keep a reading, if the vehicle has moved since the last one that was kept."""
+        x, y = place.mean.tolist()
         if not self.records:
-            self.spacing_m = 0.01 * range_m
+            self.spacing_m = SPACING * range_m
         else:
-            bx, by = engine.mean[engine.block(self.records[-1].place)].tolist()
-            if hypot(x - bx, y - by) < self.spacing_m:
-                return
-        place = ("place", reading.beacon, self.count)
+            last_x, last_y = engine.mean[engine.block(self.records[-1].place)].tolist()
+            if hypot(x - last_x, y - last_y) < self.spacing_m:
+                return False
+        block = ("place", self.beacon, self.count)
         self.count += 1
-        engine.augment(place, engine.mean[:2].copy(), np.array((0, 1)), np.eye(2))
-        self.records.append(Record(reading, place))
+        engine.augment(block, place.mean, place.columns, place.jacobian)
+        self.records.append(Record(reading, block, range_m))
         if len(self.records) > MOST:
             self.spacing_m *= 2.0
             for record in self.records[1::2]:
                 engine.remove(record.place)
             self.records = self.records[::2]
+        return True
 
-    def solve(
-        self, engine: EkfSlam, rows: Rows, calibration: slice, settings: SlamSettings
-    ) -> tuple[FloatArray, FloatArray] | None:
-        if len(self.records) < LEAST:
+    def drop(self, engine: EkfSlam) -> None:
+        """Forget the readings."""
+        for record in self.records:
+            engine.remove(record.place)
+        self.records = []
+
+    def look(self, engine: EkfSlam, row_of: RowOf, shared: slice, prior_at: PriorAt, reach_m: float) -> None:
+        """Look for the beacon: sets ``candidates``.
+
+        Args:
+            engine: holds the places and the calibration.
+            row_of: what a reading should be (the row without bearing).
+            shared: the calibration's place in the state.
+            prior_at: prior of a beacon at x_m, y_m.
+            reach_m: how far it is from the last place, roughly.
+        """
+        problem = _problem(engine, self.records, row_of, shared, reach_m)
+        starts: list[Prior] = []
+        for radius_m in {reach_m, self._usual_m(reach_m)}:
+            starts += problem.around(prior_at, radius_m)
+        starts += [Prior(c.mean, prior_at(*c.mean[:2].tolist()).covariance) for c in self.candidates]
+        found = [candidate for candidate in map(problem.refine, starts) if candidate is not None]
+        best = min(found, key=lambda c: c.cost, default=None)
+        if best is not None:
+            mirrored = problem.refine(prior_at(*problem.mirrored(best.mean[:2])))
+            found += [] if mirrored is None else [mirrored]
+        found.sort(key=lambda c: c.cost)
+        apart: list[Candidate] = []
+        for candidate in found:
+            if all(hypot(*(candidate.mean - c.mean)[:2].tolist()) > APART * reach_m for c in apart):
+                apart.append(candidate)
+        self.candidates = apart[:2]
+
+    def _usual_m(self, reach_m: float) -> float:
+        """Median distance that the readings tell: the last one may have gone round a corner."""
+        return median([record.distance_m for record in self.records]) if self.records else reach_m
+
+    def found(self, engine: EkfSlam) -> Candidate | None:
+        """The beacon's place, if there is only one, well enough known to be linearised at, and the readings agree."""
+        if not self.candidates:
             return None
-        z = np.array(
-            [r.reading.rssi_dbm if isinstance(r.reading, RssiReading) else r.reading.range_m for r in self.records]
-        )
-        places = np.array([engine.mean[engine.block(r.place)] for r in self.records])
-        columns = np.concatenate([np.r_[engine.block(r.place)] for r in self.records] + [np.r_[calibration]]).astype(
-            np.intp
-        )
-        P = engine.covariance[np.ix_(columns, columns)]
-        cal = engine.mean[calibration].tolist()
-        m, c = z.size, len(cal)
-        first = self.records[-1].reading
-        distance = _distance(settings, first)
-        found: list[Candidate] = []
-        for k in range(STARTS):
-            angle = 2.0 * pi * k / STARTS
-            mean, spread = widened(
-                settings, places[-1, 0] + distance * cos(angle), places[-1, 1] + distance * sin(angle), distance, first
-            )
-            prior = mean.copy()
-            Wp = np.linalg.inv(spread)
-            b = mean.copy()
-            cost = np.inf
-            for _ in range(12):
-                H, G, e = np.zeros((m, columns.size)), np.zeros((m, b.size)), np.zeros(m)
-                R = np.zeros(m)
-                for i, record in enumerate(self.records):
-                    row = rows(record.reading, [*places[i].tolist(), 0.0], cal, b.tolist())[0]
-                    e[i] = z[i] - row.expected
-                    H[i, 2 * i : 2 * i + 2] = row.pose[:2]
-                    H[i, columns.size - c :] = row.calibration
-                    G[i] = row.beacon
-                    R[i] = row.variance
-                S = H @ P @ H.T + np.diag(R)
-                WG = np.linalg.solve(S, G)
-                A = G.T @ WG + Wp
-                step = np.linalg.solve(A, WG.T @ e + Wp @ (prior - b))
-                size = hypot(step[0], step[1])
-                if size > 0.5 * distance:
-                    step *= 0.5 * distance / size
-                b = b + step
-                if size < 1e-4 * distance:
-                    break
-            cost = float(e @ np.linalg.solve(S, e))
-            if not np.isfinite(cost):
-                continue
-            if all(hypot(*(b[:2] - o.mean[:2])) > 0.02 * distance for o in found):
-                found.append(Candidate(b, np.linalg.inv(A), cost))
-        found.sort(key=lambda f: f.cost)
-        self.candidates = found[:2]
-        if not found:
+        best = self.candidates[0]
+        x, y = engine.mean[engine.block(self.records[-1].place)].tolist()
+        sight = best.mean[:2] - (x, y)
+        distance = hypot(*sight.tolist())
+        along, across = sight / distance, np.array((-sight[1], sight[0])) / distance
+        C = best.covariance[:2, :2]
+        tight = TIGHT * min(max(self.count / MOST, 1.0), LOOSEST)
+        if across.dot(C).dot(across) > (tight * distance) ** 2 or along.dot(C).dot(along) > (DEEP * distance) ** 2:
             return None
-        best = found[0]
-        sigma = float(np.sqrt(np.linalg.eigvalsh(best.covariance[:2, :2])[-1]))
-        if sigma > TIGHT * hypot(*(best.mean[:2] - places[-1])):
+        m = len(self.records)
+        excess = max(1.0, best.cost / (m - best.mean.size))
+        if best.cost > m + FIT * sqrt(2.0 * m) and self.count <= MOST:
             return None
-        if len(found) > 1 and found[1].cost - best.cost < MARGIN:
+        if any(other.cost - best.cost < MARGIN * excess for other in self.candidates[1:]):
             return None
-        return widened(settings, best.mean[0], best.mean[1], distance, first)
+        return best._replace(variances=excess * best.variances)
 
 
-def _distance(s: SlamSettings, reading: Reading) -> float:
-    if isinstance(reading, RssiReading):
-        assert s.rssi is not None
-        return float(10.0 ** ((s.rssi.reference_dbm - reading.rssi_dbm) / (10.0 * s.rssi.exponent)))
-    return max(reading.range_m, 0.0)
+class _Problem(NamedTuple):
+    """Find b in z = h(places, calibration, b)."""
+
+    readings: list[Reading]
+    z: FloatArray
+    places: list[list[float]]
+    calibration: list[float]
+    P: FloatArray
+    row_of: RowOf
+    reach_m: float
+
+    def around(self, prior_at: PriorAt, radius_m: float) -> list[Prior]:
+        """Where to begin: the best directions on a circle about the last place."""
+        x, y = self.places[-1]
+        angles = [2.0 * pi * k / STARTS for k in range(STARTS)]
+        ring = [prior_at(x + radius_m * cos(angle), y + radius_m * sin(angle)) for angle in angles]
+        costs = [self.rough(prior) for prior in ring]
+        return [ring[k] for k in range(STARTS) if costs[k] <= min(costs[k - 1], costs[(k + 1) % STARTS])]
+
+    def mirrored(self, point: FloatArray) -> tuple[float, float]:
+        """The image of a point (2,) on the other side of the way, which ranges tell apart last."""
+        places = np.array(self.places)
+        middle = places.mean(axis=0)
+        along = np.linalg.svd(places - middle)[2][0]
+        x, y = middle + 2.0 * along * along.dot(point - middle) - (point - middle)
+        return float(x), float(y)
+
+    def rough(self, prior: Prior) -> float:
+        """How badly a guess fits, places and calibration as they are; a reading that is off counts little (Cauchy)."""
+        b = prior.mean.tolist()
+        cost = 0.0
+        for reading, z, place in zip(self.readings, self.z.tolist(), self.places, strict=True):
+            row = self.row_of(reading, [*place, 0.0], self.calibration, b)
+            cost += log1p((z - row.expected) ** 2 / row.variance)
+        return cost
+
+    def refine(self, prior: Prior) -> Candidate | None:
+        """Gauss-Newton with weights; None where it leads nowhere."""
+        b, W, stride = prior.mean.copy(), np.linalg.inv(prior.covariance), 0.5 * self.reach_m
+        variances, A, cost = self.z, W, inf
+        for k in range(ITERATIONS):
+            H, G, e, R = self._linear(b)
+            spread = H.dot(self.P).dot(H.T)
+            variances, left_out = _weighed(e, spread.diagonal() + R, R, k)
+            S = spread + np.diag(variances)
+            SG = np.linalg.solve(S, G)
+            A = G.T.dot(SG) + W
+            step = np.linalg.solve(A, SG.T.dot(e) + W.dot(prior.mean - b))
+            size = hypot(step[0], step[1])
+            cost = float(e.dot(np.linalg.solve(S, e))) + left_out
+            if not (isfinite(cost) and isfinite(size)):
+                return None
+            if size < 1e-3 * stride and k > ROBUST:
+                break
+            b = b + step * min(1.0, stride / max(size, 1e-12))
+        return Candidate(b, np.linalg.inv(A), cost, variances)
+
+    def _linear(self, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        m, c = self.z.size, len(self.calibration)
+        H, G, e, R = np.zeros((m, 2 * m + c)), np.zeros((m, b.size)), np.zeros(m), np.zeros(m)
+        values = b.tolist()
+        for i, (reading, place) in enumerate(zip(self.readings, self.places, strict=True)):
+            row = self.row_of(reading, [*place, 0.0], self.calibration, values)
+            H[i, 2 * i : 2 * i + 2] = row.pose[:2]
+            H[i, 2 * m : 2 * m + len(row.calibration)] = row.calibration
+            G[i], R[i], e[i] = row.beacon, row.variance, self.z[i] - row.expected
+        return H, G, e, R
 
 
-def widened(
-    settings: SlamSettings, x_m: float, y_m: float, range_m: float, reading: Reading
-) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance of a beacon about which nothing but its readings is known."""
-    mean, sigma = [x_m, y_m], [100.0 * (range_m + 0.1)] * 2
-    if isinstance(reading, RssiReading) and settings.rssi is not None:
-        if settings.rssi.reference_sigma_db > 0.0:
-            mean.append(settings.rssi.reference_dbm)
-            sigma.append(settings.rssi.reference_sigma_db)
-        if settings.rssi.exponent_sigma > 0.0:
-            mean.append(settings.rssi.exponent)
-            sigma.append(settings.rssi.exponent_sigma)
-    return np.array(mean), np.diag(np.square(sigma))
+def _weighed(e: FloatArray, S: FloatArray, R: FloatArray, step: int) -> tuple[FloatArray, float]:
+    """Variances of the readings at a step of the iteration, and what those that are left out cost.
+
+    Args:
+        e: residuals, shape (m,).
+        S: their variances by all that is unknown, shape (m,).
+        R: those of the readings, shape (m,).
+        step: how many went before.
+    """
+    if step < PLAIN:
+        return R, 0.0
+    sigmas = np.abs(e) / np.sqrt(S)
+    if step < ROBUST:
+        return R + S * np.maximum(sigmas / KNEE - 1.0, 0.0), 0.0
+    # by the usual residual, not by the noise that was promised: or a bad place could leave out what speaks against it
+    limit = KNEE * max(1.0, MEDIAN_TO_SIGMA * float(np.median(sigmas)))
+    is_out = sigmas > limit
+    return R + np.where(is_out, OUT * e * e, 0.0), limit**2 * float(is_out.sum())
+
+
+def _problem(engine: EkfSlam, records: list[Record], row_of: RowOf, shared: slice, reach_m: float) -> _Problem:
+    readings = [record.reading for record in records]
+    z = np.array([strength_of(r) for r in readings])
+    blocks = [engine.block(record.place) for record in records]
+    columns = columns_of(*blocks, shared)
+    P = engine.covariance[np.ix_(columns, columns)]
+    places = [engine.mean[block].tolist() for block in blocks]
+    return _Problem(readings, z, places, engine.mean[shared].tolist(), P, row_of, reach_m)

@@ -9,6 +9,8 @@ import numpy as np
 from ccatp.filters.base import FloatArray
 
 POSE = 3  # x_m, y_m, heading_rad: the first states of a vehicle
+SMALL_RAD = 1e-3
+"""Half a turn below which sin(a) / a is 1 - a^2 / 6 to the last digit."""
 
 
 class Pose(NamedTuple):
@@ -58,12 +60,26 @@ class Steering:
 Odometry = Increment | Steering
 
 
+class RestReading(NamedTuple):
+    """What a vehicle at rest shows of its odometry's calibration.
+
+    Attributes:
+        column: of the state that it measures.
+        value: what it should be.
+        variance: of the value.
+    """
+
+    column: int
+    value: float
+    variance: float
+
+
 class MotionStep(NamedTuple):
     """A prediction of the vehicle's states.
 
     Attributes:
         mean: shape (v,).
-        F: d(mean)/d(states before), shape (v, v).
+        F: d(mean)/d(states before), shape (v, v); work space, as Q: it holds until the next step.
         Q: covariance of what the odometry does not say, shape (v, v).
     """
 
@@ -106,6 +122,8 @@ class DifferentialNoise:
         turn_bias_walk_rad_s_sqrt_s: how it wanders, (rad/s) / sqrt(s).
         turn_scale_sigma: prior of the relative error of turns; 0: not estimated.
         distance_scale_sigma: prior of the relative error of distances; 0: not estimated.
+        rest_speed_m_s, rest_turn_rad_s: odometry slower than both comes from a vehicle at rest; used where a turn bias
+            is estimated; 0: never.
     """
 
     distance_per_sqrt_m: float
@@ -118,6 +136,8 @@ class DifferentialNoise:
     turn_bias_walk_rad_s_sqrt_s: float = 0.0
     turn_scale_sigma: float = 0.0
     distance_scale_sigma: float = 0.0
+    rest_speed_m_s: float = 0.0
+    rest_turn_rad_s: float = 0.0
 
 
 class DifferentialDrive:
@@ -129,7 +149,7 @@ class DifferentialDrive:
         x <- x + c d cos(m) - l sin(m),  y <- y + c d sin(m) + l cos(m),  heading <- heading + w
 
     States behind the pose, each where its prior is not zero: turn_bias_rad_s (b), turn_scale (e_w), distance_scale
-    (e_d): positive where the odometry reads too much.
+    (e_d): positive where the odometry reads too much. At rest the turn is nothing but the bias: the heading stays.
 
     Args:
         noise: of the odometry, and priors of its calibration.
@@ -144,63 +164,83 @@ class DifferentialDrive:
         )
         self.names = tuple(name for name, sigma in priors if sigma > 0.0)
         self.prior_sigmas = tuple(sigma for _, sigma in priors if sigma > 0.0)
-        self._place = {name: POSE + i for i, name in enumerate(self.names)}
-        self.size = POSE + len(self.names)
+        place = {name: POSE + i for i, name in enumerate(self.names)}
+        self._bias, self._turn_scale, self._way_scale = (place.get(name, -1) for name, _ in priors)
+        size = POSE + len(self.names)
+        self._F, self._Q = np.eye(size), np.zeros((size, size))
 
     def step(self, states: FloatArray, odometry: Odometry) -> MotionStep:
         """See ``MotionModel.step``; takes an ``Increment``."""
         if not isinstance(odometry, Increment):
             raise TypeError(f"a differential drive takes increments, not {type(odometry).__name__}")
         values: list[float] = states.tolist()
-        place, dt = self._place, odometry.interval_s
-        bias, turn_scale, way_scale = (self._at(values, n) for n in ("turn_bias_rad_s", "turn_scale", "distance_scale"))
-        way, side = odometry.distance_m / (1.0 + way_scale), odometry.lateral_m / (1.0 + way_scale)
-        turn = odometry.turn_rad / (1.0 + turn_scale) - bias * dt
+        scaled = 1.0 + values[self._way_scale] if self._way_scale >= 0 else 1.0
+        way, side = odometry.distance_m / scaled, odometry.lateral_m / scaled
+        is_at_rest = self._bias >= 0 and self._rests(odometry)
+        turn, by_bias, by_scale = (0.0, 0.0, 0.0) if is_at_rest else self._turn(values, odometry)
         half = 0.5 * turn
-        chord = 1.0 - half * half / 6.0 if abs(half) < 1e-3 else sin(half) / half
-        d_chord = -half / 3.0 if abs(half) < 1e-3 else (cos(half) - chord) / half  # by half
+        chord = 1.0 - half * half / 6.0 if abs(half) < SMALL_RAD else sin(half) / half
+        d_chord = -half / 3.0 if abs(half) < SMALL_RAD else (cos(half) - chord) / half
         c, s = cos(values[2] + half), sin(values[2] + half)
         dx, dy = chord * way * c - side * s, chord * way * s + side * c
-        # by the turn: half of what the heading does, and the chord that shrinks
-        x_turn, y_turn = 0.5 * (-dy + d_chord * way * c), 0.5 * (dx + d_chord * way * s)
-        mean = states.copy()
+        # by the turn: half of what the heading does, and half of what the chord loses
+        x_turn, y_turn = 0.5 * (d_chord * way * c - dy), 0.5 * (d_chord * way * s + dx)
+        mean, F = states.copy(), self._F
         mean[0], mean[1], mean[2] = values[0] + dx, values[1] + dy, values[2] + turn
-        F = np.eye(self.size)
         F[0, 2], F[1, 2] = -dy, dx
-        for name, by in (("turn_bias_rad_s", -dt), ("turn_scale", -odometry.turn_rad / (1.0 + turn_scale) ** 2)):
-            if name in place:
-                F[0, place[name]], F[1, place[name]], F[2, place[name]] = x_turn * by, y_turn * by, by
-        if "distance_scale" in place:
-            F[0, place["distance_scale"]], F[1, place["distance_scale"]] = (
-                -dx / (1.0 + way_scale),
-                -dy / (1.0 + way_scale),
-            )
-        return MotionStep(mean, F, self._noise(odometry, (c, s), (x_turn, y_turn), chord))
+        for place, by in ((self._bias, by_bias), (self._turn_scale, by_scale)):
+            if place >= 0:
+                F[0, place], F[1, place], F[2, place] = x_turn * by, y_turn * by, by
+        if self._way_scale >= 0:
+            F[0, self._way_scale], F[1, self._way_scale] = -dx / scaled, -dy / scaled
+        Q = self._spread(odometry, (c, s), (x_turn, y_turn), chord, 0.0 if is_at_rest else 1.0)
+        return MotionStep(mean, F, Q)
 
-    def _at(self, values: list[float], name: str) -> float:
-        place = self._place.get(name)
-        return 0.0 if place is None else values[place]
+    def at_rest(self, odometry: Odometry) -> RestReading | None:
+        """At rest the turn that is told is the bias, by the gyroscope's angle random walk; None while it drives."""
+        if self._bias < 0 or not isinstance(odometry, Increment) or not self._rests(odometry):
+            return None
+        dt = odometry.interval_s
+        return RestReading(self._bias, odometry.turn_rad / dt, self.noise.turn_per_sqrt_s**2 / dt)
 
-    def _noise(
-        self, odometry: Increment, direction: tuple[float, float], by_turn: tuple[float, float], chord: float
+    def _rests(self, odometry: Increment) -> bool:
+        dt, noise = odometry.interval_s, self.noise
+        return (
+            abs(odometry.distance_m) < noise.rest_speed_m_s * dt and abs(odometry.turn_rad) < noise.rest_turn_rad_s * dt
+        )
+
+    def _turn(self, values: list[float], odometry: Increment) -> tuple[float, float, float]:
+        """The corrected turn, and its derivatives by the bias and by the relative error of turns."""
+        scaled = 1.0 + values[self._turn_scale] if self._turn_scale >= 0 else 1.0
+        turn, dt = odometry.turn_rad / scaled, odometry.interval_s
+        bias = values[self._bias] if self._bias >= 0 else 0.0
+        return turn - bias * dt, -dt, -turn / scaled
+
+    def _spread(
+        self,
+        odometry: Increment,
+        direction: tuple[float, float],
+        by_turn: tuple[float, float],
+        chord: float,
+        turning: float,
     ) -> FloatArray:
         noise, dt = self.noise, odometry.interval_s
         way, turned = hypot(odometry.distance_m, odometry.lateral_m), abs(odometry.turn_rad)
         var_way = noise.distance_per_sqrt_m**2 * way + noise.distance_per_sqrt_rad**2 * turned
         var_turn = noise.turn_per_sqrt_m**2 * way + noise.turn_per_sqrt_rad**2 * turned + noise.turn_per_sqrt_s**2 * dt
         var_side = noise.lateral_per_sqrt_m**2 * way
+        var_turn *= turning
         (c, s), (tx, ty) = direction, by_turn
         ax, ay = chord * c, chord * s
-        Q = np.zeros((self.size, self.size))
+        Q = self._Q
         Q[0, 0] = ax * ax * var_way + tx * tx * var_turn + s * s * var_side
         Q[1, 1] = ay * ay * var_way + ty * ty * var_turn + c * c * var_side
         Q[0, 1] = Q[1, 0] = ax * ay * var_way + tx * ty * var_turn - s * c * var_side
         Q[0, 2] = Q[2, 0] = tx * var_turn
         Q[1, 2] = Q[2, 1] = ty * var_turn
         Q[2, 2] = var_turn
-        place = self._place.get("turn_bias_rad_s")
-        if place is not None:
-            Q[place, place] = noise.turn_bias_walk_rad_s_sqrt_s**2 * dt
+        if self._bias >= 0:
+            Q[self._bias, self._bias] = noise.turn_bias_walk_rad_s_sqrt_s**2 * dt
         return Q
 
 
@@ -222,7 +262,8 @@ class Ackermann:
 
     Reference ``front`` (Hevrdejs and Knoll 2017, eq. 3): x <- x + T v cos(heading + steer),
     y <- y + T v sin(heading + steer), heading <- heading + T v sin(steer) / l.
-    Reference ``rear``: the same point on the rear axle, x <- x + T v cos(heading), heading <- heading + T v tan(steer) / l.
+    Reference ``rear``: the same point on the rear axle, x <- x + T v cos(heading),
+    heading <- heading + T v tan(steer) / l.
 
     Args:
         wheelbase_m: l.

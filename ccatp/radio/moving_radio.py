@@ -1,13 +1,19 @@
 """Pure. The radio that moves: how its place, its velocity and its shadowing go on between two readings."""
 
-from math import exp, sqrt
+from collections.abc import Sequence
+from math import atan2, cos, exp, hypot, log, pi, sin, sqrt
 
 import numpy as np
 
+from ccatp.angles import wrap_pi
 from ccatp.filters.base import FloatArray
-from ccatp.filters.ekf_slam import EkfSlam
-from ccatp.radio.readings import BeaconId
+from ccatp.filters.ekf_slam import Columns, EkfSlam, Update, columns_of
+from ccatp.radio.path_loss import PathLoss
+from ccatp.radio.readings import BeaconId, RssiReading
+from ccatp.radio.signal_rows import PLACE
 
+_TYPICAL = 0.4  # mean distance of two places in a square over its diagonal: 0.521 / sqrt(2)
+_NEAREST_M = 0.02  # nearer than that a direction has no derivative worth the name
 _STATES = 4  # x_m, y_m, and the velocity
 
 
@@ -27,6 +33,7 @@ class MovingRadio:
         course_time_s: T.
         shadowing_sigma_db: sigma; 0: no such state.
         shadowing_length_m: L.
+        room_m: lengths of its walls; it never leaves the room.
     """
 
     def __init__(
@@ -36,18 +43,84 @@ class MovingRadio:
         course_time_s: float,
         shadowing_sigma_db: float,
         shadowing_length_m: float,
+        room_m: tuple[float, float],
     ) -> None:
         self.beacon = beacon
         self._speed_sigma_m_s = speed_sigma_m_s
         self._course_time_s = course_time_s
         self._shadowing_sigma_db = shadowing_sigma_db
         self._shadowing_length_m = shadowing_length_m
+        self._room_m = room_m
 
-    @property
-    def prior_sigmas(self) -> list[float]:
-        """Of the states behind the place."""
-        shadowing = [self._shadowing_sigma_db] if self._shadowing_sigma_db > 0.0 else []
-        return [self._speed_sigma_m_s, self._speed_sigma_m_s, *shadowing]
+    def join(self, engine: EkfSlam, bearing_rad: float) -> None:
+        """Begin in the direction of a first bearing, anywhere in the room; the reading itself is to follow.
+
+        In polar coordinates about the vehicle: the direction is spread over the circle, and the distance as between
+        two places in the room, by a factor of two about 0.4 of its diagonal.
+        """
+        direction, log_range = float(engine.mean[2]) + bearing_rad, log(_TYPICAL * hypot(*self._room_m))
+        behind = [self._speed_sigma_m_s] * 2
+        if self._shadowing_sigma_db > 0.0:
+            behind.append(self._shadowing_sigma_db)
+        spread = np.array([pi, log(2.0), *behind])
+        mean = np.zeros(spread.size)
+        mean[:PLACE] = direction, log_range
+        none: Columns = np.empty(0, dtype=np.intp)
+        engine.augment(self.beacon, mean, none, np.zeros((mean.size, 0)), np.eye(mean.size), np.diag(spread**2))
+        self._to_plane(engine)
+
+    def update(
+        self,
+        engine: EkfSlam,
+        reading: RssiReading,
+        path_loss: PathLoss,
+        bearing_sigma_rad: float,
+        gates: Sequence[float],
+    ) -> Update:
+        """Condition on a reading, in polar coordinates about the vehicle.
+
+        There level and bearing are linear: z = P_ref - (10 eta / ln 10) ln r + b, beta = direction - heading. In the
+        plane a level has another slope at each estimate, and many levels with one unknown b would seem to tell the
+        range (modified polar coordinates, Aidala and Hammel 1983).
+
+        Args:
+            engine: the filter.
+            reading: level, and bearing where there is one.
+            path_loss: of the radio.
+            bearing_sigma_rad: noise and steps of a bearing.
+            gates: largest normalised innovation squared that is used, of one row and of two.
+        """
+        self._to_polar(engine)
+        block = engine.block(self.beacon)
+        slope = 10.0 * path_loss.exponent / log(10.0)
+        columns = columns_of((2,), block)
+        x = engine.mean.take(columns)
+        H = np.zeros((1 if reading.bearing_rad is None else 2, columns.size))
+        H[0, 2], H[0, 1 + _STATES :] = -slope, self.shadowing_row
+        residual = np.array([reading.rssi_dbm - path_loss.reference_dbm - float(H[0] @ x)])
+        variances = [path_loss.sigma_db**2]
+        if reading.bearing_rad is not None:
+            H[1, 0], H[1, 1] = -1.0, 1.0
+            residual = np.append(residual, wrap_pi(reading.bearing_rad - float(x[1] - x[0])))
+            variances.append(bearing_sigma_rad**2)
+        found = engine.update(columns, H, residual, np.array(variances), gates[len(variances) - 1])
+        self._to_plane(engine)
+        return found
+
+    def _to_polar(self, engine: EkfSlam) -> None:
+        """Direction and log range from the vehicle in place of x_m and y_m."""
+        start = engine.block(self.beacon).start
+        dx, dy = (engine.mean[start : start + PLACE] - engine.mean[:PLACE]).tolist()
+        r = max(hypot(dx, dy), _NEAREST_M)
+        J = np.array(((-dy, dx), (dx, dy))) / (r * r)
+        _transformed(engine, start, J, -J, (atan2(dy, dx), log(r)))
+
+    def _to_plane(self, engine: EkfSlam) -> None:
+        start = engine.block(self.beacon).start
+        direction, log_range = engine.mean[start : start + PLACE].tolist()
+        dx, dy = exp(log_range) * cos(direction), exp(log_range) * sin(direction)
+        x, y = engine.mean[:PLACE].tolist()
+        _transformed(engine, start, np.array(((-dy, dx), (dx, dy))), np.eye(PLACE), (x + dx, y + dy))
 
     @property
     def shadowing_row(self) -> FloatArray:
@@ -80,3 +153,13 @@ class MovingRadio:
             F[_STATES, _STATES] = c
             Q[_STATES, _STATES] = self._shadowing_sigma_db**2 * (1.0 - c * c)
         return F, Q
+
+
+def _transformed(
+    engine: EkfSlam, start: int, by_place: FloatArray, by_vehicle: FloatArray, place: tuple[float, float]
+) -> None:
+    """Other coordinates of a radio's place: the state is the same, said otherwise."""
+    P, rows = engine.covariance, slice(start, start + PLACE)
+    P[rows] = by_place @ P[rows] + by_vehicle @ P[:PLACE]
+    P[:, rows] = P[:, rows] @ by_place.T + P[:, :PLACE] @ by_vehicle.T
+    engine.mean[rows] = place

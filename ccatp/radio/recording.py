@@ -44,6 +44,12 @@ class Readings(NamedTuple):
     bearing_rad: FloatArray
     rssi_dbm: FloatArray
 
+    def where(self, rows: npt.NDArray[np.bool_] | IntArray) -> "Readings":
+        """Some of the readings."""
+        return Readings(
+            self.times_s[rows], self.beacon[rows], self.range_m[rows], self.bearing_rad[rows], self.rssi_dbm[rows]
+        )
+
 
 class Truth(NamedTuple):
     """Where the vehicle was, world frame.

@@ -76,6 +76,8 @@ def signal_settings(cfg: RadioConfig) -> SignalSettings:
         shadowing_sigma_db=sigma_db,
         shadowing=_map(cfg, sigma_db) if cfg.estimator.shadowing == "map" and sigma_db > 0.0 else None,
         moving=_moving(cfg, sigma_db),
+        placed_share=cfg.estimator.placed_share,
+        waiting_scans=cfg.estimator.waiting_scans,
         gates=(float(chi2.ppf(quantile, 1)), float(chi2.ppf(quantile, 2))),
     )
 
@@ -94,6 +96,7 @@ def _moving(cfg: RadioConfig, sigma_db: float) -> MovingRadio:
         estimator.target_course_time_s,
         sigma_db,
         cfg.path_loss.shadowing_length_m,
+        cfg.workspace.size_m,
     )
 
 

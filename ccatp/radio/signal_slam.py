@@ -2,11 +2,10 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import cos, hypot, log, log10, sin, sqrt
+from math import cos, hypot, sin, sqrt
 
 import numpy as np
 
-from ccatp.angles import wrap_pi
 from ccatp.filters.base import FloatArray
 from ccatp.filters.ekf_slam import Columns, EkfSlam, Update, columns_of
 from ccatp.radio.motion import POSE, MotionModel, Odometry, Pose
@@ -14,16 +13,14 @@ from ccatp.radio.moving_radio import MovingRadio
 from ccatp.radio.path_loss import PathLoss
 from ccatp.radio.readings import BeaconId, RssiReading
 from ccatp.radio.shadowing_map import ShadowingMap
+from ccatp.radio.signal_newcomers import Newcomers, PoseKey, Prior, Record
+from ccatp.radio.signal_rows import PLACE, Rows, Sight, rows_of
 from ccatp.radio.slam import BeaconEstimate, Learned
 
-PLACE = 2  # x_m, y_m: the first states of a radio
+_POSE_COLUMNS = columns_of(range(POSE))
 _ITERATIONS = 4
-_FIRST_ITERATIONS = 10
 _WIDE = 10.0  # spread of a radio before its first reading, in ranges of that reading
-_NEAREST_M = 0.02  # nearer than that neither level nor bearing has a derivative worth the name
-_DB_PER_NEPER = 10.0 / log(10.0)
-
-Linearise = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+_NEAREST_M = 0.02  # nearer than that a distance has no derivative worth the name
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +35,8 @@ class SignalSettings:
         shadowing_sigma_db: standard deviation of static shadowing; 0: none.
         shadowing: its map, for static radios; None: what there is of it counts as white noise.
         moving: the radio that moves; None without one.
+        placed_share: a new static radio joins when its place is this sure, as a share of its range ...
+        waiting_scans: ... or when as many readings wait; each scan keeps three states until then.
         gates: largest normalised innovation squared that is used, of one row and of two.
     """
 
@@ -48,6 +47,8 @@ class SignalSettings:
     shadowing_sigma_db: float
     shadowing: ShadowingMap | None
     moving: MovingRadio | None
+    placed_share: float
+    waiting_scans: int
     gates: tuple[float, float]
 
 
@@ -75,21 +76,26 @@ class SignalSlam:
         P[range(POSE, v), range(POSE, v)] = sigmas**2
         self.engine = EkfSlam(mean, P)
         self.learned: list[Learned] = []
+        self.newcomers = Newcomers(self.engine)
 
     @property
     def pose(self) -> Pose:
         """The vehicle; the heading does not wrap."""
-        return Pose(*self.engine.mean[:POSE].tolist())
+        return Pose(*self.newcomers.conditioned(_POSE_COLUMNS)[0].tolist())
 
     @property
     def pose_covariance(self) -> FloatArray:
         """Of x_m, y_m, heading_rad, shape (3, 3)."""
-        return self.engine.covariance[:POSE, :POSE].copy()
+        return self.newcomers.conditioned(_POSE_COLUMNS)[1]
 
     @property
     def beacons(self) -> dict[BeaconId, BeaconEstimate]:
         """The map: places alone, x_m and y_m."""
-        return {beacon: self._place(beacon) for beacon in self._names()}
+        found = {
+            beacon: BeaconEstimate(guess.mean[:PLACE], guess.covariance[:PLACE, :PLACE])
+            for beacon, guess in self.newcomers.guesses.items()
+        }
+        return found | {beacon: self._place(beacon) for beacon in self._names()}
 
     @property
     def calibration(self) -> dict[str, tuple[float, float]]:
@@ -102,25 +108,28 @@ class SignalSlam:
         """Carry the vehicle and the moving radio on."""
         before = self.engine.mean[:PLACE].tolist()
         step = self.settings.motion.step(self.engine.mean[: self.engine.vehicle_size], odometry)
-        self.engine.predict(*step)
+        self.engine.predict(step.mean, step.F, step.Q)
         moving = self.settings.moving
         if moving is not None and moving.beacon in self.engine:
             travel_m = hypot(step.mean[0] - before[0], step.mean[1] - before[1])
             moving.predict(self.engine, odometry.interval_s, travel_m)
 
     def observe(self, readings: Iterable[RssiReading]) -> list[Learned]:
-        """Take readings of any radios, one after the other; new ones join at their first bearing.
+        """Take readings of any radios, one after the other; new ones are placed when their readings suffice.
 
         A new radio of which no bearing is known is not used: a level alone is a circle.
         """
         self.learned = []
+        waiting = []
         for reading in readings:
-            if reading.beacon in self.engine:
-                found = self._update(reading, _ITERATIONS, gated=True)
-                self.learned.append(Learned(reading.beacon, found.residual, found.nis, found.size, found.accepted))
-            elif reading.bearing_rad is not None:
-                self._join(reading, reading.bearing_rad)
-                self._update(reading, _FIRST_ITERATIONS, gated=False)
+            is_known = reading.beacon in self.engine
+            if is_known or self._is_moving(reading.beacon):
+                found = self._update_moving(reading) if self._is_moving(reading.beacon) else self._update(reading)
+                if found is not None and is_known:
+                    self.learned.append(Learned(reading.beacon, found.residual, found.nis, found.size, found.accepted))
+            else:
+                waiting.append(reading)
+        self._wait(waiting)
         return self.learned
 
     def remove(self, beacon: BeaconId) -> None:
@@ -129,6 +138,9 @@ class SignalSlam:
         Raises:
             BlockError: it is not on the map.
         """
+        if beacon in self.newcomers.names:
+            self.newcomers.drop(beacon)
+            return
         self.engine.remove(beacon)
 
     def distance(self, beacon: BeaconId) -> tuple[float, float]:
@@ -139,10 +151,21 @@ class SignalSlam:
         """
         start = self.engine.block(beacon).start
         columns = columns_of(range(PLACE), range(start, start + PLACE))
-        x, y, bx, by = self.engine.mean.take(columns).tolist()
+        mean, covariance = self.newcomers.conditioned(columns)
+        x, y, bx, by = mean.tolist()
         r = max(hypot(bx - x, by - y), _NEAREST_M)
-        ux, uy = (bx - x) / r, (by - y) / r
-        return r, sqrt(max(self.engine.spread(columns, np.array((-ux, -uy, ux, uy))), 0.0))
+        h = np.array((x - bx, y - by, bx - x, by - y)) / r
+        return r, sqrt(max(float(h @ covariance @ h), 0.0))
+
+    def joint(self, beacons: Sequence[BeaconId]) -> tuple[FloatArray, FloatArray]:
+        """Pose and the places of some radios on the map together: mean (3 + 2 k,) and covariance.
+
+        Raises:
+            BlockError: one is not on the map.
+        """
+        starts = [self.engine.block(beacon).start for beacon in beacons]
+        columns = columns_of(range(POSE), *(range(start, start + PLACE) for start in starts))
+        return self.newcomers.conditioned(columns)
 
     def path_loss_of(self, beacon: BeaconId) -> PathLoss:
         """The calibration of a radio."""
@@ -153,74 +176,110 @@ class SignalSlam:
 
     def _place(self, beacon: BeaconId) -> BeaconEstimate:
         start = self.engine.block(beacon).start
-        place = slice(start, start + PLACE)
-        return BeaconEstimate(self.engine.mean[place].copy(), self.engine.covariance[place, place].copy())
+        return BeaconEstimate(*self.newcomers.conditioned(columns_of(range(start, start + PLACE))))
 
     def _is_moving(self, beacon: BeaconId) -> bool:
         return self.settings.moving is not None and beacon == self.settings.moving.beacon
 
-    def _join(self, reading: RssiReading, bearing_rad: float) -> None:
-        """At range and bearing, spread so widely that the reading alone places it."""
-        settings, pose = self.settings, self.pose
+    def _prior(self, reading: RssiReading, bearing_rad: float, pose: Sequence[float]) -> Prior:
+        """A radio at a range and bearing, spread so widely that readings alone place it."""
+        settings = self.settings
         range_m = self.path_loss_of(reading.beacon).median_range_m(reading.rssi_dbm)
-        way_rad = pose.heading_rad + bearing_rad
-        place = [pose.x_m + range_m * cos(way_rad), pose.y_m + range_m * sin(way_rad)]
+        way_rad = pose[2] + bearing_rad
         spread = [_WIDE * range_m] * PLACE
-        if self._is_moving(reading.beacon) and settings.moving is not None:
-            spread += settings.moving.prior_sigmas
-        elif settings.shadowing is not None:
+        if settings.shadowing is not None:
             spread += [1.0] * settings.shadowing.size
         mean = np.zeros(len(spread))
-        mean[:PLACE] = place
+        mean[:PLACE] = pose[0] + range_m * cos(way_rad), pose[1] + range_m * sin(way_rad)
+        return Prior(mean, np.array(spread))
+
+    def _augment(self, beacon: BeaconId, prior: Prior) -> None:
         none: Columns = np.empty(0, dtype=np.intp)
-        self.engine.augment(
-            reading.beacon, mean, none, np.zeros((mean.size, 0)), np.eye(mean.size), np.diag(np.square(spread))
+        size = prior.mean.size
+        self.engine.augment(beacon, prior.mean, none, np.zeros((size, 0)), np.eye(size), np.diag(prior.sigmas**2))
+
+    def _wait(self, readings: list[RssiReading]) -> None:
+        """Readings of static radios that are not on the map yet."""
+        if not readings:
+            return
+        pose = self.newcomers.keep_pose()
+        for reading in readings:
+            self.newcomers.add(reading, pose)
+        priors = {}
+        for beacon in self.newcomers.names:
+            with_bearing = (r for r in self.newcomers.records(beacon) if r.reading.bearing_rad is not None)
+            if first := next(with_bearing, None):  # a level alone is a circle
+                at = self.engine.mean[self.engine.block(first.pose)].tolist()
+                priors[beacon] = self._prior(first.reading, first.reading.bearing_rad or 0.0, at)
+        if not priors:
+            return
+        self.newcomers.solve(priors, self._rows_at)
+        ready = [beacon for beacon in priors if self._is_ready(beacon)]
+        for beacon in ready:
+            self._settle(beacon, priors[beacon])
+        if left := {beacon: prior for beacon, prior in priors.items() if beacon not in ready and ready}:
+            self.newcomers.solve(left, self._rows_at)
+
+    def _is_ready(self, beacon: BeaconId) -> bool:
+        """Whether a place is so sure that its error does not bend the model, or enough waits."""
+        if len(self.newcomers.records(beacon)) >= self.settings.waiting_scans:
+            return True
+        guess, pose = self.newcomers.guesses[beacon], self.engine.mean
+        range_m = hypot(guess.mean[0] - pose[0], guess.mean[1] - pose[1])
+        largest = float(np.linalg.eigvalsh(guess.covariance[:PLACE, :PLACE])[-1])
+        return largest < (self.settings.placed_share * range_m) ** 2
+
+    def _settle(self, beacon: BeaconId, prior: Prior) -> None:
+        """A radio joins the map with all that waits of it; the rest of the state learns from it, too.
+
+        The model is linearised at the guess: from the prior the way there is long, and not safe without its damping.
+        """
+        self._augment(beacon, prior)
+        rows = self._rows_at(
+            self.newcomers.records(beacon), lambda key: self.engine.block(key).start, self.engine.block(beacon)
         )
+        x = self.newcomers.linearisation(beacon)
+        residual, H = rows.linearise(x)
+        off = residual + H @ (x - self.engine.mean)[rows.columns]
+        self.engine.update(rows.columns, H, off, rows.variances)
+        self.newcomers.drop(beacon)
 
-    def _update(self, reading: RssiReading, iterations: int, *, gated: bool) -> Update:
-        block = self.engine.block(reading.beacon)
-        shadow, rest_db2 = self._shadow(reading.beacon)
-        of_radio = range(block.start, block.start + PLACE)
-        columns = columns_of(range(POSE), of_radio, range(block.stop - shadow.size, block.stop))
+    def _update(self, reading: RssiReading) -> Update:
+        rows = self._rows([self._sight(reading, 0)], reading.beacon, self.engine.block(reading.beacon))
+        gate = self.settings.gates[rows.variances.size - 1]
+        return self.engine.update_iterated(rows.columns, rows.linearise, rows.variances, _ITERATIONS, gate)
+
+    def _update_moving(self, reading: RssiReading) -> Update | None:
+        """The radio that moves joins at its first bearing: it would be elsewhere later."""
+        settings, moving = self.settings, self.settings.moving
+        if moving is None:
+            return None
+        if reading.beacon not in self.engine:
+            if reading.bearing_rad is None:
+                return None
+            moving.join(self.engine, reading.bearing_rad)
         path_loss = self.path_loss_of(reading.beacon)
-        variances = [path_loss.sigma_db**2 + rest_db2]
-        if reading.bearing_rad is not None:
-            variances.append(self.settings.bearing_sigma_rad**2)
-        gate = self.settings.gates[len(variances) - 1] if gated else np.inf
-        linearise = _linearised(reading, path_loss, columns, shadow)
-        return self.engine.update_iterated(columns, linearise, np.array(variances), iterations, gate)
+        return moving.update(self.engine, reading, path_loss, settings.bearing_sigma_rad, settings.gates)
 
-    def _shadow(self, beacon: BeaconId) -> tuple[FloatArray, float]:
+    def _rows_at(self, records: list[Record], pose_at: Callable[[PoseKey], int], radio: slice) -> Rows:
+        sights = []
+        for record in records:
+            place = self.engine.block(record.pose).start
+            sights.append(self._sight(record.reading, place)._replace(pose=pose_at(record.pose)))
+        return self._rows(sights, records[0].reading.beacon, radio)
+
+    def _rows(self, sights: list[Sight], beacon: BeaconId, radio: slice) -> Rows:
+        return rows_of(sights, radio, self.path_loss_of(beacon), self.settings.bearing_sigma_rad)
+
+    def _sight(self, reading: RssiReading, pose: int) -> Sight:
+        """A reading taken at the pose that begins at a column."""
+        x_m, y_m = self.engine.mean[pose : pose + PLACE].tolist()
+        shadow, rest_db2 = self._shadow(reading.beacon, x_m, y_m)
+        return Sight(reading, pose, shadow, self.path_loss_of(reading.beacon).sigma_db ** 2 + rest_db2)
+
+    def _shadow(self, beacon: BeaconId, x_m: float, y_m: float) -> tuple[FloatArray, float]:
         """Derivatives of a level by the shadowing states, which end a radio's block, and the variance of the rest."""
         settings = self.settings
-        if self._is_moving(beacon) and settings.moving is not None:
-            return settings.moving.shadowing_row, 0.0
         if settings.shadowing is None:
             return np.empty(0), settings.shadowing_sigma_db**2
-        pose = self.pose
-        return settings.shadowing.row(pose.x_m, pose.y_m)
-
-
-def _linearised(reading: RssiReading, path_loss: PathLoss, columns: Columns, shadow: FloatArray) -> Linearise:
-    """Residual and Jacobian of a reading over pose, place and shadowing, as functions of the state."""
-    slope = _DB_PER_NEPER * path_loss.exponent
-    size = columns.size
-
-    def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        values = x.take(columns)
-        px, py, heading, bx, by = values[: POSE + PLACE].tolist()
-        dx, dy = bx - px, by - py
-        r = max(hypot(dx, dy), _NEAREST_M)
-        q = r * r
-        expected = path_loss.reference_dbm - 10.0 * path_loss.exponent * log10(r)
-        expected += float(shadow @ values[POSE + PLACE :])
-        H = np.zeros((1 if reading.bearing_rad is None else 2, size))
-        H[0, : POSE + PLACE] = slope * dx / q, slope * dy / q, 0.0, -slope * dx / q, -slope * dy / q
-        H[0, POSE + PLACE :] = shadow
-        if reading.bearing_rad is None:
-            return np.array((reading.rssi_dbm - expected,)), H
-        H[1, : POSE + PLACE] = dy / q, -dx / q, -1.0, -dy / q, dx / q
-        off_rad = wrap_pi(reading.bearing_rad - (np.arctan2(dy, dx) - heading))
-        return np.array((reading.rssi_dbm - expected, off_rad)), H
-
-    return linearise
+        return settings.shadowing.row(x_m, y_m)

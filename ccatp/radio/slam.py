@@ -2,19 +2,25 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import cos, sin
+from math import hypot, sqrt
 from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.angles import wrap_pi
 from ccatp.filters.base import FloatArray
-from ccatp.filters.ekf_slam import Columns, EkfSlam, Update, columns_of
-from ccatp.radio.joining import Waiting, widened
-from ccatp.radio.motion import POSE, Odometry, Pose
-from ccatp.radio.readings import BeaconId, RangeReading, Reading, RssiReading
-from ccatp.radio.sightings import Row, bearing_row, range_row, rssi_row
+from ccatp.filters.ekf_slam import BlockError, EkfSlam, Update
+from ccatp.radio.beacon_map import BeaconMap, Entry
+from ccatp.radio.dead_reckoning import DeadReckoning
+from ccatp.radio.doubts import Doubts
+from ccatp.radio.motion import POSE, DifferentialDrive, Odometry, Pose
+from ccatp.radio.newcomers import Newcomers
+from ccatp.radio.noise_level import NoiseLevel
+from ccatp.radio.readings import BeaconId, Reading
+from ccatp.radio.settling import derivatives, wrapped
+from ccatp.radio.sightings import Sensors, bearing_of, kind_of, strength_of
 from ccatp.radio.slam_settings import SlamSettings
+
+DELAY = "odometry_delay_s"
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +41,10 @@ class Learned(NamedTuple):
 
     Attributes:
         beacon: which one.
-        residual: z - h(x), shape (m,).
-        nis: nu^T S^-1 nu.
-        size: m.
-        accepted: False where the gate refused it.
+        residual: z - h(x) of the bearing, if there is one, and of the range or the strength, shape (m,).
+        nis: nu^T S^-1 nu, with the larger noise where a reading was beyond the knee.
+        size: m; a reading whose bearing is refused has its range left out.
+        accepted: False where it was refused; the state is then as before, or has taken the bearing alone.
     """
 
     beacon: BeaconId
@@ -49,13 +55,20 @@ class Learned(NamedTuple):
 
 
 class BeaconSlam:
-    """EKF-SLAM of a vehicle among beacons, by ``EkfSlam``.
+    """EKF-SLAM of a vehicle among beacons, by ``EkfSlam``; docs/slam.md has the models.
 
     Args:
         settings: vehicle and radios.
         pose0: where the vehicle begins; it defines the frame of the map.
         P0: covariance of that, shape (3, 3).
-        known: beacons with a prior, the covariance that of the prior.
+        known: beacons with a prior: mean (b,) and covariance (b, b).
+
+    Attributes:
+        engine: the state: vehicle | calibration | beacons, wandering errors and places where readings wait.
+        learned: what the readings of the last ``observe`` did.
+        waiting: beacons that were heard and are not on the map yet, with the candidates for their places.
+        levels: what the noise of each sensor and of the motion is, relative to the settings, in variance.
+        jumps: how often the pose was doubted.
     """
 
     def __init__(
@@ -66,28 +79,37 @@ class BeaconSlam:
         known: Mapping[BeaconId, BeaconEstimate] | None = None,
     ) -> None:
         self.settings = settings
-        motion, ranges = settings.motion, settings.range
-        sigmas = np.array(motion.prior_sigmas)
-        v = POSE + sigmas.size
+        self._motion, self._sensors, trust = settings.motion, Sensors(settings), settings.trust
+        delay = (settings.delay_sigma_s,) if settings.delay_sigma_s > 0.0 else ()
+        own, shared = self._motion.prior_sigmas, (*self._sensors.prior_sigmas, *delay)
+        v, self._ranges = POSE + len(own), len(self._sensors.names)
         mean, P = np.zeros(v), np.zeros((v, v))
         mean[:POSE], P[:POSE, :POSE] = pose0, P0
-        P[range(POSE, v), range(POSE, v)] = sigmas**2
-        priors = (
-            [] if ranges is None else [("range_scale", ranges.scale_sigma), ("range_offset_m", ranges.offset_sigma_m)]
+        P[range(POSE, v), range(POSE, v)] = np.square(own)
+        self.engine = EkfSlam(mean, P, np.zeros(len(shared)), np.diag(np.square(shared)))
+        self._shared = slice(v, v + len(shared))
+        self._delay = v + len(shared) - 1 if delay else -1
+        self._names: tuple[str, ...] = (*self._motion.names, *self._sensors.names, *((DELAY,) if delay else ()))
+        self._clock = DeadReckoning(is_delayed=bool(delay))
+        self._map = BeaconMap(self.engine, self._shared)
+        self.levels = {
+            k: NoiseLevel(trust.learn_prior, trust.learn_memory) for k in ("range", "bearing", "rssi", "motion")
+        }
+        self._learns = trust.learn_memory > 0.0
+        self._fresh = np.zeros((POSE, POSE))  # process noise since the last update
+        self._doubts, self.jumps = Doubts(trust.doubt_pose_after), 0
+        self._way_m = 0.0
+        self._newcomers = Newcomers(
+            self.engine, self._sensors, self._map, self._clock, self.levels, self._shared, self._delay
         )
-        self._shared = tuple(name for name, sigma in priors if sigma > 0.0)
-        prior = np.diag([sigma**2 for _, sigma in priors if sigma > 0.0])
-        self.engine = EkfSlam(mean, P, np.zeros(len(self._shared)), prior)
-        self._calibration = slice(v, v + len(self._shared))
-        self._columns: dict[BeaconId, Columns] = {}
-        self.waiting: dict[BeaconId, Waiting] = {}
+        self.waiting = self._newcomers.waiting
         self.learned: list[Learned] = []
         for beacon, estimate in (known or {}).items():
-            self._join(beacon, estimate.mean, estimate.covariance)
+            self._map.join(beacon, estimate.mean, estimate.covariance)
 
     @property
     def pose(self) -> Pose:
-        """The vehicle; the heading does not wrap."""
+        """The vehicle after the last odometry; the heading does not wrap."""
         return Pose(*self.engine.mean[:POSE].tolist())
 
     @property
@@ -98,154 +120,124 @@ class BeaconSlam:
     @property
     def beacons(self) -> dict[BeaconId, BeaconEstimate]:
         """The map."""
-        found = {}
-        for beacon in self._columns:
-            place = self.engine.block(beacon)
-            found[beacon] = BeaconEstimate(self.engine.mean[place].copy(), self.engine.covariance[place, place].copy())
-        return found
+        x, P, place = self.engine.mean, self.engine.covariance, self.engine.block
+        return {b: BeaconEstimate(x[place(b)].copy(), P[place(b), place(b)].copy()) for b in self._map}
 
     @property
     def calibration(self) -> dict[str, tuple[float, float]]:
         """Mean and standard deviation of what is calibrated on the way, by name."""
-        names = [*self.settings.motion.names, *self._shared]
         mean, variances = self.engine.mean.tolist(), self.engine.covariance.diagonal().tolist()
-        return {name: (mean[POSE + i], variances[POSE + i] ** 0.5) for i, name in enumerate(names)}
+        return {name: (mean[POSE + i], sqrt(variances[POSE + i])) for i, name in enumerate(self._names)}
 
     def predict(self, odometry: Odometry) -> None:
-        """Carry the vehicle on."""
-        step = self.settings.motion.step(self.engine.mean[: self.engine.vehicle_size], odometry)
-        self.engine.predict(*step)
+        """Carry the vehicle on.
+
+        Raises:
+            TypeError: the odometry is of another kind of vehicle.
+        """
+        delay_s = float(self.engine.mean[self._delay]) if self._delay >= 0 else 0.0
+        for step in self._clock.due(odometry, delay_s):
+            self._step(step)
+
+    def _step(self, odometry: Odometry) -> None:
+        engine = self.engine
+        before = engine.mean[: engine.vehicle_size].copy()
+        mean, F, Q = self._motion.step(before, odometry)
+        if self._learns:
+            Q = Q * self.levels["motion"].factor
+            turned = F[:POSE, :POSE]
+            self._fresh = turned.dot(self._fresh).dot(turned.T) + Q[:POSE, :POSE]
+        engine.predict(mean, F, Q)
+        self._clock.took(odometry, before, mean)
+        self._way_m += hypot(mean[0] - before[0], mean[1] - before[1])
+        rest = self._motion.at_rest(odometry) if isinstance(self._motion, DifferentialDrive) else None
+        if rest is not None:
+            residual = rest.value - float(engine.mean[rest.column])
+            engine.update_row(np.array((rest.column,)), np.ones(1), residual, rest.variance)
 
     def observe(self, readings: Iterable[Reading]) -> list[Learned]:
-        """Take readings of any beacons, one after the other; those of new ones begin their place on the map."""
+        """Take readings of any beacons, one after the other; those of new ones begin their place on the map.
+
+        Raises:
+            SensorError: the settings have no model of a reading.
+        """
         self.learned = []
         for reading in readings:
-            if reading.beacon in self._columns:
-                self.learned.append(self._update(reading))
+            if reading.beacon in self._map:
+                self.learned.append(self._update(reading, self._map[reading.beacon]))
             else:
-                self._meet(reading)
+                self._newcomers.meet(reading)
         return self.learned
 
     def remove(self, beacon: BeaconId) -> None:
         """Forget a beacon; one that is heard again begins anew.
 
         Raises:
-            BlockError: it is not on the map.
+            BlockError: nothing was heard of it.
         """
-        self.engine.remove(beacon)
-        del self._columns[beacon]
-        self._renumber()
-
-    def _renumber(self) -> None:
-        for beacon in self._columns:
-            self._columns[beacon] = columns_of(range(POSE), self._calibration, self.engine.block(beacon))
-
-    def _join(self, beacon: BeaconId, mean: FloatArray, covariance: FloatArray) -> None:
-        none = np.empty(0, dtype=np.intp)
-        self.engine.augment(beacon, mean, none, np.zeros((mean.size, 0)), np.eye(mean.size), covariance)
-        self._columns[beacon] = columns_of(range(POSE), self._calibration, self.engine.block(beacon))
-
-    def _rows(self, reading: Reading, pose: list[float], calibration: list[float], beacon: list[float]) -> list[Row]:
-        s = self.settings
-        if isinstance(reading, RssiReading):
-            assert s.rssi is not None
-            rows = [rssi_row(pose, calibration, beacon, s.rssi)]
-        else:
-            assert s.range is not None
-            rows = [range_row(pose, calibration, beacon, s.range)]
-        if not isinstance(reading, RangeReading) and reading.bearing_rad is not None:
-            assert s.bearing is not None
-            rows.append(bearing_row(pose, calibration, beacon, s.bearing.sigma_rad))
-        return rows
-
-    def _update(self, reading: Reading) -> Learned:
-        columns = self._columns[reading.beacon]
-        x = self.engine.mean.take(columns).tolist()
-        split = POSE + len(self._shared)
-        rows = self._rows(reading, x[:POSE], x[POSE:split], x[split:])
-        gate = self.settings.gate_sigmas**2
-        z = _values(reading)
-        if len(rows) == 1:
-            row = rows[0]
-            h = np.array((*row.pose, *row.calibration, *row.beacon))
-            found = self.engine.update_row(columns, h, z[0] - row.expected, row.variance, gate)
-        else:
-            H = np.array([(*row.pose, *row.calibration, *row.beacon) for row in rows])
-            residual = np.array((z[0] - rows[0].expected, wrap_pi(z[1] - rows[1].expected)))
-            found = self.engine.update(columns, H, residual, np.array([row.variance for row in rows]), gate)
-        return Learned(reading.beacon, found.residual, found.nis, found.size, found.accepted)
-
-    def _meet(self, reading: Reading) -> None:
-        """A reading of a beacon that is not on the map yet."""
-        bearing = None if isinstance(reading, RangeReading) else reading.bearing_rad
-        if bearing is not None:
-            start, spread = self._first_guess(reading, bearing)
-            self._join(reading.beacon, start, spread)
-            self._settle([reading], [None])
+        if self._newcomers.forget(beacon):
             return
-        waiting = self.waiting.setdefault(reading.beacon, Waiting())
-        waiting.take(self.engine, reading, self._distance(reading))
-        self._renumber()
-        found = waiting.solve(self.engine, self._rows, self._calibration, self.settings)
-        if found is None:
-            return
-        self._join(reading.beacon, *found)
-        self._settle([r.reading for r in waiting.records], [r.place for r in waiting.records])
-        for record in waiting.records:
-            self.engine.remove(record.place)
-        del self.waiting[reading.beacon]
-        self._renumber()
+        if beacon not in self._map:
+            raise BlockError(beacon, "is not on the map")
+        self._map.leave(beacon)
 
-    def _distance(self, reading: Reading) -> float:
-        """What a reading says of the distance alone."""
-        s, z = self.settings, _values(reading)[0]
-        if isinstance(reading, RssiReading):
-            assert s.rssi is not None
-            return float(10.0 ** ((s.rssi.reference_dbm - z) / (10.0 * s.rssi.exponent)))
-        return max(z, 0.0)
+    def _update(self, reading: Reading, entry: Entry) -> Learned:
+        """Bearing first, which says whether it is the beacon at all; then the range or the strength."""
+        model = self._sensors.wander(reading)
+        if model is not None:
+            self._map.wander_to(reading.beacon, model, self._way_m, reading.time_s)
+        found = []
+        if bearing_of(reading) is not None:
+            found.append(self._take(reading, entry, "bearing"))
+        if not found or found[0].accepted:
+            found.append(self._take(reading, entry, kind_of(reading)))
+        if self._learns:
+            self._fresh = np.zeros((POSE, POSE))
+        accepted = found[-1].accepted
+        self._judge(reading.beacon, entry, accepted=accepted)
+        residual = np.concatenate([update.residual for update in found])
+        return Learned(reading.beacon, residual, sum(update.nis for update in found), len(found), accepted)
 
-    def _first_guess(self, reading: Reading, bearing_rad: float) -> tuple[FloatArray, FloatArray]:
-        """Beacon at range and bearing, with a spread so wide that the readings alone place it."""
-        pose, r = self.pose, self._distance(reading)
-        way = pose.heading_rad + bearing_rad
-        return widened(self.settings, pose.x_m + r * cos(way), pose.y_m + r * sin(way), r, reading)
+    def _take(self, reading: Reading, entry: Entry, kind: str) -> Update:
+        """One scalar of a reading."""
+        engine, trust, level = self.engine, self.settings.trust, self.levels[kind]
+        x = engine.mean.take(entry.columns).tolist()
+        split = POSE + self._shared.stop - self._shared.start
+        beacon = x[split : split + entry.size]
+        at = self._newcomers.carried(engine.mean, reading)
+        is_angle = kind == "bearing"
+        if is_angle:
+            row, z = self._sensors.bearing(at.pose, beacon), bearing_of(reading)
+        else:
+            row, z = self._sensors.row(reading, at.pose, x[POSE : POSE + self._ranges], beacon), strength_of(reading)
+        h = [*derivatives(row, at, delayed=self._delay >= 0), *row.beacon]
+        expected, r = row.expected, row.variance * level.factor
+        own = r
+        if entry.wander >= 0:
+            model = None if is_angle else self._sensors.wander(reading)
+            share = 0.0 if model is None else model.share
+            h.append(sqrt(share * r))
+            expected += h[-1] * x[-1]
+            r *= 1.0 - share
+            own = r + entry.fresh * h[-1] * h[-1]
+        residual = wrapped(z or 0.0, expected, is_angle=is_angle)
+        found = engine.update_row(entry.columns, np.array(h), residual, r, trust.gate_sigmas**2, trust.knee_sigmas)
+        if found.accepted and self._learns:
+            s = found.spread.item()
+            level.learn(found.nis, own / s)
+            by_pose = np.array(h[:POSE])
+            self.levels["motion"].learn(found.nis, float(by_pose.dot(self._fresh).dot(by_pose)) / s)
+        return found
 
-    def _settle(self, readings: list[Reading], places: list[object | None]) -> Update:
-        """Condition a beacon that has just joined, and all that is correlated with it, on what was heard of it."""
-        engine, block = self.engine, self.engine.block(readings[0].beacon)
-        poses = [slice(0, POSE) if p is None else engine.block(p) for p in places]
-        parts = sorted({(p.start, p.stop) for p in poses})
-        columns = columns_of(*(slice(*part) for part in parts), self._calibration, block)
-        index = {int(c): i for i, c in enumerate(columns)}
-        z = [_values(r) for r in readings]
-        m = sum(len(v) for v in z)
-
-        def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-            residual, H, i = np.zeros(m), np.zeros((m, columns.size)), 0
-            calibration, beacon = x[self._calibration].tolist(), x[block].tolist()
-            for reading, place, values in zip(readings, poses, z, strict=True):
-                pose = [*x[place].tolist(), 0.0][:POSE]
-                for k, row in enumerate(self._rows(reading, pose, calibration, beacon)):
-                    residual[i] = values[k] - row.expected if k == 0 else wrap_pi(values[k] - row.expected)
-                    at = index[place.start]
-                    H[i, at : at + place.stop - place.start] = row.pose[: place.stop - place.start]
-                    at = index[self._calibration.start] if self._shared else 0
-                    H[i, at : at + len(self._shared)] = row.calibration
-                    H[i, index[block.start] :] = row.beacon
-                    i += 1
-            return residual, H
-
-        x = engine.mean
-        variances = []
-        for reading, place in zip(readings, poses, strict=True):
-            pose = [*x[place].tolist(), 0.0][:POSE]
-            rows = self._rows(reading, pose, x[self._calibration].tolist(), x[block].tolist())
-            variances += [row.variance for row in rows]
-        return engine.update_iterated(columns, linearise, np.array(variances), 6)
-
-
-def _values(reading: Reading) -> tuple[float, ...]:
-    first = reading.rssi_dbm if isinstance(reading, RssiReading) else reading.range_m
-    if isinstance(reading, RangeReading) or reading.bearing_rad is None:
-        return (first,)
-    return (first, reading.bearing_rad)
+    def _judge(self, beacon: BeaconId, entry: Entry, *, accepted: bool) -> None:
+        """Refusals accuse the pose, or a beacon that alone is refused: the one is loosened, the other begins anew."""
+        entry.refused = 0 if accepted else entry.refused + 1
+        trust = self.settings.trust
+        if self._doubts.take(accepted=accepted):
+            v = self.engine.vehicle_size
+            jump = np.zeros(v)
+            jump[:POSE] = trust.jump_m, trust.jump_m, trust.jump_rad
+            self.engine.predict(self.engine.mean[:v].copy(), np.eye(v), np.diag(jump**2))
+            self.jumps += 1
+        if entry.refused >= trust.doubt_beacon_after:
+            self._map.leave(beacon)

@@ -8,8 +8,9 @@ from ccatp.radio.recording import Readings, RecordedRun, Steps, Truth
 from ccatp.radio_data.cleaning import in_order, names_of, within
 from ccatp.radio_data.errors import RadioDataError
 from ccatp.radio_data.text_table import Table, content_lines, number, read_text
-from ccatp.radio_data.truth import checked_heading, pose_of_truth
+from ccatp.radio_data.truth import checked_heading, pose_of_truth, turning_factor
 
+TRACK_WARNING = 0.2
 # The readme calls the wheel columns right, left and the fourth the distance between the wheels; the numbers say left,
 # right, and half that distance (see wheel_columns in checks).
 LINES = {
@@ -54,6 +55,7 @@ def read_labyrinth(path: Path) -> RecordedRun:
     if "gt2" in tables:
         t, x, y = tables["gt2"].values.T
         truth = checked_heading(Truth(t, x, y, np.full(len(t), np.nan)), steps, warnings)
+        warnings += wheel_columns(truth, steps, float(np.median(tables["odom2diff"].values[:, 4])))
     nothing = np.full(len(ranges), np.nan)
     return RecordedRun(
         name=file.name.split(".")[0],
@@ -70,6 +72,25 @@ def read_labyrinth(path: Path) -> RecordedRun:
         first_pose=pose_of_truth(truth, steps, warnings),
         warnings=tuple(warnings),
     )
+
+
+def wheel_columns(truth: Truth, steps: Steps, half_track_m: float) -> list[str]:
+    """What the truth says of the wheel columns, a line; nothing where it tells too little.
+
+    Args:
+        truth: positions.
+        steps: odometry with the columns read as left, right, half the track.
+        half_track_m: as the text has it.
+    """
+    factor = turning_factor(truth, steps)
+    if factor is None:
+        return []
+    order, read_m = "left, right" if factor > 0.0 else "right, left", 2.0 * half_track_m
+    track_m = read_m / abs(factor)
+    found = f"wheel columns by the shape of the true path: {order}, track {track_m:.3f} m"
+    if factor > 0.0 and abs(factor - 1.0) < TRACK_WARNING:
+        return [f"{found} (the readme says right, left and {half_track_m:.4f} m); read as left, right, {read_m:.4f} m"]
+    return [f"{found}; they were read as left, right and {read_m:.4f} m, so that the odometry is wrong"]
 
 
 def _chosen(folder: Path) -> Path:

@@ -45,6 +45,17 @@ def read_run(path: Path, data_format: str | None, robot: int | None) -> Recorded
     return replace(run, warnings=(*run.warnings, *suspicions(run)))
 
 
+def robots_of(path: Path) -> list[int | None]:
+    """The robots of a set: numbers if it has several, ``[None]`` for the only one.
+
+    Raises:
+        RadioDataError: there is no such set.
+    """
+    if not path.exists():
+        raise RadioDataError(path, "no such file or folder")
+    return [*robots_in(path)] if path.is_dir() and found_format(path) == "mrclam" else [None]
+
+
 def found_format(path: Path) -> str:
     """Which format a file or folder has, by its names and its first line.
 

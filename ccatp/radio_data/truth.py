@@ -12,6 +12,12 @@ AGREEMENT = 0.8
 """Length of the mean vector of (course - heading) above which the two differ by a constant."""
 LARGEST_SIDESLIP_RAD = 0.3
 """A constant difference below it is the vehicle's own; above it is the reference's frame."""
+PIECE_S = 10.0
+"""Long enough for a turn or two, short enough for odometry."""
+PIECE_POINTS = 40
+LEAST_PIECES = 4
+TELLING = 0.5
+"""A turning factor is believed if it halves the misfit of a straight path."""
 FIRST_WAY_M = 2.0
 """Way whose shape gives the first heading if the reference has positions alone."""
 
@@ -64,6 +70,43 @@ def checked_heading(truth: Truth, steps: Steps, warnings: list[str]) -> Truth:
     what = "pi" if abs(by) == np.pi else f"{by:.3f} rad"
     warnings.append(f"truth heading is turned by {what} against the course; it was turned back")
     return truth._replace(heading_rad=truth.heading_rad + by)
+
+
+def turning_factor(truth: Truth, steps: Steps) -> float | None:
+    """By what the turns of the odometry must be multiplied so that its path has the shape of the true one.
+
+    The path is cut into pieces of some ``PIECE_S``; each is laid on the truth by its own rigid motion, and the factor
+    with the least median misfit is taken. Needs no heading of the truth. None where no factor is much better than not
+    turning at all, or the vehicle hardly moves.
+    """
+    start_s, end_s = max(steps.times_s[0], truth.times_s[0]), min(steps.times_s[-1], truth.times_s[-1])
+    pieces = int((end_s - start_s) / PIECE_S)
+    if pieces < LEAST_PIECES:
+        return None
+    t = np.linspace(start_s, start_s + pieces * PIECE_S, pieces * PIECE_POINTS)
+    true = np.interp(t, truth.times_s, truth.x_m) + 1j * np.interp(t, truth.times_s, truth.y_m)
+    true = true.reshape(pieces, PIECE_POINTS)
+    true -= true.mean(axis=1, keepdims=True)
+
+    def misfit(factor: float) -> float:
+        path = dead_reckoned(steps._replace(turn_rad=factor * steps.turn_rad), (0.0, 0.0, 0.0))
+        own = np.interp(t, steps.times_s, path[:, 0]) + 1j * np.interp(t, steps.times_s, path[:, 1])
+        own = own.reshape(pieces, PIECE_POINTS)
+        own = own - own.mean(axis=1, keepdims=True)
+        turned = (own.conj() * true).sum(axis=1)
+        turned /= np.maximum(np.abs(turned), 1e-12)
+        return float(np.median(np.sqrt((np.abs(own * turned[:, None] - true) ** 2).mean(axis=1))))
+
+    sizes = np.geomspace(1.0 / 64.0, 64.0, 85)
+    factors = np.concatenate([-sizes, sizes])
+    misfits = np.array([misfit(float(factor)) for factor in factors])
+    best = float(factors[int(np.argmin(misfits))])
+    fine = best * np.linspace(0.9, 1.1, 41)
+    fine_misfits = np.array([misfit(float(factor)) for factor in fine])
+    moved = float(np.median(np.abs(true).max(axis=1)))
+    if moved < CHORD_M or fine_misfits.min() > TELLING * misfit(0.0):
+        return None
+    return float(fine[int(np.argmin(fine_misfits))])
 
 
 def pose_of_truth(truth: Truth | None, steps: Steps, warnings: list[str]) -> tuple[float, float, float]:

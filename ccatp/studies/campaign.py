@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 
 import ccatp
 from ccatp.config.models import Config
+from ccatp.config.radio_models import RadioConfig
 from ccatp.errors import CcatpError, ExitStatus
 
 Factor = str | int | float | bool
 Factors = Mapping[str, Factor]
 Arrays = Mapping[str, NDArray[Any]]
-Load = Callable[[Mapping[str, object]], Config]
+AnyConfig = Config | RadioConfig
+Load = Callable[[Mapping[str, object]], AnyConfig]
 """Dotted keys, stronger than the configuration file, to a configuration."""
 
 
@@ -66,7 +68,29 @@ class Job:
     study: str
     factors: Factors
     seed: int
-    cfg: Config
+    whole: AnyConfig
+
+    @property
+    def cfg(self) -> Config:
+        """The configuration of a job on a mirror.
+
+        Raises:
+            TypeError: the job is one among radio beacons.
+        """
+        if not isinstance(self.whole, Config):
+            raise TypeError(f"job {self.key} has no mirror; take its radio configuration")
+        return self.whole
+
+    @property
+    def radio(self) -> RadioConfig:
+        """The configuration of a job among radio beacons.
+
+        Raises:
+            TypeError: the job is one on a mirror.
+        """
+        if not isinstance(self.whole, RadioConfig):
+            raise TypeError(f"job {self.key} is one on a mirror; take its mission's configuration")
+        return self.whole
 
     @property
     def cell(self) -> str:
@@ -81,7 +105,7 @@ class Job:
     @property
     def fingerprint(self) -> str:
         """Of everything that the outcome depends on, this program's version included."""
-        whole = [ccatp.__version__, self.study, dict(self.factors), self.seed, self.cfg.model_dump(mode="json")]
+        whole = [ccatp.__version__, self.study, dict(self.factors), self.seed, self.whole.model_dump(mode="json")]
         return sha256(dumps(whole, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -134,6 +158,7 @@ class Study:
         defaults: dotted keys of the study's own: stronger than the configuration file, weaker than the command line.
         mirrors: cells are crossed with these; empty where the study chooses the mirror in its cells.
         runs: seeds of each cell, unless told otherwise.
+        is_radio: its configurations are those of robots among radio beacons.
     """
 
     name: str
@@ -146,6 +171,7 @@ class Study:
     defaults: Mapping[str, object] = field(default_factory=dict)
     mirrors: tuple[str, ...] = ("thesis-m1",)
     runs: int = 20
+    is_radio: bool = False
 
 
 def plain(value: Any) -> Any:

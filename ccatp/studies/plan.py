@@ -3,8 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-from ccatp.config.models import Config
-from ccatp.studies.campaign import CampaignError, Cell, Job, Load, Study
+from ccatp.studies.campaign import AnyConfig, CampaignError, Cell, Job, Load, Study
 
 
 class Shard(NamedTuple):
@@ -109,6 +108,6 @@ def _jobs_of_cell(study: Study, cell: Cell, load: Load, settings: Mapping[str, o
     return [Job(study.name, cell.factors, seed, with_seed(cfg, seed)) for seed in seeds]
 
 
-def with_seed(cfg: Config, seed: int) -> Config:
+def with_seed(cfg: AnyConfig, seed: int) -> AnyConfig:
     """The same configuration with another seed."""
     return cfg.model_copy(update={"run": cfg.run.model_copy(update={"seed": seed})})

@@ -30,6 +30,7 @@ class RadioRun:
         clearances_m: between body and nearest obstacle.
         truth, estimates, targets, believed: paths of the vehicle and of the target, x_m and y_m.
         places: at the end, by name: estimate, covariance, truth.
+        joint_nees: at the end, of the pose and all static radios on the map, and its degrees of freedom.
     """
 
     pose_errors: list[tuple[float, float, float]] = field(default_factory=list)
@@ -45,6 +46,7 @@ class RadioRun:
     targets: list[tuple[float, float]] = field(default_factory=list)
     believed: list[tuple[float, float]] = field(default_factory=list)
     places: dict[str, tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=dict)
+    joint_nees: tuple[float, int] = (0.0, 0)
 
 
 def run_radio(cfg: RadioConfig) -> RadioRun:
@@ -63,7 +65,16 @@ def run_radio(cfg: RadioConfig) -> RadioRun:
     truths = _true_places(world, cfg.follow.target)
     for name, estimate in loop.slam.beacons.items():
         run.places[str(name)] = (estimate.mean, estimate.covariance, np.array(truths[str(name)]))
+    run.joint_nees = _joint_nees(world, loop)
     return run
+
+
+def _joint_nees(world: RadioWorld, loop: BeaconLoop) -> tuple[float, int]:
+    """Of what is on the map: radios whose readings still wait are left out."""
+    placed = [name for name in world.beacons_m if name in loop.slam.engine]
+    mean, covariance = loop.slam.joint(placed)
+    truth = np.concatenate([world.pose, *(world.beacons_m[name] for name in placed)])
+    return _nees(mean - truth, covariance), truth.size
 
 
 def _note(run: RadioRun, world: RadioWorld, loop: BeaconLoop, reckoned: Pose, target: str) -> None:

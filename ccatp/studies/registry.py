@@ -32,6 +32,14 @@ STUDIES = {
         "ccatp.studies.cricket_study", "STUDY", "self-mapping of motes: the published figures, better ways"
     ),
     "mote-sizes": Entry("ccatp.studies.mote_sizes", "run", "time of self-mapping against the number of motes"),
+    "radio-signals": Entry(
+        "ccatp.studies.radio_signals_study", "STUDY", "levels and bearings of ZigBee radios, beside 2017"
+    ),
+    "radio-slam": Entry(
+        "ccatp.studies.radio_slam_study", "STUDY", "EKF-SLAM among ZigBee radios: rooms, slip, shadowing"
+    ),
+    "radio-cases": Entry("ccatp.studies.radio_cases_study", "STUDY", "cases I to III of 2017 side by side with ours"),
+    "radio-follow": Entry("ccatp.studies.radio_follow_study", "STUDY", "a moving radio followed, beside 2018"),
     "loops": Entry("ccatp.studies.loops", "run", "Bode plots, margins and root loci of the controllers"),
 }
 

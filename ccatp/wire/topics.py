@@ -220,6 +220,74 @@ class Misalignment(Message):
     panels: list[tuple[int, int, float, float, float]]
 
 
+class BeaconTrack(Message):
+    """A batch of estimates of a robot among beacons, in the frame of its start.
+
+    Rows: seq, t_s, x_m, y_m, heading_rad; covariance of these: xx, xy, yy, xh, yh, hh; dead reckoning: x_m, y_m.
+    """
+
+    rows: list[tuple[int, float, float, float, float, float, float, float, float, float, float, float, float]]
+
+
+BeaconEllipse = tuple[float, float, float, float, float]
+
+
+class BeaconMap(Message):
+    """The map of a robot among beacons, for displays and reports; positions in m.
+
+    Attributes:
+        system: zigbee, follow, cricket.
+        pose: x_m, y_m, heading_rad.
+        pose_ellipse: x, y, and their covariance xx, xy, yy, m2.
+        beacons: of each radio or mote on the map, the same.
+        target: of the radio that is followed, the same; ``None`` before it was heard.
+        obstacles: points in the room that the distance sensors saw lately.
+        waypoints: all of them, in order; ``next_waypoint`` is the number of the one driven to, -1 for none.
+        distances: of the distance sensors, m.
+        nis_sum, nis_size, refused: of all readings so far: normalised innovations squared, their degrees of freedom,
+            and how many readings the gate refused.
+        notes: what the mission has to say of the map: phases, errors expected.
+    """
+
+    system: str
+    pose: tuple[float, float, float]
+    pose_ellipse: BeaconEllipse
+    beacons: dict[str, BeaconEllipse]
+    target: BeaconEllipse | None
+    obstacles: list[tuple[float, float]]
+    waypoints: list[tuple[float, float]]
+    next_waypoint: int
+    distances: list[float]
+    nis_sum: float
+    nis_size: int
+    refused: int
+    notes: dict[str, float]
+
+
+class BeaconArrival(Message):
+    """A waypoint is reached, by the estimate: number in the loop and lap, both from 0, its place, the estimate."""
+
+    waypoint: int
+    lap: int
+    place: tuple[float, float]
+    estimate: BeaconEllipse
+
+
+class BeaconTruth(Message):
+    """A batch of simulated truth of a robot among beacons (simulation only).
+
+    Rows: seq, t_s, x_m, y_m, heading_rad; the moving radio: x_m, y_m; clearance of the body to the nearest obstacle, m.
+    """
+
+    rows: list[tuple[int, float, float, float, float, float | None, float | None, float | None]]
+
+
+class BeaconPlaces(Message):
+    """Where radios and motes really are (simulation only), m."""
+
+    places: dict[str, tuple[float, float]]
+
+
 @dataclass(frozen=True, slots=True)
 class Topic:
     """One row of the table.
@@ -261,6 +329,11 @@ TOPICS: tuple[Topic, ...] = (
     Topic("timing", Timing, "main", 1.0, 0.0, False),
     Topic("misalignment", Misalignment, "dataloop", 0.0, 0.0, True),
     Topic("truth", Truth, "dataloop", 1.0, 0.0, True),
+    Topic("beacon_track", BeaconTrack, "main", 1.0, 0.0, True),
+    Topic("beacon_map", BeaconMap, "main", 2.0, 2.0, True),
+    Topic("beacon_arrival", BeaconArrival, "main", 0.0, 0.0, True),
+    Topic("beacon_places", BeaconPlaces, "dataloop", 0.0, 0.0, True),
+    Topic("beacon_truth", BeaconTruth, "dataloop", 1.0, 0.0, True),
 )
 RECORD_FORMAT = 1
 """Of a recording, kept in it; one more wherever an older reader would misunderstand what is recorded."""

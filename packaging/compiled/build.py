@@ -99,7 +99,7 @@ def build(source: Path, wheels: Path) -> None:
         python_requires=project["requires-python"],
         install_requires=project["dependencies"],
         packages=find_packages(include=["ccatp", "ccatp.*"]),
-        package_data={"": ["py.typed", "*.pyi", "configs/**/*"]},
+        package_data={"": ["py.typed", "*.pyi", "configs/**/*", "static/*"]},
         entry_points={"console_scripts": [f"{name} = {at}" for name, at in project["scripts"].items()]},
         ext_modules=[*modules, kernel],
         cmdclass={"build_ext": BuildOnAllCores},

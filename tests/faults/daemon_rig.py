@@ -19,7 +19,7 @@ from ccatp.dataloop import DataLoop
 from ccatp.etalon_standin import EtalonStandIn
 from ccatp.fault_proxy.proxy import FaultProxy
 from ccatp.mirror.mirror import build_mirror
-from ccatp.processes.common import Endpoints, ProcessArgs
+from ccatp.processes.common import EitherArgs, Endpoints, ProcessArgs
 from ccatp.processes.danger_loop import DangerLoop
 from ccatp.processes.main_loop import MainLoop, open_work
 from ccatp.puck_truth import ZmqPuck
@@ -182,7 +182,7 @@ async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncI
                     for proxy in (one, two)
                 )
                 (run_dir / "config.toml").write_text(dump_config(main_args.config), encoding="utf-8")
-                hosting, opening = open_work(main_args)
+                hosting, opening = open_work(EitherArgs(main_args, None))
                 with opening as make_work:
                     main = MainLoop(main_args, context, hosting, make_work)
                     danger = DangerLoop(danger_args, context)

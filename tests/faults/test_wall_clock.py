@@ -11,8 +11,9 @@ import ccatp
 PACKAGE = Path(ccatp.__file__).parent
 CALLS = {("time", "time"), ("time", "time_ns"), ("time", "localtime"), ("time", "gmtime"), ("datetime", "now"),
          ("datetime", "today"), ("datetime", "utcnow"), ("date", "today")}  # fmt: skip
-# Labels: rows of the store and names of run directories say when they were made.
-LABELS = {"store.py", "supervisor.py"}
+# Labels: rows of the store, names of run directories and the observatory's feed say when they were made. The check before
+# a mission shows the clock itself.
+LABELS = {"store.py", "supervisor.py", "cli_calibrate.py", "ocs_desk.py", "check_probes.py"}
 
 
 def wall_clocks(tree: ast.AST) -> Iterator[int]:

@@ -36,10 +36,12 @@ class Run:
         args: further command line arguments.
     """
 
+    free_ports: tuple[str, ...] = FREE_PORTS
+
     def __init__(self, run_dir: Path, runtime_dir: Path, *args: str) -> None:
         self.run_dir, self.runtime_dir = run_dir, runtime_dir
         command = [sys.executable, "-m", "ccatp", "run", "--sim", "--run-dir", str(run_dir)]
-        command += ["--runtime-dir", str(runtime_dir), *FREE_PORTS, *args]
+        command += ["--runtime-dir", str(runtime_dir), *self.free_ports, *args]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         self.stdout = self.stderr = ""
 

@@ -56,6 +56,11 @@ def test_two_panels(start: Start, mirror: str) -> None:
     log = [json.loads(line) for line in (run.run_dir / "log.jsonl").read_text().splitlines()]
     assert {"main", "danger", "supervisor", "dataloop"} <= {entry["process"] for entry in log}
     assert "SIMULATION" in run.stderr
+    # The run ends by naming its report, which is whole.
+    assert run.stderr.rstrip().endswith(f"report  {run.run_dir / 'report.html'}")
+    report = (run.run_dir / "report.html").read_text()
+    assert "18 pass" in report
+    assert "Not in this run" not in report
 
 
 def test_the_same_seed_gives_the_same_summary_and_another_does_not(start: Start) -> None:
@@ -76,6 +81,8 @@ def test_four_processes_beside_the_supervisor(start: Start) -> None:
     run.process.send_signal(signal.SIGINT)
     assert run.wait() == 130
     assert "Traceback" not in run.stderr
+    assert f"report  none; make it with: ccatp report {run.run_dir}" in run.stderr
+    assert not (run.run_dir / "report.html").exists()
 
 
 def children(run: Run) -> list[psutil.Process]:
@@ -145,6 +152,8 @@ def test_two_interrupts_end_as_one(start: Start) -> None:
     run.process.send_signal(signal.SIGINT)
     assert run.wait() == 130
     assert "Traceback" not in run.stderr
+    assert f"report  none; make it with: ccatp report {run.run_dir}" in run.stderr
+    assert not (run.run_dir / "report.html").exists()
     assert measured_in_store(run) == run.summary["points"]["measured"] >= 2
 
 

@@ -22,8 +22,9 @@ class Bus:
     def publisher(self) -> Publisher:
         return self._ends.enter_context(closing(Publisher(self._context, ENDPOINT)))
 
-    def subscriber(self, *topics: str) -> Subscriber:
-        return self._ends.enter_context(closing(Subscriber(self._context, [ENDPOINT], topics)))
+    def subscriber(self, *topics: str, is_onlooking: bool = False, keeps_newest: bool = False) -> Subscriber:
+        made = Subscriber(self._context, [ENDPOINT], topics, is_onlooking=is_onlooking, keeps_newest=keeps_newest)
+        return self._ends.enter_context(closing(made))
 
 
 @pytest.fixture
@@ -78,3 +79,35 @@ def test_bad_messages_are_counted_and_dropped(bus: Bus) -> None:
     publisher.send("presence.main", presence(3))
     assert subscriber.receive(1.0) == ("presence.main", presence(3))
     assert subscriber.bad_messages == 1
+
+
+def test_nobody_waits_for_an_onlooker_who_gets_it_all_the_same(bus: Bus) -> None:
+    publisher = bus.publisher()
+    onlooker = bus.subscriber("presence.main", is_onlooking=True)
+    other = bus.subscriber("log")
+    while not publisher.has_subscriber("log"):
+        pass
+    received = None
+    while received is None:  # until the other subscription has arrived as well
+        publisher.send("presence.main", presence(1))
+        received = onlooker.receive(0.05)
+    assert received == ("presence.main", presence(1))
+    assert not publisher.has_subscriber("presence.main")
+    assert other.receive() is None
+
+
+def test_of_what_waits_the_newest_is_kept(bus: Bus) -> None:
+    publisher = bus.publisher()
+    newest = bus.subscriber("presence.main", keeps_newest=True)
+    while not publisher.has_subscriber("presence.main"):
+        pass
+    seen: list[int] = []
+    for seq in range(200):
+        publisher.send("presence.main", presence(seq))
+    while 199 not in seen:
+        received = newest.receive(5.0)
+        assert received is not None
+        assert isinstance(received[1], Presence)
+        seen.append(received[1].seq)
+    assert len(seen) < 200
+    assert newest.receive() is None

@@ -93,11 +93,12 @@ def test_every_help_shows_an_example(path: tuple[str, ...], capsys: pytest.Captu
 
 
 def test_the_commands_are_those_of_the_contract_the_map_and_the_conformance() -> None:
-    assert {" ".join(path) for path in commands(cli) if path} - {"map", "conformance"} == {
+    assert {" ".join(path) for path in commands(cli) if path} - {"map", "conformance", "dashboard"} == {
         "run", "status", "pause", "resume", "abort", "stop", "emergency",
         "sim", "sim robot", "sim etalon", "config", "config check", "config schema", "study", "replay", "bench",
-        "keys", "keys generate", "keys show-public", "clear", "align", "plan",
-        "log", "log info", "log recover", "stream",
+        "keys", "keys generate", "keys show-public", "clear", "align", "plan", "report", "compare",
+        "log", "log info", "log recover", "stream", "calibrate", "check", "completion",
+        "radio", "radio slam", "radio compare", "radio calibrate", "radio fix", "radio fuzzy", "radio map",
     }  # fmt: skip
 
 
@@ -136,7 +137,7 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
             ["sim", "robot", "--faults", "none.toml"],
             "ccatp: none.toml: no such file or directory; name a TOML file that",
         ),
-        (["emergency", "fier"], "'fier' is not one of 'fire', 'earthquake', 'power', 'weather', 'operator'"),
+        (["emergency", "fier"], "'fier' is none of fire, earthquake, power, weather, operator; did you mean fire?"),
         (
             ["config", "check", "none.toml"],
             "ccatp: none.toml: no such file or directory; name a TOML file that exists\n",
@@ -158,7 +159,7 @@ def test_no_command_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_run_hands_over_what_was_asked_for(stub: Stub, tmp_path: Path) -> None:
-    calls = stub("ccatp.supervisor", "run_survey", 3)
+    calls = stub("ccatp.supervisor", "run", 3)
     argv = "run --sim --mirror fyst-m2 --world thesis-x2 --filter kf --panels 4 --seed 2 --realtime --json"
     more = ["--run-dir", str(tmp_path), "--runtime-dir", "/run/x", "--set", "limits.v_max_m_s=0.05"]
     assert main([*argv.split(), *more]) == 3
@@ -181,13 +182,13 @@ def test_run_hands_over_what_was_asked_for(stub: Stub, tmp_path: Path) -> None:
 
 
 def test_run_says_nothing_of_what_was_not_asked_for(stub: Stub) -> None:
-    calls = stub("ccatp.supervisor", "run_survey", 0)
+    calls = stub("ccatp.supervisor", "run", 0)
     assert main(["run", "--config", "mine.toml"]) == 0
     assert calls == [(RunOptions(sim=False, config_file=Path("mine.toml")),)]
 
 
 def test_a_resumed_run_takes_the_configuration_of_its_directory(stub: Stub) -> None:
-    calls = stub("ccatp.supervisor", "run_survey", 0)
+    calls = stub("ccatp.supervisor", "run", 0)
     assert main(["run", "--sim", "--resume", "--run-dir", "runs/a"]) == 0
     (options,) = calls[0]
     assert (options.config_file, options.run_dir, options.resume) == (Path("runs/a/config.toml"), Path("runs/a"), True)
@@ -204,7 +205,7 @@ def test_a_resumed_run_takes_the_configuration_of_its_directory(stub: Stub) -> N
 def test_expected_errors_are_one_line_and_their_exit_status(
     error: BaseException, status: int, line: str, stub: Stub, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    stub("ccatp.supervisor", "run_survey", error)
+    stub("ccatp.supervisor", "run", error)
     assert main(["run", "--sim"]) == status
     assert capsys.readouterr().err.lstrip("\n") == line
 

@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ def refusal(capsys: pytest.CaptureFixture[str], *args: str) -> str:
     return shown.err
 
 
-def ranges_file(path: Path, pairs: list[tuple[int, int]], noise_m: float = 0.002) -> Path:
+def ranges_file(path: Path, pairs: Sequence[tuple[int, int]], noise_m: float = 0.002) -> Path:
     rng = np.random.default_rng(1)
     lines = ["first,second,range_m,sigma_m"]
     for i, j in pairs:

@@ -1,64 +1,18 @@
 """Tests of the client: what it asks over real sockets, and what it makes of the answers."""
 
-import asyncio
-import json
 import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
-import zmq.asyncio
 
 from ccatp.client import Client, Latched, Pong, StillWaiting
 from ccatp.errors import RefusedError, UnreachableError
 from ccatp.processes.run_collector import NO_STATUS
-from ccatp.router import Router
-
-Answer = Callable[[dict[str, Any]], dict[str, Any]]
-
-
-@contextmanager
-def serving(folder: Path, channel: str, answer: Answer) -> Iterator[list[dict[str, Any]]]:
-    """A real ROUTER in a thread of its own; yields what it was asked."""
-    asked: list[dict[str, Any]] = []
-    ready, loop = threading.Event(), asyncio.new_event_loop()
-
-    def handle(frame: bytes) -> bytes:
-        asked.append(json.loads(frame))
-        return json.dumps(answer(asked[-1])).encode()
-
-    async def serve() -> None:
-        context = zmq.asyncio.Context()
-        try:
-            async with Router(f"ipc://{folder / channel}", handle, context) as router:
-                ready.set()
-                await router.serve()
-        finally:
-            context.destroy(linger=0)
-
-    task = loop.create_task(serve())
-
-    def run() -> None:
-        try:
-            loop.run_until_complete(task)
-        except asyncio.CancelledError:
-            pass
-        finally:
-            loop.close()
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    assert ready.wait(10.0)
-    try:
-        yield asked
-    finally:
-        loop.call_soon_threadsafe(task.cancel)
-        thread.join()
+from tests.unit.serving import serving
 
 
 @pytest.fixture

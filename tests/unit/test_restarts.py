@@ -56,3 +56,11 @@ def test_a_start_may_take_longer() -> None:
     assert not any(watch.is_hung(0.1 * k) for k in range(10))
     assert watch.is_hung(1.1)
     assert watch.text == "has said nothing for 1 s and was killed"
+
+
+def test_a_run_goes_on_without_what_it_does_not_need() -> None:
+    policy = RestartPolicy(1, 60.0)
+    again = policy.died("dashboard", -9, 0.0, is_needed=False)
+    assert again == (Fate.RESTART, "process dashboard was killed by SIGKILL: starting it anew, the survey goes on")
+    assert policy.died("dashboard", -9, 1.0, is_needed=False).fate is Fate.WITHOUT
+    assert policy.died("dashboard", 2, 99.0, is_needed=False).fate is Fate.WITHOUT

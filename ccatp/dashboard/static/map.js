@@ -275,7 +275,7 @@ export class MapView {
 
   // The next point is ringed, those behind it are joined by a line.
   paintNext(pen, at, r) {
-    const next = this.byName?.get(this.mission?.point ?? "");
+    const next = this.byName?.get(this.mission?.next_point ?? "");
     if (next === undefined || this.mission.state === "done") return;
     const ahead = [next];
     for (let k = next + 1; k < this.ground.points.length && ahead.length < NEXT; k++) if ((this.states[k] ?? TODO) === TODO) ahead.push(k);
@@ -340,7 +340,8 @@ export class MapView {
       pen.globalAlpha *= 0.85;
       polygon(pen, [fl, fr, rr, rl], this.inks.robot);
       pen.globalAlpha = this.isLost ? 0.5 : 1;
-      const nose = at(x + 0.07 * c, y + 0.07 * s), a = at(x - 0.03 * c - 0.05 * s, y - 0.03 * s + 0.05 * c), b = at(x - 0.03 * c + 0.05 * s, y - 0.03 * s - 0.05 * c);
+      const at2 = (u, v) => at(x + u * c - v * s, y + u * s + v * c);
+      const [nose, a, b] = [at2(0.08, 0), at2(-0.05, 0.04), at2(-0.05, -0.04)];
       polygon(pen, [nose, a, b], this.inks.card);
       const r = Math.min(Math.max(scale * 0.014, 1.8), 9);
       sensors.forEach(([sx, sy], k) => disc(pen, sx, sy, r, this.robot?.edges ? (this.robot.edges[k] ? this.inks.good : this.inks.bad) : this.inks.quiet));

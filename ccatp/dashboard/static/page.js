@@ -132,7 +132,7 @@ function showMission({ mission, losses }) {
   $("progress").value = mission.done;
   text("elapsed", clock(mission.elapsed_s));
   text("eta", clock(mission.eta_s));
-  text("point", mission.point || "–");
+  text("point", mission.next_point || "–");
   text("arrival", mission.done ? `${mission.error_mm.toFixed(2)} mm` : "–");
   text("skipped", String(mission.skipped));
   text("slips", mission.slips ? `${mission.slips}, worst ${mission.lag_ms.toFixed(0)} ms` : "0");

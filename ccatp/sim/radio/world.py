@@ -4,6 +4,7 @@ import numpy as np
 
 from ccatp.config.radio_models import RadioConfig
 from ccatp.sim.radio.frame import DriveCommand, Packet, Sighting, TruePose, WorldFrame
+from ccatp.sim.radio.incidents import Incidents
 from ccatp.sim.radio.obstacles import clearance_m, seen_m
 from ccatp.sim.radio.propagation import TrueRadio
 from ccatp.sim.radio.target import MovingTarget
@@ -19,6 +20,7 @@ class RadioWorld:
 
     Attributes:
         time_s: since the start.
+        obstacles: in the room now.
 
     Args:
         cfg: the configuration; ``sim`` holds the truth.
@@ -28,15 +30,17 @@ class RadioWorld:
     def __init__(self, cfg: RadioConfig, seed: int | None = None) -> None:
         seed = cfg.run.seed if seed is None else seed
         self._cfg = cfg
+        self._incidents = Incidents(cfg.sim.incidents)
+        self.obstacles = list(cfg.sim.obstacles)
         self._vehicle = TrueVehicle(cfg.vehicle, cfg.sim.vehicle, _true_start(cfg, seed), _stream(seed, _WHEELS))
-        self._target = MovingTarget(cfg.sim.target, cfg.workspace.size_m, _stream(seed, _TARGET))
+        self._target = MovingTarget(cfg.sim.target, cfg.workspace.size_m, cfg.sim.obstacles, _stream(seed, _TARGET))
         self._distances = _stream(seed, _DISTANCES)
         references = {name: beacon.reference_dbm for name, beacon in cfg.sim.beacons.items()}
         if cfg.sim.target.motion != "none":
             references[cfg.follow.target] = cfg.sim.target.reference_dbm
         self._radios = {
             name: TrueRadio(
-                name, reference_dbm, cfg.sim.radio, cfg.workspace.size_m, cfg.sim.obstacles, cfg.scan.readings,
+                name, reference_dbm, cfg.sim.radio, cfg.workspace.size_m, self.obstacles, cfg.scan.readings,
                 _stream(seed, _PLACES, index), _stream(seed, _NOISE, index),
             )
             for index, (name, reference_dbm) in enumerate(references.items())
@@ -61,7 +65,7 @@ class RadioWorld:
     @property
     def clearance_m(self) -> float:
         """Between the vehicle's body and the nearest obstacle; negative after a collision."""
-        return clearance_m(self.pose, self._cfg.sim.obstacles) - self._cfg.vehicle.radius_m
+        return clearance_m(self.pose, self.obstacles) - self._cfg.vehicle.radius_m
 
     def step(self, command: DriveCommand, interval_s: float, *, static: bool, target: bool) -> WorldFrame:
         """Drive on, then listen.
@@ -72,8 +76,14 @@ class RadioWorld:
             static: scan for the static radios at its end.
             target: scan for the moving one.
         """
+        incidents = self._incidents
+        self.obstacles[:] = (*self._cfg.sim.obstacles, *incidents.obstacles(self.time_s))
         wheels = self._vehicle.step(command, interval_s)
-        self._target.step(interval_s)
+        approach_m_s = incidents.approach_m_s(self.time_s)
+        if approach_m_s is None:
+            self._target.step(interval_s)
+        else:
+            self._target.approach(self.pose[:2], approach_m_s * interval_s)
         self.time_s += interval_s
         packets, sightings = self._heard(static=static, target=target)
         return WorldFrame(self.time_s, wheels, packets, sightings, self._seen())
@@ -82,6 +92,7 @@ class RadioWorld:
         places = dict(self.beacons_m) if static else {}
         if target and self.target_m is not None:
             places[self._cfg.follow.target] = self.target_m
+        places = {name: place_m for name, place_m in places.items() if self._incidents.is_heard(name, self.time_s)}
         if self._cfg.sim.radio.scan == "drawn":
             found = (self._radios[name].sight(self.pose, place_m) for name, place_m in places.items())
             return (), tuple(sighting for sighting in found if sighting is not None)
@@ -92,7 +103,7 @@ class RadioWorld:
         cfg = self._cfg
         distances = []
         for direction_rad in cfg.avoidance.sensors_rad:
-            true_m = seen_m(self.pose, direction_rad, cfg.sim.obstacles)
+            true_m = seen_m(self.pose, direction_rad, self.obstacles)
             read_m = true_m + cfg.sim.range_sigma_m * self._distances.standard_normal()
             distances.append(max(0.0, min(read_m, cfg.avoidance.range_max_m)))
         return tuple(distances)

@@ -28,6 +28,7 @@ from ccatp.bench.problems import (
     survey_problem,
 )
 from ccatp.bench.race import Difference, largest_difference, race
+from ccatp.bench.slam_race import dense_slam, our_slam, slam_problem
 from ccatp.cli_bench import bench
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
@@ -243,3 +244,14 @@ def test_the_machine(tmp_path: Path) -> None:
     assert cpu_model(tmp_path / "none") != "Some CPU @ 1 GHz"
     assert f"Python {sys.version_info.major}." in report.machine_line(machine(info))
     assert "ccatp interpreted" in report.machine_line(machine(info))
+
+
+@pytest.mark.parametrize("beacons", [4, 20])
+def test_slam_by_blocks_equals_whole_matrices(beacons: int) -> None:
+    problem = slam_problem(beacons, STEPS, 1)
+    ours, dense = our_slam(problem), dense_slam(problem)
+    assert largest_difference(ours, dense, STEPS).absolute < suite.EQUAL_WITHIN
+    mean, covariance = ours.result()
+    heard = slice(5, 7)
+    assert np.trace(covariance[heard, heard]) < 0.8 * np.trace(problem.covariance[heard, heard])
+    assert mean.size == 5 + 2 * beacons

@@ -10,7 +10,7 @@ from ccatp.radio.range_network import RangeNetwork, RigidBody, build_network
 from ccatp.radio.tdoa import MoteRange
 
 FloatArray = NDArray[np.float64]
-Pairs = Sequence[tuple[int, int]]
+Pairs = list[tuple[int, int]]
 
 SIGMA_M = 0.02 / 3.0
 HEADS = np.array([[0.0, 1.0], [5.0, 1.0], [0.0, 4.5], [5.0, 4.5], [0.0, 8.0], [5.0, 8.0]])

@@ -1,0 +1,1 @@
+"""Pure. What is asked before a mission, and what the answers mean."""

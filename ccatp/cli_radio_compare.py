@@ -1,0 +1,79 @@
+"""Glue. The command ``ccatp radio compare``."""
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ccatp.cli_frame import CONFIG_OPTION, complain, example, overrides, settings_option
+from ccatp.cli_radio_slam import FILTERS, estimate
+
+if TYPE_CHECKING:
+    from ccatp.config.recording_models import RecordingsConfig
+    from ccatp.radio.recording import RecordedRun
+
+
+@click.command(
+    epilog=example(
+        "ccatp radio compare recordings/Plaza2_.mat recordings/MRCLAM_Dataset7",
+        "ccatp radio compare recordings/Plaza2_.mat --peers",
+    )
+)
+@click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--robot", type=click.IntRange(min=1), metavar="N", help="Robot of an MRCLAM set; else all that are there."
+)
+@click.option("--peers", is_flag=True, help="GTSAM (iSAM2, batch) on the same input as well; needs ccatp[peers].")
+@CONFIG_OPTION
+@settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
+@click.option("--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there.")
+def compare(
+    paths: Sequence[Path], robot: int | None, peers: bool, config_file: Path | None, settings: Mapping[str, object],
+    json_output: bool,
+) -> int:  # fmt: skip
+    """Run all estimators over recorded runs: a table of their errors and times, side by side."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads would only fight over them
+    from ccatp.config.recording_loader import load_recordings_config
+    from ccatp.radio.comparison import markdown, with_means
+    from ccatp.radio_data.reader import read_run, robots_of
+
+    assumed = load_recordings_config(config_file, overrides(settings, {}))
+    rows: list[dict[str, Any]] = []
+    for path in paths:
+        found: list[dict[str, Any]] = []
+        for one in robots_of(path) if robot is None else [robot]:
+            run = read_run(path, None, one)
+            complain(f"{run.name} ...", 0)
+            found += compared(run, assumed, peers)
+        rows += with_means(found, f"{path.resolve().name}, mean")
+    if json_output:
+        click.echo(json.dumps({"rows": rows}, allow_nan=False))
+        return 0
+    for line in markdown(rows):
+        click.echo(line)
+    return 0
+
+
+def compared(run: "RecordedRun", assumed: "RecordingsConfig", peers: bool) -> list[dict[str, Any]]:
+    """A row for each of our estimators, and for GTSAM's if asked for."""
+    from time import perf_counter
+
+    from ccatp.radio.assumed import batch_settings
+    from ccatp.radio.comparison import row
+
+    rows = []
+    for name in FILTERS:
+        begin_s = perf_counter()
+        track = estimate(run, assumed, name)
+        rows.append(row(run, name, track, perf_counter() - begin_s))
+    if peers:
+        from ccatp.gtsam_peer import run_gtsam
+
+        found = run_gtsam(run, batch_settings(getattr(assumed, run.kind)), perf_counter)
+        rows.append(row(run, "GTSAM iSAM2", found.isam2, float(found.isam2.update_s.sum()), peer=True))
+        # it starts from what iSAM2 ended with, so that its time is not a run's
+        rows.append(row(run, "GTSAM batch", found.batch, None, peer=True))
+    return rows

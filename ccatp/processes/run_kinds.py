@@ -1,0 +1,93 @@
+"""Glue. What differs between a survey and a mission among beacons for the supervisor that runs it."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+import zmq
+
+from ccatp.config.models import Config, ProcessesConfig
+from ccatp.config.radio_models import RadioConfig
+from ccatp.processes.beacon_collector import BeaconCollector
+from ccatp.processes.children import ProcessSpec
+from ccatp.processes.collecting import Collector
+from ccatp.processes.common import Endpoints
+from ccatp.processes.run_collector import RunCollector
+from ccatp.processes.run_view import BeaconView, RunView, survey_title
+from ccatp.wire.topics import Presence
+
+Heard = Callable[[Presence], None]
+Context = zmq.Context[zmq.Socket[bytes]]
+
+
+class RunKind(Protocol):
+    """One kind of run."""
+
+    @property
+    def rows(self) -> tuple[ProcessSpec, ...]:
+        """Of the process table."""
+
+    @property
+    def processes(self) -> ProcessesConfig:
+        """When one hangs, and how often they are started anew."""
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """Of the run, for the log."""
+
+    def collector(self, context: Context, endpoints: Endpoints, run_dir: Path, on_presence: Heard) -> Collector:
+        """Who listens to it."""
+
+    def view(self, run_dir: Path) -> RunView:
+        """Who shows it."""
+
+
+class SurveyRun:
+    """The survey of a mirror.
+
+    Args:
+        cfg: the configuration.
+        rows: of the process table.
+        is_sim: robot and laser system are stand-ins.
+    """
+
+    def __init__(self, cfg: Config, rows: tuple[ProcessSpec, ...], *, is_sim: bool) -> None:
+        self._cfg, self._is_sim = cfg, is_sim
+        self.rows, self.processes = rows, cfg.run
+        self.facts: dict[str, object] = {"mirror": cfg.mirror.name, "seed": cfg.run.seed, "sim": is_sim}
+
+    def collector(self, context: Context, endpoints: Endpoints, run_dir: Path, on_presence: Heard) -> Collector:
+        """Who listens to it."""
+        return RunCollector(context, endpoints, self._cfg, run_dir, is_sim=self._is_sim, on_presence=on_presence)
+
+    def view(self, run_dir: Path) -> RunView:
+        """Who shows it."""
+        return RunView(survey_title(self._cfg, is_sim=self._is_sim), is_sim=self._is_sim, run_dir=run_dir)
+
+
+class BeaconRun:
+    """A mission among beacons.
+
+    Args:
+        cfg: the configuration.
+        rows: of the process table.
+        is_sim: the robot is a stand-in.
+    """
+
+    def __init__(self, cfg: RadioConfig, rows: tuple[ProcessSpec, ...], *, is_sim: bool) -> None:
+        self._cfg, self._is_sim = cfg, is_sim
+        self.rows, self.processes = rows, cfg.processes
+        self.facts: dict[str, object] = {"system": cfg.system, "seed": cfg.run.seed, "sim": is_sim}
+
+    def collector(self, context: Context, endpoints: Endpoints, run_dir: Path, on_presence: Heard) -> Collector:
+        """Who listens to it."""
+        return BeaconCollector(context, endpoints, self._cfg, run_dir, is_sim=self._is_sim, on_presence=on_presence)
+
+    def view(self, run_dir: Path) -> RunView:
+        """Who shows it."""
+        cfg = self._cfg
+        what = "follow a radio" if cfg.follow.is_active else "visit waypoints"
+        seed = f", seed {cfg.run.seed}" if self._is_sim else ""
+        title = f"ccatp {'SIMULATION' if self._is_sim else 'mission'} among beacons: {cfg.system}, {what}{seed}"
+        goals = "seconds" if cfg.follow.is_active else "waypoints"
+        return BeaconView(title, is_sim=self._is_sim, run_dir=run_dir, goals=goals)

@@ -1,0 +1,163 @@
+"""Pure. Calibration of the log-distance model from pairs of distance and level, with confidence."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import inf, nan, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+from scipy.stats import t as student
+
+from ccatp.filters.base import FloatArray
+from ccatp.radio.path_loss import PathLoss
+
+LEAST_PLACES = 3  # two unknowns and one to tell the spread
+_PLAUSIBLE_EXPONENT = (1.0, 6.0)  # a corridor that guides waves has 1.2, a building with walls in the way up to 6
+_FAR_OFF = 3.5  # studentised residual of a place that wants a second look
+
+
+class CalibrationError(ValueError):
+    """Pairs from which no path loss follows; the message carries the numbers."""
+
+
+class LevelPair(NamedTuple):
+    """One reading.
+
+    Attributes:
+        distance_m: from the radio.
+        level_dbm: what was heard.
+        place: where; readings without a place belong to the place of their distance.
+    """
+
+    distance_m: float
+    level_dbm: float
+    place: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PathLossFit:
+    """Path loss z = P_ref - 10 eta log10(r) with the confidence of its two parameters.
+
+    Attributes:
+        reference_dbm: P_ref.
+        exponent: eta.
+        covariance: of both, shape (2, 2).
+        sigma_db: spread of the levels of places about the line, whatever makes it.
+        white_sigma_db: of repeated readings at one place; NaN where nothing was repeated.
+        shadowing_sigma_db: of what stays with a place, sigma without the white part; NaN likewise.
+        places: their number.
+        readings: of all of them.
+        residuals_db: mean level minus line of each place, shape (places,).
+        distances_m: of the places, shape (places,).
+    """
+
+    reference_dbm: float
+    exponent: float
+    covariance: FloatArray
+    sigma_db: float
+    white_sigma_db: float
+    shadowing_sigma_db: float
+    places: int
+    readings: int
+    residuals_db: FloatArray
+    distances_m: FloatArray
+
+    @property
+    def path_loss(self) -> PathLoss:
+        """The model, its noise that of a reading at a new place."""
+        return PathLoss(self.reference_dbm, self.exponent, self.sigma_db)
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom of sigma."""
+        return self.places - 2
+
+    def half_widths(self, confidence: float) -> tuple[float, float]:
+        """Of the two-sided confidence intervals of P_ref, dB, and eta (Student's t)."""
+        quantile = float(student.ppf(0.5 + 0.5 * confidence, self.freedom))
+        return quantile * sqrt(self.covariance[0, 0]), quantile * sqrt(self.covariance[1, 1])
+
+    def sigma_interval_db(self, confidence: float) -> tuple[float, float]:
+        """Confidence interval of sigma (chi-squared)."""
+        tail = 0.5 * (1.0 - confidence)
+        low, high = (float(chi2.ppf(share, self.freedom)) for share in (1.0 - tail, tail))
+        square = self.freedom * self.sigma_db**2
+        return sqrt(square / low), sqrt(square / high)
+
+    def predicted(self, distances_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean and scale of the level of a new place at distances (n,): Student's t with ``freedom``, both (n,)."""
+        rows = np.column_stack([np.ones(distances_m.size), -10.0 * np.log10(distances_m)])
+        mean = rows @ (self.reference_dbm, self.exponent)
+        scale = np.sqrt(self.sigma_db**2 + np.einsum("ij,jk,ik->i", rows, self.covariance, rows))
+        return mean, scale
+
+    def doubts(self) -> list[str]:
+        """What does not look like a path loss, a line each."""
+        found = []
+        low, high = _PLAUSIBLE_EXPONENT
+        if not low <= self.exponent <= high:
+            found.append(
+                f"exponent {self.exponent:.2f} is outside {low:g} to {high:g}: are the distances in metres, "
+                "and do the levels belong to them?"
+            )
+        for distance_m, residual_db, size in zip(self.distances_m, self.residuals_db, self._studentised(), strict=True):
+            if abs(size) > _FAR_OFF:
+                found.append(f"level at {distance_m:g} m is {residual_db:+.1f} dB off the line; look at it again")
+        return found
+
+    def _studentised(self) -> FloatArray:
+        """Residuals over their deviations, each place left out of its own sigma."""
+        rows = np.column_stack([np.ones(self.places), -10.0 * np.log10(self.distances_m)])
+        leverage = np.einsum("ij,ji->i", rows, np.linalg.pinv(rows))
+        square = self.residuals_db**2 / np.maximum(1.0 - leverage, 1e-9)
+        rest = (self.freedom * self.sigma_db**2 - square) / max(self.freedom - 1, 1)
+        return np.asarray(np.sign(self.residuals_db) * np.sqrt(square / np.maximum(rest, 1e-9)))
+
+
+def fit_path_loss(pairs: Iterable[LevelPair]) -> PathLossFit:
+    """Least squares line of level over -10 log10(distance).
+
+    Every place counts once, with the mean of its readings: what is off at a place is off for all of them, so a hundred
+    readings at one place are no hundred witnesses.
+
+    Raises:
+        CalibrationError: fewer than three distances, one that is not positive, or one that is not finite.
+    """
+    by_place: dict[tuple[float, tuple[float, float] | None], list[float]] = {}
+    for pair in pairs:
+        if not (0.0 < pair.distance_m < inf and abs(pair.level_dbm) < inf):
+            raise CalibrationError(f"pair of {pair.distance_m:g} m and {pair.level_dbm:g} dBm cannot be used")
+        by_place.setdefault((pair.distance_m, pair.place), []).append(pair.level_dbm)
+    distances = np.array([distance_m for distance_m, _ in by_place])
+    if (different := np.unique(distances).size) < LEAST_PLACES:
+        raise CalibrationError(f"{different} different distances, at least {LEAST_PLACES} needed; measure at more")
+    levels = np.array([np.mean(group) for group in by_place.values()])
+    rows = np.column_stack([np.ones(distances.size), -10.0 * np.log10(distances)])
+    normal = np.linalg.inv(rows.T @ rows)
+    found = normal @ rows.T @ levels
+    residuals = levels - rows @ found
+    variance = float(residuals @ residuals) / (distances.size - 2)
+    white, shadowing = _parts(list(by_place.values()), variance)
+    return PathLossFit(
+        reference_dbm=float(found[0]),
+        exponent=float(found[1]),
+        covariance=variance * normal,
+        sigma_db=sqrt(variance),
+        white_sigma_db=white,
+        shadowing_sigma_db=shadowing,
+        places=distances.size,
+        readings=sum(map(len, by_place.values())),
+        residuals_db=residuals,
+        distances_m=distances,
+    )
+
+
+def _parts(groups: list[list[float]], variance_db2: float) -> tuple[float, float]:
+    """White and static standard deviations; NaN where no place has two readings."""
+    freedom = sum(len(group) - 1 for group in groups)
+    if freedom == 0:
+        return nan, nan
+    within = sum(float(np.var(group)) * len(group) for group in groups) / freedom
+    in_means = within * float(np.mean([1.0 / len(group) for group in groups]))
+    return sqrt(within), sqrt(max(variance_db2 - in_means, 0.0))

@@ -1,0 +1,66 @@
+"""Pure. A beacon that has just joined, conditioned on what was heard of it, at the places where that was heard."""
+
+import numpy as np
+
+from ccatp.angles import wrap_pi
+from ccatp.filters.base import FloatArray
+from ccatp.filters.ekf_slam import Columns, EkfSlam, Update, columns_of
+from ccatp.radio.dead_reckoning import Carried
+from ccatp.radio.joining import Record, RowOf
+from ccatp.radio.motion import POSE
+from ccatp.radio.sightings import Row, strength_of
+
+LINEARISATIONS = 8
+"""At most; Gauss-Newton on readings that a beacon joined by comes to rest within five."""
+
+
+def settle_by_places(
+    engine: EkfSlam, records: list[Record], row_of: RowOf, shared: slice, block: slice, variances: FloatArray
+) -> Update:
+    """Condition a beacon, the places where it was heard, the calibration and all else on the readings, iterated.
+
+    Args:
+        engine: holds the places, and the beacon with an all but flat prior at its candidate.
+        records: readings and their places.
+        row_of: what a reading should be.
+        shared: the calibration's place in the state.
+        block: the beacon's.
+        variances: of the readings, shape (m,).
+    """
+    places = [engine.block(record.place) for record in records]
+    columns = columns_of(*places, shared, block)
+    z = [strength_of(record.reading) for record in records]
+    m, c = len(z), shared.stop - shared.start
+
+    def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        residual, H = np.zeros(m), np.zeros((m, columns.size))
+        calibration, beacon = x[shared].tolist(), x[block].tolist()
+        for i, (record, place) in enumerate(zip(records, places, strict=True)):
+            row = row_of(record.reading, [*x[place].tolist(), 0.0], calibration, beacon)
+            residual[i] = z[i] - row.expected
+            H[i, 2 * i : 2 * i + 2] = row.pose[:2]
+            H[i, 2 * m : 2 * m + len(row.calibration)] = row.calibration
+            H[i, 2 * m + c :] = row.beacon
+        return residual, H
+
+    return engine.update_iterated(columns, linearise, variances, LINEARISATIONS)
+
+
+def derivatives(row: Row, at: Carried, *, delayed: bool) -> list[float]:
+    """Dh by the pose and the calibration of the state: a row at the pose that was carried to a reading's time."""
+    (hx, hy, turned), (x_heading, y_heading) = row.pose, at.by_heading()
+    found = [hx, hy, turned + hx * x_heading + hy * y_heading, *row.calibration]
+    if delayed:
+        x_delay, y_delay, heading_delay = at.by_delay()
+        found.append(hx * x_delay + hy * y_delay + turned * heading_delay)
+    return found
+
+
+def wrapped(z: float, expected: float, *, is_angle: bool) -> float:
+    """Residual z - h(x), the short way round for angles."""
+    return wrap_pi(z - expected) if is_angle else z - expected
+
+
+def pose_columns(shared: slice, block: slice) -> Columns:
+    """Columns of pose, calibration and a beacon."""
+    return columns_of(slice(0, POSE), shared, block)

@@ -1,0 +1,177 @@
+"""Edge. Levels by distance or by place: CSV, sheets of a workbook, and folders of XBee logs ("Node A: -56")."""
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ccatp.radio.path_loss_fit import LevelPair
+from ccatp.radio_data.errors import RadioDataError
+from ccatp.radio_data.text_table import read_text
+from ccatp.radio_data.xlsx import read_workbook
+
+_LOG_LINE = re.compile(r"Node\s+(?P<node>\S+?)\s*:\s*(?P<level>[-+]?\d+(?:\.\d+)?)")
+_DISTANCE = re.compile(r"distance|range|^r$|^d$|_m$", re.IGNORECASE)
+_LEVEL = re.compile(r"rssi|level|dbm", re.IGNORECASE)
+_LEVEL_OF = re.compile(r"(?:rssi|level)[\s_]+(?P<node>\S+)", re.IGNORECASE)
+
+
+@dataclass(frozen=True, slots=True)
+class LevelTable:
+    """Pairs of distance and level, and what was odd about them.
+
+    Attributes:
+        name: file, and sheet where there is one.
+        pairs: the readings.
+        warnings: a line each.
+    """
+
+    name: str
+    pairs: tuple[LevelPair, ...]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class HeardPlace:
+    """A place, and the levels heard there by node."""
+
+    place_m: tuple[float, float]
+    levels_dbm: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceTable:
+    """Places with levels, and what was odd about them: see ``LevelTable``."""
+
+    name: str
+    places: tuple[HeardPlace, ...]
+    warnings: tuple[str, ...]
+
+
+def read_levels(path: Path, sheet: str | None = None, points: Path | None = None) -> LevelTable:
+    """Pairs of distance and level.
+
+    Args:
+        path: CSV or workbook with a column of distances (m) and one of levels (dBm), or a folder of XBee logs.
+        sheet: of a workbook, the first one if not given.
+        points: of a folder: CSV or workbook with the distance of each log, in a column ``point``.
+
+    Raises:
+        RadioDataError: it cannot be read, or has no such columns.
+    """
+    if path.is_dir():
+        return _read_folder(path, sheet, points)
+    name, rows = _read_rows(path, sheet)
+    head = rows[0]
+    at = [
+        _column(path, head, _DISTANCE, "distances, as distance_m"),
+        _column(path, head, _LEVEL, "levels, as rssi_dbm"),
+    ]
+    numbers = [[_number(path, index, row, column) for column in at] for index, row in enumerate(rows[1:], 2)]
+    levels, warnings = _signed([level for _, level in numbers])
+    pairs = tuple(LevelPair(r_m, level) for (r_m, _), level in zip(numbers, levels, strict=True))
+    return LevelTable(name, pairs, tuple(warnings))
+
+
+def read_places(path: Path, sheet: str | None = None) -> PlaceTable:
+    """Places and levels: columns ``x``, ``y`` (m) and ``RSSI A``, ``RSSI B``, ... (dBm).
+
+    Raises:
+        RadioDataError: it cannot be read, or has no such columns.
+    """
+    name, rows = _read_rows(path, sheet)
+    head = [cell.strip() for cell in rows[0]]
+    nodes = {match["node"]: i for i, cell in enumerate(head) if (match := _LEVEL_OF.fullmatch(cell))}
+    x, y = (_column(path, head, re.compile(rf"^{axis}(_m)?$", re.IGNORECASE), f"places, as {axis}") for axis in "xy")
+    if not nodes:
+        raise RadioDataError(path, 'has no column of levels by node; name one "RSSI A" for each node')
+    body = rows[1:]
+    places = [tuple(_number(path, i, row, column) for column in (x, y)) for i, row in enumerate(body, 2)]
+    flat = [_number(path, i, row, column) for i, row in enumerate(body, 2) for column in nodes.values()]
+    levels, warnings = _signed(flat)
+    n = len(nodes)
+    heard = tuple(
+        HeardPlace((place[0], place[1]), dict(zip(nodes, levels[i * n : (i + 1) * n], strict=True)))
+        for i, place in enumerate(places)
+    )
+    return PlaceTable(name, heard, tuple(warnings))
+
+
+def read_log(file: Path) -> dict[str, list[float]]:
+    """Levels by node of an XBee log with lines as ``Node A: -56``.
+
+    Raises:
+        RadioDataError: it cannot be read, or a line is none of these.
+    """
+    found: dict[str, list[float]] = {}
+    for number, line in enumerate(read_text(file).splitlines(), 1):
+        if not line.strip():
+            continue
+        match = _LOG_LINE.fullmatch(line.strip())
+        if match is None:
+            raise RadioDataError(file, f'"{line.strip()[:40]}" is no line like "Node A: -56"', number)
+        found.setdefault(match["node"], []).append(float(match["level"]))
+    return found
+
+
+def _read_folder(folder: Path, sheet: str | None, points: Path | None) -> LevelTable:
+    if points is None:
+        raise RadioDataError(folder, "is a folder of logs; name the table of their distances with --points")
+    name, rows = _read_rows(points, sheet)
+    column = _column(points, rows[0], re.compile("point", re.IGNORECASE), "points")
+    at = _column(points, rows[0], _DISTANCE, "distances, as distance_m")
+    pairs, missing = [], []
+    for index, row in enumerate(rows[1:], 2):
+        point, distance_m = int(_number(points, index, row, column)), _number(points, index, row, at)
+        file = folder / f"{point}.txt"
+        if not file.is_file():
+            missing.append(file.name)
+            continue
+        pairs += [LevelPair(distance_m, level) for levels in read_log(file).values() for level in levels]
+    if not pairs:
+        raise RadioDataError(folder, f"holds none of the logs that {points.name} names, as {missing[0]}")
+    warnings = [f"{len(missing)} logs are missing, the first {missing[0]}"] if missing else []
+    return LevelTable(f"{folder.name}, distances of {name}", tuple(pairs), tuple(warnings))
+
+
+def _read_rows(path: Path, sheet: str | None) -> tuple[str, list[list[str]]]:
+    """Name and rows, the head first."""
+    if path.suffix.lower() != ".xlsx":
+        text = read_text(path)
+        lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+        delimiter = next((mark for mark in ",;\t" if lines and mark in lines[0]), None)
+        rows = list(csv.reader(lines, delimiter=delimiter)) if delimiter else [line.split() for line in lines]
+        name = path.name
+    else:
+        sheets = read_workbook(path)
+        chosen = sheet or next(iter(sheets), "")
+        if chosen not in sheets:
+            raise RadioDataError(path, f'has no sheet "{chosen}"; there are {", ".join(sheets)}')
+        rows = [row for row in sheets[chosen] if any(cell.strip() for cell in row)]
+        name = f"{path.name}, sheet {chosen}"
+    if len(rows) < 2:
+        raise RadioDataError(path, "holds no rows below a head; the first row names the columns")
+    return name, rows
+
+
+def _column(path: Path, head: Sequence[str], pattern: re.Pattern[str], what: str) -> int:
+    found = next((i for i, cell in enumerate(head) if pattern.search(cell.strip())), None)
+    if found is None:
+        raise RadioDataError(path, f"has no column of {what}; its columns are {', '.join(head)}", 1)
+    return found
+
+
+def _number(path: Path, line: int, row: Sequence[str], column: int) -> float:
+    text = row[column].strip() if column < len(row) else ""
+    try:
+        return float(text)
+    except ValueError as error:
+        raise RadioDataError(path, f'"{text[:40]}" in column {column + 1} is no number', line) from error
+
+
+def _signed(levels: list[float]) -> tuple[list[float], list[str]]:
+    """Levels in dBm: a set of positive numbers only leaves the sign out."""
+    if levels and min(levels) > 0.0:
+        return [-level for level in levels], ["all levels are positive: taken for dBm without their sign"]
+    return levels, []

@@ -1,0 +1,240 @@
+"""Pure. A robot among beacons behind the robot link: its rules, its vehicle, what it hears. Time is an argument.
+
+Choices the interface leaves open:
+
+* The boot is frame 0 at t = 0, with no reading; a frame ends each step of the world.
+* The robot scans by itself, every so many frames.
+* The wheels obey at once; the link has no delay; there are no fans; the battery stays full.
+* A steering angle turns the robot like wheels of unequal speed, so it needs the permit ``turn``; the echo is that of
+  the wheels.
+"""
+
+from math import isfinite
+from typing import Protocol
+
+from ccatp.config.radio_models import RadioConfig
+from ccatp.sim.radio.frame import DriveCommand, Packet, Sighting, TruePose, WorldFrame
+from ccatp.sim.rules import Fans, MotionRules
+from ccatp.wire.beacon_frame import BeaconFrame, MoteBurst, RadioSample, RadioScan, SteerSample, with_extras
+from ccatp.wire.robot import PROTOCOL, Hello, RobotData, encode_sensors
+from ccatp.wire.robot_messages import VehicleData
+
+_CORNER = (0.0, 0.0)  # a robot without edge sensors has them where it is
+
+
+class Surroundings(Protocol):
+    """The true world round the robot; ``ccatp.sim.radio.world.RadioWorld`` is one."""
+
+    @property
+    def pose(self) -> TruePose:
+        """Where the vehicle is."""
+
+    @property
+    def target_m(self) -> tuple[float, float] | None:
+        """Where the moving radio is; None without one."""
+
+    @property
+    def beacons_m(self) -> dict[str, tuple[float, float]]:
+        """Where the static radios are."""
+
+    @property
+    def clearance_m(self) -> float:
+        """Between the vehicle's body and the nearest obstacle."""
+
+    def step(self, command: DriveCommand, interval_s: float, *, static: bool, target: bool) -> WorldFrame:
+        """Drive on, then listen."""
+
+
+class MoteEars(Protocol):
+    """What the robot hears of motes."""
+
+    def hear(self, time_s: float, pose: TruePose) -> list[MoteBurst]:
+        """Pulses heard since the last frame."""
+
+
+class BeaconRobot:
+    """The robot from its boot on.
+
+    Args:
+        cfg: the configuration.
+        world: where it drives.
+        ears: for motes, where there are any.
+
+    Attributes:
+        rules, fans: what it enforces; the fans do nothing.
+        world: the truth.
+        seq, t_s: newest frame and its time.
+        frame_s: period of the frames.
+        reboots: none.
+    """
+
+    def __init__(self, cfg: RadioConfig, world: Surroundings, ears: MoteEars | None = None) -> None:
+        self._cfg, self.world, self._ears = cfg, world, ears
+        self.frame_s = cfg.run.step_s
+        self.rules = MotionRules(cfg.sim.robot.ttl_s, cfg.robot.max_wheel_rad_s)
+        self.fans = Fans(0.0)
+        self.seq, self.t_s, self.reboots = 0, 0.0, 0
+        self._steer_rad = 0.0
+        self._line = b""
+        self._read(None)
+
+    def hello(self, *, boot: int, nonce: str, auth: str, lockstep: bool) -> Hello:
+        """The first message on a connection."""
+        cfg = self._cfg
+        vehicle = cfg.vehicle
+        data = RobotData(
+            wheel_radius_m=cfg.robot.wheel_radius_m,
+            wheel_base_m=vehicle.track_m,
+            edge_sensors_m=(_CORNER, _CORNER, _CORNER, _CORNER),
+            puck_m=(0.0, 0.0, 0.0),
+            max_wheel_rad_s=cfg.robot.max_wheel_rad_s,
+            fan_floor=0.0,
+            vehicle=VehicleData(
+                kind=vehicle.kind,
+                axle_distance_m=vehicle.wheelbase_m,
+                steer_max_rad=vehicle.steer_max_rad,
+                distance_sensors_rad=list(cfg.avoidance.sensors_rad),
+            ),
+        )
+        return Hello(
+            protocol=PROTOCOL,
+            boot=boot,
+            nonce=nonce,
+            auth="hmac-sha256" if auth == "hmac-sha256" else "none",
+            lockstep=lockstep,
+            frame_hz=1.0 / self.frame_s,
+            ttl_s=cfg.sim.robot.ttl_s,
+            robot=data,
+        )
+
+    @property
+    def next_t_s(self) -> float:
+        """Time of the next frame."""
+        return (self.seq + 1) * self.frame_s
+
+    @property
+    def delivered_seq(self) -> int:
+        """Number of the newest frame."""
+        return self.seq
+
+    @property
+    def delivered_line(self) -> bytes:
+        """The newest frame as a line with its LF."""
+        return self._line
+
+    # -- commands -------------------------------------------------------------------------------------------------
+
+    def join_controller(self) -> None:
+        """A new session holds the controller's role."""
+        self.rules.join_controller()
+        self.fans.join_controller()
+
+    def join_monitor(self) -> None:
+        """A new session holds the monitor's role; from now on the second key is needed."""
+        self.rules.join_monitor()
+
+    def lose_controller(self) -> None:
+        """The controller's session is gone: hold."""
+        self.rules.lose_controller()
+
+    def lose_monitor(self) -> None:
+        """The monitor's session is gone: hold."""
+        self.rules.lose_monitor()
+
+    def drive(
+        self,
+        seq: int,
+        right_rad_s: float,
+        left_rad_s: float,
+        now_s: float | None = None,
+        steer_rad: float | None = None,
+    ) -> bool:
+        """Take a drive; false for an old or equal ``seq`` and for numbers not finite.
+
+        Args:
+            seq: its number.
+            right_rad_s, left_rad_s: set points of the wheels.
+            now_s: the robot's clock at its arrival; that of the newest frame by default.
+            steer_rad: of the steered wheel, straight ahead by default.
+        """
+        steer = 0.0 if steer_rad is None or self._cfg.vehicle.kind != "ackermann" else steer_rad
+        if not isfinite(steer):
+            return False
+        at_s = self.t_s if now_s is None else now_s
+        if not self.rules.drive(seq, right_rad_s, left_rad_s, at_s, is_steered=steer != 0.0):
+            return False
+        self._steer_rad = steer
+        return True
+
+    def permit(self, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float | None = None) -> bool:
+        """Take a permit; false for an old or equal ``seq``. ``now_s`` as for ``drive``."""
+        return self.rules.permit(seq, forward, reverse, turn, self.t_s if now_s is None else now_s)
+
+    def command_fans(self, seq: int, left: float, right: float) -> bool:
+        """Take fan duties, for nothing."""
+        return self.fans.command(seq, left, right)
+
+    # -- frames ---------------------------------------------------------------------------------------------------
+
+    def advance(self) -> None:
+        """Drive one frame and listen."""
+        self.seq += 1
+        self.t_s = round(self.seq * self.frame_s, 9)
+        right, left = self.rules.set_points(self.t_s)
+        observation = self._cfg.observation
+        frame = self.world.step(
+            self._command(right, left),
+            self.frame_s,
+            static=self.seq % observation.every_steps == 0,
+            target=self.seq % observation.target_every_steps == 0,
+        )
+        self._read(frame)
+
+    def _command(self, right_rad_s: float, left_rad_s: float) -> DriveCommand:
+        radius_m, vehicle = self._cfg.robot.wheel_radius_m, self._cfg.vehicle
+        speed_m_s = 0.5 * radius_m * (right_rad_s + left_rad_s)
+        if vehicle.kind == "ackermann":
+            return DriveCommand(speed_m_s, self._steer_rad, 0.0)
+        return DriveCommand(speed_m_s, 0.0, radius_m * (right_rad_s - left_rad_s) / vehicle.track_m)
+
+    def _read(self, frame: WorldFrame | None) -> None:
+        t_s = self.t_s
+        seq, age_s, permit_age_s, is_held = self.rules.echo(t_s)
+        cmd = seq, round(age_s, 6), round(permit_age_s, 6), is_held
+        wheels: list[tuple[float, float, float]] = []
+        extras = BeaconFrame()
+        if frame is not None:
+            radius_m, vehicle = self._cfg.robot.wheel_radius_m, self._cfg.vehicle
+            half_m_s = 0.5 * vehicle.track_m * frame.wheels.turn_rate_rad_s
+            speed_m_s = frame.wheels.speed_m_s
+            wheels = [(t_s, (speed_m_s + half_m_s) / radius_m, (speed_m_s - half_m_s) / radius_m)]
+            extras = self._extras(frame)
+        line = encode_sensors(self.seq, t_s, (), wheels, (), None, (0.0, 0.0), 1.0, cmd, ())
+        self._line = with_extras(line, extras)
+
+    def _extras(self, frame: WorldFrame) -> BeaconFrame:
+        t_s = self.t_s
+        is_steered = self._cfg.vehicle.kind == "ackermann"
+        return BeaconFrame(
+            steer=[SteerSample(t_s, frame.wheels.steer_rad)] if is_steered else [],
+            radio=[_sample(t_s, sighting) for sighting in frame.sightings],
+            scan=_scan(t_s, frame.packets, self._cfg.scan.readings),
+            distances=list(frame.distances_m),
+            motes=[] if self._ears is None else self._ears.hear(t_s, self.world.pose),
+        )
+
+
+def _sample(t_s: float, sighting: Sighting) -> RadioSample:
+    return RadioSample(t_s, sighting.beacon, sighting.rssi_dbm, sighting.bearing_rad)
+
+
+def _scan(t_s: float, packets: tuple[Packet, ...], readings: int) -> RadioScan | None:
+    """The packets of a turn, each in its place."""
+    if not packets:
+        return None
+    step_rad = 6.283185307179586 / readings
+    levels: dict[str, list[float | None]] = {}
+    for packet in packets:
+        row = levels.setdefault(packet.beacon, [None] * readings)
+        row[round(packet.direction_rad / step_rad) % readings] = packet.rssi_dbm
+    return RadioScan(t_s, step_rad, levels)

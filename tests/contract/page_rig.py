@@ -1,0 +1,209 @@
+"""The real dashboard at a free port, and a daemon played by the test: publishers, and an operator channel."""
+
+import asyncio
+import json
+import socket
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import msgspec
+import structlog
+import zmq
+import zmq.asyncio
+
+from ccatp.bus import Publisher
+from ccatp.config.models import Config
+from ccatp.processes.common import Endpoints
+from ccatp.processes.dashboard import Dashboard
+from ccatp.router import Router
+from ccatp.wire.channels import format_ok
+from ccatp.wire.topics import MissionStatus, Picture, Presence
+
+DEADLINE_S = 20.0
+Handler = Callable[[bytes], Awaitable[bytes]]
+
+
+@dataclass
+class Reply:
+    """An answer over HTTP."""
+
+    code: int
+    headers: dict[str, str]
+    body: bytes
+
+    @property
+    def data(self) -> Any:
+        return json.loads(self.body)
+
+
+@dataclass
+class Rig:
+    """What a test has in hand.
+
+    Attributes:
+        port: of the page.
+        main, danger: publishers of the played daemon.
+        stop: ends the dashboard.
+        lines: what it logged.
+        asked: requests that came over the operator channel.
+        answer: what answers them.
+    """
+
+    port: int
+    main: Publisher
+    danger: Publisher
+    stop: asyncio.Event
+    lines: list[dict[str, Any]]
+    asked: list[dict[str, Any]] = field(default_factory=list)
+    answer: Handler | None = None
+    _seq: int = 0
+
+    async def handle(self, frame: bytes) -> bytes:
+        self.asked.append(json.loads(frame))
+        return format_ok() if self.answer is None else await self.answer(frame)
+
+    def tell_alive(self, phase: str = "joined") -> None:
+        """Both loops speak, and the mission drives."""
+        self._seq += 1
+        now_s = time.monotonic()
+        for publisher, name in ((self.main, "main"), (self.danger, "danger")):
+            known = Presence(seq=self._seq, t_s=now_s, process=name, pid=1, phase=phase, frame_age_s=0.01)
+            publisher.send(f"presence.{name}", known)
+        self.main.send("mission", mission(seq=self._seq))
+        self.main.send("picture", picture(self._seq))
+
+    async def ask(self, method: str, path: str, host: str = "", **headers: str) -> Reply:
+        """One request on a connection of its own; header names with _ for -."""
+        reader, writer = await asyncio.open_connection("127.0.0.1", self.port)
+        lines = [f"{method} {path} HTTP/1.1", f"host: {host or f'127.0.0.1:{self.port}'}", "connection: close"]
+        lines += [f"{name.replace('_', '-')}: {value}" for name, value in headers.items()]
+        writer.write(("\r\n".join(lines) + "\r\n\r\n").encode())
+        try:
+            async with asyncio.timeout(DEADLINE_S):
+                return _parsed(await reader.read())
+        finally:
+            writer.close()
+            await writer.wait_closed()
+
+    async def until(self, path: str, is_there: Callable[[Reply], bool]) -> Reply:
+        """Ask until the answer is as wanted; the played daemon lives meanwhile."""
+        async with asyncio.timeout(DEADLINE_S):
+            while True:
+                self.tell_alive()
+                reply = await self.ask("GET", path)
+                if is_there(reply):
+                    return reply
+
+    @asynccontextmanager
+    async def page(self) -> AsyncIterator["Page"]:
+        """An open page."""
+        reader, writer = await asyncio.open_connection("127.0.0.1", self.port)
+        writer.write(f"GET /events HTTP/1.1\r\nhost: 127.0.0.1:{self.port}\r\n\r\n".encode())
+        async with asyncio.timeout(DEADLINE_S):
+            head = await reader.readuntil(b"\r\n\r\n")
+        try:
+            yield Page(reader, head)
+        finally:
+            writer.close()
+            await writer.wait_closed()
+
+
+class Page:
+    """The events of an open page."""
+
+    def __init__(self, reader: asyncio.StreamReader, head: bytes) -> None:
+        self._reader, self.head = reader, head
+        self._text = b""
+
+    async def event(self) -> tuple[str, dict[str, Any]]:
+        """The next one."""
+        async with asyncio.timeout(DEADLINE_S):
+            while b"\n\n" not in self._text:
+                size = int(await self._reader.readuntil(b"\r\n"), 16)
+                if size == 0:
+                    raise EOFError("the stream is over")
+                self._text += (await self._reader.readexactly(size + 2))[:-2]
+        text, _, self._text = self._text.partition(b"\n\n")
+        name, data = (line.partition(b": ")[2] for line in text.split(b"\n"))
+        return name.decode(), json.loads(data)
+
+    async def until(self, is_there: Callable[[str, dict[str, Any]], bool]) -> tuple[str, dict[str, Any]]:
+        """The first one that is as wanted."""
+        while True:
+            event = await self.event()
+            if is_there(*event):
+                return event
+
+
+def mission(**fields: Any) -> MissionStatus:
+    """A mission that drives."""
+    known: dict[str, Any] = {
+        "seq": 1, "t_s": 1.0, "state": "driving", "cause": "", "done": 3, "skipped": 0, "total": 9, "point": "1-2-7",
+        "elapsed_s": 5.0, "eta_s": 90.0, "error_mm": 0.0, "code": 0, "outcome": "", "lower_bound_s": 95.0,
+        "exit_status": -1,
+    }  # fmt: skip
+    return MissionStatus(**(known | fields))
+
+
+def picture(seq: int) -> Picture:
+    """A pose."""
+    return Picture(
+        seq=seq, t_s=0.1 * seq, x_m=1.0, y_m=-2.0, heading_rad=0.5, covariance_m2=(1e-6, 0.0, 1e-6),
+        heading_sigma_rad=0.01, nis=2.0, size=2, line=msgspec.Raw(b"null"),
+    )  # fmt: skip
+
+
+def _parsed(raw: bytes) -> Reply:
+    head, _, body = raw.partition(b"\r\n\r\n")
+    first, *lines = head.decode("latin-1").split("\r\n")
+    headers = {name.lower(): value for name, _, value in (line.partition(": ") for line in lines)}
+    return Reply(int(first.split()[1]), headers, body)
+
+
+class _Log:
+    """Stands for the logger: what would be written."""
+
+    def __init__(self) -> None:
+        self.lines: list[dict[str, Any]] = []
+
+    def info(self, text: str, **fields: Any) -> None:
+        self.lines.append({"text": text, **fields})
+
+
+@asynccontextmanager
+async def page_rig(cfg: Config, folder: Path, *, has_daemon: bool = True) -> AsyncIterator[Rig]:
+    """The dashboard with this configuration; its runtime and run directory are ``folder``.
+
+    Args:
+        cfg: configuration; the port is chosen here.
+        folder: a short path, empty.
+        has_daemon: somebody answers the operator channel.
+    """
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    endpoints = Endpoints(folder)
+    listener = socket.create_server(("127.0.0.1", 0))
+    log, stop = _Log(), asyncio.Event()
+    main, danger = (Publisher(context, endpoints.of(name)) for name in ("main", "danger"))
+    rig = Rig(listener.getsockname()[1], main, danger, stop, log.lines)
+    dashboard = Dashboard(cfg, folder, endpoints, is_sim=True, log=cast(structlog.typing.FilteringBoundLogger, log))
+    try:
+        async with asyncio.TaskGroup() as tasks:
+            served = tasks.create_task(dashboard.run(listener, stop, has_pulse=True))
+            if has_daemon:
+                async with Router(endpoints.of("control"), rig.handle, zmq.asyncio.Context.shadow(context)) as router:
+                    answering = tasks.create_task(router.serve())
+                    yield rig
+                    answering.cancel()
+            else:
+                yield rig
+            stop.set()
+            await served
+    finally:
+        dashboard.close()
+        rig.main.close()
+        rig.danger.close()
+        context.destroy(linger=0)

@@ -1,0 +1,358 @@
+"""The dashboard over HTTP: the real application on a real socket, a daemon played by the test behind it."""
+
+import asyncio
+import shutil
+import socket
+import tempfile
+import time
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.wire.channels import format_error, format_ok
+from ccatp.wire.topics import Log
+from tests.contract.page_rig import DEADLINE_S, Rig, mission, page_rig
+from tests.unit.dashboard.prometheus import parse
+
+FILES = (
+    "page.js", "map.js", "plots.js", "commands.js", "page.css", "icon.svg", "uPlot.iife.min.js", "uPlot.min.css"
+)  # fmt: skip
+TOKEN = "0123456789abcdef0123456789abcdef"
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    path = Path(tempfile.mkdtemp(prefix="ccatp-"))
+    yield path
+    shutil.rmtree(path, ignore_errors=True)
+
+
+@pytest.fixture(scope="module")
+def cfg() -> Config:
+    return load_config(None, {"run.panels": 1, "dashboard.slow_client_s": 0.4, "dashboard.command_timeout_s": 0.5})
+
+
+@pytest.fixture
+async def rig(cfg: Config, folder: Path) -> AsyncIterator[Rig]:
+    async with page_rig(cfg, folder) as rig:
+        yield rig
+
+
+async def test_the_page_and_all_that_it_wants_come_from_here(rig: Rig) -> None:
+    page = await rig.ask("GET", "/")
+    assert page.code == 200
+    assert page.headers["content-type"] == "text/html; charset=utf-8"
+    policy = page.headers["content-security-policy"]
+    assert policy.startswith("default-src 'none'; script-src 'self'; style-src 'self';")
+    assert "unsafe" not in policy
+    assert page.headers["x-content-type-options"] == "nosniff"
+    assert b"://" not in page.body.replace(b"http://www.w3.org/2000/svg", b"")
+    for name in FILES:
+        file = await rig.ask("GET", f"/static/{name}")
+        assert file.code == 200, name
+        assert len(file.body) > 100
+        again = await rig.ask("GET", f"/static/{name}", if_none_match=file.headers["etag"])
+        assert (again.code, again.body) == (304, b"")
+
+
+async def test_the_ground(rig: Rig) -> None:
+    ground = (await rig.ask("GET", "/ground")).data
+    assert (ground["title"], ground["is_sim"], ground["needs_token"]) == ("fyst-m1", True, False)
+    assert len(ground["points"]) == 9
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "code", "message"),
+    [
+        ("GET", "/nothing", 404, "bad endpoint: /nothing"),
+        ("GET", "/static/uPlot.LICENSE", 404, "bad endpoint: /static/uPlot.LICENSE"),
+        ("GET", "/static/../app.py", 404, "bad endpoint: /static/../app.py"),
+        ("GET", "/abort", 405, "method not POST"),
+        ("POST", "/status", 405, "method not GET"),
+        ("POST", "/events", 405, "method not GET"),
+    ],
+)
+async def test_what_there_is_not_is_told_as_the_telescope_does(
+    rig: Rig, method: str, path: str, code: int, message: str
+) -> None:
+    reply = await rig.ask(method, path)
+    assert reply.code == code
+    assert reply.data == {"status": "error", "message": message}
+    assert "content-security-policy" in reply.headers
+
+
+async def test_status_and_health(rig: Rig) -> None:
+    sick = await rig.ask("GET", "/healthz")
+    assert sick.code == 503
+    assert sick.data == {"status": "error", "message": "main was never heard of"}
+    well = await rig.until("/healthz", lambda reply: reply.code == 200)
+    assert well.data == {"status": "ok"}
+    status = (await rig.until("/status", lambda reply: reply.data["pose"] is not None)).data
+    assert status["status"] == "ok"
+    assert status["mission"]["state"] == "driving"
+    assert status["trouble"] == ""
+
+
+async def test_metrics_are_what_prometheus_reads(rig: Rig) -> None:
+    await rig.until("/healthz", lambda reply: reply.code == 200)
+    reply = await rig.until("/metrics", lambda reply: b"position_sigma" in reply.body)
+    assert reply.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
+    metrics = parse(reply.body.decode())
+    assert metrics["ccatp_up"].samples == {"": 1.0}
+    assert metrics["ccatp_points"].samples['state="measured"'] == 3.0
+
+
+@pytest.mark.parametrize("command", ["pause", "resume", "abort", "stop"])
+async def test_a_command_goes_to_the_operator_channel(rig: Rig, command: str) -> None:
+    reply = await rig.ask("POST", f"/{command}")
+    assert (reply.code, reply.data) == (200, {"status": "ok"})
+    assert rig.asked == [{"cmd": command}]
+    assert rig.lines[-1]["command"] == command
+
+
+async def test_the_answer_comes_when_the_command_took_effect(rig: Rig) -> None:
+    asked, took_effect = asyncio.Event(), asyncio.Event()
+
+    async def later(_frame: bytes) -> bytes:
+        asked.set()
+        await took_effect.wait()
+        return format_ok()
+
+    rig.answer = later
+    async with asyncio.TaskGroup() as tasks:
+        reply = tasks.create_task(rig.ask("POST", "/pause"))
+        await asked.wait()
+        assert (await rig.ask("GET", "/ground")).code == 200  # others are served meanwhile
+        assert not reply.done()
+        took_effect.set()
+    assert reply.result().code == 200
+
+
+async def test_a_refusal_has_its_reason(rig: Rig) -> None:
+    async def refuse(_frame: bytes) -> bytes:
+        return format_error("the mission is not held but turning")
+
+    rig.answer = refuse
+    reply = await rig.ask("POST", "/resume")
+    assert reply.code == 409
+    assert reply.data == {"status": "error", "message": "resume: the mission is not held but turning"}
+
+
+async def test_an_answer_that_is_none(rig: Rig) -> None:
+    async def babble(_frame: bytes) -> bytes:
+        return b"maybe"
+
+    rig.answer = babble
+    reply = await rig.ask("POST", "/stop")
+    assert reply.code == 502
+    assert reply.data["message"] == "stop: the main loop answered with not UTF-8 JSON"
+
+
+async def test_no_daemon_is_told_within_the_time(cfg: Config, folder: Path) -> None:
+    async with page_rig(cfg, folder, has_daemon=False) as rig:
+        reply = await rig.ask("POST", "/abort")
+    assert reply.code == 504
+    assert reply.data["message"] == "abort: no answer from the main loop within 0.5 s"
+
+
+async def test_too_many_commands_at_a_time(rig: Rig) -> None:
+    never = asyncio.Event()
+
+    async def hang(_frame: bytes) -> bytes:
+        await never.wait()
+        return format_ok()
+
+    rig.answer = hang
+    async with asyncio.TaskGroup() as tasks:
+        waiting = [tasks.create_task(rig.ask("POST", "/pause")) for _ in range(9)]
+    codes = sorted(task.result().code for task in waiting)
+    assert codes == [503, *[504] * 8]
+    never.set()
+
+
+@pytest.mark.parametrize(
+    ("headers", "code", "message"),
+    [
+        ({"origin": "http://evil.example"}, 403, "commands from pages of http://evil.example are not taken"),
+        ({"sec_fetch_site": "cross-site"}, 403, "commands from pages of other sites (cross-site) are not taken"),
+        ({"host": "evil.org"}, 421, "this is not evil.org; ask by address, or add the name to dashboard.host_names"),
+    ],
+)  # fmt: skip
+async def test_pages_of_others_command_nothing(rig: Rig, headers: dict[str, str], code: int, message: str) -> None:
+    reply = await rig.ask("POST", "/abort", **headers)
+    assert (reply.code, reply.data["message"]) == (code, message)
+    assert rig.asked == []
+
+
+@pytest.mark.parametrize("path", ["/", "/status", "/events", "/ground", "/metrics", "/static/page.js"])
+async def test_nor_do_they_read_anything(rig: Rig, path: str) -> None:
+    assert (await rig.ask("GET", path, host="evil.example")).code == 421
+    reply = await rig.ask("GET", path if path != "/events" else "/status", origin="http://evil.example")
+    assert "access-control-allow-origin" not in reply.headers  # what a browser does not hand to their script
+
+
+async def test_commands_with_a_token(cfg: Config, folder: Path) -> None:
+    path = folder / "token"
+    path.write_text(TOKEN)
+    path.chmod(0o600)
+    guarded = cfg.dashboard.model_copy(update={"token_file": str(path), "host_names": ("m1.local",)})
+    async with page_rig(cfg.model_copy(update={"dashboard": guarded}), folder) as rig:
+        assert (await rig.ask("GET", "/ground", host="m1.local")).data["needs_token"] is True
+        for none in ({}, {"authorization": "Bearer wrong"}):
+            reply = await rig.ask("POST", "/abort", **none)
+            assert reply.code == 401
+            assert reply.headers["www-authenticate"] == "Bearer"
+            assert rig.asked == []
+        assert TOKEN not in str(rig.lines)
+        assert (await rig.ask("POST", "/abort", authorization=f"Bearer {TOKEN}")).code == 200
+        assert (await rig.ask("GET", "/status")).code == 200  # looking needs none
+
+
+async def test_a_page_begins_with_everything_and_goes_on_with_news(rig: Rig) -> None:
+    await rig.until("/healthz", lambda reply: reply.code == 200)
+    async with rig.page() as first:
+        assert b"text/event-stream" in first.head
+        assert b"no-store" in first.head
+        name, state = await first.event()
+        assert name == "all"
+        assert state["is_sim"] is True
+        rig.main.send("log", Log(seq=1, t_s=2.0, level="info", process="main", text="a line"))
+        name, state = await first.until(lambda _, state: bool(state["log"]))
+        assert (name, state["log"]) == ("news", [[2.0, "info", "a line"]])
+        async with rig.page() as second:
+            name, state = await second.event()
+            assert (name, state["log"]) == ("all", [[2.0, "info", "a line"]])
+        rig.tell_alive()
+        _, state = await first.until(lambda _, state: state["pose"] is not None)
+        assert state["losses"] == []
+
+
+async def test_nobody_waits_for_us_and_nobody_works_for_us_while_nobody_looks(rig: Rig) -> None:
+    # A run begins when track, estimate and verdict have subscribers: those of the run itself.
+    def subscribed() -> set[str]:
+        names = {"track", "estimate", "picture", "mission"}
+        found = {name for name in names if rig.main.has_subscriber(name)}
+        return found | ({"verdict"} if rig.danger.has_subscriber("verdict") else set())
+
+    await rig.until("/ground", lambda reply: reply.code == 200)
+    assert subscribed() == set()
+    async with rig.page() as page:
+        while "picture" not in subscribed():
+            await page.event()
+        assert subscribed() == {"picture"}
+        rig.tell_alive()
+        await page.until(lambda _, state: state["pose"] is not None)
+    async with asyncio.timeout(DEADLINE_S):
+        while subscribed():
+            await rig.ask("GET", "/ground")
+
+
+async def test_a_dead_loop_shows_at_once(rig: Rig) -> None:
+    await rig.until("/healthz", lambda reply: reply.code == 200)
+    async with rig.page() as page:
+        rig.danger.close()
+        _, state = await page.until(lambda _, state: bool(state["losses"]))
+        assert state["losses"][0][0] == "the danger loop is gone"
+        assert state["losses"][0][1] < 0.8  # cut, not merely silent for as long as it may be
+        reply = await rig.ask("GET", "/healthz")
+        assert reply.code == 503
+        assert reply.data["message"].startswith("the danger loop is gone for ")
+
+
+async def test_a_silent_loop_shows(rig: Rig) -> None:
+    await rig.until("/healthz", lambda reply: reply.code == 200)
+    async with rig.page() as page:
+        while not rig.main.has_subscriber("picture"):
+            await page.event()
+        rig.tell_alive()
+        _, state = await page.until(lambda _, state: bool(state["losses"]))
+        assert state["losses"][0][0] == "the main loop has said nothing"
+        assert state["losses"][0][1] >= 0.8
+
+
+async def test_the_end_is_told_and_comes_soon_with_a_page_open(rig: Rig) -> None:
+    await rig.until("/healthz", lambda reply: reply.code == 200)
+    async with rig.page() as page:
+        await page.event()
+        rig.main.send("mission", mission(state="done", outcome="complete", done=9, exit_status=0))
+        await page.until(lambda _, state: state["is_over"])
+        begun_s = time.monotonic()
+        rig.stop.set()
+        _, state = await page.until(lambda name, _: name == "end")
+        assert state["mission"]["outcome"] == "complete"
+        with pytest.raises(EOFError):
+            await page.event()
+        assert time.monotonic() - begun_s < 2.0  # nothing in it waits but for the server's own look, every 0.1 s
+
+
+async def closed(reader: asyncio.StreamReader) -> bytes:
+    """What came until the other end closed."""
+    async with asyncio.timeout(DEADLINE_S):
+        try:
+            return await reader.read()
+        except ConnectionError:
+            return b""
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nhost: local"])
+async def test_who_sends_no_whole_request_is_dropped(rig: Rig, sent: bytes) -> None:
+    reader, writer = await asyncio.open_connection("127.0.0.1", rig.port)
+    writer.write(sent)
+    await closed(reader)
+    writer.close()
+
+
+async def test_a_second_request_that_never_ends_is_dropped_as_well(rig: Rig) -> None:
+    reader, writer = await asyncio.open_connection("127.0.0.1", rig.port)
+    writer.write(b"GET /healthz HTTP/1.1\r\nhost: localhost\r\n\r\n")
+    async with asyncio.timeout(DEADLINE_S):
+        await reader.readuntil(b"}\n")
+    writer.write(b"GET /healthz HTTP")  # from here on no keep-alive of the server's own counts
+    assert await closed(reader) == b""
+    writer.close()
+
+
+async def test_who_takes_nothing_is_dropped(rig: Rig) -> None:
+    await rig.until("/healthz", lambda reply: reply.code == 200)
+    lazy = socket.socket()
+    lazy.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    lazy.setblocking(False)
+    loop = asyncio.get_running_loop()
+    with lazy:
+        await loop.sock_connect(lazy, ("127.0.0.1", rig.port))
+        await loop.sock_sendall(lazy, f"GET /events HTTP/1.1\r\nhost: 127.0.0.1:{rig.port}\r\n\r\n".encode())
+        long = "x" * 50_000
+        async with asyncio.timeout(DEADLINE_S):
+            metrics: dict[str, Any] = {}
+            while metrics != {"": 1.0}:
+                metrics = parse((await rig.ask("GET", "/metrics")).body.decode())["ccatp_dashboard_pages"].samples
+            while metrics != {"": 0.0}:
+                rig.main.send("log", Log(seq=1, t_s=2.0, level="info", process="main", text=long))
+                metrics = parse((await rig.ask("GET", "/metrics")).body.decode())["ccatp_dashboard_pages"].samples
+
+
+async def test_newcomers_beyond_the_limit_are_turned_away(cfg: Config, folder: Path) -> None:
+    few = cfg.dashboard.model_copy(update={"max_connections": 2, "slow_client_s": DEADLINE_S})
+    async with page_rig(cfg.model_copy(update={"dashboard": few}), folder) as rig, rig.page() as page:
+        await page.event()
+        reader, writer = await asyncio.open_connection("127.0.0.1", rig.port)
+        third, other = await asyncio.open_connection("127.0.0.1", rig.port)
+        assert await closed(third) == b""
+        await page.event()  # those who are in stay
+        writer.write(f"GET /ground HTTP/1.1\r\nhost: 127.0.0.1:{rig.port}\r\nconnection: close\r\n\r\n".encode())
+        assert (await closed(reader)).startswith(b"HTTP/1.1 200 ")
+        writer.close()
+        other.close()
+
+
+async def test_garbage_is_answered_and_noted_sparingly(rig: Rig) -> None:
+    for _ in range(30):
+        reader, writer = await asyncio.open_connection("127.0.0.1", rig.port)
+        writer.write(b"\x00\x01\x02\r\n\r\n")
+        assert (await closed(reader)).startswith(b"HTTP/1.1 400 ")
+        writer.close()
+    assert (await rig.ask("GET", "/ground")).code == 200

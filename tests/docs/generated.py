@@ -1,0 +1,157 @@
+"""The parts of the documentation that are made from the code, between markers in its pages: ``make docs``.
+
+A marker is a comment: ``<!-- made: NAME -->``, and ``<!-- made -->`` at its end. A test compares what stands between
+them with what the code says now.
+"""
+
+import re
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import click
+
+from ccatp.cli import cli
+from ccatp.samples import EventCode, Severity
+from ccatp.supervisor import PROCESSES
+from ccatp.wire.topics import TOPICS
+from tests.docs.alarm_scan import ROOT, Cause, causes
+
+DOCS = ROOT / "docs"
+MARKED = re.compile(r"(<!-- made: (\w+) -->\n).*?(<!-- made -->)", re.DOTALL)
+REACTIONS = {
+    "none": "nothing",
+    "inform": "told",
+    "slow": "half the speed",
+    "pause": "pause: wheels held, goes on by itself",
+    "hold": "hold: wheels held, a fix, then on by itself",
+    "return": "home",
+    "fault": "fault: held until an operator resumes",
+    "back off": "back off",
+}
+
+
+def alarms() -> str:
+    """Every cause with what it means."""
+    known = causes()
+    catalogue = tomllib.loads((DOCS / "alarms.toml").read_text(encoding="utf-8"))["group"]
+    return "\n".join(part for group in catalogue for part in _group(group, known))
+
+
+def _group(group: Mapping[str, object], known: Mapping[str, Cause]) -> Iterator[str]:
+    rows = group["alarms"]
+    assert isinstance(rows, Mapping)
+    yield f"## {group['title']}\n"
+    if group["about"]:
+        yield f"{group['about']}\n"
+    yield "| it says | what happens | what it means | what to do |\n|---|---|---|---|"
+    for text, row in rows.items():
+        reactions = known[text].reactions if text in known else frozenset[str]()
+        what = ", or ".join(_reaction(name) for name in sorted(reactions, key=_rank))
+        yield f"| {text} | {what} | {row['means']} | {row['do']} |"
+    yield ""
+
+
+def _rank(name: str) -> int:
+    return list(REACTIONS).index(name)
+
+
+def _reaction(name: str) -> str:
+    return REACTIONS[name]
+
+
+def severities() -> str:
+    """The severities, least first."""
+    rows = [
+        f"| {int(severity)} | `{severity.name.lower()}` | {REACTIONS[severity.name.lower()]} |" for severity in Severity
+    ]
+    return "\n".join(["| | severity | what happens |", "|---|---|---|", *rows])
+
+
+def topics() -> str:
+    """The topic table."""
+    lines = ["| topic | from | rate, Hz | stale after, s | recorded | message |", "|---|---|---|---|---|---|"]
+    for topic in TOPICS:
+        rate = f"{topic.rate_hz:g}" if topic.rate_hz else "event"
+        stale = f"{topic.stale_after_s:g}" if topic.stale_after_s else "\u2013"
+        recorded = "yes" if topic.recorded else "no"
+        summary = (topic.message.__doc__ or "").strip().splitlines()[0]
+        lines.append(f"| `{topic.name}` | {topic.publisher} | {rate} | {stale} | {recorded} | {summary} |")
+    return "\n".join(lines)
+
+
+def processes() -> str:
+    """The process table."""
+    lines = ["| process | module | runs | when it dies |", "|---|---|---|---|"]
+    for process in PROCESSES:
+        runs = "with `--sim`" if process.is_stand_in else "always"
+        dies = "started anew" if process.is_replaceable else "the run ends, held"
+        lines.append(f"| {process.name} | `{process.module}` | {runs} | {dies} |")
+    return "\n".join(lines)
+
+
+def codes() -> str:
+    """The event codes."""
+    rows = [f"| {int(code)} | {code.name.lower().replace('_', ' ')} |" for code in EventCode]
+    return "\n".join(["| code | |", "|---|---|", *rows])
+
+
+def commands() -> str:
+    """Every command with its first line of help and its options."""
+    return "\n".join(_commands(cli, ("ccatp",)))
+
+
+def _commands(group: click.Group, path: tuple[str, ...]) -> Iterator[str]:
+    for name, command in sorted(group.commands.items()):
+        own = (*path, name)
+        if isinstance(command, click.Group):
+            yield from _commands(command, own)
+            continue
+        usage = " ".join(
+            [*own, *(p.make_metavar(click.Context(command)) for p in command.params if isinstance(p, click.Argument))]
+        )
+        yield f"## `{usage}`\n"
+        paragraphs = (command.help or "").replace("\b", "").strip()
+        yield f"{paragraphs}\n"
+        for option in command.params:
+            if isinstance(option, click.Option) and not option.hidden:
+                yield f"* {_option(option)}"
+        yield ""
+
+
+def _option(option: click.Option) -> str:
+    names = ", ".join(f"`{name}`" for name in (*option.opts, *option.secondary_opts))
+    return f"{names}: {option.help}" if option.help else names
+
+
+MADE: dict[str, Callable[[], str]] = {
+    "alarms": alarms,
+    "severities": severities,
+    "topics": topics,
+    "processes": processes,
+    "codes": codes,
+    "commands": commands,
+}
+
+
+def pages() -> dict[Path, str]:
+    """The pages with markers, as they should be."""
+    found = {}
+    for path in sorted(DOCS.glob("*.md")):
+        text = path.read_text(encoding="utf-8")
+        made = MARKED.sub(lambda match: f"{match[1]}{MADE[match[2]]().rstrip()}\n{match[3]}", text)
+        if MARKED.search(text):
+            found[path] = made
+    return found
+
+
+def main() -> None:
+    """Write them."""
+    for path, text in pages().items():
+        if path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+            print(path.relative_to(ROOT))
+
+
+if __name__ == "__main__":
+    main()

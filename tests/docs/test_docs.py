@@ -1,0 +1,129 @@
+"""The documentation: what is made from the code is current, code blocks run, command lines exist, Sphinx is content."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+
+from ccatp.cli import cli, main
+from tests.docs.alarm_scan import ROOT, causes
+from tests.docs.generated import DOCS, MADE, MARKED, REACTIONS, pages
+from tests.unit.reporting.recorded import record
+
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+SOURCES = [*sorted(DOCS.glob("*.md")), ROOT / "README.md"]
+# Console commands that are quick and need no daemon: these are not only understood but run.
+EXAMPLES = {"ID": "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"}  # for placeholders that a command would refuse
+RUN = frozenset(("config", "plan", "report", "align", "compare"))
+
+
+def blocks(path: Path, *languages: str) -> list[str]:
+    return [body for language, body in FENCE.findall(path.read_text(encoding="utf-8")) if language in languages]
+
+
+def test_every_cause_has_its_line_and_no_other() -> None:
+    groups = tomllib.loads((DOCS / "alarms.toml").read_text(encoding="utf-8"))["group"]
+    described = [text for group in groups for text in group["alarms"]]
+    assert len(described) == len(set(described))
+    known = causes()
+    assert set(known) - set(described) == set(), "say in docs/alarms.toml what these mean, then make docs"
+    assert set(described) - set(known) == set(), "docs/alarms.toml describes what the code does not say any more"
+    assert all(cause.reactions and cause.reactions <= set(REACTIONS) for cause in known.values())
+
+
+def test_the_scan_follows_names_branches_and_callers() -> None:
+    found = {text: cause.reactions for text, cause in causes().items()}
+    assert found["drives reach the wheels late"] == {"slow"}  # an assignment in its own branch
+    assert found["drives reach the wheels too late"] == {"pause"}
+    assert found["the \u2026 wheel is blocked"] == {"hold"}  # either branch of a choice
+    assert found["the \u2026 fan gives too little"] == {"fault", "inform"}  # a parameter of another method
+    assert found["the robot reports a fault of its inertial unit"] == {"slow"}  # a table
+    assert found["encoder samples stale"] == {"hold"}
+    assert 'Severity.HOLD if missing.signal == "enc"' in (ROOT / "ccatp/danger.py").read_text(encoding="utf-8")
+
+
+def test_what_is_made_from_the_code_is_current() -> None:
+    found = pages()
+    used = [name for path in found for name in re.findall(MARKED, path.read_text(encoding="utf-8"))]
+    assert {name for _, name, _ in used} == set(MADE)
+    for path, text in found.items():
+        assert path.read_text(encoding="utf-8") == text, f"{path.name} is not current: make docs"
+
+
+@pytest.mark.parametrize("path", [path for path in SOURCES if blocks(path, "python")], ids=lambda path: path.stem)
+def test_python_blocks_run(path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    names: dict[str, object] = {"__name__": "__docs__"}
+    for number, body in enumerate(blocks(path, "python"), 1):
+        exec(compile(body, f"{path.name}, block {number}", "exec"), names)
+    assert capfd.readouterr().out  # every one of them shows something
+
+
+def command_lines() -> Iterator[tuple[str, str]]:
+    """Command lines of ``ccatp`` in fenced blocks: the page, and the line without comment and prompt."""
+    for path in SOURCES:
+        for body in blocks(path, "", "console", "sh"):
+            for line in body.splitlines():
+                words = re.split(r"\s#\s|\s{3,}", line.removeprefix("$ ").strip())[0]  # the rest is a remark
+                if re.match(r"(\S*/)?ccatp [a-z]", words) and not re.search(r"\.\.\.|\u2026|\[--", words):
+                    yield path.stem, words
+
+
+@pytest.mark.parametrize(("page", "line"), sorted(set(command_lines())))
+def test_command_lines_exist(page: str, line: str) -> None:
+    shown = re.split(r" [|>] ", line)[0]
+    words = [EXAMPLES.get(word, word) for word in shlex.split(shown)[1:]]
+    command: click.Command = cli
+    context = click.Context(cli, info_name="ccatp")
+    while isinstance(command, click.Group):
+        name, command_found, words = command.resolve_command(context, words)
+        assert command_found is not None, line
+        command, context = command_found, click.Context(command_found, parent=context, info_name=name)
+    command.make_context(context.info_name, list(words), parent=context.parent)  # parses; runs nothing
+
+
+@pytest.fixture(scope="module")
+def telescope(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory in which the lines of the guides make sense."""
+    folder = tmp_path_factory.mktemp("telescope")
+    (folder / "telescope.toml").write_text("[run]\npanels = 2\n")
+    tonight = record(folder / "runs" / "tonight", only=4)
+    for name in ("before", "after"):
+        shutil.copytree(tonight, folder / "runs" / name)
+    return folder
+
+
+def quick_lines() -> list[str]:
+    return sorted({
+        line.split(" ", 1)[1]
+        for path in SOURCES
+        for body in blocks(path, "console")
+        for line in (one.removeprefix("$ ") for one in body.splitlines() if one.startswith("$ ccatp "))
+        if line.split()[1] in RUN
+    })  # fmt: skip
+
+
+@pytest.mark.parametrize("line", quick_lines())
+def test_console_lines_run(
+    line: str, telescope: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if "--fig" in line:
+        pytest.importorskip("matplotlib")
+    monkeypatch.chdir(telescope)
+    assert main(shlex.split(line)) == 0, capsys.readouterr().err
+    assert capsys.readouterr().out
+
+
+def test_sphinx_builds_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("furo")
+    # Everything is read and every reference resolved; only the writing of HTML is left to ``make docs``.
+    command = [sys.executable, "-m", "sphinx", "-W", "-q", "-b", "dummy", str(DOCS), str(tmp_path / "docs")]
+    done = subprocess.run(command, cwd=ROOT, env={**os.environ}, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -1,0 +1,70 @@
+"""Recorded sets with ground truth, read beside the checkout: what the estimators make of them."""
+
+import time
+from pathlib import Path
+
+import pytest
+
+from ccatp.config.recording_loader import load_recordings_config
+from ccatp.radio.assumed import batch_settings
+from ccatp.radio.batch import smooth
+from ccatp.radio.judged import Judgement, judge
+from ccatp.radio.recording import RecordedRun
+from ccatp.radio.track import Track
+from ccatp.radio_data.reader import read_run
+
+DATA = Path(__file__).parents[3] / "shared" / "data" / "radio"
+pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"the recorded radio data are not at {DATA}")
+
+
+def smoothed(path: str, robot: int | None = None) -> tuple[RecordedRun, Track, Judgement]:
+    """A set through the smoother as it is configured."""
+    run = read_run(DATA / path, None, robot)
+    track = smooth(run, batch_settings(getattr(load_recordings_config(), run.kind)), time.perf_counter)
+    return run, track, judge(track, run)
+
+
+def test_plaza2_smoothed() -> None:
+    run, track, found = smoothed("plaza/Plaza2_.mat")
+    assert found.trajectory_rmse_m is not None
+    assert found.beacon_rmse_m is not None
+    assert found.trajectory_rmse_m < 0.25  # the goal
+    assert found.beacon_rmse_m < 0.3
+    scale, sigma = track.calibration["range_scale"]
+    assert 1.0 + scale == pytest.approx(1.0693, rel=0.007)  # the slope of ranges over true distances
+    assert abs(scale - 0.0693) < 3.0 * sigma
+    told = " | ".join(run.warnings)
+    for warning in ("turned by pi", "odometry distance equals the truth", "ranges read +7.0 per cent"):
+        assert warning in told
+
+
+def test_mrclam7_smoothed() -> None:
+    _, track, found = smoothed("mrclam/set7", 1)
+    assert found.trajectory_rmse_m is not None
+    assert found.trajectory_rmse_m < 0.12  # the goal, which is one of the mean over the robots
+    assert len(track.beacons) == 15
+    assert track.calibration["delay_s"].value == pytest.approx(0.25, abs=0.1)  # odometry is what was commanded
+
+
+@pytest.mark.slow
+def test_mrclam7_smoothed_mean_of_all_robots() -> None:
+    errors = [smoothed("mrclam/set7", robot)[2].trajectory_rmse_m or 9.0 for robot in range(1, 6)]
+    assert sum(errors) / len(errors) < 0.12
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", [3, 5])
+def test_mrclam3_maps_the_landmarks_without_truth_of_the_path(robot: int) -> None:
+    _, _, found = smoothed("mrclam/set3", robot)
+    assert found.trajectory_rmse_m is None
+    assert found.beacon_rmse_m is not None
+    assert found.beacon_rmse_m < 0.1
+
+
+def test_labyrinth_smoothed() -> None:
+    run, _, found = smoothed("uwb_labyrinth")
+    assert found.trajectory_rmse_m is not None
+    assert found.trajectory_rmse_m < 0.065
+    told = " | ".join(run.warnings)
+    assert "wheel columns by the shape of the true path: left, right, track 0.15" in told
+    assert "ranges read +5.0 per cent" in told

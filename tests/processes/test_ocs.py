@@ -1,0 +1,108 @@
+"""The agent at a real crossbar router: from an OCS client a survey is started, its status polled, and aborted."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.processes.ocs_network import INSTANCE, network
+
+# Crossbar is no dependency of ours: name one with this variable, or have it in the path.
+CROSSBAR = os.environ.get("CCATP_CROSSBAR") or shutil.which("crossbar")
+
+
+def until(look: Callable[[], Any], timeout_s: float = 90.0) -> Any:
+    deadline_s, found = time.monotonic() + timeout_s, None
+    while time.monotonic() < deadline_s:
+        if found := look():
+            return found
+        time.sleep(0.2)
+    raise AssertionError(f"not within {timeout_s} s; last seen {found}")
+
+
+def connect(options: list[str]) -> Any:
+    from ocs.ocs_client import OCSClient
+
+    try:
+        return OCSClient(INSTANCE, args=options)
+    except RuntimeError:  # the agent is not there yet
+        return None
+
+
+# A subscriber in a process of its own, because its libraries want the whole process.
+SUBSCRIBER = """
+import asyncio, json, sys
+from autobahn.asyncio.wamp import ApplicationRunner, ApplicationSession
+class Ear(ApplicationSession):
+    async def onJoin(self, details):
+        await self.subscribe(self.hear, sys.argv[3])
+    def hear(self, message, *_):
+        blocks = message[0] if isinstance(message, (list, tuple)) else message
+        if "survey" in blocks:
+            print(json.dumps(blocks["survey"]), flush=True)
+            self.leave()
+    def onDisconnect(self):
+        asyncio.get_event_loop().stop()
+ApplicationRunner(sys.argv[1], sys.argv[2]).run(Ear)
+"""
+
+
+def published(options: list[str]) -> dict[str, Any]:
+    """The next block that somebody who listens to the feed gets."""
+    hub = json.loads(Path(options[1]).read_text())["hub"]
+    feed = f"{hub['address_root']}.{INSTANCE}.feeds.survey"
+    command = [sys.executable, "-c", SUBSCRIBER, hub["wamp_server"], hub["wamp_realm"], feed]
+    found: dict[str, Any] = json.loads(subprocess.check_output(command, timeout=30.0))
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")  # of OCS's own libraries
+@pytest.mark.skipif(
+    CROSSBAR is None, reason="no crossbar here: pip install crossbar elsewhere, name it in CCATP_CROSSBAR"
+)
+def test_survey_status_abort_from_an_ocs_client(tmp_path: Path, runtime_dir: Path) -> None:
+    pytest.importorskip("ocs", reason="needs the extra ocs")
+    assert CROSSBAR is not None
+    config = tmp_path / "sim.toml"
+    config.write_text(
+        "[sim.robot]\nport = 0\n[sim.etalon]\nport = 0\n[mission]\ncalibration_length_m = 0.0\n"
+        '[run]\nmirror = "thesis-m1"\n'
+    )
+    options = ("--sim", "--realtime", "--config", str(config), "--runtime-dir", str(runtime_dir), "--period", "0.5")
+    with network(CROSSBAR, tmp_path, *options) as client_options:
+        client = until(lambda: connect(client_options))
+        refused = client.status()
+        assert not refused.session["success"]
+        assert "no daemon in" in str(refused.session["messages"])
+        assert client.survey.start(panels=-1)[0] != 0  # refused by the check of its parameter
+        assert client.survey.start(panels=2)[0] == 0
+        state = until(lambda: (client.survey.status().session["data"] or {}).get("state") in ("turning", "driving"))
+        assert state
+        assert client.status().session["data"]["total"] == 18
+        assert client.pause().session["success"]
+        assert client.status().session["data"]["state"] == "held"
+        assert client.resume().session["success"]
+        fed = until(lambda: client.monitor.status().session["data"])
+        assert fed["running"]
+        block = published(client_options)
+        assert block["data"]["total"][0] == 18
+        assert block["data"]["state"][0] in (
+            "held",
+            "turning",
+            "driving",
+            "settling",
+            "measuring",
+        )  # of the last second
+        assert client.abort().session["success"]
+        ended = client.survey.wait(timeout=120)
+        assert "aborted, the robot is at base" in str(ended.session["messages"])
+        assert ended.session["data"]["exit_status"] == 3
+        until(lambda: not client.monitor.status().session["data"]["running"])

@@ -1,0 +1,219 @@
+"""The parts of missions among beacons, one by one."""
+
+from math import inf, pi, radians
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ccatp.beacon_assembly import assemble_beacons, check_beacon_robot
+from ccatp.beacon_danger import BeaconDanger
+from ccatp.beacon_mission.mission import Arrival
+from ccatp.beacon_mission.navigator import Belief
+from ccatp.beacon_mission.permits import permitted
+from ccatp.beacon_mission.self_map import SelfMap
+from ccatp.beacon_mission.senses import SenseReader
+from ccatp.beacon_mission.wheel_rates import wheel_rates
+from ccatp.beacon_store import BeaconStore, BeaconStoreError
+from ccatp.beacon_summary import BeaconSummary, beacon_facts
+from ccatp.config.radio_models import RadioConfig
+from ccatp.control.waypoint_steering import HALT, Drive
+from ccatp.errors import ConfigError
+from ccatp.hazards.echo_memory import EchoMemory
+from ccatp.samples import EventCode, Verdict
+from ccatp.sim.beacon_robot import BeaconRobot
+from ccatp.sim.radio.world import RadioWorld
+from ccatp.wire.beacon_frame import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
+from ccatp.wire.robot import BadLine, Hello, Sensors, decode_from_robot
+from tests.unit.beacon_mission.stories import beacon_config
+
+FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
+NO_FORWARD = Verdict(0, 0.0, EventCode.NEAR_EDGE, "", "", 0.0, 0.0, False, True, True)
+NOTHING = Verdict(0, 0.0, EventCode.NEAR_EDGE, "", "", 0.0, 0.0, False, False, False)
+
+
+@pytest.fixture
+def cfg() -> RadioConfig:
+    return beacon_config("zigbee")
+
+
+def frame_of(robot: BeaconRobot) -> tuple[Sensors, BeaconFrame]:
+    line = robot.delivered_line.strip()
+    sensors = decode_from_robot(line)
+    assert isinstance(sensors, Sensors)
+    return sensors, decode_beacon_frame(line)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "verdict", "sent"),
+    [
+        (Drive(0.1, 0.2, 0.0), FREE, Drive(0.1, 0.2, 0.0)),
+        (Drive(0.1, 0.2, 0.0), NO_FORWARD, Drive(-0.05, 0.0, 0.0)),
+        (Drive(-0.1, 0.2, 0.0), NO_FORWARD, Drive(-0.1, 0.2, 0.0)),
+        (Drive(0.1, 0.2, 0.0), NOTHING, HALT),
+        (Drive(-0.1, 0.2, 0.0), NOTHING, HALT),
+        (Drive(0.0, 0.2, 0.3), NOTHING, Drive(0.0, 0.0, 0.0)),
+        (Drive(float("nan"), 0.0, 0.0), FREE, HALT),
+    ],
+)
+def test_nothing_is_sent_that_is_not_permitted(wanted: Drive, verdict: Verdict, sent: Drive) -> None:
+    assert permitted(wanted, verdict, 0.05) == sent
+
+
+def test_wheel_rates_of_both_vehicles(cfg: RadioConfig) -> None:
+    rate = 0.1 / cfg.robot.wheel_radius_m
+    assert wheel_rates(Drive(0.1, 0.2, 0.0), cfg) == (rate, rate, 0.2)
+    turning = cfg.model_copy(update={"vehicle": cfg.vehicle.model_copy(update={"kind": "differential"})})
+    right, left, steer = wheel_rates(Drive(0.1, 0.0, 0.5), turning)
+    assert steer is None
+    assert right - left == pytest.approx(0.5 * cfg.vehicle.track_m / cfg.robot.wheel_radius_m)
+
+
+def test_echoes_stay_where_they_are_while_the_robot_moves() -> None:
+    memory = EchoMemory((0.0, pi / 2), 1.0, 20.0)
+    memory.see(0.0, (0.5, 3.0))
+    assert memory.nearest_m(0.0, 0.1) == pytest.approx(0.5)
+    memory.roll(0.2, 0.0, 0.0)
+    assert memory.nearest_m(0.0, 0.1) == pytest.approx(0.3)
+    memory.roll(0.0, 0.0, pi)  # turned round: it is behind now
+    assert memory.nearest_m(0.0, 0.1) == inf
+    assert memory.behind_m(0.0, 0.1) == pytest.approx(0.3)
+    memory.see(20.5, (3.0, 3.0))
+    assert memory.behind_m(0.0, 0.1) == inf  # forgotten
+
+
+def test_the_course_of_a_steered_vehicle_is_where_its_front_wheel_points() -> None:
+    memory = EchoMemory((0.0,), 2.0, 20.0)
+    memory.see(0.0, (1.0,))
+    memory.roll(1.0, pi / 2, 0.0)  # sideways, as wheels at a right angle would
+    assert memory.nearest_m(-pi / 4, 0.01) == pytest.approx(2.0**0.5)
+
+
+def test_wheels_steering_and_scans_are_read_from_the_link(cfg: RadioConfig) -> None:
+    robot = BeaconRobot(cfg, RadioWorld(cfg))
+    robot.join_controller()
+    reader = SenseReader(cfg)
+    reader.read(*frame_of(robot))
+    robot.drive(1, 1.0, 1.0, None, 0.3)
+    robot.advance()
+    (wheels,) = reader.read(*frame_of(robot)).wheels
+    assert wheels.interval_s == pytest.approx(0.1)
+    assert wheels.speed_m_s == pytest.approx(cfg.robot.wheel_radius_m, abs=5 * cfg.sim.vehicle.speed_sigma_m_s)
+    assert wheels.steer_rad == pytest.approx(0.3, abs=5 * cfg.sim.vehicle.steer_sigma_rad)
+
+
+def test_a_scan_on_the_link_keeps_its_directions() -> None:
+    cfg = beacon_config("zigbee", sim__radio__scan="reflector", observation__every_steps=1)
+    world = RadioWorld(cfg)
+    robot = BeaconRobot(cfg, world)
+    robot.advance()
+    packets = SenseReader(cfg).read(*frame_of(robot)).packets
+    assert len(packets) == 4 * cfg.scan.readings
+    step = 2 * pi / cfg.scan.readings
+    assert {round(packet.direction_rad / step, 6) % cfg.scan.readings for packet in packets} == set(range(40))
+    assert len(robot.delivered_line) < 8192
+
+
+def test_steering_needs_the_permit_to_turn(cfg: RadioConfig) -> None:
+    robot = BeaconRobot(cfg, RadioWorld(cfg))
+    robot.join_controller()
+    robot.join_monitor()
+    for seq, steer, turn, is_held in ((1, 0.2, True, False), (2, 0.2, False, True), (3, 0.0, False, False)):
+        robot.permit(seq, True, True, turn)
+        robot.drive(seq, 1.0, 1.0, None, steer)
+        robot.advance()
+        assert robot.rules.is_held is is_held
+
+
+def test_a_drive_outlives_its_time_to_live_by_nothing(cfg: RadioConfig) -> None:
+    robot = BeaconRobot(cfg, RadioWorld(cfg))
+    robot.join_controller()
+    robot.drive(1, 1.0, 1.0)
+    held = []
+    for _ in range(4):
+        robot.advance()
+        held.append(robot.rules.is_held)
+    assert held == [False, False, True, True]
+
+
+def test_extra_keys_out_of_range_are_a_bad_line(cfg: RadioConfig) -> None:
+    line = with_extras(BeaconRobot(cfg, RadioWorld(cfg)).delivered_line, BeaconFrame(distances=[1.0, 2.0]))
+    assert decode_beacon_frame(line.strip()).distances == [1.0, 2.0]
+    with pytest.raises(BadLine, match="distances"):
+        decode_beacon_frame(line.strip().replace(b"2.0", b"-2.0"))
+
+
+def test_the_danger_rules_find_the_target_by_its_level() -> None:
+    cfg = beacon_config("follow")
+    danger, robot = BeaconDanger(cfg), BeaconRobot(cfg, RadioWorld(cfg))
+    sensors, _ = frame_of(robot)
+    for level_dbm, is_near in ((-36.0, False), (-28.0, True)):  # at 1 m, at 0.4 m
+        scan = RadioScan(0.0, radians(9.0), {"target": [level_dbm, None], "beacon1": [-50.0]})
+        danger.reset()
+        verdict = danger.step(sensors, BeaconFrame(scan=scan), None)
+        assert (verdict.signal == "target") is is_near
+        assert verdict.forward is not is_near
+        assert verdict.reverse
+
+
+def test_no_frame_means_no_permit(cfg: RadioConfig) -> None:
+    verdict = BeaconDanger(cfg).stale(7, 1.5)
+    assert (verdict.forward, verdict.reverse, verdict.turn) == (False, False, False)
+
+
+def test_another_robot_is_refused(cfg: RadioConfig) -> None:
+    hello = BeaconRobot(cfg, RadioWorld(cfg)).hello(boot=1, nonce="0" * 32, auth="none", lockstep=True)
+    check_beacon_robot(cfg, hello)
+    other = beacon_config("zigbee", vehicle__wheelbase_m=0.5, vehicle__kind="differential")
+    with pytest.raises(ConfigError, match=r"vehicle.wheelbase_m is 0.5 here and 0.35 there.*kind is differential"):
+        check_beacon_robot(other, hello)
+    with pytest.raises(ConfigError, match="the distance sensors look elsewhere"):
+        check_beacon_robot(beacon_config("follow"), hello)
+
+
+def test_a_mirror_robot_is_no_beacon_robot(cfg: RadioConfig) -> None:
+    hello = BeaconRobot(cfg, RadioWorld(cfg)).hello(boot=1, nonce="0" * 32, auth="none", lockstep=True)
+    hello.robot.vehicle = None
+    assert isinstance(hello, Hello)
+    with pytest.raises(ConfigError, match="says nothing of its vehicle"):
+        check_beacon_robot(cfg, hello)
+
+
+def test_a_summary_without_truth_holds_what_needs_none(cfg: RadioConfig) -> None:
+    book = BeaconSummary(beacon_facts(cfg, is_sim=False))
+    navigator = assemble_beacons(cfg).navigator
+    book.set_map({"beacon1": (0.1, 0.2, 0.01, 0.0, 0.01)}, (2.0, 2, 0), navigator.notes)
+    summary = book.build(1.0)
+    assert summary["trajectory_rmse_m"] is None
+    assert summary["position_error_m"]["max"] is None
+    assert summary["beacons"]["rmse_m"] is None
+    assert summary["beacons"]["mapped"] == 1
+    assert summary["consistency"]["nis_mean"] == 1.0
+
+
+def test_the_store_keeps_what_was_reached(cfg: RadioConfig, tmp_path: Path) -> None:
+    import sqlite3
+
+    path = tmp_path / "mission.sqlite"
+    store = BeaconStore(path, {"system": "zigbee"}, cfg.workspace.waypoints_m, 2)
+    store.record_arrival(3.5, 5, Arrival(1, 1, (2.2, 0.8), Belief((2.1, 0.8, 0.0), np.eye(3))))
+    store.record_event(4.0, "warning", "held: no radio is heard")
+    store.close()
+    with sqlite3.connect(path) as db:
+        reached = db.execute("SELECT number, lap, waypoint, reached_s FROM waypoint WHERE reached_s NOTNULL").fetchall()
+        assert reached == [(5, 1, 1, 3.5)]
+        assert db.execute("SELECT count(*) FROM waypoint").fetchone() == (8,)
+        assert db.execute("SELECT text FROM event").fetchall() == [("held: no radio is heard",)]
+    db.close()
+    with pytest.raises(BeaconStoreError, match="holds a mission already"):
+        BeaconStore(path, {}, (), 0)
+    with pytest.raises(BeaconStoreError, match="cannot be made"):
+        BeaconStore(tmp_path / "nowhere" / "mission.sqlite", {}, (), 0)
+
+
+def test_pulses_of_unknown_motes_are_left_out() -> None:
+    own = SelfMap(beacon_config("cricket").cricket)
+    own.take(MoteBurst(0.0, "stranger", "N1-1", 20.0, [0.01]))
+    own.take(MoteBurst(0.0, "N1-1", "robot", 20.0, [0.01]))
+    assert own.places is None
+    assert not own.is_done

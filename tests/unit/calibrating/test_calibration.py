@@ -1,0 +1,176 @@
+"""Tests of the calibration: the true robot is found within the uncertainty that is stated."""
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from ccatp.calibrating.dead_reckoning import Wheels, carry
+from ccatp.calibrating.drive import Drive, FloatArray
+from ccatp.calibrating.estimate import Calibration, CalibrationError, calibrate
+from ccatp.calibrating.report import check_usable, lines, rows
+from ccatp.cli import main
+from tests.unit.calibrating.driven import OTHER_ROBOT, CalibrationDrive, priors, record
+
+
+@pytest.fixture(scope="module")
+def driven() -> CalibrationDrive:
+    return CalibrationDrive(5, "thesis", 2, OTHER_ROBOT)
+
+
+@pytest.fixture(scope="module")
+def drive(driven: CalibrationDrive) -> Drive:
+    return driven.drive
+
+
+@pytest.fixture(scope="module")
+def found(driven: CalibrationDrive, drive: Drive) -> Calibration:
+    return calibrate(driven.mirror, drive, priors(driven.cfg))
+
+
+def nees(found: Calibration, truth: FloatArray) -> float:
+    error = np.array((found.radius_m, found.base_m, found.bias_rad_s)) - truth
+    return float(error @ np.linalg.solve(found.covariance, error))
+
+
+def test_the_true_robot_is_found(driven: CalibrationDrive, found: Calibration) -> None:
+    truth, cfg = driven.truth(), driven.cfg
+    assert abs(truth[0] - cfg.robot.wheel_radius_m) > 5e-5  # it is another one than configured
+    assert abs(truth[1] - cfg.robot.wheel_base_m) > 5e-4
+    assert nees(found, truth) < chi2.ppf(0.999, 3)
+    assert found.sigmas[0] < 1e-6
+    assert found.sigmas[1] < 5e-6
+    assert found.sigmas[2] < 3e-4
+    wheels = driven.robot.world.wheels
+    difference_m = wheels.radius_m * (wheels.right_scale - wheels.left_scale)
+    assert abs(found.radius_difference_m - difference_m) < 5.0 * found.radius_difference_sigma_m
+
+
+def test_a_drive_has_a_segment_for_each_leg(drive: Drive) -> None:
+    assert len(drive.segments) == 8  # two rounds of four legs
+    assert len(drive.places) == 9
+    assert drive.encoder_sigma_rad_s == pytest.approx(0.001, rel=0.1)  # of the world
+    assert drive.encoder_period_s == pytest.approx(0.001)
+    assert drive.gyro_sigma_rad_s == pytest.approx(0.0087, rel=0.15)
+    for segment in drive.segments:  # no frame is left out
+        assert segment.motions[0][0] == 0
+        assert segment.motions[-1][1] == len(segment.right_rad)
+        assert all(one[1] == other[0] for one, other in pairwise(segment.motions))
+    # a turn in place and the way behind it are parted
+    assert max(len(segment.motions) for segment in drive.segments) >= 2
+
+
+def test_derivatives_are_those_of_the_motion(driven: CalibrationDrive, drive: Drive) -> None:
+    segment = max(drive.segments, key=lambda one: len(one.motions))
+    start = np.array([drive.places[0].x_m, drive.places[0].y_m, 0.7])
+    wheels = Wheels(0.0301, 0.0299, 0.151, 0.01)
+    led = carry(driven.mirror, segment, start, wheels)
+    for k, step in enumerate((1e-6, 1e-6, 1e-6, 1e-4)):
+        up, down = (carry(driven.mirror, segment, start, wheels._replace(**{wheels._fields[k]: wheels[k] + s})).end
+                    for s in (step, -step))  # fmt: skip
+        assert led.of_wheels[:, k] == pytest.approx((up - down) / (2 * step), rel=2e-3, abs=2e-4)
+    turned = [carry(driven.mirror, segment, start + np.array([0.0, 0.0, s]), wheels).end for s in (1e-4, -1e-4)]
+    assert led.of_start[:, 2] == pytest.approx((turned[0] - turned[1]) / 2e-4, abs=1e-4)
+    # all motions of a wheel gaining together is the same as a larger wheel
+    right = led.of_slip[:, 0::2].sum(axis=1)
+    assert right == pytest.approx(led.of_wheels[:, 0] * wheels.right_m, rel=2e-3, abs=1e-6)
+
+
+def test_slip_that_varies_widens_the_uncertainty(found: Calibration) -> None:
+    slipping = CalibrationDrive(3, "hard", 2, {})
+    result = calibrate(slipping.mirror, slipping.drive, priors(slipping.cfg))
+    assert 0.004 < result.slip_sigma < 0.03  # drawn from 1 to 5 %: standard deviation 0.0115
+    assert result.sigmas[0] > 50.0 * found.sigmas[0]
+    world = slipping.cfg.world
+    truth = slipping.truth(0.5 * (world.slip_min + world.slip_max))  # what rolls is the radius less the mean slip
+    assert nees(result, truth) < chi2.ppf(0.999, 3)
+    assert result.creep == pytest.approx(world.creep_fraction, abs=5.0 * result.creep_sigma)
+
+
+def test_what_cannot_show_the_wheels_is_refused(driven: CalibrationDrive, drive: Drive) -> None:
+    before = priors(driven.cfg)
+    few = replace(drive, segments=drive.segments[:3], places=drive.places[:4])
+    with pytest.raises(CalibrationError, match="the drive has 3 legs with a fix at each end, 4 are needed"):
+        calibrate(driven.mirror, few, before)
+    still = tuple(replace(s, right_rad=0.1 * s.right_rad, left_rad=0.1 * s.left_rad) for s in drive.segments)
+    with pytest.raises(CalibrationError, match="no turn by more than a radian"):
+        calibrate(driven.mirror, replace(drive, segments=still), before)
+    turning = tuple(replace(s, left_rad=-s.right_rad) for s in drive.segments)
+    with pytest.raises(CalibrationError, match="no way of more than 50 mm"):
+        calibrate(driven.mirror, replace(drive, segments=turning), before)
+
+
+def test_what_must_not_be_written_is_refused(driven: CalibrationDrive, found: Calibration) -> None:
+    table = rows(driven.cfg, found)
+    check_usable(table)
+    with pytest.raises(CalibrationError, match="no better than a measuring tape"):
+        check_usable((table[0]._replace(sigma=0.001), *table[1:]))
+    with pytest.raises(CalibrationError, match="more than 5% apart: another robot"):
+        check_usable((table[0], table[1]._replace(configured=0.2), table[2]))
+    assert "robot.wheel_base_m" in "\n".join(lines(table, found))
+    assert table[0]._replace(found=0.0301234567, sigma=3.2e-6).rounded == 0.0301235
+
+
+def test_the_command_writes_what_it_found(
+    driven: CalibrationDrive, found: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_dir, config = record(tmp_path / "run", driven), tmp_path / "telescope.toml"
+    text = "# ours\n[robot]\nwheel_radius_m = 0.03  # by a tape\n\n[limits]\nv_max_m_s = 0.05\n"
+    config.write_text(text)
+    config.chmod(0o640)
+    command = ["calibrate", "--from", str(run_dir), "--config", str(config)]
+    assert main([*command, "--dry-run"]) == 0
+    shown = capsys.readouterr()
+    assert "-wheel_radius_m = 0.03  # by a tape" in shown.out
+    assert "nothing written" in shown.err
+    assert config.read_text() == text
+    assert main([*command, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    told = result["parameters"]["robot.wheel_radius_m"]
+    assert told["found"] == pytest.approx(found.radius_m, abs=1e-9)  # of a few decimals of the recorded samples
+    assert result["written"] == str(config)
+    written = config.read_text()
+    assert f"wheel_radius_m = {round(found.radius_m, 8)}  # by a tape" in written
+    assert written.startswith("# ours\n[robot]\n")
+    assert "[limits]\nv_max_m_s = 0.05\n" in written
+    assert "[localizer]\ngyroscope_bias_rad_s = " in written
+    assert config.stat().st_mode & 0o777 == 0o640
+    assert list(tmp_path.iterdir()) == [run_dir, config] or len(list(tmp_path.iterdir())) == 2
+    assert main([*command]) == 0
+    assert "nothing to change" in capsys.readouterr().out
+
+
+def test_without_a_configuration_nothing_is_written(
+    driven: CalibrationDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["calibrate", "--from", str(record(tmp_path / "run", driven))]) == 0
+    assert "robot.wheel_radius_m = " in capsys.readouterr().out
+
+
+def test_misuse(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate"]) == 2
+    assert "name the robot's configuration with --config FILE, or add --sim" in capsys.readouterr().err
+    assert main(["calibrate", "--from", str(tmp_path)]) == 2
+    assert "no telemetry.mcap there" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("world", "changes", "mean_slip"), [("thesis", OTHER_ROBOT, 0.0), ("hard", {}, 0.03)])
+def test_over_many_robots_errors_are_as_large_as_stated(
+    world: str, changes: dict[str, object], mean_slip: float
+) -> None:
+    found, offsets = [], []
+    for seed in range(1, 25):
+        one = CalibrationDrive(seed, world, 3, changes)
+        result, truth = calibrate(one.mirror, one.drive, priors(one.cfg)), one.truth(mean_slip)
+        found.append(nees(result, truth))
+        offsets.append((np.array((result.radius_m, result.base_m, result.bias_rad_s)) - truth) / result.sigmas)
+    low, high = float(chi2.ppf(0.001, 3 * len(found))), float(chi2.ppf(0.999, 3 * len(found)))
+    print(f"{world}: NEES mean {np.mean(found):.2f} of 3, allowed {low / len(found):.2f} to {high / len(found):.2f}")
+    assert low < sum(found) < high
+    # One way or the other: an error common to all drives, as of a wheel's last run-down left out, is no noise.
+    assert np.abs(np.mean(offsets, axis=0)) == pytest.approx(0.0, abs=3.5 / np.sqrt(len(offsets)))

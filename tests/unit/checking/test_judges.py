@@ -1,0 +1,212 @@
+"""Tests of the check's judgement: a sound robot passes, and each thing that is wrong is found and told."""
+
+from collections.abc import Callable, Sequence
+
+import msgspec
+import numpy as np
+import pytest
+
+from ccatp.checking.finding import Finding, Outcome, as_json, failed, has_failed, lines, passed, skipped, warned
+from ccatp.checking.judge_laser import judge_air, judge_fix, judge_lasers
+from ccatp.checking.judge_robot import NAMES, Heard, judge_robot
+from ccatp.config.loader import load_config
+from ccatp.config.models import Config
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.samples import Fix, GravitySample, ImuSample, Vector3, WheelSample
+from ccatp.sim.robot import Robot
+from ccatp.wire.multiline import Environment
+from ccatp.wire.robot import Hello, RobotData, Sensors
+
+FRAMES = 300
+
+
+def stand(cfg: Config) -> tuple[Mirror, Heard]:
+    """What a robot that nobody drives says for three seconds."""
+    mirror = build_mirror(cfg.mirror)
+    robot = Robot(cfg, mirror, np.random.default_rng(cfg.run.seed))
+    robot.join_monitor()
+    frames: list[Sensors] = []
+    while len(frames) < FRAMES:
+        robot.advance()
+        if robot.delivered is not None:
+            frames.append(robot.delivered)
+    data = RobotData(
+        cfg.robot.wheel_radius_m, cfg.robot.wheel_base_m, cfg.robot.edge_sensors_m, (0.0, 0.0, cfg.robot.puck_height_m),
+        cfg.robot.max_wheel_rad_s, cfg.sim.robot.fan_floor if mirror.overhang else 0.0,
+    )  # fmt: skip
+    hello = Hello("ccatp-robot/1", 7, "0" * 32, "none", False, 100.0, 0.25, data)
+    return mirror, Heard(hello, frames, [0.01 * k for k in range(FRAMES)])
+
+
+@pytest.fixture(scope="module")
+def cfg() -> Config:
+    return load_config()
+
+
+@pytest.fixture(scope="module")
+def stood(cfg: Config) -> tuple[Mirror, Heard]:
+    return stand(cfg)
+
+
+@pytest.mark.parametrize("mirror", ["fyst-m1", "fyst-m2", "thesis-m1"])
+def test_a_sound_robot_passes(mirror: str) -> None:
+    cfg = load_config(None, {"run.mirror": mirror})
+    found = judge_robot(cfg, *stand(cfg))
+    assert [finding.name for finding in found] == list(NAMES)
+    assert {finding.outcome for finding in found} == {Outcome.PASS}, lines(found)
+
+
+Change = Callable[[Sensors], None]
+
+
+def every(**fields: object) -> Change:
+    def change(frame: Sensors) -> None:
+        for name, value in fields.items():
+            setattr(frame, name, value)
+
+    return change
+
+
+def edge(*values: int) -> Change:
+    return lambda frame: setattr(frame, "edge", [(t, *values) for t, *_ in frame.edge])
+
+
+def turning(frame: Sensors) -> None:
+    frame.enc = [WheelSample(t, 0.1, left) for t, _, left in frame.enc]
+
+
+def spinning(frame: Sensors) -> None:
+    frame.imu = [ImuSample(t, ax, wz + 0.2) for t, ax, wz in frame.imu]
+
+
+def frozen(frame: Sensors) -> None:
+    frame.imu = [ImuSample(t, 0.1, 0.01) for t, *_ in frame.imu]
+
+
+def flat(frame: Sensors) -> None:
+    frame.gravity = None if frame.gravity is None else GravitySample(frame.gravity[0], 0.0, 0.0, -1.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "name", "outcome", "told"),
+    [
+        (every(faults=["fan_left"]), "faults", Outcome.FAIL, "reports fan_left"),
+        (every(enc=[]), "encoders", Outcome.FAIL, "right: 0 samples a second, 50 are needed"),
+        (turning, "encoders", Outcome.FAIL, "right wheel turns at 0.100 rad/s"),
+        (every(imu=[]), "inertial unit", Outcome.FAIL, "0 samples a second"),
+        (frozen, "inertial unit", Outcome.FAIL, "readings in a row are the same"),
+        (spinning, "inertial unit", Outcome.FAIL, "zero rate +0.1992"),
+        (every(edge=[]), "edge sensors", Outcome.FAIL, "0 samples a second"),
+        (edge(0, 1, 1, 0), "edge sensors", Outcome.FAIL, "front left and rear right see no panel"),
+        (flat, "gravity", Outcome.FAIL, "is this the right mirror"),
+        (every(gravity=None), "gravity", Outcome.WARN, "too few readings"),
+        (every(soc=0.1), "battery", Outcome.FAIL, "10%"),
+        (every(soc=0.5), "battery", Outcome.WARN, "50%, for 36 min"),
+    ],
+)
+def test_what_is_wrong_is_found(
+    cfg: Config, stood: tuple[Mirror, Heard], change: Change, name: str, outcome: Outcome, told: str
+) -> None:
+    mirror, heard = stood
+    frames = [msgspec.convert(msgspec.to_builtins(frame), Sensors) for frame in heard.frames]
+    for frame in frames:
+        change(frame)
+    found = judge_robot(cfg, mirror, heard._replace(frames=frames))
+    (wrong,) = [finding for finding in found if finding.outcome is not Outcome.PASS]
+    assert (wrong.name, wrong.outcome) == (name, outcome)
+    assert told in wrong.found
+    assert wrong.todo
+
+
+def test_a_sensor_that_flickers_is_told(cfg: Config, stood: tuple[Mirror, Heard]) -> None:
+    mirror, heard = stood
+    frames = [msgspec.convert(msgspec.to_builtins(frame), Sensors) for frame in heard.frames]
+    edge(1, 0, 1, 1)(frames[5])
+    (wrong,) = [f for f in judge_robot(cfg, mirror, heard._replace(frames=frames)) if f.outcome is not Outcome.PASS]
+    assert "front right see the panel on and off" in wrong.found
+
+
+@pytest.mark.parametrize(
+    ("arrived_s", "name", "outcome", "told"),
+    [
+        ([0.02 * k for k in range(FRAMES)], "frames", Outcome.FAIL, "50.0 a second"),
+        ([0.01 * k + 0.2 * (k > 100) for k in range(FRAMES)], "frames", Outcome.FAIL, "longest gap 210 ms"),
+        ([0.01 * k + 0.06 * (k > 100) for k in range(FRAMES)], "frames", Outcome.WARN, "longest gap 70 ms"),
+        ([0.0105 * k for k in range(FRAMES)], "robot clock", Outcome.FAIL, "runs at 0.95"),
+    ],
+)
+def test_time_that_is_wrong_is_found(
+    cfg: Config, stood: tuple[Mirror, Heard], arrived_s: Sequence[float], name: str, outcome: Outcome, told: str
+) -> None:
+    mirror, heard = stood
+    found = {f.name: f for f in judge_robot(cfg, mirror, heard._replace(arrived_s=arrived_s))}
+    assert found[name].outcome is outcome
+    assert told in found[name].found
+
+
+def test_one_frame_is_not_enough(cfg: Config, stood: tuple[Mirror, Heard]) -> None:
+    mirror, heard = stood
+    alone = heard._replace(frames=heard.frames[:1], arrived_s=heard.arrived_s[:1])
+    assert judge_robot(cfg, mirror, alone)[1].found == "a single frame"
+
+
+def test_another_robot_and_lockstep_are_told(cfg: Config, stood: tuple[Mirror, Heard]) -> None:
+    mirror, heard = stood
+    other = msgspec.structs.replace(heard.hello.robot, wheel_base_m=0.2)
+    hello = msgspec.structs.replace(heard.hello, robot=other, lockstep=True)
+    found = {f.name: f for f in judge_robot(cfg, mirror, heard._replace(hello=hello))}
+    assert "wheel_base_m is 0.15 here and 0.2 there" in found["robot geometry"].found
+    assert found["robot clock"].outcome is Outcome.WARN
+
+
+def test_fans_below_the_floor_are_told() -> None:
+    cfg = load_config(None, {"run.mirror": "fyst-m2"})
+    mirror, heard = stand(cfg)
+    frames = [msgspec.convert(msgspec.to_builtins(frame), Sensors) for frame in heard.frames]
+    frames[7].fans = (0.6, 0.3)
+    found = {f.name: f for f in judge_robot(cfg, mirror, heard._replace(frames=frames))}
+    assert "the robot would fall" in found["fans"].todo
+    weak = load_config(None, {"run.mirror": "fyst-m2", "robot.fan_duty": [0.5, 0.8]})
+    assert "raise robot.fan_duty" in {f.name: f for f in judge_robot(weak, mirror, heard)}["fans"].todo
+
+
+def test_lasers_and_air() -> None:
+    assert judge_lasers(connected=True, laser_ready=True).outcome is Outcome.PASS
+    assert "no laser" in judge_lasers(connected=False, laser_ready=True).found
+    assert "not warm" in judge_lasers(connected=True, laser_ready=False).found
+    assert judge_air(Environment(-5.0, 525.0, 30.0)).outcome is Outcome.PASS
+    for air in (Environment(99.0, 525.0, 30.0), Environment(-5.0, 52.5, 30.0), Environment(-5.0, 525.0, 130.0)):
+        assert "not the air of any telescope" in judge_air(air).found
+
+
+def test_a_fix_is_where_a_robot_at_base_has_its_puck(cfg: Config, stood: tuple[Mirror, Heard]) -> None:
+    mirror = stood[0]
+    at_base = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m)
+
+    def fix(position_m: Vector3) -> Finding:
+        return judge_fix(cfg, mirror, Fix(0.0, position_m, (0.0,) * 9, 1.0, (1, 2, 3, 4), 1e-6))
+
+    assert fix(at_base).outcome is Outcome.PASS
+    high = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m + 0.01)
+    assert "puck_height_m" in fix(high).todo
+    assert "set the robot down at base" in fix((at_base[0] + 0.4, at_base[1], at_base[2])).todo
+    assert fix((1e3 * at_base[0], 1e3 * at_base[1], 1e3 * at_base[2])).outcome is Outcome.FAIL  # millimetres
+
+
+def test_the_table() -> None:
+    found = [passed("a", "well"), warned("bcd", "so", "look"), failed("e", "bad", "mend"), *skipped(["f"], "no e")]
+    assert lines(found) == [
+        "pass  a    well",
+        "warn  bcd  so",
+        "           -> look",
+        "fail  e    bad",
+        "           -> mend",
+        "skip  f    no e",
+        "not ready: 1 pass, 1 warn, 1 fail, 1 skip",
+    ]
+    assert has_failed(found)
+    assert not has_failed(found[:2])
+    assert as_json(found[:1]) == {
+        "ready": True,
+        "checks": [{"name": "a", "outcome": "pass", "found": "well", "todo": ""}],
+    }

@@ -1,0 +1,49 @@
+"""Main puts a picture together for those who asked, and for nobody else."""
+
+from pathlib import Path
+
+import zmq
+
+from ccatp.bus import Publisher, Subscriber
+from ccatp.config.models import Config
+from ccatp.localizer import build_localizer
+from ccatp.mirror.mirror import build_mirror
+from ccatp.processes.painting import Painter
+from ccatp.wire.topics import Picture
+
+LINE = b'{"type":"sensors"}'
+
+
+def test_a_picture_for_a_subscriber_only(config: Config, tmp_path: Path) -> None:
+    mirror = build_mirror(config.mirror)
+    localizer = build_localizer(config, mirror)
+    endpoint = f"ipc://{tmp_path}/main"
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    publisher = Publisher(context, endpoint)
+    painter = Painter(publisher)
+    subscriber = Subscriber(context, [endpoint], ["picture"], keeps_newest=True)
+    try:
+        while not publisher.has_subscriber("picture"):
+            pass
+        painter.tell_if_wanted(1, 0.1)  # nothing is seen yet
+        painter.sees(localizer, LINE)
+        painter.tell_if_wanted(2, 0.2)
+        painter.tell_if_wanted(3, 0.3)
+        received = subscriber.receive(5.0)
+        while received is not None and isinstance(received[1], Picture) and received[1].seq < 3:
+            received = subscriber.receive(5.0)
+        assert received is not None
+        picture = received[1]
+        assert isinstance(picture, Picture)
+        base = mirror.base_pose
+        assert (picture.x_m, picture.y_m) == (base.x_m, base.y_m)
+        assert bytes(picture.line) == LINE
+        assert picture.covariance_m2[0] > 0.0
+        subscriber.close()
+        while publisher.has_subscriber("picture"):
+            pass
+        painter.tell_if_wanted(4, 0.4)  # nobody asked: nothing is sent, as the next subscriber finds
+    finally:
+        subscriber.close()
+        publisher.close()
+        context.destroy(linger=0)

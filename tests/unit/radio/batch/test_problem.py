@@ -1,0 +1,233 @@
+"""The batch problem against independent arithmetic: derivatives by differences, matrices by dense algebra."""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from ccatp.radio.batch.arrow import Factored, LinAlgError
+from ccatp.radio.batch.descent import t_cost, t_weights
+from ccatp.radio.batch.problem import BEACON, SHARED, BatchProblem, State, repeats
+from ccatp.radio.batch.reckoning import CALIBRATION, Reckoning, chained
+from ccatp.radio.batch.settings import BatchPriors, BatchSettings, RadioNoise
+from ccatp.radio.motion import DifferentialNoise
+from ccatp.radio.recording import Readings, Steps, dead_reckoned
+
+FloatArray = npt.NDArray[np.float64]
+DELAY = CALIBRATION.index("delay_s")
+ODOMETRY = DifferentialNoise(0.02, 0.01, 0.02, 0.05, 0.01, 0.015)
+RADIO = RadioNoise(0.1, 0.02, 0.03, 3.0, -40.0, 2.2, 5.0, 0.0)
+PRIORS = BatchPriors(0.1, 0.1, 0.05, 0.02, 0.2, 0.1, 0.3, 0.02, 5.0, 0.4, 0.1, 2.0, 0.05, 0.03)
+NO_PRIORS = replace(
+    PRIORS, distance_scale=0.0, turn_scale=0.0, turn_per_m=0.0, turn_bias_rad_s=0.0, delay_s=0.0, range_scale=0.0,
+    range_offset_m=0.0, bearing_offset_rad=0.0, rssi_reference_db=0.0, rssi_exponent=0.0, beacon_offset_m=0.0,
+    beacon_reference_db=0.0,
+)  # fmt: skip
+SETTINGS = BatchSettings(ODOMETRY, RADIO, PRIORS)
+
+
+def steps(n: int = 60, rng: np.random.Generator | None = None) -> Steps:
+    """A winding way with steps of uneven length."""
+    rng = rng or np.random.default_rng(5)
+    t = np.cumsum(np.concatenate([[0.0], rng.uniform(0.1, 0.2, n)]))
+    return Steps(t, rng.uniform(0.0, 0.2, n), rng.uniform(-0.2, 0.3, n), rng.uniform(-0.05, 0.05, n))
+
+
+def problem() -> tuple[BatchProblem, State]:
+    """Six readings of two beacons, of all kinds, and a state off the minimum."""
+    rng = np.random.default_rng(11)
+    s = steps()
+    t = np.array([0.7, 1.9, 2.0, 3.3, 4.4, 5.5])
+    nan = np.nan
+    readings = Readings(
+        t,
+        np.array([0, 1, 0, 1, 0, 1]),
+        np.array([3.0, nan, 2.5, 4.0, nan, 3.9]),
+        np.array([0.3, -0.2, nan, 1.0, 0.5, nan]),
+        np.array([nan, -52.0, nan, nan, -50.0, -55.0]),
+    )
+    times = np.union1d(s.times_s[:1], t)
+    made = BatchProblem(s, readings, times, (0.1, -0.2, 0.3), SETTINGS, np.ones(2, dtype=bool))
+    poses = np.column_stack([np.interp(times, s.times_s, c) for c in dead_reckoned(s, (0.1, -0.2, 0.3)).T])
+    poses += 0.05 * rng.standard_normal(poses.shape)
+    shared = 0.02 * rng.standard_normal(len(SHARED))
+    beacons = np.column_stack([[2.0, -1.5], [3.0, 1.0], 0.02 * rng.standard_normal((2, 2))])
+    return made, State(poses, shared, beacons)
+
+
+def flat(state: State) -> FloatArray:
+    """All unknowns in a row."""
+    return np.concatenate([state.poses.ravel(), state.shared, state.beacons.ravel()])
+
+
+def unflat(x: FloatArray, like: State) -> State:
+    """And back."""
+    n = like.poses.size
+    return State(x[:n].reshape(-1, 3), x[n : n + len(SHARED)], x[n + len(SHARED) :].reshape(-1, BEACON))
+
+
+def half_squares(made: BatchProblem, x: FloatArray, like: State, weights: FloatArray, odometry: FloatArray) -> float:
+    """Half the weighted sum of squares, from the residuals alone; noise of the odometry as at ``like``."""
+    state = unflat(x, like)
+    at_like, found = made.residuals(like), made.residuals(state)
+    W = at_like.odometry_information
+    total = np.einsum("k,ki,kij,kj->", odometry, found.odometry, W, found.odometry)
+    return float(0.5 * (total + (weights * found.chi2).sum())) + made.prior_cost(state)
+
+
+def dense(made: BatchProblem, state: State, weights: FloatArray, odometry: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The normal equations as one full matrix and its right-hand side."""
+    system = made.normal_equations(state, weights, odometry)
+    n, m = len(system.diagonal), len(system.corner)
+    A = np.zeros((3 * n + m, 3 * n + m))
+    for k in range(n):
+        A[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = system.diagonal[k]
+        A[3 * k : 3 * k + 3, 3 * n :] = system.border[k]
+        if k:
+            A[3 * k : 3 * k + 3, 3 * k - 3 : 3 * k] = system.below[k - 1]
+            A[3 * k - 3 : 3 * k, 3 * k : 3 * k + 3] = system.below[k - 1].T
+    A[3 * n :, : 3 * n] = A[: 3 * n, 3 * n :].T
+    A[3 * n :, 3 * n :] = system.corner
+    return A, np.concatenate([system.pose_side.ravel(), system.shared_side])
+
+
+def test_the_gradient_is_that_of_the_cost() -> None:
+    made, state = problem()
+    weights, odometry = np.linspace(0.5, 1.5, 6), np.linspace(0.8, 1.2, len(state.poses) - 1)
+    _, side = dense(made, state, weights, odometry)
+    x = flat(state)
+    h = 1e-6
+    for k in range(x.size):
+        step = np.zeros_like(x)
+        step[k] = h
+        up = half_squares(made, x + step, state, weights, odometry)
+        down = half_squares(made, x - step, state, weights, odometry)
+        if k != DELAY + state.poses.size:  # its derivative is taken across 50 ms: below
+            assert -side[k] == pytest.approx((up - down) / (2.0 * h), rel=1e-4, abs=1e-4), k
+
+
+def test_increments_by_the_delay() -> None:
+    """On odometry whose rates change little within the 50 ms of the difference."""
+    t = np.arange(0.0, 8.0, 0.02)
+    v, w = 0.5 + 0.2 * np.sin(t[:-1]), 0.4 * np.cos(0.7 * t[:-1])
+    s = Steps(t, 0.02 * v, 0.02 * w, 0.02 * 0.1 * v)
+    reckoning = Reckoning(s, np.array([1.0, 2.5, 6.0]))
+    calibration = np.array([0.05, -0.03, 0.02, 0.01, 0.3])
+    found = reckoning.increments(calibration, ODOMETRY).by_calibration[:, :, DELAY]
+    h = np.array([0.0, 0.0, 0.0, 0.0, 0.04])
+    up, down = (reckoning.increments(calibration + sign * h, ODOMETRY).motion for sign in (1.0, -1.0))
+    assert found == pytest.approx((up - down) / 0.08, rel=0.02, abs=2e-3)
+
+
+def test_the_matrix_is_that_of_the_residuals() -> None:
+    """J^T W J by differences of the residuals."""
+    made, state = problem()
+    ones, odometry = np.ones(6), np.ones(len(state.poses) - 1)
+    A, _ = dense(made, state, ones, odometry)
+    found = made.residuals(state)
+    roots = np.linalg.cholesky(found.odometry_information).transpose(0, 2, 1)
+
+    def whitened(x: FloatArray) -> FloatArray:
+        r = made.residuals(unflat(x, state))
+        return np.concatenate(
+            [np.einsum("kij,kj->ki", roots, r.odometry).ravel(), (r.readings * np.sqrt(found.information)).ravel()]
+        )
+
+    x, h = flat(state), 1e-6
+    J = np.column_stack([(whitened(x + h * e) - whitened(x - h * e)) / (2.0 * h) for e in np.eye(x.size)])
+    expected = J.T @ J
+    expected[:3, :3] += np.diag(made.first_information)
+    n = state.poses.size
+    expected[n:, n:] += np.diag(made.prior_information)
+    keep = np.arange(x.size) != n + DELAY
+    assert A[np.ix_(keep, keep)] == pytest.approx(expected[np.ix_(keep, keep)], rel=1e-4, abs=1e-3)
+
+
+def test_factors_solution_determinant_and_covariance_are_those_of_the_full_matrix() -> None:
+    made, state = problem()
+    A, side = dense(made, state, np.ones(6), np.ones(len(state.poses) - 1))
+    factored = Factored(made.normal_equations(state, np.ones(6), np.ones(len(state.poses) - 1)))
+    n = state.poses.size
+    poses, shared = factored.solution()
+    assert np.concatenate([poses.ravel(), shared]) == pytest.approx(np.linalg.solve(A, side), rel=1e-8)
+    assert factored.log_determinant() == pytest.approx(np.linalg.slogdet(A)[1])
+    C = np.linalg.inv(A)
+    assert factored.shared_covariance() == pytest.approx(C[n:, n:], rel=1e-6, abs=1e-12)
+    for k, covariance in enumerate(factored.pose_covariances()):
+        assert covariance == pytest.approx(C[3 * k : 3 * k + 3, 3 * k : 3 * k + 3], rel=1e-6, abs=1e-12)
+
+
+def test_damping_multiplies_the_diagonal() -> None:
+    made, state = problem()
+    ones = np.ones(len(state.poses) - 1)
+    A, side = dense(made, state, np.ones(6), ones)
+    poses, shared = Factored(made.normal_equations(state, np.ones(6), ones), damping=0.5).solution()
+    expected = np.linalg.solve(A + 0.5 * np.diag(np.diag(A)), side)
+    assert np.concatenate([poses.ravel(), shared]) == pytest.approx(expected, rel=1e-8)
+
+
+def test_a_matrix_that_is_not_positive_definite_is_refused() -> None:
+    made, state = problem()
+    system = made.normal_equations(state, np.ones(6), np.ones(len(state.poses) - 1))
+    system.diagonal[2] *= -1.0
+    with pytest.raises(LinAlgError, match="not positive definite"):
+        Factored(system)
+
+
+def test_what_has_no_prior_is_not_estimated() -> None:
+    made, state = problem()
+    fixed = BatchProblem(
+        steps(), made.readings, np.union1d(steps().times_s[:1], made.readings.times_s), (0.1, -0.2, 0.3),
+        BatchSettings(ODOMETRY, RADIO, NO_PRIORS), np.array([True, False]),
+    )  # fmt: skip
+    assert np.flatnonzero(fixed.free).tolist() == [len(SHARED), len(SHARED) + 1]  # x and y of the first beacon
+    assert fixed.residuals(state).information[1::2].sum() == 0.0  # readings of the other one count nothing
+
+
+def test_increments_put_together_are_dead_reckoning() -> None:
+    s = steps()
+    t = np.array([0.0, 1.0, 1.01, 2.7, s.times_s[-1]])
+    motion = Reckoning(s, t).increments(np.zeros(len(CALIBRATION)), ODOMETRY).motion
+    path = dead_reckoned(s, (1.0, 2.0, 0.5))
+    assert chained(np.array([1.0, 2.0, 0.5]), motion)[-1] == pytest.approx(path[-1], abs=2e-3)  # cut chords
+
+
+def test_the_noise_of_an_increment_is_that_of_its_steps() -> None:
+    """Against many noisy runs of the same steps."""
+    rng = np.random.default_rng(2)
+    s = steps(n=25)
+    ends = s.times_s[[0, -1]]
+    found = Reckoning(s, ends).increments(np.zeros(len(CALIBRATION)), ODOMETRY).covariance[0]
+    dt = np.diff(s.times_s)
+    way, turned = np.hypot(s.distance_m, s.lateral_m), np.abs(s.turn_rad)
+    sigma_way = np.sqrt(0.02**2 * way + 0.01**2 * turned)
+    sigma_turn = np.sqrt(0.02**2 * way + 0.05**2 * turned + 0.01**2 * dt)
+    sigma_side = 0.015 * np.sqrt(way)
+    draws = []
+    for _ in range(4000):
+        e = rng.standard_normal((3, way.size))
+        noisy = Steps(
+            s.times_s, s.distance_m + sigma_way * e[0], s.turn_rad + sigma_turn * e[1], s.lateral_m + sigma_side * e[2]
+        )
+        draws.append(dead_reckoned(noisy, (0.0, 0.0, 0.0))[-1])
+    # 4000 draws tell a variance to 2 per cent; correlations of curved ways are not quite linear
+    assert np.cov(np.array(draws).T) == pytest.approx(found, rel=0.12, abs=2e-4)
+
+
+def test_weights_are_the_gradient_of_the_cost() -> None:
+    chi2, sizes = np.array([0.0, 0.5, 3.0, 80.0]), np.array([1.0, 2.0, 2.0, 1.0])
+    for softness in (1.0, 7.0):
+        h = 1e-5
+        for k in range(4):
+            e = np.zeros(4)
+            e[k] = h
+            slope = (t_cost(chi2 + e, sizes, 4.0, softness) - t_cost(chi2 - e, sizes, 4.0, softness)) / (2.0 * h)
+            assert t_weights(chi2, sizes, 4.0, softness)[k] == pytest.approx(2.0 * slope, rel=1e-6)
+
+
+def test_readings_that_share_their_error_are_counted() -> None:
+    nothing = np.full(5, np.nan)
+    readings = Readings(np.array([0.0, 0.4, 0.8, 5.0, 5.1]), np.array([0, 0, 0, 0, 1]), nothing, nothing, nothing)
+    assert repeats(readings, 1.0).tolist() == [2.0, 3.0, 2.0, 1.0, 1.0]
+    assert repeats(readings, 0.0).tolist() == [1.0] * 5

@@ -1,0 +1,118 @@
+"""Alignment, root mean squares and consistency against what can be worked out by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ccatp.radio.judged import judge, truth_at
+from ccatp.radio.metrics import RigidMotion, consistency, nees, rigid_alignment, rms, wrapped
+from ccatp.radio.recording import Truth
+from ccatp.radio.track import BeaconFix, Track
+from tests.unit.radio_data.sets import BEACONS, recorded, world
+
+
+def test_a_rigid_motion_is_found_again() -> None:
+    points = np.random.default_rng(1).normal(size=(50, 2))
+    motion = RigidMotion(2.4, -3.0, 7.0)
+    found = rigid_alignment(points, motion.moved(points))
+    assert found == pytest.approx(motion)
+
+
+def test_alignment_is_that_of_scipy_and_neither_scales_nor_reflects() -> None:
+    rng = np.random.default_rng(2)
+    p = rng.normal(size=(40, 2))
+    q = 1.5 * p * (1.0, -1.0) + rng.normal(scale=0.3, size=(40, 2))  # scaled, mirrored, noisy
+    found = rigid_alignment(p, q)
+    planar = [np.column_stack([x - x.mean(axis=0), np.zeros(40)]) for x in (p, q)]
+    angles = np.linspace(-np.pi, np.pi, 20001)
+    misfits = [((Rotation.from_euler("z", a).apply(planar[0]) - planar[1]) ** 2).sum() for a in angles]
+    assert found.angle_rad == pytest.approx(angles[int(np.argmin(misfits))], abs=4e-4)
+    moved = found.moved(p)
+    assert np.ptp(moved, axis=0) != pytest.approx(np.ptp(q, axis=0), rel=0.1)
+    assert moved.mean(axis=0) == pytest.approx(q.mean(axis=0))
+
+
+def test_covariances_turn_with_the_points() -> None:
+    rng = np.random.default_rng(3)
+    points = rng.multivariate_normal((0.0, 0.0), ((4.0, 1.0), (1.0, 0.5)), size=200)
+    motion = RigidMotion(0.7, 1.0, 2.0)
+    assert motion.turned(np.cov(points.T)) == pytest.approx(np.cov(motion.moved(points).T))
+
+
+def test_root_mean_square_leaves_out_what_is_not_finite() -> None:
+    assert rms(np.array([3.0, np.nan, -4.0])) == pytest.approx(np.sqrt(12.5))
+    assert rms(np.array([np.nan])) is None
+    assert wrapped(np.array([3.5, -3.5])) == pytest.approx([3.5 - 2 * np.pi, 2 * np.pi - 3.5])
+
+
+def test_squares_of_gaussian_errors_lie_in_the_band_and_others_do_not() -> None:
+    rng = np.random.default_rng(4)
+    P = np.array(((2.0, 0.3), (0.3, 0.5)))
+    errors = rng.multivariate_normal((0.0, 0.0), P, size=500)
+    squares = nees(errors, np.broadcast_to(P, (500, 2, 2)))
+    honest = consistency(squares, np.full(500, 2.0))
+    assert honest is not None
+    assert honest.low < honest.mean < honest.high
+    assert (honest.low, honest.high) == pytest.approx((0.914, 1.090), abs=0.002)  # tables of chi-squared, 1000 degrees
+    proud = consistency(squares * 1.5, np.full(500, 2.0))
+    assert proud is not None
+    assert proud.mean > proud.high
+    assert consistency(np.empty(0), np.empty(0)) is None
+
+
+def test_truth_is_unknown_outside_and_in_its_gaps() -> None:
+    t = np.array([0.0, 0.4, 2.0, 2.4, 2.8])
+    found = truth_at(Truth(t, t, -t, 2.0 * t), np.array([-0.1, 0.2, 1.0, 2.2, 2.9]))
+    assert np.isnan(found[[0, 2, 4]]).all()
+    assert found[[1, 3]] == pytest.approx(np.array([(0.2, -0.2, 0.4), (2.2, -2.2, 4.4)]))
+    slow = np.array([0.0, 1.0, 2.0, 3.0, 9.0])  # a reference of a hertz is no gap
+    assert np.isfinite(truth_at(Truth(slow, slow, slow, slow), np.array([0.5, 5.0]))[:, 0]).tolist() == [True, False]
+
+
+def track_of(turned: RigidMotion, *, beacons: bool = True) -> Track:
+    """The truth of a simulated run, moved rigidly, with a beacon 0.3 m off."""
+    w = world(seconds=20.0)
+    places = turned.moved(np.array(list(BEACONS.values())) + np.array([[0.3, 0.0], [0, 0], [0, 0], [0, 0]]))
+    poses = np.column_stack([turned.moved(w.poses[:, :2]), w.poses[:, 2] + turned.angle_rad])
+    return Track(
+        times_s=w.times_s,
+        poses=poses,
+        covariances=np.broadcast_to(np.eye(3), (len(poses), 3, 3)),
+        beacons={n: BeaconFix(x, y, np.eye(2)) for n, (x, y) in zip(BEACONS, places.tolist(), strict=True)}
+        if beacons
+        else {},
+        calibration={},
+        nis=np.empty(0),
+        nis_sizes=np.empty(0),
+        refused=0,
+        update_s=np.empty(0),
+        updates=0,
+        warnings=(),
+    )
+
+
+def test_a_track_is_judged_after_one_rigid_alignment() -> None:
+    judged = judge(track_of(RigidMotion(1.0, 5.0, -3.0)), recorded(world(seconds=20.0)))
+    assert judged.trajectory_rmse_m == pytest.approx(0.0, abs=1e-9)
+    assert judged.heading_rmse_rad == pytest.approx(0.0, abs=1e-9)
+    assert judged.beacon_rmse_m == pytest.approx(0.15)  # sqrt(0.3^2 / 4)
+    assert judged.beacon_errors_m == pytest.approx({"6": 0.3, "7": 0.0, "8": 0.0, "9": 0.0}, abs=1e-9)
+    assert judged.nees is not None
+    assert judged.nees.mean > 1.0  # the poses as they are, not aligned
+    assert judged.nis is None
+
+
+def test_without_a_true_path_the_beacons_are_aligned_themselves() -> None:
+    run = replace(recorded(world(seconds=20.0)), truth=None)
+    judged = judge(track_of(RigidMotion(1.0, 5.0, -3.0)), run)
+    assert judged.trajectory_rmse_m is None
+    assert judged.heading_rmse_rad is None
+    assert judged.nees is None
+    assert judged.beacon_rmse_m is not None
+    assert 0.0 < judged.beacon_rmse_m < 0.15
+    two = {name: BEACONS[name] for name in ("6", "7")}
+    assert judge(track_of(RigidMotion(1.0, 5.0, -3.0)), replace(run, beacon_truth_m=two)).beacon_rmse_m is None
+    none = judge(track_of(RigidMotion(0.0, 0.0, 0.0), beacons=False), run)
+    assert none.beacon_rmse_m is None

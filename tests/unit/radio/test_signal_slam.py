@@ -1,0 +1,212 @@
+"""EKF-SLAM by levels and bearings: derivatives against differences, consistency over seeds, what waits, what moves."""
+
+from math import hypot, log
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from ccatp.config.radio_loader import load_radio_config
+from ccatp.config.radio_models import RadioConfig
+from ccatp.filters.ekf_slam import BlockError, EkfSlam
+from ccatp.radio.motion import Increment, Odometry, Steering
+from ccatp.radio.moving_radio import MovingRadio
+from ccatp.radio.path_loss import PathLoss
+from ccatp.radio.readings import RssiReading
+from ccatp.radio.shadowing_map import ShadowingMap
+from ccatp.radio.signal_rows import Sight, rows_of
+from ccatp.radio.signal_settings import new_slam, vehicle_of
+from ccatp.radio.signal_slam import SignalSlam
+from ccatp.radio.slipping_vehicle import SlippingVehicle, WheelNoise
+from ccatp.studies.radio_run import run_radio
+
+NOISE = WheelNoise(0.01, 0.02, 0.01, 0.05)
+ODOMETRY: dict[str, Odometry] = {
+    "ackermann": Steering(0.1, 0.1, 0.15, 0.3),
+    "differential": Increment(0.1, 0.1, 0.015, 0.02),
+}
+
+
+def config(**keys: object) -> RadioConfig:
+    return load_radio_config(None, {name.replace("__", "."): value for name, value in keys.items()})
+
+
+@pytest.mark.parametrize("kind", ["ackermann", "differential"])
+def test_motion_has_the_derivatives_of_its_mean(kind: str) -> None:
+    model = SlippingVehicle("ackermann" if kind == "ackermann" else "differential", 0.35, NOISE)
+    assert model.names == ("heading_drift_rad_s", "slip")
+    x = np.array((1.0, 2.0, 0.7, 0.02, 0.06))
+    F = model.step(x, ODOMETRY[kind]).F
+    for k in range(5):
+        step = np.eye(5)[k] * 1e-6
+        slope = (model.step(x + step, ODOMETRY[kind]).mean - model.step(x - step, ODOMETRY[kind]).mean) / 2e-6
+        assert F[:, k] == pytest.approx(slope, abs=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["ackermann", "differential"])
+def test_motion_noise_is_that_of_its_readings(kind: str) -> None:
+    model = SlippingVehicle("ackermann" if kind == "ackermann" else "differential", 0.35, NOISE)
+    x, rng = np.array((1.0, 2.0, 0.7, 0.02, 0.06)), np.random.default_rng(1)
+    drawn = []
+    for speed, turn in rng.standard_normal((4000, 2)).tolist():
+        if kind == "ackermann":
+            odometry: Odometry = Steering(0.1, 0.1, 0.15 + 0.01 * speed, 0.3 + 0.02 * turn)
+        else:
+            odometry = Increment(0.1, 0.1, 0.1 * (0.15 + 0.01 * speed), 0.1 * (0.2 + 0.02 * turn))
+        drawn.append(model.step(x, odometry).mean[:3])
+    Q = model.step(x, ODOMETRY[kind]).Q[:3, :3]
+    assert np.sqrt(np.diag(Q)) == pytest.approx(np.std(drawn, axis=0), rel=0.06)
+
+
+def test_wheels_that_stand_have_no_noise() -> None:
+    step = SlippingVehicle("ackermann", 0.35, NOISE).step(np.zeros(5), Steering(0.1, 0.1, 0.0, 0.3))
+    assert not step.Q.any()
+
+
+def test_a_vehicle_takes_the_odometry_of_its_kind() -> None:
+    with pytest.raises(TypeError, match="takes speed and steering angle, not Increment"):
+        SlippingVehicle("ackermann", 0.35, NOISE).step(np.zeros(5), ODOMETRY["differential"])
+    with pytest.raises(TypeError, match="takes increments, not Steering"):
+        SlippingVehicle("differential", 0.35, NOISE).step(np.zeros(5), ODOMETRY["ackermann"])
+    assert vehicle_of(config()).names == ()
+
+
+def test_rows_have_the_derivatives_of_level_and_bearing() -> None:
+    shadow = np.array((0.5, -0.3))
+    sights = [
+        Sight(RssiReading(0.0, "b", -40.0, 0.4), 0, shadow, 4.0),
+        Sight(RssiReading(0.0, "b", -41.0, None), 3, shadow, 4.0),
+    ]
+    x = np.array((0.1, 0.2, 0.3, 0.6, 0.1, 0.5, 2.0, 1.5, 0.7, -0.2))
+    rows = rows_of(sights, slice(6, 10), PathLoss(-33.0, 2.0, 2.0), 0.3)
+    residual, H = rows.linearise(x)
+    assert residual.shape == (3,)
+    for k in range(10):
+        step = np.eye(10)[k] * 1e-6
+        slope = (rows.linearise(x + step)[0] - rows.linearise(x - step)[0]) / 2e-6
+        assert H[:, k] == pytest.approx(-slope, abs=1e-6)
+
+
+def test_shadowing_map_reproduces_its_points_and_its_variance() -> None:
+    grid = ShadowingMap((2.0, 1.0), 0.5, 5.0, 1.5)
+    assert grid.size == 15
+    row, rest = grid.row(0.5, 0.5)
+    assert float(row @ row) == pytest.approx(25.0)
+    assert rest == pytest.approx(0.0, abs=1e-6)
+    far, _ = grid.row(2.0, 0.5)
+    assert float(row @ far) == pytest.approx(25.0 * np.exp(-1.0))
+    between, rest = grid.row(0.75, 0.75)
+    assert float(between @ between) + rest == pytest.approx(25.0)
+    assert 1.0 < rest < 12.0
+
+
+def moving() -> tuple[EkfSlam, MovingRadio]:
+    engine = EkfSlam(np.array((1.0, 1.0, 0.5)), np.diag((0.01, 0.01, 0.001)))
+    radio = MovingRadio("t", 0.02, 20.0, 5.0, 1.5, (3.0, 3.0))
+    radio.join(engine, 0.2)
+    return engine, radio
+
+
+def test_many_levels_with_one_unknown_offset_do_not_tell_the_range() -> None:
+    engine, radio = moving()
+    loss = PathLoss(-33.0, 2.0, 2.0)
+    rng = np.random.default_rng(4)
+    for _ in range(300):
+        level_dbm = loss.level_dbm(1.5) - 6.0 + 2.0 * rng.standard_normal()
+        reading = RssiReading(0.0, "t", level_dbm, 0.2 + 0.3 * rng.standard_normal())
+        radio.update(engine, reading, loss, 0.32, (9e9, 9e9))
+    place = engine.block("t")
+    offset = engine.mean[place][:2] - engine.mean[:2]
+    r = float(np.hypot(*offset))
+    along = offset / r
+    sigma = float(np.sqrt(along @ engine.covariance[place, place][:2, :2] @ along)) / r
+    # prior of ln r (ln 2) and 5 dB of shadowing (0.576): together 0.443; three hundred levels add nothing to that
+    assert sigma == pytest.approx(1.0 / np.hypot(1.0 / log(2.0), 1.0 / 0.576), rel=0.05)
+
+
+def test_other_coordinates_change_nothing() -> None:
+    engine, radio = moving()
+    mean, covariance = engine.mean.copy(), engine.covariance.copy()
+    radio._to_polar(engine)
+    radio._to_plane(engine)
+    assert engine.mean == pytest.approx(mean)
+    assert engine.covariance == pytest.approx(covariance, abs=1e-9)
+
+
+def test_a_velocity_is_carried_into_the_place() -> None:
+    engine, radio = moving()
+    block = engine.block("t")
+    start = engine.mean[block][:2].copy()
+    engine.mean[block.start + 2 : block.start + 4] = (0.02, 0.0)
+    for _ in range(100):
+        radio.predict(engine, 0.1, 0.0)
+    # T (1 - exp(-t / T)) v after 10 s
+    assert engine.mean[block][0] - start[0] == pytest.approx(20.0 * (1.0 - np.exp(-0.5)) * 0.02)
+    assert float(np.linalg.eigvalsh(engine.covariance)[0]) > -1e-12
+
+
+def heard(slam_cfg: RadioConfig, scans: int) -> tuple[SignalSlam, float]:
+    slam = new_slam(slam_cfg)
+    loss = slam.path_loss_of("b")
+    for k in range(scans):
+        for _ in range(10):
+            slam.predict(Steering(0.0, 0.1, 0.15, 0.0))
+        pose = slam.engine.mean[:3].tolist()
+        level = loss.level_dbm(hypot(2.0 - pose[0], 2.0 - pose[1]))
+        slam.observe([RssiReading(k, "b", level, np.arctan2(2.0 - pose[1], 2.0 - pose[0]) - pose[2])])
+    estimate = slam.beacons["b"]
+    return slam, float(np.hypot(*(estimate.mean - 2.0)))
+
+
+def test_a_new_radio_waits_and_is_on_the_map_all_the_same() -> None:
+    slam, error_m = heard(config(), 1)
+    assert "b" not in slam.engine
+    assert error_m < 0.01
+    slam, error_m = heard(config(estimator__waiting_scans=4), 5)
+    assert "b" in slam.engine
+    assert error_m < 0.02
+    assert not [b for b in slam.engine.blocks if not isinstance(b, str)]
+
+
+def test_a_radio_without_a_bearing_is_not_placed_and_removal_forgets() -> None:
+    slam = new_slam(config())
+    slam.observe([RssiReading(0.0, "b", -40.0, None)])
+    assert slam.beacons == {}
+    slam.remove("b")
+    with pytest.raises(BlockError, match="is not in the state"):
+        slam.remove("b")
+
+
+SHADOW = {
+    "sim.radio.shadowing_sigma_db": 5.0,
+    "path_loss.shadowing_sigma_db": 5.0,
+    "estimator.shadowing": "map",
+}
+
+
+def test_white_noise_runs_are_consistent() -> None:
+    runs = [run_radio(load_radio_config(None, {"run.seed": seed, "run.steps": 450})) for seed in range(1, 7)]
+    nees, states = (sum(run.joint_nees[k] for run in runs) for k in (0, 1))
+    low, high = (float(chi2.ppf(share, states)) for share in (0.001, 0.999))
+    assert low < nees < high
+    rows = sum(size for run in runs for _, size in run.nis)
+    assert sum(nis for run in runs for nis, _ in run.nis) / rows == pytest.approx(1.0, abs=3.5 * (2.0 / rows) ** 0.5)
+
+
+def test_ignored_shadowing_is_overconfident_and_mapped_shadowing_is_not() -> None:
+    hits = {}
+    for mode in ("none", "map"):
+        keys = {**SHADOW, "estimator.shadowing": mode, "run.steps": 450}
+        runs = [run_radio(load_radio_config(None, {**keys, "run.seed": seed})) for seed in range(1, 4)]
+        hits[mode] = np.mean([run.beacon_nees[name][-1] < 4.605 for run in runs for name in run.places])
+    assert hits["none"] < 0.5
+    assert hits["map"] > 0.7
+
+
+def test_slip_is_found_and_the_pose_gains_by_it() -> None:
+    keys = {"sim.vehicle.slip": 0.05, "odometry.slip_sigma": 0.05, "observation.every_steps": 2}
+    run = run_radio(load_radio_config(None, keys))
+    squares = [
+        np.mean(np.array(errors)[:, :2] ** 2) for errors in (run.pose_errors, [e[:2] for e in run.reckoned_errors])
+    ]
+    assert squares[0] < 0.5 * squares[1]

@@ -1,0 +1,150 @@
+"""Run directories as the daemon writes them, made in process: recording, database, log, summary."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ccatp.config.loader import dump_config, load_config
+from ccatp.config.models import Config
+from ccatp.recorder import Recorder
+from ccatp.samples import DeckPose, Fix, PanelPose, PointId
+from ccatp.store import MissionStore, PlannedPoint
+from ccatp.studies.rehearsal import Rehearsing
+from ccatp.surveying.states import State
+from ccatp.wire.robot import Sensors
+from ccatp.wire.topics import TOPICS, Arrival, FixMessage, Misalignment, MissionStatus, Track, Truth, schema_of
+
+BATCH = 100
+
+
+class RecordingRun(Rehearsing):
+    """A mission in process that leaves a run directory behind.
+
+    Args:
+        cfg: its configuration.
+        run_dir: where it writes.
+        is_simulation: what the recording says of itself; without a simulation no truth is recorded.
+        only: points measured before it is told to abort; None for a whole mission.
+    """
+
+    def __init__(self, cfg: Config, run_dir: Path, *, is_simulation: bool = True, only: int | None = None) -> None:
+        super().__init__(cfg, with_track=False)
+        run_dir.mkdir(parents=True, exist_ok=True)
+        self.run_dir, self.is_simulation, self.only = run_dir, is_simulation, only
+        (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
+        self.recorder = Recorder(
+            run_dir / "telemetry.mcap",
+            [(topic.name, schema_of(topic.name)) for topic in TOPICS if topic.recorded],
+            is_simulation=is_simulation,
+            metadata={"ccatp": "0.0.test", "config": dump_config(cfg)},
+        )
+        points = [PlannedPoint(point, 0.0, 0.0) for point in self.parts.points]
+        self.store = MissionStore.create(
+            run_dir / "mission.sqlite", mirror=cfg.mirror.name, seed=cfg.run.seed, config_toml="", points=points
+        )
+        self.log = (run_dir / "log.jsonl").open("a", encoding="utf-8")
+        self.track: list[tuple[Any, ...]] = []
+        self.truth: list[tuple[Any, ...]] = []
+        self.note_arrival = self.book.builder.add_arrival
+        self.book.builder.add_arrival = self.arrive  # type: ignore[method-assign]
+        self.seq, self.t_s, self.seen = 0, 0.0, State.IDLE
+
+    def leave(self) -> Path:
+        """Drive it, and close everything as the daemon does at its end."""
+        self.say("supervisor", "run", mirror=self.cfg.mirror.name)
+        if self.is_simulation:
+            lies = self.robot.world.misalignments
+            panels = [(*panel, m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in lies.items()]
+            self.write("misalignment", Misalignment(seq=0, t_s=0.0, panels=panels))
+        result = self.run()
+        self.flush()
+        self.status(outcome=result.outcome, exit_status=0 if result.outcome == "complete" else 3)
+        self.recorder.close()
+        self.store.close()
+        self.say("supervisor", "end", status=0)
+        self.log.close()
+        (self.run_dir / "summary.json").write_text(json.dumps(result.summary), encoding="utf-8")
+        return self.run_dir
+
+    def say(self, process: str, event: str, level: str = "info", **fields: object) -> None:
+        line = {"process": process, **fields, "event": event, "level": level, "wall": "2026-01-01T12:00:00.5Z"}
+        self.log.write(json.dumps(line) + "\n")
+
+    def write(self, topic: str, message: msgspec.Struct) -> None:
+        self.recorder.write(topic, getattr(message, "t_s", 0.0), msgspec.json.encode(message))
+
+    def status(self, outcome: str = "", exit_status: int = -1) -> None:
+        mission = self.mission
+        message = MissionStatus(
+            seq=self.seq, t_s=self.t_s, state=str(mission.state), cause=mission.cause, done=len(mission.done),
+            skipped=len(mission.skipped), total=self.parts.total_points, point="", elapsed_s=self.t_s, eta_s=0.0,
+            error_mm=0.0, code=0, outcome=outcome, lower_bound_s=self.parts.lower_bound_s, exit_status=exit_status,
+        )  # fmt: skip
+        self.write("mission", message)
+
+    def flush(self) -> None:
+        if self.track:
+            self.write("track", Track(seq=self.seq, t_s=self.t_s, rows=self.track))
+        if self.truth and self.is_simulation:
+            self.write("truth", Truth(seq=self.seq, t_s=self.t_s, rows=self.truth))
+        self.track, self.truth = [], []
+        self.status()
+
+    def _note_truth(self) -> None:
+        super()._note_truth()
+        self.truth.append(tuple(self.book.truth_at(self.robot.seq)))
+
+    def _publish(self, seq: int, t_s: float, pose: PanelPose, state: State) -> None:
+        super()._publish(seq, t_s, pose, state)
+        self.seq, self.t_s = seq, t_s
+        row = (seq, t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, self.localizer.position_sigma_m)
+        self.track.append(row)
+        if state is not self.seen:
+            self.say("main", "state", "debug", seq=seq, before=str(self.seen), after=str(state))
+            self.seen = state
+        if len(self.track) >= BATCH:
+            self.flush()
+        if self.only is not None and len(self.mission.done) >= self.only:
+            self.only = None
+            self.mission.abort("the observatory wants the robot home")
+
+    def _measure(self, frame: Sensors) -> None:
+        point = self.mission.measuring_point
+        before = self.localizer.deck_pose
+        self.newest: Fix | None = None
+        super()._measure(frame)
+        if self.newest is not None:
+            self.keep(point, self.newest, before)
+
+    def arrive(self, point: PointId, seq: int) -> None:
+        self.note_arrival(point, seq)
+        error_mm = 1e3 * self.mission.survey.distance_m(self.localizer.pose)
+        self.write("arrival", Arrival(seq=seq, t_s=self.t_s, point=(*point,), error_mm=error_mm))
+
+    def _fuse(self, fix: Fix) -> None:
+        self.newest = fix
+        super()._fuse(fix)
+
+    def keep(self, point: PointId | None, fix: Fix, before: DeckPose) -> None:
+        after = self.localizer.deck_pose
+        jump_mm = 1e3 * float(np.hypot(after.x_m - before.x_m, after.y_m - before.y_m))
+        self.write(
+            "fix",
+            FixMessage(
+                seq=self.seq, t_s=fix.t_s, point=None if point is None else (*point,), is_fused=True,
+                position_m=fix.position_m, covariance_m2=list(fix.covariance_m2), dop=fix.dop,
+                residual_rms_m=fix.residual_rms_m, channels=list(fix.channels), jump_mm=jump_mm,
+            ),
+        )  # fmt: skip
+        if point is not None and point in self.mission.done:
+            self.store.record_fix(point, fix, before, remeasure=True).result()
+
+
+def record(run_dir: Path, *, is_simulation: bool = True, only: int | None = None, **changes: object) -> Path:
+    """The run directory of a mission in process: one panel of fyst-m1 in a hard world, unless told otherwise."""
+    settings = {"run.panels": 1, "run.world": "hard", "mission.calibration_length_m": 0.0}
+    settings |= {key.replace("__", "."): value for key, value in changes.items()}
+    return RecordingRun(load_config(overrides=settings), run_dir, is_simulation=is_simulation, only=only).leave()

@@ -1,0 +1,89 @@
+"""Where the time went: spells from the log and from the status, and the least time of the same way."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from ccatp.assembly import assemble
+from ccatp.report_reader import read_record
+from ccatp.reporting.record import RunRecord, Session, StateChange
+from ccatp.reporting.time_budget import least_times, sampled_spells, spells_of, time_budget
+
+
+@pytest.fixture
+def record(recorded: Path) -> RunRecord:
+    return read_record(recorded)
+
+
+def only(record: RunRecord) -> Session:
+    (session,) = record.sessions
+    return session
+
+
+def said(*changes: tuple[int, str, str]) -> tuple[StateChange, ...]:
+    return tuple(StateChange(*change) for change in changes)
+
+
+def test_the_times_add_up_to_the_mission(record: RunRecord) -> None:
+    found = time_budget(record)
+    assert found is not None
+    assert record.summary is not None
+    assert found.is_exact
+    assert found.total_s == pytest.approx(record.summary["mission_time_s"], abs=0.02)  # a frame at each end
+    assert set(found.spent_s) == {"turn", "drive", "settle", "measure", "wait"}
+    measurements = found.visits["measure"]
+    assert measurements >= 9
+    assert found.spent_s["measure"] == pytest.approx(measurements * record.cfg.etalon.measuring_time_s, abs=1e-6)
+
+
+def test_the_least_time_is_the_bound_of_the_run(record: RunRecord) -> None:
+    found = time_budget(record)
+    assert found is not None
+    assert found.bound_s == pytest.approx(assemble(record.cfg).lower_bound_s, abs=1e-9)
+    assert found.covers == "the whole mission"
+    assert found.bound_s is not None
+    assert found.bound_s < found.total_s
+
+
+def test_the_least_time_of_half_a_mission_ends_at_its_last_point(record: RunRecord) -> None:
+    whole, _ = least_times(record)
+    half, covers = least_times(replace(record, measured=record.measured[:3]))
+    none, _ = least_times(replace(record, measured=()))
+    assert whole is not None
+    assert half is not None
+    assert half["measure"] == pytest.approx(3 * 0.5)
+    assert 0.0 < half["drive"] < 0.5 * whole["drive"]
+    assert covers == "the planned way to the last measured point"
+    assert none is None
+
+
+def test_a_longer_measurement_waited(record: RunRecord) -> None:
+    session = only(record)
+    changes = said((100, "idle", "measuring"), (250, "measuring", "held"), (300, "held", "done"))
+    found = time_budget(replace(record, sessions=(replace(session, changes=changes),)))
+    assert found is not None
+    # 1 s idle, 1.5 s measuring of which half a second is due, half a second held, and nothing after the end.
+    assert found.spent_s == {"measure": pytest.approx(0.5), "wait": pytest.approx(2.5)}
+
+
+def test_a_main_loop_that_died_leaves_a_wait(record: RunRecord) -> None:
+    session = only(record)
+    changes = said((100, "idle", "driving"), (300, "idle", "settling"), (310, "settling", "done"))
+    spells = spells_of(replace(session, changes=changes))
+    assert spells is not None
+    assert [spell.state for spell in spells] == ["idle", "idle", "settling"]
+    assert [spell.duration_s for spell in spells] == pytest.approx([1.0, 2.0, 0.1])
+
+
+def test_the_status_tells_coarsely(record: RunRecord) -> None:
+    session = only(record)
+    sampled = sampled_spells(session)
+    assert sum(spell.duration_s for spell in sampled) == pytest.approx(session.span_s, abs=2.0)  # a batch at each end
+    found = time_budget(replace(record, sessions=(replace(session, changes=()),)))
+    assert found is not None
+    assert not found.is_exact
+
+
+def test_nothing_tells_nothing(record: RunRecord) -> None:
+    assert time_budget(replace(record, sessions=())) is None

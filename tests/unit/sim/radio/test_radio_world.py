@@ -1,0 +1,195 @@
+"""The true world among beacons: motion, propagation, shadowing, scans, obstacles, target, streams of noise."""
+
+from math import hypot, log10, pi
+
+import numpy as np
+import pytest
+
+from ccatp.angles import wrap_pi
+from ccatp.config.radio_loader import load_radio_config
+from ccatp.config.radio_models import RadioConfig, SimObstacleConfig
+from ccatp.sim.radio.frame import HALT, DriveCommand, TruePose
+from ccatp.sim.radio.obstacles import clearance_m, count_between, seen_m
+from ccatp.sim.radio.propagation import TrueRadio
+from ccatp.sim.radio.shadowing import ShadowingField
+from ccatp.sim.radio.target import MovingTarget
+from ccatp.sim.radio.world import RadioWorld
+
+BALL = SimObstacleConfig(x_m=1.0, y_m=0.0, radius_m=0.2)
+
+
+def config(**keys: object) -> RadioConfig:
+    return load_radio_config(None, {name.replace("__", "."): value for name, value in keys.items()})
+
+
+def radio(cfg: RadioConfig, obstacles: tuple[SimObstacleConfig, ...] = ()) -> TrueRadio:
+    streams = np.random.default_rng(1), np.random.default_rng(2)
+    return TrueRadio("b", -33.0, cfg.sim.radio, (3.0, 3.0), obstacles, 40, *streams)
+
+
+def drive(cfg: RadioConfig, command: DriveCommand, steps: int) -> RadioWorld:
+    world = RadioWorld(cfg)
+    for _ in range(steps):
+        world.step(command, 0.1, static=False, target=False)
+    return world
+
+
+EXACT = {"sim__vehicle__start_position_offset_m": 0.0, "sim__vehicle__start_heading_offset_rad": 0.0}
+
+
+def test_ackermann_moves_as_printed() -> None:
+    world = drive(config(**EXACT), DriveCommand(0.1, 0.3, 0.0), 1)
+    assert world.pose.x_m == pytest.approx(0.8 + 0.01 * np.cos(0.3))
+    assert world.pose.y_m == pytest.approx(0.8 + 0.01 * np.sin(0.3))
+    assert world.pose.heading_rad == pytest.approx(0.01 * np.sin(0.3) / 0.35)
+
+
+def test_differential_drive_goes_along_a_circle() -> None:
+    world = drive(config(vehicle__kind="differential", **EXACT), DriveCommand(0.1, 0.0, 0.5), round(2 * pi / 0.05) * 1)
+    centre = (0.8, 0.8 + 0.1 / 0.5)
+    assert hypot(world.pose.x_m - centre[0], world.pose.y_m - centre[1]) == pytest.approx(0.2, abs=1e-6)
+
+
+def test_slip_and_drift_are_not_in_the_odometry() -> None:
+    quiet = {"sim__vehicle__speed_sigma_m_s": 0.0, "sim__vehicle__steer_sigma_rad": 0.0}
+    cfg = config(**EXACT, **quiet, sim__vehicle__slip=0.05, sim__vehicle__heading_drift_rad_s=0.01)
+    world = RadioWorld(cfg)
+    frame = world.step(DriveCommand(0.1, 0.0, 0.0), 0.1, static=False, target=False)
+    assert world.pose.x_m == pytest.approx(0.8 + 0.01 * 0.95)
+    assert world.pose.heading_rad == pytest.approx(0.001)
+    assert frame.wheels.speed_m_s == 0.1
+
+
+def test_commands_beyond_the_limits_are_cut() -> None:
+    world = drive(config(**EXACT), DriveCommand(9.0, 0.0, 0.0), 1)
+    assert world.pose.x_m == pytest.approx(0.8 + 0.015)
+
+
+def test_level_follows_the_log_distance_model() -> None:
+    for distance_m in (0.5, 1.0, 3.0):
+        (ray,) = radio(config()).rays(TruePose(0.0, 0.0, 0.0), (distance_m, 0.0))
+        assert ray.level_dbm == pytest.approx(-33.0 - 20.0 * log10(distance_m))
+
+
+def test_white_noise_has_its_spread_and_steps() -> None:
+    one = radio(config(sim__radio__resolution_db=0.0))
+    levels = [s.rssi_dbm for _ in range(4000) if (s := one.sight(TruePose(0.0, 0.0, 0.0), (1.0, 0.0)))]
+    assert np.mean(levels) == pytest.approx(-33.0, abs=0.12)  # 4 sigma of the mean
+    assert np.std(levels) == pytest.approx(2.0, abs=0.1)
+    whole = radio(config()).sight(TruePose(0.0, 0.0, 0.0), (1.0, 0.0))
+    assert whole is not None
+    assert whole.rssi_dbm == round(whole.rssi_dbm)
+
+
+def test_drawn_bearings_lie_on_steps_of_nine_degrees() -> None:
+    one = radio(config())
+    errors = []
+    for _ in range(2000):
+        sighting = one.sight(TruePose(0.0, 0.0, 0.3), (0.0, 2.0))
+        assert sighting is not None
+        steps = sighting.bearing_rad / np.radians(9.0)
+        assert steps == pytest.approx(round(steps), abs=1e-9)
+        errors.append(wrap_pi(sighting.bearing_rad - (pi / 2 - 0.3)))
+    assert np.degrees(np.std(errors)) == pytest.approx(hypot(18.0, 9.0 / 12**0.5), rel=0.06)
+
+
+def test_a_turn_of_the_reflector_is_strongest_towards_the_radio() -> None:
+    one = radio(config(sim__radio__white_sigma_db=0.0))
+    packets = one.scan(TruePose(0.0, 0.0, 0.5), (2.0, 0.0))
+    assert len(packets) == 40
+    strongest = max(packets, key=lambda packet: packet.rssi_dbm)
+    assert abs(wrap_pi(strongest.direction_rad + 0.5)) < np.radians(18.0)  # ties by whole decibels
+    assert min(p.rssi_dbm for p in packets) == pytest.approx(strongest.rssi_dbm - 15.0, abs=1.0)
+
+
+def test_packets_are_lost_as_often_as_told_and_below_the_sensitivity() -> None:
+    one = radio(config(sim__radio__loss_probability=0.3))
+    heard = sum(len(one.scan(TruePose(0.0, 0.0, 0.0), (1.0, 0.0))) for _ in range(50))
+    assert heard == pytest.approx(0.7 * 2000, abs=4 * (2000 * 0.21) ** 0.5)
+    assert radio(config(sim__radio__sensitivity_dbm=-20.0)).scan(TruePose(0.0, 0.0, 0.0), (1.0, 0.0)) == []
+
+
+def test_an_obstacle_in_the_line_of_sight_weakens_and_lets_a_reflection_win() -> None:
+    here, there = TruePose(0.0, 0.0, 0.0), (2.0, 0.0)
+    free, blocked = radio(config()), radio(config(), (BALL,))
+    assert free.rays(here, there)[0].level_dbm - blocked.rays(here, there)[0].level_dbm == pytest.approx(6.0)
+    cfg = config(sim__radio__multipath_paths=6, sim__radio__multipath_level_db=1.0, sim__radio__obstacle_loss_db=40.0)
+    sighting = radio(cfg, (BALL,)).sight(here, there)
+    assert sighting is not None
+    strongest = max(radio(cfg, (BALL,)).rays(here, there)[1:], key=lambda ray: ray.level_dbm)
+    assert sighting.rssi_dbm == pytest.approx(strongest.level_dbm, abs=10.0)
+    assert strongest.direction_rad != 0.0
+
+
+def test_shadowing_stays_and_decorrelates_exponentially() -> None:
+    at = [(0.0, 0.0), (0.5, 0.0), (1.5, 0.0)]
+    fields = [ShadowingField(5.0, 1.5, np.random.default_rng(seed)) for seed in range(600)]
+    values = np.array([[field.at(place, (3.0, 3.0)) for place in at] for field in fields])
+    assert fields[0].at(at[1], (3.0, 3.0)) == values[0, 1]
+    correlation = values.T @ values / len(fields) / 25.0
+    assert correlation[0, 0] == pytest.approx(1.0, abs=0.2)  # 3.5 sigma of 600 draws
+    assert correlation[0, 1] == pytest.approx(np.exp(-0.5 / 1.5), abs=0.17)
+    assert correlation[0, 2] == pytest.approx(np.exp(-1.0), abs=0.17)
+    elsewhere = np.array([field.at(at[0], (3.0, 1.5)) for field in fields])
+    assert np.mean(elsewhere * values[:, 0]) / 25.0 == pytest.approx(np.exp(-1.0), abs=0.17)
+
+
+def test_no_shadowing_is_nothing() -> None:
+    assert ShadowingField(0.0, 1.0, np.random.default_rng(0)).at((0.0, 0.0), (1.0, 1.0)) == 0.0
+
+
+def test_obstacles_are_seen_between_and_along_rays() -> None:
+    here = TruePose(0.0, 0.0, 0.0)
+    assert count_between((0.0, 0.0), (2.0, 0.1), [BALL]) == 1
+    assert count_between((0.0, 0.0), (0.7, 0.0), [BALL]) == 0
+    assert count_between((0.0, 0.5), (2.0, 0.5), [BALL]) == 0
+    assert seen_m(here, 0.0, [BALL]) == pytest.approx(0.8)
+    assert seen_m(here, pi, [BALL]) == np.inf
+    assert seen_m(here, 0.3, [BALL]) == np.inf
+    assert clearance_m(here, [BALL]) == pytest.approx(0.8)
+
+
+def test_a_random_target_keeps_its_speed_and_stays_in_the_room_and_out_of_obstacles() -> None:
+    cfg = config(sim__target__motion="random", sim__target__speed_m_s=0.1)
+    target = MovingTarget(cfg.sim.target, (3.0, 3.0), [BALL], np.random.default_rng(3))
+    for _ in range(5000):
+        before = target.position_m
+        target.step(0.1)
+        x, y = target.position_m
+        assert 0.0 <= x <= 3.0
+        assert 0.0 <= y <= 3.0
+        assert hypot(x - BALL.x_m, y - BALL.y_m) >= BALL.radius_m - 1e-9
+        assert hypot(x - before[0], y - before[1]) < 0.0101 + 0.02  # a step, and what a wall turns back
+
+
+def test_a_target_walks_its_waypoints_round_and_round() -> None:
+    cfg = config(
+        sim__target__motion="waypoints", sim__target__speed_m_s=0.1, sim__target__x_m=0.0, sim__target__y_m=0.0,
+        sim__target__waypoints_m=[[1.0, 0.0], [1.0, 1.0], [0.0, 0.0]],
+    )  # fmt: skip
+    target = MovingTarget(cfg.sim.target, (3.0, 3.0), (), np.random.default_rng(0))
+    for _ in range(150):
+        target.step(0.1)
+    assert target.position_m == pytest.approx((1.0, 0.5))
+
+
+def test_a_seed_repeats_itself_and_listening_does_not_change_the_rest() -> None:
+    cfg = load_radio_config(None, {"system": "follow"})
+    worlds = [RadioWorld(cfg), RadioWorld(cfg)]
+    frames = [
+        [world.step(DriveCommand(0.1, 0.1, 0.0), 0.1, static=listens, target=True) for _ in range(20)]
+        for world, listens in zip(worlds, (True, False), strict=True)
+    ]
+    assert worlds[0].pose == worlds[1].pose
+    assert worlds[0].target_m == worlds[1].target_m
+    assert [f.sightings[-1] for f in frames[0]] == [f.sightings[-1] for f in frames[1]]
+    assert len(frames[0][0].sightings) == 5
+    assert RadioWorld(cfg, seed=2).pose != RadioWorld(cfg).pose
+
+
+def test_reflector_worlds_give_packets_and_others_sightings() -> None:
+    world = RadioWorld(config(sim__radio__scan="reflector"))
+    frame = world.step(HALT, 0.1, static=True, target=False)
+    assert len(frame.packets) == 160
+    assert frame.sightings == ()
+    assert world.clearance_m == np.inf

@@ -1,0 +1,137 @@
+"""`ccatp radio calibrate`, `fix` and `fuzzy` on small files, and on the XBee sheets where they are at hand."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ccatp.cli import main
+
+XBEE = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "radio" / "xbee_rssi"
+needs_xbee = pytest.mark.skipif(not XBEE.is_dir(), reason="the XBee sheets are not beside the checkout")
+BEACONS = ("--beacon", "A=0,0", "--beacon", "B=0,4", "--beacon", "C=4,0")
+
+
+def said(capsys: pytest.CaptureFixture[str], *argv: object) -> tuple[int, str, str]:
+    status = main([str(part) for part in argv])
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def pairs(folder: Path) -> Path:
+    rows = [f"{d},{-45.0 - 25.0 * np.log10(d) + 0.5 * (-1) ** k:.4f}" for k, d in enumerate((0.5, 1, 2, 3, 4, 5))]
+    (folder / "pairs.csv").write_text("distance_m,rssi_dbm\n" + "\n".join(rows) + "\n")
+    return folder / "pairs.csv"
+
+
+def test_calibrate_prints_what_the_configuration_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = said(capsys, "radio", "calibrate", pairs(tmp_path))
+    assert (status, err) == (0, "")
+    assert "reference_dbm = -44." in out
+    found = json.loads(said(capsys, "radio", "calibrate", pairs(tmp_path), "--json")[1])
+    assert found["exponent"] == pytest.approx(2.5, abs=0.3)
+    assert found["places"] == 6
+    assert found["white_sigma_db"] is None
+
+
+def test_figures_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
+    assert said(capsys, "radio", "calibrate", pairs(tmp_path), "--figure", tmp_path / "a.png")[0] == 0
+    assert said(capsys, "radio", "fuzzy", "--figure", tmp_path / "b.png")[0] == 0
+    assert all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in ("a.png", "b.png"))
+    status, _, err = said(capsys, "radio", "fuzzy", "--figure", tmp_path / "none" / "b.png")
+    assert status == 2
+    assert "cannot be written" in err
+
+
+def test_fuzzy_tells_the_speed_at_a_point(capsys: pytest.CaptureFixture[str]) -> None:
+    found = json.loads(said(capsys, "radio", "fuzzy", "--at", 2.0, 0.0, "--at", 0.05, 2.0, "--json")[1])
+    assert [point["speed_m_s"] for point in found["points"]] == [0.15, 0.05]
+    gap = 'control.fuzzy.rules=[{when={distance_m="near"},then="slow"}]'
+    status, _, err = said(capsys, "radio", "fuzzy", "--set", gap)
+    assert status == 2
+    assert "no rule of the fuzzy controller fires" in err
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (("radio", "calibrate", "nowhere.csv"), "no such file"),
+        (("radio", "fix", "nowhere.csv"), "give the place of two beacons"),
+        (("radio", "fix", "nowhere.csv", "--beacon", "A"), "is not NAME=X,Y"),
+        (("radio", "fix", "nowhere.csv", *BEACONS), "no such file"),
+    ],
+)
+def test_bad_input_is_one_line(argv: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = said(capsys, *argv)
+    assert status != 0
+    assert out == ""
+    assert message in err
+    assert err.count("\n") == 1
+
+
+def places(folder: Path) -> Path:
+    rows = []
+    for x in (0.5, 1.5, 2.5, 3.5):
+        for y in (0.5, 1.5, 2.5, 3.5):
+            r = [np.hypot(x - bx, y - by) for bx, by in ((0, 0), (0, 4), (4, 0))]
+            rows.append(f"{x},{y}," + ",".join(f"{-45.0 - 25.0 * np.log10(d) + 0.1 * ((x + y) % 2):.3f}" for d in r))
+    (folder / "places.csv").write_text("x,y,RSSI A,RSSI B,RSSI C\n" + "\n".join(rows) + "\n")
+    return folder / "places.csv"
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ((), "give either --fingerprints or --path-loss"),
+        (("--room", "1,2"), "is not X0,Y0,X1,Y1"),
+        (("--room", "1,2,0,3"), "its second corner"),
+        (("--spacing", "0"), "must be positive"),
+        (("--exchange", "A,Z"), "is not two beacons of the data, which has A, B, C"),
+    ],
+)
+def test_fix_says_what_is_missing(
+    tmp_path: Path, more: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, _, err = said(capsys, "radio", "fix", places(tmp_path), *BEACONS, *more)
+    assert status == 2
+    assert message in err
+
+
+def test_fix_finds_places_and_exchanged_beacons(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = places(tmp_path)
+    found = json.loads(said(capsys, "radio", "fix", file, *BEACONS, "--fingerprints", file, "--json")[1])
+    assert found["leave_one_out"] is True
+    assert found["mean_error_m"] < 0.15
+    other = tmp_path / "other.csv"
+    other.write_text(file.read_text().replace("RSSI B,RSSI C", "RSSI C,RSSI B"))
+    status, out, err = said(capsys, "radio", "fix", other, *BEACONS, "--fingerprints", file)
+    assert status == 0
+    assert "beacons look exchanged: B is C, C is B" in err
+    exchanged = said(capsys, "radio", "fix", other, *BEACONS, "--fingerprints", file, "--exchange", "B,C", "--json")
+    assert json.loads(exchanged[1])["mean_error_m"] < 0.15
+    assert "mean error" in out
+
+
+@needs_xbee
+def test_xbee_scenario_1_is_fixed_within_its_limit(capsys: pytest.CaptureFixture[str]) -> None:
+    folder = XBEE / "Scenario1"
+    common = (*BEACONS, "--fingerprints", folder / "Database_Scenario1.xlsx", "--json")
+    tests = json.loads(said(capsys, "radio", "fix", folder / "Tests_Scenario1.xlsx", "--exchange", "B,C", *common)[1])
+    own = json.loads(said(capsys, "radio", "fix", folder / "Database_Scenario1.xlsx", *common)[1])
+    assert tests["mean_error_m"] <= 1.3
+    assert own["mean_error_m"] <= 1.3
+    inside = (tests["in_region"] + own["in_region"]) / (len(tests["points"]) + len(own["points"]))
+    assert 0.80 <= inside <= 0.95
+
+
+@needs_xbee
+def test_xbee_sheets_and_logs_agree(capsys: pytest.CaptureFixture[str]) -> None:
+    sheet = XBEE / "Scenario1" / "Pathloss_Scenario1.xlsx"
+    one = json.loads(said(capsys, "radio", "calibrate", sheet, "--json")[1])
+    logs = XBEE / "Scenario1" / "Pathloss" / "Zigbee"
+    other = json.loads(said(capsys, "radio", "calibrate", logs, "--points", sheet, "--json")[1])
+    assert other["readings"] == 900
+    assert other["exponent"] == pytest.approx(one["exponent"], abs=0.05)
+    assert other["shadowing_sigma_db"] > 5.0 * other["white_sigma_db"]

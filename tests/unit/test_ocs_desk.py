@@ -1,0 +1,201 @@
+"""Tests of what the agent of the observatory control system does, with a daemon and a survey that tests play."""
+
+import argparse
+import sys
+import tempfile
+import threading
+import time
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from ccatp import ocs_plugin
+from ccatp.client import Client
+from ccatp.ocs_agent import OcsMissing, add_arguments, main, register, survey_command
+from ccatp.ocs_desk import SurveyDesk, feed_fields
+from ccatp.processes.run_collector import NO_STATUS
+from tests.unit.serving import serving
+
+
+class Session:
+    """As an OCS session."""
+
+    def __init__(self) -> None:
+        self.status = "running"
+        self.data: dict[str, Any] = {}
+
+    def set_status(self, status: str) -> None:
+        self.status = status
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="ccatp-") as path:  # short: unix sockets take no long one
+        yield Path(path)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ccatp.ocs_desk.PERIOD_S", 0.01)
+
+
+def desk_of(folder: Path, program: str = "") -> SurveyDesk:
+    command = [sys.executable, "-c", program]
+    return SurveyDesk(Client(folder, 5.0), command, {}, lambda _: None)
+
+
+def status(**fields: object) -> dict[str, Any]:
+    return {"ok": True, "status": {**msgspec.to_builtins(NO_STATUS), "state": "driving", **fields}}
+
+
+@pytest.mark.parametrize(
+    ("code", "success", "told"),
+    [(0, True, "complete"), (3, False, "at base"), (4, False, "not at base"), (5, False, "did not answer"),
+     (7, False, "status 7")],
+)  # fmt: skip
+def test_a_survey_ends_as_its_process_does(code: int, success: bool, told: str, folder: Path) -> None:
+    session = Session()
+    done, text = desk_of(folder, f"raise SystemExit({code})").survey(session)
+    assert done is success
+    assert told in text
+    assert session.data["exit_status"] == code
+
+
+def test_the_number_of_panels_goes_to_the_survey(folder: Path) -> None:
+    program = "import sys; raise SystemExit(0 if sys.argv[1:] == ['--panels', '3'] else 9)"
+    assert desk_of(folder, program).survey(Session(), 3) == (True, "the survey is complete")
+
+
+def test_a_survey_that_says_nothing_is_ended(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ccatp.ocs_desk.START_TIMEOUT_S", 0.2)
+    done, text = desk_of(folder, "import time; time.sleep(60)").survey(Session())
+    assert not done
+    assert "said nothing within 0.2 s" in text
+
+
+def test_a_survey_that_runs_already_is_followed_and_aborted_when_the_session_stops(folder: Path) -> None:
+    session, asked = Session(), []
+
+    def answer(request: dict[str, Any]) -> dict[str, Any]:
+        asked.append(request["cmd"])
+        if len(asked) == 4:
+            session.status = "stopping"
+        return status(done=len(asked), exit_status=3 if "abort" in asked else -1)
+
+    with serving(folder, "control", answer):
+
+        def go_away() -> None:
+            while "abort" not in asked:
+                time.sleep(0.001)
+            # what the daemon's end looks like from here
+            (folder / "control").unlink(missing_ok=True)
+
+        thread = threading.Thread(target=go_away)
+        thread.start()
+        done, text = desk_of(folder, "raise SystemExit(9)").survey(session)
+        thread.join()
+    assert "abort" in asked
+    assert session.data["state"] == "driving"
+    assert (done, text) in ((True, "aborted, the robot is at base"), (False, "the survey is over"))
+
+
+def test_orders_and_refusals(folder: Path) -> None:
+    session = Session()
+    desk = desk_of(folder)
+    done, text = desk.ask("status", session)
+    assert not done
+    assert "no daemon in" in text
+    with serving(folder, "control", lambda request: status(state=request["cmd"])):
+        assert desk.ask("pause", session) == (True, "pause: pause")
+        assert session.data["state"] == "pause"
+    with serving(folder, "control", lambda _: {"ok": False, "error": "nothing is paused"}):
+        assert desk.ask("resume") == (False, "resume refused: nothing is paused")
+
+
+def test_the_monitor_publishes_until_it_is_stopped(folder: Path) -> None:
+    session = Session()
+    blocks: list[dict[str, Any]] = []
+
+    def publish(block: dict[str, Any]) -> None:
+        blocks.append(block)
+        if len(blocks) >= 3:
+            session.status = "stopping"
+
+    with serving(folder, "control", lambda _: status(done=5)):
+        assert desk_of(folder).monitor(session, publish, 0.01) == (True, "monitoring ended")
+    assert [block["block_name"] for block in blocks] == ["daemon", "survey", "daemon", "survey"]
+    assert blocks[0]["data"] == {"running": 1}
+    assert blocks[1]["data"]["done"] == 5
+    session.status, blocks[:] = "running", []
+    desk_of(folder / "none").monitor(session, publish, 0.01)
+    assert [block["data"] for block in blocks] == [{"running": 0}] * 3
+
+
+def test_feed_fields_are_plain(folder: Path) -> None:
+    assert all(isinstance(value, (int, float, str)) for value in feed_fields(NO_STATUS).values())
+
+
+class Agent:
+    """Notes what is registered."""
+
+    def __init__(self) -> None:
+        self.processes: dict[str, Any] = {}
+        self.tasks: dict[str, Any] = {}
+        self.feeds: list[str] = []
+        self.published: list[Any] = []
+
+    def register_feed(self, name: str, **_: object) -> None:
+        self.feeds.append(name)
+
+    def register_process(self, name: str, start: Any, stop: Any, **_: object) -> None:
+        self.processes[name] = (start, stop)
+
+    def register_task(self, name: str, start: Any, **_: object) -> None:
+        self.tasks[name] = start
+
+    def publish_to_feed(self, name: str, block: Any) -> None:
+        self.published.append((name, block))
+
+
+def test_what_the_agent_offers(folder: Path) -> None:
+    agent = Agent()
+    register(agent, desk_of(folder, "raise SystemExit(0)"), lambda *_, **__: lambda function: function, 0.01)
+    assert set(agent.processes) == {"survey", "monitor"}
+    assert set(agent.tasks) == {"status", "pause", "resume", "abort", "stop"}
+    assert agent.feeds == ["survey"]
+    assert agent.processes["survey"][0](Session(), {"panels": None})[0]
+    session = Session()
+    assert agent.processes["monitor"][1](session, {})[0]
+    assert session.status == "stopping"
+    assert not agent.tasks["abort"](Session(), {})[0]
+    assert "**Task**" in agent.tasks["abort"].__doc__
+    session.status = "running"
+    thread = threading.Thread(target=agent.processes["monitor"][0], args=(session, {}))
+    thread.start()
+    while not agent.published:
+        time.sleep(0.001)
+    session.status = "stopping"
+    thread.join()
+    assert agent.published[0][0] == "survey"
+
+
+def test_the_command_of_a_survey() -> None:
+    parser = add_arguments(argparse.ArgumentParser())
+    args = parser.parse_args(["--sim", "--realtime", "--config", "a.toml", "--mirror", "fyst-m2"])
+    assert survey_command(args)[3:] == ["run", "--sim", "--realtime", "--config", "a.toml", "--mirror", "fyst-m2"]
+
+
+def test_without_the_extra_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ocs", None)
+    with pytest.raises(OcsMissing, match=r"install ccatp with its extra, ccatp\[ocs\]"):
+        main([])
+
+
+def test_the_plugin_names_the_agent() -> None:
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    assert project["entry-points"]["ocs.plugins"] == {"ccatp": "ccatp.ocs_plugin"}
+    assert ocs_plugin.agents["CcatpAgent"] == {"module": "ccatp.ocs_agent", "entry_point": "main"}
