@@ -11,8 +11,8 @@ import ccatp
 PACKAGE = Path(ccatp.__file__).parent
 CALLS = {("time", "time"), ("time", "time_ns"), ("time", "localtime"), ("time", "gmtime"), ("datetime", "now"),
          ("datetime", "today"), ("datetime", "utcnow"), ("date", "today")}  # fmt: skip
-# Labels: rows of the store, names of run directories and the observatory's feed say when they were made. The check before
-# a mission shows the clock itself.
+# Labels: rows of the store, names of run directories and the observatory's feed say when they were made. The check
+# before a mission shows the clock itself.
 LABELS = {"store.py", "supervisor.py", "cli_calibrate.py", "ocs_desk.py", "check_probes.py"}
 
 

@@ -104,6 +104,7 @@ def fits_a_phone(page: Page) -> None:
 
 
 def knows_keys(page: Page) -> None:
+    expect(page.locator("#pause")).to_be_enabled()  # not while the page waits for news of a busy machine
     page.keyboard.press("p")
     expect(page.locator("#answer")).to_have_text("pause: done")
     expect(page.locator("#state")).to_contain_text("held")

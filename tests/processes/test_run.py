@@ -52,7 +52,10 @@ def test_two_panels(start: Start, mirror: str) -> None:
     assert load_config(run.run_dir / "config.toml").run.panels == 2
     recorded = {message.topic for message in iter_messages(run.run_dir / "telemetry.mcap")}
     # Nothing went wrong, so there is nothing that the localizer had to be treated for.
-    assert recorded - {"danger_event"} == {t.name for t in TOPICS if t.recorded} - {"danger_event", "treatment"}
+    of_surveys = {t.name for t in TOPICS if t.recorded and not t.name.startswith("beacon_")}
+    views = {topic for topic in recorded if topic.startswith("view/")}
+    assert recorded - views - {"danger_event"} == of_surveys - {"danger_event", "treatment"}
+    assert {"view/pose", "view/true_pose", "view/panels", "view/points", "view/log"} <= views
     log = [json.loads(line) for line in (run.run_dir / "log.jsonl").read_text().splitlines()]
     assert {"main", "danger", "supervisor", "dataloop"} <= {entry["process"] for entry in log}
     assert "SIMULATION" in run.stderr
