@@ -27,7 +27,8 @@ SWEEP_M = 1e-5
 
 FloatArray = NDArray[np.float64]
 mirror_names = st.sampled_from(NAMES)
-order_names = st.sampled_from(sorted(ORDERS))
+SURVEYS = sorted(ORDERS.keys() - {"calibration"})  # which has no points
+order_names = st.sampled_from(SURVEYS)
 
 
 @cache
@@ -107,7 +108,7 @@ def check_route(cfg: Config, mirror: Mirror, stops: Sequence[Stop]) -> None:
     assert worst_sensor(cfg, mirror, drive(mirror, mirror.base_pose, stops)) >= cfg.mission.turn_clearance_m - SWEEP_M
 
 
-@pytest.mark.parametrize("order", sorted(ORDERS))
+@pytest.mark.parametrize("order", SURVEYS)
 @pytest.mark.parametrize("name", NAMES)
 def test_whole_survey_stays_on_the_mirror(name: str, order: str) -> None:
     cfg, mirror = load(name)
@@ -168,7 +169,7 @@ def check_way_home(cfg: Config, mirror: Mirror, start: DeckPose) -> None:
     assert worst_sensor(cfg, mirror, legs) >= cfg.mission.turn_clearance_m - SWEEP_M
 
 
-@pytest.mark.parametrize("order", sorted(ORDERS))
+@pytest.mark.parametrize("order", SURVEYS)
 @pytest.mark.parametrize("name", NAMES)
 def test_home_from_the_end_of_a_survey(name: str, order: str) -> None:
     """As it stands at the last stop, and at the last of the first few panels."""
