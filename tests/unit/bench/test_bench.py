@@ -172,11 +172,17 @@ def test_the_command_and_its_page(tmp_path: Path) -> None:
     assert {"cpu", "cores", "python", "numpy"} <= result["machine"].keys()
     for case in result["cases"]:
         assert {"name", "us_p50", "us_p99", "peer", "peer_us_p50", "ratio"} <= case.keys()
+        if case["name"].startswith("ekf-slam, 200"):
+            assert case["peer"] is None  # whole matrices of that size take too long
+            assert case["us_p50"] > 0.0
+            continue
         assert case["ratio"] == pytest.approx(case["us_p50"] / case["peer_us_p50"])
         assert result["equal_within"] == 1e-10
         assert case["largest_difference"] <= 1e-10 or case["error"] <= 1e-10 < case["peer_error"]
-    peers = {case["peer"] for case in result["cases"]}
-    assert peers == {"eq. 2.13 in numpy", "filterpy", "Stone Soup", "scipy.optimize.least_squares"}
+    peers = {case["peer"] for case in result["cases"]} - {None}
+    assert peers == {
+        "eq. 2.13 in numpy", "filterpy", "Stone Soup", "scipy.optimize.least_squares", "whole matrices in numpy",
+    }  # fmt: skip
     table = [line for line in page.read_text().splitlines() if line.startswith("|")]
     assert len(table) == len(result["cases"]) + 2
     assert len({line.count("|") for line in table}) == 1
