@@ -115,7 +115,10 @@ def test_a_real_job_has_every_figure(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "hint"),
-    [("filter", "did you mean filters"), ("zzz", "there are thesis, filters, time, sensitivity, ablation, danger, cricket, mote-sizes")],
+    [
+        ("filter", "did you mean filters"),
+        ("zzz", "there are thesis, filters, time, sensitivity, ablation, danger, cricket, mote-sizes"),
+    ],
 )
 def test_an_unknown_study_is_answered_with_the_nearest(name: str, hint: str) -> None:
     with pytest.raises(CampaignError, match=f"no study '{name}'; {hint}"):
