@@ -9,14 +9,14 @@ from typing import Any
 import click
 
 import ccatp
-from ccatp.cli_align import align
-from ccatp.cli_bench import bench
-from ccatp.cli_calibrate import calibrate
-from ccatp.cli_check import check
-from ccatp.cli_completion import completion
-from ccatp.cli_conformance import conformance
-from ccatp.cli_dashboard import dashboard
-from ccatp.cli_frame import (
+from ccatp.commands.align import align
+from ccatp.commands.bench import bench
+from ccatp.commands.calibrate import calibrate
+from ccatp.commands.check import check
+from ccatp.commands.completion import completion
+from ccatp.commands.conformance import conformance
+from ccatp.commands.dashboard import dashboard
+from ccatp.commands.frame import (
     ADDRESS_OPTIONS,
     CONFIG_OPTION,
     FAULTS_OPTION,
@@ -34,15 +34,15 @@ from ccatp.cli_frame import (
     run_command_line,
     tell,
 )
-from ccatp.cli_keys import keys
-from ccatp.cli_log import log
-from ccatp.cli_plan import plan
-from ccatp.cli_radio import radio
-from ccatp.cli_replay import replay
-from ccatp.cli_report import compare, report
-from ccatp.cli_status import status
-from ccatp.cli_stream import stream
-from ccatp.cli_study import study
+from ccatp.commands.keys import keys
+from ccatp.commands.log import log
+from ccatp.commands.plan import plan
+from ccatp.commands.radio import radio
+from ccatp.commands.replay import replay
+from ccatp.commands.report import compare, report
+from ccatp.commands.status import status
+from ccatp.commands.stream import stream
+from ccatp.commands.study import study
 from ccatp.package import COMPILED, build
 
 EMERGENCY_KINDS = ("fire", "earthquake", "power", "weather", "operator")
@@ -71,7 +71,7 @@ def cli() -> None:
 @click.option("--sim", is_flag=True, help="Simulate robot and laser system on this machine.")
 @WORLD_OPTIONS
 @click.option("--panels", type=int, metavar="N", help="Only the first N panels of the traversal; 0 takes all.")
-@click.option("--filter", "filter_name", metavar="NAME", help="State estimator: kf.")
+@click.option("--filter", "filter_name", metavar="NAME", help="State estimator: kf, ekf or ukf.")
 @click.option("--realtime", is_flag=True, help="Pace the simulation on the wall clock.")
 @click.option(
     "--run-dir", type=click.Path(path_type=Path), help="Where to write; runs/<time>-<mirror>-s<seed> if not given."

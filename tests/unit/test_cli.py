@@ -14,7 +14,7 @@ import pytest
 
 import ccatp
 from ccatp.cli import cli, main
-from ccatp.cli_frame import parse_setting
+from ccatp.commands.frame import parse_setting
 from ccatp.config.models import Config
 from ccatp.errors import ConfigError, UnreachableError
 from ccatp.run_options import RunOptions

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ccatp.cli_frame import complain, example
+from ccatp.commands.frame import complain, example
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
 _FOLDER = click.Path(path_type=Path, file_okay=False)

@@ -87,7 +87,7 @@ def test_watching_a_daemon_that_goes_ends_well(
     assert main(command) == 5  # nobody was there
     with serving(folder, "control", answers({})):
         # The daemon goes between two looks.
-        monkeypatch.setattr("ccatp.cli_status.time.sleep", lambda _: (folder / "control").unlink())
+        monkeypatch.setattr("ccatp.commands.status.time.sleep", lambda _: (folder / "control").unlink())
         assert main(command) == 0
     assert "driving" in capsys.readouterr().out
 

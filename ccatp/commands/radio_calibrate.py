@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.cli_frame import complain, example
+from ccatp.commands.frame import complain, example
 from ccatp.errors import CcatpError, ExitStatus
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from ccatp.cli_frame import CONFIG_OPTION, SETTINGS_OPTION, example, overrides
+from ccatp.commands.frame import CONFIG_OPTION, SETTINGS_OPTION, example, overrides
 
 
 class _StudyCommand(click.Command):

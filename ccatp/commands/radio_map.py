@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.cli_frame import complain, example, overrides, settings_option
+from ccatp.commands.frame import complain, example, overrides, settings_option
 
 if TYPE_CHECKING:
     from ccatp.config.cricket_models import CricketConfig

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.cli_frame import complain, example, overrides, settings_option
+from ccatp.commands.frame import complain, example, overrides, settings_option
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ccatp.cli_frame import WORLD_OPTIONS, complain, example, overrides
+from ccatp.commands.frame import WORLD_OPTIONS, complain, example, overrides
 from ccatp.errors import CcatpError, ExitStatus
 
 

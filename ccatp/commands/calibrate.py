@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.cli_frame import RUNTIME_DIR_OPTION, WORLD_OPTIONS, complain, example, overrides
+from ccatp.commands.frame import RUNTIME_DIR_OPTION, WORLD_OPTIONS, complain, example, overrides
 from ccatp.errors import CcatpError
 
 if TYPE_CHECKING:

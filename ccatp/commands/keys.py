@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ccatp.cli_frame import SuggestingGroup, example
+from ccatp.commands.frame import SuggestingGroup, example
 from ccatp.errors import ConfigError
 
 DEFAULT_DIR = "keys"

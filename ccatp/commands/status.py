@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from ccatp.cli_frame import CONFIG_OPTION, RUNTIME_DIR_OPTION, ask_daemon, configured_folder, example, tell
+from ccatp.commands.frame import CONFIG_OPTION, RUNTIME_DIR_OPTION, ask_daemon, configured_folder, example, tell
 from ccatp.errors import UnreachableError
 
 # Without a terminal a line is told at a change, and at least this often.

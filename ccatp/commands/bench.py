@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from ccatp.cli_frame import WORLD_OPTIONS, example, overrides
+from ccatp.commands.frame import WORLD_OPTIONS, example, overrides
 
 PAGE = "docs/bench.md"
 

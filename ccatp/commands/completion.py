@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from ccatp.cli_frame import NearestChoice, example
+from ccatp.commands.frame import NearestChoice, example
 
 SHELLS = ("bash", "zsh", "fish")
 VARIABLE = "_CCATP_COMPLETE"

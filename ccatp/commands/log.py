@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ccatp.cli_frame import SuggestingGroup, example
+from ccatp.commands.frame import SuggestingGroup, example
 
 if TYPE_CHECKING:
     from ccatp.recording_tools import RecordingFacts

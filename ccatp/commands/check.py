@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ccatp.cli_frame import RUNTIME_DIR_OPTION, WORLD_OPTIONS, example, overrides
+from ccatp.commands.frame import RUNTIME_DIR_OPTION, WORLD_OPTIONS, example, overrides
 from ccatp.errors import ConfigError, ExitStatus
 
 if TYPE_CHECKING:

@@ -2,13 +2,13 @@
 
 import click
 
-from ccatp.cli_frame import SuggestingGroup, example
-from ccatp.cli_radio_calibrate import calibrate
-from ccatp.cli_radio_compare import compare
-from ccatp.cli_radio_fix import fix
-from ccatp.cli_radio_fuzzy import fuzzy
-from ccatp.cli_radio_map import radio_map
-from ccatp.cli_radio_slam import slam
+from ccatp.commands.frame import SuggestingGroup, example
+from ccatp.commands.radio_calibrate import calibrate
+from ccatp.commands.radio_compare import compare
+from ccatp.commands.radio_fix import fix
+from ccatp.commands.radio_fuzzy import fuzzy
+from ccatp.commands.radio_map import radio_map
+from ccatp.commands.radio_slam import slam
 
 
 @click.group(cls=SuggestingGroup, epilog=example("ccatp radio slam recordings/Plaza2_.mat"))

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.cli_frame import complain, example
-from ccatp.cli_radio_calibrate import FIGURE_OPTION, JSON_OPTION, CalibrateError
+from ccatp.commands.frame import complain, example
+from ccatp.commands.radio_calibrate import FIGURE_OPTION, JSON_OPTION, CalibrateError
 
 if TYPE_CHECKING:
     from ccatp.radio.level_fix import LevelFix, LevelLocator, Room

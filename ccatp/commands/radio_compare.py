@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.cli_frame import CONFIG_OPTION, complain, example, overrides, settings_option
-from ccatp.cli_radio_slam import FILTERS, estimate
+from ccatp.commands.frame import CONFIG_OPTION, complain, example, overrides, settings_option
+from ccatp.commands.radio_slam import FILTERS, estimate
 
 if TYPE_CHECKING:
     from ccatp.config.recording_models import RecordingsConfig

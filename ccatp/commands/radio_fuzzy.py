@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from ccatp.cli_frame import SETTINGS_OPTION, example
-from ccatp.cli_radio_calibrate import FIGURE_OPTION, JSON_OPTION, CalibrateError
+from ccatp.commands.frame import SETTINGS_OPTION, example
+from ccatp.commands.radio_calibrate import FIGURE_OPTION, JSON_OPTION, CalibrateError
 
 
 @click.command(epilog=example("ccatp radio fuzzy --figure speed.png", "ccatp radio fuzzy --at 0.3 0.5"))

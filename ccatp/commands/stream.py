@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from ccatp.cli_frame import CONFIG_OPTION, RUNTIME_DIR_OPTION, configured_folder, example
+from ccatp.commands.frame import CONFIG_OPTION, RUNTIME_DIR_OPTION, configured_folder, example
 
 PLOTJUGGLER_PORT = 9872
 FOXGLOVE_PORT = 8765

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from ccatp.cli_frame import ADDRESS_OPTIONS, RUNTIME_DIR_OPTION, example, overrides, settings_option
+from ccatp.commands.frame import ADDRESS_OPTIONS, RUNTIME_DIR_OPTION, example, overrides, settings_option
 
 
 @click.command(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.cli_frame import CONFIG_OPTION, complain, example, overrides, settings_option
+from ccatp.commands.frame import CONFIG_OPTION, complain, example, overrides, settings_option
 from ccatp.errors import CcatpError, ExitStatus
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def slam(
 
 
 def _side_by_side(run: "RecordedRun", assumed: "RecordingsConfig") -> list[dict[str, Any]]:
-    from ccatp.cli_radio_compare import compared
+    from ccatp.commands.radio_compare import compared
 
     return compared(run, assumed, peers=True)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ccatp.cli_frame import complain, example
+from ccatp.commands.frame import complain, example
 from ccatp.errors import ConfigError
 
 if TYPE_CHECKING:

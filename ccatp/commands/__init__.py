@@ -1,0 +1,1 @@
+"""The commands of ``ccatp``, one file each; ``ccatp.cli`` gathers them."""
