@@ -149,11 +149,9 @@ class LegTracker:
         if self.phase is TURN:
             angle = self._bearing_error(pose, target, creep)
             rate = None if speeds is None else speeds.omega_rad_s
-            if self._has_run_away(pose, target, angle):
-                if hypot(target[0] - pose[0], target[1] - pose[1]) <= ALL_BUT_THERE_M:
-                    self.phase = DONE
-                    return STILL
-                self._begin_alignment(pose, target, angle)
+            if self._angular.overtime_s >= 0.0 and self._has_run_away(pose, target, angle):
+                self.phase = DONE
+                return STILL
             if not self._angular.is_over(angle, self._heading_tolerance_rad, rate):
                 return Twist(0.0, self._angular.step(angle, dt_s, rate))
             self._begin_drive(pose, target)
@@ -167,7 +165,12 @@ class LegTracker:
         self._angular.begin(angle_rad)
 
     def _has_run_away(self, pose: tuple[float, float, float], target: tuple[float, float], angle_rad: float) -> bool:
-        """Whether the heading that the turn is for is no longer the one it began for; another frame is another aim."""
+        """Whether a stop that is all but reached lies on another bearing than the one that the turn began for.
+
+        In another frame there is another aim.
+        """
+        if hypot(target[0] - pose[0], target[1] - pose[1]) > ALL_BUT_THERE_M:
+            return False
         aimed_at, heading_rad = self._aim
         if target != aimed_at:
             self._aim = target, pose[2] + angle_rad
