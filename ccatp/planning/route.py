@@ -190,10 +190,10 @@ def _stops(
         )
         for arrival in best.path()
     ]
-    begins = [(start.x_m, start.y_m), *((stop.x_m, stop.y_m) for stop in ends[:-1])]
+    begins = [(start.x_m, start.y_m), *((stop.x_m, stop.y_m) for stop in ends)]
     # A heading that is off by 10 mrad misses by a centimetre after a metre: long legs are looked after on the way.
     return tuple(
-        part for begin, end in zip(begins, ends, strict=True) for part in in_parts(*begin, end, mission.longest_leg_m)
+        part for begin, end in zip(begins, ends, strict=False) for part in in_parts(*begin, end, mission.longest_leg_m)
     )
 
 
