@@ -4,11 +4,11 @@ from pathlib import Path
 
 from ccatp.drawing.shapes import Picture
 from ccatp.errors import CcatpError, ExitStatus
-from ccatp.picture_file import PictureError, write_figures, write_svg
-from ccatp.report_reader import read_record
+from ccatp.pictures.picture_file import PictureError, write_figures, write_svg
 from ccatp.reporting.compare_page import Pair, compare_figures, compare_page, pair_of
 from ccatp.reporting.findings import Findings, findings_of
 from ccatp.reporting.run_page import run_figures, run_page
+from ccatp.run_files.report_reader import read_record
 
 REPORT, COMPARISON = "report.html", "compare.html"
 

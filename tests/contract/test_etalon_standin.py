@@ -12,10 +12,10 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from ccatp import etalon_standin
 from ccatp.config.models import SimEtalonConfig
-from ccatp.etalon_standin import EtalonStandIn, FixedPuck, TruthSource, TruthUnavailable, ZmqPuck
 from ccatp.sim.etalon import PuckTruth
+from ccatp.stand_ins import etalon_standin
+from ccatp.stand_ins.etalon_standin import EtalonStandIn, FixedPuck, TruthSource, TruthUnavailable, ZmqPuck
 from ccatp.wire.multiline import ChannelData, parse_reply
 
 CHANNELS = (1, 2, 3, 4)
