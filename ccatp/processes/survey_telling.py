@@ -4,7 +4,7 @@ import structlog
 
 from ccatp.bus import Publisher
 from ccatp.localizer import Localizer
-from ccatp.processes.painting import Painter
+from ccatp.processes.painting import Painter, look_at_localizer
 from ccatp.processes.telling import Teller
 from ccatp.samples import Fix, PointId
 from ccatp.wire.topics import (
@@ -32,7 +32,7 @@ class SurveyTeller(Teller):
     def __init__(self, publisher: Publisher, log: structlog.typing.FilteringBoundLogger) -> None:
         """Start with empty batches."""
         super().__init__(publisher, log)
-        self._painter = Painter(publisher)
+        self._painter = Painter(publisher, look_at_localizer)
         self._track: list[tuple[int, float, int, int, float, float, float, float]] = []
 
     def frame(
