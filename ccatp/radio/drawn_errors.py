@@ -1,4 +1,4 @@
-"""Pure. The errors of a trilateration, drawn: its steps made again and again on ranges with errors, all draws at once."""
+"""Pure. The errors of a trilateration, drawn: its steps made again on ranges with errors, all draws at once."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -194,8 +194,8 @@ class _Rows:
     def curvature(self, x: FloatArray, P: FloatArray) -> FloatArray:
         """Covariance of what the rows leave out of second order, tr(A_k P_kl A_l P_lk) / 2, shape (m, m).
 
-        P_kl is the covariance of the ways of two pairs; A, the second derivative of a distance, is (1 - u u^T) / r across
-        the line of sight u (Jazwinski 1970, section 9.3). It stays the same however often a pair is measured.
+        P_kl is the covariance of the ways of two pairs; A, the second derivative of a distance, is (1 - u u^T) / r
+        across the line of sight u (Jazwinski 1970, section 9.3). Measuring a pair more often does not lessen it.
         """
         d = self._dimension
         points = x[self._at].reshape(-1, d)

@@ -39,8 +39,8 @@ class Consistency(NamedTuple):
     dof: int
 
     def is_in_band(self, share: float) -> bool:
-        low, high = chi2.ppf((0.5 - share / 2, 0.5 + share / 2), self.dof) / self.dof
-        return bool(low <= self.mean <= high)
+        low, high = (float(chi2.ppf(at, self.dof)) / self.dof for at in (0.5 - share / 2, 0.5 + share / 2))
+        return low <= self.mean <= high
 
 
 def after_phase_one(cfg: CricketConfig, seeds: range, draws: int) -> Consistency:
