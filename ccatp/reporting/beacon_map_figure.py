@@ -105,7 +105,8 @@ def beacon_map_figure(record: BeaconRecord, width: float) -> Picture:
 def _bounds(record: BeaconRecord) -> tuple[FloatArray, FloatArray]:
     size = np.array(record.cfg.workspace.size_m)
     places = [np.zeros((1, 2)), size[None]]
-    places += [np.array([ellipse[:2]]) for ellipse in record.beacons.values()]
+    for x, y, xx, xy, yy in record.beacons.values():
+        places.append(ellipse_m(np.array([x, y]), np.array(((xx, xy), (xy, yy)))))
     places += [np.array([place]) for place in record.places.values()]
     if record.truth is not None:
         places += [record.truth.place_m, record.truth.target_m]
