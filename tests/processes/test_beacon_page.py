@@ -16,9 +16,6 @@ from tests.processes.test_beacon_runs import BeaconRunProcess
 from tests.processes.test_dashboard_run import WITH_PAGE, ask
 from tests.processes.test_page import CHROMIUM, PATIENCE_MS, aborts_in_two_steps, browser_page, fits_a_phone
 
-# A short way home.
-NEAR = ("--set", "workspace.waypoints_m=[[0.8, 0.8], [1.4, 0.8], [1.4, 1.4], [0.8, 1.4]]")
-
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium: the page is not tried in a browser")
 
 
@@ -26,13 +23,13 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium: the page 
 def run(tmp_path: Path, runtime_dir: Path) -> Iterator[BeaconRunProcess]:
     config = ("--config", str(shipped_config_dir() / "zigbee.toml"))
     started = BeaconRunProcess(
-        tmp_path / "run", runtime_dir, *config, "--realtime", "--json", "--set", "mission.laps=50", *NEAR, *WITH_PAGE
+        tmp_path / "run", runtime_dir, *config, "--realtime", "--json", "--set", "mission.laps=50", *WITH_PAGE
     )
     yield started
     started.end()
 
 
-def test_an_operator_looks_and_aborts(run: BeaconRunProcess) -> None:
+def test_an_operator_looks_aborts_and_stops(run: BeaconRunProcess) -> None:
     run.until(lambda status: status["done"] >= 1)
     port = load_radio_config(run.run_dir / "config.toml").dashboard.port
     requests: list[str] = []
@@ -45,12 +42,14 @@ def test_an_operator_looks_and_aborts(run: BeaconRunProcess) -> None:
         status, _ = ask(port, "GET", "/healthz")
         assert status == 200
         aborts_in_two_steps(page)
-        assert run.wait() == 3, run.stderr
-        expect(page.locator("#ended")).to_contain_text("The daemon has ended: aborted, at base")
+        expect(page.locator("#state")).to_contain_text("returning")
+        page.locator("#stop").click()
+        assert run.wait() == 4, run.stderr
+        expect(page.locator("#ended")).to_contain_text("The daemon has ended: stopped")
         expect(page.locator("#ended")).to_contain_text(re.compile(r"\d+ of 200 waypoints reached"))
     assert {urlsplit(asked).netloc for asked in requests} == {f"127.0.0.1:{port}"}, "asked elsewhere"
     assert errors == []
-    assert json.loads(run.stdout)["outcome"] == "aborted, at base"
+    assert json.loads(run.stdout)["outcome"] == "stopped"
     assert f"report  {run.run_dir / 'report.html'}" in run.stderr
     assert "Waypoints among ZigBee beacons" in (run.run_dir / "report.html").read_text()
 
