@@ -16,6 +16,7 @@ from ccatp.radio.tdoa import MoteRange
 from ccatp.radio.trilateration import DegenerateStep, Sketch, Step
 from ccatp.radio.unfolding import classical_scaling
 
+_FLAT = 4.0  # of range errors that may make a flat beginning look high
 _CLIQUES = 4000  # first motes looked at; the best of them begins the map
 
 
@@ -143,6 +144,13 @@ def _seed(network: RangeNetwork, means: PairMeans, sketch: Sketch) -> None:
         shape = "triangle" if d == 2 else "tetrahedron"
         raise DegenerateStep(f"no {shape} of motes with ranges between all of them: trilateration has no beginning")
     names = [network.names[mote] for mote in best]
+    longest_m = float(_distances(means, best).max())
+    # A simplex that is flat looks as high as this by the errors of its ranges alone.
+    if best_height_m**2 < _FLAT * longest_m * max(sigma for _, sigma in _sides(means, best)):
+        raise DegenerateStep(
+            f"{', '.join(names)}: the best motes to begin with lie {'in a line' if d == 2 else 'in a plane'}, or "
+            "nearly: trilateration has no beginning"
+        )
     rows = [MoteRange(names[a], names[b], *_between(means, best[a], best[b])) for a, b in combinations(range(d + 1), 2)]
     model = MapModel(build_network(rows, d, names))
     start = classical_scaling(_distances(means, best), d)
@@ -155,6 +163,11 @@ def _height(means: PairMeans, motes: tuple[int, ...]) -> float:
     """Least width of a simplex, m: its smallest extent along a principal axis."""
     points = classical_scaling(_distances(means, motes), len(motes) - 1)
     return float(np.linalg.svd(points, compute_uv=False)[-1])
+
+
+def _sides(means: PairMeans, motes: tuple[int, ...]) -> list[tuple[float, float]]:
+    """Range and sigma of every two of some motes."""
+    return [_between(means, a, b) for a, b in combinations(motes, 2)]
 
 
 def _distances(means: PairMeans, motes: tuple[int, ...]) -> FloatArray:
