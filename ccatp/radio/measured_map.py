@@ -108,10 +108,10 @@ def map_measured(
     places, covariance = _framed(found, motes, true_m)
     at_found = MapModel(found.network, with_offset=model.with_offset, with_scale=model.with_scale)
     error_m = None if true_m is None else aligned_rms_m(places, true_m, mirrors=True)
-    expected_m = map_rms_m(found.covariance_m2, found.positions_m, motes, aligned=True)
+    expected_m: float | None = map_rms_m(found.covariance_m2, found.positions_m, motes, aligned=True)
     bound_m = bound_rms_m(at_found, found.positions_m, motes, aligned=True)
     warnings = [*_disagreeing(network), *folds.warnings, *found.warnings]
-    if _is_flat(expected_m, places) or (bound_m is not None and _is_flat(bound_m, places)):
+    if any(_is_flat(error, places) for error in (expected_m, bound_m)):
         # Derivatives at a place where they vanish: what comes out is a huge number, and means that nothing is known.
         expected_m, bound_m = None, None
         warnings.append(f"the motes lie {'in a line' if network.dimension == 2 else 'in a plane'}, or nearly: {_FLAT}")
@@ -135,9 +135,9 @@ def map_measured(
     return MeasuredMap(names, places, covariance, true_m, data)
 
 
-def _is_flat(error_m: float, places_m: FloatArray) -> bool:
+def _is_flat(error_m: float | None, places_m: FloatArray) -> bool:
     """Whether an error expected is larger than the map itself."""
-    return error_m > float(np.linalg.norm(np.ptp(places_m, axis=0)))
+    return error_m is not None and error_m > float(np.linalg.norm(np.ptp(places_m, axis=0)))
 
 
 def _disagreeing(network: RangeNetwork) -> Iterator[str]:
