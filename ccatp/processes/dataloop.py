@@ -7,7 +7,6 @@ import sys
 
 import structlog
 
-from ccatp.beacon_server import serve_beacons
 from ccatp.body_file import FILE
 from ccatp.config.models import Config
 from ccatp.config.radio_models import RadioConfig
@@ -64,6 +63,8 @@ def main() -> int:
 
 
 def _among_beacons(args: BeaconArgs) -> int:
+    from ccatp.beacon_server import serve_beacons  # noqa: PLC0415 - a survey starts sooner without it
+
     if not args.is_realtime:
         spinning.leave_a_core(os.getppid())
 
@@ -120,6 +121,8 @@ def run_alone(cfg: Config, lockstep: bool, faults: FaultPlan | None = None) -> i
 
 def run_beacons_alone(cfg: RadioConfig, lockstep: bool) -> int:
     """The same of a robot among beacons."""
+    from ccatp.beacon_server import serve_beacons  # noqa: PLC0415 - a survey starts sooner without it
+
     truth = Endpoints(make_runtime_dir(cfg.processes.runtime_dir, os.environ)).of("puck")
     listener = _listener(cfg.sim.robot.host, cfg.sim.robot.port)
     _say_where(cfg.system, listener, truth)

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ccatp.filters.ekf_slam import EkfSlam, Update
 from ccatp.radio.range_network import FloatArray, MappingError
@@ -78,7 +78,7 @@ class MoteMapper:
         self._prior = mean.copy(), covariance.copy(), np.diag((settings.offset_sigma_m**2, settings.scale_sigma**2))
         self._filter = self._at_prior()
         self._settings = settings
-        self._gate = float(chi2.ppf(settings.gate_probability, 1))
+        self._gate = float(chdtri(1, 1.0 - settings.gate_probability))
         self._count = count
         self._pairs: dict[tuple[int, int], tuple[float, float]] = {}  # sum of z / sigma^2, sum of 1 / sigma^2
 
