@@ -7,10 +7,10 @@ import structlog
 
 from ccatp.beacon_assembly import TrackRow, track_row
 from ccatp.beacon_mission.mission import Arrival, BeaconMission
-from ccatp.beacon_mission.navigator import Ellipse
+from ccatp.beacon_mission.navigator import Ellipse, Navigator
 from ccatp.bus import Publisher
 from ccatp.config.radio_models import RadioConfig
-from ccatp.processes.painting import Painter, look_at_navigator
+from ccatp.processes.painting import Look, Painter
 from ccatp.processes.telling import Teller
 from ccatp.wire.topics import (
     BeaconArrival,
@@ -160,3 +160,12 @@ class BeaconTeller(Teller):
 
 def _kind(name: str, cfg: RadioConfig) -> tuple[str]:
     return ("target" if cfg.follow.is_active and name == cfg.follow.target else "beacon",)
+
+
+def look_at_navigator(navigator: Navigator) -> Look:
+    """The pose among beacons; how readings agree is told with the map, as a sum over many of them."""
+    belief = navigator.belief
+    x_m, y_m, *covariance = belief.ellipse
+    xx, xy, yy = covariance
+    sigma_rad = float(max(belief.covariance[2, 2], 0.0)) ** 0.5
+    return Look(x_m, y_m, belief.pose[2], (xx, xy, yy), sigma_rad, 0.0, 0)

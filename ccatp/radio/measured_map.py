@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from ccatp.config.cricket_models import CricketConfig
 from ccatp.radio.fold_over import find_fold_over
@@ -148,7 +148,7 @@ def _disagreeing(network: RangeNetwork) -> Iterator[str]:
     weights = network.sigmas_m**-2.0
     means = np.bincount(place, weights * network.ranges_m) / np.bincount(place, weights)
     squares = np.bincount(place, weights * (network.ranges_m - means[place]) ** 2)
-    chances = chi2.sf(squares, np.maximum(np.bincount(place) - 1, 1))
+    chances = chdtrc(np.maximum(np.bincount(place) - 1, 1), squares)
     if not (bad := np.flatnonzero(chances < _CHANCE / len(found))).size:
         return
     worst = int(bad[np.argmax(squares[bad])])

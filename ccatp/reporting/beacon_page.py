@@ -5,7 +5,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ccatp.drawing.shapes import Picture
 from ccatp.reporting.beacon_figures import beacon_error_figure, consistency_figure, map_error_figure, target_figure
@@ -248,7 +248,7 @@ def _consistency_section(record: BeaconRecord) -> Section | None:
     if readings:
         size = sum(reading.size for reading in readings)
         mean = sum(reading.nis for reading in readings) / size
-        low, high = (float(bound) / size for bound in (chi2.ppf(at, size) for at in (0.5 - _BAND / 2, 0.5 + _BAND / 2)))
+        low, high = (float(bound) / size for bound in (chdtri(size, at) for at in (0.5 + _BAND / 2, 0.5 - _BAND / 2)))
         band = f"<small>95 % band {low:.3f} to {high:.3f} of {size} readings</small>"
         values["mean NIS"] = f"{mean:.3f} {band}"
         values["readings refused"] = text(record.maps[-1].refused)

@@ -8,7 +8,8 @@ from ccatp.bus import Publisher, Subscriber
 from ccatp.config.models import Config
 from ccatp.localizer import build_localizer
 from ccatp.mirror.mirror import build_mirror
-from ccatp.processes.painting import Painter, look_at_localizer
+from ccatp.processes.painting import Painter
+from ccatp.processes.survey_telling import look_at_localizer
 from ccatp.wire.topics import Picture
 
 LINE = b'{"type":"sensors"}'
