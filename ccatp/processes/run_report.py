@@ -26,7 +26,7 @@ def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.Fi
     from ccatp.run_files.run_reader import RunReadError  # noqa: PLC0415
 
     try:
-        return str(report_run(run_dir)[0])
+        return str(report_run(run_dir).path)
     except RunReadError as error:
         return f"none; {error}"
     except Exception as error:

@@ -23,7 +23,7 @@ SHORT = {
 class BeaconRunProcess(Run):
     """``ccatp run --sim`` of a mission among beacons."""
 
-    free_ports = ("--set", "sim.robot.port=0")
+    free_ports = ("--set", "sim.robot.port=0", "--set", "dashboard.enabled=false")
 
 
 Begin = Callable[..., BeaconRunProcess]

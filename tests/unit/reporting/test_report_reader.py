@@ -165,7 +165,7 @@ def test_no_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RunReadError, match=r"no config\.toml there; name the directory of a run"):
         read_record(tmp_path)
     (tmp_path / "config.toml").write_text('system = "cricket"\n')
-    with pytest.raises(RunReadError, match=r"a mission among beacons; reports are of surveys"):
+    with pytest.raises(RunReadError, match=r"a mission among beacons; this is for surveys"):
         read_record(tmp_path)
     (tmp_path / "config.toml").write_text("[run]\nspeed = 1\n")
     with pytest.raises(ConfigError, match=r"run\.speed is unknown"):
