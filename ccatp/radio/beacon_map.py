@@ -58,6 +58,10 @@ class BeaconMap:
     def __getitem__(self, beacon: BeaconId) -> Entry:
         return self._entries[beacon]
 
+    def get(self, beacon: BeaconId) -> Entry | None:
+        """A beacon; None where it is not on the map."""
+        return self._entries.get(beacon)
+
     def join(self, beacon: BeaconId, mean: FloatArray, covariance: FloatArray) -> Entry:
         """A beacon that is correlated with nothing yet: mean (b,), covariance (b, b)."""
         self._append(beacon, mean, covariance)
