@@ -21,6 +21,7 @@ from ccatp.radio.readings import BeaconId, Reading
 from ccatp.radio.settling import derivatives
 from ccatp.radio.sightings import Sensors, bearing_of, kind_of, strength_of
 from ccatp.radio.slam_settings import SlamSettings, Wander
+from ccatp.radio.transport import Transport
 
 DELAY = "odometry_delay_s"
 
@@ -95,6 +96,7 @@ class BeaconSlam:
         self._names: tuple[str, ...] = (*self._motion.names, *self._sensors.names, *((DELAY,) if delay else ()))
         self._clock = DeadReckoning(is_delayed=bool(delay))
         self._map = BeaconMap(self.engine, self._shared)
+        self._transport = Transport(self.engine) if trust.transports else None
         self.levels = {
             k: NoiseLevel(trust.learn_prior, trust.learn_memory) for k in ("range", "bearing", "rssi", "motion")
         }
@@ -155,7 +157,9 @@ class BeaconSlam:
         rest = self._motion.at_rest(odometry) if isinstance(self._motion, DifferentialDrive) else None
         if rest is not None:
             residual = rest.value - float(engine.mean[rest.column])
+            corrected = engine.mean.copy()
             engine.update_row(np.array((rest.column,)), np.ones(1), residual, rest.variance)
+            self._follow(corrected)
 
     def observe(self, readings: Iterable[Reading]) -> list[Learned]:
         """Take readings of any beacons, one after the other; those of new ones begin their place on the map.
@@ -165,12 +169,18 @@ class BeaconSlam:
         """
         self.learned = []
         for reading in readings:
-            entry = self._map.get(reading.beacon)
+            entry, before = self._map.get(reading.beacon), self.engine.mean.copy()
             if entry is None:
                 self._newcomers.meet(reading)
             else:
                 self.learned.append(self._update(reading, entry))
+            self._follow(before)
         return self.learned
+
+    def _follow(self, before: FloatArray) -> None:
+        """The covariance follows a correction of the state."""
+        if self._transport is not None:
+            self._transport.follow(before)
 
     def remove(self, beacon: BeaconId) -> None:
         """Forget a beacon; one that is heard again begins anew.
