@@ -16,7 +16,7 @@ from collections import Counter, deque
 from math import inf, isfinite, log, sin, sqrt
 
 from ccatp.config.radio_models import RadioConfig
-from ccatp.hazards.abort_latch import AbortLatch, EmergencyKind, is_at_base_or_held
+from ccatp.hazards.abort_latch import HEARD_AFTER_FRAMES, AbortLatch, EmergencyKind, is_at_base_or_held
 from ccatp.hazards.echo_memory import EchoMemory
 from ccatp.samples import EventCode, Severity, Verdict
 from ccatp.wire.beacon_frame import BeaconFrame
@@ -54,7 +54,9 @@ class BeaconDanger:
         self._steer_rad = 0.0
         self._held_since_s: float | None = None
         self._is_vague = False
-        self._state = "idle"
+        self._state, self._state_seq = "idle", -1
+        self._frame_seq = -1
+        self._raised_seq = -HEARD_AFTER_FRAMES - 2  # the frame in which the newest emergency was raised
         self._code = _NORMAL
 
     # -- for the observatory --------------------------------------------------------------------------------------
@@ -66,12 +68,16 @@ class BeaconDanger:
 
     @property
     def at_base_or_held(self) -> bool:
-        """Whether main's newest estimate says so."""
-        return is_at_base_or_held(self._state)
+        """Whether main's newest estimate says so; see ``DangerMonitor.at_base_or_held``."""
+        return self._state_seq > self._raised_seq + HEARD_AFTER_FRAMES and is_at_base_or_held(self._state)
 
     def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
         """Latch an emergency; returns why it was refused, or None."""
-        return self.latch.raise_emergency(kind, emergency_id, note)
+        before = self.latch.newest
+        refusal = self.latch.raise_emergency(kind, emergency_id, note)
+        if self.latch.newest is not before:
+            self._raised_seq = self._frame_seq
+        return refusal
 
     def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
         """End an emergency; returns why it was refused, or None."""
@@ -87,11 +93,12 @@ class BeaconDanger:
             extras: its keys of a robot among beacons.
             estimate: main's newest.
         """
+        self._frame_seq = sensors.seq
         self._hear(sensors.t, extras)
         self._roll(sensors, extras)
         self._echoes.see(sensors.t, extras.distances)
         if estimate is not None:
-            self._state = estimate.state
+            self._state, self._state_seq = estimate.state, estimate.seq
         hold = self._hold(sensors.t, estimate)
         if hold is not None:
             verdict = self._held(sensors, *hold)

@@ -21,7 +21,7 @@ from math import isfinite
 from typing import NamedTuple, Protocol
 
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
-from ccatp.hazards.abort_latch import AbortLatch, EmergencyKind, is_at_base_or_held
+from ccatp.hazards.abort_latch import HEARD_AFTER_FRAMES, AbortLatch, EmergencyKind, is_at_base_or_held
 from ccatp.hazards.edge_episode import Episode, Phase
 from ccatp.hazards.edge_map import EdgeMap, MirrorMap
 from ccatp.hazards.edge_rule import EdgeRule, PoseEstimate
@@ -133,6 +133,7 @@ class DangerMonitor:
         self._edge_t_s: float | None = None
         self._state = ""
         self._known: Estimate | None = None
+        self._raised_seq = -HEARD_AFTER_FRAMES - 1  # the frame in which the newest emergency was raised
         self._time.reset()
         self._is_climbing = False
         if self._board is not None:
@@ -144,7 +145,11 @@ class DangerMonitor:
 
     def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
         """Latch an emergency; returns why it was refused, or None. The same id again is harmless."""
-        return self.latch.raise_emergency(kind, emergency_id, note)
+        before = self.latch.newest
+        refusal = self.latch.raise_emergency(kind, emergency_id, note)
+        if self.latch.newest is not before:
+            self._raised_seq = self.verdict.seq
+        return refusal
 
     def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
         """End an emergency; returns why it was refused, or None."""
@@ -156,7 +161,13 @@ class DangerMonitor:
 
     @property
     def at_base_or_held(self) -> bool:
-        """Whether main's newest estimate, if it was fresh in the last frame, says so."""
+        """Whether main's newest estimate, if it was fresh in the last frame, says so.
+
+        What main said before it heard of the newest emergency does not count.
+        """
+        known = self._known
+        if known is None or known.seq <= self._raised_seq + HEARD_AFTER_FRAMES:
+            return False
         return is_at_base_or_held(self._state)
 
     @property

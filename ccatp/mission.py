@@ -197,6 +197,11 @@ class Mission:
         self._standing.doubts_pose = value
 
     @property
+    def wants_calibration(self) -> bool:
+        """The calibration drive was given up: the robot was held, and found again elsewhere."""
+        return self._standing.wants_calibration
+
+    @property
     def wants_full_fans(self) -> bool:
         """Something happened after which the robot shall be pressed on with all that the fans have."""
         return self._standing.wants_full_fans

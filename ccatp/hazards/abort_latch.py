@@ -6,6 +6,8 @@ from enum import StrEnum
 # An observatory has a handful at a time; a peer that floods the latch must not fill the memory.
 MAX_ACTIVE = 256
 MAX_CLEARED = 1024
+# Main acts on a verdict in the frame after it at the latest; what it says of a frame later than that knows of it.
+HEARD_AFTER_FRAMES = 2
 # The mission's states (``ccatp.surveying.states``) in which the robot stands at base or is held.
 AT_BASE_OR_HELD = frozenset({"idle", "held", "done"})
 

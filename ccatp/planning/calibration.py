@@ -1,6 +1,7 @@
 """Pure. The calibration drive: back and forth at base with a fix at each end, before the survey begins."""
 
-from math import cos, sin
+from collections.abc import Sequence
+from math import cos, hypot, sin
 
 from ccatp.config.models import MissionConfig, RobotConfig
 from ccatp.mirror.mirror import Mirror
@@ -10,6 +11,7 @@ from ccatp.samples import DeckPose, Stop, StopKind
 
 _SHORTEST_M = 0.08  # a leg shorter than this teaches less than it costs
 _STEP_M = 0.02
+_BESIDE_M = 0.03  # so far beside its line a drive can still go on
 
 
 def plan_calibration(mirror: Mirror, robot: RobotConfig, mission: MissionConfig, base: DeckPose) -> tuple[Stop, ...]:
@@ -58,3 +60,19 @@ def _room_m(mirror: Mirror, base: DeckPose, cx: float, cy: float, depth_m: float
             break
         way_m = step_m
     return way_m
+
+
+def is_on_drive(stops: Sequence[Stop], x_m: float, y_m: float) -> bool:
+    """Whether a calibration drive can go on from a place: it lies on its line, where the robot may turn anywhere.
+
+    Args:
+        stops: a route with the drive's stops.
+        x_m, y_m: the place, deck frame.
+    """
+    ends = dict.fromkeys((stop.x_m, stop.y_m) for stop in stops if stop.kind is StopKind.CALIBRATE)
+    if len(ends) != 2:
+        return False
+    (ax, ay), (bx, by) = ends
+    dx, dy = bx - ax, by - ay
+    share = min(max(((x_m - ax) * dx + (y_m - ay) * dy) / (dx * dx + dy * dy), 0.0), 1.0)
+    return hypot(x_m - ax - share * dx, y_m - ay - share * dy) <= _BESIDE_M

@@ -29,6 +29,7 @@ from ccatp.surveying.states import PURPOSES, Outcome, State
 from ccatp.wire.robot import Hello, Sensors
 from ccatp.wire.topics import is_estimate_due
 
+GIVEN_UP = "the calibration drive is left out, as the robot was held elsewhere: slip and heading are learned on the way"
 EXIT_STATUS = {
     Outcome.COMPLETE: ExitStatus.COMPLETE,
     Outcome.AT_BASE: ExitStatus.ABORTED,
@@ -79,6 +80,7 @@ class SurveyWork:
         self._is_deaf = False
         self._state = State.IDLE
         self._motion_now: Motion | None = None
+        self._has_told_calibration = False
         self._told: tuple[tuple[float, float, float, float], int] | None = None
         # An operator's commands are the mission's; so is what holds it.
         self.pause, self.resume, self.abort, self.stop = mission.pause, mission.resume, mission.abort, mission.stop
@@ -265,6 +267,9 @@ class SurveyWork:
             doubt = health.doubt_position_m, health.doubt_heading_rad
             self._localizer.doubt(*doubt)
             self._teller.treatment(sensors.seq, sensors.t, "doubted", doubt)
+        if mission.wants_calibration and not self._has_told_calibration:
+            self._has_told_calibration = True
+            self._teller.say("warning", GIVEN_UP)
         if mission.wants_full_fans:
             self._fans.press_on()  # pressed on first, held then
         if mission.is_faulted:

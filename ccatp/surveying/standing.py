@@ -50,6 +50,7 @@ class Standing:
         is_off_route: the way back to the route has to be planned.
         is_review_due: the time budget has to be looked at.
         doubts_pose: the localizer shall doubt its pose.
+        wants_calibration: the calibration drive was given up, too far from where it leads.
         wants_full_fans: the robot shall be pressed on with all that the fans have.
         retreat: the retreat from an edge under way.
         stuck_s: when a retreat led nowhere, robot time.
@@ -78,6 +79,7 @@ class Standing:
         self.is_held_by_hand = self.is_faulted = self.is_hold_deaf = False
         self.is_lost = self.is_at_start = cfg.mission.fix_at_start
         self.is_off_route = self.is_review_due = self.doubts_pose = self.wants_full_fans = False
+        self.wants_calibration = False
         self.retreat: Retreat | None = None
         self.stuck_s: float | None = None
         self.backoffs = 0

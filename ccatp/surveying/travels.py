@@ -1,6 +1,7 @@
 """Pure. What the robot does in each state of a survey: legs, coming to rest, standing, the retreat, the way home."""
 
 from ccatp.control.tracker import DONE, DRIVE
+from ccatp.planning.calibration import is_on_drive
 from ccatp.planning.errors import PlanError
 from ccatp.samples import PointId, Stop, StopKind, Verdict
 from ccatp.surveying.budget import TimeBudget
@@ -130,13 +131,19 @@ class Travels:
 
     def _find_route(self, motion: Motion) -> Order:
         """Plan anew from where the robot is; one frame of standing still, however long that takes."""
-        standing = self._standing
+        standing, stop = self._standing, self._standing.survey.current
+        deck = motion.deck
+        if stop is not None and stop.kind is StopKind.CALIBRATE:
+            if is_on_drive(standing.survey.stops, deck.x_m, deck.y_m):
+                standing.is_off_route = False  # what was measured of the drive is not lost, and the rest of it follows
+                return STAND
+            standing.wants_calibration = True
         due = standing.leftovers.chunk
         try:
             if due and self._plan_points is not None:
-                standing.route = self._plan_points(motion.deck, due)
+                standing.route = self._plan_points(deck, due)
             else:
-                standing.route = self._plan_rest(standing.route, motion.deck, {*standing.done, *standing.skipped})
+                standing.route = self._plan_rest(standing.route, deck, {*standing.done, *standing.skipped})
         except PlanError as error:
             standing.fault(f"no way on: {error}")
             return STAND

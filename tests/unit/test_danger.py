@@ -588,6 +588,19 @@ def test_mains_state_tells_whether_an_emergency_may_be_cleared(on_panel: Story) 
     assert not on_panel.monitor.at_base_or_held
 
 
+def test_what_main_said_before_an_emergency_does_not_clear_it(on_panel: Story) -> None:
+    on_panel.state = "held"
+    on_panel.run(5)
+    assert on_panel.monitor.emergency("fire", "a") is None
+    assert not on_panel.monitor.at_base_or_held  # it may have been told to go on meanwhile
+    on_panel.run(2)
+    assert not on_panel.monitor.at_base_or_held
+    on_panel.run(3)
+    assert on_panel.monitor.at_base_or_held
+    assert on_panel.monitor.emergency("fire", "a") is None  # repeated, it is no other one
+    assert on_panel.monitor.at_base_or_held
+
+
 # -- map and odometry -------------------------------------------------------------------------------------------------
 
 
