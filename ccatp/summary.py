@@ -6,7 +6,7 @@ the rows were cut into batches: the same run gives the same file. What needs the
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -186,6 +186,26 @@ class SummaryBuilder:
     def set_wall(self, time_s: float) -> None:
         """Wall time of the run."""
         self._wall_s = time_s
+
+    def precede(self, earlier: "SummaryBuilder") -> None:
+        """Take in a session of the same mission that ended before this one began: one summary tells of both.
+
+        Points and those left out are as the later session says; the bound is that of the whole way, which the earlier
+        one began.
+        """
+        earlier._settle(is_over=True)
+        if earlier._facts.lower_bound_s > 0.0:
+            self._facts = replace(self._facts, lower_bound_s=earlier._facts.lower_bound_s)
+        self._mission_time_s += earlier._mission_time_s
+        self._arrivals = {
+            **earlier._arrivals,
+            **{k: v for k, v in self._arrivals.items() if k not in earlier._arrivals},
+        }
+        self._errors = [*earlier._errors, *self._errors]
+        self._true_edges += earlier._true_edges
+        self._false_edges += earlier._false_edges
+        self._falls += earlier._falls
+        self._overrun_m = max(self._overrun_m, earlier._overrun_m)
 
     @property
     def unresolved(self) -> int:

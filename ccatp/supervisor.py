@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import socket
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -12,6 +13,7 @@ from datetime import UTC, datetime
 from fcntl import LOCK_EX, LOCK_NB, flock
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import zmq
 
@@ -34,7 +36,7 @@ from ccatp.robot_link import read_key
 from ccatp.run_options import RunOptions, default_run_dir
 from ccatp.runtime_dir import make_runtime_dir
 from ccatp.service_notify import take_from
-from ccatp.unfinished import find_unfinished, forget_finished, note_unfinished
+from ccatp.unfinished import find_unfinished, finished_summary, forget_finished, note_unfinished
 from ccatp.wire.topics import Presence
 
 POLL_MS = 20
@@ -147,6 +149,8 @@ def run_survey(options: RunOptions) -> int:
             cfg = cfg.model_copy(update={"dashboard": page.config})
         run_dir = _make_run_dir(options, cfg)
         stack.enter_context(_lock(run_dir / ".lock", "--run-dir"))
+        if options.resume and (done := finished_summary(run_dir)) is not None:
+            return _tell_finished(done, run_dir, as_json=options.json_output)
         (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
         (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
         if options.faults_file is not None:
@@ -262,6 +266,15 @@ def _make_run_dir(options: RunOptions, cfg: Config) -> Path:
     if options.resume:
         _check_resumed(run_dir, cfg)
     return _made(run_dir)
+
+
+def _tell_finished(summary: dict[str, Any], run_dir: Path, *, as_json: bool) -> int:
+    """Nothing is left of a mission: what is known of it stays as it is."""
+    if as_json:
+        print(json.dumps(summary))
+    count = summary["points"]["total"]
+    print(f"nothing left to do: all {count} points of {run_dir} are measured", file=sys.stderr)
+    return ExitStatus.COMPLETE
 
 
 def _check_resumed(run_dir: Path, cfg: Config) -> None:

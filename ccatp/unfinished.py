@@ -1,7 +1,9 @@
 """Edge. The run that has not finished, by name: what a service that is started again goes on with."""
 
+import json
 import os
 from pathlib import Path
+from typing import Any
 
 from ccatp.errors import ConfigError, ExitStatus
 
@@ -24,6 +26,17 @@ def find_unfinished() -> Path | None:
         raise ConfigError(f"--recover: cannot read {FILE}: {error}; remove it to begin a new run") from error
     run_dir = Path(text)
     return run_dir if text and (run_dir / "mission.sqlite").exists() else None
+
+
+def finished_summary(run_dir: Path) -> dict[str, Any] | None:
+    """The summary of a mission of which every point is measured, ``None`` for any other."""
+    try:
+        summary = json.loads((run_dir / "summary.json").read_text(encoding="utf-8"))
+        points = summary["points"]
+        is_finished = points["measured"] == points["total"] > 0
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return summary if is_finished else None
 
 
 def note_unfinished(run_dir: Path) -> None:

@@ -16,14 +16,27 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.planning.traversal import ORDERS
 from ccatp.processes.collecting import Collector
 from ccatp.processes.common import Endpoints
+from ccatp.run_files.recorder import iter_messages, recordings
 from ccatp.samples import PanelId, PanelPose, PointId
 from ccatp.storage.store import MissionStore
 from ccatp.summary import RunFacts, SummaryBuilder, puck_targets
 from ccatp.viewing.views import Views
-from ccatp.wire.topics import Arrival, DangerEvent, Message, MissionStatus, Presence, Timing, Track, Truth
+from ccatp.wire.topics import (
+    Arrival,
+    DangerEvent,
+    Message,
+    MissionStatus,
+    Presence,
+    Timing,
+    Track,
+    Truth,
+    unpack,
+)
 
 # A panel's plane has three parameters; the fit says so too, this saves the attempt.
 MIN_FIXES = 3
+# What a summary is made of; a recording holds twenty times as much.
+SUMMARISED = {"mission", "track", "truth", "arrival", "danger_event"}
 
 
 NO_STATUS = MissionStatus(
@@ -97,6 +110,13 @@ class RunCollector(Collector):
         return self._views.of(message)
 
     def _begin(self, status: MissionStatus) -> SummaryBuilder:
+        self._builder = builder = self._builder_for(status)
+        for message in self._early:
+            self._add(builder, message)
+        self._early.clear()
+        return builder
+
+    def _builder_for(self, status: MissionStatus) -> SummaryBuilder:
         cfg = self._cfg
         points = ORDERS[cfg.run.order](self._mirror, cfg.run.panels)
         facts = RunFacts(
@@ -111,11 +131,7 @@ class RunCollector(Collector):
             has_truth=self._is_sim,
         )
         targets = puck_targets(self._mirror, points, cfg.robot.puck_height_m)
-        self._builder = builder = SummaryBuilder(facts, targets, self._mirror.surface.normal)
-        for message in self._early:
-            self._add(builder, message)
-        self._early.clear()
-        return builder
+        return SummaryBuilder(facts, targets, self._mirror.surface.normal)
 
     def _add(self, builder: SummaryBuilder, message: Message) -> None:
         if isinstance(message, Truth):
@@ -158,7 +174,30 @@ class RunCollector(Collector):
             {panel: (fit.piston_m, fit.tip_rad, fit.tilt_rad) for panel, fit in self._fits().items()}, self._injected
         )
         builder.set_wall(wall_s)
+        sessions = [self._earlier(path) for path in recordings(self._run_dir / "telemetry.mcap")[:-1]]
+        for session in reversed([session for session in sessions if session is not None]):
+            builder.precede(session)
         return builder.build()
+
+    def _earlier(self, path: Path) -> SummaryBuilder | None:
+        """What an earlier session of the mission left in its recording; nothing where it never said where it stood."""
+        builder: SummaryBuilder | None = None
+        early: list[Message] = []
+        for recorded in iter_messages(path):
+            if recorded.topic not in SUMMARISED:
+                continue
+            _, _, message = unpack(recorded.topic.encode() + b" " + recorded.payload)
+            if not isinstance(message, Message):
+                continue
+            if builder is None and isinstance(message, MissionStatus):
+                builder = self._builder_for(message)
+                for one in early:
+                    self._add(builder, one)
+            if builder is None:
+                early.append(message)
+            else:
+                self._add(builder, message)
+        return builder
 
     def _fits(self) -> dict[PanelId, PanelFit]:
         path = self._run_dir / "mission.sqlite"

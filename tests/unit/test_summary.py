@@ -233,3 +233,29 @@ def test_the_table_is_short_and_has_every_figure(builder: SummaryBuilder) -> Non
     assert "points                 total 693  measured 0" in text
     assert "mean -" in text
     assert "within_budget yes" in text
+
+
+def test_a_mission_in_two_sessions_has_one_summary(mirror: Mirror) -> None:
+    first, second = make(mirror, lower_bound_s=50.0), make(mirror, lower_bound_s=20.0)
+    other = PointId(5, 5, 4)
+    places = {point: mirror.point_on_deck(point) for point in (POINT, other)}
+    truth, track = tables(40)
+    first.add_truth([truth_row(mirror, 1, *places[POINT], clearance=-0.002)])
+    first.add_arrival(POINT, 1)
+    first.add_verdict_event(1, 1)
+    first.set_mission(1, 0, 30.0)
+    second.add_truth(truth[:20])  # its frames are counted anew
+    second.add_track(track[:20])
+    second.add_truth([truth_row(mirror, 30, 0.3, 0.3), truth_row(mirror, 31, *places[other])])
+    second.add_arrival(POINT, 30)  # approached once more: the first time counts
+    second.add_arrival(other, 31)
+    second.set_mission(2, 0, 25.0)
+    alone = second.build()
+    second.precede(first)
+    both = second.build()
+    assert alone["points"]["first_arrival_within_10mm"] == 1
+    assert (both["points"]["measured"], both["points"]["first_arrival_within_10mm"]) == (2, 2)
+    assert both["arrival_error_mm"]["max"] < 0.01
+    assert (both["mission_time_s"], both["lower_bound_s"]) == (55.0, 50.0)
+    assert both["danger"] == {"true_edges": 1, "false_edges": 0, "falls": 0, "max_overrun_mm": 2.0}
+    assert both["localization_error_mm"] == alone["localization_error_mm"]

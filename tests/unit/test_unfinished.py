@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ccatp.errors import ConfigError, ExitStatus
-from ccatp.unfinished import FILE, find_unfinished, forget_finished, note_unfinished
+from ccatp.unfinished import FILE, find_unfinished, finished_summary, forget_finished, note_unfinished
 
 
 @pytest.fixture(autouse=True)
@@ -48,3 +48,20 @@ def test_a_note_that_cannot_be_read_or_written(tmp_path: Path) -> None:
     FILE.parent.write_text("")
     with pytest.raises(ConfigError, match="--recover: cannot write"):
         note_unfinished(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "is_finished"),
+    [
+        ('{"points": {"measured": 9, "total": 9}}', True),
+        ('{"points": {"measured": 8, "total": 9}}', False),
+        ('{"points": {"measured": 0, "total": 0}}', False),
+        ('{"points": {"measured": 9', False),
+        ('{"points": 9}', False),
+        ("[]", False),
+    ],
+)
+def test_a_mission_is_finished_when_its_summary_says_so(text: str, is_finished: bool, tmp_path: Path) -> None:
+    assert finished_summary(tmp_path) is None
+    (tmp_path / "summary.json").write_text(text)
+    assert (finished_summary(tmp_path) is not None) is is_finished
