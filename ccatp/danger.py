@@ -275,20 +275,28 @@ class DangerMonitor:
             cause = "all edge sensors off: lifted or fallen"
             found.append(Finding(Severity.HOLD, cause, "edge", 4.0, 3.0, full_fans=True, patience_s=limit_s))
         for i, episode in enumerate(self._edges.episodes):
-            if episode is not None and self._stays_off(episode):
+            if episode is not None and self._stays_off(i, episode):
                 cause = "an edge sensor stays off though it was moved back and the others are on"
                 limit_m = self._health.stuck_off_m
                 found.append(Finding(Severity.HOLD, cause, CORNERS[i].value, episode.retreat_m, limit_m))
         return found
 
-    def _stays_off(self, episode: Episode) -> bool:
+    def _stays_off(self, sensor: int, episode: Episode) -> bool:
         """Once that is so, it stays so until the sensor has been on for long enough to end the episode."""
         if episode.phase is not Phase.DECLARED or self._health is None:
             return False
         if not episode.is_doubted and episode.retreat_m >= self._health.stuck_off_m:
             others = (e is None or e is episode or e.is_on for e in self._edges.episodes)
-            episode.is_doubted = all(others)
+            episode.is_doubted = all(others) and not self._is_over_rim(sensor)
         return episode.is_doubted
+
+    def _is_over_rim(self, sensor: int) -> bool:
+        """Whether a sensor is beyond the rim by the map, so that being off is what it should be."""
+        known = self._known
+        if known is None:
+            return False
+        pose = known.x_m, known.y_m, known.heading_rad
+        return self._map.is_beyond_rim(self._map.place(pose, self._sensors_m[sensor]))
 
     def _climb(self, t_s: float, found: list[Finding]) -> list[Finding]:
         self._is_climbing = bool(found)

@@ -11,6 +11,7 @@ from ccatp.radio.tdoa import MoteRange
 PLAIN = ("first", "second", "range_m")
 SESSION = ("session", "pos", "deg", "anchor", "tag", "mean_m")
 PLACES = ("name", "x_m", "y_m")
+LONGEST_M = 1e6
 
 
 class RangeFileError(MappingError):
@@ -116,8 +117,9 @@ def _name(path: Path, line: int, key: str, text: str) -> str:
 
 
 def _checked(path: Path, line: int, reading: MoteRange) -> MoteRange:
-    if not 0.0 <= reading.range_m < float("inf"):
-        raise RangeFileError(f"{path}:{line}: range of {reading.range_m:g} m is no distance")
+    if not 0.0 < reading.range_m <= LONGEST_M:
+        what = "is no distance" if not reading.range_m > 0.0 else f"is more than the {LONGEST_M:g} m that beacons reach"
+        raise RangeFileError(f"{path}:{line}: range of {reading.range_m:g} m {what}; in metres, between two places")
     if not 0.0 < reading.sigma_m < float("inf"):
         raise RangeFileError(f"{path}:{line}: sigma of {reading.sigma_m:g} m, must be positive")
     if reading.first == reading.second:

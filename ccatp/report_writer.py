@@ -1,14 +1,19 @@
 """Edge. Writes the report of a run, and the one of two runs beside each other: a page, and figures where asked for."""
 
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from ccatp.drawing.shapes import Picture
 from ccatp.errors import CcatpError, ExitStatus
-from ccatp.picture_file import PictureError, write_figures, write_svg
-from ccatp.report_reader import read_record
+from ccatp.pictures.picture_file import PictureError, write_figures, write_svg
+from ccatp.reporting.beacon_page import beacon_data, beacon_figures, beacon_page
 from ccatp.reporting.compare_page import Pair, compare_figures, compare_page, pair_of
-from ccatp.reporting.findings import Findings, findings_of
+from ccatp.reporting.data import run_data
+from ccatp.reporting.findings import findings_of
 from ccatp.reporting.run_page import run_figures, run_page
+from ccatp.run_files.beacon_report_reader import read_beacon_record
+from ccatp.run_files.report_reader import is_beacon_run, read_record
 
 REPORT, COMPARISON = "report.html", "compare.html"
 
@@ -19,7 +24,21 @@ class ReportError(CcatpError):
     exit_status = ExitStatus.USAGE
 
 
-def report_run(run_dir: Path, out: Path | None = None, figures: Path | None = None) -> tuple[Path, Findings]:
+class Report(NamedTuple):
+    """A report that was written.
+
+    Attributes:
+        path: of the page.
+        data: its figures.
+        warnings: what of the run is damaged, one line each.
+    """
+
+    path: Path
+    data: dict[str, Any]
+    warnings: tuple[str, ...]
+
+
+def report_run(run_dir: Path, out: Path | None = None, figures: Path | None = None) -> Report:
     """Write the report of a run.
 
     Args:
@@ -27,21 +46,25 @@ def report_run(run_dir: Path, out: Path | None = None, figures: Path | None = No
         out: the page; ``report.html`` in the run directory if not given.
         figures: a directory for the figures as SVG, PNG and PDF; none are written if not given.
 
-    Returns:
-        The page's path, and what is in it.
-
     Raises:
         RunReadError: no run there.
         ConfigError: its configuration cannot be used.
         ReportError: the page cannot be written.
         PictureError: a figure cannot be written, or matplotlib is not installed.
     """
-    found = findings_of(read_record(run_dir))
     path = out or run_dir / REPORT
-    write_page(run_page(found), path)
+    if is_beacon_run(run_dir):
+        record = read_beacon_record(run_dir)
+        markup, data, pictures = beacon_page(record), beacon_data(record), partial(beacon_figures, record)
+        warnings = record.warnings
+    else:
+        found = findings_of(read_record(run_dir))
+        markup, data, pictures = run_page(found), run_data(found), partial(run_figures, found)
+        warnings = found.record.warnings
+    write_page(markup, path)
     if figures is not None:
-        write_pictures(run_figures(found), figures)
-    return path, found
+        write_pictures(pictures(), figures)
+    return Report(path, data, warnings)
 
 
 def compare_runs(run_a: Path, run_b: Path, out: Path, figures: Path | None = None) -> Pair:

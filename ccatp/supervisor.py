@@ -42,18 +42,21 @@ POLL_MS = 20
 LOCKSTEP_NICENESS = 10
 
 
+# First, so that it is there for the end of the others. It gets what time they leave, so it has a minute to speak.
+_DASHBOARD = ProcessSpec(
+    "dashboard",
+    "ccatp.processes.dashboard",
+    listens="dashboard",
+    is_loop=True,
+    is_needed=False,
+    niceness=15,
+    patience_s=60.0,
+)
+
+
 # In the order of starting; stopping is in the reverse order, so that main holds the wheels first.
 PROCESSES: tuple[ProcessSpec, ...] = (
-    # First, so that it is there for the end of the others. It gets what time they leave, so it has a minute to speak.
-    ProcessSpec(
-        "dashboard",
-        "ccatp.processes.dashboard",
-        listens="dashboard",
-        is_loop=True,
-        is_needed=False,
-        niceness=15,
-        patience_s=60.0,
-    ),
+    _DASHBOARD,
     ProcessSpec("dataloop", "ccatp.processes.dataloop", is_stand_in=True, listens="sim.robot", is_replaceable=False),
     ProcessSpec("etalon", "ccatp.processes.etalon", is_stand_in=True, listens="sim.etalon"),
     ProcessSpec("danger", "ccatp.processes.danger_loop", is_loop=True),
@@ -63,6 +66,7 @@ PROCESSES: tuple[ProcessSpec, ...] = (
 
 # No laser system: what is measured is measured by radio. A main loop that dies takes the map with it: held, and over.
 BEACON_PROCESSES: tuple[ProcessSpec, ...] = (
+    _DASHBOARD,
     ProcessSpec("dataloop", "ccatp.processes.dataloop", is_stand_in=True, listens="sim.robot", is_replaceable=False),
     ProcessSpec("danger", "ccatp.processes.danger_loop", is_loop=True),
     ProcessSpec("main", "ccatp.processes.main_loop", is_loop=True, is_replaceable=False),
@@ -86,6 +90,7 @@ def run_beacons(options: RunOptions) -> int:
     cfg = load_radio_config(options.config_file, dict(options.overrides))
     check_observatory(cfg.observatory)
     read_key(cfg.robot.key_file, must_be_private=not options.sim)
+    read_token(cfg.dashboard)
     started = time.monotonic()
     with ExitStack() as stack:
         runtime_dir = make_runtime_dir(str(options.runtime_dir or cfg.processes.runtime_dir), os.environ)
@@ -96,12 +101,16 @@ def run_beacons(options: RunOptions) -> int:
             sockets["dataloop"] = listener = stack.enter_context(listen("sim.robot", at.host, at.port))
             host, port = listener.getsockname()
             cfg = cfg.model_copy(update={"robot": cfg.robot.model_copy(update={"host": host, "port": port})})
+        page = open_page_socket(cfg.dashboard)
+        if page.socket is not None:
+            sockets["dashboard"] = stack.enter_context(page.socket)
+            cfg = cfg.model_copy(update={"dashboard": page.config})
         run_dir = _new_run_dir(options, cfg.system, cfg.run.seed)
         stack.enter_context(_lock(run_dir / ".lock", "--run-dir"))
         (run_dir / "config.toml").write_text(dump_radio_config(cfg), encoding="utf-8")
         (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
         kind = BeaconRun(cfg, BEACON_PROCESSES, is_sim=options.sim)
-        return _Run(options, kind, run_dir, Endpoints(runtime_dir), sockets, None, started).go()
+        return _Run(options, kind, run_dir, Endpoints(runtime_dir), sockets, page, started).go()
 
 
 def run_survey(options: RunOptions) -> int:

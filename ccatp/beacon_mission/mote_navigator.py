@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from math import hypot
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ccatp.beacon_mission.navigator import Belief, Ellipse, Score, ellipse_of
 from ccatp.beacon_mission.self_map import SelfMap
@@ -38,7 +38,7 @@ class MoteNavigator:
         start = cfg.start
         self._cfg, self._motion = cfg, vehicle_of(cfg)
         self._self_map = SelfMap(cfg.cricket)
-        self._gate = float(chi2.ppf(cfg.listener.gate_probability, 1))
+        self._gate = float(chdtri(1, 1.0 - cfg.listener.gate_probability))
         v = self._motion.size
         mean, sigmas = np.zeros(v), np.zeros(v)
         mean[:POSE] = Pose(start.x_m, start.y_m, start.heading_rad)

@@ -84,14 +84,15 @@ class SelfMap:
             pair = frozenset((i, j))
             temperature_c = float(np.mean(self._temperatures[pair]))
             rows.append(pair_range(cfg, (plan.names[i], plan.names[j]), self._delays[pair], temperature_c))
-        laid = map_by_plan(plan, build_network(rows, plan.dimension, plan.names), cfg.phase1.max_dop)
+        laid = map_by_plan(plan, build_network(rows, plan.dimension, plan.names), cfg.phase1.max_dop, cfg.phase1.draws)
         motes, d = list(plan.heads), plan.dimension
         at = (np.array(motes)[:, None] * d + np.arange(d)).ravel()
         known, covariance = plan.surveyed_m[motes], laid.covariance_m2[np.ix_(at, at)]
+        mean = (laid.positions_m + laid.bias_m)[motes]
         if cfg.phase2.prior == "printed":
             fixed = np.flatnonzero(np.isfinite(known.ravel())).tolist()
             covariance = printed_prior(len(motes), d, fixed, cfg.phase2.printed_variance_m2)
-        mapper = MoteMapper(laid.positions_m[motes], covariance, _settings(cfg), known)
+        mapper = MoteMapper(mean, covariance, _settings(cfg), known)
         self.notes = {"map_phase1_expected_m": mapper.expected_rms_m, "map_updates": 0.0}
         self._note(mapper)
         return mapper

@@ -31,12 +31,11 @@ def report(run_dir: Path, out: Path | None, figures: Path | None, json_output: b
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads would only fight over them
     from ccatp.report_writer import report_run
-    from ccatp.reporting.data import run_data
 
-    path, found = report_run(run_dir, out, figures)
-    for warning in found.record.warnings:
+    path, data, warnings = report_run(run_dir, out, figures)
+    for warning in warnings:
         complain(f"warning: {warning}", 0)
-    click.echo(json.dumps({"report": str(path), **run_data(found)}) if json_output else path)
+    click.echo(json.dumps({"report": str(path), **data}) if json_output else path)
     return 0
 
 

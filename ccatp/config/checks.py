@@ -53,7 +53,7 @@ def check_config(cfg: Config) -> list[Fault]:
         *_check_world(cfg.world, cfg.sim.robot),
         *_check_light(cfg.align),
         *_check_observatory(cfg.observatory),
-        *_check_dashboard(cfg.dashboard),
+        *check_dashboard(cfg.dashboard),
         *_check_stand_ins(cfg),
         *_check_standstill(cfg),
         *_check_panels(cfg.mirror.panels),
@@ -171,7 +171,7 @@ def _check_observatory(observatory: ObservatoryConfig) -> Iterator[Fault]:
             yield Fault((root, name), what, ((root, "endpoint"),))
 
 
-def _check_dashboard(dashboard: DashboardConfig) -> Iterator[Fault]:
+def check_dashboard(dashboard: DashboardConfig) -> Iterator[Fault]:
     """Whoever reaches the page may stop the robot, unless there is a token."""
     if not (is_loopback(dashboard.host) or dashboard.token_file):
         what = f'= "{dashboard.host}" is beyond this machine; name a file with a token in dashboard.token_file'

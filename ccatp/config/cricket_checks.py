@@ -9,6 +9,7 @@ from ccatp.config.toml_text import Key
 
 ROOT: Key = ("cricket",)
 ANCHORS = 2  # A is the origin, B shows the second axis
+LEAST_DRAWS = 200
 LEAST_NETWORK = 3  # motes of a stand that can trilaterate others in the plane
 
 
@@ -18,7 +19,7 @@ def check_cricket(cfg: CricketConfig) -> list[Fault]:
     Args:
         cfg: the section ``cricket``.
     """
-    return [*_check_layout(cfg), *_check_places(cfg), *_check_transducer(cfg)]
+    return [*_check_layout(cfg), *_check_places(cfg), *_check_transducer(cfg), *_check_draws(cfg)]
 
 
 def _check_layout(cfg: CricketConfig) -> Iterator[Fault]:
@@ -33,6 +34,12 @@ def _check_layout(cfg: CricketConfig) -> Iterator[Fault]:
             yield Fault((*ROOT, "stand_m"), f"has {len(cfg.stand_m)} motes; trilateration needs {LEAST_NETWORK}")
     if cfg.layout == "motes" and len(cfg.motes) < 2:
         yield Fault((*ROOT, "motes"), f"has {len(cfg.motes)}; a map needs two")
+
+
+def _check_draws(cfg: CricketConfig) -> Iterator[Fault]:
+    if 0 < cfg.phase1.draws < LEAST_DRAWS:
+        what = f"= {cfg.phase1.draws} tell no covariance of dozens of coordinates; 0, or {LEAST_DRAWS} at least"
+        yield Fault((*ROOT, "phase1", "draws"), what)
 
 
 def _check_places(cfg: CricketConfig) -> Iterator[Fault]:

@@ -11,6 +11,7 @@ Coordinates = Annotated[tuple[Annotated[float, Field(ge=-1e3, le=1e3)], ...], Fi
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Celsius = Annotated[float, Field(ge=-60.0, le=80.0)]
 Off = Annotated[float, Field(ge=0.0, le=3.1416)]
+Draws = Annotated[int, Field(ge=0, le=100_000)]
 Many = Annotated[int, Field(ge=1, le=100_000)]
 
 
@@ -58,6 +59,7 @@ class PhaseOneConfig(Model):
     """Trilateration."""
 
     max_dop: Positive
+    draws: Draws  # 0, or many
 
 
 class PhaseTwoConfig(Model):

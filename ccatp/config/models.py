@@ -337,6 +337,7 @@ class MissionConfig(Model):
     max_backoffs_per_stop: Annotated[int, Field(ge=1)]
     fix_at_start: bool
     via_sigma_m: Positive
+    longest_leg_m: Positive
     calibration_length_m: Annotated[float, Field(ge=0.0, le=0.5)]  # 0 = no calibration drive
     calibration_rounds: Annotated[int, Field(ge=1, le=5)]
     arrival_tolerance_m: Positive

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from ccatp.config.checks import check_dashboard
 from ccatp.config.cricket_checks import check_cricket
 from ccatp.config.messages import Fault, choice_hint
 from ccatp.config.radio_models import FuzzyConfig, RadioConfig
@@ -21,6 +22,7 @@ def check_radio_config(cfg: RadioConfig) -> list[Fault]:
         *_check_avoidance(cfg),
         *_check_room(cfg),
         *check_cricket(cfg.cricket),
+        *check_dashboard(cfg.dashboard),
     ]
 
 

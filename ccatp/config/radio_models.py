@@ -13,7 +13,16 @@ from ccatp.config.beacon_models import (
     SimBeaconRobotConfig,
 )
 from ccatp.config.cricket_models import CricketConfig
-from ccatp.config.models import Model, NonNegative, ObservatoryConfig, Pair, PidConfig, Positive, ProcessesConfig
+from ccatp.config.models import (
+    DashboardConfig,
+    Model,
+    NonNegative,
+    ObservatoryConfig,
+    Pair,
+    PidConfig,
+    Positive,
+    ProcessesConfig,
+)
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
@@ -268,5 +277,6 @@ class RadioConfig(Model):
     robot: BeaconRobotConfig
     processes: ProcessesConfig
     observatory: ObservatoryConfig
+    dashboard: DashboardConfig
     sim: RadioSimConfig
     cricket: CricketConfig

@@ -14,6 +14,9 @@ from ccatp.samples import Twist
 
 # Further off the bearing than this an unshaped drive stops and aligns again: the thesis aligns first, then heads on.
 REALIGN_RAD = 0.5
+# A stop so near whose bearing moves by more than REALIGN_RAD in a turn is as good as reached: the turn itself shifts
+# the robot by millimetres, and would chase a bearing that runs away from it.
+ALL_BUT_THERE_M = 0.01
 NO_CREEP = (0.0, 0.0)
 STILL = Twist(0.0, 0.0)
 
@@ -75,6 +78,7 @@ class LegTracker:
         self._steering_damping = gains.angular.kd
         self._omega_max = omega
         self._reverse = False
+        self._aim = (0.0, 0.0), 0.0  # stop and heading of the turn under way
         self.phase = DONE
 
     def begin(
@@ -98,8 +102,7 @@ class LegTracker:
             return
         angle = self._bearing_error(pose, target, creep)
         if abs(angle) > self._straight_rad:
-            self.phase = TURN
-            self._angular.begin(angle)
+            self._begin_alignment(pose, target, angle)
         else:
             self._begin_drive(pose, target)
 
@@ -146,12 +149,33 @@ class LegTracker:
         if self.phase is TURN:
             angle = self._bearing_error(pose, target, creep)
             rate = None if speeds is None else speeds.omega_rad_s
+            if self._angular.overtime_s >= 0.0 and self._has_run_away(pose, target, angle):
+                self.phase = DONE
+                return STILL
             if not self._angular.is_over(angle, self._heading_tolerance_rad, rate):
                 return Twist(0.0, self._angular.step(angle, dt_s, rate))
             self._begin_drive(pose, target)
         if self.phase is DONE:
             return STILL
         return self._drive(pose, target, dt_s, speeds, creep) if self._shaped else self._head_on(pose, target, dt_s)
+
+    def _begin_alignment(self, pose: tuple[float, float, float], target: tuple[float, float], angle_rad: float) -> None:
+        self.phase = TURN
+        self._aim = target, pose[2] + angle_rad
+        self._angular.begin(angle_rad)
+
+    def _has_run_away(self, pose: tuple[float, float, float], target: tuple[float, float], angle_rad: float) -> bool:
+        """Whether a stop that is all but reached lies on another bearing than the one that the turn began for.
+
+        In another frame there is another aim.
+        """
+        if hypot(target[0] - pose[0], target[1] - pose[1]) > ALL_BUT_THERE_M:
+            return False
+        aimed_at, heading_rad = self._aim
+        if target != aimed_at:
+            self._aim = target, pose[2] + angle_rad
+            return False
+        return abs(wrap_pi(pose[2] + angle_rad - heading_rad)) > REALIGN_RAD
 
     def _begin_drive(self, pose: tuple[float, float, float], target: tuple[float, float]) -> None:
         self.phase = DRIVE
@@ -210,8 +234,7 @@ class LegTracker:
             return STILL
         error = atan2(left, ahead)
         if abs(error) > REALIGN_RAD:
-            self.phase = TURN
-            self._angular.begin(error)
+            self._begin_alignment(pose, target, error)
             return STILL
         speed = self._forward.step(remaining, dt_s, None)
         return Twist(-speed if self._reverse else speed, self._steering.step(error, dt_s))

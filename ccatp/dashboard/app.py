@@ -140,7 +140,7 @@ def build_app(
         return _error(503, trouble) if trouble else _json({"status": "ok"})
 
     async def metrics(_request: Request) -> Response:
-        text = metrics_text(hub.state(), str(ground["title"]), hub.pages)
+        text = metrics_text(hub.state(), ground, hub.pages)
         return Response(text, headers={"content-type": CONTENT_TYPE, "cache-control": "no-store"})
 
     def command(name: OperatorCommand) -> Callable[[Request], Awaitable[Response]]:

@@ -1,17 +1,34 @@
 """Edge. What the dashboard receives: the rare messages always, the frequent ones only while somebody looks."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import zmq
 
 from ccatp.bus import Subscriber
 from ccatp.dashboard.view import View
 
-# What makes the page's history, and costs nothing to speak of.
-ALWAYS = {
-    "main": ("presence.main", "mission", "arrival", "fix", "log", "scene"),
-    "danger": ("presence.danger", "danger_event"),
-}
+
+class Wants(NamedTuple):
+    """The topics of one kind of mission.
+
+    Attributes:
+        main: what makes the page's history, and costs nothing to speak of; besides that of every mission.
+        track: of the estimates, while somebody looks.
+        truth: of the simulated truth, likewise.
+        once: of the simulated truth, what is told once.
+    """
+
+    main: tuple[str, ...]
+    track: str
+    truth: str
+    once: tuple[str, ...]
+
+
+SURVEY = Wants(("arrival", "fix", "scene"), "track", "truth", ())
+BEACONS = Wants(("beacon_arrival", "beacon_map", "scene"), "beacon_track", "beacon_truth", ("beacon_places",))
+_OF_MAIN = ("presence.main", "mission", "log")
+_OF_DANGER = ("presence.danger", "danger_event")
 # Taken at a time: a publisher that never pauses must not keep the pages waiting.
 MOST = 2_000
 
@@ -26,6 +43,7 @@ class Feed:
         endpoint_of: where main, danger and truth publish.
         view: what hears it.
         is_sim: there is a truth.
+        wants: what there is to hear of the mission.
     """
 
     def __init__(
@@ -35,13 +53,18 @@ class Feed:
         view: View,
         *,
         is_sim: bool,
+        wants: Wants = SURVEY,
     ) -> None:
         """Subscribe to what is always received."""
         self._context, self._endpoint_of, self._view, self._is_sim = context, endpoint_of, view, is_sim
+        self._wants = wants
+        always = {"main": (*_OF_MAIN, *wants.main), "danger": _OF_DANGER}
         self._always = {
             name: Subscriber(context, [endpoint_of(name)], topics, is_watching=True, is_onlooking=True)
-            for name, topics in ALWAYS.items()
+            for name, topics in always.items()
         }
+        if is_sim and wants.once:
+            self._always["truth"] = self._onlooker("truth", *wants.once)
         self._glancing: list[Subscriber] = []
         self._looking: list[Subscriber] = []
 
@@ -63,9 +86,9 @@ class Feed:
         """Receive the path as it is driven and, in simulation, the truth, or do not any more."""
         self._view.is_tracking = wanted
         if wanted and not self._looking:
-            self._looking = [self._onlooker("main", "track")]
+            self._looking = [self._onlooker("main", self._wants.track)]
             if self._is_sim:
-                self._looking.append(self._onlooker("truth", "truth"))
+                self._looking.append(self._onlooker("truth", self._wants.truth))
         elif not wanted and self._looking:
             _close(self._looking)
 
@@ -92,8 +115,8 @@ class Feed:
         for subscriber in self._always.values():
             subscriber.close()
 
-    def _onlooker(self, publisher: str, topic: str) -> Subscriber:
-        return Subscriber(self._context, [self._endpoint_of(publisher)], [topic], is_onlooking=True)
+    def _onlooker(self, publisher: str, *topics: str) -> Subscriber:
+        return Subscriber(self._context, [self._endpoint_of(publisher)], topics, is_onlooking=True)
 
 
 def _close(subscribers: list[Subscriber]) -> None:

@@ -6,7 +6,19 @@ from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror
 from ccatp.planning.traversal import ORDERS
 from ccatp.samples import PointId
+from ccatp.surveying.states import State
 
+CODES = ["normal operation", "near the mirror's edge", "operation aborted"]
+WORDS = {
+    "simulation-what": "robot and laser system are simulated",
+    "progress-head": "Survey",
+    "unit": "points",
+    "point-name": "next point",
+    "arrival-name": "last arrival",
+    "goal": "points",
+    "reached": "measured",
+}
+"""What the page calls things: by the id of their place on it, and for its own sentences."""
 TODO, ARRIVED, MEASURED, SKIPPED = range(4)
 """State of a point: to be done, the robot came to rest there, measured, left out."""
 
@@ -49,4 +61,9 @@ def ground(mirror: Mirror, cfg: Config, *, is_sim: bool, needs_token: bool) -> d
         "wheel_base_m": cfg.robot.wheel_base_m,
         "arrival_tolerance_mm": 1e3 * cfg.mission.arrival_tolerance_m,
         "rate_hz": cfg.dashboard.rate_hz,
+        "states": [str(state) for state in State],
+        "codes": CODES,
+        "plots": ["arrival", "error", "jump", "nis"],
+        "hides": [],
+        "words": WORDS,
     }

@@ -34,10 +34,14 @@ class Links:
     """Dates what comes from each process.
 
     Times called ``now_s`` are the machine's monotonic clock, by which processes date their presence as well.
+
+    Args:
+        has_laser: a laser system measures.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, has_laser: bool = True) -> None:
         """Nothing heard."""
+        self._has_laser = has_laser
         self._liveness = Liveness()
         self._presences: dict[str, Presence] = {}
         self._cut_s: dict[str, float] = {}
@@ -96,7 +100,8 @@ class Links:
     def shown(self, now_s: float) -> list[Link]:
         """All ends."""
         links = [self._loop(name, now_s) for name in LOOPS]
-        return [*links, self._robot(now_s), self._laser(now_s)]
+        links.append(self._robot(now_s))
+        return [*links, self._laser(now_s)] if self._has_laser else links
 
     def as_data(self, now_s: float) -> list[dict[str, Any]]:
         """All ends, for the page."""

@@ -1,10 +1,9 @@
 """Pure. The state of a run in the text format that Prometheus reads (exposition format 0.0.4)."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import ccatp
-from ccatp.surveying.states import State
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 Labels = tuple[tuple[str, str], ...]
@@ -27,21 +26,25 @@ class _Page:
         self.put(name, "gauge", help_text, [] if value is None else [((), value)])
 
 
-def metrics_text(state: Mapping[str, Any], mirror: str, pages: int) -> str:
+def metrics_text(state: Mapping[str, Any], ground: Mapping[str, Any], pages: int) -> str:
     """The metrics.
 
     Args:
         state: ``View.status_data``.
-        mirror: its name.
+        ground: of the page: its title, and the states that the mission may have.
         pages: open ones.
     """
     page = _Page()
-    info = (("mirror", mirror), ("simulation", str(state["is_sim"]).lower()), ("version", ccatp.__version__))
+    info = (
+        ("mirror", str(ground["title"])),
+        ("simulation", str(state["is_sim"]).lower()),
+        ("version", ccatp.__version__),
+    )
     page.put("info", "gauge", "What runs.", [(info, 1.0)])
     page.gauge("up", "1 when the run is well: both loops speak, and the robot sends frames.", not state["trouble"])
     _put_links(page, state)
     if (mission := state["mission"]) is not None:
-        _put_mission(page, mission)
+        _put_mission(page, mission, ground["states"])
     if (verdict := state["verdict"]) is not None:
         page.gauge("event_code", "Event code: 0 normal, 1 near the edge, 2 aborted.", verdict["code"])
         page.gauge("severity", "Severity of what gave cause, 0 none to 6 fault.", verdict["severity"])
@@ -72,11 +75,11 @@ def _put_links(page: _Page, state: Mapping[str, Any]) -> None:
     page.put("process_restarts_total", "counter", "Times a process was started anew, as seen from here.", restarts)
 
 
-def _put_mission(page: _Page, mission: Mapping[str, Any]) -> None:
-    states = [((("state", str(state)),), float(state == mission["state"])) for state in State]
+def _put_mission(page: _Page, mission: Mapping[str, Any], known: Sequence[str]) -> None:
+    states = [((("state", state),), float(state == mission["state"])) for state in known]
     page.put("mission_state", "gauge", "1 for the state of the mission.", states)
     counts = [((("state", name),), mission[key]) for name, key in _COUNTS.items()]
-    page.put("points", "gauge", "Measurement points.", counts)
+    page.put("points", "gauge", "Measurement points, or waypoints.", counts)
     page.gauge("elapsed_seconds", "Of the mission, by the robot's clock.", mission["elapsed_s"])
     page.gauge("remaining_seconds", "Estimate of what is left.", mission["eta_s"])
     page.put("late_frames_total", "counter", "Frames that were served late.", [((), mission["slips"])])

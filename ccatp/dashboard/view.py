@@ -21,6 +21,7 @@ class View:
     Args:
         is_sim: the robot is a stand-in.
         series: names of the plots.
+        has_laser: a laser system measures.
 
     Attributes:
         links: who is heard of.
@@ -28,10 +29,10 @@ class View:
         is_tracking: the path comes as it is driven; else only its stops are known.
     """
 
-    def __init__(self, *, is_sim: bool, series: Iterable[str]) -> None:
+    def __init__(self, *, is_sim: bool, series: Iterable[str], has_laser: bool = True) -> None:
         """Nothing heard."""
         self._is_sim = is_sim
-        self.links = Links()
+        self.links = Links(has_laser=has_laser)
         self.status: MissionStatus | None = None
         self.is_tracking = False
         self._status_s = self._verdict_s = float("-inf")

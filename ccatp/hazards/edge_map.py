@@ -93,6 +93,10 @@ class EdgeMap:
         ahead = x + reach_m * direction[0], y + reach_m * direction[1]
         return self._rim.segment_clearance_m(x, y, *ahead) <= slack_m
 
+    def is_beyond_rim(self, place: tuple[float, float]) -> bool:
+        """Whether a place is off the mirror."""
+        return self._rim.signed_distance_m(*place) <= 0.0
+
     def has_edge_near(self, place: tuple[float, float], slack_m: float) -> bool:
         """Whether a panel may end within ``slack_m`` of a place: at a seam or at the rim."""
         return self._rim.signed_distance_m(*place) <= slack_m or self.seam_at(place, slack_m) is not None

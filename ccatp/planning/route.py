@@ -13,6 +13,7 @@ from ccatp.planning.course import course_of_heading
 from ccatp.planning.errors import OutsideMirrorError, UnreachableError
 from ccatp.planning.escape import find_escape
 from ccatp.planning.legs import LegRules
+from ccatp.planning.parts import in_parts
 from ccatp.planning.retreats import find_retreats
 from ccatp.planning.search import Arrival, Search, Target
 from ccatp.planning.stance import build_body, build_places
@@ -179,7 +180,7 @@ def _stops(
             )
     point_of = dict(zip(places[1:], points, strict=True))
     best = min(arrivals, key=lambda arrival: arrival.cost_s)
-    return tuple(
+    ends = [
         Stop(
             arrival.place.x_m,
             arrival.place.y_m,
@@ -188,6 +189,11 @@ def _stops(
             arrival.reverse,
         )
         for arrival in best.path()
+    ]
+    begins = [(start.x_m, start.y_m), *((stop.x_m, stop.y_m) for stop in ends)]
+    # A heading that is off by 10 mrad misses by a centimetre after a metre: long legs are looked after on the way.
+    return tuple(
+        part for begin, end in zip(begins, ends, strict=False) for part in in_parts(*begin, end, mission.longest_leg_m)
     )
 
 

@@ -1,8 +1,5 @@
 """Pure. The way home: from any place on the mirror to base along panels inside the rim, as a series of stops."""
 
-from itertools import pairwise
-from math import ceil, hypot
-
 import numpy as np
 
 from ccatp.angles import difference
@@ -13,6 +10,7 @@ from ccatp.planning.course import course_of_heading
 from ccatp.planning.errors import OutsideMirrorError, UnreachableError
 from ccatp.planning.escape import find_escape
 from ccatp.planning.legs import LegRules
+from ccatp.planning.parts import in_parts
 from ccatp.planning.retreats import find_retreats
 from ccatp.planning.search import Arrival, Search, Target
 from ccatp.planning.stance import build_body, build_places
@@ -64,8 +62,12 @@ def plan_way_home(
             f"turn_clearance_m = {mission.turn_clearance_m}"
         )
     path = _best(arrivals, course_of_heading(mirror, base), limits).path()
-    stops = [stop for a, b in pairwise([Arrival(here, 0.0, 0.0), *path]) for stop in _vias(a, b)]
-    return (*stops[:-1], Stop(base.x_m, base.y_m, StopKind.BASE, None, path[-1].reverse, base.heading_rad))
+    ends = [Stop(a.place.x_m, a.place.y_m, StopKind.VIA, None, a.reverse) for a in path[:-1]]
+    ends.append(Stop(base.x_m, base.y_m, StopKind.BASE, None, path[-1].reverse, base.heading_rad))
+    begins = [(here.x_m, here.y_m), *((stop.x_m, stop.y_m) for stop in ends)]
+    return tuple(
+        part for begin, end in zip(begins, ends, strict=False) for part in in_parts(*begin, end, _LONGEST_LEG_M)
+    )
 
 
 def _best(arrivals: list[Arrival], course_rad: float, limits: LimitsConfig) -> Arrival:
@@ -76,13 +78,3 @@ def _best(arrivals: list[Arrival], course_rad: float, limits: LimitsConfig) -> A
         return not arrival.place.can_turn(arrival.course_rad, course_rad), arrival.cost_s + turned_s
 
     return min(arrivals, key=rank)
-
-
-def _vias(a: Arrival, b: Arrival) -> list[Stop]:
-    """A leg as stops no further apart than the longest leg."""
-    dx, dy = b.place.x_m - a.place.x_m, b.place.y_m - a.place.y_m
-    parts = max(1, ceil(hypot(dx, dy) / _LONGEST_LEG_M))
-    return [
-        Stop(a.place.x_m + dx * k / parts, a.place.y_m + dy * k / parts, StopKind.VIA, reverse=b.reverse)
-        for k in range(1, parts + 1)
-    ]

@@ -6,11 +6,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from ccatp.config.loader import load_config
+from ccatp.config.radio_loader import is_radio_file, load_radio_config
 from ccatp.errors import ConfigError, UnreachableError
 from ccatp.processes.common import RUN_DIR_FILE, Endpoints, open_log
 from ccatp.processes.dashboard import run_dashboard
 from ccatp.processes.page_socket import open_page_socket
-from ccatp.recorder import read_metadata
+from ccatp.run_files.recorder import read_metadata
 from ccatp.runtime_dir import runtime_dir_path
 
 ROOT = "dashboard."
@@ -33,7 +34,8 @@ def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callab
             raise ConfigError(f"--set: {key} is no key of the page; the daemon runs with what it has, see {ROOT}*")
     folder = runtime_dir_path(str(runtime_dir or ""), os.environ)
     run_dir = _run_dir_of(folder)
-    cfg = load_config(run_dir / "config.toml", {**settings, f"{ROOT}enabled": True})
+    path, wanted = run_dir / "config.toml", {**settings, f"{ROOT}enabled": True}
+    cfg = load_radio_config(path, wanted) if is_radio_file(path) else load_config(path, wanted)
     page = open_page_socket(cfg.dashboard)
     if page.socket is None:
         raise ConfigError(page.text)

@@ -7,9 +7,10 @@ import structlog
 
 from ccatp.beacon_assembly import TrackRow, track_row
 from ccatp.beacon_mission.mission import Arrival, BeaconMission
-from ccatp.beacon_mission.navigator import Ellipse
+from ccatp.beacon_mission.navigator import Ellipse, Navigator
 from ccatp.bus import Publisher
 from ccatp.config.radio_models import RadioConfig
+from ccatp.processes.painting import Look, Painter
 from ccatp.processes.telling import Teller
 from ccatp.wire.topics import (
     BeaconArrival,
@@ -17,6 +18,7 @@ from ccatp.wire.topics import (
     BeaconTrack,
     Estimate,
     Message,
+    MissionStatus,
     Scene,
     Shape,
     is_estimate_due,
@@ -46,6 +48,7 @@ class BeaconTeller(Teller):
         """Start with empty batches."""
         super().__init__(publisher, log)
         self._cfg, self._mission = cfg, mission
+        self._painter = Painter(publisher, look_at_navigator)
         self._track: list[TrackRow] = []
         self._echoes: deque[tuple[float, float]] = deque(maxlen=ECHO_MEMORY)
         self._trail: deque[tuple[float, float]] = deque(maxlen=TRAIL)
@@ -63,6 +66,7 @@ class BeaconTeller(Teller):
         """
         self.seq, self.t_s = seq, t_s
         navigator = self._mission.navigator
+        self._painter.sees(navigator, raw)
         belief = navigator.belief
         x_m, y_m, heading_rad = belief.pose
         if is_first or is_estimate_due(seq):
@@ -131,6 +135,11 @@ class BeaconTeller(Teller):
         shapes.append(Shape("robot", "robot", x_m, y_m, belief.ellipse[2:], heading_rad, radius_m=cfg.vehicle.radius_m))
         return shapes
 
+    def status(self, message: MissionStatus) -> None:
+        """Publish the mission's status, and a picture of all that is newest for whoever looks on."""
+        super().status(message)
+        self._painter.tell_if_wanted(self.seq, self.t_s)
+
     def arrival(self, arrival: Arrival) -> None:
         """A waypoint is reached in the present frame."""
         message = BeaconArrival(
@@ -151,3 +160,12 @@ class BeaconTeller(Teller):
 
 def _kind(name: str, cfg: RadioConfig) -> tuple[str]:
     return ("target" if cfg.follow.is_active and name == cfg.follow.target else "beacon",)
+
+
+def look_at_navigator(navigator: Navigator) -> Look:
+    """The pose among beacons; how readings agree is told with the map, as a sum over many of them."""
+    belief = navigator.belief
+    x_m, y_m, *covariance = belief.ellipse
+    xx, xy, yy = covariance
+    sigma_rad = float(max(belief.covariance[2, 2], 0.0)) ** 0.5
+    return Look(x_m, y_m, belief.pose[2], (xx, xy, yy), sigma_rad, 0.0, 0)

@@ -7,30 +7,43 @@ import socket
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import structlog
 import zmq
 
 from ccatp.bus import Publisher
 from ccatp.config.models import Config
+from ccatp.config.radio_models import RadioConfig
 from ccatp.dashboard.app import build_app
+from ccatp.dashboard.beacon_ground import beacon_ground
+from ccatp.dashboard.beacon_view import BeaconView
 from ccatp.dashboard.commands import CommandDesk
-from ccatp.dashboard.feed import Feed
-from ccatp.dashboard.ground import ground
+from ccatp.dashboard.feed import BEACONS, SURVEY, Feed, Wants
+from ccatp.dashboard.ground import ground as survey_ground
 from ccatp.dashboard.hub import Hub
 from ccatp.dashboard.server import serve
 from ccatp.dashboard.survey_view import SurveyView
 from ccatp.dashboard.token_file import read_token
+from ccatp.dashboard.view import View
 from ccatp.mirror.mirror import build_mirror
 from ccatp.processes import spinning
-from ccatp.processes.common import Endpoints, die_with_parent, open_log, parse_args, stop_on_signals
+from ccatp.processes.common import Endpoints, die_with_parent, open_log, parse_either, stop_on_signals
 from ccatp.processes.observing import LOGGED_LINES, LOGGED_PERIOD_S, LineBudget
 from ccatp.processes.pulse import Pulse
-from ccatp.store_reader import read_survey
-from ccatp.store_rows import StoreError
+from ccatp.storage.store_reader import read_survey
+from ccatp.storage.store_rows import StoreError
 
 Logger = structlog.typing.FilteringBoundLogger
 PULSE_PERIOD_S = 0.5
+
+
+class Shown(NamedTuple):
+    """What a page shows of one kind of mission: its view, its ground, and the topics that make them."""
+
+    view: View
+    ground: dict[str, Any]
+    wants: Wants
 
 
 class Dashboard:
@@ -47,20 +60,20 @@ class Dashboard:
         ConfigError: the token cannot be read.
     """
 
-    def __init__(self, cfg: Config, run_dir: Path, endpoints: Endpoints, *, is_sim: bool, log: Logger) -> None:
+    def __init__(
+        self, cfg: Config | RadioConfig, run_dir: Path, endpoints: Endpoints, *, is_sim: bool, log: Logger
+    ) -> None:
         """Subscribe."""
         self._cfg, self._log, self._endpoints = cfg, log, endpoints
         token = read_token(cfg.dashboard)
-        mirror = build_mirror(cfg.mirror)
-        view = SurveyView(mirror, cfg, is_sim=is_sim)
-        _remember(view, run_dir, mirror.name)
+        view, ground, wants = _shown(cfg, run_dir, is_sim=is_sim, needs_token=token is not None)
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._feed = Feed(self._context, endpoints.of, view, is_sim=is_sim)
+        self._feed = Feed(self._context, endpoints.of, view, is_sim=is_sim, wants=wants)
         self._hub = Hub(self._feed, view, cfg.dashboard.rate_hz)
         self._app = build_app(
             self._hub,
             CommandDesk(self._context, endpoints.of("control"), cfg.dashboard.command_timeout_s),
-            ground(mirror, cfg, is_sim=is_sim, needs_token=token is not None),
+            ground,
             host_names=cfg.dashboard.host_names,
             token=token,
             note=_sparing(log),
@@ -105,8 +118,8 @@ class Dashboard:
 
 
 async def run_dashboard(
-    cfg: Config, run_dir: Path, endpoints: Endpoints, listener: socket.socket, *, is_sim: bool, log: Logger,
-    has_pulse: bool,
+    cfg: Config | RadioConfig, run_dir: Path, endpoints: Endpoints, listener: socket.socket, *, is_sim: bool,
+    log: Logger, has_pulse: bool,
 ) -> None:  # fmt: skip
     """A dashboard from its beginning to SIGTERM or SIGINT; arguments as of ``Dashboard`` and its ``run``."""
     stop = asyncio.Event()
@@ -117,6 +130,17 @@ async def run_dashboard(
         await dashboard.run(listener, stop, has_pulse=has_pulse)
     finally:
         dashboard.close()
+
+
+def _shown(cfg: Config | RadioConfig, run_dir: Path, *, is_sim: bool, needs_token: bool) -> Shown:
+    """THE table of missions for the page."""
+    if isinstance(cfg, RadioConfig):
+        ground = beacon_ground(cfg, is_sim=is_sim, needs_token=needs_token)
+        return Shown(BeaconView(cfg, is_sim=is_sim), ground, BEACONS)
+    mirror = build_mirror(cfg.mirror)
+    view = SurveyView(mirror, cfg, is_sim=is_sim)
+    _remember(view, run_dir, mirror.name)
+    return Shown(view, survey_ground(mirror, cfg, is_sim=is_sim, needs_token=needs_token), SURVEY)
 
 
 def _remember(view: SurveyView, run_dir: Path, mirror: str) -> None:
@@ -164,7 +188,7 @@ def _log_warnings(log: Logger) -> None:
 def main() -> int:
     """Entry of ``python -m ccatp.processes.dashboard``."""
     die_with_parent()
-    args = parse_args()
+    args = parse_either().one
     if not args.is_realtime:
         spinning.leave_a_core(os.getppid())
     log = open_log(args.run_dir / "log.jsonl", "dashboard")

@@ -4,7 +4,7 @@ import structlog
 
 from ccatp.bus import Publisher
 from ccatp.localizer import Localizer
-from ccatp.processes.painting import Painter
+from ccatp.processes.painting import Look, Painter
 from ccatp.processes.telling import Teller
 from ccatp.samples import Fix, PointId
 from ccatp.wire.topics import (
@@ -32,7 +32,7 @@ class SurveyTeller(Teller):
     def __init__(self, publisher: Publisher, log: structlog.typing.FilteringBoundLogger) -> None:
         """Start with empty batches."""
         super().__init__(publisher, log)
-        self._painter = Painter(publisher)
+        self._painter = Painter(publisher, look_at_localizer)
         self._track: list[tuple[int, float, int, int, float, float, float, float]] = []
 
     def frame(
@@ -119,3 +119,17 @@ class SurveyTeller(Teller):
         """Publish the mission's status, and a picture of all that is newest for whoever looks on."""
         super().status(message)
         self._painter.tell_if_wanted(self.seq, self.t_s)
+
+
+def look_at_localizer(localizer: Localizer) -> Look:
+    """The pose on the deck, and the filter's last update."""
+    pose, covariance, innovation = localizer.deck_pose, localizer.pose_covariance, localizer.innovation
+    return Look(
+        x_m=pose.x_m,
+        y_m=pose.y_m,
+        heading_rad=pose.heading_rad,
+        covariance_m2=(float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])),
+        heading_sigma_rad=localizer.heading_sigma_rad,
+        nis=innovation.nis if innovation is not None else 0.0,
+        size=innovation.size if innovation is not None else 0,
+    )

@@ -80,6 +80,8 @@ def _turn_singles(
     rows_of = _rows_by_mote(network)
     places = fit.state.positions_m.copy()
     turned, near = 0, dict[tuple[int, ...], float]()
+    if network.count <= network.dimension + 1 and np.isnan(network.known_m).all():
+        return fit, 0, near  # a triangle (tetrahedron) with one corner mirrored is all of it mirrored: the same map
     for mote in network.loose:
         rows = rows_of[mote]
         if np.isfinite(network.known_m[mote]).any() or len(rows) < network.dimension:

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import chdtrc
 
 from ccatp.config.cricket_models import CricketConfig
 from ccatp.radio.fold_over import find_fold_over
@@ -29,6 +30,8 @@ from ccatp.radio.self_mapping import MapperSettings, MoteMapper, run_phase_two
 from ccatp.radio.tdoa import MoteRange
 
 _TELLING = 12.0  # a drop of chi-squared that chance gives one offset in two thousand
+_CHANCE = 1e-4  # that sound ranges of one pair of all disagree as much
+_FLAT = "the ranges do not tell how far each is off it"
 _CONTRADICTED = 3.0  # chi-squared for each degree of freedom
 _WIDER = 1e4  # of variances: what a range that is used twice adds by its first use is then a ten-thousandth
 
@@ -105,9 +108,16 @@ def map_measured(
     places, covariance = _framed(found, motes, true_m)
     at_found = MapModel(found.network, with_offset=model.with_offset, with_scale=model.with_scale)
     error_m = None if true_m is None else aligned_rms_m(places, true_m, mirrors=True)
+    expected_m: float | None = map_rms_m(found.covariance_m2, found.positions_m, motes, aligned=True)
+    bound_m = bound_rms_m(at_found, found.positions_m, motes, aligned=True)
+    warnings = [*_disagreeing(network), *folds.warnings, *found.warnings]
+    if any(_is_flat(error, places) for error in (expected_m, bound_m)):
+        # Derivatives at a place where they vanish: what comes out is a huge number, and means that nothing is known.
+        expected_m, bound_m = None, None
+        warnings.append(f"the motes lie {'in a line' if network.dimension == 2 else 'in a plane'}, or nearly: {_FLAT}")
     data = {
         "rms_m": {"p10": error_m, "p50": error_m, "p90": error_m},
-        "crlb_m": bound_rms_m(at_found, found.positions_m, motes, aligned=True),
+        "crlb_m": bound_m,
         "rank_deficiency": freedom.deficiency,
         "fold_over_risk": not folds.is_unique,
         "phase1_rms_m": _phase1_error_m(cfg, network, motes, true_m),
@@ -116,13 +126,39 @@ def map_measured(
         "seeds": 1,
         "motes": len(motes),
         "frame": "aligned",
-        "expected_rms_m": map_rms_m(found.covariance_m2, found.positions_m, motes, aligned=True),
+        "expected_rms_m": expected_m,
         "offset_m": found.offset_m,
         "scale": 1.0 + found.scale,
         "free_directions": [*freedom.frame, *freedom.flexes, *freedom.calibration],
-        "warnings": [*folds.warnings, *found.warnings],
+        "warnings": warnings,
     }
     return MeasuredMap(names, places, covariance, true_m, data)
+
+
+def _is_flat(error_m: float | None, places_m: FloatArray) -> bool:
+    """Whether an error expected is larger than the map itself."""
+    return error_m is not None and error_m > float(np.linalg.norm(np.ptp(places_m, axis=0)))
+
+
+def _disagreeing(network: RangeNetwork) -> Iterator[str]:
+    """A word on the pair whose own ranges contradict each other most, more than chance would have them."""
+    pairs = np.sort(np.column_stack([network.first, network.second]), axis=1)
+    found, place = np.unique(pairs, axis=0, return_inverse=True)
+    place = place.ravel()
+    weights = network.sigmas_m**-2.0
+    means = np.bincount(place, weights * network.ranges_m) / np.bincount(place, weights)
+    squares = np.bincount(place, weights * (network.ranges_m - means[place]) ** 2)
+    chances = chdtrc(np.maximum(np.bincount(place) - 1, 1), squares)
+    if not (bad := np.flatnonzero(chances < _CHANCE / len(found))).size:
+        return
+    worst = int(bad[np.argmax(squares[bad])])
+    ranges = network.ranges_m[place == worst]
+    more = f" and {bad.size - 1} more pairs" if bad.size > 1 else ""
+    first, second = (network.names[mote] for mote in found[worst])
+    yield (
+        f"ranges between {first} and {second}{more} disagree among themselves: {ranges.min():.4g} to "
+        f"{ranges.max():.4g} m with a sigma of {network.sigmas_m[place == worst].min():.3g} m"
+    )
 
 
 def _network(cfg: CricketConfig, file: MeasuredRanges, tags_m: Places | None) -> RangeNetwork:

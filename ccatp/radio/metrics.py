@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ccatp.filters.base import FloatArray
 
@@ -84,7 +84,7 @@ def consistency(squares: FloatArray, sizes: FloatArray) -> Consistency | None:
     freedom = float(sizes[finite].sum())
     if freedom == 0.0:
         return None
-    low, high = (float(chi2.ppf(q, freedom)) / freedom for q in (0.025, 0.975))
+    low, high = (float(chdtri(freedom, q)) / freedom for q in (0.975, 0.025))
     return Consistency(float(squares[finite].sum()) / freedom, low, high)
 
 

@@ -6,8 +6,7 @@ from math import inf, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import t as student
+from scipy.special import chdtri, stdtrit
 
 from ccatp.filters.base import FloatArray
 from ccatp.radio.path_loss import PathLoss
@@ -75,13 +74,13 @@ class PathLossFit:
 
     def half_widths(self, confidence: float) -> tuple[float, float]:
         """Of the two-sided confidence intervals of P_ref, dB, and eta (Student's t)."""
-        quantile = float(student.ppf(0.5 + 0.5 * confidence, self.freedom))
+        quantile = float(stdtrit(self.freedom, 0.5 + 0.5 * confidence))
         return quantile * sqrt(self.covariance[0, 0]), quantile * sqrt(self.covariance[1, 1])
 
     def sigma_interval_db(self, confidence: float) -> tuple[float, float]:
         """Confidence interval of sigma (chi-squared)."""
         tail = 0.5 * (1.0 - confidence)
-        low, high = (float(chi2.ppf(share, self.freedom)) for share in (1.0 - tail, tail))
+        low, high = (float(chdtri(self.freedom, share)) for share in (tail, 1.0 - tail))
         square = self.freedom * self.sigma_db**2
         return sqrt(square / low), sqrt(square / high)
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ccatp.radio.drawn_errors import DrawnErrors, draw_errors
 from ccatp.radio.map_batch import BatchSettings, fit_map, position_covariance
 from ccatp.radio.map_model import MapModel
 from ccatp.radio.mote_plan import MotePlan
@@ -15,6 +16,7 @@ from ccatp.radio.tdoa import MoteRange
 from ccatp.radio.trilateration import DegenerateStep, Sketch, Step
 from ccatp.radio.unfolding import classical_scaling
 
+_FLAT = 4.0  # of range errors that may make a flat beginning look high
 _CLIQUES = 4000  # first motes looked at; the best of them begins the map
 
 
@@ -24,17 +26,19 @@ class FirstMap(NamedTuple):
     Attributes:
         positions_m: nan for motes without a place, shape (n, d).
         covariance_m2: of all coordinates, zero for motes without a place, shape (n d, n d).
+        bias_m: mean error of the places, as far as it is known, shape (n, d).
         steps: in their order.
         unplaced: motes that no step reached.
     """
 
     positions_m: FloatArray
     covariance_m2: FloatArray
+    bias_m: FloatArray
     steps: tuple[Step, ...]
     unplaced: tuple[int, ...]
 
 
-def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float) -> FirstMap:
+def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: int = 0) -> FirstMap:
     """Phase 1 of Patil et al., figure 8, in the field's frame.
 
     A is the origin, B on the second axis, the first stand follows by the law of cosines, every other one by
@@ -44,11 +48,13 @@ def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float) -> FirstM
         plan: anchors, stands, the frame.
         network: ranges of ``plan.phase1_pairs``.
         max_dop: dilution of precision that no step may exceed.
+        draws: of the errors, for bias and covariance; 0 for a covariance by derivatives, and no bias.
 
     Raises:
         MissingRange, DegenerateStep: a step that cannot be made; the message names its motes.
     """
-    sketch = Sketch(plan.names, PairMeans(network), plan.dimension, max_dop)
+    means = PairMeans(network)
+    sketch = Sketch(plan.names, means, plan.dimension, max_dop)
     origin, axis = plan.anchors
     sketch.set_axes(origin, axis)
     for mote in plan.networks[0]:
@@ -60,12 +66,30 @@ def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float) -> FirstM
             sketch.add_by_ranges(mote, before)
     up = plan.axes_m[1] / np.linalg.norm(plan.axes_m[1])
     field_from_map = np.column_stack([(up[1], -up[0]), up])
+    errors = _errors(sketch, _shaped(plan, sketch.positions_m), means, draws)
     positions = sketch.positions_m @ field_from_map.T + plan.axes_m[0]
     turn = np.kron(np.eye(len(plan.names)), field_from_map)
-    return FirstMap(positions, turn @ sketch.covariance_m2 @ turn.T, tuple(sketch.steps), ())
+    bias = errors.bias_m @ field_from_map.T
+    return FirstMap(positions, turn @ errors.covariance_m2 @ turn.T, bias, tuple(sketch.steps), ())
 
 
-def map_as_possible(network: RangeNetwork, max_dop: float) -> FirstMap:
+def _shaped(plan: MotePlan, found_m: FloatArray) -> FloatArray:
+    """Places with the stands as they are known to be."""
+    places = found_m.copy()
+    for stand in plan.bodies:
+        motes = list(stand.motes)
+        places[motes] = best_motion(stand.local_m, found_m[motes]).apply(stand.local_m)
+    return places
+
+
+def _errors(sketch: Sketch, places_m: FloatArray, means: PairMeans, draws: int) -> DrawnErrors:
+    if draws == 0:
+        return DrawnErrors(np.zeros_like(places_m), sketch.covariance_m2)
+    # The same draws for every map: the same ranges give the same one.
+    return draw_errors(places_m, sketch.steps, means, sketch.covariance_m2, np.random.default_rng(0), draws)
+
+
+def map_as_possible(network: RangeNetwork, max_dop: float, draws: int = 0) -> FirstMap:
     """A trilateration without a plan: a good triangle (tetrahedron) of motes begins, whoever has most ranges follows.
 
     Motes that cannot be placed well enough, from d + 1 others at least, are left out.
@@ -73,6 +97,7 @@ def map_as_possible(network: RangeNetwork, max_dop: float) -> FirstMap:
     Args:
         network: the ranges.
         max_dop: dilution of precision that no step may exceed.
+        draws: as of ``map_by_plan``.
 
     Raises:
         DegenerateStep: there is no triangle (tetrahedron) to begin with.
@@ -97,7 +122,8 @@ def map_as_possible(network: RangeNetwork, max_dop: float) -> FirstMap:
         except DegenerateStep:
             refused.add(mote)
     unplaced = tuple(mote for mote in range(network.count) if not sketch.is_placed(mote))
-    return FirstMap(sketch.positions_m, sketch.covariance_m2, tuple(sketch.steps), unplaced)
+    errors = _errors(sketch, sketch.positions_m, means, draws)
+    return FirstMap(sketch.positions_m, errors.covariance_m2, errors.bias_m, tuple(sketch.steps), unplaced)
 
 
 def _seed(network: RangeNetwork, means: PairMeans, sketch: Sketch) -> None:
@@ -118,6 +144,13 @@ def _seed(network: RangeNetwork, means: PairMeans, sketch: Sketch) -> None:
         shape = "triangle" if d == 2 else "tetrahedron"
         raise DegenerateStep(f"no {shape} of motes with ranges between all of them: trilateration has no beginning")
     names = [network.names[mote] for mote in best]
+    longest_m = float(_distances(means, best).max())
+    # A simplex that is flat looks as high as this by the errors of its ranges alone.
+    if best_height_m**2 < _FLAT * longest_m * max(sigma for _, sigma in _sides(means, best)):
+        raise DegenerateStep(
+            f"{', '.join(names)}: the best motes to begin with lie {'in a line' if d == 2 else 'in a plane'}, or "
+            "nearly: trilateration has no beginning"
+        )
     rows = [MoteRange(names[a], names[b], *_between(means, best[a], best[b])) for a, b in combinations(range(d + 1), 2)]
     model = MapModel(build_network(rows, d, names))
     start = classical_scaling(_distances(means, best), d)
@@ -130,6 +163,11 @@ def _height(means: PairMeans, motes: tuple[int, ...]) -> float:
     """Least width of a simplex, m: its smallest extent along a principal axis."""
     points = classical_scaling(_distances(means, motes), len(motes) - 1)
     return float(np.linalg.svd(points, compute_uv=False)[-1])
+
+
+def _sides(means: PairMeans, motes: tuple[int, ...]) -> list[tuple[float, float]]:
+    """Range and sigma of every two of some motes."""
+    return [_between(means, a, b) for a, b in combinations(motes, 2)]
 
 
 def _distances(means: PairMeans, motes: tuple[int, ...]) -> FloatArray:

@@ -4,11 +4,13 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ccatp.filters.ekf_slam import EkfSlam, Update
 from ccatp.radio.range_network import FloatArray, MappingError
 
+_STRAIGHT = 0.01  # share of the variance of a range up to which its curvature does not matter
+_CURVED = 2  # times that all pairs are taken together: how far the map is from straight depends on its errors
 _POOLED = 80  # pairs up to which all of them are linearised together after each reading
 _DIRECTION_M = 1e-9  # motes nearer than this have no direction between them
 
@@ -76,7 +78,7 @@ class MoteMapper:
         self._prior = mean.copy(), covariance.copy(), np.diag((settings.offset_sigma_m**2, settings.scale_sigma**2))
         self._filter = self._at_prior()
         self._settings = settings
-        self._gate = float(chi2.ppf(settings.gate_probability, 1))
+        self._gate = float(chdtri(1, 1.0 - settings.gate_probability))
         self._count = count
         self._pairs: dict[tuple[int, int], tuple[float, float]] = {}  # sum of z / sigma^2, sum of 1 / sigma^2
 
@@ -134,9 +136,14 @@ class MoteMapper:
         """The posterior of the prior and all mean ranges, linearised where the map is now."""
         totals, weights = np.array(list(self._pairs.values())).T
         rows = _Rows(self._dimension, self._count, list(self._pairs), totals / weights)
-        start = self._filter.mean.copy()
-        self._filter = self._at_prior()
-        self._filter.update_iterated(rows.columns, _From(rows, start), 1.0 / weights, self._settings.linearisations)
+        for _ in range(_CURVED):
+            start = self._filter.mean.copy()
+            curvature = rows.curvature(start, self._filter.covariance)
+            R = np.diag(1.0 / weights) + curvature
+            self._filter = self._at_prior()
+            self._filter.update_iterated(rows.columns, _From(rows, start), R, self._settings.linearisations)
+            if float((curvature.diagonal() * weights).max()) < _STRAIGHT:
+                break
 
     def _update(self, rows: "_Rows", R: FloatArray, gate: float) -> Update:
         if self._settings.linearisations == 1:
@@ -183,6 +190,24 @@ class _Rows:
         H[rows, self._ends[:, 1:] * d + np.arange(d)] = -u
         H[:, -2], H[:, -1] = 1.0, distances
         return self._ranges_m - scale * distances - offset_m, H
+
+    def curvature(self, x: FloatArray, P: FloatArray) -> FloatArray:
+        """Covariance of what the rows leave out of second order, tr(A_k P_kl A_l P_lk) / 2, shape (m, m).
+
+        P_kl is the covariance of the ways of two pairs; A, the second derivative of a distance, is (1 - u u^T) / r
+        across the line of sight u (Jazwinski 1970, section 9.3). Measuring a pair more often does not lessen it.
+        """
+        d = self._dimension
+        points = x[self._at].reshape(-1, d)
+        ways = points[self._ends[:, 0]] - points[self._ends[:, 1]]
+        distances = np.sqrt((ways**2).sum(axis=1))
+        u = ways / distances[:, None]
+        A = (np.eye(d) - u[:, :, None] * u[:, None, :]) / distances[:, None, None]
+        C = P[np.ix_(self._at, self._at)].reshape(len(points), d, len(points), d)
+        i, j = self._ends[:, :1], self._ends[:, 1:]
+        ways_ways = C[i, :, i.T] - C[i, :, j.T] - C[j, :, i.T] + C[j, :, j.T]  # of pairs k and l, shape (m, m, d, d)
+        left = np.einsum("kab,klbc->klac", A, ways_ways)
+        return np.asarray(0.5 * np.einsum("klac,lcd,klad->kl", left, A, ways_ways))
 
 
 class _From:

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from typing import Protocol
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ccatp.config.radio_models import RadioConfig
 from ccatp.radio.motion import Increment, Odometry, Pose, Steering
@@ -78,7 +78,7 @@ def signal_settings(cfg: RadioConfig) -> SignalSettings:
         moving=_moving(cfg, sigma_db),
         placed_share=cfg.estimator.placed_share,
         waiting_scans=cfg.estimator.waiting_scans,
-        gates=(float(chi2.ppf(quantile, 1)), float(chi2.ppf(quantile, 2))),
+        gates=(float(chdtri(1, 1.0 - quantile)), float(chdtri(2, 1.0 - quantile))),
     )
 
 

@@ -1,6 +1,6 @@
 """Pure. The sections of a report. Each appears where the run holds what it shows; a new kind of run adds its own."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -166,17 +166,20 @@ def error_section(found: Findings) -> Section | None:
 def events_section(found: Findings) -> Section | None:
     """What the processes said."""
     lines = found.record.log
-    if not lines:
-        return None
+    return Section("events", "Events", events_body(lines)) if lines else None
+
+
+def events_body(lines: Sequence[LogLine]) -> str:
+    """Lines of a log: all of few, of many those that matter, and the others under one line."""
     grave = [line for line in lines if line.level not in ("info", "debug")]
     head = ["robot, s", "UTC", "process", "what"]
     if len(lines) <= _SHOWN_EVENTS:
-        return Section("events", "Events", table(head, map(_event, lines), "texts log"))
+        return table(head, map(_event, lines), "texts log")
     some = table(head, map(_event, grave[:_SHOWN_EVENTS]), "texts log") if grave else "<p>No warnings, no errors.</p>"
     if len(grave) > _SHOWN_EVENTS:
         some += f"<p>and {len(grave) - _SHOWN_EVENTS} more warnings and errors.</p>"
     whole = folded(f"All {len(lines)} lines", table(head, map(_event, lines), "texts log"))
-    return Section("events", "Events", some + whole)
+    return some + whole
 
 
 def _event(line: LogLine) -> list[str]:
@@ -200,12 +203,19 @@ def configuration_section(found: Findings) -> Section:
         "ccatp": text(", ".join(versions)) or shown(None),
         "sessions": text(len(record.sessions)),
     }
-    changes = [[text(key), _value(ours), _value(usual)] for key, (ours, usual) in record.changed.items()]
-    changed = table(["key", "this run", "default"], changes, "texts") if changes else "<p>Everything as shipped.</p>"
-    files = table(["file", "kB"], [[text(name), shown(size / 1e3, 1)] for name, size in record.files.items()])
-    body = facts(values) + "<h3>Other than the defaults</h3>" + changed
-    body += folded("The whole configuration", f"<pre>{text(record.config_text)}</pre>") + folded("Files", files)
+    body = facts(values) + changes_body(record.changed, record.config_text, record.files)
     return Section("configuration", "Configuration", body)
+
+
+def changes_body(changed: Mapping[str, tuple[object, object]], config_text: str, files: Mapping[str, int]) -> str:
+    """What differs from the shipped configuration; under a line each, all of it, and the files of the run."""
+    changes = [[text(key), _value(ours), _value(usual)] for key, (ours, usual) in changed.items()]
+    shown_changes = (
+        table(["key", "this run", "default"], changes, "texts") if changes else "<p>Everything as shipped.</p>"
+    )
+    sizes = table(["file", "kB"], [[text(name), shown(size / 1e3, 1)] for name, size in files.items()])
+    whole = folded("The whole configuration", f"<pre>{text(config_text)}</pre>") + folded("Files", sizes)
+    return f"<h3>Other than the defaults</h3>{shown_changes}{whole}"
 
 
 def _value(value: Any) -> str:

@@ -84,16 +84,16 @@ class MoteOutlook:
     bound_rms_m: float | None
 
 
-def first_map(cfg: CricketConfig, field: SimulatedField) -> FirstMap:
-    """Phase 1.
+def first_map(cfg: CricketConfig, field: SimulatedField, draws: int = 0) -> FirstMap:
+    """Phase 1; where its bias and covariance are of use, by so many draws.
 
     Raises:
         MappingError: a step that cannot be made.
     """
     network = field.network()
     if field.plan.networks:
-        return map_by_plan(field.plan, network, cfg.phase1.max_dop)
-    return map_as_possible(network, cfg.phase1.max_dop)
+        return map_by_plan(field.plan, network, cfg.phase1.max_dop, draws)
+    return map_as_possible(network, cfg.phase1.max_dop, draws)
 
 
 def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
@@ -102,19 +102,21 @@ def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
     Raises:
         MappingError: phase 1 cannot place a mote.
     """
-    plan, first = field.plan, first_map(cfg, field)
+    plan, first = field.plan, first_map(cfg, field, cfg.phase1.draws)
     motes = list(plan.heads or plan.mapped)
     if lost := [plan.names[mote] for mote in motes if mote in first.unplaced]:
         raise MappingError(f"phase 1 cannot place {lost[0]} (and {len(lost) - 1} more); the batch needs no such start")
     d = plan.dimension
     at = (np.array(motes)[:, None] * d + np.arange(d)).ravel()
     known, places = plan.surveyed_m[motes], first.positions_m[motes]
+    mean = places + first.bias_m[motes]
     covariance = first.covariance_m2[np.ix_(at, at)]
     if cfg.phase2.prior == "printed":
         covariance = printed_prior(
             len(motes), d, np.flatnonzero(np.isfinite(known.ravel())).tolist(), cfg.phase2.printed_variance_m2
         )
-    mapper = MoteMapper(places, covariance, mapper_settings(cfg), known)
+        mean = places
+    mapper = MoteMapper(mean, covariance, mapper_settings(cfg), known)
     index = {mote: row for row, mote in enumerate(motes)}
     readings = [(index[i], index[j], range_m, sigma_m) for i, j, range_m, sigma_m in field.second]
     went = run_phase_two(mapper, readings, cfg.phase2.target_rms_m)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ccatp.config.radio_models import RadioConfig
 from ccatp.studies.campaign import Column, Factors, Job, Outcome
@@ -15,7 +15,7 @@ FloatArray = NDArray[np.float64]
 
 SETTLED_SHARE = 0.3  # of a run: errors over time are counted after it, when radios have been found
 _CURVE_EVERY = 10  # steps between the points of a curve
-_HIT = float(chi2.ppf(0.9, 2))
+_HIT = float(chdtri(2, 0.1))
 _BAND = 0.95
 
 COLUMNS = (
@@ -159,7 +159,7 @@ def _band(freedom: float) -> str:
     """Where the mean of so many normalised squares lies with 95 % probability."""
     if freedom < 1.0:
         return "-"
-    low, high = (float(chi2.ppf(share, freedom)) / freedom for share in (0.5 - 0.5 * _BAND, 0.5 + 0.5 * _BAND))
+    low, high = (float(chdtri(freedom, share)) / freedom for share in (0.5 + 0.5 * _BAND, 0.5 - 0.5 * _BAND))
     return f"{low:.3f} to {high:.3f}"
 
 

@@ -32,6 +32,9 @@ STUDIES = {
         "ccatp.studies.cricket_study", "STUDY", "self-mapping of motes: the published figures, better ways"
     ),
     "mote-sizes": Entry("ccatp.studies.mote_sizes", "run", "time of self-mapping against the number of motes"),
+    "mote-navigation": Entry(
+        "ccatp.studies.mote_navigation", "STUDY", "a robot guided by motes that mapped themselves"
+    ),
     "radio-signals": Entry(
         "ccatp.studies.radio_signals_study", "STUDY", "levels and bearings of ZigBee radios, beside 2017"
     ),

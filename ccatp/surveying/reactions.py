@@ -139,8 +139,8 @@ class Reactions:
             return
         if standing.ignores_motion:
             standing.go_on()  # where the edge is, is not known before a fix; standing still for it is safe anywhere
-        if standing.is_finding and standing.state in (SETTLING, MEASURING):
-            return
+        if standing.is_lost and standing.state in (SETTLING, MEASURING):
+            return  # it stands, and a rim on the map is a matter of the pose that is being found
         if standing.state is State.HELD and standing.is_held_by_hand:
             return
         mission = standing.cfg.mission

@@ -45,7 +45,6 @@ class Standing:
         is_held_by_hand: somebody has to resume.
         is_faulted: something is wrong, and an operator has to look after it.
         is_hold_deaf: held because wheels or inertial unit are not to be believed.
-        is_finding: the robot is found after such a hold.
         is_lost: a fix comes before the next move, because the pose is known to be wrong or (``is_at_start``) not
             confirmed yet.
         is_off_route: the way back to the route has to be planned.
@@ -76,7 +75,7 @@ class Standing:
         self.abort_cause: str | None = None
         self.bar = ""
         self.severity = Severity.NONE
-        self.is_held_by_hand = self.is_faulted = self.is_hold_deaf = self.is_finding = False
+        self.is_held_by_hand = self.is_faulted = self.is_hold_deaf = False
         self.is_lost = self.is_at_start = cfg.mission.fix_at_start
         self.is_off_route = self.is_review_due = self.doubts_pose = self.wants_full_fans = False
         self.retreat: Retreat | None = None
@@ -184,8 +183,7 @@ class Standing:
     def go_on(self) -> None:
         """To what is next: finding the robot, home, the next stop, or the end."""
         self.interrupt_parts()
-        self.is_finding = self.ignores_motion
-        self.doubts_pose |= self.is_finding
+        self.doubts_pose |= self.ignores_motion
         self.is_faulted = False
         # Wherever a hold left the robot: the route's next turn may not be safe there.
         self.is_off_route |= self.state is State.HELD

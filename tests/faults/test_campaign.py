@@ -25,6 +25,13 @@ def test_a_slip_in_the_calibration_drive_does_not_mislead_for_good(seed: int) ->
     assert ending.result.summary["points"]["measured"] == ending.result.summary["points"]["total"]
 
 
+def test_a_rim_on_the_map_of_a_robot_that_finds_itself_is_no_edge() -> None:
+    # An encoder at its rail turns the estimate by a radian: looks at the map show a rim, until the heading is found.
+    ending = survey(189, random_plan(189))
+    assert any(record.signal == "encoder_left" and record.changed for record in ending.injected)
+    assert (ending.result.outcome, ending.result.summary["points"]["measured"]) == ("complete", 9), ending.line
+
+
 @pytest.mark.slow
 def test_nobody_falls_and_what_passes_by_is_survived() -> None:
     incomplete = []

@@ -15,7 +15,7 @@ import pytest
 from ccatp.router import RequestFailed, request
 from ccatp.wire.channels import format_request
 
-# The calibration drive takes half a minute: on the wall clock only where it is what is tested.
+# The calibration drive takes as long as a panel: it is done only where it matters.
 NO_CALIBRATION = ("--set", "mission.calibration_length_m=0")
 FREE_PORTS = ("--set", "sim.robot.port=0", "--set", "sim.etalon.port=0", "--set", "dashboard.enabled=false")
 
@@ -114,8 +114,8 @@ def start(tmp_path: Path, runtime_dir: Path) -> Iterator[Callable[..., Run]]:
     """Starts runs and ends those that a failing test leaves behind."""
     runs: list[Run] = []
 
-    def begin(*args: str) -> Run:
-        quick = NO_CALIBRATION if "--realtime" in args else ()
+    def begin(*args: str, calibrates: bool = False) -> Run:
+        quick = () if calibrates else NO_CALIBRATION
         run = Run(tmp_path / f"run{len(runs)}", runtime_dir, *quick, *args)
         runs.append(run)
         return run

@@ -9,7 +9,7 @@ import pytest
 
 from ccatp.config.loader import shipped_config_dir
 from ccatp.config.radio_loader import load_radio_config
-from ccatp.recorder import iter_messages
+from ccatp.run_files.recorder import iter_messages
 from ccatp.studies.beacon_rehearsal import rehearse_beacons
 from tests.processes.conftest import Run
 
@@ -23,7 +23,7 @@ SHORT = {
 class BeaconRunProcess(Run):
     """``ccatp run --sim`` of a mission among beacons."""
 
-    free_ports = ("--set", "sim.robot.port=0")
+    free_ports = ("--set", "sim.robot.port=0", "--set", "dashboard.enabled=false")
 
 
 Begin = Callable[..., BeaconRunProcess]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ccatp.config.loader import load_config
-from ccatp.recorder import iter_messages
+from ccatp.run_files.recorder import iter_messages
 from ccatp.studies.rehearsal import rehearse
 from tests.faults.linking import Measured
 from tests.processes.conftest import Run
@@ -44,7 +44,9 @@ def test_a_rehearsal_is_the_run_without_the_sockets(
     (tmp_path / "clock").mkdir()
     (tmp_path / "clock" / "sitecustomize.py").write_text(RESTLESS_CLOCK)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "clock"), *sys.path]))
-    run = start("--panels", "1", "--mirror", "thesis-m1", "--filter", "ekf", "--world", "hard", "--seed", "3")
+    run = start(
+        "--panels", "1", "--mirror", "thesis-m1", "--filter", "ekf", "--world", "hard", "--seed", "3", calibrates=True
+    )
     assert run.wait() == 0, run.stderr
     labels = [json.loads(line)["wall"] for line in (run.run_dir / "log.jsonl").read_text().splitlines()]
     instants = [datetime.fromisoformat(label) for label in labels]

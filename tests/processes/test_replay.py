@@ -15,8 +15,8 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.replaying.comparison import REPRODUCED
 from ccatp.replaying.events import in_order
 from ccatp.replaying.player import replay
-from ccatp.run_reader import open_run
-from tests.processes.conftest import Run
+from ccatp.run_files.run_reader import open_run
+from tests.processes.conftest import NO_CALIBRATION, Run
 
 Start = Callable[..., Run]
 
@@ -47,7 +47,7 @@ def hard_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     """One panel of the hard world with the extended Kalman filter."""
     folder = tmp_path_factory.mktemp("r")
     (folder / "s").mkdir()
-    run = Run(folder / "run", folder / "s", "--panels", "1", "--world", "hard", "--filter", "ekf")
+    run = Run(folder / "run", folder / "s", *NO_CALIBRATION, "--panels", "1", "--world", "hard", "--filter", "ekf")
     try:
         assert run.wait() == 0, run.stderr
         yield run

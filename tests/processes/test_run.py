@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 from ccatp.config.loader import load_config
-from ccatp.recorder import iter_messages
+from ccatp.run_files.recorder import iter_messages
 from ccatp.wire.topics import TOPICS
 from tests.processes.conftest import Run
 
@@ -35,7 +35,7 @@ def without_wall(summary: dict[str, Any]) -> dict[str, Any]:
 
 @pytest.mark.parametrize("mirror", ["fyst-m1", "thesis-m2"])
 def test_two_panels(start: Start, mirror: str) -> None:
-    run = start("--mirror", mirror, "--panels", "2", "--json")
+    run = start("--mirror", mirror, "--panels", "2", "--json", calibrates=mirror == "fyst-m1")
     assert run.wait() == 0, run.stderr
     summary = json.loads(run.stdout)  # nothing else on standard output
     assert summary == run.summary
@@ -103,7 +103,9 @@ def test_a_simulated_robot_that_dies_ends_the_run_with_a_line(start: Start) -> N
     assert measured_in_store(run) == run.summary["points"]["measured"]
 
 
-@pytest.mark.parametrize("state", ["turning", "driving", "measuring"])
+@pytest.mark.parametrize(
+    "state", ["driving", *(pytest.param(name, marks=pytest.mark.slow) for name in ("turning", "measuring"))]
+)
 def test_emergency_brings_the_robot_to_base(start: Start, state: str) -> None:
     run = start("--panels", "1", "--realtime")
     run.until(lambda status: status["done"] >= 1 and status["state"] == state)
@@ -171,7 +173,7 @@ def test_resume_wants_the_same_points(start: Start) -> None:
 
 
 def test_lockstep_pause_stops_simulated_time(start: Start) -> None:
-    run = start("--panels", "4")
+    run = start("--panels", "1")
     run.until(lambda status: status["done"] >= 3)
     elapsed = run.ask("pause")["status"]["elapsed_s"]
     time.sleep(0.5)
@@ -179,7 +181,7 @@ def test_lockstep_pause_stops_simulated_time(start: Start) -> None:
     assert run.ask("status")["status"]["elapsed_s"] - elapsed < 0.2
     assert run.ask("resume")["ok"]
     assert run.wait() == 0, run.stderr
-    assert run.summary["points"]["measured"] == 36
+    assert run.summary["points"]["measured"] == 9
 
 
 def test_an_emergency_is_heard_in_a_lockstep_pause(start: Start) -> None:
@@ -207,7 +209,7 @@ def test_operator_abort_ends_at_base(start: Start) -> None:
 
 
 def test_bad_peers_leave_the_survey_undisturbed(start: Start) -> None:
-    run = start("--panels", "4")
+    run = start("--panels", "1")
     run.until(lambda status: status["state"] == "driving")
     garbage = [b"\x00\xff\n", b'{"type":"join","role":"king"}\n', b'{"type":"join","role":"controller","client":"x"}\n']
     for payload in (*garbage, b"x" * 1_000_000 + b"\n"):
@@ -220,7 +222,7 @@ def test_bad_peers_leave_the_survey_undisturbed(start: Start) -> None:
                 except (ConnectionResetError, BrokenPipeError):
                     pass  # refused: as it should be
     assert run.wait() == 0, run.stderr
-    assert run.summary["points"]["measured"] == 36
+    assert run.summary["points"]["measured"] == 9
     assert run.summary["danger"]["false_edges"] == 0
 
 

@@ -149,6 +149,12 @@ def test_eight_surveyed_anchors(with_tags: bool, tmp_path: Path, capsys: pytest.
     ("text", "what"),
     [
         ("first,second,range_m\nA,B,-1.0\n", ":2: range of -1 m is no distance"),
+        ("first,second,range_m\nA,B,nan\n", ":2: range of nan m is no distance"),
+        ("first,second,range_m\nA,B,0\n", ":2: range of 0 m is no distance"),
+        ("first,second,range_m\nA,B,inf\n", ":2: range of inf m is more than the 1e+06 m"),
+        ("first,second,range_m\nA,B,1e300\n", ":2: range of 1e+300 m is more than the 1e+06 m"),
+        ("first,second,range_m\nA,B,1.0,more\nB,C\n", ":3: range_m = '' is no number"),
+        ("", ":1: columns ; wanted first,second,range_m"),
         ("first,second,range_m\nA,A,1.0\n", ":2: from A to itself"),
         ("first,second,range_m\nA,B,far\n", ":2: range_m = 'far' is no number"),
         ("first,second,range_m,sigma_m\nA,B,1.0,0\n", ":2: sigma of 0 m, must be positive"),
@@ -167,6 +173,46 @@ def test_ranges_that_make_no_map(text: str, what: str, tmp_path: Path, capsys: p
     path = tmp_path / "ranges.csv"
     path.write_text(text)
     assert what in refusal(capsys, "--ranges", str(path))
+
+
+def measured(path: Path, rows: str, capsys: pytest.CaptureFixture[str], *args: str) -> dict[str, Any]:
+    path.write_text("first,second,range_m\n" + rows)
+    return mapped(capsys, "--ranges", str(path), *args)
+
+
+def test_two_motes_are_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "r.csv"
+    data = measured(path, "A,B,1.0\n", capsys)
+    assert (data["motes"], data["rank_deficiency"], data["warnings"]) == (2, 0, [])
+    assert data["expected_rms_m"] < 0.01
+    assert "no triangle of motes" in refusal(capsys, "--ranges", str(path), "--method", "ekf")
+
+
+def test_a_triangle_is_not_in_doubt_of_its_mirror_image(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = measured(tmp_path / "r.csv", "A,B,1\nB,C,1\nA,C,1\n", capsys)
+    assert data["warnings"] == []
+    assert data["crlb_m"] < 0.01
+
+
+@pytest.mark.parametrize("rows", ["A,B,1\nB,C,1\nA,C,2\n", "A,B,1\nB,C,1\nA,C,2\nA,D,3\nB,D,2\nC,D,1\n"])
+def test_motes_in_a_line(rows: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "r.csv"
+    data = measured(path, rows, capsys)
+    assert (data["crlb_m"], data["expected_rms_m"]) == (None, None)
+    assert data["warnings"][-1].startswith("the motes lie in a line, or nearly: the ranges do not tell how far")
+    assert "the best motes to begin with lie in a line, or nearly" in refusal(
+        capsys, "--ranges", str(path), "--method", "ekf"
+    )
+
+
+def test_ranges_of_one_pair_that_disagree(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = "A,B,1\nB,A,4\nB,C,1\nA,C,1.2\nA,D,1\nB,D,1\nC,D,1.1\n"
+    data = measured(tmp_path / "r.csv", rows, capsys)
+    assert data["warnings"][0] == (
+        "ranges between A and B disagree among themselves: 1 to 4 m with a sigma of 0.00667 m"
+    )
+    sound = measured(tmp_path / "r.csv", rows.replace("B,A,4", "B,A,1.01"), capsys)
+    assert not any("disagree" in warning for warning in sound["warnings"])
 
 
 def test_files_that_do_not_fit_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,6 +1,7 @@
 // The map: panels, points, path, robot, and whatever else the daemon has to show. Metres, x to the right, y up.
 const TODO = 0, ARRIVED = 1, MEASURED = 2, SKIPPED = 3;
 const MARGIN = 0.25;
+const BEYOND = 1.5; // metres outside of the rim that are still shown
 const ZOOM = [0.5, 400];
 const NEXT = 4;
 // An ellipse of three sigma is magnified until it can be seen.
@@ -16,6 +17,7 @@ const LOOKS = {
     if (!shape.outline_m && !shape.radius_m) disc(pen, x, y, 5, pen.inks.quiet);
   },
   trail: () => {},
+  true: (pen, x, y) => cross(pen, x, y, pen.inks.quiet), // where it really is: in simulation alone
 };
 const FILLED = { obstacle: "seam" };
 
@@ -78,7 +80,9 @@ export class MapView {
     const measured = this.states.filter((how) => how === MEASURED).length;
     const where = this.pose ? `robot at ${this.pose.x_m.toFixed(2)}, ${this.pose.y_m.toFixed(2)} m` : "robot not known";
     const other = this.shapes.length ? `, ${this.shapes.length} other things` : "";
-    const words = `Map: ${where}, ${measured} of ${this.ground.points.length} points measured${other}`;
+    const { goal, reached } = this.ground.words ?? {};
+    const goals = this.ground.points.length ? `, ${measured} of ${this.ground.points.length} ${goal} ${reached}` : "";
+    const words = `Map: ${where}${goals}${other}`;
     if (this.canvas.getAttribute("aria-label") !== words) this.canvas.setAttribute("aria-label", words);
   }
 
@@ -86,11 +90,18 @@ export class MapView {
 
   bounds() {
     const { rim, points, base } = this.ground;
-    const all = rim.length ? rim : [...points.map((p) => p.slice(1)), ...this.path, ...this.shapes.map((s) => [s.x_m, s.y_m]), ...this.shapes.flatMap((s) => s.outline_m ?? [])];
+    const all = rim.length ? [...rim, ...this.around(rim)] : [...points.map((p) => p.slice(1)), ...this.path, ...this.shapes.map((s) => [s.x_m, s.y_m]), ...this.shapes.flatMap((s) => s.outline_m ?? [])];
     if (!rim.length && this.pose) all.push([this.pose.x_m, this.pose.y_m]);
     if (!all.length) return base ? [base[0] - 1, base[1] - 1, base[0] + 1, base[1] + 1] : [-1, -1, 1, 1];
     const xs = all.map((p) => p[0]), ys = all.map((p) => p[1]);
     return [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
+  }
+
+  // What stands outside of the rim, but not far away: a first guess may be anywhere.
+  around(rim) {
+    const xs = rim.map((p) => p[0]), ys = rim.map((p) => p[1]);
+    const [x0, x1, y0, y1] = [Math.min(...xs) - BEYOND, Math.max(...xs) + BEYOND, Math.min(...ys) - BEYOND, Math.max(...ys) + BEYOND];
+    return this.shapes.map((s) => [s.x_m, s.y_m]).filter(([x, y]) => x >= x0 && x <= x1 && y >= y0 && y <= y1);
   }
 
   view() {
@@ -371,6 +382,11 @@ function polygon(pen, places, colour) {
   pen.closePath();
   pen.fillStyle = colour;
   pen.fill();
+}
+
+function cross(pen, x, y, colour) {
+  line(pen, [[x - 5, y - 5], [x + 5, y + 5]], colour, 1.5, false);
+  line(pen, [[x - 5, y + 5], [x + 5, y - 5]], colour, 1.5, false);
 }
 
 function disc(pen, x, y, radius, colour) {

@@ -6,7 +6,6 @@ import { Plots } from "./plots.js";
 const SILENCE_MS = 800;
 const RETRY_MS = 1500;
 const MAX_LINES = 200;
-const CODES = ["normal operation", "near the mirror's edge", "operation aborted"];
 const LEVELS = { held: "bad", "backing off": "warn", returning: "warn", idle: "", done: "" };
 const SEVERITIES = ["", "inform", "slow", "pause", "hold", "return", "fault"];
 
@@ -26,13 +25,16 @@ const clock = (s) => {
 const age = (s) => (s === null ? "" : s < 9.95 ? `${s.toFixed(1)} s` : s < 120 ? `${Math.round(s)} s` : `${Math.round(s / 60)} min`);
 
 const map = new MapView($("map"), $("legend"));
-const plots = new Plots({ arrival: $("plot-arrival"), error: $("plot-error"), jump: $("plot-jump"), nis: $("plot-nis") });
+const plots = new Plots((name) => $(`plot-${name}`));
 const commands = new Commands();
 
 let source = null;
 let heardAt = performance.now();
 let isEnded = false;
 let isConnecting = false;
+let codes = [];
+let words = {};
+let hidden = [];
 
 // -- the stream ---------------------------------------------------------------------------------------------------
 
@@ -65,6 +67,12 @@ function begin(ground) {
   document.title = `${ground.is_sim ? "SIM " : ""}${ground.title} – ccatp`;
   $("simulation").hidden = !ground.is_sim;
   $("token-row").hidden = !ground.needs_token;
+  ({ codes, words } = ground);
+  for (const [id, word] of Object.entries(words)) if ($(id)) text(id, word);
+  for (const id of hidden) $(id).hidden = false; // the mission before may have been of another kind
+  for (const id of ground.hides) $(id).hidden = true;
+  hidden = ground.hides;
+  plots.begin(ground.plots);
   map.begin(ground);
 }
 
@@ -81,7 +89,7 @@ function end(state) {
   isEnded = true;
   const mission = state.mission;
   const how = mission?.outcome || (mission ? `while ${mission.state}` : "before it began");
-  text("ended", `The daemon has ended: ${how}${mission ? `, ${mission.done} of ${mission.total} points measured` : ""}.`);
+  text("ended", `The daemon has ended: ${how}${mission ? `, ${mission.done} of ${mission.total} ${words.goal} ${words.reached}` : ""}.`);
   $("ended").hidden = false;
   alarm([]);
   commands.end();
@@ -107,6 +115,7 @@ function alarm(losses) {
 function show(state, isAll) {
   alarm(state.losses);
   showMission(state);
+  showFacts(state.facts);
   showVerdict(state.verdict);
   showRobot(state.robot, state.pose);
   showLinks(state);
@@ -138,11 +147,28 @@ function showMission({ mission, losses }) {
   text("slips", mission.slips ? `${mission.slips}, worst ${mission.lag_ms.toFixed(0)} ms` : "0");
 }
 
+// Name and value of what else a mission has to say.
+function showFacts(facts) {
+  const list = $("facts");
+  list.hidden = !facts?.length;
+  if (list.hidden) return;
+  while (list.children.length < facts.length) {
+    const row = document.createElement("div");
+    row.append(document.createElement("dt"), document.createElement("dd"));
+    list.append(row);
+  }
+  while (list.children.length > facts.length) list.lastChild.remove();
+  facts.forEach((fact, k) => fact.forEach((words, column) => {
+    const node = list.children[k].children[column];
+    if (node.textContent !== words) node.textContent = words;
+  }));
+}
+
 function showVerdict(verdict) {
   if (!verdict) return;
   const unit = verdict.cause ? ` (${verdict.signal} ${verdict.value.toPrecision(3)}, limit ${verdict.limit.toPrecision(3)})` : "";
   const grave = SEVERITIES[verdict.severity] ? `, ${SEVERITIES[verdict.severity]}` : "";
-  text("verdict", `${verdict.code} ${CODES[verdict.code] ?? ""}${grave}${verdict.cause ? `: ${verdict.cause}${unit}` : ""}`);
+  text("verdict", `${verdict.code} ${codes[verdict.code] ?? ""}${grave}${verdict.cause ? `: ${verdict.cause}${unit}` : ""}`);
   $("verdict").dataset.level = verdict.code === 2 || verdict.severity >= 4 ? "bad" : verdict.code || verdict.severity ? "warn" : "";
   $("verdict").classList.toggle("stale", Boolean(verdict.is_stale));
   for (const way of ["forward", "reverse", "turn"]) {

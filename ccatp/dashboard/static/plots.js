@@ -15,27 +15,55 @@ const LOOKS = {
     { label: "3σ", ink: "--warn", dash: [5, 4] },
   ],
   jump: [{ label: "jump", ink: "--good", dots: true }],
+  map: [
+    { label: "true error", ink: "--accent" },
+    { label: "expected", ink: "--warn", dash: [5, 4] },
+  ],
   nis: [{ label: "NIS / dof", ink: "--path", dots: true }],
+  target: [
+    { label: "distance", ink: "--accent" },
+    { label: "to be kept", ink: "--warn", dash: [5, 4] },
+  ],
+  clearance: [{ label: "nearest", ink: "--accent" }],
 };
 // Rows as they are sent into rows as they are drawn.
 const SHAPE = { nis: ([t, nis, size]) => [t, nis / size] };
 
 export class Plots {
-  constructor(places) {
-    this.rows = Object.fromEntries(Object.keys(LOOKS).map((name) => [name, []]));
-    this.places = places;
+  constructor(placeOf) {
+    this.placeOf = placeOf;
+    this.names = [];
+    this.rows = {};
+    this.places = {};
     this.plots = {};
     this.dirty = new Set();
     this.drawnAt = 0;
-    this.build();
     matchMedia("(prefers-color-scheme: light)").addEventListener("change", () => this.build());
-    new ResizeObserver(() => this.resize()).observe(places.arrival);
+    this.observer = new ResizeObserver(() => this.resize());
+  }
+
+  // Which of them this mission has; they may be others when the next one begins at the same place.
+  begin(names) {
+    if (names.join() === this.names.join()) return;
+    for (const name of this.names) {
+      this.plots[name].destroy();
+      this.places[name].closest("figure").hidden = true;
+    }
+    this.names = names;
+    this.rows = Object.fromEntries(names.map((name) => [name, []]));
+    this.places = Object.fromEntries(names.map((name) => [name, this.placeOf(name)]));
+    this.plots = {};
+    this.observer.disconnect();
+    for (const name of names) this.places[name].closest("figure").hidden = false;
+    this.build();
+    this.observer.observe(this.places[names[0]]);
   }
 
   build() {
     const style = getComputedStyle(document.documentElement);
     const ink = (name) => style.getPropertyValue(name).trim();
-    for (const [name, columns] of Object.entries(LOOKS)) {
+    for (const name of this.names) {
+      const columns = LOOKS[name];
       this.plots[name]?.destroy();
       const axis = { stroke: ink("--quiet"), grid: { stroke: ink("--line"), width: 1 }, ticks: { show: false }, font: "11px system-ui" };
       this.plots[name] = new uPlot(
@@ -70,7 +98,7 @@ export class Plots {
   }
 
   hear(series, isAll) {
-    for (const name of Object.keys(LOOKS)) {
+    for (const name of this.names) {
       const news = (series[name] ?? []).map(SHAPE[name] ?? ((row) => row));
       if (isAll) this.rows[name] = news;
       else if (news.length) this.rows[name].push(...news);

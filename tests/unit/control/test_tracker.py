@@ -137,3 +137,22 @@ def test_steering_damps_a_rate_that_it_did_not_want(tracker: LegTracker, config:
         tracker.begin((0.0, 0.0, 0.0), (0.5, 0.0), False)
         rates.append(tracker.step((0.0, 0.0, 0.0), (0.5, 0.0), DT, Twist(0.0, omega)).omega_rad_s)
     assert rates[1] - rates[0] == pytest.approx(-0.1 * config.control.gain_sets["shipped"].angular.kd)
+
+
+def test_a_turn_does_not_chase_the_bearing_of_a_stop_at_its_feet(tracker: LegTracker) -> None:
+    # The turn carries the robot round the stop, which is always a radian further.
+    stop, near_m = (0.3, 0.4), 0.002
+
+    def carry(robot: Robot) -> None:
+        robot.x, robot.y = stop[0] - near_m * cos(robot.heading + 1.0), stop[1] - near_m * sin(robot.heading + 1.0)
+
+    robot = Robot((0.0, 0.0, 0.0))
+    carry(robot)
+    tracker.begin(robot.pose, stop, reverse=False)
+    planned_s, t = tracker.planned_s, 0.0
+    while tracker.phase is not Phase.DONE:
+        robot.drive(tracker.step(robot.pose, stop, DT))
+        carry(robot)
+        t += DT
+        assert t < 1.2 * planned_s, f"still {tracker.phase} after {t} s"
+    assert t >= planned_s

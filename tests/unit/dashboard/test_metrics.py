@@ -8,8 +8,10 @@ from ccatp.config.loader import load_config
 from ccatp.dashboard.metrics import metrics_text
 from ccatp.dashboard.survey_view import SurveyView
 from ccatp.mirror.mirror import build_mirror
+from ccatp.surveying.states import State
 from tests.unit.dashboard.prometheus import parse
 
+GROUND = {"title": "fyst-m1", "states": [str(state) for state in State]}
 NOTHING: dict[str, Any] = {
     "is_sim": False, "trouble": "main was never heard of", "links": [], "restarts": {"main": 0, "danger": 2},
     "mission": None, "verdict": None, "robot": None, "pose": None,
@@ -34,7 +36,7 @@ ALL: dict[str, Any] = NOTHING | {
 
 
 def test_all_of_it() -> None:
-    metrics = parse(metrics_text(ALL, "fyst-m1", 3))
+    metrics = parse(metrics_text(ALL, GROUND, 3))
     values = {name: metric.samples for name, metric in metrics.items()}
     assert values["ccatp_up"] == {"": 1.0}
     assert values["ccatp_points"] == {'state="planned"': 693.0, 'state="measured"': 12.0, 'state="skipped"': 1.0}
@@ -52,20 +54,20 @@ def test_all_of_it() -> None:
 
 
 def test_what_is_not_known_is_left_out() -> None:
-    metrics = parse(metrics_text(NOTHING, "fyst-m1", 0))
+    metrics = parse(metrics_text(NOTHING, GROUND, 0))
     assert set(metrics) == {"ccatp_info", "ccatp_up", "ccatp_process_restarts_total", "ccatp_dashboard_pages"}
     assert metrics["ccatp_up"].samples == {"": 0.0}
 
 
 def test_a_name_with_everything_that_has_to_be_escaped() -> None:
-    labels = next(iter(parse(metrics_text(NOTHING, 'a"b\\c\nd', 0))["ccatp_info"].samples))
+    labels = next(iter(parse(metrics_text(NOTHING, GROUND | {"title": 'a"b\\c\nd'}, 0))["ccatp_info"].samples))
     assert labels.startswith(r'mirror="a\"b\\c\nd",')
 
 
 def test_the_state_of_a_real_view() -> None:
     cfg = load_config(None, {"run.panels": 1})
     view = SurveyView(build_mirror(cfg.mirror), cfg, is_sim=True)
-    assert parse(metrics_text(view.status_data(1.0), "fyst-m1", 0))["ccatp_up"].samples == {"": 0.0}
+    assert parse(metrics_text(view.status_data(1.0), GROUND, 0))["ccatp_up"].samples == {"": 0.0}
 
 
 @pytest.mark.parametrize(

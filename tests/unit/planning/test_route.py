@@ -62,12 +62,19 @@ def test_whole_surveys_fit_into_the_hour(world: Any) -> None:
 
 
 def test_largest_leg_of_thesis_m1(thesis: Any) -> None:
-    route = plan(thesis, thesis_order(thesis.mirror))
-    ends = [(stop.x_m, stop.y_m) for stop in route.stops]
-    legs = sorted(hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(ends))
+    points, cfg = thesis_order(thesis.mirror), thesis.cfg
+
+    def legs_of(longest_m: float) -> list[float]:
+        mission = cfg.mission.model_copy(update={"longest_leg_m": longest_m})
+        route = plan_route(thesis.mirror, points, cfg.robot, cfg.limits, mission, thesis.mirror.base_pose)
+        ends = [(stop.x_m, stop.y_m) for stop in route.stops]
+        return sorted(hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(ends))
+
+    legs = legs_of(2.0)
     # Around the stepped corners straight up and across: on the diagonals, shorter by 0.3 m, a sensor runs along a seam.
     assert legs[-1] == pytest.approx(0.733, abs=0.002)  # the retreats before and after lie on a grid of 5 mm
     assert legs[-9] == pytest.approx(0.254, abs=0.012)  # else 744 - 490 mm, between two rows; a retreat may slant it
+    assert legs_of(cfg.mission.longest_leg_m)[-1] <= cfg.mission.longest_leg_m
 
 
 def test_points_of_a_row_need_no_stops_between(thesis: Any) -> None:

@@ -9,6 +9,7 @@ from ccatp.config.models import Config
 from ccatp.localizer import build_localizer
 from ccatp.mirror.mirror import build_mirror
 from ccatp.processes.painting import Painter
+from ccatp.processes.survey_telling import look_at_localizer
 from ccatp.wire.topics import Picture
 
 LINE = b'{"type":"sensors"}'
@@ -20,7 +21,7 @@ def test_a_picture_for_a_subscriber_only(config: Config, tmp_path: Path) -> None
     endpoint = f"ipc://{tmp_path}/main"
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     publisher = Publisher(context, endpoint)
-    painter = Painter(publisher)
+    painter = Painter(publisher, look_at_localizer)
     subscriber = Subscriber(context, [endpoint], ["picture"], keeps_newest=True)
     try:
         while not publisher.has_subscriber("picture"):

@@ -10,6 +10,7 @@ from ccatp.processes.common import open_log
 from ccatp.processes.run_report import write_run_report
 from ccatp.processes.run_view import RunView, survey_title
 from tests.unit.aligning.conftest import load
+from tests.unit.reporting.beacon_recorded import record_beacons
 from tests.unit.run_folder import make_run
 
 CFG, M1 = load("fyst-m1")
@@ -32,11 +33,11 @@ def test_an_interrupted_run_does_not_wait_for_one(run_dir: Path) -> None:
     assert not (run_dir / "report.html").exists()
 
 
-def test_a_mission_among_beacons_says_that_it_has_none(run_dir: Path) -> None:
-    (run_dir / "config.toml").write_text('system = "zigbee"\n')
+def test_a_mission_among_beacons_gets_one(tmp_path: Path) -> None:
+    run_dir = record_beacons(tmp_path / "beacons")
     log = open_log(run_dir / "log.jsonl", "supervisor")
-    told = write_run_report(run_dir, ExitStatus.COMPLETE, log)
-    assert told == f"none; {run_dir}: a mission among beacons; reports are of surveys, its figures are in summary.json"
+    assert write_run_report(run_dir, ExitStatus.COMPLETE, log) == str(run_dir / "report.html")
+    assert "Waypoints among ZigBee beacons" in (run_dir / "report.html").read_text()
 
 
 def test_whatever_goes_wrong_is_logged_and_no_more(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:

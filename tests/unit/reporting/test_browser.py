@@ -19,7 +19,7 @@ def test_the_pages_open_by_themselves(recorded: Path, tmp_path: Path) -> None:
     # One test with one browser: its processes end with the test.
     from playwright.sync_api import sync_playwright
 
-    report, _ = report_run(recorded, tmp_path / "report.html")
+    report = report_run(recorded, tmp_path / "report.html").path
     compare_runs(recorded, recorded, tmp_path / "compare.html")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])

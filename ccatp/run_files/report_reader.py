@@ -14,14 +14,14 @@ from ccatp.config.loader import load_config
 from ccatp.config.models import Config
 from ccatp.config.radio_loader import is_radio_file
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.recorder import read_metadata, recordings
 from ccatp.reporting.record import PlannedRow, RunRecord, Session, changed_keys
-from ccatp.run_reader import CONFIG, TELEMETRY, RunReadError
-from ccatp.session_reader import read_session
-from ccatp.state_log import ReadLine, changes_of, read_log
-from ccatp.store_reader import read_survey
-from ccatp.store_rows import StoreError, point_name
-from ccatp.survey_reader import STORE, read_truth
+from ccatp.run_files.recorder import read_metadata, recordings
+from ccatp.run_files.run_reader import CONFIG, TELEMETRY, RunReadError
+from ccatp.run_files.session_reader import read_session
+from ccatp.run_files.state_log import ReadLine, changes_of, read_log
+from ccatp.run_files.survey_reader import STORE, read_truth
+from ccatp.storage.store_reader import read_survey
+from ccatp.storage.store_rows import StoreError, point_name
 
 SUMMARY, LOG = "summary.json", "log.jsonl"
 
@@ -33,12 +33,8 @@ def read_record(run_dir: Path) -> RunRecord:
         RunReadError: no such directory, no run in it, or none of a survey.
         ConfigError: its configuration cannot be used.
     """
-    if not run_dir.is_dir():
-        raise RunReadError(f"{run_dir}: no such directory; name the directory of a run")
-    if not (run_dir / CONFIG).is_file():
-        raise RunReadError(f"{run_dir}: no {CONFIG} there; name the directory of a run")
-    if is_radio_file(run_dir / CONFIG):
-        raise RunReadError(f"{run_dir}: a mission among beacons; reports are of surveys, its figures are in {SUMMARY}")
+    if is_beacon_run(run_dir):
+        raise RunReadError(f"{run_dir}: a mission among beacons; this is for surveys, ccatp report takes both")
     cfg = load_config(run_dir / CONFIG)
     mirror = build_mirror(cfg.mirror)
     missing: list[str] = []
@@ -56,16 +52,30 @@ def read_record(run_dir: Path) -> RunRecord:
         changed=_changed(cfg),
         mirror=mirror,
         is_simulation=is_simulation,
-        summary=_summary(run_dir / SUMMARY, missing, warnings),
+        summary=read_summary(run_dir / SUMMARY, missing, warnings),
         sessions=sessions,
         points=points,
         measured=measured,
         injected=injected,
         log=tuple(line.shown for line in log if line.shown is not None),
-        files=dict(_files(run_dir)),
+        files=files_of(run_dir),
         missing=tuple(missing),
         warnings=tuple(warnings),
     )
+
+
+def is_beacon_run(run_dir: Path) -> bool:
+    """Whether a run is a mission among beacons.
+
+    Raises:
+        RunReadError: no such directory, or no run in it.
+        ConfigError: its configuration cannot be read.
+    """
+    if not run_dir.is_dir():
+        raise RunReadError(f"{run_dir}: no such directory; name the directory of a run")
+    if not (run_dir / CONFIG).is_file():
+        raise RunReadError(f"{run_dir}: no {CONFIG} there; name the directory of a run")
+    return is_radio_file(run_dir / CONFIG)
 
 
 def _changed(cfg: Config) -> dict[str, tuple[object, object]]:
@@ -115,7 +125,8 @@ def _survey(
     return points, tuple(Measured(one.point, one.fix) for one in stored.fixes)
 
 
-def _summary(path: Path, missing: list[str], warnings: list[str]) -> Mapping[str, Any] | None:
+def read_summary(path: Path, missing: list[str], warnings: list[str]) -> Mapping[str, Any] | None:
+    """``summary.json``; None where there is none, or none that can be read, and a line that says so."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -128,6 +139,11 @@ def _summary(path: Path, missing: list[str], warnings: list[str]) -> Mapping[str
         warnings.append(f"{path.name}: is no summary")
         return None
     return found
+
+
+def files_of(run_dir: Path) -> dict[str, int]:
+    """Names and sizes in bytes of what a run wrote."""
+    return dict(_files(run_dir))
 
 
 def _files(run_dir: Path) -> Iterator[tuple[str, int]]:

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from ccatp.config.radio_models import FuzzyConfig
 from ccatp.control.fuzzy import Sugeno
-from ccatp.picture_file import PictureError
+from ccatp.pictures.picture_file import PictureError
 from ccatp.radio.level_fix import LevelFix
 from ccatp.radio.path_loss_fit import LevelPair, PathLossFit
 
@@ -36,7 +36,7 @@ def draw_path_loss(fit: PathLossFit, pairs: Sequence[LevelPair], name: str, out:
     distances, levels = np.array([pair[:2] for pair in pairs]).T
     grid = np.geomspace(distances.min() / 1.2, distances.max() * 1.2, 200)
     mean, scale = fit.predicted(grid)
-    half = scale * float(student.ppf(0.975, fit.freedom))
+    half = scale * float(stdtrit(fit.freedom, 0.975))
     axes.fill_between(grid, mean - half, mean + half, color=_BLUE, alpha=0.12, linewidth=0, label="95 % of new places")
     axes.plot(grid, mean, color=_BLUE, linewidth=1.6, label=_formula(fit))
     axes.plot(distances, levels, "o", color=_GOLD, markersize=4, markeredgecolor="white", label="readings")

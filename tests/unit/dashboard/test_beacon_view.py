@@ -1,0 +1,170 @@
+"""The page of a mission among beacons, from messages in virtual time."""
+
+import json
+from typing import Any
+
+import msgspec
+import pytest
+
+from ccatp.beacon_mission.states import State
+from ccatp.config.radio_loader import load_radio_config
+from ccatp.config.radio_models import RadioConfig
+from ccatp.dashboard.beacon_ground import beacon_ground, waypoint_name
+from ccatp.dashboard.beacon_view import BeaconView, expected_rms_m, true_rms_m, worst_sigma_m
+from ccatp.dashboard.ground import MEASURED, TODO
+from ccatp.errors import ConfigError
+from ccatp.wire.topics import (
+    BeaconArrival,
+    BeaconMap,
+    BeaconPlaces,
+    BeaconTrack,
+    BeaconTruth,
+    Scene,
+    Shape,
+)
+
+ELLIPSE = (0.8, 0.8, 4e-4, 0.0, 4e-4)
+
+
+def config(system: str = "zigbee", **keys: object) -> RadioConfig:
+    return load_radio_config(None, {"system": system, **keys})
+
+
+@pytest.fixture
+def view() -> BeaconView:
+    return BeaconView(config(), is_sim=True)
+
+
+def told_map(t_s: float = 1.0, **fields: Any) -> BeaconMap:
+    known: dict[str, Any] = {
+        "seq": 10, "t_s": t_s, "system": "zigbee", "pose": (0.8, 0.8, 0.0), "pose_ellipse": ELLIPSE,
+        "beacons": {"a": (0.3, 0.0, 0.03, 0.0, 0.01), "b": (3.0, 0.4, 0.02, 0.0, 0.02)}, "target": None,
+        "obstacles": [], "waypoints": [(0.8, 0.8), (2.2, 0.8)], "next_waypoint": 1, "distances": [1.5, 0.7],
+        "nis_sum": 0.0, "nis_size": 0, "refused": 0, "notes": {},
+    }  # fmt: skip
+    return BeaconMap(**(known | fields))
+
+
+def arrival(waypoint: int, lap: int = 0) -> BeaconArrival:
+    return BeaconArrival(seq=1, t_s=1.0, waypoint=waypoint, lap=lap, place=(0.8, 0.8), estimate=ELLIPSE)
+
+
+def encoded(data: dict[str, Any]) -> dict[str, Any]:
+    """As a page gets it."""
+    decoded: dict[str, Any] = json.loads(msgspec.json.encode(data))
+    return decoded
+
+
+def test_waypoints_are_done_one_after_the_other_and_anew_in_the_next_lap(view: BeaconView) -> None:
+    view.hear(arrival(0), 0.0)
+    view.hear(arrival(1), 0.0)
+    assert view.news(0.0)["points"] == [[0, MEASURED, None], [1, MEASURED, None]]
+    assert view.news(0.0)["points"] == []
+    view.hear(arrival(0, lap=1), 0.0)
+    assert view.news(0.0)["points"] == [[0, MEASURED, None], *([k, TODO, None] for k in (1, 2, 3))]
+    assert view.everything(0.0)["points"] == [[0, MEASURED, None]]
+
+
+def test_the_map_against_what_is_expected_and_what_is_true(view: BeaconView) -> None:
+    view.hear(BeaconPlaces(seq=0, t_s=0.0, places={"a": (0.0, 0.0), "b": (3.0, 0.0)}), 0.0)
+    view.hear(told_map(), 0.0)
+    view.hear(told_map(1.5, nis_sum=6.0, nis_size=4, refused=2), 0.0)
+    series = view.news(0.0)["series"]
+    # Root mean squares of 0.3 and 0.4 m, and of variances of 0.04 for each place, in mm.
+    assert series["map"] == [(1.5, pytest.approx(353.55), pytest.approx(200.0))]
+    assert series["nis"] == [(1.5, 6.0, 4)]
+    assert series["clearance"] == [(1.5, 0.7)]
+    view.hear(told_map(2.0, nis_sum=7.0, nis_size=6, refused=2), 0.0)
+    assert view.news(0.0)["series"]["nis"] == [(2.0, 1.0, 2)]
+    view.hear(told_map(2.5), 0.0)  # of another main loop: it begins anew
+    assert "nis" not in view.news(0.0)["series"]
+
+
+def test_facts(view: BeaconView) -> None:
+    assert view.everything(0.0)["facts"] == []
+    view.hear(told_map(nis_sum=6.0, nis_size=4, refused=2), 0.0)
+    assert dict(view.everything(0.0)["facts"]) == {
+        "beacons on the map": "2",
+        "error of the map, expected": "200.0 mm",
+        "readings used, refused": "4, 2",
+        "mean NIS": "1.50",
+        "to the waypoint": "1.40 m",
+        "lap": "1 of 2",
+    }
+
+
+def test_a_target_is_followed() -> None:
+    view = BeaconView(config("follow"), is_sim=True)
+    target = (1.8, 0.8, 0.01, 0.0, 0.01)
+    for t_s in (1.0, 1.5):
+        view.hear(told_map(t_s, target=target, beacons={"target": target}, waypoints=[], next_waypoint=-1), 0.0)
+    told = view.news(0.0)
+    assert told["series"]["target"] == [(1.5, 1.0, 0.6)]
+    assert "map" not in told["series"]  # the one that moves is none of the map
+    assert dict(told["facts"])["distance to the target"] == "1.00 m"
+
+
+def test_the_error_against_the_truth_is_the_worst_of_each_second(view: BeaconView) -> None:
+    rows: Any = [(k, 0.1 * k, 1.0, 2.0, 0.0, 4e-4, 0.0, 1e-4, 0.0, 0.0, 1e-4, 1.0, 2.0) for k in (10, 15, 20)]
+    view.hear(BeaconTrack(seq=20, t_s=2.0, rows=rows), 0.0)
+    true: Any = [(k, 0.1 * k, 1.0, 2.01, 0.0, None, None, None) for k in (10, 15, 20)]
+    view.hear(BeaconTruth(seq=20, t_s=2.0, rows=true), 0.0)
+    assert view.news(0.0)["series"]["error"] == [(1.0, pytest.approx(10.0), pytest.approx(60.0))]
+
+
+def test_without_a_truth_three_sigma_alone() -> None:
+    view = BeaconView(config(), is_sim=False)
+    rows: Any = [(k, 0.1 * k, 1.0, 2.0, 0.0, 4e-4, 0.0, 1e-4, 0.0, 0.0, 1e-4, 1.0, 2.0) for k in (10, 20)]
+    view.hear(BeaconTrack(seq=20, t_s=2.0, rows=rows), 0.0)
+    assert view.news(0.0)["series"]["error"] == [(1.0, None, 60.0), (2.0, None, 60.0)]
+
+
+def test_the_scene_without_what_the_page_draws_itself(view: BeaconView) -> None:
+    kinds = ("robot", "trail", "waypoint", "beacon", "obstacle")
+    view.hear(BeaconPlaces(seq=0, t_s=0.0, places={"a": (0.0, 1.0)}), 0.0)
+    view.hear(Scene(seq=1, t_s=1.0, shapes=[Shape(kind, kind, 1.0, 1.0) for kind in kinds]), 0.0)
+    told = encoded(view.news(0.0))
+    assert [shape["kind"] for shape in told["shapes"]] == ["true", "beacon", "obstacle"]
+    assert told["shapes"][0]["y_m"] == 1.0
+
+
+def test_there_is_no_laser(view: BeaconView) -> None:
+    assert [link["name"] for link in view.news(0.0)["links"]] == ["main loop", "danger loop", "robot"]
+
+
+def test_the_path_comes_with_the_map(view: BeaconView) -> None:
+    view.hear(told_map(), 0.0)
+    view.hear(told_map(1.5, pose=(0.801, 0.8, 0.0)), 0.0)  # nobody sees so little
+    view.hear(told_map(2.0, pose=(0.9, 0.8, 0.0)), 0.0)
+    assert view.everything(0.0)["path"] == [(0.8, 0.8), (0.9, 0.8)]
+
+
+def test_figures() -> None:
+    assert expected_rms_m({}) is None
+    assert true_rms_m({"a": ELLIPSE}, {}) is None
+    assert worst_sigma_m(1.0, 0.0, 4.0) == pytest.approx(2.0)
+    assert worst_sigma_m(2.0, 1.0, 2.0) == pytest.approx(3.0**0.5)
+
+
+@pytest.mark.parametrize("system", ["zigbee", "follow", "cricket"])
+def test_the_ground(system: str) -> None:
+    cfg = config(system)
+    told = encoded(beacon_ground(cfg, is_sim=True, needs_token=True))
+    assert told["needs_token"] is True
+    assert told["rim"][2] == list(cfg.workspace.size_m)
+    assert told["states"] == [str(state) for state in State]
+    is_following = system == "follow"
+    assert len(told["points"]) == (0 if is_following else len(cfg.workspace.waypoints_m))
+    assert ("target" in told["plots"]) is is_following
+    assert told["words"]["unit"] == ("seconds" if is_following else "waypoints")
+
+
+def test_names_are_those_of_the_status() -> None:
+    assert waypoint_name(0) == "waypoint 1"
+    ground = beacon_ground(config(), is_sim=True, needs_token=False)
+    assert [point[0] for point in ground["points"]] == [waypoint_name(k) for k in range(4)]
+
+
+def test_a_page_beyond_this_machine_wants_a_token() -> None:
+    with pytest.raises(ConfigError, match=r"dashboard\.host = \"0\.0\.0\.0\" is beyond this machine"):
+        config(**{"dashboard.host": "0.0.0.0"})

@@ -1,0 +1,143 @@
+"""Reports of missions among beacons: what is read, what it amounts to, the page, its figures, and what is missing."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ccatp.cli import main
+from ccatp.report_writer import report_run
+from ccatp.reporting.beacon_figures import consistency_figure, map_error_figure, target_figure
+from ccatp.reporting.beacon_map_figure import beacon_map_figure, ellipse_m
+from ccatp.reporting.beacon_page import beacon_data, beacon_figures, beacon_page
+from ccatp.reporting.beacon_record import beacon_rows, pose_errors_m, pose_nees, readings_of, waypoint_rows
+from ccatp.reporting.html import NARROW, WIDE
+from ccatp.run_files.beacon_report_reader import read_beacon_record
+from ccatp.run_files.run_reader import RunReadError
+from tests.unit.reporting.beacon_recorded import FRAMES, OFF_M, SIGMA_M, beacon_config, record_beacons
+from tests.unit.reporting.test_pages import Markup
+
+ALL = ["map", "waypoints", "localization", "consistency", "events", "configuration"]
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record_beacons(tmp_path_factory.mktemp("beacons") / "run")
+
+
+def test_errors_and_consistency_of_a_record(run_dir: Path) -> None:
+    record = read_beacon_record(run_dir)
+    assert len(record.track.seq) == FRAMES  # the frame that was told twice counts once
+    assert record.track.sigma_m == pytest.approx(SIGMA_M)
+    errors, nees = pose_errors_m(record), pose_nees(record)
+    assert errors is not None
+    assert errors == pytest.approx(OFF_M)
+    assert nees == pytest.approx((OFF_M / SIGMA_M) ** 2)
+    readings = readings_of(record)
+    assert [reading.nis for reading in readings] == pytest.approx([3.0] * 12)
+    assert [reading.size for reading in readings] == [2] * 12
+    first, second = beacon_rows(record)
+    assert (first.name, first.sigma_m, first.error_m, first.nees) == ("beacon1", *map(pytest.approx, (0.1, 0.1, 1.0)))
+    assert second.error_m == 0.0
+    assert second.sigma_m == pytest.approx(0.012**0.5)
+
+
+def test_a_waypoint_that_was_reached(run_dir: Path) -> None:
+    (row,) = waypoint_rows(read_beacon_record(run_dir))
+    assert (row.number, row.lap, row.waypoint, row.t_s, row.place_m) == (1, 1, 1, 1.0, (0.8, 0.8))
+    assert row.sigma_m == pytest.approx(SIGMA_M)
+    assert row.estimate_off_m == pytest.approx(0.2)
+    assert row.true_off_m == pytest.approx((0.2**2 + OFF_M**2) ** 0.5)
+    assert row.error_m == pytest.approx(OFF_M)
+    assert row.sigmas == pytest.approx(OFF_M / SIGMA_M)
+
+
+def test_the_page(run_dir: Path) -> None:
+    record = read_beacon_record(run_dir)
+    page = beacon_page(record)
+    markup = Markup(page)
+    assert markup.outside == []
+    assert markup.anchors == ALL
+    assert "SIMULATION, seed 5" in page
+    assert '<strong class="good">complete</strong>' in page
+    assert "held: &lt;b&gt;near&lt;/b&gt;" in page  # text stays text
+    assert "obstacle 1\u00d7" in page
+    assert "mission.laps" in page  # other than the defaults
+    assert "30 <small>mm rms, 30 largest</small>" in page
+    assert "1.500 <small>95 % band" in page
+
+
+def test_its_figures_are_drawn_for_screens_and_telephones(run_dir: Path) -> None:
+    record = read_beacon_record(run_dir)
+    assert set(beacon_figures(record)) == {"map", "localization", "consistency", "beacons"}
+    assert target_figure(record, WIDE) is None
+    for width in (WIDE, NARROW):
+        for picture in (
+            beacon_map_figure(record, width), consistency_figure(record, width), map_error_figure(record, width)
+        ):  # fmt: skip
+            assert picture is not None
+            assert picture.width == width
+            assert picture.height > 200.0
+
+
+def test_an_ellipse_of_three_sigma() -> None:
+    outline = ellipse_m(np.array([1.0, 2.0]), np.array(((0.04, 0.0), (0.0, 0.01))))
+    assert outline.min(axis=0) == pytest.approx((0.4, 1.7), abs=2e-3)
+    assert outline.max(axis=0) == pytest.approx((1.6, 2.3), abs=2e-3)
+
+
+def test_a_robot_that_follows(tmp_path: Path) -> None:
+    record = read_beacon_record(record_beacons(tmp_path / "run", beacon_config("follow")))
+    assert set(record.beacons) == {"beacon1", "beacon2"}  # the one that moves is none of the map
+    assert target_figure(record, WIDE) is not None
+    markup = Markup(beacon_page(record))
+    assert "target" in markup.anchors
+    assert "waypoints" not in markup.anchors
+
+
+def test_a_real_robot_has_no_truth(tmp_path: Path) -> None:
+    record = read_beacon_record(record_beacons(tmp_path / "run", is_sim=False))
+    page = beacon_page(record)
+    assert "real robot" in page
+    assert "The true pose is not known" in page
+    assert pose_nees(record) is None
+    data = beacon_data(record)
+    assert (data["position_error_m"], data["pose_nees_mean"], data["waypoints"]["within_3_sigma"]) == (None, None, None)
+    assert data["waypoints"]["reached"] == 1
+    Markup(page)
+
+
+def test_a_run_that_was_killed_says_what_it_lacks(tmp_path: Path) -> None:
+    run_dir = record_beacons(tmp_path / "run", ends=False)
+    whole = (run_dir / "telemetry.mcap").read_bytes()
+    (run_dir / "telemetry.mcap").write_bytes(whole[: int(0.7 * len(whole))])
+    record = read_beacon_record(run_dir)
+    page = beacon_page(record)
+    assert "summary.json: the run goes on, or was killed before its end" in page
+    assert any("telemetry.mcap" in warning for warning in record.warnings)
+    Markup(page)
+    for name in ("telemetry.mcap", "log.jsonl"):
+        (run_dir / name).unlink()
+    record = read_beacon_record(run_dir)
+    assert {line.partition(":")[0] for line in record.missing} == {"telemetry.mcap", "log.jsonl", "summary.json"}
+    assert beacon_figures(record) == {}
+    assert Markup(beacon_page(record)).anchors == ["configuration"]
+
+
+def test_the_command(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "page.html"
+    assert main(["report", str(run_dir), "--out", str(page), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["report"] == str(page)
+    assert (told["system"], told["seed"], told["outcome"]) == ("zigbee", 5, "complete")
+    assert told["waypoints"] == {"total": 4, "reached": 1, "within_3_sigma": 1}
+    assert told["nis_mean"] == 1.5
+    assert told["position_error_m"] == {"rms": OFF_M, "max": OFF_M}
+    assert Markup(page.read_text()).anchors == ALL
+    assert report_run(run_dir, tmp_path / "again.html").data == {k: v for k, v in told.items() if k != "report"}
+
+
+def test_two_of_them_are_not_compared(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", str(run_dir), str(run_dir)]) == RunReadError.exit_status
+    assert "a mission among beacons; this is for surveys, ccatp report takes both" in capsys.readouterr().err
