@@ -15,6 +15,12 @@ from ccatp.radio.track import BeaconFix, Calibrated, Track
 
 FINEST_S = 0.1
 """Steps of odometry shorter than that are put together."""
+DOUBTFUL_NIS = 1.3
+"""Mean square of normalised innovations, per degree of freedom, that is told: of learned noise it is one."""
+DOUBTFUL_JUMPS = 0.003
+"""How often the pose has to be doubted, for each reading, that it is told."""
+DOUBTFUL_SHARE = 0.3
+"""Share of refused readings that is told."""
 
 
 def filter_run(
@@ -79,12 +85,28 @@ def filter_run(
         predict_s=np.array(predict_s[1:]),
         scalar_s=np.array(scalar_s),
         updates=updates - refused,
-        warnings=tuple(
-            f"beacon {name} could not be placed: its readings leave two places or none"
-            for name in run.beacon_ids
-            if name not in slam.beacons
+        warnings=(
+            *(
+                f"beacon {name} could not be placed: its readings leave two places or none"
+                for name in run.beacon_ids
+                if name not in slam.beacons
+            ),
+            *_doubts(np.array(nis), np.array(sizes, dtype=np.float64), refused, slam.jumps),
         ),
     )
+
+
+def _doubts(nis: FloatArray, sizes: FloatArray, refused: int, jumps: int) -> Iterator[str]:
+    """What the innovations say against the assumptions."""
+    if nis.size and nis.sum() > DOUBTFUL_NIS * sizes.sum():
+        yield (
+            f"innovations are {float(nis.sum() / sizes.sum()):.2f} times as large, in squares, as they should be: "
+            "clocks apart, scales beyond what the configuration allows, or beacons exchanged on the way?"
+        )
+    if jumps > DOUBTFUL_JUMPS * (nis.size + refused):
+        yield f"the pose had to be doubted {jumps} times: pushed, beacons misread, or odometry that misses something?"
+    if refused > DOUBTFUL_SHARE * (nis.size + refused):
+        yield f"{refused} of {nis.size + refused} readings were refused: do they belong to this odometry?"
 
 
 def _spaced(times_s: FloatArray) -> FloatArray:

@@ -64,6 +64,13 @@ def _units(run: RecordedRun) -> Iterator[str]:
     moving = float(np.percentile(np.abs(steps.distance_m) / interval_s, 99))
     if moving > FASTEST_M_S:
         yield f"odometry moves by up to {moving:.0f} m/s: are the distances in millimetres?"
+    wild = np.flatnonzero(np.abs(steps.distance_m) / interval_s > FASTEST_M_S)
+    if wild.size and moving <= FASTEST_M_S:
+        first = int(wild[0])
+        yield (
+            f"odometry: {plural(wild.size, 'step')} faster than {FASTEST_M_S:.0f} m/s, the first of "
+            f"{steps.distance_m[first]:.3g} m at {steps.times_s[first]:.3f} s: what follows is lost"
+        )
     widest = np.abs(run.readings.bearing_rad[np.isfinite(run.readings.bearing_rad)]).max(initial=0.0)
     if widest > 2.0 * np.pi + 0.01:
         yield f"bearings reach {widest:.0f} rad: are they in degrees?"

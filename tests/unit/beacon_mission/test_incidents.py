@@ -10,6 +10,7 @@ from tests.unit.beacon_mission.stories import beacon_config, moved_m, play, targ
 SILENCE = {"type": "radio_loss", "at_s": 20.0, "for_s": 20.0, "beacons": []}
 THING = {"type": "obstacle", "at_s": 0.0, "for_s": 40.0, "x_m": 2.0, "y_m": 0.8, "radius_m": 0.15}
 COMING = {"type": "target_approach", "at_s": 30.0, "for_s": 6.0, "speed_m_s": 0.08}
+FASTER = {**COMING, "for_s": 8.0, "speed_m_s": 0.12}
 
 
 def test_silence_of_all_radios_holds_the_robot_until_they_are_heard_again() -> None:
@@ -63,8 +64,16 @@ def test_the_robot_backs_off_from_a_target_that_comes() -> None:
     found = play(BeaconStage(cfg)).result()
     distances, speeds = target_distances(found), np.array(found.speeds_m_s)
     during = (np.array(found.times_s) > 30.0) & (np.array(found.times_s) < 40.0)
-    assert distances[during].min() < cfg.follow.safe_distance_m
+    assert cfg.danger.target_m < distances[during].min() < cfg.follow.safe_distance_m
     assert speeds[during].min() == pytest.approx(-cfg.follow.back_speed_m_s)
+    assert "target" not in found.summary["danger"]  # it began early enough
+
+
+def test_no_motion_towards_a_target_that_comes_faster_than_the_robot_backs() -> None:
+    cfg = beacon_config("follow", mission__follow_s=45.0, sim__incidents=[FASTER], sim__obstacles=[])
+    found = play(BeaconStage(cfg)).result()
+    distances, speeds = target_distances(found), np.array(found.speeds_m_s)
+    assert distances.min() < cfg.danger.target_m
     assert "target" in found.summary["danger"]
     assert (speeds[distances < 0.9 * cfg.danger.target_m] <= 0.0).all()
 

@@ -1,0 +1,61 @@
+"""The filter over a recorded run: times of its parts, and what it tells of data that do not fit together."""
+
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+import pytest
+
+from ccatp.config.recording_loader import load_recordings_config
+from ccatp.radio.assumed import slam_settings
+from ccatp.radio.causal import filter_run
+from ccatp.radio.recording import RecordedRun
+from ccatp.radio.track import Track
+from ccatp.radio_data.checks import suspicions
+from tests.unit.radio_data.sets import recorded, world
+
+
+def track_of(run: RecordedRun) -> Track:
+    cfg = load_recordings_config(None, {})
+    return filter_run(run, slam_settings(cfg.csv, cfg.filter), (0.05, 0.05), perf_counter)
+
+
+def test_sound_data_raise_no_doubt_and_parts_are_timed() -> None:
+    run = recorded(world())
+    track = track_of(run)
+    assert track.warnings == ()
+    assert len(track.predict_s) == len(track.times_s) - 1
+    assert len(track.update_s) == len(run.readings.times_s)
+    joined = 4 * 2  # each beacon's first reading is no update of it
+    assert len(track.scalar_s) == 2 * len(run.readings.times_s) - joined
+    assert 0.0 < np.median(track.scalar_s) < np.median(track.update_s)
+
+
+def test_readings_of_another_time_are_told() -> None:
+    run = recorded(world(seconds=120.0))
+    late = run.readings.times_s + 4.0
+    shifted = replace(run, readings=run.readings._replace(times_s=late).where(late < run.steps.times_s[-1]))
+    assert any("innovations are" in w or "had to be doubted" in w for w in track_of(shifted).warnings)
+
+
+def test_beacons_that_are_misread_half_the_time_are_told() -> None:
+    run = recorded(world(seconds=120.0))
+    beacon = run.readings.beacon.copy()
+    rng = np.random.default_rng(2)
+    misread = rng.uniform(size=beacon.size) < 0.5
+    beacon[misread] = rng.integers(0, 4, int(misread.sum()))
+    told = track_of(replace(run, readings=run.readings._replace(beacon=beacon))).warnings
+    assert any("had to be doubted" in w for w in told)
+    assert any("readings were refused" in w for w in told)
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_a_wild_step_of_the_odometry_is_told(steps: int) -> None:
+    run = replace(recorded(world()), truth=None)
+    distance = run.steps.distance_m.copy()
+    distance[100 : 100 + steps] = 1e6
+    told = suspicions(replace(run, steps=run.steps._replace(distance_m=distance)))
+    assert any(
+        f"{steps} step{'s' * (steps > 1)} faster than 50 m/s, the first of 1e+06 m at 10.000 s" in w for w in told
+    )
+    assert not any("faster than" in w for w in suspicions(run))
