@@ -107,7 +107,7 @@ def run(
     from ccatp.supervisor import run as run_to_the_end
 
     if faults_file is not None:
-        from ccatp.fault_plan import read_plan
+        from ccatp.stand_ins.fault_plan import read_plan
 
         read_plan(faults_file, lockstep=not realtime)  # its mistakes are told before anything is started
     named = {
@@ -265,8 +265,8 @@ def sim_robot(
     """Run the simulated robot behind the robot link, for any controller."""
     from ccatp.config.loader import load_config
     from ccatp.config.radio_loader import is_radio_file, load_radio_config
-    from ccatp.fault_plan import read_plan
     from ccatp.processes.dataloop import run_alone
+    from ccatp.stand_ins.fault_plan import read_plan
 
     named = {"sim.robot.host": host, "sim.robot.port": port, "run.mirror": mirror, "run.world": world, "run.seed": seed}
     if config_file is not None and is_radio_file(config_file):
@@ -335,7 +335,7 @@ cli.add_command(conformance)
 @click.option("--out", type=click.Path(path_type=Path), help="The picture; map.png in the run directory if not given.")
 def draw_map(run_dir: Path, out: Path | None) -> int:
     """Draw the map of a run: panels, path, and each point coloured by its arrival error (needs matplotlib)."""
-    from ccatp.run_map import draw_from_run_dir
+    from ccatp.pictures.run_map import draw_from_run_dir
 
     picture = out or run_dir / "map.png"
     draw_from_run_dir(run_dir, picture)

@@ -13,18 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
-from ccatp.body_file import BodyFile
 from ccatp.config.models import Config
 from ccatp.fault_proxy.proxy import FaultProxy
-from ccatp.link_faults import LinkFaults
-from ccatp.link_server import LinkServer, Log
 from ccatp.mirror.mirror import build_mirror
 from ccatp.samples import DeckPose
 from ccatp.sim.faults.plan import FaultPlan
 from ccatp.sim.faults.record import Injected
 from ccatp.sim.robot import Robot
 from ccatp.sim.truth import TruthLog
-from ccatp.truth_outlet import TruthOutlet
+from ccatp.stand_ins.body_file import BodyFile
+from ccatp.stand_ins.link_faults import LinkFaults
+from ccatp.stand_ins.link_server import LinkServer, Log
+from ccatp.stand_ins.truth_outlet import TruthOutlet
 
 
 class DataLoop(LinkServer):

@@ -197,6 +197,8 @@ class _Session:
             nis_sizes=np.empty(0),
             refused=0,
             update_s=update_s,
+            predict_s=np.empty(0),
+            scalar_s=np.empty(0),
             updates=len(self._at),
             warnings=(),
         )

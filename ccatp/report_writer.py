@@ -4,16 +4,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ccatp.beacon_report_reader import read_beacon_record
 from ccatp.drawing.shapes import Picture
 from ccatp.errors import CcatpError, ExitStatus
-from ccatp.picture_file import PictureError, write_figures, write_svg
-from ccatp.report_reader import is_beacon_run, read_record
+from ccatp.pictures.picture_file import PictureError, write_figures, write_svg
 from ccatp.reporting.beacon_page import beacon_data, beacon_figures, beacon_page
 from ccatp.reporting.compare_page import Pair, compare_figures, compare_page, pair_of
 from ccatp.reporting.data import run_data
 from ccatp.reporting.findings import findings_of
 from ccatp.reporting.run_page import run_figures, run_page
+from ccatp.run_files.beacon_report_reader import read_beacon_record
+from ccatp.run_files.report_reader import is_beacon_run, read_record
 
 REPORT, COMPARISON = "report.html", "compare.html"
 

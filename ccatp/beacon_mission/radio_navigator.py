@@ -64,7 +64,8 @@ class RadioNavigator:
         if estimate is None or self._heard_s is None:
             return None
         x_m, y_m = estimate.mean[:2].tolist()
-        return TargetSight((x_m, y_m), self.slam.distance(self._target)[1], t_s - self._heard_s)
+        sigma_m = self.slam.distance(self._target)[1]
+        return TargetSight((x_m, y_m), sigma_m, t_s - self._heard_s, self.slam.moving_velocity_m_s)
 
     def take(self, senses: Senses) -> None:
         """Predict over the wheels' intervals, then take what was heard."""

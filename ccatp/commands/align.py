@@ -13,7 +13,7 @@ from ccatp.errors import CcatpError, ConfigError, ExitStatus
 
 if TYPE_CHECKING:
     from ccatp.aligning.survey_result import SurveyResult
-    from ccatp.survey_reader import Survey
+    from ccatp.run_files.survey_reader import Survey
 
 # What the fixes are judged by; everything else has acted on the run already.
 ACTING = ("align.", "robot.puck_height_m", "mirror.")
@@ -53,7 +53,7 @@ def align(
     from ccatp.aligning.survey_result import survey_result
     from ccatp.aligning.table import head_lines, table_lines
     from ccatp.mirror.mirror import build_mirror
-    from ccatp.survey_reader import read_run
+    from ccatp.run_files.survey_reader import read_run
 
     for option, file in (("--csv", csv_file), ("--figure", figure_file)):
         if file is not None and not file.parent.is_dir():
@@ -74,7 +74,7 @@ def align(
     if csv_file is not None:
         _write(csv_file, csv_lines(result))
     if figure_file is not None:
-        from ccatp.align_map import draw_alignment
+        from ccatp.pictures.align_map import draw_alignment
 
         draw_alignment(mirror, result, figure_file, f"{mirror.name}: {len(result.panels)} panels", str(run_dir))
     if json_output:

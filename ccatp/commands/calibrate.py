@@ -62,7 +62,7 @@ def calibrate(
     from ccatp.calibrating.estimate import Priors
     from ccatp.calibrating.estimate import calibrate as estimate
     from ccatp.calibrating.report import as_json, check_usable, lines, rows
-    from ccatp.drive_reader import read_drive
+    from ccatp.run_files.drive_reader import read_drive
 
     drive, on_mirror, cfg = read_drive(from_dir)
     full = cfg.localizer.full_state

@@ -65,8 +65,8 @@ def _findings(
 
     from ccatp.check_probes import probe_keys, probe_laser, probe_machine, probe_robot
     from ccatp.checking.finding import passed
+    from ccatp.commands.stand_ins import stand_ins
     from ccatp.mirror.mirror import build_mirror
-    from ccatp.stand_ins import stand_ins
 
     mirror = build_mirror(cfg.mirror)
     where = config_file or "the default one"

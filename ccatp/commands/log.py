@@ -9,7 +9,7 @@ import click
 from ccatp.commands.frame import SuggestingGroup, example
 
 if TYPE_CHECKING:
-    from ccatp.recording_tools import RecordingFacts
+    from ccatp.run_files.recording_tools import RecordingFacts
 
 
 @click.group(cls=SuggestingGroup, epilog=example("ccatp log info runs/tonight", "ccatp log recover telemetry.mcap"))
@@ -25,7 +25,7 @@ def info(path: Path, json_output: bool) -> int:
 
     The status is 1 where a recording was cut off or is damaged; ccatp log recover saves what is intact.
     """
-    from ccatp.recording_tools import read_facts, recording_files
+    from ccatp.run_files.recording_tools import read_facts, recording_files
 
     found = [read_facts(file) for file in recording_files(path)]
     if json_output:
@@ -45,8 +45,8 @@ def recover(path: Path, out: Path | None, json_output: bool) -> int:
 
     The old file stays as it is. Of a run directory the newest recording is taken.
     """
-    from ccatp.recording_tools import recording_files
-    from ccatp.recording_tools import recover as save
+    from ccatp.run_files.recording_tools import recording_files
+    from ccatp.run_files.recording_tools import recover as save
 
     file = recording_files(path)[-1]
     saved = save(file, out or file.with_name(f"{file.stem}.recovered{file.suffix}"))

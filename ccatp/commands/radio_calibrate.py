@@ -54,7 +54,7 @@ def calibrate(path: Path, sheet: str | None, points: Path | None, figure: Path |
     for warning in warnings:
         complain(f"warning: {warning}", 0)
     if figure is not None:
-        from ccatp.level_figures import draw_path_loss
+        from ccatp.pictures.level_figures import draw_path_loss
 
         draw_path_loss(fit, table.pairs, table.name, figure)
     if json_output:

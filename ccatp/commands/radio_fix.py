@@ -66,7 +66,7 @@ def fix(
         found.append(own.fix(heard.levels_dbm))
     result = {"data": table.name, "leave_one_out": leave_out, **_judged(found, table.places), "warnings": warnings}
     if figure is not None:
-        from ccatp.level_figures import draw_fixes
+        from ccatp.pictures.level_figures import draw_fixes
 
         draw_fixes(found, [heard.place_m for heard in table.places], places_m, table.name, figure)
     if json_output:

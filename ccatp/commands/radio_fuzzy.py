@@ -38,7 +38,7 @@ def fuzzy(
         named = {"distance_m": distance_m, "heading_error_rad": abs(error_rad)}
         values.append({**named, "speed_m_s": round(sugeno.evaluate([named[name] for name in sugeno.inputs]), 5)})
     if figure is not None:
-        from ccatp.level_figures import draw_fuzzy
+        from ccatp.pictures.level_figures import draw_fuzzy
 
         draw_fuzzy(cfg, figure)
     if json_output:

@@ -91,7 +91,7 @@ def radio_map(
 def _simulated(
     cfg: "CricketConfig", method: str, seeds: range, out_file: Path | None, figure_file: Path | None
 ) -> dict[str, Any]:
-    from ccatp.mote_figure import draw_mote_map
+    from ccatp.pictures.mote_figure import draw_mote_map
     from ccatp.studies.mote_pictures import pictured
     from ccatp.studies.mote_summary import campaign_data, run_campaign
 
@@ -112,7 +112,7 @@ def _measured(
 ) -> dict[str, Any]:
     import numpy as np
 
-    from ccatp.mote_figure import MapPicture, draw_mote_map
+    from ccatp.pictures.mote_figure import MapPicture, draw_mote_map
     from ccatp.radio.measured_map import map_measured
     from ccatp.range_csv import read_places, read_ranges
 

@@ -74,7 +74,7 @@ def slam(
     judged = judge(track, run)
     data: dict[str, Any] = result_data(run, filter_name, track, judged)
     if figure_file is not None:
-        from ccatp.slam_map import draw_slam
+        from ccatp.pictures.slam_map import draw_slam
 
         draw_slam(run, track, judged, figure_file, f"{run.name}, {filter_name}")
     if peers:

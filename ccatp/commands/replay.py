@@ -16,7 +16,7 @@ from ccatp.errors import CcatpError, ConfigError, ExitStatus
 if TYPE_CHECKING:
     from ccatp.config.models import Config
     from ccatp.replaying.judging import Judged
-    from ccatp.run_reader import Recording
+    from ccatp.run_files.run_reader import Recording
 
 # The sections of the configuration that a localizer is built from. Everything else has acted on the run already.
 ACTING = ("localizer.", "robot.", "mirror.", "run.filter")
@@ -51,7 +51,7 @@ def replay(
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from ccatp.replaying.judging import judge
     from ccatp.replaying.table import csv_lines, table_lines
-    from ccatp.run_reader import open_run
+    from ccatp.run_files.run_reader import open_run
 
     if out is not None and not out.parent.is_dir():
         raise ReplayError(f"--out: no directory {out.parent}; make it first")  # before the work, not after it

@@ -161,7 +161,10 @@ class FollowConfig(Model):
     target: Name
     safe_distance_m: Positive
     band_m: Positive
+    margin_sigmas: NonNegative
+    foresight_s: NonNegative
     back_speed_m_s: Positive
+    retreat_s: Positive
     lost_after_s: Positive
 
 

@@ -72,6 +72,7 @@ class SlamFilterConfig(Model):
     doubt_beacon_after: Annotated[int, Field(ge=1)]
     jump_m: Positive
     jump_rad: Positive
+    transports: bool
     wander_share: Annotated[float, Field(ge=0.0, lt=1.0)]
     wander_length_m: Positive
     rest_speed_m_s: NonNegative

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from ccatp.angles import bearing, wrap_pi
 from ccatp.config.radio_models import AvoidanceConfig
-from ccatp.control.waypoint_steering import Aim, PlanarPose
+from ccatp.control.waypoint_steering import Aim, PlanarPose, Point
 
 _AHEAD_RAD = pi / 3.0  # what lies within this of the course is in the way of the body
 
@@ -89,6 +89,10 @@ class ObstacleAvoider:
         """
         in_way = (d for d, angle_rad in self._near(pose) if abs(wrap_pi(angle_rad - direction_rad)) < _AHEAD_RAD)
         return min(in_way, default=inf)
+
+    def points_m(self) -> list[Point]:
+        """What is remembered, in the room."""
+        return [(echo.x_m, echo.y_m) for echo in self._echoes]
 
     def _near(self, pose: PlanarPose) -> Iterator[tuple[float, float]]:
         for echo in self._echoes:

@@ -6,7 +6,8 @@ from math import pi
 
 from ccatp.config.radio_models import RadioConfig
 from ccatp.control.avoidance import ObstacleAvoider, Way
-from ccatp.control.following import Follower, TargetSight
+from ccatp.control.following import Follower, FollowState, TargetSight
+from ccatp.control.retreat import Retreat
 from ccatp.control.waypoint_steering import HALT, Aim, Drive, Driver, PlanarPose, WaypointList, aim_at
 
 
@@ -44,6 +45,7 @@ class BeaconPilot:
             cfg.workspace.waypoints_m, cfg.control.arrival_radius_m, loops=cfg.workspace.loops
         )
         self.follower = Follower(cfg.follow, self._driver)
+        self._retreat = Retreat(cfg)
         self.state = PilotState.VISITING
 
     def drive(
@@ -67,6 +69,9 @@ class BeaconPilot:
         if not self._cfg.avoidance.is_active:
             return self._without_obstacles(aim, interval_s)
         self._avoider.see(time_s, pose, distances_m)
+        if target is not None and self._cfg.follow.is_active and self.follower.state is FollowState.BACKING:
+            self._driver.reset()
+            return self._retreat.drive(pose, target.position_m, target.velocity_m_s, self._avoider.points_m())
         if time_s < self._escapes_until_s:
             return self._held(pose, self._escape())
         if aim is None:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg.blas import daxpy, dger, dscal
 
 from ccatp.filters.base import HUGE, FilterDiverged, FilterError, FilterShapeError, FloatArray, checked_gaussian
 
@@ -15,8 +16,6 @@ Linearise = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 STRONG = 1e6
 """Ratio of a row's variance to its noise beyond which P - K S K^T would lose digits: there the Joseph form is used."""
-ROOM = 16
-"""States that are laid out beyond those in use; doubled when they are used up."""
 
 
 class BlockError(FilterError):
@@ -45,6 +44,22 @@ class Update(NamedTuple):
     spread: FloatArray
 
 
+class RowUpdate(NamedTuple):
+    """What one row did, as ``Update`` has it: numbers, because arrays of one take longer than the algebra.
+
+    Attributes:
+        residual: z - h(x) as it was given.
+        nis: nu^2 / S.
+        accepted: False where the gate refused it; the state is then unchanged.
+        spread: S with the noise as it was given.
+    """
+
+    residual: float
+    nis: float
+    accepted: bool
+    spread: float
+
+
 class EkfSlam:
     """EKF-SLAM: x = (vehicle | calibration | one block for each landmark), P = cov(x).
 
@@ -53,8 +68,8 @@ class EkfSlam:
     augment:  b = g(x, z):  P_bx = G_x P,  P_bb = G_x P G_x^T + G_z R G_z^T
 
     Hevrdejs and Knoll 2017, eqs 1 and 2. H is sparse: a row names the columns that it touches, so an update costs one
-    product with those columns and one rank-m subtraction: n^2. P lives in a square array with room to spare; ``mean``
-    and ``covariance`` are views of it, which the next call changes.
+    product with those columns and one rank-m subtraction: n^2. The next call changes ``mean`` and ``covariance``, or
+    puts others in their place.
 
     Args:
         vehicle_mean: shape (v,).
@@ -79,26 +94,24 @@ class EkfSlam:
         c = 0 if calibration_mean is None else int(np.size(calibration_mean))
         self.calibration_size = c
         self._blocks: dict[BlockId, slice] = {}
-        self._n = v + c
-        self._x, self._P = np.zeros(v + c + ROOM), np.zeros((v + c + ROOM, v + c + ROOM))
-        self._x[:v], self._P[:v, :v] = x, P
+        mean, covariance = np.zeros(v + c), np.zeros((v + c, v + c))
+        mean[:v], covariance[:v, :v] = x, P
         if calibration_mean is not None and c > 0:
             given = np.zeros((c, c)) if calibration_covariance is None else np.asarray(calibration_covariance)
-            x, P = checked_gaussian(calibration_mean, given, given.shape)
-            self._x[v : v + c], self._P[v : v + c, v : v + c] = x, P
-        self._view()
+            mean[v:], covariance[v:, v:] = checked_gaussian(calibration_mean, given, given.shape)
+        self._take(mean, covariance)
 
-    def _view(self) -> None:
-        n, v = self._n, self.vehicle_size
-        self.mean = self._x[:n]
-        self.covariance = self._P[:n, :n]
-        self._rows, self._columns = self.covariance[:v], self.covariance[:, :v]
-        self._corner, self._vehicle = self.covariance[:v, :v], self.mean[:v]
+    def _take(self, mean: FloatArray, covariance: FloatArray) -> None:
+        """Another state; its covariance lies in one piece, as BLAS wants it for subtracting in place."""
+        v = self.vehicle_size
+        covariance = np.ascontiguousarray(covariance)
+        self.mean, self.covariance, self._transposed = mean, covariance, covariance.T
+        self._rows, self._columns, self._vehicle = covariance[:v], covariance[:, :v], mean[:v]
 
     @property
     def size(self) -> int:
         """n, the number of states."""
-        return self._n
+        return self.mean.size
 
     @property
     def blocks(self) -> tuple[BlockId, ...]:
@@ -132,9 +145,12 @@ class EkfSlam:
         rows = F.dot(self._rows)
         corner = rows[:, :v].dot(F.T)
         corner += Q
-        if not np.vdot(corner, corner) + np.vdot(vehicle_mean, vehicle_mean) < HUGE:
+        flat = corner.ravel()
+        if not flat.dot(flat) + vehicle_mean.dot(vehicle_mean) < HUGE:
             raise FilterDiverged(f"prediction is not finite: vehicle {vehicle_mean.tolist()}")
-        rows[:, :v] = 0.5 * (corner + corner.T)
+        symmetric = corner + corner.T
+        symmetric *= 0.5
+        rows[:, :v] = symmetric
         self._rows[:] = rows
         self._columns[:] = rows.T
         self._vehicle[:] = vehicle_mean
@@ -159,7 +175,7 @@ class EkfSlam:
 
     def update_row(
         self, columns: Columns, h: FloatArray, residual: float, r: float, gate: float = inf, knee: float = inf
-    ) -> Update:
+    ) -> RowUpdate:
         """Condition on one row.
 
         Args:
@@ -174,28 +190,25 @@ class EkfSlam:
         Raises:
             FilterDiverged: the update is not finite, or the noise is not positive.
         """
-        P = self.covariance
-        cross = h.dot(P.take(columns, axis=0))
-        s = float(h.dot(cross.take(columns))) + r
+        cross = h.dot(self.covariance.take(columns, axis=0))
+        s = given = float(h.dot(cross.take(columns))) + r
         if not (r > 0.0 and r <= s * (1.0 + 1e-9) and s < HUGE and residual * residual < HUGE):
             raise FilterDiverged(f"update is not finite: residual {residual:.6g}, noise {r:.3g}, variance {s:.3g}")
         nis = residual * residual / s
         if nis > gate:
-            return Update(np.array((residual,)), nis, 1, False, np.array((s,)))
-        spread = np.array((s,))
+            return RowUpdate(residual, nis, False, given)
         if nis > knee * knee:
-            larger = s * sqrt(nis) / knee
-            r += larger - s
-            s, nis = larger, residual * residual / larger
-        learned = Update(np.array((residual,)), nis, 1, True, spread)
+            s *= sqrt(nis) / knee
+            r += s - given
+            nis = residual * residual / s
+        root = sqrt(s)
+        dscal(1.0 / root, cross)
         if s < STRONG * r:
-            v = cross * (1.0 / sqrt(s))
-            P -= v[:, None] * v
+            dger(-1.0, cross, cross, a=self._transposed, overwrite_a=1)  # of equal vectors: P stays symmetric exactly
         else:
-            self._joseph(columns, h[None, :], cross[:, None] / s, np.array(((r,),)))
-        cross *= residual / s
-        self.mean += cross
-        return learned
+            self._joseph(columns, h[None, :], cross[:, None] / root, np.array(((r,),)))
+        daxpy(cross, self.mean, a=residual / root)
+        return RowUpdate(residual, nis, True, given)
 
     def update(self, columns: Columns, H: FloatArray, residual: FloatArray, R: FloatArray, gate: float = inf) -> Update:
         """Condition on m rows at once.
@@ -284,7 +297,7 @@ class EkfSlam:
         """
         if block in self._blocks:
             raise BlockError(block, "is in the state already")
-        n, b = self._n, mean.size
+        n, b = self.size, mean.size
         if J_state.shape != (b, columns.size):
             raise FilterShapeError("J_state", J_state.shape, f"({b}, {columns.size})")
         across = J_state.dot(self.covariance[columns])
@@ -295,13 +308,12 @@ class EkfSlam:
             own = own + J_z.dot(R).dot(J_z.T)
         if not float(np.vdot(own, own) + np.vdot(mean, mean)) < HUGE:
             raise FilterDiverged(f"block {block!r} is not finite: mean {mean.tolist()}")
-        self._grow(n + b)
-        self._x[n : n + b] = mean
-        self._P[n : n + b, :n], self._P[:n, n : n + b] = across, across.T
-        self._P[n : n + b, n : n + b] = 0.5 * (own + own.T)
+        grown, P = np.concatenate((self.mean, mean)), np.empty((n + b, n + b))
+        P[:n, :n] = self.covariance
+        P[n:, :n], P[:n, n:] = across, across.T
+        P[n:, n:] = 0.5 * (own + own.T)
         self._blocks[block] = slice(n, n + b)
-        self._n = n + b
-        self._view()
+        self._take(grown, P)
 
     def remove(self, block: BlockId) -> None:
         """Forget a landmark: its rows and columns go, which is what marginalising it means.
@@ -310,24 +322,13 @@ class EkfSlam:
             BlockError: there is none.
         """
         gone = self.block(block)
-        n, b = self._n, gone.stop - gone.start
+        n, b = self.size, gone.stop - gone.start
         keep = np.r_[0 : gone.start, gone.stop : n]
-        self._x[: n - b] = self._x[keep]
-        self._P[: n - b, : n - b] = self._P[np.ix_(keep, keep)]
+        self._take(self.mean[keep], self.covariance[np.ix_(keep, keep)])
         del self._blocks[block]
         for name, place in self._blocks.items():
             if place.start > gone.start:
                 self._blocks[name] = slice(place.start - b, place.stop - b)
-        self._n = n - b
-        self._view()
-
-    def _grow(self, n: int) -> None:
-        if n <= self._x.size:
-            return
-        room = max(n, 2 * self._x.size)
-        x, P = np.zeros(room), np.zeros((room, room))
-        x[: self._n], P[: self._n, : self._n] = self.mean, self.covariance
-        self._x, self._P = x, P
 
     def _moments(self, columns: Columns, H: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
         cross = H.dot(self.covariance[columns]).T

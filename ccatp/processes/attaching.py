@@ -11,7 +11,7 @@ from ccatp.errors import ConfigError, UnreachableError
 from ccatp.processes.common import RUN_DIR_FILE, Endpoints, open_log
 from ccatp.processes.dashboard import run_dashboard
 from ccatp.processes.page_socket import open_page_socket
-from ccatp.recorder import read_metadata
+from ccatp.run_files.recorder import read_metadata
 from ccatp.runtime_dir import runtime_dir_path
 
 ROOT = "dashboard."

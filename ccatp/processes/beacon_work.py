@@ -9,7 +9,6 @@ from ccatp.beacon_mission.mission import BeaconMission
 from ccatp.beacon_mission.senses import SenseReader, Senses
 from ccatp.beacon_mission.states import DONE, HELD, IDLE, RETURNING, State
 from ccatp.beacon_mission.wheel_rates import wheel_rates
-from ccatp.beacon_store import BeaconStore
 from ccatp.config.radio_models import RadioConfig
 from ccatp.control.waypoint_steering import HALT
 from ccatp.errors import ExitStatus
@@ -17,6 +16,7 @@ from ccatp.processes.beacon_telling import BeaconTeller
 from ccatp.processes.common import BeaconArgs
 from ccatp.processes.work import Drive, Host, Hosting, MakeWork, Progress, Served
 from ccatp.samples import Verdict
+from ccatp.storage.beacon_store import BeaconStore
 from ccatp.surveying.states import Outcome
 from ccatp.wire.beacon_frame import NOTHING, decode_beacon_frame
 from ccatp.wire.robot import BadLine, Hello

@@ -9,7 +9,7 @@ from ccatp.planning.traversal import ORDERS
 from ccatp.processes.common import ProcessArgs
 from ccatp.processes.keeping import recovery_from
 from ccatp.samples import PointId
-from ccatp.store import MissionStore, PlannedPoint, StoreError
+from ccatp.storage.store import MissionStore, PlannedPoint, StoreError
 from ccatp.surveying.recovery import Recovery
 
 

@@ -12,7 +12,7 @@ import ccatp
 from ccatp.bus import Subscriber
 from ccatp.errors import ExitStatus
 from ccatp.processes.common import Endpoints
-from ccatp.recorder import Recorder
+from ccatp.run_files.recorder import Recorder
 from ccatp.viewing.views import recorded_schemas
 from ccatp.wire.topics import (
     RECORD_FORMAT,

@@ -31,8 +31,8 @@ from ccatp.processes import spinning
 from ccatp.processes.common import Endpoints, die_with_parent, open_log, parse_either, stop_on_signals
 from ccatp.processes.observing import LOGGED_LINES, LOGGED_PERIOD_S, LineBudget
 from ccatp.processes.pulse import Pulse
-from ccatp.store_reader import read_survey
-from ccatp.store_rows import StoreError
+from ccatp.storage.store_reader import read_survey
+from ccatp.storage.store_rows import StoreError
 
 Logger = structlog.typing.FilteringBoundLogger
 PULSE_PERIOD_S = 0.5

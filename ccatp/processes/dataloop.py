@@ -7,12 +7,10 @@ import sys
 
 import structlog
 
-from ccatp.body_file import FILE
 from ccatp.config.models import Config
 from ccatp.config.radio_models import RadioConfig
 from ccatp.dataloop import serve
 from ccatp.errors import ConfigError
-from ccatp.fault_plan import read_plan
 from ccatp.processes import spinning
 from ccatp.processes.common import (
     FAULTS_FILE,
@@ -26,6 +24,8 @@ from ccatp.processes.common import (
 from ccatp.robot_link import read_key
 from ccatp.runtime_dir import make_runtime_dir
 from ccatp.sim.faults.plan import FaultPlan
+from ccatp.stand_ins.body_file import FILE
+from ccatp.stand_ins.fault_plan import read_plan
 
 
 def main() -> int:
@@ -63,7 +63,7 @@ def main() -> int:
 
 
 def _among_beacons(args: BeaconArgs) -> int:
-    from ccatp.beacon_server import serve_beacons  # noqa: PLC0415 - a survey starts sooner without it
+    from ccatp.stand_ins.beacon_server import serve_beacons  # noqa: PLC0415 - a survey starts sooner without it
 
     if not args.is_realtime:
         spinning.leave_a_core(os.getppid())
@@ -121,7 +121,7 @@ def run_alone(cfg: Config, lockstep: bool, faults: FaultPlan | None = None) -> i
 
 def run_beacons_alone(cfg: RadioConfig, lockstep: bool) -> int:
     """The same of a robot among beacons."""
-    from ccatp.beacon_server import serve_beacons  # noqa: PLC0415 - a survey starts sooner without it
+    from ccatp.stand_ins.beacon_server import serve_beacons  # noqa: PLC0415 - a survey starts sooner without it
 
     truth = Endpoints(make_runtime_dir(cfg.processes.runtime_dir, os.environ)).of("puck")
     listener = _listener(cfg.sim.robot.host, cfg.sim.robot.port)

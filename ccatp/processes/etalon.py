@@ -9,12 +9,12 @@ import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.errors import ConfigError
-from ccatp.etalon_standin import EtalonStandIn, FixedPuck, TruthSource, ZmqPuck
 from ccatp.mirror.mirror import build_mirror
 from ccatp.processes import spinning
 from ccatp.processes.common import die_with_parent, parse_args, stop_on_signals
 from ccatp.samples import Vector3
 from ccatp.sim.etalon import SEED_STREAM
+from ccatp.stand_ins.etalon_standin import EtalonStandIn, FixedPuck, TruthSource, ZmqPuck
 
 
 async def _serve(cfg: Config, truth: TruthSource, listener: socket.socket | None, stop: asyncio.Event) -> None:

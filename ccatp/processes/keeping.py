@@ -3,11 +3,11 @@
 import math
 from pathlib import Path
 
-from ccatp.checkpoint import FILE, Checkpoint, CheckpointFile, read_checkpoint
 from ccatp.config.models import LimitsConfig
 from ccatp.localizer import Localizer
 from ccatp.mission import Mission
 from ccatp.samples import DeckPose, PointId
+from ccatp.storage.checkpoint import FILE, Checkpoint, CheckpointFile, read_checkpoint
 from ccatp.surveying.recovery import Recovery, doubted
 from ccatp.surveying.states import HELD, IDLE, MEASURING, SETTLING, State
 

@@ -14,7 +14,7 @@ from ccatp.metrology.scrutiny import Scrutiny
 from ccatp.mission import Mission
 from ccatp.processes.survey_telling import SurveyTeller
 from ccatp.samples import DeckPose, Fix, PointId, Vector3
-from ccatp.store import MissionStore, StoreError
+from ccatp.storage.store import MissionStore, StoreError
 from ccatp.surveying.approaches import Approaches
 
 # A commit takes milliseconds, on a busy disk a second. One that takes longer is told, and much longer holds the robot.

@@ -17,7 +17,7 @@ from ccatp.planning.traversal import ORDERS
 from ccatp.processes.collecting import Collector
 from ccatp.processes.common import Endpoints
 from ccatp.samples import PanelId, PanelPose, PointId
-from ccatp.store import MissionStore
+from ccatp.storage.store import MissionStore
 from ccatp.summary import RunFacts, SummaryBuilder, puck_targets
 from ccatp.viewing.views import Views
 from ccatp.wire.topics import Arrival, DangerEvent, Message, MissionStatus, Presence, Timing, Track, Truth

@@ -23,7 +23,7 @@ def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.Fi
         return by_hand
     # Nothing of it is needed while the robot moves.
     from ccatp.report_writer import report_run  # noqa: PLC0415
-    from ccatp.run_reader import RunReadError  # noqa: PLC0415
+    from ccatp.run_files.run_reader import RunReadError  # noqa: PLC0415
 
     try:
         return str(report_run(run_dir).path)

@@ -16,8 +16,8 @@ from ccatp.errors import ConfigError
 from ccatp.live_streams import Stream
 from ccatp.mirror.mirror import build_mirror
 from ccatp.processes.common import RUN_DIR_FILE, Endpoints
-from ccatp.recorder import read_metadata
-from ccatp.recording_tools import TELEMETRY
+from ccatp.run_files.recorder import read_metadata
+from ccatp.run_files.recording_tools import TELEMETRY
 from ccatp.viewing.plain_schema import plain_schema
 from ccatp.viewing.views import VIEWS, Shown, Views, view_schemas
 from ccatp.wire.topics import BY_NAME, Message, Presence, schema_of

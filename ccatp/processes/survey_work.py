@@ -20,7 +20,7 @@ from ccatp.processes.survey_telling import SurveyTeller
 from ccatp.processes.survey_watch import SurveyWatch
 from ccatp.processes.work import Drive, Host, Hosting, MakeWork, Progress, Served
 from ccatp.samples import Verdict
-from ccatp.store import MissionStore
+from ccatp.storage.store import MissionStore
 from ccatp.surveying.journey import Motion
 from ccatp.surveying.leftovers import by_reason
 from ccatp.surveying.mirror_check import MirrorCheck

@@ -62,4 +62,5 @@ def _trust(how: SlamFilterConfig, gate_sigmas: float) -> Trust:
         doubt_beacon_after=how.doubt_beacon_after,
         jump_m=how.jump_m,
         jump_rad=how.jump_rad,
+        transports=how.transports,
     )

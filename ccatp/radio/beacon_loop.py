@@ -77,7 +77,8 @@ class BeaconLoop:
         if estimate is None or self._heard_s is None:
             return None
         x_m, y_m = estimate.mean.tolist()
-        return TargetSight((x_m, y_m), self.slam.distance(self._cfg.follow.target)[1], time_s - self._heard_s)
+        sigma_m, velocity_m_s = self.slam.distance(self._cfg.follow.target)[1], self.slam.moving_velocity_m_s
+        return TargetSight((x_m, y_m), sigma_m, time_s - self._heard_s, velocity_m_s)
 
     @staticmethod
     def first() -> Drive:

@@ -7,12 +7,21 @@ from math import exp
 import numpy as np
 
 from ccatp.filters.base import FloatArray
-from ccatp.filters.ekf_slam import Columns, EkfSlam, columns_of
+from ccatp.filters.ekf_slam import BlockId, Columns, EkfSlam, columns_of
 from ccatp.radio.motion import POSE
 from ccatp.radio.readings import BeaconId
 from ccatp.radio.slam_settings import Wander
 
 _NONE = np.empty(0, dtype=np.intp)
+
+
+WANDER = "wander"
+"""First part of the name of a block that holds a wandering error."""
+
+
+def is_place(block: BlockId) -> bool:
+    """Whether a block of the state begins with x_m and y_m."""
+    return not (isinstance(block, tuple) and block[0] == WANDER)
 
 
 @dataclass(slots=True)
@@ -58,6 +67,10 @@ class BeaconMap:
     def __getitem__(self, beacon: BeaconId) -> Entry:
         return self._entries[beacon]
 
+    def get(self, beacon: BeaconId) -> Entry | None:
+        """A beacon; None where it is not on the map."""
+        return self._entries.get(beacon)
+
     def join(self, beacon: BeaconId, mean: FloatArray, covariance: FloatArray) -> Entry:
         """A beacon that is correlated with nothing yet: mean (b,), covariance (b, b)."""
         self._append(beacon, mean, covariance)
@@ -72,8 +85,8 @@ class BeaconMap:
             BlockError: it is not on the map.
         """
         self._engine.remove(beacon)
-        if ("wander", beacon) in self._engine:
-            self._engine.remove(("wander", beacon))
+        if (WANDER, beacon) in self._engine:
+            self._engine.remove((WANDER, beacon))
         del self._entries[beacon]
         self.renumber()
 
@@ -82,8 +95,8 @@ class BeaconMap:
         engine = self._engine
         for beacon, entry in self._entries.items():
             parts: list[slice] = [slice(0, POSE), self._shared, engine.block(beacon)]
-            if ("wander", beacon) in engine:
-                parts.append(engine.block(("wander", beacon)))
+            if (WANDER, beacon) in engine:
+                parts.append(engine.block((WANDER, beacon)))
                 entry.wander = parts[-1].start
             entry.columns = columns_of(*parts)
 
@@ -91,7 +104,7 @@ class BeaconMap:
         """Bring a beacon's wandering error, in sigmas, to now: w <- phi w, variance <- phi^2 variance + 1 - phi^2."""
         entry = self._entries[beacon]
         if entry.wander < 0:
-            self._append(("wander", beacon), np.zeros(1), np.eye(1))
+            self._append((WANDER, beacon), np.zeros(1), np.eye(1))
             self.renumber()
         else:
             phi = exp(-(way_m - entry.way_m) / model.length_m - max(time_s - entry.time_s, 0.0) / model.time_s)

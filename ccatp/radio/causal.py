@@ -37,18 +37,26 @@ def filter_run(
     nis: list[float] = []
     sizes: list[int] = []
     took: list[float] = []
+    predict_s: list[float] = []
+    scalar_s: list[float] = []
     refused = updates = next_reading = 0
     for k, time_s in enumerate(times.tolist()):
         begin_s = clock_s()
         if k:
             slam.predict(increments[k - 1])
+        predicted_s = clock_s()
+        predict_s.append(predicted_s - begin_s)
         now = []
         while next_reading < len(heard) and heard[next_reading].time_s <= time_s:
             now.append(heard[next_reading])
             next_reading += 1
         if now:
             learned = slam.observe(now)
-            took += [(clock_s() - begin_s) / len(now)] * len(now)
+            end_s = clock_s()
+            took += [(end_s - begin_s) / len(now)] * len(now)
+            if len(learned) == len(now):  # nothing that waits or joins: updates alone
+                scalars = sum(one.size for one in learned)
+                scalar_s += [(end_s - predicted_s) / scalars] * scalars
             for one in learned:
                 refused += not one.accepted
                 if one.accepted:
@@ -68,6 +76,8 @@ def filter_run(
         nis_sizes=np.array(sizes, dtype=np.float64),
         refused=refused,
         update_s=np.array(took),
+        predict_s=np.array(predict_s[1:]),
+        scalar_s=np.array(scalar_s),
         updates=updates - refused,
         warnings=tuple(
             f"beacon {name} could not be placed: its readings leave two places or none"

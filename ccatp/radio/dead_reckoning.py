@@ -2,7 +2,7 @@
 
 from collections import deque
 from dataclasses import replace
-from math import cos, nan, sin
+from math import cos, hypot, nan, sin
 from typing import NamedTuple
 
 from ccatp.filters.base import FloatArray
@@ -10,6 +10,9 @@ from ccatp.radio.motion import POSE, Increment, Odometry
 
 SLIVER = 0.2
 """Part of an interval that is not worth a step of its own: the pose is carried over it."""
+
+
+STANDS = (0.0, 0.0, 0.0)
 
 
 class Carried(NamedTuple):
@@ -71,22 +74,25 @@ class DeadReckoning:
                 found.append(done)
         return found
 
-    def took(self, odometry: Odometry, before: FloatArray, after: FloatArray) -> None:
-        """A step was taken, from one state to another."""
+    def took(self, odometry: Odometry, before: FloatArray, after: FloatArray) -> float:
+        """A step was taken, from one state to another; its length, m."""
         self._until_s, dt = odometry.time_s, odometry.interval_s
         self._interval_s = dt
+        x, y, heading = before[:POSE].tolist()
+        new_x, new_y, new_heading = after[:POSE].tolist()
+        dx, dy, turn = new_x - x, new_y - y, new_heading - heading
         if dt > 0.0:
-            x, y, heading = before[:POSE].tolist()
-            new_x, new_y, new_heading = after[:POSE].tolist()
-            dx, dy, turn = new_x - x, new_y - y, new_heading - heading
             c, s = cos(heading + 0.5 * turn), sin(heading + 0.5 * turn)
             self._rates = ((dx * c + dy * s) / dt, (dy * c - dx * s) / dt, turn / dt)
+        return hypot(dx, dy)
 
     def at(self, pose: list[float], time_s: float, delay_s: float) -> Carried:
-        """The pose at a reading's time, carried no further than an interval."""
+        """The pose, the first of some states, at a reading's time, carried no further than an interval."""
         limit_s = self._interval_s
         back_s = self._until_s + delay_s - time_s
         back_s = max(-limit_s, min(limit_s, back_s)) if limit_s > 0.0 else 0.0
+        if back_s == 0.0 and not self._is_delayed:
+            return Carried(pose[:POSE], STANDS, 0.0)  # its speed does not matter
         ahead, side, turn = self._rates
         heading = pose[2] - back_s * turn
         c, s = cos(heading), sin(heading)

@@ -11,9 +11,13 @@ class Doubts:
     def __init__(self, after: int) -> None:
         self._after, self._refused = after, 0
 
-    def take(self, *, accepted: bool) -> bool:
-        """Take a verdict; True if the pose is to be doubted now."""
-        self._refused = 0 if accepted else self._refused + 1
+    def clear(self) -> None:
+        """A reading was believed."""
+        self._refused = 0
+
+    def refuse(self) -> bool:
+        """A reading was not believed; True if the pose is to be doubted now."""
+        self._refused += 1
         if self._refused < self._after:
             return False
         self._refused = 0

@@ -23,10 +23,15 @@ class NoiseLevel:
         """Take an innovation: its normalised square, and the share of this noise in its variance."""
         if self._memory <= 0.0:
             return
-        self._information = min(self._information + share * share, self._memory)
-        change = share * (nis - 1.0) / self._information
-        factor = self.factor * exp(max(-LARGEST, min(LARGEST, change)))
-        self.factor = max(1.0 / FURTHEST, min(FURTHEST, factor))
+        information = self._information + share * share
+        self._information = information = min(self._memory, information)
+        change = share * (nis - 1.0) / information
+        if not -LARGEST < change < LARGEST:
+            change = LARGEST if change > 0.0 else -LARGEST
+        factor = self.factor * exp(change)
+        if not 1.0 / FURTHEST < factor < FURTHEST:
+            factor = FURTHEST if factor > 1.0 else 1.0 / FURTHEST
+        self.factor = factor
 
 
 LARGEST = 0.3

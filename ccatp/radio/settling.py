@@ -48,11 +48,14 @@ def settle_by_places(
 
 def derivatives(row: Row, at: Carried, *, delayed: bool) -> list[float]:
     """Dh by the pose and the calibration of the state: a row at the pose that was carried to a reading's time."""
-    (hx, hy, turned), (x_heading, y_heading) = row.pose, at.by_heading()
-    found = [hx, hy, turned + hx * x_heading + hy * y_heading, *row.calibration]
-    if delayed:
-        x_delay, y_delay, heading_delay = at.by_delay()
-        found.append(hx * x_delay + hy * y_delay + turned * heading_delay)
+    hx, hy, turned = row.pose
+    if not delayed and at.back_s == 0.0:
+        return [hx, hy, turned, *row.calibration]
+    vx, vy, turn = at.velocity
+    by_heading = at.back_s * (hx * vy - hy * vx)
+    found = [hx, hy, turned + by_heading, *row.calibration]
+    if delayed:  # the heading turns at ``turn``, too
+        found.append(-hx * vx - hy * vy - turn * (turned + by_heading))
     return found
 
 

@@ -37,16 +37,17 @@ def range_row(pose: list[float], calibration: list[float], beacon: list[float], 
     """Z = (1 + e) r + o; ``calibration`` begins with e and o, each where its prior is not zero; beacon (x_m, y_m)."""
     dx, dy = beacon[0] - pose[0], beacon[1] - pose[1]
     r = max(sqrt(dx * dx + dy * dy), LEAST_RANGE_M)
-    scale, offset, by = 1.0, 0.0, []
+    scale, offset = 1.0, 0.0
+    by: tuple[float, ...] = ()
     if model.scale_sigma > 0.0:
         scale += calibration[0]
-        by.append(r)
+        by = (r,)
     if model.offset_sigma_m > 0.0:
         offset = calibration[len(by)]
-        by.append(1.0)
+        by = (*by, 1.0)
     ux, uy = scale * dx / r, scale * dy / r
     variance = model.sigma_m**2 + (model.sigma_per_m * r) ** 2
-    return Row(scale * r + offset, (-ux, -uy, 0.0), tuple(by), (ux, uy), variance)
+    return Row(scale * r + offset, (-ux, -uy, 0.0), by, (ux, uy), variance)
 
 
 def bearing_row(pose: list[float], shared: int, beacon: list[float], model: BearingModel) -> Row:

@@ -157,6 +157,16 @@ class SignalSlam:
         h = np.array((x - bx, y - by, bx - x, by - y)) / r
         return r, sqrt(max(float(h @ covariance @ h), 0.0))
 
+    @property
+    def moving_velocity_m_s(self) -> tuple[float, float]:
+        """Of the radio that moves; 0 before it was heard."""
+        moving = self.settings.moving
+        if moving is None or moving.beacon not in self.engine:
+            return 0.0, 0.0
+        start = self.engine.block(moving.beacon).start + PLACE
+        vx, vy = self.engine.mean[start : start + PLACE].tolist()
+        return vx, vy
+
     def joint(self, beacons: Sequence[BeaconId]) -> tuple[FloatArray, FloatArray]:
         """Pose and the places of some radios on the map together: mean (3 + 2 k,) and covariance.
 

@@ -2,23 +2,26 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import hypot, sqrt
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
 
+from ccatp.angles import wrap_pi
 from ccatp.filters.base import FloatArray
-from ccatp.filters.ekf_slam import BlockError, EkfSlam, Update
+from ccatp.filters.ekf_slam import BlockError, EkfSlam, RowUpdate
 from ccatp.radio.beacon_map import BeaconMap, Entry
 from ccatp.radio.dead_reckoning import DeadReckoning
 from ccatp.radio.doubts import Doubts
+from ccatp.radio.fresh_noise import FreshNoise
 from ccatp.radio.motion import POSE, DifferentialDrive, Odometry, Pose
 from ccatp.radio.newcomers import Newcomers
 from ccatp.radio.noise_level import NoiseLevel
 from ccatp.radio.readings import BeaconId, Reading
-from ccatp.radio.settling import derivatives, wrapped
+from ccatp.radio.settling import derivatives
 from ccatp.radio.sightings import Sensors, bearing_of, kind_of, strength_of
-from ccatp.radio.slam_settings import SlamSettings
+from ccatp.radio.slam_settings import SlamSettings, Wander
+from ccatp.radio.transport import Transport
 
 DELAY = "odometry_delay_s"
 
@@ -89,14 +92,17 @@ class BeaconSlam:
         self.engine = EkfSlam(mean, P, np.zeros(len(shared)), np.diag(np.square(shared)))
         self._shared = slice(v, v + len(shared))
         self._delay = v + len(shared) - 1 if delay else -1
+        self._shown = POSE + len(shared)  # of the columns of a row, those before the beacon
         self._names: tuple[str, ...] = (*self._motion.names, *self._sensors.names, *((DELAY,) if delay else ()))
         self._clock = DeadReckoning(is_delayed=bool(delay))
         self._map = BeaconMap(self.engine, self._shared)
+        self._transport = Transport(self.engine) if trust.transports else None
         self.levels = {
             k: NoiseLevel(trust.learn_prior, trust.learn_memory) for k in ("range", "bearing", "rssi", "motion")
         }
         self._learns = trust.learn_memory > 0.0
-        self._fresh = np.zeros((POSE, POSE))  # process noise since the last update
+        self._fresh = FreshNoise()
+        self._gate, self._knee = trust.gate_sigmas**2, trust.knee_sigmas
         self._doubts, self.jumps = Doubts(trust.doubt_pose_after), 0
         self._way_m = 0.0
         self._newcomers = Newcomers(
@@ -145,15 +151,15 @@ class BeaconSlam:
         mean, F, Q = self._motion.step(before, odometry)
         if self._learns:
             Q = Q * self.levels["motion"].factor
-            turned = F[:POSE, :POSE]
-            self._fresh = turned.dot(self._fresh).dot(turned.T) + Q[:POSE, :POSE]
+            self._fresh.step(F, Q)
         engine.predict(mean, F, Q)
-        self._clock.took(odometry, before, mean)
-        self._way_m += hypot(mean[0] - before[0], mean[1] - before[1])
+        self._way_m += self._clock.took(odometry, before, mean)
         rest = self._motion.at_rest(odometry) if isinstance(self._motion, DifferentialDrive) else None
         if rest is not None:
             residual = rest.value - float(engine.mean[rest.column])
+            corrected = engine.mean.copy()
             engine.update_row(np.array((rest.column,)), np.ones(1), residual, rest.variance)
+            self._follow(corrected)
 
     def observe(self, readings: Iterable[Reading]) -> list[Learned]:
         """Take readings of any beacons, one after the other; those of new ones begin their place on the map.
@@ -163,11 +169,18 @@ class BeaconSlam:
         """
         self.learned = []
         for reading in readings:
-            if reading.beacon in self._map:
-                self.learned.append(self._update(reading, self._map[reading.beacon]))
-            else:
+            entry, before = self._map.get(reading.beacon), self.engine.mean.copy()
+            if entry is None:
                 self._newcomers.meet(reading)
+            else:
+                self.learned.append(self._update(reading, entry))
+            self._follow(before)
         return self.learned
+
+    def _follow(self, before: FloatArray) -> None:
+        """The covariance follows a correction of the state."""
+        if self._transport is not None:
+            self._transport.follow(before)
 
     def remove(self, beacon: BeaconId) -> None:
         """Forget a beacon; one that is heard again begins anew.
@@ -186,54 +199,58 @@ class BeaconSlam:
         model = self._sensors.wander(reading)
         if model is not None:
             self._map.wander_to(reading.beacon, model, self._way_m, reading.time_s)
-        found = []
-        if bearing_of(reading) is not None:
-            found.append(self._take(reading, entry, "bearing"))
-        if not found or found[0].accepted:
-            found.append(self._take(reading, entry, kind_of(reading)))
+        bearing = bearing_of(reading)
+        residuals, nis, found = [], 0.0, None
+        if bearing is not None:
+            found = self._take(reading, entry, "bearing", bearing, model)
+            residuals, nis = [found.residual], found.nis
+        if found is None or found.accepted:
+            found = self._take(reading, entry, kind_of(reading), strength_of(reading), model)
+            residuals.append(found.residual)
+            nis += found.nis
         if self._learns:
-            self._fresh = np.zeros((POSE, POSE))
-        accepted = found[-1].accepted
-        self._judge(reading.beacon, entry, accepted=accepted)
-        residual = np.concatenate([update.residual for update in found])
-        return Learned(reading.beacon, residual, sum(update.nis for update in found), len(found), accepted)
+            self._fresh.clear()
+        self._judge(reading.beacon, entry, accepted=found.accepted)
+        return Learned(reading.beacon, np.array(residuals), nis, len(residuals), found.accepted)
 
-    def _take(self, reading: Reading, entry: Entry, kind: str) -> Update:
+    def _take(self, reading: Reading, entry: Entry, kind: str, z: float, model: Wander | None) -> RowUpdate:
         """One scalar of a reading."""
-        engine, trust, level = self.engine, self.settings.trust, self.levels[kind]
-        x = engine.mean.take(entry.columns).tolist()
-        split = POSE + self._shared.stop - self._shared.start
-        beacon = x[split : split + entry.size]
-        at = self._newcomers.carried(engine.mean, reading)
-        is_angle = kind == "bearing"
+        engine, level = self.engine, self.levels[kind]
+        x: list[float] = engine.mean.take(entry.columns).tolist()
+        is_delayed, is_angle, shown = self._delay >= 0, kind == "bearing", self._shown
+        beacon = x[shown : shown + entry.size]
+        at = self._clock.at(x, reading.time_s, x[shown - 1] if is_delayed else 0.0)
         if is_angle:
-            row, z = self._sensors.bearing(at.pose, beacon), bearing_of(reading)
+            row = self._sensors.bearing(at.pose, beacon)
         else:
-            row, z = self._sensors.row(reading, at.pose, x[POSE : POSE + self._ranges], beacon), strength_of(reading)
-        h = [*derivatives(row, at, delayed=self._delay >= 0), *row.beacon]
-        expected, r = row.expected, row.variance * level.factor
-        own = r
+            row = self._sensors.row(reading, at.pose, x[POSE : POSE + self._ranges], beacon)
+        h = derivatives(row, at, delayed=is_delayed)
+        h += row.beacon
+        expected, own = row.expected, row.variance * level.factor
+        r = own
         if entry.wander >= 0:
-            model = None if is_angle else self._sensors.wander(reading)
-            share = 0.0 if model is None else model.share
-            h.append(sqrt(share * r))
-            expected += h[-1] * x[-1]
+            share = 0.0 if model is None or is_angle else model.share
+            by_wander = sqrt(share * r)
+            h.append(by_wander)
+            expected += by_wander * x[-1]
             r *= 1.0 - share
-            own = r + entry.fresh * h[-1] * h[-1]
-        residual = wrapped(z or 0.0, expected, is_angle=is_angle)
-        found = engine.update_row(entry.columns, np.array(h), residual, r, trust.gate_sigmas**2, trust.knee_sigmas)
+            own = r + entry.fresh * by_wander * by_wander
+        residual = wrap_pi(z - expected) if is_angle else z - expected
+        found = engine.update_row(entry.columns, np.array(h), residual, r, self._gate, self._knee)
         if found.accepted and self._learns:
-            s = found.spread.item()
-            level.learn(found.nis, own / s)
-            by_pose = np.array(h[:POSE])
-            self.levels["motion"].learn(found.nis, float(by_pose.dot(self._fresh).dot(by_pose)) / s)
+            level.learn(found.nis, own / found.spread)
+            self.levels["motion"].learn(found.nis, self._fresh.seen(h[0], h[1], h[2]) / found.spread)
         return found
 
     def _judge(self, beacon: BeaconId, entry: Entry, *, accepted: bool) -> None:
         """Refusals accuse the pose, or a beacon that alone is refused: the one is loosened, the other begins anew."""
-        entry.refused = 0 if accepted else entry.refused + 1
+        if accepted:
+            entry.refused = 0
+            self._doubts.clear()
+            return
+        entry.refused += 1
         trust = self.settings.trust
-        if self._doubts.take(accepted=accepted):
+        if self._doubts.refuse():
             v = self.engine.vehicle_size
             jump = np.zeros(v)
             jump[:POSE] = trust.jump_m, trust.jump_m, trust.jump_rad

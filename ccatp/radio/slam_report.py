@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ccatp.filters.base import FloatArray
 from ccatp.radio.judged import Judgement, aligned_beacons
 from ccatp.radio.recording import RecordedRun
 from ccatp.radio.track import Track
@@ -36,7 +37,9 @@ def result_data(run: RecordedRun, filter_name: str, track: Track, judged: Judgem
         "nees_mean": None if nees is None else nees.mean,
         "updates": track.updates,
         "refused": track.refused,
-        "update_us_p50": float(np.median(track.update_s)) * 1e6 if track.update_s.size else None,
+        "update_us_p50": _median_us(track.update_s),
+        "predict_us_p50": _median_us(track.predict_s),
+        "scalar_us_p50": _median_us(track.scalar_s),
         "warnings": [*run.warnings, *track.warnings],
     }
 
@@ -58,7 +61,7 @@ def table_lines(run: RecordedRun, data: dict[str, Any]) -> list[str]:
         rows.append(("NIS", f"{data['nis_mean']:.3f} per degree of freedom (95 % band {low:.3f} to {high:.3f})"))
     if data["nees_mean"] is not None:
         rows.append(("NEES", f"{data['nees_mean']:.3f} per degree of freedom"))
-    rows.append(("update", _number(data["update_us_p50"], "{:.0f} us")))
+    rows.append(("update", _number(data["update_us_p50"], "{:.0f} us a reading") + _parts(data)))
     lines = [f"{name:<12} {text}" for name, text in rows]
     lines += ["", f"{'beacon':<8} {'x_m':>9} {'y_m':>9} {'sigma_x':>8} {'sigma_y':>8} {'error_m':>8}"]
     for name, (x, y) in data["beacons"].items():
@@ -73,6 +76,17 @@ def _errors(data: dict[str, Any]) -> str:
         return "no truth"
     heading = _number(data["heading_rmse_rad"], ", heading {:.4f} rad rms")
     return f"{data['trajectory_rmse_m']:.3f} m rms" + ("" if heading == "-" else heading)
+
+
+def _median_us(times_s: FloatArray) -> float | None:
+    return float(np.median(times_s)) * 1e6 if times_s.size else None
+
+
+def _parts(data: dict[str, Any]) -> str:
+    predict_us, scalar_us = data["predict_us_p50"], data["scalar_us_p50"]
+    if predict_us is None or scalar_us is None:
+        return ""
+    return f": prediction {predict_us:.0f} us, each scalar {scalar_us:.0f} us"
 
 
 def _number(value: float | None, shape: str) -> str:

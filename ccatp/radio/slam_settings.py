@@ -86,6 +86,8 @@ class Trust:
         doubt_beacon_after: refusals in a row of one beacon, others being believed, after which it is placed anew.
         jump_m: what the pose may have jumped by when it is doubted, standard deviation of x and of y.
         jump_rad: the same of the heading.
+        transports: whether the covariance follows corrections of the map, so that its heading is never learned from
+            linearising anew (``Transport``).
     """
 
     gate_sigmas: float
@@ -96,6 +98,7 @@ class Trust:
     doubt_beacon_after: int
     jump_m: float
     jump_rad: float
+    transports: bool
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,7 +39,11 @@ class Track(NamedTuple):
         nis: normalised innovations squared of the readings that were used, shape (u,); none from a smoother.
         nis_sizes: their degrees of freedom, shape (u,).
         refused: how many readings were refused, or weigh less than a tenth.
-        update_s: wall time of each update, s; of a smoother its whole time shared among the readings.
+        update_s: wall time of each reading, the prediction to it included, s; of a smoother its whole time shared among
+            the readings.
+        predict_s: wall time of each prediction, s; none from a smoother.
+        scalar_s: wall time of each scalar of a reading of a beacon on the map, s, without prediction; none from a
+            smoother.
         updates: how many readings were used.
         warnings: what is doubtful, a line each.
     """
@@ -53,5 +57,7 @@ class Track(NamedTuple):
     nis_sizes: FloatArray
     refused: int
     update_s: FloatArray
+    predict_s: FloatArray
+    scalar_s: FloatArray
     updates: int
     warnings: tuple[str, ...]

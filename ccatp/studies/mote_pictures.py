@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ccatp.mote_figure import MapPicture, Traces
+from ccatp.pictures.mote_figure import MapPicture, Traces
 from ccatp.radio.rigid_alignment import best_motion
 from ccatp.studies.mote_runs import MoteRun
 from ccatp.studies.mote_summary import MoteCampaign, traces_of

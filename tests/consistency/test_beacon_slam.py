@@ -13,7 +13,9 @@ from ccatp.radio.slam import BeaconSlam
 from ccatp.radio.slam_settings import BearingModel, RangeModel, SlamSettings, Trust
 
 NOISE = DifferentialNoise(0.02, 0.0, 0.01, 0.02, 0.0, 0.0)
-PLAIN = Trust(1e3, 1e3, 0.0, 1.0, 10**9, 10**9, 0.3, 0.3)  # the textbook's filter: no gate, no knee, nothing learned
+PLAIN = Trust(
+    1e3, 1e3, 0.0, 1.0, 10**9, 10**9, 0.3, 0.3, True
+)  # the textbook's filter: no gate, no knee, nothing learned
 BEACONS = {1: (4.0, 1.0), 2: (2.0, 6.0), 3: (-3.0, 4.0), 4: (-1.0, -2.0)}
 SIGMA_M, SIGMA_RAD, STEP_M, TURN_RAD = 0.1, 0.05, 0.1, 0.04
 P0 = np.diag((1e-4, 1e-4, 1e-4))

@@ -11,7 +11,7 @@ from ccatp.config.models import Config
 from ccatp.conformance.runner import Conformance
 from ccatp.conformance.verdict import Result
 from ccatp.dataloop import DataLoop
-from ccatp.link_server import _Connection
+from ccatp.stand_ins.link_server import _Connection
 
 Message = dict[str, Any]
 STOP_S = 10.0

@@ -20,8 +20,8 @@ from ccatp.etalon_client import (
     Readiness,
     TooFewChannels,
 )
-from ccatp.etalon_standin import EtalonStandIn, FixedPuck
 from ccatp.samples import Fix, Vector3
+from ccatp.stand_ins.etalon_standin import EtalonStandIn, FixedPuck
 from ccatp.wire.multiline import (
     FLAGS,
     ChannelData,

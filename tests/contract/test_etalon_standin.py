@@ -12,10 +12,10 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from ccatp import etalon_standin
 from ccatp.config.models import SimEtalonConfig
-from ccatp.etalon_standin import EtalonStandIn, FixedPuck, TruthSource, TruthUnavailable, ZmqPuck
 from ccatp.sim.etalon import PuckTruth
+from ccatp.stand_ins import etalon_standin
+from ccatp.stand_ins.etalon_standin import EtalonStandIn, FixedPuck, TruthSource, TruthUnavailable, ZmqPuck
 from ccatp.wire.multiline import ChannelData, parse_reply
 
 CHANNELS = (1, 2, 3, 4)
@@ -196,7 +196,7 @@ async def test_a_client_that_never_reads_is_dropped(monkeypatch: pytest.MonkeyPa
     async with running(server) as port, peer(port) as client, peer(port) as deaf:
         deaf.writer.transport.pause_reading()  # type: ignore[attr-defined]
         request = b"latestlengthvalid," + b",".join(b"%d" % n for n in range(1, 33)) + b"\r\n"
-        async with asyncio.timeout(5.0):
+        async with asyncio.timeout(60.0):
             while not server.counts["lost_clients"]:
                 if not deaf.writer.transport.is_closing():
                     deaf.writer.write(request * 50)

@@ -16,16 +16,16 @@ import zmq
 from ccatp.config.loader import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.dataloop import DataLoop
-from ccatp.etalon_standin import EtalonStandIn
 from ccatp.fault_proxy.proxy import FaultProxy
 from ccatp.mirror.mirror import build_mirror
 from ccatp.processes.common import EitherArgs, Endpoints, ProcessArgs
 from ccatp.processes.danger_loop import DangerLoop
 from ccatp.processes.main_loop import MainLoop, open_work
-from ccatp.puck_truth import ZmqPuck
 from ccatp.robot_link import RobotLink
 from ccatp.sim.truth import TruthLog
-from ccatp.truth_outlet import TruthOutlet
+from ccatp.stand_ins.etalon_standin import EtalonStandIn
+from ccatp.stand_ins.puck_truth import ZmqPuck
+from ccatp.stand_ins.truth_outlet import TruthOutlet
 
 DEADLINE_S = 60.0
 SEND_DRIVE, SEND_PERMIT = RobotLink.send_drive, RobotLink.send_permit

@@ -21,7 +21,7 @@ from ccatp.processes.survey_telling import SurveyTeller
 from ccatp.radio.multilateration import MultilaterationError
 from ccatp.samples import Fix, PointId, Vector3
 from ccatp.sim.faults.plan import FaultPlan, parse_plan
-from ccatp.store import MissionStore, PlannedPoint
+from ccatp.storage.store import MissionStore, PlannedPoint
 from ccatp.wire.robot import Sensors
 from tests.faults.campaign import FaultyRehearsal
 

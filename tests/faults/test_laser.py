@@ -16,7 +16,6 @@ from ccatp.config.loader import load_config
 from ccatp.config.models import Config
 from ccatp.etalon_client import EtalonClient, StaleLengths
 from ccatp.etalon_errors import EtalonError, EtalonTimeout
-from ccatp.etalon_standin import EtalonStandIn, FixedPuck
 from ccatp.localizer import build_localizer
 from ccatp.metrology.frame_check import FrameCheck, explain, signed_axes
 from ccatp.metrology.scrutiny import Scrutiny
@@ -27,7 +26,8 @@ from ccatp.processes.survey_telling import SurveyTeller
 from ccatp.radio.multilateration import MultilaterationError
 from ccatp.radio.puck_fix import solve_fix
 from ccatp.samples import Fix, PointId
-from ccatp.store import MissionStore, PlannedPoint
+from ccatp.stand_ins.etalon_standin import EtalonStandIn, FixedPuck
+from ccatp.storage.store import MissionStore, PlannedPoint
 from ccatp.surveying.states import State
 from ccatp.wire import multiline
 from tests.contract.test_etalon_client import (

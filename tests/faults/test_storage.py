@@ -27,9 +27,9 @@ from ccatp.processes.common import open_log
 from ccatp.processes.log_stream import LogStream
 from ccatp.processes.measuring import MeasuringDesk, Request
 from ccatp.processes.survey_telling import SurveyTeller
-from ccatp.recorder import Recorder, iter_messages
+from ccatp.run_files.recorder import Recorder, iter_messages
 from ccatp.samples import DeckPose, Fix, PointId
-from ccatp.store import MissionStore, PlannedPoint, StoreError, StoreEvent
+from ccatp.storage.store import MissionStore, PlannedPoint, StoreError, StoreEvent
 
 Measured = Callable[[str, float], None]
 POINTS = [PointId(row, col, n) for row in range(1, 10) for col in range(1, 9) for n in range(1, 10)][: 77 * 9]
@@ -306,7 +306,7 @@ WRITER = """
 import resource, signal, sys
 from pathlib import Path
 from ccatp.samples import DeckPose, Fix, PointId
-from ccatp.store import MissionStore, StoreError
+from ccatp.storage.store import MissionStore, StoreError
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 path = Path(sys.argv[1])
 with MissionStore.open(path, mirror="fyst-m1") as store:

@@ -10,13 +10,13 @@ from typing import Any
 
 import msgspec
 
-from ccatp import store_rows
 from ccatp.config.loader import dump_config, load_config
 from ccatp.errors import ConfigError
-from ccatp.recorder import Recorder, iter_messages
-from ccatp.run_reader import RunReadError, open_run
+from ccatp.run_files.recorder import Recorder, iter_messages
+from ccatp.run_files.run_reader import RunReadError, open_run
 from ccatp.samples import DeckPose, Fix, PointId
-from ccatp.store import MissionStore, PlannedPoint, StoreError
+from ccatp.storage import store_rows
+from ccatp.storage.store import MissionStore, PlannedPoint, StoreError
 from ccatp.wire.topics import TOPICS, FixMessage, Rest, SensorLines, Track, pack, schema_of
 from tests.fuzz.decoders import SENSORS
 from tests.fuzz.fuzzer import Target

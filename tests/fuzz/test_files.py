@@ -11,7 +11,7 @@ import pytest
 from ccatp.config.loader import load_config
 from ccatp.config.toml_text import format_toml
 from ccatp.errors import ConfigError
-from ccatp.store import StoreError
+from ccatp.storage.store import StoreError
 from tests.fuzz.files import (
     check_store,
     config_target,

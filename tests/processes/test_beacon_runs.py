@@ -9,7 +9,7 @@ import pytest
 
 from ccatp.config.loader import shipped_config_dir
 from ccatp.config.radio_loader import load_radio_config
-from ccatp.recorder import iter_messages
+from ccatp.run_files.recorder import iter_messages
 from ccatp.studies.beacon_rehearsal import rehearse_beacons
 from tests.processes.conftest import Run
 

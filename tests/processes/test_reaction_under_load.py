@@ -23,13 +23,13 @@ import pytest
 
 from ccatp.config.loader import dump_config, load_config
 from ccatp.dataloop import DataLoop
-from ccatp.etalon_standin import EtalonStandIn
 from ccatp.fault_proxy.pipe import Pipe
 from ccatp.fault_proxy.proxy import FaultProxy
 from ccatp.mirror.mirror import build_mirror
-from ccatp.puck_truth import ZmqPuck
 from ccatp.sim.truth import TruthLog
-from ccatp.truth_outlet import TruthOutlet
+from ccatp.stand_ins.etalon_standin import EtalonStandIn
+from ccatp.stand_ins.puck_truth import ZmqPuck
+from ccatp.stand_ins.truth_outlet import TruthOutlet
 from tests.faults.linking import Measured
 
 TIMES = int(os.environ.get("CCATP_REACTIONS", "3"))

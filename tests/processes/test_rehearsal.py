@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ccatp.config.loader import load_config
-from ccatp.recorder import iter_messages
+from ccatp.run_files.recorder import iter_messages
 from ccatp.studies.rehearsal import rehearse
 from tests.faults.linking import Measured
 from tests.processes.conftest import Run

@@ -15,7 +15,7 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.replaying.comparison import REPRODUCED
 from ccatp.replaying.events import in_order
 from ccatp.replaying.player import replay
-from ccatp.run_reader import open_run
+from ccatp.run_files.run_reader import open_run
 from tests.processes.conftest import NO_CALIBRATION, Run
 
 Start = Callable[..., Run]

@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 from ccatp.config.loader import load_config
-from ccatp.recorder import iter_messages
+from ccatp.run_files.recorder import iter_messages
 from ccatp.wire.topics import TOPICS
 from tests.processes.conftest import Run
 

@@ -9,9 +9,9 @@ from ccatp.aligning.deviations import Measured
 from ccatp.config.loader import dump_config
 from ccatp.config.models import Config
 from ccatp.mirror.alignment import PanelMisalignment
-from ccatp.recorder import Recorder
+from ccatp.run_files.recorder import Recorder
 from ccatp.samples import DeckPose, PanelId, PointId
-from ccatp.store import MissionStore, PlannedPoint
+from ccatp.storage.store import MissionStore, PlannedPoint
 from ccatp.wire.topics import Misalignment, schema_of
 
 HERE = DeckPose(0.0, 0.0, 0.0)

@@ -5,7 +5,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from ccatp.checkpoint import Checkpoint, CheckpointFile, read_checkpoint
+from ccatp.storage.checkpoint import Checkpoint, CheckpointFile, read_checkpoint
 
 
 def record(count: int) -> Checkpoint:

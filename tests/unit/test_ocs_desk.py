@@ -13,10 +13,10 @@ from typing import Any
 import msgspec
 import pytest
 
-from ccatp import ocs_plugin
 from ccatp.client import Client
-from ccatp.ocs_agent import OcsMissing, add_arguments, main, register, survey_command
-from ccatp.ocs_desk import SurveyDesk, feed_fields
+from ccatp.observatory import plugin as ocs_plugin
+from ccatp.observatory.agent import OcsMissing, add_arguments, main, register, survey_command
+from ccatp.observatory.desk import SurveyDesk, feed_fields
 from ccatp.processes.run_collector import NO_STATUS
 from tests.unit.serving import serving
 
@@ -40,7 +40,7 @@ def folder() -> Iterator[Path]:
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ccatp.ocs_desk.PERIOD_S", 0.01)
+    monkeypatch.setattr("ccatp.observatory.desk.PERIOD_S", 0.01)
 
 
 def desk_of(folder: Path, program: str = "") -> SurveyDesk:
@@ -71,7 +71,7 @@ def test_the_number_of_panels_goes_to_the_survey(folder: Path) -> None:
 
 
 def test_a_survey_that_says_nothing_is_ended(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ccatp.ocs_desk.START_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("ccatp.observatory.desk.START_TIMEOUT_S", 0.2)
     done, text = desk_of(folder, "import time; time.sleep(60)").survey(Session())
     assert not done
     assert "said nothing within 0.2 s" in text
@@ -197,5 +197,5 @@ def test_without_the_extra_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_plugin_names_the_agent() -> None:
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
-    assert project["entry-points"]["ocs.plugins"] == {"ccatp": "ccatp.ocs_plugin"}
-    assert ocs_plugin.agents["CcatpAgent"] == {"module": "ccatp.ocs_agent", "entry_point": "main"}
+    assert project["entry-points"]["ocs.plugins"] == {"ccatp": "ccatp.observatory.plugin"}
+    assert ocs_plugin.agents["CcatpAgent"] == {"module": "ccatp.observatory.agent", "entry_point": "main"}

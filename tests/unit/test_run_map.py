@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp import run_map
 from ccatp.config.loader import dump_config, load_config
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.recorder import Recorder
+from ccatp.pictures import run_map
+from ccatp.pictures.run_map import MapPoint, RunMapError, draw_from_run_dir, draw_run_map
 from ccatp.reporting.points import arrival_error_m
-from ccatp.run_map import MapPoint, RunMapError, draw_from_run_dir, draw_run_map
+from ccatp.run_files.recorder import Recorder
 from ccatp.samples import DeckPose, Fix, PanelId, PointId
-from ccatp.store import MissionStore, PlannedPoint
+from ccatp.storage.store import MissionStore, PlannedPoint
 
 PNG = b"\x89PNG\r\n\x1a\n"
 POINTS = [PointId(5, 5, n) for n in range(1, 10)]

@@ -11,10 +11,10 @@ from ccatp.cli import main
 from ccatp.config.loader import dump_config, load_config
 from ccatp.filters import FilterDiverged
 from ccatp.mirror.mirror import build_mirror
-from ccatp.recorder import Recorder
 from ccatp.replaying import player
 from ccatp.replaying.events import Stood
-from ccatp.run_reader import RunReadError, open_run
+from ccatp.run_files.recorder import Recorder
+from ccatp.run_files.run_reader import RunReadError, open_run
 from ccatp.wire.robot import Sensors, encode_sensors
 from ccatp.wire.topics import RECORD_FORMAT, TOPICS, Arrival, Message, Rest, SensorLines, Track, Truth, pack, schema_of
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from ccatp import store, store_rows
 from ccatp.samples import DeckPose, Fix, PointId
-from ccatp.store import MissionStore, PlannedPoint, StoreError, StoreEvent, StoreRefusal
-from ccatp.store_rows import AlreadyMeasuredError, UnknownPointError
+from ccatp.storage import store, store_rows
+from ccatp.storage.store import MissionStore, PlannedPoint, StoreError, StoreEvent, StoreRefusal
+from ccatp.storage.store_rows import AlreadyMeasuredError, UnknownPointError
 
 PANEL = [PointId(1, 2, n) for n in range(1, 10)]
 POSE = DeckPose(0.1, 0.2, 0.3)
@@ -301,7 +301,7 @@ WRITER = """
 import sys
 from pathlib import Path
 from ccatp.samples import DeckPose, Fix, PointId
-from ccatp.store import MissionStore, StoreEvent
+from ccatp.storage.store import MissionStore, StoreEvent
 db = MissionStore.open(Path(sys.argv[1]), mirror="fyst-m1")
 for point in sorted({p.point for p in db.points()} - db.measured_points()):
     db.record_event(StoreEvent(1.0, "x"))

@@ -115,6 +115,8 @@ def _track(
         nis_sizes=np.empty(0),
         refused=int((weights[counted] < LITTLE).sum()),
         update_s=np.array([took_s / max(updates, 1)]),
+        predict_s=np.empty(0),
+        scalar_s=np.empty(0),
         updates=updates,
         warnings=_warnings(run, start, found.converged),
     )

@@ -14,7 +14,6 @@ from ccatp.beacon_mission.permits import permitted
 from ccatp.beacon_mission.self_map import SelfMap
 from ccatp.beacon_mission.senses import SenseReader
 from ccatp.beacon_mission.wheel_rates import wheel_rates
-from ccatp.beacon_store import BeaconStore, BeaconStoreError
 from ccatp.beacon_summary import BeaconSummary, beacon_facts
 from ccatp.config.radio_models import RadioConfig
 from ccatp.control.waypoint_steering import HALT, Drive
@@ -23,6 +22,7 @@ from ccatp.hazards.echo_memory import EchoMemory
 from ccatp.samples import EventCode, Verdict
 from ccatp.sim.beacon_robot import BeaconRobot
 from ccatp.sim.radio.world import RadioWorld
+from ccatp.storage.beacon_store import BeaconStore, BeaconStoreError
 from ccatp.wire.beacon_frame import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
 from ccatp.wire.robot import BadLine, Hello, Sensors, decode_from_robot
 from tests.unit.beacon_mission.stories import beacon_config

@@ -10,7 +10,7 @@ from ccatp.calibrating.drive import Drive, DriveBuilder, FloatArray
 from ccatp.calibrating.estimate import Priors
 from ccatp.config.loader import dump_config, load_config
 from ccatp.config.models import Config
-from ccatp.recorder import Recorder
+from ccatp.run_files.recorder import Recorder
 from ccatp.samples import Fix
 from ccatp.studies.rehearsal import Rehearsing
 from ccatp.wire.robot import Sensors, encode

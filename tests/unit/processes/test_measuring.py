@@ -16,7 +16,7 @@ from ccatp.mission import Mission
 from ccatp.processes.measuring import MeasuringDesk, Request
 from ccatp.processes.survey_telling import SurveyTeller
 from ccatp.samples import DeckPose, Fix
-from ccatp.store import MissionStore
+from ccatp.storage.store import MissionStore
 
 FIX = Fix(1.0, (0.0, 0.0, 0.0), (0.0,) * 9, 1.0, (1,), 0.0)
 

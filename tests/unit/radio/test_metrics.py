@@ -88,6 +88,8 @@ def track_of(turned: RigidMotion, *, beacons: bool = True) -> Track:
         nis_sizes=np.empty(0),
         refused=0,
         update_s=np.empty(0),
+        predict_s=np.empty(0),
+        scalar_s=np.empty(0),
         updates=0,
         warnings=(),
     )

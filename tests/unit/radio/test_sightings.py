@@ -13,7 +13,7 @@ from ccatp.radio.settling import derivatives, wrapped
 from ccatp.radio.sightings import Row, SensorError, Sensors
 from ccatp.radio.slam_settings import BearingModel, RangeModel, RssiModel, SlamSettings, Trust
 
-TRUST = Trust(5.0, 3.0, 0.0, 1.0, 3, 20, 0.3, 0.3)
+TRUST = Trust(5.0, 3.0, 0.0, 1.0, 3, 20, 0.3, 0.3, True)
 MOTION = DifferentialDrive(DifferentialNoise(0.05, 0.0, 0.01, 0.0, 0.0, 0.0))
 SETTINGS = SlamSettings(
     MOTION, TRUST, RangeModel(0.1, 0.02, 0.1, 0.3), BearingModel(0.05), RssiModel(2.0, -40.0, 3.0, 2.0, 0.3)

@@ -8,7 +8,7 @@ import msgspec
 
 from ccatp.config.radio_loader import dump_radio_config, load_radio_config
 from ccatp.config.radio_models import RadioConfig
-from ccatp.recorder import Recorder
+from ccatp.run_files.recorder import Recorder
 from ccatp.wire.topics import (
     BeaconArrival,
     BeaconMap,

@@ -9,9 +9,9 @@ import numpy as np
 
 from ccatp.config.loader import dump_config, load_config
 from ccatp.config.models import Config
-from ccatp.recorder import Recorder
+from ccatp.run_files.recorder import Recorder
 from ccatp.samples import DeckPose, Fix, PanelPose, PointId
-from ccatp.store import MissionStore, PlannedPoint
+from ccatp.storage.store import MissionStore, PlannedPoint
 from ccatp.studies.rehearsal import Rehearsing
 from ccatp.surveying.states import State
 from ccatp.wire.robot import Sensors

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.beacon_report_reader import read_beacon_record
 from ccatp.cli import main
 from ccatp.report_writer import report_run
 from ccatp.reporting.beacon_figures import consistency_figure, map_error_figure, target_figure
@@ -14,7 +13,8 @@ from ccatp.reporting.beacon_map_figure import beacon_map_figure, ellipse_m
 from ccatp.reporting.beacon_page import beacon_data, beacon_figures, beacon_page
 from ccatp.reporting.beacon_record import beacon_rows, pose_errors_m, pose_nees, readings_of, waypoint_rows
 from ccatp.reporting.html import NARROW, WIDE
-from ccatp.run_reader import RunReadError
+from ccatp.run_files.beacon_report_reader import read_beacon_record
+from ccatp.run_files.run_reader import RunReadError
 from tests.unit.reporting.beacon_recorded import FRAMES, OFF_M, SIGMA_M, beacon_config, record_beacons
 from tests.unit.reporting.test_pages import Markup
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from ccatp.cli import main
-from ccatp.report_reader import read_record
 from ccatp.report_writer import ReportError, compare_runs, report_run
 from ccatp.reporting.compare_page import compare_page, pair_of
 from ccatp.reporting.findings import findings_of, outcome_of
@@ -18,6 +17,7 @@ from ccatp.reporting.page import POLICY
 from ccatp.reporting.record import LogLine
 from ccatp.reporting.run_page import run_page
 from ccatp.reporting.sections import SECTIONS, sections_of
+from ccatp.run_files.report_reader import read_record
 from tests.unit.reporting.recorded import record
 
 FETCHED = {"src", "href", "srcset", "action", "data", "poster"}

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from ccatp.aligning.deviations import Measured
-from ccatp.report_reader import read_record
 from ccatp.reporting.errors import error_figures, error_series
 from ccatp.reporting.points import Grade, counted, first_arrivals_mm, point_verdicts
 from ccatp.reporting.record import PlannedRow, RunRecord, changed_keys
+from ccatp.run_files.report_reader import read_record
 from ccatp.samples import PointId, Vector3
 from ccatp.wire.topics import FixMessage
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from ccatp.assembly import assemble
-from ccatp.report_reader import read_record
 from ccatp.reporting.record import RunRecord, Session, StateChange
 from ccatp.reporting.time_budget import least_times, sampled_spells, spells_of, time_budget
+from ccatp.run_files.report_reader import read_record
 
 
 @pytest.fixture

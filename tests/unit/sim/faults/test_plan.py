@@ -7,10 +7,10 @@ import pytest
 from ccatp.cli import main
 from ccatp.config.loader import shipped_config_dir
 from ccatp.errors import ConfigError
-from ccatp.fault_plan import read_plan
 from ccatp.sim.faults.link_models import LINK_TYPES
 from ccatp.sim.faults.models import TYPES, Intermittent
 from ccatp.sim.faults.plan import FaultPlan, check_pacing, parse_plan
+from ccatp.stand_ins.fault_plan import read_plan
 
 FAULT = '[[fault]]\nsignal = "imu_wz"\nat_s = 1.0\n'
 LINK = "[[link]]\nat_s = 1.0\n"

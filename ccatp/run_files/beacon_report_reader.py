@@ -7,12 +7,12 @@ import numpy as np
 
 from ccatp.config.radio_loader import load_radio_config
 from ccatp.config.radio_models import RadioConfig
-from ccatp.recorder import iter_messages, read_metadata, recordings
-from ccatp.report_reader import LOG, SUMMARY, files_of, read_summary
 from ccatp.reporting.beacon_record import TRACK_COLUMNS, TRUTH_COLUMNS, BeaconRecord, pose_track, pose_truth
 from ccatp.reporting.record import FloatArray, changed_keys
-from ccatp.run_reader import CONFIG, TELEMETRY
-from ccatp.state_log import read_log
+from ccatp.run_files.recorder import iter_messages, read_metadata, recordings
+from ccatp.run_files.report_reader import LOG, SUMMARY, files_of, read_summary
+from ccatp.run_files.run_reader import CONFIG, TELEMETRY
+from ccatp.run_files.state_log import read_log
 from ccatp.wire.topics import (
     BadMessage,
     BeaconArrival,

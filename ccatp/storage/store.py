@@ -20,9 +20,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from ccatp import store_rows as rows
 from ccatp.samples import DeckPose, Fix, PointId
-from ccatp.store_rows import PlannedPoint, StoredFix, StoredPoint, StoreError, StoreEvent, StoreRefusal
+from ccatp.storage import store_rows as rows
+from ccatp.storage.store_rows import PlannedPoint, StoredFix, StoredPoint, StoreError, StoreEvent, StoreRefusal
 
 __all__ = ["MissionStore", "PlannedPoint", "StoreError", "StoreEvent", "StoreRefusal", "StoredFix", "StoredPoint"]
 

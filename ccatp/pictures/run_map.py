@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from ccatp.config.loader import load_config
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.recorder import iter_messages, read_metadata, recordings
 from ccatp.reporting.points import arrival_error_m
-from ccatp.store import MissionStore, StoreError
+from ccatp.run_files.recorder import iter_messages, read_metadata, recordings
+from ccatp.storage.store import MissionStore, StoreError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,14 +14,14 @@ from ccatp.config.loader import load_config
 from ccatp.config.models import Config
 from ccatp.config.radio_loader import is_radio_file
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.recorder import read_metadata, recordings
 from ccatp.reporting.record import PlannedRow, RunRecord, Session, changed_keys
-from ccatp.run_reader import CONFIG, TELEMETRY, RunReadError
-from ccatp.session_reader import read_session
-from ccatp.state_log import ReadLine, changes_of, read_log
-from ccatp.store_reader import read_survey
-from ccatp.store_rows import StoreError, point_name
-from ccatp.survey_reader import STORE, read_truth
+from ccatp.run_files.recorder import read_metadata, recordings
+from ccatp.run_files.run_reader import CONFIG, TELEMETRY, RunReadError
+from ccatp.run_files.session_reader import read_session
+from ccatp.run_files.state_log import ReadLine, changes_of, read_log
+from ccatp.run_files.survey_reader import STORE, read_truth
+from ccatp.storage.store_reader import read_survey
+from ccatp.storage.store_rows import StoreError, point_name
 
 SUMMARY, LOG = "summary.json", "log.jsonl"
 

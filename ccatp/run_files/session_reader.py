@@ -11,8 +11,8 @@ import numpy as np
 from ccatp.mirror.batches import deck_rows
 from ccatp.mirror.errors import MirrorError
 from ccatp.mirror.mirror import Mirror
-from ccatp.recorder import iter_messages, read_metadata
 from ccatp.reporting.record import Arrived, FloatArray, Session, StateChange, Track, Truth
+from ccatp.run_files.recorder import iter_messages, read_metadata
 from ccatp.samples import PointId
 from ccatp.wire.topics import Arrival, BadMessage, DangerEvent, FixMessage, Message, MissionStatus, unpack
 from ccatp.wire.topics import Track as TrackMessage

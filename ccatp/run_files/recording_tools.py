@@ -10,8 +10,8 @@ from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
 from mcap.writer import Writer
 
 from ccatp.errors import CcatpError, ExitStatus
-from ccatp.recorder import CHUNK_BYTES, recordings
-from ccatp.recording_scan import Condition, scan, strict_faults
+from ccatp.run_files.recorder import CHUNK_BYTES, recordings
+from ccatp.run_files.recording_scan import Condition, scan, strict_faults
 
 TELEMETRY = "telemetry.mcap"
 _NS = 1e9

@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 
 from ccatp.config.radio_models import FuzzyConfig
 from ccatp.control.fuzzy import Sugeno
-from ccatp.picture_file import PictureError
+from ccatp.pictures.picture_file import PictureError
 from ccatp.radio.level_fix import LevelFix
 from ccatp.radio.path_loss_fit import LevelPair, PathLossFit
 

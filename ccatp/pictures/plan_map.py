@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ccatp.mirror.mirror import Mirror
-from ccatp.run_map import RunMapError, draw_base, draw_panels
+from ccatp.pictures.run_map import RunMapError, draw_base, draw_panels
 from ccatp.samples import StopKind
 from ccatp.survey_plan import SurveyPlan
 

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
 
-from ccatp import store_rows as rows
 from ccatp.samples import PointId
-from ccatp.store_rows import StoredFix, StoredPoint, StoreError
+from ccatp.storage import store_rows as rows
+from ccatp.storage.store_rows import StoredFix, StoredPoint, StoreError
 
 _BUSY_TIMEOUT_S = 10.0
 # What SQLite says of a file whose last transaction was cut off: it cannot be read before it has been rolled back.

@@ -4,10 +4,10 @@ import asyncio
 import socket
 
 from ccatp.config.radio_models import RadioConfig
-from ccatp.link_server import LinkServer, Log
 from ccatp.sim.beacon_truth import BeaconTruthLog
 from ccatp.sim.beacon_world import build_beacon_robot, motes_of
-from ccatp.truth_outlet import TruthOutlet
+from ccatp.stand_ins.link_server import LinkServer, Log
+from ccatp.stand_ins.truth_outlet import TruthOutlet
 
 
 class BeaconLoop(LinkServer):

@@ -6,7 +6,7 @@ from ccatp.calibrating.drive import Drive, DriveBuilder
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.replaying.events import Marked, in_order
-from ccatp.run_reader import open_run
+from ccatp.run_files.run_reader import open_run
 
 # A survey has hundreds of legs; what its first ones do not show the others hardly will, and time grows with the cube.
 MAX_FIXES = 60

@@ -7,11 +7,11 @@ from typing import NamedTuple
 from ccatp.aligning.deviations import Measured
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
-from ccatp.recorder import iter_messages, read_metadata, recordings
-from ccatp.run_reader import CONFIG, TELEMETRY, RunReadError
+from ccatp.run_files.recorder import iter_messages, read_metadata, recordings
+from ccatp.run_files.run_reader import CONFIG, TELEMETRY, RunReadError
 from ccatp.samples import PanelId, PointId, Vector3
-from ccatp.store_reader import read_survey
-from ccatp.store_rows import StoreError, point_name
+from ccatp.storage.store_reader import read_survey
+from ccatp.storage.store_rows import StoreError, point_name
 from ccatp.wire.topics import BadMessage, Misalignment, unpack
 
 STORE = "mission.sqlite"

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccatp.config.models import SimEtalonConfig
-from ccatp.puck_truth import FixedPuck, TruthSource, TruthUnavailable, ZmqPuck
 from ccatp.sim.etalon import EtalonModel
+from ccatp.stand_ins.puck_truth import FixedPuck, TruthSource, TruthUnavailable, ZmqPuck
 from ccatp.wire import multiline
 from ccatp.wire.multiline import ChannelData, Command, Connected, LaserReady, Notice, Remark, Reply, Request
 

@@ -14,7 +14,7 @@ from ccatp.aligning.moves import adjuster_places
 from ccatp.aligning.panel_result import PanelResult
 from ccatp.aligning.survey_result import SurveyResult
 from ccatp.mirror.mirror import Mirror
-from ccatp.run_map import RunMapError, draw_panels
+from ccatp.pictures.run_map import RunMapError, draw_panels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

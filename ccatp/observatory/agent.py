@@ -9,7 +9,7 @@ from typing import Any
 
 from ccatp.client import Client
 from ccatp.errors import CcatpError, ExitStatus
-from ccatp.ocs_desk import Answer, SurveyDesk
+from ccatp.observatory.desk import Answer, SurveyDesk
 
 AGENT_CLASS = "CcatpAgent"
 FEED = "survey"

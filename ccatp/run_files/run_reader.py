@@ -12,9 +12,9 @@ from ccatp.config.loader import load_config
 from ccatp.config.models import Config
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.mirror.mirror import Mirror
-from ccatp.recorder import iter_messages, read_metadata, recordings
 from ccatp.replaying.events import Message, Stood, fix_given
 from ccatp.replaying.trace import IntArray, Trace, TraceBuilder, trace_of_truth
+from ccatp.run_files.recorder import iter_messages, read_metadata, recordings
 from ccatp.wire.robot import BadLine, Sensors, decode_from_robot
 from ccatp.wire.topics import (
     RECORD_FORMAT,

@@ -1,0 +1,1 @@
+"""Simulated robot and laser system behind their real protocols."""

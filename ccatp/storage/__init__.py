@@ -1,0 +1,1 @@
+"""What survives ``kill -9``: the databases of missions and their checkpoint."""
