@@ -112,7 +112,9 @@ def draw(cells: Sequence[CellResult], out: Path) -> None:
     seconds = np.arange(len(cell.arrays["nees"]))
     above.plot(seconds, 1e3 * cell.arrays["error_m"], color=colour(0), label="true error of the position")
     above.plot(seconds, 1e3 * cell.arrays["sigma_m"], color=colour(1), linestyle="--", label="expected by the filter")
-    above.axhline(1e3 * cell.values["map_m"], color=QUIET, linewidth=1.0, linestyle=":", label="true error of the map")
+    above.axhline(
+        1e3 * cell.values["map_m"], color=QUIET, linewidth=1.0, linestyle=":", label="true error of the map at the end"
+    )
     above.set(ylabel="mm, root mean square", yscale="log")
     above.set_title("A robot that navigates by motes which mapped themselves", color=INK)
     above.legend(frameon=False, fontsize=8)

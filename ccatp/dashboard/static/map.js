@@ -301,7 +301,7 @@ export class MapView {
     pen.stroke();
   }
 
-  paintShapes(pen, { at, scale }) {
+  paintShapes(pen, { at, scale, w }) {
     for (const shape of this.shapes) {
       const [x, y] = at(shape.x_m, shape.y_m);
       if (shape.outline_m?.length > 1) {
@@ -330,8 +330,9 @@ export class MapView {
       if (shape.label) {
         pen.fillStyle = this.inks.ink;
         pen.font = "12px system-ui";
-        pen.textAlign = "left";
-        pen.fillText(shape.label, x + 10, y - 8);
+        const isFar = x > w - 70; // beside the edge it would be cut off
+        pen.textAlign = isFar ? "right" : "left";
+        pen.fillText(shape.label, isFar ? x - 10 : x + 10, y - 8);
       }
     }
   }
