@@ -21,6 +21,7 @@ from ccatp.commands.frame import (
     CONFIG_OPTION,
     FAULTS_OPTION,
     RUNTIME_DIR_OPTION,
+    TIMEOUT_OPTION,
     WORLD_OPTIONS,
     NearestChoice,
     SuggestingGroup,
@@ -140,7 +141,7 @@ def _daemon_options(command: Any) -> Any:
     return options(
         CONFIG_OPTION,
         RUNTIME_DIR_OPTION,
-        click.option("--timeout", "timeout_s", type=float, default=10.0, show_default=True, help="Seconds to wait."),
+        TIMEOUT_OPTION,
         click.option("--json", "json_output", is_flag=True, help="The daemon's answer as JSON on standard output."),
     )(command)
 

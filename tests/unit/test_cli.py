@@ -153,6 +153,17 @@ def test_misuse_is_one_line_and_exit_2(argv: list[str], message: str, capsys: py
     assert not out
 
 
+@pytest.mark.parametrize("time_s", ["0", "-1", "nan", "inf", "1e300", "soon"])
+@pytest.mark.parametrize("command", [["status"], ["pause"], ["emergency", "fire"], ["conformance", "127.0.0.1:7010"]])
+def test_a_time_to_wait_is_finite_and_more_than_none(
+    command: list[str], time_s: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*command, "--timeout", time_s]) == 2
+    err = capsys.readouterr().err
+    assert f"'--timeout': {time_s} is no time to wait; give more than 0 s" in err
+    assert err.count("\n") == 1
+
+
 def test_no_command_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 2
     assert "Usage: ccatp" in capsys.readouterr().err
