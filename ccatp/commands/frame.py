@@ -184,7 +184,7 @@ WORLD_OPTIONS = options(
         "--world",
         metavar="NAME",
         shell_complete=names_of("worlds"),
-        help="Simulated world: thesis, thesis-x2, or a .toml file.",
+        help="Simulated world: thesis, thesis-x2, hard, extreme, or a .toml file.",
     ),
     click.option("--seed", type=int, metavar="N", help="Seed of every random draw."),
     SETTINGS_OPTION,
