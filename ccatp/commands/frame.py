@@ -31,7 +31,7 @@ class NearestChoice(click.Choice[str]):
         return super().convert(value, param, ctx)
 
 
-class WaitingTime(click.ParamType):
+class WaitingTime(click.ParamType[float]):
     """Seconds to wait: more than none, and at most a day."""
 
     name = "seconds"
