@@ -155,9 +155,16 @@ def _clock() -> Finding:
 
 
 def _disk(runs_dir: Path) -> Iterator[Finding]:
+    """Free room and speed where runs are written; ``runs_dir`` itself is made by the first run."""
     place = runs_dir.absolute()
-    while not place.is_dir():
+    if place.exists() and not place.is_dir():
+        yield failed("disk", f"{place} is no directory", "name another with --runs-dir")
+        return
+    if not place.is_dir():
         place = place.parent
+    if not place.is_dir():
+        yield failed("disk", f"no directory {place} to make {runs_dir.name} in", "make it, or mount the disk it is on")
+        return
     free = shutil.disk_usage(place).free
     found = f"{free / 1e9:.1f} GB free in {place}"
     if free < FREE_BYTES:

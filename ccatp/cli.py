@@ -1,6 +1,7 @@
 """Glue. The commands. Only click is imported here: ``--help`` and completion must be quick, so commands import late."""
 
 import json
+import re
 import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from ccatp.commands.frame import (
     CONFIG_OPTION,
     FAULTS_OPTION,
     RUNTIME_DIR_OPTION,
+    TIMEOUT_OPTION,
     WORLD_OPTIONS,
     NearestChoice,
     SuggestingGroup,
@@ -45,6 +47,8 @@ from ccatp.commands.stream import stream
 from ccatp.commands.study import study
 from ccatp.package import COMPILED, build
 
+# No laser reaches farther.
+FARTHEST_PUCK_M = 1000.0
 EMERGENCY_KINDS = ("fire", "earthquake", "power", "weather", "operator")
 
 
@@ -140,7 +144,7 @@ def _daemon_options(command: Any) -> Any:
     return options(
         CONFIG_OPTION,
         RUNTIME_DIR_OPTION,
-        click.option("--timeout", "timeout_s", type=float, default=10.0, show_default=True, help="Seconds to wait."),
+        TIMEOUT_OPTION,
         click.option("--json", "json_output", is_flag=True, help="The daemon's answer as JSON on standard output."),
     )(command)
 
@@ -246,6 +250,20 @@ def _ask_observatory(
     return ask_over_tcp(endpoint, server_key, key_file, payload, timeout_s)
 
 
+def _finite(
+    _ctx: click.Context, _param: click.Parameter, place: tuple[float, float, float] | None
+) -> tuple[float, float, float] | None:
+    if place is not None and not all(abs(value) <= FARTHEST_PUCK_M for value in place):
+        raise click.BadParameter(f"each of X Y Z is a number of metres, at most {FARTHEST_PUCK_M:g} from the origin")
+    return place
+
+
+def _endpoint(_ctx: click.Context, _param: click.Parameter, endpoint: str | None) -> str | None:
+    if endpoint is not None and not re.fullmatch(r"ipc://.+|tcp://[^\s/:]+:\d{1,5}", endpoint):
+        raise click.BadParameter(f"{endpoint!r} is no endpoint; give ipc://PATH, as ccatp sim robot tells it")
+    return endpoint
+
+
 @cli.group(cls=SuggestingGroup, epilog=example("ccatp sim robot --port 7010"))
 def sim() -> None:
     """Stand-ins of robot and laser system, alone."""
@@ -258,9 +276,11 @@ def sim() -> None:
 @WORLD_OPTIONS
 @click.option("--realtime/--lockstep", default=True, show_default=True, help="Wall clock, or wait for each command.")
 @FAULTS_OPTION
+@RUNTIME_DIR_OPTION
 def sim_robot(
     host: str | None, port: int | None, config_file: Path | None, mirror: str | None, world: str | None,
     seed: int | None, settings: Mapping[str, object], realtime: bool, faults_file: Path | None,
+    runtime_dir: Path | None,
 ) -> int:  # fmt: skip
     """Run the simulated robot behind the robot link, for any controller."""
     from ccatp.config.loader import load_config
@@ -273,10 +293,10 @@ def sim_robot(
         from ccatp.processes.dataloop import run_beacons_alone
 
         among_beacons = load_radio_config(config_file, overrides(settings, named))
-        return int(run_beacons_alone(among_beacons, lockstep=not realtime))
+        return int(run_beacons_alone(among_beacons, lockstep=not realtime, runtime_dir=runtime_dir))
     cfg = load_config(config_file, overrides(settings, named))
     plan = None if faults_file is None else read_plan(faults_file, lockstep=not realtime)
-    return int(run_alone(cfg, lockstep=not realtime, faults=plan))
+    return int(run_alone(cfg, lockstep=not realtime, faults=plan, runtime_dir=runtime_dir))
 
 
 @sim.command("etalon", epilog=example("ccatp sim etalon --port 2001 --puck 0.1 -0.5 3.4"))
@@ -286,14 +306,25 @@ def sim_robot(
     "--puck",
     "puck_world_m",
     type=(float, float, float),
+    callback=_finite,
     metavar="X Y Z",
     help="Where the puck stands: world frame, metres.",
 )
-@click.option("--truth", metavar="ENDPOINT", help="Follow the true puck that a simulated robot publishes there.")
+@click.option(
+    "--truth",
+    callback=_endpoint,
+    metavar="ENDPOINT",
+    help="Follow the true puck that a simulated robot publishes there.",
+)
+@click.option(
+    "--runtime-dir",
+    type=click.Path(path_type=Path),
+    help="Follow the true puck of the simulated robot that has this folder.",
+)
 def sim_etalon(
     host: str | None, port: int | None, config_file: Path | None, mirror: str | None, world: str | None,
     seed: int | None, settings: Mapping[str, object],
-    puck_world_m: tuple[float, float, float] | None, truth: str | None,
+    puck_world_m: tuple[float, float, float] | None, truth: str | None, runtime_dir: Path | None,
 ) -> int:  # fmt: skip
     """Run the simulated MultiLine server; the puck stands at the base unless told otherwise."""
     from ccatp.config.loader import load_config
@@ -301,6 +332,12 @@ def sim_etalon(
 
     if puck_world_m is not None and truth is not None:
         raise click.UsageError("--puck and --truth exclude each other")
+    if runtime_dir is not None:
+        if puck_world_m is not None or truth is not None:
+            raise click.UsageError("--runtime-dir tells where the puck is: leave out --puck and --truth")
+        from ccatp.runtime_dir import runtime_dir_path
+
+        truth = f"ipc://{runtime_dir_path(str(runtime_dir), {})}/puck"
     named = {
         "sim.etalon.host": host,
         "sim.etalon.port": port,

@@ -25,7 +25,7 @@ import msgspec
 from ccatp.curve_keys import read_pair, read_public
 from ccatp.errors import CcatpError, ExitStatus, RefusedError, UnreachableError
 from ccatp.router import CurveClient, RequestFailed, request
-from ccatp.runtime_dir import runtime_dir_path
+from ccatp.runtime_dir import is_deserted, runtime_dir_path
 from ccatp.wire.topics import MissionStatus
 
 EmergencyKind = Literal["fire", "earthquake", "power", "weather", "operator"]
@@ -205,9 +205,9 @@ class Client:
         """Where a channel is served.
 
         Raises:
-            UnreachableError: no daemon has made it.
+            UnreachableError: no daemon has made it, or it is gone.
         """
-        if not (self.runtime_dir / channel).exists():
+        if not (self.runtime_dir / channel).exists() or is_deserted(self.runtime_dir):
             raise UnreachableError(
                 f"no daemon in {self.runtime_dir}; start one with ccatp run, or name its folder with --runtime-dir"
             )

@@ -3,10 +3,19 @@
 import os
 import stat
 import tempfile
-from collections.abc import Mapping
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from fcntl import LOCK_EX, LOCK_NB, LOCK_SH, flock
 from pathlib import Path
 
-from ccatp.errors import RuntimeDirError
+from ccatp.errors import RefusedError, RuntimeDirError
+
+LOCK_FILE = "lock"
+# Held by whoever gives away the truth of a simulation there: a daemon's stand-in, or one alone.
+TRUTH_LOCK_FILE = "truth.lock"
+# Who asks whether a lock is held has it for an instant.
+_SECOND_LOOK_S = 0.05
 
 # sockaddr_un.sun_path holds 108 bytes with its closing zero on Linux.
 MAX_SOCKET_PATH_BYTES = 107
@@ -72,3 +81,48 @@ def make_runtime_dir(configured: str, environ: Mapping[str, str]) -> Path:
             f"chmod 700 {path}"
         )
     return path
+
+
+@contextmanager
+def locked(path: Path, refusal: str) -> Iterator[None]:
+    """Hold the lock of a file for as long as the block lasts; it ends with the process, whatever ends that.
+
+    Args:
+        path: the file, made when it is missing.
+        refusal: what to say where somebody else holds it.
+
+    Raises:
+        RefusedError: somebody else does.
+    """
+    with path.open("w") as file:
+        if not _takes(file.fileno(), LOCK_EX):
+            time.sleep(_SECOND_LOOK_S)
+            if not _takes(file.fileno(), LOCK_EX):
+                raise RefusedError(refusal)
+        yield
+
+
+def is_deserted(runtime_dir: Path) -> bool:
+    """Whether a daemon was there and is gone: its lock is there and nobody holds it."""
+    try:
+        with (runtime_dir / LOCK_FILE).open() as file:
+            return _takes(file.fileno(), LOCK_SH)
+    except OSError:
+        return False  # whose it is cannot be told
+
+
+def remove_sockets(runtime_dir: Path, names: Iterable[str]) -> None:
+    """Remove sockets that nobody serves any more; what is no socket stays."""
+    for name in names:
+        path = runtime_dir / name
+        with suppress(OSError):
+            if stat.S_ISSOCK(path.lstat().st_mode):
+                path.unlink()
+
+
+def _takes(fd: int, operation: int) -> bool:
+    try:
+        flock(fd, operation | LOCK_NB)
+    except OSError:
+        return False
+    return True

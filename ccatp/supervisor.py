@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
-from fcntl import LOCK_EX, LOCK_NB, flock
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -21,7 +20,7 @@ from ccatp.config.loader import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.config.radio_loader import dump_radio_config, is_radio_file, load_radio_config
 from ccatp.dashboard.token_file import read_token
-from ccatp.errors import ConfigError, ExitStatus, RefusedError
+from ccatp.errors import ConfigError, ExitStatus
 from ccatp.processes.children import Children, ProcessSpec
 from ccatp.processes.collecting import Collector
 from ccatp.processes.common import FAULTS_FILE, RUN_DIR_FILE, Endpoints, open_log
@@ -34,7 +33,7 @@ from ccatp.processes.service import Service
 from ccatp.restarts import Decision, Fate
 from ccatp.robot_link import read_key
 from ccatp.run_options import RunOptions, default_run_dir
-from ccatp.runtime_dir import make_runtime_dir
+from ccatp.runtime_dir import LOCK_FILE, TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
 from ccatp.service_notify import take_from
 from ccatp.unfinished import find_unfinished, finished_summary, forget_finished, note_unfinished
 from ccatp.wire.topics import Presence
@@ -43,6 +42,10 @@ POLL_MS = 20
 # In lockstep the three that answer each other keep both cores of a small machine busy: recording takes what they leave.
 LOCKSTEP_NICENESS = 10
 
+
+# In the runtime directory. Those of the truth may be of a simulated robot that runs alone, beside a run without one.
+SOCKETS = ("main", "danger", "control", "emergency", "dashboard")
+TRUTH_SOCKETS = ("truth", "puck")
 
 # First, so that it is there for the end of the others. It gets what time they leave, so it has a minute to speak.
 _DASHBOARD = ProcessSpec(
@@ -96,7 +99,7 @@ def run_beacons(options: RunOptions) -> int:
     started = time.monotonic()
     with ExitStack() as stack:
         runtime_dir = make_runtime_dir(str(options.runtime_dir or cfg.processes.runtime_dir), os.environ)
-        stack.enter_context(_lock(runtime_dir / "lock", "--runtime-dir"))
+        _take(stack, runtime_dir, is_sim=options.sim)
         sockets: dict[str, socket.socket] = {}
         if options.sim:
             at = cfg.sim.robot
@@ -138,7 +141,7 @@ def run_survey(options: RunOptions) -> int:
     started = time.monotonic()
     with ExitStack() as stack:
         runtime_dir = make_runtime_dir(str(options.runtime_dir or cfg.run.runtime_dir), os.environ)
-        stack.enter_context(_lock(runtime_dir / "lock", "--runtime-dir"))
+        _take(stack, runtime_dir, is_sim=options.sim)
         stand_ins = [p for p in PROCESSES if p.is_stand_in and p.listens and options.sim]
         places = places_of(cfg)
         sockets = {p.name: stack.enter_context(listen(p.listens, *places[p.listens])) for p in stand_ins}
@@ -177,14 +180,18 @@ def _recover(options: RunOptions) -> int:
 
 @contextmanager
 def _lock(path: Path, option: str) -> Iterator[None]:
-    with path.open("w") as file:
-        try:
-            flock(file, LOCK_EX | LOCK_NB)
-        except OSError as error:
-            raise RefusedError(
-                f"another ccatp runs in {path.parent}; end it with 'ccatp stop', or give this one its own {option}"
-            ) from error
+    refusal = f"another ccatp runs in {path.parent}; end it with 'ccatp stop', or give this one its own {option}"
+    with locked(path, refusal):
         yield
+
+
+def _take(stack: ExitStack, runtime_dir: Path, *, is_sim: bool) -> None:
+    """Have a runtime directory for ourselves until the end, when our sockets go, too."""
+    stack.enter_context(_lock(runtime_dir / LOCK_FILE, "--runtime-dir"))
+    if is_sim:
+        alone = f"a simulated robot runs alone in {runtime_dir}; end it, or give this one its own --runtime-dir"
+        stack.enter_context(locked(runtime_dir / TRUTH_LOCK_FILE, alone))
+    stack.callback(remove_sockets, runtime_dir, (*SOCKETS, *(TRUTH_SOCKETS if is_sim else ())))
 
 
 @contextmanager

@@ -115,7 +115,9 @@ def plan_lines(cfg: Config, plan: SurveyPlan) -> Iterator[str]:
     vias = sum(stop.kind is StopKind.VIA for stop in plan.stops)
     panels = [panel for panel, _ in groupby(point.panel for point in plan.points)]
     limits = cfg.limits
-    yield f"{cfg.mirror.name}: {len(plan.points)} points of {len(set(panels))} panels, order {cfg.run.order}"
+    count = len(set(panels))
+    of = f"{count} panel{'' if count == 1 else 's'}"
+    yield f"{cfg.mirror.name}: {len(plan.points)} points of {of}, order {cfg.run.order}"
     yield f"first panels    {_names(panels)}"
     yield f"way             {plan.length_m:.1f} m, {len(plan.stops)} stops, {vias} of them only on the way"
     yield (

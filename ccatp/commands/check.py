@@ -39,12 +39,14 @@ def check(
     if not sim and config_file is None:
         raise click.UsageError("name the robot's configuration with --config FILE, or add --sim")
     from ccatp.checking.finding import as_json, failed, has_failed
-    from ccatp.config.loader import load_config
+    from ccatp.config.loader import NotASurvey, load_config
 
     named = {"run.mirror": mirror, "run.world": world, "run.seed": seed}
     try:
         cfg = load_config(config_file, overrides(settings, named))
         found = _findings(cfg, config_file, runs_dir, runtime_dir, sim=sim)
+    except NotASurvey:
+        raise
     except ConfigError as error:
         found = [failed("configuration", str(error), "correct it; ccatp config check FILE lists all that is wrong")]
     if json_output:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ccatp.commands.frame import complain, example
+from ccatp.commands.frame import WaitingTime, complain, example
 from ccatp.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -32,7 +32,13 @@ FAILED = 1
 @click.option("--no-motion", is_flag=True, help="Leave out the checks that turn wheels.")
 @click.option("--only", multiple=True, metavar="ID", help="Run only this check. May be repeated.")
 @click.option(
-    "--timeout", "timeout_s", type=float, default=3.0, show_default=True, help="Seconds to wait for an answer."
+    "--timeout",
+    "timeout_s",
+    type=WaitingTime(),
+    metavar="SECONDS",
+    default=3.0,
+    show_default=True,
+    help="Seconds to wait for an answer.",
 )
 @click.option("--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there.")
 def conformance(
@@ -47,8 +53,6 @@ def conformance(
     from ccatp.conformance.table import check_ids
 
     address = _address(server)
-    if not (math.isfinite(timeout_s) and timeout_s > 0.0):
-        raise click.UsageError(f"--timeout {timeout_s:g} is no time to wait")
     _check_ids(only, check_ids())
     checks = Conformance(address, _key(key_file), timeout_s)
     if not no_motion:

@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import math
 import os
 import sys
 import tomllib
@@ -15,6 +16,8 @@ from ccatp.errors import CcatpError, ExitStatus
 from ccatp.package import configs_dir
 
 Command = Callable[..., Any]
+# Longer than any answer takes; what libzmq waits for is an int of milliseconds.
+LONGEST_WAIT_S = 86_400.0
 
 
 class NearestChoice(click.Choice[str]):
@@ -26,6 +29,22 @@ class NearestChoice(click.Choice[str]):
         if near and value not in self.choices:
             self.fail(f"{value!r} is none of {', '.join(self.choices)}; did you mean {near[0]}?", param, ctx)
         return super().convert(value, param, ctx)
+
+
+class WaitingTime(click.ParamType[float]):
+    """Seconds to wait: more than none, and at most a day."""
+
+    name = "seconds"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """As ``click.ParamType.convert``."""
+        try:
+            time_s = float(value)
+        except ValueError:
+            time_s = math.nan
+        if not 0.0 < time_s <= LONGEST_WAIT_S:
+            self.fail(f"{value} is no time to wait; give more than 0 s, at most {LONGEST_WAIT_S:g} s", param, ctx)
+        return time_s
 
 
 class SuggestingGroup(click.Group):
@@ -133,6 +152,10 @@ def names_of(folder: str) -> Callable[[click.Context, click.Parameter, str], lis
 
 
 CONFIG_OPTION = click.option("--config", "config_file", type=click.Path(path_type=Path), help="Configuration (TOML).")
+TIMEOUT_OPTION = click.option(
+    "--timeout", "timeout_s", type=WaitingTime(), default=10.0, show_default=True, metavar="SECONDS",
+    help="Seconds to wait.",
+)  # fmt: skip
 RUNTIME_DIR_OPTION = click.option(
     "--runtime-dir", type=click.Path(path_type=Path), help="Folder of the sockets, if not the usual one."
 )
@@ -161,7 +184,7 @@ WORLD_OPTIONS = options(
         "--world",
         metavar="NAME",
         shell_complete=names_of("worlds"),
-        help="Simulated world: thesis, thesis-x2, or a .toml file.",
+        help="Simulated world: thesis, thesis-x2, hard, extreme, or a .toml file.",
     ),
     click.option("--seed", type=int, metavar="N", help="Seed of every random draw."),
     SETTINGS_OPTION,

@@ -9,7 +9,15 @@ from typing import Any
 
 import click
 
-from ccatp.commands.frame import CONFIG_OPTION, RUNTIME_DIR_OPTION, ask_daemon, configured_folder, example, tell
+from ccatp.commands.frame import (
+    CONFIG_OPTION,
+    RUNTIME_DIR_OPTION,
+    TIMEOUT_OPTION,
+    ask_daemon,
+    configured_folder,
+    example,
+    tell,
+)
 from ccatp.errors import UnreachableError
 
 # Without a terminal a line is told at a change, and at least this often.
@@ -21,7 +29,7 @@ QUIET_S = 10.0
 )
 @CONFIG_OPTION
 @RUNTIME_DIR_OPTION
-@click.option("--timeout", "timeout_s", type=float, default=10.0, show_default=True, help="Seconds to wait.")
+@TIMEOUT_OPTION
 @click.option("--watch", is_flag=True, help="Go on until the run is over.")
 @click.option(
     "--every", "period_s", type=click.FloatRange(0.1, 3600.0), default=1.0, show_default=True, metavar="SECONDS",

@@ -106,7 +106,9 @@ def study(
 
 def _analysed(analysis: Callable[[Any, Path], dict[str, Any]], cfg: Any, out: Path) -> dict[str, Any]:
     from ccatp.studies.campaign import CampaignFailed
+    from ccatp.studies.ledger import make_out
 
+    make_out(out)
     try:
         return analysis(cfg, out)
     except OSError as error:

@@ -16,10 +16,15 @@ from ccatp.errors import ConfigError
 from ccatp.package import configs_dir
 
 DEFAULT_FILE = "ccatp.toml"
+_RUN_FILE = "config.toml"  # of a run directory
 _SECTIONS: dict[str, tuple[str, type[BaseModel]]] = {
     "mirror": ("mirrors", MirrorConfig),
     "world": ("worlds", WorldConfig),
 }
+
+
+class NotASurvey(ConfigError):
+    """A configuration of a mission among beacons where one of a survey is wanted."""
 
 
 def shipped_config_dir() -> Path:
@@ -44,10 +49,12 @@ def load_config(
 
     Raises:
         ConfigError: one line with file, line, key, what is wrong and what to do.
+        NotASurvey: the file is of a mission among beacons.
     """
     config_dir = config_dir or shipped_config_dir()
     default = read_source(config_dir / DEFAULT_FILE)
     user = read_source(file) if file else Source("", "", {})
+    _refuse_beacons(user, file)
     command = Source("command line", "", nested(overrides or {}))
     sources = [command, user, default]
     tree: Tree = {}
@@ -58,6 +65,15 @@ def load_config(
         tree[section] = merged(named.tree, _overlay(section, tree, sources))
         sources.append(named)
     return _validated(tree, sources)
+
+
+def _refuse_beacons(user: Source, file: Path | None) -> None:
+    if file is None or "system" not in user.tree:
+        return
+    name = f"{file}: is of a mission among beacons (system = {format_value(user.tree['system'])})"
+    if file.name == _RUN_FILE:
+        raise NotASurvey(f"{name}, and this is for surveys of mirrors alone; use ccatp report {file.parent}")
+    raise NotASurvey(f"{name}, and this is for surveys of mirrors alone; use ccatp run or ccatp study with it")
 
 
 def dump_config(cfg: Config) -> str:

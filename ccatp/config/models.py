@@ -71,10 +71,10 @@ class RobotConfig(LinkConfig):
 class LimitsConfig(Model):
     """Motion limits of the robot's origin."""
 
-    v_max_m_s: Annotated[float, Field(gt=0.0, le=0.3)]
-    a_max_m_s2: Annotated[float, Field(gt=0.0, le=2.0)]
-    omega_max_rad_s: Annotated[float, Field(gt=0.0, le=5.0)]
-    alpha_max_rad_s2: Annotated[float, Field(gt=0.0, le=20.0)]
+    v_max_m_s: Annotated[float, Field(ge=0.001, le=0.3)]  # slower, a survey would take days
+    a_max_m_s2: Annotated[float, Field(ge=0.001, le=2.0)]
+    omega_max_rad_s: Annotated[float, Field(ge=0.001, le=5.0)]
+    alpha_max_rad_s2: Annotated[float, Field(ge=0.001, le=20.0)]
 
 
 class PidConfig(Model):
@@ -437,7 +437,7 @@ class WorldConfig(Model):
 class SurfaceConfig(Model):
     """Polynomial sag, thesis eq. 1.1; millimetres in the mirror frame."""
 
-    normalisation_radius_mm: Positive
+    normalisation_radius_mm: Annotated[float, Field(ge=100.0, le=1e6)]  # its sixth power divides coefficients
     terms: tuple[tuple[int, int, float], ...]  # (power of x, power of y, coefficient in mm)
 
 

@@ -123,6 +123,10 @@ def draw_from_run_dir(run_dir: Path, out: Path) -> None:
 
 
 def _points(database: Path, mirror: Mirror, puck_height_m: float) -> list[MapPoint]:
+    if not database.is_file():
+        raise RunMapError(
+            f"{database.parent}: no {database.name} there, so no points to draw; was the run ever under way?"
+        )
     try:
         with MissionStore.open(database, mirror=mirror.name) as store:
             rows, fixes = store.points(), {stored.point: stored.fix for stored in store.fixes()}

@@ -4,6 +4,9 @@ import asyncio
 import os
 import socket
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import structlog
 
@@ -22,7 +25,7 @@ from ccatp.processes.common import (
     stop_on_signals,
 )
 from ccatp.robot_link import read_key
-from ccatp.runtime_dir import make_runtime_dir
+from ccatp.runtime_dir import TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
 from ccatp.sim.faults.plan import FaultPlan
 from ccatp.stand_ins.body_file import FILE
 from ccatp.stand_ins.fault_plan import read_plan
@@ -86,7 +89,7 @@ def _among_beacons(args: BeaconArgs) -> int:
     return spinning.run(run(), is_spinning=not args.is_realtime)
 
 
-def run_alone(cfg: Config, lockstep: bool, faults: FaultPlan | None = None) -> int:
+def run_alone(cfg: Config, lockstep: bool, faults: FaultPlan | None = None, runtime_dir: Path | None = None) -> int:
     """The stand-in alone, for other people's controllers; ends on SIGINT or SIGTERM.
 
     Its truth is at ``puck`` in the runtime directory, for ``ccatp sim etalon --truth``.
@@ -95,12 +98,13 @@ def run_alone(cfg: Config, lockstep: bool, faults: FaultPlan | None = None) -> i
         cfg: configuration; ``sim.robot`` holds the address.
         lockstep: simulated time waits for the controller.
         faults: what shall go wrong.
-    """
-    truth = Endpoints(make_runtime_dir(cfg.run.runtime_dir, os.environ)).of("puck")
-    listener = _listener(cfg.sim.robot.host, cfg.sim.robot.port)
-    _say_where(cfg.mirror.name, listener, truth)
+        runtime_dir: where its truth is, if not in the configured folder.
 
-    async def run() -> None:
+    Raises:
+        RefusedError: another one has its truth there.
+    """
+
+    async def run(listener: socket.socket, truth: str) -> None:
         stop = asyncio.Event()
         stop_on_signals(stop)
         await serve(
@@ -115,26 +119,44 @@ def run_alone(cfg: Config, lockstep: bool, faults: FaultPlan | None = None) -> i
             faults=faults,
         )
 
-    asyncio.run(run())
+    with (
+        _truth_outlet(runtime_dir, cfg.run.runtime_dir) as truth,
+        _listener(cfg.sim.robot.host, cfg.sim.robot.port) as listener,
+    ):
+        _say_where(cfg.mirror.name, listener, truth)
+        asyncio.run(run(listener, truth))
     return 0
 
 
-def run_beacons_alone(cfg: RadioConfig, lockstep: bool) -> int:
+def run_beacons_alone(cfg: RadioConfig, lockstep: bool, runtime_dir: Path | None = None) -> int:
     """The same of a robot among beacons."""
     from ccatp.stand_ins.beacon_server import serve_beacons  # noqa: PLC0415 - a survey starts sooner without it
 
-    truth = Endpoints(make_runtime_dir(cfg.processes.runtime_dir, os.environ)).of("puck")
-    listener = _listener(cfg.sim.robot.host, cfg.sim.robot.port)
-    _say_where(cfg.system, listener, truth)
-
-    async def run() -> None:
+    async def run(listener: socket.socket, truth: str) -> None:
         stop = asyncio.Event()
         stop_on_signals(stop)
         key, log = read_key(cfg.robot.key_file), _plain_log()
         await serve_beacons(cfg, lockstep=lockstep, stop=stop, listen_sock=listener, truth_rep=truth, key=key, log=log)
 
-    asyncio.run(run())
+    with (
+        _truth_outlet(runtime_dir, cfg.processes.runtime_dir) as truth,
+        _listener(cfg.sim.robot.host, cfg.sim.robot.port) as listener,
+    ):
+        _say_where(cfg.system, listener, truth)
+        asyncio.run(run(listener, truth))
     return 0
+
+
+@contextmanager
+def _truth_outlet(runtime_dir: Path | None, configured: str) -> Iterator[str]:
+    """The endpoint of the truth, for this one alone."""
+    folder = make_runtime_dir(str(runtime_dir or configured), os.environ)
+    refusal = f"another simulated robot has its truth in {folder}; end it, or give this one its own --runtime-dir"
+    with locked(folder / TRUTH_LOCK_FILE, refusal):
+        try:
+            yield Endpoints(folder).of("puck")
+        finally:
+            remove_sockets(folder, ("puck",))
 
 
 def _listener(host: str, port: int) -> socket.socket:

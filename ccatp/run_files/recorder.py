@@ -20,6 +20,8 @@ from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.writer import Writer
 from zstandard import ZstdError
 
+from ccatp.run_files.recording_scan import told
+
 CHUNK_BYTES = 16 * 1024
 FLUSH_AFTER_S = 1.0  # of message time: slow topics do not wait for a full chunk
 HELD_BACK_S = 0.25  # of the machine's time: nor does anything else
@@ -244,7 +246,7 @@ def _iter_records(path: Path, on_damage: Callable[[str], None] | None) -> Iterat
                 return
             except _DAMAGE as error:
                 if on_damage is not None:
-                    on_damage(f"{path}: damaged or cut off before byte {file.tell()}: {type(error).__name__} {error}")
+                    on_damage(f"{path}: damaged or cut off before byte {file.tell()}: {told(error)}")
                 return
             yield from inner
 

@@ -108,14 +108,20 @@ def strict_faults(path: Path) -> list[str]:
             for _ in StreamReader(file, validate_crcs=True, record_size_limit=path.stat().st_size).records:
                 pass
         except DAMAGE as error:
-            faults.append(f"read from the beginning: {type(error).__name__}: {error}")
+            faults.append(f"read from the beginning: {told(error)}")
         file.seek(0)
         try:
             for _ in make_reader(file, validate_crcs=True).iter_messages():
                 pass
         except DAMAGE as error:
-            faults.append(f"read by its index: {type(error).__name__}: {error}")
+            faults.append(f"read by its index: {told(error)}")
     return faults
+
+
+def told(error: Exception) -> str:
+    """What an error of the format's reader says; some of them have a name alone."""
+    name = type(error).__name__
+    return f"{name}: {error}" if str(error) else name
 
 
 def _records(data: mmap.mmap, condition: Condition) -> Iterator[McapRecord]:

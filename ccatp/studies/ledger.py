@@ -22,6 +22,18 @@ from ccatp.studies.plan import WHOLE, Shard
 PATTERN = "jobs*.jsonl"
 
 
+def make_out(out: Path) -> None:
+    """Make a study's directory, before any work.
+
+    Raises:
+        CampaignError: it cannot be made.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CampaignError(f"--out: cannot make {out}: {error.strerror or error}; choose another --out") from error
+
+
 class Ledger:
     """The finished jobs in a directory.
 
@@ -31,12 +43,13 @@ class Ledger:
         others: directories whose jobs are taken over.
 
     Raises:
-        CampaignError: another campaign writes here, a directory does not exist, or a file holds what is no ledger.
+        CampaignError: ``out`` cannot be made, another campaign writes here, a directory does not exist, or a file holds
+            what is no ledger.
     """
 
     def __init__(self, out: Path, shard: Shard = WHOLE, others: Iterable[Path] = ()) -> None:
         """Open the shard's file and read all that is there."""
-        out.mkdir(parents=True, exist_ok=True)
+        make_out(out)
         name = "jobs.jsonl" if shard == WHOLE else f"jobs-{shard.number}of{shard.of}.jsonl"
         self._done: dict[str, tuple[str, Path, Outcome]] = {}
         self._took_s: dict[str, float] = {}

@@ -232,7 +232,7 @@ def test_another_kind_of_server(first: bytes, said: str, capsys: pytest.CaptureF
         (["host:70100"], "'host:70100' is not HOST:PORT"),
         (["127.0.0.1:7010", "--only", "ttl-drve"], "no check 'ttl-drve'; did you mean ttl-drive?"),
         (["127.0.0.1:7010", "--only", "zzz"], "no check 'zzz'; there are hello,"),
-        (["127.0.0.1:7010", "--timeout", "0"], "--timeout 0 is no time to wait"),
+        (["127.0.0.1:7010", "--timeout", "0"], "'--timeout': 0 is no time to wait"),
     ],
 )
 def test_usage(args: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

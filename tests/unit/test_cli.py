@@ -17,7 +17,9 @@ from ccatp.cli import cli, main
 from ccatp.commands.frame import parse_setting
 from ccatp.config.models import Config
 from ccatp.errors import ConfigError, UnreachableError
+from ccatp.package import configs_dir
 from ccatp.run_options import RunOptions
+from ccatp.runtime_dir import LOCK_FILE, TRUTH_LOCK_FILE, locked
 
 EMERGENCY_ID = "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"
 
@@ -120,6 +122,11 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
             "ccatp: --resume carries on in a run directory; name it with --run-dir; see ccatp run --help\n",
         ),
         (["sim", "etalon", "--puck", "1", "2", "3", "--truth", "ipc://x"], "--puck and --truth exclude each other"),
+        (["sim", "etalon", "--puck", "nan", "0", "0"], "each of X Y Z is a number of metres, at most 1000 from the"),
+        (["sim", "etalon", "--puck", "0", "0", "-inf"], "each of X Y Z is a number of metres"),
+        (["sim", "etalon", "--truth", "foo"], "'foo' is no endpoint; give ipc://PATH, as ccatp sim robot tells it"),
+        (["sim", "etalon", "--truth", "tcp://a"], "'tcp://a' is no endpoint"),
+        (["sim", "etalon", "--truth", "ipc://x", "--runtime-dir", "x"], "leave out --puck and --truth"),
         (["run", "--sim", "--miror", "x"], "Did you mean one of: '--mirror'"),
         (["run", "--sim", "--set", "seed"], "'seed' is not KEY=VALUE, as in run.seed=2"),
         (["run", "--sim", "--held"], "--held goes with --resume; --recover holds by itself"),
@@ -151,6 +158,17 @@ def test_misuse_is_one_line_and_exit_2(argv: list[str], message: str, capsys: py
     assert err.startswith("ccatp: ")
     assert err.count("\n") == 1
     assert not out
+
+
+@pytest.mark.parametrize("time_s", ["0", "-1", "nan", "inf", "1e300", "soon"])
+@pytest.mark.parametrize("command", [["status"], ["pause"], ["emergency", "fire"], ["conformance", "127.0.0.1:7010"]])
+def test_a_time_to_wait_is_finite_and_more_than_none(
+    command: list[str], time_s: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*command, "--timeout", time_s]) == 2
+    err = capsys.readouterr().err
+    assert f"'--timeout': {time_s} is no time to wait; give more than 0 s" in err
+    assert err.count("\n") == 1
 
 
 def test_no_command_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
@@ -287,13 +305,46 @@ def test_the_robot_alone_gets_its_address(stub: Stub) -> None:
     cfg, options = calls[0]
     assert isinstance(cfg, Config)
     assert (cfg.sim.robot.host, cfg.sim.robot.port, cfg.mirror.name, cfg.run.seed) == ("0.0.0.0", 0, "fyst-m2", 4)
-    assert options == {"lockstep": True, "faults": None}
+    assert options == {"lockstep": True, "faults": None, "runtime_dir": None}
 
 
 def test_the_robot_alone_is_paced_unless_told_otherwise(stub: Stub) -> None:
     calls = stub("ccatp.processes.dataloop", "run_alone", 0)
     assert main(["sim", "robot"]) == 0
-    assert calls[0][1] == {"lockstep": False, "faults": None}
+    assert calls[0][1] == {"lockstep": False, "faults": None, "runtime_dir": None}
+
+
+def test_two_robots_alone_want_two_places(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with locked(tmp_path / TRUTH_LOCK_FILE, ""):
+        tmp_path.chmod(0o700)
+        for command in (
+            ["sim", "robot", "--port", "0"],
+            ["sim", "robot", "--config", str(configs_dir() / "zigbee.toml")],
+        ):
+            assert main([*command, "--runtime-dir", str(tmp_path)]) == 1
+            err = capsys.readouterr().err
+            assert err.startswith(f"ccatp: another simulated robot has its truth in {tmp_path}; end it, or give this")
+            assert err.count("\n") == 1
+        assert main(["run", "--sim", "--runtime-dir", str(tmp_path)]) == 1
+        assert f"a simulated robot runs alone in {tmp_path}" in capsys.readouterr().err
+
+
+def test_the_laser_system_follows_the_robot_of_a_place(stub: Stub, tmp_path: Path) -> None:
+    calls = stub("ccatp.processes.etalon", "run_alone", 0)
+    assert main(["sim", "etalon", "--runtime-dir", str(tmp_path)]) == 0
+    assert calls[0][2] == f"ipc://{tmp_path}/puck"
+
+
+def test_a_daemon_that_is_gone_is_told_at_once(
+    daemon_dir: Path, router: Router, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calls = router({"ok": True})
+    with locked(daemon_dir / LOCK_FILE, ""):
+        assert main(["status"]) == 0
+    capsys.readouterr()
+    assert main(["status"]) == 5
+    assert capsys.readouterr().err.startswith(f"ccatp: no daemon in {daemon_dir}; start one")
+    assert len(calls) == 1
 
 
 def test_the_laser_system_alone_gets_its_puck(stub: Stub) -> None:

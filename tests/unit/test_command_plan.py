@@ -1,6 +1,7 @@
 """The command ``ccatp plan``: what it tells is what a run would do."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import pytest
 
 from ccatp.assembly import assemble
 from ccatp.cli import main
-from ccatp.config.loader import load_config
+from ccatp.config.loader import available, load_config
 
 NAMES = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
 
@@ -17,6 +18,17 @@ def planned(capsys: pytest.CaptureFixture[str], *args: str, status: int = 0) -> 
     assert main(["plan", "--json", *args]) == status
     result: dict[str, Any] = json.loads(capsys.readouterr().out)
     return result
+
+
+def test_every_shipped_world_is_named_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", "--help"]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert set(available("world")) <= set(re.split(r"[ ,]+", told))
+
+
+def test_one_panel_is_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", "--mirror", "fyst-m2", "--panels", "1"]) == 0
+    assert "fyst-m2: 9 points of 1 panel, order thesis\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -98,6 +110,12 @@ def test_the_figure_is_drawn(suffix: str, magic: bytes, tmp_path: Path) -> None:
     [
         (["--mirror", "fyst-m3"], "fyst-m3"),
         (["--panels", "-1"], "run.panels"),
+        (["--set", "limits.v_max_m_s=1e-300"], "limits.v_max_m_s = 1e-300 must be at least 0.001"),
+        (["--set", "limits.alpha_max_rad_s2=1e-300"], "limits.alpha_max_rad_s2 = 1e-300 must be at least 0.001"),
+        (
+            ["--panels", "1", "--set", "mirror.surface.normalisation_radius_mm=1e-300"],
+            "mirror.surface.normalisation_radius_mm = 1e-300 must be at least 100",
+        ),
         (["--figure", "nowhere/plan.png"], "--figure: no directory nowhere; make it first"),
         (["--panels", "1", "--figure", "plan.tiff7"], "plan.tiff7: cannot be written"),
     ],

@@ -85,11 +85,20 @@ def test_an_analysis_has_nothing_to_hand_out(
     assert f"study one has no runs to hand out; leave {surplus[0]} out" in capsys.readouterr().err
 
 
-def test_an_analysis_that_cannot_write_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("name", ["one", "toy"])
+def test_a_directory_that_cannot_be_is_one_line(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").touch()
-    assert main(["study", "one", "--out", str(tmp_path / "file/out")]) == 4
+    assert main(["study", name, "--out", str(tmp_path / "file/out")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.endswith("Not a directory; make room or choose another --out")
+    assert line.startswith(f"ccatp: --out: cannot make {tmp_path}/file/out: ")
+    assert line.endswith("choose another --out")
+
+
+def test_an_analysis_that_cannot_write_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "table.md").mkdir()
+    assert main(["study", "one", "--out", str(tmp_path)]) == 4
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("Is a directory; make room or choose another --out")
 
 
 def test_an_unknown_study_is_one_line(

@@ -1,6 +1,7 @@
 """What can be wrong before a run begins, and the process table."""
 
 import socket
+from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -9,7 +10,8 @@ import pytest
 from ccatp.config.loader import load_config
 from ccatp.errors import ConfigError, RefusedError
 from ccatp.run_options import RunOptions
-from ccatp.supervisor import PROCESSES, _lock, _make_run_dir, _recover, run_survey
+from ccatp.runtime_dir import is_deserted
+from ccatp.supervisor import PROCESSES, _lock, _make_run_dir, _recover, _take, run_survey
 
 
 def options(**fields: object) -> RunOptions:
@@ -58,6 +60,21 @@ def test_one_daemon_in_a_runtime_directory(tmp_path: Path) -> None:
             pass
     with _lock(path, "--runtime-dir"):
         pass
+
+
+def test_the_sockets_go_with_the_daemon(tmp_path: Path) -> None:
+    for is_sim, left in ((False, {"puck", "main2", "truth"}), (True, {"main2"})):
+        with ExitStack() as stack:
+            _take(stack, tmp_path, is_sim=is_sim)
+            for name in ("control", "puck", "truth", "main2"):
+                with socket.socket(socket.AF_UNIX) as made:
+                    (tmp_path / name).unlink(missing_ok=True)
+                    made.bind(str(tmp_path / name))
+            (tmp_path / "main").write_text("no socket")
+            assert not is_deserted(tmp_path)
+        assert {path.name for path in tmp_path.iterdir() if path.is_socket()} == left
+        assert is_deserted(tmp_path)
+        assert (tmp_path / "main").read_text() == "no socket"
 
 
 def test_a_list_of_clients_that_cannot_be_used_is_refused_before_anything_is_made(tmp_path: Path) -> None:

@@ -82,6 +82,16 @@ def test_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert by_name(probe_machine(cfg, tmp_path, tmp_path / "rt", {}))["disk writes"].outcome is Outcome.FAIL
 
 
+def test_no_run_can_be_written_there(tmp_path: Path) -> None:
+    cfg = load_config()
+    (tmp_path / "file").touch()
+    for where, told in (("file", "is no directory"), ("file/runs", "no directory"), ("nowhere/runs", "no directory")):
+        found = by_name(probe_machine(cfg, tmp_path / where, tmp_path / "rt", {}))
+        assert found["disk"].outcome is Outcome.FAIL
+        assert told in found["disk"].found
+        assert "disk space" not in found
+
+
 def test_a_daemon_that_runs_is_told(tmp_path: Path) -> None:
     cfg = load_config()
     (tmp_path / "rt").mkdir(mode=0o700)

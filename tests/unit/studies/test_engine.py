@@ -123,8 +123,9 @@ def test_a_worker_that_dies_ends_the_campaign(tmp_path: Path, monkeypatch: pytes
 @pytest.mark.parametrize("out", ["file/out", "file"])
 def test_a_directory_that_cannot_be_written_is_one_line(tmp_path: Path, out: str) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(CampaignFailed, match=r"file.*: (Not a directory|File exists); make room or choose another --o"):
+    with pytest.raises(CampaignError, match=r"file.*: (Not a directory|File exists); choose another --out") as refused:
         campaign(tmp_path / out)
+    assert refused.value.exit_status == 2
 
 
 def test_a_cluster_that_does_not_answer_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
