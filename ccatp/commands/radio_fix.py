@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from math import hypot
+from math import hypot, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 REGION = 0.9
 _CLEARLY = 6.9  # of log-likelihood: a thousand to one
+_LARGEST_M = 1e4  # of coordinates: levels reach no further than that
+_MOST_POINTS = 250_000  # of the grid: a few megabytes for each beacon
 _NEAREST_M = 0.1  # nearer than this the log-distance model is not believed
 
 
@@ -50,11 +52,11 @@ def fix(
     from ccatp.radio.level_fix import LevelLocator
     from ccatp.radio_data.levels import read_places
 
-    places_m = dict(_beacon(text) for text in beacons)
+    places_m = _beacons(beacons)
     if len(places_m) < 2:
         raise CalibrateError("--beacon: give the place of two beacons at least, as --beacon A=0,0 --beacon B=0,4")
-    table = _exchanged(read_places(path, sheet), exchange)
     area = _room(room, places_m, spacing_m)
+    table = _exchanged(read_places(path, sheet), exchange)
     fits, leave_out = _fits(path, fingerprints, path_loss, places_m, sheet)
     locator = LevelLocator(places_m, fits(None), area)
     warnings = [*table.warnings, *([] if leave_out else _names_doubt(locator, table))]
@@ -76,32 +78,66 @@ def fix(
     return 0
 
 
+def _beacons(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+    places_m: dict[str, tuple[float, float]] = {}
+    for text in texts:
+        name, place_m = _beacon(text)
+        if name in places_m:
+            raise CalibrateError(f"--beacon {text}: {name} was given before; each beacon has one place")
+        places_m[name] = place_m
+    return places_m
+
+
 def _beacon(text: str) -> tuple[str, tuple[float, float]]:
     name, _, place = text.partition("=")
     try:
         x_m, y_m = (float(part) for part in place.split(","))
     except ValueError as error:
         raise CalibrateError(f"--beacon {text}: is not NAME=X,Y in metres, as in A=0,4") from error
-    return name.strip(), (x_m, y_m)
+    if not (name := name.strip()):
+        raise CalibrateError(f"--beacon {text}: has no name; it is NAME=X,Y in metres, as in A=0,4")
+    _check_reach(f"--beacon {text}", (x_m, y_m))
+    return name, (x_m, y_m)
+
+
+def _check_reach(option: str, values_m: Sequence[float]) -> None:
+    if not all(isfinite(value) and abs(value) <= _LARGEST_M for value in values_m):
+        raise CalibrateError(f"{option}: coordinates must be numbers within ±{_LARGEST_M:g} m")
 
 
 def _room(text: str | None, places_m: dict[str, tuple[float, float]], spacing_m: float) -> "Room":
     """The given room, or the rectangle round the beacons and a quarter of its longer side more."""
     from ccatp.radio.level_fix import Room
 
-    if spacing_m <= 0.0:
-        raise CalibrateError(f"--spacing {spacing_m:g}: must be positive")
+    x0, y0, x1, y1 = _sides(text, places_m)
+    longest_m, most = max(x1 - x0, y1 - y0), _MOST_POINTS
+    if not 0.0 < spacing_m <= longest_m:
+        raise CalibrateError(
+            f"--spacing {spacing_m:g}: must be above 0 and at most the room's longer side {longest_m:g} m"
+        )
+    if ((x1 - x0) / spacing_m + 1.0) * ((y1 - y0) / spacing_m + 1.0) > most:
+        raise CalibrateError(
+            f"--spacing {spacing_m:g}: makes more than {most} points in a room of {x1 - x0:g} by {y1 - y0:g} m; "
+            f"give {longest_m / (most**0.5 - 1.0):.2g} m or more, or a smaller --room"
+        )
+    return Room((x0, y0), (x1, y1), spacing_m)
+
+
+def _sides(text: str | None, places_m: dict[str, tuple[float, float]]) -> tuple[float, float, float, float]:
     if text is None:
         xs, ys = zip(*places_m.values(), strict=True)
+        if len(set(places_m.values())) == 1:
+            raise CalibrateError("--beacon: all stand at one place, which bounds no room; give --room X0,Y0,X1,Y1")
         margin_m = 0.25 * max(max(xs) - min(xs), max(ys) - min(ys))
-        return Room((min(xs) - margin_m, min(ys) - margin_m), (max(xs) + margin_m, max(ys) + margin_m), spacing_m)
+        return min(xs) - margin_m, min(ys) - margin_m, max(xs) + margin_m, max(ys) + margin_m
     try:
         x0, y0, x1, y1 = (float(part) for part in text.split(","))
     except ValueError as error:
         raise CalibrateError(f"--room {text}: is not X0,Y0,X1,Y1 in metres") from error
+    _check_reach(f"--room {text}", (x0, y0, x1, y1))
     if x1 <= x0 or y1 <= y0:
         raise CalibrateError(f"--room {text}: its second corner must be above and to the right of its first")
-    return Room((x0, y0), (x1, y1), spacing_m)
+    return x0, y0, x1, y1
 
 
 def _exchanged(table: "PlaceTable", exchange: str | None) -> "PlaceTable":

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from math import isfinite
 from pathlib import Path
 
 import click
@@ -26,6 +27,9 @@ def fuzzy(
     from ccatp.config.radio_loader import load_radio_config
     from ccatp.control.fuzzy import FuzzyGapError, Sugeno
 
+    for distance_m, error_rad in at:
+        if not (isfinite(distance_m) and isfinite(error_rad) and distance_m >= 0.0):
+            raise CalibrateError(f"--at {distance_m:g} {error_rad:g}: wants a distance >= 0 m and a finite angle, rad")
     cfg = load_radio_config(config_file, settings).control.fuzzy
     try:
         sugeno = Sugeno(cfg)

@@ -21,7 +21,7 @@ FILTERS = ("ekf-slam", "smoother")
 
 
 class SlamCommandError(CcatpError):
-    """A result that cannot be written, or a part that is not installed."""
+    """A result that cannot be written, a part that is not installed, or data of which an estimator makes nothing."""
 
     exit_status = ExitStatus.USAGE
 
@@ -99,7 +99,24 @@ def _side_by_side(run: "RecordedRun", assumed: "RecordingsConfig") -> list[dict[
 
 
 def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) -> "Track":
-    """A run through one of ``FILTERS``."""
+    """A run through one of ``FILTERS``.
+
+    Raises:
+        SlamCommandError: the data drove the estimator beyond finite numbers, or leave it without an answer.
+    """
+    from numpy.linalg import LinAlgError
+
+    from ccatp.filters.base import FilterError
+
+    try:
+        return _estimated(run, assumed, filter_name)
+    except (FilterError, LinAlgError) as error:
+        raise SlamCommandError(
+            f"{run.name}: {filter_name} finds no finite map for these data ({str(error)[:80]}); look at its warnings"
+        ) from error
+
+
+def _estimated(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) -> "Track":
     from time import perf_counter
 
     from ccatp.config.recording_models import RecordingConfig

@@ -62,7 +62,7 @@ def read_events_csv(file: Path) -> RecordedRun:
         steps=steps,
         readings=readings,
         beacon_ids=heard_ids,
-        beacon_truth_m={} if surveyed is None else {beacon_ids[int(i)]: (x, y) for i, x, y in surveyed.values.tolist()},
+        beacon_truth_m=_surveyed(surveyed, beacon_ids),
         truth=truth,
         first_pose=pose_of_truth(truth, steps, warnings),
         warnings=tuple(warnings),
@@ -91,6 +91,8 @@ def _row(file: Path, line: int, kind: str, words: Sequence[str], names: dict[str
     least = sum(not column.startswith("(") for column in columns)
     if not least <= len(words) <= len(columns):
         raise RadioDataError(file, f"{len(words)} values after {kind}, wanted {', '.join(columns)}", line)
+    if "beacon" in columns and not words[columns.index("beacon")]:
+        raise RadioDataError(file, f"{kind} has no name of a beacon", line)
     values = [
         names.setdefault(word, float(len(names)))
         if column == "beacon"
@@ -99,6 +101,18 @@ def _row(file: Path, line: int, kind: str, words: Sequence[str], names: dict[str
     ]
     missing = 0.0 if kind == "odom" else np.nan  # no travel sideways; heading unknown
     return values + [missing] * (len(columns) - len(values))
+
+
+def _surveyed(table: Table | None, beacon_ids: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Places by name; a beacon that is told twice must stand at the same place."""
+    places: dict[str, tuple[float, float]] = {}
+    if table is None:
+        return places
+    for line, (index, x_m, y_m) in zip(table.lines.tolist(), table.values.tolist(), strict=True):
+        name = beacon_ids[int(index)]
+        if places.setdefault(name, (x_m, y_m)) != (x_m, y_m):
+            raise RadioDataError(table.file, f"beacon {name} was surveyed at another place before", line)
+    return places
 
 
 def _steps(odometry: Table) -> Steps:

@@ -4,7 +4,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ccatp.radio.recording import RecordedRun
+from ccatp.radio_data.bounds import bounded
 from ccatp.radio_data.checks import suspicions
 from ccatp.radio_data.errors import RadioDataError
 from ccatp.radio_data.events_csv import is_events_csv, read_events_csv
@@ -32,17 +35,21 @@ def read_run(path: Path, data_format: str | None, robot: int | None) -> Recorded
     data_format = data_format or found_format(path)
     if robot is not None and data_format != "mrclam":
         raise RadioDataError(path, f"a {data_format} set has one vehicle: leave out --robot")
-    if data_format == "mrclam":
-        run = read_mrclam(path, robot)
-    elif data_format == "plaza":
-        run = read_plaza(path)
-    elif data_format == "labyrinth":
-        run = read_labyrinth(path)
-    else:
-        if path.is_dir():
-            raise RadioDataError(path, "is a folder: name the CSV file in it")
-        run = read_events_csv(path)
+    with np.errstate(all="ignore"):  # numbers that overflow are refused below
+        run = bounded(_read(path, data_format, robot), path)
     return replace(run, warnings=(*run.warnings, *suspicions(run)))
+
+
+def _read(path: Path, data_format: str, robot: int | None) -> RecordedRun:
+    if data_format == "mrclam":
+        return read_mrclam(path, robot)
+    if data_format == "plaza":
+        return read_plaza(path)
+    if data_format == "labyrinth":
+        return read_labyrinth(path)
+    if path.is_dir():
+        raise RadioDataError(path, "is a folder: name the CSV file in it")
+    return read_events_csv(path)
 
 
 def robots_of(path: Path) -> list[int | None]:

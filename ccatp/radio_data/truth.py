@@ -8,6 +8,8 @@ from ccatp.radio.recording import Steps, Truth, dead_reckoned
 FloatArray = npt.NDArray[np.float64]
 CHORD_M = 0.2
 """Travel over which a course is told from positions: well above the centimetres of GNSS and camera references."""
+LONGEST_WAY_M = 1e6
+"""Longer ways are no vehicle's; they are not cut into chords."""
 AGREEMENT = 0.8
 """Length of the mean vector of (course - heading) above which the two differ by a constant."""
 LARGEST_SIDESLIP_RAD = 0.3
@@ -39,7 +41,7 @@ def chords(truth: Truth, steps: Steps) -> npt.NDArray[np.int64]:
     inside = (truth.times_s >= steps.times_s[0]) & (truth.times_s <= steps.times_s[-1])
     rows = np.flatnonzero(inside)
     way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(truth.x_m[rows]), np.diff(truth.y_m[rows])))])
-    if not rows.size or way[-1] < CHORD_M:
+    if not rows.size or not CHORD_M <= way[-1] <= LONGEST_WAY_M:
         return rows[:0]
     marks = np.arange(0.0, way[-1], CHORD_M)
     return np.asarray(rows[np.unique(np.minimum(np.searchsorted(way, marks), rows.size - 1))])

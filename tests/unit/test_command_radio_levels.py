@@ -54,6 +54,14 @@ def test_fuzzy_tells_the_speed_at_a_point(capsys: pytest.CaptureFixture[str]) ->
     assert "no rule of the fuzzy controller fires" in err
 
 
+@pytest.mark.parametrize("at", [("nan", "0.5"), ("-3", "0.5"), ("1", "inf"), ("inf", "0")])
+def test_fuzzy_refuses_what_is_no_point(at: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = said(capsys, "radio", "fuzzy", "--at", *at)
+    assert (status, out) == (2, "")
+    assert "wants a distance >= 0 m and a finite angle" in err
+    assert err.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
@@ -61,6 +69,7 @@ def test_fuzzy_tells_the_speed_at_a_point(capsys: pytest.CaptureFixture[str]) ->
         (("radio", "fix", "nowhere.csv"), "give the place of two beacons"),
         (("radio", "fix", "nowhere.csv", "--beacon", "A"), "is not NAME=X,Y"),
         (("radio", "fix", "nowhere.csv", *BEACONS), "no such file"),
+        (("radio", "fix", "nowhere.csv", "--beacon", "A=0,0", "--beacon", "B=0,0"), "which bounds no room"),
     ],
 )
 def test_bad_input_is_one_line(argv: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -87,7 +96,13 @@ def places(folder: Path) -> Path:
         ((), "give either --fingerprints or --path-loss"),
         (("--room", "1,2"), "is not X0,Y0,X1,Y1"),
         (("--room", "1,2,0,3"), "its second corner"),
-        (("--spacing", "0"), "must be positive"),
+        (("--room", "0,0,1,inf"), "must be numbers within"),
+        (("--spacing", "0"), "must be above 0 and at most the room's longer side 6 m"),
+        (("--spacing", "nan"), "must be above 0"),
+        (("--spacing", "1e-4"), "more than 250000 points in a room of 6 by 6 m; give 0.012 m or more"),
+        (("--beacon", "A=1,1"), "A was given before"),
+        (("--beacon", "D=nan,0"), "--beacon D=nan,0: coordinates must be numbers"),
+        (("--beacon", "=1,0"), "--beacon =1,0: has no name"),
         (("--exchange", "A,Z"), "is not two beacons of the data, which has A, B, C"),
     ],
 )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ccatp.cli import main
+from ccatp.filters import FilterDiverged
 from tests.unit.radio_data.sets import BEACONS, csv_lines, world, write_lines, write_mrclam, write_plaza
 
 CONTRACT = {
@@ -113,3 +114,15 @@ def test_a_picture_without_matplotlib(
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     assert main(["radio", "slam", str(recording), "--figure", str(tmp_path / "map.png")]) == 2
     assert "ccatp[plots]" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("error", [FilterDiverged("prediction is not finite"), np.linalg.LinAlgError("singular")])
+def test_an_estimator_that_finds_nothing(
+    recording: Path, error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def diverging(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("ccatp.radio.causal.filter_run", diverging)
+    assert main(["radio", "slam", str(recording)]) == 2
+    assert f"mine: ekf-slam finds no finite map for these data ({error})" in capsys.readouterr().err.splitlines()[-1]

@@ -24,6 +24,8 @@ SURE_MARGIN = 8.0
 """Half a chi-squared by which a beacon's best place must beat the next one before it joins."""
 LEAST_READINGS = 4
 """Of a beacon that joins without bearings."""
+LEAST_WAY_M = 0.01
+"""Between the places of a beacon's readings without bearings: from a single place it may lie anywhere on a circle."""
 SURE_SPREAD = 0.15
 """Largest standard deviation of a beacon that joins, over its distance."""
 
@@ -121,6 +123,8 @@ def _join(
             continue
         # one that is surely placed is looked at again at the end, by all readings
         if rows.size < LEAST_READINGS or (used[beacon] and not doubtful[beacon] and not last):
+            continue
+        if np.ptp(state.poses[problem.at[rows], :2], axis=0).max() < LEAST_WAY_M:
             continue
         distance, variance = problem.distances(state, rows)
         found = place_by_distances(state.poses[problem.at[rows]], distance, variance)

@@ -148,7 +148,7 @@ def _warnings(run: RecordedRun, start: Start, converged: bool) -> tuple[str, ...
     lines = []
     for k, name in enumerate(run.beacon_ids):
         if not start.used[k]:
-            lines.append(f"beacon {name} could not be placed: too few readings of it")
+            lines.append(f"beacon {name} could not be placed: too few readings of it, or all from one place")
         elif start.doubtful[k]:
             lines.append(f"beacon {name} may lie at its mirror image: the path tells too little of its side")
     if not converged:

@@ -158,6 +158,17 @@ FAULTS: list[tuple[Make, str | None, str]] = [
         _text("odom,0,0,0", "odom,1,0,0", "odom,2,0,0", "range,9,a,1"), None,
         r"nothing was heard of beacons within the time of the odometry",
     ),
+    (_with("range,1,,3"), None, rf"mine\.csv:{LAST}: range has no name of a beacon"),
+    (_with("beacon,6,9,9"), None, rf"mine\.csv:{LAST}: beacon 6 was surveyed at another place before"),
+    (_with("odom,20.5,1e300,0"), None, r"a step forward of 1e\+300 m at 20\.5 s cannot be; at most 1000 is taken"),
+    (_with("odom,20.5,0,0,-1e300"), None, r"a step to the left of -1e\+300 m at 20\.5 s cannot be"),
+    (_with("odom,20.5,0,1e200"), None, r"a turn of 1e\+200 rad at 20\.5 s cannot be"),
+    (_with("odom,1e300,0,0"), None, r"time of odometry of 1e\+300 s after its first row cannot be"),
+    (_with("truth,20.5,1e200,0,0"), None, r"truth: x of 1e\+200 m at 20\.5 s cannot be"),
+    (
+        _text("odom,0,0,0", "odom,1,0,0", "odom,2,0,0", "range,1,a,1e200"), None,
+        r"none of its readings can be \(1 range beyond 1e\+06 m",
+    ),
 ]  # fmt: skip
 
 
@@ -178,3 +189,18 @@ def test_a_robot_that_is_not_there(tmp_path: Path) -> None:
 def test_a_robot_of_a_set_with_one_vehicle(tmp_path: Path) -> None:
     with pytest.raises(RadioDataError, match=r"a plaza set has one vehicle: leave out --robot"):
         read_run(write_plaza(tmp_path, W), None, 1)
+
+
+def test_readings_that_cannot_be_are_left_out(tmp_path: Path) -> None:
+    lines = ["range,1.01,6,1e200", "rssi,1.02,6,-1e9", "bearing,1.03,6,inf", "range,1.04,7,2.5", "bearing,1.04,7,1e9"]
+    run = read_run(write_lines(tmp_path / "mine.csv", [*csv_lines(W), *lines, "beacon,far,1e200,0"]), None, None)
+    assert len(run.readings.times_s) == len(W.read_s) + 1
+    assert "far" not in run.beacon_truth_m
+    told = " ".join(run.warnings)
+    for words in (
+        "1 range beyond 1e+06 m, the first 1e+200 m at 1.01 s",
+        "1 signal strength beyond",
+        "1 bearing beyond",
+    ):
+        assert words in told
+    assert "surveyed place of far: is no place" in told

@@ -174,8 +174,21 @@ def test_a_beacon_with_too_few_readings_is_told() -> None:
     run = run_of(10, bearings=False)
     keep = (run.readings.beacon != 2) | (np.arange(len(run.readings.times_s)) < 8)
     track = smooth(replace(run, readings=run.readings.where(keep)), SETTINGS, no_clock)
-    assert "beacon 8 could not be placed: too few readings of it" in track.warnings
+    assert "beacon 8 could not be placed: too few readings of it, or all from one place" in track.warnings
     assert set(track.beacons) == {"6", "7", "9"}
+
+
+@pytest.mark.parametrize("range_m", [0.0, 3.0])
+def test_a_robot_that_stands_places_no_beacon(range_m: float) -> None:
+    w = world(10, 20.0)
+    n = w.distance_m.size
+    stood = changed(
+        w, poses=np.zeros((n + 1, 3)), distance_m=np.zeros(n), turn_rad=np.zeros(n), range_m=0.0 * w.range_m + range_m
+    )
+    track = smooth(recorded(stood, bearings=False), SETTINGS, no_clock)
+    assert track.beacons == {}
+    assert np.isfinite(track.covariances).all()
+    assert sum("or all from one place" in warning for warning in track.warnings) == len(BEACONS)
 
 
 def test_mirror_images_of_a_straight_path_cost_the_same() -> None:
