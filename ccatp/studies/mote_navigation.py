@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ccatp.studies.beacon_rehearsal import rehearse_beacons
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
@@ -96,7 +96,7 @@ def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
 def band(runs: int) -> tuple[float, float]:
     """Where the mean NEES of so many poses lies in 95 of 100 cases, for each degree of freedom."""
     dof = _STATES * runs
-    low, high = (float(chi2.ppf(at, dof)) / dof for at in (0.5 - _BAND / 2, 0.5 + _BAND / 2))
+    low, high = (float(chdtri(dof, at)) / dof for at in (0.5 + _BAND / 2, 0.5 - _BAND / 2))
     return low, high
 
 
