@@ -11,11 +11,15 @@ from tomlkit.exceptions import TOMLKitError
 
 from ccatp.errors import ConfigError
 
+# In comments: a stand-in value, and what takes its place.
+UNVERIFIED, MEASURED = "UNVERIFIED", "measured by ccatp calibrate"
+
 
 def with_values(text: str, values: Mapping[str, float], file: Path) -> str:
     """The text with other values of some keys.
 
-    A key that is there keeps its comment; one that is not is added to its section.
+    A key that is there keeps its comment, but for the mark of values that nobody has measured; one that is not is
+    added to its section.
 
     Args:
         text: TOML.
@@ -37,6 +41,8 @@ def with_values(text: str, values: Mapping[str, float], file: Path) -> str:
             if not isinstance(table, dict):
                 raise ConfigError(f"{file}: {section} is a value, not a section; {dotted} cannot be set there")
             table[key] = value
+            trivia = table[key].trivia
+            trivia.comment = trivia.comment.replace(UNVERIFIED, MEASURED)
         return tomlkit.dumps(document)
     except TOMLKitError as error:
         raise ConfigError(f"{file}: is not TOML: {error}") from error

@@ -39,7 +39,8 @@ def status_rows(status: Mapping[str, Any]) -> list[tuple[str, str]]:
     elapsed_s, eta_s = float(status.get("elapsed_s", 0.0)), float(status.get("eta_s", 0.0))
     bound_s = float(status.get("lower_bound_s", 0.0))
     rows.append(("time", f"{clock(elapsed_s)} elapsed, {clock(eta_s)} to go, no path takes less than {clock(bound_s)}"))
-    rows.append(("arrival", f"{float(status.get('error_mm', 0.0)):.2f} mm from the last point, as estimated"))
+    error_mm = float(status.get("error_mm", 0.0))  # exactly zero before the first arrival
+    rows.append(("arrival", f"{error_mm:.2f} mm from the last point, as estimated" if error_mm else "none yet"))
     code = int(status.get("code", 0))
     rows.append(("danger", f"{code} {CODES.get(code, '')}".strip()))
     if slips := int(status.get("slips", 0)):

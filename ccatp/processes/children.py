@@ -17,6 +17,8 @@ from ccatp.wire.topics import Presence
 # The matrices are 4 x 4: threads of the linear algebra would only fight the processes for the cores.
 ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 STOP_TIMEOUT_S = 4.0
+# Whoever comes last has this long, even where others have used up the time.
+LEAST_STOP_S = 1.0
 # A loop that was started anew joins within this.
 RECOVERY_S = 5.0
 Say = Callable[[str, str], None]
@@ -164,7 +166,7 @@ class Children:
                 continue
             process.terminate()
             try:
-                process.wait(max(deadline_s - time.monotonic(), 0.0))
+                process.wait(max(deadline_s - time.monotonic(), LEAST_STOP_S))
             except subprocess.TimeoutExpired:
                 self._say("error", f"process {name} did not stop within {STOP_TIMEOUT_S:g} s and was killed")
                 process.kill()

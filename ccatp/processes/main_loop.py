@@ -19,6 +19,7 @@ from ccatp.processes.common import (
     parse_either,
     report,
     stop_on_signals,
+    unless_stopped,
 )
 from ccatp.processes.frame_clock import FrameClock
 from ccatp.processes.frame_service import FrameService
@@ -118,7 +119,8 @@ class MainLoop:
     # -- beginning and end ----------------------------------------------------------------------------------------
 
     async def _join(self, stop: asyncio.Event) -> None:
-        await self._work.connect()
+        if not await unless_stopped(stop, self._work.connect()):
+            return
         self._pulse.phase = "ready"
         publisher = self._publisher
         while not (

@@ -47,7 +47,7 @@ class RunView:
         self._has_pose = False
         self._told_tenths = 0
         self._goals = goals
-        self._console.print(f"{title}; writing {run_dir}")
+        self._console.print(f"{title}; writing {run_dir}", soft_wrap=True, markup=False)
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -96,7 +96,8 @@ class RunView:
     def text_of(self, status: MissionStatus) -> str:
         """State, place, times, error."""
         times = f"{_clock(status.elapsed_s)} elapsed, {_clock(status.eta_s)} to go"
-        return f"{status.state} {status.point}  {times}, arrival {status.error_mm:.2f} mm"
+        arrival = f", arrival {status.error_mm:.2f} mm" if status.error_mm else ""
+        return f"{_where(status.state, status.point)}, {times}{arrival}"
 
     def show_summary(self, summary: dict[str, Any], *, as_json: bool) -> None:
         """The end: JSON alone on standard output, or a table."""
@@ -125,8 +126,12 @@ class BeaconView(RunView):
     def text_of(self, status: MissionStatus) -> str:
         """State, place, time, uncertainty."""
         cause = f" ({status.cause})" if status.cause else ""
-        where = f"{status.state}{cause} {status.point}  {_clock(status.elapsed_s)} elapsed"
+        where = f"{_where(status.state + cause, status.point)}, {_clock(status.elapsed_s)} elapsed"
         return f"{where}, position known to {0.1 * status.error_mm:.1f} cm"
+
+
+def _where(state: str, point: str) -> str:
+    return f"{state} {point}" if point else state
 
 
 def _clock(seconds: float) -> str:

@@ -43,6 +43,13 @@ class SurveyWatch:
             self._vigil.over()
         teller.log.debug("state", seq=seq, before=before, after=mission.state, cause=mission.cause)
         if mission.state in (State.HELD, State.BACKING_OFF) or before is State.HELD:
-            teller.say("warning", f"{mission.state}: {mission.cause}" if mission.cause else f"{mission.state}")
+            teller.say("warning", state_text(mission.state, mission.cause))
         if mission.state is State.RETURNING and before is not State.BACKING_OFF:
             teller.say("warning", f"returning to base: {mission.cause}")
+
+
+def state_text(state: State, cause: str) -> str:
+    """What is said of the state in which a mission is held, or of the one after that."""
+    if cause:
+        return f"{state}: {cause}"
+    return f"{state}" if state in (State.HELD, State.BACKING_OFF, State.DONE) else f"going on: {state}"

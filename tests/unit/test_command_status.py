@@ -35,6 +35,7 @@ def test_the_table() -> None:
         ("arrival", "0.05 mm from the last point, as estimated"),
         ("danger", "0 normal"),
     ]
+    assert dict(status_rows({**STATUS, "error_mm": 0.0}))["arrival"] == "none yet"
     held = {**STATUS, "state": "held", "point": "", "cause": "operator", "code": 2, "slips": 4, "lag_ms": 31.0}
     held |= {"left_out": {"out of time": ["1-2-3", "1-2-4"]}, "exit_status": 4, "outcome": "stopped"}
     found = dict(status_rows(held))

@@ -24,6 +24,12 @@ def test_only_the_value_changes() -> None:
     assert after == TEXT.replace("seed = 3      # three", "seed = 4.5      # three")
 
 
+def test_what_is_measured_is_unverified_no_more() -> None:
+    text = "[robot]\na_m = 0.03  # UNVERIFIED; 1 % wrong\nb_m = 0.1  # UNVERIFIED\n"
+    after = with_values(text, {"robot.a_m": 0.031}, Path("x.toml"))
+    assert after == text.replace("0.03  # UNVERIFIED", "0.031  # measured by ccatp calibrate")
+
+
 def test_new_keys_and_sections_are_added() -> None:
     after = with_values(TEXT, {"robot.wheel_base_m": 0.151, "a.b": 1.0}, Path("x.toml"))
     assert after == TEXT + "wheel_base_m = 0.151\n\n[a]\nb = 1.0\n"

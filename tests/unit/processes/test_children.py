@@ -65,3 +65,16 @@ def test_it_is_nicer_than_its_parent_from_the_start(config: Config, monkeypatch:
     own = os.getpriority(os.PRIO_PROCESS, 0)
     assert os.getpriority(os.PRIO_PROCESS, found.process.pid) == min(own + 7, 19)
     children.kill_all()
+
+
+@pytest.mark.usefixtures("child")
+def test_the_last_to_be_stopped_has_its_time(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    monkeypatch.setenv("STATUS", "0")
+    monkeypatch.setattr("ccatp.processes.children.STOP_TIMEOUT_S", 0.0)  # others have used it up
+    monkeypatch.setattr("ccatp.processes.children.LEAST_STOP_S", 30.0)
+    children = Children(config.run, lambda _spec, _is_restarted: ([], ()), lambda _level, text: said.append(text))
+    children.start(SPEC)
+    children.stop_all()
+    children.kill_all()
+    assert said == []
