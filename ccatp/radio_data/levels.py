@@ -138,7 +138,7 @@ def _read_folder(folder: Path, sheet: str | None, points: Path | None) -> LevelT
 def _read_rows(path: Path, sheet: str | None) -> tuple[str, list[list[str]]]:
     """Name and rows, the head first."""
     if path.suffix.lower() != ".xlsx":
-        text = read_text(path)
+        text = read_text(path, "a CSV file or an .xlsx workbook with columns of levels")
         lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
         delimiter = next((mark for mark in ",;\t" if lines and mark in lines[0]), None)
         rows = list(csv.reader(lines, delimiter=delimiter)) if delimiter else [line.split() for line in lines]

@@ -65,15 +65,19 @@ def _with_reference(run: RecordedRun) -> RecordedRun:
     return replace(run, truth=None, warnings=(*run.warnings, told))
 
 
-def robots_of(path: Path) -> list[int | None]:
+def robots_of(path: Path, data_format: str | None = None) -> list[int | None]:
     """The robots of a set: numbers if it has several, ``[None]`` for the only one.
+
+    Args:
+        path: file or folder of the data set.
+        data_format: one of ``FORMATS``; found out from the files if ``None``.
 
     Raises:
         RadioDataError: there is no such set.
     """
     if not path.exists():
         raise RadioDataError(path, "no such file or folder")
-    return [*robots_in(path)] if path.is_dir() and found_format(path) == "mrclam" else [None]
+    return [*robots_in(path)] if path.is_dir() and (data_format or found_format(path)) == "mrclam" else [None]
 
 
 def found_format(path: Path) -> str:
