@@ -12,6 +12,7 @@ import pytest
 
 from ccatp.beacon_file import BeaconFileError, read_beacons, write_beacons
 from ccatp.cli import main
+from ccatp.radio.range_network import MappingError
 from ccatp.range_csv import read_places, read_ranges
 from tests.unit.radio.fields import ALL, HEADS
 
@@ -259,6 +260,12 @@ def test_a_truth_of_too_few_coordinates(tmp_path: Path, capsys: pytest.CaptureFi
         "cricket.random.size_m=[1,1,1]",
     )
     assert "--truth: M0 has 2 coordinates, wanted 3" in shown
+
+
+def test_a_place_that_is_none(tmp_path: Path) -> None:
+    (tmp_path / "p.csv").write_text("name,x_m,y_m\nM0,0,0\nM1,nan,0\n")
+    with pytest.raises(MappingError, match=r"p\.csv:3: x_m = nan is no place within 1e\+06 m"):
+        read_places(tmp_path / "p.csv")
 
 
 def test_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
