@@ -87,6 +87,14 @@ def test_what_is_no_text_is_told_what_calibrates(tmp_path: Path, capsys: pytest.
     assert "is not text; give a CSV file or an .xlsx workbook with columns of levels" in err
 
 
+@pytest.mark.parametrize("level", ["nan", "-1e300"])
+def test_levels_that_are_none(tmp_path: Path, level: str, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "k.csv").write_text(f"distance_m,rssi_dbm\n1,-40\n2,{level}\n3,-60\n4,-62\n")
+    status, _, err = said(capsys, "radio", "calibrate", tmp_path / "k.csv")
+    assert status == 2
+    assert f"k.csv:3: {level.replace('e3', 'e+3')} in column 2 is no level" in err
+
+
 def test_compare_takes_the_format_that_its_hint_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "name it with --format" in said(capsys, "radio", "compare", tmp_path)[2]
     status, _, err = said(capsys, "radio", "compare", tmp_path, "--format", "labyrinth")
