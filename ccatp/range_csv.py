@@ -63,7 +63,7 @@ def read_places(path: Path) -> dict[str, tuple[float, ...]]:
         raise RangeFileError(f"{path}:1: columns {','.join(header)}; wanted {','.join(PLACES)}[,z_m]")
     axes = [axis for axis in ("x_m", "y_m", "z_m") if axis in header]
     return {
-        _name(path, line, "name", row["name"]): tuple(_number(path, line, axis, row[axis]) for axis in axes)
+        _name(path, line, "name", row["name"]): tuple(_coordinate(path, line, axis, row[axis]) for axis in axes)
         for line, row in rows
     }
 
@@ -108,6 +108,12 @@ def _number(path: Path, line: int, key: str, text: str) -> float:
         return float(text)
     except ValueError:
         raise RangeFileError(f"{path}:{line}: {key} = {text!r} is no number") from None
+
+
+def _coordinate(path: Path, line: int, key: str, text: str) -> float:
+    if not abs(value_m := _number(path, line, key, text)) <= LONGEST_M:
+        raise RangeFileError(f"{path}:{line}: {key} = {value_m:g} is no place within {LONGEST_M:g} m")
+    return value_m
 
 
 def _name(path: Path, line: int, key: str, text: str) -> str:

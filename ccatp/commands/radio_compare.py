@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ccatp.commands.frame import CONFIG_OPTION, complain, example, overrides, settings_option
-from ccatp.commands.radio_slam import FILTERS, estimate
+from ccatp.commands.radio_slam import FILTERS, FORMATS, estimate
 
 if TYPE_CHECKING:
     from ccatp.config.recording_models import RecordingsConfig
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 )
 @click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
+    "--format", "data_format", type=click.Choice(FORMATS), help="Format of all the data; found out if not given."
+)
+@click.option(
     "--robot", type=click.IntRange(min=1), metavar="N", help="Robot of an MRCLAM set; else all that are there."
 )
 @click.option("--peers", is_flag=True, help="GTSAM (iSAM2, batch) on the same input as well; needs ccatp[peers].")
@@ -31,8 +34,8 @@ if TYPE_CHECKING:
 @settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
 @click.option("--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there.")
 def compare(
-    paths: Sequence[Path], robot: int | None, peers: bool, config_file: Path | None, settings: Mapping[str, object],
-    json_output: bool,
+    paths: Sequence[Path], data_format: str | None, robot: int | None, peers: bool, config_file: Path | None,
+    settings: Mapping[str, object], json_output: bool,
 ) -> int:  # fmt: skip
     """Run all estimators over recorded runs: a table of their errors and times, side by side."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads would only fight over them
@@ -44,8 +47,8 @@ def compare(
     rows: list[dict[str, Any]] = []
     for path in paths:
         found: list[dict[str, Any]] = []
-        for one in robots_of(path) if robot is None else [robot]:
-            run = read_run(path, None, one)
+        for one in robots_of(path, data_format) if robot is None else [robot]:
+            run = read_run(path, data_format, one)
             complain(f"{run.name} ...", 0)
             found += compared(run, assumed, peers)
         rows += with_means(found, f"{path.resolve().name}, mean")

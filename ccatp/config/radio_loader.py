@@ -45,6 +45,10 @@ def load_radio_config(
     config_dir = config_dir or shipped_config_dir()
     base = read_source(config_dir / BASE_FILE)
     user = read_source(file) if file else Source("", "", {})
+    if file is not None and _is_survey(user.tree):
+        raise ConfigError(
+            f"{file}: is the configuration of a survey of a mirror; give that of a robot among beacons, as cricket.toml"
+        )
     command = Source("command line", "", nested(overrides or {}))
     system = read_source(config_dir / f"{_system([command, user, base])}.toml")
     tree: Tree = {}
@@ -60,6 +64,13 @@ def is_radio_file(file: Path) -> bool:
         ConfigError: it cannot be read.
     """
     return "system" in read_source(file).tree
+
+
+def _is_survey(tree: Tree) -> bool:
+    """Whether a file without a system names a mirror or a world, which only surveys have."""
+    run = tree.get("run")
+    named = set(run) if isinstance(run, Mapping) else set()
+    return "system" not in tree and bool({"mirror", "world"} & (named | set(tree)))
 
 
 def dump_radio_config(cfg: RadioConfig) -> str:

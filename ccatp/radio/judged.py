@@ -15,6 +15,9 @@ LONGEST_GAP_S = 0.5
 USUAL_GAPS = 3.0
 """or no further than that many of its usual intervals."""
 
+LEAST_KNOWN = 3
+"""Instants with a truth: one always fits, and two but for their distance."""
+
 
 class Judgement(NamedTuple):
     """Errors of a track; None where there is no truth to tell.
@@ -48,6 +51,8 @@ def judge(track: Track, run: RecordedRun) -> Judgement:
     """
     truth = np.full((len(track.times_s), 3), np.nan) if run.truth is None else truth_at(run.truth, track.times_s)
     known = np.isfinite(truth[:, 0])
+    if known.sum() < LEAST_KNOWN:
+        truth[:], known[:] = np.nan, False
     common = [name for name in track.beacons if name in run.beacon_truth_m]
     places = np.array([(track.beacons[name].x_m, track.beacons[name].y_m) for name in common]).reshape(-1, 2)
     surveyed = np.array([run.beacon_truth_m[name] for name in common]).reshape(-1, 2)

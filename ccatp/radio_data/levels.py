@@ -16,6 +16,8 @@ _DISTANCE = re.compile(r"distance|range|^r$|^d$|_m$", re.IGNORECASE)
 _LEVEL = re.compile(r"rssi|level|dbm", re.IGNORECASE)
 _LEVEL_OF = re.compile(r"(?:rssi|level)[\s_]+(?P<node>\S+)", re.IGNORECASE)
 
+_LARGEST = 1e5  # of metres as of dBm
+
 
 @dataclass(frozen=True, slots=True)
 class LevelTable:
@@ -138,7 +140,7 @@ def _read_folder(folder: Path, sheet: str | None, points: Path | None) -> LevelT
 def _read_rows(path: Path, sheet: str | None) -> tuple[str, list[list[str]]]:
     """Name and rows, the head first."""
     if path.suffix.lower() != ".xlsx":
-        text = read_text(path)
+        text = read_text(path, "a CSV file or an .xlsx workbook with columns of levels")
         lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
         delimiter = next((mark for mark in ",;\t" if lines and mark in lines[0]), None)
         rows = list(csv.reader(lines, delimiter=delimiter)) if delimiter else [line.split() for line in lines]
@@ -165,9 +167,12 @@ def _column(path: Path, head: Sequence[str], pattern: re.Pattern[str], what: str
 def _number(path: Path, line: int, row: Sequence[str], column: int) -> float:
     text = row[column].strip() if column < len(row) else ""
     try:
-        return float(text)
+        value = float(text)
     except ValueError as error:
         raise RadioDataError(path, f'"{text[:40]}" in column {column + 1} is no number', line) from error
+    if not abs(value) <= _LARGEST:
+        raise RadioDataError(path, f"{value:g} in column {column + 1} is no level and no place, m", line)
+    return value
 
 
 def _signed(levels: list[float]) -> tuple[list[float], list[str]]:

@@ -9,6 +9,7 @@ import numpy as np
 from ccatp.radio.recording import RecordedRun
 from ccatp.radio_data.bounds import bounded
 from ccatp.radio_data.checks import suspicions
+from ccatp.radio_data.cleaning import plural
 from ccatp.radio_data.errors import RadioDataError
 from ccatp.radio_data.events_csv import is_events_csv, read_events_csv
 from ccatp.radio_data.labyrinth import is_labyrinth, read_labyrinth
@@ -16,6 +17,7 @@ from ccatp.radio_data.mrclam import ROBOT_FILE, read_mrclam, robots_in
 from ccatp.radio_data.plaza import is_plaza, read_plaza
 from ccatp.radio_data.text_table import read_text
 
+LEAST_TRUTH = 2  # rows: one fits any path
 FORMATS: Sequence[str] = ("plaza", "mrclam", "labyrinth", "csv")
 
 
@@ -36,7 +38,7 @@ def read_run(path: Path, data_format: str | None, robot: int | None) -> Recorded
     if robot is not None and data_format != "mrclam":
         raise RadioDataError(path, f"a {data_format} set has one vehicle: leave out --robot")
     with np.errstate(all="ignore"):  # numbers that overflow are refused below
-        run = bounded(_read(path, data_format, robot), path)
+        run = _with_reference(bounded(_read(path, data_format, robot), path))
     return replace(run, warnings=(*run.warnings, *suspicions(run)))
 
 
@@ -52,15 +54,30 @@ def _read(path: Path, data_format: str, robot: int | None) -> RecordedRun:
     return read_events_csv(path)
 
 
-def robots_of(path: Path) -> list[int | None]:
+def _with_reference(run: RecordedRun) -> RecordedRun:
+    """The run without a truth of too few rows, of which only the first pose is left."""
+    if run.truth is None or len(run.truth.times_s) >= LEAST_TRUTH:
+        return run
+    rows = plural(len(run.truth.times_s), "row")
+    told = (
+        f"no reference trajectory: the truth has {rows}, good for the first pose alone; errors of the path stay unknown"
+    )
+    return replace(run, truth=None, warnings=(*run.warnings, told))
+
+
+def robots_of(path: Path, data_format: str | None = None) -> list[int | None]:
     """The robots of a set: numbers if it has several, ``[None]`` for the only one.
+
+    Args:
+        path: file or folder of the data set.
+        data_format: one of ``FORMATS``; found out from the files if ``None``.
 
     Raises:
         RadioDataError: there is no such set.
     """
     if not path.exists():
         raise RadioDataError(path, "no such file or folder")
-    return [*robots_in(path)] if path.is_dir() and found_format(path) == "mrclam" else [None]
+    return [*robots_in(path)] if path.is_dir() and (data_format or found_format(path)) == "mrclam" else [None]
 
 
 def found_format(path: Path) -> str:

@@ -29,8 +29,12 @@ class Table(NamedTuple):
     lines: npt.NDArray[np.int64]
 
 
-def read_text(file: Path) -> str:
+def read_text(file: Path, wanted: str = "a data set of the formats plaza, mrclam, labyrinth or csv") -> str:
     """The text of a file, unpacked if it is gzipped, whatever its name.
+
+    Args:
+        file: where it is.
+        wanted: what to give in place of a file that is no text.
 
     Raises:
         RadioDataError: it is missing, cannot be read, or is no text.
@@ -45,9 +49,7 @@ def read_text(file: Path) -> str:
     except (OSError, EOFError, zlib.error) as error:
         raise RadioDataError(file, f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
     except UnicodeDecodeError as error:
-        raise RadioDataError(
-            file, "is not text; give a data set of the formats plaza, mrclam, labyrinth or csv"
-        ) from error
+        raise RadioDataError(file, f"is not text; give {wanted}") from error
 
 
 def content_lines(text: str) -> list[tuple[int, str]]:

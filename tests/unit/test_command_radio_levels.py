@@ -80,6 +80,35 @@ def test_bad_input_is_one_line(argv: tuple[str, ...], message: str, capsys: pyte
     assert err.count("\n") == 1
 
 
+def test_what_is_no_text_is_told_what_calibrates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rnd.csv").write_bytes(b"\xff\xfe\x00\x81")
+    status, _, err = said(capsys, "radio", "calibrate", tmp_path / "rnd.csv")
+    assert status == 2
+    assert "is not text; give a CSV file or an .xlsx workbook with columns of levels" in err
+
+
+@pytest.mark.parametrize("level", ["nan", "-1e300"])
+def test_levels_that_are_none(tmp_path: Path, level: str, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "k.csv").write_text(f"distance_m,rssi_dbm\n1,-40\n2,{level}\n3,-60\n4,-62\n")
+    status, _, err = said(capsys, "radio", "calibrate", tmp_path / "k.csv")
+    assert status == 2
+    assert f"k.csv:3: {level.replace('e3', 'e+3')} in column 2 is no level" in err
+
+
+def test_compare_takes_the_format_that_its_hint_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "name it with --format" in said(capsys, "radio", "compare", tmp_path)[2]
+    status, _, err = said(capsys, "radio", "compare", tmp_path, "--format", "labyrinth")
+    assert status == 2
+    assert "holds no Labyrinth text" in err
+
+
+def test_map_tells_the_configuration_of_a_survey(capsys: pytest.CaptureFixture[str]) -> None:
+    file = Path(__file__).parents[2] / "configs" / "ccatp.toml"
+    status, _, err = said(capsys, "radio", "map", "--config", file)
+    assert status == 2
+    assert "ccatp.toml: is the configuration of a survey of a mirror" in err
+
+
 def places(folder: Path) -> Path:
     rows = []
     for x in (0.5, 1.5, 2.5, 3.5):

@@ -12,6 +12,7 @@ import pytest
 
 from ccatp.beacon_file import BeaconFileError, read_beacons, write_beacons
 from ccatp.cli import main
+from ccatp.radio.range_network import MappingError
 from ccatp.range_csv import read_places, read_ranges
 from tests.unit.radio.fields import ALL, HEADS
 
@@ -189,9 +190,10 @@ def test_two_motes_are_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 
 
 def test_a_triangle_is_not_in_doubt_of_its_mirror_image(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    data = measured(tmp_path / "r.csv", "A,B,1\nB,C,1\nA,C,1\n", capsys)
-    assert data["warnings"] == []
-    assert data["crlb_m"] < 0.01
+    for method in ("batch", "ekf"):
+        data = measured(tmp_path / "r.csv", "A,B,1\nB,C,1\nA,C,1\n", capsys, "--method", method)
+        assert (data["warnings"], data["fold_over_risk"]) == ([], False)
+        assert data["crlb_m"] < 0.01
 
 
 @pytest.mark.parametrize("rows", ["A,B,1\nB,C,1\nA,C,2\n", "A,B,1\nB,C,1\nA,C,2\nA,D,3\nB,D,2\nC,D,1\n"])
@@ -258,6 +260,12 @@ def test_a_truth_of_too_few_coordinates(tmp_path: Path, capsys: pytest.CaptureFi
         "cricket.random.size_m=[1,1,1]",
     )
     assert "--truth: M0 has 2 coordinates, wanted 3" in shown
+
+
+def test_a_place_that_is_none(tmp_path: Path) -> None:
+    (tmp_path / "p.csv").write_text("name,x_m,y_m\nM0,0,0\nM1,nan,0\n")
+    with pytest.raises(MappingError, match=r"p\.csv:3: x_m = nan is no place within 1e\+06 m"):
+        read_places(tmp_path / "p.csv")
 
 
 def test_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

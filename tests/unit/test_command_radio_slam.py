@@ -9,7 +9,15 @@ import pytest
 
 from ccatp.cli import main
 from ccatp.filters import FilterDiverged
-from tests.unit.radio_data.sets import BEACONS, csv_lines, world, write_lines, write_mrclam, write_plaza
+from tests.unit.radio_data.sets import (
+    BEACONS,
+    csv_lines,
+    labyrinth_lines,
+    world,
+    write_lines,
+    write_mrclam,
+    write_plaza,
+)
 
 CONTRACT = {
     "dataset", "filter", "trajectory_rmse_m", "heading_rmse_rad", "beacon_rmse_m", "beacons", "range_scale",
@@ -53,6 +61,20 @@ def test_what_is_not_known_is_null(tmp_path: Path, capsys: pytest.CaptureFixture
     data = json.loads(capsys.readouterr().out)
     assert data["trajectory_rmse_m"] is data["heading_rmse_rad"] is data["beacon_rmse_m"] is data["nees_mean"] is None
     assert len(data["beacons"]) == len(BEACONS)
+
+
+@pytest.mark.parametrize("filter_name", ["ekf-slam", "smoother"])
+def test_a_truth_of_one_row_is_no_trajectory(
+    tmp_path: Path, filter_name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = labyrinth_lines(world(seconds=30.0))
+    first = next(line for line in lines if line.startswith("gt2"))
+    file = write_lines(tmp_path / "lab.txt", [first, *(line for line in lines if not line.startswith("gt2"))])
+    assert main(["radio", "slam", str(file), "--json", "--filter", filter_name]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["trajectory_rmse_m"] is data["nees_mean"] is None
+    assert data["beacon_rmse_m"] < 0.5
+    assert "no reference trajectory: the truth has 1 row" in data["warnings"][-1] + data["warnings"][0]
 
 
 def test_the_table_names_what_was_found(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
