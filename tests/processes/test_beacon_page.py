@@ -69,9 +69,11 @@ def sees_a_mission_among_beacons(page: Page) -> None:
         "aria-label", re.compile(r"Map: robot at .* m, \d of 4 waypoints reached, \d+ other things")
     )
     expect(page.locator("#plot-error")).to_have_attribute(
-        "aria-label", re.compile("latest true error [0-9.]+, 3\u03c3")
+        "aria-label", re.compile("latest true error [0-9.]+, 3\u03c3"), timeout=PATIENCE_MS
     )
-    expect(page.locator("#plot-map")).to_have_attribute("aria-label", re.compile("latest true error [0-9.]+, expected"))
+    expect(page.locator("#plot-map")).to_have_attribute(
+        "aria-label", re.compile("latest true error [0-9.]+, expected"), timeout=PATIENCE_MS
+    )
     expect(page.locator("#plot-arrival")).to_be_hidden()
     drawn = "document.querySelector('#map').toDataURL()"
     first = page.evaluate(drawn)
