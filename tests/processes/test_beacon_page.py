@@ -29,6 +29,7 @@ def run(tmp_path: Path, runtime_dir: Path) -> Iterator[BeaconRunProcess]:
     started.end()
 
 
+@pytest.mark.slow  # the page's own code is tried by test_page
 def test_an_operator_looks_aborts_and_stops(run: BeaconRunProcess) -> None:
     run.until(lambda status: status["done"] >= 1)
     port = load_radio_config(run.run_dir / "config.toml").dashboard.port

@@ -36,6 +36,8 @@ def test_a_robot_that_is_driven_is_not_disturbed(start: Callable[..., Run], runt
     assert status == 1
     assert "role taken" in found["robot link"]["found"]
     assert "a daemon runs in" in found["runtime directory"]["found"]
-    assert run.ask("status")["status"]["state"] != "held"
+    # A machine that starts a command may serve a frame late, and the daemon holds for that, but never for the check.
+    at = run.ask("status")["status"]
+    assert at["state"] != "held" or "late" in at["cause"], at["cause"]
     run.ask("stop")
     run.wait()

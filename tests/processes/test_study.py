@@ -162,6 +162,7 @@ def cluster(started: Callable[..., subprocess.Popen[str]], tmp_path: Path) -> st
     return address
 
 
+@pytest.mark.slow
 def test_a_cluster_gives_the_same_cells(cluster: str, whole: list[dict[str, Any]], tmp_path: Path) -> None:
     out = tmp_path / "out"
     run = finished(*STUDY, "--runs", "2", "--cluster", cluster, "--out", str(out), "--json")
