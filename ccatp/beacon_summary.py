@@ -7,12 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccatp.config.radio_models import RadioConfig
-from ccatp.radio.rigid_alignment import best_motion
+from ccatp.radio.metrics import nees
+from ccatp.radio.rigid_alignment import aligned_rms_m, rms_m
+from ccatp.wire.beacon_rows import (
+    TRACK_COLUMNS,
+    TRUTH_COLUMNS,
+    PoseTruth,
+    pose_errors,
+    pose_track,
+    pose_truth,
+    table,
+)
 
 FloatArray = NDArray[np.float64]
-_SEQ, _T, _X, _Y, _H = range(5)
-_XX, _XY, _YY, _XH, _YH, _HH, _RX, _RY = range(5, 13)
-_TX, _TY, _CLEARANCE = 5, 6, 7
 WITHIN_SIGMAS = 3.0
 
 
@@ -118,34 +125,34 @@ class BeaconSummary:
     def build(self, wall_s: float) -> dict[str, Any]:
         """The summary; lengths in m, angles in rad, times in s. What needs the truth is null without it."""
         facts = self._facts
-        track = np.array(self._track, dtype=np.float64).reshape(-1, 13)
-        rows = [[np.nan if value is None else value for value in row] for row in self._truth]
-        truth = np.array(rows, dtype=np.float64).reshape(-1, 8)
-        if len(track):  # the last drive may have been driven, or not
-            truth = truth[truth[:, _SEQ] <= track[-1, _SEQ]]
-        _, i, j = np.intersect1d(track[:, _SEQ], truth[:, _SEQ], return_indices=True)
-        track, true = track[i] if facts.has_truth else track, truth[j]
+        track = pose_track(table(self._track, TRACK_COLUMNS))
+        truth = pose_truth(table(self._truth, TRUTH_COLUMNS))
+        if len(track.seq):  # the last drive may have been driven, or not
+            truth = truth.at(truth.seq <= track.seq[-1])
+        _, i, j = np.intersect1d(track.seq, truth.seq, return_indices=True)
+        track, true = track.at(i), truth.at(j)
         # A robot that stands until motes have mapped themselves navigates from then on.
-        is_navigating = track[:, _T] >= self._notes.get("map_time_s", 0.0)
-        if facts.has_truth and is_navigating.any():
-            track, true = track[is_navigating], true[is_navigating]
-        known = facts.has_truth and len(true) > 0
+        is_navigating = track.t_s >= self._notes.get("map_time_s", 0.0)
+        if is_navigating.any():
+            track, true = track.at(is_navigating), true.at(is_navigating)
+        known = facts.has_truth and len(true.seq) > 0
+        errors = pose_errors(track, true)
         return {
             "system": facts.system,
             "seed": facts.seed,
             "outcome": self._outcome,
             "cause": self._cause,
             "waypoints": self._waypoints(truth if known else None),
-            "trajectory_rmse_m": _aligned_rmse(track, true) if known else None,
-            "position_error_m": _position_errors(track, true) if known else _no_distribution(),
-            "heading_rmse_rad": _rounded(np.sqrt(np.mean(_heading_errors(track, true) ** 2))) if known else None,
-            "dead_reckoning_rmse_m": _reckoned_rmse(track, true) if known else None,
-            "path_length_m": _path_m(true[:, [_X, _Y]]) if known else None,
+            "trajectory_rmse_m": _rounded(aligned_rms_m(track.place_m, true.place_m)) if known else None,
+            "position_error_m": _distribution(np.hypot(errors[:, 0], errors[:, 1])) if known else _no_distribution(),
+            "heading_rmse_rad": _rounded(np.sqrt(np.mean(errors[:, 2] ** 2))) if known else None,
+            "dead_reckoning_rmse_m": _rounded(rms_m(track.reckoned_m, true.place_m)) if known else None,
+            "path_length_m": _path_m(true.place_m) if known else None,
             "beacons": self._beacon_figures(known=known),
             "target": self._target_figures(truth, known=known),
             "obstacles": _obstacle_figures(truth, known=known),
             "consistency": {
-                "pose_nees_mean": _pose_nees(track, true) if known else None,
+                "pose_nees_mean": _rounded(np.mean(nees(errors, track.covariance))) if known else None,
                 "nis_mean": _rounded(self._score[0] / self._score[1]) if self._score[1] else None,
                 "readings": self._score[1],
                 "refused": self._score[2],
@@ -165,11 +172,11 @@ class BeaconSummary:
             "tick_us_p99": _rounded(p99, 1),
         }
 
-    def _waypoints(self, truth: FloatArray | None) -> dict[str, Any]:
+    def _waypoints(self, truth: PoseTruth | None) -> dict[str, Any]:
         """Reached by the estimate, and how often the truth was within 3 sigma of it then."""
         within: int | None = None
         if truth is not None:
-            places = {int(row[_SEQ]): row for row in truth}
+            places = dict(zip(truth.seq.astype(int).tolist(), truth.place_m, strict=True))
             within = sum(_sigmas(one, places[one.seq]) <= WITHIN_SIGMAS for one in self._reached if one.seq in places)
         return {"total": self._facts.waypoints, "reached": len(self._reached), "within_3_sigma": within}
 
@@ -190,16 +197,16 @@ class BeaconSummary:
             "places_m": {name: [_rounded(place[0]), _rounded(place[1])] for name, place in sorted(found.items())},
         }
 
-    def _target_figures(self, truth: FloatArray, *, known: bool) -> dict[str, Any] | None:
+    def _target_figures(self, truth: PoseTruth, *, known: bool) -> dict[str, Any] | None:
         safe_m = self._facts.safe_distance_m
         if safe_m is None:
             return None
-        late = truth[(truth[:, _T] >= self._facts.settled_s) & np.isfinite(truth[:, _TX])] if known else truth[:0]
-        distances = np.hypot(late[:, _X] - late[:, _TX], late[:, _Y] - late[:, _TY])
+        late = truth.at((truth.t_s >= self._facts.settled_s) & np.isfinite(truth.target_m[:, 0]) & known)
+        distances = np.hypot(*(late.place_m - late.target_m).T)
         error_m = None
         place = self._beacons.get(self._facts.target)
-        if known and place is not None and len(truth):
-            error_m = _rounded(np.hypot(place[0] - truth[-1, _TX], place[1] - truth[-1, _TY]))
+        if known and place is not None:
+            error_m = _rounded(np.hypot(*(place[:2] - truth.target_m[-1])))
         return {
             "safe_distance_m": safe_m,
             "distance_mean_m": _rounded(distances.mean()) if len(distances) else None,
@@ -209,8 +216,7 @@ class BeaconSummary:
         }
 
 
-def _position_errors(track: FloatArray, true: FloatArray) -> dict[str, float | None]:
-    errors = np.hypot(track[:, _X] - true[:, _X], track[:, _Y] - true[:, _Y])
+def _distribution(errors: FloatArray) -> dict[str, float | None]:
     p50, p99 = np.percentile(errors, (50, 99))
     figures = {"rmse": np.sqrt(np.mean(errors**2)), "mean": errors.mean(), "p50": p50, "p99": p99, "max": errors.max()}
     return {name: _rounded(value) for name, value in figures.items()}
@@ -220,44 +226,21 @@ def _no_distribution() -> dict[str, float | None]:
     return dict.fromkeys(("rmse", "mean", "p50", "p99", "max"))
 
 
-def _aligned_rmse(track: FloatArray, true: FloatArray) -> float | None:
-    """After one rigid motion of the estimated path, without scale."""
-    places, truths = track[:, [_X, _Y]], true[:, [_X, _Y]]
-    off = best_motion(places, truths).apply(places) - truths
-    return _rounded(np.sqrt(np.mean(np.sum(off**2, axis=1))))
-
-
-def _reckoned_rmse(track: FloatArray, true: FloatArray) -> float | None:
-    return _rounded(np.sqrt(np.mean((track[:, _RX] - true[:, _X]) ** 2 + (track[:, _RY] - true[:, _Y]) ** 2)))
-
-
-def _heading_errors(track: FloatArray, true: FloatArray) -> FloatArray:
-    turn = track[:, _H] - true[:, _H]
-    return np.asarray(np.arctan2(np.sin(turn), np.cos(turn)))
-
-
-def _pose_nees(track: FloatArray, true: FloatArray) -> float | None:
-    """Mean of e^T P^-1 e over x, y and heading; 3 is expected."""
-    errors = np.column_stack((track[:, [_X, _Y]] - true[:, [_X, _Y]], _heading_errors(track, true)))
-    P = track[:, [_XX, _XY, _XH, _XY, _YY, _YH, _XH, _YH, _HH]].reshape(-1, 3, 3)
-    return _rounded(np.mean(np.einsum("ni,ni->n", errors, np.linalg.solve(P, errors[:, :, None])[:, :, 0])))
-
-
 def _path_m(places: FloatArray) -> float | None:
     return _rounded(np.hypot(*np.diff(places, axis=0).T).sum())
 
 
-def _obstacle_figures(truth: FloatArray, *, known: bool) -> dict[str, Any] | None:
-    clearances = truth[np.isfinite(truth[:, _CLEARANCE]), _CLEARANCE]
+def _obstacle_figures(truth: PoseTruth, *, known: bool) -> dict[str, Any] | None:
+    clearances = truth.clearance_m[np.isfinite(truth.clearance_m)]
     if known and not len(clearances):
         return None
     least_m = clearances.min() if known else None
     return {"least_clearance_m": _rounded(least_m), "touched": None if least_m is None else bool(least_m <= 0.0)}
 
 
-def _sigmas(reached: Reached, true: FloatArray) -> float:
+def _sigmas(reached: Reached, true_m: FloatArray) -> float:
     x, y, xx, xy, yy = reached.estimate
-    off = np.array((true[_X] - x, true[_Y] - y))
+    off = true_m - (x, y)
     return float(np.sqrt(off @ np.linalg.solve(np.array(((xx, xy), (xy, yy))), off)))
 
 

@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 
 from ccatp.drawing.shapes import Picture
 from ccatp.errors import CcatpError, ExitStatus
-from ccatp.pictures.picture_file import PictureError, write_figures, write_svg
+from ccatp.pictures.figures import PictureError
+from ccatp.pictures.picture_file import write_figures, write_svg
 from ccatp.reporting.beacon_page import beacon_data, beacon_figures, beacon_page
 from ccatp.reporting.compare_page import Pair, compare_figures, compare_page, pair_of
 from ccatp.reporting.data import run_data

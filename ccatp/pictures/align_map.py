@@ -14,19 +14,18 @@ from ccatp.aligning.moves import adjuster_places
 from ccatp.aligning.panel_result import PanelResult
 from ccatp.aligning.survey_result import SurveyResult
 from ccatp.mirror.mirror import Mirror
-from ccatp.pictures.run_map import RunMapError, draw_panels
+from ccatp.pictures.deck_map import add_colour_bar, new_deck_map, write_title
+from ccatp.pictures.figures import BAD, INK, QUIET, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap, Normalize
-    from matplotlib.figure import Figure
 
     Colours = tuple[Colormap, Normalize]
 
 WIDTH_PX = 2400
 DPI = 200
 _CELLS = 12  # along each side of a panel
-_INK, _QUIET, _BAD = "#1f2933", "#6b7785", "#d64545"
 _COLOURS = ("#5a8fc4", "#a9cbe3", "#f7f7f5", "#f3c08c", "#d5703f")  # below, ideal, above; figures stay legible on each
 _MICRO = 1e6
 
@@ -45,36 +44,16 @@ def draw_alignment(mirror: Mirror, result: SurveyResult, out: Path, title: str, 
         subtitle: second line.
 
     Raises:
-        RunMapError: matplotlib is not installed, or the file cannot be written.
+        PictureError: matplotlib is not installed, or the file cannot be written.
     """
-    try:
-        from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second, and belongs to an extra
-    except ImportError as error:
-        raise RunMapError("drawing needs matplotlib: install ccatp with its extra, ccatp[plots]") from error
-    low, high = mirror.rim.vertices.min(axis=0), mirror.rim.vertices.max(axis=0)
-    width = WIDTH_PX / DPI
-    height = (width - 1.6) * float((high[1] - low[1] + 0.5) / (high[0] - low[0] + 0.5)) + 1.6
-    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
-    axes = figure.add_axes((0.75 / width, 0.7 / height, (width - 1.75) / width, (height - 1.6) / height))
-    draw_panels(axes, mirror)
+    figure, axes = new_deck_map(mirror, WIDTH_PX, DPI)
     colours = _colours(result)
     for panel in result.panels:
         _draw_panel(axes, mirror, panel, colours)
-    _draw_bar(figure, axes, colours)
-    axes.set(xlim=(low[0] - 0.25, high[0] + 0.25), ylim=(low[1] - 0.25, high[1] + 0.25))
-    axes.set(xlabel="x, m (deck frame)", ylabel="y, m (deck frame)", aspect="equal")
-    axes.tick_params(labelsize=8, color=_QUIET, labelcolor=_INK)
-    for side in axes.spines.values():
-        side.set_visible(False)
-    axes.text(0.0, 1.05, title + _half_wavefront(result), transform=axes.transAxes, fontsize=15, color=_INK)
+    _draw_bar(axes, colours)
     legend = "figures: moves of the vertical adjusters, um, > 0 towards the robot; dots: measured points"
-    axes.text(
-        0.0, 1.022, "  ·  ".join(filter(None, (subtitle, legend))), transform=axes.transAxes, fontsize=9, color=_QUIET
-    )
-    try:
-        figure.savefig(out)
-    except (OSError, ValueError) as error:
-        raise RunMapError(f"{out}: cannot be written: {error}") from error
+    write_title(axes, title + _half_wavefront(result), "  ·  ".join(filter(None, (subtitle, legend))))
+    save_figure(figure, out)
 
 
 def _half_wavefront(result: SurveyResult) -> str:
@@ -101,25 +80,21 @@ def _draw_panel(axes: "Axes", mirror: Mirror, panel: PanelResult, colours: "Colo
     x, y, values = on_grid_m(mirror, panel, _CELLS)
     axes.pcolormesh(x, y, values * _MICRO, cmap=cmap, norm=norm, zorder=2, rasterized=True)
     size = 2.0 * body.half_x_m, 2.0 * body.half_y_m
-    axes.add_patch(Rectangle((x[0], y[0]), *size, fill=False, edgecolor=_QUIET, linewidth=0.7, zorder=3))
+    axes.add_patch(Rectangle((x[0], y[0]), *size, fill=False, edgecolor=QUIET, linewidth=0.7, zorder=3))
     (dots_x, dots_y), heights = found.deck_m[panel.is_kept].T, found.values_m[panel.is_kept] * _MICRO
-    axes.scatter(dots_x, dots_y, c=heights, cmap=cmap, norm=norm, s=22, edgecolors=_QUIET, linewidths=0.3, zorder=5)
+    axes.scatter(dots_x, dots_y, c=heights, cmap=cmap, norm=norm, s=22, edgecolors=QUIET, linewidths=0.3, zorder=5)
     crosses_x, crosses_y = found.deck_m[~panel.is_kept].T
-    axes.scatter(crosses_x, crosses_y, marker="x", color=_BAD, s=36, linewidths=1.6, zorder=6)
-    small: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 5.5, "color": _INK, "zorder": 6}
+    axes.scatter(crosses_x, crosses_y, marker="x", color=BAD, s=36, linewidths=1.6, zorder=6)
+    small: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 5.5, "color": INK, "zorder": 6}
     names, adjusters = adjuster_places(mirror, panel.panel)
     for name, place, move in zip(names, adjusters.tolist(), panel.rigid.moves.values_m, strict=True):
         deck_x, deck_y, _ = body.to_deck((*place, 0.0))
         axes.text(deck_x, deck_y - 0.025, f"{name} {_MICRO * move:+.0f}", **small)
 
 
-def _draw_bar(figure: "Figure", axes: "Axes", colours: "Colours") -> None:
+def _draw_bar(axes: "Axes", colours: "Colours") -> None:
     from matplotlib.cm import ScalarMappable  # noqa: PLC0415 - see above
 
     cmap, norm = colours
-    place = axes.get_position()
-    bar_axes = figure.add_axes((place.x1 + 0.006, place.y0 + 0.15 * place.height, 0.013, 0.7 * place.height))
-    bar = figure.colorbar(ScalarMappable(norm, cmap), cax=bar_axes, extend="both")
-    bar.outline.set_visible(False)
-    bar.ax.tick_params(labelsize=8, color=_QUIET, labelcolor=_INK)
-    bar.set_label("deviation along the normal, um, > 0 towards the robot", fontsize=9, color=_INK)
+    label = "deviation along the normal, um, > 0 towards the robot"
+    add_colour_bar(axes, ScalarMappable(norm, cmap), label, extend="both")

@@ -5,22 +5,16 @@ Needs the extra ``plots`` (matplotlib), imported only when something is drawn.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import stdtrit
 
 from ccatp.config.radio_models import FuzzyConfig
 from ccatp.control.fuzzy import Sugeno
-from ccatp.pictures.picture_file import PictureError
+from ccatp.pictures.figures import INK, QUIET, dress, new_figure, save_figure
 from ccatp.radio.level_fix import LevelFix
 from ccatp.radio.path_loss_fit import LevelPair, PathLossFit
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-_INK, _QUIET, _GRID = "#1f2933", "#6b7785", "#e3e8ed"
 _BLUE, _GOLD, _GREEN, _RED = "#0b3c5d", "#d08c00", "#1d9a8a", "#c0392b"
 _REGION = 0.9
 
@@ -31,7 +25,7 @@ def draw_path_loss(fit: PathLossFit, pairs: Sequence[LevelPair], name: str, out:
     Raises:
         PictureError: matplotlib is not installed, or the file cannot be written.
     """
-    figure = _new_figure(7.0, 4.4)
+    figure = new_figure(7.0, 4.4)
     axes = figure.subplots()
     distances, levels = np.array([pair[:2] for pair in pairs]).T
     grid = np.geomspace(distances.min() / 1.2, distances.max() * 1.2, 200)
@@ -42,9 +36,9 @@ def draw_path_loss(fit: PathLossFit, pairs: Sequence[LevelPair], name: str, out:
     axes.plot(distances, levels, "o", color=_GOLD, markersize=4, markeredgecolor="white", label="readings")
     axes.set(xscale="log", xlabel="distance, m", ylabel="level, dBm", title=name)
     axes.xaxis.set_major_formatter("{x:g}")
-    _dress(axes)
+    dress(axes)
     axes.legend(frameon=False, fontsize=8)
-    _save(figure, out)
+    save_figure(figure, out)
 
 
 def draw_fixes(
@@ -59,24 +53,24 @@ def draw_fixes(
     shown = list(zip(fixes, truths, strict=True))[:12]
     columns = min(5, len(shown))
     rows = -(-len(shown) // columns)
-    figure = _new_figure(2.3 * columns, 2.3 * rows + 0.5)
+    figure = new_figure(2.3 * columns, 2.3 * rows + 0.5)
     panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
     for index, (axes, (fix, truth)) in enumerate(zip(panels, shown, strict=False), 1):
         inside = fix.points_m[fix.region(_REGION)]
         axes.plot(*inside.T, "s", color=_BLUE, alpha=0.18, markersize=2.2, markeredgewidth=0, label="90 % region")
-        axes.plot(*np.array(list(beacons_m.values())).T, "^", color=_QUIET, markersize=5, label="beacons")
+        axes.plot(*np.array(list(beacons_m.values())).T, "^", color=QUIET, markersize=5, label="beacons")
         axes.plot(*truth, "x", color=_RED, markersize=6, markeredgewidth=1.6, label="truth")
         axes.plot(*fix.position_m, "o", color=_GOLD, markersize=5, markeredgecolor="white", label="fix")
         error_m = float(np.hypot(*(fix.position_m - truth)))
         axes.set_title(f"{index}: {error_m:.2f} m")
         axes.set_aspect("equal")
-        _dress(axes)
+        dress(axes)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
-    figure.suptitle(name, fontsize=10, color=_INK)
-    _save(figure, out)
+    figure.suptitle(name, fontsize=10, color=INK)
+    save_figure(figure, out)
 
 
 def draw_fuzzy(cfg: FuzzyConfig, out: Path) -> None:
@@ -87,7 +81,7 @@ def draw_fuzzy(cfg: FuzzyConfig, out: Path) -> None:
         FuzzyGapError: the rules leave a gap.
     """
     sugeno = Sugeno(cfg)
-    figure = _new_figure(10.0, 4.6)
+    figure = new_figure(10.0, 4.6)
     layout = figure.add_gridspec(2, 2, width_ratios=(1.5, 1.0))
     spans = [_span(cfg, name) for name in sugeno.inputs]
     x, y = (np.linspace(*span, 121) for span in spans)
@@ -105,13 +99,13 @@ def draw_fuzzy(cfg: FuzzyConfig, out: Path) -> None:
         values = np.linspace(*span, 200)
         grades = np.array([sugeno.memberships(row, value) for value in values.tolist()])
         for index, term in enumerate(cfg.inputs[name].terms):
-            colour = (_BLUE, _GOLD, _GREEN, _RED, _QUIET)[index % 5]
+            colour = (_BLUE, _GOLD, _GREEN, _RED, QUIET)[index % 5]
             panel.plot(np.degrees(values) if in_degrees[row] else values, grades[:, index], color=colour, label=term)
         panel.set(xlabel=_label(name), ylim=(-0.03, 1.08))
         panel.legend(frameon=False, fontsize=8, loc="center right")
-        _dress(panel)
-    axes.tick_params(labelsize=8, color=_QUIET, labelcolor=_INK)
-    _save(figure, out)
+        dress(panel)
+    axes.tick_params(labelsize=8, color=QUIET, labelcolor=INK)
+    save_figure(figure, out)
 
 
 def _formula(fit: PathLossFit) -> str:
@@ -132,28 +126,3 @@ def _span(cfg: FuzzyConfig, name: str) -> tuple[float, float]:
 def _label(name: str) -> str:
     words = name.replace("_", " ")
     return words.removesuffix(" rad") + ", deg" if name.endswith("_rad") else words.removesuffix(" m") + ", m"
-
-
-def _new_figure(width_in: float, height_in: float) -> "Figure":
-    try:
-        from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second, and belongs to an extra
-    except ImportError as error:
-        raise PictureError("drawing needs matplotlib: install ccatp with its extra, ccatp[plots]") from error
-    return Figure(figsize=(width_in, height_in), dpi=160, facecolor="white", layout="constrained")
-
-
-def _dress(axes: "Axes") -> None:
-    axes.grid(True, color=_GRID, linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.tick_params(which="both", labelsize=8, color=_QUIET, labelcolor=_INK)
-    axes.title.set_fontsize(9)
-    for side in axes.spines.values():
-        side.set_color(_GRID)
-
-
-def _save(figure: "Figure", out: Path) -> None:
-    metadata = {"CreationDate": None} if out.suffix.lower() == ".pdf" else {}
-    try:
-        figure.savefig(out, metadata=metadata)
-    except (OSError, ValueError) as error:
-        raise PictureError(f"{out}: cannot be written: {error}") from error

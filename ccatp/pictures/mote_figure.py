@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ccatp.radio.range_network import MappingError
+from ccatp.pictures.figures import GRID, INK, QUIET, dress, new_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 FloatArray = NDArray[np.float64]
 
-INK, QUIET, GRID = "#1f2933", "#6b7785", "#e3e8ed"
 FOUND, TRUE, DOUBT = "#0b3c5d", "#d08c00", "#c0392b"
 _CHI2_90 = 4.605  # of two degrees of freedom: the ellipse that holds nine of ten
 _LABELLED = 40  # motes up to which each has its name beside it
@@ -71,21 +70,14 @@ def draw_mote_map(picture: MapPicture, traces: Traces | None, out: Path) -> None
         out: the file; its suffix tells the format (PNG, PDF, SVG).
 
     Raises:
-        MappingError: matplotlib is not installed, or the file cannot be written.
+        PictureError: matplotlib is not installed, or the file cannot be written.
     """
-    try:
-        from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second, and belongs to an extra
-    except ImportError as error:
-        raise MappingError("drawing needs matplotlib: install ccatp with its extra, ccatp[plots]") from error
-    figure = Figure(figsize=(11.0 if traces else 6.5, 6.5), dpi=160, facecolor="white", layout="constrained")
+    figure = new_figure(11.0 if traces else 6.5, 6.5)
     panels = figure.subplots(1, 2 if traces else 1, squeeze=False)[0]
     draw_places(panels[0], picture)
     if traces is not None:
         draw_traces(panels[1], traces)
-    try:
-        figure.savefig(out)
-    except (OSError, ValueError) as error:
-        raise MappingError(f"{out}: cannot be written: {error}") from error
+    save_figure(figure, out)
 
 
 def draw_places(axes: "Axes", picture: MapPicture) -> None:
@@ -114,7 +106,7 @@ def draw_places(axes: "Axes", picture: MapPicture) -> None:
     axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     axes.margins(0.1)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=3, frameon=False, fontsize=8)
-    _dress(axes)
+    dress(axes)
 
 
 def draw_traces(axes: "Axes", traces: Traces, label: str = "", shade: str = FOUND) -> None:
@@ -134,7 +126,7 @@ def draw_traces(axes: "Axes", traces: Traces, label: str = "", shade: str = FOUN
     axes.set(xlabel="updates", ylabel="root mean square error, m")
     axes.set_title(f"{traces.runs} runs", fontsize=10, color=INK)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=2, frameon=False, fontsize=8)
-    _dress(axes)
+    dress(axes)
 
 
 def _ellipses(axes: "Axes", picture: MapPicture) -> float:
@@ -157,11 +149,3 @@ def _ellipses(axes: "Axes", picture: MapPicture) -> float:
             Ellipse(place, size[1], size[0], angle=angle, facecolor=FOUND, alpha=0.18, edgecolor=FOUND, zorder=2)
         )
     return grown
-
-
-def _dress(axes: "Axes") -> None:
-    axes.grid(True, which="major", color=GRID, linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.tick_params(which="both", labelsize=8, color=QUIET, labelcolor=INK)
-    for side in axes.spines.values():
-        side.set_color(GRID)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ccatp.drawing.shapes import Area, Boxes, Dots, Line, Picture, Shape, Text
 from ccatp.drawing.svg import svg_of
-from ccatp.errors import CcatpError, ExitStatus
+from ccatp.pictures.figures import PictureError, new_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,12 +22,6 @@ DPI = 96.0  # a CSS pixel is a 96th of an inch
 _PNG_SCALE = 2.0
 _POINTS = 72.0 / DPI
 _ANCHORS = {"start": "left", "middle": "center", "end": "right"}
-
-
-class PictureError(CcatpError):
-    """A picture that cannot be written."""
-
-    exit_status = ExitStatus.USAGE
 
 
 def write_svg(picture: Picture, path: Path) -> None:
@@ -51,23 +45,12 @@ def write_figures(picture: Picture, stem: Path) -> list[Path]:
     figure = _figure(picture)
     paths = [stem.with_name(stem.name + suffix) for suffix in (".png", ".pdf")]
     for path in paths:
-        # Without these the same picture would be another file each day.
-        metadata: dict[str, Any] = {"CreationDate": None} if path.suffix == ".pdf" else {"Software": None}
-        try:
-            figure.savefig(path, dpi=DPI * _PNG_SCALE, metadata=metadata)
-        except OSError as error:
-            raise PictureError(f"{path}: cannot be written: {error.strerror or error}") from error
+        save_figure(figure, path, DPI * _PNG_SCALE)
     return paths
 
 
 def _figure(picture: Picture) -> "Figure":
-    try:
-        from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second, and belongs to an extra
-    except ImportError as error:
-        raise PictureError(
-            "PNG and PDF need matplotlib: install ccatp with its extra, ccatp[plots]; the report itself does not"
-        ) from error
-    figure = Figure(figsize=(picture.width / DPI, picture.height / DPI), dpi=DPI, facecolor="white")
+    figure = new_figure(picture.width / DPI, picture.height / DPI, DPI, layout=None)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0.0, picture.width), ylim=(picture.height, 0.0))
     axes.axis("off")

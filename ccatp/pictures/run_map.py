@@ -6,7 +6,7 @@ Needs the extra ``plots`` (matplotlib), imported only when something is drawn.
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from math import ceil, cos, sin
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,31 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccatp.config.loader import load_config
-from ccatp.errors import CcatpError, ExitStatus
+from ccatp.drawing.colours import PATH, SMALL_TO_LARGE
 from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.pictures.deck_map import add_colour_bar, draw_base, new_deck_map, write_title
+from ccatp.pictures.figures import BAD, INK, QUIET, PictureError, save_figure
 from ccatp.reporting.points import arrival_error_m
 from ccatp.run_files.recorder import iter_messages, read_metadata, recordings
 from ccatp.storage.store import MissionStore, StoreError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 FloatArray = NDArray[np.float64]
 
 WIDTH_PX = 1600
 DPI = 160
 LIMIT_MM = 10.0  # arrivals beyond it miss the requirement; the colours end there at the latest
-MAX_PATH_POINTS = 40_000
-
-_INK, _QUIET, _PANEL, _SEAM, _PATH, _BAD = "#1f2933", "#6b7785", "#f1f4f7", "#c5ced8", "#8fa3b8", "#d64545"
-_COLOURS = ("#123f6d", "#1d8a99", "#f0b429")  # small to large; lightness tells the ends apart as well
-
-
-class RunMapError(CcatpError):
-    """A run that cannot be drawn."""
-
-    exit_status = ExitStatus.USAGE
+MAXPATH_POINTS = 40_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,28 +63,16 @@ def draw_run_map(
         subtitle: second line: seed, world, errors.
 
     Raises:
-        RunMapError: matplotlib is not installed, or the file cannot be written.
+        PictureError: matplotlib is not installed, or the file cannot be written.
     """
-    try:
-        from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second, and belongs to an extra
-    except ImportError as error:
-        raise RunMapError("drawing needs matplotlib: install ccatp with its extra, ccatp[plots]") from error
-    low, high = mirror.rim.vertices.min(axis=0), mirror.rim.vertices.max(axis=0)
-    width = WIDTH_PX / DPI
-    # Margins of 0.25 m around the mirror; 1.5 inches beside it for colour bar and labels, 1.5 above and below.
-    height = (width - 1.5) * float((high[1] - low[1] + 0.5) / (high[0] - low[0] + 0.5)) + 1.5
-    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
-    axes = figure.add_axes((0.75 / width, 0.85 / height, (width - 1.5) / width, (height - 1.6) / height))
-    draw_panels(axes, mirror)
-    step = max(1, len(path_xy) // MAX_PATH_POINTS)
-    axes.plot(path_xy[::step, 0], path_xy[::step, 1], color=_PATH, linewidth=0.9, zorder=3, label="driven path")
+    figure, axes = new_deck_map(mirror, WIDTH_PX, DPI)
+    step = max(1, len(path_xy) // MAXPATH_POINTS)
+    axes.plot(path_xy[::step, 0], path_xy[::step, 1], color=PATH, linewidth=0.9, zorder=3, label="driven path")
     draw_base(axes, mirror)
-    _draw_points(figure, axes, points)
-    _dress(axes, low - 0.25, high + 0.25, title, subtitle)
-    try:
-        figure.savefig(out)
-    except (OSError, ValueError) as error:
-        raise RunMapError(f"{out}: cannot be written: {error}") from error
+    _draw_points(axes, points)
+    write_title(axes, title, subtitle)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.045), ncols=4, frameon=False, fontsize=8.5, labelcolor=INK)
+    save_figure(figure, out)
 
 
 def draw_from_run_dir(run_dir: Path, out: Path) -> None:
@@ -101,11 +81,11 @@ def draw_from_run_dir(run_dir: Path, out: Path) -> None:
     The arrival error is the distance from the puck's foot, as the laser system measured it, to the measurement point.
 
     Raises:
-        RunMapError: the directory holds no run, or the map cannot be drawn.
+        PictureError: the directory holds no run, or the map cannot be drawn.
         ConfigError: its configuration cannot be read.
     """
     if not (run_dir / "config.toml").is_file():
-        raise RunMapError(f"{run_dir}: no config.toml there; name the directory of a run")
+        raise PictureError(f"{run_dir}: no config.toml there; name the directory of a run")
     cfg = load_config(run_dir / "config.toml")
     mirror = build_mirror(cfg.mirror)
     parts = recordings(run_dir / "telemetry.mcap")
@@ -124,14 +104,14 @@ def draw_from_run_dir(run_dir: Path, out: Path) -> None:
 
 def _points(database: Path, mirror: Mirror, puck_height_m: float) -> list[MapPoint]:
     if not database.is_file():
-        raise RunMapError(
+        raise PictureError(
             f"{database.parent}: no {database.name} there, so no points to draw; was the run ever under way?"
         )
     try:
         with MissionStore.open(database, mirror=mirror.name) as store:
             rows, fixes = store.points(), {stored.point: stored.fix for stored in store.fixes()}
     except StoreError as error:
-        raise RunMapError(str(error)) from error
+        raise PictureError(str(error)) from error
     points = []
     for row in rows:
         fix = fixes.get(row.point)
@@ -159,35 +139,7 @@ def _mission_time_s(path: Path) -> float | None:
         return None  # a run that was killed has no summary; its map is worth the more
 
 
-def draw_panels(axes: "Axes", mirror: Mirror) -> None:
-    """Draw panels and rim, deck frame, with the numbers of columns and rows."""
-    from matplotlib.collections import PatchCollection  # noqa: PLC0415 - see above
-    from matplotlib.patches import Polygon, Rectangle  # noqa: PLC0415
-
-    tiles = [
-        Rectangle((p.x_m - p.half_x_m, p.y_m - p.half_y_m), 2 * p.half_x_m, 2 * p.half_y_m)
-        for p in mirror.panels.values()
-    ]
-    axes.add_collection(PatchCollection(tiles, facecolor=_PANEL, edgecolor=_SEAM, linewidth=0.7, zorder=1))
-    axes.add_patch(Polygon(mirror.rim.vertices, closed=True, fill=False, edgecolor=_INK, linewidth=1.5, zorder=2))
-    small: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7.5, "color": _QUIET}
-    (low_x, low_y) = mirror.rim.vertices.min(axis=0)
-    for col, x in {p.id.col: p.x_m for p in mirror.panels.values()}.items():
-        axes.text(x, low_y - 0.12, f"column {col}" if col == 1 else f"{col}", **small)
-    for row, y in {p.id.row: p.y_m for p in mirror.panels.values()}.items():
-        axes.text(low_x - 0.12, y, f"row {row}" if row == 1 else f"{row}", rotation=90, **small)
-
-
-def draw_base(axes: "Axes", mirror: Mirror) -> None:
-    """Draw where the robot starts, and its heading."""
-    base = mirror.base_pose
-    ahead = {"dx": 0.18 * cos(base.heading_rad), "dy": 0.18 * sin(base.heading_rad)}
-    shape = {"width": 0.035, "head_width": 0.11, "head_length": 0.09, "length_includes_head": True}
-    axes.arrow(base.x_m, base.y_m, **ahead, **shape, color=_INK, linewidth=0, zorder=6)
-    axes.plot(base.x_m, base.y_m, "o", color=_INK, markersize=9, zorder=6, linestyle="", label="base")
-
-
-def _draw_points(figure: "Figure", axes: "Axes", points: Sequence[MapPoint]) -> None:
+def _draw_points(axes: "Axes", points: Sequence[MapPoint]) -> None:
     from matplotlib.colors import LinearSegmentedColormap  # noqa: PLC0415 - see above
 
     measured = [p for p in points if p.error_mm is not None]
@@ -195,32 +147,16 @@ def _draw_points(figure: "Figure", axes: "Axes", points: Sequence[MapPoint]) -> 
     # A single far one must not make all others look alike.
     usual, largest = np.percentile(errors, (98, 100)) if len(errors) else (1.0, 1.0)
     top = min(LIMIT_MM, max(0.1, ceil(usual * 10) / 10))
-    colours = LinearSegmentedColormap.from_list("arrival error", _COLOURS)
+    colours = LinearSegmentedColormap.from_list("arrival error", SMALL_TO_LARGE)
     dots = axes.scatter(
         [p.x_m for p in measured], [p.y_m for p in measured], c=errors, cmap=colours, vmin=0.0, vmax=top,
         s=40, edgecolors="white", linewidths=0.7, zorder=5,
     )  # fmt: skip
     skipped = [p for p in points if p.is_skipped and p.error_mm is None]
     to_come = [p for p in points if not p.is_skipped and p.error_mm is None]
-    crosses: dict[str, Any] = {"marker": "x", "color": _BAD, "s": 36, "linewidths": 1.6, "label": "skipped"}
-    rings: dict[str, Any] = {"facecolors": "white", "edgecolors": _QUIET, "s": 26, "label": "not measured"}
+    crosses: dict[str, Any] = {"marker": "x", "color": BAD, "s": 36, "linewidths": 1.6, "label": "skipped"}
+    rings: dict[str, Any] = {"facecolors": "white", "edgecolors": QUIET, "s": 26, "label": "not measured"}
     for some, look in ((skipped, crosses), (to_come, rings)):
         if some:
             axes.scatter([p.x_m for p in some], [p.y_m for p in some], zorder=5, **look)
-    place = axes.get_position()
-    bar_axes = figure.add_axes((place.x1 + 0.006, place.y0 + 0.2 * place.height, 0.013, 0.6 * place.height))
-    bar = figure.colorbar(dots, cax=bar_axes, extend="max" if largest > top else "neither")
-    bar.outline.set_visible(False)
-    bar.ax.tick_params(labelsize=8, color=_QUIET, labelcolor=_INK)
-    bar.set_label("arrival error, mm", fontsize=9, color=_INK)
-
-
-def _dress(axes: "Axes", low: FloatArray, high: FloatArray, title: str, subtitle: str) -> None:
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x, m (deck frame)", ylabel="y, m (deck frame)")
-    axes.set_aspect("equal")
-    axes.tick_params(labelsize=8, color=_QUIET, labelcolor=_INK)
-    for side in axes.spines.values():
-        side.set_visible(False)
-    axes.text(0.0, 1.045, title, transform=axes.transAxes, fontsize=15, fontweight="bold", color=_INK)
-    axes.text(0.0, 1.018, subtitle, transform=axes.transAxes, fontsize=9.5, color=_QUIET)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.045), ncols=4, frameon=False, fontsize=8.5, labelcolor=_INK)
+    add_colour_bar(axes, dots, "arrival error, mm", extend="max" if largest > top else "neither")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from ccatp.errors import CcatpError, ExitStatus
+from ccatp.pictures.figures import GRID, INK, QUIET, dress, new_figure, save_figure
 from ccatp.radio.judged import Judgement, aligned_beacons, truth_at
 from ccatp.radio.recording import RecordedRun, dead_reckoned
 from ccatp.radio.track import BeaconFix, Track
@@ -22,15 +22,7 @@ WIDTH_PX = 1800
 DPI = 180
 SIGMAS = 3.0  # of the ellipses
 POSE_ELLIPSES = 24  # along the path
-_INK, _QUIET, _GRID, _TRUTH, _PATH, _MAP, _RECKONED = (
-    "#1f2933", "#6b7785", "#e4e9ee", "#8fa3b8", "#1d6fa5", "#d5703f", "#d9c9a8",
-)  # fmt: skip
-
-
-class SlamMapError(CcatpError):
-    """A picture that cannot be drawn or written."""
-
-    exit_status = ExitStatus.USAGE
+_TRUTH, _PATH, _MAP, _RECKONED = "#8fa3b8", "#1d6fa5", "#d5703f", "#d9c9a8"
 
 
 def draw_slam(run: RecordedRun, track: Track, judged: Judgement, out: Path, title: str) -> None:
@@ -44,12 +36,8 @@ def draw_slam(run: RecordedRun, track: Track, judged: Judgement, out: Path, titl
         title: first line.
 
     Raises:
-        SlamMapError: matplotlib is not installed, or the file cannot be written.
+        PictureError: matplotlib is not installed, or the file cannot be written.
     """
-    try:
-        from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second, and belongs to an extra
-    except ImportError as error:
-        raise SlamMapError("drawing needs matplotlib: install ccatp with its extra, ccatp[plots]") from error
     beacons = aligned_beacons(track, judged.alignment)
     path = judged.alignment.moved(track.poses[:, :2])
     centre, half = _frame(run, path, beacons)
@@ -58,27 +46,24 @@ def draw_slam(run: RecordedRun, track: Track, judged: Judgement, out: Path, titl
     map_height = (width - 1.3) * float(half[1] / half[0])
     below = 1.9 if known else 0.6
     height = map_height + below + 1.3
-    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
+    figure = new_figure(width, height, DPI, layout=None)
     axes = figure.add_axes((0.75 / width, (below + 0.3) / height, (width - 1.3) / width, map_height / height))
     _draw_paths(axes, run, track, judged, path)
     _draw_beacons(axes, run, beacons)
     axes.set(xlim=(centre[0] - half[0], centre[0] + half[0]), ylim=(centre[1] - half[1], centre[1] + half[1]))
     axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
-    _dress(axes)
+    dress(axes)
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(
         handles, labels, loc="upper left", bbox_to_anchor=(0.68 / width, 1.0 - 0.62 / height), ncols=len(labels),
-        fontsize=8, frameon=False, labelcolor=_INK, columnspacing=1.4, handletextpad=0.5,
+        fontsize=8, frameon=False, labelcolor=INK, columnspacing=1.4, handletextpad=0.5,
     )  # fmt: skip
-    figure.text(0.75 / width, 1.0 - 0.32 / height, title, fontsize=14, color=_INK)
-    figure.text(0.75 / width, 1.0 - 0.58 / height, _figures(judged), fontsize=9, color=_QUIET)
+    figure.text(0.75 / width, 1.0 - 0.32 / height, title, fontsize=14, color=INK)
+    figure.text(0.75 / width, 1.0 - 0.58 / height, _figures(judged), fontsize=9, color=QUIET)
     if known:
         error_axes = figure.add_axes((0.75 / width, 0.55 / height, (width - 1.3) / width, 1.1 / height))
         _draw_error(error_axes, track, judged)
-    try:
-        figure.savefig(out)
-    except (OSError, ValueError) as error:
-        raise SlamMapError(f"{out}: cannot be written: {error}") from error
+    save_figure(figure, out)
 
 
 def ellipse(covariance: FloatArray, sigmas: float) -> FloatArray:
@@ -126,7 +111,7 @@ def _draw_beacons(axes: "Axes", run: RecordedRun, beacons: dict[str, BeaconFix])
             marker="x",
             s=46,
             linewidths=1.6,
-            color=_INK,
+            color=INK,
             zorder=6,
             label="surveyed beacon",
         )
@@ -136,28 +121,18 @@ def _draw_beacons(axes: "Axes", run: RecordedRun, beacons: dict[str, BeaconFix])
         outline = np.array((fix.x_m, fix.y_m)) + ellipse(fix.covariance, SIGMAS)
         axes.plot(*outline.T, color=_MAP, linewidth=1.0, zorder=5)
         axes.annotate(
-            name, (fix.x_m, fix.y_m), xytext=(6, 5), textcoords="offset points", fontsize=8, color=_INK, zorder=8
+            name, (fix.x_m, fix.y_m), xytext=(6, 5), textcoords="offset points", fontsize=8, color=INK, zorder=8
         )
 
 
 def _draw_error(axes: "Axes", track: Track, judged: Judgement) -> None:
     sigma = np.sqrt(np.trace(track.covariances[:, :2, :2], axis1=1, axis2=2))
     t = track.times_s - track.times_s[0]
-    axes.fill_between(t, 0.0, SIGMAS * sigma, color=_GRID, linewidth=0.0, label="3 sigma")
+    axes.fill_between(t, 0.0, SIGMAS * sigma, color=GRID, linewidth=0.0, label="3 sigma")
     axes.plot(t, judged.errors_m, color=_PATH, linewidth=0.8, label="error")
     top = float(np.nanmax(judged.errors_m))
     axes.set(xlim=(0.0, t[-1]), ylim=(0.0, 1.15 * max(top, 1e-6)), xlabel="time, s", ylabel="error, m")
-    _dress(axes)
-
-
-def _dress(axes: "Axes") -> None:
-    axes.tick_params(labelsize=8, color=_QUIET, labelcolor=_INK)
-    axes.xaxis.label.set(fontsize=9, color=_INK)
-    axes.yaxis.label.set(fontsize=9, color=_INK)
-    axes.grid(color=_GRID, linewidth=0.6, zorder=0)
-    axes.set_axisbelow(True)
-    for side in axes.spines.values():
-        side.set_visible(False)
+    dress(axes)
 
 
 def _figures(judged: Judgement) -> str:

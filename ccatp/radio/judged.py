@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.filters.base import FloatArray
-from ccatp.radio.metrics import Consistency, RigidMotion, consistency, nees, rigid_alignment, rms, wrapped
+from ccatp.radio.metrics import Consistency, consistency, nees, rms, wrapped
 from ccatp.radio.recording import RecordedRun, Truth
+from ccatp.radio.rigid_alignment import RigidMotion, best_motion
 from ccatp.radio.track import BeaconFix, Track
 
 LONGEST_GAP_S = 0.5
@@ -57,11 +58,11 @@ def judge(track: Track, run: RecordedRun) -> Judgement:
     places = np.array([(track.beacons[name].x_m, track.beacons[name].y_m) for name in common]).reshape(-1, 2)
     surveyed = np.array([run.beacon_truth_m[name] for name in common]).reshape(-1, 2)
     if known.any():
-        alignment = rigid_alignment(track.poses[known, :2], truth[known, :2])
+        alignment = best_motion(track.poses[known, :2], truth[known, :2])
     elif len(common) > 1:
-        alignment = rigid_alignment(places, surveyed)
+        alignment = best_motion(places, surveyed)
     else:
-        alignment = RigidMotion(0.0, 0.0, 0.0)
+        alignment = RigidMotion(np.eye(2), np.zeros(2))
     errors = np.hypot(*(alignment.moved(track.poses[:, :2]) - truth[:, :2]).T)
     headings = wrapped(track.poses[:, 2] + alignment.angle_rad - truth[:, 2])
     offsets = np.hypot(*(alignment.moved(places) - surveyed).T)

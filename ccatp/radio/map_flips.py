@@ -170,7 +170,7 @@ def _turn_sets(
 def _moved_m(network: RangeNetwork, one_m: FloatArray, other_m: FloatArray) -> float:
     """The largest distance between two maps once one is laid on the other, as its own frame allows."""
     if np.isnan(network.known_m).all():
-        one_m = best_motion(one_m, other_m, mirrors=not network.bodies).apply(one_m)
+        one_m = best_motion(one_m, other_m, mirrors=not network.bodies).moved(one_m)
     return float(np.linalg.norm(one_m - other_m, axis=1).max())
 
 

@@ -70,7 +70,7 @@ class MapModel:
         for body in self.network.bodies:
             motes = list(body.motes)
             motion = best_motion(body.local_m, positions_m[motes])
-            positions[motes] = motion.apply(body.local_m)
+            positions[motes] = motion.moved(body.local_m)
             rotations.append(motion.rotation)
         d = self.network.dimension
         return MapState(positions, np.array(rotations).reshape(-1, d, d), offset_m, scale)

@@ -177,7 +177,7 @@ def _relation(first: Patch, second: Patch, dimension: int) -> tuple[FloatArray, 
     target, source = first.places_m[at_first], second.places_m[at_second]
     centred, other = source - source.mean(axis=0), target - target.mean(axis=0)
     motion = best_motion(source, target, mirrors=True)
-    error = float(((motion.apply(source) - target) ** 2).sum())
+    error = float(((motion.moved(source) - target) ** 2).sum())
     # The best turn of the opposite handedness loses twice the least singular value.
     singular = np.linalg.svd(centred.T @ other, compute_uv=False)
     gap = 4.0 * float(singular[-1])

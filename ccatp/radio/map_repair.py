@@ -88,7 +88,7 @@ def _mapped_anew(network: RangeNetwork, fit: BatchFit, motes: IntArray, settings
         np.concatenate([means.sigmas_m, np.full(len(a), float(means.sigmas_m.min()))]),
         d,
     )
-    start = best_motion(start[at], known[at], mirrors=True).apply(start)
+    start = best_motion(start[at], known[at], mirrors=True).moved(start)
     model = MapModel(part)
     found = fit_map(model, model.state(start), settings)
     places = fit.state.positions_m.copy()

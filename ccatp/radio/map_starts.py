@@ -44,7 +44,7 @@ def _images(network: RangeNetwork, places_m: FloatArray) -> list[FloatArray]:
     """Places in the frame of known motes, or with their mirror image."""
     known = np.isfinite(network.known_m).all(axis=1)
     if known.sum() > network.dimension:
-        return [best_motion(places_m[known], network.known_m[known], mirrors=True).apply(places_m)]
+        return [best_motion(places_m[known], network.known_m[known], mirrors=True).moved(places_m)]
     if not network.bodies and not np.isfinite(network.known_m).any():
         return [places_m]
     flip = np.ones(network.dimension)

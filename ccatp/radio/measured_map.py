@@ -283,8 +283,7 @@ def _framed(found: _Found, motes: list[int], true_m: FloatArray | None) -> tuple
     places = found.positions_m[motes]
     at = (np.array(motes)[:, None] * d + np.arange(d)).ravel()
     motion = plain_frame(places) if true_m is None else best_motion(places, true_m, mirrors=True)
-    turn = np.kron(np.eye(len(motes)), motion.rotation)
-    return motion.apply(places), turn @ found.covariance_m2[np.ix_(at, at)] @ turn.T
+    return motion.moved(places), motion.turned_map(found.covariance_m2[np.ix_(at, at)])
 
 
 def _truth(truth_m: Places, names: tuple[str, ...], dimension: int) -> FloatArray:

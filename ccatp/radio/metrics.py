@@ -1,4 +1,4 @@
-"""Pure. How good a track is: rigid alignment, root mean squares, consistency with its own covariance."""
+"""Pure. How good an estimate is: root mean squares, consistency with its own covariance."""
 
 from typing import NamedTuple
 
@@ -6,45 +6,6 @@ import numpy as np
 from scipy.special import chdtri
 
 from ccatp.filters.base import FloatArray
-
-
-class RigidMotion(NamedTuple):
-    """A rotation about the origin, then a translation; no scale, no reflection.
-
-    Attributes:
-        angle_rad: counter-clockwise.
-        x_m: translation.
-        y_m: translation.
-    """
-
-    angle_rad: float
-    x_m: float
-    y_m: float
-
-    def moved(self, points_m: FloatArray) -> FloatArray:
-        """Points x, y, shape (n, 2), after it."""
-        c, s = np.cos(self.angle_rad), np.sin(self.angle_rad)
-        moved: FloatArray = points_m @ np.array(((c, s), (-s, c))) + np.array((self.x_m, self.y_m))
-        return moved
-
-    def turned(self, covariances: FloatArray) -> FloatArray:
-        """Covariances of points, shape (..., 2, 2), after it."""
-        c, s = np.cos(self.angle_rad), np.sin(self.angle_rad)
-        R = np.array(((c, -s), (s, c)))
-        turned: FloatArray = R @ covariances @ R.T
-        return turned
-
-
-def rigid_alignment(points_m: FloatArray, onto_m: FloatArray) -> RigidMotion:
-    """The rigid motion that lays points (n, 2) on others (n, 2) with the least sum of squares (Umeyama 1991, scale 1).
-
-    In the plane the angle is that of sum conj(p - mean p) (q - mean q), the points as complex numbers. A single point,
-    or points that all fall together, fix the translation alone.
-    """
-    p, q = points_m[:, 0] + 1j * points_m[:, 1], onto_m[:, 0] + 1j * onto_m[:, 1]
-    angle = float(np.angle(np.vdot(p - p.mean(), q - q.mean())))
-    shift = q.mean() - p.mean() * np.exp(1j * angle)
-    return RigidMotion(angle, float(shift.real), float(shift.imag))
 
 
 def rms(errors: FloatArray) -> float | None:

@@ -33,15 +33,14 @@ def pinned_map(
     first, second = int(whole[0]), int(part[0])
     axis = int(np.flatnonzero(is_known[second])[0])
     motion = _onto(positions_m, known_m, first, second, axis)
-    moved = motion.apply(positions_m)
+    moved = motion.moved(positions_m)
     count = len(positions_m)
-    turn = np.kron(np.eye(count), motion.rotation)
     rows = [2 * first, 2 * first + 1, 2 * second + axis]
     modes = rigid_modes(moved)
     K = np.zeros((3, 2 * count))
     K[np.arange(3), rows] = 1.0
     S = np.eye(2 * count) - modes @ np.linalg.solve(K @ modes, K)
-    return moved, S @ (turn @ covariance_m2 @ turn.T) @ S.T
+    return moved, S @ motion.turned_map(covariance_m2) @ S.T
 
 
 def plain_frame(positions_m: FloatArray) -> RigidMotion:

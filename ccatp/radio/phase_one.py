@@ -11,7 +11,7 @@ from ccatp.radio.map_model import MapModel
 from ccatp.radio.mote_plan import MotePlan
 from ccatp.radio.pair_means import PairMeans
 from ccatp.radio.range_network import FloatArray, MappingError, RangeNetwork, build_network
-from ccatp.radio.rigid_alignment import best_motion
+from ccatp.radio.rigid_alignment import RigidMotion, best_motion
 from ccatp.radio.tdoa import MoteRange
 from ccatp.radio.trilateration import DegenerateStep, Sketch, Step
 from ccatp.radio.unfolding import classical_scaling
@@ -60,17 +60,16 @@ def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: in
     for mote in plan.networks[0]:
         sketch.add_by_cosines(mote, origin, axis)
     for (stand, before), (_, after) in pairwise(zip(plan.bodies, plan.networks, strict=True)):
-        shape = best_motion(stand.local_m, sketch.positions_m[list(before)]).apply(stand.local_m)
+        shape = best_motion(stand.local_m, sketch.positions_m[list(before)]).moved(stand.local_m)
         sketch.linearise_at(before, shape)
         for mote in after:
             sketch.add_by_ranges(mote, before)
     up = plan.axes_m[1] / np.linalg.norm(plan.axes_m[1])
     field_from_map = np.column_stack([(up[1], -up[0]), up])
     errors = _errors(sketch, _shaped(plan, sketch.positions_m), means, draws)
-    positions = sketch.positions_m @ field_from_map.T + plan.axes_m[0]
-    turn = np.kron(np.eye(len(plan.names)), field_from_map)
-    bias = errors.bias_m @ field_from_map.T
-    return FirstMap(positions, turn @ errors.covariance_m2 @ turn.T, bias, tuple(sketch.steps), ())
+    motion = RigidMotion(field_from_map, plan.axes_m[0])
+    positions, covariance = motion.moved(sketch.positions_m), motion.turned_map(errors.covariance_m2)
+    return FirstMap(positions, covariance, errors.bias_m @ field_from_map.T, tuple(sketch.steps), ())
 
 
 def _shaped(plan: MotePlan, found_m: FloatArray) -> FloatArray:
@@ -78,7 +77,7 @@ def _shaped(plan: MotePlan, found_m: FloatArray) -> FloatArray:
     places = found_m.copy()
     for stand in plan.bodies:
         motes = list(stand.motes)
-        places[motes] = best_motion(stand.local_m, found_m[motes]).apply(stand.local_m)
+        places[motes] = best_motion(stand.local_m, found_m[motes]).moved(stand.local_m)
     return places
 
 

@@ -19,9 +19,26 @@ class RigidMotion(NamedTuple):
     rotation: FloatArray
     translation_m: FloatArray
 
-    def apply(self, points_m: FloatArray) -> FloatArray:
+    @property
+    def angle_rad(self) -> float:
+        """Of a turn in the plane, counter-clockwise."""
+        return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
+
+    def moved(self, points_m: FloatArray) -> FloatArray:
         """The images of points, shape (n, d)."""
         return points_m @ self.rotation.T + self.translation_m
+
+    def turned(self, covariances_m2: FloatArray) -> FloatArray:
+        """The covariances of the images, shape (..., d, d)."""
+        turned: FloatArray = self.rotation @ covariances_m2 @ self.rotation.T
+        return turned
+
+    def turned_map(self, covariance_m2: FloatArray) -> FloatArray:
+        """The covariance of the images of n points together, shape (n d, n d)."""
+        d = len(self.rotation)
+        n = len(covariance_m2) // d
+        blocks = covariance_m2.reshape(n, d, n, d).swapaxes(1, 2)
+        return self.turned(blocks).swapaxes(1, 2).reshape(n * d, n * d)
 
 
 def best_motion(
@@ -54,7 +71,7 @@ def aligned_rms_m(found_m: FloatArray, true_m: FloatArray, *, mirrors: bool = Fa
         true_m: shape (n, d).
         mirrors: whether a mirror image counts as the same map.
     """
-    moved = best_motion(found_m, true_m, mirrors=mirrors).apply(found_m)
+    moved = best_motion(found_m, true_m, mirrors=mirrors).moved(found_m)
     return rms_m(moved, true_m)
 
 

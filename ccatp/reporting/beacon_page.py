@@ -18,9 +18,10 @@ from ccatp.reporting.beacon_record import (
     readings_of,
     waypoint_rows,
 )
-from ccatp.reporting.html import WIDE, clock, facts, figure, listed, shown, table, text
+from ccatp.reporting.head import chips, foot, head
+from ccatp.reporting.html import WIDE, clock, facts, figure, shown, table, text
 from ccatp.reporting.page import Section, page
-from ccatp.reporting.record import FloatArray
+from ccatp.reporting.record import COMPLETE, FloatArray, Outcome
 from ccatp.reporting.sections import changes_body, events_body
 
 _MILLI = 1e3
@@ -36,8 +37,7 @@ TITLES = {
 def beacon_page(record: BeaconRecord) -> str:
     """The report as one HTML file."""
     sections = [section for make in SECTIONS if (section := make(record)) is not None]
-    foot = f"Made by <code>ccatp report</code> from {text(record.name)}; this file needs nothing else."
-    return page(f"{record.name}: {record.cfg.system}", _head(record), sections, foot)
+    return page(f"{record.name}: {record.cfg.system}", _head(record), sections, foot(record))
 
 
 def beacon_figures(record: BeaconRecord) -> dict[str, Picture]:
@@ -55,7 +55,7 @@ def beacon_figures(record: BeaconRecord) -> dict[str, Picture]:
 
 def beacon_data(record: BeaconRecord) -> dict[str, Any]:
     """What ``ccatp report --json`` tells of it; lengths in m, null is not known."""
-    outcome, cause = outcome_of(record)
+    outcome = outcome_of(record)
     errors = _settled(record, pose_errors_m(record))
     rows = waypoint_rows(record)
     known = [row for row in rows if row.sigmas is not None]
@@ -67,8 +67,8 @@ def beacon_data(record: BeaconRecord) -> dict[str, Any]:
         "system": record.cfg.system,
         "simulation": record.is_simulation,
         "seed": record.cfg.run.seed,
-        "outcome": outcome,
-        "cause": cause,
+        "outcome": outcome.text,
+        "cause": outcome.cause,
         "waypoints": {
             "total": 0
             if record.cfg.follow.is_active
@@ -92,38 +92,21 @@ def beacon_data(record: BeaconRecord) -> dict[str, Any]:
     }
 
 
-def outcome_of(record: BeaconRecord) -> tuple[str, str]:
+def outcome_of(record: BeaconRecord) -> Outcome:
     """How it ended, and why."""
     if record.summary is not None:
         outcome = str(record.summary.get("outcome") or "")
         cause = str(record.summary.get("cause") or "")
-        return outcome or "ended before its goal", cause
+        return Outcome(outcome or "ended before its goal", cause, outcome == COMPLETE)
     last = record.statuses[-1] if record.statuses else None
     if last is None:
-        return "not known", ""
-    return (last.outcome or f"goes on, or was killed: {last.state}"), last.cause
+        return Outcome("not known", "", False)
+    return Outcome(last.outcome or f"goes on, or was killed: {last.state}", last.cause, last.outcome == COMPLETE)
 
 
 def _head(record: BeaconRecord) -> str:
-    outcome, cause = outcome_of(record)
-    is_good = outcome == "complete"
-    began = next((line.wall[:19].replace("T", " ") + " UTC" for line in record.log if line.wall), "")
-    if record.is_simulation:
-        chip = f'<span class="chip sim">SIMULATION, seed {record.cfg.run.seed}</span>'
-    else:
-        known = "real robot" if record.is_simulation is False else "robot or simulation: no recording tells"
-        chip = f'<span class="chip">{known}</span>'
-    boxes = "".join(
-        f'<div class="box"><strong>{title}</strong>{listed(lines)}</div>'
-        for title, lines in (("Not in this run", record.missing), ("Warnings", record.warnings))
-        if lines
-    )
-    return (
-        f"{chip}<h1>{text(TITLES[record.cfg.system])}</h1>"
-        f'<p class="quiet">{text(record.name)}{f", begun {text(began)}" if began else ""}</p>'
-        f'<p><strong class="{"good" if is_good else "bad"}">{text(outcome)}</strong>'
-        f"{f': {text(cause)}' if cause else ''}</p>{boxes}{facts(_headline(record))}"
-    )
+    chip = chips(record.is_simulation, f"seed {record.cfg.run.seed}")
+    return head(record, chip, TITLES[record.cfg.system], outcome_of(record), record.warnings, _headline(record))
 
 
 def _headline(record: BeaconRecord) -> dict[str, str]:

@@ -2,85 +2,32 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ccatp.config.radio_models import RadioConfig
-from ccatp.reporting.record import FloatArray, LogLine
+from ccatp.radio.metrics import nees
+from ccatp.reporting.record import FloatArray, RunFiles
+from ccatp.wire.beacon_rows import PoseTrack, PoseTruth, pose_errors
 from ccatp.wire.topics import BeaconArrival, BeaconEllipse, BeaconMap, DangerEvent, MissionStatus
 
-TRACK_COLUMNS, TRUTH_COLUMNS = 13, 8
 
-
-class PoseTrack(NamedTuple):
-    """Estimates of k frames, in the frame of the room.
-
-    Attributes:
-        seq, t_s: frames and robot time, shape (k,).
-        place_m: x, y, shape (k, 2).
-        heading_rad: shape (k,).
-        covariance: of x, y, heading, shape (k, 3, 3).
-        reckoned_m: where dead reckoning alone would see the robot, shape (k, 2).
-    """
-
-    seq: FloatArray
-    t_s: FloatArray
-    place_m: FloatArray
-    heading_rad: FloatArray
-    covariance: FloatArray
-    reckoned_m: FloatArray
-
-    @property
-    def sigma_m(self) -> FloatArray:
-        """Standard deviation of the place in its worst direction, shape (k,)."""
-        return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(self.covariance[:, :2, :2])[:, -1], 0.0)))
-
-
-class PoseTruth(NamedTuple):
-    """The simulated truth in the same frames.
-
-    Attributes:
-        place_m: x, y, shape (k, 2); NaN where a frame has none.
-        heading_rad: shape (k,).
-        target_m: the radio that moves, shape (k, 2).
-        clearance_m: of the body to the nearest obstacle, shape (k,).
-    """
-
-    place_m: FloatArray
-    heading_rad: FloatArray
-    target_m: FloatArray
-    clearance_m: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BeaconRecord:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class BeaconRecord(RunFiles):
     """A mission among beacons.
 
     Attributes:
-        name: how the reader called it: its directory.
         version: of the program that recorded it.
-        cfg, config_text: configuration, and its file.
-        changed: keys with another value than the shipped one: value of the run, and shipped value.
-        is_simulation: None where there is no recording to tell.
-        summary: ``summary.json``; None where the run did not come to write one.
+        cfg: configuration.
         track: estimates of all frames.
-        truth: in the same frames; None on a real robot.
+        truth: in the same frames, NaN where there is none; None on a real robot.
         maps, arrivals, statuses, verdicts: messages in the order of recording.
         places: where the beacons really are.
-        log: what the processes said, without what they said for debugging.
-        files: names and sizes in bytes.
-        missing: what a complete run would hold and this one does not, one line each.
-        warnings: what is damaged, one line each.
     """
 
-    name: str
     version: str
     cfg: RadioConfig
-    config_text: str
-    changed: Mapping[str, tuple[object, object]]
-    is_simulation: bool | None
-    summary: Mapping[str, Any] | None
     track: PoseTrack
     truth: PoseTruth | None
     maps: tuple[BeaconMap, ...]
@@ -88,10 +35,6 @@ class BeaconRecord:
     statuses: tuple[MissionStatus, ...]
     verdicts: tuple[DangerEvent, ...]
     places: Mapping[str, tuple[float, float]]
-    log: tuple[LogLine, ...]
-    files: Mapping[str, int]
-    missing: tuple[str, ...]
-    warnings: tuple[str, ...]
 
     @property
     def beacons(self) -> dict[str, BeaconEllipse]:
@@ -109,20 +52,6 @@ class BeaconRecord:
         return self.maps[-1].notes.get("map_time_s", 0.0) if self.maps else 0.0
 
 
-def pose_track(rows: FloatArray) -> PoseTrack:
-    """Rows of the topic ``beacon_track``, shape (k, 13)."""
-    P = rows[:, [5, 6, 8, 6, 7, 9, 8, 9, 10]].reshape(-1, 3, 3)
-    return PoseTrack(rows[:, 0], rows[:, 1], rows[:, 2:4], rows[:, 4], P, rows[:, 11:13])
-
-
-def pose_truth(rows: FloatArray, seq: FloatArray) -> PoseTruth:
-    """Rows of the topic ``beacon_truth``, shape (j, 8), at the frames of an estimate, shape (k,)."""
-    found = np.full((len(seq), TRUTH_COLUMNS), np.nan)
-    _, here, there = np.intersect1d(seq, rows[:, 0], return_indices=True)
-    found[here] = rows[there]
-    return PoseTruth(found[:, 2:4], found[:, 4], found[:, 5:7], found[:, 7])
-
-
 def pose_errors_m(record: BeaconRecord) -> FloatArray | None:
     """Distance of the estimated place from the true one, shape (k,); None where nobody knows the truth."""
     if record.truth is None:
@@ -134,12 +63,7 @@ def pose_nees(record: BeaconRecord) -> FloatArray | None:
     """e^T P^-1 e of x, y and heading, shape (k,); 3 is expected. None where nobody knows the truth."""
     if record.truth is None:
         return None
-    turn = record.track.heading_rad - record.truth.heading_rad
-    turn = np.arctan2(np.sin(turn), np.cos(turn))
-    errors = np.column_stack([record.track.place_m - record.truth.place_m, turn])
-    return np.asarray(
-        np.einsum("ni,ni->n", errors, np.linalg.solve(record.track.covariance, errors[:, :, None])[..., 0])
-    )
+    return nees(pose_errors(record.track, record.truth), record.track.covariance)
 
 
 class Reading(NamedTuple):

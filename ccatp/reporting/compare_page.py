@@ -10,13 +10,13 @@ from ccatp.drawing.shapes import Picture
 from ccatp.reporting.compare_figures import change_figure, distribution_figure, errors_figure
 from ccatp.reporting.data import run_data
 from ccatp.reporting.findings import Findings
+from ccatp.reporting.head import gaps
 from ccatp.reporting.html import WIDE, Cell, figure, folded, shown, table, text
 from ccatp.reporting.page import Section, page
 from ccatp.reporting.panel_changes import Changes, PanelChange, panel_changes
 from ccatp.reporting.path_figure import point_text
 from ccatp.reporting.record import changed_keys
-from ccatp.reporting.run_page import chips
-from ccatp.reporting.sections import gaps
+from ccatp.reporting.run_page import survey_chips
 from ccatp.reporting.time_figure import time_figure
 
 _MICRO = 1e6
@@ -61,7 +61,8 @@ def _introduced(letter: str, found: Findings) -> str:
     cause = f": {text(outcome.cause)}" if outcome.cause else ""
     kind = "good" if outcome.is_good else "bad"
     name = f"<strong>{letter}</strong> {text(found.record.name)}, {text(found.record.mirror.name)}"
-    return f"<p>{chips(found.record)} {name}, <span class='{kind}'>{text(outcome.text)}</span>{cause}</p>{gaps(found)}"
+    boxes = gaps(found.record, found.warnings)
+    return f"<p>{survey_chips(found.record)} {name}, <span class='{kind}'>{text(outcome.text)}</span>{cause}</p>{boxes}"
 
 
 def compared_figures(pair: Pair) -> dict[str, tuple[float | None, float | None]]:

@@ -1,24 +1,13 @@
 """Pure. Everything that is thought out about a run, once, for the page, the figures and the data alike."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from ccatp.aligning.comparison import Comparison, compare
 from ccatp.aligning.survey_result import SurveyResult, survey_result
 from ccatp.reporting.errors import ErrorFigures, ErrorSeries, error_figures, error_series
 from ccatp.reporting.points import Grade, PointVerdict, point_verdicts
-from ccatp.reporting.record import RunRecord
+from ccatp.reporting.record import COMPLETE, Outcome, RunRecord
 from ccatp.reporting.time_budget import TimeBudget, time_budget
-
-COMPLETE = "complete"
-
-
-class Outcome(NamedTuple):
-    """How a run ended, in a few words; why, where somebody said so; and whether that is as it should be."""
-
-    text: str
-    cause: str
-    is_good: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +32,11 @@ class Findings:
     budget: TimeBudget | None
     alignment: SurveyResult | None
     against: Comparison | None
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is damaged in the run, and doubtful in its alignment."""
+        return self.record.warnings + (self.alignment.warnings if self.alignment is not None else ())
 
     @property
     def has_failed(self) -> bool:

@@ -16,6 +16,7 @@ from ccatp.wire.topics import DangerEvent, FixMessage, MissionStatus
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+COMPLETE = "complete"
 WITHIN_MM = 10.0  # the thesis's requirement on arrivals
 
 
@@ -110,21 +111,24 @@ class PlannedRow(NamedTuple):
     t_s: float | None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RunRecord:
-    """A run.
+class Outcome(NamedTuple):
+    """How a run ended, in a few words; why, where somebody said so; and whether that is as it should be."""
+
+    text: str
+    cause: str
+    is_good: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class RunFiles:
+    """What every run leaves behind, whatever its mission.
 
     Attributes:
         name: how the reader called it: its directory.
-        cfg, config_text: configuration, and its file.
+        config_text: its configuration file.
         changed: keys with another value than the shipped one: value of the run, and shipped value.
-        mirror: the mirror.
         is_simulation: None where there is no recording to tell.
         summary: ``summary.json``; None where the run did not come to write one.
-        sessions: recordings, oldest first.
-        points: of the mission database, by row, column and number; None where there is none.
-        measured: points with a sound fix.
-        injected: piston (m), tip and tilt (rad) of the simulated panels.
         log: what the processes said, without what they said for debugging.
         files: names and sizes in bytes.
         missing: what a complete run would hold and this one does not, one line each.
@@ -132,20 +136,35 @@ class RunRecord:
     """
 
     name: str
-    cfg: Config
     config_text: str
     changed: Mapping[str, tuple[object, object]]
-    mirror: Mirror
     is_simulation: bool | None
     summary: Mapping[str, Any] | None
-    sessions: tuple[Session, ...]
-    points: tuple[PlannedRow, ...] | None
-    measured: tuple[Measured, ...]
-    injected: Mapping[PanelId, Vector3] | None
     log: tuple[LogLine, ...]
     files: Mapping[str, int]
     missing: tuple[str, ...]
     warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class RunRecord(RunFiles):
+    """A survey.
+
+    Attributes:
+        cfg: configuration.
+        mirror: the mirror.
+        sessions: recordings, oldest first.
+        points: of the mission database, by row, column and number; None where there is none.
+        measured: points with a sound fix.
+        injected: piston (m), tip and tilt (rad) of the simulated panels.
+    """
+
+    cfg: Config
+    mirror: Mirror
+    sessions: tuple[Session, ...]
+    points: tuple[PlannedRow, ...] | None
+    measured: tuple[Measured, ...]
+    injected: Mapping[PanelId, Vector3] | None
 
     @property
     def last_status(self) -> MissionStatus | None:

@@ -3,12 +3,13 @@
 from ccatp.drawing.shapes import Picture
 from ccatp.reporting.error_figure import error_figure
 from ccatp.reporting.findings import Findings
-from ccatp.reporting.html import WIDE, facts, shown, text
+from ccatp.reporting.head import chips, foot, head
+from ccatp.reporting.html import WIDE, shown
 from ccatp.reporting.page import page
 from ccatp.reporting.path_figure import path_figure
 from ccatp.reporting.points import Grade
 from ccatp.reporting.record import WITHIN_MM, RunRecord
-from ccatp.reporting.sections import duration, gaps, sections_of
+from ccatp.reporting.sections import duration, sections_of
 from ccatp.reporting.surface_figure import surface_figure
 from ccatp.reporting.time_figure import time_figure
 
@@ -18,31 +19,17 @@ _MICRO = 1e6
 def run_page(found: Findings) -> str:
     """The report as one HTML file."""
     record = found.record
-    title = f"{record.name}: {record.mirror.name}"
-    foot = f"Made by <code>ccatp report</code> from {text(record.name)}; this file needs nothing else."
-    return page(title, _head(found), sections_of(found), foot)
+    return page(f"{record.name}: {record.mirror.name}", _head(found), sections_of(found), foot(record))
 
 
 def _head(found: Findings) -> str:
-    record, outcome = found.record, found.outcome
-    cause = f": {text(outcome.cause)}" if outcome.cause else ""
-    began = next((line.wall[:19].replace("T", " ") + " UTC" for line in record.log if line.wall), "")
-    return (
-        f"{chips(record)}<h1>Survey of {text(record.mirror.name)}</h1>"
-        f'<p class="quiet">{text(record.name)}{f", begun {text(began)}" if began else ""}</p>'
-        f'<p><strong class="{"good" if outcome.is_good else "bad"}">{text(outcome.text)}</strong>{cause}</p>'
-        f"{gaps(found)}{facts(headline(found))}"
-    )
+    record, title = found.record, f"Survey of {found.record.mirror.name}"
+    return head(record, survey_chips(record), title, found.outcome, found.warnings, headline(found))
 
 
-def chips(record: RunRecord) -> str:
-    """What kind of run it was, so that nobody takes a simulation for the telescope."""
-    if record.is_simulation:
-        return (
-            f'<span class="chip sim">SIMULATION, world {text(record.cfg.world.name)}, seed {record.cfg.run.seed}</span>'
-        )
-    known = "real robot" if record.is_simulation is False else "robot or simulation: no recording tells"
-    return f'<span class="chip">{known}</span>'
+def survey_chips(record: RunRecord) -> str:
+    """What kind of survey it was."""
+    return chips(record.is_simulation, f"world {record.cfg.world.name}, seed {record.cfg.run.seed}")
 
 
 def headline(found: Findings) -> dict[str, str]:

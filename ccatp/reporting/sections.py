@@ -6,7 +6,7 @@ from typing import Any
 
 from ccatp.reporting.error_figure import error_figure
 from ccatp.reporting.findings import Findings
-from ccatp.reporting.html import clock, facts, figure, folded, listed, shown, table, text
+from ccatp.reporting.html import clock, facts, figure, folded, shown, table, text
 from ccatp.reporting.page import Section
 from ccatp.reporting.panel_section import panel_section
 from ccatp.reporting.path_figure import path_figure, point_text
@@ -238,18 +238,6 @@ SECTIONS: tuple[Callable[[Findings], Section | None], ...] = (
 def sections_of(found: Findings) -> list[Section]:
     """The sections that the run holds something for."""
     return [section for make in SECTIONS if (section := make(found)) is not None]
-
-
-def gaps(found: Findings) -> str:
-    """What is missing or damaged, as a box; empty where all is there."""
-    record = found.record
-    warnings = [*record.warnings, *(found.alignment.warnings if found.alignment is not None else ())]
-    box = ""
-    if record.missing:
-        box += f'<div class="box"><strong>Not in this run</strong>{listed(record.missing)}</div>'
-    if warnings:
-        box += f'<div class="box"><strong>Warnings</strong>{listed(warnings)}</div>'
-    return box
 
 
 def duration(found: Findings) -> str:

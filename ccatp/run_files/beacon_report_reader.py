@@ -7,12 +7,13 @@ import numpy as np
 
 from ccatp.config.radio_loader import load_radio_config
 from ccatp.config.radio_models import RadioConfig
-from ccatp.reporting.beacon_record import TRACK_COLUMNS, TRUTH_COLUMNS, BeaconRecord, pose_track, pose_truth
+from ccatp.reporting.beacon_record import BeaconRecord
 from ccatp.reporting.record import FloatArray, changed_keys
 from ccatp.run_files.recorder import iter_messages, read_metadata, recordings
 from ccatp.run_files.report_reader import LOG, SUMMARY, files_of, read_summary
 from ccatp.run_files.run_reader import CONFIG, TELEMETRY
 from ccatp.run_files.state_log import read_log
+from ccatp.wire.beacon_rows import TRACK_COLUMNS, TRUTH_COLUMNS, pose_track, pose_truth, table, truth_in
 from ccatp.wire.topics import (
     BadMessage,
     BeaconArrival,
@@ -63,7 +64,7 @@ def read_beacon_record(run_dir: Path) -> BeaconRecord:
         is_simulation=found.is_simulation,
         summary=read_summary(run_dir / SUMMARY, missing, warnings),
         track=pose_track(track),
-        truth=pose_truth(_ordered(found.truth, TRUTH_COLUMNS), track[:, 0]) if found.truth else None,
+        truth=truth_in(pose_truth(_ordered(found.truth, TRUTH_COLUMNS)), track[:, 0]) if found.truth else None,
         maps=tuple(found.maps),
         arrivals=tuple(found.arrivals),
         statuses=tuple(found.statuses),
@@ -113,9 +114,9 @@ class _Collected:
 
     def _take(self, message: object) -> None:
         if isinstance(message, BeaconTrack):
-            self.track.append(_table(message.rows, TRACK_COLUMNS))
+            self.track.append(table(message.rows, TRACK_COLUMNS))
         elif isinstance(message, BeaconTruth):
-            self.truth.append(_table(message.rows, TRUTH_COLUMNS))
+            self.truth.append(table(message.rows, TRUTH_COLUMNS))
         elif isinstance(message, BeaconPlaces):
             self.places = message.places
         elif isinstance(message, BeaconMap):
@@ -126,11 +127,6 @@ class _Collected:
             self.statuses.append(message)
         elif isinstance(message, DangerEvent):
             self.verdicts.append(message)
-
-
-def _table(rows: Sequence[Sequence[float | None]], columns: int) -> FloatArray:
-    filled = [[np.nan if value is None else value for value in row] for row in rows]
-    return np.array(filled, dtype=np.float64).reshape(-1, columns)
 
 
 def _ordered(batches: Sequence[FloatArray], columns: int) -> FloatArray:

@@ -7,20 +7,17 @@ it, with one report.
 
 import json
 import os
-import struct
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, McapRecord, Message, Metadata
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
-from zstandard import ZstdError
 
-from ccatp.run_files.recording_scan import told
+from ccatp.run_files.recording_scan import DAMAGE, told
 
 CHUNK_BYTES = 16 * 1024
 FLUSH_AFTER_S = 1.0  # of message time: slow topics do not wait for a full chunk
@@ -29,18 +26,6 @@ _METADATA = "ccatp"
 _SIMULATION = "simulation"
 _MAX_T_S = 1e9  # thirty years of uptime: anything beyond is not a time since boot
 _NS = 1e9
-
-# What the reader of the format raises on bytes that are not what they should be.
-_DAMAGE = (
-    McapError,
-    CRCValidationError,
-    ZstdError,
-    struct.error,
-    ValueError,
-    ArithmeticError,
-    LookupError,
-    MemoryError,
-)
 
 
 class RecordedMessage(NamedTuple):
@@ -244,7 +229,7 @@ def _iter_records(path: Path, on_damage: Callable[[str], None] | None) -> Iterat
                 inner = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]
             except StopIteration:
                 return
-            except _DAMAGE as error:
+            except DAMAGE as error:
                 if on_damage is not None:
                     on_damage(f"{path}: damaged or cut off before byte {file.tell()}: {told(error)}")
                 return

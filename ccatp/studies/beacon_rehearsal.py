@@ -15,6 +15,15 @@ from ccatp.samples import Verdict
 from ccatp.sim.beacon_truth import BeaconTruthLog
 from ccatp.sim.beacon_world import build_beacon_robot, motes_of
 from ccatp.wire.beacon_frame import decode_beacon_frame
+from ccatp.wire.beacon_rows import (
+    TRACK_COLUMNS,
+    TRUTH_COLUMNS,
+    PoseTrack,
+    PoseTruth,
+    pose_track,
+    pose_truth,
+    table,
+)
 from ccatp.wire.robot import Sensors, decode_from_robot
 from ccatp.wire.topics import Estimate, is_estimate_due
 
@@ -42,6 +51,11 @@ class BeaconRehearsal:
     truth: list[Any] = field(default_factory=list)
     outcome: str = ""
     cause: str = ""
+
+    @property
+    def poses(self) -> tuple[PoseTrack, PoseTruth]:
+        """Estimates and truth as arrays."""
+        return pose_track(table(self.track, TRACK_COLUMNS)), pose_truth(table(self.truth, TRUTH_COLUMNS))
 
 
 class BeaconStage:

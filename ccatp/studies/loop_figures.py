@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ccatp.studies.loop_models import Loop, LoopsError, Margins, response, root_locus
+from ccatp.studies.figures import INK, QUIET, dress, new_figure, save
+from ccatp.studies.loop_models import Loop, Margins, response, root_locus
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-_INK, _QUIET, _GRID = "#1f2933", "#6b7785", "#e3e8ed"
 _COLOURS = {"printed": "#d08c00", "true": "#123f6d"}
 _PLANTS = {"printed": "1/(Ts+1)", "true": "1/(s(Ts+1))"}
 _DASHES = ("-", "--", ":")  # by the order of the delays
@@ -29,9 +28,9 @@ def draw_bode(loops: Sequence[Loop], margins: Sequence[Margins], out: Path) -> N
     """Draw magnitude and phase of the loops of one controller into ``bode_<gains>_<axis>.png`` and ``.pdf``.
 
     Raises:
-        LoopsError: matplotlib is not installed.
+        CampaignError: matplotlib is not installed.
     """
-    figure = _figure(8.0, 6.4)
+    figure = new_figure(8.0, 6.4)
     upper, lower = figure.subplots(2, 1, sharex=True)
     crossovers = [m.gain_crossover_rad_s for m in margins if np.isfinite(m.gain_crossover_rad_s)]
     centre = np.log10(max(crossovers, default=1.0))
@@ -45,8 +44,8 @@ def draw_bode(loops: Sequence[Loop], margins: Sequence[Margins], out: Path) -> N
         if np.isfinite(found.gain_crossover_rad_s):
             at = response(loop, np.geomspace(1e-4, found.gain_crossover_rad_s, 400))[1][-1]
             lower.plot(found.gain_crossover_rad_s, degrees(at), "o", color=_COLOURS[loop.plant], markersize=4)
-    upper.axhline(0.0, color=_QUIET, linewidth=0.8)
-    lower.axhline(-180.0, color=_QUIET, linewidth=0.8)
+    upper.axhline(0.0, color=QUIET, linewidth=0.8)
+    lower.axhline(-180.0, color=QUIET, linewidth=0.8)
     lower.set_ylim(-290.0, 10.0)
     lower.set_yticks(range(-270, 1, 45))
     upper.set_ylabel("magnitude, dB")
@@ -54,19 +53,20 @@ def draw_bode(loops: Sequence[Loop], margins: Sequence[Margins], out: Path) -> N
     lower.set_xlabel("frequency, rad/s")
     upper.set_title(f"Open loop, {loops[0].axis}, gains “{loops[0].gains}”, T = {loops[0].lag_s:g} s")
     lower.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, frameon=False, fontsize=8)
-    _dress(upper, lower)
-    _save(figure, out / f"bode_{loops[0].gains}_{loops[0].axis}")
+    dress(upper, lower, grid="both")
+    save(figure, out / f"bode_{loops[0].gains}_{loops[0].axis}")
 
 
 def draw_locus(loops: Sequence[Loop], out: Path) -> None:
     """Draw the root loci, each plant without and with the longest delay: ``rlocus_<gains>_<axis>.png`` and ``.pdf``.
 
     Raises:
-        LoopsError: matplotlib or python-control is not installed.
+        CampaignError: matplotlib is not installed.
+        LoopsError: python-control is not installed.
     """
     ends = {min(loop.delay_frames for loop in loops), max(loop.delay_frames for loop in loops)}
     shown = [loop for loop in loops if loop.delay_frames in ends]
-    figure = _figure(3.6 * len(shown), 5.6)
+    figure = new_figure(3.6 * len(shown), 5.6)
     panels = figure.subplots(1, len(shown), squeeze=False)[0]
     for axes, loop in zip(panels, shown, strict=True):
         _draw_poles(axes, loop)
@@ -74,8 +74,8 @@ def draw_locus(loops: Sequence[Loop], out: Path) -> None:
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
     figure.suptitle(f"Root locus, {loops[0].axis}, gains “{loops[0].gains}”, T = {loops[0].lag_s:g} s")
-    _dress(*panels)
-    _save(figure, out / f"rlocus_{loops[0].gains}_{loops[0].axis}")
+    dress(*panels, grid="both")
+    save(figure, out / f"rlocus_{loops[0].gains}_{loops[0].axis}")
 
 
 def _draw_poles(axes: "Axes", loop: Loop) -> None:
@@ -83,8 +83,8 @@ def _draw_poles(axes: "Axes", loop: Loop) -> None:
     colour = _COLOURS[loop.plant]
     axes.plot(loci.real, loci.imag, ".", color=colour, markersize=1.5)
     zeros, poles, closed = np.roots(loop.numerator), np.roots(loop.denominator), root_locus(loop, np.array([1.0]))[0]
-    axes.plot(poles.real, poles.imag, "x", color=_INK, markersize=8, label="open-loop pole")
-    axes.plot(zeros.real, zeros.imag, "o", color=_INK, markersize=8, fillstyle="none", label="open-loop zero")
+    axes.plot(poles.real, poles.imag, "x", color=INK, markersize=8, label="open-loop pole")
+    axes.plot(zeros.real, zeros.imag, "o", color=INK, markersize=8, fillstyle="none", label="open-loop zero")
     axes.plot(closed.real, closed.imag, "s", color=colour, markersize=5, label="closed-loop pole at the set gain")
     axes.axvspan(0.0, 1e4, color="#d64545", alpha=0.06, linewidth=0, label="unstable")
     size = _WINDOW_CORNERS / loop.lag_s
@@ -100,25 +100,3 @@ def _style(loops: Sequence[Loop], loop: Loop) -> str:
 def _label(loop: Loop, found: Margins) -> str:
     gain = f"{found.gain_db:.0f} dB" if np.isfinite(found.gain_db) else "∞"
     return f"{_PLANTS[loop.plant]}, {loop.delay_frames} frames: {degrees(found.phase_rad):.0f}°, {gain}"
-
-
-def _figure(width_in: float, height_in: float) -> "Figure":
-    try:
-        from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second, and belongs to an extra
-    except ImportError as error:
-        raise LoopsError("drawing needs matplotlib: install ccatp[plots]") from error
-    return Figure(figsize=(width_in, height_in), dpi=160, facecolor="white", layout="constrained")
-
-
-def _dress(*panels: "Axes") -> None:
-    for axes in panels:
-        axes.grid(True, which="both", color=_GRID, linewidth=0.6)
-        axes.set_axisbelow(True)
-        axes.tick_params(labelsize=8, color=_QUIET, labelcolor=_INK)
-        for side in axes.spines.values():
-            side.set_color(_GRID)
-
-
-def _save(figure: "Figure", stem: Path) -> None:
-    figure.savefig(stem.with_suffix(".png"))
-    figure.savefig(stem.with_suffix(".pdf"), metadata={"CreationDate": None})  # the same result, the same bytes

@@ -8,16 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from ccatp.radio.metrics import nees
 from ccatp.studies.beacon_rehearsal import rehearse_beacons
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
 from ccatp.studies.figures import INK, LIMIT, QUIET, colour, dress, new_figure, save
+from ccatp.wire.beacon_rows import PoseTrack, PoseTruth, pose_errors
 
 FloatArray = NDArray[np.float64]
 
 SECOND = 10  # frames; errors are compared once in so many
 _STATES = 3  # x, y, heading
 _BAND = 0.95
-_XX, _XY, _YY, _XH, _YH, _HH = range(5, 11)
 
 
 def run_job(job: Job) -> Outcome:
@@ -36,30 +37,25 @@ def run_job(job: Job) -> Outcome:
         "updates": summary["map"]["map_updates"],
     }
     begin_s = summary["map"]["map_time_s"]
-    return Outcome(values, seconds_of(np.array(found.track), np.array(found.truth, dtype=np.float64), begin_s))
+    return Outcome(values, seconds_of(*found.poses, begin_s))
 
 
-def seconds_of(track: FloatArray, truth: FloatArray, begin_s: float) -> dict[str, FloatArray]:
+def seconds_of(track: PoseTrack, truth: PoseTruth, begin_s: float) -> dict[str, FloatArray]:
     """Errors of the pose, once a second.
 
     Args:
-        track: rows of ``beacon_track``.
-        truth: rows of ``beacon_truth``.
+        track: estimates.
+        truth: what was true.
         begin_s: robot time of the first that counts.
 
     Returns:
         ``nees`` of the pose, ``error_m`` of the position, ``sigma_m``, root of the trace of its covariance.
     """
-    _, i, j = np.intersect1d(track[:, 0], truth[:, 0], return_indices=True)
-    track, truth = track[i], truth[j]
-    counts = track[:, 1] >= begin_s
-    track, truth = track[counts][::SECOND], truth[counts][::SECOND]
-    turn = track[:, 4] - truth[:, 4]
-    errors = np.column_stack([track[:, 2:4] - truth[:, 2:4], np.arctan2(np.sin(turn), np.cos(turn))])
-    P = track[:, [_XX, _XY, _XH, _XY, _YY, _YH, _XH, _YH, _HH]].reshape(-1, _STATES, _STATES)
-    nees = np.einsum("ni,ni->n", errors, np.linalg.solve(P, errors[:, :, None])[:, :, 0])
+    known = np.intersect1d(track.seq[track.t_s >= begin_s], truth.seq, return_indices=True)[0][::SECOND]
+    track, truth = track.at(np.isin(track.seq, known)), truth.at(np.isin(truth.seq, known))
+    errors, P = pose_errors(track, truth), track.covariance
     return {
-        "nees": nees,
+        "nees": nees(errors, P),
         "error_m": np.hypot(errors[:, 0], errors[:, 1]),
         "sigma_m": np.sqrt(P[:, 0, 0] + P[:, 1, 1]),
     }
@@ -70,11 +66,11 @@ def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
     del factors
     runs = [outcome.values for outcome in outcomes]
     length = min(len(outcome.arrays["nees"]) for outcome in outcomes)
-    nees, errors, sigmas = (
+    squares, errors, sigmas = (
         np.array([outcome.arrays[key][:length] for outcome in outcomes]) for key in ("nees", "error_m", "sigma_m")
     )
     low, high = band(len(outcomes))
-    each = nees.mean(axis=0) / _STATES
+    each = squares.mean(axis=0) / _STATES
     readings = sum(run["readings"] for run in runs)
     values: dict[str, Any] = {
         "complete": sum(run["outcome"] == "complete" for run in runs),

@@ -22,8 +22,7 @@ def pictured(campaign: MoteCampaign, seed: int) -> tuple[MapPicture, Traces | No
     positions_m, covariance_m2 = run.positions_m, run.covariance_m2
     if run.is_aligned:  # its frame is its own: moved onto the truth, for the eye
         motion = best_motion(run.positions_m, run.true_m, mirrors=True)
-        turn = np.kron(np.eye(len(run.names)), motion.rotation)
-        positions_m, covariance_m2 = motion.apply(positions_m), turn @ covariance_m2 @ turn.T
+        positions_m, covariance_m2 = motion.moved(positions_m), motion.turned_map(covariance_m2)
     pairs = np.array(_pairs(campaign, run), dtype=np.intp).reshape(-1, 2)
     picture = MapPicture(run.names, positions_m, covariance_m2, run.true_m, pairs, run.doubtful, title)
     if campaign.method != "ekf":

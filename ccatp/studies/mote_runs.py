@@ -306,15 +306,13 @@ def _in_field(cfg: CricketConfig, field: SimulatedField, found: MoteMap) -> tupl
     plan = field.plan
     if not plan.anchors:
         motion = plain_frame(found.positions_m)
-        turn = np.kron(np.eye(len(plan.names)), motion.rotation)
-        return motion.apply(found.positions_m), turn @ found.covariance_m2 @ turn.T
+        return motion.moved(found.positions_m), motion.turned_map(found.covariance_m2)
     up = plan.axes_m[1] / np.linalg.norm(plan.axes_m[1])
     origin, axis = plan.anchors
     way = found.positions_m[axis] - found.positions_m[origin]
     wanted = np.array([plan.axes_m[0], plan.axes_m[0] + up * np.linalg.norm(way)])
     motion = best_motion(found.positions_m[[origin, axis]], wanted)
-    turn = np.kron(np.eye(len(plan.names)), motion.rotation)
-    positions, covariance = motion.apply(found.positions_m), turn @ found.covariance_m2 @ turn.T
+    positions, covariance = motion.moved(found.positions_m), motion.turned_map(found.covariance_m2)
     if np.isfinite(plan.surveyed_m).sum() == 3:
         return pinned_map(positions, covariance, plan.surveyed_m)
     return positions, covariance

@@ -74,14 +74,14 @@ def _cell(size: int, seed: int) -> dict[str, Any]:
     found = map_motes(network, BatchSettings(_ROBUST), mirrors=folds.mirrors)
     mapped_s = time.perf_counter()
     errors = np.linalg.norm(
-        best_motion(found.positions_m, true_m, mirrors=True).apply(found.positions_m) - true_m, axis=1
+        best_motion(found.positions_m, true_m, mirrors=True).moved(found.positions_m) - true_m, axis=1
     )
     in_doubt = {mote for _, motes in folds.mirrors for mote in motes} | {
         mote for fold in found.folds for mote in fold.motes
     }
     sure = [mote for mote in range(network.count) if mote not in in_doubt]
     held = (
-        best_motion(found.positions_m[sure], true_m[sure], mirrors=True).apply(found.positions_m[sure]) - true_m[sure]
+        best_motion(found.positions_m[sure], true_m[sure], mirrors=True).moved(found.positions_m[sure]) - true_m[sure]
     )
     return {
         "motes": network.count,

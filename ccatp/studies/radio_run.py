@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ccatp.angles import wrap_pi
 from ccatp.config.radio_models import RadioConfig
 from ccatp.radio.beacon_loop import BeaconLoop
 from ccatp.radio.motion import Pose
@@ -79,7 +80,7 @@ def _joint_nees(world: RadioWorld, loop: BeaconLoop) -> tuple[float, int]:
 
 def _note(run: RadioRun, world: RadioWorld, loop: BeaconLoop, reckoned: Pose, target: str) -> None:
     true, pose = world.pose, loop.slam.pose
-    error = (pose.x_m - true.x_m, pose.y_m - true.y_m, pose.heading_rad - true.heading_rad)
+    error = (pose.x_m - true.x_m, pose.y_m - true.y_m, wrap_pi(pose.heading_rad - true.heading_rad))
     run.pose_errors.append(error)
     run.pose_nees.append(_nees(np.array(error), loop.slam.pose_covariance))
     run.reckoned_errors.append((reckoned.x_m - true.x_m, reckoned.y_m - true.y_m))

@@ -12,7 +12,8 @@ import pytest
 from ccatp.config.loader import dump_config, load_config
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.pictures import run_map
-from ccatp.pictures.run_map import MapPoint, RunMapError, draw_from_run_dir, draw_run_map
+from ccatp.pictures.figures import PictureError
+from ccatp.pictures.run_map import MapPoint, draw_from_run_dir, draw_run_map
 from ccatp.reporting.points import arrival_error_m
 from ccatp.run_files.recorder import Recorder
 from ccatp.samples import DeckPose, Fix, PanelId, PointId
@@ -107,16 +108,16 @@ def test_arrival_error_is_the_distance_of_foot_and_point(mirror: Mirror) -> None
 def test_what_cannot_be_drawn_is_said_in_one_line(
     tmp_path: Path, mirror: Mirror, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(RunMapError, match=r"no config\.toml there"):
+    with pytest.raises(PictureError, match=r"no config\.toml there"):
         draw_from_run_dir(tmp_path, tmp_path / "map.png")
     make_run(tmp_path, mirror)
-    with pytest.raises(RunMapError, match="cannot be written"):
+    with pytest.raises(PictureError, match="cannot be written"):
         draw_from_run_dir(tmp_path, tmp_path / "nowhere" / "map.png")
-    with pytest.raises(RunMapError, match="cannot be written"):
+    with pytest.raises(PictureError, match="cannot be written"):
         draw_from_run_dir(tmp_path, tmp_path / "map.what")
     (tmp_path / "mission.sqlite").unlink()
-    with pytest.raises(RunMapError, match=r"no mission\.sqlite there"):
+    with pytest.raises(PictureError, match=r"no mission\.sqlite there"):
         draw_from_run_dir(tmp_path, tmp_path / "map.png")
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(RunMapError, match=r"ccatp\[plots\]"):
+    with pytest.raises(PictureError, match=r"ccatp\[plots\]"):
         draw_run_map(mirror, np.empty((0, 2)), [], tmp_path / "map.png", "title")

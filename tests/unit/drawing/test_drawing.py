@@ -12,7 +12,8 @@ from ccatp.drawing.colours import LEVELS, ColourScale
 from ccatp.drawing.shapes import Area, Boxes, Dots, Line, Picture, Shape, Text
 from ccatp.drawing.svg import svg_of
 from ccatp.drawing.thinning import envelope, thinned
-from ccatp.pictures.picture_file import PictureError, write_figures, write_svg
+from ccatp.pictures.figures import PictureError
+from ccatp.pictures.picture_file import write_figures, write_svg
 
 PIXEL_SHAPES: tuple[Shape, ...] = (
     Boxes(np.array([[0.0, 0.0, 50.0, 100.0]]), "#ff0000"),

@@ -115,7 +115,7 @@ def test_the_covariance_is_that_of_many_runs() -> None:
         model = MapModel(network_of(HEADS, ALL, rng))
         fit = fit_map(model, model.state(HEADS), PLAIN)
         found = fit.state.positions_m
-        errors.append((best_motion(found, HEADS).apply(found) - HEADS).ravel())
+        errors.append((best_motion(found, HEADS).moved(found) - HEADS).ravel())
         covariance, free = position_covariance(model, fit)
     assert free == 3
     sample = np.cov(np.array(errors).T)

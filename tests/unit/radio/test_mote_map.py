@@ -156,7 +156,7 @@ def test_a_pinned_map_has_the_errors_of_its_frame() -> None:
         found_m, free_covariance = fit.state.positions_m, position_covariance(model, fit)[0]
         motion = best_motion(found_m, HEADS)
         whole = np.kron(np.eye(6), turn @ motion.rotation)
-        near = motion.apply(found_m) @ turn.T + 0.3  # not quite in the frame yet
+        near = motion.moved(found_m) @ turn.T + 0.3  # not quite in the frame yet
         moved, covariance = pinned_map(near, whole @ free_covariance @ whole.T, known)
         errors.append((moved - HEADS).ravel())
     sample = np.cov(np.array(errors).T)
@@ -174,7 +174,7 @@ def test_a_frame_wants_three_coordinates() -> None:
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_frame_of_the_maps_own(dimension: int) -> None:
     points = np.random.default_rng(1).normal(size=(5, dimension))
-    moved = plain_frame(points).apply(points)
+    moved = plain_frame(points).moved(points)
     assert moved[0] == pytest.approx(np.zeros(dimension))
     assert moved[1, 0] > 0.0
     assert moved[1, 1:] == pytest.approx(np.zeros(dimension - 1), abs=1e-12)

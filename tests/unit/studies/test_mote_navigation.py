@@ -9,20 +9,21 @@ from ccatp.config.radio_loader import load_radio_config
 from ccatp.studies.beacon_rehearsal import rehearse_beacons
 from ccatp.studies.campaign import CellResult, Outcome
 from ccatp.studies.mote_navigation import STUDY, band, combine, draw, seconds_of
+from ccatp.wire.beacon_rows import PoseTrack, PoseTruth, pose_track, pose_truth
 
 
-def rows(frames: int) -> tuple[np.ndarray, np.ndarray]:
+def poses(frames: int) -> tuple[PoseTrack, PoseTruth]:
     """Estimates with sigmas of 0.02, 0.02 m and 0.1 rad, and a truth 0.04 m and a turn of 0.2 rad away from them."""
     track, truth = np.zeros((frames, 13)), np.zeros((frames, 8))
     track[:, 0] = truth[:, 0] = np.arange(frames)
     track[:, 1] = truth[:, 1] = 0.1 * np.arange(frames)
     track[:, [5, 7]], track[:, 10] = 4e-4, 1e-2
     truth[:, 2], truth[:, 4] = 0.04, 2.0 * np.pi - 0.2
-    return track, truth
+    return pose_track(track), pose_truth(truth)
 
 
 def test_errors_by_the_second_from_the_map_on() -> None:
-    found = seconds_of(*rows(60), 2.0)
+    found = seconds_of(*poses(60), 2.0)
     assert {name: len(values) for name, values in found.items()} == {"nees": 4, "error_m": 4, "sigma_m": 4}
     assert found["nees"] == pytest.approx(8.0)  # (0.04 / 0.02)^2 + (0.2 / 0.1)^2: the turn is wrapped
     assert found["error_m"] == pytest.approx(0.04)
@@ -61,7 +62,6 @@ def test_missions_are_consistent() -> None:
     for seed in range(1, 13):
         run = rehearse_beacons(load_radio_config(None, {"system": "cricket", "run.seed": seed}))
         assert run.outcome == "complete"
-        truth = np.array(run.truth, dtype=np.float64)
-        each.append(seconds_of(np.array(run.track), truth, run.summary["map"]["map_time_s"])["nees"].mean() / 3.0)
+        each.append(seconds_of(*run.poses, run.summary["map"]["map_time_s"])["nees"].mean() / 3.0)
     low, high = band(len(each))  # of single seconds: a mean over a mission's varies less
     assert low < np.mean(each) < high
