@@ -10,6 +10,8 @@ WORKERS ?= 2
 
 # Small matrices: threads of the linear algebra would only fight each other for the cores.
 export OPENBLAS_NUM_THREADS := 1
+# Some containers forbid it; every process of every test would compile every module anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input

@@ -3,11 +3,13 @@
 import asyncio
 import inspect
 import os
+import signal
 import socket
 from collections.abc import AsyncIterator, Iterator
 
 import psutil
 import pytest
+from _pytest.nodeid import coerce_node_id
 from hypothesis import settings
 
 from ccatp.config.loader import load_config
@@ -20,10 +22,26 @@ settings.register_profile("repeatable", derandomize=True)
 settings.register_profile("explore", derandomize=False, print_blob=True)
 settings.load_profile("repeatable")
 
+# A shell makes what it starts in the background deaf to Ctrl-C, and children inherit that; those under test must not.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 # Processes that end on their own after a test closed its side of them.
 GRACE_S = 2.0
 # Passes of the event loop that cancelled tasks and closing transports get to finish.
 GRACE_PASSES = 10
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> Iterator[None]:
+    """Tests of a group to one worker: xdist 3.8 writes the group where pytest 9.2 does not look for it any more."""
+    yield
+    if not getattr(config.option, "loadgroup", False):
+        return
+    for item in items:
+        group = item.get_closest_marker("xdist_group")
+        if group is not None and "@" not in item.nodeid:
+            item._id = coerce_node_id(f"{item.nodeid}@{group.args[0]}")
 
 
 @pytest.fixture(autouse=True)

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from _pytest.nodeid import coerce_node_id
 
 from ccatp.router import RequestFailed, request
 from ccatp.wire.channels import format_request
@@ -21,18 +20,12 @@ NO_CALIBRATION = ("--set", "mission.calibration_length_m=0")
 FREE_PORTS = ("--set", "sim.robot.port=0", "--set", "sim.etalon.port=0", "--set", "dashboard.enabled=false")
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> Iterator[None]:
-    """Runs one after the other, beside all other tests: two lockstep runs at once would fight for the cores.
-
-    xdist 3.8 writes a group where pytest 9.2 does not look for it any more: it is put into the identity itself.
-    """
-    yield
-    if not getattr(config.option, "loadgroup", False):
-        return
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Runs one after the other, beside all other tests: two lockstep runs at once would fight for the cores."""
     for item in items:
-        if Path(__file__).parent in item.path.parents and "@" not in item.nodeid:
-            item._id = coerce_node_id(f"{item.nodeid}@processes")
+        if Path(__file__).parent in item.path.parents and item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group("processes"))
 
 
 class Run:

@@ -180,7 +180,7 @@ shares = st.floats(0.0, 1.0, exclude_max=True)
 angles = st.floats(radians(-60.0), radians(60.0))
 # Within three sigma of the start errors of the worlds: 2 mm and 0.01 rad.
 errors = st.tuples(st.floats(-0.004, 0.004), st.floats(-0.004, 0.004), st.floats(-0.02, 0.02))
-few = settings(max_examples=25, deadline=None, derandomize=True)
+few = settings(max_examples=15, deadline=None)  # which ones is the profile's choice
 
 
 def boundary(name: str, share: float) -> tuple[float, float, float]:
@@ -375,7 +375,7 @@ def test_no_false_edge_with_stops_over_the_gap(
     assert not cross_seam(name, at, angle, 0.08, error, stops).has_edge
 
 
-@settings(max_examples=4, deadline=None, derandomize=True)
+@settings(max_examples=3, deadline=None)
 @given(names, sides, angles, errors)
 def test_no_false_edge_at_5_mm_a_second(
     name: str, at: tuple[int, bool, bool, float], angle: float, error: Error

@@ -92,7 +92,7 @@ def least_clearance(mirror: Mirror, start: DeckPose, stops: Sequence[Stop]) -> f
     return min(mirror.rim.segment_clearance_m(*a, *b) for a, b in pairwise(ends))
 
 
-@settings(deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(mirror_names, order_names, st.integers(0, 120))
 def test_every_point_exactly_once(name: str, order: str, panels: int) -> None:
     _, mirror = load(name)
@@ -121,7 +121,7 @@ def test_whole_survey_stays_on_the_mirror(name: str, order: str) -> None:
     assert all(stop.kind is StopKind.VIA and stop.point is None for stop in route.stops if stop not in measured)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(mirror_names, order_names, st.integers(1, 90), st.integers(0, 2**32), st.floats(0.0, 1.0))
 def test_any_rest_of_a_survey_stays_on_the_mirror(name: str, order: str, panels: int, seed: int, part: float) -> None:
     cfg, mirror = load(name)
@@ -190,14 +190,13 @@ def test_home_from_every_point(name: str) -> None:
             check_way_home(cfg, mirror, DeckPose(x, y, radians(37.0 * k)))
 
 
-@pytest.mark.parametrize("off_axis_deg", [-4.0, 4.0])
 @pytest.mark.parametrize("name", NAMES)
-def test_home_from_a_point_at_the_rim_without_a_sweep(name: str, off_axis_deg: float) -> None:
+def test_home_from_a_point_at_the_rim_without_a_sweep(name: str) -> None:
     """As a survey stands there, along the rim or across it, no sensor comes nearer to it than on a survey."""
     cfg, mirror = load(name)
     near = [xy for xy in map(mirror.point_on_deck, thesis_order(mirror)) if mirror.rim.signed_distance_m(*xy) < 0.1323]
     for k, (x, y) in enumerate(near):
-        start = DeckPose(x, y, radians(90.0 * k + off_axis_deg))
+        start = DeckPose(x, y, radians(90.0 * k + (4.0, -4.0)[k // 4 % 2]))  # all four directions, on both sides
         stops = plan_way_home(mirror, start, mirror.base_pose, cfg.robot, cfg.limits, cfg.mission)
         assert worst_sensor(cfg, mirror, drive(mirror, start, stops)) >= cfg.mission.turn_clearance_m - SWEEP_M
 
@@ -222,7 +221,7 @@ def test_home_from_the_rim(name: str, edge: int, along: float, depth: float, hea
         check_way_home(cfg, mirror, DeckPose(float(x), float(y), heading))
 
 
-@settings(deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(mirror_names, order_names, st.integers(1, 6))
 def test_stops_on_the_way_cost_time_and_nothing_else(name: str, order: str, panels: int) -> None:
     cfg, mirror = load(name)

@@ -7,6 +7,8 @@ from scipy.stats import chi2
 from ccatp.studies.beacon_rehearsal import BeaconRehearsal, rehearse_beacons
 from tests.unit.beacon_mission.stories import beacon_config, target_distances
 
+pytestmark = pytest.mark.xdist_group("beacon-missions")  # the missions by motes are driven once
+
 SURE = 0.9999  # both tails of a band together miss once in ten thousand
 
 

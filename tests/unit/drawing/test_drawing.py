@@ -162,8 +162,6 @@ def test_without_matplotlib_one_line_says_so(tmp_path: Path, monkeypatch: pytest
         return usual(name, *args, **kwargs)  # type: ignore[arg-type]
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(
-        PictureError, match=r"PNG and PDF need matplotlib: install ccatp with its extra, ccatp\[plots\]"
-    ):
+    with pytest.raises(PictureError, match=r"drawing needs matplotlib: install ccatp with its extra, ccatp\[plots\]"):
         write_figures(PICTURE, tmp_path / "a")
     write_svg(PICTURE, tmp_path / "a.svg")
