@@ -12,6 +12,8 @@ PLAIN = ("first", "second", "range_m")
 SESSION = ("session", "pos", "deg", "anchor", "tag", "mean_m")
 PLACES = ("name", "x_m", "y_m")
 LONGEST_M = 1e6
+SHORTEST_M = 1e-3  # no two motes are nearer
+FINEST_M = 1e-6  # no range is better
 
 
 class RangeFileError(MappingError):
@@ -123,11 +125,12 @@ def _name(path: Path, line: int, key: str, text: str) -> str:
 
 
 def _checked(path: Path, line: int, reading: MoteRange) -> MoteRange:
-    if not 0.0 < reading.range_m <= LONGEST_M:
-        what = "is no distance" if not reading.range_m > 0.0 else f"is more than the {LONGEST_M:g} m that beacons reach"
+    if not SHORTEST_M <= reading.range_m <= LONGEST_M:
+        is_far = reading.range_m > LONGEST_M
+        what = f"is more than the {LONGEST_M:g} m that beacons reach" if is_far else "is no distance"
         raise RangeFileError(f"{path}:{line}: range of {reading.range_m:g} m {what}; in metres, between two places")
-    if not 0.0 < reading.sigma_m < float("inf"):
-        raise RangeFileError(f"{path}:{line}: sigma of {reading.sigma_m:g} m, must be positive")
+    if not FINEST_M <= reading.sigma_m <= LONGEST_M:
+        raise RangeFileError(f"{path}:{line}: sigma of {reading.sigma_m:g} m, must be {FINEST_M:g} to {LONGEST_M:g} m")
     if reading.first == reading.second:
         raise RangeFileError(f"{path}:{line}: from {reading.first} to itself; leave it out")
     return reading

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.commands.frame import complain, example, overrides, settings_option
+from ccatp.commands.frame import JSON_OPTION, OutputFile, complain, example, figure_option, overrides, settings_option
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
 
 if TYPE_CHECKING:
@@ -34,14 +34,9 @@ class AlignError(CcatpError):
 )
 @click.argument("run_dir", type=click.Path(path_type=Path))
 @settings_option("A key of align or mirror, or robot.puck_height_m, as in align.point_floor_m=2e-6.")
-@click.option("--csv", "csv_file", type=click.Path(path_type=Path, dir_okay=False), help="Write a line a panel (CSV).")
-@click.option(
-    "--figure",
-    "figure_file",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="Draw deviations and moves (PNG, PDF or SVG; needs matplotlib).",
-)
-@click.option("--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there.")
+@click.option("--csv", "csv_file", type=OutputFile(), help="Write a line a panel (CSV).")
+@figure_option("Draw deviations and moves")
+@JSON_OPTION
 def align(
     run_dir: Path, settings: Mapping[str, object], csv_file: Path | None, figure_file: Path | None, json_output: bool
 ) -> int:
@@ -55,9 +50,6 @@ def align(
     from ccatp.mirror.mirror import build_mirror
     from ccatp.run_files.survey_reader import read_run
 
-    for option, file in (("--csv", csv_file), ("--figure", figure_file)):
-        if file is not None and not file.parent.is_dir():
-            raise AlignError(f"{option}: no directory {file.parent}; make it first")
     changes = overrides(settings, {})
     if idle := [key for key in changes if not key.startswith(ACTING)]:
         raise ConfigError(f"command line: {idle[0]}: has no effect on the alignment; what has: {', '.join(ACTING)}")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from ccatp.commands.frame import WORLD_OPTIONS, example, overrides
+from ccatp.commands.frame import JSON_OPTION, WORLD_OPTIONS, example, overrides
 
 PAGE = "docs/bench.md"
 
@@ -20,7 +20,7 @@ PAGE = "docs/bench.md"
     "--markdown", type=click.Path(path_type=Path, dir_okay=False), is_flag=False, flag_value=PAGE, metavar="[FILE]",
     help=f"Write the table to FILE; {PAGE} if not named.",
 )  # fmt: skip
-@click.option("--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there.")
+@JSON_OPTION
 def bench(
     config_file: Path | None, mirror: str | None, world: str | None, seed: int | None, settings: Mapping[str, object],
     quick: bool, steps_only: bool, markdown: Path | None, json_output: bool,

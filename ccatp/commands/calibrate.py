@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.commands.frame import RUNTIME_DIR_OPTION, WORLD_OPTIONS, complain, example, overrides
+from ccatp.commands.frame import JSON_OPTION, RUNTIME_DIR_OPTION, WORLD_OPTIONS, complain, example, overrides
 from ccatp.errors import CcatpError
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class DriveFailed(CcatpError):
 @click.option("--from", "from_dir", type=click.Path(path_type=Path), help="Do not drive: take the drive of this run.")
 @click.option("--run-dir", type=click.Path(path_type=Path), help="Where to record the drive.")
 @click.option("--dry-run", is_flag=True, help="Drive and tell, but write nothing into the configuration.")
-@click.option("--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there.")
+@JSON_OPTION
 @RUNTIME_DIR_OPTION
 def calibrate(
     sim: bool, config_file: Path | None, mirror: str | None, world: str | None, seed: int | None,

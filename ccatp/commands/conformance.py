@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ccatp.commands.frame import WaitingTime, complain, example
+from ccatp.commands.frame import JSON_OPTION, WaitingTime, complain, example
 from ccatp.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ FAILED = 1
     show_default=True,
     help="Seconds to wait for an answer.",
 )
-@click.option("--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there.")
+@JSON_OPTION
 def conformance(
     server: str, key_file: str | None, no_motion: bool, only: Sequence[str], timeout_s: float, json_output: bool
 ) -> int:

@@ -47,6 +47,29 @@ class WaitingTime(click.ParamType[float]):
         return time_s
 
 
+class OutputFile(click.Path):
+    """A file to be written: what cannot be is told before the work, not after it.
+
+    Args:
+        formats: how its name may end; however it likes, if none is given.
+    """
+
+    def __init__(self, *formats: str) -> None:
+        super().__init__(dir_okay=False, path_type=Path)
+        self.formats = formats
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """As ``click.Path.convert``."""
+        path = Path(str(super().convert(value, param, ctx)))
+        option = "output" if param is None else param.opts[0]
+        if not path.parent.is_dir():
+            raise click.UsageError(f"{option}: no directory {path.parent}; make it first", ctx)
+        if self.formats and path.suffix.lower() not in self.formats:
+            known = ", ".join(self.formats)
+            raise click.UsageError(f"{option}: {path.name}: no format by that name; the file may end in {known}", ctx)
+        return path
+
+
 class SuggestingGroup(click.Group):
     """A group of commands that answers a misspelt one with the nearest."""
 
@@ -162,6 +185,18 @@ RUNTIME_DIR_OPTION = click.option(
 FAULTS_OPTION = click.option(
     "--faults", "faults_file", type=click.Path(path_type=Path), help="Fault plan (TOML) for the simulated robot."
 )
+
+JSON_OPTION = click.option(
+    "--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there."
+)
+
+
+def figure_option(what: str) -> Callable[[Command], Command]:
+    """``--figure FILE``; ``what`` says what is drawn."""
+    return click.option(
+        "--figure", "figure_file", type=OutputFile(".png", ".pdf", ".svg"),
+        help=f"{what} (PNG, PDF or SVG; needs matplotlib).",
+    )  # fmt: skip
 
 
 def settings_option(which: str) -> Callable[[Command], Command]:

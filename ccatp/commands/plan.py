@@ -6,14 +6,8 @@ from pathlib import Path
 
 import click
 
-from ccatp.commands.frame import WORLD_OPTIONS, complain, example, overrides
-from ccatp.errors import CcatpError, ExitStatus
-
-
-class PlanFileError(CcatpError):
-    """A picture that cannot be written."""
-
-    exit_status = ExitStatus.USAGE
+from ccatp.commands.frame import JSON_OPTION, WORLD_OPTIONS, complain, example, figure_option, overrides
+from ccatp.errors import ExitStatus
 
 
 @click.command(
@@ -26,13 +20,8 @@ class PlanFileError(CcatpError):
 @WORLD_OPTIONS
 @click.option("--panels", type=int, metavar="N", help="Only the first N panels of the traversal; 0 takes all.")
 @click.option("--filter", "filter_name", metavar="NAME", help="State estimator: some drive a calibration first.")
-@click.option(
-    "--figure",
-    "figure_file",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="Draw the way (PNG, PDF or SVG; needs matplotlib).",
-)
-@click.option("--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there.")
+@figure_option("Draw the way")
+@JSON_OPTION
 def plan(
     config_file: Path | None, mirror: str | None, world: str | None, seed: int | None,
     settings: Mapping[str, object], panels: int | None, filter_name: str | None,
@@ -46,8 +35,6 @@ def plan(
     from ccatp.mirror.mirror import build_mirror
     from ccatp.survey_plan import make_plan, plan_data, plan_lines
 
-    if figure_file is not None and not figure_file.parent.is_dir():
-        raise PlanFileError(f"--figure: no directory {figure_file.parent}; make it first")
     named = {
         "run.mirror": mirror, "run.world": world, "run.seed": seed, "run.panels": panels, "run.filter": filter_name,
     }  # fmt: skip

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.commands.frame import complain, example
+from ccatp.commands.frame import JSON_OPTION, complain, example, figure_option
 from ccatp.errors import CcatpError, ExitStatus
 
 if TYPE_CHECKING:
@@ -22,12 +22,6 @@ class CalibrateError(CcatpError):
     exit_status = ExitStatus.USAGE
 
 
-FIGURE_OPTION = click.option(
-    "--figure", type=click.Path(path_type=Path, dir_okay=False), help="Draw it (PNG, PDF or SVG; needs matplotlib)."
-)
-JSON_OPTION = click.option("--json", "json_output", is_flag=True, help="Result as JSON, nothing else on the output.")
-
-
 @click.command(
     epilog=example(
         "ccatp radio calibrate pairs.csv --figure path_loss.png",
@@ -38,9 +32,9 @@ JSON_OPTION = click.option("--json", "json_output", is_flag=True, help="Result a
 @click.argument("path", type=click.Path(path_type=Path))
 @click.option("--sheet", metavar="NAME", help="Sheet of a workbook; the first if not given.")
 @click.option("--points", type=click.Path(path_type=Path), help="Table of the distances of a folder of logs.")
-@FIGURE_OPTION
+@figure_option("Draw it")
 @JSON_OPTION
-def calibrate(path: Path, sheet: str | None, points: Path | None, figure: Path | None, json_output: bool) -> int:
+def calibrate(path: Path, sheet: str | None, points: Path | None, figure_file: Path | None, json_output: bool) -> int:
     """Find reference level, exponent and spread of a radio from pairs of distance and level."""
     from ccatp.radio.path_loss_fit import CalibrationError, fit_path_loss
     from ccatp.radio_data.levels import read_levels
@@ -53,10 +47,10 @@ def calibrate(path: Path, sheet: str | None, points: Path | None, figure: Path |
     warnings = [*table.warnings, *fit.doubts()]
     for warning in warnings:
         complain(f"warning: {warning}", 0)
-    if figure is not None:
+    if figure_file is not None:
         from ccatp.pictures.level_figures import draw_path_loss
 
-        draw_path_loss(fit, table.pairs, table.name, figure)
+        draw_path_loss(fit, table.pairs, table.name, figure_file)
     if json_output:
         click.echo(json.dumps({"data": table.name, **fit_data(fit), "warnings": warnings}))
         return 0
@@ -106,7 +100,7 @@ def _tell_fit(name: str, fit: "PathLossFit") -> None:
         "  [path_loss]",
         f"  reference_dbm = {fit.reference_dbm:.2f}",
         f"  exponent = {fit.exponent:.3f}",
-        f"  white_sigma_db = {max(fit.white_sigma_db, _LEAST_DB) if is_repeated else fit.sigma_db:.2f}",
+        f"  white_sigma_db = {max(fit.white_sigma_db if is_repeated else fit.sigma_db, _LEAST_DB):.2f}",
     ]
     if is_repeated:
         lines.append(f"  shadowing_sigma_db = {fit.shadowing_sigma_db:.2f}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.commands.frame import CONFIG_OPTION, complain, example, overrides, settings_option
+from ccatp.commands.frame import CONFIG_OPTION, JSON_OPTION, complain, example, overrides, settings_option
 from ccatp.commands.radio_slam import FILTERS, FORMATS, estimate
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 @click.option("--peers", is_flag=True, help="GTSAM (iSAM2, batch) on the same input as well; needs ccatp[peers].")
 @CONFIG_OPTION
 @settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
-@click.option("--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there.")
+@JSON_OPTION
 def compare(
     paths: Sequence[Path], data_format: str | None, robot: int | None, peers: bool, config_file: Path | None,
     settings: Mapping[str, object], json_output: bool,

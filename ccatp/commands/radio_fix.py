@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.commands.frame import complain, example
-from ccatp.commands.radio_calibrate import FIGURE_OPTION, JSON_OPTION, CalibrateError
+from ccatp.commands.frame import JSON_OPTION, complain, example, figure_option
+from ccatp.commands.radio_calibrate import CalibrateError
 
 if TYPE_CHECKING:
     from ccatp.radio.level_fix import LevelFix, LevelLocator, Room
@@ -42,11 +42,11 @@ _NEAREST_M = 0.1  # nearer than this the log-distance model is not believed
 @click.option("--room", metavar="X0,Y0,X1,Y1", help="Where the receiver may be, m; round the beacons if not given.")
 @click.option("--spacing", "spacing_m", type=float, default=0.1, show_default=True, help="Of the grid, m.")
 @click.option("--sheet", metavar="NAME", help="Sheet of the workbooks; the first if not given.")
-@FIGURE_OPTION
+@figure_option("Draw it")
 @JSON_OPTION
 def fix(
     path: Path, fingerprints: Path | None, path_loss: Path | None, beacons: Sequence[str], exchange: str | None,
-    room: str | None, spacing_m: float, sheet: str | None, figure: Path | None, json_output: bool,
+    room: str | None, spacing_m: float, sheet: str | None, figure_file: Path | None, json_output: bool,
 ) -> int:  # fmt: skip
     """Find each place of PATH from one level of each beacon, and judge the errors and the 90 % regions."""
     from ccatp.radio.level_fix import LevelLocator
@@ -67,10 +67,10 @@ def fix(
         own = LevelLocator(places_m, fits(index), area) if leave_out else locator
         found.append(own.fix(heard.levels_dbm))
     result = {"data": table.name, "leave_one_out": leave_out, **_judged(found, table.places), "warnings": warnings}
-    if figure is not None:
+    if figure_file is not None:
         from ccatp.pictures.level_figures import draw_fixes
 
-        draw_fixes(found, [heard.place_m for heard in table.places], places_m, table.name, figure)
+        draw_fixes(found, [heard.place_m for heard in table.places], places_m, table.name, figure_file)
     if json_output:
         click.echo(json.dumps(result))
         return 0

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import click
 
-from ccatp.commands.frame import SETTINGS_OPTION, example
-from ccatp.commands.radio_calibrate import FIGURE_OPTION, JSON_OPTION, CalibrateError
+from ccatp.commands.frame import JSON_OPTION, SETTINGS_OPTION, example, figure_option
+from ccatp.commands.radio_calibrate import CalibrateError
 
 
 @click.command(epilog=example("ccatp radio fuzzy --figure speed.png", "ccatp radio fuzzy --at 0.3 0.5"))
@@ -17,10 +17,10 @@ from ccatp.commands.radio_calibrate import FIGURE_OPTION, JSON_OPTION, Calibrate
 @click.option(
     "--at", nargs=2, type=float, multiple=True, metavar="M RAD", help="Speed at a distance and a heading error."
 )
-@FIGURE_OPTION
+@figure_option("Draw it")
 @JSON_OPTION
 def fuzzy(
-    config_file: Path | None, settings: dict[str, object], at: Sequence[tuple[float, float]], figure: Path | None,
+    config_file: Path | None, settings: dict[str, object], at: Sequence[tuple[float, float]], figure_file: Path | None,
     json_output: bool,
 ) -> int:  # fmt: skip
     """Show the fuzzy speed controller: its table, its surface, its value at a point."""
@@ -41,10 +41,10 @@ def fuzzy(
     for distance_m, error_rad in points:
         named = {"distance_m": distance_m, "heading_error_rad": abs(error_rad)}
         values.append({**named, "speed_m_s": round(sugeno.evaluate([named[name] for name in sugeno.inputs]), 5)})
-    if figure is not None:
+    if figure_file is not None:
         from ccatp.pictures.level_figures import draw_fuzzy
 
-        draw_fuzzy(cfg, figure)
+        draw_fuzzy(cfg, figure_file)
     if json_output:
         click.echo(json.dumps({"rules": len(cfg.rules), "points": values}))
         return 0

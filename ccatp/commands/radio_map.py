@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.commands.frame import complain, example, overrides, settings_option
+from ccatp.commands.frame import JSON_OPTION, OutputFile, complain, example, figure_option, overrides, settings_option
 
 if TYPE_CHECKING:
     from ccatp.config.cricket_models import CricketConfig
@@ -39,14 +39,9 @@ METHODS = ("ekf", "batch")
 @click.option("--offset", is_flag=True, help="Estimate a common offset of the ranges.")
 @click.option("--scale", is_flag=True, help="Estimate a common scale of the ranges.")
 @settings_option("A key of cricket, as in cricket.phase2.pairs=zigzag.")
-@click.option("--out", "out_file", type=click.Path(path_type=Path, dir_okay=False), help="Write a beacon file (TOML).")
-@click.option(
-    "--figure",
-    "figure_file",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="Draw map and errors (PNG, PDF or SVG).",
-)
-@click.option("--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there.")
+@click.option("--out", "out_file", type=OutputFile(), help="Write a beacon file (TOML).")
+@figure_option("Draw map and errors")
+@JSON_OPTION
 def radio_map(
     config_file: Path | None, ranges_file: Path | None, tags_file: Path | None, truth_file: Path | None,
     method: str, seeds: int, seed: int | None, offset: bool, scale: bool, settings: Mapping[str, object],
@@ -59,11 +54,7 @@ def radio_map(
         raise click.UsageError("--seeds is for simulated ranges; --ranges has been measured once")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads would only fight over them
     from ccatp.config.radio_loader import load_radio_config
-    from ccatp.radio.range_network import MappingError
 
-    for option, file in (("--out", out_file), ("--figure", figure_file)):
-        if file is not None and not file.parent.is_dir():
-            raise MappingError(f"{option}: no directory {file.parent}; make it first")
     named: dict[str, object] = {
         "run.seed": seed,
         "cricket.batch.estimates_offset": offset or None,

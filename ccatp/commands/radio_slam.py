@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.commands.frame import CONFIG_OPTION, complain, example, overrides, settings_option
+from ccatp.commands.frame import (
+    CONFIG_OPTION,
+    JSON_OPTION,
+    complain,
+    example,
+    figure_option,
+    overrides,
+    settings_option,
+)
 from ccatp.errors import CcatpError, ExitStatus
 
 if TYPE_CHECKING:
@@ -21,7 +29,7 @@ FILTERS = ("ekf-slam", "smoother")
 
 
 class SlamCommandError(CcatpError):
-    """A result that cannot be written, a part that is not installed, or data of which an estimator makes nothing."""
+    """A part that is not installed, or data of which an estimator makes nothing."""
 
     exit_status = ExitStatus.USAGE
 
@@ -42,12 +50,9 @@ class SlamCommandError(CcatpError):
 )  # fmt: skip
 @CONFIG_OPTION
 @settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
-@click.option(
-    "--figure", "figure_file", type=click.Path(path_type=Path, dir_okay=False),
-    help="Draw map and path (PNG, PDF or SVG; needs matplotlib).",
-)  # fmt: skip
+@figure_option("Draw map and path")
 @click.option("--peers", is_flag=True, help="All our estimators and GTSAM's side by side; needs ccatp[peers].")
-@click.option("--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there.")
+@JSON_OPTION
 def slam(
     path: Path, data_format: str | None, robot: int | None, filter_name: str, config_file: Path | None,
     settings: Mapping[str, object], figure_file: Path | None, peers: bool, json_output: bool,
@@ -62,8 +67,6 @@ def slam(
     from ccatp.radio.slam_report import result_data, table_lines
     from ccatp.radio_data.reader import read_run
 
-    if figure_file is not None and not figure_file.parent.is_dir():
-        raise SlamCommandError(f"--figure: no directory {figure_file.parent}; make it first")
     assumed = load_recordings_config(config_file, overrides(settings, {}))
     run = read_run(path, data_format, robot)
     for warning in run.warnings:

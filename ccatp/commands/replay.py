@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.commands.frame import complain, example, overrides, settings_option
+from ccatp.commands.frame import JSON_OPTION, OutputFile, complain, example, overrides, settings_option
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
 
 if TYPE_CHECKING:
@@ -40,8 +40,8 @@ class ReplayError(CcatpError):
 @click.option("--filter", "filter_name", metavar="NAME", help="State estimator, if not that of the run: kf, ekf, ukf.")
 @settings_option("A key of localizer, robot or mirror, as in localizer.full_state.fix_gate_nis=20.")
 @click.option("--smooth", is_flag=True, help="Go back over the run with the smoother, too (not with kf).")
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Write the estimates of all frames (CSV).")
-@click.option("--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there.")
+@click.option("--out", type=OutputFile(), help="Write the estimates of all frames (CSV).")
+@JSON_OPTION
 def replay(
     run_dir: Path, filter_name: str | None, settings: Mapping[str, object], smooth: bool, out: Path | None,
     json_output: bool,
@@ -53,8 +53,6 @@ def replay(
     from ccatp.replaying.table import csv_lines, table_lines
     from ccatp.run_files.run_reader import open_run
 
-    if out is not None and not out.parent.is_dir():
-        raise ReplayError(f"--out: no directory {out.parent}; make it first")  # before the work, not after it
     changes = overrides(settings, {"run.filter": filter_name})
     recordings = open_run(run_dir)
     configs = [_config(recording, changes, smooth) for recording in recordings]

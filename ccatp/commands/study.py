@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from ccatp.commands.frame import CONFIG_OPTION, SETTINGS_OPTION, example, overrides
+from ccatp.commands.frame import CONFIG_OPTION, JSON_OPTION, SETTINGS_OPTION, example, overrides
 
 
 class _StudyCommand(click.Command):
@@ -58,7 +58,7 @@ class _StudyCommand(click.Command):
 @CONFIG_OPTION
 @SETTINGS_OPTION
 @click.option("--no-figures", is_flag=True, help="Tables only; needs no matplotlib.")
-@click.option("--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there.")
+@JSON_OPTION
 def study(
     name: str, out: Path | None, runs: int | None, workers: int | None, cluster: str | None, shard: str | None,
     others: Sequence[Path], only: Sequence[str], mirrors: Sequence[str], panels: int | None, seed: int | None,

@@ -40,7 +40,7 @@ class AirConfig(Model):
 class RangingConfig(Model):
     """How good a range is, as the estimators take it."""
 
-    sigma_m: Positive
+    sigma_m: Annotated[float, Field(ge=1e-6, le=1e3)]
     thermometer_sigma_c: NonNegative
     repeats: Many
     combine: Literal["mean", "median"]

@@ -5,7 +5,7 @@ same: 409 for a refusal, 405 for a wrong method, 503 for what cannot be had now.
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import msgspec
@@ -100,6 +100,83 @@ async def _wait_for_end(receive: Receive, stream: Stream) -> None:
     stream.end(b"")
 
 
+class Answers:
+    """What is answered to each question.
+
+    Args:
+        hub: the state.
+        ground: what does not change, ``ccatp.dashboard.ground``.
+    """
+
+    def __init__(self, hub: Hub, ground: Mapping[str, Any]) -> None:
+        self._hub, self._ground = hub, ground
+        self._ground_json, self._files = msgspec.json.encode(ground), read_static_files()
+
+    async def page(self, request: Request) -> Response:
+        """The page itself."""
+        return _file(request, self._files["index.html"])
+
+    async def static(self, request: Request) -> Response:
+        """What the page is made of."""
+        found = self._files.get(request.path_params["name"])
+        return _error(404, f"bad endpoint: {request.url.path}") if found is None else _file(request, found)
+
+    async def ground(self, _request: Request) -> Response:
+        """What does not change."""
+        return _json_bytes(self._ground_json)
+
+    async def status(self, _request: Request) -> Response:
+        """The state as a whole."""
+        return _json({"status": "ok", **self._hub.state()})
+
+    async def healthz(self, _request: Request) -> Response:
+        """Whether all is well."""
+        trouble = self._hub.state()["trouble"]
+        return _error(503, trouble) if trouble else _json({"status": "ok"})
+
+    async def metrics(self, _request: Request) -> Response:
+        """The state in the text format of Prometheus."""
+        text = metrics_text(self._hub.state(), self._ground, self._hub.pages)
+        return Response(text, headers={"content-type": CONTENT_TYPE, "cache-control": "no-store"})
+
+
+class Counter:
+    """Where commands are taken: from our own page, and with the token if there is one.
+
+    Args:
+        desk: takes commands.
+        token: that commands have to carry, or ``None``.
+        note: a line for the log, with its fields.
+    """
+
+    def __init__(self, desk: CommandDesk, token: str | None, note: Note) -> None:
+        self._desk, self._token, self._note = desk, token, note
+
+    async def obey(self, name: OperatorCommand, request: Request) -> Response:
+        """Pass a command on, or say why not."""
+        headers, told = request.headers, {"command": str(name)}
+        told["client"] = request.client.host if request.client is not None else "?"
+        refusal = origin_refusal(headers.get("origin"), headers.get("sec-fetch-site"), headers["host"])
+        if refusal is not None:
+            self._note("refused", {**told, "why": refusal})
+            return _error(403, refusal)
+        refusal = token_refusal(headers.get("authorization"), self._token)
+        if refusal is not None:
+            self._note("refused", {**told, "why": refusal})
+            return _error(401, refusal, {"www-authenticate": "Bearer"})
+        answer = await self._desk.ask(name)
+        self._note("command", {**told, "refusal": answer.refusal})
+        return _error(answer.http_status, answer.refusal) if answer.refusal else _json({"status": "ok"})
+
+    def route(self, name: OperatorCommand) -> Route:
+        """The way to it for one command."""
+
+        async def obey(request: Request) -> Response:
+            return await self.obey(name, request)
+
+        return Route(f"/{name}", obey, methods=["POST"])
+
+
 def build_app(
     hub: Hub,
     desk: CommandDesk,
@@ -119,67 +196,27 @@ def build_app(
         token: that commands have to carry, or ``None``.
         note: a line for the log, with its fields.
     """
-    files = read_static_files()
-    ground_json = msgspec.json.encode(ground)
-
-    async def page(_request: Request) -> Response:
-        return _file(_request, files["index.html"])
-
-    async def static(request: Request) -> Response:
-        found = files.get(request.path_params["name"])
-        return _error(404, f"bad endpoint: {request.url.path}") if found is None else _file(request, found)
-
-    async def the_ground(_request: Request) -> Response:
-        return _json_bytes(ground_json)
-
-    async def status(_request: Request) -> Response:
-        return _json({"status": "ok", **hub.state()})
-
-    async def healthz(_request: Request) -> Response:
-        trouble = hub.state()["trouble"]
-        return _error(503, trouble) if trouble else _json({"status": "ok"})
-
-    async def metrics(_request: Request) -> Response:
-        text = metrics_text(hub.state(), ground, hub.pages)
-        return Response(text, headers={"content-type": CONTENT_TYPE, "cache-control": "no-store"})
-
-    def command(name: OperatorCommand) -> Callable[[Request], Awaitable[Response]]:
-        async def obey(request: Request) -> Response:
-            headers = request.headers
-            client = request.client.host if request.client is not None else "?"
-            refusal = origin_refusal(headers.get("origin"), headers.get("sec-fetch-site"), headers["host"])
-            if refusal is not None:
-                note("refused", {"command": str(name), "client": client, "why": refusal})
-                return _error(403, refusal)
-            refusal = token_refusal(headers.get("authorization"), token)
-            if refusal is not None:
-                note("refused", {"command": str(name), "client": client, "why": refusal})
-                return _error(401, refusal, {"www-authenticate": "Bearer"})
-            answer = await desk.ask(name)
-            note("command", {"command": str(name), "client": client, "refusal": answer.refusal})
-            return _error(answer.http_status, answer.refusal) if answer.refusal else _json({"status": "ok"})
-
-        return obey
-
-    async def refused(request: Request, error: Exception) -> Response:
-        code = error.status_code if isinstance(error, HTTPException) else 500
-        wanted = "POST" if request.url.path.strip("/") in COMMANDS else "GET"
-        texts = {404: f"bad endpoint: {request.url.path}", 405: f"method not {wanted}"}
-        headers = {"allow": wanted} if code == 405 else {}
-        return _error(code, texts.get(code, "internal error"), headers)
-
+    answers, counter = Answers(hub, ground), Counter(desk, token, note)
     routes = [
-        Route("/", page),
-        Route("/static/{name}", static),
-        Route("/ground", the_ground),
+        Route("/", answers.page),
+        Route("/static/{name}", answers.static),
+        Route("/ground", answers.ground),
         Route("/events", Events(hub)),
-        Route("/status", status),
-        Route("/healthz", healthz),
-        Route("/metrics", metrics),
-        *(Route(f"/{name}", command(name), methods=["POST"]) for name in COMMANDS),
+        Route("/status", answers.status),
+        Route("/healthz", answers.healthz),
+        Route("/metrics", answers.metrics),
+        *(counter.route(name) for name in COMMANDS),
     ]
     door = Middleware(Door, names=host_names)
-    return Starlette(routes=routes, middleware=[door], exception_handlers={HTTPException: refused})
+    return Starlette(routes=routes, middleware=[door], exception_handlers={HTTPException: _refused})
+
+
+async def _refused(request: Request, error: Exception) -> Response:
+    code = error.status_code if isinstance(error, HTTPException) else 500
+    wanted = "POST" if request.url.path.strip("/") in COMMANDS else "GET"
+    texts = {404: f"bad endpoint: {request.url.path}", 405: f"method not {wanted}"}
+    headers = {"allow": wanted} if code == 405 else {}
+    return _error(code, texts.get(code, "internal error"), headers)
 
 
 def _json(data: Mapping[str, Any], code: int = 200, headers: Mapping[str, str] | None = None) -> Response:

@@ -7,7 +7,7 @@ from typing import Any
 from ccatp.config.radio_models import RadioConfig
 from ccatp.dashboard.against_truth import Second, TruthCompare
 from ccatp.dashboard.beacon_ground import beacon_waypoints
-from ccatp.dashboard.ground import MEASURED, TODO
+from ccatp.dashboard.ground import MEASURED, PLANNED
 from ccatp.dashboard.view import View
 from ccatp.wire.topics import (
     BeaconArrival,
@@ -39,7 +39,7 @@ class BeaconView(View):
         """Nothing heard."""
         super().__init__(is_sim=is_sim, series=SERIES, has_laser=False)
         self._cfg = cfg
-        self._states = [TODO] * len(beacon_waypoints(cfg))
+        self._states = [PLANNED] * len(beacon_waypoints(cfg))
         self._lap = 0
         self._changed: set[int] = set()
         self._map: BeaconMap | None = None
@@ -57,7 +57,7 @@ class BeaconView(View):
     def _take_arrival(self, arrival: BeaconArrival, _now_s: float) -> None:
         if arrival.lap > self._lap:  # the round begins anew
             self._lap = arrival.lap
-            self._states = [TODO] * len(self._states)
+            self._states = [PLANNED] * len(self._states)
             self._changed.update(range(len(self._states)))
         if 0 <= arrival.waypoint < len(self._states):
             self._states[arrival.waypoint] = MEASURED
@@ -113,7 +113,7 @@ class BeaconView(View):
         return {"points": points, "facts": self._facts()}
 
     def _own_all(self) -> dict[str, Any]:
-        points = [[k, state, None] for k, state in enumerate(self._states) if state != TODO]
+        points = [[k, state, None] for k, state in enumerate(self._states) if state != PLANNED]
         return {"points": points, "facts": self._facts()}
 
     def _facts(self) -> list[tuple[str, str]]:

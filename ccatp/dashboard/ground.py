@@ -19,8 +19,8 @@ WORDS = {
     "reached": "measured",
 }
 """What the page calls things: by the id of their place on it, and for its own sentences."""
-TODO, ARRIVED, MEASURED, SKIPPED = range(4)
-"""State of a point: to be done, the robot came to rest there, measured, left out."""
+PLANNED, ARRIVED, MEASURED, SKIPPED = range(4)
+"""State of a point: planned, the robot came to rest there, measured, left out."""
 
 
 def point_name(point: PointId) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 
 from ccatp.config.models import Config
 from ccatp.dashboard.against_truth import Second, TruthCompare
-from ccatp.dashboard.ground import ARRIVED, MEASURED, SKIPPED, TODO, point_name, survey_points
+from ccatp.dashboard.ground import ARRIVED, MEASURED, PLANNED, SKIPPED, point_name, survey_points
 from ccatp.dashboard.view import View
 from ccatp.mirror.batches import deck_poses
 from ccatp.mirror.errors import ConvergenceError
@@ -35,7 +35,7 @@ class SurveyView(View):
         self.points = survey_points(mirror, cfg)
         self._index = {point: k for k, point in enumerate(self.points)}
         self._by_name = {point_name(point): k for k, point in enumerate(self.points)}
-        self._states = [TODO] * len(self.points)
+        self._states = [PLANNED] * len(self.points)
         self._errors_mm: list[float | None] = [None] * len(self.points)
         self._changed: set[int] = set()
         self._truth = TruthCompare()
@@ -133,10 +133,10 @@ class SurveyView(View):
         return {"points": points}
 
     def _own_all(self) -> dict[str, Any]:
-        return {"points": [[k, s, self._errors_mm[k]] for k, s in enumerate(self._states) if s != TODO]}
+        return {"points": [[k, s, self._errors_mm[k]] for k, s in enumerate(self._states) if s != PLANNED]}
 
     def _next_point(self) -> str:
         """On the way to a stop that is no point the mission names none; then it is the first to be done."""
-        if self.status is None or self.status.point or self.status.outcome or TODO not in self._states:
+        if self.status is None or self.status.point or self.status.outcome or PLANNED not in self._states:
             return super()._next_point()
-        return point_name(self.points[self._states.index(TODO)])
+        return point_name(self.points[self._states.index(PLANNED)])

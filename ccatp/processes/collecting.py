@@ -1,5 +1,6 @@
 """Glue. Listens to a run from its start to its end: recording, progress, how the mission stands."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -46,7 +47,7 @@ class View(Protocol):
         """Where the mission stands."""
 
 
-class Collector:
+class Collector(ABC):
     """Listens to a run; what the summary is made of is the business of a class of its own for each kind of mission.
 
     Args:
@@ -87,6 +88,7 @@ class Collector:
 
     # -- of each kind of mission ----------------------------------------------------------------------------------
 
+    @abstractmethod
     def take(self, message: Message) -> None:
         """A message for the summary."""
 
@@ -101,9 +103,9 @@ class Collector:
             self._collect_until_truth(int(self._ask(b"flush").get("rows", 0)))
         self.collect(1, None)
 
+    @abstractmethod
     def summary(self, wall_s: float) -> dict[str, Any]:
         """``summary.json`` of what was collected; call it when main has closed the mission's database."""
-        raise NotImplementedError
 
     # -- of all of them -------------------------------------------------------------------------------------------
 

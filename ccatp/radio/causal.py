@@ -1,7 +1,8 @@
 """Pure. ``BeaconSlam`` over a recorded run: what is known at each instant from readings up to it."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from ccatp.filters.base import FloatArray
 from ccatp.radio.motion import Increment
 from ccatp.radio.readings import RangeBearingReading, RangeReading, Reading, RssiReading
 from ccatp.radio.recording import RecordedRun, Steps
-from ccatp.radio.slam import BeaconSlam
+from ccatp.radio.slam import BeaconSlam, Learned
 from ccatp.radio.slam_settings import SlamSettings
 from ccatp.radio.track import BeaconFix, Calibrated, Track
 
@@ -36,40 +37,23 @@ def filter_run(
     """
     position, heading = first_sigmas
     slam = BeaconSlam(settings, run.first_pose, np.diag((position**2, position**2, heading**2)))
-    heard = list(_readings(run))
     times = np.union1d(_spaced(run.steps.times_s), run.readings.times_s)
-    increments = _increments(run.steps, times)
+    increments, readings = _increments(run.steps, times), _Heard(run)
     poses, covariances = np.empty((len(times), 3)), np.empty((len(times), 3, 3))
-    nis: list[float] = []
-    sizes: list[int] = []
-    took: list[float] = []
-    predict_s: list[float] = []
-    scalar_s: list[float] = []
-    refused = updates = next_reading = 0
+    book = _Book()
     for k, time_s in enumerate(times.tolist()):
         begin_s = clock_s()
         if k:
             slam.predict(increments[k - 1])
         predicted_s = clock_s()
-        predict_s.append(predicted_s - begin_s)
-        now = []
-        while next_reading < len(heard) and heard[next_reading].time_s <= time_s:
-            now.append(heard[next_reading])
-            next_reading += 1
-        if now:
+        book.predict_s.append(predicted_s - begin_s)
+        if now := readings.until(time_s):
             learned = slam.observe(now)
             end_s = clock_s()
-            took += [(end_s - begin_s) / len(now)] * len(now)
-            if len(learned) == len(now):  # nothing that waits or joins: updates alone
-                scalars = sum(one.size for one in learned)
-                scalar_s += [(end_s - predicted_s) / scalars] * scalars
-            for one in learned:
-                refused += not one.accepted
-                if one.accepted:
-                    nis.append(one.nis)
-                    sizes.append(one.size)
-            updates += len(learned)
+            book.observed(learned, len(now), end_s - begin_s, end_s - predicted_s)
         poses[k], covariances[k] = slam.pose, slam.pose_covariance
+    nis, sizes = np.array(book.nis), np.array(book.sizes, dtype=np.float64)
+    lost = [name for name in run.beacon_ids if name not in slam.beacons]
     return Track(
         times_s=times,
         poses=poses,
@@ -78,22 +62,55 @@ def filter_run(
             str(b): BeaconFix(float(e.mean[0]), float(e.mean[1]), e.covariance[:2, :2]) for b, e in slam.beacons.items()
         },
         calibration={name: Calibrated(*found) for name, found in slam.calibration.items()},
-        nis=np.array(nis),
-        nis_sizes=np.array(sizes, dtype=np.float64),
-        refused=refused,
-        update_s=np.array(took),
-        predict_s=np.array(predict_s[1:]),
-        scalar_s=np.array(scalar_s),
-        updates=updates - refused,
+        nis=nis,
+        nis_sizes=sizes,
+        refused=book.refused,
+        update_s=np.array(book.update_s),
+        predict_s=np.array(book.predict_s[1:]),
+        scalar_s=np.array(book.scalar_s),
+        updates=len(book.nis),
         warnings=(
-            *(
-                f"beacon {name} could not be placed: its readings leave two places or none"
-                for name in run.beacon_ids
-                if name not in slam.beacons
-            ),
-            *_doubts(np.array(nis), np.array(sizes, dtype=np.float64), refused, slam.jumps),
+            *(f"beacon {name} could not be placed: its readings leave two places or none" for name in lost),
+            *_doubts(nis, sizes, book.refused, slam.jumps),
         ),
     )
+
+
+class _Heard:
+    """The readings of a run, handed out in order of time."""
+
+    def __init__(self, run: RecordedRun) -> None:
+        self._all, self._next = list(_readings(run)), 0
+
+    def until(self, time_s: float) -> list[Reading]:
+        """Those up to ``time_s`` that were not handed out before."""
+        first = self._next
+        while self._next < len(self._all) and self._all[self._next].time_s <= time_s:
+            self._next += 1
+        return self._all[first : self._next]
+
+
+@dataclass(slots=True)
+class _Book:
+    """What the readings said, and what each step cost, s: of a prediction, of a reading with it, of a scalar alone."""
+
+    nis: list[float] = field(default_factory=list)
+    sizes: list[int] = field(default_factory=list)
+    refused: int = 0
+    predict_s: list[float] = field(default_factory=list)
+    update_s: list[float] = field(default_factory=list)
+    scalar_s: list[float] = field(default_factory=list)
+
+    def observed(self, learned: Sequence[Learned], count: int, whole_s: float, update_s: float) -> None:
+        """``count`` readings of a moment were put into the filter."""
+        self.update_s += [whole_s / count] * count
+        if len(learned) == count:  # nothing that waits or joins: updates alone
+            scalars = sum(one.size for one in learned)
+            self.scalar_s += [update_s / scalars] * scalars
+        accepted = [one for one in learned if one.accepted]
+        self.refused += len(learned) - len(accepted)
+        self.nis += [one.nis for one in accepted]
+        self.sizes += [one.size for one in accepted]
 
 
 def _doubts(nis: FloatArray, sizes: FloatArray, refused: int, jumps: int) -> Iterator[str]:

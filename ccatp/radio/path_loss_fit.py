@@ -11,6 +11,7 @@ from scipy.special import chdtri, stdtrit
 from ccatp.filters.base import FloatArray
 from ccatp.radio.path_loss import PathLoss
 
+LEAST_EXPONENT = 0.1  # free space has 2; levels that hardly fall tell no distance
 LEAST_PLACES = 3  # two unknowns and one to tell the spread
 _PLAUSIBLE_EXPONENT = (1.0, 6.0)  # a corridor that guides waves has 1.2, a building with walls in the way up to 6
 _FAR_OFF = 3.5  # studentised residual of a place that wants a second look
@@ -121,7 +122,8 @@ def fit_path_loss(pairs: Iterable[LevelPair]) -> PathLossFit:
     readings at one place are no hundred witnesses.
 
     Raises:
-        CalibrationError: fewer than three distances, one that is not positive, or one that is not finite.
+        CalibrationError: fewer than three distances, one that is not positive, one that is not finite, or levels that
+            do not fall with distance.
     """
     by_place: dict[tuple[float, tuple[float, float] | None], list[float]] = {}
     for pair in pairs:
@@ -135,6 +137,10 @@ def fit_path_loss(pairs: Iterable[LevelPair]) -> PathLossFit:
     rows = np.column_stack([np.ones(distances.size), -10.0 * np.log10(distances)])
     normal = np.linalg.inv(rows.T @ rows)
     found = normal @ rows.T @ levels
+    if not found[1] >= LEAST_EXPONENT:
+        raise CalibrationError(
+            f"levels do not fall with distance (exponent {found[1]:.2f}): are they distances in m, then levels in dBm?"
+        )
     residuals = levels - rows @ found
     variance = float(residuals @ residuals) / (distances.size - 2)
     white, shadowing = _parts(list(by_place.values()), variance)

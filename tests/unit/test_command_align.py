@@ -148,7 +148,7 @@ def test_settings_act(run_dir: Path, capsys: pytest.CaptureFixture[str]) -> None
     [
         (["--csv", "nowhere/moves.csv"], "--csv: no directory nowhere; make it first"),
         (["--figure", "nowhere/map.png"], "--figure: no directory nowhere; make it first"),
-        (["--figure", "map.tiff7"], "map.tiff7: cannot be written"),
+        (["--figure", "map.tiff7"], "--figure: map.tiff7: no format by that name"),
         (["--set", "run.seed=2"], "run.seed: has no effect on the alignment; what has: align., robot.puck_height_m"),
         (["--set", "align.false_alarm=2"], "align.false_alarm"),
         (

@@ -117,7 +117,10 @@ def test_the_figure_is_drawn(suffix: str, magic: bytes, tmp_path: Path) -> None:
             "mirror.surface.normalisation_radius_mm = 1e-300 must be at least 100",
         ),
         (["--figure", "nowhere/plan.png"], "--figure: no directory nowhere; make it first"),
-        (["--panels", "1", "--figure", "plan.tiff7"], "plan.tiff7: cannot be written"),
+        (
+            ["--panels", "1", "--figure", "plan.tiff7"],
+            "--figure: plan.tiff7: no format by that name; the file may end in .png, .pdf, .svg",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(

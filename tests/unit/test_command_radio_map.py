@@ -158,7 +158,9 @@ def test_eight_surveyed_anchors(with_tags: bool, tmp_path: Path, capsys: pytest.
         ("", ":1: columns ; wanted first,second,range_m"),
         ("first,second,range_m\nA,A,1.0\n", ":2: from A to itself"),
         ("first,second,range_m\nA,B,far\n", ":2: range_m = 'far' is no number"),
-        ("first,second,range_m,sigma_m\nA,B,1.0,0\n", ":2: sigma of 0 m, must be positive"),
+        ("first,second,range_m,sigma_m\nA,B,1.0,0\n", ":2: sigma of 0 m, must be 1e-06 to 1e+06 m"),
+        ("first,second,range_m,sigma_m\nA,B,1.0,1e-200\n", ":2: sigma of 1e-200 m, must be 1e-06 to 1e+06 m"),
+        ("first,second,range_m\nA,B,1e-300\n", ":2: range of 1e-300 m is no distance"),
         ("first,second,range_m\nA,,1.0\n", ":2: second is empty"),
         ("first,second,range_m\n", "has no ranges, only a header"),
         ("session,pos,deg,anchor,tag,mean_m\n", "has no ranges, only a header"),
@@ -300,7 +302,9 @@ def test_without_matplotlib(
 
 def test_a_figure_that_no_format_has(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = ranges_file(tmp_path / "r.csv", ALL)
-    assert "m.gifx: cannot be written" in refusal(capsys, "--ranges", str(path), "--figure", str(tmp_path / "m.gifx"))
+    assert "m.gifx: no format by that name" in refusal(
+        capsys, "--ranges", str(path), "--figure", str(tmp_path / "m.gifx")
+    )
 
 
 def test_beacon_files(tmp_path: Path) -> None:

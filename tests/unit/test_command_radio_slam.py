@@ -115,7 +115,7 @@ def test_the_picture(recording: Path, tmp_path: Path, filter_name: str, capsys: 
         (["{csv}", "--format", "lidar"], "'lidar' is not one of"),
         (["{csv}", "--filter", "particle"], "'particle' is not one of"),
         (["{csv}", "--figure", "{tmp}/no/map.png"], "--figure: no directory"),
-        (["{csv}", "--figure", "{tmp}/map.wrong"], "map.wrong: cannot be written"),
+        (["{csv}", "--figure", "{tmp}/map.wrong"], "map.wrong: no format by that name"),
         (["{csv}", "--set", "csv.radio.range_sigma_m=-1"], "csv.radio.range_sigma_m"),
         (["{csv}", "--set", "csv.radio.nothing=1"], "csv.radio.nothing"),
     ],

@@ -1,5 +1,5 @@
 // The map: panels, points, path, robot, and whatever else the daemon has to show. Metres, x to the right, y up.
-const TODO = 0, ARRIVED = 1, MEASURED = 2, SKIPPED = 3;
+const PLANNED = 0, ARRIVED = 1, MEASURED = 2, SKIPPED = 3;
 const MARGIN = 0.25;
 const BEYOND = 1.5; // metres outside of the rim that are still shown
 const ZOOM = [0.5, 400];
@@ -261,7 +261,7 @@ export class MapView {
     const tolerance = this.ground.arrival_tolerance_mm;
     this.ground.points.forEach(([, x, y], k) => {
       const [px, py] = at(x, y);
-      const how = this.states[k] ?? TODO;
+      const how = this.states[k] ?? PLANNED;
       pen.beginPath();
       if (how === SKIPPED) {
         pen.strokeStyle = this.inks.bad;
@@ -289,7 +289,7 @@ export class MapView {
     const next = this.byName?.get(this.mission?.next_point ?? "");
     if (next === undefined || this.mission.state === "done") return;
     const ahead = [next];
-    for (let k = next + 1; k < this.ground.points.length && ahead.length < NEXT; k++) if ((this.states[k] ?? TODO) === TODO) ahead.push(k);
+    for (let k = next + 1; k < this.ground.points.length && ahead.length < NEXT; k++) if ((this.states[k] ?? PLANNED) === PLANNED) ahead.push(k);
     const places = ahead.map((k) => at(this.ground.points[k][1], this.ground.points[k][2]));
     pen.setLineDash([4, 5]);
     line(pen, this.pose ? [at(this.pose.x_m, this.pose.y_m), ...places] : places, this.inks.accent, 1.2, false);

@@ -11,7 +11,7 @@ from ccatp.config.radio_loader import load_radio_config
 from ccatp.config.radio_models import RadioConfig
 from ccatp.dashboard.beacon_ground import beacon_ground, waypoint_name
 from ccatp.dashboard.beacon_view import BeaconView, expected_rms_m, true_rms_m, worst_sigma_m
-from ccatp.dashboard.ground import MEASURED, TODO
+from ccatp.dashboard.ground import MEASURED, PLANNED
 from ccatp.errors import ConfigError
 from ccatp.wire.topics import (
     BeaconArrival,
@@ -61,7 +61,7 @@ def test_waypoints_are_done_one_after_the_other_and_anew_in_the_next_lap(view: B
     assert view.news(0.0)["points"] == [[0, MEASURED, None], [1, MEASURED, None]]
     assert view.news(0.0)["points"] == []
     view.hear(arrival(0, lap=1), 0.0)
-    assert view.news(0.0)["points"] == [[0, MEASURED, None], *([k, TODO, None] for k in (1, 2, 3))]
+    assert view.news(0.0)["points"] == [[0, MEASURED, None], *([k, PLANNED, None] for k in (1, 2, 3))]
     assert view.everything(0.0)["points"] == [[0, MEASURED, None]]
 
 

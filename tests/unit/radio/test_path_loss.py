@@ -76,7 +76,7 @@ def test_repeated_readings_tell_white_from_static() -> None:
 
 
 def test_places_at_the_same_distance_stay_places() -> None:
-    pairs = [LevelPair(d, -45.0 + s, (d, s)) for d in (1.0, 2.0, 4.0) for s in (-1.0, 1.0)]
+    pairs = [LevelPair(d, -45.0 - d + s, (d, s)) for d in (1.0, 2.0, 4.0) for s in (-1.0, 1.0)]
     assert fit_path_loss(pairs).places == 6
     assert fit_path_loss([LevelPair(*pair[:2]) for pair in pairs]).places == 3
 
@@ -86,8 +86,14 @@ def test_doubts_are_told() -> None:
     assert fit_path_loss(good).doubts() == []
     off = [*good[:-1], LevelPair(good[-1].distance_m, good[-1].level_dbm + 20.0)]
     assert any("off the line" in doubt for doubt in fit_path_loss(off).doubts())
-    rising = [LevelPair(d, -60.0 + 5.0 * d) for d in (1.0, 2.0, 3.0, 4.0)]
-    assert any("is outside 1 to 6" in doubt for doubt in fit_path_loss(rising).doubts())
+    flat = [LevelPair(d, -60.0 - 0.5 * d) for d in (1.0, 2.0, 3.0, 4.0)]
+    assert any("is outside 1 to 6" in doubt for doubt in fit_path_loss(flat).doubts())
+
+
+@pytest.mark.parametrize("slope_db_m", [0.0, 5.0])
+def test_levels_that_do_not_fall_are_no_path_loss(slope_db_m: float) -> None:
+    with pytest.raises(CalibrationError, match="levels do not fall with distance"):
+        fit_path_loss([LevelPair(d, -60.0 + slope_db_m * d) for d in (1.0, 2.0, 3.0, 4.0)])
 
 
 @pytest.mark.parametrize(
