@@ -1,7 +1,7 @@
 """Reaction times of the daemon as it runs, while six programs want the processors and a seventh the disk.
 
 The robot is a stand-in in this process, which is preferred where the system permits it: a real one is a machine of its
-own. ``CCATP_REACTIONS`` says how often each fault is made.
+own. ``CCATP_REACTIONS`` says how often each kind of fault is made: a process is killed, is stopped, the link is silent.
 """
 
 import asyncio
@@ -33,6 +33,7 @@ from ccatp.stand_ins.truth_outlet import TruthOutlet
 from tests.faults.linking import Measured
 
 TIMES = int(os.environ.get("CCATP_REACTIONS", "3"))
+IN_A_SURVEY = 10  # faults that one daemon has to bear, at most
 HOGS = 6
 HOG = "while True: pass"
 FSYNC = """
@@ -149,8 +150,8 @@ class Survey:
 @asynccontextmanager
 async def survey(folder: Path, runtime_dir: Path) -> AsyncIterator[Survey]:
     """A survey that begins at base; the daemon is ended at the end."""
-    settings = {"sim.robot.port": 0, "run.mirror": "fyst-m2", "run.filter": "kf", "run.panels": 3,
-                "mission.calibration_length_m": 0}  # fmt: skip
+    settings = {"sim.robot.port": 0, "run.mirror": "fyst-m2", "run.filter": "kf", "run.panels": 20,
+                "run.restart_limit": IN_A_SURVEY, "mission.calibration_length_m": 0}  # fmt: skip
     cfg = load_config(overrides=settings)
     mirror, stop = build_mirror(cfg.mirror), asyncio.Event()
     async with AsyncExitStack() as stack:
@@ -246,35 +247,50 @@ def preferred() -> Iterator[None]:
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
+def surveys() -> list[tuple[str, range]]:
+    """Faults, and which of their times one daemon bears: each kind ``TIMES`` times, shared among the processes."""
+    found = []
+    for name in FAULTS:
+        times = -(-TIMES // sum(other.split()[0] == name.split()[0] for other in FAULTS))
+        each = 1 if name == "kill all" else IN_A_SURVEY
+        found += [(name, range(first, min(first + each, times))) for first in range(0, times, each)]
+    return found
+
+
 @pytest.mark.slow
 @pytest.mark.fault("P6", "P19")
-@pytest.mark.parametrize("kind", FAULTS)
-@pytest.mark.parametrize("time_", range(TIMES))
+@pytest.mark.parametrize(("fault", "times"), surveys(), ids=str)
 @pytest.mark.usefixtures("preferred")
-async def test_reaction(kind: str, time_: int, tmp_path: Path, runtime_dir: Path, measured: Measured) -> None:
-    make, evidence_s = FAULTS[kind]
+async def test_reaction(fault: str, times: range, tmp_path: Path, runtime_dir: Path, measured: Measured) -> None:
     async with survey(tmp_path, runtime_dir) as it:
         with load(tmp_path):
-            await it.driving()
-            await asyncio.sleep(0.037 * (time_ % 10))
-            begun_s = time.monotonic()
-            make(it)
-            await asyncio.sleep(STOPPED_S)
-            turned_s, zero_s = it.wire.turned_s, it.wire.zero_after(begun_s)
-            assert zero_s is not None, "the host never said so"
-            measured("P19", 1e3 * max(zero_s - begun_s - evidence_s, 0.0))
-            measured("P19", 1e3 * (zero_s - begun_s), "from_event_ms")
-            if kind.startswith("stop"):
-                measured("P6", 1e3 * max(zero_s - begun_s - evidence_s, 0.0))
-            if kind == "kill all":
-                measured("P19", 1e3 * max(turned_s - begun_s, 0.0), "stopped_ms")
-            if evidence_s:  # back again: what was due meanwhile must not be done now
-                assert turned_s - begun_s < STOPPED_S - 0.1
-                it.proxy.heal()
-                for name in ("main", "danger"):
-                    with contextlib.suppress(AssertionError, ProcessLookupError):
-                        os.kill(it.pid_of(name), signal.SIGCONT)
-                await asyncio.sleep(STOPPED_S)
+            for time_ in times:
+                await it.driving()
+                await asyncio.sleep(0.037 * (time_ % 10))
+                await react(it, fault, measured)
             measured("P19", it.wire.stale, "stale_drives")
             duties = [duty for duty in it.wire.duties if duty != it.wire.duties[0]]
             measured("P19", max(len(duties) - 1, 0), "fan_changes")  # one is the daemon's own at its start
+
+
+async def react(it: Survey, fault: str, measured: Measured) -> None:
+    """Make a fault, and see what host and robot do."""
+    make, evidence_s = FAULTS[fault]
+    begun_s = time.monotonic()
+    make(it)
+    await asyncio.sleep(STOPPED_S)
+    turned_s, zero_s = it.wire.turned_s, it.wire.zero_after(begun_s)
+    assert zero_s is not None, "the host never said so"
+    measured("P19", 1e3 * max(zero_s - begun_s - evidence_s, 0.0))
+    measured("P19", 1e3 * (zero_s - begun_s), "from_event_ms")
+    if fault.startswith("stop"):
+        measured("P6", 1e3 * max(zero_s - begun_s - evidence_s, 0.0))
+    if fault == "kill all":
+        measured("P19", 1e3 * max(turned_s - begun_s, 0.0), "stopped_ms")
+    if evidence_s:  # back again: what was due meanwhile must not be done now
+        assert turned_s - begun_s < STOPPED_S - 0.1
+        it.proxy.heal()
+        for name in ("main", "danger"):
+            with contextlib.suppress(AssertionError, ProcessLookupError):
+                os.kill(it.pid_of(name), signal.SIGCONT)
+        await asyncio.sleep(STOPPED_S)
