@@ -8,11 +8,9 @@ from ccatp.radio.mote_plan import network_plan
 from ccatp.radio.mote_ranges import pair_range
 from ccatp.radio.phase_one import map_by_plan
 from ccatp.radio.range_network import build_network
-from ccatp.radio.self_mapping import MapperSettings, MoteMapper, printed_prior
+from ccatp.radio.self_mapping import MoteMapper, mapper_settings, printed_prior
 from ccatp.radio.tdoa import MoteRange
 from ccatp.wire.beacon_frame import MoteBurst
-
-_OFFSET_SIGMA_M, _SCALE_SIGMA = 0.5, 0.05  # priors of a common offset and scale, where they are estimated
 
 
 class SelfMap:
@@ -92,7 +90,7 @@ class SelfMap:
         if cfg.phase2.prior == "printed":
             fixed = np.flatnonzero(np.isfinite(known.ravel())).tolist()
             covariance = printed_prior(len(motes), d, fixed, cfg.phase2.printed_variance_m2)
-        mapper = MoteMapper(mean, covariance, _settings(cfg), known)
+        mapper = MoteMapper(mean, covariance, mapper_settings(cfg), known)
         self.notes = {"map_phase1_expected_m": mapper.expected_rms_m, "map_updates": 0.0}
         self._note(mapper)
         return mapper
@@ -110,15 +108,3 @@ class SelfMap:
 
     def _note(self, mapper: MoteMapper) -> None:
         self.notes["map_expected_m"] = mapper.expected_rms_m
-
-
-def _settings(cfg: CricketConfig) -> MapperSettings:
-    """How phase 2 goes."""
-    return MapperSettings(
-        cfg.phase2.linearisations,
-        cfg.phase2.pools,
-        cfg.phase2.gate_probability,
-        cfg.phase2.target_rms_m,
-        _OFFSET_SIGMA_M if cfg.batch.estimates_offset else 0.0,
-        _SCALE_SIGMA if cfg.batch.estimates_scale else 0.0,
-    )

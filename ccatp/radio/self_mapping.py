@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
+from ccatp.config.cricket_models import CricketConfig
 from ccatp.filters.ekf_slam import EkfSlam, Update
 from ccatp.radio.range_network import FloatArray, MappingError
 
@@ -13,6 +14,9 @@ _STRAIGHT = 0.01  # share of the variance of a range up to which its curvature d
 _CURVED = 2  # times that all pairs are taken together: how far the map is from straight depends on its errors
 _POOLED = 80  # pairs up to which all of them are linearised together after each reading
 _DIRECTION_M = 1e-9  # motes nearer than this have no direction between them
+
+
+_OFFSET_SIGMA_M, _SCALE_SIGMA = 0.5, 0.05  # priors of a common offset and scale, where they are estimated
 
 
 class MapperSettings(NamedTuple):
@@ -33,6 +37,18 @@ class MapperSettings(NamedTuple):
     target_rms_m: float
     offset_sigma_m: float = 0.0
     scale_sigma: float = 0.0
+
+
+def mapper_settings(cfg: CricketConfig) -> MapperSettings:
+    """How phase 2 goes by the configuration."""
+    return MapperSettings(
+        cfg.phase2.linearisations,
+        cfg.phase2.pools,
+        cfg.phase2.gate_probability,
+        cfg.phase2.target_rms_m,
+        _OFFSET_SIGMA_M if cfg.batch.estimates_offset else 0.0,
+        _SCALE_SIGMA if cfg.batch.estimates_scale else 0.0,
+    )
 
 
 class MoteMapper:

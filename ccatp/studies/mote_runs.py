@@ -16,11 +16,10 @@ from ccatp.radio.range_bound import bound_rms_m, map_rms_m
 from ccatp.radio.range_network import FloatArray, MappingError, RangeNetwork
 from ccatp.radio.rigid_alignment import aligned_rms_m, best_motion, rms_m
 from ccatp.radio.rigidity import Freedom, find_freedom, generic_state
-from ccatp.radio.self_mapping import MapperSettings, MoteMapper, printed_prior, run_phase_two
+from ccatp.radio.self_mapping import MoteMapper, mapper_settings, printed_prior, run_phase_two
 from ccatp.radio.stands import complete_stands
 from ccatp.studies.mote_field import SimulatedField
 
-_OFFSET_SIGMA_M, _SCALE_SIGMA = 0.5, 0.05  # of the filter's priors, where an offset or a scale is estimated
 _GENERIC = 0  # seed of the random places of rank and fold-over: they must not depend on the run
 
 
@@ -224,18 +223,6 @@ def batch_network(cfg: CricketConfig, field: SimulatedField) -> RangeNetwork:
 def batch_settings(cfg: CricketConfig) -> BatchSettings:
     """How the batch fits."""
     return BatchSettings(cfg.batch.robust_scale, cfg.batch.max_iterations)
-
-
-def mapper_settings(cfg: CricketConfig) -> MapperSettings:
-    """How the filter goes."""
-    return MapperSettings(
-        cfg.phase2.linearisations,
-        cfg.phase2.pools,
-        cfg.phase2.gate_probability,
-        cfg.phase2.target_rms_m,
-        _OFFSET_SIGMA_M if cfg.batch.estimates_offset else 0.0,
-        _SCALE_SIGMA if cfg.batch.estimates_scale else 0.0,
-    )
 
 
 def look_ahead(cfg: CricketConfig, field: SimulatedField, method: str, updates: int | None = None) -> MoteOutlook:
