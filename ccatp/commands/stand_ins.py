@@ -11,9 +11,10 @@ from pathlib import Path
 from ccatp.config.loader import dump_config
 from ccatp.config.models import Config
 from ccatp.package import child_environment
-from ccatp.processes.children import ENVIRONMENT
 from ccatp.processes.common import SUPERVISOR_PID
-from ccatp.supervisor import PROCESSES, listen, places_of, with_addresses
+from ccatp.supervision.children import ENVIRONMENT
+from ccatp.supervision.listening import listen, places_of, with_addresses
+from ccatp.supervisor import PROCESSES
 
 STOP_TIMEOUT_S = 5.0
 

@@ -11,7 +11,7 @@ import pytest
 
 from ccatp.client import Client, Latched, Pong, StillWaiting
 from ccatp.errors import RefusedError, UnreachableError
-from ccatp.processes.run_collector import NO_STATUS
+from ccatp.supervision.run_collector import NO_STATUS
 from tests.unit.serving import serving
 
 

@@ -10,8 +10,8 @@ import msgspec
 import pytest
 
 from ccatp.cli import main
-from ccatp.processes.run_collector import NO_STATUS
 from ccatp.status_table import clock, share_done, status_line, status_rows
+from ccatp.supervision.run_collector import NO_STATUS
 from tests.unit.serving import serving
 
 STATUS = {

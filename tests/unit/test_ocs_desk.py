@@ -17,7 +17,7 @@ from ccatp.client import Client
 from ccatp.observatory import plugin as ocs_plugin
 from ccatp.observatory.agent import OcsMissing, add_arguments, main, register, survey_command
 from ccatp.observatory.desk import SurveyDesk, feed_fields
-from ccatp.processes.run_collector import NO_STATUS
+from ccatp.supervision.run_collector import NO_STATUS
 from tests.unit.serving import serving
 
 

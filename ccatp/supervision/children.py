@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from ccatp.config.models import ProcessesConfig
 from ccatp.package import child_environment
 from ccatp.processes.common import SUPERVISOR_PID
-from ccatp.restarts import Decision, Fate, RestartPolicy, SilenceWatch
+from ccatp.supervision.restarts import Decision, Fate, RestartPolicy, SilenceWatch
 from ccatp.wire.topics import Presence
 
 # The matrices are 4 x 4: threads of the linear algebra would only fight the processes for the cores.

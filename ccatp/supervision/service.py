@@ -1,7 +1,7 @@
 """Glue. The daemon as a service: ready when the loops have joined, the watchdog stroked while all is well, an end."""
 
 from ccatp.liveness import STALE_AFTER_S, Liveness
-from ccatp.service_notify import Notifier
+from ccatp.supervision.service_notify import Notifier
 from ccatp.wire.topics import MissionStatus, Presence
 
 STATUS_PERIOD_S = 1.0

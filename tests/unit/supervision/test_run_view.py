@@ -5,9 +5,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from ccatp.processes.run_collector import NO_STATUS
-from ccatp.processes.run_view import BeaconView, RunView
 from ccatp.processes.survey_watch import state_text
+from ccatp.supervision.run_collector import NO_STATUS
+from ccatp.supervision.run_view import BeaconView, RunView
 from ccatp.surveying.states import State
 
 

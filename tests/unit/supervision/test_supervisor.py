@@ -11,7 +11,8 @@ from ccatp.config.loader import load_config
 from ccatp.errors import ConfigError, RefusedError
 from ccatp.run_options import RunOptions
 from ccatp.runtime_dir import is_deserted
-from ccatp.supervisor import PROCESSES, _lock, _make_run_dir, _recover, _take, run_survey
+from ccatp.supervision.run_folder import own_runtime_dir, owned, survey_run_dir
+from ccatp.supervisor import PROCESSES, _recover, run_survey
 
 
 def options(**fields: object) -> RunOptions:
@@ -38,34 +39,34 @@ def test_a_port_in_use(tmp_path: Path) -> None:
 def test_a_run_directory_with_a_mission_wants_resume(tmp_path: Path) -> None:
     (tmp_path / "mission.sqlite").touch()
     with pytest.raises(ConfigError, match="holds a mission already; give --resume"):
-        _make_run_dir(options(run_dir=tmp_path), load_config())
-    assert _make_run_dir(options(run_dir=tmp_path, resume=True), load_config()) == tmp_path
+        survey_run_dir(options(run_dir=tmp_path), load_config())
+    assert survey_run_dir(options(run_dir=tmp_path, resume=True), load_config()) == tmp_path
 
 
 def test_nothing_to_resume(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no mission in"):
-        _make_run_dir(options(run_dir=tmp_path, resume=True), load_config())
+        survey_run_dir(options(run_dir=tmp_path, resume=True), load_config())
 
 
 def test_a_run_directory_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="cannot make"):
-        _make_run_dir(options(run_dir=tmp_path / "file" / "run"), load_config())
+        survey_run_dir(options(run_dir=tmp_path / "file" / "run"), load_config())
 
 
 def test_one_daemon_in_a_runtime_directory(tmp_path: Path) -> None:
     path = tmp_path / "lock"
-    with _lock(path, "--runtime-dir"), pytest.raises(RefusedError, match="another ccatp runs in"):  # noqa: SIM117
-        with _lock(path, "--runtime-dir"):
+    with owned(path, "--runtime-dir"), pytest.raises(RefusedError, match="another ccatp runs in"):  # noqa: SIM117
+        with owned(path, "--runtime-dir"):
             pass
-    with _lock(path, "--runtime-dir"):
+    with owned(path, "--runtime-dir"):
         pass
 
 
 def test_the_sockets_go_with_the_daemon(tmp_path: Path) -> None:
     for is_sim, left in ((False, {"puck", "main2", "truth"}), (True, {"main2"})):
         with ExitStack() as stack:
-            _take(stack, tmp_path, is_sim=is_sim)
+            own_runtime_dir(stack, tmp_path, is_sim=is_sim)
             for name in ("control", "puck", "truth", "main2"):
                 with socket.socket(socket.AF_UNIX) as made:
                     (tmp_path / name).unlink(missing_ok=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ccatp.errors import ConfigError, ExitStatus
-from ccatp.unfinished import FILE, find_unfinished, finished_summary, forget_finished, note_unfinished
+from ccatp.supervision.unfinished import FILE, find_unfinished, finished_summary, forget_finished, note_unfinished
 
 
 @pytest.fixture(autouse=True)

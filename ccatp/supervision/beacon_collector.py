@@ -9,8 +9,8 @@ import zmq
 from ccatp.beacon_summary import BeaconSummary, Reached, beacon_facts
 from ccatp.config.radio_loader import dump_radio_config
 from ccatp.config.radio_models import RadioConfig
-from ccatp.processes.collecting import Collector
 from ccatp.processes.common import Endpoints
+from ccatp.supervision.collecting import Collector
 from ccatp.wire.topics import (
     BeaconArrival,
     BeaconMap,

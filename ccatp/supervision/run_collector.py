@@ -14,12 +14,12 @@ from ccatp.mirror.batches import FloatArray, deck_poses
 from ccatp.mirror.errors import PanelFitError
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.planning.traversal import ORDERS
-from ccatp.processes.collecting import Collector
 from ccatp.processes.common import Endpoints
 from ccatp.run_files.recorder import iter_messages, recordings
 from ccatp.samples import PanelId, PanelPose, PointId
 from ccatp.storage.store import MissionStore
 from ccatp.summary import RunFacts, SummaryBuilder, puck_targets
+from ccatp.supervision.collecting import Collector
 from ccatp.viewing.views import Views
 from ccatp.wire.topics import (
     Arrival,

@@ -8,12 +8,12 @@ import zmq
 
 from ccatp.config.models import Config, ProcessesConfig
 from ccatp.config.radio_models import RadioConfig
-from ccatp.processes.beacon_collector import BeaconCollector
-from ccatp.processes.children import ProcessSpec
-from ccatp.processes.collecting import Collector
 from ccatp.processes.common import Endpoints
-from ccatp.processes.run_collector import RunCollector
-from ccatp.processes.run_view import BeaconView, RunView, survey_title
+from ccatp.supervision.beacon_collector import BeaconCollector
+from ccatp.supervision.children import ProcessSpec
+from ccatp.supervision.collecting import Collector
+from ccatp.supervision.run_collector import RunCollector
+from ccatp.supervision.run_view import BeaconView, RunView, survey_title
 from ccatp.wire.topics import Presence
 
 Heard = Callable[[Presence], None]

@@ -7,8 +7,8 @@ import pytest
 
 from ccatp.errors import ExitStatus
 from ccatp.processes.common import open_log
-from ccatp.processes.run_report import write_run_report
-from ccatp.processes.run_view import RunView, survey_title
+from ccatp.supervision.run_report import write_run_report
+from ccatp.supervision.run_view import RunView, survey_title
 from tests.unit.aligning.conftest import load
 from tests.unit.reporting.beacon_recorded import record_beacons
 from tests.unit.run_folder import make_run

@@ -17,12 +17,12 @@ import structlog
 
 from ccatp.liveness import Liveness
 from ccatp.processes import realtime
-from ccatp.processes.run_collector import NO_STATUS
-from ccatp.processes.service import Service
-from ccatp.service_notify import Notifier, take_from, watchdog_period_s
+from ccatp.supervision.run_collector import NO_STATUS
+from ccatp.supervision.service import Service
+from ccatp.supervision.service_notify import Notifier, take_from, watchdog_period_s
 from ccatp.wire.topics import Presence
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 UNIT = ROOT / "packaging" / "ccatp.service"
 
 
