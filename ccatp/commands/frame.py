@@ -224,6 +224,12 @@ WORLD_OPTIONS = options(
     click.option("--seed", type=int, metavar="N", help="Seed of every random draw."),
     SETTINGS_OPTION,
 )
+DAEMON_OPTIONS = options(
+    CONFIG_OPTION,
+    RUNTIME_DIR_OPTION,
+    TIMEOUT_OPTION,
+    click.option("--json", "json_output", is_flag=True, help="The daemon's answer as JSON on standard output."),
+)
 ADDRESS_OPTIONS = options(
     click.option("--host", help="Address to listen on."),
     click.option("--port", type=int, help="Port to listen on; 0 takes any free one."),
@@ -265,32 +271,6 @@ def ask_daemon(runtime_dir: Path | None, channel: str, payload: dict[str, object
 
     daemon = Client(runtime_dir, timeout_s)
     return daemon.ask(str(payload["cmd"])) if channel == "control" else daemon.observatory.ask(payload)
-
-
-def ask_over_tcp(
-    endpoint: str, server_key: Path, key: Path, payload: dict[str, object], timeout_s: float
-) -> dict[str, Any]:
-    """One request to the observatory channel of a daemon elsewhere.
-
-    Args:
-        endpoint: ``tcp://HOST:PORT``.
-        server_key: file with the daemon's public key.
-        key: file with our own secret key.
-        payload: the request.
-        timeout_s: longest wait for the answer.
-
-    Raises:
-        ConfigError: a key file cannot be used.
-        UnreachableError: nobody listens there, or no answer came in time; a daemon does not answer who is not listed.
-        RefusedError: the daemon said no, and why.
-    """
-    from ccatp.client import exchange
-    from ccatp.curve_keys import read_pair, read_public
-    from ccatp.router import CurveClient
-
-    pair = read_pair(key, "--key")
-    curve = CurveClient(read_public(server_key, "--server-key"), pair.public, pair.secret)
-    return exchange(endpoint, payload, timeout_s, curve, repeats=True)
 
 
 def tell(reply: Mapping[str, Any], json_output: bool) -> None:
