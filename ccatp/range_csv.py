@@ -4,9 +4,9 @@ import csv
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-from ccatp.radio.measured_map import MeasuredRanges
-from ccatp.radio.range_network import MappingError
-from ccatp.radio.tdoa import MoteRange
+from ccatp.motes.measured_map import MeasuredRanges
+from ccatp.motes.range_network import MappingError
+from ccatp.motes.tdoa import MoteRange
 
 PLAIN = ("first", "second", "range_m")
 SESSION = ("session", "pos", "deg", "anchor", "tag", "mean_m")

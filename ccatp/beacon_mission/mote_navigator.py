@@ -13,7 +13,7 @@ from ccatp.config.radio_models import RadioConfig
 from ccatp.control.following import TargetSight
 from ccatp.filters.base import FloatArray
 from ccatp.filters.ekf_slam import EkfSlam, columns_of
-from ccatp.radio.mote_ranges import pair_range
+from ccatp.motes.mote_ranges import pair_range
 from ccatp.radio.motion import POSE, Pose
 from ccatp.radio.signal_settings import odometry_of, vehicle_of
 from ccatp.wire.beacon_frame import MoteBurst

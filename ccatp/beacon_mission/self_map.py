@@ -4,12 +4,12 @@ import numpy as np
 
 from ccatp.config.cricket_models import CricketConfig
 from ccatp.filters.base import FloatArray
-from ccatp.radio.mote_plan import network_plan
-from ccatp.radio.mote_ranges import pair_range
-from ccatp.radio.phase_one import map_by_plan
-from ccatp.radio.range_network import build_network
-from ccatp.radio.self_mapping import MoteMapper, mapper_settings, printed_prior
-from ccatp.radio.tdoa import MoteRange
+from ccatp.motes.mote_plan import network_plan
+from ccatp.motes.mote_ranges import pair_range
+from ccatp.motes.phase_one import map_by_plan
+from ccatp.motes.range_network import build_network
+from ccatp.motes.self_mapping import MoteMapper, mapper_settings, printed_prior
+from ccatp.motes.tdoa import MoteRange
 from ccatp.wire.beacon_frame import MoteBurst
 
 

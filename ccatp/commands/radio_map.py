@@ -103,8 +103,8 @@ def _measured(
 ) -> dict[str, Any]:
     import numpy as np
 
+    from ccatp.motes.measured_map import map_measured
     from ccatp.pictures.mote_figure import MapPicture, draw_mote_map
-    from ccatp.radio.measured_map import map_measured
     from ccatp.range_csv import read_places, read_ranges
 
     ranges_file, tags_file, truth_file = files

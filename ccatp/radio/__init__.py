@@ -1,1 +1,1 @@
-"""Pure. Positions from ranges."""
+"""Pure. Positions from what radios tell: ranges, bearings, signal strengths."""

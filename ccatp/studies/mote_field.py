@@ -6,10 +6,10 @@ from itertools import cycle, islice
 import numpy as np
 
 from ccatp.config.cricket_models import CricketConfig
-from ccatp.radio.mote_plan import MotePlan, loose_plan, network_plan
-from ccatp.radio.mote_ranges import pair_range
-from ccatp.radio.range_network import FloatArray, MappingError, RangeNetwork, build_network
-from ccatp.radio.tdoa import MoteRange
+from ccatp.motes.mote_plan import MotePlan, loose_plan, network_plan
+from ccatp.motes.mote_ranges import pair_range
+from ccatp.motes.range_network import FloatArray, MappingError, RangeNetwork, build_network
+from ccatp.motes.tdoa import MoteRange
 from ccatp.sim.motes.layout import true_motes
 from ccatp.sim.motes.ranging import Heard, MoteField
 

@@ -6,18 +6,18 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.config.cricket_models import CricketConfig
-from ccatp.radio.fold_over import FoldOver, find_fold_over
-from ccatp.radio.map_batch import BatchSettings
-from ccatp.radio.map_model import MapModel
-from ccatp.radio.mote_frame import pinned_map, plain_frame
-from ccatp.radio.mote_map import MoteMap, map_motes
-from ccatp.radio.phase_one import FirstMap, map_as_possible, map_by_plan
-from ccatp.radio.range_bound import bound_rms_m, map_rms_m
-from ccatp.radio.range_network import FloatArray, MappingError, RangeNetwork
+from ccatp.motes.fold_over import FoldOver, find_fold_over
+from ccatp.motes.map_batch import BatchSettings
+from ccatp.motes.map_model import MapModel
+from ccatp.motes.mote_frame import pinned_map, plain_frame
+from ccatp.motes.mote_map import MoteMap, map_motes
+from ccatp.motes.phase_one import FirstMap, map_as_possible, map_by_plan
+from ccatp.motes.range_bound import bound_rms_m, map_rms_m
+from ccatp.motes.range_network import FloatArray, MappingError, RangeNetwork
+from ccatp.motes.rigidity import Freedom, find_freedom, generic_state
+from ccatp.motes.self_mapping import MoteMapper, mapper_settings, printed_prior, run_phase_two
+from ccatp.motes.stands import complete_stands
 from ccatp.radio.rigid_alignment import aligned_rms_m, best_motion, rms_m
-from ccatp.radio.rigidity import Freedom, find_freedom, generic_state
-from ccatp.radio.self_mapping import MoteMapper, mapper_settings, printed_prior, run_phase_two
-from ccatp.radio.stands import complete_stands
 from ccatp.studies.mote_field import SimulatedField
 
 _GENERIC = 0  # seed of the random places of rank and fold-over: they must not depend on the run

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.radio.fold_over import find_fold_over
-from ccatp.radio.map_batch import BatchSettings
-from ccatp.radio.map_model import MapModel
-from ccatp.radio.mote_map import map_motes
-from ccatp.radio.range_bound import bound_rms_m
-from ccatp.radio.range_network import RangeNetwork, build_network, components
+from ccatp.motes.fold_over import find_fold_over
+from ccatp.motes.map_batch import BatchSettings
+from ccatp.motes.map_model import MapModel
+from ccatp.motes.mote_map import map_motes
+from ccatp.motes.range_bound import bound_rms_m
+from ccatp.motes.range_network import RangeNetwork, build_network, components
+from ccatp.motes.rigidity import find_freedom, generic_state
+from ccatp.motes.tdoa import MoteRange
 from ccatp.radio.rigid_alignment import best_motion
-from ccatp.radio.rigidity import find_freedom, generic_state
-from ccatp.radio.tdoa import MoteRange
 from ccatp.studies.figures import INK, colour, dress, new_figure, save
 
 SIZES = (30, 60, 120, 250, 500, 1000)

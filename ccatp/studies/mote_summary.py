@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ccatp.config.cricket_models import CricketConfig
-from ccatp.radio.range_network import FloatArray
+from ccatp.motes.range_network import FloatArray
 from ccatp.radio.rigid_alignment import aligned_rms_m, rms_m
 from ccatp.studies.mote_field import SimulatedField, simulate_field
 from ccatp.studies.mote_runs import MoteOutlook, MoteRun, look_ahead, run_batch, run_filter

@@ -12,9 +12,9 @@ import pytest
 
 from ccatp.beacon_file import BeaconFileError, read_beacons, write_beacons
 from ccatp.cli import main
-from ccatp.radio.range_network import MappingError
+from ccatp.motes.range_network import MappingError
 from ccatp.range_csv import read_places, read_ranges
-from tests.unit.radio.fields import ALL, HEADS
+from tests.unit.motes.fields import ALL, HEADS
 
 SESSION = Path(__file__).parents[2].parent / "shared" / "data" / "radio" / "uwb_planar"
 CONTRACT = {"rms_m", "crlb_m", "rank_deficiency", "fold_over_risk", "phase1_rms_m", "iterations"}

@@ -7,7 +7,7 @@ import pytest
 
 from ccatp.config.models import Config
 from ccatp.config.radio_loader import load_radio_config
-from ccatp.radio.range_network import MappingError
+from ccatp.motes.range_network import MappingError
 from ccatp.studies import mote_sizes
 from ccatp.studies.campaign import Cell, CellResult, Job
 from ccatp.studies.cricket_study import CASES, STUDY, combine, draw, run_job

@@ -1,0 +1,129 @@
+"""Generic global rigidity against what is known of graphs, and the names of what can fold."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from ccatp.motes.fold_over import find_fold_over
+from ccatp.motes.map_batch import BatchSettings, fit_map
+from ccatp.motes.map_model import MapModel
+from ccatp.motes.range_network import RigidBody
+from tests.unit.motes.fields import ADJACENT, ALL, HEADS, ZIGZAG, FloatArray, Pairs, near_pairs, network_of
+
+
+def is_unique(places: FloatArray, pairs: Pairs) -> bool:
+    return find_fold_over(network_of(places, pairs), np.random.default_rng(0)).is_unique
+
+
+def test_the_fields_programmes() -> None:
+    assert is_unique(HEADS, ALL)
+    assert not is_unique(HEADS, ADJACENT)
+    assert not is_unique(HEADS, ZIGZAG)
+
+
+def test_nine_pairs_fold_at_every_pair_between() -> None:
+    found = find_fold_over(network_of(HEADS, ADJACENT), np.random.default_rng(0))
+    assert ((1, 2), (0,)) in found.mirrors
+    assert ((3, 4), (5,)) in found.mirrors
+    assert ((2, 3), (0, 1)) in found.mirrors or ((2, 3), (4, 5)) in found.mirrors
+    assert "M0 may be mirrored across the line through M1, M2" in found.warnings
+    assert len(found.single_pairs) == 9  # nothing confirms any of them
+
+
+def test_what_may_fold_does_fold_and_fits_as_well() -> None:
+    network = network_of(HEADS, ADJACENT)
+    (separator, motes), *_ = find_fold_over(network, np.random.default_rng(0)).mirrors
+    through = HEADS[list(separator)]
+    along = (through[1] - through[0]) / np.linalg.norm(through[1] - through[0])
+    folded = HEADS.copy()
+    offset = folded[list(motes)] - through[0]
+    folded[list(motes)] = through[0] + 2.0 * np.outer(offset @ along, along) - offset
+    model = MapModel(network)
+    fit = fit_map(model, model.state(folded), BatchSettings())
+    assert np.abs(fit.residuals_m).max() < 1e-9
+    assert np.abs(fit.state.positions_m - HEADS).max() > 1.0
+
+
+@pytest.mark.parametrize(
+    ("count", "pairs", "unique"),
+    [
+        (4, list(combinations(range(4), 2)), True),  # complete
+        (4, [(0, 1), (1, 2), (2, 3), (0, 3), (0, 2)], False),  # two triangles on one side
+        (5, [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)], True),  # a wheel
+        (6, [(i, j) for i in range(3) for j in range(3, 6)], False),  # K33: rigid, 3-connected, no range to spare
+        (7, [(i, j) for i in range(3) for j in range(3, 7)], True),  # K34
+        (6, [(0, 1), (1, 2), (0, 2), (3, 4), (4, 5), (3, 5), (0, 3), (1, 4), (2, 5)], False),  # prism
+    ],
+)
+def test_graphs_of_the_plane(count: int, pairs: Pairs, unique: bool) -> None:
+    assert is_unique(np.random.default_rng(1).normal(size=(count, 2)), pairs) == unique
+
+
+def test_a_prism_names_the_ranges_that_nothing_confirms() -> None:
+    pairs = [(0, 1), (1, 2), (0, 2), (3, 4), (4, 5), (3, 5), (0, 3), (1, 4), (2, 5)]
+    found = find_fold_over(network_of(HEADS, pairs), np.random.default_rng(0))
+    assert found.mirrors == ()
+    assert "ranges that nothing confirms, so that several maps may fit: M0 to M1" in found.warnings[0]
+
+
+def test_space() -> None:
+    places = np.random.default_rng(2).normal(size=(6, 3))
+    complete = near_pairs(places, 99.0)
+    assert is_unique(places, [pair for pair in complete if pair != (0, 1)])
+    hanging = [pair for pair in complete if 5 not in pair or pair in ((0, 5), (1, 5), (2, 5))]
+    found = find_fold_over(network_of(places, hanging), np.random.default_rng(0))
+    assert found.mirrors == (((0, 1, 2), (5,)),)
+    assert found.warnings == ("M5 may be mirrored across the plane through M0, M1, M2",)
+    # the double banana: four-connected but for its two tips, and it turns about them
+    banana = [(i, j) for i, j in combinations(range(5), 2) if (i, j) != (0, 1)]
+    other = [(a + 3 if a > 1 else a, b + 3 if b > 1 else b) for a, b in banana]
+    assert not is_unique(np.random.default_rng(3).normal(size=(8, 3)), [*banana, *other])
+
+
+def test_bodies_and_known_places_count_as_measured() -> None:
+    local = np.array([[0.0, 0.0], [0.5, 0.0], [0.2, 0.4]])
+    places = np.concatenate([local, local + np.array([5.0, 1.0])])
+    pairs = [(i, j) for i in range(3) for j in range(3, 6)]
+    bodies = [RigidBody("a", (0, 1, 2), local), RigidBody("b", (3, 4, 5), local)]
+    rng = np.random.default_rng(0)
+    assert not find_fold_over(network_of(places, pairs), rng).is_unique
+    assert find_fold_over(network_of(places, pairs, bodies=bodies), rng).is_unique
+    known = np.full((6, 2), np.nan)
+    known[:5] = HEADS[:5]
+    assert find_fold_over(network_of(HEADS, [(0, 5), (1, 5), (3, 5)], known_m=known), rng).is_unique
+    assert not find_fold_over(network_of(HEADS, [(0, 5), (1, 5)], known_m=known), rng).is_unique
+
+
+def test_random_graphs_against_hendricksons_conditions() -> None:
+    """In the plane: unique if and only if 3-connected and rigid without any one range (Jackson and Jordan 2005)."""
+    rng = np.random.default_rng(5)
+    seen = set()
+    for _ in range(60):
+        count = int(rng.integers(5, 9))
+        pairs = [pair for pair in combinations(range(count), 2) if rng.random() < 0.62]
+        if {mote for pair in pairs for mote in pair} != set(range(count)) or not connected(count, pairs, set()):
+            continue
+        places = rng.normal(size=(count, 2))
+        three = all(connected(count, pairs, set(cut)) for cut in combinations(range(count), 2))
+        spare = all(rank(places, [p for p in pairs if p != gone]) == 2 * count - 3 for gone in pairs)
+        assert is_unique(places, pairs) == (three and spare)
+        seen.add(three and spare)
+    assert seen == {True, False}
+
+
+def connected(count: int, pairs: Pairs, without: set[int]) -> bool:
+    left = set(range(count)) - without
+    reached, edge = set(), {min(left)}
+    while edge:
+        reached |= edge
+        edge = {b for pair in pairs for a, b in (pair, pair[::-1]) if a in edge and b in left} - reached
+    return reached == left
+
+
+def rank(places: FloatArray, pairs: Pairs) -> int:
+    rows = np.zeros((len(pairs), places.size))
+    for row, (i, j) in enumerate(pairs):
+        rows[row, 2 * i : 2 * i + 2] = places[i] - places[j]
+        rows[row, 2 * j : 2 * j + 2] = places[j] - places[i]
+    return int(np.linalg.matrix_rank(rows))

@@ -1,0 +1,175 @@
+"""Phase 1: the law of cosines, trilateration, joint covariance against many runs, refusals."""
+
+import numpy as np
+import pytest
+
+from ccatp.config.cricket_models import CricketConfig
+from ccatp.config.radio_loader import load_radio_config
+from ccatp.motes.mote_plan import MotePlan, head_pairs, network_plan
+from ccatp.motes.pair_means import PairMeans
+from ccatp.motes.phase_one import map_as_possible, map_by_plan
+from ccatp.motes.range_network import RangeNetwork, build_network
+from ccatp.motes.tdoa import MoteRange
+from ccatp.motes.trilateration import DegenerateStep, MissingRange, Sketch
+from ccatp.radio.rigid_alignment import aligned_rms_m
+from ccatp.sim.motes.layout import true_motes
+from tests.unit.motes.fields import SIGMA_M, FloatArray, near_pairs, network_of
+
+A, B = np.zeros(2), np.array([0.0, 2.0])
+
+
+@pytest.fixture(scope="module")
+def cfg() -> CricketConfig:
+    return load_radio_config(None, {"system": "cricket"}).cricket
+
+
+def sketch_of(places: FloatArray, rng: np.random.Generator | None = None, sigma_m: float = SIGMA_M) -> Sketch:
+    network = network_of(places, near_pairs(places, 1e3), rng, sigma_m=sigma_m)
+    return Sketch(network.names, PairMeans(network), 2, 60.0)
+
+
+def field_ranges(
+    cfg: CricketConfig, rng: np.random.Generator | None, sigma_m: float = 1e-3
+) -> tuple[MotePlan, RangeNetwork]:
+    plan = network_plan(cfg)
+    places = true_motes(cfg, np.random.default_rng(0)).positions_m
+    rows = []
+    for i, j in plan.phase1_pairs:
+        noise_m = 0.0 if rng is None else float(rng.normal(0.0, sigma_m))
+        rows.append(
+            MoteRange(plan.names[i], plan.names[j], float(np.linalg.norm(places[i] - places[j])) + noise_m, sigma_m)
+        )
+    return plan, build_network(rows, 2, plan.names)
+
+
+def test_the_axes_and_the_law_of_cosines() -> None:
+    places = np.array([A, B, [1.5, 0.7]])
+    sketch = sketch_of(places)
+    sketch.set_axes(0, 1)
+    sketch.add_by_cosines(2, 0, 1)
+    assert sketch.positions_m == pytest.approx(places)
+    assert [step.how for step in sketch.steps] == ["axes", "axes", "cosines"]
+
+
+def test_joint_errors_of_cosines_and_trilateration() -> None:
+    places = np.array([A, B, [1.0, 1.0], [1.4, 1.3], [1.4, 0.7], [4.0, 1.5]])
+    rng = np.random.default_rng(1)
+
+    def laid(noise: np.random.Generator | None) -> Sketch:
+        sketch = sketch_of(places, noise, sigma_m=1e-3)
+        sketch.set_axes(0, 1)
+        for mote in (2, 3, 4):
+            sketch.add_by_cosines(mote, 0, 1)
+        sketch.add_by_ranges(5, (2, 3, 4))
+        return sketch
+
+    sample = np.cov(np.array([laid(rng).positions_m.ravel() for _ in range(300)]).T)
+    covariance = laid(None).covariance_m2
+    spread = np.sqrt(covariance.diagonal())
+    at = spread > 1e-9  # the origin and B's x are exact
+    assert np.flatnonzero(~at).tolist() == [0, 1, 2]
+    assert np.sqrt(sample.diagonal())[at] == pytest.approx(spread[at], rel=0.13)  # 300 runs: 4 %
+    # correlations too: what a mote inherits from B and from its references
+    scale = np.outer(spread[at], spread[at])
+    assert (sample[np.ix_(at, at)] / scale) == pytest.approx(covariance[np.ix_(at, at)] / scale, abs=0.25)
+
+
+def test_a_mote_on_the_axis_is_refused() -> None:
+    sketch = sketch_of(np.array([A, B, [0.0, 1.0]]))
+    sketch.set_axes(0, 1)
+    with pytest.raises(DegenerateStep, match=r"M2: ranges of 1.000 and 1.000 m to M0 and M1, 2.000 m apart, meet on"):
+        sketch.add_by_cosines(2, 0, 1)
+
+
+def test_a_mote_near_the_axis_is_too_uncertain() -> None:
+    sketch = sketch_of(np.array([A, B, [0.01, 1.0]]))
+    sketch.set_axes(0, 1)
+    with pytest.raises(DegenerateStep, match=r"M2 from M0, M1: dilution of precision \d+(\.\d+)? exceeds 60"):
+        sketch.add_by_cosines(2, 0, 1)
+
+
+def test_references_on_a_line_are_refused() -> None:
+    places = np.array([A, B, [1.0, 0.5], [1.0, 1.0], [1.0, 1.5], [9.0, 1.0]])
+    sketch = sketch_of(places)
+    sketch.set_axes(0, 1)
+    for mote in (2, 3, 4):
+        sketch.add_by_cosines(mote, 0, 1)
+    with pytest.raises(DegenerateStep, match="M5 from M2, M3, M4: the mirror image across them, 16 m away"):
+        sketch.add_by_ranges(5, (2, 3, 4))
+
+
+def test_references_in_line_with_the_mote_are_refused() -> None:
+    places = np.array([A, B, [1.0, 0.5], [1.0, 1.0], [1.0, 1.5], [1.0, 9.0]])
+    sketch = sketch_of(places)
+    sketch.set_axes(0, 1)
+    for mote in (2, 3, 4):
+        sketch.add_by_cosines(mote, 0, 1)
+    with pytest.raises(DegenerateStep, match=r"M5 from M2, M3, M4: .*(undetermined|dilution)"):
+        sketch.add_by_ranges(5, (2, 3, 4))
+
+
+def test_a_missing_range_names_both_motes() -> None:
+    network = network_of(np.array([A, B, [1.0, 1.0]]), [(0, 1), (0, 2)])
+    sketch = Sketch(network.names, PairMeans(network), 2, 60.0)
+    sketch.set_axes(0, 1)
+    with pytest.raises(MissingRange, match="no range between M1 and M2"):
+        sketch.add_by_cosines(2, 0, 1)
+
+
+def test_exact_ranges_give_the_field_in_its_frame(cfg: CricketConfig) -> None:
+    plan, network = field_ranges(cfg, None)
+    found = map_by_plan(plan, network, cfg.phase1.max_dop)
+    assert found.positions_m == pytest.approx(true_motes(cfg, np.random.default_rng(0)).positions_m, abs=1e-6)
+    assert found.unplaced == ()
+    dops = [step.dop for step in found.steps if step.how == "trilateration"]
+    # three motes 0.5 m apart, 5 to 6 m away: some 14 to 20
+    assert 10.0 < min(dops) < max(dops) < 25.0
+
+
+def test_errors_grow_from_stand_to_stand(cfg: CricketConfig) -> None:
+    rng, errors, expected = np.random.default_rng(2), [], []
+    truth = true_motes(cfg, np.random.default_rng(0)).positions_m
+    for _ in range(30):
+        plan, network = field_ranges(cfg, rng, 2e-4)
+        found = map_by_plan(plan, network, cfg.phase1.max_dop)
+        errors.append(((found.positions_m - truth) ** 2).sum(axis=1))
+        expected.append(found.covariance_m2.diagonal().reshape(-1, 2).sum(axis=1))
+    rms, wanted = np.sqrt(np.mean(errors, axis=0)), np.sqrt(np.mean(expected, axis=0))
+    heads = list(plan.heads)
+    assert all(later > 1.2 * before for before, later in zip(rms[heads][:-2], rms[heads][2:], strict=True))
+    assert rms[heads] == pytest.approx(wanted[heads], rel=0.4)  # 30 runs: 13 % a value
+
+
+def test_a_limit_on_the_dilution_stops_phase_one(cfg: CricketConfig) -> None:
+    plan, network = field_ranges(cfg, None)
+    with pytest.raises(DegenerateStep, match=r"N2-1 from N1-1, N1-2, N1-3: dilution of precision 1\d\.\d+ exceeds 10"):
+        map_by_plan(plan, network, 10.0)
+
+
+@pytest.mark.parametrize(("dimension", "reach_m"), [(2, 5.5), (3, 7.5)])
+def test_without_a_plan_mote_after_mote(dimension: int, reach_m: float) -> None:
+    rng = np.random.default_rng(6)
+    places = rng.uniform(0.0, 10.0, (40, dimension))
+    network = network_of(places, near_pairs(places, reach_m), rng, sigma_m=1e-4)
+    found = map_as_possible(network, 60.0)
+    placed = [mote for mote in range(40) if mote not in found.unplaced]
+    assert len(placed) > 35
+    assert aligned_rms_m(found.positions_m[placed], places[placed], mirrors=True) < 0.01
+
+
+def test_what_hangs_on_two_ranges_is_left_out() -> None:
+    places = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 3.0], [5.0, 5.0], [9.0, 9.0]])
+    network = network_of(places, [(0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3), (3, 4), (1, 4)])
+    assert map_as_possible(network, 60.0).unplaced == (4,)
+
+
+def test_no_triangle_no_beginning() -> None:
+    network = network_of(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), [(0, 1), (1, 2), (2, 3), (0, 3)])
+    with pytest.raises(DegenerateStep, match="no triangle of motes"):
+        map_as_possible(network, 60.0)
+
+
+def test_programmes_of_phase_two() -> None:
+    assert head_pairs(4, "zigzag") == [(0, 1), (1, 2), (2, 3)]
+    assert len(head_pairs(6, "adjacent")) == 9
+    assert len(head_pairs(6, "all")) == 15
