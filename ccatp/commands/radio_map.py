@@ -72,7 +72,7 @@ def radio_map(
     if json_output:
         click.echo(json.dumps(data))
     else:
-        from ccatp.mote_table import report_lines
+        from ccatp.motes.mote_table import report_lines
 
         for line in report_lines(data):
             click.echo(line)
@@ -105,7 +105,7 @@ def _measured(
 
     from ccatp.motes.measured_map import map_measured
     from ccatp.pictures.mote_figure import MapPicture, draw_mote_map
-    from ccatp.range_csv import read_places, read_ranges
+    from ccatp.radio_data.range_csv import read_places, read_ranges
 
     ranges_file, tags_file, truth_file = files
     found = map_measured(
@@ -127,7 +127,7 @@ def _measured(
 
 
 def _write(path: Path, names: tuple[str, ...], positions_m: Any, covariance_m2: Any, layout: str) -> None:
-    from ccatp.beacon_file import write_beacons
+    from ccatp.radio_data.beacon_file import write_beacons
 
     frame = "field: as the anchors and surveyed places of the configuration say"
     if layout != "networks":

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
-from tests.unit.motes.test_trilateration import field_ranges
 
 from ccatp.config.cricket_models import CricketConfig
 from ccatp.config.radio_loader import load_radio_config
@@ -15,6 +14,7 @@ from ccatp.motes.self_mapping import conditioned
 from ccatp.studies.mote_field import simulate_field
 from ccatp.studies.mote_runs import first_map, run_filter
 from tests.unit.motes.fields import near_pairs, network_of
+from tests.unit.motes.test_trilateration import field_ranges
 
 FloatArray = NDArray[np.float64]
 DRAWS = 800
