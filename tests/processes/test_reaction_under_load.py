@@ -35,7 +35,7 @@ from tests.faults.linking import Measured
 TIMES = int(os.environ.get("CCATP_REACTIONS", "3"))
 IN_A_SURVEY = 10  # faults that one daemon has to bear, at most ...
 # ... but for those after which it is not there any more, or waits for an operator.
-FEWER = {"kill all": 1, "stop danger": 2}
+FEWER = {"kill all": 1, "stop danger": 2, "black hole": 2}
 HOGS = 6
 HOG = "while True: pass"
 FSYNC = """
