@@ -13,7 +13,14 @@ CALLS = {("time", "time"), ("time", "time_ns"), ("time", "localtime"), ("time", 
          ("datetime", "today"), ("datetime", "utcnow"), ("date", "today")}  # fmt: skip
 # Labels: rows of the store, names of run directories and the observatory's feed say when they were made. The check
 # before a mission shows the clock itself.
-LABELS = {"storage/store.py", "supervisor.py", "commands/calibrate.py", "observatory/desk.py", "check_probes.py"}
+LABELS = {
+    "storage/store.py",
+    "supervisor.py",
+    "supervision/run_folder.py",
+    "commands/calibrate.py",
+    "observatory/desk.py",
+    "check_probes.py",
+}
 
 
 def wall_clocks(tree: ast.AST) -> Iterator[int]:
