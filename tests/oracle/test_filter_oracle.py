@@ -161,7 +161,7 @@ def drive(plan: list[tuple[float, list[int]]], seed: int) -> list[Step]:
 
 
 @EVERY_FILTER
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(plan=st.lists(steps_taken, min_size=1, max_size=3), seed=st.integers(0, 2**32 - 1), vector_R=st.booleans())
 def test_any_subset_of_the_robots_measurements(
     name: str, plan: list[tuple[float, list[int]]], seed: int, vector_R: bool
@@ -173,7 +173,7 @@ def test_any_subset_of_the_robots_measurements(
 
 
 @EVERY_FILTER
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 5), sizes=st.lists(st.integers(0, 6), min_size=1, max_size=2))
 def test_any_linear_gaussian_system_with_correlated_noise(name: str, seed: int, n: int, sizes: list[int]) -> None:
     rng = np.random.default_rng(seed)

@@ -163,16 +163,6 @@ def test_two_interrupts_end_as_one(start: Start) -> None:
     assert measured_in_store(run) == run.summary["points"]["measured"] >= 2
 
 
-def test_resume_wants_the_same_points(start: Start) -> None:
-    run = start("--panels", "1")
-    assert run.wait() == 0
-    before = (run.run_dir / "config.toml").read_text()
-    again = Run(run.run_dir, run.runtime_dir, "--resume", "--panels", "2")
-    assert again.wait() == 2
-    assert "run.panels was 1" in again.stderr
-    assert (run.run_dir / "config.toml").read_text() == before
-
-
 def test_lockstep_pause_stops_simulated_time(start: Start) -> None:
     run = start("--panels", "1")
     run.until(lambda status: status["done"] >= 3)

@@ -180,7 +180,7 @@ shares = st.floats(0.0, 1.0, exclude_max=True)
 angles = st.floats(radians(-60.0), radians(60.0))
 # Within three sigma of the start errors of the worlds: 2 mm and 0.01 rad.
 errors = st.tuples(st.floats(-0.004, 0.004), st.floats(-0.004, 0.004), st.floats(-0.02, 0.02))
-few = settings(max_examples=15, deadline=None)  # which ones is the profile's choice
+few = settings(max_examples=12, deadline=None)  # which ones is the profile's choice
 
 
 def boundary(name: str, share: float) -> tuple[float, float, float]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.loader import dump_config, load_config
 from ccatp.errors import ConfigError, RefusedError
 from ccatp.run_options import RunOptions
 from ccatp.runtime_dir import is_deserted
@@ -46,6 +46,25 @@ def test_a_run_directory_with_a_mission_wants_resume(tmp_path: Path) -> None:
 def test_nothing_to_resume(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no mission in"):
         survey_run_dir(options(run_dir=tmp_path, resume=True), load_config())
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"run.panels": 2}, "run.panels was 1 in .* and is 2 now"),
+        ({"run.panels": 1, "run.order": "optimised"}, "run.order was thesis in .* and is optimised now"),
+        ({"run.panels": 1, "run.mirror": "thesis-m2"}, "run.mirror was fyst-m1 in .* and is thesis-m2 now"),
+    ],
+)
+def test_a_survey_is_resumed_with_its_own_points(tmp_path: Path, changes: dict[str, object], told: str) -> None:
+    (tmp_path / "mission.sqlite").touch()
+    before = dump_config(load_config(overrides={"run.panels": 1}))
+    (tmp_path / "config.toml").write_text(before)
+    with pytest.raises(ConfigError, match=told):
+        survey_run_dir(options(run_dir=tmp_path, resume=True), load_config(overrides=changes))
+    assert (tmp_path / "config.toml").read_text() == before
+    same = load_config(overrides={"run.panels": 1})
+    assert survey_run_dir(options(run_dir=tmp_path, resume=True), same) == tmp_path
 
 
 def test_a_run_directory_that_cannot_be_made(tmp_path: Path) -> None:
