@@ -90,6 +90,7 @@ def test_the_other_filters_reproduce_theirs(name: str, start: Start) -> None:
     assert result["fixes"]["given"] >= 2
 
 
+@pytest.mark.slow
 def test_a_run_in_real_time_is_reproduced(start: Start) -> None:
     # Frames go on while a fix is on its way, and batches end where the wall clock ends them.
     run = stopped(start("--panels", "1", "--world", "hard", "--filter", "ekf", "--realtime"), points=1)
