@@ -1,16 +1,11 @@
 """Glue. Collects a mission among beacons from the bus for its summary."""
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
-
-import zmq
 
 from ccatp.beacon_summary import BeaconSummary, Reached, beacon_facts
 from ccatp.config.radio_loader import dump_radio_config
 from ccatp.config.radio_models import RadioConfig
-from ccatp.processes.common import Endpoints
-from ccatp.supervision.collecting import Collector
+from ccatp.supervision.collecting import Collector, RunAccess
 from ccatp.wire.topics import (
     BeaconArrival,
     BeaconMap,
@@ -20,7 +15,6 @@ from ccatp.wire.topics import (
     DangerEvent,
     Message,
     MissionStatus,
-    Presence,
     Timing,
 )
 
@@ -29,28 +23,15 @@ class BeaconCollector(Collector):
     """Listens to a mission among beacons from its start to its end.
 
     Args:
-        context: ZeroMQ context of the process.
-        endpoints: where the processes publish.
+        access: how it is reached.
         cfg: the run's configuration.
-        run_dir: the recording is there.
-        is_sim: the simulated truth can be asked for.
-        on_presence: told that a process is there.
     """
 
-    def __init__(
-        self,
-        context: zmq.Context[zmq.Socket[bytes]],
-        endpoints: Endpoints,
-        cfg: RadioConfig,
-        run_dir: Path,
-        *,
-        is_sim: bool,
-        on_presence: Callable[[Presence], None],
-    ) -> None:
+    def __init__(self, access: RunAccess, cfg: RadioConfig) -> None:
         """Subscribe before anybody publishes."""
         metadata = {"system": cfg.system, "seed": str(cfg.run.seed), "config": dump_radio_config(cfg)}
-        super().__init__(context, endpoints, run_dir, metadata, is_sim=is_sim, on_presence=on_presence)
-        self._summary = BeaconSummary(beacon_facts(cfg, is_sim=is_sim))
+        super().__init__(access, metadata)
+        self._summary = BeaconSummary(beacon_facts(cfg, is_sim=access.is_sim))
         self._signal = ""
 
     def take(self, message: Message) -> None:

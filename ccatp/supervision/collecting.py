@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import msgspec
 import zmq
@@ -47,37 +47,42 @@ class View(Protocol):
         """Where the mission stands."""
 
 
-class Collector(ABC):
-    """Listens to a run; what the summary is made of is the business of a class of its own for each kind of mission.
+class RunAccess(NamedTuple):
+    """How a run is reached by who listens to it.
 
-    Args:
+    Attributes:
         context: ZeroMQ context of the process.
         endpoints: where the processes publish.
-        run_dir: the recording is there.
-        metadata: of the recording, beside its format and our version.
+        run_dir: the recording is there, and the mission's database.
         is_sim: the simulated truth can be asked for.
         on_presence: told that a process is there.
     """
 
-    def __init__(
-        self,
-        context: zmq.Context[zmq.Socket[bytes]],
-        endpoints: Endpoints,
-        run_dir: Path,
-        metadata: Mapping[str, str],
-        *,
-        is_sim: bool,
-        on_presence: Callable[[Presence], None],
-    ) -> None:
+    context: zmq.Context[zmq.Socket[bytes]]
+    endpoints: Endpoints
+    run_dir: Path
+    is_sim: bool
+    on_presence: Callable[[Presence], None]
+
+
+class Collector(ABC):
+    """Listens to a run; what the summary is made of is the business of a class of its own for each kind of mission.
+
+    Args:
+        access: how the run is reached.
+        metadata: of the recording, beside its format and our version.
+    """
+
+    def __init__(self, access: RunAccess, metadata: Mapping[str, str]) -> None:
         """Subscribe before anybody publishes."""
-        self._context, self._endpoints, self._is_sim = context, endpoints, is_sim
-        self._on_presence = on_presence
-        names = ("main", "danger", "dashboard", "truth") if is_sim else ("main", "danger", "dashboard")
-        self._subscriber = Subscriber(context, [endpoints.of(name) for name in names], RECEIVED)
+        self._context, self._endpoints, self._is_sim = access.context, access.endpoints, access.is_sim
+        self._on_presence = access.on_presence
+        names = ("main", "danger", "dashboard", *(("truth",) if access.is_sim else ()))
+        self._subscriber = Subscriber(access.context, [access.endpoints.of(name) for name in names], RECEIVED)
         self._recorder = Recorder(
-            run_dir / "telemetry.mcap",
+            access.run_dir / "telemetry.mcap",
             recorded_schemas(),
-            is_simulation=is_sim,
+            is_simulation=access.is_sim,
             metadata={"format": str(RECORD_FORMAT), "ccatp": ccatp.__version__, **metadata},
             on_failure=self._on_recorder_failure,
         )

@@ -16,7 +16,7 @@ from ccatp.processes.common import Endpoints, open_log
 from ccatp.processes.page_socket import PageSocket
 from ccatp.run_options import RunOptions
 from ccatp.supervision.children import Children, ProcessSpec
-from ccatp.supervision.collecting import Collector
+from ccatp.supervision.collecting import Collector, RunAccess
 from ccatp.supervision.restarts import Decision, Fate
 from ccatp.supervision.run_kinds import RunKind
 from ccatp.supervision.run_report import write_run_report
@@ -67,7 +67,8 @@ class Run:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         # A flag and no exception: a signal must not be lost in somebody's handler of exceptions, nor end the ending.
         previous = {n: signal.signal(n, self._interrupt) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-        collector = self._kind.collector(context, self._endpoints, self._run_dir, self._heard)
+        access = RunAccess(context, self._endpoints, self._run_dir, self._options.sim, self._heard)
+        collector = self._kind.collector(access)
         self._view = view = self._kind.view(self._run_dir)
         try:
             with collector, view:

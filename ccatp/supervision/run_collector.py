@@ -1,11 +1,10 @@
 """Glue. Collects a survey from the bus: what its summary needs, and the views of its recording."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zmq
 
 from ccatp.config.loader import dump_config
 from ccatp.config.models import Config
@@ -14,19 +13,17 @@ from ccatp.mirror.batches import FloatArray, deck_poses
 from ccatp.mirror.errors import PanelFitError
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.planning.traversal import ORDERS
-from ccatp.processes.common import Endpoints
 from ccatp.run_files.recorder import iter_messages, recordings
 from ccatp.samples import PanelId, PanelPose, PointId
 from ccatp.storage.store import MissionStore
 from ccatp.summary import RunFacts, SummaryBuilder, puck_targets
-from ccatp.supervision.collecting import Collector
+from ccatp.supervision.collecting import Collector, RunAccess
 from ccatp.viewing.views import Views
 from ccatp.wire.topics import (
     Arrival,
     DangerEvent,
     Message,
     MissionStatus,
-    Presence,
     Timing,
     Track,
     Truth,
@@ -62,24 +59,11 @@ class RunCollector(Collector):
     """Listens to a survey from its start to its end.
 
     Args:
-        context: ZeroMQ context of the process.
-        endpoints: where the processes publish.
+        access: how it is reached.
         cfg: the run's configuration.
-        run_dir: the recording and the mission's database are there.
-        is_sim: the simulated truth can be asked for.
-        on_presence: told that a process is there.
     """
 
-    def __init__(
-        self,
-        context: zmq.Context[zmq.Socket[bytes]],
-        endpoints: Endpoints,
-        cfg: Config,
-        run_dir: Path,
-        *,
-        is_sim: bool,
-        on_presence: Callable[[Presence], None],
-    ) -> None:
+    def __init__(self, access: RunAccess, cfg: Config) -> None:
         """Subscribe before anybody publishes."""
         metadata = {
             "mirror": cfg.mirror.name,
@@ -87,8 +71,8 @@ class RunCollector(Collector):
             "world": cfg.world.name,
             "config": dump_config(cfg),  # a later session in the same directory may have another
         }
-        super().__init__(context, endpoints, run_dir, metadata, is_sim=is_sim, on_presence=on_presence)
-        self._cfg, self._run_dir = cfg, run_dir
+        super().__init__(access, metadata)
+        self._cfg, self._run_dir = cfg, access.run_dir
         self._mirror: Mirror = build_mirror(cfg.mirror)
         self._views = Views(self._mirror, cfg.robot.puck_height_m)
         self._builder: SummaryBuilder | None = None

@@ -1,23 +1,15 @@
 """Glue. What differs between a survey and a mission among beacons for the supervisor that runs it."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-import zmq
-
 from ccatp.config.models import Config, ProcessesConfig
 from ccatp.config.radio_models import RadioConfig
-from ccatp.processes.common import Endpoints
 from ccatp.supervision.beacon_collector import BeaconCollector
 from ccatp.supervision.children import ProcessSpec
-from ccatp.supervision.collecting import Collector
+from ccatp.supervision.collecting import Collector, RunAccess
 from ccatp.supervision.run_collector import RunCollector
 from ccatp.supervision.run_view import BeaconView, RunView, survey_title
-from ccatp.wire.topics import Presence
-
-Heard = Callable[[Presence], None]
-Context = zmq.Context[zmq.Socket[bytes]]
 
 
 class RunKind(Protocol):
@@ -35,7 +27,7 @@ class RunKind(Protocol):
     def facts(self) -> dict[str, object]:
         """Of the run, for the log."""
 
-    def collector(self, context: Context, endpoints: Endpoints, run_dir: Path, on_presence: Heard) -> Collector:
+    def collector(self, access: RunAccess) -> Collector:
         """Who listens to it."""
 
     def view(self, run_dir: Path) -> RunView:
@@ -56,9 +48,9 @@ class SurveyRun:
         self.rows, self.processes = rows, cfg.run
         self.facts: dict[str, object] = {"mirror": cfg.mirror.name, "seed": cfg.run.seed, "sim": is_sim}
 
-    def collector(self, context: Context, endpoints: Endpoints, run_dir: Path, on_presence: Heard) -> Collector:
+    def collector(self, access: RunAccess) -> Collector:
         """Who listens to it."""
-        return RunCollector(context, endpoints, self._cfg, run_dir, is_sim=self._is_sim, on_presence=on_presence)
+        return RunCollector(access, self._cfg)
 
     def view(self, run_dir: Path) -> RunView:
         """Who shows it."""
@@ -79,9 +71,9 @@ class BeaconRun:
         self.rows, self.processes = rows, cfg.processes
         self.facts: dict[str, object] = {"system": cfg.system, "seed": cfg.run.seed, "sim": is_sim}
 
-    def collector(self, context: Context, endpoints: Endpoints, run_dir: Path, on_presence: Heard) -> Collector:
+    def collector(self, access: RunAccess) -> Collector:
         """Who listens to it."""
-        return BeaconCollector(context, endpoints, self._cfg, run_dir, is_sim=self._is_sim, on_presence=on_presence)
+        return BeaconCollector(access, self._cfg)
 
     def view(self, run_dir: Path) -> RunView:
         """Who shows it."""
