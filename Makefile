@@ -17,7 +17,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
-.PHONY: help run test test-slow chromium faults docs lint format fast lock clean
+.PHONY: help run test test-slow tried-in faults docs lint format fast lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -36,14 +36,16 @@ help:
 run: $(VENV)/.installed
 	@$(BIN)/ccatp run --sim $(ARGS)
 
-test: lint chromium
+test: lint tried-in
 	$(PYTEST) $(PYTEST_ARGS)
 
-# The page is tried in a real browser where there is one.
-chromium:
-	@command -v chromium >/dev/null || { test "$$(id -u)" = 0 && command -v apt-get >/dev/null && echo "ccatp: installing chromium" && \
-		{ apt-get install -y -qq chromium || { apt-get update -qq && apt-get install -y -qq chromium; }; } >/dev/null 2>&1; } || \
-		echo "ccatp: no chromium, so the tests of the page in a browser are skipped; on Debian: apt install chromium"
+# The page is tried in a real browser and the completions in their shells, where there are these.
+TRIED_IN := chromium zsh fish
+tried-in:
+	@wanted=; for tool in $(TRIED_IN); do command -v $$tool >/dev/null || wanted="$$wanted $$tool"; done; test -z "$$wanted" || \
+		{ test "$$(id -u)" = 0 && command -v apt-get >/dev/null && echo "ccatp: installing$$wanted" && \
+		{ apt-get install -y -qq $$wanted || { apt-get update -qq && apt-get install -y -qq $$wanted; }; } >/dev/null 2>&1; } || \
+		echo "ccatp: without$$wanted, so what is tried in them is skipped; on Debian: apt install$$wanted"
 
 test-slow: $(VENV)/.installed-dev
 	$(PYTEST) -m slow $(PYTEST_ARGS)
