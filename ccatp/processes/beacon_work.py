@@ -14,7 +14,7 @@ from ccatp.control.waypoint_steering import HALT
 from ccatp.errors import ExitStatus
 from ccatp.processes.beacon_telling import BeaconTeller
 from ccatp.processes.common import BeaconArgs
-from ccatp.processes.work import Drive, Host, Hosting, MakeWork, Progress, Served
+from ccatp.processes.work import STILL, Drive, Host, Hosting, MakeWork, Progress, Served
 from ccatp.samples import Verdict
 from ccatp.storage.beacon_store import BeaconStore
 from ccatp.surveying.states import Outcome
@@ -168,6 +168,11 @@ class BeaconWork:
             drive = HALT
         self._speed_m_s = drive.speed_m_s
         return Drive(*wheel_rates(drive, self._cfg))
+
+    def stand(self, _frame: Served) -> Drive:
+        """The robot stands, and nothing is decided in this frame."""
+        self._speed_m_s = 0.0
+        return STILL
 
     def tell(self, frame: Served) -> None:
         """The estimate, arrivals, a state that is new."""

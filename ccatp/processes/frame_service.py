@@ -3,6 +3,7 @@
 import asyncio
 import time
 from collections.abc import Callable
+from math import inf
 
 from ccatp.config.models import LinkConfig
 from ccatp.errors import CcatpError, ExitStatus
@@ -17,6 +18,8 @@ from ccatp.wire.robot import Sensors
 
 # Of a robot that moved nobody knows where it is when the samples of more frames than this are missing.
 UNSEEN_S = 0.1
+# The frames that come while a way is planned for a robot that stands are late for a reason, and served within this.
+CATCH_UP_S = 0.5
 
 
 class Surprise(CcatpError):
@@ -58,7 +61,7 @@ class FrameService:
         self._teller, self._on_surprise = work.teller, on_surprise
         self.lag = FrameLag(cfg.slip_after_s)
         self.over = asyncio.Event()
-        self._lag_s = 0.0
+        self._catches_up_until_s = -inf
         self._was_quiet = False
         self._unanswered: int | None = None
 
@@ -102,7 +105,7 @@ class FrameService:
         waiting = time.perf_counter()
         verdict = None if is_unjudged else self._hear(sensors.seq)
         heard = time.perf_counter()
-        drive = work.decide(frame, None if self._is_late(sensors.t) else verdict, self._lag_s)
+        drive = self._decide(frame, verdict)
         self._answer(sensors.seq, drive)
         work.tell(frame)
         self._teller.tick(1e6 * (time.perf_counter() - heard + waiting - start))
@@ -118,14 +121,23 @@ class FrameService:
             self._teller.say("warning", f"the robot moved and was out of sight for {dt_s:.2f} s: it is found again")
             self._work.lose_sight()
 
-    def _is_late(self, t_s: float) -> bool:
-        """Whether the frame is too late to move on: then the mission pauses until frames are prompt again."""
-        self._lag_s = lag_s = 0.0 if self._seat.is_lockstep else self.lag.served(t_s, time.monotonic())
-        if lag_s <= self._cfg.lag_limit_s:
-            return False
-        if self._work.interrupt(f"a frame was served {1e3 * lag_s:.0f} ms late"):
-            self._teller.log.warning("late frame", seq=self._clock.seq, lag_s=lag_s, limit_s=self._cfg.lag_limit_s)
-        return True
+    def _decide(self, frame: Served, verdict: Verdict | None) -> Drive:
+        """The drive that answers a frame. One that is too late moves nothing."""
+        work, limit_s, begun_s = self._work, self._cfg.lag_limit_s, time.monotonic()
+        lag_s = 0.0 if self._seat.is_lockstep else self.lag.served(frame.sensors.t, begun_s)
+        if lag_s > limit_s:
+            if begun_s < self._catches_up_until_s:
+                return work.stand(frame)
+            verdict = None
+            # Paused until frames are prompt again.
+            if work.interrupt(f"a frame was served {1e3 * lag_s:.0f} ms late"):
+                self._teller.log.warning("late frame", seq=self._clock.seq, lag_s=lag_s, limit_s=limit_s)
+        drive = work.decide(frame, verdict, lag_s)
+        now_s = time.monotonic()
+        is_slow, is_still = now_s - begun_s > self._seat.frame_period_s, drive == STILL
+        # A hold for what planning cost would have to be planned away again, and so on for ever on a slow machine.
+        self._catches_up_until_s = now_s + CATCH_UP_S if is_slow and is_still else -inf
+        return drive
 
     # -- answers --------------------------------------------------------------------------------------------------
 

@@ -18,7 +18,7 @@ from ccatp.processes.keeping import Keeper
 from ccatp.processes.measuring import MeasuringDesk, Request
 from ccatp.processes.survey_telling import SurveyTeller
 from ccatp.processes.survey_watch import SurveyWatch
-from ccatp.processes.work import Drive, Host, Hosting, MakeWork, Progress, Served
+from ccatp.processes.work import STILL, Drive, Host, Hosting, MakeWork, Progress, Served
 from ccatp.samples import Verdict
 from ccatp.storage.store import MissionStore
 from ccatp.surveying.journey import Motion
@@ -236,9 +236,18 @@ class SurveyWork:
         self._gate_watch.look(motion.t_s)
         if order.at_rest or order.measure:
             self._execute(order, motion)
-        seq = frame.sensors.seq
-        self._told = self._commanded.told() if frame.is_first or is_estimate_due(seq) else None
+        self._note_told(frame)
         return Drive(right, left)
+
+    def stand(self, frame: Served) -> Drive:
+        """The robot stands, and nothing is decided in this frame."""
+        self._note_told(frame)
+        return STILL
+
+    def _note_told(self, frame: Served) -> None:
+        """What the wheels were told since the last estimate, where one is due."""
+        is_due = frame.is_first or is_estimate_due(frame.sensors.seq)
+        self._told = self._commanded.told() if is_due else None
 
     def _is_on_mirror(self, sensors: Sensors) -> bool:
         """Whether the robot may move, as far as gravity knows: it stands on the mirror of the configuration.

@@ -208,6 +208,9 @@ class Work(Obeying, Protocol):
             lag_s: how late the frame is served.
         """
 
+    def stand(self, frame: Served) -> Drive:
+        """In place of ``decide``: the robot stands, and nothing is decided in this frame."""
+
     def tell(self, frame: Served) -> None:
         """The drive is on its way: publish the estimate, keep records."""
 

@@ -105,6 +105,7 @@ def places(name: str) -> tuple[Place, ...]:
     return tuple(found)
 
 
+@lru_cache(maxsize=1)  # all speeds begin at the same place
 def start_before(name: str, place: Place, heading_rad: float, sign: float) -> DeckPose | None:
     """Where a robot that drives at the place last stands with all its sensors on the mirror; None for nowhere."""
     cfg, mirror = world(name)

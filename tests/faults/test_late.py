@@ -59,3 +59,30 @@ async def test_stalls_and_blocks(measured: Measured) -> None:
         measured("P8", 0 if status.slips > slips and len(daemon.events("late frame")) > told else 1)
         assert status.lag_ms >= 60.0
         assert not stale(daemon, begun_s, begun_s + 0.2)
+
+
+@pytest.mark.fault("P8")
+async def test_planning_longer_than_a_frame_may_wait_pauses_nobody() -> None:
+    # On a slow or busy machine it takes longer than the limit: a pause for that would end in planning anew.
+    clock = asyncio.get_running_loop().time
+    async with running_daemon(configuration()) as daemon:
+        await daemon.until(lambda: daemon.is_driving)
+        mission = daemon.main._work._mission  # type: ignore[attr-defined]
+        plan, planned = mission._travels._plan_rest, []
+
+        def plan_slowly(*args: object) -> object:
+            time.sleep(0.12)
+            planned.append(clock())
+            return plan(*args)
+
+        mission._travels._plan_rest = plan_slowly
+        assert mission.pause("a test") is None
+        await daemon.until(lambda: not daemon.is_driving)
+        told = len(daemon.events("late frame"))
+        assert mission.resume() is None
+        await daemon.until(lambda: bool(planned))
+        await moving_again(daemon, planned[0])
+        # The danger loop, here in the same event loop, is blocked as well: that may cost another plan.
+        assert len(planned) < 5
+        assert len(daemon.events("late frame")) == told
+        assert not stale(daemon, planned[0] - 0.12, planned[-1] + 0.2)
