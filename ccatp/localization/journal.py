@@ -14,11 +14,17 @@ _SAME_TIME_S = 1e-6
 class _Entry:
     """The state before some steps, the time to which they bring it, and how long the robot may have moved in them."""
 
-    __slots__ = ("covariance", "dt_s", "mean", "steps", "t_s")
+    __slots__ = ("covariance", "dt_s", "kept_s", "mean", "steps", "t_s")
 
     def __init__(self, t_s: float, dt_s: float, mean: FloatArray, covariance: FloatArray) -> None:
         self.t_s, self.dt_s, self.mean, self.covariance = t_s, dt_s, mean, covariance
         self.steps: list[Step] = []
+        self.kept_s = t_s  # the steps are those since then
+
+    def settle(self, t_s: float, mean: FloatArray, covariance: FloatArray) -> None:
+        """The robot has stood since the entry's end: the present state is as good as the one before the steps."""
+        self.kept_s, self.mean, self.covariance = t_s, mean, covariance
+        self.steps.clear()
 
 
 class Journal:
@@ -48,11 +54,21 @@ class Journal:
         entries = self._entries
         if dt_s == 0.0 and entries and entries[-1].dt_s == 0.0:
             entries[-1].t_s = t_s  # a standstill, however long, is one entry
+            if entries[-1].kept_s < t_s - self._reach_s:
+                self._settle(t_s, filter_)
             return
         entries.append(_Entry(t_s, dt_s, filter_.mean, filter_.covariance))
         # Two entries at least: a standstill may outlast the reach, and its beginning is where its fix belongs.
         while len(entries) > 2 and entries[1].t_s < t_s - self._reach_s:
             entries.popleft()
+
+    def _settle(self, t_s: float, filter_: Filter) -> None:
+        """Forget how the state of a long standstill came about: nothing grows however long the robot stands."""
+        entries = self._entries
+        while len(entries) > 2:
+            entries.popleft()
+        for entry in entries:
+            entry.settle(t_s, filter_.mean, filter_.covariance)
 
     def add(self, step: Step) -> None:
         """Keep a step of the present entry."""

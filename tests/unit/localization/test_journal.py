@@ -338,3 +338,28 @@ def test_a_fix_at_rest_leaves_the_robot_at_rest() -> None:
     assert found.state[0][[V, A, W]] == pytest.approx([0.0, 0.0, 0.0], abs=4e-3)
     found.step(*robot.frame())
     assert found.is_resting
+
+
+def test_a_standstill_however_long_does_not_grow_and_takes_a_measurement_of_its_beginning() -> None:
+    reach_s, walked = 2.0, 5
+    recorded = Recorded(reach_s)
+    for k in range(1, walked + 1):
+        recorded.step(k)
+    stood_s, z = 0.1 * walked, 0.7
+    row = np.array([[0.0, 1.0]])
+    for k in range(1000):
+        recorded.journal.begin(stood_s + 0.1 * (k + 1), 0.0, recorded.filter)
+        step = partial(recorded.measure, 0.0, row)
+        recorded.journal.add(step)
+        step()
+        kept = sum(len(entry.steps) for entry in recorded.journal._entries)
+        assert kept <= 2 * walked + reach_s / 0.1 + 1
+    assert len(recorded.journal._entries) == 2
+    # Taken in the standstill or at its first instant, it is a measurement of today's state.
+    for t_s in (stood_s + 0.05, stood_s):
+        assert recorded.journal.oldest_s <= t_s
+        today = Recorded()
+        today.filter.reset(recorded.filter.mean, recorded.filter.covariance)
+        today.measure(z, np.array([[0.2, 1.0]]))
+        recorded.late(t_s, z)
+        same(recorded, today)
