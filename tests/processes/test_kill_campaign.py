@@ -19,7 +19,7 @@ from tests.processes.killing import first_after, log_of, robot_record, send
 from tests.processes.test_restarts import fixes, until_another
 
 KILLS = int(os.environ.get("CCATP_KILLS", "40"))
-KILLS_PER_MISSION = 5
+KILLS_PER_MISSION = 15
 VICTIMS = (("main",), ("danger",), ("main", "danger"), ("etalon",))
 # Three of one process within a minute end a run; here they come closer.
 LIMIT = ("--set", "run.restart_limit=100")
