@@ -47,14 +47,14 @@ def campaign(rng: random.Random, run: Run, kills: int, figures: dict[str, Any]) 
             until_another(run, name, pid)
             figures["kills"] += 1
             if name == "main" and not is_hung:
-                figures["held_ms"].append(1e3 * first_after(run, at_s, "dataloop", "controller lost"))
                 figures["mains"].append(at_s)
         figures["acknowledged"] = acknowledged
 
 
-def note_ready(run: Run, figures: dict[str, Any]) -> None:
-    """From each kill of main to its successor having joined."""
+def note_times(run: Run, figures: dict[str, Any]) -> None:
+    """From each kill of main to the robot holding its wheels, and to the successor having joined."""
     for at_s in figures.pop("mains"):
+        figures["held_ms"].append(1e3 * first_after(run, at_s, "dataloop", "controller lost"))
         figures["ready_s"].append(first_after(run, at_s, "main", "joined the robot"))
 
 
@@ -75,7 +75,7 @@ def test_random_kills(tmp_path: Path, runtime_dir: Path, measured: Callable[[str
             assert run.wait(300.0) == 0, run.stderr
         finally:
             run.end()
-        note_ready(run, figures)
+        note_times(run, figures)
         points = Counter(fixes(run))
         record = robot_record(run)
         figures["missions"] += 1
