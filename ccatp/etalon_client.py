@@ -12,7 +12,6 @@ from math import dist
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-import structlog
 from numpy.typing import NDArray
 
 from ccatp.config.models import EtalonConfig
@@ -61,7 +60,6 @@ _MOVED_M = 0.005  # further apart than this two places have different lengths
 
 _ReplyT = TypeVar("_ReplyT", Connected, LaserReady, Environment, ChannelData, Notice)
 _T = TypeVar("_T")
-_log = structlog.get_logger(__name__)
 
 
 class Readiness(NamedTuple):
@@ -79,13 +77,20 @@ class EtalonClient:
         counts: connects, requests, retries, drained (connections closed for unasked or left-over bytes).
     """
 
-    def __init__(self, cfg: EtalonConfig, channels: Sequence[int], collimators_m: NDArray[np.float64]) -> None:
+    def __init__(
+        self,
+        cfg: EtalonConfig,
+        channels: Sequence[int],
+        collimators_m: NDArray[np.float64],
+        on_retry: Callable[[EtalonError, int], None] = lambda _error, _left: None,
+    ) -> None:
         """Set up without a connection.
 
         Args:
             cfg: address, deadlines, limits.
             channels: channels to ask for, each once, length k >= 4.
             collimators_m: where their beams start, world frame, shape (k, 3).
+            on_retry: told of each error after which it is tried again, and how many tries are left then.
 
         Raises:
             ValueError: channels and collimators do not fit, or are too few.
@@ -93,7 +98,7 @@ class EtalonClient:
         if np.shape(collimators_m) != (len(set(channels)), 3) or len(set(channels)) < _NEEDED_CHANNELS:
             raise ValueError(f"channels {tuple(channels)}, collimators {np.shape(collimators_m)}: need (k, 3), k >= 4")
         self.counts: Counter[str] = Counter()
-        self._cfg = cfg
+        self._cfg, self._on_retry = cfg, on_retry
         self._where = f"Etalon server {cfg.host}:{cfg.port}"
         self._channels = tuple(channels)
         self._collimators = dict(zip(self._channels, np.asarray(collimators_m, dtype=np.float64), strict=True))
@@ -212,7 +217,7 @@ class EtalonClient:
                     raise
                 left = max(left - 1, 0)
                 self.counts["retries"] += 1
-                _log.warning("etalon_retry", error=str(error), tries_left=left)
+                self._on_retry(error, left)
                 if isinstance(error, EtalonUnreachable | EtalonBadReply):
                     await asyncio.sleep(self._cfg.reconnect_delay_s)
                 elif not isinstance(error, EtalonTimeout):

@@ -60,7 +60,7 @@ class SurveyWork:
         self._fans = FanDesk(cfg.robot.fan_duty, self._seat, mission, teller, has_floor=bool(parts.mirror.overhang))
         self._commanded = Commanded(cfg.robot, cfg.sim.robot.frame_hz)
         self._seat.on_drive = self._commanded.sent
-        self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m)
+        self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
         self._measuring = MeasuringDesk(
             cfg.mission,
             self._etalon,
@@ -148,6 +148,9 @@ class SurveyWork:
             await self._etalon.connect()
         except EtalonError as error:
             raise UnreachableError(str(error)) from error
+
+    def _on_retry(self, error: EtalonError, tries_left: int) -> None:
+        self._teller.log.warning("laser system asked again", error=str(error), tries_left=tries_left)
 
     async def run(self) -> None:
         """Take measurements, for ever."""

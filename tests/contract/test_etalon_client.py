@@ -260,6 +260,19 @@ async def test_after_a_time_out_the_retry_is_made_on_another_connection(server: 
         assert client.counts == {"connects": 2, "requests": 2, "retries": 1}
 
 
+async def test_each_error_after_which_it_is_tried_again_is_told(
+    server: ScriptedServer, capfd: pytest.CaptureFixture[str]
+) -> None:
+    told: list[tuple[str, int]] = []
+    server.script.extend((b"garbage\r\n", silence))
+    cfg = config(server.port, request_timeout_s=0.05, retries=2)
+    client = EtalonClient(cfg, CHANNELS, COLLIMATORS, lambda error, left: told.append((type(error).__name__, left)))
+    assert_at(await client.measure(1.0, EXPECTED), PUCK)
+    await client.close()
+    assert told == [("EtalonBadReply", 1), ("EtalonTimeout", 0)]
+    assert capfd.readouterr() == ("", "")  # whoever uses it may have given standard output to JSON
+
+
 async def test_a_cancelled_request_takes_its_connection_with_it(server: ScriptedServer) -> None:
     server.script.append(silence)
     async with client_of(server.port) as client:
