@@ -85,7 +85,7 @@ def hidden_offset(found: MoteMap, network: RangeNetwork, settings: BatchSettings
     without, shown = fit_map(MapModel(network), state, settings), fit_map(model, state, settings)
     cost, offset_m = shown.cost, shown.state.offset_m
     agreement = agreement_of(shown, network.sigmas_m, dof)
-    if agreement.is_denied and found.agreement.is_denied:
+    if found.agreement.is_denied:
         # An offset may have bent the map too far to be seen from there.
         anew = map_motes(network, settings, with_offset=True)
         cost, offset_m, agreement = anew.cost, anew.offset_m, anew.agreement

@@ -101,9 +101,10 @@ def _all_fits(model: MapModel, start_m: FloatArray | None, settings: BatchSettin
     """Fits from all starts that it takes, with an offset or a scale known better and better."""
     network = model.network
     fits = _fits(model, network, start_m, settings)
+    best: BatchFit | None = None
     for _ in range(_CORRECTIONS if model.with_offset or model.with_scale else 0):
-        best = min(fits, key=lambda fit: fit.cost)
-        if _is_sure(model, best):
+        before, best = best, min(fits, key=lambda fit: fit.cost)
+        if _is_sure(model, best) or (before is not None and best.cost >= before.cost * (1.0 - _SAME)):
             break
         # An offset bends the map that the unfolding begins with: once more, with what is known of it by now.
         ranges_m = np.maximum((network.ranges_m - best.state.offset_m) / (1.0 + best.state.scale), 0.0)
@@ -176,7 +177,18 @@ def _fits(
         is_repeated = network.count > FEW and abs(found.cost - before) <= _SAME * before < float("inf")
         if _is_sure(model, found) or is_repeated:
             break
+        if len(fits) == len(images) and _may_be_grown(network, settings):
+            # Wrong ranges would lead all starts by least squares astray, one after the other.
+            found, is_settled = searched(model, found, settings)
+            fits.append(found)
+            if _is_sure(model, found) or (is_settled and _is_sound(model, found)):
+                break
     return fits
+
+
+def _may_be_grown(network: RangeNetwork, settings: BatchSettings) -> bool:
+    """Whether growing is quick, and tells more than the shapes of bodies do."""
+    return network.count <= FEW and not network.bodies and bool(np.isfinite(settings.robust_scale))
 
 
 def _is_sure(model: MapModel, fit: BatchFit) -> bool:

@@ -92,7 +92,7 @@ def _table(path: Path) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(_without_comments(file))
-            rows = [(reader.line_num, row) for row in reader if row]
+            rows = [(reader.line_num, row) for row in reader if len(row) > 1 or "".join(row).strip()]
     except OSError as error:
         raise RangeFileError(
             f"{path}: {(error.strerror or str(error)).lower()}; name a CSV file that exists"

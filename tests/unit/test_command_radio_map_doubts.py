@@ -55,7 +55,7 @@ def test_four_wrong_ranges(tell: Any) -> None:
 
 def test_a_common_offset_is_still_told(tell: Any) -> None:
     data = tell(FLAT, long=dict.fromkeys(range(28), 0.3) | {3: 2.3})
-    assert any(warning.startswith("all ranges look 30") for warning in data["warnings"])
+    assert any(warning.startswith("all ranges look 299 mm long") for warning in data["warnings"])
     assert data["expected_rms_m"] is None
     offset = tell(FLAT, "--offset", long=dict.fromkeys(range(28), 0.3) | {3: 2.3})
     assert offset["offset_m"] == pytest.approx(0.3, abs=0.01)
@@ -64,7 +64,7 @@ def test_a_common_offset_is_still_told(tell: Any) -> None:
 
 def test_ranges_in_space_mapped_in_the_plane(tell: Any, tmp_path: Path) -> None:
     out = tmp_path / "b.toml"
-    data = tell(DEEP, "--out", str(out))
+    data = tell(DEEP[:7], "--out", str(out))
     assert data["warnings"][0].startswith("--truth: z_m, which differs by")
     denied = next(warning for warning in data["warnings"] if warning.startswith("the map contradicts its ranges"))
     assert "--dimension 3" in denied

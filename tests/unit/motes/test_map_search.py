@@ -73,26 +73,25 @@ def test_the_robust_minimum_is_found_where_least_squares_leads_astray() -> None:
 
 @pytest.mark.parametrize("finds_sigma", [False, True])
 def test_a_tenth_of_the_ranges_may_be_wrong(finds_sigma: bool) -> None:
-    for seed in (11, 12):
-        network, places, rows = wrong(seed, 10, 5)
-        found = map_motes(network, ROBUST, finds_sigma=finds_sigma)
-        assert aligned_rms_m(found.positions_m, places, mirrors=True) < 0.01
-        assert found.agreement.outlying == tuple(rows)
-        assert not found.agreement.is_denied
-        assert found.sigma_m == pytest.approx(SIGMA_M, rel=0.5)
+    network, places, rows = wrong(11, 10, 5)
+    found = map_motes(network, ROBUST, finds_sigma=finds_sigma)
+    assert aligned_rms_m(found.positions_m, places, mirrors=True) < 0.01
+    assert found.agreement.outlying == tuple(rows)
+    assert not found.agreement.is_denied
+    assert found.sigma_m == pytest.approx(SIGMA_M, rel=0.5)
 
 
 def test_the_same_ranges_give_the_same_map() -> None:
-    network, _, _ = wrong(3, 8, 4)
+    network, _, _ = wrong(3, 7, 2)
     first, again = map_motes(network, ROBUST), map_motes(network, ROBUST)
     assert (first.positions_m == again.positions_m).all()
 
 
 @pytest.mark.parametrize("given", [0.2, 1.0, 5.0])
 def test_the_scale_of_sound_residuals(given: float) -> None:
-    """Whatever the sigmas were taken for; 12 sets of 45 ranges tell it to a few hundredths on the average."""
+    """Whatever the sigmas were taken for; 8 sets of 45 ranges tell it to a few hundredths on the average."""
     scales = []
-    for seed in range(12):
+    for seed in range(8):
         network, places, _ = wrong(seed, 10, 0)
         network.sigmas_m[:] = given * SIGMA_M
         model = MapModel(network)
