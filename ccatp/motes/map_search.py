@@ -67,7 +67,8 @@ def scaled(model: MapModel, first: BatchFit, settings: BatchSettings) -> ScaledF
         settings: of the fits.
     """
     best = _settled(model, first, settings)
-    if best.factor <= 1.0 or not np.isfinite(settings.robust_scale):
+    # Shapes of bodies hold a map together by themselves.
+    if best.factor <= 1.0 or model.network.bodies or not np.isfinite(settings.robust_scale):
         return best
     times = 0
     for fit in _grown_fits(model, first, settings):

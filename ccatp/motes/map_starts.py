@@ -16,7 +16,7 @@ from ccatp.radio.rigid_alignment import best_motion
 _WHOLE = 130  # motes up to which the whole map is unfolded at once; beyond, it is stitched from patches
 FEW = 60  # motes up to which unfolding from drawn places costs little
 _DRAWS = 16
-_FEW_DRAWS = 4  # where there are more
+_FEW_DRAWS = 2  # where there are more, and each takes seconds
 _MAX_DOP = 60.0  # of a trilateration that is but a start
 
 
