@@ -38,14 +38,17 @@ METHODS = ("ekf", "batch")
 @click.option("--seed", type=click.IntRange(min=0), metavar="N", help="Seed of the first run.")
 @click.option("--offset", is_flag=True, help="Estimate a common offset of the ranges.")
 @click.option("--scale", is_flag=True, help="Estimate a common scale of the ranges.")
+@click.option(
+    "--dimension", type=click.IntRange(2, 3), metavar="D", help="2 for motes in a plane, 3 for motes in space."
+)
 @settings_option("A key of cricket, as in cricket.phase2.pairs=zigzag.")
 @click.option("--out", "out_file", type=OutputFile(), help="Write a beacon file (TOML).")
 @figure_option("Draw map and errors")
 @JSON_OPTION
 def radio_map(
     config_file: Path | None, ranges_file: Path | None, tags_file: Path | None, truth_file: Path | None,
-    method: str, seeds: int, seed: int | None, offset: bool, scale: bool, settings: Mapping[str, object],
-    out_file: Path | None, figure_file: Path | None, json_output: bool,
+    method: str, seeds: int, seed: int | None, offset: bool, scale: bool, dimension: int | None,
+    settings: Mapping[str, object], out_file: Path | None, figure_file: Path | None, json_output: bool,
 ) -> int:  # fmt: skip
     """Map beacons from the ranges between them."""
     if ranges_file is None and (tags_file is not None or truth_file is not None):
@@ -57,12 +60,13 @@ def radio_map(
 
     named: dict[str, object] = {
         "run.seed": seed,
+        "cricket.dimension": dimension,
         "cricket.batch.estimates_offset": offset or None,
         "cricket.batch.estimates_scale": scale or None,
     }
     if config_file is None:
         named["system"] = "cricket"
-    cfg = load_radio_config(config_file, overrides(settings, named))
+    cfg = load_radio_config(config_file, overrides(settings, named), simulates=ranges_file is None)
     if ranges_file is None:
         data = _simulated(cfg.cricket, method, range(cfg.run.seed, cfg.run.seed + seeds), out_file, figure_file)
     else:

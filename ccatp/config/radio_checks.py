@@ -10,18 +10,19 @@ from ccatp.config.radio_models import FuzzyConfig, RadioConfig
 FUZZY_INPUTS = ("distance_m", "heading_error_rad")
 
 
-def check_radio_config(cfg: RadioConfig) -> list[Fault]:
+def check_radio_config(cfg: RadioConfig, *, simulates: bool = True) -> list[Fault]:
     """Everything wrong with a configuration whose values are each in range.
 
     Args:
         cfg: the configuration.
+        simulates: whether the field of motes is simulated, or its ranges were measured.
     """
     return [
         *_check_fuzzy(cfg.control.fuzzy),
         *_check_follow(cfg),
         *_check_avoidance(cfg),
         *_check_room(cfg),
-        *check_cricket(cfg.cricket),
+        *check_cricket(cfg.cricket, simulates=simulates),
         *check_dashboard(cfg.dashboard),
     ]
 

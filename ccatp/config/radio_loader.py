@@ -27,7 +27,11 @@ _WHOLE: tuple[Key, ...] = (
 
 
 def load_radio_config(
-    file: Path | None = None, overrides: Mapping[str, object] | None = None, config_dir: Path | None = None
+    file: Path | None = None,
+    overrides: Mapping[str, object] | None = None,
+    config_dir: Path | None = None,
+    *,
+    simulates: bool = True,
 ) -> RadioConfig:
     """The whole configuration of a robot among radio beacons.
 
@@ -38,6 +42,7 @@ def load_radio_config(
         file: the user's configuration, or ``None``.
         overrides: dotted keys, stronger than the file; ``None`` values are left out.
         config_dir: folder with ``radio.toml``; the shipped one if ``None``.
+        simulates: whether a field of motes is simulated, or its ranges were measured.
 
     Raises:
         ConfigError: one line with file, line, key, what is wrong and what to do.
@@ -54,7 +59,7 @@ def load_radio_config(
     tree: Tree = {}
     for source in (base, system, user):
         tree = merged(tree, source.tree, _WHOLE)
-    return _validated(merged(tree, command.tree), [command, user, system, base])
+    return _validated(merged(tree, command.tree), [command, user, system, base], simulates)
 
 
 def is_radio_file(file: Path) -> bool:
@@ -91,14 +96,14 @@ def _system(sources: list[Source]) -> str:
     raise ConfigError(f"{sources[-1].name}: system is missing; {choice_hint('', SYSTEMS)}")
 
 
-def _validated(tree: Tree, sources: list[Source]) -> RadioConfig:
+def _validated(tree: Tree, sources: list[Source], simulates: bool) -> RadioConfig:
     try:
         # by way of JSON, where strict means what it should for TOML: an array is a tuple, "1" is no number
         cfg = RadioConfig.model_validate_json(json.dumps(tree, default=str), strict=True)
     except ValidationError as error:
         faults = faults_of(error.errors(), RadioConfig)
     else:
-        faults = check_radio_config(cfg)
+        faults = check_radio_config(cfg, simulates=simulates)
         if not faults:
             return cfg
     raise ConfigError(*(fault_line(fault, sources) for fault in faults))

@@ -5,6 +5,7 @@ from contextlib import suppress
 
 import numpy as np
 
+from ccatp.motes.map_growth import grown
 from ccatp.motes.map_patches import stitched
 from ccatp.motes.pair_means import PairMeans
 from ccatp.motes.phase_one import map_as_possible
@@ -15,6 +16,7 @@ from ccatp.radio.rigid_alignment import best_motion
 _WHOLE = 130  # motes up to which the whole map is unfolded at once; beyond, it is stitched from patches
 FEW = 60  # motes up to which unfolding from drawn places costs little
 _DRAWS = 16
+_FEW_DRAWS = 2  # where there are more, and each takes seconds
 _MAX_DOP = 60.0  # of a trilateration that is but a start
 
 
@@ -38,6 +40,22 @@ def map_starts(network: RangeNetwork, given_m: FloatArray | None) -> Iterator[li
     if count <= FEW:
         for draw in range(_DRAWS):  # the same ranges give the same map
             yield _images(network, unfolded(count, pairs, distances_m, sigmas_m, d, rng=np.random.default_rng(draw)))
+
+
+def grown_starts(network: RangeNetwork, robust_scale: float) -> Iterator[list[FloatArray]]:
+    """Maps grown from drawn triangles, which a few wrong ranges do not bend; with their mirror images as before.
+
+    Args:
+        network: ranges, bodies, known places.
+        robust_scale: of the Cauchy loss, in sigmas.
+    """
+    means = PairMeans(network)
+    pairs, distances_m, sigmas_m = _with_bodies(network, means)
+    for draw in range(_DRAWS if network.count <= FEW else _FEW_DRAWS):
+        rng = np.random.default_rng(draw)
+        places = grown(network.count, pairs, distances_m, sigmas_m, network.dimension, robust_scale, rng)
+        if places is not None:
+            yield _images(network, _filled(places, means))
 
 
 def _images(network: RangeNetwork, places_m: FloatArray) -> list[FloatArray]:

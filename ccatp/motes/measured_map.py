@@ -1,17 +1,17 @@
 """Pure. A map from measured ranges: graph, outlook, filter or batch, and the error where the truth is known."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc
 
 from ccatp.config.cricket_models import CricketConfig
 from ccatp.motes.fold_over import find_fold_over
-from ccatp.motes.map_batch import BatchSettings, fit_map
+from ccatp.motes.map_batch import BatchSettings
 from ccatp.motes.map_model import MapModel
+from ccatp.motes.map_warnings import disagreeing, doubts, flat, hidden_offset, is_flat, left_out_heights, untold
 from ccatp.motes.mote_frame import plain_frame
-from ccatp.motes.mote_map import MoteMap, map_motes
+from ccatp.motes.mote_map import map_motes
 from ccatp.motes.phase_one import map_as_possible
 from ccatp.motes.range_bound import bound_rms_m, map_rms_m
 from ccatp.motes.range_network import (
@@ -29,10 +29,6 @@ from ccatp.motes.self_mapping import MapperSettings, MoteMapper, run_phase_two
 from ccatp.motes.tdoa import MoteRange
 from ccatp.radio.rigid_alignment import aligned_rms_m, best_motion
 
-_TELLING = 12.0  # a drop of chi-squared that chance gives one offset in two thousand
-_CHANCE = 1e-4  # that sound ranges of one pair of all disagree as much
-_FLAT = "the ranges do not tell how far each is off it"
-_CONTRADICTED = 3.0  # chi-squared for each degree of freedom
 _WIDER = 1e4  # of variances: what a range that is used twice adds by its first use is then a ten-thousandth
 
 Places = Mapping[str, tuple[float, ...]]
@@ -75,6 +71,7 @@ class _Found(NamedTuple):
     offset_m: float
     scale: float
     iterations: int
+    is_trusted: bool
     warnings: tuple[str, ...]
 
 
@@ -108,16 +105,22 @@ def map_measured(
     places, covariance = _framed(found, motes, true_m)
     at_found = MapModel(found.network, with_offset=model.with_offset, with_scale=model.with_scale)
     error_m = None if true_m is None else aligned_rms_m(places, true_m, mirrors=True)
-    expected_m: float | None = map_rms_m(found.covariance_m2, found.positions_m, motes, aligned=True)
+    expected_m = map_rms_m(found.covariance_m2, found.positions_m, motes, aligned=True)
     bound_m = bound_rms_m(at_found, found.positions_m, motes, aligned=True)
-    warnings = [*_disagreeing(network), *folds.warnings, *found.warnings]
-    if any(_is_flat(error, places) for error in (expected_m, bound_m)):
-        # Derivatives at a place where they vanish: what comes out is a huge number, and means that nothing is known.
-        expected_m, bound_m = None, None
-        warnings.append(f"the motes lie {'in a line' if network.dimension == 2 else 'in a plane'}, or nearly: {_FLAT}")
+    warnings = [
+        word
+        for option, given in (("--tags", tags_m), ("--truth", truth_m))
+        if given
+        for word in left_out_heights(option, given, network.dimension, cfg.ranging.sigma_m)
+    ]
+    warnings += [*disagreeing(network), *folds.warnings, *found.warnings, *map(untold, freedom.untold)]
+    # Derivatives at a place where they vanish: what comes out is large, and means that nothing is known.
+    if is_thin := is_flat(bound_m, places) or (found.is_trusted and is_flat(expected_m, places)):
+        warnings.append(flat(network.dimension))
+    is_known = found.is_trusted and bound_m is not None and not is_thin
     data = {
         "rms_m": {"p10": error_m, "p50": error_m, "p90": error_m},
-        "crlb_m": bound_m,
+        "crlb_m": None if is_thin else bound_m,
         "rank_deficiency": freedom.deficiency,
         "fold_over_risk": not folds.is_unique,
         "phase1_rms_m": _phase1_error_m(cfg, network, motes, true_m),
@@ -126,39 +129,13 @@ def map_measured(
         "seeds": 1,
         "motes": len(motes),
         "frame": "aligned",
-        "expected_rms_m": expected_m,
-        "offset_m": found.offset_m,
-        "scale": 1.0 + found.scale,
+        "expected_rms_m": expected_m if is_known else None,
+        "offset_m": None if "offset" in freedom.untold else found.offset_m,
+        "scale": None if "scale" in freedom.untold else 1.0 + found.scale,
         "free_directions": [*freedom.frame, *freedom.flexes, *freedom.calibration],
         "warnings": warnings,
     }
     return MeasuredMap(names, places, covariance, true_m, data)
-
-
-def _is_flat(error_m: float | None, places_m: FloatArray) -> bool:
-    """Whether an error expected is larger than the map itself."""
-    return error_m is not None and error_m > float(np.linalg.norm(np.ptp(places_m, axis=0)))
-
-
-def _disagreeing(network: RangeNetwork) -> Iterator[str]:
-    """A word on the pair whose own ranges contradict each other most, more than chance would have them."""
-    pairs = np.sort(np.column_stack([network.first, network.second]), axis=1)
-    found, place = np.unique(pairs, axis=0, return_inverse=True)
-    place = place.ravel()
-    weights = network.sigmas_m**-2.0
-    means = np.bincount(place, weights * network.ranges_m) / np.bincount(place, weights)
-    squares = np.bincount(place, weights * (network.ranges_m - means[place]) ** 2)
-    chances = chdtrc(np.maximum(np.bincount(place) - 1, 1), squares)
-    if not (bad := np.flatnonzero(chances < _CHANCE / len(found))).size:
-        return
-    worst = int(bad[np.argmax(squares[bad])])
-    ranges = network.ranges_m[place == worst]
-    more = f" and {bad.size - 1} more pairs" if bad.size > 1 else ""
-    first, second = (network.names[mote] for mote in found[worst])
-    yield (
-        f"ranges between {first} and {second}{more} disagree among themselves: {ranges.min():.4g} to "
-        f"{ranges.max():.4g} m with a sigma of {network.sigmas_m[place == worst].min():.3g} m"
-    )
 
 
 def _network(cfg: CricketConfig, file: MeasuredRanges, tags_m: Places | None) -> RangeNetwork:
@@ -203,39 +180,15 @@ def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Any) -> _Found:
         network.names, network.dimension, network.first, network.second,
         network.ranges_m, network.sigmas_m * factor, network.bodies, network.known_m,
     )  # fmt: skip
-    warnings = [*_hidden_offset(found, scaled, settings)] if not cfg.batch.estimates_offset else []
-    warnings += [
-        f"{list_names([network.names[mote] for mote in fold.motes])}: the mirror image fits almost as well "
-        f"(chi-squared {fold.cost_gap:.1f} more)"
-        for fold in found.folds[:5]
-    ]
-    if factor == 1.0 and found.variance_factor > _CONTRADICTED:
-        warnings.append(
-            f"the map contradicts its ranges: chi-squared {found.variance_factor:.1f} for each degree of freedom; "
-            "it is folded, or the sigmas are too small"
-        )
-    if factor > 1.5:
-        warnings.append(f"ranges scatter by {1e3 * found.sigma_m:.3g} mm, {factor:.1f} times what they were taken for")
-    if found.outliers:
-        warnings.append(
-            f"{found.outliers} of {len(network.ranges_m)} ranges contradict the others and count for little"
-        )
+    warnings = [*hidden_offset(found, scaled, settings)] if not cfg.batch.estimates_offset else []
+    warnings += doubts(found, network, factor)
+    is_denied = found.agreement.is_denied
+    # Of a map that its ranges deny, at least what they miss it by.
+    inflation = float(((found.residuals_m / scaled.sigmas_m) ** 2).sum()) / found.dof if is_denied else 1.0
     return _Found(
-        found.positions_m, found.covariance_m2, scaled, found.offset_m, found.scale, found.iterations, tuple(warnings)
-    )
-
-
-def _hidden_offset(found: MoteMap, network: RangeNetwork, settings: BatchSettings) -> Iterator[str]:
-    """A word on an offset that the ranges show, where none is estimated."""
-    model = MapModel(network, with_offset=True)
-    state = model.state(found.positions_m, 0.0, found.scale)
-    plain = settings._replace(robust_scale=float("inf"))
-    without, shown = fit_map(MapModel(network), state, plain), fit_map(model, state, plain)
-    if without.cost - shown.cost > _TELLING and len(network.ranges_m) > model.size:
-        yield (
-            f"all ranges look {1e3 * shown.state.offset_m:.0f} mm long in common (chi-squared {without.cost:.0f}, "
-            f"{shown.cost:.0f} with an offset); --offset estimates it"
-        )
+        found.positions_m, inflation * found.covariance_m2, scaled, found.offset_m, found.scale, found.iterations,
+        not is_denied, tuple(warnings),
+    )  # fmt: skip
 
 
 def _filter(cfg: CricketConfig, network: RangeNetwork) -> _Found:
@@ -260,7 +213,7 @@ def _filter(cfg: CricketConfig, network: RangeNetwork) -> _Found:
     )
     went = run_phase_two(mapper, rows, 0.0)
     warnings = (f"{went.refused} of {len(went.nis)} ranges were refused by the gate",) if went.refused else ()
-    return _Found(mapper.positions_m, mapper.covariance_m2, network, 0.0, 0.0, len(went.nis), warnings)
+    return _Found(mapper.positions_m, mapper.covariance_m2, network, 0.0, 0.0, len(went.nis), True, warnings)
 
 
 def _phase1_error_m(

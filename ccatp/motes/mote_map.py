@@ -4,14 +4,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ccatp.motes.map_agreement import Agreement, agreement_of
 from ccatp.motes.map_batch import BatchFit, BatchSettings, fit_from_afar, fit_map, position_covariance
 from ccatp.motes.map_flips import Fold, unfold
 from ccatp.motes.map_model import MapModel, MapState
 from ccatp.motes.map_repair import repaired
+from ccatp.motes.map_search import scaled, searched
 from ccatp.motes.map_starts import FEW, map_starts
 from ccatp.motes.range_network import FloatArray, RangeNetwork
 
-_NORMAL_MAD = 1.4826  # standard deviation over the median absolute deviation of a normal distribution
 _SURE = 2.0  # a map whose cost per degree of freedom is less needs no other start
 _SAME = 1e-6  # relative difference of costs that are the same minimum's
 _CORRECTIONS = 3  # times that the unfolding is repeated with ranges corrected by the offset found
@@ -32,7 +33,7 @@ class MoteMap:
         residuals_m: measured less computed ranges, shape (m,).
         sigma_m: median of the sigmas in the end.
         iterations: steps of all fits.
-        outliers: ranges of which the loss left less than half.
+        agreement: of the ranges with the map.
         free: directions that no range sees, the frame's included.
         folds: sets of motes whose mirror image fits almost as well.
     """
@@ -47,7 +48,7 @@ class MoteMap:
     residuals_m: FloatArray
     sigma_m: float
     iterations: int
-    outliers: int
+    agreement: Agreement
     free: int
     folds: tuple[Fold, ...]
 
@@ -81,19 +82,16 @@ def map_motes(
         with_scale: estimate a common scale.
         start_m: one more place to begin, shape (n, d), nan where unknown.
         mirrors: sets of motes that the graph lets fold, from ``find_fold_over``.
-        finds_sigma: the sigmas are right up to a factor, which the residuals of a first map without robust loss tell.
+        finds_sigma: the sigmas are right up to a factor, which the residuals tell (``scaled``).
     """
     model = MapModel(network, with_offset=with_offset, with_scale=with_scale)
     if finds_sigma:
         plain = settings._replace(robust_scale=float("inf"))
         first = min(_all_fits(model, start_m, plain), key=lambda fit: fit.cost)
-        share = np.sqrt(len(network.ranges_m) / max(len(network.ranges_m) - model.size, 1))
-        factor = share * _NORMAL_MAD * float(np.median(np.abs(first.residuals_m) / network.sigmas_m))
-        network = replace(network, sigmas_m=network.sigmas_m * max(factor, 1e-9))
-        model = MapModel(network, with_offset=with_offset, with_scale=with_scale)
-        fits = [fit_from_afar(model, first.state, settings)]
-        if not _is_sure(model, fits[0]):
-            fits += _all_fits(model, first.state.positions_m, settings)
+        _, model, fit = scaled(model, first, settings)
+        fits = [fit]
+        if not _is_sure(model, fit) and not _is_sound(model, fit):
+            fits += _all_fits(model, fit.state.positions_m, settings)
     else:
         fits = _all_fits(model, start_m, settings)
     return _unfolded_map(model, fits, settings, mirrors)
@@ -103,9 +101,10 @@ def _all_fits(model: MapModel, start_m: FloatArray | None, settings: BatchSettin
     """Fits from all starts that it takes, with an offset or a scale known better and better."""
     network = model.network
     fits = _fits(model, network, start_m, settings)
+    best: BatchFit | None = None
     for _ in range(_CORRECTIONS if model.with_offset or model.with_scale else 0):
-        best = min(fits, key=lambda fit: fit.cost)
-        if _is_sure(model, best):
+        before, best = best, min(fits, key=lambda fit: fit.cost)
+        if _is_sure(model, best) or (before is not None and best.cost >= before.cost * (1.0 - _SAME)):
             break
         # An offset bends the map that the unfolding begins with: once more, with what is known of it by now.
         ranges_m = np.maximum((network.ranges_m - best.state.offset_m) / (1.0 + best.state.scale), 0.0)
@@ -125,10 +124,12 @@ def _unfolded_map(
     steps = sum(fit.iterations for fit in fits)
     best = repaired(model, best, settings)
     if not _is_sure(model, best) and np.isfinite(settings.robust_scale):
-        # To a robust loss a folded map is a good one with a few outliers: look for folds by least squares first.
-        plain = settings._replace(robust_scale=float("inf"))
-        open_map = unfold(model, fit_map(model, best.state, plain), plain, mirrors).fit
-        best = min(best, fit_map(model, open_map.state, settings), key=lambda fit: fit.cost)
+        best, is_settled = searched(model, best, settings)
+        if not (is_settled and _is_sound(model, best)):
+            # To a robust loss a folded map is a good one with a few outliers: look for folds by least squares first.
+            plain = settings._replace(robust_scale=float("inf"))
+            open_map = unfold(model, fit_map(model, best.state, plain), plain, mirrors).fit
+            best = min(best, fit_map(model, open_map.state, settings), key=lambda fit: fit.cost)
     found = unfold(model, best, settings, mirrors)
     fit = found.fit
     covariance, free = position_covariance(model, fit)
@@ -144,7 +145,7 @@ def _unfolded_map(
         residuals_m=fit.residuals_m,
         sigma_m=float(np.median(network.sigmas_m)),
         iterations=steps,
-        outliers=int((fit.weights < 0.5).sum()),
+        agreement=agreement_of(fit, network.sigmas_m, dof),
         free=free,
         folds=found.doubtful,
     )
@@ -176,8 +177,25 @@ def _fits(
         is_repeated = network.count > FEW and abs(found.cost - before) <= _SAME * before < float("inf")
         if _is_sure(model, found) or is_repeated:
             break
+        if len(fits) == len(images) and _may_be_grown(network, settings):
+            # Wrong ranges would lead all starts by least squares astray, one after the other.
+            found, is_settled = searched(model, found, settings)
+            fits.append(found)
+            if _is_sure(model, found) or (is_settled and _is_sound(model, found)):
+                break
     return fits
+
+
+def _may_be_grown(network: RangeNetwork, settings: BatchSettings) -> bool:
+    """Whether growing is quick, and tells more than the shapes of bodies do."""
+    return network.count <= FEW and not network.bodies and bool(np.isfinite(settings.robust_scale))
 
 
 def _is_sure(model: MapModel, fit: BatchFit) -> bool:
     return fit.cost < _SURE * max(len(model.network.ranges_m) - model.size, 1)
+
+
+def _is_sound(model: MapModel, fit: BatchFit) -> bool:
+    """Whether the ranges fit but for a few outliers."""
+    network = model.network
+    return not agreement_of(fit, network.sigmas_m, len(network.ranges_m) - model.size).is_denied

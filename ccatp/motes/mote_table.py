@@ -28,10 +28,11 @@ def report_lines(data: dict[str, Any]) -> Iterator[str]:
         yield f"  error of the others                {_mm(data['rms_of_others_m'])}"
     yield f"  expected by the estimator          {_mm(data['expected_rms_m'])}"
     yield f"  updates or steps                   {data['iterations']}"
-    if data["offset_m"]:
+    if data["offset_m"] != 0.0:
         yield f"  common offset of the ranges        {_mm(data['offset_m'])}"
     if data["scale"] != 1.0:
-        yield f"  common scale of the ranges         {data['scale']:.6f}"
+        scale = "unknown" if data["scale"] is None else f"{data['scale']:.6f}"
+        yield f"  common scale of the ranges         {scale}"
 
 
 def _mm(value_m: float | None) -> str:

@@ -26,7 +26,7 @@ class Freedom(NamedTuple):
         rank: of the derivatives of the ranges by them.
         frame: names of rigid motions of the whole map that are free.
         flexes: which motes move against the others, one line for each free direction.
-        calibration: what of offset and scale cannot be told from the map.
+        untold: what of offset and scale cannot be told from the map.
         parts: motes that hold together, largest first; a mote in two parts is a hinge.
     """
 
@@ -34,13 +34,18 @@ class Freedom(NamedTuple):
     rank: int
     frame: tuple[str, ...]
     flexes: tuple[str, ...]
-    calibration: tuple[str, ...]
+    untold: tuple[str, ...]
     parts: tuple[tuple[int, ...], ...]
 
     @property
     def deficiency(self) -> int:
         """Free directions beyond the frame's."""
         return self.unknowns - self.rank - len(self.frame)
+
+    @property
+    def calibration(self) -> tuple[str, ...]:
+        """A line for each that cannot be told."""
+        return tuple(f"range {name}: the map takes it up" for name in self.untold)
 
 
 def generic_state(model: MapModel, rng: np.random.Generator) -> MapState:
@@ -72,16 +77,16 @@ def find_freedom(model: MapModel, state: MapState) -> Freedom:
     null = _null_space(model, state)
     moves = np.asarray(model.position_jacobian(state) @ null[: model.coordinates])
     names = [name for name, on in (("offset", model.with_offset), ("scale", model.with_scale)) if on]
-    calibration = tuple(
-        f"range {name}: the map takes it up"
+    untold = tuple(
+        name
         for row, name in enumerate(names)
         if null.shape[1] and float(np.abs(null[model.coordinates + row]).max()) > 1e-7
     )
     frame = _frame(moves, state.positions_m)
     extra = null.shape[1] - len(frame)
     parts = rigid_parts(moves, state.positions_m, extra)
-    flexes = _flexes(moves, state.positions_m, parts, network) if extra > len(calibration) else ()
-    return Freedom(model.size, model.size - null.shape[1], frame, flexes, calibration, parts)
+    flexes = _flexes(moves, state.positions_m, parts, network) if extra > len(untold) else ()
+    return Freedom(model.size, model.size - null.shape[1], frame, flexes, untold, parts)
 
 
 def rigid_parts(moves: FloatArray, points: FloatArray, extra: int) -> tuple[tuple[int, ...], ...]:

@@ -11,6 +11,7 @@ from ccatp.motes.tdoa import MoteRange
 PLAIN = ("first", "second", "range_m")
 SESSION = ("session", "pos", "deg", "anchor", "tag", "mean_m")
 PLACES = ("name", "x_m", "y_m")
+COMMENT = "#"
 LONGEST_M = 1e6
 SHORTEST_M = 1e-3  # no two motes are nearer
 FINEST_M = 1e-6  # no range is better
@@ -21,7 +22,7 @@ class RangeFileError(MappingError):
 
 
 def read_ranges(path: Path, sigma_m: float) -> MeasuredRanges:
-    """Ranges of a CSV file with a header.
+    """Ranges of a CSV file with a header; lines that begin with # are comments.
 
     Two forms are read. ``first,second,range_m`` with ``sigma_m`` where ranges differ in quality: one range a line.
     ``session,pos,deg,anchor,tag,n,mean_m,...``: a trolley with tags among anchors, one line for the mean range of an
@@ -63,6 +64,8 @@ def read_places(path: Path) -> dict[str, tuple[float, ...]]:
     header, rows = _table(path)
     if not set(PLACES) <= set(header):
         raise RangeFileError(f"{path}:1: columns {','.join(header)}; wanted {','.join(PLACES)}[,z_m]")
+    if not rows:
+        raise RangeFileError(f"{path}: has no places, only a header")
     axes = [axis for axis in ("x_m", "y_m", "z_m") if axis in header]
     return {
         _name(path, line, "name", row["name"]): tuple(_coordinate(path, line, axis, row[axis]) for axis in axes)
@@ -88,21 +91,25 @@ def _table(path: Path) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
     """Header, and the lines with their numbers."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file, restkey="", restval="")
-            header = [name.strip() for name in reader.fieldnames or []]
-            reader.fieldnames = header
-            return header, list(_lines(reader))
+            reader = csv.reader(_without_comments(file))
+            rows = [(reader.line_num, row) for row in reader if len(row) > 1 or "".join(row).strip()]
     except OSError as error:
         raise RangeFileError(
             f"{path}: {(error.strerror or str(error)).lower()}; name a CSV file that exists"
         ) from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise RangeFileError(f"{path}: is no CSV text: {error}") from error
+    if not rows:
+        raise RangeFileError(f"{path}: is empty; give a header and a line for each")
+    header = [name.strip() for name in rows[0][1]]
+    padding = [""] * len(header)
+    return header, [(line, dict(zip(header, row + padding, strict=False))) for line, row in rows[1:]]
 
 
-def _lines(reader: "csv.DictReader[str]") -> Iterator[tuple[int, dict[str, str]]]:
-    for row in reader:
-        yield reader.line_num, {key: value for key, value in row.items() if isinstance(value, str)}
+def _without_comments(lines: Iterable[str]) -> Iterator[str]:
+    """The lines, empty in place of comments, so that their numbers stay."""
+    for line in lines:
+        yield "\n" if line.lstrip().startswith(COMMENT) else line
 
 
 def _number(path: Path, line: int, key: str, text: str) -> float:
