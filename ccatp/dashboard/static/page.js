@@ -31,6 +31,7 @@ const commands = new Commands();
 let source = null;
 let heardAt = performance.now();
 let isEnded = false;
+let isDashboardGone = false;
 let isConnecting = false;
 let codes = [];
 let words = {};
@@ -78,28 +79,36 @@ function begin(ground) {
 
 function hear(state, isAll) {
   heardAt = performance.now();
-  isEnded = false;
+  isEnded = isDashboardGone = false;
   $("ended").hidden = true;
   show(state, isAll);
 }
 
+// Of the survey only where main has said so: a robot that drives must not be taken for one that stands.
 function end(state) {
   source.close();
   show(state, true);
-  isEnded = true;
-  const mission = state.mission;
-  const how = mission?.outcome || (mission ? `while ${mission.state}` : "before it began");
-  text("ended", `The daemon has ended: ${how}${mission ? `, ${mission.done} of ${mission.total} ${words.goal} ${words.reached}` : ""}.`);
-  $("ended").hidden = false;
-  alarm([]);
   commands.end();
-  setTimeout(connect, RETRY_MS); // the next survey may begin at the same place
+  isEnded = state.is_over;
+  isDashboardGone = !isEnded;
+  heardAt = performance.now();
+  if (isEnded) tellEnd(state.mission);
+  tellSilence();
+  setTimeout(connect, RETRY_MS); // the next dashboard, or the next survey, may begin at the same place
 }
 
-setInterval(() => {
+function tellEnd({ outcome, state, done, total }) {
+  text("ended", `The daemon has ended: ${outcome || `while ${state}`}, ${done} of ${total} ${words.goal} ${words.reached}.`);
+  $("ended").hidden = false;
+}
+
+function tellSilence() {
   const silent = performance.now() - heardAt;
-  if (!isEnded && silent > SILENCE_MS) alarm([["the dashboard does not answer", silent / 1000]]);
-}, 100);
+  if (isEnded || !(isDashboardGone || silent > SILENCE_MS)) return;
+  const what = isDashboardGone ? "the dashboard has ended; the survey may go on" : "the dashboard does not answer";
+  alarm([[what, silent / 1000]]);
+}
+setInterval(tellSilence, 100);
 
 // -- what is shown ------------------------------------------------------------------------------------------------
 
