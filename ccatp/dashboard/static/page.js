@@ -175,9 +175,8 @@ function showFacts(facts) {
 
 function showVerdict(verdict) {
   if (!verdict) return;
-  const unit = verdict.cause ? ` (${verdict.signal} ${verdict.value.toPrecision(3)}, limit ${verdict.limit.toPrecision(3)})` : "";
   const grave = SEVERITIES[verdict.severity] ? `, ${SEVERITIES[verdict.severity]}` : "";
-  text("verdict", `${verdict.code} ${codes[verdict.code] ?? ""}${grave}${verdict.cause ? `: ${verdict.cause}${unit}` : ""}`);
+  text("verdict", `${verdict.code} ${codes[verdict.code] ?? ""}${grave}${verdict.text ? `: ${verdict.text}` : ""}`);
   $("verdict").dataset.level = verdict.code === 2 || verdict.severity >= 4 ? "bad" : verdict.code || verdict.severity ? "warn" : "";
   $("verdict").classList.toggle("stale", Boolean(verdict.is_stale));
   for (const way of ["forward", "reverse", "turn"]) {

@@ -222,7 +222,7 @@ def test_the_verdict_and_its_cause(view: SurveyView) -> None:
     shown = encoded(view.news(1.5))["verdict"]
     assert shown == {
         "cause": "edge", "signal": "front_left", "value": 0.006, "limit": 0.005, "off": [True, False, False, False],
-        "code": 1, "severity": 0, "permits": {"forward": False, "reverse": True, "turn": False}, "is_stale": False,
+        "code": 1, "severity": 0, "text": "edge (front left): 0.006 (limit 0.005)", "permits": {"forward": False, "reverse": True, "turn": False}, "is_stale": False,
     }  # fmt: skip
     assert view.news(2.5)["verdict"]["is_stale"]
 
@@ -236,7 +236,7 @@ def test_a_danger_event_is_a_line_as_well(view: SurveyView) -> None:
     state = view.news(1.0)
     assert state["verdict"]["code"] == 2
     assert "permits" not in state["verdict"]
-    assert state["log"] == [(1.25, "warning", "danger: fire emergency:fire 1 (limit 0)")]
+    assert state["log"] == [(1.25, "warning", "danger: fire")]
     view.hear(Log(seq=5, t_s=2.0, level="info", process="main", text="joined"), 2.0)
     assert view.news(2.0)["log"] == [(2.0, "info", "joined")]
 

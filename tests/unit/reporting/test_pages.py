@@ -128,18 +128,6 @@ def test_text_stays_text(recorded: Path) -> None:
     assert evil not in other
 
 
-def test_many_events_are_folded(recorded: Path) -> None:
-    whole = read_record(recorded)
-    calm = [LogLine("", 1.0 * i, "info", "main", f"line {i}") for i in range(100)]
-    bad = [LogLine("", 1.0 * i, "warning", "main", f"careful {i}") for i in range(60)]
-    (events,) = [s for s in sections_of(findings_of(replace(whole, log=(*calm, *bad)))) if s.anchor == "events"]
-    before, folded = events.body.split("<details>")
-    assert before.count("careful") == 40
-    assert "and 20 more warnings and errors" in before
-    assert "line 99" not in before
-    assert folded.count("<tr>") == 1 + 160
-
-
 def test_outcomes(recorded: Path) -> None:
     whole = read_record(recorded)
     assert outcome_of(whole) == ("complete", "", True)
