@@ -160,6 +160,7 @@ class View:
         shown: dict[str, Any] = msgspec.to_builtins(self.status)
         shown["is_stale"] = now_s - self._status_s > STATUS_STALE_S and not self.links.is_over
         shown["next_point"] = self._next_point()
+        shown["not_to_be_measured"] = sum(map(len, self.status.left_out.values()))
         return shown
 
     def _pose(self) -> dict[str, Any] | None:

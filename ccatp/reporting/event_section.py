@@ -13,7 +13,7 @@ _FEW = 40
 _CLASSES = {"error": "bad", "critical": "bad", "warning": "mid"}
 _CALM = ("info", "debug")
 # What no reader may miss, at whatever level it was said.
-_GRAVE = re.compile(r"\banew\b|\babort|emergenc|was killed|\bdied\b|link lost|returning to base|interrupted", re.I)
+_GRAVE = re.compile(r"(?i)\banew\b|\babort|emergenc|was killed|\bdied\b|link lost|returning to base|interrupted")
 # The name of a point or an address is one token; a number may have a fraction.
 _TOKEN = re.compile(r"\d+(?:[-/:.]\d+){2,}|\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 

@@ -1,5 +1,6 @@
 """Pure. The sections of a report. Each appears where the run holds what it shows; a new kind of run adds its own."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -70,6 +71,11 @@ def _cells_with_classes(markup: str) -> str:
 
 
 def _failed(points: list[PointVerdict]) -> str:
+    never = Counter(v.why or "nobody said why" for v in points if v.grade is Grade.OPEN)
+    return "".join(f"<p>{count} not measured: {text(why)}.</p>" for why, count in never.items()) + _one_by_one(points)
+
+
+def _one_by_one(points: list[PointVerdict]) -> str:
     bad = [v for v in points if v.grade in (Grade.FAIL, Grade.SKIPPED, Grade.CORRECTED)]
     if not bad:
         return ""
@@ -82,7 +88,9 @@ def surface_section(found: Findings) -> Section | None:
     """The deviation of the surface, and the half-wavefront error before and after the moves."""
     alignment = found.alignment
     if alignment is None or not alignment.panels:
-        return None
+        why = "No panel has enough points" if found.record.measured else "No point measured"
+        nothing = f"<p>{why}: no surface, no adjuster moves.</p>"
+        return Section("surface", "Surface", nothing) if found.points else None
     mirror = found.record.mirror
     title = f"{mirror.name}: deviation of the surface"
     picture = figure(partial(surface_figure, mirror, alignment.panels, title), _SURFACE)

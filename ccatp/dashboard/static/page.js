@@ -149,10 +149,10 @@ function showMission({ mission, losses }) {
   $("progress").max = Math.max(mission.total, 1);
   $("progress").value = mission.done;
   text("elapsed", clock(mission.elapsed_s));
-  text("eta", clock(mission.eta_s));
+  text("eta", mission.outcome || mission.state === "returning" ? "–" : clock(mission.eta_s));
   text("point", mission.next_point || "–");
   text("arrival", mission.done ? `${mission.error_mm.toFixed(2)} mm` : "–");
-  text("skipped", String(mission.skipped));
+  text("skipped", String(Math.max(mission.skipped, mission.not_to_be_measured)));
   text("slips", mission.slips ? `${mission.slips}, worst ${mission.lag_ms.toFixed(0)} ms` : "0");
 }
 

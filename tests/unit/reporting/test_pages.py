@@ -16,7 +16,7 @@ from ccatp.reporting.html import clock, shown, text
 from ccatp.reporting.page import POLICY
 from ccatp.reporting.record import LogLine
 from ccatp.reporting.run_page import run_page
-from ccatp.reporting.sections import SECTIONS, sections_of
+from ccatp.reporting.sections import SECTIONS
 from ccatp.run_files.report_reader import read_record
 from tests.unit.reporting.recorded import record
 
@@ -126,6 +126,16 @@ def test_text_stays_text(recorded: Path) -> None:
     other = compare_page(pair_of(findings_of(spoilt), findings_of(whole)))
     Markup(other)
     assert evil not in other
+
+
+def test_a_run_given_up_before_its_first_point_says_why(recorded: Path) -> None:
+    whole = read_record(recorded)
+    names = [f"{row.point.row}-{row.point.col}-{row.point.point}" for row in whole.points or ()]
+    rows = tuple(row._replace(status="planned", t_s=None) for row in whole.points or ())
+    summary = {**(whole.summary or {}), "points": {"left_out": {"operator": names}}}
+    found = run_page(findings_of(replace(whole, points=rows, measured=(), summary=summary)))
+    assert "<p>9 not measured: operator.</p>" in found
+    assert "<p>No point measured: no surface, no adjuster moves.</p>" in found
 
 
 def test_outcomes(recorded: Path) -> None:
