@@ -28,7 +28,7 @@ _KIND_OF = {
 }
 _OVER = "done"
 _NEVER_BEGUN = "idle"
-_ROUNDING_S = 1e-6
+_ROUNDING_S = 1e-3  # of a status; a frame takes ten times as long
 
 
 class Spell(NamedTuple):

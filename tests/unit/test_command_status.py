@@ -62,6 +62,15 @@ def test_the_command(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert json.loads(capsys.readouterr().out)["status"] == STATUS
 
 
+@pytest.mark.parametrize("command", ["pause", "resume", "abort", "stop"])
+def test_commands_answer_with_the_same_table(folder: Path, command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with serving(folder, "control", lambda _: {"ok": True, "status": STATUS}):
+        assert main(["status", "--runtime-dir", str(folder)]) == 0
+        table = capsys.readouterr().out
+        assert main([command, "--runtime-dir", str(folder)]) == 0
+    assert capsys.readouterr().out == table
+
+
 def answers(*found: dict[str, Any]) -> Any:
     left = list(found)
     return lambda _: {"ok": True, "status": {**STATUS, **(left.pop(0) if len(left) > 1 else left[0])}}

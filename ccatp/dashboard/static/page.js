@@ -195,7 +195,7 @@ function showRobot(robot, pose) {
   text("fans", robot ? robot.fans.map((duty) => `${Math.round(100 * duty)} %`).join(", ") : "–");
   text("charge", robot ? `${Math.round(100 * robot.charge)} %` : "–");
   text("held", robot ? (robot.is_held ? "held by the robot" : "free") : "–");
-  text("ages", robot ? `${Math.round(1000 * robot.drive_age_s)}, ${Math.round(1000 * robot.permit_age_s)} ms` : "–");
+  text("ages", robot ? `${Math.round(1000 * robot.drive_age_s)}, ${Math.round(1000 * robot.permit_age_s)} ms old` : "–");
   $("faults").hidden = !robot?.faults.length;
   text("faults", robot?.faults.length ? `Robot reports: ${robot.faults.join(", ")}` : "");
   text("pose-xy", pose ? `${pose.x_m.toFixed(3)}, ${pose.y_m.toFixed(3)} m` : "–");
