@@ -237,10 +237,10 @@ async def test_a_page_begins_with_everything_and_goes_on_with_news(rig: Rig) -> 
         assert state["is_sim"] is True
         rig.main.send("log", Log(seq=1, t_s=2.0, level="info", process="main", text="a line"))
         name, state = await first.until(lambda _, state: bool(state["log"]))
-        assert (name, state["log"]) == ("news", [[2.0, "info", "a line"]])
+        assert (name, state["log"]) == ("news", [[2.0, "info", "a line", 1, 1]])
         async with rig.page() as second:
             name, state = await second.event()
-            assert (name, state["log"]) == ("all", [[2.0, "info", "a line"]])
+            assert (name, state["log"]) == ("all", [[2.0, "info", "a line", 1, 1]])
         rig.tell_alive()
         _, state = await first.until(lambda _, state: state["pose"] is not None)
         assert state["losses"] == []

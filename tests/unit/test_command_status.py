@@ -44,6 +44,10 @@ def test_the_table() -> None:
     assert found["late frames"] == "4, the latest by 31 ms"
     assert found["left out: out of time"] == "1-2-3, 1-2-4"
     assert found["over"] == "with exit status 4"
+    many = dict(status_rows({**STATUS, "left_out": {"operator": [f"1-2-{k}" for k in range(1, 94)]}}))
+    assert many["left out: operator"] == (
+        "93 points: 1-2-1, 1-2-2, 1-2-3, 1-2-4, 1-2-5, 1-2-6, 1-2-7, 1-2-8, 1-2-9, 1-2-10, ..."
+    )
     assert found["outcome"] == "stopped"
 
 

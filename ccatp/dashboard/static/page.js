@@ -36,6 +36,7 @@ let isConnecting = false;
 let codes = [];
 let words = {};
 let hidden = [];
+const rowOfKind = new Map();
 
 // -- the stream ---------------------------------------------------------------------------------------------------
 
@@ -222,16 +223,21 @@ function showLinks({ links, restarts }) {
 
 function showLog(lines, isAll) {
   const list = $("log");
-  if (isAll) list.replaceChildren();
-  for (const [t, level, line] of lines) {
+  if (isAll) {
+    list.replaceChildren();
+    rowOfKind.clear();
+  }
+  for (const [t, level, line, times, kind] of lines) {
+    rowOfKind.get(kind)?.remove();
     const row = document.createElement("li");
     const time = document.createElement("time");
     time.textContent = `${t.toFixed(1)} s`;
     const body = document.createElement("span");
-    body.textContent = line;
+    body.textContent = times > 1 ? `${line} (${times}×)` : line;
     row.dataset.level = level;
     row.append(time, body);
     list.prepend(row);
+    rowOfKind.set(kind, row);
   }
   while (list.children.length > MAX_LINES) list.lastChild.remove();
 }

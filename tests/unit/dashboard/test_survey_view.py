@@ -239,9 +239,9 @@ def test_a_danger_event_is_a_line_as_well(view: SurveyView) -> None:
     state = view.news(1.0)
     assert state["verdict"]["code"] == 2
     assert "permits" not in state["verdict"]
-    assert state["log"] == [(1.25, "warning", "danger: fire")]
+    assert state["log"] == [(1.25, "warning", "danger: fire", 1, 1)]
     view.hear(Log(seq=5, t_s=2.0, level="info", process="main", text="joined"), 2.0)
-    assert view.news(2.0)["log"] == [(2.0, "info", "joined")]
+    assert view.news(2.0)["log"] == [(2.0, "info", "joined", 1, 2)]
 
 
 def test_other_things_on_the_map(view: SurveyView) -> None:
