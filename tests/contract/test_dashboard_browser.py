@@ -46,9 +46,16 @@ async def is_laid_out(page: Page) -> None:
     assert max(heights) < 1.5 * min(heights)  # one line each
     await expect(page.locator("#plot-arrival")).to_have_attribute("data-empty", "")
     await expect(page.locator("#plot-arrival .uplot")).to_be_hidden()
-    await expect(page.locator("figcaption", has_text="Localization error")).to_contain_text("mm, 3\u03c3 dashed")
-    upper = await page.locator(".map").bounding_box()
-    lower = await page.locator(".plots").bounding_box()
-    assert upper is not None
-    assert lower is not None
-    assert 0.0 < lower["y"] - upper["y"] - upper["height"] < 30.0
+    await expect(page.locator("figcaption", has_text="Position error")).to_contain_text("mm, 3\u03c3 dashed")
+    # At one instant: a banner that comes would move them.
+    places = await page.evaluate("""() => [".map", ".plots", ".side", ".log"].map(part => {
+        const box = document.querySelector(part).getBoundingClientRect();
+        return [box.top, box.bottom];
+    })""")
+    (_, map_end), (plots_top, plots_end), (_, side_end), (log_top, _) = places
+    assert map_end <= 900.0  # all of the map without scrolling
+    assert 0.0 < plots_top - map_end < 30.0
+    assert abs(plots_end - side_end) < 60.0  # no room empty on either side
+    assert log_top > plots_end
+    overflows = "nodes => nodes.filter(node => node.scrollWidth > node.clientWidth).length"
+    assert await page.locator("figcaption:visible").evaluate_all(overflows) == 0
