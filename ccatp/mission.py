@@ -233,7 +233,9 @@ class Mission:
 
     @property
     def eta_s(self) -> float:
-        """Least time that the rest of the survey takes, s."""
+        """Least time that the rest of the survey takes, s; nothing is left of one that was given up or is over."""
+        if self.abort_cause or self.state is State.DONE:
+            return 0.0
         return self._standing.route.remaining_s(self.survey.index)
 
     @property

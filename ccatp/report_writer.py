@@ -9,9 +9,10 @@ from ccatp.errors import CcatpError, ExitStatus
 from ccatp.pictures.figures import PictureError
 from ccatp.pictures.picture_file import write_figures, write_svg
 from ccatp.reporting.beacon_page import beacon_data, beacon_figures, beacon_page
-from ccatp.reporting.compare_page import Pair, compare_figures, compare_page, pair_of
+from ccatp.reporting.compare_page import compare_figures, compare_page
 from ccatp.reporting.data import run_data
 from ccatp.reporting.findings import findings_of
+from ccatp.reporting.pair import Pair, pair_of
 from ccatp.reporting.run_page import run_figures, run_page
 from ccatp.run_files.beacon_report_reader import read_beacon_record
 from ccatp.run_files.report_reader import is_beacon_run, read_record

@@ -111,6 +111,15 @@ def is_deserted(runtime_dir: Path) -> bool:
         return False  # whose it is cannot be told
 
 
+def is_held(path: Path) -> bool:
+    """Whether somebody holds the lock of a file; where it cannot be read, nobody."""
+    try:
+        with path.open() as file:
+            return not _takes(file.fileno(), LOCK_SH)
+    except OSError:
+        return False
+
+
 def remove_sockets(runtime_dir: Path, names: Iterable[str]) -> None:
     """Remove sockets that nobody serves any more; what is no socket stays."""
     for name in names:

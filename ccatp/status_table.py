@@ -1,10 +1,11 @@
 """Pure. Where a mission stands, for the terminal: a table, and one line."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 CODES = {0: "normal", 1: "near the mirror's edge", 2: "operation aborted"}
 BAR = 30
+_SHOWN = 10
 
 
 def clock(seconds: float) -> str:
@@ -45,10 +46,16 @@ def status_rows(status: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows.append(("danger", f"{code} {CODES.get(code, '')}".strip()))
     if slips := int(status.get("slips", 0)):
         rows.append(("late frames", f"{slips}, the latest by {float(status.get('lag_ms', 0.0)):.0f} ms"))
-    rows += [(f"left out: {why}", ", ".join(points)) for why, points in dict(status.get("left_out", {})).items()]
+    rows += [(f"left out: {why}", _named(points)) for why, points in dict(status.get("left_out", {})).items()]
     if (exit_status := int(status.get("exit_status", -1))) >= 0:
         rows.append(("over", f"with exit status {exit_status}"))
     return rows
+
+
+def _named(points: Sequence[str]) -> str:
+    """The first names, and of many how many there are."""
+    names = ", ".join(points[:_SHOWN])
+    return names if len(points) <= _SHOWN else f"{len(points)} points: {names}, ..."
 
 
 def status_line(status: Mapping[str, Any]) -> str:

@@ -319,6 +319,8 @@ def format_table(summary: Mapping[str, Any]) -> str:
 
 
 def _text(value: Any) -> str:
+    if isinstance(value, Mapping):  # points by the reason why they were left out
+        return ", ".join(f"{len(names)} ({why})" for why, names in value.items())
     return "-" if value is None else "yes" if value is True else "no" if value is False else f"{value}"
 
 

@@ -19,6 +19,7 @@ from ccatp.processes.common import FAULTS_FILE, RUN_DIR_FILE, Endpoints
 from ccatp.processes.observing import check_observatory
 from ccatp.processes.page_socket import open_page_socket
 from ccatp.robot_link import read_key
+from ccatp.run_files.writing import RUN_LOCK
 from ccatp.run_options import RunOptions, default_run_dir
 from ccatp.runtime_dir import make_runtime_dir
 from ccatp.supervision.children import ProcessSpec
@@ -92,7 +93,7 @@ def run_beacons(options: RunOptions) -> int:
             sockets["dashboard"] = stack.enter_context(page.socket)
             cfg = cfg.model_copy(update={"dashboard": page.config})
         run_dir = new_run_dir(options, cfg.system, cfg.run.seed)
-        stack.enter_context(owned(run_dir / ".lock", "--run-dir"))
+        stack.enter_context(owned(run_dir / RUN_LOCK, "--run-dir"))
         (run_dir / "config.toml").write_text(dump_radio_config(cfg), encoding="utf-8")
         (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
         kind = BeaconRun(cfg, BEACON_PROCESSES, is_sim=options.sim)
@@ -132,7 +133,7 @@ def run_survey(options: RunOptions) -> int:
             sockets["dashboard"] = stack.enter_context(page.socket)
             cfg = cfg.model_copy(update={"dashboard": page.config})
         run_dir = survey_run_dir(options, cfg)
-        stack.enter_context(owned(run_dir / ".lock", "--run-dir"))
+        stack.enter_context(owned(run_dir / RUN_LOCK, "--run-dir"))
         if options.resume and (done := finished_summary(run_dir)) is not None:
             return _tell_finished(done, run_dir, as_json=options.json_output)
         (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")

@@ -13,6 +13,8 @@ from ccatp.planning.tour_bound import tour_bound
 from ccatp.planning.traversal import ORDERS
 from ccatp.samples import PanelId, PointId, Stop, StopKind
 
+_SHOWN = 10
+
 
 @dataclass(frozen=True, slots=True)
 class SurveyPlan:
@@ -129,8 +131,9 @@ def plan_lines(cfg: Config, plan: SurveyPlan) -> Iterator[str]:
     yield f"any order       {_clock(plan.any_order_s)} at least, through the points that can be reached"
     word = "within" if plan.least_s <= cfg.run.budget_s else "BEYOND"
     yield f"budget          {_clock(cfg.run.budget_s)}: the least time is {word} it"
-    lost = " ".join("/".join(map(str, point)) for point in plan.out_of_reach)
-    yield f"out of reach    {f'{len(plan.out_of_reach)} points: {lost}' if lost else 'none'}"
+    lost = " ".join("/".join(map(str, point)) for point in plan.out_of_reach[:_SHOWN])
+    more = " ..." if len(plan.out_of_reach) > _SHOWN else ""
+    yield f"out of reach    {f'{len(plan.out_of_reach)} points: {lost}{more}' if lost else 'none'}"
 
 
 def _names(panels: list[PanelId]) -> str:

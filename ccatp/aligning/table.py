@@ -70,8 +70,8 @@ def _undetermined(others: Sequence[Undetermined]) -> Iterator[str]:
         yield f"panel {one.panel.row}/{one.panel.col} not determined: {one.why}"
     if len(begun) > _SHOWN:
         yield f"and {len(begun) - _SHOWN} more panels not determined"
-    if len(begun) < len(others):
-        yield f"{len(others) - len(begun)} panels not measured"
+    if count := len(others) - len(begun):
+        yield f"{count} panel{'' if count == 1 else 's'} not measured"
     if others:
         yield ""
 

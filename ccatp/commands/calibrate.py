@@ -14,6 +14,7 @@ from ccatp.errors import CcatpError
 
 if TYPE_CHECKING:
     from ccatp.calibrating.report import Row
+    from ccatp.config.models import Config
 
 
 class DriveFailed(CcatpError):
@@ -68,7 +69,7 @@ def calibrate(
     full = cfg.localizer.full_state
     priors = Priors(cfg.robot.wheel_radius_m, cfg.robot.wheel_base_m, full.gyroscope_scale_sigma, full.creep_sigma)
     found = estimate(on_mirror, drive, priors)
-    table = rows(cfg, found)
+    table = rows(_replaced(config_file, cfg), found)
     if not json_output:
         for line in lines(table, found):
             click.echo(line)
@@ -84,6 +85,22 @@ def calibrate(
         elif written is None:
             complain(f"nothing written into {config_file} (--dry-run)", 0)
     return 0
+
+
+def _replaced(config_file: Path | None, driven: "Config") -> "Config":
+    """The configuration whose values are replaced: that of the file, else that of the drive."""
+    if config_file is None:
+        return driven
+    from ccatp.config.loader import load_config
+
+    cfg = load_config(config_file)
+    if cfg.mirror.name != driven.mirror.name:
+        complain(
+            f"warning: the drive was on {driven.mirror.name}, {config_file} is for {cfg.mirror.name}: "
+            "the same robot must drive on both",
+            0,
+        )
+    return cfg
 
 
 def _drive_settings(rounds: int, length_m: float) -> dict[str, object]:

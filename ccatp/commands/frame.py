@@ -278,14 +278,25 @@ def tell(reply: Mapping[str, Any], json_output: bool) -> None:
     if json_output:
         click.echo(json.dumps(reply))
         return
-    answer = {key: value for key, value in reply.items() if key != "ok"}
-    # The operator channel answers with the status alone: its own lines need no prefix, and no empty ones.
-    status = answer.get("status")
-    lines = [(k, v) for k, v in _flat(status if isinstance(status, Mapping) else answer) if v]
-    width = max((len(key) for key, _ in lines), default=0)
-    for key, value in lines:
-        click.echo(f"{key:<{width}}  {value}")
-    if not lines:
+    _tell_rows([(k, v) for k, v in _flat({key: value for key, value in reply.items() if key != "ok"}) if v])
+
+
+def tell_status(reply: Mapping[str, Any], json_output: bool) -> None:
+    """An answer of the operator channel on standard output: where the mission stands."""
+    status = reply.get("status")
+    if json_output or not isinstance(status, Mapping):
+        tell(reply, json_output)
+        return
+    from ccatp.status_table import status_rows
+
+    _tell_rows(status_rows(status))
+
+
+def _tell_rows(rows: Sequence[tuple[str, str]]) -> None:
+    width = max((len(name) for name, _ in rows), default=0)
+    for name, value in rows:
+        click.echo(f"{name:<{width}}  {value}")
+    if not rows:
         click.echo("ok")
 
 

@@ -23,7 +23,8 @@ def log() -> None:
 def info(path: Path, json_output: bool) -> int:
     """Tell what a recording holds, and whether every checksum in it is right.
 
-    The status is 1 where a recording was cut off or is damaged; ccatp log recover saves what is intact.
+    The status is 1 where a recording was cut off or is damaged; ccatp log recover saves what is intact. One that a run
+    still writes has no index yet, which is no damage.
     """
     from ccatp.run_files.recording_tools import read_facts, recording_files
 
@@ -33,7 +34,7 @@ def info(path: Path, json_output: bool) -> int:
     else:
         for facts in found:
             _tell(facts)
-    return int(any(facts.faults for facts in found))
+    return int(not all(facts.is_in_order for facts in found))
 
 
 @log.command(epilog=example("ccatp log recover runs/tonight", "ccatp log recover telemetry.mcap --out saved.mcap"))
@@ -64,9 +65,8 @@ def recover(path: Path, out: Path | None, json_output: bool) -> int:
 
 def _tell(facts: "RecordingFacts") -> None:
     condition, span = facts.condition, facts.span_s
-    state = "complete, every checksum right" if not facts.faults else "cut off or damaged"
-    click.echo(f"{facts.path}: {state}")
-    for begin, end in condition.lost:
+    click.echo(f"{facts.path}: {facts.state}")
+    for begin, end in () if facts.is_in_order else condition.lost:
         click.echo(f"  bytes {begin} to {end} are lost")
     known = {k: v for record in facts.metadata.values() for k, v in record.items() if k != "config"}
     if known:
@@ -77,7 +77,7 @@ def _tell(facts: "RecordingFacts") -> None:
         click.echo(f"  {span[0]:.2f} to {span[1]:.2f} s, {condition.size_bytes / 1e6:.2f} MB{per_hour}")
     click.echo(f"  {facts.messages} messages in {condition.chunks} chunks")
     rows = [("topic", "schema", "messages", "per s", "kB")]
-    for name, topic in sorted(facts.topics.items()):
+    for name, topic in sorted((name, topic) for name, topic in facts.topics.items() if topic.messages):
         length_s = topic.last_s - topic.first_s
         per_s = f"{(topic.messages - 1) / length_s:.2f}" if topic.messages > 1 and length_s > 0.0 else "-"
         rows.append((name, topic.schema, str(topic.messages), per_s, f"{topic.payload_bytes / 1e3:.1f}"))
@@ -86,7 +86,10 @@ def _tell(facts: "RecordingFacts") -> None:
         left = "  ".join(text.ljust(width) for text, width in zip(row[:2], widths[:2], strict=True))
         right = "  ".join(text.rjust(width) for text, width in zip(row[2:], widths[2:], strict=True))
         click.echo(f"  {left}  {right}")
+    if empty := sum(not topic.messages for topic in facts.topics.values()):
+        click.echo(f"  {empty} topic{'s' if empty > 1 else ''} without messages")
+    if facts.is_in_order:
+        return
     for fault in facts.faults:
         click.echo(f"  {fault}")
-    if facts.faults:
-        click.echo(f"  save what is intact with: ccatp log recover {facts.path}")
+    click.echo(f"  save what is intact with: ccatp log recover {facts.path}")

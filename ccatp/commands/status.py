@@ -3,7 +3,7 @@
 import json
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from ccatp.commands.frame import (
     ask_daemon,
     configured_folder,
     example,
-    tell,
+    tell_status,
 )
 from ccatp.errors import UnreachableError
 
@@ -43,7 +43,7 @@ def status(
     """Show what the running daemon is doing."""
     folder = configured_folder(config_file, runtime_dir)
     if not watch:
-        _show(ask_daemon(folder, "control", {"cmd": "status"}, timeout_s), json_output)
+        tell_status(ask_daemon(folder, "control", {"cmd": "status"}, timeout_s), json_output)
         return 0
     answers = _answers(folder, timeout_s, period_s)
     if json_output:
@@ -55,19 +55,6 @@ def status(
     else:
         _watch_lines(answers)
     return 0
-
-
-def _show(answer: Mapping[str, Any], json_output: bool) -> None:
-    known = answer.get("status")
-    if json_output or not isinstance(known, Mapping):
-        tell(answer, json_output)
-        return
-    from ccatp.status_table import status_rows
-
-    rows = status_rows(known)
-    width = max(len(name) for name, _ in rows)
-    for name, value in rows:
-        click.echo(f"{name:<{width}}  {value}")
 
 
 def _answers(folder: Path | None, timeout_s: float, period_s: float) -> Iterator[dict[str, Any]]:

@@ -74,6 +74,9 @@ def _check_names(cfg: Config) -> Iterator[Fault]:
         yield Fault(
             ("run", "order"), f'= "{cfg.run.order}" is no traversal order; {choice_hint(cfg.run.order, ORDERS)}'
         )
+    if cfg.run.panels > (there := cfg.mirror.panels.count):
+        what = f"= {cfg.run.panels}, but {cfg.mirror.name} has {there} panels; 0 takes all of them"
+        yield Fault(("run", "panels"), what)
     gains, sets = cfg.control.gains, cfg.control.gain_sets
     if gains not in sets:
         yield Fault(("control", "gains"), f'= "{gains}" is no set of gains; {choice_hint(gains, sets)}')

@@ -127,7 +127,7 @@ class Answers:
 
     async def status(self, _request: Request) -> Response:
         """The state as a whole."""
-        return _json({"status": "ok", **self._hub.state()})
+        return _json({"status": "ok", **await self._hub.whole_state()})
 
     async def healthz(self, _request: Request) -> Response:
         """Whether all is well."""

@@ -15,6 +15,8 @@ from ccatp.dashboard.view import View
 IDLE_PERIOD_S = 0.5
 # Whoever asked for the levels will ask again within this, or is gone.
 GLANCE_S = 35.0
+# Main tells a picture ten times a second, once it has been asked for one.
+PICTURE_WAIT_S, PICTURE_LOOK_S = 0.3, 0.02
 _encoder = msgspec.json.Encoder()
 
 
@@ -98,6 +100,16 @@ class Hub:
         self._look()
         self._feed.drain(now_s)
         return self._view.status_data(now_s)
+
+    async def whole_state(self) -> dict[str, Any]:
+        """The same with the pose, for which main is waited for a little when nobody has looked before."""
+        state, patience_s = self.state(), time.monotonic() + PICTURE_WAIT_S
+        while state["pose"] is None and state["mission"] and not (state["is_over"] or state["losses"]):
+            if time.monotonic() > patience_s:
+                break
+            await asyncio.sleep(PICTURE_LOOK_S)
+            state = self.state()
+        return state
 
     async def run(self, stop: asyncio.Event) -> None:
         """Tell the pages until ``stop`` is set; then tell them that this is the end."""

@@ -1,8 +1,9 @@
 """Pure. What grows while a run goes on: samples of plots, the driven path, messages; bounded, and what of it is new."""
 
-from collections import deque
 from math import hypot
 from typing import Any
+
+from ccatp.repetition import kind_of
 
 Row = tuple[Any, ...]
 
@@ -66,29 +67,39 @@ class Trail:
 
 
 class Lines:
-    """The last lines told to the operator.
+    """The last lines told to the operator: of each kind the newest, and how often it was said.
+
+    A row is the robot's time (s), the level, the text, how often lines of its kind were said, and the kind's number.
 
     Args:
-        limit: so many are kept.
+        limit: so many kinds are kept.
     """
 
     def __init__(self, limit: int) -> None:
         """None yet."""
-        self._rows: deque[Row] = deque(maxlen=limit)
-        self._new: deque[Row] = deque(maxlen=limit)
+        self._limit = limit
+        self._rows: dict[tuple[str, str], Row] = {}
+        self._new: dict[tuple[str, str], Row] = {}
+        self._kinds = 0
 
-    def add(self, *row: Any) -> None:
+    def add(self, t_s: float, level: str, text: str) -> None:
         """One more line."""
-        self._rows.append(row)
-        self._new.append(row)
+        key = level, kind_of(text)
+        before = self._rows.pop(key, None)
+        self._new.pop(key, None)
+        self._kinds += before is None
+        times, kind = (1, self._kinds) if before is None else (before[3] + 1, before[4])
+        self._rows[key] = self._new[key] = (t_s, level, text, times, kind)
+        for rows in (self._rows, self._new):
+            if len(rows) > self._limit:
+                del rows[next(iter(rows))]
 
     @property
     def rows(self) -> list[Row]:
-        """All that are kept."""
-        return list(self._rows)
+        """All that are kept, the newest last."""
+        return list(self._rows.values())
 
     def take_new(self) -> list[Row]:
         """Those since the last time."""
-        new = list(self._new)
-        self._new.clear()
+        new, self._new = list(self._new.values()), {}
         return new

@@ -5,6 +5,7 @@ from typing import Any
 
 import msgspec
 
+from ccatp.danger_text import danger_text
 from ccatp.dashboard.links import STATUS_STALE_S, Links
 from ccatp.dashboard.series import Growing, Lines, Trail
 from ccatp.samples import Verdict
@@ -86,8 +87,8 @@ class View:
     def _take_verdict(self, verdict: Verdict | DangerEvent, now_s: float) -> None:
         self._verdict, self._verdict_s = verdict, now_s
         if isinstance(verdict, DangerEvent) and verdict.cause:
-            text = f"danger: {verdict.cause} {verdict.signal} {verdict.value:.4g} (limit {verdict.limit:.4g})"
-            self._lines.add(round(verdict.t_s, 2), "warning", text)
+            text = danger_text(verdict.cause, verdict.signal, verdict.value, verdict.limit)
+            self._lines.add(round(verdict.t_s, 2), "warning", f"danger: {text}")
 
     def _take_scene(self, scene: Scene, _now_s: float) -> None:
         self._scene, self._is_scene_new = scene, True
@@ -159,6 +160,7 @@ class View:
         shown: dict[str, Any] = msgspec.to_builtins(self.status)
         shown["is_stale"] = now_s - self._status_s > STATUS_STALE_S and not self.links.is_over
         shown["next_point"] = self._next_point()
+        shown["not_to_be_measured"] = sum(map(len, self.status.left_out.values()))
         return shown
 
     def _pose(self) -> dict[str, Any] | None:
@@ -180,6 +182,7 @@ class View:
             return None
         shown: dict[str, Any] = {name: getattr(v, name) for name in ("cause", "signal", "value", "limit", "off")}
         shown["code"], shown["severity"] = int(v.code), int(v.severity)
+        shown["text"] = danger_text(v.cause, v.signal, v.value, v.limit)
         if isinstance(v, Verdict):
             shown["permits"] = {"forward": v.forward, "reverse": v.reverse, "turn": v.turn}
             shown["is_stale"] = now_s - self._verdict_s > STATUS_STALE_S and not self.links.is_over

@@ -29,8 +29,9 @@ from ccatp.dashboard.view import View
 from ccatp.mirror.mirror import build_mirror
 from ccatp.processes import spinning
 from ccatp.processes.common import Endpoints, die_with_parent, open_log, parse_either, stop_on_signals
-from ccatp.processes.observing import LOGGED_LINES, LOGGED_PERIOD_S, LineBudget
+from ccatp.processes.observing import LOGGED_LINES, LOGGED_PERIOD_S
 from ccatp.processes.pulse import Pulse
+from ccatp.repetition import LineBudget
 from ccatp.storage.store_reader import read_survey
 from ccatp.storage.store_rows import StoreError
 

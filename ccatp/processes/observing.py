@@ -13,6 +13,7 @@ import zmq.asyncio
 from ccatp.config.models import ObservatoryConfig
 from ccatp.curve_keys import ClientsFile, KeyPair, read_clients, read_pair
 from ccatp.curve_router import CurveRouter, ZapHandler
+from ccatp.repetition import LineBudget
 from ccatp.router import Router
 from ccatp.wire.access import Client, Role
 from ccatp.wire.channels import EmergencyDesk, answer_observatory, format_error, parse_reply
@@ -30,30 +31,6 @@ class Monitor(EmergencyDesk, Protocol):
     @property
     def at_base_or_held(self) -> bool:
         """Whether the robot is at base or held, by a fresh estimate."""
-
-
-class LineBudget:
-    """So many lines in a period, and a count of those that were left out.
-
-    Args:
-        lines: at most so many ...
-        period_s: ... in this time.
-    """
-
-    def __init__(self, lines: int, period_s: float) -> None:
-        self._lines, self._period_s = lines, period_s
-        self._begun_s, self._used, self._left_out = float("-inf"), 0, 0
-
-    def take(self, now_s: float) -> int | None:
-        """Ask for a line: how many were left out since the last one, or ``None`` when this one is left out, too."""
-        if now_s - self._begun_s >= self._period_s:
-            self._begun_s, self._used = now_s, 0
-        if self._used >= self._lines:
-            self._left_out += 1
-            return None
-        self._used += 1
-        left_out, self._left_out = self._left_out, 0
-        return left_out
 
 
 class ObservatoryDesk:

@@ -18,11 +18,12 @@ from ccatp.reporting.beacon_record import (
     readings_of,
     waypoint_rows,
 )
+from ccatp.reporting.event_section import events_body
 from ccatp.reporting.head import chips, foot, head
 from ccatp.reporting.html import WIDE, clock, facts, figure, shown, table, text
 from ccatp.reporting.page import Section, page
 from ccatp.reporting.record import COMPLETE, FloatArray, Outcome
-from ccatp.reporting.sections import changes_body, events_body
+from ccatp.reporting.sections import changes_body
 
 _MILLI = 1e3
 _SIGMAS = 3.0

@@ -3,22 +3,24 @@
 from collections.abc import Iterator
 from typing import Any
 
-from ccatp.reporting.compare_page import Pair, compared_figures
-from ccatp.reporting.data import run_data
+from ccatp.reporting.data import run_data, wavefront_data
+from ccatp.reporting.pair import Pair, compared_figures
 from ccatp.reporting.panel_changes import PanelChange
 
 _MICRO = 1e6
-_WIDTH = 14
+_WIDTH = 12
 
 
 def compare_lines(pair: Pair) -> Iterator[str]:
     """A line for each figure that differs, then the panels that have moved."""
-    yield f"{'':<36}{'A':>{_WIDTH}}{'B':>{_WIDTH}}{'B less A':>{_WIDTH}}"
-    for name, (a, b) in compared_figures(pair).items():
-        change = None if a is None or b is None else b - a
-        if change != 0.0:
-            cells = "".join(f"{_cell(value):>{_WIDTH}}" for value in (a, b, change))
-            yield f"{name.replace('_', ' '):<36}{cells}"
+    if pair.warning:
+        yield f"warning: {pair.warning}"
+    rows = [(_ascii(one.name), one) for one in compared_figures(pair) if one.change != 0.0]
+    width = max((len(name) for name, _ in rows), default=0) + 2
+    yield f"{'':<{width}}{'A':>{_WIDTH}}{'B':>{_WIDTH}}{'B less A':>{_WIDTH}}"
+    for name, one in rows:
+        cells = "".join(f"{_cell(value, one.decimals):>{_WIDTH}}" for value in (one.a, one.b, one.change))
+        yield f"{name:<{width}}{cells}"
     changes = pair.changes
     if changes is None:
         return
@@ -32,17 +34,22 @@ def compare_lines(pair: Pair) -> Iterator[str]:
             yield f"{where}: piston {piston:+.1f} um, tip {tip:+.1f} urad, tilt {tilt:+.1f} urad"
 
 
-def _cell(value: float | None) -> str:
-    return "-" if value is None else f"{value:.6g}"
+def _ascii(name: str) -> str:
+    return name.replace("\u00b5", "u").replace("\u03c3", "sigma")
+
+
+def _cell(value: float | None, decimals: int) -> str:
+    return "-" if value is None else f"{value:.{decimals}f}"
 
 
 def compare_data(pair: Pair) -> dict[str, Any]:
     """What ``ccatp compare --json`` tells."""
-    changes = pair.changes
+    changes, (a, b) = pair.changes, pair.wavefronts
     return {
         "a": run_data(pair.a),
         "b": run_data(pair.b),
         "one_mirror": pair.is_one_mirror,
+        "half_wavefront_common_um": {"a": wavefront_data(a), "b": wavefront_data(b)},
         "panels": None if changes is None else [_panel(panel) for panel in changes.panels],
         "chi2": None if changes is None else round(changes.chi2, 4),
         "dof": None if changes is None else changes.dof,

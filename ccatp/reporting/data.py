@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from ccatp.aligning.wavefront import MirrorWavefront
 from ccatp.reporting.findings import Findings
 from ccatp.reporting.points import Grade
 from ccatp.reporting.time_budget import TimeBudget
@@ -27,7 +28,7 @@ def run_data(found: Findings) -> dict[str, Any]:
         "arrival_error_mm": _spread([v.first_mm for v in found.points if v.first_mm is not None]),
         "localization_error_mm": None if found.figures is None else _rounded(found.figures._asdict()),
         "time_budget_s": None if found.budget is None else budget_data(found.budget),
-        "half_wavefront_um": _wavefront(found),
+        "half_wavefront_um": None if found.alignment is None else wavefront_data(found.alignment.wavefront),
         "missing": list(record.missing),
         "warnings": list(record.warnings),
     }
@@ -52,7 +53,8 @@ def _rounded(values: dict[str, float]) -> dict[str, float]:
     return {name: round(value, 6) for name, value in values.items()}
 
 
-def _wavefront(found: Findings) -> dict[str, float] | None:
-    if found.alignment is None or found.alignment.wavefront is None:
+def wavefront_data(wavefront: MirrorWavefront | None) -> dict[str, float] | None:
+    """Half-wavefront errors, um; None where there are none."""
+    if wavefront is None:
         return None
-    return {name.removesuffix("_m"): round(v * _MICRO, 4) for name, v in found.alignment.wavefront._asdict().items()}
+    return {name.removesuffix("_m"): round(v * _MICRO, 4) for name, v in wavefront._asdict().items()}

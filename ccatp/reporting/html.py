@@ -61,6 +61,12 @@ def figure(draw: Callable[[float], Picture], caption: str) -> str:
     )
 
 
+def beside(pictures: Iterable[tuple[str, Picture]]) -> str:
+    """Pictures beside each other, below each other where the page is too narrow, each with its name."""
+    figures = (f"<figure>{svg_of(picture)}<figcaption>{text(name)}</figcaption></figure>" for name, picture in pictures)
+    return f'<div class="beside">{"".join(figures)}</div>'
+
+
 def folded(title: str, inside: str) -> str:
     """What only some readers want, under one line."""
     return f"<details><summary>{text(title)}</summary>{inside}</details>"

@@ -109,15 +109,17 @@ class MapFrame:
         self.shapes.append(Line(self.pixels(np.concatenate([here, ahead])), INK, 2.4))
         self.shapes.append(Dots(self.pixels(here), 4.5 if self.is_wide else 3.0, INK, titles=("base",)))
 
-    def finish(self, scale: ColourScale, label: str, keys: list[tuple[str, Shape]], title: str) -> Picture:
+    def finish(self, scale: ColourScale | None, label: str, keys: list[tuple[str, Shape]], title: str) -> Picture:
         """Colour bar and legend; then it is a picture.
 
         Args:
-            scale: of the colours, and ``label`` what they mean.
+            scale: of the colours, and ``label`` what they mean; None where they mean nothing.
             keys: names, each with a shape drawn around the origin.
             title: what the picture shows.
         """
         y = self.bottom + 2.2 * self.size + 12.0
+        if scale is None:
+            return Picture(self.width, self._legend(keys, y) + 8.0, tuple(self.shapes), title)
         if self.is_wide:
             length = min(420.0, 0.7 * self.bottom)
             top = (self.bottom - length) / 2.0

@@ -29,17 +29,22 @@ dt{color:var(--quiet);font-size:12.5px}dd{margin:0;font-size:17px;font-variant-n
 dd small{font-size:13px;color:var(--quiet)}
 figure{margin:12px 0}figure svg{display:block;width:100%;height:auto;max-width:880px}.narrow{display:none}
 .narrow svg{max-width:480px}
-.scroll{overflow-x:auto;margin:8px 0}
+.beside{display:flex;flex-wrap:wrap;gap:0 24px}.beside figure{flex:1 1 300px;max-width:440px}
+.beside figcaption{text-align:center;font-weight:600}
+.scroll{overflow-x:auto;margin:8px 0;background:linear-gradient(to left,#fff 40%,#fff0) right/44px 100% no-repeat local,
+linear-gradient(to left,rgb(31 41 51/.35),#fff0) right/16px 100% no-repeat scroll}
 table{border-collapse:collapse;font-size:13.5px;font-variant-numeric:tabular-nums}
 th,td{padding:3px 9px;text-align:right;white-space:nowrap;border-bottom:1px solid var(--line)}
 thead th{position:sticky;top:0;background:#fff;border-bottom:2px solid var(--line);color:var(--quiet);font-weight:600}
 tbody th{text-align:left;font-weight:600;position:sticky;left:0;background:#fff}
+thead th:first-child{left:0;z-index:1;text-align:left}
+table.figures tbody th{white-space:normal;min-width:8em}
 table.texts td,table.texts thead th{text-align:left;white-space:normal;vertical-align:top}
 table.texts td:last-child{min-width:240px}
 table.dense{font-size:12.5px}table.dense th,table.dense td{padding:3px 6px}
 td.pass{color:var(--good)}td.fail,td.skipped{color:#fff;background:var(--bad)}td.corrected{background:#fbe3c4}
 td.open{color:var(--quiet)}td.far{background:#fbe3c4}
-table.log tbody th{font-weight:400}
+table.log tbody th{font-weight:400;vertical-align:top}
 details{margin:10px 0}summary{cursor:pointer;color:#123f6d}
 pre{background:var(--soft);padding:12px;overflow-x:auto;font-size:12.5px;line-height:1.4}
 footer{margin-top:40px;padding-top:10px;border-top:1px solid var(--line);color:var(--quiet);font-size:13px}
@@ -48,7 +53,8 @@ footer{margin-top:40px;padding-top:10px;border-top:1px solid var(--line);color:v
 .log :is(th,td):nth-child(2){display:none}th,td{padding:3px 6px}}
 @media print{@page{margin:14mm}body{max-width:none;padding:0;font-size:10.5pt}nav,details:not([open]){display:none}
 h2{break-after:avoid}figure,dl,tr{break-inside:avoid}thead{display:table-header-group}
-thead th,tbody th{position:static}.scroll{overflow:visible}.wide{display:block!important}.narrow{display:none!important}
+thead th,tbody th{position:static}.scroll{overflow:visible;background:none}
+.wide{display:block!important}.narrow{display:none!important}
 figure svg{max-height:235mm}table{font-size:8pt}th,td{padding:1.5px 5px}
 *{-webkit-print-color-adjust:exact;print-color-adjust:exact}}
 """

@@ -125,6 +125,8 @@ def _from_fixes(record: RunRecord, session: Session) -> dict[PointId, float]:
 def _reasons(record: RunRecord) -> dict[PointId, str]:
     status = record.last_status
     by_reason: Mapping[str, list[str]] = {} if status is None else status.left_out
+    if not by_reason and record.summary is not None:
+        by_reason = (record.summary.get("points") or {}).get("left_out") or {}
     return {found: why for why, names in by_reason.items() for name in names if (found := _parsed(name)) is not None}
 
 

@@ -1,23 +1,24 @@
 """Pure. The sections of a report. Each appears where the run holds what it shows; a new kind of run adds its own."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
 from ccatp.reporting.error_figure import error_figure
+from ccatp.reporting.event_section import events_section
 from ccatp.reporting.findings import Findings
 from ccatp.reporting.html import clock, facts, figure, folded, shown, table, text
 from ccatp.reporting.page import Section
 from ccatp.reporting.panel_section import panel_section
 from ccatp.reporting.path_figure import path_figure, point_text
 from ccatp.reporting.points import Grade, PointVerdict, by_panel, counted
-from ccatp.reporting.record import WITHIN_MM, LogLine
+from ccatp.reporting.record import WITHIN_MM
 from ccatp.reporting.surface_figure import surface_figure
-from ccatp.reporting.time_budget import KINDS
+from ccatp.reporting.time_budget import KINDS, START_ANEW
 from ccatp.reporting.time_figure import time_figure
 
 _CLASSES = {Grade.GOOD: "pass", Grade.CORRECTED: "corrected", Grade.FAIL: "fail", Grade.SKIPPED: "skipped"}
-_SHOWN_EVENTS = 40
 _SURFACE = "Each panel as fitted; dots show what was measured in the same colours, and vanish where the fit agrees."
 _MICRO = 1e6
 
@@ -70,6 +71,11 @@ def _cells_with_classes(markup: str) -> str:
 
 
 def _failed(points: list[PointVerdict]) -> str:
+    never = Counter(v.why or "nobody said why" for v in points if v.grade is Grade.OPEN)
+    return "".join(f"<p>{count} not measured: {text(why)}.</p>" for why, count in never.items()) + _one_by_one(points)
+
+
+def _one_by_one(points: list[PointVerdict]) -> str:
     bad = [v for v in points if v.grade in (Grade.FAIL, Grade.SKIPPED, Grade.CORRECTED)]
     if not bad:
         return ""
@@ -82,7 +88,9 @@ def surface_section(found: Findings) -> Section | None:
     """The deviation of the surface, and the half-wavefront error before and after the moves."""
     alignment = found.alignment
     if alignment is None or not alignment.panels:
-        return None
+        why = "No panel has enough points" if found.record.measured else "No point measured"
+        nothing = f"<p>{why}: no surface, no adjuster moves.</p>"
+        return Section("surface", "Surface", nothing) if found.points else None
     mirror = found.record.mirror
     title = f"{mirror.name}: deviation of the surface"
     picture = figure(partial(surface_figure, mirror, alignment.panels, title), _SURFACE)
@@ -132,6 +140,11 @@ def time_section(found: Findings) -> Section | None:
     notes = (
         [] if bound_s is None else [f"Least: bang-bang from rest to rest and turning in place, for {budget.covers}."]
     )
+    if START_ANEW in budget.spent_s:
+        notes.append(
+            f"While the main loop was started anew nobody counted: the mission time of the summary is without that, "
+            f"{shown(budget.mission_s, 1)} s."
+        )
     if not budget.is_exact:
         notes.append("The states are sampled from the status, so single rows may be off by some seconds.")
     return Section(
@@ -161,32 +174,6 @@ def error_section(found: Findings) -> Section | None:
     return Section(
         "localization", "Localization error", facts(values) + note + figure(partial(error_figure, series), caption)
     )
-
-
-def events_section(found: Findings) -> Section | None:
-    """What the processes said."""
-    lines = found.record.log
-    return Section("events", "Events", events_body(lines)) if lines else None
-
-
-def events_body(lines: Sequence[LogLine]) -> str:
-    """Lines of a log: all of few, of many those that matter, and the others under one line."""
-    grave = [line for line in lines if line.level not in ("info", "debug")]
-    head = ["robot, s", "UTC", "process", "what"]
-    if len(lines) <= _SHOWN_EVENTS:
-        return table(head, map(_event, lines), "texts log")
-    some = table(head, map(_event, grave[:_SHOWN_EVENTS]), "texts log") if grave else "<p>No warnings, no errors.</p>"
-    if len(grave) > _SHOWN_EVENTS:
-        some += f"<p>and {len(grave) - _SHOWN_EVENTS} more warnings and errors.</p>"
-    whole = folded(f"All {len(lines)} lines", table(head, map(_event, lines), "texts log"))
-    return some + whole
-
-
-def _event(line: LogLine) -> list[str]:
-    wall = line.wall[11:19] or shown(None)
-    kind = {"error": "bad", "critical": "bad", "warning": "mid"}.get(line.level)
-    level = f'<strong class="{kind}">{text(line.level)}</strong> ' if kind else ""
-    return [shown(line.t_s), text(wall), text(line.process), level + text(line.text)]
 
 
 def configuration_section(found: Findings) -> Section:

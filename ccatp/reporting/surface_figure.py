@@ -28,7 +28,13 @@ class PanelCells(NamedTuple):
     values_m: FloatArray
 
 
-def surface_figure(mirror: Mirror, panels: Sequence[PanelResult], title: str, width: float) -> Picture:
+def surface_figure(
+    mirror: Mirror,
+    panels: Sequence[PanelResult],
+    title: str,
+    width: float,
+    scaled_as: Sequence[PanelResult] | None = None,
+) -> Picture:
     """Draw the map: dots show what was measured in the same colours, and vanish where the fit agrees with it.
 
     Args:
@@ -36,9 +42,11 @@ def surface_figure(mirror: Mirror, panels: Sequence[PanelResult], title: str, wi
         panels: those that could be fitted.
         title: what the picture shows.
         width: of the picture, pixels.
+        scaled_as: panels that the colours are to span; those shown if not given.
     """
     frame = MapFrame(mirror, width)
-    scale = _scale([panel.deviations.values_m[panel.is_kept] for panel in panels])
+    spanned = panels if scaled_as is None else scaled_as
+    scale = _scale([panel.deviations.values_m[panel.is_kept] for panel in spanned])
     count = _CELLS_WIDE if frame.is_wide else _CELLS_NARROW
     _draw_cells(frame, [PanelCells(*on_grid_m(mirror, panel, count)) for panel in panels], scale)
     keys: list[tuple[str, Shape]] = []

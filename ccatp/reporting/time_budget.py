@@ -13,8 +13,10 @@ from ccatp.planning.errors import PlanError
 from ccatp.planning.traversal import ORDERS
 from ccatp.reporting.record import RunRecord, Session
 from ccatp.samples import PointId, StopKind
+from ccatp.wire.topics import MissionStatus
 
-KINDS = ("turn", "drive", "settle", "measure", "wait", "back off", "home")
+START_ANEW = "start anew"
+KINDS = ("turn", "drive", "settle", "measure", "wait", "back off", "home", START_ANEW)
 _KIND_OF = {
     "turning": "turn",
     "driving": "drive",
@@ -22,9 +24,11 @@ _KIND_OF = {
     "measuring": "measure",
     "backing off": "back off",
     "returning": "home",
+    START_ANEW: START_ANEW,
 }
 _OVER = "done"
 _NEVER_BEGUN = "idle"
+_ROUNDING_S = 1e-3  # of a status; a frame takes ten times as long
 
 
 class Spell(NamedTuple):
@@ -53,8 +57,13 @@ class TimeBudget(NamedTuple):
 
     @property
     def total_s(self) -> float:
-        """Time of the mission."""
+        """Robot time from the beginning to the end."""
         return sum(self.spent_s.values())
+
+    @property
+    def mission_s(self) -> float:
+        """Without what passed while nobody was there to count it: ``mission_time_s`` of ``summary.json``."""
+        return self.total_s - self.spent_s.get(START_ANEW, 0.0)
 
     @property
     def bound_s(self) -> float | None:
@@ -79,7 +88,8 @@ def time_budget(record: RunRecord) -> TimeBudget | None:
 def spells_of(session: Session) -> list[Spell] | None:
     """Spells between the changes that the log tells; None where it does not, or the frames are not known.
 
-    What a main loop that died was at is not told; the time until its successor speaks counts as waiting.
+    What a main loop that died was at is not told; the time until its successor speaks counts as waiting, but for that
+    in which there was none.
     """
     track = session.track
     if not session.changes or not len(track.seq):
@@ -91,17 +101,36 @@ def spells_of(session: Session) -> list[Spell] | None:
     ]
     last = session.changes[-1].after
     spells.append(Spell(last, float(track.t_s[-1]) - times[-1]))
+    absent_s = sum(uncounted_s(one, later) for one, later in pairwise(_of_frames(session.statuses)))
+    anew = [index for index, spell in enumerate(spells) if index and spell.state == _NEVER_BEGUN]
+    # What its predecessor did last was not written down in time, so that it is not counted either.
+    for index in (place for last in anew for place in (last, last - 1)):
+        part_s = min(spells[index].duration_s, absent_s)
+        absent_s -= part_s
+        spells[index] = spells[index]._replace(duration_s=spells[index].duration_s - part_s)
+        spells.append(Spell(START_ANEW, part_s))
     return [spell for spell in spells if spell.duration_s > 0.0 and spell.state != _OVER]
+
+
+def uncounted_s(one: MissionStatus, later: MissionStatus) -> float:
+    """Robot time between two words of main that no mission counted: it was started anew in between."""
+    passed_s = later.t_s - one.t_s
+    missing_s = passed_s - (later.elapsed_s - one.elapsed_s)
+    return missing_s if passed_s > 0.0 and missing_s > _ROUNDING_S else 0.0
+
+
+def _of_frames(statuses: Iterable[MissionStatus]) -> list[MissionStatus]:
+    """Those of a main loop that has seen a frame."""
+    return [status for status in statuses if status.seq >= 0]
 
 
 def sampled_spells(session: Session) -> list[Spell]:
     """Spells as the status shows them: each lasts until the next."""
-    said = session.statuses
-    return [
-        Spell(one.state, later.t_s - one.t_s)
-        for one, later in pairwise(said)
-        if one.state != _OVER and later.t_s > one.t_s
-    ]
+    spells = []
+    for one, later in pairwise(_of_frames(session.statuses)):
+        absent_s = uncounted_s(one, later)
+        spells += [Spell(one.state, later.t_s - one.t_s - absent_s), Spell(START_ANEW, absent_s)]
+    return [spell for spell in spells if spell.state != _OVER and spell.duration_s > 0.0]
 
 
 def _booked(spells: Iterable[Spell], measuring_s: float) -> tuple[dict[str, float], dict[str, int]]:

@@ -9,7 +9,8 @@ from ccatp.drawing.colours import BAD, INK, PAPER, QUIET, SERIES
 from ccatp.drawing.shapes import Boxes, Picture, Text
 from ccatp.reporting.time_budget import KINDS, TimeBudget
 
-_COLOURS = dict(zip(KINDS, (SERIES[1], SERIES[0], SERIES[5], SERIES[2], SERIES[4], SERIES[3], "#6b5b95"), strict=True))
+_SHADES = (SERIES[1], SERIES[0], SERIES[5], SERIES[2], SERIES[4], SERIES[3], "#6b5b95", QUIET)
+_COLOURS = dict(zip(KINDS, _SHADES, strict=True))
 _BAR = 26.0
 _OF_THE_BUDGET = 0.4  # a few panels are no matter of an hour
 

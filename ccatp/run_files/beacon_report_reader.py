@@ -13,6 +13,7 @@ from ccatp.run_files.recorder import iter_messages, read_metadata, recordings
 from ccatp.run_files.report_reader import LOG, SUMMARY, files_of, read_summary
 from ccatp.run_files.run_reader import CONFIG, TELEMETRY
 from ccatp.run_files.state_log import read_log
+from ccatp.run_files.writing import damage_text
 from ccatp.wire.beacon_rows import TRACK_COLUMNS, TRUTH_COLUMNS, pose_track, pose_truth, table, truth_in
 from ccatp.wire.topics import (
     BadMessage,
@@ -108,7 +109,7 @@ class _Collected:
                     lost.append(str(error))
         except OSError as error:
             warnings.append(f"{path.name}: cannot be read: {error.strerror or error}")
-        warnings += [f"{text.replace(str(path), path.name)}; what came before it is in this report" for text in damages]
+        warnings += [damage_text(path, text) for text in damages]
         if lost:
             warnings.append(f"{path.name}: {len(lost)} messages cannot be read and are left out: {lost[0]}")
 

@@ -8,7 +8,7 @@ import mmap
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from io import BytesIO
+from io import SEEK_END, BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +96,9 @@ def scan(path: Path, condition: Condition) -> Iterator[McapRecord]:
         yield from _records(data, condition)
 
 
+NO_INDEX = "no index: it was not closed"
+
+
 def strict_faults(path: Path) -> list[str]:
     """What the format's own reader says against a file, all checksums compared; empty where it is in order.
 
@@ -109,6 +112,9 @@ def strict_faults(path: Path) -> list[str]:
                 pass
         except DAMAGE as error:
             faults.append(f"read from the beginning: {told(error)}")
+        file.seek(-min(len(MAGIC), path.stat().st_size), SEEK_END)
+        if file.read() != MAGIC:
+            return [*faults, NO_INDEX]
         file.seek(0)
         try:
             for _ in make_reader(file, validate_crcs=True).iter_messages():

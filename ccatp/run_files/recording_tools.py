@@ -12,6 +12,7 @@ from mcap.writer import Writer
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.run_files.recorder import CHUNK_BYTES, recordings
 from ccatp.run_files.recording_scan import Condition, scan, strict_faults
+from ccatp.run_files.writing import is_being_written
 
 TELEMETRY = "telemetry.mcap"
 _NS = 1e9
@@ -52,6 +53,7 @@ class RecordingFacts:
         metadata: what the recorder was told, by name of the record.
         topics: by name.
         faults: what the format's own strict reader says against it.
+        is_being_written: by a run that goes on.
     """
 
     path: Path
@@ -59,6 +61,19 @@ class RecordingFacts:
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     topics: dict[str, TopicFacts] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
+    is_being_written: bool = False
+
+    @property
+    def state(self) -> str:
+        """In what order it is, for a reader."""
+        if not self.faults:
+            return "complete, every checksum right"
+        return "still being written, so without an index" if self.is_being_written else "cut off or damaged"
+
+    @property
+    def is_in_order(self) -> bool:
+        """Nothing is wrong with it, but that it may have no end yet."""
+        return not self.faults or self.is_being_written
 
     @property
     def messages(self) -> int:
@@ -89,6 +104,7 @@ class RecordingFacts:
             "file": str(self.path),
             "complete": condition.is_complete,
             "verified": not self.faults,
+            "being_written": self.is_being_written,
             "faults": self.faults,
             "size_bytes": condition.size_bytes,
             "lost_bytes": condition.lost_bytes,
@@ -152,6 +168,7 @@ def read_facts(path: Path) -> RecordingFacts:
                 topic.messages += 1
                 topic.payload_bytes += len(record.data)
                 topic.first_s, topic.last_s = min(topic.first_s, t_s), max(topic.last_s, t_s)
+        facts.is_being_written = is_being_written(path)
         facts.faults = strict_faults(path)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error

@@ -13,6 +13,7 @@ from ccatp.mirror.errors import MirrorError
 from ccatp.mirror.mirror import Mirror
 from ccatp.reporting.record import Arrived, FloatArray, Session, StateChange, Track, Truth
 from ccatp.run_files.recorder import iter_messages, read_metadata
+from ccatp.run_files.writing import damage_text
 from ccatp.samples import PointId
 from ccatp.wire.topics import Arrival, BadMessage, DangerEvent, FixMessage, Message, MissionStatus, unpack
 from ccatp.wire.topics import Track as TrackMessage
@@ -71,7 +72,7 @@ def read_session(path: Path, mirror: Mirror, changes: Sequence[StateChange], war
             found.take(message)
         except (BadMessage, ValueError) as error:
             lost.append(str(error))
-    warnings += [f"{damage.replace(str(path), path.name)}; what came before it is in this report" for damage in damages]
+    warnings += [damage_text(path, damage) for damage in damages]
     if lost:
         warnings.append(f"{path.name}: {len(lost)} messages cannot be read and are left out: {lost[0]}")
     return Session(

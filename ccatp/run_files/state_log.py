@@ -6,11 +6,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ccatp.danger_text import danger_text
 from ccatp.reporting.record import LogLine, StateChange
 
 # Fields of every line; the others say more of what happened.
 _OWN = frozenset(("process", "event", "level", "wall", "seq", "t_s"))
 _DEBUG = "debug"
+# At the end of a field's name.
+_UNITS = frozenset(("s", "ms", "us", "m", "mm", "um", "rad", "mrad"))
 
 
 class ReadLine(NamedTuple):
@@ -61,14 +64,13 @@ def _parsed(text: str) -> ReadLine | None:
     begins = fields["event"] == "run" and fields.get("process") == "supervisor"
     if fields.get("level") == _DEBUG:
         return ReadLine(None, _change(fields), begins)
-    more = "  ".join(f"{key}={_shown(value)}" for key, value in fields.items() if key not in _OWN)
     t_s = fields.get("t_s")
     line = LogLine(
         wall=str(fields.get("wall", "")),
         t_s=float(t_s) if isinstance(t_s, int | float) else None,
         level=str(fields.get("level", "")),
         process=str(fields.get("process", "")),
-        text=f"{fields['event']}  {more}" if more else fields["event"],
+        text=_text(fields),
     )
     return ReadLine(line, None, begins)
 
@@ -80,10 +82,47 @@ def _change(fields: dict[str, Any]) -> StateChange | None:
     return StateChange(seq, str(before), str(after))
 
 
+def _text(fields: dict[str, Any]) -> str:
+    """What happened, and what more the line says of it: names, values and units as a reader writes them."""
+    event = str(fields["event"])
+    if event == "verdict":
+        return _verdict(fields)
+    more = [f"{_named(key)} {_shown(value)}{_unit(key)}" for key, value in fields.items() if _says(key, value)]
+    return f"{event}: {', '.join(more)}" if more else event
+
+
+def _says(key: str, value: object) -> bool:
+    return key not in _OWN and value not in ("", {}, [], None)
+
+
+def _verdict(fields: dict[str, Any]) -> str:
+    cause, signal = str(fields.get("cause", "")), str(fields.get("signal", ""))
+    if not cause:
+        return "danger: all is well again"
+    value, limit = (found if isinstance(found := fields.get(key), int | float) else 0.0 for key in ("value", "limit"))
+    return f"danger: {danger_text(cause, signal, value, limit)}, event code {fields.get('code')}"
+
+
+def _named(key: str) -> str:
+    stem, _, last = key.rpartition("_")
+    return (stem if last in _UNITS and stem else key).replace("_", " ")
+
+
+def _unit(key: str) -> str:
+    stem, _, last = key.rpartition("_")
+    return f" {last}" if last in _UNITS and stem else ""
+
+
 def _shown(value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.6g}"
-    return value if isinstance(value, str) and value else json.dumps(value)
+    if isinstance(value, dict):
+        return ", ".join(f"{_named(str(key))} {_shown(inner)}" for key, inner in value.items())
+    if isinstance(value, list):
+        return ", ".join(map(_shown, value))
+    return str(value)
 
 
 def changes_of(lines: Iterable[ReadLine], sessions: int) -> list[tuple[StateChange, ...]]:

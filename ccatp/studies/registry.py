@@ -4,12 +4,14 @@ import difflib
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
-from ccatp.config.models import Config
-from ccatp.studies.campaign import CampaignError, Study
+# The help of the command reads the table, and shall not wait for what the studies need.
+if TYPE_CHECKING:
+    from ccatp.config.models import Config
+    from ccatp.studies.campaign import Study
 
-Analysis = Callable[[Config, Path], dict[str, Any]]
+Analysis: TypeAlias = "Callable[[Config, Path], dict[str, Any]]"
 """A study without runs: a configuration and a directory, to what ``result.json`` holds."""
 
 
@@ -47,7 +49,7 @@ STUDIES = {
 }
 
 
-def find_study(name: str) -> Study | Analysis:
+def find_study(name: str) -> "Study | Analysis":
     """The study of a name.
 
     Raises:
@@ -55,6 +57,8 @@ def find_study(name: str) -> Study | Analysis:
     """
     entry = STUDIES.get(name)
     if entry is None:
+        from ccatp.studies.campaign import CampaignError  # noqa: PLC0415
+
         near = difflib.get_close_matches(name, STUDIES, n=1)
         hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(STUDIES)}"
         raise CampaignError(f"no study {name!r}; {hint}")

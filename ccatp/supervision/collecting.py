@@ -11,6 +11,7 @@ import zmq
 
 import ccatp
 from ccatp.bus import Subscriber
+from ccatp.danger_text import danger_text
 from ccatp.errors import ExitStatus
 from ccatp.processes.common import Endpoints
 from ccatp.run_files.recorder import Recorder
@@ -209,5 +210,5 @@ def _show(message: Message, view: View) -> None:
     elif isinstance(message, Log):
         view.say(message.level, message.text)
     elif isinstance(message, DangerEvent) and message.code:
-        text = f"code {message.code} {message.cause} {message.signal} {message.value:.4g} (limit {message.limit:.4g})"
-        view.say("warning", f"danger: {text} at {message.t_s:.2f} s")
+        text = danger_text(message.cause, message.signal, message.value, message.limit)
+        view.say("warning", f"danger: code {message.code}, {text}, at {message.t_s:.2f} s")

@@ -2,6 +2,7 @@
 
 import json
 import sys
+import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -10,9 +11,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from ccatp.config.models import Config
+from ccatp.repetition import Sparing
 from ccatp.summary import format_table
 from ccatp.wire.topics import MissionStatus, Track
 
+LINES_OF_A_KIND, LINES_PERIOD_S = 3, 10.0
 STYLES = {"info": "", "warning": "yellow", "error": "bold red"}
 
 
@@ -44,6 +47,7 @@ class RunView:
         """Say what runs."""
         self._console: Console = _PatientConsole(stderr=True, highlight=False)
         self._is_terminal = self._console.is_terminal
+        self._sparing = Sparing(LINES_OF_A_KIND, LINES_PERIOD_S)
         self._has_pose = False
         self._told_tenths = 0
         self._goals = goals
@@ -68,8 +72,10 @@ class RunView:
             self._progress.stop()
 
     def say(self, level: str, text: str) -> None:
-        """One line for the operator."""
-        self._console.print(f"{level}: {text}", style=STYLES[level], markup=False, soft_wrap=True)
+        """One line for the operator; of those that come again and again a few. ``log.jsonl`` has them all."""
+        told = self._sparing.take(level, text, time.monotonic())
+        if told is not None:
+            self._console.print(f"{level}: {told}", style=STYLES[level], markup=False, soft_wrap=True)
 
     def pose(self, track: Track) -> None:
         """The first pose shows that the robot is there."""

@@ -22,7 +22,8 @@ from ccatp.curve_keys import KeyPair, read_pair, write_pair
 from ccatp.curve_router import ZAP_ENDPOINT, CurveRouter, ZapHandler
 from ccatp.errors import ConfigError
 from ccatp.hazards.abort_latch import AbortLatch
-from ccatp.processes.observing import LineBudget, Observatory, ObservatoryDesk
+from ccatp.processes.observing import Observatory, ObservatoryDesk
+from ccatp.repetition import LineBudget
 from ccatp.router import MAX_CONNECTIONS, CurveClient, Router, RouterError, request, turn_away
 from ccatp.samples import EventCode
 from ccatp.wire.access import Client, Role, decode_key

@@ -13,6 +13,7 @@ import pytest
 
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
+from ccatp.dashboard.hub import IDLE_PERIOD_S
 from ccatp.wire.channels import format_error, format_ok
 from ccatp.wire.topics import Log
 from tests.contract.page_rig import DEADLINE_S, Rig, mission, page_rig
@@ -95,6 +96,20 @@ async def test_status_and_health(rig: Rig) -> None:
     assert status["status"] == "ok"
     assert status["mission"]["state"] == "driving"
     assert status["trouble"] == ""
+
+
+async def test_the_first_status_has_a_pose(rig: Rig) -> None:
+    async def live() -> None:
+        while True:
+            rig.tell_alive()
+            await asyncio.sleep(0.02)
+
+    async with asyncio.TaskGroup() as tasks:
+        living = tasks.create_task(live())
+        await asyncio.sleep(IDLE_PERIOD_S)  # it hears of the mission, and nobody has looked
+        status = (await rig.ask("GET", "/status")).data
+        living.cancel()
+    assert status["pose"] is not None
 
 
 async def test_metrics_are_what_prometheus_reads(rig: Rig) -> None:
@@ -222,10 +237,10 @@ async def test_a_page_begins_with_everything_and_goes_on_with_news(rig: Rig) -> 
         assert state["is_sim"] is True
         rig.main.send("log", Log(seq=1, t_s=2.0, level="info", process="main", text="a line"))
         name, state = await first.until(lambda _, state: bool(state["log"]))
-        assert (name, state["log"]) == ("news", [[2.0, "info", "a line"]])
+        assert (name, state["log"]) == ("news", [[2.0, "info", "a line", 1, 1]])
         async with rig.page() as second:
             name, state = await second.event()
-            assert (name, state["log"]) == ("all", [[2.0, "info", "a line"]])
+            assert (name, state["log"]) == ("all", [[2.0, "info", "a line", 1, 1]])
         rig.tell_alive()
         _, state = await first.until(lambda _, state: state["pose"] is not None)
         assert state["losses"] == []

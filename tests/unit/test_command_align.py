@@ -103,7 +103,7 @@ def test_the_table_tells_the_same(run_dir: Path, capsys: pytest.CaptureFixture[s
     assert "fyst-m1, simulation, world thesis, seed 1\n11 of 27 points measured, 1 of them left out\n" in out
     assert "\n3/7         8 " in out
     assert "left out: 3/7/6" in out
-    assert "panel 3/8 not determined: 2 of 3 points that it takes\n1 panels not measured\n" in out
+    assert "panel 3/8 not determined: 2 of 3 points that it takes\n1 panel not measured\n" in out
     assert "half-wavefront error" in out
     assert "inside its 99 % band" in out
     assert err == "ccatp: warning: panel 3/7: left out as outliers: 3/7/6; measure them again\n"
@@ -115,7 +115,7 @@ def test_a_survey_without_a_panel_is_told(tmp_path: Path, capsys: pytest.Capture
     assert (found["panels"], found["rms_before_um"], found["rms_after_um"]) == ([], None, None)
     assert (found["truth"], found["world"]) == (None, None)
     assert main(["align", str(run_dir)]) == 0
-    assert "1 panels not measured" in capsys.readouterr().out
+    assert "1 panel not measured" in capsys.readouterr().out
 
 
 def test_the_csv_has_a_line_a_panel(run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import pytest
 from ccatp.assembly import assemble
 from ccatp.cli import main
 from ccatp.config.loader import available, load_config
+from ccatp.mirror.mirror import build_mirror
+from ccatp.survey_plan import make_plan, plan_lines
 
 NAMES = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
 
@@ -87,6 +90,15 @@ def test_points_out_of_reach_are_told(capsys: pytest.CaptureFixture[str]) -> Non
     )
 
 
+def test_many_points_out_of_reach_are_counted() -> None:
+    cfg = load_config(overrides={"run.panels": 2})
+    found = make_plan(cfg, build_mirror(cfg.mirror))
+    *_, line = plan_lines(cfg, replace(found, out_of_reach=found.points))
+    assert line.startswith("out of reach    18 points: 1/2/")
+    assert line.count("/") == 2 * 10
+    assert line.endswith(" ...")
+
+
 def test_the_text_tells_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     found = planned(capsys, "--panels", "10", "--mirror", "fyst-m2")
     assert main(["plan", "--panels", "10", "--mirror", "fyst-m2"]) == 0
@@ -110,6 +122,7 @@ def test_the_figure_is_drawn(suffix: str, magic: bytes, tmp_path: Path) -> None:
     [
         (["--mirror", "fyst-m3"], "fyst-m3"),
         (["--panels", "-1"], "run.panels"),
+        (["--panels", "999"], "run.panels = 999, but fyst-m1 has 77 panels; 0 takes all of them"),
         (["--set", "limits.v_max_m_s=1e-300"], "limits.v_max_m_s = 1e-300 must be at least 0.001"),
         (["--set", "limits.alpha_max_rad_s2=1e-300"], "limits.alpha_max_rad_s2 = 1e-300 must be at least 0.001"),
         (

@@ -44,6 +44,10 @@ def test_the_table() -> None:
     assert found["late frames"] == "4, the latest by 31 ms"
     assert found["left out: out of time"] == "1-2-3, 1-2-4"
     assert found["over"] == "with exit status 4"
+    many = dict(status_rows({**STATUS, "left_out": {"operator": [f"1-2-{k}" for k in range(1, 94)]}}))
+    assert many["left out: operator"] == (
+        "93 points: 1-2-1, 1-2-2, 1-2-3, 1-2-4, 1-2-5, 1-2-6, 1-2-7, 1-2-8, 1-2-9, 1-2-10, ..."
+    )
     assert found["outcome"] == "stopped"
 
 
@@ -60,6 +64,15 @@ def test_the_command(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert capsys.readouterr().out.splitlines()[0] == "state    driving 3-4-5"
         assert main(["status", "--runtime-dir", str(folder), "--json"]) == 0
         assert json.loads(capsys.readouterr().out)["status"] == STATUS
+
+
+@pytest.mark.parametrize("command", ["pause", "resume", "abort", "stop"])
+def test_commands_answer_with_the_same_table(folder: Path, command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with serving(folder, "control", lambda _: {"ok": True, "status": STATUS}):
+        assert main(["status", "--runtime-dir", str(folder)]) == 0
+        table = capsys.readouterr().out
+        assert main([command, "--runtime-dir", str(folder)]) == 0
+    assert capsys.readouterr().out == table
 
 
 def answers(*found: dict[str, Any]) -> Any:

@@ -591,3 +591,7 @@ def test_eta_falls_as_stops_are_done(story: Story) -> None:
     assert story.mission.eta_s == 3.0
     story.until(lambda: len(story.mission.done) == 2)
     assert story.mission.eta_s == 1.0
+    story.mission.abort("operator")
+    assert story.mission.eta_s == 0.0
+    story.until_state(State.DONE)
+    assert story.mission.eta_s == 0.0

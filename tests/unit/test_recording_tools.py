@@ -16,6 +16,8 @@ from ccatp.cli import main
 from ccatp.run_files.recorder import HELD_BACK_S, Recorder, iter_messages
 from ccatp.run_files.recording_scan import Condition, scan, strict_faults
 from ccatp.run_files.recording_tools import RecordingError, read_facts, recording_files, recover
+from ccatp.run_files.writing import RUN_LOCK, damage_text
+from ccatp.runtime_dir import locked
 
 SCHEMA: dict[str, Any] = {"type": "object", "title": "x.Track", "properties": {"n": {"type": "integer"}}}
 
@@ -251,3 +253,30 @@ def test_a_full_disk_while_nothing_comes_is_reported(tmp_path: Path, monkeypatch
 def test_a_scan_of_an_empty_file_finds_nothing(tmp_path: Path) -> None:
     (tmp_path / "a").touch()
     assert list(scan(tmp_path / "a", Condition())) == []
+
+
+def test_a_recording_that_is_being_written_is_not_damaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    made = Recorder(
+        run_dir / "telemetry.mcap", [("track", SCHEMA), ("beacon_map", {})], is_simulation=True, metadata={}
+    )
+    for n in range(600):
+        made.write("track", n / 100, payload(n))
+    with locked(run_dir / RUN_LOCK, "taken"):
+        assert main(["log", "info", str(run_dir)]) == 0
+        told = capsys.readouterr().out
+        assert "telemetry.mcap: still being written, so without an index\n" in told
+        assert "log recover" not in told
+        assert "beacon_map" not in told
+        assert "  1 topic without messages\n" in told
+        assert damage_text(run_dir / "telemetry.mcap", "x").startswith("telemetry.mcap: still being written")
+    # Nobody writes it any more, and it has no end.
+    assert main(["log", "info", str(run_dir)]) == 1
+    told = capsys.readouterr().out
+    assert "telemetry.mcap: cut off or damaged\n" in told
+    assert "  no index: it was not closed\n" in told
+    assert "RecordLengthLimitExceeded" not in told
+    assert "log recover" in told
+    made.close()
+    assert main(["log", "info", str(run_dir)]) == 0

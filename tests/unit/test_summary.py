@@ -235,6 +235,12 @@ def test_the_table_is_short_and_has_every_figure(builder: SummaryBuilder) -> Non
     assert "within_budget yes" in text
 
 
+def test_points_left_out_are_counted_by_reason_in_the_table(builder: SummaryBuilder) -> None:
+    builder.set_mission(1, 2, 3.0, {"operator": ["1-2-3", "1-2-4"], "no fix": ["1-2-5"]})
+    (line,) = (line for line in format_table(builder.build()).splitlines() if line.startswith("points"))
+    assert line.endswith("left_out 2 (operator), 1 (no fix)")
+
+
 def test_a_mission_in_two_sessions_has_one_summary(mirror: Mirror) -> None:
     first, second = make(mirror, lower_bound_s=50.0), make(mirror, lower_bound_s=20.0)
     other = PointId(5, 5, 4)

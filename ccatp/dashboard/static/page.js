@@ -31,10 +31,12 @@ const commands = new Commands();
 let source = null;
 let heardAt = performance.now();
 let isEnded = false;
+let isDashboardGone = false;
 let isConnecting = false;
 let codes = [];
 let words = {};
 let hidden = [];
+const rowOfKind = new Map();
 
 // -- the stream ---------------------------------------------------------------------------------------------------
 
@@ -78,28 +80,36 @@ function begin(ground) {
 
 function hear(state, isAll) {
   heardAt = performance.now();
-  isEnded = false;
+  isEnded = isDashboardGone = false;
   $("ended").hidden = true;
   show(state, isAll);
 }
 
+// Of the survey only where main has said so: a robot that drives must not be taken for one that stands.
 function end(state) {
   source.close();
   show(state, true);
-  isEnded = true;
-  const mission = state.mission;
-  const how = mission?.outcome || (mission ? `while ${mission.state}` : "before it began");
-  text("ended", `The daemon has ended: ${how}${mission ? `, ${mission.done} of ${mission.total} ${words.goal} ${words.reached}` : ""}.`);
-  $("ended").hidden = false;
-  alarm([]);
   commands.end();
-  setTimeout(connect, RETRY_MS); // the next survey may begin at the same place
+  isEnded = state.is_over;
+  isDashboardGone = !isEnded;
+  heardAt = performance.now();
+  if (isEnded) tellEnd(state.mission);
+  tellSilence();
+  setTimeout(connect, RETRY_MS); // the next dashboard, or the next survey, may begin at the same place
 }
 
-setInterval(() => {
+function tellEnd({ outcome, state, done, total }) {
+  text("ended", `The daemon has ended: ${outcome || `while ${state}`}, ${done} of ${total} ${words.goal} ${words.reached}.`);
+  $("ended").hidden = false;
+}
+
+function tellSilence() {
   const silent = performance.now() - heardAt;
-  if (!isEnded && silent > SILENCE_MS) alarm([["the dashboard does not answer", silent / 1000]]);
-}, 100);
+  if (isEnded || !(isDashboardGone || silent > SILENCE_MS)) return;
+  const what = isDashboardGone ? "the dashboard has ended; the survey may go on" : "the dashboard does not answer";
+  alarm([[what, silent / 1000]]);
+}
+setInterval(tellSilence, 100);
 
 // -- what is shown ------------------------------------------------------------------------------------------------
 
@@ -140,10 +150,10 @@ function showMission({ mission, losses }) {
   $("progress").max = Math.max(mission.total, 1);
   $("progress").value = mission.done;
   text("elapsed", clock(mission.elapsed_s));
-  text("eta", clock(mission.eta_s));
+  text("eta", mission.outcome || mission.state === "returning" ? "–" : clock(mission.eta_s));
   text("point", mission.next_point || "–");
   text("arrival", mission.done ? `${mission.error_mm.toFixed(2)} mm` : "–");
-  text("skipped", String(mission.skipped));
+  text("skipped", String(Math.max(mission.skipped, mission.not_to_be_measured)));
   text("slips", mission.slips ? `${mission.slips}, worst ${mission.lag_ms.toFixed(0)} ms` : "0");
 }
 
@@ -166,9 +176,8 @@ function showFacts(facts) {
 
 function showVerdict(verdict) {
   if (!verdict) return;
-  const unit = verdict.cause ? ` (${verdict.signal} ${verdict.value.toPrecision(3)}, limit ${verdict.limit.toPrecision(3)})` : "";
   const grave = SEVERITIES[verdict.severity] ? `, ${SEVERITIES[verdict.severity]}` : "";
-  text("verdict", `${verdict.code} ${codes[verdict.code] ?? ""}${grave}${verdict.cause ? `: ${verdict.cause}${unit}` : ""}`);
+  text("verdict", `${verdict.code} ${codes[verdict.code] ?? ""}${grave}${verdict.text ? `: ${verdict.text}` : ""}`);
   $("verdict").dataset.level = verdict.code === 2 || verdict.severity >= 4 ? "bad" : verdict.code || verdict.severity ? "warn" : "";
   $("verdict").classList.toggle("stale", Boolean(verdict.is_stale));
   for (const way of ["forward", "reverse", "turn"]) {
@@ -187,7 +196,7 @@ function showRobot(robot, pose) {
   text("fans", robot ? robot.fans.map((duty) => `${Math.round(100 * duty)} %`).join(", ") : "–");
   text("charge", robot ? `${Math.round(100 * robot.charge)} %` : "–");
   text("held", robot ? (robot.is_held ? "held by the robot" : "free") : "–");
-  text("ages", robot ? `${Math.round(1000 * robot.drive_age_s)}, ${Math.round(1000 * robot.permit_age_s)} ms` : "–");
+  text("ages", robot ? `${Math.round(1000 * robot.drive_age_s)}, ${Math.round(1000 * robot.permit_age_s)} ms old` : "–");
   $("faults").hidden = !robot?.faults.length;
   text("faults", robot?.faults.length ? `Robot reports: ${robot.faults.join(", ")}` : "");
   text("pose-xy", pose ? `${pose.x_m.toFixed(3)}, ${pose.y_m.toFixed(3)} m` : "–");
@@ -214,16 +223,21 @@ function showLinks({ links, restarts }) {
 
 function showLog(lines, isAll) {
   const list = $("log");
-  if (isAll) list.replaceChildren();
-  for (const [t, level, line] of lines) {
+  if (isAll) {
+    list.replaceChildren();
+    rowOfKind.clear();
+  }
+  for (const [t, level, line, times, kind] of lines) {
+    rowOfKind.get(kind)?.remove();
     const row = document.createElement("li");
     const time = document.createElement("time");
     time.textContent = `${t.toFixed(1)} s`;
     const body = document.createElement("span");
-    body.textContent = line;
+    body.textContent = times > 1 ? `${line} (${times}×)` : line;
     row.dataset.level = level;
     row.append(time, body);
     list.prepend(row);
+    rowOfKind.set(kind, row);
   }
   while (list.children.length > MAX_LINES) list.lastChild.remove();
 }

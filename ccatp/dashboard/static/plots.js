@@ -2,6 +2,8 @@
 const MAX_ROWS = 4000;
 const REDRAW_MS = 400;
 const HEIGHT = 165;
+// Whole seconds, as the labels have no more.
+const TIME_STEPS_S = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600];
 const minutes = (s) => {
   const all = Math.round(s);
   return `${Math.floor(all / 60)}:${String(Math.abs(all % 60)).padStart(2, "0")}`;
@@ -72,7 +74,7 @@ export class Plots {
           height: HEIGHT,
           scales: { x: { time: false }, y: { range: (_, low, high) => range(low, high) } },
           axes: [
-            { ...axis, values: (_, at) => at.map(minutes), space: 60 },
+            { ...axis, values: (_, at) => at.map(minutes), space: 60, incrs: TIME_STEPS_S },
             { ...axis, size: 46 },
           ],
           legend: { show: false },
@@ -122,6 +124,7 @@ export class Plots {
 
   describe(name) {
     const last = this.rows[name].at(-1);
+    this.places[name].toggleAttribute("data-empty", !last);
     const words = LOOKS[name].map(({ label }, k) => (last?.[k + 1] == null ? "" : `${label} ${last[k + 1].toFixed(3)}`));
     this.places[name].setAttribute("aria-label", last ? `${this.rows[name].length} values, latest ${words.filter(Boolean).join(", ")}` : "no values yet");
   }

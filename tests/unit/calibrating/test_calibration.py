@@ -144,6 +144,18 @@ def test_the_command_writes_what_it_found(
     assert "nothing to change" in capsys.readouterr().out
 
 
+def test_what_is_replaced_is_shown(
+    driven: CalibrationDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_dir, config = record(tmp_path / "run", driven), tmp_path / "telescope.toml"
+    config.write_text('[run]\nmirror = "fyst-m2"\n[robot]\nwheel_radius_m = 0.0301\n')
+    assert main(["calibrate", "--from", str(run_dir), "--config", str(config), "--dry-run"]) == 0
+    shown = capsys.readouterr()
+    (row,) = (line for line in shown.out.splitlines() if line.startswith("robot.wheel_radius_m "))
+    assert row.split()[1] == "0.0301"
+    assert f"the drive was on fyst-m1, {config} is for fyst-m2" in shown.err
+
+
 def test_without_a_configuration_nothing_is_written(
     driven: CalibrationDrive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

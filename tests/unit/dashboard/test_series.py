@@ -47,7 +47,24 @@ def test_the_trail_leaves_out_what_nobody_sees() -> None:
 def test_lines_are_the_last_ones() -> None:
     lines = Lines(3)
     for k in range(5):
-        lines.add(k, "info", "text")
+        lines.add(k, "info", "text" + "x" * k)
     assert [row[0] for row in lines.rows] == [2, 3, 4]
     assert [row[0] for row in lines.take_new()] == [2, 3, 4]
     assert lines.take_new() == []
+
+
+def test_a_line_that_comes_again_is_one_row_with_its_newest_text() -> None:
+    lines = Lines(200)
+    lines.add(0.5, "warning", "process main was killed")
+    for k in range(300):
+        lines.add(k, "warning", f"held: a frame was served {k} ms late")
+        lines.add(k, "warning", "going on: turning")
+        if k == 9:
+            lines.take_new()
+    late = (299, "warning", "held: a frame was served 299 ms late", 300, 2)
+    assert lines.rows == [
+        (0.5, "warning", "process main was killed", 1, 1),
+        late,
+        (299, "warning", "going on: turning", 300, 3),
+    ]
+    assert lines.take_new() == lines.rows[1:]

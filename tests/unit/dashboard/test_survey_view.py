@@ -162,7 +162,9 @@ def test_points_left_out(view: SurveyView, mirror: Mirror) -> None:
     view.hear(fix_at(mirror, view.points[1], 0.0), 2.0)
     names = [f"{p.row}-{p.col}-{p.point}" for p in view.points[:2]]
     view.hear(mission(left_out={"no fix": names, "other": ["99-9-9"]}), 2.0)
-    assert [row[:2] for row in view.news(2.0)["points"]] == [[0, SKIPPED], [1, MEASURED]]
+    news = view.news(2.0)
+    assert [row[:2] for row in news["points"]] == [[0, SKIPPED], [1, MEASURED]]
+    assert news["mission"]["not_to_be_measured"] == 3
 
 
 def test_the_path_as_it_is_driven_and_in_simulation_against_the_truth(view: SurveyView, mirror: Mirror) -> None:
@@ -222,7 +224,8 @@ def test_the_verdict_and_its_cause(view: SurveyView) -> None:
     shown = encoded(view.news(1.5))["verdict"]
     assert shown == {
         "cause": "edge", "signal": "front_left", "value": 0.006, "limit": 0.005, "off": [True, False, False, False],
-        "code": 1, "severity": 0, "permits": {"forward": False, "reverse": True, "turn": False}, "is_stale": False,
+        "code": 1, "severity": 0, "text": "edge (front left): 0.006 (limit 0.005)",
+        "permits": {"forward": False, "reverse": True, "turn": False}, "is_stale": False,
     }  # fmt: skip
     assert view.news(2.5)["verdict"]["is_stale"]
 
@@ -236,9 +239,9 @@ def test_a_danger_event_is_a_line_as_well(view: SurveyView) -> None:
     state = view.news(1.0)
     assert state["verdict"]["code"] == 2
     assert "permits" not in state["verdict"]
-    assert state["log"] == [(1.25, "warning", "danger: fire emergency:fire 1 (limit 0)")]
+    assert state["log"] == [(1.25, "warning", "danger: fire", 1, 1)]
     view.hear(Log(seq=5, t_s=2.0, level="info", process="main", text="joined"), 2.0)
-    assert view.news(2.0)["log"] == [(2.0, "info", "joined")]
+    assert view.news(2.0)["log"] == [(2.0, "info", "joined", 1, 2)]
 
 
 def test_other_things_on_the_map(view: SurveyView) -> None:

@@ -16,7 +16,7 @@ from ccatp.reporting.html import NARROW, WIDE
 from ccatp.run_files.beacon_report_reader import read_beacon_record
 from ccatp.run_files.run_reader import RunReadError
 from tests.unit.reporting.beacon_recorded import FRAMES, OFF_M, SIGMA_M, beacon_config, record_beacons
-from tests.unit.reporting.test_pages import Markup
+from tests.unit.reporting.markup import Markup
 
 ALL = ["map", "waypoints", "localization", "consistency", "events", "configuration"]
 

@@ -25,7 +25,9 @@ def test_the_pages_open_by_themselves(recorded: Path, tmp_path: Path) -> None:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         for width in (1100, 390):
             opens_by_itself(browser, report, width, figures=4)
-            opens_by_itself(browser, tmp_path / "compare.html", width, figures=4)
+            opens_by_itself(browser, tmp_path / "compare.html", width, figures=5)
+        what_is_cut_off_shows_it(browser, report)
+        the_figures_of_two_runs_fit_a_telephone(browser, tmp_path / "compare.html")
         nothing_may_be_fetched_even_if_it_were_asked_for(browser, report)
         paper_has_the_wide_figures(browser, report)
         browser.close()
@@ -53,8 +55,31 @@ def opens_by_itself(browser: "Browser", path: Path, width: int, figures: int) ->
 
 def visible(page: "Page") -> list[tuple[float, float]]:
     """Left and right ends of the figures that are shown."""
-    boxes = [figure.bounding_box() for figure in page.locator("figure svg:visible").all()]
+    boxes = [figure.bounding_box() for figure in page.locator("figure svg:not(.beside *):visible").all()]
     return [(box["x"], box["x"] + box["width"]) for box in boxes if box is not None]
+
+
+def what_is_cut_off_shows_it(browser: "Browser", path: Path) -> None:
+    page = browser.new_page(viewport={"width": 390, "height": 844})
+    page.goto(path.as_uri())
+    panels = page.locator("#panels .scroll").first
+    assert panels.evaluate("node => node.scrollWidth > node.clientWidth")
+    assert "linear-gradient" in panels.evaluate("node => getComputedStyle(node).backgroundImage")
+    panels.evaluate("node => { node.scrollLeft = 200 }")
+    first = panels.locator("thead th").first.bounding_box()
+    assert first is not None
+    assert first["x"] >= 0.0  # the name of the row stays in sight
+    page.close()
+
+
+def the_figures_of_two_runs_fit_a_telephone(browser: "Browser", path: Path) -> None:
+    page = browser.new_page(viewport={"width": 390, "height": 844})
+    page.goto(path.as_uri())
+    assert page.locator("#figures .scroll").evaluate("node => node.scrollWidth <= node.clientWidth")
+    surfaces = [figure.bounding_box() for figure in page.locator(".beside svg").all()]
+    assert len(surfaces) == 2
+    assert all(box is not None and box["width"] > 300.0 for box in surfaces)
+    page.close()
 
 
 def nothing_may_be_fetched_even_if_it_were_asked_for(browser: "Browser", path: Path) -> None:

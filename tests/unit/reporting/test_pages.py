@@ -3,62 +3,23 @@
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 
 from ccatp.cli import main
-from ccatp.report_writer import ReportError, compare_runs, report_run
-from ccatp.reporting.compare_page import compare_page, pair_of
+from ccatp.report_writer import ReportError, report_run
+from ccatp.reporting.compare_page import compare_page
 from ccatp.reporting.findings import findings_of, outcome_of
 from ccatp.reporting.html import clock, shown, text
 from ccatp.reporting.page import POLICY
+from ccatp.reporting.pair import pair_of
 from ccatp.reporting.record import LogLine
 from ccatp.reporting.run_page import run_page
-from ccatp.reporting.sections import SECTIONS, sections_of
+from ccatp.reporting.sections import SECTIONS
 from ccatp.run_files.report_reader import read_record
+from tests.unit.reporting.markup import Markup
 from tests.unit.reporting.recorded import record
-
-FETCHED = {"src", "href", "srcset", "action", "data", "poster"}
-VOID = {"meta", "link", "rect", "br"}
-
-
-class Markup(HTMLParser):
-    """Checks that elements nest, and collects what a browser would fetch."""
-
-    def __init__(self, page: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.outside: list[str] = []
-        self.anchors: list[str] = []
-        self.headings: list[str] = []
-        self.feed(page)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag not in VOID:
-            self.open.append(tag)
-        for name, value in attrs:
-            if name in FETCHED and not (value or "").startswith(("#", "data:")):
-                self.outside.append(f"{tag} {name}={value}")
-            if name == "id":
-                self.anchors.append(value or "")
-            assert not name.startswith("on"), f"a script: {name}"
-        assert tag not in {"script", "iframe", "object", "embed", "img"}
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        pass  # of an SVG
-
-    def handle_endtag(self, tag: str) -> None:
-        if tag not in VOID:
-            assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if self.open and self.open[-1] == "h2":
-            self.headings.append(data)
-
 
 ALL = ["map", "points", "surface", "panels", "time", "localization", "events", "configuration"]
 
@@ -128,16 +89,14 @@ def test_text_stays_text(recorded: Path) -> None:
     assert evil not in other
 
 
-def test_many_events_are_folded(recorded: Path) -> None:
+def test_a_run_given_up_before_its_first_point_says_why(recorded: Path) -> None:
     whole = read_record(recorded)
-    calm = [LogLine("", 1.0 * i, "info", "main", f"line {i}") for i in range(100)]
-    bad = [LogLine("", 1.0 * i, "warning", "main", f"careful {i}") for i in range(60)]
-    (events,) = [s for s in sections_of(findings_of(replace(whole, log=(*calm, *bad)))) if s.anchor == "events"]
-    before, folded = events.body.split("<details>")
-    assert before.count("careful") == 40
-    assert "and 20 more warnings and errors" in before
-    assert "line 99" not in before
-    assert folded.count("<tr>") == 1 + 160
+    names = [f"{row.point.row}-{row.point.col}-{row.point.point}" for row in whole.points or ()]
+    rows = tuple(row._replace(status="planned", t_s=None) for row in whole.points or ())
+    summary = {**(whole.summary or {}), "points": {"left_out": {"operator": names}}}
+    found = run_page(findings_of(replace(whole, points=rows, measured=(), summary=summary)))
+    assert "<p>9 not measured: operator.</p>" in found
+    assert "<p>No point measured: no surface, no adjuster moves.</p>" in found
 
 
 def test_outcomes(recorded: Path) -> None:
@@ -207,65 +166,3 @@ def test_a_damaged_run_is_told_on_standard_error(run_dir: Path, capsys: pytest.C
     told = capsys.readouterr()
     assert told.err.startswith("ccatp: warning: summary.json: cannot be read: ")
     assert json.loads(told.out)["warnings"][0].startswith("summary.json: ")
-
-
-# -- two runs ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same panels, surveyed again by another filter."""
-    return record(tmp_path_factory.mktemp("recorded") / "again", run__filter="ukf")
-
-
-def test_two_surveys_of_one_mirror_agree(
-    recorded: Path, other: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "cmp.html"
-    assert main(["compare", str(recorded), str(other), "--out", str(out), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["one_mirror"], told["agree"], told["dof"], told["report"]) == (True, True, 3, str(out))
-    assert (told["a"]["run"], told["b"]["run"]) == ("tonight", "again")
-    (panel,) = told["panels"]
-    assert abs(panel["piston_um"]) < 4.0 * panel["sigma"][0]
-    page = out.read_text()
-    markup = Markup(page)
-    assert (markup.outside, markup.anchors) == (
-        [],
-        ["figures", "configuration", "time", "errors", "points", "panels"],
-    )
-    assert '<tr><th scope="row">run.filter</th><td>ekf</td><td>ukf</td></tr>' in page
-    assert "The surveys agree" in page
-
-
-def test_panels_that_moved_are_found(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    elsewhere = record(tmp_path / "moved", run__seed=2)  # its panels lie otherwise
-    assert main(["compare", str(recorded), str(elsewhere), "--out", str(tmp_path / "c.html")]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[-3].startswith("the surveys differ: chi2 of no change ")
-    assert lines[-2].startswith("panel 1/2 has moved: piston ")
-    assert lines[-1] == str(tmp_path / "c.html")
-    assert "1 of 1 panels have moved" in (tmp_path / "c.html").read_text()
-
-
-def test_figures_of_two_runs(recorded: Path, other: Path, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    compare_runs(recorded, other, tmp_path / "c.html", tmp_path / "figures")
-    names = ("time", "localization", "arrivals", "change")
-    expected = {f"{name}.{suffix}" for name in names for suffix in ("svg", "png", "pdf")}
-    assert {path.name for path in (tmp_path / "figures").iterdir()} == expected
-
-
-def test_different_mirrors_are_not_compared_point_by_point(recorded: Path, tmp_path: Path) -> None:
-    thesis = record(tmp_path / "thesis", run__mirror="thesis-m1", only=2)
-    page = compare_page(pair_of(findings_of(read_record(recorded)), findings_of(read_record(thesis))))
-    assert Markup(page).anchors == ["figures", "configuration", "time", "errors"]
-    assert "The runs are of different mirrors" in page
-
-
-def test_runs_without_anything_are_compared(recorded: Path, without: Callable[..., Path]) -> None:
-    bare = findings_of(read_record(without("telemetry.mcap", "mission.sqlite", "log.jsonl", "summary.json")))
-    page = compare_page(pair_of(bare, bare))
-    assert Markup(page).anchors == ["figures", "configuration"]
-    both = compare_page(pair_of(bare, findings_of(read_record(recorded))))
-    assert Markup(both).anchors == ["figures", "configuration", "time", "errors"]

@@ -31,7 +31,7 @@ def test_a_whole_run(recorded: Path) -> None:
     assert found.changed["run.panels"] == (1, 0)
     assert not [key for key in found.changed if key.startswith(("world", "mirror"))]
     assert found.injected is not None
-    assert [line.text for line in found.log][-1] == "end  status=0"
+    assert [line.text for line in found.log][-1] == "end: status 0"
 
 
 def test_the_track_is_on_the_deck(recorded: Path) -> None:
@@ -212,7 +212,25 @@ def test_the_log_is_shown_without_what_is_for_debugging(tmp_path: Path) -> None:
     path.write_text(lines(STATE % (1, "a", "b"), json.dumps(odd), "[]", json.dumps({"event": 3})))
     read = list(read_log(path, []))
     shown = [line.shown for line in read if line.shown is not None]
-    assert [tuple(line) for line in shown] == [("w", 3.0, "warning", "main", 'fault  lag_s=0.05  why=""')]
+    assert [tuple(line) for line in shown] == [("w", 3.0, "warning", "main", "fault: lag 0.05 s")]
+
+
+def test_fields_of_the_log_are_words(tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    verdict = {"process": "danger", "event": "verdict", "code": 0, "signal": "estimate", "value": 0.31, "limit": 0.15}
+    counts = {"process": "danger", "event": "stopped", "edges": {"front_left": 2}, "held": True, "denied": {}}
+    path.write_text(
+        lines(
+            json.dumps(verdict | {"cause": "estimate stale", "severity": 3}),
+            json.dumps(verdict | {"cause": ""}),
+            json.dumps(counts | {"names": ["a", "b"]}),
+        )
+    )
+    assert [line.shown.text for line in read_log(path, []) if line.shown is not None] == [
+        "danger: estimate stale: 0.31 s (limit 0.15 s), event code 0",
+        "danger: all is well again",
+        "stopped: edges front left 2, held yes, names a, b",
+    ]
 
 
 def test_every_topic_that_is_read_is_recorded(recorded: Path) -> None:
