@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ccatp.filters.base import FloatArray
+from ccatp.radio.lost_heading import LostHeading
 from ccatp.radio.motion import Increment
 from ccatp.radio.readings import RangeBearingReading, RangeReading, Reading, RssiReading
 from ccatp.radio.recording import RecordedRun, Steps
@@ -36,7 +37,7 @@ def filter_run(
         clock_s: tells wall time, s.
     """
     position, heading = first_sigmas
-    slam = BeaconSlam(settings, run.first_pose, np.diag((position**2, position**2, heading**2)))
+    search = LostHeading(BeaconSlam(settings, run.first_pose, np.diag((position**2, position**2, heading**2))))
     times = np.union1d(_spaced(run.steps.times_s), run.readings.times_s)
     increments, readings = _increments(run.steps, times), _Heard(run)
     poses, covariances = np.empty((len(times), 3)), np.empty((len(times), 3, 3))
@@ -44,14 +45,15 @@ def filter_run(
     for k, time_s in enumerate(times.tolist()):
         begin_s = clock_s()
         if k:
-            slam.predict(increments[k - 1])
+            search.predict(increments[k - 1])
         predicted_s = clock_s()
         book.predict_s.append(predicted_s - begin_s)
         if now := readings.until(time_s):
-            learned = slam.observe(now)
+            learned = search.observe(now)
             end_s = clock_s()
             book.observed(learned, len(now), end_s - begin_s, end_s - predicted_s)
-        poses[k], covariances[k] = slam.pose, slam.pose_covariance
+        poses[k], covariances[k] = search.best.pose, search.best.pose_covariance
+    slam = search.best
     nis, sizes = np.array(book.nis), np.array(book.sizes, dtype=np.float64)
     lost = [name for name in run.beacon_ids if name not in slam.beacons]
     return Track(
@@ -135,13 +137,13 @@ def _spaced(times_s: FloatArray) -> FloatArray:
 def _increments(steps: Steps, times_s: FloatArray) -> list[Increment]:
     """Odometry between the times, steps cut where readings fall."""
 
-    def shares(amounts: FloatArray) -> list[float]:
-        total = np.concatenate([[0.0], np.cumsum(amounts)])
+    def shares(amounts: FloatArray | float) -> list[float]:
+        total = np.concatenate([[0.0], np.cumsum(np.broadcast_to(amounts, steps.distance_m.shape))])
         shared: list[float] = np.diff(np.interp(times_s, steps.times_s, total)).tolist()
         return shared
 
     columns = (times_s[1:].tolist(), np.diff(times_s).tolist())
-    amounts = (shares(steps.distance_m), shares(steps.turn_rad), shares(steps.lateral_m))
+    amounts = map(shares, steps[1:])
     return [Increment(*row) for row in zip(*columns, *amounts, strict=True)]
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import sqrt
+from math import log, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -14,14 +14,14 @@ from ccatp.radio.beacon_map import BeaconMap, Entry
 from ccatp.radio.dead_reckoning import DeadReckoning
 from ccatp.radio.doubts import Doubts
 from ccatp.radio.fresh_noise import FreshNoise
-from ccatp.radio.motion import POSE, DifferentialDrive, Odometry, Pose
+from ccatp.radio.motion import POSE, DifferentialDrive, Increment, Odometry, Pose
 from ccatp.radio.newcomers import Newcomers
 from ccatp.radio.noise_level import NoiseLevel
 from ccatp.radio.readings import BeaconId, Reading
 from ccatp.radio.settling import derivatives
 from ccatp.radio.sightings import Sensors, bearing_of, kind_of, strength_of
 from ccatp.radio.slam_settings import SlamSettings, Wander
-from ccatp.radio.transport import Transport
+from ccatp.radio.transport import HEADING, Transport
 
 DELAY = "odometry_delay_s"
 
@@ -48,6 +48,7 @@ class Learned(NamedTuple):
         nis: nu^T S^-1 nu, with the larger noise where a reading was beyond the knee.
         size: m; a reading whose bearing is refused has its range left out.
         accepted: False where it was refused; the state is then as before, or has taken the bearing alone.
+        surprise: minus twice its log-likelihood, up to a constant: sum of nis + ln S.
     """
 
     beacon: BeaconId
@@ -55,6 +56,7 @@ class Learned(NamedTuple):
     nis: float
     size: int
     accepted: bool
+    surprise: float = 0.0
 
 
 class BeaconSlam:
@@ -152,6 +154,8 @@ class BeaconSlam:
         if self._learns:
             Q = Q * self.levels["motion"].factor
             self._fresh.step(F, Q)
+        if isinstance(odometry, Increment) and odometry.guess_m2 > 0.0:
+            Q = _with_guess(Q, odometry)
         engine.predict(mean, F, Q)
         self._way_m += self._clock.took(odometry, before, mean)
         rest = self._motion.at_rest(odometry) if isinstance(self._motion, DifferentialDrive) else None
@@ -182,6 +186,13 @@ class BeaconSlam:
         if self._transport is not None:
             self._transport.follow(before)
 
+    def told_heading(self, off_rad: float, sigma_rad: float) -> float:
+        """Take a heading that is ``off_rad`` from the one that is thought, and tells the NIS of that."""
+        before = self.engine.mean.copy()
+        found = self.engine.update_row(np.array((HEADING,)), np.ones(1), off_rad, sigma_rad**2)
+        self._follow(before)
+        return found.nis
+
     def remove(self, beacon: BeaconId) -> None:
         """Forget a beacon; one that is heard again begins anew.
 
@@ -200,18 +211,19 @@ class BeaconSlam:
         if model is not None:
             self._map.wander_to(reading.beacon, model, self._way_m, reading.time_s)
         bearing = bearing_of(reading)
-        residuals, nis, found = [], 0.0, None
+        residuals, nis, spread, found = [], 0.0, 1.0, None
         if bearing is not None:
             found = self._take(reading, entry, "bearing", bearing, model)
-            residuals, nis = [found.residual], found.nis
+            residuals, nis, spread = [found.residual], found.nis, found.spread
         if found is None or found.accepted:
             found = self._take(reading, entry, kind_of(reading), strength_of(reading), model)
             residuals.append(found.residual)
             nis += found.nis
+            spread *= found.spread
         if self._learns:
             self._fresh.clear()
         self._judge(reading.beacon, entry, accepted=found.accepted)
-        return Learned(reading.beacon, np.array(residuals), nis, len(residuals), found.accepted)
+        return Learned(reading.beacon, np.array(residuals), nis, len(residuals), found.accepted, nis + log(spread))
 
     def _take(self, reading: Reading, entry: Entry, kind: str, z: float, model: Wander | None) -> RowUpdate:
         """One scalar of a reading."""
@@ -258,3 +270,10 @@ class BeaconSlam:
             self.jumps += 1
         if entry.refused >= trust.doubt_beacon_after:
             self._map.leave(beacon)
+
+
+def _with_guess(Q: FloatArray, odometry: Increment) -> FloatArray:
+    """The noise of a step whose way is guessed, which tells nothing of the noise of odometry."""
+    Q = Q.copy()
+    Q[range(POSE), range(POSE)] += odometry.guess_m2, odometry.guess_m2, odometry.guess_rad2
+    return Q

@@ -6,13 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ccatp.radio.recording import Readings, RecordedRun, Steps, Truth
-from ccatp.radio_data.cleaning import plural
-from ccatp.radio_data.truth import chords, turn_at, turning_factor, way_at
+from ccatp.radio_data.cleaning import GAP_S, long_pauses, plural
+from ccatp.radio_data.truth import chords, guessed_between, turn_at, turning_factor, way_at
 
 FloatArray = npt.NDArray[np.float64]
 MANY_SIGMA = 1.4826  # of a Gaussian, over its median absolute deviation
-GAP_S = 2.0  # pauses shorter than that are how recorders work,
-GAP_RATIO = 20.0  # and so are those of a few usual intervals
 TRUTH_GAP_S = 1.0
 SAME = 0.01  # odometry is the truth itself if single steps agree to that part of their size
 SCALE_WARNING = 0.03
@@ -42,16 +40,13 @@ def _gaps(run: RecordedRun) -> Iterator[str]:
     if run.truth is not None:
         columns.append(("truth", run.truth.times_s, TRUTH_GAP_S))
     for what, times_s, least_s in columns:
-        pauses = np.diff(times_s)
-        if not pauses.size:
-            continue
-        usual = float(np.median(pauses[pauses > 0.0])) if (pauses > 0.0).any() else 0.0
-        long = np.flatnonzero(pauses > max(least_s, GAP_RATIO * usual))
+        long, pauses = long_pauses(times_s, least_s), np.diff(times_s)
         if long.size:
             worst = int(long[np.argmax(pauses[long])])
+            guessed = "; the way there is guessed by the speed before" if what == "odometry" else ""
             yield (
                 f"{what}: {plural(long.size, 'gap')}, the longest of {pauses[worst]:.1f} s at {times_s[worst]:.3f} s "
-                f"(usual interval {usual:.3f} s)"
+                f"(usual interval {float(np.median(pauses[pauses > 0.0])):.3f} s){guessed}"
             )
 
 
@@ -101,6 +96,8 @@ def _odometry_against(truth: Truth, steps: Steps) -> Iterator[str]:
     true_way = np.hypot(np.diff(truth.x_m[rows]), np.diff(truth.y_m[rows]))
     half_turn = np.minimum(0.5 * np.abs(np.diff(turn_at(steps, t))), 1.0)
     chord = np.abs(way) * np.sinc(half_turn / np.pi)  # of the arc
+    told = ~guessed_between(steps, t)
+    true_way, chord = true_way[told], chord[told]
     if chord.sum() > 0.0:
         scale = float(true_way.sum() / chord.sum())
         if abs(scale - 1.0) > SCALE_WARNING:

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from ccatp.radio.recording import Readings, RecordedRun, Steps, Truth
-from ccatp.radio_data.cleaning import in_order, within
+from ccatp.radio_data.bridging import bridged
+from ccatp.radio_data.cleaning import in_order, with_unknown_ways, within
 from ccatp.radio_data.errors import RadioDataError
 from ccatp.radio_data.text_table import Table, content_lines, number, read_text
 from ccatp.radio_data.truth import checked_heading, pose_of_truth
@@ -41,6 +42,8 @@ def read_events_csv(file: Path) -> RecordedRun:
     tables = _tables(file, names)
     surveyed = tables.pop("beacon", None)
     needed = {kind: sum(not column.startswith("(") for column in columns) for kind, columns in EVENTS.items()}
+    if "odom" in tables:
+        tables["odom"], needed["odom"] = with_unknown_ways(tables["odom"], warnings), 1
     tables = {kind: in_order(table, warnings, needed[kind]) for kind, table in tables.items()}
     if "odom" not in tables:
         raise RadioDataError(file, f"no event odom ({', '.join(EVENTS['odom'])})")
@@ -123,7 +126,7 @@ def _steps(odometry: Table) -> Steps:
     if (np.diff(t) <= 0.0).any():
         line = int(odometry.lines[1:][np.diff(t) <= 0.0][0])
         raise RadioDataError(odometry.file, "two events odom at the same time say different things", line)
-    return Steps(t, distance[1:], turn[1:], lateral[1:])
+    return bridged(Steps(t, distance[1:], turn[1:], lateral[1:]))
 
 
 def _readings(

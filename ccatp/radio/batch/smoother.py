@@ -43,7 +43,8 @@ def smooth(run: RecordedRun, settings: BatchSettings, clock_s: Callable[[], floa
     start = grown(run.steps, run.readings, heard_s, run.first_pose, settings, len(run.beacon_ids))
     times_s = instants(run)
     problem = BatchProblem(run.steps, run.readings, times_s, run.first_pose, settings, start.used)
-    found = descend(problem, _filled(problem, start.state, np.searchsorted(times_s, heard_s)), ITERATIONS)
+    filled = _filled(problem, _anchored(start.state, run.first_pose), np.searchsorted(times_s, heard_s))
+    found = descend(problem, filled, ITERATIONS)
     for _ in range(WIDENINGS):
         radio = _widened(problem, found.state)
         if radio == problem.radio:
@@ -59,6 +60,20 @@ def instants(run: RecordedRun) -> FloatArray:
     steps_s = run.steps.times_s
     _, first = np.unique(np.floor((steps_s - steps_s[0]) / SPACING_S), return_index=True)
     return np.union1d(run.readings.times_s, steps_s[first])
+
+
+def _anchored(state: State, first_pose: tuple[float, float, float]) -> State:
+    """The state moved as a whole, so that it begins at the first pose: nothing but the prior of that is another."""
+    x_m, y_m, heading_rad = state.poses[0].tolist()
+    turn = first_pose[2] - heading_rad
+    c, s = np.cos(turn), np.sin(turn)
+
+    def moved(points: FloatArray) -> FloatArray:
+        dx, dy = points[:, 0] - x_m, points[:, 1] - y_m
+        return np.column_stack([first_pose[0] + c * dx - s * dy, first_pose[1] + s * dx + c * dy])
+
+    poses = np.column_stack([moved(state.poses), state.poses[:, 2] + turn])
+    return State(poses, state.shared, np.column_stack([moved(state.beacons), state.beacons[:, 2:]]))
 
 
 def _filled(problem: BatchProblem, state: State, known: npt.NDArray[np.int64]) -> State:
