@@ -9,7 +9,7 @@ import numpy as np
 from ccatp.filters.base import FloatArray
 from ccatp.radio.lost_heading import LostHeading
 from ccatp.radio.motion import Increment
-from ccatp.radio.readings import RangeBearingReading, RangeReading, Reading, RssiReading
+from ccatp.radio.readings import BeaconId, RangeBearingReading, RangeReading, Reading, RssiReading
 from ccatp.radio.recording import RecordedRun, Steps
 from ccatp.radio.slam import BeaconSlam, Learned
 from ccatp.radio.slam_settings import SlamSettings
@@ -73,6 +73,7 @@ def filter_run(
         updates=len(book.nis),
         warnings=(
             *(f"beacon {name} could not be placed: its readings leave two places or none" for name in lost),
+            *_moved(slam.moved),
             *_doubts(nis, sizes, book.refused, slam.jumps),
         ),
     )
@@ -126,6 +127,13 @@ def _doubts(nis: FloatArray, sizes: FloatArray, refused: int, jumps: int) -> Ite
         yield f"the pose had to be doubted {jumps} times: pushed, beacons misread, or odometry that misses something?"
     if refused > DOUBTFUL_SHARE * (nis.size + refused):
         yield f"{refused} of {nis.size + refused} readings were refused: do they belong to this odometry?"
+
+
+def _moved(moved: Sequence[tuple[BeaconId, float]]) -> Iterator[str]:
+    """Beacons that were placed anew, a line each: the map holds their last place."""
+    for beacon in dict.fromkeys(beacon for beacon, _ in moved):
+        times = ", ".join(f"{time_s:.1f}" for name, time_s in moved if name == beacon)
+        yield f"beacon {beacon} was placed anew at {times} s: was it moved, or exchanged for another?"
 
 
 def _spaced(times_s: FloatArray) -> FloatArray:

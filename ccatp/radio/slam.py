@@ -74,6 +74,7 @@ class BeaconSlam:
         waiting: beacons that were heard and are not on the map yet, with the candidates for their places.
         levels: what the noise of each sensor and of the motion is, relative to the settings, in variance.
         jumps: how often the pose was doubted.
+        moved: beacons that had to be placed anew, each with the time_s of the reading that decided it.
     """
 
     def __init__(
@@ -106,6 +107,7 @@ class BeaconSlam:
         self._fresh = FreshNoise()
         self._gate, self._knee = trust.gate_sigmas**2, trust.knee_sigmas
         self._doubts, self.jumps = Doubts(trust.doubt_pose_after), 0
+        self.moved: list[tuple[BeaconId, float]] = []
         self._way_m = 0.0
         self._newcomers = Newcomers(
             self.engine, self._sensors, self._map, self._clock, self.levels, self._shared, self._delay
@@ -178,6 +180,9 @@ class BeaconSlam:
                 self._newcomers.meet(reading)
             else:
                 self.learned.append(self._update(reading, entry))
+                if entry.on_trial and reading.beacon not in self._map:
+                    before = self.engine.mean.copy()
+                    self._newcomers.meet(reading)
             self._follow(before)
         return self.learned
 
@@ -222,7 +227,7 @@ class BeaconSlam:
             spread *= found.spread
         if self._learns:
             self._fresh.clear()
-        self._judge(reading.beacon, entry, accepted=found.accepted)
+        self._judge(reading, entry, accepted=found.accepted)
         return Learned(reading.beacon, np.array(residuals), nis, len(residuals), found.accepted, nis + log(spread))
 
     def _take(self, reading: Reading, entry: Entry, kind: str, z: float, model: Wander | None) -> RowUpdate:
@@ -254,11 +259,15 @@ class BeaconSlam:
             self.levels["motion"].learn(found.nis, self._fresh.seen(h[0], h[1], h[2]) / found.spread)
         return found
 
-    def _judge(self, beacon: BeaconId, entry: Entry, *, accepted: bool) -> None:
+    def _judge(self, reading: Reading, entry: Entry, *, accepted: bool) -> None:
         """Refusals accuse the pose, or a beacon that alone is refused: the one is loosened, the other begins anew."""
         if accepted:
             entry.refused = 0
+            entry.on_trial = max(entry.on_trial - 1, 0)
             self._doubts.clear()
+            return
+        if entry.on_trial:
+            self._map.leave(reading.beacon)
             return
         entry.refused += 1
         trust = self.settings.trust
@@ -269,7 +278,8 @@ class BeaconSlam:
             self.engine.predict(self.engine.mean[:v].copy(), np.eye(v), np.diag(jump**2))
             self.jumps += 1
         if entry.refused >= trust.doubt_beacon_after:
-            self._map.leave(beacon)
+            self._map.leave(reading.beacon)
+            self.moved.append((reading.beacon, reading.time_s))
 
 
 def _with_guess(Q: FloatArray, odometry: Increment) -> FloatArray:

@@ -12,7 +12,7 @@ from tests.unit.radio_data.sets import csv_lines, plaza_tables, world, write_lin
 
 
 def steps_of(distance_m: FloatArray, turn_rad: FloatArray, interval_s: float = 0.1) -> Steps:
-    return Steps(interval_s * np.arange(distance_m.size + 1), distance_m, turn_rad, np.zeros(distance_m.size))
+    return Steps(interval_s * np.arange(distance_m.size + 1.0), distance_m, turn_rad, np.zeros(distance_m.size))
 
 
 def test_steps_without_a_gap_stay_as_they_are() -> None:
@@ -22,7 +22,7 @@ def test_steps_without_a_gap_stay_as_they_are() -> None:
 
 def test_a_row_that_is_lost_goes_on_as_before() -> None:
     rng = np.random.default_rng(1)
-    distance = 0.05 + 0.001 * rng.standard_normal(1000)
+    distance: FloatArray = 0.05 + 0.001 * rng.standard_normal(1000)
     distance[400] = np.nan
     found = bridged(steps_of(distance, np.full(1000, 0.01)))
     assert found.distance_m[400] == pytest.approx(0.05, abs=0.002)
