@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ccatp.filters.base import FloatArray
+from ccatp.radio.calibration_doubts import beyond_priors, learned
 from ccatp.radio.lost_heading import LostHeading
 from ccatp.radio.motion import Increment
 from ccatp.radio.readings import BeaconId, RangeBearingReading, RangeReading, Reading, RssiReading
@@ -49,12 +50,14 @@ def filter_run(
         predicted_s = clock_s()
         book.predict_s.append(predicted_s - begin_s)
         if now := readings.until(time_s):
-            learned = search.observe(now)
+            taken = search.observe(now)
             end_s = clock_s()
-            book.observed(learned, len(now), end_s - begin_s, end_s - predicted_s)
+            book.observed(taken, len(now), end_s - begin_s, end_s - predicted_s)
         poses[k], covariances[k] = search.best.pose, search.best.pose_covariance
     slam = search.best
     nis, sizes = np.array(book.nis), np.array(book.sizes, dtype=np.float64)
+    priors = dict(zip(slam.calibration, slam.prior_sigmas, strict=True))
+    calibration = learned({name: Calibrated(*found) for name, found in slam.calibration.items()}, priors)
     lost = [name for name in run.beacon_ids if name not in slam.beacons]
     return Track(
         times_s=times,
@@ -63,7 +66,7 @@ def filter_run(
         beacons={
             str(b): BeaconFix(float(e.mean[0]), float(e.mean[1]), e.covariance[:2, :2]) for b, e in slam.beacons.items()
         },
-        calibration={name: Calibrated(*found) for name, found in slam.calibration.items()},
+        calibration=calibration,
         nis=nis,
         nis_sizes=sizes,
         refused=book.refused,
@@ -73,6 +76,7 @@ def filter_run(
         updates=len(book.nis),
         warnings=(
             *(f"beacon {name} could not be placed: its readings leave two places or none" for name in lost),
+            *beyond_priors(calibration, priors, run.kind),
             *_moved(slam.moved),
             *_doubts(nis, sizes, book.refused, slam.jumps),
         ),

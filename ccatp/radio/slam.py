@@ -73,6 +73,7 @@ class BeaconSlam:
         learned: what the readings of the last ``observe`` did.
         waiting: beacons that were heard and are not on the map yet, with the candidates for their places.
         levels: what the noise of each sensor and of the motion is, relative to the settings, in variance.
+        prior_sigmas: standard deviations of ``calibration`` before any reading, in its order.
         jumps: how often the pose was doubted.
         moved: beacons that had to be placed anew, each with the time_s of the reading that decided it.
     """
@@ -96,6 +97,7 @@ class BeaconSlam:
         self._shared = slice(v, v + len(shared))
         self._delay = v + len(shared) - 1 if delay else -1
         self._shown = POSE + len(shared)  # of the columns of a row, those before the beacon
+        self.prior_sigmas = (*own, *shared)
         self._names: tuple[str, ...] = (*self._motion.names, *self._sensors.names, *((DELAY,) if delay else ()))
         self._clock = DeadReckoning(is_delayed=bool(delay))
         self._map = BeaconMap(self.engine, self._shared)
