@@ -75,7 +75,8 @@ def filter_run(
         scalar_s=np.array(book.scalar_s),
         updates=len(book.nis),
         warnings=(
-            *(f"beacon {name} could not be placed: its readings leave two places or none" for name in lost),
+            *_lost(run, lost),
+            *_unplaced(slam.unplaced),
             *beyond_priors(calibration, priors, run.kind),
             *_moved(slam.moved),
             *_doubts(nis, sizes, book.refused, slam.jumps),
@@ -133,6 +134,20 @@ def _doubts(nis: FloatArray, sizes: FloatArray, refused: int, jumps: int) -> Ite
         yield f"{refused} of {nis.size + refused} readings were refused: do they belong to this odometry?"
 
 
+def _lost(run: RecordedRun, names: Sequence[str]) -> Iterator[str]:
+    """Beacons that are not on the map, and why, a line each."""
+    r = run.readings
+    ranged = {run.beacon_ids[k] for k in np.unique(r.beacon[np.isfinite(r.range_m) | np.isfinite(r.rssi_dbm)])}
+    for name in names:
+        why = "its readings leave two places or none" if name in ranged else "only bearings of it were heard, no range"
+        yield f"beacon {name} could not be placed: {why}"
+
+
+def _unplaced(count: int) -> Iterator[str]:
+    if count:
+        yield f"{count} bearings had no range or strength of the same time and came before their beacon was placed: unused"
+
+
 def _moved(moved: Sequence[tuple[BeaconId, float]]) -> Iterator[str]:
     """Beacons that were placed anew, a line each: the map holds their last place."""
     for beacon in dict.fromkeys(beacon for beacon, _ in moved):
@@ -172,3 +187,5 @@ def _readings(run: RecordedRun) -> Iterator[Reading]:
                 yield RangeBearingReading(time_s, name, range_m, bearing)
         elif not math.isnan(rssi_dbm):
             yield RssiReading(time_s, name, rssi_dbm, bearing)
+        elif bearing is not None:
+            yield RangeBearingReading(time_s, name, math.nan, bearing)

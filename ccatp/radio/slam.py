@@ -19,7 +19,7 @@ from ccatp.radio.newcomers import Newcomers
 from ccatp.radio.noise_level import NoiseLevel
 from ccatp.radio.readings import BeaconId, Reading
 from ccatp.radio.settling import derivatives
-from ccatp.radio.sightings import Sensors, bearing_of, kind_of, strength_of
+from ccatp.radio.sightings import Sensors, bearing_of, is_direction, kind_of, strength_of
 from ccatp.radio.slam_settings import SlamSettings, Wander
 from ccatp.radio.transport import HEADING, Transport
 
@@ -75,6 +75,7 @@ class BeaconSlam:
         levels: what the noise of each sensor and of the motion is, relative to the settings, in variance.
         prior_sigmas: standard deviations of ``calibration`` before any reading, in its order.
         jumps: how often the pose was doubted.
+        unplaced: directions alone, of beacons that were not on the map then: they are not used.
         moved: beacons that had to be placed anew, each with the time_s of the reading that decided it.
     """
 
@@ -108,7 +109,7 @@ class BeaconSlam:
         self._learns = trust.learn_memory > 0.0
         self._fresh = FreshNoise()
         self._gate, self._knee = trust.gate_sigmas**2, trust.knee_sigmas
-        self._doubts, self.jumps = Doubts(trust.doubt_pose_after), 0
+        self._doubts, self.jumps, self.unplaced = Doubts(trust.doubt_pose_after), 0, 0
         self.moved: list[tuple[BeaconId, float]] = []
         self._way_m = 0.0
         self._newcomers = Newcomers(
@@ -178,11 +179,13 @@ class BeaconSlam:
         self.learned = []
         for reading in readings:
             entry, before = self._map.get(reading.beacon), self.engine.mean.copy()
-            if entry is None:
+            if entry is None and is_direction(reading):
+                self.unplaced += 1  # it may lie anywhere along it
+            elif entry is None:
                 self._newcomers.meet(reading)
             else:
                 self.learned.append(self._update(reading, entry))
-                if entry.on_trial and reading.beacon not in self._map:
+                if entry.on_trial and reading.beacon not in self._map and not is_direction(reading):
                     before = self.engine.mean.copy()
                     self._newcomers.meet(reading)
             self._follow(before)
@@ -213,8 +216,8 @@ class BeaconSlam:
         self._map.leave(beacon)
 
     def _update(self, reading: Reading, entry: Entry) -> Learned:
-        """Bearing first, which says whether it is the beacon at all; then the range or the strength."""
-        model = self._sensors.wander(reading)
+        """Bearing first, which says whether it is the beacon at all; then the range or strength, if any."""
+        model = None if is_direction(reading) else self._sensors.wander(reading)
         if model is not None:
             self._map.wander_to(reading.beacon, model, self._way_m, reading.time_s)
         bearing = bearing_of(reading)
@@ -222,7 +225,7 @@ class BeaconSlam:
         if bearing is not None:
             found = self._take(reading, entry, "bearing", bearing, model)
             residuals, nis, spread = [found.residual], found.nis, found.spread
-        if found is None or found.accepted:
+        if found is None or (found.accepted and not is_direction(reading)):
             found = self._take(reading, entry, kind_of(reading), strength_of(reading), model)
             residuals.append(found.residual)
             nis += found.nis

@@ -10,7 +10,7 @@ from ccatp.config.recording_loader import load_recordings_config
 from ccatp.radio.assumed import slam_settings
 from ccatp.radio.causal import filter_run
 from ccatp.radio.judged import judge
-from ccatp.radio.recording import RecordedRun
+from ccatp.radio.recording import Readings, RecordedRun
 from ccatp.radio.track import Track
 from ccatp.radio_data.checks import suspicions
 from tests.unit.radio_data.sets import recorded, world
@@ -64,6 +64,32 @@ def test_names_that_are_misread_now_and_then_do_not_cost_the_map(seed: int) -> N
     assert found.trajectory_rmse_m < 0.1
     assert found.beacon_rmse_m is not None
     assert found.beacon_rmse_m < 0.15
+
+
+def test_bearings_of_times_of_their_own_are_used_once_their_beacon_is_placed() -> None:
+    run = recorded(world(3, 120.0, range_sigma_m=0.3))
+    r = run.readings
+    nothing = np.full(len(r.times_s), np.nan)
+    both = Readings(
+        np.concatenate([r.times_s, r.times_s + 0.01]), np.tile(r.beacon, 2), np.concatenate([r.range_m, nothing]),
+        np.concatenate([nothing, r.bearing_rad]), np.tile(nothing, 2),
+    )  # fmt: skip
+    apart = replace(run, readings=both.where(np.argsort(both.times_s, kind="stable")))
+    ranges = replace(run, readings=r._replace(bearing_rad=nothing))
+    track, without = track_of(apart), track_of(ranges)
+    assert track.updates > 1.3 * without.updates
+    assert np.median(track.covariances[:, 2, 2]) < 0.5 * np.median(without.covariances[:, 2, 2])
+    found = judge(track, apart)
+    assert found.trajectory_rmse_m is not None
+    assert found.trajectory_rmse_m < 0.2
+    assert any("bearings had no range or strength of the same time and came before" in w for w in track.warnings)
+
+
+def test_a_beacon_of_which_only_bearings_were_heard_is_told_so() -> None:
+    run = recorded(world(3, 20.0))
+    blind = run.readings._replace(range_m=np.full(len(run.readings.times_s), np.nan))
+    told = track_of(replace(run, readings=blind)).warnings
+    assert "beacon 6 could not be placed: only bearings of it were heard, no range" in told
 
 
 def test_beacons_that_are_exchanged_on_the_way_are_told() -> None:
