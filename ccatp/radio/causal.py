@@ -145,7 +145,7 @@ def _lost(run: RecordedRun, names: Sequence[str]) -> Iterator[str]:
 
 def _unplaced(count: int) -> Iterator[str]:
     if count:
-        yield f"{count} bearings had no range or strength of the same time and came before their beacon was placed: unused"
+        yield f"{count} bearings had no range or strength of the same time and came before their beacon was placed"
 
 
 def _moved(moved: Sequence[tuple[BeaconId, float]]) -> Iterator[str]:

@@ -10,7 +10,7 @@ from ccatp.config.recording_loader import load_recordings_config
 from ccatp.radio.assumed import slam_settings
 from ccatp.radio.causal import filter_run
 from ccatp.radio.judged import judge
-from ccatp.radio.recording import Readings, RecordedRun
+from ccatp.radio.recording import Readings, RecordedRun, Truth
 from ccatp.radio.track import Track
 from ccatp.radio_data.checks import suspicions
 from tests.unit.radio_data.sets import recorded, world
@@ -90,6 +90,16 @@ def test_a_beacon_of_which_only_bearings_were_heard_is_told_so() -> None:
     blind = run.readings._replace(range_m=np.full(len(run.readings.times_s), np.nan))
     told = track_of(replace(run, readings=blind)).warnings
     assert "beacon 6 could not be placed: only bearings of it were heard, no range" in told
+
+
+def test_no_nees_where_the_truth_did_not_tell_the_first_pose() -> None:
+    run = recorded(world(seconds=20.0))
+    track = track_of(run)
+    assert judge(track, run).nees is not None
+    assert run.truth is not None
+    late = replace(run, truth=Truth(*(column[50:] for column in run.truth)))
+    assert judge(track, late).nees is None
+    assert judge(track, late).trajectory_rmse_m is not None
 
 
 def test_beacons_that_are_exchanged_on_the_way_are_told() -> None:
