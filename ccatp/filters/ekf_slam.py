@@ -1,6 +1,7 @@
 """Pure. Extended Kalman filter over a vehicle, a shared calibration and a map that grows and shrinks, on arrays."""
 
 from collections.abc import Callable, Hashable, Sequence
+from copy import copy
 from math import inf, sqrt
 from typing import NamedTuple
 
@@ -107,6 +108,14 @@ class EkfSlam:
         covariance = np.ascontiguousarray(covariance)
         self.mean, self.covariance, self._transposed = mean, covariance, covariance.T
         self._rows, self._columns, self._vehicle = covariance[:v], covariance[:, :v], mean[:v]
+
+    def __deepcopy__(self, memo: dict[int, object]) -> "EkfSlam":
+        """A filter of its own, its views upon its own state."""
+        other = copy(self)
+        other._blocks = dict(self._blocks)
+        other._take(self.mean.copy(), self.covariance.copy())
+        memo[id(self)] = other
+        return other
 
     @property
     def size(self) -> int:

@@ -35,6 +35,7 @@ class Entry:
         way_m, time_s: of the vehicle when the wandering error was last looked at.
         fresh: variance of what is new in the wandering error, in sigmas squared.
         refused: readings in a row that were not believed.
+        on_trial: readings that must still agree with the one it joined by; 0: it is believed in.
     """
 
     columns: Columns
@@ -44,6 +45,7 @@ class Entry:
     time_s: float = 0.0
     fresh: float = 1.0
     refused: int = 0
+    on_trial: int = 0
 
 
 class BeaconMap:

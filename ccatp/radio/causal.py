@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ccatp.filters.base import FloatArray
+from ccatp.radio.calibration_doubts import beyond_priors, learned
+from ccatp.radio.lost_heading import LostHeading
 from ccatp.radio.motion import Increment
-from ccatp.radio.readings import RangeBearingReading, RangeReading, Reading, RssiReading
+from ccatp.radio.readings import BeaconId, RangeBearingReading, RangeReading, Reading, RssiReading
 from ccatp.radio.recording import RecordedRun, Steps
 from ccatp.radio.slam import BeaconSlam, Learned
 from ccatp.radio.slam_settings import SlamSettings
@@ -36,7 +38,7 @@ def filter_run(
         clock_s: tells wall time, s.
     """
     position, heading = first_sigmas
-    slam = BeaconSlam(settings, run.first_pose, np.diag((position**2, position**2, heading**2)))
+    search = LostHeading(BeaconSlam(settings, run.first_pose, np.diag((position**2, position**2, heading**2))))
     times = np.union1d(_spaced(run.steps.times_s), run.readings.times_s)
     increments, readings = _increments(run.steps, times), _Heard(run)
     poses, covariances = np.empty((len(times), 3)), np.empty((len(times), 3, 3))
@@ -44,15 +46,18 @@ def filter_run(
     for k, time_s in enumerate(times.tolist()):
         begin_s = clock_s()
         if k:
-            slam.predict(increments[k - 1])
+            search.predict(increments[k - 1])
         predicted_s = clock_s()
         book.predict_s.append(predicted_s - begin_s)
         if now := readings.until(time_s):
-            learned = slam.observe(now)
+            taken = search.observe(now)
             end_s = clock_s()
-            book.observed(learned, len(now), end_s - begin_s, end_s - predicted_s)
-        poses[k], covariances[k] = slam.pose, slam.pose_covariance
+            book.observed(taken, len(now), end_s - begin_s, end_s - predicted_s)
+        poses[k], covariances[k] = search.best.pose, search.best.pose_covariance
+    slam = search.best
     nis, sizes = np.array(book.nis), np.array(book.sizes, dtype=np.float64)
+    priors = dict(zip(slam.calibration, slam.prior_sigmas, strict=True))
+    calibration = learned({name: Calibrated(*found) for name, found in slam.calibration.items()}, priors)
     lost = [name for name in run.beacon_ids if name not in slam.beacons]
     return Track(
         times_s=times,
@@ -61,7 +66,7 @@ def filter_run(
         beacons={
             str(b): BeaconFix(float(e.mean[0]), float(e.mean[1]), e.covariance[:2, :2]) for b, e in slam.beacons.items()
         },
-        calibration={name: Calibrated(*found) for name, found in slam.calibration.items()},
+        calibration=calibration,
         nis=nis,
         nis_sizes=sizes,
         refused=book.refused,
@@ -70,7 +75,10 @@ def filter_run(
         scalar_s=np.array(book.scalar_s),
         updates=len(book.nis),
         warnings=(
-            *(f"beacon {name} could not be placed: its readings leave two places or none" for name in lost),
+            *_lost(run, lost),
+            *_unplaced(slam.unplaced),
+            *beyond_priors(calibration, priors, run.kind),
+            *_moved(slam.moved),
             *_doubts(nis, sizes, book.refused, slam.jumps),
         ),
     )
@@ -126,6 +134,27 @@ def _doubts(nis: FloatArray, sizes: FloatArray, refused: int, jumps: int) -> Ite
         yield f"{refused} of {nis.size + refused} readings were refused: do they belong to this odometry?"
 
 
+def _lost(run: RecordedRun, names: Sequence[str]) -> Iterator[str]:
+    """Beacons that are not on the map, and why, a line each."""
+    r = run.readings
+    ranged = {run.beacon_ids[k] for k in np.unique(r.beacon[np.isfinite(r.range_m) | np.isfinite(r.rssi_dbm)])}
+    for name in names:
+        why = "its readings leave two places or none" if name in ranged else "only bearings of it were heard, no range"
+        yield f"beacon {name} could not be placed: {why}"
+
+
+def _unplaced(count: int) -> Iterator[str]:
+    if count:
+        yield f"{count} bearings had no range or strength of the same time and came before their beacon was placed"
+
+
+def _moved(moved: Sequence[tuple[BeaconId, float]]) -> Iterator[str]:
+    """Beacons that were placed anew, a line each: the map holds their last place."""
+    for beacon in dict.fromkeys(beacon for beacon, _ in moved):
+        times = ", ".join(f"{time_s:.1f}" for name, time_s in moved if name == beacon)
+        yield f"beacon {beacon} was placed anew at {times} s: was it moved, or exchanged for another?"
+
+
 def _spaced(times_s: FloatArray) -> FloatArray:
     """The first time, the last, and between them the first of each span of ``FINEST_S``."""
     _, first = np.unique(np.floor((times_s - times_s[0]) / FINEST_S), return_index=True)
@@ -135,13 +164,13 @@ def _spaced(times_s: FloatArray) -> FloatArray:
 def _increments(steps: Steps, times_s: FloatArray) -> list[Increment]:
     """Odometry between the times, steps cut where readings fall."""
 
-    def shares(amounts: FloatArray) -> list[float]:
-        total = np.concatenate([[0.0], np.cumsum(amounts)])
+    def shares(amounts: FloatArray | float) -> list[float]:
+        total = np.concatenate([[0.0], np.cumsum(np.broadcast_to(amounts, steps.distance_m.shape))])
         shared: list[float] = np.diff(np.interp(times_s, steps.times_s, total)).tolist()
         return shared
 
     columns = (times_s[1:].tolist(), np.diff(times_s).tolist())
-    amounts = (shares(steps.distance_m), shares(steps.turn_rad), shares(steps.lateral_m))
+    amounts = map(shares, steps[1:])
     return [Increment(*row) for row in zip(*columns, *amounts, strict=True)]
 
 
@@ -158,3 +187,5 @@ def _readings(run: RecordedRun) -> Iterator[Reading]:
                 yield RangeBearingReading(time_s, name, range_m, bearing)
         elif not math.isnan(rssi_dbm):
             yield RssiReading(time_s, name, rssi_dbm, bearing)
+        elif bearing is not None:
+            yield RangeBearingReading(time_s, name, math.nan, bearing)

@@ -112,5 +112,10 @@ def _split(step: Odometry, part: float) -> tuple[Odometry, Odometry]:
 
 def _scaled(step: Increment, part: float) -> Increment:
     return replace(
-        step, distance_m=part * step.distance_m, turn_rad=part * step.turn_rad, lateral_m=part * step.lateral_m
+        step,
+        distance_m=part * step.distance_m,
+        turn_rad=part * step.turn_rad,
+        lateral_m=part * step.lateral_m,
+        guess_m2=part * step.guess_m2,
+        guess_rad2=part * step.guess_rad2,
     )

@@ -16,6 +16,8 @@ LONGEST_GAP_S = 0.5
 USUAL_GAPS = 3.0
 """or no further than that many of its usual intervals."""
 
+FIRST_POSE_S = 1.0
+"""The truth's first row tells the first pose if it comes no later than that."""
 LEAST_KNOWN = 3
 """Instants with a truth: one always fits, and two but for their distance."""
 
@@ -29,7 +31,8 @@ class Judgement(NamedTuple):
         heading_rmse_rad: of the aligned headings.
         beacon_rmse_m: of the beacons, moved by the same alignment.
         beacon_errors_m: by name.
-        nees: of the poses as they are, without alignment; positions alone if the truth has no headings.
+        nees: of the poses as they are, without alignment; positions alone if the truth has no headings; None where the
+            first pose was not the truth's of that time.
         nis: of the innovations.
         errors_m: of each aligned position, shape (n,); NaN where there is no truth.
     """
@@ -73,7 +76,7 @@ def judge(track: Track, run: RecordedRun) -> Judgement:
         heading_rmse_rad=rms(headings),
         beacon_rmse_m=rms(offsets) if measurable else None,
         beacon_errors_m=dict(zip(common, offsets.tolist(), strict=True)) if measurable else {},
-        nees=_nees(track, truth, known),
+        nees=_nees(track, truth, known) if _begins_on_truth(run) else None,
         nis=consistency(track.nis, track.nis_sizes),
         errors_m=errors,
     )
@@ -96,6 +99,13 @@ def aligned_beacons(track: Track, alignment: RigidMotion) -> dict[str, BeaconFix
         ((x, y),) = alignment.moved(np.array([(fix.x_m, fix.y_m)])).tolist()
         moved[name] = BeaconFix(x, y, alignment.turned(fix.covariance))
     return moved
+
+
+def _begins_on_truth(run: RecordedRun) -> bool:
+    """Whether the truth told the first pose: else track and truth are of two frames."""
+    if run.truth is None:
+        return False
+    return bool(run.truth.times_s[0] - FIRST_POSE_S <= run.steps.times_s[0] <= run.truth.times_s[-1])
 
 
 def _nees(track: Track, truth: FloatArray, known: np.ndarray) -> Consistency | None:

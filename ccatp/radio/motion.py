@@ -31,6 +31,8 @@ class Increment:
         distance_m: along the arc.
         turn_rad: change of heading, counter-clockwise.
         lateral_m: to the left; zero for wheels that do not slip.
+        guess_m2: variance of x and of y at its end, because the odometry was silent and the way is guessed.
+        guess_rad2: the same of the turn.
     """
 
     time_s: float
@@ -38,6 +40,8 @@ class Increment:
     distance_m: float
     turn_rad: float
     lateral_m: float = 0.0
+    guess_m2: float = 0.0
+    guess_rad2: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

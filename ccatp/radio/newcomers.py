@@ -17,10 +17,14 @@ from ccatp.radio.sightings import Row, Sensors, bearing_of, kind_of, strength_of
 
 FLAT = 100.0
 """Standard deviation of a beacon's place before its readings, relative to its distance: they alone place it."""
+TRIAL = 2
+"""Readings that must agree with the one that a beacon joined by: a misread name would put it anywhere."""
 
 
 class Newcomers:
     """With a bearing a beacon joins at once, where range and bearing say; without one its readings wait.
+
+    One that joined at once is on trial: if one of its next ``TRIAL`` readings is refused, it begins anew with that one.
 
     Args:
         engine: the state.
@@ -71,10 +75,11 @@ class Newcomers:
         if bearing is not None:
             pose = self.carried(self._engine.mean, reading).pose
             way = pose[2] + bearing
-            self._map.join(
+            entry = self._map.join(
                 reading.beacon,
                 *self._prior(reading, reach_m, pose[0] + reach_m * cos(way), pose[1] + reach_m * sin(way)),
             )
+            entry.on_trial = TRIAL
             self._settle(reading)
             return
         waiting = self.waiting.setdefault(reading.beacon, Waiting(reading.beacon))

@@ -14,6 +14,8 @@ from ccatp.radio.path_loss import PathLoss
 LEAST_EXPONENT = 0.1  # free space has 2; levels that hardly fall tell no distance
 LEAST_PLACES = 3  # two unknowns and one to tell the spread
 _PLAUSIBLE_EXPONENT = (1.0, 6.0)  # a corridor that guides waves has 1.2, a building with walls in the way up to 6
+_LOUDEST_DBM = -10.0  # 20 dBm sent are -20 dBm at 1 m in free space, at 2.4 GHz
+_EXACT_DB = 1e-6
 _FAR_OFF = 3.5  # studentised residual of a place that wants a second look
 
 
@@ -101,6 +103,13 @@ class PathLossFit:
                 f"exponent {self.exponent:.2f} is outside {low:g} to {high:g}: are the distances in metres, "
                 "and do the levels belong to them?"
             )
+        if self.reference_dbm > _LOUDEST_DBM:
+            found.append(
+                f"reference level {self.reference_dbm:.1f} dBm is above {_LOUDEST_DBM:g} dBm, more than "
+                "a radio of 20 dBm is heard with: are the distances in metres?"
+            )
+        if self.sigma_db < _EXACT_DB:
+            found.append("levels lie on a line exactly: they were computed, not measured, and the widths mean nothing")
         for distance_m, residual_db, size in zip(self.distances_m, self.residuals_db, self._studentised(), strict=True):
             if abs(size) > _FAR_OFF:
                 found.append(f"level at {distance_m:g} m is {residual_db:+.1f} dB off the line; look at it again")

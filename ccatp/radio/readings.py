@@ -27,7 +27,7 @@ class RangeBearingReading:
     Attributes:
         time_s: when it was taken.
         beacon: which one was seen.
-        range_m: what was read, m.
+        range_m: what was read, m; NaN where the direction alone was.
         bearing_rad: from the vehicle's heading, counter-clockwise.
     """
 

@@ -19,12 +19,17 @@ class Steps(NamedTuple):
         distance_m: forward travel within a step, m, shape (n,).
         turn_rad: turn within a step, counter-clockwise, rad, shape (n,).
         lateral_m: travel to the left within a step, m, shape (n,); zeros for wheels that do not slip.
+        guess_m2: variance of the end of a step, along and across, where the odometry was silent and the way is guessed,
+            m^2, shape (n,); 0.0: none is.
+        guess_rad2: the same of its turn, rad^2.
     """
 
     times_s: FloatArray
     distance_m: FloatArray
     turn_rad: FloatArray
     lateral_m: FloatArray
+    guess_m2: FloatArray | float = 0.0
+    guess_rad2: FloatArray | float = 0.0
 
 
 class Readings(NamedTuple):

@@ -1,9 +1,9 @@
 """Pure. What a reading of a beacon should be, with its derivatives: ranges, bearings, signal strengths."""
 
-from math import atan2, log, log10, sqrt
+from math import atan2, isnan, log, log10, sqrt
 from typing import NamedTuple
 
-from ccatp.radio.readings import RangeReading, Reading, RssiReading
+from ccatp.radio.readings import RangeBearingReading, RangeReading, Reading, RssiReading
 from ccatp.radio.slam_settings import BearingModel, RangeModel, RssiModel, SlamSettings, Wander
 
 LEAST_RANGE_M = 1e-3
@@ -143,6 +143,11 @@ class Sensors:
 def bearing_of(reading: Reading) -> float | None:
     """The bearing of a reading, rad; None where it has none."""
     return None if isinstance(reading, RangeReading) else reading.bearing_rad
+
+
+def is_direction(reading: Reading) -> bool:
+    """Whether it has a bearing and nothing else."""
+    return isinstance(reading, RangeBearingReading) and isnan(reading.range_m)
 
 
 def strength_of(reading: Reading) -> float:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import sqrt
+from math import log, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -14,14 +14,14 @@ from ccatp.radio.beacon_map import BeaconMap, Entry
 from ccatp.radio.dead_reckoning import DeadReckoning
 from ccatp.radio.doubts import Doubts
 from ccatp.radio.fresh_noise import FreshNoise
-from ccatp.radio.motion import POSE, DifferentialDrive, Odometry, Pose
+from ccatp.radio.motion import POSE, DifferentialDrive, Increment, Odometry, Pose
 from ccatp.radio.newcomers import Newcomers
 from ccatp.radio.noise_level import NoiseLevel
 from ccatp.radio.readings import BeaconId, Reading
 from ccatp.radio.settling import derivatives
-from ccatp.radio.sightings import Sensors, bearing_of, kind_of, strength_of
+from ccatp.radio.sightings import Sensors, bearing_of, is_direction, kind_of, strength_of
 from ccatp.radio.slam_settings import SlamSettings, Wander
-from ccatp.radio.transport import Transport
+from ccatp.radio.transport import HEADING, Transport
 
 DELAY = "odometry_delay_s"
 
@@ -48,6 +48,7 @@ class Learned(NamedTuple):
         nis: nu^T S^-1 nu, with the larger noise where a reading was beyond the knee.
         size: m; a reading whose bearing is refused has its range left out.
         accepted: False where it was refused; the state is then as before, or has taken the bearing alone.
+        surprise: minus twice its log-likelihood, up to a constant: sum of nis + ln S.
     """
 
     beacon: BeaconId
@@ -55,6 +56,7 @@ class Learned(NamedTuple):
     nis: float
     size: int
     accepted: bool
+    surprise: float = 0.0
 
 
 class BeaconSlam:
@@ -71,7 +73,10 @@ class BeaconSlam:
         learned: what the readings of the last ``observe`` did.
         waiting: beacons that were heard and are not on the map yet, with the candidates for their places.
         levels: what the noise of each sensor and of the motion is, relative to the settings, in variance.
+        prior_sigmas: standard deviations of ``calibration`` before any reading, in its order.
         jumps: how often the pose was doubted.
+        unplaced: directions alone, of beacons that were not on the map then: they are not used.
+        moved: beacons that had to be placed anew, each with the time_s of the reading that decided it.
     """
 
     def __init__(
@@ -93,6 +98,7 @@ class BeaconSlam:
         self._shared = slice(v, v + len(shared))
         self._delay = v + len(shared) - 1 if delay else -1
         self._shown = POSE + len(shared)  # of the columns of a row, those before the beacon
+        self.prior_sigmas = (*own, *shared)
         self._names: tuple[str, ...] = (*self._motion.names, *self._sensors.names, *((DELAY,) if delay else ()))
         self._clock = DeadReckoning(is_delayed=bool(delay))
         self._map = BeaconMap(self.engine, self._shared)
@@ -103,7 +109,8 @@ class BeaconSlam:
         self._learns = trust.learn_memory > 0.0
         self._fresh = FreshNoise()
         self._gate, self._knee = trust.gate_sigmas**2, trust.knee_sigmas
-        self._doubts, self.jumps = Doubts(trust.doubt_pose_after), 0
+        self._doubts, self.jumps, self.unplaced = Doubts(trust.doubt_pose_after), 0, 0
+        self.moved: list[tuple[BeaconId, float]] = []
         self._way_m = 0.0
         self._newcomers = Newcomers(
             self.engine, self._sensors, self._map, self._clock, self.levels, self._shared, self._delay
@@ -152,6 +159,8 @@ class BeaconSlam:
         if self._learns:
             Q = Q * self.levels["motion"].factor
             self._fresh.step(F, Q)
+        if isinstance(odometry, Increment) and odometry.guess_m2 > 0.0:
+            Q = _with_guess(Q, odometry)
         engine.predict(mean, F, Q)
         self._way_m += self._clock.took(odometry, before, mean)
         rest = self._motion.at_rest(odometry) if isinstance(self._motion, DifferentialDrive) else None
@@ -170,10 +179,15 @@ class BeaconSlam:
         self.learned = []
         for reading in readings:
             entry, before = self._map.get(reading.beacon), self.engine.mean.copy()
-            if entry is None:
+            if entry is None and is_direction(reading):
+                self.unplaced += 1  # it may lie anywhere along it
+            elif entry is None:
                 self._newcomers.meet(reading)
             else:
                 self.learned.append(self._update(reading, entry))
+                if entry.on_trial and reading.beacon not in self._map and not is_direction(reading):
+                    before = self.engine.mean.copy()
+                    self._newcomers.meet(reading)
             self._follow(before)
         return self.learned
 
@@ -181,6 +195,13 @@ class BeaconSlam:
         """The covariance follows a correction of the state."""
         if self._transport is not None:
             self._transport.follow(before)
+
+    def told_heading(self, off_rad: float, sigma_rad: float) -> float:
+        """Take a heading that is ``off_rad`` from the one that is thought, and tells the NIS of that."""
+        before = self.engine.mean.copy()
+        found = self.engine.update_row(np.array((HEADING,)), np.ones(1), off_rad, sigma_rad**2)
+        self._follow(before)
+        return found.nis
 
     def remove(self, beacon: BeaconId) -> None:
         """Forget a beacon; one that is heard again begins anew.
@@ -195,23 +216,24 @@ class BeaconSlam:
         self._map.leave(beacon)
 
     def _update(self, reading: Reading, entry: Entry) -> Learned:
-        """Bearing first, which says whether it is the beacon at all; then the range or the strength."""
-        model = self._sensors.wander(reading)
+        """Bearing first, which says whether it is the beacon at all; then the range or strength, if any."""
+        model = None if is_direction(reading) else self._sensors.wander(reading)
         if model is not None:
             self._map.wander_to(reading.beacon, model, self._way_m, reading.time_s)
         bearing = bearing_of(reading)
-        residuals, nis, found = [], 0.0, None
+        residuals, nis, spread, found = [], 0.0, 1.0, None
         if bearing is not None:
             found = self._take(reading, entry, "bearing", bearing, model)
-            residuals, nis = [found.residual], found.nis
-        if found is None or found.accepted:
+            residuals, nis, spread = [found.residual], found.nis, found.spread
+        if found is None or (found.accepted and not is_direction(reading)):
             found = self._take(reading, entry, kind_of(reading), strength_of(reading), model)
             residuals.append(found.residual)
             nis += found.nis
+            spread *= found.spread
         if self._learns:
             self._fresh.clear()
-        self._judge(reading.beacon, entry, accepted=found.accepted)
-        return Learned(reading.beacon, np.array(residuals), nis, len(residuals), found.accepted)
+        self._judge(reading, entry, accepted=found.accepted)
+        return Learned(reading.beacon, np.array(residuals), nis, len(residuals), found.accepted, nis + log(spread))
 
     def _take(self, reading: Reading, entry: Entry, kind: str, z: float, model: Wander | None) -> RowUpdate:
         """One scalar of a reading."""
@@ -242,11 +264,15 @@ class BeaconSlam:
             self.levels["motion"].learn(found.nis, self._fresh.seen(h[0], h[1], h[2]) / found.spread)
         return found
 
-    def _judge(self, beacon: BeaconId, entry: Entry, *, accepted: bool) -> None:
+    def _judge(self, reading: Reading, entry: Entry, *, accepted: bool) -> None:
         """Refusals accuse the pose, or a beacon that alone is refused: the one is loosened, the other begins anew."""
         if accepted:
             entry.refused = 0
+            entry.on_trial = max(entry.on_trial - 1, 0)
             self._doubts.clear()
+            return
+        if entry.on_trial:
+            self._map.leave(reading.beacon)
             return
         entry.refused += 1
         trust = self.settings.trust
@@ -257,4 +283,12 @@ class BeaconSlam:
             self.engine.predict(self.engine.mean[:v].copy(), np.eye(v), np.diag(jump**2))
             self.jumps += 1
         if entry.refused >= trust.doubt_beacon_after:
-            self._map.leave(beacon)
+            self._map.leave(reading.beacon)
+            self.moved.append((reading.beacon, reading.time_s))
+
+
+def _with_guess(Q: FloatArray, odometry: Increment) -> FloatArray:
+    """The noise of a step whose way is guessed, which tells nothing of the noise of odometry."""
+    Q = Q.copy()
+    Q[range(POSE), range(POSE)] += odometry.guess_m2, odometry.guess_m2, odometry.guess_rad2
+    return Q

@@ -21,7 +21,12 @@ class BeaconFix(NamedTuple):
 
 
 class Calibrated(NamedTuple):
-    """A quantity found on the way: value and standard deviation."""
+    """A quantity found on the way.
+
+    Attributes:
+        value: positive where the sensor reads too much.
+        sigma: its standard deviation.
+    """
 
     value: float
     sigma: float

@@ -6,33 +6,31 @@ import numpy as np
 import numpy.typing as npt
 
 from ccatp.radio.recording import Readings, RecordedRun, Steps, Truth
-from ccatp.radio_data.cleaning import plural
-from ccatp.radio_data.truth import chords, turn_at, turning_factor, way_at
+from ccatp.radio_data.checks_of_readings import FEW, SCALE_WARNING, readings_against, unit_slip
+from ccatp.radio_data.cleaning import GAP_S, long_pauses, plural
+from ccatp.radio_data.truth import chords, guessed_between, turn_at, turning_factor, way_at
 
 FloatArray = npt.NDArray[np.float64]
-MANY_SIGMA = 1.4826  # of a Gaussian, over its median absolute deviation
-GAP_S = 2.0  # pauses shorter than that are how recorders work,
-GAP_RATIO = 20.0  # and so are those of a few usual intervals
 TRUTH_GAP_S = 1.0
 SAME = 0.01  # odometry is the truth itself if single steps agree to that part of their size
-SCALE_WARNING = 0.03
-OFFSET_WARNING_M = 0.1
 TURN_WARNING = 0.05
+STANDS = 0.01  # of what the other moves
+STANDS_M = 0.2
 LIKE = 0.3
 LEAST_TURNING_RAD2 = 0.1
 DEGREES = 180.0 / np.pi
 FASTEST_TURN_RAD_S = 10.0  # faster turning is a unit's fault
 FASTEST_M_S = 50.0
-STRANGER_M = 1.0  # readings of a beacon are strange if half of them miss its place by that,
-STRANGER_RATIO = 5.0  # and by that many times what the others miss
-FEW = 20
 
 
 def suspicions(run: RecordedRun) -> list[str]:
     """Everything that looks wrong, the most basic first."""
     found = [*_gaps(run), *_units(run), *_signs(run.readings)]
     if run.truth is not None:
-        found += [*_odometry_against(run.truth, run.steps), *_readings_against(run, run.truth)]
+        against = list(_standing(run.truth, run.steps)) or list(_odometry_against(run.truth, run.steps))
+        found += against
+        if not any(line.startswith("the truth never moves") for line in against):
+            found += readings_against(run, run.truth)
     found += _map_of(run)
     return found
 
@@ -42,16 +40,13 @@ def _gaps(run: RecordedRun) -> Iterator[str]:
     if run.truth is not None:
         columns.append(("truth", run.truth.times_s, TRUTH_GAP_S))
     for what, times_s, least_s in columns:
-        pauses = np.diff(times_s)
-        if not pauses.size:
-            continue
-        usual = float(np.median(pauses[pauses > 0.0])) if (pauses > 0.0).any() else 0.0
-        long = np.flatnonzero(pauses > max(least_s, GAP_RATIO * usual))
+        long, pauses = long_pauses(times_s, least_s), np.diff(times_s)
         if long.size:
             worst = int(long[np.argmax(pauses[long])])
+            guessed = "; the way there is guessed by the speed before" if what == "odometry" else ""
             yield (
                 f"{what}: {plural(long.size, 'gap')}, the longest of {pauses[worst]:.1f} s at {times_s[worst]:.3f} s "
-                f"(usual interval {usual:.3f} s)"
+                f"(usual interval {float(np.median(pauses[pauses > 0.0])):.3f} s){guessed}"
             )
 
 
@@ -101,12 +96,25 @@ def _odometry_against(truth: Truth, steps: Steps) -> Iterator[str]:
     true_way = np.hypot(np.diff(truth.x_m[rows]), np.diff(truth.y_m[rows]))
     half_turn = np.minimum(0.5 * np.abs(np.diff(turn_at(steps, t))), 1.0)
     chord = np.abs(way) * np.sinc(half_turn / np.pi)  # of the arc
+    told = ~guessed_between(steps, t)
+    true_way, chord = true_way[told], chord[told]
     if chord.sum() > 0.0:
         scale = float(true_way.sum() / chord.sum())
         if abs(scale - 1.0) > SCALE_WARNING:
-            unit = _unit_slip(scale, (("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048)))
+            unit = unit_slip(scale, (("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048)))
             yield f"odometry distance: true ways are {scale:.3g} times it{unit}"
     yield from _turning_against(truth, steps, rows)
+
+
+def _standing(truth: Truth, steps: Steps) -> Iterator[str]:
+    """One of the two drives, the other never moves."""
+    inside = (truth.times_s >= steps.times_s[0]) & (truth.times_s <= steps.times_s[-1])
+    extent_m = np.hypot(np.ptp(truth.x_m[inside]), np.ptp(truth.y_m[inside])) if inside.any() else 0.0
+    way_m = float(np.abs(steps.distance_m).sum() + np.abs(steps.lateral_m).sum())
+    if way_m < STANDS * extent_m:
+        yield f"odometry never moves ({way_m:.2g} m) while the truth gets {extent_m:.3g} m about: the right column?"
+    elif extent_m < STANDS * way_m and inside.sum() >= FEW and extent_m < STANDS_M < way_m:
+        yield f"the truth never moves ({extent_m:.2g} m) while the odometry travels {way_m:.3g} m: is it of this run?"
 
 
 def _copied_odometry(truth: Truth, steps: Steps) -> Iterator[str]:
@@ -153,83 +161,8 @@ def _turns(scale: float, likeness: float) -> Iterator[str]:
     elif likeness < LIKE:
         yield f"odometry turns have little to do with the truth (correlation {likeness:.2f})"
     elif abs(scale - 1.0) > TURN_WARNING:
-        unit = _unit_slip(scale, (("degrees", 1.0 / DEGREES),))
+        unit = unit_slip(scale, (("degrees", 1.0 / DEGREES),))
         yield f"odometry turns: true turns are {scale:.3g} times them{unit or ' (track of the wheels?)'}"
-
-
-def _unit_slip(scale: float, units: tuple[tuple[str, float], ...]) -> str:
-    near = [name for name, factor in units if abs(scale / factor - 1.0) < 0.15]
-    return f": are they in {near[0]}?" if near else ""
-
-
-def _readings_against(run: RecordedRun, truth: Truth) -> Iterator[str]:
-    placed = np.array([run.beacon_truth_m.get(name, (np.nan, np.nan)) for name in run.beacon_ids]).reshape(-1, 2)
-    r = run.readings
-    t = r.times_s
-    inside = (t >= truth.times_s[0]) & (t <= truth.times_s[-1]) & np.isfinite(r.range_m)
-    inside &= np.isfinite(placed[r.beacon, 0])
-    if inside.sum() < FEW:
-        return
-    pose = np.column_stack([np.interp(t[inside], truth.times_s, column) for column in (truth.x_m, truth.y_m)])
-    beacon, read = r.beacon[inside], r.range_m[inside]
-    true = np.hypot(*(placed[beacon] - pose).T)
-    yield from _unlike(run.beacon_ids, placed, pose, beacon, read)
-    scale, offset = _robust_line(true, read)
-    unit = _unit_slip(1.0 / scale if scale else 0.0, (("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048)))
-    if unit:
-        yield f"ranges read {scale:.4g} times the truth{unit}"
-    elif abs(scale - 1.0) > SCALE_WARNING:
-        yield f"ranges read {100.0 * (scale - 1.0):+.1f} per cent and {offset:+.2f} m off (fit to the truth)"
-    elif abs(offset) > OFFSET_WARNING_M:
-        yield f"ranges read {offset:+.2f} m off (fit to the truth)"
-    bearing = r.bearing_rad[inside]
-    if np.isfinite(truth.heading_rad).all() and np.isfinite(bearing).sum() >= FEW:
-        heading = np.interp(t[inside], truth.times_s, truth.heading_rad)
-        to = placed[beacon] - pose
-        off = bearing - np.arctan2(to[:, 1], to[:, 0]) + heading
-        mean = np.mean(np.exp(1j * off[np.isfinite(off)]))
-        if abs(mean) > 0.5 and abs(np.angle(mean)) > 0.05:
-            yield f"bearings read {float(np.angle(mean)):+.3f} rad off (against the truth)"
-
-
-def _robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
-    """Slope and offset of y over x, outliers left out by and by."""
-    keep = np.ones(x.size, dtype=bool)
-    slope, offset = 1.0, 0.0
-    for _ in range(5):
-        slope, offset = np.polyfit(x[keep], y[keep], 1).tolist()
-        residual = y - slope * x - offset
-        sigma = MANY_SIGMA * float(np.median(np.abs(residual - np.median(residual))))
-        keep = np.abs(residual) <= max(3.0 * sigma, 1e-9)
-    return slope, offset
-
-
-def _unlike(
-    names: tuple[str, ...], placed: FloatArray, pose: FloatArray, beacon: npt.NDArray[np.int64], read: FloatArray
-) -> Iterator[str]:
-    """Beacons whose readings do not fit their surveyed place, and whose place they do fit."""
-    count = len(names)
-    miss = np.full((count, count), np.nan)  # of the readings of one, at the place of another
-    for k in range(count):
-        rows = beacon == k
-        if rows.sum() < FEW:
-            continue
-        for other in np.flatnonzero(np.isfinite(placed[:, 0])).tolist():
-            miss[k, other] = np.median(np.abs(read[rows] - np.hypot(*(placed[other] - pose[rows]).T)))
-    own = np.diag(miss)
-    if not np.isfinite(own).any():
-        return
-    usual = float(np.nanquantile(own, 0.25))  # most may be wrong
-    strange = [k for k in range(count) if own[k] > max(STRANGER_M, STRANGER_RATIO * usual)]
-    fits = {k: int(np.nanargmin(miss[k])) for k in strange if np.nanmin(miss[k]) < 0.3 * own[k]}
-    for k in strange:
-        if k in fits and fits.get(fits[k]) == k:
-            if k < fits[k]:
-                yield f"beacons {names[k]} and {names[fits[k]]} look exchanged: each one's ranges fit the other's place"
-        elif k in fits:
-            yield f"ranges of beacon {names[k]} fit the place of {names[fits[k]]}, not its own (by {own[k]:.1f} m)"
-        else:
-            yield f"ranges of beacon {names[k]} miss its surveyed place by {own[k]:.1f} m (half of them)"
 
 
 def _map_of(run: RecordedRun) -> Iterator[str]:

@@ -8,6 +8,8 @@ import numpy.typing as npt
 from ccatp.radio_data.text_table import Table
 
 FloatArray = npt.NDArray[np.float64]
+GAP_S = 2.0  # pauses shorter than that are how recorders work,
+GAP_RATIO = 20.0  # and so are those of a few usual intervals
 
 
 def plural(count: int, what: str) -> str:
@@ -81,3 +83,27 @@ def within(times_s: FloatArray, span_s: tuple[float, float], what: str, warnings
 def listed(names: Sequence[str], most: int = 8) -> str:
     """``6, 7, 8``, shortened where there are many."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def long_pauses(times_s: FloatArray, least_s: float = GAP_S) -> npt.NDArray[np.int64]:
+    """Where a recording pauses: the rows after which nothing comes for longer than is usual."""
+    pauses = np.diff(times_s)
+    if not (pauses > 0.0).any():
+        return np.empty(0, dtype=np.int64)
+    usual_s = float(np.median(pauses[pauses > 0.0]))
+    return np.asarray(np.flatnonzero(pauses > max(least_s, GAP_RATIO * usual_s)), dtype=np.int64)
+
+
+def with_unknown_ways(table: Table, warnings: list[str]) -> Table:
+    """Odometry by increments: rows with a time and no finite way keep the time, the way is NaN; tells how many."""
+    dumb = np.isfinite(table.values[:, 0]) & ~np.isfinite(table.values).all(axis=1)
+    if not dumb.any():
+        return table
+    first = int(table.lines[np.flatnonzero(dumb)[0]])
+    warnings.append(
+        f"{table.file.name}:{first}: {plural(int(dumb.sum()), 'row')} not finite (the first here): the way there is "
+        "guessed by the speed before"
+    )
+    values = table.values.copy()
+    values[dumb, 1:] = np.nan
+    return Table(table.file, values, table.lines)

@@ -1,14 +1,16 @@
 """Edge. The CSV of our own: an event a line, for recordings of any vehicle among any beacons."""
 
+import csv
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ccatp.radio.recording import Readings, RecordedRun, Steps, Truth
-from ccatp.radio_data.cleaning import in_order, within
+from ccatp.radio_data.bridging import bridged
+from ccatp.radio_data.cleaning import in_order, plural, with_unknown_ways, within
 from ccatp.radio_data.errors import RadioDataError
-from ccatp.radio_data.text_table import Table, content_lines, number, read_text
+from ccatp.radio_data.text_table import Table, content_lines, is_number, number, read_text
 from ccatp.radio_data.truth import checked_heading, pose_of_truth
 
 # Columns after the event's name; those in parentheses may be missing. "beacon" is a name, all others are numbers.
@@ -25,9 +27,16 @@ HEADER = "event"
 
 
 def is_events_csv(text: str) -> bool:
-    """Whether the text's first line is an event or the header."""
-    lines = content_lines(text[:4096])
-    return bool(lines) and lines[0][1].split(",")[0].strip() in (*EVENTS, HEADER)
+    """Whether the text's first line, or the second below one of words, is an event or the header."""
+    lines = [_cells(content) for _, content in content_lines(text[:4096])[:2]]
+    if lines and not any(is_number(cell) for cell in lines[0]):
+        return any(cells[0] in (*EVENTS, HEADER) for cells in lines)
+    return bool(lines) and lines[0][0] in EVENTS
+
+
+def _cells(content: str) -> list[str]:
+    """The cells of a line, quoted or not."""
+    return [cell.strip() for cell in next(csv.reader([content], skipinitialspace=True))]
 
 
 def read_events_csv(file: Path) -> RecordedRun:
@@ -41,6 +50,8 @@ def read_events_csv(file: Path) -> RecordedRun:
     tables = _tables(file, names)
     surveyed = tables.pop("beacon", None)
     needed = {kind: sum(not column.startswith("(") for column in columns) for kind, columns in EVENTS.items()}
+    if "odom" in tables:
+        tables["odom"], needed["odom"] = with_unknown_ways(tables["odom"], warnings), 1
     tables = {kind: in_order(table, warnings, needed[kind]) for kind, table in tables.items()}
     if "odom" not in tables:
         raise RadioDataError(file, f"no event odom ({', '.join(EVENTS['odom'])})")
@@ -54,7 +65,14 @@ def read_events_csv(file: Path) -> RecordedRun:
     truth = None
     if "truth" in tables:
         t, x, y, heading = tables["truth"].values.T
-        whole = np.unwrap(heading) if np.isfinite(heading).all() else np.full(len(t), np.nan)
+        known = np.isfinite(heading)
+        if known.any() and not known.all():
+            line = int(tables["truth"].lines[np.flatnonzero(~known)[0]])
+            count = plural(int((~known).sum()), "row")
+            warnings.append(
+                f"{file.name}:{line}: {count} of truth without heading (the first here): no heading is used"
+            )
+        whole = np.unwrap(heading) if known.all() else np.full(len(t), np.nan)
         truth = checked_heading(Truth(t, x, y, whole), steps, warnings)
     return RecordedRun(
         name=file.name.split(".")[0],
@@ -74,8 +92,8 @@ def _tables(file: Path, names: dict[str, float]) -> dict[str, Table]:
     rows: dict[str, list[list[float]]] = {}
     lines: dict[str, list[int]] = {}
     for line, content in content_lines(read_text(file)):
-        kind, *words = (word.strip() for word in content.split(","))
-        if kind == HEADER:
+        kind, *words = _cells(content)
+        if kind == HEADER or (not rows and kind not in EVENTS and not any(is_number(word) for word in words)):
             continue
         if kind not in EVENTS:
             raise RadioDataError(file, f"no event {kind!r}; there are {', '.join(EVENTS)}", line)
@@ -123,7 +141,7 @@ def _steps(odometry: Table) -> Steps:
     if (np.diff(t) <= 0.0).any():
         line = int(odometry.lines[1:][np.diff(t) <= 0.0][0])
         raise RadioDataError(odometry.file, "two events odom at the same time say different things", line)
-    return Steps(t, distance[1:], turn[1:], lateral[1:])
+    return bridged(Steps(t, distance[1:], turn[1:], lateral[1:]))
 
 
 def _readings(

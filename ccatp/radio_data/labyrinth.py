@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from ccatp.radio.recording import Readings, RecordedRun, Steps, Truth
+from ccatp.radio_data.bridging import bridged
 from ccatp.radio_data.cleaning import in_order, names_of, within
 from ccatp.radio_data.errors import RadioDataError
 from ccatp.radio_data.text_table import Table, content_lines, number, read_text
@@ -130,4 +131,4 @@ def _steps(odometry: Table) -> Steps:
     distance = (0.5 * (left + right)[:-1] * interval_s)[later]
     turn = (((right - left) / (2.0 * half_track))[:-1] * interval_s)[later]
     times = np.concatenate([t[:-1][later], t[-1:]])
-    return Steps(times, distance, turn, (side[:-1] * interval_s)[later])
+    return bridged(Steps(times, distance, turn, (side[:-1] * interval_s)[later]))

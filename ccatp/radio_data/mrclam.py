@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ccatp.radio.recording import Readings, RecordedRun, Steps, Truth
+from ccatp.radio_data.bridging import bridged
 from ccatp.radio_data.cleaning import in_order, listed, names_of, plural, within, without_gaps_in_numbers
 from ccatp.radio_data.errors import RadioDataError
 from ccatp.radio_data.text_table import Table, read_table
@@ -88,7 +89,7 @@ def _run(folder: Path, robot: int) -> RecordedRun:
 
 
 def _steps(odometry: Table) -> Steps:
-    """A row's velocities hold until the next row, whatever the pause between."""
+    """A row's velocities hold until the next row; over a gap of the recording they are guessed."""
     t, speed, rate = odometry.values.T
     if len(t) < 3:
         raise RadioDataError(odometry.file, f"{len(t)} rows: too few for a run")
@@ -96,7 +97,7 @@ def _steps(odometry: Table) -> Steps:
     later = interval_s > 0.0  # of rows with the same time the last one holds
     times = np.concatenate([t[:-1][later], t[-1:]])
     distance, turn = (speed[:-1] * interval_s)[later], (rate[:-1] * interval_s)[later]
-    return Steps(times, distance, turn, np.zeros(len(distance)))
+    return bridged(Steps(times, distance, turn, np.zeros(len(distance))))
 
 
 def _subjects(folder: Path, barcodes: np.ndarray, warnings: list[str]) -> np.ndarray:

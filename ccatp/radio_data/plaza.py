@@ -6,7 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ccatp.radio.recording import Readings, RecordedRun, Steps, Truth
-from ccatp.radio_data.cleaning import in_order, names_of, within, without_gaps_in_numbers
+from ccatp.radio_data.bridging import bridged
+from ccatp.radio_data.cleaning import in_order, names_of, with_unknown_ways, within, without_gaps_in_numbers
 from ccatp.radio_data.errors import RadioDataError
 from ccatp.radio_data.text_table import Table, read_table
 from ccatp.radio_data.truth import checked_heading, pose_of_truth
@@ -110,7 +111,7 @@ def _text_tables(file: Path) -> dict[str, Table]:
 
 def _run(name: str, file: Path, tables: dict[str, Table]) -> RecordedRun:
     warnings: list[str] = []
-    odometry = in_order(tables["DR"], warnings)
+    odometry = in_order(with_unknown_ways(tables["DR"], warnings), warnings, 1)
     ranges = in_order(tables["TD"], warnings)
     reference = in_order(tables["GT"], warnings) if "GT" in tables else None
     steps = _steps(file, odometry, None if reference is None else float(reference.values[0, 0]))
@@ -147,4 +148,4 @@ def _steps(file: Path, odometry: Table, truth_start_s: float | None) -> Steps:
     start_s = t[0] - usual_s
     if truth_start_s is not None and t[0] - 2.0 * usual_s < truth_start_s < t[0]:
         start_s = truth_start_s
-    return Steps(np.concatenate([[start_s], t]), distance, turn, np.zeros(len(t)))
+    return bridged(Steps(np.concatenate([[start_s], t]), distance, turn, np.zeros(len(t))))

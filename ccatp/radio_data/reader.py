@@ -15,7 +15,7 @@ from ccatp.radio_data.events_csv import is_events_csv, read_events_csv
 from ccatp.radio_data.labyrinth import is_labyrinth, read_labyrinth
 from ccatp.radio_data.mrclam import ROBOT_FILE, read_mrclam, robots_in
 from ccatp.radio_data.plaza import is_plaza, read_plaza
-from ccatp.radio_data.text_table import read_text
+from ccatp.radio_data.text_table import content_lines, read_text
 
 LEAST_TRUTH = 2  # rows: one fits any path
 FORMATS: Sequence[str] = ("plaza", "mrclam", "labyrinth", "csv")
@@ -98,6 +98,8 @@ def _format_of_file(file: Path) -> str | None:
     if ROBOT_FILE.search(file.name):
         return "mrclam"
     text = read_text(file)
+    if not content_lines(text):
+        raise RadioDataError(file, "is empty: no line but comments; give a recording")
     return "labyrinth" if is_labyrinth(text) else "csv" if is_events_csv(text) else None
 
 

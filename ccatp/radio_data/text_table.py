@@ -85,7 +85,7 @@ def read_table(file: Path, names: tuple[str, ...], *, more: bool = False) -> Tab
     lines: list[int] = []
     for line, content in content_lines(read_text(file)):
         words = content.replace(",", " ").split()
-        if not rows and not any(_is_number(word) for word in words):
+        if not rows and not any(is_number(word) for word in words):
             continue  # a header without a comment sign
         if len(words) != len(names) and not (more and len(words) > len(names)):
             raise RadioDataError(file, f"{len(words)} columns, wanted {len(names)}: {', '.join(names)}", line)
@@ -96,7 +96,8 @@ def read_table(file: Path, names: tuple[str, ...], *, more: bool = False) -> Tab
     return Table(file, np.array(rows), np.array(lines, dtype=np.int64))
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Whether a cell holds one."""
     try:
         float(text)
     except ValueError:

@@ -36,6 +36,13 @@ def turn_at(steps: Steps, times_s: FloatArray) -> FloatArray:
     return turn
 
 
+def guessed_between(steps: Steps, times_s: FloatArray) -> npt.NDArray[np.bool_]:
+    """Whether any of the way between one time (n,) and the next was guessed, shape (n - 1,)."""
+    guess = np.broadcast_to(steps.guess_m2, steps.distance_m.shape)
+    total = np.interp(times_s, steps.times_s, np.concatenate([[0.0], np.cumsum(guess)]))
+    return np.asarray(np.diff(total) > 0.0)
+
+
 def chords(truth: Truth, steps: Steps) -> npt.NDArray[np.int64]:
     """Rows of the truth some ``CHORD_M`` of travel apart, within the span of the odometry."""
     inside = (truth.times_s >= steps.times_s[0]) & (truth.times_s <= steps.times_s[-1])

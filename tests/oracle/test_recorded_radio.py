@@ -43,7 +43,7 @@ def test_mrclam7_smoothed() -> None:
     assert found.trajectory_rmse_m is not None
     assert found.trajectory_rmse_m < 0.12  # the goal, which is one of the mean over the robots
     assert len(track.beacons) == 15
-    assert track.calibration["delay_s"].value == pytest.approx(0.25, abs=0.1)  # odometry is what was commanded
+    assert track.calibration["odometry_delay_s"].value == pytest.approx(0.25, abs=0.1)  # odometry is what was commanded
 
 
 @pytest.mark.slow

@@ -55,13 +55,16 @@ class Reckoning:
 
         self._fine_s, self._steps_s = fine_s, steps.times_s
         amounts = (steps.distance_m, steps.turn_rad, steps.lateral_m)
-        self._totals = [np.concatenate([[0.0], np.cumsum(amount)]) for amount in amounts]
+        self._totals = [_total(amount) for amount in amounts]
+        guesses = (np.broadcast_to(guess, steps.distance_m.shape) for guess in (steps.guess_m2, steps.guess_rad2))
+        self._guess_totals = [_total(guess) for guess in guesses]
         self._cut(0.0)
 
     def _cut(self, delay_s: float) -> None:
         """The odometry of each fine step if the vehicle lags by ``delay_s``."""
         self._delay_s = delay_s
         self.distance_m, self.turn_rad, self.lateral_m = (self._shares(total, delay_s) for total in self._totals)
+        self._guess_m2, self._guess_rad2 = (self._shares(total, delay_s) for total in self._guess_totals)
 
     def _shares(self, total: FloatArray, delay_s: float) -> FloatArray:
         shares: FloatArray = np.diff(np.interp(self._fine_s - delay_s, self._steps_s, total))
@@ -122,8 +125,10 @@ class Reckoning:
             noise.turn_per_sqrt_m**2 * way
             + noise.turn_per_sqrt_rad**2 * turned
             + noise.turn_per_sqrt_s**2 * self.interval_s
+            + self._guess_rad2
         )
-        var_side = noise.lateral_per_sqrt_m**2 * way
+        var_way = var_way + self._guess_m2
+        var_side = noise.lateral_per_sqrt_m**2 * way + self._guess_m2
         (c, s), (lx, ly) = direction, lever
         Q = np.empty((self._starts.size, 3, 3))
         Q[:, 0, 0] = self._sum(lx * lx * var_turn + c * c * var_way + s * s * var_side) + STILL_M**2
@@ -137,6 +142,10 @@ class Reckoning:
     def _sum(self, amounts: FloatArray) -> FloatArray:
         total: FloatArray = np.add.reduceat(amounts, self._starts)
         return total
+
+
+def _total(amounts: FloatArray) -> FloatArray:
+    return np.concatenate([[0.0], np.cumsum(amounts)])
 
 
 def _spaced(times_s: FloatArray) -> FloatArray:

@@ -1,6 +1,6 @@
 """Pure. The smoother of recorded runs: path, beacons and calibration that fit all odometry and all readings best."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from ccatp.radio.batch.growing import Start, grown
 from ccatp.radio.batch.problem import BEACON, SHARED, BatchProblem, State
 from ccatp.radio.batch.reckoning import CALIBRATION, carried_on
 from ccatp.radio.batch.settings import BatchSettings, RadioNoise
+from ccatp.radio.calibration_doubts import beyond_priors
 from ccatp.radio.recording import RecordedRun
 from ccatp.radio.track import BeaconFix, Calibrated, Track
 
@@ -22,8 +23,13 @@ ITERATIONS = 40
 WIDENINGS = 8
 WIDER = 1.05
 """Noise is widened where the residuals are larger than it by that factor."""
+NOISY = 4.0
+"""How many times the noise may have been widened without being told."""
 LITTLE = 0.1
 """A reading that weighs less counts as refused."""
+CORRECTING = ("distance_scale", "turn_scale")
+"""Unknowns that multiply the odometry; what is told is what it reads too much, as the filter does."""
+TOLD_AS = {"delay_s": "odometry_delay_s"}
 
 
 def smooth(run: RecordedRun, settings: BatchSettings, clock_s: Callable[[], float]) -> Track:
@@ -38,12 +44,13 @@ def smooth(run: RecordedRun, settings: BatchSettings, clock_s: Callable[[], floa
         settings: noise and priors.
         clock_s: tells wall time, s.
     """
-    begin_s = clock_s()
+    begin_s, first_radio = clock_s(), settings.radio
     heard_s = np.union1d(run.readings.times_s, run.steps.times_s[:1])
     start = grown(run.steps, run.readings, heard_s, run.first_pose, settings, len(run.beacon_ids))
     times_s = instants(run)
     problem = BatchProblem(run.steps, run.readings, times_s, run.first_pose, settings, start.used)
-    found = descend(problem, _filled(problem, start.state, np.searchsorted(times_s, heard_s)), ITERATIONS)
+    filled = _filled(problem, _anchored(start.state, run.first_pose), np.searchsorted(times_s, heard_s))
+    found = descend(problem, filled, ITERATIONS)
     for _ in range(WIDENINGS):
         radio = _widened(problem, found.state)
         if radio == problem.radio:
@@ -51,7 +58,7 @@ def smooth(run: RecordedRun, settings: BatchSettings, clock_s: Callable[[], floa
         settings = replace(settings, radio=radio)
         problem = BatchProblem(run.steps, run.readings, times_s, run.first_pose, settings, start.used)
         found = descend(problem, found.state, ITERATIONS)
-    return _track(run, problem, times_s, found, start, clock_s() - begin_s)
+    return _track(run, problem, times_s, found, start, first_radio, clock_s() - begin_s)
 
 
 def instants(run: RecordedRun) -> FloatArray:
@@ -59,6 +66,20 @@ def instants(run: RecordedRun) -> FloatArray:
     steps_s = run.steps.times_s
     _, first = np.unique(np.floor((steps_s - steps_s[0]) / SPACING_S), return_index=True)
     return np.union1d(run.readings.times_s, steps_s[first])
+
+
+def _anchored(state: State, first_pose: tuple[float, float, float]) -> State:
+    """The state moved as a whole, so that it begins at the first pose: nothing but the prior of that is another."""
+    x_m, y_m, heading_rad = state.poses[0].tolist()
+    turn = first_pose[2] - heading_rad
+    c, s = np.cos(turn), np.sin(turn)
+
+    def moved(points: FloatArray) -> FloatArray:
+        dx, dy = points[:, 0] - x_m, points[:, 1] - y_m
+        return np.column_stack([first_pose[0] + c * dx - s * dy, first_pose[1] + s * dx + c * dy])
+
+    poses = np.column_stack([moved(state.poses), state.poses[:, 2] + turn])
+    return State(poses, state.shared, np.column_stack([moved(state.beacons), state.beacons[:, 2:]]))
 
 
 def _filled(problem: BatchProblem, state: State, known: npt.NDArray[np.int64]) -> State:
@@ -94,7 +115,13 @@ def _widened(problem: BatchProblem, state: State) -> RadioNoise:
 
 
 def _track(
-    run: RecordedRun, problem: BatchProblem, times_s: FloatArray, found: Descent, start: Start, took_s: float
+    run: RecordedRun,
+    problem: BatchProblem,
+    times_s: FloatArray,
+    found: Descent,
+    start: Start,
+    first_radio: RadioNoise,
+    took_s: float,
 ) -> Track:
     state = found.state
     residuals = problem.residuals(state)
@@ -105,12 +132,14 @@ def _track(
     covariance[np.ix_(problem.free, problem.free)] = factored.shared_covariance()
     counted = problem.sizes > 0
     updates = int(counted.sum())
+    calibration = _calibration(problem, state, covariance)
+    priors = {TOLD_AS.get(name, name): getattr(problem.settings.priors, name) for name in SHARED}
     return Track(
         times_s=times_s,
         poses=state.poses,
         covariances=factored.pose_covariances(),
         beacons=_beacons(run, state, start, covariance),
-        calibration=_calibration(problem, state, covariance),
+        calibration=calibration,
         nis=np.empty(0),
         nis_sizes=np.empty(0),
         refused=int((weights[counted] < LITTLE).sum()),
@@ -118,7 +147,11 @@ def _track(
         predict_s=np.empty(0),
         scalar_s=np.empty(0),
         updates=updates,
-        warnings=_warnings(run, start, found.converged),
+        warnings=(
+            *_warnings(run, start, found.converged),
+            *beyond_priors(calibration, priors, run.kind),
+            *_noisy(problem.radio, first_radio),
+        ),
     )
 
 
@@ -137,11 +170,27 @@ def _calibration(problem: BatchProblem, state: State, covariance: FloatArray) ->
     ranged, pointed, heard = (bool(problem.there[:, k].any()) for k in range(3))
     told = {"range_scale": ranged, "range_offset_m": ranged, "bearing_offset_rad": pointed}
     told |= {"rssi_reference_db": heard, "rssi_exponent": heard}
-    return {
+    found = {
         name: Calibrated(float(state.shared[k]), float(sigmas[k]))
         for k, name in enumerate(SHARED)
         if problem.free[k] and told.get(name, True)
     }
+    return {TOLD_AS.get(name, name): _read(one) if name in CORRECTING else one for name, one in found.items()}
+
+
+def _read(correction: Calibrated) -> Calibrated:
+    """What the odometry reads too much, e with d = d_o / (1 + e), of a correction s with d = (1 + s) d_o."""
+    scale = 1.0 + correction.value
+    return Calibrated(1.0 / scale - 1.0, correction.sigma / scale**2)
+
+
+def _noisy(radio: RadioNoise, first: RadioNoise) -> Iterator[str]:
+    """Noise that had to be widened beyond what is told of such radios."""
+    for what in ("range", "bearing", "rssi"):
+        name = {"range": "range_sigma_m", "bearing": "bearing_sigma_rad", "rssi": "rssi_sigma_db"}[what]
+        ratio = getattr(radio, name) / getattr(first, name)
+        if ratio > NOISY:
+            yield f"{what} readings are {ratio:.1f} times as noisy as assumed: beacons exchanged or moved on the way?"
 
 
 def _warnings(run: RecordedRun, start: Start, converged: bool) -> tuple[str, ...]:

@@ -9,7 +9,8 @@ import pytest
 from ccatp.config.recording_loader import load_recordings_config
 from ccatp.radio.assumed import slam_settings
 from ccatp.radio.causal import filter_run
-from ccatp.radio.recording import RecordedRun
+from ccatp.radio.judged import judge
+from ccatp.radio.recording import Readings, RecordedRun, Truth
 from ccatp.radio.track import Track
 from ccatp.radio_data.checks import suspicions
 from tests.unit.radio_data.sets import recorded, world
@@ -47,6 +48,66 @@ def test_beacons_that_are_misread_half_the_time_are_told() -> None:
     told = track_of(replace(run, readings=run.readings._replace(beacon=beacon))).warnings
     assert any("had to be doubted" in w for w in told)
     assert any("readings were refused" in w for w in told)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_names_that_are_misread_now_and_then_do_not_cost_the_map(seed: int) -> None:
+    """The worst time for it is the first sight of a beacon: here the first four are all taken for others."""
+    run = recorded(world(seed, 120.0))
+    beacon, rng = run.readings.beacon.copy(), np.random.default_rng(seed)
+    misread = rng.uniform(size=beacon.size) < 0.05
+    misread[:4] = True
+    beacon[misread] = (beacon[misread] + rng.integers(1, 4, int(misread.sum()))) % 4
+    misnamed = replace(run, readings=run.readings._replace(beacon=beacon))
+    found = judge(track_of(misnamed), misnamed)
+    assert found.trajectory_rmse_m is not None
+    assert found.trajectory_rmse_m < 0.1
+    assert found.beacon_rmse_m is not None
+    assert found.beacon_rmse_m < 0.15
+
+
+def test_bearings_of_times_of_their_own_are_used_once_their_beacon_is_placed() -> None:
+    run = recorded(world(3, 120.0, range_sigma_m=0.3))
+    r = run.readings
+    nothing = np.full(len(r.times_s), np.nan)
+    both = Readings(
+        np.concatenate([r.times_s, r.times_s + 0.01]), np.tile(r.beacon, 2), np.concatenate([r.range_m, nothing]),
+        np.concatenate([nothing, r.bearing_rad]), np.tile(nothing, 2),
+    )  # fmt: skip
+    apart = replace(run, readings=both.where(np.argsort(both.times_s, kind="stable")))
+    ranges = replace(run, readings=r._replace(bearing_rad=nothing))
+    track, without = track_of(apart), track_of(ranges)
+    assert track.updates > 1.3 * without.updates
+    assert np.median(track.covariances[:, 2, 2]) < 0.5 * np.median(without.covariances[:, 2, 2])
+    found = judge(track, apart)
+    assert found.trajectory_rmse_m is not None
+    assert found.trajectory_rmse_m < 0.2
+    assert any("bearings had no range or strength of the same time and came before" in w for w in track.warnings)
+
+
+def test_a_beacon_of_which_only_bearings_were_heard_is_told_so() -> None:
+    run = recorded(world(3, 20.0))
+    blind = run.readings._replace(range_m=np.full(len(run.readings.times_s), np.nan))
+    told = track_of(replace(run, readings=blind)).warnings
+    assert "beacon 6 could not be placed: only bearings of it were heard, no range" in told
+
+
+def test_no_nees_where_the_truth_did_not_tell_the_first_pose() -> None:
+    run = recorded(world(seconds=20.0))
+    track = track_of(run)
+    assert judge(track, run).nees is not None
+    assert run.truth is not None
+    late = replace(run, truth=Truth(*(column[50:] for column in run.truth)))
+    assert judge(track, late).nees is None
+    assert judge(track, late).trajectory_rmse_m is not None
+
+
+def test_beacons_that_are_exchanged_on_the_way_are_told() -> None:
+    run = recorded(world(seconds=120.0))
+    swap = np.where(run.readings.times_s > 60.0, np.array([1, 0, 2, 3])[run.readings.beacon], run.readings.beacon)
+    told = track_of(replace(run, readings=run.readings._replace(beacon=swap))).warnings
+    for name in ("6", "7"):
+        assert any(w.startswith(f"beacon {name} was placed anew at ") and "exchanged" in w for w in told)
 
 
 @pytest.mark.parametrize("steps", [1, 3])

@@ -88,6 +88,10 @@ def test_doubts_are_told() -> None:
     assert any("off the line" in doubt for doubt in fit_path_loss(off).doubts())
     flat = [LevelPair(d, -60.0 - 0.5 * d) for d in (1.0, 2.0, 3.0, 4.0)]
     assert any("is outside 1 to 6" in doubt for doubt in fit_path_loss(flat).doubts())
+    far = [LevelPair(100.0 * pair.distance_m, pair.level_dbm) for pair in good]
+    assert any("is above -10 dBm" in doubt and "in metres" in doubt for doubt in fit_path_loss(far).doubts())
+    line = [LevelPair(r, -40.0 - 20.0 * np.log10(r)) for r in (1.0, 2.0, 4.0, 8.0)]
+    assert any("on a line exactly" in doubt for doubt in fit_path_loss(line).doubts())
 
 
 @pytest.mark.parametrize("slope_db_m", [0.0, 5.0])

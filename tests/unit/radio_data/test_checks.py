@@ -106,6 +106,52 @@ def test_exchanged_beacons() -> None:
     assert "beacons 6 and 7 look exchanged" in told(run)
 
 
+def test_beacons_that_are_exchanged_halfway() -> None:
+    swap = np.where(SOUND.readings.times_s > 60.0, np.array([1, 0, 2, 3])[SOUND.readings.beacon], SOUND.readings.beacon)
+    found = told(with_readings(SOUND, beacon=swap))
+    assert "from 60 to 120 s alone: beacons 6 and 7 look exchanged" in found
+    assert "off (fit to the truth)" not in found
+
+
+def test_neighbours_that_are_exchanged_show_by_their_bearings() -> None:
+    x, y = BEACONS["8"]
+    near = replace(SOUND, beacon_truth_m={**BEACONS, "8": (x + 0.3, y)})
+    assert "exchanged" not in told(near)
+    survey = {**BEACONS, "9": (x + 0.3, y)}
+    rows = SOUND.readings.beacon == 3
+    pose = [np.interp(SOUND.readings.times_s, W.times_s, column) for column in W.poses.T]
+    dx, dy = x + 0.3 - pose[0], y - pose[1]
+    ranges = np.where(rows, np.hypot(dx, dy), SOUND.readings.range_m)
+    bearings = np.where(rows, np.arctan2(dy, dx) - pose[2], SOUND.readings.bearing_rad)
+    run = replace(with_readings(SOUND, range_m=ranges, bearing_rad=bearings), beacon_truth_m=survey)
+    assert "exchanged" not in told(run)
+    swapped = replace(run, beacon_truth_m={**survey, "8": survey["9"], "9": survey["8"]})
+    assert "beacons 8 and 9 look exchanged" in told(swapped)
+
+
+def test_exchanged_beacons_with_a_neighbour_are_not_taken_for_it() -> None:
+    survey = {**BEACONS, "7": (BEACONS["6"][0] + 0.5, BEACONS["6"][1])}  # what the ranges of 8 fit nearly as well
+    swapped = {**survey, "6": survey["8"], "8": survey["6"]}
+    assert "beacons 6 and 8 look exchanged" in told(replace(SOUND, beacon_truth_m=swapped))
+
+
+def test_bearings_with_the_other_sign() -> None:
+    found = told(with_readings(SOUND, bearing_rad=-SOUND.readings.bearing_rad))
+    assert "bearings fit the truth with the other sign: are they clockwise?" in found
+    assert "miss its surveyed place" not in found
+
+
+def test_what_never_moves() -> None:
+    zeros = np.zeros(SOUND.steps.distance_m.size)
+    still = replace(SOUND, steps=SOUND.steps._replace(distance_m=zeros, turn_rad=zeros))
+    assert "odometry never moves (0 m) while the truth gets" in told(still)
+    assert SOUND.truth is not None
+    there = np.zeros(SOUND.truth.x_m.size)
+    found = told(with_truth(SOUND, x_m=there, y_m=there, heading_rad=there))
+    assert "the truth never moves (0 m) while the odometry travels" in found
+    assert "off (fit to the truth)" not in found
+
+
 def test_a_beacon_that_was_surveyed_elsewhere() -> None:
     moved = {**BEACONS, "8": (9.0, 4.0)}
     assert "ranges of beacon 8 miss its surveyed place by" in told(replace(SOUND, beacon_truth_m=moved))

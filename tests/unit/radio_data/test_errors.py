@@ -147,6 +147,7 @@ FAULTS: list[tuple[Make, str | None, str]] = [
         _text("range2 0 2 0.1 0 0 105", *[f"odom2diff {k} 0 0 0 {k - 1} 0 0 0" for k in range(3)]), None,
         r"data\.txt:2: the distance between the wheels is not positive",
     ),
+    (_text("", "# a comment"), None, r"data\.txt: is empty: no line but comments"),
     (_with("lidar,1,2"), None, rf"mine\.csv:{LAST}: no event 'lidar'; there are odom, range"),
     (_with("range,1,6"), None, rf"mine\.csv:{LAST}: 2 values after range, wanted time_s, beacon, range_m"),
     (_with("range,soon,6,2"), None, rf"mine\.csv:{LAST}: time_s is 'soon', not a number"),

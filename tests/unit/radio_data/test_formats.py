@@ -173,3 +173,18 @@ def test_readings_beyond_the_odometry_are_left_out_and_told(tmp_path: Path) -> N
     run = read_run(tmp_path, None, None)
     assert len(run.readings.times_s) == len(W.read_s)
     assert any("1 range before the first or after the last odometry" in warning for warning in run.warnings)
+
+
+def test_csv_with_a_head_of_words_or_quoted_cells(tmp_path: Path) -> None:
+    lines = csv_lines(W)
+    check(read_run(write_lines(tmp_path / "head.csv", ["time,x,y", *lines]), None, None), W, bearings=True)
+    quoted = [line if line.startswith("#") else ",".join(f'"{cell}"' for cell in line.split(",")) for line in lines]
+    check(read_run(write_lines(tmp_path / "quoted.csv", quoted), None, None), W, bearings=True)
+
+
+def test_csv_with_a_truth_that_lacks_some_headings_is_told(tmp_path: Path) -> None:
+    lines = csv_lines(W)
+    row = next(k for k, line in enumerate(lines) if line.startswith("truth,5.0,"))
+    lines[row] = lines[row].rsplit(",", 1)[0]
+    run = read_run(write_lines(tmp_path / "mine.csv", lines), None, None)
+    assert any(f"mine.csv:{row + 1}: 1 row of truth without heading" in warning for warning in run.warnings)

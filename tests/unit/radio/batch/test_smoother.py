@@ -57,7 +57,7 @@ def test_path_beacons_and_calibration_are_found(bearings: bool) -> None:
     assert found.trajectory_rmse_m == pytest.approx(0.0, abs=0.08)  # less than the noise of one range
     assert found.beacon_rmse_m == pytest.approx(0.0, abs=0.1)
     for name, true in (
-        ("distance_scale", 0.02),
+        ("distance_scale", -0.02 / 1.02),  # positive where the odometry reads too much
         ("turn_bias_rad_s", 0.008),
         ("range_scale", 0.04),
         ("range_offset_m", 0.15),
@@ -153,7 +153,7 @@ def test_commands_that_the_vehicle_follows_late() -> None:
     inside = lagged.readings.times_s < steps.times_s[-1]
     lagged = replace(lagged, steps=steps, readings=lagged.readings.where(inside))
     settings = replace(SETTINGS, priors=replace(SETTINGS.priors, delay_s=0.3))
-    delay, sigma = smooth(lagged, settings, no_clock).calibration["delay_s"]
+    delay, sigma = smooth(lagged, settings, no_clock).calibration["odometry_delay_s"]
     assert delay == pytest.approx(0.25, abs=max(4.0 * sigma, 0.02))
 
 
