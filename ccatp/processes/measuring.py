@@ -15,6 +15,7 @@ from ccatp.mission import Mission
 from ccatp.processes.survey_telling import SurveyTeller
 from ccatp.samples import DeckPose, Fix, PointId, Vector3
 from ccatp.storage.store import MissionStore, StoreError
+from ccatp.storage.store_rows import AlreadyMeasuredError
 from ccatp.surveying.approaches import Approaches
 
 # A commit takes milliseconds, on a busy disk a second. One that takes longer is told, and much longer holds the robot.
@@ -183,6 +184,8 @@ class MeasuringDesk:
                 return
             try:
                 await self._stored(self._store.record_fix(request.point, fix, request.estimate), request.point)
+            except AlreadyMeasuredError as error:
+                self._teller.say("warning", str(error))  # nothing is lost, and nobody has to be waited for
             except StoreError as error:
                 self._mission.fault(f"the fix of {_name(request.point)} cannot be stored: {error}")
                 return

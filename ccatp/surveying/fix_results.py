@@ -86,8 +86,9 @@ class FixResults:
         standing = self._standing
         goes_on = standing.is_awaiting_fix
         stop = standing.survey.current
-        # A pause may come while the fix is being committed: the point counts all the same.
-        if point is not None and stop is not None and stop.point == point:
+        # A pause may come while the fix is being committed, and a new way to the point: it counts all the same.
+        is_here = stop is not None and stop.point == point
+        if point is not None and (is_here or point not in record):
             if point in standing.skipped:
                 standing.skipped.remove(point)
             record.append(point)
@@ -95,7 +96,9 @@ class FixResults:
                 standing.leftovers.measured(point)
             standing.is_review_due = self._has_budget
             standing.backoffs = 0
-            standing.survey.advance()
+            if is_here:
+                standing.survey.advance()
+            standing.is_off_route |= not is_here  # the way that was planned leads to it once more
             self._doubt_heading()
             # So it does where the robot was pushed meanwhile and waits to be measured anew: there is no need any more.
             goes_on |= standing.state in (SETTLING, MEASURING)

@@ -31,7 +31,7 @@ class Story:
     """A mission, an ideal robot, and what was ordered so far."""
 
     def __init__(self, config: Config, mirror: Mirror) -> None:
-        self.mirror = mirror
+        self.config, self.mirror = config, mirror
         self.stops = tuple(
             Stop(*mirror.point_on_deck(PointId(5, 5, k)), StopKind.MEASURE, PointId(5, 5, k)) for k in (1, 2, 3)
         )
@@ -386,6 +386,30 @@ def test_a_fix_committed_during_a_pause_counts_once(story: Story) -> None:
     story.auto_fix = True
     story.mission.resume()
     story.until_state(State.DONE)
+    assert [p.point for p in story.mission.done] == [1, 2, 3]
+
+
+def test_a_fix_committed_after_the_way_was_planned_anew_counts_once(story: Story) -> None:
+    # A slow disk: the robot was paused meanwhile, and went on by a way whose next stop is not the point.
+    via = Stop(*story.mirror.point_on_deck(PointId(5, 5, 5)), StopKind.VIA)
+    story.mission = Mission(
+        story.config, story.mirror, story.route(story.stops), story.plan_home,
+        lambda route, start, skip: story.route((via, *story.plan_rest(route, start, skip).stops)),
+    )  # fmt: skip
+    story.auto_fix = False
+    story.until(lambda: story.mission.is_awaiting_fix)
+    point = story.mission.measuring_point
+    assert point is not None
+    story.mission.interrupt("a late frame")
+    story.until(lambda: bool(story.plans))
+    story.mission.fixed(point)
+    assert story.mission.done == [point]
+    asked = []
+    while story.mission.state is not State.DONE:
+        if story.frame().measure:
+            asked.append(story.mission.measuring_point)
+            story.mission.fixed(story.mission.measuring_point)
+    assert point not in asked
     assert [p.point for p in story.mission.done] == [1, 2, 3]
 
 

@@ -1,6 +1,7 @@
 """The measuring desk and a localizer that refuses."""
 
 import asyncio
+from concurrent.futures import Future
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -15,8 +16,9 @@ from ccatp.metrology.scrutiny import Finding, Scrutiny
 from ccatp.mission import Mission
 from ccatp.processes.measuring import MeasuringDesk, Request
 from ccatp.processes.survey_telling import SurveyTeller
-from ccatp.samples import DeckPose, Fix
+from ccatp.samples import DeckPose, Fix, PointId
 from ccatp.storage.store import MissionStore
+from ccatp.storage.store_rows import AlreadyMeasuredError
 
 FIX = Fix(1.0, (0.0, 0.0, 0.0), (0.0,) * 9, 1.0, (1,), 0.0)
 
@@ -76,3 +78,37 @@ async def test_every_fix_that_the_localizer_saw_is_told(
     refusals: list[Exception], told: list[bool], config: Config
 ) -> None:
     assert await told_fixes(config, *refusals) == told
+
+
+async def test_a_point_that_is_measured_already_is_done_and_nobody_has_to_be_waited_for(config: Config) -> None:
+    point, done, said = PointId(1, 2, 4), list[PointId](), list[str]()
+    over = asyncio.Event()
+    mission = SimpleNamespace(
+        is_awaiting_fix=True, request=1, is_lost=False, fixed=done.append, fault=said.append,
+        survey=SimpleNamespace(distance_m=lambda pose: 0.0),
+    )  # fmt: skip
+    refused: Future[None] = Future()
+    refused.set_exception(AlreadyMeasuredError("point 1/2/4 has been measured; its fix is not replaced"))
+    localizer = Refusing()
+    localizer.pose = None  # type: ignore[attr-defined]
+
+    async def measure(t_s: float, expected_m: Any) -> Fix:
+        return FIX
+
+    desk = MeasuringDesk(
+        config.mission,
+        cast(EtalonClient, SimpleNamespace(measure=measure)),
+        cast(Scrutiny, SimpleNamespace(begin=lambda: None, review=lambda *_, **__: Finding())),
+        cast(Localizer, localizer),
+        cast(Mission, mission),
+        cast(MissionStore, SimpleNamespace(record_fix=lambda *_: refused)),
+        cast(SurveyTeller, SimpleNamespace(fix=lambda *_, **__: None, say=lambda level, text: said.append(level))),
+        over.set,
+        lambda: 0.0,
+    )
+    serving = asyncio.get_running_loop().create_task(desk.run())
+    desk.begin(Request(1, 1.0, point, (0.0, 0.0, 0.0), DeckPose(0.0, 0.0, 0.0)))
+    async with asyncio.timeout(10.0):
+        await over.wait()
+    serving.cancel()
+    assert (done, said) == ([point], ["warning"])
