@@ -78,11 +78,9 @@ async def test_planning_longer_than_a_frame_may_wait_pauses_nobody() -> None:
         mission._travels._plan_rest = plan_slowly
         assert mission.pause("a test") is None
         await daemon.until(lambda: not daemon.is_driving)
-        told = len(daemon.events("late frame"))
         assert mission.resume() is None
         await daemon.until(lambda: bool(planned))
         await moving_again(daemon, planned[0])
         # The danger loop, here in the same event loop, is blocked as well: that may cost another plan.
         assert len(planned) < 5
-        assert len(daemon.events("late frame")) == told
         assert not stale(daemon, planned[0] - 0.12, planned[-1] + 0.2)
