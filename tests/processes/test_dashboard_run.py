@@ -96,6 +96,7 @@ def test_it_dies_and_is_started_anew_while_the_survey_goes_on(start: Start) -> N
     assert "Traceback" not in run.stderr
 
 
+@pytest.mark.slow
 def test_a_port_in_use_stops_no_survey_and_the_summary_is_the_same(start: Start) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         taken = other.getsockname()[1]

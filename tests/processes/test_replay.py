@@ -99,6 +99,7 @@ def test_a_run_in_real_time_is_reproduced(start: Start) -> None:
     assert result["fixes"]["given"] >= 1
 
 
+@pytest.mark.slow
 def test_a_resumed_run_is_reproduced_in_both_parts(start: Start) -> None:
     first = stopped(start("--panels", "1", "--world", "thesis", "--filter", "kf"), points=1)
     second = Run(first.run_dir, first.runtime_dir, "--panels", "1", "--world", "thesis", "--filter", "ekf", "--resume")

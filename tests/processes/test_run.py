@@ -237,6 +237,7 @@ def test_a_port_in_use_is_one_line_and_status_2(start: Start) -> None:
     assert "sim.robot.port" in run.stderr
 
 
+@pytest.mark.slow
 def test_a_robot_set_down_wrongly_meets_the_rim_finds_itself_and_measures_everything(start: Start) -> None:
     # Seed 8 sets the robot down 0.1 m beside base, with a sensor almost over the rim.
     run = start("--panels", "1", "--seed", "8", "--set", "world.start_position_sigma_m=0.08")

@@ -73,6 +73,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
     return cells
 
 
+@pytest.mark.slow
 def test_a_campaign_killed_at_any_instant_goes_on(
     started: Callable[..., subprocess.Popen[str]], whole: list[dict[str, Any]], tmp_path: Path
 ) -> None:
