@@ -37,36 +37,44 @@ class Refusing:
         return 0.0
 
 
-async def told_fixes(config: Config, *refusals: Exception) -> list[bool]:
-    told: list[bool] = []
-    over = asyncio.Event()
-
-    def fix(point: Any, fix: Fix, jump_m: float, *, is_fused: bool) -> None:
-        told.append(is_fused)
+async def measured_once(
+    config: Config, localizer: Refusing, mission: object, store: object, teller: object, point: PointId | None
+) -> None:
+    """One request to a desk whose laser system always answers, until it is over."""
 
     async def measure(t_s: float, expected_m: Any) -> Fix:
         return FIX
 
-    mission = SimpleNamespace(
-        is_awaiting_fix=True, request=1, is_lost=True, fixed=lambda point: None, not_fixed=lambda point, cause: None
-    )
-    sure = SimpleNamespace(begin=lambda: None, review=lambda *_, **__: Finding())
+    over = asyncio.Event()
     desk = MeasuringDesk(
         config.mission,
         cast(EtalonClient, SimpleNamespace(measure=measure)),
-        cast(Scrutiny, sure),
-        cast(Localizer, Refusing(*refusals)),
+        cast(Scrutiny, SimpleNamespace(begin=lambda: None, review=lambda *_, **__: Finding())),
+        cast(Localizer, localizer),
         cast(Mission, mission),
-        cast(MissionStore, SimpleNamespace()),
-        cast(SurveyTeller, SimpleNamespace(fix=fix, say=lambda level, text: None)),
+        cast(MissionStore, store),
+        cast(SurveyTeller, teller),
         over.set,
         lambda: 0.0,
     )
     serving = asyncio.get_running_loop().create_task(desk.run())
-    desk.begin(Request(1, 1.0, None, (0.0, 0.0, 0.0), DeckPose(0.0, 0.0, 0.0)))
+    desk.begin(Request(1, 1.0, point, (0.0, 0.0, 0.0), DeckPose(0.0, 0.0, 0.0)))
     async with asyncio.timeout(10.0):
         await over.wait()
     serving.cancel()
+
+
+async def told_fixes(config: Config, *refusals: Exception) -> list[bool]:
+    told: list[bool] = []
+
+    def fix(point: Any, fix: Fix, jump_m: float, *, is_fused: bool) -> None:
+        told.append(is_fused)
+
+    mission = SimpleNamespace(
+        is_awaiting_fix=True, request=1, is_lost=True, fixed=lambda point: None, not_fixed=lambda point, cause: None
+    )
+    teller = SimpleNamespace(fix=fix, say=lambda level, text: None)
+    await measured_once(config, Refusing(*refusals), mission, SimpleNamespace(), teller, None)
     return told
 
 
@@ -82,7 +90,6 @@ async def test_every_fix_that_the_localizer_saw_is_told(
 
 async def test_a_point_that_is_measured_already_is_done_and_nobody_has_to_be_waited_for(config: Config) -> None:
     point, done, said = PointId(1, 2, 4), list[PointId](), list[str]()
-    over = asyncio.Event()
     mission = SimpleNamespace(
         is_awaiting_fix=True, request=1, is_lost=False, fixed=done.append, fault=said.append,
         survey=SimpleNamespace(distance_m=lambda pose: 0.0),
@@ -91,24 +98,6 @@ async def test_a_point_that_is_measured_already_is_done_and_nobody_has_to_be_wai
     refused.set_exception(AlreadyMeasuredError("point 1/2/4 has been measured; its fix is not replaced"))
     localizer = Refusing()
     localizer.pose = None  # type: ignore[attr-defined]
-
-    async def measure(t_s: float, expected_m: Any) -> Fix:
-        return FIX
-
-    desk = MeasuringDesk(
-        config.mission,
-        cast(EtalonClient, SimpleNamespace(measure=measure)),
-        cast(Scrutiny, SimpleNamespace(begin=lambda: None, review=lambda *_, **__: Finding())),
-        cast(Localizer, localizer),
-        cast(Mission, mission),
-        cast(MissionStore, SimpleNamespace(record_fix=lambda *_: refused)),
-        cast(SurveyTeller, SimpleNamespace(fix=lambda *_, **__: None, say=lambda level, text: said.append(level))),
-        over.set,
-        lambda: 0.0,
-    )
-    serving = asyncio.get_running_loop().create_task(desk.run())
-    desk.begin(Request(1, 1.0, point, (0.0, 0.0, 0.0), DeckPose(0.0, 0.0, 0.0)))
-    async with asyncio.timeout(10.0):
-        await over.wait()
-    serving.cancel()
+    teller = SimpleNamespace(fix=lambda *_, **__: None, say=lambda level, text: said.append(level))
+    await measured_once(config, localizer, mission, SimpleNamespace(record_fix=lambda *_: refused), teller, point)
     assert (done, said) == ([point], ["warning"])
