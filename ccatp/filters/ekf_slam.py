@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg.blas import daxpy, dger, dscal
+from scipy.linalg.blas import daxpy, dscal
 
 from ccatp.filters.base import HUGE, FilterDiverged, FilterError, FilterShapeError, FloatArray, checked_gaussian
 
@@ -103,10 +103,9 @@ class EkfSlam:
         self._take(mean, covariance)
 
     def _take(self, mean: FloatArray, covariance: FloatArray) -> None:
-        """Another state; its covariance lies in one piece, as BLAS wants it for subtracting in place."""
+        """Another state."""
         v = self.vehicle_size
-        covariance = np.ascontiguousarray(covariance)
-        self.mean, self.covariance, self._transposed = mean, covariance, covariance.T
+        self.mean, self.covariance = mean, covariance
         self._rows, self._columns, self._vehicle = covariance[:v], covariance[:, :v], mean[:v]
 
     def __deepcopy__(self, memo: dict[int, object]) -> "EkfSlam":
@@ -213,7 +212,8 @@ class EkfSlam:
         root = sqrt(s)
         dscal(1.0 / root, cross)
         if s < STRONG * r:
-            dger(-1.0, cross, cross, a=self._transposed, overwrite_a=1)  # of equal vectors: P stays symmetric exactly
+            # P stays symmetric exactly; BLAS's rank-one update fuses some products with the sum and rounds others.
+            self.covariance -= cross[:, None] * cross
         else:
             self._joseph(columns, h[None, :], cross[:, None] / root, np.array(((r,),)))
         daxpy(cross, self.mean, a=residual / root)
