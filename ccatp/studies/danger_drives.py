@@ -17,6 +17,7 @@ from ccatp.danger import DangerMonitor
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.panels import Panel
 from ccatp.samples import DeckPose, EdgeSample, EventCode, ImuSample, PanelId, WheelSample
+from ccatp.sim.frame import named
 from ccatp.sim.plant import Plant
 from ccatp.sim.sensors import SensorSuite
 from ccatp.wire.robot import CommandEcho
@@ -171,8 +172,8 @@ class Rig:
         plant.step(t_s, self._frame_s, right_rad_s, left_rad_s)
         self._seq += 1
         sensors.enter(self._seq)
-        edge = [EdgeSample(*row) for row in sensors.read_edges(plant)]
-        enc = [WheelSample(*row) for row in sensors.read_encoders(plant)]
+        edge = named(EdgeSample, sensors.read_edges(plant))
+        enc = named(WheelSample, sensors.read_encoders(plant))
         if is_estimate_due(self._seq):
             self._estimate = self._estimated()
         return Frame(self._seq, self._seq * self._frame_s, enc, edge), estimate
