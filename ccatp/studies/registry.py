@@ -30,6 +30,7 @@ STUDIES = {
     "sensitivity": Entry("ccatp.studies.sensitivity_study", "STUDY", "what each disturbance of a hard world costs"),
     "ablation": Entry("ccatp.studies.ablation_study", "STUDY", "what each technique gives, one off at a time"),
     "danger": Entry("ccatp.studies.danger_study", "STUDY", "false edges and overrun of two edge rules"),
+    "faults": Entry("ccatp.studies.faults_study", "STUDY", "whole missions with random faults: falls, completion"),
     "cricket": Entry(
         "ccatp.studies.cricket_study", "STUDY", "self-mapping of motes: the published figures, better ways"
     ),

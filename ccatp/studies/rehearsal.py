@@ -20,6 +20,7 @@ from ccatp.localization.fixes import FixGated, FixRefused
 from ccatp.localizer import Localizer
 from ccatp.radio.multilateration import MultilaterationError
 from ccatp.samples import EventCode, Fix, PanelPose
+from ccatp.sim.faults.plan import FaultPlan
 from ccatp.sim.robot import Robot
 from ccatp.studies.rehearsal_book import RunBook
 from ccatp.studies.rehearsal_laser import LaserDesk
@@ -51,16 +52,17 @@ class Rehearsing:
     Args:
         cfg: the configuration.
         with_track: keep true and estimated pose of every frame.
+        faults: what shall go wrong with the robot; ``FaultyRehearsal`` can serve it.
     """
 
-    def __init__(self, cfg: Config, *, with_track: bool) -> None:
+    def __init__(self, cfg: Config, *, with_track: bool, faults: FaultPlan | None = None) -> None:
         """The robot stands at base, and nobody has joined it."""
         self.cfg = cfg
         parts: Parts = assemble(cfg)
         self.parts, self.mirror = parts, parts.mirror
         self.localizer: Localizer = parts.localizer
         self.mission, self.gate = parts.mission, parts.gate
-        self.robot = Robot(cfg, self.mirror, np.random.default_rng(cfg.run.seed))
+        self.robot = Robot(cfg, self.mirror, np.random.default_rng(cfg.run.seed), faults)
         self.monitor = DangerMonitor(self.mirror, cfg.robot, cfg.danger, cfg.health)
         self.predictor = CommandPredictor(cfg.robot.wheel_lag_s, self.robot.frame_s)
         self.laser = LaserDesk(cfg, self.mirror, self.robot)

@@ -22,8 +22,8 @@ from ccatp.radio.multilateration import MultilaterationError
 from ccatp.samples import Fix, PointId, Vector3
 from ccatp.sim.faults.plan import FaultPlan, parse_plan
 from ccatp.storage.store import MissionStore, PlannedPoint
+from ccatp.studies.faulty_rehearsal import FaultyRehearsal
 from ccatp.wire.robot import Sensors
-from tests.faults.campaign import FaultyRehearsal
 
 T = TypeVar("T")
 FULL = (1.0, 1.0)

@@ -4,7 +4,8 @@ import random
 
 import pytest
 
-from tests.faults.campaign import FaultyRehearsal, short_survey, single, was_real
+from ccatp.studies.faulty_rehearsal import FaultyRehearsal
+from tests.faults.campaign import short_survey, single, was_real
 from tests.faults.linking import Measured
 
 # The first panel lies at a corner. These meet the rim, one of them twice; most others find themselves before.

@@ -117,7 +117,7 @@ def test_a_real_job_has_every_figure(name: str, tmp_path: Path) -> None:
     ("name", "hint"),
     [
         ("filter", "did you mean filters"),
-        ("zzz", "there are thesis, filters, time, sensitivity, ablation, danger, cricket, mote-sizes"),
+        ("zzz", "there are thesis, filters, time, sensitivity, ablation, danger, faults, cricket, mote-sizes"),
     ],
 )
 def test_an_unknown_study_is_answered_with_the_nearest(name: str, hint: str) -> None:
