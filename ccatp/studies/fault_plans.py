@@ -9,6 +9,10 @@ LONGEST_S = 2.0
 FIRST_S = 3.0  # not before the sensors have said anything
 
 
+class NoFrames(RuntimeError):
+    """The robot fell silent for good, which no plan of passing faults does."""
+
+
 def random_plan(seed: int, count: int, last_s: float) -> FaultPlan:
     """A function of its arguments alone.
 

@@ -3,14 +3,11 @@
 from ccatp.config.models import Config
 from ccatp.sim.faults.plan import FaultPlan
 from ccatp.sim.faults.record import Injected
+from ccatp.studies.fault_plans import NoFrames
 from ccatp.studies.rehearsal import Rehearsing
 from ccatp.wire.robot import Sensors
 
 _LOST_FRAMES = 500  # without a frame for so long a mission is over
-
-
-class NoFrames(RuntimeError):
-    """The robot fell silent for good, which no plan of passing faults does."""
 
 
 class FaultyRehearsal(Rehearsing):
