@@ -3,9 +3,8 @@
 from math import exp, log
 
 # Candidates for the scatter, from "does not change" to "anything goes"; a factor of sqrt(2) apart.
-_CANDIDATES = tuple(1e-6 * 2.0 ** (k / 2.0) for k in range(32))
+_CANDIDATES = tuple(1e-7 * 2.0 ** (k / 2.0) for k in range(38))
 _FORGETTING = 0.99  # of the likelihoods per leg, so that a world that changes is noticed within a hundred legs
-_ALIKE = 10.0  # prior weight of the smallest candidate, "does not change": floors on which wheels hold are common
 _LEAST = 1e-14
 
 
@@ -30,8 +29,9 @@ class Population:
 
     def __init__(self, mean: float, sigma: float, largest: float) -> None:
         self._sigmas = [s for s in _CANDIDATES if s <= largest]
-        # Of an unknown scale nothing is known but its limits: its logarithm is uniform.
-        self._prior = [log(_ALIKE), *[0.0] * (len(self._sigmas) - 1)]
+        # Either the wheels hold, which is the smallest candidate, or they slip, and then nothing is known of the scale
+        # but its limits: its logarithm is uniform. Before the first leg one is as likely as the other.
+        self._prior = [log(max(len(self._sigmas) - 1, 1)), *[0.0] * (len(self._sigmas) - 1)]
         self._logs = [0.0] * len(self._sigmas)
         self._means = [mean] * len(self._sigmas)
         self._variances = [sigma * sigma] * len(self._sigmas)
