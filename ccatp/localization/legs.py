@@ -67,16 +67,18 @@ class LegBook:
     """Carries slip and creep from leg to leg.
 
     Right and left slip are taken apart into their mean (what the distance shows) and their difference (what the
-    heading shows); both wheels draw from one population. Where legs hardly differ, the next leg keeps the state and
-    all its correlations; where each leg slips differently, it begins with the mean of all legs. How much they differ is
-    learned (``Population``); creep varies by a share of itself.
+    heading shows). Both wheels draw from one population, so both tell how much legs differ. Where legs hardly differ,
+    the next leg keeps the state and all its correlations; where each leg slips differently, it begins with the mean of
+    all legs. How much they differ is learned (``Population``); creep varies by a share of itself.
 
     Args:
         cfg: what is expected before the first leg.
     """
 
     def __init__(self, cfg: FullStateConfig) -> None:
-        self._slip_scatter = Population(cfg.slip_mean, cfg.slip_sigma, cfg.slip_scatter_max)
+        # Half the difference of two draws scatters as their mean does.
+        expected = (cfg.slip_mean, cfg.slip_sigma), (0.0, 0.5 * cfg.slip_difference_sigma)
+        self._slip_scatter = Population(expected, cfg.slip_scatter_max)
         self._parameters = (
             _Parameter(cfg.slip_mean, cfg.slip_sigma),
             _Parameter(0.0, cfg.slip_difference_sigma),
@@ -140,11 +142,14 @@ class LegBook:
         self._is_open = False
         found = _PARAMETERS.dot(mean[_WHERE])
         known = _PARAMETERS.dot(covariance[np.ix_(_WHERE, _WHERE)]).dot(_PARAMETERS.T).diagonal()
-        mean_slip, variance = self._parameters[0].prior
-        prior = mean_slip, variance + self._wandered * self._scatters[0]
-        alone = _leg_alone(prior, (float(found[0]), float(known[0])))
-        if alone is not None:
-            self._slip_scatter.learn(*alone, 1.0 + self._wandered)
+        wander = self._wandered * self._scatters[0]
+        alone = []
+        for k, (scale, weight) in enumerate(((1.0, 1.0), (0.5, _DIFFERENCE))):
+            expected, variance = self._parameters[k].prior
+            says = _leg_alone((expected, variance + weight * wander), (float(found[k]), float(known[k])))
+            alone.append(None if says is None else (scale * says[0], scale * scale * says[1]))
+        if any(alone):
+            self._slip_scatter.learn(alone, 1.0 + self._wandered)
 
     def forget_leg(self) -> None:
         """The leg's measurements are not to be trusted."""

@@ -17,23 +17,22 @@ STEP = 2.0**0.5  # from one candidate for the scatter to the next
 
 
 def population() -> Population:
-    return Population(0.015, 0.015, 0.02)
+    return Population([(0.015, 0.015)], 0.02)
 
 
 def taught(scatter: float, legs: int, seed: int, sigma: float = 5e-4, mean: float = 0.03) -> Population:
     """After legs whose parameter is drawn from N(mean, scatter^2) and measured with ``sigma``."""
     rng, found = np.random.default_rng(seed), population()
     for _ in range(legs):
-        found.learn(mean + scatter * float(rng.normal()) + sigma * float(rng.normal()), sigma**2)
+        found.learn([(mean + scatter * float(rng.normal()) + sigma * float(rng.normal()), sigma**2)])
     return found
 
 
 def test_before_the_first_leg_it_is_what_was_expected() -> None:
     found = population()
-    assert found.mean == pytest.approx(0.015, rel=1e-12)
-    assert found.mean_variance == pytest.approx(0.015**2, rel=1e-12)
+    assert found.means[0] == pytest.approx(0.015, rel=1e-12)
+    assert found.mean_variances[0] == pytest.approx(0.015**2, rel=1e-12)
     assert 0.001 < sqrt(found.scatter) < 0.008  # log-uniform: the largest candidates carry it
-    assert found.variance == found.scatter + found.mean_variance
 
 
 def test_legs_that_all_slip_alike_shrink_the_scatter() -> None:
@@ -41,8 +40,8 @@ def test_legs_that_all_slip_alike_shrink_the_scatter() -> None:
     assert scatters == sorted(scatters, reverse=True)
     assert scatters[-1] < 5e-4 / 2.0  # less than what a single leg can show
     found = taught(0.0, 40, 1)
-    assert found.mean == pytest.approx(0.03, abs=4.0 * 5e-4 / sqrt(40))
-    assert sqrt(found.mean_variance) < 2.0 * 5e-4 / sqrt(40)
+    assert found.means[0] == pytest.approx(0.03, abs=4.0 * 5e-4 / sqrt(40))
+    assert sqrt(found.mean_variances[0]) < 2.0 * 5e-4 / sqrt(40)
 
 
 @pytest.mark.parametrize("scatter", [0.002, 0.005, 0.012])
@@ -52,7 +51,7 @@ def test_legs_that_differ_show_by_how_much(scatter: float) -> None:
     # Sixty samples give a standard deviation within 1/sqrt(120) = 9 %; the prior pulls by half of that.
     assert learned.mean() == pytest.approx(scatter, rel=0.08)
     assert learned.std() < 0.15 * scatter
-    off = np.array([(f.mean - 0.03) / sqrt(f.mean_variance) for f in found])
+    off = np.array([(f.means[0] - 0.03) / sqrt(f.mean_variances[0]) for f in found])
     assert float((off**2).mean()) == pytest.approx(1.0, abs=4.0 * sqrt(2.0 / 20))
 
 
@@ -63,23 +62,23 @@ def test_a_scatter_beyond_the_largest_is_not_thought_of() -> None:
 def test_a_world_that_changes_is_noticed() -> None:
     found, rng = taught(0.0, 60, 1), np.random.default_rng(2)
     for _ in range(40):
-        found.learn(0.03 + 0.008 * float(rng.normal()), 25e-8)
+        found.learn([(0.03 + 0.008 * float(rng.normal()), 25e-8)])
     assert sqrt(found.scatter) > 0.004
 
 
 def test_a_world_that_calms_down_is_noticed_too() -> None:
     found = taught(0.012, 300, 1)
     for _ in range(300):
-        found.learn(0.03, 25e-8)
+        found.learn([(0.03, 25e-8)])
     # Of the last 100 legs, which are remembered, 5 are of the time before: sqrt(0.05) 0.012 = 2.7e-3.
     assert sqrt(found.scatter) < 0.004
 
 
 def test_a_leg_that_shows_nothing_teaches_nothing() -> None:
     found = population()
-    before = found.mean, found.scatter
-    found.learn(0.5, 1e6)
-    assert (found.mean, found.scatter) == pytest.approx(before, rel=1e-5)
+    before = found.means[0], found.scatter
+    found.learn([(0.5, 1e6)])
+    assert (found.means[0], found.scatter) == pytest.approx(before, rel=1e-5)
 
 
 # -- the book ---------------------------------------------------------------------------------------------------------
@@ -166,16 +165,16 @@ def test_the_next_leg_is_given_what_bayes_gives_it(full: FullStateConfig) -> Non
 def test_a_leg_is_learned_from_without_what_was_expected_of_it(
     full: FullStateConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told: list[tuple[float, float, float]] = []
-    monkeypatch.setattr(Population, "learn", lambda _, value, variance, share: told.append((value, variance, share)))
+    told: list[tuple[list[tuple[float, float]], float]] = []
+    monkeypatch.setattr(Population, "learn", lambda _, samples, share: told.append((samples, share)))
     book = LegBook(full)
     x, P = state(*book.first())
     for slip, z in ((SR, 0.05), (SL, 0.03)):
         x, P = update(x, P, np.eye(STATES)[slip], z, 4e-4)  # as much as the prior: the posterior is half of each
     book.end(x, P)
-    value, variance, share = told[0]
-    assert variance == pytest.approx(2e-4, rel=1e-9)  # of a mean of two
-    assert value == pytest.approx(0.04, rel=1e-9)
+    (mean, half), share = told[0]
+    assert mean == pytest.approx((0.04, 2e-4), rel=1e-9)  # of a mean of two
+    assert half == pytest.approx((0.01, 2e-4), rel=1e-9)  # of half their difference
     assert share == 1.0
 
 
@@ -183,8 +182,8 @@ def test_what_wandered_within_a_leg_is_no_knowledge_lost(
     full: FullStateConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The leg's own variance is that of its measurements; the wander counts with the scatter of which it is a share."""
-    told: list[tuple[float, float, float]] = []
-    monkeypatch.setattr(Population, "learn", lambda _, value, variance, share: told.append((value, variance, share)))
+    told: list[tuple[list[tuple[float, float]], float]] = []
+    monkeypatch.setattr(Population, "learn", lambda _, samples, share: told.append((samples, share)))
     book = LegBook(full)
     x, P = state(*book.first())
     slip, creep = book.wander(2.0)
@@ -192,9 +191,9 @@ def test_what_wandered_within_a_leg_is_no_knowledge_lost(
     for wheel, z in ((SR, 0.05), (SL, 0.03)):
         x, P = update(x, P, np.eye(STATES)[wheel], z, 4e-4)
     book.end(x, P)
-    value, variance, share = told[0]
-    assert variance == pytest.approx(2e-4, rel=1e-9)
-    assert value == pytest.approx(0.04, rel=1e-9)
+    (mean, half), share = told[0]
+    assert mean == pytest.approx((0.04, 2e-4), rel=1e-9)
+    assert half == pytest.approx((0.01, 2e-4), rel=1e-9)
     assert share == pytest.approx(1.0 + full.wander_fraction**2 / full.wander_time_s * 2.0)
 
 
@@ -238,6 +237,15 @@ def test_a_floor_on_which_every_leg_slips_differently(full: FullStateConfig, hal
     # A uniform distribution's sigma is its half width over sqrt(3), the mean of two wheels has 1/sqrt(2) of that. Of
     # the last 100 legs, which are remembered, 7 %.
     assert book.scatter[0] == pytest.approx(half_width / sqrt(6.0), rel=0.2)
+
+
+def test_wheels_that_slip_unlike_each_other_tell_how_much_legs_differ(full: FullStateConfig) -> None:
+    """The mean of the two is the same in every leg, their difference is not."""
+    book, rng = LegBook(full), np.random.default_rng(5)
+    halves = (0.01 / sqrt(2.0) * rng.normal(size=150)).tolist()
+    drive(book, [(0.03 + half, 0.03 - half) for half in halves], 1e-7)
+    # Half of the samples scatter by 0.01/sqrt(2), half by nothing.
+    assert book.scatter[0] == pytest.approx(0.005, rel=0.2)
 
 
 def test_only_a_leg_that_was_ended_by_a_fix_teaches_its_scatter(full: FullStateConfig) -> None:
@@ -284,8 +292,8 @@ def test_what_it_expects_of_the_next_leg_is_what_the_next_leg_shows() -> None:
         for _ in range(1500 if sigma > 1e-3 else 200):
             book, mean = population(), 0.015 + 0.015 * float(rng.normal())
             for _ in range(3):
-                book.learn(mean + sigma * float(rng.normal()) + 5e-4 * float(rng.normal()), 25e-8)
-            squares.append((sigma * sigma + (mean - book.mean) ** 2) / book.variance)
+                book.learn([(mean + sigma * float(rng.normal()) + 5e-4 * float(rng.normal()), 25e-8)])
+            squares.append((sigma * sigma + (mean - book.means[0]) ** 2) / (book.scatter + book.mean_variances[0]))
         expected += weight * float(np.mean(squares))
         variance += weight * weight * float(np.var(squares)) / len(squares)
     assert 4.0 * sqrt(variance) < 0.25
