@@ -15,7 +15,7 @@ MINUTES = float(os.environ.get("CCATP_SOAK_MINUTES", "3"))
 WARM_UP_S = 900.0  # at most: what is done for the first time brings its modules and its memory along
 SLOPE_MINUTES = 20.0  # a page more or less would be MiB an hour in a shorter time
 MIB = float(1 << 20)
-# 62 minutes with half a second a point, and a second and a half more at 783 points: longer than the soak and its warm-up.
+# 62 minutes with half a second a point, and a second and a half more at 783 points: longer than warm-up and soak.
 AN_HOUR_AND_MORE = ("--mirror", "thesis-m1", "--set", "etalon.measuring_time_s=2.0")
 LOOPS = ("main", "danger")
 
