@@ -259,8 +259,8 @@ def test_what_a_leg_passes_on_knows_little_of_a_late_fix() -> None:
     taken, told = story.end_after(3.0), story.end_after(4.5)
     in_time, late = (story.tell({k: [story.fixes[taken]]}) for k in (taken, told))
     mean, covariance = apart(in_time, late)
-    # The mean of the slip is corrected, but not the scatter between the legs that the fix would have taught, by the mean
-    # of the two wheels' slips and by their difference.
+    # The mean of the slip is corrected, but not the scatter between the legs that the fix would have taught, by the
+    # mean of the two wheels' slips and by their difference.
     assert mean < 0.01
     assert covariance < 0.1
 
