@@ -20,7 +20,7 @@ class FaultyRehearsal(Rehearsing):
 
     Attributes:
         denied_s: when lines that were no frames took the permit away.
-        weak_frames: frames in which the fans gave less than their floor.
+        weak_frames: frames on an overhang in which the fans gave less than their floor.
     """
 
     def __init__(self, cfg: Config, plan: FaultPlan, *, with_track: bool = False) -> None:
@@ -56,7 +56,8 @@ class FaultyRehearsal(Rehearsing):
             self.robot.permit(self._drive_seq, verdict.forward, verdict.reverse, verdict.turn)
 
     def _serve(self, frame: Sensors, dt_s: float) -> None:
-        self.weak_frames += self.robot.fans.thrust < self.cfg.sim.robot.fan_floor
+        if self.mirror.overhang and self.robot.fans.thrust < self.cfg.sim.robot.fan_floor:
+            self.weak_frames += 1
         if dt_s > 0.0:
             super()._serve(frame, dt_s)
             return
