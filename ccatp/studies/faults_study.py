@@ -28,8 +28,8 @@ COLUMNS = (
     Column("frames below the fans' floor", "weak_frames"),
     Column("points measured", "points.measured"),
     Column("of", "points.total"),
-    Column("faults", "faults.planned"),
-    Column("that acted", "faults.acted"),
+    Column("faults", "injected.planned"),
+    Column("that acted", "injected.acted"),
     Column("mission, s", "mission_time_s", ".0f"),
     Column("time / bound", "time_ratio", ".4f"),
     Column("ended by", "ended"),
@@ -44,7 +44,7 @@ def cells() -> Sequence[Cell]:
 def run_job(job: Job) -> Outcome:
     """One mission."""
     if job.factors["faults"] == NONE:
-        about = {"faults": {"planned": 0, "acted": 0}, "is_recoverable": True, "weak_frames": 0}
+        about = {"injected": {"planned": 0, "acted": 0}, "is_recoverable": True, "weak_frames": 0}
         return _outcome(job, rehearse(job.cfg), about)
     parts = assemble(job.cfg)
     plan = random_plan(job.seed, FAULTS_PER_MISSION, parts.lower_bound_s)
@@ -52,7 +52,7 @@ def run_job(job: Job) -> Outcome:
     result = rehearsal.run()
     about = {
         # A fault that comes after the end, or between two readings of a slow sensor, does nothing.
-        "faults": {"planned": len(plan.faults), "acted": sum(record.samples > 0 for record in rehearsal.injected)},
+        "injected": {"planned": len(plan.faults), "acted": sum(record.samples > 0 for record in rehearsal.injected)},
         "is_recoverable": is_recoverable(plan, parts.mirror),
         "weak_frames": rehearsal.weak_frames,
     }
@@ -88,7 +88,7 @@ def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
         "ended": ended,
         "danger": dangers([v["danger"] for v in values]),
         "weak_frames": sum(v["weak_frames"] for v in values),
-        **{of: {name: sum(v[of][name] for v in values) for name in values[0][of]} for of in ("points", "faults")},
+        **{of: {name: sum(v[of][name] for v in values) for name in values[0][of]} for of in ("points", "injected")},
         **times(values),
     }
     arrays = {

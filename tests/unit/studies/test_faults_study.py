@@ -24,7 +24,7 @@ def outcome(seed: int, how: str, **changes: Any) -> Outcome:
         "seed": seed,
         "outcome": how,
         "cause": "" if how == "complete" else "held",
-        "faults": {"planned": 12, "acted": 11},
+        "injected": {"planned": 12, "acted": 11},
         "is_recoverable": how == "complete",
         "weak_frames": 0,
         "points": {"measured": 9, "total": 9},
@@ -57,8 +57,8 @@ def test_a_real_job(faults: str) -> None:
     assert values["points"]["measured"] == values["points"]["total"] == 9
     assert (values["danger"]["falls"], values["weak_frames"]) == (0, 0)
     planned = faults_study.FAULTS_PER_MISSION if faults == faults_study.RANDOM else 0
-    assert values["faults"]["planned"] == planned
-    assert planned / 2 <= values["faults"]["acted"] <= planned
+    assert values["injected"]["planned"] == planned
+    assert planned / 2 <= values["injected"]["acted"] <= planned
 
 
 def test_fans_that_seem_to_fail_on_an_overhang_wait_for_an_operator() -> None:
@@ -90,9 +90,10 @@ def test_a_cell_says_who_was_not_completed_and_is_drawn(tmp_path: Path) -> None:
     assert (first["complete"], first["ended"]) == (1, ["seed 2 stopped: held"])
     assert first["recoverable"] == {"runs": 1, "complete": 1}
     assert (first["danger"]["false_edges"], first["weak_frames"]) == (2, 4)
-    assert (first["faults"]["acted"], first["points"]["total"], first["time_ratio"]) == (22, 18, 1.1)
+    assert (first["injected"]["acted"], first["points"]["total"], first["time_ratio"]) == (22, 18, 1.1)
     lines = table([plain({**cell.factors, **cell.values}) for cell in results], faults_study.COLUMNS).splitlines()
     assert len(lines) == 2 + 8
-    assert "seed 2 stopped: held" in lines[2]
+    assert lines[3].startswith("| thesis-m1 | random | 2 | 1 |")
+    assert "seed 2 stopped: held" in lines[3]
     faults_study.STUDY.draw(results, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"faults.png", "faults.pdf"}
