@@ -1,6 +1,7 @@
 """Pure. Straight legs against the rim, and the way around a stepped corner."""
 
 from collections.abc import Iterable, Sequence
+from enum import IntEnum
 from math import atan2, cos, hypot, inf, sin
 
 from ccatp.mirror.mirror import Mirror
@@ -12,7 +13,19 @@ _ROUNDING_M = 1e-9
 _STEEP = 0.5
 # Further than this from a seam's border a track that should pass beside it does.
 _BESIDE_M = 0.008
-_GRAZING_M = 0.4  # what a way may be longer for it
+# More way than this within a seam's gap, and the danger rules take it for the mirror's edge.
+_EXPLAINED_M = 0.02
+
+
+class Grazing(IntEnum):
+    """How a leg lies to the seams that are oblique to it: the more, the worse."""
+
+    NONE = 0
+    BESIDE = 1  # a sensor passes so near that errors may carry it over the gap
+    ALONG = 2  # a sensor runs along within the gap: an edge, as far as anybody can tell
+
+
+_GRAZING_M = (0.0, 0.4, 4.0)  # what a way may be longer to be without
 
 
 class LegRules:
@@ -29,7 +42,8 @@ class LegRules:
         self._sensors: list[list[float]] = body.sensors_m.tolist()
         self._corners, self._nodes = _reentrant_corners(mirror, body)
         self._seams = _seam_lines(mirror)
-        self._beside_m = 0.5 * mirror.gap_m + _BESIDE_M
+        self._half_gap_m = 0.5 * mirror.gap_m
+        self._beside_m = self._half_gap_m + _BESIDE_M
 
     def clearance_m(self, a: Place, b: Place) -> float:
         """Clearance of the leg from ``a`` to ``b``: exact, or a lower bound that suffices for every rule, m."""
@@ -72,7 +86,7 @@ class LegRules:
             for ox, oy in self._sensors
         )
 
-    def grazes_seam(self, a: Place, b: Place, course_rad: float) -> bool:
+    def grazing(self, a: Place, b: Place, course_rad: float) -> Grazing:
         """Whether a sensor may run along a seam on the leg from ``a`` to ``b``, which looks like the mirror's edge.
 
         Args:
@@ -82,6 +96,7 @@ class LegRules:
         dx, dy = b.x_m - a.x_m, b.y_m - a.y_m
         length = hypot(dx, dy)
         c, s = cos(course_rad), sin(course_rad)
+        found = Grazing.NONE
         for start, way, lines, (p, q) in zip((a.x_m, a.y_m), (dx, dy), self._seams, ((c, -s), (s, c)), strict=True):
             if abs(way) >= _STEEP * length:
                 continue
@@ -90,9 +105,20 @@ class LegRules:
                 high = low + way
                 if low > high:
                     low, high = high, low
-                if any(low - self._beside_m < line < high + self._beside_m for line in lines):
-                    return True
-        return False
+                for line in lines:
+                    if low - self._beside_m < line < high + self._beside_m:
+                        if self._runs_along(low, high, line, length):
+                            return Grazing.ALONG
+                        found = Grazing.BESIDE
+        return found
+
+    def _runs_along(self, low: float, high: float, line: float, length: float) -> bool:
+        """Whether a track of ``length`` between two places across a seam lies in its gap for long."""
+        overlap = min(high, line + self._half_gap_m) - max(low, line - self._half_gap_m)
+        if overlap < 0.0:
+            return False
+        across = high - low
+        return length > _EXPLAINED_M if across == 0.0 else overlap / across * length > _EXPLAINED_M
 
     def way_around(self, a: Place, b: Place) -> tuple[Place, ...]:
         """Best chain of places that leads from ``a`` around stepped corners to ``b``, ends left out.
@@ -119,7 +145,7 @@ class LegRules:
             for i in open_places:
                 total = cost[k] + hypot(places[i].x_m - places[k].x_m, places[i].y_m - places[k].y_m)
                 if total < cost.get(i, inf) and self.is_clear(places[k], places[i]):
-                    total += _GRAZING_M if self._grazes_facing(places[k], places[i]) else 0.0
+                    total += _GRAZING_M[self._grazing_facing(places[k], places[i])]
                     if total < cost.get(i, inf):
                         cost[i], before[i] = total, k
         chain = []
@@ -133,10 +159,10 @@ class LegRules:
         return [elbow for a in sources for b in targets if not self._is_good(a, b) for elbow in self._elbows(a, b)]
 
     def _is_good(self, a: Place, b: Place) -> bool:
-        return self.is_clear(a, b) and not self._grazes_facing(a, b)
+        return self.is_clear(a, b) and not self._grazing_facing(a, b)
 
-    def _grazes_facing(self, a: Place, b: Place) -> bool:
-        return self.grazes_seam(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m))
+    def _grazing_facing(self, a: Place, b: Place) -> Grazing:
+        return self.grazing(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m))
 
     def _elbows(self, a: Place, b: Place) -> list[Place]:
         """The corners of the rectangle over a and b at which the robot can turn."""

@@ -15,8 +15,9 @@ from ccatp.planning.stance import Place
 STOP_S = 0.15
 # Of two ways that cost the same take the one driven forward.
 _REVERSE_S = 0.01
-# What a way may cost more on which no sensor runs along a seam. Met, such an edge costs ten seconds; but few are met.
-_GRAZING_S = 3.0
+# What a way may cost more on which no sensor runs along a seam, by ``Grazing``. Met, such an edge costs ten seconds; of
+# those beside the way few are met. Those along it are met again and again, until the robot waits for an operator.
+_GRAZING_S = (0.0, 3.0, 60.0)
 
 
 class Target(NamedTuple):
@@ -117,8 +118,7 @@ class Search:
             if best is not None and self._rules.are_sensors_clear(source, target, course, clearance_m):
                 turned_s, arrival = best
                 total_s = turned_s + cost_s + (_REVERSE_S if reverse else 0.0)
-                if self._rules.grazes_seam(source, target, course):
-                    total_s += _GRAZING_S
+                total_s += _GRAZING_S[self._rules.grazing(source, target, course)]
                 yield Arrival(target, course, total_s, reverse, arrival)
 
     def _cheapest_turn(self, place: Place, arrivals: list[Arrival], course: float) -> tuple[float, Arrival] | None:

@@ -7,13 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccatp.config.loader import load_config
+from ccatp.mirror.mirror import build_mirror
 from ccatp.planning.bound import path_time
 from ccatp.planning.errors import OutsideMirrorError, PlanError, UnreachableError
-from ccatp.planning.legs import LegRules
+from ccatp.planning.legs import Grazing, LegRules
 from ccatp.planning.route import Route, plan_route
 from ccatp.planning.search import Arrival, Search, Target
-from ccatp.planning.stance import build_body, build_places
+from ccatp.planning.stance import Place, build_body, build_places
 from ccatp.planning.traversal import thesis_order
+from ccatp.planning.way_home import plan_way_home
 from ccatp.samples import DeckPose, PointId, Stop, StopKind
 
 STEPS_OF_THESIS_M1 = ((1, 2), (2, 3), (7, 8), (8, 9))  # rows of 7, 9, 11, ..., 11, 9, 7 panels
@@ -154,7 +157,9 @@ def test_way_around_several_corners(thesis: Any) -> None:
     chain = [upper, *rules.way_around(upper, top), top]
     assert len(chain) == 3  # by the elbow, along rows and columns
     assert all(rules.is_clear(a, b) for a, b in pairwise(chain))
-    assert rules.way_around(lower, middle) == ()
+    slanted = [lower, *rules.way_around(lower, middle), middle]
+    assert len(slanted) == 3  # clear, but at 25 degrees it would lead a sensor along the seams between rows
+    assert rules.is_clear(lower, middle)
 
 
 def test_no_way_to_a_place_in_the_clearance(thesis: Any) -> None:
@@ -209,22 +214,49 @@ def test_no_sensor_runs_along_a_seam(thesis: Any) -> None:
     grazing = [
         (stop.x_m, stop.y_m)
         for (a, b), stop in zip(pairwise(places), stops[1:], strict=True)
-        if rules.grazes_seam(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m))
+        if rules.grazing(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m))
     ]
     assert grazing == []
+
+
+@pytest.mark.parametrize(("name", "slanted"), [("thesis-m1", 11), ("fyst-m2", 1)])  # fyst-m2 has narrower seams
+def test_no_way_off_the_route_leads_along_a_seam(name: str, slanted: int) -> None:
+    """Home from anywhere, or to a point at the other end of the mirror: straight there, a slanted way would."""
+    cfg = load_config(overrides={"run.mirror": name})
+    mirror = build_mirror(cfg.mirror)
+    rules, points = LegRules(mirror, build_body(cfg.robot, cfg.mission)), thesis_order(mirror)
+    rng, straight, found = np.random.default_rng(1), 0, []
+    for k in range(60):
+        x, y = next(p for p in rng.uniform(-3.0, 3.0, (99, 2)).tolist() if mirror.rim.signed_distance_m(*p) > 0.2)
+        start = DeckPose(x, y, float(rng.uniform(-np.pi, np.pi)))
+        if k % 2:
+            stops = plan_way_home(mirror, start, mirror.base_pose, cfg.robot, cfg.limits, cfg.mission)
+        else:
+            point = points[int(rng.integers(len(points)))]
+            stops = plan_route(mirror, [point], cfg.robot, cfg.limits, cfg.mission, start).stops
+        places = [Place(x, y, 1.0), *(Place(stop.x_m, stop.y_m, 1.0) for stop in stops)]
+        for (a, b), stop in zip(pairwise(places), stops, strict=True):
+            if (b.x_m, b.y_m) != (a.x_m, a.y_m):
+                course = atan2(b.y_m - a.y_m, b.x_m - a.x_m) + (np.pi if stop.reverse else 0.0)
+                found.append(rules.grazing(a, b, course))
+        a, b = places[0], places[-1]
+        straight += rules.grazing(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m)) is Grazing.ALONG
+    assert straight >= slanted
+    assert Grazing.ALONG not in found
 
 
 @pytest.mark.parametrize(
     ("from_m", "to_m", "grazes"),
     [
-        ((-0.34, 0.0), (-0.34, 0.2), False),  # beside it: the sensors at -0.25 and -0.43, the seam at -0.34
-        ((-0.25, 0.0), (-0.25, 0.2), True),  # the left sensors over it all the way
-        ((-0.27, 0.0), (-0.23, 0.2), True),  # across it, but so slanted that they stay over it for long
-        ((-0.40, 0.0), (-0.28, 0.02), False),  # straight across
+        ((-0.34, 0.0), (-0.34, 0.2), Grazing.NONE),  # far beside it: the sensors at -0.25 and -0.43, the seam at -0.34
+        ((-0.26, 0.0), (-0.26, 0.2), Grazing.BESIDE),  # the left sensors 10 mm from its middle: the gap begins at 5
+        ((-0.25, 0.0), (-0.25, 0.2), Grazing.ALONG),  # the left sensors over it all the way
+        ((-0.27, 0.0), (-0.23, 0.2), Grazing.ALONG),  # across it, but so slanted that they stay over it for long
+        ((-0.40, 0.0), (-0.28, 0.02), Grazing.NONE),  # straight across
     ],
 )
 def test_which_legs_graze_a_seam(
-    thesis: Any, from_m: tuple[float, float], to_m: tuple[float, float], grazes: bool
+    thesis: Any, from_m: tuple[float, float], to_m: tuple[float, float], grazes: Grazing
 ) -> None:
     body = build_body(thesis.cfg.robot, thesis.cfg.mission)
     rules = LegRules(thesis.mirror, body)
@@ -234,4 +266,4 @@ def test_which_legs_graze_a_seam(
         thesis.mirror, body, np.array([from_m[0] + shift, to_m[0] + shift]), np.array([from_m[1], to_m[1]])
     )
     assert seam.axis == "x"
-    assert rules.grazes_seam(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m)) is grazes
+    assert rules.grazing(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m)) is grazes
