@@ -8,8 +8,8 @@ from ccatp.studies.faulty_rehearsal import FaultyRehearsal
 from tests.faults.campaign import short_survey, single, was_real
 from tests.faults.linking import Measured
 
-# The first panel lies at a corner. These meet the rim, one of them twice; most others find themselves before.
-SEEDS = (0, 22, 23, 52)
+# The first panel lies at a corner. These meet the rim, some more than once; most others find themselves before.
+SEEDS = (0, 10, 22, 52, 62, 69)
 
 
 def carried_off(seed: int) -> FaultyRehearsal:

@@ -32,6 +32,11 @@ def slow(one: Seen) -> bool:
     return one.verdict.severity is Severity.SLOW and one.t_s > 1.0
 
 
+def slow_or_more(one: Seen) -> bool:
+    """Of an encoder that counts steps, every third sample may look like a wheel that runs away, which holds."""
+    return one.verdict.severity >= Severity.SLOW and one.t_s > 1.0
+
+
 def lines(signals: str, rest: str) -> str:
     """The same fault of several signals."""
     return "\n\n".join(f'signal = "{signal}"\n{rest}' for signal in signals.split())
@@ -256,7 +261,7 @@ def test_a_clock_that_wraps_does_not_count_in_the_mission_time(phase_s: float) -
 @pytest.mark.fault("S16")
 @pytest.mark.parametrize("signal", ["encoder_right encoder_left", "edge_front_left", "imu_wz"])
 def test_a_slow_sensor_slows_the_robot(signal: str) -> None:
-    run = watched(lines(signal, f'type = "slow"\nat_s = {DRIVING_S}\nevery = 3'), HARD, slow)
+    run = watched(lines(signal, f'type = "slow"\nat_s = {DRIVING_S}\nevery = 3'), HARD, slow_or_more)
     assert all(map(was_real, run.injected))
     assert run.seen[-1].t_s - DRIVING_S <= 1.05
 
