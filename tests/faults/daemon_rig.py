@@ -101,9 +101,12 @@ class Daemon:
 
     async def until(self, condition: Callable[[], bool]) -> None:
         """Wait for something; the loops go on meanwhile."""
-        async with asyncio.timeout(DEADLINE_S):
-            while not condition():  # noqa: ASYNC110 - frames are worth no event each
-                await asyncio.sleep(0.005)
+        try:
+            async with asyncio.timeout(DEADLINE_S):
+                while not condition():  # noqa: ASYNC110 - frames are worth no event each
+                    await asyncio.sleep(0.005)
+        except TimeoutError:
+            raise AssertionError(tell(self)) from None
 
     @property
     def is_driving(self) -> bool:
