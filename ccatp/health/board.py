@@ -12,7 +12,7 @@ from ccatp.health.imu_gate import ImuGate
 from ccatp.health.look import Moved, WheelMeans, Window
 from ccatp.health.seams import Ground, SeamMonitor
 from ccatp.health.supply import BatteryMonitor, FanMonitor, OwnFaults
-from ccatp.health.wheels import WheelMonitor
+from ccatp.health.wheels import LATE_S, WheelMonitor
 from ccatp.health.yaw import GyroscopeBias, YawMonitor, imu_finding
 from ccatp.samples import EdgeSample, ImuSample, Severity, WheelSample
 
@@ -27,6 +27,10 @@ class Echo(Protocol):
     @property
     def seq(self) -> int:
         """Its number."""
+
+    @property
+    def age(self) -> float:
+        """How long ago it arrived, s."""
 
     @property
     def held(self) -> bool:
@@ -161,7 +165,7 @@ class HealthBoard:
         self._home_m = 0.0
         self._frames = 0
         self._counts = [0, 0, 0]
-        self._is_free = True
+        self._is_free, self._is_late = True, False
         self._speed_m_s = 0.0
         self.findings: list[Finding] = []
 
@@ -215,6 +219,7 @@ class HealthBoard:
         self._counts[1] += len(wheels)
         self._counts[2] += len(edges)
         self._is_free = self._is_free and is_permitted and not frame.cmd.held
+        self._is_late = self._is_late or (frame.cmd.age > LATE_S and not frame.cmd.held)
         is_flickering = is_any_off or not self.flicker.is_quiet
         self._frames += 1
         if (
@@ -235,8 +240,8 @@ class HealthBoard:
         now = self._sums
         shortly, stalling = self._shortly.push(now), self._stalling.push(now)
         turning = self._turning.push(now)
-        self._wheels.step(now, shortly, stalling, is_free=self._is_free, samples=wheels)
-        self._is_free = True
+        self._wheels.step(now, shortly, stalling, is_free=self._is_free, is_late=self._is_late, samples=wheels)
+        self._is_free, self._is_late = True, False
         self._speed_m_s = 0.0
         if shortly is not None:
             self._speed_m_s = max(abs(shortly.right_m), abs(shortly.left_m)) / shortly.t_s

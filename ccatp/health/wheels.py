@@ -14,6 +14,8 @@ HOLD, FAULT = Severity.HOLD, Severity.FAULT
 _MEMORY_S = 0.4
 # What is commanded is known in steps of five frames, and reaches the wheels two delays of the link later.
 _LATENCY_S = 0.1
+LATE_S = 0.1
+"""A drive that has been in force for longer was followed by others that have not arrived: the link stalls."""
 # Wheels and gyroscope that differ by more than this within a stall's time do not show the same motion.
 _SAME_TURN_RAD = 0.05
 _STALL_RETRIES = 1
@@ -100,6 +102,7 @@ class WheelMonitor:
         self._lately: Span | None = None
         self._stall: Span | None = None
         self._held_s: float | None = None
+        self._late_s: float | None = None
         self._stood: Moved | None = None
         self._creeping = Since(), Since()
 
@@ -115,6 +118,7 @@ class WheelMonitor:
         stalling: Moved | None,
         *,
         is_free: bool,
+        is_late: bool,
         samples: Sequence[WheelSample],
     ) -> None:
         """Judge a frame.
@@ -123,11 +127,14 @@ class WheelMonitor:
             now: the sums.
             shortly, stalling: their change over ``runaway_time_s`` and over ``stall_time_s``.
             is_free: the robot executed what it was told in this frame, and was permitted to.
+            is_late: it executed what it had been told long before.
             samples: of the frame.
         """
         t_s, lately = now.t_s, self._lately
         if not is_free:
             self._held_s = t_s
+        if is_late:
+            self._late_s = t_s
         if lately is not None:
             if shortly is not None:
                 self._find_runaway(t_s, shortly, lately, samples)
@@ -178,8 +185,10 @@ class WheelMonitor:
         return low >= limit or high <= -limit
 
     def _find_creep(self, now: Moved, moved: Moved, told: Span, samples: Sequence[WheelSample]) -> None:
-        """Told to stand, and it does not."""
-        if told[1:] != (0.0, 0.0, 0.0, 0.0):
+        """Told to stand, and it does not; while the link stalls the robot goes on as it was told last, and runs down."""
+        runs_down_s = _MEMORY_S + self._cfg.stall_time_s
+        is_running_down = self._late_s is not None and now.t_s - self._late_s < runs_down_s
+        if is_running_down or told[1:] != (0.0, 0.0, 0.0, 0.0):
             self._stood = None
             return
         if self._stood is None:
