@@ -185,7 +185,7 @@ class WheelMonitor:
         return low >= limit or high <= -limit
 
     def _find_creep(self, now: Moved, moved: Moved, told: Span, samples: Sequence[WheelSample]) -> None:
-        """Told to stand, and it does not; while the link stalls the robot goes on as it was told last, and runs down."""
+        """Told to stand, and it does not. While the link stalls the robot goes on as told last, and then runs down."""
         runs_down_s = _MEMORY_S + self._cfg.stall_time_s
         is_running_down = self._late_s is not None and now.t_s - self._late_s < runs_down_s
         if is_running_down or told[1:] != (0.0, 0.0, 0.0, 0.0):
