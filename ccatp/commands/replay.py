@@ -69,9 +69,17 @@ def replay(
         complain(f"warning: {warning}", 0)
     if out is not None:
         _write(out, csv_lines(parts))
-    for line in [json.dumps(result)] if json_output else [*_head(result), *table_lines(result), _verdict(result)]:
+    is_as_it_was = result["difference"]["reproduced"]
+    may_differ = bool(changes or result["warnings"])
+    lines = [*_head(result), *table_lines(result)]
+    if is_as_it_was or may_differ:
+        lines.append(f"the replay {'reproduces' if is_as_it_was else 'differs from'} the recorded estimates")
+    for line in [json.dumps(result)] if json_output else lines:
         click.echo(line)
-    return 0
+    if is_as_it_was or may_differ:
+        return ExitStatus.COMPLETE
+    why = "was the run made by another version, or on another CPU?"
+    return complain(f"{run_dir}: the replay does not reproduce the recorded estimates: {why}", ExitStatus.REFUSED)
 
 
 def _config(recording: "Recording", changes: Mapping[str, object], smooth: bool) -> "Config":
@@ -123,6 +131,7 @@ def _facts(
         "fixes": {
             "given": sum(outcome.fixes for outcome in outcomes),
             "refused": sum(outcome.refused for outcome in outcomes),
+            "set_aside": sum(outcome.set_aside for outcome in outcomes),
             "first_difference": None if first is None else {"t_s": first[0], "said": first[1]},
         },
         "counts": _summed([outcome.counts for outcome in outcomes]),
@@ -145,20 +154,13 @@ def _head(result: Mapping[str, Any]) -> list[str]:
     lines = [
         f"{result['run_dir']}: {result['mirror']}, {where}",
         f"{result['frames']} frames, {result['span_s']:.1f} s; filter {result['filter']}, settings: {changes}",
-        f"{fixes['given']} fixes, {fixes['refused']} of them refused; {per_frame_us:.0f} us a frame",
+        f"{fixes['given']} fixes, {fixes['set_aside']} of them set aside in the run, {fixes['refused']} refused here; "
+        f"{per_frame_us:.0f} us a frame",
     ]
     if (first := fixes["first_difference"]) is not None:
         what = f"is refused here: {first['said']}" if first["said"] else "is taken here and was refused in the run"
         lines.append(f"the fix of {first['t_s']:.2f} s {what}")
     return [*lines, ""]
-
-
-def _verdict(result: Mapping[str, Any]) -> str:
-    if result["difference"]["reproduced"]:
-        return "the replay reproduces the recorded estimates"
-    if result["settings"] or result["warnings"]:
-        return "the replay differs from the recorded estimates"
-    return "the replay does not reproduce the recorded estimates: was the run made by another version, or another CPU?"
 
 
 def _progress() -> Callable[[float], None] | None:

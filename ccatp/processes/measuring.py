@@ -133,12 +133,13 @@ class MeasuringDesk:
             fix, request.expected_m, request.estimate, localizer.pose_covariance, is_lost=self._mission.is_lost
         )
         doubt, jump_m = finding.doubt or finding.refusal, 0.0
-        if not doubt:
+        is_set_aside = bool(doubt)
+        if not is_set_aside:
             try:
                 jump_m = localizer.fuse_fix(fix)
             except FixRefused as refusal:
                 doubt = str(refusal)
-        self._teller.fix(request.point, fix, jump_m, is_fused=not doubt)
+        self._teller.fix(request.point, fix, jump_m, is_fused=not doubt, is_set_aside=is_set_aside)
         if finding.refusal:
             raise FrameRefused(finding.refusal)
         if doubt:

@@ -99,8 +99,18 @@ class SurveyTeller(Teller):
         """The localizer is treated in frame ``seq``; see ``Treatment``."""
         self._publisher.send("treatment", Treatment(seq=seq, t_s=t_s, kind=kind, values=values))
 
-    def fix(self, point: PointId | None, fix: Fix, jump_m: float, *, is_fused: bool) -> None:
-        """A fix was handed to the localizer after the last frame; ``None`` for one that only finds the robot."""
+    def fix(
+        self, point: PointId | None, fix: Fix, jump_m: float, *, is_fused: bool, is_set_aside: bool = False
+    ) -> None:
+        """A fix was measured after the last frame; no point for one that only finds the robot.
+
+        Args:
+            point: that was measured.
+            fix: as measured.
+            jump_m: of the estimate.
+            is_fused: the localizer took it.
+            is_set_aside: the localizer was not given it.
+        """
         message = FixMessage(
             seq=self.seq,
             t_s=fix.t_s,
@@ -112,6 +122,7 @@ class SurveyTeller(Teller):
             residual_rms_m=fix.residual_rms_m,
             channels=list(fix.channels),
             jump_mm=1e3 * jump_m,
+            is_set_aside=is_set_aside,
         )
         self._publisher.send("fix", message)
 

@@ -31,10 +31,17 @@ class Marked:
 
 @dataclass(frozen=True, slots=True)
 class Fixed:
-    """A fix was handed over after the frame before it; ``was_fused`` tells whether it was taken then."""
+    """A fix was measured after the frame before it.
+
+    Attributes:
+        fix: as measured.
+        was_fused: the localizer took it then.
+        was_set_aside: the localizer never saw it: it was doubted, and measured again.
+    """
 
     fix: Fix
     was_fused: bool
+    was_set_aside: bool = False
 
 
 Event = Marked | Fixed
@@ -47,18 +54,19 @@ class Stood(NamedTuple):
 
 
 class FixGiven(NamedTuple):
-    """A fix was handed over after frame ``seq``."""
+    """A fix was measured after frame ``seq``; the others as in ``Fixed``."""
 
     seq: int
     fix: Fix
     was_fused: bool
+    was_set_aside: bool = False
 
 
 Message = Sensors | Stood | FixGiven | Treatment
 
 
 def fix_given(message: FixMessage) -> FixGiven:
-    """The recorded fix as it was handed to the localizer."""
+    """The recorded fix as it was measured, and what became of it."""
     fix = Fix(
         t_s=message.t_s,
         position_m=message.position_m,
@@ -67,7 +75,7 @@ def fix_given(message: FixMessage) -> FixGiven:
         channels=tuple(message.channels),
         residual_rms_m=message.residual_rms_m,
     )
-    return FixGiven(message.seq, fix, message.is_fused)
+    return FixGiven(message.seq, fix, message.is_fused, message.is_set_aside)
 
 
 def in_order(messages: Iterable[Message]) -> Iterator[Event]:

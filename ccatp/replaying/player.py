@@ -32,7 +32,8 @@ class Replayed:
         moving: frames in which the wheels turned.
         smoothed: what the whole record says of the same poses, where it was asked for.
         feet: of the fixes taken then: frame before them, deck x, y of the robot's origin as they show it, shape (f, 3).
-        fixes: handed over; ``refused`` of them not taken.
+        fixes: measured; of them ``set_aside`` were kept from the localizer in the run, and are here, and ``refused``
+            were not taken by this localizer.
         first_difference: the first fix of another fate than in the run: its time, and what the localizer said to it.
         counts: the localizer's.
     """
@@ -43,6 +44,7 @@ class Replayed:
     feet: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     fixes: int = 0
     refused: int = 0
+    set_aside: int = 0
     first_difference: tuple[float, str] | None = None
     counts: dict[str, int] = field(default_factory=dict)
 
@@ -90,7 +92,7 @@ class _Player:
         self._moving = array("q")
         self._feet = array("d")
         self._seq = -1
-        self._fixes = self._refused = 0
+        self._fixes = self._refused = self._set_aside = 0
         self._first: tuple[float, str] | None = None
 
     def _record(self, filter_: Filter) -> Filter:
@@ -113,6 +115,7 @@ class _Player:
             feet=np.array(self._feet).reshape(-1, 3),
             fixes=self._fixes,
             refused=self._refused,
+            set_aside=self._set_aside,
             first_difference=self._first,
             counts=dict(self._localizer.counts),
         )
@@ -151,6 +154,10 @@ class _Player:
 
     def _take_fix(self, event: Fixed) -> None:
         self._fixes += 1
+        if event.was_set_aside:
+            # The mission measured again for it: that has happened, whatever this localizer would have said.
+            self._set_aside += 1
+            return
         said = ""
         try:
             self._localizer.fuse_fix(event.fix)

@@ -144,7 +144,7 @@ class Arrival(Message):
 
 
 class FixMessage(Message):
-    """A fix handed to the localizer after frame ``seq``, world frame; without a point it only finds the robot."""
+    """A fix taken after frame ``seq``, world frame; without a point it only finds the robot."""
 
     point: tuple[int, int, int] | None
     is_fused: bool  # or refused: doubted and measured again, or of no use
@@ -154,6 +154,7 @@ class FixMessage(Message):
     residual_rms_m: float
     channels: list[int]
     jump_mm: float
+    is_set_aside: bool = False  # doubted before the localizer saw it
 
 
 class Rest(Message):

@@ -10,8 +10,10 @@ from typing import Any
 
 import pytest
 
+from ccatp.cli import main
 from ccatp.config.loader import load_config
 from ccatp.mirror.mirror import build_mirror
+from ccatp.replaying import comparison
 from ccatp.replaying.comparison import REPRODUCED
 from ccatp.replaying.events import in_order
 from ccatp.replaying.player import replay
@@ -90,6 +92,16 @@ def test_the_other_filters_reproduce_theirs(name: str, start: Start) -> None:
     assert result["fixes"]["given"] >= 2
 
 
+def test_a_run_whose_fixes_were_doubted_is_reproduced(start: Start) -> None:
+    # Every other fix of a point is doubted: half of the chi-squared distribution with two degrees lies above 1.4.
+    doubting = ("--set", "etalon.doubt_nis=1.4")
+    run = stopped(start("--panels", "1", "--world", "hard", "--filter", "ekf", *doubting), points=6)
+    result = result_of(run.run_dir)
+    assert result["fixes"]["set_aside"] >= 1
+    assert result["fixes"]["first_difference"] is None
+    assert result["difference"]["reproduced"]
+
+
 @pytest.mark.slow
 def test_a_run_in_real_time_is_reproduced(start: Start) -> None:
     # Frames go on while a fix is on its way, and batches end where the wall clock ends them.
@@ -110,6 +122,22 @@ def test_a_resumed_run_is_reproduced_in_both_parts(start: Start) -> None:
     result = result_of(first.run_dir)
     assert result["recordings"] == 2
     assert result["difference"]["reproduced"]  # each with its own filter
+
+
+def test_a_recording_that_is_not_reproduced_is_an_error(
+    hard_run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(comparison, "REPRODUCED", -1.0)  # which no replay reaches
+    assert main(["replay", str(hard_run.run_dir)]) == 1
+    told = capsys.readouterr()
+    assert "replayed less recorded" in told.out
+    assert told.err.startswith(f"ccatp: {hard_run.run_dir}: the replay does not reproduce the recorded estimates: ")
+    assert told.err.count("\n") == 1
+    # Another setting is asked to change something.
+    assert main(["replay", str(hard_run.run_dir), "--set", "localizer.full_state.fix_gate_nis=60"]) == 0
+    told = capsys.readouterr()
+    assert told.out.endswith("the replay differs from the recorded estimates\n")
+    assert not told.err
 
 
 def test_another_filter_gives_another_track(hard_run: Run) -> None:

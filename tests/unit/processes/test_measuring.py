@@ -64,11 +64,11 @@ async def measured_once(
     serving.cancel()
 
 
-async def told_fixes(config: Config, *refusals: Exception) -> list[bool]:
-    told: list[bool] = []
+async def told_fixes(config: Config, *refusals: Exception) -> list[tuple[bool, bool]]:
+    told: list[tuple[bool, bool]] = []
 
-    def fix(point: Any, fix: Fix, jump_m: float, *, is_fused: bool) -> None:
-        told.append(is_fused)
+    def fix(point: Any, fix: Fix, jump_m: float, *, is_fused: bool, is_set_aside: bool) -> None:
+        told.append((is_fused, is_set_aside))
 
     mission = SimpleNamespace(
         is_awaiting_fix=True, request=1, is_lost=True, fixed=lambda point: None, not_fixed=lambda point, cause: None
@@ -85,7 +85,7 @@ async def told_fixes(config: Config, *refusals: Exception) -> list[bool]:
 async def test_every_fix_that_the_localizer_saw_is_told(
     refusals: list[Exception], told: list[bool], config: Config
 ) -> None:
-    assert await told_fixes(config, *refusals) == told
+    assert await told_fixes(config, *refusals) == [(is_fused, False) for is_fused in told]
 
 
 async def test_a_point_that_is_measured_already_is_done_and_nobody_has_to_be_waited_for(config: Config) -> None:

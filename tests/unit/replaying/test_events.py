@@ -56,3 +56,5 @@ def test_a_recorded_fix_is_the_fix_again() -> None:
     )  # fmt: skip
     assert fix_given(message) == FixGiven(5, Fix(1.5, (1.0, 2.0, 3.0), (0.5,) * 9, 1.25, (1, 4), 1e-6), False)
     assert list(in_order([frame(5), fix_given(message)]))[1] == Fixed(fix_given(message).fix, False)
+    message.is_set_aside = True
+    assert list(in_order([frame(5), fix_given(message)]))[1] == Fixed(fix_given(message).fix, False, was_set_aside=True)

@@ -139,6 +139,18 @@ def test_a_fix_that_the_run_refused_and_the_replay_takes(mirror: Mirror) -> None
     assert not found.feet.size  # it showed the place of nothing
 
 
+@pytest.mark.parametrize("name", ["kf", "ekf", "ukf"])
+def test_a_fix_that_was_set_aside_is_kept_from_the_localizer(name: str, mirror: Mirror) -> None:
+    cfg = config_for(name)
+    events = list(standing(mirror, cfg, was_fused=False))
+    aside = [Fixed(e.fix, was_fused=False, was_set_aside=True) if isinstance(e, Fixed) else e for e in events]
+    found = replay(cfg, mirror, aside)
+    without = replay(cfg, mirror, [e for e in events if not isinstance(e, Fixed)])
+    assert (found.fixes, found.set_aside, found.refused, found.first_difference) == (1, 1, 0, None)
+    np.testing.assert_array_equal(found.trace.pose, without.trace.pose)
+    assert np.abs(found.trace.pose - replay(cfg, mirror, events).trace.pose).max() > 1e-4
+
+
 def test_a_fix_that_the_run_took_and_the_replay_refuses(mirror: Mirror) -> None:
     cfg = load_config(None, {"run.filter": "ekf", "localizer.full_state.fix_gate_nis": 1e-3})
     found = replay(cfg, mirror, standing(mirror, cfg))
