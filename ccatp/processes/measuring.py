@@ -213,8 +213,8 @@ class MeasuringDesk:
 
     def _is_too_far(self, point: PointId) -> bool:
         """Whether the point has to be approached again: what was measured there is not its alignment."""
-        is_too_far = self._approaches.is_too_far(point, self.arrival_error_m)
-        what = f"{1e3 * self.arrival_error_m:.1f} mm from {_name(point)}"
+        is_too_far = self._approaches.is_too_far(point, self.arrival_error_m, self._localizer.position_sigma_m)
+        what = f"{1e3 * self.arrival_error_m:.2f} mm from {_name(point)}"
         if is_too_far:
             self._teller.say("info", f"{what}: approaching it again")
         elif self.arrival_error_m > self._tolerance_m:

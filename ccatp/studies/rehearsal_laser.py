@@ -89,7 +89,7 @@ class LaserDesk:
         row.fix_distance_m = distance_m
         if localizer.innovation is not None and localizer.innovation.size == 2:
             row.nis = localizer.innovation.nis
-        is_too_far = self._approaches.is_too_far(point, distance_m)
+        is_too_far = self._approaches.is_too_far(point, distance_m, localizer.position_sigma_m)
         row.approach = self._approaches.count
         self.stops.append(row)
         if not is_too_far:
