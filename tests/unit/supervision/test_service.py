@@ -2,6 +2,7 @@
 
 import configparser
 import os
+import platform
 import re
 import resource
 import shutil
@@ -242,6 +243,29 @@ def test_real_time_is_taken_where_it_is_permitted() -> None:
     else:
         assert state.split()[:2] == ["False", "0"]
     assert state.split()[3] == str("mlockall: " not in said)
+
+
+CRUMBLING = """
+import sys
+from ccatp.processes import realtime
+def resident_kib():
+    return next(int(line.split()[1]) for line in open("/proc/self/smaps_rollup") if line.startswith("Anonymous:"))
+realtime.reserve_heap(int(sys.argv[1]))
+before = resident_kib()
+blocks = [bytes(10_000) for _ in range(1000)]
+print(resident_kib() - before)
+blocks = None
+print(resident_kib() - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the heap of glibc")
+@pytest.mark.parametrize(("reserve_bytes", "least_kib", "most_kib"), [(16 << 20, -64, 512), (0, 9_000, 11_000)])
+def test_a_reserved_heap_grows_without_new_memory(reserve_bytes: int, least_kib: int, most_kib: int) -> None:
+    command = [sys.executable, "-c", CRUMBLING, str(reserve_bytes)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    for grown_kib in map(int, result.stdout.split()):  # with 10 MB in use, and after that
+        assert least_kib <= grown_kib <= most_kib
 
 
 # -- the unit ---------------------------------------------------------------------------------------------------------
