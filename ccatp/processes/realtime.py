@@ -15,8 +15,9 @@ import structlog
 
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # of mallopt(3)
-# What a loop uses stays the same from its first minute on, but its free memory crumbles: the heap of main grows by 4 MiB
-# within an hour, each page of it a fault in the middle of a cycle. So much is there from the start, and never given back.
+# What a loop uses stays the same from its first minute on, but its free memory crumbles: the heap of main grows by 4
+# MiB in an hour, each page a fault in the middle of a cycle. So much is there from the start, and is never given
+# back.
 RESERVE_BYTES = 16 << 20
 # libzmq's threads that move messages; those that write to disk or compute on the side stay behind.
 IO_THREADS = "ZMQbg/IO"
