@@ -240,7 +240,12 @@ class HealthBoard:
         now = self._sums
         shortly, stalling = self._shortly.push(now), self._stalling.push(now)
         turning = self._turning.push(now)
-        self._wheels.step(now, shortly, stalling, is_free=self._is_free, is_late=self._is_late, samples=wheels)
+        self._rates.step(t_s, *self._counts)
+        self._counts = [0, 0, 0]
+        is_sparse = self._rates.are_encoders_sparse
+        self._wheels.step(
+            now, shortly, stalling, is_free=self._is_free, is_late=self._is_late, is_sparse=is_sparse, samples=wheels
+        )
         self._is_free, self._is_late = True, False
         self._speed_m_s = 0.0
         if shortly is not None:
@@ -248,8 +253,6 @@ class HealthBoard:
         if turning is not None:
             self._yaw.step(t_s, turning)
         self._yaw.alarm.settle(t_s)
-        self._rates.step(t_s, *self._counts)
-        self._counts = [0, 0, 0]
         self._latency.step(t_s, frame.cmd.seq)
         self._clock.settle(t_s)
         self._gap.settle(t_s)

@@ -19,6 +19,7 @@ class RateMonitor:
 
     Attributes:
         finding: the sensor that lacks most, or ``None``.
+        are_encoders_sparse: since the last step they gave less than they usually do.
     """
 
     def __init__(self, cfg: HealthConfig) -> None:
@@ -29,16 +30,21 @@ class RateMonitor:
     def reset(self) -> None:
         """Learn anew."""
         self.finding: Finding | None = None
+        self.are_encoders_sparse = False
         self._begin_s: float | None = None
+        self._last_s = 0.0
         self._counts = [0, 0, 0]
         self._usual_hz: list[float] | None = None
         self._short = [False, False, False]
 
     def step(self, t_s: float, imu: int, encoders: int, edges: int) -> None:
         """Take a frame's numbers of samples; judged once per ``rate_time_s``."""
+        elapsed_s, self._last_s = t_s - self._last_s, t_s
         if self._begin_s is None:
             self._begin_s = t_s
             return
+        if self._usual_hz is not None:
+            self.are_encoders_sparse = encoders < self._cfg.rate_share * self._usual_hz[1] * elapsed_s
         counts = self._counts
         counts[0] += imu
         counts[1] += encoders

@@ -103,6 +103,7 @@ class WheelMonitor:
         self._stall: Span | None = None
         self._held_s: float | None = None
         self._late_s: float | None = None
+        self._sparse_s: float | None = None
         self._stood: Moved | None = None
         self._creeping = Since(), Since()
 
@@ -119,6 +120,7 @@ class WheelMonitor:
         *,
         is_free: bool,
         is_late: bool,
+        is_sparse: bool,
         samples: Sequence[WheelSample],
     ) -> None:
         """Judge a frame.
@@ -128,6 +130,7 @@ class WheelMonitor:
             shortly, stalling: their change over ``runaway_time_s`` and over ``stall_time_s``.
             is_free: the robot executed what it was told in this frame, and was permitted to.
             is_late: it executed what it had been told long before.
+            is_sparse: the encoders gave fewer samples than usual.
             samples: of the frame.
         """
         t_s, lately = now.t_s, self._lately
@@ -135,9 +138,14 @@ class WheelMonitor:
             self._held_s = t_s
         if is_late:
             self._late_s = t_s
+        if is_sparse:
+            self._sparse_s = t_s
         if lately is not None:
-            if shortly is not None:
-                self._find_runaway(t_s, shortly, lately, samples)
+            # A few samples of an encoder that counts steps are no speed: with fewer of them it takes longer to tell.
+            is_vague = self._sparse_s is not None and t_s - self._sparse_s < self._cfg.stall_time_s
+            moved = stalling if is_vague else shortly
+            if moved is not None:
+                self._find_runaway(t_s, moved, lately, samples)
             if stalling is not None:
                 self._find_stall(t_s, stalling)
                 self._find_creep(now, stalling, lately, samples)

@@ -70,6 +70,19 @@ def test_a_wheel_that_runs_away(rate: float, at_s: float, measured: Measured) ->
     measured("F9", 1e3 * time_s)
 
 
+@pytest.mark.parametrize("rate", [8.0, -8.0])
+def test_a_wheel_that_runs_away_while_its_encoder_is_slow(rate: float) -> None:
+    slow = "\n\n".join(
+        f'signal = "encoder_{side}"\ntype = "slow"\nat_s = {DRIVING_S - 1.0}\nevery = 3' for side in ("left", "right")
+    )
+    fault = f'signal = "left_wheel"\ntype = "runaway"\nat_s = {DRIVING_S}\nfor_s = 0.4\nrate_rad_s = {rate}'
+    run = watched(f"{slow}\n\n{fault}", HARD, lambda one: one.t_s > DRIVING_S + 0.6)
+    assert all(map(was_real, run.injected))
+    # Fewer samples, no sooner than within the time of a stall.
+    assert run.time_to_zero_s(DRIVING_S) <= 0.3
+    assert run.first(DRIVING_S, held).verdict.signal in {"left_wheel", "encoder_left"}
+
+
 @pytest.mark.fault("S7")
 @pytest.mark.parametrize("speed_m_s", [0.002, 0.005, 0.02])
 def test_wheels_that_creep_while_they_are_held(speed_m_s: float, measured: Measured) -> None:

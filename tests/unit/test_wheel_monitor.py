@@ -21,7 +21,7 @@ def first_found_s(late_until_s: float) -> float | None:
         monitor.learn(t_s)
         now = Moved(t_s, ROLLS_M_S * t_s, 0.0, 0.0)
         lately = Moved(over_s, ROLLS_M_S * over_s, 0.0, 0.0)
-        monitor.step(now, None, lately, is_free=True, is_late=t_s <= late_until_s, samples=())
+        monitor.step(now, None, lately, is_free=True, is_late=t_s <= late_until_s, is_sparse=False, samples=())
         if monitor.alarm.finding is not None:
             return t_s
     return None
