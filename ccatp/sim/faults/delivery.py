@@ -68,6 +68,8 @@ class Stamping:
 
     def stamp_rows(self, t_s: float, rows: list[Row], since_s: float) -> list[Row]:
         """The rows under the times that are written, counted from ``since_s``."""
+        if not any(record.fault.is_active(t_s) for record in self.records):
+            return [(row[0] - since_s, *row[1:]) for row in rows]
         return [(self.stamp(t_s, row[0] - since_s, is_frame=False), *row[1:]) for row in rows]
 
 

@@ -18,6 +18,8 @@ from ccatp.sim.faults.signals import SIGNALS
 Row = tuple[Any, ...]
 """Time and readings; ``None`` is a wheel without a sample."""
 
+# A fault knows readings of so long before it begins: stuck it repeats the last one, late it gives an old one.
+_MEMORY_S = 60.0
 _ALWAYS = ("fans", "soc")
 _CATCH_UP = 3  # rows that arrive late come this many times as fast as they are taken, so that a line can hold them
 _LEAST_CATCH_UP = 10
@@ -35,13 +37,14 @@ class SensorFault:
         record: what it did.
     """
 
-    __slots__ = ("_effect", "_fault", "_is_raw", "_last", "_signal", "record", "rows_name")
+    __slots__ = ("_effect", "_fault", "_is_raw", "_last", "_sees_from_s", "_signal", "record", "rows_name")
 
     def __init__(self, fault: Fault, rng: np.random.Generator) -> None:
         self._fault, self._signal = fault, SIGNALS[fault.signal]
         self._effect: Effect = make_effect(fault, self._signal, rng)
         self._is_raw = not self._signal.is_binary or isinstance(fault, Garbage | NonFinite)
         self._last: Reading | None = None
+        self._sees_from_s = fault.at_s - _MEMORY_S - (fault.by_s if isinstance(fault, Delayed) else 0.0)
         self.rows_name = self._signal.rows
         self.record = Record(fault)
 
@@ -52,6 +55,8 @@ class SensorFault:
             rows: as they come in.
             now_s: robot time of the frame.
         """
+        if not rows or rows[0][0] >= self._fault.end_s or rows[-1][0] < self._sees_from_s:
+            return rows
         return [row for row in map(self._row, rows) if row is not None]
 
     def _row(self, row: Row) -> Row | None:
