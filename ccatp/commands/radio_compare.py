@@ -4,16 +4,12 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from ccatp.commands.frame import CONFIG_OPTION, JSON_OPTION, complain, example, overrides, settings_option
-from ccatp.commands.radio_slam import FILTERS, FORMATS, estimate
-
-if TYPE_CHECKING:
-    from ccatp.config.recording_models import RecordingsConfig
-    from ccatp.radio.recording import RecordedRun
+from ccatp.commands.recorded_slam import FORMATS, compared
 
 
 @click.command(
@@ -58,25 +54,3 @@ def compare(
     for line in markdown(rows):
         click.echo(line)
     return 0
-
-
-def compared(run: "RecordedRun", assumed: "RecordingsConfig", peers: bool) -> list[dict[str, Any]]:
-    """A row for each of our estimators, and for GTSAM's if asked for."""
-    from time import perf_counter
-
-    from ccatp.radio.assumed import batch_settings
-    from ccatp.radio.comparison import row
-
-    rows = []
-    for name in FILTERS:
-        begin_s = perf_counter()
-        track = estimate(run, assumed, name)
-        rows.append(row(run, name, track, perf_counter() - begin_s))
-    if peers:
-        from ccatp.gtsam_peer import run_gtsam
-
-        found = run_gtsam(run, batch_settings(getattr(assumed, run.kind)), perf_counter)
-        rows.append(row(run, "GTSAM iSAM2", found.isam2, float(found.isam2.update_s.sum()), peer=True))
-        # it starts from what iSAM2 ended with, so that its time is not a run's
-        rows.append(row(run, "GTSAM batch", found.batch, None, peer=True))
-    return rows

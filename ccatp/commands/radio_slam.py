@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -17,21 +17,7 @@ from ccatp.commands.frame import (
     overrides,
     settings_option,
 )
-from ccatp.errors import CcatpError, ExitStatus
-
-if TYPE_CHECKING:
-    from ccatp.config.recording_models import RecordingsConfig
-    from ccatp.radio.recording import RecordedRun
-    from ccatp.radio.track import Track
-
-FORMATS = ("plaza", "mrclam", "labyrinth", "csv")
-FILTERS = ("ekf-slam", "smoother")
-
-
-class SlamCommandError(CcatpError):
-    """A part that is not installed, or data of which an estimator makes nothing."""
-
-    exit_status = ExitStatus.USAGE
+from ccatp.commands.recorded_slam import FILTERS, FORMATS, compared, estimate
 
 
 @click.command(
@@ -81,7 +67,7 @@ def slam(
 
         draw_slam(run, track, judged, figure_file, f"{run.name}, {filter_name}")
     if peers:
-        data["peers"] = _side_by_side(run, assumed)
+        data["peers"] = compared(run, assumed, peers=True)
     if json_output:
         click.echo(json.dumps(data, allow_nan=False))
         return 0
@@ -93,44 +79,3 @@ def slam(
         for line in ("", *markdown(data["peers"])):
             click.echo(line)
     return 0
-
-
-def _side_by_side(run: "RecordedRun", assumed: "RecordingsConfig") -> list[dict[str, Any]]:
-    from ccatp.commands.radio_compare import compared
-
-    return compared(run, assumed, peers=True)
-
-
-def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) -> "Track":
-    """A run through one of ``FILTERS``.
-
-    Raises:
-        SlamCommandError: the data drove the estimator beyond finite numbers, or leave it without an answer.
-    """
-    from numpy.linalg import LinAlgError
-
-    from ccatp.filters.base import FilterError
-
-    try:
-        return _estimated(run, assumed, filter_name)
-    except (FilterError, LinAlgError) as error:
-        raise SlamCommandError(
-            f"{run.name}: {filter_name} finds no finite map for these data ({str(error)[:80]}); look at its warnings"
-        ) from error
-
-
-def _estimated(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) -> "Track":
-    from time import perf_counter
-
-    from ccatp.config.recording_models import RecordingConfig
-    from ccatp.radio.assumed import batch_settings, slam_settings
-
-    cfg: RecordingConfig = getattr(assumed, run.kind)
-    if filter_name == "smoother":
-        from ccatp.radio.batch import smooth
-
-        return smooth(run, batch_settings(cfg), perf_counter)
-    from ccatp.radio.causal import filter_run
-
-    first_sigmas = (cfg.priors.pose_m, cfg.priors.heading_rad)
-    return filter_run(run, slam_settings(cfg, assumed.filter), first_sigmas, perf_counter)
