@@ -19,6 +19,9 @@ LATE_S = 0.1
 # Wheels and gyroscope that differ by more than this within a stall's time do not show the same motion.
 _SAME_TURN_RAD = 0.05
 _STALL_RETRIES = 1
+# A few samples of an encoder that counts steps are hardly a speed: with fewer than usual a wheel has to be
+# faster than it may be by so many times, or for longer.
+_VAGUE = 2.5
 # A wheel that goes on creeping for this long while it is held will not stop by itself.
 _CREEP_FAULT_S = 1.0
 _SIDES = ("right", "left")
@@ -141,18 +144,18 @@ class WheelMonitor:
         if is_sparse:
             self._sparse_s = t_s
         if lately is not None:
-            # A few samples of an encoder that counts steps are no speed: with fewer of them it takes longer to tell.
+            limit = self._cfg.runaway_m_s
             is_vague = self._sparse_s is not None and t_s - self._sparse_s < self._cfg.stall_time_s
-            moved = stalling if is_vague else shortly
-            if moved is not None:
-                self._find_runaway(t_s, moved, lately, samples)
+            if shortly is not None:
+                self._find_runaway(t_s, shortly, lately, samples, _VAGUE * limit if is_vague else limit)
+            if is_vague and stalling is not None:
+                self._find_runaway(t_s, stalling, lately, samples, limit)
             if stalling is not None:
                 self._find_stall(t_s, stalling)
                 self._find_creep(now, stalling, lately, samples)
         self.alarm.settle(t_s)
 
-    def _find_runaway(self, t_s: float, moved: Moved, told: Span, samples: Sequence[WheelSample]) -> None:
-        limit = self._cfg.runaway_m_s
+    def _find_runaway(self, t_s: float, moved: Moved, told: Span, samples: Sequence[WheelSample], limit: float) -> None:
         right, left = moved.right_m / moved.t_s, moved.left_m / moved.t_s
         above = _excess(right, told.right_low, told.right_high), _excess(left, told.left_low, told.left_high)
         worst = max(above)

@@ -78,8 +78,7 @@ def test_a_wheel_that_runs_away_while_its_encoder_is_slow(rate: float) -> None:
     fault = f'signal = "left_wheel"\ntype = "runaway"\nat_s = {DRIVING_S}\nfor_s = 0.4\nrate_rad_s = {rate}'
     run = watched(f"{slow}\n\n{fault}", HARD, lambda one: one.t_s > DRIVING_S + 0.6)
     assert all(map(was_real, run.injected))
-    # Fewer samples, no sooner than within the time of a stall.
-    assert run.time_to_zero_s(DRIVING_S) <= 0.3
+    assert run.time_to_zero_s(DRIVING_S) <= 0.15  # two faults at once: not the 0.1 s of one
     assert run.first(DRIVING_S, held).verdict.signal in {"left_wheel", "encoder_left"}
 
 
