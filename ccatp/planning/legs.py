@@ -13,8 +13,9 @@ _ROUNDING_M = 1e-9
 _STEEP = 0.5
 # Further than this from a seam's border a track that should pass beside it does.
 _BESIDE_M = 0.008
-# More way than this within a seam's gap, and the danger rules take it for the mirror's edge.
-_EXPLAINED_M = 0.02
+# A track across a seam at 60 degrees from its normal is within the gap for twice its width. More, and the danger rules
+# take it for the mirror's edge.
+_LONGEST_CROSSING = 2.0
 
 
 class Grazing(IntEnum):
@@ -43,6 +44,7 @@ class LegRules:
         self._corners, self._nodes = _reentrant_corners(mirror, body)
         self._seams = _seam_lines(mirror)
         self._half_gap_m = 0.5 * mirror.gap_m
+        self._explained_m = _LONGEST_CROSSING * mirror.gap_m
         self._beside_m = self._half_gap_m + _BESIDE_M
 
     def clearance_m(self, a: Place, b: Place) -> float:
@@ -118,7 +120,8 @@ class LegRules:
         if overlap < 0.0:
             return False
         across = high - low
-        return length > _EXPLAINED_M if across == 0.0 else overlap / across * length > _EXPLAINED_M
+        within = length if across == 0.0 else overlap / across * length
+        return within > self._explained_m
 
     def way_around(self, a: Place, b: Place) -> tuple[Place, ...]:
         """Best chain of places that leads from ``a`` around stepped corners to ``b``, ends left out.

@@ -46,19 +46,23 @@ class Retreat:
         self._time_s = 0.0
         self._travel_m = self._turned_rad = 0.0
         self._away_rad: float | None = None
+        self._is_last = False
         front_left, front_right, rear_left, rear_right = verdict.off
-        front, rear = front_left or front_right, rear_left or rear_right
         left, right = front_left or rear_left, front_right or rear_right
         # Turning is to the side that stands on the mirror; where both or none do, to the left.
         self._away = -cfg.turn_away_rad if left and not right else cfg.turn_away_rad
-        self._direction = -1.0 if front else 1.0
         self._unturn = -copysign(1.0, rate_rad_s)
+        self._direction = 0.0
+        self.step_at = self._way_out(verdict)
+
+    def _way_out(self, verdict: Verdict) -> Step:
+        """What leads away from an edge, by the sensors that are off."""
+        front_left, front_right, rear_left, rear_right = verdict.off
+        front, rear = front_left or front_right, rear_left or rear_right
+        self._direction = -1.0 if front else 1.0
         if verdict.turn and not (front and rear):
-            self.step_at = Step.UNTURN
-        elif front != rear:
-            self.step_at = Step.BACK
-        else:
-            self.step_at = Step.STUCK
+            return Step.UNTURN
+        return Step.BACK if front != rear else Step.STUCK
 
     def step(self, motion: Motion, verdict: Verdict) -> Twist:
         """The twist until the next frame; ``step_at`` tells what it is at."""
@@ -78,12 +82,12 @@ class Retreat:
         if self.step_at is Step.UNTURN:
             return self._undo_turn(is_clear, verdict)
         if self.step_at is Step.TURN_AWAY:
-            return self._turn_away(motion, is_clear)
+            return self._turn_away(motion, is_clear, verdict)
         return STILL
 
     def _back(self, is_clear: bool, verdict: Verdict) -> Twist:
         if self._travel_m >= self._cfg.backoff_m or (is_clear and self._travel_m >= 0.5 * self._cfg.backoff_m):
-            self.step_at = Step.TURN_AWAY if is_clear else Step.STUCK
+            self.step_at = Step.STUCK if not is_clear else Step.OVER if self._is_last else Step.TURN_AWAY
             return STILL
         if not (verdict.reverse if self._direction < 0.0 else verdict.forward):
             self.step_at = Step.STUCK
@@ -99,9 +103,13 @@ class Retreat:
             return STILL
         return Twist(0.0, self._unturn * self._cfg.turn_away_rad)
 
-    def _turn_away(self, motion: Motion, is_clear: bool) -> Twist:
-        if not is_clear:  # the turn sweeps a corner over the rim: stay with what has been gained
-            self.step_at = Step.OVER
+    def _turn_away(self, motion: Motion, is_clear: bool, verdict: Verdict) -> Twist:
+        if not is_clear:  # the turn swept a corner over the rim: away from there too, and no turn any more
+            self._is_last = True
+            self._unturn = -copysign(1.0, self._away)
+            self._travel_m = self._turned_rad = 0.0
+            step = self._way_out(verdict)
+            self.step_at = Step.OVER if step is Step.STUCK else step
             return STILL
         if self._away_rad is None:
             self._away_rad = motion.pose.heading_rad + self._away
