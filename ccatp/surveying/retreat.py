@@ -55,6 +55,11 @@ class Retreat:
         self._direction = 0.0
         self.step_at = self._way_out(verdict)
 
+    @property
+    def _no_way_on(self) -> Step:
+        """After the turn away it stays with what it has gained."""
+        return Step.OVER if self._is_last else Step.STUCK
+
     def _way_out(self, verdict: Verdict) -> Step:
         """What leads away from an edge, by the sensors that are off."""
         front_left, front_right, rear_left, rear_right = verdict.off
@@ -62,7 +67,7 @@ class Retreat:
         self._direction = -1.0 if front else 1.0
         if verdict.turn and not (front and rear):
             return Step.UNTURN
-        return Step.BACK if front != rear else Step.STUCK
+        return Step.BACK if front != rear else self._no_way_on
 
     def step(self, motion: Motion, verdict: Verdict) -> Twist:
         """The twist until the next frame; ``step_at`` tells what it is at."""
@@ -73,7 +78,7 @@ class Retreat:
         self._last = pose
         self._time_s += motion.dt_s
         if self._time_s > TIME_LIMIT_S and self.step_at is not Step.OVER:
-            self.step_at = Step.STUCK
+            self.step_at = self._no_way_on
         if not (verdict.forward or verdict.reverse or verdict.turn):
             return STILL  # data are missing, which passes by itself
         is_clear = verdict.code is not EventCode.NEAR_EDGE
@@ -87,10 +92,10 @@ class Retreat:
 
     def _back(self, is_clear: bool, verdict: Verdict) -> Twist:
         if self._travel_m >= self._cfg.backoff_m or (is_clear and self._travel_m >= 0.5 * self._cfg.backoff_m):
-            self.step_at = Step.STUCK if not is_clear else Step.OVER if self._is_last else Step.TURN_AWAY
+            self.step_at = self._no_way_on if not is_clear else Step.OVER if self._is_last else Step.TURN_AWAY
             return STILL
         if not (verdict.reverse if self._direction < 0.0 else verdict.forward):
-            self.step_at = Step.STUCK
+            self.step_at = self._no_way_on
             return STILL
         return Twist(self._direction * self._cfg.backoff_speed_m_s, 0.0)
 
@@ -108,8 +113,7 @@ class Retreat:
             self._is_last = True
             self._unturn = -copysign(1.0, self._away)
             self._travel_m = self._turned_rad = 0.0
-            step = self._way_out(verdict)
-            self.step_at = Step.OVER if step is Step.STUCK else step
+            self.step_at = self._way_out(verdict)
             return STILL
         if self._away_rad is None:
             self._away_rad = motion.pose.heading_rad + self._away
