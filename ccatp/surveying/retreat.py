@@ -6,6 +6,7 @@ from math import copysign, hypot
 from ccatp.angles import difference
 from ccatp.config.models import MissionConfig
 from ccatp.control.tracker import LegTracker, Phase
+from ccatp.hazards.edge_episode import Cause
 from ccatp.samples import EventCode, PanelPose, Twist, Verdict
 from ccatp.surveying.journey import Motion
 
@@ -67,7 +68,11 @@ class Retreat:
         self._direction = -1.0 if front else 1.0
         if verdict.turn and not (front and rear):
             return Step.UNTURN
-        return Step.BACK if front != rear else self._no_way_on
+        return Step.BACK if front != rear and self._may_drive(verdict) else self._no_way_on
+
+    def _may_drive(self, verdict: Verdict) -> bool:
+        """After the turn away what is no rim may be a seam along which it would drive on: the fix will tell."""
+        return not self._is_last or verdict.cause.startswith(Cause.RIM)
 
     def step(self, motion: Motion, verdict: Verdict) -> Twist:
         """The twist until the next frame; ``step_at`` tells what it is at."""
@@ -104,12 +109,13 @@ class Retreat:
             self.step_at = Step.OVER
             return STILL
         if self._turned_rad >= UNTURN_LIMIT_RAD or not verdict.turn:
-            self.step_at = Step.BACK
+            self.step_at = Step.BACK if self._may_drive(verdict) else Step.OVER
             return STILL
         return Twist(0.0, self._unturn * self._cfg.turn_away_rad)
 
     def _turn_away(self, motion: Motion, is_clear: bool, verdict: Verdict) -> Twist:
-        if not is_clear:  # the turn swept a corner over the rim: away from there too, and no turn any more
+        if not is_clear:
+            # The turn swept a corner off: back, and no turn any more.
             self._is_last = True
             self._unturn = -copysign(1.0, self._away)
             self._travel_m = self._turned_rad = 0.0

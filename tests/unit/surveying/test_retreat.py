@@ -7,6 +7,7 @@ import pytest
 
 from ccatp.config.loader import load_config
 from ccatp.control.tracker import LegTracker
+from ccatp.hazards.edge_episode import Cause
 from ccatp.samples import DeckPose, EventCode, PanelId, PanelPose, Verdict
 from ccatp.surveying.journey import Motion
 from ccatp.surveying.retreat import Retreat, Step
@@ -29,11 +30,11 @@ def off_at(pose: tuple[float, float, float]) -> tuple[bool, bool, bool, bool]:
     return a, b, c, d
 
 
-def verdict_at(pose: tuple[float, float, float], *, may_turn: bool) -> Verdict:
+def verdict_at(pose: tuple[float, float, float], *, may_turn: bool, cause: Cause = Cause.RIM) -> Verdict:
     off = off_at(pose)
     code = EventCode.NEAR_EDGE if any(off) else EventCode.NORMAL
     front, rear = off[0] or off[1], off[2] or off[3]
-    return Verdict(0, 0.0, code, "", "", 0.0, 0.0, not front, not rear, may_turn or not any(off), off)
+    return Verdict(0, 0.0, code, cause, "", 0.0, 0.0, not front, not rear, may_turn or not any(off), off)
 
 
 def deck_of(pose: PanelPose) -> DeckPose:
@@ -44,6 +45,7 @@ def retreated(
     pose: tuple[float, float, float],
     may_turn: Callable[[Step], bool],
     blames: tuple[bool, bool, bool, bool] = (False, False, False, False),
+    cause: Cause = Cause.RIM,
 ) -> tuple[Step, tuple[float, float, float], list[Step]]:
     """Where a retreat ends that begins with the sensors that are off there, or ``blames``; wheels follow at once."""
     tracker = LegTracker(CFG.control, CFG.limits, 0.0)
@@ -57,7 +59,7 @@ def retreated(
             break
         here = PanelPose(PANEL, *pose)
         motion = Motion(k * FRAME_S, FRAME_S, here, deck_of, 0.0, rate_rad_s)
-        twist = retreat.step(motion, verdict_at(pose, may_turn=may_turn(retreat.step_at)))
+        twist = retreat.step(motion, verdict_at(pose, may_turn=may_turn(retreat.step_at), cause=cause))
         rate_rad_s = twist.omega_rad_s
         x, y, heading = pose
         heading += twist.omega_rad_s * FRAME_S
@@ -88,6 +90,11 @@ def test_in_a_corner_it_stays_with_what_it_has_gained() -> None:
     assert (step, seen) == (Step.OVER, [Step.BACK, Step.TURN_AWAY, Step.BACK, Step.OVER])
     assert end[0] > 0.088
     assert end[1] > 0.05
+
+
+def test_what_may_be_a_seam_is_not_driven_along() -> None:
+    step, _, seen = retreated((0.088, 1.0, 0.0), lambda _: False, cause=Cause.NO_MAP)
+    assert (step, seen) == (Step.OVER, [Step.BACK, Step.TURN_AWAY, Step.OVER])
 
 
 def test_where_there_is_room_it_turns_away() -> None:
