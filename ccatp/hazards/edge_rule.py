@@ -30,6 +30,8 @@ SENSORS = 4
 # Slower than this the robot stands; the estimate's sigma then falls to less than half by a fix, and by nothing else.
 _STILL_M_S = 5e-4
 _BY_A_FIX = 0.5
+# A fix shows where the robot is, but not at once what it faces: an estimate that was wrong mostly is so in its heading.
+_HEADING_RAD = 0.1
 
 
 class PoseEstimate(Protocol):
@@ -165,22 +167,29 @@ class EdgeRule:
     def _look_again(self, odometry: Odometry, estimate: PoseEstimate) -> None:
         """An edge was declared where the robot was not: a sensor that a fix shows over a seam begins anew there."""
         limits = self._limits
-        vague_m = limits.sigmas * estimate.sigma_m
         for i, episode in enumerate(self.episodes):
             if episode is None or episode.phase is not Phase.DECLARED or episode.is_on:
                 continue
             place = self._map.place((estimate.x_m, estimate.y_m, estimate.heading_rad), self._offsets[i])
-            seam = self._map.seam_at(place, limits.tolerance_m + limits.extra_m + vague_m)
-            is_rim = self._map.is_rim_ahead(place, (1.0, 0.0), 0.0, limits.margin_m + vague_m)
+            aside_m = _HEADING_RAD * hypot(*self._offsets[i])
+            slack_m = limits.sigmas * estimate.sigma_m + aside_m
+            seam = self._map.seam_at(place, limits.tolerance_m + slack_m)
+            is_rim = self._map.is_rim_ahead(place, (1.0, 0.0), 0.0, limits.margin_m + slack_m)
             if seam is not None and not is_rim:
-                self._open(i, odometry, 0.0, estimate)
+                anew = self._open(i, odometry, 0.0, estimate)
+                self._place(anew, self._offsets[i], odometry, estimate, aside_m / limits.sigmas)
 
     def _place(
-        self, episode: Episode, offset_m: tuple[float, float], odometry: Odometry, estimate: PoseEstimate
+        self,
+        episode: Episode,
+        offset_m: tuple[float, float],
+        odometry: Odometry,
+        estimate: PoseEstimate,
+        aside_m: float = 0.0,
     ) -> None:
         known = estimate.x_m, estimate.y_m, estimate.heading_rad
         pose = pose_at(self.track, odometry.t_s, estimate.t_s, known)
-        episode.place_on_map(self._map.place(pose, offset_m), pose[2], estimate.sigma_m)
+        episode.place_on_map(self._map.place(pose, offset_m), pose[2], estimate.sigma_m + aside_m)
 
     def _open(self, i: int, odometry: Odometry, dt_s: float, estimate: PoseEstimate | None) -> Episode:
         ox, oy = self._offsets[i]
