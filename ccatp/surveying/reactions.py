@@ -1,7 +1,5 @@
 """Pure. How a survey reacts to the danger loop's verdict: holds, retreats from edges, ways home, waiting."""
 
-from math import inf
-
 from ccatp.samples import Corner, EventCode, Severity, Verdict
 from ccatp.surveying.journey import Motion
 from ccatp.surveying.retreat import Retreat
@@ -13,8 +11,6 @@ NONE, SLOW, HOLD, RETURN, FAULT = Severity.NONE, Severity.SLOW, Severity.HOLD, S
 _CORNERS = frozenset(Corner)
 # Nothing moves while the ground shakes.
 EARTHQUAKE = "emergency:earthquake"
-# So long after a fix found the robot the danger loop has heard where it is: a pose in five frames, and a verdict.
-_HEARD_S = 0.2
 
 
 def abort(standing: Standing, cause: str) -> str | None:
@@ -42,8 +38,6 @@ class Reactions:
         """No verdict yet."""
         self._standing = standing
         self._emergency = ""
-        self._was_lost = False
-        self._found_s = -inf
 
     def react(self, motion: Motion, verdict: Verdict | None) -> None:
         """Do what the verdict demands.
@@ -53,9 +47,6 @@ class Reactions:
             verdict: in force, ``None`` where there is none fresh enough.
         """
         standing = self._standing
-        if self._was_lost and not standing.is_lost:
-            self._found_s = motion.t_s
-        self._was_lost = standing.is_lost
         if verdict is not None and verdict.signal == EARTHQUAKE:
             self._stand_fast(verdict.cause)
             return
@@ -151,11 +142,6 @@ class Reactions:
         if standing.is_lost and standing.state in (SETTLING, MEASURING):
             return  # it stands, and a rim on the map is a matter of the pose that is being found
         if standing.state is State.HELD and standing.is_held_by_hand:
-            return
-        if motion.t_s - self._found_s < _HEARD_S:
-            # An edge from before: where the fix shows a seam, the danger loop will say so.
-            if standing.state is not State.HELD:
-                standing.hold(verdict.cause, by_hand=False)
             return
         mission = standing.cfg.mission
         standing.backoffs += 1

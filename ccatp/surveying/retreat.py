@@ -6,7 +6,6 @@ from math import copysign, hypot
 from ccatp.angles import difference
 from ccatp.config.models import MissionConfig
 from ccatp.control.tracker import LegTracker, Phase
-from ccatp.hazards.edge_episode import Cause
 from ccatp.samples import EventCode, PanelPose, Twist, Verdict
 from ccatp.surveying.journey import Motion
 
@@ -47,32 +46,19 @@ class Retreat:
         self._time_s = 0.0
         self._travel_m = self._turned_rad = 0.0
         self._away_rad: float | None = None
-        self._is_last = False
         front_left, front_right, rear_left, rear_right = verdict.off
+        front, rear = front_left or front_right, rear_left or rear_right
         left, right = front_left or rear_left, front_right or rear_right
         # Turning is to the side that stands on the mirror; where both or none do, to the left.
         self._away = -cfg.turn_away_rad if left and not right else cfg.turn_away_rad
-        self._unturn = -copysign(1.0, rate_rad_s)
-        self._direction = 0.0
-        self.step_at = self._way_out(verdict)
-
-    @property
-    def _no_way_on(self) -> Step:
-        """After the turn away it stays with what it has gained."""
-        return Step.OVER if self._is_last else Step.STUCK
-
-    def _way_out(self, verdict: Verdict) -> Step:
-        """What leads away from an edge, by the sensors that are off."""
-        front_left, front_right, rear_left, rear_right = verdict.off
-        front, rear = front_left or front_right, rear_left or rear_right
         self._direction = -1.0 if front else 1.0
+        self._unturn = -copysign(1.0, rate_rad_s)
         if verdict.turn and not (front and rear):
-            return Step.UNTURN
-        return Step.BACK if front != rear and self._may_drive(verdict) else self._no_way_on
-
-    def _may_drive(self, verdict: Verdict) -> bool:
-        """After the turn away what is no rim may be a seam along which it would drive on: the fix will tell."""
-        return not self._is_last or verdict.cause.startswith(Cause.RIM)
+            self.step_at = Step.UNTURN
+        elif front != rear:
+            self.step_at = Step.BACK
+        else:
+            self.step_at = Step.STUCK
 
     def step(self, motion: Motion, verdict: Verdict) -> Twist:
         """The twist until the next frame; ``step_at`` tells what it is at."""
@@ -83,7 +69,7 @@ class Retreat:
         self._last = pose
         self._time_s += motion.dt_s
         if self._time_s > TIME_LIMIT_S and self.step_at is not Step.OVER:
-            self.step_at = self._no_way_on
+            self.step_at = Step.STUCK
         if not (verdict.forward or verdict.reverse or verdict.turn):
             return STILL  # data are missing, which passes by itself
         is_clear = verdict.code is not EventCode.NEAR_EDGE
@@ -92,15 +78,15 @@ class Retreat:
         if self.step_at is Step.UNTURN:
             return self._undo_turn(is_clear, verdict)
         if self.step_at is Step.TURN_AWAY:
-            return self._turn_away(motion, is_clear, verdict)
+            return self._turn_away(motion, is_clear)
         return STILL
 
     def _back(self, is_clear: bool, verdict: Verdict) -> Twist:
         if self._travel_m >= self._cfg.backoff_m or (is_clear and self._travel_m >= 0.5 * self._cfg.backoff_m):
-            self.step_at = self._no_way_on if not is_clear else Step.OVER if self._is_last else Step.TURN_AWAY
+            self.step_at = Step.TURN_AWAY if is_clear else Step.STUCK
             return STILL
         if not (verdict.reverse if self._direction < 0.0 else verdict.forward):
-            self.step_at = self._no_way_on
+            self.step_at = Step.STUCK
             return STILL
         return Twist(self._direction * self._cfg.backoff_speed_m_s, 0.0)
 
@@ -109,17 +95,13 @@ class Retreat:
             self.step_at = Step.OVER
             return STILL
         if self._turned_rad >= UNTURN_LIMIT_RAD or not verdict.turn:
-            self.step_at = Step.BACK if self._may_drive(verdict) else Step.OVER
+            self.step_at = Step.BACK
             return STILL
         return Twist(0.0, self._unturn * self._cfg.turn_away_rad)
 
-    def _turn_away(self, motion: Motion, is_clear: bool, verdict: Verdict) -> Twist:
-        if not is_clear:
-            # The turn swept a corner off: back, and no turn any more.
-            self._is_last = True
-            self._unturn = -copysign(1.0, self._away)
-            self._travel_m = self._turned_rad = 0.0
-            self.step_at = self._way_out(verdict)
+    def _turn_away(self, motion: Motion, is_clear: bool) -> Twist:
+        if not is_clear:  # the turn sweeps a corner over the rim: stay with what has been gained
+            self.step_at = Step.OVER
             return STILL
         if self._away_rad is None:
             self._away_rad = motion.pose.heading_rad + self._away

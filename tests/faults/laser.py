@@ -200,7 +200,10 @@ class DeskRehearsal(FaultyRehearsal):
             measured.nis = float("inf")
         return fix
 
-    def _note_fix(self, _point: PointId | None, _fix: Fix, _jump_m: float, *, is_fused: bool) -> None:
+    def _note_fix(
+        self, _point: PointId | None, _fix: Fix, _jump_m: float, *, is_fused: bool, is_set_aside: bool
+    ) -> None:
+        del is_set_aside
         self.asked[-1].is_fused = is_fused
 
 

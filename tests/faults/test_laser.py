@@ -135,7 +135,9 @@ class Desk:
             review=lambda *_, **__: SimpleNamespace(doubt="", refusal=""),
             refusal_of=lambda *_: "",
         )
-        localizer = SimpleNamespace(fuse_fix=lambda _fix: 0.0, notices=[], pose=None, pose_covariance=np.eye(3))
+        localizer = SimpleNamespace(
+            fuse_fix=lambda _fix: 0.0, notices=[], pose=None, pose_covariance=np.eye(3), position_sigma_m=5e-6
+        )
         self.desk = MeasuringDesk(
             config.mission,
             client,

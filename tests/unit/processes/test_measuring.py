@@ -30,6 +30,7 @@ class Refusing:
         self.refusals = list(refusals)
         self.notices: list[str] = []
         self.pose_covariance = np.eye(3)
+        self.position_sigma_m = 5e-6
 
     def fuse_fix(self, fix: Fix) -> float:
         if self.refusals:
