@@ -537,7 +537,9 @@ def test_nothing_counts_that_was_measured_while_the_robot_moved(config: Config, 
             fused.append((fix.t_s, story.t))
             return 0.0
 
-        stub = SimpleNamespace(fuse_fix=fuse, notices=[], pose=localizer.pose, pose_covariance=np.eye(3))
+        stub = SimpleNamespace(
+            fuse_fix=fuse, notices=[], pose=localizer.pose, pose_covariance=np.eye(3), position_sigma_m=5e-6
+        )
         with MissionStore.create(folder / "m.sqlite", mirror="x", seed=1, config_toml="", points=points) as store:
             desk = MeasuringDesk(
                 cfg.mission.model_copy(update={"correction_tolerance_m": 1e3}),

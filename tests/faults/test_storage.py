@@ -183,7 +183,9 @@ class Desk:
             fault=self._fault,
             survey=SimpleNamespace(distance_m=lambda pose: 0.0),
         )
-        localizer = SimpleNamespace(fuse_fix=lambda fix: 0.0, notices=[], pose=None, pose_covariance=None)
+        localizer = SimpleNamespace(
+            fuse_fix=lambda fix: 0.0, notices=[], pose=None, pose_covariance=None, position_sigma_m=5e-6
+        )
         sure = SimpleNamespace(begin=lambda: None, review=lambda *_, **__: Finding())
         teller = SimpleNamespace(fix=lambda *_, **__: None, say=lambda level, text: self.said.append(text))
         self.desk = MeasuringDesk(
