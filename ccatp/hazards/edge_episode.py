@@ -110,6 +110,7 @@ class Episode:
         self._on_place: Place = self._sensor0
         self._declared_heading = 0.0
         self._declared_place: Place = self._sensor0
+        self._place: Place = self._sensor0
         self._is_turn_spent = False
         self.retreat_m = 0.0
         self.is_doubted = False
@@ -153,6 +154,7 @@ class Episode:
         self._heading = odometry.heading_rad
         if self.phase is Phase.DECLARED:
             self._watch_turn()
+            self._place = place
             self.retreat_m = hypot(place[0] - self._declared_place[0], place[1] - self._declared_place[1])
             return False
         self._declared_place = place
@@ -178,6 +180,10 @@ class Episode:
             return False
         self.phase = Phase.RIM
         return self._off_samples >= self._limits.debounce and self._declare_rim()
+
+    def trust(self) -> None:
+        """The sensor is right after all: moved back from where it is now, it comes on."""
+        self._declared_place, self.retreat_m, self.is_doubted = self._place, 0.0, False
 
     @property
     def is_on(self) -> bool:

@@ -8,6 +8,7 @@ b. the map has a seam there: an edge when the sensor cannot be over the gap any 
    because a corner sensor that turns in place sweeps along a seam for up to 0.1 m without leaving it;
 c. the map has neither, or there is no estimate: an edge after ``no_map_travel_m``;
 d. standing still the episode is frozen, for ever; going back to where the sensor was on adds nothing;
+e. an edge over which the robot stands by (b), once a fix has shown where that is, was a seam: a new episode begins;
 g. wheels unheard: the fastest that the sensor can move, times the time;
 h. all four off: lifted or fallen.
 
@@ -26,6 +27,11 @@ from ccatp.health.look import largest_rate_rad_s
 from ccatp.samples import EdgeSample
 
 SENSORS = 4
+# Slower than this the robot stands; the estimate's sigma then falls to less than half by a fix, and by nothing else.
+_STILL_M_S = 5e-4
+_BY_A_FIX = 0.5
+# A fix shows where the robot is, but not at once what it faces: an estimate that was wrong mostly is so in its heading.
+_HEADING_RAD = 0.1
 
 
 class PoseEstimate(Protocol):
@@ -88,6 +94,7 @@ class EdgeRule:
         self._odometry: Odometry | None = None
         self._last_t_s: float | None = None
         self._all_off = self._all_on = 0
+        self._vague_m = 0.0
         self.is_lifted = False
 
     @property
@@ -116,6 +123,8 @@ class EdgeRule:
                 self._sample(sample, self._odometry, estimate)
                 self._last_t_s = sample[0]
         self._look_ahead()
+        if estimate is not None and self._has_fix(self._odometry, estimate.sigma_m):
+            self._look_again(self._odometry, estimate)
         if not any(self.episodes) and not self.is_lifted:
             self._odometry = None
 
@@ -148,12 +157,44 @@ class EdgeRule:
             if episode is not None and episode.needs_map and estimate is not None:
                 self._place(episode, self._offsets[i], odometry, estimate)
 
+    def _has_fix(self, odometry: Odometry, sigma_m: float) -> bool:
+        """Whether the robot stands and has just been measured."""
+        is_still = abs(odometry.v_m_s) + abs(odometry.omega_rad_s) * self._half_base_m < _STILL_M_S
+        has_fix = is_still and sigma_m < _BY_A_FIX * self._vague_m
+        self._vague_m = max(self._vague_m, sigma_m) if is_still and not has_fix else sigma_m
+        return has_fix
+
+    def _look_again(self, odometry: Odometry, estimate: PoseEstimate) -> None:
+        """An edge was declared where the robot was not. A sensor that a fix shows over a seam begins anew there.
+
+        One that it shows at the rim is not to blame for staying off, however far it was moved along there.
+        """
+        limits = self._limits
+        for i, episode in enumerate(self.episodes):
+            if episode is None or episode.phase is not Phase.DECLARED or episode.is_on:
+                continue
+            place = self._map.place((estimate.x_m, estimate.y_m, estimate.heading_rad), self._offsets[i])
+            aside_m = _HEADING_RAD * hypot(*self._offsets[i])
+            slack_m = limits.sigmas * estimate.sigma_m + aside_m
+            seam = self._map.seam_at(place, limits.tolerance_m + slack_m)
+            is_rim = self._map.is_rim_ahead(place, (1.0, 0.0), 0.0, limits.margin_m + slack_m)
+            if is_rim:
+                episode.trust()
+            elif seam is not None:
+                anew = self._open(i, odometry, 0.0, estimate)
+                self._place(anew, self._offsets[i], odometry, estimate, aside_m / limits.sigmas)
+
     def _place(
-        self, episode: Episode, offset_m: tuple[float, float], odometry: Odometry, estimate: PoseEstimate
+        self,
+        episode: Episode,
+        offset_m: tuple[float, float],
+        odometry: Odometry,
+        estimate: PoseEstimate,
+        aside_m: float = 0.0,
     ) -> None:
         known = estimate.x_m, estimate.y_m, estimate.heading_rad
         pose = pose_at(self.track, odometry.t_s, estimate.t_s, known)
-        episode.place_on_map(self._map.place(pose, offset_m), pose[2], estimate.sigma_m)
+        episode.place_on_map(self._map.place(pose, offset_m), pose[2], estimate.sigma_m + aside_m)
 
     def _open(self, i: int, odometry: Odometry, dt_s: float, estimate: PoseEstimate | None) -> Episode:
         ox, oy = self._offsets[i]

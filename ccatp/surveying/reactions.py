@@ -9,6 +9,8 @@ from ccatp.surveying.states import DRIVING, HELD, IDLE, MEASURING, RETURNING, SE
 NEAR_EDGE, ABORTED = EventCode.NEAR_EDGE, EventCode.ABORTED
 NONE, SLOW, HOLD, RETURN, FAULT = Severity.NONE, Severity.SLOW, Severity.HOLD, Severity.RETURN, Severity.FAULT
 _CORNERS = frozenset(Corner)
+# So long after a fix found the robot the danger loop has heard where it is: a pose in five frames, and a verdict.
+_HEARD_S = 0.2
 # Nothing moves while the ground shakes.
 EARTHQUAKE = "emergency:earthquake"
 
@@ -38,6 +40,7 @@ class Reactions:
         """No verdict yet."""
         self._standing = standing
         self._emergency = ""
+        self._was_lost = self._has_looked = False
 
     def react(self, motion: Motion, verdict: Verdict | None) -> None:
         """Do what the verdict demands.
@@ -47,6 +50,7 @@ class Reactions:
             verdict: in force, ``None`` where there is none fresh enough.
         """
         standing = self._standing
+        self._await_news(motion.t_s, verdict)
         if verdict is not None and verdict.signal == EARTHQUAKE:
             self._stand_fast(verdict.cause)
             return
@@ -69,6 +73,15 @@ class Reactions:
         is_waiting = standing.state is HELD and (standing.is_held_by_hand or motion.t_s < standing.waits_until_s)
         if standing.state is IDLE or (standing.state is HELD and not is_waiting):
             standing.go_on()
+
+    def _await_news(self, t_s: float, verdict: Verdict | None) -> None:
+        """Found at an edge, the robot stands until the danger loop knows where: what it met may have been a seam."""
+        standing = self._standing
+        if verdict is not None and verdict.severity < HOLD:
+            self._has_looked = False
+        if self._was_lost and not standing.is_lost and verdict is not None and verdict.code is NEAR_EDGE:
+            standing.stands_until_s = t_s + _HEARD_S
+        self._was_lost = standing.is_lost
 
     def _stay(self, motion: Motion, verdict: Verdict | None) -> None:
         """Not every motion is permitted, or there is no verdict."""
@@ -101,6 +114,8 @@ class Reactions:
             if not (standing.state is HELD and standing.is_faulted):
                 standing.fault(verdict.cause, is_lost=True)
             return True
+        if is_denied and severity is HOLD and verdict.signal in _CORNERS and self._looks(verdict.cause):
+            return True
         if is_denied and severity >= HOLD:
             standing.await_recovery(verdict.cause, is_pose_doubted=verdict.signal not in _CORNERS)
             return True
@@ -109,6 +124,17 @@ class Reactions:
             self._emergency = verdict.cause
             abort(standing, verdict.cause)
         return False
+
+    def _looks(self, cause: str) -> bool:
+        """A sensor that stays off may be over a seam or the rim where the pose is wrong: one fix, at rest, tells."""
+        standing = self._standing
+        if standing.state is HELD and standing.is_held_by_hand:
+            return False
+        if not self._has_looked:
+            self._has_looked = True
+            standing.await_recovery(cause)
+            standing.go_on()
+        return standing.is_lost and standing.state in (SETTLING, MEASURING)
 
     def _pace(self, *, is_slow: bool) -> None:
         """Drive at the reduced speed from now on, or at the usual one from the next leg on."""
@@ -142,6 +168,8 @@ class Reactions:
         if standing.is_lost and standing.state in (SETTLING, MEASURING):
             return  # it stands, and a rim on the map is a matter of the pose that is being found
         if standing.state is State.HELD and standing.is_held_by_hand:
+            return
+        if motion.t_s < standing.stands_until_s:
             return
         mission = standing.cfg.mission
         standing.backoffs += 1

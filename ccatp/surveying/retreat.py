@@ -6,6 +6,7 @@ from math import copysign, hypot
 from ccatp.angles import difference
 from ccatp.config.models import MissionConfig
 from ccatp.control.tracker import LegTracker, Phase
+from ccatp.hazards.edge_episode import Cause
 from ccatp.samples import EventCode, PanelPose, Twist, Verdict
 from ccatp.surveying.journey import Motion
 
@@ -29,6 +30,8 @@ class Step(StrEnum):
 class Retreat:
     """One back-off: away from the edge along the track just driven, then a turn away from the side that hung over.
 
+    A robot that met the edge backwards faces away from it, and does not turn.
+
     Args:
         cfg: distances and speeds.
         tracker: the leg tracker, borrowed for the turn.
@@ -46,12 +49,14 @@ class Retreat:
         self._time_s = 0.0
         self._travel_m = self._turned_rad = 0.0
         self._away_rad: float | None = None
+        self._has_turned_away = False
         front_left, front_right, rear_left, rear_right = verdict.off
         front, rear = front_left or front_right, rear_left or rear_right
         left, right = front_left or rear_left, front_right or rear_right
         # Turning is to the side that stands on the mirror; where both or none do, to the left.
         self._away = -cfg.turn_away_rad if left and not right else cfg.turn_away_rad
         self._direction = -1.0 if front else 1.0
+        self._after_back = Step.TURN_AWAY if front else Step.OVER
         self._unturn = -copysign(1.0, rate_rad_s)
         if verdict.turn and not (front and rear):
             self.step_at = Step.UNTURN
@@ -78,12 +83,12 @@ class Retreat:
         if self.step_at is Step.UNTURN:
             return self._undo_turn(is_clear, verdict)
         if self.step_at is Step.TURN_AWAY:
-            return self._turn_away(motion, is_clear)
+            return self._turn_away(motion, is_clear, verdict)
         return STILL
 
     def _back(self, is_clear: bool, verdict: Verdict) -> Twist:
         if self._travel_m >= self._cfg.backoff_m or (is_clear and self._travel_m >= 0.5 * self._cfg.backoff_m):
-            self.step_at = Step.TURN_AWAY if is_clear else Step.STUCK
+            self.step_at = self._after_back if is_clear else Step.STUCK
             return STILL
         if not (verdict.reverse if self._direction < 0.0 else verdict.forward):
             self.step_at = Step.STUCK
@@ -95,13 +100,16 @@ class Retreat:
             self.step_at = Step.OVER
             return STILL
         if self._turned_rad >= UNTURN_LIMIT_RAD or not verdict.turn:
-            self.step_at = Step.BACK
+            self.step_at = Step.OVER if self._has_turned_away else Step.BACK
             return STILL
         return Twist(0.0, self._unturn * self._cfg.turn_away_rad)
 
-    def _turn_away(self, motion: Motion, is_clear: bool) -> Twist:
-        if not is_clear:  # the turn sweeps a corner over the rim: stay with what has been gained
-            self.step_at = Step.OVER
+    def _turn_away(self, motion: Motion, is_clear: bool, verdict: Verdict) -> Twist:
+        if not is_clear:
+            # The turn sweeps a corner off the panels. Off the rim, back; off what may be a seam, the fix tells.
+            self._has_turned_away = True
+            self._unturn, self._turned_rad = -copysign(1.0, self._away), 0.0
+            self.step_at = Step.UNTURN if verdict.cause.startswith(Cause.RIM) else Step.OVER
             return STILL
         if self._away_rad is None:
             self._away_rad = motion.pose.heading_rad + self._away

@@ -56,6 +56,7 @@ class Standing:
         stuck_s: when a retreat led nowhere, robot time.
         backoffs: retreats since the last point.
         waits_until_s: a hold that goes on by itself lasts at least until then, robot time.
+        stands_until_s: nothing moves before then, whatever the state, robot time.
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class Standing:
         self.retreat: Retreat | None = None
         self.stuck_s: float | None = None
         self.backoffs = 0
-        self.waits_until_s = -inf
+        self.waits_until_s = self.stands_until_s = -inf
         self._recoveries_s: list[float] = []
 
     def journey_along(self, stops: Sequence[Stop]) -> Journey:

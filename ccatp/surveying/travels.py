@@ -51,6 +51,8 @@ class Travels:
             verdict: the danger loop's verdict in force.
         """
         state = self._standing.state
+        if motion.t_s < self._standing.stands_until_s:
+            return STAND
         if state is DRIVING or state is TURNING:
             return self._travel(motion)
         if state is MEASURING:

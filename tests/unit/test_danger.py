@@ -280,6 +280,49 @@ def test_a_sensor_over_a_gap_since_before_the_first_estimate_is_explained_by_it(
     assert at_seam.run(2, v=0.1).code is EventCode.NORMAL
 
 
+# -- (e) a fix --------------------------------------------------------------------------------------------------------
+
+
+def declared_where_the_robot_was_not(story: Story, aside_m: float) -> None:
+    """An edge, by an estimate that is aside from where the story says that the robot is; then it comes to rest."""
+    x, y, heading = story.pose
+    story.sigma_m = 1.5e-3
+    story.pose = (x - aside_m, y, heading)
+    assert story.run(10, v=0.1, off=FRONT).code is EventCode.NEAR_EDGE
+    story.pose = (story.pose[0] + aside_m, y, heading)
+    story.run(5, off=FRONT)
+
+
+def test_an_edge_that_a_fix_shows_to_be_a_seam_was_none(at_seam: Story) -> None:
+    at_seam.pose = (at_seam.pose[0] - 0.006, *at_seam.pose[1:])
+    declared_where_the_robot_was_not(at_seam, aside_m=0.04)
+    assert at_seam.run(20, off=FRONT).code is EventCode.NEAR_EDGE  # the pose alone says nothing
+    at_seam.sigma_m = 6e-6
+    assert at_seam.run(1, off=FRONT).code is EventCode.NORMAL
+    assert permits(at_seam.run(4, v=0.1, off=FRONT)) == ANY_PERMIT
+    # A seam, and no more: its width and tolerances are allowed once.
+    verdict = at_seam.run(12, v=0.1, off=FRONT)
+    assert (verdict.code, verdict.cause) == (EventCode.NEAR_EDGE, Cause.SEAM.value)
+    # Without another fix that stays so, however long it stands.
+    assert at_seam.run(200, off=FRONT).code is EventCode.NEAR_EDGE
+
+
+def test_an_edge_is_one_where_a_fix_shows_no_seam_or_the_rim(on_panel: Story, at_rim: Story) -> None:
+    for story in (on_panel, at_rim):
+        declared_where_the_robot_was_not(story, aside_m=0.04)
+        story.sigma_m = 6e-6
+        assert story.run(20, off=FRONT).code is EventCode.NEAR_EDGE
+
+
+def test_a_robot_that_moves_has_no_fix(at_seam: Story) -> None:
+    at_seam.pose = (at_seam.pose[0] - 0.006, *at_seam.pose[1:])
+    declared_where_the_robot_was_not(at_seam, aside_m=0.04)
+    at_seam.run(1, v=-0.002, off=FRONT)
+    at_seam.sigma_m = 6e-6
+    assert at_seam.run(1, v=-0.002, off=FRONT).code is EventCode.NEAR_EDGE
+    assert at_seam.run(50, off=FRONT).code is EventCode.NEAR_EDGE
+
+
 # -- (d) turns --------------------------------------------------------------------------------------------------------
 
 

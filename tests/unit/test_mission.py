@@ -12,7 +12,19 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.mission import Mission
 from ccatp.planning.errors import PlanError
 from ccatp.planning.route import Route
-from ccatp.samples import DeckPose, EventCode, PanelId, PanelPose, PointId, Predicted, Stop, StopKind, Twist, Verdict
+from ccatp.samples import (
+    DeckPose,
+    EventCode,
+    PanelId,
+    PanelPose,
+    PointId,
+    Predicted,
+    Severity,
+    Stop,
+    StopKind,
+    Twist,
+    Verdict,
+)
 from ccatp.surveying.correction import Corrector
 from ccatp.surveying.journey import Motion
 from ccatp.surveying.orders import Order
@@ -231,6 +243,59 @@ def test_an_edge_that_clears_in_the_end_is_left_with_a_fix(story: Story) -> None
     assert story.mission.state is State.SETTLING
     story.until_state(State.DONE)
     assert len(story.mission.done) == 3
+
+
+def found_at_the_edge(story: Story) -> None:
+    """After a retreat and a fix the sensor is off still."""
+    story.until_state(State.DRIVING)
+    story.frame(FRONT_OFF)
+    for _ in range(12):
+        story.frame(FRONT_OFF)
+    story.until_state(State.MEASURING)
+    story.until(lambda: not story.mission.is_lost)
+    story.orders.clear()
+
+
+def test_found_at_an_edge_it_stands_until_the_danger_loop_knows_where(story: Story) -> None:
+    found_at_the_edge(story)
+    for _ in range(19):
+        story.frame(FRONT_OFF)
+    assert not any(order.twist.v_m_s or order.twist.omega_rad_s for order in story.orders)
+    assert story.mission.state is not State.BACKING_OFF
+    story.until_state(State.DRIVING)
+    story.until(lambda: len(story.mission.done) == 3)
+
+
+def test_an_edge_that_the_danger_loop_still_sees_then_is_left_again(story: Story) -> None:
+    found_at_the_edge(story)
+    for _ in range(22):
+        story.frame(FRONT_OFF)
+    assert story.mission.state is State.BACKING_OFF
+
+
+def test_a_sensor_that_stays_off_is_looked_at_with_one_fix(story: Story) -> None:
+    stays_off = replace(
+        FRONT_OFF, cause="an edge sensor stays off", signal="front_left", severity=Severity.HOLD, reverse=False
+    )
+    story.until_state(State.DRIVING)
+    measured = len(story.mission.done)
+    for _ in range(300):
+        story.frame(stays_off)
+    assert story.mission.state is State.HELD
+    assert story.mission.cause == "an edge sensor stays off"
+    assert sum(order.measure for order in story.orders[-300:]) == 1
+    assert not any(order.twist.v_m_s or order.twist.omega_rad_s for order in story.orders[-300:])
+    assert len(story.mission.done) == measured  # the fix is nobody's point
+    story.until(lambda: len(story.mission.done) == 3)  # it came on: the survey goes on by itself
+
+
+def test_one_that_somebody_holds_is_left_alone_by_a_sensor_that_stays_off(story: Story) -> None:
+    stays_off = replace(FRONT_OFF, cause="stays off", signal="front_left", severity=Severity.HOLD, reverse=False)
+    story.until_state(State.DRIVING)
+    story.mission.pause("by hand")
+    for _ in range(300):
+        assert not story.frame(stays_off).measure
+    assert (story.mission.state, story.mission.is_paused) == (State.HELD, True)
 
 
 def test_abort_during_back_off_waits_for_the_retreat(story: Story) -> None:

@@ -9,14 +9,15 @@ import pytest
 
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
-from ccatp.hazards.edge_episode import Phase
-from ccatp.hazards.edge_map import EdgeMap
+from ccatp.hazards.edge_episode import Episode, Phase
+from ccatp.hazards.edge_map import EdgeMap, SeamNear
 from ccatp.hazards.edge_rule import EdgeRule, PoseEstimate
 from ccatp.samples import EdgeSample, WheelSample
 
 MS = 1e-3
 OFF_FL = (0, 1, 1, 1)
 ON, OFF = (1, 1, 1, 1), (0, 0, 0, 0)
+SEAM = SeamNear("x", 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -26,22 +27,26 @@ def cfg() -> Config:
 
 @dataclass
 class Map:
-    """A map without seams and rim that keeps what it was asked."""
+    """A map without rim, and without seams unless told, that keeps what it was asked."""
 
     gap_m: float = 0.01
     is_rim: bool = False
     placed: list[tuple[Any, ...]] = field(default_factory=list)
     slacks_m: list[float] = field(default_factory=list)
+    rims: list[tuple[Any, ...]] = field(default_factory=list)
+    seam: SeamNear | None = None
 
     def place(self, pose: Any, offset_m: Any) -> tuple[float, float]:
         self.placed.append((pose, offset_m))
         return 5.0, 6.0
 
-    def is_rim_ahead(self, *_: Any) -> bool:
+    def is_rim_ahead(self, *asked: Any) -> bool:
+        self.rims.append(asked)
         return self.is_rim
 
-    def seam_at(self, place: Any, slack_m: float, not_axis: Any = None) -> None:
+    def seam_at(self, place: Any, slack_m: float, not_axis: Any = None) -> SeamNear | None:
         self.slacks_m.append(slack_m)
+        return self.seam
 
 
 class Rule:
@@ -64,8 +69,8 @@ class Rule:
         self.rule.track.push(wheels)
         self.rule.step(samples, rest.get("estimate"))
 
-    def estimate(self, age_s: float = 0.0) -> PoseEstimate:
-        pose = SimpleNamespace(t_s=self.t_s - age_s, x_m=1.0, y_m=2.0, heading_rad=0.5, sigma_m=0.001)
+    def estimate(self, age_s: float = 0.0, sigma_m: float = 0.001) -> PoseEstimate:
+        pose = SimpleNamespace(t_s=self.t_s - age_s, x_m=1.0, y_m=2.0, heading_rad=0.5, sigma_m=sigma_m)
         return cast(PoseEstimate, pose)
 
 
@@ -211,3 +216,144 @@ def test_an_edge_seen_ahead_is_counted_once(rule: Rule) -> None:
     for _ in range(3):
         rule.feed([OFF_FL] * 10, v=0.05)
         assert rule.rule.declared == [1, 0, 0, 0]
+
+
+# -- (e) a fix --------------------------------------------------------------------------------------------------------
+
+
+def declared(rule: Rule, sigma_m: float = 0.001) -> Episode:
+    """An edge, and after it the sensor stays off while the robot is moved back and comes to rest."""
+    rule.feed([OFF_FL] * 80, v=0.1, estimate=rule.estimate(sigma_m=sigma_m))
+    rule.feed([OFF_FL] * 100, v=-0.1, estimate=rule.estimate(sigma_m=sigma_m))
+    rule.feed([OFF_FL] * 10, estimate=rule.estimate(sigma_m=sigma_m))
+    episode = rule.rule.episodes[0]
+    assert episode is not None
+    assert episode.phase is Phase.DECLARED
+    rule.map.slacks_m.clear()
+    rule.map.rims.clear()
+    return episode
+
+
+def measured(rule: Rule, sigma_m: float, *, v: float = 0.0, omega: float = 0.0, flags: Any = OFF_FL) -> Episode:
+    rule.feed([flags] * 10, v=v, omega=omega, estimate=rule.estimate(sigma_m=sigma_m))
+    episode = rule.rule.episodes[0]
+    assert episode is not None
+    return episode
+
+
+def test_a_sensor_that_a_fix_shows_over_a_seam_begins_anew_there(rule: Rule) -> None:
+    known = declared(rule)
+    rule.map.seam = SEAM
+    anew = measured(rule, 4.9e-4)
+    assert anew is not known
+    assert anew.phase is Phase.FRESH
+    assert (rule.rule.opened[0], rule.rule.declared[0]) == (2, 1)
+    # It is tied to the map by the fix, give or take 0.1 rad: the seam explains it, and so far only.
+    rule.feed([OFF_FL] * 10, v=0.1)
+    assert anew.phase is Phase.SEAM
+    rule.map.seam = None  # where it ends, no other crosses it
+    rule.feed([OFF_FL] * 200, v=0.1)
+    assert anew.phase is Phase.DECLARED
+
+
+def test_the_map_is_asked_with_the_slack_of_fix_and_heading(rule: Rule, cfg: Config) -> None:
+    declared(rule)
+    measured(rule, 4e-4)
+    aside_m = 0.1 * hypot(*cfg.robot.edge_sensors_m[0])
+    slack_m = cfg.danger.map_sigmas * 4e-4 + aside_m
+    assert rule.map.slacks_m == [pytest.approx(cfg.danger.gap_tolerance_m + slack_m)]
+    assert rule.map.rims == [((5.0, 6.0), (1.0, 0.0), 0.0, pytest.approx(cfg.danger.map_margin_m + slack_m))]
+    assert rule.map.placed[-1] == ((1.0, 2.0, 0.5), cfg.robot.edge_sensors_m[0])
+    rule.map.seam = SEAM
+    declared(rule, 0.01)
+    anew = measured(rule, 4e-4)
+    rule.map.slacks_m.clear()
+    rule.feed([OFF_FL] * 5, v=0.1)
+    assert anew.phase is Phase.SEAM
+    extra_m = cfg.danger.gap_tolerance_m + cfg.danger.seam_extra_m
+    assert rule.map.slacks_m == [pytest.approx(extra_m + slack_m)]
+
+
+def test_one_that_a_fix_shows_at_the_rim_is_not_to_blame_for_staying_off(rule: Rule) -> None:
+    episode = declared(rule)
+    assert episode.retreat_m > 0.007
+    episode.is_doubted = rule.map.is_rim = True
+    assert measured(rule, 4.9e-4) is episode
+    assert (episode.phase, episode.is_doubted) == (Phase.DECLARED, False)
+    # From here on the way back counts anew.
+    assert episode.retreat_m == 0.0
+    rule.feed([OFF_FL] * 50, v=-0.1)
+    assert episode.retreat_m == pytest.approx(0.005, abs=1e-4)
+
+
+def test_where_a_fix_shows_neither_it_is_to_blame(rule: Rule) -> None:
+    episode = declared(rule)
+    episode.is_doubted = True
+    assert measured(rule, 4.9e-4) is episode
+    assert episode.is_doubted
+    assert episode.retreat_m > 0.007
+
+
+@pytest.mark.parametrize("sigma_m", [5e-4, 9e-4, 1e-3, 2e-3])
+def test_less_than_half_the_sigma_is_a_fix_and_nothing_else(rule: Rule, sigma_m: float) -> None:
+    episode = declared(rule)
+    rule.map.seam = SEAM
+    assert measured(rule, sigma_m) is episode
+
+
+def test_a_fix_counts_against_the_vaguest_since_the_robot_stands(rule: Rule) -> None:
+    episode = declared(rule)
+    rule.map.seam = SEAM
+    measured(rule, 3e-3)
+    assert measured(rule, 1.6e-3) is episode
+    assert measured(rule, 1.4e-3) is not episode
+
+
+def test_each_fix_counts_once(rule: Rule) -> None:
+    declared(rule)
+    measured(rule, 1e-5)
+    rule.map.seam = SEAM
+    episode = measured(rule, 1e-5)
+    assert episode.phase is Phase.DECLARED
+    assert measured(rule, 1e-5) is episode
+
+
+@pytest.mark.parametrize(("v", "omega"), [(6e-4, 0.0), (-6e-4, 0.0), (0.0, 0.008), (0.0, -0.008)])
+def test_a_robot_that_moves_has_no_fix(rule: Rule, v: float, omega: float) -> None:
+    episode = declared(rule)
+    rule.map.seam = SEAM
+    assert measured(rule, 1e-5, v=v, omega=omega) is episode
+    assert measured(rule, 1e-5) is episode  # nor afterwards
+
+
+@pytest.mark.parametrize(("v", "omega"), [(4e-4, 0.0), (0.0, -0.004)])
+def test_one_that_stands_but_for_noise_has(rule: Rule, v: float, omega: float) -> None:
+    episode = declared(rule)
+    rule.map.seam = SEAM
+    assert measured(rule, 1e-5, v=v, omega=omega) is not episode
+
+
+def test_what_is_no_edge_or_on_again_is_left_alone(rule: Rule) -> None:
+    episode = declared(rule)
+    rule.map.seam = SEAM
+    assert measured(rule, 1e-5, flags=ON) is episode
+    fresh = Rule(rule.cfg)
+    fresh.feed([OFF_FL] * 10, estimate=fresh.estimate())
+    fresh.map.seam, known = SEAM, fresh.rule.episodes[0]
+    assert measured(fresh, 1e-5) is known
+
+
+def test_without_an_estimate_there_is_no_fix(rule: Rule) -> None:
+    episode = declared(rule)
+    rule.map.seam = SEAM
+    rule.feed([OFF_FL] * 10)
+    assert rule.rule.episodes[0] is episode
+
+
+def test_a_reset_forgets_how_vague_the_pose_was(rule: Rule) -> None:
+    declared(rule)
+    rule.rule.reset()
+    rule.feed([OFF_FL] * 80, v=0.1)
+    episode = rule.rule.episodes[0]
+    rule.map.seam = SEAM
+    assert measured(rule, 1e-5) is episode
