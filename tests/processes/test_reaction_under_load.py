@@ -2,6 +2,8 @@
 
 The robot is a stand-in in this process, which is preferred where the system permits it: a real one is a machine of its
 own. ``CCATP_REACTIONS`` says how often each kind of fault is made: a process is killed, is stopped, the link is silent.
+For a daemon without real-time scheduling beside a robot with it, begin this process by ``chrt -R -f 60 setpriv
+--bounding-set=-sys_nice --inh-caps=-sys_nice``: then it may not ask for more, and what it starts has neither.
 """
 
 import asyncio
@@ -242,11 +244,13 @@ FAULTS: dict[str, tuple[Callable[[Survey], None], float]] = {
 
 @pytest.fixture
 def preferred() -> Iterator[None]:
-    """This process before all others, where that is permitted."""
+    """This process before all others, where that is permitted; one that was begun so stays so."""
+    before = os.sched_getscheduler(0)
     with contextlib.suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(ROBOTS_PRIORITY))
     yield
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    if before == os.SCHED_OTHER:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def surveys() -> list[tuple[str, range]]:
