@@ -128,7 +128,7 @@ class Reactions:
     def _looks(self, cause: str) -> bool:
         """A sensor that stays off may be over a seam or the rim where the pose is wrong: one fix, at rest, tells."""
         standing = self._standing
-        if standing.state is HELD and standing.is_held_by_hand:
+        if standing.state is State.DONE or (standing.state is HELD and standing.is_held_by_hand):
             return False
         if not self._has_looked:
             self._has_looked = True

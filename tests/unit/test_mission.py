@@ -298,6 +298,17 @@ def test_one_that_somebody_holds_is_left_alone_by_a_sensor_that_stays_off(story:
     assert (story.mission.state, story.mission.is_paused) == (State.HELD, True)
 
 
+def test_after_the_end_a_sensor_that_stays_off_is_nothing(story: Story) -> None:
+    stays_off = replace(FRONT_OFF, cause="stays off", signal="front_left", severity=Severity.HOLD, reverse=False)
+    story.until_state(State.DRIVING)
+    story.mission.abort("fire")
+    story.until_state(State.DONE)
+    for _ in range(100):
+        assert not story.frame(stays_off).measure
+    assert (story.mission.state, story.mission.outcome) == (State.DONE, Outcome.AT_BASE)
+    assert story.mission.cause == "fire"
+
+
 def test_abort_during_back_off_waits_for_the_retreat(story: Story) -> None:
     story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
     story.frame(FRONT_OFF)
