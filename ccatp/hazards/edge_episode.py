@@ -151,10 +151,9 @@ class Episode:
         """
         self._off_samples += 1
         self._on_samples = 0
-        self._heading = odometry.heading_rad
+        self._heading, self._place = odometry.heading_rad, place
         if self.phase is Phase.DECLARED:
             self._watch_turn()
-            self._place = place
             self.retreat_m = hypot(place[0] - self._declared_place[0], place[1] - self._declared_place[1])
             return False
         self._declared_place = place

@@ -576,6 +576,21 @@ def test_on_and_the_way_back_from_an_edge_are_told(danger: DangerConfig) -> None
     assert not sensor.episode.is_on
 
 
+def test_one_to_be_trusted_is_moved_back_from_where_it_is(danger: DangerConfig) -> None:
+    sensor = Sensor(danger, Map(is_rim=True))
+    sensor.off(0.001)
+    assert sensor.off(0.001)
+    sensor.episode.trust()
+    sensor.off(-0.003, -0.004)
+    assert sensor.episode.retreat_m == pytest.approx(0.005)
+    sensor.episode.is_doubted = True
+    sensor.episode.trust()
+    assert (sensor.episode.is_doubted, sensor.episode.retreat_m) == (False, 0.0)
+    assert sensor.episode.phase is Phase.DECLARED
+    sensor.off(0.0, 0.002)
+    assert sensor.episode.retreat_m == pytest.approx(0.002)
+
+
 def test_behind_a_switch_an_oblique_way_has_no_side_either(danger: DangerConfig) -> None:
     limit = GAP_M + danger.gap_tolerance_m + danger.seam_extra_m
     sensor = Sensor(danger, Map(seams=("x", "y")))
