@@ -8,7 +8,8 @@ b. the map has a seam there: an edge when the sensor cannot be over the gap any 
    because a corner sensor that turns in place sweeps along a seam for up to 0.1 m without leaving it;
 c. the map has neither, or there is no estimate: an edge after ``no_map_travel_m``;
 d. standing still the episode is frozen, for ever; going back to where the sensor was on adds nothing;
-e. an edge over which the robot stands by (b), once a fix has shown where that is, was a seam: a new episode begins;
+e. an edge may have been declared by a wrong pose: a sensor that a fix at rest shows over a seam with no rim near begins
+   anew there, and one that it shows at the rim is not to blame for staying off;
 g. wheels unheard: the fastest that the sensor can move, times the time;
 h. all four off: lifted or fallen.
 
@@ -190,11 +191,11 @@ class EdgeRule:
         offset_m: tuple[float, float],
         odometry: Odometry,
         estimate: PoseEstimate,
-        aside_m: float = 0.0,
+        more_sigma_m: float = 0.0,
     ) -> None:
         known = estimate.x_m, estimate.y_m, estimate.heading_rad
         pose = pose_at(self.track, odometry.t_s, estimate.t_s, known)
-        episode.place_on_map(self._map.place(pose, offset_m), pose[2], estimate.sigma_m + aside_m)
+        episode.place_on_map(self._map.place(pose, offset_m), pose[2], estimate.sigma_m + more_sigma_m)
 
     def _open(self, i: int, odometry: Odometry, dt_s: float, estimate: PoseEstimate | None) -> Episode:
         ox, oy = self._offsets[i]
