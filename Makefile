@@ -17,7 +17,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
-.PHONY: help run test test-slow tried-in faults docs lint format fast lock clean
+.PHONY: help run test test-slow sweep tried-in faults docs lint format fast lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -25,6 +25,7 @@ help:
 	@echo "make run [ARGS=...]   survey a simulated mirror: ccatp run --sim"
 	@echo "make test             lint, types, import contract, tests"
 	@echo "make test-slow        the tests that take minutes, and new random examples"
+	@echo "make sweep            the part of that which drives over every centimetre of every rim; goes on where it was stopped"
 	@echo "make faults           docs/fault_table.md from what the last test runs showed and measured"
 	@echo "make docs             build/docs/index.html, and the parts of docs/ that are made from the code"
 	@echo "make lint             lint, types, import contract"
@@ -50,6 +51,12 @@ tried-in:
 test-slow: $(VENV)/.installed-dev
 	$(PYTEST) -m slow $(PYTEST_ARGS)
 	$(PYTEST) tests/property tests/oracle --hypothesis-profile=explore
+	@$(MAKE) --no-print-directory sweep
+
+# Beside the link to the tests there is no source that would hide the compiled build.
+sweep: $(FAST_VENV)/.installed
+	@mkdir -p build/sweep && ln -sfn ../../tests build/sweep/tests
+	cd build/sweep && $(abspath $(FAST_VENV))/bin/python -m tests.faults.whole_sweep . --workers $(WORKERS)
 
 faults: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.faults.page

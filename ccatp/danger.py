@@ -225,6 +225,8 @@ class DangerMonitor:
         if samples:
             self._edge_t_s = samples[-1][0]
         missing = self._missing(t_s, estimate, known is not None)
+        if known is None and estimate is not None and self._board is not None and isfinite(estimate.t_s):
+            self._board.hear(estimate.t_s, estimate)
         found = self._look(sensors, t_s, wheels, samples) if self._board is not None else ()
         if not found and missing is None and edges.is_idle and not origin.direction and not self.latch.is_latched:
             self.verdict = verdict = Verdict(seq, sensors.t, _NORMAL, "", "", 0.0, 0.0, True, True, True)

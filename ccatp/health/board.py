@@ -160,7 +160,7 @@ class HealthBoard:
             self.seams, self.flicker, self._clock, self._gap, self._garbled,
         ):  # fmt: skip
             monitor.reset()
-        self._estimate_seq = -1
+        self._estimate_seq = self._heard_seq = -1
         self._opened = (0, 0, 0, 0)
         self._home_m = 0.0
         self._frames = 0
@@ -285,6 +285,19 @@ class HealthBoard:
             turned = means.yaw_rad_s * dt_s
         return Moved(t_s, sums[1] + right * rolled_m, sums[2] + left * rolled_m, sums[3] + turned)
 
+    def hear(self, t_s: float, estimate: Commanded) -> None:
+        """Take what the wheels were told, from an estimate that may be too old for anything else.
+
+        Args:
+            t_s: its steady time.
+            estimate: the estimate; one that was heard already changes nothing.
+        """
+        if estimate.seq == self._heard_seq:
+            return
+        self._heard_seq = estimate.seq
+        if estimate.commanded is not None:
+            self._wheels.commands.push(t_s, estimate.commanded)
+
     def learn(self, t_s: float, estimate: Commanded, opened: Sequence[int], is_off: Sequence[bool]) -> None:
         """Take an estimate of main's that is fresh; one that was taken already changes nothing.
 
@@ -297,8 +310,7 @@ class HealthBoard:
         if estimate.seq == self._estimate_seq:
             return
         self._estimate_seq = estimate.seq
-        if estimate.commanded is not None:
-            self._wheels.commands.push(t_s, estimate.commanded)
+        self.hear(t_s, estimate)
         self._wheels.learn(t_s)
         if estimate.drive_seq >= 0:
             self._latency.sent(estimate.drive_seq, t_s)

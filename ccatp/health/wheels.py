@@ -105,6 +105,7 @@ class WheelMonitor:
         self._lately: Span | None = None
         self._stall: Span | None = None
         self._held_s: float | None = None
+        self._held_since_s: float | None = None
         self._late_s: float | None = None
         self._sparse_s: float | None = None
         self._stood: Moved | None = None
@@ -136,13 +137,18 @@ class WheelMonitor:
             is_sparse: the encoders gave fewer samples than usual.
             samples: of the frame.
         """
-        t_s, lately = now.t_s, self._lately
-        if not is_free:
+        t_s = now.t_s
+        if is_free:
+            self._held_since_s = None
+        else:
             self._held_s = t_s
+            if self._held_since_s is None:
+                self._held_since_s = t_s
         if is_late:
             self._late_s = t_s
         if is_sparse:
             self._sparse_s = t_s
+        lately = self._told(t_s)
         if lately is not None:
             limit = self._cfg.runaway_m_s
             is_vague = self._sparse_s is not None and t_s - self._sparse_s < self._cfg.stall_time_s
@@ -154,6 +160,15 @@ class WheelMonitor:
                 self._find_stall(t_s, stalling)
                 self._find_creep(now, stalling, lately, samples)
         self.alarm.settle(t_s)
+
+    def _told(self, t_s: float) -> Span | None:
+        """What the wheels were told lately; ``None`` where that is not known."""
+        lately = self._lately
+        if lately is not None and t_s - lately.t_s <= _LATENCY_S:
+            return lately
+        # Main may have told them anything since. Where the robot holds its wheels, whatever it was has been forgotten.
+        is_held = self._held_since_s is not None and t_s - self._held_since_s >= _MEMORY_S
+        return Span(t_s, 0.0, 0.0, 0.0, 0.0) if is_held else None
 
     def _find_runaway(self, t_s: float, moved: Moved, told: Span, samples: Sequence[WheelSample], limit: float) -> None:
         right, left = moved.right_m / moved.t_s, moved.left_m / moved.t_s

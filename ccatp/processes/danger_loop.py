@@ -9,7 +9,7 @@ from typing import Any
 import zmq
 import zmq.asyncio
 
-from ccatp.bus import Publisher, Subscriber
+from ccatp.bus import Publisher
 from ccatp.errors import CcatpError
 from ccatp.frame_lag import FrameLag
 from ccatp.processes import realtime, spinning
@@ -23,7 +23,7 @@ from ccatp.processes.common import (
     stop_on_signals,
 )
 from ccatp.processes.danger_duty import duty_of
-from ccatp.processes.hearing import MOST_AHEAD, await_message
+from ccatp.processes.hearing import EstimateEar
 from ccatp.processes.joining import LastingLink
 from ccatp.processes.latching import FILE as EMERGENCIES_FILE
 from ccatp.processes.latching import DurableLatch
@@ -31,7 +31,7 @@ from ccatp.processes.observing import Observatory, ObservatoryDesk
 from ccatp.processes.pulse import PERIOD_S, Pulse
 from ccatp.samples import EventCode, Severity, Verdict
 from ccatp.wire.robot import Hello, Sensors
-from ccatp.wire.topics import DangerEvent, Estimate, Message, last_estimate_before
+from ccatp.wire.topics import DangerEvent
 
 WAIT_PERIOD_S = 0.02
 
@@ -55,17 +55,15 @@ class DangerLoop:
         self.monitor.latch = DurableLatch(args.run_dir / EMERGENCIES_FILE, self.log)
         self._publisher = Publisher(context, args.endpoints.of("danger"))
         self._pulse = Pulse(self._publisher, "danger")
-        main = args.endpoints.of("main")
-        self._subscriber = Subscriber(context, [main], ["estimate", "presence.main"], is_watching=True)
-        self._estimate: Estimate | None = None
+        main, self._is_taking_over = args.endpoints.of("main"), args.is_taking_over
+        self._ear = EstimateEar(context, main, self._pulse.tell_if_due, is_taking_over=self._is_taking_over)
         self._told = (EventCode.NORMAL, "", Severity.NONE)
-        self._seq = self._first_seq = -1
+        self._seq = -1
         self._bad_lines = 0
         self._permit_seq = 0
         self._t_s = 0.0
         self._is_stale = False
         self._lag = FrameLag(duty.link.slip_after_s)
-        self._is_taking_over = args.is_taking_over
         self._hello: Hello | None = None
         self.lasting = LastingLink(
             duty.link,
@@ -108,14 +106,15 @@ class DangerLoop:
         is_heard = False
         while not stop.is_set() and not (is_heard and self._publisher.has_subscriber("verdict")):
             await asyncio.sleep(WAIT_PERIOD_S)
-            is_heard = is_heard or self._subscriber.receive() is not None
+            is_heard = is_heard or self._ear.is_main_there()
 
     def _on_joined(self, hello: Hello) -> None:
         """A session begins; its first frame comes next."""
         before, self._hello, self._is_lockstep = self._hello, hello, hello.lockstep
         if before is not None and before.boot != hello.boot:
             self.monitor.reset()
-            self._estimate, self._seq, self._first_seq = None, -1, -1
+            self._ear.forget()
+            self._seq = -1
         self._lag.forget()
         self._pulse.phase, self._pulse.frame_s = "joined", time.monotonic()
         self.log.info("joined", port=self._duty.link.port, lockstep=hello.lockstep, session=self.lasting.sessions)
@@ -124,13 +123,9 @@ class DangerLoop:
         """Judge one frame. In lockstep with a certain estimate of main's, so that the run is repeatable."""
         self._seq, self._t_s, self._pulse.frame_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
         self._bad_lines = 0
-        if self._first_seq < 0:
-            # Of the frame that it meets, a process that takes over may have missed main's estimate.
-            self._first_seq = sensors.seq + self._is_taking_over
-        wanted = last_estimate_before(sensors.seq)
-        self._take_estimates(wanted if wanted >= self._first_seq else -1)
+        estimate = self._ear.hear(sensors.seq, is_lockstep=self._is_lockstep)
         try:
-            verdict = self._duty.judge(sensors, raw, self._estimate)
+            verdict = self._duty.judge(sensors, raw, estimate)
         except Exception as error:
             # Without a verdict the robot's permit runs out: it holds by itself.
             self.log.exception("surprise in a frame", seq=self._seq)
@@ -172,28 +167,6 @@ class DangerLoop:
         self._publisher.send("danger_event", DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, **fields))
         self.log.info("verdict", seq=verdict.seq, t_s=verdict.t_s, **fields)
 
-    def _take_estimates(self, wanted_seq: int) -> None:
-        if not self._is_lockstep:
-            while (received := self._subscriber.receive()) is not None:
-                self._take_estimate(received[1])
-            return
-        if self._estimate_seq() < wanted_seq:
-            await_message(
-                self._subscriber,
-                lambda message: self._take_estimate(message) and self._estimate_seq() >= wanted_seq,
-                self._pulse.tell_if_due,
-            )
-
-    def _take_estimate(self, message: Message | Verdict) -> bool:
-        # One of a frame that we have not seen is of the robot's last boot.
-        is_ours = isinstance(message, Estimate) and message.seq <= self._seq + MOST_AHEAD
-        if isinstance(message, Estimate) and is_ours:
-            self._estimate = message
-        return is_ours
-
-    def _estimate_seq(self) -> int:
-        return -1 if self._estimate is None else self._estimate.seq
-
     async def _beat(self) -> None:
         """Be seen alive."""
         while True:
@@ -204,7 +177,7 @@ class DangerLoop:
         """Where frames stop coming, withhold the permit aloud; make a connection anew that is open and silent."""
         while True:
             await asyncio.sleep(WAIT_PERIOD_S)
-            self._subscriber.tend()
+            self._ear.tend()
             age_s = self._pulse.frame_age_s
             if self._pulse.phase != "joined" or self._is_lockstep or age_s is None:
                 continue
@@ -226,7 +199,7 @@ class DangerLoop:
 
     def close(self) -> None:
         """Close the sockets."""
-        self._subscriber.close()
+        self._ear.close()
         self._publisher.close()
 
 

@@ -7,7 +7,7 @@ import zmq
 
 from ccatp.bus import Subscriber
 from ccatp.samples import Verdict
-from ccatp.wire.topics import Message, Presence
+from ccatp.wire.topics import Estimate, Message, Presence, last_estimate_before
 
 # In lockstep simulated time stands still while we wait; longer than this the other loop hangs.
 LOCKSTEP_WAIT_S = 10.0
@@ -106,6 +106,82 @@ class VerdictEar:
         if not is_lockstep:
             age_s = max(age_s, time.monotonic() - self._wall_s)
         return verdict if age_s <= self._timeout_s else None
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._subscriber.close()
+
+
+class EstimateEar:
+    """Listens to main.
+
+    Args:
+        context: ZeroMQ context of the process.
+        endpoint: where main publishes.
+        on_wait: called now and then while lockstep waits for an estimate.
+        is_taking_over: of the frame that it meets, a process that takes over may have missed the estimate.
+    """
+
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        on_wait: Callable[[], None] = lambda: None,
+        *,
+        is_taking_over: bool = False,
+    ) -> None:
+        """Subscribe; the publisher may come up later."""
+        self._subscriber = Subscriber(context, [endpoint], ["estimate", "presence.main"], is_watching=True)
+        self._on_wait, self._is_taking_over = on_wait, is_taking_over
+        self.forget()
+
+    def is_main_there(self) -> bool:
+        """Whether anything was heard of it."""
+        return self._subscriber.receive() is not None
+
+    def tend(self) -> None:
+        """Keep the connection up where nothing is heard for long."""
+        self._subscriber.tend()
+
+    def forget(self) -> None:
+        """The robot's frames count anew: what was heard is of another time."""
+        self._newest: Estimate | None = None
+        self._judged_frame = self._judged = self._first_seq = -1
+
+    def hear(self, seq: int, *, is_lockstep: bool) -> Estimate | None:
+        """The estimate to judge a frame with: in lockstep always the same one, else the newest.
+
+        Where several waited, after a stall, the newest counts, but the drives of each have moved the wheels:
+        ``commanded`` spans those of all that no frame was judged with.
+
+        Args:
+            seq: the frame.
+            is_lockstep: wait for the estimate that goes with ``seq``.
+        """
+
+        def take(message: Message | Verdict) -> bool:
+            # One of a frame that we have not seen is of the robot's last boot.
+            if not isinstance(message, Estimate) or message.seq > seq + MOST_AHEAD:
+                return False
+            missed = self._newest if self._newest_seq > self._judged else None
+            self._newest = message if missed is None else message.following(missed)
+            return message.seq >= wanted
+
+        if self._first_seq < 0:
+            self._first_seq = seq + self._is_taking_over
+        wanted = last_estimate_before(seq)
+        if not is_lockstep:
+            while (received := self._subscriber.receive()) is not None:
+                take(received[1])
+        elif wanted >= self._first_seq and self._newest_seq < wanted:
+            await_message(self._subscriber, take, self._on_wait)
+        if seq > self._judged_frame:  # an older one is not judged
+            self._judged_frame, self._judged = seq, self._newest_seq
+        return self._newest
+
+    @property
+    def _newest_seq(self) -> int:
+        return -1 if self._newest is None else self._newest.seq
 
     def close(self) -> None:
         """Close the socket."""

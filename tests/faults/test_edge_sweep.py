@@ -1,16 +1,17 @@
 """The rim of all four mirrors, centimetre by centimetre, and ways over the seams: nobody falls, no false edge.
 
-``make test-slow`` runs one shard of 96 of the whole sweep; ``CCATP_SWEEP_SHARD=i/n`` takes another, ``0/1`` all of it
-(4 million drives, some 15 hours of one core).
+One part of 96 is swept by the slow tests, which measure for the fault table. All of it, 4 million drives, takes the
+compiled build some three hours of one core: ``make sweep``, which ``make test-slow`` ends with.
 """
 
-import os
+import json
 import random
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
 import pytest
 
-from tests.faults import edge_sweep
+from tests.faults import edge_sweep, whole_sweep
 from tests.faults.edge_sweep import (
     OVERRUN_M,
     Tally,
@@ -23,8 +24,7 @@ from tests.faults.edge_sweep import (
     turn_cases,
 )
 
-SHARD, SHARDS = map(int, os.environ.get("CCATP_SWEEP_SHARD", "5/96").split("/"))
-SEAMS = 1_000_000  # of the whole sweep
+SHARD, SHARDS = 5, 96
 MIN_DRIVEN = 0.25
 PERMIT_S = 0.1  # S22, S24
 
@@ -86,7 +86,7 @@ def test_a_sample_of_turns_beside_the_rim(measured: Measured) -> None:
 @pytest.mark.fault("S20", "S21")
 def test_a_sample_of_ways_and_stops_over_seams(measured: Measured) -> None:
     rng = random.Random(21)
-    tally = sweep(seam_case, [rng.randrange(SEAMS) for _ in range(24)])
+    tally = sweep(seam_case, [rng.randrange(whole_sweep.SEAMS) for _ in range(24)])
     check(tally)
     assert tally.over_gap > 2
     measured("S20", tally.false_edges / tally.transits)
@@ -113,8 +113,58 @@ def test_turns_beside_the_rim(measured: Measured) -> None:
 @pytest.mark.parametrize("part", range(2))
 def test_ways_and_stops_over_seams(part: int, measured: Measured) -> None:
     # Neither mirrors nor kinds of crossing may fall out of step with the shards.
-    numbers = range(SEAMS * part // 2, SEAMS * (part + 1) // 2)
+    numbers = range(whole_sweep.SEAMS * part // 2, whole_sweep.SEAMS * (part + 1) // 2)
     tally = sweep(seam_case, [k for k in numbers if k // 8 % SHARDS == SHARD % SHARDS])
     check(tally)
     measured("S20", tally.false_edges / tally.transits)
     measured("S21", float(tally.false_edges))
+
+
+# -- the whole sweep --------------------------------------------------------------------------------------------------
+
+
+def few_drives(monkeypatch: pytest.MonkeyPatch, falls_at: int | None = None) -> None:
+    """Ten drives over a rim and five over seams, in blocks of four."""
+
+    def case(number: int) -> tuple[str, Callable[[], Tally]]:
+        return f"drive {number}", lambda: Tally(drives=1, falls=int(number == falls_at))
+
+    monkeypatch.setattr(whole_sweep, "BLOCK", 4)
+    monkeypatch.setattr(whole_sweep, "KINDS", {"rim": (case, lambda: 10), "seam": (case, lambda: 5)})
+
+
+def test_the_whole_sweep_is_every_drive_once() -> None:
+    swept: dict[str, list[range]] = {}
+    for kind, first in whole_sweep.blocks():
+        swept.setdefault(kind, []).append(range(first, first + whole_sweep.BLOCK))
+    for kind, count in (("rim", rim_cases()), ("turn", turn_cases()), ("seam", whole_sweep.SEAMS)):
+        firsts = sorted(part.start for part in swept[kind])
+        assert firsts == list(range(0, count, whole_sweep.BLOCK))
+
+
+def test_the_whole_sweep_goes_on_where_it_was_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few_drives(monkeypatch)
+    assert whole_sweep.main([str(tmp_path), "--workers", "1", "--blocks", "2"]) == 0
+    path = tmp_path / "blocks.jsonl"
+    path.write_text(path.read_text()[:-5])  # killed while it wrote
+    assert whole_sweep.main([str(tmp_path), "--workers", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "1 of 5 blocks are done, 4 to do" in said
+    assert "rim: 3 of 3 blocks, 10 drives" in said
+    assert "seam: 2 of 2 blocks, 5 drives" in said
+
+
+def test_the_whole_sweep_tells_who_fell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few_drives(monkeypatch, falls_at=3)
+    assert whole_sweep.main([str(tmp_path), "--workers", "1"]) == 1
+    assert "drive 3: 1 drives" in capsys.readouterr().out
+    assert whole_sweep.main([str(tmp_path), "--workers", "1"]) == 1  # nor is it forgotten
+    monkeypatch.setattr(whole_sweep, "build", lambda: "mended")
+    few_drives(monkeypatch)
+    assert whole_sweep.main([str(tmp_path), "--workers", "1"]) == 0
+    builds = [json.loads(line)["build"] for line in (tmp_path / "blocks.jsonl").read_text().split("\n") if line]
+    assert builds[:5] != builds[5:] == ["mended"] * 5

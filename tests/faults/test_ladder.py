@@ -1,7 +1,12 @@
 """The ladder of severities, and monitors that are silent as long as nothing is wrong."""
 
+from collections import deque
+from collections.abc import Callable
+
+import msgspec
 import numpy as np
 import pytest
+import zmq
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -11,7 +16,8 @@ from ccatp.health.commanded import CommandSpan
 from ccatp.health.findings import Finding
 from ccatp.health.ladder import Ladder, denies, gravest
 from ccatp.mirror.mirror import build_mirror
-from ccatp.samples import Severity
+from ccatp.processes.hearing import EstimateEar
+from ccatp.samples import Severity, Verdict
 from ccatp.sim.robot import Robot
 from ccatp.wire.topics import Estimate, is_estimate_due
 
@@ -69,11 +75,22 @@ def test_what_comes_again_and_again_is_a_fault(gap_s: float, last: Severity) -> 
 TWISTS = st.lists(st.tuples(st.floats(-0.1, 0.1), st.floats(-1.0, 1.0), st.integers(20, 60)), min_size=1, max_size=4)
 
 
-@settings(max_examples=12, deadline=None)
-@given(st.sampled_from(["thesis", "thesis-x2", "hard", "extreme"]), TWISTS, st.integers(0, 1000))
-def test_monitors_are_silent_where_nothing_is_wrong(
-    world: str, twists: list[tuple[float, float, int]], seed: int
-) -> None:
+def found_on_the_way(
+    world: str,
+    wanted: list[tuple[float, float]],
+    seed: int,
+    heard: Callable[[list[Estimate], int], Estimate | None],
+    dv_m_s: float = 0.0025,
+) -> list[Verdict]:
+    """Verdicts that found something while a robot is driven, and nothing is wrong.
+
+    Args:
+        world: the world.
+        wanted: v (m/s) and omega (rad/s), frame by frame.
+        seed: of the robot.
+        heard: what the danger loop has heard by a frame, of the estimates that were told.
+        dv_m_s: how much faster from frame to frame; by itself the limit of the acceleration, with the gate's headroom.
+    """
     cfg = load_config(overrides={"run.world": world})
     mirror = build_mirror(cfg.mirror)
     robot = Robot(cfg, mirror, np.random.default_rng(seed))
@@ -83,28 +100,106 @@ def test_monitors_are_silent_where_nothing_is_wrong(
     robot._sensors.edges.place(robot.world.plant)
     robot.command_fans(1, *cfg.robot.fan_duty)
     monitor = DangerMonitor(mirror, cfg.robot, cfg.danger, cfg.health)
-    span, estimate, number, radius_m = CommandSpan(), None, 0, cfg.robot.wheel_radius_m
+    span, told, number, radius_m = CommandSpan(), list[Estimate](), 0, cfg.robot.wheel_radius_m
     v = omega = 0.0
-    wanted = [(0.0, 0.0)] * 60 + [(a, b) for a, b, count in twists for _ in range(count)] + [(0.0, 0.0)] * 60
     driven = (0.0, 0.0)
+    found: list[Verdict] = []
     for v_wanted, omega_wanted in wanted:
         robot.advance()
         frame = robot.delivered
         if frame is None:
             continue
+        estimate = heard(told, frame.seq)
         verdict = monitor.step(frame, estimate)
-        assert estimate is None or verdict.severity is Severity.NONE, verdict
-        v += min(max(v_wanted - v, -0.0025), 0.0025)  # the limits of the accelerations, with the gate's headroom
+        if estimate is not None and verdict.severity is not Severity.NONE:
+            found.append(verdict)
+        v += min(max(v_wanted - v, -dv_m_s), dv_m_s)
         omega += min(max(omega_wanted - omega, -0.025), 0.025)
         if is_estimate_due(frame.seq):
             pose = robot.world.plant.pose
-            estimate = Estimate(
+            told.append(Estimate(
                 seq=frame.seq, t_s=frame.t, x_m=pose.x_m, y_m=pose.y_m, heading_rad=pose.heading_rad, sigma_m=1e-3,
                 state="driving", commanded=span.take(*driven), drive_seq=number,
-            )  # fmt: skip
+            ))  # fmt: skip
         number += 1
         half = 0.5 * omega * cfg.robot.wheel_base_m
         driven = (v + half) / radius_m, (v - half) / radius_m
         span.add(*driven)
         robot.drive(number, *driven)
         robot.permit(number, verdict.forward, verdict.reverse, verdict.turn)
+    return found
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.sampled_from(["thesis", "thesis-x2", "hard", "extreme"]), TWISTS, st.integers(0, 1000))
+def test_monitors_are_silent_where_nothing_is_wrong(
+    world: str, twists: list[tuple[float, float, int]], seed: int
+) -> None:
+    wanted = [(0.0, 0.0)] * 60 + [(a, b) for a, b, count in twists for _ in range(count)] + [(0.0, 0.0)] * 60
+    assert not found_on_the_way(world, wanted, seed, lambda told, _: told[-1] if told else None)
+
+
+class Waiting:
+    """What main has published and the danger loop has not received yet."""
+
+    def __init__(self, *_: object, **__: object) -> None:
+        self.messages: deque[Estimate] = deque()
+
+    def receive(self) -> tuple[str, Estimate] | None:
+        return ("estimate", self.messages.popleft()) if self.messages else None
+
+
+@pytest.mark.fault("P8")
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("frames", "dv_m_s", "heard_until"),
+    [
+        pytest.param(12, 0.0025, lambda k: 95 if 100 < k < 126 else k, id="when they are all but old"),
+        pytest.param(2, 0.05, lambda k: 95 if 100 < k < 111 else k, id="several at once"),
+    ],
+)
+def test_drives_that_the_danger_loop_hears_of_late_have_moved_the_wheels(
+    frames: int, dv_m_s: float, heard_until: Callable[[int], int], seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A robot that has stood for long drives on for a moment, and the estimates of that wait for the danger loop."""
+    monkeypatch.setattr("ccatp.processes.hearing.Subscriber", Waiting)
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    ear = EstimateEar(context, "inproc://main")
+    context.destroy()
+    waiting: deque[Estimate] = ear._subscriber.messages  # type: ignore[attr-defined]
+    arrived = 0
+
+    def heard(told: list[Estimate], k: int) -> Estimate | None:
+        nonlocal arrived
+        while arrived < len(told) and told[arrived].seq <= heard_until(k):
+            waiting.append(told[arrived])
+            arrived += 1
+        return ear.hear(k, is_lockstep=False)
+
+    wanted = [(0.0, 0.0)] * 100 + [(0.1, 0.0)] * frames + [(0.0, 0.0)] * 188
+    found = found_on_the_way("hard", wanted, seed, heard, dv_m_s)
+    assert arrived > 50
+    assert not [one.cause for one in found if "wheel" in one.cause]
+
+
+@pytest.mark.parametrize(
+    ("seq", "t_s", "expected"), [(70, 0.7, [0.0, 4.0]), (99, 0.99, [0.0, 4.0]), (99, float("nan"), [0.0])]
+)
+def test_what_the_wheels_were_told_counts_however_old_the_estimate(seq: int, t_s: float, expected: list[float]) -> None:
+    cfg = load_config()
+    monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger, cfg.health)
+    robot = Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(1))
+    commands = monitor._board._wheels.commands  # type: ignore[union-attr]
+    commands.push(0.5, (0.0, 0.0, 0.0, 0.0))
+    while (frame := robot.delivered) is None or frame.seq < 100:
+        robot.advance()
+        if frame is not None and frame.seq < 99:
+            monitor.step(frame, None)
+    estimate = Estimate(
+        seq=seq, t_s=t_s, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-3, state="driving",
+        commanded=(0.0, 4.0, 0.0, 4.0), drive_seq=1,
+    )  # fmt: skip
+    for _ in range(3):
+        monitor.step(frame, estimate)
+        frame = msgspec.structs.replace(frame, seq=frame.seq + 1)
+    assert [span.right_high / cfg.robot.wheel_radius_m for span in commands._spans] == expected
