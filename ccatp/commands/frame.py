@@ -116,6 +116,10 @@ def run_command_line(group: click.Group, argv: Sequence[str] | None = None) -> i
     except BrokenPipeError:  # the reader of our output has seen enough; keep the interpreter from flushing into it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ExitStatus.REFUSED
+    except OSError as error:  # a path that nobody foresaw: too long a name, a folder that is not ours
+        if error.filename is None:
+            raise
+        return complain(f"{error.filename}: {error.strerror}; give another path, or mend this one", ExitStatus.USAGE)
     return int(status or 0)
 
 

@@ -134,10 +134,17 @@ def _named_section(section: str, tree: Tree, sources: list[Source], config_dir: 
         raise ConfigError(f"{source.place(key)}: run.{section} = {format_value(name)} must be the name of a {section}")
     folder = config_dir / _SECTIONS[section][0]
     path = source.folder / name if is_file_name(name) else folder / f"{name}.toml"
-    if not path.is_file():
+    if not _is_file(path):
         hint = f"no file {path}" if is_file_name(name) else choice_hint(name, available(section, config_dir))
         raise ConfigError(f"{source.place(key)}: run.{section} = {format_value(name)} is no {section}; {hint}")
     return read_source(path, (section,))
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # no name that a file may have, or in a folder that is not ours
+        return False
 
 
 def _get(tree: object, *key: str) -> object:

@@ -165,7 +165,7 @@ class HealthBoard:
         self._home_m = 0.0
         self._frames = 0
         self._counts = [0, 0, 0]
-        self._is_free, self._is_late = True, False
+        self._is_free, self._is_held, self._is_late = True, True, False
         self._speed_m_s = 0.0
         self.findings: list[Finding] = []
 
@@ -219,6 +219,7 @@ class HealthBoard:
         self._counts[1] += len(wheels)
         self._counts[2] += len(edges)
         self._is_free = self._is_free and is_permitted and not frame.cmd.held
+        self._is_held = self._is_held and frame.cmd.held
         self._is_late = self._is_late or (frame.cmd.age > LATE_S and not frame.cmd.held)
         is_flickering = is_any_off or not self.flicker.is_quiet
         self._frames += 1
@@ -244,9 +245,16 @@ class HealthBoard:
         self._counts = [0, 0, 0]
         is_sparse = self._rates.are_encoders_sparse
         self._wheels.step(
-            now, shortly, stalling, is_free=self._is_free, is_late=self._is_late, is_sparse=is_sparse, samples=wheels
+            now,
+            shortly,
+            stalling,
+            is_free=self._is_free,
+            is_held=self._is_held,
+            is_late=self._is_late,
+            is_sparse=is_sparse,
+            samples=wheels,
         )
-        self._is_free, self._is_late = True, False
+        self._is_free, self._is_held, self._is_late = True, True, False
         self._speed_m_s = 0.0
         if shortly is not None:
             self._speed_m_s = max(abs(shortly.right_m), abs(shortly.left_m)) / shortly.t_s

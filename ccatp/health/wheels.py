@@ -123,6 +123,7 @@ class WheelMonitor:
         stalling: Moved | None,
         *,
         is_free: bool,
+        is_held: bool,
         is_late: bool,
         is_sparse: bool,
         samples: Sequence[WheelSample],
@@ -132,18 +133,19 @@ class WheelMonitor:
         Args:
             now: the sums.
             shortly, stalling: their change over ``runaway_time_s`` and over ``stall_time_s``.
-            is_free: the robot executed what it was told in this frame, and was permitted to.
+            is_free: the robot executed what it was told since the last look, and was permitted to go anywhere.
+            is_held: it held its wheels by itself all that time.
             is_late: it executed what it had been told long before.
             is_sparse: the encoders gave fewer samples than usual.
             samples: of the frame.
         """
         t_s = now.t_s
-        if is_free:
-            self._held_since_s = None
-        else:
+        if not is_free:
             self._held_s = t_s
-            if self._held_since_s is None:
-                self._held_since_s = t_s
+        if not is_held:
+            self._held_since_s = None
+        elif self._held_since_s is None:
+            self._held_since_s = t_s
         if is_late:
             self._late_s = t_s
         if is_sparse:

@@ -51,7 +51,7 @@ class Estimate(Message):
         """This estimate for one who has not looked at the one before: ``commanded`` spans the drives of both."""
         mine, its = self.commanded, missed.commanded
         if mine is None or its is None:
-            return msgspec.structs.replace(self, commanded=its if mine is None else mine)
+            return self  # what is not told is not known
         span = min(its[0], mine[0]), max(its[1], mine[1]), min(its[2], mine[2]), max(its[3], mine[3])
         return msgspec.structs.replace(self, commanded=span)
 
