@@ -233,11 +233,17 @@ def exchange(
 
     Raises:
         UnreachableError: nobody listens there, or no answer came in time.
+        RequestFailed: the answer to an emergency is not that this one is in force.
         RefusedError: the daemon said no, and why.
     """
     reply = request(endpoint, json.dumps(payload).encode(), timeout_s, curve, repeats=repeats)
-    if not reply.get("ok", False):
+    if reply.get("ok") is not True:
         raise RefusedError(f"{payload.get('cmd')} refused: {reply.get('error', 'no reason given')}")
+    # Who reports a fire must not take any answer for the one that counts.
+    if payload.get("cmd") == "emergency" and (reply.get("id") != payload["id"] or reply.get("latched") is not True):
+        raise RequestFailed(
+            f"{endpoint}: something answers there, but not that this emergency is in force; is it a daemon of ccatp?"
+        )
     return reply
 
 

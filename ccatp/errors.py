@@ -33,13 +33,15 @@ class ConfigError(CcatpError):
 
     Args:
         problems: one line each, ``file:line: key: what is wrong; what to do``. The first is the message.
+        shows_all: all of them are: no command lists them.
     """
 
     exit_status = ExitStatus.USAGE
 
-    def __init__(self, *problems: str) -> None:
+    def __init__(self, *problems: str, shows_all: bool = False) -> None:
         self.problems: Sequence[str] = [" ".join(problem.split()) for problem in problems]
-        more = f" (and {len(problems) - 1} more: ccatp config check)" if len(problems) > 1 else ""
+        others = "; ".join(self.problems[1:]) if shows_all else "ccatp config check"
+        more = f" (and {len(problems) - 1} more: {others})" if len(problems) > 1 else ""
         super().__init__(self.problems[0] + more)
 
 

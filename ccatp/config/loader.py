@@ -137,7 +137,10 @@ def _named_section(section: str, tree: Tree, sources: list[Source], config_dir: 
     if not _is_file(path):
         hint = f"no file {path}" if is_file_name(name) else choice_hint(name, available(section, config_dir))
         raise ConfigError(f"{source.place(key)}: run.{section} = {format_value(name)} is no {section}; {hint}")
-    return read_source(path, (section,))
+    try:
+        return read_source(path, (section,))
+    except ConfigError as error:
+        raise ConfigError(f"{source.place(key)}: run.{section} = {format_value(name)}: {error}") from error
 
 
 def _is_file(path: Path) -> bool:

@@ -21,6 +21,7 @@ from ccatp.processes.common import (
     parse_either,
     report,
     stop_on_signals,
+    unless_stopped,
 )
 from ccatp.processes.danger_duty import duty_of
 from ccatp.processes.hearing import EstimateEar
@@ -87,10 +88,9 @@ class DangerLoop:
             served = [tasks.create_task(one) for one in work]
             try:
                 await self._wait_for_main(stop)
-                if not stop.is_set():
-                    await self.lasting.join(is_patient=self._is_taking_over)
-                    if not self._is_lockstep:
-                        realtime.enter(self._duty.realtime_priority, self.log)
+                joins = self.lasting.join(is_patient=self._is_taking_over)
+                if await unless_stopped(stop, joins) and not self._is_lockstep:
+                    realtime.enter(self._duty.realtime_priority, self.log)
                 waits = [tasks.create_task(stop.wait()), tasks.create_task(self.lost.wait())]
                 await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
                 for wait in waits:

@@ -100,6 +100,9 @@ def recovery_from(
         limits: how quickly a robot can have begun to move.
         skipped: points that stay given up.
         held_cause: why it begins held, if it does; a hold that is in force goes before.
+
+    Raises:
+        CheckpointError: it is damaged.
     """
     record = read_checkpoint(run_dir / FILE)
     if record is None:

@@ -129,8 +129,8 @@ class MainLoop:
             if stop.is_set():
                 return
             await asyncio.sleep(WAIT_PERIOD_S)
-        await self._link.join(is_patient=self._is_taking_over)
-        if not self._seat.is_lockstep:
+        is_joined = await unless_stopped(stop, self._link.join(is_patient=self._is_taking_over))
+        if is_joined and not self._seat.is_lockstep:
             realtime.enter(self._hosting.realtime_priority, self._teller.log)
 
     def _on_joined(self, hello: Hello) -> None:

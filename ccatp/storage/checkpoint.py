@@ -12,10 +12,13 @@ from pathlib import Path
 
 import msgspec
 
+from ccatp.errors import CcatpError, ExitStatus
+
 FILE = "checkpoint"
 # Each in a page of its own: a torn page takes one slot with it.
 _SLOT_BYTES = 4096
 _HEAD_BYTES = 8  # length and checksum
+_AT_BASE = "set it at base, remove this file and resume"
 _encoder = msgspec.json.Encoder()
 
 
@@ -130,13 +133,27 @@ class CheckpointFile:
             self.failure = error.strerror or str(error)
 
 
+class CheckpointError(CcatpError):
+    """There is a checkpoint, and nobody can read it: where the robot is must be told anew."""
+
+    exit_status = ExitStatus.USAGE
+
+
 def read_checkpoint(path: Path) -> Checkpoint | None:
-    """The newest whole record of a file, ``None`` where there is none."""
+    """The newest whole record of a file, ``None`` where nothing was written down.
+
+    Raises:
+        CheckpointError: something was, and none of it is whole.
+    """
     try:
         data = path.read_bytes()
-    except OSError:
+    except FileNotFoundError:
         return None
+    except OSError as error:
+        raise CheckpointError(f"{path}: {error.strerror or error}; {_AT_BASE}") from error
     records = [record for k in range(2) if (record := _slot(data[k * _SLOT_BYTES : (k + 1) * _SLOT_BYTES])) is not None]
+    if data and not records:
+        raise CheckpointError(f"{path}: damaged, so nobody knows where the robot is; {_AT_BASE}")
     return max(records, key=lambda record: record.count, default=None)
 
 

@@ -72,6 +72,9 @@ class Collector(ABC):
     Args:
         access: how the run is reached.
         metadata: of the recording, beside its format and our version.
+
+    Attributes:
+        remarks: what an operator should know of the summary.
     """
 
     def __init__(self, access: RunAccess, metadata: Mapping[str, str]) -> None:
@@ -91,6 +94,7 @@ class Collector(ABC):
         self._status: MissionStatus | None = None
         self._truth_rows = 0
         self._has_views = True
+        self.remarks: list[str] = []
 
     # -- of each kind of mission ----------------------------------------------------------------------------------
 

@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import zmq
 
@@ -84,12 +85,26 @@ class Run:
                 signal.signal(number, handler)
             self._children.kill_all()
             context.destroy(linger=0)
-        (self._run_dir / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+        for remark in collector.remarks:
+            self._say("warning", remark)
+        self._write(summary)
         self._log.info("end", status=int(status))
         if self._options.shows_summary:
             view.show_summary(summary, as_json=self._options.json_output)
             view.show_report(write_run_report(self._run_dir, status, self._log))
         return int(status)
+
+    def _write(self, summary: dict[str, Any]) -> None:
+        """Complete or not at all: that of an earlier session is better than half of a new one."""
+        path = self._run_dir / "summary.json"
+        new = path.with_name(path.name + ".new")
+        try:
+            new.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+            new.replace(path)
+        except OSError as error:
+            new.unlink(missing_ok=True)
+            reason = error.strerror or str(error)
+            self._say("error", f"{path}: cannot be written: {reason}; what was measured is in mission.sqlite")
 
     def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
         self._is_interrupted = True

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from ccatp.config.loader import dump_config
@@ -15,7 +16,8 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.planning.traversal import ORDERS
 from ccatp.run_files.recorder import iter_messages, recordings
 from ccatp.samples import PanelId, PanelPose, PointId
-from ccatp.storage.store import MissionStore
+from ccatp.storage.store_reader import StoredSurvey, read_survey
+from ccatp.storage.store_rows import StoreError
 from ccatp.summary import RunFacts, SummaryBuilder, puck_targets
 from ccatp.supervision.collecting import Collector, RunAccess
 from ccatp.viewing.views import Views
@@ -153,9 +155,18 @@ class RunCollector(Collector):
 
     def summary(self, wall_s: float) -> dict[str, Any]:
         """``summary.json`` of what was collected; call it when main has closed the mission's database."""
-        builder = self._builder or self._begin(NO_STATUS)  # where main never said where it stood
+        survey = self._stored()
+        builder = self._builder
+        if builder is None:
+            # Main ended before it said where it stood: the mission's database says as much.
+            standings = [] if survey is None else [point.status for point in survey.points]
+            done, skipped = standings.count("measured"), standings.count("skipped")
+            status = msgspec.structs.replace(NO_STATUS, total=len(standings), done=done, skipped=skipped)
+            builder = self._begin(status)
+            self._add(builder, status)
+        fits = {} if survey is None else self._fits(survey)
         builder.set_panels(
-            {panel: (fit.piston_m, fit.tip_rad, fit.tilt_rad) for panel, fit in self._fits().items()}, self._injected
+            {panel: (fit.piston_m, fit.tip_rad, fit.tilt_rad) for panel, fit in fits.items()}, self._injected
         )
         builder.set_wall(wall_s)
         sessions = [self._earlier(path) for path in recordings(self._run_dir / "telemetry.mcap")[:-1]]
@@ -183,12 +194,18 @@ class RunCollector(Collector):
                 self._add(builder, message)
         return builder
 
-    def _fits(self) -> dict[PanelId, PanelFit]:
+    def _stored(self) -> StoredSurvey | None:
         path = self._run_dir / "mission.sqlite"
         if not path.exists():  # main ended before it made one
-            return {}
-        with MissionStore.open(path, mirror=self._mirror.name) as store:
-            fixes = store.fixes()
+            return None
+        try:
+            return read_survey(path, self._mirror.name)  # it needs no room on the disk
+        except StoreError as error:
+            self.remarks.append(f"the summary is without panels: {error}")
+            return None
+
+    def _fits(self, survey: StoredSurvey) -> dict[PanelId, PanelFit]:
+        fixes = survey.fixes
         fits = {}
         for panel in sorted({PanelId(stored.point.row, stored.point.col) for stored in fixes}):
             own = [stored.fix for stored in fixes if stored.point.panel == panel]

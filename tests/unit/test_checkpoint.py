@@ -5,7 +5,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from ccatp.storage.checkpoint import Checkpoint, CheckpointFile, read_checkpoint
+from ccatp.storage.checkpoint import Checkpoint, CheckpointError, CheckpointFile, read_checkpoint
 
 
 def record(count: int) -> Checkpoint:
@@ -50,10 +50,16 @@ def test_every_flipped_bit_and_every_cut_leaves_a_whole_record_or_none(tmp_path:
             found = read_checkpoint(path)
             assert found is not None  # one slot is untouched
             assert msgspec.to_builtins(found) == written[found.count]
-    for length in range(0, len(whole), 7):
+    whole_from = 8 + int.from_bytes(whole[:4], "little")  # length and checksum, and the record of an even count
+    for length in range(1, len(whole), 7):
         path.write_bytes(whole[:length])
-        found = read_checkpoint(path)
-        assert found is None or msgspec.to_builtins(found) == written[found.count]
+        if length < whole_from:  # nobody knows where the robot is, and least of all is it at base
+            with pytest.raises(CheckpointError, match="damaged"):
+                read_checkpoint(path)
+        else:
+            found = read_checkpoint(path)
+            assert found is not None
+            assert msgspec.to_builtins(found) == written[found.count]
 
 
 def test_a_sound_checksum_over_something_else_is_no_record(tmp_path: Path) -> None:
@@ -62,7 +68,10 @@ def test_a_sound_checksum_over_something_else_is_no_record(tmp_path: Path) -> No
     body = b'{"count": 1}'
     path = tmp_path / "checkpoint"
     path.write_bytes(len(body).to_bytes(4, "little") + zlib.crc32(body).to_bytes(4, "little") + body)
-    assert read_checkpoint(path) is None
+    with pytest.raises(
+        CheckpointError, match=r"checkpoint: damaged, so nobody knows where the robot is; set it at base"
+    ):
+        read_checkpoint(path)
 
 
 def test_a_disk_that_refuses_is_told_and_does_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -59,8 +59,9 @@ def router(monkeypatch: pytest.MonkeyPatch) -> Router:
             endpoint: str, payload: bytes, timeout_s: float, curve: object, *, repeats: bool = False
         ) -> dict[str, Any]:
             assert timeout_s in {3.0, 10.0}  # as asked for, and as the default
-            calls.append((endpoint, json.loads(payload)))
-            return answer
+            asked = json.loads(payload)
+            calls.append((endpoint, asked))
+            return answer | {"id": asked["id"]} if answer.get("id") == "the same" else answer
 
         monkeypatch.setattr("ccatp.client.request", request)
         return calls
@@ -255,14 +256,35 @@ def test_an_answer_without_content_is_ok(router: Router, daemon_dir: Path, capsy
 
 
 def test_an_emergency_goes_to_the_danger_process(router: Router, daemon_dir: Path) -> None:
-    calls = router({"ok": True, "latched": True})
+    calls = router({"ok": True, "id": EMERGENCY_ID, "latched": True, "code": 2})
     assert main(["emergency", "fire", "--note", "smoke", "--id", EMERGENCY_ID]) == 0
     payload = {"cmd": "emergency", "kind": "fire", "id": EMERGENCY_ID, "note": "smoke"}
     assert calls == [(f"ipc://{daemon_dir}/emergency", payload)]
 
 
+@pytest.mark.parametrize(
+    "answer",
+    [
+        {"ok": True},
+        {"ok": True, "id": "the same", "code": 0},
+        {"ok": True, "id": "the same", "latched": False, "code": 0},
+        {"ok": True, "id": "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11", "latched": True, "code": 2},
+        {"ok": 1, "id": "the same", "latched": True, "code": 2},
+    ],
+)
+def test_an_emergency_that_is_not_in_force_is_no_success(
+    answer: dict[str, Any], router: Router, daemon_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    router(answer)
+    assert main(["emergency", "fire"]) == (5 if answer["ok"] is True else 1)
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("ccatp: ")
+    assert said.err.count("\n") == 1
+
+
 def test_each_emergency_has_its_own_id(router: Router, daemon_dir: Path) -> None:
-    calls = router({"ok": True})
+    calls = router({"ok": True, "id": "the same", "latched": True, "code": 2})
     assert main(["emergency", "power"]) == main(["emergency", "power"]) == 0
     assert calls[0][0] == f"ipc://{daemon_dir}/emergency"
     assert calls[0][1]["id"] != calls[1][1]["id"]

@@ -57,7 +57,7 @@ def parse_plan(text: str, name: str) -> FaultPlan:
     for one in (*faults, *link):
         problems += one.problems
     if problems:
-        raise ConfigError(*problems)
+        raise ConfigError(*problems, shows_all=True)
     return FaultPlan(tuple(f for f in found if f is not None), tuple(f for f in found_link if f is not None))
 
 
@@ -76,7 +76,7 @@ def check_pacing(plan: FaultPlan, name: str, *, lockstep: bool) -> None:
         if one.type not in LOCKSTEP_TYPES
     ]
     if problems:
-        raise ConfigError(*problems)
+        raise ConfigError(*problems, shows_all=True)
 
 
 class _Entry:
