@@ -6,6 +6,7 @@ import signal
 import socket
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -102,7 +103,8 @@ class Run:
             new.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
             new.replace(path)
         except OSError as error:
-            new.unlink(missing_ok=True)
+            with suppress(OSError):
+                new.unlink()
             reason = error.strerror or str(error)
             self._say("error", f"{path}: cannot be written: {reason}; what was measured is in mission.sqlite")
 

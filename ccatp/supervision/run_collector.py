@@ -1,5 +1,6 @@
 """Glue. Collects a survey from the bus: what its summary needs, and the views of its recording."""
 
+import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -157,6 +158,8 @@ class RunCollector(Collector):
         """``summary.json`` of what was collected; call it when main has closed the mission's database."""
         survey = self._stored()
         builder = self._builder
+        if builder is None and survey is None and (before := _read(self._run_dir / "summary.json")):
+            return before  # nothing is known, and that must not replace what was
         if builder is None:
             # Main ended before it said where it stood: the mission's database says as much.
             standings = [] if survey is None else [point.status for point in survey.points]
@@ -218,3 +221,12 @@ class RunCollector(Collector):
             except PanelFitError:
                 continue  # fixes on one line: a survey that ended early
         return fits
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """A summary; empty where there is none."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}

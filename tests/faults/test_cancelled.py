@@ -41,6 +41,21 @@ async def test_whenever_they_are_told_to_end(measured: Measured) -> None:
         measured("P10", await ended(seed))
 
 
+@pytest.mark.fault("P10")
+async def test_while_a_robot_that_took_the_connection_says_nothing(measured: Measured) -> None:
+    loop = asyncio.get_running_loop()
+    async with running_daemon(configuration()) as daemon:
+        for proxy in (daemon.to_main, daemon.to_danger):
+            proxy.stall("to_client")
+        await asyncio.sleep(1.0)
+        assert not daemon.sent
+        begun_s = loop.time()
+        daemon.stop.set()
+        _, waiting = await asyncio.wait(daemon.loops, timeout=10.0)
+        assert not waiting
+        measured("P10", loop.time() - begun_s)
+
+
 @pytest.mark.slow
 @pytest.mark.fault("P10")
 async def test_many_times(measured: Measured) -> None:
