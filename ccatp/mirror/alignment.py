@@ -18,7 +18,8 @@ from ccatp.samples import DeckPose, PanelId, Vector3
 FloatArray = NDArray[np.float64]
 
 _PARAMETERS = 3
-_MAX_CONDITION = 1e6  # nine points of a panel give less than 10; a line of points gives infinity
+# Of one row of points the tolerance of their arrivals, 10 mm, would make a plane: one with tilts of some 0.1 rad.
+_MIN_SPREAD_M = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +126,8 @@ def fit_panel(
         puck_height_m: nominal height of the puck along the normal.
 
     Raises:
-        PanelFitError: with fewer than three points, with points on one line, or with a covariance that is not positive.
+        PanelFitError: with fewer than three points, with points on one line to within 20 mm (rms), or with a
+            covariance that is not positive.
         UnknownPanelError: for a panel that does not exist.
         ConvergenceError: for a point far from the mirror.
     """
@@ -141,20 +143,22 @@ def fit_panel(
     variances = np.einsum("ki,kij,kj->k", world, np.asarray(covariances, dtype=np.float64), world)
     if not (np.isfinite(variances).all() and (variances > 0.0).all()):
         raise PanelFitError(f"panel {tuple(panel)}: variance along the normal is not positive: {variances.min()} m^2")
+    centred = rows[:, :2] - rows[:, :2].mean(axis=0)
+    spread_m = float(np.linalg.svd(centred, compute_uv=False)[-1]) / sqrt(len(rows))
+    if not spread_m >= _MIN_SPREAD_M:
+        raise PanelFitError(
+            f"panel {tuple(panel)}: {len(rows)} points do not span the panel: they lie on one line to within "
+            f"{1e3 * spread_m:.1f} mm, and {1e3 * _MIN_SPREAD_M:g} are the least"
+        )
     lever = normals @ np.array(body.axes[2])
     design = lever[:, None] * np.column_stack([np.ones(len(rows)), rows[:, 1], rows[:, 0]])
-    return _weighted_fit(panel, design, rows[:, 2], np.sqrt(variances))
+    return _weighted_fit(design, rows[:, 2], np.sqrt(variances))
 
 
-def _weighted_fit(panel: PanelId, design: FloatArray, deviations: FloatArray, sigmas: FloatArray) -> PanelFit:
+def _weighted_fit(design: FloatArray, deviations: FloatArray, sigmas: FloatArray) -> PanelFit:
     """Least squares by QR of the whitened design; columns piston, tip, tilt."""
     whitened = design / sigmas[:, None]
     q, r = np.linalg.qr(whitened)
-    condition = float(np.linalg.cond(whitened))
-    if not condition < _MAX_CONDITION:
-        raise PanelFitError(
-            f"panel {tuple(panel)}: {len(design)} points do not span the panel (condition {condition:.1e})"
-        )
     target = deviations / sigmas
     solution = np.linalg.solve(r, q.T @ target)
     spread = np.linalg.norm(np.linalg.solve(r, np.eye(_PARAMETERS)), axis=1)

@@ -133,6 +133,13 @@ def test_points_on_one_line_are_refused(m1: Mirror) -> None:
         fit_panel(m1, PANEL, row, np.tile(ISOTROPIC, (3, 1, 1)), HEIGHT_M)
 
 
+def test_a_row_that_was_measured_within_the_tolerance_of_arrivals_is_a_line(m1: Mirror) -> None:
+    """A survey that ends after one row: its 10 mm would be a lever, and the plane one that nobody has measured."""
+    row = pucks(m1, PANEL, TRUTH)[:3] + np.array([[0.0, 0.01, 0.0], [0.0, -0.01, 0.0], [0.0, 0.01, 0.0]])
+    with pytest.raises(PanelFitError, match=r"do not span the panel: they lie on one line to within \d\.\d mm"):
+        fit_panel(m1, PANEL, row, np.tile(ISOTROPIC, (3, 1, 1)), HEIGHT_M)
+
+
 def test_three_points_fit_exactly(m1: Mirror) -> None:
     fit = fit_panel(m1, PANEL, pucks(m1, PANEL, TRUTH)[[0, 2, 7]], np.tile(ISOTROPIC, (3, 1, 1)), HEIGHT_M)
     assert fit.dof == 0
