@@ -426,3 +426,36 @@ def test_settings_are_toml_or_text(text: str, setting: tuple[str, object]) -> No
 def test_a_setting_needs_key_and_value(text: str) -> None:
     with pytest.raises(ValueError, match=r"is not KEY=VALUE, as in run\.seed=2"):
         parse_setting(text)
+
+
+@pytest.mark.parametrize(
+    "command", [["report"], ["replay"], ["map"], ["run", "--sim", "--mirror"], ["run", "--sim", "--world"]]
+)
+def test_a_name_that_no_file_may_have_is_one_line(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*command, 300 * "x"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("ccatp: ")
+    assert said.count("\n") == 1
+
+
+def test_a_mirror_that_is_no_mirror_is_told_with_the_key_that_names_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bad.toml").write_text("no toml")
+    file = tmp_path / "mine.toml"
+    file.write_text('[run]\nmirror = "bad.toml"\n')
+    assert main(["config", "check", str(file)]) == 2
+    said = capsys.readouterr().err
+    assert f"{file}:2: run.mirror" in said
+    assert "is not TOML" in said
+
+
+def test_all_problems_of_a_fault_plan_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plan = tmp_path / "plan.toml"
+    plan.write_text('[[link]]\ntype = "delay"\nstart_s = 8.0\n')
+    assert main(["run", "--sim", "--faults", str(plan)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    for problem in ("link[0].start_s is unknown", "link[0].delay_s is missing"):
+        assert problem in said
+    assert "config check" not in said
