@@ -225,6 +225,7 @@ class DangerConfig(Model):
     seam_extra_m: Positive
     no_map_travel_m: Positive
     max_crossing_angle_rad: Annotated[float, Field(gt=0.0, lt=1.5)]
+    slanted_crossing_m: Positive
     turn_travel_limit_m: Positive
     stale_after_s: Freshness
     estimate_stale_after_s: Freshness

@@ -1,7 +1,7 @@
 """Pure. One edge sensor off the panels: where it went off, how far it has moved since, and when that is an edge."""
 
 from enum import Enum, StrEnum, auto
-from math import cos, hypot, inf, sin
+from math import cos, hypot, inf, sin, sqrt
 
 from ccatp.config.models import DangerConfig
 from ccatp.hazards.edge_map import Axis, EdgeMap
@@ -50,10 +50,11 @@ class EpisodeLimits:
         self.sigmas, self.margin_m = cfg.map_sigmas, cfg.map_margin_m
         self.gap_m, self.tolerance_m, self.extra_m = gap_m, cfg.gap_tolerance_m, cfg.seam_extra_m
         self.no_map_m, self.turn_m = cfg.no_map_travel_m, cfg.turn_travel_limit_m
-        self.min_cosine = cos(cfg.max_crossing_angle_rad)
         width = gap_m + cfg.gap_tolerance_m
+        # A narrow seam may be crossed at a greater slant: what counts in the end is how far the sensor may go.
+        self.min_cosine = min(cos(cfg.max_crossing_angle_rad), width / cfg.slanted_crossing_m)
         # Where seams cross, a path that is oblique to one is steep to the other: more than both chords is no crossing.
-        self.crossing_m = width / self.min_cosine + width / sin(cfg.max_crossing_angle_rad) + cfg.seam_extra_m
+        self.crossing_m = width / self.min_cosine + width / sqrt(1.0 - self.min_cosine**2) + cfg.seam_extra_m
         self.outward_turn_m = cfg.outward_turn_limit_m
         self.debounce, self.clear = cfg.debounce_samples, cfg.clear_samples
 

@@ -7,7 +7,7 @@ the same number is the same drive.
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache
-from math import atan2, ceil, cos, hypot, pi, radians, sin
+from math import acos, atan2, ceil, cos, hypot, pi, radians, sin
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
 from ccatp.danger import DangerMonitor
+from ccatp.hazards.edge_episode import EpisodeLimits
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.samples import DeckPose, EventCode, PanelId, Verdict
 from ccatp.studies.danger_drives import Errors, Rig
@@ -264,13 +265,19 @@ def turn_cases() -> int:
 # -- seams ------------------------------------------------------------------------------------------------------------
 
 
+def steepest_rad(name: str) -> float:
+    """At what angle to its normal a seam may be crossed, by the rules: 60 deg, and more where it is narrow."""
+    cfg, mirror = world(name)
+    return acos(EpisodeLimits(mirror.gap_m, cfg.danger).min_cosine)
+
+
 def seam_case(number: int) -> tuple[str, Callable[[], Tally]]:
     """A way over a seam, or a stop over it: mirror, seam, angle, speed and length of the stop drawn by number."""
     rng = np.random.default_rng([number, 3])
     name = MIRRORS[number % len(MIRRORS)]
     is_stop = bool(number // len(MIRRORS) % 2)
     v_m_s = float(rng.choice(SPEEDS_M_S) if is_stop else rng.uniform(SPEEDS_M_S[0], SPEEDS_M_S[-1]))
-    angle_rad = float(rng.uniform(-1.0, 1.0)) * radians(60.0)
+    angle_rad = float(rng.uniform(-1.0, 1.0)) * steepest_rad(name)
     stop_s = float(60.0 ** rng.uniform(-1.0, 1.0)) if is_stop else 0.0
     text = f"seam {number}: {name} {v_m_s:.3f} m/s at {angle_rad:.3f} rad, stop {stop_s:.2f} s"
     return text, lambda: cross(name, v_m_s, angle_rad, stop_s, rng)

@@ -1,7 +1,7 @@
 """One episode of the edge rule against a map that says what it is told: every threshold from both sides."""
 
 from dataclasses import dataclass, field
-from math import cos, hypot, inf, sin
+from math import acos, cos, hypot, inf, radians, sin
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -58,11 +58,12 @@ class Sensor:
     map: Map
     pose: tuple[float, float, float] = (1.0, 2.0, 0.0)
     turn: float = 0.0
+    gap_m: float = GAP_M
     has_map: bool = True
     episode: Episode = field(init=False)
 
     def __post_init__(self) -> None:
-        limits = EpisodeLimits(GAP_M, self.cfg)
+        limits = EpisodeLimits(self.gap_m, self.cfg)
         edge_map = cast(EdgeMap, self.map)
         self.episode = Episode(limits, edge_map, self.odometry, (OFFSET, MOVED_M), HALF_BASE_M)
         if self.has_map:
@@ -104,6 +105,7 @@ class Sensor:
 def test_the_limits_are_those_of_the_configuration(danger: DangerConfig) -> None:
     limits = EpisodeLimits(GAP_M, danger)
     width, angle = GAP_M + danger.gap_tolerance_m, danger.max_crossing_angle_rad
+    assert width / cos(angle) > danger.slanted_crossing_m
     assert limits.min_cosine == cos(angle)
     assert limits.crossing_m == pytest.approx(width / cos(angle) + width / sin(angle) + danger.seam_extra_m)
     assert (limits.gap_m, limits.tolerance_m, limits.extra_m) == (GAP_M, danger.gap_tolerance_m, danger.seam_extra_m)
@@ -243,6 +245,27 @@ def test_a_seam_allows_more_to_an_oblique_way(danger: DangerConfig, angle: float
     way = angle - turn  # in the odometry's frame
     assert not sensor.walk((limit - 2 * UM) * cos(way), (limit - 2 * UM) * sin(way), 40)
     assert sensor.walk(4 * UM * cos(way), 4 * UM * sin(way), 2)
+
+
+@pytest.mark.parametrize("gap_m", [0.0012, 0.004, 0.005, GAP_M, 0.020])
+def test_a_narrow_seam_may_be_crossed_at_a_greater_slant(danger: DangerConfig, gap_m: float) -> None:
+    """Either the angle or the way across it bounds the slant, whichever allows more."""
+    limits = EpisodeLimits(gap_m, danger)
+    width = gap_m + danger.gap_tolerance_m
+    longest = max(danger.slanted_crossing_m, width / cos(danger.max_crossing_angle_rad))
+    assert width / limits.min_cosine == pytest.approx(longest)
+    angle = acos(limits.min_cosine)
+    assert limits.crossing_m == pytest.approx(longest + width / sin(angle) + danger.seam_extra_m)
+
+
+@pytest.mark.parametrize(("degrees", "allowed_m"), [(78.0, 0.01358), (83.0, 0.02105), (84.2, 0.02477), (88.0, 0.025)])
+def test_how_far_along_a_seam_as_built(danger: DangerConfig, degrees: float, allowed_m: float) -> None:
+    """1.2 mm wide: (gap + tolerance)/cos(angle) + 3 mm, which 22 + 3 mm end."""
+    sensor = Sensor(danger, Map(seams=("x",)), gap_m=0.0012)
+    c, s = cos(radians(degrees)), sin(radians(degrees))
+    assert not sensor.walk((allowed_m - 5e-5) * c, (allowed_m - 5e-5) * s, 40)
+    assert sensor.walk(1e-4 * c, 1e-4 * s, 2)
+    assert sensor.episode.cause is Cause.SEAM
 
 
 def test_back_over_the_seam_is_no_way_across(danger: DangerConfig) -> None:
