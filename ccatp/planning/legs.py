@@ -13,8 +13,8 @@ _ROUNDING_M = 1e-9
 _STEEP = 0.5
 # Further than this from a seam's border a track that should pass beside it does.
 _BESIDE_M = 0.008
-# A track across a seam at 60 degrees from its normal is within the gap for twice its width. More, and the danger rules
-# take it for the mirror's edge.
+# A track across a seam at 60 degrees from its normal is within the gap for twice its width. More is avoided: with a
+# little more slant, or a wide gap, the danger rules take it for the mirror's edge.
 _LONGEST_CROSSING = 2.0
 
 
