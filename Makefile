@@ -17,7 +17,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
-.PHONY: help run test test-slow sweep tried-in faults docs lint format fast lock clean
+.PHONY: help run test test-slow slow-tests new-examples sweep tried-in faults docs lint format fast lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -48,10 +48,15 @@ tried-in:
 		{ apt-get install -y -qq $$wanted || { apt-get update -qq && apt-get install -y -qq $$wanted; }; } >/dev/null 2>&1; } || \
 		echo "ccatp: without$$wanted, so what is tried in them is skipped; on Debian: apt install$$wanted"
 
-test-slow: $(VENV)/.installed-dev
+# What fails in one part does not keep the others from being run.
+test-slow:
+	@$(MAKE) --no-print-directory --keep-going slow-tests new-examples sweep
+
+slow-tests: $(VENV)/.installed-dev
 	$(PYTEST) -m slow $(PYTEST_ARGS)
+
+new-examples: $(VENV)/.installed-dev
 	$(PYTEST) tests/property tests/oracle --hypothesis-profile=explore
-	@$(MAKE) --no-print-directory sweep
 
 # Beside the link to the tests there is no source that would hide the compiled build.
 sweep: $(FAST_VENV)/.installed
