@@ -79,6 +79,10 @@ class BeaconDanger:
             self._raised_seq = self._frame_seq
         return refusal
 
+    def holds(self, emergency_id: str) -> bool:
+        """Whether the emergency with that id is active."""
+        return self.latch.holds(emergency_id)
+
     def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
         """End an emergency; returns why it was refused, or None."""
         return self.latch.clear(emergency_id, at_base_or_held)
@@ -187,7 +191,11 @@ class BeaconDanger:
         self, seq: int, t_s: float, cause: str, signal: str, value: float, limit: float, severity: Severity
     ) -> Verdict:
         code = _ABORTED if self.latch.is_latched else _NORMAL
-        return Verdict(seq, t_s, code, cause, signal, value, limit, False, False, False, severity=severity)
+        latch = self.latch
+        return Verdict(
+            seq, t_s, code, cause, signal, value, limit, False, False, False, severity=severity,
+            raised=latch.raised, is_shaking=latch.is_shaking,
+        )  # fmt: skip
 
     def _near(self, sensors: Sensors) -> Verdict:
         seq, t_s, danger = sensors.seq, sensors.t, self._danger
@@ -206,7 +214,7 @@ class BeaconDanger:
             found = "an obstacle behind", "obstacle", behind_m, danger.obstacle_m
         else:
             return emergency or Verdict(seq, t_s, _NORMAL, "", "", 0.0, 0.0, True, True, True)
-        return Verdict(seq, t_s, _NEAR, *found, forward, reverse, True)
+        return Verdict(seq, t_s, _NEAR, *found, forward, reverse, True, raised=self.latch.raised)
 
     def _nearest_target_m(self) -> float:
         """The target is at least this far, by one standard deviation of its mean level; infinite without a level."""
@@ -226,4 +234,7 @@ class BeaconDanger:
         # Whoever drives while the ground shakes slips; the others are fled from.
         kind, may_move = (EmergencyKind.EARTHQUAKE, False) if self.latch.is_shaking else (newest.kind, True)
         cause, signal = f"emergency: {kind}", f"emergency:{kind}"
-        return Verdict(seq, t_s, _ABORTED, cause, signal, 1.0, 0.0, may_move, may_move, may_move)
+        return Verdict(
+            seq, t_s, _ABORTED, cause, signal, 1.0, 0.0, may_move, may_move, may_move,
+            raised=self.latch.raised, is_shaking=self.latch.is_shaking,
+        )  # fmt: skip

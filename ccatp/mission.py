@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from ccatp.config.models import Config
+from ccatp.control.gate import Purpose
 from ccatp.mirror.mirror import Mirror
 from ccatp.planning.route import Route
 from ccatp.samples import PointId, Severity, Verdict
@@ -87,6 +88,12 @@ class Mission:
         self._standing.abort_cause = recovery.abort_cause or None
         if recovery.held_cause:
             self._standing.hold(recovery.held_cause, by_hand=True)
+        if recovery.abort_cause:
+            self.know_emergency()
+
+    def know_emergency(self) -> None:
+        """An emergency that is latched when the first verdict comes is no news."""
+        self._reactions.know_emergency()
 
     def lose_sight(self) -> None:
         """The robot may have moved while nobody looked: it does not drive on before a fix, and a sure heading."""
@@ -107,8 +114,10 @@ class Mission:
         standing = self._standing
         if self.state is not State.HELD:
             return f"the mission is not held but {self.state}"
-        if standing.bar:
-            return f"{standing.bar}: nothing moves until that is cleared"
+        if standing.bar or standing.is_shaking:
+            return f"{standing.bar or reactions.EARTHQUAKE}: nothing moves until that is cleared"
+        if standing.is_latched and standing.abort_cause is None:
+            return "an emergency of before is latched: 'ccatp clear' it first"
         if standing.severity >= Severity.HOLD and standing.severity is not Severity.RETURN:
             return f"the cause persists: {self.cause}"
         standing.go_on()
@@ -171,6 +180,16 @@ class Mission:
     def is_faulted(self) -> bool:
         """Something is wrong, and it waits for an operator."""
         return self._standing.is_faulted
+
+    @property
+    def purpose(self) -> Purpose:
+        """What the last gate lets the robot move for."""
+        return self._standing.purpose
+
+    @property
+    def is_held_by_hand(self) -> bool:
+        """Held until somebody resumes."""
+        return self.state is State.HELD and self._standing.is_held_by_hand
 
     @property
     def is_paused(self) -> bool:

@@ -142,7 +142,7 @@ class RobotLink(asyncio.Protocol):
         self._bad = BadLineCounter()
         self._budget: LineBudget | None = None
         self._last_seq = -1
-        self._why = ""
+        self._why = self._oddity = ""
 
     @property
     def _where(self) -> str:
@@ -168,7 +168,8 @@ class RobotLink(asyncio.Protocol):
                 await loop.create_connection(lambda: self, self._host, self._port)
                 return await joining
         except TimeoutError:
-            raise RobotTimeout(f"no answer from the robot at {self._where} within {deadline_s:g} s") from None
+            came = f"; what came: {self._oddity}" if self._oddity else ""
+            raise RobotTimeout(f"no answer from the robot at {self._where} within {deadline_s:g} s{came}") from None
         except OSError as error:
             reason = error.strerror or str(error)
             raise RobotLinkError(f"cannot reach the robot at {self._where}: {reason}; is it running?") from error
@@ -202,7 +203,8 @@ class RobotLink(asyncio.Protocol):
                 return
             try:
                 message = decode_from_robot(line)
-            except BadLine:
+            except BadLine as error:
+                self._oddity = str(error)
                 self._count_bad()
                 continue
             if type(message) is Sensors:
@@ -260,6 +262,9 @@ class RobotLink(asyncio.Protocol):
             joining.set_result(self._hello)
             self._on_joined(self._hello)
         else:
+            self._oddity = (
+                f"joined as {message.role}, not as {self._role}" if isinstance(message, Joined) else "a second hello"
+            )
             self.counts["unexpected"] += 1
 
     def _answer(self, hello: Hello, joining: "asyncio.Future[Hello]") -> None:

@@ -162,6 +162,8 @@ class Verdict(msgspec.Struct, frozen=True):
         off: for each edge sensor whether it takes part in a declared edge.
         severity: how grave what gave cause is. An edge has none: what to do about it is in its code and permits.
         full_fans: the fans shall give all they can.
+        raised: how many emergencies have been raised so far, while one is latched; another number is another one.
+        is_shaking: an earthquake is latched, whatever else gave code and cause.
     """
 
     seq: int
@@ -177,6 +179,8 @@ class Verdict(msgspec.Struct, frozen=True):
     off: tuple[bool, bool, bool, bool] = (False, False, False, False)
     severity: Severity = Severity.NONE
     full_fans: bool = False
+    raised: int = 0
+    is_shaking: bool = False
 
 
 class Twist(msgspec.Struct, frozen=True):

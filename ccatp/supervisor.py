@@ -27,7 +27,13 @@ from ccatp.supervision.listening import listen, places_of, with_addresses
 from ccatp.supervision.one_run import Run
 from ccatp.supervision.run_folder import new_run_dir, own_runtime_dir, owned, survey_run_dir
 from ccatp.supervision.run_kinds import BeaconRun, SurveyRun
-from ccatp.supervision.unfinished import find_unfinished, finished_summary, forget_finished, note_unfinished
+from ccatp.supervision.unfinished import (
+    find_unfinished,
+    finished_summary,
+    forget_finished,
+    note_unfinished,
+    take_over_emergencies,
+)
 
 # First, so that it is there for the end of the others. It gets what time they leave, so it has a minute to speak.
 _DASHBOARD = ProcessSpec(
@@ -153,10 +159,12 @@ def _recover(options: RunOptions) -> int:
     else:
         cfg = load_config(options.config_file, dict(options.overrides))
         run_dir = default_run_dir(cfg.run.mirror, cfg.run.seed, datetime.now(UTC)).absolute()
-        options = replace(options, run_dir=run_dir)
+        # What was latched when the last run ended stays so: the robot waits at its base until it is cleared.
+        options = replace(options, run_dir=run_dir, held=take_over_emergencies(run_dir))
         note_unfinished(run_dir)
+        found = run_dir
     status = run_survey(options)
-    forget_finished(status)
+    forget_finished(status, found)
     return status
 
 

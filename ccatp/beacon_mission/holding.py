@@ -5,7 +5,7 @@ from ccatp.samples import EventCode, Severity, Verdict
 from ccatp.surveying.states import Outcome
 
 # Nothing moves while the ground shakes.
-EARTHQUAKE = "emergency:earthquake"
+EARTHQUAKE = "emergency: earthquake"
 
 
 class Holding:
@@ -26,7 +26,8 @@ class Holding:
         self.cause = self.abort_cause = ""
         self.is_faulted = False
         self._is_by_hand = False
-        self._bar = self._emergency = ""
+        self._bar = ""
+        self._raised = 0
         self._severity = Severity.NONE
 
     @property
@@ -98,8 +99,9 @@ class Holding:
             self.interrupt("no fresh verdict from the danger loop")
             return False
         self._severity = verdict.severity
-        if verdict.signal == EARTHQUAKE:
-            self._stand_fast(verdict.cause)
+        if verdict.is_shaking:
+            self._raised = verdict.raised
+            self._stand_fast()
             return False
         self._bar = ""
         if verdict.severity is Severity.FAULT:
@@ -109,19 +111,19 @@ class Holding:
             if not self.interrupt(verdict.cause) and self.state is HELD and not self._is_by_hand:
                 self.cause = verdict.cause
             return False
-        if verdict.code is EventCode.ABORTED and verdict.cause != self._emergency:
-            self._emergency = verdict.cause  # the level is repeated; what counts is that it is new
+        if verdict.code is EventCode.ABORTED and verdict.raised != self._raised:
+            self._raised = verdict.raised  # the level is repeated; what counts is that it is new
             self.abort(verdict.cause)
         if self.state is IDLE or (self.state is HELD and not self._is_by_hand):
             self._go_on()
         return self.state is not HELD
 
-    def _stand_fast(self, cause: str) -> None:
+    def _stand_fast(self) -> None:
         if self._bar:
             return
-        self._bar = self._emergency = cause
-        self.abort_cause = self.abort_cause or cause
-        self._hold(cause, by_hand=self.state is HELD and self._is_by_hand)
+        self._bar = EARTHQUAKE
+        self.abort_cause = self.abort_cause or EARTHQUAKE
+        self._hold(EARTHQUAKE, by_hand=self.state is HELD and self._is_by_hand)
 
     def _hold(self, cause: str, *, by_hand: bool) -> None:
         self.state, self.cause, self._is_by_hand = HELD, cause, by_hand

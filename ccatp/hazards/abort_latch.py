@@ -42,6 +42,9 @@ class AbortLatch:
     Each id is raised once, repeated for nothing, and cleared once. A ``clear`` is the observatory's word that the cause
     of that id is gone; it is refused while a level input says that the cause persists (``set_level``), while the robot
     is neither at base nor held, and for an id that was never raised. The latch opens with the last one cleared.
+
+    Attributes:
+        raised: how many emergencies have been latched so far.
     """
 
     def __init__(self) -> None:
@@ -49,6 +52,7 @@ class AbortLatch:
         self._active: dict[str, Emergency] = {}
         self._cleared: dict[str, None] = {}
         self._levels: set[EmergencyKind] = set()
+        self.raised = 0
 
     @property
     def is_latched(self) -> bool:
@@ -65,23 +69,32 @@ class AbortLatch:
         """The emergency raised last among the active ones."""
         return next(reversed(self._active.values())) if self._active else None
 
+    def holds(self, emergency_id: str) -> bool:
+        """Whether the emergency with that id is active."""
+        return emergency_id in self._active
+
     def set_level(self, kind: EmergencyKind, active: bool) -> None:
         """State of a lasting input (a fire panel's contact, a seismometer's alarm): no clear of that kind while on."""
         (self._levels.add if active else self._levels.discard)(kind)
 
     def raise_emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
-        """Latch an emergency; the same id again is harmless, also after its clear.
+        """Latch an emergency; the same id again is harmless, and after its clear latches nothing (``holds``).
 
         Returns:
             Why it was refused, or None.
         """
-        if emergency_id in self._active or emergency_id in self._cleared:
+        known = self._active.get(emergency_id)
+        if known is not None and known.kind != kind:
+            return f"that id is the one of an emergency of kind {known.kind}"
+        if known is not None or emergency_id in self._cleared:
             return None
         if kind not in EmergencyKind.__members__.values():
             return f"unknown kind {kind!r}"
-        if len(self._active) >= MAX_ACTIVE:
+        # Whoever fills the latch with one kind does not keep the others out.
+        if len(self._active) >= MAX_ACTIVE and any(emergency.kind == kind for emergency in self._active.values()):
             return f"{MAX_ACTIVE} emergencies are active already (the operation is aborted)"
         self._active[emergency_id] = Emergency(EmergencyKind(kind), emergency_id, note)
+        self.raised += 1
         return None
 
     def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:

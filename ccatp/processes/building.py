@@ -8,6 +8,8 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.planning.traversal import ORDERS
 from ccatp.processes.common import ProcessArgs
 from ccatp.processes.keeping import recovery_from
+from ccatp.processes.latching import FILE as EMERGENCIES
+from ccatp.processes.latching import active_ids
 from ccatp.samples import PointId
 from ccatp.storage.store import MissionStore, PlannedPoint, StoreError
 from ccatp.surveying.recovery import Recovery
@@ -32,7 +34,10 @@ def build_parts(args: ProcessArgs) -> tuple[Parts, MissionStore]:
     recovery = _recovery(args, store, points, done)
     parts = assemble(cfg, done, recovery)
     if recovery is None and args.is_held:
-        parts.mission.pause(_why_held(len(done), points))
+        latched = [f"'ccatp clear {one}'" for one in active_ids(args.run_dir / EMERGENCIES)]
+        before = f"the last run ended with an emergency that is not cleared: {', '.join(latched)}; " if latched else ""
+        parts.mission.pause(before + _why_held(len(done), points))
+        parts.mission.know_emergency()
     return parts, store
 
 

@@ -60,6 +60,9 @@ class LastingLink:
         self._on_bad_line = on_bad_line
         self._lost = asyncio.Event()
         self._is_joined = False
+        # A robot that lets join and then says nothing is as far away as one that does not answer.
+        self._failures = 0
+        self._deadline_s: float | None = None
         self.sessions = 0
         self.link = self._make()
 
@@ -70,7 +73,7 @@ class LastingLink:
             role=self._role,
             client=self._client,
             key=self._key,
-            on_sensors=self._on_sensors,
+            on_sensors=self._heed_frame,
             on_lost=self._heed_loss,
             on_joined=self._heed_join,
             on_bad_line=self._on_bad_line,
@@ -102,9 +105,13 @@ class LastingLink:
 
     async def _join_again(self) -> None:
         loop = asyncio.get_running_loop()
-        deadline_s, failures = loop.time() + self._cfg.reconnect_timeout_s, 0
-        why: UnreachableError | None = None
-        while (left_s := deadline_s - loop.time()) > 0.0:
+        if self._deadline_s is None:
+            self._deadline_s = loop.time() + self._cfg.reconnect_timeout_s
+        elif self._failures:
+            await asyncio.sleep(delay_s(self._failures, random.random()))
+        self._failures += 1
+        why: UnreachableError | str = "it lets join, and sends no frame that is one"
+        while (left_s := self._deadline_s - loop.time()) > 0.0:
             self._lost.clear()
             self.link = self._make()
             try:
@@ -115,9 +122,13 @@ class LastingLink:
                 why = error
             else:
                 return
-            await asyncio.sleep(min(delay_s(failures, random.random()), left_s))
-            failures += 1
+            await asyncio.sleep(min(delay_s(self._failures - 1, random.random()), left_s))
+            self._failures += 1
         raise RobotTimeout(f"the robot did not come back within {self._cfg.reconnect_timeout_s:g} s: {why}")
+
+    def _heed_frame(self, frame: Sensors, line: bytes) -> None:
+        self._failures, self._deadline_s = 0, None
+        self._on_sensors(frame, line)
 
     def _heed_join(self, hello: Hello) -> None:
         self._is_joined = True

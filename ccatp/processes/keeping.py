@@ -9,7 +9,7 @@ from ccatp.mission import Mission
 from ccatp.samples import DeckPose, PointId
 from ccatp.storage.checkpoint import FILE, Checkpoint, CheckpointFile, read_checkpoint
 from ccatp.surveying.recovery import Recovery, doubted
-from ccatp.surveying.states import HELD, IDLE, MEASURING, SETTLING, State
+from ccatp.surveying.states import HELD, IDLE, MEASURING, SETTLING, Outcome, State
 
 # Frames between two records: ten a second.
 PERIOD_FRAMES = 10
@@ -84,10 +84,13 @@ class Keeper:
 
 
 def in_force_of(mission: Mission) -> tuple[str, str]:
-    """Why the survey was given up, and why it waits for an operator; empty where it did or does not."""
-    if mission.state is State.DONE:
+    """Why the survey was given up, and why it waits for an operator; empty where it did or does not.
+
+    One that was stopped on its way home goes home when it goes on. An earthquake is kept by the danger loop.
+    """
+    if mission.state is State.DONE and mission.outcome is not Outcome.STOPPED:
         return "", ""
-    return mission.abort_cause, mission.cause if mission.is_paused else ""
+    return mission.abort_cause, mission.cause if mission.is_held_by_hand else ""
 
 
 def recovery_from(

@@ -2,6 +2,8 @@
 
 import json
 import os
+import uuid
+from contextlib import suppress
 from pathlib import Path
 
 import structlog
@@ -9,6 +11,16 @@ import structlog
 from ccatp.hazards.abort_latch import AbortLatch, Emergency, EmergencyKind
 
 FILE = "emergencies.json"
+# A latch of some hundred emergencies, and as many that were cleared.
+RESERVE_BYTES = 65536
+
+
+def active_ids(path: Path) -> list[str]:
+    """The ids of the emergencies that a file holds, as far as it can be read."""
+    try:
+        return [str(e["id"]) for e in json.loads(path.read_text(encoding="utf-8"))["active"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
 
 
 class DurableLatch(AbortLatch):
@@ -23,16 +35,23 @@ class DurableLatch(AbortLatch):
         """Latched as the file says."""
         super().__init__()
         self._path, self._log = path, log
+        self._new = path.with_name(f"{path.name}.new")
+        with suppress(OSError):
+            self._reserve()
         try:
             kept = json.loads(path.read_text(encoding="utf-8"))
             self._active = {e["id"]: Emergency(EmergencyKind(e["kind"]), e["id"], e["note"]) for e in kept["active"]}
             self._cleared = dict.fromkeys(map(str, kept["cleared"]))
+            self.raised = int(kept.get("raised", len(self._active) + len(self._cleared)))
         except FileNotFoundError:
             return
         except (OSError, ValueError, KeyError, TypeError) as error:
             # What it held is not known: the survey is aborted rather than driven on.
-            log.error("emergencies unreadable: taken for an emergency", file=str(path), error=str(error))
-            super().raise_emergency(EmergencyKind.OPERATOR, "unreadable", f"{path.name} cannot be read")
+            unknown = str(uuid.uuid4())
+            what = f"{path} cannot be read: taken for an emergency; 'ccatp clear {unknown}' ends it"
+            log.error(what, error=str(error))
+            super().raise_emergency(EmergencyKind.OPERATOR, unknown, f"{path.name} cannot be read")
+            self._save()
         if self._active:
             log.warning("emergencies of before", active=sorted(self._active))
 
@@ -54,14 +73,16 @@ class DurableLatch(AbortLatch):
 
     def _save(self) -> None:
         active = [{"id": e.id, "kind": e.kind, "note": e.note} for e in self._active.values()]
-        text = json.dumps({"active": active, "cleared": list(self._cleared)})
-        new = self._path.with_name(f"{self._path.name}.new")
+        text = json.dumps({"active": active, "cleared": list(self._cleared), "raised": self.raised})
+        with suppress(OSError):
+            self._reserve()
         try:
-            with new.open("w", encoding="utf-8") as file:
-                file.write(text)
+            with self._new.open("r+b") as file:
+                file.write(text.encode())
+                file.truncate()
                 file.flush()
                 os.fsync(file.fileno())
-            new.replace(self._path)
+            self._new.replace(self._path)
             folder = os.open(self._path.parent, os.O_RDONLY)
             try:
                 os.fsync(folder)
@@ -69,3 +90,10 @@ class DurableLatch(AbortLatch):
                 os.close(folder)
         except OSError as error:
             self._log.error("emergencies cannot be kept: lost if this process dies", error=str(error))
+        with suppress(OSError):
+            self._reserve()
+
+    def _reserve(self) -> None:
+        """Room for the next state, taken while there is some: an emergency is kept though the disk is full."""
+        with self._new.open("ab") as file:
+            os.posix_fallocate(file.fileno(), 0, RESERVE_BYTES)

@@ -25,7 +25,7 @@ from ccatp.surveying.journey import Motion
 from ccatp.surveying.leftovers import by_reason
 from ccatp.surveying.mirror_check import MirrorCheck
 from ccatp.surveying.orders import STAND, Order
-from ccatp.surveying.states import PURPOSES, Outcome, State
+from ccatp.surveying.states import Outcome, State
 from ccatp.wire.robot import Hello, Sensors
 from ccatp.wire.topics import is_estimate_due
 
@@ -233,9 +233,7 @@ class SurveyWork:
             raise RuntimeError("decide comes after listen, and not for a stale frame")
         order = mission.step(motion, verdict) if self._is_on_mirror(frame.sensors) else STAND
         self._heed(frame.sensors)
-        right, left = self._gate.pass_through(
-            order.twist, verdict, motion.dt_s, motion.t_s, lag_s, PURPOSES[mission.state]
-        )
+        right, left = self._gate.pass_through(order.twist, verdict, motion.dt_s, motion.t_s, lag_s, mission.purpose)
         self._gate_watch.look(motion.t_s)
         if order.at_rest or order.measure:
             self._execute(order, motion)

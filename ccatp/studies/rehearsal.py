@@ -26,7 +26,7 @@ from ccatp.studies.rehearsal_book import RunBook
 from ccatp.studies.rehearsal_laser import LaserDesk
 from ccatp.studies.rehearsal_result import Rehearsal
 from ccatp.surveying.journey import Motion
-from ccatp.surveying.states import DONE, PURPOSES, Outcome, State
+from ccatp.surveying.states import DONE, Outcome, State
 from ccatp.wire.robot import Sensors, set_point_on_wire
 from ccatp.wire.topics import Estimate, is_estimate_due
 
@@ -133,7 +133,7 @@ class Rehearsing:
         if mission.wants_full_fans and not self._has_full_fans:
             self._has_full_fans = True
             robot.command_fans(2, 1.0, 1.0)
-        right, left = self.gate.pass_through(order.twist, verdict, dt_s, t_s, 0.0, PURPOSES[mission.state])
+        right, left = self.gate.pass_through(order.twist, verdict, dt_s, t_s, 0.0, mission.purpose)
         if order.at_rest:
             localizer.rest()
             if order.arrived is not None:

@@ -6,8 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from ccatp.errors import ConfigError, ExitStatus
+from ccatp.processes.latching import FILE as EMERGENCIES
 
 FILE = Path("runs") / "unfinished"
+# What was latched when a run finished, for the next one: whoever has to clear it finds no daemon in between.
+LATCHED_FILE = Path("runs") / EMERGENCIES
 # Complete, or at base after an abort: there is nothing to go on with.
 FINISHED = (ExitStatus.COMPLETE, ExitStatus.ABORTED)
 
@@ -59,7 +62,51 @@ def note_unfinished(run_dir: Path) -> None:
         ) from error
 
 
-def forget_finished(status: int) -> None:
-    """Take the note away where the run has finished."""
-    if status in FINISHED:
-        FILE.unlink(missing_ok=True)
+def forget_finished(status: int, run_dir: Path) -> None:
+    """Take the note away where the run has finished; emergencies that are in force then stay so in the next one.
+
+    Raises:
+        ConfigError: they cannot be kept.
+    """
+    if status not in FINISHED:
+        return
+    kept = _emergencies(run_dir / EMERGENCIES)
+    try:
+        if kept:
+            new = LATCHED_FILE.with_name(f"{LATCHED_FILE.name}.new")
+            new.write_bytes(kept)
+            new.replace(LATCHED_FILE)
+        else:
+            LATCHED_FILE.unlink(missing_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--recover: cannot keep {LATCHED_FILE}: {error.strerror}") from error
+    FILE.unlink(missing_ok=True)
+
+
+def take_over_emergencies(run_dir: Path) -> bool:
+    """Give a new run the emergencies that were in force when the last one finished; whether there are any.
+
+    Raises:
+        ConfigError: they cannot be read, or not be written.
+    """
+    try:
+        kept = LATCHED_FILE.read_bytes()
+        run_dir.mkdir(parents=True, exist_ok=True)
+        (run_dir / EMERGENCIES).write_bytes(kept)
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise ConfigError(f"--recover: cannot take over {LATCHED_FILE}: {error.strerror}") from error
+    return True
+
+
+def _emergencies(path: Path) -> bytes:
+    """The file of a latch as it is, empty where it holds nothing; one that is damaged holds something."""
+    try:
+        found = path.read_bytes()
+    except FileNotFoundError:
+        return b""
+    try:
+        return found if json.loads(found)["active"] else b""
+    except (ValueError, KeyError, TypeError):
+        return found

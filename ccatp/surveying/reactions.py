@@ -11,8 +11,7 @@ NONE, SLOW, HOLD, RETURN, FAULT = Severity.NONE, Severity.SLOW, Severity.HOLD, S
 _CORNERS = frozenset(Corner)
 # So long after a fix found the robot the danger loop has heard where it is: a pose in five frames, and a verdict.
 _HEARD_S = 0.2
-# Nothing moves while the ground shakes.
-EARTHQUAKE = "emergency:earthquake"
+EARTHQUAKE = "emergency: earthquake"
 
 
 def abort(standing: Standing, cause: str) -> str | None:
@@ -39,8 +38,13 @@ class Reactions:
     def __init__(self, standing: Standing) -> None:
         """No verdict yet."""
         self._standing = standing
-        self._emergency = ""
+        self._finding = ""
+        self._raised: int | None = 0
         self._was_lost = self._has_looked = False
+
+    def know_emergency(self) -> None:
+        """Whatever is latched when the first verdict comes was acted on before."""
+        self._raised = None
 
     def react(self, motion: Motion, verdict: Verdict | None) -> None:
         """Do what the verdict demands.
@@ -51,10 +55,8 @@ class Reactions:
         """
         standing = self._standing
         self._await_news(motion.t_s, verdict)
-        if verdict is not None and verdict.signal == EARTHQUAKE:
-            self._stand_fast(verdict.cause)
+        if verdict is not None and self._heed_earthquake(verdict):
             return
-        standing.bar = ""
         if verdict is not None and (verdict.severity is not NONE or standing.severity is not NONE):
             standing.severity = verdict.severity
             if self._obey(verdict):
@@ -67,8 +69,7 @@ class Reactions:
         if verdict.code is NEAR_EDGE:
             self._meet_edge(motion, verdict)
             return
-        if verdict.code is ABORTED and verdict.cause != self._emergency:
-            self._emergency = verdict.cause  # the level is repeated; what counts is that it is new
+        if verdict.code is ABORTED and self._is_news(verdict):
             abort(standing, verdict.cause)
         is_waiting = standing.state is HELD and (standing.is_held_by_hand or motion.t_s < standing.waits_until_s)
         if standing.state is IDLE or (standing.state is HELD and not is_waiting):
@@ -94,16 +95,35 @@ class Reactions:
             # A robot that stands to be found needs no permission, and without a pose gets none before it is.
             standing.interrupt(verdict.cause)
 
-    def _stand_fast(self, cause: str) -> None:
-        """An earthquake: pressed on, held, and home when it is over; a pose from before is not to be trusted then."""
+    def _is_news(self, verdict: Verdict) -> bool:
+        """Whether another emergency was raised since the last look: the level is repeated in each verdict."""
+        is_known = self._raised is None or verdict.raised == self._raised
+        self._raised = verdict.raised
+        return not is_known
+
+    def _heed_earthquake(self, verdict: Verdict) -> bool:
+        """Nothing moves while the ground shakes, unless away from an edge; whether that is all for this frame."""
         standing = self._standing
+        standing.is_latched, standing.is_shaking = verdict.raised > 0, verdict.is_shaking
+        if not verdict.is_shaking:
+            standing.bar = ""
+            return False
         standing.wants_full_fans = True
+        if verdict.code is NEAR_EDGE:
+            return False
+        self._is_news(verdict)
+        self._stand_fast()
+        return True
+
+    def _stand_fast(self) -> None:
+        """Held, and home when it is over; a pose from before is not to be trusted then."""
+        standing = self._standing
         if standing.bar or standing.state is State.DONE:
             return
-        standing.bar = self._emergency = cause
-        standing.abort_cause = standing.abort_cause or cause
+        standing.bar = EARTHQUAKE
+        standing.abort_cause = standing.abort_cause or EARTHQUAKE
         standing.lose()
-        standing.hold(cause, by_hand=standing.state is State.HELD and standing.is_held_by_hand)
+        standing.hold(EARTHQUAKE, by_hand=standing.state is State.HELD and standing.is_held_by_hand)
 
     def _obey(self, verdict: Verdict) -> bool:
         """Do what a finding of the monitors demands; whether that is all for this frame."""
@@ -120,8 +140,8 @@ class Reactions:
             standing.await_recovery(verdict.cause, is_pose_doubted=verdict.signal not in _CORNERS)
             return True
         self._pace(is_slow=severity in (SLOW, RETURN))
-        if severity is RETURN and verdict.code is not NEAR_EDGE and verdict.cause != self._emergency:
-            self._emergency = verdict.cause
+        if severity is RETURN and verdict.code is not NEAR_EDGE and verdict.cause != self._finding:
+            self._finding = verdict.cause
             abort(standing, verdict.cause)
         return False
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Collection, Sequence
 from math import inf
 
 from ccatp.config.models import Config
+from ccatp.control.gate import Purpose
 from ccatp.mirror.mirror import Mirror
 from ccatp.planning.route import Route
 from ccatp.samples import DeckPose, PointId, Severity, Stop
@@ -15,7 +16,7 @@ from ccatp.surveying.leftovers import Leftovers
 from ccatp.surveying.missed_point import MissedPoint
 from ccatp.surveying.pace import PacedTracker
 from ccatp.surveying.retreat import Retreat
-from ccatp.surveying.states import HELD, Event, Outcome, State, next_state
+from ccatp.surveying.states import HELD, PURPOSES, Event, Outcome, State, next_state
 from ccatp.surveying.stopover import Stopover
 
 PlanHome = Callable[[DeckPose], tuple[Stop, ...]]
@@ -41,6 +42,8 @@ class Standing:
         home: the way home, once it is planned.
         abort_cause: why the survey was given up, or ``None``.
         bar: why nothing may move, an earthquake, or empty.
+        is_latched: an emergency is in force.
+        is_shaking: there is an earthquake, though the robot may be leaving an edge first.
         severity: of the newest verdict.
         is_held_by_hand: somebody has to resume.
         is_faulted: something is wrong, and an operator has to look after it.
@@ -76,6 +79,7 @@ class Standing:
         self.skipped: list[PointId] = []
         self.abort_cause: str | None = None
         self.bar = ""
+        self.is_latched = self.is_shaking = False
         self.severity = Severity.NONE
         self.is_held_by_hand = self.is_faulted = self.is_hold_deaf = False
         self.is_lost = self.is_at_start = cfg.mission.fix_at_start
@@ -102,6 +106,13 @@ class Standing:
     def ignores_motion(self) -> bool:
         """Held because wheels or inertial unit are not to be believed: whatever they say, the robot stands."""
         return self.state is HELD and self.is_hold_deaf
+
+    @property
+    def purpose(self) -> Purpose:
+        """What the last gate lets the robot move for: legs that show the heading may be part of the way home."""
+        if self.is_lost and self.abort_cause is not None and self.state in (State.TURNING, State.DRIVING):
+            return Purpose.HOMEWARD
+        return PURPOSES[self.state]
 
     @property
     def is_awaiting_fix(self) -> bool:

@@ -133,6 +133,9 @@ class EmergencyDesk(Protocol):
     def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
         """Latch; returns why it was refused, or None."""
 
+    def holds(self, emergency_id: str) -> bool:
+        """Whether the emergency with that id is latched."""
+
     def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
         """Clear; returns why it was refused, or None."""
 
@@ -158,14 +161,17 @@ def answer_observatory(
         return format_error(str(error))
     if isinstance(request, PingRequest):
         return format_ok(code=int(desk.code), age_s=age_s)
+    key = str(UUID(request.id))  # one of many ways to write it
     if isinstance(request, EmergencyRequest):
-        refusal = desk.emergency(request.kind.value, request.id, request.note)
-        # An edge may hide the abort's code until the robot is off it; the answer is about the latch.
-        accepted = format_ok(id=request.id, latched=True, code=int(EventCode.ABORTED))
+        refusal = desk.emergency(request.kind.value, key, request.note)
+        # An edge may hide the abort's code until the robot is off it; the answer is about the latch. What was cleared
+        # before is not latched again: whoever means another emergency has to know.
+        is_held = desk.holds(key)
+        accepted = format_ok(id=request.id, latched=is_held, code=int(EventCode.ABORTED if is_held else desk.code))
     elif not may_clear:
         refusal, accepted = "this client may raise emergencies, not clear them", b""
     else:
-        refusal = desk.clear(request.id, at_base_or_held)
+        refusal = desk.clear(key, at_base_or_held)
         accepted = format_ok(id=request.id, code=int(desk.code))
     return accepted if refusal is None else format_error(refusal, id=request.id)
 

@@ -59,6 +59,9 @@ class Desk:
     def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
         return self.latch.raise_emergency(kind, emergency_id, note)
 
+    def holds(self, emergency_id: str) -> bool:
+        return self.latch.holds(emergency_id)
+
     def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
         return self.latch.clear(emergency_id, at_base_or_held)
 

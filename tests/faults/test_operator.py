@@ -23,7 +23,7 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.planning.bound import path_time
 from ccatp.planning.way_home import plan_way_home
 from ccatp.router import REPEAT_S, RequestFailed, request
-from ccatp.samples import DeckPose, EventCode
+from ccatp.samples import DeckPose, EventCode, Verdict
 from ccatp.surveying.budget import home_time_s
 from ccatp.surveying.orders import Order
 from ccatp.surveying.states import State
@@ -135,6 +135,8 @@ def test_during_an_earthquake_nobody_resumes(story: Story) -> None:
         forward=False,
         reverse=False,
         turn=False,
+        raised=1,
+        is_shaking=True,
     )
     story.until_state(State.DRIVING)
     story.frame(quake)
@@ -144,6 +146,59 @@ def test_during_an_earthquake_nobody_resumes(story: Story) -> None:
     assert story.mission.state is State.HELD
     story.until_state(State.DONE)  # it is over
     assert story.mission.done == []
+
+
+def emergency(raised: int, kind: str = "fire", *, code: EventCode = EventCode.ABORTED) -> Verdict:
+    is_shaking = kind == "earthquake"
+    verdict = replace(FREE, code=code, cause=f"emergency: {kind}", signal=f"emergency:{kind}", raised=raised)
+    free = not is_shaking or code is EventCode.NEAR_EDGE
+    return replace(verdict, is_shaking=is_shaking, forward=free, reverse=free, turn=free)
+
+
+@pytest.mark.fault("O1", "O3")
+def test_an_emergency_that_is_new_outranks_a_pause_and_its_level_does_not(story: Story) -> None:
+    story.until_state(State.DRIVING)
+    story.frame(emergency(1))
+    assert str(story.mission.state) == State.RETURNING
+    assert story.mission.pause("operator") is None
+    for _ in range(50):
+        story.frame(emergency(1))  # the level
+        story.frame(emergency(1, "power"))  # one of two is cleared: what is left is the older one
+    assert str(story.mission.state) == State.HELD
+    story.frame()  # all cleared
+    assert str(story.mission.state) == State.HELD
+    story.frame(emergency(2))  # the same kind once more
+    assert str(story.mission.state) == State.RETURNING
+
+
+@pytest.mark.fault("O1", "O2")
+def test_an_earthquake_at_an_edge_presses_the_robot_on_and_nobody_resumes(story: Story) -> None:
+    story.until_state(State.DRIVING)
+    at_edge = replace(
+        emergency(1, "earthquake", code=EventCode.NEAR_EDGE), off=(True, False, False, False), forward=False
+    )
+    story.frame(at_edge)
+    assert str(story.mission.state) == State.BACKING_OFF
+    assert story.mission.wants_full_fans
+    assert story.mission.pause("operator") is None
+    assert story.mission.resume() == "emergency: earthquake: nothing moves until that is cleared"
+    story.frame(emergency(1, "earthquake"))
+    assert (story.mission.state, story.mission.cause) == (State.HELD, "emergency: earthquake")
+
+
+@pytest.mark.fault("O1", "O7")
+def test_what_was_latched_before_the_start_is_waited_for_at_base(story: Story) -> None:
+    story.mission.pause("started anew")
+    story.mission.know_emergency()
+    for _ in range(50):
+        story.frame(emergency(4))
+    assert str(story.mission.state) == State.HELD
+    assert story.mission.resume() == "an emergency of before is latched: 'ccatp clear' it first"
+    story.frame()
+    assert story.mission.resume() is None
+    story.until_state(State.DRIVING)
+    story.frame(emergency(5))
+    assert str(story.mission.state) == State.RETURNING
 
 
 @pytest.mark.fault("O1")

@@ -6,8 +6,10 @@ import pytest
 
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
+from ccatp.control.gate import Denial
 from ccatp.samples import Twist
 from ccatp.surveying.states import State
+from ccatp.wire.robot import Sensors
 from tests.faults.restarting import RestartingRehearsal
 
 MISSIONS = 30
@@ -44,6 +46,34 @@ def test_killed_while_turning_and_driving(seed: int) -> None:
 def test_killed_at_random_instants(seed: int) -> None:
     rng = random.Random(seed)
     check(RestartingRehearsal(config(seed), {rng.randrange(100, 7000) for _ in range(3)}))
+
+
+class Burning(RestartingRehearsal):
+    """There is a fire, and main dies on its way home; or main has died, and its successor looks for the heading."""
+
+    def __init__(self, cfg: Config, *, is_before: bool) -> None:
+        super().__init__(cfg, set() if is_before else {1200})
+        self._is_before, self._is_raised = is_before, False
+
+    def _serve(self, frame: Sensors, dt_s: float) -> None:
+        is_time = frame.seq > 1000 if self._is_before else bool(self.states)
+        if not self._is_raised and is_time and self.mission.state is State.DRIVING:
+            assert self.monitor.emergency("fire", "a") is None
+            self._is_raised = True
+            self._kills |= {frame.seq + 60} if self._is_before else set()
+        super()._serve(frame, dt_s)
+
+
+@pytest.mark.fault("O1", "P1")
+@pytest.mark.parametrize("is_before", [True, False])
+def test_whoever_takes_over_in_a_fire_finds_the_heading_and_goes_home(is_before: bool) -> None:
+    run = Burning(config(1, **{"mission.calibration_length_m": 0.0}), is_before=is_before)
+    result = run.run()
+    assert (run.states == [State.RETURNING]) is is_before
+    assert len(run.states) == 1
+    assert (result.outcome, result.cause) == ("aborted, at base", "emergency: fire")
+    assert run.gate.denied[Denial.ABORTED] == 0  # it drove to find its heading, too
+    assert result.summary["danger"]["falls"] == 0
 
 
 class Watching(RestartingRehearsal):

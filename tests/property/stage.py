@@ -174,7 +174,7 @@ class Stage(Rehearsing):
             verdict = None
         motion = self._motion(frame, dt_s)
         order = mission.step(motion, verdict)
-        right, left = self.gate.pass_through(order.twist, verdict, dt_s, t_s, 0.0, PURPOSES[mission.state])
+        right, left = self.gate.pass_through(order.twist, verdict, dt_s, t_s, 0.0, mission.purpose)
         if order.at_rest:
             self.localizer.rest()
         self._publish(frame.seq, t_s, motion.pose, mission.state)

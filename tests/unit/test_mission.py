@@ -36,7 +36,7 @@ FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
 FRONT_OFF = replace(
     FREE, code=EventCode.NEAR_EDGE, cause="rim", forward=False, turn=False, off=(True, True, False, False)
 )
-ABORT = replace(FREE, code=EventCode.ABORTED, cause="fire")
+ABORT = replace(FREE, code=EventCode.ABORTED, cause="fire", raised=1)
 
 
 class Story:

@@ -11,7 +11,8 @@ from ccatp.config.models import Config
 from ccatp.dataloop import DataLoop
 from ccatp.processes.joining import FIRST_DELAY_S, LONGEST_DELAY_S, LastingLink, delay_s
 from ccatp.robot_link import RobotTimeout
-from ccatp.wire.robot import Hello, Sensors
+from ccatp.wire.robot import Hello, Joined, Sensors, encode
+from tests.faults.test_link import HELLO
 
 
 def test_the_delay_grows_and_is_spread() -> None:
@@ -111,3 +112,28 @@ async def test_a_role_that_is_taken_is_tried_again_by_who_takes_over_and_not_by_
         second.lasting.close()
 
     await with_robot(story)
+
+
+@pytest.mark.fault("L1")
+async def test_a_robot_that_lets_join_and_gives_no_frame_stays_away() -> None:
+    """Each session ends at once: asked less and less often, and given up after as long as one that is not there."""
+    joins = 0
+
+    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        nonlocal joins
+        writer.write(encode(HELLO))
+        await reader.readline()
+        joins += 1
+        writer.write(encode(Joined(role="controller", session=joins)))
+        writer.close()
+
+    async with await asyncio.start_server(talk, "127.0.0.1", 0) as server:
+        port = server.sockets[0].getsockname()[1]
+        client = Client(load_config(overrides={"robot.port": port, "robot.reconnect_timeout_s": 1.0}))
+        await client.lasting.join(is_patient=False)
+        with pytest.raises(RobotTimeout, match=r"did not come back within 1 s: it lets join, and sends no frame"):
+            async with asyncio.timeout(20.0):
+                await client.lasting.serve()
+        client.lasting.close()
+    assert 2 <= joins <= 10
+    assert not client.frames

@@ -2,11 +2,12 @@
 
 from io import StringIO
 from pathlib import Path
+from uuid import UUID
 
 import pytest
 import structlog
 
-from ccatp.processes.latching import FILE, DurableLatch
+from ccatp.processes.latching import FILE, RESERVE_BYTES, DurableLatch, active_ids
 
 Log = structlog.typing.FilteringBoundLogger
 
@@ -32,6 +33,8 @@ def test_an_emergency_is_there_after_a_restart_until_it_is_cleared(tmp_path: Pat
     assert latch.clear("b", at_base_or_held=True) is None
     again = DurableLatch(path, log)
     assert again.newest == latch.newest
+    assert again.raised == 2
+    assert active_ids(path) == ["a"]
     assert again.raise_emergency("power", "b") is None  # cleared is cleared
     assert again.newest == latch.newest
     assert again.clear("a", at_base_or_held=True) is None
@@ -39,11 +42,16 @@ def test_an_emergency_is_there_after_a_restart_until_it_is_cleared(tmp_path: Pat
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"active": [{"id": "a"}], "cleared": []}', '{"active": 3}'])
-def test_a_file_that_cannot_be_read_counts_as_an_emergency(tmp_path: Path, log: Log, text: str) -> None:
+def test_a_file_that_cannot_be_read_counts_as_an_emergency(tmp_path: Path, log: Log, told: StringIO, text: str) -> None:
     (tmp_path / FILE).write_text(text)
     latch = DurableLatch(tmp_path / FILE, log)
     assert latch.is_latched
-    assert latch.clear("unreadable", at_base_or_held=True) is None
+    newest = latch.newest
+    assert newest is not None
+    assert f"'ccatp clear {UUID(newest.id)}' ends it" in told.getvalue()
+    again = DurableLatch(tmp_path / FILE, log)
+    assert again.newest == newest  # the same after a restart
+    assert again.clear(newest.id, at_base_or_held=True) is None
     assert not DurableLatch(tmp_path / FILE, log).is_latched
 
 
@@ -58,3 +66,17 @@ def test_a_disk_that_refuses_does_not_keep_an_emergency_from_being_latched(
     assert latch.raise_emergency("fire", "a") is None
     assert latch.is_latched
     assert "emergencies cannot be kept" in told.getvalue()
+
+
+@pytest.mark.fault("P13")
+def test_an_emergency_is_kept_on_a_full_disk(tmp_path: Path, log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The room for it was taken before; a full disk gives no more."""
+
+    def no_room(_fd: int, _offset: int, _length: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    latch = DurableLatch(tmp_path / FILE, log)
+    assert (tmp_path / f"{FILE}.new").stat().st_size == RESERVE_BYTES
+    monkeypatch.setattr("os.posix_fallocate", no_room)
+    assert latch.raise_emergency("earthquake", "a") is None
+    assert DurableLatch(tmp_path / FILE, log).is_shaking

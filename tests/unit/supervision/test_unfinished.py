@@ -5,7 +5,15 @@ from pathlib import Path
 import pytest
 
 from ccatp.errors import ConfigError, ExitStatus
-from ccatp.supervision.unfinished import FILE, find_unfinished, finished_summary, forget_finished, note_unfinished
+from ccatp.processes.latching import FILE as EMERGENCIES
+from ccatp.supervision.unfinished import (
+    FILE,
+    find_unfinished,
+    finished_summary,
+    forget_finished,
+    note_unfinished,
+    take_over_emergencies,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -25,10 +33,25 @@ def test_a_run_is_found_until_it_has_finished(tmp_path: Path) -> None:
     assert find_unfinished() is None
     run_dir = begin(tmp_path)
     for status in (ExitStatus.HELD, ExitStatus.INTERRUPTED, ExitStatus.UNREACHABLE):
-        forget_finished(status)
+        forget_finished(status, run_dir)
         assert find_unfinished() == run_dir
-    forget_finished(ExitStatus.COMPLETE)
+    forget_finished(ExitStatus.COMPLETE, run_dir)
     assert find_unfinished() is None
+
+
+@pytest.mark.fault("O7")
+@pytest.mark.parametrize("kept", ['{"active": [{"id": "a", "kind": "fire", "note": ""}], "cleared": []}', "{"])
+def test_an_emergency_outlives_the_run(tmp_path: Path, kept: str) -> None:
+    first, second, third = begin(tmp_path), tmp_path / "runs" / "two", tmp_path / "runs" / "three"
+    assert not take_over_emergencies(second)
+    (first / EMERGENCIES).write_text(kept)
+    forget_finished(ExitStatus.ABORTED, first)
+    assert find_unfinished() is None
+    assert take_over_emergencies(second)
+    assert (second / EMERGENCIES).read_text() == kept
+    (second / EMERGENCIES).write_text('{"active": [], "cleared": ["a"]}')
+    forget_finished(ExitStatus.COMPLETE, second)
+    assert not take_over_emergencies(third)
 
 
 def test_a_run_that_never_began_is_none(tmp_path: Path) -> None:
