@@ -73,9 +73,9 @@ class BeaconDanger:
 
     def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
         """Latch an emergency; returns why it was refused, or None."""
-        before = self.latch.newest
+        before = self.latch.raised
         refusal = self.latch.raise_emergency(kind, emergency_id, note)
-        if self.latch.newest is not before:
+        if self.latch.raised != before:
             self._raised_seq = self._frame_seq
         return refusal
 

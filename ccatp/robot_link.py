@@ -262,9 +262,8 @@ class RobotLink(asyncio.Protocol):
             joining.set_result(self._hello)
             self._on_joined(self._hello)
         else:
-            self._oddity = (
-                f"joined as {message.role}, not as {self._role}" if isinstance(message, Joined) else "a second hello"
-            )
+            if isinstance(message, Joined) and message.role != self._role:
+                self._oddity = f"joined as {message.role}, not as {self._role}"
             self.counts["unexpected"] += 1
 
     def _answer(self, hello: Hello, joining: "asyncio.Future[Hello]") -> None:

@@ -83,15 +83,17 @@ class AbortLatch:
         Returns:
             Why it was refused, or None.
         """
+        if emergency_id in self._cleared:
+            return None
+        # The same id is the same emergency, whatever is said of it; but one that shakes the robot holds it.
         known = self._active.get(emergency_id)
-        if known is not None and known.kind != kind:
-            return f"that id is the one of an emergency of kind {known.kind}"
-        if known is not None or emergency_id in self._cleared:
+        if known is not None and (kind != EmergencyKind.EARTHQUAKE or known.kind is EmergencyKind.EARTHQUAKE):
             return None
         if kind not in EmergencyKind.__members__.values():
             return f"unknown kind {kind!r}"
         # Whoever fills the latch with one kind does not keep the others out.
-        if len(self._active) >= MAX_ACTIVE and any(emergency.kind == kind for emergency in self._active.values()):
+        has_room = known is not None or len(self._active) < MAX_ACTIVE
+        if not has_room and any(emergency.kind == kind for emergency in self._active.values()):
             return f"{MAX_ACTIVE} emergencies are active already (the operation is aborted)"
         self._active[emergency_id] = Emergency(EmergencyKind(kind), emergency_id, note)
         self.raised += 1

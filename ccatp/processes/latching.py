@@ -57,9 +57,9 @@ class DurableLatch(AbortLatch):
 
     def raise_emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
         """As ``AbortLatch``, and on the disk."""
-        before = len(self._active)
+        before = self.raised
         refusal = super().raise_emergency(kind, emergency_id, note)
-        if len(self._active) != before:
+        if self.raised != before:
             self._save()
         return refusal
 

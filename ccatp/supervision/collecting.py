@@ -187,7 +187,7 @@ class Collector(ABC):
 
     def _on_recorder_failure(self, reason: str) -> None:
         if self._view is not None:
-            self._view.say("error", f"recording ended, the survey goes on: {reason}")
+            self._view.say("error", f"{reason}; the survey goes on")
 
     def _collect_until_truth(self, rows: int) -> None:
         for _ in range(int(FINISH_TIMEOUT_S * 100)):

@@ -108,6 +108,17 @@ def test_clear_only_at_base_or_held() -> None:
     assert not desk.latch.is_latched
 
 
+def test_an_id_may_be_written_in_capitals_and_what_was_cleared_is_not_in_force() -> None:
+    desk = Desk()
+    raised = f'{{"cmd":"emergency","kind":"fire","id":"{ID.upper()}"}}'
+    assert ask(desk, raised) == {"ok": True, "id": ID.upper(), "latched": True, "code": 2}
+    assert ask(desk, raised.replace(ID.upper(), ID)) == {"ok": True, "id": ID, "latched": True, "code": 2}
+    assert desk.latch.raised == 1
+    assert ask(desk, f'{{"cmd":"clear","id":"{ID}"}}', at_base_or_held=True) == {"ok": True, "id": ID, "code": 0}
+    assert ask(desk, raised) == {"ok": True, "id": ID.upper(), "latched": False, "code": 0}
+    assert not desk.latch.is_latched
+
+
 def test_ping_tells_code_and_age() -> None:
     desk = Desk()
     assert parse_observatory(b'{"cmd":"ping"}') == PingRequest(cmd="ping")

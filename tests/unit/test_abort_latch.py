@@ -85,6 +85,25 @@ def test_a_flood_of_emergencies_is_bounded_and_stays_latched() -> None:
         f"{MAX_ACTIVE} emergencies are active already (the operation is aborted)"
     )
     assert latch.is_latched
+    assert not latch.is_shaking
+    assert latch.raise_emergency("earthquake", "and this") is None  # of another kind: more than what there is
+    assert latch.is_shaking
+
+
+def test_an_id_is_that_of_one_emergency() -> None:
+    latch = AbortLatch()
+    assert latch.raise_emergency("weather", "a") is None
+    assert latch.raise_emergency("weather", "a") is None
+    assert latch.raise_emergency("fire", "a") is None
+    assert (latch.raised, latch.holds("a")) == (1, True)
+    assert latch.raise_emergency("earthquake", "a") is None
+    assert latch.raise_emergency("fire", "a") is None
+    assert (latch.raised, latch.is_shaking) == (2, True)
+    assert latch.clear("a", at_base_or_held=True) is None
+    assert latch.raise_emergency("weather", "a") is None
+    assert (latch.raised, latch.holds("a"), latch.is_latched) == (2, False, False)
+    assert latch.raise_emergency("weather", "b") is None
+    assert latch.raised == 3
 
 
 def test_memory_of_cleared_ids_is_bounded() -> None:

@@ -286,6 +286,21 @@ async def test_hung_up_on() -> None:
     await connect_error(nothing, RobotLinkError, "did not let us join: the robot closed the connection")
 
 
+@pytest.mark.parametrize(
+    ("lines", "why"),
+    [
+        (b'{"type":"hello","protocol":"ccatp-robot/1"}\n', "what came: bad line: .*boot"),
+        (HELLO + b'{"type":"joined","role":"monitor","session":1}\n', "joined as monitor, not as controller"),
+    ],
+)
+async def test_an_answer_that_is_none_is_told(lines: bytes, why: str) -> None:
+    async def odd(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(lines)
+        await reader.read()
+
+    await connect_error(odd, RobotTimeout, f"no answer from the robot at .* within 0.3 s; .*{why}")
+
+
 @pytest.mark.fault("L6")
 async def test_silence() -> None:
     async def silence(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -1,0 +1,61 @@
+"""What a main loop leaves in force for the one that follows."""
+
+import pytest
+from msgspec.structs import replace
+
+from ccatp.config.models import Config
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.processes.keeping import in_force_of
+from ccatp.samples import EventCode
+from ccatp.surveying.states import State
+from tests.unit.test_mission import ABORT, FREE, Story
+
+QUAKE = replace(
+    FREE, code=EventCode.ABORTED, cause="emergency: earthquake", forward=False, reverse=False, turn=False, raised=1,
+    is_shaking=True,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def config(config: Config) -> Config:
+    return config.model_copy(update={"mission": config.mission.model_copy(update={"fix_at_start": False})})
+
+
+@pytest.fixture(scope="module")
+def mirror(config: Config) -> Mirror:
+    return build_mirror(config.mirror)
+
+
+@pytest.fixture
+def driving(config: Config, mirror: Mirror) -> Story:
+    story = Story(config, mirror)
+    story.until_state(State.DRIVING)
+    return story
+
+
+def test_a_pause_and_an_abort(driving: Story) -> None:
+    mission = driving.mission
+    assert in_force_of(mission) == ("", "")
+    driving.frame(ABORT)
+    assert in_force_of(mission) == ("fire", "")
+    assert mission.pause("operator") is None
+    assert in_force_of(mission) == ("fire", "operator")
+
+
+@pytest.mark.fault("O1")
+def test_an_earthquake_is_kept_by_the_danger_loop(driving: Story) -> None:
+    """Who takes over is held by the next verdict, and goes home when it is over; nobody has to resume."""
+    driving.frame(QUAKE)
+    assert driving.mission.is_paused
+    assert in_force_of(driving.mission) == ("emergency: earthquake", "")
+
+
+def test_what_was_stopped_on_its_way_home_goes_home_when_it_goes_on(driving: Story) -> None:
+    assert driving.mission.abort("operator") is None
+    assert driving.mission.stop() is None
+    assert in_force_of(driving.mission) == ("operator", "")
+
+
+def test_what_is_at_base_has_nothing_in_force(driving: Story) -> None:
+    driving.until_state(State.DONE, ABORT)
+    assert in_force_of(driving.mission) == ("", "")
