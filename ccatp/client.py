@@ -241,7 +241,7 @@ def exchange(
         raise RefusedError(f"{payload.get('cmd')} refused: {reply.get('error', 'no reason given')}")
     # Who reports a fire must not take any answer for the one that counts.
     if payload.get("cmd") == "emergency" and reply.get("id") == payload["id"] and reply.get("latched") is False:
-        raise RefusedError(
+        raise RequestFailed(
             "emergency not in force: the one with that id was cleared; report another with an id of its own"
         )
     if payload.get("cmd") == "emergency" and (reply.get("id") != payload["id"] or reply.get("latched") is not True):
