@@ -112,12 +112,13 @@ class BeaconDanger:
         self._code = verdict.code
         if verdict.signal:
             self._denials[verdict.signal] += 1
-        return verdict
+        return self.latch.told(verdict)
 
     def stale(self, seq: int, t_s: float) -> Verdict:
         """The verdict when no frame came for ``stale_after_s``: nothing permitted."""
         limit_s = self._danger.stale_after_s
-        return self._denied(seq, t_s, "no sensors frame", "sensors", limit_s, limit_s, Severity.PAUSE)
+        denied = self._denied(seq, t_s, "no sensors frame", "sensors", limit_s, limit_s, Severity.PAUSE)
+        return self.latch.told(denied)
 
     def garbled(self, seq: int, t_s: float, _at_s: float) -> Verdict | None:
         """A line of the robot was no frame: nothing permitted until the next one."""
@@ -191,11 +192,7 @@ class BeaconDanger:
         self, seq: int, t_s: float, cause: str, signal: str, value: float, limit: float, severity: Severity
     ) -> Verdict:
         code = _ABORTED if self.latch.is_latched else _NORMAL
-        latch = self.latch
-        return Verdict(
-            seq, t_s, code, cause, signal, value, limit, False, False, False, severity=severity,
-            raised=latch.raised, is_shaking=latch.is_shaking,
-        )  # fmt: skip
+        return Verdict(seq, t_s, code, cause, signal, value, limit, False, False, False, severity=severity)
 
     def _near(self, sensors: Sensors) -> Verdict:
         seq, t_s, danger = sensors.seq, sensors.t, self._danger
@@ -214,7 +211,7 @@ class BeaconDanger:
             found = "an obstacle behind", "obstacle", behind_m, danger.obstacle_m
         else:
             return emergency or Verdict(seq, t_s, _NORMAL, "", "", 0.0, 0.0, True, True, True)
-        return Verdict(seq, t_s, _NEAR, *found, forward, reverse, True, raised=self.latch.raised)
+        return Verdict(seq, t_s, _NEAR, *found, forward, reverse, True)
 
     def _nearest_target_m(self) -> float:
         """The target is at least this far, by one standard deviation of its mean level; infinite without a level."""
@@ -234,7 +231,4 @@ class BeaconDanger:
         # Whoever drives while the ground shakes slips; the others are fled from.
         kind, may_move = (EmergencyKind.EARTHQUAKE, False) if self.latch.is_shaking else (newest.kind, True)
         cause, signal = f"emergency: {kind}", f"emergency:{kind}"
-        return Verdict(
-            seq, t_s, _ABORTED, cause, signal, 1.0, 0.0, may_move, may_move, may_move,
-            raised=self.latch.raised, is_shaking=self.latch.is_shaking,
-        )  # fmt: skip
+        return Verdict(seq, t_s, _ABORTED, cause, signal, 1.0, 0.0, may_move, may_move, may_move)

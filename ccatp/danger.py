@@ -20,8 +20,6 @@ from collections.abc import Sequence
 from math import isfinite
 from typing import NamedTuple, Protocol
 
-import msgspec
-
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
 from ccatp.hazards.abort_latch import HEARD_AFTER_FRAMES, AbortLatch, EmergencyKind, is_at_base_or_held
 from ccatp.hazards.edge_episode import Episode, Phase
@@ -242,7 +240,7 @@ class DangerMonitor:
             verdict = self._arbitrate(seq, sensors.t, missing)
             if self._board is not None:
                 verdict = self._weigh(verdict, self._climb(t_s, [*found, *self._own_findings(missing)]))
-            self.verdict = verdict = self._latched(verdict)
+            self.verdict = verdict = self.latch.told(verdict)
         return verdict
 
     def _shifted(self, estimate: Estimate | None) -> Estimate | None:
@@ -347,7 +345,7 @@ class DangerMonitor:
             t_s: robot time as far as known, s.
         """
         limit_s = self._stale_after_s
-        return self._latched(_denied(seq, t_s, self.code, _Missing("sensors", "no sensors frame", limit_s, limit_s)))
+        return self.latch.told(_denied(seq, t_s, self.code, _Missing("sensors", "no sensors frame", limit_s, limit_s)))
 
     def garbled(self, seq: int, t_s: float, at_s: float) -> Verdict | None:
         """A line of the robot was no frame. The verdict where there were too many: nothing permitted.
@@ -361,14 +359,7 @@ class DangerMonitor:
             return None
         finding = self._board.garbled()
         denied = _Missing(finding.signal, finding.cause, finding.value, finding.limit)
-        return self._latched(_denied(seq, t_s, self.code, denied, finding.severity))
-
-    def _latched(self, verdict: Verdict) -> Verdict:
-        """A verdict, and what it does not say of emergencies where something else gave its code."""
-        latch = self.latch
-        if not latch.is_latched:
-            return verdict
-        return msgspec.structs.replace(verdict, raised=latch.raised, is_shaking=latch.is_shaking)
+        return self.latch.told(_denied(seq, t_s, self.code, denied, finding.severity))
 
     def _is_fresh(self, estimate: Estimate, t_s: float) -> bool:
         # Written so that a time that is not a number is not fresh.

@@ -102,10 +102,12 @@ class Holding:
         if verdict.is_shaking:
             self._raised = verdict.raised
             self._stand_fast()
-            return False
-        self._bar = ""
+        else:
+            self._bar = ""
         if verdict.severity is Severity.FAULT:
             self.fault(verdict.cause)
+            return False
+        if verdict.is_shaking:
             return False
         if not (verdict.forward or verdict.reverse or verdict.turn):
             if not self.interrupt(verdict.cause) and self.state is HELD and not self._is_by_hand:

@@ -3,6 +3,10 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
+import msgspec
+
+from ccatp.samples import Verdict
+
 # An observatory has a handful at a time; a peer that floods the latch must not fill the memory.
 MAX_ACTIVE = 256
 MAX_CLEARED = 1024
@@ -68,6 +72,12 @@ class AbortLatch:
     def newest(self) -> Emergency | None:
         """The emergency raised last among the active ones."""
         return next(reversed(self._active.values())) if self._active else None
+
+    def told(self, verdict: Verdict) -> Verdict:
+        """A verdict, with what it does not say of emergencies where something else gave its code."""
+        if not self._active:
+            return verdict
+        return msgspec.structs.replace(verdict, raised=self.raised, is_shaking=self.is_shaking)
 
     def holds(self, emergency_id: str) -> bool:
         """Whether the emergency with that id is active."""

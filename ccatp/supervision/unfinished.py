@@ -48,14 +48,9 @@ def note_unfinished(run_dir: Path) -> None:
     Raises:
         ConfigError: the note cannot be written.
     """
-    new = FILE.with_name(f"{FILE.name}.new")
     try:
         FILE.parent.mkdir(parents=True, exist_ok=True)
-        with new.open("w", encoding="utf-8") as file:
-            file.write(f"{run_dir}\n")
-            file.flush()
-            os.fsync(file.fileno())
-        new.replace(FILE)
+        _write(FILE, f"{run_dir}\n".encode())
     except OSError as error:
         raise ConfigError(
             f"--recover: cannot write {FILE}: {error.strerror}; start where ./runs can be made"
@@ -73,9 +68,7 @@ def forget_finished(status: int, run_dir: Path) -> None:
     kept = _emergencies(run_dir / EMERGENCIES)
     try:
         if kept:
-            new = LATCHED_FILE.with_name(f"{LATCHED_FILE.name}.new")
-            new.write_bytes(kept)
-            new.replace(LATCHED_FILE)
+            _write(LATCHED_FILE, kept)
         else:
             LATCHED_FILE.unlink(missing_ok=True)
     except OSError as error:
@@ -92,12 +85,22 @@ def take_over_emergencies(run_dir: Path) -> bool:
     try:
         kept = LATCHED_FILE.read_bytes()
         run_dir.mkdir(parents=True, exist_ok=True)
-        (run_dir / EMERGENCIES).write_bytes(kept)
+        _write(run_dir / EMERGENCIES, kept)
     except FileNotFoundError:
         return False
     except OSError as error:
         raise ConfigError(f"--recover: cannot take over {LATCHED_FILE}: {error.strerror}") from error
     return True
+
+
+def _write(path: Path, data: bytes) -> None:
+    """All of it or nothing, and on the disk."""
+    new = path.with_name(f"{path.name}.new")
+    with new.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    new.replace(path)
 
 
 def _emergencies(path: Path) -> bytes:

@@ -54,6 +54,8 @@ class Reactions:
             verdict: in force, ``None`` where there is none fresh enough.
         """
         standing = self._standing
+        if verdict is not None and self._raised is None:
+            self._raised = verdict.raised
         self._await_news(motion.t_s, verdict)
         if verdict is not None and self._heed_earthquake(verdict):
             return
@@ -97,9 +99,8 @@ class Reactions:
 
     def _is_news(self, verdict: Verdict) -> bool:
         """Whether another emergency was raised since the last look: the level is repeated in each verdict."""
-        is_known = self._raised is None or verdict.raised == self._raised
-        self._raised = verdict.raised
-        return not is_known
+        is_news, self._raised = verdict.raised != self._raised, verdict.raised
+        return is_news
 
     def _heed_earthquake(self, verdict: Verdict) -> bool:
         """Nothing moves while the ground shakes, unless away from an edge; whether that is all for this frame."""
@@ -111,9 +112,9 @@ class Reactions:
         standing.wants_full_fans = True
         if verdict.code is NEAR_EDGE:
             return False
-        self._is_news(verdict)
+        self._raised = verdict.raised
         self._stand_fast()
-        return True
+        return verdict.severity is not FAULT  # which an operator has to look after, too
 
     def _stand_fast(self) -> None:
         """Held, and home when it is over; a pose from before is not to be trusted then."""

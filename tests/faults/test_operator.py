@@ -23,7 +23,7 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.planning.bound import path_time
 from ccatp.planning.way_home import plan_way_home
 from ccatp.router import REPEAT_S, RequestFailed, request
-from ccatp.samples import DeckPose, EventCode, Verdict
+from ccatp.samples import DeckPose, EventCode, Severity, Verdict
 from ccatp.surveying.budget import home_time_s
 from ccatp.surveying.orders import Order
 from ccatp.surveying.states import State
@@ -32,7 +32,7 @@ from ccatp.wire.channels import format_ok
 from ccatp.wire.robot import Sensors
 from tests.faults.campaign import single
 from tests.faults.laser import FULL, DeskRehearsal
-from tests.unit.test_mission import DT, FREE, FRONT_OFF, Story
+from tests.unit.test_mission import DT, FREE, FRONT_OFF, Story, from_first_leg
 
 Note = Callable[..., None]
 SURVEYING = (State.TURNING, State.DRIVING, State.SETTLING, State.MEASURING)
@@ -46,7 +46,7 @@ def one_panel(**changes: Any) -> Config:
 
 @pytest.fixture(scope="module")
 def config(config: Config) -> Config:
-    return config.model_copy(update={"mission": config.mission.model_copy(update={"fix_at_start": False})})
+    return from_first_leg(config)
 
 
 @pytest.fixture(scope="module")
@@ -184,6 +184,33 @@ def test_an_earthquake_at_an_edge_presses_the_robot_on_and_nobody_resumes(story:
     assert story.mission.resume() == "emergency: earthquake: nothing moves until that is cleared"
     story.frame(emergency(1, "earthquake"))
     assert (story.mission.state, story.mission.cause) == (State.HELD, "emergency: earthquake")
+
+
+@pytest.mark.fault("O1")
+def test_what_breaks_in_an_earthquake_waits_for_an_operator_when_it_is_over(story: Story) -> None:
+    story.until_state(State.DRIVING)
+    story.frame(emergency(1, "earthquake"))
+    broken = replace(emergency(1, "earthquake"), severity=Severity.FAULT, cause="a wheel runs away", signal="enc")
+    story.frame(broken)
+    assert story.mission.is_faulted
+    for _ in range(50):
+        story.frame()
+    assert (story.mission.state, story.mission.cause) == (State.HELD, "a wheel runs away")
+    assert story.mission.resume() is None
+    story.until_state(State.DONE)
+    assert story.mission.done == []
+
+
+@pytest.mark.fault("O1")
+def test_after_a_restart_with_nothing_latched_the_first_emergency_is_new(story: Story) -> None:
+    """It was on its way home by the operator's abort, and paused, when its predecessor died."""
+    story.mission.abort("operator")
+    story.mission.pause("operator")
+    story.mission.know_emergency()
+    story.frame()
+    assert str(story.mission.state) == State.HELD
+    story.frame(emergency(1))
+    assert str(story.mission.state) == State.RETURNING
 
 
 @pytest.mark.fault("O1", "O7")

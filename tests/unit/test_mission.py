@@ -103,10 +103,14 @@ class Story:
         self.until(lambda: self.mission.state is state, verdict)
 
 
-@pytest.fixture(scope="module")
-def config(config: Config) -> Config:
+def from_first_leg(config: Config) -> Config:
     """The stories begin with the first leg; one of them is about the fix before it."""
     return config.model_copy(update={"mission": config.mission.model_copy(update={"fix_at_start": False})})
+
+
+@pytest.fixture(scope="module")
+def config(config: Config) -> Config:
+    return from_first_leg(config)
 
 
 @pytest.fixture(scope="module")

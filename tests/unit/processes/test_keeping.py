@@ -4,11 +4,11 @@ import pytest
 from msgspec.structs import replace
 
 from ccatp.config.models import Config
-from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.mirror.mirror import build_mirror
 from ccatp.processes.keeping import in_force_of
 from ccatp.samples import EventCode
 from ccatp.surveying.states import State
-from tests.unit.test_mission import ABORT, FREE, Story
+from tests.unit.test_mission import ABORT, FREE, Story, from_first_leg
 
 QUAKE = replace(
     FREE, code=EventCode.ABORTED, cause="emergency: earthquake", forward=False, reverse=False, turn=False, raised=1,
@@ -16,19 +16,10 @@ QUAKE = replace(
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def config(config: Config) -> Config:
-    return config.model_copy(update={"mission": config.mission.model_copy(update={"fix_at_start": False})})
-
-
-@pytest.fixture(scope="module")
-def mirror(config: Config) -> Mirror:
-    return build_mirror(config.mirror)
-
-
 @pytest.fixture
-def driving(config: Config, mirror: Mirror) -> Story:
-    story = Story(config, mirror)
+def driving(config: Config) -> Story:
+    cfg = from_first_leg(config)
+    story = Story(cfg, build_mirror(cfg.mirror))
     story.until_state(State.DRIVING)
     return story
 
