@@ -121,13 +121,13 @@ $(FAST_VENV)/.installed: requirements-compiled.lock pyproject.toml $(FAST_SOURCE
 # `make lock` keeps the versions that still fit; `make lock LOCK_ARGS=--upgrade` takes the newest.
 UV ?= uv
 LOCK_ARGS ?=
-UV_COMPILE = $(UV) pip compile --quiet --universal --generate-hashes --no-emit-index-url --no-emit-find-links \
+UV_COMPILE = $(UV) pip compile --quiet --universal --generate-hashes --no-emit-index-url --no-emit-find-links --fork-strategy fewest \
 	--python-version 3.11 --custom-compile-command "make lock" $(LOCK_ARGS) --group build pyproject.toml
 
 lock:
 	$(UV_COMPILE) --output-file requirements.lock
 	$(UV_COMPILE) --group dev --all-extras --constraint requirements.lock --output-file requirements-dev.lock
-	$(UV_COMPILE) --group compiled --extra plots --extra tune --extra cluster --extra peers --constraint requirements-dev.lock --output-file requirements-compiled.lock
+	$(UV_COMPILE) --group compiled --extra tune --extra cluster --extra peers --constraint requirements-dev.lock --output-file requirements-compiled.lock
 
 clean:
 	rm -rf $(VENV) $(FAST_VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
