@@ -17,7 +17,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
-.PHONY: help run test test-slow slow-tests new-examples sweep tried-in faults docs lint format fast lock clean
+.PHONY: help run test test-slow slow-tests new-examples sweep tried-in faults docs metrics lint format fast lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -28,6 +28,7 @@ help:
 	@echo "make sweep            the part of that which drives over every centimetre of every rim; goes on where it was stopped"
 	@echo "make faults           docs/fault_table.md from what the last test runs showed and measured"
 	@echo "make docs             build/docs/index.html, and the parts of docs/ that are made from the code"
+	@echo "make metrics          size of the code base, calls and files per frame; ARGS=--names lists them"
 	@echo "make lint             lint, types, import contract"
 	@echo "make format           format the code"
 	@echo "make fast             a compiled build beside it, for campaigns: $(FAST_VENV)/bin/ccatp; needs a C compiler"
@@ -70,6 +71,9 @@ docs: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.docs.generated
 	$(BIN)/python -m sphinx -W -q -b html docs build/docs
 	@echo "ccatp: build/docs/index.html"
+
+metrics: $(VENV)/.installed-dev
+	@$(BIN)/python -m tests.metrics $(ARGS)
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check

@@ -1,0 +1,60 @@
+"""Calls and files per sensors frame in the main loop, counted by ``sys.setprofile`` during a simulated survey."""
+
+import json
+import os
+import statistics
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+_HOOK = Path(__file__).with_name("frame_hook")
+MAIN_LOOP = r"\bmain_loop\b"
+_LEAST_FRAMES = 1000
+_LOG_LINES = 10
+
+
+class FrameCalls(NamedTuple):
+    """Medians over the frames of a run, most of which drive steadily.
+
+    ``calls``, ``files``: from the bytes of the frame to its drive command; ``all_calls``, ``all_files``: until the next
+    frame, with everything that the event loop does meanwhile.
+    """
+
+    frames: int
+    calls: int
+    files: int
+    all_calls: int
+    all_files: int
+
+
+def measure(root: Path, python: Path, process: str = MAIN_LOOP) -> FrameCalls:
+    """Run ``ccatp run --sim --panels 1`` of the checkout ``root``.
+
+    Args:
+        python: interpreter of an environment with the dependencies of that checkout.
+        process: regular expression for the command line of the process to be measured.
+
+    Raises:
+        RuntimeError: the run failed, or no process matched.
+    """
+    with tempfile.TemporaryDirectory(prefix="ccatp-metrics-") as folder:
+        counts = Path(folder) / "counts"
+        counts.mkdir()
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join((str(_HOOK), str(root))),
+            "CCATP_FRAME_CALLS": str(counts),
+            "CCATP_FRAME_PACKAGE": f"{root / 'ccatp'}{os.sep}",
+            "CCATP_FRAME_PROCESS": process,
+        }
+        command = [str(python), "-m", "ccatp", "run", "--sim", "--panels", "1"]
+        command += ["--run-dir", f"{folder}/run", "--runtime-dir", f"{folder}/sockets"]
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            tail = "\n".join(done.stderr.splitlines()[-_LOG_LINES:])
+            raise RuntimeError(f"{' '.join(command)} ended with {done.returncode}:\n{tail}")
+        rows = [row for file in counts.iterdir() for row in json.loads(file.read_text())]
+    if len(rows) < _LEAST_FRAMES:
+        raise RuntimeError(f"{len(rows)} frames in processes that match {process!r}; expected {_LEAST_FRAMES} or more")
+    return FrameCalls(len(rows), *(round(statistics.median(column)) for column in zip(*rows, strict=True)))
