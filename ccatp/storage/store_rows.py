@@ -165,8 +165,12 @@ def _connect(path: Path) -> sqlite3.Connection:
     db = sqlite3.connect(path, timeout=BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False)
     # A damaged text comes back damaged, and fails its checksum, instead of ending the program.
     db.text_factory = lambda raw: raw.decode("utf-8", "surrogateescape")
-    db.execute("PRAGMA synchronous = FULL")
-    db.execute("PRAGMA journal_mode = PERSIST")
+    try:
+        db.execute("PRAGMA synchronous = FULL")
+        db.execute("PRAGMA journal_mode = PERSIST")
+    except Exception:  # not a database; its message may even be no UTF-8
+        db.close()
+        raise
     return db
 
 
