@@ -4,6 +4,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 FAST_VENV ?= .venv-fast
+NEWEST_VENV ?= .venv-newest
 ARGS ?=
 PYTEST_ARGS ?=
 WORKERS ?= 2
@@ -17,13 +18,15 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
-.PHONY: help run test test-slow slow-tests new-examples sweep tried-in faults docs metrics lint format fast lock clean
+.PHONY: help run test test-newest newest test-slow slow-tests new-examples sweep tried-in faults docs metrics lint format
+.PHONY: fast lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
 help:
 	@echo "make run [ARGS=...]   survey a simulated mirror: ccatp run --sim"
 	@echo "make test             lint, types, import contract, tests"
+	@echo "make test-newest      lint, unit and contract tests and a small survey on the newest Python installed, in $(NEWEST_VENV)"
 	@echo "make test-slow        the tests that take minutes, and new random examples"
 	@echo "make sweep            the part of that which drives over every centimetre of every rim; goes on where it was stopped"
 	@echo "make faults           docs/fault_table.md from what the last test runs showed and measured"
@@ -48,6 +51,16 @@ tried-in:
 		{ test "$$(id -u)" = 0 && command -v apt-get >/dev/null && echo "ccatp: installing$$wanted" && \
 		{ apt-get install -y -qq $$wanted || { apt-get update -qq && apt-get install -y -qq $$wanted; }; } >/dev/null 2>&1; } || \
 		echo "ccatp: without$$wanted, so what is tried in them is skipped; on Debian: apt install$$wanted"
+
+# In an environment of its own; the oldest Python is that of `make test` in CI.
+test-newest:
+	@pythons=$$(.ci/pythons | tail -n 2); newest=$${pythons##*[[:space:]]}; if test "$$pythons" = "$$newest"; then \
+		echo "ccatp: $${newest:-no python3.11 to 3.14} is the only supported Python here; nothing else to test on"; else \
+		$(MAKE) --no-print-directory VENV=$(NEWEST_VENV) PYTHON="$$newest" newest; fi
+
+newest: lint
+	$(PYTEST) tests/unit tests/contract $(PYTEST_ARGS)
+	rm -rf build/newest && $(BIN)/ccatp run --sim --panels 2 --run-dir build/newest
 
 # What fails in one part does not keep the others from being run.
 test-slow:
@@ -78,7 +91,7 @@ metrics: $(VENV)/.installed-dev
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
-	$(BIN)/mypy --strict
+	$(BIN)/mypy --strict --cache-dir .mypy_cache/$(VENV)
 	$(BIN)/lint-imports
 
 format: $(VENV)/.installed-dev
@@ -122,11 +135,12 @@ $(FAST_VENV)/.installed: requirements-compiled.lock pyproject.toml $(FAST_SOURCE
 	@touch $@
 	@$(FAST_VENV)/bin/ccatp --version
 
-# `make lock` keeps the versions that still fit; `make lock LOCK_ARGS=--upgrade` takes the newest.
+# `make lock` keeps the versions that still fit; `make lock LOCK_ARGS=--upgrade` takes the newest. One version of each
+# package for all Pythons (--fork-strategy fewest), so that types are checked against and numbers come from the same numpy.
 UV ?= uv
 LOCK_ARGS ?=
-UV_COMPILE = $(UV) pip compile --quiet --universal --generate-hashes --no-emit-index-url --no-emit-find-links --fork-strategy fewest \
-	--python-version 3.11 --custom-compile-command "make lock" $(LOCK_ARGS) --group build pyproject.toml
+UV_COMPILE = $(UV) pip compile --quiet --universal --generate-hashes --no-emit-index-url --no-emit-find-links \
+	--fork-strategy fewest --python-version 3.11 --custom-compile-command "make lock" $(LOCK_ARGS) --group build pyproject.toml
 
 lock:
 	$(UV_COMPILE) --output-file requirements.lock
@@ -134,5 +148,5 @@ lock:
 	$(UV_COMPILE) --group compiled --extra tune --extra cluster --extra peers --constraint requirements-dev.lock --output-file requirements-compiled.lock
 
 clean:
-	rm -rf $(VENV) $(FAST_VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(FAST_VENV) $(NEWEST_VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find ccatp tests -name __pycache__ -type d -prune -exec rm -rf {} +
