@@ -52,7 +52,7 @@ def report_run(run_dir: Path, out: Path | None = None, figures: Path | None = No
         RunReadError: no run there.
         ConfigError: its configuration cannot be used.
         ReportError: the page cannot be written.
-        PictureError: a figure cannot be written, or matplotlib is not installed.
+        PictureError: a figure cannot be written.
     """
     path = out or run_dir / REPORT
     if is_beacon_run(run_dir):
@@ -105,7 +105,7 @@ def write_pictures(pictures: dict[str, Picture], folder: Path) -> None:
     """Write figures as SVG, PNG and PDF.
 
     Raises:
-        PictureError: one cannot be written, or matplotlib is not installed.
+        PictureError: one cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -199,7 +199,7 @@ def figure_option(what: str) -> Callable[[Command], Command]:
     """``--figure FILE``; ``what`` says what is drawn."""
     return click.option(
         "--figure", "figure_file", type=OutputFile(".png", ".pdf", ".svg"),
-        help=f"{what} (PNG, PDF or SVG; needs matplotlib).",
+        help=f"{what} (PNG, PDF or SVG).",
     )  # fmt: skip
 
 

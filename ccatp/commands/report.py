@@ -10,9 +10,7 @@ from ccatp.commands.frame import complain, example
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
 _FOLDER = click.Path(path_type=Path, file_okay=False)
-_FIGURES = click.option(
-    "--figures", type=_FOLDER, metavar="DIR", help="Also write the figures there: SVG, PNG, PDF (needs matplotlib)."
-)
+_FIGURES = click.option("--figures", type=_FOLDER, metavar="DIR", help="Also write the figures there: SVG, PNG, PDF.")
 _JSON = click.option("--json", "json_output", is_flag=True, help="The figures of it as JSON on standard output.")
 
 

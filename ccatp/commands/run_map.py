@@ -13,7 +13,7 @@ from ccatp.commands.frame import OutputFile, example
     "--out", type=OutputFile(".png", ".pdf", ".svg"), help="The picture; map.png in the run directory if not given."
 )
 def draw_map(run_dir: Path, out: Path | None) -> int:
-    """Draw the map of a run: panels, path, and each point coloured by its arrival error (needs matplotlib)."""
+    """Draw the map of a run: panels, path, and each point coloured by its arrival error."""
     from ccatp.pictures.run_map import draw_from_run_dir
 
     picture = out or run_dir / "map.png"

@@ -57,7 +57,7 @@ class _StudyCommand(click.Command):
 @click.option("--seed", type=int, metavar="N", help="Seed of the first run.")
 @CONFIG_OPTION
 @SETTINGS_OPTION
-@click.option("--no-figures", is_flag=True, help="Tables only; needs no matplotlib.")
+@click.option("--no-figures", is_flag=True, help="Tables only.")
 @JSON_OPTION
 def study(
     name: str, out: Path | None, runs: int | None, workers: int | None, cluster: str | None, shard: str | None,

@@ -1,6 +1,6 @@
 """Edge. The alignment of a mirror as a picture: deviations in colour, and the moves of the adjusters in figures.
 
-Needs the extra ``plots`` (matplotlib), imported only when something is drawn.
+Imports matplotlib, which takes a second, only when something is drawn.
 """
 
 from math import ceil
@@ -44,7 +44,7 @@ def draw_alignment(mirror: Mirror, result: SurveyResult, out: Path, title: str, 
         subtitle: second line.
 
     Raises:
-        PictureError: matplotlib is not installed, or the file cannot be written.
+        PictureError: the file cannot be written.
     """
     figure, axes = new_deck_map(mirror, WIDTH_PX, DPI)
     colours = _colours(result)

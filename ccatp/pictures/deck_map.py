@@ -24,9 +24,6 @@ def new_deck_map(mirror: Mirror, width_px: float, dpi: float) -> "tuple[Figure, 
         mirror: what is shown.
         width_px: of the picture; its height follows.
         dpi: pixels an inch.
-
-    Raises:
-        PictureError: matplotlib is not installed.
     """
     low, high = mirror.rim.vertices.min(axis=0) - _MARGIN_M, mirror.rim.vertices.max(axis=0) + _MARGIN_M
     width = width_px / dpi

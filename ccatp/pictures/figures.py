@@ -1,6 +1,6 @@
 """Edge. Figures by matplotlib: made without a window, dressed alike, saved, with one clear error where that cannot be.
 
-Needs the extra ``plots`` (matplotlib), imported only when something is drawn.
+Imports matplotlib, which takes a second, only when something is drawn.
 """
 
 from pathlib import Path
@@ -33,14 +33,9 @@ def new_figure(
         width_in, height_in: its size, inches.
         dpi: pixels an inch.
         layout: how matplotlib places what is in it; None where every place is given.
-
-    Raises:
-        PictureError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second, and belongs to an extra
-    except ImportError as error:
-        raise PictureError("drawing needs matplotlib: install ccatp with its extra, ccatp[plots]") from error
+    from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second
+
     return Figure(figsize=(width_in, height_in), dpi=dpi, facecolor="white", layout=layout)
 
 

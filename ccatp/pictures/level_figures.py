@@ -1,6 +1,6 @@
 """Edge. Figures of signal strengths: path loss with its confidence, fixes with their regions, the fuzzy speed.
 
-Needs the extra ``plots`` (matplotlib), imported only when something is drawn.
+Imports matplotlib, which takes a second, only when something is drawn.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ def draw_path_loss(fit: PathLossFit, pairs: Sequence[LevelPair], name: str, out:
     """Levels over distance, the line, and where 95 % of new places are expected.
 
     Raises:
-        PictureError: matplotlib is not installed, or the file cannot be written.
+        PictureError: the file cannot be written.
     """
     figure = new_figure(7.0, 4.4)
     axes = figure.subplots()
@@ -48,7 +48,7 @@ def draw_fixes(
     """A panel for each point (at most twelve): its 90 % region, the fix, and where it was.
 
     Raises:
-        PictureError: matplotlib is not installed, or the file cannot be written.
+        PictureError: the file cannot be written.
     """
     shown = list(zip(fixes, truths, strict=True))[:12]
     columns = min(5, len(shown))
@@ -77,7 +77,7 @@ def draw_fuzzy(cfg: FuzzyConfig, out: Path) -> None:
     """The speed over distance and heading error, and the memberships of both.
 
     Raises:
-        PictureError: matplotlib is not installed, or the file cannot be written.
+        PictureError: the file cannot be written.
         FuzzyGapError: the rules leave a gap.
     """
     sugeno = Sugeno(cfg)

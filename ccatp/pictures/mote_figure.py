@@ -1,6 +1,6 @@
 """Edge. A map of motes as a picture: places with their ellipses, and the error after each update.
 
-Needs the extra ``plots`` (matplotlib), imported only when something is drawn.
+Imports matplotlib, which takes a second, only when something is drawn.
 """
 
 from collections.abc import Sequence
@@ -70,7 +70,7 @@ def draw_mote_map(picture: MapPicture, traces: Traces | None, out: Path) -> None
         out: the file; its suffix tells the format (PNG, PDF, SVG).
 
     Raises:
-        PictureError: matplotlib is not installed, or the file cannot be written.
+        PictureError: the file cannot be written.
     """
     figure = new_figure(11.0 if traces else 6.5, 6.5)
     panels = figure.subplots(1, 2 if traces else 1, squeeze=False)[0]

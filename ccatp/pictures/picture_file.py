@@ -1,6 +1,6 @@
 """Edge. Pictures as files: SVG by our own writer, PNG and PDF by matplotlib, shape by shape the same.
 
-Needs the extra ``plots`` (matplotlib) for PNG and PDF, imported only when such a file is written.
+Imports matplotlib, which takes a second, only when something is drawn.
 """
 
 from collections.abc import Iterator
@@ -40,7 +40,7 @@ def write_figures(picture: Picture, stem: Path) -> list[Path]:
     """Write a picture as ``stem.png``, at twice its size, and as ``stem.pdf``; returns the files.
 
     Raises:
-        PictureError: matplotlib is not installed, or a file cannot be written.
+        PictureError: a file cannot be written.
     """
     figure = _figure(picture)
     paths = [stem.with_name(stem.name + suffix) for suffix in (".png", ".pdf")]

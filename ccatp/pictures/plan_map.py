@@ -1,6 +1,6 @@
 """Edge. The way of a planned survey as a picture, coloured by the time at which the robot is there.
 
-Needs the extra ``plots`` (matplotlib), imported only when something is drawn.
+Imports matplotlib, which takes a second, only when something is drawn.
 """
 
 from itertools import pairwise
@@ -33,7 +33,7 @@ def draw_plan(mirror: Mirror, plan: SurveyPlan, out: Path) -> None:
         out: the file; its suffix tells the format (PNG, PDF, SVG).
 
     Raises:
-        PictureError: matplotlib is not installed, or the file cannot be written.
+        PictureError: the file cannot be written.
     """
     figure, axes = new_deck_map(mirror, WIDTH_PX, DPI)
     draw_base(axes, mirror)

@@ -1,6 +1,6 @@
 """Edge. The map of a run as a picture: panels, rim, driven path, and each point coloured by its arrival error.
 
-Needs the extra ``plots`` (matplotlib), imported only when something is drawn.
+Imports matplotlib, which takes a second, only when something is drawn.
 """
 
 import json
@@ -63,7 +63,7 @@ def draw_run_map(
         subtitle: second line: seed, world, errors.
 
     Raises:
-        PictureError: matplotlib is not installed, or the file cannot be written.
+        PictureError: the file cannot be written.
     """
     figure, axes = new_deck_map(mirror, WIDTH_PX, DPI)
     step = max(1, len(path_xy) // MAXPATH_POINTS)

@@ -1,6 +1,6 @@
 """Edge. Map and path of a recorded run as a picture: beacons with their ellipses, the path on the truth, the error.
 
-Needs the extra ``plots`` (matplotlib), imported only when something is drawn.
+Imports matplotlib, which takes a second, only when something is drawn.
 """
 
 from pathlib import Path
@@ -36,7 +36,7 @@ def draw_slam(run: RecordedRun, track: Track, judged: Judgement, out: Path, titl
         title: first line.
 
     Raises:
-        PictureError: matplotlib is not installed, or the file cannot be written.
+        PictureError: the file cannot be written.
     """
     beacons = aligned_beacons(track, judged.alignment)
     path = judged.alignment.moved(track.poses[:, :2])

@@ -64,11 +64,7 @@ def cells() -> Sequence[Cell]:
 
 
 def draw(results: Sequence[CellResult], out: Path) -> None:
-    """Figures ``ablation-<mirror>-<world>``, the mission with everything as a line.
-
-    Raises:
-        CampaignError: matplotlib is not installed.
-    """
+    """Figures ``ablation-<mirror>-<world>``, the mission with everything as a line."""
     for mirror, world in dict.fromkeys((str(c.factors["mirror"]), str(c.factors["world"])) for c in results):
         there = [c for c in results if (c.factors["mirror"], c.factors["world"]) == (mirror, world)]
         rows = [Row(_label(c), c, WORLDS.index(world), c.factors["without"] == ALL_ON) for c in there]

@@ -1,4 +1,4 @@
-"""Edge. Figures of the study `cricket`, as PNG and PDF. Needs the extra ``plots`` (matplotlib)."""
+"""Edge. Figures of the study `cricket`, as PNG and PDF."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,11 +19,7 @@ _CLOUD = 200  # runs shown as dots
 
 
 def draw_cricket(cells: Sequence[CellResult], out: Path) -> None:
-    """Traces (figures 11, 12, 14), clouds of maps (9, 10, 13), all ways beside each other.
-
-    Raises:
-        CampaignError: matplotlib is not installed.
-    """
+    """Traces (figures 11, 12, 14), clouds of maps (9, 10, 13), all ways beside each other."""
     found = {str(cell.factors["case"]): cell for cell in cells}
     for stem, names, title, goal_m in (
         ("figure_11_12", _POOR, "Few measurements: five pairs in a zigzag", 0.15),

@@ -12,11 +12,7 @@ _SPREAD = 0.3  # dots of a row lie beside each other
 
 
 def draw_faults(cells: Sequence[CellResult], out: Path) -> None:
-    """Figure ``faults``: every mission a dot, those that were not completed marked.
-
-    Raises:
-        CampaignError: matplotlib is not installed.
-    """
+    """Figure ``faults``: every mission a dot, those that were not completed marked."""
     figure = new_figure(7.0, 1.0 + 0.55 * len(cells))
     axes = figure.add_subplot()
     kinds = list(dict.fromkeys(cell.factors["faults"] for cell in cells))

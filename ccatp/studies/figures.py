@@ -1,11 +1,9 @@
-"""Edge. The look of the studies' figures. Needs the extra ``plots`` (matplotlib), imported when something is drawn."""
+"""Edge. The look of the studies' figures."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ccatp.pictures import figures
-from ccatp.pictures.figures import GRID, INK, QUIET, dress
-from ccatp.studies.campaign import CampaignError
+from ccatp.pictures.figures import GRID, INK, QUIET, dress, new_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,18 +20,6 @@ def colour(index: int) -> str:
     return CYCLE[index % len(CYCLE)]
 
 
-def new_figure(width_in: float, height_in: float) -> "Figure":
-    """As ``ccatp.pictures.figures.new_figure``.
-
-    Raises:
-        CampaignError: matplotlib is not installed.
-    """
-    try:
-        return figures.new_figure(width_in, height_in)
-    except figures.PictureError as error:
-        raise CampaignError(f"{error}, or add --no-figures") from error
-
-
 def save(figure: "Figure", stem: Path) -> None:
     """As PNG and as PDF.
 
@@ -41,4 +27,4 @@ def save(figure: "Figure", stem: Path) -> None:
         PictureError: a file cannot be written.
     """
     for suffix in (".png", ".pdf"):
-        figures.save_figure(figure, stem.with_suffix(suffix))
+        save_figure(figure, stem.with_suffix(suffix))

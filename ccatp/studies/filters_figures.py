@@ -26,11 +26,7 @@ _CONSISTENT = {"NEES of the pose": 3.0, "NEES of the position": 2.0, "NIS of the
 
 
 def draw_filters(cells: Sequence[CellResult], out: Path) -> None:
-    """Exceedance of localization and arrival errors, stop errors beside their bound, consistency.
-
-    Raises:
-        CampaignError: matplotlib is not installed.
-    """
+    """Exceedance of localization and arrival errors, stop errors beside their bound, consistency."""
     for mirror in dict.fromkeys(str(cell.factors["mirror"]) for cell in cells):
         there = [cell for cell in cells if cell.factors["mirror"] == mirror]
         _draw_exceedance(there, _localization, f"Localization error on {mirror}", out / f"localization-{mirror}")

@@ -1,6 +1,6 @@
 """Edge. The figures of the study `loops`, as PNG and PDF.
 
-Needs the extra ``plots`` (matplotlib), imported only when something is drawn.
+Imports matplotlib, which takes a second, only when something is drawn.
 """
 
 from collections.abc import Sequence
@@ -25,11 +25,7 @@ _WINDOW_CORNERS = 1.5  # the root locus shows this many times the servo's corner
 
 
 def draw_bode(loops: Sequence[Loop], margins: Sequence[Margins], out: Path) -> None:
-    """Draw magnitude and phase of the loops of one controller into ``bode_<gains>_<axis>.png`` and ``.pdf``.
-
-    Raises:
-        CampaignError: matplotlib is not installed.
-    """
+    """Draw magnitude and phase of the loops of one controller into ``bode_<gains>_<axis>.png`` and ``.pdf``."""
     figure = new_figure(8.0, 6.4)
     upper, lower = figure.subplots(2, 1, sharex=True)
     crossovers = [m.gain_crossover_rad_s for m in margins if np.isfinite(m.gain_crossover_rad_s)]
@@ -61,7 +57,6 @@ def draw_locus(loops: Sequence[Loop], out: Path) -> None:
     """Draw the root loci, each plant without and with the longest delay: ``rlocus_<gains>_<axis>.png`` and ``.pdf``.
 
     Raises:
-        CampaignError: matplotlib is not installed.
         LoopsError: python-control is not installed.
     """
     ends = {min(loop.delay_frames for loop in loops), max(loop.delay_frames for loop in loops)}

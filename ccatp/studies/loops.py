@@ -50,7 +50,7 @@ def run(cfg: Config, out: Path) -> dict[str, Any]:
         exist (a gain margin without a phase crossover) is None.
 
     Raises:
-        LoopsError: python-control or matplotlib is not installed.
+        LoopsError: python-control is not installed.
         OSError: ``out`` cannot be written.
     """
     started_s = time.perf_counter()

@@ -97,11 +97,7 @@ def band(runs: int) -> tuple[float, float]:
 
 
 def draw(cells: Sequence[CellResult], out: Path) -> None:
-    """Figure ``mote_navigation``: errors beside what is expected, and NEES in its band, over time.
-
-    Raises:
-        CampaignError: matplotlib is not installed.
-    """
+    """Figure ``mote_navigation``: errors beside what is expected, and NEES in its band, over time."""
     cell = cells[0]
     figure = new_figure(7.5, 5.6)
     above, below = figure.subplots(2, 1, sharex=True)

@@ -33,7 +33,6 @@ def run(cfg: Config, out: Path) -> dict[str, Any]:
         out: directory; made if it is not there.
 
     Raises:
-        CampaignError: matplotlib is not installed.
         OSError: ``out`` cannot be written.
     """
     began_s = time.perf_counter()

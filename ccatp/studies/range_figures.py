@@ -34,11 +34,7 @@ class Row(NamedTuple):
 
 
 def draw_ranges(rows: Sequence[Row], title: str, stem: Path) -> None:
-    """Mean as a dot, 99th percentile as the end of a bar.
-
-    Raises:
-        CampaignError: matplotlib is not installed.
-    """
+    """Mean as a dot, 99th percentile as the end of a bar."""
     figure = new_figure(10.5, 0.27 * len(rows) + 1.6)
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter  # noqa: PLC0415 - as in figures
 

@@ -10,11 +10,7 @@ _BASES = ("none", "all")
 
 
 def draw_sensitivity(cells: Sequence[CellResult], out: Path) -> None:
-    """One figure for each mirror, the undisturbed and the fully disturbed world as lines.
-
-    Raises:
-        CampaignError: matplotlib is not installed.
-    """
+    """One figure for each mirror, the undisturbed and the fully disturbed world as lines."""
     worlds = list(dict.fromkeys(cell.factors["world"] for cell in cells))
     for mirror in dict.fromkeys(str(cell.factors["mirror"]) for cell in cells):
         there = [cell for cell in cells if cell.factors["mirror"] == mirror]

@@ -10,11 +10,7 @@ _PARTS = ("measuring", "driving", "turning", "settling")
 
 
 def draw_time(cells: Sequence[CellResult], out: Path) -> None:
-    """One bar for each cell, stacked by what the robot does; one figure for each mirror.
-
-    Raises:
-        CampaignError: matplotlib is not installed.
-    """
+    """One bar for each cell, stacked by what the robot does; one figure for each mirror."""
     for mirror in dict.fromkeys(str(cell.factors["mirror"]) for cell in cells):
         there = [c for c in cells if c.factors["mirror"] == mirror and c.values["mission_time_s"] is not None]
         if there:

@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -289,16 +288,6 @@ def test_fields_that_cannot_be_mapped(capsys: pytest.CaptureFixture[str]) -> Non
     assert "N2-1 from N1-1, N1-2, N1-3: dilution of precision" in refusal(capsys, "--method", "ekf", *narrow)
     apart = ("--set", "cricket.layout=random", "--set", "cricket.random.count=30", "--set", "cricket.random.reach_m=9")
     assert "the motes fall into" in refusal(capsys, *apart)
-
-
-def test_without_matplotlib(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    path = ranges_file(tmp_path / "r.csv", ALL)
-    assert "install ccatp with its extra, ccatp[plots]" in refusal(
-        capsys, "--ranges", str(path), "--figure", str(tmp_path / "m.png")
-    )
 
 
 def test_a_figure_that_no_format_has(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,7 +1,6 @@
 """``ccatp radio slam``: the contract's JSON, the table, the picture, one line for each fault."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -128,14 +127,6 @@ def test_a_fault_is_one_line_and_status_2(
     out, err = capsys.readouterr()
     assert out == ""
     assert told in err.splitlines()[-1]
-
-
-def test_a_picture_without_matplotlib(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert main(["radio", "slam", str(recording), "--figure", str(tmp_path / "map.png")]) == 2
-    assert "ccatp[plots]" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("error", [FilterDiverged("prediction is not finite"), np.linalg.LinAlgError("singular")])

@@ -1,6 +1,5 @@
 """Pictures: scales, axes, thinned lines, and the same shapes as SVG, PNG and PDF."""
 
-import builtins
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -151,17 +150,3 @@ def test_files_that_cannot_be_written_are_told(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     with pytest.raises(PictureError, match=r"no/a\.png: cannot be written: No such file or directory"):
         write_figures(PICTURE, tmp_path / "no" / "a")
-
-
-def test_without_matplotlib_one_line_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    usual = builtins.__import__
-
-    def without(name: str, *args: object, **kwargs: object) -> object:
-        if name.startswith("matplotlib"):
-            raise ImportError(name)
-        return usual(name, *args, **kwargs)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(PictureError, match=r"drawing needs matplotlib: install ccatp with its extra, ccatp\[plots\]"):
-        write_figures(PICTURE, tmp_path / "a")
-    write_svg(PICTURE, tmp_path / "a.svg")

@@ -10,8 +10,7 @@ import pytest
 
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config, PidConfig
-from ccatp.studies import loop_figures, loop_models, loops
-from ccatp.studies.campaign import CampaignError
+from ccatp.studies import loop_models, loops
 from ccatp.studies.loop_models import Loop, LoopsError, margins, open_loop
 
 LAG_S, FRAME_S = 0.08, 0.01
@@ -151,11 +150,3 @@ def test_without_python_control(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "control", None)
     with pytest.raises(LoopsError, match=r"install ccatp\[tune\]"):
         loop_models.system(loop(FORWARD, "true"))
-
-
-def test_without_matplotlib(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    one = loop(FORWARD, "true")
-    known = margins(one)  # by python-control, which is there only with matplotlib
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(CampaignError, match=r"install ccatp with its extra, ccatp\[plots\]"):
-        loop_figures.draw_bode([one], [known], tmp_path)

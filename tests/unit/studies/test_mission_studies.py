@@ -11,7 +11,6 @@ from ccatp.config.loader import load_config
 from ccatp.studies import ablation_study, filters_study, sensitivity_study, time_study
 from ccatp.studies.campaign import CampaignError, CellResult, Job, plain
 from ccatp.studies.engine import CampaignOptions, run_campaign
-from ccatp.studies.figures import new_figure
 from ccatp.studies.plan import cells_of, jobs_of
 from ccatp.studies.registry import STUDIES, find_study
 from ccatp.studies.results import table
@@ -129,12 +128,6 @@ def test_every_row_of_the_registry_leads_to_a_study() -> None:
     for name in STUDIES:
         found = find_study(name)
         assert getattr(found, "name", name) == name
-
-
-def test_drawing_without_matplotlib_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
-    with pytest.raises(CampaignError, match=r"drawing needs matplotlib: install .*ccatp\[plots\], or add --no-figures"):
-        new_figure(1.0, 1.0)
 
 
 def test_a_job_has_a_name_that_tells_it_apart() -> None:
