@@ -19,7 +19,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
 .PHONY: help run test test-newest newest test-slow slow-tests new-examples sweep tried-in faults docs metrics lint format
-.PHONY: fast lock clean
+.PHONY: golden golden-quick fast lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -31,6 +31,7 @@ help:
 	@echo "make sweep            the part of that which drives over every centimetre of every rim; goes on where it was stopped"
 	@echo "make faults           docs/fault_table.md from what the last test runs showed and measured"
 	@echo "make docs             build/docs/index.html, and the parts of docs/ that are made from the code"
+	@echo "make golden           this tree against a base commit, both run here, bit for bit; make golden-quick: a few cases"
 	@echo "make metrics          size of the code base, calls and files per frame; ARGS=--names lists them"
 	@echo "make lint             lint, types, import contract"
 	@echo "make format           format the code"
@@ -84,6 +85,13 @@ docs: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.docs.generated
 	$(BIN)/python -m sphinx -W -q -b html docs build/docs
 	@echo "ccatp: build/docs/index.html"
+
+# Both run on this machine: linear algebra rounds differently on another one. ARGS=--list shows the cases.
+golden: $(VENV)/.installed-dev
+	@$(BIN)/python -m tests.golden $(ARGS)
+
+golden-quick: $(VENV)/.installed-dev
+	@$(BIN)/python -m tests.golden --quick --reuse-base $(ARGS)
 
 metrics: $(VENV)/.installed-dev
 	@$(BIN)/python -m tests.metrics $(ARGS)

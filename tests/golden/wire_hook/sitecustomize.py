@@ -1,0 +1,117 @@
+"""Writes down what passes a robot server, and acts at fixed frames. Python imports this module from PYTHONPATH.
+
+Where a process sends the first line of the robot link, its connection is written to CCATP_GOLDEN_DIR/wire.<n>, one line
+per message: ``>`` from or ``<`` to the robot, and the message; a frame that goes to several clients is written once.
+Nothing here depends on names of the package: the robot link and the channels are documented interfaces.
+
+CCATP_GOLDEN_ACTIONS is a JSON list of actions in their order. An action is done when the frame of that number is about
+to be sent for the first time. In lockstep every client has answered the frame before by then and waits, so that the
+action falls between the same two frames in each run.
+
+* ``endpoint``, ``request``: a request to a ROUTER socket; its reply goes to CCATP_GOLDEN_DIR/replies.
+* ``kill``: after so many seconds, in which other processes finish what they write in the background, the parent process
+  and this one end at once, as by ``kill -9``.
+"""
+
+import json
+import os
+import signal
+import socket
+import time
+from pathlib import Path
+from typing import Any
+from weakref import WeakKeyDictionary
+
+_HELLO = b'"hello"', b'"ccatp-robot/'
+_SENSORS = b'"sensors"'
+_REPLY_TIMEOUT_MS = 10_000
+_recv, _send = socket.socket.recv, socket.socket.send
+
+
+class _Wire:
+    """All connections of a process that is a robot server."""
+
+    def __init__(self, folder: Path, actions: list[dict[str, Any]]) -> None:
+        self._folder, self._actions = folder, actions
+        self._rests: WeakKeyDictionary[socket.socket, dict[bytes, bytes]] = WeakKeyDictionary()
+        self._last_frame = b""
+        self._file = -1
+
+    def is_known(self, connection: socket.socket, data: bytes) -> bool:
+        """Whether this is a connection of the robot link, or becomes one by its first line."""
+        if connection in self._rests:
+            return True
+        if not all(part in data for part in _HELLO):
+            return False
+        if self._file < 0:
+            self._file = _open_next(self._folder)
+        self._rests[connection] = {b"<": b"", b">": b""}
+        return True
+
+    def note(self, connection: socket.socket, direction: bytes, data: bytes) -> None:
+        rests = self._rests.get(connection)
+        if rests is None:
+            return
+        *lines, rests[direction] = (rests[direction] + data).split(b"\n")
+        for line in lines:
+            if direction == b">" and _SENSORS in line:
+                if line == self._last_frame:
+                    continue
+                self._last_frame = line
+            os.write(self._file, direction + line + b"\n")
+
+    def act_before(self, data: bytes) -> None:
+        for line in data.split(b"\n"):
+            while self._actions and _SENSORS in line and json.loads(line)["seq"] >= self._actions[0]["frame"]:
+                self._act(self._actions.pop(0))
+
+    def _act(self, action: dict[str, Any]) -> None:
+        if "kill" in action:
+            time.sleep(action["kill"])
+            os.kill(os.getppid(), signal.SIGKILL)
+            os.kill(os.getpid(), signal.SIGKILL)
+        reply = _ask(action["endpoint"], json.dumps(action["request"]).encode())
+        with (self._folder / "replies").open("ab") as file:
+            file.write(b"%d %s\n" % (action["frame"], reply))
+
+
+def _open_next(folder: Path) -> int:
+    for number in range(1000):
+        try:
+            return os.open(folder / f"wire.{number}", os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+        except FileExistsError:
+            continue
+    raise RuntimeError(f"{folder} is full of recordings of the robot link")
+
+
+def _ask(endpoint: str, request: bytes) -> bytes:
+    import zmq  # here, because the other processes need not wait for it
+
+    with zmq.Context() as context, context.socket(zmq.REQ) as peer:
+        peer.setsockopt(zmq.LINGER, 0)
+        peer.connect(endpoint)
+        peer.send(request)
+        return bytes(peer.recv()) if peer.poll(_REPLY_TIMEOUT_MS) else b"no reply"
+
+
+def _install(wire: _Wire) -> None:
+    def send(self: socket.socket, data: Any, *flags: int) -> int:
+        if not wire.is_known(self, bytes(data[:200])):
+            return _send(self, data, *flags)
+        wire.act_before(bytes(data))
+        sent = _send(self, data, *flags)
+        wire.note(self, b">", bytes(data[:sent]))
+        return sent
+
+    def recv(self: socket.socket, size: int, *flags: int) -> bytes:
+        data = _recv(self, size, *flags)
+        wire.note(self, b"<", data)
+        return data
+
+    socket.socket.send = send  # type: ignore[assignment,method-assign]
+    socket.socket.recv = recv  # type: ignore[assignment,method-assign]
+
+
+_folder = os.environ.get("CCATP_GOLDEN_DIR")
+if _folder is not None:
+    _install(_Wire(Path(_folder), json.loads(os.environ.get("CCATP_GOLDEN_ACTIONS", "[]"))))
