@@ -49,6 +49,8 @@ def main() -> int:
     except GoldenError as error:
         print(f"golden: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return 130
     equal = len(cases) - differing - failed
     print(f"{equal} of {len(cases)} cases equal to {options.base or renames.base}, {differing} differ, {failed} failed")
     return 2 if failed else 1 if differing else 0

@@ -9,6 +9,8 @@ from typing import Any
 
 _EMERGENCY_ID = "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"
 _SETTLING_S = 0.5  # what the other processes write in the background is on the disk by then
+_REPLY_S = 10.0
+_PAUSE_S = 1.0  # the reply comes when the robot is at rest, which takes frames: longer than it takes to be received
 
 
 @dataclass(frozen=True)
@@ -18,12 +20,14 @@ class Action:
     frame: int
     socket: str = ""
     request: dict[str, Any] | None = None
+    wait_s: float = _REPLY_S
 
     def resolved(self, runtime_dir: str) -> dict[str, Any]:
         """The action in the form that the hook reads."""
         if self.request is None:
             return {"frame": self.frame, "kill": _SETTLING_S}
-        return {"frame": self.frame, "endpoint": f"ipc://{runtime_dir}/{self.socket}", "request": self.request}
+        endpoint = f"ipc://{runtime_dir}/{self.socket}"
+        return {"frame": self.frame, "endpoint": endpoint, "request": self.request, "wait_s": self.wait_s}
 
 
 @dataclass(frozen=True)
@@ -119,15 +123,24 @@ def _others() -> list[Case]:
         Step(("replay", "{run}", "--json")),
         Step(("replay", "{run}", "--filter", "ukf", "--json")),
     )
+    operator = (
+        Action(1000, "control", {"cmd": "pause"}, _PAUSE_S),
+        Action(1030, "control", {"cmd": "resume"}),
+        Action(3000, "control", {"cmd": "abort"}),
+    )
     plans = tuple(
         Step(("plan", "--mirror", mirror, "--json")) for mirror in ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
     )
     return [
         Case("align", recorded, is_quick=True),
         Case("resume", (killed, _survey("--panels", "2", "--resume")), only_results=True),
+        Case("operator", (_survey("--panels", "1", actions=operator),)),
         Case("faults", (_survey("--panels", "1", "--faults", "{here}/fault_plan.toml"),)),
         *(Case(f"filter-{name}", (_survey("--panels", "1", "--filter", name),)) for name in ("kf", "ukf")),
-        *(Case(f"beacons-{system}", (_beacons(system),)) for system in ("zigbee", "follow", "cricket")),
+        *(
+            Case(f"beacons-{name}", (_beacons(name),), is_quick=name == "cricket")
+            for name in ("zigbee", "follow", "cricket")
+        ),
         Case("plan", plans),
     ]
 

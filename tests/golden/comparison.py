@@ -163,7 +163,7 @@ def _is_same(one: Any, other: Any) -> bool:
 
 
 def _shown_key(stream: str, key: tuple[int | str, ...]) -> str:
-    kind = "step" if stream in ("exit", "json") else "frame"
+    kind = {"exit": "step", "json": "step", "replies": "reply"}.get(stream, "frame")
     return f"{kind} {key[-1]}" if key else "the beginning"
 
 

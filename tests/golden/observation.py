@@ -41,7 +41,8 @@ def _observe_course(folder: Path, found: defaultdict[str, list[Row]]) -> None:
     """What happened frame by frame."""
     replies = folder / "replies"
     if replies.exists():
-        found["replies"] += [((k,), {"reply": line}) for k, line in enumerate(replies.read_text().splitlines())]
+        for k, line in enumerate(replies.read_text().splitlines()):
+            found["replies"].append(((k,), dict(flatten(_json_of(line), "reply"))))
     for part, path in enumerate(sorted(folder.glob("wire.*"))):
         found["frames"] += _frames(path, part)
     for part, path in enumerate(sorted((folder / "run").glob("*.mcap"))):

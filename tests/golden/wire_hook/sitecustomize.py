@@ -8,7 +8,8 @@ CCATP_GOLDEN_ACTIONS is a JSON list of actions in their order. An action is done
 to be sent for the first time. In lockstep every client has answered the frame before by then and waits, so that the
 action falls between the same two frames in each run.
 
-* ``endpoint``, ``request``: a request to a ROUTER socket; its reply goes to CCATP_GOLDEN_DIR/replies.
+* ``endpoint``, ``request``, ``wait_s``: a request to a ROUTER socket. CCATP_GOLDEN_DIR/replies takes its reply, or null
+  where there was none for so long: a reply that takes frames cannot come before the wait is over.
 * ``kill``: after so many seconds, in which other processes finish what they write in the background, the parent process
   and this one end at once, as by ``kill -9``.
 """
@@ -24,7 +25,6 @@ from weakref import WeakKeyDictionary
 
 _HELLO = b'"hello"', b'"ccatp-robot/'
 _SENSORS = b'"sensors"'
-_REPLY_TIMEOUT_MS = 10_000
 _recv, _send = socket.socket.recv, socket.socket.send
 
 
@@ -70,9 +70,9 @@ class _Wire:
             time.sleep(action["kill"])
             os.kill(os.getppid(), signal.SIGKILL)
             os.kill(os.getpid(), signal.SIGKILL)
-        reply = _ask(action["endpoint"], json.dumps(action["request"]).encode())
+        reply = _ask(action["endpoint"], json.dumps(action["request"]).encode(), action["wait_s"])
         with (self._folder / "replies").open("ab") as file:
-            file.write(b"%d %s\n" % (action["frame"], reply))
+            file.write(reply + b"\n")
 
 
 def _open_next(folder: Path) -> int:
@@ -84,14 +84,14 @@ def _open_next(folder: Path) -> int:
     raise RuntimeError(f"{folder} is full of recordings of the robot link")
 
 
-def _ask(endpoint: str, request: bytes) -> bytes:
+def _ask(endpoint: str, request: bytes, wait_s: float) -> bytes:
     import zmq  # here, because the other processes need not wait for it
 
     with zmq.Context() as context, context.socket(zmq.REQ) as peer:
         peer.setsockopt(zmq.LINGER, 0)
         peer.connect(endpoint)
         peer.send(request)
-        return bytes(peer.recv()) if peer.poll(_REPLY_TIMEOUT_MS) else b"no reply"
+        return bytes(peer.recv()) if peer.poll(round(1000 * wait_s)) else b"null"
 
 
 def _install(wire: _Wire) -> None:
