@@ -13,7 +13,7 @@ from tests.golden.observation import Observation, Row
 
 # In names of the base. Other topics and events are sent on the machine's clock, or follow from these.
 COMPARED = (
-    "exit", "summary", "json", "replies", "frames", "event:state",
+    "exit", "summary", "json", "replies", "frames", "event:state", "bus:verdict", "bus:estimate",
     "track", "fix", "rest", "arrival", "treatment", "danger_event", "log", "mission", "sensors", "truth",
     "misalignment", "beacon_track", "beacon_map", "beacon_arrival", "beacon_truth", "beacon_places",
 )  # fmt: skip

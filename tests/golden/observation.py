@@ -45,6 +45,9 @@ def _observe_course(folder: Path, found: defaultdict[str, list[Row]]) -> None:
             found["replies"].append(((k,), dict(flatten(_json_of(line), "reply"))))
     for part, path in enumerate(sorted(folder.glob("wire.*"))):
         found["frames"] += _frames(path, part)
+    for path in sorted(folder.glob("bus.*")):
+        for topic, row in _published(path):
+            found[f"bus:{topic}"].append(row)
     for part, path in enumerate(sorted((folder / "run").glob("*.mcap"))):
         for topic, key, fields in _recorded(path):
             found[topic].append(((part, *key), fields))
@@ -112,6 +115,14 @@ def _recorded(path: Path) -> Iterator[tuple[str, Key, dict[str, Any]]]:
                 is_list = isinstance(row, list)
                 fields = {str(k): value for k, value in enumerate(row)} if is_list else row
                 yield channel.topic, (row[0] if is_list else row.get("seq", -1),), fields
+
+
+def _published(path: Path) -> Iterator[tuple[str, Row]]:
+    for line in path.read_bytes().splitlines():
+        topic, _, text = line.decode("utf-8", "replace").partition(" ")
+        fields = _json_of(text)
+        if isinstance(fields, dict):
+            yield topic, ((fields.get("seq", -1),), fields)
 
 
 def _events(path: Path) -> Iterator[tuple[str, Row]]:

@@ -39,6 +39,9 @@ def left_behind(
     (folder / "exit.0").write_text("0")
     (folder / "out.0").write_text('{"places": {"a": [1.0, null]}, "warnings": ["far off"]}')
     (folder / "wire.0").write_text("\n".join(wire) + "\n")
+    (folder / "bus.0").write_text(
+        'verdict {"code":0,"value":0.1,"seq":1,"t_s":0.01}\ntiming {"tick_us":[1.5],"seq":1}\n'
+    )
     (run / "summary.json").write_text('{"points": {"total": 9}, "wall": {"time_s": 3.0}}')
     (run / "log.jsonl").write_text(json.dumps(state) + "\n" + '{"event": "run", "wall": "now"}\n')
     with (run / "telemetry.mcap").open("wb") as file:
@@ -78,6 +81,7 @@ def test_a_case_is_equal_to_itself_however_its_rows_are_batched(base: Observatio
         ("frames", 0, "fans.duty", [0.8, 0.9], "frame 0"),
         ("frames", 1, "sensors.t", 0.02, "frame 1"),
         ("event:state", 0, "after", "held", "frame 1"),
+        ("bus:verdict", 0, "value", 0.10000000000000002, "frame 1"),
         ("track", 1, "2", 1.2500000000000002, "frame 1"),
         ("summary", 0, "points.total", 8, "frame 0"),
         ("json", 0, "0.places.a.1", 0.0, "step 0"),

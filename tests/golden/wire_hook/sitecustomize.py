@@ -1,8 +1,9 @@
-"""Writes down what passes a robot server, and acts at fixed frames. Python imports this module from PYTHONPATH.
+"""Writes down what passes a robot server and the bus, and acts at fixed frames. Python imports this from PYTHONPATH.
 
 Where a process sends the first line of the robot link, its connection is written to CCATP_GOLDEN_DIR/wire.<n>, one line
 per message: ``>`` from or ``<`` to the robot, and the message; a frame that goes to several clients is written once.
-Nothing here depends on names of the package: the robot link and the channels are documented interfaces.
+What any process publishes by ZeroMQ goes to CCATP_GOLDEN_DIR/bus.<n>, but for long messages: set points have all their
+digits there. Nothing here depends on names of the package: the link and the channels are documented interfaces.
 
 CCATP_GOLDEN_ACTIONS is a JSON list of actions in their order. An action is done when the frame of that number is about
 to be sent for the first time. In lockstep every client has answered the frame before by then and waits, so that the
@@ -23,9 +24,12 @@ from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
 
+import zmq
+
 _HELLO = b'"hello"', b'"ccatp-robot/'
 _SENSORS = b'"sensors"'
 _recv, _send = socket.socket.recv, socket.socket.send
+_LONG_MESSAGE = 1000  # batches, which are in the recording
 
 
 class _Wire:
@@ -44,7 +48,7 @@ class _Wire:
         if not all(part in data for part in _HELLO):
             return False
         if self._file < 0:
-            self._file = _open_next(self._folder)
+            self._file = _open_next(self._folder, "wire")
         self._rests[connection] = {b"<": b"", b">": b""}
         return True
 
@@ -75,18 +79,16 @@ class _Wire:
             file.write(reply + b"\n")
 
 
-def _open_next(folder: Path) -> int:
+def _open_next(folder: Path, name: str) -> int:
     for number in range(1000):
         try:
-            return os.open(folder / f"wire.{number}", os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+            return os.open(folder / f"{name}.{number}", os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
         except FileExistsError:
             continue
-    raise RuntimeError(f"{folder} is full of recordings of the robot link")
+    raise RuntimeError(f"{folder} is full of files {name}")
 
 
 def _ask(endpoint: str, request: bytes, wait_s: float) -> bytes:
-    import zmq  # here, because the other processes need not wait for it
-
     with zmq.Context() as context, context.socket(zmq.REQ) as peer:
         peer.setsockopt(zmq.LINGER, 0)
         peer.connect(endpoint)
@@ -94,7 +96,21 @@ def _ask(endpoint: str, request: bytes, wait_s: float) -> bytes:
         return bytes(peer.recv()) if peer.poll(round(1000 * wait_s)) else b"null"
 
 
-def _install(wire: _Wire) -> None:
+def _write_down_bus(folder: Path) -> None:
+    send = zmq.Socket.send
+    files: list[int] = []
+
+    def publish(self: zmq.Socket[Any], data: Any, *arguments: Any, **options: Any) -> Any:
+        if self.type in (zmq.PUB, zmq.XPUB) and isinstance(data, bytes) and len(data) < _LONG_MESSAGE:
+            if not files:
+                files.append(_open_next(folder, "bus"))
+            os.write(files[0], data + b"\n")
+        return send(self, data, *arguments, **options)
+
+    zmq.Socket.send = publish  # type: ignore[method-assign]
+
+
+def _write_down_link(wire: _Wire) -> None:
     def send(self: socket.socket, data: Any, *flags: int) -> int:
         if not wire.is_known(self, bytes(data[:200])):
             return _send(self, data, *flags)
@@ -112,6 +128,6 @@ def _install(wire: _Wire) -> None:
     socket.socket.recv = recv  # type: ignore[assignment,method-assign]
 
 
-_folder = os.environ.get("CCATP_GOLDEN_DIR")
-if _folder is not None:
-    _install(_Wire(Path(_folder), json.loads(os.environ.get("CCATP_GOLDEN_ACTIONS", "[]"))))
+if (_folder := os.environ.get("CCATP_GOLDEN_DIR")) is not None:
+    _write_down_bus(Path(_folder))
+    _write_down_link(_Wire(Path(_folder), json.loads(os.environ.get("CCATP_GOLDEN_ACTIONS", "[]"))))
