@@ -4,11 +4,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.config.radio_models import RadioConfig
 from ccatp.radio.metrics import nees
 from ccatp.radio.rigid_alignment import aligned_rms_m, rms_m
+from ccatp.samples import FloatArray
 from ccatp.wire.beacon_rows import (
     TRACK_COLUMNS,
     TRUTH_COLUMNS,
@@ -19,7 +19,6 @@ from ccatp.wire.beacon_rows import (
     table,
 )
 
-FloatArray = NDArray[np.float64]
 WITHIN_SIGMAS = 3.0
 
 

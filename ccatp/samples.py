@@ -18,7 +18,12 @@ from enum import IntEnum, StrEnum
 from typing import NamedTuple
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 Vector3 = tuple[float, float, float]
 
 

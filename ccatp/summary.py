@@ -11,12 +11,11 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import DeckPose, EventCode, PanelId, PointId, Vector3
+from ccatp.samples import DeckPose, EventCode, FloatArray, PanelId, PointId, Vector3
 
-FloatArray = NDArray[np.float64]
 PanelFits = Mapping[PanelId, tuple[float, float, float]]  # piston (m), tip (rad), tilt (rad)
 
 WITHIN_M = 0.010  # the thesis's requirement, part of the names of two fields

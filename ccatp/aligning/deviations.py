@@ -4,13 +4,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.mirror.alignment import panel_deviations
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import Fix, PanelId, PointId
-
-FloatArray = NDArray[np.float64]
+from ccatp.samples import Fix, FloatArray, PanelId, PointId
 
 
 class Measured(NamedTuple):

@@ -12,10 +12,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from ccatp.samples import FloatArray
+
 Modes = Callable[[FloatArray], FloatArray]
 
 MAX_CONDITION = 1e4  # of columns of unit length; nine points of a panel give less than 10, points on a line infinity

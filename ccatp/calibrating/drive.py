@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from ccatp.localization.wheel_angles import WheelAngle
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import Fix
+from ccatp.samples import Fix, FloatArray
 from ccatp.wire.robot import Sensors
-
-FloatArray = NDArray[np.float64]
 
 # A frame in which no wheel turns further than this, and this many times what its noise sums up to, is one of rest.
 REST_RAD = 2e-6

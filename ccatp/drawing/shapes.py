@@ -3,10 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
+from ccatp.samples import FloatArray
 
-FloatArray = NDArray[np.float64]
 Anchor = Literal["start", "middle", "end"]
 Mark = Literal["disc", "ring", "cross"]
 

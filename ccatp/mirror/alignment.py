@@ -9,13 +9,10 @@ from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.mirror.errors import PanelFitError
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import DeckPose, PanelId, Vector3
-
-FloatArray = NDArray[np.float64]
+from ccatp.samples import DeckPose, FloatArray, PanelId, Vector3
 
 _PARAMETERS = 3
 # Of one row of points the tolerance of their arrivals, 10 mm, would make a plane: one with tilts of some 0.1 rad.

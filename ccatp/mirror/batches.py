@@ -9,9 +9,7 @@ from numpy.typing import NDArray
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.panels import Panel
 from ccatp.mirror.surface import Surface
-from ccatp.samples import PanelId, PanelPose
-
-FloatArray = NDArray[np.float64]
+from ccatp.samples import FloatArray, PanelId, PanelPose
 
 # Along the panel's normal down to the surface. It starts at the sag of some mm, on which the slope hardly changes: the
 # first step of Newton's leaves 2e-7 m, the second less than rounding.

@@ -4,7 +4,6 @@ from math import atan2, cos, pi, sin
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.angles import wrap_pi
 from ccatp.config.models import BaseConfig, CollimatorsConfig, MirrorConfig
@@ -14,9 +13,7 @@ from ccatp.mirror.layout import PanelGrid, Seam
 from ccatp.mirror.panels import POINTS_PER_PANEL, POINTS_PER_ROW, Panel, build_panel
 from ccatp.mirror.rim import build_rim
 from ccatp.mirror.surface import Axes, build_surface
-from ccatp.samples import DeckPose, PanelId, PanelPose, PointId, Vector3
-
-FloatArray = NDArray[np.float64]
+from ccatp.samples import DeckPose, FloatArray, PanelId, PanelPose, PointId, Vector3
 
 _MIN_CHANNELS = 4
 

@@ -5,13 +5,11 @@ from itertools import pairwise
 from math import hypot, inf, isfinite
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.mirror.errors import MirrorError
 from ccatp.mirror.layout import PanelGrid
 from ccatp.mirror.outline import Outline, Span
-
-FloatArray = NDArray[np.float64]
+from ccatp.samples import FloatArray
 
 Box = tuple[float, float, float]
 Point = tuple[float, float]

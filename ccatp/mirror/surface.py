@@ -4,13 +4,11 @@ from math import sqrt
 
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval2d
-from numpy.typing import NDArray
 
 from ccatp.config.models import SurfaceConfig
 from ccatp.mirror.errors import ConvergenceError
-from ccatp.samples import Vector3
+from ccatp.samples import FloatArray, Vector3
 
-FloatArray = NDArray[np.float64]
 Axes = tuple[Vector3, Vector3, Vector3]
 Jet = tuple[float, float, float, float, float, float]
 Third = tuple[float, float, float, float]

@@ -10,8 +10,8 @@ from scipy.sparse.csgraph import connected_components
 
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.motes.tdoa import MoteRange
+from ccatp.samples import FloatArray
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 _SHOWN = 6  # names in a message

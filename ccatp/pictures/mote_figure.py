@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ccatp.pictures.figures import GRID, INK, QUIET, dress, new_figure, save_figure
+from ccatp.samples import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FloatArray = NDArray[np.float64]
 
 FOUND, TRUE, DOUBT = "#0b3c5d", "#d08c00", "#c0392b"
 _CHI2_90 = 4.605  # of two degrees of freedom: the ellipse that holds nine of ten

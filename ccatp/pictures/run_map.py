@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.config.loader import load_config
 from ccatp.drawing.colours import PATH, SMALL_TO_LARGE
@@ -20,12 +19,12 @@ from ccatp.pictures.deck_map import add_colour_bar, draw_base, new_deck_map, wri
 from ccatp.pictures.figures import BAD, INK, QUIET, PictureError, save_figure
 from ccatp.reporting.points import arrival_error_m
 from ccatp.run_files.recorder import iter_messages, read_metadata, recordings
+from ccatp.samples import FloatArray
 from ccatp.storage.store import MissionStore, StoreError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FloatArray = NDArray[np.float64]
 
 WIDTH_PX = 1600
 DPI = 160

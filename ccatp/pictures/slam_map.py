@@ -7,17 +7,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from ccatp.pictures.figures import GRID, INK, QUIET, dress, new_figure, save_figure
 from ccatp.radio.judged import Judgement, aligned_beacons, truth_at
 from ccatp.radio.recording import RecordedRun, dead_reckoned
 from ccatp.radio.track import BeaconFix, Track
+from ccatp.samples import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FloatArray = npt.NDArray[np.float64]
 WIDTH_PX = 1800
 DPI = 180
 SIGMAS = 3.0  # of the ellipses

@@ -6,14 +6,11 @@ from math import ceil, floor, hypot, pi, tau
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.angles import difference
 from ccatp.config.models import MissionConfig, RobotConfig
 from ccatp.mirror.mirror import Mirror
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from ccatp.samples import BoolArray, FloatArray
 
 _BINS = 360
 _BIN_RAD = tau / _BINS

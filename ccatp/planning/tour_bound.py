@@ -12,10 +12,7 @@ from scipy.sparse import csr_array, vstack
 from ccatp.config.models import LimitsConfig
 from ccatp.mirror.mirror import Mirror
 from ccatp.planning.bound import STRAIGHT_RAD
-from ccatp.samples import PointId
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from ccatp.samples import FloatArray, IntArray, PointId
 
 # Legs to so many nearest places, at least, are told apart: the eight around a point of the grid. All further legs of
 # a place count as its shortest two of them.

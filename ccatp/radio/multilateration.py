@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from ccatp.samples import FloatArray
 
 _RANK_TOLERANCE = 1e-6  # smallest over largest singular value of H: below it the position is not determined
 _COPLANAR_TOLERANCE = 1e-9  # the same ratio for the anchors about their centroid: they lie in a plane (2-D: on a line)

@@ -3,9 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ccatp.samples import FloatArray
 
 
 class RigidMotion(NamedTuple):

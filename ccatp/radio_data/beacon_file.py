@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.config.toml_text import format_toml
 from ccatp.motes.range_network import MappingError
+from ccatp.samples import FloatArray
 
-FloatArray = NDArray[np.float64]
 _HEAD = "# Beacons, mapped by ccatp radio map: m, and the covariance of all coordinates in their order, m^2.\n\n"
 
 

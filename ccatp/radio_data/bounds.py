@@ -4,13 +4,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from ccatp.radio.recording import Readings, RecordedRun
 from ccatp.radio_data.cleaning import plural
 from ccatp.radio_data.errors import RadioDataError
+from ccatp.samples import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 LONGEST_RUN_S = 1e8  # three years
 LONGEST_STEP_M = 1e3  # between two rows of odometry
 LARGEST_TURN_RAD = 1e4  # likewise; degrees for radians stay far below it, and are told elsewhere

@@ -7,8 +7,8 @@ import numpy.typing as npt
 
 from ccatp.radio.recording import Steps
 from ccatp.radio_data.cleaning import long_pauses
+from ccatp.samples import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 BEFORE_S = 1.0
 """Over so long the speed before a gap is taken."""
 WINDOWS = 1000

@@ -10,7 +10,6 @@ from ccatp.radio_data.checks_of_readings import FEW, SCALE_WARNING, readings_aga
 from ccatp.radio_data.cleaning import GAP_S, long_pauses, plural
 from ccatp.radio_data.truth import chords, guessed_between, turn_at, turning_factor, way_at
 
-FloatArray = npt.NDArray[np.float64]
 TRUTH_GAP_S = 1.0
 SAME = 0.01  # odometry is the truth itself if single steps agree to that part of their size
 TURN_WARNING = 0.05

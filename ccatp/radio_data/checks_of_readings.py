@@ -7,9 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ccatp.radio.recording import RecordedRun, Truth
+from ccatp.samples import FloatArray, IntArray
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 MANY_SIGMA = 1.4826  # of a Gaussian, over its median absolute deviation
 SCALE_WARNING = 0.03
 OFFSET_WARNING_M = 0.1

@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ccatp.radio_data.text_table import Table
+from ccatp.samples import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 GAP_S = 2.0  # pauses shorter than that are how recorders work,
 GAP_RATIO = 20.0  # and so are those of a few usual intervals
 

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from ccatp.radio.recording import Readings, RecordedRun, Steps, Truth
 from ccatp.radio_data.bridging import bridged
@@ -12,7 +11,6 @@ from ccatp.radio_data.errors import RadioDataError
 from ccatp.radio_data.text_table import Table, read_table
 from ccatp.radio_data.truth import checked_heading, pose_of_truth
 
-FloatArray = npt.NDArray[np.float64]
 COLUMNS = {
     "DR": ("time [s]", "distance [m]", "turn [rad]"),
     "TD": ("time [s]", "sender", "beacon", "range [m]"),

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ccatp.radio_data.errors import RadioDataError
+from ccatp.samples import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 GZIP_MAGIC = b"\x1f\x8b"
 COMMENTS = ("#", "%", "//")
 

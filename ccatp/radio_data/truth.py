@@ -4,8 +4,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ccatp.radio.recording import Steps, Truth, dead_reckoned
+from ccatp.samples import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 CHORD_M = 0.2
 """Travel over which a course is told from positions: well above the centimetres of GNSS and camera references."""
 LONGEST_WAY_M = 1e6

@@ -5,13 +5,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.mirror.batches import FloatArray, deck_poses
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import PanelId, PanelPose
-
-IntArray = NDArray[np.int64]
+from ccatp.samples import IntArray, PanelId, PanelPose
 
 
 class Trace(NamedTuple):

@@ -4,17 +4,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ccatp.aligning.deviations import Measured
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import PanelId, PointId, Vector3
+from ccatp.samples import FloatArray, IntArray, PanelId, PointId, Vector3
 from ccatp.wire.topics import DangerEvent, FixMessage, MissionStatus
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 COMPLETE = "complete"
 WITHIN_MM = 10.0  # the thesis's requirement on arrivals

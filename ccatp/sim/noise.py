@@ -5,9 +5,8 @@ from itertools import chain, islice
 from math import exp, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ccatp.samples import FloatArray
 
 WHOLE = 1.5 * 2.0**52
 """``x + WHOLE - WHOLE`` is ``x`` rounded to a whole number while ``|x| < 2**51``: no call, no integer in between."""

@@ -8,12 +8,10 @@ Li and Kirubarajan 2001, 5.4). The stops count as independent: each begins a leg
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from ccatp.samples import FloatArray
 from ccatp.studies.mission_job import COLUMN
-
-FloatArray = NDArray[np.float64]
 
 _POSE = [COLUMN["error_x_m"], COLUMN["error_y_m"], COLUMN["error_heading_rad"]]
 _UPPER = [COLUMN[name] for name in ("p_xx", "p_xy", "p_xh", "p_yy", "p_yh", "p_hh")]

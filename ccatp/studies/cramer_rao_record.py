@@ -5,18 +5,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.config.models import Config
 from ccatp.localization.crossing import EdgeScanner, Transition
 from ccatp.localization.fixes import deck_foot
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import Fix, PanelId, PointId
+from ccatp.samples import Fix, FloatArray, PanelId, PointId
 from ccatp.studies.rehearsal import Rehearsing
 from ccatp.studies.rehearsal_result import Rehearsal
 from ccatp.wire.robot import Sensors
-
-FloatArray = NDArray[np.float64]
 
 T, X, Y, HX, HY, LX, LY, FX, FY, RIGHT, LEFT, RIGHT_SCALE, LEFT_SCALE, ORDERED = range(14)
 """Columns of the way.

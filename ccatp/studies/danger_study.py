@@ -10,14 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.mirror.mirror import build_mirror
+from ccatp.samples import FloatArray
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
 from ccatp.studies.danger_drives import RULES, Errors, drive_to_rim, transit
 from ccatp.studies.danger_figures import draw_danger
-
-FloatArray = NDArray[np.float64]
 
 SPEEDS_M_S = (0.05, 0.10, 0.15, 0.20)
 CROSSINGS: tuple[int | str, ...] = (0, 15, 30, 45, 60, "turn")

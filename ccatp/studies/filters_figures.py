@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ccatp.samples import FloatArray
 from ccatp.studies.campaign import CellResult
 from ccatp.studies.consistency import nees
 from ccatp.studies.figures import GRID, INK, LIMIT, QUIET, colour, dress, new_figure, save
@@ -16,7 +16,6 @@ from ccatp.studies.mission_job import COLUMN
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FloatArray = NDArray[np.float64]
 Curve = tuple[FloatArray, FloatArray]
 
 _SHOWN_MM = (0.01, 300.0)

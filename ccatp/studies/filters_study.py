@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.mirror.mirror import build_mirror
+from ccatp.samples import FloatArray
 from ccatp.studies.campaign import Cell, Column, Factors, Job, Outcome, Study
 from ccatp.studies.cramer_rao import bounds_of
 from ccatp.studies.cramer_rao_record import rehearse_recorded
@@ -14,8 +14,6 @@ from ccatp.studies.filters_figures import draw_filters
 from ccatp.studies.mission_cell import combine_missions
 from ccatp.studies.mission_job import mission_outcome
 from ccatp.studies.rehearsal import rehearse
-
-FloatArray = NDArray[np.float64]
 
 WORLDS = ("thesis", "thesis-x2", "hard", "extreme")
 FILTERS = ("kf", "ekf", "ukf")

@@ -15,11 +15,11 @@ from scipy.optimize import brentq
 from ccatp.angles import wrap_pi
 from ccatp.config.models import Config, ControlConfig, LimitsConfig, PidConfig
 from ccatp.errors import CcatpError, ExitStatus
+from ccatp.samples import FloatArray
 
 if TYPE_CHECKING:
     from control import TransferFunction
 
-FloatArray = NDArray[np.float64]
 Coefficients = tuple[float, ...]
 """A polynomial in s, highest power first."""
 

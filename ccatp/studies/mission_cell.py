@@ -6,13 +6,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ccatp.samples import FloatArray
 from ccatp.studies.campaign import Arrays, Factors, Outcome
 from ccatp.studies.consistency import nees_figures, nis_figures
 from ccatp.studies.mission_job import COLUMN
 from ccatp.studies.spread import Spread, pooled
 from ccatp.summary import WITHIN_M
-
-FloatArray = NDArray[np.float64]
 
 
 def combine_missions(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:

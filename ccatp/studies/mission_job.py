@@ -3,18 +3,15 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import PointId, Vector3
+from ccatp.samples import FloatArray, PointId, Vector3
 from ccatp.studies.campaign import Job, Outcome
 from ccatp.studies.rehearsal import rehearse
 from ccatp.studies.rehearsal_result import Rehearsal, StopRow
 from ccatp.studies.spread import Spread
 from ccatp.summary import WITHIN_M, PuckTarget, puck_targets
-
-FloatArray = NDArray[np.float64]
 
 # Columns of the array ``stops``: one row for each measurement, in the order they were taken. Errors are true minus
 # estimated, deck frame, before the fix; the covariance is that of x, y, heading, upper triangle row by row.

@@ -5,16 +5,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from ccatp.radio.metrics import nees
+from ccatp.samples import FloatArray
 from ccatp.studies.beacon_rehearsal import rehearse_beacons
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
 from ccatp.studies.figures import INK, LIMIT, QUIET, colour, dress, new_figure, save
 from ccatp.wire.beacon_rows import PoseTrack, PoseTruth, pose_errors
-
-FloatArray = NDArray[np.float64]
 
 SECOND = 10  # frames; errors are compared once in so many
 _STATES = 3  # x, y, heading

@@ -4,14 +4,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from ccatp.config.radio_models import RadioConfig
+from ccatp.samples import FloatArray
 from ccatp.studies.campaign import Column, Factors, Job, Outcome
 from ccatp.studies.radio_run import RadioRun, run_radio
-
-FloatArray = NDArray[np.float64]
 
 SETTLED_SHARE = 0.3  # of a run: errors over time are counted after it, when radios have been found
 _CURVE_EVERY = 10  # steps between the points of a curve

@@ -3,17 +3,15 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.angles import wrap_pi
 from ccatp.config.radio_models import RadioConfig
 from ccatp.radio.beacon_loop import BeaconLoop
 from ccatp.radio.motion import Pose
 from ccatp.radio.signal_settings import odometry_of, vehicle_of
+from ccatp.samples import FloatArray
 from ccatp.sim.radio.frame import DriveCommand
 from ccatp.sim.radio.world import RadioWorld
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(slots=True)

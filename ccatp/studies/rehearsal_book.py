@@ -5,17 +5,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.assembly import Parts
 from ccatp.mirror.alignment import PanelMisalignment
 from ccatp.mirror.batches import deck_poses
 from ccatp.mission import Mission
-from ccatp.samples import PanelId, PanelPose
+from ccatp.samples import FloatArray, PanelId, PanelPose
 from ccatp.sim.world import TruthRow
 from ccatp.summary import RunFacts, SummaryBuilder, puck_targets
-
-FloatArray = NDArray[np.float64]
 
 _BATCH = 1000  # frames that go to the summary at a time
 _RECENT = 64  # frames of truth at hand: more than any delay of the sensors

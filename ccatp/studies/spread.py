@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from ccatp.samples import FloatArray, IntArray
 
 PER_DECADE = 1000
 LEAST = 1e-9  # anything smaller falls into the first bin

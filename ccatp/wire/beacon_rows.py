@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ccatp.samples import FloatArray
 
 TRACK_COLUMNS, TRUTH_COLUMNS = 13, 8
 _COVARIANCE = [5, 6, 8, 6, 7, 9, 8, 9, 10]  # told as xx, xy, yy, xh, yh, hh

@@ -11,8 +11,8 @@ from ccatp.radio.batch.arrow import ArrowSystem
 from ccatp.radio.batch.reckoning import CALIBRATION, Reckoning
 from ccatp.radio.batch.settings import BatchPriors, BatchSettings, RadioNoise
 from ccatp.radio.recording import Readings, Steps
+from ccatp.samples import IntArray
 
-IntArray = npt.NDArray[np.int64]
 OF_READINGS = ("range_scale", "range_offset_m", "bearing_offset_rad", "rssi_reference_db", "rssi_exponent")
 SHARED = (*CALIBRATION, *OF_READINGS)
 """Unknowns that are neither pose nor beacon, in the order of the state: corrections, zero where all is as it should."""

@@ -3,11 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.config.cricket_models import CricketConfig, MotePlaceConfig
-
-FloatArray = NDArray[np.float64]
+from ccatp.samples import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

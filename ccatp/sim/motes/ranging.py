@@ -5,12 +5,10 @@ from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.config.cricket_models import CricketConfig, TransducerConfig
+from ccatp.samples import FloatArray
 from ccatp.sim.motes.layout import TrueMotes
-
-FloatArray = NDArray[np.float64]
 
 _ABSOLUTE_ZERO_C = -273.15
 

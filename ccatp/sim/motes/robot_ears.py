@@ -6,16 +6,14 @@ The motes send one after the other, round by round; who hears a pulse hears it a
 from math import hypot, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ccatp.config.beacon_models import ListenerConfig
 from ccatp.config.cricket_models import CricketConfig
+from ccatp.samples import FloatArray
 from ccatp.sim.motes.layout import TrueMotes
 from ccatp.sim.motes.ranging import MoteField, usable_reach
 from ccatp.sim.radio.frame import TruePose
 from ccatp.wire.beacon_frame import MoteBurst
-
-FloatArray = NDArray[np.float64]
 
 _ABSOLUTE_ZERO_C = -273.15
 _DIGITS = 9  # of a delay on the link: a nanosecond is a third of a micrometre
