@@ -16,9 +16,9 @@ from collections import Counter, deque
 from math import inf, isfinite, log, sin, sqrt
 
 from ccatp.config.radio_models import RadioConfig
-from ccatp.hazards.abort_latch import HEARD_AFTER_FRAMES, AbortLatch, EmergencyKind, is_at_base_or_held
+from ccatp.hazards.abort_latch import HEARD_AFTER_FRAMES, AbortLatch, is_at_base_or_held
 from ccatp.hazards.echo_memory import EchoMemory
-from ccatp.samples import EventCode, Severity, Verdict
+from ccatp.samples import EmergencyKind, EventCode, Severity, Verdict
 from ccatp.wire.beacon_frame import BeaconFrame
 from ccatp.wire.robot import Sensors
 from ccatp.wire.topics import Estimate

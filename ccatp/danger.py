@@ -21,7 +21,7 @@ from math import isfinite
 from typing import NamedTuple, Protocol
 
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
-from ccatp.hazards.abort_latch import HEARD_AFTER_FRAMES, AbortLatch, EmergencyKind, is_at_base_or_held
+from ccatp.hazards.abort_latch import HEARD_AFTER_FRAMES, AbortLatch, is_at_base_or_held
 from ccatp.hazards.edge_episode import Episode, Phase
 from ccatp.hazards.edge_map import EdgeMap, MirrorMap
 from ccatp.hazards.edge_rule import EdgeRule, PoseEstimate
@@ -32,7 +32,7 @@ from ccatp.health.garbled import GarbledLines
 from ccatp.health.ladder import Ladder, denies, gravest
 from ccatp.health.seams import Ground
 from ccatp.health.steady_time import SteadyTime
-from ccatp.samples import Corner, EdgeSample, EventCode, Severity, Verdict, WheelSample
+from ccatp.samples import Corner, EdgeSample, EmergencyKind, EventCode, Severity, Verdict, WheelSample
 
 CORNERS = tuple(Corner)
 CLOCK_JUMP_S = 0.1

@@ -230,3 +230,13 @@ class Stop:
     point: PointId | None = None
     reverse: bool = False
     heading_rad: float | None = None
+
+
+class EmergencyKind(StrEnum):
+    """Causes of an abort (interface control document 3)."""
+
+    EARTHQUAKE = "earthquake"
+    FIRE = "fire"
+    POWER = "power"
+    WEATHER = "weather"
+    OPERATOR = "operator"

@@ -1,11 +1,10 @@
 """Pure. Emergencies of the observatory: latched, one entry per id, each with its clear condition."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import msgspec
 
-from ccatp.samples import Verdict
+from ccatp.samples import EmergencyKind, Verdict
 
 # An observatory has a handful at a time; a peer that floods the latch must not fill the memory.
 MAX_ACTIVE = 256
@@ -14,16 +13,6 @@ MAX_CLEARED = 1024
 HEARD_AFTER_FRAMES = 2
 # The mission's states (``ccatp.surveying.states``) in which the robot stands at base or is held.
 AT_BASE_OR_HELD = frozenset({"idle", "held", "done"})
-
-
-class EmergencyKind(StrEnum):
-    """Causes of an abort (interface control document 3)."""
-
-    EARTHQUAKE = "earthquake"
-    FIRE = "fire"
-    POWER = "power"
-    WEATHER = "weather"
-    OPERATOR = "operator"
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import structlog
 
-from ccatp.hazards.abort_latch import AbortLatch, Emergency, EmergencyKind
+from ccatp.hazards.abort_latch import AbortLatch, Emergency
+from ccatp.samples import EmergencyKind
 
 FILE = "emergencies.json"
 # A latch of some hundred emergencies, and as many that were cleared.

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from ccatp.reporting.findings import Findings
 from ccatp.reporting.html import folded, shown, table, text
 from ccatp.reporting.page import Section
-from ccatp.reporting.record import LogLine
+from ccatp.run_files.state_log import LogLine
 
 _FEW = 40
 _CLASSES = {"error": "bad", "critical": "bad", "warning": "mid"}

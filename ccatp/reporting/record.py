@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from ccatp.aligning.deviations import Measured
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror
+from ccatp.run_files.state_log import LogLine, StateChange
 from ccatp.samples import FloatArray, IntArray, PanelId, PointId, Vector3
 from ccatp.wire.topics import DangerEvent, FixMessage, MissionStatus
 
@@ -49,24 +50,6 @@ class Arrived(NamedTuple):
     seq: int
     t_s: float
     estimated_error_mm: float
-
-
-class StateChange(NamedTuple):
-    """At frame ``seq`` the mission went from one state to another."""
-
-    seq: int
-    before: str
-    after: str
-
-
-class LogLine(NamedTuple):
-    """A line of the log: wall time (ISO), robot time where it is known, level, process, text."""
-
-    wall: str
-    t_s: float | None
-    level: str
-    process: str
-    text: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,8 +11,9 @@ import numpy as np
 from ccatp.mirror.batches import deck_rows
 from ccatp.mirror.errors import MirrorError
 from ccatp.mirror.mirror import Mirror
-from ccatp.reporting.record import Arrived, FloatArray, Session, StateChange, Track, Truth
+from ccatp.reporting.record import Arrived, FloatArray, Session, Track, Truth
 from ccatp.run_files.recorder import iter_messages, read_metadata
+from ccatp.run_files.state_log import StateChange
 from ccatp.run_files.writing import damage_text
 from ccatp.samples import PointId
 from ccatp.wire.topics import Arrival, BadMessage, DangerEvent, FixMessage, Message, MissionStatus, unpack

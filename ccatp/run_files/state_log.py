@@ -7,13 +7,30 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ccatp.danger_text import danger_text
-from ccatp.reporting.record import LogLine, StateChange
 
 # Fields of every line; the others say more of what happened.
 _OWN = frozenset(("process", "event", "level", "wall", "seq", "t_s"))
 _DEBUG = "debug"
 # At the end of a field's name.
 _UNITS = frozenset(("s", "ms", "us", "m", "mm", "um", "rad", "mrad"))
+
+
+class StateChange(NamedTuple):
+    """At frame ``seq`` the mission went from one state to another."""
+
+    seq: int
+    before: str
+    after: str
+
+
+class LogLine(NamedTuple):
+    """A line of the log: wall time (ISO), robot time where it is known, level, process, text."""
+
+    wall: str
+    t_s: float | None
+    level: str
+    process: str
+    text: str
 
 
 class ReadLine(NamedTuple):

@@ -11,8 +11,7 @@ from uuid import UUID
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from ccatp.hazards.abort_latch import EmergencyKind
-from ccatp.samples import EventCode
+from ccatp.samples import EmergencyKind, EventCode
 
 T = TypeVar("T")
 

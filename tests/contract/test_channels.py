@@ -11,7 +11,7 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from ccatp.hazards.abort_latch import AbortLatch, EmergencyKind
+from ccatp.hazards.abort_latch import AbortLatch
 from ccatp.router import (
     BUSY,
     HIGH_WATER_MARK,
@@ -25,7 +25,7 @@ from ccatp.router import (
     request,
     split_envelope,
 )
-from ccatp.samples import EventCode
+from ccatp.samples import EmergencyKind, EventCode
 from ccatp.wire.channels import (
     MAX_REQUEST_BYTES,
     BadRequest,

@@ -18,12 +18,12 @@ from msgspec.structs import replace
 
 from ccatp.config.loader import load_config
 from ccatp.config.models import Config
-from ccatp.hazards.abort_latch import AbortLatch, EmergencyKind
+from ccatp.hazards.abort_latch import AbortLatch
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.planning.bound import path_time
 from ccatp.planning.way_home import plan_way_home
 from ccatp.router import REPEAT_S, RequestFailed, request
-from ccatp.samples import DeckPose, EventCode, Severity, Verdict
+from ccatp.samples import DeckPose, EmergencyKind, EventCode, Severity, Verdict
 from ccatp.surveying.budget import home_time_s
 from ccatp.surveying.orders import Order
 from ccatp.surveying.states import State

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule, run_state_machine_as_test
 
 from ccatp.config.loader import load_config
-from ccatp.hazards.abort_latch import EmergencyKind
+from ccatp.samples import EmergencyKind
 from ccatp.surveying.states import DONE
 from tests.property.stage import Stage
 

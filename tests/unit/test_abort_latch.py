@@ -2,14 +2,8 @@
 
 import pytest
 
-from ccatp.hazards.abort_latch import (
-    AT_BASE_OR_HELD,
-    MAX_ACTIVE,
-    MAX_CLEARED,
-    AbortLatch,
-    EmergencyKind,
-    is_at_base_or_held,
-)
+from ccatp.hazards.abort_latch import AT_BASE_OR_HELD, MAX_ACTIVE, MAX_CLEARED, AbortLatch, is_at_base_or_held
+from ccatp.samples import EmergencyKind
 from ccatp.surveying.states import State
 
 

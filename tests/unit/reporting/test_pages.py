@@ -14,10 +14,10 @@ from ccatp.reporting.findings import findings_of, outcome_of
 from ccatp.reporting.html import clock, shown, text
 from ccatp.reporting.page import POLICY
 from ccatp.reporting.pair import pair_of
-from ccatp.reporting.record import LogLine
 from ccatp.reporting.run_page import run_page
 from ccatp.reporting.sections import SECTIONS
 from ccatp.run_files.report_reader import read_record
+from ccatp.run_files.state_log import LogLine
 from tests.unit.reporting.markup import Markup
 from tests.unit.reporting.recorded import record
 

@@ -7,9 +7,10 @@ import msgspec
 import pytest
 
 from ccatp.assembly import assemble
-from ccatp.reporting.record import RunRecord, Session, StateChange
+from ccatp.reporting.record import RunRecord, Session
 from ccatp.reporting.time_budget import least_times, sampled_spells, spells_of, time_budget
 from ccatp.run_files.report_reader import read_record
+from ccatp.run_files.state_log import StateChange
 from ccatp.wire.topics import MissionStatus
 
 
