@@ -1,4 +1,4 @@
-"""Glue. ``python -m ccatp``."""
+"""``python -m ccatp``."""
 
 import sys
 

@@ -1,17 +1,17 @@
-"""Pure. The danger loop's rules and their arbitration: from one sensors frame to one verdict (thesis 3.4).
+"""The danger loop's rules and their arbitration: from one sensors frame to one verdict (thesis 3.4).
 
 Permits are the conjunction of all rules. The code is that of the most urgent: an edge (1) outranks an abort (2), which
 outranks normal operation (0). The cause is that of the rule that takes the most away.
 
-* all four edge sensors off: code 1, nothing permitted (``ccatp.hazards.edge_rule``, rule h);
+* all four edge sensors off: code 1, nothing permitted (``ccatp.safety.edge_rule``, rule h);
 * an edge declared: code 1, no motion towards a sensor that hangs over, no turn but back;
-* the robot's centre about to drive over the rim on the map: likewise (``ccatp.hazards.origin_rule``);
+* the robot's centre about to drive over the rim on the map: likewise (``ccatp.safety.edge_rule``);
 * edge samples, encoder samples or the estimate missing or older than allowed: nothing permitted, no code of its own;
   ends by itself as soon as they are fresh again;
-* an emergency: code 2, latched, motion permitted, because the robot shall drive home (``ccatp.hazards.abort_latch``);
-  in an earthquake nothing is permitted until it is cleared.
+* an emergency: code 2, latched, motion permitted, because the robot shall drive home
+  (``ccatp.safety.emergency_latch``); in an earthquake nothing is permitted until it is cleared.
 
-Beside these the monitors of ``ccatp.health`` look at every frame. What they find has a severity; the gravest wins and
+The monitors of ``ccatp.safety.monitor`` check every frame. Each finding has a severity; the gravest wins and
 gives the verdict its cause, and any finding that holds the wheels withholds the permit, whatever else is going on. An
 edge that is to be left keeps its code and its cause as long as nothing holds the wheels.
 """
@@ -21,18 +21,14 @@ from math import isfinite
 from typing import NamedTuple, Protocol
 
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
-from ccatp.hazards.abort_latch import HEARD_AFTER_FRAMES, AbortLatch, is_at_base_or_held
-from ccatp.hazards.edge_episode import Episode, Phase
-from ccatp.hazards.edge_map import EdgeMap, MirrorMap
-from ccatp.hazards.edge_rule import EdgeRule, PoseEstimate
-from ccatp.hazards.origin_rule import OriginRule
-from ccatp.health.board import Commanded, Frame, HealthBoard
-from ccatp.health.findings import Finding
-from ccatp.health.garbled import GarbledLines
-from ccatp.health.ladder import Ladder, denies, gravest
-from ccatp.health.seams import Ground
-from ccatp.health.steady_time import SteadyTime
-from ccatp.samples import Corner, EdgeSample, EmergencyKind, EventCode, Severity, Verdict, WheelSample
+from ccatp.core import Corner, EdgeSample, EmergencyKind, EventCode, Severity, Verdict, WheelSample
+from ccatp.safety.edge_detector import EdgeMap, Episode, MirrorMap, Phase
+from ccatp.safety.edge_rule import EdgeRule, OriginRule, PoseEstimate
+from ccatp.safety.emergency_latch import HEARD_AFTER_FRAMES, AbortLatch, is_at_base_or_held
+from ccatp.safety.escalation import Finding, Ladder, denies, gravest
+from ccatp.safety.monitor import Commanded, Frame, HealthBoard
+from ccatp.safety.robot_clock import SteadyTime
+from ccatp.safety.sensor_monitors import GarbledLines, Ground
 
 CORNERS = tuple(Corner)
 CLOCK_JUMP_S = 0.1

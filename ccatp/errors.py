@@ -1,4 +1,4 @@
-"""Pure. The errors that end a command: each is one line for the reader and an exit status for scripts."""
+"""The errors that end a command: each is one line for the reader and an exit status for scripts."""
 
 from collections.abc import Sequence
 from enum import IntEnum

@@ -1,7 +1,11 @@
-"""Edge. Client of the MultiLine server: lengths over TCP, multilaterated to the position of the puck.
+"""Client of the MultiLine server: lengths over TCP, multilaterated to the position of the puck.
 
 A connection that has failed a request in any way, or that has said something unasked, is closed: the next request
 makes another, so that a late reply can never answer it. A fix is a function of the replies and the arguments alone.
+
+One connection to a MultiLine server: a line asked for at a time, or the lines of its push stream.
+
+Why a measurement of the laser system gave no fix.
 """
 
 import asyncio
@@ -9,28 +13,16 @@ from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
 from math import dist
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ccatp.config.models import EtalonConfig
-from ccatp.etalon_errors import (
-    BadSolution,
-    EtalonBadReply,
-    EtalonError,
-    EtalonServerError,
-    EtalonTimeout,
-    EtalonUnreachable,
-    StaleLengths,
-    TooFewChannels,
-)
-from ccatp.etalon_link import EtalonLink, PushQueue
-from ccatp.radio.multilateration import MultilaterationError
-from ccatp.radio.puck_fix import solve_fix
-from ccatp.samples import Fix, Vector3
-from ccatp.wire import multiline
-from ccatp.wire.multiline import (
+from ccatp.core import Fix, Vector3
+from ccatp.errors import CcatpError, ExitStatus
+from ccatp.links import multiline
+from ccatp.links.multiline import (
     ChannelData,
     Command,
     Connected,
@@ -41,19 +33,160 @@ from ccatp.wire.multiline import (
     Reply,
     Request,
 )
+from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 
-__all__ = [
-    "BadSolution",
-    "EtalonBadReply",
-    "EtalonClient",
-    "EtalonError",
-    "EtalonServerError",
-    "EtalonTimeout",
-    "EtalonUnreachable",
-    "Readiness",
-    "StaleLengths",
-    "TooFewChannels",
-]
+PushQueue = asyncio.Queue[bytes | None]  # lines of the push stream; None: the connection is gone
+
+_STREAM_LINES = 64  # lines of the push stream kept for a slow reader; older ones are dropped
+
+
+class EtalonLink(asyncio.Protocol):
+    """One connection.
+
+    Attributes:
+        fault: why it must not be used again; empty while it may.
+    """
+
+    def __init__(self) -> None:
+        self.fault = ""
+        self._unasked = False
+        self._stream: PushQueue | None = None
+        self._lines = multiline.LineSplitter()
+        self._waiting: asyncio.Future[bytes] | None = None
+        self._transport: asyncio.Transport | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Called by asyncio."""
+        self._transport = cast(asyncio.Transport, transport)  # a TCP connection has no other
+
+    def data_received(self, data: bytes) -> None:
+        """Called by asyncio: deliver whole lines."""
+        self._lines.feed(data)
+        try:
+            while not self.fault and (line := self._lines.next_line()) is not None:
+                self._deliver(line)
+        except multiline.LineTooLong as error:
+            self._fail(error)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Called by asyncio."""
+        self._fail(ConnectionError(f"connection lost: {exc}" if exc else "server closed the connection"))
+
+    def _deliver(self, line: bytes) -> None:
+        if self._stream is not None:
+            self._push(self._stream, line)
+        elif self._waiting is not None and not self._waiting.done():
+            self._waiting.set_result(line)
+        else:
+            self._unasked = True
+            self._fail(ConnectionError("server sent a line unasked"))
+
+    def _fail(self, error: Exception) -> None:
+        self.fault = self.fault or str(error)
+        if self._waiting is not None and not self._waiting.done():
+            self._waiting.set_exception(error)
+        if self._stream is not None:
+            self._push(self._stream, None)
+        self.abort()
+
+    @staticmethod
+    def _push(stream: PushQueue, line: bytes | None) -> None:
+        if stream.full():
+            stream.get_nowait()
+        stream.put_nowait(line)
+
+    @property
+    def is_clean(self) -> bool:
+        """Free of faults and leftovers: fit for the next request."""
+        return not self.fault and not self.has_leftovers
+
+    @property
+    def has_leftovers(self) -> bool:
+        """More came than was asked for, so no line can be trusted to answer what it seems to."""
+        return self._unasked or self._lines.pending
+
+    async def ask(self, request: Request) -> bytes:
+        """Send and wait for one line; the deadline is the caller's.
+
+        Raises:
+            ConnectionError: the connection is lost.
+            LineTooLong: the reply never ends.
+        """
+        self._waiting = asyncio.get_running_loop().create_future()
+        self.send(request)
+        return await self._waiting
+
+    def start_stream(self) -> PushQueue:
+        """From now on, lines go into the queue returned."""
+        self._stream = asyncio.Queue(_STREAM_LINES)
+        return self._stream
+
+    def send(self, request: Request) -> None:
+        """Send without waiting for anything.
+
+        Raises:
+            ConnectionError: the connection is lost.
+        """
+        if self._transport is None or self.fault:
+            raise ConnectionError(self.fault or "not connected")
+        self._transport.write(multiline.format_request(request))
+
+    def abort(self) -> None:
+        """Close at once; the other end's bytes, sent or to come, are lost."""
+        self.fault = self.fault or "closed"
+        if self._transport is not None:
+            self._transport.abort()
+
+
+class EtalonError(CcatpError):
+    """Base: no fix. The message says what, where and what to do, in one line."""
+
+    exit_status = ExitStatus.UNREACHABLE
+
+
+class EtalonUnreachable(EtalonError):
+    """No connection, or it was lost."""
+
+
+class EtalonTimeout(EtalonError):
+    """No reply within the deadline."""
+
+
+class EtalonBadReply(EtalonError):
+    """A reply outside the grammar, too long, or to another request."""
+
+
+class EtalonServerError(EtalonError):
+    """The server reports an error. ``code`` is its number, ``None`` where it refused the request in words."""
+
+    def __init__(self, message: str, code: int | None) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class TooFewChannels(EtalonError):
+    """Fewer than four valid lengths. ``reasons`` says by channel why it was dropped."""
+
+    def __init__(self, message: str, valid: tuple[int, ...], reasons: dict[int, str]) -> None:
+        super().__init__(message)
+        self.valid = valid
+        self.reasons = reasons
+
+
+class StaleLengths(EtalonError):
+    """The server repeats the lengths of a place that the robot has left."""
+
+
+class BadSolution(EtalonError):
+    """The lengths give no position that can be trusted; ``__cause__`` is the error of the multilateration.
+
+    ``lengths_m`` are the lengths by channel.
+    """
+
+    def __init__(self, message: str, lengths_m: dict[int, float]) -> None:
+        super().__init__(message)
+        self.lengths_m = lengths_m
+
 
 _NEEDED_CHANNELS = 4
 _MOVED_M = 0.005  # further apart than this two places have different lengths

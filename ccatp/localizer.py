@@ -1,4 +1,4 @@
-"""Pure. The localizer: what the others may ask it, and which one a configuration asks for."""
+"""The localizer: what the others may ask it, and which one a configuration asks for."""
 
 from collections.abc import Callable, Sequence
 from typing import Protocol
@@ -6,14 +6,14 @@ from typing import Protocol
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.filters import FILTERS, Filter, FloatArray, Innovation
-from ccatp.health.imu_gate import ImuGate
-from ccatp.health.look import WheelMeans, largest_rate_rad_s
-from ccatp.localization import measurements, survey_model
-from ccatp.localization.four_state import FourStateLocalizer
-from ccatp.localization.full_state import FullStateLocalizer
+from ccatp.control.motion_checks import ImuGate, WheelMeans, largest_rate_rad_s
+from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, GravitySample, ImuSample, PanelPose, WheelSample
+from ccatp.estimation import measurements
+from ccatp.estimation import state_model as survey_model
+from ccatp.estimation.full_state import FullStateLocalizer
+from ccatp.estimation.thesis_localizer import FourStateLocalizer
+from ccatp.filters import FILTERS, Filter, Innovation
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import DeckPose, EdgeSample, Fix, GravitySample, ImuSample, PanelPose, WheelSample
 
 FOUR_STATE = ("kf",)
 """Filters for linear models, which get the thesis's four states; all others get the full state."""

@@ -12,7 +12,7 @@ import pytest
 from _pytest.nodeid import coerce_node_id
 from hypothesis import settings
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
 
 pytest_plugins = ["pytester", "tests.faults.linking"]

@@ -1,4 +1,4 @@
-"""Pure. The filters of this project, and thesis eq. 2.13 as it is printed, as contenders of a race."""
+"""The filters of this project, and thesis eq. 2.13 as it is printed, as contenders of a race."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.bench.problems import FilterProblem, models
+from ccatp.core import FloatArray
 from ccatp.filters import FILTERS
-from ccatp.filters.base import FloatArray
 
 Result = tuple[FloatArray, FloatArray]
 """Mean (n,) and covariance (n, n)."""

@@ -1,4 +1,4 @@
-"""Pure. What a filter's answer is without its rounding: the same steps in decimal arithmetic of fifty digits."""
+"""What a filter's answer is without its rounding: the same steps in decimal arithmetic of fifty digits."""
 
 from decimal import Decimal, localcontext
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 
 from ccatp.bench.contenders import Contender, Result
 from ccatp.bench.problems import FilterProblem, models
-from ccatp.filters.base import FloatArray
+from ccatp.core import FloatArray
 from ccatp.filters.unscented import ALPHA, BETA, KURTOSIS
 
 DIGITS = 50

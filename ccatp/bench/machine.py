@@ -1,11 +1,11 @@
-"""Edge. What the figures were taken on."""
+"""What the figures were taken on."""
 
 import os
 import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from ccatp.package import build
+from ccatp.config.package import build
 
 PACKAGES = ("ccatp", "numpy", "scipy", "filterpy", "stonesoup")
 CPU_INFO = Path("/proc/cpuinfo")

@@ -1,4 +1,4 @@
-"""Glue. Missions against the wall clock: in one process, and the daemon's processes in lockstep over their sockets."""
+"""Missions against the wall clock: in one process, and the daemon's processes in lockstep over their sockets."""
 
 import json
 import os
@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from ccatp.config.models import Config
+from ccatp.config.package import child_environment
 from ccatp.errors import CcatpError
-from ccatp.package import child_environment
-from ccatp.studies.garbage import settle
-from ccatp.studies.rehearsal import rehearse
+from ccatp.studies.engine import settle
+from ccatp.studies.sil_run import rehearse
 
 PEER = "the wall clock"  # one frame takes it the frame's period
 TIMEOUT_S = 900.0

@@ -1,4 +1,4 @@
-"""Pure. filterpy and Stone Soup as contenders of a race, each in the way its own manual uses it.
+"""filterpy and Stone Soup as contenders of a race, each in the way its own manual uses it.
 
 Both belong to the extra ``peers`` and are imported only when a race is set up; the models are built before the clock
 starts. What the peers compute has to be what this project computes: the race checks it.
@@ -10,7 +10,7 @@ import numpy as np
 
 from ccatp.bench.contenders import Contender, Result
 from ccatp.bench.problems import DT_S, FilterProblem, models
-from ccatp.filters.base import FloatArray
+from ccatp.core import FloatArray
 
 
 def filterpy_linear(problem: FilterProblem) -> Contender:

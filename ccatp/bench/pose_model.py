@@ -1,10 +1,10 @@
-"""Pure. A robot with twelve states, as a nonlinear model for filters that are to be compared."""
+"""A robot with twelve states, as a nonlinear model for filters that are to be compared."""
 
 from math import cos, sin
 
 import numpy as np
 
-from ccatp.filters.base import FloatArray
+from ccatp.core import FloatArray
 
 X, Y, THETA, V, A, OMEGA, GYRO_BIAS, ACCELEROMETER_BIAS, SCALE_R, SCALE_L, CREEP_X, CREEP_Y = range(12)
 """Order of the state: m, m, rad, m/s, m/s^2, rad/s, rad/s, m/s^2, three relative errors, drift per metre in x and y."""

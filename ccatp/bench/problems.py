@@ -1,4 +1,4 @@
-"""Pure. What the contenders are given to solve: drawn from a seed, the same for all of them."""
+"""What the contenders are given to solve: drawn from a seed, the same for all of them."""
 
 from dataclasses import dataclass, replace
 from math import sqrt
@@ -7,8 +7,8 @@ import numpy as np
 
 from ccatp.bench.pose_model import STATES, PoseMotion, PoseSight
 from ccatp.config.models import Config, LocalizerConfig, RobotConfig
-from ccatp.filters.base import FloatArray, Observation, Transition
-from ccatp.localization.survey_model import (
+from ccatp.core import DeckPose, FloatArray
+from ccatp.estimation.state_model import (
     BA,
     BG,
     E0,
@@ -26,15 +26,15 @@ from ccatp.localization.survey_model import (
     C,
     SensorRows,
     SurveyMotion,
+    Terrain,
     V,
     W,
     X,
     Y,
-)  # fmt: skip
-from ccatp.localization.survey_model import STATES as SURVEY_STATES
-from ccatp.localization.terrain import Terrain
+)
+from ccatp.estimation.state_model import STATES as SURVEY_STATES
+from ccatp.filters.base import Observation, Transition
 from ccatp.mirror.mirror import build_mirror
-from ccatp.samples import DeckPose
 
 STEPS = 50
 DT_S = 0.01

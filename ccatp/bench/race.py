@@ -1,4 +1,4 @@
-"""Edge. Two contenders by turns on one clock."""
+"""Two contenders by turns on one clock."""
 
 import gc
 import time
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.bench.contenders import Contender
-from ccatp.filters.base import FloatArray
+from ccatp.core import FloatArray
 
 
 class Times(NamedTuple):

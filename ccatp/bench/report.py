@@ -1,4 +1,4 @@
-"""Pure. The result of the benchmarks as text: a Markdown page, lines for a terminal."""
+"""The result of the benchmarks as text: a Markdown page, lines for a terminal."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""Pure. Range EKF-SLAM as a race: ``EkfSlam`` against the same filter by whole matrices."""
+"""Range EKF-SLAM as a race: ``EkfSlam`` against the same filter by whole matrices."""
 
 from dataclasses import dataclass
 from math import cos, hypot, sin, tau
@@ -6,7 +6,7 @@ from math import cos, hypot, sin, tau
 import numpy as np
 
 from ccatp.bench.contenders import Contender
-from ccatp.filters.base import FloatArray
+from ccatp.core import FloatArray
 from ccatp.filters.ekf_slam import Columns, EkfSlam, columns_of
 
 BEACONS = (4, 50, 200)

@@ -1,4 +1,4 @@
-"""Glue. The benchmarks one after the other, as one result."""
+"""The benchmarks one after the other, as one result."""
 
 from collections.abc import Callable, Iterator, Sequence
 from math import sqrt
@@ -27,9 +27,9 @@ from ccatp.bench.problems import (
 from ccatp.bench.race import Difference, Times, largest_difference, race
 from ccatp.bench.slam_race import BEACONS, DENSE_BEACONS, dense_slam, our_slam, slam_problem
 from ccatp.config.models import Config
-from ccatp.filters.base import FloatArray
+from ccatp.core import FloatArray
 from ccatp.filters.unscented import ALPHA, BETA, KURTOSIS
-from ccatp.radio.multilateration import multilaterate
+from ccatp.mirror.multilateration import multilaterate
 
 EQUAL_WITHIN = 1e-10  # every entry of mean and covariance, SI units
 ROUNDS, QUICK_ROUNDS = 40, 4

@@ -1,10 +1,25 @@
-"""Pure. Frozen configuration models of missions among beacons: goals, dangers, robot link, incidents."""
+"""Frozen configuration models of missions among beacons: goals, dangers, robot link, incidents.
+
+Frozen configuration models of ultrasonic motes that map themselves. Values live in ``configs/radio.toml``.
+
+Frozen configuration models of the robots among radio beacons. Values live in ``configs/radio.toml``.
+"""
 
 from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ccatp.config.models import LinkConfig, Model, NonNegative, Positive
+from ccatp.config.models import (
+    DashboardConfig,
+    LinkConfig,
+    Model,
+    NonNegative,
+    ObservatoryConfig,
+    Pair,
+    PidConfig,
+    Positive,
+    ProcessesConfig,
+)
 
 # Frames come ten times a second: what is older than two of them is stale.
 SlowFreshness = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -97,3 +112,373 @@ class TargetApproachConfig(Model):
 
 
 IncidentConfig = Annotated[RadioLossConfig | ObstacleIncidentConfig | TargetApproachConfig, Field(discriminator="type")]
+
+MoteName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+Coordinates = Annotated[tuple[Annotated[float, Field(ge=-1e3, le=1e3)], ...], Field(min_length=2, max_length=3)]
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Celsius = Annotated[float, Field(ge=-60.0, le=80.0)]
+Off = Annotated[float, Field(ge=0.0, le=3.1416)]
+Draws = Annotated[int, Field(ge=0, le=100_000)]
+Many = Annotated[int, Field(ge=1, le=100_000)]
+
+
+class MotePlaceConfig(Model):
+    """Where a mote or a stand is, and the direction that it faces."""
+
+    place_m: Coordinates
+    facing: Coordinates
+
+
+class RandomMotesConfig(Model):
+    """Motes that are drawn."""
+
+    count: Annotated[int, Field(ge=3, le=5000)]
+    size_m: Coordinates
+    reach_m: Positive
+
+
+class AirConfig(Model):
+    """What the motes know of the speed of sound."""
+
+    sound_speed_m_s: Annotated[float, Field(ge=200.0, le=500.0)]
+    temperature_c: Celsius
+
+
+class RangingConfig(Model):
+    """How good a range is, as the estimators take it."""
+
+    sigma_m: Annotated[float, Field(ge=1e-6, le=1e3)]
+    thermometer_sigma_c: NonNegative
+    repeats: Many
+    combine: Literal["mean", "median"]
+
+
+class TransducerConfig(Model):
+    """Where a mote hears another: reach against the angle off the axis."""
+
+    is_omnidirectional: bool
+    off_axis_rad: Annotated[tuple[Off, ...], Field(min_length=2)]
+    reach_m: Annotated[tuple[NonNegative, ...], Field(min_length=2)]
+    nearest_m: NonNegative
+
+
+class PhaseOneConfig(Model):
+    """Trilateration."""
+
+    max_dop: Positive
+    draws: Draws  # 0, or many
+
+
+class PhaseTwoConfig(Model):
+    """The filter over distances between motes."""
+
+    pairs: Literal["zigzag", "adjacent", "all"]
+    frame: Literal["surveyed", "free"]
+    prior: Literal["trilateration", "printed"]
+    printed_variance_m2: Positive
+    pools: bool
+    linearisations: Annotated[int, Field(ge=1, le=50)]
+    gate_probability: Annotated[float, Field(gt=0.5, lt=1.0)]
+    target_rms_m: Positive
+    max_updates: Many
+
+
+class BatchConfig(Model):
+    """Least squares over all ranges."""
+
+    uses_shapes: bool
+    uses_phase2: bool
+    estimates_offset: bool
+    estimates_scale: bool
+    robust_scale: Positive
+    max_iterations: Many
+
+
+class MoteSimConfig(Model):
+    """The true air and the true faults of ranging."""
+
+    temperature_c: Celsius
+    sigma_m: NonNegative
+    thermometer_sigma_c: NonNegative
+    tick_s: NonNegative
+    latency_s: NonNegative
+    loss_probability: Fraction
+    multipath_probability: Fraction
+    multipath_excess_m: Positive
+
+
+class CricketConfig(Model):
+    """Everything about motes that map themselves."""
+
+    dimension: Literal[2, 3]
+    layout: Literal["networks", "motes", "random"]
+    anchors: dict[MoteName, Coordinates]
+    networks: dict[MoteName, MotePlaceConfig]
+    stand_m: Annotated[tuple[Coordinates, ...], Field(min_length=1)]
+    motes: dict[MoteName, MotePlaceConfig]
+    random: RandomMotesConfig
+    air: AirConfig
+    ranging: RangingConfig
+    transducer: TransducerConfig
+    phase1: PhaseOneConfig
+    phase2: PhaseTwoConfig
+    batch: BatchConfig
+    sim: MoteSimConfig
+
+
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+Share = Annotated[float, Field(ge=0.0, lt=1.0)]
+Angle = Annotated[float, Field(ge=-6.2832, le=6.2832)]
+Length = Annotated[float, Field(ge=-1e3, le=1e3)]
+Level = Annotated[float, Field(ge=-150.0, le=30.0)]  # dBm: from below any receiver's noise to a watt
+Decibel = Annotated[float, Field(ge=0.0, le=60.0)]
+Exponent = Annotated[float, Field(gt=0.5, le=8.0)]
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+Membership = tuple[float, float, float, float]
+
+
+class RadioRunConfig(Model):
+    """One run: clock, seed, end."""
+
+    seed: Annotated[int, Field(ge=0)]
+    step_s: Annotated[float, Field(gt=0.0, le=1.0)]
+    steps: Count
+
+
+class WorkspaceConfig(Model):
+    """The room, its corner at the origin, and the loop of waypoints."""
+
+    size_m: tuple[Positive, Positive]
+    waypoints_m: Annotated[tuple[Pair, ...], Field(min_length=1)]
+    loops: bool  # begin again with the first waypoint after the last
+
+
+class VehicleConfig(Model):
+    """Geometry and limits of the vehicle, as its controller and its filter know them."""
+
+    kind: Literal["ackermann", "differential"]
+    wheelbase_m: Positive
+    track_m: Positive
+    speed_max_m_s: Positive
+    steer_max_rad: Annotated[float, Field(gt=0.0, le=1.5)]
+    turn_rate_max_rad_s: Positive
+    radius_m: Positive
+
+
+class StartConfig(Model):
+    """Where the filter believes to begin, and how sure it is."""
+
+    x_m: Length
+    y_m: Length
+    heading_rad: Angle
+    position_sigma_m: Positive
+    heading_sigma_rad: Positive
+
+
+class OdometryConfig(Model):
+    """Noise of the odometry as the filter models it."""
+
+    speed_sigma_m_s: NonNegative
+    steer_sigma_rad: NonNegative
+    turn_rate_sigma_rad_s: NonNegative
+    heading_drift_sigma_rad_s: NonNegative
+    slip_sigma: NonNegative
+
+
+class PathLossConfig(Model):
+    """Log-distance model z = P_ref - 10 eta log10(r)."""
+
+    reference_dbm: Level
+    exponent: Exponent
+    white_sigma_db: Positive
+    shadowing_sigma_db: Decibel
+    shadowing_length_m: Positive
+    reference_dbm_of: dict[Name, Level]
+
+
+class ScanConfig(Model):
+    """The turning reflector."""
+
+    readings: Annotated[int, Field(ge=4, le=720)]
+    bearing_sigma_rad: Positive
+    loss_tolerance: Share
+
+
+class ObservationConfig(Model):
+    """When radios are listened to."""
+
+    every_steps: Count
+    target_every_steps: Count
+
+
+class EstimatorConfig(Model):
+    """What the filter assumes and estimates besides poses and positions."""
+
+    shadowing: Literal["none", "white", "map"]
+    shadowing_grid_m: Positive
+    placed_share: Annotated[float, Field(gt=0.0, le=1.0)]
+    waiting_scans: Annotated[int, Field(ge=1, le=200)]
+    gate_probability: Annotated[float, Field(gt=0.5, lt=1.0)]
+    target_speed_sigma_m_s: Positive
+    target_course_time_s: Positive
+
+
+class FuzzyInputConfig(Model):
+    """One input: trapezoids (left foot, left shoulder, right shoulder, right foot) by name."""
+
+    terms: Annotated[dict[Name, Membership], Field(min_length=1)]
+
+
+class FuzzyRuleConfig(Model):
+    """If all named inputs are in their terms, the output is this one."""
+
+    when: Annotated[dict[Name, Name], Field(min_length=1)]
+    then: Name
+
+
+class FuzzyConfig(Model):
+    """A zero-order Sugeno controller."""
+
+    inputs: Annotated[dict[Name, FuzzyInputConfig], Field(min_length=1)]
+    outputs: Annotated[dict[Name, float], Field(min_length=1)]
+    rules: Annotated[tuple[FuzzyRuleConfig, ...], Field(min_length=1)]
+
+
+class RadioControlConfig(Model):
+    """Steering and speed."""
+
+    speed_mode: Literal["fuzzy", "pi", "constant"]
+    steering_gain: Positive
+    constant_speed_m_s: Positive
+    arrival_radius_m: Positive
+    pi: PidConfig
+    fuzzy: FuzzyConfig
+
+
+class FollowConfig(Model):
+    """Keeping a distance from the target."""
+
+    is_active: bool
+    target: Name
+    safe_distance_m: Positive
+    band_m: Positive
+    margin_sigmas: NonNegative
+    foresight_s: NonNegative
+    back_speed_m_s: Positive
+    retreat_s: Positive
+    lost_after_s: Positive
+
+
+class AvoidanceConfig(Model):
+    """Going round what the distance sensors see."""
+
+    is_active: bool
+    sensors_rad: tuple[Angle, ...]
+    range_max_m: Positive
+    influence_m: Positive
+    stop_m: Positive
+    margin_m: NonNegative
+    memory_s: Positive
+    back_speed_m_s: Positive
+    back_time_s: Positive
+    directions: Annotated[int, Field(ge=8, le=720)]
+
+
+class SimBeaconConfig(Model):
+    """A true beacon."""
+
+    x_m: Length
+    y_m: Length
+    reference_dbm: Level
+
+
+class SimRadioConfig(Model):
+    """True propagation."""
+
+    scan: Literal["drawn", "reflector"]
+    exponent: Exponent
+    white_sigma_db: Decibel
+    bearing_sigma_rad: NonNegative
+    shadowing_sigma_db: Decibel
+    shadowing_length_m: Positive
+    multipath_paths: Annotated[int, Field(ge=0, le=20)]
+    multipath_level_db: Decibel
+    beam_width_rad: Positive
+    front_to_back_db: Decibel
+    resolution_db: Decibel
+    loss_probability: Probability
+    obstacle_loss_db: Decibel
+    sensitivity_dbm: Level
+
+
+class SimVehicleConfig(Model):
+    """How the true vehicle differs from its odometry."""
+
+    speed_sigma_m_s: NonNegative
+    steer_sigma_rad: NonNegative
+    turn_rate_sigma_rad_s: NonNegative
+    slip: Share
+    heading_drift_rad_s: Annotated[float, Field(ge=-1.0, le=1.0)]
+    start_position_offset_m: NonNegative
+    start_heading_offset_rad: NonNegative
+
+
+class SimTargetConfig(Model):
+    """The radio that moves."""
+
+    motion: Literal["none", "random", "waypoints"]
+    x_m: Length
+    y_m: Length
+    reference_dbm: Level
+    speed_m_s: NonNegative
+    turn_sigma_rad_sqrt_s: NonNegative
+    waypoints_m: tuple[Pair, ...]
+
+
+class SimObstacleConfig(Model):
+    """A round obstacle."""
+
+    x_m: Length
+    y_m: Length
+    radius_m: Positive
+
+
+class RadioSimConfig(Model):
+    """The true world behind ``--sim``."""
+
+    beacons: dict[Name, SimBeaconConfig]
+    radio: SimRadioConfig
+    vehicle: SimVehicleConfig
+    target: SimTargetConfig
+    obstacles: tuple[SimObstacleConfig, ...]
+    range_sigma_m: NonNegative
+    robot: SimBeaconRobotConfig
+    incidents: tuple[IncidentConfig, ...]
+
+
+class RadioConfig(Model):
+    """Everything about a robot among radio beacons."""
+
+    system: Literal["zigbee", "follow", "cricket"]
+    run: RadioRunConfig
+    workspace: WorkspaceConfig
+    vehicle: VehicleConfig
+    start: StartConfig
+    odometry: OdometryConfig
+    path_loss: PathLossConfig
+    scan: ScanConfig
+    observation: ObservationConfig
+    estimator: EstimatorConfig
+    control: RadioControlConfig
+    follow: FollowConfig
+    avoidance: AvoidanceConfig
+    listener: ListenerConfig
+    mission: BeaconMissionConfig
+    danger: BeaconDangerConfig
+    robot: BeaconRobotConfig
+    processes: ProcessesConfig
+    observatory: ObservatoryConfig
+    dashboard: DashboardConfig
+    sim: RadioSimConfig
+    cricket: CricketConfig

@@ -1,4 +1,4 @@
-"""Pure. What one value of the configuration demands of another, and values that look like another unit."""
+"""What one value of the configuration demands of another, and values that look like another unit."""
 
 import ipaddress
 import math
@@ -8,7 +8,7 @@ from pathlib import PurePath
 
 from pydantic import BaseModel
 
-from ccatp.config.messages import Fault, choice_hint, slip_hint
+from ccatp.config.messages import Fault, Key, choice_hint, slip_hint
 from ccatp.config.models import (
     AlignConfig,
     Config,
@@ -21,7 +21,6 @@ from ccatp.config.models import (
     SimRobotConfig,
     WorldConfig,
 )
-from ccatp.config.toml_text import Key
 
 FILTERS = ("kf", "ekf", "ukf")
 ORDERS = ("thesis", "optimised", "calibration")

@@ -1,4 +1,4 @@
-"""Pure. Frozen configuration models. Values live in ``configs/``; nothing here has a default with a unit."""
+"""Frozen configuration models. Values live in ``configs/``; nothing here has a default with a unit."""
 
 from typing import Annotated, Literal
 

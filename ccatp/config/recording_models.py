@@ -1,4 +1,4 @@
-"""Pure. Frozen models of what is assumed of recorded radio data. Values live in ``configs/recordings.toml``."""
+"""Frozen models of what is assumed of recorded radio data. Values live in ``configs/recordings.toml``."""
 
 from typing import Annotated
 

@@ -1,16 +1,17 @@
-"""Pure. The last gate before the wheels: every drive goes through it; it denies by default.
+"""The last gate before the wheels: every drive goes through it; it denies by default.
 
 What stands in the way is told by a reason. The danger loop denies for its own reasons by its permit; the gate trusts
 neither the mission nor the verdict's flags alone: a verdict that names an edge sensor bars that direction whatever its
 permits say, and a survey moves under a normal verdict only.
+
+The last gate before the fans: on an overhanging mirror no command below the floor gets out.
 """
 
 from enum import Enum, StrEnum
 from math import isfinite
 
 from ccatp.config.models import LimitsConfig
-from ccatp.control.kinematics import wheel_rates
-from ccatp.samples import EventCode, Twist, Verdict
+from ccatp.core import EventCode, Twist, Verdict, wheel_rates
 
 HELD = Twist(0.0, 0.0)
 # The feed-forward of the wheel lag adds T a to the speed; a tenth covers it and the feedback.
@@ -163,3 +164,32 @@ def _slewed(last: float, wanted: float, step: float, limit: float) -> float:
         return min(wanted, highest, limit)
     lowest = last - step if last < 0.0 else -step
     return max(wanted, lowest, -limit)
+
+
+class FanGate:
+    """Refuses duties that are none, or that would drop the robot.
+
+    Args:
+        floor: least duty of each fan where the mirror overhangs; 0 elsewhere.
+
+    Attributes:
+        refused: how many commands were refused.
+    """
+
+    def __init__(self, floor: float) -> None:
+        """Nothing refused yet."""
+        self._floor = floor
+        self.refused = 0
+
+    def refusal(self, left: float, right: float) -> str | None:
+        """Why these duties must not be sent; None where they may. What the robot has stays in force then."""
+        for name, duty in (("left", left), ("right", right)):
+            if not isfinite(duty) or not 0.0 <= duty <= 1.0:
+                why = f"duty {duty:g} of the {name} fan is not between 0 and 1"
+            elif duty < self._floor:
+                why = f"duty {duty:g} of the {name} fan is below the floor of {self._floor:g}"
+            else:
+                continue
+            self.refused += 1
+            return f"fan command refused: {why}; set robot.fan_duty"
+        return None

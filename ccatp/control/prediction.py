@@ -1,4 +1,4 @@
-"""Pure. Where the robot will be when a command sent now takes effect.
+"""Where the robot will be when a command sent now takes effect.
 
 The delay is counted in the sequence numbers of the drives; no clock takes part.
 """
@@ -6,7 +6,7 @@ The delay is counted in the sequence numbers of the drives; no clock takes part.
 from collections import deque
 from math import cos, exp, sin
 
-from ccatp.samples import Predicted
+from ccatp.core import Predicted
 
 Pose = tuple[float, float, float]
 

@@ -1,4 +1,4 @@
-"""Pure. What every filter offers: the ``Filter`` protocol, the innovation of an update, its typed refusals."""
+"""What every filter offers: the ``Filter`` protocol, the innovation of an update, its typed refusals."""
 
 from typing import NamedTuple, Protocol
 

@@ -1,10 +1,10 @@
-"""Pure. The matrix steps of the filters in C, which the compiled build has; elsewhere numpy does them.
+"""The matrix steps of the filters in C, which the compiled build has; elsewhere numpy does them.
 
 Each function answers None where it leaves a case to numpy, see ``packaging/compiled/block_kernel.c``. What they answer
 differs from numpy's result by rounding.
 """
 
-from ccatp.filters.base import FloatArray
+from ccatp.core import FloatArray
 
 __all__ = ["IS_COMPILED", "advance", "condition", "spread"]
 

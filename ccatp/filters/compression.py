@@ -1,10 +1,11 @@
-"""Pure. Measurement rows taken apart for the written-out update; many of them as the few that say the same."""
+"""Measurement rows taken apart for the written-out update; many of them as the few that say the same."""
 
 import numpy as np
 from numpy import vdot
 from scipy.linalg.lapack import dgeqrf, dorgqr
 
-from ccatp.filters.base import HUGE, FilterDiverged, FloatArray
+from ccatp.core import FloatArray
+from ccatp.filters.base import HUGE, FilterDiverged
 from ccatp.filters.unrolled import Row
 
 MANY = 12

@@ -1,4 +1,4 @@
-"""Pure. A Gaussian conditioned on measurements: fast where the numbers allow it, by a square root where they do not."""
+"""A Gaussian conditioned on measurements: fast where the numbers allow it, by a square root where they do not."""
 
 from math import sqrt
 from typing import NamedTuple
@@ -7,7 +7,8 @@ import numpy as np
 from numpy import vdot
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
-from ccatp.filters.base import HUGE, FilterDiverged, FloatArray
+from ccatp.core import FloatArray
+from ccatp.filters.base import HUGE, FilterDiverged
 from ccatp.filters.block_kernel import condition
 from ccatp.filters.square_root import condition_by_rows, noise_root
 

@@ -1,4 +1,4 @@
-"""Pure. Extended Kalman filter over a vehicle, a shared calibration and a map that grows and shrinks, on arrays."""
+"""Extended Kalman filter over a vehicle, a shared calibration and a map that grows and shrinks, on arrays."""
 
 from collections.abc import Callable, Hashable, Sequence
 from copy import copy
@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg.blas import daxpy, dscal
 
-from ccatp.filters.base import HUGE, FilterDiverged, FilterError, FilterShapeError, FloatArray, checked_gaussian
+from ccatp.core import FloatArray
+from ccatp.filters.base import HUGE, FilterDiverged, FilterError, FilterShapeError, checked_gaussian
 
 Columns = npt.NDArray[np.intp]
 BlockId = Hashable

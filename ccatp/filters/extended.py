@@ -1,8 +1,9 @@
-"""Pure. Extended Kalman filter: nonlinear models linearised at the mean, the rest as in ``KalmanFilter``."""
+"""Extended Kalman filter: nonlinear models linearised at the mean, the rest as in ``KalmanFilter``."""
 
 import numpy as np
 
-from ccatp.filters.base import FilterShapeError, FloatArray, Innovation, Observation, Transition
+from ccatp.core import FloatArray
+from ccatp.filters.base import FilterShapeError, Innovation, Observation, Transition
 from ccatp.filters.kalman import KalmanFilter
 
 

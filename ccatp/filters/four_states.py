@@ -1,4 +1,4 @@
-"""Pure. The linear filter of four states, in plain floats."""
+"""The linear filter of four states, in plain floats."""
 
 from collections.abc import Callable
 from typing import TypeVar, cast
@@ -6,12 +6,12 @@ from typing import TypeVar, cast
 import numpy as np
 from numpy import ndarray, vdot
 
+from ccatp.core import FloatArray
 from ccatp.filters.base import (
     HUGE,
     FilterDiverged,
     FilterModelError,
     FilterShapeError,
-    FloatArray,
     Innovation,
     Observation,
     Transition,

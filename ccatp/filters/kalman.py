@@ -1,4 +1,4 @@
-"""Pure. Linear Kalman filter, thesis eqs 2.5 to 2.13."""
+"""Linear Kalman filter, thesis eqs 2.5 to 2.13."""
 
 from collections.abc import Callable
 
@@ -6,12 +6,12 @@ import numpy as np
 from numpy import vdot
 from scipy.linalg.blas import dgemm
 
+from ccatp.core import FloatArray
 from ccatp.filters.base import (
     HUGE,
     FilterDiverged,
     FilterModelError,
     FilterShapeError,
-    FloatArray,
     Innovation,
     Learned,
     Observation,

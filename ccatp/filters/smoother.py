@@ -1,11 +1,12 @@
-"""Pure. Fixed-interval smoother of Rauch, Tung and Striebel: what the whole record says of every step."""
+"""Fixed-interval smoother of Rauch, Tung and Striebel: what the whole record says of every step."""
 
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dgetrf, dgetrs
 
-from ccatp.filters.base import Filter, FilterDiverged, FilterError, FilterShapeError, FloatArray, Transition
+from ccatp.core import FloatArray
+from ccatp.filters.base import Filter, FilterDiverged, FilterError, FilterShapeError, Transition
 
 BLOCK = 4096
 """Steps a block of memory holds."""

@@ -1,9 +1,10 @@
-"""Pure. Square roots of covariances, and the update that keeps every digit: one QR factorisation, nothing squared."""
+"""Square roots of covariances, and the update that keeps every digit: one QR factorisation, nothing squared."""
 
 import numpy as np
 from scipy.linalg.lapack import dgeqrf, dpotrf, dtrtrs
 
-from ccatp.filters.base import NEGATIVITY, FilterDiverged, FloatArray
+from ccatp.core import FloatArray
+from ccatp.filters.base import NEGATIVITY, FilterDiverged
 
 
 def condition_by_rows(

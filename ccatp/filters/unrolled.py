@@ -1,4 +1,4 @@
-"""Pure. Four states in plain floats: the steps of a linear filter written out, without a loop over states.
+"""Four states in plain floats: the steps of a linear filter written out, without a loop over states.
 
 The covariance is kept as its factors, P = U D U^T, U with units on its diagonal and zeros below, D diagonal
 (Bierman 1977): what they stand for is symmetric and positive definite whatever the rounding.

@@ -1,18 +1,10 @@
-"""Pure. Unscented Kalman filter: nonlinear models by sigma points, matrices as in ``KalmanFilter``."""
+"""Unscented Kalman filter: nonlinear models by sigma points, matrices as in ``KalmanFilter``."""
 
 import numpy as np
 from numpy import vdot
 
-from ccatp.filters.base import (
-    HUGE,
-    FilterDiverged,
-    FilterShapeError,
-    FloatArray,
-    Innovation,
-    Learned,
-    Observation,
-    Transition,
-)
+from ccatp.core import FloatArray
+from ccatp.filters.base import HUGE, FilterDiverged, FilterShapeError, Innovation, Learned, Observation, Transition
 from ccatp.filters.kalman import KalmanFilter
 from ccatp.filters.square_root import square_root
 

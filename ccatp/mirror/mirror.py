@@ -1,19 +1,88 @@
-"""Pure. The mirror as the robot meets it: one object that joins surface, frames, panels, rim and poses."""
+"""The mirror as the robot meets it: one object that joins surface, frames, panels, rim and poses.
 
+Rigid transforms between the world, the mirror and the deck frame of one mirror.
+
+Many poses at once, for those who keep track of a robot: the same transforms on arrays.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
 from math import atan2, cos, pi, sin
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ccatp.angles import wrap_pi
-from ccatp.config.models import BaseConfig, CollimatorsConfig, MirrorConfig
-from ccatp.mirror.errors import LayoutError, UnknownPanelError
-from ccatp.mirror.frames import build_frames
-from ccatp.mirror.layout import PanelGrid, Seam
-from ccatp.mirror.panels import POINTS_PER_PANEL, POINTS_PER_ROW, Panel, build_panel
+from ccatp.config.models import BaseConfig, CollimatorsConfig, FrameConfig, MirrorConfig
+from ccatp.core import DeckPose, FloatArray, PanelId, PanelPose, PointId, Vector3, wrap_pi
+from ccatp.mirror.layout import POINTS_PER_PANEL, POINTS_PER_ROW, Panel, PanelGrid, Seam, build_panel
 from ccatp.mirror.rim import build_rim
-from ccatp.mirror.surface import Axes, build_surface
-from ccatp.samples import DeckPose, FloatArray, PanelId, PanelPose, PointId, Vector3
+from ccatp.mirror.surface import Axes, LayoutError, Surface, UnknownPanelError, build_surface
+
+
+@dataclass(frozen=True, slots=True)
+class MirrorFrames:
+    """Where a mirror stands in the world.
+
+    ``p_mirror = R (p_world - origin)`` with ``R = [[1, 0, 0], [0, c, s], [0, -s, c]]``; the deck frame is the mirror
+    frame turned by pi about its y axis where ``drive_side`` is -1, and the mirror frame itself where it is +1.
+
+    Attributes:
+        origin_m: origin of the mirror frame in the world, m.
+        c, s: cosine and sine of the rotation about x.
+        drive_side: sign of the mirror frame's z on the robot's side.
+    """
+
+    origin_m: Vector3
+    c: float
+    s: float
+    drive_side: int
+
+    def deck_from_mirror(self, p: Vector3) -> Vector3:
+        """Deck coordinates of a point given in the mirror frame, m. Its own inverse."""
+        return p if self.drive_side > 0 else (-p[0], p[1], -p[2])
+
+    def mirror_from_deck(self, p: Vector3) -> Vector3:
+        """Mirror coordinates of a point given in the deck frame, m."""
+        return p if self.drive_side > 0 else (-p[0], p[1], -p[2])
+
+    def mirror_from_world(self, p: Vector3) -> Vector3:
+        """Mirror coordinates of a point given in the world frame, m."""
+        dx, dy, dz = p[0] - self.origin_m[0], p[1] - self.origin_m[1], p[2] - self.origin_m[2]
+        return dx, self.c * dy + self.s * dz, self.c * dz - self.s * dy
+
+    def world_from_mirror(self, p: Vector3) -> Vector3:
+        """World coordinates of a point given in the mirror frame, m."""
+        x, y, z = p
+        o = self.origin_m
+        return x + o[0], self.c * y - self.s * z + o[1], self.s * y + self.c * z + o[2]
+
+    def world_from_deck(self, p: Vector3) -> Vector3:
+        """World coordinates of a point given in the deck frame, m."""
+        return self.world_from_mirror(self.mirror_from_deck(p))
+
+    def deck_from_world(self, p: Vector3) -> Vector3:
+        """Deck coordinates of a point given in the world frame, m."""
+        return self.deck_from_mirror(self.mirror_from_world(p))
+
+    def rotate_world_from_deck(self, v: Vector3) -> Vector3:
+        """World components of a vector given in the deck frame."""
+        x, y, z = self.mirror_from_deck(v)
+        return x, self.c * y - self.s * z, self.s * y + self.c * z
+
+    def rotate_deck_from_world(self, v: Vector3) -> Vector3:
+        """Deck components of a vector given in the world frame."""
+        x, y, z = v
+        return self.deck_from_mirror((x, self.c * y + self.s * z, self.c * z - self.s * y))
+
+
+def build_frames(cfg: FrameConfig) -> MirrorFrames:
+    """Frames of a mirror from its configuration (mm and rad)."""
+    x, y, z = cfg.origin_world_mm
+    angle = cfg.rotation_about_x_rad
+    return MirrorFrames((x * 1e-3, y * 1e-3, z * 1e-3), cos(angle), sin(angle), cfg.reflecting_side_sign)
+
 
 _MIN_CHANNELS = 4
 
@@ -21,7 +90,7 @@ _MIN_CHANNELS = 4
 class Mirror:
     """A telescope mirror: geometry only, without state.
 
-    Points are ``Vector3`` in metres; the frames are those of ``ccatp.samples``.
+    Points are ``Vector3`` in metres; the frames are those of ``ccatp.core``.
 
     Attributes:
         name: name of the configuration.
@@ -257,3 +326,62 @@ def _collimators(cfg: CollimatorsConfig) -> tuple[tuple[int, ...], FloatArray]:
     if len(cfg.channels) < _MIN_CHANNELS:
         raise LayoutError(f"collimators: {len(cfg.channels)} channels; a position needs at least {_MIN_CHANNELS}")
     return cfg.channels, np.array(cfg.positions_world_mm, dtype=np.float64) * 1e-3
+
+
+# Along the panel's normal down to the surface. It starts at the sag of some mm, on which the slope hardly changes: the
+# first step of Newton's leaves 2e-7 m, the second less than rounding.
+_DROP_STEPS = 2
+
+
+def deck_poses(mirror: Mirror, poses: Sequence[PanelPose]) -> FloatArray:
+    """``Mirror.deck_pose`` of many.
+
+    Args:
+        mirror: the mirror.
+        poses: k poses in panel frames.
+
+    Returns:
+        Rows of deck x, y (m), heading (rad) and height of the surface there (m), shape (k, 4).
+    """
+    places = np.array([[p.x_m for p in poses], [p.y_m for p in poses], [p.heading_rad for p in poses]]).T
+    return _by_runs(mirror, [p.panel for p in poses], places)
+
+
+def deck_rows(mirror: Mirror, panels: NDArray[np.int64], places: FloatArray) -> FloatArray:
+    """The same of poses that are arrays already.
+
+    Args:
+        mirror: the mirror.
+        panels: row and column of each, shape (k, 2).
+        places: x, y (m) and heading (rad) in the frames of these panels, shape (k, 3).
+    """
+    return _by_runs(mirror, [PanelId(row, col) for row, col in panels.tolist()], places)
+
+
+def _by_runs(mirror: Mirror, panels: Sequence[PanelId], places: FloatArray) -> FloatArray:
+    rows = np.empty((len(panels), 4))
+    start = 0
+    for panel, run in groupby(panels):
+        end = start + sum(1 for _ in run)
+        rows[start:end] = _on_panel(mirror.surface, mirror.panel(panel), places[start:end])
+        start = end
+    return rows
+
+
+def _on_panel(surface: Surface, panel: Panel, places: FloatArray) -> FloatArray:
+    axes = np.array(panel.axes)
+    points = np.array(panel.origin) + places[:, :2] @ axes[:2]
+    for _ in range(_DROP_STEPS):
+        x, y, z = points.T
+        fx, fy = surface.gradients(x, y)
+        gap = (surface.heights_m(x, y) - z) / (axes[2, 2] - fx * axes[2, 0] - fy * axes[2, 1])
+        points += gap[:, None] * axes[2]
+    x, y, z = points.T
+    fx, fy = surface.gradients(x, y)
+    e1 = np.column_stack([np.ones_like(fx), np.zeros_like(fx), fx]) / np.sqrt(1.0 + fx * fx)[:, None]
+    n = np.column_stack([-fx, -fy, np.ones_like(fx)]) / np.sqrt(1.0 + fx * fx + fy * fy)[:, None]
+    # The heading lies in the tangent plane at the robot and projects on (cos, sin, 0) of the panel frame.
+    flat = np.cos(places[:, 2, None]) * axes[0] + np.sin(places[:, 2, None]) * axes[1]
+    h = flat - ((flat * n).sum(axis=1) / (n @ axes[2]))[:, None] * axes[2]
+    heading = np.arctan2((h * np.cross(n, e1)).sum(axis=1), (h * e1).sum(axis=1))
+    return np.column_stack([x, y, heading, z])

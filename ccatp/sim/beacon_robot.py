@@ -1,4 +1,4 @@
-"""Pure. A robot among beacons behind the robot link: its rules, its vehicle, what it hears. Time is an argument.
+"""A robot among beacons behind the robot link: its rules, its vehicle, what it hears. Time is an argument.
 
 Choices the interface leaves open:
 
@@ -7,23 +7,33 @@ Choices the interface leaves open:
 * The wheels obey at once; the link has no delay; there are no fans; the battery stays full.
 * A steering angle turns the robot like wheels of unequal speed, so it needs the permit ``turn``; the echo is that of
   the wheels.
+
+What leaves the simulation of a robot among beacons by the truth's own sockets.
+
+The simulated robot among beacons of a configuration, and the world round it.
 """
 
 from math import isfinite
 from typing import Protocol
 
-from ccatp.config.radio_models import RadioConfig
-from ccatp.sim.radio.frame import DriveCommand, Packet, Sighting, TruePose, WorldFrame
+import msgspec
+import numpy as np
+
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.links.beacon_messages import BeaconFrame, MoteBurst, RadioSample, RadioScan, SteerSample, with_extras
+from ccatp.links.robot_codec import encode_sensors
+from ccatp.links.robot_messages import PROTOCOL, Hello, RobotData, VehicleData
+from ccatp.links.topics import BeaconPlaces, BeaconTruth
+from ccatp.sim.motes import RobotEars, TrueMotes, true_motes
+from ccatp.sim.radio import DriveCommand, Packet, Sighting, TruePose, WorldFrame
+from ccatp.sim.radio_world import RadioWorld
 from ccatp.sim.rules import Fans, MotionRules
-from ccatp.wire.beacon_frame import BeaconFrame, MoteBurst, RadioSample, RadioScan, SteerSample, with_extras
-from ccatp.wire.robot import PROTOCOL, Hello, RobotData, encode_sensors
-from ccatp.wire.robot_messages import VehicleData
 
 _CORNER = (0.0, 0.0)  # a robot without edge sensors has them where it is
 
 
 class Surroundings(Protocol):
-    """The true world round the robot; ``ccatp.sim.radio.world.RadioWorld`` is one."""
+    """The true world round the robot; ``ccatp.sim.radio_world.RadioWorld`` is one."""
 
     @property
     def pose(self) -> TruePose:
@@ -238,3 +248,76 @@ def _scan(t_s: float, packets: tuple[Packet, ...], readings: int) -> RadioScan |
         row = levels.setdefault(packet.beacon, [None] * readings)
         row[round(packet.direction_rad / step_rad) % readings] = packet.rssi_dbm
     return RadioScan(t_s, step_rad, levels)
+
+
+BATCH_ROWS = 50
+
+
+class BeaconTruthLog:
+    """Collects a row per frame.
+
+    Requests, answered as JSON: ``b"flush"``: ``{"rows": n}``, the number of rows taken so far (the caller takes the
+    pending ones first); anything else: ``{"error"}``.
+
+    Args:
+        robot: whose truth it is.
+        motes_m: where the motes are, by name.
+    """
+
+    def __init__(self, robot: BeaconRobot, motes_m: dict[str, tuple[float, float]]) -> None:
+        self._robot, self._motes_m = robot, motes_m
+        self._rows: list[tuple[int, float, float, float, float, float | None, float | None, float | None]] = []
+        self._taken = 0
+        self.add()
+
+    def add(self) -> bool:
+        """Add the row of the newest frame; true when the batch should be taken."""
+        robot = self._robot
+        world = robot.world
+        target = world.target_m or (None, None)
+        clearance_m = world.clearance_m
+        is_bounded = clearance_m < float("inf")
+        self._rows.append((robot.seq, robot.t_s, *world.pose, *target, clearance_m if is_bounded else None))
+        return len(self._rows) >= BATCH_ROWS
+
+    def batch(self) -> tuple[str, BeaconTruth] | None:
+        """The pending rows as a topic and its message, or ``None`` without any."""
+        rows, self._rows = self._rows, []
+        self._taken += len(rows)
+        return ("beacon_truth", BeaconTruth(seq=self._robot.seq, t_s=self._robot.t_s, rows=rows)) if rows else None
+
+    def preface(self) -> tuple[str, BeaconPlaces]:
+        """Where radios and motes are."""
+        places = {**self._robot.world.beacons_m, **self._motes_m}
+        return "beacon_places", BeaconPlaces(seq=self._robot.seq, t_s=self._robot.t_s, places=places)
+
+    def answer(self, request: bytes) -> bytes:
+        """The reply to a request."""
+        known = {"rows": self._taken} if request == b"flush" else {"error": "unknown request; known is flush"}
+        return msgspec.json.encode(known)
+
+
+# Streams of random numbers of a seed, apart from those of the world.
+_LAYOUT, _EARS = 20, 21
+
+
+def build_beacon_robot(cfg: RadioConfig) -> BeaconRobot:
+    """The robot of a configuration, just booted."""
+    world = RadioWorld(cfg)
+    if cfg.system != "cricket":
+        return BeaconRobot(cfg, world)
+    rng = np.random.default_rng([cfg.run.seed, _EARS])
+    return BeaconRobot(cfg, world, RobotEars(cfg.cricket, cfg.listener, _motes(cfg), rng))
+
+
+def motes_of(cfg: RadioConfig) -> dict[str, tuple[float, float]]:
+    """Where the motes are, by name."""
+    if cfg.system != "cricket":
+        return {}
+    motes = _motes(cfg)
+    places = motes.positions_m.tolist()
+    return {name: (place[0], place[1]) for name, place in zip(motes.names, places, strict=True)}
+
+
+def _motes(cfg: RadioConfig) -> TrueMotes:
+    return true_motes(cfg.cricket, np.random.default_rng([cfg.run.seed, _LAYOUT]))

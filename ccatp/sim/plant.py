@@ -1,4 +1,4 @@
-"""Pure. Truth of the differential drive on the curved surface, deck frame.
+"""Truth of the differential drive on the curved surface, deck frame.
 
 The wheel servos are first order, ``T dw/dt + w = u`` with the set point u constant within a step, so rates, wheel
 travel and acceleration are exact at every instant of it. The body moves by one midpoint step on the surface metric;
@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from math import cos, exp, sin, sqrt
 from typing import Protocol
 
-from ccatp.mirror.surface import Surface
-from ccatp.mirror.surface_patch import SurfacePatch
-from ccatp.samples import DeckPose
+from ccatp.core import DeckPose
+from ccatp.mirror.surface import Surface, SurfacePatch
 
 # A wheel this slow stands still: the exponential of the servo would never get there, and 1e-9 rad/s is 1 um in 9 h.
 _STANDSTILL_RAD_S = 1e-9

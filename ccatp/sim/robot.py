@@ -1,4 +1,4 @@
-"""Pure. The robot: its rules, its fans, its world and its sensors, one frame after the other. Time is an argument.
+"""The robot: its rules, its fans, its world and its sensors, one frame after the other. Time is an argument.
 
 Choices the interface leaves open:
 
@@ -8,29 +8,124 @@ Choices the interface leaves open:
 * Without a drive in force the echo has seq -1; ages count from the arrival of what came into force last, at most from
   the boot.
 * The link's delays are whole frames. The frame read at t is delivered when the clock shows t + the sensors' delay,
-  the truth is that of the clock. Commands wait in ``ccatp.sim.command_delay``.
-* The battery stays full, ``faults`` stays empty, nothing fails, unless a fault plan says so (``ccatp.sim.faults``).
+  the truth is that of the clock. Commands wait in ``ccatp.sim.robot``.
+* The battery stays full, ``faults`` stays empty, nothing fails without a fault plan (``ccatp.sim.fault_injector``).
 * A reboot by plan takes no time. On the link, clock and frames count from it; ``seq`` and ``t_s`` here, the truth and
   the times of the plan go on.
+
+The way of commands to the wheels: what arrives takes effect a whole number of frames later.
+
+A command that arrives while frame n is the newest takes effect in the frame that follows n + delay. Its age counts from
+its arrival, so the time-to-live covers the delay, too. Without a delay nothing waits. Whether a command is newer than
+the one before is judged when it arrives. Drives, permits and duties do not overtake their own kind, and no kind matters
+to another: each waits in a line of its own.
+
+What leaves the simulation by the truth's own sockets: rows in batches, and answers to requests.
 """
 
 from collections import deque
-from math import ceil
+from math import ceil, isfinite
 
+import msgspec
 import numpy as np
 
 from ccatp.config.models import Config
+from ccatp.core import DeckPose
+from ccatp.links.robot_messages import MAX_LINE_BYTES, PROTOCOL, CommandEcho, Hello, RobotData, Sensors
+from ccatp.links.topics import Misalignment, Truth
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import DeckPose
-from ccatp.sim.command_delay import CommandDelay
-from ccatp.sim.faults.injector import Injector
-from ccatp.sim.faults.plan import FaultPlan
-from ccatp.sim.frame import Frame, as_line, as_message
-from ccatp.sim.rules import Fans, MotionRules
+from ccatp.sim.fault_injector import Injector
+from ccatp.sim.fault_plan import FaultPlan
+from ccatp.sim.rules import Fans, Frame, MotionRules, as_line, as_message
 from ccatp.sim.sensors import SensorSuite
-from ccatp.sim.world import World
-from ccatp.wire.lines import MAX_LINE_BYTES
-from ccatp.wire.robot import PROTOCOL, CommandEcho, Hello, RobotData, Sensors
+from ccatp.sim.world import TruthRow, World
+
+
+class CommandDelay:
+    """Takes commands and hands them to the rules and the fans when they are due.
+
+    Args:
+        rules: decides on drives and permits.
+        fans: decides on duties.
+        frames: length of the delay.
+    """
+
+    __slots__ = ("_drives", "_duties", "_fans", "_frames", "_newest_drive", "_newest_duty", "_newest_permit",
+                 "_permits", "_rules")  # fmt: skip
+
+    def __init__(self, rules: MotionRules, fans: Fans, frames: int) -> None:
+        self._rules, self._fans, self._frames = rules, fans, frames
+        # (frame in which it is due, what the rules or the fans take)
+        self._drives: deque[tuple[int, int, float, float, float]] = deque()
+        self._permits: deque[tuple[int, int, tuple[bool, bool, bool], float]] = deque()
+        self._duties: deque[tuple[int, int, float, float]] = deque()
+        self._newest_drive = self._newest_permit = self._newest_duty = -1
+
+    def drive(self, frame: int, seq: int, right_rad_s: float, left_rad_s: float, now_s: float) -> bool:
+        """Take a drive; false for an old or equal ``seq`` and for numbers not finite."""
+        if not self._frames:
+            return self._rules.drive(seq, right_rad_s, left_rad_s, now_s)
+        if seq <= self._newest_drive or not (isfinite(right_rad_s) and isfinite(left_rad_s)):
+            return False
+        self._newest_drive = seq
+        self._drives.append((frame + self._frames, seq, right_rad_s, left_rad_s, now_s))
+        return True
+
+    def permit(self, frame: int, seq: int, allowed: tuple[bool, bool, bool], now_s: float) -> bool:
+        """Take a permit (forward, reverse, turn); false for an old or equal ``seq``."""
+        if not self._frames:
+            return self._rules.permit(seq, *allowed, now_s)
+        if seq <= self._newest_permit:
+            return False
+        self._newest_permit = seq
+        self._permits.append((frame + self._frames, seq, allowed, now_s))
+        return True
+
+    def fans(self, frame: int, seq: int, left: float, right: float) -> bool:
+        """Take fan duties; false for an old or equal ``seq`` and for numbers not finite."""
+        if not self._frames:
+            return self._fans.command(seq, left, right)
+        if seq <= self._newest_duty or not (isfinite(left) and isfinite(right)):
+            return False
+        self._newest_duty = seq
+        self._duties.append((frame + self._frames, seq, left, right))
+        return True
+
+    def release(self, frame: int) -> None:
+        """Hand on what is due when the step after ``frame`` begins."""
+        drives, permits, duties = self._drives, self._permits, self._duties
+        while drives and drives[0][0] <= frame:
+            _, seq, right_rad_s, left_rad_s, now_s = drives.popleft()
+            self._rules.drive(seq, right_rad_s, left_rad_s, now_s)
+        while permits and permits[0][0] <= frame:
+            _, seq, (forward, reverse, turn), now_s = permits.popleft()
+            self._rules.permit(seq, forward, reverse, turn, now_s)
+        while duties and duties[0][0] <= frame:
+            _, seq, left, right = duties.popleft()
+            self._fans.command(seq, left, right)
+
+    def join_controller(self) -> None:
+        """A new session: drives of the one before are forgotten; its fan duties, already accepted, come into force."""
+        self.lose_controller()
+        for _, seq, left, right in self._duties:
+            self._fans.command(seq, left, right)
+        self._duties.clear()
+        self._newest_duty = -1
+
+    def join_monitor(self) -> None:
+        """A new session: permits of the one before are forgotten."""
+        self.lose_monitor()
+
+    def lose_controller(self) -> None:
+        """Drives on their way are forgotten; fan duties are not."""
+        self._drives.clear()
+        self._newest_drive = -1
+
+    def lose_monitor(self) -> None:
+        """Permits on their way are forgotten."""
+        self._permits.clear()
+        self._newest_permit = -1
+
 
 # Worst case of a frame's line: fixed part, and bytes per sample of each list. Counted rates have all their digits.
 _FRAME_BYTES, _IMU_BYTES, _ENCODER_BYTES, _COUNTER_BYTES, _EDGE_BYTES = 420, 48, 44, 64, 26
@@ -291,3 +386,75 @@ def _check_rates(cfg: Config) -> None:
             f"sim.robot: frames at {sim.frame_hz:g} Hz take up to {line_bytes} bytes, a line holds {MAX_LINE_BYTES}: "
             "raise frame_hz or lower the sensors' rates"
         )
+
+
+BATCH_ROWS = 100
+
+
+class TruthLog:
+    """Collects a row per frame.
+
+    Requests, answered as JSON (SI; puck in the world frame, start pose in the deck frame):
+
+    * ``b"puck"``: ``{"t", "puck": [x, y, z], "moved_m"}``, ``moved_m`` the furthest within the last measuring time;
+    * ``b"misalignment"``: ``{"panels": [[row, col, piston_m, tip_rad, tilt_rad], ...], "start": [x, y, heading]}``;
+    * ``b"flush"``: ``{"rows": n}``, the number of rows taken so far (the caller takes the pending ones first);
+    * anything else: ``{"error"}``.
+
+    Args:
+        robot: whose truth it is.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self._rows: list[TruthRow] = []
+        self._taken = 0
+        self._is_fallen = False
+        self.add()
+
+    def add(self) -> bool:
+        """Add the row of the newest frame; true when the batch should be taken: it is full, or the robot fell."""
+        robot = self._robot
+        world = robot.world
+        self._rows.append(world.truth_row(robot.seq, robot.t_s))
+        has_changed = world.is_fallen is not self._is_fallen
+        self._is_fallen = world.is_fallen
+        return has_changed or len(self._rows) >= BATCH_ROWS
+
+    def take(self) -> Truth | None:
+        """The pending rows as a message of the topic table, or ``None`` without any."""
+        rows, self._rows = self._rows, []
+        self._taken += len(rows)
+        return Truth(seq=self._robot.seq, t_s=self._robot.t_s, rows=rows) if rows else None
+
+    def batch(self) -> tuple[str, Truth] | None:
+        """The same with its topic."""
+        rows = self.take()
+        return None if rows is None else ("truth", rows)
+
+    def preface(self) -> tuple[str, Misalignment]:
+        """How the panels lie, with its topic."""
+        return "misalignment", self.misalignment()
+
+    def misalignment(self) -> Misalignment:
+        """How the panels lie, as a message of the topic table."""
+        return Misalignment(seq=self._robot.seq, t_s=self._robot.t_s, panels=self._panels())
+
+    def _panels(self) -> list[tuple[int, int, float, float, float]]:
+        found = self._robot.world.misalignments.items()
+        return [(*panel, m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in found]
+
+    def answer(self, request: bytes) -> bytes:
+        """The reply to a request."""
+        world = self._robot.world
+        reply: dict[str, object]
+        if request == b"puck":
+            reply = {"t": self._robot.t_s, "puck": world.puck_world(), "moved_m": world.moved_m()}
+        elif request == b"flush":
+            reply = {"rows": self._taken}
+        elif request == b"misalignment":
+            start = world.start_pose
+            reply = {"panels": self._panels(), "start": (start.x_m, start.y_m, start.heading_rad)}
+        else:
+            reply = {"error": "unknown request; known are puck, misalignment, flush"}
+        return msgspec.json.encode(reply)

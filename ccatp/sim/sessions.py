@@ -1,4 +1,4 @@
-"""Pure. The robot's side of the robot link without sockets: sessions, roles, refusals, lockstep.
+"""The robot's side of the robot link without sockets: sessions, roles, refusals, lockstep.
 
 Bytes and time are arguments, the transport is whatever has ``write`` and ``close``. Two clocks: ``now_s`` is any
 monotonic wall clock; the robot's own clock is the simulated one in lockstep and the wall clock since boot otherwise.
@@ -23,27 +23,26 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
 
-from ccatp.sim.rules import Fans, MotionRules
-from ccatp.wire.lines import BadLineCounter, LineBuffer, LineTooLong
-from ccatp.wire.robot import (
+from ccatp.links.robot_codec import BadLine, decode_from_client, encode, is_mac_right
+from ccatp.links.robot_messages import (
     AUTH_HMAC,
     AUTH_NONE,
-    BadLine,
+    BadLineCounter,
     Drive,
     FromClient,
     Hello,
     Join,
     Joined,
+    LineBuffer,
+    LineTooLong,
     Permit,
     RefusalReason,
     Refused,
     Role,
     Unknown,
-    decode_from_client,
-    encode,
-    is_mac_right,
 )
-from ccatp.wire.robot import Fans as FansMessage
+from ccatp.links.robot_messages import Fans as FansMessage
+from ccatp.sim.rules import Fans, MotionRules
 
 JOIN_TIMEOUT_S = 2.0
 SILENCE_S = 5.0

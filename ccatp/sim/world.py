@@ -1,4 +1,4 @@
-"""Pure. The truth of one run: where the robot really is, how the panels really lie, and whether it fell."""
+"""The truth of one run: where the robot really is, how the panels really lie, and whether it fell."""
 
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -7,12 +7,11 @@ from typing import Protocol
 
 import numpy as np
 
-from ccatp.angles import wrap_pi
 from ccatp.config.models import Config
-from ccatp.mirror.alignment import PanelMisalignment, misaligned_puck_world
+from ccatp.core import DeckPose, PanelId, PanelPose, Vector3, wrap_pi
 from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.outline import NearOutline
-from ccatp.samples import DeckPose, PanelId, PanelPose, Vector3
+from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
+from ccatp.mirror.rim import NearOutline
 from ccatp.sim.disturbances import Creep, Vibration, WheelSlip, draw_wheels
 from ccatp.sim.plant import Disturbance, Plant
 

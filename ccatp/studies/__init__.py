@@ -1,1 +1,4 @@
-"""Glue. Studies: campaigns and analyses that answer a question with a table, figures and a machine-readable result."""
+"""Monte Carlo campaigns, comparisons with published results and with peers, replay of recorded runs.
+
+``registry`` is the table of studies; ``campaign`` and ``engine`` run them.
+"""

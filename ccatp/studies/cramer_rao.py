@@ -1,4 +1,4 @@
-"""Pure. The posterior Cramér-Rao bound of the position at the stops of a rehearsal, computed from the truth.
+"""The posterior Cramér-Rao bound of the position at the stops of a rehearsal, computed from the truth.
 
 No estimator can have a smaller mean square error than the inverse of the Bayesian information, and for a Markov process
 the recursion of Tichavský, Muravchik and Nehorai (1998) carries that information from step to step. With Gaussian
@@ -26,11 +26,11 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from ccatp.config.models import Config, WorldConfig
+from ccatp.core import FloatArray, PointId
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import PointId
 from ccatp.sim.disturbances import LEG_PAUSE_S, LEVEL_SLOPE
 from ccatp.studies import cramer_rao_record as way
-from ccatp.studies.cramer_rao_record import FloatArray, SeamPass, StopFix, TrueRecord
+from ccatp.studies.cramer_rao_record import SeamPass, StopFix, TrueRecord
 
 (X, Y, PSI, BG, KG, BA, SR, SL, UR, UL, RR, RL, KL, C, ER, ER0, EL, EL0, J, J0, JA, JA0) = range(22)
 """Order of the state.

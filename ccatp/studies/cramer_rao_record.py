@@ -1,4 +1,4 @@
-"""Pure. A rehearsal that keeps what the Cramér-Rao bound is computed from: true way, seams, fixes."""
+"""A rehearsal that keeps what the Cramér-Rao bound is computed from: true way, seams, fixes."""
 
 from array import array
 from dataclasses import dataclass
@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.localization.crossing import EdgeScanner, Transition
-from ccatp.localization.fixes import deck_foot
+from ccatp.core import Fix, FloatArray, PanelId, PointId
+from ccatp.estimation.fixes import deck_foot
+from ccatp.estimation.seams import EdgeScanner, Transition
+from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import Fix, FloatArray, PanelId, PointId
-from ccatp.studies.rehearsal import Rehearsing
-from ccatp.studies.rehearsal_result import Rehearsal
-from ccatp.wire.robot import Sensors
+from ccatp.studies.sil_models import Rehearsal
+from ccatp.studies.sil_run import Rehearsing
 
 T, X, Y, HX, HY, LX, LY, FX, FY, RIGHT, LEFT, RIGHT_SCALE, LEFT_SCALE, ORDERED = range(14)
 """Columns of the way.

@@ -1,4 +1,4 @@
-"""Pure. Single drives over a seam and to the rim on the simulated plant, judged by two edge rules.
+"""Single drives over a seam and to the rim on the simulated plant, judged by two edge rules.
 
 The robot drives on constant set points; its wheels slip, its sensors err and the panels' edges lie as the world says
 (creep and vibration are left out). The rules see what the danger loop sees: edge and encoder samples frame by frame,
@@ -13,15 +13,15 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from ccatp.config.models import Config
+from ccatp.core import DeckPose, EdgeSample, EventCode, ImuSample, PanelId, WheelSample
 from ccatp.danger import DangerMonitor
+from ccatp.links.robot_messages import CommandEcho
+from ccatp.links.topics import Estimate, is_estimate_due
+from ccatp.mirror.layout import Panel
 from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.panels import Panel
-from ccatp.samples import DeckPose, EdgeSample, EventCode, ImuSample, PanelId, WheelSample
-from ccatp.sim.frame import named
 from ccatp.sim.plant import Plant
+from ccatp.sim.rules import named
 from ccatp.sim.sensors import SensorSuite
-from ccatp.wire.robot import CommandEcho
-from ccatp.wire.topics import Estimate, is_estimate_due
 
 RULES = ("thesis", "shipped")
 OFF_S = 0.1

@@ -1,20 +1,171 @@
-"""Pure. The study `faults`: whole missions without faults, and with random ones that pass by: falls, completion."""
+"""The study `faults`: whole missions without faults, and with random ones that pass by: falls, completion.
 
+The figure of the study `faults`: what faults that pass by cost in time.
+
+Random plans of faults that pass by: sensors, frames, clock, wheels, at random times of a mission.
+
+A rehearsal whose robot has a plan of faults: frames lost or garbled, a clock that jumps, wheels blocked.
+"""
+
+import random
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ccatp.assembly import assemble
+from ccatp.config.models import Config
+from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
-from ccatp.sim.faults.plan import FaultPlan
-from ccatp.studies.campaign import Cell, Column, Factors, Job, Outcome, Study
-from ccatp.studies.fault_plans import random_plan
-from ccatp.studies.faults_figures import draw_faults
-from ccatp.studies.faulty_rehearsal import FaultyRehearsal
-from ccatp.studies.mission_cell import dangers, times
-from ccatp.studies.rehearsal import rehearse
-from ccatp.studies.rehearsal_result import Rehearsal
+from ccatp.report.plots import dress, new_figure
+from ccatp.sim.fault_models import SENSOR_SIGNALS, Injected
+from ccatp.sim.fault_plan import FaultPlan, parse_plan
+from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
+from ccatp.studies.figures import LIMIT, colour, save
+from ccatp.studies.mission_study import dangers, times
+from ccatp.studies.sil_models import Rehearsal
+from ccatp.studies.sil_run import Rehearsing, rehearse
+from ccatp.survey.composition import assemble
+
+_SPREAD = 0.3  # dots of a row lie beside each other
+
+
+def draw_faults(cells: Sequence[CellResult], out: Path) -> None:
+    """Figure ``faults``: every mission a dot, those that were not completed marked."""
+    figure = new_figure(7.0, 1.0 + 0.55 * len(cells))
+    axes = figure.add_subplot()
+    kinds = list(dict.fromkeys(cell.factors["faults"] for cell in cells))
+    for k, cell in enumerate(cells):
+        ratios, is_complete = cell.arrays["time_ratio"], cell.arrays["is_complete"].astype(bool)
+        rows = k + _SPREAD * np.linspace(-1.0, 1.0, len(ratios)) if len(ratios) > 1 else np.array([float(k)])
+        shade = colour(kinds.index(cell.factors["faults"]))
+        axes.plot(ratios[is_complete], rows[is_complete], ".", color=shade, markersize=5)
+        axes.plot(ratios[~is_complete], rows[~is_complete], "x", color=LIMIT, markersize=6)
+    axes.set_yticks(range(len(cells)), [f"{c.factors['mirror']}, faults: {c.factors['faults']}" for c in cells])
+    axes.invert_yaxis()
+    axes.set_xlabel("mission time over its bound; a cross: not completed")
+    dress(axes)
+    save(figure, out / "faults")
+
+
+LONGEST_S = 2.0
+FIRST_S = 3.0  # not before the sensors have said anything
+
+
+class NoFrames(RuntimeError):
+    """The robot fell silent for good, which no plan of passing faults does."""
+
+
+def random_plan(seed: int, count: int, last_s: float) -> FaultPlan:
+    """A function of its arguments alone.
+
+    Args:
+        seed: of the plan.
+        count: how many faults.
+        last_s: robot time by which all have begun; each lasts at most ``LONGEST_S``.
+    """
+    rng = random.Random(f"plan {seed}")
+    texts = []
+    for _ in range(count):
+        signal, kind, keys = _draw(rng)
+        at_s, for_s = rng.uniform(FIRST_S, last_s), rng.uniform(0.05, LONGEST_S)
+        texts.append(
+            f'[[fault]]\nsignal = "{signal}"\ntype = "{kind}"\nat_s = {at_s:.3f}\nfor_s = {for_s:.3f}\n{keys}\n'
+        )
+    return parse_plan("".join(texts), f"plan {seed}")
+
+
+def _draw(rng: random.Random) -> tuple[str, str, str]:
+    """Signal, type and keys of a fault."""
+    if rng.random() < 0.25:
+        return rng.choice(
+            [
+                ("frames", "drop", f"every = {rng.randint(1, 4)}"),
+                ("frames", "reorder", f"every = {rng.randint(2, 5)}"),
+                ("frames", "duplicate", "every = 2"),
+                ("clock", "jump", f"by_s = {rng.uniform(-0.5, 0.5):.3f}"),
+                ("body", "slip", f"factor = {rng.uniform(0.2, 1.0):.3f}"),
+                ("right_wheel", "blocked", ""),
+                ("left_wheel", "blocked", ""),
+                ("faults", "raise", 'names = ["imu", "edge"]'),
+            ]
+        )
+    signal = rng.choice(SENSOR_SIGNALS)
+    kind, keys = rng.choice(
+        [
+            ("off", ""),
+            ("stuck", ""),
+            ("garbage", f"beyond = {rng.choice((0.0, 0.3))}"),
+            ("wrong", f"factor = {rng.uniform(0.5, 1.5):.3f}"),
+            ("slow", f"every = {rng.randint(2, 20)}"),
+            ("delayed", f'by_s = {rng.uniform(0.02, 0.5):.3f}\nstamps = "{rng.choice(("old", "fresh"))}"'),
+            ("intermittent", f"period_s = {rng.uniform(0.01, 0.3):.3f}\nduty = 0.5"),
+            ("saturated", "low = -0.1\nhigh = 0.1" if not signal.startswith("edge") else "high = 0.0"),
+            ("non_finite", 'token = "NaN"'),
+        ]
+    )
+    return signal, kind, keys
+
+
+_LOST_FRAMES = 500  # without a frame for so long a mission is over
+
+
+class FaultyRehearsal(Rehearsing):
+    """As the processes: a frame that nobody can take is passed over, and one that is not newer is answered with zeros.
+
+    Args:
+        cfg: the configuration.
+        plan: what shall go wrong.
+        with_track: keep true and estimated pose of every frame.
+
+    Attributes:
+        denied_s: when lines that were no frames took the permit away.
+        weak_frames: frames on an overhang in which the fans gave less than their floor.
+    """
+
+    def __init__(self, cfg: Config, plan: FaultPlan, *, with_track: bool = False) -> None:
+        super().__init__(cfg, with_track=with_track, faults=plan)
+        self.denied_s: list[float] = []
+        self.weak_frames = 0
+
+    @property
+    def injected(self) -> tuple[Injected, ...]:
+        """What became of each fault of the plan."""
+        injector = self.robot.injector
+        return () if injector is None else injector.injected
+
+    def _note_truth(self) -> None:
+        super()._note_truth()
+        for _ in range(_LOST_FRAMES):
+            if self.robot.delivered is not None:
+                return
+            self._hear_garbled()
+            self.robot.advance()
+            super()._note_truth()
+        raise NoFrames(f"no frame arrives any more after {self.robot.t_s:.2f} s")
+
+    def _hear_garbled(self) -> None:
+        """As the danger loop on a line that no client may take."""
+        last = self.monitor.verdict
+        if not self.robot.delivered_line or last.seq < 0:
+            return
+        verdict = self.monitor.garbled(last.seq, last.t_s, self.robot.t_s)
+        if verdict is not None:
+            self.denied_s.append(self.robot.t_s)
+            self._drive_seq += 1  # numbers drives and permits alike here
+            self.robot.permit(self._drive_seq, verdict.forward, verdict.reverse, verdict.turn)
+
+    def _serve(self, frame: Sensors, dt_s: float) -> None:
+        if self.mirror.overhang and self.robot.fans.thrust < self.cfg.sim.robot.fan_floor:
+            self.weak_frames += 1
+        if dt_s > 0.0:
+            super()._serve(frame, dt_s)
+            return
+        self.localizer.step(frame.t, frame.imu, frame.enc, frame.edge, frame.gravity)
+        self._drive_seq += 1
+        self._foresee(self._drive_seq, 0.0, 0.0)
+        self.robot.drive(self._drive_seq, 0.0, 0.0)
+
 
 NONE, RANDOM = "none", "random"
 FAULTS_PER_MISSION = 12

@@ -1,23 +1,39 @@
-"""Glue. The study `mote-sizes`: what a batch map of sparse ranges costs, against the number of motes."""
+"""The study `mote-sizes`: what a batch map of sparse ranges costs, against the number of motes.
+
+Many self-mappings of one configuration, put together: errors, bound, what is free, traces.
+
+What is drawn of a campaign of self-mappings: its first map, and the errors of all runs.
+"""
 
 import json
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, bound_rms_m
+from ccatp.beacons.cricket.mote_map import map_motes
+from ccatp.beacons.cricket.range_network import MoteRange, RangeNetwork, build_network, components
+from ccatp.beacons.cricket.rigidity import find_fold_over, find_freedom, generic_state
+from ccatp.config.beacon_models import CricketConfig
 from ccatp.config.models import Config
-from ccatp.motes.fold_over import find_fold_over
-from ccatp.motes.map_batch import BatchSettings
-from ccatp.motes.map_model import MapModel
-from ccatp.motes.mote_map import map_motes
-from ccatp.motes.range_bound import bound_rms_m
-from ccatp.motes.range_network import RangeNetwork, build_network, components
-from ccatp.motes.rigidity import find_freedom, generic_state
-from ccatp.motes.tdoa import MoteRange
-from ccatp.radio.rigid_alignment import best_motion
-from ccatp.studies.figures import INK, colour, dress, new_figure, save
+from ccatp.core import FloatArray
+from ccatp.filters.metrics import aligned_rms_m, best_motion, rms_m
+from ccatp.report.beacon_plots import MapPicture, Traces
+from ccatp.report.drawing import INK
+from ccatp.report.plots import dress, new_figure
+from ccatp.studies.figures import colour, save
+from ccatp.studies.mote_runs import (
+    MoteOutlook,
+    MoteRun,
+    SimulatedField,
+    look_ahead,
+    run_batch,
+    run_filter,
+    simulate_field,
+)
 
 SIZES = (30, 60, 120, 250, 500, 1000)
 NEIGHBOURS = 13.0  # of a mote, on the average, beside those at the rim
@@ -121,3 +137,142 @@ def _draw(cells: list[dict[str, Any]], stem: Path) -> None:
     axes.legend(frameon=False, fontsize=8)
     dress(axes)
     save(figure, stem)
+
+
+METHODS = ("ekf", "batch")
+
+
+class MoteCampaign(NamedTuple):
+    """Runs of one configuration.
+
+    Attributes:
+        method: ``ekf`` or ``batch``.
+        runs: in the order of their seeds.
+        outlook: of the first seed's graph, bounds at the median number of updates.
+        field: the first.
+    """
+
+    method: str
+    runs: tuple[MoteRun, ...]
+    outlook: MoteOutlook
+    field: SimulatedField
+
+
+def run_campaign(
+    cfg: CricketConfig, method: str, seeds: Sequence[int], tell: Callable[[int], None] = lambda _: None
+) -> MoteCampaign:
+    """Map the motes once for each seed.
+
+    Args:
+        cfg: the motes.
+        method: ``ekf`` or ``batch``.
+        seeds: of the runs.
+        tell: called with the number of runs done.
+
+    Raises:
+        MappingError: a field of which no map can be made.
+    """
+    field = simulate_field(cfg, seeds[0])
+    outlook = look_ahead(cfg, field, method)
+    runs = []
+    for done, seed in enumerate(seeds, start=1):
+        drawn = field if seed == seeds[0] else simulate_field(cfg, seed)
+        # Drawn layouts differ from seed to seed, and so do their folds.
+        known = outlook if cfg.layout != "random" or seed == seeds[0] else look_ahead(cfg, drawn, method)
+        runs.append(run_filter(cfg, drawn) if method == "ekf" else run_batch(cfg, drawn, known))
+        tell(done)
+    if method == "ekf":
+        updates = int(np.median([run.iterations for run in runs]))
+        outlook = look_ahead(cfg, field, method, max(updates, 1))
+    return MoteCampaign(method, tuple(runs), outlook, field)
+
+
+def campaign_data(campaign: MoteCampaign) -> dict[str, Any]:
+    """What ``ccatp radio map --json`` prints."""
+    runs, outlook = campaign.runs, campaign.outlook
+    laid = [run.phase1_rms_m for run in runs if run.phase1_rms_m is not None]
+    return {
+        "rms_m": percentiles([run.rms_m for run in runs]),
+        "crlb_m": outlook.bound_rms_m,
+        "rank_deficiency": outlook.freedom.deficiency,
+        "fold_over_risk": not outlook.folds.is_unique,
+        "phase1_rms_m": float(np.median(laid)) if laid else None,
+        "iterations": int(np.median([run.iterations for run in runs])),
+        "method": campaign.method,
+        "seeds": len(runs),
+        "motes": len(runs[0].names),
+        "frame": "aligned" if runs[0].is_aligned else "surveyed",
+        "rms_of_all_m": float(np.sqrt(np.mean([run.rms_m**2 for run in runs]))),
+        "motes_in_doubt": int(np.median([len(run.doubtful) for run in runs])),
+        "rms_of_others_m": float(np.median([sure_rms_m(run) for run in runs])),
+        "expected_rms_m": float(np.median([run.expected_rms_m for run in runs])),
+        "offset_m": float(np.median([run.offset_m for run in runs])),
+        "scale": 1.0 + float(np.median([run.scale for run in runs])),
+        "free_directions": [*outlook.freedom.frame, *outlook.freedom.flexes, *outlook.freedom.calibration],
+        "warnings": list(outlook.folds.warnings),
+    }
+
+
+def sure_rms_m(run: MoteRun) -> float:
+    """Error of the motes that are not in doubt, in the frame of the run; not a number where there are too few."""
+    sure = [row for row in range(len(run.names)) if row not in run.doubtful]
+    found, true = run.positions_m[sure], run.true_m[sure]
+    if not run.is_aligned:
+        return rms_m(found, true)
+    return aligned_rms_m(found, true, mirrors=True) if len(sure) > true.shape[1] else float("nan")
+
+
+def percentiles(values: Sequence[float]) -> dict[str, float]:
+    """10, 50 and 90 %."""
+    low, middle, high = np.percentile(values, (10, 50, 90))
+    return {"p10": float(low), "p50": float(middle), "p90": float(high)}
+
+
+def traces_of(runs: Sequence[MoteRun]) -> tuple[FloatArray, FloatArray]:
+    """Errors and expected errors by update, shape (runs, k) each; a run that ended early stays where it was."""
+    longest = max(len(run.trace_m) for run in runs)
+
+    def padded(traces: Sequence[FloatArray]) -> FloatArray:
+        return np.array([np.pad(trace, (0, longest - len(trace)), mode="edge") for trace in traces])
+
+    return padded([run.trace_m for run in runs]), padded([run.expected_trace_m for run in runs])
+
+
+_LINED = 100  # motes up to which the measured pairs are drawn
+
+
+def pictured(campaign: MoteCampaign, seed: int) -> tuple[MapPicture, Traces | None]:
+    """The map of the first run, and of the filter the errors against updates.
+
+    Args:
+        campaign: the runs.
+        seed: of the first, for the title.
+    """
+    run = campaign.runs[0]
+    title = f"{campaign.method}, {len(run.names)} motes, seed {seed}, error {1e3 * run.rms_m:.3g} mm"
+    positions_m, covariance_m2 = run.positions_m, run.covariance_m2
+    if run.is_aligned:  # its frame is its own: moved onto the truth, for the eye
+        motion = best_motion(run.positions_m, run.true_m, mirrors=True)
+        positions_m, covariance_m2 = motion.moved(positions_m), motion.turned_map(covariance_m2)
+    pairs = np.array(_pairs(campaign, run), dtype=np.intp).reshape(-1, 2)
+    picture = MapPicture(run.names, positions_m, covariance_m2, run.true_m, pairs, run.doubtful, title)
+    if campaign.method != "ekf":
+        return picture, None
+    errors, expected = traces_of(campaign.runs)
+    low, middle, high = np.percentile(errors, (10, 50, 90), axis=0)
+    bound_m = campaign.outlook.bound_rms_m
+    return picture, Traces(low, middle, high, np.median(expected, axis=0), bound_m, len(campaign.runs))
+
+
+def _pairs(campaign: MoteCampaign, run: MoteRun) -> list[tuple[int, int]]:
+    """Pairs of motes of the map that ranged, in phase 2 for the filter, in phase 1 for the batch."""
+    field = campaign.field
+    if len(run.names) > _LINED:
+        return []
+    row = {name: number for number, name in enumerate(run.names)}
+    names = field.plan.names
+    if campaign.method == "ekf":
+        ends = {(names[i], names[j]) for i, j, _, _ in field.second}
+    else:
+        ends = {(reading.first, reading.second) for reading in field.first}
+    return sorted((row[a], row[b]) for a, b in ends if a in row and b in row)

@@ -1,4 +1,4 @@
-"""Glue. THE table of studies: name, module, one line. A study is imported when it is asked for."""
+"""THE table of studies: name, module, one line. A study is imported when it is asked for."""
 
 import difflib
 from collections.abc import Callable
@@ -6,10 +6,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
-# The help of the command reads the table, and shall not wait for what the studies need.
 if TYPE_CHECKING:
     from ccatp.config.models import Config
     from ccatp.studies.campaign import Study
+
+
+# The help of the command reads the table, and shall not wait for what the studies need.
+
 
 Analysis: TypeAlias = "Callable[[Config, Path], dict[str, Any]]"
 """A study without runs: a configuration and a directory, to what ``result.json`` holds."""
@@ -27,8 +30,8 @@ STUDIES = {
     "thesis": Entry("ccatp.studies.thesis_study", "STUDY", "the thesis's own simulation again, under several readings"),
     "filters": Entry("ccatp.studies.filters_study", "STUDY", "filters in four worlds, over whole missions"),
     "time": Entry("ccatp.studies.time_study", "STUDY", "order, speed and measuring time against the hour"),
-    "sensitivity": Entry("ccatp.studies.sensitivity_study", "STUDY", "what each disturbance of a hard world costs"),
-    "ablation": Entry("ccatp.studies.ablation_study", "STUDY", "what each technique gives, one off at a time"),
+    "sensitivity": Entry("ccatp.studies.factor_studies", "SENSITIVITY", "what each disturbance of a hard world costs"),
+    "ablation": Entry("ccatp.studies.factor_studies", "ABLATION", "what each technique gives, one off at a time"),
     "danger": Entry("ccatp.studies.danger_study", "STUDY", "false edges and overrun of two edge rules"),
     "faults": Entry("ccatp.studies.faults_study", "STUDY", "whole missions with random faults: falls, completion"),
     "cricket": Entry(
@@ -42,10 +45,10 @@ STUDIES = {
         "ccatp.studies.radio_signals_study", "STUDY", "levels and bearings of ZigBee radios, beside 2017"
     ),
     "radio-slam": Entry(
-        "ccatp.studies.radio_slam_study", "STUDY", "EKF-SLAM among ZigBee radios: rooms, slip, shadowing"
+        "ccatp.studies.radio_studies", "RADIO_SLAM", "EKF-SLAM among ZigBee radios: rooms, slip, shadowing"
     ),
-    "radio-cases": Entry("ccatp.studies.radio_cases_study", "STUDY", "cases I to III of 2017 side by side with ours"),
-    "radio-follow": Entry("ccatp.studies.radio_follow_study", "STUDY", "a moving radio followed, beside 2018"),
+    "radio-cases": Entry("ccatp.studies.radio_studies", "RADIO_CASES", "cases I to III of 2017 side by side with ours"),
+    "radio-follow": Entry("ccatp.studies.radio_studies", "RADIO_FOLLOW", "a moving radio followed, beside 2018"),
     "loops": Entry("ccatp.studies.loops", "run", "Bode plots, margins and root loci of the controllers"),
 }
 

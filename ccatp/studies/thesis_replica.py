@@ -1,4 +1,4 @@
-"""Pure. The thesis's simulation, done again: four panels, its filter, its control, and two readings of what it prints.
+"""The thesis's simulation, done again: four panels, its filter, its control, and two readings of what it prints.
 
 * ``noise_is_variance``: eq. 2.17 calls sigma a variance; then a sensor's standard deviation is the root of what table
   2.1 lists. The filter's R follows, as the thesis adjusts it.
@@ -17,16 +17,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ccatp.assembly import assemble
 from ccatp.config.models import Config
+from ccatp.core import EdgeSample, EventCode, Fix, GravitySample, ImuSample, Verdict, WheelSample
 from ccatp.danger import DangerMonitor, Estimate, SensorsFrame
+from ccatp.estimation.measurements import STATES, THETA
+from ccatp.estimation.seams import Transition
+from ccatp.estimation.thesis_localizer import FourStateLocalizer
 from ccatp.filters import FILTERS
-from ccatp.localization.crossing import Transition
-from ccatp.localization.four_state import FourStateLocalizer
-from ccatp.localization.measurements import STATES, THETA
-from ccatp.samples import EdgeSample, EventCode, Fix, GravitySample, ImuSample, Verdict, WheelSample
-from ccatp.studies.rehearsal import Rehearsing
-from ccatp.studies.rehearsal_result import Rehearsal
+from ccatp.studies.sil_models import Rehearsal
+from ccatp.studies.sil_run import Rehearsing
+from ccatp.survey.composition import assemble
 
 FRAME_HZ = 100.0
 POINTS, PANELS = 36, 4

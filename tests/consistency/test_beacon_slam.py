@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ccatp.angles import wrap_pi
-from ccatp.radio.motion import DifferentialDrive, DifferentialNoise, Increment
-from ccatp.radio.readings import RangeBearingReading, RangeReading, Reading
-from ccatp.radio.slam import BeaconSlam
-from ccatp.radio.slam_settings import BearingModel, RangeModel, SlamSettings, Trust
+from ccatp.beacons.slam.beacon_map import BearingModel, RangeModel, SlamSettings, Trust
+from ccatp.beacons.slam.motion import DifferentialDrive, DifferentialNoise, Increment
+from ccatp.beacons.slam.range_slam import BeaconSlam
+from ccatp.beacons.slam.recording import RangeBearingReading, RangeReading, Reading
+from ccatp.core import wrap_pi
 
 NOISE = DifferentialNoise(0.02, 0.0, 0.01, 0.02, 0.0, 0.0)
 PLAIN = Trust(

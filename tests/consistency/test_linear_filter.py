@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ccatp.filters import FILTERS, FloatArray
+from ccatp.core import FloatArray
+from ccatp.filters import FILTERS
 
 SEEDS, STEPS, DT_S = 50, 40, 0.01
 F = np.eye(4)

@@ -13,32 +13,14 @@ import pytest
 from scipy.stats import chi2
 
 from ccatp.config.models import LocalizerConfig
+from ccatp.core import FloatArray, PanelId, PanelPose
+from ccatp.estimation.odometry import Block
+from ccatp.estimation.slip_prior import LegBook
+from ccatp.estimation.state_filter import SurveyFilter
+from ccatp.estimation.state_model import BA, BG, KG, KL, PL, PR, PSI, SL, SR, STATES, A, C, V, W, X, Y
+from ccatp.estimation.wheel_angles import WheelAngle
 from ccatp.filters import FILTERS
-from ccatp.filters.base import FloatArray
-from ccatp.localization.block import Block
-from ccatp.localization.legs import LegBook
-from ccatp.localization.survey_filter import SurveyFilter
-from ccatp.localization.survey_model import (
-    BA,
-    BG,
-    KG,
-    KL,
-    PL,
-    PR,
-    PSI,
-    SL,
-    SR,
-    STATES,
-    A,
-    C,
-    V,
-    W,
-    X,
-    Y,
-)
-from ccatp.localization.wheel_angles import WheelAngle
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import PanelId, PanelPose
 from tests.unit.localization.drive import config, mirror
 
 SEEDS, STEPS, DT_S = 50, 50, 0.04

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ccatp.filters import FILTERS, FloatArray, Smoother
+from ccatp.core import FloatArray
+from ccatp.filters import FILTERS, Smoother
 
 BOTH = pytest.mark.parametrize("name", ["ekf", "ukf"])
 DT_S, SEEDS, STEPS = 0.1, 50, 60

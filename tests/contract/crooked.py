@@ -7,11 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from typing import Any, NamedTuple
 
+from ccatp.commissioning.conformance.judges import Result
+from ccatp.commissioning.conformance.runner import Conformance
 from ccatp.config.models import Config
-from ccatp.conformance.runner import Conformance
-from ccatp.conformance.verdict import Result
-from ccatp.dataloop import DataLoop
-from ccatp.stand_ins.link_server import _Connection
+from ccatp.dataloop import DataLoop, _Connection
 
 Message = dict[str, Any]
 STOP_S = 10.0

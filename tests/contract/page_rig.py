@@ -15,13 +15,13 @@ import structlog
 import zmq
 import zmq.asyncio
 
-from ccatp.bus import Publisher
 from ccatp.config.models import Config
-from ccatp.processes.common import Endpoints
-from ccatp.processes.dashboard import Dashboard
-from ccatp.router import Router
-from ccatp.wire.channels import format_ok
-from ccatp.wire.topics import MissionStatus, Picture, Presence
+from ccatp.daemon.dashboard import Dashboard
+from ccatp.daemon.process import Endpoints
+from ccatp.links.bus import Publisher
+from ccatp.links.channels import format_ok
+from ccatp.links.rpc import Router
+from ccatp.links.topics import MissionStatus, Picture, Presence
 
 DEADLINE_S = 20.0
 Handler = Callable[[bytes], Awaitable[bytes]]

@@ -11,22 +11,8 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from ccatp.hazards.abort_latch import AbortLatch
-from ccatp.router import (
-    BUSY,
-    HIGH_WATER_MARK,
-    MAX_FRAME_BYTES,
-    MAX_PENDING,
-    NOT_SINGLE,
-    Handler,
-    RequestFailed,
-    Router,
-    RouterError,
-    request,
-    split_envelope,
-)
-from ccatp.samples import EmergencyKind, EventCode
-from ccatp.wire.channels import (
+from ccatp.core import EmergencyKind, EventCode
+from ccatp.links.channels import (
     MAX_REQUEST_BYTES,
     BadRequest,
     ClearRequest,
@@ -41,6 +27,20 @@ from ccatp.wire.channels import (
     parse_operator,
     parse_reply,
 )
+from ccatp.links.rpc import (
+    BUSY,
+    HIGH_WATER_MARK,
+    MAX_FRAME_BYTES,
+    MAX_PENDING,
+    NOT_SINGLE,
+    Handler,
+    RequestFailed,
+    Router,
+    RouterError,
+    request,
+    split_envelope,
+)
+from ccatp.safety.emergency_latch import AbortLatch
 
 ID = "3b241101-e2bb-4255-8caf-4136c566a962"
 DEADLINE_S = 5.0  # only a broken test waits so long

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from ccatp.cli import main
-from ccatp.config.loader import load_config
+from ccatp.commissioning.conformance.checks import CHECKS, check_ids
+from ccatp.commissioning.conformance.judges import Result
+from ccatp.commissioning.conformance.runner import Conformance
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.conformance.runner import Conformance
-from ccatp.conformance.table import CHECKS, check_ids
-from ccatp.conformance.verdict import Result
 from ccatp.dataloop import DataLoop
 from tests.contract.crooked import HONEST, Crooked, checked, serving
 from tests.faults.table import conformance_rows, load_table

@@ -8,17 +8,18 @@ from typing import Any
 
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.commissioning.conformance import motion_checks as stories_frames
+from ccatp.commissioning.conformance import session_checks as stories_session
+from ccatp.commissioning.conformance.checks import CHECKS
+from ccatp.commissioning.conformance.session_checks import BAD_DRIVES
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.conformance import stories_frames, stories_session
-from ccatp.conformance.stories_input import BAD_DRIVES
-from ccatp.conformance.table import CHECKS
 from ccatp.dataloop import DataLoop
+from ccatp.links.robot_codec import join_mac
+from ccatp.links.robot_messages import BadLineCounter, Drive, LineBuffer
+from ccatp.links.robot_messages import Fans as FansMessage
 from ccatp.sim import sessions
 from ccatp.sim.rules import Fans, MotionRules
-from ccatp.wire.lines import BadLineCounter, LineBuffer
-from ccatp.wire.robot import Drive, join_mac
-from ccatp.wire.robot import Fans as FansMessage
 from tests.contract.crooked import Crooked, Message, Middle, failures
 
 AT_ONCE = 8  # servers

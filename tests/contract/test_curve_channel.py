@@ -18,16 +18,24 @@ from zmq.utils.monitor import parse_monitor_message
 
 from ccatp.cli import main
 from ccatp.config.models import ObservatoryConfig
-from ccatp.curve_keys import KeyPair, read_pair, write_pair
-from ccatp.curve_router import ZAP_ENDPOINT, CurveRouter, ZapHandler
+from ccatp.core import EventCode
+from ccatp.daemon.command_handlers import Observatory, ObservatoryDesk
 from ccatp.errors import ConfigError
-from ccatp.hazards.abort_latch import AbortLatch
-from ccatp.processes.observing import Observatory, ObservatoryDesk
-from ccatp.repetition import LineBudget
-from ccatp.router import MAX_CONNECTIONS, CurveClient, Router, RouterError, request, turn_away
-from ccatp.samples import EventCode
-from ccatp.wire.access import Client, Role, decode_key
-from ccatp.wire.channels import format_ok, format_request, parse_reply
+from ccatp.links.auth import Client, KeyPair, Role, decode_key, read_pair, write_pair
+from ccatp.links.channels import format_ok, format_request, parse_reply
+from ccatp.links.liveness import LineBudget
+from ccatp.links.rpc import (
+    MAX_CONNECTIONS,
+    ZAP_ENDPOINT,
+    CurveClient,
+    CurveRouter,
+    Router,
+    RouterError,
+    ZapHandler,
+    request,
+    turn_away,
+)
+from ccatp.safety.emergency_latch import AbortLatch
 
 DEADLINE_S = 20.0
 ID = "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"
@@ -302,7 +310,7 @@ async def test_a_handler_that_fails_takes_the_channel_with_it(site: Site, monkey
     def surprise(*_: object) -> None:
         raise LookupError("surprise")
 
-    monkeypatch.setattr("ccatp.curve_router.answer_zap", surprise)
+    monkeypatch.setattr("ccatp.links.rpc.answer_zap", surprise)
     with pytest.raises(ExceptionGroup) as caught:
         async with served(site):
             await is_locked_out(site.endpoint, with_curve(site.client("observatory")))

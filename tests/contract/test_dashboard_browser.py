@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from playwright.async_api import Page, async_playwright, expect
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from tests.contract.page_rig import page_rig
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

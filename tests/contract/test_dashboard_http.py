@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.dashboard.hub import IDLE_PERIOD_S
-from ccatp.wire.channels import format_error, format_ok
-from ccatp.wire.topics import Log
+from ccatp.links.channels import format_error, format_ok
+from ccatp.links.topics import Log
+from ccatp.report.dashboard.hub import IDLE_PERIOD_S
 from tests.contract.page_rig import DEADLINE_S, Rig, mission, page_rig
 from tests.unit.dashboard.prometheus import parse
 

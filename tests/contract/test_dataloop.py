@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 
 from ccatp.config.models import Config
 from ccatp.dataloop import DataLoop, serve
-from ccatp.robot_link import RobotLink, RobotRefused
-from ccatp.wire.robot import Role, Sensors, join_mac
+from ccatp.links.robot_codec import join_mac
+from ccatp.links.robot_link import RobotLink, RobotRefused
+from ccatp.links.robot_messages import Role, Sensors
 from tests.contract.test_robot_wire import MALFORMED_FROM_CLIENT
 
 DEADLINE_S = 5.0  # what takes milliseconds in a good run may take this long on a loaded machine
@@ -445,7 +446,7 @@ async def test_time_to_live_on_the_wall_clock(config: Config) -> None:
 
 
 async def test_fans_never_go_below_the_floor_on_an_overhang() -> None:
-    from ccatp.config.loader import load_config
+    from ccatp.config.load import load_config
 
     async with running(load_config(overrides={"run.mirror": "fyst-m2"})) as rig:
         peer = await rig.peer()
@@ -513,7 +514,7 @@ async def test_the_same_seed_gives_the_same_bytes(config: Config) -> None:
 
 @pytest.mark.parametrize("world", ["hard", "extreme"])
 async def test_a_disturbed_world_in_lockstep(world: str) -> None:
-    from ccatp.config.loader import load_config
+    from ccatp.config.load import load_config
 
     cfg = load_config(overrides={"run.world": world})
     first = await _drive_through(cfg, 1, 300)
@@ -523,7 +524,7 @@ async def test_a_disturbed_world_in_lockstep(world: str) -> None:
 
 
 async def test_a_disturbed_world_on_the_wall_clock() -> None:
-    from ccatp.config.loader import load_config
+    from ccatp.config.load import load_config
 
     cfg = load_config(overrides={"run.world": "extreme"})
     delay = round(cfg.world.sensors_delay_s * cfg.sim.robot.frame_hz)

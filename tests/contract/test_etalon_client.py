@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ccatp.config.models import EtalonConfig, SimEtalonConfig
+from ccatp.core import Fix, Vector3
 from ccatp.etalon_client import (
     BadSolution,
     EtalonBadReply,
@@ -20,9 +21,7 @@ from ccatp.etalon_client import (
     Readiness,
     TooFewChannels,
 )
-from ccatp.samples import Fix, Vector3
-from ccatp.stand_ins.etalon_standin import EtalonStandIn, FixedPuck
-from ccatp.wire.multiline import (
+from ccatp.links.multiline import (
     FLAGS,
     ChannelData,
     ChannelRecord,
@@ -32,6 +31,7 @@ from ccatp.wire.multiline import (
     Remark,
     format_reply,
 )
+from ccatp.sim.etalon_server import EtalonStandIn, FixedPuck
 
 CHANNELS = (1, 2, 3, 4, 5, 6, 7, 8)
 COLLIMATORS = np.array([[x, y, z] for x in (-4.0, 5.0) for y in (-5.0, 4.0) for z in (-3.0, 6.0)])

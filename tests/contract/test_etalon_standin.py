@@ -13,10 +13,10 @@ import zmq
 import zmq.asyncio
 
 from ccatp.config.models import SimEtalonConfig
-from ccatp.sim.etalon import PuckTruth
-from ccatp.stand_ins import etalon_standin
-from ccatp.stand_ins.etalon_standin import EtalonStandIn, FixedPuck, TruthSource, TruthUnavailable, ZmqPuck
-from ccatp.wire.multiline import ChannelData, parse_reply
+from ccatp.links.multiline import ChannelData, parse_reply
+from ccatp.sim import etalon_server as etalon_standin
+from ccatp.sim.etalon_server import EtalonStandIn, FixedPuck, TruthSource, TruthUnavailable, ZmqPuck
+from ccatp.sim.laser import PuckTruth
 
 CHANNELS = (1, 2, 3, 4)
 COLLIMATORS = np.array([[0.0, 0.0, 5.0], [3.0, 0.0, 4.0], [0.0, 4.0, 3.0], [-6.0, 0.0, 8.0]])

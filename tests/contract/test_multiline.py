@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.wire.multiline import (
+from ccatp.links.multiline import (
     FLAGS,
     BadReply,
     BadRequest,

@@ -7,23 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.samples import EdgeSample, GravitySample, ImuSample, WheelSample
-from ccatp.wire.lines import BadLineCounter, LineBuffer, LineTooLong
-from ccatp.wire.robot import (
+from ccatp.core import EdgeSample, GravitySample, ImuSample, WheelSample
+from ccatp.links.robot_codec import (
     BadLine,
-    CommandEcho,
-    Drive,
-    Fans,
-    FromClient,
-    FromRobot,
-    Hello,
-    Join,
-    Joined,
-    Permit,
-    Refused,
-    RobotData,
-    Sensors,
-    Unknown,
     decode_from_client,
     decode_from_robot,
     encode,
@@ -32,6 +18,24 @@ from ccatp.wire.robot import (
     is_mac_right,
     join_mac,
     set_point_on_wire,
+)
+from ccatp.links.robot_messages import (
+    BadLineCounter,
+    CommandEcho,
+    Drive,
+    Fans,
+    FromClient,
+    FromRobot,
+    Hello,
+    Join,
+    Joined,
+    LineBuffer,
+    LineTooLong,
+    Permit,
+    Refused,
+    RobotData,
+    Sensors,
+    Unknown,
 )
 
 NONCE = "00112233445566778899aabbccddeeff"

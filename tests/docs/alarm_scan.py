@@ -21,16 +21,15 @@ REACTIONS = {
     "_ask_to_hold": "hold", "recover": "hold",
 }  # fmt: skip
 # Causes that stand in tables or in verdicts: file, name, reaction.
-EDGES, CENTRE = ("ccatp/hazards/edge_episode.py", "Cause"), ("ccatp/danger.py", "CENTRE")
-OWN = "ccatp/health/supply.py", "_OWN"
+EDGES, CENTRE = ("ccatp/safety/edge_detector.py", "Cause"), ("ccatp/danger.py", "CENTRE")
+OWN = "ccatp/safety/power_monitors.py", "_OWN"
 LITERAL = (
     ("ccatp/danger.py", "lifted or fallen", "hold"),
     ("ccatp/danger.py", "emergency: \u2026", "return"),
-    ("ccatp/health/supply.py", "the robot reports a fault that is not known here", "inform"),
+    ("ccatp/safety/power_monitors.py", "the robot reports a fault that is not known here", "inform"),
 )
 SOURCES = (
-    "ccatp/danger.py", "ccatp/health", "ccatp/hazards", "ccatp/surveying", "ccatp/mission.py", "ccatp/localization",
-    "ccatp/processes",
+    "ccatp/danger.py", "ccatp/safety", "ccatp/survey", "ccatp/estimation", "ccatp/daemon",
 )  # fmt: skip
 VARIES = "\u2026"
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import click
 
 from ccatp.cli import cli
-from ccatp.samples import EventCode, Severity
-from ccatp.supervisor import PROCESSES
-from ccatp.wire.topics import TOPICS
+from ccatp.core import EventCode, Severity
+from ccatp.daemon.supervisor import PROCESSES
+from ccatp.links.topics import TOPICS
 from tests.docs.alarm_scan import ROOT, Cause, causes
 
 DOCS = ROOT / "docs"

@@ -6,16 +6,15 @@ from itertools import pairwise
 from math import hypot
 from typing import NamedTuple
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.samples import DeckPose, Severity, Verdict
-from ccatp.sim.faults.plan import FaultPlan, parse_plan
-from ccatp.sim.faults.record import Injected
-from ccatp.studies.fault_plans import random_plan
-from ccatp.studies.faulty_rehearsal import FaultyRehearsal
-from ccatp.studies.rehearsal_result import Rehearsal
-from ccatp.surveying.states import State
-from ccatp.wire.robot import Sensors
+from ccatp.core import DeckPose, Severity, Verdict
+from ccatp.links.robot_messages import Sensors
+from ccatp.sim.fault_models import Injected
+from ccatp.sim.fault_plan import FaultPlan, parse_plan
+from ccatp.studies.faults_study import FaultyRehearsal, random_plan
+from ccatp.studies.sil_models import Rehearsal
+from ccatp.survey.state import State
 
 LAST_S = 80.0
 FAULTS_PER_MISSION = 4

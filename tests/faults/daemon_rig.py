@@ -13,19 +13,18 @@ import numpy as np
 import structlog
 import zmq
 
-from ccatp.config.loader import dump_config, load_config
+from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
+from ccatp.daemon.danger_loop import DangerLoop
+from ccatp.daemon.main_loop import MainLoop, open_work
+from ccatp.daemon.process import EitherArgs, Endpoints, ProcessArgs
 from ccatp.dataloop import DataLoop
-from ccatp.fault_proxy.proxy import FaultProxy
+from ccatp.links.robot_link import RobotLink
 from ccatp.mirror.mirror import build_mirror
-from ccatp.processes.common import EitherArgs, Endpoints, ProcessArgs
-from ccatp.processes.danger_loop import DangerLoop
-from ccatp.processes.main_loop import MainLoop, open_work
-from ccatp.robot_link import RobotLink
-from ccatp.sim.truth import TruthLog
-from ccatp.stand_ins.etalon_standin import EtalonStandIn
-from ccatp.stand_ins.puck_truth import ZmqPuck
-from ccatp.stand_ins.truth_outlet import TruthOutlet
+from ccatp.sim.etalon_server import EtalonStandIn, ZmqPuck
+from ccatp.sim.fault_proxy import FaultProxy
+from ccatp.sim.ground_truth import TruthOutlet
+from ccatp.sim.robot import TruthLog
 
 DEADLINE_S = 60.0
 SEND_DRIVE, SEND_PERMIT = RobotLink.send_drive, RobotLink.send_permit
@@ -150,8 +149,8 @@ def _logging_to(entries: list[dict[str, Any]]) -> Iterator[None]:
 
     logger = structlog.wrap_logger(None, processors=[structlog.processors.add_log_level, keep])
     with (
-        patch("ccatp.processes.main_loop.open_log", lambda _, name: logger.bind(process=name)),
-        patch("ccatp.processes.danger_loop.open_log", lambda _, name: logger.bind(process=name)),
+        patch("ccatp.daemon.main_loop.open_log", lambda _, name: logger.bind(process=name)),
+        patch("ccatp.daemon.danger_loop.open_log", lambda _, name: logger.bind(process=name)),
     ):
         yield
 

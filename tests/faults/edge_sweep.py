@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.core import DeckPose, EventCode, PanelId, Verdict
 from ccatp.danger import DangerMonitor
-from ccatp.hazards.edge_episode import EpisodeLimits
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose, EventCode, PanelId, Verdict
+from ccatp.safety.edge_detector import EpisodeLimits
 from ccatp.studies.danger_drives import Errors, Rig
 
 MIRRORS = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")

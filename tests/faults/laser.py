@@ -11,19 +11,18 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.etalon_client import BadSolution, EtalonClient
-from ccatp.etalon_errors import EtalonError
-from ccatp.localization.fixes import FixRefused, deck_foot
-from ccatp.metrology.judge import nis_of
-from ccatp.metrology.scrutiny import Scrutiny
-from ccatp.processes.measuring import MeasuringDesk, Request
-from ccatp.processes.survey_telling import SurveyTeller
-from ccatp.radio.multilateration import MultilaterationError
-from ccatp.samples import Fix, PointId, Vector3
-from ccatp.sim.faults.plan import FaultPlan, parse_plan
-from ccatp.storage.store import MissionStore, PlannedPoint
-from ccatp.studies.faulty_rehearsal import FaultyRehearsal
-from ccatp.wire.robot import Sensors
+from ccatp.core import Fix, PointId, Vector3
+from ccatp.daemon.fix_service import MeasuringDesk, Request
+from ccatp.daemon.telemetry import SurveyTeller
+from ccatp.estimation.fixes import FixRefused, deck_foot
+from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
+from ccatp.links.robot_messages import Sensors
+from ccatp.mirror.multilateration import MultilaterationError
+from ccatp.records.store import MissionStore
+from ccatp.records.store_rows import PlannedPoint
+from ccatp.sim.fault_plan import FaultPlan, parse_plan
+from ccatp.studies.faults_study import FaultyRehearsal
+from ccatp.survey.fix_gate import Scrutiny, nis_of
 
 T = TypeVar("T")
 FULL = (1.0, 1.0)

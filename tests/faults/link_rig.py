@@ -4,14 +4,14 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
+from ccatp.core import PanelPose
 from ccatp.dataloop import DataLoop
-from ccatp.fault_proxy.proxy import FaultProxy
+from ccatp.links.robot_link import RobotLink
+from ccatp.links.robot_messages import Sensors
 from ccatp.localizer import Localizer, build_localizer
 from ccatp.mirror.mirror import build_mirror
-from ccatp.robot_link import RobotLink
-from ccatp.samples import PanelPose
-from ccatp.wire.robot import Sensors
+from ccatp.sim.fault_proxy import FaultProxy
 
 DEADLINE_S = 30.0  # what never happens in a good run may take this long in a bad one
 SEED = 3

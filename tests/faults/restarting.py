@@ -2,15 +2,15 @@
 
 from math import hypot
 
-from ccatp.assembly import assemble
 from ccatp.config.models import Config
 from ccatp.control.prediction import CommandPredictor
-from ccatp.samples import DeckPose, PointId
-from ccatp.studies.rehearsal import Rehearsing
-from ccatp.studies.rehearsal_result import Rehearsal
-from ccatp.surveying.recovery import Recovery, doubted
-from ccatp.surveying.states import DRIVING, RETURNING, TURNING, State
-from ccatp.wire.robot import Sensors
+from ccatp.core import DeckPose, PointId
+from ccatp.links.robot_messages import Sensors
+from ccatp.studies.sil_models import Rehearsal
+from ccatp.studies.sil_run import Rehearsing
+from ccatp.survey.composition import assemble
+from ccatp.survey.heading_recovery import Recovery, doubted
+from ccatp.survey.state import DRIVING, RETURNING, TURNING, State
 
 MOVING = (TURNING, DRIVING, RETURNING, State.BACKING_OFF)
 RECORD_FRAMES = 10

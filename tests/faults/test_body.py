@@ -6,8 +6,8 @@ from itertools import pairwise
 import pytest
 
 from ccatp.config.models import Config
-from ccatp.samples import Severity
-from ccatp.surveying.states import Outcome, State
+from ccatp.core import Severity
+from ccatp.survey.state import Outcome, State
 from tests.faults.campaign import Seen, short_survey, was_real, watched
 
 Measured = Callable[[str, float], None]

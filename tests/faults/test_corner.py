@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from ccatp.studies.faulty_rehearsal import FaultyRehearsal
+from ccatp.studies.faults_study import FaultyRehearsal
 from tests.faults.campaign import short_survey, single, was_real
 from tests.faults.linking import Measured
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.surveying.states import State
-from ccatp.wire.robot import Sensors
+from ccatp.links.robot_messages import Sensors
+from ccatp.survey.state import State
 from tests.faults.laser import DeskRehearsal
 from tests.faults.test_operator import one_panel
 

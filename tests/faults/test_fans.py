@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.control.fan_gate import FanGate
-from ccatp.samples import Severity
-from ccatp.surveying.states import State
+from ccatp.control.gate import FanGate
+from ccatp.core import Severity
+from ccatp.survey.state import State
 from tests.faults.campaign import Seen, short_survey, was_real, watched
 
 Measured = Callable[[str, float], None]

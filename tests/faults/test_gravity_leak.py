@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ccatp.config.loader import load_config
-from ccatp.studies.rehearsal import Rehearsing
-from ccatp.wire.robot import Sensors
+from ccatp.config.load import load_config
+from ccatp.links.robot_messages import Sensors
+from ccatp.studies.sil_run import Rehearsing
 
 SEEDS = (1, 2, 3)
 TWO_DEGREES_M_S2 = 0.34  # of an attitude that is two degrees wrong; sixty times the sensor's noise

@@ -10,16 +10,15 @@ import zmq
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
+from ccatp.core import Severity, Verdict
+from ccatp.daemon.subscribers import EstimateEar
 from ccatp.danger import DangerMonitor
-from ccatp.health.commanded import CommandSpan
-from ccatp.health.findings import Finding
-from ccatp.health.ladder import Ladder, denies, gravest
+from ccatp.links.topics import Estimate, is_estimate_due
 from ccatp.mirror.mirror import build_mirror
-from ccatp.processes.hearing import EstimateEar
-from ccatp.samples import Severity, Verdict
+from ccatp.safety.escalation import Finding, Ladder, denies, gravest
+from ccatp.safety.wheel_monitors import CommandSpan
 from ccatp.sim.robot import Robot
-from ccatp.wire.topics import Estimate, is_estimate_due
 
 HEALTH = load_config().health
 DENYING = {Severity.PAUSE, Severity.HOLD, Severity.FAULT}
@@ -162,7 +161,7 @@ def test_drives_that_the_danger_loop_hears_of_late_have_moved_the_wheels(
     frames: int, dv_m_s: float, heard_until: Callable[[int], int], seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A robot that has stood for long drives on for a moment, and the estimates of that wait for the danger loop."""
-    monkeypatch.setattr("ccatp.processes.hearing.Subscriber", Waiting)
+    monkeypatch.setattr("ccatp.daemon.subscribers.Subscriber", Waiting)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     ear = EstimateEar(context, "inproc://main")
     context.destroy()

@@ -12,24 +12,22 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.etalon_client import EtalonClient, StaleLengths
-from ccatp.etalon_errors import EtalonError, EtalonTimeout
+from ccatp.core import Fix, PointId
+from ccatp.daemon.fix_service import MeasuringDesk, Request
+from ccatp.daemon.telemetry import SurveyTeller
+from ccatp.etalon_client import EtalonClient, EtalonError, EtalonTimeout, StaleLengths
+from ccatp.links import multiline
 from ccatp.localizer import build_localizer
-from ccatp.metrology.frame_check import FrameCheck, explain, signed_axes
-from ccatp.metrology.scrutiny import Scrutiny
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.mission import Mission
-from ccatp.processes.measuring import MeasuringDesk, Request
-from ccatp.processes.survey_telling import SurveyTeller
-from ccatp.radio.multilateration import MultilaterationError
-from ccatp.radio.puck_fix import solve_fix
-from ccatp.samples import Fix, PointId
-from ccatp.stand_ins.etalon_standin import EtalonStandIn, FixedPuck
-from ccatp.storage.store import MissionStore, PlannedPoint
-from ccatp.surveying.states import State
-from ccatp.wire import multiline
+from ccatp.mirror.multilateration import MultilaterationError, solve_fix
+from ccatp.records.store import MissionStore
+from ccatp.records.store_rows import PlannedPoint
+from ccatp.sim.etalon_server import EtalonStandIn, FixedPuck
+from ccatp.survey.fix_gate import FrameCheck, Scrutiny, explain, signed_axes
+from ccatp.survey.mission import Mission
+from ccatp.survey.state import State
 from tests.contract.test_etalon_client import (
     CHANNELS,
     COLLIMATORS,

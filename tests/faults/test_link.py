@@ -14,15 +14,15 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
+from ccatp.core import PanelPose
 from ccatp.dataloop import DataLoop
+from ccatp.links.robot_codec import decode_from_robot, encode, encode_sensors
+from ccatp.links.robot_link import BACKLOG_S, FLOOD_FACTOR, RobotLink, RobotTimeout, WrongProtocol
+from ccatp.links.robot_messages import PROTOCOL, Hello, LineBudget, LineBuffer, RobotData, Sensors
 from ccatp.mirror.mirror import build_mirror
-from ccatp.robot_link import BACKLOG_S, FLOOD_FACTOR, RobotLink, RobotTimeout, WrongProtocol
-from ccatp.samples import PanelPose
 from ccatp.sim.robot import Robot
 from ccatp.sim.sessions import RobotServer
-from ccatp.wire.lines import LineBudget, LineBuffer
-from ccatp.wire.robot import PROTOCOL, Hello, RobotData, Sensors, decode_from_robot, encode, encode_sensors
 from tests.faults.link_rig import DEADLINE_S, Driver, robot_behind_proxy
 from tests.faults.linking import Measured
 

@@ -12,14 +12,14 @@ from tests.faults.linking import Measured
 
 # Every task that the two loops serve, by the method that it runs.
 TASKS = (
-    "ccatp.processes.main_loop.MainLoop._beat",
-    "ccatp.processes.main_loop.MainLoop._watch",
-    "ccatp.processes.measuring.MeasuringDesk.run",
-    "ccatp.processes.joining.LastingLink.serve",
-    "ccatp.router.Router.serve",
-    "ccatp.processes.danger_loop.DangerLoop._beat",
-    "ccatp.processes.danger_loop.DangerLoop._watch",
-    "ccatp.processes.observing.Observatory.serve",
+    "ccatp.daemon.main_loop.MainLoop._beat",
+    "ccatp.daemon.main_loop.MainLoop._watch",
+    "ccatp.daemon.fix_service.MeasuringDesk.run",
+    "ccatp.daemon.robot_session.LastingLink.serve",
+    "ccatp.links.rpc.Router.serve",
+    "ccatp.daemon.danger_loop.DangerLoop._beat",
+    "ccatp.daemon.danger_loop.DangerLoop._watch",
+    "ccatp.daemon.command_handlers.Observatory.serve",
 )
 
 
@@ -67,8 +67,8 @@ def method_names() -> Callable[[], set[str]]:
     import inspect
     import textwrap
 
-    from ccatp.processes.danger_loop import DangerLoop
-    from ccatp.processes.main_loop import MainLoop
+    from ccatp.daemon.danger_loop import DangerLoop
+    from ccatp.daemon.main_loop import MainLoop
 
     def read() -> set[str]:
         found = set[str]()

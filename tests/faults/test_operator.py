@@ -16,20 +16,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.hazards.abort_latch import AbortLatch
+from ccatp.core import DeckPose, EmergencyKind, EventCode, Severity, Verdict
+from ccatp.links.channels import format_ok
+from ccatp.links.robot_messages import Sensors
+from ccatp.links.rpc import REPEAT_S, RequestFailed, request
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.planning.bound import path_time
-from ccatp.planning.way_home import plan_way_home
-from ccatp.router import REPEAT_S, RequestFailed, request
-from ccatp.samples import DeckPose, EmergencyKind, EventCode, Severity, Verdict
-from ccatp.surveying.budget import home_time_s
-from ccatp.surveying.orders import Order
-from ccatp.surveying.states import State
-from ccatp.surveying.vigil import Call, Vigil
-from ccatp.wire.channels import format_ok
-from ccatp.wire.robot import Sensors
+from ccatp.safety.emergency_latch import AbortLatch
+from ccatp.survey.behaviours import home_time_s
+from ccatp.survey.planning.search import path_time
+from ccatp.survey.planning.way_home import plan_way_home
+from ccatp.survey.reactions import Call, Vigil
+from ccatp.survey.state import State
+from ccatp.survey.stops import Order
 from tests.faults.campaign import single
 from tests.faults.laser import FULL, DeskRehearsal
 from tests.unit.test_mission import DT, FREE, FRONT_OFF, Story, from_first_leg

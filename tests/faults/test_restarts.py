@@ -4,12 +4,12 @@ import random
 
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.control.gate import Denial
-from ccatp.samples import Twist
-from ccatp.surveying.states import State
-from ccatp.wire.robot import Sensors
+from ccatp.core import Twist
+from ccatp.links.robot_messages import Sensors
+from ccatp.survey.state import State
 from tests.faults.restarting import RestartingRehearsal
 
 MISSIONS = 30

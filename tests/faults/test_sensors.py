@@ -6,8 +6,8 @@ from math import hypot
 
 import pytest
 
-from ccatp.samples import Severity
-from ccatp.surveying.states import State
+from ccatp.core import Severity
+from ccatp.survey.state import State
 from tests.faults.campaign import Seen, Watched, short_survey, was_real, watched
 
 Measured = Callable[[str, float], None]

@@ -18,18 +18,18 @@ from typing import Any, cast
 import pytest
 
 from ccatp.config.models import Config
+from ccatp.core import DeckPose, Fix, PointId
+from ccatp.daemon import fix_service as measuring
+from ccatp.daemon.fix_service import MeasuringDesk, Request
+from ccatp.daemon.process import LogStream, open_log
+from ccatp.daemon.telemetry import SurveyTeller
 from ccatp.etalon_client import EtalonClient
 from ccatp.localizer import Localizer
-from ccatp.metrology.scrutiny import Finding, Scrutiny
-from ccatp.mission import Mission
-from ccatp.processes import measuring
-from ccatp.processes.common import open_log
-from ccatp.processes.log_stream import LogStream
-from ccatp.processes.measuring import MeasuringDesk, Request
-from ccatp.processes.survey_telling import SurveyTeller
-from ccatp.run_files.recorder import Recorder, iter_messages
-from ccatp.samples import DeckPose, Fix, PointId
-from ccatp.storage.store import MissionStore, PlannedPoint, StoreError, StoreEvent
+from ccatp.records.recorder import Recorder, iter_messages
+from ccatp.records.store import MissionStore
+from ccatp.records.store_rows import PlannedPoint, StoreError, StoreEvent
+from ccatp.survey.fix_gate import Finding, Scrutiny
+from ccatp.survey.mission import Mission
 
 Measured = Callable[[str, float], None]
 POINTS = [PointId(row, col, n) for row in range(1, 10) for col in range(1, 9) for n in range(1, 10)][: 77 * 9]
@@ -307,8 +307,8 @@ async def test_a_broken_disk_holds_the_robot_with_the_reason(tmp_path: Path, con
 WRITER = """
 import resource, signal, sys
 from pathlib import Path
-from ccatp.samples import DeckPose, Fix, PointId
-from ccatp.storage.store import MissionStore, StoreError
+from ccatp.core import DeckPose, Fix, PointId
+from ccatp.records.store import MissionStore, StoreError
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 path = Path(sys.argv[1])
 with MissionStore.open(path, mirror="fyst-m1") as store:

@@ -14,12 +14,12 @@ CALLS = {("time", "time"), ("time", "time_ns"), ("time", "localtime"), ("time", 
 # Labels: rows of the store, names of run directories and the observatory's feed say when they were made. The check
 # before a mission shows the clock itself.
 LABELS = {
-    "storage/store.py",
-    "supervisor.py",
-    "supervision/run_folder.py",
-    "commands/calibrate.py",
-    "observatory/desk.py",
-    "check_probes.py",
+    "records/store.py",
+    "daemon/supervisor.py",
+    "daemon/run_dir.py",
+    "cli/prepare.py",
+    "daemon/ocs_agent.py",
+    "commissioning/probes.py",
 }
 
 

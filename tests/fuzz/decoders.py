@@ -5,11 +5,13 @@ import math
 import random
 from collections.abc import Hashable
 
+from ccatp.core import EventCode, Verdict
 from ccatp.errors import ConfigError
-from ccatp.samples import EventCode, Verdict
-from ccatp.sim.faults.plan import parse_plan
-from ccatp.wire import channels, multiline, robot, topics
-from ccatp.wire.access import BadAccess, parse_clients
+from ccatp.links import channels, multiline, topics
+from ccatp.links import robot_codec as robot
+from ccatp.links.auth import BadAccess, parse_clients
+from ccatp.links.robot_messages import LineBuffer, LineTooLong, Sensors
+from ccatp.sim.fault_plan import parse_plan
 from tests.fuzz.fuzzer import Target
 
 HELLO = (
@@ -61,7 +63,7 @@ def targets() -> list[Target]:
     return [
         Target("robot link, from the robot", _from_robot(), _robot, (robot.BadLine,)),
         Target("robot link, from a client", _from_client(), _client, (robot.BadLine,)),
-        Target("robot link, lines", [SENSORS + b"\n" + HELLO + b"\n"], _lines, (robot.LineTooLong,)),
+        Target("robot link, lines", [SENSORS + b"\n" + HELLO + b"\n"], _lines, (LineTooLong,)),
         Target("MultiLine, requests", [b"isconnected", b"latestlengthvalid,1,2,32"], _request, (multiline.BadRequest,)),
         Target("MultiLine, replies", _replies(), _reply, (multiline.BadReply,)),
         Target("MultiLine, lines", [b"laserready_1\r\nmeasstarted\n"], _split, (multiline.LineTooLong,)),
@@ -91,7 +93,7 @@ def _from_client() -> list[bytes]:
 def _robot(line: bytes) -> Hashable:
     message = robot.decode_from_robot(line)
     assert_finite(message)
-    if isinstance(message, robot.Sensors):
+    if isinstance(message, Sensors):
         return len(message.imu), len(message.enc), len(message.edge), message.gravity is None, len(message.faults) > 0
     return type(message).__name__
 
@@ -117,24 +119,24 @@ def assert_finite(message: object) -> None:
 def _lines(data: bytes) -> Hashable:
     """However the stream is chopped, the lines are the same; the second run is byte by byte in clumps."""
     limit = 600
-    whole = _fed(robot.LineBuffer(limit), [data])
+    whole = _fed(LineBuffer(limit), [data])
     rng = random.Random(len(data))
     cuts = sorted(rng.randrange(len(data) + 1) for _ in range(5))
     parts = [data[a:b] for a, b in zip([0, *cuts], [*cuts, len(data)], strict=True)]
-    assert _fed(robot.LineBuffer(limit), parts) == whole
+    assert _fed(LineBuffer(limit), parts) == whole
     lines, is_too_long = whole
     assert all(len(line) <= limit and b"\n" not in line for line in lines)
     if is_too_long:
-        raise robot.LineTooLong(limit, lines)
+        raise LineTooLong(limit, lines)
     return min(len(lines), 20)
 
 
-def _fed(buffer: robot.LineBuffer, parts: list[bytes]) -> tuple[list[bytes], bool]:
+def _fed(buffer: LineBuffer, parts: list[bytes]) -> tuple[list[bytes], bool]:
     lines: list[bytes] = []
     for part in parts:
         try:
             lines += buffer.feed(part)
-        except robot.LineTooLong as error:
+        except LineTooLong as error:
             return [*lines, *error.lines], True
     return lines, False
 

@@ -10,14 +10,15 @@ from typing import Any
 
 import msgspec
 
-from ccatp.config.loader import dump_config, load_config
+from ccatp.config.load import dump_config, load_config
+from ccatp.core import DeckPose, Fix, PointId
 from ccatp.errors import ConfigError
-from ccatp.run_files.recorder import Recorder, iter_messages
-from ccatp.run_files.run_reader import RunReadError, open_run
-from ccatp.samples import DeckPose, Fix, PointId
-from ccatp.storage import store_rows
-from ccatp.storage.store import MissionStore, PlannedPoint, StoreError
-from ccatp.wire.topics import TOPICS, FixMessage, Rest, SensorLines, Track, pack, schema_of
+from ccatp.links.topics import TOPICS, FixMessage, Rest, SensorLines, Track, pack, schema_of
+from ccatp.records import store_rows
+from ccatp.records.recorder import Recorder, iter_messages
+from ccatp.records.run_reader import RunReadError, open_run
+from ccatp.records.store import MissionStore
+from ccatp.records.store_rows import PlannedPoint, StoreError
 from tests.fuzz.decoders import SENSORS
 from tests.fuzz.fuzzer import Target
 

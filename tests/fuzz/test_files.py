@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.config.loader import load_config
-from ccatp.config.toml_text import format_toml
+from ccatp.config.load import load_config
+from ccatp.config.messages import format_toml
 from ccatp.errors import ConfigError
-from ccatp.storage.store import StoreError
+from ccatp.records.store_rows import StoreError
 from tests.fuzz.files import (
     check_store,
     config_target,

@@ -56,7 +56,7 @@ def test_what_is_listed_as_equivalent_is_there() -> None:
     """A line that has changed needs a new look."""
     source = "".join(
         (ROOT / "ccatp" / path).read_text()
-        for path in ("control/gate.py", "hazards/edge_episode.py", "hazards/edge_rule.py")
+        for path in ("control/gate.py", "safety/edge_detector.py", "safety/edge_rule.py")
     )
     assert all(text in source for text, _ in equivalents())
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from ccatp.filters.base import FilterDiverged, FilterShapeError, FloatArray
+from ccatp.core import FloatArray
+from ccatp.filters.base import FilterDiverged, FilterShapeError
 from ccatp.filters.ekf_slam import BlockError, EkfSlam, columns_of
 
 

@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ccatp.filters import FILTERS, FloatArray
+from ccatp.core import FloatArray
+from ccatp.filters import FILTERS
 
 Row = list[Fraction]
 Matrix = list[Row]

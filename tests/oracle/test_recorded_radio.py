@@ -5,13 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.config.recording_loader import load_recordings_config
-from ccatp.radio.assumed import batch_settings
-from ccatp.radio.batch import smooth
-from ccatp.radio.judged import Judgement, judge
-from ccatp.radio.recording import RecordedRun
-from ccatp.radio.track import Track
-from ccatp.radio_data.reader import read_run
+from ccatp.beacons.datasets.reader import read_run
+from ccatp.beacons.slam.batch_smoother import smooth
+from ccatp.beacons.slam.evaluation import Judgement, judge
+from ccatp.beacons.slam.recording import RecordedRun, Track
+from ccatp.beacons.slam.settings import batch_settings
+from ccatp.config.load import load_recordings_config
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "radio"
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"the recorded radio data are not at {DATA}")

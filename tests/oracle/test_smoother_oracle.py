@@ -10,7 +10,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from ccatp.filters import FILTERS, FloatArray, Smoother
+from ccatp.core import FloatArray
+from ccatp.filters import FILTERS, Smoother
 
 Matrix = list[list[Fraction]]
 Update = tuple[FloatArray, FloatArray, FloatArray]

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from ccatp.router import RequestFailed, request
-from ccatp.wire.channels import format_request
+from ccatp.links.channels import format_request
+from ccatp.links.rpc import RequestFailed, request
 
 # The calibration drive takes as long as a panel: it is done only where it matters.
 NO_CALIBRATION = ("--set", "mission.calibration_length_m=0")
@@ -80,14 +80,14 @@ class Run:
     @property
     def config_port(self) -> int:
         """The port on which the robot's stand-in listens."""
-        from ccatp.config.loader import load_config
+        from ccatp.config.load import load_config
 
         return load_config(self.run_dir / "config.toml").robot.port
 
     @property
     def etalon_port(self) -> int:
         """The port on which the laser system's stand-in listens."""
-        from ccatp.config.loader import load_config
+        from ccatp.config.load import load_config
 
         return load_config(self.run_dir / "config.toml").etalon.port
 

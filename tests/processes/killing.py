@@ -11,12 +11,12 @@ import psutil
 
 from tests.processes.conftest import Run
 
-MODULES = {"main": "main_loop", "danger": "danger_loop", "etalon": "etalon", "dataloop": "dataloop"}
+MODULES = {"main": "main_loop", "danger": "danger_loop", "etalon": "sim_etalon", "dataloop": "sim_robot"}
 
 
 def child(run: Run, name: str) -> psutil.Process:
     """The process of that name in the process table."""
-    module = f"ccatp.processes.{MODULES[name]}"
+    module = f"ccatp.daemon.{MODULES[name]}"
     return next(c for c in psutil.Process(run.process.pid).children() if module in _command_line(c))
 
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ccatp.package import child_environment
+from ccatp.config.package import child_environment
 
 REALM, ROOT, INSTANCE = "test_realm", "observatory", "ccatp"
 
@@ -78,7 +78,7 @@ def network(crossbar: str, folder: Path, *arguments: str) -> Iterator[list[str]]
             _wait_for_port(port, router)
             options = ["--site-file", str(sites), "--site-host", "localhost"]
             agent = subprocess.Popen(
-                [sys.executable, "-m", "ccatp.observatory.agent", *options, "--instance-id", INSTANCE, *arguments],
+                [sys.executable, "-m", "ccatp.daemon.ocs_agent", *options, "--instance-id", INSTANCE, *arguments],
                 stdout=agent_log, stderr=agent_log, cwd=folder, env=child_environment(os.environ),
             )  # fmt: skip
             try:

@@ -19,8 +19,8 @@ import numpy as np
 import psutil
 import zmq
 
-from ccatp.bus import Subscriber
-from ccatp.wire.topics import Timing
+from ccatp.links.bus import Subscriber
+from ccatp.links.topics import Timing
 
 URL = re.compile(r"http://127\.0\.0\.1:(\d+)/")
 SETTINGS = ("sim.robot.port=0", "sim.etalon.port=0", "dashboard.port=0", "mission.calibration_length_m=0")
@@ -95,7 +95,7 @@ def main(seconds: float, rounds: int) -> None:
             port = wait_for_page(run.stderr)
             time.sleep(BEGINNING_S)
             children = psutil.Process(run.pid).children()
-            dashboard = next(child for child in children if "ccatp.processes.dashboard" in child.cmdline())
+            dashboard = next(child for child in children if "ccatp.daemon.dashboard" in child.cmdline())
             subscriber = Subscriber(context, [f"ipc://{Path(folder) / 'main'}"], ["timing"])
             for k in range(rounds):
                 for pages in PAGES if k % 2 == 0 else reversed(PAGES):

@@ -13,16 +13,15 @@ from pathlib import Path
 
 import zmq
 
-from ccatp.bus import Publisher, Subscriber
-from ccatp.config.loader import dump_config, load_config
+from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
-from ccatp.control.kinematics import twist_of, wheel_rates
+from ccatp.core import DeckPose, PanelId, Twist, twist_of, wheel_rates
+from ccatp.daemon.process import Endpoints
+from ccatp.links.bus import Publisher, Subscriber
+from ccatp.links.robot_link import RobotLink
+from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import DangerEvent, Estimate, Presence, Truth
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.processes.common import Endpoints
-from ccatp.robot_link import RobotLink
-from ccatp.samples import DeckPose, PanelId, Twist
-from ccatp.wire.robot import Sensors
-from ccatp.wire.topics import DangerEvent, Estimate, Presence, Truth
 
 START_M = 0.20  # of the robot's origin inside the rim: all sensors stand on the mirror, whatever the heading
 PATIENCE_S = 60.0
@@ -147,8 +146,8 @@ def processes(cfg: Config, case: RimCase, run_dir: Path, endpoints: Endpoints) -
         python = [sys.executable, "-m"]
         fd = listener.fileno()
         started = [
-            subprocess.Popen([*python, "ccatp.processes.dataloop", *common, "--listen-fd", str(fd)], pass_fds=(fd,)),
-            subprocess.Popen([*python, "ccatp.processes.danger_loop", *common]),
+            subprocess.Popen([*python, "ccatp.daemon.sim_robot", *common, "--listen-fd", str(fd)], pass_fds=(fd,)),
+            subprocess.Popen([*python, "ccatp.daemon.danger_loop", *common]),
         ]
         try:
             yield cfg

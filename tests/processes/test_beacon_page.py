@@ -10,8 +10,7 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Page, expect
 
-from ccatp.config.loader import shipped_config_dir
-from ccatp.config.radio_loader import load_radio_config
+from ccatp.config.load import load_radio_config, shipped_config_dir
 from tests.processes.test_beacon_runs import BeaconRunProcess
 from tests.processes.test_dashboard_run import WITH_PAGE, ask
 from tests.processes.test_page import CHROMIUM, PATIENCE_MS, aborts_in_two_steps, browser_page, fits_a_phone

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.config.loader import shipped_config_dir
-from ccatp.config.radio_loader import load_radio_config
-from ccatp.run_files.recorder import iter_messages
-from ccatp.studies.beacon_rehearsal import rehearse_beacons
+from ccatp.config.load import load_radio_config, shipped_config_dir
+from ccatp.records.recorder import iter_messages
+from ccatp.studies.mote_navigation import rehearse_beacons
 from tests.processes.conftest import Run
 
 SHORT = {

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.client import Client
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.errors import RefusedError
-from ccatp.http_client import HttpClient
+from ccatp.links.client import Client, HttpClient
 from tests.processes.conftest import Run
 
 

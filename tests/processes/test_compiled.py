@@ -16,10 +16,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
-from ccatp.filters.base import FloatArray
+from ccatp.config.load import load_config
+from ccatp.core import FloatArray
 from ccatp.filters.conditioning import Conditioner
-from ccatp.studies.rehearsal import rehearse
+from ccatp.studies.sil_run import rehearse
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("compiled")]
 
@@ -31,10 +31,10 @@ PROGRAM = """
 import json, sys
 if sys.argv[1] == "numpy":
     sys.modules["ccatp.filters._kernel"] = None
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.filters.block_kernel import IS_COMPILED
-from ccatp.package import build
-from ccatp.studies.rehearsal import rehearse
+from ccatp.config.package import build
+from ccatp.studies.sil_run import rehearse
 summary = rehearse(load_config(None, json.loads(sys.argv[2]))).summary
 print(json.dumps({"build": build(), "has_kernel": IS_COMPILED, "summary": summary}))
 """

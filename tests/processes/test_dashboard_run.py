@@ -16,8 +16,8 @@ from typing import Any
 import psutil
 import pytest
 
-from ccatp.config.loader import load_config
-from ccatp.studies.rehearsal import rehearse
+from ccatp.config.load import load_config
+from ccatp.studies.sil_run import rehearse
 from tests.processes.conftest import Run
 
 Start = Callable[..., Run]
@@ -68,7 +68,7 @@ def dashboard_of(run: Run, not_pid: int = 0) -> psutil.Process:
     deadline = time.monotonic() + DEADLINE_S
     while time.monotonic() < deadline:
         for child in psutil.Process(run.process.pid).children():
-            if child.pid != not_pid and "ccatp.processes.dashboard" in child.cmdline():
+            if child.pid != not_pid and "ccatp.daemon.dashboard" in child.cmdline():
                 return child
         time.sleep(0.01)
     raise AssertionError("no dashboard")

@@ -47,7 +47,7 @@ def _url(request: Request) -> str:
 def killed_main(run: Run) -> float:
     """Kill the main loop; returns when, s."""
     for child in psutil.Process(run.process.pid).children():
-        if "ccatp.processes.main_loop" in child.cmdline():
+        if "ccatp.daemon.main_loop" in child.cmdline():
             child.kill()
             return time.monotonic()
     raise AssertionError("no main loop")

@@ -23,15 +23,14 @@ import numpy as np
 import psutil
 import pytest
 
-from ccatp.config.loader import dump_config, load_config
+from ccatp.config.load import dump_config, load_config
 from ccatp.dataloop import DataLoop
-from ccatp.fault_proxy.pipe import Pipe
-from ccatp.fault_proxy.proxy import FaultProxy
 from ccatp.mirror.mirror import build_mirror
-from ccatp.sim.truth import TruthLog
-from ccatp.stand_ins.etalon_standin import EtalonStandIn
-from ccatp.stand_ins.puck_truth import ZmqPuck
-from ccatp.stand_ins.truth_outlet import TruthOutlet
+from ccatp.sim.etalon_server import EtalonStandIn, ZmqPuck
+from ccatp.sim.fault_proxy import FaultProxy
+from ccatp.sim.ground_truth import TruthOutlet
+from ccatp.sim.network_faults import Pipe
+from ccatp.sim.robot import TruthLog
 from tests.faults.linking import Measured
 
 TIMES = int(os.environ.get("CCATP_REACTIONS", "3"))

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
-from ccatp.run_files.recorder import iter_messages
-from ccatp.studies.rehearsal import rehearse
+from ccatp.config.load import load_config
+from ccatp.records.recorder import iter_messages
+from ccatp.studies.sil_run import rehearse
 from tests.faults.linking import Measured
 from tests.processes.conftest import Run
 

@@ -11,13 +11,12 @@ from typing import Any
 import pytest
 
 from ccatp.cli import main
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.mirror.mirror import build_mirror
-from ccatp.replaying import comparison
-from ccatp.replaying.comparison import REPRODUCED
-from ccatp.replaying.events import in_order
-from ccatp.replaying.player import replay
-from ccatp.run_files.run_reader import open_run
+from ccatp.records.run_reader import in_order, open_run
+from ccatp.studies import replay_report as comparison
+from ccatp.studies.replay import replay
+from ccatp.studies.replay_report import REPRODUCED
 from tests.processes.conftest import NO_CALIBRATION, Run
 
 Start = Callable[..., Run]

@@ -14,9 +14,9 @@ from typing import Any
 import psutil
 import pytest
 
-from ccatp.config.loader import load_config
-from ccatp.run_files.recorder import iter_messages
-from ccatp.wire.topics import TOPICS
+from ccatp.config.load import load_config
+from ccatp.links.topics import TOPICS
+from ccatp.records.recorder import iter_messages
 from tests.processes.conftest import Run
 
 Start = Callable[..., Run]
@@ -80,8 +80,8 @@ def test_the_same_seed_gives_the_same_summary_and_another_does_not(start: Start)
 def test_four_processes_beside_the_supervisor(start: Start) -> None:
     run = start("--panels", "1", "--realtime")
     run.until(lambda status: status["state"] == "driving")
-    modules = {" ".join(child.cmdline()).split("ccatp.processes.")[1].split()[0] for child in children(run)}
-    assert modules == {"dataloop", "etalon", "danger_loop", "main_loop"}
+    modules = {" ".join(child.cmdline()).split("ccatp.daemon.")[1].split()[0] for child in children(run)}
+    assert modules == {"sim_robot", "sim_etalon", "danger_loop", "main_loop"}
     run.process.send_signal(signal.SIGINT)
     assert run.wait() == 130
     assert "Traceback" not in run.stderr
@@ -96,7 +96,7 @@ def children(run: Run) -> list[psutil.Process]:
 def test_a_simulated_robot_that_dies_ends_the_run_with_a_line(start: Start) -> None:
     run = start("--panels", "1", "--realtime")
     run.until(lambda status: status["state"] == "driving")
-    victim = next(child for child in children(run) if "ccatp.processes.dataloop" in child.cmdline())
+    victim = next(child for child in children(run) if "ccatp.daemon.sim_robot" in child.cmdline())
     os.kill(victim.pid, signal.SIGKILL)
     assert run.wait() == 4
     assert "Traceback" not in run.stderr

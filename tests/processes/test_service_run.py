@@ -51,7 +51,7 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager
 
 
 def child(run: Run, module: str) -> psutil.Process:
-    return next(c for c in psutil.Process(run.process.pid).children() if f"ccatp.processes.{module}" in c.cmdline())
+    return next(c for c in psutil.Process(run.process.pid).children() if f"ccatp.daemon.{module}" in c.cmdline())
 
 
 @pytest.mark.fault("P6", "P7")

@@ -13,18 +13,17 @@ import numpy as np
 from msgspec.structs import replace
 
 from ccatp.config.models import Config
-from ccatp.control.fan_gate import FanGate
-from ccatp.control.gate import Purpose
-from ccatp.control.kinematics import twist_of
+from ccatp.control.gate import FanGate, Purpose
+from ccatp.core import EdgeSample, EventCode, PointId, Twist, Verdict, WheelSample, twist_of
 from ccatp.danger import DangerMonitor
-from ccatp.localization.fixes import FixRefused
-from ccatp.radio.multilateration import MultilaterationError
-from ccatp.samples import EdgeSample, EventCode, PointId, Twist, Verdict, WheelSample
+from ccatp.estimation.fixes import FixRefused
+from ccatp.links.robot_codec import set_point_on_wire
+from ccatp.links.robot_messages import Sensors
+from ccatp.mirror.multilateration import MultilaterationError
 from ccatp.sim.robot import Robot
-from ccatp.studies.rehearsal import Rehearsing
-from ccatp.studies.rehearsal_laser import LaserDesk
-from ccatp.surveying.states import BACKING_OFF, DONE, DRIVING, HELD, PURPOSES, RETURNING, TURNING
-from ccatp.wire.robot import Sensors, set_point_on_wire
+from ccatp.studies.sil_models import LaserDesk
+from ccatp.studies.sil_run import Rehearsing
+from ccatp.survey.state import BACKING_OFF, DONE, DRIVING, HELD, PURPOSES, RETURNING, TURNING
 
 FRESH_S = 0.15  # I10
 BACK_IN_SIGHT_S = 1e-6  # times are multiples of a frame, up to rounding

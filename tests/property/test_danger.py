@@ -13,12 +13,12 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.core import DeckPose, EdgeSample, EventCode, ImuSample, PanelId, PointId, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
+from ccatp.links.robot_messages import CommandEcho
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose, EdgeSample, EventCode, ImuSample, PanelId, PointId, Verdict, WheelSample
-from ccatp.wire.robot import CommandEcho
 
 MIRRORS = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
 LAG_S = 0.08  # the robot's wheel servo, worlds.md
@@ -273,7 +273,7 @@ def test_no_fall_without_an_estimate_even_where_only_edges_stop_the_robot(
 
 def is_straight_rim(robot: Robot) -> bool:
     """No inner corner of the rim within reach: there the tip of a notch passes between the sensors, and only the map
-    can tell (``ccatp.hazards.origin_rule``)."""
+    can tell (``ccatp.safety.edge_rule``)."""
     x, y, _ = robot.pose
     return all(hypot(x - vx, y - vy) > 0.25 for vx, vy in inner_corners(robot.name))
 

@@ -8,10 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.angles import difference
 from ccatp.config.models import MirrorConfig
+from ccatp.core import DeckPose, PanelId, PanelPose, Vector3, difference
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose, PanelId, PanelPose, Vector3
 
 FOLDER = Path(__file__).parents[2] / "configs" / "mirrors"
 TOLERANCE = 1e-9  # m and rad: a thousandth of the laser's micrometre

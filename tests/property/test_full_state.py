@@ -9,10 +9,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ccatp.angles import difference
-from ccatp.localization.fixes import FixRefused
-from ccatp.localization.full_state import FullStateLocalizer
-from ccatp.samples import EdgeSample, GravitySample, ImuSample, PanelPose, WheelSample
+from ccatp.core import EdgeSample, GravitySample, ImuSample, PanelPose, WheelSample, difference
+from ccatp.estimation.fixes import FixRefused
+from ccatp.estimation.full_state import FullStateLocalizer
 from tests.unit.localization.drive import STEEP, Errors, Frame, Robot, build, fix_at, run, trapeze
 
 FRAMES = 60

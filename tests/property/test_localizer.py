@@ -9,14 +9,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ccatp.angles import difference
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.core import EdgeSample, ImuSample, PanelId, PanelPose, WheelSample, difference
+from ccatp.estimation.odometry import arc_step
+from ccatp.estimation.thesis_localizer import FourStateLocalizer as Localizer
 from ccatp.filters import FILTERS
-from ccatp.localization.four_state import FourStateLocalizer as Localizer
-from ccatp.localization.odometry import arc_step
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import EdgeSample, ImuSample, PanelId, PanelPose, WheelSample
 from tests.faults.linking import Measured
 
 Frame = tuple[float, list[ImuSample], list[WheelSample], list[EdgeSample]]

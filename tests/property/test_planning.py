@@ -11,14 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.core import DeckPose, Stop, StopKind
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.planning.bound import path_time
-from ccatp.planning.route import plan_rejoin, plan_route
-from ccatp.planning.traversal import ORDERS, thesis_order
-from ccatp.planning.way_home import plan_way_home
-from ccatp.samples import DeckPose, Stop, StopKind
+from ccatp.survey.planning.route import ORDERS, plan_rejoin, plan_route, thesis_order
+from ccatp.survey.planning.search import path_time
+from ccatp.survey.planning.way_home import plan_way_home
 
 NAMES = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
 ROUNDING_M = 1e-8  # the rim's segment clearance is exact to 1 nm

@@ -9,9 +9,9 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule, run_state_machine_as_test
 
-from ccatp.config.loader import load_config
-from ccatp.samples import EmergencyKind
-from ccatp.surveying.states import DONE
+from ccatp.config.load import load_config
+from ccatp.core import EmergencyKind
+from ccatp.survey.state import DONE
 from tests.property.stage import Stage
 
 WARM_UP_FRAMES = 90  # the fix at base; the first leg begins

@@ -5,14 +5,15 @@ from pathlib import Path
 
 import msgspec
 
-from ccatp.aligning.deviations import Measured
-from ccatp.config.loader import dump_config
+from ccatp.config.load import dump_config
 from ccatp.config.models import Config
-from ccatp.mirror.alignment import PanelMisalignment
-from ccatp.run_files.recorder import Recorder
-from ccatp.samples import DeckPose, PanelId, PointId
-from ccatp.storage.store import MissionStore, PlannedPoint
-from ccatp.wire.topics import Misalignment, schema_of
+from ccatp.core import DeckPose, PanelId, PointId
+from ccatp.links.topics import Misalignment, schema_of
+from ccatp.mirror.misalignment import PanelMisalignment
+from ccatp.mirror.panel_alignment import Measured
+from ccatp.records.recorder import Recorder
+from ccatp.records.store import MissionStore
+from ccatp.records.store_rows import PlannedPoint
 
 HERE = DeckPose(0.0, 0.0, 0.0)
 

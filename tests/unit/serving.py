@@ -10,7 +10,7 @@ from typing import Any
 
 import zmq.asyncio
 
-from ccatp.router import Router
+from ccatp.links.rpc import Router
 
 Answer = Callable[[dict[str, Any]], dict[str, Any]]
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from ccatp.hazards.abort_latch import AT_BASE_OR_HELD, MAX_ACTIVE, MAX_CLEARED, AbortLatch, is_at_base_or_held
-from ccatp.samples import EmergencyKind
-from ccatp.surveying.states import State
+from ccatp.core import EmergencyKind
+from ccatp.safety.emergency_latch import AT_BASE_OR_HELD, MAX_ACTIVE, MAX_CLEARED, AbortLatch, is_at_base_or_held
+from ccatp.survey.state import State
 
 
 @pytest.mark.parametrize("kind", list(EmergencyKind))

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from zmq.utils import z85
 
-from ccatp.wire.access import Admission, BadAccess, Client, Role, answer_zap, decode_key, parse_clients
+from ccatp.links.auth import Admission, BadAccess, Client, Role, answer_zap, decode_key, parse_clients
 
 KEY = b"k" * 32
 TEXT = z85.encode(KEY).decode()

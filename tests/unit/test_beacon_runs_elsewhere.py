@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from ccatp.cli import main
-from ccatp.config.loader import dump_config, load_config
-from ccatp.package import configs_dir
-from ccatp.run_files.recorder import Recorder, iter_messages
-from ccatp.wire.topics import schema_of
+from ccatp.config.load import dump_config, load_config
+from ccatp.config.package import configs_dir
+from ccatp.links.topics import schema_of
+from ccatp.records.recorder import Recorder, iter_messages
 
 
 @pytest.mark.parametrize("command", [["align"], ["map"], ["replay"], ["calibrate", "--from"]])

@@ -6,8 +6,8 @@ from contextlib import ExitStack, closing
 import pytest
 import zmq
 
-from ccatp.bus import Publisher, Subscriber
-from ccatp.wire.topics import Log, Presence
+from ccatp.links.bus import Publisher, Subscriber
+from ccatp.links.topics import Log, Presence
 
 ENDPOINT = "inproc://bus"
 Context = zmq.Context[zmq.Socket[bytes]]

@@ -5,7 +5,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from ccatp.storage.checkpoint import Checkpoint, CheckpointError, CheckpointFile, read_checkpoint
+from ccatp.records.checkpoint import Checkpoint, CheckpointError, CheckpointFile, read_checkpoint
 
 
 def record(count: int) -> Checkpoint:

@@ -14,12 +14,12 @@ import pytest
 
 import ccatp
 from ccatp.cli import cli, main
-from ccatp.commands.frame import parse_setting
+from ccatp.cli.common import parse_setting
 from ccatp.config.models import Config
+from ccatp.config.package import configs_dir
+from ccatp.daemon.run_dir import RunOptions
 from ccatp.errors import ConfigError, UnreachableError
-from ccatp.package import configs_dir
-from ccatp.run_options import RunOptions
-from ccatp.runtime_dir import LOCK_FILE, TRUTH_LOCK_FILE, locked
+from ccatp.links.runtime_dir import LOCK_FILE, TRUTH_LOCK_FILE, locked
 
 EMERGENCY_ID = "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"
 
@@ -63,7 +63,7 @@ def router(monkeypatch: pytest.MonkeyPatch) -> Router:
             calls.append((endpoint, asked))
             return answer | {"id": asked["id"]} if answer.get("id") == "the same" else answer
 
-        monkeypatch.setattr("ccatp.client.request", request)
+        monkeypatch.setattr("ccatp.links.client.request", request)
         return calls
 
     return put
@@ -178,7 +178,7 @@ def test_no_command_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_run_hands_over_what_was_asked_for(stub: Stub, tmp_path: Path) -> None:
-    calls = stub("ccatp.supervisor", "run", 3)
+    calls = stub("ccatp.daemon.supervisor", "run", 3)
     argv = "run --sim --mirror fyst-m2 --world thesis-x2 --filter kf --panels 4 --seed 2 --realtime --json"
     more = ["--run-dir", str(tmp_path), "--runtime-dir", "/run/x", "--set", "limits.v_max_m_s=0.05"]
     assert main([*argv.split(), *more]) == 3
@@ -201,13 +201,13 @@ def test_run_hands_over_what_was_asked_for(stub: Stub, tmp_path: Path) -> None:
 
 
 def test_run_says_nothing_of_what_was_not_asked_for(stub: Stub) -> None:
-    calls = stub("ccatp.supervisor", "run", 0)
+    calls = stub("ccatp.daemon.supervisor", "run", 0)
     assert main(["run", "--config", "mine.toml"]) == 0
     assert calls == [(RunOptions(sim=False, config_file=Path("mine.toml")),)]
 
 
 def test_a_resumed_run_takes_the_configuration_of_its_directory(stub: Stub) -> None:
-    calls = stub("ccatp.supervisor", "run", 0)
+    calls = stub("ccatp.daemon.supervisor", "run", 0)
     assert main(["run", "--sim", "--resume", "--run-dir", "runs/a"]) == 0
     (options,) = calls[0]
     assert (options.config_file, options.run_dir, options.resume) == (Path("runs/a/config.toml"), Path("runs/a"), True)
@@ -224,7 +224,7 @@ def test_a_resumed_run_takes_the_configuration_of_its_directory(stub: Stub) -> N
 def test_expected_errors_are_one_line_and_their_exit_status(
     error: BaseException, status: int, line: str, stub: Stub, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    stub("ccatp.supervisor", "run", error)
+    stub("ccatp.daemon.supervisor", "run", error)
     assert main(["run", "--sim"]) == status
     assert capsys.readouterr().err.lstrip("\n") == line
 
@@ -321,7 +321,7 @@ def test_a_refusal_tells_the_reason(router: Router, daemon_dir: Path, capsys: py
 
 
 def test_the_robot_alone_gets_its_address(stub: Stub) -> None:
-    calls = stub("ccatp.processes.dataloop", "run_alone", 0)
+    calls = stub("ccatp.daemon.sim_robot", "run_alone", 0)
     argv = "sim robot --host 0.0.0.0 --port 0 --mirror fyst-m2 --seed 4 --lockstep --set sim.open_to_network=true"
     assert main(argv.split()) == 0
     cfg, options = calls[0]
@@ -331,7 +331,7 @@ def test_the_robot_alone_gets_its_address(stub: Stub) -> None:
 
 
 def test_the_robot_alone_is_paced_unless_told_otherwise(stub: Stub) -> None:
-    calls = stub("ccatp.processes.dataloop", "run_alone", 0)
+    calls = stub("ccatp.daemon.sim_robot", "run_alone", 0)
     assert main(["sim", "robot"]) == 0
     assert calls[0][1] == {"lockstep": False, "faults": None, "runtime_dir": None}
 
@@ -352,7 +352,7 @@ def test_two_robots_alone_want_two_places(tmp_path: Path, capsys: pytest.Capture
 
 
 def test_the_laser_system_follows_the_robot_of_a_place(stub: Stub, tmp_path: Path) -> None:
-    calls = stub("ccatp.processes.etalon", "run_alone", 0)
+    calls = stub("ccatp.daemon.sim_etalon", "run_alone", 0)
     assert main(["sim", "etalon", "--runtime-dir", str(tmp_path)]) == 0
     assert calls[0][2] == f"ipc://{tmp_path}/puck"
 
@@ -370,7 +370,7 @@ def test_a_daemon_that_is_gone_is_told_at_once(
 
 
 def test_the_laser_system_alone_gets_its_puck(stub: Stub) -> None:
-    calls = stub("ccatp.processes.etalon", "run_alone", 0)
+    calls = stub("ccatp.daemon.sim_etalon", "run_alone", 0)
     argv = "sim etalon --port 2002 --puck 0.1 -0.5 3.4 --set etalon.retries=1"
     assert main(argv.split()) == 0
     cfg, puck, truth = calls[0]

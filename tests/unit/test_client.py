@@ -9,9 +9,9 @@ from typing import Any
 import msgspec
 import pytest
 
-from ccatp.client import Client, Latched, Pong, StillWaiting
+from ccatp.daemon.survey_collector import NO_STATUS
 from ccatp.errors import RefusedError, UnreachableError
-from ccatp.supervision.run_collector import NO_STATUS
+from ccatp.links.client import Client, Latched, Pong, StillWaiting
 from tests.unit.serving import serving
 
 

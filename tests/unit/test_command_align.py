@@ -8,16 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.aligning.deviations import Measured
 from ccatp.cli import main
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.core import Fix, PanelId, PointId
 from ccatp.localizer import Localizer
-from ccatp.mirror.alignment import PanelMisalignment
-from ccatp.samples import Fix, PanelId, PointId
-from ccatp.studies.rehearsal import Rehearsing
-from ccatp.studies.rehearsal_laser import LaserDesk
-from ccatp.studies.rehearsal_result import StopRow
+from ccatp.mirror.misalignment import PanelMisalignment
+from ccatp.mirror.panel_alignment import Measured
+from ccatp.studies.sil_models import LaserDesk, StopRow
+from ccatp.studies.sil_run import Rehearsing
 from tests.unit.aligning.conftest import NAMES, exact_fix, load, misaligned, survey
 from tests.unit.run_folder import make_run
 

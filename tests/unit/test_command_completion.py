@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ccatp.cli import main
-from ccatp.package import child_environment
+from ccatp.config.package import child_environment
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,7 @@ def test_another_shell_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
 def test_without_a_bash_its_script_is_there_all_the_same(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ccatp.commands.completion.shutil.which", lambda _: None)
+    monkeypatch.setattr("ccatp.cli.config.shutil.which", lambda _: None)
     assert main(["completion", "bash"]) == 0
     assert "_ccatp_completion" in capsys.readouterr().out
 

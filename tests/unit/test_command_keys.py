@@ -11,10 +11,10 @@ import zmq
 import zmq.auth
 
 from ccatp.cli import main
-from ccatp.config.loader import dump_config, load_config
-from ccatp.curve_keys import ClientsFile, read_clients, read_pair, read_public
+from ccatp.config.load import dump_config, load_config
 from ccatp.errors import ConfigError
-from ccatp.robot_link import read_key
+from ccatp.links.auth import ClientsFile, read_clients, read_pair, read_public
+from ccatp.links.robot_link import read_key
 
 
 @pytest.fixture

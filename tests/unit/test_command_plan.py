@@ -8,11 +8,10 @@ from typing import Any
 
 import pytest
 
-from ccatp.assembly import assemble
 from ccatp.cli import main
-from ccatp.config.loader import available, load_config
+from ccatp.config.load import available, load_config
 from ccatp.mirror.mirror import build_mirror
-from ccatp.survey_plan import make_plan, plan_lines
+from ccatp.survey.composition import assemble, make_plan, plan_lines
 
 NAMES = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
 

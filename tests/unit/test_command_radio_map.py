@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccatp.beacons.cricket.range_network import MappingError
+from ccatp.beacons.datasets.range_csv import BeaconFileError, read_beacons, read_places, read_ranges, write_beacons
 from ccatp.cli import main
-from ccatp.motes.range_network import MappingError
-from ccatp.radio_data.beacon_file import BeaconFileError, read_beacons, write_beacons
-from ccatp.radio_data.range_csv import read_places, read_ranges
 from tests.unit.motes.fields import ALL, HEADS
 
 SESSION = Path(__file__).parents[2].parent / "shared" / "data" / "radio" / "uwb_planar"

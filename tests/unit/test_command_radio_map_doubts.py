@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccatp.beacons.datasets.range_csv import read_beacons
 from ccatp.cli import main
-from ccatp.radio_data.beacon_file import read_beacons
 from tests.unit.motes.fields import FloatArray
 
 NOISE_M = 0.005

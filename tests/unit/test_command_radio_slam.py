@@ -136,6 +136,6 @@ def test_an_estimator_that_finds_nothing(
     def diverging(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("ccatp.radio.causal.filter_run", diverging)
+    monkeypatch.setattr("ccatp.beacons.slam.causal.filter_run", diverging)
     assert main(["radio", "slam", str(recording)]) == 2
     assert f"mine: ekf-slam finds no finite map for these data ({error})" in capsys.readouterr().err.splitlines()[-1]

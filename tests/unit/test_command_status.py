@@ -10,8 +10,8 @@ import msgspec
 import pytest
 
 from ccatp.cli import main
-from ccatp.status_table import clock, share_done, status_line, status_rows
-from ccatp.supervision.run_collector import NO_STATUS
+from ccatp.daemon.survey_collector import NO_STATUS
+from ccatp.daemon.terminal import clock, share_done, status_line, status_rows
 from tests.unit.serving import serving
 
 STATUS = {
@@ -101,7 +101,7 @@ def test_watching_a_daemon_that_goes_ends_well(
     assert main(command) == 5  # nobody was there
     with serving(folder, "control", answers({})):
         # The daemon goes between two looks.
-        monkeypatch.setattr("ccatp.commands.status.time.sleep", lambda _: (folder / "control").unlink())
+        monkeypatch.setattr("ccatp.cli.operate.time.sleep", lambda _: (folder / "control").unlink())
         assert main(command) == 0
     assert "driving" in capsys.readouterr().out
 

@@ -6,16 +6,15 @@ from typing import Any
 
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.core import Corner, EdgeSample, EventCode, ImuSample, Verdict, WheelSample
 from ccatp.danger import CENTRE, DangerMonitor
-from ccatp.hazards.edge_episode import Cause
-from ccatp.hazards.edge_map import EdgeMap
-from ccatp.hazards.wheel_track import KNOTS_KEPT, Odometry, WheelTrack, pose_at
+from ccatp.links.robot_messages import CommandEcho
+from ccatp.links.topics import Estimate
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import Corner, EdgeSample, EventCode, ImuSample, Verdict, WheelSample
-from ccatp.wire.robot import CommandEcho
-from ccatp.wire.topics import Estimate
+from ccatp.safety.edge_detector import Cause, EdgeMap
+from ccatp.safety.wheel_odometry import KNOTS_KEPT, Odometry, WheelTrack, pose_at
 
 FL, FR, RL, RR = ("front_left",), ("front_right",), ("rear_left",), ("rear_right",)
 FRONT, ALL = FL + FR, FL + FR + RL + RR

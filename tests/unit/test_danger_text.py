@@ -2,7 +2,7 @@
 
 import pytest
 
-from ccatp.danger_text import danger_text
+from ccatp.core import danger_text
 
 
 @pytest.mark.parametrize(

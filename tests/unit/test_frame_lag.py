@@ -2,7 +2,7 @@
 
 import pytest
 
-from ccatp.frame_lag import MAX_DRIFT, FrameLag
+from ccatp.daemon.robot_session import MAX_DRIFT, FrameLag
 
 
 def serve(lag: FrameLag, late_s: dict[int, float], frames: int = 100, drift: float = 0.0) -> list[float]:

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ccatp.beacons.slam.evaluation import judge, markdown, with_means
+from ccatp.beacons.slam.settings import batch_settings
 from ccatp.cli import main
-from ccatp.config.recording_loader import load_recordings_config
-from ccatp.gtsam_peer import PeerError, run_gtsam
-from ccatp.radio.assumed import batch_settings
-from ccatp.radio.comparison import markdown, with_means
-from ccatp.radio.judged import judge
+from ccatp.config.load import load_recordings_config
+from ccatp.studies.gtsam_peer import PeerError, run_gtsam
 from tests.unit.radio_data.sets import BEACONS, csv_lines, recorded, world, write_lines, write_mrclam
 
 SETTINGS = batch_settings(load_recordings_config().csv)

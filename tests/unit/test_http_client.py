@@ -9,7 +9,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 import pytest
 
 from ccatp.errors import ConfigError, RefusedError, UnreachableError
-from ccatp.http_client import HttpClient
+from ccatp.links.client import HttpClient
 
 Answer = Callable[[str, str, str | None], tuple[int, bytes]]
 

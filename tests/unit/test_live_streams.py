@@ -12,9 +12,9 @@ import pytest
 import zmq
 
 from ccatp.cli import main
-from ccatp.live_streams import FoxgloveStream, PlotJugglerStream, Stream, StreamError, check_host
-from ccatp.processes.streaming import RUN, streamed_schemas
-from ccatp.viewing.views import Shown
+from ccatp.daemon.streaming import RUN, streamed_schemas
+from ccatp.report.live import FoxgloveStream, PlotJugglerStream, Stream, StreamError, check_host
+from ccatp.report.views import Shown
 from tests.web_socket import WebSocket
 
 PANELS = Shown("view/panels", 0.0, b'{"deletions":[],"entities":[]}')

@@ -11,19 +11,17 @@ from math import atan, cos, hypot, inf, nan, pi, sin
 import numpy as np
 import pytest
 
-from ccatp.angles import difference
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.filters import FILTERS, FilterDiverged, FilterShapeError, FloatArray, Innovation, KalmanFilter
+from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, ImuSample, PanelId, PanelPose, WheelSample, difference
+from ccatp.estimation.fixes import FixRefused, PositionSigma
+from ccatp.estimation.measurements import ConstantAcceleration, MeasurementBuilder
+from ccatp.estimation.odometry import Odometer, Place, arc_step
+from ccatp.estimation.seams import HeadingFix, HeadingGate, heading_from_pair
+from ccatp.estimation.thesis_localizer import FourStateLocalizer as Localizer
+from ccatp.filters import FILTERS, FilterDiverged, FilterShapeError, Innovation, KalmanFilter
 from ccatp.filters.base import Observation
-from ccatp.localization.crossing import HeadingFix, HeadingGate, heading_from_pair
-from ccatp.localization.fixes import FixRefused
-from ccatp.localization.four_state import FourStateLocalizer as Localizer
-from ccatp.localization.measurements import ConstantAcceleration, MeasurementBuilder
-from ccatp.localization.odometry import Odometer, Place, arc_step
-from ccatp.localization.position_sigma import PositionSigma
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose, EdgeSample, Fix, ImuSample, PanelId, PanelPose, WheelSample
 
 Rate = Callable[[float], float]
 Frame = tuple[float, list[ImuSample], list[WheelSample], list[EdgeSample]]

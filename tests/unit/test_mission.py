@@ -8,11 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from ccatp.config.models import Config
-from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.mission import Mission
-from ccatp.planning.errors import PlanError
-from ccatp.planning.route import Route
-from ccatp.samples import (
+from ccatp.core import (
     DeckPose,
     EventCode,
     PanelId,
@@ -25,10 +21,13 @@ from ccatp.samples import (
     Twist,
     Verdict,
 )
-from ccatp.surveying.correction import Corrector
-from ccatp.surveying.journey import Motion
-from ccatp.surveying.orders import Order
-from ccatp.surveying.states import Event, Outcome, State, next_state
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.survey.mission import Mission
+from ccatp.survey.planning.legs import PlanError
+from ccatp.survey.planning.route import Route
+from ccatp.survey.route_follower import Corrector, Motion
+from ccatp.survey.state import Event, Outcome, State, next_state
+from ccatp.survey.stops import Order
 
 DT, LAG = 0.01, 0.08
 PANEL = PanelId(5, 5)

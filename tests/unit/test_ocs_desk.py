@@ -13,11 +13,10 @@ from typing import Any
 import msgspec
 import pytest
 
-from ccatp.client import Client
-from ccatp.observatory import plugin as ocs_plugin
-from ccatp.observatory.agent import OcsMissing, add_arguments, main, register, survey_command
-from ccatp.observatory.desk import SurveyDesk, feed_fields
-from ccatp.supervision.run_collector import NO_STATUS
+from ccatp.daemon import ocs_plugin
+from ccatp.daemon.ocs_agent import OcsMissing, SurveyDesk, add_arguments, feed_fields, main, register, survey_command
+from ccatp.daemon.survey_collector import NO_STATUS
+from ccatp.links.client import Client
 from tests.unit.serving import serving
 
 
@@ -40,7 +39,7 @@ def folder() -> Iterator[Path]:
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ccatp.observatory.desk.PERIOD_S", 0.01)
+    monkeypatch.setattr("ccatp.daemon.ocs_agent.PERIOD_S", 0.01)
 
 
 def desk_of(folder: Path, program: str = "") -> SurveyDesk:
@@ -71,7 +70,7 @@ def test_the_number_of_panels_goes_to_the_survey(folder: Path) -> None:
 
 
 def test_a_survey_that_says_nothing_is_ended(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ccatp.observatory.desk.START_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("ccatp.daemon.ocs_agent.START_TIMEOUT_S", 0.2)
     done, text = desk_of(folder, "import time; time.sleep(60)").survey(Session())
     assert not done
     assert "said nothing within 0.2 s" in text
@@ -197,5 +196,5 @@ def test_without_the_extra_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_plugin_names_the_agent() -> None:
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
-    assert project["entry-points"]["ocs.plugins"] == {"ccatp": "ccatp.observatory.plugin"}
-    assert ocs_plugin.agents["CcatpAgent"] == {"module": "ccatp.observatory.agent", "entry_point": "main"}
+    assert project["entry-points"]["ocs.plugins"] == {"ccatp": "ccatp.daemon.ocs_plugin"}
+    assert ocs_plugin.agents["CcatpAgent"] == {"module": "ccatp.daemon.ocs_agent", "entry_point": "main"}

@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 
 import ccatp
-from ccatp import package
+from ccatp.config import package
 
 
 def test_a_machine_code_mission_makes_the_build_compiled(tmp_path: Path) -> None:
-    (tmp_path / "mission.py").touch()
+    (tmp_path / "survey").mkdir()
+    (tmp_path / "survey" / "mission.py").touch()
     assert package.build(tmp_path) == "interpreted"
-    (tmp_path / f"mission{EXTENSION_SUFFIXES[0]}").touch()
+    (tmp_path / "survey" / f"mission{EXTENSION_SUFFIXES[0]}").touch()
     assert package.build(tmp_path) == "compiled"
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
-from ccatp.run_files.recorder import Recorder, iter_messages, read_metadata, recordings
+from ccatp.records.recorder import Recorder, iter_messages, read_metadata, recordings
 
 SCHEMA: dict[str, Any] = {"type": "object", "properties": {"n": {"type": "integer"}}}
 TOPICS = [("track", SCHEMA), ("fix", SCHEMA)]
@@ -104,7 +104,7 @@ def test_slow_topics_reach_the_file_without_a_full_chunk(path: Path) -> None:
 WRITER = """
 import sys
 from pathlib import Path
-from ccatp.run_files.recorder import Recorder
+from ccatp.records.recorder import Recorder
 recorder = Recorder(Path(sys.argv[1]), [("track", {})], is_simulation=True)
 n = 0
 while True:

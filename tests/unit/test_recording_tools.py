@@ -13,11 +13,18 @@ import pytest
 from mcap.reader import make_reader
 
 from ccatp.cli import main
-from ccatp.run_files.recorder import HELD_BACK_S, Recorder, iter_messages
-from ccatp.run_files.recording_scan import Condition, scan, strict_faults
-from ccatp.run_files.recording_tools import RecordingError, read_facts, recording_files, recover
-from ccatp.run_files.writing import RUN_LOCK, damage_text
-from ccatp.runtime_dir import locked
+from ccatp.links.runtime_dir import locked
+from ccatp.records.recorder import (
+    HELD_BACK_S,
+    RUN_LOCK,
+    Condition,
+    Recorder,
+    damage_text,
+    iter_messages,
+    scan,
+    strict_faults,
+)
+from ccatp.records.recording_repair import RecordingError, read_facts, recording_files, recover
 
 SCHEMA: dict[str, Any] = {"type": "object", "title": "x.Track", "properties": {"n": {"type": "integer"}}}
 
@@ -149,7 +156,7 @@ def test_nothing_is_overwritten(path: Path, tmp_path: Path) -> None:
 
 
 def test_a_disk_that_garbles_is_noticed(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ccatp.run_files.recording_tools.strict_faults", lambda _: ["crc"])
+    monkeypatch.setattr("ccatp.records.recording_repair.strict_faults", lambda _: ["crc"])
     with pytest.raises(RecordingError, match=r"does not read back \(crc\)"):
         recover(path, tmp_path / "out.mcap")
 
@@ -177,7 +184,7 @@ def test_commands(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 WRITER = """
 import os, sys, time, random
 from pathlib import Path
-from ccatp.run_files.recorder import Recorder
+from ccatp.records.recorder import Recorder
 recorder = Recorder(Path(sys.argv[1]), [("track", {})], is_simulation=True)
 notes = os.open(sys.argv[2], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
 rng, n = random.Random(int(sys.argv[3])), 0
@@ -221,7 +228,7 @@ def test_killed_at_ten_random_moments_all_but_the_last_second_is_there(tmp_path:
 
 def test_nothing_waits_longer_than_a_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 100.0
-    monkeypatch.setattr("ccatp.run_files.recorder.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("ccatp.records.recorder.time.monotonic", lambda: now_s)
     path = tmp_path / "telemetry.mcap"
     made = Recorder(path, [("track", {})], is_simulation=True)
     made.write("track", 0.5, b"{}")
@@ -238,13 +245,13 @@ def test_a_full_disk_while_nothing_comes_is_reported(tmp_path: Path, monkeypatch
     told: list[str] = []
     made = Recorder(tmp_path / "a.mcap", [("track", {})], is_simulation=True, on_failure=told.append)
     made.write("track", 0.5, b"{}")
-    monkeypatch.setattr("ccatp.run_files.recorder.HELD_BACK_S", 0.0)
+    monkeypatch.setattr("ccatp.records.recorder.HELD_BACK_S", 0.0)
 
     def full(*_: object) -> int:
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("ccatp.run_files.recorder.os.write", full)
+        patch.setattr("ccatp.records.recorder.os.write", full)
         made.tend()
     assert not made.is_recording
     assert "No space left" in told[0]

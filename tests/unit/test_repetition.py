@@ -2,7 +2,7 @@
 
 import pytest
 
-from ccatp.repetition import Sparing, kind_of
+from ccatp.links.liveness import Sparing, kind_of
 
 
 @pytest.mark.parametrize(

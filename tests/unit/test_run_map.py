@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.config.loader import dump_config, load_config
+from ccatp.config.load import dump_config, load_config
+from ccatp.core import DeckPose, Fix, PanelId, PointId
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.pictures import run_map
-from ccatp.pictures.figures import PictureError
-from ccatp.pictures.run_map import MapPoint, draw_from_run_dir, draw_run_map
-from ccatp.reporting.points import arrival_error_m
-from ccatp.run_files.recorder import Recorder
-from ccatp.samples import DeckPose, Fix, PanelId, PointId
-from ccatp.storage.store import MissionStore, PlannedPoint
+from ccatp.records.recorder import Recorder
+from ccatp.records.store import MissionStore
+from ccatp.records.store_rows import PlannedPoint
+from ccatp.report import plots as run_map
+from ccatp.report.findings import arrival_error_m
+from ccatp.report.plots import MapPoint, PictureError, draw_from_run_dir, draw_run_map
 
 PNG = b"\x89PNG\r\n\x1a\n"
 POINTS = [PointId(5, 5, n) for n in range(1, 10)]
@@ -65,7 +65,7 @@ def test_a_run_directory_becomes_a_png(tmp_path: Path, mirror: Mirror, monkeypat
     draw_from_run_dir(tmp_path, tmp_path / "map.png")
     content = (tmp_path / "map.png").read_bytes()
     assert content.startswith(PNG)
-    assert int.from_bytes(content[16:20], "big") == run_map.WIDTH_PX
+    assert int.from_bytes(content[16:20], "big") == run_map.MAP_WIDTH_PX
     ((path_xy, points, title, subtitle),) = shown
     assert title == "fyst-m1: 4 of 9 points in 2 min 05 s"
     assert "simulation, world thesis  ·  seed 1  ·  filter ekf" in subtitle

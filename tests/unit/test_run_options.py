@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.run_options import RunOptions, default_run_dir
+from ccatp.daemon.run_dir import RunOptions, default_run_dir
 
 NOW = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
 

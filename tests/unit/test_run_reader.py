@@ -8,15 +8,15 @@ import msgspec
 import pytest
 
 from ccatp.cli import main
-from ccatp.config.loader import dump_config, load_config
+from ccatp.config.load import dump_config, load_config
 from ccatp.filters import FilterDiverged
+from ccatp.links.robot_codec import encode_sensors
+from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import RECORD_FORMAT, TOPICS, Arrival, Message, Rest, SensorLines, Track, Truth, pack, schema_of
 from ccatp.mirror.mirror import build_mirror
-from ccatp.replaying import player
-from ccatp.replaying.events import Stood
-from ccatp.run_files.recorder import Recorder
-from ccatp.run_files.run_reader import RunReadError, open_run
-from ccatp.wire.robot import Sensors, encode_sensors
-from ccatp.wire.topics import RECORD_FORMAT, TOPICS, Arrival, Message, Rest, SensorLines, Track, Truth, pack, schema_of
+from ccatp.records.recorder import Recorder
+from ccatp.records.run_reader import RunReadError, Stood, open_run
+from ccatp.studies import replay as player
 
 
 def line_of(seq: int) -> bytes:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from ccatp.errors import RuntimeDirError
-from ccatp.runtime_dir import MAX_SOCKET_NAME_BYTES, MAX_SOCKET_PATH_BYTES, make_runtime_dir, runtime_dir_path
+from ccatp.links.runtime_dir import MAX_SOCKET_NAME_BYTES, MAX_SOCKET_PATH_BYTES, make_runtime_dir, runtime_dir_path
 
 
 def test_the_configured_folder_comes_first() -> None:

@@ -12,10 +12,17 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.samples import DeckPose, Fix, PointId
-from ccatp.storage import store, store_rows
-from ccatp.storage.store import MissionStore, PlannedPoint, StoreError, StoreEvent, StoreRefusal
-from ccatp.storage.store_rows import AlreadyMeasuredError, UnknownPointError
+from ccatp.core import DeckPose, Fix, PointId
+from ccatp.records import store, store_rows
+from ccatp.records.store import MissionStore
+from ccatp.records.store_rows import (
+    AlreadyMeasuredError,
+    PlannedPoint,
+    StoreError,
+    StoreEvent,
+    StoreRefusal,
+    UnknownPointError,
+)
 
 PANEL = [PointId(1, 2, n) for n in range(1, 10)]
 POSE = DeckPose(0.1, 0.2, 0.3)
@@ -300,8 +307,8 @@ def test_a_writer_that_dies_takes_its_requests_with_it(path: Path, monkeypatch: 
 WRITER = """
 import sys
 from pathlib import Path
-from ccatp.samples import DeckPose, Fix, PointId
-from ccatp.storage.store import MissionStore, StoreEvent
+from ccatp.core import DeckPose, Fix, PointId
+from ccatp.records.store import MissionStore, StoreEvent
 db = MissionStore.open(Path(sys.argv[1]), mirror="fyst-m1")
 for point in sorted({p.point for p in db.points()} - db.measured_points()):
     db.record_event(StoreEvent(1.0, "x"))

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ccatp import summary as summary_module
 from ccatp.config.models import MirrorConfig
+from ccatp.core import DeckPose, PanelId, PointId
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose, PanelId, PointId
-from ccatp.summary import RunFacts, SummaryBuilder, format_table, puck_targets
+from ccatp.records import summary as summary_module
+from ccatp.records.summary import RunFacts, SummaryBuilder, format_table, puck_targets
 
 HEIGHT_M = 0.05
 POINT = PointId(5, 5, 3)

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from ccatp.core import PanelId
 from ccatp.errors import ConfigError
-from ccatp.mirror.alignment import PanelMisalignment
-from ccatp.run_files.recorder import Recorder
-from ccatp.run_files.run_reader import RunReadError
-from ccatp.run_files.survey_reader import read_run
-from ccatp.samples import PanelId
-from ccatp.storage.store_reader import read_survey
+from ccatp.mirror.misalignment import PanelMisalignment
+from ccatp.records.recorder import Recorder
+from ccatp.records.run_reader import RunReadError
+from ccatp.records.store import read_survey
+from ccatp.records.survey_reader import read_run
 from tests.unit.aligning.conftest import exact_fix, load
 from tests.unit.run_folder import make_run, record_truth
 
@@ -191,7 +191,7 @@ def test_a_recording_that_cannot_be_read_is_told(run_dir: Path, monkeypatch: pyt
     def fails(path: Path) -> dict[str, str]:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("ccatp.run_files.survey_reader.read_metadata", fails)
+    monkeypatch.setattr("ccatp.records.survey_reader.read_metadata", fails)
     found = read_run(run_dir, {})
     assert found.injected is None
     assert found.warnings == (

@@ -5,8 +5,8 @@ import json
 import msgspec
 import pytest
 
-from ccatp.samples import EventCode, Verdict
-from ccatp.wire.topics import (
+from ccatp.core import EventCode, Verdict
+from ccatp.links.topics import (
     BY_NAME,
     ESTIMATE_FRAMES,
     TOPICS,

@@ -2,9 +2,9 @@
 
 import pytest
 
-from ccatp.config.loader import load_config
-from ccatp.health.look import Moved
-from ccatp.health.wheels import WheelMonitor
+from ccatp.config.load import load_config
+from ccatp.control.motion_checks import Moved
+from ccatp.safety.wheel_monitors import WheelMonitor
 
 FRAME_S = 0.01
 ROLLS_M_S = 0.0054  # just above what a standing wheel may show

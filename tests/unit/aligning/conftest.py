@@ -6,14 +6,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ccatp.aligning.deviations import Deviations, Measured
-from ccatp.aligning.modes import FloatArray
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.mirror.alignment import PanelMisalignment, misaligned_puck_world
+from ccatp.core import DeckPose, Fix, FloatArray, PanelId, PointId
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.radio.puck_fix import solve_fix
-from ccatp.samples import DeckPose, Fix, PanelId, PointId
+from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
+from ccatp.mirror.multilateration import solve_fix
+from ccatp.mirror.panel_alignment import Deviations, Measured
 from ccatp.sim.world import draw_misalignments
 
 NAMES = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ccatp.aligning.deviations import Measured, deviations_of
-from ccatp.mirror.alignment import PanelMisalignment, misaligned_puck_world
-from ccatp.mirror.errors import UnknownPanelError
+from ccatp.core import DeckPose, Fix, PanelId, PointId
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import DeckPose, Fix, PanelId, PointId
+from ccatp.mirror.misalignment import PanelMisalignment, misaligned_puck_world
+from ccatp.mirror.panel_alignment import Measured, deviations_of
+from ccatp.mirror.surface import UnknownPanelError
 from tests.unit.aligning.conftest import HEIGHT_M, exact_fix
 
 PANEL = PanelId(1, 2)

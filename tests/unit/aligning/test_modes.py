@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ccatp.aligning.modes import Modes, adjustable, fit_modes, gram, quadratic, rigid
+from ccatp.mirror.panel_alignment import Modes, adjustable, fit_modes, gram, quadratic, rigid
 from tests.unit.aligning.conftest import GRID_M
 
 ALL: list[tuple[Modes, int]] = [(rigid, 3), (adjustable, 5), (quadratic, 6)]

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from ccatp.aligning.modes import Modes, adjustable, fit_modes, rigid
-from ccatp.aligning.moves import adjuster_moves, adjuster_places
+from ccatp.core import PanelId
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import PanelId
+from ccatp.mirror.panel_alignment import Modes, adjustable, adjuster_moves, adjuster_places, fit_modes, rigid
 from tests.unit.aligning.conftest import GRID_M
 
 PANEL = PanelId(3, 7)

@@ -5,8 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from ccatp.aligning.modes import quadratic, rigid
-from ccatp.aligning.outliers import explain, prices
+from ccatp.mirror.panel_alignment import explain, prices, quadratic, rigid
 from tests.unit.aligning.conftest import GRID_M, on_grid
 
 SIGMA_M = 2e-6

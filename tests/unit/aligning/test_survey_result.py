@@ -5,14 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ccatp.aligning.comparison import compare
-from ccatp.aligning.deviations import Measured
-from ccatp.aligning.panel_result import PanelResult
-from ccatp.aligning.survey_result import survey_result
 from ccatp.config.models import Config
-from ccatp.mirror.alignment import PanelMisalignment
+from ccatp.core import PanelId, PointId, Vector3
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import PanelId, PointId, Vector3
+from ccatp.mirror.mirror_alignment import compare, survey_result
+from ccatp.mirror.misalignment import PanelMisalignment
+from ccatp.mirror.panel_alignment import Measured, PanelResult
 from tests.unit.aligning.conftest import HEIGHT_M, Truth, exact_fix, load, misaligned, survey
 
 CFG, M1 = load("fyst-m1")

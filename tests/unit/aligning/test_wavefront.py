@@ -5,16 +5,18 @@ from math import atan, cos, sqrt
 import numpy as np
 import pytest
 
-from ccatp.aligning.modes import fit_modes, gram, rigid
-from ccatp.aligning.wavefront import (
+from ccatp.core import PanelId
+from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.panel_alignment import (
     PanelWavefront,
     cos_incidence,
+    fit_modes,
+    gram,
     half_size_m,
     mirror_wavefront,
     panel_wavefront,
+    rigid,
 )
-from ccatp.mirror.mirror import Mirror
-from ccatp.samples import PanelId
 from tests.unit.aligning.conftest import GRID_M, load
 
 MIDDLE = PanelId(5, 5)

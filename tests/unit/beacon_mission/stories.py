@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ccatp.config.loader import shipped_config_dir
-from ccatp.config.radio_loader import load_radio_config
-from ccatp.config.radio_models import RadioConfig
-from ccatp.studies.beacon_rehearsal import BeaconRehearsal, BeaconStage
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.load import load_radio_config, shipped_config_dir
+from ccatp.studies.mote_navigation import BeaconRehearsal, BeaconStage
 
 
 def beacon_config(system: str, **overrides: Any) -> RadioConfig:

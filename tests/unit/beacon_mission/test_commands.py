@@ -2,9 +2,9 @@
 
 import pytest
 
-from ccatp.beacon_mission.states import DONE, HELD, VISITING
-from ccatp.samples import EventCode, Severity, Verdict
-from ccatp.studies.beacon_rehearsal import BeaconStage
+from ccatp.beacons.mission import DONE, HELD, VISITING
+from ccatp.core import EventCode, Severity, Verdict
+from ccatp.studies.mote_navigation import BeaconStage
 from tests.unit.beacon_mission.stories import beacon_config, play
 
 FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)

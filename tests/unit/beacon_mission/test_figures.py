@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ccatp.studies.beacon_rehearsal import BeaconRehearsal, rehearse_beacons
+from ccatp.studies.mote_navigation import BeaconRehearsal, rehearse_beacons
 from tests.unit.beacon_mission.stories import beacon_config, target_distances
 
 pytestmark = pytest.mark.xdist_group("beacon-missions")  # the missions by motes are driven once

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ccatp.samples import EventCode, Severity
-from ccatp.studies.beacon_rehearsal import BeaconStage
+from ccatp.core import EventCode, Severity
+from ccatp.studies.mote_navigation import BeaconStage
 from tests.unit.beacon_mission.stories import beacon_config, moved_m, play, target_distances
 
 SILENCE = {"type": "radio_loss", "at_s": 20.0, "for_s": 20.0, "beacons": []}

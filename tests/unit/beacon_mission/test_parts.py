@@ -6,25 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.beacon_assembly import assemble_beacons, check_beacon_robot
-from ccatp.beacon_danger import BeaconDanger
-from ccatp.beacon_mission.mission import Arrival
-from ccatp.beacon_mission.navigator import Belief
-from ccatp.beacon_mission.permits import permitted
-from ccatp.beacon_mission.self_map import SelfMap
-from ccatp.beacon_mission.senses import SenseReader
-from ccatp.beacon_mission.wheel_rates import wheel_rates
-from ccatp.beacon_summary import BeaconSummary, beacon_facts
-from ccatp.config.radio_models import RadioConfig
-from ccatp.control.waypoint_steering import HALT, Drive
+from ccatp.beacons.mission import Arrival, assemble_beacons, check_beacon_robot, permitted, wheel_rates
+from ccatp.beacons.navigation import Belief, SelfMap, SenseReader
+from ccatp.beacons.steering import HALT, Drive
+from ccatp.beacons.store import BeaconStore, BeaconStoreError
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.core import EventCode, Verdict
 from ccatp.errors import ConfigError
-from ccatp.hazards.echo_memory import EchoMemory
-from ccatp.samples import EventCode, Verdict
+from ccatp.links.beacon_messages import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
+from ccatp.links.robot_codec import BadLine, decode_from_robot
+from ccatp.links.robot_messages import Hello, Sensors
+from ccatp.records.beacon_summary import BeaconSummary, beacon_facts
+from ccatp.safety.beacons import BeaconDanger, EchoMemory
 from ccatp.sim.beacon_robot import BeaconRobot
-from ccatp.sim.radio.world import RadioWorld
-from ccatp.storage.beacon_store import BeaconStore, BeaconStoreError
-from ccatp.wire.beacon_frame import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
-from ccatp.wire.robot import BadLine, Hello, Sensors, decode_from_robot
+from ccatp.sim.radio_world import RadioWorld
 from tests.unit.beacon_mission.stories import beacon_config
 
 FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)

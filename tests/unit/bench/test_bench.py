@@ -29,8 +29,8 @@ from ccatp.bench.problems import (
 )
 from ccatp.bench.race import Difference, largest_difference, race
 from ccatp.bench.slam_race import dense_slam, our_slam, slam_problem
-from ccatp.commands.bench import bench
-from ccatp.config.loader import load_config
+from ccatp.cli.study import bench
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.filters.unscented import ALPHA, BETA
 

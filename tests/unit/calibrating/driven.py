@@ -6,15 +6,16 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from ccatp.calibrating.drive import Drive, DriveBuilder, FloatArray
-from ccatp.calibrating.estimate import Priors
-from ccatp.config.loader import dump_config, load_config
+from ccatp.commissioning.calibration import Priors
+from ccatp.commissioning.calibration_drive import Drive, DriveBuilder
+from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
-from ccatp.run_files.recorder import Recorder
-from ccatp.samples import Fix
-from ccatp.studies.rehearsal import Rehearsing
-from ccatp.wire.robot import Sensors, encode
-from ccatp.wire.topics import RECORD_FORMAT, TOPICS, FixMessage, SensorLines, pack, schema_of
+from ccatp.core import Fix, FloatArray
+from ccatp.links.robot_codec import encode
+from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import RECORD_FORMAT, TOPICS, FixMessage, SensorLines, pack, schema_of
+from ccatp.records.recorder import Recorder
+from ccatp.studies.sil_run import Rehearsing
 
 # A robot that is not what the configuration says, in a world without slip: thesis with these.
 OTHER_ROBOT = {

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ccatp.calibrating.dead_reckoning import Wheels, carry
-from ccatp.calibrating.drive import Drive, FloatArray
-from ccatp.calibrating.estimate import Calibration, CalibrationError, calibrate
-from ccatp.calibrating.report import check_usable, lines, rows
 from ccatp.cli import main
+from ccatp.commissioning.calibration import Calibration, CalibrationError, calibrate, check_usable, lines, rows
+from ccatp.commissioning.calibration_drive import Drive, Wheels, carry
+from ccatp.core import FloatArray
 from tests.unit.calibrating.driven import OTHER_ROBOT, CalibrationDrive, priors, record
 
 

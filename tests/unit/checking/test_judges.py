@@ -6,16 +6,30 @@ import msgspec
 import numpy as np
 import pytest
 
-from ccatp.checking.finding import Finding, Outcome, as_json, failed, has_failed, lines, passed, skipped, warned
-from ccatp.checking.judge_laser import judge_air, judge_fix, judge_lasers
-from ccatp.checking.judge_robot import NAMES, Heard, judge_robot
-from ccatp.config.loader import load_config
+from ccatp.commissioning.preflight import (
+    ROBOT_NAMES,
+    Finding,
+    Heard,
+    Outcome,
+    as_json,
+    failed,
+    has_failed,
+    judge_air,
+    judge_fix,
+    judge_lasers,
+    judge_robot,
+    lines,
+    passed,
+    skipped,
+    warned,
+)
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.core import Fix, GravitySample, ImuSample, Vector3, WheelSample
+from ccatp.links.multiline import Environment
+from ccatp.links.robot_messages import Hello, RobotData, Sensors
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import Fix, GravitySample, ImuSample, Vector3, WheelSample
 from ccatp.sim.robot import Robot
-from ccatp.wire.multiline import Environment
-from ccatp.wire.robot import Hello, RobotData, Sensors
 
 FRAMES = 300
 
@@ -52,7 +66,7 @@ def stood(cfg: Config) -> tuple[Mirror, Heard]:
 def test_a_sound_robot_passes(mirror: str) -> None:
     cfg = load_config(None, {"run.mirror": mirror})
     found = judge_robot(cfg, *stand(cfg))
-    assert [finding.name for finding in found] == list(NAMES)
+    assert [finding.name for finding in found] == list(ROBOT_NAMES)
     assert {finding.outcome for finding in found} == {Outcome.PASS}, lines(found)
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.check_probes import probe_keys, probe_laser, probe_machine, probe_robot
-from ccatp.checking.finding import Finding, Outcome
 from ccatp.cli import main
-from ccatp.config.loader import load_config
+from ccatp.commissioning.preflight import Finding, Outcome
+from ccatp.commissioning.probes import probe_keys, probe_laser, probe_machine, probe_robot
+from ccatp.config.load import load_config
 from ccatp.mirror.mirror import build_mirror
 
 
@@ -69,8 +69,8 @@ def test_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert found["runtime directory"].outcome is Outcome.PASS
     assert not (tmp_path / "runs").exists()  # nothing is made
     usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr("ccatp.check_probes.shutil.disk_usage", lambda _: usage(1, 1, 1_000_000))
-    monkeypatch.setattr("ccatp.check_probes._slowest_write_s", lambda _: 0.5)
+    monkeypatch.setattr("ccatp.commissioning.probes.shutil.disk_usage", lambda _: usage(1, 1, 1_000_000))
+    monkeypatch.setattr("ccatp.commissioning.probes._slowest_write_s", lambda _: 0.5)
     found = by_name(probe_machine(cfg, tmp_path, tmp_path / "rt", {}))
     assert found["disk space"].outcome is Outcome.FAIL
     assert "took 500.0 ms" in found["disk writes"].found
@@ -78,7 +78,7 @@ def test_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(_: Path) -> float:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("ccatp.check_probes._slowest_write_s", refuse)
+    monkeypatch.setattr("ccatp.commissioning.probes._slowest_write_s", refuse)
     assert by_name(probe_machine(cfg, tmp_path, tmp_path / "rt", {}))["disk writes"].outcome is Outcome.FAIL
 
 
@@ -106,14 +106,14 @@ def test_a_daemon_that_runs_is_told(tmp_path: Path) -> None:
 
 def test_a_clock_that_was_never_set(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     then = time.gmtime(0)
-    monkeypatch.setattr("ccatp.check_probes.time.gmtime", lambda: then)
+    monkeypatch.setattr("ccatp.commissioning.probes.time.gmtime", lambda: then)
     found = by_name(probe_machine(load_config(), tmp_path, tmp_path / "rt", {}))
     assert found["machine clock"].outcome is Outcome.FAIL
 
 
 def test_real_time_that_is_not_permitted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("ccatp.check_probes.os.geteuid", lambda: 1000)
-    monkeypatch.setattr("ccatp.check_probes.resource.getrlimit", lambda _: (0, 0))
+    monkeypatch.setattr("ccatp.commissioning.probes.os.geteuid", lambda: 1000)
+    monkeypatch.setattr("ccatp.commissioning.probes.resource.getrlimit", lambda _: (0, 0))
     found = by_name(probe_machine(load_config(), tmp_path, tmp_path / "rt", {}))
     assert found["real time"].outcome is Outcome.WARN
     cfg = load_config(None, {"run.realtime_priority": 0})

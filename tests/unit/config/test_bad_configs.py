@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.errors import ConfigError
 
 FOLDER = Path(__file__).parents[2] / "configs"

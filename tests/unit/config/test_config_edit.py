@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.config_edit import difference, with_values, write_in_place
+from ccatp.config.load import difference, with_values, write_in_place
 from ccatp.errors import ConfigError
 
 TEXT = """# head

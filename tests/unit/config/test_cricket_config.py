@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from ccatp.config.radio_loader import dump_radio_config, load_radio_config
+from ccatp.config.load import dump_radio_config, load_radio_config
 from ccatp.errors import ConfigError
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.config.loader import available, dump_config, json_schema, load_config, shipped_config_dir
+from ccatp.config.load import available, dump_config, json_schema, load_config, shipped_config_dir
 from ccatp.config.models import Config
 from ccatp.errors import ConfigError
 

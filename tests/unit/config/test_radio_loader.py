@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.config.loader import shipped_config_dir
-from ccatp.config.radio_loader import dump_radio_config, is_radio_file, load_radio_config
+from ccatp.config.load import dump_radio_config, is_radio_file, load_radio_config, shipped_config_dir
 from ccatp.errors import ConfigError
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.config.toml_text import find_line, format_key, format_toml, format_value
+from ccatp.config.messages import find_line, format_key, format_toml, format_value
 
 TEXT = """# comment with x = 1
 top = 1

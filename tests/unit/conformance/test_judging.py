@@ -4,13 +4,25 @@ from typing import Any
 
 import pytest
 
-from ccatp.conformance import judge_frames, judge_hello
-from ccatp.conformance.judge_rules import judge_lost, judge_newest, judge_once, judge_ttl, mean_rates
-from ccatp.conformance.reading import Frame, fault_of_line, parse_frame, read_message
-from ccatp.conformance.report import last_line, table_line
-from ccatp.conformance.stage import Facts, Stage
-from ccatp.conformance.stories_fans import _other as other_duty
-from ccatp.conformance.verdict import Broken, NotApplicable, Result
+from ccatp.commissioning.conformance import judges as judge_frames
+from ccatp.commissioning.conformance import judges as judge_hello
+from ccatp.commissioning.conformance.connections import Facts, Stage
+from ccatp.commissioning.conformance.judges import (
+    Broken,
+    Frame,
+    NotApplicable,
+    Result,
+    fault_of_line,
+    judge_lost,
+    judge_newest,
+    judge_once,
+    judge_ttl,
+    mean_rates,
+    parse_frame,
+    read_message,
+)
+from ccatp.commissioning.conformance.rule_checks import _other as other_duty
+from ccatp.commissioning.conformance.runner import last_line, table_line
 
 TTL_S, FRAME_S = 0.25, 0.01
 CMD: dict[str, Any] = {"seq": 1, "age": 0.01, "permit_age": 0.02, "held": False}

@@ -3,7 +3,7 @@
 import pytest
 
 from ccatp.config.models import Config
-from ccatp.control.axis import ProfiledAxis
+from ccatp.control.pid import ProfiledAxis
 
 DT, LAG, V_MAX, A_MAX = 0.01, 0.08, 0.1, 0.2
 

@@ -5,14 +5,12 @@ from math import cos, hypot, pi, sin
 import pytest
 from numpy.random import default_rng
 
-from ccatp.config.radio_loader import load_radio_config
-from ccatp.config.radio_models import RadioConfig
-from ccatp.control.beacon_pilot import BeaconPilot, PilotState
-from ccatp.control.following import FollowState, TargetSight
-from ccatp.control.waypoint_steering import HALT, Aim, Driver, WaypointList, aim_at
-from ccatp.sim.radio.frame import DriveCommand, TruePose
-from ccatp.sim.radio.obstacles import clearance_m, seen_m
-from ccatp.sim.radio.vehicle import TrueVehicle
+from ccatp.beacons.pilot import BeaconPilot, FollowState, PilotState, TargetSight
+from ccatp.beacons.steering import HALT, Aim, Driver, WaypointList, aim_at
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.load import load_radio_config
+from ccatp.sim.radio import DriveCommand, TruePose, clearance_m, seen_m
+from ccatp.sim.radio_world import TrueVehicle
 
 QUIET = {f"sim.vehicle.{name}": 0.0 for name in ("speed_sigma_m_s", "steer_sigma_rad", "turn_rate_sigma_rad_s")}
 

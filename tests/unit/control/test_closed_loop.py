@@ -10,14 +10,13 @@ from math import cos, exp, hypot, pi, sin
 import numpy as np
 import pytest
 
-from ccatp.assembly import build_gate
 from ccatp.config.models import Config
 from ccatp.control.gate import Purpose
-from ccatp.control.kinematics import twist_of
 from ccatp.control.prediction import CommandPredictor
 from ccatp.control.tracker import LegTracker, Phase
-from ccatp.planning.bound import bang_bang_time
-from ccatp.samples import EventCode, Twist, Verdict
+from ccatp.core import EventCode, Twist, Verdict, twist_of
+from ccatp.survey.composition import build_gate
+from ccatp.survey.planning.search import bang_bang_time
 
 DT = 0.01
 FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)

@@ -2,9 +2,9 @@
 
 import pytest
 
-from ccatp.config.radio_loader import load_radio_config
-from ccatp.config.radio_models import FuzzyConfig
-from ccatp.control.fuzzy import FuzzyGapError, Sugeno
+from ccatp.beacons.steering import FuzzyGapError, Sugeno
+from ccatp.config.beacon_models import FuzzyConfig
+from ccatp.config.load import load_radio_config
 
 
 def two_terms(rules: list[dict[str, object]]) -> FuzzyConfig:

@@ -9,12 +9,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from ccatp.config.models import LimitsConfig
-from ccatp.control.fan_gate import FanGate
-from ccatp.control.gate import Denial, DriveGate, Purpose
-from ccatp.control.kinematics import twist_of, wheel_rates
-from ccatp.processes.gate_watch import GateWatch
-from ccatp.samples import EventCode, Twist, Verdict
-from ccatp.surveying.states import PURPOSES, State
+from ccatp.control.gate import Denial, DriveGate, FanGate, Purpose
+from ccatp.core import EventCode, Twist, Verdict, twist_of, wheel_rates
+from ccatp.daemon.frame_service import GateWatch
+from ccatp.survey.state import PURPOSES, State
 
 LIMITS = LimitsConfig(v_max_m_s=0.1, a_max_m_s2=0.2, omega_max_rad_s=0.8, alpha_max_rad_s2=2.0)
 FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)

@@ -5,7 +5,7 @@ from math import cos, exp, sin
 import pytest
 
 from ccatp.control.prediction import CommandPredictor
-from ccatp.samples import Predicted
+from ccatp.core import Predicted
 
 DT, LAG = 0.01, 0.08
 POSE = (0.1, -0.2, 0.7)

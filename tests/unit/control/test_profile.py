@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.control.profile import Profile, lag_feed_forward
+from ccatp.control.pid import Profile, lag_feed_forward
 
 
 def test_trapezoid_takes_the_bang_bang_time() -> None:

@@ -5,15 +5,12 @@ from math import hypot, pi
 import pytest
 from numpy.random import default_rng
 
-from ccatp.config.radio_loader import load_radio_config
-from ccatp.config.radio_models import RadioConfig
-from ccatp.control.beacon_pilot import BeaconPilot
-from ccatp.control.following import TargetSight
-from ccatp.control.retreat import Retreat
-from ccatp.control.waypoint_steering import HALT
-from ccatp.sim.radio.frame import DriveCommand, TruePose
-from ccatp.sim.radio.obstacles import clearance_m, seen_m
-from ccatp.sim.radio.vehicle import TrueVehicle
+from ccatp.beacons.pilot import BeaconPilot, Retreat, TargetSight
+from ccatp.beacons.steering import HALT
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.load import load_radio_config
+from ccatp.sim.radio import DriveCommand, TruePose, clearance_m, seen_m
+from ccatp.sim.radio_world import TrueVehicle
 
 STILL = (0.0, 0.0)
 POSE = (1.5, 1.5, 0.0)

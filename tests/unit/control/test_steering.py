@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_continuous_are
 
-from ccatp.control.steering import Line, Sight, line_rate
+from ccatp.control.tracker import Line, Sight, line_rate
 
 NONE = (0.0, 0.0)
 

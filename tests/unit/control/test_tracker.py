@@ -5,10 +5,9 @@ from math import cos, exp, hypot, pi, sin
 
 import pytest
 
-from ccatp.angles import difference
 from ccatp.config.models import Config
 from ccatp.control.tracker import LegTracker, Phase
-from ccatp.samples import Twist
+from ccatp.core import Twist, difference
 
 DT, LAG = 0.01, 0.08
 Pose = tuple[float, float, float]

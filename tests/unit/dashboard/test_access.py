@@ -2,7 +2,7 @@
 
 import pytest
 
-from ccatp.dashboard.access import host_refusal, origin_refusal, token_refusal
+from ccatp.report.dashboard.access import host_refusal, origin_refusal, token_refusal
 
 TOKEN = "0123456789abcdef0123456789abcdef"
 

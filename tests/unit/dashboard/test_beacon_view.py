@@ -6,22 +6,20 @@ from typing import Any
 import msgspec
 import pytest
 
-from ccatp.beacon_mission.states import State
-from ccatp.config.radio_loader import load_radio_config
-from ccatp.config.radio_models import RadioConfig
-from ccatp.dashboard.beacon_ground import beacon_ground, waypoint_name
-from ccatp.dashboard.beacon_view import BeaconView, expected_rms_m, true_rms_m, worst_sigma_m
-from ccatp.dashboard.ground import MEASURED, PLANNED
+from ccatp.beacons.mission import State
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.load import load_radio_config
 from ccatp.errors import ConfigError
-from ccatp.wire.topics import (
-    BeaconArrival,
-    BeaconMap,
-    BeaconPlaces,
-    BeaconTrack,
-    BeaconTruth,
-    Scene,
-    Shape,
+from ccatp.links.topics import BeaconArrival, BeaconMap, BeaconPlaces, BeaconTrack, BeaconTruth, Scene, Shape
+from ccatp.report.dashboard.beacon_view import (
+    BeaconView,
+    beacon_ground,
+    expected_rms_m,
+    true_rms_m,
+    waypoint_name,
+    worst_sigma_m,
 )
+from ccatp.report.dashboard.survey_view import MEASURED, PLANNED
 
 ELLIPSE = (0.8, 0.8, 4e-4, 0.0, 4e-4)
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from ccatp.dashboard.links import Links
-from ccatp.wire.topics import MissionStatus, Presence
+from ccatp.links.topics import MissionStatus, Presence
+from ccatp.report.dashboard.view import Links
 
 
 def presence(process: str, t_s: float, *, pid: int = 1, phase: str = "joined", age_s: float | None = 0.01) -> Presence:

@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 
-from ccatp.config.loader import load_config
-from ccatp.dashboard.metrics import metrics_text
-from ccatp.dashboard.survey_view import SurveyView
+from ccatp.config.load import load_config
 from ccatp.mirror.mirror import build_mirror
-from ccatp.surveying.states import State
+from ccatp.report.dashboard.metrics import metrics_text
+from ccatp.report.dashboard.survey_view import SurveyView
+from ccatp.survey.state import State
 from tests.unit.dashboard.prometheus import parse
 
 GROUND = {"title": "fyst-m1", "states": [str(state) for state in State]}

@@ -2,7 +2,7 @@
 
 from itertools import pairwise
 
-from ccatp.dashboard.series import Growing, Lines, Trail
+from ccatp.report.dashboard.view import Growing, Lines, Trail
 
 
 def test_what_is_new_is_told_once() -> None:

@@ -8,24 +8,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.dashboard.ground import ARRIVED, MEASURED, SKIPPED, ground
-from ccatp.dashboard.survey_view import SurveyView
+from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Severity, Verdict
+from ccatp.links.topics import Arrival, DangerEvent, FixMessage, Log, MissionStatus, Picture, Scene, Shape, Track, Truth
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose, EventCode, PanelId, PanelPose, PointId, Severity, Verdict
-from ccatp.wire.topics import (
-    Arrival,
-    DangerEvent,
-    FixMessage,
-    Log,
-    MissionStatus,
-    Picture,
-    Scene,
-    Shape,
-    Track,
-    Truth,
-)
+from ccatp.report.dashboard.survey_view import ARRIVED, MEASURED, SKIPPED, SurveyView, ground
 
 LINE = (
     b'{"type":"sensors","seq":5,"t":1.5,"imu":[],"enc":[],"edge":[[1.4,1,1,1,1],[1.5,1,0,1,1]],"gravity":null,'

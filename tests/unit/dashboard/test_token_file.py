@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from ccatp.config.models import Config
-from ccatp.dashboard.token_file import read_token
 from ccatp.errors import ConfigError
+from ccatp.report.dashboard.access import read_token
 
 TOKEN = "0123456789abcdef0123456789abcdef"
 

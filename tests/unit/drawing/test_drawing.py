@@ -6,13 +6,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.drawing.axes import Axis, Plot, colour_bar, legend, number_text, ticks
-from ccatp.drawing.colours import LEVELS, ColourScale
-from ccatp.drawing.shapes import Area, Boxes, Dots, Line, Picture, Shape, Text
-from ccatp.drawing.svg import svg_of
-from ccatp.drawing.thinning import envelope, thinned
-from ccatp.pictures.figures import PictureError
-from ccatp.pictures.picture_file import write_figures, write_svg
+from ccatp.report.drawing import (
+    LEVELS,
+    Area,
+    Axis,
+    Boxes,
+    ColourScale,
+    Dots,
+    Line,
+    Picture,
+    Plot,
+    Shape,
+    Text,
+    colour_bar,
+    envelope,
+    legend,
+    number_text,
+    svg_of,
+    thinned,
+    ticks,
+)
+from ccatp.report.plots import PictureError, write_figures, write_svg
 
 PIXEL_SHAPES: tuple[Shape, ...] = (
     Boxes(np.array([[0.0, 0.0, 50.0, 100.0]]), "#ff0000"),

@@ -7,8 +7,8 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from ccatp.fault_proxy import pipe
-from ccatp.fault_proxy.proxy import FaultProxy
+from ccatp.sim import network_faults as pipe
+from ccatp.sim.fault_proxy import FaultProxy
 
 DEADLINE_S = 5.0  # what never happens in a good run may take this long in a bad one
 LINES = [b"line %d of some length\n" % k for k in range(40)]

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.dataloop import serve
-from ccatp.robot_link import RobotLink
-from ccatp.sim.faults.link_models import LINK_TYPES, LOCKSTEP_TYPES
-from ccatp.sim.faults.plan import parse_plan
-from ccatp.wire.robot import Sensors
+from ccatp.links.robot_link import RobotLink
+from ccatp.links.robot_messages import Sensors
+from ccatp.sim.fault_models import LINK_TYPES, LOCKSTEP_TYPES
+from ccatp.sim.fault_plan import parse_plan
 
 DEADLINE_S = 20.0
 

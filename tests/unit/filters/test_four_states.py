@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ccatp.core import FloatArray
 from ccatp.filters import (
     FILTERS,
     FilterDiverged,
     FilterModelError,
     FilterShapeError,
-    FloatArray,
     FourStateFilter,
     KalmanFilter,
     linear_filter,

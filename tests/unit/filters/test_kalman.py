@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from ccatp.filters import FILTERS, FilterDiverged, FilterShapeError, FloatArray, KalmanFilter
+from ccatp.core import FloatArray
+from ccatp.filters import FILTERS, FilterDiverged, FilterShapeError, KalmanFilter
 
 EYE = np.eye(2)
 

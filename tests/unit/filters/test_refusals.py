@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from ccatp.core import FloatArray
 from ccatp.filters import (
     FILTERS,
     Filter,
     FilterDiverged,
     FilterModelError,
     FilterShapeError,
-    FloatArray,
     KalmanFilter,
     Smoother,
     SmootherEmpty,

@@ -7,11 +7,20 @@ from typing import Any, cast
 
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import DangerConfig
-from ccatp.hazards.edge_episode import DIRECTION_TRAVEL_M, LONG_ON, Cause, Episode, EpisodeLimits, Phase
-from ccatp.hazards.edge_map import Axis, EdgeMap, SeamNear
-from ccatp.hazards.wheel_track import Odometry
+from ccatp.safety.edge_detector import (
+    DIRECTION_TRAVEL_M,
+    LONG_ON,
+    Axis,
+    Cause,
+    EdgeMap,
+    Episode,
+    EpisodeLimits,
+    Phase,
+    SeamNear,
+)
+from ccatp.safety.wheel_odometry import Odometry
 
 GAP_M = 0.010
 OFFSET = (0.09, -0.07)

@@ -7,12 +7,11 @@ from typing import Any, cast
 
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.hazards.edge_episode import Episode, Phase
-from ccatp.hazards.edge_map import EdgeMap, SeamNear
-from ccatp.hazards.edge_rule import EdgeRule, PoseEstimate
-from ccatp.samples import EdgeSample, WheelSample
+from ccatp.core import EdgeSample, WheelSample
+from ccatp.safety.edge_detector import EdgeMap, Episode, Phase, SeamNear
+from ccatp.safety.edge_rule import EdgeRule, PoseEstimate
 
 MS = 1e-3
 OFF_FL = (0, 1, 1, 1)

@@ -13,14 +13,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.angles import difference
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.core import (
+    DeckPose,
+    EdgeSample,
+    Fix,
+    GravitySample,
+    ImuSample,
+    PanelId,
+    PanelPose,
+    Vector3,
+    WheelSample,
+    difference,
+)
+from ccatp.estimation.full_state import FullStateLocalizer
+from ccatp.estimation.state_model import STATES
 from ccatp.filters import FILTERS
-from ccatp.localization.full_state import FullStateLocalizer
-from ccatp.localization.survey_model import STATES
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose, EdgeSample, Fix, GravitySample, ImuSample, PanelId, PanelPose, Vector3, WheelSample
 
 Rate = Callable[[float], float]
 DT_S = 1e-3

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.filters import FILTERS, Filter, FilterDiverged, FloatArray
-from ccatp.localization.fixes import FixGated, FixRefused
-from ccatp.localization.full_state import FullStateLocalizer
-from ccatp.localization.intake import MAX_FRAME_STEP_S
-from ccatp.localization.survey_model import BG, PSI, SL, SR, STATES, TX, A, V, W, X, Y
-from ccatp.samples import DeckPose, Fix, GravitySample, PanelId, PanelPose
+from ccatp.core import DeckPose, Fix, FloatArray, GravitySample, PanelId, PanelPose
+from ccatp.estimation.fixes import FixGated, FixRefused
+from ccatp.estimation.full_state import FullStateLocalizer
+from ccatp.estimation.sample_validation import MAX_FRAME_STEP_S
+from ccatp.estimation.state_model import BG, PSI, SL, SR, STATES, TX, A, V, W, X, Y
+from ccatp.filters import FILTERS, Filter, FilterDiverged
 from tests.unit.localization.drive import (
     FRAME_S,
     STEEP,

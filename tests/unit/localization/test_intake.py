@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ccatp.localization.intake import SampleIntake
-from ccatp.samples import ImuSample, WheelSample
+from ccatp.core import ImuSample, WheelSample
+from ccatp.estimation.sample_validation import SampleIntake
 
 HISTORY_S = 0.2
 ONE = WheelSample(1.002, 1.0, 2.0)

@@ -5,14 +5,13 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
+from ccatp.core import Fix, FloatArray
+from ccatp.estimation.fixes import FixRefused
+from ccatp.estimation.full_state import FullStateLocalizer
+from ccatp.estimation.replay_buffer import Journal, Step
+from ccatp.estimation.state_filter import SurveyFilter
+from ccatp.estimation.state_model import STATES, A, V, W
 from ccatp.filters import FILTERS, KalmanFilter
-from ccatp.filters.base import FloatArray
-from ccatp.localization.fixes import FixRefused
-from ccatp.localization.full_state import FullStateLocalizer
-from ccatp.localization.journal import Journal, Step
-from ccatp.localization.survey_filter import SurveyFilter
-from ccatp.localization.survey_model import STATES, A, V, W
-from ccatp.samples import Fix
 from tests.unit.localization.drive import (
     FRAME_S,
     STEEP,

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from ccatp.config.models import FullStateConfig
-from ccatp.filters.base import FloatArray
-from ccatp.localization.legs import LegBook
-from ccatp.localization.population import Population
-from ccatp.localization.survey_model import SL, SR, STATES, C
+from ccatp.core import FloatArray
+from ccatp.estimation.slip_prior import LegBook, Population
+from ccatp.estimation.state_model import SL, SR, STATES, C
 
 DRAWN = [SR, SL, C]
 STEP = 2.0**0.5  # from one candidate for the scatter to the next

@@ -5,9 +5,9 @@ from math import cos
 import numpy as np
 import pytest
 
-from ccatp.localization.fixes import FixGated
-from ccatp.localization.survey_model import PSI
-from ccatp.samples import DeckPose, Fix, PanelPose
+from ccatp.core import DeckPose, Fix, PanelPose
+from ccatp.estimation.fixes import FixGated
+from ccatp.estimation.state_model import PSI
 from tests.unit.localization.drive import STEEP, Robot, build, errors_of, fix_at, mirror, run, trapeze
 from tests.unit.localization.test_full_state import NOISY, STRAIGHT, fragile, rested, shifted
 from tests.unit.localization.test_journal import Story

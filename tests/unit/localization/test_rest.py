@@ -5,14 +5,11 @@ from math import pi, sin, sqrt
 import numpy as np
 import pytest
 
-from ccatp.angles import difference, wrap_pi
 from ccatp.config.models import FullStateConfig
-from ccatp.localization.noise_floor import NoiseFloor
-from ccatp.localization.rest import RestWatch, heading_from_gravity
-from ccatp.localization.survey_model import BA, BG, PSI, A, W
-from ccatp.localization.terrain import Terrain
+from ccatp.core import DeckPose, GravitySample, ImuSample, PanelPose, difference, wrap_pi
+from ccatp.estimation.measurements import NoiseFloor, RestWatch, heading_from_gravity
+from ccatp.estimation.state_model import BA, BG, PSI, A, Terrain, W
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import DeckPose, GravitySample, ImuSample, PanelPose
 from tests.unit.localization.drive import FRAME_S, STEEP, Errors, Frame, Robot, build, errors_of, run, trapeze
 
 WINDOW = 15  # samples in a mean of the noise floor

@@ -7,12 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ccatp.filters.base import FloatArray
-from ccatp.localization.block import Block, BlockBuilder
-from ccatp.localization.running_pose import RunningPose
-from ccatp.localization.survey_model import BG, KG, PL, PR, PSI, STATES, A, SurveyMotion, V, W, X, Y
-from ccatp.localization.terrain import Slope
-from ccatp.samples import ImuSample
+from ccatp.core import FloatArray, ImuSample
+from ccatp.estimation.odometry import Block, BlockBuilder, RunningPose
+from ccatp.estimation.state_model import BG, KG, PL, PR, PSI, STATES, A, Slope, SurveyMotion, V, W, X, Y
 from tests.unit.localization.drive import config
 from tests.unit.localization.test_survey_model import LEVEL, slopes, states
 

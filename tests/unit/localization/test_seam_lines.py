@@ -10,13 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ccatp.config.models import FullStateConfig
-from ccatp.filters.base import FloatArray
-from ccatp.localization.crossing import Transition
-from ccatp.localization.seam_lines import Edge, SeamLines
-from ccatp.localization.survey_model import E0, E1, PSI, STATES, A, V, W, X, Y
-from ccatp.localization.terrain import Slope, Terrain
+from ccatp.core import DeckPose, FloatArray, PanelId, PanelPose
+from ccatp.estimation.seams import Edge, SeamLines, Transition
+from ccatp.estimation.state_model import E0, E1, PSI, STATES, A, Slope, Terrain, V, W, X, Y
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import DeckPose, PanelId, PanelPose
 from tests.unit.localization.drive import Rate, Robot, build, config, errors_of, mirror, run, trapeze
 
 SENSORS = config().robot.edge_sensors_m

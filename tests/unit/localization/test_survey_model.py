@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ccatp.angles import difference
-from ccatp.filters.base import FloatArray
-from ccatp.localization.survey_model import (
+from ccatp.core import FloatArray, difference
+from ccatp.estimation.state_model import (
     BA,
     BG,
     KG,
@@ -24,13 +23,14 @@ from ccatp.localization.survey_model import (
     A,
     C,
     SensorRows,
+    Slope,
     SurveyMotion,
+    Terrain,
     V,
     W,
     X,
     Y,
 )
-from ccatp.localization.terrain import Slope, Terrain
 from ccatp.mirror.mirror import Mirror
 from tests.unit.localization.drive import STEEP, Errors, Robot, config
 

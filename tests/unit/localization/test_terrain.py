@@ -7,13 +7,12 @@ from typing import cast
 import numpy as np
 import pytest
 
-from ccatp.angles import difference
-from ccatp.localization.panel_frame import PanelFrame
-from ccatp.localization.seam_lines import axes_on
-from ccatp.localization.terrain import Slope, Terrain
+from ccatp.core import DeckPose, PanelId, difference
+from ccatp.estimation.localizer_base import PanelFrame
+from ccatp.estimation.seams import axes_on
+from ccatp.estimation.state_model import Slope, Terrain
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.surface import Surface
-from ccatp.samples import DeckPose, PanelId
 
 REACH_M = 5e-3
 

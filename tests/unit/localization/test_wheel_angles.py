@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ccatp.localization.wheel_angles import WheelAngle
+from ccatp.estimation.wheel_angles import WheelAngle
 
 DT_S = 1e-3
 COUNT_RAD = 2.0 * pi / 1024.0

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ccatp.mirror.alignment import PanelMisalignment, fit_panel, misaligned_puck_world, panel_deviations
-from ccatp.mirror.errors import PanelFitError, UnknownPanelError
+from ccatp.core import DeckPose, PanelId
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import DeckPose, PanelId
+from ccatp.mirror.misalignment import PanelMisalignment, fit_panel, misaligned_puck_world, panel_deviations
+from ccatp.mirror.surface import PanelFitError, UnknownPanelError
 
 HEIGHT_M = 0.05
 PANEL = PanelId(3, 7)

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from ccatp.mirror.batches import deck_poses
-from ccatp.mirror.mirror import Mirror
-from ccatp.samples import PanelPose
+from ccatp.core import PanelPose
+from ccatp.mirror.mirror import Mirror, deck_poses
 
 
 def test_many_poses_are_as_one_by_one(mirror: Mirror) -> None:

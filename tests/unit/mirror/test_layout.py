@@ -5,10 +5,10 @@ from math import hypot, inf, nan
 import pytest
 
 from ccatp.config.models import PanelsConfig
-from ccatp.mirror.errors import UnknownPanelError
+from ccatp.core import PanelId, PointId
 from ccatp.mirror.layout import PanelGrid
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import PanelId, PointId
+from ccatp.mirror.surface import UnknownPanelError
 
 
 def test_m1_columns_run_against_the_mirror_frames_x(m1: Mirror) -> None:

@@ -6,10 +6,9 @@ from math import cos, hypot, pi, sin, sqrt
 import numpy as np
 import pytest
 
-from ccatp.angles import bearing, difference
-from ccatp.mirror.errors import ConvergenceError, UnknownPanelError
+from ccatp.core import DeckPose, PanelId, PanelPose, PointId, bearing, difference
 from ccatp.mirror.mirror import Mirror
-from ccatp.samples import DeckPose, PanelId, PanelPose, PointId
+from ccatp.mirror.surface import ConvergenceError, UnknownPanelError
 
 POSE = DeckPose(1.1, -1.7, 0.6)
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.outline import NearOutline
-from ccatp.mirror.rim import Rim
+from ccatp.mirror.rim import NearOutline, Rim
 
 
 def test_a_part_decides_within_its_disc_as_the_whole(mirror: Mirror) -> None:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ccatp.mirror.errors import MirrorError
+from ccatp.core import PanelId
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.rim import Rim
-from ccatp.samples import PanelId
+from ccatp.mirror.surface import MirrorError
 
 SPACING_M = 0.004
 Rectangle = tuple[float, float, float, float]

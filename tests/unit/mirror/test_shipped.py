@@ -8,9 +8,9 @@ import pytest
 from pydantic import ValidationError
 
 from ccatp.config.models import MirrorConfig
-from ccatp.mirror.errors import LayoutError
+from ccatp.core import DeckPose
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose
+from ccatp.mirror.surface import LayoutError
 
 Raw = dict[str, Any]
 PANELS = {"fyst-m1": 77, "fyst-m2": 69, "thesis-m1": 87, "thesis-m2": 78}

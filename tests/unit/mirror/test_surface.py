@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from ccatp.config.models import SurfaceConfig
-from ccatp.mirror.errors import ConvergenceError
 from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.surface import Surface, build_surface
+from ccatp.mirror.surface import ConvergenceError, Surface, build_surface
 
 # (x, y, z) in mm in the mirror frame, evaluated from the published coefficient matrix by other means.
 CHECK_POINTS = {

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.surface import Jet, Surface
-from ccatp.mirror.surface_patch import SurfacePatch
+from ccatp.mirror.surface import Jet, Surface, SurfacePatch
 
 REACH_M = 5e-3
 # Height in m, slopes, second derivatives in 1/m, as the class says.

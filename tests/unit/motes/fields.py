@@ -6,8 +6,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from ccatp.motes.range_network import RangeNetwork, RigidBody, build_network
-from ccatp.motes.tdoa import MoteRange
+from ccatp.beacons.cricket.range_network import MoteRange, RangeNetwork, RigidBody, build_network
 
 FloatArray = NDArray[np.float64]
 Pairs = list[tuple[int, int]]

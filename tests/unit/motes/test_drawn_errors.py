@@ -7,12 +7,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from ccatp.config.cricket_models import CricketConfig
-from ccatp.config.radio_loader import load_radio_config
-from ccatp.motes.phase_one import FirstMap, map_as_possible, map_by_plan
-from ccatp.motes.self_mapping import conditioned
-from ccatp.studies.mote_field import simulate_field
-from ccatp.studies.mote_runs import first_map, run_filter
+from ccatp.beacons.cricket.self_mapping import conditioned
+from ccatp.beacons.cricket.trilateration import FirstMap, map_as_possible, map_by_plan
+from ccatp.config.beacon_models import CricketConfig
+from ccatp.config.load import load_radio_config
+from ccatp.studies.mote_runs import first_map, run_filter, simulate_field
 from tests.unit.motes.fields import near_pairs, network_of
 from tests.unit.motes.test_trilateration import field_ranges
 

@@ -5,10 +5,9 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from ccatp.motes.fold_over import find_fold_over
-from ccatp.motes.map_batch import BatchSettings, fit_map
-from ccatp.motes.map_model import MapModel
-from ccatp.motes.range_network import RigidBody
+from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, fit_map
+from ccatp.beacons.cricket.range_network import RigidBody
+from ccatp.beacons.cricket.rigidity import find_fold_over
 from tests.unit.motes.fields import ADJACENT, ALL, HEADS, ZIGZAG, FloatArray, Pairs, near_pairs, network_of
 
 

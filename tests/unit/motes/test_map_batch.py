@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from ccatp.motes.map_batch import BatchSettings, fit_map, position_covariance
-from ccatp.motes.map_model import MapModel
-from ccatp.motes.range_network import RigidBody
-from ccatp.radio.rigid_alignment import aligned_rms_m, best_motion
+from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, fit_map, position_covariance
+from ccatp.beacons.cricket.range_network import RigidBody
+from ccatp.filters.metrics import aligned_rms_m, best_motion
 from tests.unit.motes.fields import ALL, HEADS, SIGMA_M, FloatArray, near_pairs, network_of
 
 PLAIN = BatchSettings()
@@ -101,7 +100,7 @@ def test_sparse_and_dense_steps_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     places = rng.uniform(0.0, 10.0, (30, 2))
     model = MapModel(network_of(places, near_pairs(places, 5.0), rng))
     dense = fit_map(model, model.state(places), PLAIN)
-    monkeypatch.setattr("ccatp.motes.map_batch._DENSE", 0)
+    monkeypatch.setattr("ccatp.beacons.cricket.map_fit._DENSE", 0)
     sparse = fit_map(model, model.state(places), PLAIN)
     assert sparse.cost == pytest.approx(dense.cost, rel=1e-9)
     assert sparse.state.positions_m == pytest.approx(dense.state.positions_m, abs=1e-6)

@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 from scipy.special import ndtri
 
-from ccatp.motes.map_agreement import agreement_of
-from ccatp.motes.map_batch import BatchSettings, fit_from_afar, fit_map
-from ccatp.motes.map_growth import grown
-from ccatp.motes.map_model import MapModel
-from ccatp.motes.map_search import residual_scale, scaled, searched
-from ccatp.motes.mote_map import map_motes
-from ccatp.motes.pair_means import PairMeans
-from ccatp.motes.range_network import RangeNetwork
-from ccatp.radio.rigid_alignment import aligned_rms_m
+from ccatp.beacons.cricket.flip_search import residual_scale, scaled, searched
+from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, fit_from_afar, fit_map
+from ccatp.beacons.cricket.map_start import grown
+from ccatp.beacons.cricket.mote_map import map_motes
+from ccatp.beacons.cricket.range_network import PairMeans, RangeNetwork
+from ccatp.beacons.cricket.unfolding import agreement_of
+from ccatp.filters.metrics import aligned_rms_m
 from tests.unit.motes.fields import SIGMA_M, FloatArray, near_pairs, network_of
 
 ROBUST = BatchSettings(robust_scale=4.0)

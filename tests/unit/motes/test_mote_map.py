@@ -5,14 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ccatp.motes.fold_over import find_fold_over
-from ccatp.motes.map_batch import BatchSettings, fit_map, position_covariance
-from ccatp.motes.map_model import MapModel
-from ccatp.motes.mote_frame import pinned_map, plain_frame
-from ccatp.motes.mote_map import map_motes
-from ccatp.motes.range_bound import bound_rms_m
-from ccatp.motes.range_network import RangeNetwork, RigidBody
-from ccatp.radio.rigid_alignment import aligned_rms_m, best_motion
+from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, bound_rms_m, fit_map, position_covariance
+from ccatp.beacons.cricket.mote_map import map_motes, pinned_map, plain_frame
+from ccatp.beacons.cricket.range_network import RangeNetwork, RigidBody
+from ccatp.beacons.cricket.rigidity import find_fold_over
+from ccatp.filters.metrics import aligned_rms_m, best_motion
 from tests.unit.motes.fields import (
     ADJACENT,
     ALL,

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from ccatp.errors import ExitStatus
-from ccatp.motes.pair_means import PairMeans
-from ccatp.motes.range_network import (
+from ccatp.beacons.cricket.range_network import (
     BadRange,
     Disconnected,
+    MoteRange,
+    PairMeans,
     RigidBody,
     TooFewRanges,
     UnknownMote,
@@ -15,7 +15,7 @@ from ccatp.motes.range_network import (
     graph_pairs,
     list_names,
 )
-from ccatp.motes.tdoa import MoteRange
+from ccatp.errors import ExitStatus
 
 
 def row(first: str, second: str, range_m: float = 1.0, sigma_m: float = 0.01) -> MoteRange:

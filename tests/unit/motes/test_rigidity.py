@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ccatp.motes.map_model import MapModel
-from ccatp.motes.range_network import RigidBody
-from ccatp.motes.rigidity import Freedom, find_freedom, generic_state
+from ccatp.beacons.cricket.map_fit import MapModel
+from ccatp.beacons.cricket.range_network import RigidBody
+from ccatp.beacons.cricket.rigidity import Freedom, find_freedom, generic_state
 from tests.unit.motes.fields import ADJACENT, ALL, HEADS, ZIGZAG, FloatArray, Pairs, near_pairs, network_of
 
 NOWHERE = np.full((6, 2), np.nan)

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from ccatp.motes.map_batch import BatchSettings, fit_map
-from ccatp.motes.map_model import MapModel
-from ccatp.motes.range_network import MappingError
-from ccatp.motes.self_mapping import MapperSettings, MoteMapper, conditioned, printed_prior, run_phase_two
+from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, fit_map
+from ccatp.beacons.cricket.range_network import MappingError
+from ccatp.beacons.cricket.self_mapping import MapperSettings, MoteMapper, conditioned, printed_prior, run_phase_two
 from tests.unit.motes.fields import ADJACENT, ALL, HEADS, SIGMA_M, ZIGZAG, FloatArray, Pairs, network_of
 
 POOLED = MapperSettings(linearisations=10, pools=True, gate_probability=1.0, target_rms_m=0.0)

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from ccatp.config.radio_loader import load_radio_config
-from ccatp.motes.mote_plan import loose_plan, network_plan
-from ccatp.motes.stands import complete_stands
-from ccatp.sim.motes.layout import true_motes
+from ccatp.beacons.cricket.self_mapping import complete_stands, loose_plan, network_plan
+from ccatp.config.load import load_radio_config
+from ccatp.sim.motes import true_motes
 
 CFG = load_radio_config(None, {"system": "cricket"}).cricket
 PLAN = network_plan(CFG)

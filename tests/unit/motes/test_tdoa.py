@@ -2,7 +2,7 @@
 
 import pytest
 
-from ccatp.motes.tdoa import Air, TdoaError, range_from_delay, range_sigma, sound_speed
+from ccatp.beacons.cricket.range_network import Air, TdoaError, range_from_delay, range_sigma, sound_speed
 
 AIR = Air(344.0, 20.0)
 

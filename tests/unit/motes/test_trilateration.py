@@ -3,16 +3,13 @@
 import numpy as np
 import pytest
 
-from ccatp.config.cricket_models import CricketConfig
-from ccatp.config.radio_loader import load_radio_config
-from ccatp.motes.mote_plan import MotePlan, head_pairs, network_plan
-from ccatp.motes.pair_means import PairMeans
-from ccatp.motes.phase_one import map_as_possible, map_by_plan
-from ccatp.motes.range_network import RangeNetwork, build_network
-from ccatp.motes.tdoa import MoteRange
-from ccatp.motes.trilateration import DegenerateStep, MissingRange, Sketch
-from ccatp.radio.rigid_alignment import aligned_rms_m
-from ccatp.sim.motes.layout import true_motes
+from ccatp.beacons.cricket.range_network import MoteRange, PairMeans, RangeNetwork, build_network
+from ccatp.beacons.cricket.self_mapping import MotePlan, head_pairs, network_plan
+from ccatp.beacons.cricket.trilateration import DegenerateStep, MissingRange, Sketch, map_as_possible, map_by_plan
+from ccatp.config.beacon_models import CricketConfig
+from ccatp.config.load import load_radio_config
+from ccatp.filters.metrics import aligned_rms_m
+from ccatp.sim.motes import true_motes
 from tests.unit.motes.fields import SIGMA_M, FloatArray, near_pairs, network_of
 
 A, B = np.zeros(2), np.array([0.0, 2.0])

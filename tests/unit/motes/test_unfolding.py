@@ -3,15 +3,12 @@
 import numpy as np
 import pytest
 
-from ccatp.motes.map_batch import BatchSettings, fit_map
-from ccatp.motes.map_flips import unfold
-from ccatp.motes.map_model import MapModel
-from ccatp.motes.map_patches import stitched
-from ccatp.motes.map_repair import repaired
-from ccatp.motes.pair_means import PairMeans
-from ccatp.motes.range_network import components
-from ccatp.motes.unfolding import classical_scaling, completed, unfolded
-from ccatp.radio.rigid_alignment import aligned_rms_m
+from ccatp.beacons.cricket.flip_search import unfold
+from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, fit_map
+from ccatp.beacons.cricket.map_start import stitched
+from ccatp.beacons.cricket.range_network import PairMeans, components
+from ccatp.beacons.cricket.unfolding import classical_scaling, completed, repaired, unfolded
+from ccatp.filters.metrics import aligned_rms_m
 from tests.unit.motes.fields import ALL, HEADS, FloatArray, near_pairs, network_of
 
 SETTINGS = BatchSettings(robust_scale=4.0)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror, build_mirror
 

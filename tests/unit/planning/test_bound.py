@@ -5,8 +5,10 @@ from typing import Any
 
 import pytest
 
-from ccatp.control.profile import Profile
-from ccatp.planning.bound import (
+from ccatp.control.pid import Profile
+from ccatp.core import DeckPose, Stop, StopKind
+from ccatp.survey.planning.route import thesis_order
+from ccatp.survey.planning.search import (
     STRAIGHT_RAD,
     bang_bang_time,
     leg_lengths,
@@ -15,8 +17,6 @@ from ccatp.planning.bound import (
     stop_times,
     turn_time,
 )
-from ccatp.planning.traversal import thesis_order
-from ccatp.samples import DeckPose, Stop, StopKind
 
 FLAT = 1e-3  # the patch at the apex of M1 that these tests drive on is flat to 1 mm in a metre
 

@@ -5,9 +5,8 @@ from typing import Any
 
 import pytest
 
-from ccatp.angles import difference
-from ccatp.planning.course import course_of_heading, heading_of_course
-from ccatp.samples import DeckPose
+from ccatp.core import DeckPose, difference
+from ccatp.survey.planning.legs import course_of_heading, heading_of_course
 
 ROUNDING = 1e-12
 

@@ -5,8 +5,8 @@ from math import hypot
 
 import pytest
 
-from ccatp.planning.parts import in_parts
-from ccatp.samples import PointId, Stop, StopKind
+from ccatp.core import PointId, Stop, StopKind
+from ccatp.survey.planning.legs import in_parts
 
 STOP = Stop(0.7, 0.0, StopKind.MEASURE, PointId(1, 2, 3), True)
 

@@ -7,17 +7,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
+from ccatp.core import DeckPose, PointId, Stop, StopKind
 from ccatp.mirror.mirror import build_mirror
-from ccatp.planning.bound import path_time
-from ccatp.planning.errors import OutsideMirrorError, PlanError, UnreachableError
-from ccatp.planning.legs import Grazing, LegRules
-from ccatp.planning.route import Route, plan_route
-from ccatp.planning.search import Arrival, Search, Target
-from ccatp.planning.stance import Place, build_body, build_places
-from ccatp.planning.traversal import thesis_order
-from ccatp.planning.way_home import plan_way_home
-from ccatp.samples import DeckPose, PointId, Stop, StopKind
+from ccatp.survey.planning.legs import (
+    Grazing,
+    LegRules,
+    OutsideMirrorError,
+    Place,
+    PlanError,
+    UnreachableError,
+    build_body,
+    build_places,
+)
+from ccatp.survey.planning.route import Route, plan_route, thesis_order
+from ccatp.survey.planning.search import Arrival, Search, Target, path_time
+from ccatp.survey.planning.way_home import plan_way_home
 
 STEPS_OF_THESIS_M1 = ((1, 2), (2, 3), (7, 8), (8, 9))  # rows of 7, 9, 11, ..., 11, 9, 7 panels
 

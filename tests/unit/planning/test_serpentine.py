@@ -7,12 +7,18 @@ from typing import Any
 import pytest
 
 from ccatp.config.models import LimitsConfig
+from ccatp.core import PointId, Stop, StopKind
 from ccatp.mirror.mirror import Mirror
-from ccatp.planning.bound import path_time
-from ccatp.planning.route import plan_route
-from ccatp.planning.serpentine import fastest_serpentine, serpentines
-from ccatp.planning.traversal import NOMINAL_LIMITS, ORDERS, optimised_order, thesis_order
-from ccatp.samples import PointId, Stop, StopKind
+from ccatp.survey.planning.route import (
+    NOMINAL_LIMITS,
+    ORDERS,
+    fastest_serpentine,
+    optimised_order,
+    plan_route,
+    serpentines,
+    thesis_order,
+)
+from ccatp.survey.planning.search import path_time
 
 LONGEST_STEP_M = 0.27  # neighbours on one line are 220 to 254 mm apart
 

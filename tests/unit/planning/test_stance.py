@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccatp.core import DeckPose, PanelId, PointId
 from ccatp.mirror.mirror import Mirror
-from ccatp.planning.retreats import find_retreats
-from ccatp.planning.stance import Body, Place, Stance, build_body, build_places, sensor_depths
-from ccatp.samples import DeckPose, PanelId, PointId
+from ccatp.survey.planning.escape import find_retreats
+from ccatp.survey.planning.legs import Body, Place, Stance, build_body, build_places, sensor_depths
 
 
 def body_of(world: Any) -> Body:

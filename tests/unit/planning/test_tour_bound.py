@@ -8,15 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.angles import bearing, difference
 from ccatp.config.models import LimitsConfig
+from ccatp.core import DeckPose, PointId, Stop, StopKind, bearing, difference
 from ccatp.mirror.mirror import build_mirror
-from ccatp.planning.bound import leg_time, path_time, turn_time
-from ccatp.planning.course import heading_of_course
-from ccatp.planning.route import plan_route
-from ccatp.planning.tour_bound import tour_bound
-from ccatp.planning.traversal import optimised_order, thesis_order
-from ccatp.samples import DeckPose, PointId, Stop, StopKind
+from ccatp.survey.planning.legs import heading_of_course
+from ccatp.survey.planning.route import optimised_order, plan_route, thesis_order
+from ccatp.survey.planning.search import leg_time, path_time, turn_time
+from ccatp.survey.planning.tour_bound import tour_bound
 
 ROUNDING_S = 1e-6  # sums of some thousand terms, at prices of some seconds
 
@@ -58,7 +56,7 @@ def test_legs_that_are_not_near_make_it_lower_only(
     chosen = [points[k] for k in np.random.default_rng(seed).choice(len(points), 5, replace=False)]
     best = min(fastest_drive(thesis, order, thesis.cfg.limits) for order in permutations(chosen))
     whole = tour_bound(thesis.mirror, chosen, thesis.cfg.limits, 0.5)
-    monkeypatch.setattr("ccatp.planning.tour_bound._NEAR", near)
+    monkeypatch.setattr("ccatp.survey.planning.tour_bound._NEAR", near)
     bound = tour_bound(thesis.mirror, chosen, thesis.cfg.limits, 0.5)
     assert 0.3 * best < bound <= whole + ROUNDING_S <= best + 2.0 * ROUNDING_S
 

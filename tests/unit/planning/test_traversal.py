@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
+from ccatp.core import PanelId
 from ccatp.mirror.mirror import Mirror
-from ccatp.planning.traversal import ORDERS, panel_order, thesis_order
-from ccatp.samples import PanelId
+from ccatp.survey.planning.route import ORDERS, panel_order, thesis_order
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from ccatp.planning.errors import OutsideMirrorError, UnreachableError
-from ccatp.planning.way_home import plan_way_home
-from ccatp.samples import DeckPose, Stop, StopKind
+from ccatp.core import DeckPose, Stop, StopKind
+from ccatp.survey.planning.legs import OutsideMirrorError, UnreachableError
+from ccatp.survey.planning.way_home import plan_way_home
 
 
 def go(world: Any, start: DeckPose, base: DeckPose | None = None) -> tuple[Stop, ...]:

@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 
-from ccatp.assembly import Parts
-from ccatp.config.loader import dump_config, load_config
+from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
+from ccatp.core import DeckPose, StopKind
+from ccatp.daemon.checkpoints import StoreUnusable, build_parts
+from ccatp.daemon.process import Endpoints, ProcessArgs
 from ccatp.errors import ConfigError
-from ccatp.processes.building import StoreUnusable, build_parts
-from ccatp.processes.common import Endpoints, ProcessArgs
-from ccatp.samples import DeckPose, StopKind
-from ccatp.wire.robot import Hello, RobotData
+from ccatp.links.robot_messages import Hello, RobotData
+from ccatp.survey.composition import Parts
 
 
 def args(config: Config, folder: Path) -> ProcessArgs:
@@ -87,7 +87,7 @@ def test_a_store_that_exists_is_not_overwritten(tmp_path: Path) -> None:
 def test_a_resumed_plan_leaves_out_what_is_measured(tmp_path: Path) -> None:
     import numpy as np
 
-    from ccatp.samples import Fix
+    from ccatp.core import Fix
 
     where = args(load_config(None, {"run.panels": 1}), tmp_path)
     built, store = build_parts(where)

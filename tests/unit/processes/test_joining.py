@@ -6,12 +6,13 @@ from typing import Any
 
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.daemon.robot_session import FIRST_DELAY_S, LONGEST_DELAY_S, LastingLink, delay_s
 from ccatp.dataloop import DataLoop
-from ccatp.processes.joining import FIRST_DELAY_S, LONGEST_DELAY_S, LastingLink, delay_s
-from ccatp.robot_link import RobotTimeout
-from ccatp.wire.robot import Hello, Joined, Sensors, encode
+from ccatp.links.robot_codec import encode
+from ccatp.links.robot_link import RobotTimeout
+from ccatp.links.robot_messages import Hello, Joined, Sensors
 from tests.faults.test_link import HELLO
 
 

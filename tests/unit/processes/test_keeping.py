@@ -4,10 +4,10 @@ import pytest
 from msgspec.structs import replace
 
 from ccatp.config.models import Config
+from ccatp.core import EventCode
+from ccatp.daemon.checkpoints import in_force_of
 from ccatp.mirror.mirror import build_mirror
-from ccatp.processes.keeping import in_force_of
-from ccatp.samples import EventCode
-from ccatp.surveying.states import State
+from ccatp.survey.state import State
 from tests.unit.test_mission import ABORT, FREE, Story, from_first_leg
 
 QUAKE = replace(

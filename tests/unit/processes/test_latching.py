@@ -7,7 +7,7 @@ from uuid import UUID
 import pytest
 import structlog
 
-from ccatp.processes.latching import FILE, RESERVE_BYTES, DurableLatch, active_ids
+from ccatp.daemon.danger_loop import FILE, RESERVE_BYTES, DurableLatch, active_ids
 
 Log = structlog.typing.FilteringBoundLogger
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from ccatp.config.models import Config
+from ccatp.core import DeckPose, Fix, PointId
+from ccatp.daemon.fix_service import MeasuringDesk, Request
+from ccatp.daemon.telemetry import SurveyTeller
+from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.etalon_client import EtalonClient
-from ccatp.localization.fixes import FixGated, FixRefused
 from ccatp.localizer import Localizer
-from ccatp.metrology.scrutiny import Finding, Scrutiny
-from ccatp.mission import Mission
-from ccatp.processes.measuring import MeasuringDesk, Request
-from ccatp.processes.survey_telling import SurveyTeller
-from ccatp.samples import DeckPose, Fix, PointId
-from ccatp.storage.store import MissionStore
-from ccatp.storage.store_rows import AlreadyMeasuredError
+from ccatp.records.store import MissionStore
+from ccatp.records.store_rows import AlreadyMeasuredError
+from ccatp.survey.fix_gate import Finding, Scrutiny
+from ccatp.survey.mission import Mission
 
 FIX = Fix(1.0, (0.0, 0.0, 0.0), (0.0,) * 9, 1.0, (1,), 0.0)
 

@@ -5,8 +5,8 @@ import socket
 import pytest
 
 from ccatp.config.models import Config
-from ccatp.processes import page_socket
-from ccatp.processes.page_socket import open_page_socket, page_url
+from ccatp.daemon import dashboard as page_socket
+from ccatp.daemon.dashboard import open_page_socket, page_url
 
 
 def test_none_is_wanted(config: Config) -> None:

@@ -4,13 +4,12 @@ from pathlib import Path
 
 import zmq
 
-from ccatp.bus import Publisher, Subscriber
 from ccatp.config.models import Config
+from ccatp.daemon.telemetry import Painter, look_at_localizer
+from ccatp.links.bus import Publisher, Subscriber
+from ccatp.links.topics import Picture
 from ccatp.localizer import build_localizer
 from ccatp.mirror.mirror import build_mirror
-from ccatp.processes.painting import Painter
-from ccatp.processes.survey_telling import look_at_localizer
-from ccatp.wire.topics import Picture
 
 LINE = b'{"type":"sensors"}'
 

@@ -6,12 +6,11 @@ from typing import Any, cast
 import msgspec
 import structlog
 
-from ccatp.bus import Publisher
+from ccatp.core import DeckPose, Fix, PanelId, PanelPose
+from ccatp.daemon.telemetry import BATCH_FRAMES, SurveyTeller
+from ccatp.links.bus import Publisher
+from ccatp.links.topics import FixMessage, Message, SensorLines, Track
 from ccatp.localizer import Localizer
-from ccatp.processes.survey_telling import SurveyTeller
-from ccatp.processes.telling import BATCH_FRAMES
-from ccatp.samples import DeckPose, Fix, PanelId, PanelPose
-from ccatp.wire.topics import FixMessage, Message, SensorLines, Track
 
 
 class Listener:

@@ -3,8 +3,8 @@
 import os
 from pathlib import Path
 
-from ccatp.config.loader import dump_config, load_config
-from ccatp.processes.common import parse_args
+from ccatp.config.load import dump_config, load_config
+from ccatp.daemon.process import parse_args
 
 
 def test_sockets_are_for_their_owner_alone(tmp_path: Path) -> None:

@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
+from ccatp.daemon.process import unless_stopped
 from ccatp.errors import UnreachableError
-from ccatp.processes.common import unless_stopped
 
 
 async def refuse() -> None:

@@ -5,14 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ccatp.config.recording_loader import load_recordings_config
-from ccatp.radio.assumed import batch_settings, slam_settings
-from ccatp.radio.batch import smooth
-from ccatp.radio.causal import filter_run
-from ccatp.radio.judged import judge
-from ccatp.radio.recording import RecordedRun
-from ccatp.radio.slam_report import result_data
-from ccatp.radio.track import Track
+from ccatp.beacons.slam.batch_smoother import smooth
+from ccatp.beacons.slam.causal import filter_run
+from ccatp.beacons.slam.evaluation import judge, result_data
+from ccatp.beacons.slam.recording import RecordedRun, Track
+from ccatp.beacons.slam.settings import batch_settings, slam_settings
+from ccatp.config.load import load_recordings_config
 from tests.unit.radio_data.sets import recorded, world
 
 CONFIG = load_recordings_config(None, {})

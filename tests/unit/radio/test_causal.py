@@ -6,13 +6,12 @@ from time import perf_counter
 import numpy as np
 import pytest
 
-from ccatp.config.recording_loader import load_recordings_config
-from ccatp.radio.assumed import slam_settings
-from ccatp.radio.causal import filter_run
-from ccatp.radio.judged import judge
-from ccatp.radio.recording import Readings, RecordedRun, Truth
-from ccatp.radio.track import Track
-from ccatp.radio_data.checks import suspicions
+from ccatp.beacons.datasets.checks import suspicions
+from ccatp.beacons.slam.causal import filter_run
+from ccatp.beacons.slam.evaluation import judge
+from ccatp.beacons.slam.recording import Readings, RecordedRun, Track, Truth
+from ccatp.beacons.slam.settings import slam_settings
+from ccatp.config.load import load_recordings_config
 from tests.unit.radio_data.sets import recorded, world
 
 

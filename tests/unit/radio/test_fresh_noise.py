@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ccatp.radio.fresh_noise import FreshNoise
+from ccatp.beacons.slam.range_slam import FreshNoise
 
 
 def test_it_is_that_of_the_matrices() -> None:

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from ccatp.radio.level_fix import LevelLocator, Room, likeliest_names
-from ccatp.radio.path_loss_fit import LevelPair, PathLossFit, fit_path_loss
+from ccatp.beacons.slam.path_loss import LevelLocator, LevelPair, PathLossFit, Room, fit_path_loss, likeliest_names
 
 BEACONS = {"A": (0.0, 0.0), "B": (0.0, 4.0), "C": (4.0, 0.0)}
 ROOM = Room((0.0, 0.0), (4.0, 4.0), 0.1)

@@ -6,14 +6,14 @@ from time import perf_counter
 import numpy as np
 import pytest
 
-from ccatp.config.recording_loader import load_recordings_config
-from ccatp.radio.assumed import batch_settings, slam_settings
-from ccatp.radio.batch import smooth
-from ccatp.radio.causal import filter_run
-from ccatp.radio.judged import judge
-from ccatp.radio.recording import RecordedRun, Steps
-from ccatp.radio_data.bridging import bridged
-from ccatp.radio_data.checks import suspicions
+from ccatp.beacons.datasets.checks import suspicions
+from ccatp.beacons.datasets.tables import bridged
+from ccatp.beacons.slam.batch_smoother import smooth
+from ccatp.beacons.slam.causal import filter_run
+from ccatp.beacons.slam.evaluation import judge
+from ccatp.beacons.slam.recording import RecordedRun, Steps
+from ccatp.beacons.slam.settings import batch_settings, slam_settings
+from ccatp.config.load import load_recordings_config
 from tests.unit.radio_data.sets import recorded, world
 
 CONFIG = load_recordings_config(None, {})

@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ccatp.radio.judged import judge, truth_at
-from ccatp.radio.metrics import consistency, nees, rms, wrapped
-from ccatp.radio.recording import Truth
-from ccatp.radio.rigid_alignment import RigidMotion
-from ccatp.radio.track import BeaconFix, Track
+from ccatp.beacons.slam.evaluation import judge, truth_at
+from ccatp.beacons.slam.recording import BeaconFix, Track, Truth
+from ccatp.filters.metrics import RigidMotion, consistency, nees, rms, wrapped
 from tests.unit.radio_data.sets import BEACONS, recorded, world
 
 

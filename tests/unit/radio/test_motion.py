@@ -7,8 +7,15 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from ccatp.filters.base import FloatArray
-from ccatp.radio.motion import Ackermann, AckermannNoise, DifferentialDrive, DifferentialNoise, Increment, Steering
+from ccatp.beacons.slam.motion import (
+    Ackermann,
+    AckermannNoise,
+    DifferentialDrive,
+    DifferentialNoise,
+    Increment,
+    Steering,
+)
+from ccatp.core import FloatArray
 
 NOISE = DifferentialNoise(0.05, 0.03, 0.01, 0.05, 0.002, 0.02, 0.02, 1e-4, 0.1, 0.1, 0.03, 0.03)
 

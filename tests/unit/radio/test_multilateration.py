@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import optimize, stats
 
-from ccatp.radio.multilateration import (
+from ccatp.core import FloatArray
+from ccatp.mirror.multilateration import (
     DegenerateGeometry,
     DilutionTooLarge,
-    FloatArray,
     NoConvergence,
     ResidualTooLarge,
     TooFarFromExpected,

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from ccatp.radio.path_loss import PathLoss
-from ccatp.radio.path_loss_fit import CalibrationError, LevelPair, fit_path_loss
+from ccatp.beacons.slam.path_loss import CalibrationError, LevelPair, PathLoss, fit_path_loss
 
 
 def test_printed_ranges_of_2017_come_out() -> None:

@@ -5,8 +5,7 @@ import pytest
 
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import build_mirror
-from ccatp.radio.multilateration import TooFewRanges
-from ccatp.radio.puck_fix import solve_fix
+from ccatp.mirror.multilateration import TooFewRanges, solve_fix
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])

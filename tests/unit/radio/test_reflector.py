@@ -4,9 +4,9 @@ from math import pi, radians
 
 import pytest
 
-from ccatp.angles import wrap_pi
-from ccatp.radio.reflector import ReflectorScan, ScanResult
-from ccatp.sim.radio.frame import Packet
+from ccatp.beacons.slam.reflector import ReflectorScan, ScanResult
+from ccatp.core import wrap_pi
+from ccatp.sim.radio import Packet
 
 SCAN = ReflectorScan(readings=40, bearing_sigma_rad=radians(18.0), loss_tolerance=0.5)
 STEP = radians(9.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ccatp.radio.rigid_alignment import RigidMotion, aligned_rms_m, best_motion, rigid_modes, rms_m
+from ccatp.filters.metrics import RigidMotion, aligned_rms_m, best_motion, rigid_modes, rms_m
 
 RNG = np.random.default_rng(3)
 

@@ -5,13 +5,12 @@ from math import log10, pi
 import numpy as np
 import pytest
 
-from ccatp.filters.base import FloatArray
-from ccatp.radio.dead_reckoning import DeadReckoning
-from ccatp.radio.motion import DifferentialDrive, DifferentialNoise, Increment, Odometry
-from ccatp.radio.readings import RangeBearingReading, RangeReading, RssiReading
-from ccatp.radio.settling import derivatives, wrapped
-from ccatp.radio.sightings import Row, SensorError, Sensors
-from ccatp.radio.slam_settings import BearingModel, RangeModel, RssiModel, SlamSettings, Trust
+from ccatp.beacons.slam.beacon_map import BearingModel, RangeModel, RssiModel, SlamSettings, Trust
+from ccatp.beacons.slam.landmark_init import derivatives, wrapped
+from ccatp.beacons.slam.measurement_models import Row, SensorError, Sensors
+from ccatp.beacons.slam.motion import DeadReckoning, DifferentialDrive, DifferentialNoise, Increment, Odometry
+from ccatp.beacons.slam.recording import RangeBearingReading, RangeReading, RssiReading
+from ccatp.core import FloatArray
 
 TRUST = Trust(5.0, 3.0, 0.0, 1.0, 3, 20, 0.3, 0.3, True)
 MOTION = DifferentialDrive(DifferentialNoise(0.05, 0.0, 0.01, 0.0, 0.0, 0.0))

@@ -6,19 +6,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ccatp.config.radio_loader import load_radio_config
-from ccatp.config.radio_models import RadioConfig
+from ccatp.beacons.slam.motion import Increment, Odometry, SlippingVehicle, Steering, WheelNoise
+from ccatp.beacons.slam.path_loss import PathLoss
+from ccatp.beacons.slam.recording import RssiReading
+from ccatp.beacons.slam.settings import new_slam, vehicle_of
+from ccatp.beacons.slam.signal_landmarks import MovingRadio, ShadowingMap, Sight, rows_of
+from ccatp.beacons.slam.signal_slam import SignalSlam
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.load import load_radio_config
 from ccatp.filters.ekf_slam import BlockError, EkfSlam
-from ccatp.radio.motion import Increment, Odometry, Steering
-from ccatp.radio.moving_radio import MovingRadio
-from ccatp.radio.path_loss import PathLoss
-from ccatp.radio.readings import RssiReading
-from ccatp.radio.shadowing_map import ShadowingMap
-from ccatp.radio.signal_rows import Sight, rows_of
-from ccatp.radio.signal_settings import new_slam, vehicle_of
-from ccatp.radio.signal_slam import SignalSlam
-from ccatp.radio.slipping_vehicle import SlippingVehicle, WheelNoise
-from ccatp.studies.radio_run import run_radio
+from ccatp.studies.radio_runs import run_radio
 
 NOISE = WheelNoise(0.01, 0.02, 0.01, 0.05)
 ODOMETRY: dict[str, Odometry] = {

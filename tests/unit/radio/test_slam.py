@@ -8,13 +8,12 @@ from statistics import median
 import numpy as np
 import pytest
 
-from ccatp.angles import wrap_pi
+from ccatp.beacons.slam.beacon_map import BearingModel, NoiseLevel, RangeModel, RssiModel, SlamSettings, Trust, Wander
+from ccatp.beacons.slam.motion import DifferentialDrive, DifferentialNoise, Increment
+from ccatp.beacons.slam.range_slam import BeaconEstimate, BeaconSlam
+from ccatp.beacons.slam.recording import BeaconId, RangeBearingReading, RangeReading, Reading, RssiReading
+from ccatp.core import wrap_pi
 from ccatp.filters.ekf_slam import BlockError
-from ccatp.radio.motion import DifferentialDrive, DifferentialNoise, Increment
-from ccatp.radio.noise_level import NoiseLevel
-from ccatp.radio.readings import BeaconId, RangeBearingReading, RangeReading, Reading, RssiReading
-from ccatp.radio.slam import BeaconEstimate, BeaconSlam
-from ccatp.radio.slam_settings import BearingModel, RangeModel, RssiModel, SlamSettings, Trust, Wander
 
 TRUST = Trust(6.0, 3.0, 100.0, 5.0, 3, 20, 0.3, 0.3, True)
 MOTION = DifferentialNoise(0.01, 0.0, 0.005, 0.005, 0.0, 0.0)

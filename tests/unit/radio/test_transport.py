@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ccatp.filters.base import FloatArray
+from ccatp.beacons.slam.beacon_map import Transport
+from ccatp.core import FloatArray
 from ccatp.filters.ekf_slam import EkfSlam
-from ccatp.radio.transport import Transport
 
 QUARTER = np.array(((0.0, -1.0), (1.0, 0.0)))
 

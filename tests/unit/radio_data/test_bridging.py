@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.radio.recording import FloatArray, Steps
-from ccatp.radio_data.bridging import LOST_RAD, bridged
-from ccatp.radio_data.reader import read_run
+from ccatp.beacons.datasets.reader import read_run
+from ccatp.beacons.datasets.tables import LOST_RAD, bridged
+from ccatp.beacons.slam.recording import Steps
+from ccatp.core import FloatArray
 from tests.unit.radio_data.sets import csv_lines, plaza_tables, world, write_lines, write_plaza
 
 

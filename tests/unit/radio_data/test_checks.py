@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.radio.recording import RecordedRun, Steps, Truth
-from ccatp.radio_data.checks import suspicions
-from ccatp.radio_data.reader import read_run
+from ccatp.beacons.datasets.checks import suspicions
+from ccatp.beacons.datasets.reader import read_run
+from ccatp.beacons.slam.recording import RecordedRun, Steps, Truth
 from tests.unit.radio_data.sets import BEACONS, labyrinth_lines, plaza_tables, recorded, world, write_lines, write_plaza
 
 W = world(seconds=120.0)

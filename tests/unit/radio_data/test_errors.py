@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import scipy.io
 
+from ccatp.beacons.datasets.reader import read_run
+from ccatp.beacons.datasets.tables import RadioDataError
 from ccatp.errors import ExitStatus
-from ccatp.radio_data.errors import RadioDataError
-from ccatp.radio_data.reader import read_run
 from tests.unit.radio_data.sets import (
     csv_lines,
     labyrinth_lines,

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from ccatp.beacons.datasets.events_csv import EVENTS
+from ccatp.beacons.datasets.reader import read_run
 from ccatp.cli import main
-from ccatp.radio_data.events_csv import EVENTS
-from ccatp.radio_data.reader import read_run
 
 DOCS = Path(__file__).parents[3] / "docs"
 EXAMPLE = DOCS / "radio_example.csv"

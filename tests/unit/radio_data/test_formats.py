@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.radio.recording import RecordedRun, dead_reckoned
-from ccatp.radio_data.reader import found_format, read_run
+from ccatp.beacons.datasets.reader import found_format, read_run
+from ccatp.beacons.slam.recording import RecordedRun, dead_reckoned
 from tests.unit.radio_data.sets import (
     BEACONS,
     World,

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.radio_data.errors import RadioDataError
-from ccatp.radio_data.levels import read_levels, read_log, read_places
-from ccatp.radio_data.xlsx import read_workbook
+from ccatp.beacons.datasets.levels import read_levels, read_log, read_places, read_workbook
+from ccatp.beacons.datasets.tables import RadioDataError
 
 MAIN = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
 RELATIONS = "http://schemas.openxmlformats.org/officeDocument/2006/relationships"

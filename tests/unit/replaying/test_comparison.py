@@ -5,14 +5,23 @@ from math import pi, sqrt
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
-from ccatp.filters import FloatArray
+from ccatp.config.load import load_config
+from ccatp.core import FloatArray
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.replaying.comparison import REPRODUCED, difference, errors_of, figures, fix_distances_m, joined
-from ccatp.replaying.judging import Judged, judge
-from ccatp.replaying.player import Replayed
-from ccatp.replaying.table import csv_lines, table_lines
-from ccatp.replaying.trace import Trace
+from ccatp.records.run_reader import Trace
+from ccatp.studies.replay import Replayed
+from ccatp.studies.replay_report import (
+    REPRODUCED,
+    Judged,
+    csv_lines,
+    difference,
+    errors_of,
+    figures,
+    fix_distances_m,
+    joined,
+    judge,
+    table_lines,
+)
 
 NONE = np.empty(0, dtype=np.int64)
 

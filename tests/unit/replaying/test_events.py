@@ -1,9 +1,9 @@
 """The order of what was recorded in batches and what was recorded at once."""
 
-from ccatp.replaying.events import Event, Fixed, FixGiven, Marked, Message, Stood, fix_given, in_order
-from ccatp.samples import Fix
-from ccatp.wire.robot import CommandEcho, Sensors
-from ccatp.wire.topics import FixMessage
+from ccatp.core import Fix
+from ccatp.links.robot_messages import CommandEcho, Sensors
+from ccatp.links.topics import FixMessage
+from ccatp.records.run_reader import Event, Fixed, FixGiven, Marked, Message, Stood, fix_given, in_order
 
 
 def frame(seq: int) -> Sensors:

@@ -6,14 +6,14 @@ from math import cos, sin
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.core import DeckPose, EdgeSample, Fix, GravitySample, ImuSample, WheelSample
+from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.localizer import build_localizer
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.replaying.events import Event, Fixed, Marked
-from ccatp.replaying.player import has_smoother, replay
-from ccatp.samples import DeckPose, EdgeSample, Fix, GravitySample, ImuSample, WheelSample
-from ccatp.wire.robot import CommandEcho, Sensors
+from ccatp.records.run_reader import Event, Fixed, Marked
+from ccatp.studies.replay import has_smoother, replay
 
 FRAME_S = 0.01
 STILL_FRAMES = 60  # longer than a rest takes to be seen

@@ -5,9 +5,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ccatp.filters import FILTERS, FloatArray, Smoother
-from ccatp.replaying import recording_filter
-from ccatp.replaying.recording_filter import RecordingFilter, added_noise, transition_of_reset
+from ccatp.core import FloatArray
+from ccatp.filters import FILTERS, Smoother
+from ccatp.studies import replay as recording_filter
+from ccatp.studies.replay import RecordingFilter, added_noise, transition_of_reset
 
 N = 4
 F = np.eye(N) + np.diag([0.5, 0.2, 0.1], 1)

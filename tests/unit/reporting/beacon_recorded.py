@@ -6,10 +6,9 @@ from typing import Any
 
 import msgspec
 
-from ccatp.config.radio_loader import dump_radio_config, load_radio_config
-from ccatp.config.radio_models import RadioConfig
-from ccatp.run_files.recorder import Recorder
-from ccatp.wire.topics import (
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.load import dump_radio_config, load_radio_config
+from ccatp.links.topics import (
     BeaconArrival,
     BeaconMap,
     BeaconPlaces,
@@ -20,6 +19,7 @@ from ccatp.wire.topics import (
     MissionStatus,
     schema_of,
 )
+from ccatp.records.recorder import Recorder
 
 FRAMES, PERIOD_S = 61, 0.1
 SIGMA_M, OFF_M = 0.02, 0.03  # of the estimate; the truth lies so far to the right of it

@@ -7,15 +7,16 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ccatp.config.loader import dump_config, load_config
+from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
-from ccatp.run_files.recorder import Recorder
-from ccatp.samples import DeckPose, Fix, PanelPose, PointId
-from ccatp.storage.store import MissionStore, PlannedPoint
-from ccatp.studies.rehearsal import Rehearsing
-from ccatp.surveying.states import State
-from ccatp.wire.robot import Sensors
-from ccatp.wire.topics import TOPICS, Arrival, FixMessage, Misalignment, MissionStatus, Track, Truth, schema_of
+from ccatp.core import DeckPose, Fix, PanelPose, PointId
+from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import TOPICS, Arrival, FixMessage, Misalignment, MissionStatus, Track, Truth, schema_of
+from ccatp.records.recorder import Recorder
+from ccatp.records.store import MissionStore
+from ccatp.records.store_rows import PlannedPoint
+from ccatp.studies.sil_run import Rehearsing
+from ccatp.survey.state import State
 
 BATCH = 100
 

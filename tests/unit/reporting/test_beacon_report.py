@@ -7,14 +7,19 @@ import numpy as np
 import pytest
 
 from ccatp.cli import main
-from ccatp.report_writer import report_run
-from ccatp.reporting.beacon_figures import consistency_figure, map_error_figure, target_figure
-from ccatp.reporting.beacon_map_figure import beacon_map_figure, ellipse_m
-from ccatp.reporting.beacon_page import beacon_data, beacon_figures, beacon_page
-from ccatp.reporting.beacon_record import beacon_rows, pose_errors_m, pose_nees, readings_of, waypoint_rows
-from ccatp.reporting.html import NARROW, WIDE
-from ccatp.run_files.beacon_report_reader import read_beacon_record
-from ccatp.run_files.run_reader import RunReadError
+from ccatp.records.run_reader import RunReadError
+from ccatp.report.beacon_figures import (
+    beacon_map_figure,
+    consistency_figure,
+    ellipse_m,
+    map_error_figure,
+    target_figure,
+)
+from ccatp.report.beacon_page import beacon_data, beacon_figures, beacon_page
+from ccatp.report.html import NARROW, WIDE
+from ccatp.report.record import beacon_rows, pose_errors_m, pose_nees, readings_of, waypoint_rows
+from ccatp.report.record_reader import read_beacon_record
+from ccatp.report.writer import report_run
 from tests.unit.reporting.beacon_recorded import FRAMES, OFF_M, SIGMA_M, beacon_config, record_beacons
 from tests.unit.reporting.markup import Markup
 

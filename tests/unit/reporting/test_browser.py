@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ccatp.report_writer import compare_runs, report_run
+from ccatp.report.writer import compare_runs, report_run
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -8,12 +8,11 @@ from pathlib import Path
 import pytest
 
 from ccatp.cli import main
-from ccatp.report_writer import compare_runs
-from ccatp.reporting.compare_page import compare_page
-from ccatp.reporting.compare_text import compare_lines
-from ccatp.reporting.findings import findings_of
-from ccatp.reporting.pair import compared_figures, pair_of
-from ccatp.run_files.report_reader import read_record
+from ccatp.report.compare import compared_figures, pair_of
+from ccatp.report.compare_page import compare_lines, compare_page
+from ccatp.report.findings import findings_of
+from ccatp.report.record_reader import read_record
+from ccatp.report.writer import compare_runs
 from tests.unit.reporting.markup import Markup
 from tests.unit.reporting.recorded import record
 

@@ -1,7 +1,7 @@
 """What the processes said, on the page: floods are one row, and what matters comes first."""
 
-from ccatp.reporting.event_section import events_body, gathered
-from ccatp.run_files.state_log import LogLine
+from ccatp.records.state_log import LogLine
+from ccatp.report.sections import events_body, gathered
 
 
 def line(text: str, level: str = "warning", t_s: float | None = 1.0, process: str = "main") -> LogLine:

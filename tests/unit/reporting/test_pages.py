@@ -8,16 +8,15 @@ from pathlib import Path
 import pytest
 
 from ccatp.cli import main
-from ccatp.report_writer import ReportError, report_run
-from ccatp.reporting.compare_page import compare_page
-from ccatp.reporting.findings import findings_of, outcome_of
-from ccatp.reporting.html import clock, shown, text
-from ccatp.reporting.page import POLICY
-from ccatp.reporting.pair import pair_of
-from ccatp.reporting.run_page import run_page
-from ccatp.reporting.sections import SECTIONS
-from ccatp.run_files.report_reader import read_record
-from ccatp.run_files.state_log import LogLine
+from ccatp.records.state_log import LogLine
+from ccatp.report.compare import pair_of
+from ccatp.report.compare_page import compare_page
+from ccatp.report.findings import findings_of, outcome_of
+from ccatp.report.html import POLICY, clock, shown, text
+from ccatp.report.record_reader import read_record
+from ccatp.report.run_page import run_page
+from ccatp.report.sections import SECTIONS
+from ccatp.report.writer import ReportError, report_run
 from tests.unit.reporting.markup import Markup
 from tests.unit.reporting.recorded import record
 

@@ -8,13 +8,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from ccatp.aligning.deviations import Measured
-from ccatp.reporting.errors import error_figures, error_series
-from ccatp.reporting.points import Grade, counted, first_arrivals_mm, point_verdicts
-from ccatp.reporting.record import PlannedRow, RunRecord, changed_keys
-from ccatp.run_files.report_reader import read_record
-from ccatp.samples import PointId, Vector3
-from ccatp.wire.topics import FixMessage
+from ccatp.core import PointId, Vector3
+from ccatp.links.topics import FixMessage
+from ccatp.mirror.panel_alignment import Measured
+from ccatp.report.analysis import error_figures, error_series
+from ccatp.report.findings import Grade, counted, first_arrivals_mm, point_verdicts
+from ccatp.report.record import PlannedRow, RunRecord, changed_keys
+from ccatp.report.record_reader import read_record
 
 
 @pytest.fixture

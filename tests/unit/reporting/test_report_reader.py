@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from ccatp.errors import ConfigError
-from ccatp.reporting.findings import findings_of
-from ccatp.run_files.recorder import iter_messages
-from ccatp.run_files.report_reader import read_record
-from ccatp.run_files.run_reader import RunReadError
-from ccatp.run_files.state_log import changes_of, read_log
+from ccatp.records.recorder import iter_messages
+from ccatp.records.run_reader import RunReadError
+from ccatp.records.state_log import changes_of, read_log
+from ccatp.report.findings import findings_of
+from ccatp.report.record_reader import read_record
 from tests.unit.reporting.recorded import record
 
 
@@ -129,7 +129,7 @@ def test_a_spoilt_database_is_left_out(run_dir: Path) -> None:
 
 
 def test_messages_of_another_version_are_left_out(run_dir: Path) -> None:
-    from ccatp.run_files.recorder import Recorder
+    from ccatp.records.recorder import Recorder
 
     (run_dir / "telemetry.mcap").unlink()
     recorder = Recorder(run_dir / "telemetry.mcap", [("track", {}), ("fix", {})], is_simulation=False)
@@ -176,7 +176,7 @@ def test_recordings_that_cannot_be_opened_are_told(run_dir: Path, monkeypatch: p
     def refuse(path: Path) -> dict[str, str]:
         raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr("ccatp.run_files.report_reader.read_metadata", refuse)
+    monkeypatch.setattr("ccatp.report.record_reader.read_metadata", refuse)
     found = read_record(run_dir)
     assert found.sessions == ()
     assert "telemetry.mcap: cannot be read: Permission denied" in found.warnings
@@ -234,8 +234,8 @@ def test_fields_of_the_log_are_words(tmp_path: Path) -> None:
 
 
 def test_every_topic_that_is_read_is_recorded(recorded: Path) -> None:
-    from ccatp.run_files.session_reader import READ
-    from ccatp.wire.topics import BY_NAME
+    from ccatp.links.topics import BY_NAME
+    from ccatp.report.record_reader import TOPICS_READ
 
-    assert all(BY_NAME[name].recorded for name in READ)
-    assert {message.topic for message in iter_messages(recorded / "telemetry.mcap")} >= READ - {"danger_event"}
+    assert all(BY_NAME[name].recorded for name in TOPICS_READ)
+    assert {message.topic for message in iter_messages(recorded / "telemetry.mcap")} >= TOPICS_READ - {"danger_event"}

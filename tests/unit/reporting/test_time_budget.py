@@ -6,12 +6,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from ccatp.assembly import assemble
-from ccatp.reporting.record import RunRecord, Session
-from ccatp.reporting.time_budget import least_times, sampled_spells, spells_of, time_budget
-from ccatp.run_files.report_reader import read_record
-from ccatp.run_files.state_log import StateChange
-from ccatp.wire.topics import MissionStatus
+from ccatp.links.topics import MissionStatus
+from ccatp.records.state_log import StateChange
+from ccatp.report.analysis import least_times, sampled_spells, spells_of, time_budget
+from ccatp.report.record import RunRecord, Session
+from ccatp.report.record_reader import read_record
+from ccatp.survey.composition import assemble
 
 
 @pytest.fixture

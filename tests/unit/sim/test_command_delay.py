@@ -4,7 +4,7 @@ from math import inf, nan
 
 import pytest
 
-from ccatp.sim.command_delay import CommandDelay
+from ccatp.sim.robot import CommandDelay
 from ccatp.sim.rules import Fans, MotionRules
 
 DT_S = 0.01

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from ccatp.config.models import Config, WorldConfig
+from ccatp.core import DeckPose
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose
 from ccatp.sim.disturbances import Creep, Vibration, WheelSlip, draw_wheels
 from ccatp.sim.plant import Disturbance, Plant
 

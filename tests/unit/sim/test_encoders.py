@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from ccatp.config.models import Config, WorldConfig
+from ccatp.core import DeckPose
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose
-from ccatp.sim.encoders import CountingEncoders, RateEncoders
-from ccatp.sim.inertial import InertialUnit
 from ccatp.sim.plant import Plant
-from ccatp.sim.sample_times import SampleTimes
+from ccatp.sim.sensors import CountingEncoders, InertialUnit, RateEncoders, SampleTimes
 
 COUNTS, HZ, FRAME_HZ, LAG_S = 1200, 1000.0, 100.0, 0.08
 QUANTUM_RAD = 2.0 * pi / COUNTS

@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 
 from ccatp.config.models import SimEtalonConfig
-from ccatp.sim.etalon import EtalonModel, PuckTruth
-from ccatp.wire.multiline import FLAGS
+from ccatp.links.multiline import FLAGS
+from ccatp.sim.laser import EtalonModel, PuckTruth
 
 CHANNELS = (1, 2, 5, 9)
 COLLIMATORS = np.array([[0.0, 0.0, 10.0], [3.0, 0.0, 9.0], [0.0, 4.0, 8.0], [-3.0, -4.0, 12.0]])

@@ -5,10 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.config.cricket_models import CricketConfig
-from ccatp.config.radio_loader import load_radio_config
-from ccatp.sim.motes.layout import TrueMotes, true_motes
-from ccatp.sim.motes.ranging import Heard, MoteField, usable_reach
+from ccatp.config.beacon_models import CricketConfig
+from ccatp.config.load import load_radio_config
+from ccatp.sim.motes import Heard, MoteField, TrueMotes, true_motes, usable_reach
 
 
 def config(**keys: Any) -> CricketConfig:

@@ -5,7 +5,7 @@ from math import exp, sqrt
 import numpy as np
 import pytest
 
-from ccatp.sim.noise import WHOLE, DriftingBias, NoiseStream, OrnsteinUhlenbeck
+from ccatp.sim.disturbances import WHOLE, DriftingBias, NoiseStream, OrnsteinUhlenbeck
 
 SIGMA, TIME_S, DT_S = 0.3, 2.0, 0.01
 

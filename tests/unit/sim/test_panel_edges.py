@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.core import DeckPose, PanelId
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose, PanelId
-from ccatp.sim.edge_sensors import EdgeSensors
-from ccatp.sim.panel_edges import MIN_GAP_M, PanelEdges, nominal_rectangles
+from ccatp.sim.edge_sensors import MIN_GAP_M, EdgeSensors, PanelEdges, nominal_rectangles
 from ccatp.sim.plant import Plant
 
 SIGMA_M = 2e-4

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from ccatp.config.models import Config
+from ccatp.core import DeckPose
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose
 from ccatp.sim.plant import Disturbance, Plant
 
 RADIUS_M, BASE_M, LAG_S = 0.03, 0.15, 0.08

@@ -5,15 +5,14 @@ import json
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.core import DeckPose, PanelId
+from ccatp.links.robot_codec import decode_from_robot
+from ccatp.links.robot_messages import MAX_LINE_BYTES, Sensors
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose, PanelId
-from ccatp.sim.robot import Robot
-from ccatp.sim.truth import TruthLog
+from ccatp.sim.robot import Robot, TruthLog
 from ccatp.sim.world import TruthRow
-from ccatp.wire.lines import MAX_LINE_BYTES
-from ccatp.wire.robot import Sensors, decode_from_robot
 
 
 @pytest.fixture(scope="module")

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from ccatp.config.models import Config, SimRobotConfig
+from ccatp.core import DeckPose
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose
+from ccatp.sim.disturbances import NoiseStream
 from ccatp.sim.edge_sensors import EdgeSensors
-from ccatp.sim.noise import NoiseStream
 from ccatp.sim.plant import Plant
-from ccatp.sim.sample_times import SampleTimes
-from ccatp.sim.sensors import SensorSuite
+from ccatp.sim.sensors import SampleTimes, SensorSuite
 
 OFFSETS = ((0.09, 0.09), (0.09, -0.09), (-0.09, 0.09), (-0.09, -0.09))
 DT_S = 0.01

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.links.robot_codec import join_mac
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.sim.robot import Robot
 from ccatp.sim.sessions import MAX_LAG_S, MAX_SESSIONS, RobotServer, Session
-from ccatp.wire.robot import join_mac
 
 JOIN = b'{"type":"join","role":"controller","client":"test"}\n'
 JOIN_MONITOR = b'{"type":"join","role":"monitor","client":"test"}\n'

@@ -4,10 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from ccatp.studies.campaign import Outcome
-from ccatp.studies.mission_job import COLUMN, STOP_COLUMNS
-from ccatp.studies.spread import Spread
-from ccatp.summary import WITHIN_M
+from ccatp.records.summary import WITHIN_M
+from ccatp.studies.campaign import Outcome, Spread
+from ccatp.studies.mission_study import COLUMN, STOP_COLUMNS
 
 SIGMA_M, SIGMA_RAD = 1e-3, 2e-3
 

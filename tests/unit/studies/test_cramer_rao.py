@@ -5,10 +5,10 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.core import PanelId
 from ccatp.mirror.mirror import build_mirror
-from ccatp.samples import PanelId
 from ccatp.studies import cramer_rao_record as way
 from ccatp.studies.cramer_rao import StopBound, bounds_of, summarise
 from ccatp.studies.cramer_rao_record import SeamPass, StopFix, TrueRecord, rehearse_recorded

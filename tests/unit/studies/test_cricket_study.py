@@ -5,14 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ccatp.beacons.cricket.range_network import MappingError
+from ccatp.config.load import load_radio_config
 from ccatp.config.models import Config
-from ccatp.config.radio_loader import load_radio_config
-from ccatp.motes.range_network import MappingError
 from ccatp.studies import mote_sizes
 from ccatp.studies.campaign import Cell, CellResult, Job
 from ccatp.studies.cricket_study import CASES, STUDY, combine, draw, run_job
-from ccatp.studies.mote_field import simulate_field
-from ccatp.studies.mote_runs import run_batch, run_filter
+from ccatp.studies.mote_runs import run_batch, run_filter, simulate_field
 
 
 def result(config: Config, case: str, seeds: int) -> CellResult:

@@ -6,23 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.core import EdgeSample
+from ccatp.links.topics import Estimate
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import EdgeSample
 from ccatp.studies.campaign import CellResult, Job, Outcome
-from ccatp.studies.danger_drives import (
-    OFF_S,
-    RULES,
-    Errors,
-    Frame,
-    OffTimeRule,
-    build_rule,
-    drive_to_rim,
-    transit,
-)
+from ccatp.studies.danger_drives import OFF_S, RULES, Errors, Frame, OffTimeRule, build_rule, drive_to_rim, transit
 from ccatp.studies.danger_study import bootstrap, cells, combine, draw, run_job, wilson
-from ccatp.wire.topics import Estimate
 
 ERRORS = Errors(1e-3, 2e-3)
 NOWHERE = Estimate(seq=0, t_s=0.0, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-3, state="driving")

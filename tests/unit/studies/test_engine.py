@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.studies.campaign import CampaignError, CampaignFailed, CampaignInterrupted, ClusterUnreachable
+from ccatp.studies.campaign import CampaignError, CampaignFailed, CampaignInterrupted, ClusterUnreachable, Shard
 from ccatp.studies.engine import FAILURES, CampaignOptions, run_campaign
-from ccatp.studies.plan import Shard
 from tests.unit.studies.toy import FAULTS, STUDY, load
 
 CELLS = [
@@ -129,6 +128,6 @@ def test_a_directory_that_cannot_be_written_is_one_line(tmp_path: Path, out: str
 
 
 def test_a_cluster_that_does_not_answer_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ccatp.studies.executors._CLUSTER_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("ccatp.studies.engine._CLUSTER_TIMEOUT_S", 0.2)
     with pytest.raises(ClusterUnreachable, match=r"--cluster tcp://127.0.0.1:9: no scheduler answers there"):
         campaign(tmp_path, cluster="tcp://127.0.0.1:9")

@@ -6,14 +6,12 @@ from typing import Any
 
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.mirror.mirror import build_mirror
 from ccatp.studies import faults_study
-from ccatp.studies.campaign import CellResult, Job, Outcome, plain
-from ccatp.studies.fault_plans import FIRST_S, LONGEST_S, random_plan
-from ccatp.studies.faults_study import is_recoverable
-from ccatp.studies.plan import cells_of
-from ccatp.studies.results import table
+from ccatp.studies.campaign import CellResult, Job, Outcome, cells_of, plain
+from ccatp.studies.faults_study import FIRST_S, LONGEST_S, is_recoverable, random_plan
+from ccatp.studies.job_store import table
 from tests.faults.campaign import single
 
 DANGER = {"true_edges": 0, "false_edges": 1, "falls": 0, "max_overrun_mm": 2.0}

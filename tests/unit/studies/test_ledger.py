@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.studies.campaign import CampaignError, Job, Outcome
-from ccatp.studies.ledger import Ledger
-from ccatp.studies.plan import Shard, cells_of, jobs_of
+from ccatp.studies.campaign import CampaignError, Job, Outcome, Shard, cells_of, jobs_of
+from ccatp.studies.job_store import Ledger
 from tests.unit.studies.toy import STUDY, load
 
 

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config, PidConfig
-from ccatp.studies import loop_models, loops
-from ccatp.studies.loop_models import Loop, LoopsError, margins, open_loop
+from ccatp.studies import loops
+from ccatp.studies import loops as loop_models
+from ccatp.studies.loops import Loop, LoopsError, margins, open_loop
 
 LAG_S, FRAME_S = 0.08, 0.01
 
@@ -118,7 +119,7 @@ def test_every_set_of_gains_is_analysed(cfg: Config) -> None:
 
 
 def test_steering_is_the_regulator_on_the_line(cfg: Config) -> None:
-    from ccatp.control.steering import Sight, line_rate
+    from ccatp.control.tracker import Sight, line_rate
 
     pid, v = loop_models.steering(cfg.limits, cfg.control), cfg.limits.v_max_m_s
     weights = cfg.control.cross_track_gain_rad_m2, cfg.control.heading_weight_1_s2

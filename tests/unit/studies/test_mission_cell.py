@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.studies.campaign import Job, plain
-from ccatp.studies.consistency import chi_square_figures, nees
-from ccatp.studies.mission_cell import combine_missions
-from ccatp.studies.mission_job import COLUMN, run_mission
+from ccatp.studies.mission_study import COLUMN, chi_square_figures, combine_missions, nees, run_mission
 from tests.unit.studies.missions import SIGMA_M, mission, stops_of
 
 

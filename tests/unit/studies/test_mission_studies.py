@@ -2,37 +2,36 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
 
-from ccatp.config.loader import load_config
-from ccatp.studies import ablation_study, filters_study, sensitivity_study, time_study
-from ccatp.studies.campaign import CampaignError, CellResult, Job, plain
+from ccatp.config.load import load_config
+from ccatp.studies import filters_study, time_study
+from ccatp.studies.campaign import CampaignError, CellResult, Job, Study, cells_of, jobs_of, plain
 from ccatp.studies.engine import CampaignOptions, run_campaign
-from ccatp.studies.plan import cells_of, jobs_of
+from ccatp.studies.factor_studies import ABLATION, GROUPS, SENSITIVITY, sensitivity_cells
+from ccatp.studies.job_store import table
 from ccatp.studies.registry import STUDIES, find_study
-from ccatp.studies.results import table
 from tests.unit.studies.missions import mission
 
-CAMPAIGNS = (filters_study, time_study, sensitivity_study, ablation_study)
+CAMPAIGNS = (filters_study.STUDY, time_study.STUDY, SENSITIVITY, ABLATION)
 
 
-def results_of(study: ModuleType) -> list[CellResult]:
+def results_of(study: Study) -> list[CellResult]:
     """Cells of two made-up missions each."""
     found = []
-    for k, cell in enumerate(cells_of(study.STUDY)):
+    for k, cell in enumerate(cells_of(study)):
         scale = 1e-3 * (1 + k % 5)
         runs = [mission([scale, 2 * scale], cause="wind"), mission([3 * scale, scale])]
-        values, arrays = study.STUDY.combine(cell.factors, runs)
+        values, arrays = study.combine(cell.factors, runs)
         found.append(CellResult(cell.factors, {"runs": 2, **values}, arrays))
     return found
 
 
 @pytest.mark.parametrize("study", CAMPAIGNS)
-def test_every_cell_is_a_configuration_of_its_own(study: ModuleType) -> None:
-    plan = jobs_of(study.STUDY, cells_of(study.STUDY), lambda keys: load_config(None, keys), {}, 1)
+def test_every_cell_is_a_configuration_of_its_own(study: Study) -> None:
+    plan = jobs_of(study, cells_of(study), lambda keys: load_config(None, keys), {}, 1)
     configurations = [group[0].cfg.model_dump_json() for group in plan]
     assert len(set(configurations)) == len(configurations) > 1
 
@@ -40,17 +39,20 @@ def test_every_cell_is_a_configuration_of_its_own(study: ModuleType) -> None:
 @pytest.mark.parametrize(
     ("study", "stems"),
     [
-        (filters_study, {"localization-thesis-m1", "arrival-thesis-m1", "bound-thesis-m1", "consistency-thesis-m1"}),
-        (time_study, {"time-thesis-m1"}),
-        (sensitivity_study, {"sensitivity-thesis-m1"}),
-        (ablation_study, {"ablation-thesis-m1-thesis", "ablation-thesis-m1-hard"}),
+        (
+            filters_study.STUDY,
+            {"localization-thesis-m1", "arrival-thesis-m1", "bound-thesis-m1", "consistency-thesis-m1"},
+        ),
+        (time_study.STUDY, {"time-thesis-m1"}),
+        (SENSITIVITY, {"sensitivity-thesis-m1"}),
+        (ABLATION, {"ablation-thesis-m1-thesis", "ablation-thesis-m1-hard"}),
     ],
 )
-def test_figures_and_table_show_every_cell(study: ModuleType, stems: set[str], tmp_path: Path) -> None:
+def test_figures_and_table_show_every_cell(study: Study, stems: set[str], tmp_path: Path) -> None:
     results = results_of(study)
-    study.STUDY.draw(results, tmp_path)
+    study.draw(results, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {f"{stem}.{kind}" for stem in stems for kind in ("png", "pdf")}
-    lines = table([plain({**cell.factors, **cell.values}) for cell in results], study.STUDY.columns).splitlines()
+    lines = table([plain({**cell.factors, **cell.values}) for cell in results], study.columns).splitlines()
     assert len(lines) == 2 + len(results)
     # Every column finds its figure.
     shown = [line.split(" | ") for line in lines[2:]]
@@ -78,7 +80,7 @@ def test_the_margin_is_that_of_the_slowest_mission() -> None:
 
 
 def test_each_group_of_disturbances_is_added_and_taken_away() -> None:
-    cells = {str(cell.factors["group"]): cell for cell in sensitivity_study.cells()}
+    cells = {str(cell.factors["group"]): cell for cell in sensitivity_cells()}
     hard = load_config(None, {"run.world": "hard"}).world
     slip = load_config(None, cells["plus slip"].overrides).world
     assert (slip.slip_max, slip.creep_fraction) == (hard.slip_max, 0.0)
@@ -90,7 +92,7 @@ def test_everything_that_is_disturbed_belongs_to_a_group() -> None:
     """With all groups added, the quiet world is the hard one but for its name."""
     quiet, hard = (load_config(None, {"run.world": name}).world.model_dump() for name in ("thesis", "hard"))
     differing = {key for key in quiet if quiet[key] != hard[key]} - {"name"}
-    assert differing <= {key for group in sensitivity_study.GROUPS.values() for key in group}
+    assert differing <= {key for group in GROUPS.values() for key in group}
 
 
 FACTORS: Mapping[str, Mapping[str, Any]] = {

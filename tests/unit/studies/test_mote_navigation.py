@@ -5,11 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.config.radio_loader import load_radio_config
-from ccatp.studies.beacon_rehearsal import rehearse_beacons
+from ccatp.config.load import load_radio_config
+from ccatp.links.beacon_messages import PoseTrack, PoseTruth, pose_track, pose_truth
 from ccatp.studies.campaign import CellResult, Outcome
-from ccatp.studies.mote_navigation import STUDY, band, combine, draw, seconds_of
-from ccatp.wire.beacon_rows import PoseTrack, PoseTruth, pose_track, pose_truth
+from ccatp.studies.mote_navigation import STUDY, band, combine, draw, rehearse_beacons, seconds_of
 
 
 def poses(frames: int) -> tuple[PoseTrack, PoseTruth]:

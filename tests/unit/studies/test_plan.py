@@ -7,10 +7,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.studies.campaign import CampaignError, Cell, CellResult, Factors, Job, Outcome, Study, plain
-from ccatp.studies.plan import Shard, cells_of, jobs_of, parse_choice, parse_shard, with_seed
+from ccatp.studies.campaign import (
+    CampaignError,
+    Cell,
+    CellResult,
+    Factors,
+    Job,
+    Outcome,
+    Shard,
+    Study,
+    cells_of,
+    jobs_of,
+    parse_choice,
+    parse_shard,
+    plain,
+    with_seed,
+)
 
 
 def run_job(job: Job) -> Outcome:

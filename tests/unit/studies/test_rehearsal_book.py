@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from ccatp.assembly import Parts, assemble
 from ccatp.config.models import Config
 from ccatp.sim.world import TruthRow
-from ccatp.studies.rehearsal_book import RunBook
+from ccatp.studies.sil_models import RunBook
+from ccatp.survey.composition import Parts, assemble
 
 FRAMES, DELAY = 2500, 3  # more than two batches; frames by which the estimates lag behind the truth
 

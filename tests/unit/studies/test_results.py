@@ -3,8 +3,7 @@
 import pytest
 
 from ccatp.studies.campaign import Column
-from ccatp.studies.progress import time_left
-from ccatp.studies.results import table
+from ccatp.studies.job_store import table, time_left
 
 
 def test_a_table_has_the_factors_first() -> None:

@@ -2,9 +2,7 @@
 
 import pytest
 
-from ccatp.studies.campaign import Job
-from ccatp.studies.plan import cells_of, jobs_of
-from ccatp.studies.schedule import Schedule
+from ccatp.studies.campaign import Job, Schedule, cells_of, jobs_of
 from tests.unit.studies.toy import STUDY, load
 
 SLOW, FAST = "speed_m_s=0.05", "speed_m_s=0.1"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ccatp.studies.spread import LEAST, Spread, pooled
+from ccatp.studies.campaign import LEAST, Spread, pooled
 
 BIN = 0.0012  # half a bin, 1/2000 of a decade, is 0.115 %
 

@@ -6,14 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
+from ccatp.core import EdgeSample, Fix, ImuSample, WheelSample
+from ccatp.estimation.measurements import STATES
+from ccatp.estimation.seams import HeadingFix
 from ccatp.filters import FILTERS
-from ccatp.localization.crossing import HeadingFix
-from ccatp.localization.measurements import STATES
 from ccatp.mirror.mirror import build_mirror
-from ccatp.samples import EdgeSample, Fix, ImuSample, WheelSample
-from ccatp.studies.campaign import CellResult, Job, Outcome
-from ccatp.studies.spread import Spread
+from ccatp.studies.campaign import CellResult, Job, Outcome, Spread
 from ccatp.studies.thesis_replica import LIMIT_M, ThesisLocalizer, overrides_of, run_replica
 from ccatp.studies.thesis_study import PUBLISHED, cells, combine, draw, run_job
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ccatp.config.models import Config
-from ccatp.supervision.children import Children, ProcessSpec
+from ccatp.daemon.child_processes import Children, ProcessSpec
 
 # Ends with the status in its variable, or waits for its end.
 CODE = "import os, sys, time; status = int(os.environ['STATUS']); sys.exit(status) if status else time.sleep(60.0)"
@@ -71,8 +71,8 @@ def test_it_is_nicer_than_its_parent_from_the_start(config: Config, monkeypatch:
 def test_the_last_to_be_stopped_has_its_time(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     monkeypatch.setenv("STATUS", "0")
-    monkeypatch.setattr("ccatp.supervision.children.STOP_TIMEOUT_S", 0.0)  # others have used it up
-    monkeypatch.setattr("ccatp.supervision.children.LEAST_STOP_S", 30.0)
+    monkeypatch.setattr("ccatp.daemon.child_processes.STOP_TIMEOUT_S", 0.0)  # others have used it up
+    monkeypatch.setattr("ccatp.daemon.child_processes.LEAST_STOP_S", 30.0)
     children = Children(config.run, lambda _spec, _is_restarted: ([], ()), lambda _level, text: said.append(text))
     children.start(SPEC)
     children.stop_all()

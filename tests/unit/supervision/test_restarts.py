@@ -2,7 +2,7 @@
 
 import pytest
 
-from ccatp.supervision.restarts import Fate, RestartPolicy, SilenceWatch
+from ccatp.daemon.child_processes import Fate, RestartPolicy, SilenceWatch
 
 
 @pytest.mark.fault("P18")

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from ccatp.daemon.process import open_log
+from ccatp.daemon.terminal import RunView, survey_title, write_run_report
 from ccatp.errors import ExitStatus
-from ccatp.processes.common import open_log
-from ccatp.supervision.run_report import write_run_report
-from ccatp.supervision.run_view import RunView, survey_title
 from tests.unit.aligning.conftest import load
 from tests.unit.reporting.beacon_recorded import record_beacons
 from tests.unit.run_folder import make_run
@@ -44,7 +43,7 @@ def test_whatever_goes_wrong_is_logged_and_no_more(run_dir: Path, monkeypatch: p
     def fail(run_dir: Path) -> None:
         raise ZeroDivisionError("of nothing")
 
-    monkeypatch.setattr("ccatp.report_writer.report_run", fail)
+    monkeypatch.setattr("ccatp.report.writer.report_run", fail)
     log = open_log(run_dir / "log.jsonl", "supervisor")
     assert write_run_report(run_dir, ExitStatus.COMPLETE, log) == f"none; make it with: ccatp report {run_dir}"
     (line,) = (json.loads(text) for text in (run_dir / "log.jsonl").read_text().splitlines())

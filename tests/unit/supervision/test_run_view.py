@@ -5,10 +5,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from ccatp.processes.survey_watch import state_text
-from ccatp.supervision.run_collector import NO_STATUS
-from ccatp.supervision.run_view import BeaconView, RunView
-from ccatp.surveying.states import State
+from ccatp.daemon.survey_collector import NO_STATUS
+from ccatp.daemon.survey_runner import state_text
+from ccatp.daemon.terminal import BeaconView, RunView
+from ccatp.survey.state import State
 
 
 def test_progress_with_and_without_a_point(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,12 +16,11 @@ from typing import Any
 import pytest
 import structlog
 
-from ccatp.liveness import Liveness
-from ccatp.processes import realtime
-from ccatp.supervision.run_collector import NO_STATUS
-from ccatp.supervision.service import Service
-from ccatp.supervision.service_notify import Notifier, take_from, watchdog_period_s
-from ccatp.wire.topics import Presence
+from ccatp.daemon import realtime
+from ccatp.daemon.service import Notifier, Service, take_from, watchdog_period_s
+from ccatp.daemon.survey_collector import NO_STATUS
+from ccatp.links.liveness import Liveness
+from ccatp.links.topics import Presence
 
 ROOT = Path(__file__).parents[3]
 UNIT = ROOT / "packaging" / "ccatp.service"
@@ -218,7 +217,7 @@ def test_priority_0_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 REALTIME = """
 import os, sys, structlog, zmq
-from ccatp.processes import realtime
+from ccatp.daemon import realtime
 context = zmq.Context()
 ends = context.socket(zmq.PAIR), context.socket(zmq.PAIR)
 ends[1].connect(f"tcp://127.0.0.1:{ends[0].bind_to_random_port('tcp://127.0.0.1')}")
@@ -247,7 +246,7 @@ def test_real_time_is_taken_where_it_is_permitted() -> None:
 
 CRUMBLING = """
 import ctypes, sys
-from ccatp.processes import realtime
+from ccatp.daemon import realtime
 def resident_kib():
     return next(int(line.split()[1]) for line in open("/proc/self/smaps_rollup") if line.startswith("Anonymous:"))
 reserve_bytes = int(sys.argv[1])
@@ -329,7 +328,7 @@ def test_the_unit_grants_what_the_loops_ask_for() -> None:
     found = settings()
     assert found["Type"] == ["notify"]
     assert found["LimitMEMLOCK"] == ["infinity"]
-    from ccatp.config.loader import load_config
+    from ccatp.config.load import load_config
 
     assert int(found["LimitRTPRIO"][0]) >= load_config().run.realtime_priority > 0
     assert found["RestrictRealtime"] == ["no"]

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.config.loader import dump_config, load_config
+from ccatp.config.load import dump_config, load_config
+from ccatp.daemon.run_dir import RunOptions, own_runtime_dir, owned, survey_run_dir
+from ccatp.daemon.supervisor import PROCESSES, _recover, run_survey
 from ccatp.errors import ConfigError, RefusedError
-from ccatp.run_options import RunOptions
-from ccatp.runtime_dir import is_deserted
-from ccatp.supervision.run_folder import own_runtime_dir, owned, survey_run_dir
-from ccatp.supervisor import PROCESSES, _recover, run_survey
+from ccatp.links.runtime_dir import is_deserted
 
 
 def options(**fields: object) -> RunOptions:
@@ -121,7 +120,7 @@ def test_a_service_goes_on_with_the_run_that_did_not_finish(tmp_path: Path, monk
         return 4 if len(asked) == 1 else 0
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("ccatp.supervisor.run_survey", run)
+    monkeypatch.setattr("ccatp.daemon.supervisor.run_survey", run)
     assert [_recover(options(recover=True)) for _ in range(2)] == [4, 0]
     first, second = asked
     assert (first.resume, first.held) == (False, False)

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from ccatp.errors import ConfigError, ExitStatus
-from ccatp.processes.latching import FILE as EMERGENCIES
-from ccatp.supervision.unfinished import (
+from ccatp.daemon.danger_loop import FILE as EMERGENCIES
+from ccatp.daemon.run_dir import (
     FILE,
     find_unfinished,
     finished_summary,
@@ -14,6 +13,7 @@ from ccatp.supervision.unfinished import (
     note_unfinished,
     take_over_emergencies,
 )
+from ccatp.errors import ConfigError, ExitStatus
 
 
 @pytest.fixture(autouse=True)

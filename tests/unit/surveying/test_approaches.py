@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ccatp.samples import PointId
-from ccatp.surveying.approaches import Approaches
+from ccatp.core import PointId
+from ccatp.survey.state import Approaches
 
 HERE, THERE = PointId(1, 2, 3), PointId(1, 2, 4)
 

@@ -2,12 +2,12 @@
 
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.planning.calibration import is_on_drive
-from ccatp.samples import PointId, Stop, StopKind
-from ccatp.studies.rehearsal import Rehearsing
-from ccatp.wire.robot import Sensors
+from ccatp.core import PointId, Stop, StopKind
+from ccatp.links.robot_messages import Sensors
+from ccatp.studies.sil_run import Rehearsing
+from ccatp.survey.planning.escape import is_on_drive
 
 DRIVE = (
     Stop(0.0, 0.1, StopKind.CALIBRATE, reverse=True),

@@ -5,9 +5,9 @@ from math import cos, hypot, pi, sin
 import pytest
 
 from ccatp.config.models import Config
+from ccatp.core import DeckPose, PanelId, PanelPose, Stop, StopKind
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose, PanelId, PanelPose, Stop, StopKind
-from ccatp.surveying.correction import Aim, Corrector, plan_aim
+from ccatp.survey.route_follower import Aim, Corrector, plan_aim
 
 POSE = (0.1, 0.2, 0.5)
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
+from ccatp.core import DeckPose
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import DeckPose
-from ccatp.surveying.mirror_check import PATIENCE_S, READINGS, MirrorCheck
+from ccatp.survey.reactions import PATIENCE_S, READINGS, MirrorCheck
 
 MIRRORS = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
 SIGMA_RAD = 0.035  # of a reading, as shipped

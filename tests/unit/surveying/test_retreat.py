@@ -4,12 +4,12 @@ from math import cos, pi, sin
 
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.control.tracker import LegTracker
-from ccatp.hazards.edge_episode import Cause
-from ccatp.samples import DeckPose, EventCode, PanelId, PanelPose, Verdict
-from ccatp.surveying.journey import Motion
-from ccatp.surveying.retreat import Retreat, Step
+from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, Verdict
+from ccatp.safety.edge_detector import Cause
+from ccatp.survey.retreat import Retreat, Step
+from ccatp.survey.route_follower import Motion
 
 CFG = load_config()
 FRAME_S = 0.01

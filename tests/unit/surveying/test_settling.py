@@ -6,7 +6,7 @@ from math import exp
 import pytest
 
 from ccatp.config.models import Config
-from ccatp.surveying.settling import Stillness
+from ccatp.survey.stops import Stillness
 
 DT = 0.01
 

@@ -3,10 +3,10 @@
 import pytest
 
 from ccatp.config.models import Config
+from ccatp.core import PanelId, PanelPose, PointId
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import PanelId, PanelPose, PointId
-from ccatp.surveying.journey import Motion
-from ccatp.surveying.stopover import SETTLE_LIMIT_S, Stopover
+from ccatp.survey.route_follower import Motion
+from ccatp.survey.stops import SETTLE_LIMIT_S, Stopover
 
 DT, MEASURING_S = 0.01, 0.5
 POINT = PointId(5, 5, 1)

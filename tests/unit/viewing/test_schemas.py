@@ -6,14 +6,12 @@ import foxglove.messages as sdk
 import msgspec
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
+from ccatp.core import PanelId, PointId
+from ccatp.links.topics import TOPICS
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import PanelId, PointId
-from ccatp.viewing.foxglove import time_of
-from ccatp.viewing.panel_scene import colour_of, panel_scene, point_scene
-from ccatp.viewing.plain_schema import plain_schema
-from ccatp.viewing.views import VIEWS, recorded_schemas, view_schemas
-from ccatp.wire.topics import TOPICS
+from ccatp.report.foxglove import colour_of, panel_scene, plain_schema, point_scene, time_of
+from ccatp.report.views import VIEWS, recorded_schemas, view_schemas
 
 PLAIN = ("boolean", "string", "number", "integer")
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
+from ccatp.core import PanelId, PanelPose, PointId
+from ccatp.links.topics import FixMessage, Log, Message, SensorLines, Track, Truth
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.samples import PanelId, PanelPose, PointId
-from ccatp.viewing.panel_scene import quaternion
-from ccatp.viewing.views import POINTS_AGAIN_S, Shown, Views
-from ccatp.wire.topics import FixMessage, Log, Message, SensorLines, Track, Truth
+from ccatp.report.foxglove import quaternion
+from ccatp.report.views import POINTS_AGAIN_S, Shown, Views
 
 PUCK_M = 0.05
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ccatp.wire.xbee import XbeeFrames, XbeeLevel, level_of, xbee_frame
+from ccatp.links.xbee import XbeeFrames, XbeeLevel, level_of, xbee_frame
 
 DISCOVERY = (
     b"\x88\x01ND\x00" + b"\x12\x34" + b"\x00\x13\xa2\x00" + b"\x40\x7d\x11\x7e" + b"\x29" + b"beacon3\x00"

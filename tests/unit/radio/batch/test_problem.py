@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.linalg import LinAlgError
 
-from ccatp.radio.batch.arrow import Factored, LinAlgError
-from ccatp.radio.batch.descent import t_cost, t_weights
-from ccatp.radio.batch.problem import BEACON, SHARED, BatchProblem, State, repeats
-from ccatp.radio.batch.reckoning import CALIBRATION, Reckoning, chained
-from ccatp.radio.batch.settings import BatchPriors, BatchSettings, RadioNoise
-from ccatp.radio.motion import DifferentialNoise
-from ccatp.radio.recording import Readings, Steps, dead_reckoned
+from ccatp.beacons.slam.batch_odometry import CALIBRATION, BatchPriors, BatchSettings, RadioNoise, Reckoning, chained
+from ccatp.beacons.slam.batch_problem import BEACON, SHARED, BatchProblem, Factored, State, repeats
+from ccatp.beacons.slam.batch_solver import t_cost, t_weights
+from ccatp.beacons.slam.motion import DifferentialNoise
+from ccatp.beacons.slam.recording import Readings, Steps, dead_reckoned
 
 FloatArray = npt.NDArray[np.float64]
 DELAY = CALIBRATION.index("delay_s")

@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ccatp.config.recording_loader import load_recordings_config
-from ccatp.radio.assumed import batch_settings
-from ccatp.radio.batch import smooth
-from ccatp.radio.batch.placing import place_by_distances
-from ccatp.radio.batch.settings import BatchSettings
-from ccatp.radio.judged import judge
-from ccatp.radio.recording import RecordedRun, Steps
-from ccatp.radio.track import Track
+from ccatp.beacons.slam.batch_odometry import BatchSettings
+from ccatp.beacons.slam.batch_smoother import smooth
+from ccatp.beacons.slam.batch_solver import place_by_distances
+from ccatp.beacons.slam.evaluation import judge
+from ccatp.beacons.slam.recording import RecordedRun, Steps, Track
+from ccatp.beacons.slam.settings import batch_settings
+from ccatp.config.load import load_recordings_config
 from tests.unit.radio_data.sets import BEACONS, changed, recorded, world
 
 SETTINGS = batch_settings(load_recordings_config().csv)

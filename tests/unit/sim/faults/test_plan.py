@@ -5,12 +5,11 @@ from pathlib import Path
 import pytest
 
 from ccatp.cli import main
-from ccatp.config.loader import shipped_config_dir
+from ccatp.config.load import shipped_config_dir
 from ccatp.errors import ConfigError
-from ccatp.sim.faults.link_models import LINK_TYPES
-from ccatp.sim.faults.models import TYPES, Intermittent
-from ccatp.sim.faults.plan import FaultPlan, check_pacing, parse_plan
-from ccatp.stand_ins.fault_plan import read_plan
+from ccatp.sim.fault_models import LINK_TYPES, TYPES, Intermittent
+from ccatp.sim.fault_plan import FaultPlan, check_pacing, parse_plan
+from ccatp.sim.ground_truth import read_plan
 
 FAULT = '[[fault]]\nsignal = "imu_wz"\nat_s = 1.0\n'
 LINK = "[[link]]\nat_s = 1.0\n"

@@ -7,14 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccatp.config.loader import load_config
+from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.sim.faults.effects import make_effect
-from ccatp.sim.faults.models import TYPES, Drift
-from ccatp.sim.faults.plan import FaultPlan, parse_plan
-from ccatp.sim.faults.record import Injected
-from ccatp.sim.faults.signals import SIGNALS
+from ccatp.sim.fault_effects import make_effect
+from ccatp.sim.fault_models import SIGNALS, TYPES, Drift, Injected
+from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.sim.robot import Robot
 
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from ccatp.config.models import Config
+from ccatp.links.robot_codec import BadLine, decode_from_robot
+from ccatp.links.robot_messages import MAX_LINE_BYTES
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.sim.faults.models import SENSOR_SIGNALS, TYPES
-from ccatp.sim.faults.plan import FaultPlan, parse_plan
-from ccatp.sim.faults.sensing import make_sensor_fault
+from ccatp.sim.fault_effects import make_sensor_fault
+from ccatp.sim.fault_models import SENSOR_SIGNALS, TYPES
+from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.sim.robot import Robot
-from ccatp.wire.lines import MAX_LINE_BYTES
-from ccatp.wire.robot import BadLine, decode_from_robot
 
 PLACES = {
     "imu_ax": ("imu", 1),
@@ -317,7 +317,7 @@ def test_garbage_within_the_range_is_taken_and_beyond_it_is_dropped_whole(config
 
 @pytest.mark.parametrize("world", ["thesis", "hard"])
 def test_a_run_with_an_empty_plan_is_the_run_without(world: str) -> None:
-    from ccatp.config.loader import load_config
+    from ccatp.config.load import load_config
 
     cfg = load_config(overrides={"run.world": world, "run.mirror": "fyst-m2"})
     deck = build_mirror(cfg.mirror)

@@ -8,7 +8,7 @@ import pytest
 
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.sim.faults.plan import parse_plan
+from ccatp.sim.fault_plan import parse_plan
 from ccatp.sim.robot import Robot
 from ccatp.sim.sessions import DEAF_S, RobotServer, Session
 

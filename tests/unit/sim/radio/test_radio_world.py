@@ -5,15 +5,21 @@ from math import hypot, log10, pi
 import numpy as np
 import pytest
 
-from ccatp.angles import wrap_pi
-from ccatp.config.radio_loader import load_radio_config
-from ccatp.config.radio_models import RadioConfig, SimObstacleConfig
-from ccatp.sim.radio.frame import HALT, DriveCommand, TruePose
-from ccatp.sim.radio.obstacles import clearance_m, count_between, seen_m
-from ccatp.sim.radio.propagation import TrueRadio
-from ccatp.sim.radio.shadowing import ShadowingField
-from ccatp.sim.radio.target import MovingTarget
-from ccatp.sim.radio.world import RadioWorld
+from ccatp.config.beacon_models import RadioConfig, SimObstacleConfig
+from ccatp.config.load import load_radio_config
+from ccatp.core import wrap_pi
+from ccatp.sim.radio import (
+    HALT,
+    DriveCommand,
+    MovingTarget,
+    ShadowingField,
+    TruePose,
+    TrueRadio,
+    clearance_m,
+    count_between,
+    seen_m,
+)
+from ccatp.sim.radio_world import RadioWorld
 
 BALL = SimObstacleConfig(x_m=1.0, y_m=0.0, radius_m=0.2)
 

@@ -1,0 +1,407 @@
+"""A map from measured ranges: graph, outlook, filter or batch, and the error where the truth is known.
+
+What is said about a map of measured ranges: doubts, contradictions, and what may be behind them.
+
+The result of a self-mapping in words.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import chdtrc
+
+from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, bound_rms_m, fit_map, map_rms_m
+from ccatp.beacons.cricket.mote_map import MoteMap, map_motes, plain_frame
+from ccatp.beacons.cricket.range_network import (
+    MappingError,
+    MoteRange,
+    RangeNetwork,
+    RigidBody,
+    TooFewRanges,
+    UnknownMote,
+    build_network,
+    list_names,
+)
+from ccatp.beacons.cricket.rigidity import find_fold_over, find_freedom, generic_state
+from ccatp.beacons.cricket.self_mapping import MapperSettings, MoteMapper, run_phase_two
+from ccatp.beacons.cricket.trilateration import map_as_possible
+from ccatp.beacons.cricket.unfolding import agreement_of
+from ccatp.config.beacon_models import CricketConfig
+from ccatp.core import FloatArray
+from ccatp.filters.metrics import aligned_rms_m, best_motion
+
+_TELLING = 12.0  # a drop of chi-squared that chance gives one offset in two thousand
+_CHANCE = 1e-4  # that sound ranges of one pair of all disagree as much
+_SCATTER = 1.5  # factor of the sigmas that is worth a word
+_FOLDS = 5  # sets of motes that are named
+_IN_SPACE = ", or the motes are not in a plane: --dimension 3 maps them in space"
+
+
+def disagreeing(network: RangeNetwork) -> Iterator[str]:
+    """A word on the pair whose own ranges contradict each other most, more than chance would have them."""
+    pairs = np.sort(np.column_stack([network.first, network.second]), axis=1)
+    found, place = np.unique(pairs, axis=0, return_inverse=True)
+    place = place.ravel()
+    weights = network.sigmas_m**-2.0
+    means = np.bincount(place, weights * network.ranges_m) / np.bincount(place, weights)
+    squares = np.bincount(place, weights * (network.ranges_m - means[place]) ** 2)
+    chances = chdtrc(np.maximum(np.bincount(place) - 1, 1), squares)
+    if not (bad := np.flatnonzero(chances < _CHANCE / len(found))).size:
+        return
+    worst = int(bad[np.argmax(squares[bad])])
+    ranges = network.ranges_m[place == worst]
+    more = f" and {bad.size - 1} more pairs" if bad.size > 1 else ""
+    first, second = (network.names[mote] for mote in found[worst])
+    yield (
+        f"ranges between {first} and {second}{more} disagree among themselves: {ranges.min():.4g} to "
+        f"{ranges.max():.4g} m with a sigma of {network.sigmas_m[place == worst].min():.3g} m"
+    )
+
+
+def doubts(found: MoteMap, network: RangeNetwork, factor: float) -> Iterator[str]:
+    """Words on folds, contradictions, scatter and outliers of a batch map.
+
+    Args:
+        found: the map.
+        network: its ranges.
+        factor: of the sigmas, as the residuals told it.
+    """
+    for fold in found.folds[:_FOLDS]:
+        motes = list_names([network.names[mote] for mote in fold.motes])
+        yield f"{motes}: the mirror image fits almost as well (chi-squared {fold.cost_gap:.1f} more)"
+    in_space = _IN_SPACE if network.dimension == 2 else ""
+    agreement, count = found.agreement, len(network.ranges_m)
+    if agreement.is_denied:
+        yield (
+            f"the map contradicts its ranges: {agreement.outliers} of {count} far off it, chi-squared "
+            f"{agreement.factor:.1f} for each degree of freedom of the others; it is folded, or the sigmas are too "
+            f"small{in_space}"
+        )
+    elif agreement.outliers:
+        rows = agreement.outlying
+        pairs = [f"{network.names[network.first[row]]} to {network.names[network.second[row]]}" for row in rows]
+        yield f"{agreement.outliers} of {count} ranges contradict the others and count for little: {list_names(pairs)}"
+    if factor > _SCATTER:
+        yield (
+            f"ranges scatter by {1e3 * found.sigma_m:.3g} mm, {factor:.1f} times what they were taken for: they are "
+            f"worse{in_space}"
+        )
+
+
+def hidden_offset(found: MoteMap, network: RangeNetwork, settings: BatchSettings) -> Iterator[str]:
+    """A word on an offset that the ranges show, where none is estimated; outliers have little say in it.
+
+    Args:
+        found: the map.
+        network: its ranges, with the sigmas that they were found to have.
+        settings: of the fits.
+    """
+    model = MapModel(network, with_offset=True)
+    dof = len(network.ranges_m) - model.size
+    if dof <= 0:
+        return
+    state = model.state(found.positions_m, 0.0, found.scale)
+    without, shown = fit_map(MapModel(network), state, settings), fit_map(model, state, settings)
+    cost, offset_m = shown.cost, shown.state.offset_m
+    agreement = agreement_of(shown, network.sigmas_m, dof)
+    if found.agreement.is_denied:
+        # An offset may have bent the map too far to be seen from there.
+        anew = map_motes(network, settings, with_offset=True)
+        cost, offset_m, agreement = anew.cost, anew.offset_m, anew.agreement
+    # Where the ranges deny the map even so, any unknown more betters it, and means nothing.
+    if without.cost - cost > _TELLING and not agreement.is_denied:
+        yield (
+            f"all ranges look {1e3 * offset_m:.0f} mm long in common (chi-squared {without.cost:.0f}, "
+            f"{cost:.0f} with an offset); --offset estimates it"
+        )
+
+
+def untold(name: str) -> str:
+    """A word on an offset or a scale that was to be estimated and cannot be."""
+    return f"no {name} can be told from these ranges: the map takes it up, and its own size is free; leave --{name} out"
+
+
+def left_out_heights(
+    option: str, places_m: Mapping[str, tuple[float, ...]], dimension: int, least_m: float
+) -> Iterator[str]:
+    """A word on third coordinates that a map in the plane has no use for, where they differ by more than so much."""
+    heights_m = [place[2] for place in places_m.values() if len(place) > dimension]
+    if heights_m and (spread_m := max(heights_m) - min(heights_m)) > least_m:
+        yield (
+            f"{option}: z_m, which differs by {spread_m:.3g} m, is left out of a map in 2 dimensions; --dimension 3 "
+            "maps in space"
+        )
+
+
+def is_flat(error_m: float | None, places_m: FloatArray) -> bool:
+    """Whether an error expected is larger than the map's least extent, root mean square.
+
+    Args:
+        error_m: expected, by derivatives at the map.
+        places_m: shape (n, d); of n motes, n - 1 extents count.
+    """
+    extents_m = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False) / np.sqrt(len(places_m))
+    extents_m = extents_m[: len(places_m) - 1]
+    return error_m is not None and bool(extents_m.size) and error_m > float(extents_m[-1])
+
+
+def flat(dimension: int) -> str:
+    """A word on a map whose motes lie in fewer dimensions than it has."""
+    return (
+        f"the motes lie {'in a line' if dimension == 2 else 'in a plane'}, or nearly: the ranges do not tell how far "
+        "each is off it"
+    )
+
+
+_WIDER = 1e4  # of variances: what a range that is used twice adds by its first use is then a ten-thousandth
+
+Places = Mapping[str, tuple[float, ...]]
+
+
+class MeasuredRanges(NamedTuple):
+    """Ranges as they were recorded.
+
+    Attributes:
+        readings: in their order.
+        groups: names of motes that move together, by the name of their pose: tags of a trolley that stood there.
+        tags: the tag that each of those motes is.
+    """
+
+    readings: tuple[MoteRange, ...]
+    groups: Mapping[str, tuple[str, ...]]
+    tags: Mapping[str, str]
+
+
+class MeasuredMap(NamedTuple):
+    """A map of real motes.
+
+    Attributes:
+        names, positions_m, covariance_m2: the map; moved onto the truth where that is known.
+        true_m: shape (n, d), or None.
+        data: as ``ccatp radio map --json`` prints it.
+    """
+
+    names: tuple[str, ...]
+    positions_m: FloatArray
+    covariance_m2: FloatArray
+    true_m: FloatArray | None
+    data: dict[str, Any]
+
+
+class _Found(NamedTuple):
+    positions_m: FloatArray
+    covariance_m2: FloatArray
+    network: RangeNetwork
+    offset_m: float
+    scale: float
+    iterations: int
+    is_trusted: bool
+    warnings: tuple[str, ...]
+
+
+def map_measured(
+    cfg: CricketConfig, method: str, file: MeasuredRanges, tags_m: Places | None, truth_m: Places | None
+) -> MeasuredMap:
+    """Map what a file of ranges holds.
+
+    Places of a trolley that stood somewhere are mapped along with the anchors, which are what the result is about.
+
+    Args:
+        cfg: dimension, sigma, settings of filter and batch.
+        method: ``ekf`` or ``batch``.
+        file: the ranges.
+        tags_m: places of tags on their trolley, where known.
+        truth_m: true places, where known, of any of the motes.
+
+    Raises:
+        MappingError: the ranges make no map, or the files do not fit each other.
+    """
+    network = _network(cfg, file, tags_m)
+    rng = np.random.default_rng(0)
+    model = MapModel(network, with_offset=cfg.batch.estimates_offset, with_scale=cfg.batch.estimates_scale)
+    freedom = find_freedom(model, generic_state(model, rng))
+    folds = find_fold_over(network, rng)
+    _check_enough(model, network)
+    found = _batch(cfg, network, folds.mirrors) if method == "batch" else _filter(cfg, network)
+    motes = [row for row, name in enumerate(network.names) if name not in file.tags]
+    names = tuple(network.names[mote] for mote in motes)
+    true_m = None if truth_m is None else _truth(truth_m, names, network.dimension)
+    places, covariance = _framed(found, motes, true_m)
+    at_found = MapModel(found.network, with_offset=model.with_offset, with_scale=model.with_scale)
+    error_m = None if true_m is None else aligned_rms_m(places, true_m, mirrors=True)
+    expected_m = map_rms_m(found.covariance_m2, found.positions_m, motes, aligned=True)
+    bound_m = bound_rms_m(at_found, found.positions_m, motes, aligned=True)
+    warnings = [
+        word
+        for option, given in (("--tags", tags_m), ("--truth", truth_m))
+        if given
+        for word in left_out_heights(option, given, network.dimension, cfg.ranging.sigma_m)
+    ]
+    warnings += [*disagreeing(network), *folds.warnings, *found.warnings, *map(untold, freedom.untold)]
+    # Derivatives at a place where they vanish: what comes out is large, and means that nothing is known.
+    if is_thin := is_flat(bound_m, places) or (found.is_trusted and is_flat(expected_m, places)):
+        warnings.append(flat(network.dimension))
+    is_known = found.is_trusted and bound_m is not None and not is_thin
+    data = {
+        "rms_m": {"p10": error_m, "p50": error_m, "p90": error_m},
+        "crlb_m": None if is_thin else bound_m,
+        "rank_deficiency": freedom.deficiency,
+        "fold_over_risk": not folds.is_unique,
+        "phase1_rms_m": _phase1_error_m(cfg, network, motes, true_m),
+        "iterations": found.iterations,
+        "method": method,
+        "seeds": 1,
+        "motes": len(motes),
+        "frame": "aligned",
+        "expected_rms_m": expected_m if is_known else None,
+        "offset_m": None if "offset" in freedom.untold else found.offset_m,
+        "scale": None if "scale" in freedom.untold else 1.0 + found.scale,
+        "free_directions": [*freedom.frame, *freedom.flexes, *freedom.calibration],
+        "warnings": warnings,
+    }
+    return MeasuredMap(names, places, covariance, true_m, data)
+
+
+def _network(cfg: CricketConfig, file: MeasuredRanges, tags_m: Places | None) -> RangeNetwork:
+    names = tuple(dict.fromkeys(name for row in file.readings for name in (row.first, row.second)))
+    if tags_m is None:
+        return build_network(file.readings, cfg.dimension, names)
+    if not file.groups:
+        raise MappingError("--tags: these ranges are of no trolley; columns session, pos, deg, anchor, tag tell one")
+    index = {name: row for row, name in enumerate(names)}
+    bodies = []
+    for pose, motes in file.groups.items():
+        if unknown := [file.tags[mote] for mote in motes if file.tags[mote] not in tags_m]:
+            raise UnknownMote(f"--tags: no place of {unknown[0]}; there are {list_names(list(tags_m))}")
+        local = np.array([tags_m[file.tags[mote]][: cfg.dimension] for mote in motes], dtype=np.float64)
+        bodies.append(RigidBody(pose, tuple(index[mote] for mote in motes), local))
+    return build_network(file.readings, cfg.dimension, names, bodies)
+
+
+def _check_enough(model: MapModel, network: RangeNetwork) -> None:
+    d = network.dimension
+    wanted = model.size - d * (d + 1) // 2
+    measured = len(np.unique(np.sort(np.column_stack([network.first, network.second]), axis=1), axis=0))
+    if network.count > 2 and measured < min(wanted, network.count):
+        raise TooFewRanges(
+            f"{measured} pairs of {network.count} motes were measured, a map in {d} dimensions has {wanted} unknowns; "
+            "measure more pairs"
+        )
+
+
+def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Any) -> _Found:
+    settings = BatchSettings(cfg.batch.robust_scale, cfg.batch.max_iterations)
+    found = map_motes(
+        network,
+        settings,
+        with_offset=cfg.batch.estimates_offset,
+        with_scale=cfg.batch.estimates_scale,
+        mirrors=mirrors,
+        finds_sigma=len(network.ranges_m) > 2 * network.count * network.dimension,
+    )
+    factor = found.sigma_m / float(np.median(network.sigmas_m))
+    scaled = RangeNetwork(
+        network.names, network.dimension, network.first, network.second,
+        network.ranges_m, network.sigmas_m * factor, network.bodies, network.known_m,
+    )  # fmt: skip
+    warnings = [*hidden_offset(found, scaled, settings)] if not cfg.batch.estimates_offset else []
+    warnings += doubts(found, network, factor)
+    is_denied = found.agreement.is_denied
+    # Of a map that its ranges deny, at least what they miss it by.
+    inflation = float(((found.residuals_m / scaled.sigmas_m) ** 2).sum()) / found.dof if is_denied else 1.0
+    return _Found(
+        found.positions_m, inflation * found.covariance_m2, scaled, found.offset_m, found.scale, found.iterations,
+        not is_denied, tuple(warnings),
+    )  # fmt: skip
+
+
+def _filter(cfg: CricketConfig, network: RangeNetwork) -> _Found:
+    """Trilateration, then every range once."""
+    if network.bodies:
+        raise MappingError("the filter knows no trolleys: leave --tags out, or take --method batch")
+    first = map_as_possible(network, cfg.phase1.max_dop)
+    if first.unplaced:
+        lost = list_names([network.names[mote] for mote in first.unplaced])
+        raise MappingError(f"trilateration cannot place {lost}; take --method batch, which needs no such start")
+    # The ranges have made the first map already: its shape is a start, and its covariance, taken wide, hardly counts.
+    settings = MapperSettings(
+        cfg.phase2.linearisations, cfg.phase2.pools, cfg.phase2.gate_probability, cfg.phase2.target_rms_m
+    )
+    mapper = MoteMapper(first.positions_m, _WIDER * first.covariance_m2, settings)
+    rows = zip(
+        network.first.tolist(),
+        network.second.tolist(),
+        network.ranges_m.tolist(),
+        network.sigmas_m.tolist(),
+        strict=True,
+    )
+    went = run_phase_two(mapper, rows, 0.0)
+    warnings = (f"{went.refused} of {len(went.nis)} ranges were refused by the gate",) if went.refused else ()
+    return _Found(mapper.positions_m, mapper.covariance_m2, network, 0.0, 0.0, len(went.nis), True, warnings)
+
+
+def _phase1_error_m(
+    cfg: CricketConfig, network: RangeNetwork, motes: list[int], true_m: FloatArray | None
+) -> float | None:
+    if true_m is None:
+        return None
+    try:
+        first = map_as_possible(network, cfg.phase1.max_dop)
+    except MappingError:
+        return None
+    if set(first.unplaced) & set(motes):
+        return None
+    return aligned_rms_m(first.positions_m[motes], true_m, mirrors=True)
+
+
+def _framed(found: _Found, motes: list[int], true_m: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+    """The motes that count, moved onto the truth or into a frame of their own."""
+    d = found.positions_m.shape[1]
+    places = found.positions_m[motes]
+    at = (np.array(motes)[:, None] * d + np.arange(d)).ravel()
+    motion = plain_frame(places) if true_m is None else best_motion(places, true_m, mirrors=True)
+    return motion.moved(places), motion.turned_map(found.covariance_m2[np.ix_(at, at)])
+
+
+def _truth(truth_m: Places, names: tuple[str, ...], dimension: int) -> FloatArray:
+    if lost := [name for name in names if name not in truth_m]:
+        raise UnknownMote(f"--truth: no place of {list_names(lost)}; there are {list_names(list(truth_m))}")
+    if short := [name for name in names if len(truth_m[name]) < dimension]:
+        raise MappingError(f"--truth: {short[0]} has {len(truth_m[short[0]])} coordinates, wanted {dimension}")
+    return np.array([truth_m[name][:dimension] for name in names], dtype=np.float64)
+
+
+def report_lines(data: dict[str, Any]) -> Iterator[str]:
+    """What ``ccatp radio map`` prints without ``--json``: first what the ranges can tell, then what was found.
+
+    Args:
+        data: as ``--json`` prints it.
+    """
+    yield f"{data['motes']} motes, {data['method']}, frame {data['frame']}, {data['seeds']} runs"
+    yield ""
+    yield "what the ranges can tell"
+    yield f"  free directions beyond the frame   {data['rank_deficiency']}"
+    for line in data["free_directions"]:
+        yield f"    {line}"
+    yield f"  other maps fit as well             {'yes' if data['fold_over_risk'] else 'no'}"
+    yield f"  least error (Cramér-Rao)           {_mm(data['crlb_m'])}"
+    yield ""
+    yield "what was found"
+    yield f"  after phase 1                      {_mm(data['phase1_rms_m'])}"
+    rms = data["rms_m"]
+    yield f"  error, median (10 to 90 %)         {_mm(rms['p50'])} ({_mm(rms['p10'])} to {_mm(rms['p90'])})"
+    if data.get("motes_in_doubt"):
+        yield f"  motes in doubt                     {data['motes_in_doubt']}"
+        yield f"  error of the others                {_mm(data['rms_of_others_m'])}"
+    yield f"  expected by the estimator          {_mm(data['expected_rms_m'])}"
+    yield f"  updates or steps                   {data['iterations']}"
+    if data["offset_m"] != 0.0:
+        yield f"  common offset of the ranges        {_mm(data['offset_m'])}"
+    if data["scale"] != 1.0:
+        scale = "unknown" if data["scale"] is None else f"{data['scale']:.6f}"
+        yield f"  common scale of the ranges         {scale}"
+
+
+def _mm(value_m: float | None) -> str:
+    return "unknown" if value_m is None else f"{1e3 * value_m:.3g} mm"

@@ -1,0 +1,352 @@
+"""Motes and the ranges between them: what a self-mapping starts from, checked.
+
+Range from the time between a radio message and an ultrasonic pulse, with the air's temperature in it.
+
+One range for each pair of motes: the weighted mean of all that were measured between them.
+
+From delays that motes heard to ranges of pairs.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ccatp.config.beacon_models import CricketConfig
+from ccatp.core import FloatArray
+from ccatp.errors import CcatpError, ExitStatus
+
+ABSOLUTE_ZERO_C = -273.15
+COLDEST_C, HOTTEST_C = -60.0, 80.0  # beyond, a thermometer is broken
+
+
+class TdoaError(ValueError):
+    """A delay or a temperature that no range can be made of."""
+
+
+class Air(NamedTuple):
+    """The speed of sound, known at one temperature.
+
+    Attributes:
+        sound_speed_m_s: at ``temperature_c``.
+        temperature_c: degrees Celsius.
+    """
+
+    sound_speed_m_s: float
+    temperature_c: float
+
+
+class MoteRange(NamedTuple):
+    """One distance between two motes.
+
+    Attributes:
+        first, second: names of the motes.
+        range_m: their distance.
+        sigma_m: its standard deviation.
+    """
+
+    first: str
+    second: str
+    range_m: float
+    sigma_m: float
+
+
+def sound_speed(air: Air, temperature_c: float) -> float:
+    """Speed of sound c = c_0 sqrt(T / T_0), T in kelvin: that of an ideal gas.
+
+    Args:
+        air: c_0 and T_0.
+        temperature_c: degrees Celsius.
+
+    Raises:
+        TdoaError: no temperature of air.
+    """
+    if not COLDEST_C <= temperature_c <= HOTTEST_C:
+        raise TdoaError(f"temperature of {temperature_c:g} C is outside {COLDEST_C:g} to {HOTTEST_C:g} C")
+    return air.sound_speed_m_s * sqrt((temperature_c - ABSOLUTE_ZERO_C) / (air.temperature_c - ABSOLUTE_ZERO_C))
+
+
+def range_from_delay(air: Air, delay_s: float, temperature_c: float) -> float:
+    """Distance d = c(T) (t_2 - t_1), Patil et al. eq. 1; the radio message takes no time.
+
+    Args:
+        air: what is known of the speed of sound.
+        delay_s: arrival of the pulse after that of the message.
+        temperature_c: as the listener's thermometer tells.
+
+    Raises:
+        TdoaError: a delay that is negative or not finite, or no temperature of air.
+    """
+    if not 0.0 <= delay_s < float("inf"):
+        raise TdoaError(f"delay of {delay_s:g} s: the pulse cannot arrive before the message")
+    return sound_speed(air, temperature_c) * delay_s
+
+
+def range_sigma(
+    sigma_m: float, range_m: float, temperature_sigma_c: float, temperature_c: float, repeats: int
+) -> float:
+    """Standard deviation of the mean of repeated ranges.
+
+    sigma^2 = sigma_1^2 / n + (d sigma_T / (2 T))^2: repeating lessens the noise of a reading, not what a wrong
+    thermometer does, dc/c = dT / (2 T).
+
+    Args:
+        sigma_m: of one reading.
+        range_m: the distance d.
+        temperature_sigma_c: of the thermometer.
+        temperature_c: T, in degrees Celsius.
+        repeats: n.
+    """
+    scale = temperature_sigma_c / (2.0 * (temperature_c - ABSOLUTE_ZERO_C))
+    return sqrt(sigma_m**2 / repeats + (range_m * scale) ** 2)
+
+
+IndexArray = NDArray[np.intp]
+
+_SHOWN = 6  # names in a message
+
+
+class MappingError(CcatpError):
+    """Ranges of which no map can be made."""
+
+    exit_status = ExitStatus.USAGE
+
+
+class UnknownMote(MappingError):
+    """A range names a mote that is none."""
+
+
+class BadRange(MappingError):
+    """A range that no two motes can have."""
+
+
+class Disconnected(MappingError):
+    """No chain of ranges leads from some motes to the others."""
+
+
+class TooFewRanges(MappingError):
+    """Fewer ranges than anything could be determined from."""
+
+
+@dataclass(frozen=True, slots=True)
+class RigidBody:
+    """Motes whose places relative to each other are known: a network on its stand, tags on a trolley.
+
+    Attributes:
+        name: of the body.
+        motes: their indices, length k.
+        local_m: their places in the body's own frame, shape (k, d).
+    """
+
+    name: str
+    motes: tuple[int, ...]
+    local_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class RangeNetwork:
+    """A graph of ranges.
+
+    Attributes:
+        names: of the n motes.
+        dimension: d, 2 or 3.
+        first, second: ends of each of the m ranges, indices of motes, shape (m,).
+        ranges_m: measured, shape (m,).
+        sigmas_m: standard deviations, shape (m,).
+        bodies: no mote is in two of them.
+        known_m: coordinates that are known, nan elsewhere, shape (n, d); none for motes of bodies.
+    """
+
+    names: tuple[str, ...]
+    dimension: int
+    first: IndexArray
+    second: IndexArray
+    ranges_m: FloatArray
+    sigmas_m: FloatArray
+    bodies: tuple[RigidBody, ...]
+    known_m: FloatArray
+
+    @property
+    def count(self) -> int:
+        """N, the number of motes."""
+        return len(self.names)
+
+    @property
+    def loose(self) -> tuple[int, ...]:
+        """Motes that are in no body."""
+        bound = {mote for body in self.bodies for mote in body.motes}
+        return tuple(mote for mote in range(self.count) if mote not in bound)
+
+
+def build_network(
+    readings: Iterable[MoteRange],
+    dimension: int,
+    names: Sequence[str] | None = None,
+    bodies: Sequence[RigidBody] = (),
+    known_m: FloatArray | None = None,
+) -> RangeNetwork:
+    """The graph of some ranges, checked.
+
+    Args:
+        readings: the ranges; those of one pair may be repeated.
+        dimension: 2 or 3.
+        names: the motes in their order; those of the readings, as they come, if ``None``.
+        bodies: motes that are rigidly joined.
+        known_m: known coordinates, nan elsewhere, shape (n, d).
+
+    Raises:
+        UnknownMote: a range names a mote that is not among ``names``.
+        BadRange: negative or not finite, without a positive sigma, or from a mote to itself.
+        TooFewRanges: there is none, or there are fewer than two motes.
+        Disconnected: the motes fall apart.
+    """
+    rows = list(readings)
+    if names is None:
+        names = tuple(dict.fromkeys(name for row in rows for name in (row.first, row.second)))
+    index = {name: place for place, name in enumerate(names)}
+    for row in rows:
+        _check_row(row, index)
+    if len(names) < 2 or not rows:
+        raise TooFewRanges(f"{len(rows)} ranges among {len(names)} motes; a map needs two motes and a range at least")
+    network = RangeNetwork(
+        names=tuple(names),
+        dimension=dimension,
+        first=np.array([index[row.first] for row in rows], dtype=np.intp),
+        second=np.array([index[row.second] for row in rows], dtype=np.intp),
+        ranges_m=np.array([row.range_m for row in rows], dtype=np.float64),
+        sigmas_m=np.array([row.sigma_m for row in rows], dtype=np.float64),
+        bodies=tuple(bodies),
+        known_m=np.full((len(names), dimension), np.nan) if known_m is None else known_m,
+    )
+    _check_connected(network)
+    return network
+
+
+def graph_pairs(network: RangeNetwork) -> IndexArray:
+    """Pairs whose distance is known or measured, each once and in order, shape (e, 2): ranges, and pairs of a body."""
+    pairs = [np.column_stack([network.first, network.second])]
+    for body in network.bodies:
+        motes = np.array(body.motes, dtype=np.intp)
+        upper = np.triu_indices(len(motes), 1)
+        pairs.append(np.column_stack([motes[upper[0]], motes[upper[1]]]))
+    together = np.sort(np.concatenate(pairs), axis=1)
+    return np.unique(together, axis=0)
+
+
+def components(count: int, pairs: IndexArray) -> IndexArray:
+    """The number of the connected part that each vertex is in, shape (n,)."""
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    labels = connected_components(graph, directed=False)[1]
+    return np.asarray(labels, dtype=np.intp)
+
+
+def list_names(names: Sequence[str]) -> str:
+    """The first few of some names, and how many there are more."""
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more
+
+
+def _check_row(row: MoteRange, index: dict[str, int]) -> None:
+    for name in (row.first, row.second):
+        if name not in index:
+            raise UnknownMote(
+                f"range {row.first} to {row.second}: no mote {name!r}; there are {list_names(list(index))}"
+            )
+    if row.first == row.second:
+        raise BadRange(f"range {row.first} to {row.second}: from a mote to itself; leave it out")
+    if not 0.0 <= row.range_m < float("inf"):
+        raise BadRange(f"range {row.first} to {row.second}: {row.range_m:g} m is no distance")
+    if not 0.0 < row.sigma_m < float("inf"):
+        raise BadRange(f"range {row.first} to {row.second}: sigma of {row.sigma_m:g} m, must be positive")
+
+
+def _check_connected(network: RangeNetwork) -> None:
+    # Motes whose places are known hang together without any range.
+    known = np.flatnonzero(np.isfinite(network.known_m).all(axis=1))
+    linked = np.concatenate([graph_pairs(network), np.column_stack([known[:-1], known[1:]])])
+    labels = components(network.count, linked)
+    sizes = np.bincount(labels)
+    if len(sizes) == 1:
+        return
+    lost = [network.names[mote] for mote in np.flatnonzero(labels == sizes.argmin())]
+    raise Disconnected(
+        f"the motes fall into {len(sizes)} parts with no range between them: {list_names(lost)} on one side; "
+        "measure a range across, or map the parts one by one"
+    )
+
+
+class PairMeans:
+    """Ranges by pair, r = sum(r_i / sigma_i^2) / sum(1 / sigma_i^2).
+
+    Args:
+        network: the ranges, those of a pair in either direction.
+
+    Attributes:
+        pairs: each once, the smaller index first, shape (e, 2).
+        ranges_m: shape (e,).
+        sigmas_m: of the means, shape (e,).
+    """
+
+    def __init__(self, network: RangeNetwork) -> None:
+        pairs = np.sort(np.column_stack([network.first, network.second]), axis=1)
+        self.pairs: IndexArray
+        self.pairs, place = np.unique(pairs, axis=0, return_inverse=True)
+        weights = 1.0 / network.sigmas_m**2
+        total = np.bincount(place.ravel(), weights)
+        self.ranges_m: FloatArray = np.bincount(place.ravel(), weights * network.ranges_m) / total
+        self.sigmas_m: FloatArray = 1.0 / np.sqrt(total)
+        self._index = {(int(i), int(j)): row for row, (i, j) in enumerate(self.pairs)}
+        self._partners: dict[int, list[int]] = {}
+        for i, j in self.pairs.tolist():
+            self._partners.setdefault(i, []).append(j)
+            self._partners.setdefault(j, []).append(i)
+
+    def between(self, first: int, second: int) -> tuple[float, float] | None:
+        """Range and sigma of a pair in either order, or None."""
+        row = self._index.get((min(first, second), max(first, second)))
+        return None if row is None else (float(self.ranges_m[row]), float(self.sigmas_m[row]))
+
+    def partners(self, mote: int) -> list[int]:
+        """The motes that have a range to this one."""
+        return self._partners.get(mote, [])
+
+    def are_all_linked(self, motes: Iterable[int]) -> bool:
+        """Whether every two of some motes have a range."""
+        listed = list(motes)
+        return all(self.between(a, b) is not None for k, a in enumerate(listed) for b in listed[k + 1 :])
+
+
+_MEDIAN_COST = np.sqrt(np.pi / 2.0)  # of the median's standard deviation against the mean's, for normal noise
+
+
+def air_of(cfg: CricketConfig) -> Air:
+    """What the motes know of the speed of sound."""
+    return Air(cfg.air.sound_speed_m_s, cfg.air.temperature_c)
+
+
+def pair_range(
+    cfg: CricketConfig, names: tuple[str, str], delays_s: FloatArray | Sequence[float], temperature_c: float
+) -> MoteRange:
+    """The range of a pair from its readings.
+
+    Args:
+        cfg: air, sigma of a reading, mean or median.
+        names: of transmitter and listener.
+        delays_s: pulse after message, one for each reading, shape (k,), k >= 1.
+        temperature_c: of the listener's thermometer.
+
+    Raises:
+        TdoaError: a delay or a temperature that none can be.
+    """
+    delay_s = float(np.median(delays_s) if cfg.ranging.combine == "median" else np.mean(delays_s))
+    range_m = range_from_delay(air_of(cfg), delay_s, temperature_c)
+    count = len(delays_s)
+    sigma_m = range_sigma(cfg.ranging.sigma_m, range_m, cfg.ranging.thermometer_sigma_c, temperature_c, count)
+    if cfg.ranging.combine == "median" and count > 2:
+        sigma_m *= float(_MEDIAN_COST)
+    return MoteRange(*names, range_m, sigma_m)

@@ -1,0 +1,296 @@
+"""A first map of a few dozen motes: multidimensional scaling, unfolded in more dimensions than there are.
+
+Whether a map and its ranges agree: which ranges are outliers, and how well the others fit.
+
+Maps anew, with all around them held, the places of a map where ranges contradict it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import shortest_path
+
+from ccatp.beacons.cricket.map_fit import BatchFit, BatchSettings, MapModel, fit_map
+from ccatp.beacons.cricket.range_network import IndexArray, PairMeans, RangeNetwork, components
+from ccatp.core import FloatArray
+from ccatp.filters.metrics import best_motion
+
+_SPARE = 2  # dimensions more than the map has, in which what is folded can turn over
+_SQUEEZES = tuple(
+    np.geomspace(1e-3, 1e3, 7).tolist()
+)  # weight of the spare dimensions, in units of the mean weight of a range
+_STEPS = 25  # of each squeeze; the last fit of all is left to others
+
+
+def unfolded(
+    count: int,
+    pairs: IndexArray,
+    distances_m: FloatArray,
+    sigmas_m: FloatArray,
+    dimension: int,
+    *,
+    squeezes: Sequence[float] = _SQUEEZES,
+    rng: np.random.Generator | None = None,
+) -> FloatArray:
+    """Places of n points from some of their distances, shape (n, d); as ranges do, it leaves frame and mirror open.
+
+    The missing distances are taken as the shortest way along known ones (Shang et al., MDS-MAP, 2003), classical
+    scaling (Torgerson 1952) gives places in d + 2 dimensions, and weighted least squares on the known distances alone
+    go on from there, while a weight on the spare dimensions grows until the points lie in d. A map that is folded over
+    in d dimensions often has a way down through the spare ones.
+
+    Args:
+        count: n.
+        pairs: known distances, shape (e, 2), connected.
+        distances_m: shape (e,).
+        sigmas_m: shape (e,).
+        dimension: d.
+        squeezes: weights of the spare dimensions one after the other, in units of the median weight of a distance.
+        rng: draws the places to begin with, where those by classical scaling led astray.
+    """
+    wide = dimension + _SPARE
+    if rng is None:
+        points = classical_scaling(completed(count, pairs, distances_m), wide)
+    else:
+        points = rng.normal(0.0, float(np.median(distances_m)), (count, wide))
+    weights = 1.0 / sigmas_m**2
+    # Weights that differ by orders of magnitude would freeze the strong ones before the weak ones have turned.
+    weights = np.minimum(weights / np.median(weights), 25.0)
+    for squeeze in squeezes:
+        points = _relaxed(points, pairs, distances_m, weights, squeeze, dimension)
+        points = _turned(points)
+    return np.ascontiguousarray(points[:, :dimension])
+
+
+def completed(count: int, pairs: IndexArray, distances_m: FloatArray) -> FloatArray:
+    """All distances, unknown ones as the shortest way along known ones, shape (n, n)."""
+    # A distance of nought would be no edge.
+    graph = coo_array((np.maximum(distances_m, 1e-9), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return np.asarray(shortest_path(graph.tocsr(), directed=False))
+
+
+def classical_scaling(distances_m: FloatArray, dimension: int) -> FloatArray:
+    """Torgerson's scaling: the leading eigenvectors of -1/2 J D^2 J, shape (n, dimension)."""
+    squares = distances_m**2
+    centred = squares - squares.mean(axis=0) - squares.mean(axis=1)[:, None] + squares.mean()
+    values, vectors = np.linalg.eigh(-0.5 * centred)
+    points = np.zeros((len(distances_m), dimension))
+    kept = min(dimension, len(distances_m))
+    leading = np.maximum(values[::-1][:kept], 0.0)
+    points[:, :kept] = vectors[:, ::-1][:, :kept] * np.sqrt(leading)
+    return points
+
+
+def _turned(points: FloatArray) -> FloatArray:
+    """The points along their principal axes, the widest first."""
+    centred = points - points.mean(axis=0)
+    return np.asarray(centred @ np.linalg.svd(centred, full_matrices=False)[2].T)
+
+
+class _Stress:
+    """sum w (d - |p_i - p_j|)^2 + squeeze |spare coordinates|^2, and the Gauss-Newton step down from it."""
+
+    def __init__(
+        self,
+        count: int,
+        wide: int,
+        pairs: IndexArray,
+        distances_m: FloatArray,
+        weights: FloatArray,
+        penalty: FloatArray,
+    ) -> None:
+        self._i, self._j = pairs[:, 0], pairs[:, 1]
+        self._distances_m, self._weights, self._penalty = distances_m, weights, penalty
+        self._count, self._wide, self._size = count, wide, count * wide
+        frame = np.arange(wide)
+        at = np.concatenate([self._i[:, None] * wide + frame, self._j[:, None] * wide + frame], axis=1)
+        self._at = at.ravel()
+        self._cells = (at[:, :, None] * self._size + at[:, None, :]).ravel()
+
+    def look(self, places: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Cost, errors of the distances (e,), and unit vectors (e, wide)."""
+        ways = places[self._i] - places[self._j]
+        lengths = np.sqrt(np.einsum("ij,ij->i", ways, ways))
+        errors = self._distances_m - lengths
+        cost = float(self._weights @ errors**2 + self._penalty @ (places**2).sum(axis=0))
+        return cost, errors, ways / np.maximum(lengths, 1e-9)[:, None]
+
+    def step(self, places: FloatArray, errors: FloatArray, units: FloatArray, damping: float) -> FloatArray:
+        """The damped step, shape (n, wide)."""
+        rows = np.concatenate([units, -units], axis=1)
+        weighted = self._weights[:, None] * rows
+        blocks = weighted[:, :, None] * rows[:, None, :]
+        summed = np.asarray(np.bincount(self._cells, blocks.ravel(), self._size**2), dtype=np.float64)
+        normal = summed.reshape(self._size, self._size)
+        pull = np.bincount(self._at, (errors[:, None] * weighted).ravel(), self._size)
+        normal[np.diag_indices_from(normal)] += np.tile(self._penalty, self._count) + damping
+        gradient = pull - (places * self._penalty).ravel()
+        return np.asarray(
+            cho_solve(cho_factor(normal, check_finite=False), gradient, check_finite=False).reshape(
+                self._count, self._wide
+            )
+        )
+
+
+def _relaxed(
+    points: FloatArray, pairs: IndexArray, distances_m: FloatArray, weights: FloatArray, squeeze: float, dimension: int
+) -> FloatArray:
+    """Points after some damped Gauss-Newton steps (Levenberg 1944) down the stress."""
+    count, wide = points.shape
+    penalty = np.where(np.arange(wide) < dimension, 0.0, squeeze)
+    stress = _Stress(count, wide, pairs, distances_m, weights, penalty)
+    cost, errors, units = stress.look(points)
+    damping = 1e-2
+    for _ in range(_STEPS):
+        trial = points + stress.step(points, errors, units, damping)
+        seen = stress.look(trial)
+        if seen[0] < cost:
+            gain = cost - seen[0]
+            points, (cost, errors, units), damping = trial, seen, max(0.3 * damping, 1e-6)
+            if gain < 1e-9 * cost:
+                break
+        else:
+            damping *= 5.0
+            if damping > 1e6:
+                break
+    return points
+
+
+_DENIED = 3.0  # chi-squared for each degree of freedom
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """How the ranges fit a map.
+
+    Attributes:
+        outlying: ranges of which the loss left less than half.
+        inlier_cost: chi-squared of the others.
+        dof: of all ranges.
+    """
+
+    outlying: tuple[int, ...]
+    inlier_cost: float
+    dof: int
+
+    @property
+    def outliers(self) -> int:
+        """The number of ``outlying``."""
+        return len(self.outlying)
+
+    @property
+    def factor(self) -> float:
+        """Chi-squared of the ranges that are no outliers by their degree of freedom: 1 where the sigmas are right."""
+        left = self.dof - self.outliers
+        return self.inlier_cost / left if left > 0 else 1.0
+
+    @property
+    def is_denied(self) -> bool:
+        """Whether the good ranges do not fit, or more than half of those to spare are outliers.
+
+        As many outliers as that can agree on another map (breakdown point: Rousseeuw 1984).
+        """
+        return self.factor > _DENIED or 2 * self.outliers > self.dof > 0
+
+
+def agreement_of(fit: BatchFit, sigmas_m: FloatArray, dof: int) -> Agreement:
+    """How the ranges fit a map.
+
+    Args:
+        fit: the map.
+        sigmas_m: of its ranges, shape (m,).
+        dof: ranges less unknowns that they determine.
+    """
+    is_out = fit.weights < 0.5
+    cost = float(((fit.residuals_m / sigmas_m)[~is_out] ** 2).sum())
+    return Agreement(tuple(np.flatnonzero(is_out).tolist()), cost, dof)
+
+
+_SUSPECT = 4.0  # residual in sigmas that makes both ends of a range suspects
+_LARGEST = 60  # motes of one place that is mapped anew
+_ROUNDS = 3
+
+
+def repaired(model: MapModel, fit: BatchFit, settings: BatchSettings) -> BatchFit:
+    """A map whose contradictions were looked at one place at a time; bodies and known motes stay as they are.
+
+    A few motes that are folded over together are a minimum of their own. Where ranges disagree with the map, the motes
+    at their ends and all their partners are taken out and unfolded afresh between the motes that hold them.
+
+    Args:
+        model: network and unknowns.
+        fit: where to begin.
+        settings: of the fits.
+    """
+    network = model.network
+    if network.bodies:
+        return fit
+    for _ in range(_ROUNDS):
+        better = False
+        for motes in _contradicted(network, fit):
+            places = _mapped_anew(network, fit, motes, settings)
+            if places is None:
+                continue
+            other = fit_map(model, model.state(places, fit.state.offset_m, fit.state.scale), settings)
+            if other.cost < fit.cost * (1.0 - 1e-6):
+                fit, better = other, True
+        if not better:
+            break
+    return fit
+
+
+def _contradicted(network: RangeNetwork, fit: BatchFit) -> list[IndexArray]:
+    """Suspects and their partners, each set that hangs together by itself."""
+    bad = np.abs(fit.residuals_m) > _SUSPECT * network.sigmas_m
+    if not bad.any():
+        return []
+    pairs = np.column_stack([network.first, network.second])
+    suspects = np.unique(pairs[bad])
+    near = np.unique(pairs[np.isin(pairs, suspects).any(axis=1)])
+    inside = np.isin(pairs, near).all(axis=1)
+    labels = components(network.count, pairs[inside])
+    groups = [near[labels[near] == label] for label in np.unique(labels[near])]
+    return [group for group in groups if len(group) <= _LARGEST]
+
+
+def _mapped_anew(network: RangeNetwork, fit: BatchFit, motes: IndexArray, settings: BatchSettings) -> FloatArray | None:
+    """All places with some motes unfolded between their partners; None where too little holds them."""
+    d = network.dimension
+    pairs = np.column_stack([network.first, network.second])
+    rows = np.flatnonzero(np.isin(pairs, motes).any(axis=1))
+    members = np.unique(pairs[rows])
+    ring = np.setdiff1d(members, motes)
+    if len(ring) < d + 1:
+        return None
+    index = {int(mote): place for place, mote in enumerate(members)}
+    known = np.where(np.isin(members, ring)[:, None], fit.state.positions_m[members], np.nan)
+    part = RangeNetwork(
+        names=tuple(network.names[mote] for mote in members),
+        dimension=d,
+        first=np.array([index[int(mote)] for mote in network.first[rows]], dtype=np.intp),
+        second=np.array([index[int(mote)] for mote in network.second[rows]], dtype=np.intp),
+        ranges_m=(network.ranges_m[rows] - fit.state.offset_m) / (1.0 + fit.state.scale),
+        sigmas_m=network.sigmas_m[rows],
+        bodies=(),
+        known_m=known,
+    )
+    means = PairMeans(part)
+    at = np.flatnonzero(np.isfinite(known[:, 0]))
+    a, b = np.triu_indices(len(at), 1)
+    held = np.linalg.norm(known[at[a]] - known[at[b]], axis=1)
+    start = unfolded(
+        len(members),
+        np.concatenate([means.pairs, np.column_stack([at[a], at[b]])]),
+        np.concatenate([means.ranges_m, held]),
+        np.concatenate([means.sigmas_m, np.full(len(a), float(means.sigmas_m.min()))]),
+        d,
+    )
+    start = best_motion(start[at], known[at], mirrors=True).moved(start)
+    model = MapModel(part)
+    found = fit_map(model, model.state(start), settings)
+    places = fit.state.positions_m.copy()
+    places[members] = found.state.positions_m
+    return places

@@ -1,0 +1,358 @@
+"""What looks wrong in a recorded run, a line each: for the reader's eyes, nothing of it reaches an estimator.
+
+What readings say against truth and survey, a line each: scale, sign, beacons that are not in their place.
+"""
+
+from collections.abc import Generator, Iterator
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ccatp.beacons.datasets.tables import GAP_S, long_pauses, plural
+from ccatp.beacons.datasets.truth import chords, guessed_between, turn_at, turning_factor, way_at
+from ccatp.beacons.slam.recording import Readings, RecordedRun, Steps, Truth
+from ccatp.core import FloatArray, IntArray
+
+MANY_SIGMA = 1.4826  # of a Gaussian, over its median absolute deviation
+SCALE_WARNING = 0.03
+OFFSET_WARNING_M = 0.1
+STRANGER_M = 0.3  # readings of a beacon are strange if half of them miss its place by that,
+STRANGER_RATIO = 5.0  # and by that many times what the others miss
+FITTING = 0.3  # of what they miss their own place by: then they fit another,
+EXCHANGED = 0.75  # or, if those of the other fit here as well as theirs there, are exchanged with it
+TELLING = 1.5  # times what the others miss, without which nothing is exchanged
+AGREEMENT = 0.5  # length of the mean vector of bearing errors that share a constant
+CLOSE = 0.9  # the same, of bearings that tell places
+PIECES = 4  # of the run, looked at one by one
+FEW = 20
+FITS = " fit "  # in a line that says whose place it is
+
+
+class _Seen(NamedTuple):
+    """Readings with truth and surveyed place.
+
+    Attributes:
+        times_s: shape (m,).
+        pose: true x_m, y_m, heading_rad, shape (m, 3).
+        beacon: shape (m,).
+        range_m: shape (m,).
+        bearing_rad: shape (m,); NaN where none was read.
+    """
+
+    times_s: FloatArray
+    pose: FloatArray
+    beacon: IntArray
+    range_m: FloatArray
+    bearing_rad: FloatArray
+
+    def where(self, rows: npt.NDArray[np.bool_]) -> "_Seen":
+        return _Seen(self.times_s[rows], self.pose[rows], self.beacon[rows], self.range_m[rows], self.bearing_rad[rows])
+
+
+def readings_against(run: RecordedRun, truth: Truth) -> Iterator[str]:
+    """What looks wrong in readings where truth and places are known."""
+    placed = np.array([run.beacon_truth_m.get(name, (np.nan, np.nan)) for name in run.beacon_ids]).reshape(-1, 2)
+    r, t = run.readings, run.readings.times_s
+    inside = (t >= truth.times_s[0]) & (t <= truth.times_s[-1]) & np.isfinite(r.range_m)
+    inside &= np.isfinite(placed[r.beacon, 0])
+    if inside.sum() < FEW:
+        return
+    pose = np.column_stack([np.interp(t[inside], truth.times_s, column) for column in truth[1:]])
+    if not np.isfinite(truth.heading_rad).all():
+        pose[:, 2] = np.nan
+    seen = _Seen(t[inside], pose, r.beacon[inside], r.range_m[inside], r.bearing_rad[inside])
+    told, off_rad = _bearings(seen, placed)
+    strange = yield from _misplaced(run.beacon_ids, placed, seen, off_rad)
+    yield from _ranges(seen, placed, strange)
+    yield from told
+
+
+def unit_slip(scale: float, units: tuple[tuple[str, float], ...]) -> str:
+    """The question whether they are in that unit, for a scale that is near one's."""
+    near = [name for name, factor in units if abs(scale / factor - 1.0) < 0.15]
+    return f": are they in {near[0]}?" if near else ""
+
+
+def _ranges(seen: _Seen, placed: FloatArray, strange: list[int]) -> Iterator[str]:
+    """Slope and offset over true distances; of beacons that are not in their place nothing follows."""
+    sound = ~np.isin(seen.beacon, strange)
+    if sound.sum() >= FEW:
+        seen = seen.where(sound)
+    scale, offset = _robust_line(np.hypot(*(placed[seen.beacon] - seen.pose[:, :2]).T), seen.range_m)
+    unit = unit_slip(1.0 / scale if scale else 0.0, (("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048)))
+    if unit:
+        yield f"ranges read {scale:.4g} times the truth{unit}"
+    elif abs(scale - 1.0) > SCALE_WARNING:
+        yield f"ranges read {100.0 * (scale - 1.0):+.1f} per cent and {offset:+.2f} m off (fit to the truth)"
+    elif abs(offset) > OFFSET_WARNING_M:
+        yield f"ranges read {offset:+.2f} m off (fit to the truth)"
+
+
+def _bearings(seen: _Seen, placed: FloatArray) -> tuple[list[str], float | None]:
+    """What is told of bearings, and their constant error, rad; None where they tell no place."""
+    to = placed[seen.beacon] - seen.pose[:, :2]
+    expected = np.arctan2(to[:, 1], to[:, 0]) - seen.pose[:, 2]
+    known = np.isfinite(seen.bearing_rad + expected)
+    if known.sum() < FEW:
+        return [], None
+    bearing, expected = seen.bearing_rad[known], expected[known]
+    mean, mirrored = (complex(np.mean(np.exp(1j * (sign * bearing - expected)))) for sign in (1.0, -1.0))
+    if abs(mirrored) > max(AGREEMENT, abs(mean)) and abs(np.angle(mirrored)) < 0.5:
+        return ["bearings fit the truth with the other sign: are they clockwise?"], None
+    if abs(mean) <= AGREEMENT:
+        return [], None
+    off_rad = float(np.angle(mean))
+    told = [f"bearings read {off_rad:+.3f} rad off (against the truth)"] if abs(off_rad) > 0.05 else []
+    return told, off_rad if abs(mean) > CLOSE else None
+
+
+def _robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Slope and offset of y over x, outliers left out by and by."""
+    keep = np.ones(x.size, dtype=bool)
+    slope, offset = 1.0, 0.0
+    for _ in range(5):
+        slope, offset = np.polyfit(x[keep], y[keep], 1).tolist()
+        residual = y - slope * x - offset
+        sigma = MANY_SIGMA * float(np.median(np.abs(residual - np.median(residual))))
+        keep = np.abs(residual) <= max(3.0 * sigma, 1e-9)
+    return slope, offset
+
+
+def _misplaced(
+    names: tuple[str, ...], placed: FloatArray, seen: _Seen, off_rad: float | None
+) -> Generator[str, None, list[int]]:
+    """Beacons that do not fit their surveyed place, all along or for a part of the run; returns them."""
+    whole = _unlike(names, _misses(placed, seen), _misses(placed, seen, off_rad))
+    explained = {k for line, beacons in whole.items() if FITS in line for k in beacons}
+    edges = np.linspace(seen.times_s[0], seen.times_s[-1], PIECES + 1)
+    parts: dict[str, list[int]] = {}
+    partly: set[int] = set()
+    for piece in range(PIECES):
+        now = seen.where((seen.times_s >= edges[piece]) & (seen.times_s <= edges[piece + 1]))
+        for line, beacons in _unlike(names, _misses(placed, now), _misses(placed, now, off_rad)).items():
+            if FITS in line and not explained.intersection(beacons):  # a few readings may all be off: no misses
+                parts.setdefault(line.split(" (by ")[0], []).append(piece)
+                partly.update(beacons)
+    yield from (line for line, beacons in whole.items() if not partly.intersection(beacons))
+    for line, pieces in parts.items():
+        yield f"from {edges[pieces[0]]:.0f} to {edges[pieces[-1] + 1]:.0f} s alone: {line}"
+    return sorted(partly.union(*whole.values()))
+
+
+def _misses(placed: FloatArray, seen: _Seen, off_rad: float | None = None) -> FloatArray:
+    """Median miss, m, of the readings of one beacon at the place of another, shape (n, n); NaN where there are few.
+
+    With the constant error of the bearings it is that of the place where they point, else that of the range.
+    """
+    count = len(placed)
+    miss = np.full((count, count), np.nan)
+    way = seen.bearing_rad - (off_rad or 0.0) + seen.pose[:, 2]
+    pointed = seen.pose[:, :2] + seen.range_m[:, None] * np.column_stack([np.cos(way), np.sin(way)])
+    for k in range(count):
+        rows = seen.beacon == k
+        if rows.sum() < FEW:
+            continue
+        for other in np.flatnonzero(np.isfinite(placed[:, 0])).tolist():
+            if off_rad is not None and np.isfinite(pointed[rows]).all():
+                off = np.hypot(*(placed[other] - pointed[rows]).T)
+            else:
+                off = np.abs(seen.range_m[rows] - np.hypot(*(placed[other] - seen.pose[rows, :2]).T))
+            miss[k, other] = np.median(off)
+    return miss
+
+
+def _unlike(names: tuple[str, ...], miss: FloatArray, pointed: FloatArray) -> dict[str, tuple[int, ...]]:
+    """Lines on beacons whose readings do not fit their surveyed place, each with those beacons."""
+    if not np.isfinite(np.diag(miss)).any():
+        return {}
+    own, usual = _own_and_usual(pointed)
+    gain = pointed / own[:, None]
+    mutual = np.maximum(gain, gain.T)  # the worse of both directions
+    mutual[~(np.minimum.outer(own, own) > TELLING * usual)] = np.nan
+    lines: dict[str, tuple[int, ...]] = {}
+    paired: set[int] = set()
+    for k, other in zip(*np.unravel_index(np.argsort(mutual, axis=None), mutual.shape), strict=True):
+        if k < other and mutual[k, other] < EXCHANGED and not paired & {k, other}:
+            paired |= {int(k), int(other)}
+            line = f"beacons {names[k]} and {names[other]} look exchanged: each one's ranges fit the other's place"
+            lines[line] = (int(k), int(other))
+    own, usual = _own_and_usual(miss)
+    strange = [k for k in range(len(names)) if own[k] > max(STRANGER_M, STRANGER_RATIO * usual) and k not in paired]
+    for k in strange:
+        best = int(np.nanargmin(miss[k]))
+        if miss[k, best] < FITTING * own[k]:
+            line = f"ranges of beacon {names[k]} fit the place of {names[best]}, not its own (by {own[k]:.1f} m)"
+        else:
+            line = f"ranges of beacon {names[k]} miss its surveyed place by {own[k]:.1f} m (half of them)"
+        lines[line] = (k,)
+    return lines
+
+
+def _own_and_usual(miss: FloatArray) -> tuple[FloatArray, float]:
+    """What each misses its own place by, and what is usual: most may be wrong."""
+    own = np.diag(miss)
+    return own, float(np.nanquantile(own, 0.25))
+
+
+TRUTH_GAP_S = 1.0
+SAME = 0.01  # odometry is the truth itself if single steps agree to that part of their size
+TURN_WARNING = 0.05
+STANDS = 0.01  # of what the other moves
+STANDS_M = 0.2
+LIKE = 0.3
+LEAST_TURNING_RAD2 = 0.1
+DEGREES = 180.0 / np.pi
+FASTEST_TURN_RAD_S = 10.0  # faster turning is a unit's fault
+FASTEST_M_S = 50.0
+
+
+def suspicions(run: RecordedRun) -> list[str]:
+    """Everything that looks wrong, the most basic first."""
+    found = [*_gaps(run), *_units(run), *_signs(run.readings)]
+    if run.truth is not None:
+        against = list(_standing(run.truth, run.steps)) or list(_odometry_against(run.truth, run.steps))
+        found += against
+        if not any(line.startswith("the truth never moves") for line in against):
+            found += readings_against(run, run.truth)
+    found += _map_of(run)
+    return found
+
+
+def _gaps(run: RecordedRun) -> Iterator[str]:
+    columns = [("odometry", run.steps.times_s, GAP_S), ("readings", run.readings.times_s, GAP_S)]
+    if run.truth is not None:
+        columns.append(("truth", run.truth.times_s, TRUTH_GAP_S))
+    for what, times_s, least_s in columns:
+        long, pauses = long_pauses(times_s, least_s), np.diff(times_s)
+        if long.size:
+            worst = int(long[np.argmax(pauses[long])])
+            guessed = "; the way there is guessed by the speed before" if what == "odometry" else ""
+            yield (
+                f"{what}: {plural(long.size, 'gap')}, the longest of {pauses[worst]:.1f} s at {times_s[worst]:.3f} s "
+                f"(usual interval {float(np.median(pauses[pauses > 0.0])):.3f} s){guessed}"
+            )
+
+
+def _units(run: RecordedRun) -> Iterator[str]:
+    steps = run.steps
+    interval_s = np.maximum(np.diff(steps.times_s), 1e-3)
+    turning = float(np.percentile(np.abs(steps.turn_rad) / interval_s, 99))
+    if turning > FASTEST_TURN_RAD_S:
+        yield f"odometry turns by up to {turning:.0f} rad/s: are the turns in degrees?"
+    moving = float(np.percentile(np.abs(steps.distance_m) / interval_s, 99))
+    if moving > FASTEST_M_S:
+        yield f"odometry moves by up to {moving:.0f} m/s: are the distances in millimetres?"
+    wild = np.flatnonzero(np.abs(steps.distance_m) / interval_s > FASTEST_M_S)
+    if wild.size and moving <= FASTEST_M_S:
+        first = int(wild[0])
+        yield (
+            f"odometry: {plural(wild.size, 'step')} faster than {FASTEST_M_S:.0f} m/s, the first of "
+            f"{steps.distance_m[first]:.3g} m at {steps.times_s[first]:.3f} s: what follows is lost"
+        )
+    widest = np.abs(run.readings.bearing_rad[np.isfinite(run.readings.bearing_rad)]).max(initial=0.0)
+    if widest > 2.0 * np.pi + 0.01:
+        yield f"bearings reach {widest:.0f} rad: are they in degrees?"
+    if run.truth is not None and np.isfinite(run.truth.heading_rad).any():
+        heading = run.truth.heading_rad[np.isfinite(run.truth.heading_rad)]
+        turned = np.abs(np.diff(heading)).sum()
+        by_odometry = np.abs(steps.turn_rad).sum()
+        if turned > 15.0 * by_odometry > 15.0:
+            yield f"truth turns {turned / by_odometry:.0f} times as much as the odometry: is its heading in degrees?"
+
+
+def _signs(readings: Readings) -> Iterator[str]:
+    negative = int((readings.range_m < 0.0).sum())
+    if negative:
+        yield f"{plural(negative, 'range')} below zero"
+    positive = int((readings.rssi_dbm > 0.0).sum())
+    if positive:
+        yield f"{plural(positive, 'signal strength')} above 0 dBm: is the sign missing?"
+
+
+def _odometry_against(truth: Truth, steps: Steps) -> Iterator[str]:
+    rows = chords(truth, steps)
+    if rows.size < FEW:
+        return
+    yield from _copied_odometry(truth, steps)
+    t = truth.times_s[rows]
+    way = np.diff(way_at(steps, t))
+    true_way = np.hypot(np.diff(truth.x_m[rows]), np.diff(truth.y_m[rows]))
+    half_turn = np.minimum(0.5 * np.abs(np.diff(turn_at(steps, t))), 1.0)
+    chord = np.abs(way) * np.sinc(half_turn / np.pi)  # of the arc
+    told = ~guessed_between(steps, t)
+    true_way, chord = true_way[told], chord[told]
+    if chord.sum() > 0.0:
+        scale = float(true_way.sum() / chord.sum())
+        if abs(scale - 1.0) > SCALE_WARNING:
+            unit = unit_slip(scale, (("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048)))
+            yield f"odometry distance: true ways are {scale:.3g} times it{unit}"
+    yield from _turning_against(truth, steps, rows)
+
+
+def _standing(truth: Truth, steps: Steps) -> Iterator[str]:
+    """One of the two drives, the other never moves."""
+    inside = (truth.times_s >= steps.times_s[0]) & (truth.times_s <= steps.times_s[-1])
+    extent_m = np.hypot(np.ptp(truth.x_m[inside]), np.ptp(truth.y_m[inside])) if inside.any() else 0.0
+    way_m = float(np.abs(steps.distance_m).sum() + np.abs(steps.lateral_m).sum())
+    if way_m < STANDS * extent_m:
+        yield f"odometry never moves ({way_m:.2g} m) while the truth gets {extent_m:.3g} m about: the right column?"
+    elif extent_m < STANDS * way_m and inside.sum() >= FEW and extent_m < STANDS_M < way_m:
+        yield f"the truth never moves ({extent_m:.2g} m) while the odometry travels {way_m:.3g} m: is it of this run?"
+
+
+def _copied_odometry(truth: Truth, steps: Steps) -> Iterator[str]:
+    """Odometry that was made from the truth: single steps agree better than any wheel could tell."""
+    x, y = (np.interp(steps.times_s, truth.times_s, column) for column in (truth.x_m, truth.y_m))
+    inside = (steps.times_s >= truth.times_s[0]) & (steps.times_s <= truth.times_s[-1])
+    inside = inside[:-1] & inside[1:]
+    true_way, way = np.hypot(np.diff(x), np.diff(y))[inside], np.abs(steps.distance_m)[inside]
+    moved = true_way > 0.1 * np.median(true_way[true_way > 0.0]) if (true_way > 0.0).any() else true_way > 0.0
+    if moved.sum() < FEW:
+        return
+    miss = float(np.sqrt(np.mean((way - true_way)[moved] ** 2)) / np.sqrt(np.mean(true_way[moved] ** 2)))
+    if miss < SAME:
+        yield (
+            f"odometry distance equals the truth (single steps agree within {100.0 * miss:.2g} per cent): it was made "
+            "from the truth, and results are better than odometry would give"
+        )
+    heading = np.interp(steps.times_s, truth.times_s, truth.heading_rad)
+    if not np.isfinite(heading).all():
+        return
+    true_turn, turn = np.diff(heading)[inside], steps.turn_rad[inside]
+    size = float(np.sqrt(np.mean(true_turn**2)))
+    if size > 0.0 and float(np.sqrt(np.mean((turn - true_turn) ** 2))) < SAME * size:
+        yield "odometry turns equal the truth: they were made from it"
+
+
+def _turning_against(truth: Truth, steps: Steps, rows: npt.NDArray[np.int64]) -> Iterator[str]:
+    """Turns by the truth's heading over those of the odometry; by the shape of the path if the truth has none."""
+    if not np.isfinite(truth.heading_rad).all():
+        factor = turning_factor(truth, steps)
+        if factor is not None:
+            yield from _turns(factor, 1.0)
+        return
+    t = truth.times_s[rows]
+    x, y = np.diff(turn_at(steps, t)), np.diff(truth.heading_rad[rows])
+    if float(x @ x) < LEAST_TURNING_RAD2 or y.std() == 0.0:
+        return
+    yield from _turns(float(x @ y) / float(x @ x), float(np.corrcoef(x, y)[0, 1]))
+
+
+def _turns(scale: float, likeness: float) -> Iterator[str]:
+    if scale < 0.0 and abs(likeness) > LIKE:
+        yield f"odometry turns the other way than the truth ({scale:.3g} times): wheels exchanged, or a sign?"
+    elif likeness < LIKE:
+        yield f"odometry turns have little to do with the truth (correlation {likeness:.2f})"
+    elif abs(scale - 1.0) > TURN_WARNING:
+        unit = unit_slip(scale, (("degrees", 1.0 / DEGREES),))
+        yield f"odometry turns: true turns are {scale:.3g} times them{unit or ' (track of the wheels?)'}"
+
+
+def _map_of(run: RecordedRun) -> Iterator[str]:
+    unknown = [name for name in run.beacon_ids if name not in run.beacon_truth_m]
+    if unknown and run.beacon_truth_m:
+        yield f"beacons without a surveyed place: {', '.join(unknown)}"
+    unheard = [name for name in run.beacon_truth_m if name not in run.beacon_ids]
+    if unheard:
+        yield f"surveyed beacons that were never heard: {', '.join(unheard)}"

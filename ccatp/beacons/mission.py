@@ -1,0 +1,398 @@
+"""A mission among beacons: from readings and the danger loop's verdict to set points. Time is an argument.
+
+States of a mission among beacons.
+
+When a mission among beacons stands, and why: commands of an operator, verdicts of the danger loop, faults.
+
+The last gate of a robot among beacons: nothing is sent that the verdict does not permit.
+
+Set points of a vehicle as wheel rates of the robot link, and a steering angle where there is one.
+
+Assembles the parts of a mission among beacons from a configuration, for the daemon and rehearsals alike.
+"""
+
+from enum import StrEnum
+from math import isfinite
+from typing import NamedTuple
+
+from ccatp.beacons.navigation import Belief, MoteNavigator, Navigator, RadioNavigator, Senses
+from ccatp.beacons.pilot import BeaconPilot
+from ccatp.beacons.steering import HALT, Drive
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.core import EventCode, Severity, Verdict
+from ccatp.errors import ConfigError
+from ccatp.links.robot_messages import Hello
+from ccatp.survey.state import Outcome
+
+
+class State(StrEnum):
+    """What the mission is at; idle, held and done mean to the danger loop that the robot stands."""
+
+    IDLE = "idle"
+    MAPPING = "mapping"  # stands while motes map themselves
+    VISITING = "visiting"  # on the way to a waypoint
+    FOLLOWING = "following"  # behind the target
+    RETURNING = "returning"  # to where it started
+    HELD = "held"
+    DONE = "done"
+
+
+IDLE, MAPPING, VISITING, FOLLOWING, RETURNING, HELD, DONE = State
+MOVING = (VISITING, FOLLOWING, RETURNING)
+
+# Nothing moves while the ground shakes.
+EARTHQUAKE = "emergency: earthquake"
+
+
+class Holding:
+    """State and causes of the mission.
+
+    Attributes:
+        state: where it stands.
+        outcome: how it ended.
+        cause: why it is held or returns.
+        abort_cause: why it was given up, or empty.
+        is_faulted: something is wrong, and an operator has to look after it.
+    """
+
+    def __init__(self) -> None:
+        """Idle."""
+        self.state: State = IDLE
+        self.outcome = Outcome.NONE
+        self.cause = self.abort_cause = ""
+        self.is_faulted = False
+        self._is_by_hand = False
+        self._bar = ""
+        self._raised = 0
+        self._severity = Severity.NONE
+
+    @property
+    def is_paused(self) -> bool:
+        """Held until somebody resumes, or says that an earthquake is over."""
+        return self.state is HELD and (self._is_by_hand or bool(self._bar))
+
+    # -- commands: each returns why it was refused, or None -------------------------------------------------------
+
+    def pause(self, cause: str) -> str | None:
+        """Hold until ``resume``."""
+        if self.state is DONE:
+            return "the mission is over"
+        self._hold(cause, by_hand=True)
+        return None
+
+    def resume(self) -> str | None:
+        """Go on after a hold; what holds the robot must be gone."""
+        if self.state is not HELD:
+            return f"the mission is not held but {self.state}"
+        if self._bar:
+            return f"{self._bar}: nothing moves until that is cleared"
+        if self._severity >= Severity.HOLD:
+            return f"the cause persists: {self.cause}"
+        self._go_on()
+        return None
+
+    def abort(self, cause: str) -> str | None:
+        """Return to where the robot started, and end there."""
+        if self.state is DONE:
+            return "the mission is over"
+        self.abort_cause = self.abort_cause or cause
+        if not self._bar:
+            self._go_on()
+            self.cause = self.abort_cause
+        return None
+
+    def stop(self) -> str | None:
+        """Hold the wheels and end here."""
+        if self.state is DONE:
+            return "the mission is over"
+        self.finish(Outcome.STOPPED)
+        return None
+
+    def fault(self, cause: str) -> None:
+        """Hold until an operator resumes, because something is wrong."""
+        if self.state is not DONE and not self.is_faulted:
+            self._hold(cause, by_hand=True)
+            self.is_faulted = True
+
+    def interrupt(self, cause: str) -> bool:
+        """Hold until frames and verdicts are fresh again; returns whether that was news."""
+        if self.state in (IDLE, HELD, DONE):
+            return False
+        self._hold(cause, by_hand=False)
+        return True
+
+    def finish(self, outcome: Outcome) -> None:
+        """The mission is over."""
+        self.state, self.outcome = DONE, outcome
+
+    # -- verdicts -------------------------------------------------------------------------------------------------
+
+    def react(self, verdict: Verdict | None) -> bool:
+        """Do what a verdict demands; whether the robot may go about its business."""
+        if self.state is DONE:
+            return False
+        if verdict is None:
+            self.interrupt("no fresh verdict from the danger loop")
+            return False
+        self._severity = verdict.severity
+        if verdict.is_shaking:
+            self._raised = verdict.raised
+            self._stand_fast()
+        else:
+            self._bar = ""
+        if verdict.severity is Severity.FAULT:
+            self.fault(verdict.cause)
+            return False
+        if verdict.is_shaking:
+            return False
+        if not (verdict.forward or verdict.reverse or verdict.turn):
+            if not self.interrupt(verdict.cause) and self.state is HELD and not self._is_by_hand:
+                self.cause = verdict.cause
+            return False
+        if verdict.code is EventCode.ABORTED and verdict.raised != self._raised:
+            self._raised = verdict.raised  # the level is repeated; what counts is that it is new
+            self.abort(verdict.cause)
+        if self.state is IDLE or (self.state is HELD and not self._is_by_hand):
+            self._go_on()
+        return self.state is not HELD
+
+    def _stand_fast(self) -> None:
+        if self._bar:
+            return
+        self._bar = EARTHQUAKE
+        self.abort_cause = self.abort_cause or EARTHQUAKE
+        self._hold(EARTHQUAKE, by_hand=self.state is HELD and self._is_by_hand)
+
+    def _hold(self, cause: str, *, by_hand: bool) -> None:
+        self.state, self.cause, self._is_by_hand = HELD, cause, by_hand
+
+    def _go_on(self) -> None:
+        """What is next is found in the next frame."""
+        self.state, self.cause = IDLE, self.abort_cause
+        self._is_by_hand = self.is_faulted = False
+
+
+def permitted(drive: Drive, verdict: Verdict, back_speed_m_s: float) -> Drive:
+    """What is left of a drive.
+
+    Where forward motion is wanted and denied, the robot backs off straight, if that is permitted: what it stands before
+    stays there, and wheels that steer cannot turn on the spot.
+
+    Args:
+        drive: wanted.
+        verdict: in force.
+        back_speed_m_s: of backing off.
+    """
+    if not all(map(isfinite, drive)):
+        return HALT
+    if drive.speed_m_s > 0.0 and not verdict.forward:
+        return Drive(-back_speed_m_s, 0.0, 0.0) if verdict.reverse else HALT
+    if drive.speed_m_s < 0.0 and not verdict.reverse:
+        return HALT
+    if not verdict.turn:
+        return Drive(drive.speed_m_s, 0.0, 0.0)
+    return drive
+
+
+class Arrival(NamedTuple):
+    """A waypoint is reached.
+
+    Attributes:
+        waypoint, lap: its number in the loop and the lap, both from 0.
+        place_m: where it is.
+        belief: where the robot believes to be.
+    """
+
+    waypoint: int
+    lap: int
+    place_m: tuple[float, float]
+    belief: Belief
+
+
+class BeaconMission(Holding):
+    """Maps and visits waypoints, or follows a radio, and returns to its start when it is given up.
+
+    Call ``step`` once per frame.
+
+    Args:
+        cfg: the configuration; nothing of ``sim`` is used.
+        navigator: knows where the robot is.
+
+    Attributes:
+        navigator: the same.
+        pilot: who drives.
+        arrivals: waypoints reached, in order.
+    """
+
+    def __init__(self, cfg: RadioConfig, navigator: Navigator) -> None:
+        """Idle at the start."""
+        super().__init__()
+        self._cfg, self.navigator = cfg, navigator
+        self.pilot = BeaconPilot(cfg)
+        self._homing: BeaconPilot | None = None
+        self.arrivals: list[Arrival] = []
+        self._begun_s: float | None = None
+        self._followed_s = 0.0
+        self._is_following = cfg.follow.is_active
+
+    @property
+    def total(self) -> int:
+        """Waypoints to be reached, or seconds to follow."""
+        mission = self._cfg.mission
+        return round(mission.follow_s) if self._is_following else mission.laps * len(self._cfg.workspace.waypoints_m)
+
+    @property
+    def done(self) -> int:
+        """Of these."""
+        return min(int(self._followed_s), self.total) if self._is_following else len(self.arrivals)
+
+    @property
+    def next_waypoint(self) -> int:
+        """Number of the waypoint driven to, -1 for none."""
+        is_visiting = not self._is_following and len(self.arrivals) < self.total
+        return len(self.arrivals) % len(self._cfg.workspace.waypoints_m) if is_visiting else -1
+
+    def step(self, senses: Senses, interval_s: float, verdict: Verdict | None) -> Drive:
+        """One frame: take its readings, react to the verdict, drive on as far as it permits.
+
+        Args:
+            senses: the frame.
+            interval_s: until the next one.
+            verdict: the danger loop's, in force; ``None`` where there is none fresh enough.
+        """
+        self.navigator.take(senses)
+        t_s = senses.t_s
+        if self._begun_s is None:
+            self._begun_s = t_s
+        if not self.react(verdict) or verdict is None:
+            return HALT
+        if t_s - self._begun_s > self._cfg.mission.time_limit_s and self.state is not IDLE and not self.abort_cause:
+            self.fault(f"the mission takes longer than mission.time_limit_s = {self._cfg.mission.time_limit_s:g}")
+            return HALT
+        drive = self._wanted(senses, interval_s)
+        return permitted(drive, verdict, self._cfg.avoidance.back_speed_m_s)
+
+    def _wanted(self, senses: Senses, interval_s: float) -> Drive:
+        if self.state is HELD:
+            return HALT
+        if self.navigator.is_mapping:
+            if self.abort_cause:
+                self.finish(Outcome.AT_BASE)  # it never left
+            else:
+                self.state = MAPPING
+            return HALT
+        if self.abort_cause:
+            return self._return(senses, interval_s)
+        pose, target = self.navigator.belief.pose, self.navigator.target(senses.t_s)
+        drive = self.pilot.drive(senses.t_s, interval_s, pose, target, self._distances(senses))
+        if self._is_following:
+            self._follow(interval_s)
+        else:
+            self._visit()
+        return HALT if self.outcome is not Outcome.NONE else drive
+
+    def _follow(self, interval_s: float) -> None:
+        self.state = FOLLOWING
+        self._followed_s += interval_s
+        if self._followed_s >= self._cfg.mission.follow_s:
+            self.finish(Outcome.COMPLETE)
+
+    def _visit(self) -> None:
+        self.state = VISITING
+        waypoints = self._cfg.workspace.waypoints_m
+        while len(self.arrivals) < min(self.pilot.waypoints.reached, self.total):
+            lap, waypoint = divmod(len(self.arrivals), len(waypoints))
+            self.arrivals.append(Arrival(waypoint, lap, waypoints[waypoint], self.navigator.belief))
+        if len(self.arrivals) >= self.total:
+            self.finish(Outcome.COMPLETE)
+
+    def _return(self, senses: Senses, interval_s: float) -> Drive:
+        self.state = RETURNING
+        if self._homing is None:
+            self._homing = _homing_pilot(self._cfg)
+        drive = self._homing.drive(senses.t_s, interval_s, self.navigator.belief.pose, None, self._distances(senses))
+        if self._homing.waypoints.current_m is None:
+            self.finish(Outcome.AT_BASE)
+            return HALT
+        return drive
+
+    def _distances(self, senses: Senses) -> tuple[float, ...]:
+        """Of sensors that told nothing in this frame, that they see nothing: what they saw before is remembered."""
+        avoidance = self._cfg.avoidance
+        return senses.distances_m or (avoidance.range_max_m,) * len(avoidance.sensors_rad)
+
+
+def _homing_pilot(cfg: RadioConfig) -> BeaconPilot:
+    """A pilot to where the robot started."""
+    base = ((cfg.start.x_m, cfg.start.y_m),)
+    workspace = cfg.workspace.model_copy(update={"waypoints_m": base, "loops": False})
+    follow = cfg.follow.model_copy(update={"is_active": False})
+    return BeaconPilot(cfg.model_copy(update={"workspace": workspace, "follow": follow}))
+
+
+class WheelRates(NamedTuple):
+    """What goes to the robot: wheel rates, rad/s, and the angle of the steered wheel, rad, ``None`` without one."""
+
+    right_rad_s: float
+    left_rad_s: float
+    steer_rad: float | None
+
+
+def wheel_rates(drive: Drive, cfg: RadioConfig) -> WheelRates:
+    """The rates whose mean is v / r and whose difference is omega b / r (b the track); steered wheels turn alike."""
+    radius_m, vehicle = cfg.robot.wheel_radius_m, cfg.vehicle
+    rate_rad_s = drive.speed_m_s / radius_m
+    if vehicle.kind == "ackermann":
+        return WheelRates(rate_rad_s, rate_rad_s, drive.steer_rad)
+    half_rad_s = 0.5 * vehicle.track_m * drive.turn_rate_rad_s / radius_m
+    return WheelRates(rate_rad_s + half_rad_s, rate_rad_s - half_rad_s, None)
+
+
+# The configuration may be calibrated, the robot's own figures are nominal: this much apart they describe two robots.
+TOLERANCE = 0.05
+TrackRow = tuple[int, float, float, float, float, float, float, float, float, float, float, float, float]
+
+
+def assemble_beacons(cfg: RadioConfig) -> BeaconMission:
+    """The mission of a configuration, the robot standing at its believed start."""
+    return BeaconMission(cfg, build_navigator(cfg))
+
+
+def build_navigator(cfg: RadioConfig) -> Navigator:
+    """What finds the robot: radios mapped on the way, or motes that map themselves first."""
+    return MoteNavigator(cfg) if cfg.system == "cricket" else RadioNavigator(cfg)
+
+
+def track_row(seq: int, t_s: float, navigator: Navigator) -> TrackRow:
+    """A row of the topic ``beacon_track``."""
+    (x, y, heading), P = navigator.belief
+    xx, xy, xh = P[0].tolist()
+    _, yy, yh = P[1].tolist()
+    return seq, t_s, x, y, heading, xx, xy, yy, xh, yh, float(P[2, 2]), *navigator.reckoned_m
+
+
+def check_beacon_robot(cfg: RadioConfig, hello: Hello) -> None:
+    """Refuse a robot whose own geometry contradicts the configuration.
+
+    Raises:
+        ConfigError: it is another robot.
+    """
+    own, vehicle = hello.robot, hello.robot.vehicle
+    if vehicle is None:
+        raise ConfigError("robot: it says nothing of its vehicle: this is no robot for missions among beacons")
+    problems = [
+        f"{name} is {ours:g} here and {theirs:g} there"
+        for name, ours, theirs in (
+            ("robot.wheel_radius_m", cfg.robot.wheel_radius_m, own.wheel_radius_m),
+            ("vehicle.track_m", cfg.vehicle.track_m, own.wheel_base_m),
+            ("vehicle.wheelbase_m", cfg.vehicle.wheelbase_m, vehicle.axle_distance_m),
+        )
+        if abs(ours - theirs) > TOLERANCE * theirs
+    ]
+    if vehicle.kind != cfg.vehicle.kind:
+        problems.append(f"vehicle.kind is {cfg.vehicle.kind} here and {vehicle.kind} there")
+    ours, theirs = cfg.avoidance.sensors_rad, vehicle.distance_sensors_rad
+    if len(ours) != len(theirs) or any(abs(a - b) > TOLERANCE for a, b in zip(ours, theirs, strict=True)):
+        problems.append("the distance sensors look elsewhere (avoidance.sensors_rad)")
+    if problems:
+        raise ConfigError(f"robot: the configuration is not of this robot: {'; '.join(problems)}")

@@ -1,0 +1,536 @@
+"""Where a robot among beacons believes to be: what its mission asks of whatever estimates that.
+
+The map that motes make of themselves before a robot drives by it: phase 1, phase 2, then what it is worth.
+
+What a frame of the link tells a robot among beacons: intervals of the wheels, scans, distances, pulses.
+
+Navigation by radios that are mapped on the way: EKF-SLAM on levels and bearings.
+
+Navigation by ultrasonic motes: they map themselves, then ranges to them carry the robot; one joint state.
+"""
+
+from collections.abc import Mapping
+from math import hypot
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from scipy.special import chdtri
+
+from ccatp.beacons.cricket.range_network import MoteRange, build_network, pair_range
+from ccatp.beacons.cricket.self_mapping import MoteMapper, mapper_settings, network_plan, printed_prior
+from ccatp.beacons.cricket.trilateration import map_by_plan
+from ccatp.beacons.pilot import TargetSight
+from ccatp.beacons.slam.motion import POSE, Pose
+from ccatp.beacons.slam.settings import new_slam, odometry_of, readings_of, scan_of, vehicle_of
+from ccatp.config.beacon_models import CricketConfig, RadioConfig
+from ccatp.core import FloatArray, WheelSample
+from ccatp.filters.ekf_slam import EkfSlam, columns_of
+from ccatp.links.beacon_messages import BeaconFrame, MoteBurst, RadioScan
+from ccatp.links.robot_messages import Sensors
+
+
+class SelfMap:
+    """Collects what motes report of each other until the map is good enough.
+
+    Phase 1 begins when every pair of its plan has been read as often as configured, phase 2 takes the readings after
+    that one by one (Patil et al., figure 8).
+
+    Args:
+        cfg: the motes, layout ``networks``; nothing of ``sim`` is used.
+
+    Attributes:
+        names: of the motes on the map, the first of each stand.
+        notes: errors that are expected after each phase, m; updates of phase 2.
+    """
+
+    def __init__(self, cfg: CricketConfig) -> None:
+        """Nothing heard."""
+        self._cfg, self._plan = cfg, network_plan(cfg)
+        names, heads = self._plan.names, self._plan.heads
+        self._index = {name: mote for mote, name in enumerate(names)}
+        self.names = tuple(names[mote] for mote in heads)
+        self._row_of = {mote: row for row, mote in enumerate(heads)}
+        self._wanted = {frozenset(pair) for pair in self._plan.phase1_pairs}
+        self._second = {frozenset(pair) for pair in self._plan.phase2_pairs}
+        self._delays: dict[frozenset[int], list[float]] = {}
+        self._temperatures: dict[frozenset[int], list[float]] = {}
+        self._mapper: MoteMapper | None = None
+        self.notes: dict[str, float] = {}
+
+    @property
+    def is_done(self) -> bool:
+        """Good enough, or as good as it gets with the readings there may be."""
+        phase2, mapper = self._cfg.phase2, self._mapper
+        if mapper is None:
+            return False
+        return mapper.expected_rms_m <= phase2.target_rms_m or self.notes["map_updates"] >= phase2.max_updates
+
+    @property
+    def places(self) -> tuple[FloatArray, FloatArray] | None:
+        """Positions (n, 2) and their joint covariance (2 n, 2 n); ``None`` before phase 1."""
+        return None if self._mapper is None else (self._mapper.positions_m, self._mapper.covariance_m2)
+
+    def take(self, burst: MoteBurst) -> None:
+        """A pulse from one mote to another; those of others are none of ours.
+
+        Raises:
+            MappingError: phase 1 cannot be made of these ranges.
+            TdoaError: a delay or a temperature that none can be.
+        """
+        first, second = self._index.get(burst.sender), self._index.get(burst.listener)
+        if first is None or second is None or self.is_done:
+            return
+        pair = frozenset((first, second))
+        if self._mapper is not None:
+            self._refine(self._mapper, pair, burst)
+        elif pair in self._wanted:
+            self._delays.setdefault(pair, []).extend(burst.delays_s)
+            self._temperatures.setdefault(pair, []).extend([burst.temperature_c] * len(burst.delays_s))
+            repeats = self._cfg.ranging.repeats
+            if all(len(self._delays.get(wanted, ())) >= repeats for wanted in self._wanted):
+                self._mapper = self._lay_out()
+
+    def _lay_out(self) -> MoteMapper:
+        """Phase 1: trilateration; then the prior of phase 2."""
+        cfg, plan = self._cfg, self._plan
+        rows: list[MoteRange] = []
+        for i, j in plan.phase1_pairs:
+            pair = frozenset((i, j))
+            temperature_c = float(np.mean(self._temperatures[pair]))
+            rows.append(pair_range(cfg, (plan.names[i], plan.names[j]), self._delays[pair], temperature_c))
+        laid = map_by_plan(plan, build_network(rows, plan.dimension, plan.names), cfg.phase1.max_dop, cfg.phase1.draws)
+        motes, d = list(plan.heads), plan.dimension
+        at = (np.array(motes)[:, None] * d + np.arange(d)).ravel()
+        known, covariance = plan.surveyed_m[motes], laid.covariance_m2[np.ix_(at, at)]
+        mean = (laid.positions_m + laid.bias_m)[motes]
+        if cfg.phase2.prior == "printed":
+            fixed = np.flatnonzero(np.isfinite(known.ravel())).tolist()
+            covariance = printed_prior(len(motes), d, fixed, cfg.phase2.printed_variance_m2)
+        mapper = MoteMapper(mean, covariance, mapper_settings(cfg), known)
+        self.notes = {"map_phase1_expected_m": mapper.expected_rms_m, "map_updates": 0.0}
+        self._note(mapper)
+        return mapper
+
+    def _refine(self, mapper: MoteMapper, pair: frozenset[int], burst: MoteBurst) -> None:
+        """Phase 2: each distance between first motes of two stands corrects the places of both."""
+        if pair not in self._second:
+            return
+        i, j = sorted(pair)
+        for delay_s in burst.delays_s:
+            reading = pair_range(self._cfg, (burst.sender, burst.listener), [delay_s], burst.temperature_c)
+            mapper.observe(self._row_of[i], self._row_of[j], reading.range_m, reading.sigma_m)
+            self.notes["map_updates"] += 1.0
+        self._note(mapper)
+
+    def _note(self, mapper: MoteMapper) -> None:
+        self.notes["map_expected_m"] = mapper.expected_rms_m
+
+
+_EPSILON_S = 1e-9  # an interval shorter than this is none
+
+
+class WheelInterval(NamedTuple):
+    """Odometry of an interval.
+
+    Attributes:
+        end_s: its end, robot time.
+        interval_s: its length.
+        speed_m_s: mean speed.
+        steer_rad: steering angle to the left; of a steered vehicle.
+        turn_rate_rad_s: turn rate to the left; of a differential drive.
+    """
+
+    end_s: float
+    interval_s: float
+    speed_m_s: float
+    steer_rad: float
+    turn_rate_rad_s: float
+
+
+class ScanReading(NamedTuple):
+    """One answer of a radio while the reflector pointed somewhere."""
+
+    beacon: str
+    direction_rad: float
+    rssi_dbm: float
+
+
+class Sighting(NamedTuple):
+    """A radio heard from somewhere."""
+
+    beacon: str
+    rssi_dbm: float
+    bearing_rad: float | None
+
+
+class Senses(NamedTuple):
+    """A frame as a mission takes it.
+
+    Attributes:
+        t_s: its time.
+        wheels: since the last frame, without gaps; empty where nothing is known of them.
+        packets: of a scan that is to be read.
+        sightings: scans that were read already.
+        distances_m: of the distance sensors; empty without a reading.
+        motes: pulses heard.
+    """
+
+    t_s: float
+    wheels: tuple[WheelInterval, ...]
+    packets: tuple[ScanReading, ...]
+    sightings: tuple[Sighting, ...]
+    distances_m: tuple[float, ...]
+    motes: tuple[MoteBurst, ...]
+
+    @property
+    def heard(self) -> frozenset[str]:
+        """Radios of which anything was heard."""
+        return frozenset([*(one.beacon for one in self.packets), *(one.beacon for one in self.sightings)])
+
+
+class SenseReader:
+    """Reads one frame after the other.
+
+    Args:
+        cfg: wheels and vehicle.
+    """
+
+    def __init__(self, cfg: RadioConfig) -> None:
+        """Before the first frame."""
+        self._radius_m, self._track_m = cfg.robot.wheel_radius_m, cfg.vehicle.track_m
+        self._read_to_s: float | None = None
+        self._steer_rad = 0.0
+
+    def forget(self) -> None:
+        """The robot's clock counts anew."""
+        self._read_to_s = None
+
+    def read(self, sensors: Sensors, extras: BeaconFrame) -> Senses:
+        """The senses of a frame; each wheel sample stands for the time since the one before."""
+        if self._read_to_s is None:
+            self._read_to_s = sensors.t
+        steering = {sample.t_s: sample.steer_rad for sample in extras.steer}
+        wheels = [self._interval(sample, steering) for sample in sensors.enc]
+        return Senses(
+            sensors.t,
+            tuple(one for one in wheels if one is not None),
+            _packets(extras.scan),
+            tuple(Sighting(one.beacon, one.rssi_dbm, one.bearing_rad) for one in extras.radio),
+            tuple(extras.distances),
+            tuple(extras.motes),
+        )
+
+    def _interval(self, sample: WheelSample, steering: dict[float, float]) -> WheelInterval | None:
+        self._steer_rad = steering.get(sample.t_s, self._steer_rad)
+        right, left = sample.right_rad_s, sample.left_rad_s
+        before_s = sample.t_s if self._read_to_s is None else self._read_to_s
+        interval_s = sample.t_s - before_s
+        if right is None or left is None or interval_s < _EPSILON_S:
+            return None  # the next sample stands for this time, too
+        self._read_to_s = sample.t_s
+        speed_m_s = 0.5 * self._radius_m * (right + left)
+        rate_rad_s = self._radius_m * (right - left) / self._track_m
+        return WheelInterval(sample.t_s, interval_s, speed_m_s, self._steer_rad, rate_rad_s)
+
+
+def _packets(scan: RadioScan | None) -> tuple[ScanReading, ...]:
+    if scan is None:
+        return ()
+    return tuple(
+        ScanReading(beacon, index * scan.step, level)
+        for beacon, levels in scan.levels.items()
+        for index, level in enumerate(levels)
+        if level is not None
+    )
+
+
+def distance_m(a: tuple[float, ...], b: tuple[float, ...]) -> float:
+    """Between two places (x, y, ...)."""
+    return hypot(a[0] - b[0], a[1] - b[1])
+
+
+Ellipse = tuple[float, float, float, float, float]
+
+
+class Belief(NamedTuple):
+    """What is believed now.
+
+    Attributes:
+        pose: x m, y m, heading rad (continuous).
+        covariance: of these, shape (3, 3).
+    """
+
+    pose: tuple[float, float, float]
+    covariance: FloatArray
+
+    @property
+    def ellipse(self) -> Ellipse:
+        """x, y and their covariance xx, xy, yy."""
+        P = self.covariance
+        return self.pose[0], self.pose[1], float(P[0, 0]), float(P[0, 1]), float(P[1, 1])
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the position in its worst direction."""
+        xx, xy, yy = self.ellipse[2:]
+        middle, spread = 0.5 * (xx + yy), (0.25 * (xx - yy) ** 2 + xy * xy) ** 0.5
+        return float(max(middle + spread, 0.0) ** 0.5)
+
+
+class Score(NamedTuple):
+    """How the readings agree with what was expected of them, all so far.
+
+    Attributes:
+        nis_sum: sum of the normalised innovations squared.
+        nis_size: sum of their degrees of freedom.
+        refused: readings that the gate refused; not in the sums.
+    """
+
+    nis_sum: float
+    nis_size: int
+    refused: int
+
+
+class Navigator(Protocol):
+    """Estimates pose and beacons."""
+
+    @property
+    def is_mapping(self) -> bool:
+        """It needs the robot to stand: there is no map yet to drive by."""
+
+    @property
+    def belief(self) -> Belief:
+        """Of the robot."""
+
+    @property
+    def reckoned_m(self) -> tuple[float, float]:
+        """Where dead reckoning alone would see it."""
+
+    @property
+    def beacons(self) -> Mapping[str, Ellipse]:
+        """The map."""
+
+    @property
+    def score(self) -> Score:
+        """Consistency so far."""
+
+    @property
+    def notes(self) -> Mapping[str, float]:
+        """What there is to say of the map."""
+
+    def target(self, t_s: float) -> TargetSight | None:
+        """What is believed of the radio that is followed, at a time; ``None`` before it was heard."""
+
+    def take(self, senses: Senses) -> None:
+        """Take the readings of a frame.
+
+        Raises:
+            CcatpError: they make no map, and never will.
+        """
+
+
+def ellipse_of(mean: FloatArray, covariance: FloatArray) -> Ellipse:
+    """x, y and their covariance of a place, shapes (2+,) and (2+, 2+)."""
+    return (
+        float(mean[0]),
+        float(mean[1]),
+        float(covariance[0, 0]),
+        float(covariance[0, 1]),
+        float(covariance[1, 1]),
+    )
+
+
+class RadioNavigator:
+    """Hosts ``SignalSlam``.
+
+    Args:
+        cfg: the configuration; nothing of ``sim`` is used.
+    """
+
+    is_mapping = False  # the map grows while the robot drives
+
+    def __init__(self, cfg: RadioConfig) -> None:
+        """At the believed start."""
+        self._cfg, self._scan = cfg, scan_of(cfg)
+        self._target = cfg.follow.target
+        self.slam = new_slam(cfg)
+        self._motion = vehicle_of(cfg)
+        self._reckoned = np.zeros(self._motion.size)
+        self._reckoned[:POSE] = Pose(cfg.start.x_m, cfg.start.y_m, cfg.start.heading_rad)
+        self._heard_s: float | None = None
+        self._score = Score(0.0, 0, 0)
+
+    @property
+    def belief(self) -> Belief:
+        """Of the robot."""
+        x_m, y_m, heading_rad = self.slam.pose
+        return Belief((x_m, y_m, heading_rad), self.slam.pose_covariance)
+
+    @property
+    def reckoned_m(self) -> tuple[float, float]:
+        """Where dead reckoning alone would see it."""
+        return float(self._reckoned[0]), float(self._reckoned[1])
+
+    @property
+    def beacons(self) -> Mapping[str, Ellipse]:
+        """The map, the target among the radios."""
+        return {str(name): ellipse_of(found.mean, found.covariance) for name, found in self.slam.beacons.items()}
+
+    @property
+    def score(self) -> Score:
+        """Consistency so far."""
+        return self._score
+
+    @property
+    def notes(self) -> Mapping[str, float]:
+        """What the vehicle's calibration is believed to be."""
+        return {name: mean for name, (mean, _) in self.slam.calibration.items()}
+
+    def target(self, t_s: float) -> TargetSight | None:
+        """What is believed of the radio that is followed."""
+        estimate = self.slam.beacons.get(self._target)
+        if estimate is None or self._heard_s is None:
+            return None
+        x_m, y_m = estimate.mean[:2].tolist()
+        sigma_m = self.slam.distance(self._target)[1]
+        return TargetSight((x_m, y_m), sigma_m, t_s - self._heard_s, self.slam.moving_velocity_m_s)
+
+    def take(self, senses: Senses) -> None:
+        """Predict over the wheels' intervals, then take what was heard."""
+        for wheels in senses.wheels:
+            odometry = odometry_of(self._cfg, wheels.end_s, wheels)
+            self.slam.predict(odometry)
+            self._reckoned[:POSE] = self._motion.step(self._reckoned, odometry).mean[:POSE]
+        readings = readings_of(senses.t_s, [*self._scan.results(senses.packets), *senses.sightings])
+        learned = self.slam.observe(readings)
+        used = [one for one in learned if one.accepted]
+        self._score = Score(
+            self._score.nis_sum + sum(one.nis for one in used),
+            self._score.nis_size + sum(one.size for one in used),
+            self._score.refused + len(learned) - len(used),
+        )
+        if any(reading.beacon == self._target for reading in readings):
+            self._heard_s = senses.t_s
+
+
+_PLACE = 2
+_NEAREST_M = 0.02  # nearer than that a range has no direction
+
+
+class MoteNavigator:
+    """An EKF over the robot and all motes of the map.
+
+    State: pose and its calibration, then the motes. The map joins with the joint covariance that its self-mapping left,
+    so that its errors, which hang together, count as such: ranges correct the robot as far as the map is known, and
+    the map as far as the robot is. A range is z = |p - m| + noise.
+
+    Args:
+        cfg: the configuration; nothing of ``sim`` is used.
+    """
+
+    def __init__(self, cfg: RadioConfig) -> None:
+        """At the believed start, without a map."""
+        start = cfg.start
+        self._cfg, self._motion = cfg, vehicle_of(cfg)
+        self._self_map = SelfMap(cfg.cricket)
+        self._gate = float(chdtri(1, 1.0 - cfg.listener.gate_probability))
+        v = self._motion.size
+        mean, sigmas = np.zeros(v), np.zeros(v)
+        mean[:POSE] = Pose(start.x_m, start.y_m, start.heading_rad)
+        sigmas[:POSE] = start.position_sigma_m, start.position_sigma_m, start.heading_sigma_rad
+        sigmas[POSE:] = self._motion.prior_sigmas
+        self._filter = EkfSlam(mean, np.diag(sigmas**2))
+        self._reckoned = mean.copy()
+        self._place_of: dict[str, int] = {}
+        self._score = Score(0.0, 0, 0)
+
+    @property
+    def is_mapping(self) -> bool:
+        """The motes have no map of themselves yet."""
+        return not self._place_of
+
+    @property
+    def belief(self) -> Belief:
+        """Of the robot."""
+        x_m, y_m, heading_rad = self._filter.mean[:POSE].tolist()
+        return Belief((x_m, y_m, heading_rad), self._filter.covariance[:POSE, :POSE].copy())
+
+    @property
+    def reckoned_m(self) -> tuple[float, float]:
+        """Where dead reckoning alone would see it."""
+        return float(self._reckoned[0]), float(self._reckoned[1])
+
+    @property
+    def beacons(self) -> Mapping[str, Ellipse]:
+        """The map; before the robot has one, what the motes have of it."""
+        if self._place_of:
+            mean, P, at = self._filter.mean, self._filter.covariance, self._place_of
+        else:
+            places = self._self_map.places
+            if places is None:
+                return {}
+            mean, P = places[0].ravel(), places[1]
+            at = {name: _PLACE * row for row, name in enumerate(self._self_map.names)}
+        return {name: ellipse_of(mean[i : i + _PLACE], P[i : i + _PLACE, i : i + _PLACE]) for name, i in at.items()}
+
+    @property
+    def score(self) -> Score:
+        """Consistency of the robot's ranges so far."""
+        return self._score
+
+    @property
+    def notes(self) -> Mapping[str, float]:
+        """How well the map is known."""
+        return self._self_map.notes
+
+    def target(self, _t_s: float) -> TargetSight | None:
+        """Nothing is followed."""
+        return None
+
+    def take(self, senses: Senses) -> None:
+        """Predict over the wheels' intervals, then take what was heard.
+
+        Raises:
+            MappingError: the motes cannot be mapped.
+            TdoaError: a delay or a temperature that none can be.
+        """
+        motion, state = self._motion, self._filter
+        for wheels in senses.wheels:
+            odometry = odometry_of(self._cfg, wheels.end_s, wheels)
+            step = motion.step(state.mean[: state.vehicle_size], odometry)
+            state.predict(step.mean, step.F, step.Q)
+            self._reckoned = motion.step(self._reckoned, odometry).mean
+        for burst in senses.motes:
+            if burst.listener == self._cfg.listener.name:
+                self._range(burst)
+            elif self.is_mapping:
+                self._self_map.take(burst)
+        if self.is_mapping and self._self_map.is_done and self._self_map.places is not None:
+            self._join(*self._self_map.places)
+            self._self_map.notes["map_time_s"] = senses.t_s
+
+    def _join(self, positions_m: FloatArray, covariance_m2: FloatArray) -> None:
+        """The map becomes part of the state, as one block; nothing ties it to the robot yet."""
+        none = np.empty(0, dtype=np.intp)
+        size = positions_m.size
+        self._filter.augment("map", positions_m.ravel(), none, np.zeros((size, 0)), np.eye(size), covariance_m2)
+        start = self._filter.block("map").start
+        self._place_of = {name: start + _PLACE * row for row, name in enumerate(self._self_map.names)}
+
+    def _range(self, burst: MoteBurst) -> None:
+        at = self._place_of.get(burst.sender)
+        if at is None or not burst.delays_s:
+            return
+        reading = pair_range(self._cfg.cricket, (burst.sender, burst.listener), burst.delays_s, burst.temperature_c)
+        columns = columns_of(range(_PLACE), range(at, at + _PLACE))
+        x, y, mx, my = self._filter.mean.take(columns).tolist()
+        r = max(hypot(x - mx, y - my), _NEAREST_M)
+        ux, uy = (x - mx) / r, (y - my) / r
+        found = self._filter.update_row(
+            columns, np.array((ux, uy, -ux, -uy)), reading.range_m - r, reading.sigma_m**2, self._gate
+        )
+        nis_sum, nis_size, refused = self._score
+        if found.accepted:
+            self._score = Score(nis_sum + found.nis, nis_size + 1, refused)
+        else:
+            self._score = Score(nis_sum, nis_size, refused + 1)

@@ -1,0 +1,440 @@
+"""Who decides where a robot among beacons drives next: waypoints or the target, round the obstacles.
+
+Following a moving target at a safe distance: approach, hold, back off, and what to do when it is lost.
+
+Going round obstacles: a short memory of what the distance sensors saw; the free heading nearest to the aim.
+
+Getting away from what comes near without touching what stands about: the best of a fan of short arcs.
+"""
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from enum import StrEnum
+from math import asin, cos, hypot, inf, pi, sin, tau
+from typing import NamedTuple
+
+from ccatp.beacons.steering import HALT, Aim, Drive, Driver, PlanarPose, Point, WaypointList, aim_at
+from ccatp.config.beacon_models import AvoidanceConfig, FollowConfig, RadioConfig
+from ccatp.core import bearing, wrap_pi
+
+_NEAREST_M = 0.02  # nearer than that a direction means nothing
+
+
+class FollowState(StrEnum):
+    """What a follower is doing."""
+
+    LOST = "lost"  # not heard for too long, or never: stands
+    APPROACHING = "approaching"
+    HOLDING = "holding"  # within the band round the safe distance: stands
+    BACKING = "backing"  # too near
+
+
+class TargetSight(NamedTuple):
+    """What is believed of the target.
+
+    Attributes:
+        position_m: where it is.
+        sigma_m: standard deviation of its distance.
+        unheard_s: since it was last heard.
+        velocity_m_s: how it moves.
+    """
+
+    position_m: Point
+    sigma_m: float
+    unheard_s: float
+    velocity_m_s: Point = (0.0, 0.0)
+
+
+class Follower:
+    """Keeps a safe distance from a point that moves.
+
+    The distance to keep grows by the uncertainty of the target along the line of sight, so a robot that knows little
+    stays away, and by what the target will have come nearer in a moment. It is a limit from below: a target that is
+    nearer is backed off from until it is a band farther; one that is farther than two bands beyond is approached until
+    it is one band beyond; in between the robot stands. So noise does not switch its state.
+
+    Attributes:
+        state: what it is doing.
+
+    Args:
+        cfg: distances and time-out.
+        driver: what turns an aim into set points.
+    """
+
+    def __init__(self, cfg: FollowConfig, driver: Driver) -> None:
+        self._cfg = cfg
+        self._driver = driver
+        self.state = FollowState.LOST
+        self._sight: Aim | None = None
+
+    def aim(self, pose: PlanarPose, target: TargetSight | None) -> Aim | None:
+        """What is left to go, and decides what to do; None while nothing is to be approached.
+
+        Args:
+            pose: x m, y m, heading rad.
+            target: what is believed of it; None before it was first heard.
+        """
+        self._sight = None
+        if target is None or target.unheard_s > self._cfg.lost_after_s:
+            self.state = FollowState.LOST
+            return None
+        self._sight = aim_at(pose, target.position_m)
+        cfg = self._cfg
+        closing_m = cfg.foresight_s * _closing_m_s(pose, target)
+        # at most as much again: who stays away from what he does not know learns nothing of it
+        margin_m = min(cfg.margin_sigmas * target.sigma_m, cfg.safe_distance_m)
+        left_m = self._sight.distance_m - cfg.safe_distance_m - margin_m - closing_m
+        self.state = self._next_state(left_m)
+        if self.state is not FollowState.APPROACHING:
+            return None
+        return Aim(max(left_m - cfg.band_m, 0.0), self._sight.error_rad)
+
+    def stay(self) -> Drive:
+        """Set points while nothing is to be approached: back off, turn to the target, or stand."""
+        self._driver.reset()
+        if self._sight is None:
+            return HALT
+        if self.state is FollowState.BACKING:
+            return self._driver.away(self._cfg.back_speed_m_s, self._sight.error_rad)
+        return self._driver.face(self._sight.error_rad)
+
+    def _next_state(self, left_m: float) -> FollowState:
+        band_m = self._cfg.band_m
+        if left_m > 2.0 * band_m or (left_m > band_m and self.state is FollowState.APPROACHING):
+            return FollowState.APPROACHING
+        if left_m < 0.0 or (left_m < band_m and self.state is FollowState.BACKING):
+            return FollowState.BACKING
+        return FollowState.HOLDING
+
+
+def _closing_m_s(pose: PlanarPose, target: TargetSight) -> float:
+    """How fast the target comes nearer by its own motion; 0 if it goes away."""
+    dx_m, dy_m = pose[0] - target.position_m[0], pose[1] - target.position_m[1]
+    vx, vy = target.velocity_m_s
+    return max(0.0, (vx * dx_m + vy * dy_m) / max(hypot(dx_m, dy_m), _NEAREST_M))
+
+
+_AHEAD_RAD = pi / 3.0  # what lies within this of the course is in the way of the body
+
+
+class _Echo(NamedTuple):
+    time_s: float
+    x_m: float
+    y_m: float
+
+
+class Way(NamedTuple):
+    """What the obstacles leave of an aim.
+
+    Attributes:
+        aim: changed where something stands in the way.
+        speed_factor: 1 far from everything, 0 where nothing but standing is safe.
+        is_blocked: no heading is free.
+        nearest_m: distance to the nearest obstacle that is remembered; infinite without one.
+    """
+
+    aim: Aim
+    speed_factor: float
+    is_blocked: bool
+    nearest_m: float
+
+
+class ObstacleAvoider:
+    """Chooses the free heading nearest to the aim, after Borenstein and Koren's vector field histogram (1991).
+
+    Echoes are kept as points in the room for a while, because a few sensors look past what stands between them. A point
+    at distance d blocks the headings within asin((radius + margin) / d) of its own. Of the free ones that heading is
+    taken whose distance from the aim, and a tenth of that from straight ahead, is least: that keeps to one side.
+
+    Args:
+        cfg: sensors and distances.
+        radius_m: of the circle round the vehicle's body.
+    """
+
+    def __init__(self, cfg: AvoidanceConfig, radius_m: float) -> None:
+        self._cfg = cfg
+        self._reach_m = radius_m + cfg.margin_m
+        self._echoes: deque[_Echo] = deque()
+
+    def see(self, time_s: float, pose: PlanarPose, distances_m: Sequence[float]) -> None:
+        """Remember what the sensors show, and forget what is old.
+
+        Args:
+            time_s: now.
+            pose: x m, y m, heading rad.
+            distances_m: in the order of the configured sensors.
+        """
+        while self._echoes and time_s - self._echoes[0].time_s > self._cfg.memory_s:
+            self._echoes.popleft()
+        for direction_rad, distance_m in zip(self._cfg.sensors_rad, distances_m, strict=True):
+            if distance_m < min(self._cfg.range_max_m, 2.0 * self._cfg.influence_m):
+                course_rad = pose[2] + direction_rad
+                self._echoes.append(
+                    _Echo(time_s, pose[0] + distance_m * cos(course_rad), pose[1] + distance_m * sin(course_rad))
+                )
+
+    def way(self, pose: PlanarPose, aim: Aim) -> Way:
+        """What is left of an aim at a pose."""
+        near = list(self._near(pose))
+        nearest_m = min((distance_m for distance_m, _ in near), default=inf)
+        # What stands behind the aim is not in the way to it.
+        near = [echo for echo in near if echo[0] - self._reach_m < aim.distance_m]
+        blocked = [(wrap_pi(angle_rad), asin(min(1.0, self._reach_m / max(d, 1e-6)))) for d, angle_rad in near]
+        error_rad = self._free_heading(aim.error_rad, blocked)
+        if error_rad is None:
+            return Way(aim, 0.0, True, nearest_m)
+        return Way(Aim(aim.distance_m, error_rad), self._speed_factor(near), False, nearest_m)
+
+    def clear_m(self, pose: PlanarPose, direction_rad: float) -> float:
+        """Distance to the nearest remembered obstacle in the way of a body that moves in a direction, m.
+
+        Args:
+            pose: x m, y m, heading rad.
+            direction_rad: of the motion, left of the heading: 0 forwards, pi backwards.
+        """
+        in_way = (d for d, angle_rad in self._near(pose) if abs(wrap_pi(angle_rad - direction_rad)) < _AHEAD_RAD)
+        return min(in_way, default=inf)
+
+    def points_m(self) -> list[Point]:
+        """What is remembered, in the room."""
+        return [(echo.x_m, echo.y_m) for echo in self._echoes]
+
+    def _near(self, pose: PlanarPose) -> Iterator[tuple[float, float]]:
+        for echo in self._echoes:
+            dx_m, dy_m = echo.x_m - pose[0], echo.y_m - pose[1]
+            distance_m = hypot(dx_m, dy_m)
+            if distance_m < self._cfg.influence_m:
+                yield distance_m, bearing(dx_m, dy_m) - pose[2]
+
+    def _free_heading(self, wanted_rad: float, blocked: Sequence[tuple[float, float]]) -> float | None:
+        def is_free(heading_rad: float) -> bool:
+            return all(abs(wrap_pi(heading_rad - at_rad)) >= half_rad for at_rad, half_rad in blocked)
+
+        if is_free(wanted_rad):
+            return wanted_rad
+        headings = (wrap_pi(k * tau / self._cfg.directions) for k in range(self._cfg.directions))
+        free = [heading_rad for heading_rad in headings if is_free(heading_rad)]
+        return min(free, key=lambda h: abs(wrap_pi(h - wanted_rad)) + 0.1 * abs(h), default=None)
+
+    def _speed_factor(self, near: Sequence[tuple[float, float]]) -> float:
+        """Of what lies ahead: 1 at the edge of influence, 0 at the distance to stop."""
+        cfg = self._cfg
+        ahead_m = min((d for d, angle_rad in near if abs(wrap_pi(angle_rad)) < _AHEAD_RAD), default=cfg.influence_m)
+        return max(0.0, min(1.0, (ahead_m - cfg.stop_m) / (cfg.influence_m - cfg.stop_m)))
+
+
+_STEPS = 6  # of an arc, where distances are looked at
+_CURVES = (0.0, -0.3, 0.3, -0.6, 0.6, -1.0, 1.0)  # shares of the largest steering
+_COURSES = 24  # of a vehicle that turns on the spot
+_TURN_S = 1.0  # it turns by what is left in that time ...
+_STRAIGHT_RAD = 0.3  # ... and goes when less is left
+_KEEPING = 0.03  # metres that an arc in the direction of the last one may gain less than another
+
+
+class _Arc(NamedTuple):
+    drive: Drive
+    places: list[Point]
+
+
+class Retreat:
+    """A dynamic window over arcs forwards and backwards (Fox, Burgard, Thrun 1997).
+
+    Of a vehicle that turns on the spot over courses, each after its turn. One is possible if the vehicle stays in the
+    room, and keeps ``avoidance.stop_m`` from everything that the sensors have seen or, where it is nearer already, does
+    not come nearer. Of these it takes the one after which the threat, going on as it goes, is farthest; where none
+    gains anything it stands.
+
+    Args:
+        cfg: vehicle, workspace, follow and avoidance are used.
+    """
+
+    def __init__(self, cfg: RadioConfig) -> None:
+        self._cfg = cfg
+        self._last = 0.0
+
+    def drive(
+        self, pose: PlanarPose, threat_m: Point, threat_velocity_m_s: Point, obstacles_m: Sequence[Point]
+    ) -> Drive:
+        """Set points for the next interval.
+
+        Args:
+            pose: x m, y m, heading rad.
+            threat_m: where it is.
+            threat_velocity_m_s: how it moves.
+            obstacles_m: points in the room that the sensors have seen.
+        """
+        horizon_s = self._cfg.follow.retreat_s
+        vx, vy = threat_velocity_m_s
+        path = [(threat_m[0] + vx * t_s, threat_m[1] + vy * t_s) for t_s in _times_s(horizon_s)]
+        best, gain_m = HALT, _far(pose[:2], path[-1])
+        for arc in self._arcs(pose, horizon_s):
+            if not self._is_free(pose[:2], arc.places, obstacles_m):
+                continue
+            far_m = _far(arc.places[-1], path[-1])
+            if arc.drive.speed_m_s * self._last > 0.0:
+                far_m += _KEEPING
+            if far_m > gain_m:
+                best, gain_m = arc.drive, far_m
+        self._last = best.speed_m_s
+        return best
+
+    def _arcs(self, pose: PlanarPose, horizon_s: float) -> Iterator[_Arc]:
+        speed_m_s = min(self._cfg.follow.back_speed_m_s, self._cfg.vehicle.speed_max_m_s)
+        if self._cfg.vehicle.kind == "ackermann":
+            for signed_m_s in (-speed_m_s, speed_m_s):
+                for curve in _CURVES:
+                    drive = Drive(signed_m_s, curve * self._cfg.vehicle.steer_max_rad, 0.0)
+                    yield _Arc(drive, self._places(pose, drive, horizon_s))
+            return
+        for k in range(_COURSES):
+            yield self._straight(pose, wrap_pi(pi + k * tau / _COURSES), speed_m_s, horizon_s)
+
+    def _places(self, pose: PlanarPose, drive: Drive, horizon_s: float) -> list[Point]:
+        """Along the arc of wheels that steer."""
+        x_m, y_m, heading_rad = pose
+        interval_s = horizon_s / _STEPS
+        turn_rad = interval_s * drive.speed_m_s * sin(drive.steer_rad) / self._cfg.vehicle.wheelbase_m
+        places = []
+        for _ in range(_STEPS):
+            course_rad = heading_rad + 0.5 * turn_rad + drive.steer_rad
+            x_m += interval_s * drive.speed_m_s * cos(course_rad)
+            y_m += interval_s * drive.speed_m_s * sin(course_rad)
+            heading_rad += turn_rad
+            places.append((x_m, y_m))
+        return places
+
+    def _straight(self, pose: PlanarPose, course_rad: float, speed_m_s: float, horizon_s: float) -> _Arc:
+        """A turn on the spot and then straight on, forwards or backwards, by which the turn is less."""
+        is_back = abs(course_rad) > pi / 2.0
+        error_rad = wrap_pi(course_rad - pi) if is_back else course_rad
+        most_rad_s = self._cfg.vehicle.turn_rate_max_rad_s
+        delay_s = abs(error_rad) / most_rad_s
+        rate_rad_s = max(-most_rad_s, min(most_rad_s, error_rad / _TURN_S))
+        goes = abs(error_rad) < _STRAIGHT_RAD
+        along_rad = pose[2] + course_rad
+        ways_m = [speed_m_s * max(0.0, t_s - delay_s) for t_s in _times_s(horizon_s)]
+        places = [(pose[0] + way_m * cos(along_rad), pose[1] + way_m * sin(along_rad)) for way_m in ways_m]
+        return _Arc(Drive((-speed_m_s if is_back else speed_m_s) * goes, 0.0, rate_rad_s), places)
+
+    def _is_free(self, start_m: Point, places: Sequence[Point], obstacles_m: Sequence[Point]) -> bool:
+        margin_m = self._cfg.avoidance.stop_m
+        nearest_m = min((_far(start_m, obstacle) for obstacle in obstacles_m), default=inf)
+        for place in places:
+            if any(_far(place, obstacle) < min(margin_m, nearest_m) for obstacle in obstacles_m):
+                return False
+        size = self._cfg.workspace.size_m
+        return all(min(0.0, start_m[k]) <= places[-1][k] <= max(size[k], start_m[k]) for k in range(2))
+
+
+def _times_s(horizon_s: float) -> list[float]:
+    return [horizon_s * (k + 1) / _STEPS for k in range(_STEPS)]
+
+
+def _far(a: Point, b: Point) -> float:
+    return hypot(a[0] - b[0], a[1] - b[1])
+
+
+class PilotState(StrEnum):
+    """What the pilot is doing."""
+
+    VISITING = "visiting"  # on the way to a waypoint
+    ARRIVED = "arrived"  # all waypoints reached: stands
+    FOLLOWING = "following"  # see ``FollowState``
+    AVOIDING = "avoiding"  # off its course to get round something
+    ESCAPING = "escaping"  # backs off from what stands too near ahead
+
+
+class BeaconPilot:
+    """Turns a pose, a target and the distance sensors into set points, step by step.
+
+    Attributes:
+        state: what it is doing.
+        waypoints: how far the loop of waypoints is.
+        follower: what it does about the target, where one is followed.
+
+    Args:
+        cfg: workspace, vehicle, control, follow and avoidance are used.
+
+    Raises:
+        FuzzyGapError: the rules leave a gap.
+    """
+
+    def __init__(self, cfg: RadioConfig) -> None:
+        self._cfg = cfg
+        self._driver = Driver(cfg.control, cfg.vehicle)
+        self._avoider = ObstacleAvoider(cfg.avoidance, cfg.vehicle.radius_m)
+        self._escapes_until_s = 0.0
+        self.waypoints = WaypointList(
+            cfg.workspace.waypoints_m, cfg.control.arrival_radius_m, loops=cfg.workspace.loops
+        )
+        self.follower = Follower(cfg.follow, self._driver)
+        self._retreat = Retreat(cfg)
+        self.state = PilotState.VISITING
+
+    def drive(
+        self,
+        time_s: float,
+        interval_s: float,
+        pose: PlanarPose,
+        target: TargetSight | None,
+        distances_m: Sequence[float],
+    ) -> Drive:
+        """Set points for the next interval.
+
+        Args:
+            time_s: now.
+            interval_s: the interval.
+            pose: x m, y m, heading rad.
+            target: what is believed of the target; None without one.
+            distances_m: of the distance sensors.
+        """
+        aim = self._aim(pose, target)
+        if not self._cfg.avoidance.is_active:
+            return self._without_obstacles(aim, interval_s)
+        self._avoider.see(time_s, pose, distances_m)
+        if target is not None and self._cfg.follow.is_active and self.follower.state is FollowState.BACKING:
+            self._driver.reset()
+            return self._retreat.drive(pose, target.position_m, target.velocity_m_s, self._avoider.points_m())
+        if time_s < self._escapes_until_s:
+            return self._held(pose, self._escape())
+        if aim is None:
+            return self._held(pose, self._without_obstacles(aim, interval_s))
+        way = self._avoider.way(pose, aim)
+        if way.is_blocked or way.speed_factor <= 0.0:
+            self._escapes_until_s = time_s + self._cfg.avoidance.back_time_s
+            return self._held(pose, self._escape())
+        return self._round(aim, way, interval_s)
+
+    def _aim(self, pose: PlanarPose, target: TargetSight | None) -> Aim | None:
+        if self._cfg.follow.is_active:
+            self.state = PilotState.FOLLOWING
+            return self.follower.aim(pose, target)
+        reached = self.waypoints.reached
+        goal_m = self.waypoints.visit(pose)
+        if self.waypoints.reached != reached:
+            self._driver.reset()
+        self.state = PilotState.ARRIVED if goal_m is None else PilotState.VISITING
+        return None if goal_m is None else aim_at(pose, goal_m)
+
+    def _without_obstacles(self, aim: Aim | None, interval_s: float) -> Drive:
+        if aim is not None:
+            return self._driver.drive(aim, interval_s)
+        return self.follower.stay() if self._cfg.follow.is_active else HALT
+
+    def _round(self, aim: Aim, way: Way, interval_s: float) -> Drive:
+        if way.aim.error_rad != aim.error_rad:
+            self.state = PilotState.AVOIDING
+        found = self._driver.drive(way.aim, interval_s)
+        return found._replace(speed_m_s=found.speed_m_s * way.speed_factor)
+
+    def _held(self, pose: PlanarPose, drive: Drive) -> Drive:
+        """No motion towards something that stands too near in its direction."""
+        if not drive.speed_m_s:
+            return drive
+        clear_m = self._avoider.clear_m(pose, 0.0 if drive.speed_m_s > 0.0 else pi)
+        return drive._replace(speed_m_s=0.0) if clear_m < self._cfg.avoidance.stop_m else drive
+
+    def _escape(self) -> Drive:
+        self.state = PilotState.ESCAPING
+        self._driver.reset()
+        return self._driver.away(self._cfg.avoidance.back_speed_m_s, 0.0)

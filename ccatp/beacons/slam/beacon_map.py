@@ -1,0 +1,341 @@
+"""Where beacons stand in the state: their columns, the error of each that wanders, joining and leaving.
+
+The noise of a sensor, learned from what its innovations leave.
+
+What ``BeaconSlam`` is told of its vehicle and of its radios; nothing about a place.
+
+What is not known of a heading stays unknown: the covariance follows the map when the map is corrected.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import exp
+
+import numpy as np
+from scipy.linalg.blas import daxpy, dger
+
+from ccatp.beacons.slam.motion import POSE, MotionModel
+from ccatp.beacons.slam.recording import BeaconId
+from ccatp.core import FloatArray
+from ccatp.filters.ekf_slam import BlockId, Columns, EkfSlam, columns_of
+
+
+class NoiseLevel:
+    """A factor f on the variances of a noise, by maximum likelihood on the way (Fisher scoring).
+
+    An innovation of variance S, of which the share a = f r / S is this noise, has the log-likelihood
+    -(ln S + nu^2 / S) / 2: its derivative by ln f is a (nis - 1) / 2, its Fisher information a^2 / 2. So
+    J <- J + a^2, ln f <- ln f + a (nis - 1) / J.
+
+    Args:
+        prior: J at the start, the innovations that the starting value counts for.
+        memory: largest J: older innovations fade; 0: the factor stays one.
+    """
+
+    def __init__(self, prior: float, memory: float) -> None:
+        self.factor = 1.0
+        self._information, self._memory = prior, memory
+
+    def learn(self, nis: float, share: float) -> None:
+        """Take an innovation: its normalised square, and the share of this noise in its variance."""
+        if self._memory <= 0.0:
+            return
+        information = self._information + share * share
+        self._information = information = min(self._memory, information)
+        change = share * (nis - 1.0) / information
+        if not -LARGEST < change < LARGEST:
+            change = LARGEST if change > 0.0 else -LARGEST
+        factor = self.factor * exp(change)
+        if not 1.0 / FURTHEST < factor < FURTHEST:
+            factor = FURTHEST if factor > 1.0 else 1.0 / FURTHEST
+        self.factor = factor
+
+
+LARGEST = 0.3
+"""Most that one innovation may change the logarithm of the factor."""
+FURTHEST = 100.0
+"""Largest factor, and one over the least: a sensor ten times worse than promised is not one to be believed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wander:
+    """An error of a beacon's readings that stays while the vehicle does: multipath, shadowing, a tilted camera.
+
+    A Gauss-Markov process of each beacon by itself: correlation exp(-way / length_m - time / time_s).
+
+    Attributes:
+        share: of the variance of the noise; the rest is new with every reading.
+        length_m: way of the vehicle after which it is forgotten.
+        time_s: time after which it is forgotten.
+    """
+
+    share: float
+    length_m: float
+    time_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class RangeModel:
+    """A ranging radio: z = (1 + scale) r + offset + wander + noise.
+
+    Attributes:
+        sigma_m: standard deviation of the noise; where it starts if the noise is learned.
+        sigma_per_m: what a metre of range adds to it, in squares: var = sigma_m^2 + (sigma_per_m r)^2.
+        scale_sigma: prior of the relative error that all ranges share; 0: not estimated.
+        offset_sigma_m: prior of the offset that all ranges share; 0: not estimated.
+        wander: of each beacon; None: there is none.
+    """
+
+    sigma_m: float
+    sigma_per_m: float
+    scale_sigma: float
+    offset_sigma_m: float
+    wander: Wander | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class BearingModel:
+    """A direction finder.
+
+    Attributes:
+        sigma_rad: standard deviation of the noise; where it starts if the noise is learned.
+    """
+
+    sigma_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class RssiModel:
+    """Signal strength by the log-distance model z = P_ref - 10 eta log10(r / 1 m) + noise (Hevrdejs and Knoll, eq. 4).
+
+    Attributes:
+        sigma_db: standard deviation of the noise; where it starts if the noise is learned.
+        reference_dbm: P_ref at 1 m.
+        reference_sigma_db: its prior, of each beacon by itself; 0: not estimated.
+        exponent: eta.
+        exponent_sigma: its prior, of each beacon by itself; 0: not estimated.
+        wander: of each beacon; None: there is none.
+    """
+
+    sigma_db: float
+    reference_dbm: float
+    reference_sigma_db: float
+    exponent: float
+    exponent_sigma: float
+    wander: Wander | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """How far readings are believed.
+
+    Attributes:
+        gate_sigmas: innovations further off than that are refused.
+        knee_sigmas: innovations beyond weigh no more than those at the knee (Huber).
+        learn_memory: readings over which noise levels are learned; 0: the noise is as it is given.
+        learn_prior: readings that the given noise counts for.
+        doubt_pose_after: refusals in a row, of any beacons, after which the pose is doubted.
+        doubt_beacon_after: refusals in a row of one beacon, others being believed, after which it is placed anew.
+        jump_m: what the pose may have jumped by when it is doubted, standard deviation of x and of y.
+        jump_rad: the same of the heading.
+        transports: whether the covariance follows corrections of the map, so that its heading is never learned from
+            linearising anew (``Transport``).
+    """
+
+    gate_sigmas: float
+    knee_sigmas: float
+    learn_memory: float
+    learn_prior: float
+    doubt_pose_after: int
+    doubt_beacon_after: int
+    jump_m: float
+    jump_rad: float
+    transports: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SlamSettings:
+    """What a run of ``BeaconSlam`` needs to know.
+
+    Attributes:
+        motion: the vehicle.
+        trust: of the readings.
+        range: of range and range-bearing readings; None where there are none.
+        bearing: of readings with a bearing; None where there are none.
+        rssi: of RSSI readings; None where there are none.
+        delay_sigma_s: prior of the time after which the vehicle has done what its odometry tells, by the stamps of the
+            readings: commands that take a while to be followed, stamps that come late; 0: not estimated.
+    """
+
+    motion: MotionModel
+    trust: Trust
+    range: RangeModel | None = None
+    bearing: BearingModel | None = None
+    rssi: RssiModel | None = None
+    delay_sigma_s: float = 0.0
+
+
+_NONE = np.empty(0, dtype=np.intp)
+
+
+WANDER = "wander"
+"""First part of the name of a block that holds a wandering error."""
+
+
+def is_place(block: BlockId) -> bool:
+    """Whether a block of the state begins with x_m and y_m."""
+    return not (isinstance(block, tuple) and block[0] == WANDER)
+
+
+@dataclass(slots=True)
+class Entry:
+    """A beacon on the map.
+
+    Attributes:
+        columns: pose, calibration, beacon and its wandering error, shape (k,).
+        size: of the beacon's block.
+        wander: column of the wandering error; -1: none.
+        way_m, time_s: of the vehicle when the wandering error was last looked at.
+        fresh: variance of what is new in the wandering error, in sigmas squared.
+        refused: readings in a row that were not believed.
+        on_trial: readings that must still agree with the one it joined by; 0: it is believed in.
+    """
+
+    columns: Columns
+    size: int
+    wander: int = -1
+    way_m: float = 0.0
+    time_s: float = 0.0
+    fresh: float = 1.0
+    refused: int = 0
+    on_trial: int = 0
+
+
+class BeaconMap:
+    """The beacons' blocks of an ``EkfSlam``.
+
+    Args:
+        engine: the state.
+        shared: where its calibration stands.
+    """
+
+    def __init__(self, engine: EkfSlam, shared: slice) -> None:
+        self._engine, self._shared = engine, shared
+        self._entries: dict[BeaconId, Entry] = {}
+
+    def __contains__(self, beacon: BeaconId) -> bool:
+        return beacon in self._entries
+
+    def __iter__(self) -> Iterator[BeaconId]:
+        return iter(self._entries)
+
+    def __getitem__(self, beacon: BeaconId) -> Entry:
+        return self._entries[beacon]
+
+    def get(self, beacon: BeaconId) -> Entry | None:
+        """A beacon; None where it is not on the map."""
+        return self._entries.get(beacon)
+
+    def join(self, beacon: BeaconId, mean: FloatArray, covariance: FloatArray) -> Entry:
+        """A beacon that is correlated with nothing yet: mean (b,), covariance (b, b)."""
+        self._append(beacon, mean, covariance)
+        self._entries[beacon] = Entry(_NONE, mean.size)
+        self.renumber()
+        return self._entries[beacon]
+
+    def leave(self, beacon: BeaconId) -> None:
+        """Forget a beacon.
+
+        Raises:
+            BlockError: it is not on the map.
+        """
+        self._engine.remove(beacon)
+        if (WANDER, beacon) in self._engine:
+            self._engine.remove((WANDER, beacon))
+        del self._entries[beacon]
+        self.renumber()
+
+    def renumber(self) -> None:
+        """Find the columns anew, after a block has gone."""
+        engine = self._engine
+        for beacon, entry in self._entries.items():
+            parts: list[slice] = [slice(0, POSE), self._shared, engine.block(beacon)]
+            if (WANDER, beacon) in engine:
+                parts.append(engine.block((WANDER, beacon)))
+                entry.wander = parts[-1].start
+            entry.columns = columns_of(*parts)
+
+    def wander_to(self, beacon: BeaconId, model: Wander, way_m: float, time_s: float) -> None:
+        """Bring a beacon's wandering error, in sigmas, to now: w <- phi w, variance <- phi^2 variance + 1 - phi^2."""
+        entry = self._entries[beacon]
+        if entry.wander < 0:
+            self._append((WANDER, beacon), np.zeros(1), np.eye(1))
+            self.renumber()
+        else:
+            phi = exp(-(way_m - entry.way_m) / model.length_m - max(time_s - entry.time_s, 0.0) / model.time_s)
+            entry.fresh = 1.0 - phi * phi
+            self._engine.relax(entry.wander, phi, entry.fresh)
+        entry.way_m, entry.time_s = way_m, time_s
+
+    def _append(self, block: object, mean: FloatArray, covariance: FloatArray) -> None:
+        b = mean.size
+        self._engine.augment(block, mean, _NONE, np.zeros((b, 0)), np.eye(b), covariance)
+
+
+HEADING = 2
+
+
+class Transport:
+    """After a correction, P <- M P M^T with M = I + d e^T, e the heading and d = J (new - old) of every place.
+
+    Nobody tells the heading of the whole map: a turn of everything about any point changes no reading. In the state it
+    is the direction (J p of each place p, 1 of the heading), J a quarter turn; derivatives are taken at the estimate,
+    so it changes with each correction, and a filter that leaves P as it was takes that change for knowledge. A
+    covariance of errors that turn with the heading does not have to change (the invariant EKF: Barrau and Bonnabel
+    2015; Zhang et al. 2017); this is that covariance, said of errors of x and y.
+
+    Args:
+        engine: the state: the pose first, then blocks.
+    """
+
+    def __init__(self, engine: EkfSlam) -> None:
+        self._engine = engine
+        self._seen: FloatArray | None = None
+        self._partner = np.empty(0, dtype=np.intp)
+        self._sign = np.empty(0)
+
+    def follow(self, before: FloatArray) -> None:
+        """The state was corrected.
+
+        Args:
+            before: its mean before that, shape (n,) or, without what joined since, less; work space afterwards. Where
+                something left the state since, nothing is done.
+        """
+        engine = self._engine
+        P = engine.covariance
+        if P is not self._seen:
+            self._look(P)
+        if before.size > engine.size:
+            return
+        if before.size < engine.size:
+            before = np.concatenate((before, engine.mean[before.size :]))
+        daxpy(engine.mean, before, a=-1.0)
+        d = before.take(self._partner)
+        d *= self._sign
+        more = P[HEADING] + d
+        less = P[HEADING] - d
+        half = 0.5 * P.item(HEADING, HEADING)  # w = P e + d e^T P e / 2
+        daxpy(d, more, a=half)
+        daxpy(d, less, a=half)
+        # d w^T + w d^T as a difference of squares: P stays symmetric exactly
+        dger(0.5, more, more, a=P.T, overwrite_a=1)
+        dger(-0.5, less, less, a=P.T, overwrite_a=1)
+
+    def _look(self, P: FloatArray) -> None:
+        """Which states are x and y of a place: each with its partner and the sign of the quarter turn."""
+        engine = self._engine
+        self._seen = P
+        x = np.array([0, *(engine.block(block).start for block in engine.blocks if is_place(block))])
+        self._partner, self._sign = np.zeros(engine.size, dtype=np.intp), np.zeros(engine.size)
+        self._partner[x], self._sign[x] = x + 1, 1.0  # of the old less the new
+        self._partner[x + 1], self._sign[x + 1] = x, -1.0

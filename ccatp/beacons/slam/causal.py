@@ -1,0 +1,317 @@
+"""``BeaconSlam`` over a recorded run: what is known at each instant from readings up to it.
+
+Calibration against what was assumed of it: what no reading told, and what lies beyond its prior.
+
+After a gap in the odometry the heading may be anything: several are followed until the beacons tell which.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field
+from math import inf, pi, sqrt
+
+import numpy as np
+
+from ccatp.beacons.slam.beacon_map import HEADING, SlamSettings
+from ccatp.beacons.slam.motion import Increment
+from ccatp.beacons.slam.range_slam import BeaconSlam, Learned
+from ccatp.beacons.slam.recording import (
+    BeaconFix,
+    BeaconId,
+    Calibrated,
+    RangeBearingReading,
+    RangeReading,
+    Reading,
+    RecordedRun,
+    RssiReading,
+    Steps,
+    Track,
+)
+from ccatp.core import FloatArray
+
+FAR = 3.0
+"""Standard deviations of the prior beyond which a value is told."""
+UNCHANGED = 0.999
+"""Of the prior's standard deviation: what is left of it where no reading told anything."""
+KEYS = {"odometry_delay_s": "delay_s"}
+"""Keys under ``priors`` that are called otherwise than the quantity."""
+
+
+def learned(calibration: Mapping[str, Calibrated], priors: Mapping[str, float]) -> dict[str, Calibrated]:
+    """Those that the readings told something of; a prior is no result.
+
+    Args:
+        calibration: by name.
+        priors: standard deviations before any reading, by name.
+    """
+    return {name: found for name, found in calibration.items() if found.sigma < UNCHANGED * priors[name]}
+
+
+def beyond_priors(calibration: Mapping[str, Calibrated], priors: Mapping[str, float], kind: str) -> Iterator[str]:
+    """Values that their prior all but excludes, a line each: they would be further off still if it let them.
+
+    Args:
+        calibration: by name.
+        priors: standard deviations before any reading, about zero, by name.
+        kind: of the recording, as the configuration calls it.
+    """
+    for name, (value, _) in calibration.items():
+        sigma = priors[name]
+        if abs(value) > FAR * sigma:
+            yield (
+                f"{name} comes out as {value:+.3g}, {abs(value) / sigma:.1f} standard deviations of its prior: "
+                f"if that can be, widen {kind}.priors.{KEYS.get(name, name)} (now {sigma:g})"
+            )
+
+
+HEADINGS = 8
+"""Followed at once; within an eighth of a circle the filter finds its way."""
+LOST_RAD = pi / HEADINGS
+"""Standard deviation of a heading beyond which it is looked for."""
+WORSE = 30.0
+"""Twice the log-likelihood by which one falls behind the best and is given up: more than two outliers make."""
+LONGEST = 400
+"""Readings after which the best is taken."""
+OUTLIER = 25.0
+"""What a reading may count at most against one of them."""
+
+
+class LostHeading:
+    """One ``BeaconSlam``, or several that differ by their heading.
+
+    A Gaussian whose heading is spread over the circle is split into ``HEADINGS`` narrow ones; each reading that all of
+    them take is held against each (a Gaussian sum: Alspach and Sorenson 1972).
+
+    Args:
+        slam: the filter before anything was lost.
+
+    Attributes:
+        best: the filter that the readings fit best so far.
+    """
+
+    def __init__(self, slam: BeaconSlam) -> None:
+        self.best = slam
+        self._others: list[BeaconSlam] = []
+        self._scores = [0.0]
+        self._taken, self._is_guessed = 0, False
+
+    def predict(self, odometry: Increment) -> None:
+        """Carry all of them on; behind a gap the heading is split."""
+        for slam in (self.best, *self._others):
+            slam.predict(odometry)
+        was_guessed, self._is_guessed = self._is_guessed, odometry.guess_rad2 > 0.0
+        if was_guessed and not self._is_guessed and self.best.pose_covariance[HEADING, HEADING] > LOST_RAD**2:
+            self._split()
+
+    def observe(self, readings: Sequence[Reading]) -> list[Learned]:
+        """Take readings; what they did to the best."""
+        learned = self.best.observe(readings)
+        if self._others:
+            self._weigh([learned, *(slam.observe(readings) for slam in self._others)])
+        return learned
+
+    def _split(self) -> None:
+        for beacon in list(self.best.waiting):  # what was heard of it before the gap belongs to another frame
+            self.best.remove(beacon)
+        if not self.best.beacons:
+            return
+        step_rad = 2.0 * pi / HEADINGS
+        slams = [self.best, *(deepcopy(self.best) for _ in range(HEADINGS - 1))]
+        self._scores = [
+            slam.told_heading(((k + HEADINGS // 2) % HEADINGS - HEADINGS // 2) * step_rad, step_rad / sqrt(12.0))
+            for k, slam in enumerate(slams)
+        ]
+        self._others, self._taken = slams[1:], 0
+
+    def _weigh(self, learned: Sequence[list[Learned]]) -> None:
+        """Readings that not all have taken, because a beacon is not on every map, say nothing."""
+        for each in learned:
+            each.sort(key=lambda one: str(one.beacon))
+        if len({tuple(one.beacon for one in each) for each in learned}) > 1:
+            return
+        slams = [self.best, *self._others]
+        self._scores = [
+            score + sum(one.surprise - max(one.nis - OUTLIER, 0.0) for one in each)
+            for score, each in zip(self._scores, learned, strict=True)
+        ]
+        self._taken += len(learned[0])
+        limit = min(self._scores) + (WORSE if self._taken < LONGEST else 0.0)
+        kept = sorted((s, k) for k, s in enumerate(self._scores) if s <= limit and s < inf)
+        self._scores = [score for score, _ in kept]
+        self.best, *self._others = (slams[k] for _, k in kept)
+
+
+FINEST_S = 0.1
+"""Steps of odometry shorter than that are put together."""
+DOUBTFUL_NIS = 1.3
+"""Mean square of normalised innovations, per degree of freedom, that is told: of learned noise it is one."""
+DOUBTFUL_JUMPS = 0.003
+"""How often the pose has to be doubted, for each reading, that it is told."""
+DOUBTFUL_SHARE = 0.3
+"""Share of refused readings that is told."""
+
+
+def filter_run(
+    run: RecordedRun, settings: SlamSettings, first_sigmas: tuple[float, float], clock_s: Callable[[], float]
+) -> Track:
+    """Run the filter over a recording; nothing of the truth is used but the first pose.
+
+    Args:
+        run: odometry, readings, first pose.
+        settings: of the filter.
+        first_sigmas: of the first position, m, and the first heading, rad.
+        clock_s: tells wall time, s.
+    """
+    position, heading = first_sigmas
+    search = LostHeading(BeaconSlam(settings, run.first_pose, np.diag((position**2, position**2, heading**2))))
+    times = np.union1d(_spaced(run.steps.times_s), run.readings.times_s)
+    increments, readings = _increments(run.steps, times), _Heard(run)
+    poses, covariances = np.empty((len(times), 3)), np.empty((len(times), 3, 3))
+    book = _Book()
+    for k, time_s in enumerate(times.tolist()):
+        begin_s = clock_s()
+        if k:
+            search.predict(increments[k - 1])
+        predicted_s = clock_s()
+        book.predict_s.append(predicted_s - begin_s)
+        if now := readings.until(time_s):
+            taken = search.observe(now)
+            end_s = clock_s()
+            book.observed(taken, len(now), end_s - begin_s, end_s - predicted_s)
+        poses[k], covariances[k] = search.best.pose, search.best.pose_covariance
+    slam = search.best
+    nis, sizes = np.array(book.nis), np.array(book.sizes, dtype=np.float64)
+    priors = dict(zip(slam.calibration, slam.prior_sigmas, strict=True))
+    calibration = learned({name: Calibrated(*found) for name, found in slam.calibration.items()}, priors)
+    lost = [name for name in run.beacon_ids if name not in slam.beacons]
+    return Track(
+        times_s=times,
+        poses=poses,
+        covariances=covariances,
+        beacons={
+            str(b): BeaconFix(float(e.mean[0]), float(e.mean[1]), e.covariance[:2, :2]) for b, e in slam.beacons.items()
+        },
+        calibration=calibration,
+        nis=nis,
+        nis_sizes=sizes,
+        refused=book.refused,
+        update_s=np.array(book.update_s),
+        predict_s=np.array(book.predict_s[1:]),
+        scalar_s=np.array(book.scalar_s),
+        updates=len(book.nis),
+        warnings=(
+            *_lost(run, lost),
+            *_unplaced(slam.unplaced),
+            *beyond_priors(calibration, priors, run.kind),
+            *_moved(slam.moved),
+            *_doubts(nis, sizes, book.refused, slam.jumps),
+        ),
+    )
+
+
+class _Heard:
+    """The readings of a run, handed out in order of time."""
+
+    def __init__(self, run: RecordedRun) -> None:
+        self._all, self._next = list(_readings(run)), 0
+
+    def until(self, time_s: float) -> list[Reading]:
+        """Those up to ``time_s`` that were not handed out before."""
+        first = self._next
+        while self._next < len(self._all) and self._all[self._next].time_s <= time_s:
+            self._next += 1
+        return self._all[first : self._next]
+
+
+@dataclass(slots=True)
+class _Book:
+    """What the readings said, and what each step cost, s: of a prediction, of a reading with it, of a scalar alone."""
+
+    nis: list[float] = field(default_factory=list)
+    sizes: list[int] = field(default_factory=list)
+    refused: int = 0
+    predict_s: list[float] = field(default_factory=list)
+    update_s: list[float] = field(default_factory=list)
+    scalar_s: list[float] = field(default_factory=list)
+
+    def observed(self, learned: Sequence[Learned], count: int, whole_s: float, update_s: float) -> None:
+        """``count`` readings of a moment were put into the filter."""
+        self.update_s += [whole_s / count] * count
+        if len(learned) == count:  # nothing that waits or joins: updates alone
+            scalars = sum(one.size for one in learned)
+            self.scalar_s += [update_s / scalars] * scalars
+        accepted = [one for one in learned if one.accepted]
+        self.refused += len(learned) - len(accepted)
+        self.nis += [one.nis for one in accepted]
+        self.sizes += [one.size for one in accepted]
+
+
+def _doubts(nis: FloatArray, sizes: FloatArray, refused: int, jumps: int) -> Iterator[str]:
+    """What the innovations say against the assumptions."""
+    if nis.size and nis.sum() > DOUBTFUL_NIS * sizes.sum():
+        yield (
+            f"innovations are {float(nis.sum() / sizes.sum()):.2f} times as large, in squares, as they should be: "
+            "clocks apart, scales beyond what the configuration allows, or beacons exchanged on the way?"
+        )
+    if jumps > DOUBTFUL_JUMPS * (nis.size + refused):
+        yield f"the pose had to be doubted {jumps} times: pushed, beacons misread, or odometry that misses something?"
+    if refused > DOUBTFUL_SHARE * (nis.size + refused):
+        yield f"{refused} of {nis.size + refused} readings were refused: do they belong to this odometry?"
+
+
+def _lost(run: RecordedRun, names: Sequence[str]) -> Iterator[str]:
+    """Beacons that are not on the map, and why, a line each."""
+    r = run.readings
+    ranged = {run.beacon_ids[k] for k in np.unique(r.beacon[np.isfinite(r.range_m) | np.isfinite(r.rssi_dbm)])}
+    for name in names:
+        why = "its readings leave two places or none" if name in ranged else "only bearings of it were heard, no range"
+        yield f"beacon {name} could not be placed: {why}"
+
+
+def _unplaced(count: int) -> Iterator[str]:
+    if count:
+        yield f"{count} bearings had no range or strength of the same time and came before their beacon was placed"
+
+
+def _moved(moved: Sequence[tuple[BeaconId, float]]) -> Iterator[str]:
+    """Beacons that were placed anew, a line each: the map holds their last place."""
+    for beacon in dict.fromkeys(beacon for beacon, _ in moved):
+        times = ", ".join(f"{time_s:.1f}" for name, time_s in moved if name == beacon)
+        yield f"beacon {beacon} was placed anew at {times} s: was it moved, or exchanged for another?"
+
+
+def _spaced(times_s: FloatArray) -> FloatArray:
+    """The first time, the last, and between them the first of each span of ``FINEST_S``."""
+    _, first = np.unique(np.floor((times_s - times_s[0]) / FINEST_S), return_index=True)
+    return np.union1d(times_s[first], times_s[-1:])
+
+
+def _increments(steps: Steps, times_s: FloatArray) -> list[Increment]:
+    """Odometry between the times, steps cut where readings fall."""
+
+    def shares(amounts: FloatArray | float) -> list[float]:
+        total = np.concatenate([[0.0], np.cumsum(np.broadcast_to(amounts, steps.distance_m.shape))])
+        shared: list[float] = np.diff(np.interp(times_s, steps.times_s, total)).tolist()
+        return shared
+
+    columns = (times_s[1:].tolist(), np.diff(times_s).tolist())
+    amounts = map(shares, steps[1:])
+    return [Increment(*row) for row in zip(*columns, *amounts, strict=True)]
+
+
+def _readings(run: RecordedRun) -> Iterator[Reading]:
+    """In order of time; a range goes before a signal strength of the same moment."""
+    r = run.readings
+    for time_s, beacon, range_m, bearing_rad, rssi_dbm in zip(*(column.tolist() for column in r), strict=True):
+        name = run.beacon_ids[beacon]
+        bearing = None if math.isnan(bearing_rad) else bearing_rad
+        if not math.isnan(range_m):
+            if bearing is None:
+                yield RangeReading(time_s, name, range_m)
+            else:
+                yield RangeBearingReading(time_s, name, range_m, bearing)
+        elif not math.isnan(rssi_dbm):
+            yield RssiReading(time_s, name, rssi_dbm, bearing)
+        elif bearing is not None:
+            yield RangeBearingReading(time_s, name, math.nan, bearing)

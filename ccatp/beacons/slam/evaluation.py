@@ -1,0 +1,262 @@
+"""A track against the truth of its recording: the figures that ``ccatp radio slam`` tells.
+
+The result of ``ccatp radio slam``: as data for machines, as a table for people.
+
+Estimators side by side on the same recordings: rows of figures, as a Markdown table.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ccatp.beacons.slam.recording import BeaconFix, RecordedRun, Track, Truth
+from ccatp.core import FloatArray
+from ccatp.filters.metrics import Consistency, RigidMotion, best_motion, consistency, nees, rms, wrapped
+
+LONGEST_GAP_S = 0.5
+"""The truth is taken as known between two of its rows that lie no further apart,"""
+USUAL_GAPS = 3.0
+"""or no further than that many of its usual intervals."""
+
+FIRST_POSE_S = 1.0
+"""The truth's first row tells the first pose if it comes no later than that."""
+LEAST_KNOWN = 3
+"""Instants with a truth: one always fits, and two but for their distance."""
+
+
+class Judgement(NamedTuple):
+    """Errors of a track; None where there is no truth to tell.
+
+    Attributes:
+        alignment: lays the track on the truth.
+        trajectory_rmse_m: of the aligned positions.
+        heading_rmse_rad: of the aligned headings.
+        beacon_rmse_m: of the beacons, moved by the same alignment.
+        beacon_errors_m: by name.
+        nees: of the poses as they are, without alignment; positions alone if the truth has no headings; None where the
+            first pose was not the truth's of that time.
+        nis: of the innovations.
+        errors_m: of each aligned position, shape (n,); NaN where there is no truth.
+    """
+
+    alignment: RigidMotion
+    trajectory_rmse_m: float | None
+    heading_rmse_rad: float | None
+    beacon_rmse_m: float | None
+    beacon_errors_m: Mapping[str, float]
+    nees: Consistency | None
+    nis: Consistency | None
+    errors_m: FloatArray
+
+
+def judge(track: Track, run: RecordedRun) -> Judgement:
+    """Compare a track with the truth of the run.
+
+    One rigid motion without scale lays the positions on the truth; the beacons move with it. If only the beacons were
+    surveyed, they are aligned themselves.
+    """
+    truth = np.full((len(track.times_s), 3), np.nan) if run.truth is None else truth_at(run.truth, track.times_s)
+    known = np.isfinite(truth[:, 0])
+    if known.sum() < LEAST_KNOWN:
+        truth[:], known[:] = np.nan, False
+    common = [name for name in track.beacons if name in run.beacon_truth_m]
+    places = np.array([(track.beacons[name].x_m, track.beacons[name].y_m) for name in common]).reshape(-1, 2)
+    surveyed = np.array([run.beacon_truth_m[name] for name in common]).reshape(-1, 2)
+    if known.any():
+        alignment = best_motion(track.poses[known, :2], truth[known, :2])
+    elif len(common) > 1:
+        alignment = best_motion(places, surveyed)
+    else:
+        alignment = RigidMotion(np.eye(2), np.zeros(2))
+    errors = np.hypot(*(alignment.moved(track.poses[:, :2]) - truth[:, :2]).T)
+    headings = wrapped(track.poses[:, 2] + alignment.angle_rad - truth[:, 2])
+    offsets = np.hypot(*(alignment.moved(places) - surveyed).T)
+    measurable = known.any() or len(common) > 2  # two points always fit
+    return Judgement(
+        alignment=alignment,
+        trajectory_rmse_m=rms(errors),
+        heading_rmse_rad=rms(headings),
+        beacon_rmse_m=rms(offsets) if measurable else None,
+        beacon_errors_m=dict(zip(common, offsets.tolist(), strict=True)) if measurable else {},
+        nees=_nees(track, truth, known) if _begins_on_truth(run) else None,
+        nis=consistency(track.nis, track.nis_sizes),
+        errors_m=errors,
+    )
+
+
+def truth_at(truth: Truth, times_s: FloatArray) -> FloatArray:
+    """True x_m, y_m, heading_rad at some times, shape (n, 3); NaN outside the truth and in its gaps."""
+    columns = [np.interp(times_s, truth.times_s, column) for column in truth[1:]]
+    after = np.searchsorted(truth.times_s, times_s).clip(1, len(truth.times_s) - 1)
+    gap = truth.times_s[after] - truth.times_s[after - 1]
+    longest_s = max(LONGEST_GAP_S, USUAL_GAPS * float(np.median(np.diff(truth.times_s))))
+    inside = (times_s >= truth.times_s[0]) & (times_s <= truth.times_s[-1]) & (gap <= longest_s)
+    return np.where(inside[:, None], np.column_stack(columns), np.nan)
+
+
+def aligned_beacons(track: Track, alignment: RigidMotion) -> dict[str, BeaconFix]:
+    """The map after an alignment."""
+    moved = {}
+    for name, fix in track.beacons.items():
+        ((x, y),) = alignment.moved(np.array([(fix.x_m, fix.y_m)])).tolist()
+        moved[name] = BeaconFix(x, y, alignment.turned(fix.covariance))
+    return moved
+
+
+def _begins_on_truth(run: RecordedRun) -> bool:
+    """Whether the truth told the first pose: else track and truth are of two frames."""
+    if run.truth is None:
+        return False
+    return bool(run.truth.times_s[0] - FIRST_POSE_S <= run.steps.times_s[0] <= run.truth.times_s[-1])
+
+
+def _nees(track: Track, truth: FloatArray, known: np.ndarray) -> Consistency | None:
+    if not known.any():
+        return None
+    size = 3 if np.isfinite(truth[known, 2]).all() else 2
+    errors = track.poses[known] - truth[known]
+    errors[:, 2] = wrapped(errors[:, 2])
+    squares = nees(errors[:, :size], track.covariances[known][:, :size, :size])
+    return consistency(squares, np.full(squares.size, float(size)))
+
+
+SCALES = ("range_scale", "distance_scale", "turn_scale")
+"""Told as factors: 1.07 for ranges that read 7 % too long."""
+
+
+def result_data(run: RecordedRun, filter_name: str, track: Track, judged: Judgement) -> dict[str, Any]:
+    """The result as JSON has it; None where nothing is known."""
+    beacons = aligned_beacons(track, judged.alignment)
+    calibration = {name: (value + (name in SCALES), sigma) for name, (value, sigma) in track.calibration.items()}
+    nis, nees = judged.nis, judged.nees
+    return {
+        "dataset": run.name,
+        "format": run.kind,
+        "filter": filter_name,
+        "trajectory_rmse_m": _finite(judged.trajectory_rmse_m),
+        "heading_rmse_rad": _finite(judged.heading_rmse_rad),
+        "beacon_rmse_m": _finite(judged.beacon_rmse_m),
+        "beacons": {name: [fix.x_m, fix.y_m] for name, fix in beacons.items()},
+        "beacon_sigmas_m": {name: np.sqrt(np.diag(fix.covariance)).tolist() for name, fix in beacons.items()},
+        "beacon_errors_m": dict(judged.beacon_errors_m),
+        "range_scale": calibration["range_scale"][0] if "range_scale" in calibration else None,
+        "range_offset_m": calibration["range_offset_m"][0] if "range_offset_m" in calibration else None,
+        "calibration": {name: {"value": value, "sigma": sigma} for name, (value, sigma) in calibration.items()},
+        "nis_mean": None if nis is None else nis.mean,
+        "nis_band": None if nis is None else [nis.low, nis.high],
+        "nees_mean": None if nees is None else nees.mean,
+        "updates": track.updates,
+        "refused": track.refused,
+        "update_us_p50": _median_us(track.update_s),
+        "predict_us_p50": _median_us(track.predict_s),
+        "scalar_us_p50": _median_us(track.scalar_s),
+        "warnings": [*run.warnings, *track.warnings],
+    }
+
+
+def table_lines(run: RecordedRun, data: dict[str, Any]) -> list[str]:
+    """The result for people."""
+    span_s = run.steps.times_s[-1] - run.steps.times_s[0]
+    way_m = float(np.abs(run.steps.distance_m).sum())
+    heard = f"{len(run.readings.times_s)} readings of {len(run.beacon_ids)} beacons"
+    rows = [
+        ("data", f"{data['dataset']} ({data['format']}): {span_s:.0f} s, {way_m:.0f} m by odometry, {heard}"),
+        ("filter", f"{data['filter']}: {data['updates']} updates, {data['refused']} refused"),
+        ("path", _errors(data)),
+        ("beacons", _number(data["beacon_rmse_m"], "{:.3f} m rms")),
+    ]
+    rows += [("calibration", f"{name} {c['value']:.5g} +- {c['sigma']:.2g}") for name, c in data["calibration"].items()]
+    if data["nis_mean"] is not None:
+        low, high = data["nis_band"]
+        rows.append(("NIS", f"{data['nis_mean']:.3f} per degree of freedom (95 % band {low:.3f} to {high:.3f})"))
+    if data["nees_mean"] is not None:
+        rows.append(("NEES", f"{data['nees_mean']:.3f} per degree of freedom"))
+    rows.append(("update", _number(data["update_us_p50"], "{:.0f} us a reading") + _parts(data)))
+    lines = [f"{name:<12} {text}" for name, text in rows]
+    lines += ["", f"{'beacon':<8} {'x_m':>9} {'y_m':>9} {'sigma_x':>8} {'sigma_y':>8} {'error_m':>8}"]
+    for name, (x, y) in data["beacons"].items():
+        sx, sy = data["beacon_sigmas_m"][name]
+        error = _number(data["beacon_errors_m"].get(name), "{:.3f}")
+        lines.append(f"{name:<8} {x:9.3f} {y:9.3f} {sx:8.3f} {sy:8.3f} {error:>8}")
+    return lines
+
+
+def _errors(data: dict[str, Any]) -> str:
+    if data["trajectory_rmse_m"] is None:
+        return "no truth"
+    heading = _number(data["heading_rmse_rad"], ", heading {:.4f} rad rms")
+    return f"{data['trajectory_rmse_m']:.3f} m rms" + ("" if heading == "-" else heading)
+
+
+def _median_us(times_s: FloatArray) -> float | None:
+    return float(np.median(times_s)) * 1e6 if times_s.size else None
+
+
+def _parts(data: dict[str, Any]) -> str:
+    predict_us, scalar_us = data["predict_us_p50"], data["scalar_us_p50"]
+    if predict_us is None or scalar_us is None:
+        return ""
+    return f": prediction {predict_us:.0f} us, each scalar {scalar_us:.0f} us"
+
+
+def _number(value: float | None, shape: str) -> str:
+    return "-" if value is None else shape.format(value)
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
+
+
+COLUMNS = (
+    ("data", "dataset", "{}"),
+    ("estimator", "filter", "{}"),
+    ("path, m", "trajectory_rmse_m", "{:.3f}"),
+    ("heading, rad", "heading_rmse_rad", "{:.4f}"),
+    ("beacons, m", "beacon_rmse_m", "{:.3f}"),
+    ("range scale", "range_scale", "{:.4f}"),
+    ("NIS", "nis_mean", "{:.2f}"),
+    ("NEES", "nees_mean", "{:.2f}"),
+    ("update, us", "update_us_p50", "{:.0f}"),
+    ("whole run, s", "run_s", "{:.1f}"),
+)
+AVERAGED = ("trajectory_rmse_m", "heading_rmse_rad", "beacon_rmse_m", "update_us_p50", "run_s")
+
+
+def row(run: RecordedRun, name: str, track: Track, run_s: float | None, *, peer: bool = False) -> dict[str, Any]:
+    """The figures of one estimator on one run; a peer tells no covariance."""
+    data = result_data(run, name, track, judge(track, run))
+    found = {key: data.get(key) for _, key, _ in COLUMNS}
+    found["run_s"] = run_s
+    if peer:
+        found["nees_mean"] = None
+    return found
+
+
+def with_means(rows: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]]:
+    """The rows, and behind them the mean of each estimator over the runs, if there are several."""
+    estimators = list(dict.fromkeys(r["filter"] for r in rows))
+    means = []
+    for estimator in estimators:
+        own = [r for r in rows if r["filter"] == estimator]
+        if len(own) < 2:
+            return list(rows)
+        mean: dict[str, Any] = {key: None for _, key, _ in COLUMNS}
+        mean.update(dataset=name, filter=estimator)
+        for key in AVERAGED:
+            values = [r[key] for r in own if r[key] is not None]
+            mean[key] = float(np.mean(values)) if values else None
+        means.append(mean)
+    return [*rows, *means]
+
+
+def markdown(rows: Iterable[dict[str, Any]]) -> list[str]:
+    """A table."""
+    cells = [[title for title, _, _ in COLUMNS]]
+    cells += [["-" if r[key] is None else shape.format(r[key]) for _, key, shape in COLUMNS] for r in rows]
+    widths = [max(len(line[k]) for line in cells) for k in range(len(COLUMNS))]
+    lines = [
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in cells
+    ]
+    return [lines[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines[1:]]

@@ -1,0 +1,536 @@
+"""How a vehicle moves between two readings: differential drive and Ackermann, with Jacobian and noise.
+
+Motion of a vehicle whose wheels slip and whose heading drifts, both estimated on the way.
+
+The clock of odometry beside that of readings: what is due, and where the vehicle was at a reading.
+"""
+
+from collections import deque
+from dataclasses import dataclass, replace
+from math import cos, hypot, nan, sin, tan
+from typing import Literal, NamedTuple, Protocol
+
+import numpy as np
+
+from ccatp.core import FloatArray
+
+POSE = 3  # x_m, y_m, heading_rad: the first states of a vehicle
+SMALL_RAD = 1e-3
+"""Half a turn below which sin(a) / a is 1 - a^2 / 6 to the last digit."""
+
+
+class Pose(NamedTuple):
+    """Where a vehicle stands; the heading is continuous, it does not wrap."""
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Increment:
+    """Odometry of an interval: what the wheels, or wheels and gyroscope, say was travelled.
+
+    Attributes:
+        time_s: end of the interval.
+        interval_s: its length.
+        distance_m: along the arc.
+        turn_rad: change of heading, counter-clockwise.
+        lateral_m: to the left; zero for wheels that do not slip.
+        guess_m2: variance of x and of y at its end, because the odometry was silent and the way is guessed.
+        guess_rad2: the same of the turn.
+    """
+
+    time_s: float
+    interval_s: float
+    distance_m: float
+    turn_rad: float
+    lateral_m: float = 0.0
+    guess_m2: float = 0.0
+    guess_rad2: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Steering:
+    """Odometry of a steered vehicle over an interval.
+
+    Attributes:
+        time_s: end of the interval.
+        interval_s: its length.
+        speed_m_s: of the wheel that the model refers to.
+        steer_rad: angle of the steered wheel, counter-clockwise.
+    """
+
+    time_s: float
+    interval_s: float
+    speed_m_s: float
+    steer_rad: float
+
+
+Odometry = Increment | Steering
+
+
+class RestReading(NamedTuple):
+    """What a vehicle at rest shows of its odometry's calibration.
+
+    Attributes:
+        column: of the state that it measures.
+        value: what it should be.
+        variance: of the value.
+    """
+
+    column: int
+    value: float
+    variance: float
+
+
+class MotionStep(NamedTuple):
+    """A prediction of the vehicle's states.
+
+    Attributes:
+        mean: shape (v,).
+        F: d(mean)/d(states before), shape (v, v); work space, as Q: it holds until the next step.
+        Q: covariance of what the odometry does not say, shape (v, v).
+    """
+
+    mean: FloatArray
+    F: FloatArray
+    Q: FloatArray
+
+
+class MotionModel(Protocol):
+    """What ``BeaconSlam`` asks of a vehicle; its states are the pose and the odometry's calibration behind it."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the calibration states."""
+
+    @property
+    def prior_sigmas(self) -> tuple[float, ...]:
+        """Of the calibration states."""
+
+    def step(self, states: FloatArray, odometry: Odometry) -> MotionStep:
+        """The states (v,) after the interval.
+
+        Raises:
+            TypeError: the odometry is of another kind of vehicle.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class DifferentialNoise:
+    """Noise of odometry by increments; all are random walks, so variances grow with the way and the time.
+
+    Attributes:
+        distance_per_sqrt_m: standard deviation of the distance after a metre, m / sqrt(m).
+        distance_per_sqrt_rad: of the distance after a radian of turning, m / sqrt(rad).
+        turn_per_sqrt_m: of the heading after a metre, rad / sqrt(m).
+        turn_per_sqrt_rad: of the heading after a radian, rad / sqrt(rad).
+        turn_per_sqrt_s: of the heading after a second, rad / sqrt(s) (a gyroscope's angle random walk).
+        lateral_per_sqrt_m: of the way sideways after a metre, m / sqrt(m).
+        turn_bias_sigma_rad_s: prior of a constant error of the turn rate; 0: not estimated.
+        turn_bias_walk_rad_s_sqrt_s: how it wanders, (rad/s) / sqrt(s).
+        turn_scale_sigma: prior of the relative error of turns; 0: not estimated.
+        distance_scale_sigma: prior of the relative error of distances; 0: not estimated.
+        rest_speed_m_s, rest_turn_rad_s: odometry slower than both comes from a vehicle at rest; used where a turn bias
+            is estimated; 0: never.
+    """
+
+    distance_per_sqrt_m: float
+    distance_per_sqrt_rad: float
+    turn_per_sqrt_m: float
+    turn_per_sqrt_rad: float
+    turn_per_sqrt_s: float
+    lateral_per_sqrt_m: float
+    turn_bias_sigma_rad_s: float = 0.0
+    turn_bias_walk_rad_s_sqrt_s: float = 0.0
+    turn_scale_sigma: float = 0.0
+    distance_scale_sigma: float = 0.0
+    rest_speed_m_s: float = 0.0
+    rest_turn_rad_s: float = 0.0
+
+
+class DifferentialDrive:
+    """Odometry by increments: the chord of a circular arc (thesis eq. 2.14 as it is meant).
+
+    With the corrected way d = d_o / (1 + e_d) and turn w = w_o / (1 + e_w) - b dt, m = heading + w / 2 and
+    c = sin(w / 2) / (w / 2):
+
+        x <- x + c d cos(m) - l sin(m),  y <- y + c d sin(m) + l cos(m),  heading <- heading + w
+
+    States behind the pose, each where its prior is not zero: turn_bias_rad_s (b), turn_scale (e_w), distance_scale
+    (e_d): positive where the odometry reads too much. At rest the turn is nothing but the bias: the heading stays.
+
+    Args:
+        noise: of the odometry, and priors of its calibration.
+    """
+
+    def __init__(self, noise: DifferentialNoise) -> None:
+        self.noise = noise
+        priors = (
+            ("turn_bias_rad_s", noise.turn_bias_sigma_rad_s),
+            ("turn_scale", noise.turn_scale_sigma),
+            ("distance_scale", noise.distance_scale_sigma),
+        )
+        self.names = tuple(name for name, sigma in priors if sigma > 0.0)
+        self.prior_sigmas = tuple(sigma for _, sigma in priors if sigma > 0.0)
+        place = {name: POSE + i for i, name in enumerate(self.names)}
+        self._bias, self._turn_scale, self._way_scale = (place.get(name, -1) for name, _ in priors)
+        size = POSE + len(self.names)
+        self._F, self._Q = np.eye(size), np.zeros((size, size))
+
+    def step(self, states: FloatArray, odometry: Odometry) -> MotionStep:
+        """See ``MotionModel.step``; takes an ``Increment``."""
+        if not isinstance(odometry, Increment):
+            raise TypeError(f"a differential drive takes increments, not {type(odometry).__name__}")
+        values: list[float] = states.tolist()
+        scaled = 1.0 + values[self._way_scale] if self._way_scale >= 0 else 1.0
+        way, side = odometry.distance_m / scaled, odometry.lateral_m / scaled
+        is_at_rest = self._bias >= 0 and self._rests(odometry)
+        turn, by_bias, by_scale = (0.0, 0.0, 0.0) if is_at_rest else self._turn(values, odometry)
+        half = 0.5 * turn
+        chord = 1.0 - half * half / 6.0 if abs(half) < SMALL_RAD else sin(half) / half
+        d_chord = -half / 3.0 if abs(half) < SMALL_RAD else (cos(half) - chord) / half
+        c, s = cos(values[2] + half), sin(values[2] + half)
+        dx, dy = chord * way * c - side * s, chord * way * s + side * c
+        # by the turn: half of what the heading does, and half of what the chord loses
+        x_turn, y_turn = 0.5 * (d_chord * way * c - dy), 0.5 * (d_chord * way * s + dx)
+        mean, F = states.copy(), self._F
+        mean[0], mean[1], mean[2] = values[0] + dx, values[1] + dy, values[2] + turn
+        F[0, 2], F[1, 2] = -dy, dx
+        for place, by in ((self._bias, by_bias), (self._turn_scale, by_scale)):
+            if place >= 0:
+                F[0, place], F[1, place], F[2, place] = x_turn * by, y_turn * by, by
+        if self._way_scale >= 0:
+            F[0, self._way_scale], F[1, self._way_scale] = -dx / scaled, -dy / scaled
+        Q = self._spread(odometry, (c, s), (x_turn, y_turn), chord, 0.0 if is_at_rest else 1.0)
+        return MotionStep(mean, F, Q)
+
+    def at_rest(self, odometry: Odometry) -> RestReading | None:
+        """At rest the turn that is told is the bias, by the gyroscope's angle random walk; None while it drives."""
+        if self._bias < 0 or not isinstance(odometry, Increment) or not self._rests(odometry):
+            return None
+        dt = odometry.interval_s
+        return RestReading(self._bias, odometry.turn_rad / dt, self.noise.turn_per_sqrt_s**2 / dt)
+
+    def _rests(self, odometry: Increment) -> bool:
+        dt, noise = odometry.interval_s, self.noise
+        return (
+            abs(odometry.distance_m) < noise.rest_speed_m_s * dt and abs(odometry.turn_rad) < noise.rest_turn_rad_s * dt
+        )
+
+    def _turn(self, values: list[float], odometry: Increment) -> tuple[float, float, float]:
+        """The corrected turn, and its derivatives by the bias and by the relative error of turns."""
+        scaled = 1.0 + values[self._turn_scale] if self._turn_scale >= 0 else 1.0
+        turn, dt = odometry.turn_rad / scaled, odometry.interval_s
+        bias = values[self._bias] if self._bias >= 0 else 0.0
+        return turn - bias * dt, -dt, -turn / scaled
+
+    def _spread(
+        self,
+        odometry: Increment,
+        direction: tuple[float, float],
+        by_turn: tuple[float, float],
+        chord: float,
+        turning: float,
+    ) -> FloatArray:
+        noise, dt = self.noise, odometry.interval_s
+        way, turned = hypot(odometry.distance_m, odometry.lateral_m), abs(odometry.turn_rad)
+        var_way = noise.distance_per_sqrt_m**2 * way + noise.distance_per_sqrt_rad**2 * turned
+        var_turn = noise.turn_per_sqrt_m**2 * way + noise.turn_per_sqrt_rad**2 * turned + noise.turn_per_sqrt_s**2 * dt
+        var_side = noise.lateral_per_sqrt_m**2 * way
+        var_turn *= turning
+        (c, s), (tx, ty) = direction, by_turn
+        ax, ay = chord * c, chord * s
+        Q = self._Q
+        Q[0, 0] = ax * ax * var_way + tx * tx * var_turn + s * s * var_side
+        Q[1, 1] = ay * ay * var_way + ty * ty * var_turn + c * c * var_side
+        Q[0, 1] = Q[1, 0] = ax * ay * var_way + tx * ty * var_turn - s * c * var_side
+        Q[0, 2] = Q[2, 0] = tx * var_turn
+        Q[1, 2] = Q[2, 1] = ty * var_turn
+        Q[2, 2] = var_turn
+        if self._bias >= 0:
+            Q[self._bias, self._bias] = noise.turn_bias_walk_rad_s_sqrt_s**2 * dt
+        return Q
+
+
+@dataclass(frozen=True, slots=True)
+class AckermannNoise:
+    """Noise of a steered vehicle's odometry, of every interval anew.
+
+    Attributes:
+        speed_sigma_m_s: standard deviation of the speed.
+        steer_sigma_rad: of the steered wheel's angle.
+    """
+
+    speed_sigma_m_s: float
+    steer_sigma_rad: float
+
+
+class Ackermann:
+    """A steered vehicle.
+
+    Reference ``front`` (Hevrdejs and Knoll 2017, eq. 3): x <- x + T v cos(heading + steer),
+    y <- y + T v sin(heading + steer), heading <- heading + T v sin(steer) / l.
+    Reference ``rear``: the same point on the rear axle, x <- x + T v cos(heading),
+    heading <- heading + T v tan(steer) / l.
+
+    Args:
+        wheelbase_m: l.
+        noise: of speed and steering angle.
+        reference: which axle the pose and the speed belong to.
+    """
+
+    names: tuple[str, ...] = ()
+    prior_sigmas: tuple[float, ...] = ()
+
+    def __init__(
+        self, wheelbase_m: float, noise: AckermannNoise, reference: Literal["front", "rear"] = "front"
+    ) -> None:
+        self.wheelbase_m = wheelbase_m
+        self.noise = noise
+        self.reference = reference
+
+    def step(self, states: FloatArray, odometry: Odometry) -> MotionStep:
+        """See ``MotionModel.step``; takes a ``Steering``."""
+        if not isinstance(odometry, Steering):
+            raise TypeError(f"an Ackermann vehicle takes speed and steering angle, not {type(odometry).__name__}")
+        x, y, heading = states.tolist()
+        t, steer = odometry.interval_s, odometry.steer_rad
+        way = t * odometry.speed_m_s
+        if self.reference == "front":
+            c, s = cos(heading + steer), sin(heading + steer)
+            curve, d_curve, swing = sin(steer) / self.wheelbase_m, cos(steer) / self.wheelbase_m, 1.0
+        else:
+            c, s = cos(heading), sin(heading)
+            curve, d_curve, swing = tan(steer) / self.wheelbase_m, (1.0 + tan(steer) ** 2) / self.wheelbase_m, 0.0
+        mean = np.array((x + way * c, y + way * s, heading + way * curve))
+        F = np.array(((1.0, 0.0, -way * s), (0.0, 1.0, way * c), (0.0, 0.0, 1.0)))
+        L = np.array(((t * c, -way * s * swing), (t * s, way * c * swing), (t * curve, way * d_curve)))
+        L[:, 0] *= self.noise.speed_sigma_m_s
+        L[:, 1] *= self.noise.steer_sigma_rad
+        return MotionStep(mean, F, L.dot(L.T))
+
+
+@dataclass(frozen=True, slots=True)
+class WheelNoise:
+    """Noise of the odometry, of every interval anew, and priors of its constant errors.
+
+    Attributes:
+        speed_sigma_m_s: standard deviation of the speed.
+        turn_sigma: of the steering angle (rad), or of the turn rate (rad/s).
+        drift_sigma_rad_s: prior of a constant drift of the heading; 0: not estimated.
+        slip_sigma: prior of the share of the travel that is lost; 0: not estimated.
+    """
+
+    speed_sigma_m_s: float
+    turn_sigma: float
+    drift_sigma_rad_s: float
+    slip_sigma: float
+
+
+class _Turn(NamedTuple):
+    """How an interval turns the vehicle, with derivatives by the reading of steering or turn rate, speed and slip.
+
+    Attributes:
+        swing_rad: of the course against the heading at the start.
+        turn_rad: of the heading.
+        swing_by: the swing by the reading, by the slip and by the drift.
+        turn_by: the turn by the reading, by the speed and by the slip.
+    """
+
+    swing_rad: float
+    turn_rad: float
+    swing_by: tuple[float, float, float]
+    turn_by: tuple[float, float, float]
+
+
+class SlippingVehicle:
+    """A steered vehicle (Hevrdejs and Knoll 2017, eq. 3) or a differential drive, with slip s and drift b.
+
+    With the way d = T v (1 - s), x <- x + d cos(h + a), y <- y + d sin(h + a), h <- h + w:
+
+    * steered by g: a = g, w = d sin(g) / l + T b
+    * differential at the rate omega: w = T omega (1 - s) + T b, a = w / 2
+
+    States behind the pose: heading_drift_rad_s (b) and slip (s), each where its prior is not zero. Wheels that read
+    zero stand, and have no noise.
+
+    Args:
+        kind: ``ackermann`` takes ``Steering``, ``differential`` takes ``Increment``.
+        wheelbase_m: l.
+        noise: of the odometry.
+    """
+
+    def __init__(self, kind: Literal["ackermann", "differential"], wheelbase_m: float, noise: WheelNoise) -> None:
+        self._is_steered = kind == "ackermann"
+        self._wheelbase_m = wheelbase_m
+        self._noise = noise
+        priors = (("heading_drift_rad_s", noise.drift_sigma_rad_s), ("slip", noise.slip_sigma))
+        self.names = tuple(name for name, sigma in priors if sigma > 0.0)
+        self.prior_sigmas = tuple(sigma for _, sigma in priors if sigma > 0.0)
+        self._drift = POSE if noise.drift_sigma_rad_s > 0.0 else None
+        self._slip = POSE + (self._drift is not None) if noise.slip_sigma > 0.0 else None
+        self.size = POSE + len(self.names)
+
+    def step(self, states: FloatArray, odometry: Odometry) -> MotionStep:
+        """See ``MotionModel.step``."""
+        T, v, reading = self._read(odometry)
+        values: list[float] = states.tolist()
+        drift = 0.0 if self._drift is None else values[self._drift]
+        slip = 0.0 if self._slip is None else values[self._slip]
+        turn = (self._steered if self._is_steered else self._differential)(T, v, reading, drift, slip)
+        d = T * v * (1.0 - slip)
+        c, s = cos(values[2] + turn.swing_rad), sin(values[2] + turn.swing_rad)
+        mean = states.copy()
+        mean[:POSE] = values[0] + d * c, values[1] + d * s, values[2] + turn.turn_rad
+        F = np.eye(self.size)
+        F[0, 2], F[1, 2] = -d * s, d * c
+        swing_by_reading, swing_by_slip, swing_by_drift = turn.swing_by
+        turn_by_reading, turn_by_speed, turn_by_slip = turn.turn_by
+        if self._drift is not None:
+            F[:POSE, self._drift] = -d * s * swing_by_drift, d * c * swing_by_drift, T
+        if self._slip is not None:
+            F[:POSE, self._slip] = -T * v * c - d * s * swing_by_slip, -T * v * s + d * c * swing_by_slip, turn_by_slip
+        L = np.zeros((self.size, 2))
+        L[:POSE, 0] = T * (1.0 - slip) * c, T * (1.0 - slip) * s, turn_by_speed
+        L[:POSE, 1] = -d * s * swing_by_reading, d * c * swing_by_reading, turn_by_reading
+        stands = v == 0.0 and (self._is_steered or reading == 0.0)
+        L *= (0.0, 0.0) if stands else (self._noise.speed_sigma_m_s, self._noise.turn_sigma)
+        return MotionStep(mean, F, L @ L.T)
+
+    def _steered(self, T: float, v: float, steer: float, drift: float, slip: float) -> _Turn:
+        curve = T * sin(steer) / self._wheelbase_m
+        d_steer = T * v * (1.0 - slip) * cos(steer) / self._wheelbase_m
+        w = curve * v * (1.0 - slip) + T * drift
+        return _Turn(steer, w, (1.0, 0.0, 0.0), (d_steer, curve * (1.0 - slip), -curve * v))
+
+    @staticmethod
+    def _differential(T: float, _v: float, omega: float, drift: float, slip: float) -> _Turn:
+        w = T * omega * (1.0 - slip) + T * drift
+        by_omega, by_slip = T * (1.0 - slip), -T * omega
+        return _Turn(0.5 * w, w, (0.5 * by_omega, 0.5 * by_slip, 0.5 * T), (by_omega, 0.0, by_slip))
+
+    def _read(self, odometry: Odometry) -> tuple[float, float, float]:
+        """Interval, speed, and steering angle or turn rate."""
+        if self._is_steered:
+            if not isinstance(odometry, Steering):
+                raise TypeError(f"a steered vehicle takes speed and steering angle, not {type(odometry).__name__}")
+            return odometry.interval_s, odometry.speed_m_s, odometry.steer_rad
+        if not isinstance(odometry, Increment):
+            raise TypeError(f"a differential drive takes increments, not {type(odometry).__name__}")
+        T = odometry.interval_s
+        return T, odometry.distance_m / T, odometry.turn_rad / T
+
+
+SLIVER = 0.2
+"""Part of an interval that is not worth a step of its own: the pose is carried over it."""
+
+
+STANDS = (0.0, 0.0, 0.0)
+
+
+class Carried(NamedTuple):
+    """The pose at a reading's time: pose(t) = pose - back_s (vx, vy, turn).
+
+    Attributes:
+        pose: x_m, y_m, heading_rad.
+        velocity: vx_m_s, vy_m_s in the frame of the map, turn_rad_s.
+        back_s: the time it was carried back by; negative: forwards.
+    """
+
+    pose: list[float]
+    velocity: tuple[float, float, float]
+    back_s: float
+
+    def by_heading(self) -> tuple[float, float]:
+        """Derivatives of x and y by the heading of the state."""
+        return self.back_s * self.velocity[1], -self.back_s * self.velocity[0]
+
+    def by_delay(self) -> tuple[float, float, float]:
+        """Derivatives of x, y and heading by the delay."""
+        (vx, vy, turn), (x_heading, y_heading) = self.velocity, self.by_heading()
+        return -vx - turn * x_heading, -vy - turn * y_heading, -turn
+
+
+class DeadReckoning:
+    """Odometry that tells what the vehicle will have done after a delay, which may be an estimate.
+
+    Commanded speeds run ahead of the wheels; stamps of readings may come late or early. Steps wait until they are due:
+    the state is the pose at t - delay by odometry's clock, which is the pose at t by that of the readings. Of a
+    negative delay, odometry that comes late, only an interval can be made up for. What is left, less than an interval,
+    the pose is carried over at constant speed, and the derivative by the delay is that speed (Li and Mourikis 2014).
+    So readings between two steps are taken at their own time even where no delay is asked for.
+
+    Args:
+        is_delayed: False: every step is due at once.
+    """
+
+    def __init__(self, *, is_delayed: bool) -> None:
+        self._is_delayed = is_delayed
+        self._steps: deque[Odometry] = deque()
+        self._until_s, self._interval_s = nan, 0.0
+        self._rates = (0.0, 0.0, 0.0)  # forwards, to the left, turn
+
+    def due(self, odometry: Odometry, delay_s: float) -> list[Odometry]:
+        """The steps, or parts of one, to be taken when ``odometry`` arrives."""
+        if not self._is_delayed:
+            return [odometry]
+        steps, found = self._steps, []
+        steps.append(odometry)
+        until_s = odometry.time_s - delay_s
+        while steps and steps[0].time_s <= until_s:
+            found.append(steps.popleft())
+        if steps:
+            first = steps[0]
+            part = (until_s - first.time_s + first.interval_s) / first.interval_s if first.interval_s > 0.0 else 0.0
+            if SLIVER < part < 1.0 - SLIVER:
+                done, steps[0] = _split(first, part)
+                found.append(done)
+        return found
+
+    def took(self, odometry: Odometry, before: FloatArray, after: FloatArray) -> float:
+        """A step was taken, from one state to another; its length, m."""
+        self._until_s, dt = odometry.time_s, odometry.interval_s
+        self._interval_s = dt
+        x, y, heading = before[:POSE].tolist()
+        new_x, new_y, new_heading = after[:POSE].tolist()
+        dx, dy, turn = new_x - x, new_y - y, new_heading - heading
+        if dt > 0.0:
+            c, s = cos(heading + 0.5 * turn), sin(heading + 0.5 * turn)
+            self._rates = ((dx * c + dy * s) / dt, (dy * c - dx * s) / dt, turn / dt)
+        return hypot(dx, dy)
+
+    def at(self, pose: list[float], time_s: float, delay_s: float) -> Carried:
+        """The pose, the first of some states, at a reading's time, carried no further than an interval."""
+        limit_s = self._interval_s
+        back_s = self._until_s + delay_s - time_s
+        back_s = max(-limit_s, min(limit_s, back_s)) if limit_s > 0.0 else 0.0
+        if back_s == 0.0 and not self._is_delayed:
+            return Carried(pose[:POSE], STANDS, 0.0)  # its speed does not matter
+        ahead, side, turn = self._rates
+        heading = pose[2] - back_s * turn
+        c, s = cos(heading), sin(heading)
+        vx, vy = ahead * c - side * s, ahead * s + side * c
+        return Carried([pose[0] - back_s * vx, pose[1] - back_s * vy, heading], (vx, vy, turn), back_s)
+
+
+def _split(step: Odometry, part: float) -> tuple[Odometry, Odometry]:
+    """A step in two."""
+    first_s, rest_s = part * step.interval_s, (1.0 - part) * step.interval_s
+    first = replace(step, time_s=step.time_s - rest_s, interval_s=first_s)
+    rest = replace(step, interval_s=rest_s)
+    if isinstance(first, Increment) and isinstance(rest, Increment):
+        return _scaled(first, part), _scaled(rest, 1.0 - part)
+    return first, rest
+
+
+def _scaled(step: Increment, part: float) -> Increment:
+    return replace(
+        step,
+        distance_m=part * step.distance_m,
+        turn_rad=part * step.turn_rad,
+        lateral_m=part * step.lateral_m,
+        guess_m2=part * step.guess_m2,
+        guess_rad2=part * step.guess_rad2,
+    )

@@ -1,0 +1,343 @@
+"""A vehicle among beacons that places them on a map while it finds itself on it: EKF-SLAM over readings.
+
+Refused readings, counted: whether they accuse the pose or a beacon.
+
+What the motion has added to the covariance of the pose since something was last heard.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from math import log, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.beacons.slam.beacon_map import HEADING, BeaconMap, Entry, NoiseLevel, SlamSettings, Transport, Wander
+from ccatp.beacons.slam.landmark_init import Newcomers, derivatives
+from ccatp.beacons.slam.measurement_models import Sensors, bearing_of, is_direction, kind_of, strength_of
+from ccatp.beacons.slam.motion import POSE, DeadReckoning, DifferentialDrive, Increment, Odometry, Pose
+from ccatp.beacons.slam.recording import BeaconId, Reading
+from ccatp.core import FloatArray, wrap_pi
+from ccatp.filters.ekf_slam import BlockError, EkfSlam, RowUpdate
+
+
+class Doubts:
+    """One reading that is not believed is an outlier. Several in a row, of whichever beacons, accuse the pose.
+
+    Args:
+        after: refusals in a row that accuse the pose.
+    """
+
+    def __init__(self, after: int) -> None:
+        self._after, self._refused = after, 0
+
+    def clear(self) -> None:
+        """A reading was believed."""
+        self._refused = 0
+
+    def refuse(self) -> bool:
+        """A reading was not believed; True if the pose is to be doubted now."""
+        self._refused += 1
+        if self._refused < self._after:
+            return False
+        self._refused = 0
+        return True
+
+
+class FreshNoise:
+    """N <- G N G^T + Q, N symmetric, G = dh(pose)/d(pose): the identity, but for the derivatives by the heading.
+
+    Six numbers in place of an array of nine: an update of so small a one by NumPy takes longer than the rest.
+    """
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Something was heard."""
+        self._xx = self._xy = self._xt = self._yy = self._yt = self._tt = 0.0
+
+    def step(self, F: FloatArray, Q: FloatArray) -> None:
+        """The vehicle moves on: Jacobian and noise of its states, each of shape (v, v), the pose first."""
+        f, g, tt = F.item(0, 2), F.item(1, 2), self._tt
+        xt, yt = self._xt + f * tt, self._yt + g * tt
+        self._xx += f * (self._xt + xt) + Q.item(0, 0)
+        self._xy += g * self._xt + f * yt + Q.item(0, 1)
+        self._yy += g * (self._yt + yt) + Q.item(1, 1)
+        self._xt, self._yt, self._tt = xt + Q.item(0, 2), yt + Q.item(1, 2), tt + Q.item(2, 2)
+
+    def seen(self, hx: float, hy: float, ht: float) -> float:
+        """H N H^T of a row with these derivatives by the pose."""
+        across = hx * (hx * self._xx + 2.0 * (hy * self._xy + ht * self._xt))
+        return across + hy * (hy * self._yy + 2.0 * ht * self._yt) + ht * ht * self._tt
+
+
+DELAY = "odometry_delay_s"
+
+
+@dataclass(frozen=True, slots=True)
+class BeaconEstimate:
+    """A beacon on the map.
+
+    Attributes:
+        mean: x_m, y_m and, where they are estimated, reference_dbm and exponent, shape (b,).
+        covariance: shape (b, b).
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+
+
+class Learned(NamedTuple):
+    """What one reading did: an ``Innovation`` with the beacon it came from.
+
+    Attributes:
+        beacon: which one.
+        residual: z - h(x) of the bearing, if there is one, and of the range or the strength, shape (m,).
+        nis: nu^T S^-1 nu, with the larger noise where a reading was beyond the knee.
+        size: m; a reading whose bearing is refused has its range left out.
+        accepted: False where it was refused; the state is then as before, or has taken the bearing alone.
+        surprise: minus twice its log-likelihood, up to a constant: sum of nis + ln S.
+    """
+
+    beacon: BeaconId
+    residual: FloatArray
+    nis: float
+    size: int
+    accepted: bool
+    surprise: float = 0.0
+
+
+class BeaconSlam:
+    """EKF-SLAM of a vehicle among beacons, by ``EkfSlam``; docs/slam.md has the models.
+
+    Args:
+        settings: vehicle and radios.
+        pose0: where the vehicle begins; it defines the frame of the map.
+        P0: covariance of that, shape (3, 3).
+        known: beacons with a prior: mean (b,) and covariance (b, b).
+
+    Attributes:
+        engine: the state: vehicle | calibration | beacons, wandering errors and places where readings wait.
+        learned: what the readings of the last ``observe`` did.
+        waiting: beacons that were heard and are not on the map yet, with the candidates for their places.
+        levels: what the noise of each sensor and of the motion is, relative to the settings, in variance.
+        prior_sigmas: standard deviations of ``calibration`` before any reading, in its order.
+        jumps: how often the pose was doubted.
+        unplaced: directions alone, of beacons that were not on the map then: they are not used.
+        moved: beacons that had to be placed anew, each with the time_s of the reading that decided it.
+    """
+
+    def __init__(
+        self,
+        settings: SlamSettings,
+        pose0: Pose | Sequence[float],
+        P0: FloatArray,
+        known: Mapping[BeaconId, BeaconEstimate] | None = None,
+    ) -> None:
+        self.settings = settings
+        self._motion, self._sensors, trust = settings.motion, Sensors(settings), settings.trust
+        delay = (settings.delay_sigma_s,) if settings.delay_sigma_s > 0.0 else ()
+        own, shared = self._motion.prior_sigmas, (*self._sensors.prior_sigmas, *delay)
+        v, self._ranges = POSE + len(own), len(self._sensors.names)
+        mean, P = np.zeros(v), np.zeros((v, v))
+        mean[:POSE], P[:POSE, :POSE] = pose0, P0
+        P[range(POSE, v), range(POSE, v)] = np.square(own)
+        self.engine = EkfSlam(mean, P, np.zeros(len(shared)), np.diag(np.square(shared)))
+        self._shared = slice(v, v + len(shared))
+        self._delay = v + len(shared) - 1 if delay else -1
+        self._shown = POSE + len(shared)  # of the columns of a row, those before the beacon
+        self.prior_sigmas = (*own, *shared)
+        self._names: tuple[str, ...] = (*self._motion.names, *self._sensors.names, *((DELAY,) if delay else ()))
+        self._clock = DeadReckoning(is_delayed=bool(delay))
+        self._map = BeaconMap(self.engine, self._shared)
+        self._transport = Transport(self.engine) if trust.transports else None
+        self.levels = {
+            k: NoiseLevel(trust.learn_prior, trust.learn_memory) for k in ("range", "bearing", "rssi", "motion")
+        }
+        self._learns = trust.learn_memory > 0.0
+        self._fresh = FreshNoise()
+        self._gate, self._knee = trust.gate_sigmas**2, trust.knee_sigmas
+        self._doubts, self.jumps, self.unplaced = Doubts(trust.doubt_pose_after), 0, 0
+        self.moved: list[tuple[BeaconId, float]] = []
+        self._way_m = 0.0
+        self._newcomers = Newcomers(
+            self.engine, self._sensors, self._map, self._clock, self.levels, self._shared, self._delay
+        )
+        self.waiting = self._newcomers.waiting
+        self.learned: list[Learned] = []
+        for beacon, estimate in (known or {}).items():
+            self._map.join(beacon, estimate.mean, estimate.covariance)
+
+    @property
+    def pose(self) -> Pose:
+        """The vehicle after the last odometry; the heading does not wrap."""
+        return Pose(*self.engine.mean[:POSE].tolist())
+
+    @property
+    def pose_covariance(self) -> FloatArray:
+        """Of x_m, y_m, heading_rad, shape (3, 3)."""
+        return self.engine.covariance[:POSE, :POSE].copy()
+
+    @property
+    def beacons(self) -> dict[BeaconId, BeaconEstimate]:
+        """The map."""
+        x, P, place = self.engine.mean, self.engine.covariance, self.engine.block
+        return {b: BeaconEstimate(x[place(b)].copy(), P[place(b), place(b)].copy()) for b in self._map}
+
+    @property
+    def calibration(self) -> dict[str, tuple[float, float]]:
+        """Mean and standard deviation of what is calibrated on the way, by name."""
+        mean, variances = self.engine.mean.tolist(), self.engine.covariance.diagonal().tolist()
+        return {name: (mean[POSE + i], sqrt(variances[POSE + i])) for i, name in enumerate(self._names)}
+
+    def predict(self, odometry: Odometry) -> None:
+        """Carry the vehicle on.
+
+        Raises:
+            TypeError: the odometry is of another kind of vehicle.
+        """
+        delay_s = float(self.engine.mean[self._delay]) if self._delay >= 0 else 0.0
+        for step in self._clock.due(odometry, delay_s):
+            self._step(step)
+
+    def _step(self, odometry: Odometry) -> None:
+        engine = self.engine
+        before = engine.mean[: engine.vehicle_size].copy()
+        mean, F, Q = self._motion.step(before, odometry)
+        if self._learns:
+            Q = Q * self.levels["motion"].factor
+            self._fresh.step(F, Q)
+        if isinstance(odometry, Increment) and odometry.guess_m2 > 0.0:
+            Q = _with_guess(Q, odometry)
+        engine.predict(mean, F, Q)
+        self._way_m += self._clock.took(odometry, before, mean)
+        rest = self._motion.at_rest(odometry) if isinstance(self._motion, DifferentialDrive) else None
+        if rest is not None:
+            residual = rest.value - float(engine.mean[rest.column])
+            corrected = engine.mean.copy()
+            engine.update_row(np.array((rest.column,)), np.ones(1), residual, rest.variance)
+            self._follow(corrected)
+
+    def observe(self, readings: Iterable[Reading]) -> list[Learned]:
+        """Take readings of any beacons, one after the other; those of new ones begin their place on the map.
+
+        Raises:
+            SensorError: the settings have no model of a reading.
+        """
+        self.learned = []
+        for reading in readings:
+            entry, before = self._map.get(reading.beacon), self.engine.mean.copy()
+            if entry is None and is_direction(reading):
+                self.unplaced += 1  # it may lie anywhere along it
+            elif entry is None:
+                self._newcomers.meet(reading)
+            else:
+                self.learned.append(self._update(reading, entry))
+                if entry.on_trial and reading.beacon not in self._map and not is_direction(reading):
+                    before = self.engine.mean.copy()
+                    self._newcomers.meet(reading)
+            self._follow(before)
+        return self.learned
+
+    def _follow(self, before: FloatArray) -> None:
+        """The covariance follows a correction of the state."""
+        if self._transport is not None:
+            self._transport.follow(before)
+
+    def told_heading(self, off_rad: float, sigma_rad: float) -> float:
+        """Take a heading that is ``off_rad`` from the one that is thought, and tells the NIS of that."""
+        before = self.engine.mean.copy()
+        found = self.engine.update_row(np.array((HEADING,)), np.ones(1), off_rad, sigma_rad**2)
+        self._follow(before)
+        return found.nis
+
+    def remove(self, beacon: BeaconId) -> None:
+        """Forget a beacon; one that is heard again begins anew.
+
+        Raises:
+            BlockError: nothing was heard of it.
+        """
+        if self._newcomers.forget(beacon):
+            return
+        if beacon not in self._map:
+            raise BlockError(beacon, "is not on the map")
+        self._map.leave(beacon)
+
+    def _update(self, reading: Reading, entry: Entry) -> Learned:
+        """Bearing first, which says whether it is the beacon at all; then the range or strength, if any."""
+        model = None if is_direction(reading) else self._sensors.wander(reading)
+        if model is not None:
+            self._map.wander_to(reading.beacon, model, self._way_m, reading.time_s)
+        bearing = bearing_of(reading)
+        residuals, nis, spread, found = [], 0.0, 1.0, None
+        if bearing is not None:
+            found = self._take(reading, entry, "bearing", bearing, model)
+            residuals, nis, spread = [found.residual], found.nis, found.spread
+        if found is None or (found.accepted and not is_direction(reading)):
+            found = self._take(reading, entry, kind_of(reading), strength_of(reading), model)
+            residuals.append(found.residual)
+            nis += found.nis
+            spread *= found.spread
+        if self._learns:
+            self._fresh.clear()
+        self._judge(reading, entry, accepted=found.accepted)
+        return Learned(reading.beacon, np.array(residuals), nis, len(residuals), found.accepted, nis + log(spread))
+
+    def _take(self, reading: Reading, entry: Entry, kind: str, z: float, model: Wander | None) -> RowUpdate:
+        """One scalar of a reading."""
+        engine, level = self.engine, self.levels[kind]
+        x: list[float] = engine.mean.take(entry.columns).tolist()
+        is_delayed, is_angle, shown = self._delay >= 0, kind == "bearing", self._shown
+        beacon = x[shown : shown + entry.size]
+        at = self._clock.at(x, reading.time_s, x[shown - 1] if is_delayed else 0.0)
+        if is_angle:
+            row = self._sensors.bearing(at.pose, beacon)
+        else:
+            row = self._sensors.row(reading, at.pose, x[POSE : POSE + self._ranges], beacon)
+        h = derivatives(row, at, delayed=is_delayed)
+        h += row.beacon
+        expected, own = row.expected, row.variance * level.factor
+        r = own
+        if entry.wander >= 0:
+            share = 0.0 if model is None or is_angle else model.share
+            by_wander = sqrt(share * r)
+            h.append(by_wander)
+            expected += by_wander * x[-1]
+            r *= 1.0 - share
+            own = r + entry.fresh * by_wander * by_wander
+        residual = wrap_pi(z - expected) if is_angle else z - expected
+        found = engine.update_row(entry.columns, np.array(h), residual, r, self._gate, self._knee)
+        if found.accepted and self._learns:
+            level.learn(found.nis, own / found.spread)
+            self.levels["motion"].learn(found.nis, self._fresh.seen(h[0], h[1], h[2]) / found.spread)
+        return found
+
+    def _judge(self, reading: Reading, entry: Entry, *, accepted: bool) -> None:
+        """Refusals accuse the pose, or a beacon that alone is refused: the one is loosened, the other begins anew."""
+        if accepted:
+            entry.refused = 0
+            entry.on_trial = max(entry.on_trial - 1, 0)
+            self._doubts.clear()
+            return
+        if entry.on_trial:
+            self._map.leave(reading.beacon)
+            return
+        entry.refused += 1
+        trust = self.settings.trust
+        if self._doubts.refuse():
+            v = self.engine.vehicle_size
+            jump = np.zeros(v)
+            jump[:POSE] = trust.jump_m, trust.jump_m, trust.jump_rad
+            self.engine.predict(self.engine.mean[:v].copy(), np.eye(v), np.diag(jump**2))
+            self.jumps += 1
+        if entry.refused >= trust.doubt_beacon_after:
+            self._map.leave(reading.beacon)
+            self.moved.append((reading.beacon, reading.time_s))
+
+
+def _with_guess(Q: FloatArray, odometry: Increment) -> FloatArray:
+    """The noise of a step whose way is guessed, which tells nothing of the noise of odometry."""
+    Q = Q.copy()
+    Q[range(POSE), range(POSE)] += odometry.guess_m2, odometry.guess_m2, odometry.guess_rad2
+    return Q

@@ -1,0 +1,235 @@
+"""A recorded run in the units and the order that estimators want: odometry, readings, truth if there is one.
+
+What an estimator says of a recorded run: the path, the map, the calibration, each with its uncertainty.
+
+What a radio tells of a beacon: ranges, bearings and signal strengths, each with its own time.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ccatp.core import FloatArray, IntArray
+
+
+class Steps(NamedTuple):
+    """Dead reckoning, one step a row: step k carries the vehicle from times_s[k] to times_s[k + 1].
+
+    Args:
+        times_s: where steps begin and end, s, shape (n + 1,), rising.
+        distance_m: forward travel within a step, m, shape (n,).
+        turn_rad: turn within a step, counter-clockwise, rad, shape (n,).
+        lateral_m: travel to the left within a step, m, shape (n,); zeros for wheels that do not slip.
+        guess_m2: variance of the end of a step, along and across, where the odometry was silent and the way is guessed,
+            m^2, shape (n,); 0.0: none is.
+        guess_rad2: the same of its turn, rad^2.
+    """
+
+    times_s: FloatArray
+    distance_m: FloatArray
+    turn_rad: FloatArray
+    lateral_m: FloatArray
+    guess_m2: FloatArray | float = 0.0
+    guess_rad2: FloatArray | float = 0.0
+
+
+class Readings(NamedTuple):
+    """What was heard of beacons, one reading a row, in order of time.
+
+    Args:
+        times_s: shape (m,), s, rising.
+        beacon: index into ``RecordedRun.beacon_ids``, shape (m,).
+        range_m: shape (m,), m; NaN where none was measured.
+        bearing_rad: from the heading, counter-clockwise, rad, shape (m,); NaN where none was measured.
+        rssi_dbm: signal strength, dBm, shape (m,); NaN where none was measured.
+    """
+
+    times_s: FloatArray
+    beacon: IntArray
+    range_m: FloatArray
+    bearing_rad: FloatArray
+    rssi_dbm: FloatArray
+
+    def where(self, rows: npt.NDArray[np.bool_] | IntArray) -> "Readings":
+        """Some of the readings."""
+        return Readings(
+            self.times_s[rows], self.beacon[rows], self.range_m[rows], self.bearing_rad[rows], self.rssi_dbm[rows]
+        )
+
+
+class Truth(NamedTuple):
+    """Where the vehicle was, world frame.
+
+    Args:
+        times_s: shape (k,), s, rising.
+        x_m: shape (k,), m.
+        y_m: shape (k,), m.
+        heading_rad: shape (k,), rad, continuous; NaN where the reference saw positions alone.
+    """
+
+    times_s: FloatArray
+    x_m: FloatArray
+    y_m: FloatArray
+    heading_rad: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedRun:
+    """One vehicle's run among beacons.
+
+    Attributes:
+        name: of the data set, as in ``Plaza2``.
+        kind: format that it was read from: plaza, mrclam, labyrinth or csv.
+        steps: of dead reckoning.
+        readings: what was heard of beacons.
+        beacon_ids: name of each beacon as the data set gives it.
+        beacon_truth_m: surveyed x, y by name, world frame, m; beacons that were not surveyed are missing.
+        truth: reference trajectory, or none.
+        first_pose: x_m, y_m, heading_rad at the first odometry time, world frame: the one thing that an estimator may
+            take from the truth; the origin if there is no truth.
+        warnings: what looks wrong in the set, a line each.
+    """
+
+    name: str
+    kind: str
+    steps: Steps
+    readings: Readings
+    beacon_ids: tuple[str, ...]
+    beacon_truth_m: Mapping[str, tuple[float, float]]
+    truth: Truth | None
+    first_pose: tuple[float, float, float]
+    warnings: tuple[str, ...]
+
+
+def dead_reckoned(steps: Steps, first_pose: tuple[float, float, float]) -> FloatArray:
+    """Poses x_m, y_m, heading_rad at ``steps.times_s`` by odometry alone, shape (n + 1, 3).
+
+    Each step is a chord at the mean heading: x <- x + d cos(heading + turn / 2), thesis eq. 2.14 as it is meant.
+    """
+    x_m, y_m, heading_rad = first_pose
+    headings = heading_rad + np.concatenate([[0.0], np.cumsum(steps.turn_rad)])
+    middle = headings[:-1] + 0.5 * steps.turn_rad
+    c, s = np.cos(middle), np.sin(middle)
+    dx, dy = steps.distance_m * c - steps.lateral_m * s, steps.distance_m * s + steps.lateral_m * c
+    x, y = x_m + np.concatenate([[0.0], np.cumsum(dx)]), y_m + np.concatenate([[0.0], np.cumsum(dy)])
+    return np.column_stack([x, y, headings])
+
+
+class BeaconFix(NamedTuple):
+    """A beacon on the map.
+
+    Attributes:
+        x_m: place.
+        y_m: place.
+        covariance: of x_m, y_m, shape (2, 2).
+    """
+
+    x_m: float
+    y_m: float
+    covariance: FloatArray
+
+
+class Calibrated(NamedTuple):
+    """A quantity found on the way.
+
+    Attributes:
+        value: positive where the sensor reads too much.
+        sigma: its standard deviation.
+    """
+
+    value: float
+    sigma: float
+
+
+class Track(NamedTuple):
+    """An estimate of a run.
+
+    Attributes:
+        times_s: shape (n,), rising.
+        poses: x_m, y_m, heading_rad, shape (n, 3).
+        covariances: of the poses, shape (n, 3, 3).
+        beacons: the map, by name.
+        calibration: what was calibrated on the way, by name.
+        nis: normalised innovations squared of the readings that were used, shape (u,); none from a smoother.
+        nis_sizes: their degrees of freedom, shape (u,).
+        refused: how many readings were refused, or weigh less than a tenth.
+        update_s: wall time of each reading, the prediction to it included, s; of a smoother its whole time shared among
+            the readings.
+        predict_s: wall time of each prediction, s; none from a smoother.
+        scalar_s: wall time of each scalar of a reading of a beacon on the map, s, without prediction; none from a
+            smoother.
+        updates: how many readings were used.
+        warnings: what is doubtful, a line each.
+    """
+
+    times_s: FloatArray
+    poses: FloatArray
+    covariances: FloatArray
+    beacons: Mapping[str, BeaconFix]
+    calibration: Mapping[str, Calibrated]
+    nis: FloatArray
+    nis_sizes: FloatArray
+    refused: int
+    update_s: FloatArray
+    predict_s: FloatArray
+    scalar_s: FloatArray
+    updates: int
+    warnings: tuple[str, ...]
+
+
+BeaconId = int | str
+
+
+@dataclass(frozen=True, slots=True)
+class RangeReading:
+    """A range to a beacon, as it was measured: scale error, offset and all.
+
+    Attributes:
+        time_s: when it was taken.
+        beacon: which one answered.
+        range_m: what was read, m.
+    """
+
+    time_s: float
+    beacon: BeaconId
+    range_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class RangeBearingReading:
+    """A range and a direction.
+
+    Attributes:
+        time_s: when it was taken.
+        beacon: which one was seen.
+        range_m: what was read, m; NaN where the direction alone was.
+        bearing_rad: from the vehicle's heading, counter-clockwise.
+    """
+
+    time_s: float
+    beacon: BeaconId
+    range_m: float
+    bearing_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class RssiReading:
+    """A signal strength, with the direction where it was strongest if an antenna turns.
+
+    Attributes:
+        time_s: when it was taken.
+        beacon: which one was heard.
+        rssi_dbm: received signal strength, dBm.
+        bearing_rad: from the vehicle's heading, counter-clockwise; None without a directional antenna.
+    """
+
+    time_s: float
+    beacon: BeaconId
+    rssi_dbm: float
+    bearing_rad: float | None = None
+
+
+Reading = RangeReading | RangeBearingReading | RssiReading

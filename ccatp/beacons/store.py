@@ -1,0 +1,74 @@
+"""The database of a mission among beacons: waypoints as they are reached, events. Survives ``kill -9``.
+
+SQLite with a rollback journal and ``synchronous=FULL``: what is committed is on the disk, the file alone is complete.
+"""
+
+import sqlite3
+from pathlib import Path
+
+from ccatp.beacons.mission import Arrival
+from ccatp.errors import CcatpError, ExitStatus
+
+_SCHEMA = """
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE waypoint (
+    number INTEGER PRIMARY KEY, lap INTEGER NOT NULL, waypoint INTEGER NOT NULL, x_m REAL NOT NULL, y_m REAL NOT NULL,
+    reached_s REAL, estimate_x_m REAL, estimate_y_m REAL, xx_m2 REAL, xy_m2 REAL, yy_m2 REAL
+);
+CREATE TABLE event (t_s REAL NOT NULL, level TEXT NOT NULL, text TEXT NOT NULL);
+"""
+
+
+class BeaconStoreError(CcatpError):
+    """The database cannot be made."""
+
+    exit_status = ExitStatus.USAGE
+
+
+class BeaconStore:
+    """The database of one run.
+
+    Args:
+        path: a file that does not exist.
+        meta: what the run is of.
+        waypoints: places, in the order of one lap.
+        laps: how often they are visited; 0 where there are none to visit.
+
+    Raises:
+        BeaconStoreError: the file exists, or cannot be made.
+    """
+
+    def __init__(self, path: Path, meta: dict[str, str], waypoints: tuple[tuple[float, float], ...], laps: int) -> None:
+        if path.exists():
+            raise BeaconStoreError(f"{path}: holds a mission already; give another --run-dir")
+        try:
+            self._db = sqlite3.connect(path, isolation_level=None)
+            self._db.execute("PRAGMA synchronous=FULL")
+            self._db.executescript(f"BEGIN; {_SCHEMA} COMMIT;")
+        except sqlite3.Error as error:
+            raise BeaconStoreError(f"{path}: cannot be made: {error}") from error
+        planned = [
+            (lap * len(waypoints) + at, lap, at, *place) for lap in range(laps) for at, place in enumerate(waypoints)
+        ]
+        with self._db:
+            self._db.execute("BEGIN")
+            self._db.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
+            self._db.executemany(
+                "INSERT INTO waypoint (number, lap, waypoint, x_m, y_m) VALUES (?, ?, ?, ?, ?)", planned
+            )
+
+    def record_arrival(self, t_s: float, number: int, arrival: Arrival) -> None:
+        """A waypoint is reached, robot time t_s; ``number`` counts over all laps."""
+        self._db.execute(
+            "UPDATE waypoint SET reached_s = ?, estimate_x_m = ?, estimate_y_m = ?, xx_m2 = ?, xy_m2 = ?, yy_m2 = ? "
+            "WHERE number = ?",
+            (t_s, *arrival.belief.ellipse, number),
+        )
+
+    def record_event(self, t_s: float, level: str, text: str) -> None:
+        """Something happened."""
+        self._db.execute("INSERT INTO event VALUES (?, ?, ?)", (t_s, level, text))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._db.close()

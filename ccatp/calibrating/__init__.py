@@ -1,1 +1,0 @@
-"""Pure. Wheel radii, wheel base and gyroscope bias out of a drive between fixes."""

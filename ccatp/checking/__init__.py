@@ -1,1 +1,0 @@
-"""Pure. What is asked before a mission, and what the answers mean."""

@@ -1,0 +1,44 @@
+"""The table of commands. Only click is imported here: ``--help`` and completion must be quick.
+
+Each module holds the commands of one purpose; ``common`` what they share.
+"""
+
+from collections.abc import Sequence
+
+import click
+
+import ccatp
+from ccatp.cli import config, operate, prepare, radio, recording, report, run, sim, study
+from ccatp.cli.common import SuggestingGroup, example, run_command_line
+from ccatp.config.package import COMPILED, build
+
+COMMANDS = (
+    # before a mission
+    *(prepare.plan, prepare.check, prepare.calibrate, config.config, config.keys),
+    # during a mission
+    *(run.run, operate.status, operate.pause, operate.resume, operate.abort, operate.stop),
+    *(operate.emergency, operate.clear, run.dashboard, run.stream),
+    # after a mission
+    *(report.report, report.compare, report.align, report.replay, report.draw_map, recording.log),
+    # simulation and studies
+    *(sim.sim, study.study, study.bench, sim.conformance, radio.radio, config.completion),
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    return run_command_line(cli, argv)
+
+
+@click.group(
+    cls=SuggestingGroup,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog=example("ccatp run --sim", "ccatp run --sim --mirror fyst-m2 --seed 2", "ccatp status --json"),
+)
+@click.version_option(ccatp.__version__, message="ccatp %(version)s" + (" compiled" if build() == COMPILED else ""))
+def cli() -> None:
+    """Survey telescope mirrors with a laser-tracked robot."""
+
+
+for command in COMMANDS:
+    cli.add_command(command)

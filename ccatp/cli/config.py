@@ -1,0 +1,185 @@
+"""The commands ``ccatp config check`` and ``ccatp config schema``.
+
+``ccatp keys``: makes the keys of the observatory channel and of the robot link, and shows the public ones.
+
+The command ``ccatp completion``: the lines that teach a shell our commands, options and names.
+"""
+
+import json
+import re
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ccatp.cli.common import NearestChoice, SuggestingGroup, complain, example
+from ccatp.errors import ConfigError
+
+
+@click.group(
+    cls=SuggestingGroup, epilog=example("ccatp config check telescope.toml", "ccatp config schema > ccatp.schema.json")
+)
+def config() -> None:
+    """Check and describe configurations."""
+
+
+@config.command("check", epilog=example("ccatp config check telescope.toml"))
+@click.argument("file", type=click.Path(path_type=Path))
+def config_check(file: Path) -> int:
+    """Check a configuration; each problem is one line with file, line and key."""
+    from ccatp.config.load import is_radio_file, load_config, load_radio_config
+    from ccatp.errors import ConfigError
+
+    try:
+        if is_radio_file(file):
+            beacons = load_radio_config(file)
+            click.echo(f"{file}: ok: system {beacons.system}, seed {beacons.run.seed}")
+            return 0
+        cfg = load_config(file)
+    except ConfigError as error:
+        for problem in error.problems:
+            complain(problem, error.exit_status)
+        return error.exit_status
+    shown = f"mirror {cfg.mirror.name}, {cfg.mirror.panels.count} panels, world {cfg.world.name}, seed {cfg.run.seed}"
+    click.echo(f"{file}: ok: {shown}")
+    return 0
+
+
+@config.command("schema", epilog=example("ccatp config schema > ccatp.schema.json"))
+def config_schema() -> None:
+    """Print the JSON schema of a configuration file."""
+    from ccatp.config.load import json_schema
+
+    click.echo(json.dumps(json_schema(), indent=2))
+
+
+DEFAULT_DIR = "keys"
+DEFAULT_NAME = "ccatp"
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}")
+
+
+def _name(_ctx: click.Context, _param: click.Parameter, name: str | None) -> str | None:
+    """A name that stands in file names and in tables of TOML as it is.
+
+    Raises:
+        click.BadParameter: it does not.
+    """
+    if name is not None and not _NAME.fullmatch(name):
+        raise click.BadParameter(f"{name!r}: letters, digits, - and _ only, at most 63")
+    return name
+
+
+DIR_OPTION = click.option(
+    "--dir", "folder", type=click.Path(path_type=Path), default=DEFAULT_DIR, show_default=True,
+    help="Folder of the keys, for its owner alone.",
+)  # fmt: skip
+
+
+@click.group(cls=SuggestingGroup, epilog=example("ccatp keys generate --dir /etc/ccatp/keys"))
+def keys() -> None:
+    """Make keys and show the public ones."""
+
+
+@keys.command(
+    epilog=example(
+        "ccatp keys generate --dir /etc/ccatp/keys",
+        "ccatp keys generate --client --name observatory --dir ~/ccatp-keys",
+    )
+)
+@DIR_OPTION
+@click.option("--name", callback=_name, default=DEFAULT_NAME, show_default=True, help="First part of the file names.")
+@click.option(
+    "--client", "is_client", is_flag=True, help="For one who talks to a daemon: a CURVE pair and nothing else."
+)
+@click.option("--force", is_flag=True, help="Replace keys that are there already; peers then need the new ones.")
+def generate(folder: Path, name: str, is_client: bool, force: bool) -> None:
+    """Make a CURVE pair for the observatory channel and a key for the robot link."""
+    from ccatp.links import auth as files
+
+    suffixes: Sequence[str] = (files.PUBLIC_SUFFIX, files.SECRET_SUFFIX)
+    if not is_client:
+        suffixes = (*suffixes, files.LINK_SUFFIX)
+    if not force and (there := files.files_in_the_way(folder, name, suffixes)):
+        raise ConfigError(f"--dir: {there[0]} exists; choose another --name, or replace it with --force")
+    folder = folder.absolute()
+    files.make_key_dir(folder)
+    public, secret = files.write_pair(folder, name, is_replacing=force)
+    _say(public, "public, for the peers")
+    _say(secret, "secret, stays here")
+    if is_client:
+        key = files.read_public(public, "--dir").decode()
+        click.echo(f'\nAdd to the list of clients at the daemon (or role = "clear"):\n\n[clients.{name}]')
+        click.echo(f'public_key = "{key}"\nrole = "raise"')
+        click.echo(f"\nThen: ccatp emergency KIND --endpoint tcp://HOST:PORT --server-key ccatp.key --key {secret}")
+        return
+    link = files.write_link_key(folder, name, is_replacing=force)
+    _say(link, "secret, the same file at the robot")
+    clients = files.write_clients(folder, name)
+    _say(clients, "who gets in, nobody so far")
+    click.echo("\nAdd to the configuration, and clients to the list (ccatp keys generate --client, at theirs):\n")
+    click.echo(f'[robot]\nkey_file = "{link}"\n\n[observatory]\nendpoint = "tcp://ADDRESS:7020"')
+    click.echo(f'key_file = "{secret}"\nclients_file = "{clients}"')
+
+
+@keys.command("show-public", epilog=example("ccatp keys show-public --dir /etc/ccatp/keys"))
+@DIR_OPTION
+@click.option("--name", callback=_name, default=None, help="One of them; all if not given.")
+@click.option("--json", "json_output", is_flag=True, help="As JSON: names and keys.")
+def show_public(folder: Path, name: str | None, json_output: bool) -> None:
+    """Show the public keys in a folder."""
+    from ccatp.links import auth as files
+
+    pattern = f"{name or '*'}{files.PUBLIC_SUFFIX}"
+    found = {path.name.removesuffix(files.PUBLIC_SUFFIX): path for path in sorted(folder.glob(pattern))}
+    if not found:
+        raise ConfigError(f"--dir: no {pattern} in {folder}; make one with ccatp keys generate")
+    shown: dict[str, Any] = {key: files.read_public(path, "--dir").decode() for key, path in found.items()}
+    if json_output:
+        click.echo(json.dumps(shown))
+        return
+    width = max(map(len, shown))
+    for key, value in shown.items():
+        click.echo(f"{key:<{width}}  {value}")
+
+
+def _say(path: Path, what: str) -> None:
+    click.echo(f"{path}  ({what})")
+
+
+SHELLS = ("bash", "zsh", "fish")
+VARIABLE = "_CCATP_COMPLETE"
+
+
+@click.command(
+    epilog=example(
+        'eval "$(ccatp completion bash)"',
+        "ccatp completion zsh > ~/.zfunc/_ccatp",
+        "ccatp completion fish > ~/.config/fish/completions/ccatp.fish",
+    )
+)
+@click.argument("shell", type=NearestChoice(SHELLS), metavar="SHELL")
+@click.pass_context
+def completion(context: click.Context, shell: str) -> int:
+    """Print the completion for SHELL: bash, zsh or fish.
+
+    For bash put the line of the example into ~/.bashrc; for zsh a folder of $fpath takes the file.
+    """
+    from click.shell_completion import get_completion_class
+
+    root = context.find_root().command
+    kind = get_completion_class(shell)
+    if kind is None:  # click knows all of SHELLS
+        raise click.UsageError(f"no completion for {shell}")
+    sys.stdout.write(_source(kind, root, shell))
+    return 0
+
+
+def _source(kind: Any, root: click.Command, shell: str) -> str:
+    """The script; click asks bash for its version first, which is of no use where there is none to ask."""
+    script = kind(root, {}, "ccatp", VARIABLE)
+    if shell == "bash" and shutil.which("bash") is None:
+        return str(script.source_template % script.source_vars()) + "\n"
+    return str(script.source()) + "\n"

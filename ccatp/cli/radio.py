@@ -1,0 +1,361 @@
+"""The commands ``ccatp radio``: systems of radio beacons.
+
+A recorded run through one estimator, or through all of them.
+
+The command ``ccatp radio slam``.
+
+The command ``ccatp radio compare``.
+
+The command ``ccatp radio map``.
+"""
+
+import json
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ccatp.cli.common import (
+    CONFIG_OPTION,
+    JSON_OPTION,
+    OutputFile,
+    SuggestingGroup,
+    complain,
+    example,
+    figure_option,
+    overrides,
+    settings_option,
+)
+from ccatp.cli.radio_levels import calibrate, fix, fuzzy
+from ccatp.errors import CcatpError, ExitStatus
+
+if TYPE_CHECKING:
+    from ccatp.beacons.slam.recording import RecordedRun, Track
+    from ccatp.config.beacon_models import CricketConfig
+    from ccatp.config.recording_models import RecordingsConfig
+
+
+FORMATS = ("plaza", "mrclam", "labyrinth", "csv")
+FILTERS = ("ekf-slam", "smoother")
+
+
+class SlamCommandError(CcatpError):
+    """A part that is not installed, or data of which an estimator makes nothing."""
+
+    exit_status = ExitStatus.USAGE
+
+
+def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) -> "Track":
+    """A run through one of ``FILTERS``.
+
+    Raises:
+        SlamCommandError: the data drove the estimator beyond finite numbers, or leave it without an answer.
+    """
+    from numpy.linalg import LinAlgError
+
+    from ccatp.filters.base import FilterError
+
+    try:
+        return _estimated(run, assumed, filter_name)
+    except (FilterError, LinAlgError) as error:
+        raise SlamCommandError(
+            f"{run.name}: {filter_name} finds no finite map for these data ({str(error)[:80]}); look at its warnings"
+        ) from error
+
+
+def _estimated(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) -> "Track":
+    from time import perf_counter
+
+    from ccatp.beacons.slam.settings import batch_settings, slam_settings
+    from ccatp.config.recording_models import RecordingConfig
+
+    cfg: RecordingConfig = getattr(assumed, run.kind)
+    if filter_name == "smoother":
+        from ccatp.beacons.slam.batch_smoother import smooth
+
+        return smooth(run, batch_settings(cfg), perf_counter)
+    from ccatp.beacons.slam.causal import filter_run
+
+    first_sigmas = (cfg.priors.pose_m, cfg.priors.heading_rad)
+    return filter_run(run, slam_settings(cfg, assumed.filter), first_sigmas, perf_counter)
+
+
+def compared(run: "RecordedRun", assumed: "RecordingsConfig", peers: bool) -> list[dict[str, Any]]:
+    """A row for each of our estimators, and for GTSAM's if asked for."""
+    from time import perf_counter
+
+    from ccatp.beacons.slam.evaluation import row
+    from ccatp.beacons.slam.settings import batch_settings
+
+    rows = []
+    for name in FILTERS:
+        begin_s = perf_counter()
+        track = estimate(run, assumed, name)
+        rows.append(row(run, name, track, perf_counter() - begin_s))
+    if peers:
+        from ccatp.studies.gtsam_peer import run_gtsam
+
+        found = run_gtsam(run, batch_settings(getattr(assumed, run.kind)), perf_counter)
+        rows.append(row(run, "GTSAM iSAM2", found.isam2, float(found.isam2.update_s.sum()), peer=True))
+        # it starts from what iSAM2 ended with, so that its time is not a run's
+        rows.append(row(run, "GTSAM batch", found.batch, None, peer=True))
+    return rows
+
+
+@click.command(
+    epilog=example(
+        "ccatp radio slam recordings/Plaza2_.mat",
+        "ccatp radio slam recordings/MRCLAM_Dataset7 --robot 2 --filter smoother --json",
+        "ccatp radio slam mine.csv --set csv.radio.range_sigma_m=0.3 --figure map.png",
+    )
+)
+@click.argument("path", type=click.Path(path_type=Path))
+@click.option("--format", "data_format", type=click.Choice(FORMATS), help="Format of the data; found out if not given.")
+@click.option("--robot", type=click.IntRange(min=1), metavar="N", help="Robot of an MRCLAM set; else the first there.")
+@click.option(
+    "--filter", "filter_name", type=click.Choice(FILTERS), default=FILTERS[0], show_default=True,
+    help="ekf-slam: at each instant from readings up to it; smoother: from all of them.",
+)  # fmt: skip
+@CONFIG_OPTION
+@settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
+@figure_option("Draw map and path")
+@click.option("--peers", is_flag=True, help="All our estimators and GTSAM's side by side; needs ccatp[peers].")
+@JSON_OPTION
+def slam(
+    path: Path, data_format: str | None, robot: int | None, filter_name: str, config_file: Path | None,
+    settings: Mapping[str, object], figure_file: Path | None, peers: bool, json_output: bool,
+) -> int:  # fmt: skip
+    """Map the beacons of a recorded run and find the vehicle's path on that map.
+
+    PATH is a file or folder of the formats Plaza, MRCLAM, Labyrinth, or a CSV of events (docs/radio_data.md).
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads would only fight over them
+    from ccatp.beacons.datasets.reader import read_run
+    from ccatp.beacons.slam.evaluation import judge, result_data, table_lines
+    from ccatp.config.load import load_recordings_config
+
+    assumed = load_recordings_config(config_file, overrides(settings, {}))
+    run = read_run(path, data_format, robot)
+    for warning in run.warnings:
+        complain(f"warning: {warning}", 0)
+    track = estimate(run, assumed, filter_name)
+    for warning in track.warnings:
+        complain(f"warning: {warning}", 0)
+    judged = judge(track, run)
+    data: dict[str, Any] = result_data(run, filter_name, track, judged)
+    if figure_file is not None:
+        from ccatp.report.beacon_plots import draw_slam
+
+        draw_slam(run, track, judged, figure_file, f"{run.name}, {filter_name}")
+    if peers:
+        data["peers"] = compared(run, assumed, peers=True)
+    if json_output:
+        click.echo(json.dumps(data, allow_nan=False))
+        return 0
+    for line in table_lines(run, data):
+        click.echo(line)
+    if peers:
+        from ccatp.beacons.slam.evaluation import markdown
+
+        for line in ("", *markdown(data["peers"])):
+            click.echo(line)
+    return 0
+
+
+@click.command(
+    epilog=example(
+        "ccatp radio compare recordings/Plaza2_.mat recordings/MRCLAM_Dataset7",
+        "ccatp radio compare recordings/Plaza2_.mat --peers",
+    )
+)
+@click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--format", "data_format", type=click.Choice(FORMATS), help="Format of all the data; found out if not given."
+)
+@click.option(
+    "--robot", type=click.IntRange(min=1), metavar="N", help="Robot of an MRCLAM set; else all that are there."
+)
+@click.option("--peers", is_flag=True, help="GTSAM (iSAM2, batch) on the same input as well; needs ccatp[peers].")
+@CONFIG_OPTION
+@settings_option("A key of recordings.toml, as in plaza.priors.range_scale=0.1.")
+@JSON_OPTION
+def compare(
+    paths: Sequence[Path], data_format: str | None, robot: int | None, peers: bool, config_file: Path | None,
+    settings: Mapping[str, object], json_output: bool,
+) -> int:  # fmt: skip
+    """Run all estimators over recorded runs: a table of their errors and times, side by side."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads would only fight over them
+    from ccatp.beacons.datasets.reader import read_run, robots_of
+    from ccatp.beacons.slam.evaluation import markdown, with_means
+    from ccatp.config.load import load_recordings_config
+
+    assumed = load_recordings_config(config_file, overrides(settings, {}))
+    rows: list[dict[str, Any]] = []
+    for path in paths:
+        found: list[dict[str, Any]] = []
+        for one in robots_of(path, data_format) if robot is None else [robot]:
+            run = read_run(path, data_format, one)
+            complain(f"{run.name} ...", 0)
+            found += compared(run, assumed, peers)
+        rows += with_means(found, f"{path.resolve().name}, mean")
+    if json_output:
+        click.echo(json.dumps({"rows": rows}, allow_nan=False))
+        return 0
+    for line in markdown(rows):
+        click.echo(line)
+    return 0
+
+
+METHODS = ("ekf", "batch")
+
+
+@click.command(
+    "map",
+    epilog=example(
+        "ccatp radio map --config configs/cricket.toml --seeds 20",
+        "ccatp radio map --method ekf --set cricket.phase2.pairs=zigzag --figure map.png",
+        "ccatp radio map --ranges ranges.csv --offset --out beacons.toml --json",
+    ),
+)
+@click.option("--config", "config_file", type=click.Path(path_type=Path), help="Motes to simulate (TOML).")
+@click.option(
+    "--ranges", "ranges_file", type=click.Path(path_type=Path), help="Measured ranges (CSV) in place of simulated ones."
+)
+@click.option("--tags", "tags_file", type=click.Path(path_type=Path), help="Places of tags on their trolley (CSV).")
+@click.option("--truth", "truth_file", type=click.Path(path_type=Path), help="True places (CSV) to compare with.")
+@click.option(
+    "--method", type=click.Choice(METHODS), default="batch", show_default=True, help="Filter, or all ranges at once."
+)
+@click.option("--seeds", type=click.IntRange(min=1), default=1, show_default=True, metavar="N", help="Simulated runs.")
+@click.option("--seed", type=click.IntRange(min=0), metavar="N", help="Seed of the first run.")
+@click.option("--offset", is_flag=True, help="Estimate a common offset of the ranges.")
+@click.option("--scale", is_flag=True, help="Estimate a common scale of the ranges.")
+@click.option(
+    "--dimension", type=click.IntRange(2, 3), metavar="D", help="2 for motes in a plane, 3 for motes in space."
+)
+@settings_option("A key of cricket, as in cricket.phase2.pairs=zigzag.")
+@click.option("--out", "out_file", type=OutputFile(), help="Write a beacon file (TOML).")
+@figure_option("Draw map and errors")
+@JSON_OPTION
+def radio_map(
+    config_file: Path | None, ranges_file: Path | None, tags_file: Path | None, truth_file: Path | None,
+    method: str, seeds: int, seed: int | None, offset: bool, scale: bool, dimension: int | None,
+    settings: Mapping[str, object], out_file: Path | None, figure_file: Path | None, json_output: bool,
+) -> int:  # fmt: skip
+    """Map beacons from the ranges between them."""
+    if ranges_file is None and (tags_file is not None or truth_file is not None):
+        raise click.UsageError("--tags and --truth go with --ranges; a simulation knows both")
+    if ranges_file is not None and seeds > 1:
+        raise click.UsageError("--seeds is for simulated ranges; --ranges has been measured once")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads would only fight over them
+    from ccatp.config.load import load_radio_config
+
+    named: dict[str, object] = {
+        "run.seed": seed,
+        "cricket.dimension": dimension,
+        "cricket.batch.estimates_offset": offset or None,
+        "cricket.batch.estimates_scale": scale or None,
+    }
+    if config_file is None:
+        named["system"] = "cricket"
+    cfg = load_radio_config(config_file, overrides(settings, named), simulates=ranges_file is None)
+    if ranges_file is None:
+        data = _simulated(cfg.cricket, method, range(cfg.run.seed, cfg.run.seed + seeds), out_file, figure_file)
+    else:
+        data = _measured(cfg.cricket, method, (ranges_file, tags_file, truth_file), out_file, figure_file)
+    for warning in data["warnings"]:
+        complain(f"warning: {warning}", 0)
+    if json_output:
+        click.echo(json.dumps(data))
+    else:
+        from ccatp.beacons.cricket.measured_map import report_lines
+
+        for line in report_lines(data):
+            click.echo(line)
+    return 0
+
+
+def _simulated(
+    cfg: "CricketConfig", method: str, seeds: range, out_file: Path | None, figure_file: Path | None
+) -> dict[str, Any]:
+    from ccatp.report.beacon_plots import draw_mote_map
+    from ccatp.studies.mote_sizes import campaign_data, pictured, run_campaign
+
+    campaign = run_campaign(cfg, method, seeds, _progress(len(seeds)))
+    if out_file is not None:
+        _write(out_file, *campaign.runs[0].whole, cfg.layout)
+    if figure_file is not None:
+        draw_mote_map(*pictured(campaign, seeds[0]), figure_file)
+    return campaign_data(campaign)
+
+
+def _measured(
+    cfg: "CricketConfig",
+    method: str,
+    files: tuple[Path, Path | None, Path | None],
+    out_file: Path | None,
+    figure_file: Path | None,
+) -> dict[str, Any]:
+    import numpy as np
+
+    from ccatp.beacons.cricket.measured_map import map_measured
+    from ccatp.beacons.datasets.range_csv import read_places, read_ranges
+    from ccatp.report.beacon_plots import MapPicture, draw_mote_map
+
+    ranges_file, tags_file, truth_file = files
+    found = map_measured(
+        cfg,
+        method,
+        read_ranges(ranges_file, cfg.ranging.sigma_m),
+        None if tags_file is None else read_places(tags_file),
+        None if truth_file is None else read_places(truth_file),
+    )
+    if out_file is not None:
+        _write(out_file, found.names, found.positions_m, found.covariance_m2, "measured")
+    if figure_file is not None:
+        error = found.data["rms_m"]["p50"]
+        title = f"{method}, {len(found.names)} motes" + (f", error {1e3 * error:.3g} mm" if error is not None else "")
+        nothing = np.zeros((0, 2), dtype=np.intp)
+        picture = MapPicture(found.names, found.positions_m, found.covariance_m2, found.true_m, nothing, (), title)
+        draw_mote_map(picture, None, figure_file)
+    return found.data
+
+
+def _write(path: Path, names: tuple[str, ...], positions_m: Any, covariance_m2: Any, layout: str) -> None:
+    from ccatp.beacons.datasets.range_csv import write_beacons
+
+    frame = "field: as the anchors and surveyed places of the configuration say"
+    if layout != "networks":
+        frame = "own: first beacon at the origin, second on +x, third at y > 0; covariance of the aligned map"
+    write_beacons(path, names, positions_m, covariance_m2, frame)
+
+
+def _progress(total: int) -> Callable[[int], None]:
+    """A counter on a terminal, a line for each tenth elsewhere, on standard error; nothing for a single run."""
+    is_live = sys.stderr.isatty()
+
+    def tell(done: int) -> None:
+        if total == 1:
+            return
+        if is_live:
+            click.echo(f"\rccatp: {done} of {total} runs", nl=done == total, err=True)
+        elif 10 * done // total > 10 * (done - 1) // total:
+            complain(f"{done} of {total} runs", 0)
+
+    return tell
+
+
+@click.group(cls=SuggestingGroup, epilog=example("ccatp radio slam recordings/Plaza2_.mat"))
+def radio() -> None:
+    """Robots among radio beacons: mapping them, finding the way by them."""
+
+
+radio.add_command(slam)
+radio.add_command(calibrate)
+radio.add_command(fix)
+radio.add_command(fuzzy)
+radio.add_command(radio_map)
+radio.add_command(compare)

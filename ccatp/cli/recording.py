@@ -1,0 +1,95 @@
+"""The commands ``ccatp log info`` and ``ccatp log recover``."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ccatp.cli.common import SuggestingGroup, example
+
+if TYPE_CHECKING:
+    from ccatp.records.recording_repair import RecordingFacts
+
+
+@click.group(cls=SuggestingGroup, epilog=example("ccatp log info runs/tonight", "ccatp log recover telemetry.mcap"))
+def log() -> None:
+    """Look into recordings and save damaged ones."""
+
+
+@log.command(epilog=example("ccatp log info runs/tonight", "ccatp log info runs/tonight/telemetry.mcap --json"))
+@click.argument("path", metavar="FILE|RUN_DIR", type=click.Path(path_type=Path))
+@click.option("--json", "json_output", is_flag=True, help="As JSON on standard output, nothing else there.")
+def info(path: Path, json_output: bool) -> int:
+    """Tell what a recording holds, and whether every checksum in it is right.
+
+    The status is 1 where a recording was cut off or is damaged; ccatp log recover saves what is intact. One that a run
+    still writes has no index yet, which is no damage.
+    """
+    from ccatp.records.recording_repair import read_facts, recording_files
+
+    found = [read_facts(file) for file in recording_files(path)]
+    if json_output:
+        click.echo(json.dumps({"recordings": [facts.as_json() for facts in found]}))
+    else:
+        for facts in found:
+            _tell(facts)
+    return int(not all(facts.is_in_order for facts in found))
+
+
+@log.command(epilog=example("ccatp log recover runs/tonight", "ccatp log recover telemetry.mcap --out saved.mcap"))
+@click.argument("path", metavar="FILE|RUN_DIR", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="The new file; FILE.recovered.mcap if not given.")
+@click.option("--json", "json_output", is_flag=True, help="As JSON on standard output, nothing else there.")
+def recover(path: Path, out: Path | None, json_output: bool) -> int:
+    """Save what is intact of a recording that was cut off or damaged, as a new file with an index.
+
+    The old file stays as it is. Of a run directory the newest recording is taken.
+    """
+    from ccatp.records.recording_repair import recording_files
+    from ccatp.records.recording_repair import recover as save
+
+    file = recording_files(path)[-1]
+    saved = save(file, out or file.with_name(f"{file.stem}.recovered{file.suffix}"))
+    lost = saved.condition.lost_bytes
+    if json_output:
+        end_s = saved.end_s
+        facts = {"file": str(saved.path), "messages": saved.messages, "end_s": end_s, "lost_bytes": lost}
+        click.echo(json.dumps({**facts, "was_complete": saved.condition.is_complete}))
+        return 0
+    until = "" if saved.end_s is None else f" up to {saved.end_s:.2f} s"
+    state = "was complete" if saved.condition.is_complete else f"{lost} of {saved.condition.size_bytes} bytes are lost"
+    click.echo(f"{saved.path}: {saved.messages} messages{until}; {file} {state}")
+    return 0
+
+
+def _tell(facts: "RecordingFacts") -> None:
+    condition, span = facts.condition, facts.span_s
+    click.echo(f"{facts.path}: {facts.state}")
+    for begin, end in () if facts.is_in_order else condition.lost:
+        click.echo(f"  bytes {begin} to {end} are lost")
+    known = {k: v for record in facts.metadata.values() for k, v in record.items() if k != "config"}
+    if known:
+        click.echo("  " + ", ".join(f"{key} {value}" for key, value in sorted(known.items())))
+    if span is not None:
+        rate = facts.bytes_per_hour
+        per_hour = "" if rate is None else f", {rate / 1e6:.1f} MB an hour"
+        click.echo(f"  {span[0]:.2f} to {span[1]:.2f} s, {condition.size_bytes / 1e6:.2f} MB{per_hour}")
+    click.echo(f"  {facts.messages} messages in {condition.chunks} chunks")
+    rows = [("topic", "schema", "messages", "per s", "kB")]
+    for name, topic in sorted((name, topic) for name, topic in facts.topics.items() if topic.messages):
+        length_s = topic.last_s - topic.first_s
+        per_s = f"{(topic.messages - 1) / length_s:.2f}" if topic.messages > 1 and length_s > 0.0 else "-"
+        rows.append((name, topic.schema, str(topic.messages), per_s, f"{topic.payload_bytes / 1e3:.1f}"))
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    for row in rows:
+        left = "  ".join(text.ljust(width) for text, width in zip(row[:2], widths[:2], strict=True))
+        right = "  ".join(text.rjust(width) for text, width in zip(row[2:], widths[2:], strict=True))
+        click.echo(f"  {left}  {right}")
+    if empty := sum(not topic.messages for topic in facts.topics.values()):
+        click.echo(f"  {empty} topic{'s' if empty > 1 else ''} without messages")
+    if facts.is_in_order:
+        return
+    for fault in facts.faults:
+        click.echo(f"  {fault}")
+    click.echo(f"  save what is intact with: ccatp log recover {facts.path}")

@@ -1,0 +1,348 @@
+"""The commands ``ccatp report`` and ``ccatp compare``.
+
+The command ``ccatp map``.
+
+The command ``ccatp align``.
+
+The command ``ccatp replay``.
+"""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ccatp.cli.common import JSON_OPTION, OutputFile, complain, example, figure_option, overrides, settings_option
+from ccatp.errors import CcatpError, ConfigError, ExitStatus
+
+if TYPE_CHECKING:
+    from ccatp.config.models import Config
+    from ccatp.mirror.mirror_alignment import SurveyResult
+    from ccatp.records.run_reader import Recording
+    from ccatp.records.survey_reader import Survey
+    from ccatp.studies.replay_report import Judged
+
+
+_FILE = click.Path(path_type=Path, dir_okay=False)
+_FOLDER = click.Path(path_type=Path, file_okay=False)
+_FIGURES = click.option("--figures", type=_FOLDER, metavar="DIR", help="Also write the figures there: SVG, PNG, PDF.")
+_JSON = click.option("--json", "json_output", is_flag=True, help="The figures of it as JSON on standard output.")
+
+
+@click.command(
+    epilog=example("ccatp report runs/tonight", "ccatp report runs/tonight --out tonight.html --figures figs")
+)
+@click.argument("run_dir", type=click.Path(path_type=Path))
+@click.option("--out", type=_FILE, metavar="FILE", help="The page; report.html in the run directory if not given.")
+@_FIGURES
+@_JSON
+def report(run_dir: Path, out: Path | None, figures: Path | None, json_output: bool) -> int:
+    """Write the report of a run: one page that opens without a network.
+
+    Map, errors, how the panels lie, where the time went, events. It takes runs that are over, go on, were killed or
+    resumed, and says what is missing.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads would only fight over them
+    from ccatp.report.writer import report_run
+
+    path, data, warnings = report_run(run_dir, out, figures)
+    for warning in warnings:
+        complain(f"warning: {warning}", 0)
+    click.echo(json.dumps({"report": str(path), **data}) if json_output else path)
+    return 0
+
+
+@click.command(epilog=example("ccatp compare runs/before runs/after", "ccatp compare runs/a runs/b --json"))
+@click.argument("run_a", type=click.Path(path_type=Path))
+@click.argument("run_b", type=click.Path(path_type=Path))
+@click.option("--out", type=_FILE, metavar="FILE", help="The page; compare.html in RUN_B if not given.")
+@_FIGURES
+@_JSON
+def compare(run_a: Path, run_b: Path, out: Path | None, figures: Path | None, json_output: bool) -> int:
+    """Put two runs beside each other: figures, configuration, time, errors, and which panels have moved."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from ccatp.report.compare_page import compare_data, compare_lines
+    from ccatp.report.writer import COMPARISON, compare_runs
+
+    path = out or run_b / COMPARISON
+    pair = compare_runs(run_a, run_b, path, figures)
+    for found in (pair.a, pair.b):
+        for warning in found.record.warnings:
+            complain(f"warning: {found.record.name}: {warning}", 0)
+    for line in [json.dumps({"report": str(path), **compare_data(pair)})] if json_output else compare_lines(pair):
+        click.echo(line)
+    if not json_output:
+        click.echo(path)
+    return 0
+
+
+@click.command("map", epilog=example("ccatp map runs/20260101T000000Z-fyst-m1-s1 --out map.png"))
+@click.argument("run_dir", type=click.Path(path_type=Path))
+@click.option(
+    "--out", type=OutputFile(".png", ".pdf", ".svg"), help="The picture; map.png in the run directory if not given."
+)
+def draw_map(run_dir: Path, out: Path | None) -> int:
+    """Draw the map of a run: panels, path, and each point coloured by its arrival error."""
+    from ccatp.report.plots import draw_from_run_dir
+
+    picture = out or run_dir / "map.png"
+    draw_from_run_dir(run_dir, picture)
+    click.echo(picture)
+    return 0
+
+
+# What the fixes are judged by; everything else has acted on the run already.
+ALIGN_KEYS = ("align.", "robot.puck_height_m", "mirror.")
+
+
+class AlignError(CcatpError):
+    """A result that cannot be written."""
+
+    exit_status = ExitStatus.USAGE
+
+
+@click.command(
+    epilog=example(
+        "ccatp align runs/tonight",
+        "ccatp align runs/tonight --csv moves.csv --figure panels.png",
+        "ccatp align runs/tonight --json --set align.point_floor_m=2e-6",
+    )
+)
+@click.argument("run_dir", type=click.Path(path_type=Path))
+@settings_option("A key of align or mirror, or robot.puck_height_m, as in align.point_floor_m=2e-6.")
+@click.option("--csv", "csv_file", type=OutputFile(), help="Write a line a panel (CSV).")
+@figure_option("Draw deviations and moves")
+@JSON_OPTION
+def align(
+    run_dir: Path, settings: Mapping[str, object], csv_file: Path | None, figure_file: Path | None, json_output: bool
+) -> int:
+    """Tell how the panels lie and how to turn their adjusters, from the fixes of a run."""
+    # Matrices are small; threads would only fight over them.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from ccatp.mirror.mirror import build_mirror
+    from ccatp.mirror.mirror_alignment import compare, survey_result
+    from ccatp.records.survey_reader import read_run
+    from ccatp.report.alignment import csv_lines, head_lines, result_data, table_lines
+
+    changes = overrides(settings, {})
+    if idle := [key for key in changes if not key.startswith(ALIGN_KEYS)]:
+        raise ConfigError(f"command line: {idle[0]}: has no effect on the alignment; what has: {', '.join(ALIGN_KEYS)}")
+    survey = read_run(run_dir, changes)
+    cfg = survey.cfg
+    mirror = build_mirror(cfg.mirror)
+    planned = {point.panel for point in survey.planned}
+    result = survey_result(mirror, cfg.align, cfg.robot.puck_height_m, survey.measured, planned)
+    comparison = None if survey.injected is None else compare(result.panels, survey.injected)
+    facts = _facts(run_dir, survey, result)
+    warnings = [*survey.warnings, *result.warnings]
+    for warning in warnings:
+        complain(f"warning: {warning}", 0)
+    if csv_file is not None:
+        _write(csv_file, csv_lines(result))
+    if figure_file is not None:
+        from ccatp.report.plots import draw_alignment
+
+        draw_alignment(mirror, result, figure_file, f"{mirror.name}: {len(result.panels)} panels", str(run_dir))
+    if json_output:
+        click.echo(json.dumps({**facts, **result_data(result, comparison), "warnings": warnings}))
+        return 0
+    for line in (*head_lines(facts), *table_lines(result, comparison, cfg.align.puck_height_sigma_m)):
+        click.echo(line)
+    return 0
+
+
+def _facts(run_dir: Path, survey: "Survey", result: "SurveyResult") -> dict[str, Any]:
+    cfg = survey.cfg
+    return {
+        "run_dir": str(run_dir),
+        "mirror": cfg.mirror.name,
+        "world": cfg.world.name if survey.is_simulation else None,
+        "seed": cfg.run.seed,
+        "points": {
+            "total": len(survey.planned),
+            "measured": len(survey.measured),
+            "outliers": sum(len(panel.outliers) for panel in result.panels),
+        },
+        "adjusters": list(result.panels[0].adjusters) if result.panels else [],
+        "puck_height_sigma_um": round(cfg.align.puck_height_sigma_m * 1e6, 4),
+    }
+
+
+def _write(path: Path, lines: Iterable[str]) -> None:
+    try:
+        with path.open("w", encoding="utf-8") as file:
+            file.writelines(line + "\n" for line in lines)
+    except OSError as error:
+        raise AlignError(f"--csv: cannot write {path}: {error.strerror or error}") from error
+
+
+# The sections of the configuration that a localizer is built from. Everything else has acted on the run already.
+REPLAY_ACTING = ("localizer.", "robot.", "mirror.", "run.filter")
+PROGRESS_S = 50.0
+
+
+class ReplayError(CcatpError):
+    """A run that cannot be replayed."""
+
+    exit_status = ExitStatus.USAGE
+
+
+@click.command(
+    epilog=example(
+        "ccatp replay runs/tonight",
+        "ccatp replay runs/tonight --filter ukf --smooth",
+        "ccatp replay runs/tonight --set localizer.full_state.fix_gate_nis=20 --out track.csv",
+    )
+)
+@click.argument("run_dir", type=click.Path(path_type=Path))
+@click.option("--filter", "filter_name", metavar="NAME", help="State estimator, if not that of the run: kf, ekf, ukf.")
+@settings_option("A key of localizer, robot or mirror, as in localizer.full_state.fix_gate_nis=20.")
+@click.option("--smooth", is_flag=True, help="Go back over the run with the smoother, too (not with kf).")
+@click.option("--out", type=OutputFile(), help="Write the estimates of all frames (CSV).")
+@JSON_OPTION
+def replay(
+    run_dir: Path, filter_name: str | None, settings: Mapping[str, object], smooth: bool, out: Path | None,
+    json_output: bool,
+) -> int:  # fmt: skip
+    """Run an estimator again over the recorded samples of a run, as it was or with other settings."""
+    # As in the run itself: matrices are small, and another number of threads may round differently.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from ccatp.records.run_reader import open_run
+    from ccatp.studies.replay_report import csv_lines, judge, table_lines
+
+    changes = overrides(settings, {"run.filter": filter_name})
+    recordings = open_run(run_dir)
+    configs = [_config(recording, changes, smooth) for recording in recordings]
+    started = time.monotonic()
+    parts = [_judged(recording, cfg, smooth) for recording, cfg in zip(recordings, configs, strict=True)]
+    result = {
+        "run_dir": str(run_dir),
+        **_replay_facts(recordings, configs, parts, changes),
+        **judge(parts),
+        "warnings": [warning for recording in recordings for warning in recording.warnings],
+        "wall": {"time_s": round(time.monotonic() - started, 3)},
+    }
+    for warning in result["warnings"]:
+        complain(f"warning: {warning}", 0)
+    if out is not None:
+        _replay_write(out, csv_lines(parts))
+    is_as_it_was = result["difference"]["reproduced"]
+    may_differ = bool(changes or result["warnings"])
+    lines = [*_head(result), *table_lines(result)]
+    if is_as_it_was or may_differ:
+        lines.append(f"the replay {'reproduces' if is_as_it_was else 'differs from'} the recorded estimates")
+    for line in [json.dumps(result)] if json_output else lines:
+        click.echo(line)
+    if is_as_it_was or may_differ:
+        return ExitStatus.COMPLETE
+    why = "was the run made by another version, or on another CPU?"
+    return complain(f"{run_dir}: the replay does not reproduce the recorded estimates: {why}", ExitStatus.REFUSED)
+
+
+def _config(recording: "Recording", changes: Mapping[str, object], smooth: bool) -> "Config":
+    from ccatp.studies.replay import has_smoother
+
+    cfg = recording.config(changes)
+    if idle := [key for key in changes if not key.startswith(REPLAY_ACTING)]:
+        raise ConfigError(f"command line: {idle[0]}: has no effect on a replay; what has: localizer, robot, mirror")
+    if smooth and not has_smoother(cfg):
+        raise ConfigError(f"--smooth: the pose is no state of filter {cfg.run.filter}; choose --filter ekf or ukf")
+    return cfg
+
+
+def _judged(recording: "Recording", cfg: "Config", smooth: bool) -> "Judged":
+    from ccatp.filters import FilterError
+    from ccatp.mirror.mirror import build_mirror
+    from ccatp.mirror.surface import MirrorError
+    from ccatp.records.run_reader import in_order
+    from ccatp.studies.replay import replay as play
+    from ccatp.studies.replay_report import Judged
+
+    mirror = build_mirror(cfg.mirror)
+    try:
+        replayed = play(cfg, mirror, in_order(recording.messages()), smooth=smooth, on_frame=_progress())
+    except (FilterError, MirrorError) as error:
+        raise ReplayError(f"{recording.path}: the estimator gave up: {error}; try other settings") from error
+    if not len(replayed.trace.seq):
+        why = f" ({recording.warnings[-1]})" if recording.warnings else ""
+        raise ReplayError(f"{recording.path}: no sensors frames in it{why}")
+    return Judged(replayed, recording.recorded(mirror), recording.truth(), recording.arrival_frames(), mirror)
+
+
+def _replay_facts(
+    recordings: Sequence["Recording"], configs: Sequence["Config"], parts: Sequence["Judged"],
+    changes: Mapping[str, object],
+) -> dict[str, Any]:  # fmt: skip
+    traces = [part.replayed.trace for part in parts]
+    outcomes = [part.replayed for part in parts]
+    first = next((outcome.first_difference for outcome in outcomes if outcome.first_difference), None)
+    return {
+        "mirror": configs[-1].mirror.name,
+        "world": configs[-1].world.name if recordings[-1].is_simulation else None,
+        "seed": configs[-1].run.seed,
+        "recordings": len(recordings),
+        "frames": sum(len(trace.seq) for trace in traces),
+        "span_s": round(sum(float(trace.t_s[-1] - trace.t_s[0]) for trace in traces), 3),
+        "filter": configs[-1].run.filter,
+        "settings": dict(changes),
+        "fixes": {
+            "given": sum(outcome.fixes for outcome in outcomes),
+            "refused": sum(outcome.refused for outcome in outcomes),
+            "set_aside": sum(outcome.set_aside for outcome in outcomes),
+            "first_difference": None if first is None else {"t_s": first[0], "said": first[1]},
+        },
+        "counts": _summed([outcome.counts for outcome in outcomes]),
+    }
+
+
+def _summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    total: dict[str, int] = {}
+    for one in counts:
+        for name, number in one.items():
+            total[name] = total.get(name, 0) + number
+    return total
+
+
+def _head(result: Mapping[str, Any]) -> list[str]:
+    where = "real robot" if result["world"] is None else f"simulation, world {result['world']}, seed {result['seed']}"
+    fixes = result["fixes"]
+    per_frame_us = 1e6 * result["wall"]["time_s"] / result["frames"]
+    changes = ", ".join(f"{key}={value}" for key, value in result["settings"].items()) or "as recorded"
+    lines = [
+        f"{result['run_dir']}: {result['mirror']}, {where}",
+        f"{result['frames']} frames, {result['span_s']:.1f} s; filter {result['filter']}, settings: {changes}",
+        f"{fixes['given']} fixes, {fixes['set_aside']} of them set aside in the run, {fixes['refused']} refused here; "
+        f"{per_frame_us:.0f} us a frame",
+    ]
+    if (first := fixes["first_difference"]) is not None:
+        what = f"is refused here: {first['said']}" if first["said"] else "is taken here and was refused in the run"
+        lines.append(f"the fix of {first['t_s']:.2f} s {what}")
+    return [*lines, ""]
+
+
+def _progress() -> Callable[[float], None] | None:
+    """Robot time on a terminal, now and then."""
+    if not sys.stderr.isatty():
+        return None
+    told_s = float("-inf")
+
+    def tell(t_s: float) -> None:
+        nonlocal told_s
+        if t_s - told_s >= PROGRESS_S:
+            told_s = t_s
+            click.echo(f"\rreplayed {t_s:.0f} s \r", nl=False, err=True)
+
+    return tell
+
+
+def _replay_write(path: Path, lines: Iterable[str]) -> None:
+    try:
+        with path.open("w", encoding="utf-8") as file:
+            file.writelines(line + "\n" for line in lines)
+    except OSError as error:
+        raise ReplayError(f"--out: cannot write {path}: {error.strerror or error}") from error

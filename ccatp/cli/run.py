@@ -1,0 +1,170 @@
+"""The command ``ccatp run``.
+
+The command ``ccatp dashboard``.
+
+The command ``ccatp stream``.
+"""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import click
+
+from ccatp.cli.common import (
+    ADDRESS_OPTIONS,
+    CONFIG_OPTION,
+    FAULTS_OPTION,
+    RUNTIME_DIR_OPTION,
+    WORLD_OPTIONS,
+    configured_folder,
+    example,
+    overrides,
+    settings_option,
+)
+
+
+@click.command(
+    epilog=example(
+        "ccatp run --sim --mirror fyst-m2 --panels 4", "ccatp run --config telescope.toml --run-dir runs/tonight"
+    )
+)
+@click.option("--sim", is_flag=True, help="Simulate robot and laser system on this machine.")
+@WORLD_OPTIONS
+@click.option("--panels", type=int, metavar="N", help="Only the first N panels of the traversal; 0 takes all.")
+@click.option("--filter", "filter_name", metavar="NAME", help="State estimator: kf, ekf or ukf.")
+@click.option("--realtime", is_flag=True, help="Pace the simulation on the wall clock.")
+@click.option(
+    "--run-dir", type=click.Path(path_type=Path), help="Where to write; runs/<time>-<mirror>-s<seed> if not given."
+)
+@click.option("--resume", is_flag=True, help="Carry on with the mission in --run-dir.")
+@click.option("--held", is_flag=True, help="With --resume: nothing moves until ccatp resume.")
+@click.option("--recover", is_flag=True, help="For services: carry on, held, with the run that did not finish, if any.")
+@click.option("--json", "json_output", is_flag=True, help="Summary as JSON on standard output, nothing else there.")
+@FAULTS_OPTION
+@RUNTIME_DIR_OPTION
+def run(
+    sim: bool, config_file: Path | None, mirror: str | None, world: str | None, seed: int | None,
+    settings: Mapping[str, object], panels: int | None, filter_name: str | None, realtime: bool,
+    run_dir: Path | None, resume: bool, held: bool, recover: bool, json_output: bool,
+    faults_file: Path | None, runtime_dir: Path | None,
+) -> int:  # fmt: skip
+    """Survey the mirror of the configuration and end with a summary."""
+    if faults_file is not None and not sim:
+        raise click.UsageError(
+            "--faults goes with --sim alone: faults are for the simulated robot, never for a real one"
+        )
+    if held and not resume:
+        raise click.UsageError("--held goes with --resume; --recover holds by itself")
+    if recover and (resume or run_dir is not None):
+        raise click.UsageError("--recover finds the run by itself: leave out --resume and --run-dir")
+    if resume and run_dir is None:
+        raise click.UsageError("--resume carries on in a run directory; name it with --run-dir")
+    if resume and config_file is None and run_dir is not None:
+        config_file = run_dir / "config.toml"
+    if not sim and config_file is None:
+        raise click.UsageError("name the robot's configuration with --config FILE, or add --sim")
+    from ccatp.daemon.run_dir import RunOptions
+    from ccatp.daemon.supervisor import run as run_to_the_end
+
+    if faults_file is not None:
+        from ccatp.sim.ground_truth import read_plan
+
+        read_plan(faults_file, lockstep=not realtime)  # its mistakes are told before anything is started
+    named = {
+        "run.mirror": mirror,
+        "run.world": world,
+        "run.seed": seed,
+        "run.panels": panels,
+        "run.filter": filter_name,
+    }
+    return int(
+        run_to_the_end(
+            RunOptions(
+                sim=sim,
+                config_file=config_file,
+                overrides=overrides(settings, named),
+                realtime=realtime,
+                run_dir=run_dir,
+                resume=resume,
+                held=held,
+                recover=recover,
+                json_output=json_output,
+                runtime_dir=runtime_dir,
+                faults_file=faults_file,
+            )
+        )
+    )
+
+
+@click.command(
+    epilog=example(
+        "ccatp dashboard", "ccatp dashboard --port 8080", "ccatp dashboard --host 0.0.0.0 --token-file page.token"
+    )
+)
+@ADDRESS_OPTIONS
+@click.option("--token-file", type=click.Path(path_type=Path), help="File with the token that commands have to carry.")
+@RUNTIME_DIR_OPTION
+@settings_option("A key of dashboard, as in dashboard.rate_hz=5.")
+def dashboard(
+    host: str | None,
+    port: int | None,
+    token_file: Path | None,
+    runtime_dir: Path | None,
+    settings: Mapping[str, object],
+) -> int:
+    """Show a running daemon on a web page, and command it from there; Ctrl-C ends the page and nothing else.
+
+    A run has a page of its own unless dashboard.enabled is false.
+    """
+    from ccatp.daemon.dashboard import attach
+
+    named = {
+        "dashboard.host": host,
+        "dashboard.port": port,
+        "dashboard.token_file": None if token_file is None else str(token_file),
+    }
+    return attach(runtime_dir, overrides(settings, named), click.echo)
+
+
+PLOTJUGGLER_PORT = 9872
+FOXGLOVE_PORT = 8765
+
+
+@click.command(
+    epilog=example("ccatp stream", "ccatp stream --foxglove", "ccatp stream --no-plotjuggler --foxglove-port 8800")
+)
+@CONFIG_OPTION
+@RUNTIME_DIR_OPTION
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
+@click.option("--plotjuggler/--no-plotjuggler", default=True, show_default=True, help="Serve PlotJuggler's ZMQ plugin.")
+@click.option("--port", type=click.IntRange(0, 65535), default=PLOTJUGGLER_PORT, show_default=True, help="Its port.")
+@click.option("--foxglove", is_flag=True, help="Serve Foxglove and Lichtblick by WebSocket (extra foxglove).")
+@click.option(
+    "--foxglove-port",
+    type=click.IntRange(0, 65535),
+    help=f"Its port, else {FOXGLOVE_PORT}; implies --foxglove.",
+)
+@click.option("--open-to-network", is_flag=True, help="Let --host be another address than this machine's own.")
+def stream(
+    config_file: Path | None, runtime_dir: Path | None, host: str, plotjuggler: bool, port: int,
+    foxglove: bool, foxglove_port: int | None, open_to_network: bool,
+) -> int:  # fmt: skip
+    """Stream the runs on this machine live to PlotJuggler and Foxglove, until interrupted.
+
+    It may be started and ended at any time; runs do not notice. A viewer that comes late gets the panels' map at once.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from ccatp.daemon.streaming import serve
+
+    foxglove_port = FOXGLOVE_PORT if foxglove and foxglove_port is None else foxglove_port
+    if not plotjuggler and foxglove_port is None:
+        raise click.UsageError("nothing to serve: leave out --no-plotjuggler, or add --foxglove")
+    return serve(
+        configured_folder(config_file, runtime_dir),
+        host,
+        port if plotjuggler else None,
+        foxglove_port,
+        is_open=open_to_network,
+        say=lambda text: click.echo(f"ccatp stream: {text}", err=True),
+    )

@@ -1,0 +1,162 @@
+"""The command ``ccatp study``.
+
+The command ``ccatp bench``.
+"""
+
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ccatp.cli.common import CONFIG_OPTION, JSON_OPTION, SETTINGS_OPTION, WORLD_OPTIONS, example, overrides
+
+
+class _StudyCommand(click.Command):
+    """A command whose help lists the studies, from their table, when it is asked for."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The studies, and the examples."""
+        from ccatp.studies.registry import STUDIES
+
+        with formatter.section("Studies"):
+            formatter.write_dl([(name, entry.title) for name, entry in STUDIES.items()])
+        super().format_epilog(ctx, formatter)
+
+
+@click.command(
+    cls=_StudyCommand,
+    epilog=example(
+        "ccatp study filters --runs 20 --out studies/filters",
+        "ccatp study filters --only world=hard,extreme --only filter=ekf --out studies/ekf",
+        "ccatp study time --mirror fyst-m1 --mirror fyst-m2 --out studies/time",
+    ),
+)
+@click.argument("name", metavar="NAME")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="Where to write, studies/NAME if not given; a campaign that was stopped goes on there.",
+)
+@click.option(
+    "--runs", type=click.IntRange(min=1), metavar="N", help="Seeds of each cell; else the study's own number."
+)
+@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes; one for each core if not given.")
+@click.option("--cluster", metavar="ADDRESS", help="Scheduler of dask.distributed that does the jobs instead.")
+@click.option("--shard", metavar="I/N", help="Only every N-th job, from the I-th on; without it all are put together.")
+@click.option(
+    "--from",
+    "others",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Take over the jobs that are done there. May be repeated.",
+)
+@click.option("--only", multiple=True, metavar="FACTOR=LEVEL[,LEVEL]", help="Only these cells. May be repeated.")
+@click.option("--mirror", "mirrors", multiple=True, metavar="NAME", help="In place of the study's. May be repeated.")
+@click.option("--panels", type=int, metavar="N", help="Only the first N panels of the traversal; 0 takes all.")
+@click.option("--seed", type=int, metavar="N", help="Seed of the first run.")
+@CONFIG_OPTION
+@SETTINGS_OPTION
+@click.option("--no-figures", is_flag=True, help="Tables only.")
+@JSON_OPTION
+def study(
+    name: str, out: Path | None, runs: int | None, workers: int | None, cluster: str | None, shard: str | None,
+    others: Sequence[Path], only: Sequence[str], mirrors: Sequence[str], panels: int | None, seed: int | None,
+    config_file: Path | None, settings: Mapping[str, object], no_figures: bool, json_output: bool,
+) -> int:  # fmt: skip
+    """Run the study NAME: many missions or an analysis, with tables, figures and a machine-readable result."""
+    from ccatp.studies.engine import limit_threads
+
+    limit_threads()  # before numpy is imported
+    from ccatp.config.load import load_config, load_radio_config
+    from ccatp.studies.campaign import WHOLE, CampaignError, Study, parse_choice, parse_shard
+    from ccatp.studies.engine import CampaignOptions, run_campaign
+    from ccatp.studies.registry import find_study
+
+    out = out or Path("studies") / name
+    given = overrides(settings, {"run.panels": panels, "run.seed": seed})
+    found = find_study(name)
+    if isinstance(found, Study):
+        options = CampaignOptions(
+            out=out,
+            runs=runs,
+            workers=workers,
+            cluster=cluster,
+            shard=parse_shard(shard) if shard else WHOLE,
+            others=tuple(others),
+            mirrors=tuple(mirrors),
+            only=dict(parse_choice(text) for text in only),
+            settings=given,
+            with_figures=not no_figures,
+        )
+        load = load_radio_config if found.is_radio else load_config
+        result = run_campaign(found, lambda keys: load(config_file, keys), options)
+    else:
+        idle = {"--cluster": cluster, "--shard": shard, "--from": others, "--only": only, "--mirror": mirrors}
+        if surplus := [option for option, value in idle.items() if value]:
+            raise CampaignError(f"study {name} has no runs to hand out; leave {surplus[0]} out")
+        if runs or workers:
+            click.echo(f"ccatp: study {name} is one analysis: --runs and --workers change nothing", err=True)
+        result = _analysed(found, load_config(config_file, given), out)
+    _tell(result, out, json_output)
+    return 0
+
+
+def _analysed(analysis: Callable[[Any, Path], dict[str, Any]], cfg: Any, out: Path) -> dict[str, Any]:
+    from ccatp.studies.campaign import CampaignFailed
+    from ccatp.studies.job_store import make_out
+
+    make_out(out)
+    try:
+        return analysis(cfg, out)
+    except OSError as error:
+        raise CampaignFailed(
+            f"{error.filename or out}: {error.strerror or error}; make room or choose another --out"
+        ) from error
+
+
+def _tell(result: dict[str, Any], out: Path, json_output: bool) -> None:
+    click.echo(json.dumps(result) if json_output else (out / "table.md").read_text(encoding="utf-8").rstrip())
+
+
+PAGE = "docs/bench.md"
+
+
+@click.command(epilog=example("ccatp bench --quick", "ccatp bench --json", "ccatp bench --markdown"))
+@WORLD_OPTIONS
+@click.option("--quick", is_flag=True, help="A tenth of the repeats, a mission of one panel.")
+@click.option("--steps-only", is_flag=True, help="No missions.")
+@click.option(
+    "--markdown", type=click.Path(path_type=Path, dir_okay=False), is_flag=False, flag_value=PAGE, metavar="[FILE]",
+    help=f"Write the table to FILE; {PAGE} if not named.",
+)  # fmt: skip
+@JSON_OPTION
+def bench(
+    config_file: Path | None, mirror: str | None, world: str | None, seed: int | None, settings: Mapping[str, object],
+    quick: bool, steps_only: bool, markdown: Path | None, json_output: bool,
+) -> int:  # fmt: skip
+    """Time this project's parts against peers that compute the same, by turns in one run."""
+    # Matrices are small: threads of the linear algebra would be timed instead. Set before numpy is imported.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    import tempfile
+
+    from ccatp.bench.report import markdown as page
+    from ccatp.bench.report import terminal_lines
+    from ccatp.bench.suite import run_bench
+    from ccatp.config.load import dump_config, load_config
+
+    named = {"run.mirror": mirror, "run.world": world, "run.seed": seed}
+    cfg = load_config(config_file, overrides(settings, named))
+    with tempfile.TemporaryDirectory(prefix="ccatp-bench-") as folder:
+        exact = Path(folder) / "config.toml"
+        exact.write_text(dump_config(cfg), encoding="utf-8")
+        result = run_bench(cfg, quick=quick, run_args=("--config", str(exact)), missions=not steps_only)
+    if markdown is not None:
+        markdown.write_text(page(result), encoding="utf-8")
+    for line in [json.dumps(result)] if json_output else terminal_lines(result):
+        click.echo(line)
+    return 0

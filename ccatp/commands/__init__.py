@@ -1,1 +1,0 @@
-"""The commands of ``ccatp``, one file each; ``ccatp.cli`` gathers them."""

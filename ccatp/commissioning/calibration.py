@@ -1,0 +1,380 @@
+"""Weighted least squares for wheel radii, wheel base and gyroscope bias over all segments of a drive together.
+
+Unknown are the parameters and the pose at every fix. Known are, each with its covariance: the fixes; where the wheels
+lead from each pose to the next, right but for the noise of the encoders and the slip of each motion; the change of
+heading that the gyroscope felt. How much slip varies from motion to motion is not known beforehand: it is chosen so
+that the residuals are as large as they should be (chi^2 = degrees of freedom), and widens all uncertainties with it.
+
+A calibration as values of the configuration, as lines for the reader, as JSON.
+"""
+
+from dataclasses import dataclass
+from math import floor, log10, sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ccatp.commissioning.calibration_drive import Carried, Drive, Segment, Wheels, carry
+from ccatp.config.models import Config
+from ccatp.core import FloatArray
+from ccatp.errors import CcatpError, ExitStatus
+from ccatp.mirror.mirror import Mirror
+
+RIGHT, LEFT, BASE, CREEP, BIAS, SCALE = range(6)
+PARAMETERS = 6
+MIN_SEGMENTS = 4
+MIN_TURN_RAD = 1.0
+MIN_WAY_M = 0.05
+_ROUNDS = 8
+_CONVERGED = 1e-4  # of a standard deviation
+# What the midpoint rule and the rounding of samples leave.
+_FLOOR_M, _FLOOR_RAD = 5e-7, 5e-7
+_LEAST_SLIP, _MOST_SLIP = 1e-6, 0.2
+_LEAST_WAY_RAD = 1e-3  # a wheel that hardly turned in a motion says nothing
+
+
+class CalibrationError(CcatpError):
+    """A drive from which nothing can be learned."""
+
+    exit_status = ExitStatus.USAGE
+
+
+@dataclass(frozen=True, slots=True)
+class Priors:
+    """What is thought before the drive.
+
+    Attributes:
+        radius_m, base_m: where the search begins; they have no weight.
+        gyro_scale_sigma: standard deviation of the gyroscope's scale error, about 0.
+        creep_sigma: of the downhill drift, part of the way, about 0.
+    """
+
+    radius_m: float
+    base_m: float
+    gyro_scale_sigma: float
+    creep_sigma: float
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What a drive shows.
+
+    Attributes:
+        radius_m, base_m, bias_rad_s: mean of both radii, wheel base, gyroscope bias.
+        covariance: of these three, shape (3, 3).
+        radius_difference_m: right minus left, and its standard deviation.
+        radius_difference_sigma_m: of it.
+        gyro_scale, gyro_scale_sigma: scale error of the gyroscope.
+        creep, creep_sigma: downhill drift, part of the way.
+        slip_sigma: how much slip varies from motion to motion; 0 where nothing shows that it does.
+        chi2, degrees: of all residuals, with ``slip_sigma`` as it is.
+        segments: how many.
+    """
+
+    radius_m: float
+    base_m: float
+    bias_rad_s: float
+    covariance: FloatArray
+    radius_difference_m: float
+    radius_difference_sigma_m: float
+    gyro_scale: float
+    gyro_scale_sigma: float
+    creep: float
+    creep_sigma: float
+    slip_sigma: float
+    chi2: float
+    degrees: int
+    segments: int
+
+    @property
+    def sigmas(self) -> tuple[float, float, float]:
+        """Standard deviations of radius (m), base (m) and bias (rad/s)."""
+        radius, base, bias = (sqrt(variance) for variance in np.diag(self.covariance))
+        return radius, base, bias
+
+
+def calibrate(mirror: Mirror, drive: Drive, priors: Priors) -> Calibration:
+    """Estimate the parameters.
+
+    Args:
+        mirror: where the drive took place.
+        drive: the drive.
+        priors: what is thought before it.
+
+    Raises:
+        CalibrationError: too few segments, or no turns or ways among them.
+    """
+    _check(drive, priors)
+    problem = _Problem(mirror, drive, priors)
+    x = _first_guess(mirror, drive, priors)
+    slip = 0.0
+    # The scatter of slip moves the solution, and the solution the scatter: twice is enough.
+    for _ in range(2):
+        solution = problem.solve(x, slip)
+        slip = problem.fitting_slip(solution.x)
+        x = solution.x
+    solution = problem.solve(x, slip)
+    excess = max(1.0, solution.chi2 / solution.degrees)
+    x, P = solution.x[:PARAMETERS], solution.covariance * excess
+    pick = np.zeros((4, PARAMETERS))
+    pick[0, [RIGHT, LEFT]] = 0.5
+    pick[1, BASE] = pick[2, BIAS] = pick[3, RIGHT] = 1.0
+    pick[3, LEFT] = -1.0
+    values, covariance = pick @ x, pick @ P @ pick.T
+    return Calibration(
+        radius_m=float(values[0]),
+        base_m=float(values[1]),
+        bias_rad_s=float(values[2]),
+        covariance=covariance[:3, :3],
+        radius_difference_m=float(values[3]),
+        radius_difference_sigma_m=sqrt(covariance[3, 3]),
+        gyro_scale=float(x[SCALE]),
+        gyro_scale_sigma=sqrt(P[SCALE, SCALE]),
+        creep=float(x[CREEP]),
+        creep_sigma=sqrt(P[CREEP, CREEP]),
+        slip_sigma=slip,
+        chi2=solution.chi2,
+        degrees=solution.degrees,
+        segments=len(drive.segments),
+    )
+
+
+def _check(drive: Drive, priors: Priors) -> None:
+    if len(drive.segments) < MIN_SEGMENTS:
+        raise CalibrationError(
+            f"the drive has {len(drive.segments)} legs with a fix at each end, {MIN_SEGMENTS} are needed; drive again"
+        )
+    turns = [priors.radius_m / priors.base_m * abs(float((s.right_rad - s.left_rad).sum())) for s in drive.segments]
+    ways = [0.5 * priors.radius_m * abs(float((s.right_rad + s.left_rad).sum())) for s in drive.segments]
+    if max(turns) < MIN_TURN_RAD:
+        raise CalibrationError("the drive has no turn by more than a radian: it does not show the wheel base")
+    if max(ways) < MIN_WAY_M:
+        raise CalibrationError("the drive has no way of more than 50 mm: it does not show the wheel radius")
+
+
+@dataclass(frozen=True, slots=True)
+class _Solution:
+    """Parameters and poses, covariance of the parameters."""
+
+    x: FloatArray
+    covariance: FloatArray
+    chi2: float
+    degrees: int
+
+
+class _Problem:
+    """The equations of one drive."""
+
+    def __init__(self, mirror: Mirror, drive: Drive, priors: Priors) -> None:
+        self._mirror, self._drive, self._priors = mirror, drive, priors
+
+    def solve(self, x: FloatArray, slip_sigma: float) -> _Solution:
+        """Gauss-Newton from ``x``."""
+        for _ in range(_ROUNDS):
+            rows, residuals = self._whitened(x, self._carried(x), slip_sigma)
+            step, *_ = np.linalg.lstsq(rows, residuals, rcond=None)
+            x = x + step
+            if float(np.sum((rows @ step) ** 2)) < _CONVERGED**2:
+                break
+        rows, residuals = self._whitened(x, self._carried(x), slip_sigma)
+        # Columns of very different size: scaled before the inverse.
+        scale = 1.0 / np.sqrt((rows * rows).sum(axis=0))
+        covariance = np.linalg.inv((rows * scale).T @ (rows * scale)) * np.outer(scale, scale)
+        degrees = rows.shape[0] - rows.shape[1]
+        return _Solution(x, covariance[:PARAMETERS, :PARAMETERS], float(residuals @ residuals), degrees)
+
+    def fitting_slip(self, x: FloatArray) -> float:
+        """The scatter of slip with which chi^2 equals the degrees of freedom, linearised at ``x``; it falls with it."""
+        carried = self._carried(x)
+
+        def excess(slip_sigma: float) -> float:
+            rows, residuals = self._whitened(x, carried, slip_sigma)
+            step, *_ = np.linalg.lstsq(rows, residuals, rcond=None)
+            left = residuals - rows @ step
+            return float(np.sum(left**2)) - int(rows.shape[0] - rows.shape[1])
+
+        if excess(0.0) <= 0.0:
+            return 0.0
+        low, high = _LEAST_SLIP, _MOST_SLIP
+        while high > 1.02 * low:
+            middle = sqrt(low * high)
+            low, high = (middle, high) if excess(middle) > 0.0 else (low, middle)
+        return high
+
+    def _carried(self, x: FloatArray) -> list[Carried]:
+        wheels = Wheels(*x[[RIGHT, LEFT, BASE, CREEP]].tolist())
+        starts = x[PARAMETERS:].reshape(-1, 3)
+        return [
+            carry(self._mirror, segment, start, wheels)
+            for segment, start in zip(self._drive.segments, starts[:-1], strict=True)
+        ]
+
+    def _whitened(self, x: FloatArray, carried: list[Carried], slip_sigma: float) -> tuple[FloatArray, FloatArray]:
+        """Whitened Jacobian and residuals: what is known minus what ``x`` makes of it."""
+        drive, size = self._drive, len(x)
+        rows, residuals = [], []
+
+        def add(jacobian: FloatArray, residual: FloatArray, covariance: FloatArray) -> None:
+            whitener = np.linalg.inv(np.linalg.cholesky(covariance))
+            rows.append(whitener @ jacobian)
+            residuals.append(whitener @ residual)
+
+        for k, place in enumerate(drive.places):
+            at = PARAMETERS + 3 * k
+            jacobian = np.zeros((2, size))
+            jacobian[:, at : at + 2] = np.eye(2)
+            add(jacobian, np.array((place.x_m, place.y_m)) - x[at : at + 2], place.covariance_m2)
+        for k, (segment, led) in enumerate(zip(drive.segments, carried, strict=True)):
+            at = PARAMETERS + 3 * k
+            jacobian = np.zeros((3, size))
+            jacobian[:, at + 3 : at + 6] = np.eye(3)
+            jacobian[:, at : at + 3] = -led.of_start
+            jacobian[:, [RIGHT, LEFT, BASE, CREEP]] = -led.of_wheels
+            add(jacobian, led.end - x[at + 3 : at + 6], _process_covariance(drive, segment, led, slip_sigma))
+            add(*_gyro_row(drive, k, led, x))
+        for index, sigma in ((SCALE, self._priors.gyro_scale_sigma), (CREEP, self._priors.creep_sigma)):
+            jacobian = np.zeros((1, size))
+            jacobian[0, index] = 1.0
+            add(jacobian, -x[[index]], np.array([[sigma**2]]))
+        return np.vstack(rows), np.concatenate(residuals)
+
+
+def _first_guess(mirror: Mirror, drive: Drive, priors: Priors) -> FloatArray:
+    """Poses from the fixes, headings from the wheels, the first one so that the first way lies along it."""
+    wheels = Wheels(priors.radius_m, priors.radius_m, priors.base_m, 0.0)
+    poses = np.zeros((len(drive.places), 3))
+    poses[:, :2] = [(place.x_m, place.y_m) for place in drive.places]
+    went = carry(mirror, drive.segments[0], poses[0], wheels).end[:2] - poses[0, :2]
+    seen = poses[1, :2] - poses[0, :2]
+    poses[0, 2] = np.arctan2(seen[1], seen[0]) - np.arctan2(went[1], went[0])
+    for k, segment in enumerate(drive.segments):
+        poses[k + 1, 2] = carry(mirror, segment, poses[k], wheels).end[2]
+    parameters = [priors.radius_m, priors.radius_m, priors.base_m, 0.0, 0.0, 0.0]
+    return np.concatenate((parameters, poses.ravel()))
+
+
+def _process_covariance(drive: Drive, segment: Segment, carried: Carried, slip_sigma: float) -> FloatArray:
+    """Covariance of where a segment leads: the encoders' noise and the slip of each motion, each wheel by itself."""
+    frame_s = segment.duration_s / len(segment.right_rad)
+    shares = []
+    for first, last in segment.motions:
+        noise = drive.encoder_sigma_rad_s**2 * drive.encoder_period_s * (last - first) * frame_s
+        noise += drive.quantum_rad**2 / 6.0  # half a count at either end, uniform
+        for turned in (segment.right_rad, segment.left_rad):
+            way_rad = float(np.abs(turned[first:last]).sum())
+            shares.append(slip_sigma**2 + noise / max(way_rad, _LEAST_WAY_RAD) ** 2)
+    floor = np.diag((_FLOOR_M**2, _FLOOR_M**2, _FLOOR_RAD**2))
+    covariance: FloatArray = carried.of_slip @ np.diag(shares) @ carried.of_slip.T + floor
+    return covariance
+
+
+def _gyro_row(drive: Drive, k: int, carried: Carried, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The gyroscope's sum: (1 + scale) (change of heading less what the curvature does) + bias times time."""
+    segment = drive.segments[k]
+    at = PARAMETERS + 3 * k
+    start_rad, end_rad = float(x[at + 2]), float(x[at + 5])
+    curvature_rad = float(carried.end[2]) - start_rad - carried.turn_rad
+    turned_rad = end_rad - start_rad - curvature_rad
+    jacobian = np.zeros((1, len(x)))
+    jacobian[0, at + 5], jacobian[0, at + 2] = 1.0 + x[SCALE], -1.0 - x[SCALE]
+    jacobian[0, SCALE], jacobian[0, BIAS] = turned_rad, segment.gyro_s
+    expected = (1.0 + x[SCALE]) * turned_rad + x[BIAS] * segment.gyro_s
+    period_s = segment.gyro_s / max(segment.gyro_samples, 1)
+    variance = (drive.gyro_sigma_rad_s * period_s) ** 2 * segment.gyro_samples + _FLOOR_RAD**2
+    return jacobian, np.array([segment.gyro_rad - expected]), np.array([[variance]])
+
+
+# The daemon refuses a robot whose own figures differ from the configuration by more than this.
+MOST_DIFFERENCE = 0.05
+# Less certain than this, a new value would be worse than a measuring tape's.
+MOST_SIGMA = 0.01
+SHOWN_SLIP = 1e-4
+
+
+class Row(NamedTuple):
+    """One key of the configuration.
+
+    Attributes:
+        key: dotted.
+        configured, found, sigma: in the unit of the key.
+    """
+
+    key: str
+    configured: float
+    found: float
+    sigma: float
+
+    @property
+    def rounded(self) -> float:
+        """The value found, to a tenth of its standard deviation."""
+        return round(self.found, 1 - floor(log10(self.sigma)))
+
+
+def rows(cfg: Config, found: Calibration) -> tuple[Row, Row, Row]:
+    """What is configured and what the drive shows."""
+    radius, base, bias = found.sigmas
+    return (
+        Row("robot.wheel_radius_m", cfg.robot.wheel_radius_m, found.radius_m, radius),
+        Row("robot.wheel_base_m", cfg.robot.wheel_base_m, found.base_m, base),
+        Row("localizer.gyroscope_bias_rad_s", cfg.localizer.gyroscope_bias_rad_s, found.bias_rad_s, bias),
+    )
+
+
+def check_usable(table: tuple[Row, ...]) -> None:
+    """Refuse what must not get into a configuration.
+
+    Raises:
+        CalibrationError: a length is too uncertain, or far from what is configured.
+    """
+    for row in table[:2]:
+        if row.sigma > MOST_SIGMA * row.found:
+            raise CalibrationError(
+                f"{row.key}: {row.found:.6g} +- {row.sigma:.2g} is no better than a measuring tape; "
+                "drive more rounds (--rounds), or find out why the wheels slip"
+            )
+        if abs(row.found - row.configured) > MOST_DIFFERENCE * row.configured:
+            raise CalibrationError(
+                f"{row.key}: the drive shows {row.found:.6g}, {row.configured:.6g} is configured, more than "
+                f"{MOST_DIFFERENCE:.0%} apart: another robot, or a wheel that is not in order; nothing is written"
+            )
+
+
+def lines(table: tuple[Row, ...], found: Calibration) -> list[str]:
+    """For the reader."""
+    shown = [("key", "configured", "found", "sigma", "off by")]
+    for row in table:
+        off = (row.found - row.configured) / row.sigma
+        shown.append((row.key, f"{row.configured:.6g}", f"{row.found:.7g}", f"{row.sigma:.2g}", f"{off:+.1f} sigma"))
+    widths = [max(len(one[i]) for one in shown) for i in range(5)]
+    text = [
+        "  ".join([one[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(one[1:], widths[1:], strict=True))])
+        for one in shown
+    ]
+    difference, sigma = 1e3 * found.radius_difference_m, 1e3 * found.radius_difference_sigma_m
+    scale, scale_sigma = 100.0 * found.gyro_scale, 100.0 * found.gyro_scale_sigma
+    slip = f", slip varies by {100.0 * found.slip_sigma:.2g} % from motion to motion"
+    return [
+        *text,
+        f"right wheel larger than left by {difference:.4f} +- {sigma:.4f} mm; "
+        f"gyroscope reads {scale:+.2f} +- {scale_sigma:.2f} % too much; "
+        f"downhill drift {100.0 * found.creep:.2f} +- {100.0 * found.creep_sigma:.2f} % of the way",
+        f"{found.segments} legs, chi2 {found.chi2:.1f} at {found.degrees} degrees of freedom"
+        f"{slip if found.slip_sigma > SHOWN_SLIP else ''}",
+    ]
+
+
+def as_json(table: tuple[Row, ...], found: Calibration) -> dict[str, Any]:
+    """For ``--json``."""
+    return {
+        "parameters": {
+            row.key: {"configured": row.configured, "found": row.found, "sigma": row.sigma} for row in table
+        },
+        "covariance": found.covariance.tolist(),
+        "radius_difference_m": [found.radius_difference_m, found.radius_difference_sigma_m],
+        "gyroscope_scale": [found.gyro_scale, found.gyro_scale_sigma],
+        "creep": [found.creep, found.creep_sigma],
+        "slip_sigma": found.slip_sigma,
+        "chi2": found.chi2,
+        "degrees": found.degrees,
+        "segments": found.segments,
+    }

@@ -1,0 +1,386 @@
+"""A recorded drive, cut into segments from fix to fix: what the wheels turned and the gyroscope summed up.
+
+A segment driven again by its wheels alone, for several sets of parameters at once.
+
+The drive in a run directory, as the calibration takes it.
+"""
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from math import sqrt
+from pathlib import Path
+from statistics import median
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ccatp.config.models import Config
+from ccatp.core import Fix, FloatArray
+from ccatp.estimation.state_model import Terrain
+from ccatp.estimation.wheel_angles import WheelAngle
+from ccatp.links.robot_messages import Sensors
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.records.run_reader import Marked, in_order, open_run
+
+# A frame in which no wheel turns further than this, and this many times what its noise sums up to, is one of rest.
+REST_RAD = 2e-6
+REST_SIGMAS = 6.0
+# A frame in which a wheel turns less than this shows the noise of its encoder.
+SLOW_RAD = 3e-5
+# Shorter rests than this part no motions.
+REST_FRAMES = 5
+# Of normally distributed differences: their median size over their standard deviation, and that over a sample's.
+_MEDIAN_TO_SIGMA = 1.0 / (0.6745 * 2.0**0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a fix saw the robot, deck frame.
+
+    Attributes:
+        x_m, y_m: foot of the puck.
+        covariance_m2: of both, shape (2, 2).
+    """
+
+    x_m: float
+    y_m: float
+    covariance_m2: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """From one fix to the next.
+
+    Attributes:
+        right_rad, left_rad: what each wheel turned, frame by frame, shape (n,).
+        motions: first and last (exclusive) frame of each motion; together all frames.
+        gyro_rad: sum of the gyroscope's rates times their periods.
+        gyro_s: over this time.
+        gyro_samples: so many.
+        duration_s: from fix to fix.
+    """
+
+    right_rad: FloatArray
+    left_rad: FloatArray
+    motions: tuple[tuple[int, int], ...]
+    gyro_rad: float
+    gyro_s: float
+    gyro_samples: int
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """A whole drive.
+
+    Attributes:
+        places: k + 1 fixes.
+        segments: k.
+        encoder_sigma_rad_s: noise of a rate sample; 0 of a counter.
+        encoder_period_s: between two samples.
+        quantum_rad: step of a counter; 0 where the rate itself is read.
+        gyro_sigma_rad_s: noise of a gyroscope sample.
+    """
+
+    places: tuple[Place, ...]
+    segments: tuple[Segment, ...]
+    encoder_sigma_rad_s: float
+    encoder_period_s: float
+    quantum_rad: float
+    gyro_sigma_rad_s: float
+
+
+@dataclass(slots=True)
+class _Open:
+    """The segment that is being driven."""
+
+    right: list[float] = field(default_factory=list)
+    left: list[float] = field(default_factory=list)
+    gyro_rad: float = 0.0
+    gyro_s: float = 0.0
+    gyro_samples: int = 0
+    begun_s: float = 0.0
+
+
+class DriveBuilder:
+    """Takes a drive as it comes: frames and fixes, in their order.
+
+    Args:
+        mirror: where it takes place.
+        puck_height_m: above the surface along its normal.
+    """
+
+    def __init__(self, mirror: Mirror, puck_height_m: float) -> None:
+        self._mirror, self._puck_height_m = mirror, puck_height_m
+        self._wheels = WheelAngle(), WheelAngle()
+        self._places: list[Place] = []
+        self._segments: list[Segment] = []
+        self._open = _Open()
+        self._scatters: list[float] = []
+        self._periods: list[float] = []
+        self._samples = 0
+        self._gyro_steps: list[float] = []
+        self._gyro: tuple[float, float] | None = None
+        self._last_seq = -1
+        self._t_s = 0.0
+
+    def frame(self, sensors: Sensors) -> None:
+        """Take a frame; one that is not newer is left out."""
+        if sensors.seq <= self._last_seq:
+            return
+        self._last_seq, self._t_s = sensors.seq, sensors.t
+        right = [(row[0], row[1]) for row in sensors.enc if row[1] is not None]
+        left = [(row[0], row[2]) for row in sensors.enc if row[2] is not None]
+        for wheel, samples, turned in zip(
+            self._wheels, (right, left), (self._open.right, self._open.left), strict=True
+        ):
+            turned.append(wheel.add([t for t, _ in samples], [rate for _, rate in samples]))
+        if len(right) > 1:
+            times = [t for t, _ in right]
+            if abs(self._open.right[-1]) < SLOW_RAD:  # motion is no noise
+                self._scatters.append(float(np.std([rate for _, rate in right], ddof=1)))
+            self._periods.append((times[-1] - times[0]) / (len(times) - 1))
+            self._samples = len(times)
+        for t_s, _, rate in sensors.imu:
+            self._feel(t_s, rate)
+
+    def _feel(self, t_s: float, rate_rad_s: float) -> None:
+        if self._gyro is not None:
+            period_s = t_s - self._gyro[0]
+            self._open.gyro_rad += rate_rad_s * period_s
+            self._open.gyro_s += period_s
+            self._open.gyro_samples += 1
+            self._gyro_steps.append(abs(rate_rad_s - self._gyro[1]))
+        self._gyro = t_s, rate_rad_s
+
+    def fix(self, fix: Fix) -> None:
+        """Take a fix of the robot at rest; a second one at the same place replaces the first."""
+        place = self._place(fix)
+        done, self._open = self._open, _Open(begun_s=self._t_s)
+        if not self._places:
+            self._places.append(place)
+            return
+        right, left = np.array(done.right), np.array(done.left)
+        motions = _motions(right, left, self._rest_rad())
+        if not motions:
+            self._places[-1] = place
+            self._join(done)
+            return
+        self._places.append(place)
+        duration_s = self._t_s - done.begun_s
+        self._segments.append(Segment(right, left, motions, done.gyro_rad, done.gyro_s, done.gyro_samples, duration_s))
+
+    def _rest_rad(self) -> float:
+        if not self._scatters or self._wheels[0].is_counter:  # a counter at rest says nothing
+            return REST_RAD
+        noise_rad = median(self._scatters) * median(self._periods) * sqrt(self._samples)
+        return max(REST_RAD, REST_SIGMAS * noise_rad)
+
+    def _join(self, rest: _Open) -> None:
+        """A rest between two fixes at one place shows the gyroscope's bias like any other; no segment knows it."""
+        self._open.gyro_rad, self._open.gyro_s = rest.gyro_rad, rest.gyro_s
+        self._open.gyro_samples, self._open.begun_s = rest.gyro_samples, rest.begun_s
+
+    def _place(self, fix: Fix) -> Place:
+        x, y, _ = self._mirror.foot_of_puck(fix.position_m, self._puck_height_m)
+        axes = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+        turn = np.array([self._mirror.rotate_deck_from_world(axis) for axis in axes]).T
+        covariance = turn @ np.array(fix.covariance_m2).reshape(3, 3) @ turn.T
+        # The foot follows the puck along the surface; what it rises by the slope moves it sideways.
+        fx, fy = self._mirror.surface.gradient(x, y)
+        normal = np.array([-fx, -fy, 1.0]) / np.sqrt(1.0 + fx * fx + fy * fy)
+        along = (np.eye(3) - np.outer(normal, normal))[:2]
+        return Place(x, y, along @ covariance @ along.T)
+
+    def build(self) -> Drive:
+        """The drive so far."""
+        right, left = self._wheels
+        is_counter = right.is_counter or left.is_counter
+        quantum = min(right.quantum_rad, left.quantum_rad) if is_counter else 0.0
+        return Drive(
+            tuple(self._places),
+            tuple(self._segments),
+            0.0 if is_counter or not self._scatters else median(self._scatters),
+            median(self._periods) if self._periods else 0.0,
+            quantum,
+            median(self._gyro_steps) * _MEDIAN_TO_SIGMA if self._gyro_steps else 0.0,
+        )
+
+
+def _motions(right: FloatArray, left: FloatArray, rest_rad: float) -> tuple[tuple[int, int], ...]:
+    """The frames, parted into motions: by rests, and a turn in place from a way.
+
+    Together they cover all frames: wheels run down long after they seem to stand, by some micrometres in all.
+    """
+    moving = np.flatnonzero((np.abs(right) > rest_rad) | (np.abs(left) > rest_rad))
+    if not len(moving):
+        return ()
+    is_turn = np.abs(right - left) > np.abs(right + left)
+    spans = []
+    for run in np.split(moving, np.flatnonzero(np.diff(moving) > REST_FRAMES) + 1):
+        spans += _same_kind(is_turn, int(run[0]), int(run[-1]) + 1)
+    begins = [0, *(begin for begin, _ in spans[1:])]
+    return tuple(zip(begins, [*begins[1:], len(right)], strict=True))
+
+
+def _same_kind(is_turn: NDArray[np.bool_], first: int, last: int) -> list[tuple[int, int]]:
+    """Parts of a motion; what lasts for a few frames only belongs to what goes before it."""
+    cuts = [first]
+    for at in range(first + 1, last):
+        if is_turn[at] != is_turn[at - 1]:
+            cuts.append(at)
+    cuts.append(last)
+    spans: list[tuple[int, int]] = []
+    for begin, end in pairwise(cuts):
+        is_same = bool(spans) and is_turn[spans[-1][0]] == is_turn[begin]
+        if spans and (end - begin <= REST_FRAMES or is_same):
+            spans[-1] = (spans[-1][0], end)
+        else:
+            spans.append((begin, end))
+    return spans
+
+
+# Frames summed up to a step: at 0.1 m/s and 1 rad/s one of 3 mm or 0.03 rad, whose midpoint rule is exact to 1e-4 of
+# the curvature that steering gives it.
+STEP_FRAMES = 3
+
+
+class Wheels(NamedTuple):
+    """What turns wheel angles into motion.
+
+    Attributes:
+        right_m, left_m: radii.
+        base_m: distance of the wheels.
+        creep: downhill drift, part of the way.
+    """
+
+    right_m: float
+    left_m: float
+    base_m: float
+    creep: float
+
+
+class Carried(NamedTuple):
+    """Where a segment leads from one pose, and how that depends on what is not known.
+
+    Attributes:
+        end: x, y (m), heading (rad), deck frame, shape (3,).
+        of_wheels: derivatives of ``end`` by the four of ``Wheels``, shape (3, 4).
+        of_start: by the pose at the start, shape (3, 3).
+        of_slip: by the share of travel that right and left wheel gain in each motion, shape (3, 2 motions).
+        turn_rad: the robot's own rotation; what is left of the change of heading the surface's curvature does.
+    """
+
+    end: FloatArray
+    of_wheels: FloatArray
+    of_start: FloatArray
+    of_slip: FloatArray
+    turn_rad: float
+
+
+def carry(mirror: Mirror, segment: Segment, start: FloatArray, wheels: Wheels) -> Carried:
+    """Drive a segment again.
+
+    The model is that of the localizer (thesis eqs 2.11, 2.14 on the curved surface): with d = (r_R phi_R + r_L phi_L)/2
+    and turn = (r_R phi_R - r_L phi_L)/b the deck position moves by d h(psi + turn/2) + c |d| g, and the heading by
+    turn - fy (fxx dx + fxy dy) / ((1 + fx^2) W).
+
+    Args:
+        mirror: the surface.
+        segment: what the wheels turned.
+        start: x, y (m), heading (rad), deck frame.
+        wheels: the parameters.
+    """
+    steps = np.array(wheels) * 1e-5
+    steps[3] = 1e-3
+    columns = 1 + len(wheels) + 1 + 2 * len(segment.motions)
+    right_m, left_m = np.full(columns, wheels.right_m), np.full(columns, wheels.left_m)
+    base_m, creep = np.full(columns, wheels.base_m), np.full(columns, wheels.creep)
+    for k, parameter in enumerate((right_m, left_m, base_m, creep)):
+        parameter[1 + k] += steps[k]
+    psi = np.full(columns, start[2])
+    psi[5] += _TURN_RAD
+    grips = [
+        (1 + len(wheels) + 1 + 2 * m + side, first, last)
+        for m, (first, last) in enumerate(segment.motions)
+        for side, (first, last) in ((0, (first, last)), (1, (first, last)))
+    ]
+    x, y, psi, turned = _drive(mirror, segment, start, psi, (right_m, left_m, base_m, creep), grips)
+    ends = np.array([x, y, psi])
+    end = ends[:, 0]
+    away = ends - end[:, None]
+    of_start = np.eye(3)
+    of_start[:, 2] = away[:, 5] / _TURN_RAD
+    return Carried(end, away[:, 1:5] / steps, of_start, away[:, 6:] / _GRIP, turned)
+
+
+_TURN_RAD, _GRIP = 1e-5, 1e-4
+
+
+def _drive(
+    mirror: Mirror,
+    segment: Segment,
+    start: FloatArray,
+    psi: FloatArray,
+    wheels: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    grips: list[tuple[int, int, int]],
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Step by step, one column for each set of parameters; the surface is that under the first column."""
+    right_m, left_m, base_m, creep = wheels
+    terrain = Terrain(mirror)
+    x, y = np.full(len(psi), start[0]), np.full(len(psi), start[1])
+    psi = psi.copy()
+    dx0 = dy0 = turned = 0.0
+    for first, last in segment.motions:
+        for begin in range(first, last, STEP_FRAMES):
+            end = min(begin + STEP_FRAMES, last)
+            phi_r, phi_l = float(segment.right_rad[begin:end].sum()), float(segment.left_rad[begin:end].sum())
+            if phi_r == phi_l == 0.0:  # a counter at rest
+                continue
+            right, left = right_m * phi_r, left_m * phi_l
+            for column, motion_first, motion_last in grips:
+                if motion_first <= begin < motion_last:
+                    (right if (column - 6) % 2 == 0 else left)[column] *= 1.0 + _GRIP
+            d, turn = 0.5 * (right + left), (right - left) / base_m
+            # In the middle of the step, as far as the last one tells.
+            fx, fy, fxx, fxy, _, gx, gy = terrain.at(float(x[0]) + 0.5 * dx0, float(y[0]) + 0.5 * dy0)
+            s2 = 1.0 + fx * fx
+            s, norm = s2**0.5, (s2 + fy * fy) ** 0.5
+            ex, ey = -fx * fy / (norm * s), s / norm
+            middle = psi + 0.5 * turn
+            cosine, sine = np.cos(middle), np.sin(middle)
+            drift = creep * np.abs(d)
+            dx = d * (cosine / s + sine * ex) + drift * gx
+            dy = d * sine * ey + drift * gy
+            x, y = x + dx, y + dy
+            psi = psi + turn - fy * (fxx * dx + fxy * dy) / (s2 * norm)
+            dx0, dy0 = float(dx[0]), float(dy[0])
+            turned += float(turn[0])
+    return x, y, psi, turned
+
+
+# A survey has hundreds of legs; what its first ones do not show the others hardly will, and time grows with the cube.
+MAX_FIXES = 60
+
+
+def read_drive(run_dir: Path) -> tuple[Drive, Mirror, Config]:
+    """The newest recording of a run: its drive, its mirror, its configuration.
+
+    Raises:
+        RunReadError: there is no recording that can be read.
+        ConfigError: its configuration cannot be used.
+    """
+    recording = open_run(run_dir)[-1]
+    cfg = recording.config({})
+    mirror = build_mirror(cfg.mirror)
+    builder, fixes = DriveBuilder(mirror, cfg.robot.puck_height_m), 0
+    for event in in_order(recording.messages()):
+        if isinstance(event, Marked):
+            builder.frame(event.sensors)
+        elif event.was_fused:
+            builder.fix(event.fix)
+            fixes += 1
+            if fixes == MAX_FIXES:
+                break
+    return builder.build(), mirror, cfg

@@ -1,0 +1,312 @@
+"""One line of the check before a mission, and all of them as a table.
+
+What the MultiLine server says, against the configuration.
+
+What the robot says of itself while it stands, against the configuration.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from enum import StrEnum
+from itertools import pairwise
+from math import dist
+from statistics import fmean
+from typing import Any, NamedTuple
+
+from ccatp.config.models import Config
+from ccatp.core import Fix
+from ccatp.links.multiline import Environment
+from ccatp.links.robot_messages import Hello, Sensors
+from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.surface import ConvergenceError
+from ccatp.survey.composition import robot_problems
+from ccatp.survey.reactions import MirrorCheck
+
+
+class Outcome(StrEnum):
+    """How a check went."""
+
+    PASS = "pass"  # noqa: S105 - no password
+    WARN = "warn"  # a mission is possible; somebody should know
+    FAIL = "fail"
+    SKIP = "skip"  # what it would look at is not there
+
+
+class Finding(NamedTuple):
+    """One check.
+
+    Attributes:
+        name: what was looked at.
+        outcome: how it went.
+        found: what was seen.
+        todo: what to do; empty where all is well.
+    """
+
+    name: str
+    outcome: Outcome
+    found: str
+    todo: str = ""
+
+
+def passed(name: str, found: str) -> Finding:
+    """All is well."""
+    return Finding(name, Outcome.PASS, found)
+
+
+def warned(name: str, found: str, todo: str) -> Finding:
+    """A mission is possible."""
+    return Finding(name, Outcome.WARN, found, todo)
+
+
+def failed(name: str, found: str, todo: str) -> Finding:
+    """No mission like that."""
+    return Finding(name, Outcome.FAIL, found, todo)
+
+
+def skipped(names: Iterable[str], why: str) -> list[Finding]:
+    """What could not be looked at."""
+    return [Finding(name, Outcome.SKIP, why) for name in names]
+
+
+def has_failed(findings: Iterable[Finding]) -> bool:
+    """Whether one failed."""
+    return any(finding.outcome is Outcome.FAIL for finding in findings)
+
+
+def lines(findings: Sequence[Finding]) -> list[str]:
+    """The table as plain text, and what it comes to."""
+    width = max(len(finding.name) for finding in findings)
+    text = []
+    for finding in findings:
+        text.append(f"{finding.outcome:<4}  {finding.name:<{width}}  {finding.found}")
+        if finding.todo:
+            text.append(f"{'':4}  {'':{width}}  -> {finding.todo}")
+    counts = {outcome: sum(f.outcome is outcome for f in findings) for outcome in Outcome}
+    told = ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count)
+    return [*text, f"{'not ready' if has_failed(findings) else 'ready'}: {told}"]
+
+
+def as_json(findings: Sequence[Finding]) -> dict[str, Any]:
+    """For ``--json``."""
+    return {"ready": not has_failed(findings), "checks": [finding._asdict() for finding in findings]}
+
+
+LASER_NAMES = ("lasers", "air", "laser fix")
+# Air as it can be at a telescope, from the sea to 6000 m.
+TEMPERATURE_C, PRESSURE_HPA, HUMIDITY_PCT = (-40.0, 50.0), (400.0, 1100.0), (0.0, 100.0)
+
+
+def judge_lasers(*, connected: bool, laser_ready: bool) -> Finding:
+    """Are the lasers there, and warm?"""
+    if not connected:
+        return failed("lasers", "the server has no laser", "switch the laser unit on and connect it to its server")
+    if not laser_ready:
+        return failed("lasers", "not warm yet", "wait until the laser unit is ready")
+    return passed("lasers", "connected and warm")
+
+
+def judge_air(air: Environment) -> Finding:
+    """Can the air be what the server takes it for? Lengths are corrected by it."""
+    found = f"{air.temperature_c:.1f} degC, {air.pressure_hpa:.0f} hPa, {air.humidity_pct:.0f} %"
+    for value, (low, high) in (
+        (air.temperature_c, TEMPERATURE_C),
+        (air.pressure_hpa, PRESSURE_HPA),
+        (air.humidity_pct, HUMIDITY_PCT),
+    ):
+        if not low <= value <= high:
+            todo = "look at the weather station of the laser unit: lengths are corrected by it"
+            return failed("air", f"{found}: not the air of any telescope", todo)
+    return passed("air", found)
+
+
+def judge_fix(cfg: Config, mirror: Mirror, fix: Fix) -> Finding:
+    """Is the puck where a robot at base has it?"""
+    expected = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m)
+    off_m = dist(fix.position_m, expected)
+    try:
+        *_, deviation_m = mirror.foot_of_puck(fix.position_m, cfg.robot.puck_height_m)
+    except ConvergenceError:
+        deviation_m = off_m
+    found = (
+        f"{len(fix.channels)} channels, residual {1e6 * fix.residual_rms_m:.1f} um, {1e3 * off_m:.1f} mm from base, "
+        f"{1e3 * deviation_m:+.2f} mm off the surface"
+    )
+    if off_m > cfg.etalon.start_distance_m:
+        return failed("laser fix", found, "set the robot down at base; else frame or unit of the collimators is wrong")
+    if abs(deviation_m) > cfg.etalon.max_surface_residual_m:
+        return failed("laser fix", found, "robot.puck_height_m or the collimators' positions are wrong")
+    return passed("laser fix", found)
+
+
+ROBOT_NAMES = (
+    "robot geometry", "frames", "robot clock", "faults", "encoders", "inertial unit", "edge sensors", "gravity", "fans",
+    "battery",
+)  # fmt: skip
+EDGES = ("front left", "front right", "rear left", "rear right")
+# The rates that a robot must have: half of what the interface allows, which the danger rules still bear.
+LEAST_HZ = {"imu": 20.0, "enc": 50.0, "edge": 200.0}
+CLOCK_TOLERANCE = 0.01
+STANDING_RAD_S = 0.02
+BIAS_SIGMAS = 5.0
+
+
+class Heard(NamedTuple):
+    """What came from the robot.
+
+    Attributes:
+        hello: its first line.
+        frames: one after the other.
+        arrived_s: when each came, by our monotonic clock.
+    """
+
+    hello: Hello
+    frames: Sequence[Sensors]
+    arrived_s: Sequence[float]
+
+
+def judge_robot(cfg: Config, mirror: Mirror, heard: Heard) -> list[Finding]:
+    """All checks of a robot that stands at base."""
+    problems = robot_problems(cfg, mirror, heard.hello)
+    geometry = (
+        failed("robot geometry", "; ".join(problems), "measure the robot and correct [robot], or run.mirror")
+        if problems
+        else passed("robot geometry", f"wheel radius {cfg.robot.wheel_radius_m:g} m, base {cfg.robot.wheel_base_m:g} m")
+    )
+    return [
+        geometry,
+        _frames(cfg, heard),
+        _clock(heard),
+        _faults(heard.frames),
+        _encoders(heard.frames),
+        _inertial_unit(cfg, heard.frames),
+        _edge_sensors(heard.frames),
+        _gravity(mirror, heard.frames),
+        _fans(cfg, mirror, heard),
+        _battery(cfg, heard.frames),
+    ]
+
+
+def _span_s(frames: Sequence[Sensors]) -> float:
+    return frames[-1].t - frames[0].t
+
+
+def _frames(cfg: Config, heard: Heard) -> Finding:
+    frames, nominal = heard.frames, heard.hello.frame_hz
+    span_s = heard.arrived_s[-1] - heard.arrived_s[0]
+    if span_s <= 0.0:
+        return failed("frames", "a single frame", "is something between us and the robot that holds frames back?")
+    rate, gap_s = (len(frames) - 1) / span_s, max(b - a for a, b in pairwise(heard.arrived_s))
+    missing = sum(b.seq - a.seq - 1 for a, b in pairwise(frames))
+    found = f"{rate:.1f} a second of {nominal:g}, longest gap {1e3 * gap_s:.0f} ms, {missing} missing"
+    if gap_s > cfg.robot.sensors_timeout_s or rate < 0.9 * nominal:
+        return failed("frames", found, "look at the network between here and the robot, and at the load of both")
+    if gap_s > cfg.robot.lag_limit_s or missing:
+        return warned("frames", found, "the robot will pause now and then; look at the network and the load")
+    return passed("frames", found)
+
+
+def _clock(heard: Heard) -> Finding:
+    theirs_s, ours_s = _span_s(heard.frames), heard.arrived_s[-1] - heard.arrived_s[0]
+    ratio = theirs_s / ours_s if ours_s > 0.0 else 0.0
+    found = f"runs at {ratio:.4f} of ours, {heard.frames[-1].t:.0f} s since boot {heard.hello.boot}"
+    if heard.hello.lockstep:
+        return warned("robot clock", "simulated, in lockstep", "a real robot has a clock of its own")
+    # What was under way at both ends blurs a short look.
+    if abs(ratio - 1.0) > CLOCK_TOLERANCE + 0.05 / max(ours_s, 0.1):
+        return failed("robot clock", found, "boot the robot; if it stays so its clock is not in order")
+    return passed("robot clock", found)
+
+
+def _faults(frames: Sequence[Sensors]) -> Finding:
+    told = sorted({fault for frame in frames for fault in frame.faults})
+    if told:
+        return failed("faults", f"the robot reports {', '.join(told)}", "see to it before anything moves")
+    return passed("faults", "the robot reports none")
+
+
+def _too_slow(kind: str, count: int, frames: Sequence[Sensors]) -> str:
+    rate = count / max(_span_s(frames), 1e-3)
+    return "" if rate >= LEAST_HZ[kind] else f"{rate:.0f} samples a second, {LEAST_HZ[kind]:.0f} are needed"
+
+
+def _encoders(frames: Sequence[Sensors]) -> Finding:
+    todo = "look at the encoders and their cables"
+    for index, side in ((1, "right"), (2, "left")):
+        rates = [rate for frame in frames for row in frame.enc if (rate := row[index]) is not None]
+        if slow := _too_slow("enc", len(rates), frames):
+            return failed("encoders", f"{side}: {slow}", todo)
+        if abs(fmean(rates)) > STANDING_RAD_S:
+            return failed("encoders", f"{side} wheel turns at {fmean(rates):.3f} rad/s, and should stand", todo)
+    return passed("encoders", "both wheels stand")
+
+
+def _inertial_unit(cfg: Config, frames: Sequence[Sensors]) -> Finding:
+    rows = [row for frame in frames for row in frame.imu]
+    todo = "look at the inertial unit and its cable"
+    if slow := _too_slow("imu", len(rows), frames):
+        return failed("inertial unit", slow, todo)
+    repeated = longest = 0
+    for before, after in pairwise(rows):
+        repeated = repeated + 1 if before[1:] == after[1:] else 0
+        longest = max(longest, repeated)
+    if longest >= cfg.health.identical_samples:
+        return failed("inertial unit", f"{longest + 1} readings in a row are the same: it is frozen", todo)
+    rate = fmean(row[2] for row in rows)
+    limit = BIAS_SIGMAS * cfg.localizer.full_state.gyroscope_bias_sigma_rad_s
+    found = f"zero rate {rate:+.4f} rad/s, {cfg.localizer.gyroscope_bias_rad_s:+.4f} is configured"
+    if abs(rate - cfg.localizer.gyroscope_bias_rad_s) > limit:
+        return failed("inertial unit", found, "let it warm up and stand still; then ccatp calibrate")
+    return passed("inertial unit", found)
+
+
+def _edge_sensors(frames: Sequence[Sensors]) -> Finding:
+    rows = [row[1:] for frame in frames for row in frame.edge]
+    if slow := _too_slow("edge", len(rows), frames):
+        return failed("edge sensors", slow, "look at the edge sensors and their cable")
+    off = [name for name, values in zip(EDGES, zip(*rows, strict=True), strict=True) if not any(values)]
+    if off:
+        todo = "set the robot down at base, on a panel with all four; clean the sensors"
+        return failed("edge sensors", f"{' and '.join(off)} see no panel", todo)
+    if flickering := list(_flickering(rows)):
+        return failed("edge sensors", f"{' and '.join(flickering)} see the panel on and off", "clean the sensors")
+    return passed("edge sensors", "all four see the panel")
+
+
+def _flickering(rows: Sequence[Sequence[int]]) -> Iterator[str]:
+    for name, values in zip(EDGES, zip(*rows, strict=True), strict=True):
+        if not all(values):
+            yield name
+
+
+def _gravity(mirror: Mirror, frames: Sequence[Sensors]) -> Finding:
+    check = MirrorCheck(mirror)
+    is_known = any(check.hear(frame.t, frame.gravity, mirror.base_pose) for frame in frames)
+    if check.contradiction:
+        return failed(
+            "gravity", check.contradiction, "set run.mirror to where the robot stands, or set it down at base"
+        )
+    if check.warning or not is_known:
+        found = check.warning or "too few readings"
+        return warned("gravity", found, "make sure by eye that this is the right mirror")
+    return passed("gravity", f"the slope is that of {mirror.name} at base")
+
+
+def _fans(cfg: Config, mirror: Mirror, heard: Heard) -> Finding:
+    least, floor = min(min(frame.fans) for frame in heard.frames), heard.hello.robot.fan_floor
+    found = f"at least {least:.2f} of duty, the floor is {floor:g}"
+    if mirror.overhang and least < floor:
+        return failed("fans", found, "the robot would fall: keep a hand on it, and find out why the fans are weak")
+    if mirror.overhang and min(cfg.robot.fan_duty) < floor:
+        told = f"robot.fan_duty {min(cfg.robot.fan_duty):g} is below the robot's floor {floor:g}"
+        return failed("fans", told, "raise robot.fan_duty")
+    return passed("fans", found)
+
+
+def _battery(cfg: Config, frames: Sequence[Sensors]) -> Finding:
+    charge, health = frames[-1].soc, cfg.health
+    lasts_s = max(charge - health.battery_reserve, 0.0) * health.battery_life_s
+    found = f"{charge:.0%}, for {lasts_s / 60.0:.0f} min above the reserve of {health.battery_reserve:.0%}"
+    if charge <= health.battery_reserve:
+        return failed("battery", found, "charge it")
+    if lasts_s < cfg.run.budget_s:
+        return warned("battery", found, f"a survey may take {cfg.run.budget_s / 60.0:.0f} min: charge it")
+    return passed("battery", found)

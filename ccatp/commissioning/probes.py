@@ -1,0 +1,220 @@
+"""Looks at robot, laser system and machine for the check before a mission; nothing moves, nothing changes."""
+
+import asyncio
+import ctypes
+import os
+import resource
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from fcntl import LOCK_EX, LOCK_NB, flock
+from pathlib import Path
+
+from ccatp.commissioning import preflight as judge_laser
+from ccatp.commissioning import preflight as judge_robot
+from ccatp.commissioning.preflight import Finding, Heard, failed, passed, skipped, warned
+from ccatp.config.models import Config
+from ccatp.errors import CcatpError
+from ccatp.etalon_client import EtalonClient, EtalonError, EtalonUnreachable
+from ccatp.links.robot_link import RobotLink, RobotLinkError, read_key
+from ccatp.links.robot_messages import Hello, Sensors
+from ccatp.links.runtime_dir import make_runtime_dir
+from ccatp.mirror.mirror import Mirror
+
+LISTEN_S = 3.0
+FIRST_FRAME_S = 2.0
+# A mission of an hour records a tenth of this, and its database as much again.
+FREE_BYTES = 2_000_000_000
+WRITES, SLOW_WRITE_S = 20, 0.1
+_TIME_ERROR = 5
+_LOCAL = ("127.", "localhost", "::1")
+
+
+async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -> list[Finding]:
+    """Join the robot as monitor, listen for a while, judge what it says.
+
+    A monitor that says nothing permits nothing: as long as it listens nobody can move the robot.
+    """
+    frames: list[Sensors] = []
+    arrived_s: list[float] = []
+    hellos: list[Hello] = []
+    lost: list[str] = []
+    has_news, is_lost = asyncio.Event(), asyncio.Event()
+
+    def take(sensors: Sensors, _raw: bytes) -> None:
+        frames.append(sensors)
+        arrived_s.append(time.monotonic())
+        has_news.set()
+
+    def lose(reason: str) -> None:
+        lost.append(reason)
+        has_news.set()
+        is_lost.set()
+
+    try:
+        key = read_key(cfg.robot.key_file)
+    except CcatpError as error:
+        return [failed("robot link", str(error), "see ccatp keys"), *skipped(judge_robot.ROBOT_NAMES, "no robot link")]
+    link = RobotLink(
+        host=cfg.robot.host, port=cfg.robot.port, role="monitor", client="check", key=key,
+        on_sensors=take, on_lost=lose, on_joined=hellos.append,
+    )  # fmt: skip
+    try:
+        await link.connect(cfg.robot.connect_timeout_s)
+        await _listen(has_news, is_lost, listen_s)
+    except RobotLinkError as error:
+        todo = "switch the robot on; check [robot] host, port and key_file; end what else drives it"
+        return [failed("robot link", str(error), todo), *skipped(judge_robot.ROBOT_NAMES, "no robot link")]
+    finally:
+        link.close()
+    hello = hellos[0]
+    found = [_link_finding(cfg, hello)]
+    if lost or not frames:
+        why = lost[0] if lost else f"no sensors frame within {FIRST_FRAME_S:g} s"
+        lost_link = failed("robot link", why, "look at the robot's own log")
+        return [lost_link, *skipped(judge_robot.ROBOT_NAMES, "no frames")]
+    return [*found, *judge_robot.judge_robot(cfg, mirror, Heard(hello, frames, arrived_s))]
+
+
+async def _listen(has_news: asyncio.Event, is_lost: asyncio.Event, listen_s: float) -> None:
+    """Wait for the first frame and then for as long as is to be listened; no longer than the session lasts."""
+    with suppress(TimeoutError):
+        async with asyncio.timeout(FIRST_FRAME_S):
+            await has_news.wait()
+        async with asyncio.timeout(listen_s):
+            await is_lost.wait()
+
+
+def _link_finding(cfg: Config, hello: Hello) -> Finding:
+    found = f"{cfg.robot.host}:{cfg.robot.port}, {hello.protocol}, auth {hello.auth}"
+    if hello.auth == "none" and not cfg.robot.host.startswith(_LOCAL):
+        todo = "anybody on that network can drive it: give it a key (ccatp keys generate, robot.key_file)"
+        return warned("robot link", found, todo)
+    return passed("robot link", found)
+
+
+async def probe_laser(cfg: Config, mirror: Mirror) -> list[Finding]:
+    """Ask the MultiLine server how it is, and where the puck is."""
+    quick = cfg.etalon.model_copy(update={"reconnect_for_s": 0.0})
+    client = EtalonClient(quick, mirror.channels, mirror.collimators_m)
+    name = "laser server"
+    try:
+        try:
+            readiness = await client.isready()
+        except EtalonError as error:
+            todo = "start the MultiLine server; check [etalon] host and port"
+            return [failed(name, str(error), todo), *skipped(judge_laser.LASER_NAMES, "no laser server")]
+        found = [
+            passed(name, f"{cfg.etalon.host}:{cfg.etalon.port}"),
+            judge_laser.judge_lasers(connected=readiness.connected, laser_ready=readiness.laser_ready),
+            judge_laser.judge_air(readiness.environment),
+        ]
+        try:
+            await asyncio.sleep(cfg.etalon.measuring_time_s)
+            fix = await client.measure(0.0, mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m))
+        except EtalonUnreachable as error:
+            return [*found, failed("laser fix", str(error), "the server went away; look at its log")]
+        except EtalonError as error:
+            todo = "set the robot down at base, with a free view for the beams"
+            return [*found, failed("laser fix", str(error), todo)]
+        return [*found, judge_laser.judge_fix(cfg, mirror, fix)]
+    finally:
+        await client.close()
+
+
+def probe_machine(cfg: Config, runs_dir: Path, runtime_dir: Path | None, environ: Mapping[str, str]) -> list[Finding]:
+    """Clock, disk, runtime directory, real time."""
+    return [_clock(), *_disk(runs_dir), _runtime_dir(cfg, runtime_dir, environ), _real_time(cfg)]
+
+
+def probe_keys(cfg: Config, *, sim: bool) -> Finding:
+    """The key of the robot link; those of the observatory channel are judged where it is served."""
+    try:
+        key = read_key(cfg.robot.key_file, must_be_private=not sim)
+    except CcatpError as error:
+        return failed("robot key", str(error), "make one with ccatp keys generate, and give the robot the same")
+    return passed("robot key", f"{cfg.robot.key_file}" if key else "none configured")
+
+
+def _clock() -> Finding:
+    """Whether somebody keeps the machine's time: logs and recordings are compared by it."""
+    name, year = "machine clock", time.gmtime().tm_year
+    told = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
+    if year < 2025:
+        return failed(name, told, "set the clock; is its battery empty?")
+    if sys.platform != "linux":
+        return passed(name, told)
+    # struct timex is 208 bytes long; with its first field, the modes, zero it is only asked.
+    state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(256))
+    if state in (-1, _TIME_ERROR):
+        return warned(name, f"{told}, kept by nobody", "logs may not fit those of others: start chrony or timesyncd")
+    return passed(name, f"{told}, synchronised")
+
+
+def _disk(runs_dir: Path) -> Iterator[Finding]:
+    """Free room and speed where runs are written; ``runs_dir`` itself is made by the first run."""
+    place = runs_dir.absolute()
+    if place.exists() and not place.is_dir():
+        yield failed("disk", f"{place} is no directory", "name another with --runs-dir")
+        return
+    if not place.is_dir():
+        place = place.parent
+    if not place.is_dir():
+        yield failed("disk", f"no directory {place} to make {runs_dir.name} in", "make it, or mount the disk it is on")
+        return
+    free = shutil.disk_usage(place).free
+    found = f"{free / 1e9:.1f} GB free in {place}"
+    if free < FREE_BYTES:
+        yield failed("disk space", found, f"make room: {FREE_BYTES / 1e9:.0f} GB are a day of recordings")
+    else:
+        yield passed("disk space", found)
+    try:
+        slowest_s = _slowest_write_s(place)
+    except OSError as error:
+        yield failed("disk writes", f"{place}: {error.strerror}", "let the daemon's user write there, or use --run-dir")
+        return
+    found = f"the slowest of {WRITES} took {1e3 * slowest_s:.1f} ms"
+    if slowest_s > SLOW_WRITE_S:
+        yield warned("disk writes", found, "a point counts when it is on the disk: use a faster one")
+    else:
+        yield passed("disk writes", found)
+
+
+def _slowest_write_s(folder: Path) -> float:
+    slowest_s = 0.0
+    with tempfile.TemporaryFile(dir=folder) as file:
+        for _ in range(WRITES):
+            begin_s = time.monotonic()
+            file.write(bytes(4096))
+            file.flush()
+            os.fsync(file.fileno())
+            slowest_s = max(slowest_s, time.monotonic() - begin_s)
+    return slowest_s
+
+
+def _runtime_dir(cfg: Config, runtime_dir: Path | None, environ: Mapping[str, str]) -> Finding:
+    name = "runtime directory"
+    try:
+        folder = make_runtime_dir(str(runtime_dir or cfg.run.runtime_dir), environ)
+    except CcatpError as error:
+        return failed(name, str(error), "choose another with --runtime-dir")
+    try:
+        with (folder / "lock").open("a") as file:
+            flock(file, LOCK_EX | LOCK_NB)
+    except OSError:
+        return failed(name, f"a daemon runs in {folder}", "ask it with ccatp status; end it with ccatp stop")
+    return passed(name, str(folder))
+
+
+def _real_time(cfg: Config) -> Finding:
+    name, priority = "real time", cfg.run.realtime_priority
+    if not priority:
+        return passed(name, "not asked for (run.realtime_priority = 0)")
+    limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0] if hasattr(resource, "RLIMIT_RTPRIO") else 0
+    if os.geteuid() == 0 or limit in (-1, resource.RLIM_INFINITY) or limit >= priority:
+        return passed(name, f"priority {priority} is permitted")
+    todo = "reaction times hold only while a core is idle: the unit grants it with LimitRTPRIO"
+    return warned(name, f"priority {priority} is not permitted to this user", todo)

@@ -1,0 +1,494 @@
+"""Reads the configuration: the default file, the user's, the command line, one mirror and one world.
+
+Where the values of a configuration come from: files and the command line, laid over each other.
+
+Reads the configuration of a robot among radio beacons: base file, the system's, the user's, command line.
+
+Reads what is assumed of recorded radio data: the shipped file, the user's, the command line.
+
+Changes single keys of a configuration file, with everything else in it, comments included, as it was.
+"""
+
+import difflib
+import json
+import os
+import re
+import tempfile
+import tomllib
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from pydantic import BaseModel, ValidationError
+from tomlkit.exceptions import TOMLKitError
+
+from ccatp.config.beacon_checks import check_radio_config
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.checks import check_config, is_file_name
+from ccatp.config.messages import Fault, Key, choice_hint, faults_of, find_line, format_key, format_toml, format_value
+from ccatp.config.models import Config, MirrorConfig, WorldConfig
+from ccatp.config.package import configs_dir
+from ccatp.config.recording_models import RecordingsConfig
+from ccatp.errors import ConfigError
+
+Tree = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One place that values come from.
+
+    Attributes:
+        name: file name as the user knows it, or ``command line``.
+        text: the file's text; empty for the command line.
+        tree: what it says.
+        root: the section of the configuration that ``tree`` is.
+        folder: what relative file names in it refer to.
+    """
+
+    name: str
+    text: str
+    tree: Tree
+    root: Key = ()
+    folder: Path = Path()
+
+    def depth(self, key: Key) -> int:
+        """How many parts of a key this source holds; all of them where it holds a value in place of a section."""
+        if key[: len(self.root)] != self.root:
+            return 0
+        node: object = self.tree
+        for depth, part in enumerate(key[len(self.root) :], start=len(self.root)):
+            if not isinstance(node, Mapping):
+                break
+            if part not in node:
+                return depth
+            node = node[part]
+        return len(key)
+
+    def place(self, key: Key) -> str:
+        """``file:line`` of a key."""
+        line = find_line(self.text, key[len(self.root) :])
+        return f"{self.name}:{line}" if line else self.name
+
+
+def read_source(path: Path, root: Key = ()) -> Source:
+    """What a TOML file says, as the section ``root`` of a configuration.
+
+    Raises:
+        ConfigError: there is no such file, or it is not TOML.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: {(error.strerror or str(error)).lower()}; name a TOML file that exists") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
+    try:
+        return Source(str(path), text, tomllib.loads(text), root, path.parent)
+    except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
+        at = re.search(r" \(at line (\d+), column (\d+)\)", str(error))
+        line = int(at[1]) if at else max(1, len(text.splitlines()))
+        what = re.sub(r" \(at .*\)$", "", str(error))
+        raise ConfigError(f"{path}:{line}: is not TOML: {what[:1].lower()}{what[1:]}") from error
+
+
+def nested(dotted: Mapping[str, object]) -> Tree:
+    """``{"run.seed": 2}`` as ``{"run": {"seed": 2}}``.
+
+    Raises:
+        ConfigError: a key is given both as a value and as a section.
+    """
+    tree: Tree = {}
+    for key, value in dotted.items():
+        if value is None:
+            continue
+        *sections, name = key.split(".")
+        node = tree
+        for section in sections:
+            node = node.setdefault(section, {})
+            if not isinstance(node, dict):
+                raise ConfigError(f"command line: {key}: {section} is given as a value already; give one of them")
+        node[name] = value
+    return tree
+
+
+def merged(
+    below: Mapping[str, Any], above: Mapping[str, Any], whole: Collection[Key] = (), at: tuple[str, ...] = ()
+) -> Tree:
+    """``above`` laid over ``below``, section by section; arrays are replaced whole.
+
+    Args:
+        below: what the weaker source says.
+        above: what the stronger one says.
+        whole: sections that are lists by name: they are replaced whole, too.
+        at: where in the configuration the two stand.
+    """
+    tree = dict(below)
+    for name, value in above.items():
+        key = (*at, name)
+        both = isinstance(value, Mapping) and isinstance(tree.get(name), Mapping) and key not in whole
+        tree[name] = merged(tree[name], value, whole, key) if both else value
+    return tree
+
+
+def source_of(key: Key, sources: Iterable[Source]) -> Source:
+    """The source that says most about a key; of equals the strongest, which stands first."""
+    return max(sources, key=lambda source: source.depth(key))
+
+
+def fault_line(fault: Fault, sources: list[Source]) -> str:
+    """The line for the reader. Of keys that contradict each other it points to the one nearest to the user."""
+    held = [(sources.index(source_of(key, sources)), key) for key in (fault.key, *fault.related)]
+    strength, key = min(held, key=lambda pair: pair[0])
+    return f"{sources[strength].place(key)}: {format_key(fault.key)} {fault.what}"
+
+
+DEFAULT_FILE = "ccatp.toml"
+_RUN_FILE = "config.toml"  # of a run directory
+_SECTIONS: dict[str, tuple[str, type[BaseModel]]] = {
+    "mirror": ("mirrors", MirrorConfig),
+    "world": ("worlds", WorldConfig),
+}
+
+
+class NotASurvey(ConfigError):
+    """A configuration of a mission among beacons where one of a survey is wanted."""
+
+
+def shipped_config_dir() -> Path:
+    """The folder of the configurations that come with ccatp."""
+    return configs_dir()
+
+
+def load_config(
+    file: Path | None = None, overrides: Mapping[str, object] | None = None, config_dir: Path | None = None
+) -> Config:
+    """The whole configuration of a run.
+
+    The user's file needs only the keys that differ from the default file. ``mirror`` and ``world`` come from the files
+    that ``run.mirror`` and ``run.world`` name, a name or the path of a ``.toml`` file; a file with complete sections
+    ``[mirror]`` and ``[world]``, as a run directory holds, is taken as it is, and single keys of these sections are
+    laid over the named file.
+
+    Args:
+        file: the user's configuration, or ``None``.
+        overrides: dotted keys, stronger than the file; ``None`` values are left out.
+        config_dir: folder with ``ccatp.toml``, ``mirrors/`` and ``worlds/``; the shipped one if ``None``.
+
+    Raises:
+        ConfigError: one line with file, line, key, what is wrong and what to do.
+        NotASurvey: the file is of a mission among beacons.
+    """
+    config_dir = config_dir or shipped_config_dir()
+    default = read_source(config_dir / DEFAULT_FILE)
+    user = read_source(file) if file else Source("", "", {})
+    _refuse_beacons(user, file)
+    command = Source("command line", "", nested(overrides or {}))
+    sources = [command, user, default]
+    tree: Tree = {}
+    for source in reversed(sources):
+        tree = merged(tree, source.tree)
+    for section in _SECTIONS:
+        named = _named_section(section, tree, sources, config_dir)
+        tree[section] = merged(named.tree, _overlay(section, tree, sources))
+        sources.append(named)
+    return _validated(tree, sources)
+
+
+def _refuse_beacons(user: Source, file: Path | None) -> None:
+    if file is None or "system" not in user.tree:
+        return
+    name = f"{file}: is of a mission among beacons (system = {format_value(user.tree['system'])})"
+    if file.name == _RUN_FILE:
+        raise NotASurvey(f"{name}, and this is for surveys of mirrors alone; use ccatp report {file.parent}")
+    raise NotASurvey(f"{name}, and this is for surveys of mirrors alone; use ccatp run or ccatp study with it")
+
+
+def dump_config(cfg: Config) -> str:
+    """The complete configuration as TOML; ``load_config`` on it gives an equal one."""
+    return "# The exact configuration of one run; ccatp run --config FILE repeats it.\n\n" + format_toml(
+        cfg.model_dump()
+    )
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON schema of a configuration file. Nothing is required: what one leaves out comes from the default file."""
+    schema = Config.model_json_schema()
+    for model in (schema, *schema["$defs"].values()):
+        model.pop("required", None)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "ccatp configuration"}
+
+
+def available(kind: str, config_dir: Path | None = None) -> list[str]:
+    """Names of the shipped ``mirror`` or ``world`` files."""
+    folder = (config_dir or shipped_config_dir()) / _SECTIONS[kind][0]
+    return sorted(path.stem for path in folder.glob("*.toml"))
+
+
+def _is_complete(section: str, value: object) -> bool:
+    return isinstance(value, Mapping) and set(_SECTIONS[section][1].model_fields) <= set(value)
+
+
+def _is_replaced(section: str, user: Source, command: Source) -> bool:
+    """Whether the command line names another mirror or world than the one that the user's file holds in full."""
+    wanted = _get(command.tree, "run", section)
+    return wanted is not None and wanted != _get(user.tree, "run", section)
+
+
+def _overlay(section: str, tree: Tree, sources: list[Source]) -> Mapping[str, Any]:
+    """What file and command line say about the section itself."""
+    command, user = sources[:2]
+    if _is_complete(section, user.tree.get(section)) and _is_replaced(section, user, command):
+        overlay = command.tree.get(section, {})
+    else:
+        overlay = tree.get(section, {})
+    if not isinstance(overlay, Mapping):
+        place = source_of((section,), sources).place((section,))
+        raise ConfigError(f"{place}: {section}: must be a section; name a {section} with run.{section}")
+    return overlay
+
+
+def _named_section(section: str, tree: Tree, sources: list[Source], config_dir: Path) -> Source:
+    """The file that ``run.mirror`` or ``run.world`` names; an empty source where the user's file holds all of it."""
+    command, user = sources[:2]
+    if _is_complete(section, user.tree.get(section)) and not _is_replaced(section, user, command):
+        return Source("", "", {}, (section,))
+    key: Key = ("run", section)
+    name = _get(tree, "run", section)
+    source = source_of(key, sources)
+    if not isinstance(tree["run"], Mapping):
+        raise ConfigError(f"{source.place(key)}: run = {format_value(tree['run'])} must be a section, not a value")
+    if not isinstance(name, str) or not name:
+        raise ConfigError(f"{source.place(key)}: run.{section} = {format_value(name)} must be the name of a {section}")
+    folder = config_dir / _SECTIONS[section][0]
+    path = source.folder / name if is_file_name(name) else folder / f"{name}.toml"
+    if not _is_file(path):
+        hint = f"no file {path}" if is_file_name(name) else choice_hint(name, available(section, config_dir))
+        raise ConfigError(f"{source.place(key)}: run.{section} = {format_value(name)} is no {section}; {hint}")
+    try:
+        return read_source(path, (section,))
+    except ConfigError as error:
+        raise ConfigError(f"{source.place(key)}: run.{section} = {format_value(name)}: {error}") from error
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # no name that a file may have, or in a folder that is not ours
+        return False
+
+
+def _get(tree: object, *key: str) -> object:
+    for part in key:
+        tree = tree.get(part) if isinstance(tree, Mapping) else None
+    return tree
+
+
+def _validated(tree: Tree, sources: list[Source]) -> Config:
+    try:
+        # by way of JSON, where strict means what it should for TOML: an array is a tuple, "1" is no number
+        cfg = Config.model_validate_json(json.dumps(tree, default=str), strict=True)
+    except ValidationError as error:
+        faults = faults_of(error.errors())
+    else:
+        faults = check_config(cfg)
+        if not faults:
+            return cfg
+    raise ConfigError(*(fault_line(fault, sources) for fault in faults))
+
+
+BEACON_FILE = "radio.toml"
+SYSTEMS = ("zigbee", "follow", "cricket")
+# A file that names its own beacons means these and no others; on the command line one may be moved.
+_WHOLE: tuple[Key, ...] = (
+    ("sim", "beacons"),
+    ("path_loss", "reference_dbm_of"),
+    ("cricket", "networks"),
+    ("cricket", "motes"),
+    ("cricket", "anchors"),
+)
+
+
+def load_radio_config(
+    file: Path | None = None,
+    overrides: Mapping[str, object] | None = None,
+    config_dir: Path | None = None,
+    *,
+    simulates: bool = True,
+) -> RadioConfig:
+    """The whole configuration of a robot among radio beacons.
+
+    ``system`` of the user's file, else of the base file, says which of ``zigbee.toml``, ``follow.toml`` and
+    ``cricket.toml`` lies between the two.
+
+    Args:
+        file: the user's configuration, or ``None``.
+        overrides: dotted keys, stronger than the file; ``None`` values are left out.
+        config_dir: folder with ``radio.toml``; the shipped one if ``None``.
+        simulates: whether a field of motes is simulated, or its ranges were measured.
+
+    Raises:
+        ConfigError: one line with file, line, key, what is wrong and what to do.
+    """
+    config_dir = config_dir or shipped_config_dir()
+    base = read_source(config_dir / BEACON_FILE)
+    user = read_source(file) if file else Source("", "", {})
+    if file is not None and _is_survey(user.tree):
+        raise ConfigError(
+            f"{file}: is the configuration of a survey of a mirror; give that of a robot among beacons, as cricket.toml"
+        )
+    command = Source("command line", "", nested(overrides or {}))
+    system = read_source(config_dir / f"{_system([command, user, base])}.toml")
+    tree: Tree = {}
+    for source in (base, system, user):
+        tree = merged(tree, source.tree, _WHOLE)
+    return _radio_loader_validated(merged(tree, command.tree), [command, user, system, base], simulates)
+
+
+def is_radio_file(file: Path) -> bool:
+    """Whether a configuration file is one of a robot among radio beacons: it names its ``system``.
+
+    Raises:
+        ConfigError: it cannot be read.
+    """
+    return "system" in read_source(file).tree
+
+
+def _is_survey(tree: Tree) -> bool:
+    """Whether a file without a system names a mirror or a world, which only surveys have."""
+    run = tree.get("run")
+    named = set(run) if isinstance(run, Mapping) else set()
+    return "system" not in tree and bool({"mirror", "world"} & (named | set(tree)))
+
+
+def dump_radio_config(cfg: RadioConfig) -> str:
+    """The complete configuration as TOML; ``load_radio_config`` on it gives an equal one."""
+    return "# The exact configuration of one run; ccatp run --config FILE repeats it.\n\n" + format_toml(
+        cfg.model_dump()
+    )
+
+
+def _system(sources: list[Source]) -> str:
+    for source in sources:
+        if "system" in source.tree:
+            name = source.tree["system"]
+            if name not in SYSTEMS:
+                hint = choice_hint(str(name), SYSTEMS)
+                raise ConfigError(f"{source.place(('system',))}: system = {format_value(name)} is no system; {hint}")
+            return str(name)
+    raise ConfigError(f"{sources[-1].name}: system is missing; {choice_hint('', SYSTEMS)}")
+
+
+def _radio_loader_validated(tree: Tree, sources: list[Source], simulates: bool) -> RadioConfig:
+    try:
+        # by way of JSON, where strict means what it should for TOML: an array is a tuple, "1" is no number
+        cfg = RadioConfig.model_validate_json(json.dumps(tree, default=str), strict=True)
+    except ValidationError as error:
+        faults = faults_of(error.errors(), RadioConfig)
+    else:
+        faults = check_radio_config(cfg, simulates=simulates)
+        if not faults:
+            return cfg
+    raise ConfigError(*(fault_line(fault, sources) for fault in faults))
+
+
+RECORDING_FILE = "recordings.toml"
+
+
+def load_recordings_config(file: Path | None = None, overrides: Mapping[str, object] | None = None) -> RecordingsConfig:
+    """What is assumed of recordings, by format.
+
+    Args:
+        file: the user's configuration, or ``None``; it needs only its own differences.
+        overrides: dotted keys, stronger than the file, as in ``plaza.priors.range_scale``.
+
+    Raises:
+        ConfigError: one line with file, line, key, what is wrong and what to do.
+    """
+    base = read_source(shipped_config_dir() / RECORDING_FILE)
+    user = read_source(file) if file else Source("", "", {})
+    command = Source("command line", "", nested(overrides or {}))
+    tree: Tree = {}
+    for source in (base, user, command):
+        tree = merged(tree, source.tree)
+    try:
+        return RecordingsConfig.model_validate_json(json.dumps(tree, default=str), strict=True)
+    except ValidationError as error:
+        sources = [command, user, base]
+        faults = faults_of(error.errors(), RecordingsConfig)
+        raise ConfigError(*(fault_line(fault, sources) for fault in faults)) from error
+
+
+# In comments: a stand-in value, and what takes its place.
+UNVERIFIED, MEASURED = "UNVERIFIED", "measured by ccatp calibrate"
+
+
+def with_values(text: str, values: Mapping[str, float], file: Path) -> str:
+    """The text with other values of some keys.
+
+    A key that is there keeps its comment, but for the mark of values that nobody has measured; one that is not is
+    added to its section.
+
+    Args:
+        text: TOML.
+        values: by dotted key, ``section.key``.
+        file: where the text is from, for errors.
+
+    Raises:
+        ConfigError: the text is not TOML, or a key stands where no key can be.
+    """
+    try:
+        document = tomlkit.parse(text)
+        for dotted, value in values.items():
+            section, _, key = dotted.rpartition(".")
+            if section not in document:
+                if document.as_string().strip():
+                    document.add(tomlkit.nl())
+                document.add(section, tomlkit.table())
+            table = document[section]
+            if not isinstance(table, dict):
+                raise ConfigError(f"{file}: {section} is a value, not a section; {dotted} cannot be set there")
+            table[key] = value
+            trivia = table[key].trivia
+            trivia.comment = trivia.comment.replace(UNVERIFIED, MEASURED)
+        return tomlkit.dumps(document)
+    except TOMLKitError as error:
+        raise ConfigError(f"{file}: is not TOML: {error}") from error
+
+
+def difference(before: str, after: str, file: Path) -> str:
+    """What would change, as a unified diff; empty where nothing does."""
+    old, new = before.splitlines(keepends=True), after.splitlines(keepends=True)
+    return "".join(difflib.unified_diff(old, new, fromfile=str(file), tofile=f"{file} (new)"))
+
+
+def write_in_place(file: Path, text: str) -> None:
+    """Replace a file's contents at once: whoever reads it finds the old ones or the new ones, also after a power cut.
+
+    Its mode stays as it is; where it is a link, what it points to is replaced.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
+    file = file.resolve()
+    try:
+        handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be written: {error.strerror or error}") from error
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as out:
+            out.write(text)
+            out.flush()
+            os.fchmod(out.fileno(), file.stat().st_mode & 0o7777)
+            os.fsync(out.fileno())
+        Path(name).replace(file)
+        folder = os.open(file.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+    except OSError as error:
+        Path(name).unlink(missing_ok=True)
+        raise ConfigError(f"{file}: cannot be written: {error.strerror or error}") from error

@@ -1,0 +1,205 @@
+"""A frame as the monitors look at it: how far wheels and gyroscope say that the robot moved, and since when.
+
+Which readings of the inertial unit can be believed: range, agreement with the wheels, noise.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from math import inf
+from typing import NamedTuple
+
+from ccatp.config.models import HealthConfig, RobotConfig
+from ccatp.core import ImuSample, WheelSample
+
+
+class Moved(NamedTuple):
+    """Running sums since the start, at one time.
+
+    Attributes:
+        t_s: the time.
+        right_m, left_m: travel of the wheels' rims.
+        turned_rad: what the gyroscope has turned by, as far as it could be believed.
+    """
+
+    t_s: float
+    right_m: float
+    left_m: float
+    turned_rad: float
+
+
+class Window:
+    """The change of running sums over a time.
+
+    Args:
+        span_s: that time.
+    """
+
+    __slots__ = ("_kept", "_span_s")
+
+    def __init__(self, span_s: float) -> None:
+        """Empty."""
+        self._span_s = span_s - 1e-6
+        self._kept: deque[Moved] = deque()
+
+    def reset(self) -> None:
+        """Empty again."""
+        self._kept.clear()
+
+    def push(self, now: Moved) -> Moved | None:
+        """Take the newest sums; the change over the span (``t_s`` is its length), ``None`` while it is shorter."""
+        kept, since_s = self._kept, now[0] - self._span_s
+        kept.append(now)
+        while len(kept) > 1 and kept[1][0] <= since_s:
+            kept.popleft()
+        t_s, right_m, left_m, turned_rad = kept[0]
+        if t_s > since_s:
+            return None
+        return Moved(now[0] - t_s, now[1] - right_m, now[2] - left_m, now[3] - turned_rad)
+
+
+class WheelMeans:
+    """The mean rates of the wheels over a frame, and the yaw rate that they mean, smoothed.
+
+    Args:
+        robot: wheels.
+
+    Attributes:
+        right_rad_s, left_rad_s: means over the last frame; ``None`` for a wheel that gave no sample.
+        yaw_rad_s: smoothed over some frames, because a count of an encoder is a jump of its rate.
+    """
+
+    _SMOOTH_S = 0.05
+
+    __slots__ = ("_limit_rad_s", "_per_base", "left_rad_s", "right_rad_s", "yaw_rad_s")
+
+    def __init__(self, robot: RobotConfig) -> None:
+        """Standing still."""
+        self._per_base = robot.wheel_radius_m / robot.wheel_base_m
+        self._limit_rad_s = largest_rate_rad_s(robot)
+        self.right_rad_s: float | None = 0.0
+        self.left_rad_s: float | None = 0.0
+        self.yaw_rad_s = 0.0
+
+    def take(self, samples: Sequence[WheelSample], dt_s: float) -> None:
+        """Take a frame's samples; ``dt_s`` after the last frame."""
+        if not samples:
+            self.right_rad_s = self.left_rad_s = None
+            return
+        _, right, left = zip(*samples, strict=True)
+        count = len(right)
+        try:
+            right_rad_s, left_rad_s = sum(right) / count, sum(left) / count
+        except TypeError:  # a wheel gave no sample
+            self._take_some(right, left)
+            return
+        limit = self._limit_rad_s
+        if not (-limit <= right_rad_s <= limit and -limit <= left_rad_s <= limit):
+            self._take_some(right, left)
+            return
+        self.right_rad_s, self.left_rad_s = right_rad_s, left_rad_s
+        share = dt_s / (self._SMOOTH_S + dt_s)
+        self.yaw_rad_s += share * (self._per_base * (right_rad_s - left_rad_s) - self.yaw_rad_s)
+
+    def _take_some(self, right: Sequence[float | None], left: Sequence[float | None]) -> None:
+        self.right_rad_s, self.left_rad_s = self._mean(right), self._mean(left)
+
+    def _mean(self, rates: Sequence[float | None]) -> float | None:
+        limit = self._limit_rad_s
+        usable = [rate for rate in rates if rate is not None and -limit <= rate <= limit]
+        return sum(usable) / len(usable) if usable else None
+
+
+def as_standing(samples: Sequence[WheelSample]) -> list[WheelSample]:
+    """What the encoders would say of wheels that stand: for a robot that is held and whose encoders are in doubt."""
+    return [WheelSample(sample.t_s, 0.0, 0.0) for sample in samples]
+
+
+def largest_rate_rad_s(robot: RobotConfig) -> float:
+    """No wheel turns faster, rad/s: an encoder that says so is wrong. A count more per sample is no contradiction."""
+    return 3.0 * robot.max_wheel_rad_s
+
+
+_STILL_RAD_S = 0.02  # yaw rate of wheels that stand
+
+
+class ImuGate:
+    """Leaves out the inertial unit while its readings are impossible.
+
+    * An acceleration or an angular rate beyond what the robot can do.
+    * An angular rate that jumps away from what the wheels do. One that glides away from it, or has been elsewhere all
+      along, may be right, and the wheels' encoders wrong: that is for ``ccatp.safety.wheel_monitors`` to find.
+    * A reading that repeats itself exactly: a unit that has shown noise at rest never does. One without noise may.
+
+    After an impossible reading the unit stays out for the quarantine, because garbage is plausible now and then.
+
+    Args:
+        cfg: limits.
+
+    Attributes:
+        cause: why the unit is out, or empty.
+        value, limit: what of it passed which limit.
+        out_since_s: since when; infinite while it is believed.
+    """
+
+    def __init__(self, cfg: HealthConfig) -> None:
+        """Believed, until it says something impossible."""
+        self._rate, self._share = cfg.imu_rate_rad_s, cfg.imu_rate_share
+        self._largest, self._jump = cfg.imu_largest_rad_s, cfg.imu_jump_rad_s
+        self._acceleration, self._identical = cfg.imu_acceleration_m_s2, cfg.identical_samples
+        self._quarantine_s = cfg.imu_quarantine_s
+        self.reset()
+
+    def reset(self) -> None:
+        """The clock began anew."""
+        self._ax = self._wz = inf
+        self._same_ax = self._same_wz = self._different = 0
+        self._is_noisy = False
+        self._bad_s = -inf
+        self.cause, self.value, self.limit = "", 0.0, 0.0
+        self.out_since_s = inf
+
+    def admit(self, samples: Sequence[ImuSample], yaw_rad_s: float) -> Sequence[ImuSample]:
+        """The samples that can be believed.
+
+        Args:
+            samples: of a frame, oldest first.
+            yaw_rad_s: what the wheels say.
+        """
+        limit = self._rate + self._share * (yaw_rad_s if yaw_rad_s >= 0.0 else -yaw_rad_s)
+        is_good = True
+        for t_s, ax, wz in samples:
+            if ax == self._ax or wz == self._wz or not self._is_noisy:
+                self._compare(ax, wz, yaw_rad_s)
+            off, jump, largest = wz - yaw_rad_s, wz - self._wz, self._largest
+            self._same_ax = self._same_ax + 1 if ax == self._ax else 0
+            self._same_wz = self._same_wz + 1 if wz == self._wz else 0
+            self._ax, self._wz = ax, wz
+            if not -largest <= wz <= largest or (not -limit <= off <= limit and not -self._jump <= jump <= self._jump):
+                self._blame(t_s, "the gyroscope's rate is impossible", off, limit)
+            elif not -self._acceleration <= ax <= self._acceleration:
+                self._blame(t_s, "the acceleration is impossible", ax, self._acceleration)
+            elif self._is_repeating():
+                repeats = max(self._same_ax, self._same_wz) + 1
+                self._blame(t_s, "the inertial unit repeats itself", repeats, self._identical)
+            if -self._quarantine_s < t_s - self._bad_s < self._quarantine_s:
+                is_good = False
+            elif self.cause:
+                self.cause, self.out_since_s = "", inf
+        return samples if is_good else ()
+
+    def _compare(self, ax: float, wz: float, yaw_rad_s: float) -> None:
+        """Learn at rest whether the unit has noise."""
+        if -_STILL_RAD_S < yaw_rad_s < _STILL_RAD_S and ax != self._ax and wz != self._wz:
+            self._different += 1
+            self._is_noisy = self._is_noisy or self._different >= self._identical
+        else:
+            self._different = 0
+
+    def _is_repeating(self) -> bool:
+        # The first reading is not a repetition.
+        return self._is_noisy and max(self._same_ax, self._same_wz) >= self._identical - 1
+
+    def _blame(self, t_s: float, cause: str, value: float, limit: float) -> None:
+        self._bad_s = t_s
+        if not self.cause:
+            self.cause, self.value, self.limit, self.out_since_s = cause, float(value), float(limit), t_s

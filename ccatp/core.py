@@ -1,0 +1,317 @@
+"""Value types that every package shares: sensor samples, poses, fixes, verdicts; angle arithmetic."""
+
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+from math import atan2, cos, pi, sin, tau
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+Vector3 = tuple[float, float, float]
+
+
+class ImuSample(NamedTuple):
+    """One reading of the inertial unit: acceleration along robot x (gravity removed) and angular rate about robot z."""
+
+    t_s: float
+    ax_m_s2: float
+    wz_rad_s: float
+
+
+class WheelSample(NamedTuple):
+    """One reading of the wheel encoders. ``None`` marks a wheel that gave no sample."""
+
+    t_s: float
+    right_rad_s: float | None
+    left_rad_s: float | None
+
+
+class EdgeSample(NamedTuple):
+    """One reading of the edge sensors: 1 = panel under the sensor, 0 = none."""
+
+    t_s: float
+    front_left: int
+    front_right: int
+    rear_left: int
+    rear_right: int
+
+
+class GravitySample(NamedTuple):
+    """Unit direction of gravity in the robot frame."""
+
+    t_s: float
+    gx: float
+    gy: float
+    gz: float
+
+
+class PanelId(NamedTuple):
+    """Row and column of a panel, both counted from 1 as in the mirror's data file."""
+
+    row: int
+    col: int
+
+
+class PointId(NamedTuple):
+    """A measurement point: panel and number 1 to 9 (row by row from the panel's lower left, thesis fig. 2.2)."""
+
+    row: int
+    col: int
+    point: int
+
+    @property
+    def panel(self) -> PanelId:
+        """The panel on which the point lies."""
+        return PanelId(self.row, self.col)
+
+
+class PanelPose(msgspec.Struct, frozen=True):
+    """Pose in a panel frame, ``(x, y, theta)_p`` of the thesis."""
+
+    panel: PanelId
+    x_m: float
+    y_m: float
+    heading_rad: float
+
+
+class DeckPose(msgspec.Struct, frozen=True):
+    """Pose in the deck frame: (x, y) of the robot's origin and its heading.
+
+    ``heading_rad`` is measured in the local tangent plane from the tangent of the line y = const (towards +x).
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """A multilaterated position of the puck.
+
+    Attributes:
+        t_s: robot time to which the position belongs.
+        position_m: puck centre in the world frame, shape (3,).
+        covariance_m2: 3 x 3 covariance in the world frame, row-major, length 9.
+        dop: position dilution of precision, sqrt(trace((J^T J)^-1)), dimensionless.
+        channels: the laser channels that took part.
+        residual_rms_m: root mean square of the length residuals.
+    """
+
+    t_s: float
+    position_m: Vector3
+    covariance_m2: tuple[float, ...]
+    dop: float
+    channels: tuple[int, ...]
+    residual_rms_m: float
+
+
+class EventCode(IntEnum):
+    """Event codes of the thesis, table 3.2. Labels, not priorities."""
+
+    NORMAL = 0
+    NEAR_EDGE = 1
+    ABORTED = 2
+
+
+class Severity(IntEnum):
+    """How grave a finding is; of several the gravest counts."""
+
+    NONE = 0
+    INFORM = 1  # is told, and nothing else
+    SLOW = 2  # go on at reduced speed
+    PAUSE = 3  # hold the wheels, go on as soon as it is over
+    HOLD = 4  # hold the wheels, go on when it is over and a fix was had
+    RETURN = 5  # home, at reduced speed
+    FAULT = 6  # hold the wheels until an operator resumes
+
+
+class Corner(StrEnum):
+    """Edge sensors, in the order of the robot link."""
+
+    FRONT_LEFT = "front_left"
+    FRONT_RIGHT = "front_right"
+    REAR_LEFT = "rear_left"
+    REAR_RIGHT = "rear_right"
+
+
+class Verdict(msgspec.Struct, frozen=True):
+    """What the danger loop says about one sensor frame.
+
+    Attributes:
+        seq: the sensors frame judged.
+        t_s: its time.
+        code: event code.
+        cause: why, in one short phrase; empty when normal.
+        signal: the signal that gave cause (``"front_left"``, ``"estimate"``, ``"emergency:fire"``), or empty.
+        value: the signal's value in the unit of ``limit``.
+        limit: the limit it passed.
+        forward, reverse, turn: the motion permitted until the next verdict.
+        off: for each edge sensor whether it takes part in a declared edge.
+        severity: how grave what gave cause is. An edge has none: what to do about it is in its code and permits.
+        full_fans: the fans shall give all they can.
+        raised: how many emergencies have been raised so far, while one is latched; another number is another one.
+        is_shaking: an earthquake is latched, whatever else gave code and cause.
+    """
+
+    seq: int
+    t_s: float
+    code: EventCode
+    cause: str
+    signal: str
+    value: float
+    limit: float
+    forward: bool
+    reverse: bool
+    turn: bool
+    off: tuple[bool, bool, bool, bool] = (False, False, False, False)
+    severity: Severity = Severity.NONE
+    full_fans: bool = False
+    raised: int = 0
+    is_shaking: bool = False
+
+
+class Twist(msgspec.Struct, frozen=True):
+    """Velocity of the robot's origin: forward speed and angular rate about its z axis."""
+
+    v_m_s: float
+    omega_rad_s: float
+
+
+class Predicted(msgspec.Struct, frozen=True):
+    """Where the robot will be: a pose in a plane, (x_m, y_m, heading_rad), and the speeds there."""
+
+    pose: Vector3
+    v_m_s: float
+    omega_rad_s: float
+
+
+class StopKind(StrEnum):
+    """What a stop on the path is for."""
+
+    MEASURE = "measure"
+    CALIBRATE = "calibrate"
+    VIA = "via"
+    BASE = "base"
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """One stop of a path.
+
+    Attributes:
+        x_m, y_m: where the robot's origin shall stand, deck frame.
+        kind: what the stop is for.
+        point: the measurement point, where ``kind`` is ``MEASURE``.
+        reverse: the leg that ends here is driven backwards (the heading points away from the stop).
+        heading_rad: deck heading to turn to after arriving, where one is asked for (at base).
+    """
+
+    x_m: float
+    y_m: float
+    kind: StopKind
+    point: PointId | None = None
+    reverse: bool = False
+    heading_rad: float | None = None
+
+
+class EmergencyKind(StrEnum):
+    """Causes of an abort (interface control document 3)."""
+
+    EARTHQUAKE = "earthquake"
+    FIRE = "fire"
+    POWER = "power"
+    WEATHER = "weather"
+    OPERATOR = "operator"
+
+
+def wrap_pi(angle_rad: float) -> float:
+    """Wrap an angle to [-pi, pi).
+
+    Args:
+        angle_rad: any finite angle, rad.
+
+    Returns:
+        The same direction in [-pi, pi), rad.
+    """
+    return (angle_rad + pi) % tau - pi
+
+
+def difference(a_rad: float, b_rad: float) -> float:
+    """Shortest signed rotation that takes ``b_rad`` to ``a_rad``, in [-pi, pi), rad."""
+    return (a_rad - b_rad + pi) % tau - pi
+
+
+def bearing(dx_m: float, dy_m: float) -> float:
+    """Direction of the vector (dx, dy), rad from the x axis, counter-clockwise.
+
+    Thesis eq. 3.2 prints ``arctan(x, y)``; the angle from the x axis is ``atan2(y, x)``.
+    """
+    return atan2(dy_m, dx_m)
+
+
+def rotate(x_m: float, y_m: float, angle_rad: float) -> tuple[float, float]:
+    """Rotate the vector (x, y) counter-clockwise by ``angle_rad``."""
+    c, s = cos(angle_rad), sin(angle_rad)
+    return c * x_m - s * y_m, s * x_m + c * y_m
+
+
+def wheel_rates(twist: Twist, wheel_radius_m: float, wheel_base_m: float) -> tuple[float, float]:
+    """Inverse kinematics, eq. 3.3: wheel angular rates for a velocity of the robot's origin.
+
+    Args:
+        twist: forward speed (m/s) and angular rate (rad/s).
+        wheel_radius_m: r.
+        wheel_base_m: L, the distance between the wheels.
+
+    Returns:
+        (right, left) wheel rates, rad/s.
+    """
+    half = 0.5 * wheel_base_m * twist.omega_rad_s
+    return (twist.v_m_s + half) / wheel_radius_m, (twist.v_m_s - half) / wheel_radius_m
+
+
+def twist_of(right_rad_s: float, left_rad_s: float, wheel_radius_m: float, wheel_base_m: float) -> Twist:
+    """Forward kinematics, the inverse of eq. 3.3."""
+    return Twist(
+        0.5 * wheel_radius_m * (right_rad_s + left_rad_s), wheel_radius_m * (right_rad_s - left_rad_s) / wheel_base_m
+    )
+
+
+# By the signal; whatever is stale or missing has an age. A signal that stands for several quantities has none.
+_UNITS = {
+    "estimate": "s",
+    "sensors": "s",
+    "enc": "s",
+    "frames": "s",
+    "clock": "s",
+    "latency": "s",
+    "radio": "s",
+    "encoders": "m/s",
+    "imu_wz": "rad/s",
+    "position": "m",
+}
+
+
+def danger_text(cause: str, signal: str, value: float, limit: float) -> str:
+    """``estimate stale: 0.31 s (limit 0.15 s)``.
+
+    Args:
+        cause: why, in one short phrase.
+        signal: what gave cause; it is named where the cause does not.
+        value, limit: in the unit of the signal; a limit of 0 is none.
+    """
+    named = signal.replace("_", " ")
+    where = "" if not named or named in cause or signal.startswith("emergency") else f" ({named})"
+    if not limit:
+        return cause + where
+    is_age = cause.startswith("no ") or "stale" in cause
+    unit = "s" if is_age else _UNITS.get(signal, "")
+    told, bound = (f"{number:.4g} {unit}".rstrip() for number in (value, limit))
+    # Of what was never there the age is put at the limit.
+    return f"{cause}{where}: " + (f"limit {bound}" if told == bound else f"{told} (limit {bound})")

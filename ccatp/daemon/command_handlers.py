@@ -1,0 +1,213 @@
+"""Answers the operator channel: each command is answered after it took effect or was refused.
+
+Answers the observatory: at the unix socket, and over TCP for those who are listed.
+"""
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Protocol
+
+import msgspec
+import structlog
+import zmq.asyncio
+
+from ccatp.config.models import ObservatoryConfig
+from ccatp.daemon.mission_runner import Obeying
+from ccatp.links.auth import Client, ClientsFile, KeyPair, Role, read_clients, read_pair
+from ccatp.links.channels import (
+    BadRequest,
+    EmergencyDesk,
+    OperatorCommand,
+    answer_observatory,
+    format_error,
+    format_ok,
+    parse_operator,
+    parse_reply,
+)
+from ccatp.links.liveness import LineBudget
+from ccatp.links.rpc import CurveRouter, Router, ZapHandler
+from ccatp.links.topics import MissionStatus
+
+# A robot at 0.1 m/s is at rest within half a second; a command that took no effect by then has failed.
+EFFECT_TIMEOUT_S = 5.0
+CAUSE = "operator"
+
+
+class OperatorDesk:
+    """Hands the commands of an operator to the mission.
+
+    Args:
+        mission: obeys or refuses.
+        say: tells the log and the terminal (level, text).
+        status: where the mission stands.
+        settled: waits until the robot is held at rest.
+        on_change: called after a command changed the mission.
+    """
+
+    def __init__(
+        self,
+        mission: Obeying,
+        say: Callable[[str, str], None],
+        status: Callable[[], MissionStatus],
+        settled: Callable[[], Awaitable[None]],
+        on_change: Callable[[], None],
+    ) -> None:
+        """Nothing asked yet."""
+        self._mission, self._say, self._status = mission, say, status
+        self._settled, self._on_change = settled, on_change
+
+    async def handle(self, frame: bytes) -> bytes:
+        """The reply to one request."""
+        try:
+            command = parse_operator(frame).cmd
+        except BadRequest as error:
+            return format_error(str(error))
+        if command is OperatorCommand.STATUS:
+            return format_ok(status=msgspec.to_builtins(self._status()))
+        refusal = self._obey(command)
+        if refusal is not None:
+            return format_error(refusal)
+        self._say("info", f"operator: {command}")
+        self._on_change()
+        try:
+            if command in (OperatorCommand.PAUSE, OperatorCommand.STOP):
+                async with asyncio.timeout(EFFECT_TIMEOUT_S):
+                    await self._settled()
+        except TimeoutError:
+            return format_error(f"{command}: accepted, but the robot is not at rest after {EFFECT_TIMEOUT_S:.0f} s")
+        return format_ok(status=msgspec.to_builtins(self._status()))
+
+    def _obey(self, command: OperatorCommand) -> str | None:
+        if command is OperatorCommand.PAUSE:
+            return self._mission.pause(CAUSE)
+        if command is OperatorCommand.RESUME:
+            return self._mission.resume()
+        if command is OperatorCommand.ABORT:
+            return self._mission.abort(CAUSE)
+        return self._mission.stop()
+
+
+KEY_FILE, CLIENTS_FILE = "observatory.key_file", "observatory.clients_file"
+# Whoever reaches the unix socket has the daemon's own user: it might as well stop the daemon.
+LOCAL = Client("local", Role.CLEAR)
+# Somebody who asks over and over must not fill the log.
+LOGGED_LINES, LOGGED_PERIOD_S = 10, 60.0
+
+
+class Monitor(EmergencyDesk, Protocol):
+    """What is asked and told; ``ccatp.danger.DangerMonitor`` is one."""
+
+    @property
+    def at_base_or_held(self) -> bool:
+        """Whether the robot is at base or held, by a fresh estimate."""
+
+
+class ObservatoryDesk:
+    """Hands the requests of the observatory to the danger rules, and tells the log.
+
+    Args:
+        monitor: latches and clears.
+        age_s: age of the last frame, ``None`` before the first.
+        log: the process's logger.
+    """
+
+    def __init__(
+        self, monitor: Monitor, age_s: Callable[[], float | None], log: structlog.typing.FilteringBoundLogger
+    ) -> None:
+        """Nothing asked yet."""
+        self._monitor, self._age_s, self._log = monitor, age_s, log
+        self._accepted = LineBudget(LOGGED_LINES, LOGGED_PERIOD_S)
+        self._refused = LineBudget(LOGGED_LINES, LOGGED_PERIOD_S)
+
+    def answer(self, frame: bytes, client: Client = LOCAL) -> bytes:
+        """The reply to a request of a client."""
+        reply = answer_observatory(
+            frame,
+            self._monitor,
+            at_base_or_held=self._monitor.at_base_or_held,
+            age_s=self._age_s(),
+            may_clear=client.role is Role.CLEAR,
+        )
+        told = parse_reply(reply)
+        if not told["ok"]:
+            self.refuse(client.name, told["error"])
+        elif "id" in told:
+            left_out = self._accepted.take(time.monotonic())
+            if left_out is not None:
+                text = frame.decode("utf-8", "replace")
+                self._log.warning("observatory", client=client.name, request=text, code=told["code"], left_out=left_out)
+        return reply
+
+    def refuse(self, client: str, why: str) -> None:
+        """Note that somebody was refused."""
+        left_out = self._refused.take(time.monotonic())
+        if left_out is not None:
+            self._log.warning("observatory: refused", client=client, why=why, left_out=left_out)
+
+    def note(self, text: str, **fields: object) -> None:
+        """A line for the log."""
+        self._log.info(text, **fields)
+
+
+class Observatory:
+    """The observatory channel: a unix socket, and TCP where it is configured.
+
+    Args:
+        local_endpoint: the unix socket.
+        cfg: TCP endpoint and its keys.
+        desk: what answers.
+
+    Raises:
+        ConfigError: the keys or the list of clients cannot be used.
+    """
+
+    def __init__(self, local_endpoint: str, cfg: ObservatoryConfig, desk: ObservatoryDesk) -> None:
+        """Read the keys; nothing is bound yet."""
+        self._local_endpoint, self._cfg, self._desk = local_endpoint, cfg, desk
+        self._keys = check_observatory(cfg)
+        self._clients = ClientsFile(Path(cfg.clients_file), CLIENTS_FILE)
+
+    async def serve(self, context: zmq.asyncio.Context) -> None:
+        """Bind, and answer until cancelled; whatever fails ends all of it.
+
+        Raises:
+            RouterError: an endpoint cannot be bound.
+        """
+        async with AsyncExitStack() as stack:
+            local = await stack.enter_async_context(Router(self._local_endpoint, self._desk.answer, context))
+            work = [local.serve()]
+            if self._keys is not None:
+                zap = ZapHandler(context, lambda: self._clients.clients, self._on_locked_out)
+                remote = CurveRouter(self._cfg.endpoint, self._answer_remote, context, self._keys)
+                work.append((await stack.enter_async_context(zap)).serve())
+                work.append((await stack.enter_async_context(remote)).serve())
+                self._desk.note("observatory channel", endpoint=remote.bound, clients=len(self._clients.clients))
+            async with asyncio.TaskGroup() as tasks:
+                for coroutine in work:
+                    tasks.create_task(coroutine)
+
+    def _answer_remote(self, frame: bytes, user_id: str) -> bytes:
+        """Whoever is taken off the list loses their rights at once, connected or not."""
+        client = self._clients.clients.get(bytes.fromhex(user_id))
+        if client is None:
+            self._on_locked_out(f"key {user_id} is not on the list any more")
+            return format_error("this client is not on the list any more")
+        return self._desk.answer(frame, client)
+
+    def _on_locked_out(self, why: str) -> None:
+        self._desk.refuse("unknown", f"{why}; {self._clients.trouble}" if self._clients.trouble else why)
+
+
+def check_observatory(cfg: ObservatoryConfig) -> KeyPair | None:
+    """The server's keys, ``None`` where TCP is not configured.
+
+    Raises:
+        ConfigError: the keys or the list of clients cannot be used.
+    """
+    if not cfg.endpoint:
+        return None
+    read_clients(Path(cfg.clients_file), CLIENTS_FILE)
+    return read_pair(Path(cfg.key_file), KEY_FILE)

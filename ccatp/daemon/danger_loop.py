@@ -1,0 +1,409 @@
+"""The danger-loop process: judges every sensors frame, gives the robot its permit and main its verdict.
+
+What a danger loop has to judge by the configuration of its run: a survey, or a mission among beacons.
+
+The latch of emergencies in a file: a danger loop that is started anew knows what the last one was told.
+"""
+
+import asyncio
+import json
+import os
+import sys
+import time
+import uuid
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import structlog
+import zmq
+import zmq.asyncio
+
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.models import Config, LinkConfig, ObservatoryConfig
+from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
+from ccatp.daemon import realtime
+from ccatp.daemon import realtime as spinning
+from ccatp.daemon.command_handlers import Monitor, Observatory, ObservatoryDesk
+from ccatp.daemon.process import (
+    BeaconArgs,
+    ProcessArgs,
+    die_with_parent,
+    open_log,
+    parse_either,
+    report,
+    stop_on_signals,
+    unless_stopped,
+)
+from ccatp.daemon.robot_session import FrameLag, LastingLink
+from ccatp.daemon.subscribers import PERIOD_S, EstimateEar, Pulse
+from ccatp.danger import DangerMonitor
+from ccatp.errors import CcatpError
+from ccatp.links.beacon_messages import decode_beacon_frame
+from ccatp.links.bus import Publisher
+from ccatp.links.robot_codec import BadLine
+from ccatp.links.robot_messages import Hello, Sensors
+from ccatp.links.topics import DangerEvent, Estimate
+from ccatp.mirror.mirror import build_mirror
+from ccatp.safety.beacons import BeaconDanger
+from ccatp.safety.emergency_latch import AbortLatch, Emergency
+
+Judge = Callable[[Sensors, bytes, Estimate | None], Verdict]
+
+
+class Guard(Monitor, Protocol):
+    """The danger rules of a mission."""
+
+    latch: AbortLatch
+
+    @property
+    def counts(self) -> dict[str, object]:
+        """For the log, at the end."""
+
+    def reset(self) -> None:
+        """The robot has booted."""
+
+    def stale(self, seq: int, t_s: float) -> Verdict:
+        """The verdict when no frame came in time."""
+
+    def garbled(self, seq: int, t_s: float, at_s: float) -> Verdict | None:
+        """The verdict where a line of the robot was no frame, if that counts."""
+
+
+class DangerDuty(NamedTuple):
+    """What the process hosts.
+
+    Attributes:
+        monitor: the rules.
+        judge: the verdict on a frame, its line and main's newest estimate.
+        link: the robot link.
+        observatory: the channel of the observatory.
+        realtime_priority: of the process.
+        stale_after_s: no permit on frames that are older.
+    """
+
+    monitor: Guard
+    judge: Judge
+    link: LinkConfig
+    observatory: ObservatoryConfig
+    realtime_priority: int
+    stale_after_s: float
+
+
+def duty_of(cfg: Config | RadioConfig) -> DangerDuty:
+    """The rules that go with a configuration."""
+    if isinstance(cfg, RadioConfig):
+        return _among_beacons(cfg)
+    monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger, cfg.health)
+
+    def judge(sensors: Sensors, _raw: bytes, estimate: Estimate | None) -> Verdict:
+        return monitor.step(sensors, estimate)
+
+    return DangerDuty(monitor, judge, cfg.robot, cfg.observatory, cfg.run.realtime_priority, cfg.danger.stale_after_s)
+
+
+def _among_beacons(cfg: RadioConfig) -> DangerDuty:
+    monitor = BeaconDanger(cfg)
+
+    def judge(sensors: Sensors, raw: bytes, estimate: Estimate | None) -> Verdict:
+        try:
+            extras = decode_beacon_frame(raw)
+        except BadLine:
+            # Without its distances nobody knows what is ahead.
+            return monitor.stale(sensors.seq, sensors.t)
+        return monitor.step(sensors, extras, estimate)
+
+    return DangerDuty(
+        monitor, judge, cfg.robot, cfg.observatory, cfg.processes.realtime_priority, cfg.danger.stale_after_s
+    )
+
+
+FILE = "emergencies.json"
+# A latch of some hundred emergencies, and as many that were cleared.
+RESERVE_BYTES = 65536
+
+
+def active_ids(path: Path) -> list[str]:
+    """The ids of the emergencies that a file holds, as far as it can be read."""
+    try:
+        return [str(e["id"]) for e in json.loads(path.read_text(encoding="utf-8"))["active"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+
+
+class DurableLatch(AbortLatch):
+    """A latch that is on the disk before anybody is told that it is latched.
+
+    Args:
+        path: the file; one that is there is read.
+        log: told when the file cannot be read or written; the latch holds all the same.
+    """
+
+    def __init__(self, path: Path, log: structlog.typing.FilteringBoundLogger) -> None:
+        """Latched as the file says."""
+        super().__init__()
+        self._path, self._log = path, log
+        self._new = path.with_name(f"{path.name}.new")
+        with suppress(OSError):
+            self._reserve()
+        try:
+            kept = json.loads(path.read_text(encoding="utf-8"))
+            self._active = {e["id"]: Emergency(EmergencyKind(e["kind"]), e["id"], e["note"]) for e in kept["active"]}
+            self._cleared = dict.fromkeys(map(str, kept["cleared"]))
+            self.raised = int(kept.get("raised", len(self._active) + len(self._cleared)))
+        except FileNotFoundError:
+            return
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            # What it held is not known: the survey is aborted rather than driven on.
+            unknown = str(uuid.uuid4())
+            what = f"{path} cannot be read: taken for an emergency; 'ccatp clear {unknown}' ends it"
+            log.error(what, error=str(error))
+            super().raise_emergency(EmergencyKind.OPERATOR, unknown, f"{path.name} cannot be read")
+            self._save()
+        if self._active:
+            log.warning("emergencies of before", active=sorted(self._active))
+
+    def raise_emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
+        """As ``AbortLatch``, and on the disk."""
+        before = self.raised
+        refusal = super().raise_emergency(kind, emergency_id, note)
+        if self.raised != before:
+            self._save()
+        return refusal
+
+    def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
+        """As ``AbortLatch``, and on the disk."""
+        before = len(self._active)
+        refusal = super().clear(emergency_id, at_base_or_held)
+        if len(self._active) != before:
+            self._save()
+        return refusal
+
+    def _save(self) -> None:
+        active = [{"id": e.id, "kind": e.kind, "note": e.note} for e in self._active.values()]
+        text = json.dumps({"active": active, "cleared": list(self._cleared), "raised": self.raised})
+        with suppress(OSError):
+            self._reserve()
+        try:
+            with self._new.open("r+b") as file:
+                file.write(text.encode())
+                file.truncate()
+                file.flush()
+                os.fsync(file.fileno())
+            self._new.replace(self._path)
+            folder = os.open(self._path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+        except OSError as error:
+            self._log.error("emergencies cannot be kept: lost if this process dies", error=str(error))
+        with suppress(OSError):
+            self._reserve()
+
+    def _reserve(self) -> None:
+        """Room for the next state, taken while there is some: an emergency is kept though the disk is full."""
+        with self._new.open("ab") as file:
+            os.posix_fallocate(file.fileno(), 0, RESERVE_BYTES)
+
+
+WAIT_PERIOD_S = 0.02
+
+
+class DangerLoop:
+    """Wires the monitor to the robot link, the bus and the observatory channel.
+
+    A process that is started anew finds the latch as it was.
+
+    Args:
+        args: configuration and endpoints.
+        context: ZeroMQ context of the process.
+    """
+
+    def __init__(self, args: ProcessArgs | BeaconArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
+        """Build the pure part and bind the sockets."""
+        self._duty = duty = duty_of(args.config)
+        self._endpoints, self._context = args.endpoints, context
+        self.log = open_log(args.run_dir / "log.jsonl", "danger")
+        self.monitor = duty.monitor
+        self.monitor.latch = DurableLatch(args.run_dir / FILE, self.log)
+        self._publisher = Publisher(context, args.endpoints.of("danger"))
+        self._pulse = Pulse(self._publisher, "danger")
+        main, self._is_taking_over = args.endpoints.of("main"), args.is_taking_over
+        self._ear = EstimateEar(context, main, self._pulse.tell_if_due, is_taking_over=self._is_taking_over)
+        self._told = (EventCode.NORMAL, "", Severity.NONE)
+        self._seq = -1
+        self._bad_lines = 0
+        self._permit_seq = 0
+        self._t_s = 0.0
+        self._is_stale = False
+        self._lag = FrameLag(duty.link.slip_after_s)
+        self._hello: Hello | None = None
+        self.lasting = LastingLink(
+            duty.link,
+            role="monitor",
+            client="danger",
+            on_sensors=self.on_sensors,
+            on_lost=self._on_lost,
+            on_joined=self._on_joined,
+            on_bad_line=self._on_bad_line,
+        )
+        desk = ObservatoryDesk(self.monitor, lambda: self._pulse.frame_age_s if self._seq >= 0 else None, self.log)
+        self._observatory = Observatory(args.endpoints.of("emergency"), duty.observatory, desk)
+        self.lost = asyncio.Event()
+        self._is_lockstep = False
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Join the robot, then judge frames until ``stop`` is set or the link is lost."""
+        shadow = zmq.asyncio.Context.shadow(self._context)
+        async with asyncio.TaskGroup() as tasks:
+            work = self._observatory.serve(shadow), self._beat(), self._watch(), self.lasting.serve()
+            served = [tasks.create_task(one) for one in work]
+            try:
+                await self._wait_for_main(stop)
+                joins = self.lasting.join(is_patient=self._is_taking_over)
+                if await unless_stopped(stop, joins) and not self._is_lockstep:
+                    realtime.enter(self._duty.realtime_priority, self.log)
+                waits = [tasks.create_task(stop.wait()), tasks.create_task(self.lost.wait())]
+                await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+                for wait in waits:
+                    wait.cancel()
+            finally:
+                for task in served:
+                    task.cancel()
+                self.lasting.close()
+        self.log.info("stopped", **self.monitor.counts)
+
+    async def _wait_for_main(self, stop: asyncio.Event) -> None:
+        """Join the robot only when messages get through, both ways: the first ones must not be lost."""
+        is_heard = False
+        while not stop.is_set() and not (is_heard and self._publisher.has_subscriber("verdict")):
+            await asyncio.sleep(WAIT_PERIOD_S)
+            is_heard = is_heard or self._ear.is_main_there()
+
+    def _on_joined(self, hello: Hello) -> None:
+        """A session begins; its first frame comes next."""
+        before, self._hello, self._is_lockstep = self._hello, hello, hello.lockstep
+        if before is not None and before.boot != hello.boot:
+            self.monitor.reset()
+            self._ear.forget()
+            self._seq = -1
+        self._lag.forget()
+        self._pulse.phase, self._pulse.frame_s = "joined", time.monotonic()
+        self.log.info("joined", port=self._duty.link.port, lockstep=hello.lockstep, session=self.lasting.sessions)
+
+    def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
+        """Judge one frame. In lockstep with a certain estimate of main's, so that the run is repeatable."""
+        self._seq, self._t_s, self._pulse.frame_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
+        self._bad_lines = 0
+        estimate = self._ear.hear(sensors.seq, is_lockstep=self._is_lockstep)
+        try:
+            verdict = self._duty.judge(sensors, raw, estimate)
+        except Exception as error:
+            # Without a verdict the robot's permit runs out: it holds by itself.
+            self.log.exception("surprise in a frame", seq=self._seq)
+            print(f"ccatp danger: internal error: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+            self.lost.set()
+            return
+        if not self._is_lockstep and self._lag.served(sensors.t, time.monotonic()) > self._duty.stale_after_s:
+            verdict = self.monitor.stale(sensors.seq, sensors.t)  # it saw the past: no permit for the present
+        self._give(verdict, sensors.seq)
+
+    def _on_bad_line(self) -> None:
+        """A line was no frame. In lockstep each stands for a frame's time, so that the run is repeatable."""
+        self._bad_lines += 1
+        hello = self._hello
+        is_timed = hello is not None and hello.lockstep
+        at_s = self._t_s + self._bad_lines / hello.frame_hz if hello and is_timed else time.monotonic()
+        verdict = self.monitor.garbled(self._seq, self._t_s, at_s)
+        if verdict is not None:
+            self._give(verdict, self._seq)
+
+    def _give(self, verdict: Verdict, ack: int) -> None:
+        if ack >= 0:  # the robot first: what it may do does not wait for anyone to read why
+            self._permit_seq += 1
+            self.lasting.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
+        self._publisher.send("verdict", verdict)
+        if (verdict.code, verdict.cause, verdict.severity) != self._told:
+            self._announce(verdict)
+
+    def _announce(self, verdict: Verdict) -> None:
+        self._told = verdict.code, verdict.cause, verdict.severity
+        fields: dict[str, Any] = {
+            "code": int(verdict.code),
+            "cause": verdict.cause,
+            "signal": verdict.signal,
+            "value": verdict.value,
+            "limit": verdict.limit,
+            "severity": int(verdict.severity),
+        }
+        self._publisher.send("danger_event", DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, **fields))
+        self.log.info("verdict", seq=verdict.seq, t_s=verdict.t_s, **fields)
+
+    async def _beat(self) -> None:
+        """Be seen alive."""
+        while True:
+            self._pulse.tell()
+            await asyncio.sleep(PERIOD_S)
+
+    async def _watch(self) -> None:
+        """Where frames stop coming, withhold the permit aloud; make a connection anew that is open and silent."""
+        while True:
+            await asyncio.sleep(WAIT_PERIOD_S)
+            self._ear.tend()
+            age_s = self._pulse.frame_age_s
+            if self._pulse.phase != "joined" or self._is_lockstep or age_s is None:
+                continue
+            if age_s > self._duty.stale_after_s:
+                self._declare_stale(age_s)
+            if age_s > self._duty.link.silence_timeout_s:
+                self.lasting.give_up(f"no sensors frame for {age_s:.2f} s")
+
+    def _declare_stale(self, age_s: float) -> None:
+        if not self._is_stale:
+            self._is_stale = True
+            self.log.warning("sensors stale", age_s=age_s)
+        self._give(self.monitor.stale(self._seq, self._t_s), self._seq)
+
+    def _on_lost(self, reason: str) -> None:
+        self._pulse.phase = "rejoining"
+        self.log.warning("robot link lost", reason=reason)
+        self._give(self.monitor.stale(self._seq, self._t_s), -1)
+
+    def close(self) -> None:
+        """Close the sockets."""
+        self._ear.close()
+        self._publisher.close()
+
+
+async def run(args: ProcessArgs | BeaconArgs) -> int:
+    """The process, from its arguments to its exit status."""
+    stop = asyncio.Event()
+    stop_on_signals(stop)
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    loop: DangerLoop | None = None
+    status = 0
+    try:
+        loop = DangerLoop(args, context)
+        await loop.run(stop)
+    except* CcatpError as group:
+        status = report("danger", group)
+    finally:
+        if loop is not None:
+            loop.close()
+        context.destroy(linger=0)
+    return status or (0 if stop.is_set() else 4)
+
+
+def main() -> int:
+    """Entry of ``python -m ccatp.daemon.danger_loop``."""
+    die_with_parent()
+    args = parse_either()
+    if not args.is_realtime:
+        spinning.leave_a_core(os.getppid())
+    return spinning.run(run(args.one), is_spinning=not args.is_realtime)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,319 @@
+"""The dashboard's process: of a run, at the socket that it inherits, or alone, attached to a running daemon.
+
+Where the dashboard listens: bound by the supervisor, so that one that is started anew is found there again.
+
+A dashboard beside a daemon that runs already: ``ccatp dashboard``.
+"""
+
+import asyncio
+import errno
+import logging
+import os
+import socket
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import structlog
+import zmq
+
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.load import is_radio_file, load_config, load_radio_config
+from ccatp.config.models import Config, DashboardConfig
+from ccatp.daemon import realtime as spinning
+from ccatp.daemon.command_handlers import LOGGED_LINES, LOGGED_PERIOD_S
+from ccatp.daemon.process import RUN_DIR_FILE, Endpoints, die_with_parent, open_log, parse_either, stop_on_signals
+from ccatp.daemon.subscribers import Pulse
+from ccatp.errors import ConfigError, UnreachableError
+from ccatp.links.bus import Publisher
+from ccatp.links.liveness import LineBudget
+from ccatp.links.runtime_dir import runtime_dir_path
+from ccatp.mirror.mirror import build_mirror
+from ccatp.records.recorder import read_metadata
+from ccatp.records.store import read_survey
+from ccatp.records.store_rows import StoreError
+from ccatp.report.dashboard.access import read_token
+from ccatp.report.dashboard.app import CommandDesk, build_app
+from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground
+from ccatp.report.dashboard.hub import BEACONS, SURVEY, Feed, Hub, Wants
+from ccatp.report.dashboard.server import serve
+from ccatp.report.dashboard.survey_view import SurveyView
+from ccatp.report.dashboard.survey_view import ground as survey_ground
+from ccatp.report.dashboard.view import View
+
+Logger = structlog.typing.FilteringBoundLogger
+PULSE_PERIOD_S = 0.5
+
+
+class Shown(NamedTuple):
+    """What a page shows of one kind of mission: its view, its ground, and the topics that make them."""
+
+    view: View
+    ground: dict[str, Any]
+    wants: Wants
+
+
+class Dashboard:
+    """The parts of a dashboard, put together.
+
+    Args:
+        cfg: the run's configuration; ``dashboard`` holds the limits.
+        run_dir: what was measured before is read from there.
+        endpoints: where the run's processes are.
+        is_sim: robot and laser system are stand-ins.
+        log: of the process.
+
+    Raises:
+        ConfigError: the token cannot be read.
+    """
+
+    def __init__(
+        self, cfg: Config | RadioConfig, run_dir: Path, endpoints: Endpoints, *, is_sim: bool, log: Logger
+    ) -> None:
+        """Subscribe."""
+        self._cfg, self._log, self._endpoints = cfg, log, endpoints
+        token = read_token(cfg.dashboard)
+        view, ground, wants = _shown(cfg, run_dir, is_sim=is_sim, needs_token=token is not None)
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._feed = Feed(self._context, endpoints.of, view, is_sim=is_sim, wants=wants)
+        self._hub = Hub(self._feed, view, cfg.dashboard.rate_hz)
+        self._app = build_app(
+            self._hub,
+            CommandDesk(self._context, endpoints.of("control"), cfg.dashboard.command_timeout_s),
+            ground,
+            host_names=cfg.dashboard.host_names,
+            token=token,
+            note=_sparing(log),
+        )
+
+    async def run(self, listener: socket.socket, stop: asyncio.Event, *, has_pulse: bool) -> None:
+        """Serve until ``stop`` is set.
+
+        Args:
+            listener: a listening socket.
+            stop: the end.
+            has_pulse: tell the supervisor that we are there.
+        """
+        told = asyncio.Event()
+
+        async def tell() -> None:
+            await self._hub.run(stop)
+            told.set()  # the pages know that this is the end
+
+        async with asyncio.TaskGroup() as tasks:
+            pulse = tasks.create_task(self._beat()) if has_pulse else None
+            tasks.create_task(tell())
+            await serve(self._app, listener, self._cfg.dashboard, told)
+            if pulse is not None:
+                pulse.cancel()
+
+    async def _beat(self) -> None:
+        publisher = Publisher(self._context, self._endpoints.of("dashboard"))
+        pulse = Pulse(publisher, "dashboard")
+        pulse.phase = "ready"
+        try:
+            while True:
+                pulse.tell()
+                await asyncio.sleep(PULSE_PERIOD_S)
+        finally:
+            publisher.close()
+
+    def close(self) -> None:
+        """Close the sockets."""
+        self._feed.close()
+        self._context.destroy(linger=0)
+
+
+async def run_dashboard(
+    cfg: Config | RadioConfig, run_dir: Path, endpoints: Endpoints, listener: socket.socket, *, is_sim: bool,
+    log: Logger, has_pulse: bool,
+) -> None:  # fmt: skip
+    """A dashboard from its beginning to SIGTERM or SIGINT; arguments as of ``Dashboard`` and its ``run``."""
+    stop = asyncio.Event()
+    stop_on_signals(stop)
+    _log_warnings(log)
+    dashboard = Dashboard(cfg, run_dir, endpoints, is_sim=is_sim, log=log)
+    try:
+        await dashboard.run(listener, stop, has_pulse=has_pulse)
+    finally:
+        dashboard.close()
+
+
+def _shown(cfg: Config | RadioConfig, run_dir: Path, *, is_sim: bool, needs_token: bool) -> Shown:
+    """THE table of missions for the page."""
+    if isinstance(cfg, RadioConfig):
+        ground = beacon_ground(cfg, is_sim=is_sim, needs_token=needs_token)
+        return Shown(BeaconView(cfg, is_sim=is_sim), ground, BEACONS)
+    mirror = build_mirror(cfg.mirror)
+    view = SurveyView(mirror, cfg, is_sim=is_sim)
+    _remember(view, run_dir, mirror.name)
+    return Shown(view, survey_ground(mirror, cfg, is_sim=is_sim, needs_token=needs_token), SURVEY)
+
+
+def _remember(view: SurveyView, run_dir: Path, mirror: str) -> None:
+    """What stands in the mission's database is on the page, whoever measured it; without one there is nothing yet."""
+    try:
+        survey = read_survey(run_dir / "mission.sqlite", mirror)
+    except StoreError:
+        return
+    measured = [(stored.point, stored.fix.t_s, stored.fix.position_m) for stored in survey.fixes]
+    view.begin_with(measured, [stored.point for stored in survey.points if stored.status == "skipped"])
+
+
+def _sparing(log: Logger) -> Callable[[str, dict[str, object]], None]:
+    """Lines for the log, at most so many in a minute: whoever reaches the port can cause them."""
+    budget = LineBudget(LOGGED_LINES, LOGGED_PERIOD_S)
+
+    def note(text: str, fields: dict[str, object]) -> None:
+        left_out = budget.take(asyncio.get_running_loop().time())
+        if left_out is not None:
+            log.info(text, **fields, left_out=left_out)
+
+    return note
+
+
+class _Handler(logging.Handler):
+    """Warnings of the HTTP server go where ours go."""
+
+    def __init__(self, log: Logger) -> None:
+        super().__init__(logging.WARNING)
+        self._log, self._budget = log, LineBudget(LOGGED_LINES, LOGGED_PERIOD_S)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        left_out = self._budget.take(record.created)
+        if left_out is not None:
+            self._log.log(record.levelno, record.getMessage().strip(), exc_info=record.exc_info, left_out=left_out)
+
+
+def _log_warnings(log: Logger) -> None:
+    for name in ("uvicorn.error", "asyncio"):
+        logger = logging.getLogger(name)
+        logger.handlers, logger.propagate = [_Handler(log)], False
+        logger.setLevel(logging.WARNING)
+
+
+def main() -> int:
+    """Entry of ``python -m ccatp.daemon.dashboard``."""
+    die_with_parent()
+    args = parse_either().one
+    if not args.is_realtime:
+        spinning.leave_a_core(os.getppid())
+    log = open_log(args.run_dir / "log.jsonl", "dashboard")
+    listener = socket.socket(fileno=args.listen_fd)
+    asyncio.run(
+        run_dashboard(args.config, args.run_dir, args.endpoints, listener, is_sim=args.is_sim, log=log, has_pulse=True)
+    )
+    return 0
+
+
+BACKLOG = 64
+
+
+class PageSocket(NamedTuple):
+    """What came of the wish to listen.
+
+    Attributes:
+        socket: it listens; ``None`` where there is no dashboard.
+        config: with the port that it has.
+        level, text: what the operator is told; empty when there is nothing to tell.
+    """
+
+    socket: socket.socket | None
+    config: DashboardConfig
+    level: str
+    text: str
+
+
+def open_page_socket(cfg: DashboardConfig) -> PageSocket:
+    """Listen at the configured address, or at another port when that one is in use; a survey goes on without a page.
+
+    Args:
+        cfg: address, and whether a page is wanted at all.
+    """
+    if not cfg.enabled:
+        return PageSocket(None, cfg, "info", "")
+    try:
+        listener = _listen(cfg.host, cfg.port)
+    except OSError as error:
+        if error.errno != errno.EADDRINUSE:
+            return PageSocket(None, cfg, "warning", _without(cfg, error))
+    else:
+        return _told(listener, cfg, "info", "dashboard: ")
+    try:
+        listener = _listen(cfg.host, 0)
+    except OSError as error:
+        return PageSocket(None, cfg, "warning", _without(cfg, error))
+    return _told(listener, cfg, "warning", f"dashboard: port {cfg.port} is in use, so it is at ")
+
+
+def page_url(host: str, port: int) -> str:
+    """The page's address."""
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    return socket.create_server((host, port), family=family, backlog=BACKLOG)
+
+
+def _told(listener: socket.socket, cfg: DashboardConfig, level: str, before: str) -> PageSocket:
+    port = listener.getsockname()[1]
+    return PageSocket(listener, cfg.model_copy(update={"port": port}), level, before + page_url(cfg.host, port))
+
+
+def _without(cfg: DashboardConfig, error: OSError) -> str:
+    why = str(error.strerror).partition(" (while")[0]  # Python appends the address once more
+    return f"no dashboard: cannot listen on {cfg.host}:{cfg.port}: {why}; choose another dashboard.host"
+
+
+ROOT = "dashboard."
+
+
+def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callable[[str], None]) -> int:
+    """Serve until SIGINT or SIGTERM.
+
+    Args:
+        runtime_dir: of the daemon, if not the usual one.
+        settings: keys of ``dashboard`` that are not those of the run.
+        say: tells where the page is.
+
+    Raises:
+        UnreachableError: no daemon runs there.
+        ConfigError: a setting that is none of the page's, a token that cannot be read, or no address to listen on.
+    """
+    for key in settings:
+        if not key.startswith(ROOT):
+            raise ConfigError(f"--set: {key} is no key of the page; the daemon runs with what it has, see {ROOT}*")
+    folder = runtime_dir_path(str(runtime_dir or ""), os.environ)
+    run_dir = _run_dir_of(folder)
+    path, wanted = run_dir / "config.toml", {**settings, f"{ROOT}enabled": True}
+    cfg = load_radio_config(path, wanted) if is_radio_file(path) else load_config(path, wanted)
+    page = open_page_socket(cfg.dashboard)
+    if page.socket is None:
+        raise ConfigError(page.text)
+    is_sim = read_metadata(run_dir / "telemetry.mcap").get("simulation") == "true"
+    log = open_log(run_dir / "log.jsonl", "dashboard")
+    with page.socket:
+        say(page.text)
+        asyncio.run(
+            run_dashboard(cfg, run_dir, Endpoints(folder), page.socket, is_sim=is_sim, log=log, has_pulse=False)
+        )
+    return 0
+
+
+def _run_dir_of(runtime_dir: Path) -> Path:
+    """Where the daemon of a runtime directory writes."""
+    try:
+        run_dir = Path((runtime_dir / RUN_DIR_FILE).read_text(encoding="utf-8").strip())
+    except OSError:
+        run_dir = None
+    if run_dir is None or not (runtime_dir / "control").exists():
+        raise UnreachableError(
+            f"no daemon in {runtime_dir}; start one with ccatp run, or name its folder with --runtime-dir"
+        )
+    return run_dir
+
+
+if __name__ == "__main__":
+    sys.exit(main())

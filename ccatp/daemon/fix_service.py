@@ -1,0 +1,228 @@
+"""One measurement at a time: laser system, localizer, store, mission."""
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any
+
+from ccatp.config.models import MissionConfig
+from ccatp.core import DeckPose, Fix, PointId, Vector3
+from ccatp.daemon.telemetry import SurveyTeller
+from ccatp.estimation.fixes import FixRefused
+from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
+from ccatp.localizer import Localizer
+from ccatp.records.store import MissionStore
+from ccatp.records.store_rows import AlreadyMeasuredError, StoreError
+from ccatp.survey.fix_gate import Scrutiny
+from ccatp.survey.mission import Mission
+from ccatp.survey.state import Approaches
+
+# A commit takes milliseconds, on a busy disk a second. One that takes longer is told, and much longer holds the robot.
+SLOW_DISK_S = 2.0
+STALLED_DISK_S = 30.0
+# A fix that is doubted is measured again this often; who is doubted then is not believed.
+REPEATS = 2
+
+
+class FrameRefused(EtalonError):
+    """The laser system measures in another frame or unit than ours: it is of no use for this mission."""
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One measurement wanted: of a point, or (``None``) to find the robot again; ``number`` is the mission's."""
+
+    number: int
+    t_s: float
+    point: PointId | None
+    expected_m: Vector3
+    estimate: DeckPose
+
+
+class MeasuringDesk:
+    """Takes the measurements that the mission orders.
+
+    Args:
+        cfg: how near the robot has to come, and how often it may try.
+        client: the laser system's client.
+        scrutiny: looks at a fix before the localizer gets it.
+        localizer: takes the fix.
+        mission: is told the result.
+        store: keeps it; a point counts only when it is committed.
+        teller: tells the others.
+        on_over: called after each measurement, good or bad.
+        between_s: how long to wait for new lengths before measuring again at the same place.
+    """
+
+    def __init__(
+        self,
+        cfg: MissionConfig,
+        client: EtalonClient,
+        scrutiny: Scrutiny,
+        localizer: Localizer,
+        mission: Mission,
+        store: MissionStore,
+        teller: SurveyTeller,
+        on_over: Callable[[], None],
+        between_s: Callable[[], float],
+    ) -> None:
+        """Nothing is wanted yet."""
+        self._tolerance_m = cfg.arrival_tolerance_m
+        self._approaches = Approaches(cfg.correction_tolerance_m, cfg.max_approaches)
+        self._client, self._localizer, self._mission = client, localizer, mission
+        self._store, self._teller, self._on_over, self._between_s = store, teller, on_over, between_s
+        self._scrutiny = scrutiny
+        self._timeout_s = cfg.measure_timeout_s
+        self._wanted: Request | None = None
+        self._wakes = asyncio.Event()
+        self.is_busy = False
+        self.arrival_error_m = 0.0  # distance of the last fix from its point
+
+    def begin(self, request: Request) -> None:
+        """Take a measurement; ``is_busy`` until it is over. One that is under way is finished first, for nothing."""
+        self.is_busy = True
+        self._wanted = request
+        self._wakes.set()
+
+    async def run(self) -> None:
+        """Serve requests for ever."""
+        while True:
+            await self._wakes.wait()
+            self._wakes.clear()
+            request, self._wanted = self._wanted, None
+            if request is not None:
+                await self._serve(request)
+            if self._wanted is None:
+                self.is_busy = False
+                self._on_over()
+
+    def _is_wanted(self, request: Request) -> bool:
+        """A pause or an edge in between means that the robot may have moved: the lengths are worth nothing then."""
+        return self._mission.is_awaiting_fix and self._mission.request == request.number
+
+    async def _serve(self, request: Request) -> None:
+        """Measure, again where the fix is doubted, all within the time that a point may take."""
+        self._scrutiny.begin()
+        try:
+            async with asyncio.timeout(self._timeout_s):
+                fix, doubt = await self._measure(request)
+                for _ in range(REPEATS):
+                    if doubt and self._is_wanted(request):
+                        await asyncio.sleep(self._between_s())
+                        fix, doubt = await self._measure(request)
+        except (EtalonError, TimeoutError) as error:
+            await self._fail(request, str(error) or f"no fix within {self._timeout_s:g} s", error)
+            return
+        if not self._is_wanted(request):
+            self._teller.say("info", f"measurement of {_name(request.point)} discarded: the robot was interrupted")
+        elif doubt:
+            await self._fail(request, doubt, None)
+        else:
+            await self._keep(request, fix)
+
+    async def _measure(self, request: Request) -> tuple[Fix, str]:
+        """One fix, handed to the localizer if it is still wanted, and why it is doubted."""
+        fix = await self._client.measure(request.t_s, request.expected_m)
+        return fix, self._try(request, fix) if self._is_wanted(request) else ""
+
+    def _try(self, request: Request, fix: Fix) -> str:
+        """Hand a fix to the localizer, unless it is doubted; why it is, or empty."""
+        localizer = self._localizer
+        finding = self._scrutiny.review(
+            fix, request.expected_m, request.estimate, localizer.pose_covariance, is_lost=self._mission.is_lost
+        )
+        doubt, jump_m = finding.doubt or finding.refusal, 0.0
+        is_set_aside = bool(doubt)
+        if not is_set_aside:
+            try:
+                jump_m = localizer.fuse_fix(fix)
+            except FixRefused as refusal:
+                doubt = str(refusal)
+        self._teller.fix(request.point, fix, jump_m, is_fused=not doubt, is_set_aside=is_set_aside)
+        if finding.refusal:
+            raise FrameRefused(finding.refusal)
+        if doubt:
+            self._teller.say("info", f"the fix at {_name(request.point)} is doubted: {doubt}")
+            return doubt
+        for notice in localizer.notices:
+            self._teller.say("warning", notice)
+        localizer.notices.clear()
+        if jump_m > self._tolerance_m:
+            self._teller.say(
+                "warning", f"the fix at {_name(request.point)} moved the estimate by {1e3 * jump_m:.1f} mm"
+            )
+        return ""
+
+    async def _fail(self, request: Request, why: str, error: Exception | None) -> None:
+        if isinstance(error, BadSolution):
+            refusal = self._scrutiny.refusal_of(error.lengths_m, request.expected_m)
+            error = FrameRefused(refusal) if refusal else error
+        if isinstance(error, FrameRefused):
+            self._teller.say("error", str(error))
+            if self._is_wanted(request):
+                self._mission.fault(str(error))
+            return
+        self._teller.say("warning", f"measurement of {_name(request.point)} failed: {why}")
+        if self._is_wanted(request):
+            await self._skip(request, why)
+
+    async def _skip(self, request: Request, cause: str) -> None:
+        if request.point is not None:
+            try:
+                await self._stored(self._store.record_skipped(request.point, request.t_s), request.point)
+            except StoreError as error:
+                self._mission.fault(f"that {_name(request.point)} is skipped cannot be stored: {error}")
+                return
+        self._mission.not_fixed(request.point, cause)
+
+    async def _keep(self, request: Request, fix: Fix) -> None:
+        """The localizer has taken the fix: store it where the robot is near enough to the point."""
+        if request.point is not None:
+            self.arrival_error_m = self._mission.survey.distance_m(self._localizer.pose)
+            if self._is_too_far(request.point):
+                self._mission.again()
+                return
+            try:
+                await self._stored(self._store.record_fix(request.point, fix, request.estimate), request.point)
+            except AlreadyMeasuredError as error:
+                self._teller.say("warning", str(error))  # nothing is lost, and nobody has to be waited for
+            except StoreError as error:
+                self._mission.fault(f"the fix of {_name(request.point)} cannot be stored: {error}")
+                return
+        self._mission.fixed(request.point)
+
+    async def _stored(self, commit: "Future[Any]", point: PointId) -> None:
+        """Wait for a commit. On a disk that stalls the robot stands here, and after a while is held for an operator.
+
+        Raises:
+            StoreError: it will not be committed.
+        """
+        waiting = asyncio.wrap_future(commit)
+        try:
+            await asyncio.wait([waiting], timeout=SLOW_DISK_S)
+            if not waiting.done():
+                self._teller.say("warning", f"the disk is slow: {_name(point)} waits for its commit")
+                await asyncio.wait([waiting], timeout=STALLED_DISK_S - SLOW_DISK_S)
+            if not waiting.done():
+                self._mission.fault(f"the disk stalls: {_name(point)} is not stored after {STALLED_DISK_S:g} s")
+                self._on_over()
+            await waiting
+        finally:
+            waiting.cancel()
+
+    def _is_too_far(self, point: PointId) -> bool:
+        """Whether the point has to be approached again: what was measured there is not its alignment."""
+        is_too_far = self._approaches.is_too_far(point, self.arrival_error_m, self._localizer.position_sigma_m)
+        what = f"{1e3 * self.arrival_error_m:.2f} mm from {_name(point)}"
+        if is_too_far:
+            self._teller.say("info", f"{what}: approaching it again")
+        elif self.arrival_error_m > self._tolerance_m:
+            self._teller.say(
+                "warning", f"{what} after {self._approaches.count} approaches: measured there all the same"
+            )
+        return is_too_far
+
+
+def _name(point: PointId | None) -> str:
+    return "the robot's place" if point is None else f"point {point.row}-{point.col}-{point.point}"

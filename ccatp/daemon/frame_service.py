@@ -1,0 +1,254 @@
+"""One sensors frame after the other, in the order that lockstep needs: listen, hear, decide, drive.
+
+Tells when the last gate denies a drive, and why: at most one line per reason and second.
+
+The fans that press the robot on: sent once a session, and again when they shall give all they can.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable
+from math import inf
+
+from ccatp.config.models import LinkConfig
+from ccatp.control.gate import Denial, DriveGate, FanGate
+from ccatp.core import Verdict
+from ccatp.daemon.mission_runner import STILL, Drive, FrameClock, Served, Work
+from ccatp.daemon.robot_session import FrameLag, Seat
+from ccatp.daemon.subscribers import Pulse, VerdictEar
+from ccatp.daemon.telemetry import Teller
+from ccatp.errors import CcatpError, ExitStatus
+from ccatp.links.robot_messages import Sensors
+from ccatp.survey.mission import Mission
+
+# Of a robot that moved nobody knows where it is when the samples of more frames than this are missing.
+UNSEEN_S = 0.1
+# The frames that come while a way is planned for a robot that stands are late for a reason, and served within this.
+CATCH_UP_S = 0.5
+
+
+class Surprise(CcatpError):
+    """An error that nobody foresaw; the log has it all. The process is started anew."""
+
+    exit_status = ExitStatus.HELD
+
+
+class FrameService:
+    """Serves the frames of the robot with the decisions of a mission.
+
+    Args:
+        cfg: the robot link.
+        work: the mission.
+        seat: where drives go out.
+        clock: of the frames.
+        ear: hears the danger loop.
+        pulse: shows that frames are served.
+        on_surprise: told of an error that ends the process.
+
+    Attributes:
+        lag: how late frames are served.
+        over: set when the mission is over, and no frame is served any more.
+    """
+
+    def __init__(
+        self,
+        cfg: LinkConfig,
+        work: Work,
+        seat: Seat,
+        clock: FrameClock,
+        ear: VerdictEar,
+        pulse: Pulse,
+        *,
+        on_surprise: Callable[[Exception], None],
+    ) -> None:
+        """No frame yet."""
+        self._cfg, self._work, self._seat, self._clock, self._ear, self._pulse = cfg, work, seat, clock, ear, pulse
+        self._teller, self._on_surprise = work.teller, on_surprise
+        self.lag = FrameLag(cfg.slip_after_s)
+        self.over = asyncio.Event()
+        self._catches_up_until_s = -inf
+        self._was_quiet = False
+        self._unanswered: int | None = None
+
+    def begin_session(self) -> None:
+        """A session begins; its first frame comes next."""
+        self.lag.forget()
+        self._pulse.phase, self._pulse.frame_s = "joined", time.monotonic()
+
+    def lose(self) -> None:
+        """The session is gone; held by the robot itself."""
+        # What it did since the last frame shows in the next one, if that comes soon.
+        self._was_quiet = self._work.is_quiet
+        self._pulse.phase, self._unanswered = "rejoining", None
+
+    def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
+        """Serve one sensors frame. A surprise ends the process, held, and not just the connection."""
+        if self.over.is_set():
+            return
+        try:
+            self._serve(sensors, raw)
+        except Exception as error:
+            self._teller.log.exception("surprise in a frame", seq=self._clock.seq)
+            self._teller.say("error", f"internal error, wheels held: {type(error).__name__}: {error}; see log.jsonl")
+            self._on_surprise(Surprise(f"internal error: {type(error).__name__}: {error}"))
+
+    def _serve(self, sensors: Sensors, raw: bytes) -> None:
+        start = time.perf_counter()
+        seat, work = self._seat, self._work
+        steady_s, dt_s = self._clock.look(sensors.seq, sensors.t, seat.frame_period_s)
+        frame = Served(sensors, raw, steady_s, dt_s, seat.is_new_session)
+        is_unjudged = seat.is_unjudged
+        if frame.is_first:
+            self._greet(dt_s)
+        self._clock.serve(sensors.seq, steady_s)
+        self._pulse.frame_s = time.monotonic()
+        work.listen(frame)
+        if dt_s <= 0.0:  # counted by the localizer; a controller cannot go back in time
+            self._teller.stale_frame(sensors.seq, raw)
+            self._answer(sensors.seq, STILL)
+            return
+        waiting = time.perf_counter()
+        verdict = None if is_unjudged else self._hear(sensors.seq)
+        heard = time.perf_counter()
+        drive = self._decide(frame, verdict)
+        self._answer(sensors.seq, drive)
+        work.tell(frame)
+        self._teller.tick(1e6 * (time.perf_counter() - heard + waiting - start))
+
+    def _hear(self, seq: int) -> Verdict | None:
+        return self._ear.hear(seq, self._seat.frame_period_s, is_lockstep=self._seat.is_lockstep)
+
+    def _greet(self, dt_s: float) -> None:
+        """Before the first drive and not on joining, so that in lockstep the robot is told in a certain frame."""
+        self._seat.is_new_session = False
+        self._work.greet()
+        if self._clock.has_begun and dt_s > UNSEEN_S and not self._was_quiet:
+            self._teller.say("warning", f"the robot moved and was out of sight for {dt_s:.2f} s: it is found again")
+            self._work.lose_sight()
+
+    def _decide(self, frame: Served, verdict: Verdict | None) -> Drive:
+        """The drive that answers a frame. One that is too late moves nothing."""
+        work, limit_s, begun_s = self._work, self._cfg.lag_limit_s, time.monotonic()
+        lag_s = 0.0 if self._seat.is_lockstep else self.lag.served(frame.sensors.t, begun_s)
+        if lag_s > limit_s:
+            if begun_s < self._catches_up_until_s:
+                return work.stand(frame)
+            verdict = None
+            # Paused until frames are prompt again.
+            if work.interrupt(f"a frame was served {1e3 * lag_s:.0f} ms late"):
+                self._teller.log.warning("late frame", seq=self._clock.seq, lag_s=lag_s, limit_s=limit_s)
+        drive = work.decide(frame, verdict, lag_s)
+        now_s = time.monotonic()
+        is_slow, is_still = now_s - begun_s > self._seat.frame_period_s, drive == STILL
+        # A hold for what planning cost would have to be planned away again, and so on for ever on a slow machine.
+        self._catches_up_until_s = now_s + CATCH_UP_S if is_slow and is_still else -inf
+        return drive
+
+    # -- answers --------------------------------------------------------------------------------------------------
+
+    def _may_answer(self) -> bool:
+        """In lockstep simulated time stands still while a peer is waited for, and all but still in a pause."""
+        if not self._seat.is_lockstep:
+            return True
+        return not self._work.is_busy and not (self._work.is_paused and self._work.is_quiet)
+
+    def _answer(self, seq: int, drive: Drive) -> None:
+        if self._may_answer():
+            self._seat.drive(seq, *drive)
+        else:
+            self._unanswered = seq
+
+    def answer_held(self) -> None:
+        """Answer the frame that waits, if nothing stands against it any more."""
+        if self._may_answer():
+            self.release()
+
+    def release(self) -> None:
+        """Answer the frame that waits, standing."""
+        seq, self._unanswered = self._unanswered, None
+        if seq is not None:
+            self._seat.drive(seq, *STILL)
+
+
+REPEAT_S = 1.0
+
+Say = Callable[[str, str], None]
+
+
+class GateWatch:
+    """Looks at the gate after each frame.
+
+    Args:
+        gate: main's gate.
+        say: takes a level and a line, for the log and the bus.
+    """
+
+    def __init__(self, gate: DriveGate, say: Say) -> None:
+        """Nothing denied yet."""
+        self._gate, self._say = gate, say
+        self._said_s: dict[Denial, float] = {}
+
+    def look(self, t_s: float) -> None:
+        """Tell of a drive denied in the frame of robot time ``t_s``."""
+        denial = self._gate.denial
+        if denial is None:
+            return
+        said_s = self._said_s.get(denial)
+        # A clock that went back must not silence it.
+        if said_s is not None and 0.0 <= t_s - said_s < REPEAT_S:
+            return
+        self._said_s[denial] = t_s
+        self._say("warning", f"drive denied: {denial} ({self._gate.denied[denial]} so far)")
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How often each reason stood in the way, those that never did left out."""
+        return {denial.name.lower(): count for denial, count in self._gate.denied.items() if count}
+
+
+FULL_FANS = (1.0, 1.0)
+
+
+class FanDesk:
+    """Sends fan duties through the fans' gate.
+
+    Args:
+        duty: of the configuration, left and right.
+        seat: sends them.
+        mission: held where they are refused.
+        teller: tells that.
+        has_floor: the mirror overhangs, and the robot's own floor counts.
+    """
+
+    def __init__(
+        self, duty: tuple[float, float], seat: Seat, mission: Mission, teller: Teller, *, has_floor: bool
+    ) -> None:
+        """Nothing sent."""
+        self._duty, self._seat, self._mission, self._teller = duty, seat, mission, teller
+        self._has_floor, self._has_pressed_on = has_floor, False
+        self._gate = FanGate(0.0)
+
+    @property
+    def refused(self) -> int:
+        """How often duties were refused in this session."""
+        return self._gate.refused
+
+    def begin(self, floor: float) -> None:
+        """A session begins with a robot that has this floor."""
+        self._gate = FanGate(floor if self._has_floor else 0.0)
+
+    def press_on(self) -> None:
+        """All that they can from now on; said once."""
+        if not self._has_pressed_on:
+            self._has_pressed_on = True
+            self.send()
+
+    def send(self) -> None:
+        """Send what is in force."""
+        duty = FULL_FANS if self._has_pressed_on else self._duty
+        refusal = self._gate.refusal(*duty)
+        if refusal is None:
+            self._seat.send_fans(duty)
+        else:
+            self._teller.say("error", refusal)
+            self._mission.fault(refusal)

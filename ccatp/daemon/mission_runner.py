@@ -1,0 +1,285 @@
+"""What a mission is to the main-loop process that hosts it: frames in, drives out, verdicts, commands, topics.
+
+The process keeps the links, the clock, the order of things and the end; the mission keeps everything that depends on
+what it is good for. A new kind of mission is a class with these methods and a row where missions are chosen.
+
+The time of the frames that a main loop serves: steady, from the first one on, over boots of the robot.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import structlog
+
+from ccatp.config.models import LinkConfig
+from ccatp.core import Verdict
+from ccatp.daemon.robot_session import Seat
+from ccatp.daemon.telemetry import Teller
+from ccatp.errors import ExitStatus
+from ccatp.links.bus import Publisher
+from ccatp.links.robot_messages import Hello, Sensors
+from ccatp.safety.robot_clock import SteadyTime
+
+
+class FrameClock:
+    """Numbers and times of the frames.
+
+    Args:
+        jump_s: the robot's clock has jumped if a frame is further off.
+        elapsed_s: of the mission, before the first frame that we serve.
+
+    Attributes:
+        seq: the newest frame.
+        t_s: its time, without jumps.
+        has_begun: a frame was served, in this boot of the robot.
+    """
+
+    def __init__(self, jump_s: float, elapsed_s: float = 0.0) -> None:
+        """No frame yet."""
+        self._jump_s, self._before_s = jump_s, elapsed_s
+        self._steady = SteadyTime(jump_s)
+        self._first_s: float | None = None
+        self.seq, self.t_s = -1, 0.0
+
+    @property
+    def has_begun(self) -> bool:
+        """A frame was served, in this boot of the robot."""
+        return self._first_s is not None
+
+    @property
+    def elapsed_s(self) -> float:
+        """Robot time of the mission, s."""
+        return self._before_s + (0.0 if self._first_s is None else self.t_s - self._first_s)
+
+    @property
+    def offset_s(self) -> float:
+        """Our time less the robot's."""
+        return self._steady.offset_s
+
+    def begin_with(self, elapsed_s: float) -> None:
+        """So much of the mission was over before we came."""
+        self._before_s = elapsed_s
+
+    def look(self, seq: int, t_s: float, period_s: float) -> tuple[float, float]:
+        """Time of a frame and time since the last one, s; nothing is changed before ``serve``.
+
+        Args:
+            seq: its number.
+            t_s: its time by the robot's clock.
+            period_s: time since the frame before where there is none.
+        """
+        # What counts durations goes by a time that does not jump; everything else by the robot's own.
+        steady_s = self._steady.at(seq, t_s) if seq > self.seq else self.t_s
+        return steady_s, steady_s - self.t_s if self._first_s is not None else period_s
+
+    def serve(self, seq: int, steady_s: float) -> bool:
+        """The frame is served now; whether it is the first in this boot of the robot."""
+        is_first = self._first_s is None
+        if self._first_s is None:
+            self._first_s = steady_s
+        self.t_s, self.seq = steady_s, max(seq, self.seq)
+        return is_first
+
+    def boot(self) -> None:
+        """The robot's frames and clock count anew."""
+        self._before_s, self._first_s, self.seq = self.elapsed_s, None, -1
+        self._steady = SteadyTime(self._jump_s)
+
+
+class Hosting(NamedTuple):
+    """What the process itself needs of a configuration.
+
+    Attributes:
+        link: the robot link.
+        realtime_priority: of the process; 0 = ordinary scheduling.
+        verdict_timeout_s: a verdict older than this is none.
+        clock_jump_s: the robot's clock has jumped if a frame is further off.
+        frame_hz: of the frames, until the robot tells it.
+    """
+
+    link: LinkConfig
+    realtime_priority: int
+    verdict_timeout_s: float
+    clock_jump_s: float
+    frame_hz: float
+
+
+class Served(NamedTuple):
+    """A frame as it is served.
+
+    Attributes:
+        sensors: as the robot sent it.
+        raw: its line.
+        t_s: its time, without jumps; that of the robot stands in ``sensors``.
+        dt_s: since the frame before; not positive where the robot's clock or frames went back.
+        is_first: of a session.
+    """
+
+    sensors: Sensors
+    raw: bytes
+    t_s: float
+    dt_s: float
+    is_first: bool
+
+
+class Drive(NamedTuple):
+    """Set points of the wheels, rad/s, and of the steering, rad, where the robot has one."""
+
+    right_rad_s: float
+    left_rad_s: float
+    steer_rad: float | None = None
+
+
+STILL = Drive(0.0, 0.0)
+
+
+class Progress(NamedTuple):
+    """How far a mission is, as ``MissionStatus`` tells it."""
+
+    state: str
+    cause: str
+    done: int
+    skipped: int
+    total: int
+    point: str
+    eta_s: float
+    error_mm: float
+    outcome: str
+    lower_bound_s: float
+    left_out: Mapping[str, list[str]]
+
+
+class Obeying(Protocol):
+    """Takes the commands of an operator; each returns why it was refused, or ``None``."""
+
+    def pause(self, cause: str) -> str | None:
+        """Hold until ``resume``."""
+
+    def resume(self) -> str | None:
+        """Go on after a hold."""
+
+    def abort(self, cause: str) -> str | None:
+        """Return to base and end there."""
+
+    def stop(self) -> str | None:
+        """Hold the wheels and end here."""
+
+
+@dataclass(frozen=True, slots=True)
+class Host:
+    """What the process gives to its mission.
+
+    Attributes:
+        run_dir: the run directory.
+        publisher: main's.
+        log: the process's logger.
+        seat: the controller's, at the robot.
+        clock: of the frames.
+        is_patient: simulated time waits for us.
+        finish: ends the process with a status, once the last messages are out.
+        answer: something changed between two frames: lockstep time may go on.
+    """
+
+    run_dir: Path
+    publisher: Publisher
+    log: structlog.typing.FilteringBoundLogger
+    seat: Seat
+    clock: FrameClock
+    is_patient: bool
+    finish: Callable[[ExitStatus], None]
+    answer: Callable[[], None]
+
+
+class Work(Obeying, Protocol):
+    """A mission in the main-loop process."""
+
+    @property
+    def teller(self) -> Teller:
+        """Tells the others."""
+
+    @property
+    def cause(self) -> str:
+        """Why it is held."""
+
+    @property
+    def is_paused(self) -> bool:
+        """Held until somebody resumes: in lockstep time all but stands still."""
+
+    @property
+    def is_busy(self) -> bool:
+        """Waits for a peer: in lockstep time stands still."""
+
+    @property
+    def is_quiet(self) -> bool:
+        """The robot is at rest."""
+
+    def progress(self) -> Progress:
+        """How far it is."""
+
+    # -- beside the frames ----------------------------------------------------------------------------------------
+
+    async def connect(self) -> None:
+        """Connect to peers other than the robot.
+
+        Raises:
+            UnreachableError: one does not answer.
+        """
+
+    async def run(self) -> None:
+        """Whatever is to be done beside the frames, for ever."""
+
+    async def close(self) -> None:
+        """Close what ``connect`` and ``run`` have opened."""
+
+    def check_robot(self, hello: Hello) -> None:
+        """Refuse a robot that is not of the configuration.
+
+        Raises:
+            ConfigError: it is another one.
+        """
+
+    def begin_session(self, hello: Hello) -> None:
+        """A session begins; its first frame comes next."""
+
+    def greet(self) -> None:
+        """The first frame of a session is here, and is answered next: what the robot has to be told once."""
+
+    def lose_sight(self) -> None:
+        """The robot booted, or moved while nobody looked."""
+
+    def interrupt(self, cause: str) -> bool:
+        """Hold until frames and verdicts are fresh again; returns whether that was news."""
+
+    def keep(self) -> None:
+        """Write down what a successor needs."""
+
+    def settle(self) -> None:
+        """Something changed between two frames: tell it, and end where that is the end."""
+
+    def note_end(self) -> None:
+        """The process ends: last words for the log."""
+
+    # -- the frame, in this order ---------------------------------------------------------------------------------
+
+    def listen(self, frame: Served) -> None:
+        """Take what the robot says; the danger loop judges the same frame meanwhile."""
+
+    def decide(self, frame: Served, verdict: Verdict | None, lag_s: float) -> Drive:
+        """The drive that answers the frame.
+
+        Args:
+            frame: the same.
+            verdict: of the danger loop, ``None`` where there is none in force.
+            lag_s: how late the frame is served.
+        """
+
+    def stand(self, frame: Served) -> Drive:
+        """In place of ``decide``: the robot stands, and nothing is decided in this frame."""
+
+    def tell(self, frame: Served) -> None:
+        """The drive is on its way: publish the estimate, keep records."""
+
+
+MakeWork = Callable[[Host], Work]

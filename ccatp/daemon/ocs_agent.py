@@ -1,0 +1,281 @@
+"""The agent of the observatory control system (extra ``ocs``): surveys as its process, orders as its tasks.
+
+What the agent of the observatory control system does, without its framework.
+
+A survey is a process of its own, started here or by somebody else (systemd, an operator); this side asks it and follows
+it. When the agent dies the survey goes on, and an agent that is started anew follows it again.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import msgspec
+
+from ccatp.config.package import child_environment
+from ccatp.errors import CcatpError, ExitStatus, UnreachableError
+from ccatp.links.client import Client
+from ccatp.links.topics import MissionStatus
+
+Answer = tuple[bool, str]
+PERIOD_S = 0.5
+# A survey that was started tells its status within this: processes, planning, joining.
+START_TIMEOUT_S = 60.0
+ENDINGS: Mapping[int, str] = {
+    ExitStatus.COMPLETE: "the survey is complete",
+    ExitStatus.ABORTED: "aborted, the robot is at base",
+    ExitStatus.HELD: "held, the robot is not at base",
+    ExitStatus.UNREACHABLE: "the robot or the laser system did not answer",
+    ExitStatus.INTERRUPTED: "interrupted, the wheels are held",
+}
+
+
+class Session(Protocol):
+    """The part of an OCS session that is used."""
+
+    status: str
+    data: dict[str, Any]
+
+
+@dataclass(slots=True)
+class SurveyDesk:
+    """Starts, follows and ends surveys.
+
+    Attributes:
+        client: of the daemon.
+        command: of a survey, ``ccatp run ...``.
+        environment: in which it runs.
+        log: tells the agent's log.
+    """
+
+    client: Client
+    command: Sequence[str]
+    environment: Mapping[str, str]
+    log: Callable[[str], None]
+
+    def survey(self, session: Session, panels: int | None = None) -> Answer:
+        """Start a survey, or join the one that runs, and follow it to its end.
+
+        When the session is told to stop, the survey is aborted, and the session ends with it: the robot is at base.
+
+        Args:
+            session: its ``data`` shows the status.
+            panels: survey only the first so many; all of the configuration where ``None``.
+        """
+        if self._status() is not None:
+            self.log("a survey runs already; following it")
+            return self._follow(session, None)
+        command = [*self.command, *([] if panels is None else ["--panels", str(panels)])]
+        self.log(f"starting {' '.join(command)}")
+        child = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            start_new_session=True,  # it outlives the agent
+            env=child_environment(self.environment),
+        )
+        return self._follow(session, child)
+
+    def _follow(self, session: Session, child: "subprocess.Popen[bytes] | None") -> Answer:
+        deadline_s, is_aborted, last = time.monotonic() + START_TIMEOUT_S, False, None
+        while child is None or child.poll() is None:
+            status = self._status()
+            if status is not None:
+                last = status
+                session.data = shown(status)
+            elif child is None:  # it was there, and is gone
+                break
+            elif last is None and time.monotonic() > deadline_s:
+                child.terminate()
+                child.wait()
+                return False, f"the survey said nothing within {START_TIMEOUT_S:g} s and was ended"
+            if session.status not in ("starting", "running") and not is_aborted and status is not None:
+                is_aborted = self.ask("abort")[0]
+            time.sleep(PERIOD_S)
+        code = child.returncode if child is not None else (-1 if last is None else last.exit_status)
+        session.data = {**session.data, "exit_status": code}
+        if code < 0:
+            return False, "the survey is over"
+        ending = ENDINGS.get(code, f"the survey ended with status {code}; see its log")
+        # Whoever stopped it wanted it aborted.
+        return code == ExitStatus.COMPLETE or (is_aborted and code == ExitStatus.ABORTED), ending
+
+    def ask(self, order: str, session: Session | None = None) -> Answer:
+        """One order to the daemon: status, pause, resume, abort, stop."""
+        try:
+            status: MissionStatus = getattr(self.client, order)()
+        except CcatpError as error:
+            return False, str(error)
+        if session is not None:
+            session.data = shown(status)
+        return True, f"{order}: {status.state}"
+
+    def monitor(self, session: Session, publish: Callable[[dict[str, Any]], None], period_s: float) -> Answer:
+        """Publish the status again and again until the session is told to stop.
+
+        Args:
+            session: its ``data`` shows what was published last.
+            publish: takes a block of the feed.
+            period_s: between two blocks.
+        """
+        while session.status in ("starting", "running"):
+            status = self._status()
+            now_s = time.time()
+            publish({"timestamp": now_s, "block_name": "daemon", "data": {"running": int(status is not None)}})
+            if status is not None:
+                publish({"timestamp": now_s, "block_name": "survey", "data": feed_fields(status)})
+            session.data = {"timestamp": now_s, "running": status is not None}
+            if status is not None:
+                session.data |= shown(status)
+            until_s = time.monotonic() + period_s
+            while session.status in ("starting", "running") and time.monotonic() < until_s:
+                time.sleep(min(0.1, period_s))
+        return True, "monitoring ended"
+
+    def _status(self) -> MissionStatus | None:
+        try:
+            return self.client.status()
+        except UnreachableError:
+            return None
+
+
+def shown(status: MissionStatus) -> dict[str, Any]:
+    """The whole status as a session shows it."""
+    found: dict[str, Any] = msgspec.to_builtins(status)
+    return found
+
+
+def feed_fields(status: MissionStatus) -> dict[str, Any]:
+    """What of the status goes into the feed: numbers and short texts, always the same fields."""
+    return {
+        "state": status.state,
+        "cause": status.cause,
+        "point": status.point,
+        "done": status.done,
+        "skipped": status.skipped,
+        "total": status.total,
+        "elapsed_s": status.elapsed_s,
+        "eta_s": status.eta_s,
+        "arrival_error_mm": status.error_mm,
+        "danger_code": status.code,
+        "late_frames": status.slips,
+        "exit_status": status.exit_status,
+    }
+
+
+AGENT_CLASS = "CcatpAgent"
+FEED = "survey"
+ORDERS = ("status", "pause", "resume", "abort", "stop")
+# A pause is answered when the robot is at rest.
+TIMEOUT_S = 10.0
+
+
+class OcsMissing(CcatpError):
+    """The extra is not installed."""
+
+    exit_status = ExitStatus.USAGE
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
+    """The agent's own options; those of OCS come beside them."""
+    own = parser.add_argument_group("Agent options")
+    own.add_argument("--config", type=Path, help="configuration of the surveys")
+    own.add_argument("--sim", action="store_true", help="simulate robot and laser system")
+    own.add_argument("--realtime", action="store_true", help="with --sim: pace the simulation on the wall clock")
+    own.add_argument("--mirror", help="mirror of the surveys, if not that of the configuration")
+    own.add_argument("--runtime-dir", type=Path, help="folder of the daemon's sockets, if not the usual one")
+    own.add_argument("--period", type=float, default=1.0, help="seconds between two blocks of the feed")
+    return parser
+
+
+def survey_command(args: argparse.Namespace) -> list[str]:
+    """``ccatp run`` as the agent's options want it."""
+    command = [sys.executable, "-m", "ccatp", "run"]
+    command += [flag for flag, is_given in (("--sim", args.sim), ("--realtime", args.realtime)) if is_given]
+    for option, value in (("--config", args.config), ("--mirror", args.mirror), ("--runtime-dir", args.runtime_dir)):
+        if value is not None:
+            command += [option, str(value)]
+    return command
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Entry of ``ocs-agent-cli --agent CcatpAgent``: join the crossbar router and serve until it ends.
+
+    Raises:
+        OcsMissing: the extra is not installed.
+    """
+    try:
+        import txaio  # type: ignore[import-untyped, unused-ignore]  # noqa: PLC0415 - belongs to an extra
+        from ocs import ocs_agent, site_config  # noqa: PLC0415
+    except ImportError as error:
+        raise OcsMissing("the agent needs OCS: install ccatp with its extra, ccatp[ocs]") from error
+    txaio.start_logging(  # type: ignore[attr-defined, unused-ignore]
+        level=os.environ.get("LOGLEVEL", "info")
+    )
+    parser = add_arguments(argparse.ArgumentParser())
+    parsed = site_config.parse_args(agent_class=AGENT_CLASS, parser=parser, args=args)
+    if not parsed.sim and parsed.config is None:
+        parser.error("name the robot's configuration with --config FILE, or add --sim")
+    agent, runner = ocs_agent.init_site_agent(parsed)
+    desk = SurveyDesk(Client(parsed.runtime_dir, TIMEOUT_S), survey_command(parsed), os.environ, agent.log.info)
+    register(agent, desk, ocs_agent.param, parsed.period)
+    runner.run(agent, auto_reconnect=True)
+
+
+def register(agent: Any, desk: SurveyDesk, param: Any, period_s: float) -> None:
+    """Tell the agent its processes, tasks and feed.
+
+    Args:
+        agent: an ``ocs.ocs_agent.OCSAgent``.
+        desk: what does the work, in threads of the agent.
+        param: ``ocs.ocs_agent.param``.
+        period_s: between two blocks of the feed.
+    """
+
+    def stop(session: Any, params: Any) -> Answer:
+        del params
+        session.set_status("stopping")
+        return True, "asked to stop"
+
+    def survey(session: Any, params: Any) -> Answer:
+        """Start a survey, or join the one that runs, and end with it.
+
+        **Process** - with ``panels`` only of the first so many. Stopping it aborts the survey: the robot drives to its
+        base.
+        """
+        return desk.survey(session, params["panels"])
+
+    def monitor(session: Any, params: Any) -> Answer:
+        """Publish the state of the survey to the feed ``survey``, whether one runs or not.
+
+        **Process** - begins with the agent.
+        """
+        del params
+        return desk.monitor(session, lambda block: agent.publish_to_feed(FEED, block), period_s)
+
+    panels = param("panels", default=None, type=int, check=lambda number: number >= 0)
+    nothing = param("_")
+    agent.register_feed(FEED, record=True, agg_params={"frame_length": 60}, buffer_time=1.0)
+    agent.register_process("survey", panels(survey), stop, blocking=True)
+    agent.register_process("monitor", nothing(monitor), stop, blocking=True, startup=True)
+    for order in ORDERS:
+        agent.register_task(order, nothing(_task(desk, order)), blocking=True)
+
+
+def _task(desk: SurveyDesk, order: str) -> Callable[[Any, Any], Answer]:
+    def task(session: Any, params: Any) -> Answer:
+        del params
+        return desk.ask(order, session)
+
+    task.__doc__ = f"Ask the daemon: {order}.\n\n**Task** - {order}(): the status afterwards is in the session's data."
+    return task
+
+
+if __name__ == "__main__":
+    main()

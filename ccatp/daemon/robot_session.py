@@ -1,0 +1,304 @@
+"""A link to the robot that lasts: joined, lost, joined again, until the robot stays away for too long.
+
+The controller's seat at the robot: the session, its numbers, its clock.
+
+The drives of a differential drive on their way: what will come of them, and what main had the wheels do.
+
+How late frames are served: what a blocked event loop, a busy machine or a slow link costs.
+"""
+
+import asyncio
+import random
+from collections.abc import Callable
+
+from ccatp.config.models import LinkConfig, RobotConfig
+from ccatp.control.prediction import CommandPredictor
+from ccatp.core import twist_of
+from ccatp.errors import UnreachableError
+from ccatp.links.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout, read_key
+from ccatp.links.robot_messages import Hello, Role, Sensors
+from ccatp.safety.wheel_monitors import CommandSpan
+
+FIRST_DELAY_S, LONGEST_DELAY_S = 0.05, 1.0
+# A robot that accepts a connection and does not answer is not there yet: rather ask anew.
+ATTEMPT_S = 2.0
+# What will be refused the next time, too.
+FINAL = ("bad mac",)
+
+
+def delay_s(failures: int, share: float) -> float:
+    """How long to wait before the next attempt: twice as long each time, spread so that two clients do not collide.
+
+    Args:
+        failures: attempts that failed so far.
+        share: random, 0 to 1.
+    """
+    return max(FIRST_DELAY_S, min(LONGEST_DELAY_S, FIRST_DELAY_S * 2.0 ** min(failures, 10)) * (0.5 + 0.5 * share))
+
+
+class LastingLink:
+    """Keeps a role at the robot.
+
+    Args:
+        cfg: where it is, and for how long to try.
+        role: what to join as.
+        client: name of this client.
+        on_sensors: called with each frame and its line; in lockstep a new session begins with the last frame again.
+        on_lost: called with the reason when a session ends.
+        on_joined: called with the robot's hello when a session begins, before its first frame.
+        on_bad_line: called after each line that fails a check.
+
+    Attributes:
+        link: the present session, or the last one.
+    """
+
+    def __init__(
+        self,
+        cfg: LinkConfig,
+        *,
+        role: Role,
+        client: str,
+        on_sensors: Callable[[Sensors, bytes], None],
+        on_lost: Callable[[str], None],
+        on_joined: Callable[[Hello], None],
+        on_bad_line: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Read the key; nothing is connected yet."""
+        self._cfg, self._role, self._client = cfg, role, client
+        self._key = read_key(cfg.key_file)
+        self._on_sensors, self._on_lost, self._on_joined = on_sensors, on_lost, on_joined
+        self._on_bad_line = on_bad_line
+        self._lost = asyncio.Event()
+        self._is_joined = False
+        # A robot that lets join and then says nothing is as far away as one that does not answer.
+        self._failures = 0
+        self._deadline_s: float | None = None
+        self.sessions = 0
+        self.link = self._make()
+
+    def _make(self) -> RobotLink:
+        return RobotLink(
+            host=self._cfg.host,
+            port=self._cfg.port,
+            role=self._role,
+            client=self._client,
+            key=self._key,
+            on_sensors=self._heed_frame,
+            on_lost=self._heed_loss,
+            on_joined=self._heed_join,
+            on_bad_line=self._on_bad_line,
+        )
+
+    async def join(self, *, is_patient: bool) -> None:
+        """Join for the first time.
+
+        Args:
+            is_patient: try for as long as after a loss, because the robot may still hold a dead session's role.
+
+        Raises:
+            UnreachableError: the robot is not there, or refuses.
+        """
+        if is_patient:
+            await self._join_again()
+        else:
+            await self.link.connect(self._cfg.connect_timeout_s)
+
+    async def serve(self) -> None:
+        """Join again after each loss, for ever.
+
+        Raises:
+            UnreachableError: the robot stayed away for ``reconnect_timeout_s``, or refuses for good.
+        """
+        while True:
+            await self._lost.wait()
+            await self._join_again()
+
+    async def _join_again(self) -> None:
+        loop = asyncio.get_running_loop()
+        if self._deadline_s is None:
+            self._deadline_s = loop.time() + self._cfg.reconnect_timeout_s
+        elif self._failures:
+            await asyncio.sleep(delay_s(self._failures, random.random()))
+        self._failures += 1
+        why: UnreachableError | str = "it lets join, and sends no frame that is one"
+        while (left_s := self._deadline_s - loop.time()) > 0.0:
+            self._lost.clear()
+            self.link = self._make()
+            try:
+                await self.link.connect(min(ATTEMPT_S, left_s))
+            except RobotLinkError as error:
+                if isinstance(error, RobotRefused) and error.reason in FINAL:
+                    raise
+                why = error
+            else:
+                return
+            await asyncio.sleep(min(delay_s(self._failures - 1, random.random()), left_s))
+            self._failures += 1
+        raise RobotTimeout(f"the robot did not come back within {self._cfg.reconnect_timeout_s:g} s: {why}")
+
+    def _heed_frame(self, frame: Sensors, line: bytes) -> None:
+        self._failures, self._deadline_s = 0, None
+        self._on_sensors(frame, line)
+
+    def _heed_join(self, hello: Hello) -> None:
+        self._is_joined = True
+        self.sessions += 1
+        self._on_joined(hello)
+
+    def _heed_loss(self, reason: str) -> None:
+        self._is_joined = False
+        self._lost.set()
+        self._on_lost(reason)
+
+    def give_up(self, reason: str) -> None:
+        """The connection is open and dead: begin anew."""
+        if self._is_joined:
+            self.link.abort(reason)
+
+    def close(self) -> None:
+        """End the session; nobody is told."""
+        self.link.close()
+
+
+class Seat:
+    """Sends drives and fans, and knows what the session is like.
+
+    Args:
+        link: the link, with the controller's role.
+        is_taking_over: somebody else sat here before.
+        frame_hz: rate of the frames, until the robot tells it.
+
+    Attributes:
+        on_drive: told of each drive that is sent: its number, and the rates of the right and the left wheel, rad/s.
+        is_lockstep: the robot's clock is simulated.
+        is_new_session: no frame of this session has been served yet.
+    """
+
+    def __init__(self, link: LastingLink, *, is_taking_over: bool, frame_hz: float) -> None:
+        """Not joined."""
+        self._link, self._is_taking_over, self._frame_hz = link, is_taking_over, frame_hz
+        self._hello: Hello | None = None
+        self._drive_seq = self._fans_seq = 0
+        self.on_drive: Callable[[int, float, float], None] = lambda _seq, _right, _left: None
+        self.is_lockstep = self.is_new_session = False
+
+    def begin(self, hello: Hello, where: str) -> str:
+        """A session begins, at an address; what people say of it."""
+        before, self._hello, self.is_lockstep = self._hello, hello, hello.lockstep
+        self.is_new_session = True
+        return f"joined the robot at {where}{'' if before is None else ' again'}"
+
+    def has_booted(self, hello: Hello) -> bool:
+        """Whether the robot has started anew since the last session; to be asked before ``begin``."""
+        return self._hello is not None and self._hello.boot != hello.boot
+
+    @property
+    def frame_period_s(self) -> float:
+        """Time between two frames."""
+        return 1.0 / (self._hello.frame_hz if self._hello is not None else self._frame_hz)
+
+    @property
+    def is_unjudged(self) -> bool:
+        """Danger may have judged the first frame before this session began, and does so once: the next one will do."""
+        return self.is_new_session and (self._is_taking_over or self._link.sessions > 1)
+
+    def drive(self, ack: int, right: float, left: float, steer: float | None = None) -> None:
+        """Send wheel rates, rad/s, and the steering angle, rad, where there is one, computed from frame ``ack``."""
+        self._drive_seq += 1
+        self.on_drive(self._drive_seq, right, left)
+        link = self._link.link
+        if steer is None:
+            link.send_drive(self._drive_seq, max(ack, 0), right, left)
+        else:
+            link.send_drive(self._drive_seq, max(ack, 0), right, left, steer)
+
+    def send_fans(self, duty: tuple[float, float]) -> None:
+        """Send the fans' duties."""
+        self._fans_seq += 1
+        self._link.link.send_fans(self._fans_seq, duty)
+
+
+class Commanded:
+    """Hears of each drive that is sent.
+
+    Args:
+        cfg: the robot.
+        frame_hz: rate of the frames, until the robot tells it.
+
+    Attributes:
+        predictor: of what is on its way.
+    """
+
+    def __init__(self, cfg: RobotConfig, frame_hz: float) -> None:
+        """Nothing sent."""
+        self._cfg = cfg
+        self._span = CommandSpan()
+        self._newest, self._driven = 0, (0.0, 0.0)
+        self.begin(frame_hz)
+
+    def begin(self, frame_hz: float) -> None:
+        """A session begins: nothing of the one before is on its way."""
+        self.predictor = CommandPredictor(self._cfg.wheel_lag_s, 1.0 / frame_hz)
+
+    def sent(self, seq: int, right: float, left: float) -> None:
+        """Drive ``seq``, wheel rates in rad/s, is sent."""
+        self._newest, self._driven = seq, (right, left)
+        self._span.add(right, left)
+        twist = twist_of(right, left, self._cfg.wheel_radius_m, self._cfg.wheel_base_m)
+        self.predictor.sent(seq, twist.v_m_s, twist.omega_rad_s)
+
+    def told(self) -> tuple[tuple[float, float, float, float], int]:
+        """Span of the set points since it was asked for last, rad/s, and the number of the newest drive."""
+        return self._span.take(*self._driven), self._newest
+
+
+# The robot's clock and the host's drift apart by less than this share; a quartz is ten times better.
+MAX_DRIFT = 2e-4
+_NEVER_S = float("inf")
+
+
+class FrameLag:
+    """Measures the lag of each frame against the promptest one lately.
+
+    The difference of the host's clock to the robot's is least for a frame that was served at once. It may grow by the
+    drift of the clocks; whatever it is above that, the frame is late. What always takes the same time does not show.
+
+    Args:
+        slip_s: a frame served later than this is a slip of the cycle.
+
+    Attributes:
+        slips: frames served later than ``slip_s``.
+        worst_s: the largest lag so far, s.
+    """
+
+    __slots__ = ("_least_s", "_slip_s", "_t_s", "_wall_s", "slips", "worst_s")
+
+    def __init__(self, slip_s: float) -> None:
+        """Nothing served yet."""
+        self._slip_s = slip_s
+        self._t_s, self._wall_s, self._least_s = _NEVER_S, 0.0, 0.0
+        self.slips = 0
+        self.worst_s = 0.0
+
+    def forget(self) -> None:
+        """Begin anew: another session, or another boot."""
+        self._t_s = _NEVER_S
+
+    def served(self, t_s: float, wall_s: float) -> float:
+        """The lag of a frame, s.
+
+        Args:
+            t_s: the robot's time of the frame; where it runs backwards, the clock was set and lags count anew.
+            wall_s: the host's monotonic clock when the frame is served.
+        """
+        offset_s = wall_s - t_s
+        if t_s < self._t_s:
+            self._least_s = offset_s
+        else:
+            self._least_s = min(offset_s, self._least_s + MAX_DRIFT * (wall_s - self._wall_s))
+        self._t_s, self._wall_s = t_s, wall_s
+        lag_s = offset_s - self._least_s
+        if lag_s > self._slip_s:
+            self.slips += 1
+        self.worst_s = max(self.worst_s, lag_s)
+        return lag_s

@@ -1,0 +1,261 @@
+"""The folders of a run: its own, made or taken up again, and that of its sockets; each for one daemon alone.
+
+The run that has not finished, by name: what a service that is started again goes on with.
+
+What ``ccatp run`` was asked to do.
+"""
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path, PurePath
+from typing import Any
+
+from ccatp.config.load import load_config
+from ccatp.config.models import Config
+from ccatp.daemon.danger_loop import FILE as EMERGENCIES
+from ccatp.errors import ConfigError, ExitStatus
+from ccatp.links.runtime_dir import LOCK_FILE, TRUTH_LOCK_FILE, locked, remove_sockets
+
+FILE = Path("runs") / "unfinished"
+# What was latched when a run finished, for the next one: whoever has to clear it finds no daemon in between.
+LATCHED_FILE = Path("runs") / EMERGENCIES
+# Complete, or at base after an abort: there is nothing to go on with.
+FINISHED = (ExitStatus.COMPLETE, ExitStatus.ABORTED)
+
+
+def find_unfinished() -> Path | None:
+    """The directory of the run that did not finish, ``None`` where there is none with a mission in it.
+
+    Raises:
+        ConfigError: the note cannot be read.
+    """
+    try:
+        text = FILE.read_text(encoding="utf-8").strip()
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--recover: cannot read {FILE}: {error}; remove it to begin a new run") from error
+    run_dir = Path(text)
+    return run_dir if text and (run_dir / "mission.sqlite").exists() else None
+
+
+def finished_summary(run_dir: Path) -> dict[str, Any] | None:
+    """The summary of a mission of which every point is measured, ``None`` for any other."""
+    try:
+        summary = json.loads((run_dir / "summary.json").read_text(encoding="utf-8"))
+        points = summary["points"]
+        is_finished = points["measured"] == points["total"] > 0
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return summary if is_finished else None
+
+
+def note_unfinished(run_dir: Path) -> None:
+    """Note that a run has begun.
+
+    Raises:
+        ConfigError: the note cannot be written.
+    """
+    try:
+        FILE.parent.mkdir(parents=True, exist_ok=True)
+        _write(FILE, f"{run_dir}\n".encode())
+    except OSError as error:
+        raise ConfigError(
+            f"--recover: cannot write {FILE}: {error.strerror}; start where ./runs can be made"
+        ) from error
+
+
+def forget_finished(status: int, run_dir: Path) -> None:
+    """Take the note away where the run has finished; emergencies that are in force then stay so in the next one.
+
+    Raises:
+        ConfigError: they cannot be kept.
+    """
+    if status not in FINISHED:
+        return
+    kept = _emergencies(run_dir / EMERGENCIES)
+    try:
+        if kept:
+            _write(LATCHED_FILE, kept)
+        else:
+            LATCHED_FILE.unlink(missing_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--recover: cannot keep {LATCHED_FILE}: {error.strerror}") from error
+    FILE.unlink(missing_ok=True)
+
+
+def take_over_emergencies(run_dir: Path) -> bool:
+    """Give a new run the emergencies that were in force when the last one finished; whether there are any.
+
+    Raises:
+        ConfigError: they cannot be read, or not be written.
+    """
+    try:
+        kept = LATCHED_FILE.read_bytes()
+        run_dir.mkdir(parents=True, exist_ok=True)
+        _write(run_dir / EMERGENCIES, kept)
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise ConfigError(f"--recover: cannot take over {LATCHED_FILE}: {error.strerror}") from error
+    return True
+
+
+def _write(path: Path, data: bytes) -> None:
+    """All of it or nothing, and on the disk."""
+    new = path.with_name(f"{path.name}.new")
+    with new.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    new.replace(path)
+
+
+def _emergencies(path: Path) -> bytes:
+    """The file of a latch as it is, empty where it holds nothing; one that is damaged holds something."""
+    try:
+        found = path.read_bytes()
+    except FileNotFoundError:
+        return b""
+    try:
+        return found if json.loads(found)["active"] else b""
+    except (ValueError, KeyError, TypeError):
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """The command line of ``ccatp run``.
+
+    Attributes:
+        sim: start the stand-ins of robot and laser system.
+        config_file: the user's configuration, or ``None`` for the default one.
+        overrides: dotted keys given on the command line (``{"run.seed": 2}``), stronger than the file.
+        realtime: pace the stand-ins on the wall clock instead of in lockstep.
+        run_dir: where the run is written; ``None`` asks for ``default_run_dir``.
+        resume: carry on with the mission in ``run_dir``.
+        held: begin held, until an operator resumes.
+        recover: carry on, held, with the run that did not finish, or else begin one that may be recovered.
+        json_output: the summary goes to standard output as JSON, and nothing else does.
+        runtime_dir: folder of the unix sockets given on the command line, or ``None``.
+        faults_file: plan of faults for the stand-ins, or ``None``; a copy goes into the run directory.
+        shows_summary: the summary goes to standard output at the end.
+    """
+
+    sim: bool
+    config_file: Path | None = None
+    overrides: Mapping[str, object] = field(default_factory=dict)
+    realtime: bool = False
+    run_dir: Path | None = None
+    resume: bool = False
+    held: bool = False
+    recover: bool = False
+    json_output: bool = False
+    runtime_dir: Path | None = None
+    faults_file: Path | None = None
+    shows_summary: bool = True
+
+    @property
+    def is_paced(self) -> bool:
+        """The robot's clock is that of the wall: there is time to sleep between frames."""
+        return self.realtime or not self.sim
+
+
+def default_run_dir(mirror: str, seed: int, now_utc: datetime, parent: Path = Path("runs")) -> Path:
+    """Where a run is written when nobody said: ``runs/<UTC time>-<mirror>-s<seed>``.
+
+    Args:
+        mirror: ``run.mirror``, a name or the path of a file.
+        seed: ``run.seed``.
+        now_utc: the time, with its zone set to UTC.
+        parent: the folder of all runs.
+    """
+    return parent / f"{now_utc:%Y%m%dT%H%M%SZ}-{PurePath(mirror).stem}-s{seed}"
+
+
+# In the runtime directory. Those of the truth may be of a simulated robot that runs alone, beside a run without one.
+SOCKETS = ("main", "danger", "control", "emergency", "dashboard")
+TRUTH_SOCKETS = ("truth", "puck")
+
+
+@contextmanager
+def owned(path: Path, option: str) -> Iterator[None]:
+    """Hold a lock, or say that another daemon does and which ``option`` names another place.
+
+    Raises:
+        RefusedError: it is held.
+    """
+    refusal = f"another ccatp runs in {path.parent}; end it with 'ccatp stop', or give this one its own {option}"
+    with locked(path, refusal):
+        yield
+
+
+def own_runtime_dir(stack: ExitStack, runtime_dir: Path, *, is_sim: bool) -> None:
+    """Have a runtime directory for ourselves until the end, when our sockets go, too.
+
+    Raises:
+        RefusedError: another daemon has it, or a simulated robot that runs alone.
+    """
+    stack.enter_context(owned(runtime_dir / LOCK_FILE, "--runtime-dir"))
+    if is_sim:
+        alone = f"a simulated robot runs alone in {runtime_dir}; end it, or give this one its own --runtime-dir"
+        stack.enter_context(locked(runtime_dir / TRUTH_LOCK_FILE, alone))
+    stack.callback(remove_sockets, runtime_dir, (*SOCKETS, *(TRUTH_SOCKETS if is_sim else ())))
+
+
+def new_run_dir(options: RunOptions, name: str, seed: int) -> Path:
+    """The folder of a run that begins anew.
+
+    Raises:
+        ConfigError: it holds a mission already, or cannot be made.
+    """
+    run_dir = options.run_dir or default_run_dir(name, seed, datetime.now(UTC))
+    if (run_dir / "mission.sqlite").exists():
+        raise ConfigError(f"--run-dir: {run_dir} holds a mission already; name another folder")
+    return _made(run_dir)
+
+
+def _made(run_dir: Path) -> Path:
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--run-dir: cannot make {run_dir}: {error.strerror}") from error
+    return run_dir.absolute()
+
+
+def survey_run_dir(options: RunOptions, cfg: Config) -> Path:
+    """The folder of a survey that begins anew, or is resumed with the points that it was planned with.
+
+    Raises:
+        ConfigError: what is asked for does not fit what it holds, or it cannot be made.
+    """
+    run_dir = options.run_dir or default_run_dir(cfg.run.mirror, cfg.run.seed, datetime.now(UTC))
+    has_mission = (run_dir / "mission.sqlite").exists()
+    if has_mission and not options.resume:
+        raise ConfigError(
+            f"--run-dir: {run_dir} holds a mission already; give --resume to go on with it, or another folder"
+        )
+    if options.resume and not has_mission:
+        raise ConfigError(f"--resume: no mission in {run_dir}; name the folder of the run with --run-dir")
+    if options.resume:
+        _check_resumed(run_dir, cfg)
+    return _made(run_dir)
+
+
+def _check_resumed(run_dir: Path, cfg: Config) -> None:
+    """A mission goes on with the points it was planned with."""
+    path = run_dir / "config.toml"
+    if not path.exists():
+        return
+    before = load_config(path)
+    for name, was, wanted in (
+        ("run.mirror", before.mirror.name, cfg.mirror.name),
+        ("run.order", before.run.order, cfg.run.order),
+        ("run.panels", before.run.panels, cfg.run.panels),
+    ):
+        if was != wanted:
+            raise ConfigError(f"--resume: {name} was {was} in {run_dir} and is {wanted} now; resume with what it was")

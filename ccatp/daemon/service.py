@@ -1,0 +1,114 @@
+"""The daemon as a service: ready when the loops have joined, the watchdog stroked while all is well, an end.
+
+Tells the service manager how the daemon fares: the datagrams of ``sd_notify(3)``.
+"""
+
+import contextlib
+import os
+import socket
+from collections.abc import Mapping, MutableMapping
+
+from ccatp.links.liveness import STALE_AFTER_S, Liveness
+from ccatp.links.topics import MissionStatus, Presence
+
+SOCKET, WATCHDOG_USEC, WATCHDOG_PID = "NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"
+
+
+class Notifier:
+    """Sends lines like ``READY=1`` to the service manager, or to nobody where none listens.
+
+    Args:
+        address: its datagram socket: a path, or a name in the abstract namespace behind ``@``; empty for none.
+    """
+
+    def __init__(self, address: str) -> None:
+        self._address = "\0" + address[1:] if address.startswith("@") else address
+        self.is_heard = address.startswith(("@", "/"))
+
+    def send(self, *lines: str) -> None:
+        """Send one datagram. A service manager that is gone or does not read holds nobody up."""
+        if not self.is_heard:
+            return
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as peer:
+            peer.setblocking(False)
+            with contextlib.suppress(OSError):
+                peer.sendto("\n".join(lines).encode(), self._address)
+
+
+def watchdog_period_s(environ: Mapping[str, str]) -> float | None:
+    """How often the service manager wants to hear ``WATCHDOG=1`` from this process; ``None`` where it does not."""
+    text = environ.get(WATCHDOG_USEC, "")
+    if environ.get(WATCHDOG_PID, str(os.getpid())) != str(os.getpid()) or not text.isdecimal() or int(text) == 0:
+        return None
+    return int(text) * 1e-6
+
+
+def take_from(environ: MutableMapping[str, str]) -> tuple[Notifier, float | None]:
+    """Notifier and watchdog period, taken out of the environment: they are not the children's."""
+    notifier, period_s = Notifier(environ.get(SOCKET, "")), watchdog_period_s(environ)
+    for name in (SOCKET, WATCHDOG_USEC, WATCHDOG_PID):
+        environ.pop(name, None)
+    return notifier, period_s
+
+
+STATUS_PERIOD_S = 1.0
+# Strokes in a watchdog period, and the part of it after which silence of a loop withholds them.
+STROKES, STALE_SHARE = 4.0, 0.5
+
+
+class Service:
+    """Tells the service manager what the supervisor hears.
+
+    Args:
+        notifier: to the service manager.
+        watchdog_s: its watchdog's period, ``None`` without one.
+    """
+
+    def __init__(self, notifier: Notifier, watchdog_s: float | None) -> None:
+        """Nothing told yet."""
+        self._notifier, self._watchdog_s = notifier, watchdog_s
+        self._liveness = Liveness(min(STALE_AFTER_S, STALE_SHARE * (watchdog_s or STALE_AFTER_S / STALE_SHARE)))
+        self._is_ready = self._is_troubled = False
+        self._stroked_s = self._told_s = float("-inf")
+        self._text = ""
+
+    def heard(self, presence: Presence) -> None:
+        """A loop is there."""
+        self._liveness.heard(presence)
+
+    def beat(self, now_s: float, status: MissionStatus | None, *, is_recovering: bool = False) -> None:
+        """Tell what is due.
+
+        Args:
+            now_s: time of the machine's monotonic clock.
+            status: where the mission stands, once it is known.
+            is_recovering: the supervisor has just started a process anew; the manager is not to end all of it.
+        """
+        if not self._notifier.is_heard:
+            return
+        if not self._is_ready:
+            if self._liveness.has_joined:
+                self._is_ready = True
+                self._notifier.send("READY=1")
+            return
+        trouble = self._liveness.trouble(now_s)
+        may_stroke = is_recovering or not trouble
+        if self._watchdog_s is not None and may_stroke and now_s - self._stroked_s >= self._watchdog_s / STROKES:
+            self._stroked_s = now_s
+            self._notifier.send("WATCHDOG=1")
+        has_turned, self._is_troubled = bool(trouble) != self._is_troubled, bool(trouble)
+        text = f"trouble: {trouble}" if trouble else _told(status)
+        if text != self._text and (has_turned or now_s - self._told_s >= STATUS_PERIOD_S):
+            self._text, self._told_s = text, now_s
+            self._notifier.send(f"STATUS={text}")
+
+    def stopping(self) -> None:
+        """The run ends."""
+        self._notifier.send("STOPPING=1", "STATUS=holding the wheels and saving")
+
+
+def _told(status: MissionStatus | None) -> str:
+    if status is None:
+        return "joined the robot"
+    cause = f" ({status.cause})" if status.cause else ""
+    return f"{status.state}{cause}, {status.done} of {status.total} points"

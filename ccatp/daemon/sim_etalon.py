@@ -1,0 +1,97 @@
+"""The process of the Etalon stand-in: a MultiLine server over simulated lengths."""
+
+import asyncio
+import os
+import socket
+import sys
+
+import numpy as np
+
+from ccatp.config.models import Config
+from ccatp.core import Vector3
+from ccatp.daemon import realtime as spinning
+from ccatp.daemon.process import die_with_parent, parse_args, stop_on_signals
+from ccatp.errors import ConfigError
+from ccatp.mirror.mirror import build_mirror
+from ccatp.sim.etalon_server import EtalonStandIn, FixedPuck, TruthSource, ZmqPuck
+from ccatp.sim.laser import SEED_STREAM
+
+
+async def _serve(cfg: Config, truth: TruthSource, listener: socket.socket | None, stop: asyncio.Event) -> None:
+    mirror = build_mirror(cfg.mirror)
+    server = EtalonStandIn(
+        cfg.sim.etalon,
+        mirror.channels,
+        mirror.collimators_m,
+        truth,
+        np.random.default_rng([cfg.run.seed, SEED_STREAM]),
+        measuring_time_s=cfg.etalon.measuring_time_s,
+    )
+    try:
+        port = await server.start(cfg.sim.etalon.host, cfg.sim.etalon.port, listener)
+    except OSError as error:
+        at = f"{cfg.sim.etalon.host}:{cfg.sim.etalon.port}"
+        raise ConfigError(
+            f"sim.etalon.port: cannot listen on {at}: {error.strerror}; choose another with --port"
+        ) from error
+    if listener is None:
+        print(f"ccatp: MultiLine stand-in on {cfg.sim.etalon.host}:{port}", file=sys.stderr, flush=True)
+    try:
+        async with asyncio.TaskGroup() as tasks:
+            serving = tasks.create_task(server.serve())
+            await stop.wait()
+            serving.cancel()
+    finally:
+        await server.close()
+
+
+def main() -> int:
+    """Entry of ``python -m ccatp.daemon.sim_etalon``."""
+    die_with_parent()
+    args = parse_args()
+    if not args.is_realtime:
+        spinning.leave_a_core(os.getppid())
+
+    async def run() -> None:
+        stop = asyncio.Event()
+        stop_on_signals(stop)
+        truth = ZmqPuck(args.endpoints.of("puck"))
+        try:
+            await _serve(args.config, truth, socket.socket(fileno=args.listen_fd), stop)
+        finally:
+            truth.close()
+
+    asyncio.run(run())
+    return 0
+
+
+def run_alone(cfg: Config, puck_world_m: Vector3 | None, truth: str | None) -> int:
+    """The stand-in alone, for other people's controllers; ends on SIGINT or SIGTERM.
+
+    Args:
+        cfg: configuration.
+        puck_world_m: a puck that stands still there, world frame; at base where neither this nor ``truth`` is given.
+        truth: ZeroMQ endpoint of a DataLoop that knows where the puck is.
+    """
+
+    async def run() -> None:
+        stop = asyncio.Event()
+        stop_on_signals(stop)
+        if truth is not None:
+            source: ZmqPuck | FixedPuck = ZmqPuck(truth)
+        else:
+            mirror = build_mirror(cfg.mirror)
+            at_base = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m)
+            source = FixedPuck(puck_world_m or at_base, step_s=cfg.etalon.measuring_time_s)
+        try:
+            await _serve(cfg, source, None, stop)
+        finally:
+            if isinstance(source, ZmqPuck):
+                source.close()
+
+    asyncio.run(run())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,203 @@
+"""Streams the runs of a runtime directory live, one after the other, beside whatever else goes on there.
+
+It only listens, and it subscribes once the loops have joined the robot: nobody waits for it or counts on it.
+
+``ccatp stream`` from its options to its end.
+"""
+
+import json
+import os
+import signal
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import FrameType
+
+import msgspec
+import zmq
+
+from ccatp.config.load import load_config
+from ccatp.daemon.process import RUN_DIR_FILE, Endpoints
+from ccatp.errors import ConfigError
+from ccatp.links.bus import Subscriber
+from ccatp.links.runtime_dir import runtime_dir_path
+from ccatp.links.topics import BY_NAME, Message, Presence, schema_of
+from ccatp.mirror.mirror import build_mirror
+from ccatp.records.recorder import read_metadata
+from ccatp.records.recording_repair import TELEMETRY
+from ccatp.report.foxglove import plain_schema
+from ccatp.report.live import FoxgloveStream, PlotJugglerStream, Stream, check_host
+from ccatp.report.views import VIEWS, Shown, Views, view_schemas
+
+# What is shown of the topics themselves; batches are shown as their views.
+PASSED_ON = ("mission", "arrival", "rest", "treatment", "fix", "danger_event")
+TURNED_INTO_VIEWS = ("estimate", "sensors", "fix", "truth", "log")
+LATCHED = frozenset(view.name for view in VIEWS if view.is_latched)
+RUN = "run"
+PERIOD_MS = 20
+
+
+class RunFact(msgspec.Struct):
+    """What runs: the first thing that a viewer wants to know."""
+
+    mirror: str
+    world: str
+    simulation: bool
+    seed: int
+    filter: str
+    run_dir: str
+
+
+def streamed_schemas() -> list[tuple[str, dict[str, object]]]:
+    """Name and schema of every topic that is streamed."""
+    raw = [(name, plain_schema(schema_of(name), f"ccatp.{BY_NAME[name].message.__name__}")) for name in PASSED_ON]
+    return [(RUN, plain_schema(msgspec.json.schema(RunFact), "ccatp.Run")), *raw, *view_schemas()]
+
+
+class Streamer:
+    """Listens to the runs of a runtime directory.
+
+    Args:
+        context: ZeroMQ context of the process.
+        runtime_dir: where the runs are.
+        streams: where they are streamed to.
+        say: tells the user.
+    """
+
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        runtime_dir: Path,
+        streams: Sequence[Stream],
+        say: Callable[[str], None],
+    ) -> None:
+        """Listen for a run."""
+        self._context, self._streams, self._say = context, streams, say
+        self._runtime_dir, self._endpoints = runtime_dir, Endpoints(runtime_dir)
+        self._ear = Subscriber(context, [self._endpoints.of("main")], ["presence.main"])
+        self._run: Subscriber | None = None
+        self._views: Views | None = None
+        self._pid = -1
+
+    def step(self) -> None:
+        """Wait for a moment and pass on what came."""
+        sockets = [self._ear.socket, *([] if self._run is None else [self._run.socket])]
+        poller = zmq.Poller()
+        for socket in sockets:
+            poller.register(socket, zmq.POLLIN)
+        poller.poll(PERIOD_MS)
+        while (received := self._ear.receive()) is not None:
+            if isinstance(received[1], Presence):
+                self._heed(received[1])
+        while self._run is not None and (raw := self._run.receive_raw()) is not None:
+            if isinstance(raw[2], Message):
+                self._pass_on(raw[0], raw[1], raw[2])
+        for stream in self._streams:
+            stream.tend()
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._ear.close()
+        self._forget()
+
+    def _heed(self, presence: Presence) -> None:
+        if presence.pid == self._pid or presence.phase != "joined":
+            return
+        self._forget()
+        try:
+            run_dir = Path((self._runtime_dir / RUN_DIR_FILE).read_text(encoding="utf-8").strip())
+            cfg = load_config(run_dir / "config.toml")
+            is_simulation = read_metadata(run_dir / TELEMETRY).get("simulation") == "true"
+        except (OSError, ConfigError) as error:
+            self._say(f"a run whose configuration cannot be read is not streamed: {error}")
+            return
+        finally:
+            self._pid = presence.pid
+        self._views = Views(build_mirror(cfg.mirror), cfg.robot.puck_height_m)
+        fact = RunFact(
+            cfg.mirror.name, cfg.world.name if is_simulation else "", is_simulation, cfg.run.seed, cfg.run.filter,
+            str(run_dir),
+        )  # fmt: skip
+        self._send((Shown(RUN, 0.0, json.dumps(msgspec.to_builtins(fact)).encode()), *self._views.begin()))
+        names = ("main", "danger", "truth") if is_simulation else ("main", "danger")
+        topics = dict.fromkeys((*PASSED_ON, *TURNED_INTO_VIEWS))
+        self._run = Subscriber(self._context, [self._endpoints.of(name) for name in names], topics)
+        self._say(f"streaming {'SIMULATION of ' if is_simulation else ''}{cfg.mirror.name}, {run_dir}")
+
+    def _pass_on(self, name: str, body: bytes, message: Message) -> None:
+        if name in PASSED_ON:
+            self._send([Shown(name, max(message.t_s, 0.0), body)])
+        if name in TURNED_INTO_VIEWS and self._views is not None:
+            self._send(self._views.of(message))
+
+    def _send(self, messages: Iterable[Shown]) -> None:
+        for shown in messages:
+            for stream in self._streams:
+                stream.send(shown, is_latched=shown.topic == RUN or shown.topic in LATCHED)
+
+    def _forget(self) -> None:
+        if self._run is not None:
+            self._run.close()
+            self._run = None
+
+
+NICENESS = 10
+
+
+def serve(
+    runtime_dir: Path | None,
+    host: str,
+    plotjuggler_port: int | None,
+    foxglove_port: int | None,
+    *,
+    is_open: bool,
+    say: Callable[[str], None],
+) -> int:
+    """Stream until SIGINT or SIGTERM.
+
+    Args:
+        runtime_dir: of the runs, if not the usual one.
+        host: where to listen.
+        plotjuggler_port, foxglove_port: 0 takes any free one, ``None`` serves none.
+        is_open: the host may be another one than this machine.
+        say: tells the user.
+
+    Raises:
+        StreamError: something cannot be served.
+    """
+    check_host(host, is_open=is_open)
+    folder = runtime_dir_path(str(runtime_dir or ""), os.environ)
+    is_over = False
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        nonlocal is_over
+        is_over = True
+
+    with ExitStack() as stack:
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        stack.callback(context.term)
+        streams: list[Stream] = []
+        for stream in _streams(context, host, plotjuggler_port, foxglove_port):
+            stack.callback(stream.close)
+            streams.append(stream)
+            say(f"serving at {stream.where}")
+        streamer = Streamer(context, folder, streams, say)
+        stack.callback(streamer.close)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            stack.callback(signal.signal, number, signal.signal(number, end))
+        os.nice(NICENESS)
+        say(f"waiting for a run in {folder}")
+        while not is_over:
+            streamer.step()
+    return 0
+
+
+def _streams(
+    context: "zmq.Context[zmq.Socket[bytes]]", host: str, plotjuggler_port: int | None, foxglove_port: int | None
+) -> "list[Stream]":
+    found: list[Stream] = []
+    if plotjuggler_port is not None:
+        found.append(PlotJugglerStream(context, host, plotjuggler_port))
+    if foxglove_port is not None:
+        found.append(FoxgloveStream("ccatp", host, foxglove_port, streamed_schemas()))
+    return found

@@ -1,0 +1,239 @@
+"""What a loop hears of the other one: that it is there, and in lockstep what it has to wait for.
+
+A process is seen alive: its presence on the bus, also while it waits for another one.
+"""
+
+import os
+import time
+from collections.abc import Callable
+
+import zmq
+
+from ccatp.core import Verdict
+from ccatp.links.bus import Publisher, Subscriber
+from ccatp.links.topics import Estimate, Message, Presence, last_estimate_before
+
+# In lockstep simulated time stands still while we wait; longer than this the other loop hangs.
+LOCKSTEP_WAIT_S = 10.0
+# How long to wait at a time: in between we are seen alive, and see whether the other one is gone.
+SLICE_S = 0.02
+# Danger is at most a few frames ahead of main: a number far beyond ours is of the robot's last boot.
+MOST_AHEAD = 100
+
+
+def await_message(
+    subscriber: Subscriber, is_it: Callable[[Message | Verdict], bool], on_wait: Callable[[], None]
+) -> None:
+    """Receive messages until the one that lockstep waits for; not for ever, and not for a process that is gone.
+
+    Args:
+        subscriber: watches its publisher.
+        is_it: takes each message; whether it was the one.
+        on_wait: called now and then meanwhile.
+    """
+    deadline = time.monotonic() + LOCKSTEP_WAIT_S
+    while True:
+        received = subscriber.receive(SLICE_S)
+        if received is not None:
+            if is_it(received[1]):
+                return
+        elif subscriber.is_cut or time.monotonic() > deadline:
+            return
+        else:
+            on_wait()
+
+
+class VerdictEar:
+    """Listens to the danger loop.
+
+    Args:
+        context: ZeroMQ context of the process.
+        endpoint: where the danger loop publishes.
+        timeout_s: a verdict older than this is none.
+        on_wait: called now and then while lockstep waits for a verdict.
+    """
+
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        timeout_s: float,
+        on_wait: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Subscribe; the publisher may come up later."""
+        self._subscriber = Subscriber(context, [endpoint], ["verdict", "presence.danger"], is_watching=True)
+        self._timeout_s, self._on_wait = timeout_s, on_wait
+        self._wall_s = 0.0
+        self.verdict: Verdict | None = None
+
+    def is_danger_joined(self) -> bool:
+        """Whether it says that it has joined the robot; it repeats that."""
+        while (received := self._subscriber.receive()) is not None:
+            message = received[1]
+            if isinstance(message, Presence) and message.phase == "joined":
+                return True
+        return False
+
+    def tend(self) -> None:
+        """Keep the connection up where nothing is heard for long."""
+        self._subscriber.tend()
+
+    def forget(self) -> None:
+        """The robot's frames count anew: the verdict in force is of another time."""
+        self.verdict = None
+
+    def hear(self, seq: int, frame_s: float, *, is_lockstep: bool) -> Verdict | None:
+        """The verdict in force: in lockstep that of this very frame, else the newest that is fresh.
+
+        Args:
+            seq: the present frame.
+            frame_s: time between frames.
+            is_lockstep: wait for the verdict on ``seq``.
+        """
+        newest = seq + MOST_AHEAD
+
+        def take(message: Message | Verdict) -> bool:
+            if isinstance(message, Verdict) and message.seq <= newest:
+                self.verdict, self._wall_s = message, time.monotonic()
+                return message.seq >= seq
+            return False
+
+        if not is_lockstep:
+            while (received := self._subscriber.receive()) is not None:
+                take(received[1])
+        elif self.verdict is None or self.verdict.seq < seq:
+            await_message(self._subscriber, take, self._on_wait)
+        verdict = self.verdict
+        if verdict is None or (is_lockstep and verdict.seq < seq):
+            return None
+        age_s = max((seq - verdict.seq) * frame_s, 0.0)
+        if not is_lockstep:
+            age_s = max(age_s, time.monotonic() - self._wall_s)
+        return verdict if age_s <= self._timeout_s else None
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._subscriber.close()
+
+
+class EstimateEar:
+    """Listens to main.
+
+    Args:
+        context: ZeroMQ context of the process.
+        endpoint: where main publishes.
+        on_wait: called now and then while lockstep waits for an estimate.
+        is_taking_over: of the frame that it meets, a process that takes over may have missed the estimate.
+    """
+
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        on_wait: Callable[[], None] = lambda: None,
+        *,
+        is_taking_over: bool = False,
+    ) -> None:
+        """Subscribe; the publisher may come up later."""
+        self._subscriber = Subscriber(context, [endpoint], ["estimate", "presence.main"], is_watching=True)
+        self._on_wait, self._is_taking_over = on_wait, is_taking_over
+        self.forget()
+
+    def is_main_there(self) -> bool:
+        """Whether anything was heard of it."""
+        return self._subscriber.receive() is not None
+
+    def tend(self) -> None:
+        """Keep the connection up where nothing is heard for long."""
+        self._subscriber.tend()
+
+    def forget(self) -> None:
+        """The robot's frames count anew: what was heard is of another time."""
+        self._newest: Estimate | None = None
+        self._judged_frame = self._judged = self._first_seq = -1
+
+    def hear(self, seq: int, *, is_lockstep: bool) -> Estimate | None:
+        """The estimate to judge a frame with: in lockstep always the same one, else the newest.
+
+        Where several waited, after a stall, the newest counts, but the drives of each have moved the wheels:
+        ``commanded`` spans those of all that no frame was judged with.
+
+        Args:
+            seq: the frame.
+            is_lockstep: wait for the estimate that goes with ``seq``.
+        """
+
+        def take(message: Message | Verdict) -> bool:
+            # One of a frame that we have not seen is of the robot's last boot.
+            if not isinstance(message, Estimate) or message.seq > seq + MOST_AHEAD:
+                return False
+            missed = self._newest if self._newest_seq > self._judged else None
+            self._newest = message if missed is None else message.following(missed)
+            return message.seq >= wanted
+
+        if self._first_seq < 0:
+            self._first_seq = seq + self._is_taking_over
+        wanted = last_estimate_before(seq)
+        if not is_lockstep:
+            while (received := self._subscriber.receive()) is not None:
+                take(received[1])
+        elif wanted >= self._first_seq and self._newest_seq < wanted:
+            await_message(self._subscriber, take, self._on_wait)
+        if seq > self._judged_frame:  # an older one is not judged
+            self._judged_frame, self._judged = seq, self._newest_seq
+        return self._newest
+
+    @property
+    def _newest_seq(self) -> int:
+        return -1 if self._newest is None else self._newest.seq
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._subscriber.close()
+
+
+PERIOD_S = 0.1
+
+
+class Pulse:
+    """Tells the presence of one process.
+
+    Args:
+        publisher: the process's publisher.
+        process: its name.
+
+    Attributes:
+        phase: starting, ready, joined, rejoining (the robot is away), done.
+        frame_s: time of the monotonic clock at which the newest frame was served, ``None`` before the first.
+    """
+
+    def __init__(self, publisher: Publisher, process: str) -> None:
+        """Starting."""
+        self._publisher, self._topic, self._process = publisher, f"presence.{process}", process
+        self.phase = "starting"
+        self.frame_s: float | None = None
+        self._count, self._told_s = 0, 0.0
+
+    @property
+    def frame_age_s(self) -> float | None:
+        """Since the newest frame was served."""
+        return None if self.frame_s is None else time.monotonic() - self.frame_s
+
+    def tell(self) -> None:
+        """Tell it now."""
+        self._told_s = now_s = time.monotonic()
+        presence = Presence(
+            seq=self._count,
+            t_s=now_s,
+            process=self._process,
+            pid=os.getpid(),
+            phase=self.phase,
+            frame_age_s=self.frame_age_s,
+        )
+        self._publisher.send(self._topic, presence)
+        self._count += 1
+
+    def tell_if_due(self) -> None:
+        """Tell it if it has been a while."""
+        if time.monotonic() - self._told_s >= PERIOD_S:
+            self.tell()

@@ -1,0 +1,387 @@
+"""The survey of a mirror in the main-loop process: localizer, mission, gate, laser system, fans, store.
+
+What operators are told of a survey's states, and who looks after one that is held for long.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from ccatp.config.models import Config
+from ccatp.control.motion_checks import as_standing
+from ccatp.core import Verdict
+from ccatp.daemon.checkpoints import Keeper, build_parts
+from ccatp.daemon.fix_service import MeasuringDesk, Request
+from ccatp.daemon.frame_service import FanDesk, GateWatch
+from ccatp.daemon.mission_runner import STILL, Drive, Host, Hosting, MakeWork, Progress, Served
+from ccatp.daemon.process import ProcessArgs
+from ccatp.daemon.robot_session import Commanded
+from ccatp.daemon.telemetry import SurveyTeller, Teller
+from ccatp.errors import ExitStatus, UnreachableError
+from ccatp.etalon_client import EtalonClient, EtalonError
+from ccatp.links.robot_messages import Hello, Sensors
+from ccatp.links.topics import is_estimate_due
+from ccatp.records.store import MissionStore
+from ccatp.survey.behaviours import home_time_s
+from ccatp.survey.composition import Parts
+from ccatp.survey.fix_gate import Scrutiny
+from ccatp.survey.reactions import Call, MirrorCheck, Vigil
+from ccatp.survey.route_follower import Motion
+from ccatp.survey.state import Outcome, State, by_reason
+from ccatp.survey.stops import STAND, Order
+
+
+class SurveyWatch:
+    """Tells states, reminds of faults, and sends a robot home that nobody comes for.
+
+    Args:
+        cfg: the configuration.
+        parts: the survey.
+        teller: tells it.
+    """
+
+    def __init__(self, cfg: Config, parts: Parts, teller: Teller) -> None:
+        """Nothing to look after."""
+        self._limits, self._base = cfg.limits, parts.mirror.base_pose
+        self._mission, self._localizer, self._teller = parts.mission, parts.localizer, teller
+        self._vigil = Vigil(cfg, falls=parts.mirror.overhang)
+
+    def keep_vigil(self, sensors: Sensors) -> None:
+        """A fault that nobody looks after: an alarm now and then, and home before the battery is too low for it."""
+        mission, vigil, pose = self._mission, self._vigil, self._localizer.deck_pose
+        knows_place = not (mission.is_lost or self._localizer.is_frozen)
+        home_s = home_time_s(self._base, self._limits, pose.x_m, pose.y_m) if knows_place else None
+        call = vigil.watch(sensors.t, sensors.soc, home_s)
+        if call is Call.REMIND:
+            held_s = vigil.held_s(sensors.t)
+            self._teller.say("error", f"held for {held_s:.0f} s, waiting for an operator: {mission.cause}")
+        elif call is Call.RETURN:
+            mission.abort(f"nobody came, and the battery ({sensors.soc:.0%}) lasts for little more than the way home")
+
+    def tell_state(self, before: State, seq: int) -> None:
+        """The mission's state is another one than before, in frame ``seq``."""
+        mission, teller = self._mission, self._teller
+        if not mission.is_faulted:
+            self._vigil.over()
+        teller.log.debug("state", seq=seq, before=before, after=mission.state, cause=mission.cause)
+        if mission.state in (State.HELD, State.BACKING_OFF) or before is State.HELD:
+            teller.say("warning", state_text(mission.state, mission.cause))
+        if mission.state is State.RETURNING and before is not State.BACKING_OFF:
+            teller.say("warning", f"returning to base: {mission.cause}")
+
+
+def state_text(state: State, cause: str) -> str:
+    """What is said of the state in which a mission is held, or of the one after that."""
+    if cause:
+        return f"{state}: {cause}"
+    return f"{state}" if state in (State.HELD, State.BACKING_OFF, State.DONE) else f"going on: {state}"
+
+
+GIVEN_UP = "the calibration drive is left out, as the robot was held elsewhere: slip and heading are learned on the way"
+EXIT_STATUS = {
+    Outcome.COMPLETE: ExitStatus.COMPLETE,
+    Outcome.AT_BASE: ExitStatus.ABORTED,
+    Outcome.STOPPED: ExitStatus.HELD,
+    Outcome.NONE: ExitStatus.INTERRUPTED,
+}
+
+
+class SurveyWork:
+    """A survey as the main-loop process hosts it.
+
+    Args:
+        cfg: the configuration.
+        host: what the process has for it.
+        parts: the pure parts, built from the configuration.
+        store: the mission's database.
+    """
+
+    def __init__(self, cfg: Config, host: Host, parts: Parts, store: MissionStore) -> None:
+        """Wire the parts."""
+        self._cfg, self._host, self._parts, self._store = cfg, host, parts, store
+        self._mirror, self._localizer, self._gate = parts.mirror, parts.localizer, parts.gate
+        self._mission = mission = parts.mission
+        self._seat, self._clock = host.seat, host.clock
+        self._clock.begin_with(parts.elapsed_s)
+        self._teller = teller = SurveyTeller(host.publisher, host.log)
+        self._gate_watch = GateWatch(self._gate, teller.say)
+        self._fans = FanDesk(cfg.robot.fan_duty, self._seat, mission, teller, has_floor=bool(parts.mirror.overhang))
+        self._commanded = Commanded(cfg.robot, cfg.sim.robot.frame_hz)
+        self._seat.on_drive = self._commanded.sent
+        self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
+        self._measuring = MeasuringDesk(
+            cfg.mission,
+            self._etalon,
+            Scrutiny(parts.mirror, cfg),
+            parts.localizer,
+            mission,
+            store,
+            teller,
+            host.answer,
+            # lockstep time stands still meanwhile
+            lambda: 0.0 if self._seat.is_lockstep else cfg.etalon.measuring_time_s,
+        )
+        self._keeper = Keeper(host.run_dir, parts.localizer, mission, is_patient=host.is_patient)
+        self._watch = SurveyWatch(cfg, parts, teller)
+        self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
+        self._recovery = parts.recovery
+        self._is_deaf = False
+        self._state = State.IDLE
+        self._motion_now: Motion | None = None
+        self._has_told_calibration = False
+        self._told: tuple[tuple[float, float, float, float], int] | None = None
+        # An operator's commands are the mission's; so is what holds it.
+        self.pause, self.resume, self.abort, self.stop = mission.pause, mission.resume, mission.abort, mission.stop
+        self.interrupt, self.lose_sight = mission.interrupt, mission.lose_sight
+
+    @property
+    def teller(self) -> SurveyTeller:
+        """Tells the others."""
+        return self._teller
+
+    @property
+    def cause(self) -> str:
+        """Why it is held."""
+        return self._mission.cause
+
+    @property
+    def is_paused(self) -> bool:
+        """Held until somebody resumes."""
+        return self._mission.is_paused
+
+    @property
+    def is_busy(self) -> bool:
+        """A measurement is under way."""
+        return self._measuring.is_busy
+
+    @property
+    def is_quiet(self) -> bool:
+        """The robot is at rest."""
+        control = self._cfg.control
+        return (
+            abs(self._localizer.speed_m_s) <= control.settle_speed_m_s
+            and abs(self._localizer.rate_rad_s) <= control.settle_rate_rad_s
+        )
+
+    def progress(self) -> Progress:
+        """How far it is."""
+        mission = self._mission
+        stop = mission.journey.current
+        point = stop.point if stop is not None else None
+        if mission.is_paused:
+            point = mission.survey.next_point
+        return Progress(
+            state=str(mission.state),
+            cause=mission.cause,
+            done=len(mission.done) + self._parts.already_done,
+            skipped=len(mission.skipped),
+            total=self._parts.total_points,
+            point=f"{point.row}-{point.col}-{point.point}" if point is not None else "",
+            eta_s=mission.eta_s,
+            error_mm=1e3 * self._measuring.arrival_error_m,
+            outcome=str(mission.outcome),
+            lower_bound_s=self._parts.lower_bound_s,
+            left_out=by_reason(mission.left_out),
+        )
+
+    # -- beside the frames ----------------------------------------------------------------------------------------
+
+    async def connect(self) -> None:
+        """Connect to the laser system.
+
+        Raises:
+            UnreachableError: it does not answer.
+        """
+        try:
+            await self._etalon.connect()
+        except EtalonError as error:
+            raise UnreachableError(str(error)) from error
+
+    def _on_retry(self, error: EtalonError, tries_left: int) -> None:
+        self._teller.log.warning("laser system asked again", error=str(error), tries_left=tries_left)
+
+    async def run(self) -> None:
+        """Take measurements, for ever."""
+        await self._measuring.run()
+
+    async def close(self) -> None:
+        """Close the files and the laser system."""
+        self._keeper.close()
+        await self._etalon.close()
+
+    def check_robot(self, hello: Hello) -> None:
+        """Refuse a robot whose own geometry contradicts the configuration."""
+        self._parts.check_robot(hello)
+
+    def begin_session(self, hello: Hello) -> None:
+        """A session begins."""
+        self._commanded.begin(hello.frame_hz)
+        self._keeper.boot = hello.boot
+        self._fans.begin(hello.robot.fan_floor)
+
+    def greet(self) -> None:
+        """The fans, before the first drive."""
+        self._fans.send()
+
+    def keep(self) -> None:
+        """Write down what a successor needs."""
+        self._keeper.keep(self._clock.seq, self._clock.t_s, self._clock.elapsed_s)
+
+    def settle(self) -> None:
+        """Tell a state that is new, and end where that is the end."""
+        if self._mission.state is not self._state:
+            self._on_state()
+
+    def note_end(self) -> None:
+        """What the gates refused."""
+        self._teller.log.info("gate", denied=self._gate_watch.counts, fans_refused=self._fans.refused)
+
+    # -- the frame ------------------------------------------------------------------------------------------------
+
+    def listen(self, frame: Served) -> None:
+        """The frame's samples go to the localizer, or as much of them as is to be believed."""
+        sensors, mission, localizer = frame.sensors, self._mission, self._localizer
+        self._tell_beginning(sensors)
+        is_deaf = mission.ignores_motion
+        if is_deaf is not self._is_deaf:
+            self._is_deaf = is_deaf
+            self._teller.treatment(sensors.seq, sensors.t, "deaf" if is_deaf else "hearing")
+        imu, enc = ((), as_standing(sensors.enc)) if is_deaf else (sensors.imu, sensors.enc)
+        localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
+        if localizer.hold_requested:
+            # A filter that diverged is frozen until it has a fix.
+            mission.recover(localizer.hold_cause, frame.t_s)
+            localizer.clear_hold()
+        self._motion_now = self._motion(frame) if frame.dt_s > 0.0 else None
+
+    def _tell_beginning(self, sensors: Sensors) -> None:
+        """Where the localizer of a loop that takes over begins: who replays the run has to know."""
+        recovery, self._recovery = self._recovery, None
+        if recovery is not None:
+            pose, sigmas = recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad)
+            values = (pose.x_m, pose.y_m, pose.heading_rad, *sigmas)
+            self._teller.treatment(sensors.seq, sensors.t, "begun", values)
+
+    def _motion(self, frame: Served) -> Motion:
+        localizer, echo = self._localizer, frame.sensors.cmd
+        pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
+        place = pose.x_m, pose.y_m, pose.heading_rad
+        ahead = self._commanded.predictor.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
+        return Motion(
+            frame.t_s, frame.dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead, self._position_sigma_m
+        )
+
+    def _position_sigma_m(self) -> float:
+        return self._localizer.position_sigma_m
+
+    def decide(self, frame: Served, verdict: Verdict | None, lag_s: float) -> Drive:
+        """What the mission wants, as far as the gate lets it through."""
+        mission, motion = self._mission, self._motion_now
+        if motion is None:
+            raise RuntimeError("decide comes after listen, and not for a stale frame")
+        order = mission.step(motion, verdict) if self._is_on_mirror(frame.sensors) else STAND
+        self._heed(frame.sensors)
+        right, left = self._gate.pass_through(order.twist, verdict, motion.dt_s, motion.t_s, lag_s, mission.purpose)
+        self._gate_watch.look(motion.t_s)
+        if order.at_rest or order.measure:
+            self._execute(order, motion)
+        self._note_told(frame)
+        return Drive(right, left)
+
+    def stand(self, frame: Served) -> Drive:
+        """The robot stands, and nothing is decided in this frame."""
+        self._note_told(frame)
+        return STILL
+
+    def _note_told(self, frame: Served) -> None:
+        """What the wheels were told since the last estimate, where one is due."""
+        is_due = frame.is_first or is_estimate_due(frame.sensors.seq)
+        self._told = self._commanded.told() if is_due else None
+
+    def _is_on_mirror(self, sensors: Sensors) -> bool:
+        """Whether the robot may move, as far as gravity knows: it stands on the mirror of the configuration.
+
+        In lockstep the mission begins at once, and ends when gravity contradicts: nothing real can be harmed, and a run
+        stays the same function of its seed.
+        """
+        check = self._mirror_check
+        if check is None:
+            return True
+        if check.hear(sensors.t, sensors.gravity, self._localizer.deck_pose):
+            self._mirror_check = None
+            if check.warning:
+                self._teller.say("warning", check.warning)
+        if check.contradiction:
+            self._teller.say("error", check.contradiction)
+            self._host.finish(ExitStatus.USAGE)
+            return False
+        return self._mirror_check is None or self._seat.is_lockstep
+
+    def _heed(self, sensors: Sensors) -> None:
+        """What the mission wants besides the drive, before that is sent."""
+        mission, health = self._mission, self._cfg.health
+        if mission.doubts_pose:
+            mission.doubts_pose = False
+            doubt = health.doubt_position_m, health.doubt_heading_rad
+            self._localizer.doubt(*doubt)
+            self._teller.treatment(sensors.seq, sensors.t, "doubted", doubt)
+        if mission.wants_calibration and not self._has_told_calibration:
+            self._has_told_calibration = True
+            self._teller.say("warning", GIVEN_UP)
+        if mission.wants_full_fans:
+            self._fans.press_on()  # pressed on first, held then
+        if mission.is_faulted:
+            self._watch.keep_vigil(sensors)
+
+    def _execute(self, order: Order, motion: Motion) -> None:
+        mission, seq = self._mission, self._clock.seq
+        if order.at_rest:
+            self._localizer.rest()
+            self._teller.rest(seq, motion.t_s)
+        if order.arrived is not None:
+            error_m = mission.survey.distance_m(motion.pose)
+            self._teller.arrival(seq, motion.t_s, order.arrived, error_m)
+            self._store.record_arrival(order.arrived, motion.t_s, error_m)
+        if order.measure:
+            pose = self._localizer.deck_pose
+            expected = self._mirror.puck_world(pose, self._cfg.robot.puck_height_m)
+            # The localizer dates a fix by the robot's own clock.
+            t_s = motion.t_s - self._clock.offset_s
+            self._measuring.begin(Request(mission.request, t_s, mission.measuring_point, expected, pose))
+
+    def tell(self, frame: Served) -> None:
+        """The estimate, the checkpoint, a state that is new."""
+        seq, t_s = frame.sensors.seq, frame.sensors.t
+        self._teller.frame(
+            seq, t_s, self._localizer, self._mission.state, frame.raw, self._told, is_first=frame.is_first
+        )
+        self._keeper.frame(seq, t_s, self._clock.elapsed_s)
+        self.settle()
+
+    def _on_state(self) -> None:
+        mission = self._mission
+        before, self._state = self._state, mission.state
+        self._watch.tell_state(before, self._clock.seq)
+        if mission.state is State.DONE:
+            self._host.finish(EXIT_STATUS[mission.outcome])
+        elif mission.is_faulted and self._seat.is_lockstep:
+            # Nobody can be waited for while simulated time runs at many times the wall clock.
+            self._host.finish(EXIT_STATUS[Outcome.STOPPED])
+
+
+def hosting_of(cfg: Config) -> Hosting:
+    """What the process needs of the configuration of a survey."""
+    return Hosting(
+        cfg.robot,
+        cfg.run.realtime_priority,
+        cfg.mission.verdict_timeout_s,
+        cfg.health.clock_jump_s,
+        cfg.sim.robot.frame_hz,
+    )
+
+
+@contextmanager
+def open_survey(args: ProcessArgs) -> Iterator[MakeWork]:
+    """The parts and the database of a survey, new or taken over; what makes the mission of them."""
+    parts, store = build_parts(args)
+    with store:
+        yield lambda host: SurveyWork(args.config, host, parts, store)

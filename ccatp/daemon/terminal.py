@@ -1,0 +1,245 @@
+"""What a run shows on the terminal: progress where there is one, plain lines where there is none.
+
+The report at the end of a run. It never fails the run, and nobody who asked for the end waits for it.
+
+Where a mission stands, for the terminal: a table, and one line.
+"""
+
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import structlog
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from ccatp.config.models import Config
+from ccatp.errors import ExitStatus
+from ccatp.links.liveness import Sparing
+from ccatp.links.topics import MissionStatus, Track
+from ccatp.records.summary import format_table
+
+LINES_OF_A_KIND, LINES_PERIOD_S = 3, 10.0
+STYLES = {"info": "", "warning": "yellow", "error": "bold red"}
+
+
+class _PatientConsole(Console):
+    """A terminal that may go away: the survey goes on without it."""
+
+    def on_broken_pipe(self) -> None:
+        """Say nothing more."""
+        self.quiet = True
+
+    def _check_buffer(self) -> None:
+        try:
+            super()._check_buffer()
+        except OSError:
+            self.quiet = True
+
+
+class RunView:
+    """Progress and messages on standard error; the summary on standard output.
+
+    Args:
+        title: what runs.
+        is_sim: mark it visibly as a simulation.
+        run_dir: where the run is written.
+        goals: what there are so many of to be done.
+    """
+
+    def __init__(self, title: str, *, is_sim: bool, run_dir: Path, goals: str = "points") -> None:
+        """Say what runs."""
+        self._console: Console = _PatientConsole(stderr=True, highlight=False)
+        self._is_terminal = self._console.is_terminal
+        self._sparing = Sparing(LINES_OF_A_KIND, LINES_PERIOD_S)
+        self._has_pose = False
+        self._told_tenths = 0
+        self._goals = goals
+        self._console.print(f"{title}; writing {run_dir}", soft_wrap=True, markup=False)
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[state]}"),
+            console=self._console,
+            auto_refresh=False,
+        )
+        self._task = self._progress.add_task("SIM" if is_sim else goals, total=None, state="starting")
+
+    def __enter__(self) -> "RunView":
+        if self._is_terminal:
+            self._progress.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._is_terminal:
+            self._progress.stop()
+
+    def say(self, level: str, text: str) -> None:
+        """One line for the operator; of those that come again and again a few. ``log.jsonl`` has them all."""
+        told = self._sparing.take(level, text, time.monotonic())
+        if told is not None:
+            self._console.print(f"{level}: {told}", style=STYLES[level], markup=False, soft_wrap=True)
+
+    def pose(self, track: Track) -> None:
+        """The first pose shows that the robot is there."""
+        if not self._has_pose and track.rows:
+            self._has_pose = True
+            _, t_s, row, col, x, y, heading, _ = track.rows[-1]
+            where = f"panel {row}-{col}, x {x:.4f} m, y {y:.4f} m, heading {heading:.4f} rad"
+            self.say("info", f"first pose at {t_s:.2f} s: {where}")
+
+    def status(self, status: MissionStatus) -> None:
+        """Points done, state, ETA, error."""
+        text = self.text_of(status)
+        if self._is_terminal:
+            self._progress.update(self._task, completed=status.done, total=status.total, state=text)
+            self._progress.refresh()
+            return
+        tenths = 10 * status.done // max(status.total, 1)
+        if tenths > self._told_tenths:
+            self._told_tenths = tenths
+            self._console.print(
+                f"{10 * tenths} %: {status.done} of {status.total} {self._goals}, {text}", soft_wrap=True
+            )
+
+    def text_of(self, status: MissionStatus) -> str:
+        """State, place, times, error."""
+        times = f"{_clock(status.elapsed_s)} elapsed, {_clock(status.eta_s)} to go"
+        arrival = f", arrival {status.error_mm:.2f} mm" if status.error_mm else ""
+        return f"{_where(status.state, status.point)}, {times}{arrival}"
+
+    def show_summary(self, summary: dict[str, Any], *, as_json: bool) -> None:
+        """The end: JSON alone on standard output, or a table."""
+        if as_json:
+            json.dump(summary, sys.stdout, indent=1)
+            sys.stdout.write("\n")
+        else:
+            sys.stdout.write(format_table(summary) + "\n")
+        sys.stdout.flush()
+
+    def show_report(self, where: str) -> None:
+        """Where the report is, or why there is none; on standard error, so that JSON stays alone."""
+        self._console.print(f"report  {where}", soft_wrap=True, markup=False)
+
+
+def survey_title(cfg: Config, *, is_sim: bool) -> str:
+    """What runs, of a survey."""
+    what = "SIMULATION" if is_sim else "survey"
+    world = f", world {cfg.world.name}, seed {cfg.run.seed}" if is_sim else ""
+    return f"ccatp {what} of {cfg.mirror.name}{world}, filter {cfg.run.filter}"
+
+
+class BeaconView(RunView):
+    """The same of a mission among beacons."""
+
+    def text_of(self, status: MissionStatus) -> str:
+        """State, place, time, uncertainty."""
+        cause = f" ({status.cause})" if status.cause else ""
+        where = f"{_where(status.state + cause, status.point)}, {_clock(status.elapsed_s)} elapsed"
+        return f"{where}, position known to {0.1 * status.error_mm:.1f} cm"
+
+
+def _where(state: str, point: str) -> str:
+    return f"{state} {point}" if point else state
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02d}"
+
+
+def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.FilteringBoundLogger) -> str:
+    """Write the report of a run that has ended.
+
+    Args:
+        run_dir: the run.
+        status: what it ended with; an interrupted run gets none, because somebody is waiting for the end.
+        log: takes why there is none.
+
+    Returns:
+        Where it is, or why there is none.
+    """
+    by_hand = f"none; make it with: ccatp report {run_dir}"
+    if status is ExitStatus.INTERRUPTED:
+        return by_hand
+    # Nothing of it is needed while the robot moves.
+    from ccatp.records.run_reader import RunReadError  # noqa: PLC0415
+    from ccatp.report.writer import report_run  # noqa: PLC0415
+
+    try:
+        return str(report_run(run_dir).path)
+    except RunReadError as error:
+        return f"none; {error}"
+    except Exception as error:
+        # Whatever it is: the survey is done, and its record is on the disk.
+        log.error("report", error=f"{type(error).__name__}: {error}")
+        return by_hand
+
+
+CODES = {0: "normal", 1: "near the mirror's edge", 2: "operation aborted"}
+BAR = 30
+_SHOWN = 10
+
+
+def clock(seconds: float) -> str:
+    """``1:02:03``, or ``2:03`` below an hour."""
+    minutes, rest = divmod(max(round(seconds), 0), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def share_done(status: Mapping[str, Any]) -> float:
+    """Points that are done with, 0 to 1."""
+    total = int(status.get("total", 0))
+    return (int(status.get("done", 0)) + int(status.get("skipped", 0))) / total if total else 0.0
+
+
+def status_rows(status: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Name and value of each line of the table.
+
+    Args:
+        status: the ``status`` of the operator channel's answer.
+    """
+    done, total, skipped = (int(status.get(key, 0)) for key in ("done", "total", "skipped"))
+    state, point, cause = (str(status.get(key, "")) for key in ("state", "point", "cause"))
+    rows = [("state", f"{state} {point}".strip())]
+    if cause:
+        rows.append(("cause", cause))
+    if outcome := str(status.get("outcome", "")):
+        rows.append(("outcome", outcome))
+    filled = round(BAR * share_done(status))
+    skips = f", {skipped} skipped" if skipped else ""
+    rows.append(("points", f"{done} of {total} measured{skips}  [{'#' * filled}{'.' * (BAR - filled)}]"))
+    elapsed_s, eta_s = float(status.get("elapsed_s", 0.0)), float(status.get("eta_s", 0.0))
+    bound_s = float(status.get("lower_bound_s", 0.0))
+    rows.append(("time", f"{clock(elapsed_s)} elapsed, {clock(eta_s)} to go, no path takes less than {clock(bound_s)}"))
+    error_mm = float(status.get("error_mm", 0.0))  # exactly zero before the first arrival
+    rows.append(("arrival", f"{error_mm:.2f} mm from the last point, as estimated" if error_mm else "none yet"))
+    code = int(status.get("code", 0))
+    rows.append(("danger", f"{code} {CODES.get(code, '')}".strip()))
+    if slips := int(status.get("slips", 0)):
+        rows.append(("late frames", f"{slips}, the latest by {float(status.get('lag_ms', 0.0)):.0f} ms"))
+    rows += [(f"left out: {why}", _named(points)) for why, points in dict(status.get("left_out", {})).items()]
+    if (exit_status := int(status.get("exit_status", -1))) >= 0:
+        rows.append(("over", f"with exit status {exit_status}"))
+    return rows
+
+
+def _named(points: Sequence[str]) -> str:
+    """The first names, and of many how many there are."""
+    names = ", ".join(points[:_SHOWN])
+    return names if len(points) <= _SHOWN else f"{len(points)} points: {names}, ..."
+
+
+def status_line(status: Mapping[str, Any]) -> str:
+    """The same in one line."""
+    what = f"{status.get('state', '')} {status.get('point', '')}".strip()
+    cause = f" ({status['cause']})" if status.get("cause") else ""
+    times = f"{clock(float(status.get('elapsed_s', 0.0)))} elapsed, {clock(float(status.get('eta_s', 0.0)))} to go"
+    points = f"{status.get('done', 0)} of {status.get('total', 0)} points"
+    return f"{100.0 * share_done(status):.0f} %: {points}, {what}{cause}, {times}"

@@ -1,1 +1,0 @@
-"""The operator's web page: what it shows (pure), and how it gets out (edge)."""

@@ -1,0 +1,229 @@
+"""What a fix of the puck says about the robot: its position in a panel frame and how well it is known.
+
+What a fix of the puck says of the full state, and the state that begins anew from one.
+
+How well the position is known: one standard deviation for every direction on the surface.
+"""
+
+from math import isfinite, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.core import DeckPose, Fix, FloatArray, PanelId
+from ccatp.estimation.seams import axes_on
+from ccatp.estimation.state_model import PL, PR, PSI, STATES, TX, TY, A, Slope, V, W, X, Y
+from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.surface import MirrorError
+
+_WORLD_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+class FixRefused(ValueError):
+    """A fix cannot be used; the pose is unchanged. The message carries the numbers."""
+
+
+class FixGated(FixRefused):
+    """A fix contradicts the estimate; measured again it may prove to be right."""
+
+
+class DeckFoot(NamedTuple):
+    """Where the robot's origin stood when a fix was taken.
+
+    Attributes:
+        x_m, y_m: deck frame.
+        covariance_m2: of the two, shape (2, 2).
+        deviation_m: height of the surface there above the ideal one.
+    """
+
+    x_m: float
+    y_m: float
+    covariance_m2: FloatArray
+    deviation_m: float
+
+
+class Foot(NamedTuple):
+    """Where the robot's origin stood when a fix was taken.
+
+    Attributes:
+        x_m, y_m: in the panel frame.
+        variance_m2: mean variance of the two.
+        deviation_m: height of the surface there above the ideal one.
+    """
+
+    x_m: float
+    y_m: float
+    variance_m2: float
+    deviation_m: float
+
+
+def check_fix(fix: Fix, oldest_s: float, newest_s: float) -> None:
+    """Refuse a fix that is not finite or of a time for which the robot's path is not known.
+
+    Raises:
+        FixRefused: with the numbers.
+    """
+    if not all(isfinite(v) for v in (fix.t_s, *fix.position_m, *fix.covariance_m2)):
+        raise FixRefused(f"fix is not finite: {fix.position_m} m at {fix.t_s} s")
+    if not oldest_s <= fix.t_s <= newest_s:
+        raise FixRefused(f"fix of {fix.t_s:.3f} s is outside the known path, {oldest_s:.3f} s to {newest_s:.3f} s")
+
+
+def foot_of_fix(mirror: Mirror, fix: Fix, puck_height_m: float, panel: PanelId) -> Foot:
+    """Foot of the puck on the surface, in the frame of ``panel``.
+
+    The puck stands ``puck_height_m`` above the robot's origin along the surface normal. Of the fix's covariance only
+    the part along the surface counts: half its trace without the normal's share.
+
+    Raises:
+        FixRefused: the position is far from the mirror, or its covariance has no positive part along the surface.
+    """
+    try:
+        x, y, deviation = mirror.foot_of_puck(fix.position_m, puck_height_m)
+    except MirrorError as error:
+        raise FixRefused(f"fix at {fix.position_m} m has no foot on the mirror: {error}") from error
+    normal = np.array(mirror.rotate_world_from_deck(mirror.surface.normal(x, y)))
+    covariance = np.array(fix.covariance_m2, dtype=np.float64).reshape(3, 3)
+    variance = 0.5 * float(np.trace(covariance) - normal @ covariance @ normal)
+    if not variance > 0.0:
+        raise FixRefused(f"fix has the variance {variance:.3g} m^2 along the surface")
+    foot = mirror.panel_pose(panel, DeckPose(x, y, 0.0))  # the heading plays no part
+    return Foot(foot.x_m, foot.y_m, variance, deviation)
+
+
+def deck_foot(mirror: Mirror, fix: Fix, puck_height_m: float) -> DeckFoot:
+    """Foot of the puck on the surface, deck frame, with its whole covariance along the surface.
+
+    An error along the normal leaves the foot where it is, so the fix's covariance is projected along the normal on the
+    deck plane: ``J = [[1, 0, -nx/nz], [0, 1, -ny/nz]]``, ``J R^T C R J^T``.
+
+    Raises:
+        FixRefused: the position is far from the mirror, or its covariance has no positive part along the surface.
+    """
+    try:
+        x, y, deviation = mirror.foot_of_puck(fix.position_m, puck_height_m)
+    except MirrorError as error:
+        raise FixRefused(f"fix at {fix.position_m} m has no foot on the mirror: {error}") from error
+    fx, fy = mirror.surface.gradient(x, y)
+    # The normal is along (-fx, -fy, 1).
+    J = np.array([[1.0, 0.0, fx], [0.0, 1.0, fy]])
+    rotation = np.array([mirror.rotate_deck_from_world(axis) for axis in _WORLD_AXES]).T
+    onto = J.dot(rotation)
+    covariance: FloatArray = onto.dot(np.array(fix.covariance_m2, dtype=np.float64).reshape(3, 3)).dot(onto.T)
+    if not (covariance[0, 0] > 0.0 and np.linalg.det(covariance) > 0.0):
+        raise FixRefused(f"fix has the covariance {covariance.ravel().tolist()} m^2 along the surface")
+    return DeckFoot(x, y, covariance, deviation)
+
+
+_UNKNOWN_SPEEDS = 0.1**2, 0.5**2, 1.0**2  # variances of v, a, w of a robot of which nothing is known
+
+
+def fix_row(z: FloatArray, mean: FloatArray, slope: Slope, late_s: float) -> tuple[FloatArray, FloatArray]:
+    """Residual (2,) and row of the measurement model (2, n) of a position.
+
+    Args:
+        z: the robot's origin by the puck, deck, m, shape (2,).
+        mean: the state, shape (n,).
+        slope: the ground under it.
+        late_s: by how much the state is later than the position; V and W held meanwhile.
+    """
+    H = np.zeros((2, STATES))
+    H[0, X] = H[1, Y] = H[0, TX] = H[1, TY] = 1.0
+    residual = z - mean[[X, Y]] - mean[[TX, TY]]
+    if late_s == 0.0:
+        return residual, H
+    v, w = float(mean[V]), float(mean[W])
+    hx, hy, lx, ly = axes_on(slope, float(mean[PSI]) - 0.5 * w * late_s)
+    way = v * late_s
+    H[:, PSI] = -way * lx, -way * ly
+    H[:, V] = -late_s * hx, -late_s * hy
+    H[:, W] = -0.5 * late_s * H[:, PSI]
+    return residual + way * np.array((hx, hy)), H
+
+
+def begun_anew(
+    mean: FloatArray,
+    covariance: FloatArray,
+    residual: FloatArray,
+    variance: FloatArray,
+    tilt_variance_m2: float,
+    heading_variance_rad2: float,
+    *,
+    is_lost: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (n,) and covariance (n, n) of a state whose position was wrong; wheel angles count from here.
+
+    The heading loses its certainty, not its value. The way since the position was measured is taken from the estimate
+    that was wrong: wrong about where it began, not about what the wheels did.
+
+    Args:
+        mean: the wrong state, shape (n,).
+        covariance: of it, shape (n, n).
+        residual: of the position, shape (2,); see ``fix_row``.
+        variance: covariance of the position, m^2, shape (2, 2).
+        tilt_variance_m2: of what the panel's tilt does to the puck's place, each way.
+        heading_variance_rad2: what the heading's variance grows by.
+        is_lost: the filter has stood still meanwhile; the speeds are not known either.
+    """
+    x, P = mean.copy(), covariance.copy()
+    heading_rad2 = float(P[PSI, PSI]) + heading_variance_rad2
+    new = [X, Y, PSI, PR, PL, TX, TY, *((V, A, W) if is_lost else ())]
+    P[new, :] = 0.0
+    P[:, new] = 0.0
+    P[:2, :2], P[PSI, PSI] = variance, heading_rad2
+    P[[X, Y, TX, TY], [X, Y, TX, TY]] += tilt_variance_m2
+    P[[X, Y, TX, TY], [TX, TY, X, Y]] -= tilt_variance_m2
+    x[:2] += residual + x[[TX, TY]]
+    x[[PR, PL, TX, TY]] = 0.0
+    if is_lost:
+        x[[V, A, W]] = 0.0
+        P[V, V], P[A, A], P[W, W] = _UNKNOWN_SPEEDS
+    return x, P
+
+
+class PositionSigma:
+    """Standard deviation of the position along any one direction.
+
+    Slip and a heading error last from one fix to the next, so their contributions grow with the travel, not with its
+    root: sigma^2 = fix^2 + (slip_fraction s)^2 + (integral of sigma_theta ds)^2.
+
+    Args:
+        sigma_m: at the start, m.
+        slip_fraction: part of the travel by which the wheels may err.
+    """
+
+    def __init__(self, sigma_m: float, slip_fraction: float) -> None:
+        self._slip_fraction = slip_fraction
+        self._known_m2 = sigma_m**2
+        self._along_m = 0.0
+        self._across_m = 0.0
+
+    @property
+    def sigma_m(self) -> float:
+        """The standard deviation, m."""
+        return sqrt(self._variance_m2)
+
+    def travel(self, distance_m: float, heading_sigma_rad: float) -> None:
+        """The robot moved on by ``distance_m`` >= 0 at a heading known to ``heading_sigma_rad``."""
+        self._along_m += self._slip_fraction * distance_m
+        self._across_m += heading_sigma_rad * distance_m
+
+    def growth_m2(self, distance_m: float, heading_sigma_rad: float) -> float:
+        """Variance that a displacement of ``distance_m`` alone brings in, m^2."""
+        return distance_m**2 * (self._slip_fraction**2 + heading_sigma_rad**2)
+
+    def widen(self, sigma_m: float) -> None:
+        """Add an independent error of ``sigma_m``."""
+        self._known_m2 += sigma_m**2
+
+    def fuse(self, variance_m2: float) -> float:
+        """Fuse a measured position of ``variance_m2`` > 0; returns its weight, 0 to 1."""
+        prior = self._variance_m2
+        gain = prior / (prior + variance_m2)
+        self._known_m2 = gain * variance_m2
+        self._along_m = self._across_m = 0.0
+        return gain
+
+    @property
+    def _variance_m2(self) -> float:
+        return self._known_m2 + self._along_m**2 + self._across_m**2

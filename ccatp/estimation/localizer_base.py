@@ -1,0 +1,186 @@
+"""What every localizer does with a frame before it looks inside: order of time, holds, divergence.
+
+The panel under the robot, and poses in its frame.
+"""
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Sequence
+from math import atan2, cos, sin, sqrt
+from typing import Generic, TypeVar
+
+from ccatp.control.motion_checks import ImuGate, WheelMeans
+from ccatp.core import EdgeSample, GravitySample, ImuSample, PanelId, PanelPose, WheelSample
+from ccatp.estimation.sample_validation import BACKWARD_LIMIT, FrameClock, FrameKind, SampleIntake
+from ccatp.estimation.state_model import Slope
+from ccatp.filters.base import FilterDiverged
+from ccatp.mirror.mirror import Mirror
+
+Taken = TypeVar("Taken")
+
+
+class FrameReceiver(ABC, Generic[Taken]):
+    """Admits frames in their order, asks to hold where they or the filter go wrong.
+
+    Args:
+        history_s: samples older than this before their frame are refused.
+
+    Attributes:
+        counts: what was refused or used, by name.
+        hold_cause: why the mission should hold, or empty; stays until ``clear_hold``.
+        is_frozen: the filter has diverged; the pose stands still until the next fix.
+        notices: what an operator should read; whoever reads them empties the list.
+    """
+
+    def __init__(self, history_s: float) -> None:
+        self.counts: dict[str, int] = Counter()
+        self.hold_cause = ""
+        self.is_frozen = False
+        self.notices: list[str] = []
+        self._clock = FrameClock()
+        self._intake = SampleIntake(history_s, self.counts)
+        self._guard: tuple[ImuGate, WheelMeans] | None = None
+
+    def guard(self, gate: ImuGate, means: WheelMeans, largest_rate_rad_s: float) -> None:
+        """From now on leave out inertial samples that the gate does not believe, and wheels faster than any is."""
+        self._guard = gate, means
+        self._intake.largest_rate_rad_s = largest_rate_rad_s
+
+    @property
+    def t_s(self) -> float:
+        """Robot time to which the pose belongs: that of the last frame used; -inf before the first."""
+        return self._clock.t_s
+
+    @property
+    def hold_requested(self) -> bool:
+        """Whether the mission should hold."""
+        return bool(self.hold_cause)
+
+    def clear_hold(self) -> None:
+        """Forget the cause for a hold; one that persists comes back."""
+        self.hold_cause = ""
+
+    def step(
+        self,
+        t_s: float,
+        imu: Sequence[ImuSample],
+        encoders: Sequence[WheelSample],
+        edges: Sequence[EdgeSample],
+        gravity: GravitySample | None = None,
+    ) -> None:
+        """Take one sensors frame.
+
+        Any number of samples of each kind, each with its own time, oldest first. Unusable ones are dropped and counted;
+        a frame that is not newer than the last one changes nothing.
+
+        Args:
+            t_s: the frame's time, robot clock, s; the pose belongs to it afterwards.
+            imu: samples of the inertial unit since the last frame.
+            encoders: samples of the wheel encoders since the last frame.
+            edges: samples of the edge sensors since the last frame.
+            gravity: direction of gravity in the robot frame, where it was read; the thesis's localizer does without.
+        """
+        last_s, kind = self._clock.t_s, self._clock.admit(t_s)
+        dt_s = t_s - last_s if kind is FrameKind.NEXT else 0.0
+        if kind is FrameKind.RESYNC:
+            if self._guard is not None:
+                self._guard[0].reset()
+            self._resync(t_s, last_s)
+        elif kind is not FrameKind.NEXT:
+            self.counts[f"{kind.value}_frames"] += 1
+            if self._clock.stale_run >= BACKWARD_LIMIT:
+                self._ask_to_hold("time stamps of the frames run backward")
+            return
+        if self._guard is not None:
+            imu = self._believed(imu, encoders, dt_s)
+        taken = self._take(t_s, imu, encoders)
+        if self._intake.backward_source:
+            self._ask_to_hold(f"time stamps of the {self._intake.backward_source} run backward")
+            self._intake.backward_source = ""
+        if self.is_frozen:
+            return
+        try:
+            self._use(t_s, dt_s, taken, edges, gravity)
+        except FilterDiverged as error:
+            self._freeze(error)
+
+    def _believed(self, imu: Sequence[ImuSample], encoders: Sequence[WheelSample], dt_s: float) -> Sequence[ImuSample]:
+        if self._guard is None:
+            return imu
+        gate, means = self._guard
+        means.take(encoders, dt_s)
+        believed = gate.admit(imu, means.yaw_rad_s) if imu else imu
+        if len(believed) != len(imu):
+            self.counts["imu_doubted"] += len(imu)
+        return believed
+
+    def _freeze(self, error: FilterDiverged) -> None:
+        self.is_frozen = True
+        self.counts["diverged"] += 1
+        self._ask_to_hold(f"filter: {error}")
+
+    def _ask_to_hold(self, cause: str) -> None:
+        self.hold_cause = self.hold_cause or cause
+
+    @abstractmethod
+    def _resync(self, t_s: float, last_s: float) -> None:
+        """Go on in a new time base that begins at ``t_s``; ``last_s`` is the end of the old one, -inf at the start."""
+
+    @abstractmethod
+    def _take(self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample]) -> Taken:
+        """The usable samples of a frame; wheels are counted even while the filter is frozen."""
+
+    @abstractmethod
+    def _use(
+        self, t_s: float, dt_s: float, taken: Taken, edges: Sequence[EdgeSample], gravity: GravitySample | None
+    ) -> None:
+        """Bring the filter to ``t_s``, ``dt_s`` after the last frame (0 in a new time base). May diverge."""
+
+
+_NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under the robot is looked up
+
+
+class PanelFrame:
+    """The panel under the robot, and poses in its frame.
+
+    Args:
+        mirror: the mirror.
+        panel: where the robot is first.
+    """
+
+    def __init__(self, mirror: Mirror, panel: PanelId) -> None:
+        self._mirror = mirror
+        self.enter(panel)
+
+    def enter(self, panel: PanelId) -> None:
+        """Give poses in the frame of ``panel`` from now on."""
+        found = self._mirror.panel(panel)
+        self.panel = panel
+        self._origin = found.origin
+        (self._ax, self._ay, self._az), (self._bx, self._by, self._bz) = found.axes[:2]
+        self._cx, self._cy = found.x_m, found.y_m
+        self._near_x, self._near_y = _NEAR_BORDER * found.half_x_m, _NEAR_BORDER * found.half_y_m
+
+    def hand_over(self, x: float, y: float) -> None:
+        """The robot is at this deck point."""
+        if abs(x - self._cx) > self._near_x or abs(y - self._cy) > self._near_y:
+            panel = self._mirror.panel_at(x, y)
+            if panel is not None and panel != self.panel:
+                self.enter(panel)
+
+    def pose(self, deck: tuple[float, float, float], height_m: float, slope: Slope) -> PanelPose:
+        """A deck pose (x, y, heading) on a surface of this height and slope, as ``Mirror.panel_pose``."""
+        x, y, psi = deck
+        ox, oy, oz = self._origin
+        px, py, pz = x - ox, y - oy, height_m - oz
+        fx, fy = slope[0], slope[1]
+        s2 = 1.0 + fx * fx
+        s, norm = sqrt(s2), sqrt(s2 + fy * fy)
+        c, d = cos(psi), sin(psi)
+        hx, hy = c / s - d * fx * fy / (norm * s), d * s / norm
+        along, across = self.along(hx, hy, fx * hx + fy * hy)
+        return PanelPose(self.panel, *self.along(px, py, pz), atan2(across, along))
+
+    def along(self, dx: float, dy: float, dz: float) -> tuple[float, float]:
+        """Components of a deck vector along the panel's axes."""
+        return self._ax * dx + self._ay * dy + self._az * dz, self._bx * dx + self._by * dy + self._bz * dz

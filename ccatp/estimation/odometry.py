@@ -1,0 +1,267 @@
+"""Dead reckoning: the arc driven in one step, and the path driven lately.
+
+The odometer's frame is arbitrary but rigid: neither a fix nor a hand-over between panels moves it, so displacements
+and turns between two recent times can be read off it whatever happened to the pose in between.
+
+The pose between two steps of the filter, carried on frame by frame from what the wheels do.
+
+Frames gathered into one step of the filter.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from math import cos, hypot, sin, sqrt
+from typing import NamedTuple
+
+from ccatp.core import FloatArray, ImuSample
+from ccatp.estimation.state_model import C, Slope
+
+_STILL_M = 2e-5
+_STILL_RAD = 1e-4
+_SMALL_RAD = 1e-4
+
+
+class Place(NamedTuple):
+    """Position (m) and heading (rad) in the odometer's frame."""
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+
+
+def arc_step(v_m_s: float, heading_rad: float, turn_rad: float, dt_s: float) -> tuple[float, float]:
+    """Displacement over one step at constant speed and rate.
+
+    The chord of the arc: v dt sinc(turn/2) in the direction heading + turn/2. For a small step it becomes
+    (v dt cos theta, v dt sin theta), which is what thesis eq. 2.14 means; the thesis prints ``v cos(theta dt)``, with
+    the time step inside the cosine and missing on the speed.
+
+    Args:
+        v_m_s: mean forward speed, m/s.
+        heading_rad: heading at the beginning, rad.
+        turn_rad: turn over the step, rad.
+        dt_s: duration, s.
+
+    Returns:
+        (dx, dy), m, in the frame of the heading.
+    """
+    half = 0.5 * turn_rad
+    # Below _SMALL_RAD the series 1 - half^2/6 is exact to the last digit, and 0/0 is avoided.
+    chord = v_m_s * dt_s * (sin(half) / half if abs(half) > _SMALL_RAD else 1.0 - half * half / 6.0)
+    return chord * cos(heading_rad + half), chord * sin(heading_rad + half)
+
+
+class Odometer:
+    """The path of the last ``history_s``, and the whole of the standstill before it.
+
+    A standstill keeps two entries however long it lasts, so a fix that took its time is still found.
+
+    Args:
+        history_s: how far back the path is kept while the robot moves.
+    """
+
+    def __init__(self, history_s: float) -> None:
+        self._history_s = history_s
+        self._path: deque[tuple[float, Place]] = deque()
+        self.place = Place(0.0, 0.0, 0.0)
+
+    def start(self, t_s: float) -> None:
+        """Begin at ``t_s``; a second call moves the time base and keeps the path."""
+        if not self._path:
+            self._path.append((t_s, self.place))
+            return
+        shift = t_s - self._path[-1][0]
+        self._path = deque((t + shift, place) for t, place in self._path)
+
+    def advance(self, t_s: float, v_m_s: float, turn_rad: float, dt_s: float) -> None:
+        """Drive one step that ends at ``t_s``: mean speed m/s, turn rad, duration s."""
+        here = self.place
+        dx, dy = arc_step(v_m_s, here.heading_rad, turn_rad, dt_s)
+        self.place = Place(here.x_m + dx, here.y_m + dy, here.heading_rad + turn_rad)
+        path = self._path
+        if len(path) > 1 and _is_still(path[-2][1], self.place):
+            path[-1] = (t_s, self.place)
+        else:
+            path.append((t_s, self.place))
+        oldest = t_s - self._history_s
+        while len(path) > 2 and path[1][0] < oldest:
+            path.popleft()
+
+    @property
+    def oldest_s(self) -> float:
+        """The earliest time that ``at`` knows."""
+        return self._path[0][0] if self._path else float("inf")
+
+    def at(self, t_s: float) -> Place:
+        """Place at ``t_s``, linear between steps; outside the kept path its nearest end."""
+        later = None
+        for entry in reversed(self._path):
+            if entry[0] <= t_s:
+                return entry[1] if later is None else _between(entry, later, t_s)
+            later = entry
+        return later[1] if later is not None else self.place
+
+
+def _is_still(a: Place, b: Place) -> bool:
+    return hypot(b.x_m - a.x_m, b.y_m - a.y_m) < _STILL_M and abs(b.heading_rad - a.heading_rad) < _STILL_RAD
+
+
+def _between(early: tuple[float, Place], late: tuple[float, Place], t_s: float) -> Place:
+    (t0, a), (t1, b) = early, late
+    part = (t_s - t0) / (t1 - t0)
+    return Place(*(p + part * (q - p) for p, q in zip(a, b, strict=True)))
+
+
+class RunningPose:
+    """Deck pose and speeds at the present frame: the filter's state at its last step, and dead reckoning since.
+
+    Same motion as ``SurveyMotion``, with slip, scale errors and ground as the filter knew them at its last step; a few
+    hundredths of a second later nothing else is worth knowing.
+
+    The speeds come from an observer of fixed gain: the filter's acceleration carries the speed on, the wheels' travel
+    corrects it by as much as their resolution is worth; the rate is the mean of wheels and gyroscope by their noise.
+
+    Args:
+        wheel_radius_m: nominal.
+        wheel_base_m: nominal.
+        jerk_density_m2_s5: by how much the acceleration changes.
+    """
+
+    def __init__(self, wheel_radius_m: float, wheel_base_m: float, jerk_density_m2_s5: float) -> None:
+        self._radius_m, self._base_m = wheel_radius_m, wheel_base_m
+        self._jerk_density_m2_s5 = jerk_density_m2_s5
+        self._noise = (0.0, 0.0, 0.0)
+        self._speed_gain = self._gyro_share = 0.0
+        self.x_m = self.y_m = self.heading_rad = self.v_m_s = self.omega_rad_s = 0.0
+        self.creep_x = self.creep_y = 0.0
+
+    def begin(self, mean: FloatArray, slope: Slope, half_s: float) -> None:
+        """The filter has taken a step of which ``half_s`` is half the length; its mean speed belongs to the middle."""
+        state: list[float] = mean[: C + 1].tolist()
+        x, y, psi, v, a, w, self._bias, scale, _, s_r, s_l, k_l, c = state
+        self.x_m, self.y_m, self.heading_rad = x, y, psi
+        self._a = a
+        self.v_m_s, self.omega_rad_s = v + a * half_s, w
+        self._per_scale = 1.0 / (1.0 + scale)
+        self._right_m, self._left_m = self._radius_m * (1.0 - s_r), self._radius_m * (1.0 - s_l)
+        self._per_base = 1.0 / (self._base_m * (1.0 + k_l))
+        fx, fy, fxx, fxy, _, gx, gy = slope
+        s2 = 1.0 + fx * fx
+        s = sqrt(s2)
+        norm = sqrt(s2 + fy * fy)
+        self._along, self._ex, self._ey = 1.0 / s, -fx * fy / (norm * s), s / norm
+        self._k1, self._k2 = fy * fxx / (s2 * norm), fy * fxy / (s2 * norm)
+        self.creep_x, self.creep_y = c * gx, c * gy
+
+    def trust(self, angle_variance_rad2: float, rate_variance_rad2_s2: float, dt_s: float) -> None:
+        """Noise of one wheel's travel in a frame of ``dt_s``, and of a sample of the gyroscope."""
+        noise = angle_variance_rad2, rate_variance_rad2_s2, dt_s
+        if noise == self._noise:
+            return
+        self._noise = noise
+        radius_dt2 = (self._radius_m / dt_s) ** 2
+        process, variance = self._jerk_density_m2_s5 * dt_s**3, 0.5 * radius_dt2 * angle_variance_rad2
+        # Steady state of the scalar Kalman filter.
+        prior = 0.5 * (process + sqrt(process * (process + 4.0 * variance)))
+        self._speed_gain = prior / (prior + variance)
+        turning = 2.0 * radius_dt2 * angle_variance_rad2 / self._base_m**2
+        self._gyro_share = turning / (turning + rate_variance_rad2_s2)
+
+    def stand(self) -> None:
+        """The robot is at rest."""
+        self.v_m_s = self.omega_rad_s = self._a = 0.0
+
+    def advance(self, dt_s: float, right_rad: float, left_rad: float, rate_rad_s: float | None) -> None:
+        """A frame of ``dt_s`` in which the wheels turned so far; the gyroscope's last sample, where there is one."""
+        right, left = right_rad * self._right_m, left_rad * self._left_m
+        d, turn = 0.5 * (right + left), (right - left) * self._per_base
+        middle = self.heading_rad + 0.5 * turn
+        cosine, sine = cos(middle), sin(middle)
+        way = d if d >= 0.0 else -d
+        dx = d * (cosine * self._along + sine * self._ex) + way * self.creep_x
+        dy = d * sine * self._ey + way * self.creep_y
+        self.x_m += dx
+        self.y_m += dy
+        self.heading_rad += turn - self._k1 * dx - self._k2 * dy
+        speed = self.v_m_s + self._a * dt_s
+        self.v_m_s = speed + self._speed_gain * (d / dt_s - speed) if dt_s else speed
+        rate = turn / dt_s if dt_s else self.omega_rad_s
+        if rate_rad_s is not None:
+            rate += self._gyro_share * ((rate_rad_s - self._bias) * self._per_scale - rate)
+        self.omega_rad_s = rate
+
+
+class Block(NamedTuple):
+    """What some frames in a row say together.
+
+    Attributes:
+        dt_s: their length.
+        turning_s: how long of it the wheels turned.
+        rate_rad_s: mean of the inertial unit's angular rate over the block; None without samples.
+        acceleration_m_s2: mean of its acceleration from the middle of the block before to the middle of this one.
+        samples: how many went into the means.
+    """
+
+    dt_s: float
+    turning_s: float
+    rate_rad_s: float | None
+    acceleration_m_s2: float | None
+    samples: int
+
+
+class BlockBuilder:
+    """Gathers frames.
+
+    Wheel angles are exact over any time, and a mean of n rates tells as much as n rates, so nothing is lost by taking
+    several frames in one step as long as the path between them is an arc. V and W are means over a step: the mean rate
+    is that of the samples by the trapezoid rule, the difference of two mean speeds is the mean acceleration from middle
+    to middle.
+    """
+
+    def __init__(self) -> None:
+        self._last: tuple[float, float] | None = None  # acceleration and rate at the end of the last frame
+        self._before: float | None = None  # mean acceleration of the last block
+        self._clear()
+
+    def _clear(self) -> None:
+        self.dt_s = self._turning_s = self._rates = self._accelerations = 0.0
+        self._samples = 0
+
+    def restart(self) -> None:
+        """The robot's clock has jumped, or it has been at rest: nothing reaches across."""
+        self._last = self._before = None
+        self._clear()
+
+    def stand(self, imu: Sequence[ImuSample]) -> None:
+        """A frame at rest: its sample is where the trapezoid of the first moving frame begins."""
+        self._last = (imu[-1][1], imu[-1][2]) if imu else None
+        self._before = None
+
+    def add(self, dt_s: float, *, is_turning: bool, imu: Sequence[ImuSample]) -> None:
+        """Take a frame of length ``dt_s``; of the inertial unit its last sample."""
+        self.dt_s += dt_s
+        if is_turning:
+            self._turning_s += dt_s
+        if not imu:
+            self._last = None
+            return
+        _, ax, wz = imu[-1]
+        last = self._last
+        if last is not None:
+            self._accelerations += last[0] + ax
+            self._rates += last[1] + wz
+            self._samples += 1
+        self._last = (ax, wz)
+
+    def take(self) -> Block:
+        """The block so far; gathering begins anew."""
+        n = self._samples
+        rate = acceleration = None
+        if n:
+            rate, acceleration = 0.5 * self._rates / n, 0.5 * self._accelerations / n
+        before, self._before = self._before, acceleration
+        if acceleration is not None and before is not None:
+            acceleration = 0.5 * (before + acceleration)
+        block = Block(self.dt_s, self._turning_s, rate, acceleration, n)
+        self._clear()
+        return block

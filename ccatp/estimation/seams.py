@@ -1,0 +1,394 @@
+"""Heading from panel crossings, thesis 2.1.5: the entering angle seen by a pair of edge sensors.
+
+Seams as position measurements: where an edge sensor changes its value, it stands over a panel's edge.
+"""
+
+from collections.abc import Sequence
+from math import atan2, cos, hypot, inf, pi, sin, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.config.models import LocalizerConfig, RobotConfig
+from ccatp.core import DeckPose, EdgeSample, FloatArray, PanelId, PanelPose, rotate
+from ccatp.estimation.odometry import Odometer, Place
+from ccatp.estimation.state_model import E0, E1, PSI, STATES, A, Slope, V, W, X
+from ccatp.mirror.layout import Seam
+from ccatp.mirror.mirror import Mirror
+
+_PAIRS = ((0, 1), (2, 3))  # front, rear: (left, right) in the order of EdgeSample
+# An edge is taken for a seam where the sensor is expected within this part of a panel's size from one. Whatever else
+# an edge can be (the rim, the next seam) is at least ten times further.
+_REACH = 0.05
+_UNIFORM = 1.0 / 12.0  # variance of a uniform distribution over one interval
+
+
+class Transition(NamedTuple):
+    """One edge sensor changed its value.
+
+    Attributes:
+        t_s: middle between the last sample of the old value and the first of the new one.
+        interval_s: time between those two samples.
+        corner: index of the sensor: front-left, front-right, rear-left, rear-right.
+        is_on: the new value.
+    """
+
+    t_s: float
+    interval_s: float
+    corner: int
+    is_on: bool
+
+
+class EdgeScanner:
+    """Finds the transitions in the stream of edge samples. Samples that are not newer than the last are skipped."""
+
+    def __init__(self) -> None:
+        self._t_s = -inf
+        self._values: tuple[int, ...] = ()
+
+    def restart(self) -> None:
+        """Forget the last sample: the robot's clock has jumped."""
+        self._t_s = -inf
+        self._values = ()
+
+    def scan(self, edges: Sequence[EdgeSample]) -> list[Transition]:
+        """Transitions of a frame, oldest first; normally none."""
+        found: list[Transition] = []
+        last, values = self._t_s, self._values
+        for sample in edges:
+            t = sample[0]
+            if not last < t < inf:
+                continue
+            if sample[1:] != values:
+                if values:
+                    found.extend(_transitions(last, values, sample))
+                values = sample[1:]
+            last = t
+        self._t_s, self._values = last, values
+        return found
+
+
+def _transitions(last_s: float, values: tuple[int, ...], sample: EdgeSample) -> list[Transition]:
+    t = sample[0]
+    return [
+        Transition(0.5 * (last_s + t), t - last_s, corner, bool(new))
+        for corner, (old, new) in enumerate(zip(values, sample[1:], strict=True))
+        if old != new
+    ]
+
+
+def heading_from_pair(
+    left: Place, right: Place, left_xy: tuple[float, float], right_xy: tuple[float, float], normal_rad: float
+) -> tuple[float, float, float]:
+    """Heading of the robot when two of its sensors have crossed the same straight line.
+
+    Both sensors stood on the line, so the vector between the two crossings, the sensors' own offset included, lies
+    along it. In the robot frame at the right sensor's crossing that vector is
+    ``u = R(turn) left_xy - right_xy + displacement``, and with the line's normal at angle phi::
+
+        theta + atan2(u_y, u_x) = phi + pi/2   (mod pi)
+
+    In pure translation u = (s_left - s_right, w) and this is ``theta = phi + atan((s_left - s_right)/w)``, thesis eq.
+    2.15 and 2.16 with a sign: positive travel is forward, so one formula holds for every edge, driven forward or in
+    reverse, whichever sensor is first. A turn between the two crossings is taken from the odometer.
+
+    Args:
+        left: odometer place at the crossing of the left sensor.
+        right: odometer place at the crossing of the right sensor.
+        left_xy: the left sensor in the robot frame, m.
+        right_xy: the right sensor in the robot frame, m.
+        normal_rad: phi, direction of the line's normal, either side.
+
+    Returns:
+        heading at the right sensor's crossing, rad, in the frame of ``normal_rad``, known modulo pi; |u|, m; and the
+        component of u across the robot, m.
+    """
+    turn = left.heading_rad - right.heading_rad
+    dx, dy = rotate(left.x_m - right.x_m, left.y_m - right.y_m, -right.heading_rad)
+    lx, ly = rotate(*left_xy, turn)
+    ux, uy = lx + dx - right_xy[0], ly + dy - right_xy[1]
+    return normal_rad + 0.5 * pi - atan2(uy, ux), hypot(ux, uy), abs(uy)
+
+
+class _Mark(NamedTuple):
+    """One sensor's last crossing of an edge of one kind."""
+
+    t_s: float
+    interval_s: float
+    place: Place
+    seam: Seam
+    x_m: float
+    y_m: float
+
+
+class HeadingFix(NamedTuple):
+    """A heading seen at a seam: how much it exceeds the estimate (rad) and its variance (rad^2)."""
+
+    innovation_rad: float
+    variance_rad2: float
+
+
+class CrossingDetector:
+    """Turns transitions of the edge sensors into headings.
+
+    Both edges of a gap and both pairs count: up to four headings per seam. A heading is only taken where both sensors
+    of a pair crossed the same seam in the same sense, and between the two the robot moved on in near-pure translation.
+
+    Args:
+        mirror: where the seams are.
+        robot: where the sensors are.
+        cfg: limits and timing of a crossing.
+    """
+
+    def __init__(self, mirror: Mirror, robot: RobotConfig, cfg: LocalizerConfig) -> None:
+        self._mirror = mirror
+        self._sensors = robot.edge_sensors_m
+        self._cfg = cfg
+        self._scanner = EdgeScanner()
+        self._marks: dict[tuple[int, bool], _Mark] = {}
+        self._disturbed_s = -inf
+        panel = next(iter(mirror.panels.values()))
+        self._reach_m = _REACH * 2.0 * min(panel.half_x_m, panel.half_y_m)
+
+    def restart(self) -> None:
+        """Forget everything seen: the robot's clock has jumped."""
+        self._scanner.restart()
+        self._marks.clear()
+        self._disturbed_s = -inf
+
+    def scan(self, t_s: float, v_m_s: float, omega_rad_s: float, edges: Sequence[EdgeSample]) -> list[Transition]:
+        """Note the motion at ``t_s`` and return the transitions of the frame, normally none."""
+        if abs(omega_rad_s) > self._cfg.crossing_max_rate_rad_s or abs(v_m_s) < self._cfg.crossing_min_speed_m_s:
+            self._disturbed_s = t_s
+        return self._scanner.scan(edges)
+
+    def headings(
+        self, transitions: Sequence[Transition], odometer: Odometer, pose: PanelPose, deck: DeckPose, v_m_s: float
+    ) -> list[HeadingFix]:
+        """Headings completed by these transitions.
+
+        Args:
+            transitions: of this frame.
+            odometer: advanced to this frame.
+            pose: estimated pose now.
+            deck: the same in the deck frame; decides which seam a sensor crossed.
+            v_m_s: forward speed.
+        """
+        found = []
+        for transition in transitions:
+            mark = self._mark(transition, odometer, deck)
+            if mark is None:
+                continue
+            self._marks[transition.corner, transition.is_on] = mark
+            fix = self._complete(_PAIRS[transition.corner // 2], transition.is_on, odometer.place, pose, v_m_s)
+            if fix is not None:
+                found.append(fix)
+        return found
+
+    def _complete(
+        self, pair: tuple[int, int], is_on: bool, now: Place, pose: PanelPose, v_m_s: float
+    ) -> HeadingFix | None:
+        left, right = self._marks.get((pair[0], is_on)), self._marks.get((pair[1], is_on))
+        if left is None or right is None or not self._belong_together(left, right):
+            return None
+        del self._marks[pair[0], is_on], self._marks[pair[1], is_on]
+        x, y = 0.5 * (left.x_m + right.x_m), 0.5 * (left.y_m + right.y_m)
+        normal = self._mirror.seam_normal_angle(pose.panel, left.seam.axis, x, y)
+        left_xy, right_xy = self._sensors[pair[0]], self._sensors[pair[1]]
+        heading, length, across = heading_from_pair(left.place, right.place, left_xy, right_xy, normal)
+        estimate = pose.heading_rad + right.place.heading_rad - now.heading_rad
+        innovation = (heading - estimate + 0.5 * pi) % pi - 0.5 * pi
+        travel = hypot(left.place.x_m - right.place.x_m, left.place.y_m - right.place.y_m)
+        timing = self._timing_variance(left) + self._timing_variance(right)
+        # An error e of the travel turns u by e * across / |u|^2.
+        variance = (v_m_s**2 * timing + (self._cfg.slip_fraction * travel) ** 2) * (across / length**2) ** 2
+        return HeadingFix(innovation, variance)
+
+    def _mark(self, transition: Transition, odometer: Odometer, pose: DeckPose) -> _Mark | None:
+        x, y = self._mirror.body_offset(pose, *self._sensors[transition.corner])
+        seam = self._mirror.nearest_seam(x, y)
+        if seam is None or abs(seam.distance_m) > self._reach_m:
+            return None
+        place = odometer.at(transition.t_s)
+        # The point on the seam, for the direction of its tangent: the crossed coordinate is known from the map.
+        on_seam = (seam.position_m, y) if seam.axis == "x" else (x, seam.position_m)
+        return _Mark(transition.t_s, transition.interval_s, place, seam, *on_seam)
+
+    def _belong_together(self, left: _Mark, right: _Mark) -> bool:
+        same = left.seam.axis == right.seam.axis and abs(left.seam.position_m - right.seam.position_m) < self._reach_m
+        return same and min(left.t_s, right.t_s) > self._disturbed_s
+
+    def _timing_variance(self, mark: _Mark) -> float:
+        """Variance of a transition's time, s^2: as configured, but never better than its sampling interval."""
+        return max(self._cfg.crossing_time_sigma_s**2, mark.interval_s**2 * _UNIFORM)
+
+
+class HeadingGate:
+    """Refuses a heading that does not fit the estimate, unless a second one bears it out.
+
+    A single false crossing is one that nothing agrees with. Two in a row that agree with each other show that the
+    estimate is wrong and its variance too small; without this a confident filter would refuse every true heading
+    from then on.
+
+    Args:
+        gate_sigma: largest deviation in common standard deviations.
+    """
+
+    def __init__(self, gate_sigma: float) -> None:
+        self._gate_sigma = gate_sigma
+        self._refused: HeadingFix | None = None
+
+    def extra_variance(self, seen: HeadingFix, prior_rad2: float) -> float | None:
+        """Variance (rad^2) by which the estimate has to be widened before it takes ``seen``; None = refused.
+
+        Args:
+            seen: heading against the estimate.
+            prior_rad2: variance of the estimate.
+        """
+        if self._is_within(seen.innovation_rad, seen.variance_rad2 + prior_rad2):
+            self._refused = None
+            return 0.0
+        before, self._refused = self._refused, seen
+        if before is None:
+            return None
+        apart = seen.innovation_rad - before.innovation_rad
+        # The estimate's own drift from one crossing to the next is part of what the two may differ by.
+        if not self._is_within(apart, seen.variance_rad2 + before.variance_rad2 + prior_rad2):
+            return None
+        self._refused = None
+        return seen.innovation_rad**2
+
+    def _is_within(self, deviation_rad: float, variance_rad2: float) -> bool:
+        return abs(deviation_rad) <= self._gate_sigma * sqrt(variance_rad2)
+
+
+# An edge is taken for a seam where the sensor is expected within this part of a panel's size from one; whatever else it
+# can be (the rim, the next seam) is at least ten times further.
+_TIMING_FLOOR_M2 = 1e-10  # (10 um)^2: the sensor's own repeatability, UNVERIFIED
+
+
+class Edge(NamedTuple):
+    """A panel's edge that a sensor has crossed.
+
+    Attributes:
+        k: the deck axis across it, 0 or 1.
+        position_m: where the map has it, along that axis.
+        offset: index of the state that holds how far it lies from there.
+        is_new: it was not crossed before, its offset is unknown.
+    """
+
+    k: int
+    position_m: float
+    offset: int
+    is_new: bool
+
+
+class Line(NamedTuple):
+    """One sensor over one edge: ``sensor - edge - offset = 0`` along one axis.
+
+    Attributes:
+        residual_m: zero minus the expectation.
+        H: row of the measurement model, shape (1, n).
+        variance_m2: of the sensor's place at the transition.
+    """
+
+    residual_m: float
+    H: FloatArray
+    variance_m2: float
+
+
+class SeamLines:
+    """Turns transitions of the edge sensors into lines.
+
+    An edge lies some tenths of a millimetre from where the map has it, but all four sensors cross the same edge: its
+    offset is a state, so that what they say *against each other* (heading, travel from front to rear) counts with the
+    precision of the timing, and only what they say together with that of the map.
+
+    Args:
+        mirror: where the seams are.
+        robot: where the sensors are.
+    """
+
+    def __init__(self, mirror: Mirror, robot: RobotConfig) -> None:
+        self._mirror = mirror
+        self._sensors = robot.edge_sensors_m
+        panel = next(iter(mirror.panels.values()))
+        self._reach_m = _REACH * 2.0 * min(panel.half_x_m, panel.half_y_m)
+        self._half = {"x": panel.half_x_m, "y": panel.half_y_m}
+        self._edges: dict[int, tuple[str, float, PanelId]] = {}
+
+    def forget(self) -> None:
+        """The pose was found anew: the offsets belong to another one."""
+        self._edges.clear()
+
+    def meet(self, transition: Transition, t_s: float, x: FloatArray, slope: Slope) -> Edge | None:
+        """Which edge a transition belongs to; None where no seam is near.
+
+        Args:
+            transition: one sensor's.
+            t_s: time of the state, s.
+            x: state, shape (n,).
+            slope: of the surface under the robot.
+        """
+        place, (along_x, along_y), _ = self._sensor(transition, t_s, x, slope)
+        seam = self._mirror.nearest_seam(*place)
+        if seam is None or abs(seam.distance_m) > self._reach_m:
+            return None
+        k = 0 if seam.axis == "x" else 1
+        speed = (along_x, along_y)[k]
+        edge_m, panel = self._edge(seam.axis, seam.position_m, place, is_high=(speed > 0.0) is transition.is_on)
+        state = E1 if transition.is_on else E0
+        edge = (seam.axis, edge_m, panel)
+        is_new = self._edges.get(state) != edge
+        self._edges[state] = edge
+        return Edge(k, edge_m, state, is_new)
+
+    def line(self, edge: Edge, transition: Transition, t_s: float, x: FloatArray, slope: Slope) -> Line:
+        """What a transition over ``edge`` says about the state; arguments as in ``meet``."""
+        place, speeds, (forward, left, lever) = self._sensor(transition, t_s, x, slope, edge.k)
+        late_s = t_s - transition.t_s
+        v = float(x[V]) - float(x[A]) * late_s
+        H = np.zeros((1, STATES))
+        row = H[0]
+        row[X + edge.k] = 1.0
+        row[PSI] = lever - v * late_s * left
+        row[V] = -late_s * forward
+        row[A] = late_s * late_s * forward
+        row[W] = -late_s * row[PSI]
+        row[edge.offset] = -1.0
+        variance = (speeds[edge.k] * transition.interval_s) ** 2 * _UNIFORM + _TIMING_FLOOR_M2
+        return Line(edge.position_m + float(x[edge.offset]) - place[edge.k], H, variance)
+
+    def _sensor(
+        self, transition: Transition, t_s: float, x: FloatArray, slope: Slope, k: int = 0
+    ) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float, float]]:
+        """Place (m) and velocity (m/s) of a sensor at its transition; along axis k: heading, left, lever of a turn."""
+        late_s = t_s - transition.t_s
+        ox, oy = self._sensors[transition.corner]
+        x_m, y_m, psi, v, a, w = x[:6].tolist()
+        v -= a * late_s
+        hx, hy, lx, ly = axes_on(slope, psi - w * late_s)
+        # A point of the body moves by v h, and by w times its lever turned by a quarter.
+        turn_x, turn_y = ox * lx - oy * hx, ox * ly - oy * hy
+        place = x_m - v * late_s * hx + ox * hx + oy * lx, y_m - v * late_s * hy + ox * hy + oy * ly
+        velocity = v * hx + w * turn_x, v * hy + w * turn_y
+        return place, velocity, ((hx, lx, turn_x) if k == 0 else (hy, ly, turn_y))
+
+    def _edge(self, axis: str, position_m: float, place: tuple[float, float], is_high: bool) -> tuple[float, PanelId]:
+        """The edge above (``is_high``) or below a seam's centre line, and its panel."""
+        k = 0 if axis == "x" else 1
+        inside = [place[0], place[1]]
+        inside[k] = position_m + (self._half[axis] if is_high else -self._half[axis])
+        panel = self._mirror.panels[self._mirror.nearest_panel(*inside)]
+        centre = (panel.x_m, panel.y_m)[k]
+        return centre - self._half[axis] if is_high else centre + self._half[axis], panel.id
+
+
+def axes_on(slope: Slope, psi: float) -> tuple[float, float, float, float]:
+    """Deck components (hx, hy, lx, ly) of the robot's x and y axes, as ``Mirror.body_axes``."""
+    fx, fy = slope[0], slope[1]
+    s2 = 1.0 + fx * fx
+    s, norm = sqrt(s2), sqrt(s2 + fy * fy)
+    ex, ey = -fx * fy / (norm * s), s / norm
+    c, d = cos(psi), sin(psi)
+    return c / s + d * ex, d * ey, c * ex - d / s, c * ey

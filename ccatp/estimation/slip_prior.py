@@ -1,0 +1,242 @@
+"""The book of legs: what the legs driven so far say of the slip and the creep of the next one.
+
+What the legs driven so far tell about the next one: means and scatter of what each leg draws anew.
+"""
+
+from collections.abc import Sequence
+from math import exp, log
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.config.models import FullStateConfig
+from ccatp.core import FloatArray
+from ccatp.estimation.state_model import SL, SR, C
+
+# Candidates for the scatter, from "does not change" to "anything goes"; a factor of sqrt(2) apart.
+_CANDIDATES = tuple(1e-7 * 2.0 ** (k / 2.0) for k in range(38))
+_FORGETTING = 0.99  # of the likelihoods per leg, so that a world that changes is noticed within a hundred legs
+_LEAST = 1e-14
+
+
+class Population:
+    """Bayes for parameters that are drawn anew for each leg from N(mu_j, sigma^2): sigma common, all unknown.
+
+    After a leg its estimate y_j with variance R_j is one sample: y_j ~ N(mu_j, sigma^2 + R_j). Given sigma, the means
+    follow by the Kalman equations; each candidate of a grid of sigmas has means of its own and the weight that its
+    predictions have earned. So one set of constants serves a floor on which wheels never slip and one on which each leg
+    slips differently: what the mixture expects of the next leg is what the filter is given.
+
+    Args:
+        expected: of each parameter, mean and standard deviation of mu before the first leg.
+        largest: the largest scatter thought possible; candidates beyond it are left out.
+
+    Attributes:
+        means: expectation of each parameter in the next leg.
+        mean_variances: how well they are known.
+        scatter: the expectation of sigma^2, which is what the next leg will show of it.
+    """
+
+    def __init__(self, expected: Sequence[tuple[float, float]], largest: float) -> None:
+        self._sigmas = [s for s in _CANDIDATES if s <= largest]
+        # Either the wheels hold, which is the smallest candidate, or they slip, and then nothing is known of the scale
+        # but its limits: its logarithm is uniform. Before the first leg one is as likely as the other.
+        self._prior = [log(max(len(self._sigmas) - 1, 1)), *[0.0] * (len(self._sigmas) - 1)]
+        self._logs = [0.0] * len(self._sigmas)
+        self._means = [[mean] * len(self._sigmas) for mean, _ in expected]
+        self._variances = [[sigma * sigma] * len(self._sigmas) for _, sigma in expected]
+        self.means = self.mean_variances = [0.0] * len(expected)
+        self.scatter = 0.0
+        self._mix()
+
+    def learn(self, samples: Sequence[tuple[float, float] | None], share: float = 1.0) -> None:
+        """Take what a leg says of its parameters.
+
+        Args:
+            samples: of each parameter the estimate, and the variance that the leg's own measurements give it, without
+                the prior; None where the leg says nothing of it.
+            share: of sigma^2 in them: more than one where the parameters also wander within the leg.
+        """
+        self._logs = [_FORGETTING * likelihood for likelihood in self._logs]
+        for sample, means, variances in zip(samples, self._means, self._variances, strict=True):
+            if sample is None:
+                continue
+            value, variance = sample
+            for k, sigma in enumerate(self._sigmas):
+                known, e = variances[k], value - means[k]
+                total = known + share * sigma * sigma + variance
+                self._logs[k] -= 0.5 * (e * e / total + log(total))
+                means[k] += known / total * e
+                variances[k] = max(known * (1.0 - known / total), _LEAST)
+        top = max(self._logs)
+        self._logs = [likelihood - top for likelihood in self._logs]
+        self._mix()
+
+    def _mix(self) -> None:
+        logs = [a + b for a, b in zip(self._logs, self._prior, strict=True)]
+        top = max(logs)
+        weights = [exp(value - top) for value in logs]
+        total = sum(weights)
+        weights = [weight / total for weight in weights]
+        self.means = [sum(w * m for w, m in zip(weights, means, strict=True)) for means in self._means]
+        self.mean_variances = [
+            sum(w * (v + (m - mixed) ** 2) for w, m, v in zip(weights, means, variances, strict=True))
+            for mixed, means, variances in zip(self.means, self._means, self._variances, strict=True)
+        ]
+        self.scatter = sum(w * s * s for w, s in zip(weights, self._sigmas, strict=True))
+
+
+# A leg that has not narrowed the prior by more than rounding (variance after / before) has nothing to teach.
+_TAUGHT = 0.9999
+# var(s_R - s_L) over var((s_R + s_L)/2), both wheels drawing from one population.
+_DIFFERENCE = 4.0
+
+# Parameters (mean slip, difference of the slips, creep) out of the states (SR, SL, C), and back.
+_PARAMETERS = np.array([[0.5, 0.5, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+_STATES = np.linalg.inv(_PARAMETERS)
+_WHERE = [SR, SL, C]
+
+
+class Redraw(NamedTuple):
+    """Transition of (right slip, left slip, creep) from one leg to the next: ``s' = F (s - found) + mean + e``.
+
+    Attributes:
+        found: the last leg's expectation, shape (3,).
+        F: what the next leg keeps of the deviations, shape (3, 3).
+        mean: the next leg's expectation, shape (3,).
+        Q: covariance of e, shape (3, 3).
+    """
+
+    found: FloatArray
+    F: FloatArray
+    mean: FloatArray
+    Q: FloatArray
+
+
+class _Parameter:
+    """One parameter: leg by leg it is m + d, the mean m unknown with variance v, d drawn anew with variance scatter."""
+
+    __slots__ = ("beta", "mean", "prior", "variance")
+
+    def __init__(self, mean: float, sigma: float) -> None:
+        self.mean, self.variance = mean, sigma * sigma
+        self.prior = (mean, sigma * sigma)
+        self.beta = 1.0
+
+    def pass_on(self, found: float, known: float, old_scatter: float, scatter: float) -> tuple[float, float]:
+        """From a leg's posterior (mean ``found``, variance ``known``) to the next leg's prior.
+
+        The leg's parameter tells of m by the share beta = v / (v + scatter) of what was not known of it.
+
+        Returns:
+            beta, and the variance of what the next leg's parameter has of its own.
+        """
+        beta = self.variance / (self.variance + old_scatter)
+        own = self.variance * (1.0 - beta)
+        self.mean += beta * (found - self.mean)
+        self.variance = own + beta * beta * known
+        self.beta = beta
+        self.prior = (self.mean, self.variance + scatter)
+        return beta, own + scatter
+
+
+class LegBook:
+    """Carries slip and creep from leg to leg.
+
+    Right and left slip are taken apart into their mean (what the distance shows) and their difference (what the
+    heading shows). Both wheels draw from one population, so both tell how much legs differ. Where legs hardly differ,
+    the next leg keeps the state and all its correlations; where each leg slips differently, it begins with the mean of
+    all legs. How much they differ is learned (``Population``); creep varies by a share of itself.
+
+    Args:
+        cfg: what is expected before the first leg.
+    """
+
+    def __init__(self, cfg: FullStateConfig) -> None:
+        # Half the difference of two draws scatters as their mean does.
+        expected = (cfg.slip_mean, cfg.slip_sigma), (0.0, 0.5 * cfg.slip_difference_sigma)
+        self._slip_scatter = Population(expected, cfg.slip_scatter_max)
+        self._parameters = (
+            _Parameter(cfg.slip_mean, cfg.slip_sigma),
+            _Parameter(0.0, cfg.slip_difference_sigma),
+            _Parameter(0.0, cfg.creep_sigma),
+        )
+        self._creep_share = cfg.creep_scatter_share**2
+        self._scatters = self._learned()
+        self._wander = cfg.wander_fraction**2 / cfg.wander_time_s
+        self._wandered = 0.0  # variance of the mean slip's wander in this leg, part of the scatter
+        self._is_open = False
+
+    def _learned(self) -> tuple[float, float, float]:
+        slip, creep = self._slip_scatter.scatter, self._parameters[2]
+        return slip, _DIFFERENCE * slip, self._creep_share * (creep.mean * creep.mean + creep.variance)
+
+    @property
+    def scatter(self) -> tuple[float, float]:
+        """Learned standard deviation from leg to leg of the mean slip and of the creep."""
+        return self._scatters[0] ** 0.5, self._scatters[2] ** 0.5
+
+    def first(self) -> tuple[FloatArray, FloatArray]:
+        """Prior of (right slip, left slip, creep) before the first leg: mean (3,), covariance (3, 3)."""
+        self._open()
+        means, variances = [], []
+        for parameter, scatter in zip(self._parameters, self._scatters, strict=True):
+            parameter.prior = (parameter.mean, parameter.variance + scatter)
+            means.append(parameter.mean)
+            variances.append(parameter.variance + scatter)
+        return _STATES.dot(np.array(means)), (_STATES * variances).dot(_STATES.T)
+
+    def begin(self, mean: FloatArray, covariance: FloatArray) -> Redraw:
+        """A leg begins; the state before it, mean (n,) and covariance (n, n), ends the last one."""
+        states = mean[_WHERE]
+        found = _PARAMETERS.dot(states)
+        known = _PARAMETERS.dot(covariance[np.ix_(_WHERE, _WHERE)]).dot(_PARAMETERS.T).diagonal()
+        before, self._scatters = self._scatters, self._learned()
+        betas, owns = [], []
+        for k, parameter in enumerate(self._parameters):
+            beta, own = parameter.pass_on(float(found[k]), float(known[k]), before[k], self._scatters[k])
+            betas.append(beta)
+            owns.append(own)
+        self._open()
+        means = np.array([parameter.mean for parameter in self._parameters])
+        F, Q = (_STATES * betas).dot(_PARAMETERS), (_STATES * owns).dot(_STATES.T)
+        return Redraw(states, F, _STATES.dot(means), Q)
+
+    def _open(self) -> None:
+        self._is_open = True
+        self._wandered = 0.0
+
+    def wander(self, dt_s: float) -> tuple[float, float]:
+        """Slip (of each wheel) and creep wander within the leg for a step of ``dt_s``: by which variance."""
+        per_step = self._wander * dt_s
+        self._wandered += per_step
+        return 2.0 * per_step * self._scatters[0], per_step * self._scatters[2]
+
+    def end(self, mean: FloatArray, covariance: FloatArray) -> None:
+        """A fix has ended the leg: learn how much legs differ from the state after it, (n,) and (n, n)."""
+        if not self._is_open:
+            return
+        self._is_open = False
+        found = _PARAMETERS.dot(mean[_WHERE])
+        known = _PARAMETERS.dot(covariance[np.ix_(_WHERE, _WHERE)]).dot(_PARAMETERS.T).diagonal()
+        wander = self._wandered * self._scatters[0]
+        alone = []
+        for k, (scale, weight) in enumerate(((1.0, 1.0), (0.5, _DIFFERENCE))):
+            expected, variance = self._parameters[k].prior
+            says = _leg_alone((expected, variance + weight * wander), (float(found[k]), float(known[k])))
+            alone.append(None if says is None else (scale * says[0], scale * scale * says[1]))
+        if any(alone):
+            self._slip_scatter.learn(alone, 1.0 + self._wandered)
+
+    def forget_leg(self) -> None:
+        """The leg's measurements are not to be trusted."""
+        self._is_open = False
+
+
+def _leg_alone(prior: tuple[float, float], posterior: tuple[float, float]) -> tuple[float, float] | None:
+    """What the leg alone says, (estimate, variance): the posterior divided by the prior, both Gaussian; or nothing."""
+    (m0, p0), (m1, p1) = prior, posterior
+    if not 0.0 < p1 < _TAUGHT * p0:
+        return None
+    information = 1.0 / p1 - 1.0 / p0
+    return (m1 / p1 - m0 / p0) / information, 1.0 / information

@@ -1,0 +1,399 @@
+"""What is done to the full-state filter: steps of the motion, rests, legs, seams, fixes; and done again."""
+
+from math import sqrt
+
+import numpy as np
+
+from ccatp.config.models import LocalizerConfig, RobotConfig
+from ccatp.core import DeckPose, FloatArray, PanelId, difference
+from ccatp.estimation.fixes import begun_anew, fix_row
+from ccatp.estimation.measurements import RestReading, heading_from_gravity
+from ccatp.estimation.odometry import Block
+from ccatp.estimation.replay_buffer import Journal, Step
+from ccatp.estimation.seams import Edge, SeamLines, Transition
+from ccatp.estimation.slip_prior import LegBook, Redraw
+from ccatp.estimation.state_model import (
+    BA,
+    BG,
+    E0,
+    E1,
+    KG,
+    KL,
+    PL,
+    PR,
+    PSI,
+    SL,
+    SR,
+    STATES,
+    TX,
+    TY,
+    A,
+    Affine,
+    C,
+    SensorRows,
+    Slope,
+    SurveyMotion,
+    Terrain,
+    V,
+    W,
+    X,
+    Y,
+)
+from ccatp.estimation.wheel_angles import WheelAngle
+from ccatp.filters.base import Filter, Innovation
+from ccatp.mirror.mirror import Mirror
+
+_STOP_ROWS = np.eye(STATES)[[V, A, W]]
+_DRAWN = [SR, SL, C]
+_WHERE_DRAWN = np.ix_(_DRAWN, _DRAWN)
+
+
+class SurveyFilter:
+    """The filter, the model and the journal. Each public method but the questions is one thing that happens to it.
+
+    Everything that changes the filter goes through ``_do``, which notes it for the replay after a late fix.
+
+    Args:
+        filter_: an extended or unscented filter of ``STATES`` states.
+        mirror: the mirror's geometry.
+        robot: wheel and sensor geometry.
+        cfg: noise model.
+        counts: of what was used and refused; counted on here.
+        start: deck pose at the first frame, at rest.
+    """
+
+    def __init__(
+        self,
+        filter_: Filter,
+        mirror: Mirror,
+        robot: RobotConfig,
+        cfg: LocalizerConfig,
+        counts: dict[str, int],
+        start: DeckPose,
+    ) -> None:
+        self.innovation: Innovation | None = None
+        self.journal = Journal(cfg.full_state.rewind_s)
+        self._filter, self._counts = filter_, counts
+        self._is_again = False
+        self._cfg, self._full = cfg, cfg.full_state
+        self._mirror, self._terrain = mirror, Terrain(mirror)
+        self._motion = SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m)
+        self._rows = SensorRows()
+        self._drift = np.zeros(STATES)
+        self._seams = SeamLines(mirror, robot)
+        self._legs = LegBook(self._full)
+        self._tilt_sigma_m = robot.puck_height_m * cfg.full_state.panel_tilt_sigma_rad
+        self._gravity_deck = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
+        self._start(start)
+
+    def _start(self, pose: DeckPose) -> None:
+        self._filter.reset(*self._first(pose))
+        self._panel = self._panel_below()
+
+    def _first(self, pose: DeckPose) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance of who knows a pose and nothing else."""
+        cfg, full = self._cfg, self._full
+        mean, sigma = np.zeros(STATES), np.zeros(STATES)
+        mean[[X, Y, PSI]] = pose.x_m, pose.y_m, pose.heading_rad
+        mean[BG] = cfg.gyroscope_bias_rad_s
+        sigma[[X, Y]] = cfg.start_position_sigma_m
+        sigma[PSI] = cfg.start_heading_sigma_rad
+        sigma[[V, A, W]] = cfg.reset_speed_sigma_m_s, cfg.reset_acceleration_sigma_m_s2, cfg.reset_rate_sigma_rad_s
+        sigma[BG], sigma[KG] = full.gyroscope_bias_sigma_rad_s, full.gyroscope_scale_sigma
+        sigma[BA], sigma[KL] = full.accelerometer_bias_sigma_m_s2, full.wheel_base_sigma
+        sigma[[E0, E1]], sigma[[TX, TY]] = full.edge_sigma_m, self._tilt_sigma_m
+        P = np.diag(sigma**2)
+        mean[_DRAWN], P[_WHERE_DRAWN] = self._legs.first()
+        return mean, P
+
+    @property
+    def mean(self) -> FloatArray:
+        """Of the state, shape (n,); see ``survey_model``."""
+        return self._filter.mean
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of the state, shape (n, n)."""
+        return self._filter.covariance
+
+    def slope(self) -> Slope:
+        """The ground under the estimated position."""
+        mean = self._filter.mean
+        return self._terrain.at(float(mean[X]), float(mean[Y]))
+
+    def height_m(self, x_m: float, y_m: float) -> float:
+        """Height of the surface over a deck point."""
+        return self._terrain.height_m(x_m, y_m)
+
+    def _count(self, what: str) -> None:
+        """Count something, once: not when it is done again."""
+        self._counts[what] += not self._is_again
+
+    def begin(self, t_s: float, dt_s: float) -> None:
+        """Steps follow that bring the state to ``t_s``; the robot may have moved in the last ``dt_s`` of it."""
+        self.journal.begin(t_s, dt_s, self._filter)
+
+    def _do(self, step: Step) -> None:
+        self.journal.add(step)
+        step()
+
+    # -- motion -------------------------------------------------------------------------------------------------------
+
+    def move(self, block: Block, right: WheelAngle, left: WheelAngle, imu_variances: tuple[float, float]) -> None:
+        """A block of frames: predict, then update with wheel angles, angular rate and acceleration.
+
+        Args:
+            block: frames since the last step.
+            right: the wheel's angle at its end; no reading where its last frame brought none.
+            left: likewise.
+            imu_variances: of single samples: angular rate, acceleration.
+        """
+        dt_s = block.dt_s
+        if dt_s > 0.0:
+            scatter = self._legs.wander(block.turning_s)
+            encoders = self.encoder_walk(right) * dt_s
+            self._do(lambda: self._predict(dt_s, scatter, encoders))
+        counts = None
+        if right.is_fresh or left.is_fresh:
+            gap_rad = right.take_gap() + left.take_gap()
+            variance = max(right.variance_rad2(), left.variance_rad2()) + gap_rad * gap_rad
+            counts = right.angle_rad, left.angle_rad, variance
+        rate = acceleration = None
+        if block.rate_rad_s is not None:
+            rate = block.rate_rad_s, imu_variances[0] / block.samples
+        if block.acceleration_m_s2 is not None and self._full.use.accelerometer:
+            # Set points jump, and the acceleration with them, anywhere between two samples.
+            jump = self._full.acceleration_jump_m_s2**2
+            acceleration = block.acceleration_m_s2, imu_variances[1] / block.samples + jump
+        self._do(lambda: self._sense(counts, rate, acceleration))
+        self._enter()
+
+    def _enter(self) -> None:
+        """The tilt belongs to the panel under the robot."""
+        panel = self._panel_below()
+        if panel != self._panel:
+            self._panel = panel
+            self._do(lambda: self._renew([TX, TY], self._tilt_sigma_m))
+
+    def _panel_below(self) -> PanelId:
+        mean = self._filter.mean
+        return self._mirror.nearest_panel(float(mean[X]), float(mean[Y]))
+
+    def _predict(self, dt_s: float, scatter: tuple[float, float], encoders: float) -> None:
+        full, mean = self._full, self._filter.mean
+        motion = self._motion.over(dt_s, self._terrain.at(float(mean[X]), float(mean[Y])))
+        slip, creep = scatter
+        jerk, twist = full.jerk_density_m2_s5 * dt_s, full.angular_acceleration_density_rad2_s3 * dt_s
+        impulses = np.array((jerk, twist, slip, slip, creep))
+        drift = self._drift  # work space, of which the model keeps nothing
+        drift[BG] = full.gyroscope_bias_walk_rad_s_sqrt_s**2 * dt_s
+        drift[BA] = full.accelerometer_bias_walk_m_s2_sqrt_s**2 * dt_s
+        drift[PR] = drift[PL] = encoders
+        self._filter.predict(motion, motion.noise(mean, impulses, drift))
+
+    def encoder_walk(self, wheel: WheelAngle) -> float:
+        """Growth of the summed angle's error per second: white rate noise, none where a counter counts."""
+        found = wheel.noise_rad2_s2
+        variance = self._cfg.encoder_sigma_rad_s**2 if found is None else found
+        return variance * self._full.encoder_period_s
+
+    def _sense(
+        self,
+        counts: tuple[float, float, float] | None,
+        rate: tuple[float, float] | None,
+        acceleration: tuple[float, float] | None,
+    ) -> None:
+        rows = self._rows.take(counts, rate, acceleration)
+        if rows.z.size:
+            self._filter.update(rows.z, rows, rows.R)
+
+    # -- rest and legs ------------------------------------------------------------------------------------------------
+
+    def stop(self, angles: tuple[float, float]) -> None:
+        """The wheels stand, at these angles (rad): no speed, no acceleration, no rate; they count from here."""
+        full = self._full
+        sigma = full.rest_speed_sigma_m_s, full.rest_acceleration_sigma_m_s2, full.rest_turn_sigma_rad_s
+        R = np.square(sigma)
+        shift = np.zeros(STATES)
+        shift[PR], shift[PL] = -angles[0], -angles[1]
+        if full.use.zero_velocity:
+            self._do(lambda: self._update(np.zeros(3), _STOP_ROWS, R))
+        self._do(lambda: self._filter.predict(Affine.shift(shift), np.zeros((STATES, STATES))))
+
+    def _update(self, z: FloatArray, H: FloatArray, R: FloatArray) -> None:
+        self._filter.update(z, H, R)
+
+    def calibrate(self, reading: RestReading, rested_s: float, imu_variances: tuple[float, float]) -> None:
+        """Biases from the inertial unit's means over a rest of ``rested_s``, heading from gravity.
+
+        Args:
+            reading: the means.
+            rested_s: how long the biases have wandered.
+            imu_variances: of single samples: angular rate, acceleration.
+        """
+        full, n = self._full, reading.samples
+        Q = np.zeros((STATES, STATES))
+        Q[BG, BG] = full.gyroscope_bias_walk_rad_s_sqrt_s**2 * rested_s
+        Q[BA, BA] = full.accelerometer_bias_walk_m_s2_sqrt_s**2 * rested_s
+        self._do(lambda: self._filter.predict(np.eye(STATES), Q))
+        if full.use.rest_biases:
+            H = np.zeros((2, STATES))
+            # v, a and w stay what the stop made of them; the scale error acts on a rate of zero.
+            H[0, BG] = H[0, W] = H[1, BA] = H[1, A] = 1.0
+            z = np.array((reading.rate_rad_s, reading.acceleration_m_s2))
+            R = np.array((imu_variances[0] / n, imu_variances[1] / n))
+            self._do(lambda: self._update(z, H, R))
+        if reading.gravity_count and full.use.gravity:
+            self._do(lambda: self._feel_gravity(reading.bearing_rad, reading.gravity_count))
+
+    def _feel_gravity(self, bearing_rad: float, count: int) -> None:
+        mean, full = self._filter.mean, self._full
+        slope = self.slope()
+        tilt = self._tilt(slope.fx, slope.fy)
+        if tilt < full.gravity_least_tilt:
+            return
+        variance = (full.gravity_sigma_rad / tilt) ** 2 / count + full.gravity_floor_rad**2
+        residual = difference(heading_from_gravity(bearing_rad, slope), float(mean[PSI]))
+        prior = float(self._filter.covariance[PSI, PSI])
+        if residual * residual > full.gravity_gate**2 * (variance + prior):
+            self._count("gravity_gated")
+            return
+        H = np.zeros((1, STATES))
+        H[0, PSI] = 1.0
+        self._update(np.array([float(mean[PSI]) + residual]), H, np.array([variance]))
+
+    def _tilt(self, fx: float, fy: float) -> float:
+        """Sine of the angle between the surface and the horizontal."""
+        gx, gy, gz = self._gravity_deck
+        along = (gz - fx * gx - fy * gy) / sqrt(1.0 + fx * fx + fy * fy)
+        return sqrt(max(1.0 - along * along, 0.0))
+
+    def begin_leg(self) -> None:
+        """Slip and creep of the coming leg, from the legs so far."""
+        if self._full.use.slip_per_leg:
+            redraw = self._legs.begin(self._filter.mean, self._filter.covariance)
+            self._do(lambda: self._redraw(redraw))
+
+    def _redraw(self, redraw: Redraw) -> None:
+        F, Q, offset = np.eye(STATES), np.zeros((STATES, STATES)), np.zeros(STATES)
+        F[_WHERE_DRAWN], Q[_WHERE_DRAWN] = redraw.F, redraw.Q
+        offset[_DRAWN] = redraw.mean - redraw.F.dot(redraw.found)
+        self._filter.predict(Affine(F, offset), Q)
+
+    def end_leg(self) -> None:
+        """A fix has been fused at the leg's end."""
+        self._legs.end(self._filter.mean, self._filter.covariance)
+
+    # -- seams --------------------------------------------------------------------------------------------------------
+
+    def cross(self, transition: Transition, t_s: float) -> None:
+        """An edge sensor has changed its value; the state belongs to ``t_s``."""
+        if not self._full.use.seams:
+            return
+        edge = self._seams.meet(transition, t_s, self._filter.mean, self.slope())
+        if edge is not None:
+            self._do(lambda: self._use_line(edge, transition, t_s))
+
+    def _use_line(self, edge: Edge, transition: Transition, t_s: float) -> None:
+        if edge.is_new:
+            self._renew([edge.offset], self._full.edge_sigma_m)
+        mean, P = self._filter.mean, self._filter.covariance
+        residual, H, variance = self._seams.line(edge, transition, t_s, mean, self.slope())
+        spread = variance + float(H[0].dot(P).dot(H[0]))
+        is_used = residual * residual <= self._full.line_gate**2 * spread
+        self._count("crossings_used" if is_used else "crossings_gated")
+        if is_used:
+            self._update(H.dot(mean) + residual, H, np.array([variance]))
+
+    def _renew(self, states: list[int], sigma: float) -> None:
+        """States are given to other edges or panels: nothing known of them, nothing correlated."""
+        F, Q = np.eye(STATES), np.zeros((STATES, STATES))
+        F[states, states] = 0.0
+        Q[states, states] = sigma * sigma
+        self._filter.predict(F, Q)
+
+    # -- fixes --------------------------------------------------------------------------------------------------------
+
+    def fix(self, t_s: float, z: FloatArray, variance: FloatArray) -> int:
+        """The robot's origin at ``t_s``, deck, m (2,), and its covariance (2, 2).
+
+        Returns:
+            how many steps were done again after it.
+        """
+        found: list[Innovation] = []
+
+        def step(late_s: float) -> None:
+            innovation = self._use_fix(z, variance, late_s)
+            if not found:
+                found.append(innovation)
+
+        self._is_again = True
+        try:
+            count = self.journal.take(t_s, step, self._filter)
+        finally:
+            self._is_again = False
+        self.innovation = found[0]
+        return count
+
+    def _use_fix(self, z: FloatArray, variance: FloatArray, late_s: float) -> Innovation:
+        mean = self._filter.mean
+        residual, H = self._fix_row(z, mean, late_s)
+        return self._filter.update(H.dot(mean) + residual, H, variance)
+
+    def _fix_row(self, z: FloatArray, mean: FloatArray, late_s: float) -> tuple[FloatArray, FloatArray]:
+        return fix_row(z, mean, self._terrain.at(float(mean[X]), float(mean[Y])), late_s)
+
+    def fix_residual(self, t_s: float, z: FloatArray) -> FloatArray:
+        """How far a position (2,) lies from what the filter held for true at ``t_s``."""
+        mean, _, late_s = self.journal.look(t_s, self._filter)
+        return self._fix_row(z, mean, late_s)[0]
+
+    def is_gated(self, t_s: float, z: FloatArray, variance: FloatArray) -> bool:
+        """Whether a position contradicts the estimate of its own time."""
+        mean, P, late_s = self.journal.look(t_s, self._filter)
+        residual, H = self._fix_row(z, mean, late_s)
+        S = H.dot(P).dot(H.T) + variance
+        return float(residual.dot(np.linalg.solve(S, residual))) > self._full.fix_gate_nis
+
+    def relocate(
+        self,
+        t_s: float,
+        z: FloatArray,
+        variance: FloatArray,
+        *,
+        is_lost: bool,
+        turn_rad: float = 0.0,
+        again: bool = False,
+    ) -> None:
+        """Begin anew from a position (2,) measured at ``t_s``, and its covariance (2, 2); see ``begun_anew``.
+
+        The heading is doubted by ``turn_rad``, and never by less than a set angle. ``again``: what was learned of the
+        sensors and of slip has led astray since it began anew the last time, and is forgotten, too.
+
+        Raises:
+            FilterDiverged: the state is not finite.
+        """
+        residual = self.fix_residual(t_s, z)
+        mean, P = self._filter.mean, self._filter.covariance
+        heading_rad2 = max(self._full.relocated_heading_sigma_rad, turn_rad) ** 2
+        x, P = begun_anew(mean, P, residual, variance, self._tilt_sigma_m**2, heading_rad2, is_lost=is_lost)
+        self.journal.restart()
+        self._seams.forget()
+        self._legs.forget_leg()
+        self.innovation = None
+        if again:
+            self._legs = LegBook(self._full)
+            first, P_first = self._first(DeckPose(float(x[X]), float(x[Y]), float(x[PSI])))
+            P_first[:2, :2], P_first[PSI, PSI] = P[:2, :2], P[PSI, PSI]
+            for i in (TX, TY):
+                P_first[i, :2] = P_first[:2, i] = P[i, :2]
+            x, P = first, P_first
+        self._filter.reset(x, P)
+        self._panel = self._panel_below()
+
+    def lose(self, way_m: float, turn_rad: float) -> None:
+        """The robot may have gone this far, and turned, without anyone looking."""
+        Q = np.zeros((STATES, STATES))
+        Q[X, X] = Q[Y, Y] = way_m * way_m
+        Q[PSI, PSI] = turn_rad * turn_rad
+        self._filter.predict(np.eye(STATES), Q)

@@ -1,0 +1,363 @@
+"""The full-state model: how pose, speeds and the sensors' errors move on, and what the sensors see of them.
+
+One model for every nonlinear filter. The pose is kept in the deck frame, on the curved surface, so no panel change
+touches the state. The wheel angles are states: the encoders' counts measure them with an error that never grows, which
+is what makes a counting encoder worth more than its rate (a rate out of counts jumps by 0.5 rad/s per 10 ms).
+
+An affine transition of a filter's state.
+
+The mirror's surface around the robot, from one exact evaluation carried on by Taylor's theorem.
+"""
+
+from math import cos, sin, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.core import FloatArray
+from ccatp.filters.block_kernel import spread
+from ccatp.mirror.mirror import Mirror
+
+
+class Affine:
+    """x <- F x + b, as a ``Transition`` for the nonlinear filters.
+
+    Args:
+        F: shape (n, n).
+        b: shape (n,).
+    """
+
+    def __init__(self, F: FloatArray, b: FloatArray) -> None:
+        self._F, self._b = F, b
+
+    @classmethod
+    def shift(cls, b: FloatArray) -> "Affine":
+        """Translate by b: x <- x + b."""
+        return cls(np.eye(b.size), b)
+
+    def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Image of x (n,) and the Jacobian (n, n)."""
+        return self._F.dot(x) + self._b, self._F
+
+    def through(self, points: FloatArray) -> FloatArray:
+        """Images of the rows (k, n)."""
+        image: FloatArray = points.dot(self._F.T) + self._b
+        return image
+
+
+# Third derivatives of these mirrors stay below 3e-3 1/m^2: within this distance a slope is off by less than 1e-7.
+_REACH_M = 5e-3
+# A tangent plane flatter than this has no downhill direction worth the name.
+_LEVEL = 1e-3
+
+
+class Slope(NamedTuple):
+    """First and second derivatives of the surface at a deck point, and the downhill unit tangent.
+
+    Attributes:
+        fx, fy: slopes.
+        fxx, fxy, fyy: second derivatives, 1/m.
+        gx, gy: deck components of the downhill direction in the tangent plane; zero on level ground.
+    """
+
+    fx: float
+    fy: float
+    fxx: float
+    fxy: float
+    fyy: float
+    gx: float
+    gy: float
+
+
+class Terrain:
+    """Slopes where the robot is, at a fraction of the cost of the polynomial.
+
+    Args:
+        mirror: the ideal mirror.
+    """
+
+    def __init__(self, mirror: Mirror) -> None:
+        self._surface = mirror.surface
+        self._gravity = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))  # the telescope points to the zenith
+        self._x_m = self._y_m = float("inf")
+        self._f_m = 0.0
+        self._slope = Slope(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def at(self, x_m: float, y_m: float) -> Slope:
+        """Slopes at a deck point."""
+        dx, dy = x_m - self._x_m, y_m - self._y_m
+        if not -_REACH_M < dx < _REACH_M or not -_REACH_M < dy < _REACH_M:
+            return self._evaluate(x_m, y_m)
+        fx, fy, fxx, fxy, fyy, gx, gy = self._slope
+        return Slope(fx + fxx * dx + fxy * dy, fy + fxy * dx + fyy * dy, fxx, fxy, fyy, gx, gy)
+
+    def height_m(self, x_m: float, y_m: float) -> float:
+        """Height of the surface over a deck point."""
+        dx, dy = x_m - self._x_m, y_m - self._y_m
+        if not -_REACH_M < dx < _REACH_M or not -_REACH_M < dy < _REACH_M:
+            self._evaluate(x_m, y_m)
+            return self._f_m
+        fx, fy, fxx, fxy, fyy, _, _ = self._slope
+        return self._f_m + fx * dx + fy * dy + 0.5 * (fxx * dx * dx + fyy * dy * dy) + fxy * dx * dy
+
+    def _evaluate(self, x_m: float, y_m: float) -> Slope:
+        self._f_m, fx, fy, fxx, fxy, fyy = self._surface.jet(x_m, y_m)
+        self._x_m, self._y_m = x_m, y_m
+        self._slope = Slope(fx, fy, fxx, fxy, fyy, *self._downhill(fx, fy))
+        return self._slope
+
+    def _downhill(self, fx: float, fy: float) -> tuple[float, float]:
+        """Deck components of gravity's part along the surface, as a unit vector."""
+        gx, gy, gz = self._gravity
+        norm = 1.0 + fx * fx + fy * fy
+        # n = (-fx, -fy, 1)/W; what is left of g without its part along n.
+        along = (gz - fx * gx - fy * gy) / norm
+        tx, ty, tz = gx + along * fx, gy + along * fy, gz - along
+        length = sqrt(tx * tx + ty * ty + tz * tz)
+        return (tx / length, ty / length) if length > _LEVEL else (0.0, 0.0)
+
+
+X, Y, PSI, V, A, W, BG, KG, BA, SR, SL, KL, C, PR, PL, E0, E1, TX, TY = range(19)
+"""Order of the state.
+
+X, Y: robot origin, deck frame, m. PSI: deck heading, rad, not wrapped. V: speed that the wheels give the body over the
+last step, m/s. A: its rate of change, m/s^2. W: rate about the normal over the last step, rad/s. BG: gyroscope bias,
+rad/s. KG: gyroscope scale error. BA: accelerometer bias, m/s^2. SR, SL: slip of the right and of the left wheel, the
+part of its travel that the body does not follow (an error of the radius included). KL: relative error of the wheel
+base. C: downhill creep, part of |V|. PR, PL: angle of the right and of the left wheel since the last rest, rad. E0, E1:
+how far the two edges of the seam crossed last lie from where the map has them, m. TX, TY: by how much the puck is off
+its place over the robot because the panel under it is tilted, deck frame, m.
+"""
+STATES = 19
+_NOISY = np.array([A, W, SR, SL, C])  # whose noise enters at the beginning of a step and is carried through it
+_SPEEDS = (PSI, V, A, W)
+# Entries of the motion's Jacobian beside those of the identity, as `SurveyMotion.at` lists them: one call sets all.
+_ENTRIES = np.array(
+    [
+        row * STATES + column
+        for row, columns in (
+            (X, (*_SPEEDS, C)),
+            (Y, (*_SPEEDS, C)),
+            (PSI, (*_SPEEDS, C)),
+            (V, (A,)),
+            (PR, (V, A, W, SR, KL)),
+            (PL, (V, A, W, SL, KL)),
+        )
+        for column in columns
+    ]
+)
+
+
+class SurveyMotion:
+    """Transition of the state over one step: thesis eqs 2.11 and 2.14, with the errors as states.
+
+    ::
+
+        v' = v + a dt,   d = v' dt,   turn = w dt
+        (x, y)' = (x, y) + d h(psi + turn/2) + c |d| g
+        psi' = psi + turn - fy (fxx dx + fxy dy) / ((1 + fx^2) W)
+        phi_R' = phi_R + (d + turn (1 + kl) L/2) / (r (1 - s_R)),   phi_L' likewise with -L/2
+
+    h and g are the deck components of the heading and of the downhill direction in the tangent plane. The noise of a
+    step is an impulse at its beginning (see ``ConstantAcceleration``), so v', a and w hold for the whole of it.
+
+    Args:
+        wheel_radius_m: r, nominal.
+        wheel_base_m: L, nominal.
+    """
+
+    def __init__(self, wheel_radius_m: float, wheel_base_m: float) -> None:
+        self._radius_m, self._half_base_m = wheel_radius_m, 0.5 * wheel_base_m
+        self._dt_s = 0.0
+        self._slope = Slope(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self._of: FloatArray | None = None
+        self._x = np.zeros(STATES)
+        self._F = np.eye(STATES)
+        self._flat = self._F.reshape(-1)
+
+    def over(self, dt_s: float, slope: Slope) -> "SurveyMotion":
+        """Set the step's duration and the ground under it."""
+        self._dt_s, self._slope = dt_s, slope
+        self._of = None
+        return self
+
+    def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The state after the step (n,) and the Jacobian (n, n); work space that holds until the next call."""
+        if x is self._of:  # the same arrays again: the filter asks for what the noise has asked for already
+            return self._x, self._F
+        self._of = x
+        state: list[float] = x.tolist()
+        x_m, y_m, psi, v, a, w, bg, kg, ba, s_r, s_l, kl, c, p_r, p_l, e0, e1, tx, ty = state
+        dt, (fx, fy, fxx, fxy, _, gx, gy) = self._dt_s, self._slope
+        v += a * dt
+        d, turn = v * dt, w * dt
+        s2 = 1.0 + fx * fx
+        s, norm = sqrt(s2), sqrt(s2 + fy * fy)
+        ex, ey = -fx * fy / (norm * s), s / norm
+        middle = psi + 0.5 * turn
+        cosine, sine = cos(middle), sin(middle)
+        hx, hy, lx, ly = cosine / s + sine * ex, sine * ey, cosine * ex - sine / s, cosine * ey
+        way = abs(d)
+        dx, dy = d * hx + c * way * gx, d * hy + c * way * gy
+        k1, k2 = fy * fxx / (s2 * norm), fy * fxy / (s2 * norm)
+        per_r, per_l = 1.0 / (self._radius_m * (1.0 - s_r)), 1.0 / (self._radius_m * (1.0 - s_l))
+        half = self._half_base_m
+        side = turn * (1.0 + kl) * half
+        right, left = d + side, d - side
+        self._x[:] = (
+            x_m + dx,
+            y_m + dy,
+            psi + turn - k1 * dx - k2 * dy,
+            v,
+            a,
+            w,
+            bg,
+            kg,
+            ba,
+            s_r,
+            s_l,
+            kl,
+            c,
+            p_r + right * per_r,
+            p_l + left * per_l,
+            *(e0, e1, tx, ty),
+        )
+        sign = c if d >= 0.0 else -c
+        xv, yv = dt * (hx + sign * gx), dt * (hy + sign * gy)
+        x_psi, y_psi, x_c, y_c = d * lx, d * ly, way * gx, way * gy
+        w_dt, turn_dt = 0.5 * dt, dt * (1.0 + kl) * half
+        self._flat[_ENTRIES] = (
+            *(x_psi, xv, dt * xv, w_dt * x_psi, x_c),
+            *(y_psi, yv, dt * yv, w_dt * y_psi, y_c),
+            1.0 - k1 * x_psi - k2 * y_psi,
+            -k1 * xv - k2 * yv,
+            dt * (-k1 * xv - k2 * yv),
+            dt - w_dt * (k1 * x_psi + k2 * y_psi),
+            -k1 * x_c - k2 * y_c,
+            dt,
+            *(dt * per_r, dt * dt * per_r, turn_dt * per_r, right * per_r / (1.0 - s_r), turn * half * per_r),
+            *(dt * per_l, dt * dt * per_l, -turn_dt * per_l, left * per_l / (1.0 - s_l), -turn * half * per_l),
+        )
+        return self._x, self._F
+
+    def through(self, points: FloatArray) -> FloatArray:
+        """The states (k, n) after the step, one for each row."""
+        dt, (fx, fy, fxx, fxy, _, gx, gy) = self._dt_s, self._slope
+        x_m, y_m, psi, v, a, w, _, _, _, s_r, s_l, kl, c, p_r, p_l, *_ = points.T
+        v = v + a * dt
+        d, turn = v * dt, w * dt
+        s2 = 1.0 + fx * fx
+        s, norm = sqrt(s2), sqrt(s2 + fy * fy)
+        middle = psi + 0.5 * turn
+        cosine, sine = np.cos(middle), np.sin(middle)
+        way = c * np.abs(d)
+        dx = d * (cosine / s - sine * (fx * fy / (norm * s))) + way * gx
+        dy = d * (sine * (s / norm)) + way * gy
+        side = turn * (1.0 + kl) * self._half_base_m
+        after = points.copy()
+        after[:, X], after[:, Y] = x_m + dx, y_m + dy
+        after[:, PSI] = psi + turn - fy * (fxx * dx + fxy * dy) / (s2 * norm)
+        after[:, V] = v
+        after[:, PR] = p_r + (d + side) / (self._radius_m * (1.0 - s_r))
+        after[:, PL] = p_l + (d - side) / (self._radius_m * (1.0 - s_l))
+        return after
+
+    def noise(self, x: FloatArray, impulses: FloatArray, drift: FloatArray) -> FloatArray:
+        """Covariance (n, n) of a step's noise.
+
+        Args:
+            x: the state before it, shape (n,).
+            impulses: variances of the impulses on A, W, SR, SL, C at its beginning, shape (5,).
+            drift: variances that enter at its end, shape (n,).
+        """
+        G = self.at(x)[1].take(_NOISY, axis=1)
+        Q = spread(G, impulses, drift)
+        if Q is None:
+            G *= np.sqrt(impulses)
+            Q = G.dot(G.T)
+            Q.reshape(-1)[:: STATES + 1] += drift
+        return Q
+
+
+class SensorRows:
+    """What one frame measures: wheel angles, angular rate, acceleration; any of them may be missing.
+
+    ::
+
+        counts_R = phi_R,   counts_L = phi_L,   omega_z = (1 + kg) w + bg,   a_x = a + ba
+
+    Attributes:
+        z, R: measurements and variances of the rows taken, shape (m,).
+    """
+
+    def __init__(self) -> None:
+        self._rows: tuple[int, ...] = ()
+        self._H: dict[tuple[int, ...], FloatArray] = {}
+        self.z = self.R = np.empty(0)
+
+    def take(
+        self,
+        counts: tuple[float, float, float] | None,
+        rate: tuple[float, float] | None,
+        acceleration: tuple[float, float] | None,
+    ) -> "SensorRows":
+        """Set the rows.
+
+        Args:
+            counts: angles of right and left wheel, rad, and the variance of each, rad^2.
+            rate: angular rate, rad/s, and its variance.
+            acceleration: m/s^2, and its variance.
+        """
+        z: list[float] = []
+        R: list[float] = []
+        rows: tuple[int, ...] = ()
+        # The rate before the angles: the other way round little is left of its variance, and digits go with the rest.
+        if rate is not None:
+            z, R, rows = [rate[0]], [rate[1]], (W,)
+        if counts is not None:
+            z += counts[:2]
+            R += (counts[2], counts[2])
+            rows += (PR, PL)
+        if acceleration is not None:
+            z.append(acceleration[0])
+            R.append(acceleration[1])
+            rows += (A,)
+        self.z, self.R, self._rows = np.array(z), np.array(R), rows
+        return self
+
+    def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Expected measurements (m,) and the Jacobian (m, n); work space that holds until the next call."""
+        rows = self._rows
+        H = self._H.get(rows)
+        if H is None:
+            H = self._H[rows] = _pattern(rows)
+        h: FloatArray = x.take(rows)
+        if rows[0] == W:
+            w = float(x[W])
+            scale = 1.0 + float(x[KG])
+            H[0, W], H[0, KG] = scale, w
+            h[0] = scale * w + float(x[BG])
+        if rows[-1] == A:
+            h[-1] += x[BA]
+        return h, H
+
+    def through(self, points: FloatArray) -> FloatArray:
+        """Expected measurements (k, m) of the states (k, n)."""
+        rows = self._rows
+        h: FloatArray = points[:, list(rows)]
+        if rows[0] == W:
+            h[:, 0] = (1.0 + points[:, KG]) * points[:, W] + points[:, BG]
+        if rows[-1] == A:
+            h[:, -1] += points[:, BA]
+        return h
+
+
+def _pattern(rows: tuple[int, ...]) -> FloatArray:
+    H = np.zeros((len(rows), STATES))
+    for k, state in enumerate(rows):
+        H[k, state] = 1.0
+        if state == W:
+            H[k, BG] = 1.0
+        elif state == A:
+            H[k, BA] = 1.0
+    return H

@@ -1,0 +1,282 @@
+"""The localizer of thesis chapter 2: four states in a filter, the pose integrated in a panel frame beside it."""
+
+from collections.abc import Sequence
+from math import hypot, isfinite, sqrt
+
+import numpy as np
+
+from ccatp.config.models import LocalizerConfig, RobotConfig
+from ccatp.core import (
+    DeckPose,
+    EdgeSample,
+    Fix,
+    FloatArray,
+    GravitySample,
+    ImuSample,
+    PanelId,
+    PanelPose,
+    WheelSample,
+    difference,
+    rotate,
+    wrap_pi,
+)
+from ccatp.estimation.fixes import PositionSigma, check_fix, foot_of_fix
+from ccatp.estimation.localizer_base import FrameReceiver
+from ccatp.estimation.measurements import OMEGA, STATES, THETA, ConstantAcceleration, MeasurementBuilder, Stack, V
+from ccatp.estimation.odometry import Odometer, arc_step
+from ccatp.estimation.sample_validation import MAX_FRAME_STEP_S
+from ccatp.estimation.seams import CrossingDetector, HeadingFix, HeadingGate, Transition
+from ccatp.filters.base import Filter, FilterDiverged, Innovation
+from ccatp.mirror.mirror import Mirror
+
+_NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under the robot is looked up
+_IMPOSSIBLE = 2.0  # an estimate of this many times the wheels' largest rate is no estimate
+_SELECT_HEADING = np.eye(STATES)[THETA : THETA + 1]
+
+
+class FourStateLocalizer(FrameReceiver[Stack]):
+    """Estimates the pose (x, y, theta)_p (thesis 2.1, fig. 2.5).
+
+    Each frame: the filter predicts over the time since the last frame and is updated with every usable sample at its
+    own time (``MeasurementBuilder``); speed and heading move the position (eq. 2.14); a seam crossed by a pair of edge
+    sensors updates the heading. Where the robot's origin enters another cell, pose and heading continue in the frame of
+    that panel. Departure: the thesis overwrites the heading at a crossing; here it is a measurement of theta with the
+    variance of its timing, so that state and covariance stay consistent.
+
+    Args:
+        filter_: filter of the four states of eq. 2.1; re-initialised here.
+        mirror: the mirror's geometry.
+        robot: wheel and sensor geometry.
+        cfg: noise model.
+        start: pose at the first frame, at rest.
+
+    Attributes:
+        innovation: of the last filter update with samples, or None.
+        fix_deviation_m: how far the last fix was above the ideal surface.
+    """
+
+    def __init__(
+        self, filter_: Filter, mirror: Mirror, robot: RobotConfig, cfg: LocalizerConfig, start: PanelPose
+    ) -> None:
+        super().__init__(cfg.history_s)
+        self.innovation: Innovation | None = None
+        self.fix_deviation_m = 0.0
+        self._filter = filter_
+        self._mirror = mirror
+        self._cfg = cfg
+        self._puck_height_m = robot.puck_height_m
+        self._v_limit_m_s = _IMPOSSIBLE * robot.wheel_radius_m * robot.max_wheel_rad_s
+        self._omega_limit_rad_s = 2.0 * self._v_limit_m_s / robot.wheel_base_m
+        self._process = ConstantAcceleration(cfg)
+        self._builder = MeasurementBuilder(robot, cfg)
+        self._odometer = Odometer(cfg.history_s)
+        self._crossings = CrossingDetector(mirror, robot, cfg)
+        self._gate = HeadingGate(cfg.crossing_gate_sigma)
+        self._sigma = PositionSigma(cfg.start_position_sigma_m, cfg.slip_fraction)
+        self._deck: DeckPose | None = None
+        self._x_m, self._y_m = start.x_m, start.y_m
+        self._enter(start.panel)
+        self._reset_at_rest(start.heading_rad, cfg.start_heading_sigma_rad**2)
+
+    @property
+    def pose(self) -> PanelPose:
+        """Estimated pose in the frame of the panel under the robot."""
+        return PanelPose(self._panel, self._x_m, self._y_m, wrap_pi(float(self._filter.mean[THETA])))
+
+    @property
+    def deck_pose(self) -> DeckPose:
+        """The same in the deck frame."""
+        if self._deck is None:
+            self._deck = self._mirror.deck_pose(self.pose)
+        return self._deck
+
+    @property
+    def speed_m_s(self) -> float:
+        """Estimated forward speed."""
+        return float(self._filter.mean[V])
+
+    @property
+    def rate_rad_s(self) -> float:
+        """Estimated angular rate."""
+        return float(self._filter.mean[OMEGA])
+
+    @property
+    def position_sigma_m(self) -> float:
+        """Standard deviation of the position along any direction."""
+        return self._sigma.sigma_m
+
+    @property
+    def heading_sigma_rad(self) -> float:
+        """Standard deviation of the heading."""
+        return sqrt(float(self._filter.covariance[THETA, THETA]))
+
+    @property
+    def pose_covariance(self) -> FloatArray:
+        """Covariance of (x, y, heading) along the surface, shape (3, 3); correlations are not known."""
+        return np.diag((self.position_sigma_m**2, self.position_sigma_m**2, self.heading_sigma_rad**2))
+
+    @property
+    def creep(self) -> tuple[float, float]:
+        """Estimated drift per metre of travel: none in this model."""
+        return 0.0, 0.0
+
+    def _take(self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample]) -> Stack:
+        return self._intake.stack(self._builder, t_s, imu, encoders)
+
+    def _use(
+        self,
+        t_s: float,
+        dt_s: float,
+        taken: Stack,
+        edges: Sequence[EdgeSample],
+        gravity: GravitySample | None,  # the thesis does without
+    ) -> None:
+        self._advance(t_s, dt_s, taken)
+        transitions = self._crossings.scan(t_s, self.speed_m_s, self.rate_rad_s, edges)
+        if transitions:
+            self._use_crossings(transitions)
+
+    def reset_filter(self, mu: FloatArray, sigma: FloatArray) -> None:
+        """Re-initialise the filter, the thesis's ``resetFilter``.
+
+        Args:
+            mu: state (v, a, theta, omega), shape (4,), theta in the panel frame.
+            sigma: its covariance, shape (4, 4).
+
+        Raises:
+            FilterError: not a Gaussian of four states.
+        """
+        self._filter.reset(mu, sigma)
+        if self.is_frozen:
+            self._crossings.restart()
+        self.is_frozen = False
+        self._deck = None
+
+    def rest(self) -> None:
+        """The robot stands: v, a and omega are zero with the configured sigmas, the heading keeps its variance.
+
+        The rows and columns of the three go with them: the thesis resets diagonal entries only, which leaves
+        correlations that no longer fit. To be called at standstill; while coasting it makes the filter overconfident.
+        """
+        if not self.is_frozen:
+            mean, covariance = self._filter.mean, self._filter.covariance
+            self._reset_at_rest(float(mean[THETA]), float(covariance[THETA, THETA]))
+
+    def fuse_fix(self, fix: Fix) -> float:
+        """Fuse a multilaterated position of the puck (thesis 2.1.3).
+
+        The fix belongs to ``fix.t_s``: what the robot has moved since then is added. Position and fix are weighted by
+        their variances.
+
+        Args:
+            fix: position and covariance of the puck, world frame.
+
+        Returns:
+            How far the pose jumped, m.
+
+        Raises:
+            FixRefused: not finite, too old, from the future, or far from the mirror; the pose is unchanged.
+        """
+        check_fix(fix, self._odometer.oldest_s, self._clock.t_s + MAX_FRAME_STEP_S)
+        foot = foot_of_fix(self._mirror, fix, self._puck_height_m, self._panel)
+        self.fix_deviation_m = foot.deviation_m
+        then, here = self._odometer.at(fix.t_s), self._odometer.place
+        # The odometer's frame is turned against the panel's by the difference of their headings.
+        turned = float(self._filter.mean[THETA]) - here.heading_rad
+        dx, dy = rotate(here.x_m - then.x_m, here.y_m - then.y_m, turned)
+        ex, ey = foot.x_m + dx - self._x_m, foot.y_m + dy - self._y_m
+        variance = foot.variance_m2 + self._sigma.growth_m2(hypot(dx, dy), self.heading_sigma_rad)
+        if self.is_frozen:
+            # Whatever turned the filter over may have turned the heading as well.
+            prior = float(self._filter.covariance[THETA, THETA]) + self._cfg.start_heading_sigma_rad**2
+            self._reset_at_rest(float(self._filter.mean[THETA]), prior)
+            self._sigma.widen(self._cfg.start_position_sigma_m)
+        gain = self._sigma.fuse(variance)
+        self._x_m, self._y_m = self._x_m + gain * ex, self._y_m + gain * ey
+        self._deck = None
+        self.counts["fixes"] += 1
+        self._hand_over()
+        return gain * hypot(ex, ey)
+
+    def _advance(self, t_s: float, dt_s: float, stack: Stack) -> None:
+        before = self._filter.mean, self._filter.covariance
+        self._filter.predict(*self._process.over(dt_s))
+        innovation = self._filter.update(*stack)
+        if innovation.size:
+            self.innovation = innovation
+        v0, _, theta0, _ = before[0].tolist()
+        v1, _, theta1, omega1 = self._filter.mean.tolist()
+        if abs(v1) > self._v_limit_m_s or abs(omega1) > self._omega_limit_rad_s:
+            self._filter.reset(*before)
+            raise FilterDiverged(f"{v1:.3g} m/s and {omega1:.3g} rad/s are more than the wheels can do")
+        v, turn = 0.5 * (v0 + v1), theta1 - theta0
+        dx, dy = arc_step(v, theta0, turn, dt_s)
+        self._x_m, self._y_m = self._x_m + dx, self._y_m + dy
+        self._deck = None
+        self._odometer.advance(t_s, v, turn, dt_s)
+        self._sigma.travel(abs(v) * dt_s, self.heading_sigma_rad)
+        if abs(self._x_m) > self._near_x_m or abs(self._y_m) > self._near_y_m:
+            self._hand_over()
+
+    def _hand_over(self) -> None:
+        """Continue in the frame of the panel whose cell holds the robot's origin; the deck pose stays the same."""
+        deck = self.deck_pose
+        panel = self._mirror.panel_at(deck.x_m, deck.y_m)
+        if panel is None or panel == self._panel:
+            return
+        new = self._mirror.panel_pose(panel, deck)
+        self._x_m, self._y_m = new.x_m, new.y_m
+        mean = self._filter.mean.copy()
+        mean[THETA] += difference(new.heading_rad, float(mean[THETA]))
+        self._filter.reset(mean, self._filter.covariance)
+        self._enter(panel)
+
+    def _enter(self, panel: PanelId) -> None:
+        self._panel = panel
+        found = self._mirror.panel(panel)
+        self._near_x_m, self._near_y_m = _NEAR_BORDER * found.half_x_m, _NEAR_BORDER * found.half_y_m
+
+    def _use_crossings(self, transitions: Sequence[Transition]) -> None:
+        filter_ = self._filter
+        theta = float(filter_.mean[THETA])
+        seen = self._crossings.headings(transitions, self._odometer, self.pose, self.deck_pose, self.speed_m_s)
+        for innovation, variance in seen:
+            heading = theta + innovation
+            left_over = HeadingFix(heading - float(filter_.mean[THETA]), variance)
+            extra = self._gate.extra_variance(left_over, float(filter_.covariance[THETA, THETA]))
+            self.counts["crossings_gated" if extra is None else "crossings_used"] += 1
+            if extra is None:
+                continue
+            if extra:
+                covariance = filter_.covariance.copy()
+                covariance[THETA, THETA] += extra
+                filter_.reset(filter_.mean, covariance)
+            filter_.update(np.array([heading]), _SELECT_HEADING, np.array([variance]))
+            self._deck = None
+
+    def _reset_at_rest(self, heading_rad: float, variance_rad2: float) -> None:
+        cfg = self._cfg
+        speed, rate = cfg.reset_speed_sigma_m_s, cfg.reset_rate_sigma_rad_s
+        variances = (speed**2, cfg.reset_acceleration_sigma_m_s2**2, variance_rad2, rate**2)
+        self.reset_filter(np.array([0.0, 0.0, heading_rad, 0.0]), np.diag(variances))
+
+    def doubt(self, way_m: float, turn_rad: float) -> None:
+        """The pose may be wrong by this much, because what it was made of was: the pose stays, its certainty goes."""
+        if self.is_frozen:
+            return
+        self._sigma.widen(way_m)
+        wider = np.zeros((STATES, STATES))
+        wider[THETA, THETA] = turn_rad * turn_rad
+        self._filter.predict(np.eye(STATES), wider)
+
+    def _resync(self, t_s: float, last_s: float) -> None:
+        """Go on in a new time base: the pose does not step, what may have happened meanwhile goes to the sigmas."""
+        self._odometer.start(t_s)
+        if not isfinite(last_s):
+            return
+        self.counts["resyncs"] += 1
+        self._intake.restart()
+        self._crossings.restart()
+        self._sigma.widen(abs(self.speed_m_s) * MAX_FRAME_STEP_S)
+        if not self.is_frozen:
+            self._filter.predict(np.eye(STATES), self._process.over(MAX_FRAME_STEP_S)[1])

@@ -1,0 +1,150 @@
+"""How good an estimate is: root mean squares, consistency with its own covariance.
+
+The rigid motion that brings one set of points nearest to another, and the error that is left.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from ccatp.core import FloatArray
+
+
+def rms(errors: FloatArray) -> float | None:
+    """Root mean square of what is finite; None of nothing."""
+    finite = errors[np.isfinite(errors)]
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else None
+
+
+def wrapped(angles_rad: FloatArray) -> FloatArray:
+    """Angles in [-pi, pi)."""
+    result: FloatArray = (angles_rad + np.pi) % (2.0 * np.pi) - np.pi
+    return result
+
+
+class Consistency(NamedTuple):
+    """Mean normalised square of errors or innovations, per degree of freedom: 1 if the covariance is honest.
+
+    Attributes:
+        mean: sum of the squares over sum of the degrees of freedom.
+        low: of the 95 % band that independent Gaussian errors would leave it in.
+        high: its upper end.
+    """
+
+    mean: float
+    low: float
+    high: float
+
+
+def consistency(squares: FloatArray, sizes: FloatArray) -> Consistency | None:
+    """Mean of normalised squares against the chi-squared law (Bar-Shalom, Li, Kirubarajan 2001, section 5.4).
+
+    Args:
+        squares: normalised innovations (NIS) or errors (NEES) squared, shape (n,).
+        sizes: degrees of freedom of each, shape (n,).
+    """
+    finite = np.isfinite(squares)
+    freedom = float(sizes[finite].sum())
+    if freedom == 0.0:
+        return None
+    low, high = (float(chdtri(freedom, q)) / freedom for q in (0.975, 0.025))
+    return Consistency(float(squares[finite].sum()) / freedom, low, high)
+
+
+def nees(errors: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Normalised estimation error squared e^T P^-1 e of each row; errors (n, d), covariances (n, d, d)."""
+    solved = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
+    squares: FloatArray = np.einsum("ni,ni->n", errors, solved)
+    return squares
+
+
+class RigidMotion(NamedTuple):
+    """x -> R x + t.
+
+    Attributes:
+        rotation: R, orthogonal, shape (d, d).
+        translation_m: t, shape (d,).
+    """
+
+    rotation: FloatArray
+    translation_m: FloatArray
+
+    @property
+    def angle_rad(self) -> float:
+        """Of a turn in the plane, counter-clockwise."""
+        return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
+
+    def moved(self, points_m: FloatArray) -> FloatArray:
+        """The images of points, shape (n, d)."""
+        return points_m @ self.rotation.T + self.translation_m
+
+    def turned(self, covariances_m2: FloatArray) -> FloatArray:
+        """The covariances of the images, shape (..., d, d)."""
+        turned: FloatArray = self.rotation @ covariances_m2 @ self.rotation.T
+        return turned
+
+    def turned_map(self, covariance_m2: FloatArray) -> FloatArray:
+        """The covariance of the images of n points together, shape (n d, n d)."""
+        d = len(self.rotation)
+        n = len(covariance_m2) // d
+        blocks = covariance_m2.reshape(n, d, n, d).swapaxes(1, 2)
+        return self.turned(blocks).swapaxes(1, 2).reshape(n * d, n * d)
+
+
+def best_motion(
+    source_m: FloatArray, target_m: FloatArray, *, mirrors: bool = False, weights: FloatArray | None = None
+) -> RigidMotion:
+    """The motion that minimises sum(w |R a + t - b|^2) (Kabsch 1976, Umeyama 1991), without a scale.
+
+    Args:
+        source_m: points a, shape (n, d).
+        target_m: points b, shape (n, d).
+        mirrors: whether R may be a reflection: ranges alone do not tell a map from its mirror image.
+        weights: w, shape (n,); equal if ``None``.
+    """
+    w = np.ones(len(source_m)) if weights is None else weights
+    w = w / w.sum()
+    centre_a, centre_b = w @ source_m, w @ target_m
+    U, _, Vt = np.linalg.svd((source_m - centre_a).T @ ((target_m - centre_b) * w[:, None]))
+    signs = np.ones(source_m.shape[1])
+    if not mirrors and np.linalg.det(U @ Vt) < 0.0:
+        signs[-1] = -1.0
+    rotation = (U * signs @ Vt).T
+    return RigidMotion(rotation, centre_b - rotation @ centre_a)
+
+
+def aligned_rms_m(found_m: FloatArray, true_m: FloatArray, *, mirrors: bool = False) -> float:
+    """Root mean square distance of points from the truth after the best rigid motion, sqrt(mean |e|^2).
+
+    Args:
+        found_m: shape (n, d).
+        true_m: shape (n, d).
+        mirrors: whether a mirror image counts as the same map.
+    """
+    moved = best_motion(found_m, true_m, mirrors=mirrors).moved(found_m)
+    return rms_m(moved, true_m)
+
+
+def rms_m(found_m: FloatArray, true_m: FloatArray) -> float:
+    """Root mean square distance of points from the truth as they are, sqrt(mean |e|^2)."""
+    return float(np.sqrt(((found_m - true_m) ** 2).sum(axis=1).mean()))
+
+
+def rigid_modes(points_m: FloatArray) -> FloatArray:
+    """Infinitesimal rigid motions of points: translations, then rotations, orthonormal, shape (n d, d (d + 1) / 2)."""
+    count, dimension = points_m.shape
+    centred = points_m - points_m.mean(axis=0)
+    modes = []
+    for axis in range(dimension):
+        mode = np.zeros((count, dimension))
+        mode[:, axis] = 1.0
+        modes.append(mode.ravel())
+    for a in range(dimension):
+        for b in range(a + 1, dimension):
+            mode = np.zeros((count, dimension))
+            mode[:, a], mode[:, b] = -centred[:, b], centred[:, a]
+            modes.append(mode.ravel())
+    basis = np.column_stack(modes)
+    U, singular, _ = np.linalg.svd(basis, full_matrices=False)
+    return np.asarray(U[:, singular > 1e-12 * singular[0]])

@@ -1,1 +1,0 @@
-"""Pure. The parts of the danger loop: edge episodes against the map, the robot's origin, the latch of aborts."""

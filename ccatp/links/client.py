@@ -1,0 +1,368 @@
+"""A small client of a running daemon: operator and observatory channel, synchronous, typed, with deadlines.
+
+    from ccatp.links.client import Client
+
+    daemon = Client()
+    print(daemon.status().state)
+    daemon.abort()
+    daemon.wait(lambda status: status.exit_status >= 0, timeout_s=600.0)
+
+Every method raises ``UnreachableError`` where no answer comes in time and ``RefusedError`` where the daemon says no;
+both are ``ccatp.errors.CcatpError``, one line each.
+
+The same small client over HTTP, for a daemon on another machine, by way of its dashboard.
+
+from ccatp.links.client import HttpClient
+
+page = HttpClient("http://127.0.0.1:7080")
+print(page.status()["trouble"])
+page.abort()
+"""
+
+import json
+import os
+import time
+import urllib.error
+import urllib.request
+import uuid
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import msgspec
+
+from ccatp.errors import CcatpError, ConfigError, ExitStatus, RefusedError, UnreachableError
+from ccatp.links.auth import read_pair, read_public
+from ccatp.links.rpc import CurveClient, RequestFailed, request
+from ccatp.links.runtime_dir import is_deserted, runtime_dir_path
+from ccatp.links.topics import MissionStatus
+
+EmergencyKind = Literal["fire", "earthquake", "power", "weather", "operator"]
+TIMEOUT_S = 10.0
+PERIOD_S = 0.2
+_T = TypeVar("_T")
+
+
+class StillWaiting(CcatpError):
+    """What was waited for did not come in time."""
+
+    exit_status = ExitStatus.REFUSED
+
+
+class Latched(msgspec.Struct, frozen=True):
+    """An emergency that is in force.
+
+    Attributes:
+        id: what ``clear`` wants.
+        code: the event code.
+    """
+
+    id: str
+    code: int
+
+
+class Pong(msgspec.Struct, frozen=True):
+    """The danger loop is there.
+
+    Attributes:
+        code: event code: 0 normal, 1 near an edge, 2 aborted.
+        age_s: of its newest frame, ``None`` before the first.
+    """
+
+    code: int
+    age_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Observatory:
+    """The observatory channel of a daemon.
+
+    Args:
+        endpoint: where it serves; ``Client.observatory`` knows that of a daemon on this machine.
+        curve: the keys, where that is ``tcp://``; see ``connect``.
+        timeout_s: longest wait for an answer.
+    """
+
+    endpoint: str
+    curve: CurveClient | None = None
+    timeout_s: float = TIMEOUT_S
+
+    @classmethod
+    def connect(cls, endpoint: str, server_key: Path, key: Path, timeout_s: float = TIMEOUT_S) -> "Observatory":
+        """A daemon on another machine.
+
+        Args:
+            endpoint: ``tcp://HOST:PORT``.
+            server_key: file with the daemon's public key.
+            key: file with our own secret key, which the daemon lists.
+            timeout_s: longest wait for an answer.
+
+        Raises:
+            ConfigError: a key file cannot be used.
+        """
+        pair = read_pair(key, "key")
+        return cls(endpoint, CurveClient(read_public(server_key, "server_key"), pair.public, pair.secret), timeout_s)
+
+    def emergency(self, kind: EmergencyKind, note: str = "", emergency_id: str | None = None) -> Latched:
+        """Report an emergency: the robot goes to its base. Told again and again until it is answered.
+
+        Args:
+            kind: what it is.
+            note: for the log.
+            emergency_id: a UUID; the same one again is harmless. A new one if not given.
+
+        Raises:
+            UnreachableError, RefusedError: see the module.
+        """
+        payload = {"cmd": "emergency", "kind": kind, "id": emergency_id or str(uuid.uuid4()), "note": note}
+        return _as(Latched, self.ask(payload))
+
+    def clear(self, emergency_id: str) -> None:
+        """End an emergency whose cause is gone; the robot must be at base or held.
+
+        Raises:
+            UnreachableError, RefusedError: see the module.
+        """
+        self.ask({"cmd": "clear", "id": emergency_id})
+
+    def ping(self) -> Pong:
+        """Ask for the event code.
+
+        Raises:
+            UnreachableError, RefusedError: see the module.
+        """
+        return _as(Pong, self.ask({"cmd": "ping"}))
+
+    def ask(self, payload: Mapping[str, object]) -> dict[str, Any]:
+        """One request as it is; the whole answer."""
+        return exchange(self.endpoint, payload, self.timeout_s, self.curve, repeats=True)
+
+
+class Client:
+    """The operator channel of a daemon on this machine.
+
+    Args:
+        runtime_dir: its runtime directory, if not the usual one.
+        timeout_s: longest wait for an answer; a pause is answered when the robot is at rest.
+    """
+
+    def __init__(self, runtime_dir: Path | None = None, timeout_s: float = TIMEOUT_S) -> None:
+        self.runtime_dir = runtime_dir_path(str(runtime_dir or ""), os.environ)
+        self.timeout_s = timeout_s
+
+    @property
+    def observatory(self) -> Observatory:
+        """The observatory channel of the same daemon."""
+        return Observatory(self._endpoint("emergency"), timeout_s=self.timeout_s)
+
+    def status(self) -> MissionStatus:
+        """Where the mission stands.
+
+        Raises:
+            UnreachableError, RefusedError: see the module.
+        """
+        return self._order("status")
+
+    def pause(self) -> MissionStatus:
+        """Hold the robot where it is, until ``resume``; returns when it is at rest."""
+        return self._order("pause")
+
+    def resume(self) -> MissionStatus:
+        """Carry on after ``pause``."""
+        return self._order("resume")
+
+    def abort(self) -> MissionStatus:
+        """Give up the survey; the robot drives to its base."""
+        return self._order("abort")
+
+    def stop(self) -> MissionStatus:
+        """Hold the wheels where the robot is, save, and end the daemon."""
+        return self._order("stop")
+
+    def wait(
+        self, is_there: Callable[[MissionStatus], bool], timeout_s: float, period_s: float = PERIOD_S
+    ) -> MissionStatus:
+        """Poll the status until a condition holds.
+
+        Args:
+            is_there: the condition.
+            timeout_s: longest wait, s.
+            period_s: between two looks, s.
+
+        Raises:
+            StillWaiting: it does not hold in time; the daemon goes on.
+            UnreachableError: the daemon is gone.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        while not is_there(status := self.status()):
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0.0:
+                raise StillWaiting(
+                    f"not within {timeout_s:g} s: the mission is {status.state}, {status.done} points done"
+                )
+            time.sleep(min(period_s, left_s))
+        return status
+
+    def ask(self, cmd: str) -> dict[str, Any]:
+        """One command as it is; the whole answer."""
+        return exchange(self._endpoint("control"), {"cmd": cmd}, self.timeout_s)
+
+    def _order(self, cmd: str) -> MissionStatus:
+        return _as(MissionStatus, self.ask(cmd).get("status"))
+
+    def _endpoint(self, channel: str) -> str:
+        """Where a channel is served.
+
+        Raises:
+            UnreachableError: no daemon has made it, or it is gone.
+        """
+        if not (self.runtime_dir / channel).exists() or is_deserted(self.runtime_dir):
+            raise UnreachableError(
+                f"no daemon in {self.runtime_dir}; start one with ccatp run, or name its folder with --runtime-dir"
+            )
+        return f"ipc://{self.runtime_dir / channel}"
+
+
+def exchange(
+    endpoint: str,
+    payload: Mapping[str, object],
+    timeout_s: float,
+    curve: CurveClient | None = None,
+    *,
+    repeats: bool = False,
+) -> dict[str, Any]:
+    """One request and its answer.
+
+    Args:
+        endpoint: where it is served.
+        payload: the request.
+        timeout_s: longest wait, s.
+        curve: the keys, where the endpoint is ``tcp://``.
+        repeats: ask again and again until there is an answer; only for what may be asked twice.
+
+    Raises:
+        UnreachableError: nobody listens there, or no answer came in time.
+        RequestFailed: the answer to an emergency is not that this one is in force.
+        RefusedError: the daemon said no, and why.
+    """
+    reply = request(endpoint, json.dumps(payload).encode(), timeout_s, curve, repeats=repeats)
+    if reply.get("ok") is not True:
+        raise RefusedError(f"{payload.get('cmd')} refused: {reply.get('error', 'no reason given')}")
+    # Who reports a fire must not take any answer for the one that counts.
+    if payload.get("cmd") == "emergency" and reply.get("id") == payload["id"] and reply.get("latched") is False:
+        raise RequestFailed(
+            "emergency not in force: the one with that id was cleared; report another with an id of its own"
+        )
+    if payload.get("cmd") == "emergency" and (reply.get("id") != payload["id"] or reply.get("latched") is not True):
+        raise RequestFailed(
+            f"{endpoint}: something answers there, but not that this emergency is in force; is it a daemon of ccatp?"
+        )
+    return reply
+
+
+def _as(kind: type[_T], found: object) -> _T:
+    try:
+        return msgspec.convert(found, kind)
+    except msgspec.ValidationError as error:
+        raise RequestFailed(
+            f"the daemon's answer is not what was asked for: {error}; is it of another version?"
+        ) from error
+
+
+MAX_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class HttpClient:
+    """A dashboard.
+
+    Attributes:
+        url: of the page, ``http://HOST:PORT``.
+        token: that commands have to carry where the page is open to a network.
+        timeout_s: longest wait for an answer; a pause is answered when the robot is at rest.
+    """
+
+    url: str
+    token: str = ""
+    timeout_s: float = TIMEOUT_S
+
+    def __post_init__(self) -> None:
+        """Refuse what is no page.
+
+        Raises:
+            ConfigError: the URL is not one of HTTP.
+        """
+        if not self.url.startswith(("http://", "https://")):
+            raise ConfigError(f"{self.url!r} is no page; name it like http://127.0.0.1:7080")
+
+    def status(self) -> dict[str, Any]:
+        """What the page shows.
+
+        Raises:
+            UnreachableError: nobody answers in time.
+        """
+        return self._ask("GET", "status")
+
+    def is_healthy(self) -> bool:
+        """Whether the daemon is there and well.
+
+        Raises:
+            UnreachableError: not even the dashboard answers.
+        """
+        try:
+            self._ask("GET", "healthz")
+        except RefusedError:
+            return False
+        return True
+
+    def pause(self) -> None:
+        """Hold the robot where it is, until ``resume``; returns when it is at rest.
+
+        Raises:
+            RefusedError: the daemon said no, and why.
+            UnreachableError: nobody answers in time.
+        """
+        self._ask("POST", "pause")
+
+    def resume(self) -> None:
+        """Carry on after ``pause``."""
+        self._ask("POST", "resume")
+
+    def abort(self) -> None:
+        """Give up the survey; the robot drives to its base."""
+        self._ask("POST", "abort")
+
+    def stop(self) -> None:
+        """Hold the wheels where the robot is, save, and end the daemon."""
+        self._ask("POST", "stop")
+
+    def _ask(self, method: str, name: str) -> dict[str, Any]:
+        where = f"{self.url.rstrip('/')}/{name}"
+        headers = {"authorization": f"Bearer {self.token}"} if self.token else {}
+        question = urllib.request.Request(where, method=method, headers=headers)  # noqa: S310 - http, see above
+        try:
+            with urllib.request.urlopen(question, timeout=self.timeout_s) as reply:  # noqa: S310 - the same
+                text = reply.read(MAX_BYTES)
+        except urllib.error.HTTPError as error:
+            with error:
+                raise RefusedError(f"{name} refused ({error.code}): {_message(error.read(MAX_BYTES))}") from error
+        except (urllib.error.URLError, TimeoutError, ConnectionError) as error:
+            why = getattr(error, "reason", error)
+            raise UnreachableError(f"no answer from {where}: {why}; is ccatp dashboard running there?") from error
+        try:
+            found = json.loads(text)
+        except ValueError as error:
+            raise UnreachableError(f"{where}: the answer is no JSON; is this a ccatp dashboard?") from error
+        if not isinstance(found, dict):
+            raise UnreachableError(f"{where}: the answer is no object; is this a ccatp dashboard?")
+        return found
+
+
+def _message(text: bytes) -> str:
+    """What the page says to a refusal."""
+    try:
+        found = json.loads(text)
+        return str(found["message"])
+    except (ValueError, KeyError, TypeError):
+        return text.decode("utf-8", "replace")[:200]

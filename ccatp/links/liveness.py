@@ -1,0 +1,116 @@
+"""Whether a run is alive: both loops are heard of, have joined the robot, and get its frames.
+
+Lines that are said again and again: which are of one kind, and how many of them are told.
+"""
+
+import re
+
+from ccatp.links.topics import BY_NAME, Presence
+
+LOOPS = ("main", "danger")
+STALE_AFTER_S = min(BY_NAME[f"presence.{name}"].stale_after_s for name in LOOPS)
+
+
+class Liveness:
+    """What the loops say of themselves, and how long ago.
+
+    Args:
+        stale_after_s: what is older than this does not count, neither a word of a loop nor a frame of the robot.
+    """
+
+    def __init__(self, stale_after_s: float = STALE_AFTER_S) -> None:
+        """Nothing heard."""
+        self._stale_after_s = stale_after_s
+        self._presences: dict[str, Presence] = {}
+
+    def heard(self, presence: Presence) -> None:
+        """A loop is there. Its words are dated by its own clock, which is the machine's: waiting in line ages them."""
+        self._presences[presence.process] = presence
+
+    @property
+    def has_joined(self) -> bool:
+        """Whether both loops have said that they joined the robot."""
+        return all(name in self._presences and self._presences[name].phase in ("joined", "done") for name in LOOPS)
+
+    def trouble(self, now_s: float) -> str:
+        """What is wrong, or nothing.
+
+        Args:
+            now_s: time of the machine's monotonic clock.
+        """
+        for name in LOOPS:
+            presence = self._presences.get(name)
+            if presence is None:
+                return f"{name} was never heard of"
+            age_s = now_s - presence.t_s
+            if age_s > self._stale_after_s:
+                return f"{name} was last heard of {age_s:.1f} s ago"
+            if presence.phase == "joined":
+                if presence.frame_age_s is None:
+                    return f"{name} has had no frame from the robot yet"
+                if presence.frame_age_s + age_s > self._stale_after_s:
+                    return f"{name} had its last frame from the robot {presence.frame_age_s + age_s:.1f} s ago"
+        return ""
+
+
+# Not those in the names of points and addresses: another point is another matter.
+_NUMBER = re.compile(r"(?<![\w./:-])\d+(?:\.\d+)?(?![\w/:-]|\.\d)")
+
+
+def kind_of(text: str) -> str:
+    """The text without its numbers: lines with the same are of one kind."""
+    return _NUMBER.sub("#", text)
+
+
+class LineBudget:
+    """So many lines in a period, and a count of those that were left out.
+
+    Args:
+        lines: at most so many ...
+        period_s: ... in this time.
+    """
+
+    def __init__(self, lines: int, period_s: float) -> None:
+        self._lines, self._period_s = lines, period_s
+        self._begun_s, self._used, self._left_out = float("-inf"), 0, 0
+
+    def take(self, now_s: float) -> int | None:
+        """Ask for a line: how many were left out since the last one, or ``None`` when this one is left out, too."""
+        if now_s - self._begun_s >= self._period_s:
+            self._begun_s, self._used = now_s, 0
+        if self._used >= self._lines:
+            self._left_out += 1
+            return None
+        self._used += 1
+        left_out, self._left_out = self._left_out, 0
+        return left_out
+
+
+class Sparing:
+    """Lines for a terminal: a few of each kind in a period, and how many like it were left out before.
+
+    Args:
+        lines: of each kind ...
+        period_s: ... in this time.
+    """
+
+    def __init__(self, lines: int, period_s: float) -> None:
+        """Nothing said."""
+        self._lines, self._period_s = lines, period_s
+        self._budgets: dict[str, LineBudget] = {}
+
+    def take(self, level: str, text: str, now_s: float) -> str | None:
+        """The line as it is told; ``None`` where it is left out. Errors are all told.
+
+        Args:
+            level: of the line.
+            text: what it says.
+            now_s: time of any clock that only goes forward.
+        """
+        if level == "error":
+            return text
+        budget = self._budgets.setdefault(f"{level} {kind_of(text)}", LineBudget(self._lines, self._period_s))
+        left_out = budget.take(now_s)
+        if left_out is None:
+            return None
+        return f"{text} ({left_out} more times)" if left_out else text

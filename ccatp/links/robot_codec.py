@@ -1,0 +1,256 @@
+"""Codec of the robot link (interface control document 1): JSON lines between the robot and its clients.
+
+Decoding is strict: numbers are finite and in range, no key stands twice, booleans are no numbers. Unknown keys are
+ignored, a message of an unknown type is told apart from a bad line. Nothing of a bad line is used.
+"""
+
+import hashlib
+import hmac
+import json
+import math
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+import msgspec
+
+from ccatp.links.robot_messages import (
+    MAX_ACCELERATION_M_S2,
+    MAX_RATE_RAD_S,
+    MAX_TIME_S,
+    CommandEcho,
+    Drive,
+    Fans,
+    FromClient,
+    FromRobot,
+    Join,
+    Permit,
+    RobotLinkMessage,
+    Sensors,
+    Unknown,
+)
+
+_GRAVITY_NORM = (0.5, 1.5)  # a unit vector, however noisy
+
+
+class BadLine(ValueError):
+    """A line that fails a check.
+
+    Attributes:
+        message_type: the ``type`` it claims, where that much could be read.
+    """
+
+    def __init__(self, reason: str, message_type: str = "") -> None:
+        super().__init__(f"bad line: {reason}")
+        self.message_type = message_type
+
+
+# Number of keys of the messages whose keys are all required. When all of them are there, a line with exactly this many
+# colons has no other key and none twice: every key brings a colon of its own.
+_KEYS: dict[type, int] = {Sensors: 15, Drive: 5, Permit: 6, Fans: 3}
+_MAX_INTEGER_DIGITS = 400
+_FROM_ROBOT_TYPES = frozenset(("hello", "joined", "refused", "sensors"))
+_FROM_CLIENT_TYPES = frozenset(("join", "drive", "permit", "fans"))
+
+_robot_decoder: msgspec.json.Decoder[FromRobot] = msgspec.json.Decoder(FromRobot)
+_client_decoder: msgspec.json.Decoder[FromClient] = msgspec.json.Decoder(FromClient)
+_encoder = msgspec.json.Encoder()
+
+
+def decode_from_robot(line: bytes) -> FromRobot | Unknown:
+    """The message in a line of the robot (without its LF).
+
+    Raises:
+        BadLine: the line fails a check.
+    """
+    try:
+        message = _robot_decoder.decode(line)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        return _unknown_or_bad(line, str(error), _FROM_ROBOT_TYPES)
+    if line.count(b":") != _KEYS.get(type(message)):
+        _check_keys(line)
+    if type(message) is Sensors:
+        _check_samples(message)
+    return message
+
+
+def decode_from_client(line: bytes) -> FromClient | Unknown:
+    """The message in a line of a client (without its LF).
+
+    Raises:
+        BadLine: the line fails a check.
+    """
+    try:
+        message = _client_decoder.decode(line)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        return _unknown_or_bad(line, str(error), _FROM_CLIENT_TYPES)
+    if line.count(b":") != _KEYS.get(type(message)):
+        _check_keys(line)
+    return message
+
+
+def encode(message: FromRobot | FromClient) -> bytes:
+    """The message as one line with its LF.
+
+    Raises:
+        ValueError: a drive that is not finite (JSON has no such number).
+    """
+    if isinstance(message, Drive):
+        return format_drive(message.seq, message.ack, message.wr, message.wl, message.steer)
+    return _encoder.encode(message) + b"\n"
+
+
+def format_drive(seq: int, ack: int, wr: float, wl: float, steer: float | None = None) -> bytes:
+    """A drive as one line; the key ``steer`` only where there is an angle.
+
+    Raises:
+        ValueError: a set point that is not finite.
+    """
+    if not math.isfinite(wr) or not math.isfinite(wl):
+        raise ValueError(f"drive set points must be finite: wr {wr}, wl {wl}")
+    if steer is not None:
+        if not math.isfinite(steer):
+            raise ValueError(f"drive set points must be finite: steer {steer}")
+        return b'{"type":"drive","seq":%d,"ack":%d,"wr":%.9g,"wl":%.9g,"steer":%.9g}\n' % (seq, ack, wr, wl, steer)
+    return b'{"type":"drive","seq":%d,"ack":%d,"wr":%.9g,"wl":%.9g}\n' % (seq, ack, wr, wl)
+
+
+def set_point_on_wire(rate_rad_s: float) -> float:
+    """What arrives of a set point: the nine digits of ``format_drive``."""
+    return float(b"%.9g" % rate_rad_s) if rate_rad_s else rate_rad_s
+
+
+def format_permit(seq: int, ack: int, forward: bool, reverse: bool, turn: bool) -> bytes:
+    """A permit as one line."""
+    return b'{"type":"permit","seq":%d,"ack":%d,"forward":%b,"reverse":%b,"turn":%b}\n' % (
+        seq,
+        ack,
+        b"true" if forward else b"false",
+        b"true" if reverse else b"false",
+        b"true" if turn else b"false",
+    )
+
+
+def encode_sensors(
+    seq: int,
+    t_s: float,
+    imu: Sequence[tuple[float, float, float]],
+    enc: Sequence[tuple[float, float | None, float | None]],
+    edge: Sequence[tuple[float, int, int, int, int]],
+    gravity: tuple[float, float, float, float] | None,
+    fans: tuple[float, float],
+    soc: float,
+    cmd: tuple[int, float, float, bool],
+    faults: Sequence[str],
+) -> bytes:
+    """A sensors frame as one line, from plain tuples in the order of the wire (finite numbers, SI units)."""
+    frame = _SensorsOut(seq, t_s, imu, enc, edge, gravity, fans, soc, CommandEcho(*cmd), faults)
+    return _encoder.encode(frame) + b"\n"
+
+
+class _SensorsOut(RobotLinkMessage, tag="sensors"):
+    """Sensors as they are encoded: plain tuples cost a tenth of named ones."""
+
+    seq: int
+    t: float
+    imu: Any
+    enc: Any
+    edge: Any
+    gravity: Any
+    fans: tuple[float, float]
+    soc: float
+    cmd: CommandEcho
+    faults: Any
+
+
+def join_mac(key: bytes, nonce: str, role: str) -> str:
+    """HMAC-SHA256 over nonce, colon and role, as hex digits."""
+    return hmac.new(key, f"{nonce}:{role}".encode("ascii"), hashlib.sha256).hexdigest()
+
+
+def is_mac_right(key: bytes, nonce: str, join: Join) -> bool:
+    """Whether a join carries the code that belongs to key, nonce and role; takes the same time for every wrong one."""
+    return hmac.compare_digest(join_mac(key, nonce, join.role).encode(), join.mac.lower().encode())
+
+
+def _check_samples(frame: Sensors) -> None:
+    """Ranges of the samples, which the types cannot say.
+
+    Raises:
+        BadLine: a sample out of range.
+    """
+    rate, latest = MAX_RATE_RAD_S, MAX_TIME_S
+    for t, ax, wz in frame.imu:
+        limit = MAX_ACCELERATION_M_S2
+        if not (0.0 <= t <= latest and -limit <= ax <= limit and -rate <= wz <= rate):
+            raise BadLine("imu sample out of range", "sensors")
+    for t, wr, wl in frame.enc:
+        right = wr is None or -rate <= wr <= rate
+        if not (right and 0.0 <= t <= latest and (wl is None or -rate <= wl <= rate)):
+            raise BadLine("encoder sample out of range", "sensors")
+    for t, a, b, c, d in frame.edge:
+        if (a | b | c | d) & ~1 or not 0.0 <= t <= latest:
+            raise BadLine("edge sample out of range", "sensors")
+    if frame.gravity is not None:
+        t, gx, gy, gz = frame.gravity
+        if not (_GRAVITY_NORM[0] <= math.hypot(gx, gy, gz) <= _GRAVITY_NORM[1] and 0.0 <= t <= latest):
+            raise BadLine("gravity out of range", "sensors")
+
+
+def _unknown_or_bad(line: bytes, reason: str, known: frozenset[str]) -> Unknown:
+    """What a line is that the fast decoder refused: a message of an unknown type, or bad.
+
+    Raises:
+        BadLine: it is bad.
+    """
+    value = _check_keys(line)
+    message_type = value.get("type") if isinstance(value, dict) else None
+    if not isinstance(message_type, str):
+        raise BadLine("no object with a type")
+    if message_type in known:
+        raise BadLine(reason, message_type)
+    return Unknown(message_type)
+
+
+def _check_keys(line: bytes) -> Any:
+    """Read the whole line slowly: no key twice, every number finite, also where the fast decoder skips.
+
+    Raises:
+        BadLine: it is no such JSON.
+    """
+    try:
+        return json.loads(
+            line.decode("utf-8"),
+            object_pairs_hook=_object,
+            parse_float=_finite,
+            parse_int=_integer,
+            parse_constant=_refuse_constant,
+        )
+    except BadLine:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise BadLine(f"{type(error).__name__}: {str(error)[:80]}") from None
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise BadLine("a key stands twice")
+    return found
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise BadLine(f"number {text[:20]} is not finite")
+    return number
+
+
+def _integer(text: str) -> int:
+    # As a float it would be infinite: what is a number to one reader must not be none to the next.
+    if len(text) > _MAX_INTEGER_DIGITS or not math.isfinite(float(text)):
+        raise BadLine("integer of too many digits")
+    return int(text)
+
+
+def _refuse_constant(text: str) -> NoReturn:
+    raise BadLine(f"{text} is no number of JSON")

@@ -1,0 +1,326 @@
+"""The client's end of the robot link: joins the robot, hands over its frames, sends commands. Decides nothing."""
+
+import asyncio
+import socket
+import stat
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import cast
+
+from ccatp.errors import ConfigError, UnreachableError
+from ccatp.links.robot_codec import BadLine, decode_from_robot, encode, format_drive, format_permit, join_mac
+from ccatp.links.robot_messages import (
+    AUTH_HMAC,
+    PROTOCOL,
+    BadLineCounter,
+    FromRobot,
+    Hello,
+    Join,
+    Joined,
+    LineBudget,
+    LineBuffer,
+    LineTooLong,
+    Refused,
+    Role,
+    Sensors,
+    Unknown,
+)
+from ccatp.links.robot_messages import Fans as FansMessage
+
+# Commands wait in the kernel or not at all: what piles up here is stale before it arrives.
+MAX_UNSENT_BYTES = 4096
+# A dead peer is noticed within seconds: unacknowledged data for 1000 ms, or silence for 1 s and 3 probes of 1 s.
+# A robot in real time that sends more lines than this is flooding us. What piles up while the link is stuck may come at
+# once: half a minute of frames, which is as long as a stall may last; then three times what it should send.
+BACKLOG_S = 30.0
+FLOOD_FACTOR = 3.0
+LINUX_OPTIONS = {"TCP_USER_TIMEOUT": 1000, "TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
+
+
+class RobotLinkError(UnreachableError):
+    """The robot cannot be joined."""
+
+
+class RobotRefused(RobotLinkError):
+    """The robot refused the join; ``reason`` is its own."""
+
+    def __init__(self, where: str, role: str, reason: str) -> None:
+        super().__init__(f"the robot at {where} refused the role {role}: {reason}{_HINTS.get(reason, '')}")
+        self.reason = reason
+
+
+class WrongProtocol(RobotLinkError):
+    """Whatever answers does not speak this protocol."""
+
+
+class RobotTimeout(RobotLinkError):
+    """The robot did not answer in time."""
+
+
+_HINTS = {
+    "role taken": "; another program drives it",
+    "bad mac": "; check robot.key_file",
+    "busy": "; too many connections",
+}
+
+
+def read_key(key_file: str, *, must_be_private: bool = False) -> bytes | None:
+    """Key of the robot link: the file's bytes without white space around them; ``None`` when no file is named.
+
+    Args:
+        key_file: path, or empty.
+        must_be_private: refuse a file that others may read; the key of a stand-in is no secret.
+
+    Raises:
+        ConfigError: the file cannot be read, is empty, or is not private.
+    """
+    if not key_file:
+        return None
+    try:
+        mode = Path(key_file).stat().st_mode
+        key = Path(key_file).read_bytes().strip()
+    except OSError as error:
+        raise ConfigError(f"robot.key_file: cannot read {key_file}: {error.strerror}") from error
+    if must_be_private and mode & (stat.S_IRWXG | stat.S_IRWXO):
+        mode = stat.S_IMODE(mode)
+        raise ConfigError(f"robot.key_file: {key_file} is open to others (mode {mode:04o}); chmod go= {key_file}")
+    if not key:
+        raise ConfigError(f"robot.key_file: {key_file} is empty")
+    return key
+
+
+class RobotLink(asyncio.Protocol):
+    """One session with the robot.
+
+    Frames that are not newer than the last one are dropped and counted, and so are bad lines; neither reaches the
+    caller. While the robot does not take what was sent, drives and permits are dropped and counted: a burst of old
+    commands must never follow a stall.
+
+    Args:
+        host: the robot's host.
+        port: its port.
+        role: what to join as.
+        client: name of this client.
+        key: of the HMAC, where the robot asks for it.
+        on_sensors: called with each frame and its line (without LF), within the event loop's read.
+        on_lost: called once with the reason when a joined session ends, unless ``close`` ended it.
+        on_joined: called with the robot's hello when the session begins, before its first frame.
+        on_bad_line: called after each line of a joined session that fails a check.
+
+    Attributes:
+        counts: bad_lines, unknown_types, unexpected, repeated_frames, unsent.
+    """
+
+    def __init__(
+        self,
+        *,
+        host: str,
+        port: int,
+        role: Role,
+        client: str,
+        key: bytes | None,
+        on_sensors: Callable[[Sensors, bytes], None],
+        on_lost: Callable[[str], None],
+        on_joined: Callable[[Hello], None] = lambda _hello: None,
+        on_bad_line: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._host, self._port, self._role, self._client, self._key = host, port, role, client, key
+        self._on_sensors, self._on_lost, self._on_joined = on_sensors, on_lost, on_joined
+        self._on_bad_line = on_bad_line
+        self.counts: Counter[str] = Counter()
+        self._transport: asyncio.Transport | None = None
+        self._hello: Hello | None = None
+        self._joining: asyncio.Future[Hello] | None = None
+        self._is_joined = self._is_closing = self._is_paused = False
+        self._lines = LineBuffer()
+        self._bad = BadLineCounter()
+        self._budget: LineBudget | None = None
+        self._last_seq = -1
+        self._why = self._oddity = ""
+
+    @property
+    def _where(self) -> str:
+        return f"{self._host}:{self._port}"
+
+    async def connect(self, deadline_s: float) -> Hello:
+        """Connect and join. A link is used once: for another session make another.
+
+        Args:
+            deadline_s: longest time for all of it.
+
+        Raises:
+            RobotTimeout: it took longer.
+            RobotRefused: the robot said no.
+            WrongProtocol: another protocol, or no robot at all.
+            RobotLinkError: nobody answers, or the connection ended.
+        """
+        loop = asyncio.get_running_loop()
+        joining: asyncio.Future[Hello] = loop.create_future()
+        self._joining = joining
+        try:
+            async with asyncio.timeout(deadline_s):
+                await loop.create_connection(lambda: self, self._host, self._port)
+                return await joining
+        except TimeoutError:
+            came = f"; what came: {self._oddity}" if self._oddity else ""
+            raise RobotTimeout(f"no answer from the robot at {self._where} within {deadline_s:g} s{came}") from None
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise RobotLinkError(f"cannot reach the robot at {self._where}: {reason}; is it running?") from error
+        finally:
+            if not self._is_joined:
+                joining.cancel()
+                self.close()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Called by asyncio."""
+        self._transport = cast(asyncio.Transport, transport)  # a TCP connection has no other
+        self._transport.set_write_buffer_limits(high=MAX_UNSENT_BYTES)
+        peer = self._transport.get_extra_info("socket")
+        peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        peer.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for name, value in LINUX_OPTIONS.items():
+            if hasattr(socket, name):
+                peer.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+
+    def data_received(self, data: bytes) -> None:
+        """Called by asyncio: serve whole lines."""
+        is_too_long = False
+        try:
+            lines = self._lines.feed(data)
+        except LineTooLong as error:
+            lines, is_too_long = error.lines, True
+        if self._budget is not None and not self._budget.take(len(lines), asyncio.get_running_loop().time()):
+            self._end("a flood of lines from the robot")
+        for line in lines:
+            if self._is_closing or self._why:
+                return
+            try:
+                message = decode_from_robot(line)
+            except BadLine as error:
+                self._oddity = str(error)
+                self._count_bad()
+                continue
+            if type(message) is Sensors:
+                self._take_frame(message, line)
+            else:
+                self._take(message)
+        if is_too_long:
+            self._end("the robot sent a line over the limit")
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Called by asyncio."""
+        why = self._why or (f"connection lost: {exc}" if exc else "the robot closed the connection")
+        self._transport = None
+        if self._joining is not None and not self._joining.done():
+            if self._hello is None and self._bad.total:
+                self._joining.set_exception(WrongProtocol(f"no robot answers at {self._where}: {why}"))
+            else:
+                self._joining.set_exception(RobotLinkError(f"the robot at {self._where} did not let us join: {why}"))
+        elif self._is_joined and not self._is_closing:
+            self._is_joined = False
+            self._on_lost(why)
+
+    def pause_writing(self) -> None:
+        """Called by asyncio: the robot does not take what was sent."""
+        self._is_paused = True
+
+    def resume_writing(self) -> None:
+        """Called by asyncio."""
+        self._is_paused = False
+
+    def _take_frame(self, frame: Sensors, line: bytes) -> None:
+        if not self._is_joined:
+            self.counts["unexpected"] += 1
+        elif frame.seq <= self._last_seq:
+            self.counts["repeated_frames"] += 1
+        else:
+            self._last_seq = frame.seq
+            self._on_sensors(frame, line)
+
+    def _take(self, message: FromRobot | Unknown) -> None:
+        joining = self._joining
+        if isinstance(message, Unknown):
+            self.counts["unknown_types"] += 1
+        elif joining is None or joining.done():
+            self.counts["unexpected"] += 1
+        elif isinstance(message, Refused):
+            joining.set_exception(RobotRefused(self._where, self._role, message.reason))
+        elif isinstance(message, Hello) and self._hello is None:
+            self._answer(message, joining)
+        elif isinstance(message, Joined) and self._hello is not None and message.role == self._role:
+            self._is_joined = True
+            if not self._hello.lockstep:  # there it is we who set the pace
+                rate_hz = self._hello.frame_hz
+                self._budget = LineBudget(BACKLOG_S * rate_hz, FLOOD_FACTOR * rate_hz)
+            joining.set_result(self._hello)
+            self._on_joined(self._hello)
+        else:
+            if isinstance(message, Joined) and message.role != self._role:
+                self._oddity = f"joined as {message.role}, not as {self._role}"
+            self.counts["unexpected"] += 1
+
+    def _answer(self, hello: Hello, joining: "asyncio.Future[Hello]") -> None:
+        if hello.protocol != PROTOCOL:
+            error = f"the robot at {self._where} speaks {hello.protocol}, this program {PROTOCOL}"
+            joining.set_exception(WrongProtocol(error))
+            return
+        mac = ""
+        if hello.auth == AUTH_HMAC:
+            if self._key is None:
+                error = f"the robot at {self._where} asks for a key: name its file in robot.key_file"
+                joining.set_exception(RobotLinkError(error))
+                return
+            mac = join_mac(self._key, hello.nonce, self._role)
+        self._hello = hello
+        self.send_raw(encode(Join(role=self._role, client=self._client, mac=mac)))
+
+    def _count_bad(self) -> None:
+        self.counts["bad_lines"] += 1
+        if self._bad.add(asyncio.get_running_loop().time()):
+            self._end("too many bad lines from the robot")
+        elif self._is_joined:
+            self._on_bad_line()
+
+    def _end(self, why: str) -> None:
+        self._why = self._why or why
+        if self._transport is not None:
+            self._transport.abort()
+
+    def abort(self, why: str) -> None:
+        """Break the connection at once, whatever waits to be sent; ``on_lost`` is called with ``why``."""
+        self._end(why)
+
+    def send_drive(self, seq: int, ack: int, wr_rad_s: float, wl_rad_s: float, steer_rad: float | None = None) -> None:
+        """Send wheel set points, and the steering angle of a robot that has one.
+
+        Raises:
+            ValueError: a set point that is not finite.
+        """
+        self._send_fresh(format_drive(seq, ack, wr_rad_s, wl_rad_s, steer_rad))
+
+    def send_permit(self, seq: int, ack: int, forward: bool, reverse: bool, turn: bool) -> None:
+        """Send what motion is allowed."""
+        self._send_fresh(format_permit(seq, ack, forward, reverse, turn))
+
+    def send_fans(self, seq: int, duty: tuple[float, float]) -> None:
+        """Send fan duties (left, right), 0 to 1."""
+        self.send_raw(encode(FansMessage(seq=seq, duty=duty)))
+
+    def _send_fresh(self, line: bytes) -> None:
+        if self._is_paused:
+            self.counts["unsent"] += 1
+        else:
+            self.send_raw(line)
+
+    def send_raw(self, data: bytes) -> None:
+        """Send bytes as they are; nothing happens when the connection is gone."""
+        if self._transport is not None and not self._transport.is_closing():
+            self._transport.write(data)
+
+    def close(self) -> None:
+        """End the session after what was sent; ``on_lost`` is not called."""
+        self._is_closing = True
+        if self._transport is not None:
+            self._transport.close()

@@ -1,0 +1,137 @@
+"""The folder of the unix sockets and the lock of one daemon."""
+
+import os
+import stat
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from fcntl import LOCK_EX, LOCK_NB, LOCK_SH, flock
+from pathlib import Path
+
+from ccatp.errors import RefusedError, RuntimeDirError
+
+LOCK_FILE = "lock"
+# Held by whoever gives away the truth of a simulation there: a daemon's stand-in, or one alone.
+TRUTH_LOCK_FILE = "truth.lock"
+# Who asks whether a lock is held has it for an instant.
+_SECOND_LOOK_S = 0.05
+
+# sockaddr_un.sun_path holds 108 bytes with its closing zero on Linux.
+MAX_SOCKET_PATH_BYTES = 107
+# The longest name of a socket in the folder; the sockets of the lanes between the processes are named by this too.
+MAX_SOCKET_NAME_BYTES = 24
+
+
+def runtime_dir_path(configured: str, environ: Mapping[str, str]) -> Path:
+    """The folder, which need not exist: the configured one, or the first that the environment offers.
+
+    ``run.runtime_dir``, else ``$CCATP_RUNTIME_DIR``, else ``$XDG_RUNTIME_DIR/ccatp``, else ``ccatp-<uid>`` in the
+    temporary directory.
+
+    Args:
+        configured: ``run.runtime_dir``; empty when nothing is configured.
+        environ: the environment.
+
+    Raises:
+        RuntimeDirError: the path is too long for a unix socket in it.
+    """
+    if configured:
+        path = Path(configured).expanduser()
+    elif environ.get("CCATP_RUNTIME_DIR"):
+        path = Path(environ["CCATP_RUNTIME_DIR"])
+    elif environ.get("XDG_RUNTIME_DIR"):
+        path = Path(environ["XDG_RUNTIME_DIR"]) / "ccatp"
+    else:
+        path = Path(tempfile.gettempdir()) / f"ccatp-{os.getuid()}"
+    path = path.absolute()
+    longest = len(os.fsencode(path)) + 1 + MAX_SOCKET_NAME_BYTES
+    if longest > MAX_SOCKET_PATH_BYTES:
+        raise RuntimeDirError(
+            f"runtime directory {path}: {longest} bytes with a socket's name, a unix socket takes at most "
+            f"{MAX_SOCKET_PATH_BYTES}; choose a shorter one with --runtime-dir or CCATP_RUNTIME_DIR"
+        )
+    return path
+
+
+def make_runtime_dir(configured: str, environ: Mapping[str, str]) -> Path:
+    """The folder, made with mode 0700 when it is missing, and checked to be the caller's own.
+
+    Raises:
+        RuntimeDirError: it cannot be made, is not a folder, belongs to somebody else or is writable for others.
+    """
+    path = runtime_dir_path(configured, environ)
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        info = path.lstat()
+    except OSError as error:
+        raise RuntimeDirError(
+            f"runtime directory {path}: {error.strerror}; choose another with --runtime-dir"
+        ) from error
+    if not stat.S_ISDIR(info.st_mode):
+        raise RuntimeDirError(f"runtime directory {path}: is a link, not a folder; choose another with --runtime-dir")
+    if info.st_uid != os.getuid():
+        raise RuntimeDirError(
+            f"runtime directory {path}: belongs to user {info.st_uid}, not to {os.getuid()}; "
+            "choose another with --runtime-dir"
+        )
+    if info.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise RuntimeDirError(
+            f"runtime directory {path}: others may write there (mode {stat.S_IMODE(info.st_mode):04o}); "
+            f"chmod 700 {path}"
+        )
+    return path
+
+
+@contextmanager
+def locked(path: Path, refusal: str) -> Iterator[None]:
+    """Hold the lock of a file for as long as the block lasts; it ends with the process, whatever ends that.
+
+    Args:
+        path: the file, made when it is missing.
+        refusal: what to say where somebody else holds it.
+
+    Raises:
+        RefusedError: somebody else does.
+    """
+    with path.open("w") as file:
+        if not _takes(file.fileno(), LOCK_EX):
+            time.sleep(_SECOND_LOOK_S)
+            if not _takes(file.fileno(), LOCK_EX):
+                raise RefusedError(refusal)
+        yield
+
+
+def is_deserted(runtime_dir: Path) -> bool:
+    """Whether a daemon was there and is gone: its lock is there and nobody holds it."""
+    try:
+        with (runtime_dir / LOCK_FILE).open() as file:
+            return _takes(file.fileno(), LOCK_SH)
+    except OSError:
+        return False  # whose it is cannot be told
+
+
+def is_held(path: Path) -> bool:
+    """Whether somebody holds the lock of a file; where it cannot be read, nobody."""
+    try:
+        with path.open() as file:
+            return not _takes(file.fileno(), LOCK_SH)
+    except OSError:
+        return False
+
+
+def remove_sockets(runtime_dir: Path, names: Iterable[str]) -> None:
+    """Remove sockets that nobody serves any more; what is no socket stays."""
+    for name in names:
+        path = runtime_dir / name
+        with suppress(OSError):
+            if stat.S_ISSOCK(path.lstat().st_mode):
+                path.unlink()
+
+
+def _takes(fd: int, operation: int) -> bool:
+    try:
+        flock(fd, operation | LOCK_NB)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,391 @@
+"""THE topic table: everything the processes share over ZeroMQ, and its codec.
+
+A message is one ZeroMQ frame: topic name, one space, JSON. Liveness, recording and displays are derived from the table;
+a new topic is a row. Levels are repeated at the topic's rate; ``rate_hz`` 0 marks an event.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import msgspec
+
+from ccatp.core import Verdict
+
+
+class Message(msgspec.Struct, kw_only=True):
+    """Base of all messages: every one carries a sequence number and a time."""
+
+    seq: int
+    t_s: float
+
+
+class Presence(Message):
+    """A process is alive, before and while frames flow.
+
+    ``phase``: starting, ready (may be joined to), joined, done. ``frame_age_s``: wall time since the process served its
+    newest sensors frame, ``None`` before the first. ``t_s`` is of the machine's monotonic clock.
+    """
+
+    process: str
+    pid: int
+    phase: str
+    frame_age_s: float | None = None
+
+
+class Estimate(Message):
+    """The localizer's pose after frame ``seq``, deck frame, and what main had the wheels do.
+
+    ``commanded``: lowest and highest set point of the right wheel, then of the left one, rad/s, over the drives sent
+    since the last estimate. ``drive_seq``: number of the newest of them.
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+    sigma_m: float
+    state: str
+    commanded: tuple[float, float, float, float] | None = None
+    drive_seq: int = -1
+
+    def following(self, missed: "Estimate") -> "Estimate":
+        """This estimate for one who has not looked at the one before: ``commanded`` spans the drives of both."""
+        mine, its = self.commanded, missed.commanded
+        if mine is None or its is None:
+            return self  # what is not told is not known
+        span = min(its[0], mine[0]), max(its[1], mine[1]), min(its[2], mine[2]), max(its[3], mine[3])
+        return msgspec.structs.replace(self, commanded=span)
+
+
+class MissionStatus(Message):
+    """Mission state for operators."""
+
+    state: str
+    cause: str
+    done: int
+    skipped: int
+    total: int
+    point: str
+    elapsed_s: float
+    eta_s: float
+    error_mm: float
+    code: int
+    outcome: str
+    lower_bound_s: float
+    exit_status: int  # what the run ends with; -1 while it goes on
+    slips: int = 0  # frames that were served late, in real time
+    lag_ms: float = 0.0  # ... the latest of them
+    left_out: dict[str, list[str]] = {}  # points skipped, or not measured any more, by the reason
+
+
+class Picture(Message):
+    """The newest of everything that a display shows, told only while somebody has asked for it.
+
+    Attributes:
+        x_m, y_m, heading_rad: pose, deck frame.
+        covariance_m2: of x and y: xx, xy, yy.
+        heading_sigma_rad: standard deviation of the heading.
+        nis, size: normalised innovation squared of the filter's last update, and its degrees of freedom; 0 for none.
+        line: the newest sensors line, as it came from the robot.
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+    covariance_m2: tuple[float, float, float]
+    heading_sigma_rad: float
+    nis: float
+    size: int
+    line: msgspec.Raw
+
+
+class Shape(msgspec.Struct, omit_defaults=True):
+    """One thing on the map, in the plane of the pose.
+
+    Attributes:
+        id: the same thing has the same one in the next message.
+        kind: how it looks: ``beacon``, ``obstacle``, ``target``, ``robot``, ``trail``; a display draws others plainly.
+        x_m, y_m: where it is.
+        covariance_m2: of x and y: xx, xy, yy; drawn as its ellipse.
+        heading_rad: for what points somewhere.
+        radius_m: for what is round.
+        outline_m: for what is neither: a line, closed where the first point comes again.
+        label: what is written beside it.
+    """
+
+    id: str
+    kind: str
+    x_m: float
+    y_m: float
+    covariance_m2: tuple[float, float, float] | None = None
+    heading_rad: float | None = None
+    radius_m: float | None = None
+    outline_m: list[tuple[float, float]] = []
+    label: str = ""
+
+
+class Scene(Message):
+    """What is on the map besides the mirror and the robot; each message has all of it."""
+
+    shapes: list[Shape]
+
+
+class Track(Message):
+    """A batch of estimates.
+
+    Rows: seq, t_s, row and column of the panel, x_m, y_m, heading_rad (panel frame), sigma_m.
+    """
+
+    rows: list[tuple[int, float, int, int, float, float, float, float]]
+
+
+class SensorLines(Message):
+    """A batch of sensors lines as they came from the robot, each a JSON object of the robot link."""
+
+    lines: list[msgspec.Raw]
+
+
+class Arrival(Message):
+    """The robot came to rest at a measurement point for the first time; ``error_mm`` is the estimated distance."""
+
+    point: tuple[int, int, int]
+    error_mm: float
+
+
+class FixMessage(Message):
+    """A fix taken after frame ``seq``, world frame; without a point it only finds the robot."""
+
+    point: tuple[int, int, int] | None
+    is_fused: bool  # or refused: doubted and measured again, or of no use
+    position_m: tuple[float, float, float]
+    covariance_m2: list[float]
+    dop: float
+    residual_rms_m: float
+    channels: list[int]
+    jump_mm: float
+    is_set_aside: bool = False  # doubted before the localizer saw it
+
+
+class Rest(Message):
+    """The mission takes the robot to be at rest from frame ``seq`` on."""
+
+
+TreatmentKind = Literal["begun", "doubted", "deaf", "hearing"]
+
+
+class Treatment(Message):
+    """What the localizer is treated with from frame ``seq`` on, besides samples and fixes.
+
+    Attributes:
+        kind: ``begun``: it begins anew before this frame, values are x (m), y (m), heading (rad), deck frame, and the
+            standard deviations of place (m) and heading (rad); ``doubted``: after the samples of this frame its pose
+            may be wrong by so much, m and rad; ``deaf``, ``hearing``: whatever wheels and inertial unit say, the robot
+            stands, or not any more.
+        values: see there.
+    """
+
+    kind: TreatmentKind
+    values: tuple[float, ...] = ()
+
+
+class DangerEvent(Message):
+    """The verdict's code, cause or severity changed; without a cause all is well again."""
+
+    code: int
+    cause: str
+    signal: str
+    value: float
+    limit: float
+    off: tuple[bool, bool, bool, bool]
+    severity: int = 0
+
+
+class Log(Message):
+    """One line for the operator's terminal."""
+
+    level: str
+    process: str
+    text: str
+
+
+class Timing(Message):
+    """Wall time of main-loop ticks, microseconds."""
+
+    tick_us: list[float]
+
+
+class Truth(Message):
+    """A batch of simulated truth (simulation only).
+
+    Rows: seq, t_s, x_m, y_m, heading_rad (deck), X, Y, Z (surface point, deck, m), clearance of the worst edge sensor
+    to the rim (m), fallen (0 or 1), mask of the edge sensors beyond the rim (bit 0 = front left).
+    """
+
+    rows: list[tuple[int, float, float, float, float, float, float, float, float, int, int]]
+
+
+class Misalignment(Message):
+    """How the simulated panels really lie (simulation only): row, column, piston_m, tip_rad, tilt_rad."""
+
+    panels: list[tuple[int, int, float, float, float]]
+
+
+class BeaconTrack(Message):
+    """A batch of estimates of a robot among beacons, in the frame of its start.
+
+    Rows: seq, t_s, x_m, y_m, heading_rad; covariance of these: xx, xy, yy, xh, yh, hh; dead reckoning: x_m, y_m.
+    """
+
+    rows: list[tuple[int, float, float, float, float, float, float, float, float, float, float, float, float]]
+
+
+BeaconEllipse = tuple[float, float, float, float, float]
+
+
+class BeaconMap(Message):
+    """The map of a robot among beacons, for displays and reports; positions in m.
+
+    Attributes:
+        system: zigbee, follow, cricket.
+        pose: x_m, y_m, heading_rad.
+        pose_ellipse: x, y, and their covariance xx, xy, yy, m2.
+        beacons: of each radio or mote on the map, the same.
+        target: of the radio that is followed, the same; ``None`` before it was heard.
+        obstacles: points in the room that the distance sensors saw lately.
+        waypoints: all of them, in order; ``next_waypoint`` is the number of the one driven to, -1 for none.
+        distances: of the distance sensors, m.
+        nis_sum, nis_size, refused: of all readings so far: normalised innovations squared, their degrees of freedom,
+            and how many readings the gate refused.
+        notes: what the mission has to say of the map: phases, errors expected.
+    """
+
+    system: str
+    pose: tuple[float, float, float]
+    pose_ellipse: BeaconEllipse
+    beacons: dict[str, BeaconEllipse]
+    target: BeaconEllipse | None
+    obstacles: list[tuple[float, float]]
+    waypoints: list[tuple[float, float]]
+    next_waypoint: int
+    distances: list[float]
+    nis_sum: float
+    nis_size: int
+    refused: int
+    notes: dict[str, float]
+
+
+class BeaconArrival(Message):
+    """A waypoint is reached, by the estimate: number in the loop and lap, both from 0, its place, the estimate."""
+
+    waypoint: int
+    lap: int
+    place: tuple[float, float]
+    estimate: BeaconEllipse
+
+
+class BeaconTruth(Message):
+    """A batch of simulated truth of a robot among beacons (simulation only).
+
+    Rows: seq, t_s, x_m, y_m, heading_rad; the moving radio: x_m, y_m; clearance of the body to the nearest obstacle, m.
+    """
+
+    rows: list[tuple[int, float, float, float, float, float | None, float | None, float | None]]
+
+
+class BeaconPlaces(Message):
+    """Where radios and motes really are (simulation only), m."""
+
+    places: dict[str, tuple[float, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One row of the table.
+
+    Attributes:
+        name: as it stands before the JSON.
+        message: the type.
+        publisher: the process that publishes it.
+        rate_hz: nominal rate; 0 for an event.
+        stale_after_s: a level older than this must not be used; 0 for events and batches.
+        recorded: goes to ``telemetry.mcap``.
+    """
+
+    name: str
+    message: type[Message] | type[Verdict]
+    publisher: str
+    rate_hz: float
+    stale_after_s: float
+    recorded: bool
+
+
+TOPICS: tuple[Topic, ...] = (
+    Topic("presence.main", Presence, "main", 10.0, 1.0, False),
+    Topic("presence.danger", Presence, "danger", 10.0, 1.0, False),
+    Topic("presence.dashboard", Presence, "dashboard", 2.0, 5.0, False),
+    Topic("picture", Picture, "main", 10.0, 0.8, False),
+    Topic("scene", Scene, "main", 2.0, 5.0, False),
+    Topic("estimate", Estimate, "main", 20.0, 0.15, False),
+    Topic("verdict", Verdict, "danger", 100.0, 0.15, False),
+    Topic("mission", MissionStatus, "main", 10.0, 1.0, True),
+    Topic("track", Track, "main", 1.0, 0.0, True),
+    Topic("sensors", SensorLines, "main", 1.0, 0.0, True),
+    Topic("arrival", Arrival, "main", 0.0, 0.0, True),
+    Topic("rest", Rest, "main", 0.0, 0.0, True),
+    Topic("treatment", Treatment, "main", 0.0, 0.0, True),
+    Topic("fix", FixMessage, "main", 0.0, 0.0, True),
+    Topic("danger_event", DangerEvent, "danger", 0.0, 0.0, True),
+    Topic("log", Log, "main", 0.0, 0.0, True),
+    Topic("timing", Timing, "main", 1.0, 0.0, False),
+    Topic("misalignment", Misalignment, "dataloop", 0.0, 0.0, True),
+    Topic("truth", Truth, "dataloop", 1.0, 0.0, True),
+    Topic("beacon_track", BeaconTrack, "main", 1.0, 0.0, True),
+    Topic("beacon_map", BeaconMap, "main", 2.0, 2.0, True),
+    Topic("beacon_arrival", BeaconArrival, "main", 0.0, 0.0, True),
+    Topic("beacon_places", BeaconPlaces, "dataloop", 0.0, 0.0, True),
+    Topic("beacon_truth", BeaconTruth, "dataloop", 1.0, 0.0, True),
+)
+RECORD_FORMAT = 1
+"""Of a recording, kept in it; one more wherever an older reader would misunderstand what is recorded."""
+BY_NAME = {topic.name: topic for topic in TOPICS}
+# Danger carries a pose on by the wheels itself: a pose in five frames is fresh enough and costs a fifth.
+ESTIMATE_FRAMES = 5
+_encoder = msgspec.json.Encoder()
+_decoders: dict[str, msgspec.json.Decoder[Any]] = {t.name: msgspec.json.Decoder(t.message) for t in TOPICS}
+_prefixes = {topic.name: topic.name.encode() + b" " for topic in TOPICS}
+
+
+def is_estimate_due(seq: int) -> bool:
+    """Whether main publishes its estimate after frame ``seq``."""
+    return seq % ESTIMATE_FRAMES == 0
+
+
+def last_estimate_before(seq: int) -> int:
+    """The frame of the newest estimate that the verdict on frame ``seq`` is based on, < 0 for none."""
+    return (seq - 1) // ESTIMATE_FRAMES * ESTIMATE_FRAMES if seq > 0 else -1
+
+
+class BadMessage(Exception):
+    """A frame on the bus that is not of the topic table."""
+
+
+def pack(name: str, message: Message | Verdict) -> bytes:
+    """One frame: topic, space, JSON."""
+    return _prefixes[name] + _encoder.encode(message)
+
+
+def unpack(frame: bytes) -> tuple[str, bytes, Message | Verdict]:
+    """The topic's name, JSON text and message of a frame; raises ``BadMessage``."""
+    name, _, body = frame.partition(b" ")
+    decoder = _decoders.get(name.decode("ascii", "replace"))
+    if decoder is None:
+        raise BadMessage(f"unknown topic {name[:40]!r}")
+    try:
+        message: Message | Verdict = decoder.decode(body)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise BadMessage(f"topic {name.decode()}: {error}") from error
+    return name.decode(), body, message
+
+
+def schema_of(name: str) -> dict[str, Any]:
+    """JSON schema of a topic's messages."""
+    return msgspec.json.schema(BY_NAME[name].message)

@@ -1,0 +1,137 @@
+"""XBee API frames: what a coordinator on the serial line says of the radios that it hears.
+
+802.15.4 firmware, API mode: 0x7E, length (2 bytes), frame data, checksum (0xFF minus the sum of the data). Received
+packets (0x80, 0x81) carry the level as a byte of -dBm; the answer to a node discovery (0x88, "ND") carries it in DB,
+with the serial number in SH and SL and the node identifier in NI (Hevrdejs and Knoll 2017, data packet).
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+START = 0x7E
+ESCAPE = 0x7D
+_ESCAPED = frozenset((START, ESCAPE, 0x11, 0x13))
+_FLIP = 0x20
+_LONGEST = 256  # no 802.15.4 frame with its addresses is longer
+_RECEIVED_64, _RECEIVED_16, _COMMAND_ANSWER = 0x80, 0x81, 0x88
+_OK = 0
+
+
+class XbeeLevel(NamedTuple):
+    """One radio and how strongly it was heard.
+
+    Attributes:
+        node: identifier: the text that the radio sends, or its NI.
+        address: 64-bit serial number, or the 16-bit address where only that is known.
+        rssi_dbm: level.
+    """
+
+    node: str
+    address: int
+    rssi_dbm: float
+
+
+class XbeeFrames:
+    """Takes bytes as they come and gives the levels in whole frames.
+
+    Bytes before a start, frames with a wrong checksum or an impossible length, and frames that tell no level are left
+    out; the former two are counted.
+
+    Attributes:
+        bad: frames that were damaged.
+
+    Args:
+        escaped: API mode 2, in which 0x7E, 0x7D, 0x11 and 0x13 inside a frame are escaped.
+    """
+
+    def __init__(self, *, escaped: bool) -> None:
+        self._escaped = escaped
+        self._buffer = bytearray()
+        self.bad = 0
+
+    def feed(self, data: bytes) -> list[XbeeLevel]:
+        """The levels of the frames that these bytes complete."""
+        self._buffer += data
+        return [level for frame in self._frames() if (level := level_of(frame)) is not None]
+
+    def _frames(self) -> Iterator[bytes]:
+        while (start := self._buffer.find(START)) >= 0:
+            del self._buffer[:start]
+            body, used = self._unescaped()
+            if len(body) < 2:
+                return
+            length = int.from_bytes(body[:2], "big")
+            if not 1 <= length <= _LONGEST:
+                self._skip()
+                continue
+            if len(body) < length + 3:
+                # In mode 2 a start inside a frame means that the rest of this one is lost.
+                if self._escaped and used < len(self._buffer):
+                    self._skip()
+                    continue
+                return
+            if sum(body[2 : length + 3]) & 0xFF != 0xFF:
+                self._skip()
+                continue
+            yield bytes(body[2 : length + 2])
+            del self._buffer[: self._raw_length(length + 3)]
+        self._buffer.clear()
+
+    def _skip(self) -> None:
+        self.bad += 1
+        del self._buffer[0]
+
+    def _unescaped(self) -> tuple[bytearray, int]:
+        """What follows the start, as far as it belongs to this frame, and how many raw bytes that is."""
+        if not self._escaped:
+            return self._buffer[1:], len(self._buffer)
+        body, flips = bytearray(), False
+        for index in range(1, len(self._buffer)):
+            byte = self._buffer[index]
+            if byte == START:
+                return body, index
+            if byte == ESCAPE:
+                flips = True
+                continue
+            body.append(byte ^ _FLIP if flips else byte)
+            flips = False
+        return body, len(self._buffer)
+
+    def _raw_length(self, count: int) -> int:
+        """Raw bytes, the start included, that hold so many bytes of a frame."""
+        index = 1
+        for _ in range(count):
+            index += 2 if self._escaped and self._buffer[index] == ESCAPE else 1
+        return index
+
+
+def level_of(frame: bytes) -> XbeeLevel | None:
+    """The radio and level that the data of a frame tell; None where they tell none, or end too early."""
+    kind = frame[0]
+    if kind == _RECEIVED_16 and len(frame) >= 5:
+        return XbeeLevel(_text(frame[5:]), int.from_bytes(frame[1:3], "big"), -float(frame[3]))
+    if kind == _RECEIVED_64 and len(frame) >= 11:
+        return XbeeLevel(_text(frame[11:]), int.from_bytes(frame[1:9], "big"), -float(frame[9]))
+    # 0x88, frame number, "ND", status, then MY (2), SH (4), SL (4), DB (1), NI (text and a zero)
+    if kind == _COMMAND_ANSWER and len(frame) >= 16 and frame[2:4] == b"ND" and frame[4] == _OK:
+        return XbeeLevel(_text(frame[16:]), int.from_bytes(frame[7:15], "big"), -float(frame[15]))
+    return None
+
+
+def xbee_frame(data: bytes, *, escaped: bool) -> bytes:
+    """A whole frame around its data.
+
+    Raises:
+        ValueError: the data are empty or longer than any frame.
+    """
+    if not 1 <= len(data) <= _LONGEST:
+        raise ValueError(f"frame data of {len(data)} bytes; an XBee frame has 1 to {_LONGEST}")
+    body = len(data).to_bytes(2, "big") + data + bytes([0xFF - (sum(data) & 0xFF)])
+    if not escaped:
+        return bytes([START]) + body
+    return bytes([START]) + b"".join(bytes([ESCAPE, b ^ _FLIP]) if b in _ESCAPED else bytes([b]) for b in body)
+
+
+def _text(data: bytes) -> str:
+    """Up to the first zero; bytes that are no ASCII show as a question mark."""
+    return data.split(b"\0", 1)[0].decode("ascii", errors="replace").replace("\ufffd", "?").strip()

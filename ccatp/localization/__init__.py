@@ -1,1 +1,0 @@
-"""Pure. The parts of the localizer: samples taken in, odometry, seam crossings, fixes."""

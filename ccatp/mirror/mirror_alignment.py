@@ -1,0 +1,197 @@
+"""The alignment of a whole mirror, from its fixes.
+
+Recovered misalignment against the one that was simulated: does the stated uncertainty hold?
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from ccatp.config.models import AlignConfig
+from ccatp.core import PanelId, PointId, Vector3
+from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.panel_alignment import (
+    Deviations,
+    Measured,
+    MirrorWavefront,
+    PanelResult,
+    Prices,
+    cos_incidence,
+    deviations_of,
+    explain,
+    mirror_wavefront,
+    panel_result,
+    prices,
+)
+from ccatp.mirror.surface import ConvergenceError
+
+ENOUGH = 3  # points of a plane
+
+
+class Undetermined(NamedTuple):
+    """A panel whose fixes do not determine how it lies; ``why`` completes its line."""
+
+    panel: PanelId
+    points: int
+    why: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurveyResult:
+    """How the panels of a mirror lie.
+
+    Attributes:
+        panels: those that could be fitted, rows then columns.
+        undetermined: the others, of the mission's.
+        wavefront: of all fitted panels, with rigid moves; None without any.
+        wavefront_bent: the same with moves that bend; None where a panel has too few points for them.
+        price: of outliers and shapes.
+        warnings: what a reader should know, one line each.
+    """
+
+    panels: tuple[PanelResult, ...]
+    undetermined: tuple[Undetermined, ...]
+    wavefront: MirrorWavefront | None
+    wavefront_bent: MirrorWavefront | None
+    price: Prices
+    warnings: tuple[str, ...]
+
+
+def survey_result(
+    mirror: Mirror,
+    cfg: AlignConfig,
+    puck_height_m: float,
+    measured: Iterable[Measured],
+    planned: Iterable[PanelId],
+) -> SurveyResult:
+    """Fit every panel.
+
+    Args:
+        mirror: the ideal mirror.
+        cfg: section ``align``.
+        puck_height_m: nominal height of the puck along the normal.
+        measured: the fixes, one a point.
+        planned: the mission's panels; one without enough fixes is told as not determined.
+    """
+    warnings: list[str] = []
+    by_panel: dict[PanelId, list[Measured]] = {panel: [] for panel in sorted(set(planned))}
+    for one in measured:
+        by_panel.setdefault(one.point.panel, []).append(one)
+    usable, undetermined = _usable(mirror, cfg, puck_height_m, by_panel)
+    light = cfg.light.get(mirror.name)
+    if light is None:
+        warnings.append(f"no light is configured for {mirror.name} (align.light): its angle of incidence is taken as 0")
+    price = prices(cfg.false_alarm, sum(len(found.points) for found in usable.values()), len(usable))
+    panels = []
+    for panel, found in usable.items():
+        result = panel_result(mirror, panel, found, explain(found, price), cos_incidence(mirror, panel, light))
+        if result is None:
+            undetermined.append(Undetermined(panel, len(found.points), "its points lie on one line"))
+        else:
+            panels.append(result)
+    warnings += [line for panel in panels for line in _remarks(panel, cfg.false_alarm / len(panels))]
+    bent = [panel.bending.wavefront for panel in panels if panel.bending is not None]
+    return SurveyResult(
+        panels=tuple(panels),
+        undetermined=tuple(sorted(undetermined)),
+        wavefront=mirror_wavefront([panel.rigid.wavefront for panel in panels]),
+        wavefront_bent=mirror_wavefront(bent) if len(bent) == len(panels) else None,
+        price=price,
+        warnings=tuple(warnings),
+    )
+
+
+def _usable(
+    mirror: Mirror, cfg: AlignConfig, puck_height_m: float, by_panel: Mapping[PanelId, Sequence[Measured]]
+) -> tuple[dict[PanelId, Deviations], list[Undetermined]]:
+    """Deviations of the panels with enough fixes, and the other panels."""
+    usable: dict[PanelId, Deviations] = {}
+    others: list[Undetermined] = []
+    for panel, some in by_panel.items():
+        if len(some) < ENOUGH:
+            others.append(Undetermined(panel, len(some), f"{len(some)} of {ENOUGH} points that it takes"))
+            continue
+        try:
+            found = deviations_of(mirror, panel, some, puck_height_m, cfg.point_floor_m)
+        except ConvergenceError as error:
+            others.append(Undetermined(panel, len(some), f"a fix is far from the mirror: {error}"))
+            continue
+        if not (found.sigmas_m > 0.0).all():
+            others.append(Undetermined(panel, len(some), "a fix claims to be exact: its covariance is not positive"))
+            continue
+        usable[panel] = found
+    return usable, others
+
+
+def point_text(point: PointId) -> str:
+    """A point as in the other commands: row/column/number."""
+    return "/".join(map(str, point))
+
+
+def _remarks(result: PanelResult, rare: float) -> list[str]:
+    where = f"panel {result.panel.row}/{result.panel.col}"
+    lines = []
+    if result.outliers:
+        names = ", ".join(map(point_text, result.outliers))
+        lines.append(f"{where}: left out as outliers: {names}; measure them again")
+    if result.probability < rare:
+        lines.append(
+            f"{where}: its points contradict each other by more than they are uncertain (chance "
+            f"{result.probability:.1g} with {result.model_dof} degrees of freedom); its sigmas are too small"
+        )
+    return lines
+
+
+BAND = 0.99
+
+
+class Comparison(NamedTuple):
+    """Recovered minus injected, over all panels that could be fitted.
+
+    Attributes:
+        panels: how many.
+        piston_rms_m, tilt_rms_rad: of the differences; tip and tilt together.
+        chi2: sum of ``e^T C^-1 e`` over the panels, e the three differences and C their covariance.
+        dof: three a panel.
+        low, high: what chi2 stays between with 99 % probability where the stated covariances are right.
+    """
+
+    panels: int
+    piston_rms_m: float
+    tilt_rms_rad: float
+    chi2: float
+    dof: int
+    low: float
+    high: float
+
+    @property
+    def agrees(self) -> bool:
+        """The chi-square lies in its band."""
+        return self.low <= self.chi2 <= self.high
+
+
+def compare(panels: Sequence[PanelResult], injected: Mapping[PanelId, Vector3]) -> Comparison | None:
+    """Compare; None without a panel of which both are known.
+
+    Args:
+        panels: as fitted.
+        injected: piston (m), tip and tilt (rad) as simulated.
+    """
+    known = [panel for panel in panels if panel.panel in injected]
+    if not known:
+        return None
+    errors = np.array([panel.fit.values - np.array(injected[panel.panel]) for panel in known])
+    chi2 = sum(float(e @ np.linalg.solve(p.fit.covariance, e)) for e, p in zip(errors, known, strict=True))
+    dof = errors.size
+    return Comparison(
+        panels=len(known),
+        piston_rms_m=float(np.sqrt(np.mean(errors[:, 0] ** 2))),
+        tilt_rms_rad=float(np.sqrt(np.mean(errors[:, 1:] ** 2))),
+        chi2=chi2,
+        dof=dof,
+        low=float(chdtri(dof, 0.5 + 0.5 * BAND)),
+        high=float(chdtri(dof, 0.5 - 0.5 * BAND)),
+    )

@@ -1,0 +1,175 @@
+"""Misalignment of panels: the model, the puck on a misaligned panel, and the fit from measured positions.
+
+The model, used by the simulated truth and by the fit alike: a panel is a rigid body, displaced along its own normal by
+``D(x_p, y_p) = piston + tilt x_p + tip y_p`` with (x_p, y_p) the panel coordinates of the surface point. Angles are
+small (100 urad), so the sideways motion of second order is left out.
+"""
+
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+
+from ccatp.core import DeckPose, FloatArray, PanelId, Vector3
+from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.surface import PanelFitError
+
+_PARAMETERS = 3
+# Of one row of points the tolerance of their arrivals, 10 mm, would make a plane: one with tilts of some 0.1 rad.
+_MIN_SPREAD_M = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class PanelMisalignment:
+    """Rigid misalignment of a panel against the ideal surface.
+
+    Attributes:
+        piston_m: displacement of the panel's centre along its normal, > 0 towards the robot.
+        tip_rad: slope of the displacement along the panel's y axis.
+        tilt_rad: slope of the displacement along the panel's x axis.
+    """
+
+    piston_m: float
+    tip_rad: float
+    tilt_rad: float
+
+    def displacement_m(self, x_p: float, y_p: float) -> float:
+        """Displacement along the panel's normal at the panel coordinates (x_p, y_p), m."""
+        return self.piston_m + self.tilt_rad * x_p + self.tip_rad * y_p
+
+
+@dataclass(frozen=True, slots=True)
+class PanelFit:
+    """Misalignment of a panel as measured.
+
+    Attributes:
+        piston_m, tip_rad, tilt_rad: as in ``PanelMisalignment``.
+        sigma: standard deviations of piston (m), tip and tilt (rad), from the covariance of the positions.
+        chi2: weighted sum of squared residuals.
+        dof: points minus three.
+    """
+
+    piston_m: float
+    tip_rad: float
+    tilt_rad: float
+    sigma: Vector3
+    chi2: float
+    dof: int
+
+
+def misaligned_puck_world(
+    mirror: Mirror, panel: PanelId, misalignment: PanelMisalignment, p: DeckPose, height_m: float
+) -> Vector3:
+    """World position of the puck's centre while the robot stands on a misaligned panel.
+
+    The surface point moves by D along the panel's normal z, and the surface normal n on which the puck stands turns
+    with the panel: ``n' = n - (tilt x + tip y)`` of the panel's axes, to first order.
+
+    Args:
+        mirror: the ideal mirror.
+        panel: the panel that carries the robot.
+        misalignment: its misalignment.
+        p: deck pose of the robot's contact point, before the displacement.
+        height_m: height of the puck's centre along the normal.
+
+    Raises:
+        UnknownPanelError: for a panel that does not exist.
+    """
+    body = mirror.panel(panel)
+    point = mirror.surface.point(p.x_m, p.y_m)
+    x_p, y_p, _ = body.from_deck(point)
+    d = misalignment.displacement_m(x_p, y_p)
+    nx, ny, nz = body.rotate_from_deck(mirror.surface.normal(p.x_m, p.y_m))
+    # The rotation vector of the panel is (tip, -tilt, 0); its cross product with n is the change of the normal.
+    tip, tilt = misalignment.tip_rad, misalignment.tilt_rad
+    mx, my, mz = nx - tilt * nz, ny - tip * nz, nz + tip * ny + tilt * nx
+    scale = height_m / sqrt(mx * mx + my * my + mz * mz)
+    ox, oy, oz = body.rotate_to_deck((scale * mx, scale * my, scale * mz + d))
+    return mirror.world_from_deck((point[0] + ox, point[1] + oy, point[2] + oz))
+
+
+def panel_deviations(mirror: Mirror, panel: PanelId, points_world: FloatArray, puck_height_m: float) -> FloatArray:
+    """Deviation of each puck along the local normal from the ideal surface where it actually stood.
+
+    Args:
+        mirror: the ideal mirror.
+        panel: the panel in whose frame the places are given.
+        points_world: puck centres, world frame, m, shape (k, 3).
+        puck_height_m: nominal height of the puck along the normal.
+
+    Returns:
+        Rows (x_p, y_p, deviation), m, shape (k, 3).
+
+    Raises:
+        UnknownPanelError: for a panel that does not exist.
+        ConvergenceError: for a point far from the mirror.
+    """
+    return np.array([_deviation(mirror, panel, p, puck_height_m) for p in _as_points(points_world)]).reshape(-1, 3)
+
+
+def fit_panel(
+    mirror: Mirror, panel: PanelId, points_world: FloatArray, covariances: FloatArray, puck_height_m: float
+) -> PanelFit:
+    """Weighted least squares of piston, tip and tilt from measured puck positions on one panel.
+
+    Solves ``d_k = (piston + tilt x_k + tip y_k) (n_k . z) + e_k`` with ``var(e_k) = n_k^T C_k n_k``: only the error
+    along the local normal n_k counts, because sideways errors move along the surface. Points are independent.
+
+    Args:
+        mirror: the ideal mirror.
+        panel: the panel that was measured.
+        points_world: puck centres, world frame, m, shape (k, 3), k >= 3.
+        covariances: their covariances, world frame, m^2, shape (k, 3, 3).
+        puck_height_m: nominal height of the puck along the normal.
+
+    Raises:
+        PanelFitError: with fewer than three points, with points on one line to within 20 mm (rms), or with a
+            covariance that is not positive.
+        UnknownPanelError: for a panel that does not exist.
+        ConvergenceError: for a point far from the mirror.
+    """
+    points = np.asarray(points_world, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < _PARAMETERS:
+        raise PanelFitError(f"panel {tuple(panel)}: fit needs points of shape (k >= 3, 3), got {points.shape}")
+    if np.shape(covariances) != (len(points), 3, 3):
+        raise PanelFitError(f"panel {tuple(panel)}: {len(points)} points, covariances of shape {np.shape(covariances)}")
+    body = mirror.panel(panel)
+    rows = panel_deviations(mirror, panel, points, puck_height_m)
+    normals = np.array([mirror.surface.normal(*body.to_deck((x, y, 0.0))[:2]) for x, y, _ in rows])
+    world = np.array([mirror.rotate_world_from_deck((n[0], n[1], n[2])) for n in normals])
+    variances = np.einsum("ki,kij,kj->k", world, np.asarray(covariances, dtype=np.float64), world)
+    if not (np.isfinite(variances).all() and (variances > 0.0).all()):
+        raise PanelFitError(f"panel {tuple(panel)}: variance along the normal is not positive: {variances.min()} m^2")
+    centred = rows[:, :2] - rows[:, :2].mean(axis=0)
+    spread_m = float(np.linalg.svd(centred, compute_uv=False)[-1]) / sqrt(len(rows))
+    if not spread_m >= _MIN_SPREAD_M:
+        raise PanelFitError(
+            f"panel {tuple(panel)}: {len(rows)} points do not span the panel: they lie on one line to within "
+            f"{1e3 * spread_m:.1f} mm, and {1e3 * _MIN_SPREAD_M:g} are the least"
+        )
+    lever = normals @ np.array(body.axes[2])
+    design = lever[:, None] * np.column_stack([np.ones(len(rows)), rows[:, 1], rows[:, 0]])
+    return _weighted_fit(design, rows[:, 2], np.sqrt(variances))
+
+
+def _weighted_fit(design: FloatArray, deviations: FloatArray, sigmas: FloatArray) -> PanelFit:
+    """Least squares by QR of the whitened design; columns piston, tip, tilt."""
+    whitened = design / sigmas[:, None]
+    q, r = np.linalg.qr(whitened)
+    target = deviations / sigmas
+    solution = np.linalg.solve(r, q.T @ target)
+    spread = np.linalg.norm(np.linalg.solve(r, np.eye(_PARAMETERS)), axis=1)
+    residual = target - whitened @ solution
+    piston, tip, tilt = (float(v) for v in solution)
+    sigma = float(spread[0]), float(spread[1]), float(spread[2])
+    return PanelFit(piston, tip, tilt, sigma, float(residual @ residual), len(design) - _PARAMETERS)
+
+
+def _deviation(mirror: Mirror, panel: PanelId, world: Vector3, puck_height_m: float) -> Vector3:
+    x, y, deviation = mirror.foot_of_puck(world, puck_height_m)
+    x_p, y_p, _ = mirror.panel(panel).from_deck(mirror.surface.point(x, y))
+    return x_p, y_p, deviation
+
+
+def _as_points(points_world: FloatArray) -> list[Vector3]:
+    return [(float(x), float(y), float(z)) for x, y, z in points_world]

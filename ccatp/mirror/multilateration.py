@@ -1,0 +1,278 @@
+"""Position from ranges to known anchors: damped Gauss-Newton, covariance, dilution of precision.
+
+From valid lengths to the fix of the puck.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ccatp.config.models import EtalonConfig
+from ccatp.core import Fix, FloatArray, Vector3
+
+_RANK_TOLERANCE = 1e-6  # smallest over largest singular value of H: below it the position is not determined
+_COPLANAR_TOLERANCE = 1e-9  # the same ratio for the anchors about their centroid: they lie in a plane (2-D: on a line)
+_FIRST_DAMPING = 1e-6  # of the mean diagonal of H^T W H: as good as Gauss-Newton, yet solvable where H loses rank
+
+
+class MultilaterationError(ValueError):
+    """Base: no position that can be used. The message carries the numbers."""
+
+
+class TooFewRanges(MultilaterationError):
+    """Fewer ranges than dimension + 1."""
+
+
+class DegenerateGeometry(MultilaterationError):
+    """Anchors and position leave a direction undetermined."""
+
+
+class NoConvergence(MultilaterationError):
+    """The iteration did not come to rest."""
+
+
+class ResidualTooLarge(MultilaterationError):
+    """The ranges contradict each other by more than the limit."""
+
+
+class DilutionTooLarge(MultilaterationError):
+    """The geometry magnifies range errors by more than the limit."""
+
+
+class TooFarFromExpected(MultilaterationError):
+    """The position is further than the limit from where it was expected."""
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """A multilaterated position, in the frame of the anchors.
+
+    Attributes:
+        position_m: shape (d,).
+        covariance_m2: (H^T W H)^-1, shape (d, d).
+        dop: sqrt(trace((H^T H)^-1)), dimensionless.
+        residuals_m: measured minus computed ranges, shape (m,).
+        chi_squared: sum of the squared residuals over their variances; m - d degrees of freedom.
+        iterations: steps tried.
+    """
+
+    position_m: FloatArray
+    covariance_m2: FloatArray
+    dop: float
+    residuals_m: FloatArray
+    chi_squared: float
+    iterations: int
+
+    @property
+    def residual_rms_m(self) -> float:
+        """Root mean square of the residuals."""
+        return float(np.sqrt(np.mean(self.residuals_m**2)))
+
+
+def multilaterate(
+    anchors_m: ArrayLike,
+    ranges_m: ArrayLike,
+    sigmas_m: ArrayLike,
+    expected_m: ArrayLike,
+    *,
+    max_iterations: int = 100,
+    tolerance_m: float = 1e-9,
+) -> Solution:
+    """Weighted least squares position from ranges.
+
+    Minimises sum(((r_i - |x - a_i|) / sigma_i)^2) from ``expected_m`` on, by the steps
+    (H^T W H + lambda I) dx = H^T W (r - |x - a|), H_i = (x - a_i)^T / |x - a_i|, W = diag(1 / sigma^2); lambda falls
+    tenfold after a step that lessens the sum and rises tenfold after one that does not (Levenberg 1944).
+
+    Anchors that lie in one plane (in two dimensions: on one line) see two mirror images of the position equally well.
+    The expected position then selects the side: the image on its side of the plane is returned. An expected position
+    in that plane selects none and gives ``DegenerateGeometry``.
+
+    Args:
+        anchors_m: shape (m, d), d = 2 or 3, m >= d + 1.
+        ranges_m: shape (m,).
+        sigmas_m: standard deviations of the ranges, shape (m,), > 0.
+        expected_m: where to start, same frame as the anchors, shape (d,).
+        max_iterations: steps to try at most. Three to five do where the ranges agree; ranges that contradict each other
+            by much slow Gauss-Newton down.
+        tolerance_m: a step shorter than this ends the iteration.
+
+    Raises:
+        ValueError: shapes, numbers that are not finite, sigmas that are not positive.
+        TooFewRanges, DegenerateGeometry, NoConvergence: see there.
+    """
+    problem = _checked(anchors_m, ranges_m, sigmas_m, expected_m)
+    anchors, ranges, sigmas, start = problem
+    position, iterations = _iterate(problem, max_iterations, tolerance_m)
+    position = _on_side_of(start, position, anchors)
+    distances, directions = _geometry(anchors, position)
+    singular = np.linalg.svd(directions, compute_uv=False)
+    if singular[-1] <= _RANK_TOLERANCE * singular[0]:
+        raise DegenerateGeometry(
+            f"{len(ranges)} anchors leave a direction undetermined at {_text(position)} m "
+            f"(singular values {singular[0]:.3g} to {singular[-1]:.3g}); they lie on a line, or in a plane with it"
+        )
+    weighted = directions / sigmas[:, None]
+    covariance = np.linalg.solve(weighted.T @ weighted, np.eye(len(position)))
+    residuals = ranges - distances
+    return Solution(
+        position_m=position,
+        covariance_m2=0.5 * (covariance + covariance.T),
+        dop=float(np.sqrt(np.sum(singular**-2.0))),
+        residuals_m=residuals,
+        chi_squared=float(np.sum((residuals / sigmas) ** 2)),
+        iterations=iterations,
+    )
+
+
+def check_solution(
+    solution: Solution, expected_m: ArrayLike, *, max_residual_m: float, max_dop: float, max_distance_m: float
+) -> None:
+    """Refuse a solution that cannot be trusted.
+
+    Args:
+        solution: what ``multilaterate`` gave.
+        expected_m: where the position was expected, shape (d,).
+        max_residual_m: limit of the largest absolute residual.
+        max_dop: limit of the dilution of precision.
+        max_distance_m: limit of the distance from the expected position.
+
+    Raises:
+        ResidualTooLarge, DilutionTooLarge, TooFarFromExpected: in this order.
+    """
+    residual_m = float(np.max(np.abs(solution.residuals_m)))
+    if not residual_m <= max_residual_m:
+        raise ResidualTooLarge(f"largest residual {residual_m * 1e3:.4g} mm exceeds {max_residual_m * 1e3:.4g} mm")
+    if not solution.dop <= max_dop:
+        raise DilutionTooLarge(f"dilution of precision {solution.dop:.4g} exceeds {max_dop:.4g}")
+    distance_m = float(np.linalg.norm(solution.position_m - np.asarray(expected_m, dtype=np.float64)))
+    if not distance_m <= max_distance_m:
+        raise TooFarFromExpected(f"position {distance_m:.4g} m from the expected one exceeds {max_distance_m:.4g} m")
+
+
+class _Problem(NamedTuple):
+    anchors: FloatArray
+    ranges: FloatArray
+    sigmas: FloatArray
+    start: FloatArray
+
+
+def _checked(anchors_m: ArrayLike, ranges_m: ArrayLike, sigmas_m: ArrayLike, expected_m: ArrayLike) -> _Problem:
+    anchors = np.asarray(anchors_m, dtype=np.float64)
+    ranges = np.asarray(ranges_m, dtype=np.float64)
+    sigmas = np.asarray(sigmas_m, dtype=np.float64)
+    expected = np.asarray(expected_m, dtype=np.float64)
+    dimension = expected.size
+    if expected.shape not in ((2,), (3,)):
+        raise ValueError(f"expected position of shape {expected.shape}, not (2,) or (3,)")
+    if anchors.shape != (ranges.size, dimension) or ranges.ndim != 1 or sigmas.shape != ranges.shape:
+        raise ValueError(
+            f"anchors {anchors.shape}, ranges {ranges.shape}, sigmas {sigmas.shape} do not fit dimension {dimension}"
+        )
+    if not all(bool(np.isfinite(values).all()) for values in (anchors, ranges, sigmas, expected)):
+        raise ValueError("anchors, ranges, sigmas or expected position not finite")
+    if bool((sigmas <= 0.0).any()):
+        raise ValueError(f"sigma of {float(sigmas.min())} m, must be positive")
+    if ranges.size < dimension + 1:
+        raise TooFewRanges(f"{ranges.size} ranges, at least {dimension + 1} needed in {dimension} dimensions")
+    return _Problem(anchors, ranges, sigmas, expected)
+
+
+def _geometry(anchors: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distances (m,) and unit vectors from the anchors to the position, shape (m, d): the Jacobian H."""
+    offsets = position - anchors
+    distances = np.sqrt(np.einsum("ij,ij->i", offsets, offsets))
+    # At an anchor the direction is undefined: a zero row leaves that range out of this step.
+    return distances, offsets / np.maximum(distances, 1e-12)[:, None]
+
+
+def _iterate(problem: _Problem, max_iterations: int, tolerance_m: float) -> tuple[FloatArray, int]:
+    anchors, ranges, sigmas, start = problem
+    position = start
+    distances, directions = _geometry(anchors, position)
+    residuals = (ranges - distances) / sigmas
+    cost = float(residuals @ residuals)
+    damping = _FIRST_DAMPING
+    step_m = float("inf")
+    identity = np.eye(start.size)
+    for iteration in range(1, max_iterations + 1):
+        weighted = directions / sigmas[:, None]
+        normal = weighted.T @ weighted
+        scale = float(np.trace(normal)) / start.size
+        step = np.linalg.solve(normal + damping * scale * identity, weighted.T @ residuals)
+        step_m = float(np.sqrt(step @ step))
+        trial = position + step
+        trial_distances, trial_directions = _geometry(anchors, trial)
+        trial_residuals = (ranges - trial_distances) / sigmas
+        trial_cost = float(trial_residuals @ trial_residuals)
+        if trial_cost <= cost:
+            position, directions, residuals, cost = trial, trial_directions, trial_residuals, trial_cost
+            damping = max(damping * 0.1, 1e-15)
+        else:
+            damping *= 10.0
+        if step_m <= tolerance_m:
+            return position, iteration
+    raise NoConvergence(
+        f"no rest after {max_iterations} iterations: last step {step_m:.3g} m, limit {tolerance_m:.3g} m"
+    )
+
+
+def _on_side_of(start: FloatArray, position: FloatArray, anchors: FloatArray) -> FloatArray:
+    """The mirror image of ``position`` that lies on the side of ``start``, where the anchors lie in a plane."""
+    centroid = anchors.mean(axis=0)
+    _, singular, axes = np.linalg.svd(anchors - centroid)
+    if singular[-1] > _COPLANAR_TOLERANCE * singular[0]:
+        return position
+    normal: FloatArray = axes[-1]
+    height = float((position - centroid) @ normal)
+    if height * float((start - centroid) @ normal) < 0.0:
+        return position - 2.0 * height * normal
+    return position
+
+
+def _text(position: FloatArray) -> str:
+    return "(" + ", ".join(f"{value:.4f}" for value in position) + ")"
+
+
+def solve_fix(
+    cfg: EtalonConfig,
+    t_s: float,
+    expected_m: Vector3,
+    lengths_m: Mapping[int, float],
+    collimators_m: Mapping[int, FloatArray],
+) -> Fix:
+    """Multilaterate the puck, each length with sigma = length_sigma_m + length_sigma_per_m * length, and check it.
+
+    Args:
+        cfg: sigmas, and the limits of residual, dilution of precision and distance.
+        t_s: robot time for which the lengths hold.
+        expected_m: where the puck should be, world frame, shape (3,).
+        lengths_m: length by channel, at least four.
+        collimators_m: collimator by channel, world frame, shape (3,).
+
+    Raises:
+        MultilaterationError: no solution, or one past a limit.
+    """
+    ranges_m = np.array(tuple(lengths_m.values()))
+    sigmas_m = cfg.length_sigma_m + cfg.length_sigma_per_m * ranges_m
+    anchors_m = np.array([collimators_m[channel] for channel in lengths_m]).reshape(-1, 3)  # none is too few, too
+    solution = multilaterate(anchors_m, ranges_m, sigmas_m, expected_m)
+    check_solution(
+        solution,
+        expected_m,
+        max_residual_m=cfg.max_residual_m,
+        max_dop=cfg.max_dop,
+        max_distance_m=cfg.max_distance_m,
+    )
+    x, y, z = solution.position_m.tolist()
+    return Fix(
+        t_s=t_s,
+        position_m=(x, y, z),
+        covariance_m2=tuple(solution.covariance_m2.ravel().tolist()),
+        dop=solution.dop,
+        channels=tuple(lengths_m),
+        residual_rms_m=solution.residual_rms_m,
+    )

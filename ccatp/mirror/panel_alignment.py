@@ -1,0 +1,577 @@
+"""The alignment of one panel, from its deviations.
+
+Deviation of each measured point from the ideal surface, along the normal where the puck really stood.
+
+What a panel can do: displacements along its normal as polynomials of the place on it, and their least squares.
+
+The displacement is ``D(x, y) = sum c_i m_i(x, y)`` with the modes
+
+* ``RIGID``: 1, y, x: piston, tip, tilt, as in ``ccatp.mirror.misalignment``;
+* ``QUADRATIC``: these and x^2/2, x y, y^2/2: the coefficients are the curvatures D_xx, D_xy, D_yy;
+* ``ADJUSTABLE``: the rigid ones and what five adjusters in the corners and the centre can bend besides: x y, a twist,
+  and (x^2 + y^2)/2, a bowl. How a panel bends between its adjusters is taken to be this.
+
+Moves of the vertical adjusters that bring a panel back, and their uncertainty.
+
+An adjuster moves its place on the panel along the panel's normal, > 0 towards the robot. Moving the adjusters at
+(X_j, Y_j) by ``a_j = -sum c_i m_i(X_j, Y_j)`` adds ``-D`` to the panel, D being the displacement that was fitted in the
+modes m. For the rigid modes the moves lie on a plane: they turn and shift the panel and do not bend it, and among the
+moves that take the fitted plane away they are the ones of which five adjusters need no stiffness to be known. With
+``modes.adjustable`` they take twist and bowl away as well.
+
+Outliers among the points of a panel, and whether it is bent: the cheapest explanation of its deviations.
+
+Each explanation is a fit, rigid or with curvatures, to all points but a few. It costs its chi-square, and besides a
+price for every point left out and a price for the curvatures; the cheapest one holds. Leaving a point out is the same
+as giving it a shift of its own (mean-shift model), so its price is the chi-square of one degree of freedom that noise
+reaches only with the agreed probability, shared by all points of the mirror. Baarda's data snooping asks the same of
+one point at a time; a bent panel would make it throw good points away.
+
+Half-wavefront error of a mirror, before and after its adjusters are moved.
+
+A surface that is off by d along its normal changes the path of a ray that meets it at the angle of incidence i by
+``2 d cos(i)``, to first order in d; half of it, ``d cos(i)``, is the half-wavefront error. For a paraboloid in axial
+light this is Ruze's effective tolerance (J. Ruze, Antenna tolerance theory - a review, Proc. IEEE 54 (1966) 633), as
+cos(i) = 1 / sqrt(1 + (r/2f)^2) there. The root mean square is taken over the beam: a panel counts with its area times
+cos(i).
+
+For one panel, with the fitted coefficients c, their covariance C, and G the panel's mean of the products of the modes,
+
+    before^2 = cos(i)^2 (c^T G c + u)        after^2 = cos(i)^2 (tr(C G) + u)
+
+where u is the mean square of the residuals beyond what the uncertainty of the points explains (shape that the moves
+cannot take away), and tr(C G) what the uncertain moves leave. Noise makes the u of a panel without shape negative as
+often as positive, so the mean over the mirror is taken first, and cut off at zero then.
+
+The displacement of a panel as it was fitted, at any place on it.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtrc, chdtri
+
+from ccatp.config.models import LightConfig
+from ccatp.core import BoolArray, Fix, FloatArray, PanelId, PointId
+from ccatp.mirror.layout import Panel
+from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.misalignment import panel_deviations
+
+
+class Measured(NamedTuple):
+    """A point and its fix."""
+
+    point: PointId
+    fix: Fix
+
+
+class Deviations(NamedTuple):
+    """The measured points of one panel, in the order of their numbers.
+
+    Attributes:
+        points: which they are, length k.
+        places_m: (x, y) in the panel frame of the surface point under the puck, shape (k, 2).
+        deck_m: (x, y) of the same in the deck frame, shape (k, 2).
+        values_m: deviation along the local normal, > 0 towards the robot, shape (k,).
+        sigmas_m: standard deviation of each, shape (k,).
+        lever: local normal times the panel's, shape (k,): a displacement D along the panel's normal is a deviation of
+            D times this.
+    """
+
+    points: tuple[PointId, ...]
+    places_m: FloatArray
+    deck_m: FloatArray
+    values_m: FloatArray
+    sigmas_m: FloatArray
+    lever: FloatArray
+
+
+def deviations_of(
+    mirror: Mirror, panel: PanelId, measured: Sequence[Measured], puck_height_m: float, floor_m: float
+) -> Deviations:
+    """Deviations of the points of a panel.
+
+    The variance of a deviation is ``n^T C n + floor^2``: an error of the fix sideways moves along the surface.
+
+    Args:
+        mirror: the ideal mirror.
+        panel: the panel.
+        measured: its points, at least one.
+        puck_height_m: nominal height of the puck along the normal.
+        floor_m: standard deviation, point by point, of what the covariance of a fix does not know.
+
+    Raises:
+        UnknownPanelError: for a panel that does not exist.
+        ConvergenceError: for a fix far from the mirror.
+    """
+    chosen = sorted(measured, key=lambda one: one.point)
+    body = mirror.panel(panel)
+    rows = panel_deviations(mirror, panel, np.array([one.fix.position_m for one in chosen]), puck_height_m)
+    deck = np.array([mirror.surface.drop(body.to_deck((x, y, 0.0)), body.axes[2])[:2] for x, y, _ in rows.tolist()])
+    normals = [mirror.surface.normal(x, y) for x, y in deck.tolist()]
+    world = np.array([mirror.rotate_world_from_deck(normal) for normal in normals])
+    covariances = np.array([one.fix.covariance_m2 for one in chosen], dtype=np.float64).reshape(-1, 3, 3)
+    variances = np.einsum("ki,kij,kj->k", world, covariances, world) + floor_m**2
+    return Deviations(
+        points=tuple(one.point for one in chosen),
+        places_m=rows[:, :2],
+        deck_m=deck,
+        values_m=rows[:, 2],
+        sigmas_m=np.sqrt(variances),
+        lever=np.array(normals) @ np.array(body.axes[2]),
+    )
+
+
+Modes = Callable[[FloatArray], FloatArray]
+
+MAX_CONDITION = 1e4  # of columns of unit length; nine points of a panel give less than 10, points on a line infinity
+_NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(4)  # exact for the products of quadratics
+
+
+def rigid(places_m: FloatArray) -> FloatArray:
+    """The three modes of a rigid panel at (k, 2) places: shape (k, 3)."""
+    x, y = places_m.T
+    return np.column_stack([np.ones_like(x), y, x])
+
+
+def quadratic(places_m: FloatArray) -> FloatArray:
+    """The rigid modes and three curvatures at (k, 2) places: shape (k, 6)."""
+    x, y = places_m.T
+    return np.column_stack([rigid(places_m), x * x / 2.0, x * y, y * y / 2.0])
+
+
+def adjustable(places_m: FloatArray) -> FloatArray:
+    """The rigid modes, twist and bowl at (k, 2) places: shape (k, 5)."""
+    x, y = places_m.T
+    return np.column_stack([rigid(places_m), x * y, (x * x + y * y) / 2.0])
+
+
+class ModeFit(NamedTuple):
+    """Coefficients by weighted least squares.
+
+    Attributes:
+        values: coefficients, shape (m,), m and rad and 1/m.
+        covariance: theirs, shape (m, m).
+        residuals_m: what is left of the deviations, shape (k,).
+        residual_variance_m2: mean square of the residuals that the points' own uncertainty makes one expect.
+        chi2: weighted sum of squared residuals.
+        dof: points minus coefficients.
+    """
+
+    values: FloatArray
+    covariance: FloatArray
+    residuals_m: FloatArray
+    residual_variance_m2: float
+    chi2: float
+    dof: int
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations of the coefficients."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def unexplained_m2(self) -> float:
+        """Mean square of the residuals beyond what the points' uncertainty explains; by chance < 0."""
+        return float(np.mean(self.residuals_m**2)) - self.residual_variance_m2
+
+
+def fit_modes(design: FloatArray, values_m: FloatArray, sigmas_m: FloatArray) -> ModeFit | None:
+    """Weighted least squares by QR; None where the points do not determine the coefficients.
+
+    Args:
+        design: modes at the points, each row times the point's lever, shape (k, m).
+        values_m: deviations, shape (k,).
+        sigmas_m: their standard deviations, shape (k,), > 0.
+    """
+    count, modes = design.shape
+    if count < modes:
+        return None
+    whitened = design / sigmas_m[:, None]
+    scales = np.linalg.norm(whitened, axis=0)
+    if not (scales > 0.0).all() or not np.linalg.cond(whitened / scales) < MAX_CONDITION:
+        return None
+    q, r = np.linalg.qr(whitened)
+    target = values_m / sigmas_m
+    solution = np.linalg.solve(r, q.T @ target)
+    spread = np.linalg.solve(r, np.eye(modes))
+    left = target - whitened @ solution
+    # The whitened residuals are (1 - Q Q^T) times unit noise; the trace of its square is that of itself.
+    expected = float(np.mean(sigmas_m**2 * (1.0 - np.sum(q * q, axis=1))))
+    return ModeFit(solution, spread @ spread.T, left * sigmas_m, expected, float(left @ left), count - modes)
+
+
+def gram(modes: Modes, half_m: tuple[float, float]) -> FloatArray:
+    """Mean of the products of the modes over a panel: ``c^T G c`` is the mean square of a displacement.
+
+    Args:
+        modes: the modes.
+        half_m: half the panel's size along x and y.
+    """
+    x, y = np.meshgrid(_NODES * half_m[0], _NODES * half_m[1])
+    weights = np.outer(_NODE_WEIGHTS, _NODE_WEIGHTS).ravel() / 4.0
+    at = modes(np.column_stack([x.ravel(), y.ravel()]))
+    return np.asarray(at.T @ (weights[:, None] * at))
+
+
+class Moves(NamedTuple):
+    """Moves in the order of the adjusters' names.
+
+    Attributes:
+        values_m: moves, shape (a,).
+        covariance_m2: theirs, shape (a, a); of the rank of the modes.
+    """
+
+    values_m: FloatArray
+    covariance_m2: FloatArray
+
+    @property
+    def sigma_m(self) -> FloatArray:
+        """Standard deviations."""
+        return np.asarray(np.sqrt(np.diag(self.covariance_m2)))
+
+
+def adjuster_places(mirror: Mirror, panel: PanelId) -> tuple[tuple[str, ...], FloatArray]:
+    """Names of a panel's adjusters and their (x, y) in the panel frame, shape (a, 2), m.
+
+    Raises:
+        UnknownPanelError: for a panel that does not exist.
+    """
+    body = mirror.panel(panel)
+    found = mirror.adjusters_on_deck(panel)
+    places = [body.from_deck(mirror.surface.point(x, y))[:2] for x, y in found.values()]
+    return tuple(found), np.array(places, dtype=np.float64).reshape(-1, 2)
+
+
+def adjuster_moves(fit: ModeFit, modes: Modes, places_m: FloatArray) -> Moves:
+    """Moves that take a fitted displacement away.
+
+    Args:
+        fit: coefficients of the modes.
+        modes: the modes.
+        places_m: of the adjusters, panel frame, shape (a, 2).
+    """
+    at = -modes(places_m)
+    return Moves(at @ fit.values, at @ fit.covariance @ at.T)
+
+
+_CURVATURES = 3
+# Points beyond those that a fit takes, for each that is left out. With fewer, some choice of points always fits.
+REDUNDANCY = 3
+
+
+class Prices(NamedTuple):
+    """Chi-square that has to be gained by leaving a point out, and by the three curvatures of a panel."""
+
+    outlier: float
+    shape: float
+
+
+class Explanation(NamedTuple):
+    """Points that count, and whether the curvatures are significant."""
+
+    is_kept: BoolArray
+    has_shape: bool
+
+
+def prices(false_alarm: float, points: int, panels: int) -> Prices:
+    """What an explanation costs.
+
+    Args:
+        false_alarm: probability that noise alone makes an outlier anywhere on the mirror, and as much for a shape.
+        points: measured points of the mirror.
+        panels: panels with measured points.
+    """
+    return Prices(
+        float(chdtri(1, false_alarm / max(points, 1))), float(chdtri(_CURVATURES, false_alarm / max(panels, 1)))
+    )
+
+
+def explain(deviations: Deviations, price: Prices) -> Explanation:
+    """The cheapest explanation of a panel's deviations.
+
+    A panel that cannot be fitted, or has hardly more points than it takes, keeps all of them.
+    """
+    count = len(deviations.points)
+    target = deviations.values_m / deviations.sigmas_m
+    best, lowest = Explanation(np.ones(count, dtype=np.bool_), has_shape=False), np.inf
+    for modes, needed in ((rigid, 3), (quadratic, 6)):
+        has_shape = modes is quadratic
+        extra = price.shape if has_shape else 0.0
+        whitened = modes(deviations.places_m) * (deviations.lever / deviations.sigmas_m)[:, None]
+        whitened /= np.linalg.norm(whitened, axis=0)
+        for is_kept in _subsets(count, (count - needed) // REDUNDANCY):
+            cost = extra + price.outlier * int(np.count_nonzero(~is_kept))
+            if cost >= lowest:
+                continue
+            cost += _chi2(whitened[is_kept], target[is_kept])
+            if cost < lowest:
+                best, lowest = Explanation(is_kept, has_shape), cost
+    return best
+
+
+def _subsets(count: int, most: int) -> Iterator[BoolArray]:
+    for left_out in range(most + 1):
+        for some in combinations(range(count), left_out):
+            is_kept = np.ones(count, dtype=np.bool_)
+            is_kept[list(some)] = False
+            yield is_kept
+
+
+def _chi2(whitened: FloatArray, target: FloatArray) -> float:
+    """What least squares leave; infinite where the points do not determine the coefficients."""
+    solution, _, rank, _ = np.linalg.lstsq(whitened, target, rcond=1.0 / MAX_CONDITION)
+    left = target - whitened @ solution
+    return float(left @ left) if rank == whitened.shape[1] else np.inf
+
+
+class PanelWavefront(NamedTuple):
+    """One panel's part.
+
+    Attributes:
+        weight_m2: its area across the beam.
+        fitted_m2: mean square of its half-wavefront error, as fitted.
+        uncertain_m2: the same of what uncertain moves leave of it.
+        unexplained_m2: u, as half-wavefront error; may be negative by chance.
+        noise_m2: mean square of its points' uncertainty, as half-wavefront error.
+        mean_m: mean of the half-wavefront error before.
+    """
+
+    weight_m2: float
+    fitted_m2: float
+    uncertain_m2: float
+    unexplained_m2: float
+    noise_m2: float
+    mean_m: float
+
+
+class MirrorWavefront(NamedTuple):
+    """Root mean squares over all panels that could be fitted, m.
+
+    Attributes:
+        before_m: against the ideal surface.
+        before_level_m: the same without its mean over the beam, a path that all light shares.
+        after_m: predicted, once the adjusters have been moved.
+        noise_m: of a single point: what a survey after the moves shows is this and ``after_m``, added in squares.
+    """
+
+    before_m: float
+    before_level_m: float
+    after_m: float
+    noise_m: float
+
+
+def cos_incidence(mirror: Mirror, panel: PanelId, light: LightConfig | None) -> float:
+    """Cosine of the angle between a panel's normal and the light at its centre; 1 where the light is unknown."""
+    if light is None:
+        return 1.0
+    body = mirror.panel(panel)
+    # From the panel to where the rays meet, times the vergence: for parallel light the direction itself.
+    direction = np.array(light.direction_world)
+    direction /= np.linalg.norm(direction)
+    offset = np.array(mirror.world_from_deck(body.origin)) - mirror.world_from_mirror((0.0, 0.0, 0.0))
+    direction -= light.vergence_1_m * offset
+    normal = np.array(mirror.rotate_world_from_deck(body.axes[2]))
+    return float(abs(direction @ normal) / np.linalg.norm(direction))
+
+
+def half_size_m(panel: Panel) -> tuple[float, float]:
+    """Half a panel's size along its own x and y: its deck size over the cosines of the slopes."""
+    return panel.half_x_m / panel.axes[0][0], panel.half_y_m / panel.axes[1][1]
+
+
+def panel_wavefront(panel: Panel, cos_i: float, fit: ModeFit, gram: FloatArray, sigmas_m: FloatArray) -> PanelWavefront:
+    """Half-wavefront error of one panel.
+
+    Args:
+        panel: the panel.
+        cos_i: cosine of the angle of incidence.
+        fit: its displacement in the modes that the adjusters take away.
+        gram: mean of the products of these modes over the panel.
+        sigmas_m: of the points that were fitted.
+    """
+    half_x, half_y = half_size_m(panel)
+    square = cos_i * cos_i
+    return PanelWavefront(
+        weight_m2=4.0 * half_x * half_y * cos_i,
+        fitted_m2=square * float(fit.values @ gram @ fit.values),
+        uncertain_m2=square * float(np.trace(fit.covariance @ gram)),
+        unexplained_m2=square * fit.unexplained_m2,
+        noise_m2=square * float(np.mean(sigmas_m**2)),
+        # The first mode is 1, so the first row of the products holds the means of the modes.
+        mean_m=cos_i * float(gram[0] @ fit.values),
+    )
+
+
+def mirror_wavefront(panels: Iterable[PanelWavefront]) -> MirrorWavefront | None:
+    """Root mean square over panels, weighted by their areas across the beam; None without any."""
+    table = np.array(list(panels), dtype=np.float64).reshape(-1, len(PanelWavefront._fields))
+    if not len(table):
+        return None
+    weights = table[:, 0] / table[:, 0].sum()
+    fitted, uncertain, unexplained, noise, mean = (float(value) for value in weights @ table[:, 1:])
+    left = max(unexplained, 0.0)
+    level = max(fitted - mean * mean, 0.0) + left
+    return MirrorWavefront(sqrt(fitted + left), sqrt(level), sqrt(uncertain + left), sqrt(noise))
+
+
+SHAPE = slice(3, 6)
+
+
+class Shape(NamedTuple):
+    """Curvatures of the displacement, D_xx, D_xy, D_yy.
+
+    Attributes:
+        values_1_m, sigma_1_m: curvatures and standard deviations, shape (3,).
+        gain: chi-square of the rigid fit minus that of the fit with curvatures.
+        probability: that noise alone gains as much.
+        chi2, dof: of the fit with curvatures.
+        is_significant: the panel is bent beyond what noise explains.
+    """
+
+    values_1_m: FloatArray
+    sigma_1_m: FloatArray
+    gain: float
+    probability: float
+    chi2: float
+    dof: int
+    is_significant: bool
+
+
+class Plan(NamedTuple):
+    """Moves of the adjusters and what they make of the panel's half-wavefront error."""
+
+    moves: Moves
+    wavefront: PanelWavefront
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PanelResult:
+    """How a panel lies.
+
+    Piston, tip and tilt are those of the rigid fit, also where the panel is bent: they are what the adjusters can take
+    away without bending the panel, and half as uncertain as beside three curvatures.
+
+    Attributes:
+        panel: which.
+        deviations: of all its measured points.
+        is_kept: points that count, shape (k,); the others are outliers.
+        cos_i: cosine of the angle of incidence.
+        fit: piston (m), tip, tilt (rad).
+        shape: curvatures; None with fewer points than it takes.
+        adjusters: their names, in the order of the moves.
+        rigid: moves on a plane.
+        bending: moves that take twist and bowl away, too; None with fewer points than it takes.
+    """
+
+    panel: PanelId
+    deviations: Deviations
+    is_kept: BoolArray
+    cos_i: float
+    fit: ModeFit
+    shape: Shape | None
+    adjusters: tuple[str, ...]
+    rigid: Plan
+    bending: Plan | None
+
+    @property
+    def outliers(self) -> tuple[PointId, ...]:
+        """Points that were left out."""
+        return tuple(p for p, kept in zip(self.deviations.points, self.is_kept, strict=True) if not kept)
+
+    @property
+    def probability(self) -> float:
+        """That the points' uncertainty alone gives what the chosen model leaves, or more."""
+        found = self.shape if self.shape is not None and self.shape.is_significant else self.fit
+        return float(chdtrc(found.dof, found.chi2)) if found.dof > 0 else 1.0
+
+    @property
+    def model_dof(self) -> int:
+        """Degrees of freedom that the chosen model leaves."""
+        return self.shape.dof if self.shape is not None and self.shape.is_significant else self.fit.dof
+
+
+def panel_result(
+    mirror: Mirror, panel: PanelId, deviations: Deviations, explanation: Explanation, cos_i: float
+) -> PanelResult | None:
+    """Fit a panel; None where its points do not determine piston, tip and tilt.
+
+    Args:
+        mirror: the mirror.
+        panel: the panel.
+        deviations: its measured points.
+        explanation: which of them count.
+        cos_i: cosine of the angle of incidence.
+    """
+    kept = explanation.is_kept
+    places, lever = deviations.places_m[kept], deviations.lever[kept, None]
+    values, sigmas = deviations.values_m[kept], deviations.sigmas_m[kept]
+    fit = fit_modes(lever * rigid(places), values, sigmas)
+    if fit is None:
+        return None
+    body = mirror.panel(panel)
+    names, adjusters = adjuster_places(mirror, panel)
+
+    def plan(found: ModeFit, modes: Modes) -> Plan:
+        wavefront = panel_wavefront(body, cos_i, found, gram(modes, half_size_m(body)), sigmas)
+        return Plan(adjuster_moves(found, modes, adjusters), wavefront)
+
+    bent = fit_modes(lever * adjustable(places), values, sigmas)
+    full = fit_modes(lever * quadratic(places), values, sigmas)
+    return PanelResult(
+        panel=panel,
+        deviations=deviations,
+        is_kept=kept,
+        cos_i=cos_i,
+        fit=fit,
+        shape=None if full is None else _shape(fit, full, is_significant=explanation.has_shape),
+        adjusters=names,
+        rigid=plan(fit, rigid),
+        bending=None if bent is None else plan(bent, adjustable),
+    )
+
+
+def _shape(fit: ModeFit, full: ModeFit, *, is_significant: bool) -> Shape:
+    gain = fit.chi2 - full.chi2
+    chance = float(chdtrc(3, max(gain, 0.0)))
+    return Shape(full.values[SHAPE], full.sigma[SHAPE], gain, chance, full.chi2, full.dof, is_significant)
+
+
+def displacement_m(panel: PanelResult, places_m: FloatArray) -> FloatArray:
+    """Along the panel's normal, with its curvatures where they are significant, shape (k,).
+
+    Args:
+        panel: the panel.
+        places_m: (x, y) in the panel frame, shape (k, 2).
+    """
+    found = rigid(places_m) @ panel.fit.values
+    if panel.shape is not None and panel.shape.is_significant:
+        # The rigid fit has taken the mean of the curvatures' part away; so does what is drawn.
+        bend = quadratic(places_m)[:, 3:] @ panel.shape.values_1_m
+        found += bend - bend.mean()
+    return np.asarray(found)
+
+
+def on_grid_m(mirror: Mirror, panel: PanelResult, cells: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The displacement in a grid of cells over a panel.
+
+    Args:
+        mirror: the mirror.
+        panel: the panel.
+        cells: along each side.
+
+    Returns:
+        Edges of the cells along deck x and deck y, shape (cells + 1,) each, and the displacement in their middles,
+        rows along x, shape (cells, cells).
+    """
+    body = mirror.panel(panel.panel)
+    x = np.linspace(body.x_m - body.half_x_m, body.x_m + body.half_x_m, cells + 1)
+    y = np.linspace(body.y_m - body.half_y_m, body.y_m + body.half_y_m, cells + 1)
+    middle_x, middle_y = np.meshgrid((x[1:] + x[:-1]) / 2.0, (y[1:] + y[:-1]) / 2.0)
+    deck = np.column_stack([middle_x.ravel(), middle_y.ravel()]).tolist()
+    places = np.array([body.from_deck(mirror.surface.point(*place))[:2] for place in deck])
+    return x, y, displacement_m(panel, places).reshape(cells, cells)

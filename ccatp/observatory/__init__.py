@@ -1,1 +1,0 @@
-"""The agent of the observatory control system."""

@@ -1,4 +1,0 @@
-"""Glue. What the observatory control system finds under the entry point ``ocs.plugins``: our agent."""
-
-package_name = "ccatp"
-agents = {"CcatpAgent": {"module": "ccatp.observatory.agent", "entry_point": "main"}}

@@ -1,1 +1,0 @@
-"""Glue. One module per operating-system process; each wires pure rooms to edges and decides nothing itself."""

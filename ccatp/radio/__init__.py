@@ -1,1 +1,0 @@
-"""Pure. Positions from what radios tell: ranges, bearings, signal strengths."""

@@ -1,0 +1,247 @@
+"""``summary.json`` of a mission among beacons: figures of merit against the truth where that is known."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.core import FloatArray
+from ccatp.filters.metrics import aligned_rms_m, nees, rms_m
+from ccatp.links.beacon_messages import (
+    TRACK_COLUMNS,
+    TRUTH_COLUMNS,
+    PoseTruth,
+    pose_errors,
+    pose_track,
+    pose_truth,
+    table,
+)
+
+WITHIN_SIGMAS = 3.0
+
+
+class BeaconFacts(NamedTuple):
+    """What a run is of.
+
+    Attributes:
+        system: zigbee, follow, cricket.
+        seed: of the simulation.
+        waypoints: to be reached, over all laps.
+        safe_distance_m: to be kept from the target; ``None`` without one.
+        target: name of the radio that is followed.
+        settled_s: the least distance to the target counts from this time on.
+        has_truth: the run is simulated.
+    """
+
+    system: str
+    seed: int
+    waypoints: int
+    safe_distance_m: float | None
+    target: str
+    settled_s: float
+    has_truth: bool
+
+
+def beacon_facts(cfg: RadioConfig, *, is_sim: bool) -> BeaconFacts:
+    """What the summary has to know of a run."""
+    is_following = cfg.follow.is_active
+    return BeaconFacts(
+        system=cfg.system,
+        seed=cfg.run.seed,
+        waypoints=0 if is_following else cfg.mission.laps * len(cfg.workspace.waypoints_m),
+        safe_distance_m=cfg.follow.safe_distance_m if is_following else None,
+        target=cfg.follow.target,
+        settled_s=cfg.observation.every_steps * cfg.run.step_s,
+        has_truth=is_sim,
+    )
+
+
+class Reached(NamedTuple):
+    """A waypoint reached in a frame, by the estimate: x, y and covariance xx, xy, yy."""
+
+    seq: int
+    estimate: tuple[float, float, float, float, float]
+
+
+class BeaconSummary:
+    """Collects a run.
+
+    Args:
+        facts: what it is of.
+    """
+
+    def __init__(self, facts: BeaconFacts) -> None:
+        """Nothing yet."""
+        self._facts = facts
+        self._track: list[Sequence[float]] = []
+        self._truth: list[Sequence[float | None]] = []
+        self._places: Mapping[str, tuple[float, float]] = {}
+        self._beacons: Mapping[str, Sequence[float]] = {}
+        self._reached: list[Reached] = []
+        self._score = (0.0, 0, 0)
+        self._notes: Mapping[str, float] = {}
+        self._events: dict[str, int] = {}
+        self._mission_time_s = 0.0
+        self._outcome, self._cause = "", ""
+        self._ticks_us: list[float] = []
+
+    def add_track(self, rows: Sequence[Sequence[float]]) -> None:
+        """Rows of the topic ``beacon_track``."""
+        self._track += rows
+
+    def add_truth(self, rows: Sequence[Sequence[float | None]]) -> None:
+        """Rows of the topic ``beacon_truth``."""
+        self._truth += rows
+
+    def set_places(self, places: Mapping[str, tuple[float, float]]) -> None:
+        """Where radios and motes really are."""
+        self._places = places
+
+    def set_map(
+        self, beacons: Mapping[str, Sequence[float]], score: tuple[float, int, int], notes: Mapping[str, float]
+    ) -> None:
+        """The newest map: ellipses by name; sum of NIS, its degrees of freedom, readings refused; notes."""
+        self._beacons, self._score, self._notes = beacons, score, notes
+
+    def add_reached(self, reached: Reached) -> None:
+        """A waypoint is reached."""
+        self._reached.append(reached)
+
+    def add_danger(self, signal: str) -> None:
+        """The danger loop began to deny motion because of a signal."""
+        self._events[signal] = self._events.get(signal, 0) + 1
+
+    def add_ticks(self, tick_us: Sequence[float]) -> None:
+        """Wall times of main-loop ticks, microseconds."""
+        self._ticks_us += tick_us
+
+    def set_mission(self, mission_time_s: float, outcome: str, cause: str) -> None:
+        """How long it took by the robot's clock, and how it ended."""
+        self._mission_time_s, self._outcome, self._cause = mission_time_s, outcome, cause
+
+    def build(self, wall_s: float) -> dict[str, Any]:
+        """The summary; lengths in m, angles in rad, times in s. What needs the truth is null without it."""
+        facts = self._facts
+        track = pose_track(table(self._track, TRACK_COLUMNS))
+        truth = pose_truth(table(self._truth, TRUTH_COLUMNS))
+        if len(track.seq):  # the last drive may have been driven, or not
+            truth = truth.at(truth.seq <= track.seq[-1])
+        _, i, j = np.intersect1d(track.seq, truth.seq, return_indices=True)
+        track, true = track.at(i), truth.at(j)
+        # A robot that stands until motes have mapped themselves navigates from then on.
+        is_navigating = track.t_s >= self._notes.get("map_time_s", 0.0)
+        if is_navigating.any():
+            track, true = track.at(is_navigating), true.at(is_navigating)
+        known = facts.has_truth and len(true.seq) > 0
+        errors = pose_errors(track, true)
+        return {
+            "system": facts.system,
+            "seed": facts.seed,
+            "outcome": self._outcome,
+            "cause": self._cause,
+            "waypoints": self._waypoints(truth if known else None),
+            "trajectory_rmse_m": _rounded(aligned_rms_m(track.place_m, true.place_m)) if known else None,
+            "position_error_m": _distribution(np.hypot(errors[:, 0], errors[:, 1])) if known else _no_distribution(),
+            "heading_rmse_rad": _rounded(np.sqrt(np.mean(errors[:, 2] ** 2))) if known else None,
+            "dead_reckoning_rmse_m": _rounded(rms_m(track.reckoned_m, true.place_m)) if known else None,
+            "path_length_m": _path_m(true.place_m) if known else None,
+            "beacons": self._beacon_figures(known=known),
+            "target": self._target_figures(truth, known=known),
+            "obstacles": _obstacle_figures(truth, known=known),
+            "consistency": {
+                "pose_nees_mean": _rounded(np.mean(nees(errors, track.covariance))) if known else None,
+                "nis_mean": _rounded(self._score[0] / self._score[1]) if self._score[1] else None,
+                "readings": self._score[1],
+                "refused": self._score[2],
+            },
+            "danger": dict(sorted(self._events.items())),
+            "map": {name: _rounded(value) for name, value in sorted(self._notes.items())},
+            "mission_time_s": _rounded(self._mission_time_s, 3),
+            "wall": self._wall(wall_s),
+        }
+
+    def _wall(self, wall_s: float) -> dict[str, float | None]:
+        p50, p99 = np.percentile(self._ticks_us, (50, 99)) if self._ticks_us else (None, None)
+        return {
+            "time_s": _rounded(wall_s, 3),
+            "realtime_factor": _rounded(self._mission_time_s / wall_s, 2) if wall_s else None,
+            "tick_us_p50": _rounded(p50, 1),
+            "tick_us_p99": _rounded(p99, 1),
+        }
+
+    def _waypoints(self, truth: PoseTruth | None) -> dict[str, Any]:
+        """Reached by the estimate, and how often the truth was within 3 sigma of it then."""
+        within: int | None = None
+        if truth is not None:
+            places = dict(zip(truth.seq.astype(int).tolist(), truth.place_m, strict=True))
+            within = sum(_sigmas(one, places[one.seq]) <= WITHIN_SIGMAS for one in self._reached if one.seq in places)
+        return {"total": self._facts.waypoints, "reached": len(self._reached), "within_3_sigma": within}
+
+    def _beacon_figures(self, *, known: bool) -> dict[str, Any]:
+        found = {name: place for name, place in self._beacons.items() if name != self._facts.target}
+        errors, nees = [], []
+        for name, (x, y, xx, xy, yy) in sorted(found.items()) if known else ():
+            if name in self._places:
+                off = np.subtract((x, y), self._places[name])
+                errors.append(float(np.hypot(*off)))
+                nees.append(float(off @ np.linalg.pinv(np.array(((xx, xy), (xy, yy)))) @ off))
+        return {
+            "count": len(self._places) if known else None,
+            "mapped": len(found),
+            "rmse_m": _rounded(np.sqrt(np.mean(np.square(errors)))) if errors else None,
+            "max_m": _rounded(max(errors)) if errors else None,
+            "nees_mean": _rounded(np.mean(nees)) if nees else None,
+            "places_m": {name: [_rounded(place[0]), _rounded(place[1])] for name, place in sorted(found.items())},
+        }
+
+    def _target_figures(self, truth: PoseTruth, *, known: bool) -> dict[str, Any] | None:
+        safe_m = self._facts.safe_distance_m
+        if safe_m is None:
+            return None
+        late = truth.at((truth.t_s >= self._facts.settled_s) & np.isfinite(truth.target_m[:, 0]) & known)
+        distances = np.hypot(*(late.place_m - late.target_m).T)
+        error_m = None
+        place = self._beacons.get(self._facts.target)
+        if known and place is not None:
+            error_m = _rounded(np.hypot(*(place[:2] - truth.target_m[-1])))
+        return {
+            "safe_distance_m": safe_m,
+            "distance_mean_m": _rounded(distances.mean()) if len(distances) else None,
+            "distance_min_m": _rounded(distances.min()) if len(distances) else None,
+            "distance_rms_off_m": _rounded(np.sqrt(np.mean((distances - safe_m) ** 2))) if len(distances) else None,
+            "final_error_m": error_m,
+        }
+
+
+def _distribution(errors: FloatArray) -> dict[str, float | None]:
+    p50, p99 = np.percentile(errors, (50, 99))
+    figures = {"rmse": np.sqrt(np.mean(errors**2)), "mean": errors.mean(), "p50": p50, "p99": p99, "max": errors.max()}
+    return {name: _rounded(value) for name, value in figures.items()}
+
+
+def _no_distribution() -> dict[str, float | None]:
+    return dict.fromkeys(("rmse", "mean", "p50", "p99", "max"))
+
+
+def _path_m(places: FloatArray) -> float | None:
+    return _rounded(np.hypot(*np.diff(places, axis=0).T).sum())
+
+
+def _obstacle_figures(truth: PoseTruth, *, known: bool) -> dict[str, Any] | None:
+    clearances = truth.clearance_m[np.isfinite(truth.clearance_m)]
+    if known and not len(clearances):
+        return None
+    least_m = clearances.min() if known else None
+    return {"least_clearance_m": _rounded(least_m), "touched": None if least_m is None else bool(least_m <= 0.0)}
+
+
+def _sigmas(reached: Reached, true_m: FloatArray) -> float:
+    x, y, xx, xy, yy = reached.estimate
+    off = true_m - (x, y)
+    return float(np.sqrt(off @ np.linalg.solve(np.array(((xx, xy), (xy, yy))), off)))
+
+
+def _rounded(value: Any, decimals: int = 6) -> float | None:
+    # None for what JSON has no number for; never a negative zero.
+    return None if value is None or not np.isfinite(value) else round(float(value), decimals) + 0.0

@@ -1,0 +1,356 @@
+"""A run directory as something that can be replayed: each recording with its configuration and its messages.
+
+What happened to the localizer in a run, and in which order.
+
+Poses of a robot, frame by frame.
+"""
+
+import tempfile
+from array import array
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from ccatp.config.load import load_config
+from ccatp.config.models import Config
+from ccatp.core import Fix, FloatArray, IntArray, PanelId, PanelPose
+from ccatp.errors import CcatpError, ExitStatus
+from ccatp.links.robot_codec import BadLine, decode_from_robot
+from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import (
+    RECORD_FORMAT,
+    Arrival,
+    BadMessage,
+    FixMessage,
+    Rest,
+    SensorLines,
+    Track,
+    Treatment,
+    Truth,
+    unpack,
+)
+from ccatp.mirror.mirror import Mirror, deck_poses
+from ccatp.records.recorder import iter_messages, read_metadata, recordings
+
+
+@dataclass(frozen=True, slots=True)
+class Marked:
+    """A frame was taken, and what else was done to the localizer in it.
+
+    Attributes:
+        sensors: the frame.
+        at_rest: the mission took the robot to be at rest.
+        begun: before the frame the localizer began anew, with these values of ``Treatment``.
+        is_deaf: whatever wheels and inertial unit say, the robot stands.
+        doubted: after the samples its pose was doubted by this much, m and rad.
+    """
+
+    sensors: Sensors
+    at_rest: bool
+    begun: tuple[float, ...] | None = None
+    is_deaf: bool = False
+    doubted: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Fixed:
+    """A fix was measured after the frame before it.
+
+    Attributes:
+        fix: as measured.
+        was_fused: the localizer took it then.
+        was_set_aside: the localizer never saw it: it was doubted, and measured again.
+    """
+
+    fix: Fix
+    was_fused: bool
+    was_set_aside: bool = False
+
+
+Event = Marked | Fixed
+
+
+class Stood(NamedTuple):
+    """The mission takes the robot to be at rest from frame ``seq`` on."""
+
+    seq: int
+
+
+class FixGiven(NamedTuple):
+    """A fix was measured after frame ``seq``; the others as in ``Fixed``."""
+
+    seq: int
+    fix: Fix
+    was_fused: bool
+    was_set_aside: bool = False
+
+
+Message = Sensors | Stood | FixGiven | Treatment
+
+
+def fix_given(message: FixMessage) -> FixGiven:
+    """The recorded fix as it was measured, and what became of it."""
+    fix = Fix(
+        t_s=message.t_s,
+        position_m=message.position_m,
+        covariance_m2=tuple(message.covariance_m2),
+        dop=message.dop,
+        channels=tuple(message.channels),
+        residual_rms_m=message.residual_rms_m,
+    )
+    return FixGiven(message.seq, fix, message.is_fused, message.is_set_aside)
+
+
+def in_order(messages: Iterable[Message]) -> Iterator[Event]:
+    """Frames, rests, treatments and fixes in the order in which the localizer met them.
+
+    Frames are recorded in batches, rests and fixes at once and with the number of their frame: they come at any time
+    before the batch of the frame after it. A rest belongs into its frame, a fix behind it. What belongs behind a frame
+    beyond the end of the record is left out. A treatment belongs into its frame, too.
+
+    Args:
+        messages: in the order of recording; the numbers of the frames grow.
+    """
+    rests: set[int] = set()
+    treatments: dict[tuple[int, str], tuple[float, ...]] = {}
+    is_deaf = False
+    fixes: deque[FixGiven] = deque()
+    last = -1
+    for message in messages:
+        if isinstance(message, Stood):
+            rests.add(message.seq)
+        elif isinstance(message, FixGiven):
+            fixes.append(message)
+        elif isinstance(message, Treatment):
+            treatments[message.seq, message.kind] = message.values
+        else:
+            while fixes and fixes[0].seq < message.seq:
+                yield Fixed(*fixes.popleft()[1:])
+            last = message.seq
+            at_rest = last in rests
+            rests.discard(last)
+            begun = treatments.pop((last, "begun"), None)
+            if (last, "deaf") in treatments or (last, "hearing") in treatments or begun is not None:
+                is_deaf = (last, "deaf") in treatments
+            yield Marked(message, at_rest, begun, is_deaf, treatments.pop((last, "doubted"), None))
+    while fixes and fixes[0].seq <= last:
+        yield Fixed(*fixes.popleft()[1:])
+
+
+class Trace(NamedTuple):
+    """Poses after k frames.
+
+    Attributes:
+        seq: numbers of the frames, growing, shape (k,).
+        t_s: robot time, shape (k,).
+        pose: deck x, y (m) and heading (rad), shape (k, 3).
+        height_m: of the surface there, deck frame, shape (k,).
+        covariance: of ``pose``, shape (k, 3, 3); None where it is not known.
+    """
+
+    seq: IntArray
+    t_s: FloatArray
+    pose: FloatArray
+    height_m: FloatArray
+    covariance: FloatArray | None = None
+
+    @property
+    def place(self) -> FloatArray:
+        """Points on the surface, deck frame, m, shape (k, 3)."""
+        return np.column_stack([self.pose[:, :2], self.height_m])
+
+    def moved_to(self, mirror: Mirror, pose: FloatArray, covariance: FloatArray) -> "Trace":
+        """The same frames with other poses (k, 3) and covariances (k, 3, 3)."""
+        heights = mirror.surface.heights_m(pose[:, 0], pose[:, 1])
+        return Trace(self.seq, self.t_s, pose, heights, covariance)
+
+
+class TraceBuilder:
+    """Collects poses in panel frames, in little memory."""
+
+    def __init__(self) -> None:
+        self._names = array("q")  # frame, row, column
+        self._rows = array("d")  # time, x, y, heading
+        self._covariances = array("d")
+
+    def add(self, seq: int, t_s: float, row: int, col: int, pose: tuple[float, float, float]) -> None:
+        """A pose (x, y, heading) in the frame of panel (row, col)."""
+        self._names.extend((seq, row, col))
+        self._rows.extend((t_s, *pose))
+
+    def add_covariance(self, covariance: FloatArray) -> None:
+        """Of the pose added last, deck frame, shape (3, 3)."""
+        self._covariances.extend(covariance.ravel().tolist())
+
+    def build(self, mirror: Mirror) -> Trace:
+        """The trace, in the deck frame."""
+        names = np.array(self._names, dtype=np.int64).reshape(-1, 3)
+        rows = np.array(self._rows).reshape(-1, 4)
+        poses = [
+            PanelPose(PanelId(row, col), x, y, heading)
+            for (_, row, col), (_, x, y, heading) in zip(names.tolist(), rows.tolist(), strict=True)
+        ]
+        deck = deck_poses(mirror, poses)
+        covariance = np.array(self._covariances).reshape(-1, 3, 3) if self._covariances else None
+        return Trace(names[:, 0], rows[:, 0], deck[:, :3], deck[:, 3], covariance)
+
+
+def trace_of_truth(rows: Sequence[Sequence[float]] | FloatArray) -> Trace:
+    """The simulated truth; rows as in the topic ``truth``."""
+    table = np.asarray(rows, dtype=np.float64).reshape(-1, 11)
+    return Trace(table[:, 0].astype(np.int64), table[:, 1], table[:, 2:5], table[:, 7])
+
+
+_T = TypeVar("_T")
+TELEMETRY = "telemetry.mcap"
+CONFIG = "config.toml"
+# What a replay reads; the others of the topic table would only be decoded for nothing.
+READ = frozenset(("sensors", "rest", "treatment", "fix", "track", "truth", "arrival"))
+
+
+class RunReadError(CcatpError):
+    """A run that cannot be read."""
+
+    exit_status = ExitStatus.USAGE
+
+
+@dataclass(slots=True)
+class Recording:
+    """One recording of a run; a run that was resumed has several, each from the robot's start at base.
+
+    Attributes:
+        path: the file.
+        metadata: what the recorder was told.
+        warnings: what is wrong with it; complete when ``messages`` has come to its end.
+        arrivals: frames at which the robot stood at a point for the first time; complete likewise.
+    """
+
+    path: Path
+    metadata: Mapping[str, str]
+    warnings: list[str] = field(default_factory=list)
+    arrivals: list[int] = field(default_factory=list)
+    _track: TraceBuilder = field(default_factory=TraceBuilder)
+    _truth: list[tuple[float, ...]] = field(default_factory=list)
+    _lost: int = 0
+
+    @property
+    def is_simulation(self) -> bool:
+        """It was recorded of the stand-ins."""
+        return self.metadata.get("simulation") == "true"
+
+    def config(self, overrides: Mapping[str, object]) -> Config:
+        """The configuration that was recorded with, and ``overrides`` on top.
+
+        Raises:
+            ConfigError: it cannot be used.
+        """
+        beside = self.path.with_name(CONFIG)
+        kept = self.metadata.get("config")
+        if kept is None or (beside.is_file() and _text(beside) == kept):
+            return load_config(beside, overrides)
+        # A later session of a resumed run has written its own.
+        with tempfile.TemporaryDirectory(prefix="ccatp-replay-") as folder:
+            file = Path(folder) / CONFIG
+            file.write_text(kept, encoding="utf-8")
+            return load_config(file, overrides)
+
+    def messages(self) -> Iterator[Message]:
+        """Frames, rests and fixes, in the order of recording; estimates and truth are put aside on the way."""
+        last, missing, t_s = -1, 0, 0.0
+        damages: list[str] = []
+        for topic, _, payload in iter_messages(self.path, damages.append):
+            if topic not in READ:
+                continue
+            try:
+                found = self._take(unpack(topic.encode() + b" " + payload)[2])
+            except (BadMessage, BadLine) as error:
+                self._lose(str(error))
+                continue
+            for message in found:
+                if isinstance(message, Sensors):
+                    missing += message.seq - last - 1 if last >= 0 else 0
+                    last, t_s = message.seq, message.t
+                yield message
+        self.warnings += [f"{damage}; its last frame is of {t_s:.2f} s" for damage in damages]
+        if missing:
+            self.warnings.append(f"{self.path}: {missing} frames are missing in between")
+
+    def _take(self, message: object) -> list[Message]:
+        """What a message holds for the localizer."""
+        if isinstance(message, SensorLines):
+            frames = [decode_from_robot(bytes(line)) for line in message.lines]
+            return [frame for frame in frames if isinstance(frame, Sensors)]
+        if isinstance(message, Rest):
+            return [Stood(message.seq)]
+        if isinstance(message, Treatment):
+            return [message]
+        if isinstance(message, FixMessage):
+            return [fix_given(message)]
+        if isinstance(message, Track):
+            for seq, t_s, row, col, x_m, y_m, heading_rad, _ in message.rows:
+                self._track.add(seq, t_s, row, col, (x_m, y_m, heading_rad))
+        elif isinstance(message, Truth):
+            self._truth += message.rows
+        elif isinstance(message, Arrival):
+            self.arrivals.append(message.seq)
+        return []
+
+    def _lose(self, why: str) -> None:
+        """A message that cannot be read: one line says so, however many there are."""
+        self._lost += 1
+        if self._lost == 1:
+            self.warnings.append(f"{self.path}: what cannot be read is left out: {why}")
+
+    def recorded(self, mirror: Mirror) -> Trace:
+        """What the run itself estimated."""
+        return self._track.build(mirror)
+
+    def truth(self) -> Trace | None:
+        """The simulated truth, where there is one."""
+        return trace_of_truth(np.array(self._truth)) if self._truth else None
+
+    def arrival_frames(self) -> IntArray:
+        """``arrivals`` as an array."""
+        return np.array(self.arrivals, dtype=np.int64)
+
+
+def open_run(run_dir: Path) -> list[Recording]:
+    """The recordings of a run directory, oldest first.
+
+    Raises:
+        RunReadError: there is no such directory, it holds no recording or no configuration, or one of a newer format.
+    """
+    if not run_dir.is_dir():
+        raise RunReadError(f"{run_dir}: no such directory; name the directory of a run")
+    paths = recordings(run_dir / TELEMETRY)
+    if not paths:
+        raise RunReadError(f"{run_dir}: no {TELEMETRY} there; name the directory of a run")
+    return [_open(path) for path in paths]
+
+
+def _open(path: Path) -> Recording:
+    metadata = _readable(path, read_metadata)
+    number = metadata.get("format", "0")
+    if not number.isdecimal() or int(number) > RECORD_FORMAT:
+        raise RunReadError(
+            f"{path}: recorded in format {number} by ccatp {metadata.get('ccatp', 'unknown')}, this one reads "
+            f"up to {RECORD_FORMAT}: replay it with a newer ccatp"
+        )
+    if "config" not in metadata and not path.with_name(CONFIG).is_file():
+        raise RunReadError(f"{path.parent}: no {CONFIG} there; name the directory of a run")
+    return Recording(path, metadata)
+
+
+def _text(path: Path) -> str:
+    return _readable(path, lambda file: file.read_text(encoding="utf-8", errors="replace"))
+
+
+def _readable(path: Path, read: Callable[[Path], _T]) -> _T:
+    try:
+        return read(path)
+    except OSError as error:
+        raise RunReadError(f"{path}: cannot be read: {error.strerror or error}") from error

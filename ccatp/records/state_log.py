@@ -1,0 +1,167 @@
+"""The log of a run, ``log.jsonl``: lines for a reader, and when the mission changed its state."""
+
+import json
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ccatp.core import danger_text
+
+# Fields of every line; the others say more of what happened.
+_OWN = frozenset(("process", "event", "level", "wall", "seq", "t_s"))
+_DEBUG = "debug"
+# At the end of a field's name.
+_UNITS = frozenset(("s", "ms", "us", "m", "mm", "um", "rad", "mrad"))
+
+
+class StateChange(NamedTuple):
+    """At frame ``seq`` the mission went from one state to another."""
+
+    seq: int
+    before: str
+    after: str
+
+
+class LogLine(NamedTuple):
+    """A line of the log: wall time (ISO), robot time where it is known, level, process, text."""
+
+    wall: str
+    t_s: float | None
+    level: str
+    process: str
+    text: str
+
+
+class ReadLine(NamedTuple):
+    """A line of the log.
+
+    Attributes:
+        shown: what a reader is shown; None for what was said for debugging.
+        change: what it tells of the mission's state.
+        begins: a session begins with it.
+    """
+
+    shown: LogLine | None
+    change: StateChange | None
+    begins: bool
+
+
+def read_log(path: Path, warnings: list[str]) -> Iterator[ReadLine]:
+    """The lines of a log, oldest first; a log that is not there has none.
+
+    Args:
+        path: the file; its last line may be torn, as after a ``kill -9``.
+        warnings: takes one line where something cannot be read.
+    """
+    bad = 0
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            for text in file:
+                line = _parsed(text)
+                if line is None:
+                    bad += 1
+                else:
+                    yield line
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        warnings.append(f"{path.name}: cannot be read: {error.strerror or error}")
+    if bad:
+        warnings.append(f"{path.name}: {bad} lines cannot be read and are left out")
+
+
+def _parsed(text: str) -> ReadLine | None:
+    try:
+        fields = json.loads(text)
+    except ValueError:
+        return None
+    if not isinstance(fields, dict) or not isinstance(fields.get("event"), str):
+        return None
+    begins = fields["event"] == "run" and fields.get("process") == "supervisor"
+    if fields.get("level") == _DEBUG:
+        return ReadLine(None, _change(fields), begins)
+    t_s = fields.get("t_s")
+    line = LogLine(
+        wall=str(fields.get("wall", "")),
+        t_s=float(t_s) if isinstance(t_s, int | float) else None,
+        level=str(fields.get("level", "")),
+        process=str(fields.get("process", "")),
+        text=_text(fields),
+    )
+    return ReadLine(line, None, begins)
+
+
+def _change(fields: dict[str, Any]) -> StateChange | None:
+    seq, before, after = (fields.get(key) for key in ("seq", "before", "after"))
+    if fields["event"] != "state" or not isinstance(seq, int):
+        return None
+    return StateChange(seq, str(before), str(after))
+
+
+def _text(fields: dict[str, Any]) -> str:
+    """What happened, and what more the line says of it: names, values and units as a reader writes them."""
+    event = str(fields["event"])
+    if event == "verdict":
+        return _verdict(fields)
+    more = [f"{_named(key)} {_shown(value)}{_unit(key)}" for key, value in fields.items() if _says(key, value)]
+    return f"{event}: {', '.join(more)}" if more else event
+
+
+def _says(key: str, value: object) -> bool:
+    return key not in _OWN and value not in ("", {}, [], None)
+
+
+def _verdict(fields: dict[str, Any]) -> str:
+    cause, signal = str(fields.get("cause", "")), str(fields.get("signal", ""))
+    if not cause:
+        return "danger: all is well again"
+    value, limit = (found if isinstance(found := fields.get(key), int | float) else 0.0 for key in ("value", "limit"))
+    return f"danger: {danger_text(cause, signal, value, limit)}, event code {fields.get('code')}"
+
+
+def _named(key: str) -> str:
+    stem, _, last = key.rpartition("_")
+    return (stem if last in _UNITS and stem else key).replace("_", " ")
+
+
+def _unit(key: str) -> str:
+    stem, _, last = key.rpartition("_")
+    return f" {last}" if last in _UNITS and stem else ""
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, dict):
+        return ", ".join(f"{_named(str(key))} {_shown(inner)}" for key, inner in value.items())
+    if isinstance(value, list):
+        return ", ".join(map(_shown, value))
+    return str(value)
+
+
+def changes_of(lines: Iterable[ReadLine], sessions: int) -> list[tuple[StateChange, ...]]:
+    """The changes of state in each session.
+
+    They are numbered by the robot's frames. Where these count anew within a session, because the robot booted, or where
+    the log does not hold as many sessions as there are recordings, their times are not known: then there are none.
+
+    Args:
+        lines: of the log.
+        sessions: recordings of the run.
+    """
+    parts: list[list[StateChange]] = []
+    for line in lines:
+        if line.begins:
+            parts.append([])
+        elif line.change is not None and parts:
+            parts[-1].append(line.change)
+    if len(parts) != sessions:
+        return [()] * sessions
+    return [tuple(part) if _is_in_order(part) else () for part in parts]
+
+
+def _is_in_order(part: list[StateChange]) -> bool:
+    return all(a.seq <= b.seq for a, b in pairwise(part))

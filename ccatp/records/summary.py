@@ -1,0 +1,341 @@
+"""The summary of a run: joins estimates with the simulated truth and builds ``summary.json``.
+
+Numbers are rounded to fixed decimals, and the result does not depend on how
+the rows were cut into batches: the same run gives the same file. What needs the truth is null on a real robot.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ccatp.core import DeckPose, EventCode, FloatArray, PanelId, PointId, Vector3
+from ccatp.mirror.mirror import Mirror
+
+PanelFits = Mapping[PanelId, tuple[float, float, float]]  # piston (m), tip (rad), tilt (rad)
+
+WITHIN_M = 0.010  # the thesis's requirement, part of the names of two fields
+EDGE_FRAMES = 3  # a verdict may stand on samples this many frames before or after the truth's
+HISTORY_ROWS = 60_000  # truth kept for arrivals and verdicts that come late: ten minutes at 100 Hz
+
+# Columns that truth and track share, and those of the truth alone.
+_SEQ, _X, _Y, _PSI, _SURFACE = 0, 2, 3, 4, slice(5, 8)
+_CLEARANCE, _FALLEN = 8, 9
+
+
+class PuckTarget(NamedTuple):
+    """Where the puck shall be at a measurement point, and the normal of its panel; deck frame, m."""
+
+    position_m: Vector3
+    normal: Vector3
+
+
+def puck_targets(mirror: Mirror, points: Iterable[PointId], puck_height_m: float) -> dict[PointId, PuckTarget]:
+    """Target of the puck at each point: the point on the surface plus ``puck_height_m`` along the normal there."""
+    targets = {}
+    for point in points:
+        x, y = mirror.point_on_deck(point)
+        puck = mirror.deck_from_robot(DeckPose(x, y, 0.0), (0.0, 0.0, puck_height_m))
+        targets[point] = PuckTarget(puck, mirror.panels[point.panel].axes[2])
+    return targets
+
+
+def arrival_error_m(target: PuckTarget, place_m: FloatArray, normal: Vector3, puck_height_m: float) -> float:
+    """Distance of the puck from its target in the tangent plane of the target's panel, m.
+
+    Args:
+        target: where the puck shall be.
+        place_m: surface point under the robot, deck frame, shape (3,).
+        normal: of the surface there.
+        puck_height_m: puck centre above the surface.
+    """
+    offset, across = place_m + puck_height_m * np.array(normal) - target.position_m, np.array(target.normal)
+    return float(np.linalg.norm(offset - (offset @ across) * across))
+
+
+@dataclass(frozen=True, slots=True)
+class RunFacts:
+    """What is known of a run before it starts.
+
+    Attributes:
+        mirror, world, filter, seed: as configured; ``world`` is None on a real robot.
+        total_points: points of the mission.
+        lower_bound_s: rest-to-rest time of the same path under the same limits, with the measuring.
+        budget_s: the mission's budget.
+        puck_height_m: puck centre above the surface.
+        has_truth: simulation.
+    """
+
+    mirror: str
+    world: str | None
+    filter: str
+    seed: int
+    total_points: int
+    lower_bound_s: float
+    budget_s: float
+    puck_height_m: float
+    has_truth: bool
+
+
+class SummaryBuilder:
+    """Collects a run and builds its summary.
+
+    Rows may come in batches of any size, and truth and track in any order against each other; joined rows are
+    forgotten but for their errors.
+
+    Args:
+        facts: the run.
+        targets: of every point, see ``puck_targets``.
+        normal_at: normal of the surface at deck (x, y), deck frame (``mirror.surface.normal``).
+    """
+
+    def __init__(
+        self, facts: RunFacts, targets: Mapping[PointId, PuckTarget], normal_at: Callable[[float, float], Vector3]
+    ) -> None:
+        """Nothing has happened yet."""
+        self._facts, self._targets, self._normal_at = facts, targets, normal_at
+        self._measured = self._skipped = 0
+        self._left_out: Mapping[str, Sequence[str]] = {}
+        self._mission_time_s = 0.0
+        self._wall_s: float | None = None
+        self._ticks_us: list[FloatArray] = []
+        self._open_truth, self._open_track = np.empty((0, 8)), np.empty((0, 8))
+        self._errors: list[FloatArray] = []  # rows: seq, distance (m), heading (rad)
+        self._history: deque[FloatArray] = deque()
+        self._history_rows = 0
+        self._newest_seq = -1
+        self._waiting_arrivals: dict[PointId, int] = {}
+        self._arrivals: dict[PointId, float] = {}
+        self._waiting_edges: list[int] = []
+        self._true_edges = self._false_edges = self._falls = 0
+        self._is_fallen = False
+        self._overrun_m = 0.0
+        self._fits: PanelFits = {}
+        self._injected: PanelFits | None = None
+
+    def add_truth(self, rows: Sequence[Sequence[float]] | FloatArray) -> None:
+        """Add true states, in the order of their frames.
+
+        Args:
+            rows: shape (n, 11): seq, t_s, x, y, heading (deck), X, Y, Z (surface point, deck, m), clearance of the
+                worst edge sensor to the rim (m, < 0 beyond it), fallen, mask of the sensors beyond the rim.
+        """
+        if not len(rows):
+            return
+        truth = np.asarray(rows, dtype=np.float64)
+        self._newest_seq = max(self._newest_seq, int(truth[-1, _SEQ]))
+        fallen = np.concatenate(([self._is_fallen], truth[:, _FALLEN] > 0))
+        self._falls += int(np.count_nonzero(fallen[1:] & ~fallen[:-1]))
+        self._is_fallen = bool(fallen[-1])
+        self._overrun_m = max(self._overrun_m, -float(truth[:, _CLEARANCE].min()))
+        self._history.append(truth)
+        self._history_rows += len(truth)
+        while self._history_rows - len(self._history[0]) >= HISTORY_ROWS:
+            self._history_rows -= len(self._history.popleft())
+        self._open_truth = np.concatenate((self._open_truth, truth[:, :8]))[-HISTORY_ROWS:]
+        self._join()
+        self._settle(is_over=False)
+
+    def add_track(self, rows: Sequence[Sequence[float]] | FloatArray) -> None:
+        """Add estimates of the same frames.
+
+        Args:
+            rows: shape (n, 8 or more): seq, t_s, x, y, heading (deck), X, Y, Z (surface point, deck, m), ...
+        """
+        if len(rows) and self._facts.has_truth:
+            track = np.asarray(rows, dtype=np.float64)[:, :8]
+            self._open_track = np.concatenate((self._open_track, track))[-HISTORY_ROWS:]
+            self._join()
+
+    def add_arrival(self, point: PointId, seq: int) -> None:
+        """The robot stood at a point at frame ``seq``, before any correction; only the first of a point counts."""
+        if point not in self._arrivals:
+            self._waiting_arrivals.setdefault(point, seq)
+            self._settle(is_over=False)
+
+    def add_verdict_event(self, seq: int, code: int) -> None:
+        """The verdict's code rose to ``code`` at frame ``seq``; call once for each rise."""
+        if code == EventCode.NEAR_EDGE:
+            self._waiting_edges.append(seq)
+            self._settle(is_over=False)
+
+    def add_ticks(self, tick_us: ArrayLike) -> None:
+        """Add wall times of main-loop ticks, microseconds."""
+        self._ticks_us.append(np.array(tick_us, dtype=np.float64, ndmin=1))
+
+    def set_mission(
+        self,
+        measured: int,
+        skipped: int,
+        mission_time_s: float,
+        left_out: Mapping[str, Sequence[str]] = MappingProxyType({}),
+    ) -> None:
+        """Points measured and skipped, the robot's time from start to end, and points left out, by the reason."""
+        self._measured, self._skipped, self._mission_time_s = measured, skipped, mission_time_s
+        self._left_out = left_out
+
+    def set_panels(self, fits: PanelFits, injected: PanelFits | None) -> None:
+        """Misalignment of panels as fitted, and as simulated (None on a real robot)."""
+        self._fits, self._injected = fits, injected
+
+    def set_wall(self, time_s: float) -> None:
+        """Wall time of the run."""
+        self._wall_s = time_s
+
+    def precede(self, earlier: "SummaryBuilder") -> None:
+        """Take in a session of the same mission that ended before this one began: one summary tells of both.
+
+        Points and those left out are as the later session says; the bound is that of the whole way, which the earlier
+        one began.
+        """
+        earlier._settle(is_over=True)
+        if earlier._facts.lower_bound_s > 0.0:
+            self._facts = replace(self._facts, lower_bound_s=earlier._facts.lower_bound_s)
+        self._mission_time_s += earlier._mission_time_s
+        self._arrivals = {
+            **earlier._arrivals,
+            **{k: v for k, v in self._arrivals.items() if k not in earlier._arrivals},
+        }
+        self._errors = [*earlier._errors, *self._errors]
+        self._true_edges += earlier._true_edges
+        self._false_edges += earlier._false_edges
+        self._falls += earlier._falls
+        self._overrun_m = max(self._overrun_m, earlier._overrun_m)
+
+    @property
+    def unresolved(self) -> int:
+        """Arrivals and edges that wait for their frame's truth; those left at the end count as neither good nor bad."""
+        return len(self._waiting_arrivals) + len(self._waiting_edges)
+
+    def build(self) -> dict[str, Any]:
+        """The summary, keys in the order of the command line contract."""
+        self._settle(is_over=True)
+        facts, has_truth = self._facts, self._facts.has_truth
+        arrivals = np.array(list(self._arrivals.values()))
+        errors = np.concatenate(self._errors) if self._errors else np.empty((0, 3))
+        errors = errors[np.argsort(errors[:, 0], kind="stable")]
+        distances = errors[:, 1]
+        return {
+            "mirror": facts.mirror,
+            "world": facts.world,
+            "filter": facts.filter,
+            "seed": facts.seed,
+            "points": {
+                "total": facts.total_points,
+                "measured": self._measured,
+                "first_arrival_within_10mm": int(np.count_nonzero(arrivals <= WITHIN_M)) if has_truth else None,
+                "skipped": self._skipped,
+                **({"left_out": {why: list(names) for why, names in self._left_out.items()}} if self._left_out else {}),
+            },
+            "arrival_error_mm": _distribution(arrivals),
+            "localization_error_mm": {
+                **_distribution(distances),
+                "within_10mm_fraction": _rounded(np.mean(distances <= WITHIN_M), 6) if len(distances) else None,
+            },
+            "heading_error_mrad": {"rms": _rms(errors[:, 2], 1e3)},
+            "mission_time_s": _rounded(self._mission_time_s, 3),
+            "lower_bound_s": _rounded(facts.lower_bound_s, 3),
+            "within_budget": self._mission_time_s <= facts.budget_s,
+            "danger": {
+                "true_edges": self._true_edges if has_truth else None,
+                "false_edges": self._false_edges if has_truth else None,
+                "falls": self._falls if has_truth else None,
+                "max_overrun_mm": _rounded(self._overrun_m * 1e3, 3) if has_truth else None,
+            },
+            "panels": self._panels(),
+            "wall": self._wall(),
+        }
+
+    def _panels(self) -> dict[str, Any]:
+        known = self._injected or {}
+        differences = [np.subtract(fit, known[panel]) for panel, fit in sorted(self._fits.items()) if panel in known]
+        table = np.array(differences, dtype=np.float64).reshape(-1, 3)
+        return {
+            "count": len(self._fits),
+            "piston_rms_um": _rms(table[:, 0], 1e6),
+            "tilt_rms_urad": _rms(table[:, 1:].ravel(), 1e6),
+        }
+
+    def _wall(self) -> dict[str, Any]:
+        ticks = np.concatenate(self._ticks_us) if self._ticks_us else np.empty(0)
+        p50, p99 = np.percentile(ticks, (50, 99)) if len(ticks) else (None, None)
+        return {
+            "time_s": _rounded(self._wall_s, 3),
+            "realtime_factor": _rounded(self._mission_time_s / self._wall_s, 2) if self._wall_s else None,
+            "tick_us_p50": _rounded(p50, 1),
+            "tick_us_p99": _rounded(p99, 1),
+        }
+
+    def _join(self) -> None:
+        truth, track = self._open_truth, self._open_track
+        seqs, i, j = np.intersect1d(truth[:, _SEQ], track[:, _SEQ], return_indices=True)
+        if not len(seqs):
+            return
+        distance = np.linalg.norm(track[j, _SURFACE] - truth[i, _SURFACE], axis=1)
+        turn = track[j, _PSI] - truth[i, _PSI]
+        self._errors.append(np.column_stack((seqs, distance, np.arctan2(np.sin(turn), np.cos(turn)))))
+        self._open_truth, self._open_track = np.delete(truth, i, axis=0), np.delete(track, j, axis=0)
+
+    def _settle(self, *, is_over: bool) -> None:
+        for point, seq in list(self._waiting_arrivals.items()):
+            if seq <= self._newest_seq and len(found := self._truth(seq, seq)):
+                self._arrivals[point] = self._arrival_error_m(point, found[0])
+                del self._waiting_arrivals[point]
+        for seq in list(self._waiting_edges):
+            first, last = seq - EDGE_FRAMES, seq + EDGE_FRAMES
+            if (is_over or last <= self._newest_seq) and len(found := self._truth(first, last)):
+                is_true = bool((found[:, _CLEARANCE] < 0.0).any())
+                self._true_edges += is_true
+                self._false_edges += not is_true
+                self._waiting_edges.remove(seq)
+
+    def _truth(self, first: int, last: int) -> FloatArray:
+        # Newest first: what is asked for happened just now.
+        found = []
+        for batch in reversed(self._history):
+            if batch[-1, _SEQ] < first:
+                break
+            if batch[0, _SEQ] <= last:
+                found.append(batch[(batch[:, _SEQ] >= first) & (batch[:, _SEQ] <= last)])
+        return np.concatenate(found) if found else np.empty((0, 11))
+
+    def _arrival_error_m(self, point: PointId, truth: FloatArray) -> float:
+        normal = self._normal_at(float(truth[_X]), float(truth[_Y]))
+        return arrival_error_m(self._targets[point], truth[_SURFACE], normal, self._facts.puck_height_m)
+
+
+def format_table(summary: Mapping[str, Any]) -> str:
+    """The summary as a short table for a terminal: one line a section, a dash for what is not known."""
+    single = [f"{key} {_text(value)}" for key, value in summary.items() if not isinstance(value, Mapping)]
+    sections = [(name, section) for name, section in summary.items() if isinstance(section, Mapping)]
+    lines = [("run", single), *((n, [f"{key} {_text(value)}" for key, value in s.items()]) for n, s in sections)]
+    width = max(len(name) for name, _ in lines)
+    return "\n".join(f"{name.replace('_', ' '):<{width}}  {'  '.join(values)}" for name, values in lines)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, Mapping):  # points by the reason why they were left out
+        return ", ".join(f"{len(names)} ({why})" for why, names in value.items())
+    return "-" if value is None else "yes" if value is True else "no" if value is False else f"{value}"
+
+
+def _distribution(errors_m: FloatArray) -> dict[str, float | None]:
+    """Mean, median, 99th percentile and maximum in mm; null where there are none."""
+    if not len(errors_m):
+        return dict.fromkeys(("mean", "p50", "p99", "max"))
+    p50, p99 = np.percentile(errors_m, (50, 99))
+    figures = {"mean": errors_m.mean(), "p50": p50, "p99": p99, "max": errors_m.max()}
+    return {name: _rounded(value * 1e3, 3) for name, value in figures.items()}
+
+
+def _rms(values: FloatArray, scale: float) -> float | None:
+    return _rounded(np.sqrt(np.mean(values**2)) * scale, 3) if len(values) else None
+
+
+def _rounded(value: Any, decimals: int) -> float | None:
+    # None for what JSON has no number for; never a negative zero.
+    return None if value is None or not np.isfinite(value) else round(float(value), decimals) + 0.0

@@ -1,1 +1,0 @@
-"""Replay of recorded runs: what was recorded goes through a localizer again."""

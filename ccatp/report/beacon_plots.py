@@ -1,0 +1,405 @@
+"""Figures of signal strengths: path loss with its confidence, fixes with their regions, the fuzzy speed.
+
+Imports matplotlib, which takes a second, only when something is drawn.
+
+A map of motes as a picture: places with their ellipses, and the error after each update.
+
+Imports matplotlib, which takes a second, only when something is drawn.
+
+Map and path of a recorded run as a picture: beacons with their ellipses, the path on the truth, the error.
+
+Imports matplotlib, which takes a second, only when something is drawn.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from ccatp.beacons.slam.evaluation import Judgement, aligned_beacons, truth_at
+from ccatp.beacons.slam.path_loss import LevelFix, LevelPair, PathLossFit
+from ccatp.beacons.slam.recording import BeaconFix, RecordedRun, Track, dead_reckoned
+from ccatp.beacons.steering import Sugeno
+from ccatp.config.beacon_models import FuzzyConfig
+from ccatp.core import FloatArray
+from ccatp.report.drawing import INK, QUIET
+from ccatp.report.plots import GRID, dress, new_figure, save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+_BLUE, _GOLD, _GREEN, _RED = "#0b3c5d", "#d08c00", "#1d9a8a", "#c0392b"
+_REGION = 0.9
+
+
+def draw_path_loss(fit: PathLossFit, pairs: Sequence[LevelPair], name: str, out: Path) -> None:
+    """Levels over distance, the line, and where 95 % of new places are expected.
+
+    Raises:
+        PictureError: the file cannot be written.
+    """
+    figure = new_figure(7.0, 4.4)
+    axes = figure.subplots()
+    distances, levels = np.array([pair[:2] for pair in pairs]).T
+    grid = np.geomspace(distances.min() / 1.2, distances.max() * 1.2, 200)
+    mean, scale = fit.predicted(grid)
+    half = scale * float(stdtrit(fit.freedom, 0.975))
+    axes.fill_between(grid, mean - half, mean + half, color=_BLUE, alpha=0.12, linewidth=0, label="95 % of new places")
+    axes.plot(grid, mean, color=_BLUE, linewidth=1.6, label=_formula(fit))
+    axes.plot(distances, levels, "o", color=_GOLD, markersize=4, markeredgecolor="white", label="readings")
+    axes.set(xscale="log", xlabel="distance, m", ylabel="level, dBm", title=name)
+    axes.xaxis.set_major_formatter("{x:g}")
+    dress(axes)
+    axes.legend(frameon=False, fontsize=8)
+    save_figure(figure, out)
+
+
+def draw_fixes(
+    fixes: Sequence[LevelFix], truths: Sequence[tuple[float, float]], beacons_m: Mapping[str, tuple[float, float]],
+    name: str, out: Path,
+) -> None:  # fmt: skip
+    """A panel for each point (at most twelve): its 90 % region, the fix, and where it was.
+
+    Raises:
+        PictureError: the file cannot be written.
+    """
+    shown = list(zip(fixes, truths, strict=True))[:12]
+    columns = min(5, len(shown))
+    rows = -(-len(shown) // columns)
+    figure = new_figure(2.3 * columns, 2.3 * rows + 0.5)
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+    for axes in panels[len(shown) :]:
+        axes.set_visible(False)
+    for index, (axes, (fix, truth)) in enumerate(zip(panels, shown, strict=False), 1):
+        inside = fix.points_m[fix.region(_REGION)]
+        axes.plot(*inside.T, "s", color=_BLUE, alpha=0.18, markersize=2.2, markeredgewidth=0, label="90 % region")
+        axes.plot(*np.array(list(beacons_m.values())).T, "^", color=QUIET, markersize=5, label="beacons")
+        axes.plot(*truth, "x", color=_RED, markersize=6, markeredgewidth=1.6, label="truth")
+        axes.plot(*fix.position_m, "o", color=_GOLD, markersize=5, markeredgecolor="white", label="fix")
+        error_m = float(np.hypot(*(fix.position_m - truth)))
+        axes.set_title(f"{index}: {error_m:.2f} m")
+        axes.set_aspect("equal")
+        dress(axes)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+    figure.suptitle(name, fontsize=10, color=INK)
+    save_figure(figure, out)
+
+
+def draw_fuzzy(cfg: FuzzyConfig, out: Path) -> None:
+    """The speed over distance and heading error, and the memberships of both.
+
+    Raises:
+        PictureError: the file cannot be written.
+        FuzzyGapError: the rules leave a gap.
+    """
+    sugeno = Sugeno(cfg)
+    figure = new_figure(10.0, 4.6)
+    layout = figure.add_gridspec(2, 2, width_ratios=(1.5, 1.0))
+    spans = [_span(cfg, name) for name in sugeno.inputs]
+    x, y = (np.linspace(*span, 121) for span in spans)
+    speed = np.array([[sugeno.evaluate((a, b)) for a in x.tolist()] for b in y.tolist()])
+    axes = figure.add_subplot(layout[:, 0])
+    in_degrees = [name.endswith("_rad") for name in sugeno.inputs]
+    shown_x, shown_y = (np.degrees(v) if is_angle else v for v, is_angle in zip((x, y), in_degrees, strict=True))
+    drawn = axes.contourf(shown_x, shown_y, speed, levels=np.linspace(speed.min(), speed.max(), 25), cmap="viridis")
+    lines = axes.contour(shown_x, shown_y, speed, levels=6, colors="white", linewidths=0.6)
+    axes.clabel(lines, fmt="%.2f", fontsize=7)
+    axes.set(xlabel=_label(sugeno.inputs[0]), ylabel=_label(sugeno.inputs[1]), title="speed, m/s")
+    figure.colorbar(drawn, ax=axes, format="%.2f")
+    for row, (name, span) in enumerate(zip(sugeno.inputs, spans, strict=True)):
+        panel = figure.add_subplot(layout[row, 1])
+        values = np.linspace(*span, 200)
+        grades = np.array([sugeno.memberships(row, value) for value in values.tolist()])
+        for index, term in enumerate(cfg.inputs[name].terms):
+            colour = (_BLUE, _GOLD, _GREEN, _RED, QUIET)[index % 5]
+            panel.plot(np.degrees(values) if in_degrees[row] else values, grades[:, index], color=colour, label=term)
+        panel.set(xlabel=_label(name), ylim=(-0.03, 1.08))
+        panel.legend(frameon=False, fontsize=8, loc="center right")
+        dress(panel)
+    axes.tick_params(labelsize=8, color=QUIET, labelcolor=INK)
+    save_figure(figure, out)
+
+
+def _formula(fit: PathLossFit) -> str:
+    reference, exponent = fit.half_widths(0.95)
+    return (
+        f"{fit.reference_dbm:.1f} ± {reference:.1f} dBm at 1 m, exponent {fit.exponent:.2f} ± {exponent:.2f}, "
+        f"spread {fit.sigma_db:.1f} dB"
+    )
+
+
+def _span(cfg: FuzzyConfig, name: str) -> tuple[float, float]:
+    """From nought to a quarter beyond the last corner that is not far away on purpose."""
+    corners = [corner for term in cfg.inputs[name].terms.values() for corner in term]
+    top = 1.25 * max(term[1] for term in cfg.inputs[name].terms.values())
+    return max(0.0, min(corners)), top
+
+
+def _label(name: str) -> str:
+    words = name.replace("_", " ")
+    return words.removesuffix(" rad") + ", deg" if name.endswith("_rad") else words.removesuffix(" m") + ", m"
+
+
+FOUND, TRUE, DOUBT = "#0b3c5d", "#d08c00", "#c0392b"
+_CHI2_90 = 4.605  # of two degrees of freedom: the ellipse that holds nine of ten
+_LABELLED = 40  # motes up to which each has its name beside it
+_VISIBLE = 0.012  # of the width of the map: ellipses that are smaller are drawn larger, and the title says so
+
+
+class MapPicture(NamedTuple):
+    """What is drawn of one map.
+
+    Attributes:
+        names, positions_m, covariance_m2: the map; drawn in its first two coordinates.
+        true_m: where the motes are, shape (n, d), or None.
+        pairs: measured pairs, indices, shape (e, 2).
+        doubtful: motes that may be elsewhere.
+        title: above the map.
+    """
+
+    names: Sequence[str]
+    positions_m: FloatArray
+    covariance_m2: FloatArray
+    true_m: FloatArray | None
+    pairs: NDArray[np.intp]
+    doubtful: Sequence[int]
+    title: str
+
+
+class Traces(NamedTuple):
+    """Error after each update, over runs.
+
+    Attributes:
+        low_m, middle_m, high_m: 10, 50 and 90 %, shape (k,).
+        expected_m: what the filter expects, median, shape (k,).
+        bound_m: Cramér-Rao bound, or None.
+        runs: how many.
+    """
+
+    low_m: FloatArray
+    middle_m: FloatArray
+    high_m: FloatArray
+    expected_m: FloatArray
+    bound_m: float | None
+    runs: int
+
+
+def draw_mote_map(picture: MapPicture, traces: Traces | None, out: Path) -> None:
+    """Draw a map, and beside it the errors where there are some.
+
+    Args:
+        picture: the map.
+        traces: errors against updates, or None.
+        out: the file; its suffix tells the format (PNG, PDF, SVG).
+
+    Raises:
+        PictureError: the file cannot be written.
+    """
+    figure = new_figure(11.0 if traces else 6.5, 6.5)
+    panels = figure.subplots(1, 2 if traces else 1, squeeze=False)[0]
+    draw_places(panels[0], picture)
+    if traces is not None:
+        draw_traces(panels[1], traces)
+    save_figure(figure, out)
+
+
+def draw_places(axes: "Axes", picture: MapPicture) -> None:
+    """Motes, truth, measured pairs and the ellipses that hold nine of ten."""
+    places = picture.positions_m[:, :2]
+    for i, j in picture.pairs.tolist():
+        axes.plot(*places[[i, j]].T, color=GRID, linewidth=0.8, zorder=1)
+    grown = _ellipses(axes, picture)
+    if picture.true_m is not None:
+        axes.plot(*picture.true_m[:, :2].T, "o", color=TRUE, markersize=7, fillstyle="none", label="true", zorder=3)
+    axes.plot(*places.T, "x", color=FOUND, markersize=6, label="mapped", zorder=4)
+    if len(picture.doubtful):
+        axes.plot(
+            *places[list(picture.doubtful)].T,
+            "s",
+            color=DOUBT,
+            markersize=11,
+            fillstyle="none",
+            label="may be elsewhere",
+        )
+    if len(picture.names) <= _LABELLED:
+        for name, place in zip(picture.names, places, strict=True):
+            axes.annotate(name, place, textcoords="offset points", xytext=(6, 5), fontsize=7, color=QUIET)
+    larger = f", ellipses {grown:g} times larger" if grown > 1.0 else ", 90 % ellipses"
+    axes.set_title(picture.title + larger, fontsize=10, color=INK)
+    axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    axes.margins(0.1)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=3, frameon=False, fontsize=8)
+    dress(axes)
+
+
+def draw_traces(axes: "Axes", traces: Traces, label: str = "", shade: str = FOUND) -> None:
+    """Median and the band from 10 to 90 %, what the filter expects, the bound."""
+    updates = np.arange(len(traces.middle_m))
+    axes.fill_between(updates, traces.low_m, traces.high_m, color=shade, alpha=0.18, linewidth=0)
+    axes.plot(updates, traces.middle_m, color=shade, linewidth=1.6, label=f"{label}error, median and 10 to 90 %")
+    expected = np.arange(len(traces.expected_m))
+    axes.plot(
+        expected, traces.expected_m, color=shade, linewidth=1.0, linestyle="--", label=f"{label}expected by the filter"
+    )
+    if traces.bound_m is not None:
+        axes.axhline(
+            traces.bound_m, color=QUIET, linewidth=0.9, linestyle=":", label=f"{label}Cramér-Rao bound, all updates"
+        )
+    axes.set_yscale("log")
+    axes.set(xlabel="updates", ylabel="root mean square error, m")
+    axes.set_title(f"{traces.runs} runs", fontsize=10, color=INK)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=2, frameon=False, fontsize=8)
+    dress(axes)
+
+
+def _ellipses(axes: "Axes", picture: MapPicture) -> float:
+    """Draw them; by what factor, a power of ten, they are larger than they are."""
+    from matplotlib.patches import Ellipse  # noqa: PLC0415 - see above
+
+    d = picture.positions_m.shape[1]
+    places = picture.positions_m[:, :2]
+    blocks = [picture.covariance_m2[row * d : row * d + 2, row * d : row * d + 2] for row in range(len(places))]
+    spread = [np.linalg.eigh(block) for block in blocks]
+    halves = [np.sqrt(_CHI2_90 * np.maximum(values, 0.0)) for values, _ in spread]
+    typical, width = float(np.median([half[1] for half in halves])), float(np.ptp(places, axis=0).max())
+    grown = 1.0
+    while 0.0 < typical * grown < _VISIBLE * width and grown < 1e6:
+        grown *= 10.0
+    for place, half, (_, vectors) in zip(places, halves, spread, strict=True):
+        angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
+        size = 2.0 * grown * half
+        axes.add_patch(
+            Ellipse(place, size[1], size[0], angle=angle, facecolor=FOUND, alpha=0.18, edgecolor=FOUND, zorder=2)
+        )
+    return grown
+
+
+WIDTH_PX = 1800
+DPI = 180
+SIGMAS = 3.0  # of the ellipses
+POSE_ELLIPSES = 24  # along the path
+_TRUTH, _PATH, _MAP, _RECKONED = "#8fa3b8", "#1d6fa5", "#d5703f", "#d9c9a8"
+
+
+def draw_slam(run: RecordedRun, track: Track, judged: Judgement, out: Path, title: str) -> None:
+    """Draw a track, laid on the truth if there is one, into an image file.
+
+    Args:
+        run: the recording.
+        track: what was estimated.
+        judged: its errors and its alignment.
+        out: the file; its suffix tells the format (PNG, PDF, SVG).
+        title: first line.
+
+    Raises:
+        PictureError: the file cannot be written.
+    """
+    beacons = aligned_beacons(track, judged.alignment)
+    path = judged.alignment.moved(track.poses[:, :2])
+    centre, half = _frame(run, path, beacons)
+    width = WIDTH_PX / DPI
+    known = bool(np.isfinite(judged.errors_m).any())
+    map_height = (width - 1.3) * float(half[1] / half[0])
+    below = 1.9 if known else 0.6
+    height = map_height + below + 1.3
+    figure = new_figure(width, height, DPI, layout=None)
+    axes = figure.add_axes((0.75 / width, (below + 0.3) / height, (width - 1.3) / width, map_height / height))
+    _draw_paths(axes, run, track, judged, path)
+    _draw_beacons(axes, run, beacons)
+    axes.set(xlim=(centre[0] - half[0], centre[0] + half[0]), ylim=(centre[1] - half[1], centre[1] + half[1]))
+    axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    dress(axes)
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="upper left", bbox_to_anchor=(0.68 / width, 1.0 - 0.62 / height), ncols=len(labels),
+        fontsize=8, frameon=False, labelcolor=INK, columnspacing=1.4, handletextpad=0.5,
+    )  # fmt: skip
+    figure.text(0.75 / width, 1.0 - 0.32 / height, title, fontsize=14, color=INK)
+    figure.text(0.75 / width, 1.0 - 0.58 / height, _figures(judged), fontsize=9, color=QUIET)
+    if known:
+        error_axes = figure.add_axes((0.75 / width, 0.55 / height, (width - 1.3) / width, 1.1 / height))
+        _draw_error(error_axes, track, judged)
+    save_figure(figure, out)
+
+
+def ellipse(covariance: FloatArray, sigmas: float) -> FloatArray:
+    """Outline of the region within ``sigmas`` standard deviations of the origin, shape (61, 2)."""
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.linspace(0.0, 2.0 * np.pi, 61)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    outline: FloatArray = sigmas * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return outline
+
+
+def _frame(run: RecordedRun, path: FloatArray, beacons: dict[str, BeaconFix]) -> tuple[FloatArray, FloatArray]:
+    """Centre and half size of what is shown: path and beacons, wherever dead reckoning went."""
+    places = [(fix.x_m, fix.y_m) for fix in beacons.values()]
+    places += [run.beacon_truth_m[name] for name in beacons if name in run.beacon_truth_m]
+    outlines = [np.array((fix.x_m, fix.y_m)) + ellipse(fix.covariance, SIGMAS) for fix in beacons.values()]
+    points = np.vstack([path, np.array(places).reshape(-1, 2), *outlines])
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = 0.5 * (high - low) + 0.06 * float((high - low).max()) + 1e-3
+    half[0] = max(half[0], half[1] / 1.1)  # no picture is much taller than wide,
+    half[1] = max(half[1], half[0] * 0.35)  # nor a stripe
+    return 0.5 * (low + high), half
+
+
+def _draw_paths(axes: "Axes", run: RecordedRun, track: Track, judged: Judgement, path: FloatArray) -> None:
+    reckoned = judged.alignment.moved(dead_reckoned(run.steps, run.first_pose)[:, :2])
+    axes.plot(*reckoned.T, color=_RECKONED, linewidth=0.8, zorder=1, label="odometry alone")
+    if run.truth is not None:
+        axes.plot(*truth_at(run.truth, track.times_s)[:, :2].T, color=_TRUTH, linewidth=2.2, zorder=2, label="truth")
+    axes.plot(*path.T, color=_PATH, linewidth=0.9, zorder=3, label="path")
+    marks = np.unique(np.linspace(0, len(path) - 1, POSE_ELLIPSES).astype(int))
+    covariances = judged.alignment.turned(track.covariances[marks, :2, :2])
+    for k, (place, covariance) in enumerate(zip(path[marks], covariances, strict=True)):
+        outline = place + ellipse(covariance, SIGMAS)
+        label = "3 sigma of the path" if k == 0 else "_"
+        axes.plot(*outline.T, color=_PATH, linewidth=0.7, alpha=0.6, zorder=4, label=label)
+
+
+def _draw_beacons(axes: "Axes", run: RecordedRun, beacons: dict[str, BeaconFix]) -> None:
+    surveyed = np.array([run.beacon_truth_m[name] for name in beacons if name in run.beacon_truth_m]).reshape(-1, 2)
+    if surveyed.size:
+        axes.scatter(
+            surveyed[:, 0],
+            surveyed[:, 1],
+            marker="x",
+            s=46,
+            linewidths=1.6,
+            color=INK,
+            zorder=6,
+            label="surveyed beacon",
+        )
+    for k, (name, fix) in enumerate(beacons.items()):
+        label = "beacon, 3 sigma" if k == 0 else "_"
+        axes.plot(fix.x_m, fix.y_m, "o", color=_MAP, markersize=4.5, zorder=7, label=label)
+        outline = np.array((fix.x_m, fix.y_m)) + ellipse(fix.covariance, SIGMAS)
+        axes.plot(*outline.T, color=_MAP, linewidth=1.0, zorder=5)
+        axes.annotate(
+            name, (fix.x_m, fix.y_m), xytext=(6, 5), textcoords="offset points", fontsize=8, color=INK, zorder=8
+        )
+
+
+def _draw_error(axes: "Axes", track: Track, judged: Judgement) -> None:
+    sigma = np.sqrt(np.trace(track.covariances[:, :2, :2], axis1=1, axis2=2))
+    t = track.times_s - track.times_s[0]
+    axes.fill_between(t, 0.0, SIGMAS * sigma, color=GRID, linewidth=0.0, label="3 sigma")
+    axes.plot(t, judged.errors_m, color=_PATH, linewidth=0.8, label="error")
+    top = float(np.nanmax(judged.errors_m))
+    axes.set(xlim=(0.0, t[-1]), ylim=(0.0, 1.15 * max(top, 1e-6)), xlabel="time, s", ylabel="error, m")
+    dress(axes)
+
+
+def _figures(judged: Judgement) -> str:
+    parts = []
+    if judged.trajectory_rmse_m is not None:
+        parts.append(f"path {judged.trajectory_rmse_m:.3f} m rms after one rigid alignment")
+    if judged.beacon_rmse_m is not None:
+        parts.append(f"beacons {judged.beacon_rmse_m:.3f} m rms")
+    return "  ·  ".join(parts) or "no truth to compare with"

@@ -1,0 +1,233 @@
+"""The page of a mission among beacons: waypoints, the map and what is known of it, errors against the truth.
+
+What does not change while a mission among beacons goes on: the room, the waypoints, the words of the page.
+"""
+
+from collections.abc import Iterable, Mapping
+from math import hypot, sqrt
+from typing import Any
+
+from ccatp.beacons.mission import State
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.links.topics import BeaconArrival, BeaconEllipse, BeaconMap, BeaconPlaces, BeaconTrack, BeaconTruth
+from ccatp.report.dashboard.survey_view import MEASURED, PLANNED, Second, TruthCompare
+from ccatp.report.dashboard.view import View
+
+CODES = ["normal operation", "near something", "operation aborted"]
+TITLES = {"zigbee": "ZigBee beacons", "follow": "Following a radio", "cricket": "Ultrasonic motes"}
+# What a robot of a survey has and this one has not.
+HIDDEN = ["edges", "fans-row", "skipped-row", "eta-row"]
+
+
+def waypoint_name(number: int) -> str:
+    """A waypoint as the mission's status names it; its number is from 0."""
+    return f"waypoint {number + 1}"
+
+
+def beacon_waypoints(cfg: RadioConfig) -> list[tuple[float, float]]:
+    """Those of one lap; a robot that follows a radio has none."""
+    return [] if cfg.follow.is_active else list(cfg.workspace.waypoints_m)
+
+
+def beacon_ground(cfg: RadioConfig, *, is_sim: bool, needs_token: bool) -> dict[str, Any]:
+    """The ground for the page, lengths in m, in the frame of the room.
+
+    Args:
+        cfg: the run's configuration.
+        is_sim: the robot is a stand-in.
+        needs_token: commands must carry a token.
+    """
+    width_m, depth_m = cfg.workspace.size_m
+    is_following = cfg.follow.is_active
+    goals = "seconds" if is_following else "waypoints"
+    return {
+        "title": TITLES[cfg.system],
+        "is_sim": is_sim,
+        "subtitle": f"{cfg.system}.toml, seed {cfg.run.seed}" if is_sim else f"{cfg.system}.toml",
+        "needs_token": needs_token,
+        "panels": [],
+        "rim": [[0.0, 0.0], [width_m, 0.0], [width_m, depth_m], [0.0, depth_m]],
+        "points": [[waypoint_name(at), *place] for at, place in enumerate(beacon_waypoints(cfg))],
+        "base": [cfg.start.x_m, cfg.start.y_m, cfg.start.heading_rad],
+        "edge_sensors_m": [],
+        "wheel_base_m": cfg.vehicle.track_m,
+        "arrival_tolerance_mm": 1e3 * cfg.control.arrival_radius_m,
+        "rate_hz": cfg.dashboard.rate_hz,
+        "states": [str(state) for state in State],
+        "codes": CODES,
+        "plots": _plots(cfg),
+        "hides": HIDDEN,
+        "words": {
+            "simulation-what": "robot, radios and motes are simulated",
+            "progress-head": "Following" if is_following else "Waypoints",
+            "unit": goals,
+            "point-name": "driving to",
+            "arrival-name": "position \u03c3",
+            "goal": goals,
+            "reached": "followed" if is_following else "reached",
+        },
+    }
+
+
+def _plots(cfg: RadioConfig) -> list[str]:
+    last = ["target"] if cfg.follow.is_active else ["clearance"] if cfg.avoidance.is_active else []
+    return ["error", "map", "nis", *last]
+
+
+SERIES = ("error", "map", "nis", "target", "clearance")
+"""Rows of robot time (s) and: true error and three sigma of the position (mm), the latter alone where nobody knows the
+truth; true error of the beacons and the standard deviation expected (both root mean square of a place, mm); NIS and
+degrees of freedom of the readings since the row before; distance to the target and the one to be kept (m); nearest
+thing that a distance sensor sees (m)."""
+# The page draws these itself, from what comes more often.
+_DRAWN = frozenset(("robot", "trail", "waypoint"))
+
+
+class BeaconView(View):
+    """What a page shows of a mission among beacons.
+
+    Args:
+        cfg: the run's configuration.
+        is_sim: the robot is a stand-in.
+    """
+
+    def __init__(self, cfg: RadioConfig, *, is_sim: bool) -> None:
+        """Nothing heard."""
+        super().__init__(is_sim=is_sim, series=SERIES, has_laser=False)
+        self._cfg = cfg
+        self._states = [PLANNED] * len(beacon_waypoints(cfg))
+        self._lap = 0
+        self._changed: set[int] = set()
+        self._map: BeaconMap | None = None
+        self._places: Mapping[str, tuple[float, float]] = {}
+        self._truth = TruthCompare()
+        self._sigma_second = -1
+        self._takers |= {
+            BeaconArrival: self._take_arrival,
+            BeaconMap: self._take_map,
+            BeaconPlaces: self._take_places,
+            BeaconTrack: self._take_track,
+            BeaconTruth: self._take_truth,
+        }
+
+    def _take_arrival(self, arrival: BeaconArrival, _now_s: float) -> None:
+        if arrival.lap > self._lap:  # the round begins anew
+            self._lap = arrival.lap
+            self._states = [PLANNED] * len(self._states)
+            self._changed.update(range(len(self._states)))
+        if 0 <= arrival.waypoint < len(self._states):
+            self._states[arrival.waypoint] = MEASURED
+            self._changed.add(arrival.waypoint)
+
+    def _take_places(self, places: BeaconPlaces, _now_s: float) -> None:
+        self._places = places.places
+
+    def _take_map(self, message: BeaconMap, _now_s: float) -> None:
+        before, self._map = self._map, message
+        t_s = round(message.t_s, 2)
+        self._trail.add(message.pose[0], message.pose[1])
+        if before is None or message.nis_size < before.nis_size:  # the first, or of another main loop
+            return
+        if message.nis_size > before.nis_size:
+            nis = round(message.nis_sum - before.nis_sum, 3)
+            self._series["nis"].add(t_s, nis, message.nis_size - before.nis_size)
+        if (sigma_m := expected_rms_m(self._static(message))) is not None:
+            error_m = true_rms_m(self._static(message), self._places)
+            self._series["map"].add(t_s, _mm(error_m), _mm(sigma_m))
+        if message.target is not None:
+            distance_m = hypot(message.target[0] - message.pose[0], message.target[1] - message.pose[1])
+            self._series["target"].add(t_s, round(distance_m, 3), self._cfg.follow.safe_distance_m)
+        if message.distances:
+            self._series["clearance"].add(t_s, round(min(message.distances), 3))
+
+    def _take_track(self, track: BeaconTrack, _now_s: float) -> None:
+        for seq, t_s, x_m, y_m, _, xx, xy, yy, *_ in track.rows:
+            if not TruthCompare.is_compared(seq):
+                continue
+            sigma_m = worst_sigma_m(xx, xy, yy)
+            if self._is_sim:
+                self._compared(self._truth.estimate(seq, x_m, y_m, sigma_m))
+            elif int(t_s) != self._sigma_second:
+                self._sigma_second = int(t_s)
+                self._series["error"].add(round(t_s, 2), None, round(3e3 * sigma_m, 3))
+
+    def _take_truth(self, truth: BeaconTruth, _now_s: float) -> None:
+        self._compared(self._truth.truth(row[:4] for row in truth.rows))
+
+    def _compared(self, seconds: Iterable[Second]) -> None:
+        for second in seconds:
+            self._series["error"].add(round(second.t_s, 2), round(second.error_mm, 3), round(second.three_sigma_mm, 3))
+
+    def _static(self, message: BeaconMap) -> dict[str, BeaconEllipse]:
+        """The beacons that stand."""
+        target = self._cfg.follow.target if self._cfg.follow.is_active else ""
+        return {name: ellipse for name, ellipse in message.beacons.items() if name != target}
+
+    def _own_news(self) -> dict[str, Any]:
+        points = [[k, self._states[k], None] for k in sorted(self._changed)]
+        self._changed.clear()
+        return {"points": points, "facts": self._facts()}
+
+    def _own_all(self) -> dict[str, Any]:
+        points = [[k, state, None] for k, state in enumerate(self._states) if state != PLANNED]
+        return {"points": points, "facts": self._facts()}
+
+    def _facts(self) -> list[tuple[str, str]]:
+        """What else there is to say, name and value."""
+        message = self._map
+        if message is None:
+            return []
+        static = self._static(message)
+        rows = [("beacons on the map", str(len(static)))]
+        if (sigma_m := expected_rms_m(static)) is not None:
+            rows.append(("error of the map, expected", f"{1e3 * sigma_m:.1f} mm"))
+        if (error_m := true_rms_m(static, self._places)) is not None:
+            rows.append(("error of the map, true", f"{1e3 * error_m:.1f} mm"))
+        if message.nis_size:
+            rows.append(("readings used, refused", f"{message.nis_size}, {message.refused}"))
+            rows.append(("mean NIS", f"{message.nis_sum / message.nis_size:.2f}"))
+        if message.target is not None:
+            distance_m = hypot(message.target[0] - message.pose[0], message.target[1] - message.pose[1])
+            rows.append(("distance to the target", f"{distance_m:.2f} m"))
+            rows.append(("to be kept", f"{self._cfg.follow.safe_distance_m:.2f} m"))
+        elif message.waypoints and message.next_waypoint >= 0:
+            x_m, y_m = message.waypoints[message.next_waypoint]
+            rows.append(("to the waypoint", f"{hypot(x_m - message.pose[0], y_m - message.pose[1]):.2f} m"))
+        if self._cfg.mission.laps > 1 and message.waypoints:
+            rows.append(("lap", f"{self._lap + 1} of {self._cfg.mission.laps}"))
+        return rows
+
+    def _shapes(self) -> list[Any]:
+        shapes = [shape for shape in super()._shapes() if shape["kind"] not in _DRAWN]
+        true = [
+            {"id": f"true {name}", "kind": "true", "x_m": x_m, "y_m": y_m} for name, (x_m, y_m) in self._places.items()
+        ]
+        return [*true, *shapes]
+
+
+def expected_rms_m(beacons: Mapping[str, BeaconEllipse]) -> float | None:
+    """Root of the mean square of a place's error that the filter expects, sqrt(mean(xx + yy)); None without beacons."""
+    if not beacons:
+        return None
+    total = sum(xx + yy for _, _, xx, _, yy in beacons.values())
+    return sqrt(max(total, 0.0) / len(beacons))
+
+
+def true_rms_m(beacons: Mapping[str, BeaconEllipse], places: Mapping[str, tuple[float, float]]) -> float | None:
+    """Root of the mean square distance of the beacons from where they really are; None where nobody knows that."""
+    squares = [
+        (x - places[name][0]) ** 2 + (y - places[name][1]) ** 2
+        for name, (x, y, *_) in beacons.items()
+        if name in places
+    ]
+    return sqrt(sum(squares) / len(squares)) if squares else None
+
+
+def worst_sigma_m(xx: float, xy: float, yy: float) -> float:
+    """Standard deviation of a place in its worst direction."""
+    middle, spread = 0.5 * (xx + yy), hypot(0.5 * (xx - yy), xy)
+    return sqrt(max(middle + spread, 0.0))
+
+
+def _mm(value_m: float | None) -> float | None:
+    return None if value_m is None else round(1e3 * value_m, 2)

@@ -1,0 +1,268 @@
+"""The page of a survey: its points, the errors against laser and truth, the path.
+
+What does not change while a run goes on: the map on which things are drawn, and what the page may do.
+
+How far the estimate is from the simulated truth, frame by frame, and the worst of each second.
+"""
+
+from collections import OrderedDict
+from collections.abc import Iterable
+from math import dist, hypot
+from typing import Any, NamedTuple
+
+from ccatp.config.models import Config
+from ccatp.core import PanelId, PanelPose, PointId, Vector3
+from ccatp.links.topics import Arrival, FixMessage, MissionStatus, Picture, Track, Truth
+from ccatp.mirror.mirror import Mirror, deck_poses
+from ccatp.mirror.surface import ConvergenceError
+from ccatp.report.dashboard.view import View
+from ccatp.survey.planning.route import ORDERS
+from ccatp.survey.state import State
+
+CODES = ["normal operation", "near the mirror's edge", "operation aborted"]
+WORDS = {
+    "simulation-what": "robot and laser system are simulated",
+    "progress-head": "Survey",
+    "unit": "points",
+    "point-name": "next point",
+    "arrival-name": "last arrival",
+    "goal": "points",
+    "reached": "measured",
+}
+"""What the page calls things: by the id of their place on it, and for its own sentences."""
+PLANNED, ARRIVED, MEASURED, SKIPPED = range(4)
+"""State of a point: planned, the robot came to rest there, measured, left out."""
+
+
+def point_name(point: PointId) -> str:
+    """A point as the mission's status names it."""
+    return f"{point.row}-{point.col}-{point.point}"
+
+
+def survey_points(mirror: Mirror, cfg: Config) -> list[PointId]:
+    """The points of the survey in the order in which they are visited."""
+    return ORDERS[cfg.run.order](mirror, cfg.run.panels)
+
+
+def ground(mirror: Mirror, cfg: Config, *, is_sim: bool, needs_token: bool) -> dict[str, Any]:
+    """The ground for the page, lengths in m, deck frame.
+
+    Args:
+        mirror: where the survey takes place.
+        cfg: the run's configuration.
+        is_sim: robot and laser system are stand-ins.
+        needs_token: commands must carry a token.
+    """
+    base = mirror.base_pose
+    return {
+        "title": mirror.name,
+        "is_sim": is_sim,
+        "subtitle": f"world {cfg.world.name}, seed {cfg.run.seed}" if is_sim else f"filter {cfg.run.filter}",
+        "needs_token": needs_token,
+        "panels": [
+            [p.id.row, p.id.col, *(round(v, 4) for v in (p.x_m, p.y_m, p.half_x_m, p.half_y_m))]
+            for p in mirror.panels.values()
+        ],
+        "rim": [[round(float(x), 4), round(float(y), 4)] for x, y in mirror.rim.vertices],
+        "points": [
+            [point_name(p), *(round(v, 4) for v in mirror.point_on_deck(p))] for p in survey_points(mirror, cfg)
+        ],
+        "base": [round(base.x_m, 4), round(base.y_m, 4), round(base.heading_rad, 4)],
+        "edge_sensors_m": cfg.robot.edge_sensors_m,
+        "wheel_base_m": cfg.robot.wheel_base_m,
+        "arrival_tolerance_mm": 1e3 * cfg.mission.arrival_tolerance_m,
+        "rate_hz": cfg.dashboard.rate_hz,
+        "states": [str(state) for state in State],
+        "codes": CODES,
+        "plots": ["arrival", "error", "jump", "nis"],
+        "hides": [],
+        "words": WORDS,
+    }
+
+
+# Of every so many frames one is compared: ten a second.
+EVERY = 10
+# Frames whose other half has not come: batches of a second, and some reserve.
+WAITING = 500
+
+
+class Second(NamedTuple):
+    """The worst of one second: robot time (s), true error of the position and its three sigma (mm)."""
+
+    t_s: float
+    error_mm: float
+    three_sigma_mm: float
+
+
+class TruthCompare:
+    """Joins what main estimated and what the stand-in knows; either may come first."""
+
+    def __init__(self) -> None:
+        """Nothing came yet."""
+        self._estimates: OrderedDict[int, tuple[float, float, float]] = OrderedDict()
+        self._truths: OrderedDict[int, tuple[float, float, float]] = OrderedDict()
+        self._second = -1
+        self._worst: Second | None = None
+
+    @staticmethod
+    def is_compared(seq: int) -> bool:
+        """Whether a frame is one of those that are compared."""
+        return seq % EVERY == 0
+
+    def estimate(self, seq: int, x_m: float, y_m: float, sigma_m: float) -> list[Second]:
+        """Main's estimate after frame ``seq``, deck frame; returns the seconds that are complete by it."""
+        return self._join(seq, self._estimates, (x_m, y_m, sigma_m))
+
+    def truth(self, rows: Iterable[tuple[int, float, float, float]]) -> list[Second]:
+        """True places: rows of frame, time (s), x and y (m); returns the seconds that are complete by them."""
+        done = []
+        for seq, t_s, x_m, y_m in rows:
+            if self.is_compared(seq):
+                done += self._join(seq, self._truths, (t_s, x_m, y_m))
+        return done
+
+    def _join(
+        self, seq: int, own: OrderedDict[int, tuple[float, float, float]], value: tuple[float, float, float]
+    ) -> list[Second]:
+        own[seq] = value
+        if len(own) > WAITING:
+            own.popitem(last=False)
+        if seq not in self._estimates or seq not in self._truths:
+            return []
+        x_m, y_m, sigma_m = self._estimates.pop(seq)
+        t_s, true_x_m, true_y_m = self._truths.pop(seq)
+        here = Second(t_s, 1e3 * hypot(x_m - true_x_m, y_m - true_y_m), 3e3 * sigma_m)
+        if int(t_s) == self._second and self._worst is not None:
+            if here.error_mm > self._worst.error_mm:
+                self._worst = here
+            return []
+        done, self._second, self._worst = self._worst, int(t_s), here
+        return [] if done is None else [done]
+
+
+SERIES = ("arrival", "jump", "nis", "error")
+"""Rows of robot time (s) and: arrival error by the laser (mm); how far a fix moved the estimate (mm); NIS and degrees
+of freedom; true error and three sigma of the position (mm), the latter alone where nobody knows the truth."""
+
+
+class SurveyView(View):
+    """What a page shows of a survey.
+
+    Args:
+        mirror: where it takes place.
+        cfg: the run's configuration.
+        is_sim: robot and laser system are stand-ins.
+    """
+
+    def __init__(self, mirror: Mirror, cfg: Config, *, is_sim: bool) -> None:
+        """Nothing heard."""
+        super().__init__(is_sim=is_sim, series=SERIES)
+        self._mirror, self._puck_height_m = mirror, cfg.robot.puck_height_m
+        self.points = survey_points(mirror, cfg)
+        self._index = {point: k for k, point in enumerate(self.points)}
+        self._by_name = {point_name(point): k for k, point in enumerate(self.points)}
+        self._states = [PLANNED] * len(self.points)
+        self._errors_mm: list[float | None] = [None] * len(self.points)
+        self._changed: set[int] = set()
+        self._truth = TruthCompare()
+        self._sigma_second = -1
+        self._takers |= {
+            Arrival: self._take_arrival,
+            FixMessage: self._take_fix,
+            Track: self._take_track,
+            Truth: self._take_truth,
+        }
+
+    def begin_with(self, measured: Iterable[tuple[PointId, float, Vector3]], skipped: Iterable[PointId]) -> None:
+        """What was done before this process began.
+
+        Args:
+            measured: points with the time (s) and the puck (world frame, m) of their fixes, in any order.
+            skipped: points left out.
+        """
+        for point, t_s, position_m in sorted(measured, key=lambda row: row[1]):
+            self._measured(point, t_s, position_m)
+        for point in skipped:
+            self._mark(self._index.get(point), SKIPPED)
+
+    def _take_status(self, status: MissionStatus, now_s: float) -> None:
+        super()._take_status(status, now_s)
+        for names in status.left_out.values():
+            for name in names:
+                index = self._by_name.get(name)
+                if index is not None and self._states[index] != MEASURED:
+                    self._mark(index, SKIPPED)
+
+    def _take_picture(self, picture: Picture, now_s: float) -> None:
+        before = self._picture
+        super()._take_picture(picture, now_s)
+        if picture.size and (before is None or picture.nis != before.nis):
+            self._series["nis"].add(round(picture.t_s, 2), round(picture.nis, 3), picture.size)
+
+    def _take_arrival(self, arrival: Arrival, _now_s: float) -> None:
+        index = self._index.get(PointId(*arrival.point))
+        if index is not None and self._states[index] != MEASURED:
+            self._mark(index, ARRIVED)
+
+    def _take_fix(self, fix: FixMessage, now_s: float) -> None:
+        self.links.fix_s = now_s
+        if fix.is_fused:
+            self._series["jump"].add(round(fix.t_s, 2), round(fix.jump_mm, 4))
+        if fix.is_fused and fix.point is not None:
+            self._measured(PointId(*fix.point), fix.t_s, fix.position_m)
+
+    def _measured(self, point: PointId, t_s: float, position_m: Vector3) -> None:
+        index = self._index.get(point)
+        if index is None:
+            return
+        self._mark(index, MEASURED)
+        mirror = self._mirror
+        try:
+            x_m, y_m, _ = mirror.foot_of_puck(position_m, self._puck_height_m)
+        except ConvergenceError:
+            return  # whatever it is a fix of, it is not on this mirror
+        target = mirror.surface_point(*mirror.point_on_deck(point))
+        error_mm = round(1e3 * dist(mirror.surface_point(x_m, y_m), target), 3)
+        self._errors_mm[index] = error_mm
+        self._series["arrival"].add(round(t_s, 2), error_mm)
+        if not self.is_tracking:
+            self._trail.add(x_m, y_m)
+
+    def _take_track(self, track: Track, _now_s: float) -> None:
+        rows = [row for row in track.rows if TruthCompare.is_compared(row[0])]
+        if not rows:
+            return
+        poses = deck_poses(self._mirror, [PanelPose(PanelId(r[2], r[3]), r[4], r[5], r[6]) for r in rows])
+        for row, (x_m, y_m) in zip(rows, poses[:, :2].tolist(), strict=True):
+            self._trail.add(x_m, y_m)
+            if self._is_sim:
+                self._compared(self._truth.estimate(row[0], x_m, y_m, row[7]))
+            elif int(row[1]) != self._sigma_second:
+                self._sigma_second = int(row[1])
+                self._series["error"].add(round(row[1], 2), None, round(3e3 * row[7], 3))
+
+    def _take_truth(self, truth: Truth, _now_s: float) -> None:
+        self._compared(self._truth.truth(row[:4] for row in truth.rows))
+
+    def _compared(self, seconds: Iterable[Second]) -> None:
+        for second in seconds:
+            self._series["error"].add(round(second.t_s, 2), round(second.error_mm, 3), round(second.three_sigma_mm, 3))
+
+    def _mark(self, index: int | None, state: int) -> None:
+        if index is not None:
+            self._states[index] = state
+            self._changed.add(index)
+
+    def _own_news(self) -> dict[str, Any]:
+        points = [[k, self._states[k], self._errors_mm[k]] for k in sorted(self._changed)]
+        self._changed.clear()
+        return {"points": points}
+
+    def _own_all(self) -> dict[str, Any]:
+        return {"points": [[k, s, self._errors_mm[k]] for k, s in enumerate(self._states) if s != PLANNED]}
+
+    def _next_point(self) -> str:
+        """On the way to a stop that is no point the mission names none; then it is the first to be done."""
+        if self.status is None or self.status.point or self.status.outcome or PLANNED not in self._states:
+            return super()._next_point()
+        return point_name(self.points[self._states.index(PLANNED)])

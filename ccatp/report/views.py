@@ -1,0 +1,304 @@
+"""What viewers are shown of a run beside the raw topics: one table of views, and their derivation from messages.
+
+A view is a topic of its own, named ``view/...``, at a tenth of the frame rate at most: a recording with views is little
+larger, and a live stream of them small. What stays as it is (frames, the panels' map) is latched: whoever comes late is
+told again.
+"""
+
+from collections.abc import Iterator, Sequence
+from math import cos, hypot, sin
+from typing import Any, NamedTuple
+
+import msgspec
+from msgspec import UNSET
+
+from ccatp.core import DeckPose, PanelId, PanelPose, PointId, wrap_pi
+from ccatp.links.topics import TOPICS, Estimate, FixMessage, Log, Message, SensorLines, Track, Truth, schema_of
+from ccatp.mirror.mirror import Mirror, deck_poses
+from ccatp.report.foxglove import (
+    DECK,
+    LEVELS,
+    FrameTransform,
+    Pose,
+    PoseInFrame,
+    SceneUpdate,
+    Vector3,
+    panel_scene,
+    plain_schema,
+    point_scene,
+    quaternion,
+    robot_rotation,
+    time_of,
+)
+from ccatp.report.foxglove import Log as FoxgloveLog
+
+WORLD, ROBOT, TRUE_ROBOT = "world", "robot", "true robot"
+EVERY_FRAMES = 10
+# All points are told again this often, for whoever jumps into the middle of a recording.
+POINTS_AGAIN_S = 60.0
+_KEPT = 1000
+
+
+class RobotView(msgspec.Struct, frozen=True):
+    """Scalars to plot, of every tenth frame: the estimate on the deck, and the frame's own values."""
+
+    t_s: float
+    seq: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    sigma_m: float
+
+
+class SensorView(msgspec.Struct, frozen=True):
+    """Scalars to plot, of every tenth frame: the newest sample of each sensor; ages as the robot echoes them.
+
+    What a frame does not hold is left out: viewers plot no nulls.
+    """
+
+    t_s: float
+    seq: int
+    wheel_right_rad_s: float | msgspec.UnsetType
+    wheel_left_rad_s: float | msgspec.UnsetType
+    acceleration_m_s2: float | msgspec.UnsetType
+    yaw_rate_rad_s: float | msgspec.UnsetType
+    edge_front_left: int | msgspec.UnsetType
+    edge_front_right: int | msgspec.UnsetType
+    edge_rear_left: int | msgspec.UnsetType
+    edge_rear_right: int | msgspec.UnsetType
+    fan_left: float
+    fan_right: float
+    battery: float
+    drive_age_s: float | msgspec.UnsetType
+    permit_age_s: float | msgspec.UnsetType
+    held: bool
+
+
+class ErrorView(msgspec.Struct, frozen=True):
+    """Estimate against the simulated truth, every tenth frame (simulation only); along and across the true heading."""
+
+    t_s: float
+    seq: int
+    position_mm: float
+    along_mm: float
+    across_mm: float
+    heading_mrad: float
+
+
+class View(NamedTuple):
+    """One row of the table of views.
+
+    Attributes:
+        name: the topic.
+        message: its type.
+        schema_name: what viewers know it by.
+        is_latched: the last message holds until another one comes.
+    """
+
+    name: str
+    message: type[msgspec.Struct]
+    schema_name: str
+    is_latched: bool = False
+
+
+class Shown(NamedTuple):
+    """A message of a view: topic, robot time (s), JSON."""
+
+    topic: str
+    t_s: float
+    payload: bytes
+
+
+VIEWS = (
+    View("view/frames", FrameTransform, "foxglove.FrameTransform", True),
+    View("view/panels", SceneUpdate, "foxglove.SceneUpdate", True),
+    View("view/points", SceneUpdate, "foxglove.SceneUpdate"),
+    View("view/robot_frame", FrameTransform, "foxglove.FrameTransform"),
+    View("view/pose", PoseInFrame, "foxglove.PoseInFrame"),
+    View("view/true_pose", PoseInFrame, "foxglove.PoseInFrame"),
+    View("view/log", FoxgloveLog, "foxglove.Log"),
+    View("view/robot", RobotView, "ccatp.Robot"),
+    View("view/sensors", SensorView, "ccatp.Sensors"),
+    View("view/error", ErrorView, "ccatp.Error"),
+)
+_encode = msgspec.json.Encoder().encode
+
+
+class _Echo(msgspec.Struct):
+    age: float | None = None
+    permit_age: float | None = None
+    held: bool = False
+
+
+class _Line(msgspec.Struct):
+    """The part of a sensors line that is shown; what it lacks is no fault of ours to judge."""
+
+    seq: int
+    t: float
+    imu: list[tuple[float, float, float]]
+    enc: list[tuple[float, float, float]]
+    edge: list[tuple[float, int, int, int, int]]
+    fans: tuple[float, float]
+    soc: float
+    cmd: _Echo
+
+
+_line_decoder = msgspec.json.Decoder(_Line)
+
+
+def recorded_schemas() -> list[tuple[str, dict[str, Any]]]:
+    """Name and schema of every channel of a recording: the recorded topics, and the views of them."""
+    raw = [(t.name, plain_schema(schema_of(t.name), f"ccatp.{t.message.__name__}")) for t in TOPICS if t.recorded]
+    return [*raw, *view_schemas()]
+
+
+def view_schemas() -> list[tuple[str, dict[str, Any]]]:
+    """Name and schema of every view."""
+    return [(view.name, plain_schema(msgspec.json.schema(view.message), view.schema_name)) for view in VIEWS]
+
+
+class Views:
+    """Derives the views of one run.
+
+    Args:
+        mirror: where it takes place.
+        puck_height_m: above the surface along its normal.
+    """
+
+    def __init__(self, mirror: Mirror, puck_height_m: float) -> None:
+        """Nothing seen yet."""
+        self._mirror, self._puck_height_m = mirror, puck_height_m
+        self._deviations_m: dict[PointId, float] = {}
+        # Of one frame either may come first; what has no partner is not kept for ever.
+        self._estimates: dict[int, DeckPose] = {}
+        self._truths: dict[int, DeckPose] = {}
+        self._points_told_s = 0.0
+        self._has_begun = False
+
+    def begin(self, t_s: float = 0.0) -> Iterator[Shown]:
+        """What is latched: the world's frame and the panels' map."""
+        self._has_begun = True
+        mirror, now = self._mirror, time_of(t_s)
+        origin = Vector3(*mirror.world_from_deck((0.0, 0.0, 0.0)))
+        x, y, z = (mirror.rotate_world_from_deck(axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+        yield _shown("view/frames", t_s, FrameTransform(now, WORLD, DECK, origin, quaternion((x, y, z))))
+        yield _shown("view/panels", t_s, panel_scene(mirror, now))
+
+    def of(self, message: Message) -> Iterator[Shown]:
+        """The views of one message."""
+        if not self._has_begun:
+            yield from self.begin(max(message.t_s, 0.0))
+        if isinstance(message, Estimate):
+            yield from self._of_estimate(message)
+        elif isinstance(message, Track):
+            yield from self._of_track(message)
+        elif isinstance(message, SensorLines):
+            yield from _of_lines(message.lines)
+        elif isinstance(message, Truth):
+            yield from self._of_truth(message)
+        elif isinstance(message, FixMessage):
+            yield from self._of_fix(message)
+        elif isinstance(message, Log):
+            log = FoxgloveLog(
+                time_of(max(message.t_s, 0.0)), LEVELS.get(message.level, 0), message.text, message.process
+            )
+            yield _shown("view/log", message.t_s, log)
+
+    def all_points(self, t_s: float) -> Iterator[Shown]:
+        """Every measured point so far."""
+        panels = dict.fromkeys(point.panel for point in self._deviations_m)
+        if panels:
+            yield _shown("view/points", t_s, point_scene(self._mirror, panels, self._deviations_m, time_of(t_s)))
+
+    def _of_estimate(self, estimate: Estimate) -> Iterator[Shown]:
+        pose = DeckPose(estimate.x_m, estimate.y_m, estimate.heading_rad)
+        yield from self._of_pose(estimate.seq, estimate.t_s, pose, estimate.sigma_m)
+
+    def _of_track(self, track: Track) -> Iterator[Shown]:
+        rows = [row for row in track.rows if row[0] % EVERY_FRAMES == 0]
+        if not rows:
+            return
+        poses = [PanelPose(PanelId(row, col), x, y, heading) for _, _, row, col, x, y, heading, _ in rows]
+        for row, place in zip(rows, deck_poses(self._mirror, poses).tolist(), strict=True):
+            yield from self._of_pose(row[0], row[1], DeckPose(*place[:3]), row[7])
+
+    def _of_pose(self, seq: int, t_s: float, pose: DeckPose, sigma_m: float) -> Iterator[Shown]:
+        if seq % EVERY_FRAMES == 0:
+            yield from self._compared(seq, t_s, self._estimates, pose)
+        now, shown = time_of(t_s), self._pose_of(pose)
+        yield _shown("view/pose", t_s, PoseInFrame(now, DECK, shown))
+        frame = FrameTransform(now, DECK, ROBOT, shown.position, shown.orientation)
+        yield _shown("view/robot_frame", t_s, frame)
+        yield _shown("view/robot", t_s, RobotView(t_s, seq, pose.x_m, pose.y_m, pose.heading_rad, sigma_m))
+
+    def _of_truth(self, truth: Truth) -> Iterator[Shown]:
+        for seq, t_s, x, y, heading, *_ in truth.rows:
+            if seq % EVERY_FRAMES:
+                continue
+            pose = DeckPose(x, y, heading)
+            yield _shown("view/true_pose", t_s, PoseInFrame(time_of(t_s), DECK, self._pose_of(pose)))
+            yield from self._compared(seq, t_s, self._truths, pose)
+
+    def _compared(self, seq: int, t_s: float, own: dict[int, DeckPose], pose: DeckPose) -> Iterator[Shown]:
+        """The error of a frame, once estimate and truth are both there."""
+        own[seq] = pose
+        if seq in self._estimates and seq in self._truths:
+            yield _shown("view/error", t_s, _error(seq, t_s, self._estimates.pop(seq), self._truths.pop(seq)))
+        elif len(own) > _KEPT:
+            del own[next(iter(own))]
+
+    def _of_fix(self, fix: FixMessage) -> Iterator[Shown]:
+        if fix.point is None or not fix.is_fused:
+            return
+        point = PointId(*fix.point)
+        *_, self._deviations_m[point] = self._mirror.foot_of_puck(fix.position_m, self._puck_height_m)
+        if fix.t_s - self._points_told_s >= POINTS_AGAIN_S:
+            self._points_told_s = fix.t_s
+            yield from self.all_points(fix.t_s)
+            return
+        scene = point_scene(self._mirror, (point.panel,), self._deviations_m, time_of(fix.t_s))
+        yield _shown("view/points", fix.t_s, scene)
+
+    def _pose_of(self, pose: DeckPose) -> Pose:
+        return Pose(Vector3(*self._mirror.surface_point(pose.x_m, pose.y_m)), robot_rotation(self._mirror, pose))
+
+
+def _of_lines(lines: Sequence[msgspec.Raw]) -> Iterator[Shown]:
+    for raw in lines[::EVERY_FRAMES]:
+        try:
+            line = _line_decoder.decode(raw)
+        except msgspec.MsgspecError:
+            continue
+        _, right, left = line.enc[-1] if line.enc else (0.0, UNSET, UNSET)
+        _, acceleration, rate = line.imu[-1] if line.imu else (0.0, UNSET, UNSET)
+        edges: Sequence[int | msgspec.UnsetType] = line.edge[-1][1:] if line.edge else (UNSET,) * 4
+        view = SensorView(
+            t_s=line.t,
+            seq=line.seq,
+            wheel_right_rad_s=right,
+            wheel_left_rad_s=left,
+            acceleration_m_s2=acceleration,
+            yaw_rate_rad_s=rate,
+            edge_front_left=edges[0],
+            edge_front_right=edges[1],
+            edge_rear_left=edges[2],
+            edge_rear_right=edges[3],
+            fan_left=line.fans[0],
+            fan_right=line.fans[1],
+            battery=line.soc,
+            drive_age_s=UNSET if line.cmd.age is None else line.cmd.age,
+            permit_age_s=UNSET if line.cmd.permit_age is None else line.cmd.permit_age,
+            held=line.cmd.held,
+        )
+        yield _shown("view/sensors", line.t, view)
+
+
+def _error(seq: int, t_s: float, estimate: DeckPose, truth: DeckPose) -> ErrorView:
+    dx, dy = estimate.x_m - truth.x_m, estimate.y_m - truth.y_m
+    c, s = cos(truth.heading_rad), sin(truth.heading_rad)
+    turn = wrap_pi(estimate.heading_rad - truth.heading_rad)
+    return ErrorView(t_s, seq, 1e3 * hypot(dx, dy), 1e3 * (c * dx + s * dy), 1e3 * (c * dy - s * dx), 1e3 * turn)
+
+
+def _shown(topic: str, t_s: float, message: msgspec.Struct) -> Shown:
+    return Shown(topic, max(t_s, 0.0), _encode(message))

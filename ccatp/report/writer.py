@@ -1,0 +1,113 @@
+"""Writes the report of a run, and the one of two runs beside each other: a page, and figures where asked for."""
+
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ccatp.errors import CcatpError, ExitStatus
+from ccatp.report.beacon_page import beacon_data, beacon_figures, beacon_page
+from ccatp.report.compare import Pair, pair_of
+from ccatp.report.compare_page import compare_figures, compare_page
+from ccatp.report.drawing import Picture
+from ccatp.report.findings import findings_of
+from ccatp.report.plots import PictureError, write_figures, write_svg
+from ccatp.report.record_reader import is_beacon_run, read_beacon_record, read_record
+from ccatp.report.run_page import run_data, run_figures, run_page
+
+REPORT, COMPARISON = "report.html", "compare.html"
+
+
+class ReportError(CcatpError):
+    """A report that cannot be written."""
+
+    exit_status = ExitStatus.USAGE
+
+
+class Report(NamedTuple):
+    """A report that was written.
+
+    Attributes:
+        path: of the page.
+        data: its figures.
+        warnings: what of the run is damaged, one line each.
+    """
+
+    path: Path
+    data: dict[str, Any]
+    warnings: tuple[str, ...]
+
+
+def report_run(run_dir: Path, out: Path | None = None, figures: Path | None = None) -> Report:
+    """Write the report of a run.
+
+    Args:
+        run_dir: its directory.
+        out: the page; ``report.html`` in the run directory if not given.
+        figures: a directory for the figures as SVG, PNG and PDF; none are written if not given.
+
+    Raises:
+        RunReadError: no run there.
+        ConfigError: its configuration cannot be used.
+        ReportError: the page cannot be written.
+        PictureError: a figure cannot be written.
+    """
+    path = out or run_dir / REPORT
+    if is_beacon_run(run_dir):
+        record = read_beacon_record(run_dir)
+        markup, data, pictures = beacon_page(record), beacon_data(record), partial(beacon_figures, record)
+        warnings = record.warnings
+    else:
+        found = findings_of(read_record(run_dir))
+        markup, data, pictures = run_page(found), run_data(found), partial(run_figures, found)
+        warnings = found.record.warnings
+    write_page(markup, path)
+    if figures is not None:
+        write_pictures(pictures(), figures)
+    return Report(path, data, warnings)
+
+
+def compare_runs(run_a: Path, run_b: Path, out: Path, figures: Path | None = None) -> Pair:
+    """Write two runs beside each other.
+
+    Args:
+        run_a, run_b: their directories.
+        out: the page.
+        figures: a directory for the figures; none are written if not given.
+
+    Raises:
+        CcatpError: as ``report_run``.
+    """
+    pair = pair_of(findings_of(read_record(run_a)), findings_of(read_record(run_b)))
+    write_page(compare_page(pair), out)
+    if figures is not None:
+        write_pictures(compare_figures(pair), figures)
+    return pair
+
+
+def write_page(markup: str, path: Path) -> None:
+    """Write a page, complete or not at all.
+
+    Raises:
+        ReportError: it cannot be written.
+    """
+    new = path.with_name(path.name + ".new")
+    try:
+        new.write_text(markup, encoding="utf-8")
+        new.replace(path)
+    except OSError as error:
+        raise ReportError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def write_pictures(pictures: dict[str, Picture], folder: Path) -> None:
+    """Write figures as SVG, PNG and PDF.
+
+    Raises:
+        PictureError: one cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise PictureError(f"{folder}: cannot be made: {error.strerror or error}") from error
+    for name, picture in pictures.items():
+        write_svg(picture, folder / f"{name}.svg")
+        write_figures(picture, folder / name)

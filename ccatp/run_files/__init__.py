@@ -1,1 +1,0 @@
-"""What a run leaves behind, telemetry and log, and those who read it."""

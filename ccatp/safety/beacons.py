@@ -1,0 +1,299 @@
+"""The danger rules of a robot among beacons: verdict and permits for each frame, from the frame and an estimate.
+
+Every rule looks at what the robot itself senses; of main's estimate only its uncertainty and its age count.
+
+* obstacle: something that the distance sensors see, or saw lately, is nearer than ``obstacle_m`` within ``ahead_rad``
+  of the course: no forward motion, code 1; likewise behind, and no reverse;
+* target: by the mean level of the radio that is followed, less one standard deviation of that mean, it is nearer than
+  ``target_m``: no forward motion, code 1;
+* silence: neither a static radio nor a mote was heard for ``radio_timeout_s``: hold;
+* estimate: too old, or its standard deviation above ``position_sigma_m`` (until below ``position_clear_m``): hold;
+* a hold that lasts ``hold_limit_s`` is a fault;
+* an emergency: code 2, latched (``ccatp.safety.emergency_latch``); in an earthquake nothing is permitted.
+
+What the distance sensors saw lately, seen from where the robot is now: carried on by the wheels alone.
+"""
+
+from collections import Counter, deque
+from collections.abc import Sequence
+from math import atan2, cos, hypot, inf, isfinite, log, pi, sin, sqrt
+from typing import NamedTuple
+
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.core import EmergencyKind, EventCode, Severity, Verdict, wrap_pi
+from ccatp.links.beacon_messages import BeaconFrame
+from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import Estimate
+from ccatp.safety.emergency_latch import HEARD_AFTER_FRAMES, AbortLatch, is_at_base_or_held
+
+
+class _Echo(NamedTuple):
+    time_s: float
+    x_m: float  # in the frame in which the robot stood when this memory began
+    y_m: float
+
+
+class EchoMemory:
+    """Points in the frame of dead reckoning. Over its short memory that drifts by less than a sensor's noise.
+
+    Args:
+        sensors_rad: where the sensors look, left of the heading.
+        reach_m: farther echoes are not kept.
+        memory_s: how long one is believed.
+    """
+
+    def __init__(self, sensors_rad: Sequence[float], reach_m: float, memory_s: float) -> None:
+        """Nothing seen."""
+        self._sensors_rad, self._reach_m, self._memory_s = tuple(sensors_rad), reach_m, memory_s
+        self._echoes: deque[_Echo] = deque()
+        self._x_m = self._y_m = self._heading_rad = self._steer_rad = 0.0
+
+    def roll(self, way_m: float, course_rad: float, turn_rad: float) -> None:
+        """The robot has moved.
+
+        Args:
+            way_m: negative in reverse.
+            course_rad: of the way, left of the heading before: the steering angle of a steered front wheel.
+            turn_rad: of the heading.
+        """
+        along_rad = self._heading_rad + course_rad
+        self._x_m += way_m * cos(along_rad)
+        self._y_m += way_m * sin(along_rad)
+        self._heading_rad += turn_rad
+
+    def see(self, time_s: float, distances_m: Sequence[float]) -> None:
+        """Take the readings of a frame, in the order of the sensors, and forget what is old."""
+        while self._echoes and time_s - self._echoes[0].time_s > self._memory_s:
+            self._echoes.popleft()
+        for angle_rad, distance_m in zip(self._sensors_rad, distances_m, strict=False):
+            if distance_m < self._reach_m:
+                at_rad = self._heading_rad + angle_rad
+                x_m, y_m = self._x_m + distance_m * cos(at_rad), self._y_m + distance_m * sin(at_rad)
+                self._echoes.append(_Echo(time_s, x_m, y_m))
+
+    def nearest_m(self, course_rad: float, within_rad: float) -> float:
+        """Distance to the nearest point within an angle of a course left of the heading; infinite without one."""
+        found = inf
+        for echo in self._echoes:
+            dx_m, dy_m = echo.x_m - self._x_m, echo.y_m - self._y_m
+            distance_m = hypot(dx_m, dy_m)
+            if distance_m < found:
+                off_rad = wrap_pi(atan2(dy_m, dx_m) - self._heading_rad - course_rad)
+                if abs(off_rad) <= within_rad:
+                    found = distance_m
+        return found
+
+    def behind_m(self, course_rad: float, within_rad: float) -> float:
+        """The same, opposite to the course."""
+        return self.nearest_m(course_rad + pi, within_rad)
+
+
+_NORMAL, _NEAR, _ABORTED = EventCode
+
+
+class BeaconDanger:
+    """Judges frames. Call ``step`` once per frame, ``stale`` when no frame came in time.
+
+    Args:
+        cfg: the configuration; nothing of ``sim`` is used.
+
+    Attributes:
+        latch: of emergencies.
+    """
+
+    def __init__(self, cfg: RadioConfig) -> None:
+        """Nothing heard yet."""
+        self._danger, self._follow, self._loss = cfg.danger, cfg.follow, cfg.path_loss
+        self._avoidance, self._vehicle, self._radius_m = cfg.avoidance, cfg.vehicle, cfg.robot.wheel_radius_m
+        self.latch = AbortLatch()
+        self._denials: Counter[str] = Counter()
+        self.reset()
+
+    def reset(self) -> None:
+        """The robot has booted: its clock counts anew. Emergencies stay latched."""
+        self._heard_s: float | None = None
+        self._levels: deque[tuple[float, float]] = deque()
+        avoidance = self._avoidance
+        self._echoes = EchoMemory(avoidance.sensors_rad, avoidance.influence_m, self._danger.memory_s)
+        self._rolled_to_s: float | None = None
+        self._steer_rad = 0.0
+        self._held_since_s: float | None = None
+        self._is_vague = False
+        self._state, self._state_seq = "idle", -1
+        self._frame_seq = -1
+        self._raised_seq = -HEARD_AFTER_FRAMES - 2  # the frame in which the newest emergency was raised
+        self._code = _NORMAL
+
+    # -- for the observatory --------------------------------------------------------------------------------------
+
+    @property
+    def code(self) -> EventCode:
+        """The event code now."""
+        return self._code
+
+    @property
+    def at_base_or_held(self) -> bool:
+        """Whether main's newest estimate says so; see ``DangerMonitor.at_base_or_held``."""
+        return self._state_seq > self._raised_seq + HEARD_AFTER_FRAMES and is_at_base_or_held(self._state)
+
+    def emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
+        """Latch an emergency; returns why it was refused, or None."""
+        before = self.latch.raised
+        refusal = self.latch.raise_emergency(kind, emergency_id, note)
+        if self.latch.raised != before:
+            self._raised_seq = self._frame_seq
+        return refusal
+
+    def holds(self, emergency_id: str) -> bool:
+        """Whether the emergency with that id is active."""
+        return self.latch.holds(emergency_id)
+
+    def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
+        """End an emergency; returns why it was refused, or None."""
+        return self.latch.clear(emergency_id, at_base_or_held)
+
+    # -- frames ---------------------------------------------------------------------------------------------------
+
+    def step(self, sensors: Sensors, extras: BeaconFrame, estimate: Estimate | None) -> Verdict:
+        """The verdict on one frame.
+
+        Args:
+            sensors: the frame.
+            extras: its keys of a robot among beacons.
+            estimate: main's newest.
+        """
+        self._frame_seq = sensors.seq
+        self._hear(sensors.t, extras)
+        self._roll(sensors, extras)
+        self._echoes.see(sensors.t, extras.distances)
+        if estimate is not None:
+            self._state, self._state_seq = estimate.state, estimate.seq
+        hold = self._hold(sensors.t, estimate)
+        if hold is not None:
+            verdict = self._held(sensors, *hold)
+        else:
+            self._held_since_s = None
+            verdict = self._near(sensors)
+        self._code = verdict.code
+        if verdict.signal:
+            self._denials[verdict.signal] += 1
+        return self.latch.told(verdict)
+
+    def stale(self, seq: int, t_s: float) -> Verdict:
+        """The verdict when no frame came for ``stale_after_s``: nothing permitted."""
+        limit_s = self._danger.stale_after_s
+        denied = self._denied(seq, t_s, "no sensors frame", "sensors", limit_s, limit_s, Severity.PAUSE)
+        return self.latch.told(denied)
+
+    def garbled(self, seq: int, t_s: float, _at_s: float) -> Verdict | None:
+        """A line of the robot was no frame: nothing permitted until the next one."""
+        return self.stale(seq, t_s)
+
+    @property
+    def counts(self) -> dict[str, object]:
+        """Frames on which motion was denied, by signal."""
+        return {"denied": dict(self._denials)}
+
+    def _hear(self, t_s: float, extras: BeaconFrame) -> None:
+        names = {sample.beacon for sample in extras.radio}
+        if extras.scan is not None:
+            names |= {name for name, levels in extras.scan.levels.items() if any(z is not None for z in levels)}
+        is_heard = bool(names - {self._follow.target}) or bool(extras.motes)
+        if self._heard_s is None or is_heard:
+            self._heard_s = t_s
+        self._levels.extend((t_s, sample.rssi_dbm) for sample in extras.radio if sample.beacon == self._follow.target)
+        if extras.scan is not None:
+            levels = [z for z in extras.scan.levels.get(self._follow.target, ()) if z is not None]
+            self._levels.extend([(t_s, max(levels))] if levels else [])
+        while self._levels and t_s - self._levels[0][0] > self._danger.target_window_s:
+            self._levels.popleft()
+
+    def _roll(self, sensors: Sensors, extras: BeaconFrame) -> None:
+        """Carry the echoes on by the wheels; each sample stands for the time since the one before."""
+        steering, vehicle = {sample.t_s: sample.steer_rad for sample in extras.steer}, self._vehicle
+        for t_s, right, left in sensors.enc:
+            before_s = sensors.t if self._rolled_to_s is None else self._rolled_to_s
+            if right is None or left is None or t_s <= before_s:
+                continue
+            interval_s, self._rolled_to_s = t_s - before_s, t_s
+            way_m = 0.5 * self._radius_m * (right + left) * interval_s
+            if vehicle.kind == "ackermann":
+                self._steer_rad = steering.get(t_s, self._steer_rad)
+                turn_rad = way_m * sin(self._steer_rad) / vehicle.wheelbase_m
+                self._echoes.roll(way_m, self._steer_rad, turn_rad)
+            else:
+                turn_rad = self._radius_m * (right - left) / vehicle.track_m * interval_s
+                self._echoes.roll(way_m, 0.5 * turn_rad, turn_rad)
+        if self._rolled_to_s is None:
+            self._rolled_to_s = sensors.t
+
+    def _hold(self, t_s: float, estimate: Estimate | None) -> tuple[str, str, float, float] | None:
+        """Why nothing is permitted: cause, signal, value, limit."""
+        danger = self._danger
+        heard_s = t_s if self._heard_s is None else self._heard_s
+        if t_s - heard_s > danger.radio_timeout_s:
+            return "no radio is heard", "radio", t_s - heard_s, danger.radio_timeout_s
+        age_s = inf if estimate is None else t_s - estimate.t_s
+        if estimate is None or not age_s <= danger.estimate_timeout_s:
+            limit_s = danger.estimate_timeout_s
+            is_beginning = estimate is None and t_s <= limit_s
+            return None if is_beginning else ("no fresh estimate", "estimate", min(age_s, 1e9), limit_s)
+        limit_m = danger.position_clear_m if self._is_vague else danger.position_sigma_m
+        self._is_vague = not (isfinite(estimate.sigma_m) and estimate.sigma_m <= limit_m)
+        if self._is_vague:
+            return "the position is too uncertain", "position", min(estimate.sigma_m, 1e9), limit_m
+        return None
+
+    def _held(self, sensors: Sensors, cause: str, signal: str, value: float, limit: float) -> Verdict:
+        if self._held_since_s is None:
+            self._held_since_s = sensors.t
+        held_s = sensors.t - self._held_since_s
+        is_fault = held_s > self._danger.hold_limit_s
+        severity = Severity.FAULT if is_fault else Severity.HOLD
+        told = f"{cause} for {held_s:.0f} s" if is_fault else cause
+        return self._denied(sensors.seq, sensors.t, told, signal, value, limit, severity)
+
+    def _denied(
+        self, seq: int, t_s: float, cause: str, signal: str, value: float, limit: float, severity: Severity
+    ) -> Verdict:
+        code = _ABORTED if self.latch.is_latched else _NORMAL
+        return Verdict(seq, t_s, code, cause, signal, value, limit, False, False, False, severity=severity)
+
+    def _near(self, sensors: Sensors) -> Verdict:
+        seq, t_s, danger = sensors.seq, sensors.t, self._danger
+        emergency = self._emergency(seq, t_s)
+        if emergency is not None and not emergency.forward:
+            return emergency
+        ahead_m = self._echoes.nearest_m(self._steer_rad, danger.ahead_rad)
+        behind_m = self._echoes.behind_m(self._steer_rad, danger.ahead_rad)
+        target_m = self._nearest_target_m()
+        forward, reverse = ahead_m >= danger.obstacle_m and target_m >= danger.target_m, behind_m >= danger.obstacle_m
+        if ahead_m < danger.obstacle_m:
+            found = "an obstacle ahead", "obstacle", ahead_m, danger.obstacle_m
+        elif target_m < danger.target_m:
+            found = "the target is too near", "target", target_m, danger.target_m
+        elif behind_m < danger.obstacle_m:
+            found = "an obstacle behind", "obstacle", behind_m, danger.obstacle_m
+        else:
+            return emergency or Verdict(seq, t_s, _NORMAL, "", "", 0.0, 0.0, True, True, True)
+        return Verdict(seq, t_s, _NEAR, *found, forward, reverse, True)
+
+    def _nearest_target_m(self) -> float:
+        """The target is at least this far, by one standard deviation of its mean level; infinite without a level."""
+        if not self._follow.is_active or not self._levels:
+            return inf
+        loss = self._loss
+        mean_dbm = sum(level for _, level in self._levels) / len(self._levels)
+        reference_dbm = loss.reference_dbm_of.get(self._follow.target, loss.reference_dbm)
+        decades = (reference_dbm - mean_dbm) / (10.0 * loss.exponent)
+        sigma = self._danger.target_level_sigma_db * log(10.0) / (10.0 * loss.exponent) / sqrt(len(self._levels))
+        return float(10.0**decades) * (1.0 - min(sigma, 1.0))
+
+    def _emergency(self, seq: int, t_s: float) -> Verdict | None:
+        newest = self.latch.newest
+        if newest is None:
+            return None
+        # Whoever drives while the ground shakes slips; the others are fled from.
+        kind, may_move = (EmergencyKind.EARTHQUAKE, False) if self.latch.is_shaking else (newest.kind, True)
+        cause, signal = f"emergency: {kind}", f"emergency:{kind}"
+        return Verdict(seq, t_s, _ABORTED, cause, signal, 1.0, 0.0, may_move, may_move, may_move)

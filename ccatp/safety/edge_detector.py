@@ -1,0 +1,440 @@
+"""One edge sensor off the panels: where it went off, how far it has moved since, and when that is an edge.
+
+What the map says about a place where an edge sensor went off: rim ahead, seam, or neither.
+"""
+
+from enum import Enum, StrEnum, auto
+from math import cos, hypot, inf, sin, sqrt
+from typing import Literal, NamedTuple, Protocol
+
+from ccatp.config.models import DangerConfig
+from ccatp.core import DeckPose, PanelId
+from ccatp.mirror.layout import Panel
+from ccatp.safety.wheel_odometry import Odometry
+
+Axis = Literal["x", "y"]
+
+
+class RimMap(Protocol):
+    """The outline of a mirror."""
+
+    def signed_distance_m(self, x: float, y: float) -> float:
+        """Distance to the rim, > 0 inside."""
+
+    def segment_clearance_m(self, x0: float, y0: float, x1: float, y1: float) -> float:
+        """Least signed distance along a segment."""
+
+
+class MirrorMap(Protocol):
+    """The part of a mirror that the danger rules look at."""
+
+    @property
+    def gap_m(self) -> float:
+        """Width of a seam."""
+
+    @property
+    def panels(self) -> dict[PanelId, Panel]:
+        """All panels."""
+
+    @property
+    def rim(self) -> RimMap:
+        """The outline."""
+
+    @property
+    def overhang(self) -> bool:
+        """The robot hangs and needs its fans."""
+
+    @property
+    def base_pose(self) -> DeckPose:
+        """Where the robot starts and returns to."""
+
+    @property
+    def nearest_panel(self) -> "NearestPanel":
+        """The panel whose cell is nearest to a deck point."""
+
+    def body_offset(self, p: DeckPose, ox: float, oy: float) -> tuple[float, float]:
+        """Deck place of a point of the robot."""
+
+
+class NearestPanel(Protocol):
+    """Call signature of ``MirrorMap.nearest_panel``."""
+
+    def __call__(self, x: float, y: float) -> PanelId:
+        """The panel nearest to the deck point."""
+
+
+class SeamNear(NamedTuple):
+    """An interior seam near a place: the deck coordinate that is constant along it, and the signed distance, m."""
+
+    axis: Axis
+    distance_m: float
+
+
+class EdgeMap:
+    """Look-ups of the edge rule in the deck plane, metres."""
+
+    def __init__(self, mirror: MirrorMap) -> None:
+        """Keep the mirror."""
+        self._mirror = mirror
+        self._rim = mirror.rim
+        self.gap_m = mirror.gap_m
+
+    def place(self, pose: tuple[float, float, float], offset_m: tuple[float, float]) -> tuple[float, float]:
+        """Deck (x, y) of a sensor at ``offset_m`` (robot frame) of a robot at ``pose`` (x, y, heading)."""
+        return self._mirror.body_offset(DeckPose(*pose), *offset_m)
+
+    def is_rim_ahead(
+        self, place: tuple[float, float], direction: tuple[float, float], reach_m: float, slack_m: float
+    ) -> bool:
+        """Whether a sensor at ``place`` that moves along the unit vector ``direction`` meets the rim.
+
+        Args:
+            place: deck (x, y), m.
+            direction: unit vector in the deck plane.
+            reach_m: how far ahead to look.
+            slack_m: uncertainty of the place in every direction.
+        """
+        x, y = place
+        if self._rim.signed_distance_m(x, y) > reach_m + slack_m:
+            return False
+        ahead = x + reach_m * direction[0], y + reach_m * direction[1]
+        return self._rim.segment_clearance_m(x, y, *ahead) <= slack_m
+
+    def is_beyond_rim(self, place: tuple[float, float]) -> bool:
+        """Whether a place is off the mirror."""
+        return self._rim.signed_distance_m(*place) <= 0.0
+
+    def has_edge_near(self, place: tuple[float, float], slack_m: float) -> bool:
+        """Whether a panel may end within ``slack_m`` of a place: at a seam or at the rim."""
+        return self._rim.signed_distance_m(*place) <= slack_m or self.seam_at(place, slack_m) is not None
+
+    def seam_at(self, place: tuple[float, float], slack_m: float, not_axis: Axis | None = None) -> SeamNear | None:
+        """The nearest interior seam whose gap, widened by ``slack_m`` on both sides, holds the place.
+
+        Args:
+            place: deck (x, y), m.
+            slack_m: uncertainty of the place across the seam.
+            not_axis: leave out the seams along which this coordinate is constant.
+        """
+        x, y = place
+        panel = self._mirror.panels[self._mirror.nearest_panel(x, y)]
+        half_gap = 0.5 * self.gap_m
+        row, col = panel.id
+        panels = self._mirror.panels
+        found: SeamNear | None = None
+        # x grows with the column, y with the row: the seam lies half a gap beyond the panel's own edge.
+        dx, dy = x - panel.x_m, y - panel.y_m
+        to_x = SeamNear("x", dx - (panel.half_x_m + half_gap) * (1 if dx > 0.0 else -1))
+        to_y = SeamNear("y", dy - (panel.half_y_m + half_gap) * (1 if dy > 0.0 else -1))
+        across_x = PanelId(row, col + (1 if dx > 0.0 else -1))
+        across_y = PanelId(row + (1 if dy > 0.0 else -1), col)
+        for seam, neighbour in ((to_x, across_x), (to_y, across_y)):
+            is_there = seam.axis != not_axis and neighbour in panels and abs(seam.distance_m) <= half_gap + slack_m
+            if is_there and (found is None or abs(seam.distance_m) < abs(found.distance_m)):
+                found = seam
+        return found
+
+
+Place = tuple[float, float]
+
+# The direction of a sensor's motion is taken over this length: far above what encoder noise adds up to at rest (1e-5 m
+# a minute), far below what a rule allows.
+DIRECTION_TRAVEL_M = 2e-4
+# Below this cosine the side from which a sensor came to a seam is not told by its direction any more.
+MIN_SIDE_COSINE = 0.3
+# A sensor that stays on this many times longer than it takes to clear an edge is on a panel, moving or not.
+LONG_ON = 10
+
+
+class Phase(Enum):
+    """What is known of an episode."""
+
+    FRESH = auto()  # the sensor has not moved since it went off
+    SEAM = auto()  # the map explains it by a seam
+    NO_MAP = auto()  # the map does not explain it
+    RIM = auto()  # the map has the rim ahead
+    DECLARED = auto()  # an edge
+
+
+class Cause(StrEnum):
+    """Why an edge was declared."""
+
+    RIM = "rim ahead on the map"
+    SEAM = "further off the panel than the seam is wide"
+    NO_MAP = "off the panel where the map has no seam"
+    SILENT_WHEELS = "off the panel while the wheels are not heard"
+
+
+class EpisodeLimits:
+    """The limits of the edge rule.
+
+    Args:
+        gap_m: width of the seams.
+        cfg: the danger loop's configuration.
+    """
+
+    def __init__(self, gap_m: float, cfg: DangerConfig) -> None:
+        """Copy what the rule needs."""
+        self.sigmas, self.margin_m = cfg.map_sigmas, cfg.map_margin_m
+        self.gap_m, self.tolerance_m, self.extra_m = gap_m, cfg.gap_tolerance_m, cfg.seam_extra_m
+        self.no_map_m, self.turn_m = cfg.no_map_travel_m, cfg.turn_travel_limit_m
+        width = gap_m + cfg.gap_tolerance_m
+        # A narrow seam may be crossed at a greater slant: what counts in the end is how far the sensor may go.
+        self.min_cosine = min(cos(cfg.max_crossing_angle_rad), width / cfg.slanted_crossing_m)
+        # Where seams cross, a path that is oblique to one is steep to the other: more than both chords is no crossing.
+        self.crossing_m = width / self.min_cosine + width / sqrt(1.0 - self.min_cosine**2) + cfg.seam_extra_m
+        self.outward_turn_m = cfg.outward_turn_limit_m
+        self.debounce, self.clear = cfg.debounce_samples, cfg.clear_samples
+
+
+class Episode:
+    """A sensor's time off the panels. Places are in the odometry's frame unless called map places.
+
+    Args:
+        limits: the rule's limits.
+        edge_map: the map.
+        odometry: the robot at the first off sample.
+        sensor: its place in the robot frame, and how far it moves between two samples, which is how late it may have
+            been noticed, m.
+        half_base_m: half the wheel base; less translation than that per radian means turning in place.
+
+    Attributes:
+        phase: what is known.
+        cause, value_m, limit_m: the declared edge: why, and the travel against its limit.
+        retreat_m: how far the sensor has been moved since it was declared, while it stayed off.
+        is_doubted: the sensor is to blame, and no edge.
+    """
+
+    def __init__(
+        self,
+        limits: EpisodeLimits,
+        edge_map: EdgeMap,
+        odometry: Odometry,
+        sensor: tuple[Place, float],
+        half_base_m: float,
+    ) -> None:
+        """Open at the first off sample."""
+        self._limits, self._map = limits, edge_map
+        offset_m, moved_m = sensor
+        self._radius_m, self._half_base_m, self._moved_m = hypot(*offset_m), half_base_m, moved_m
+        c, s = cos(odometry.heading_rad), sin(odometry.heading_rad)
+        self._robot0: Place = (odometry.x_m, odometry.y_m)
+        self._sensor0: Place = (
+            odometry.x_m + c * offset_m[0] - s * offset_m[1],
+            odometry.y_m + s * offset_m[0] + c * offset_m[1],
+        )
+        self._heading0 = self._heading = odometry.heading_rad
+        self._map0: Place | None = None
+        self._cos, self._sin, self._sigma_m = 1.0, 0.0, inf
+        self._moved: Place = (0.0, 0.0)
+        self._recent: Place = (0.0, 0.0)
+        self._direction: Place = (0.0, 0.0)
+        self._axis: Axis = "x"
+        self._side = 0.0
+        self._has_switched = False
+        self._base: tuple[Place, Place] = ((0.0, 0.0), (0.0, 0.0))
+        self.is_from_turn = False
+        self._turn_sign = 0.0
+        self._off_samples = self._on_samples = 0
+        self._on_place: Place = self._sensor0
+        self._declared_heading = 0.0
+        self._declared_place: Place = self._sensor0
+        self._place: Place = self._sensor0
+        self._is_turn_spent = False
+        self.retreat_m = 0.0
+        self.is_doubted = False
+        self.phase = Phase.FRESH
+        self.cause: Cause | None = None
+        self.value_m = self.limit_m = 0.0
+
+    def place_on_map(self, place: Place, deck_heading_rad: float, sigma_m: float) -> None:
+        """Tie the episode to the map: the sensor's deck place, the robot's deck heading and the estimate's sigma."""
+        turn = deck_heading_rad - self._heading0
+        self._map0, self._cos, self._sin, self._sigma_m = place, cos(turn), sin(turn), sigma_m
+
+    @property
+    def needs_map(self) -> bool:
+        """Whether the sensor still is where it went off, but without a place on the map."""
+        return self.phase is Phase.FRESH and self._map0 is None
+
+    # -- samples --------------------------------------------------------------------------------------------------
+
+    def see_on(self, place: Place) -> bool:
+        """The sensor is on a panel at ``place``. Returns whether the episode is over."""
+        if self._on_samples == 0:
+            self._on_place = place
+        self._on_samples += 1
+        if self._on_samples < self._limits.clear:
+            return False
+        if self.phase is Phase.DECLARED or self._on_samples >= LONG_ON * self._limits.clear:
+            return True
+        return hypot(place[0] - self._on_place[0], place[1] - self._on_place[1]) >= self._limits.no_map_m
+
+    def see_off(self, odometry: Odometry, place: Place, worst_m: float) -> bool:
+        """The sensor is off at ``place``. Returns whether that declares an edge now.
+
+        Args:
+            odometry: the robot.
+            place: the sensor.
+            worst_m: travel that wheels unheard may have added, rule (g).
+        """
+        self._off_samples += 1
+        self._on_samples = 0
+        self._heading, self._place = odometry.heading_rad, place
+        if self.phase is Phase.DECLARED:
+            self._watch_turn()
+            self.retreat_m = hypot(place[0] - self._declared_place[0], place[1] - self._declared_place[1])
+            return False
+        self._declared_place = place
+        if worst_m > self._limits.no_map_m:
+            return self._declare(Cause.SILENT_WHEELS, worst_m, self._limits.no_map_m)
+        c, s, sensor0, robot0 = self._cos, self._sin, self._sensor0, self._robot0
+        dx, dy = place[0] - sensor0[0], place[1] - sensor0[1]
+        self._moved = c * dx - s * dy, s * dx + c * dy
+        dx, dy = odometry.x_m - robot0[0], odometry.y_m - robot0[1]
+        robot = c * dx - s * dy, s * dx + c * dy
+        if self.phase is Phase.FRESH:
+            self._classify(robot)
+        return self._judge(robot)
+
+    def look_ahead(self) -> bool:
+        """Rule (a) along the motion since the last call. Returns whether that declares an edge now."""
+        dx, dy = self._moved[0] - self._recent[0], self._moved[1] - self._recent[1]
+        length = hypot(dx, dy)
+        if self._on_samples or self._map0 is None or length < DIRECTION_TRAVEL_M or self.phase is Phase.FRESH:
+            return False
+        self._recent = self._moved
+        if not self._is_rim((dx / length, dy / length)):
+            return False
+        self.phase = Phase.RIM
+        return self._off_samples >= self._limits.debounce and self._declare_rim()
+
+    def trust(self) -> None:
+        """The sensor is right after all: moved back from where it is now, it comes on."""
+        self._declared_place, self.retreat_m, self.is_doubted = self._place, 0.0, False
+
+    @property
+    def is_on(self) -> bool:
+        """The sensor is on at present: the episode may be about to end."""
+        return self._on_samples > 0
+
+    @property
+    def permits_turn(self) -> bool:
+        """Whether the robot may turn: back, out of an edge that it met in turning."""
+        return self.phase is not Phase.DECLARED or (self.is_from_turn and not self._is_turn_spent)
+
+    # -- rules ----------------------------------------------------------------------------------------------------
+
+    def _classify(self, robot: Place) -> None:
+        """Once the sensor has moved: rules (a), (b) or (c)?"""
+        length = hypot(*self._moved)
+        if length < DIRECTION_TRAVEL_M:
+            return
+        self._direction = direction = self._moved[0] / length, self._moved[1] / length
+        turned = self._heading - self._heading0
+        self.is_from_turn = hypot(*robot) < abs(turned) * self._half_base_m
+        self._turn_sign = 1.0 if turned >= 0.0 else -1.0
+        self.phase = Phase.NO_MAP
+        if self._map0 is None:
+            return
+        if self._is_rim(direction):
+            self.phase = Phase.RIM
+            return
+        seam = self._map.seam_at(self._map0, self._slack_m())
+        if seam is not None:
+            self.phase = Phase.SEAM
+            self._set_seam(seam.axis)
+
+    def _slack_m(self) -> float:
+        """How far the map place may be wrong across a seam.
+
+        The extra covers the heading's part, which the estimate's sigma leaves out: 3 mm are 1.3 deg at a corner sensor.
+        """
+        limits = self._limits
+        return limits.tolerance_m + limits.extra_m + limits.sigmas * self._sigma_m + self._moved_m
+
+    def _is_rim(self, direction: Place) -> bool:
+        if self._map0 is None:
+            return False
+        here = self._map0[0] + self._moved[0], self._map0[1] + self._moved[1]
+        return self._map.is_rim_ahead(here, direction, self._limits.margin_m, self._limits.sigmas * self._sigma_m)
+
+    def _set_seam(self, axis: Axis) -> None:
+        self._axis = axis
+        across = self._direction[0] if axis == "x" else self._direction[1]
+        # Only where the robot's own translation brought the sensor here does its direction tell forth from back.
+        known = not self.is_from_turn and not self._has_switched and abs(across) >= MIN_SIDE_COSINE
+        self._side = (1.0 if across > 0.0 else -1.0) if known else 0.0
+
+    def _judge(self, robot: Place) -> bool:
+        if self._off_samples < self._limits.debounce:
+            return False
+        if self.phase is Phase.RIM:
+            return self._declare_rim()
+        if self.phase is Phase.NO_MAP:
+            return self._judge_no_map()
+        return self.phase is Phase.SEAM and self._judge_seam(robot)
+
+    def _declare_rim(self) -> bool:
+        return self._declare(Cause.RIM, hypot(*self._moved), 0.0)
+
+    def _judge_no_map(self) -> bool:
+        ux, uy = self._direction
+        mx, my = self._moved
+        travel = hypot(max(ux * mx + uy * my, 0.0), ux * my - uy * mx)
+        return travel > self._limits.no_map_m and self._declare(Cause.NO_MAP, travel, self._limits.no_map_m)
+
+    def _judge_seam(self, robot: Place) -> bool:
+        value, limit = self._seam_excess(robot)
+        if value <= limit or self._switch_seam(robot):
+            return False
+        return self._declare(Cause.SEAM, value, limit)
+
+    def _seam_excess(self, robot: Place) -> tuple[float, float]:
+        """The travel that is over its limit, and that limit; else what translation has used up of its allowance."""
+        limits = self._limits
+        k = 0 if self._axis == "x" else 1
+        width = limits.gap_m + limits.tolerance_m
+        sensor0, robot0 = self._base
+        across = self._moved[k] - sensor0[k]
+        across = across * self._side if self._side else abs(across)
+        if across > width + limits.extra_m:
+            return across, width + limits.extra_m
+        swept = abs(self._heading - self._heading0) * self._radius_m
+        if swept > limits.turn_m:
+            return swept, limits.turn_m
+        tx, ty = robot[0] - robot0[0], robot[1] - robot0[1]
+        if self._side and tx * self._direction[0] + ty * self._direction[1] <= 0.0:
+            return 0.0, width
+        travel = hypot(tx, ty)
+        if travel < width:
+            return travel, width
+        from_start = hypot(*robot)
+        if from_start > limits.crossing_m:
+            return from_start, limits.crossing_m
+        cosine = max(abs((tx, ty)[k]) / travel, limits.min_cosine)
+        return travel, width / cosine + limits.extra_m
+
+    def _switch_seam(self, robot: Place) -> bool:
+        """Where two seams cross, a sensor may leave one along the other: once, that is no edge."""
+        if self._has_switched or self._map0 is None or hypot(*robot) > self._limits.crossing_m:
+            return False
+        here = self._map0[0] + self._moved[0], self._map0[1] + self._moved[1]
+        seam = self._map.seam_at(here, self._slack_m(), not_axis=self._axis)
+        if seam is None:
+            return False
+        self._has_switched = True
+        self._base = (self._moved, robot)
+        self._set_seam(seam.axis)
+        return True
+
+    def _declare(self, cause: Cause, value_m: float, limit_m: float) -> bool:
+        self.phase = Phase.DECLARED
+        self.cause, self.value_m, self.limit_m = cause, value_m, limit_m
+        self._declared_heading = self._heading
+        return True
+
+    def _watch_turn(self) -> None:
+        outward = self._turn_sign * (self._heading - self._declared_heading) * self._radius_m
+        if outward > self._limits.outward_turn_m:
+            self._is_turn_spent = True

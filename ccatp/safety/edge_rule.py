@@ -1,0 +1,325 @@
+"""Edge or gap, by travelled distance with the map as prior: one episode per sensor that is off the panels.
+
+The rule, for a sensor that reads "off" (the travel is the sensor's own, its part from the robot's rotation included):
+
+a. the map has the rim ahead of it within ``map_margin_m``, give or take ``map_sigmas`` sigma: an edge at once;
+b. the map has a seam there: an edge when the sensor cannot be over the gap any more. Translation of the robot may carry
+   it ``(gap + tolerance) / cos(angle to the seam's normal) + extra``; what rotation adds counts across the seam only,
+   because a corner sensor that turns in place sweeps along a seam for up to 0.1 m without leaving it;
+c. the map has neither, or there is no estimate: an edge after ``no_map_travel_m``;
+d. standing still the episode is frozen, for ever; going back to where the sensor was on adds nothing;
+e. an edge may have been declared by a wrong pose: a sensor that a fix at rest shows over a seam with no rim near begins
+   anew there, and one that it shows at the rim is not to blame for staying off;
+g. wheels unheard: the fastest that the sensor can move, times the time;
+h. all four off: lifted or fallen.
+
+An episode ends when the sensor has stood on a panel for ``clear_samples`` samples and has moved on by
+``no_map_travel_m``, so that a sensor that chatters does not begin anew again and again.
+
+The robot's centre and the rim on the map: a notch's tip passes between the edge sensors unseen.
+
+At an inner corner of the stepped rim the empty quadrant points at the robot like a wedge. Driven at along its bisector,
+the front sensors, 180 mm apart, leave the panels only when its tip has come under the centre. Where the position is
+known, the map sees it coming; where it is not, four corner sensors cannot.
+"""
+
+from collections.abc import Sequence
+from math import cos, hypot, inf, sin
+from typing import Protocol
+
+from ccatp.config.models import DangerConfig, RobotConfig
+from ccatp.control.motion_checks import largest_rate_rad_s
+from ccatp.core import EdgeSample, WheelSample
+from ccatp.safety.edge_detector import EdgeMap, Episode, EpisodeLimits, Phase, RimMap
+from ccatp.safety.wheel_odometry import Odometry, WheelTrack, pose_at
+
+SENSORS = 4
+# Slower than this the robot stands; the estimate's sigma then falls to less than half by a fix, and by nothing else.
+_STILL_M_S = 5e-4
+_BY_A_FIX = 0.5
+# A fix shows where the robot is, but not at once what it faces: an estimate that was wrong mostly is so in its heading.
+_HEADING_RAD = 0.1
+
+
+class PoseEstimate(Protocol):
+    """The localizer's pose, deck frame."""
+
+    @property
+    def t_s(self) -> float:
+        """Robot time of the pose."""
+
+    @property
+    def x_m(self) -> float:
+        """Deck x."""
+
+    @property
+    def y_m(self) -> float:
+        """Deck y."""
+
+    @property
+    def heading_rad(self) -> float:
+        """Deck heading."""
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the position."""
+
+
+class EdgeRule:
+    """The four sensors' episodes and what they declare.
+
+    Args:
+        edge_map: the mirror as the rule sees it.
+        robot: wheels and sensor places.
+        cfg: distances and counts.
+
+    Attributes:
+        episodes: one per sensor, in the order of the robot link.
+        is_lifted: all four sensors have been off (rule h), and have not been back on for ``clear_samples``.
+        opened, declared: episodes opened and edges declared per sensor since the start.
+    """
+
+    def __init__(self, edge_map: EdgeMap, robot: RobotConfig, cfg: DangerConfig) -> None:
+        """All sensors on."""
+        self._map = edge_map
+        self._offsets = robot.edge_sensors_m
+        reach_s = 2.0 * max(cfg.stale_after_s, cfg.estimate_stale_after_s)
+        self.track = WheelTrack(
+            robot.wheel_radius_m, robot.wheel_base_m, cfg.stale_after_s, reach_s, largest_rate_rad_s(robot)
+        )
+        self._limits = EpisodeLimits(edge_map.gap_m, cfg)
+        self._half_base_m = 0.5 * robot.wheel_base_m
+        self._clear_samples, self._lifted_samples = cfg.clear_samples, cfg.lifted_samples
+        self._worst_m_s = tuple(_fastest(robot, offset) for offset in robot.edge_sensors_m)
+        self.opened, self.declared = [0, 0, 0, 0], [0, 0, 0, 0]
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget episodes, odometry and times: the robot's clock began anew."""
+        self.track.reset()
+        self.episodes: tuple[Episode | None, ...] = (None, None, None, None)
+        self._odometry: Odometry | None = None
+        self._last_t_s: float | None = None
+        self._all_off = self._all_on = 0
+        self._vague_m = 0.0
+        self.is_lifted = False
+
+    @property
+    def is_idle(self) -> bool:
+        """No episode is open, nor is the robot lifted."""
+        return self._odometry is None
+
+    def step(self, samples: list[EdgeSample], estimate: PoseEstimate | None) -> None:
+        """Judge a frame's samples, oldest first. The frame's encoder samples must have been pushed to ``track``.
+
+        Args:
+            samples: edge samples; those that go back in time are dropped.
+            estimate: the newest pose, already found fresh and finite; None without one.
+        """
+        if not samples:
+            return
+        if self._odometry is None and _are_all_on(samples):
+            self._last_t_s = samples[-1][0]
+            return
+        self.track.update(samples[-1][0])
+        if self._odometry is None:
+            self._odometry = Odometry(self.track, samples[0][0] if self._last_t_s is None else self._last_t_s)
+        self._tie_to_map(self._odometry, estimate)
+        for sample in samples:
+            if self._last_t_s is None or sample[0] > self._last_t_s:
+                self._sample(sample, self._odometry, estimate)
+                self._last_t_s = sample[0]
+        self._look_ahead()
+        if estimate is not None and self._has_fix(self._odometry, estimate.sigma_m):
+            self._look_again(self._odometry, estimate)
+        if not any(self.episodes) and not self.is_lifted:
+            self._odometry = None
+
+    def _sample(self, sample: EdgeSample, odometry: Odometry, estimate: PoseEstimate | None) -> None:
+        t_s = sample[0]
+        dt_s = 0.0 if self._last_t_s is None else t_s - self._last_t_s
+        odometry.advance_to(t_s)
+        silent_s = self.track.silence_s(t_s)
+        c, s = cos(odometry.heading_rad), sin(odometry.heading_rad)
+        off = 0
+        for i, known in enumerate(self.episodes):
+            # Anything but a clear "on" counts as off.
+            is_on = sample[i + 1] == 1
+            if is_on and known is None:
+                continue
+            off += not is_on
+            episode = known or self._open(i, odometry, dt_s, estimate)
+            ox, oy = self._offsets[i]
+            place = odometry.x_m + c * ox - s * oy, odometry.y_m + s * ox + c * oy
+            if is_on:
+                if episode.see_on(place):
+                    self._replace(i, None)
+            elif episode.see_off(odometry, place, silent_s * self._worst_m_s[i]):
+                self.declared[i] += 1
+        self._count_all(off)
+
+    def _tie_to_map(self, odometry: Odometry, estimate: PoseEstimate | None) -> None:
+        """Give a sensor that has stood off a panel since before the first estimate its place on the map."""
+        for i, episode in enumerate(self.episodes):
+            if episode is not None and episode.needs_map and estimate is not None:
+                self._place(episode, self._offsets[i], odometry, estimate)
+
+    def _has_fix(self, odometry: Odometry, sigma_m: float) -> bool:
+        """Whether the robot stands and has just been measured."""
+        is_still = abs(odometry.v_m_s) + abs(odometry.omega_rad_s) * self._half_base_m < _STILL_M_S
+        has_fix = is_still and sigma_m < _BY_A_FIX * self._vague_m
+        self._vague_m = max(self._vague_m, sigma_m) if is_still and not has_fix else sigma_m
+        return has_fix
+
+    def _look_again(self, odometry: Odometry, estimate: PoseEstimate) -> None:
+        """An edge was declared where the robot was not. A sensor that a fix shows over a seam begins anew there.
+
+        One that it shows at the rim is not to blame for staying off, however far it was moved along there.
+        """
+        limits = self._limits
+        for i, episode in enumerate(self.episodes):
+            if episode is None or episode.phase is not Phase.DECLARED or episode.is_on:
+                continue
+            place = self._map.place((estimate.x_m, estimate.y_m, estimate.heading_rad), self._offsets[i])
+            aside_m = _HEADING_RAD * hypot(*self._offsets[i])
+            slack_m = limits.sigmas * estimate.sigma_m + aside_m
+            seam = self._map.seam_at(place, limits.tolerance_m + slack_m)
+            is_rim = self._map.is_rim_ahead(place, (1.0, 0.0), 0.0, limits.margin_m + slack_m)
+            if is_rim:
+                episode.trust()
+            elif seam is not None:
+                anew = self._open(i, odometry, 0.0, estimate)
+                self._place(anew, self._offsets[i], odometry, estimate, aside_m / limits.sigmas)
+
+    def _place(
+        self,
+        episode: Episode,
+        offset_m: tuple[float, float],
+        odometry: Odometry,
+        estimate: PoseEstimate,
+        more_sigma_m: float = 0.0,
+    ) -> None:
+        known = estimate.x_m, estimate.y_m, estimate.heading_rad
+        pose = pose_at(self.track, odometry.t_s, estimate.t_s, known)
+        episode.place_on_map(self._map.place(pose, offset_m), pose[2], estimate.sigma_m + more_sigma_m)
+
+    def _open(self, i: int, odometry: Odometry, dt_s: float, estimate: PoseEstimate | None) -> Episode:
+        ox, oy = self._offsets[i]
+        moved_m = (abs(odometry.v_m_s) + abs(odometry.omega_rad_s) * hypot(ox, oy)) * dt_s
+        episode = Episode(self._limits, self._map, odometry, ((ox, oy), moved_m), self._half_base_m)
+        if estimate is not None:
+            self._place(episode, (ox, oy), odometry, estimate)
+        self.opened[i] += 1
+        self._replace(i, episode)
+        return episode
+
+    def _replace(self, i: int, episode: Episode | None) -> None:
+        self.episodes = (*self.episodes[:i], episode, *self.episodes[i + 1 :])
+
+    def _count_all(self, off: int) -> None:
+        self._all_off = self._all_off + 1 if off == SENSORS else 0
+        self._all_on = self._all_on + 1 if off == 0 else 0
+        if self._all_off >= self._lifted_samples:
+            self.is_lifted = True
+        elif self.is_lifted and self._all_on >= self._clear_samples:
+            self.reset_episodes()
+
+    def reset_episodes(self) -> None:
+        """Begin anew on the panels: the robot has been put back."""
+        self.is_lifted = False
+        self.episodes = (None, None, None, None)
+
+    def _look_ahead(self) -> None:
+        """Rule (a) again, once per frame, for what is off and moves: a seam may lead to the rim."""
+        for i, episode in enumerate(self.episodes):
+            if episode is not None and episode.phase is not Phase.DECLARED and episode.look_ahead():
+                self.declared[i] += 1
+
+
+def _are_all_on(samples: list[EdgeSample]) -> bool:
+    """Whether every sensor is on in every sample; anything but a clear 1 is off."""
+    for _, front_left, front_right, rear_left, rear_right in samples:
+        if not (front_left == 1 and front_right == 1 and rear_left == 1 and rear_right == 1):
+            return False
+    return True
+
+
+def _fastest(robot: RobotConfig, offset_m: tuple[float, float]) -> float:
+    """Largest speed of a sensor, m/s: it is linear in the wheel rates, so it is taken at a corner of their range."""
+    edge_m_s = robot.wheel_radius_m * robot.max_wheel_rad_s
+    omega = 2.0 * edge_m_s / robot.wheel_base_m
+    return max(edge_m_s, omega * hypot(*offset_m))
+
+
+# Where the clearance is wide, it is looked up this often at least: a fix may move the estimate.
+LOOK_PERIOD_S = 0.1
+# Sum of the wheel rates that is motion and not encoder noise (0.3 mm/s).
+MOVING_RAD_S = 0.02
+
+
+class OriginRule:
+    """Declares an edge when the centre drives at the rim and is closer to it than half the sensors' lead.
+
+    A straight rim never gets that close: the sensors meet it first. Ends when the centre is ``map_margin_m`` further
+    away than it takes to declare.
+
+    Args:
+        rim: the mirror's outline.
+        robot: wheels and sensor places.
+        cfg: sigmas and margin.
+
+    Attributes:
+        direction: 0, or the sign of the motion that is barred.
+        clearance_m, limit_m: the centre's distance to the rim at the last look, and what it must not fall below.
+        declared: how often an edge was declared.
+    """
+
+    def __init__(self, rim: RimMap, robot: RobotConfig, cfg: DangerConfig) -> None:
+        """Nothing barred."""
+        self._rim = rim
+        self._lead_m = min(min(abs(x), abs(y)) for x, y in robot.edge_sensors_m)
+        self._sigmas, self._margin_m = cfg.map_sigmas, cfg.map_margin_m
+        self._fastest_m_s = robot.wheel_radius_m * robot.max_wheel_rad_s
+        self.declared = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget: the robot's clock began anew."""
+        self.direction = 0
+        self.clearance_m, self.limit_m = inf, 0.0
+        self._look_at_s = -inf
+
+    def step(self, t_s: float, estimate: PoseEstimate, wheels: Sequence[WheelSample]) -> None:
+        """Look up the clearance, where it may have come near the limit.
+
+        Args:
+            t_s: time of the frame.
+            estimate: a fresh pose.
+            wheels: the frame's encoder samples.
+        """
+        if t_s < self._look_at_s:
+            return
+        x, y = estimate.x_m, estimate.y_m
+        self.clearance_m = clearance = self._rim.signed_distance_m(x, y)
+        self.limit_m = limit = min(0.5 * self._lead_m + self._sigmas * estimate.sigma_m, self._lead_m)
+        if self.direction == 0:
+            self._look_at_s = t_s + min(max(clearance - limit, 0.0) / self._fastest_m_s, LOOK_PERIOD_S)
+            if clearance < limit:
+                self._judge(estimate, wheels)
+        elif clearance > limit + self._margin_m:
+            self.direction = 0
+
+    def _judge(self, estimate: PoseEstimate, wheels: Sequence[WheelSample]) -> None:
+        _, right, left = wheels[-1] if wheels else (0.0, None, None)
+        if right is None or left is None:
+            return
+        total = right + left
+        if abs(total) < MOVING_RAD_S:
+            return
+        direction = 1 if total > 0.0 else -1
+        ahead_m = direction * self._margin_m
+        x = estimate.x_m + ahead_m * cos(estimate.heading_rad)
+        y = estimate.y_m + ahead_m * sin(estimate.heading_rad)
+        if self._rim.signed_distance_m(x, y) < self.clearance_m:
+            self.direction = direction
+            self.declared += 1

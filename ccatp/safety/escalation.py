@@ -1,0 +1,169 @@
+"""The ladder: the gravest finding wins, and what does not pass in time, or comes again and again, gets graver.
+
+What a monitor finds, and how long a finding stays after its evidence is gone.
+"""
+
+from collections import deque
+from collections.abc import Iterable
+from math import inf
+from typing import NamedTuple
+
+from ccatp.config.models import HealthConfig
+from ccatp.core import Severity
+
+
+class Finding(NamedTuple):
+    """Something is wrong.
+
+    Attributes:
+        severity: what has to be done.
+        cause: why, in one short phrase.
+        signal: what gave cause.
+        value: its value, in the unit of ``limit``.
+        limit: the limit that it passed.
+        full_fans: the fans shall give all they can.
+        retries: how often it may come again before it is a fault; ``None``: as often as the configuration says.
+        patience_s: a hold that lasts longer is a fault; ``None``: as the configuration says.
+    """
+
+    severity: Severity
+    cause: str
+    signal: str
+    value: float
+    limit: float
+    full_fans: bool = False
+    retries: int | None = None
+    patience_s: float | None = None
+
+
+class Alarm:
+    """A finding that stays until there has been no evidence of it for a while.
+
+    Args:
+        clear_s: that while.
+
+    Attributes:
+        finding: the finding, or ``None``.
+    """
+
+    __slots__ = ("_clear_s", "_seen_s", "finding")
+
+    def __init__(self, clear_s: float) -> None:
+        """Nothing found."""
+        self._clear_s = clear_s
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget."""
+        self.finding: Finding | None = None
+        self._seen_s = -inf
+
+    def see(self, t_s: float, finding: Finding) -> None:
+        """There is evidence at ``t_s``. The first values are kept, unless it has become graver."""
+        if self.finding is None or finding.severity > self.finding.severity:
+            self.finding = finding
+        self._seen_s = t_s
+
+    def settle(self, t_s: float) -> None:
+        """Let the finding go if its last evidence is long ago at ``t_s``."""
+        if self.finding is not None and t_s - self._seen_s >= self._clear_s:
+            self.finding = None
+
+
+class Since:
+    """Since when something has been so without interruption.
+
+    Attributes:
+        t_s: since then; ``None`` while it is not so.
+    """
+
+    __slots__ = ("t_s",)
+
+    def __init__(self) -> None:
+        """It is not so."""
+        self.t_s: float | None = None
+
+    def lasts(self, t_s: float, is_so: bool) -> float:
+        """For how long it has been so at ``t_s``, s; < 0 while it is not."""
+        if not is_so:
+            self.t_s = None
+            return -1.0
+        if self.t_s is None:
+            self.t_s = t_s
+        return t_s - self.t_s
+
+
+_DENYING = (Severity.PAUSE, Severity.HOLD, Severity.FAULT)
+
+
+def gravest(findings: Iterable[Finding]) -> Finding | None:
+    """The finding that wins: the gravest, of equal ones the first."""
+    return max(findings, key=lambda finding: finding.severity, default=None)
+
+
+def denies(findings: Iterable[Finding]) -> bool:
+    """Whether any of the findings holds the wheels. Going home does not, but what else is found may."""
+    return any(finding.severity in _DENYING for finding in findings)
+
+
+class Ladder:
+    """Raises the severity of what lasts or comes back.
+
+    A pause that lasts for longer than ``pause_limit_s`` is a hold, so that a fix is had before going on; a hold that
+    lasts for longer than its patience is a fault, because it does not pass by itself; a hold for the same signal that
+    comes more than ``retries`` times again within ``retry_window_s`` is one, too.
+
+    Args:
+        cfg: these times.
+    """
+
+    def __init__(self, cfg: HealthConfig) -> None:
+        """Nothing found."""
+        self._cfg = cfg
+        self._since_s: dict[str, float] = {}
+        self._held: dict[str, deque[float]] = {}
+
+    def reset(self) -> None:
+        """The robot's clock began anew; what came back before does not count."""
+        self._since_s.clear()
+        self._held.clear()
+
+    def climb(self, t_s: float, findings: list[Finding]) -> list[Finding]:
+        """The findings of a frame, raised where their time is up.
+
+        Args:
+            t_s: time of the frame.
+            findings: all there are; an empty list ends every count of duration.
+        """
+        since = self._since_s
+        now: dict[str, float] = {}
+        for finding in findings:
+            now[finding.signal] = min(since.get(finding.signal, t_s), now.get(finding.signal, inf))
+        self._since_s = now
+        return [self._raised(t_s, finding) for finding in findings]
+
+    def _raised(self, t_s: float, finding: Finding) -> Finding:
+        cfg, lasted_s = self._cfg, t_s - self._since_s[finding.signal]
+        if finding.severity is Severity.PAUSE:
+            if lasted_s < cfg.pause_limit_s:
+                return finding
+            finding = finding._replace(severity=Severity.HOLD)
+        if finding.severity is not Severity.HOLD:
+            return finding
+        patience_s = cfg.hold_limit_s if finding.patience_s is None else finding.patience_s
+        if lasted_s >= patience_s:
+            return finding._replace(
+                severity=Severity.FAULT, cause=f"{finding.cause}, for {patience_s:g} s", retries=None
+            )
+        return self._count(t_s, finding, is_new=lasted_s == 0.0)
+
+    def _count(self, t_s: float, finding: Finding, *, is_new: bool) -> Finding:
+        cfg, held = self._cfg, self._held.setdefault(finding.signal, deque())
+        while held and t_s - held[0] > cfg.retry_window_s:
+            held.popleft()
+        if is_new:
+            held.append(t_s)
+        retries = cfg.retries if finding.retries is None else finding.retries
+        if len(held) <= retries + 1:
+            return finding
+        return finding._replace(severity=Severity.FAULT, cause=f"{finding.cause}, again after {retries} retries")

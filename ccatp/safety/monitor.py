@@ -1,0 +1,335 @@
+"""The board: every monitor, frame by frame, and what they find together."""
+
+from collections.abc import Callable, Sequence
+from math import hypot
+from typing import Protocol
+
+from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
+from ccatp.control.motion_checks import ImuGate, Moved, WheelMeans, Window
+from ccatp.core import EdgeSample, ImuSample, Severity, WheelSample
+from ccatp.safety.escalation import Alarm, Finding
+from ccatp.safety.power_monitors import BatteryMonitor, FanMonitor, OwnFaults
+from ccatp.safety.sensor_monitors import FlickerMonitor, Ground, LatencyMonitor, RateMonitor, SeamMonitor
+from ccatp.safety.wheel_monitors import LATE_S, GyroscopeBias, WheelMonitor, YawMonitor, imu_finding
+
+_STANDS_RAD_S = 0.02  # a wheel's mean over a frame below which it stands: 0.6 mm/s
+_LOOK_FRAMES = 2  # the monitors judge one frame in so many while nothing is wrong; sums are kept in every one
+_SLOW_LOOK_FRAMES = 10  # what changes slowly is looked at this often
+
+
+class Echo(Protocol):
+    """The robot's word on the drive in force."""
+
+    @property
+    def seq(self) -> int:
+        """Its number."""
+
+    @property
+    def age(self) -> float:
+        """How long ago it arrived, s."""
+
+    @property
+    def held(self) -> bool:
+        """The robot holds its wheels by its own rules."""
+
+
+class Frame(Protocol):
+    """The part of a sensors frame that the monitors read."""
+
+    @property
+    def imu(self) -> Sequence[ImuSample]:
+        """Inertial samples, oldest first."""
+
+    @property
+    def fans(self) -> tuple[float, float]:
+        """Fan duties as the robot says."""
+
+    @property
+    def soc(self) -> float:
+        """Charge."""
+
+    @property
+    def cmd(self) -> Echo:
+        """Command echo."""
+
+    @property
+    def faults(self) -> Sequence[str]:
+        """What the robot reports of itself."""
+
+
+class Commanded(Protocol):
+    """Main's estimate and commands."""
+
+    @property
+    def seq(self) -> int:
+        """The frame of the estimate."""
+
+    @property
+    def x_m(self) -> float:
+        """Deck x."""
+
+    @property
+    def y_m(self) -> float:
+        """Deck y."""
+
+    @property
+    def heading_rad(self) -> float:
+        """Deck heading."""
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the place."""
+
+    @property
+    def commanded(self) -> tuple[float, float, float, float] | None:
+        """Span of the set points since the estimate before; ``None`` where they are not told."""
+
+    @property
+    def drive_seq(self) -> int:
+        """Number of the newest drive."""
+
+
+class HealthBoard:
+    """All monitors but the edge rule's.
+
+    Args:
+        cfg: their limits.
+        danger: sigmas of the map.
+        robot: wheels, sensors, fan duties.
+        ground: the map under the edge sensors.
+        base_m: where base is, deck frame.
+        overhang: whether the robot falls without its fans.
+        is_explained: whether the map has an edge of a panel near a sensor.
+
+    Attributes:
+        findings: everything found, as it is now.
+    """
+
+    def __init__(
+        self,
+        cfg: HealthConfig,
+        danger: DangerConfig,
+        robot: RobotConfig,
+        ground: Ground,
+        base_m: tuple[float, float],
+        overhang: bool,
+        is_explained: Callable[[int], bool],
+    ) -> None:
+        """Nothing found."""
+        self._cfg, self._radius_m, self._base_m = cfg, robot.wheel_radius_m, base_m
+        self._means = WheelMeans(robot)
+        self._gate = ImuGate(cfg)
+        self._bias = GyroscopeBias()
+        self._shortly, self._stalling = Window(cfg.runaway_time_s), Window(cfg.stall_time_s)
+        self._turning = Window(cfg.yaw_time_s)
+        self._wheels, self._yaw = WheelMonitor(cfg, robot), YawMonitor(cfg, robot)
+        self._rates, self._latency = RateMonitor(cfg), LatencyMonitor(cfg)
+        self._fans, self._battery = FanMonitor(cfg, robot.fan_duty, overhang), BatteryMonitor(cfg)
+        self._own = OwnFaults(cfg)
+        fastest = robot.wheel_radius_m * robot.max_wheel_rad_s
+        self.seams = SeamMonitor(cfg, ground, robot.edge_sensors_m, danger.map_sigmas, fastest)
+        self.flicker = FlickerMonitor(cfg, is_explained)
+        self._clock, self._gap = Alarm(cfg.imu_quarantine_s), Alarm(cfg.imu_quarantine_s)
+        self._garbled = Alarm(cfg.retry_after_s)
+        self._alarms = (
+            self._wheels.alarm,
+            self._yaw.alarm,
+            self._fans.alarm,
+            self._latency.alarm,
+            self._clock,
+            self._gap,
+            self._garbled,
+            self.flicker.chatter,
+            self.flicker.flash,
+        )
+        self.reset()
+
+    def reset(self) -> None:
+        """Another boot of the robot."""
+        self._t_s: float | None = None
+        self._sums = Moved(0.0, 0.0, 0.0, 0.0)
+        self._gate.reset()
+        for window in (self._shortly, self._stalling, self._turning):
+            window.reset()
+        for monitor in (
+            self._wheels, self._yaw, self._rates, self._latency, self._fans, self._battery, self._own,
+            self.seams, self.flicker, self._clock, self._gap, self._garbled,
+        ):  # fmt: skip
+            monitor.reset()
+        self._estimate_seq = self._heard_seq = -1
+        self._opened = (0, 0, 0, 0)
+        self._home_m = 0.0
+        self._frames = 0
+        self._counts = [0, 0, 0]
+        self._is_free, self._is_held, self._is_late = True, True, False
+        self._speed_m_s = 0.0
+        self.findings: list[Finding] = []
+
+    # -- frames ---------------------------------------------------------------------------------------------------
+
+    def jumped(self, t_s: float, by_s: float) -> None:
+        """The robot's clock has jumped before the frame at ``t_s``."""
+        limit_s = self._cfg.clock_jump_s
+        self._clock.see(t_s, Finding(Severity.PAUSE, "the robot's clock has jumped", "clock", by_s, limit_s))
+        self._gate.reset()
+        self.findings = self._found()
+
+    def garbled(self) -> Finding:
+        """Too many lines that are no frames came since the last frame; what is found stays until frames come again."""
+        cfg = self._cfg
+        cause, lines = "lines of the robot were no frames", float(cfg.garbled_lines)
+        finding = Finding(Severity.HOLD, cause, "lines", lines, lines)
+        self._garbled.see(self._t_s or 0.0, finding)
+        self.findings = self._found()
+        return finding
+
+    def step(
+        self,
+        t_s: float,
+        frame: Frame,
+        wheels: Sequence[WheelSample],
+        edges: Sequence[EdgeSample],
+        *,
+        is_permitted: bool,
+        is_any_off: bool,
+    ) -> None:
+        """Look at a frame.
+
+        Args:
+            t_s: its steady time.
+            frame: the frame.
+            wheels, edges: its samples with steady times.
+            is_permitted: the last verdict permitted every motion.
+            is_any_off: an edge sensor is off, or has just been.
+        """
+        dt_s = 0.0 if self._t_s is None else t_s - self._t_s
+        self._t_s = t_s
+        is_gap = dt_s > self._cfg.gap_s
+        if is_gap:
+            cause = "frames were lost: nobody saw where the robot went"
+            self._gap.see(t_s, Finding(Severity.HOLD, cause, "frames", dt_s, self._cfg.gap_s))
+        imu = frame.imu
+        self._means.take(wheels, dt_s)
+        self._sums = self._added(imu, dt_s)
+        self._counts[0] += len(imu)
+        self._counts[1] += len(wheels)
+        self._counts[2] += len(edges)
+        self._is_free = self._is_free and is_permitted and not frame.cmd.held
+        self._is_held = self._is_held and frame.cmd.held
+        self._is_late = self._is_late or (frame.cmd.age > LATE_S and not frame.cmd.held)
+        is_flickering = is_any_off or not self.flicker.is_quiet
+        self._frames += 1
+        if (
+            self._frames % _LOOK_FRAMES == 0
+            or is_flickering
+            or is_gap
+            or frame.faults
+            or self.findings
+            or self._gate.cause
+        ):
+            self._judge(t_s, frame, wheels)
+            if is_flickering:
+                self.flicker.step(t_s, edges, self._speed_m_s)
+            self.findings = self._found()
+
+    def _judge(self, t_s: float, frame: Frame, wheels: Sequence[WheelSample]) -> None:
+        """What need not be looked at in every frame while nothing is wrong."""
+        now = self._sums
+        shortly, stalling = self._shortly.push(now), self._stalling.push(now)
+        turning = self._turning.push(now)
+        self._rates.step(t_s, *self._counts)
+        self._counts = [0, 0, 0]
+        is_sparse = self._rates.are_encoders_sparse
+        self._wheels.step(
+            now,
+            shortly,
+            stalling,
+            is_free=self._is_free,
+            is_held=self._is_held,
+            is_late=self._is_late,
+            is_sparse=is_sparse,
+            samples=wheels,
+        )
+        self._is_free, self._is_held, self._is_late = True, True, False
+        self._speed_m_s = 0.0
+        if shortly is not None:
+            self._speed_m_s = max(abs(shortly.right_m), abs(shortly.left_m)) / shortly.t_s
+        if turning is not None:
+            self._yaw.step(t_s, turning)
+        self._yaw.alarm.settle(t_s)
+        self._latency.step(t_s, frame.cmd.seq)
+        self._clock.settle(t_s)
+        self._gap.settle(t_s)
+        self._garbled.settle(t_s)
+        faults = frame.faults
+        if faults or self._own.alarms:
+            self._own.step(t_s, faults)
+        self._fans.step(t_s, frame.fans, faults)
+        if self._frames % _SLOW_LOOK_FRAMES < _LOOK_FRAMES:
+            self._battery.step(t_s, frame.soc, "battery_low" in faults, self._home_m)
+
+    def _added(self, imu: Sequence[ImuSample], dt_s: float) -> Moved:
+        """The sums with this frame's motion. What is not known of it is taken to be none, of all."""
+        means, sums = self._means, self._sums
+        right, left = means.right_rad_s, means.left_rad_s
+        usable = self._gate.admit(imu, means.yaw_rad_s) if imu else imu
+        t_s = self._t_s or 0.0
+        if right is None or left is None:
+            # Without one of them none is counted, so that they do not disagree about what is not known.
+            return Moved(t_s, *sums[1:])
+        rolled_m = self._radius_m * dt_s
+        if usable:
+            wz = usable[-1][2]
+            if -_STANDS_RAD_S < right < _STANDS_RAD_S and -_STANDS_RAD_S < left < _STANDS_RAD_S:
+                self._bias.stand(wz, dt_s)
+                turned = 0.0
+            else:
+                turned = (wz - self._bias.rad_s) * dt_s
+        else:
+            turned = means.yaw_rad_s * dt_s
+        return Moved(t_s, sums[1] + right * rolled_m, sums[2] + left * rolled_m, sums[3] + turned)
+
+    def hear(self, t_s: float, estimate: Commanded) -> None:
+        """Take what the wheels were told, from an estimate that may be too old for anything else.
+
+        Args:
+            t_s: its steady time.
+            estimate: the estimate; one that was heard already changes nothing.
+        """
+        if estimate.seq == self._heard_seq:
+            return
+        self._heard_seq = estimate.seq
+        if estimate.commanded is not None:
+            self._wheels.commands.push(t_s, estimate.commanded)
+
+    def learn(self, t_s: float, estimate: Commanded, opened: Sequence[int], is_off: Sequence[bool]) -> None:
+        """Take an estimate of main's that is fresh; one that was taken already changes nothing.
+
+        Args:
+            t_s: its steady time.
+            estimate: the estimate.
+            opened: how often each edge sensor left the panels so far.
+            is_off: for each whether it is off the panels.
+        """
+        if estimate.seq == self._estimate_seq:
+            return
+        self._estimate_seq = estimate.seq
+        self.hear(t_s, estimate)
+        self._wheels.learn(t_s)
+        if estimate.drive_seq >= 0:
+            self._latency.sent(estimate.drive_seq, t_s)
+        for i, count in enumerate(opened):
+            if is_off[i] or count != self._opened[i]:
+                self.seams.went_off(i)
+        self._opened = (opened[0], opened[1], opened[2], opened[3])
+        x, y = estimate.x_m, estimate.y_m
+        self.seams.step(t_s, (x, y, estimate.heading_rad), estimate.sigma_m)
+        self._home_m = hypot(x - self._base_m[0], y - self._base_m[1])
+
+    def _found(self) -> list[Finding]:
+        found = [alarm.finding for alarm in self._alarms if alarm.finding is not None]
+        others = imu_finding(self._gate), self._rates.finding, self._battery.finding, self.seams.finding
+        found += [finding for finding in others if finding is not None]
+        if self._own.alarms:
+            found += [alarm.finding for alarm in self._own.alarms.values() if alarm.finding is not None]
+        return found

@@ -1,0 +1,84 @@
+"""The robot's time without its jumps: what counts durations must not notice that a counter wrapped or was set."""
+
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
+
+from ccatp.core import EdgeSample, GravitySample, ImuSample, WheelSample
+
+_Sample = TypeVar("_Sample", ImuSample, WheelSample, EdgeSample, GravitySample)
+
+
+class ClockJump(NamedTuple):
+    """The robot's clock jumped before a frame.
+
+    Attributes:
+        seq: the first frame of the new time base.
+        by_s: how much it is off what was expected; < 0 backward.
+    """
+
+    seq: int
+    by_s: float
+
+
+class SteadyTime:
+    """Gives each frame a time that never jumps.
+
+    From frame to frame the robot's clock has to go on by the frames' period, times the frames that were lost in
+    between; further off than ``limit_s``, or backward, it has jumped, and counting goes on by the period. A real gap
+    without frames whose numbers go on looks the same, and is left out likewise.
+
+    Args:
+        limit_s: a jump.
+
+    Attributes:
+        jump: the newest jump, ``None`` before the first.
+        offset_s: steady time less the robot's.
+    """
+
+    def __init__(self, limit_s: float) -> None:
+        """No frame yet."""
+        self._limit_s = limit_s
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew: another boot of the robot."""
+        self._seq, self._t_s = -1, 0.0
+        self._period_s = 0.0
+        self.offset_s = self._before_s = 0.0
+        self.jump: ClockJump | None = None
+
+    def at(self, seq: int, t_s: float) -> float:
+        """The steady time of frame ``seq``, which is newer than all before, of robot time ``t_s``, s."""
+        if self._seq < 0:
+            self._seq, self._t_s = seq, t_s
+            return t_s
+        frames, step_s = seq - self._seq, t_s - self._t_s
+        expected_s = frames * self._period_s if self._period_s else step_s
+        if step_s <= 0.0 or step_s - expected_s > self._limit_s:
+            self._before_s = self.offset_s
+            self.offset_s += expected_s - step_s
+            self.jump = ClockJump(seq, step_s - expected_s)
+        elif frames == 1:
+            self._period_s = step_s
+        self._seq, self._t_s = seq, t_s
+        return t_s + self.offset_s
+
+    def of(self, seq: int, t_s: float) -> float:
+        """The steady time of an older frame ``seq`` of robot time ``t_s``, s; at most one jump lies in between."""
+        is_before = self.jump is not None and seq < self.jump.seq
+        return t_s + (self._before_s if is_before else self.offset_s)
+
+    def of_samples(self, samples: Sequence[_Sample], t_s: float) -> list[_Sample]:
+        """Samples of the newest frame with steady times.
+
+        Args:
+            samples: as they came. A sample that is far nearer to the frame in the time base before belongs to that.
+            t_s: the frame's steady time.
+        """
+        now_s, before_s, limit_s = self.offset_s, self._before_s, self._limit_s
+        found = []
+        for sample in samples:
+            own_s, other_s = sample.t_s + now_s, sample.t_s + before_s
+            is_other = abs(own_s - t_s) > limit_s and abs(other_s - t_s) < abs(own_s - t_s)
+            found.append(sample._replace(t_s=other_s if is_other else own_s))
+        return found

@@ -1,0 +1,364 @@
+"""Edge sensors that change where the map has nothing to see: chatter, flashes of light.
+
+The flow of frames and samples: gaps, sensors that got slow, latency of the link.
+
+Lines of the robot that are no frames: how many there may be within a while.
+
+Every seam is a proof test of the edge sensors: one that crosses it and sees nothing may be blind.
+"""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from math import hypot, inf
+from typing import NamedTuple, Protocol
+
+from ccatp.config.models import HealthConfig
+from ccatp.core import Corner, EdgeSample, PanelId, Severity
+from ccatp.safety.escalation import Alarm, Finding
+
+_CORNERS = tuple(corner.value for corner in Corner)
+# Slower than this nothing crosses an edge; vibration moves a sensor by less in a frame.
+_STILL_M_S = 0.002
+_CLEAR_S = 0.2
+
+
+class FlickerMonitor:
+    """Judges the changes of the edge sensors, in frames in which any of them is off or has been.
+
+    * More transitions than allowed in a short time where the map has no edge of a panel: chatter, a hold.
+    * A sensor that goes off while the wheels stand where the map has no edge: a pause until it is on again, for at
+      most ``pause_limit_s``; then the edge rule has the last word, and the robot goes slowly.
+
+    Standing at an edge of a panel a sensor may chatter as it likes: vibration does that.
+
+    Args:
+        cfg: limits.
+        is_explained: whether the map, at the newest estimate, has an edge of a panel near a sensor (by its index).
+
+    Attributes:
+        chatter, flash: what was found.
+    """
+
+    def __init__(self, cfg: HealthConfig, is_explained: Callable[[int], bool]) -> None:
+        """All sensors on."""
+        self._cfg, self._is_explained = cfg, is_explained
+        self.chatter, self.flash = Alarm(cfg.retry_after_s), Alarm(_CLEAR_S)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget."""
+        self.chatter.reset()
+        self.flash.reset()
+        self._last: tuple[int, ...] = (1, 1, 1, 1)
+        self._changes: tuple[deque[float], ...] = (deque(), deque(), deque(), deque())
+        self._flashing_s: list[float | None] = [None, None, None, None]
+
+    @property
+    def is_quiet(self) -> bool:
+        """Nothing to look at as long as all sensors are on."""
+        return self._last == (1, 1, 1, 1) and self.chatter.finding is None and self.flash.finding is None
+
+    def step(self, t_s: float, samples: Sequence[EdgeSample], speed_m_s: float) -> None:
+        """Judge a frame.
+
+        Args:
+            t_s: its time.
+            samples: its edge samples, oldest first.
+            speed_m_s: of the faster wheel.
+        """
+        since_s = t_s - self._cfg.chatter_time_s
+        for sample in samples:
+            state = sample[1:]
+            if state != self._last:
+                self._change(sample[0], state, is_still=speed_m_s < _STILL_M_S)
+        for i, changes in enumerate(self._changes):
+            while changes and changes[0] < since_s:
+                changes.popleft()
+            if len(changes) > self._cfg.chatter_transitions and not self._is_explained(i):
+                self.chatter.see(t_s, self._chattering(i, len(changes)))
+        self._judge_flashes(t_s)
+        self.chatter.settle(t_s)
+        self.flash.settle(t_s)
+
+    def _chattering(self, i: int, count: int) -> Finding:
+        limit = self._cfg.chatter_transitions
+        return Finding(Severity.HOLD, "an edge sensor chatters", _CORNERS[i], count, limit)
+
+    def _change(self, t_s: float, state: tuple[int, ...], *, is_still: bool) -> None:
+        for i, (before, now) in enumerate(zip(self._last, state, strict=True)):
+            if before == now:
+                continue
+            self._changes[i].append(t_s)
+            if now == 1:
+                self._flashing_s[i] = None
+            elif is_still and not self._is_explained(i):
+                self._flashing_s[i] = t_s
+        self._last = state
+
+    def _judge_flashes(self, t_s: float) -> None:
+        off = [i for i, since_s in enumerate(self._flashing_s) if since_s is not None]
+        if not off:
+            return
+        longest_s = max(t_s - (self._flashing_s[i] or t_s) for i in off)
+        limit_s = self._cfg.pause_limit_s
+        severity = Severity.PAUSE if longest_s < limit_s - _CLEAR_S else Severity.SLOW
+        cause = "an edge sensor went off though nothing moved"
+        self.flash.see(t_s, Finding(severity, cause, _CORNERS[off[0]], len(off), 0.0))
+        if severity is Severity.SLOW and self.flash.finding is not None:
+            self.flash.finding = self.flash.finding._replace(severity=Severity.SLOW)
+
+
+_SOURCES = ("imu", "enc", "edge")
+# Sensors are taken to be sound while the robot stands for its first fix; that time shows their usual rates.
+_LEARN_S = 0.5
+
+
+class RateMonitor:
+    """Samples per time of each sensor against what was usual at the start.
+
+    Args:
+        cfg: limits.
+
+    Attributes:
+        finding: the sensor that lacks most, or ``None``.
+        are_encoders_sparse: since the last step they gave less than they usually do.
+    """
+
+    def __init__(self, cfg: HealthConfig) -> None:
+        """Rates are not known yet."""
+        self._cfg = cfg
+        self.reset()
+
+    def reset(self) -> None:
+        """Learn anew."""
+        self.finding: Finding | None = None
+        self.are_encoders_sparse = False
+        self._begin_s: float | None = None
+        self._last_s = 0.0
+        self._counts = [0, 0, 0]
+        self._usual_hz: list[float] | None = None
+        self._short = [False, False, False]
+
+    def step(self, t_s: float, imu: int, encoders: int, edges: int) -> None:
+        """Take a frame's numbers of samples; judged once per ``rate_time_s``."""
+        elapsed_s, self._last_s = t_s - self._last_s, t_s
+        if self._begin_s is None:
+            self._begin_s = t_s
+            return
+        if self._usual_hz is not None:
+            self.are_encoders_sparse = encoders < self._cfg.rate_share * self._usual_hz[1] * elapsed_s
+        counts = self._counts
+        counts[0] += imu
+        counts[1] += encoders
+        counts[2] += edges
+        span_s = t_s - self._begin_s
+        if span_s >= self._cfg.rate_time_s - 1e-6:
+            self._judge(span_s)
+            self._begin_s, self._counts = t_s, [0, 0, 0]
+
+    def _judge(self, span_s: float) -> None:
+        rates = [count / span_s for count in self._counts]
+        if self._usual_hz is None:
+            self._usual_hz = rates
+            return
+        shares = [rate / usual if usual else 1.0 for rate, usual in zip(rates, self._usual_hz, strict=True)]
+        least, limit = min(shares), self._cfg.rate_share
+        if least >= limit:
+            self.finding = None
+            return
+        name = _SOURCES[shares.index(least)]
+        self.finding = Finding(Severity.SLOW, "a sensor gives too few samples", name, least, limit)
+
+
+class LatencyMonitor:
+    """How long a drive takes until its echo comes back: slower, so that the way to a stop stays what it was.
+
+    Args:
+        cfg: limits.
+
+    Attributes:
+        alarm: what was found.
+    """
+
+    def __init__(self, cfg: HealthConfig) -> None:
+        """Nothing found."""
+        self._cfg = cfg
+        self.alarm = Alarm(cfg.rate_time_s)
+        self.reset()
+
+    def reset(self) -> None:
+        """Another session: drives are numbered anew."""
+        self.alarm.reset()
+        self._sent: deque[tuple[int, float]] = deque(maxlen=64)
+
+    def sent(self, number: int, t_s: float) -> None:
+        """The drive ``number`` had been sent by ``t_s``."""
+        self._sent.append((number, t_s))
+
+    def step(self, t_s: float, echoed: int) -> None:
+        """Take the number of the drive in force."""
+        sent = self._sent
+        while len(sent) > 1 and sent[1][0] <= echoed:
+            sent.popleft()
+        if len(sent) > 1 and echoed >= 0:
+            # The second one is not in force yet.
+            latency_s, cfg = t_s - sent[1][1], self._cfg
+            if latency_s > cfg.latency_pause_s:
+                cause = "drives reach the wheels too late"
+                self.alarm.see(t_s, Finding(Severity.PAUSE, cause, "latency", latency_s, cfg.latency_pause_s))
+            elif latency_s > cfg.latency_slow_s:
+                cause = "drives reach the wheels late"
+                self.alarm.see(t_s, Finding(Severity.SLOW, cause, "latency", latency_s, cfg.latency_slow_s))
+        self.alarm.settle(t_s)
+
+
+class GarbledLines:
+    """Counts them on any clock that runs on.
+
+    Args:
+        limit: so many within the window are too many.
+        window_s: the window, s.
+    """
+
+    __slots__ = ("_times_s", "_window_s")
+
+    def __init__(self, limit: int, window_s: float) -> None:
+        """None yet."""
+        self._times_s = deque([-inf] * limit, maxlen=limit)
+        self._window_s = window_s
+
+    def add(self, at_s: float) -> bool:
+        """Count one at ``at_s``; true where this and those before it are too many."""
+        self._times_s.append(at_s)
+        return at_s - self._times_s[0] <= self._window_s
+
+
+class PanelPlace(Protocol):
+    """The place of a panel, deck frame."""
+
+    @property
+    def x_m(self) -> float:
+        """Centre."""
+
+    @property
+    def y_m(self) -> float:
+        """Centre."""
+
+    @property
+    def half_x_m(self) -> float:
+        """Half the extent along x."""
+
+    @property
+    def half_y_m(self) -> float:
+        """Half the extent along y."""
+
+
+class Ground(NamedTuple):
+    """The part of a mirror that the proof tests look at.
+
+    Attributes:
+        panels: all panels.
+        nearest: the panel nearest to a deck point.
+        place: deck place of a point of the robot at a pose (x, y, heading).
+    """
+
+    panels: dict[PanelId, PanelPlace]
+    nearest: Callable[[float, float], PanelId]
+    place: Callable[[tuple[float, float, float], tuple[float, float]], tuple[float, float]]
+
+
+class SeamMonitor:
+    """Counts the seams that each sensor crossed without going off.
+
+    A sensor is on a panel for certain where the map has it further inside than the estimate may be wrong. When it is
+    for certain on another panel than before, it has crossed a seam; if it has not been off in between, it has missed
+    it. Any off sample proves the sensor sound. A pose that jumps (a fix) is no motion, and begins anew.
+
+    Args:
+        cfg: limits.
+        ground: the map.
+        sensors_m: places of the sensors, robot frame.
+        sigmas: how many sigmas of the estimate to allow for.
+        fastest_m_s: no sensor moves faster.
+
+    Attributes:
+        missed: seams in a row, per sensor.
+        crossed: seams crossed by all sensors.
+    """
+
+    def __init__(
+        self,
+        cfg: HealthConfig,
+        ground: Ground,
+        sensors_m: tuple[tuple[float, float], ...],
+        sigmas: float,
+        fastest_m_s: float,
+    ) -> None:
+        """No seam crossed."""
+        self._cfg, self._ground, self._sensors_m = cfg, ground, sensors_m
+        self._sigmas, self._fastest_m_s = sigmas, fastest_m_s
+        self.missed = [0, 0, 0, 0]
+        self.crossed = 0
+        self._blind = Alarm(cfg.retry_after_s)
+        self.reset()
+
+    def reset(self) -> None:
+        """Where the sensors are is not known; what they have missed is."""
+        self._panels: list[PanelId | None] = [None, None, None, None]
+        self._seen = [False, False, False, False]
+        self._pose: tuple[float, float, float, float] | None = None
+
+    def went_off(self, sensor: int) -> None:
+        """A sensor has gone off, or is off: it is not blind."""
+        self._seen[sensor] = True
+        self.missed[sensor] = 0
+
+    def step(self, t_s: float, pose: tuple[float, float, float], sigma_m: float) -> None:
+        """Take a new estimate: its time, (x, y, heading) on the deck, standard deviation of the place."""
+        x, y, heading = pose
+        self._blind.settle(t_s)
+        before, self._pose = self._pose, (t_s, x, y, heading)
+        margin_m = self._cfg.seam_margin_m + self._sigmas * sigma_m
+        if before is not None:
+            reach_m = self._fastest_m_s * abs(t_s - before[0]) + self._cfg.seam_margin_m
+            if hypot(x - before[1], y - before[2]) > reach_m:
+                self._panels = [None, None, None, None]
+        for i, offset_m in enumerate(self._sensors_m):
+            panel = self._panel_under(self._ground.place(pose, offset_m), margin_m)
+            if panel is not None and panel != self._panels[i]:
+                self._enter(i, panel)
+
+    def _panel_under(self, place: tuple[float, float], margin_m: float) -> PanelId | None:
+        x, y = place
+        found = self._ground.nearest(x, y)
+        panel = self._ground.panels[found]
+        dx, dy = x - panel.x_m, y - panel.y_m
+        is_inside = abs(dx) < panel.half_x_m - margin_m and abs(dy) < panel.half_y_m - margin_m
+        return found if is_inside else None
+
+    def _enter(self, i: int, panel: PanelId) -> None:
+        if self._panels[i] is not None:
+            self.crossed += 1
+            if not self._seen[i]:
+                self._miss(i)
+        self._panels[i] = panel
+        self._seen[i] = False
+
+    def _miss(self, i: int) -> None:
+        self.missed[i] = missed = self.missed[i] + 1
+        limit = self._cfg.seams_failed
+        if missed >= limit and self._pose is not None:
+            # The pose may be wrong instead: the hold brings a fix, and one more seam shows which.
+            cause = "an edge sensor sees no seams: blind"
+            self._blind.see(self._pose[0], Finding(Severity.HOLD, cause, _CORNERS[i], missed, limit, retries=0))
+
+    @property
+    def finding(self) -> Finding | None:
+        """What is thought of the sensor that has missed most seams in a row, if enough."""
+        if self._blind.finding is not None:
+            return self._blind.finding
+        most, limit = max(self.missed), self._cfg.seams_suspect
+        if most < limit:
+            return None
+        corner = _CORNERS[self.missed.index(most)]
+        return Finding(Severity.SLOW, "an edge sensor did not see a seam", corner, most, limit)

@@ -1,0 +1,327 @@
+"""TCP server that stands in for the MultiLine server: the same grammar over simulated lengths.
+
+Known limitations (the sources of the grammar are silent on all of them):
+
+* A line that is no request is answered ``error_unknown-request``, ``error_bad-arguments`` or ``error_bad-channel`` (not
+  1 to 32, or twice); ``measurelengthwithrawdata`` is unknown. The connection stays open.
+* A channel that is not installed gives a record of length 0 with ``daq_error``.
+* Where the position of the puck cannot be had, each record is of length 0 with ``daq_error`` and the server error is 1.
+* While a client receives the push stream, its own requests but ``stopmeasnogui`` are answered ``error_busy``, and so is
+  another client's ``startmeasnogui``. Other clients' queries are answered, which the real server may refuse: a
+  second client must not be able to stop a survey. The stream runs on the wall clock, a lockstep run or not.
+* ``stopmeasnogui`` without a stream is answered ``measstopped``.
+* Channel groups, the measurement window, ``defanadata`` and ``measurementfinished`` are not simulated.
+
+The true position of the puck for the Etalon stand-in: held fixed, or asked from the robot's stand-in.
+"""
+
+import asyncio
+import socket
+from collections import Counter
+from collections.abc import Sequence
+from typing import Protocol, cast
+
+import msgspec
+import numpy as np
+import zmq
+import zmq.asyncio
+from numpy.typing import NDArray
+
+from ccatp.config.models import SimEtalonConfig
+from ccatp.core import Vector3
+from ccatp.links import multiline
+from ccatp.links.multiline import ChannelData, Command, Connected, LaserReady, Notice, Remark, Reply, Request
+from ccatp.sim.laser import EtalonModel, PuckTruth
+
+_MAX_REPLY_BYTES = 4096
+
+
+class TruthUnavailable(Exception):
+    """The position of the puck could not be had."""
+
+
+class TruthSource(Protocol):
+    """Where the stand-in learns the position of the puck."""
+
+    async def puck(self) -> PuckTruth:
+        """The puck now.
+
+        Raises:
+            TruthUnavailable: it cannot be had.
+        """
+
+
+class FixedPuck:
+    """A puck that stands still; attributes may be changed. ``step_s`` passes between two queries, for fresh noise."""
+
+    def __init__(self, position_m: Vector3, *, t_s: float = 0.0, moved_m: float = 0.0, step_s: float = 0.0) -> None:
+        """``position_m`` is in the world frame."""
+        self.position_m = position_m
+        self.t_s = t_s
+        self.moved_m = moved_m
+        self.step_s = step_s
+
+    async def puck(self) -> PuckTruth:
+        """The puck where it was put."""
+        truth = PuckTruth(self.t_s, self.position_m, self.moved_m)
+        self.t_s += self.step_s
+        return truth
+
+
+class _TruthReply(msgspec.Struct):
+    t: float
+    puck: Vector3
+    moved_m: float
+
+
+class ZmqPuck:
+    """Asks the robot's stand-in: request ``b"puck"``, reply ``{"t", "puck": [x, y, z], "moved_m"}``, SI, world."""
+
+    def __init__(self, endpoint: str, timeout_s: float = 1.0) -> None:
+        """``timeout_s`` is the deadline of one request, waiting for a turn included."""
+        self._endpoint = endpoint
+        self._timeout_s = timeout_s
+        self._context = zmq.asyncio.Context()
+        self._socket: zmq.asyncio.Socket | None = None
+        self._turn = asyncio.Lock()
+
+    async def puck(self) -> PuckTruth:
+        """The puck now; after a failure the socket is made anew, as a REQ socket that lost its reply is stuck.
+
+        Raises:
+            TruthUnavailable: no reply in time, or one that is not of the form above.
+        """
+        try:
+            async with asyncio.timeout(self._timeout_s), self._turn:
+                return await self._ask()
+        except TimeoutError:
+            raise TruthUnavailable(f"no puck from {self._endpoint} within {self._timeout_s} s") from None
+        except (zmq.ZMQError, msgspec.MsgspecError) as error:
+            raise TruthUnavailable(f"no puck from {self._endpoint}: {error}") from None
+
+    async def _ask(self) -> PuckTruth:
+        try:
+            peer = self._socket or self._connect()
+            await peer.send(b"puck")
+            # Strict JSON: it has no NaN, and numbers past the range of a float are refused.
+            reply = msgspec.json.decode(await peer.recv(), type=_TruthReply)
+        except BaseException:
+            self.close_socket()
+            raise
+        return PuckTruth(reply.t, reply.puck, reply.moved_m)
+
+    def _connect(self) -> zmq.asyncio.Socket:
+        peer = self._context.socket(zmq.REQ)
+        self._socket = peer
+        peer.setsockopt(zmq.LINGER, 0)
+        peer.setsockopt(zmq.MAXMSGSIZE, _MAX_REPLY_BYTES)
+        peer.connect(self._endpoint)
+        return peer
+
+    def close_socket(self) -> None:
+        """Forget the socket; the next request makes another."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def close(self) -> None:
+        """Release socket and context."""
+        self.close_socket()
+        self._context.term()
+
+
+_READ_BYTES = 65536
+_SEND_TIMEOUT_S = 5.0  # a client that does not read for this long is dropped
+_MAX_CLIENTS = 64
+_BUSY = Remark("error", "busy")
+
+
+class EtalonStandIn:
+    """The server.
+
+    Attributes:
+        model: lengths and flags; ``blocked``, ``flags`` and ``laser_ready`` may be changed at any time.
+        connected: answer to ``isconnected``.
+        push_hz: rate of the push stream.
+        counts: requests, bad_requests, oversized_lines, truth_failures, refused_clients, lost_clients.
+    """
+
+    def __init__(
+        self,
+        cfg: SimEtalonConfig,
+        mirror_channels: Sequence[int],
+        collimators_m: NDArray[np.float64],
+        truth: TruthSource,
+        rng: np.random.Generator,
+        *,
+        measuring_time_s: float,
+    ) -> None:
+        """Set up without a socket.
+
+        Args:
+            cfg: noise and motion tolerance.
+            mirror_channels: installed channels, length k.
+            collimators_m: world frame, shape (k, 3).
+            truth: where the puck is; ``moved_m`` is meant over ``measuring_time_s``.
+            rng: one draw gives the key of all noise.
+            measuring_time_s: how long a length is averaged.
+        """
+        self.model = EtalonModel(cfg, mirror_channels, collimators_m, rng)
+        self.measuring_time_s = measuring_time_s
+        self.connected = True
+        self.push_hz = 5.0
+        self.counts: Counter[str] = Counter()
+        self._truth = truth
+        self._server: asyncio.Server | None = None
+        self._sessions: set[asyncio.Task[None]] = set()
+        self._streaming: _Session | None = None
+        self._end: asyncio.Future[None] | None = None
+
+    async def start(self, host: str, port: int, sock: socket.socket | None = None) -> int:
+        """Listen on ``host:port`` (0 = any free port) or on the bound socket ``sock``; return the port.
+
+        Raises:
+            OSError: the address cannot be had.
+        """
+        self._end = asyncio.get_running_loop().create_future()
+        if sock is None:
+            self._server = await asyncio.start_server(self._accept, host, port)
+        else:
+            self._server = await asyncio.start_server(self._accept, sock=sock)
+        return int(self._server.sockets[0].getsockname()[1])
+
+    async def serve(self) -> None:
+        """Wait until closed. An error that nobody foresaw in a session ends it and is raised here."""
+        if self._end is None:
+            raise RuntimeError("Etalon stand-in not started: call start first")
+        await asyncio.shield(self._end)
+
+    async def close(self) -> None:
+        """Stop listening and end all sessions."""
+        if self._server is None or self._end is None:
+            return
+        self._server.close()
+        sessions = tuple(self._sessions)
+        for session in sessions:
+            session.cancel()
+        await asyncio.gather(*sessions, return_exceptions=True)
+        await self._server.wait_closed()
+        self._server = None
+        if not self._end.done():
+            self._end.set_result(None)
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = cast("asyncio.Task[None]", asyncio.current_task())
+        if len(self._sessions) >= _MAX_CLIENTS:
+            self.counts["refused_clients"] += 1
+            writer.transport.abort()
+            return
+        self._sessions.add(task)
+        try:
+            await _Session(self, writer).run(reader)
+        except* asyncio.CancelledError:
+            pass  # by close(); asyncio logs a connection's task that ends cancelled as an error
+        except* multiline.LineTooLong:
+            self.counts["oversized_lines"] += 1
+        except* (ConnectionError, TimeoutError):
+            self.counts["lost_clients"] += 1
+        except* Exception as error:
+            if self._end is not None and not self._end.done():
+                self._end.set_exception(error)
+        finally:
+            self._sessions.discard(task)
+            writer.transport.abort()
+
+    async def lengths(self, channels: Sequence[int]) -> ChannelData:
+        """Measure once."""
+        try:
+            puck = await self._truth.puck()
+        except TruthUnavailable:
+            self.counts["truth_failures"] += 1
+            return ChannelData(self.model.failed_records(channels), server_error=1)
+        return ChannelData(self.model.records(channels, puck))
+
+    def take_stream(self, session: "_Session") -> bool:
+        """Give the push stream to a session, unless another has it."""
+        if self._streaming is None:
+            self._streaming = session
+        return self._streaming is session
+
+    def release_stream(self, session: "_Session") -> None:
+        """Take the push stream back."""
+        if self._streaming is session:
+            self._streaming = None
+
+
+class _Session:
+    """One client."""
+
+    def __init__(self, server: EtalonStandIn, writer: asyncio.StreamWriter) -> None:
+        self._server = server
+        self._writer = writer
+        self._push: asyncio.Task[None] | None = None
+
+    async def run(self, reader: asyncio.StreamReader) -> None:
+        lines = multiline.LineSplitter()
+        async with asyncio.TaskGroup() as group:
+            try:
+                while data := await reader.read(_READ_BYTES):
+                    lines.feed(data)
+                    while (line := lines.next_line()) is not None:
+                        await self._handle(line, group)
+            finally:
+                self._stop_stream()
+        self._writer.close()
+        async with asyncio.timeout(_SEND_TIMEOUT_S):
+            await self._writer.wait_closed()
+
+    async def _handle(self, line: bytes, group: asyncio.TaskGroup) -> None:
+        try:
+            request = multiline.parse_request(line)
+        except multiline.BadRequest as error:
+            self._server.counts["bad_requests"] += 1
+            await self._send(Remark("error", error.reason))
+            return
+        self._server.counts["requests"] += 1
+        reply = await self._answer(request)
+        await self._send(reply)
+        if reply is Notice.STARTED:
+            self._push = group.create_task(self._stream())
+
+    async def _answer(self, request: Request) -> Reply:
+        server = self._server
+        command = request.command
+        reply: Reply = _BUSY
+        if command is Command.STOP_MEASUREMENT:
+            self._stop_stream()
+            reply = Notice.STOPPED
+        elif self._push is not None:
+            pass
+        elif command is Command.LATEST_LENGTH_VALID:
+            reply = await server.lengths(request.channels)
+        elif command is Command.IS_CONNECTED:
+            reply = Connected(server.connected)
+        elif command is Command.LASER_READY:
+            reply = LaserReady(server.model.laser_ready)
+        elif command is Command.ENVIRONMENT_DATA:
+            reply = server.model.environment
+        elif server.take_stream(self):
+            reply = Notice.STARTED
+        return reply
+
+    async def _stream(self) -> None:
+        while True:
+            await self._send(await self._server.lengths(self._server.model.channels))
+            await asyncio.sleep(1.0 / self._server.push_hz)
+
+    def _stop_stream(self) -> None:
+        """End the stream: a record is written in one piece, so after this none follows."""
+        if self._push is not None:
+            self._push.cancel()
+            self._push = None
+        self._server.release_stream(self)
+
+    async def _send(self, reply: Reply) -> None:
+        self._writer.write(multiline.format_reply(reply))
+        async with asyncio.timeout(_SEND_TIMEOUT_S):
+            await self._writer.drain()

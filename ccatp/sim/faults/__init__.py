@@ -1,1 +1,0 @@
-"""Pure. Faults of the simulated robot by a timed plan, and the record of what was really injected."""

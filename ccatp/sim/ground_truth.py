@@ -1,0 +1,155 @@
+"""The truth of a simulation by ZeroMQ, apart from the robot link: requests, and batches of rows for recorders.
+
+Where the simulated robot stands while nobody simulates it: a real one stays where it is when its host dies.
+
+Reads a fault plan: what shall go wrong in a simulated run.
+"""
+
+import os
+import zlib
+from pathlib import Path
+from struct import Struct
+from typing import Protocol
+
+import zmq
+import zmq.asyncio
+
+from ccatp.core import DeckPose
+from ccatp.errors import ConfigError
+from ccatp.links.bus import Publisher
+from ccatp.links.topics import Message
+from ccatp.sim.fault_plan import FaultPlan, check_pacing, parse_plan
+from ccatp.sim.robot import Robot
+
+MAX_REQUEST_BYTES = 4096
+
+
+class TruthSource(Protocol):
+    """What there is to give."""
+
+    def add(self) -> bool:
+        """Add the row of the newest frame; true when the batch should be taken."""
+
+    def batch(self) -> tuple[str, Message] | None:
+        """The pending rows as a topic and its message, or ``None`` without any."""
+
+    def preface(self) -> tuple[str, Message]:
+        """What a recorder has to know before the first batch, likewise."""
+
+    def answer(self, request: bytes) -> bytes:
+        """The reply to a request."""
+
+
+class TruthOutlet:
+    """Gives the truth away by ZeroMQ.
+
+    Args:
+        truth: what there is to give.
+        rep: endpoint of the REP socket, if any.
+        pub: endpoint of the PUB socket, if any.
+    """
+
+    def __init__(self, truth: TruthSource, rep: str | None, pub: str | None) -> None:
+        self._truth = truth
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._publisher = Publisher(self._context, pub) if pub else None
+        self._has_told = False
+        self._rep = zmq.asyncio.Context.shadow(self._context).socket(zmq.REP) if rep else None
+        if self._rep is not None and rep:
+            self._rep.setsockopt(zmq.LINGER, 0)
+            self._rep.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
+            self._rep.bind(rep)
+
+    def add(self) -> None:
+        """Take the row of the newest frame."""
+        if self._truth.add():
+            self.flush()
+
+    def flush(self) -> None:
+        """Publish the pending rows."""
+        batch = self._truth.batch()
+        if batch is None or self._publisher is None:
+            return
+        if not self._has_told:  # before the first batch: whoever records one has the other, however the run ends
+            self._has_told = True
+            self._publisher.send(*self._truth.preface())
+        self._publisher.send(*batch)
+
+    async def serve(self) -> None:
+        """Answer requests for ever."""
+        while self._rep is not None:
+            request = await self._rep.recv()
+            if request == b"flush":
+                self.flush()
+            await self._rep.send(self._truth.answer(request))
+
+    def close(self) -> None:
+        """Release the sockets."""
+        if self._rep is not None:
+            self._rep.close()
+        if self._publisher is not None:
+            self._publisher.close()
+        self._context.destroy(linger=0)
+
+
+FILE = "robot"
+PERIOD_FRAMES = 10
+_POSE, _CRC = Struct("<3d"), Struct("<I")
+
+
+class BodyFile:
+    """Keeps the true pose, ten times a second of its time.
+
+    Args:
+        path: the file; made with the first pose.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._fd = path, -1
+
+    def read(self) -> DeckPose | None:
+        """The pose that was kept last, deck frame; ``None`` without a sound one."""
+        try:
+            data = self._path.read_bytes()
+        except OSError:
+            return None
+        body, crc = data[: _POSE.size], data[_POSE.size :]
+        if len(crc) != _CRC.size or _CRC.unpack(crc)[0] != zlib.crc32(body):
+            return None
+        return DeckPose(*_POSE.unpack(body))
+
+    def keep(self, robot: Robot) -> None:
+        """A frame has been driven."""
+        if robot.seq % PERIOD_FRAMES:
+            return
+        if self._fd < 0:
+            self._fd = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        plant = robot.world.plant
+        body = _POSE.pack(plant.x_m, plant.y_m, plant.heading_rad)
+        os.pwrite(self._fd, body + _CRC.pack(zlib.crc32(body)), 0)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._fd >= 0:
+            os.close(self._fd)
+
+
+def read_plan(file: Path, *, lockstep: bool) -> FaultPlan:
+    """The plan in a file.
+
+    Args:
+        file: TOML.
+        lockstep: simulated time waits for the clients; not every fault of the link makes sense then.
+
+    Raises:
+        ConfigError: one line per problem with file, line, key, what is wrong and what to do.
+    """
+    try:
+        text = file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{file}: {(error.strerror or str(error)).lower()}; name a TOML file that exists") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{file}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
+    plan = parse_plan(text, str(file))
+    check_pacing(plan, str(file), lockstep=lockstep)
+    return plan

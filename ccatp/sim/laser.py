@@ -1,0 +1,141 @@
+"""The simulated laser metrology: lengths with noise, error flags, motion tolerance.
+
+The noise of a length is a function of (seed, time of the puck, channel) alone, not of the requests that went before: a
+second client, a repeated request or another order of channels never changes what a survey reads.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ccatp.config.models import SimEtalonConfig
+from ccatp.core import Vector3
+from ccatp.links.multiline import FLAGS, ChannelRecord, Environment
+
+# Air on a high site. Lengths are already corrected for refraction, so it takes no part in them.
+AIR = Environment(temperature_c=-5.0, pressure_hpa=525.0, humidity_pct=30.0)
+
+_INTENSITY = (400, 2000)  # least and largest counts of a good return; arbitrary units
+_LENGTH_DECIMALS = 6  # of a millimetre: a thousandth of the smallest noise that matters
+_WORD = 2**64 - 1
+SEED_STREAM = 2
+"""The laser's stream of random numbers: with the run's seed it makes the seed of its generator."""
+
+
+class PuckTruth(NamedTuple):
+    """Where the puck truly is.
+
+    Attributes:
+        t_s: robot time.
+        position_m: centre of the puck, world frame, shape (3,).
+        moved_m: the furthest it was from there within the last measuring time.
+    """
+
+    t_s: float
+    position_m: Vector3
+    moved_m: float
+
+
+class EtalonModel:
+    """Channels that look at the puck from known collimators.
+
+    Attributes:
+        blocked: channels whose beam is interrupted.
+        flags: further error flags to raise, names out of ``wire.multiline.FLAGS`` by channel.
+        laser_ready: while false, each record carries ``laser_temp_error``.
+        environment: air that goes into each record.
+    """
+
+    def __init__(
+        self,
+        cfg: SimEtalonConfig,
+        channels: Sequence[int],
+        collimators_m: NDArray[np.float64],
+        rng: np.random.Generator,
+    ) -> None:
+        """Set up the channels.
+
+        Args:
+            cfg: noise and motion tolerance.
+            channels: channel numbers, length k.
+            collimators_m: where their beams start, world frame, shape (k, 3).
+            rng: gives the key of all noise; one draw.
+
+        Raises:
+            ValueError: channels and collimators do not fit.
+        """
+        if np.shape(collimators_m) != (len(channels), 3):
+            raise ValueError(f"{len(channels)} channels, collimators of shape {np.shape(collimators_m)}")
+        self._sigma_m = cfg.length_sigma_m
+        self._sigma_per_m = cfg.length_sigma_per_m
+        self._motion_tolerance_m = cfg.motion_tolerance_m
+        self._collimators: dict[int, list[float]] = dict(
+            zip(channels, np.asarray(collimators_m, dtype=np.float64).tolist(), strict=True)
+        )
+        self._key = int(rng.integers(2**63))
+        self.blocked: set[int] = set()
+        self.flags: dict[int, set[str]] = {}
+        self.laser_ready = True
+        self.environment = AIR
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """The installed channels."""
+        return tuple(self._collimators)
+
+    def records(self, channels: Sequence[int], puck: PuckTruth) -> tuple[ChannelRecord, ...]:
+        """One record per asked channel, in the order asked.
+
+        The length is |puck - collimator| plus noise of sigma = length_sigma_m + length_sigma_per_m * length. A channel
+        that is not installed gives ``daq_error`` and the length 0, a blocked one ``beam_break`` and the length 0, a
+        puck that moved further than the tolerance ``motion_tolerance_error``.
+        """
+        common = self._common_flags(puck)
+        return tuple(self._record(channel, puck, common) for channel in channels)
+
+    def failed_records(self, channels: Sequence[int]) -> tuple[ChannelRecord, ...]:
+        """One record of length 0 with ``daq_error`` per asked channel: nothing could be measured."""
+        return tuple(self._format(channel, 0.0, {"daq_error"}) for channel in channels)
+
+    def _common_flags(self, puck: PuckTruth) -> set[str]:
+        flags = set()
+        if not puck.moved_m <= self._motion_tolerance_m:
+            flags.add("motion_tolerance_error")
+        if not self.laser_ready:
+            flags.add("laser_temp_error")
+        return flags
+
+    def _record(self, channel: int, puck: PuckTruth, common: set[str]) -> ChannelRecord:
+        collimator = self._collimators.get(channel)
+        if collimator is None:
+            return self._format(channel, 0.0, {"daq_error"})
+        flags = common | self.flags.get(channel, set())
+        if channel in self.blocked:
+            return self._format(channel, 0.0, flags | {"beam_break"})
+        length_m = math.dist(collimator, puck.position_m)
+        sigma_m = self._sigma_m + self._sigma_per_m * length_m
+        return self._format(channel, length_m + sigma_m * self._noise(puck.t_s, channel), flags)
+
+    def _noise(self, t_s: float, channel: int) -> float:
+        """Standard normal number that belongs to this channel at this time (to the microsecond)."""
+        # A counter-based generator: the key names the stream, the counter (its low words count draws) the time.
+        counter = np.array([0, 0, round(t_s * 1e6) & _WORD, 0], dtype=np.uint64)
+        key = np.array([self._key, channel], dtype=np.uint64)
+        return float(np.random.Generator(np.random.Philox(counter=counter, key=key)).standard_normal())
+
+    def _format(self, channel: int, length_m: float, flags: set[str]) -> ChannelRecord:
+        air = self.environment
+        low, high = _INTENSITY if length_m and "intensity_error" not in flags else (0, 0)
+        return ChannelRecord(
+            channel,
+            round(length_m * 1e3, _LENGTH_DECIMALS),
+            low,
+            high,
+            air.temperature_c,
+            air.pressure_hpa,
+            air.humidity_pct,
+            *(int(name in flags) for name in FLAGS),
+        )

@@ -1,0 +1,245 @@
+"""Where the motes of a simulated field are, and where they look.
+
+What motes hear of each other: usable region, flight of the pulse, echoes, losses, thermometers.
+
+What the robot's listener gets of motes: their pulses, and at first what they report of each other.
+
+The motes send one after the other, round by round; who hears a pulse hears it at once. Reports are not lost.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import hypot, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.config.beacon_models import CricketConfig, ListenerConfig, MotePlaceConfig, TransducerConfig
+from ccatp.core import FloatArray
+from ccatp.links.beacon_messages import MoteBurst
+from ccatp.sim.radio import TruePose
+
+
+@dataclass(frozen=True, slots=True)
+class TrueMotes:
+    """The motes as they are.
+
+    Attributes:
+        names: anchors first, then stand by stand.
+        positions_m: shape (n, d).
+        facings: unit vectors, shape (n, d); zero where a mote is turned to whoever it talks to.
+    """
+
+    names: tuple[str, ...]
+    positions_m: FloatArray
+    facings: FloatArray
+
+
+def true_motes(cfg: CricketConfig, rng: np.random.Generator) -> TrueMotes:
+    """The motes of a configuration.
+
+    Args:
+        cfg: layout and its places.
+        rng: draws the places of ``random``.
+    """
+    if cfg.layout == "networks":
+        return _stands(cfg)
+    if cfg.layout == "motes":
+        places = np.array([mote.place_m for mote in cfg.motes.values()], dtype=np.float64)
+        return TrueMotes(tuple(cfg.motes), places, np.array([_unit(mote) for mote in cfg.motes.values()]))
+    size = np.array(cfg.random.size_m)
+    places = rng.uniform(0.0, 1.0, (cfg.random.count, cfg.dimension)) * size
+    names = tuple(f"M{number + 1}" for number in range(cfg.random.count))
+    return TrueMotes(names, places, np.zeros_like(places))
+
+
+def _stands(cfg: CricketConfig) -> TrueMotes:
+    stand = np.array(cfg.stand_m, dtype=np.float64)
+    places, facings = [np.array(list(cfg.anchors.values()), dtype=np.float64)], [np.zeros((len(cfg.anchors), 2))]
+    names = list(cfg.anchors)
+    for name, network in cfg.networks.items():
+        x, y = _unit(network)
+        places.append(np.array(network.place_m) + stand @ np.array([[x, y], [-y, x]]))
+        facings.append(np.tile((x, y), (len(stand), 1)))
+        names += [f"{name}-{mote + 1}" for mote in range(len(stand))]
+    return TrueMotes(tuple(names), np.concatenate(places), np.concatenate(facings))
+
+
+def _unit(mote: MotePlaceConfig) -> FloatArray:
+    facing = np.array(mote.facing, dtype=np.float64)
+    return np.asarray(facing / np.linalg.norm(facing))
+
+
+_ABSOLUTE_ZERO_C = -273.15
+
+
+class Heard(NamedTuple):
+    """Readings of one pair.
+
+    Attributes:
+        transmitter, listener: indices of the motes.
+        delays_s: pulse after message, shape (k,); as many as were heard.
+        temperature_c: of the listener's thermometer.
+    """
+
+    transmitter: int
+    listener: int
+    delays_s: FloatArray
+    temperature_c: float
+
+
+class MoteField:
+    """Motes that range among themselves.
+
+    Args:
+        cfg: transducer, air, the true faults.
+        motes: where they are.
+        rng: draws the errors of the thermometers, once for each mote.
+    """
+
+    def __init__(self, cfg: CricketConfig, motes: TrueMotes, rng: np.random.Generator) -> None:
+        self.motes = motes
+        self._cfg = cfg
+        true = cfg.sim
+        self._temperatures_c = true.temperature_c + rng.normal(0.0, true.thermometer_sigma_c, len(motes.names))
+        ratio = (true.temperature_c - _ABSOLUTE_ZERO_C) / (cfg.air.temperature_c - _ABSOLUTE_ZERO_C)
+        self._sound_m_s = cfg.air.sound_speed_m_s * sqrt(ratio)
+
+    def hears(self, transmitter: int, listener: int) -> bool:
+        """Whether a mote is in the usable region of another, and the other in its own."""
+        places, facings = self.motes.positions_m, self.motes.facings
+        way = places[listener] - places[transmitter]
+        distance_m = float(np.linalg.norm(way))
+        if self._cfg.layout == "random" and distance_m > self._cfg.random.reach_m:
+            return False
+        off = _off_axis(facings[transmitter], way), _off_axis(facings[listener], -way)
+        return self._cfg.transducer.nearest_m <= distance_m <= usable_reach(self._cfg.transducer, *off)
+
+    def listen(self, pairs: Sequence[tuple[int, int]], repeats: int, rng: np.random.Generator) -> list[Heard]:
+        """Readings of pairs; a pair that hears nothing is left out.
+
+        Args:
+            pairs: transmitter and listener of each.
+            repeats: pulses of each.
+            rng: noise, losses, echoes.
+        """
+        heard = []
+        for transmitter, listener in pairs:
+            if not self.hears(transmitter, listener):
+                continue
+            delays_s = self._delays(transmitter, listener, repeats, rng)
+            if delays_s.size:
+                heard.append(Heard(transmitter, listener, delays_s, float(self._temperatures_c[listener])))
+        return heard
+
+    def _delays(self, transmitter: int, listener: int, repeats: int, rng: np.random.Generator) -> FloatArray:
+        true = self._cfg.sim
+        ways_m = np.full(repeats, float(np.linalg.norm(np.subtract(*self.motes.positions_m[[transmitter, listener]]))))
+        is_echo = rng.random(repeats) < true.multipath_probability
+        ways_m[is_echo] += rng.exponential(true.multipath_excess_m, int(is_echo.sum()))
+        ways_m += rng.normal(0.0, true.sigma_m, repeats)
+        delays_s = np.maximum(ways_m / self._sound_m_s + true.latency_s, 0.0)
+        if true.tick_s > 0.0:
+            delays_s = np.round(delays_s / true.tick_s) * true.tick_s
+        return np.asarray(delays_s[rng.random(repeats) >= true.loss_probability])
+
+
+def usable_reach(transducer: TransducerConfig, off_transmitter_rad: float, off_listener_rad: float) -> float:
+    """How far a pulse is heard, m: reach(a) reach(b) / reach(0).
+
+    Both transducers have the same directivity, and each takes its share of the reach on the axis.
+
+    Args:
+        transducer: the table of reaches; straight lines between its angles, nothing beyond.
+        off_transmitter_rad: angle a between the transmitter's axis and the way.
+        off_listener_rad: angle b between the listener's axis and the way.
+    """
+    on_axis_m = transducer.reach_m[0]
+    if transducer.is_omnidirectional or on_axis_m <= 0.0:
+        return on_axis_m
+    off = np.interp((off_transmitter_rad, off_listener_rad), transducer.off_axis_rad, transducer.reach_m, right=0.0)
+    return float(off[0] * off[1] / on_axis_m)
+
+
+def _off_axis(facing: FloatArray, way: FloatArray) -> float:
+    """Angle between an axis and a way; nought for a mote that is turned to the other."""
+    length = float(np.linalg.norm(way))
+    if not facing.any() or length <= 0.0:
+        return 0.0
+    return float(np.arccos(np.clip(facing @ way / length, -1.0, 1.0)))
+
+
+_DIGITS = 9  # of a delay on the link: a nanosecond is a third of a micrometre
+
+
+class RobotEars:
+    """Hears frame by frame.
+
+    Args:
+        cfg: transducers, air, the true faults of ranging.
+        listener: who the robot is to the motes, and how many send in a frame.
+        motes: where they are.
+        rng: of thermometers, noise, losses, echoes.
+    """
+
+    def __init__(
+        self, cfg: CricketConfig, listener: ListenerConfig, motes: TrueMotes, rng: np.random.Generator
+    ) -> None:
+        self._cfg, self._listener, self._motes, self._rng = cfg, listener, motes, rng
+        self._field = MoteField(cfg, motes, rng)
+        true = cfg.sim
+        self._temperature_c = true.temperature_c + float(rng.normal(0.0, true.thermometer_sigma_c))
+        ratio = (true.temperature_c - _ABSOLUTE_ZERO_C) / (cfg.air.temperature_c - _ABSOLUTE_ZERO_C)
+        self._sound_m_s = cfg.air.sound_speed_m_s * sqrt(ratio)
+        self._sent = 0
+
+    def hear(self, time_s: float, pose: TruePose) -> list[MoteBurst]:
+        """Pulses of the frame that ends now."""
+        count = len(self._motes.names)
+        heard: list[MoteBurst] = []
+        for _ in range(self._listener.pulses_per_frame):
+            sender, round_number = self._sent % count, self._sent // count
+            self._sent += 1
+            if round_number < self._listener.mapping_rounds:
+                heard += self._reports(time_s, sender)
+            heard += self._own(time_s, pose, sender)
+        return heard
+
+    def _reports(self, time_s: float, sender: int) -> list[MoteBurst]:
+        names = self._motes.names
+        pairs = [(sender, other) for other in range(len(names)) if other != sender]
+        found = self._field.listen(pairs, 1, self._rng)
+        return [
+            MoteBurst(time_s, names[sender], names[one.listener], round(one.temperature_c, 6), _rounded(one.delays_s))
+            for one in found
+        ]
+
+    def _own(self, time_s: float, pose: TruePose, sender: int) -> list[MoteBurst]:
+        """The robot's listener hears all round; the mote has its cone."""
+        true, rng, cfg = self._cfg.sim, self._rng, self._cfg
+        dx, dy = pose.x_m - self._motes.positions_m[sender, 0], pose.y_m - self._motes.positions_m[sender, 1]
+        way_m = hypot(dx, dy)
+        # Drawn whatever becomes of it, so that one pulse more or less does not change all that follow.
+        noise, echo_m, is_echo, is_lost = rng.normal(), rng.exponential(), rng.random(), rng.random()
+        reach_m = usable_reach(cfg.transducer, self._off_axis(sender, dx, dy), 0.0)
+        if not cfg.transducer.nearest_m <= way_m <= reach_m or is_lost < true.loss_probability:
+            return []
+        if is_echo < true.multipath_probability:
+            way_m += true.multipath_excess_m * float(echo_m)
+        way_m += true.sigma_m * float(noise)
+        delay_s = max(way_m / self._sound_m_s + true.latency_s, 0.0)
+        if true.tick_s > 0.0:
+            delay_s = round(delay_s / true.tick_s) * true.tick_s
+        name = self._motes.names[sender]
+        return [MoteBurst(time_s, name, self._listener.name, round(self._temperature_c, 6), [round(delay_s, _DIGITS)])]
+
+    def _off_axis(self, sender: int, dx: float, dy: float) -> float:
+        facing = self._motes.facings[sender]
+        way_m = hypot(dx, dy)
+        if not facing.any() or way_m <= 0.0:
+            return 0.0
+        return float(np.arccos(np.clip((facing[0] * dx + facing[1] * dy) / way_m, -1.0, 1.0)))
+
+
+def _rounded(delays_s: FloatArray) -> list[float]:
+    return [round(float(delay_s), _DIGITS) for delay_s in delays_s]

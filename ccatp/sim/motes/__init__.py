@@ -1,1 +1,0 @@
-"""Pure. The true world of ultrasonic motes: where they are, what they hear, how long sound takes."""

@@ -1,1 +1,0 @@
-"""Pure. The true world of a robot among radio beacons."""

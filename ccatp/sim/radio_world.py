@@ -1,0 +1,193 @@
+"""The true vehicle: Ackermann or differential drive, wheels that slip, a heading that drifts, noisy odometry.
+
+The true world of a robot among radio beacons: one call a step, commands in, readings out.
+"""
+
+from math import cos, sin
+
+import numpy as np
+
+from ccatp.config.beacon_models import RadioConfig, SimVehicleConfig, VehicleConfig
+from ccatp.sim.radio import (
+    DriveCommand,
+    Incidents,
+    MovingTarget,
+    Packet,
+    Sighting,
+    TruePose,
+    TrueRadio,
+    WheelReading,
+    WorldFrame,
+    clearance_m,
+    seen_m,
+)
+
+
+class TrueVehicle:
+    """A vehicle that obeys its commands at once within its limits.
+
+    Ackermann, 2017 eq. 3 (x, y of the front axle): x += T v cos(theta + gamma), y += T v sin(theta + gamma),
+    theta += T v sin(gamma) / l. Differential drive: the chord of a circular arc. The body makes (1 - slip) of the
+    wheels' travel and turns with the drift besides; the odometry knows of neither and has white noise.
+
+    Args:
+        geometry: kind and limits.
+        truth: slip, drift and noise.
+        pose: at the start.
+        rng: of the noise.
+    """
+
+    def __init__(
+        self, geometry: VehicleConfig, truth: SimVehicleConfig, pose: TruePose, rng: np.random.Generator
+    ) -> None:
+        self._geometry = geometry
+        self._truth = truth
+        self._rng = rng
+        self.pose = pose
+
+    def step(self, command: DriveCommand, interval_s: float) -> WheelReading:
+        """Drive for an interval (s); what the odometry tells of it."""
+        limits, truth = self._geometry, self._truth
+        speed_m_s = _clamped(command.speed_m_s, limits.speed_max_m_s)
+        travel_m = speed_m_s * (1.0 - truth.slip) * interval_s
+        drift_rad = truth.heading_drift_rad_s * interval_s
+        noise = self._rng.standard_normal(2).tolist()
+        read_m_s = speed_m_s + truth.speed_sigma_m_s * noise[0]
+        if limits.kind == "ackermann":
+            steer_rad = _clamped(command.steer_rad, limits.steer_max_rad)
+            self._roll(travel_m, steer_rad, drift_rad)
+            return WheelReading(interval_s, read_m_s, steer_rad + truth.steer_sigma_rad * noise[1], 0.0)
+        rate_rad_s = _clamped(command.turn_rate_rad_s, limits.turn_rate_max_rad_s)
+        self._arc(travel_m, rate_rad_s * (1.0 - truth.slip) * interval_s + drift_rad)
+        return WheelReading(interval_s, read_m_s, 0.0, rate_rad_s + truth.turn_rate_sigma_rad_s * noise[1])
+
+    def _roll(self, travel_m: float, steer_rad: float, drift_rad: float) -> None:
+        x_m, y_m, heading_rad = self.pose
+        course_rad = heading_rad + steer_rad
+        turn_rad = travel_m * sin(steer_rad) / self._geometry.wheelbase_m + drift_rad
+        self.pose = TruePose(x_m + travel_m * cos(course_rad), y_m + travel_m * sin(course_rad), heading_rad + turn_rad)
+
+    def _arc(self, travel_m: float, turn_rad: float) -> None:
+        x_m, y_m, heading_rad = self.pose
+        half_rad = 0.5 * turn_rad
+        chord_m = travel_m * (sin(half_rad) / half_rad if half_rad else 1.0)
+        course_rad = heading_rad + half_rad
+        self.pose = TruePose(x_m + chord_m * cos(course_rad), y_m + chord_m * sin(course_rad), heading_rad + turn_rad)
+
+
+def _clamped(value: float, limit: float) -> float:
+    return max(-limit, min(limit, value))
+
+
+Point = tuple[float, float]
+# Streams of random numbers of a seed: what one of them draws does not depend on how often another is asked.
+_START, _WHEELS, _TARGET, _DISTANCES, _PLACES, _NOISE = range(6)
+
+
+class RadioWorld:
+    """Vehicle, beacons, moving target, obstacles.
+
+    Attributes:
+        time_s: since the start.
+        obstacles: in the room now.
+
+    Args:
+        cfg: the configuration; ``sim`` holds the truth.
+        seed: in place of the configuration's.
+    """
+
+    def __init__(self, cfg: RadioConfig, seed: int | None = None) -> None:
+        seed = cfg.run.seed if seed is None else seed
+        self._cfg = cfg
+        self._incidents = Incidents(cfg.sim.incidents)
+        self.obstacles = list(cfg.sim.obstacles)
+        self._vehicle = TrueVehicle(cfg.vehicle, cfg.sim.vehicle, _true_start(cfg, seed), _stream(seed, _WHEELS))
+        self._target = MovingTarget(cfg.sim.target, cfg.workspace.size_m, cfg.sim.obstacles, _stream(seed, _TARGET))
+        self._distances = _stream(seed, _DISTANCES)
+        references = {name: beacon.reference_dbm for name, beacon in cfg.sim.beacons.items()}
+        if cfg.sim.target.motion != "none":
+            references[cfg.follow.target] = cfg.sim.target.reference_dbm
+        self._radios = {
+            name: TrueRadio(
+                name, reference_dbm, cfg.sim.radio, cfg.workspace.size_m, self.obstacles, cfg.scan.readings,
+                _stream(seed, _PLACES, index), _stream(seed, _NOISE, index),
+            )
+            for index, (name, reference_dbm) in enumerate(references.items())
+        }  # fmt: skip
+        self.time_s = 0.0
+
+    @property
+    def pose(self) -> TruePose:
+        """Where the vehicle is."""
+        return self._vehicle.pose
+
+    @property
+    def target_m(self) -> Point | None:
+        """Where the moving radio is; None without one."""
+        return None if self._cfg.sim.target.motion == "none" else self._target.position_m
+
+    @property
+    def beacons_m(self) -> dict[str, Point]:
+        """Where the static radios are, by name."""
+        return {name: (beacon.x_m, beacon.y_m) for name, beacon in self._cfg.sim.beacons.items()}
+
+    @property
+    def clearance_m(self) -> float:
+        """Between the vehicle's body and the nearest obstacle; negative after a collision."""
+        return clearance_m(self.pose, self.obstacles) - self._cfg.vehicle.radius_m
+
+    def step(self, command: DriveCommand, interval_s: float, *, static: bool, target: bool) -> WorldFrame:
+        """Drive on, then listen.
+
+        Args:
+            command: set points of the step.
+            interval_s: its length.
+            static: scan for the static radios at its end.
+            target: scan for the moving one.
+        """
+        incidents = self._incidents
+        self.obstacles[:] = (*self._cfg.sim.obstacles, *incidents.obstacles(self.time_s))
+        wheels = self._vehicle.step(command, interval_s)
+        approach_m_s = incidents.approach_m_s(self.time_s)
+        if approach_m_s is None:
+            self._target.step(interval_s)
+        else:
+            self._target.approach(self.pose[:2], approach_m_s * interval_s)
+        self.time_s += interval_s
+        packets, sightings = self._heard(static=static, target=target)
+        return WorldFrame(self.time_s, wheels, packets, sightings, self._seen())
+
+    def _heard(self, *, static: bool, target: bool) -> tuple[tuple[Packet, ...], tuple[Sighting, ...]]:
+        places = dict(self.beacons_m) if static else {}
+        if target and self.target_m is not None:
+            places[self._cfg.follow.target] = self.target_m
+        places = {name: place_m for name, place_m in places.items() if self._incidents.is_heard(name, self.time_s)}
+        if self._cfg.sim.radio.scan == "drawn":
+            found = (self._radios[name].sight(self.pose, place_m) for name, place_m in places.items())
+            return (), tuple(sighting for sighting in found if sighting is not None)
+        scans = (self._radios[name].scan(self.pose, place_m) for name, place_m in places.items())
+        return tuple(packet for packets in scans for packet in packets), ()
+
+    def _seen(self) -> tuple[float, ...]:
+        cfg = self._cfg
+        distances = []
+        for direction_rad in cfg.avoidance.sensors_rad:
+            true_m = seen_m(self.pose, direction_rad, self.obstacles)
+            read_m = true_m + cfg.sim.range_sigma_m * self._distances.standard_normal()
+            distances.append(max(0.0, min(read_m, cfg.avoidance.range_max_m)))
+        return tuple(distances)
+
+
+def _stream(seed: int, *name: int) -> np.random.Generator:
+    return np.random.default_rng([seed, *name])
+
+
+def _true_start(cfg: RadioConfig, seed: int) -> TruePose:
+    """The believed start with an offset that is drawn."""
+    x, y, turn = _stream(seed, _START).standard_normal(3).tolist()
+    offset_m = cfg.sim.vehicle.start_position_offset_m
+    return TruePose(
+        cfg.start.x_m + offset_m * x,
+        cfg.start.y_m + offset_m * y,
+        cfg.start.heading_rad + cfg.sim.vehicle.start_heading_offset_rad * turn,
+    )

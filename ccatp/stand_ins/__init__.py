@@ -1,1 +1,0 @@
-"""Simulated robot and laser system behind their real protocols."""

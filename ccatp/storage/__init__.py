@@ -1,1 +1,0 @@
-"""What survives ``kill -9``: the databases of missions and their checkpoint."""

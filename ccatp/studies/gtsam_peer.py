@@ -1,0 +1,202 @@
+"""GTSAM on the same raw input as our own estimators: iSAM2 as the run goes on, Levenberg-Marquardt at its end.
+
+Needs the extra ``peers`` (gtsam), imported only when it is asked for. Its stock factors hold poses, points, ranges and
+bearings; calibration they do not know, so ranges and odometry go in as they were recorded. Noise is the same as ours,
+readings are robust (Huber), beacons without bearings begin where our placing puts them on
+its own path.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ccatp.beacons.slam.batch_odometry import CALIBRATION, BatchSettings, Reckoning
+from ccatp.beacons.slam.batch_solver import place_by_distances
+from ccatp.beacons.slam.recording import BeaconFix, RecordedRun, Track
+from ccatp.core import FloatArray
+from ccatp.errors import CcatpError, ExitStatus
+
+HUBER = 2.0
+"""Knee of the robust loss, in sigmas. A loss that gives up on readings leaves beacons without any, and GTSAM stops."""
+LEAST_READINGS = 8
+SURE_MARGIN = 8.0
+SURE_SPREAD = 0.15
+UNKNOWN = np.full((2, 2), np.nan)  # uncertainty is not asked of the peers
+
+
+class PeerError(CcatpError):
+    """The peer is not installed, or gave up."""
+
+    exit_status = ExitStatus.USAGE
+
+
+class Peers(NamedTuple):
+    """What GTSAM made of a run.
+
+    Attributes:
+        isam2: each pose as it was estimated from readings up to it; the map at the end.
+        batch: of all readings.
+    """
+
+    isam2: Track
+    batch: Track
+
+
+def run_gtsam(run: RecordedRun, settings: BatchSettings, clock_s: Callable[[], float]) -> Peers:
+    """Both estimates of a run.
+
+    Raises:
+        PeerError: gtsam is not installed, or its optimisation failed.
+    """
+    try:
+        import gtsam  # noqa: PLC0415 -- large, and belongs to an extra
+    except ImportError as error:
+        raise PeerError("--peers needs GTSAM: install ccatp with its extra, ccatp[peers]") from error
+    if not np.isfinite(run.readings.range_m).all():
+        raise PeerError("--peers takes sets whose readings all have a range: GTSAM has no factor of signal strengths")
+    try:
+        return _Session(gtsam, run, settings).solve(clock_s)
+    except RuntimeError as error:
+        raise PeerError(f"GTSAM gave up on {run.name}: {' '.join(str(error).split())[:120]}") from error
+
+
+class _Session:
+    """The graph as it grows."""
+
+    def __init__(self, gtsam: Any, run: RecordedRun, settings: BatchSettings) -> None:
+        self._gtsam, self._run, self._settings = gtsam, run, settings
+        self._times = np.union1d(run.readings.times_s, run.steps.times_s[:1])
+        reckoning = Reckoning(run.steps, self._times, delayed=False)
+        self._increments = reckoning.increments(np.zeros(len(CALIBRATION)), settings.odometry)
+        self._at = np.searchsorted(self._times, run.readings.times_s)
+        self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._placed: set[int] = set()
+        self._waiting: dict[int, list[int]] = {}
+        self._path = np.empty((len(self._times), 3))
+        self._final: Any = None
+
+    def solve(self, clock_s: Callable[[], float]) -> Peers:
+        gtsam, run = self._gtsam, self._run
+        isam = gtsam.ISAM2(gtsam.ISAM2Params())
+        rows_at = np.split(np.arange(len(self._at)), np.searchsorted(self._at, np.arange(1, len(self._times))))
+        took = []
+        pose = gtsam.Pose2(*run.first_pose)
+        p = self._settings.priors
+        prior = gtsam.noiseModel.Diagonal.Sigmas(np.array((p.pose_m, p.pose_m, p.heading_rad)))
+        for k in range(len(self._times)):
+            begin_s = clock_s()
+            graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+            if k == 0:
+                graph.add(gtsam.PriorFactorPose2(self._x(0), pose, prior))
+            else:
+                step = gtsam.Pose2(*self._increments.motion[k - 1])
+                noise = gtsam.noiseModel.Gaussian.Covariance(self._increments.covariance[k - 1])
+                graph.add(gtsam.BetweenFactorPose2(self._x(k - 1), self._x(k), step, noise))
+                pose = pose.compose(step)
+            values.insert(self._x(k), pose)
+            self._path[k] = pose.x(), pose.y(), pose.theta()
+            for row in rows_at[k].tolist():
+                self._read(row, graph, values)
+            self._graph.push_back(graph)
+            self._values.insert(values)
+            isam.update(graph, values)
+            estimate = isam.calculateEstimatePose2(self._x(k))
+            pose = estimate
+            self._path[k] = pose.x(), pose.y(), pose.theta()
+            took += [(clock_s() - begin_s) / max(len(rows_at[k]), 1)] * len(rows_at[k])
+        self._final = isam.calculateEstimate()
+        path = self._unwrapped(self._path)
+        isam2 = self._track(path, self._beacons(self._final), np.array(took))
+        begin_s = clock_s()
+        best = gtsam.LevenbergMarquardtOptimizer(self._graph, self._final).optimize()
+        # its time is that of a start, which iSAM2 gives, and of the descent
+        spent = clock_s() - begin_s
+        poses = np.array([(q.x(), q.y(), q.theta()) for q in map(best.atPose2, map(self._x, range(len(self._times))))])
+        share = np.array([spent / max(len(self._at), 1)])
+        return Peers(isam2, self._track(self._unwrapped(poses), self._beacons(best), share))
+
+    def _read(self, row: int, graph: Any, values: Any) -> None:
+        """A reading: a factor if its beacon is placed; else it waits until the beacon can be."""
+        r = self._run.readings
+        beacon = int(r.beacon[row])
+        if beacon not in self._placed:
+            waiting = self._waiting.setdefault(beacon, [])
+            waiting.append(row)
+            place = self._place(row, waiting)
+            if place is None:
+                return
+            self._placed.add(beacon)
+            values.insert(self._l(beacon), np.array(place))
+            for earlier in self._waiting.pop(beacon):
+                graph.add(self._factor(earlier))
+            return
+        graph.add(self._factor(row))
+
+    def _place(self, row: int, waiting: list[int]) -> tuple[float, float] | None:
+        r = self._run.readings
+        poses = self._path[self._at[waiting]]
+        if np.isfinite(r.bearing_rad[row]):
+            x, y, heading = poses[-1]
+            way = heading + r.bearing_rad[row]
+            return float(x + r.range_m[row] * np.cos(way)), float(y + r.range_m[row] * np.sin(way))
+        if len(waiting) < LEAST_READINGS:
+            return None
+        found = place_by_distances(poses, r.range_m[waiting], self._variance(r.range_m[waiting]))
+        last = row >= len(r.times_s) - len(self._run.beacon_ids)
+        if last or (found.margin > SURE_MARGIN and found.spread < SURE_SPREAD):
+            return found.x_m, found.y_m
+        return None
+
+    def _factor(self, row: int) -> Any:
+        gtsam, r = self._gtsam, self._run.readings
+        keys = self._x(int(self._at[row])), self._l(int(r.beacon[row]))
+        sigma = float(np.sqrt(self._variance(r.range_m[row])))
+        if np.isfinite(r.bearing_rad[row]):
+            sigmas = np.array((self._settings.radio.bearing_sigma_rad, sigma))
+            noise = self._robust(gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+            return gtsam.BearingRangeFactor2D(*keys, gtsam.Rot2(r.bearing_rad[row]), r.range_m[row], noise)
+        noise = self._robust(gtsam.noiseModel.Isotropic.Sigma(1, sigma))
+        return gtsam.RangeFactor2D(*keys, r.range_m[row], noise)
+
+    def _robust(self, noise: Any) -> Any:
+        model = self._gtsam.noiseModel
+        return model.Robust.Create(model.mEstimator.Huber.Create(HUBER), noise)
+
+    def _variance(self, range_m: FloatArray) -> FloatArray:
+        radio = self._settings.radio
+        variance: FloatArray = radio.range_sigma_m**2 + (radio.range_sigma_per_m * range_m) ** 2
+        return variance
+
+    def _x(self, k: int) -> Any:
+        return self._gtsam.symbol("x", k)
+
+    def _l(self, beacon: int) -> Any:
+        return self._gtsam.symbol("l", beacon)
+
+    def _beacons(self, values: Any) -> dict[str, BeaconFix]:
+        found = {}
+        for beacon in sorted(self._placed):
+            x, y = values.atPoint2(self._l(beacon)).tolist()
+            found[self._run.beacon_ids[beacon]] = BeaconFix(x, y, UNKNOWN)
+        return found
+
+    def _unwrapped(self, path: FloatArray) -> FloatArray:
+        return np.column_stack([path[:, :2], np.unwrap(path[:, 2])])
+
+    def _track(self, path: FloatArray, beacons: dict[str, BeaconFix], update_s: FloatArray) -> Track:
+        return Track(
+            times_s=self._times,
+            poses=path,
+            covariances=np.broadcast_to(np.eye(3), (len(path), 3, 3)),
+            beacons=beacons,
+            calibration={},
+            nis=np.empty(0),
+            nis_sizes=np.empty(0),
+            refused=0,
+            update_s=update_s,
+            predict_s=np.empty(0),
+            scalar_s=np.empty(0),
+            updates=len(self._at),
+            warnings=(),
+        )

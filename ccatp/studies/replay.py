@@ -1,0 +1,367 @@
+"""The events of a run through a localizer.
+
+A filter that keeps what is done to it, so that a smoother can go back over it.
+"""
+
+from array import array
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from ccatp.config.models import Config
+from ccatp.control.motion_checks import as_standing
+from ccatp.core import DeckPose, FloatArray, IntArray
+from ccatp.estimation.fixes import FixRefused
+from ccatp.filters.base import Filter, FilterError, Innovation, Observation, Transition
+from ccatp.filters.smoother import ROUNDING, Smoother
+from ccatp.localizer import FOUR_STATE, Localizer, build_doubting, build_localizer
+from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.surface import MirrorError
+from ccatp.records.run_reader import Event, Fixed, Marked, Trace, TraceBuilder
+
+# Calls that may still be taken back. A late fix reaches back some seconds, which are a few hundred.
+REACH = 2000
+# Steps in one smoother: some 30 MB at 19 states, so that going back needs little more memory than the record itself.
+CHAPTER = 4096
+
+
+class _Step(NamedTuple):
+    """x' = F x + ..., P' = F P F^T + Q: what a smoother needs of a transition."""
+
+    F: FloatArray
+    predicted: FloatArray
+    Q: FloatArray
+
+
+class _Past(NamedTuple):
+    """The state before a call, and the transition that the call was; None for an update."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    step: _Step | None
+
+
+class _State(NamedTuple):
+    """A mean and its covariance: all that a smoother asks of a filter."""
+
+    mean: FloatArray
+    covariance: FloatArray
+
+
+class SmoothedPoses(NamedTuple):
+    """The first three states, given everything recorded: means (k, 3) and covariances (k, 3, 3) of k states."""
+
+    means: FloatArray
+    covariances: FloatArray
+
+
+class RecordingFilter:
+    """Does what the filter in it does, and records every transition of the state.
+
+    A ``reset`` is one of three things. To a state that the filter has been in: it is taken back there, and what came
+    after is forgotten. From a state in which nothing was recorded yet: the beginning. Anything else is a transition of
+    its own (``transition_of_reset``).
+
+    The record costs ``Smoother``'s memory, 9 kB a transition at 19 states.
+
+    Args:
+        filter_: does the work.
+
+    Attributes:
+        mean, covariance, transition: the filter's.
+    """
+
+    def __init__(self, filter_: Filter) -> None:
+        self._filter = filter_
+        self._past: deque[_Past] = deque()
+        self._chapters: list[Smoother] = []
+        self._recorded = 0  # in the chapters
+        self._pending = 0  # transitions among the past
+        self._look()
+
+    def _look(self) -> None:
+        filter_ = self._filter
+        self.mean, self.covariance, self.transition = filter_.mean, filter_.covariance, filter_.transition
+
+    @property
+    def count(self) -> int:
+        """Transitions so far: the present state is that after as many."""
+        return self._recorded + self._pending
+
+    def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
+        """As ``Filter.predict``."""
+        mean, covariance = self.mean, self.covariance
+        self._filter.predict(F, Q)
+        self._look()
+        noise = added_noise(covariance, self.transition, self.covariance, Q)
+        self._keep(_Past(mean, covariance, _Step(self.transition, self.mean, noise)))
+
+    def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
+        """As ``Filter.update``."""
+        past = _Past(self.mean, self.covariance, None)
+        innovation = self._filter.update(z, H, R)
+        self._look()
+        self._keep(past)
+        return innovation
+
+    def reset(self, mean: FloatArray, covariance: FloatArray) -> None:
+        """As ``Filter.reset``."""
+        before = _State(self.mean, self.covariance)
+        is_beginning = not self.count and not self._past
+        is_back = self._take_back(mean, covariance)
+        self._filter.reset(mean, covariance)
+        self._look()
+        if is_beginning or is_back:
+            return
+        F, Q = transition_of_reset(before.covariance, self.covariance)
+        self._keep(_Past(before.mean, before.covariance, _Step(F, self.mean, Q)))
+
+    def _take_back(self, mean: FloatArray, covariance: FloatArray) -> bool:
+        """Forget everything after the state with these arrays, where the filter has been in it."""
+        if mean is self.mean and covariance is self.covariance:
+            return True
+        past = self._past
+        for k in range(len(past) - 1, -1, -1):
+            if past[k].mean is mean and past[k].covariance is covariance:
+                while len(past) > k:
+                    self._pending -= past.pop().step is not None
+                return True
+        return False
+
+    def _keep(self, past: _Past) -> None:
+        self._past.append(past)
+        self._pending += past.step is not None
+        if len(self._past) > REACH:
+            self._settle()
+
+    def _settle(self) -> None:
+        """Hand the oldest call to the smoother."""
+        mean, covariance, step = self._past.popleft()
+        if step is None:
+            return
+        self._pending -= 1
+        if self._recorded % CHAPTER == 0:
+            self._chapters.append(Smoother(mean.size))
+        self._chapters[-1].record(mean, covariance, *step)
+        self._recorded += 1
+
+    def smooth(self) -> SmoothedPoses:
+        """The first three states after 0, 1, ... ``count`` transitions, given everything.
+
+        Nothing can be taken back afterwards.
+
+        Raises:
+            FilterDiverged: a smoothed state is not finite.
+        """
+        while self._past:
+            self._settle()
+        n = self._recorded
+        means, covariances = np.empty((n + 1, 3)), np.empty((n + 1, 3, 3))
+        end = _State(self.mean, self.covariance)
+        means[n], covariances[n] = end.mean[:3], end.covariance[:3, :3]
+        for number in range(len(self._chapters) - 1, -1, -1):
+            chapter, first = self._chapters[number], number * CHAPTER
+            found = chapter.smooth(cast(Filter, end))  # of which it reads the mean and the covariance
+            last = first + len(chapter)
+            means[first:last], covariances[first:last] = found.means[:-1, :3], found.covariances[:-1, :3, :3]
+            end = _State(found.means[0], found.covariances[0])
+        return SmoothedPoses(means, covariances)
+
+
+def added_noise(P: FloatArray, F: FloatArray, predicted: FloatArray, Q: FloatArray) -> FloatArray:
+    """Q of ``P' = F P F^T + Q`` where F is a regression and the given Q only part of what the prediction added.
+
+    Args:
+        P: covariance before a prediction, shape (n, n).
+        F: its transition, shape (n, n).
+        predicted: P' after it, shape (n, n).
+        Q: the noise that it was given, shape (n, n).
+    """
+    excess = predicted - F.dot(P).dot(F.T) - Q
+    sigma = np.sqrt(np.maximum(predicted.diagonal(), 0.0))
+    # Rounding is left out, so that a state without noise stays one.
+    is_rounding = bool((np.abs(excess) <= ROUNDING * np.outer(sigma, sigma)).all())
+    return Q if is_rounding else Q + excess
+
+
+def transition_of_reset(before: FloatArray, after: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """F and Q (n, n) of a reset, from the covariances (n, n) around it.
+
+    States whose variance changed are drawn anew (their rows of F are zero), the others keep what was known of them; a
+    change of the mean alone shifts the state. That holds where the reset left the covariance of the others as it was
+    and cut them from those that it drew; otherwise nothing before it says anything of what came after.
+    """
+    rounding = ROUNDING * np.sqrt(np.outer(after.diagonal(), after.diagonal()).clip(0.0))
+    has_changed = np.abs(after - before) > rounding
+    is_drawn = has_changed.diagonal()
+    drawn, kept = np.flatnonzero(is_drawn), np.flatnonzero(~is_drawn)
+    if has_changed[np.ix_(kept, kept)].any() or after[np.ix_(drawn, kept)].any():
+        return np.zeros_like(after), after.copy()
+    F, Q = np.diag((~is_drawn).astype(np.float64)), np.zeros_like(after)
+    Q[np.ix_(drawn, drawn)] = after[np.ix_(drawn, drawn)]
+    return F, Q
+
+
+# Wheels that turn faster than this move the robot: ten times the noise of an encoder that gives rates.
+TURNING_RAD_S = 0.01
+
+
+@dataclass(slots=True)
+class Replayed:
+    """What a localizer made of a run.
+
+    Attributes:
+        trace: its estimates, each before the fix that was taken there.
+        moving: frames in which the wheels turned.
+        smoothed: what the whole record says of the same poses, where it was asked for.
+        feet: of the fixes taken then: frame before them, deck x, y of the robot's origin as they show it, shape (f, 3).
+        fixes: measured; of them ``set_aside`` were kept from the localizer in the run, and are here, and ``refused``
+            were not taken by this localizer.
+        first_difference: the first fix of another fate than in the run: its time, and what the localizer said to it.
+        counts: the localizer's.
+    """
+
+    trace: Trace
+    moving: IntArray
+    smoothed: Trace | None = None
+    feet: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    fixes: int = 0
+    refused: int = 0
+    set_aside: int = 0
+    first_difference: tuple[float, str] | None = None
+    counts: dict[str, int] = field(default_factory=dict)
+
+
+def has_smoother(cfg: Config) -> bool:
+    """Whether the whole pose is in the filter, so that a smoother can go back over it."""
+    return cfg.run.filter not in FOUR_STATE
+
+
+def replay(
+    cfg: Config,
+    mirror: Mirror,
+    events: Iterable[Event],
+    *,
+    smooth: bool = False,
+    on_frame: Callable[[float], None] | None = None,
+) -> Replayed:
+    """Run the localizer of a configuration over the events of a run, from its start at base.
+
+    Args:
+        cfg: which filter, and its settings.
+        mirror: the mirror of the run.
+        events: see ``in_order``.
+        smooth: go back over the run with the smoother afterwards.
+        on_frame: told the robot time of each frame, s.
+
+    Raises:
+        ValueError: the filter has no smoother.
+        FilterError: the smoothed state is not finite, or the smoother would have to go across a restart.
+    """
+    if smooth and not has_smoother(cfg):
+        raise ValueError(f"no smoother for filter {cfg.run.filter}: the pose is not in it")
+    return _Player(cfg, mirror, smooth).play(events, on_frame)
+
+
+class _Player:
+    def __init__(self, cfg: Config, mirror: Mirror, smooth: bool) -> None:
+        self._cfg, self._mirror, self._puck_height_m = cfg, mirror, cfg.robot.puck_height_m
+        self._recording: RecordingFilter | None = None
+        self._wrap: Callable[[Filter], Filter] = self._record if smooth else lambda filter_: filter_
+        self._localizer: Localizer = build_localizer(cfg, mirror, self._wrap)
+        self._builder = TraceBuilder()
+        self._steps = array("q")  # transitions of the filter up to each frame
+        self._states = array("d")  # and x, y, heading after them
+        self._moving = array("q")
+        self._feet = array("d")
+        self._seq = -1
+        self._fixes = self._refused = self._set_aside = 0
+        self._first: tuple[float, str] | None = None
+
+    def _record(self, filter_: Filter) -> Filter:
+        self._recording = RecordingFilter(filter_)
+        return self._recording
+
+    def play(self, events: Iterable[Event], on_frame: Callable[[float], None] | None) -> Replayed:
+        for event in events:
+            if isinstance(event, Fixed):
+                self._take_fix(event)
+            else:
+                self._take_frame(event)
+                if on_frame is not None:
+                    on_frame(event.sensors.t)
+        trace = self._builder.build(self._mirror)
+        return Replayed(
+            trace=trace,
+            moving=np.array(self._moving, dtype=np.int64),
+            smoothed=self._smooth(trace, self._recording) if self._recording is not None else None,
+            feet=np.array(self._feet).reshape(-1, 3),
+            fixes=self._fixes,
+            refused=self._refused,
+            set_aside=self._set_aside,
+            first_difference=self._first,
+            counts=dict(self._localizer.counts),
+        )
+
+    def _begin(self, values: tuple[float, ...]) -> None:
+        """A main loop that took over from another one began where the robot was seen last."""
+        if self._recording is not None and self._seq >= 0:
+            raise FilterError("the main loop was started anew within this recording, and no smoother goes across that")
+        x_m, y_m, heading_rad, *sigmas = values
+        pose = DeckPose(x_m, y_m, heading_rad)
+        self._localizer = build_doubting(self._cfg, self._mirror, pose, (sigmas[0], sigmas[1]), self._wrap)
+
+    def _take_frame(self, event: Marked) -> None:
+        """As the main loop does."""
+        if event.begun is not None:
+            self._begin(event.begun)
+        localizer, sensors = self._localizer, event.sensors
+        imu, enc = ((), as_standing(sensors.enc)) if event.is_deaf else (sensors.imu, sensors.enc)
+        localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
+        if localizer.hold_requested:
+            localizer.clear_hold()
+        if event.doubted is not None:
+            localizer.doubt(*event.doubted)
+        if event.at_rest:
+            localizer.rest()
+        self._seq = sensors.seq
+        if any(abs(right or 0.0) > TURNING_RAD_S or abs(left or 0.0) > TURNING_RAD_S for _, right, left in sensors.enc):
+            self._moving.append(sensors.seq)
+        pose = localizer.pose
+        row, col = pose.panel
+        self._builder.add(sensors.seq, sensors.t, row, col, (pose.x_m, pose.y_m, pose.heading_rad))
+        self._builder.add_covariance(localizer.pose_covariance)
+        if self._recording is not None:
+            self._steps.append(self._recording.count)
+            self._states.extend(self._recording.mean[:3].tolist())
+
+    def _take_fix(self, event: Fixed) -> None:
+        self._fixes += 1
+        if event.was_set_aside:
+            # The mission measured again for it: that has happened, whatever this localizer would have said.
+            self._set_aside += 1
+            return
+        said = ""
+        try:
+            self._localizer.fuse_fix(event.fix)
+        except (FixRefused, FilterError) as refusal:
+            said = str(refusal)
+            self._refused += 1
+        if bool(said) is event.was_fused and self._first is None:
+            self._first = event.fix.t_s, said
+        if event.was_fused:
+            try:
+                x, y, _ = self._mirror.foot_of_puck(event.fix.position_m, self._puck_height_m)
+            except MirrorError:
+                return
+            self._feet.extend((self._seq, x, y))
+
+    def _smooth(self, trace: Trace, recording: RecordingFilter) -> Trace:
+        """Each pose corrected as the state of the filter that it was carried on from."""
+        means, covariances = recording.smooth()
+        steps = np.array(self._steps, dtype=np.int64)
+        corrections = means[steps] - np.array(self._states).reshape(-1, 3)
+        return trace.moved_to(self._mirror, trace.pose + corrections, covariances[steps])

@@ -1,0 +1,332 @@
+"""What the robot does in each state of a survey: legs, coming to rest, standing, the retreat, the way home.
+
+The time budget of a mission: what is left out so that the robot is home when the time is over.
+"""
+
+from collections.abc import Callable, Sequence
+from math import hypot, pi
+
+from ccatp.config.models import LimitsConfig
+from ccatp.control.tracker import DONE, DRIVE
+from ccatp.core import DeckPose, PointId, Stop, StopKind, Verdict
+from ccatp.mirror.mirror import Mirror
+from ccatp.survey.planning.escape import is_on_drive
+from ccatp.survey.planning.legs import PlanError
+from ccatp.survey.planning.search import leg_time, turn_time
+from ccatp.survey.retreat import Step
+from ccatp.survey.route_follower import Journey, Motion
+from ccatp.survey.state import (
+    BACKING_OFF,
+    DRIVING,
+    MEASURING,
+    RETURNING,
+    SETTLING,
+    TURNING,
+    Event,
+    Outcome,
+    PlanHome,
+    PlanPoints,
+    PlanRest,
+    Standing,
+)
+from ccatp.survey.stops import STAND, Homing, Order
+
+# Points of a panel that are measured when not all can be: corners and centre, then three that determine a plane.
+LEVELS = (frozenset((1, 3, 5, 7, 9)), frozenset((1, 3, 8)))
+_TURN_RAD = 0.5 * pi  # taken before every leg
+_DETOUR = 1.5  # the way home around the rim's steps against the straight line
+_DOCKING_S = 15.0  # escape from the rim, turns on the way, the turn at base
+_FIRST_S = 60.0  # planned motion before the pace is known
+_LARGEST_PACE = 5.0
+
+
+def home_time_s(base: DeckPose, limits: LimitsConfig, x_m: float, y_m: float) -> float:
+    """An upper estimate of the way to ``base`` from a place on the deck, s; no way is planned for it."""
+    length_m = _DETOUR * hypot(x_m - base.x_m, y_m - base.y_m)
+    stops = 1 + int(length_m)
+    return leg_time(length_m, limits) + stops * turn_time(_TURN_RAD, limits) + _DOCKING_S
+
+
+class TimeBudget:
+    """Compares what is left to do with the time that is left.
+
+    Args:
+        budget_s: time from the first frame until the robot is home or the survey complete.
+        mirror: where the points are.
+        limits: motion limits.
+        measuring_time_s: standstill at each point.
+    """
+
+    def __init__(self, budget_s: float, mirror: Mirror, limits: LimitsConfig, measuring_time_s: float) -> None:
+        """The time begins with the first review."""
+        self.budget_s = budget_s
+        self._limits, self._measuring_s = limits, measuring_time_s
+        self._place_of: Callable[[PointId], tuple[float, float]] = mirror.point_on_deck
+        self._base = mirror.base_pose
+        self._begun_s: float | None = None
+        self._planned_s = 0.0
+        self._next_s = 0.0
+
+    def begin(self, t_s: float) -> None:
+        """The first frame's time; again is harmless."""
+        if self._begun_s is None:
+            self._begun_s = t_s
+
+    def _home_s(self, point: PointId) -> float:
+        return home_time_s(self._base, self._limits, *self._place_of(point))
+
+    def tour_s(self, x_m: float, y_m: float, points: Sequence[PointId]) -> float:
+        """An estimate of the time to drive to the points in their order and to measure them."""
+        total_s = 0.0
+        turn_s = turn_time(_TURN_RAD, self._limits)
+        for point in points:
+            px, py = self._place_of(point)
+            total_s += leg_time(hypot(px - x_m, py - y_m), self._limits) + turn_s + self._measuring_s
+            x_m, y_m = px, py
+        return total_s
+
+    def review(self, t_s: float, pose: DeckPose, left: Sequence[PointId]) -> Sequence[PointId] | None:
+        """One point is done with: what to do with those that are left.
+
+        Args:
+            t_s: robot time.
+            pose: of the robot, deck.
+            left: points, in the order in which they are to be measured.
+
+        Returns:
+            The points to go on with, ``left`` itself where there is time for all; None to go home now.
+        """
+        elapsed_s = t_s - (self._begun_s if self._begun_s is not None else t_s)
+        self._planned_s += self._next_s
+        self._next_s = self.tour_s(pose.x_m, pose.y_m, left[:1])
+        late = elapsed_s / self._planned_s if self._planned_s > _FIRST_S else 1.0
+        pace = min(max(late, 1.0), _LARGEST_PACE)
+        left_s = self.budget_s - elapsed_s
+        x, y = pose.x_m, pose.y_m
+        if not left or pace * self.tour_s(x, y, left) <= left_s:
+            return left
+        if pace * (self._next_s + self._home_s(left[0])) > left_s:
+            return None
+        thinned: Sequence[PointId] = left
+        for level in LEVELS:
+            thinned = [point for point in left if point.point in level]
+            if not thinned:
+                return None
+            if pace * (self.tour_s(x, y, thinned) + self._home_s(thinned[-1])) <= left_s:
+                break
+        return left if len(thinned) == len(left) else thinned
+
+
+class Travels:
+    """One frame of whatever the state says.
+
+    Args:
+        standing: what the rooms of the survey share.
+        budget: the time there is, if that is limited.
+        plan_home: gives the stops from a pose to base.
+        plan_rest: gives the way back to a route from a pose, without the points that are done with.
+        plan_points: gives a route through points from a pose, if there is such a planner.
+    """
+
+    def __init__(
+        self,
+        standing: Standing,
+        budget: TimeBudget | None,
+        plan_home: PlanHome,
+        plan_rest: PlanRest,
+        plan_points: PlanPoints | None,
+    ) -> None:
+        """Nothing driven yet."""
+        self._standing, self._budget = standing, budget
+        self._plan_home, self._plan_rest, self._plan_points = plan_home, plan_rest, plan_points
+
+    @property
+    def measuring_point(self) -> PointId | None:
+        """The point being measured; ``None`` for a fix that only serves to find the robot again."""
+        standing = self._standing
+        stop = standing.survey.current
+        return None if standing.is_lost or stop is None else stop.point
+
+    def step(self, motion: Motion, verdict: Verdict | None) -> Order:
+        """One frame.
+
+        Args:
+            motion: time, pose and speed of the present frame.
+            verdict: the danger loop's verdict in force.
+        """
+        state = self._standing.state
+        if motion.t_s < self._standing.stands_until_s:
+            return STAND
+        if state is DRIVING or state is TURNING:
+            return self._travel(motion)
+        if state is MEASURING:
+            return self._stand(motion)
+        if state is SETTLING:
+            return self._settle(motion)
+        if state is RETURNING:
+            return self._return(motion)
+        if state is BACKING_OFF and verdict is not None:
+            return self._back_off(motion, verdict)
+        return STAND
+
+    # -- legs -----------------------------------------------------------------------------------------------------
+
+    def _is_overdue(self, motion: Motion) -> bool:
+        """Whether the leg takes so long that something must be wrong; that holds the robot."""
+        journey = self._standing.journey
+        stop = journey.current
+        if stop is None or not journey.is_overdue(motion.t_s):
+            return False
+        where = f"({stop.x_m:.3f}, {stop.y_m:.3f}) m"
+        self._standing.fault(f"the leg to {where} is overdue: is a wheel blocked or slipping?")
+        return True
+
+    def _travel(self, motion: Motion) -> Order:
+        standing = self._standing
+        if standing.is_lost:
+            return self._align(motion)
+        if standing.is_review_due and self._is_out_of_time(motion):
+            return STAND
+        survey = standing.survey
+        stop = survey.current
+        if stop is not None and not standing.missed.follows_route(motion, stop, survey):
+            standing.is_off_route = True
+        if standing.is_off_route:
+            return self._find_route(motion)
+        if stop is None:
+            standing.go_on()
+            return STAND
+        order = self._follow(survey, motion, stop)
+        if order is not None:
+            return order
+        if stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) or self._is_vague(motion, stop):
+            standing.apply(Event.ARRIVED)
+            return self._settle(motion)
+        survey.advance()
+        standing.go_on()
+        return self._travel(motion)
+
+    def _follow(self, journey: Journey, motion: Motion, stop: Stop) -> Order | None:
+        """One frame of the leg to a stop; ``None`` when it is reached."""
+        standing = self._standing
+        twist = journey.follow(motion, stop)
+        if self._is_overdue(motion):
+            return STAND
+        phase = standing.tracker.phase
+        if phase is DONE:
+            return None
+        if (phase is DRIVE) is not (standing.state is DRIVING):
+            standing.apply(Event.TURNED if phase is DRIVE else Event.REALIGN)
+        return Order(twist)
+
+    def _align(self, motion: Motion) -> Order:
+        """One frame of a leg that shows the heading; a fix follows."""
+        aligner = self._standing.aligner
+        leg = aligner.leg(motion.deck)
+        stop = None if leg is None else leg.current
+        order = None if leg is None or stop is None else self._follow(leg, motion, stop)
+        if order is not None:
+            return order
+        aligner.interrupt()
+        self._standing.apply(Event.ARRIVED)
+        return self._settle(motion)
+
+    def _is_vague(self, motion: Motion, stop: Stop) -> bool:
+        """Whether to measure at a via point: they lie near the rim, and the next turn needs the room the route left."""
+        return stop.kind is StopKind.VIA and motion.sigma_of() > self._standing.cfg.mission.via_sigma_m
+
+    def _find_route(self, motion: Motion) -> Order:
+        """Plan anew from where the robot is; one frame of standing still, however long that takes."""
+        standing, stop = self._standing, self._standing.survey.current
+        deck = motion.deck
+        if stop is not None and stop.kind is StopKind.CALIBRATE:
+            if is_on_drive(standing.survey.stops, deck.x_m, deck.y_m):
+                standing.is_off_route = False  # what was measured of the drive is not lost, and the rest of it follows
+                return STAND
+            standing.wants_calibration = True
+        due = standing.leftovers.chunk
+        try:
+            if due and self._plan_points is not None:
+                standing.route = self._plan_points(deck, due)
+            else:
+                standing.route = self._plan_rest(standing.route, deck, {*standing.done, *standing.skipped})
+        except PlanError as error:
+            standing.fault(f"no way on: {error}")
+            return STAND
+        standing.is_off_route = False
+        standing.survey = standing.journey_along(standing.route.stops)
+        return STAND
+
+    def _is_out_of_time(self, motion: Motion) -> bool:
+        """Review the budget after a point: whether it is time to go home; what does not fit is left out."""
+        standing, budget = self._standing, self._budget
+        standing.is_review_due = False
+        if budget is None:
+            return False
+        stops = standing.survey.stops[standing.survey.index :]
+        left = standing.leftovers.due or [stop.point for stop in stops if stop.point is not None]
+        going_on = budget.review(motion.t_s, motion.deck, left)
+        if going_on is None:
+            standing.abort_cause = standing.abort_cause or f"the time budget of {budget.budget_s:g} s is used up"
+            standing.go_on()
+            return True
+        if going_on is not left:
+            standing.leftovers.thin_out(left, going_on, "no time for it")
+            standing.is_off_route = True
+        return False
+
+    # -- standing -------------------------------------------------------------------------------------------------
+
+    def _settle(self, motion: Motion) -> Order:
+        standing = self._standing
+        if standing.stopover.has_settled(motion):
+            standing.apply(Event.SETTLED)
+            return Order(STAND.twist, at_rest=True, arrived=standing.stopover.arrival_at(self.measuring_point))
+        self._check_rest(motion)
+        return STAND
+
+    def _stand(self, motion: Motion) -> Order:
+        if self._standing.stopover.is_due(motion):
+            return Order(STAND.twist, measure=True)
+        self._check_rest(motion)
+        return STAND
+
+    def _check_rest(self, motion: Motion) -> None:
+        if self._standing.stopover.is_restless(motion.t_s):
+            speeds = f"{motion.speed_m_s:.4f} m/s, {motion.rate_rad_s:.4f} rad/s"
+            self._standing.fault(f"the robot does not come to rest: {speeds}")
+
+    # -- edge and home --------------------------------------------------------------------------------------------
+
+    def _back_off(self, motion: Motion, verdict: Verdict) -> Order:
+        standing = self._standing
+        retreat = standing.retreat
+        if retreat is None:
+            standing.go_on()
+            return STAND
+        twist = retreat.step(motion, verdict)
+        if retreat.step_at is Step.TURN_AWAY and standing.abort_cause is not None:
+            retreat.step_at = Step.OVER  # there is no route to turn to; the way home begins from here
+        if retreat.step_at is Step.STUCK:
+            standing.hold("stuck at the edge: no motion away from it is permitted, or none helps", by_hand=False)
+            standing.stuck_s = motion.t_s
+            return STAND
+        if retreat.step_at is Step.OVER:
+            standing.apply(Event.FIND)
+            return STAND
+        return Order(twist)
+
+    def _return(self, motion: Motion) -> Order:
+        standing = self._standing
+        if standing.home is None:
+            try:
+                standing.home = Homing(standing.journey_along(self._plan_home(motion.deck)), standing.tracker)
+            except PlanError as error:
+                standing.fault(f"no way home: {error}")
+            return STAND
+        if standing.home.is_at_base:
+            standing.outcome = Outcome.AT_BASE
+            standing.apply(Event.FINISHED)
+            return Order(STAND.twist, at_rest=True)
+        twist = standing.home.step(motion, standing.stopover.is_quiet(motion))
+        return STAND if self._is_overdue(motion) else Order(twist)

@@ -1,0 +1,321 @@
+"""Assembles the parts of a main loop from a configuration, for the daemon and for rehearsals alike.
+
+A survey before anything moves: its order, way, least time, and the points that cannot be reached.
+"""
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from math import hypot
+from typing import Any
+
+from ccatp.config.models import Config
+from ccatp.control.gate import DriveGate
+from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind
+from ccatp.errors import ConfigError
+from ccatp.links.robot_messages import Hello
+from ccatp.localizer import FOUR_STATE, Localizer, build_doubting, build_localizer
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.survey.heading_recovery import Recovery
+from ccatp.survey.mission import Mission
+from ccatp.survey.planning.escape import plan_calibration
+from ccatp.survey.planning.route import ORDERS, Route, plan_rejoin, plan_route, with_prelude
+from ccatp.survey.planning.search import leg_lengths, leg_time, path_time, stop_times
+from ccatp.survey.planning.tour_bound import tour_bound
+from ccatp.survey.planning.way_home import plan_way_home
+from ccatp.survey.state import PlanHome, PlanPoints, PlanRest
+
+# The configuration may be calibrated, the robot's own figures are nominal: this much apart they describe two robots.
+RADIUS_TOLERANCE = 0.05
+SENSOR_TOLERANCE_M = 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """The pure parts of a main loop, and what a summary needs to know of the plan."""
+
+    cfg: Config
+    mirror: Mirror
+    localizer: Localizer
+    mission: Mission
+    gate: DriveGate
+    route: Route
+    points: tuple[PointId, ...]
+    already_done: int
+    lower_bound_s: float
+    elapsed_s: float = 0.0
+    recovery: Recovery | None = None
+
+    @property
+    def total_points(self) -> int:
+        """Points of the mission, measured or not."""
+        return len(self.points)
+
+    def check_robot(self, hello: Hello) -> None:
+        """Refuse a robot whose own geometry contradicts the configuration."""
+        problems = robot_problems(self.cfg, self.mirror, hello)
+        if problems:
+            raise ConfigError(f"robot: the configuration is not of this robot: {'; '.join(problems)}")
+
+
+def assemble(cfg: Config, done: Collection[PointId] = (), recovery: Recovery | None = None) -> Parts:
+    """All pure parts of a main loop, the robot standing at base or where another main loop left it.
+
+    Args:
+        cfg: the configuration.
+        done: points that are measured already.
+        recovery: what the other one left, if there was one.
+
+    Raises:
+        PlanError: a point cannot be reached.
+    """
+    mirror = build_mirror(cfg.mirror)
+    points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
+    route = plan_survey(cfg, mirror, points, done, calibrates=recovery is None)
+    localizer = _build_localizer(cfg, mirror, recovery)
+    # No drive shows the four states their heading: the fix does not reach it.
+    heading_sigma_of = float if cfg.run.filter in FOUR_STATE else lambda: localizer.heading_sigma_rad
+    planners = _home_planner(cfg, mirror), _rest_planner(cfg, mirror), _points_planner(cfg, mirror)
+    mission = Mission(cfg, mirror, route, *planners, heading_sigma_of)
+    if recovery is not None:
+        mission.take_over(recovery)
+    return Parts(
+        cfg=cfg,
+        mirror=mirror,
+        localizer=localizer,
+        mission=mission,
+        gate=build_gate(cfg),
+        route=route,
+        points=tuple(points),
+        already_done=len(set(done)),
+        elapsed_s=0.0 if recovery is None else recovery.elapsed_s,
+        recovery=recovery,
+        lower_bound_s=path_time(route.stops, mirror.base_pose, cfg.limits, mirror, cfg.etalon.measuring_time_s),
+    )
+
+
+def plan_survey(
+    cfg: Config,
+    mirror: Mirror,
+    points: Sequence[PointId],
+    done: Collection[PointId] = (),
+    out_of_reach: list[PointId] | None = None,
+    *,
+    calibrates: bool = True,
+) -> Route:
+    """The route of a survey from base, with the calibration drive before it.
+
+    Args:
+        cfg: the configuration.
+        mirror: its mirror.
+        points: in the order of measuring.
+        done: points that are measured already.
+        out_of_reach: takes the points that cannot be reached, and the route goes without them.
+        calibrates: drive a calibration first, where the localizer has a use for it.
+
+    Raises:
+        PlanError: a point cannot be reached and there is no ``out_of_reach``, or base is not on the mirror.
+    """
+    limits, start, measuring_s = cfg.limits, mirror.base_pose, cfg.etalon.measuring_time_s
+    route = plan_route(mirror, points, cfg.robot, limits, cfg.mission, start, done, measuring_s, out_of_reach)
+    if not calibrates or cfg.run.filter in FOUR_STATE:  # they have no states that the drive could calibrate
+        return route
+    drive = plan_calibration(mirror, cfg.robot, cfg.mission, start)
+    return with_prelude(mirror, route, drive, limits, start, measuring_s)
+
+
+def build_gate(cfg: Config) -> DriveGate:
+    """The last gate before the wheels."""
+    robot = cfg.robot
+    return DriveGate(
+        cfg.limits,
+        robot.wheel_radius_m,
+        robot.wheel_base_m,
+        robot.max_wheel_rad_s,
+        robot.wheel_lag_s,
+        cfg.mission.verdict_timeout_s,
+        robot.sensors_timeout_s,
+    )
+
+
+def robot_problems(cfg: Config, mirror: Mirror, hello: Hello) -> list[str]:
+    """In what the robot's own geometry contradicts the configuration; empty where it does not."""
+    robot, own = cfg.robot, hello.robot
+    problems = [
+        f"{name} is {ours} here and {theirs} there"
+        for name, ours, theirs in (
+            ("wheel_radius_m", robot.wheel_radius_m, own.wheel_radius_m),
+            ("wheel_base_m", robot.wheel_base_m, own.wheel_base_m),
+        )
+        if abs(ours - theirs) > RADIUS_TOLERANCE * theirs
+    ]
+    for ours, theirs in zip(robot.edge_sensors_m, own.edge_sensors_m, strict=True):
+        if hypot(ours[0] - theirs[0], ours[1] - theirs[1]) > SENSOR_TOLERANCE_M:
+            problems.append(f"an edge sensor is at {ours} here and at {tuple(theirs)} there")
+    puck = own.puck_m
+    if hypot(puck[0], puck[1], puck[2] - robot.puck_height_m) > SENSOR_TOLERANCE_M:
+        problems.append(f"the puck is at (0, 0, {robot.puck_height_m}) here and at {tuple(puck)} there")
+    if mirror.overhang and own.fan_floor <= 0.0:
+        problems.append("the mirror overhangs and the robot has no fan floor")
+    return problems
+
+
+def _build_localizer(cfg: Config, mirror: Mirror, recovery: Recovery | None) -> Localizer:
+    if recovery is None:
+        return build_localizer(cfg, mirror)
+    return build_doubting(cfg, mirror, recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad))
+
+
+def _rest_planner(cfg: Config, mirror: Mirror) -> PlanRest:
+    def plan(route: Route, start: DeckPose, skip: Collection[PointId]) -> Route:
+        measuring_s = cfg.etalon.measuring_time_s
+        return plan_rejoin(mirror, route, cfg.robot, cfg.limits, cfg.mission, start, skip, measuring_s)
+
+    return plan
+
+
+def _points_planner(cfg: Config, mirror: Mirror) -> PlanPoints:
+    def plan(start: DeckPose, points: Sequence[PointId]) -> Route:
+        measuring_s = cfg.etalon.measuring_time_s
+        return plan_route(mirror, points, cfg.robot, cfg.limits, cfg.mission, start, (), measuring_s)
+
+    return plan
+
+
+def _home_planner(cfg: Config, mirror: Mirror) -> PlanHome:
+    def plan(start: DeckPose) -> tuple[Stop, ...]:
+        return plan_way_home(mirror, start, mirror.base_pose, cfg.robot, cfg.limits, cfg.mission)
+
+    return plan
+
+
+_SHOWN = 10
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyPlan:
+    """What a survey would do.
+
+    Attributes:
+        points: in the order of measuring, those out of reach included.
+        out_of_reach: no safe way leads there with the configured clearances; a run would be refused.
+        stops: where the robot would stand, one after the other.
+        times_s: since the start, when it stands at each stop, before what it measures there.
+        length_m: of the whole way.
+        driving_s, turning_s, measuring_s: least times, rest to rest; their sum is the survey's lower bound.
+        any_order_s: no order of the points takes less.
+    """
+
+    points: tuple[PointId, ...]
+    out_of_reach: tuple[PointId, ...]
+    stops: tuple[Stop, ...]
+    times_s: tuple[float, ...]
+    length_m: float
+    driving_s: float
+    turning_s: float
+    measuring_s: float
+    any_order_s: float
+
+    @property
+    def least_s(self) -> float:
+        """Lower bound of the survey's time along this way."""
+        return self.driving_s + self.turning_s + self.measuring_s
+
+
+def make_plan(cfg: Config, mirror: Mirror) -> SurveyPlan:
+    """Plan the survey of a configuration as a run would.
+
+    Raises:
+        PlanError: base is not on the mirror, or the robot cannot get away from there.
+    """
+    points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
+    out_of_reach: list[PointId] = []
+    stops = plan_survey(cfg, mirror, points, (), out_of_reach).stops
+    legs_s = [leg_time(length, cfg.limits) for length in leg_lengths(stops, mirror.base_pose, mirror)]
+    times_s = stop_times(stops, mirror.base_pose, cfg.limits, mirror)
+    rests_s = [cfg.etalon.measuring_time_s * _is_measured(stop) for stop in stops]
+    clock_s, arrivals_s = 0.0, []
+    for time_s, rest_s in zip(times_s, rests_s, strict=True):
+        arrivals_s.append(clock_s + time_s)
+        clock_s += time_s + rest_s
+    reached = [point for point in points if point not in set(out_of_reach)]
+    return SurveyPlan(
+        points=tuple(points),
+        out_of_reach=tuple(out_of_reach),
+        stops=stops,
+        times_s=tuple(arrivals_s),
+        length_m=sum(leg_lengths(stops, mirror.base_pose, mirror)),
+        driving_s=sum(legs_s),
+        turning_s=sum(times_s) - sum(legs_s),
+        measuring_s=sum(rests_s),
+        any_order_s=tour_bound(mirror, reached, cfg.limits, cfg.etalon.measuring_time_s),
+    )
+
+
+def _is_measured(stop: Stop) -> bool:
+    return stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE)
+
+
+def plan_data(cfg: Config, plan: SurveyPlan) -> dict[str, Any]:
+    """The plan as data: lengths in m, times in s, points as [row, column, number]."""
+    kinds = [stop.kind for stop in plan.stops]
+    return {
+        "mirror": cfg.mirror.name,
+        "order": cfg.run.order,
+        "filter": cfg.run.filter,
+        "points": {"total": len(plan.points), "reached": len(plan.points) - len(plan.out_of_reach)},
+        "out_of_reach": [list(point) for point in plan.out_of_reach],
+        "length_m": round(plan.length_m, 3),
+        "lower_bound_s": round(plan.least_s, 3),
+        "driving_s": round(plan.driving_s, 3),
+        "turning_s": round(plan.turning_s, 3),
+        "measuring_s": round(plan.measuring_s, 3),
+        "any_order_bound_s": round(plan.any_order_s, 3),
+        "budget_s": cfg.run.budget_s,
+        "fits_budget": plan.least_s <= cfg.run.budget_s,
+        "via_stops": kinds.count(StopKind.VIA),
+        "stops": [
+            {
+                "t_s": round(time_s, 3),
+                "x_m": round(stop.x_m, 4),
+                "y_m": round(stop.y_m, 4),
+                "kind": stop.kind.value,
+                "point": None if stop.point is None else list(stop.point),
+                "reverse": stop.reverse,
+            }
+            for stop, time_s in zip(plan.stops, plan.times_s, strict=True)
+        ],
+    }
+
+
+def plan_lines(cfg: Config, plan: SurveyPlan) -> Iterator[str]:
+    """The plan for a terminal."""
+    vias = sum(stop.kind is StopKind.VIA for stop in plan.stops)
+    panels = [panel for panel, _ in groupby(point.panel for point in plan.points)]
+    limits = cfg.limits
+    count = len(set(panels))
+    of = f"{count} panel{'' if count == 1 else 's'}"
+    yield f"{cfg.mirror.name}: {len(plan.points)} points of {of}, order {cfg.run.order}"
+    yield f"first panels    {_names(panels)}"
+    yield f"way             {plan.length_m:.1f} m, {len(plan.stops)} stops, {vias} of them only on the way"
+    yield (
+        f"least time      {_clock(plan.least_s)}: {plan.driving_s:.0f} s driving, {plan.turning_s:.0f} s turning, "
+        f"{plan.measuring_s:.0f} s measuring"
+    )
+    at = f"at {limits.v_max_m_s:g} m/s and {limits.omega_max_rad_s:g} rad/s"
+    yield f"                {at}; simulated surveys take 1 to 10 % more"
+    yield f"any order       {_clock(plan.any_order_s)} at least, through the points that can be reached"
+    word = "within" if plan.least_s <= cfg.run.budget_s else "BEYOND"
+    yield f"budget          {_clock(cfg.run.budget_s)}: the least time is {word} it"
+    lost = " ".join("/".join(map(str, point)) for point in plan.out_of_reach[:_SHOWN])
+    more = " ..." if len(plan.out_of_reach) > _SHOWN else ""
+    yield f"out of reach    {f'{len(plan.out_of_reach)} points: {lost}{more}' if lost else 'none'}"
+
+
+def _names(panels: list[PanelId]) -> str:
+    shown = " ".join(f"{panel.row}/{panel.col}" for panel in panels[:9])
+    return shown + (" ..." if len(panels) > 9 else "")
+
+
+def _clock(time_s: float) -> str:
+    return f"{int(time_s) // 60} min {int(time_s) % 60:02d} s"

@@ -1,0 +1,291 @@
+"""What is asked of a fix before it is used: our frame and unit, on the surface, repeated where it is doubted.
+
+Doubts about a fix: off the surface, far from the estimate, or not repeated by the next.
+
+Whether the laser system measures in our frame and in our unit: asked of the first fixes of a mission.
+
+The collimators' surveyed places may be written down with other axes, another hand or another unit than the mirror's;
+the lengths may come in another unit. The lengths then fit all the same, or a place far off. So the first fixes are
+compared with where the robot must be, and what does not fit is explained, as far as one mistake explains it.
+"""
+
+from collections.abc import Mapping
+from itertools import permutations, product
+from math import dist, hypot, isfinite
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.config.models import Config, EtalonConfig
+from ccatp.core import DeckPose, Fix, FloatArray, Vector3
+from ccatp.estimation.fixes import DeckFoot, FixRefused, deck_foot
+from ccatp.localizer import FOUR_STATE
+from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.multilateration import MultilaterationError, solve_fix
+
+_CONSISTENT = 3  # so many fixes that agree are right against any estimate
+_FAR = 4.0  # where the localizer has no gate of its own, this many times the limit asks for them
+
+
+class FixJudge:
+    """Judges the fixes of one standstill; ``begin`` starts the next.
+
+    A fix off the surface is never believed. One that contradicts the estimate is believed once another of the same
+    standstill agrees with it; one that contradicts it beyond the localizer's own gate once two others do. A localizer
+    that has such a gate keeps that count itself.
+
+    Args:
+        mirror: the ideal surface.
+        cfg: the limits.
+        puck_height_m: of the puck above the robot's origin.
+        gate_nis: the localizer's gate; ``None`` where it has none.
+    """
+
+    def __init__(self, mirror: Mirror, cfg: EtalonConfig, puck_height_m: float, gate_nis: float | None) -> None:
+        """No fix seen."""
+        self._mirror, self._cfg, self._puck_height_m, self._gate_nis = mirror, cfg, puck_height_m, gate_nis
+        self._seen: list[Vector3] = []
+
+    def begin(self) -> None:
+        """The robot stands anew: what was measured before says nothing about here."""
+        self._seen.clear()
+
+    def doubt(self, fix: Fix, pose: DeckPose, covariance: FloatArray) -> str:
+        """Why to measure again instead of using ``fix``, or empty.
+
+        Args:
+            fix: as measured.
+            pose: the estimate for its time.
+            covariance: of the estimate's (x, y, heading), shape (3, 3).
+        """
+        try:
+            foot = deck_foot(self._mirror, fix, self._puck_height_m)
+        except FixRefused as refusal:
+            return str(refusal)
+        if not abs(foot.deviation_m) <= self._cfg.max_surface_residual_m:
+            limit_mm = 1e3 * self._cfg.max_surface_residual_m
+            return f"the puck is {1e3 * foot.deviation_m:.1f} mm off the surface, at most {limit_mm:g} mm are possible"
+        agreeing = 1 + sum(dist(fix.position_m, other) <= self._cfg.repeat_m for other in self._seen)
+        self._seen.append(fix.position_m)
+        nis = nis_of(foot, pose, covariance)
+        # A localizer that is frozen has no estimate to contradict.
+        if not isfinite(nis) or nis <= self._cfg.doubt_nis:
+            return ""
+        if self._gate_nis is not None and nis > self._gate_nis:
+            return ""
+        beyond = self._gate_nis is None and nis > _FAR * self._cfg.doubt_nis
+        if agreeing >= (_CONSISTENT if beyond else 2):
+            return ""
+        return f"it is {1e3 * hypot(foot.x_m - pose.x_m, foot.y_m - pose.y_m):.1f} mm from the estimate (NIS {nis:.3g})"
+
+
+def nis_of(foot: DeckFoot, pose: DeckPose, covariance: FloatArray) -> float:
+    """Normalised innovation squared of a fix against an estimate, two degrees of freedom; NaN where there is none.
+
+    Args:
+        foot: of the fix.
+        pose: the estimate.
+        covariance: of its (x, y, heading), shape (3, 3).
+    """
+    residual = np.array((foot.x_m - pose.x_m, foot.y_m - pose.y_m))
+    spread = covariance[:2, :2] + foot.covariance_m2
+    if not np.isfinite(spread).all():
+        return float("nan")
+    return float(residual.dot(np.linalg.solve(spread, residual)))
+
+
+AXES = "xyz"
+UNITS = (("mm for m", 1e-3), ("m for mm", 1e3), ("inches for mm", 25.4), ("mm for inches", 1.0 / 25.4))
+_ENOUGH = 3  # places that do not lie on a line determine a frame
+_AREA_M2 = 1e-3  # of their triangle: 0.2 m and 10 mm
+
+
+def signed_axes() -> tuple[FloatArray, ...]:
+    """All 48 matrices that exchange and turn round axes, each (3, 3); the first is the identity."""
+    found = []
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            found.append(matrix)
+    return tuple(found)
+
+
+_SIGNED_AXES = signed_axes()
+
+
+class FrameFault(NamedTuple):
+    """What is wrong with the first fixes.
+
+    Attributes:
+        distance_m: how far the fix is from where the robot must be.
+        explanation: the one mistake that would explain it; empty where none does.
+    """
+
+    distance_m: float
+    explanation: str
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether one mistake in axes or units explains it."""
+        return bool(self.explanation)
+
+    def __str__(self) -> str:
+        """The explanation, or what else may be wrong."""
+        return self.explanation or "no exchange of axes or units explains it; is it at base, and is this the mirror?"
+
+
+class FrameCheck:
+    """Looks at the first fixes of a mission, until they have shown enough.
+
+    Args:
+        cfg: how far off a first fix may be.
+    """
+
+    def __init__(self, cfg: EtalonConfig) -> None:
+        """Nothing seen."""
+        self._limit_m = cfg.start_distance_m
+        self._places: list[FloatArray] = []
+        self.is_over = False
+
+    def look(self, measured_m: Vector3, expected_m: Vector3) -> FrameFault | None:
+        """One of the first fixes; what is wrong with it, or None.
+
+        Args:
+            measured_m, expected_m: of the puck, world frame, the robot standing still.
+        """
+        if self.is_over:
+            return None
+        distance_m = dist(measured_m, expected_m)
+        if not distance_m <= self._limit_m:
+            return FrameFault(distance_m, explain(measured_m, expected_m, self._limit_m))
+        self._places.append(np.array(measured_m))
+        self.is_over = len(self._places) >= _ENOUGH and _spans_a_plane(self._places)
+        return None
+
+
+def _spans_a_plane(places: list[FloatArray]) -> bool:
+    spread = np.array(places) - np.mean(places, axis=0)
+    singular = np.linalg.svd(spread, compute_uv=False)
+    return bool(singular[0] * singular[1] > _AREA_M2)
+
+
+def explain(measured_m: Vector3, expected_m: Vector3, limit_m: float) -> str:
+    """The mistake in axes or unit that turns one position into the other; empty where none does."""
+    measured, expected = np.array(measured_m), np.array(expected_m)
+    for name, factor in UNITS:
+        if np.linalg.norm(factor * measured - expected) <= limit_m:
+            return f"the unit is wrong: {name}"
+    errors = [float(np.linalg.norm(matrix.T @ measured - expected)) for matrix in _SIGNED_AXES]
+    best = int(np.argmin(errors))
+    if best and errors[best] <= limit_m:
+        return f"the axes are wrong: what should be (x, y, z) is {_name(_SIGNED_AXES[best])}"
+    return ""
+
+
+def explain_lengths(
+    cfg: EtalonConfig, expected_m: Vector3, lengths_m: Mapping[int, float], collimators_m: Mapping[int, FloatArray]
+) -> str:
+    """What turns lengths that give no position near the expected one into ones that do: axes or unit.
+
+    Empty where no such mistake does.
+
+    Args:
+        cfg: limits of a solution.
+        expected_m: where the puck must be, world frame.
+        lengths_m: by channel, as measured.
+        collimators_m: by channel, world frame, as configured, shape (3,).
+    """
+    for name, factor in UNITS:
+        scaled = {channel: factor * length for channel, length in lengths_m.items()}
+        if _fits(cfg, expected_m, scaled, collimators_m):
+            return f"the lengths' unit is wrong: {name}"
+        places = {channel: factor * place for channel, place in collimators_m.items()}
+        if _fits(cfg, expected_m, lengths_m, places):
+            return f"the collimators' unit is wrong: {name}"
+    for matrix in _SIGNED_AXES[1:]:
+        turned = {channel: matrix.T @ place for channel, place in collimators_m.items()}
+        if _fits(cfg, expected_m, lengths_m, turned):
+            return f"the collimators' axes are wrong: what should be (x, y, z) is {_name(matrix)}"
+    return ""
+
+
+def _fits(
+    cfg: EtalonConfig, expected_m: Vector3, lengths_m: Mapping[int, float], collimators_m: Mapping[int, FloatArray]
+) -> bool:
+    try:
+        fix: Fix = solve_fix(cfg, 0.0, expected_m, lengths_m, collimators_m)
+    except (MultilaterationError, ValueError):
+        return False
+    return dist(fix.position_m, expected_m) <= cfg.start_distance_m
+
+
+def _name(matrix: FloatArray) -> str:
+    rows = [int(np.argmax(np.abs(row))) for row in matrix]
+    signs = [float(row[k]) for row, k in zip(matrix, rows, strict=True)]
+    return "(" + ", ".join(f"{'-' if sign < 0.0 else ''}{AXES[k]}" for sign, k in zip(signs, rows, strict=True)) + ")"
+
+
+class Finding(NamedTuple):
+    """What was found: nothing where both are empty.
+
+    Attributes:
+        doubt: why to measure again.
+        refusal: why this laser system must not be used for this mission.
+    """
+
+    doubt: str = ""
+    refusal: str = ""
+
+
+class Scrutiny:
+    """Looks at every fix of a mission before the localizer gets it.
+
+    Args:
+        mirror: the ideal surface.
+        cfg: the configuration.
+    """
+
+    def __init__(self, mirror: Mirror, cfg: Config) -> None:
+        """No fix seen."""
+        gate = None if cfg.run.filter in FOUR_STATE else cfg.localizer.full_state.fix_gate_nis
+        self._judge = FixJudge(mirror, cfg.etalon, cfg.robot.puck_height_m, gate)
+        self._frame = FrameCheck(cfg.etalon)
+        self._cfg = cfg.etalon
+        self._collimators_m = dict(zip(mirror.channels, np.asarray(mirror.collimators_m), strict=True))
+        self._is_first = True
+
+    def begin(self) -> None:
+        """The robot stands anew."""
+        self._judge.begin()
+
+    def review(
+        self, fix: Fix, expected_m: Vector3, pose: DeckPose, covariance: FloatArray, *, is_lost: bool = False
+    ) -> Finding:
+        """Judge a fix.
+
+        Args:
+            fix: as measured.
+            expected_m: of the puck, world frame, by the estimate.
+            pose: the estimate for the fix's time.
+            covariance: of the estimate's (x, y, heading), shape (3, 3).
+            is_lost: the estimate is known to be wrong.
+        """
+        is_first, self._is_first = self._is_first, False
+        fault = None if is_lost else self._frame.look(fix.position_m, expected_m)
+        if fault is not None and (is_first or fault.is_explained):
+            where = "its base" if is_first else "the place it drove to"
+            return Finding(refusal=f"the laser system sees the robot {fault.distance_m:.2f} m from {where}: {fault}")
+        return Finding(doubt=self._judge.doubt(fix, pose, covariance))
+
+    def refusal_of(self, lengths_m: Mapping[int, float], expected_m: Vector3) -> str:
+        """Why lengths that gave no position speak against the laser system; empty once a fix has been right.
+
+        Args:
+            lengths_m: by channel, as measured.
+            expected_m: where the puck must be, world frame.
+        """
+        if not self._is_first:
+            return ""
+        why = explain_lengths(self._cfg, expected_m, lengths_m, self._collimators_m)
+        return f"the laser system's lengths do not lead to the robot's base: {why}" if why else ""

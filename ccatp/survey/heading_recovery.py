@@ -1,0 +1,165 @@
+"""Finding a doubtful heading: short legs, straight ahead or back, with a fix at each end.
+
+What a main loop that takes over from another one starts with, and how much of it is a guess.
+"""
+
+from collections.abc import Callable, Sequence
+from math import cos, hypot, sin
+from typing import NamedTuple
+
+from ccatp.config.models import MissionConfig, RobotConfig
+from ccatp.core import DeckPose, PointId, Stop, StopKind
+from ccatp.mirror.mirror import Mirror
+from ccatp.survey.planning.legs import build_body, course_of_heading
+from ccatp.survey.route_follower import Journey
+
+# There and back, twice: a filter of a heading that was far off needs more than one look.
+_MOST_LEGS = 4
+_STEP_M = 0.01
+# A shorter leg says less of the heading than was known before.
+_SHORTEST_M = 0.04
+# The robot may leave the leg to either side by this many standard deviations of its heading.
+_SIGMAS = 2.0
+# Of the way at least this part must lead away from the rim.
+_LEAVING = 0.5
+# A heading that so many times the limit is wrong leads a leg of the survey astray.
+_LOST = 2.0
+
+
+class Aligner:
+    """While the heading is in doubt: which leg shows more of it.
+
+    Args:
+        mirror: where there is room.
+        robot: where its sensors are.
+        cfg: when a heading is in doubt, how long a leg is, how far it keeps from the rim.
+        heading_sigma_of: how well the heading is known, rad.
+        make_journey: makes a journey of stops.
+
+    Attributes:
+        journey: the leg being driven, if any.
+    """
+
+    def __init__(
+        self,
+        mirror: Mirror,
+        robot: RobotConfig,
+        cfg: MissionConfig,
+        heading_sigma_of: Callable[[], float],
+        make_journey: Callable[[Sequence[Stop]], Journey],
+    ) -> None:
+        """Nothing is in doubt."""
+        self._mirror, self._limit_rad, self._wanted_m = mirror, cfg.heading_doubt_rad, cfg.alignment_leg_m
+        # Whatever the heading, no sensor leaves the mirror.
+        self._clearance_m = max(build_body(robot, cfg).turning_depth_m, cfg.leg_clearance_m)
+        self._sigma_of, self._make_journey = heading_sigma_of, make_journey
+        self._legs_left = 0
+        self._was_reverse = True
+        self.journey: Journey | None = None
+
+    def doubt(self) -> None:
+        """The robot may have turned while nobody looked."""
+        self._legs_left, self.journey = _MOST_LEGS, None
+
+    @property
+    def is_needed(self) -> bool:
+        """Whether the heading is known so badly that no leg of the survey should begin with it."""
+        return self._sigma_of() > _LOST * self._limit_rad
+
+    @property
+    def wants_leg(self) -> bool:
+        """Whether the heading has to be found before the robot drives on; to be asked after a fix."""
+        if self._legs_left and self._sigma_of() <= self._limit_rad:
+            self._legs_left = 0
+        return self._legs_left > 0
+
+    def leg(self, deck: DeckPose) -> Journey | None:
+        """The leg being driven, or a new one from a pose; ``None`` where there is no room for any."""
+        if self.journey is None:
+            stop = self._plan(deck)
+            self._legs_left = 0 if stop is None else self._legs_left - 1
+            self.journey = None if stop is None else self._make_journey([stop])
+        return self.journey
+
+    def interrupt(self) -> None:
+        """The leg is over, or the robot stopped on it: the next one begins where it is then."""
+        self.journey = None
+
+    def _plan(self, deck: DeckPose) -> Stop | None:
+        """Back where the last one came from; where there is less room than wanted, whichever way has more."""
+        course = course_of_heading(self._mirror, deck)
+        rooms = []
+        for is_reverse in (not self._was_reverse, self._was_reverse):
+            sign = -1.0 if is_reverse else 1.0
+            way = sign * cos(course), sign * sin(course)
+            rooms.append((self._room_m(deck, way), is_reverse, way))
+        room_m, is_reverse, (cx, cy) = max(rooms, key=lambda room: room[0])
+        if room_m < _SHORTEST_M:
+            return None
+        self._was_reverse = is_reverse
+        return Stop(deck.x_m + room_m * cx, deck.y_m + room_m * cy, StopKind.CALIBRATE, reverse=is_reverse)
+
+    def _room_m(self, deck: DeckPose, way: tuple[float, float]) -> float:
+        """How far a leg may go, up to the length wanted, with the robot somewhere beside it."""
+        rim, spread = self._mirror.rim, _SIGMAS * self._sigma_of()
+        room_m, wanted_m = 0.0, self._wanted_m
+        depth_m = rim.signed_distance_m(deck.x_m, deck.y_m)
+        while room_m < wanted_m:
+            step_m = min(room_m + _STEP_M, wanted_m)
+            before_m, depth_m = depth_m, rim.signed_distance_m(deck.x_m + step_m * way[0], deck.y_m + step_m * way[1])
+            # Where it could not turn the robot may still leave the rim behind.
+            is_leaving = depth_m - before_m > _LEAVING * (step_m - room_m)
+            if depth_m < self._clearance_m + spread * step_m and not is_leaving:
+                break
+            room_m = step_m
+        return room_m
+
+
+# Of a robot that stood: it may have crept, or been touched.
+_STOOD_M, _STOOD_RAD = 0.005, 0.01
+# Of one that moved: the record is up to 0.1 s old, the last command lives for 0.25 s, the wheels run down in 0.1 s.
+_UNSEEN_S = 0.45
+# Within the age of the record it may have begun to move.
+_BEGUN_S = 0.1
+
+
+class Recovery(NamedTuple):
+    """Where and how to go on.
+
+    Attributes:
+        pose: where the robot was seen last, deck frame.
+        position_sigma_m, heading_sigma_rad: how far it may be from there now.
+        elapsed_s: time that the mission has taken so far.
+        skipped: points that were given up.
+        abort_cause: why the robot is on its way home, or empty.
+        held_cause: why an operator has to resume it, or empty.
+    """
+
+    pose: DeckPose
+    position_sigma_m: float
+    heading_sigma_rad: float
+    elapsed_s: float = 0.0
+    skipped: tuple[PointId, ...] = ()
+    abort_cause: str = ""
+    held_cause: str = ""
+
+
+def doubted(
+    sigmas: tuple[float, float], speeds: tuple[float, float], accelerations: tuple[float, float], *, stood: bool
+) -> tuple[float, float]:
+    """How well a pose is known of a robot that nobody has watched since.
+
+    Args:
+        sigmas: of position (m) and heading (rad) when it was seen last.
+        speeds: forward (m/s) and angular (rad/s) then.
+        accelerations: the largest, m/s^2 and rad/s^2.
+        stood: it stood then and was not to move.
+
+    Returns:
+        Standard deviations of position (m) and heading (rad).
+    """
+    way, turn = (
+        0.0 if stood else _UNSEEN_S * (abs(speed) + _BEGUN_S * largest)
+        for speed, largest in zip(speeds, accelerations, strict=True)
+    )
+    return hypot(sigmas[0], way, _STOOD_M), hypot(sigmas[1], turn, _STOOD_RAD)

@@ -1,0 +1,194 @@
+"""The first move away from the rim, from wherever the robot happens to stand and whatever it faces.
+
+Places to turn near a measurement point at the rim, each one short straight move away from it.
+
+The calibration drive: back and forth at base with a fix at each end, before the survey begins.
+"""
+
+from collections.abc import Sequence
+from math import ceil, cos, hypot, pi, sin
+
+import numpy as np
+
+from ccatp.config.models import LimitsConfig, MissionConfig, RobotConfig
+from ccatp.core import DeckPose, FloatArray, Stop, StopKind
+from ccatp.mirror.mirror import Mirror
+from ccatp.survey.planning.legs import Body, Place, UnreachableError, build_body, course_of_heading, sensor_depths
+from ccatp.survey.planning.search import Arrival, leg_time, turn_time
+
+_TURNS_RAD = np.radians(np.arange(-180, 181, 2))
+_NO_TURN = len(_TURNS_RAD) // 2
+# Further it would creep along the rim; straight away from it, or out of a corner, 0.2 m are enough.
+_DISTANCES_M = np.r_[0:401:10] * 1e-3
+# Half way between two turns a sensor at 0.13 m is at most 0.13 (1 - cos(1 deg)) = 20 um further out than in them.
+_BETWEEN_TURNS_M = 2e-5
+_ROUNDING_M = 1e-6
+_MILLIMETRE_M = 1e-3
+
+
+def find_escape(mirror: Mirror, body: Body, start: Arrival, limits: LimitsConfig) -> Arrival:
+    """The best single turn and straight leg, forward or in reverse, to a place where the robot can turn freely.
+
+    Best is what brings no sensor nearer to the rim than ``turn_clearance_m``, or than it is already; of those the
+    fastest, with the smallest turn. Where a sensor has to come nearer, the one that brings it least far.
+
+    Args:
+        mirror: the mirror.
+        body: the robot and its clearances.
+        start: place on the mirror and what the robot faces there.
+        limits: motion limits.
+
+    Raises:
+        UnreachableError: if there is no such place within 0.4 m.
+    """
+    x0, y0 = start.place.x_m, start.place.y_m
+    courses = start.course_rad + _TURNS_RAD
+    ways = np.stack((courses, courses + pi), axis=1)  # forward, in reverse; shape (turns, 2)
+    xs = x0 + _DISTANCES_M * np.cos(ways)[..., None]
+    ys = y0 + _DISTANCES_M * np.sin(ways)[..., None]
+    depths = mirror.rim.signed_distances_m(xs, ys)
+    sensors = sensor_depths(mirror, body, xs, ys, courses[:, None, None])
+    least_sensors = np.minimum(np.minimum.accumulate(sensors, axis=2), _swept(sensors[:, 0, 0])[:, None, None])
+    allowed_m = min(body.turn_clearance_m + _BETWEEN_TURNS_M, float(sensors[_NO_TURN, 0, 0])) - _ROUNDING_M
+    best: tuple[int, float, float, Arrival] | None = None
+    for turn, way in np.ndindex(ways.shape):
+        free = depths[turn, way] >= body.turning_depth_m
+        step = int(np.argmax(free))
+        if not free[step]:
+            continue
+        deficit_mm = ceil(max(allowed_m - float(least_sensors[turn, way, step]), 0.0) / _MILLIMETRE_M)
+        turn_rad = abs(float(_TURNS_RAD[turn]))
+        cost_s = turn_time(turn_rad, limits) + leg_time(float(_DISTANCES_M[step]), limits)
+        if best is not None and (deficit_mm, cost_s, turn_rad) >= best[:3]:
+            continue
+        place = Place(float(xs[turn, way, step]), float(ys[turn, way, step]), float(depths[turn, way, step]))
+        # Never outward, not even past a re-entrant corner.
+        if mirror.rim.segment_clearance_m(x0, y0, place.x_m, place.y_m) >= start.place.depth_m - _ROUNDING_M:
+            best = deficit_mm, cost_s, turn_rad, Arrival(place, float(courses[turn]), cost_s, way == 1, start)
+    if best is None:
+        raise UnreachableError(
+            f"no place to turn within 0.4 m of ({x0:.3f}, {y0:.3f}) m, {start.place.depth_m:.3f} m from the rim of "
+            f"{mirror.name}"
+        )
+    return best[3]
+
+
+def _swept(at_turn: FloatArray) -> FloatArray:
+    """Least sensor depth during a turn in place to each of ``_TURNS_RAD``, given that at each of them, m."""
+    left = np.minimum.accumulate(at_turn[_NO_TURN:])
+    right = np.minimum.accumulate(at_turn[_NO_TURN::-1])
+    return np.concatenate((right[:0:-1], left))
+
+
+# A shorter move would be steered by the error of the position: 1 mm on 20 mm are the 0.05 rad that need no turn.
+_RETREAT_M = np.r_[20:100:5, 100:301:10] * 1e-3
+_SLANTS_RAD = np.radians([0, 2, -2, 4, -4, 6, -6, 8, -8, 10, -10, 12, -12, 14, -14])
+_COURSES_RAD = np.radians([0, 90, 180, 270])[:, None] + _SLANTS_RAD  # (sides, slants)
+
+
+def find_retreats(mirror: Mirror, body: Body, places: list[Place]) -> list[tuple[Place, ...]]:
+    """For each place where the robot cannot turn freely the nearest ones around it where it can.
+
+    At most one to each side of the grid of panels, straight or slightly slanted: slanted where the place is in a
+    corner, or to move off along the rim.
+
+    Args:
+        mirror: the mirror.
+        body: the robot and its clearances.
+        places: where it may have to turn.
+
+    Returns:
+        The retreats of each place; none for one at which the robot can turn.
+    """
+    near = [k for k, place in enumerate(places) if place.stance is not None]
+    x0 = np.array([places[k].x_m for k in near]).reshape(-1, 1, 1, 1)
+    y0 = np.array([places[k].y_m for k in near]).reshape(-1, 1, 1, 1)
+    depths = mirror.rim.signed_distances_m(
+        x0 + _RETREAT_M * np.cos(_COURSES_RAD)[..., None], y0 + _RETREAT_M * np.sin(_COURSES_RAD)[..., None]
+    )
+    found: list[tuple[Place, ...]] = [()] * len(places)
+    for k, sides in zip(near, depths, strict=True):
+        nearest = [_nearest(places[k], body, *side) for side in zip(sides, _COURSES_RAD, strict=True)]
+        found[k] = tuple(retreat for retreat in nearest if retreat is not None)
+    return found
+
+
+def _nearest(place: Place, body: Body, depths: FloatArray, courses_rad: FloatArray) -> Place | None:
+    """Nearest place to turn on one side, by the straightest of equally long moves."""
+    faced = np.array([place.can_face(course) or place.can_face(course + pi) for course in courses_rad.tolist()])
+    is_good = (depths >= body.turning_depth_m) & faced[:, None]
+    if not is_good.any():
+        return None
+    step = int(np.argmax(is_good.any(axis=0)))
+    slant = int(np.argmax(is_good[:, step]))
+    distance_m, course = float(_RETREAT_M[step]), float(courses_rad[slant])
+    return Place(place.x_m + distance_m * cos(course), place.y_m + distance_m * sin(course), float(depths[slant, step]))
+
+
+_SHORTEST_M = 0.08  # a leg shorter than this teaches less than it costs
+_STEP_M = 0.02
+_BESIDE_M = 0.03  # so far beside its line a drive can still go on
+
+
+def plan_calibration(mirror: Mirror, robot: RobotConfig, mission: MissionConfig, base: DeckPose) -> tuple[Stop, ...]:
+    """Rounds of four legs between base and a place behind or before it; they end at base with the heading of the start.
+
+    There and back along one line, once driven with the same heading and once with the opposite one: a wrong heading
+    shifts the two ends against each other, creep shifts both downhill, slip shortens both legs, and two half turns tell
+    a wrong wheel base from a wrong gyroscope. So the first leg of the survey is driven with errors that are known. A
+    second round shows whether slip and creep are the same again.
+
+    Args:
+        mirror: the mirror.
+        robot: where the sensors are.
+        mission: clearances, the length wanted (0 = no calibration), and how many rounds.
+        base: where the robot stands.
+
+    Returns:
+        The stops; none where there is no room.
+    """
+    depth_m = max(build_body(robot, mission).turning_depth_m, mission.leg_clearance_m)
+    course = course_of_heading(mirror, base)
+    if mirror.rim.signed_distance_m(base.x_m, base.y_m) < depth_m:
+        return ()
+    for is_reverse in (True, False):
+        sign = -1.0 if is_reverse else 1.0
+        way_m = _room_m(mirror, base, sign * cos(course), sign * sin(course), depth_m, mission.calibration_length_m)
+        if way_m >= _SHORTEST_M:
+            away = base.x_m + sign * way_m * cos(course), base.y_m + sign * way_m * sin(course)
+            home = base.x_m, base.y_m
+            drive = (
+                Stop(*away, StopKind.CALIBRATE, reverse=is_reverse),
+                Stop(*home, StopKind.CALIBRATE, reverse=not is_reverse),
+                Stop(*away, StopKind.CALIBRATE, reverse=not is_reverse),
+                Stop(*home, StopKind.CALIBRATE, reverse=not is_reverse),
+            )
+            return drive * mission.calibration_rounds
+    return ()
+
+
+def _room_m(mirror: Mirror, base: DeckPose, cx: float, cy: float, depth_m: float, wanted_m: float) -> float:
+    """How far the robot can go from base in a direction of the deck plane and still turn there, up to ``wanted_m``."""
+    way_m = 0.0
+    while way_m < wanted_m:
+        step_m = min(way_m + _STEP_M, wanted_m)
+        if mirror.rim.signed_distance_m(base.x_m + step_m * cx, base.y_m + step_m * cy) < depth_m:
+            break
+        way_m = step_m
+    return way_m
+
+
+def is_on_drive(stops: Sequence[Stop], x_m: float, y_m: float) -> bool:
+    """Whether a calibration drive can go on from a place: it lies on its line, where the robot may turn anywhere.
+
+    Args:
+        stops: a route with the drive's stops.
+        x_m, y_m: the place, deck frame.
+    """
+    ends = dict.fromkeys((stop.x_m, stop.y_m) for stop in stops if stop.kind is StopKind.CALIBRATE)
+    if len(ends) != 2:
+        return False
+    (ax, ay), (bx, by) = ends
+    dx, dy = bx - ax, by - ay
+    share = min(max(((x_m - ax) * dx + (y_m - ay) * dy) / (dx * dx + dy * dy), 0.0), 1.0)
+    return hypot(x_m - ax - share * dx, y_m - ay - share * dy) <= _BESIDE_M

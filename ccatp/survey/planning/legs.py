@@ -1,0 +1,416 @@
+"""Straight legs against the rim, and the way around a stepped corner.
+
+Where the robot can stand and which way it can face and turn there without a sensor passing the rim.
+
+Courses and headings: a direction in the deck plane, and the angle in the tangent plane that projects on it.
+
+Typed refusals of the path planner; each message carries its numbers.
+
+A long leg in parts: the stops between them are where the robot points itself at the next one anew.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from itertools import accumulate
+from math import atan2, ceil, cos, floor, hypot, inf, pi, sin, tau
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.config.models import MissionConfig, RobotConfig
+from ccatp.core import BoolArray, DeckPose, FloatArray, PanelId, Stop, StopKind, bearing, difference
+from ccatp.errors import CcatpError, ExitStatus
+from ccatp.mirror.mirror import Mirror
+
+_BINS = 360
+_BIN_RAD = tau / _BINS
+# Half way between two bins a sensor at 0.13 m is at most 0.13 (1 - cos(0.5 deg)) = 5 um further out than in them.
+_BETWEEN_BINS_M = 1e-5
+# A turn this near to half a turn may go either way round: the noise of the heading decides.
+_AMBIGUOUS_RAD = 0.1
+# Beyond what turning needs, so that a place found on one grid is still a place to turn after rounding.
+_SPARE_M = 0.001
+
+
+class Stance:
+    """Courses that the robot can face at one place near the rim, 360 of them, and turns between them."""
+
+    __slots__ = ("_blocked",)
+
+    def __init__(self, free: BoolArray) -> None:
+        """Keep the running number of blocked courses over four turns: any arc is one difference.
+
+        Args:
+            free: whether all sensors keep their clearance on the course of k degrees, shape (360,).
+        """
+        self._blocked: list[int] = [0, *accumulate(np.tile(~free, 4).astype(int).tolist())]
+
+    def can_face(self, course_rad: float) -> bool:
+        """Whether the robot can face a course."""
+        return self._is_free(course_rad % tau + tau, 0.0)
+
+    def can_turn(self, from_rad: float, to_rad: float) -> bool:
+        """Whether it can turn in place the short way from one course to another; near half a turn, either way."""
+        start = from_rad % tau + tau
+        angle = difference(to_rad, from_rad)
+        if not self._is_free(start, angle):
+            return False
+        if pi - abs(angle) > _AMBIGUOUS_RAD:
+            return True
+        return self._is_free(start, angle - tau if angle > 0.0 else angle + tau)
+
+    def _is_free(self, start_rad: float, angle_rad: float) -> bool:
+        low, high = sorted((start_rad, start_rad + angle_rad))
+        first, last = floor(low / _BIN_RAD), ceil(high / _BIN_RAD)
+        return self._blocked[last + 1] == self._blocked[first]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """A place on the deck.
+
+    Attributes:
+        x_m, y_m: deck coordinates.
+        depth_m: distance to the rim.
+        stance: what the robot can do there; ``None`` where it can turn as it likes.
+    """
+
+    x_m: float
+    y_m: float
+    depth_m: float
+    stance: Stance | None = None
+
+    def can_face(self, course_rad: float) -> bool:
+        """Whether the robot can face a course here."""
+        return self.stance is None or self.stance.can_face(course_rad)
+
+    def can_turn(self, from_rad: float, to_rad: float) -> bool:
+        """Whether the robot can turn in place here, the short way."""
+        return self.stance is None or self.stance.can_turn(from_rad, to_rad)
+
+
+class Body(NamedTuple):
+    """The robot as its edge sensors see it.
+
+    Attributes:
+        sensors_m: the sensors in the robot frame, shape (4, 2).
+        reach_m: the largest distance of one from the robot's origin.
+        leg_clearance_m: what the origin keeps from the rim on a leg.
+        turn_clearance_m: what each sensor keeps from it, always.
+    """
+
+    sensors_m: FloatArray
+    reach_m: float
+    leg_clearance_m: float
+    turn_clearance_m: float
+
+    @property
+    def turning_depth_m(self) -> float:
+        """Distance from the rim at which the robot may stand and turn as it likes."""
+        return max(self.reach_m + self.turn_clearance_m, self.leg_clearance_m) + _SPARE_M
+
+
+def build_body(robot: RobotConfig, mission: MissionConfig) -> Body:
+    """The robot's body and its clearances out of the configuration."""
+    reach_m = max(hypot(x, y) for x, y in robot.edge_sensors_m)
+    return Body(np.array(robot.edge_sensors_m), reach_m, mission.leg_clearance_m, mission.turn_clearance_m)
+
+
+def sensor_depths(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray, courses_rad: FloatArray) -> FloatArray:
+    """Distance to the rim of the sensor nearest to it, of a robot that stands at (x, y) facing a course.
+
+    The robot lies in the tangent plane; its sensors are projected on the deck: with the course u = (c, s) and the rise
+    g = fx c + fy s along it, ``h = (c, s, g)/sqrt(1 + g^2)`` and ``l = n x h``.
+
+    Args:
+        mirror: the mirror.
+        body: the robot.
+        xs, ys, courses_rad: arrays that broadcast against each other, m and rad.
+
+    Returns:
+        The common shape, m; negative where a sensor is beyond the rim.
+    """
+    x, y, course = np.broadcast_arrays(xs, ys, courses_rad)
+    fx, fy = mirror.surface.gradients(x, y)
+    c, s = np.cos(course), np.sin(course)
+    g = fx * c + fy * s
+    h = np.sqrt(1.0 + g * g)
+    w = h * np.sqrt(1.0 + fx * fx + fy * fy)
+    ox, oy = body.sensors_m[:, 0], body.sensors_m[:, 1]
+    px = x[..., None] + ox * (c / h)[..., None] - oy * ((s + fy * g) / w)[..., None]
+    py = y[..., None] + ox * (s / h)[..., None] + oy * ((c + fx * g) / w)[..., None]
+    return np.asarray(mirror.rim.signed_distances_m(px, py).min(axis=-1), dtype=np.float64)
+
+
+def build_places(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray) -> list[Place]:
+    """Places at deck coordinates of shape (n,), m, each with its stance where it is near the rim."""
+    depths = mirror.rim.signed_distances_m(xs, ys)
+    near = np.flatnonzero(depths < body.turning_depth_m)
+    courses: FloatArray = np.arange(_BINS, dtype=np.float64) * _BIN_RAD
+    free = (
+        sensor_depths(mirror, body, xs[near, None], ys[near, None], courses) >= body.turn_clearance_m + _BETWEEN_BINS_M
+    )
+    stances = {int(k): Stance(row) for k, row in zip(near, free, strict=True)}
+    return [
+        Place(x, y, depth, stances.get(k))
+        for k, (x, y, depth) in enumerate(zip(xs.tolist(), ys.tolist(), depths.tolist(), strict=True))
+    ]
+
+
+_ROUNDING_M = 1e-9
+# A sensor whose track meets a seam more steeply than 30 degrees is over it soon; the danger rules know how soon.
+_STEEP = 0.5
+# Further than this from a seam's border a track that should pass beside it does.
+_BESIDE_M = 0.008
+# A track across a seam at 60 degrees from its normal is within the gap for twice its width. More is avoided: with a
+# little more slant, or a wide gap, the danger rules take it for the mirror's edge.
+_LONGEST_CROSSING = 2.0
+
+
+class Grazing(IntEnum):
+    """How a leg lies to the seams that are oblique to it: the more, the worse."""
+
+    NONE = 0
+    BESIDE = 1  # a sensor passes so near that errors may carry it over the gap
+    ALONG = 2  # a sensor runs along within the gap: an edge, as far as anybody can tell
+
+
+_GRAZING_M = (0.0, 0.4, 4.0)  # what a way may be longer to be without
+
+
+class LegRules:
+    """Says which straight legs the robot may drive.
+
+    Args:
+        mirror: the mirror.
+        body: the robot and its clearances.
+    """
+
+    def __init__(self, mirror: Mirror, body: Body) -> None:
+        """Find the rim's re-entrant corners and the places from which the robot can drive around them."""
+        self._rim, self._body = mirror.rim, body
+        self._sensors: list[list[float]] = body.sensors_m.tolist()
+        self._corners, self._nodes = _reentrant_corners(mirror, body)
+        self._seams = _seam_lines(mirror)
+        self._half_gap_m = 0.5 * mirror.gap_m
+        self._explained_m = _LONGEST_CROSSING * mirror.gap_m
+        self._beside_m = self._half_gap_m + _BESIDE_M
+
+    def clearance_m(self, a: Place, b: Place) -> float:
+        """Clearance of the leg from ``a`` to ``b``: exact, or a lower bound that suffices for every rule, m."""
+        # The distance from the rim changes by at most the distance driven.
+        at_least = 0.5 * (a.depth_m + b.depth_m - hypot(b.x_m - a.x_m, b.y_m - a.y_m))
+        if at_least >= self._body.turning_depth_m:
+            return at_least
+        return self._rim.segment_clearance_m(a.x_m, a.y_m, b.x_m, b.y_m)
+
+    def is_enough(self, clearance_m: float) -> bool:
+        """Whether the robot's origin may pass the rim so near."""
+        return clearance_m >= self._body.leg_clearance_m - _ROUNDING_M
+
+    def is_clear(self, a: Place, b: Place) -> bool:
+        """Whether the robot's origin keeps the clearance of a leg from ``a`` to ``b``."""
+        return self.is_enough(self.clearance_m(a, b))
+
+    def are_sensors_clear(self, a: Place, b: Place, course_rad: float, clearance_m: float) -> bool:
+        """Whether the sensors of a robot that faces ``course_rad`` all the way keep their clearance between the ends.
+
+        Where no re-entrant corner is near, the mirror is convex, and a sensor is nearest to the rim at an end of its
+        straight track: the ends are the stances' affair.
+
+        Args:
+            a, b: ends of the leg.
+            course_rad: what the robot faces.
+            clearance_m: clearance of the leg itself, from ``clearance_m``.
+        """
+        body = self._body
+        if clearance_m >= body.reach_m + body.turn_clearance_m:
+            return True
+        if self._corner_distance_m(a, b) >= body.reach_m + body.turn_clearance_m:
+            return True
+        c, s = cos(course_rad), sin(course_rad)
+        return all(
+            self._rim.segment_clearance_m(
+                a.x_m + c * ox - s * oy, a.y_m + s * ox + c * oy, b.x_m + c * ox - s * oy, b.y_m + s * ox + c * oy
+            )
+            >= body.turn_clearance_m
+            for ox, oy in self._sensors
+        )
+
+    def grazing(self, a: Place, b: Place, course_rad: float) -> Grazing:
+        """Whether a sensor may run along a seam on the leg from ``a`` to ``b``, which looks like the mirror's edge.
+
+        Args:
+            a, b: ends of the leg.
+            course_rad: what the robot faces.
+        """
+        dx, dy = b.x_m - a.x_m, b.y_m - a.y_m
+        length = hypot(dx, dy)
+        c, s = cos(course_rad), sin(course_rad)
+        found = Grazing.NONE
+        for start, way, lines, (p, q) in zip((a.x_m, a.y_m), (dx, dy), self._seams, ((c, -s), (s, c)), strict=True):
+            if abs(way) >= _STEEP * length:
+                continue
+            for ox, oy in self._sensors:
+                low = start + p * ox + q * oy
+                high = low + way
+                if low > high:
+                    low, high = high, low
+                for line in lines:
+                    if low - self._beside_m < line < high + self._beside_m:
+                        if self._runs_along(low, high, line, length):
+                            return Grazing.ALONG
+                        found = Grazing.BESIDE
+        return found
+
+    def _runs_along(self, low: float, high: float, line: float, length: float) -> bool:
+        """Whether a track of ``length`` between two places across a seam lies in its gap for long."""
+        overlap = min(high, line + self._half_gap_m) - max(low, line - self._half_gap_m)
+        if overlap < 0.0:
+            return False
+        across = high - low
+        within = length if across == 0.0 else overlap / across * length
+        return within > self._explained_m
+
+    def way_around(self, a: Place, b: Place) -> tuple[Place, ...]:
+        """Best chain of places that leads from ``a`` around stepped corners to ``b``, ends left out.
+
+        Dijkstra's algorithm on the visibility graph of the corners, inset by the clearance, and of the two elbows from
+        which both ends lie along the panels' rows and columns: on such legs no sensor runs along a seam.
+
+        Returns:
+            The places between; none where the straight leg is good, and where there is no way.
+        """
+        if self._is_good(a, b):
+            return ()
+        places = [a, *self._nodes, *self._elbows(a, b), b]
+        cost = {0: 0.0}
+        before: dict[int, int] = {}
+        open_places = set(range(len(places)))
+        while open_places:
+            k = min(open_places, key=lambda i: cost.get(i, inf))
+            if k not in cost:
+                return ()
+            if k == len(places) - 1:
+                break
+            open_places.remove(k)
+            for i in open_places:
+                total = cost[k] + hypot(places[i].x_m - places[k].x_m, places[i].y_m - places[k].y_m)
+                if total < cost.get(i, inf) and self.is_clear(places[k], places[i]):
+                    total += _GRAZING_M[self._grazing_facing(places[k], places[i])]
+                    if total < cost.get(i, inf):
+                        cost[i], before[i] = total, k
+        chain = []
+        k = len(places) - 1
+        while (k := before[k]) != 0:
+            chain.append(places[k])
+        return tuple(reversed(chain))
+
+    def elbows(self, sources: Iterable[Place], targets: Sequence[Place]) -> list[Place]:
+        """Elbows between all places of two groups between which the straight leg is not good."""
+        return [elbow for a in sources for b in targets if not self._is_good(a, b) for elbow in self._elbows(a, b)]
+
+    def _is_good(self, a: Place, b: Place) -> bool:
+        return self.is_clear(a, b) and not self._grazing_facing(a, b)
+
+    def _grazing_facing(self, a: Place, b: Place) -> Grazing:
+        return self.grazing(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m))
+
+    def _elbows(self, a: Place, b: Place) -> list[Place]:
+        """The corners of the rectangle over a and b at which the robot can turn."""
+        places = []
+        for x, y in ((a.x_m, b.y_m), (b.x_m, a.y_m)):
+            depth = self._rim.signed_distance_m(x, y)
+            if depth >= self._body.turning_depth_m:
+                places.append(Place(x, y, depth))
+        return places
+
+    def _corner_distance_m(self, a: Place, b: Place) -> float:
+        return min((_segment_distance(corner, a, b) for corner in self._corners), default=inf)
+
+
+def _seam_lines(mirror: Mirror) -> tuple[list[float], list[float]]:
+    """The deck x of the seams between columns, the deck y of those between rows."""
+    xs, ys = set(), set()
+    half_gap = 0.5 * mirror.gap_m
+    for panel in mirror.panels.values():
+        row, col = panel.id
+        if PanelId(row, col + 1) in mirror.panels:
+            xs.add(round(panel.x_m + panel.half_x_m + half_gap, 6))
+        if PanelId(row + 1, col) in mirror.panels:
+            ys.add(round(panel.y_m + panel.half_y_m + half_gap, 6))
+    return sorted(xs), sorted(ys)
+
+
+def _reentrant_corners(mirror: Mirror, body: Body) -> tuple[list[tuple[float, float]], list[Place]]:
+    """Corners of the rim at which the mirror has 270 degrees, and for each the place inset by the clearance."""
+    vertices = [(float(x), float(y)) for x, y in mirror.rim.vertices]
+    corners, nodes = [], []
+    for (x0, y0), (x1, y1), (x2, y2) in zip(
+        vertices[-1:] + vertices[:-1], vertices, vertices[1:] + vertices[:1], strict=True
+    ):
+        if (x1 - x0) * (y2 - y1) - (y1 - y0) * (x2 - x1) >= 0.0:
+            continue
+        corners.append((x1, y1))
+        # The bisector between coming from the last vertex and going on against the next points to the inside.
+        before, after = atan2(y1 - y0, x1 - x0), atan2(y1 - y2, x1 - x2)
+        inset = max(body.leg_clearance_m, body.turning_depth_m / 2**0.5) + _ROUNDING_M
+        x, y = x1 + inset * (cos(before) + cos(after)), y1 + inset * (sin(before) + sin(after))
+        depth = mirror.rim.signed_distance_m(x, y)
+        if depth >= body.turning_depth_m:
+            nodes.append(Place(x, y, depth))
+    return corners, nodes
+
+
+def _segment_distance(p: tuple[float, float], a: Place, b: Place) -> float:
+    ux, uy = b.x_m - a.x_m, b.y_m - a.y_m
+    wx, wy = p[0] - a.x_m, p[1] - a.y_m
+    length2 = ux * ux + uy * uy
+    t = 0.0 if length2 == 0.0 else min(max((wx * ux + wy * uy) / length2, 0.0), 1.0)
+    return hypot(wx - t * ux, wy - t * uy)
+
+
+def heading_of_course(mirror: Mirror, x: float, y: float, course_rad: float) -> float:
+    """Deck heading (in the tangent plane) of a robot whose heading projects on a course in the deck plane, rad."""
+    (ax, _, az), (bx, by, bz), _ = mirror.surface.axes(x, y)
+    fx, fy = mirror.surface.gradient(x, y)
+    c, s = cos(course_rad), sin(course_rad)
+    rise = fx * c + fy * s
+    return atan2(bx * c + by * s + bz * rise, ax * c + az * rise)
+
+
+def course_of_heading(mirror: Mirror, pose: DeckPose) -> float:
+    """Direction in the deck plane on which the robot's heading projects, rad."""
+    hx, hy, _, _ = mirror.body_axes(pose)
+    return bearing(hx, hy)
+
+
+class PlanError(CcatpError):
+    """Base of every refusal of this room."""
+
+
+class OutsideMirrorError(PlanError):
+    """A path was asked for from a place that is not on the mirror."""
+
+
+class UnreachableError(PlanError):
+    """No sequence of turns and straight legs leads there with the clearances of the configuration."""
+
+    exit_status = ExitStatus.USAGE
+
+
+def in_parts(x_m: float, y_m: float, stop: Stop, longest_m: float) -> list[Stop]:
+    """The straight leg to a stop as equal parts, the stop itself the last.
+
+    Args:
+        x_m, y_m: where the leg begins, deck frame.
+        stop: where it ends.
+        longest_m: no part is longer.
+    """
+    dx, dy = stop.x_m - x_m, stop.y_m - y_m
+    parts = max(1, ceil(hypot(dx, dy) / longest_m))
+    between = (
+        Stop(x_m + dx * k / parts, y_m + dy * k / parts, StopKind.VIA, reverse=stop.reverse) for k in range(1, parts)
+    )
+    return [*between, stop]

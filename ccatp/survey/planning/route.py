@@ -1,0 +1,347 @@
+"""The route of a survey: measurement points in their order and the stops that lead from each to the next.
+
+The points of all panels as one serpentine over whole lines, upright or level, from the best of its starts.
+
+In which order the measurement points are visited: the thesis's, table 3.1 and fig. 3.2, and a faster one.
+"""
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import accumulate, chain
+
+import numpy as np
+
+from ccatp.config.models import LimitsConfig, MissionConfig, RobotConfig
+from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind
+from ccatp.mirror.layout import POINTS_PER_ROW
+from ccatp.mirror.mirror import Mirror
+from ccatp.survey.planning.escape import find_escape, find_retreats
+from ccatp.survey.planning.legs import (
+    LegRules,
+    OutsideMirrorError,
+    UnreachableError,
+    build_body,
+    build_places,
+    course_of_heading,
+    in_parts,
+)
+from ccatp.survey.planning.search import Arrival, Search, Target, leg_lengths, path_time, stop_times
+
+_REPLANNED_POINTS = 4  # at least, before the old route is joined again
+
+
+@dataclass(frozen=True, slots=True)
+class Route:
+    """The stops of a survey.
+
+    Attributes:
+        stops: in order; points to measure and stops on the way.
+        times_s: least time from before stop k to the end, shape (stops + 1,); the last is 0.
+        lengths_m: way from before stop k to the end, likewise.
+    """
+
+    stops: tuple[Stop, ...]
+    times_s: tuple[float, ...]
+    lengths_m: tuple[float, ...]
+
+    def remaining_s(self, index: int) -> float:
+        """Least time that is left while stop ``index`` is being approached, s; 0 behind the last."""
+        return self.times_s[min(index, len(self.stops))]
+
+    def remaining_m(self, index: int) -> float:
+        """Way that is left while stop ``index`` is being approached, m; 0 behind the last."""
+        return self.lengths_m[min(index, len(self.stops))]
+
+
+def plan_route(
+    mirror: Mirror,
+    points: Sequence[PointId],
+    robot: RobotConfig,
+    limits: LimitsConfig,
+    mission: MissionConfig,
+    start: DeckPose,
+    skip: Collection[PointId] = (),
+    measuring_time_s: float = 0.0,
+    out_of_reach: list[PointId] | None = None,
+) -> Route:
+    """The fastest drivable sequence of stops through the points.
+
+    The robot turns in place and moves straight, forward or in reverse. On every leg its origin keeps
+    ``leg_clearance_m`` from the rim and all its edge sensors ``turn_clearance_m``, during turns too; where the thesis's
+    straight way does not, stops are put in between.
+
+    Args:
+        mirror: the mirror.
+        points: what to measure, in order.
+        robot, limits, mission: sensors, motion limits, clearances.
+        start: pose of the robot, deck frame.
+        skip: points already measured.
+        measuring_time_s: standstill at each point, for the remaining time only.
+        out_of_reach: takes the points that cannot be reached, and the route goes without them.
+
+    Raises:
+        OutsideMirrorError: if the start is not on the mirror.
+        UnreachableError: if a point cannot be reached with the clearances, and there is no ``out_of_reach``.
+    """
+    left = set(points).difference(skip)
+    wanted = [point for point in points if point in left]
+    stops = _stops(mirror, wanted, robot, limits, mission, start, out_of_reach)
+    return _with_remains(mirror, stops, limits, start, measuring_time_s)
+
+
+def with_prelude(
+    mirror: Mirror,
+    route: Route,
+    prelude: tuple[Stop, ...],
+    limits: LimitsConfig,
+    start: DeckPose,
+    measuring_time_s: float = 0.0,
+) -> Route:
+    """A route with stops before it that lead from its start back to its start."""
+    head = _with_remains(mirror, prelude, limits, start, measuring_time_s)
+    return Route(
+        prelude + route.stops,
+        tuple(t + route.times_s[0] for t in head.times_s[:-1]) + route.times_s,
+        tuple(t + route.lengths_m[0] for t in head.lengths_m[:-1]) + route.lengths_m,
+    )
+
+
+def plan_rejoin(
+    mirror: Mirror,
+    route: Route,
+    robot: RobotConfig,
+    limits: LimitsConfig,
+    mission: MissionConfig,
+    start: DeckPose,
+    skip: Collection[PointId],
+    measuring_time_s: float = 0.0,
+) -> Route:
+    """The way from ``start`` back to a route: its next points planned anew, the rest as it was.
+
+    Planning a whole mirror anew takes longer than the robot's frames may wait. The new part ends at a point where the
+    robot can turn freely, so that it does not matter how it arrives there.
+
+    Args:
+        mirror: the mirror.
+        route: the route that was left.
+        robot, limits, mission: sensors, motion limits, clearances.
+        start: pose of the robot, deck frame.
+        skip: points that are done with.
+        measuring_time_s: standstill at each point, for the remaining time only.
+
+    Raises:
+        OutsideMirrorError: if the start is not on the mirror.
+        UnreachableError: if a point cannot be reached with the clearances.
+    """
+    body = build_body(robot, mission)
+    left = [k for k, stop in enumerate(route.stops) if stop.point is not None and stop.point not in skip]
+    free = (
+        n
+        for n, k in enumerate(left)
+        if n >= _REPLANNED_POINTS
+        and mirror.rim.signed_distance_m(route.stops[k].x_m, route.stops[k].y_m) >= body.turning_depth_m
+    )
+    count = next(free, len(left) - 1) + 1
+    points = [point for k in left[:count] if (point := route.stops[k].point) is not None]
+    head = plan_route(mirror, points, robot, limits, mission, start, (), measuring_time_s)
+    rest = left[count - 1] + 1 if left else len(route.stops)
+    return Route(
+        head.stops + route.stops[rest:],
+        tuple(t + route.times_s[rest] for t in head.times_s[:-1]) + route.times_s[rest:],
+        tuple(t + route.lengths_m[rest] for t in head.lengths_m[:-1]) + route.lengths_m[rest:],
+    )
+
+
+def _stops(
+    mirror: Mirror,
+    points: list[PointId],
+    robot: RobotConfig,
+    limits: LimitsConfig,
+    mission: MissionConfig,
+    start: DeckPose,
+    out_of_reach: list[PointId] | None,
+) -> tuple[Stop, ...]:
+    body = build_body(robot, mission)
+    xy = np.array([(start.x_m, start.y_m), *(mirror.point_on_deck(point) for point in points)])
+    places = build_places(mirror, body, xy[:, 0], xy[:, 1])
+    if not places[0].depth_m > 0.0:
+        raise OutsideMirrorError(
+            f"start ({start.x_m:.3f}, {start.y_m:.3f}) m is {-places[0].depth_m:.3f} m beyond the rim of {mirror.name}"
+        )
+    search = Search(LegRules(mirror, body), limits)
+    retreats = find_retreats(mirror, body, places)
+    first = Arrival(places[0], course_of_heading(mirror, start), 0.0)
+    if places[0].stance is not None:  # too near the rim to turn: away from it first, as on the way home
+        first, retreats[0] = find_escape(mirror, body, first, limits), ()
+    arrivals, before = [first], 0
+    for k, point in enumerate(points, start=1):
+        found = search.advance(arrivals, retreats[before], Target(places[k], retreats[k]))
+        if found:
+            arrivals, before = found, k
+        elif out_of_reach is not None:
+            out_of_reach.append(point)
+        else:
+            raise UnreachableError(
+                f"mission: no safe way to point {point.row}-{point.col}-{point.point} of {mirror.name}, "
+                f"{places[k].depth_m:.3f} m from the rim, with leg_clearance_m = {mission.leg_clearance_m} and "
+                f"turn_clearance_m = {mission.turn_clearance_m}"
+            )
+    point_of = dict(zip(places[1:], points, strict=True))
+    best = min(arrivals, key=lambda arrival: arrival.cost_s)
+    ends = [
+        Stop(
+            arrival.place.x_m,
+            arrival.place.y_m,
+            StopKind.MEASURE if arrival.place in point_of else StopKind.VIA,
+            point_of.get(arrival.place),
+            arrival.reverse,
+        )
+        for arrival in best.path()
+    ]
+    begins = [(start.x_m, start.y_m), *((stop.x_m, stop.y_m) for stop in ends)]
+    # A heading that is off by 10 mrad misses by a centimetre after a metre: long legs are looked after on the way.
+    return tuple(
+        part for begin, end in zip(begins, ends, strict=False) for part in in_parts(*begin, end, mission.longest_leg_m)
+    )
+
+
+def _with_remains(
+    mirror: Mirror, stops: tuple[Stop, ...], limits: LimitsConfig, start: DeckPose, measuring_time_s: float
+) -> Route:
+    times = [
+        time_s + (measuring_time_s if stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) else 0.0)
+        for stop, time_s in zip(stops, stop_times(stops, start, limits, mirror), strict=True)
+    ]
+    return Route(stops, _sums_to_the_end(times), _sums_to_the_end(leg_lengths(stops, start, mirror)))
+
+
+def _sums_to_the_end(parts: list[float]) -> tuple[float, ...]:
+    return tuple(accumulate(reversed(parts), initial=0.0))[::-1]
+
+
+# Line and place within the line, both counted over the whole grid of panels.
+_Split = Callable[[PointId], tuple[int, int]]
+
+
+def fastest_serpentine(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig) -> list[PointId]:
+    """The points line by line, every second line backwards: the fastest from base of all eight such orders.
+
+    On a line nothing has to be turned for, so that quarter turns remain at the ends of the lines only. Compared are
+    the least times of the straight legs from point to point, turns included; of equals the first of ``serpentines``.
+
+    Args:
+        mirror: the mirror; its base pose is the start.
+        points: what to measure, in any order.
+        limits: motion limits by which turns are weighed against ways.
+
+    Returns:
+        The same points.
+    """
+    return min(serpentines(points), key=lambda order: _straight_time(mirror, order, limits))
+
+
+def serpentines(points: Sequence[PointId]) -> Iterator[list[PointId]]:
+    """All eight serpentines: along the rows, along the columns; each from any of its corners.
+
+    Args:
+        points: in any order.
+    """
+    for split in (_on_row, _on_column):
+        lines = _lines(points, split)
+        for stacked in (lines, lines[::-1]):
+            for odd in (0, 1):
+                turned = (line[::-1] if k % 2 != odd else line for k, line in enumerate(stacked))
+                yield list(chain.from_iterable(turned))
+
+
+def _lines(points: Sequence[PointId], split: _Split) -> list[list[PointId]]:
+    lines: dict[int, list[PointId]] = {}
+    for point in sorted(points, key=split):
+        lines.setdefault(split(point)[0], []).append(point)
+    return list(lines.values())
+
+
+def _on_row(point: PointId) -> tuple[int, int]:
+    upward, along = divmod(point.point - 1, POINTS_PER_ROW)
+    return point.row * POINTS_PER_ROW + upward, point.col * POINTS_PER_ROW + along
+
+
+def _on_column(point: PointId) -> tuple[int, int]:
+    line, place = _on_row(point)
+    return place, line
+
+
+def _straight_time(mirror: Mirror, order: Sequence[PointId], limits: LimitsConfig) -> float:
+    stops = [Stop(x, y, StopKind.MEASURE, point) for point in order for x, y in (mirror.point_on_deck(point),)]
+    return path_time(stops, mirror.base_pose, limits, mirror, 0.0)
+
+
+# Mirror, number of panels (0 = all): a resumed mission and its summary find the same order from nothing else.
+Order = Callable[[Mirror, int], list[PointId]]
+
+# By these, those of the thesis's robot (its speed) and of the stand-in (the rest, UNVERIFIED), turns are weighed
+# against ways. Not by the configured ones: a survey goes on in the order in which it began, whatever its limits are.
+NOMINAL_LIMITS = LimitsConfig(v_max_m_s=0.1, a_max_m_s2=0.2, omega_max_rad_s=1.0, alpha_max_rad_s2=2.0)
+
+# Points 1 to 9 are numbered row by row from the panel's lower left (thesis fig. 2.2). Each order is a serpentine over
+# the three rows of points; it begins on the side on which the robot enters the panel.
+PANEL_ORDERS: dict[int, tuple[int, ...]] = {
+    1: (1, 2, 3, 6, 5, 4, 7, 8, 9),  # lower left to upper right
+    2: (3, 2, 1, 4, 5, 6, 9, 8, 7),  # lower right to upper left
+    3: (9, 8, 7, 4, 5, 6, 3, 2, 1),  # upper right to lower left
+    4: (7, 8, 9, 6, 5, 4, 1, 2, 3),  # upper left to lower right
+}
+
+# Thesis table 3.1, keyed by (row mod 2, column mod 2), both counted from 1 over the mirror's whole grid.
+ORDER_BY_PARITY: dict[tuple[int, int], int] = {(1, 1): 1, (1, 0): 4, (0, 1): 2, (0, 0): 3}
+
+
+def panel_order(panel: PanelId) -> tuple[int, ...]:
+    """Numbers of the nine points of a panel in the order of thesis table 3.1."""
+    return PANEL_ORDERS[ORDER_BY_PARITY[panel.row % 2, panel.col % 2]]
+
+
+def thesis_order(mirror: Mirror, panels: int = 0) -> list[PointId]:
+    """Points of the mirror in the order of the thesis: panel by panel, odd rows towards +column, even rows back.
+
+    Args:
+        mirror: the mirror.
+        panels: take the first so many panels only; 0 = all.
+
+    Returns:
+        Nine points per panel, each exactly once.
+
+    Raises:
+        ValueError: if ``panels`` is negative.
+    """
+    if panels < 0:
+        raise ValueError(f"panels = {panels}: a survey takes 0 (= all) or more panels")
+    serpentine = sorted(mirror.panels, key=lambda p: (p.row, p.col if p.row % 2 else -p.col))
+    chosen = serpentine[:panels] if panels else serpentine
+    return [PointId(panel.row, panel.col, number) for panel in chosen for number in panel_order(panel)]
+
+
+def optimised_order(mirror: Mirror, panels: int = 0, limits: LimitsConfig = NOMINAL_LIMITS) -> list[PointId]:
+    """The same points in whole lines across the panels, see ``fastest_serpentine``.
+
+    Args:
+        mirror: the mirror.
+        panels: take the points of the first so many panels of the thesis's order only; 0 = all.
+        limits: motion limits by which turns are weighed against ways.
+
+    Returns:
+        Nine points per panel, each exactly once.
+
+    Raises:
+        ValueError: if ``panels`` is negative.
+    """
+    return fastest_serpentine(mirror, thesis_order(mirror, panels), limits)
+
+
+def no_points(mirror: Mirror, panels: int = 0) -> list[PointId]:
+    """None: a drive that consists of its calibration alone."""
+    del mirror, panels
+    return []
+
+
+ORDERS: dict[str, Order] = {"thesis": thesis_order, "optimised": optimised_order, "calibration": no_points}

@@ -1,0 +1,227 @@
+"""The cheapest sequence of turns and straight legs through given places: dynamic programming along the order.
+
+Bang-bang times: the least time that a path takes under the motion limits, turning in place at every stop.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from math import dist, hypot, pi, sqrt
+from typing import NamedTuple
+
+from ccatp.config.models import LimitsConfig
+from ccatp.core import DeckPose, Stop, StopKind, bearing, difference
+from ccatp.mirror.mirror import Mirror
+from ccatp.survey.planning.legs import LegRules, Place, heading_of_course
+
+# A leg that begins within this of the heading is steered for on the way and needs no turn in place, by
+# control.straight_tolerance_rad; the points of a row, dropped on the curved surface, lie on a straight line to 10 mrad.
+STRAIGHT_RAD = 0.05
+
+
+def bang_bang_time(distance: float, v_max: float, a_max: float) -> float:
+    """Least time from rest to rest under bounded speed and acceleration, s.
+
+    ``2 sqrt(d/a)`` while the peak stays below v (d < v^2/a), else ``d/v + v/a``.
+
+    Args:
+        distance: m or rad, sign ignored.
+        v_max: speed limit, m/s or rad/s.
+        a_max: acceleration limit, m/s^2 or rad/s^2.
+
+    Raises:
+        ValueError: if a limit is not positive.
+    """
+    if v_max <= 0.0 or a_max <= 0.0:
+        raise ValueError(f"limits must be positive, got v_max={v_max}, a_max={a_max}")
+    length = abs(distance)
+    if length * a_max < v_max * v_max:
+        return 2.0 * sqrt(length / a_max)
+    return length / v_max + v_max / a_max
+
+
+def leg_time(length_m: float, limits: LimitsConfig) -> float:
+    """Bang-bang time of a straight leg, s."""
+    return bang_bang_time(length_m, limits.v_max_m_s, limits.a_max_m_s2)
+
+
+def turn_time(angle_rad: float, limits: LimitsConfig, straight_rad: float = STRAIGHT_RAD) -> float:
+    """Bang-bang time of a turn in place, s; 0 for less than ``straight_rad``, which is steered on the way."""
+    if abs(angle_rad) <= straight_rad:
+        return 0.0
+    return bang_bang_time(angle_rad, limits.omega_max_rad_s, limits.alpha_max_rad_s2)
+
+
+def stop_times(stops: Sequence[Stop], start: DeckPose, limits: LimitsConfig, mirror: Mirror) -> list[float]:
+    """Bang-bang time from each stop's predecessor (``start`` for the first) until the robot stands on the stop, s.
+
+    Turns are measured in the tangent plane where the robot stands, and go the short way.
+    """
+    times = []
+    x, y, heading = start.x_m, start.y_m, start.heading_rad
+    for stop, length_m in zip(stops, leg_lengths(stops, start, mirror), strict=True):
+        time_s = leg_time(length_m, limits)
+        if length_m > 0.0:
+            course = bearing(stop.x_m - x, stop.y_m - y) + (pi if stop.reverse else 0.0)
+            time_s += turn_time(difference(heading_of_course(mirror, x, y, course), heading), limits)
+            heading = heading_of_course(mirror, stop.x_m, stop.y_m, course)
+        x, y = stop.x_m, stop.y_m
+        if stop.heading_rad is not None:
+            time_s += turn_time(difference(stop.heading_rad, heading), limits)
+            heading = stop.heading_rad
+        times.append(time_s)
+    return times
+
+
+def path_time(
+    stops: Sequence[Stop], start: DeckPose, limits: LimitsConfig, mirror: Mirror, measuring_time_s: float
+) -> float:
+    """Least time to drive a path from rest to rest and to measure at its measurement points, s.
+
+    Args:
+        stops: the path.
+        start: pose before the first leg, deck frame.
+        limits: motion limits.
+        mirror: gives the surface on which the legs lie.
+        measuring_time_s: standstill at each measurement point.
+    """
+    measurements = sum(stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) for stop in stops)
+    return sum(stop_times(stops, start, limits, mirror)) + measurements * measuring_time_s
+
+
+def leg_lengths(stops: Sequence[Stop], start: DeckPose, mirror: Mirror) -> list[float]:
+    """Length of the leg to each stop on the surface, m.
+
+    It is the chord between the surface points, which falls short of the arc by less than 0.1 mm in a metre.
+    """
+    first = mirror.surface_point(start.x_m, start.y_m)
+    points = [first, *(mirror.surface_point(stop.x_m, stop.y_m) for stop in stops)]
+    return [dist(a, b) for a, b in pairwise(points)]
+
+
+def path_length(stops: Sequence[Stop], start: DeckPose, mirror: Mirror) -> float:
+    """Length of a path on the surface, m."""
+    return sum(leg_lengths(stops, start, mirror))
+
+
+# What a stop costs beyond the bang-bang time of its legs: the servo's lag and settling.
+STOP_S = 0.15
+# Of two ways that cost the same take the one driven forward.
+_REVERSE_S = 0.01
+# What a way may cost more on which no sensor runs along a seam, by ``Grazing``. Met, such an edge costs ten seconds; of
+# those beside the way few are met. Those along it are met again and again, until the robot waits for an operator.
+_GRAZING_S = (0.0, 3.0, 60.0)
+
+
+class Target(NamedTuple):
+    """A place to be reached, and the places near it where the robot may turn before and after."""
+
+    place: Place
+    retreats: tuple[Place, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arrival:
+    """The robot has arrived at a place by the cheapest way that ends with this leg.
+
+    Attributes:
+        place: where it is.
+        course_rad: what it faces, as a direction in the deck plane.
+        cost_s: time so far.
+        reverse: the leg was driven backwards.
+        before: the arrival before; ``None`` at the start.
+    """
+
+    place: Place
+    course_rad: float
+    cost_s: float
+    reverse: bool = False
+    before: "Arrival | None" = None
+
+    def path(self) -> list["Arrival"]:
+        """The arrivals on the way here, the start left out."""
+        path = []
+        arrival = self
+        while arrival.before is not None:
+            path.append(arrival)
+            arrival = arrival.before
+        return path[::-1]
+
+
+Frontier = dict[Place, list[Arrival]]
+
+
+class Search:
+    """Finds the way through targets in their order.
+
+    Between two targets the robot may drive straight on, turn at a retreat of the first or of the second or of both,
+    and has to drive around stepped corners; each leg forward or in reverse.
+
+    Args:
+        rules: which legs are allowed.
+        limits: motion limits.
+    """
+
+    def __init__(self, rules: LegRules, limits: LimitsConfig) -> None:
+        """Keep the rules."""
+        self._rules, self._limits = rules, limits
+
+    def advance(self, arrivals: Sequence[Arrival], retreats: tuple[Place, ...], target: Target) -> list[Arrival]:
+        """All sensible ways on from one place to the next target; none where there is no way.
+
+        Args:
+            arrivals: ways to the present place.
+            retreats: places near it where the robot may turn.
+            target: where to go.
+        """
+        here = arrivals[0].place
+        frontier: Frontier = {here: list(arrivals)}
+        frontier |= self._extend(frontier, retreats)
+        elbows = self._rules.elbows(frontier, (target.place, *target.retreats))
+        if elbows:
+            frontier = _merged(frontier, self._extend(frontier, elbows))
+        around = frontier
+        for corner in self._rules.way_around(here, target.place):
+            around = self._extend(around, (corner,))
+        if around is not frontier:
+            frontier = _merged(frontier, around)
+        frontier = _merged(frontier, self._extend(frontier, target.retreats))
+        return self._extend(frontier, (target.place,)).get(target.place, [])
+
+    def _extend(self, frontier: Frontier, targets: Iterable[Place]) -> Frontier:
+        """One leg further: for each target, each place it is reached from and each direction the cheapest way."""
+        reached: Frontier = {}
+        for target in targets:
+            ways = [way for source, arrivals in frontier.items() for way in self._legs(source, arrivals, target)]
+            if ways:
+                reached[target] = ways
+        return reached
+
+    def _legs(self, source: Place, arrivals: list[Arrival], target: Place) -> Iterator[Arrival]:
+        dx, dy = target.x_m - source.x_m, target.y_m - source.y_m
+        clearance_m = self._rules.clearance_m(source, target)
+        if not self._rules.is_enough(clearance_m):
+            return
+        cost_s = leg_time(hypot(dx, dy), self._limits) + STOP_S
+        for reverse in (False, True):
+            course = bearing(dx, dy) + (pi if reverse else 0.0)
+            if not target.can_face(course):
+                continue
+            best = self._cheapest_turn(source, arrivals, course)
+            if best is not None and self._rules.are_sensors_clear(source, target, course, clearance_m):
+                turned_s, arrival = best
+                total_s = turned_s + cost_s + (_REVERSE_S if reverse else 0.0)
+                total_s += _GRAZING_S[self._rules.grazing(source, target, course)]
+                yield Arrival(target, course, total_s, reverse, arrival)
+
+    def _cheapest_turn(self, place: Place, arrivals: list[Arrival], course: float) -> tuple[float, Arrival] | None:
+        best: tuple[float, Arrival] | None = None
+        for arrival in arrivals:
+            cost_s = arrival.cost_s + turn_time(difference(course, arrival.course_rad), self._limits)
+            if (best is None or cost_s < best[0]) and place.can_turn(arrival.course_rad, course):
+                best = cost_s, arrival
+        return best
+
+
+def _merged(a: Frontier, b: Frontier) -> Frontier:
+    return {place: [*a.get(place, ()), *b.get(place, ())] for place in (a | b)}

@@ -1,0 +1,194 @@
+"""A time that no order of the measurement points can beat, whatever it is: by this orders are judged."""
+
+from collections.abc import Sequence
+from math import pi
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+from scipy.sparse import csr_array, vstack
+
+from ccatp.config.models import LimitsConfig
+from ccatp.core import FloatArray, IntArray, PointId
+from ccatp.mirror.mirror import Mirror
+from ccatp.survey.planning.search import STRAIGHT_RAD
+
+# Legs to so many nearest places, at least, are told apart: the eight around a point of the grid. All further legs of
+# a place count as its shortest two of them.
+_NEAR = 8
+_NONE = -1  # in place of a near leg: a far one, or none
+
+
+class _Choices(NamedTuple):
+    """What each place can be joined to, one choice a row, the choices of a place one after the other.
+
+    Attributes:
+        place: whose choice it is; 0 is base, shape (m,).
+        near: the near places it is joined to, ``_NONE`` for a far one or none, shape (m, 2).
+        is_end: the tour ends there, shape (m,).
+        cost_s: half of each leg, and the turn between them, shape (m,).
+    """
+
+    place: IntArray
+    near: IntArray
+    is_end: NDArray[np.bool_]
+    cost_s: FloatArray
+
+
+def tour_bound(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig, measuring_time_s: float) -> float:
+    """Least time that any tour takes from base through all points, in any order, s.
+
+    A tour drives straight from point to point, forward or in reverse, rests at each and turns in place; it may end
+    anywhere. The rim is ignored. Stops in between are not counted in: a tour with some is bounded by its legs alone.
+
+    The bound: give half of each leg to either of its ends. Then a tour costs the sum over its places of
+    ``c_p(q, r) = (T_pq + T_pr)/2 + turn``, with q and r the neighbours of p; at base and at the last point, with one
+    neighbour, of half a leg. Driving in reverse changes a heading by pi, so no turn is longer than pi/2. Let p pay a
+    price ``l_pq`` for the leg to q, with ``l_qp = -l_pq``, and the last point pay a price m: along a tour the prices of
+    the legs cancel, and one m is paid. So for *any* prices
+
+        tour >= sum over p of min over (q, r) of [c_p(q, r) + l_pq + l_pr (+ m at an end)] - m,
+
+    since each place of the tour chooses no cheaper than the cheapest. The prices that make it largest are the dual
+    values of the linear programme in which each place mixes its choices such that both ends of a leg agree about it;
+    should the solver stop early the bound gets lower, not wrong. Legs that are not near have no price and turn for
+    nothing, which makes choices cheaper only.
+
+    Args:
+        mirror: the mirror; its base pose is the start.
+        points: what to measure; their order does not matter.
+        limits: motion limits.
+        measuring_time_s: standstill at each point.
+    """
+    if not points:
+        return 0.0
+    legs_s, headings = _legs(mirror, points, limits)
+    choices = _choices(legs_s, headings, mirror.base_pose.heading_rad, limits)
+    return _priced(choices) + len(points) * measuring_time_s
+
+
+def _legs(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig) -> tuple[FloatArray, FloatArray]:
+    """Times of all legs, s, and the headings at their first places, rad; base is place 0, both of shape (n, n)."""
+    base = mirror.base_pose
+    xy = np.array([(base.x_m, base.y_m), *(mirror.point_on_deck(point) for point in points)])
+    surface = np.array([mirror.surface_point(x, y) for x, y in xy.tolist()])
+    lengths_m = np.linalg.norm(surface[:, None] - surface, axis=2)
+    headings = np.stack([_headings(mirror, x, y, xy) for x, y in xy.tolist()])
+    return _bang_bang_times(lengths_m, limits.v_max_m_s, limits.a_max_m_s2), headings
+
+
+def _headings(mirror: Mirror, x: float, y: float, xy: FloatArray) -> FloatArray:
+    """As ``heading_of_course``, from one place towards many, rad."""
+    (ax, _, az), (bx, by, bz), _ = mirror.surface.axes(x, y)
+    fx, fy = mirror.surface.gradient(x, y)
+    dx, dy = xy[:, 0] - x, xy[:, 1] - y
+    rise = fx * dx + fy * dy
+    return np.asarray(np.arctan2(bx * dx + by * dy + bz * rise, ax * dx + az * rise), dtype=np.float64)
+
+
+def _bang_bang_times(distances: FloatArray, v_max: float, a_max: float) -> FloatArray:
+    """As ``bang_bang_time``, of many."""
+    short = distances * a_max < v_max * v_max
+    return np.where(short, 2.0 * np.sqrt(distances / a_max), distances / v_max + v_max / a_max)
+
+
+def _turn_times(angles_rad: FloatArray, limits: LimitsConfig) -> FloatArray:
+    """Least times of turns between two legs each of which may be driven either way, s."""
+    least = np.abs((angles_rad + pi / 2.0) % pi - pi / 2.0)
+    times = _bang_bang_times(least, limits.omega_max_rad_s, limits.alpha_max_rad_s2)
+    return np.where(least <= STRAIGHT_RAD, 0.0, times)
+
+
+def _choices(legs_s: FloatArray, headings: FloatArray, base_heading_rad: float, limits: LimitsConfig) -> _Choices:
+    is_near = _near(legs_s)
+    parts = [_of_base(legs_s[0], _turn_times(headings[0] - base_heading_rad, limits), is_near[0])]
+    for k in range(1, len(legs_s)):
+        near = np.flatnonzero(is_near[k])
+        # A leg of no length has no direction.
+        angles = np.where(legs_s[k, near] > 0.0, headings[k, near], np.nan)
+        turns_s = np.nan_to_num(_turn_times(angles[:, None] - angles, limits), nan=0.0)
+        parts.append(_of_point(k, near, legs_s[k, near] / 2.0, turns_s, _least_far(legs_s[k], is_near[k], k) / 2.0))
+    return _Choices(
+        np.concatenate([part.place for part in parts]),
+        np.concatenate([part.near for part in parts]),
+        np.concatenate([part.is_end for part in parts]),
+        np.concatenate([part.cost_s for part in parts]),
+    )
+
+
+def _near(legs_s: FloatArray) -> NDArray[np.bool_]:
+    """Whether one of two places is among the nearest of the other, shape (n, n)."""
+    count = min(_NEAR, len(legs_s) - 1)
+    others = legs_s + np.diag(np.full(len(legs_s), np.inf))
+    near = np.zeros(legs_s.shape, dtype=np.bool_)
+    np.put_along_axis(near, np.argsort(others, axis=1, kind="stable")[:, :count], True, axis=1)
+    return near | near.T
+
+
+def _least_far(legs_s: FloatArray, is_near: NDArray[np.bool_], own: int) -> FloatArray:
+    """The two shortest legs that are not near; infinite where there is none, s."""
+    is_far = ~is_near
+    is_far[own] = False
+    return np.sort(np.r_[legs_s[is_far], np.inf, np.inf])[:2]
+
+
+def _of_base(legs_s: FloatArray, turns_s: FloatArray, is_near: NDArray[np.bool_]) -> _Choices:
+    near = np.flatnonzero(is_near)
+    costs = np.r_[(legs_s / 2.0 + np.where(legs_s > 0.0, turns_s, 0.0))[near], _least_far(legs_s, is_near, 0)[0] / 2.0]
+    joined = np.full((len(costs), 2), _NONE)
+    joined[:-1, 0] = near
+    return _finite(_Choices(np.zeros(len(costs), dtype=np.int64), joined, np.zeros(len(costs), dtype=np.bool_), costs))
+
+
+def _of_point(place: int, near: IntArray, halves_s: FloatArray, turns_s: FloatArray, far_s: FloatArray) -> _Choices:
+    """Two near legs; a near and a far one; two far ones; one leg only, where the tour ends: near, far."""
+    first, second = np.triu_indices(len(near), 1)
+    none = np.full(len(near), _NONE)
+    joined = np.r_[
+        np.c_[near[first], near[second]], np.c_[near, none], [(_NONE, _NONE)], np.c_[near, none], [(_NONE, _NONE)]
+    ]
+    pairs_s = halves_s[first] + halves_s[second] + turns_s[first, second]
+    costs = np.r_[pairs_s, halves_s + far_s[0], far_s[0] + far_s[1], halves_s, far_s[0]]
+    is_end = np.arange(len(costs)) >= len(costs) - len(near) - 1
+    return _finite(_Choices(np.full(len(costs), place), joined, is_end, costs))
+
+
+def _finite(choices: _Choices) -> _Choices:
+    possible = np.isfinite(choices.cost_s)
+    place, near, is_end, cost_s = choices
+    return _Choices(place[possible], near[possible], is_end[possible], cost_s[possible])
+
+
+def _priced(choices: _Choices) -> float:
+    """The sum of the cheapest choices at the prices that make it largest, s."""
+    one_each, agreement = _constraints(choices)
+    wanted = np.zeros(agreement.shape[0])
+    wanted[-1] = 1.0
+    constraints: Any = vstack((one_each, agreement))  # its type says that it takes none that are sparse; it does
+    solution = linprog(
+        choices.cost_s,
+        A_eq=constraints,
+        b_eq=np.r_[np.ones(one_each.shape[0]), wanted],
+        method="highs-ipm",  # a tenth of the simplex method's time
+    )
+    prices = np.asarray(solution.eqlin.marginals, dtype=np.float64)[one_each.shape[0] :]
+    at_prices = choices.cost_s - agreement.T @ prices
+    first = np.flatnonzero(np.diff(choices.place, prepend=-1))
+    return float(np.minimum.reduceat(at_prices, first).sum() + prices[-1])
+
+
+def _constraints(choices: _Choices) -> tuple[csr_array, csr_array]:
+    """Which choices are whose, shape (places, m), and on what they have to agree, shape (legs + 1, m).
+
+    Of a leg's two ends the one pays what the other gets. The last row counts the ends of the tour.
+    """
+    places, m = int(choices.place[-1]) + 1, len(choices.cost_s)
+    row, side = np.nonzero(choices.near != _NONE)
+    own, other = choices.place[row], choices.near[row, side]
+    legs, leg = np.unique(np.minimum(own, other) * places + np.maximum(own, other), return_inverse=True)
+    ends = np.flatnonzero(choices.is_end)
+    signs = np.r_[np.where(own < other, 1.0, -1.0), np.ones(len(ends))]
+    where = np.r_[leg, np.full(len(ends), len(legs))], np.r_[row, ends]
+    agreement = csr_array((signs, where), shape=(len(legs) + 1, m))
+    return csr_array((np.ones(m), (choices.place, np.arange(m))), shape=(places, m)), agreement

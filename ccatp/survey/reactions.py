@@ -1,0 +1,339 @@
+"""How a survey reacts to the danger loop's verdict: holds, retreats from edges, ways home, waiting.
+
+Nobody resumes a faulted robot: a reminder every minute, and home before the battery no longer lasts for it.
+
+Before the first motion: does gravity agree with the slope of the configured mirror where the robot stands?
+"""
+
+from collections.abc import Sequence
+from enum import StrEnum
+from math import acos, degrees, pi, radians, sqrt
+from statistics import median
+
+from ccatp.config.models import Config
+from ccatp.core import Corner, DeckPose, EventCode, Severity, Verdict
+from ccatp.mirror.mirror import Mirror
+from ccatp.survey.retreat import Retreat
+from ccatp.survey.route_follower import Motion
+from ccatp.survey.state import DRIVING, HELD, IDLE, MEASURING, RETURNING, SETTLING, TURNING, Event, Standing, State
+
+NEAR_EDGE, ABORTED = EventCode.NEAR_EDGE, EventCode.ABORTED
+NONE, SLOW, HOLD, RETURN, FAULT = Severity.NONE, Severity.SLOW, Severity.HOLD, Severity.RETURN, Severity.FAULT
+_CORNERS = frozenset(Corner)
+# So long after a fix found the robot the danger loop has heard where it is: a pose in five frames, and a verdict.
+_HEARD_S = 0.2
+EARTHQUAKE = "emergency: earthquake"
+
+
+def abort(standing: Standing, cause: str) -> str | None:
+    """Return to base and end there; why that is refused, or ``None``."""
+    if standing.state is State.DONE:
+        return "the mission is over"
+    is_news = standing.abort_cause is None
+    standing.abort_cause = standing.abort_cause or cause
+    if standing.bar:
+        return None  # home, but not before the robot may move
+    # An edge outranks an abort: the retreat and its fix come first.
+    if standing.state is State.HELD or (is_news and standing.state is not State.BACKING_OFF and not standing.is_lost):
+        standing.go_on()
+    return None
+
+
+class Reactions:
+    """Hears the verdict of each frame before anything moves.
+
+    Args:
+        standing: what the rooms of the survey share.
+    """
+
+    def __init__(self, standing: Standing) -> None:
+        """No verdict yet."""
+        self._standing = standing
+        self._finding = ""
+        self._raised: int | None = 0
+        self._was_lost = self._has_looked = False
+
+    def know_emergency(self) -> None:
+        """Whatever is latched when the first verdict comes was acted on before."""
+        self._raised = None
+
+    def react(self, motion: Motion, verdict: Verdict | None) -> None:
+        """Do what the verdict demands.
+
+        Args:
+            motion: the present frame.
+            verdict: in force, ``None`` where there is none fresh enough.
+        """
+        standing = self._standing
+        if verdict is not None and self._raised is None:
+            self._raised = verdict.raised
+        self._await_news(motion.t_s, verdict)
+        if verdict is not None and self._heed_earthquake(verdict):
+            return
+        if verdict is not None and (verdict.severity is not NONE or standing.severity is not NONE):
+            standing.severity = verdict.severity
+            if self._obey(verdict):
+                return
+        if standing.stuck_s is not None and self._waits_at_edge(motion.t_s, verdict):
+            return
+        if verdict is None or not (verdict.forward and verdict.reverse and verdict.turn):
+            self._stay(motion, verdict)
+            return
+        if verdict.code is NEAR_EDGE:
+            self._meet_edge(motion, verdict)
+            return
+        if verdict.code is ABORTED and self._is_news(verdict):
+            abort(standing, verdict.cause)
+        is_waiting = standing.state is HELD and (standing.is_held_by_hand or motion.t_s < standing.waits_until_s)
+        if standing.state is IDLE or (standing.state is HELD and not is_waiting):
+            standing.go_on()
+
+    def _await_news(self, t_s: float, verdict: Verdict | None) -> None:
+        """Found at an edge, the robot stands until the danger loop knows where: what it met may have been a seam."""
+        standing = self._standing
+        if verdict is not None and verdict.severity < HOLD:
+            self._has_looked = False
+        if self._was_lost and not standing.is_lost and verdict is not None and verdict.code is NEAR_EDGE:
+            standing.stands_until_s = t_s + _HEARD_S
+        self._was_lost = standing.is_lost
+
+    def _stay(self, motion: Motion, verdict: Verdict | None) -> None:
+        """Not every motion is permitted, or there is no verdict."""
+        standing = self._standing
+        if verdict is None:
+            standing.interrupt("no fresh verdict from the danger loop")
+        elif verdict.code is NEAR_EDGE:
+            self._meet_edge(motion, verdict)
+        elif not (standing.is_lost and standing.state in (SETTLING, MEASURING)):
+            # A robot that stands to be found needs no permission, and without a pose gets none before it is.
+            standing.interrupt(verdict.cause)
+
+    def _is_news(self, verdict: Verdict) -> bool:
+        """Whether another emergency was raised since the last look: the level is repeated in each verdict."""
+        is_news, self._raised = verdict.raised != self._raised, verdict.raised
+        return is_news
+
+    def _heed_earthquake(self, verdict: Verdict) -> bool:
+        """Nothing moves while the ground shakes, unless away from an edge; whether that is all for this frame."""
+        standing = self._standing
+        standing.is_latched, standing.is_shaking = verdict.raised > 0, verdict.is_shaking
+        if not verdict.is_shaking:
+            standing.bar = ""
+            return False
+        standing.wants_full_fans = True
+        if verdict.code is NEAR_EDGE:
+            return False
+        self._raised = verdict.raised
+        self._stand_fast()
+        return verdict.severity is not FAULT  # which an operator has to look after, too
+
+    def _stand_fast(self) -> None:
+        """Held, and home when it is over; a pose from before is not to be trusted then."""
+        standing = self._standing
+        if standing.bar or standing.state is State.DONE:
+            return
+        standing.bar = EARTHQUAKE
+        standing.abort_cause = standing.abort_cause or EARTHQUAKE
+        standing.lose()
+        standing.hold(EARTHQUAKE, by_hand=standing.state is State.HELD and standing.is_held_by_hand)
+
+    def _obey(self, verdict: Verdict) -> bool:
+        """Do what a finding of the monitors demands; whether that is all for this frame."""
+        standing, severity = self._standing, verdict.severity
+        standing.wants_full_fans |= verdict.full_fans
+        is_denied = not (verdict.forward or verdict.reverse or verdict.turn)
+        if severity is FAULT:
+            if not (standing.state is HELD and standing.is_faulted):
+                standing.fault(verdict.cause, is_lost=True)
+            return True
+        if is_denied and severity is HOLD and verdict.signal in _CORNERS and self._looks(verdict.cause):
+            return True
+        if is_denied and severity >= HOLD:
+            standing.await_recovery(verdict.cause, is_pose_doubted=verdict.signal not in _CORNERS)
+            return True
+        self._pace(is_slow=severity in (SLOW, RETURN))
+        if severity is RETURN and verdict.code is not NEAR_EDGE and verdict.cause != self._finding:
+            self._finding = verdict.cause
+            abort(standing, verdict.cause)
+        return False
+
+    def _looks(self, cause: str) -> bool:
+        """A sensor that stays off may be over a seam or the rim where the pose is wrong: one fix, at rest, tells."""
+        standing = self._standing
+        if standing.state is State.DONE or (standing.state is HELD and standing.is_held_by_hand):
+            return False
+        if not self._has_looked:
+            self._has_looked = True
+            standing.await_recovery(cause)
+            standing.go_on()
+        return standing.is_lost and standing.state in (SETTLING, MEASURING)
+
+    def _pace(self, *, is_slow: bool) -> None:
+        """Drive at the reduced speed from now on, or at the usual one from the next leg on."""
+        standing = self._standing
+        if is_slow is standing.tracker.is_slow:
+            return
+        standing.tracker.is_slow = is_slow
+        if is_slow and standing.state in (DRIVING, TURNING, RETURNING):
+            standing.interrupt_travel()
+
+    def _waits_at_edge(self, t_s: float, verdict: Verdict | None) -> bool:
+        """After a retreat that led nowhere: whether to go on waiting until no sensor hangs over any more."""
+        standing = self._standing
+        if standing.state is not HELD or standing.is_held_by_hand or standing.stuck_s is None:
+            standing.stuck_s = None
+            return False
+        if verdict is not None and verdict.code is not NEAR_EDGE:
+            standing.stuck_s = None
+            return False
+        if t_s - standing.stuck_s > standing.cfg.health.hold_limit_s:
+            standing.stuck_s = None
+            standing.fault(standing.cause)
+        return True
+
+    def _meet_edge(self, motion: Motion, verdict: Verdict) -> None:
+        standing = self._standing
+        if standing.state in (State.BACKING_OFF, State.DONE):
+            return
+        if standing.ignores_motion:
+            standing.go_on()  # where the edge is, is not known before a fix; standing still for it is safe anywhere
+        if standing.is_lost and standing.state in (SETTLING, MEASURING):
+            return  # it stands, and a rim on the map is a matter of the pose that is being found
+        if standing.state is State.HELD and standing.is_held_by_hand:
+            return
+        if motion.t_s < standing.stands_until_s:
+            return
+        mission = standing.cfg.mission
+        standing.backoffs += 1
+        if standing.backoffs > mission.max_backoffs_per_stop:
+            standing.backoffs = 0
+            standing.fault(
+                f"at the edge again after {mission.max_backoffs_per_stop} back-offs: is an edge sensor dirty?"
+            )
+            return
+        # Back at an edge right after a fix of the place: then it is the heading that is wrong.
+        standing.doubts_pose |= standing.backoffs > 1
+        standing.cause = verdict.cause
+        standing.interrupt_parts()
+        # An edge that the route did not foresee means that the pose is wrong: it is found again before moving on.
+        standing.lose()
+        standing.apply(Event.EDGE)
+        standing.retreat = Retreat(mission, standing.tracker, verdict, motion.pose, motion.rate_rad_s)
+
+
+_EARLY = 1.05  # from the decision to the first turn of a wheel some charge goes, too
+
+
+class Call(StrEnum):
+    """What the vigil asks for."""
+
+    NOTHING = ""
+    REMIND = "remind"
+    RETURN = "return"
+
+
+class Vigil:
+    """Watches over a fault.
+
+    Args:
+        cfg: period of the alarm; life, reserve and margin of the battery.
+        falls: without fans the robot falls off this mirror: only there it is worth moving without an operator.
+    """
+
+    def __init__(self, cfg: Config, *, falls: bool) -> None:
+        """No fault."""
+        self._alarm_period_s, self._health, self._falls = cfg.mission.alarm_period_s, cfg.health, falls
+        self._since_s: float | None = None
+        self._remind_at_s = 0.0
+        self._has_returned = False
+
+    def held_s(self, t_s: float) -> float:
+        """How long the fault lasts."""
+        return 0.0 if self._since_s is None else t_s - self._since_s
+
+    def over(self) -> None:
+        """There is no fault any more."""
+        self._since_s = None
+
+    def watch(self, t_s: float, soc: float, home_s: float | None) -> Call:
+        """One frame of a fault.
+
+        Args:
+            t_s: robot time.
+            soc: state of charge, 0 to 1.
+            home_s: time of the way home; ``None`` where the robot does not know where it is.
+        """
+        if self._since_s is None or t_s < self._since_s:
+            self._since_s, self._remind_at_s = t_s, t_s + self._alarm_period_s
+        # Once: a return that failed may have failed for the reason of the fault.
+        if self._falls and not self._has_returned and home_s is not None and self.is_low(soc, home_s):
+            self._has_returned = True
+            return Call.RETURN
+        if t_s < self._remind_at_s:
+            return Call.NOTHING
+        self._remind_at_s = t_s + self._alarm_period_s
+        return Call.REMIND
+
+    def is_low(self, soc: float, home_s: float) -> bool:
+        """Whether the charge above the reserve is less than the way home may take."""
+        needed = _EARLY * self._health.battery_margin * home_s / self._health.battery_life_s
+        return not soc - self._health.battery_reserve > needed
+
+
+# A mirror that is more than 5 deg off must never pass. The median of so many readings of 2 deg each is right within 0.4
+# deg, one standard deviation; what else may differ (the start pose, the sensor's mounting) is far below the limit.
+LIMIT_RAD = radians(3.5)
+READINGS = 40
+# What has come in after this time has to do, s; none at all: the robot has no such sensor.
+PATIENCE_S = 4.0
+
+
+class MirrorCheck:
+    """Compares the slope that gravity shows with the map's. The heading plays no part, so that it need not be known.
+
+    Args:
+        mirror: the configured mirror.
+
+    Attributes:
+        contradiction: why the mirror cannot be this one; empty while nothing speaks against it.
+        warning: what could not be checked.
+    """
+
+    def __init__(self, mirror: Mirror) -> None:
+        """Nothing heard."""
+        self._mirror = mirror
+        self._slopes_rad: list[float] = []
+        self._first_s: float | None = None
+        self.contradiction = self.warning = ""
+
+    def hear(self, t_s: float, gravity: Sequence[float] | None, pose: DeckPose) -> bool:
+        """Take a frame; true once all is known that will be.
+
+        Args:
+            t_s: time of the frame, s.
+            gravity: time and direction of gravity in the robot frame, where the frame has a reading.
+            pose: where the robot is thought to stand.
+        """
+        if self._first_s is None:
+            self._first_s = t_s
+        if gravity is not None:
+            self._slopes_rad.append(_slope(gravity[1:]))
+        is_over = abs(t_s - self._first_s) >= PATIENCE_S
+        if len(self._slopes_rad) < READINGS and not is_over:
+            return False
+        if not self._slopes_rad:
+            self.warning = "the robot tells no gravity: nobody knows whether it stands on the configured mirror"
+            return True
+        felt_rad, expected_rad = median(self._slopes_rad), _slope(self._mirror.gravity_in_robot(pose))
+        if abs(felt_rad - expected_rad) > LIMIT_RAD:
+            self.contradiction = (
+                f"the robot stands on a slope of {degrees(felt_rad):.1f} deg, {self._mirror.name} has one of "
+                f"{degrees(expected_rad):.1f} deg there: is this the right mirror (run.mirror, --mirror)?"
+            )
+        return True
+
+
+def _slope(gravity: Sequence[float]) -> float:
+    """Angle between the surface and the horizontal, rad; more than a right angle where the surface overhangs."""
+    x, y, z = gravity
+    return pi - acos(max(-1.0, min(1.0, z / sqrt(x * x + y * y + z * z))))

@@ -1,0 +1,303 @@
+"""A series of stops and the leg being driven: the path planner of thesis 3.2 as the mission uses it.
+
+The leg tracker at two paces: the usual one, and the reduced one while something is not quite right.
+
+The short move that brings a robot standing beside its point onto it, in place of a new route.
+"""
+
+from collections.abc import Callable, Sequence
+from math import atan2, ceil, cos, hypot, pi, sin
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.config.models import ControlConfig, HealthConfig, LimitsConfig, MissionConfig, RobotConfig
+from ccatp.control.tracker import DONE, NO_CREEP, LegTracker
+from ccatp.core import DeckPose, PanelId, PanelPose, PointId, Predicted, Stop, Twist, difference
+from ccatp.mirror.mirror import Mirror
+from ccatp.survey.planning.legs import build_body, course_of_heading, sensor_depths
+
+
+class PacedTracker(LegTracker):
+    """A leg tracker that plans with the reduced limits while ``is_slow``; a change counts from the next leg or turn.
+
+    Args:
+        control: tolerances and gains.
+        limits: the usual limits.
+        health: the reduced speeds.
+        wheel_lag_s: time constant of the wheel servo.
+
+    Attributes:
+        is_slow: plan the next motion at the reduced pace.
+    """
+
+    def __init__(self, control: ControlConfig, limits: LimitsConfig, health: HealthConfig, wheel_lag_s: float) -> None:
+        """At the usual pace."""
+        slow = limits.model_copy(
+            update={
+                "v_max_m_s": min(limits.v_max_m_s, health.slow_speed_m_s),
+                "omega_max_rad_s": min(limits.omega_max_rad_s, health.slow_rate_rad_s),
+            }
+        )
+        self._paces = LegTracker(control, limits, wheel_lag_s), LegTracker(control, slow, wheel_lag_s)
+        super().__init__(control, limits, wheel_lag_s)
+        self.is_slow = self._was_slow = False
+
+    def begin(
+        self,
+        pose: tuple[float, float, float],
+        target: tuple[float, float],
+        reverse: bool,
+        creep: tuple[float, float] = NO_CREEP,
+    ) -> None:
+        """Start a leg; see ``LegTracker.begin``."""
+        self._change_pace()
+        super().begin(pose, target, reverse, creep)
+
+    def begin_turn(self, angle_rad: float) -> None:
+        """Start a turn in place; see ``LegTracker.begin_turn``."""
+        self._change_pace()
+        super().begin_turn(angle_rad)
+
+    def _change_pace(self) -> None:
+        """Take over the axes of the other tracker: they hold the limits."""
+        if self.is_slow is self._was_slow:
+            return
+        self._was_slow = self.is_slow
+        other = self._paces[self.is_slow]
+        self._along, self._forward, self._angular = other._along, other._forward, other._angular
+        self._steering, self._line, self._omega_max = other._steering, other._line, other._omega_max
+
+
+# A sensor at 0.13 m sweeps 2 mm in a hundredth of a turn's radian; between two such steps it is 0.03 mm further out.
+_SWEEP_RAD = 0.04
+
+
+class Aim(NamedTuple):
+    """Where a correction leads, in the frame of the panel on which the robot stands.
+
+    Attributes:
+        x_m, y_m: where the robot's origin shall stand.
+        reverse: it moves there backwards.
+        turn_rad: turn in place before it.
+    """
+
+    x_m: float
+    y_m: float
+    reverse: bool
+    turn_rad: float
+
+
+def plan_aim(pose: tuple[float, float, float], target: tuple[float, float], tolerance_m: float, margin: float) -> Aim:
+    """The least motion that brings the robot within the tolerance.
+
+    Straight along the heading, where the part beside it is at most ``margin`` of the tolerance; else by the smaller
+    turn that points head or tail at the target.
+
+    Args:
+        pose: (x, y, heading), m and rad.
+        target: (x, y) in the same plane, m.
+        tolerance_m: how near the robot has to come.
+        margin: share of it that a straight move may leave.
+    """
+    x, y, heading = pose
+    dx, dy = target[0] - x, target[1] - y
+    c, s = cos(heading), sin(heading)
+    ahead, beside = c * dx + s * dy, c * dy - s * dx
+    if abs(beside) <= margin * tolerance_m:
+        return Aim(x + ahead * c, y + ahead * s, ahead < 0.0, 0.0)
+    turn = difference(atan2(dy, dx), heading)
+    if abs(turn) <= 0.5 * pi:
+        return Aim(*target, False, turn)
+    return Aim(*target, True, difference(turn, pi))
+
+
+class Corrector:
+    """Says where a correction leads, or that none is to be had; and whether a turn after it is safe.
+
+    Args:
+        mirror: gives the rim.
+        robot: gives the edge sensors.
+        cfg: tolerance, reach and clearances.
+    """
+
+    def __init__(self, mirror: Mirror, robot: RobotConfig, cfg: MissionConfig) -> None:
+        """Nothing is kept but what is given."""
+        self._mirror, self._cfg = mirror, cfg
+        self._body = build_body(robot, cfg)
+
+    def aim(self, pose: PanelPose, target: tuple[float, float]) -> Aim | None:
+        """The correction from ``pose`` to ``target``; ``None`` where it is too far or a sensor would pass the rim.
+
+        Args:
+            pose: where the robot stands.
+            target: (x, y) in the frame of its panel, m.
+        """
+        cfg = self._cfg
+        distance_m = hypot(target[0] - pose.x_m, target[1] - pose.y_m)
+        if distance_m > cfg.correction_reach_m:
+            return None
+        aim = plan_aim(
+            (pose.x_m, pose.y_m, pose.heading_rad), target, cfg.correction_tolerance_m, cfg.correction_margin
+        )
+        turned = PanelPose(pose.panel, pose.x_m, pose.y_m, pose.heading_rad + aim.turn_rad)
+        there = PanelPose(pose.panel, aim.x_m, aim.y_m, turned.heading_rad)
+        start, end = self._mirror.deck_pose(pose), self._mirror.deck_pose(there)
+        if not self._is_clear(start, aim.turn_rad):
+            return None
+        # Between the ends of a few centimetres a sensor is never nearer to the rim than by half of them.
+        is_safe = self._is_clear(self._mirror.deck_pose(turned), 0.0) and self._is_clear(end, 0.0)
+        return aim if is_safe else None
+
+    def can_go_on(self, pose: DeckPose, stop: Stop) -> bool:
+        """Whether the turn towards ``stop`` from where a correction ended keeps every sensor on the mirror."""
+        bearing = atan2(stop.y_m - pose.y_m, stop.x_m - pose.x_m) + (pi if stop.reverse else 0.0)
+        return self._is_clear(pose, difference(bearing, course_of_heading(self._mirror, pose)))
+
+    def _is_clear(self, pose: DeckPose, turn_rad: float) -> bool:
+        body = self._body
+        if self._mirror.rim.signed_distance_m(pose.x_m, pose.y_m) >= body.turning_depth_m:
+            return True
+        course = course_of_heading(self._mirror, pose)
+        courses = np.linspace(course, course + turn_rad, 1 + ceil(abs(turn_rad) / _SWEEP_RAD))
+        depths = sensor_depths(self._mirror, body, np.array(pose.x_m), np.array(pose.y_m), courses)
+        return bool(depths.min() >= body.turn_clearance_m)
+
+
+class Motion(NamedTuple):
+    """What the localizer says about the present frame.
+
+    ``creep`` is the drift (dx, dy) per metre of travel in the plane of ``pose``. ``ahead`` is where the robot will be,
+    in the same plane, when the twist decided now takes effect; ``None`` where that is at once. Whether it has arrived
+    and stands still is judged by ``pose``; it is steered by ``ahead``. ``sigma_of`` says how well the position is
+    known, in its worst direction, m.
+    """
+
+    t_s: float
+    dt_s: float
+    pose: PanelPose
+    deck_of: Callable[[PanelPose], DeckPose]  # hardly ever asked for, and not cheap
+    speed_m_s: float
+    rate_rad_s: float
+    creep: tuple[float, float] = (0.0, 0.0)
+    ahead: Predicted | None = None
+    sigma_of: Callable[[], float] = float  # hardly ever asked for either
+
+    @property
+    def steered(self) -> Predicted:
+        """The state that the next twist will meet."""
+        if self.ahead is not None:
+            return self.ahead
+        pose = self.pose
+        return Predicted((pose.x_m, pose.y_m, pose.heading_rad), self.speed_m_s, self.rate_rad_s)
+
+    @property
+    def lead_rad(self) -> float:
+        """How far the robot will have turned until then."""
+        return 0.0 if self.ahead is None else self.ahead.pose[2] - self.pose.heading_rad
+
+    @property
+    def deck(self) -> DeckPose:
+        """The pose in the deck frame."""
+        return self.deck_of(self.pose)
+
+    def with_only(self, *, ahead: bool, creep: bool) -> "Motion":
+        """The same without what steering is not to use: the prediction, the drift."""
+        return Motion(
+            self.t_s,
+            self.dt_s,
+            self.pose,
+            self.deck_of,
+            self.speed_m_s,
+            self.rate_rad_s,
+            self.creep if creep else (0.0, 0.0),
+            self.ahead if ahead else None,
+            self.sigma_of,
+        )
+
+
+class Journey:
+    """Keeps the current stop until all are exhausted, and drives the leg to it.
+
+    Args:
+        mirror: gives the stops in the frame of the panel on which the robot is.
+        tracker: the leg tracker.
+        timeout_factor: a motion that takes longer than this times its bang-bang time plus 5 s is overdue.
+        stops: the stops, in order.
+
+    Attributes:
+        current: the stop being tracked; ``None`` when all are exhausted.
+        index: its place among them.
+    """
+
+    def __init__(self, mirror: Mirror, tracker: LegTracker, timeout_factor: float, stops: Sequence[Stop]) -> None:
+        """Stand before the first leg."""
+        self._mirror, self._tracker, self._timeout_factor = mirror, tracker, timeout_factor
+        self.stops = tuple(stops)
+        self.index = 0
+        self.current: Stop | None = self.stops[0] if self.stops else None
+        self._is_begun = False
+        self._deadline_s = 0.0
+        self._target: tuple[PanelId, Stop, tuple[float, float]] | None = None
+        self._aim: tuple[PanelId, Aim] | None = None
+
+    @property
+    def next_point(self) -> PointId | None:
+        """The point to be measured next, at the current stop or a later one."""
+        return next((stop.point for stop in self.stops[self.index :] if stop.point is not None), None)
+
+    def advance(self) -> None:
+        """The current stop is done with."""
+        self.index += 1
+        self.current = self.stops[self.index] if self.index < len(self.stops) else None
+        self._is_begun, self._aim = False, None
+
+    def interrupt(self) -> None:
+        """The robot stopped on the way: the leg begins anew, from wherever it is then."""
+        self._is_begun, self._aim = False, None
+
+    def correct(self, panel: PanelId, aim: Aim) -> None:
+        """The leg to the current stop is a correction, as long as the robot stays on the panel."""
+        self._is_begun, self._aim = False, (panel, aim)
+
+    def follow(self, motion: Motion, stop: Stop) -> Twist:
+        """One frame of the leg to ``stop``: the twist until the next frame."""
+        state, panel = motion.steered, motion.pose.panel
+        target, reverse = self.target_in(panel, stop), stop.reverse
+        if self._aim is not None and self._aim[0] == panel:
+            x, y, reverse, _ = self._aim[1]
+            target = x, y
+        if not self._is_begun:
+            self._is_begun = True
+            self._tracker.begin(state.pose, target, reverse, motion.creep)
+            self._set_deadline(motion.t_s)
+        tracker = self._tracker
+        before = tracker.phase
+        twist = tracker.step(state.pose, target, motion.dt_s, state, motion.creep)
+        if tracker.phase is not before and tracker.phase is not DONE:
+            self._set_deadline(motion.t_s)
+        return twist
+
+    def is_overdue(self, t_s: float) -> bool:
+        """Whether the leg begun takes far longer than it should."""
+        return self._is_begun and t_s > self._deadline_s
+
+    def distance_m(self, pose: PanelPose) -> float:
+        """Distance to the current stop, m (0 where there is none)."""
+        stop = self.current
+        if stop is None:
+            return 0.0
+        x, y = self.target_in(pose.panel, stop)
+        return hypot(x - pose.x_m, y - pose.y_m)
+
+    def _set_deadline(self, t_s: float) -> None:
+        self._deadline_s = t_s + 5.0 + self._timeout_factor * self._tracker.planned_s
+
+    def target_in(self, panel: PanelId, stop: Stop) -> tuple[float, float]:
+        """The stop in the frame of a panel, (x, y), m."""
+        cached = self._target
+        if cached is not None and cached[0] == panel and cached[1] is stop:
+            return cached[2]
+        x, y, _ = self._mirror.panels[panel].from_deck(self._mirror.surface_point(stop.x_m, stop.y_m))
+        self._target = (panel, stop, (x, y))
+        return x, y

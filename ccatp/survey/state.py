@@ -1,0 +1,467 @@
+"""Where a survey stands: what its rooms share, and the few moves between the states that all of them make.
+
+The mission as a total state machine: states, events, and the table of transitions.
+
+Points whose measurement failed: why, and each of them once more when the others are done.
+
+Leaving a point that a fix showed to be missed: by a correction, and then by the route, where that is safe.
+
+How often a point was approached, and whether it has to be approached again.
+"""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from enum import StrEnum
+from math import inf
+from types import MappingProxyType
+
+from ccatp.config.models import Config
+from ccatp.control.gate import Purpose
+from ccatp.core import DeckPose, PointId, Severity, Stop
+from ccatp.mirror.mirror import Mirror
+from ccatp.survey.heading_recovery import Aligner
+from ccatp.survey.planning.route import Route
+from ccatp.survey.retreat import Retreat
+from ccatp.survey.route_follower import Corrector, Journey, Motion, PacedTracker
+from ccatp.survey.stops import Homing, Stopover
+
+
+class State(StrEnum):
+    """What the mission is at."""
+
+    IDLE = "idle"
+    TURNING = "turning"
+    DRIVING = "driving"
+    SETTLING = "settling"
+    MEASURING = "measuring"
+    BACKING_OFF = "backing off"
+    RETURNING = "returning"
+    HELD = "held"
+    DONE = "done"
+
+
+IDLE, TURNING, DRIVING, SETTLING, MEASURING, BACKING_OFF, RETURNING, HELD, DONE = State
+
+
+class Event(StrEnum):
+    """What can happen to it. Every event has a meaning in every state; where the table is silent it changes nothing."""
+
+    GO_ON = "go on"  # the survey starts, or goes on to the next leg
+    TURNED = "turned"  # the robot points at the stop
+    REALIGN = "realign"  # it does not any more
+    ARRIVED = "arrived"  # the stop is reached
+    SETTLED = "settled"  # the robot is at rest there
+    EDGE = "edge"  # code 1: near the mirror's edge
+    GO_HOME = "go home"  # code 2, or the operator's abort
+    FIND = "find"  # stand still for a fix: the pose is not to be trusted
+    HOLD = "hold"  # pause, fault, or no permission to move
+    FINISHED = "finished"  # all points done, at base after an abort, or stopped
+
+
+class Outcome(StrEnum):
+    """How a mission ended."""
+
+    NONE = ""
+    COMPLETE = "complete"
+    AT_BASE = "aborted, at base"
+    STOPPED = "stopped"
+
+
+_ANYWHERE = {Event.HOLD: State.HELD, Event.FINISHED: State.DONE}
+_SURVEYING = _ANYWHERE | {Event.EDGE: State.BACKING_OFF, Event.GO_HOME: State.RETURNING, Event.GO_ON: State.TURNING}
+
+# (state, event) -> state. An edge outranks an abort: while backing off GO_HOME changes nothing. DONE is final.
+TRANSITIONS = MappingProxyType(
+    {
+        State.IDLE: _ANYWHERE
+        | {
+            Event.GO_ON: State.TURNING,
+            Event.GO_HOME: State.RETURNING,
+            Event.EDGE: State.BACKING_OFF,
+            Event.FIND: State.SETTLING,
+        },
+        State.TURNING: _SURVEYING | {Event.TURNED: State.DRIVING, Event.ARRIVED: State.SETTLING},
+        State.DRIVING: _SURVEYING | {Event.REALIGN: State.TURNING, Event.ARRIVED: State.SETTLING},
+        State.SETTLING: _SURVEYING | {Event.SETTLED: State.MEASURING},
+        State.MEASURING: _SURVEYING,
+        State.BACKING_OFF: _ANYWHERE | {Event.FIND: State.SETTLING},
+        State.RETURNING: _ANYWHERE | {Event.EDGE: State.BACKING_OFF},
+        State.HELD: _ANYWHERE
+        | {
+            Event.GO_ON: State.TURNING,
+            Event.GO_HOME: State.RETURNING,
+            Event.EDGE: State.BACKING_OFF,
+            Event.FIND: State.SETTLING,
+        },
+        State.DONE: {},
+    }
+)
+
+
+# What the last gate lets a state move for.
+PURPOSES = MappingProxyType(
+    {
+        State.IDLE: Purpose.STAND,
+        State.TURNING: Purpose.SURVEY,
+        State.DRIVING: Purpose.SURVEY,
+        State.SETTLING: Purpose.STAND,
+        State.MEASURING: Purpose.STAND,
+        State.BACKING_OFF: Purpose.RETREAT,
+        State.RETURNING: Purpose.HOMEWARD,
+        State.HELD: Purpose.STAND,
+        State.DONE: Purpose.STAND,
+    }
+)
+
+
+def next_state(state: State, event: Event) -> State:
+    """The state after ``event``; total over all pairs."""
+    return TRANSITIONS[state].get(event, state)
+
+
+# Planned at a time: a way through so many points takes less than the robot's frames may wait.
+CHUNK = 12
+
+
+def by_reason(causes: Mapping[PointId, str]) -> dict[str, list[str]]:
+    """Points, as people name them, by why they were left out."""
+    named: dict[str, list[str]] = {}
+    for point, why in causes.items():
+        named.setdefault(why, []).append(f"{point.row}-{point.col}-{point.point}")
+    return named
+
+
+class Leftovers:
+    """Keeps what is to be measured off the planned route.
+
+    Attributes:
+        causes: why a point was skipped.
+        due: points to be measured in this order, away from the planned route.
+    """
+
+    def __init__(self) -> None:
+        """Nothing failed."""
+        self.causes: dict[PointId, str] = {}
+        self.due: list[PointId] = []
+        self._tried_again: set[PointId] = set()
+
+    def failed(self, point: PointId, cause: str) -> None:
+        """The measurement of a point failed."""
+        self.causes[point] = cause
+        self._is_over(point)
+
+    def measured(self, point: PointId) -> None:
+        """A point is measured, perhaps after it failed."""
+        self.causes.pop(point, None)
+        self._is_over(point)
+
+    def _is_over(self, point: PointId) -> None:
+        if point in self.due:
+            self.due.remove(point)
+
+    def begin_second_round(self) -> None:
+        """What failed and was not tried again yet is due; last first, because the robot is nearer to that."""
+        if not self.due:
+            self.due = [point for point in reversed(self.causes) if point not in self._tried_again]
+            self._tried_again.update(self.due)
+
+    def thin_out(self, points: Sequence[PointId], wanted: Sequence[PointId], cause: str) -> None:
+        """Of these points only the wanted ones are due; there is no time for the others."""
+        self.due = list(wanted)
+        dropped = set(points).difference(wanted)
+        self.causes |= {point: cause for point in points if point in dropped}
+        self._tried_again |= dropped
+
+    @property
+    def chunk(self) -> list[PointId]:
+        """The points to be planned next."""
+        return self.due[:CHUNK]
+
+
+class MissedPoint:
+    """Keeps whether the current stop was missed, and at which one the last correction was made.
+
+    Args:
+        corrector: says where a correction leads.
+
+    Attributes:
+        corrections: correction moves begun.
+    """
+
+    def __init__(self, corrector: Corrector) -> None:
+        """Nothing missed."""
+        self._corrector = corrector
+        self._is_missed = False
+        self._corrected: Stop | None = None  # until the next leg
+        self.corrections = 0
+
+    def miss(self) -> None:
+        """The fix shows the robot too far from its point."""
+        self._is_missed = True
+
+    def interrupt(self) -> None:
+        """The robot stopped, or goes on: wherever it is, it is not where it missed the point."""
+        self._is_missed = False
+
+    def follows_route(self, motion: Motion, stop: Stop, journey: Journey) -> bool:
+        """Whether the leg to ``stop`` may be driven as planned, or as the correction that begins here.
+
+        Args:
+            motion: the present frame.
+            stop: the current one.
+            journey: its journey.
+        """
+        if self._is_missed:
+            self._is_missed = False
+            return self._correct(motion, stop, journey)
+        if self._corrected is None or self._corrected is stop:
+            return True
+        self._corrected = None
+        return self._corrector.can_go_on(motion.deck, stop)
+
+    def _correct(self, motion: Motion, stop: Stop, journey: Journey) -> bool:
+        panel = motion.pose.panel
+        aim = self._corrector.aim(motion.pose, journey.target_in(panel, stop))
+        if aim is None:
+            return False
+        journey.correct(panel, aim)
+        self._corrected = stop
+        self.corrections += 1
+        return True
+
+
+PlanHome = Callable[[DeckPose], tuple[Stop, ...]]
+PlanRest = Callable[[Route, DeckPose, Collection[PointId]], Route]
+PlanPoints = Callable[[DeckPose, Sequence[PointId]], Route]
+
+
+class Standing:
+    """State, causes and parts of one survey.
+
+    Args:
+        cfg: the configuration.
+        mirror: the mirror surveyed.
+        route: the route of the survey.
+        has_planner: points that failed once can be planned for.
+        heading_sigma_of: how well the heading is known, rad.
+
+    Attributes:
+        state, outcome, cause: as operators see them.
+        done, skipped: points, in the order in which that happened.
+        leftovers: the points that failed.
+        survey: the journey along the route.
+        home: the way home, once it is planned.
+        abort_cause: why the survey was given up, or ``None``.
+        bar: why nothing may move, an earthquake, or empty.
+        is_latched: an emergency is in force.
+        is_shaking: there is an earthquake, though the robot may be leaving an edge first.
+        severity: of the newest verdict.
+        is_held_by_hand: somebody has to resume.
+        is_faulted: something is wrong, and an operator has to look after it.
+        is_hold_deaf: held because wheels or inertial unit are not to be believed.
+        is_lost: a fix comes before the next move, because the pose is known to be wrong or (``is_at_start``) not
+            confirmed yet.
+        is_off_route: the way back to the route has to be planned.
+        is_review_due: the time budget has to be looked at.
+        doubts_pose: the localizer shall doubt its pose.
+        wants_calibration: the calibration drive was given up, too far from where it leads.
+        wants_full_fans: the robot shall be pressed on with all that the fans have.
+        retreat: the retreat from an edge under way.
+        stuck_s: when a retreat led nowhere, robot time.
+        backoffs: retreats since the last point.
+        waits_until_s: a hold that goes on by itself lasts at least until then, robot time.
+        stands_until_s: nothing moves before then, whatever the state, robot time.
+    """
+
+    def __init__(
+        self, cfg: Config, mirror: Mirror, route: Route, heading_sigma_of: Callable[[], float], *, has_planner: bool
+    ) -> None:
+        """Idle at base."""
+        self.cfg, self.mirror, self.route, self._has_planner = cfg, mirror, route, has_planner
+        self.tracker = PacedTracker(cfg.control, cfg.limits, cfg.health, cfg.robot.wheel_lag_s)
+        self.survey = self.journey_along(route.stops)
+        self.home: Homing | None = None
+        self.stopover = Stopover(cfg.control, cfg.etalon.measuring_time_s)
+        self.missed = MissedPoint(Corrector(mirror, cfg.robot, cfg.mission))
+        self.aligner = Aligner(mirror, cfg.robot, cfg.mission, heading_sigma_of, self.journey_along)
+        self.leftovers = Leftovers()
+        self.state, self.outcome, self.cause = State.IDLE, Outcome.NONE, ""
+        self.done: list[PointId] = []
+        self.skipped: list[PointId] = []
+        self.abort_cause: str | None = None
+        self.bar = ""
+        self.is_latched = self.is_shaking = False
+        self.severity = Severity.NONE
+        self.is_held_by_hand = self.is_faulted = self.is_hold_deaf = False
+        self.is_lost = self.is_at_start = cfg.mission.fix_at_start
+        self.is_off_route = self.is_review_due = self.doubts_pose = self.wants_full_fans = False
+        self.wants_calibration = False
+        self.retreat: Retreat | None = None
+        self.stuck_s: float | None = None
+        self.backoffs = 0
+        self.waits_until_s = self.stands_until_s = -inf
+        self._recoveries_s: list[float] = []
+
+    def journey_along(self, stops: Sequence[Stop]) -> Journey:
+        """A journey along stops."""
+        return Journey(self.mirror, self.tracker, self.cfg.control.leg_timeout_factor, stops)
+
+    @property
+    def journey(self) -> Journey:
+        """The journey being made: the survey, the way home, or a leg that shows the heading."""
+        if self.aligner.journey is not None:
+            return self.aligner.journey
+        return self.survey if self.home is None else self.home.journey
+
+    @property
+    def ignores_motion(self) -> bool:
+        """Held because wheels or inertial unit are not to be believed: whatever they say, the robot stands."""
+        return self.state is HELD and self.is_hold_deaf
+
+    @property
+    def purpose(self) -> Purpose:
+        """What the last gate lets the robot move for: legs that show the heading may be part of the way home."""
+        if self.is_lost and self.abort_cause is not None and self.state in (State.TURNING, State.DRIVING):
+            return Purpose.HOMEWARD
+        return PURPOSES[self.state]
+
+    @property
+    def is_awaiting_fix(self) -> bool:
+        """Whether the measurement asked for last is still wanted."""
+        return self.state is State.MEASURING and self.stopover.is_asked
+
+    def apply(self, event: Event) -> None:
+        """Something happened: the table says what state that makes."""
+        self.state = next_state(self.state, event)
+
+    def lose(self) -> None:
+        """The pose is known to be wrong: a fix comes before the next move."""
+        self.is_lost, self.is_at_start = True, False
+
+    def interrupt_travel(self) -> None:
+        """Drive the leg anew from where the robot is."""
+        (self.survey if self.home is None else self.home).interrupt()
+
+    def interrupt_parts(self) -> None:
+        """Forget where in a leg, a stop or a docking the robot was: it begins anew from where it is."""
+        self.interrupt_travel()
+        self.stopover.interrupt()
+        self.missed.interrupt()
+        self.aligner.interrupt()
+
+    # -- holding and going on -------------------------------------------------------------------------------------
+
+    def hold(self, cause: str, *, by_hand: bool) -> None:
+        """Hold, until somebody resumes or until the cause is gone."""
+        self.interrupt_parts()
+        self.apply(Event.HOLD)
+        self.is_held_by_hand = by_hand
+        self.is_hold_deaf = False
+        self.cause = cause
+
+    def interrupt(self, cause: str) -> bool:
+        """Hold until frames and verdicts are fresh again; returns whether that was news."""
+        if self.state in (State.IDLE, State.HELD, State.DONE):
+            return False
+        self.hold(cause, by_hand=False)
+        return True
+
+    def fault(self, cause: str, *, is_lost: bool = False) -> None:
+        """Hold until an operator resumes, because something is wrong; where the pose is, a fix comes first then."""
+        if self.state is State.DONE:
+            return
+        self.is_lost |= is_lost
+        self.hold(cause, by_hand=True)
+        self.is_faulted = True
+
+    def await_recovery(self, cause: str, *, is_pose_doubted: bool = False) -> None:
+        """Hold until the cause is gone, and then find out where the robot is before moving on."""
+        if self.state is State.DONE or (self.state is HELD and self.is_held_by_hand):
+            return
+        self.lose()
+        was_deaf = self.ignores_motion
+        if not self.interrupt(cause):
+            self.cause = cause
+        self.is_hold_deaf = was_deaf or is_pose_doubted
+
+    def recover(self, cause: str, t_s: float) -> None:
+        """Hold, and go on with a fix; what comes again and again is a fault.
+
+        Args:
+            cause: why.
+            t_s: now.
+        """
+        if self.state is State.DONE or (self.state is HELD and self.is_held_by_hand):
+            return
+        health = self.cfg.health
+        self._recoveries_s = [since_s for since_s in self._recoveries_s if t_s - since_s <= health.retry_window_s]
+        if self._recoveries_s and t_s - self._recoveries_s[-1] <= health.pause_limit_s:
+            self._recoveries_s.pop()  # still the same: frame by frame it is asked for again
+        self._recoveries_s.append(t_s)
+        if len(self._recoveries_s) > 1 + health.retries:
+            self.fault(cause, is_lost=True)
+        else:
+            self.await_recovery(cause)
+            # A filter that is frozen cannot tell when the robot stands.
+            self.waits_until_s = t_s + health.retry_after_s
+
+    def go_on(self) -> None:
+        """To what is next: finding the robot, home, the next stop, or the end."""
+        self.interrupt_parts()
+        self.doubts_pose |= self.ignores_motion
+        self.is_faulted = False
+        # Wherever a hold left the robot: the route's next turn may not be safe there.
+        self.is_off_route |= self.state is State.HELD
+        if self.is_lost:
+            self.apply(Event.FIND)
+        elif self.abort_cause is not None:
+            self.cause = self.abort_cause
+            self.home = None  # planned anew from where the robot is now
+            self.apply(Event.GO_HOME)
+        elif self.survey.current is None and not self._has_more():
+            self.outcome = Outcome.COMPLETE
+            self.apply(Event.FINISHED)
+        else:
+            self.cause = ""
+            self.apply(Event.GO_ON)
+
+    def _has_more(self) -> bool:
+        """Whether points are due away from the planned route: those that failed once, or a thinned rest."""
+        if not self._has_planner:
+            return False
+        self.leftovers.begin_second_round()
+        self.is_off_route |= bool(self.leftovers.due)
+        return bool(self.leftovers.due)
+
+
+# A puck is within the tolerance when it is so by more than the fix may be wrong (guard band, ISO 14253-1); but a laser
+# system of little precision cannot make a robot approach a point again and again.
+_GUARD_SIGMAS = 3.0
+_MOST_GUARD = 0.1  # of the tolerance
+
+
+class Approaches:
+    """Decides on a correction move after each fix.
+
+    Args:
+        tolerance_m: a puck further than this from its point has to come nearer.
+        limit: approaches of one point before it is measured wherever the robot stands.
+    """
+
+    def __init__(self, tolerance_m: float, limit: int) -> None:
+        """No point approached yet."""
+        self._tolerance_m, self._limit = tolerance_m, limit
+        self._point: PointId | None = None
+        self.count = 0
+
+    def is_too_far(self, point: PointId, error_m: float, sigma_m: float) -> bool:
+        """Whether ``point`` has to be approached again; call once for each fix taken there.
+
+        Args:
+            point: that was measured.
+            error_m: distance of the puck from it, by the fix.
+            sigma_m: standard deviation of the robot's place after the fix, along its worst direction.
+        """
+        self.count = self.count + 1 if point == self._point else 1
+        self._point = point
+        guard_m = min(_GUARD_SIGMAS * sigma_m, _MOST_GUARD * self._tolerance_m)
+        return error_m > self._tolerance_m - guard_m and self.count < self._limit

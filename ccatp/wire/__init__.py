@@ -1,1 +1,0 @@
-"""Pure. Every message that crosses a border, and its codec."""
