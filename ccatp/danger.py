@@ -22,13 +22,13 @@ from typing import NamedTuple, Protocol
 
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
 from ccatp.core import Corner, EdgeSample, EmergencyKind, EventCode, Severity, Verdict, WheelSample
-from ccatp.safety.edge_detector import EdgeMap, Episode, MirrorMap, Phase
-from ccatp.safety.edge_rule import EdgeRule, OriginRule, PoseEstimate
-from ccatp.safety.emergency_latch import HEARD_AFTER_FRAMES, AbortLatch, is_at_base_or_held
-from ccatp.safety.escalation import Finding, Ladder, denies, gravest
-from ccatp.safety.monitor import Commanded, Frame, HealthBoard
+from ccatp.safety.edge_detector import EdgeDetector, EdgeMap, EdgePhase, MirrorMap
+from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule, PoseEstimate
+from ccatp.safety.emergency_latch import HEARD_AFTER_FRAMES, EmergencyLatch, is_at_base_or_held
+from ccatp.safety.escalation import MonitorFinding, SeverityEscalation, denies, gravest
+from ccatp.safety.monitor import CommandedMotion, HealthMonitor, MonitorFrame
 from ccatp.safety.robot_clock import SteadyTime
-from ccatp.safety.sensor_monitors import GarbledLines, Ground
+from ccatp.safety.sensor_monitors import FramingErrorRate, Ground
 
 CORNERS = tuple(Corner)
 CLOCK_JUMP_S = 0.1
@@ -48,7 +48,7 @@ class _Missing(NamedTuple):
     limit_s: float
 
 
-class SensorsFrame(Frame, Protocol):
+class SensorsFrame(MonitorFrame, Protocol):
     """The part of a sensors frame that the rules read."""
 
     @property
@@ -82,7 +82,7 @@ class _Shifted(NamedTuple):
     drive_seq: int
 
 
-class Estimate(PoseEstimate, Commanded, Protocol):
+class PoseReport(PoseEstimate, CommandedMotion, Protocol):
     """Main's estimate: pose, the state of the mission, what the wheels were told."""
 
     @property
@@ -107,19 +107,19 @@ class DangerMonitor:
         self._cfg, self._sensors_m, self._health = cfg, robot.edge_sensors_m, health
         self._map = EdgeMap(mirror)
         self._edges = EdgeRule(self._map, robot, cfg)
-        self._board: HealthBoard | None = None
+        self._board: HealthMonitor | None = None
         if health is not None:
             base = mirror.base_pose
             ground = Ground(dict(mirror.panels), mirror.nearest_panel, self._map.place)
-            self._board = HealthBoard(
+            self._board = HealthMonitor(
                 health, cfg, robot, ground, (base.x_m, base.y_m), mirror.overhang, self._is_explained
             )
-            self._ladder = Ladder(health)
-            self._garbled = GarbledLines(health.garbled_lines, health.garbled_window_s)
+            self._ladder = SeverityEscalation(health)
+            self._garbled = FramingErrorRate(health.garbled_lines, health.garbled_window_s)
         self._time = SteadyTime(CLOCK_JUMP_S if health is None else health.clock_jump_s)
-        self._origin = OriginRule(mirror.rim, robot, cfg)
+        self._origin = CentreClearanceCheck(mirror.rim, robot, cfg)
         self._stale_after_s, self._estimate_stale_after_s = cfg.stale_after_s, cfg.estimate_stale_after_s
-        self.latch = AbortLatch()
+        self.latch = EmergencyLatch()
         self.reset()
 
     def reset(self) -> None:
@@ -128,7 +128,7 @@ class DangerMonitor:
         self._origin.reset()
         self._edge_t_s: float | None = None
         self._state = ""
-        self._known: Estimate | None = None
+        self._known: PoseReport | None = None
         self._raised_seq = -HEARD_AFTER_FRAMES - 1  # the frame in which the newest emergency was raised
         self._time.reset()
         self._is_climbing = False
@@ -156,7 +156,7 @@ class DangerMonitor:
         return self.latch.holds(emergency_id)
 
     def set_level(self, kind: EmergencyKind, active: bool) -> None:
-        """Whether a lasting cause is present; see ``AbortLatch.set_level``."""
+        """Whether a lasting cause is present; see ``EmergencyLatch.set_level``."""
         self.latch.set_level(kind, active)
 
     @property
@@ -194,7 +194,7 @@ class DangerMonitor:
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
-    def step(self, sensors: SensorsFrame, estimate: Estimate | None) -> Verdict:
+    def step(self, sensors: SensorsFrame, estimate: PoseReport | None) -> Verdict:
         """The verdict on a frame.
 
         Args:
@@ -239,7 +239,7 @@ class DangerMonitor:
             self.verdict = verdict = self.latch.told(verdict)
         return verdict
 
-    def _shifted(self, estimate: Estimate | None) -> Estimate | None:
+    def _shifted(self, estimate: PoseReport | None) -> PoseReport | None:
         if estimate is None:
             return None
         e, t_s = estimate, self._time.of(estimate.seq, estimate.t_s)
@@ -249,7 +249,7 @@ class DangerMonitor:
 
     def _look(
         self, sensors: SensorsFrame, t_s: float, wheels: Sequence[WheelSample], samples: list[EdgeSample]
-    ) -> Sequence[Finding]:
+    ) -> Sequence[MonitorFinding]:
         """What the monitors find in the frame."""
         board, known, jump = self._board, self._known, self._time.jump
         if board is None:
@@ -274,29 +274,29 @@ class DangerMonitor:
         slack_m = cfg.gap_tolerance_m + cfg.seam_extra_m + cfg.map_sigmas * known.sigma_m
         return self._map.has_edge_near(self._map.place(pose, self._sensors_m[sensor]), slack_m)
 
-    def _own_findings(self, missing: _Missing | None) -> list[Finding]:
+    def _own_findings(self, missing: _Missing | None) -> list[MonitorFinding]:
         """Findings of the rules here: data that are missing, the robot lifted, a sensor off for no reason."""
         found = []
         if missing is not None:
             # Without its wheels nobody knows where the robot went meanwhile.
             severity = Severity.HOLD if missing.signal == "enc" else _STALE
-            found.append(Finding(severity, missing.cause, missing.signal, missing.age_s, missing.limit_s))
+            found.append(MonitorFinding(severity, missing.cause, missing.signal, missing.age_s, missing.limit_s))
         if self._health is None:
             return found
         if self._edges.is_lifted:
             limit_s = self._health.lifted_limit_s
             cause = "all edge sensors off: lifted or fallen"
-            found.append(Finding(Severity.HOLD, cause, "edge", 4.0, 3.0, full_fans=True, patience_s=limit_s))
+            found.append(MonitorFinding(Severity.HOLD, cause, "edge", 4.0, 3.0, full_fans=True, patience_s=limit_s))
         for i, episode in enumerate(self._edges.episodes):
             if episode is not None and self._stays_off(i, episode):
                 cause = "an edge sensor stays off though it was moved back and the others are on"
                 limit_m = self._health.stuck_off_m
-                found.append(Finding(Severity.HOLD, cause, CORNERS[i].value, episode.retreat_m, limit_m))
+                found.append(MonitorFinding(Severity.HOLD, cause, CORNERS[i].value, episode.retreat_m, limit_m))
         return found
 
-    def _stays_off(self, sensor: int, episode: Episode) -> bool:
+    def _stays_off(self, sensor: int, episode: EdgeDetector) -> bool:
         """Once that is so, it stays so until the sensor has been on for long enough to end the episode."""
-        if episode.phase is not Phase.DECLARED or self._health is None:
+        if episode.phase is not EdgePhase.DECLARED or self._health is None:
             return False
         if not episode.is_doubted and episode.retreat_m >= self._health.stuck_off_m:
             others = (e is None or e is episode or e.is_on for e in self._edges.episodes)
@@ -311,11 +311,11 @@ class DangerMonitor:
         pose = known.x_m, known.y_m, known.heading_rad
         return self._map.is_beyond_rim(self._map.place(pose, self._sensors_m[sensor]))
 
-    def _climb(self, t_s: float, found: list[Finding]) -> list[Finding]:
+    def _climb(self, t_s: float, found: list[MonitorFinding]) -> list[MonitorFinding]:
         self._is_climbing = bool(found)
         return self._ladder.climb(t_s, found)
 
-    def _weigh(self, verdict: Verdict, found: list[Finding]) -> Verdict:
+    def _weigh(self, verdict: Verdict, found: list[MonitorFinding]) -> Verdict:
         """The verdict of the rules with what was found."""
         top = gravest(found)
         if top is None:
@@ -357,13 +357,13 @@ class DangerMonitor:
         denied = _Missing(finding.signal, finding.cause, finding.value, finding.limit)
         return self.latch.told(_denied(seq, t_s, self.code, denied, finding.severity))
 
-    def _is_fresh(self, estimate: Estimate, t_s: float) -> bool:
+    def _is_fresh(self, estimate: PoseReport, t_s: float) -> bool:
         # Written so that a time that is not a number is not fresh.
         return abs(t_s - estimate.t_s) <= self._estimate_stale_after_s and isfinite(
             estimate.x_m + estimate.y_m + estimate.heading_rad + estimate.sigma_m
         )
 
-    def _missing(self, t_s: float, estimate: Estimate | None, is_known: bool) -> _Missing | None:
+    def _missing(self, t_s: float, estimate: PoseReport | None, is_known: bool) -> _Missing | None:
         limit_s = self._stale_after_s
         if self._edge_t_s is None:
             return _Missing("edge", "no edge samples", limit_s, limit_s)
@@ -375,7 +375,7 @@ class DangerMonitor:
             return _Missing("enc", "encoder samples stale", silent_s, limit_s)
         return None if is_known else self._estimate_missing(t_s, estimate)
 
-    def _estimate_missing(self, t_s: float, estimate: Estimate | None) -> _Missing:
+    def _estimate_missing(self, t_s: float, estimate: PoseReport | None) -> _Missing:
         # The values go out as JSON: an age that is not finite is no number there.
         limit_s = self._estimate_stale_after_s
         if estimate is None:
@@ -387,9 +387,9 @@ class DangerMonitor:
 
     # -- arbitration ----------------------------------------------------------------------------------------------
 
-    def _declared(self) -> Episode | None:
+    def _declared(self) -> EdgeDetector | None:
         """The first sensor's episode that is a declared edge."""
-        return next((e for e in self._edges.episodes if e is not None and e.phase is Phase.DECLARED), None)
+        return next((e for e in self._edges.episodes if e is not None and e.phase is EdgePhase.DECLARED), None)
 
     def _arbitrate(self, seq: int, t_s: float, missing: _Missing | None) -> Verdict:
         if self._edges.is_lifted:
@@ -411,7 +411,7 @@ class DangerMonitor:
         cause, signal = f"emergency: {kind}", f"emergency:{kind}"
         return Verdict(seq, t_s, EventCode.ABORTED, cause, signal, 1.0, 0.0, may_move, may_move, may_move)
 
-    def _edge_verdict(self, seq: int, t_s: float, episode: Episode, missing: _Missing | None) -> Verdict:
+    def _edge_verdict(self, seq: int, t_s: float, episode: EdgeDetector, missing: _Missing | None) -> Verdict:
         front_left, front_right, rear_left, rear_right = off = self._declared_sensors()
         turn = all(e is None or e.permits_turn for e in self._edges.episodes)
         known, barred = missing is None, self._origin.direction
@@ -440,7 +440,7 @@ class DangerMonitor:
         )
 
     def _declared_sensors(self) -> tuple[bool, bool, bool, bool]:
-        a, b, c, d = (e is not None and e.phase is Phase.DECLARED for e in self._edges.episodes)
+        a, b, c, d = (e is not None and e.phase is EdgePhase.DECLARED for e in self._edges.episodes)
         return a, b, c, d
 
 

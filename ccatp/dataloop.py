@@ -27,23 +27,23 @@ from ccatp.sim.beacon_robot import BeaconTruthLog, build_beacon_robot, motes_of
 from ccatp.sim.fault_models import Injected
 from ccatp.sim.fault_plan import FaultPlan
 from ccatp.sim.fault_proxy import FaultProxy, LinkFaults
-from ccatp.sim.ground_truth import BodyFile, TruthOutlet
+from ccatp.sim.ground_truth import GroundTruthPublisher, SimPoseFile
 from ccatp.sim.robot import Robot, TruthLog
-from ccatp.sim.sessions import RobotServer, ServedRobot, Session
+from ccatp.sim.sessions import RobotServer, RobotSession, ServedRobot
 
 HOUSEKEEPING_S = 0.25
 # A client that does not read gets no more frames once this much waits for it; it finds the newest when it reads on.
 MAX_UNSENT_BYTES = 1 << 18
 
 
-class Log(Protocol):
+class ServerLog(Protocol):
     """A structlog logger, or whatever has this method."""
 
     def info(self, event: str, **fields: object) -> object:
         """Take one line, and what belongs to it."""
 
 
-class LinkServer:
+class RobotLinkServer:
     """The server of one robot.
 
     Args:
@@ -58,7 +58,7 @@ class LinkServer:
     """
 
     def __init__(
-        self, robot: ServedRobot, address: tuple[str, int], *, lockstep: bool, key: bytes | None, log: Log | None
+        self, robot: ServedRobot, address: tuple[str, int], *, lockstep: bool, key: bytes | None, log: ServerLog | None
     ) -> None:
         self._served, self._address, self._is_lockstep = robot, address, lockstep
         self._key, self._log = key, log
@@ -135,12 +135,12 @@ class LinkServer:
     def _connection(self) -> "_Connection":
         return _Connection(self)
 
-    def opened(self, connection: "_Connection") -> Session:
+    def opened(self, connection: "_Connection") -> RobotSession:
         """A client connected."""
         self._connections.add(connection)
         return self.server.accept(connection, asyncio.get_running_loop().time())
 
-    def closed(self, connection: "_Connection", session: Session) -> None:
+    def closed(self, connection: "_Connection", session: RobotSession) -> None:
         """A client is gone."""
         self._connections.discard(connection)
         self.server.lost(session)
@@ -167,10 +167,10 @@ class LinkServer:
 class _Connection(asyncio.Protocol):
     """Bytes in and out of one connection."""
 
-    def __init__(self, owner: LinkServer) -> None:
+    def __init__(self, owner: RobotLinkServer) -> None:
         self._owner = owner
         self._transport: asyncio.Transport | None = None
-        self._session: Session | None = None
+        self._session: RobotSession | None = None
         self._is_paused = False
         self._clock = asyncio.get_running_loop().time
 
@@ -214,7 +214,7 @@ class _Connection(asyncio.Protocol):
             self._transport.close()
 
 
-class DataLoop(LinkServer):
+class DataLoop(RobotLinkServer):
     """The server.
 
     Args:
@@ -239,14 +239,14 @@ class DataLoop(LinkServer):
         lockstep: bool,
         seed: int,
         key: bytes | None = None,
-        log: Log | None = None,
+        log: ServerLog | None = None,
         faults: FaultPlan | None = None,
         start: DeckPose | None = None,
     ) -> None:
         self.robot = Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(seed), faults, start)
         super().__init__(self.robot, (cfg.sim.robot.host, cfg.sim.robot.port), lockstep=lockstep, key=key, log=log)
-        self.body: BodyFile | None = None
-        self.truth: TruthOutlet | None = None
+        self.body: SimPoseFile | None = None
+        self.truth: GroundTruthPublisher | None = None
         self.link_faults: LinkFaults | None = None
 
     def on_close(self) -> None:
@@ -289,7 +289,7 @@ async def serve(
     truth_rep: str | None = None,
     truth_pub: str | None = None,
     key: bytes | None = None,
-    log: Log | None = None,
+    log: ServerLog | None = None,
     faults: FaultPlan | None = None,
     body_file: Path | None = None,
     is_resuming: bool = False,
@@ -314,11 +314,11 @@ async def serve(
         OSError: the address cannot be had.
         zmq.ZMQError: an endpoint cannot be had.
     """
-    body = None if body_file is None else BodyFile(body_file)
+    body = None if body_file is None else SimPoseFile(body_file)
     start = body.read() if body is not None and is_resuming else None
     data_loop = DataLoop(cfg, lockstep, seed, key, log, faults, start)
     data_loop.body = body
-    data_loop.truth = outlet = TruthOutlet(TruthLog(data_loop.robot), truth_rep, truth_pub)
+    data_loop.truth = outlet = GroundTruthPublisher(TruthLog(data_loop.robot), truth_rep, truth_pub)
     try:
         async with AsyncExitStack() as stack:
             if faults is not None and faults.link:
@@ -347,7 +347,7 @@ async def _put_proxy_before(
     return behind
 
 
-class BeaconLoop(LinkServer):
+class BeaconRobotServer(RobotLinkServer):
     """The server.
 
     Args:
@@ -361,10 +361,10 @@ class BeaconLoop(LinkServer):
         truth: who gives the truth away.
     """
 
-    def __init__(self, cfg: RadioConfig, *, lockstep: bool, key: bytes | None, log: Log | None) -> None:
+    def __init__(self, cfg: RadioConfig, *, lockstep: bool, key: bytes | None, log: ServerLog | None) -> None:
         self.robot = build_beacon_robot(cfg)
         super().__init__(self.robot, (cfg.sim.robot.host, cfg.sim.robot.port), lockstep=lockstep, key=key, log=log)
-        self.truth: TruthOutlet | None = None
+        self.truth: GroundTruthPublisher | None = None
 
     def on_frame(self) -> None:
         """Keep the truth."""
@@ -386,7 +386,7 @@ async def serve_beacons(
     truth_rep: str | None = None,
     truth_pub: str | None = None,
     key: bytes | None = None,
-    log: Log | None = None,
+    log: ServerLog | None = None,
 ) -> None:
     """Run a robot among beacons until ``stop`` is set.
 
@@ -404,8 +404,8 @@ async def serve_beacons(
         OSError: the address cannot be had.
         zmq.ZMQError: an endpoint cannot be had.
     """
-    loop = BeaconLoop(cfg, lockstep=lockstep, key=key, log=log)
-    loop.truth = outlet = TruthOutlet(BeaconTruthLog(loop.robot, motes_of(cfg)), truth_rep, truth_pub)
+    loop = BeaconRobotServer(cfg, lockstep=lockstep, key=key, log=log)
+    loop.truth = outlet = GroundTruthPublisher(BeaconTruthLog(loop.robot, motes_of(cfg)), truth_rep, truth_pub)
     try:
         await loop.start(listen_sock)
         async with asyncio.TaskGroup() as tasks:

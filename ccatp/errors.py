@@ -57,7 +57,7 @@ class RefusedError(CcatpError):
     exit_status = ExitStatus.REFUSED
 
 
-class UnreachableError(CcatpError):
+class DaemonUnreachableError(CcatpError):
     """A peer that does not answer."""
 
     exit_status = ExitStatus.UNREACHABLE

@@ -28,10 +28,10 @@ from ccatp.links.multiline import (
     Connected,
     Environment,
     LaserReady,
+    MultilineRequest,
     Notice,
     Remark,
     Reply,
-    Request,
 )
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 
@@ -65,7 +65,7 @@ class EtalonLink(asyncio.Protocol):
         try:
             while not self.fault and (line := self._lines.next_line()) is not None:
                 self._deliver(line)
-        except multiline.LineTooLong as error:
+        except multiline.MultilineTooLong as error:
             self._fail(error)
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -105,7 +105,7 @@ class EtalonLink(asyncio.Protocol):
         """More came than was asked for, so no line can be trusted to answer what it seems to."""
         return self._unasked or self._lines.pending
 
-    async def ask(self, request: Request) -> bytes:
+    async def ask(self, request: MultilineRequest) -> bytes:
         """Send and wait for one line; the deadline is the caller's.
 
         Raises:
@@ -121,7 +121,7 @@ class EtalonLink(asyncio.Protocol):
         self._stream = asyncio.Queue(_STREAM_LINES)
         return self._stream
 
-    def send(self, request: Request) -> None:
+    def send(self, request: MultilineRequest) -> None:
         """Send without waiting for anything.
 
         Raises:
@@ -235,7 +235,7 @@ class EtalonClient:
         self._where = f"Etalon server {cfg.host}:{cfg.port}"
         self._channels = tuple(channels)
         self._collimators = dict(zip(self._channels, np.asarray(collimators_m, dtype=np.float64), strict=True))
-        self._request = Request(Command.LATEST_LENGTH_VALID, self._channels)
+        self._request = MultilineRequest(Command.LATEST_LENGTH_VALID, self._channels)
         self._link: EtalonLink | None = None
         self._turn = asyncio.Lock()
         self._last: tuple[dict[int, float], Vector3] | None = None  # lengths of the last fix, and where it was expected
@@ -312,7 +312,7 @@ class EtalonClient:
     async def _command(self, link: EtalonLink, queue: PushQueue, command: Command, awaited: Notice) -> None:
         """Start or stop the stream; records that were already on their way are passed over."""
         try:
-            link.send(Request(command))
+            link.send(MultilineRequest(command))
         except ConnectionError as error:
             raise EtalonUnreachable(f"{self._where}: {error}; is it running?") from None
         while (reply := await self._next_pushed(queue)) is not awaited:
@@ -382,7 +382,7 @@ class EtalonClient:
             self._link.abort()
             self._link = None
 
-    async def _ask(self, request: Request, expected: type[_ReplyT]) -> _ReplyT:
+    async def _ask(self, request: MultilineRequest, expected: type[_ReplyT]) -> _ReplyT:
         """One request, one reply of the expected kind; whatever else happens, the connection is gone."""
         link = await self._usable_link()
         self.counts["requests"] += 1
@@ -398,7 +398,7 @@ class EtalonClient:
         except TimeoutError:
             self._drop()
             raise self._timeout(request.command) from None
-        except (multiline.BadReply, multiline.LineTooLong) as error:
+        except (multiline.BadReply, multiline.MultilineTooLong) as error:
             self._drop()
             raise EtalonBadReply(f"{self._where}: {error}; is this a MultiLine server?") from None
         except ConnectionError as error:
@@ -420,9 +420,9 @@ class EtalonClient:
             raise EtalonServerError(f"{self._where}: refused {request}: {reply.text!r}; see its log", None)
 
     async def _ask_readiness(self) -> Readiness:
-        connected = await self._ask(Request(Command.IS_CONNECTED), Connected)
-        laser_ready = await self._ask(Request(Command.LASER_READY), LaserReady)
-        environment = await self._ask(Request(Command.ENVIRONMENT_DATA), Environment)
+        connected = await self._ask(MultilineRequest(Command.IS_CONNECTED), Connected)
+        laser_ready = await self._ask(MultilineRequest(Command.LASER_READY), LaserReady)
+        environment = await self._ask(MultilineRequest(Command.ENVIRONMENT_DATA), Environment)
         return Readiness(connected.value, laser_ready.value, environment)
 
     async def _measure_once(self, t_s: float, expected_m: Vector3) -> Fix:

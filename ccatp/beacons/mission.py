@@ -15,17 +15,17 @@ from enum import StrEnum
 from math import isfinite
 from typing import NamedTuple
 
-from ccatp.beacons.navigation import Belief, MoteNavigator, Navigator, RadioNavigator, Senses
+from ccatp.beacons.navigation import BeaconMeasurements, MoteNavigator, Navigator, PoseBelief, RadioNavigator
 from ccatp.beacons.pilot import BeaconPilot
-from ccatp.beacons.steering import HALT, Drive
+from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import EventCode, Severity, Verdict
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello
-from ccatp.survey.state import Outcome
+from ccatp.survey.state import SurveyOutcome
 
 
-class State(StrEnum):
+class BeaconState(StrEnum):
     """What the mission is at; idle, held and done mean to the danger loop that the robot stands."""
 
     IDLE = "idle"
@@ -37,14 +37,14 @@ class State(StrEnum):
     DONE = "done"
 
 
-IDLE, MAPPING, VISITING, FOLLOWING, RETURNING, HELD, DONE = State
+IDLE, MAPPING, VISITING, FOLLOWING, RETURNING, HELD, DONE = BeaconState
 MOVING = (VISITING, FOLLOWING, RETURNING)
 
 # Nothing moves while the ground shakes.
 EARTHQUAKE = "emergency: earthquake"
 
 
-class Holding:
+class BeaconHold:
     """State and causes of the mission.
 
     Attributes:
@@ -57,8 +57,8 @@ class Holding:
 
     def __init__(self) -> None:
         """Idle."""
-        self.state: State = IDLE
-        self.outcome = Outcome.NONE
+        self.state: BeaconState = IDLE
+        self.outcome = SurveyOutcome.NONE
         self.cause = self.abort_cause = ""
         self.is_faulted = False
         self._is_by_hand = False
@@ -105,7 +105,7 @@ class Holding:
         """Hold the wheels and end here."""
         if self.state is DONE:
             return "the mission is over"
-        self.finish(Outcome.STOPPED)
+        self.finish(SurveyOutcome.STOPPED)
         return None
 
     def fault(self, cause: str) -> None:
@@ -121,7 +121,7 @@ class Holding:
         self._hold(cause, by_hand=False)
         return True
 
-    def finish(self, outcome: Outcome) -> None:
+    def finish(self, outcome: SurveyOutcome) -> None:
         """The mission is over."""
         self.state, self.outcome = DONE, outcome
 
@@ -172,7 +172,7 @@ class Holding:
         self._is_by_hand = self.is_faulted = False
 
 
-def permitted(drive: Drive, verdict: Verdict, back_speed_m_s: float) -> Drive:
+def permitted(drive: SteeringCommand, verdict: Verdict, back_speed_m_s: float) -> SteeringCommand:
     """What is left of a drive.
 
     Where forward motion is wanted and denied, the robot backs off straight, if that is permitted: what it stands before
@@ -186,15 +186,15 @@ def permitted(drive: Drive, verdict: Verdict, back_speed_m_s: float) -> Drive:
     if not all(map(isfinite, drive)):
         return HALT
     if drive.speed_m_s > 0.0 and not verdict.forward:
-        return Drive(-back_speed_m_s, 0.0, 0.0) if verdict.reverse else HALT
+        return SteeringCommand(-back_speed_m_s, 0.0, 0.0) if verdict.reverse else HALT
     if drive.speed_m_s < 0.0 and not verdict.reverse:
         return HALT
     if not verdict.turn:
-        return Drive(drive.speed_m_s, 0.0, 0.0)
+        return SteeringCommand(drive.speed_m_s, 0.0, 0.0)
     return drive
 
 
-class Arrival(NamedTuple):
+class WaypointArrival(NamedTuple):
     """A waypoint is reached.
 
     Attributes:
@@ -206,10 +206,10 @@ class Arrival(NamedTuple):
     waypoint: int
     lap: int
     place_m: tuple[float, float]
-    belief: Belief
+    belief: PoseBelief
 
 
-class BeaconMission(Holding):
+class BeaconMission(BeaconHold):
     """Maps and visits waypoints, or follows a radio, and returns to its start when it is given up.
 
     Call ``step`` once per frame.
@@ -230,7 +230,7 @@ class BeaconMission(Holding):
         self._cfg, self.navigator = cfg, navigator
         self.pilot = BeaconPilot(cfg)
         self._homing: BeaconPilot | None = None
-        self.arrivals: list[Arrival] = []
+        self.arrivals: list[WaypointArrival] = []
         self._begun_s: float | None = None
         self._followed_s = 0.0
         self._is_following = cfg.follow.is_active
@@ -252,7 +252,7 @@ class BeaconMission(Holding):
         is_visiting = not self._is_following and len(self.arrivals) < self.total
         return len(self.arrivals) % len(self._cfg.workspace.waypoints_m) if is_visiting else -1
 
-    def step(self, senses: Senses, interval_s: float, verdict: Verdict | None) -> Drive:
+    def step(self, senses: BeaconMeasurements, interval_s: float, verdict: Verdict | None) -> SteeringCommand:
         """One frame: take its readings, react to the verdict, drive on as far as it permits.
 
         Args:
@@ -272,12 +272,12 @@ class BeaconMission(Holding):
         drive = self._wanted(senses, interval_s)
         return permitted(drive, verdict, self._cfg.avoidance.back_speed_m_s)
 
-    def _wanted(self, senses: Senses, interval_s: float) -> Drive:
+    def _wanted(self, senses: BeaconMeasurements, interval_s: float) -> SteeringCommand:
         if self.state is HELD:
             return HALT
         if self.navigator.is_mapping:
             if self.abort_cause:
-                self.finish(Outcome.AT_BASE)  # it never left
+                self.finish(SurveyOutcome.AT_BASE)  # it never left
             else:
                 self.state = MAPPING
             return HALT
@@ -289,34 +289,34 @@ class BeaconMission(Holding):
             self._follow(interval_s)
         else:
             self._visit()
-        return HALT if self.outcome is not Outcome.NONE else drive
+        return HALT if self.outcome is not SurveyOutcome.NONE else drive
 
     def _follow(self, interval_s: float) -> None:
         self.state = FOLLOWING
         self._followed_s += interval_s
         if self._followed_s >= self._cfg.mission.follow_s:
-            self.finish(Outcome.COMPLETE)
+            self.finish(SurveyOutcome.COMPLETE)
 
     def _visit(self) -> None:
         self.state = VISITING
         waypoints = self._cfg.workspace.waypoints_m
         while len(self.arrivals) < min(self.pilot.waypoints.reached, self.total):
             lap, waypoint = divmod(len(self.arrivals), len(waypoints))
-            self.arrivals.append(Arrival(waypoint, lap, waypoints[waypoint], self.navigator.belief))
+            self.arrivals.append(WaypointArrival(waypoint, lap, waypoints[waypoint], self.navigator.belief))
         if len(self.arrivals) >= self.total:
-            self.finish(Outcome.COMPLETE)
+            self.finish(SurveyOutcome.COMPLETE)
 
-    def _return(self, senses: Senses, interval_s: float) -> Drive:
+    def _return(self, senses: BeaconMeasurements, interval_s: float) -> SteeringCommand:
         self.state = RETURNING
         if self._homing is None:
             self._homing = _homing_pilot(self._cfg)
         drive = self._homing.drive(senses.t_s, interval_s, self.navigator.belief.pose, None, self._distances(senses))
         if self._homing.waypoints.current_m is None:
-            self.finish(Outcome.AT_BASE)
+            self.finish(SurveyOutcome.AT_BASE)
             return HALT
         return drive
 
-    def _distances(self, senses: Senses) -> tuple[float, ...]:
+    def _distances(self, senses: BeaconMeasurements) -> tuple[float, ...]:
         """Of sensors that told nothing in this frame, that they see nothing: what they saw before is remembered."""
         avoidance = self._cfg.avoidance
         return senses.distances_m or (avoidance.range_max_m,) * len(avoidance.sensors_rad)
@@ -338,7 +338,7 @@ class WheelRates(NamedTuple):
     steer_rad: float | None
 
 
-def wheel_rates(drive: Drive, cfg: RadioConfig) -> WheelRates:
+def wheel_rates(drive: SteeringCommand, cfg: RadioConfig) -> WheelRates:
     """The rates whose mean is v / r and whose difference is omega b / r (b the track); steered wheels turn alike."""
     radius_m, vehicle = cfg.robot.wheel_radius_m, cfg.vehicle
     rate_rad_s = drive.speed_m_s / radius_m

@@ -20,7 +20,7 @@ from ccatp.beacons.cricket.range_network import MoteRange, build_network, pair_r
 from ccatp.beacons.cricket.self_mapping import MoteMapper, mapper_settings, network_plan, printed_prior
 from ccatp.beacons.cricket.trilateration import map_by_plan
 from ccatp.beacons.pilot import TargetSight
-from ccatp.beacons.slam.motion import POSE, Pose
+from ccatp.beacons.slam.motion import POSE, VehiclePose
 from ccatp.beacons.slam.settings import new_slam, odometry_of, readings_of, scan_of, vehicle_of
 from ccatp.config.beacon_models import CricketConfig, RadioConfig
 from ccatp.core import FloatArray, WheelSample
@@ -155,7 +155,7 @@ class ScanReading(NamedTuple):
     rssi_dbm: float
 
 
-class Sighting(NamedTuple):
+class RadioSighting(NamedTuple):
     """A radio heard from somewhere."""
 
     beacon: str
@@ -163,7 +163,7 @@ class Sighting(NamedTuple):
     bearing_rad: float | None
 
 
-class Senses(NamedTuple):
+class BeaconMeasurements(NamedTuple):
     """A frame as a mission takes it.
 
     Attributes:
@@ -178,7 +178,7 @@ class Senses(NamedTuple):
     t_s: float
     wheels: tuple[WheelInterval, ...]
     packets: tuple[ScanReading, ...]
-    sightings: tuple[Sighting, ...]
+    sightings: tuple[RadioSighting, ...]
     distances_m: tuple[float, ...]
     motes: tuple[MoteBurst, ...]
 
@@ -188,7 +188,7 @@ class Senses(NamedTuple):
         return frozenset([*(one.beacon for one in self.packets), *(one.beacon for one in self.sightings)])
 
 
-class SenseReader:
+class MeasurementReader:
     """Reads one frame after the other.
 
     Args:
@@ -205,17 +205,17 @@ class SenseReader:
         """The robot's clock counts anew."""
         self._read_to_s = None
 
-    def read(self, sensors: Sensors, extras: BeaconFrame) -> Senses:
+    def read(self, sensors: Sensors, extras: BeaconFrame) -> BeaconMeasurements:
         """The senses of a frame; each wheel sample stands for the time since the one before."""
         if self._read_to_s is None:
             self._read_to_s = sensors.t
         steering = {sample.t_s: sample.steer_rad for sample in extras.steer}
         wheels = [self._interval(sample, steering) for sample in sensors.enc]
-        return Senses(
+        return BeaconMeasurements(
             sensors.t,
             tuple(one for one in wheels if one is not None),
             _packets(extras.scan),
-            tuple(Sighting(one.beacon, one.rssi_dbm, one.bearing_rad) for one in extras.radio),
+            tuple(RadioSighting(one.beacon, one.rssi_dbm, one.bearing_rad) for one in extras.radio),
             tuple(extras.distances),
             tuple(extras.motes),
         )
@@ -252,7 +252,7 @@ def distance_m(a: tuple[float, ...], b: tuple[float, ...]) -> float:
 Ellipse = tuple[float, float, float, float, float]
 
 
-class Belief(NamedTuple):
+class PoseBelief(NamedTuple):
     """What is believed now.
 
     Attributes:
@@ -299,7 +299,7 @@ class Navigator(Protocol):
         """It needs the robot to stand: there is no map yet to drive by."""
 
     @property
-    def belief(self) -> Belief:
+    def belief(self) -> PoseBelief:
         """Of the robot."""
 
     @property
@@ -321,7 +321,7 @@ class Navigator(Protocol):
     def target(self, t_s: float) -> TargetSight | None:
         """What is believed of the radio that is followed, at a time; ``None`` before it was heard."""
 
-    def take(self, senses: Senses) -> None:
+    def take(self, senses: BeaconMeasurements) -> None:
         """Take the readings of a frame.
 
         Raises:
@@ -356,15 +356,15 @@ class RadioNavigator:
         self.slam = new_slam(cfg)
         self._motion = vehicle_of(cfg)
         self._reckoned = np.zeros(self._motion.size)
-        self._reckoned[:POSE] = Pose(cfg.start.x_m, cfg.start.y_m, cfg.start.heading_rad)
+        self._reckoned[:POSE] = VehiclePose(cfg.start.x_m, cfg.start.y_m, cfg.start.heading_rad)
         self._heard_s: float | None = None
         self._score = Score(0.0, 0, 0)
 
     @property
-    def belief(self) -> Belief:
+    def belief(self) -> PoseBelief:
         """Of the robot."""
         x_m, y_m, heading_rad = self.slam.pose
-        return Belief((x_m, y_m, heading_rad), self.slam.pose_covariance)
+        return PoseBelief((x_m, y_m, heading_rad), self.slam.pose_covariance)
 
     @property
     def reckoned_m(self) -> tuple[float, float]:
@@ -395,7 +395,7 @@ class RadioNavigator:
         sigma_m = self.slam.distance(self._target)[1]
         return TargetSight((x_m, y_m), sigma_m, t_s - self._heard_s, self.slam.moving_velocity_m_s)
 
-    def take(self, senses: Senses) -> None:
+    def take(self, senses: BeaconMeasurements) -> None:
         """Predict over the wheels' intervals, then take what was heard."""
         for wheels in senses.wheels:
             odometry = odometry_of(self._cfg, wheels.end_s, wheels)
@@ -436,7 +436,7 @@ class MoteNavigator:
         self._gate = float(chdtri(1, 1.0 - cfg.listener.gate_probability))
         v = self._motion.size
         mean, sigmas = np.zeros(v), np.zeros(v)
-        mean[:POSE] = Pose(start.x_m, start.y_m, start.heading_rad)
+        mean[:POSE] = VehiclePose(start.x_m, start.y_m, start.heading_rad)
         sigmas[:POSE] = start.position_sigma_m, start.position_sigma_m, start.heading_sigma_rad
         sigmas[POSE:] = self._motion.prior_sigmas
         self._filter = EkfSlam(mean, np.diag(sigmas**2))
@@ -450,10 +450,10 @@ class MoteNavigator:
         return not self._place_of
 
     @property
-    def belief(self) -> Belief:
+    def belief(self) -> PoseBelief:
         """Of the robot."""
         x_m, y_m, heading_rad = self._filter.mean[:POSE].tolist()
-        return Belief((x_m, y_m, heading_rad), self._filter.covariance[:POSE, :POSE].copy())
+        return PoseBelief((x_m, y_m, heading_rad), self._filter.covariance[:POSE, :POSE].copy())
 
     @property
     def reckoned_m(self) -> tuple[float, float]:
@@ -487,7 +487,7 @@ class MoteNavigator:
         """Nothing is followed."""
         return None
 
-    def take(self, senses: Senses) -> None:
+    def take(self, senses: BeaconMeasurements) -> None:
         """Predict over the wheels' intervals, then take what was heard.
 
         Raises:

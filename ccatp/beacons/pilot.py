@@ -13,7 +13,16 @@ from enum import StrEnum
 from math import asin, cos, hypot, inf, pi, sin, tau
 from typing import NamedTuple
 
-from ccatp.beacons.steering import HALT, Aim, Drive, Driver, PlanarPose, Point, WaypointList, aim_at
+from ccatp.beacons.steering import (
+    HALT,
+    BearingToPoint,
+    PlanarPose,
+    Point,
+    SteeringCommand,
+    WaypointList,
+    WaypointSteering,
+    aim_at,
+)
 from ccatp.config.beacon_models import AvoidanceConfig, FollowConfig, RadioConfig
 from ccatp.core import bearing, wrap_pi
 
@@ -61,13 +70,13 @@ class Follower:
         driver: what turns an aim into set points.
     """
 
-    def __init__(self, cfg: FollowConfig, driver: Driver) -> None:
+    def __init__(self, cfg: FollowConfig, driver: WaypointSteering) -> None:
         self._cfg = cfg
         self._driver = driver
         self.state = FollowState.LOST
-        self._sight: Aim | None = None
+        self._sight: BearingToPoint | None = None
 
-    def aim(self, pose: PlanarPose, target: TargetSight | None) -> Aim | None:
+    def aim(self, pose: PlanarPose, target: TargetSight | None) -> BearingToPoint | None:
         """What is left to go, and decides what to do; None while nothing is to be approached.
 
         Args:
@@ -87,9 +96,9 @@ class Follower:
         self.state = self._next_state(left_m)
         if self.state is not FollowState.APPROACHING:
             return None
-        return Aim(max(left_m - cfg.band_m, 0.0), self._sight.error_rad)
+        return BearingToPoint(max(left_m - cfg.band_m, 0.0), self._sight.error_rad)
 
-    def stay(self) -> Drive:
+    def stay(self) -> SteeringCommand:
         """Set points while nothing is to be approached: back off, turn to the target, or stand."""
         self._driver.reset()
         if self._sight is None:
@@ -117,13 +126,13 @@ def _closing_m_s(pose: PlanarPose, target: TargetSight) -> float:
 _AHEAD_RAD = pi / 3.0  # what lies within this of the course is in the way of the body
 
 
-class _Echo(NamedTuple):
+class _Obstacle(NamedTuple):
     time_s: float
     x_m: float
     y_m: float
 
 
-class Way(NamedTuple):
+class FreeHeading(NamedTuple):
     """What the obstacles leave of an aim.
 
     Attributes:
@@ -133,7 +142,7 @@ class Way(NamedTuple):
         nearest_m: distance to the nearest obstacle that is remembered; infinite without one.
     """
 
-    aim: Aim
+    aim: BearingToPoint
     speed_factor: float
     is_blocked: bool
     nearest_m: float
@@ -154,7 +163,7 @@ class ObstacleAvoider:
     def __init__(self, cfg: AvoidanceConfig, radius_m: float) -> None:
         self._cfg = cfg
         self._reach_m = radius_m + cfg.margin_m
-        self._echoes: deque[_Echo] = deque()
+        self._echoes: deque[_Obstacle] = deque()
 
     def see(self, time_s: float, pose: PlanarPose, distances_m: Sequence[float]) -> None:
         """Remember what the sensors show, and forget what is old.
@@ -170,10 +179,10 @@ class ObstacleAvoider:
             if distance_m < min(self._cfg.range_max_m, 2.0 * self._cfg.influence_m):
                 course_rad = pose[2] + direction_rad
                 self._echoes.append(
-                    _Echo(time_s, pose[0] + distance_m * cos(course_rad), pose[1] + distance_m * sin(course_rad))
+                    _Obstacle(time_s, pose[0] + distance_m * cos(course_rad), pose[1] + distance_m * sin(course_rad))
                 )
 
-    def way(self, pose: PlanarPose, aim: Aim) -> Way:
+    def way(self, pose: PlanarPose, aim: BearingToPoint) -> FreeHeading:
         """What is left of an aim at a pose."""
         near = list(self._near(pose))
         nearest_m = min((distance_m for distance_m, _ in near), default=inf)
@@ -182,8 +191,8 @@ class ObstacleAvoider:
         blocked = [(wrap_pi(angle_rad), asin(min(1.0, self._reach_m / max(d, 1e-6)))) for d, angle_rad in near]
         error_rad = self._free_heading(aim.error_rad, blocked)
         if error_rad is None:
-            return Way(aim, 0.0, True, nearest_m)
-        return Way(Aim(aim.distance_m, error_rad), self._speed_factor(near), False, nearest_m)
+            return FreeHeading(aim, 0.0, True, nearest_m)
+        return FreeHeading(BearingToPoint(aim.distance_m, error_rad), self._speed_factor(near), False, nearest_m)
 
     def clear_m(self, pose: PlanarPose, direction_rad: float) -> float:
         """Distance to the nearest remembered obstacle in the way of a body that moves in a direction, m.
@@ -232,11 +241,11 @@ _KEEPING = 0.03  # metres that an arc in the direction of the last one may gain 
 
 
 class _Arc(NamedTuple):
-    drive: Drive
+    drive: SteeringCommand
     places: list[Point]
 
 
-class Retreat:
+class BackOff:
     """A dynamic window over arcs forwards and backwards (Fox, Burgard, Thrun 1997).
 
     Of a vehicle that turns on the spot over courses, each after its turn. One is possible if the vehicle stays in the
@@ -254,7 +263,7 @@ class Retreat:
 
     def drive(
         self, pose: PlanarPose, threat_m: Point, threat_velocity_m_s: Point, obstacles_m: Sequence[Point]
-    ) -> Drive:
+    ) -> SteeringCommand:
         """Set points for the next interval.
 
         Args:
@@ -283,13 +292,13 @@ class Retreat:
         if self._cfg.vehicle.kind == "ackermann":
             for signed_m_s in (-speed_m_s, speed_m_s):
                 for curve in _CURVES:
-                    drive = Drive(signed_m_s, curve * self._cfg.vehicle.steer_max_rad, 0.0)
+                    drive = SteeringCommand(signed_m_s, curve * self._cfg.vehicle.steer_max_rad, 0.0)
                     yield _Arc(drive, self._places(pose, drive, horizon_s))
             return
         for k in range(_COURSES):
             yield self._straight(pose, wrap_pi(pi + k * tau / _COURSES), speed_m_s, horizon_s)
 
-    def _places(self, pose: PlanarPose, drive: Drive, horizon_s: float) -> list[Point]:
+    def _places(self, pose: PlanarPose, drive: SteeringCommand, horizon_s: float) -> list[Point]:
         """Along the arc of wheels that steer."""
         x_m, y_m, heading_rad = pose
         interval_s = horizon_s / _STEPS
@@ -314,7 +323,7 @@ class Retreat:
         along_rad = pose[2] + course_rad
         ways_m = [speed_m_s * max(0.0, t_s - delay_s) for t_s in _times_s(horizon_s)]
         places = [(pose[0] + way_m * cos(along_rad), pose[1] + way_m * sin(along_rad)) for way_m in ways_m]
-        return _Arc(Drive((-speed_m_s if is_back else speed_m_s) * goes, 0.0, rate_rad_s), places)
+        return _Arc(SteeringCommand((-speed_m_s if is_back else speed_m_s) * goes, 0.0, rate_rad_s), places)
 
     def _is_free(self, start_m: Point, places: Sequence[Point], obstacles_m: Sequence[Point]) -> bool:
         margin_m = self._cfg.avoidance.stop_m
@@ -361,14 +370,14 @@ class BeaconPilot:
 
     def __init__(self, cfg: RadioConfig) -> None:
         self._cfg = cfg
-        self._driver = Driver(cfg.control, cfg.vehicle)
+        self._driver = WaypointSteering(cfg.control, cfg.vehicle)
         self._avoider = ObstacleAvoider(cfg.avoidance, cfg.vehicle.radius_m)
         self._escapes_until_s = 0.0
         self.waypoints = WaypointList(
             cfg.workspace.waypoints_m, cfg.control.arrival_radius_m, loops=cfg.workspace.loops
         )
         self.follower = Follower(cfg.follow, self._driver)
-        self._retreat = Retreat(cfg)
+        self._retreat = BackOff(cfg)
         self.state = PilotState.VISITING
 
     def drive(
@@ -378,7 +387,7 @@ class BeaconPilot:
         pose: PlanarPose,
         target: TargetSight | None,
         distances_m: Sequence[float],
-    ) -> Drive:
+    ) -> SteeringCommand:
         """Set points for the next interval.
 
         Args:
@@ -405,7 +414,7 @@ class BeaconPilot:
             return self._held(pose, self._escape())
         return self._round(aim, way, interval_s)
 
-    def _aim(self, pose: PlanarPose, target: TargetSight | None) -> Aim | None:
+    def _aim(self, pose: PlanarPose, target: TargetSight | None) -> BearingToPoint | None:
         if self._cfg.follow.is_active:
             self.state = PilotState.FOLLOWING
             return self.follower.aim(pose, target)
@@ -416,25 +425,25 @@ class BeaconPilot:
         self.state = PilotState.ARRIVED if goal_m is None else PilotState.VISITING
         return None if goal_m is None else aim_at(pose, goal_m)
 
-    def _without_obstacles(self, aim: Aim | None, interval_s: float) -> Drive:
+    def _without_obstacles(self, aim: BearingToPoint | None, interval_s: float) -> SteeringCommand:
         if aim is not None:
             return self._driver.drive(aim, interval_s)
         return self.follower.stay() if self._cfg.follow.is_active else HALT
 
-    def _round(self, aim: Aim, way: Way, interval_s: float) -> Drive:
+    def _round(self, aim: BearingToPoint, way: FreeHeading, interval_s: float) -> SteeringCommand:
         if way.aim.error_rad != aim.error_rad:
             self.state = PilotState.AVOIDING
         found = self._driver.drive(way.aim, interval_s)
         return found._replace(speed_m_s=found.speed_m_s * way.speed_factor)
 
-    def _held(self, pose: PlanarPose, drive: Drive) -> Drive:
+    def _held(self, pose: PlanarPose, drive: SteeringCommand) -> SteeringCommand:
         """No motion towards something that stands too near in its direction."""
         if not drive.speed_m_s:
             return drive
         clear_m = self._avoider.clear_m(pose, 0.0 if drive.speed_m_s > 0.0 else pi)
         return drive._replace(speed_m_s=0.0) if clear_m < self._cfg.avoidance.stop_m else drive
 
-    def _escape(self) -> Drive:
+    def _escape(self) -> SteeringCommand:
         self.state = PilotState.ESCAPING
         self._driver.reset()
         return self._driver.away(self._cfg.avoidance.back_speed_m_s, 0.0)

@@ -107,7 +107,7 @@ PlanarPose = tuple[float, float, float]
 Point = tuple[float, float]
 
 
-class Drive(NamedTuple):
+class SteeringCommand(NamedTuple):
     """Set points until the next step.
 
     Attributes:
@@ -121,10 +121,10 @@ class Drive(NamedTuple):
     turn_rate_rad_s: float
 
 
-HALT = Drive(0.0, 0.0, 0.0)
+HALT = SteeringCommand(0.0, 0.0, 0.0)
 
 
-class Aim(NamedTuple):
+class BearingToPoint(NamedTuple):
     """Where to go, seen from the vehicle.
 
     Attributes:
@@ -136,13 +136,13 @@ class Aim(NamedTuple):
     error_rad: float
 
 
-def aim_at(pose: PlanarPose, goal_m: Point) -> Aim:
+def aim_at(pose: PlanarPose, goal_m: Point) -> BearingToPoint:
     """A point in the room as seen from a pose (x m, y m, heading rad)."""
     dx_m, dy_m = goal_m[0] - pose[0], goal_m[1] - pose[1]
-    return Aim(hypot(dx_m, dy_m), wrap_pi(bearing(dx_m, dy_m) - pose[2]))
+    return BearingToPoint(hypot(dx_m, dy_m), wrap_pi(bearing(dx_m, dy_m) - pose[2]))
 
 
-class Driver:
+class WaypointSteering:
     """From an aim to set points.
 
     Steering gamma = K error, limited (Hevrdejs and Knoll 2017). A differential drive turns at K v_max / l error, which
@@ -170,11 +170,11 @@ class Driver:
         """Forget the integral: a new aim, or a stop."""
         self._pi.reset()
 
-    def drive(self, aim: Aim, interval_s: float) -> Drive:
+    def drive(self, aim: BearingToPoint, interval_s: float) -> SteeringCommand:
         """Set points for the next interval, s."""
         return self._turning(self._speed(aim, interval_s), aim.error_rad)
 
-    def away(self, speed_m_s: float, error_rad: float) -> Drive:
+    def away(self, speed_m_s: float, error_rad: float) -> SteeringCommand:
         """Set points that get away from what lies at ``error_rad``: backwards from what is ahead, else forwards.
 
         Wheels that steer turn the vehicle the other way round when it rolls backwards.
@@ -184,21 +184,21 @@ class Driver:
             return self._turning(speed_m_s, -wrap_pi(pi - error_rad))
         return self._turning(-speed_m_s, -error_rad if self._vehicle.kind == "ackermann" else error_rad)
 
-    def face(self, error_rad: float) -> Drive:
+    def face(self, error_rad: float) -> SteeringCommand:
         """Set points that turn to an aim without going there; an Ackermann vehicle cannot, and stands."""
         if self._vehicle.kind == "ackermann":
             return HALT
         return self._turning(0.0, error_rad)
 
-    def _turning(self, speed_m_s: float, error_rad: float) -> Drive:
+    def _turning(self, speed_m_s: float, error_rad: float) -> SteeringCommand:
         vehicle = self._vehicle
         steer_rad = _clamped(self._control.steering_gain * error_rad, vehicle.steer_max_rad)
         if vehicle.kind == "ackermann":
-            return Drive(speed_m_s, steer_rad, 0.0)
+            return SteeringCommand(speed_m_s, steer_rad, 0.0)
         rate_rad_s = self._control.steering_gain * error_rad * vehicle.speed_max_m_s / vehicle.wheelbase_m
-        return Drive(speed_m_s, 0.0, _clamped(rate_rad_s, vehicle.turn_rate_max_rad_s))
+        return SteeringCommand(speed_m_s, 0.0, _clamped(rate_rad_s, vehicle.turn_rate_max_rad_s))
 
-    def _speed(self, aim: Aim, interval_s: float) -> float:
+    def _speed(self, aim: BearingToPoint, interval_s: float) -> float:
         limit_m_s = self._vehicle.speed_max_m_s
         if self._control.speed_mode == "constant":
             return min(self._control.constant_speed_m_s, limit_m_s)

@@ -6,7 +6,7 @@ SQLite with a rollback journal and ``synchronous=FULL``: what is committed is on
 import sqlite3
 from pathlib import Path
 
-from ccatp.beacons.mission import Arrival
+from ccatp.beacons.mission import WaypointArrival
 from ccatp.errors import CcatpError, ExitStatus
 
 _SCHEMA = """
@@ -57,7 +57,7 @@ class BeaconStore:
                 "INSERT INTO waypoint (number, lap, waypoint, x_m, y_m) VALUES (?, ?, ?, ?, ?)", planned
             )
 
-    def record_arrival(self, t_s: float, number: int, arrival: Arrival) -> None:
+    def record_arrival(self, t_s: float, number: int, arrival: WaypointArrival) -> None:
         """A waypoint is reached, robot time t_s; ``number`` counts over all laps."""
         self._db.execute(
             "UPDATE waypoint SET reached_s = ?, estimate_x_m = ?, estimate_y_m = ?, xx_m2 = ?, xy_m2 = ?, yy_m2 = ? "

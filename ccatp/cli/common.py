@@ -270,9 +270,9 @@ def ask_daemon(runtime_dir: Path | None, channel: str, payload: dict[str, object
         UnreachableError: nobody listens there, or no answer came in time.
         RefusedError: the daemon said no, and why.
     """
-    from ccatp.links.client import Client
+    from ccatp.links.client import OperatorClient
 
-    daemon = Client(runtime_dir, timeout_s)
+    daemon = OperatorClient(runtime_dir, timeout_s)
     return daemon.ask(str(payload["cmd"])) if channel == "control" else daemon.observatory.ask(payload)
 
 

@@ -28,7 +28,7 @@ from ccatp.cli.common import (
     tell,
     tell_status,
 )
-from ccatp.errors import UnreachableError
+from ccatp.errors import DaemonUnreachableError
 
 
 @click.command(epilog=example("ccatp pause"))
@@ -203,7 +203,7 @@ def _answers(folder: Path | None, timeout_s: float, period_s: float) -> Iterator
     while True:
         try:
             answer = ask_daemon(folder, "control", {"cmd": "status"}, timeout_s)
-        except UnreachableError:
+        except DaemonUnreachableError:
             if not is_seen:
                 raise
             return

@@ -19,8 +19,8 @@ from ccatp.cli.common import JSON_OPTION, RUNTIME_DIR_OPTION, WORLD_OPTIONS, com
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
 
 if TYPE_CHECKING:
-    from ccatp.commissioning.calibration import Row
-    from ccatp.commissioning.preflight import Finding
+    from ccatp.commissioning.calibration import CalibrationRow
+    from ccatp.commissioning.preflight import PreflightResult
     from ccatp.config.models import Config
 
 
@@ -113,7 +113,7 @@ def check(
 
 def _findings(
     cfg: "Config", config_file: Path | None, runs_dir: Path, runtime_dir: Path | None, *, sim: bool
-) -> "list[Finding]":
+) -> "list[PreflightResult]":
     import asyncio
     import logging
     from contextlib import ExitStack
@@ -130,7 +130,7 @@ def _findings(
     found = [passed("configuration", f"{where}: mirror {mirror.name}, {len(mirror.panels)} panels")]
     found += [*probe_machine(cfg, runs_dir, runtime_dir, os.environ), probe_keys(cfg, sim=sim), _observatory(cfg)]
 
-    async def probe() -> "list[Finding]":
+    async def probe() -> "list[PreflightResult]":
         robot, laser = await asyncio.gather(probe_robot(cfg, mirror), probe_laser(cfg, mirror))
         return [*robot, *laser]
 
@@ -143,7 +143,7 @@ def _findings(
         return [*found, *asyncio.run(probe())]
 
 
-def _observatory(cfg: "Config") -> "Finding":
+def _observatory(cfg: "Config") -> "PreflightResult":
     from ccatp.commissioning.preflight import failed, passed
     from ccatp.daemon.command_handlers import check_observatory
 
@@ -157,7 +157,7 @@ def _observatory(cfg: "Config") -> "Finding":
     return passed(name, f"{cfg.observatory.endpoint}, listed in {cfg.observatory.clients_file}")
 
 
-def _show(found: "Sequence[Finding]") -> None:
+def _show(found: "Sequence[PreflightResult]") -> None:
     from ccatp.commissioning.preflight import lines
 
     if not sys.stdout.isatty():
@@ -295,7 +295,7 @@ def _drive(
     return folder
 
 
-def _write(config_file: Path | None, table: "tuple[Row, ...]", *, dry_run: bool) -> tuple[str | None, str]:
+def _write(config_file: Path | None, table: "tuple[CalibrationRow, ...]", *, dry_run: bool) -> tuple[str | None, str]:
     """The file written, if one was, and what changes in it."""
     from ccatp.config.load import difference, load_config, with_values, write_in_place
 

@@ -33,7 +33,7 @@ from ccatp.cli.radio_levels import calibrate, fix, fuzzy
 from ccatp.errors import CcatpError, ExitStatus
 
 if TYPE_CHECKING:
-    from ccatp.beacons.slam.recording import RecordedRun, Track
+    from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun
     from ccatp.config.beacon_models import CricketConfig
     from ccatp.config.recording_models import RecordingsConfig
 
@@ -48,7 +48,7 @@ class SlamCommandError(CcatpError):
     exit_status = ExitStatus.USAGE
 
 
-def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) -> "Track":
+def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) -> "EstimatedPath":
     """A run through one of ``FILTERS``.
 
     Raises:
@@ -66,7 +66,7 @@ def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) 
         ) from error
 
 
-def _estimated(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) -> "Track":
+def _estimated(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) -> "EstimatedPath":
     from time import perf_counter
 
     from ccatp.beacons.slam.settings import batch_settings, slam_settings

@@ -47,12 +47,12 @@ class CalibrateError(CcatpError):
 def calibrate(path: Path, sheet: str | None, points: Path | None, figure_file: Path | None, json_output: bool) -> int:
     """Find reference level, exponent and spread of a radio from pairs of distance and level."""
     from ccatp.beacons.datasets.levels import read_levels
-    from ccatp.beacons.slam.path_loss import CalibrationError, fit_path_loss
+    from ccatp.beacons.slam.path_loss import PathLossError, fit_path_loss
 
     table = read_levels(path, sheet, points)
     try:
         fit = fit_path_loss(table.pairs)
-    except CalibrationError as error:
+    except PathLossError as error:
         raise CalibrateError(f"{path}: {error}") from error
     warnings = [*table.warnings, *fit.doubts()]
     for warning in warnings:
@@ -262,7 +262,7 @@ def _fits(
 ) -> "tuple[Fits, bool]":  # fmt: skip
     """A function of the fingerprint to leave out (or None) to the path losses by beacon; whether to leave out."""
     from ccatp.beacons.datasets.levels import read_levels, read_places
-    from ccatp.beacons.slam.path_loss import CalibrationError, fit_path_loss
+    from ccatp.beacons.slam.path_loss import PathLossError, fit_path_loss
 
     if (fingerprints is None) == (path_loss is None):
         raise CalibrateError("give either --fingerprints or --path-loss, which calibrate the levels")
@@ -277,7 +277,7 @@ def _fits(
             return {name: fit_path_loss(_pairs(used, name, at)) for name, at in places_m.items()}
 
         fits(None)
-    except CalibrationError as error:
+    except PathLossError as error:
         raise CalibrateError(f"{fingerprints or path_loss}: {error}") from error
     return fits, fingerprints is not None and fingerprints.resolve() == path.resolve()
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ccatp.mirror.mirror_alignment import SurveyResult
     from ccatp.records.run_reader import Recording
     from ccatp.records.survey_reader import Survey
-    from ccatp.studies.replay_report import Judged
+    from ccatp.studies.replay_report import ReplayEvaluation
 
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -255,13 +255,13 @@ def _config(recording: "Recording", changes: Mapping[str, object], smooth: bool)
     return cfg
 
 
-def _judged(recording: "Recording", cfg: "Config", smooth: bool) -> "Judged":
+def _judged(recording: "Recording", cfg: "Config", smooth: bool) -> "ReplayEvaluation":
     from ccatp.filters import FilterError
     from ccatp.mirror.mirror import build_mirror
     from ccatp.mirror.surface import MirrorError
     from ccatp.records.run_reader import in_order
     from ccatp.studies.replay import replay as play
-    from ccatp.studies.replay_report import Judged
+    from ccatp.studies.replay_report import ReplayEvaluation
 
     mirror = build_mirror(cfg.mirror)
     try:
@@ -271,11 +271,11 @@ def _judged(recording: "Recording", cfg: "Config", smooth: bool) -> "Judged":
     if not len(replayed.trace.seq):
         why = f" ({recording.warnings[-1]})" if recording.warnings else ""
         raise ReplayError(f"{recording.path}: no sensors frames in it{why}")
-    return Judged(replayed, recording.recorded(mirror), recording.truth(), recording.arrival_frames(), mirror)
+    return ReplayEvaluation(replayed, recording.recorded(mirror), recording.truth(), recording.arrival_frames(), mirror)
 
 
 def _replay_facts(
-    recordings: Sequence["Recording"], configs: Sequence["Config"], parts: Sequence["Judged"],
+    recordings: Sequence["Recording"], configs: Sequence["Config"], parts: Sequence["ReplayEvaluation"],
     changes: Mapping[str, object],
 ) -> dict[str, Any]:  # fmt: skip
     traces = [part.replayed.trace for part in parts]

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccatp.commissioning.calibration_drive import Carried, Drive, Segment, Wheels, carry
+from ccatp.commissioning.calibration_drive import DeadReckonedSegment, RecordedDrive, Segment, WheelParameters, carry
 from ccatp.config.models import Config
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError, ExitStatus
@@ -93,7 +93,7 @@ class Calibration:
         return radius, base, bias
 
 
-def calibrate(mirror: Mirror, drive: Drive, priors: Priors) -> Calibration:
+def calibrate(mirror: Mirror, drive: RecordedDrive, priors: Priors) -> Calibration:
     """Estimate the parameters.
 
     Args:
@@ -139,7 +139,7 @@ def calibrate(mirror: Mirror, drive: Drive, priors: Priors) -> Calibration:
     )
 
 
-def _check(drive: Drive, priors: Priors) -> None:
+def _check(drive: RecordedDrive, priors: Priors) -> None:
     if len(drive.segments) < MIN_SEGMENTS:
         raise CalibrationError(
             f"the drive has {len(drive.segments)} legs with a fix at each end, {MIN_SEGMENTS} are needed; drive again"
@@ -165,7 +165,7 @@ class _Solution:
 class _Problem:
     """The equations of one drive."""
 
-    def __init__(self, mirror: Mirror, drive: Drive, priors: Priors) -> None:
+    def __init__(self, mirror: Mirror, drive: RecordedDrive, priors: Priors) -> None:
         self._mirror, self._drive, self._priors = mirror, drive, priors
 
     def solve(self, x: FloatArray, slip_sigma: float) -> _Solution:
@@ -201,15 +201,17 @@ class _Problem:
             low, high = (middle, high) if excess(middle) > 0.0 else (low, middle)
         return high
 
-    def _carried(self, x: FloatArray) -> list[Carried]:
-        wheels = Wheels(*x[[RIGHT, LEFT, BASE, CREEP]].tolist())
+    def _carried(self, x: FloatArray) -> list[DeadReckonedSegment]:
+        wheels = WheelParameters(*x[[RIGHT, LEFT, BASE, CREEP]].tolist())
         starts = x[PARAMETERS:].reshape(-1, 3)
         return [
             carry(self._mirror, segment, start, wheels)
             for segment, start in zip(self._drive.segments, starts[:-1], strict=True)
         ]
 
-    def _whitened(self, x: FloatArray, carried: list[Carried], slip_sigma: float) -> tuple[FloatArray, FloatArray]:
+    def _whitened(
+        self, x: FloatArray, carried: list[DeadReckonedSegment], slip_sigma: float
+    ) -> tuple[FloatArray, FloatArray]:
         """Whitened Jacobian and residuals: what is known minus what ``x`` makes of it."""
         drive, size = self._drive, len(x)
         rows, residuals = [], []
@@ -239,9 +241,9 @@ class _Problem:
         return np.vstack(rows), np.concatenate(residuals)
 
 
-def _first_guess(mirror: Mirror, drive: Drive, priors: Priors) -> FloatArray:
+def _first_guess(mirror: Mirror, drive: RecordedDrive, priors: Priors) -> FloatArray:
     """Poses from the fixes, headings from the wheels, the first one so that the first way lies along it."""
-    wheels = Wheels(priors.radius_m, priors.radius_m, priors.base_m, 0.0)
+    wheels = WheelParameters(priors.radius_m, priors.radius_m, priors.base_m, 0.0)
     poses = np.zeros((len(drive.places), 3))
     poses[:, :2] = [(place.x_m, place.y_m) for place in drive.places]
     went = carry(mirror, drive.segments[0], poses[0], wheels).end[:2] - poses[0, :2]
@@ -253,7 +255,9 @@ def _first_guess(mirror: Mirror, drive: Drive, priors: Priors) -> FloatArray:
     return np.concatenate((parameters, poses.ravel()))
 
 
-def _process_covariance(drive: Drive, segment: Segment, carried: Carried, slip_sigma: float) -> FloatArray:
+def _process_covariance(
+    drive: RecordedDrive, segment: Segment, carried: DeadReckonedSegment, slip_sigma: float
+) -> FloatArray:
     """Covariance of where a segment leads: the encoders' noise and the slip of each motion, each wheel by itself."""
     frame_s = segment.duration_s / len(segment.right_rad)
     shares = []
@@ -268,7 +272,9 @@ def _process_covariance(drive: Drive, segment: Segment, carried: Carried, slip_s
     return covariance
 
 
-def _gyro_row(drive: Drive, k: int, carried: Carried, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _gyro_row(
+    drive: RecordedDrive, k: int, carried: DeadReckonedSegment, x: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The gyroscope's sum: (1 + scale) (change of heading less what the curvature does) + bias times time."""
     segment = drive.segments[k]
     at = PARAMETERS + 3 * k
@@ -291,7 +297,7 @@ MOST_SIGMA = 0.01
 SHOWN_SLIP = 1e-4
 
 
-class Row(NamedTuple):
+class CalibrationRow(NamedTuple):
     """One key of the configuration.
 
     Attributes:
@@ -310,17 +316,17 @@ class Row(NamedTuple):
         return round(self.found, 1 - floor(log10(self.sigma)))
 
 
-def rows(cfg: Config, found: Calibration) -> tuple[Row, Row, Row]:
+def rows(cfg: Config, found: Calibration) -> tuple[CalibrationRow, CalibrationRow, CalibrationRow]:
     """What is configured and what the drive shows."""
     radius, base, bias = found.sigmas
     return (
-        Row("robot.wheel_radius_m", cfg.robot.wheel_radius_m, found.radius_m, radius),
-        Row("robot.wheel_base_m", cfg.robot.wheel_base_m, found.base_m, base),
-        Row("localizer.gyroscope_bias_rad_s", cfg.localizer.gyroscope_bias_rad_s, found.bias_rad_s, bias),
+        CalibrationRow("robot.wheel_radius_m", cfg.robot.wheel_radius_m, found.radius_m, radius),
+        CalibrationRow("robot.wheel_base_m", cfg.robot.wheel_base_m, found.base_m, base),
+        CalibrationRow("localizer.gyroscope_bias_rad_s", cfg.localizer.gyroscope_bias_rad_s, found.bias_rad_s, bias),
     )
 
 
-def check_usable(table: tuple[Row, ...]) -> None:
+def check_usable(table: tuple[CalibrationRow, ...]) -> None:
     """Refuse what must not get into a configuration.
 
     Raises:
@@ -339,7 +345,7 @@ def check_usable(table: tuple[Row, ...]) -> None:
             )
 
 
-def lines(table: tuple[Row, ...], found: Calibration) -> list[str]:
+def lines(table: tuple[CalibrationRow, ...], found: Calibration) -> list[str]:
     """For the reader."""
     shown = [("key", "configured", "found", "sigma", "off by")]
     for row in table:
@@ -363,7 +369,7 @@ def lines(table: tuple[Row, ...], found: Calibration) -> list[str]:
     ]
 
 
-def as_json(table: tuple[Row, ...], found: Calibration) -> dict[str, Any]:
+def as_json(table: tuple[CalibrationRow, ...], found: Calibration) -> dict[str, Any]:
     """For ``--json``."""
     return {
         "parameters": {

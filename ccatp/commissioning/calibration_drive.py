@@ -35,7 +35,7 @@ _MEDIAN_TO_SIGMA = 1.0 / (0.6745 * 2.0**0.5)
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class FixedPlace:
     """Where a fix saw the robot, deck frame.
 
     Attributes:
@@ -71,7 +71,7 @@ class Segment:
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class RecordedDrive:
     """A whole drive.
 
     Attributes:
@@ -83,7 +83,7 @@ class Drive:
         gyro_sigma_rad_s: noise of a gyroscope sample.
     """
 
-    places: tuple[Place, ...]
+    places: tuple[FixedPlace, ...]
     segments: tuple[Segment, ...]
     encoder_sigma_rad_s: float
     encoder_period_s: float
@@ -114,7 +114,7 @@ class DriveBuilder:
     def __init__(self, mirror: Mirror, puck_height_m: float) -> None:
         self._mirror, self._puck_height_m = mirror, puck_height_m
         self._wheels = WheelAngle(), WheelAngle()
-        self._places: list[Place] = []
+        self._places: list[FixedPlace] = []
         self._segments: list[Segment] = []
         self._open = _Open()
         self._scatters: list[float] = []
@@ -182,7 +182,7 @@ class DriveBuilder:
         self._open.gyro_rad, self._open.gyro_s = rest.gyro_rad, rest.gyro_s
         self._open.gyro_samples, self._open.begun_s = rest.gyro_samples, rest.begun_s
 
-    def _place(self, fix: Fix) -> Place:
+    def _place(self, fix: Fix) -> FixedPlace:
         x, y, _ = self._mirror.foot_of_puck(fix.position_m, self._puck_height_m)
         axes = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
         turn = np.array([self._mirror.rotate_deck_from_world(axis) for axis in axes]).T
@@ -191,14 +191,14 @@ class DriveBuilder:
         fx, fy = self._mirror.surface.gradient(x, y)
         normal = np.array([-fx, -fy, 1.0]) / np.sqrt(1.0 + fx * fx + fy * fy)
         along = (np.eye(3) - np.outer(normal, normal))[:2]
-        return Place(x, y, along @ covariance @ along.T)
+        return FixedPlace(x, y, along @ covariance @ along.T)
 
-    def build(self) -> Drive:
+    def build(self) -> RecordedDrive:
         """The drive so far."""
         right, left = self._wheels
         is_counter = right.is_counter or left.is_counter
         quantum = min(right.quantum_rad, left.quantum_rad) if is_counter else 0.0
-        return Drive(
+        return RecordedDrive(
             tuple(self._places),
             tuple(self._segments),
             0.0 if is_counter or not self._scatters else median(self._scatters),
@@ -246,7 +246,7 @@ def _same_kind(is_turn: NDArray[np.bool_], first: int, last: int) -> list[tuple[
 STEP_FRAMES = 3
 
 
-class Wheels(NamedTuple):
+class WheelParameters(NamedTuple):
     """What turns wheel angles into motion.
 
     Attributes:
@@ -261,7 +261,7 @@ class Wheels(NamedTuple):
     creep: float
 
 
-class Carried(NamedTuple):
+class DeadReckonedSegment(NamedTuple):
     """Where a segment leads from one pose, and how that depends on what is not known.
 
     Attributes:
@@ -279,7 +279,7 @@ class Carried(NamedTuple):
     turn_rad: float
 
 
-def carry(mirror: Mirror, segment: Segment, start: FloatArray, wheels: Wheels) -> Carried:
+def carry(mirror: Mirror, segment: Segment, start: FloatArray, wheels: WheelParameters) -> DeadReckonedSegment:
     """Drive a segment again.
 
     The model is that of the localizer (thesis eqs 2.11, 2.14 on the curved surface): with d = (r_R phi_R + r_L phi_L)/2
@@ -312,7 +312,7 @@ def carry(mirror: Mirror, segment: Segment, start: FloatArray, wheels: Wheels) -
     away = ends - end[:, None]
     of_start = np.eye(3)
     of_start[:, 2] = away[:, 5] / _TURN_RAD
-    return Carried(end, away[:, 1:5] / steps, of_start, away[:, 6:] / _GRIP, turned)
+    return DeadReckonedSegment(end, away[:, 1:5] / steps, of_start, away[:, 6:] / _GRIP, turned)
 
 
 _TURN_RAD, _GRIP = 1e-5, 1e-4
@@ -364,7 +364,7 @@ def _drive(
 MAX_FIXES = 60
 
 
-def read_drive(run_dir: Path) -> tuple[Drive, Mirror, Config]:
+def read_drive(run_dir: Path) -> tuple[RecordedDrive, Mirror, Config]:
     """The newest recording of a run: its drive, its mirror, its configuration.
 
     Raises:

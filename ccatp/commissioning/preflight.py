@@ -22,7 +22,7 @@ from ccatp.survey.composition import robot_problems
 from ccatp.survey.reactions import MirrorCheck
 
 
-class Outcome(StrEnum):
+class CheckOutcome(StrEnum):
     """How a check went."""
 
     PASS = "pass"  # noqa: S105 - no password
@@ -31,7 +31,7 @@ class Outcome(StrEnum):
     SKIP = "skip"  # what it would look at is not there
 
 
-class Finding(NamedTuple):
+class PreflightResult(NamedTuple):
     """One check.
 
     Attributes:
@@ -42,37 +42,37 @@ class Finding(NamedTuple):
     """
 
     name: str
-    outcome: Outcome
+    outcome: CheckOutcome
     found: str
     todo: str = ""
 
 
-def passed(name: str, found: str) -> Finding:
+def passed(name: str, found: str) -> PreflightResult:
     """All is well."""
-    return Finding(name, Outcome.PASS, found)
+    return PreflightResult(name, CheckOutcome.PASS, found)
 
 
-def warned(name: str, found: str, todo: str) -> Finding:
+def warned(name: str, found: str, todo: str) -> PreflightResult:
     """A mission is possible."""
-    return Finding(name, Outcome.WARN, found, todo)
+    return PreflightResult(name, CheckOutcome.WARN, found, todo)
 
 
-def failed(name: str, found: str, todo: str) -> Finding:
+def failed(name: str, found: str, todo: str) -> PreflightResult:
     """No mission like that."""
-    return Finding(name, Outcome.FAIL, found, todo)
+    return PreflightResult(name, CheckOutcome.FAIL, found, todo)
 
 
-def skipped(names: Iterable[str], why: str) -> list[Finding]:
+def skipped(names: Iterable[str], why: str) -> list[PreflightResult]:
     """What could not be looked at."""
-    return [Finding(name, Outcome.SKIP, why) for name in names]
+    return [PreflightResult(name, CheckOutcome.SKIP, why) for name in names]
 
 
-def has_failed(findings: Iterable[Finding]) -> bool:
+def has_failed(findings: Iterable[PreflightResult]) -> bool:
     """Whether one failed."""
-    return any(finding.outcome is Outcome.FAIL for finding in findings)
+    return any(finding.outcome is CheckOutcome.FAIL for finding in findings)
 
 
-def lines(findings: Sequence[Finding]) -> list[str]:
+def lines(findings: Sequence[PreflightResult]) -> list[str]:
     """The table as plain text, and what it comes to."""
     width = max(len(finding.name) for finding in findings)
     text = []
@@ -80,12 +80,12 @@ def lines(findings: Sequence[Finding]) -> list[str]:
         text.append(f"{finding.outcome:<4}  {finding.name:<{width}}  {finding.found}")
         if finding.todo:
             text.append(f"{'':4}  {'':{width}}  -> {finding.todo}")
-    counts = {outcome: sum(f.outcome is outcome for f in findings) for outcome in Outcome}
+    counts = {outcome: sum(f.outcome is outcome for f in findings) for outcome in CheckOutcome}
     told = ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count)
     return [*text, f"{'not ready' if has_failed(findings) else 'ready'}: {told}"]
 
 
-def as_json(findings: Sequence[Finding]) -> dict[str, Any]:
+def as_json(findings: Sequence[PreflightResult]) -> dict[str, Any]:
     """For ``--json``."""
     return {"ready": not has_failed(findings), "checks": [finding._asdict() for finding in findings]}
 
@@ -95,7 +95,7 @@ LASER_NAMES = ("lasers", "air", "laser fix")
 TEMPERATURE_C, PRESSURE_HPA, HUMIDITY_PCT = (-40.0, 50.0), (400.0, 1100.0), (0.0, 100.0)
 
 
-def judge_lasers(*, connected: bool, laser_ready: bool) -> Finding:
+def judge_lasers(*, connected: bool, laser_ready: bool) -> PreflightResult:
     """Are the lasers there, and warm?"""
     if not connected:
         return failed("lasers", "the server has no laser", "switch the laser unit on and connect it to its server")
@@ -104,7 +104,7 @@ def judge_lasers(*, connected: bool, laser_ready: bool) -> Finding:
     return passed("lasers", "connected and warm")
 
 
-def judge_air(air: Environment) -> Finding:
+def judge_air(air: Environment) -> PreflightResult:
     """Can the air be what the server takes it for? Lengths are corrected by it."""
     found = f"{air.temperature_c:.1f} degC, {air.pressure_hpa:.0f} hPa, {air.humidity_pct:.0f} %"
     for value, (low, high) in (
@@ -118,7 +118,7 @@ def judge_air(air: Environment) -> Finding:
     return passed("air", found)
 
 
-def judge_fix(cfg: Config, mirror: Mirror, fix: Fix) -> Finding:
+def judge_fix(cfg: Config, mirror: Mirror, fix: Fix) -> PreflightResult:
     """Is the puck where a robot at base has it?"""
     expected = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m)
     off_m = dist(fix.position_m, expected)
@@ -149,7 +149,7 @@ STANDING_RAD_S = 0.02
 BIAS_SIGMAS = 5.0
 
 
-class Heard(NamedTuple):
+class RobotReport(NamedTuple):
     """What came from the robot.
 
     Attributes:
@@ -163,7 +163,7 @@ class Heard(NamedTuple):
     arrived_s: Sequence[float]
 
 
-def judge_robot(cfg: Config, mirror: Mirror, heard: Heard) -> list[Finding]:
+def judge_robot(cfg: Config, mirror: Mirror, heard: RobotReport) -> list[PreflightResult]:
     """All checks of a robot that stands at base."""
     problems = robot_problems(cfg, mirror, heard.hello)
     geometry = (
@@ -189,7 +189,7 @@ def _span_s(frames: Sequence[Sensors]) -> float:
     return frames[-1].t - frames[0].t
 
 
-def _frames(cfg: Config, heard: Heard) -> Finding:
+def _frames(cfg: Config, heard: RobotReport) -> PreflightResult:
     frames, nominal = heard.frames, heard.hello.frame_hz
     span_s = heard.arrived_s[-1] - heard.arrived_s[0]
     if span_s <= 0.0:
@@ -204,7 +204,7 @@ def _frames(cfg: Config, heard: Heard) -> Finding:
     return passed("frames", found)
 
 
-def _clock(heard: Heard) -> Finding:
+def _clock(heard: RobotReport) -> PreflightResult:
     theirs_s, ours_s = _span_s(heard.frames), heard.arrived_s[-1] - heard.arrived_s[0]
     ratio = theirs_s / ours_s if ours_s > 0.0 else 0.0
     found = f"runs at {ratio:.4f} of ours, {heard.frames[-1].t:.0f} s since boot {heard.hello.boot}"
@@ -216,7 +216,7 @@ def _clock(heard: Heard) -> Finding:
     return passed("robot clock", found)
 
 
-def _faults(frames: Sequence[Sensors]) -> Finding:
+def _faults(frames: Sequence[Sensors]) -> PreflightResult:
     told = sorted({fault for frame in frames for fault in frame.faults})
     if told:
         return failed("faults", f"the robot reports {', '.join(told)}", "see to it before anything moves")
@@ -228,7 +228,7 @@ def _too_slow(kind: str, count: int, frames: Sequence[Sensors]) -> str:
     return "" if rate >= LEAST_HZ[kind] else f"{rate:.0f} samples a second, {LEAST_HZ[kind]:.0f} are needed"
 
 
-def _encoders(frames: Sequence[Sensors]) -> Finding:
+def _encoders(frames: Sequence[Sensors]) -> PreflightResult:
     todo = "look at the encoders and their cables"
     for index, side in ((1, "right"), (2, "left")):
         rates = [rate for frame in frames for row in frame.enc if (rate := row[index]) is not None]
@@ -239,7 +239,7 @@ def _encoders(frames: Sequence[Sensors]) -> Finding:
     return passed("encoders", "both wheels stand")
 
 
-def _inertial_unit(cfg: Config, frames: Sequence[Sensors]) -> Finding:
+def _inertial_unit(cfg: Config, frames: Sequence[Sensors]) -> PreflightResult:
     rows = [row for frame in frames for row in frame.imu]
     todo = "look at the inertial unit and its cable"
     if slow := _too_slow("imu", len(rows), frames):
@@ -258,7 +258,7 @@ def _inertial_unit(cfg: Config, frames: Sequence[Sensors]) -> Finding:
     return passed("inertial unit", found)
 
 
-def _edge_sensors(frames: Sequence[Sensors]) -> Finding:
+def _edge_sensors(frames: Sequence[Sensors]) -> PreflightResult:
     rows = [row[1:] for frame in frames for row in frame.edge]
     if slow := _too_slow("edge", len(rows), frames):
         return failed("edge sensors", slow, "look at the edge sensors and their cable")
@@ -277,7 +277,7 @@ def _flickering(rows: Sequence[Sequence[int]]) -> Iterator[str]:
             yield name
 
 
-def _gravity(mirror: Mirror, frames: Sequence[Sensors]) -> Finding:
+def _gravity(mirror: Mirror, frames: Sequence[Sensors]) -> PreflightResult:
     check = MirrorCheck(mirror)
     is_known = any(check.hear(frame.t, frame.gravity, mirror.base_pose) for frame in frames)
     if check.contradiction:
@@ -290,7 +290,7 @@ def _gravity(mirror: Mirror, frames: Sequence[Sensors]) -> Finding:
     return passed("gravity", f"the slope is that of {mirror.name} at base")
 
 
-def _fans(cfg: Config, mirror: Mirror, heard: Heard) -> Finding:
+def _fans(cfg: Config, mirror: Mirror, heard: RobotReport) -> PreflightResult:
     least, floor = min(min(frame.fans) for frame in heard.frames), heard.hello.robot.fan_floor
     found = f"at least {least:.2f} of duty, the floor is {floor:g}"
     if mirror.overhang and least < floor:
@@ -301,7 +301,7 @@ def _fans(cfg: Config, mirror: Mirror, heard: Heard) -> Finding:
     return passed("fans", found)
 
 
-def _battery(cfg: Config, frames: Sequence[Sensors]) -> Finding:
+def _battery(cfg: Config, frames: Sequence[Sensors]) -> PreflightResult:
     charge, health = frames[-1].soc, cfg.health
     lasts_s = max(charge - health.battery_reserve, 0.0) * health.battery_life_s
     found = f"{charge:.0%}, for {lasts_s / 60.0:.0f} min above the reserve of {health.battery_reserve:.0%}"

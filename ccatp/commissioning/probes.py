@@ -15,7 +15,7 @@ from pathlib import Path
 
 from ccatp.commissioning import preflight as judge_laser
 from ccatp.commissioning import preflight as judge_robot
-from ccatp.commissioning.preflight import Finding, Heard, failed, passed, skipped, warned
+from ccatp.commissioning.preflight import PreflightResult, RobotReport, failed, passed, skipped, warned
 from ccatp.config.models import Config
 from ccatp.errors import CcatpError
 from ccatp.etalon_client import EtalonClient, EtalonError, EtalonUnreachable
@@ -33,7 +33,7 @@ _TIME_ERROR = 5
 _LOCAL = ("127.", "localhost", "::1")
 
 
-async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -> list[Finding]:
+async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -> list[PreflightResult]:
     """Join the robot as monitor, listen for a while, judge what it says.
 
     A monitor that says nothing permits nothing: as long as it listens nobody can move the robot.
@@ -76,7 +76,7 @@ async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -
         why = lost[0] if lost else f"no sensors frame within {FIRST_FRAME_S:g} s"
         lost_link = failed("robot link", why, "look at the robot's own log")
         return [lost_link, *skipped(judge_robot.ROBOT_NAMES, "no frames")]
-    return [*found, *judge_robot.judge_robot(cfg, mirror, Heard(hello, frames, arrived_s))]
+    return [*found, *judge_robot.judge_robot(cfg, mirror, RobotReport(hello, frames, arrived_s))]
 
 
 async def _listen(has_news: asyncio.Event, is_lost: asyncio.Event, listen_s: float) -> None:
@@ -88,7 +88,7 @@ async def _listen(has_news: asyncio.Event, is_lost: asyncio.Event, listen_s: flo
             await is_lost.wait()
 
 
-def _link_finding(cfg: Config, hello: Hello) -> Finding:
+def _link_finding(cfg: Config, hello: Hello) -> PreflightResult:
     found = f"{cfg.robot.host}:{cfg.robot.port}, {hello.protocol}, auth {hello.auth}"
     if hello.auth == "none" and not cfg.robot.host.startswith(_LOCAL):
         todo = "anybody on that network can drive it: give it a key (ccatp keys generate, robot.key_file)"
@@ -96,7 +96,7 @@ def _link_finding(cfg: Config, hello: Hello) -> Finding:
     return passed("robot link", found)
 
 
-async def probe_laser(cfg: Config, mirror: Mirror) -> list[Finding]:
+async def probe_laser(cfg: Config, mirror: Mirror) -> list[PreflightResult]:
     """Ask the MultiLine server how it is, and where the puck is."""
     quick = cfg.etalon.model_copy(update={"reconnect_for_s": 0.0})
     client = EtalonClient(quick, mirror.channels, mirror.collimators_m)
@@ -125,12 +125,14 @@ async def probe_laser(cfg: Config, mirror: Mirror) -> list[Finding]:
         await client.close()
 
 
-def probe_machine(cfg: Config, runs_dir: Path, runtime_dir: Path | None, environ: Mapping[str, str]) -> list[Finding]:
+def probe_machine(
+    cfg: Config, runs_dir: Path, runtime_dir: Path | None, environ: Mapping[str, str]
+) -> list[PreflightResult]:
     """Clock, disk, runtime directory, real time."""
     return [_clock(), *_disk(runs_dir), _runtime_dir(cfg, runtime_dir, environ), _real_time(cfg)]
 
 
-def probe_keys(cfg: Config, *, sim: bool) -> Finding:
+def probe_keys(cfg: Config, *, sim: bool) -> PreflightResult:
     """The key of the robot link; those of the observatory channel are judged where it is served."""
     try:
         key = read_key(cfg.robot.key_file, must_be_private=not sim)
@@ -139,7 +141,7 @@ def probe_keys(cfg: Config, *, sim: bool) -> Finding:
     return passed("robot key", f"{cfg.robot.key_file}" if key else "none configured")
 
 
-def _clock() -> Finding:
+def _clock() -> PreflightResult:
     """Whether somebody keeps the machine's time: logs and recordings are compared by it."""
     name, year = "machine clock", time.gmtime().tm_year
     told = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
@@ -154,7 +156,7 @@ def _clock() -> Finding:
     return passed(name, f"{told}, synchronised")
 
 
-def _disk(runs_dir: Path) -> Iterator[Finding]:
+def _disk(runs_dir: Path) -> Iterator[PreflightResult]:
     """Free room and speed where runs are written; ``runs_dir`` itself is made by the first run."""
     place = runs_dir.absolute()
     if place.exists() and not place.is_dir():
@@ -195,7 +197,7 @@ def _slowest_write_s(folder: Path) -> float:
     return slowest_s
 
 
-def _runtime_dir(cfg: Config, runtime_dir: Path | None, environ: Mapping[str, str]) -> Finding:
+def _runtime_dir(cfg: Config, runtime_dir: Path | None, environ: Mapping[str, str]) -> PreflightResult:
     name = "runtime directory"
     try:
         folder = make_runtime_dir(str(runtime_dir or cfg.run.runtime_dir), environ)
@@ -209,7 +211,7 @@ def _runtime_dir(cfg: Config, runtime_dir: Path | None, environ: Mapping[str, st
     return passed(name, str(folder))
 
 
-def _real_time(cfg: Config) -> Finding:
+def _real_time(cfg: Config) -> PreflightResult:
     name, priority = "real time", cfg.run.realtime_priority
     if not priority:
         return passed(name, "not asked for (run.realtime_priority = 0)")

@@ -8,7 +8,7 @@ from pathlib import PurePath
 
 from pydantic import BaseModel
 
-from ccatp.config.messages import Fault, Key, choice_hint, slip_hint
+from ccatp.config.messages import ConfigProblem, Key, choice_hint, slip_hint
 from ccatp.config.models import (
     AlignConfig,
     Config,
@@ -38,7 +38,7 @@ _LARGEST_PORT = 65535
 _CORNERS = ((1, 1, "front-left"), (1, -1, "front-right"), (-1, 1, "rear-left"), (-1, -1, "rear-right"))
 
 
-def check_config(cfg: Config) -> list[Fault]:
+def check_config(cfg: Config) -> list[ConfigProblem]:
     """Everything wrong with a configuration whose values are each in range.
 
     Args:
@@ -66,29 +66,31 @@ def is_file_name(name: str) -> bool:
     return name.endswith(".toml") or "/" in name
 
 
-def _check_names(cfg: Config) -> Iterator[Fault]:
+def _check_names(cfg: Config) -> Iterator[ConfigProblem]:
     if cfg.run.filter not in FILTERS:
-        yield Fault(("run", "filter"), f'= "{cfg.run.filter}" is no filter; {choice_hint(cfg.run.filter, FILTERS)}')
+        yield ConfigProblem(
+            ("run", "filter"), f'= "{cfg.run.filter}" is no filter; {choice_hint(cfg.run.filter, FILTERS)}'
+        )
     if cfg.run.order not in ORDERS:
-        yield Fault(
+        yield ConfigProblem(
             ("run", "order"), f'= "{cfg.run.order}" is no traversal order; {choice_hint(cfg.run.order, ORDERS)}'
         )
     if cfg.run.panels > (there := cfg.mirror.panels.count):
         what = f"= {cfg.run.panels}, but {cfg.mirror.name} has {there} panels; 0 takes all of them"
-        yield Fault(("run", "panels"), what)
+        yield ConfigProblem(("run", "panels"), what)
     gains, sets = cfg.control.gains, cfg.control.gain_sets
     if gains not in sets:
-        yield Fault(("control", "gains"), f'= "{gains}" is no set of gains; {choice_hint(gains, sets)}')
+        yield ConfigProblem(("control", "gains"), f'= "{gains}" is no set of gains; {choice_hint(gains, sets)}')
     for section, named, found in (
         ("mirror", cfg.run.mirror, cfg.mirror.name),
         ("world", cfg.run.world, cfg.world.name),
     ):
         if not is_file_name(named) and named != found:
             what = f'= "{found}", but run.{section} = "{PurePath(named)}"; name the same in both'
-            yield Fault((section, "name"), what, (("run", section),))
+            yield ConfigProblem((section, "name"), what, (("run", section),))
 
 
-def _check_units(cfg: Config) -> Iterator[Fault]:
+def _check_units(cfg: Config) -> Iterator[ConfigProblem]:
     """Lengths and angles that have no limit of their own, but that nobody can have meant."""
     for name in type(cfg).model_fields:
         if name != "mirror":
@@ -97,7 +99,7 @@ def _check_units(cfg: Config) -> Iterator[Fault]:
     yield from _slips(cfg.mirror.base, ("mirror", "base"))
 
 
-def _slips(value: object, key: Key) -> Iterator[Fault]:
+def _slips(value: object, key: Key) -> Iterator[ConfigProblem]:
     if isinstance(value, BaseModel):
         for name in type(value).model_fields:
             yield from _slips(getattr(value, name), (*key, name))
@@ -111,25 +113,25 @@ def _slips(value: object, key: Key) -> Iterator[Fault]:
         name = next(part for part in reversed(key) if isinstance(part, str))
         largest = {"rad": _LARGEST_ANGLE_RAD, "m": _LARGEST_LENGTH_M}.get(name.rsplit("_", 1)[-1], math.inf)
         if abs(value) > largest:
-            yield Fault(key, f"= {value:g} must be at most {largest:.4g}{slip_hint(key, value)}")
+            yield ConfigProblem(key, f"= {value:g} must be at most {largest:.4g}{slip_hint(key, value)}")
 
 
-def _check_wheels(robot: RobotConfig, limits: LimitsConfig) -> Iterator[Fault]:
+def _check_wheels(robot: RobotConfig, limits: LimitsConfig) -> Iterator[ConfigProblem]:
     """The wheels must be able to give the motion that the limits allow."""
     rim_m_s = robot.max_wheel_rad_s * robot.wheel_radius_m
     formula = "max_wheel_rad_s * wheel_radius_m"
     wheels: tuple[Key, ...] = (("robot", "max_wheel_rad_s"), ("robot", "wheel_radius_m"))
     if limits.v_max_m_s > rim_m_s:
         what = f"= {limits.v_max_m_s:g} is more than the wheels give: robot.{formula} = {rim_m_s:.4g}"
-        yield Fault(("limits", "v_max_m_s"), what, wheels)
+        yield ConfigProblem(("limits", "v_max_m_s"), what, wheels)
     turning_m_s = limits.omega_max_rad_s * robot.wheel_base_m / 2.0
     if turning_m_s > rim_m_s:
         most = 2.0 * rim_m_s / robot.wheel_base_m
         what = f"= {limits.omega_max_rad_s:g} is more than the wheels give: 2 * {formula} / wheel_base_m = {most:.4g}"
-        yield Fault(("limits", "omega_max_rad_s"), what, (*wheels, ("robot", "wheel_base_m")))
+        yield ConfigProblem(("limits", "omega_max_rad_s"), what, (*wheels, ("robot", "wheel_base_m")))
 
 
-def _check_edge_sensors(robot: RobotConfig) -> Iterator[Fault]:
+def _check_edge_sensors(robot: RobotConfig) -> Iterator[ConfigProblem]:
     """Order front-left, front-right, rear-left, rear-right; x to the front, y to the left."""
     for index, ((x, y), (sign_x, sign_y, corner)) in enumerate(zip(robot.edge_sensors_m, _CORNERS, strict=True)):
         if x * sign_x <= 0.0 or y * sign_y <= 0.0:
@@ -137,27 +139,27 @@ def _check_edge_sensors(robot: RobotConfig) -> Iterator[Fault]:
                 f"= [{x:g}, {y:g}] is not {corner}, where x {'>' if sign_x > 0 else '<'} 0 "
                 f"and y {'>' if sign_y > 0 else '<'} 0; the order is front-left, front-right, rear-left, rear-right"
             )
-            yield Fault(("robot", "edge_sensors_m", index), what)
+            yield ConfigProblem(("robot", "edge_sensors_m", index), what)
 
 
-def _check_world(world: WorldConfig, sim: SimRobotConfig) -> Iterator[Fault]:
+def _check_world(world: WorldConfig, sim: SimRobotConfig) -> Iterator[ConfigProblem]:
     """Slip has a range; a delay is a number of frames, and what it delays must not be too old when it arrives."""
     if world.slip_min > world.slip_max:
         what = f"= {world.slip_min:g} is more than slip_max = {world.slip_max:g}"
-        yield Fault(("world", "slip_min"), what, (("world", "slip_max"),))
+        yield ConfigProblem(("world", "slip_min"), what, (("world", "slip_max"),))
     frame_s = 1.0 / sim.frame_hz
     for name in ("sensors_delay_s", "commands_delay_s"):
         delay_s = getattr(world, name)
         frames = delay_s * sim.frame_hz
         if abs(frames - round(frames)) > _WHOLE_FRAMES:
             what = f"= {delay_s:g} must be a whole number of frames of {frame_s:g} s"
-            yield Fault(("world", name), what, (("sim", "robot", "frame_hz"),))
+            yield ConfigProblem(("world", name), what, (("sim", "robot", "frame_hz"),))
         elif delay_s and delay_s + frame_s > sim.ttl_s * (1.0 + _WHOLE_FRAMES):
             what = f"= {delay_s:g} and a frame of {frame_s:g} s outlast sim.robot.ttl_s = {sim.ttl_s:g}"
-            yield Fault(("world", name), what, (("sim", "robot", "ttl_s"), ("sim", "robot", "frame_hz")))
+            yield ConfigProblem(("world", name), what, (("sim", "robot", "ttl_s"), ("sim", "robot", "frame_hz")))
 
 
-def _check_observatory(observatory: ObservatoryConfig) -> Iterator[Fault]:
+def _check_observatory(observatory: ObservatoryConfig) -> Iterator[ConfigProblem]:
     """TCP only with a key and a list of clients."""
     root = "observatory"
     if not observatory.endpoint:
@@ -165,19 +167,19 @@ def _check_observatory(observatory: ObservatoryConfig) -> Iterator[Fault]:
     matched = _TCP_ENDPOINT.fullmatch(observatory.endpoint)
     if matched is None or int(matched[1]) > _LARGEST_PORT:
         what = f'= "{observatory.endpoint}" must be tcp://ADDRESS:PORT, or empty for the unix socket alone'
-        yield Fault((root, "endpoint"), what)
+        yield ConfigProblem((root, "endpoint"), what)
         return
     for name in ("key_file", "clients_file"):
         if not getattr(observatory, name):
             what = f'= "", but endpoint = "{observatory.endpoint}" wants keys and a list; see ccatp keys generate'
-            yield Fault((root, name), what, ((root, "endpoint"),))
+            yield ConfigProblem((root, name), what, ((root, "endpoint"),))
 
 
-def check_dashboard(dashboard: DashboardConfig) -> Iterator[Fault]:
+def check_dashboard(dashboard: DashboardConfig) -> Iterator[ConfigProblem]:
     """Whoever reaches the page may stop the robot, unless there is a token."""
     if not (is_loopback(dashboard.host) or dashboard.token_file):
         what = f'= "{dashboard.host}" is beyond this machine; name a file with a token in dashboard.token_file'
-        yield Fault(("dashboard", "host"), what, (("dashboard", "token_file"),))
+        yield ConfigProblem(("dashboard", "host"), what, (("dashboard", "token_file"),))
 
 
 def is_loopback(host: str) -> bool:
@@ -188,20 +190,20 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def _check_stand_ins(cfg: Config) -> Iterator[Fault]:
+def _check_stand_ins(cfg: Config) -> Iterator[ConfigProblem]:
     """Whoever reaches a stand-in may command it, unless there is a key."""
     if cfg.sim.open_to_network:
         return
     hint = "set sim.open_to_network if anybody there may command it"
     if not (is_loopback(cfg.sim.robot.host) or cfg.robot.key_file):
         what = f'= "{cfg.sim.robot.host}" is beyond this machine; name a key in robot.key_file, or {hint}'
-        yield Fault(("sim", "robot", "host"), what)
+        yield ConfigProblem(("sim", "robot", "host"), what)
     if not is_loopback(cfg.sim.etalon.host):
         what = f'= "{cfg.sim.etalon.host}" is beyond this machine, and its protocol has no keys; {hint}'
-        yield Fault(("sim", "etalon", "host"), what)
+        yield ConfigProblem(("sim", "etalon", "host"), what)
 
 
-def _check_standstill(cfg: Config) -> Iterator[Fault]:
+def _check_standstill(cfg: Config) -> Iterator[ConfigProblem]:
     """Nothing is measured before the robot has stood still for long enough."""
     time_s = cfg.control.settle_time_s + cfg.etalon.measuring_time_s
     if time_s < _LEAST_STANDSTILL_S:
@@ -209,77 +211,77 @@ def _check_standstill(cfg: Config) -> Iterator[Fault]:
             f"= {cfg.etalon.measuring_time_s:g} is too short: with control.settle_time_s = "
             f"{cfg.control.settle_time_s:g} the robot must stand still for {_LEAST_STANDSTILL_S:g} s"
         )
-        yield Fault(("etalon", "measuring_time_s"), what, (("control", "settle_time_s"),))
+        yield ConfigProblem(("etalon", "measuring_time_s"), what, (("control", "settle_time_s"),))
 
 
-def _check_panels(panels: PanelsConfig) -> Iterator[Fault]:
+def _check_panels(panels: PanelsConfig) -> Iterator[ConfigProblem]:
     root: Key = ("mirror", "panels")
     for name in ("size_x_mm", "size_y_mm", "pitch_x_mm", "pitch_y_mm"):
         value = getattr(panels, name)
         if value < _SMALLEST_PANEL_MM:
-            yield Fault((*root, name), f"= {value:g} looks like metres: {value:g} m are {value * 1e3:g} mm")
+            yield ConfigProblem((*root, name), f"= {value:g} looks like metres: {value:g} m are {value * 1e3:g} mm")
             return
     rows: Key = (*root, "panels_per_row")
     total = sum(panels.panels_per_row)
     if total != panels.count:
         what = f"= {panels.count}, but panels_per_row adds up to {total}; correct one of them"
-        yield Fault((*root, "count"), what, (rows,))
+        yield ConfigProblem((*root, "count"), what, (rows,))
     for row, n in enumerate(panels.panels_per_row):
         if n > panels.cols or (panels.cols - n) % 2:
             what = f"= {n} panels cannot be centred on cols = {panels.cols}; both even or both odd, and not more"
-            yield Fault((*rows, row), what, ((*root, "cols"),))
+            yield ConfigProblem((*rows, row), what, ((*root, "cols"),))
     yield from _check_grid(panels, "x", root)
     yield from _check_grid(panels, "y", root)
 
 
-def _check_grid(panels: PanelsConfig, axis: str, root: Key) -> Iterator[Fault]:
+def _check_grid(panels: PanelsConfig, axis: str, root: Key) -> Iterator[ConfigProblem]:
     """Pitch and measurement points of one axis."""
     size, pitch = getattr(panels, f"size_{axis}_mm"), getattr(panels, f"pitch_{axis}_mm")
     size_key: Key = (*root, f"size_{axis}_mm")
     if abs(pitch - size - panels.gap_mm) > _PITCH_AGREEMENT_MM:
         what = f"= {pitch:g} must be size + gap = {size + panels.gap_mm:g}"
-        yield Fault((*root, f"pitch_{axis}_mm"), what, (size_key, (*root, "gap_mm")))
+        yield ConfigProblem((*root, f"pitch_{axis}_mm"), what, (size_key, (*root, "gap_mm")))
     low, middle, high = getattr(panels, f"points_{axis}_mm")
     if not -size / 2.0 < low < middle < high < size / 2.0:
         what = f"= [{low:g}, {middle:g}, {high:g}] must ascend within the panel, {-size / 2.0:g} to {size / 2.0:g}"
-        yield Fault((*root, f"points_{axis}_mm"), what, (size_key,))
+        yield ConfigProblem((*root, f"points_{axis}_mm"), what, (size_key,))
 
 
-def _check_base(mirror: MirrorConfig) -> Iterator[Fault]:
+def _check_base(mirror: MirrorConfig) -> Iterator[ConfigProblem]:
     """The base must stand on a panel that exists."""
     base, panels, root = mirror.base, mirror.panels, ("mirror", "base")
     rows = len(panels.panels_per_row)
     if base.row > rows:
-        yield Fault((*root, "row"), f"= {base.row}, but there are {rows} rows")
+        yield ConfigProblem((*root, "row"), f"= {base.row}, but there are {rows} rows")
         return
     n = panels.panels_per_row[base.row - 1]
     first = (panels.cols - n) // 2 + 1
     if not first <= base.col < first + n:
         what = f"= {base.col}: no panel stands there, row {base.row} has columns {first} to {first + n - 1}"
-        yield Fault((*root, "col"), what)
+        yield ConfigProblem((*root, "col"), what)
     for axis in "xy":
         value, half = getattr(base, f"{axis}_mm"), getattr(panels, f"size_{axis}_mm") / 2.0
         if abs(value) >= half:
-            yield Fault(
+            yield ConfigProblem(
                 (*root, f"{axis}_mm"), f"= {value:g} is off the panel, which reaches from {-half:g} to {half:g}"
             )
 
 
-def _check_light(align: AlignConfig) -> Iterator[Fault]:
+def _check_light(align: AlignConfig) -> Iterator[ConfigProblem]:
     for name, light in align.light.items():
         if not any(light.direction_world):
-            yield Fault(("align", "light", name, "direction_world"), "= [0, 0, 0] is no direction")
+            yield ConfigProblem(("align", "light", name, "direction_world"), "= [0, 0, 0] is no direction")
 
 
-def _check_collimators(mirror: MirrorConfig) -> Iterator[Fault]:
+def _check_collimators(mirror: MirrorConfig) -> Iterator[ConfigProblem]:
     channels, positions = mirror.collimators.channels, mirror.collimators.positions_world_mm
     root: Key = ("mirror", "collimators")
     if len(channels) < MIN_COLLIMATORS:
-        yield Fault((*root, "channels"), f"has {len(channels)}; a position needs at least {MIN_COLLIMATORS}")
+        yield ConfigProblem((*root, "channels"), f"has {len(channels)}; a position needs at least {MIN_COLLIMATORS}")
     if len(set(channels)) != len(channels):
-        yield Fault((*root, "channels"), f"= {list(channels)} names a channel twice")
+        yield ConfigProblem((*root, "channels"), f"= {list(channels)} names a channel twice")
     if len(channels) != len(positions):
-        yield Fault(
+        yield ConfigProblem(
             (*root, "positions_world_mm"),
             f"has {len(positions)} positions for {len(channels)} channels",
             ((*root, "channels"),),
@@ -287,4 +289,4 @@ def _check_collimators(mirror: MirrorConfig) -> Iterator[Fault]:
     for index, position in enumerate(positions):
         if math.hypot(*position) < _NEAREST_COLLIMATOR_MM:
             what = f"= {list(position)} is {math.hypot(*position):.3g} mm from the world's origin; looks like metres"
-            yield Fault((*root, "positions_world_mm", index), what)
+            yield ConfigProblem((*root, "positions_world_mm", index), what)

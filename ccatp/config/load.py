@@ -27,7 +27,16 @@ from tomlkit.exceptions import TOMLKitError
 from ccatp.config.beacon_checks import check_radio_config
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.checks import check_config, is_file_name
-from ccatp.config.messages import Fault, Key, choice_hint, faults_of, find_line, format_key, format_toml, format_value
+from ccatp.config.messages import (
+    ConfigProblem,
+    Key,
+    choice_hint,
+    faults_of,
+    find_line,
+    format_key,
+    format_toml,
+    format_value,
+)
 from ccatp.config.models import Config, MirrorConfig, WorldConfig
 from ccatp.config.package import configs_dir
 from ccatp.config.recording_models import RecordingsConfig
@@ -37,7 +46,7 @@ Tree = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class ConfigSource:
     """One place that values come from.
 
     Attributes:
@@ -73,7 +82,7 @@ class Source:
         return f"{self.name}:{line}" if line else self.name
 
 
-def read_source(path: Path, root: Key = ()) -> Source:
+def read_source(path: Path, root: Key = ()) -> ConfigSource:
     """What a TOML file says, as the section ``root`` of a configuration.
 
     Raises:
@@ -86,7 +95,7 @@ def read_source(path: Path, root: Key = ()) -> Source:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: is not UTF-8 text (byte {error.start}); save it as UTF-8") from error
     try:
-        return Source(str(path), text, tomllib.loads(text), root, path.parent)
+        return ConfigSource(str(path), text, tomllib.loads(text), root, path.parent)
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, deep nesting
         at = re.search(r" \(at line (\d+), column (\d+)\)", str(error))
         line = int(at[1]) if at else max(1, len(text.splitlines()))
@@ -133,12 +142,12 @@ def merged(
     return tree
 
 
-def source_of(key: Key, sources: Iterable[Source]) -> Source:
+def source_of(key: Key, sources: Iterable[ConfigSource]) -> ConfigSource:
     """The source that says most about a key; of equals the strongest, which stands first."""
     return max(sources, key=lambda source: source.depth(key))
 
 
-def fault_line(fault: Fault, sources: list[Source]) -> str:
+def fault_line(fault: ConfigProblem, sources: list[ConfigSource]) -> str:
     """The line for the reader. Of keys that contradict each other it points to the one nearest to the user."""
     held = [(sources.index(source_of(key, sources)), key) for key in (fault.key, *fault.related)]
     strength, key = min(held, key=lambda pair: pair[0])
@@ -183,9 +192,9 @@ def load_config(
     """
     config_dir = config_dir or shipped_config_dir()
     default = read_source(config_dir / DEFAULT_FILE)
-    user = read_source(file) if file else Source("", "", {})
+    user = read_source(file) if file else ConfigSource("", "", {})
     _refuse_beacons(user, file)
-    command = Source("command line", "", nested(overrides or {}))
+    command = ConfigSource("command line", "", nested(overrides or {}))
     sources = [command, user, default]
     tree: Tree = {}
     for source in reversed(sources):
@@ -197,7 +206,7 @@ def load_config(
     return _validated(tree, sources)
 
 
-def _refuse_beacons(user: Source, file: Path | None) -> None:
+def _refuse_beacons(user: ConfigSource, file: Path | None) -> None:
     if file is None or "system" not in user.tree:
         return
     name = f"{file}: is of a mission among beacons (system = {format_value(user.tree['system'])})"
@@ -231,13 +240,13 @@ def _is_complete(section: str, value: object) -> bool:
     return isinstance(value, Mapping) and set(_SECTIONS[section][1].model_fields) <= set(value)
 
 
-def _is_replaced(section: str, user: Source, command: Source) -> bool:
+def _is_replaced(section: str, user: ConfigSource, command: ConfigSource) -> bool:
     """Whether the command line names another mirror or world than the one that the user's file holds in full."""
     wanted = _get(command.tree, "run", section)
     return wanted is not None and wanted != _get(user.tree, "run", section)
 
 
-def _overlay(section: str, tree: Tree, sources: list[Source]) -> Mapping[str, Any]:
+def _overlay(section: str, tree: Tree, sources: list[ConfigSource]) -> Mapping[str, Any]:
     """What file and command line say about the section itself."""
     command, user = sources[:2]
     if _is_complete(section, user.tree.get(section)) and _is_replaced(section, user, command):
@@ -250,11 +259,11 @@ def _overlay(section: str, tree: Tree, sources: list[Source]) -> Mapping[str, An
     return overlay
 
 
-def _named_section(section: str, tree: Tree, sources: list[Source], config_dir: Path) -> Source:
+def _named_section(section: str, tree: Tree, sources: list[ConfigSource], config_dir: Path) -> ConfigSource:
     """The file that ``run.mirror`` or ``run.world`` names; an empty source where the user's file holds all of it."""
     command, user = sources[:2]
     if _is_complete(section, user.tree.get(section)) and not _is_replaced(section, user, command):
-        return Source("", "", {}, (section,))
+        return ConfigSource("", "", {}, (section,))
     key: Key = ("run", section)
     name = _get(tree, "run", section)
     source = source_of(key, sources)
@@ -286,7 +295,7 @@ def _get(tree: object, *key: str) -> object:
     return tree
 
 
-def _validated(tree: Tree, sources: list[Source]) -> Config:
+def _validated(tree: Tree, sources: list[ConfigSource]) -> Config:
     try:
         # by way of JSON, where strict means what it should for TOML: an array is a tuple, "1" is no number
         cfg = Config.model_validate_json(json.dumps(tree, default=str), strict=True)
@@ -334,12 +343,12 @@ def load_radio_config(
     """
     config_dir = config_dir or shipped_config_dir()
     base = read_source(config_dir / BEACON_FILE)
-    user = read_source(file) if file else Source("", "", {})
+    user = read_source(file) if file else ConfigSource("", "", {})
     if file is not None and _is_survey(user.tree):
         raise ConfigError(
             f"{file}: is the configuration of a survey of a mirror; give that of a robot among beacons, as cricket.toml"
         )
-    command = Source("command line", "", nested(overrides or {}))
+    command = ConfigSource("command line", "", nested(overrides or {}))
     system = read_source(config_dir / f"{_system([command, user, base])}.toml")
     tree: Tree = {}
     for source in (base, system, user):
@@ -370,7 +379,7 @@ def dump_radio_config(cfg: RadioConfig) -> str:
     )
 
 
-def _system(sources: list[Source]) -> str:
+def _system(sources: list[ConfigSource]) -> str:
     for source in sources:
         if "system" in source.tree:
             name = source.tree["system"]
@@ -381,7 +390,7 @@ def _system(sources: list[Source]) -> str:
     raise ConfigError(f"{sources[-1].name}: system is missing; {choice_hint('', SYSTEMS)}")
 
 
-def _radio_loader_validated(tree: Tree, sources: list[Source], simulates: bool) -> RadioConfig:
+def _radio_loader_validated(tree: Tree, sources: list[ConfigSource], simulates: bool) -> RadioConfig:
     try:
         # by way of JSON, where strict means what it should for TOML: an array is a tuple, "1" is no number
         cfg = RadioConfig.model_validate_json(json.dumps(tree, default=str), strict=True)
@@ -408,8 +417,8 @@ def load_recordings_config(file: Path | None = None, overrides: Mapping[str, obj
         ConfigError: one line with file, line, key, what is wrong and what to do.
     """
     base = read_source(shipped_config_dir() / RECORDING_FILE)
-    user = read_source(file) if file else Source("", "", {})
-    command = Source("command line", "", nested(overrides or {}))
+    user = read_source(file) if file else ConfigSource("", "", {})
+    command = ConfigSource("command line", "", nested(overrides or {}))
     tree: Tree = {}
     for source in (base, user, command):
         tree = merged(tree, source.tree)

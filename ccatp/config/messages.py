@@ -160,7 +160,7 @@ _TYPES = {
 _SHOWN = 60
 
 
-class Fault(NamedTuple):
+class ConfigProblem(NamedTuple):
     """One thing wrong with a configuration.
 
     Attributes:
@@ -198,7 +198,7 @@ def slip_hint(key: Key, value: float, limit: float = math.inf) -> str:
     return ""
 
 
-def faults_of(errors: Iterable[Mapping[str, Any]], root: type[BaseModel] = Config) -> list[Fault]:
+def faults_of(errors: Iterable[Mapping[str, Any]], root: type[BaseModel] = Config) -> list[ConfigProblem]:
     """The findings of ``ValidationError.errors()`` as faults, misspelt keys first: they also cause missing ones.
 
     Args:
@@ -206,7 +206,7 @@ def faults_of(errors: Iterable[Mapping[str, Any]], root: type[BaseModel] = Confi
         root: the model that was validated.
     """
     ordered = sorted(errors, key=lambda error: error["type"] != "extra_forbidden")
-    return [Fault(tuple(error["loc"]), _what(error, root)) for error in ordered]
+    return [ConfigProblem(tuple(error["loc"]), _what(error, root)) for error in ordered]
 
 
 def _what(error: Mapping[str, Any], root: type[BaseModel]) -> str:

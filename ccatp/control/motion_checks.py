@@ -12,7 +12,7 @@ from ccatp.config.models import HealthConfig, RobotConfig
 from ccatp.core import ImuSample, WheelSample
 
 
-class Moved(NamedTuple):
+class MotionSum(NamedTuple):
     """Running sums since the start, at one time.
 
     Attributes:
@@ -27,7 +27,7 @@ class Moved(NamedTuple):
     turned_rad: float
 
 
-class Window:
+class SlidingWindow:
     """The change of running sums over a time.
 
     Args:
@@ -39,13 +39,13 @@ class Window:
     def __init__(self, span_s: float) -> None:
         """Empty."""
         self._span_s = span_s - 1e-6
-        self._kept: deque[Moved] = deque()
+        self._kept: deque[MotionSum] = deque()
 
     def reset(self) -> None:
         """Empty again."""
         self._kept.clear()
 
-    def push(self, now: Moved) -> Moved | None:
+    def push(self, now: MotionSum) -> MotionSum | None:
         """Take the newest sums; the change over the span (``t_s`` is its length), ``None`` while it is shorter."""
         kept, since_s = self._kept, now[0] - self._span_s
         kept.append(now)
@@ -54,7 +54,7 @@ class Window:
         t_s, right_m, left_m, turned_rad = kept[0]
         if t_s > since_s:
             return None
-        return Moved(now[0] - t_s, now[1] - right_m, now[2] - left_m, now[3] - turned_rad)
+        return MotionSum(now[0] - t_s, now[1] - right_m, now[2] - left_m, now[3] - turned_rad)
 
 
 class WheelMeans:

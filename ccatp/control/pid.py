@@ -136,7 +136,7 @@ def clamped(value: float, limit: float) -> float:
 FEEDBACK_SHARE = 0.25
 
 
-class Axis(Protocol):
+class ControlAxis(Protocol):
     """Brings one remaining quantity (a distance in m or an angle in rad) to zero."""
 
     def begin(self, remaining: float) -> None:

@@ -8,14 +8,14 @@ from math import asin, atan2, cos, hypot, pi, sin, sqrt
 from typing import NamedTuple, Protocol
 
 from ccatp.config.models import ControlConfig, LimitsConfig
-from ccatp.control.pid import Axis, BareAxis, Pid, ProfiledAxis, clamped
+from ccatp.control.pid import BareAxis, ControlAxis, Pid, ProfiledAxis, clamped
 from ccatp.core import Twist, wrap_pi
 
 # Drift per metre beyond which an estimate is nonsense: a robot carried off that fast has lost its wheels' grip.
 CREEP_LIMIT = 0.3
 
 
-class Sight(NamedTuple):
+class LegView(NamedTuple):
     """The line as seen from the robot.
 
     Attributes:
@@ -31,7 +31,7 @@ class Sight(NamedTuple):
     gain: float
 
 
-class Line:
+class LegLine:
     """The straight line through the stop along which a leg is driven.
 
     It is held by its course alone, so it passes through the stop wherever an update moves that. A stop whose
@@ -58,7 +58,9 @@ class Line:
         self._lay(atan2(target[1] - pose[1], target[0] - pose[0]))
         self._off_rad = 0.0
 
-    def look(self, pose: tuple[float, float, float], target: tuple[float, float], creep: tuple[float, float]) -> Sight:
+    def look(
+        self, pose: tuple[float, float, float], target: tuple[float, float], creep: tuple[float, float]
+    ) -> LegView:
         """Where the robot stands.
 
         The body moves along its axis m and drifts by c per metre: (m + c) lies along the line when the part of m across
@@ -79,7 +81,7 @@ class Line:
         angle = -asin(clamped(c * creep_y - s * creep_x, CREEP_LIMIT))
         self._off_rad = off = wrap_pi(motion - self._course_rad - angle)
         along = clamped(c * creep_x + s * creep_y, CREEP_LIMIT)
-        return Sight(c * dx + s * dy, s * dx - c * dy, off, cos(angle) + along)
+        return LegView(c * dx + s * dy, s * dx - c * dy, off, cos(angle) + along)
 
     def _move_to(self, target: tuple[float, float], motion: float, dx: float, dy: float, angle: float) -> None:
         self._target = target
@@ -96,7 +98,7 @@ def crab(course_rad: float, creep: tuple[float, float]) -> float:
     return -asin(clamped(across, CREEP_LIMIT))
 
 
-def line_rate(sight: Sight, v_m_s: float, cross_gain_rad_m2: float, heading_weight_1_s2: float) -> float:
+def line_rate(sight: LegView, v_m_s: float, cross_gain_rad_m2: float, heading_weight_1_s2: float) -> float:
     """Angular rate of the optimal regulator of ``e' = v theta, theta' = omega``, rad/s.
 
     Minimising the integral of ``(g v e)^2 + w theta^2 + omega^2`` the Riccati equation is solved by
@@ -124,7 +126,7 @@ NO_CREEP = (0.0, 0.0)
 STILL = Twist(0.0, 0.0)
 
 
-class Phase(StrEnum):
+class LegPhase(StrEnum):
     """What a leg is at."""
 
     TURN = "turn"
@@ -132,7 +134,7 @@ class Phase(StrEnum):
     DONE = "done"
 
 
-TURN, DRIVE, DONE = Phase
+TURN, DRIVE, DONE = LegPhase
 
 
 class Speeds(Protocol):
@@ -167,8 +169,8 @@ class LegTracker:
         self._position_tolerance_m = gains.position_tolerance_m
         self._heading_tolerance_rad = gains.heading_tolerance_rad
         self._straight_rad = max(control.straight_tolerance_rad, gains.heading_tolerance_rad)
-        self._forward: Axis
-        self._angular: Axis
+        self._forward: ControlAxis
+        self._angular: ControlAxis
         v, a, omega, alpha = limits.v_max_m_s, limits.a_max_m_s2, limits.omega_max_rad_s, limits.alpha_max_rad_s2
         self._along = ProfiledAxis(gains.forward, control, v, a, wheel_lag_s)
         if gains.shaped:
@@ -177,7 +179,7 @@ class LegTracker:
         else:
             self._forward, self._angular = BareAxis(gains.forward, v, a), BareAxis(gains.angular, omega, alpha)
         self._steering = Pid(gains.angular, omega)
-        self._line = Line(control.lookahead_m)
+        self._line = LegLine(control.lookahead_m)
         self._steering_damping = gains.angular.kd
         self._omega_max = omega
         self._reverse = False

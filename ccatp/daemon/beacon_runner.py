@@ -16,23 +16,23 @@ from ccatp.beacons.mission import (
     HELD,
     IDLE,
     RETURNING,
-    Arrival,
     BeaconMission,
-    State,
+    BeaconState,
     TrackRow,
+    WaypointArrival,
     assemble_beacons,
     check_beacon_robot,
     track_row,
     wheel_rates,
 )
-from ccatp.beacons.navigation import Ellipse, Navigator, SenseReader, Senses
+from ccatp.beacons.navigation import BeaconMeasurements, Ellipse, MeasurementReader, Navigator
 from ccatp.beacons.steering import HALT
 from ccatp.beacons.store import BeaconStore
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import Verdict
-from ccatp.daemon.mission_runner import STILL, Drive, Host, Hosting, MakeWork, Progress, Served
+from ccatp.daemon.mission_runner import STILL, DriveCommand, MakeWork, Progress, RunnerConfig, RunnerContext, TimedFrame
 from ccatp.daemon.process import BeaconArgs
-from ccatp.daemon.telemetry import Look, Painter, Teller
+from ccatp.daemon.telemetry import DisplayStatePublisher, PoseSnapshot, TelemetryPublisher
 from ccatp.errors import ExitStatus
 from ccatp.links.beacon_messages import NOTHING, decode_beacon_frame
 from ccatp.links.bus import Publisher
@@ -40,22 +40,22 @@ from ccatp.links.robot_codec import BadLine
 from ccatp.links.robot_messages import Hello
 from ccatp.links.topics import (
     BeaconArrival,
-    BeaconMap,
+    BeaconMapMessage,
     BeaconTrack,
-    Estimate,
+    EstimateMessage,
     Message,
     MissionStatus,
+    RobotShape,
     Scene,
-    Shape,
     is_estimate_due,
 )
-from ccatp.survey.state import Outcome
+from ccatp.survey.state import SurveyOutcome
 
 ECHO_MEMORY = 200  # points that the distance sensors saw lately, for displays
 TRAIL = 400  # places of the robot, one in five frames
 
 
-class BeaconTeller(Teller):
+class BeaconTelemetry(TelemetryPublisher):
     """Publishes for a mission among beacons.
 
     Args:
@@ -75,7 +75,7 @@ class BeaconTeller(Teller):
         """Start with empty batches."""
         super().__init__(publisher, log)
         self._cfg, self._mission = cfg, mission
-        self._painter = Painter(publisher, look_at_navigator)
+        self._painter = DisplayStatePublisher(publisher, look_at_navigator)
         self._track: list[TrackRow] = []
         self._echoes: deque[tuple[float, float]] = deque(maxlen=ECHO_MEMORY)
         self._trail: deque[tuple[float, float]] = deque(maxlen=TRAIL)
@@ -98,7 +98,7 @@ class BeaconTeller(Teller):
         x_m, y_m, heading_rad = belief.pose
         if is_first or is_estimate_due(seq):
             state = str(self._mission.state)
-            estimate = Estimate(
+            estimate = EstimateMessage(
                 seq=seq, t_s=t_s, x_m=x_m, y_m=y_m, heading_rad=heading_rad, sigma_m=belief.sigma_m, state=state
             )
             self._publisher.send("estimate", estimate)
@@ -128,7 +128,7 @@ class BeaconTeller(Teller):
         target = beacons.get(cfg.follow.target) if cfg.follow.is_active else None
         waypoints = [] if cfg.follow.is_active else list(cfg.workspace.waypoints_m)
         score = navigator.score
-        message = BeaconMap(
+        message = BeaconMapMessage(
             seq=seq,
             t_s=t_s,
             system=cfg.system,
@@ -148,18 +148,22 @@ class BeaconTeller(Teller):
         self._publisher.send("beacon_map", message)
         self._publisher.send("scene", Scene(seq=seq, t_s=t_s, shapes=self._shapes(beacons, waypoints)))
 
-    def _shapes(self, beacons: dict[str, Ellipse], waypoints: list[tuple[float, float]]) -> list[Shape]:
+    def _shapes(self, beacons: dict[str, Ellipse], waypoints: list[tuple[float, float]]) -> list[RobotShape]:
         cfg, belief = self._cfg, self._mission.navigator.belief
         x_m, y_m, heading_rad = belief.pose
-        shapes = [Shape(f"beacon {name}", *_kind(name, cfg), *e[:2], e[2:], label=name) for name, e in beacons.items()]
+        shapes = [
+            RobotShape(f"beacon {name}", *_kind(name, cfg), *e[:2], e[2:], label=name) for name, e in beacons.items()
+        ]
         shapes += [
-            Shape(f"waypoint {at}", "waypoint", *place, radius_m=cfg.control.arrival_radius_m, label=str(at + 1))
+            RobotShape(f"waypoint {at}", "waypoint", *place, radius_m=cfg.control.arrival_radius_m, label=str(at + 1))
             for at, place in enumerate(waypoints)
         ]
-        shapes += [Shape(f"echo {at}", "obstacle", *place) for at, place in enumerate(self._echoes)]
+        shapes += [RobotShape(f"echo {at}", "obstacle", *place) for at, place in enumerate(self._echoes)]
         if self._trail:
-            shapes.append(Shape("trail", "trail", *self._trail[-1], outline_m=list(self._trail)))
-        shapes.append(Shape("robot", "robot", x_m, y_m, belief.ellipse[2:], heading_rad, radius_m=cfg.vehicle.radius_m))
+            shapes.append(RobotShape("trail", "trail", *self._trail[-1], outline_m=list(self._trail)))
+        shapes.append(
+            RobotShape("robot", "robot", x_m, y_m, belief.ellipse[2:], heading_rad, radius_m=cfg.vehicle.radius_m)
+        )
         return shapes
 
     def status(self, message: MissionStatus) -> None:
@@ -167,7 +171,7 @@ class BeaconTeller(Teller):
         super().status(message)
         self._painter.tell_if_wanted(self.seq, self.t_s)
 
-    def arrival(self, arrival: Arrival) -> None:
+    def arrival(self, arrival: WaypointArrival) -> None:
         """A waypoint is reached in the present frame."""
         message = BeaconArrival(
             seq=self.seq + self._frames_before,
@@ -189,24 +193,24 @@ def _kind(name: str, cfg: RadioConfig) -> tuple[str]:
     return ("target" if cfg.follow.is_active and name == cfg.follow.target else "beacon",)
 
 
-def look_at_navigator(navigator: Navigator) -> Look:
+def look_at_navigator(navigator: Navigator) -> PoseSnapshot:
     """The pose among beacons; how readings agree is told with the map, as a sum over many of them."""
     belief = navigator.belief
     x_m, y_m, *covariance = belief.ellipse
     xx, xy, yy = covariance
     sigma_rad = float(max(belief.covariance[2, 2], 0.0)) ** 0.5
-    return Look(x_m, y_m, belief.pose[2], (xx, xy, yy), sigma_rad, 0.0, 0)
+    return PoseSnapshot(x_m, y_m, belief.pose[2], (xx, xy, yy), sigma_rad, 0.0, 0)
 
 
 EXIT_STATUS = {
-    Outcome.COMPLETE: ExitStatus.COMPLETE,
-    Outcome.AT_BASE: ExitStatus.ABORTED,
-    Outcome.STOPPED: ExitStatus.HELD,
-    Outcome.NONE: ExitStatus.INTERRUPTED,
+    SurveyOutcome.COMPLETE: ExitStatus.COMPLETE,
+    SurveyOutcome.AT_BASE: ExitStatus.ABORTED,
+    SurveyOutcome.STOPPED: ExitStatus.HELD,
+    SurveyOutcome.NONE: ExitStatus.INTERRUPTED,
 }
 
 
-class BeaconWork:
+class BeaconRunner:
     """A mission among beacons as the main-loop process hosts it.
 
     Args:
@@ -218,14 +222,14 @@ class BeaconWork:
 
     is_busy = False  # it waits for nobody
 
-    def __init__(self, cfg: RadioConfig, host: Host, mission: BeaconMission, store: BeaconStore) -> None:
+    def __init__(self, cfg: RadioConfig, host: RunnerContext, mission: BeaconMission, store: BeaconStore) -> None:
         """Wire the parts."""
         self._cfg, self._host, self._mission, self._store = cfg, host, mission, store
-        self._reader = SenseReader(cfg)
-        self._teller = BeaconTeller(host.publisher, host.log, cfg, mission)
-        self._senses: Senses | None = None
+        self._reader = MeasurementReader(cfg)
+        self._teller = BeaconTelemetry(host.publisher, host.log, cfg, mission)
+        self._senses: BeaconMeasurements | None = None
         self._speed_m_s = 0.0
-        self._state: State = IDLE
+        self._state: BeaconState = IDLE
         self._was_faulted = False
         self._told_arrivals = 0
         # An operator's commands are the mission's; so is what holds it.
@@ -233,7 +237,7 @@ class BeaconWork:
         self.interrupt = mission.interrupt
 
     @property
-    def teller(self) -> BeaconTeller:
+    def teller(self) -> BeaconTelemetry:
         """Tells the others."""
         return self._teller
 
@@ -326,7 +330,7 @@ class BeaconWork:
 
     # -- the frame ------------------------------------------------------------------------------------------------
 
-    def listen(self, frame: Served) -> None:
+    def listen(self, frame: TimedFrame) -> None:
         """Read the senses of the frame; damaged extra keys are as good as none."""
         try:
             extras = decode_beacon_frame(frame.raw)
@@ -335,7 +339,7 @@ class BeaconWork:
             self._teller.log.warning("bad extra keys", seq=frame.sensors.seq, error=str(error))
         self._senses = self._reader.read(frame.sensors, extras)
 
-    def decide(self, frame: Served, verdict: Verdict | None, _lag_s: float) -> Drive:
+    def decide(self, frame: TimedFrame, verdict: Verdict | None, _lag_s: float) -> DriveCommand:
         """What the mission wants, as far as the verdict permits it."""
         mission = self._mission
         if self._senses is None:
@@ -344,14 +348,14 @@ class BeaconWork:
         if mission.state is DONE:
             drive = HALT
         self._speed_m_s = drive.speed_m_s
-        return Drive(*wheel_rates(drive, self._cfg))
+        return DriveCommand(*wheel_rates(drive, self._cfg))
 
-    def stand(self, _frame: Served) -> Drive:
+    def stand(self, _frame: TimedFrame) -> DriveCommand:
         """The robot stands, and nothing is decided in this frame."""
         self._speed_m_s = 0.0
         return STILL
 
-    def tell(self, frame: Served) -> None:
+    def tell(self, frame: TimedFrame) -> None:
         """The estimate, arrivals, a state that is new."""
         sensors, mission = frame.sensors, self._mission
         distances = () if self._senses is None else self._senses.distances_m
@@ -364,9 +368,9 @@ class BeaconWork:
         self.settle()
 
 
-def hosting_of_beacons(cfg: RadioConfig) -> Hosting:
+def hosting_of_beacons(cfg: RadioConfig) -> RunnerConfig:
     """What the process needs of the configuration."""
-    return Hosting(
+    return RunnerConfig(
         cfg.robot, cfg.processes.realtime_priority, cfg.mission.verdict_timeout_s, 10.0 * cfg.run.step_s,
         1.0 / cfg.run.step_s,
     )  # fmt: skip
@@ -381,6 +385,6 @@ def open_beacons(args: BeaconArgs) -> Iterator[MakeWork]:
     meta = {"system": cfg.system, "seed": str(cfg.run.seed)}
     store = BeaconStore(args.run_dir / "mission.sqlite", meta, cfg.workspace.waypoints_m, laps)
     try:
-        yield lambda host: BeaconWork(cfg, host, mission, store)
+        yield lambda host: BeaconRunner(cfg, host, mission, store)
     finally:
         store.close()

@@ -18,20 +18,20 @@ from ccatp.mirror.mirror import build_mirror
 from ccatp.records.checkpoint import FILE, Checkpoint, CheckpointFile, read_checkpoint
 from ccatp.records.store import MissionStore
 from ccatp.records.store_rows import PlannedPoint, StoreError
-from ccatp.survey.composition import Parts, assemble
-from ccatp.survey.heading_recovery import Recovery, doubted
+from ccatp.survey.composition import SurveyParts, assemble
+from ccatp.survey.heading_recovery import TakeoverState, doubted
 from ccatp.survey.mission import Mission
 from ccatp.survey.planning.route import ORDERS
-from ccatp.survey.state import HELD, IDLE, MEASURING, SETTLING, Outcome, State
+from ccatp.survey.state import HELD, IDLE, MEASURING, SETTLING, MissionState, SurveyOutcome
 
 # Frames between two records: ten a second.
 PERIOD_FRAMES = 10
-STANDING = (IDLE, SETTLING, MEASURING, HELD, State.DONE)
+STANDING = (IDLE, SETTLING, MEASURING, HELD, MissionState.DONE)
 # Standing still is a matter of a second; a robot that was not at rest yet may still be on its way.
 _STILL_M_S, _STILL_RAD_S = 0.002, 0.01
 
 
-class Keeper:
+class CheckpointWriter:
     """Keeps the checkpoint up to date.
 
     Args:
@@ -101,14 +101,14 @@ def in_force_of(mission: Mission) -> tuple[str, str]:
 
     One that was stopped on its way home goes home when it goes on. An earthquake is kept by the danger loop.
     """
-    if mission.state is State.DONE and mission.outcome is not Outcome.STOPPED:
+    if mission.state is MissionState.DONE and mission.outcome is not SurveyOutcome.STOPPED:
         return "", ""
     return mission.abort_cause, mission.cause if mission.is_held_by_hand else ""
 
 
 def recovery_from(
     run_dir: Path, limits: LimitsConfig, skipped: tuple[PointId, ...] = (), held_cause: str = ""
-) -> Recovery | None:
+) -> TakeoverState | None:
     """What a run directory says of a survey that goes on; ``None`` where nobody wrote anything down.
 
     Args:
@@ -131,7 +131,7 @@ def recovery_from(
         (limits.a_max_m_s2, limits.alpha_max_rad_s2),
         stood=is_still and record.state in STANDING,
     )
-    return Recovery(
+    return TakeoverState(
         DeckPose(record.x_m, record.y_m, record.heading_rad),
         sigma_m,
         sigma_rad,
@@ -148,7 +148,7 @@ class StoreUnusable(CcatpError):
     exit_status = ExitStatus.USAGE
 
 
-def build_parts(args: ProcessArgs) -> tuple[Parts, MissionStore]:
+def build_parts(args: ProcessArgs) -> tuple[SurveyParts, MissionStore]:
     """All parts of the main loop and the mission's database."""
     cfg = args.config
     mirror = build_mirror(cfg.mirror)
@@ -168,7 +168,9 @@ def build_parts(args: ProcessArgs) -> tuple[Parts, MissionStore]:
     return parts, store
 
 
-def _recovery(args: ProcessArgs, store: MissionStore, points: Sequence[PointId], done: set[PointId]) -> Recovery | None:
+def _recovery(
+    args: ProcessArgs, store: MissionStore, points: Sequence[PointId], done: set[PointId]
+) -> TakeoverState | None:
     if not args.is_taking_over:
         return None
     # A run that is resumed tries again what was skipped; a main loop that takes over does not.

@@ -22,7 +22,7 @@ from ccatp.config.models import Config, ProcessesConfig
 from ccatp.config.package import child_environment
 from ccatp.daemon.process import SUPERVISOR_PID
 from ccatp.errors import ConfigError, ExitStatus
-from ccatp.links.topics import Presence
+from ccatp.links.topics import Heartbeat
 
 # It has said why, and would say so again.
 FINAL = (ExitStatus.USAGE, ExitStatus.UNREACHABLE)
@@ -32,7 +32,7 @@ _SIGNALS = {2: "SIGINT", 3: "SIGQUIT", 6: "SIGABRT", 7: "SIGBUS", 9: "SIGKILL", 
 LONGEST_LOOK_S = 0.2
 
 
-class Fate(Enum):
+class ProcessEnd(Enum):
     """What becomes of the run."""
 
     RESTART = "restart"
@@ -41,10 +41,10 @@ class Fate(Enum):
     WITHOUT = "without"  # it goes on without the process
 
 
-class Decision(NamedTuple):
+class RestartDecision(NamedTuple):
     """What becomes of the run, and a line for people."""
 
-    fate: Fate
+    fate: ProcessEnd
     text: str
 
 
@@ -63,7 +63,7 @@ class RestartPolicy:
 
     def died(
         self, name: str, code: int, now_s: float, *, is_replaceable: bool = True, is_needed: bool = True, why: str = ""
-    ) -> Decision:
+    ) -> RestartDecision:
         """A process has died.
 
         Args:
@@ -77,21 +77,23 @@ class RestartPolicy:
         how = why or (f"was killed by {_signal(-code)}" if code < 0 else f"ended with status {code}")
         if code in FINAL:
             if not is_needed:
-                return Decision(Fate.WITHOUT, f"process {name} {how}: the survey goes on without it")
-            return Decision(Fate.END, f"process {name} {how}")
+                return RestartDecision(ProcessEnd.WITHOUT, f"process {name} {how}: the survey goes on without it")
+            return RestartDecision(ProcessEnd.END, f"process {name} {how}")
         if not is_replaceable:
-            return Decision(Fate.HELD, f"process {name} {how}: run ended, wheels held")
+            return RestartDecision(ProcessEnd.HELD, f"process {name} {how}: run ended, wheels held")
         restarts_s = self._restarts_s[name]
         while restarts_s and now_s - restarts_s[0] > self._window_s:
             restarts_s.popleft()
         if len(restarts_s) >= self._limit:
             often = f"more than {self._limit} times within {self._window_s:g} s"
             if not is_needed:
-                return Decision(Fate.WITHOUT, f"process {name} {how}, {often}: the survey goes on without it")
-            return Decision(Fate.HELD, f"process {name} {how}, {often}: run ended, wheels held")
+                return RestartDecision(
+                    ProcessEnd.WITHOUT, f"process {name} {how}, {often}: the survey goes on without it"
+                )
+            return RestartDecision(ProcessEnd.HELD, f"process {name} {how}, {often}: run ended, wheels held")
         restarts_s.append(now_s)
         meanwhile = "wheels held meanwhile" if is_needed else "the survey goes on"
-        return Decision(Fate.RESTART, f"process {name} {how}: starting it anew, {meanwhile}")
+        return RestartDecision(ProcessEnd.RESTART, f"process {name} {how}: starting it anew, {meanwhile}")
 
 
 def _signal(number: int) -> str:
@@ -175,7 +177,7 @@ class _Child:
     why_killed: str = ""
 
 
-class Children:
+class ProcessManager:
     """The processes of one run.
 
     Args:
@@ -226,13 +228,13 @@ class Children:
         watch = SilenceWatch(max(self._cfg.start_timeout_s, hang_timeout_s), hang_timeout_s) if spec.is_loop else None
         self._children[spec.name] = _Child(spec, process, pidfd, watch)
 
-    def heard(self, presence: Presence) -> None:
+    def heard(self, presence: Heartbeat) -> None:
         """A process has told its presence; words of one that is dead do not count."""
         child = self._children.get(presence.process)
         if child is not None and child.watch is not None and child.process.pid == presence.pid:
             child.watch.heard()
 
-    def look(self, now_s: float) -> tuple[str, int, Decision] | None:
+    def look(self, now_s: float) -> tuple[str, int, RestartDecision] | None:
         """Bury the dead, kill who hangs, and start anew.
 
         Returns:
@@ -254,11 +256,11 @@ class Children:
                 is_needed=spec.is_needed,
                 why=child.why_killed,
             )
-            if decision.fate not in (Fate.RESTART, Fate.WITHOUT):
+            if decision.fate not in (ProcessEnd.RESTART, ProcessEnd.WITHOUT):
                 return name, code, decision
             self._say("warning", decision.text)
             self._forget(child)
-            if decision.fate is Fate.WITHOUT:
+            if decision.fate is ProcessEnd.WITHOUT:
                 del self._children[name]
                 continue
             self.restarts += 1

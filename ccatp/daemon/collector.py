@@ -23,35 +23,35 @@ from ccatp.links.topics import (
     RECORD_FORMAT,
     TOPICS,
     BeaconArrival,
-    BeaconMap,
+    BeaconMapMessage,
     BeaconPlaces,
     BeaconTrack,
     BeaconTruth,
     DangerEvent,
-    Log,
+    Heartbeat,
+    LogMessage,
     Message,
     MissionStatus,
-    Presence,
     Timing,
-    Track,
-    Truth,
+    TrackMessage,
+    TruthMessage,
 )
 from ccatp.records.beacon_summary import BeaconSummary, Reached, beacon_facts
 from ccatp.records.recorder import Recorder
 from ccatp.report.views import recorded_schemas
 
-RECEIVED = tuple(topic.name for topic in TOPICS if topic.recorded or topic.message in (Timing, Presence))
+RECEIVED = tuple(topic.name for topic in TOPICS if topic.recorded or topic.message in (Timing, Heartbeat))
 FINISH_TIMEOUT_S = 5.0
 ASK_TIMEOUT_S = 1.0
 
 
-class View(Protocol):
+class DerivedView(Protocol):
     """Where progress is shown."""
 
     def say(self, level: str, text: str) -> None:
         """One line for the operator."""
 
-    def pose(self, track: Track) -> None:
+    def pose(self, track: TrackMessage) -> None:
         """A batch of estimates."""
 
     def status(self, status: MissionStatus) -> None:
@@ -73,7 +73,7 @@ class RunAccess(NamedTuple):
     endpoints: Endpoints
     run_dir: Path
     is_sim: bool
-    on_presence: Callable[[Presence], None]
+    on_presence: Callable[[Heartbeat], None]
 
 
 class Collector(ABC):
@@ -100,7 +100,7 @@ class Collector(ABC):
             metadata={"format": str(RECORD_FORMAT), "ccatp": ccatp.__version__, **metadata},
             on_failure=self._on_recorder_failure,
         )
-        self._view: View | None = None
+        self._view: DerivedView | None = None
         self._status: MissionStatus | None = None
         self._truth_rows = 0
         self._has_views = True
@@ -158,7 +158,7 @@ class Collector(ABC):
             poller.register(waited_for, zmq.POLLIN)
         poller.poll(timeout_ms)
 
-    def collect(self, timeout_ms: int, view: View | None) -> None:
+    def collect(self, timeout_ms: int, view: DerivedView | None) -> None:
         """Take what came in, waiting at most ``timeout_ms`` for the first."""
         self._view = view
         received = self._subscriber.receive_raw(timeout_ms / 1000.0)
@@ -169,14 +169,14 @@ class Collector(ABC):
             received = self._subscriber.receive_raw()
         self._recorder.tend()
 
-    def _take(self, name: str, body: bytes, message: Message, view: View | None) -> None:
-        if isinstance(message, Presence):
+    def _take(self, name: str, body: bytes, message: Message, view: DerivedView | None) -> None:
+        if isinstance(message, Heartbeat):
             self._on_presence(message)
             return
         if name != "timing":
             self._recorder.write(name, max(message.t_s, 0.0), body)
             self._record_views(message)
-        if isinstance(message, Truth | BeaconTruth):
+        if isinstance(message, TruthMessage | BeaconTruth):
             self._truth_rows += len(message.rows)
         if view is not None:
             _show(message, view)
@@ -216,12 +216,12 @@ class Collector(ABC):
             return reply
 
 
-def _show(message: Message, view: View) -> None:
-    if isinstance(message, Track):
+def _show(message: Message, view: DerivedView) -> None:
+    if isinstance(message, TrackMessage):
         view.pose(message)
     elif isinstance(message, MissionStatus):
         view.status(message)
-    elif isinstance(message, Log):
+    elif isinstance(message, LogMessage):
         view.say(message.level, message.text)
     elif isinstance(message, DangerEvent) and message.code:
         text = danger_text(message.cause, message.signal, message.value, message.limit)
@@ -252,7 +252,7 @@ class BeaconCollector(Collector):
             summary.add_truth(message.rows)
         elif isinstance(message, BeaconPlaces):
             summary.set_places(message.places)
-        elif isinstance(message, BeaconMap):
+        elif isinstance(message, BeaconMapMessage):
             score = message.nis_sum, message.nis_size, message.refused
             summary.set_map(message.beacons, score, message.notes)
         elif isinstance(message, BeaconArrival):

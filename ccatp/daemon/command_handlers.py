@@ -15,11 +15,11 @@ import structlog
 import zmq.asyncio
 
 from ccatp.config.models import ObservatoryConfig
-from ccatp.daemon.mission_runner import Obeying
-from ccatp.links.auth import Client, ClientsFile, KeyPair, Role, read_clients, read_pair
+from ccatp.daemon.mission_runner import CommandHandler
+from ccatp.links.auth import AuthorizedClient, ClientsFile, KeyPair, Role, read_clients, read_pair
 from ccatp.links.channels import (
     BadRequest,
-    EmergencyDesk,
+    EmergencyHandler,
     OperatorCommand,
     answer_observatory,
     format_error,
@@ -27,7 +27,7 @@ from ccatp.links.channels import (
     parse_operator,
     parse_reply,
 )
-from ccatp.links.liveness import LineBudget
+from ccatp.links.liveness import LogRateLimit
 from ccatp.links.rpc import CurveRouter, Router, ZapHandler
 from ccatp.links.topics import MissionStatus
 
@@ -36,7 +36,7 @@ EFFECT_TIMEOUT_S = 5.0
 CAUSE = "operator"
 
 
-class OperatorDesk:
+class OperatorCommandHandler:
     """Hands the commands of an operator to the mission.
 
     Args:
@@ -49,7 +49,7 @@ class OperatorDesk:
 
     def __init__(
         self,
-        mission: Obeying,
+        mission: CommandHandler,
         say: Callable[[str, str], None],
         status: Callable[[], MissionStatus],
         settled: Callable[[], Awaitable[None]],
@@ -92,12 +92,12 @@ class OperatorDesk:
 
 KEY_FILE, CLIENTS_FILE = "observatory.key_file", "observatory.clients_file"
 # Whoever reaches the unix socket has the daemon's own user: it might as well stop the daemon.
-LOCAL = Client("local", Role.CLEAR)
+LOCAL = AuthorizedClient("local", Role.CLEAR)
 # Somebody who asks over and over must not fill the log.
 LOGGED_LINES, LOGGED_PERIOD_S = 10, 60.0
 
 
-class Monitor(EmergencyDesk, Protocol):
+class EmergencyReceiver(EmergencyHandler, Protocol):
     """What is asked and told; ``ccatp.danger.DangerMonitor`` is one."""
 
     @property
@@ -105,7 +105,7 @@ class Monitor(EmergencyDesk, Protocol):
         """Whether the robot is at base or held, by a fresh estimate."""
 
 
-class ObservatoryDesk:
+class EmergencyCommandHandler:
     """Hands the requests of the observatory to the danger rules, and tells the log.
 
     Args:
@@ -115,14 +115,14 @@ class ObservatoryDesk:
     """
 
     def __init__(
-        self, monitor: Monitor, age_s: Callable[[], float | None], log: structlog.typing.FilteringBoundLogger
+        self, monitor: EmergencyReceiver, age_s: Callable[[], float | None], log: structlog.typing.FilteringBoundLogger
     ) -> None:
         """Nothing asked yet."""
         self._monitor, self._age_s, self._log = monitor, age_s, log
-        self._accepted = LineBudget(LOGGED_LINES, LOGGED_PERIOD_S)
-        self._refused = LineBudget(LOGGED_LINES, LOGGED_PERIOD_S)
+        self._accepted = LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)
+        self._refused = LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)
 
-    def answer(self, frame: bytes, client: Client = LOCAL) -> bytes:
+    def answer(self, frame: bytes, client: AuthorizedClient = LOCAL) -> bytes:
         """The reply to a request of a client."""
         reply = answer_observatory(
             frame,
@@ -152,7 +152,7 @@ class ObservatoryDesk:
         self._log.info(text, **fields)
 
 
-class Observatory:
+class ObservatoryServer:
     """The observatory channel: a unix socket, and TCP where it is configured.
 
     Args:
@@ -164,7 +164,7 @@ class Observatory:
         ConfigError: the keys or the list of clients cannot be used.
     """
 
-    def __init__(self, local_endpoint: str, cfg: ObservatoryConfig, desk: ObservatoryDesk) -> None:
+    def __init__(self, local_endpoint: str, cfg: ObservatoryConfig, desk: EmergencyCommandHandler) -> None:
         """Read the keys; nothing is bound yet."""
         self._local_endpoint, self._cfg, self._desk = local_endpoint, cfg, desk
         self._keys = check_observatory(cfg)

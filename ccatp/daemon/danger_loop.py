@@ -25,7 +25,7 @@ from ccatp.config.models import Config, LinkConfig, ObservatoryConfig
 from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon import realtime
 from ccatp.daemon import realtime as spinning
-from ccatp.daemon.command_handlers import Monitor, Observatory, ObservatoryDesk
+from ccatp.daemon.command_handlers import EmergencyCommandHandler, EmergencyReceiver, ObservatoryServer
 from ccatp.daemon.process import (
     BeaconArgs,
     ProcessArgs,
@@ -36,26 +36,26 @@ from ccatp.daemon.process import (
     stop_on_signals,
     unless_stopped,
 )
-from ccatp.daemon.robot_session import FrameLag, LastingLink
-from ccatp.daemon.subscribers import PERIOD_S, EstimateEar, Pulse
+from ccatp.daemon.robot_session import LatenessStatistics, ReconnectingRobotLink
+from ccatp.daemon.subscribers import PERIOD_S, EstimateSubscriber, HeartbeatPublisher
 from ccatp.danger import DangerMonitor
 from ccatp.errors import CcatpError
 from ccatp.links.beacon_messages import decode_beacon_frame
 from ccatp.links.bus import Publisher
 from ccatp.links.robot_codec import BadLine
 from ccatp.links.robot_messages import Hello, Sensors
-from ccatp.links.topics import DangerEvent, Estimate
+from ccatp.links.topics import DangerEvent, EstimateMessage
 from ccatp.mirror.mirror import build_mirror
-from ccatp.safety.beacons import BeaconDanger
-from ccatp.safety.emergency_latch import AbortLatch, Emergency
+from ccatp.safety.beacons import BeaconSafetyRules
+from ccatp.safety.emergency_latch import Emergency, EmergencyLatch
 
-Judge = Callable[[Sensors, bytes, Estimate | None], Verdict]
+Judge = Callable[[Sensors, bytes, EstimateMessage | None], Verdict]
 
 
-class Guard(Monitor, Protocol):
+class SafetyMonitor(EmergencyReceiver, Protocol):
     """The danger rules of a mission."""
 
-    latch: AbortLatch
+    latch: EmergencyLatch
 
     @property
     def counts(self) -> dict[str, object]:
@@ -71,7 +71,7 @@ class Guard(Monitor, Protocol):
         """The verdict where a line of the robot was no frame, if that counts."""
 
 
-class DangerDuty(NamedTuple):
+class SafetyMonitorConfig(NamedTuple):
     """What the process hosts.
 
     Attributes:
@@ -83,7 +83,7 @@ class DangerDuty(NamedTuple):
         stale_after_s: no permit on frames that are older.
     """
 
-    monitor: Guard
+    monitor: SafetyMonitor
     judge: Judge
     link: LinkConfig
     observatory: ObservatoryConfig
@@ -91,22 +91,24 @@ class DangerDuty(NamedTuple):
     stale_after_s: float
 
 
-def duty_of(cfg: Config | RadioConfig) -> DangerDuty:
+def duty_of(cfg: Config | RadioConfig) -> SafetyMonitorConfig:
     """The rules that go with a configuration."""
     if isinstance(cfg, RadioConfig):
         return _among_beacons(cfg)
     monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger, cfg.health)
 
-    def judge(sensors: Sensors, _raw: bytes, estimate: Estimate | None) -> Verdict:
+    def judge(sensors: Sensors, _raw: bytes, estimate: EstimateMessage | None) -> Verdict:
         return monitor.step(sensors, estimate)
 
-    return DangerDuty(monitor, judge, cfg.robot, cfg.observatory, cfg.run.realtime_priority, cfg.danger.stale_after_s)
+    return SafetyMonitorConfig(
+        monitor, judge, cfg.robot, cfg.observatory, cfg.run.realtime_priority, cfg.danger.stale_after_s
+    )
 
 
-def _among_beacons(cfg: RadioConfig) -> DangerDuty:
-    monitor = BeaconDanger(cfg)
+def _among_beacons(cfg: RadioConfig) -> SafetyMonitorConfig:
+    monitor = BeaconSafetyRules(cfg)
 
-    def judge(sensors: Sensors, raw: bytes, estimate: Estimate | None) -> Verdict:
+    def judge(sensors: Sensors, raw: bytes, estimate: EstimateMessage | None) -> Verdict:
         try:
             extras = decode_beacon_frame(raw)
         except BadLine:
@@ -114,7 +116,7 @@ def _among_beacons(cfg: RadioConfig) -> DangerDuty:
             return monitor.stale(sensors.seq, sensors.t)
         return monitor.step(sensors, extras, estimate)
 
-    return DangerDuty(
+    return SafetyMonitorConfig(
         monitor, judge, cfg.robot, cfg.observatory, cfg.processes.realtime_priority, cfg.danger.stale_after_s
     )
 
@@ -132,7 +134,7 @@ def active_ids(path: Path) -> list[str]:
         return []
 
 
-class DurableLatch(AbortLatch):
+class PersistentEmergencyLatch(EmergencyLatch):
     """A latch that is on the disk before anybody is told that it is latched.
 
     Args:
@@ -165,7 +167,7 @@ class DurableLatch(AbortLatch):
             log.warning("emergencies of before", active=sorted(self._active))
 
     def raise_emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
-        """As ``AbortLatch``, and on the disk."""
+        """As ``EmergencyLatch``, and on the disk."""
         before = self.raised
         refusal = super().raise_emergency(kind, emergency_id, note)
         if self.raised != before:
@@ -173,7 +175,7 @@ class DurableLatch(AbortLatch):
         return refusal
 
     def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
-        """As ``AbortLatch``, and on the disk."""
+        """As ``EmergencyLatch``, and on the disk."""
         before = len(self._active)
         refusal = super().clear(emergency_id, at_base_or_held)
         if len(self._active) != before:
@@ -227,20 +229,20 @@ class DangerLoop:
         self._endpoints, self._context = args.endpoints, context
         self.log = open_log(args.run_dir / "log.jsonl", "danger")
         self.monitor = duty.monitor
-        self.monitor.latch = DurableLatch(args.run_dir / FILE, self.log)
+        self.monitor.latch = PersistentEmergencyLatch(args.run_dir / FILE, self.log)
         self._publisher = Publisher(context, args.endpoints.of("danger"))
-        self._pulse = Pulse(self._publisher, "danger")
+        self._pulse = HeartbeatPublisher(self._publisher, "danger")
         main, self._is_taking_over = args.endpoints.of("main"), args.is_taking_over
-        self._ear = EstimateEar(context, main, self._pulse.tell_if_due, is_taking_over=self._is_taking_over)
+        self._ear = EstimateSubscriber(context, main, self._pulse.tell_if_due, is_taking_over=self._is_taking_over)
         self._told = (EventCode.NORMAL, "", Severity.NONE)
         self._seq = -1
         self._bad_lines = 0
         self._permit_seq = 0
         self._t_s = 0.0
         self._is_stale = False
-        self._lag = FrameLag(duty.link.slip_after_s)
+        self._lag = LatenessStatistics(duty.link.slip_after_s)
         self._hello: Hello | None = None
-        self.lasting = LastingLink(
+        self.lasting = ReconnectingRobotLink(
             duty.link,
             role="monitor",
             client="danger",
@@ -249,8 +251,10 @@ class DangerLoop:
             on_joined=self._on_joined,
             on_bad_line=self._on_bad_line,
         )
-        desk = ObservatoryDesk(self.monitor, lambda: self._pulse.frame_age_s if self._seq >= 0 else None, self.log)
-        self._observatory = Observatory(args.endpoints.of("emergency"), duty.observatory, desk)
+        desk = EmergencyCommandHandler(
+            self.monitor, lambda: self._pulse.frame_age_s if self._seq >= 0 else None, self.log
+        )
+        self._observatory = ObservatoryServer(args.endpoints.of("emergency"), duty.observatory, desk)
         self.lost = asyncio.Event()
         self._is_lockstep = False
 

@@ -24,32 +24,32 @@ from ccatp.config.models import Config, DashboardConfig
 from ccatp.daemon import realtime as spinning
 from ccatp.daemon.command_handlers import LOGGED_LINES, LOGGED_PERIOD_S
 from ccatp.daemon.process import RUN_DIR_FILE, Endpoints, die_with_parent, open_log, parse_either, stop_on_signals
-from ccatp.daemon.subscribers import Pulse
-from ccatp.errors import ConfigError, UnreachableError
+from ccatp.daemon.subscribers import HeartbeatPublisher
+from ccatp.errors import ConfigError, DaemonUnreachableError
 from ccatp.links.bus import Publisher
-from ccatp.links.liveness import LineBudget
+from ccatp.links.liveness import LogRateLimit
 from ccatp.links.runtime_dir import runtime_dir_path
 from ccatp.mirror.mirror import build_mirror
 from ccatp.records.recorder import read_metadata
 from ccatp.records.store import read_survey
 from ccatp.records.store_rows import StoreError
 from ccatp.report.dashboard.access import read_token
-from ccatp.report.dashboard.app import CommandDesk, build_app
+from ccatp.report.dashboard.app import CommandEndpoint, build_app
 from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground
-from ccatp.report.dashboard.hub import BEACONS, SURVEY, Feed, Hub, Wants
+from ccatp.report.dashboard.hub import BEACONS, SURVEY, BusReader, StateBroadcaster, Wants
 from ccatp.report.dashboard.server import serve
 from ccatp.report.dashboard.survey_view import SurveyView
 from ccatp.report.dashboard.survey_view import ground as survey_ground
-from ccatp.report.dashboard.view import View
+from ccatp.report.dashboard.view import RunStateView
 
 Logger = structlog.typing.FilteringBoundLogger
 PULSE_PERIOD_S = 0.5
 
 
-class Shown(NamedTuple):
+class ShownRun(NamedTuple):
     """What a page shows of one kind of mission: its view, its ground, and the topics that make them."""
 
-    view: View
+    view: RunStateView
     ground: dict[str, Any]
     wants: Wants
 
@@ -76,11 +76,11 @@ class Dashboard:
         token = read_token(cfg.dashboard)
         view, ground, wants = _shown(cfg, run_dir, is_sim=is_sim, needs_token=token is not None)
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._feed = Feed(self._context, endpoints.of, view, is_sim=is_sim, wants=wants)
-        self._hub = Hub(self._feed, view, cfg.dashboard.rate_hz)
+        self._feed = BusReader(self._context, endpoints.of, view, is_sim=is_sim, wants=wants)
+        self._hub = StateBroadcaster(self._feed, view, cfg.dashboard.rate_hz)
         self._app = build_app(
             self._hub,
-            CommandDesk(self._context, endpoints.of("control"), cfg.dashboard.command_timeout_s),
+            CommandEndpoint(self._context, endpoints.of("control"), cfg.dashboard.command_timeout_s),
             ground,
             host_names=cfg.dashboard.host_names,
             token=token,
@@ -110,7 +110,7 @@ class Dashboard:
 
     async def _beat(self) -> None:
         publisher = Publisher(self._context, self._endpoints.of("dashboard"))
-        pulse = Pulse(publisher, "dashboard")
+        pulse = HeartbeatPublisher(publisher, "dashboard")
         pulse.phase = "ready"
         try:
             while True:
@@ -140,15 +140,15 @@ async def run_dashboard(
         dashboard.close()
 
 
-def _shown(cfg: Config | RadioConfig, run_dir: Path, *, is_sim: bool, needs_token: bool) -> Shown:
+def _shown(cfg: Config | RadioConfig, run_dir: Path, *, is_sim: bool, needs_token: bool) -> ShownRun:
     """THE table of missions for the page."""
     if isinstance(cfg, RadioConfig):
         ground = beacon_ground(cfg, is_sim=is_sim, needs_token=needs_token)
-        return Shown(BeaconView(cfg, is_sim=is_sim), ground, BEACONS)
+        return ShownRun(BeaconView(cfg, is_sim=is_sim), ground, BEACONS)
     mirror = build_mirror(cfg.mirror)
     view = SurveyView(mirror, cfg, is_sim=is_sim)
     _remember(view, run_dir, mirror.name)
-    return Shown(view, survey_ground(mirror, cfg, is_sim=is_sim, needs_token=needs_token), SURVEY)
+    return ShownRun(view, survey_ground(mirror, cfg, is_sim=is_sim, needs_token=needs_token), SURVEY)
 
 
 def _remember(view: SurveyView, run_dir: Path, mirror: str) -> None:
@@ -163,7 +163,7 @@ def _remember(view: SurveyView, run_dir: Path, mirror: str) -> None:
 
 def _sparing(log: Logger) -> Callable[[str, dict[str, object]], None]:
     """Lines for the log, at most so many in a minute: whoever reaches the port can cause them."""
-    budget = LineBudget(LOGGED_LINES, LOGGED_PERIOD_S)
+    budget = LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)
 
     def note(text: str, fields: dict[str, object]) -> None:
         left_out = budget.take(asyncio.get_running_loop().time())
@@ -178,7 +178,7 @@ class _Handler(logging.Handler):
 
     def __init__(self, log: Logger) -> None:
         super().__init__(logging.WARNING)
-        self._log, self._budget = log, LineBudget(LOGGED_LINES, LOGGED_PERIOD_S)
+        self._log, self._budget = log, LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)
 
     def emit(self, record: logging.LogRecord) -> None:
         left_out = self._budget.take(record.created)
@@ -309,7 +309,7 @@ def _run_dir_of(runtime_dir: Path) -> Path:
     except OSError:
         run_dir = None
     if run_dir is None or not (runtime_dir / "control").exists():
-        raise UnreachableError(
+        raise DaemonUnreachableError(
             f"no daemon in {runtime_dir}; start one with ccatp run, or name its folder with --runtime-dir"
         )
     return run_dir

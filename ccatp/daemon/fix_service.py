@@ -8,15 +8,15 @@ from typing import Any
 
 from ccatp.config.models import MissionConfig
 from ccatp.core import DeckPose, Fix, PointId, Vector3
-from ccatp.daemon.telemetry import SurveyTeller
+from ccatp.daemon.telemetry import SurveyTelemetry
 from ccatp.estimation.fixes import FixRefused
 from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
 from ccatp.localizer import Localizer
 from ccatp.records.store import MissionStore
 from ccatp.records.store_rows import AlreadyMeasuredError, StoreError
-from ccatp.survey.fix_gate import Scrutiny
+from ccatp.survey.fix_gate import FixGate
 from ccatp.survey.mission import Mission
-from ccatp.survey.state import Approaches
+from ccatp.survey.state import ApproachCounter
 
 # A commit takes milliseconds, on a busy disk a second. One that takes longer is told, and much longer holds the robot.
 SLOW_DISK_S = 2.0
@@ -30,7 +30,7 @@ class FrameRefused(EtalonError):
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class FixRequest:
     """One measurement wanted: of a point, or (``None``) to find the robot again; ``number`` is the mission's."""
 
     number: int
@@ -40,7 +40,7 @@ class Request:
     estimate: DeckPose
 
 
-class MeasuringDesk:
+class FixService:
     """Takes the measurements that the mission orders.
 
     Args:
@@ -59,27 +59,27 @@ class MeasuringDesk:
         self,
         cfg: MissionConfig,
         client: EtalonClient,
-        scrutiny: Scrutiny,
+        scrutiny: FixGate,
         localizer: Localizer,
         mission: Mission,
         store: MissionStore,
-        teller: SurveyTeller,
+        teller: SurveyTelemetry,
         on_over: Callable[[], None],
         between_s: Callable[[], float],
     ) -> None:
         """Nothing is wanted yet."""
         self._tolerance_m = cfg.arrival_tolerance_m
-        self._approaches = Approaches(cfg.correction_tolerance_m, cfg.max_approaches)
+        self._approaches = ApproachCounter(cfg.correction_tolerance_m, cfg.max_approaches)
         self._client, self._localizer, self._mission = client, localizer, mission
         self._store, self._teller, self._on_over, self._between_s = store, teller, on_over, between_s
         self._scrutiny = scrutiny
         self._timeout_s = cfg.measure_timeout_s
-        self._wanted: Request | None = None
+        self._wanted: FixRequest | None = None
         self._wakes = asyncio.Event()
         self.is_busy = False
         self.arrival_error_m = 0.0  # distance of the last fix from its point
 
-    def begin(self, request: Request) -> None:
+    def begin(self, request: FixRequest) -> None:
         """Take a measurement; ``is_busy`` until it is over. One that is under way is finished first, for nothing."""
         self.is_busy = True
         self._wanted = request
@@ -97,11 +97,11 @@ class MeasuringDesk:
                 self.is_busy = False
                 self._on_over()
 
-    def _is_wanted(self, request: Request) -> bool:
+    def _is_wanted(self, request: FixRequest) -> bool:
         """A pause or an edge in between means that the robot may have moved: the lengths are worth nothing then."""
         return self._mission.is_awaiting_fix and self._mission.request == request.number
 
-    async def _serve(self, request: Request) -> None:
+    async def _serve(self, request: FixRequest) -> None:
         """Measure, again where the fix is doubted, all within the time that a point may take."""
         self._scrutiny.begin()
         try:
@@ -121,12 +121,12 @@ class MeasuringDesk:
         else:
             await self._keep(request, fix)
 
-    async def _measure(self, request: Request) -> tuple[Fix, str]:
+    async def _measure(self, request: FixRequest) -> tuple[Fix, str]:
         """One fix, handed to the localizer if it is still wanted, and why it is doubted."""
         fix = await self._client.measure(request.t_s, request.expected_m)
         return fix, self._try(request, fix) if self._is_wanted(request) else ""
 
-    def _try(self, request: Request, fix: Fix) -> str:
+    def _try(self, request: FixRequest, fix: Fix) -> str:
         """Hand a fix to the localizer, unless it is doubted; why it is, or empty."""
         localizer = self._localizer
         finding = self._scrutiny.review(
@@ -154,7 +154,7 @@ class MeasuringDesk:
             )
         return ""
 
-    async def _fail(self, request: Request, why: str, error: Exception | None) -> None:
+    async def _fail(self, request: FixRequest, why: str, error: Exception | None) -> None:
         if isinstance(error, BadSolution):
             refusal = self._scrutiny.refusal_of(error.lengths_m, request.expected_m)
             error = FrameRefused(refusal) if refusal else error
@@ -167,7 +167,7 @@ class MeasuringDesk:
         if self._is_wanted(request):
             await self._skip(request, why)
 
-    async def _skip(self, request: Request, cause: str) -> None:
+    async def _skip(self, request: FixRequest, cause: str) -> None:
         if request.point is not None:
             try:
                 await self._stored(self._store.record_skipped(request.point, request.t_s), request.point)
@@ -176,7 +176,7 @@ class MeasuringDesk:
                 return
         self._mission.not_fixed(request.point, cause)
 
-    async def _keep(self, request: Request, fix: Fix) -> None:
+    async def _keep(self, request: FixRequest, fix: Fix) -> None:
         """The localizer has taken the fix: store it where the robot is near enough to the point."""
         if request.point is not None:
             self.arrival_error_m = self._mission.survey.distance_m(self._localizer.pose)

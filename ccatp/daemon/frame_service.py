@@ -13,10 +13,10 @@ from math import inf
 from ccatp.config.models import LinkConfig
 from ccatp.control.gate import Denial, DriveGate, FanGate
 from ccatp.core import Verdict
-from ccatp.daemon.mission_runner import STILL, Drive, FrameClock, Served, Work
-from ccatp.daemon.robot_session import FrameLag, Seat
-from ccatp.daemon.subscribers import Pulse, VerdictEar
-from ccatp.daemon.telemetry import Teller
+from ccatp.daemon.mission_runner import STILL, DriveCommand, MissionClock, MissionRunner, TimedFrame
+from ccatp.daemon.robot_session import ControllerSession, LatenessStatistics
+from ccatp.daemon.subscribers import HeartbeatPublisher, VerdictSubscriber
+from ccatp.daemon.telemetry import TelemetryPublisher
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.links.robot_messages import Sensors
 from ccatp.survey.mission import Mission
@@ -27,7 +27,7 @@ UNSEEN_S = 0.1
 CATCH_UP_S = 0.5
 
 
-class Surprise(CcatpError):
+class UnhandledError(CcatpError):
     """An error that nobody foresaw; the log has it all. The process is started anew."""
 
     exit_status = ExitStatus.HELD
@@ -53,18 +53,18 @@ class FrameService:
     def __init__(
         self,
         cfg: LinkConfig,
-        work: Work,
-        seat: Seat,
-        clock: FrameClock,
-        ear: VerdictEar,
-        pulse: Pulse,
+        work: MissionRunner,
+        seat: ControllerSession,
+        clock: MissionClock,
+        ear: VerdictSubscriber,
+        pulse: HeartbeatPublisher,
         *,
         on_surprise: Callable[[Exception], None],
     ) -> None:
         """No frame yet."""
         self._cfg, self._work, self._seat, self._clock, self._ear, self._pulse = cfg, work, seat, clock, ear, pulse
         self._teller, self._on_surprise = work.teller, on_surprise
-        self.lag = FrameLag(cfg.slip_after_s)
+        self.lag = LatenessStatistics(cfg.slip_after_s)
         self.over = asyncio.Event()
         self._catches_up_until_s = -inf
         self._was_quiet = False
@@ -90,13 +90,13 @@ class FrameService:
         except Exception as error:
             self._teller.log.exception("surprise in a frame", seq=self._clock.seq)
             self._teller.say("error", f"internal error, wheels held: {type(error).__name__}: {error}; see log.jsonl")
-            self._on_surprise(Surprise(f"internal error: {type(error).__name__}: {error}"))
+            self._on_surprise(UnhandledError(f"internal error: {type(error).__name__}: {error}"))
 
     def _serve(self, sensors: Sensors, raw: bytes) -> None:
         start = time.perf_counter()
         seat, work = self._seat, self._work
         steady_s, dt_s = self._clock.look(sensors.seq, sensors.t, seat.frame_period_s)
-        frame = Served(sensors, raw, steady_s, dt_s, seat.is_new_session)
+        frame = TimedFrame(sensors, raw, steady_s, dt_s, seat.is_new_session)
         is_unjudged = seat.is_unjudged
         if frame.is_first:
             self._greet(dt_s)
@@ -126,7 +126,7 @@ class FrameService:
             self._teller.say("warning", f"the robot moved and was out of sight for {dt_s:.2f} s: it is found again")
             self._work.lose_sight()
 
-    def _decide(self, frame: Served, verdict: Verdict | None) -> Drive:
+    def _decide(self, frame: TimedFrame, verdict: Verdict | None) -> DriveCommand:
         """The drive that answers a frame. One that is too late moves nothing."""
         work, limit_s, begun_s = self._work, self._cfg.lag_limit_s, time.monotonic()
         lag_s = 0.0 if self._seat.is_lockstep else self.lag.served(frame.sensors.t, begun_s)
@@ -152,7 +152,7 @@ class FrameService:
             return True
         return not self._work.is_busy and not (self._work.is_paused and self._work.is_quiet)
 
-    def _answer(self, seq: int, drive: Drive) -> None:
+    def _answer(self, seq: int, drive: DriveCommand) -> None:
         if self._may_answer():
             self._seat.drive(seq, *drive)
         else:
@@ -175,7 +175,7 @@ REPEAT_S = 1.0
 Say = Callable[[str, str], None]
 
 
-class GateWatch:
+class GateLog:
     """Looks at the gate after each frame.
 
     Args:
@@ -209,7 +209,7 @@ class GateWatch:
 FULL_FANS = (1.0, 1.0)
 
 
-class FanDesk:
+class FanController:
     """Sends fan duties through the fans' gate.
 
     Args:
@@ -221,7 +221,13 @@ class FanDesk:
     """
 
     def __init__(
-        self, duty: tuple[float, float], seat: Seat, mission: Mission, teller: Teller, *, has_floor: bool
+        self,
+        duty: tuple[float, float],
+        seat: ControllerSession,
+        mission: Mission,
+        teller: TelemetryPublisher,
+        *,
+        has_floor: bool,
     ) -> None:
         """Nothing sent."""
         self._duty, self._seat, self._mission, self._teller = duty, seat, mission, teller

@@ -9,9 +9,9 @@ import zmq.asyncio
 
 from ccatp.daemon import realtime
 from ccatp.daemon import realtime as spinning
-from ccatp.daemon.command_handlers import OperatorDesk
+from ccatp.daemon.command_handlers import OperatorCommandHandler
 from ccatp.daemon.frame_service import FrameService
-from ccatp.daemon.mission_runner import FrameClock, Host, Hosting, MakeWork
+from ccatp.daemon.mission_runner import MakeWork, MissionClock, RunnerConfig, RunnerContext
 from ccatp.daemon.process import (
     BeaconArgs,
     EitherArgs,
@@ -23,8 +23,8 @@ from ccatp.daemon.process import (
     stop_on_signals,
     unless_stopped,
 )
-from ccatp.daemon.robot_session import LastingLink, Seat
-from ccatp.daemon.subscribers import PERIOD_S, Pulse, VerdictEar
+from ccatp.daemon.robot_session import ControllerSession, ReconnectingRobotLink
+from ccatp.daemon.subscribers import PERIOD_S, HeartbeatPublisher, VerdictSubscriber
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
 from ccatp.links.bus import Publisher
 from ccatp.links.robot_messages import Hello, Sensors
@@ -50,17 +50,17 @@ class MainLoop:
         self,
         args: ProcessArgs | BeaconArgs,
         context: zmq.Context[zmq.Socket[bytes]],
-        hosting: Hosting,
+        hosting: RunnerConfig,
         make_work: MakeWork,
     ) -> None:
         """Bind the sockets and wire the parts."""
         self._hosting, self._endpoints, self._context = hosting, args.endpoints, context
         self._is_taking_over = args.is_taking_over
         self._publisher = Publisher(context, args.endpoints.of("main"))
-        self._pulse = Pulse(self._publisher, "main")
+        self._pulse = HeartbeatPublisher(self._publisher, "main")
         danger = args.endpoints.of("danger")
-        self._ear = VerdictEar(context, danger, hosting.verdict_timeout_s, self._pulse.tell_if_due)
-        self._link = LastingLink(
+        self._ear = VerdictSubscriber(context, danger, hosting.verdict_timeout_s, self._pulse.tell_if_due)
+        self._link = ReconnectingRobotLink(
             hosting.link,
             role="controller",
             client="main",
@@ -68,10 +68,10 @@ class MainLoop:
             on_lost=self._on_lost,
             on_joined=self._on_joined,
         )
-        self._seat = Seat(self._link, is_taking_over=self._is_taking_over, frame_hz=hosting.frame_hz)
-        self._clock = FrameClock(hosting.clock_jump_s)
+        self._seat = ControllerSession(self._link, is_taking_over=self._is_taking_over, frame_hz=hosting.frame_hz)
+        self._clock = MissionClock(hosting.clock_jump_s)
         self._work = make_work(
-            Host(
+            RunnerContext(
                 args.run_dir,
                 self._publisher,
                 open_log(args.run_dir / "log.jsonl", "main"),
@@ -92,7 +92,7 @@ class MainLoop:
 
     async def run(self, stop: asyncio.Event) -> None:
         """Join the robot when the danger loop has, then serve frames until the mission is over or ``stop`` is set."""
-        desk = OperatorDesk(self._work, self._teller.say, self.status, self.settled, self._answer_held_frame)
+        desk = OperatorCommandHandler(self._work, self._teller.say, self.status, self.settled, self._answer_held_frame)
         shadow = zmq.asyncio.Context.shadow(self._context)
         async with Router(self._endpoints.of("control"), desk.handle, shadow) as router, asyncio.TaskGroup() as tasks:
             work = router.serve(), self._beat(), self._work.run(), self._link.serve(), self._watch()
@@ -260,7 +260,7 @@ class MainLoop:
         )
 
 
-def open_work(args: EitherArgs) -> tuple[Hosting, AbstractContextManager[MakeWork]]:
+def open_work(args: EitherArgs) -> tuple[RunnerConfig, AbstractContextManager[MakeWork]]:
     """THE table of missions: which one the configuration is of, and what the process needs to host it.
 
     Only that one is imported: a main loop that was killed is back half a second sooner.

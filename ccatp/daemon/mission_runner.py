@@ -15,15 +15,15 @@ import structlog
 
 from ccatp.config.models import LinkConfig
 from ccatp.core import Verdict
-from ccatp.daemon.robot_session import Seat
-from ccatp.daemon.telemetry import Teller
+from ccatp.daemon.robot_session import ControllerSession
+from ccatp.daemon.telemetry import TelemetryPublisher
 from ccatp.errors import ExitStatus
 from ccatp.links.bus import Publisher
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.safety.robot_clock import SteadyTime
 
 
-class FrameClock:
+class MissionClock:
     """Numbers and times of the frames.
 
     Args:
@@ -88,7 +88,7 @@ class FrameClock:
         self._steady = SteadyTime(self._jump_s)
 
 
-class Hosting(NamedTuple):
+class RunnerConfig(NamedTuple):
     """What the process itself needs of a configuration.
 
     Attributes:
@@ -106,7 +106,7 @@ class Hosting(NamedTuple):
     frame_hz: float
 
 
-class Served(NamedTuple):
+class TimedFrame(NamedTuple):
     """A frame as it is served.
 
     Attributes:
@@ -124,7 +124,7 @@ class Served(NamedTuple):
     is_first: bool
 
 
-class Drive(NamedTuple):
+class DriveCommand(NamedTuple):
     """Set points of the wheels, rad/s, and of the steering, rad, where the robot has one."""
 
     right_rad_s: float
@@ -132,7 +132,7 @@ class Drive(NamedTuple):
     steer_rad: float | None = None
 
 
-STILL = Drive(0.0, 0.0)
+STILL = DriveCommand(0.0, 0.0)
 
 
 class Progress(NamedTuple):
@@ -151,7 +151,7 @@ class Progress(NamedTuple):
     left_out: Mapping[str, list[str]]
 
 
-class Obeying(Protocol):
+class CommandHandler(Protocol):
     """Takes the commands of an operator; each returns why it was refused, or ``None``."""
 
     def pause(self, cause: str) -> str | None:
@@ -168,7 +168,7 @@ class Obeying(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Host:
+class RunnerContext:
     """What the process gives to its mission.
 
     Attributes:
@@ -185,18 +185,18 @@ class Host:
     run_dir: Path
     publisher: Publisher
     log: structlog.typing.FilteringBoundLogger
-    seat: Seat
-    clock: FrameClock
+    seat: ControllerSession
+    clock: MissionClock
     is_patient: bool
     finish: Callable[[ExitStatus], None]
     answer: Callable[[], None]
 
 
-class Work(Obeying, Protocol):
+class MissionRunner(CommandHandler, Protocol):
     """A mission in the main-loop process."""
 
     @property
-    def teller(self) -> Teller:
+    def teller(self) -> TelemetryPublisher:
         """Tells the others."""
 
     @property
@@ -263,10 +263,10 @@ class Work(Obeying, Protocol):
 
     # -- the frame, in this order ---------------------------------------------------------------------------------
 
-    def listen(self, frame: Served) -> None:
+    def listen(self, frame: TimedFrame) -> None:
         """Take what the robot says; the danger loop judges the same frame meanwhile."""
 
-    def decide(self, frame: Served, verdict: Verdict | None, lag_s: float) -> Drive:
+    def decide(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
         """The drive that answers the frame.
 
         Args:
@@ -275,11 +275,11 @@ class Work(Obeying, Protocol):
             lag_s: how late the frame is served.
         """
 
-    def stand(self, frame: Served) -> Drive:
+    def stand(self, frame: TimedFrame) -> DriveCommand:
         """In place of ``decide``: the robot stands, and nothing is decided in this frame."""
 
-    def tell(self, frame: Served) -> None:
+    def tell(self, frame: TimedFrame) -> None:
         """The drive is on its way: publish the estimate, keep records."""
 
 
-MakeWork = Callable[[Host], Work]
+MakeWork = Callable[[RunnerContext], MissionRunner]

@@ -19,8 +19,8 @@ from typing import Any, Protocol
 import msgspec
 
 from ccatp.config.package import child_environment
-from ccatp.errors import CcatpError, ExitStatus, UnreachableError
-from ccatp.links.client import Client
+from ccatp.errors import CcatpError, DaemonUnreachableError, ExitStatus
+from ccatp.links.client import OperatorClient
 from ccatp.links.topics import MissionStatus
 
 Answer = tuple[bool, str]
@@ -36,7 +36,7 @@ ENDINGS: Mapping[int, str] = {
 }
 
 
-class Session(Protocol):
+class OcsSession(Protocol):
     """The part of an OCS session that is used."""
 
     status: str
@@ -44,7 +44,7 @@ class Session(Protocol):
 
 
 @dataclass(slots=True)
-class SurveyDesk:
+class SurveyTask:
     """Starts, follows and ends surveys.
 
     Attributes:
@@ -54,12 +54,12 @@ class SurveyDesk:
         log: tells the agent's log.
     """
 
-    client: Client
+    client: OperatorClient
     command: Sequence[str]
     environment: Mapping[str, str]
     log: Callable[[str], None]
 
-    def survey(self, session: Session, panels: int | None = None) -> Answer:
+    def survey(self, session: OcsSession, panels: int | None = None) -> Answer:
         """Start a survey, or join the one that runs, and follow it to its end.
 
         When the session is told to stop, the survey is aborted, and the session ends with it: the robot is at base.
@@ -82,7 +82,7 @@ class SurveyDesk:
         )
         return self._follow(session, child)
 
-    def _follow(self, session: Session, child: "subprocess.Popen[bytes] | None") -> Answer:
+    def _follow(self, session: OcsSession, child: "subprocess.Popen[bytes] | None") -> Answer:
         deadline_s, is_aborted, last = time.monotonic() + START_TIMEOUT_S, False, None
         while child is None or child.poll() is None:
             status = self._status()
@@ -106,7 +106,7 @@ class SurveyDesk:
         # Whoever stopped it wanted it aborted.
         return code == ExitStatus.COMPLETE or (is_aborted and code == ExitStatus.ABORTED), ending
 
-    def ask(self, order: str, session: Session | None = None) -> Answer:
+    def ask(self, order: str, session: OcsSession | None = None) -> Answer:
         """One order to the daemon: status, pause, resume, abort, stop."""
         try:
             status: MissionStatus = getattr(self.client, order)()
@@ -116,7 +116,7 @@ class SurveyDesk:
             session.data = shown(status)
         return True, f"{order}: {status.state}"
 
-    def monitor(self, session: Session, publish: Callable[[dict[str, Any]], None], period_s: float) -> Answer:
+    def monitor(self, session: OcsSession, publish: Callable[[dict[str, Any]], None], period_s: float) -> Answer:
         """Publish the status again and again until the session is told to stop.
 
         Args:
@@ -141,7 +141,7 @@ class SurveyDesk:
     def _status(self) -> MissionStatus | None:
         try:
             return self.client.status()
-        except UnreachableError:
+        except DaemonUnreachableError:
             return None
 
 
@@ -223,12 +223,12 @@ def main(args: Sequence[str] | None = None) -> None:
     if not parsed.sim and parsed.config is None:
         parser.error("name the robot's configuration with --config FILE, or add --sim")
     agent, runner = ocs_agent.init_site_agent(parsed)
-    desk = SurveyDesk(Client(parsed.runtime_dir, TIMEOUT_S), survey_command(parsed), os.environ, agent.log.info)
+    desk = SurveyTask(OperatorClient(parsed.runtime_dir, TIMEOUT_S), survey_command(parsed), os.environ, agent.log.info)
     register(agent, desk, ocs_agent.param, parsed.period)
     runner.run(agent, auto_reconnect=True)
 
 
-def register(agent: Any, desk: SurveyDesk, param: Any, period_s: float) -> None:
+def register(agent: Any, desk: SurveyTask, param: Any, period_s: float) -> None:
     """Tell the agent its processes, tasks and feed.
 
     Args:
@@ -268,7 +268,7 @@ def register(agent: Any, desk: SurveyDesk, param: Any, period_s: float) -> None:
         agent.register_task(order, nothing(_task(desk, order)), blocking=True)
 
 
-def _task(desk: SurveyDesk, order: str) -> Callable[[Any, Any], Answer]:
+def _task(desk: SurveyTask, order: str) -> Callable[[Any, Any], Answer]:
     def task(session: Any, params: Any) -> Answer:
         del params
         return desk.ask(order, session)

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from ccatp.config.models import LinkConfig, RobotConfig
 from ccatp.control.prediction import CommandPredictor
 from ccatp.core import twist_of
-from ccatp.errors import UnreachableError
+from ccatp.errors import DaemonUnreachableError
 from ccatp.links.robot_link import RobotLink, RobotLinkError, RobotRefused, RobotTimeout, read_key
 from ccatp.links.robot_messages import Hello, Role, Sensors
 from ccatp.safety.wheel_monitors import CommandSpan
@@ -36,7 +36,7 @@ def delay_s(failures: int, share: float) -> float:
     return max(FIRST_DELAY_S, min(LONGEST_DELAY_S, FIRST_DELAY_S * 2.0 ** min(failures, 10)) * (0.5 + 0.5 * share))
 
 
-class LastingLink:
+class ReconnectingRobotLink:
     """Keeps a role at the robot.
 
     Args:
@@ -120,7 +120,7 @@ class LastingLink:
         elif self._failures:
             await asyncio.sleep(delay_s(self._failures, random.random()))
         self._failures += 1
-        why: UnreachableError | str = "it lets join, and sends no frame that is one"
+        why: DaemonUnreachableError | str = "it lets join, and sends no frame that is one"
         while (left_s := self._deadline_s - loop.time()) > 0.0:
             self._lost.clear()
             self.link = self._make()
@@ -160,7 +160,7 @@ class LastingLink:
         self.link.close()
 
 
-class Seat:
+class ControllerSession:
     """Sends drives and fans, and knows what the session is like.
 
     Args:
@@ -174,7 +174,7 @@ class Seat:
         is_new_session: no frame of this session has been served yet.
     """
 
-    def __init__(self, link: LastingLink, *, is_taking_over: bool, frame_hz: float) -> None:
+    def __init__(self, link: ReconnectingRobotLink, *, is_taking_over: bool, frame_hz: float) -> None:
         """Not joined."""
         self._link, self._is_taking_over, self._frame_hz = link, is_taking_over, frame_hz
         self._hello: Hello | None = None
@@ -218,7 +218,7 @@ class Seat:
         self._link.link.send_fans(self._fans_seq, duty)
 
 
-class Commanded:
+class CommandHistory:
     """Hears of each drive that is sent.
 
     Args:
@@ -257,7 +257,7 @@ MAX_DRIFT = 2e-4
 _NEVER_S = float("inf")
 
 
-class FrameLag:
+class LatenessStatistics:
     """Measures the lag of each frame against the promptest one lately.
 
     The difference of the host's clock to the robot's is least for a frame that was served at once. It may grow by the

@@ -9,7 +9,7 @@ import socket
 from collections.abc import Mapping, MutableMapping
 
 from ccatp.links.liveness import STALE_AFTER_S, Liveness
-from ccatp.links.topics import MissionStatus, Presence
+from ccatp.links.topics import Heartbeat, MissionStatus
 
 SOCKET, WATCHDOG_USEC, WATCHDOG_PID = "NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"
 
@@ -72,7 +72,7 @@ class Service:
         self._stroked_s = self._told_s = float("-inf")
         self._text = ""
 
-    def heard(self, presence: Presence) -> None:
+    def heard(self, presence: Heartbeat) -> None:
         """A loop is there."""
         self._liveness.heard(presence)
 

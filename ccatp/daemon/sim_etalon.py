@@ -13,13 +13,13 @@ from ccatp.daemon import realtime as spinning
 from ccatp.daemon.process import die_with_parent, parse_args, stop_on_signals
 from ccatp.errors import ConfigError
 from ccatp.mirror.mirror import build_mirror
-from ccatp.sim.etalon_server import EtalonStandIn, FixedPuck, TruthSource, ZmqPuck
+from ccatp.sim.etalon_server import EtalonSimulator, FixedPuck, PuckSource, ZmqPuck
 from ccatp.sim.laser import SEED_STREAM
 
 
-async def _serve(cfg: Config, truth: TruthSource, listener: socket.socket | None, stop: asyncio.Event) -> None:
+async def _serve(cfg: Config, truth: PuckSource, listener: socket.socket | None, stop: asyncio.Event) -> None:
     mirror = build_mirror(cfg.mirror)
-    server = EtalonStandIn(
+    server = EtalonSimulator(
         cfg.sim.etalon,
         mirror.channels,
         mirror.collimators_m,

@@ -21,13 +21,13 @@ from ccatp.daemon.process import RUN_DIR_FILE, Endpoints
 from ccatp.errors import ConfigError
 from ccatp.links.bus import Subscriber
 from ccatp.links.runtime_dir import runtime_dir_path
-from ccatp.links.topics import BY_NAME, Message, Presence, schema_of
+from ccatp.links.topics import BY_NAME, Heartbeat, Message, schema_of
 from ccatp.mirror.mirror import build_mirror
 from ccatp.records.recorder import read_metadata
 from ccatp.records.recording_repair import TELEMETRY
 from ccatp.report.foxglove import plain_schema
-from ccatp.report.live import FoxgloveStream, PlotJugglerStream, Stream, check_host
-from ccatp.report.views import VIEWS, Shown, Views, view_schemas
+from ccatp.report.live import FoxgloveStream, LiveStream, PlotJugglerStream, check_host
+from ccatp.report.views import VIEWS, ViewMessage, Views, view_schemas
 
 # What is shown of the topics themselves; batches are shown as their views.
 PASSED_ON = ("mission", "arrival", "rest", "treatment", "fix", "danger_event")
@@ -68,7 +68,7 @@ class Streamer:
         self,
         context: zmq.Context[zmq.Socket[bytes]],
         runtime_dir: Path,
-        streams: Sequence[Stream],
+        streams: Sequence[LiveStream],
         say: Callable[[str], None],
     ) -> None:
         """Listen for a run."""
@@ -87,7 +87,7 @@ class Streamer:
             poller.register(socket, zmq.POLLIN)
         poller.poll(PERIOD_MS)
         while (received := self._ear.receive()) is not None:
-            if isinstance(received[1], Presence):
+            if isinstance(received[1], Heartbeat):
                 self._heed(received[1])
         while self._run is not None and (raw := self._run.receive_raw()) is not None:
             if isinstance(raw[2], Message):
@@ -100,7 +100,7 @@ class Streamer:
         self._ear.close()
         self._forget()
 
-    def _heed(self, presence: Presence) -> None:
+    def _heed(self, presence: Heartbeat) -> None:
         if presence.pid == self._pid or presence.phase != "joined":
             return
         self._forget()
@@ -118,7 +118,7 @@ class Streamer:
             cfg.mirror.name, cfg.world.name if is_simulation else "", is_simulation, cfg.run.seed, cfg.run.filter,
             str(run_dir),
         )  # fmt: skip
-        self._send((Shown(RUN, 0.0, json.dumps(msgspec.to_builtins(fact)).encode()), *self._views.begin()))
+        self._send((ViewMessage(RUN, 0.0, json.dumps(msgspec.to_builtins(fact)).encode()), *self._views.begin()))
         names = ("main", "danger", "truth") if is_simulation else ("main", "danger")
         topics = dict.fromkeys((*PASSED_ON, *TURNED_INTO_VIEWS))
         self._run = Subscriber(self._context, [self._endpoints.of(name) for name in names], topics)
@@ -126,11 +126,11 @@ class Streamer:
 
     def _pass_on(self, name: str, body: bytes, message: Message) -> None:
         if name in PASSED_ON:
-            self._send([Shown(name, max(message.t_s, 0.0), body)])
+            self._send([ViewMessage(name, max(message.t_s, 0.0), body)])
         if name in TURNED_INTO_VIEWS and self._views is not None:
             self._send(self._views.of(message))
 
-    def _send(self, messages: Iterable[Shown]) -> None:
+    def _send(self, messages: Iterable[ViewMessage]) -> None:
         for shown in messages:
             for stream in self._streams:
                 stream.send(shown, is_latched=shown.topic == RUN or shown.topic in LATCHED)
@@ -176,7 +176,7 @@ def serve(
     with ExitStack() as stack:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         stack.callback(context.term)
-        streams: list[Stream] = []
+        streams: list[LiveStream] = []
         for stream in _streams(context, host, plotjuggler_port, foxglove_port):
             stack.callback(stream.close)
             streams.append(stream)
@@ -194,8 +194,8 @@ def serve(
 
 def _streams(
     context: "zmq.Context[zmq.Socket[bytes]]", host: str, plotjuggler_port: int | None, foxglove_port: int | None
-) -> "list[Stream]":
-    found: list[Stream] = []
+) -> "list[LiveStream]":
+    found: list[LiveStream] = []
     if plotjuggler_port is not None:
         found.append(PlotJugglerStream(context, host, plotjuggler_port))
     if foxglove_port is not None:

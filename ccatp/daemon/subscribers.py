@@ -11,7 +11,7 @@ import zmq
 
 from ccatp.core import Verdict
 from ccatp.links.bus import Publisher, Subscriber
-from ccatp.links.topics import Estimate, Message, Presence, last_estimate_before
+from ccatp.links.topics import EstimateMessage, Heartbeat, Message, last_estimate_before
 
 # In lockstep simulated time stands still while we wait; longer than this the other loop hangs.
 LOCKSTEP_WAIT_S = 10.0
@@ -43,7 +43,7 @@ def await_message(
             on_wait()
 
 
-class VerdictEar:
+class VerdictSubscriber:
     """Listens to the danger loop.
 
     Args:
@@ -70,7 +70,7 @@ class VerdictEar:
         """Whether it says that it has joined the robot; it repeats that."""
         while (received := self._subscriber.receive()) is not None:
             message = received[1]
-            if isinstance(message, Presence) and message.phase == "joined":
+            if isinstance(message, Heartbeat) and message.phase == "joined":
                 return True
         return False
 
@@ -116,7 +116,7 @@ class VerdictEar:
         self._subscriber.close()
 
 
-class EstimateEar:
+class EstimateSubscriber:
     """Listens to main.
 
     Args:
@@ -149,10 +149,10 @@ class EstimateEar:
 
     def forget(self) -> None:
         """The robot's frames count anew: what was heard is of another time."""
-        self._newest: Estimate | None = None
+        self._newest: EstimateMessage | None = None
         self._judged_frame = self._judged = self._first_seq = -1
 
-    def hear(self, seq: int, *, is_lockstep: bool) -> Estimate | None:
+    def hear(self, seq: int, *, is_lockstep: bool) -> EstimateMessage | None:
         """The estimate to judge a frame with: in lockstep always the same one, else the newest.
 
         Where several waited, after a stall, the newest counts, but the drives of each have moved the wheels:
@@ -165,7 +165,7 @@ class EstimateEar:
 
         def take(message: Message | Verdict) -> bool:
             # One of a frame that we have not seen is of the robot's last boot.
-            if not isinstance(message, Estimate) or message.seq > seq + MOST_AHEAD:
+            if not isinstance(message, EstimateMessage) or message.seq > seq + MOST_AHEAD:
                 return False
             missed = self._newest if self._newest_seq > self._judged else None
             self._newest = message if missed is None else message.following(missed)
@@ -195,7 +195,7 @@ class EstimateEar:
 PERIOD_S = 0.1
 
 
-class Pulse:
+class HeartbeatPublisher:
     """Tells the presence of one process.
 
     Args:
@@ -222,7 +222,7 @@ class Pulse:
     def tell(self) -> None:
         """Tell it now."""
         self._told_s = now_s = time.monotonic()
-        presence = Presence(
+        presence = Heartbeat(
             seq=self._count,
             t_s=now_s,
             process=self._process,

@@ -24,7 +24,15 @@ import zmq
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import dump_config, dump_radio_config, is_radio_file, load_config, load_radio_config
 from ccatp.config.models import Config, ProcessesConfig
-from ccatp.daemon.child_processes import Children, Decision, Fate, ProcessSpec, listen, places_of, with_addresses
+from ccatp.daemon.child_processes import (
+    ProcessEnd,
+    ProcessManager,
+    ProcessSpec,
+    RestartDecision,
+    listen,
+    places_of,
+    with_addresses,
+)
 from ccatp.daemon.collector import Collector, RunAccess
 from ccatp.daemon.command_handlers import check_observatory
 from ccatp.daemon.dashboard import PageSocket, open_page_socket
@@ -44,16 +52,16 @@ from ccatp.daemon.run_dir import (
 )
 from ccatp.daemon.service import Service, take_from
 from ccatp.daemon.survey_collector import RunCollector
-from ccatp.daemon.terminal import BeaconView, RunView, survey_title, write_run_report
+from ccatp.daemon.terminal import BeaconRunView, RunView, survey_title, write_run_report
 from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.robot_link import read_key
 from ccatp.links.runtime_dir import make_runtime_dir
-from ccatp.links.topics import Presence
+from ccatp.links.topics import Heartbeat
 from ccatp.records.recorder import RUN_LOCK
 from ccatp.report.dashboard.access import read_token
 
 
-class RunKind(Protocol):
+class MissionType(Protocol):
     """One kind of run."""
 
     @property
@@ -75,7 +83,7 @@ class RunKind(Protocol):
         """Who shows it."""
 
 
-class SurveyRun:
+class SurveyType:
     """The survey of a mirror.
 
     Args:
@@ -98,7 +106,7 @@ class SurveyRun:
         return RunView(survey_title(self._cfg, is_sim=self._is_sim), is_sim=self._is_sim, run_dir=run_dir)
 
 
-class BeaconRun:
+class BeaconType:
     """A mission among beacons.
 
     Args:
@@ -126,7 +134,7 @@ class BeaconRun:
         seed = f", seed {cfg.run.seed}" if self._is_sim else ""
         title = f"ccatp {'SIMULATION' if self._is_sim else 'mission'} among beacons: {cfg.system}, {what}{seed}"
         goals = "seconds" if cfg.follow.is_active else "waypoints"
-        return BeaconView(title, is_sim=self._is_sim, run_dir=run_dir, goals=goals)
+        return BeaconRunView(title, is_sim=self._is_sim, run_dir=run_dir, goals=goals)
 
 
 POLL_MS = 20
@@ -134,7 +142,7 @@ POLL_MS = 20
 LOCKSTEP_NICENESS = 10
 
 
-class Run:
+class SupervisedRun:
     """The children of one run and what is collected from them.
 
     Args:
@@ -150,7 +158,7 @@ class Run:
     def __init__(
         self,
         options: RunOptions,
-        kind: RunKind,
+        kind: MissionType,
         run_dir: Path,
         endpoints: Endpoints,
         sockets: Mapping[str, socket.socket],
@@ -160,7 +168,7 @@ class Run:
         self._options, self._kind, self._run_dir, self._endpoints = options, kind, run_dir, endpoints
         self._sockets, self._page, self._started_s = sockets, page, started_s
         self._view: RunView | None = None
-        self._children = Children(kind.processes, self._command_of, self._say)
+        self._children = ProcessManager(kind.processes, self._command_of, self._say)
         self._is_interrupted = False
         self._service = Service(*take_from(os.environ))
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
@@ -235,7 +243,7 @@ class Run:
         view.say("warning", "interrupted: holding the wheels and saving")
         return ExitStatus.INTERRUPTED
 
-    def _heard(self, presence: Presence) -> None:
+    def _heard(self, presence: Heartbeat) -> None:
         self._children.heard(presence)
         self._service.heard(presence)
 
@@ -261,9 +269,9 @@ class Run:
         fd = self._sockets[process.name].fileno()
         return [*arguments, "--listen-fd", str(fd)], (fd,)
 
-    def _died(self, name: str, code: int, decision: Decision) -> ExitStatus:
+    def _died(self, name: str, code: int, decision: RestartDecision) -> ExitStatus:
         self._log.error("process died", name=name, code=code)
-        if decision.fate is Fate.END:
+        if decision.fate is ProcessEnd.END:
             return ExitStatus(code)  # it has said why
         self._say("error", f"{decision.text}; see {self._run_dir / 'log.jsonl'}")
         return ExitStatus.HELD
@@ -336,8 +344,8 @@ def run_beacons(options: RunOptions) -> int:
         stack.enter_context(owned(run_dir / RUN_LOCK, "--run-dir"))
         (run_dir / "config.toml").write_text(dump_radio_config(cfg), encoding="utf-8")
         (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
-        kind = BeaconRun(cfg, BEACON_PROCESSES, is_sim=options.sim)
-        return Run(options, kind, run_dir, Endpoints(runtime_dir), sockets, page, started).go()
+        kind = BeaconType(cfg, BEACON_PROCESSES, is_sim=options.sim)
+        return SupervisedRun(options, kind, run_dir, Endpoints(runtime_dir), sockets, page, started).go()
 
 
 def run_survey(options: RunOptions) -> int:
@@ -380,8 +388,8 @@ def run_survey(options: RunOptions) -> int:
         (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
-        kind = SurveyRun(cfg, PROCESSES, is_sim=options.sim)
-        return Run(options, kind, run_dir, Endpoints(runtime_dir), sockets, page, started).go()
+        kind = SurveyType(cfg, PROCESSES, is_sim=options.sim)
+        return SupervisedRun(options, kind, run_dir, Endpoints(runtime_dir), sockets, page, started).go()
 
 
 def _recover(options: RunOptions) -> int:

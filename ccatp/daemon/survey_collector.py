@@ -12,7 +12,16 @@ from ccatp.config.load import dump_config
 from ccatp.config.models import Config
 from ccatp.core import FloatArray, PanelId, PanelPose, PointId
 from ccatp.daemon.collector import Collector, RunAccess
-from ccatp.links.topics import Arrival, DangerEvent, Message, MissionStatus, Timing, Track, Truth, unpack
+from ccatp.links.topics import (
+    ArrivalMessage,
+    DangerEvent,
+    Message,
+    MissionStatus,
+    Timing,
+    TrackMessage,
+    TruthMessage,
+    unpack,
+)
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_poses
 from ccatp.mirror.misalignment import PanelFit, fit_panel
 from ccatp.mirror.surface import PanelFitError
@@ -111,11 +120,11 @@ class RunCollector(Collector):
         return SummaryBuilder(facts, targets, self._mirror.surface.normal)
 
     def _add(self, builder: SummaryBuilder, message: Message) -> None:
-        if isinstance(message, Truth):
+        if isinstance(message, TruthMessage):
             builder.add_truth(message.rows)
-        elif isinstance(message, Track):
+        elif isinstance(message, TrackMessage):
             builder.add_track(self._on_deck(message))
-        elif isinstance(message, Arrival):
+        elif isinstance(message, ArrivalMessage):
             builder.add_arrival(PointId(*message.point), message.seq)
         elif isinstance(message, Timing):
             builder.add_ticks(message.tick_us)
@@ -126,7 +135,7 @@ class RunCollector(Collector):
         elif isinstance(message, MissionStatus):
             builder.set_mission(message.done, message.skipped, message.elapsed_s, message.left_out)
 
-    def _on_deck(self, track: Track) -> FloatArray:
+    def _on_deck(self, track: TrackMessage) -> FloatArray:
         """Rows of seq, t_s, x, y, heading (deck), X, Y, Z of the surface point, as the truth has them."""
         poses = [PanelPose(PanelId(row, col), x, y, heading) for _, _, row, col, x, y, heading, _ in track.rows]
         x, y, heading, z = deck_poses(self._mirror, poses).T

@@ -9,25 +9,25 @@ from contextlib import contextmanager
 from ccatp.config.models import Config
 from ccatp.control.motion_checks import as_standing
 from ccatp.core import Verdict
-from ccatp.daemon.checkpoints import Keeper, build_parts
-from ccatp.daemon.fix_service import MeasuringDesk, Request
-from ccatp.daemon.frame_service import FanDesk, GateWatch
-from ccatp.daemon.mission_runner import STILL, Drive, Host, Hosting, MakeWork, Progress, Served
+from ccatp.daemon.checkpoints import CheckpointWriter, build_parts
+from ccatp.daemon.fix_service import FixRequest, FixService
+from ccatp.daemon.frame_service import FanController, GateLog
+from ccatp.daemon.mission_runner import STILL, DriveCommand, MakeWork, Progress, RunnerConfig, RunnerContext, TimedFrame
 from ccatp.daemon.process import ProcessArgs
-from ccatp.daemon.robot_session import Commanded
-from ccatp.daemon.telemetry import SurveyTeller, Teller
-from ccatp.errors import ExitStatus, UnreachableError
+from ccatp.daemon.robot_session import CommandHistory
+from ccatp.daemon.telemetry import SurveyTelemetry, TelemetryPublisher
+from ccatp.errors import DaemonUnreachableError, ExitStatus
 from ccatp.etalon_client import EtalonClient, EtalonError
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.topics import is_estimate_due
 from ccatp.records.store import MissionStore
 from ccatp.survey.behaviours import home_time_s
-from ccatp.survey.composition import Parts
-from ccatp.survey.fix_gate import Scrutiny
-from ccatp.survey.reactions import Call, MirrorCheck, Vigil
-from ccatp.survey.route_follower import Motion
-from ccatp.survey.state import Outcome, State, by_reason
-from ccatp.survey.stops import STAND, Order
+from ccatp.survey.composition import SurveyParts
+from ccatp.survey.fix_gate import FixGate
+from ccatp.survey.reactions import MirrorCheck, ReminderCall, UnattendedFaultTimer
+from ccatp.survey.route_follower import StateEstimate
+from ccatp.survey.state import MissionState, SurveyOutcome, by_reason
+from ccatp.survey.stops import HOLD_POSITION, MissionCommand
 
 
 class SurveyWatch:
@@ -39,11 +39,11 @@ class SurveyWatch:
         teller: tells it.
     """
 
-    def __init__(self, cfg: Config, parts: Parts, teller: Teller) -> None:
+    def __init__(self, cfg: Config, parts: SurveyParts, teller: TelemetryPublisher) -> None:
         """Nothing to look after."""
         self._limits, self._base = cfg.limits, parts.mirror.base_pose
         self._mission, self._localizer, self._teller = parts.mission, parts.localizer, teller
-        self._vigil = Vigil(cfg, falls=parts.mirror.overhang)
+        self._vigil = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
 
     def keep_vigil(self, sensors: Sensors) -> None:
         """A fault that nobody looks after: an alarm now and then, and home before the battery is too low for it."""
@@ -51,41 +51,45 @@ class SurveyWatch:
         knows_place = not (mission.is_lost or self._localizer.is_frozen)
         home_s = home_time_s(self._base, self._limits, pose.x_m, pose.y_m) if knows_place else None
         call = vigil.watch(sensors.t, sensors.soc, home_s)
-        if call is Call.REMIND:
+        if call is ReminderCall.REMIND:
             held_s = vigil.held_s(sensors.t)
             self._teller.say("error", f"held for {held_s:.0f} s, waiting for an operator: {mission.cause}")
-        elif call is Call.RETURN:
+        elif call is ReminderCall.RETURN:
             mission.abort(f"nobody came, and the battery ({sensors.soc:.0%}) lasts for little more than the way home")
 
-    def tell_state(self, before: State, seq: int) -> None:
+    def tell_state(self, before: MissionState, seq: int) -> None:
         """The mission's state is another one than before, in frame ``seq``."""
         mission, teller = self._mission, self._teller
         if not mission.is_faulted:
             self._vigil.over()
         teller.log.debug("state", seq=seq, before=before, after=mission.state, cause=mission.cause)
-        if mission.state in (State.HELD, State.BACKING_OFF) or before is State.HELD:
+        if mission.state in (MissionState.HELD, MissionState.BACKING_OFF) or before is MissionState.HELD:
             teller.say("warning", state_text(mission.state, mission.cause))
-        if mission.state is State.RETURNING and before is not State.BACKING_OFF:
+        if mission.state is MissionState.RETURNING and before is not MissionState.BACKING_OFF:
             teller.say("warning", f"returning to base: {mission.cause}")
 
 
-def state_text(state: State, cause: str) -> str:
+def state_text(state: MissionState, cause: str) -> str:
     """What is said of the state in which a mission is held, or of the one after that."""
     if cause:
         return f"{state}: {cause}"
-    return f"{state}" if state in (State.HELD, State.BACKING_OFF, State.DONE) else f"going on: {state}"
+    return (
+        f"{state}"
+        if state in (MissionState.HELD, MissionState.BACKING_OFF, MissionState.DONE)
+        else f"going on: {state}"
+    )
 
 
 GIVEN_UP = "the calibration drive is left out, as the robot was held elsewhere: slip and heading are learned on the way"
 EXIT_STATUS = {
-    Outcome.COMPLETE: ExitStatus.COMPLETE,
-    Outcome.AT_BASE: ExitStatus.ABORTED,
-    Outcome.STOPPED: ExitStatus.HELD,
-    Outcome.NONE: ExitStatus.INTERRUPTED,
+    SurveyOutcome.COMPLETE: ExitStatus.COMPLETE,
+    SurveyOutcome.AT_BASE: ExitStatus.ABORTED,
+    SurveyOutcome.STOPPED: ExitStatus.HELD,
+    SurveyOutcome.NONE: ExitStatus.INTERRUPTED,
 }
 
 
-class SurveyWork:
+class SurveyRunner:
     """A survey as the main-loop process hosts it.
 
     Args:
@@ -95,23 +99,25 @@ class SurveyWork:
         store: the mission's database.
     """
 
-    def __init__(self, cfg: Config, host: Host, parts: Parts, store: MissionStore) -> None:
+    def __init__(self, cfg: Config, host: RunnerContext, parts: SurveyParts, store: MissionStore) -> None:
         """Wire the parts."""
         self._cfg, self._host, self._parts, self._store = cfg, host, parts, store
         self._mirror, self._localizer, self._gate = parts.mirror, parts.localizer, parts.gate
         self._mission = mission = parts.mission
         self._seat, self._clock = host.seat, host.clock
         self._clock.begin_with(parts.elapsed_s)
-        self._teller = teller = SurveyTeller(host.publisher, host.log)
-        self._gate_watch = GateWatch(self._gate, teller.say)
-        self._fans = FanDesk(cfg.robot.fan_duty, self._seat, mission, teller, has_floor=bool(parts.mirror.overhang))
-        self._commanded = Commanded(cfg.robot, cfg.sim.robot.frame_hz)
+        self._teller = teller = SurveyTelemetry(host.publisher, host.log)
+        self._gate_watch = GateLog(self._gate, teller.say)
+        self._fans = FanController(
+            cfg.robot.fan_duty, self._seat, mission, teller, has_floor=bool(parts.mirror.overhang)
+        )
+        self._commanded = CommandHistory(cfg.robot, cfg.sim.robot.frame_hz)
         self._seat.on_drive = self._commanded.sent
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
-        self._measuring = MeasuringDesk(
+        self._measuring = FixService(
             cfg.mission,
             self._etalon,
-            Scrutiny(parts.mirror, cfg),
+            FixGate(parts.mirror, cfg),
             parts.localizer,
             mission,
             store,
@@ -120,13 +126,13 @@ class SurveyWork:
             # lockstep time stands still meanwhile
             lambda: 0.0 if self._seat.is_lockstep else cfg.etalon.measuring_time_s,
         )
-        self._keeper = Keeper(host.run_dir, parts.localizer, mission, is_patient=host.is_patient)
+        self._keeper = CheckpointWriter(host.run_dir, parts.localizer, mission, is_patient=host.is_patient)
         self._watch = SurveyWatch(cfg, parts, teller)
         self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
         self._recovery = parts.recovery
         self._is_deaf = False
-        self._state = State.IDLE
-        self._motion_now: Motion | None = None
+        self._state = MissionState.IDLE
+        self._motion_now: StateEstimate | None = None
         self._has_told_calibration = False
         self._told: tuple[tuple[float, float, float, float], int] | None = None
         # An operator's commands are the mission's; so is what holds it.
@@ -134,7 +140,7 @@ class SurveyWork:
         self.interrupt, self.lose_sight = mission.interrupt, mission.lose_sight
 
     @property
-    def teller(self) -> SurveyTeller:
+    def teller(self) -> SurveyTelemetry:
         """Tells the others."""
         return self._teller
 
@@ -194,7 +200,7 @@ class SurveyWork:
         try:
             await self._etalon.connect()
         except EtalonError as error:
-            raise UnreachableError(str(error)) from error
+            raise DaemonUnreachableError(str(error)) from error
 
     def _on_retry(self, error: EtalonError, tries_left: int) -> None:
         self._teller.log.warning("laser system asked again", error=str(error), tries_left=tries_left)
@@ -237,7 +243,7 @@ class SurveyWork:
 
     # -- the frame ------------------------------------------------------------------------------------------------
 
-    def listen(self, frame: Served) -> None:
+    def listen(self, frame: TimedFrame) -> None:
         """The frame's samples go to the localizer, or as much of them as is to be believed."""
         sensors, mission, localizer = frame.sensors, self._mission, self._localizer
         self._tell_beginning(sensors)
@@ -261,38 +267,38 @@ class SurveyWork:
             values = (pose.x_m, pose.y_m, pose.heading_rad, *sigmas)
             self._teller.treatment(sensors.seq, sensors.t, "begun", values)
 
-    def _motion(self, frame: Served) -> Motion:
+    def _motion(self, frame: TimedFrame) -> StateEstimate:
         localizer, echo = self._localizer, frame.sensors.cmd
         pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
         place = pose.x_m, pose.y_m, pose.heading_rad
         ahead = self._commanded.predictor.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
-        return Motion(
+        return StateEstimate(
             frame.t_s, frame.dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead, self._position_sigma_m
         )
 
     def _position_sigma_m(self) -> float:
         return self._localizer.position_sigma_m
 
-    def decide(self, frame: Served, verdict: Verdict | None, lag_s: float) -> Drive:
+    def decide(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
         """What the mission wants, as far as the gate lets it through."""
         mission, motion = self._mission, self._motion_now
         if motion is None:
             raise RuntimeError("decide comes after listen, and not for a stale frame")
-        order = mission.step(motion, verdict) if self._is_on_mirror(frame.sensors) else STAND
+        order = mission.step(motion, verdict) if self._is_on_mirror(frame.sensors) else HOLD_POSITION
         self._heed(frame.sensors)
         right, left = self._gate.pass_through(order.twist, verdict, motion.dt_s, motion.t_s, lag_s, mission.purpose)
         self._gate_watch.look(motion.t_s)
         if order.at_rest or order.measure:
             self._execute(order, motion)
         self._note_told(frame)
-        return Drive(right, left)
+        return DriveCommand(right, left)
 
-    def stand(self, frame: Served) -> Drive:
+    def stand(self, frame: TimedFrame) -> DriveCommand:
         """The robot stands, and nothing is decided in this frame."""
         self._note_told(frame)
         return STILL
 
-    def _note_told(self, frame: Served) -> None:
+    def _note_told(self, frame: TimedFrame) -> None:
         """What the wheels were told since the last estimate, where one is due."""
         is_due = frame.is_first or is_estimate_due(frame.sensors.seq)
         self._told = self._commanded.told() if is_due else None
@@ -332,7 +338,7 @@ class SurveyWork:
         if mission.is_faulted:
             self._watch.keep_vigil(sensors)
 
-    def _execute(self, order: Order, motion: Motion) -> None:
+    def _execute(self, order: MissionCommand, motion: StateEstimate) -> None:
         mission, seq = self._mission, self._clock.seq
         if order.at_rest:
             self._localizer.rest()
@@ -346,9 +352,9 @@ class SurveyWork:
             expected = self._mirror.puck_world(pose, self._cfg.robot.puck_height_m)
             # The localizer dates a fix by the robot's own clock.
             t_s = motion.t_s - self._clock.offset_s
-            self._measuring.begin(Request(mission.request, t_s, mission.measuring_point, expected, pose))
+            self._measuring.begin(FixRequest(mission.request, t_s, mission.measuring_point, expected, pose))
 
-    def tell(self, frame: Served) -> None:
+    def tell(self, frame: TimedFrame) -> None:
         """The estimate, the checkpoint, a state that is new."""
         seq, t_s = frame.sensors.seq, frame.sensors.t
         self._teller.frame(
@@ -361,16 +367,16 @@ class SurveyWork:
         mission = self._mission
         before, self._state = self._state, mission.state
         self._watch.tell_state(before, self._clock.seq)
-        if mission.state is State.DONE:
+        if mission.state is MissionState.DONE:
             self._host.finish(EXIT_STATUS[mission.outcome])
         elif mission.is_faulted and self._seat.is_lockstep:
             # Nobody can be waited for while simulated time runs at many times the wall clock.
-            self._host.finish(EXIT_STATUS[Outcome.STOPPED])
+            self._host.finish(EXIT_STATUS[SurveyOutcome.STOPPED])
 
 
-def hosting_of(cfg: Config) -> Hosting:
+def hosting_of(cfg: Config) -> RunnerConfig:
     """What the process needs of the configuration of a survey."""
-    return Hosting(
+    return RunnerConfig(
         cfg.robot,
         cfg.run.realtime_priority,
         cfg.mission.verdict_timeout_s,
@@ -384,4 +390,4 @@ def open_survey(args: ProcessArgs) -> Iterator[MakeWork]:
     """The parts and the database of a survey, new or taken over; what makes the mission of them."""
     parts, store = build_parts(args)
     with store:
-        yield lambda host: SurveyWork(args.config, host, parts, store)
+        yield lambda host: SurveyRunner(args.config, host, parts, store)

@@ -15,17 +15,17 @@ import structlog
 from ccatp.core import Fix, PointId
 from ccatp.links.bus import Publisher
 from ccatp.links.topics import (
-    Arrival,
-    Estimate,
+    ArrivalMessage,
+    DisplayState,
+    EstimateMessage,
     FixMessage,
-    Log,
+    LogMessage,
     Message,
     MissionStatus,
-    Picture,
     Rest,
     SensorLines,
     Timing,
-    Track,
+    TrackMessage,
     Treatment,
     TreatmentKind,
     is_estimate_due,
@@ -38,7 +38,7 @@ BATCH_FRAMES = 100
 BATCH_WALL_S = 0.25
 
 
-class Teller:
+class TelemetryPublisher:
     """Publishes for the main loop; a mission adds its estimates by a class of its own.
 
     Args:
@@ -104,11 +104,11 @@ class Teller:
     def say(self, level: str, text: str) -> None:
         """One line for the log file and for the operator's terminal."""
         self.log.log({"info": 20, "warning": 30, "error": 40}[level], text, seq=self.seq, t_s=self.t_s)
-        self._publisher.send("log", Log(seq=self.seq, t_s=self.t_s, level=level, process="main", text=text))
+        self._publisher.send("log", LogMessage(seq=self.seq, t_s=self.t_s, level=level, process="main", text=text))
 
 
-class Look(NamedTuple):
-    """The pose as ``Picture`` tells it."""
+class PoseSnapshot(NamedTuple):
+    """The pose as ``DisplayState`` tells it."""
 
     x_m: float
     y_m: float
@@ -122,15 +122,15 @@ class Look(NamedTuple):
 Who = TypeVar("Who")
 
 
-class Painter(Generic[Who]):
-    """Publishes ``Picture`` for the main loop.
+class DisplayStatePublisher(Generic[Who]):
+    """Publishes ``DisplayState`` for the main loop.
 
     Args:
         publisher: main's publisher.
         look: asks whoever knows the pose.
     """
 
-    def __init__(self, publisher: Publisher, look: Callable[[Who], Look]) -> None:
+    def __init__(self, publisher: Publisher, look: Callable[[Who], PoseSnapshot]) -> None:
         """Nothing seen yet."""
         self._publisher, self._look = publisher, look
         self._who: Who | None = None
@@ -149,10 +149,10 @@ class Painter(Generic[Who]):
         if self._who is None or not self._publisher.has_subscriber("picture"):
             return
         look = self._look(self._who)
-        self._publisher.send("picture", Picture(seq=seq, t_s=t_s, line=msgspec.Raw(self._line), **look._asdict()))
+        self._publisher.send("picture", DisplayState(seq=seq, t_s=t_s, line=msgspec.Raw(self._line), **look._asdict()))
 
 
-class SurveyTeller(Teller):
+class SurveyTelemetry(TelemetryPublisher):
     """Publishes for a survey.
 
     Args:
@@ -163,7 +163,7 @@ class SurveyTeller(Teller):
     def __init__(self, publisher: Publisher, log: structlog.typing.FilteringBoundLogger) -> None:
         """Start with empty batches."""
         super().__init__(publisher, log)
-        self._painter = Painter(publisher, look_at_localizer)
+        self._painter = DisplayStatePublisher(publisher, look_at_localizer)
         self._track: list[tuple[int, float, int, int, float, float, float, float]] = []
 
     def frame(
@@ -194,7 +194,7 @@ class SurveyTeller(Teller):
             deck = localizer.deck_pose
             x, y, heading = deck.x_m, deck.y_m, deck.heading_rad
             commanded, drive_seq = told if told is not None else (None, -1)
-            message = Estimate(
+            message = EstimateMessage(
                 seq=seq,
                 t_s=t_s,
                 x_m=x,
@@ -213,11 +213,11 @@ class SurveyTeller(Teller):
     def take_estimates(self) -> tuple[str, Message] | None:
         """The pending rows of the track."""
         rows, self._track = self._track, []
-        return ("track", Track(seq=self.seq, t_s=self.t_s, rows=rows)) if rows else None
+        return ("track", TrackMessage(seq=self.seq, t_s=self.t_s, rows=rows)) if rows else None
 
     def arrival(self, seq: int, t_s: float, point: PointId, error_m: float) -> None:
         """The robot came to rest in frame ``seq``, at a point for the first time."""
-        message = Arrival(
+        message = ArrivalMessage(
             seq=seq + self._frames_before, t_s=t_s, point=(point.row, point.col, point.point), error_mm=1e3 * error_m
         )
         self._publisher.send("arrival", message)
@@ -263,10 +263,10 @@ class SurveyTeller(Teller):
         self._painter.tell_if_wanted(self.seq, self.t_s)
 
 
-def look_at_localizer(localizer: Localizer) -> Look:
+def look_at_localizer(localizer: Localizer) -> PoseSnapshot:
     """The pose on the deck, and the filter's last update."""
     pose, covariance, innovation = localizer.deck_pose, localizer.pose_covariance, localizer.innovation
-    return Look(
+    return PoseSnapshot(
         x_m=pose.x_m,
         y_m=pose.y_m,
         heading_rad=pose.heading_rad,

@@ -19,15 +19,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from ccatp.config.models import Config
 from ccatp.errors import ExitStatus
-from ccatp.links.liveness import Sparing
-from ccatp.links.topics import MissionStatus, Track
+from ccatp.links.liveness import RateLimitedLog
+from ccatp.links.topics import MissionStatus, TrackMessage
 from ccatp.records.summary import format_table
 
 LINES_OF_A_KIND, LINES_PERIOD_S = 3, 10.0
 STYLES = {"info": "", "warning": "yellow", "error": "bold red"}
 
 
-class _PatientConsole(Console):
+class _BufferedConsole(Console):
     """A terminal that may go away: the survey goes on without it."""
 
     def on_broken_pipe(self) -> None:
@@ -53,9 +53,9 @@ class RunView:
 
     def __init__(self, title: str, *, is_sim: bool, run_dir: Path, goals: str = "points") -> None:
         """Say what runs."""
-        self._console: Console = _PatientConsole(stderr=True, highlight=False)
+        self._console: Console = _BufferedConsole(stderr=True, highlight=False)
         self._is_terminal = self._console.is_terminal
-        self._sparing = Sparing(LINES_OF_A_KIND, LINES_PERIOD_S)
+        self._sparing = RateLimitedLog(LINES_OF_A_KIND, LINES_PERIOD_S)
         self._has_pose = False
         self._told_tenths = 0
         self._goals = goals
@@ -85,7 +85,7 @@ class RunView:
         if told is not None:
             self._console.print(f"{level}: {told}", style=STYLES[level], markup=False, soft_wrap=True)
 
-    def pose(self, track: Track) -> None:
+    def pose(self, track: TrackMessage) -> None:
         """The first pose shows that the robot is there."""
         if not self._has_pose and track.rows:
             self._has_pose = True
@@ -134,7 +134,7 @@ def survey_title(cfg: Config, *, is_sim: bool) -> str:
     return f"ccatp {what} of {cfg.mirror.name}{world}, filter {cfg.run.filter}"
 
 
-class BeaconView(RunView):
+class BeaconRunView(RunView):
     """The same of a mission among beacons."""
 
     def text_of(self, status: MissionStatus) -> str:

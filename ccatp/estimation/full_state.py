@@ -9,9 +9,9 @@ import numpy as np
 from ccatp.config.models import LocalizerConfig, RobotConfig
 from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, GravitySample, ImuSample, PanelPose, WheelSample, wrap_pi
 from ccatp.estimation.fixes import FixGated, check_fix, deck_foot
-from ccatp.estimation.localizer_base import FrameReceiver, PanelFrame
-from ccatp.estimation.measurements import NoiseFloor, RestWatch
-from ccatp.estimation.odometry import BlockBuilder, RunningPose
+from ccatp.estimation.localizer_base import LocalizerBase, PanelFrame
+from ccatp.estimation.measurements import NoiseFloor, ZeroVelocityDetector
+from ccatp.estimation.odometry import PosePredictor, Preintegrator
 from ccatp.estimation.sample_validation import LONGEST_GAP_S, MAX_FRAME_STEP_S
 from ccatp.estimation.seams import EdgeScanner
 from ccatp.estimation.state_filter import SurveyFilter
@@ -35,7 +35,7 @@ class _Moved(NamedTuple):
     rates_rad_s: tuple[Sequence[float], Sequence[float]]
 
 
-class FullStateLocalizer(FrameReceiver[_Moved]):
+class FullStateLocalizer(LocalizerBase[_Moved]):
     """Estimates pose, speeds, sensor errors, slip and creep with one filter (``survey_model``), deck frame.
 
     Frames are gathered into blocks; the filter takes a block in one step, and dead reckoning carries the pose from
@@ -67,12 +67,12 @@ class FullStateLocalizer(FrameReceiver[_Moved]):
         self._right, self._left = WheelAngle(), WheelAngle()
         self._gyro = NoiseFloor(cfg.gyroscope_sigma_rad_s**2)
         self._accelerometer = NoiseFloor(cfg.accelerometer_sigma_m_s2**2)
-        self._rest = RestWatch(self._full.rest_after_s, self._gyro, self._accelerometer)
+        self._rest = ZeroVelocityDetector(self._full.rest_after_s, self._gyro, self._accelerometer)
         self._rested_s = 0.0
         self._edges = EdgeScanner()
-        self._block = BlockBuilder()
+        self._block = Preintegrator()
         self._estimate = SurveyFilter(filter_, mirror, robot, cfg, self.counts, mirror.deck_pose(start))
-        self._running = RunningPose(robot.wheel_radius_m, robot.wheel_base_m, self._full.jerk_density_m2_s5)
+        self._running = PosePredictor(robot.wheel_radius_m, robot.wheel_base_m, self._full.jerk_density_m2_s5)
         self._panel = PanelFrame(mirror, start.panel)
         self._refused: list[FloatArray] = []
         self._fixed_m: FloatArray | None = None  # where the last fix that counted was

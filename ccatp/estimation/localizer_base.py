@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 
 from ccatp.control.motion_checks import ImuGate, WheelMeans
 from ccatp.core import EdgeSample, GravitySample, ImuSample, PanelId, PanelPose, WheelSample
-from ccatp.estimation.sample_validation import BACKWARD_LIMIT, FrameClock, FrameKind, SampleIntake
+from ccatp.estimation.sample_validation import BACKWARD_LIMIT, FrameKind, FrameTimeCheck, SampleValidator
 from ccatp.estimation.state_model import Slope
 from ccatp.filters.base import FilterDiverged
 from ccatp.mirror.mirror import Mirror
@@ -19,7 +19,7 @@ from ccatp.mirror.mirror import Mirror
 Taken = TypeVar("Taken")
 
 
-class FrameReceiver(ABC, Generic[Taken]):
+class LocalizerBase(ABC, Generic[Taken]):
     """Admits frames in their order, asks to hold where they or the filter go wrong.
 
     Args:
@@ -37,8 +37,8 @@ class FrameReceiver(ABC, Generic[Taken]):
         self.hold_cause = ""
         self.is_frozen = False
         self.notices: list[str] = []
-        self._clock = FrameClock()
-        self._intake = SampleIntake(history_s, self.counts)
+        self._clock = FrameTimeCheck()
+        self._intake = SampleValidator(history_s, self.counts)
         self._guard: tuple[ImuGate, WheelMeans] | None = None
 
     def guard(self, gate: ImuGate, means: WheelMeans, largest_rate_rad_s: float) -> None:

@@ -203,7 +203,7 @@ class NoiseFloor:
         self._sum, self._count, self._before = 0.0, 0, mean
 
 
-class RestReading(NamedTuple):
+class ZeroVelocityReading(NamedTuple):
     """Means over a rest.
 
     Attributes:
@@ -220,7 +220,7 @@ class RestReading(NamedTuple):
     bearing_rad: float
 
 
-class RestWatch:
+class ZeroVelocityDetector:
     """Counts frames without wheel motion and collects the inertial unit's samples at rest.
 
     Slow is not still: a servo that coasts to its set point passes every threshold long before it stands. Only after
@@ -275,10 +275,10 @@ class RestWatch:
         """Samples collected."""
         return self._count
 
-    def take(self) -> RestReading:
+    def take(self) -> ZeroVelocityReading:
         """The means so far; collecting begins anew."""
         n = max(self._count, 1)
-        found = RestReading(
+        found = ZeroVelocityReading(
             self._count, self._rate / n, self._acceleration / n, self._gravity_count, atan2(self._gy, self._gx)
         )
         self._clear()

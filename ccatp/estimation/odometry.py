@@ -21,7 +21,7 @@ _STILL_RAD = 1e-4
 _SMALL_RAD = 1e-4
 
 
-class Place(NamedTuple):
+class OdometryPose(NamedTuple):
     """Position (m) and heading (rad) in the odometer's frame."""
 
     x_m: float
@@ -62,8 +62,8 @@ class Odometer:
 
     def __init__(self, history_s: float) -> None:
         self._history_s = history_s
-        self._path: deque[tuple[float, Place]] = deque()
-        self.place = Place(0.0, 0.0, 0.0)
+        self._path: deque[tuple[float, OdometryPose]] = deque()
+        self.place = OdometryPose(0.0, 0.0, 0.0)
 
     def start(self, t_s: float) -> None:
         """Begin at ``t_s``; a second call moves the time base and keeps the path."""
@@ -77,7 +77,7 @@ class Odometer:
         """Drive one step that ends at ``t_s``: mean speed m/s, turn rad, duration s."""
         here = self.place
         dx, dy = arc_step(v_m_s, here.heading_rad, turn_rad, dt_s)
-        self.place = Place(here.x_m + dx, here.y_m + dy, here.heading_rad + turn_rad)
+        self.place = OdometryPose(here.x_m + dx, here.y_m + dy, here.heading_rad + turn_rad)
         path = self._path
         if len(path) > 1 and _is_still(path[-2][1], self.place):
             path[-1] = (t_s, self.place)
@@ -92,7 +92,7 @@ class Odometer:
         """The earliest time that ``at`` knows."""
         return self._path[0][0] if self._path else float("inf")
 
-    def at(self, t_s: float) -> Place:
+    def at(self, t_s: float) -> OdometryPose:
         """Place at ``t_s``, linear between steps; outside the kept path its nearest end."""
         later = None
         for entry in reversed(self._path):
@@ -102,17 +102,17 @@ class Odometer:
         return later[1] if later is not None else self.place
 
 
-def _is_still(a: Place, b: Place) -> bool:
+def _is_still(a: OdometryPose, b: OdometryPose) -> bool:
     return hypot(b.x_m - a.x_m, b.y_m - a.y_m) < _STILL_M and abs(b.heading_rad - a.heading_rad) < _STILL_RAD
 
 
-def _between(early: tuple[float, Place], late: tuple[float, Place], t_s: float) -> Place:
+def _between(early: tuple[float, OdometryPose], late: tuple[float, OdometryPose], t_s: float) -> OdometryPose:
     (t0, a), (t1, b) = early, late
     part = (t_s - t0) / (t1 - t0)
-    return Place(*(p + part * (q - p) for p, q in zip(a, b, strict=True)))
+    return OdometryPose(*(p + part * (q - p) for p, q in zip(a, b, strict=True)))
 
 
-class RunningPose:
+class PosePredictor:
     """Deck pose and speeds at the present frame: the filter's state at its last step, and dead reckoning since.
 
     Same motion as ``SurveyMotion``, with slip, scale errors and ground as the filter knew them at its last step; a few
@@ -191,7 +191,7 @@ class RunningPose:
         self.omega_rad_s = rate
 
 
-class Block(NamedTuple):
+class PreintegratedMotion(NamedTuple):
     """What some frames in a row say together.
 
     Attributes:
@@ -209,7 +209,7 @@ class Block(NamedTuple):
     samples: int
 
 
-class BlockBuilder:
+class Preintegrator:
     """Gathers frames.
 
     Wheel angles are exact over any time, and a mean of n rates tells as much as n rates, so nothing is lost by taking
@@ -253,7 +253,7 @@ class BlockBuilder:
             self._samples += 1
         self._last = (ax, wz)
 
-    def take(self) -> Block:
+    def take(self) -> PreintegratedMotion:
         """The block so far; gathering begins anew."""
         n = self._samples
         rate = acceleration = None
@@ -262,6 +262,6 @@ class BlockBuilder:
         before, self._before = self._before, acceleration
         if acceleration is not None and before is not None:
             acceleration = 0.5 * (before + acceleration)
-        block = Block(self.dt_s, self._turning_s, rate, acceleration, n)
+        block = PreintegratedMotion(self.dt_s, self._turning_s, rate, acceleration, n)
         self._clear()
         return block

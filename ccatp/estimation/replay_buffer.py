@@ -28,7 +28,7 @@ class _Entry:
         self.steps.clear()
 
 
-class Journal:
+class ReplayBuffer:
     """Rewind and replay.
 
     A filter replaces its arrays and never changes them, so keeping a state costs a reference.

@@ -32,7 +32,7 @@ class FrameKind(Enum):
     RESYNC = "resync"  # the first frame in a new time base
 
 
-class FrameClock:
+class FrameTimeCheck:
     """Orders frames by their time.
 
     A single frame from elsewhere (replayed, corrupted) changes nothing; the second one in a row that continues it shows
@@ -65,7 +65,7 @@ class FrameClock:
         return kind
 
 
-class Source:
+class SampleSource:
     """The time stamps of one sensor: each is used once, in increasing order.
 
     Args:
@@ -110,7 +110,7 @@ class Source:
         return "backward"
 
 
-class SampleIntake:
+class SampleValidator:
     """Picks the usable IMU and encoder samples of a frame and counts the others.
 
     Args:
@@ -142,7 +142,11 @@ class SampleIntake:
 
     def restart(self) -> None:
         """Forget every time stamp: the robot's clock has jumped."""
-        self._imu, self._right, self._left = Source("imu"), Source("right encoder"), Source("left encoder")
+        self._imu, self._right, self._left = (
+            SampleSource("imu"),
+            SampleSource("right encoder"),
+            SampleSource("left encoder"),
+        )
 
     def are_clean(self, t_s: float, encoders: Sequence[WheelSample]) -> bool:
         """Take the encoder samples whole if nothing is wrong with them: both wheels, readable, in order, new."""
@@ -208,7 +212,7 @@ class SampleIntake:
                 kept.append(sample)
         return kept
 
-    def _is_usable(self, source: Source, sample_s: float, frame_s: float) -> bool:
+    def _is_usable(self, source: SampleSource, sample_s: float, frame_s: float) -> bool:
         refusal = source.refusal(sample_s, frame_s, frame_s - self._history_s)
         if refusal is None:
             return True

@@ -11,7 +11,7 @@ import numpy as np
 
 from ccatp.config.models import LocalizerConfig, RobotConfig
 from ccatp.core import DeckPose, EdgeSample, FloatArray, PanelId, PanelPose, rotate
-from ccatp.estimation.odometry import Odometer, Place
+from ccatp.estimation.odometry import Odometer, OdometryPose
 from ccatp.estimation.state_model import E0, E1, PSI, STATES, A, Slope, V, W, X
 from ccatp.mirror.layout import Seam
 from ccatp.mirror.mirror import Mirror
@@ -23,7 +23,7 @@ _REACH = 0.05
 _UNIFORM = 1.0 / 12.0  # variance of a uniform distribution over one interval
 
 
-class Transition(NamedTuple):
+class SensorTransition(NamedTuple):
     """One edge sensor changed its value.
 
     Attributes:
@@ -51,9 +51,9 @@ class EdgeScanner:
         self._t_s = -inf
         self._values = ()
 
-    def scan(self, edges: Sequence[EdgeSample]) -> list[Transition]:
+    def scan(self, edges: Sequence[EdgeSample]) -> list[SensorTransition]:
         """Transitions of a frame, oldest first; normally none."""
-        found: list[Transition] = []
+        found: list[SensorTransition] = []
         last, values = self._t_s, self._values
         for sample in edges:
             t = sample[0]
@@ -68,17 +68,21 @@ class EdgeScanner:
         return found
 
 
-def _transitions(last_s: float, values: tuple[int, ...], sample: EdgeSample) -> list[Transition]:
+def _transitions(last_s: float, values: tuple[int, ...], sample: EdgeSample) -> list[SensorTransition]:
     t = sample[0]
     return [
-        Transition(0.5 * (last_s + t), t - last_s, corner, bool(new))
+        SensorTransition(0.5 * (last_s + t), t - last_s, corner, bool(new))
         for corner, (old, new) in enumerate(zip(values, sample[1:], strict=True))
         if old != new
     ]
 
 
 def heading_from_pair(
-    left: Place, right: Place, left_xy: tuple[float, float], right_xy: tuple[float, float], normal_rad: float
+    left: OdometryPose,
+    right: OdometryPose,
+    left_xy: tuple[float, float],
+    right_xy: tuple[float, float],
+    normal_rad: float,
 ) -> tuple[float, float, float]:
     """Heading of the robot when two of its sensors have crossed the same straight line.
 
@@ -115,7 +119,7 @@ class _Mark(NamedTuple):
 
     t_s: float
     interval_s: float
-    place: Place
+    place: OdometryPose
     seam: Seam
     x_m: float
     y_m: float
@@ -156,14 +160,14 @@ class CrossingDetector:
         self._marks.clear()
         self._disturbed_s = -inf
 
-    def scan(self, t_s: float, v_m_s: float, omega_rad_s: float, edges: Sequence[EdgeSample]) -> list[Transition]:
+    def scan(self, t_s: float, v_m_s: float, omega_rad_s: float, edges: Sequence[EdgeSample]) -> list[SensorTransition]:
         """Note the motion at ``t_s`` and return the transitions of the frame, normally none."""
         if abs(omega_rad_s) > self._cfg.crossing_max_rate_rad_s or abs(v_m_s) < self._cfg.crossing_min_speed_m_s:
             self._disturbed_s = t_s
         return self._scanner.scan(edges)
 
     def headings(
-        self, transitions: Sequence[Transition], odometer: Odometer, pose: PanelPose, deck: DeckPose, v_m_s: float
+        self, transitions: Sequence[SensorTransition], odometer: Odometer, pose: PanelPose, deck: DeckPose, v_m_s: float
     ) -> list[HeadingFix]:
         """Headings completed by these transitions.
 
@@ -186,7 +190,7 @@ class CrossingDetector:
         return found
 
     def _complete(
-        self, pair: tuple[int, int], is_on: bool, now: Place, pose: PanelPose, v_m_s: float
+        self, pair: tuple[int, int], is_on: bool, now: OdometryPose, pose: PanelPose, v_m_s: float
     ) -> HeadingFix | None:
         left, right = self._marks.get((pair[0], is_on)), self._marks.get((pair[1], is_on))
         if left is None or right is None or not self._belong_together(left, right):
@@ -204,7 +208,7 @@ class CrossingDetector:
         variance = (v_m_s**2 * timing + (self._cfg.slip_fraction * travel) ** 2) * (across / length**2) ** 2
         return HeadingFix(innovation, variance)
 
-    def _mark(self, transition: Transition, odometer: Odometer, pose: DeckPose) -> _Mark | None:
+    def _mark(self, transition: SensorTransition, odometer: Odometer, pose: DeckPose) -> _Mark | None:
         x, y = self._mirror.body_offset(pose, *self._sensors[transition.corner])
         seam = self._mirror.nearest_seam(x, y)
         if seam is None or abs(seam.distance_m) > self._reach_m:
@@ -283,7 +287,7 @@ class Edge(NamedTuple):
     is_new: bool
 
 
-class Line(NamedTuple):
+class PanelEdgeLine(NamedTuple):
     """One sensor over one edge: ``sensor - edge - offset = 0`` along one axis.
 
     Attributes:
@@ -321,7 +325,7 @@ class SeamLines:
         """The pose was found anew: the offsets belong to another one."""
         self._edges.clear()
 
-    def meet(self, transition: Transition, t_s: float, x: FloatArray, slope: Slope) -> Edge | None:
+    def meet(self, transition: SensorTransition, t_s: float, x: FloatArray, slope: Slope) -> Edge | None:
         """Which edge a transition belongs to; None where no seam is near.
 
         Args:
@@ -343,7 +347,7 @@ class SeamLines:
         self._edges[state] = edge
         return Edge(k, edge_m, state, is_new)
 
-    def line(self, edge: Edge, transition: Transition, t_s: float, x: FloatArray, slope: Slope) -> Line:
+    def line(self, edge: Edge, transition: SensorTransition, t_s: float, x: FloatArray, slope: Slope) -> PanelEdgeLine:
         """What a transition over ``edge`` says about the state; arguments as in ``meet``."""
         place, speeds, (forward, left, lever) = self._sensor(transition, t_s, x, slope, edge.k)
         late_s = t_s - transition.t_s
@@ -357,10 +361,10 @@ class SeamLines:
         row[W] = -late_s * row[PSI]
         row[edge.offset] = -1.0
         variance = (speeds[edge.k] * transition.interval_s) ** 2 * _UNIFORM + _TIMING_FLOOR_M2
-        return Line(edge.position_m + float(x[edge.offset]) - place[edge.k], H, variance)
+        return PanelEdgeLine(edge.position_m + float(x[edge.offset]) - place[edge.k], H, variance)
 
     def _sensor(
-        self, transition: Transition, t_s: float, x: FloatArray, slope: Slope, k: int = 0
+        self, transition: SensorTransition, t_s: float, x: FloatArray, slope: Slope, k: int = 0
     ) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float, float]]:
         """Place (m) and velocity (m/s) of a sensor at its transition; along axis k: heading, left, lever of a turn."""
         late_s = t_s - transition.t_s

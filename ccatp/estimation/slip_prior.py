@@ -19,7 +19,7 @@ _FORGETTING = 0.99  # of the likelihoods per leg, so that a world that changes i
 _LEAST = 1e-14
 
 
-class Population:
+class SlipPopulation:
     """Bayes for parameters that are drawn anew for each leg from N(mu_j, sigma^2): sigma common, all unknown.
 
     After a leg its estimate y_j with variance R_j is one sample: y_j ~ N(mu_j, sigma^2 + R_j). Given sigma, the means
@@ -140,7 +140,7 @@ class _Parameter:
         return beta, own + scatter
 
 
-class LegBook:
+class SlipPrior:
     """Carries slip and creep from leg to leg.
 
     Right and left slip are taken apart into their mean (what the distance shows) and their difference (what the
@@ -155,7 +155,7 @@ class LegBook:
     def __init__(self, cfg: FullStateConfig) -> None:
         # Half the difference of two draws scatters as their mean does.
         expected = (cfg.slip_mean, cfg.slip_sigma), (0.0, 0.5 * cfg.slip_difference_sigma)
-        self._slip_scatter = Population(expected, cfg.slip_scatter_max)
+        self._slip_scatter = SlipPopulation(expected, cfg.slip_scatter_max)
         self._parameters = (
             _Parameter(cfg.slip_mean, cfg.slip_sigma),
             _Parameter(0.0, cfg.slip_difference_sigma),

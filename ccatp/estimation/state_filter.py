@@ -7,11 +7,11 @@ import numpy as np
 from ccatp.config.models import LocalizerConfig, RobotConfig
 from ccatp.core import DeckPose, FloatArray, PanelId, difference
 from ccatp.estimation.fixes import begun_anew, fix_row
-from ccatp.estimation.measurements import RestReading, heading_from_gravity
-from ccatp.estimation.odometry import Block
-from ccatp.estimation.replay_buffer import Journal, Step
-from ccatp.estimation.seams import Edge, SeamLines, Transition
-from ccatp.estimation.slip_prior import LegBook, Redraw
+from ccatp.estimation.measurements import ZeroVelocityReading, heading_from_gravity
+from ccatp.estimation.odometry import PreintegratedMotion
+from ccatp.estimation.replay_buffer import ReplayBuffer, Step
+from ccatp.estimation.seams import Edge, SeamLines, SensorTransition
+from ccatp.estimation.slip_prior import Redraw, SlipPrior
 from ccatp.estimation.state_model import (
     BA,
     BG,
@@ -72,7 +72,7 @@ class SurveyFilter:
         start: DeckPose,
     ) -> None:
         self.innovation: Innovation | None = None
-        self.journal = Journal(cfg.full_state.rewind_s)
+        self.journal = ReplayBuffer(cfg.full_state.rewind_s)
         self._filter, self._counts = filter_, counts
         self._is_again = False
         self._cfg, self._full = cfg, cfg.full_state
@@ -81,7 +81,7 @@ class SurveyFilter:
         self._rows = SensorRows()
         self._drift = np.zeros(STATES)
         self._seams = SeamLines(mirror, robot)
-        self._legs = LegBook(self._full)
+        self._legs = SlipPrior(self._full)
         self._tilt_sigma_m = robot.puck_height_m * cfg.full_state.panel_tilt_sigma_rad
         self._gravity_deck = mirror.rotate_deck_from_world((0.0, 0.0, 1.0))
         self._start(start)
@@ -139,7 +139,9 @@ class SurveyFilter:
 
     # -- motion -------------------------------------------------------------------------------------------------------
 
-    def move(self, block: Block, right: WheelAngle, left: WheelAngle, imu_variances: tuple[float, float]) -> None:
+    def move(
+        self, block: PreintegratedMotion, right: WheelAngle, left: WheelAngle, imu_variances: tuple[float, float]
+    ) -> None:
         """A block of frames: predict, then update with wheel angles, angular rate and acceleration.
 
         Args:
@@ -223,7 +225,7 @@ class SurveyFilter:
     def _update(self, z: FloatArray, H: FloatArray, R: FloatArray) -> None:
         self._filter.update(z, H, R)
 
-    def calibrate(self, reading: RestReading, rested_s: float, imu_variances: tuple[float, float]) -> None:
+    def calibrate(self, reading: ZeroVelocityReading, rested_s: float, imu_variances: tuple[float, float]) -> None:
         """Biases from the inertial unit's means over a rest of ``rested_s``, heading from gravity.
 
         Args:
@@ -286,7 +288,7 @@ class SurveyFilter:
 
     # -- seams --------------------------------------------------------------------------------------------------------
 
-    def cross(self, transition: Transition, t_s: float) -> None:
+    def cross(self, transition: SensorTransition, t_s: float) -> None:
         """An edge sensor has changed its value; the state belongs to ``t_s``."""
         if not self._full.use.seams:
             return
@@ -294,7 +296,7 @@ class SurveyFilter:
         if edge is not None:
             self._do(lambda: self._use_line(edge, transition, t_s))
 
-    def _use_line(self, edge: Edge, transition: Transition, t_s: float) -> None:
+    def _use_line(self, edge: Edge, transition: SensorTransition, t_s: float) -> None:
         if edge.is_new:
             self._renew([edge.offset], self._full.edge_sigma_m)
         mean, P = self._filter.mean, self._filter.covariance
@@ -382,7 +384,7 @@ class SurveyFilter:
         self._legs.forget_leg()
         self.innovation = None
         if again:
-            self._legs = LegBook(self._full)
+            self._legs = SlipPrior(self._full)
             first, P_first = self._first(DeckPose(float(x[X]), float(x[Y]), float(x[PSI])))
             P_first[:2, :2], P_first[PSI, PSI] = P[:2, :2], P[PSI, PSI]
             for i in (TX, TY):

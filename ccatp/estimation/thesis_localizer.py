@@ -21,11 +21,11 @@ from ccatp.core import (
     wrap_pi,
 )
 from ccatp.estimation.fixes import PositionSigma, check_fix, foot_of_fix
-from ccatp.estimation.localizer_base import FrameReceiver
+from ccatp.estimation.localizer_base import LocalizerBase
 from ccatp.estimation.measurements import OMEGA, STATES, THETA, ConstantAcceleration, MeasurementBuilder, Stack, V
 from ccatp.estimation.odometry import Odometer, arc_step
 from ccatp.estimation.sample_validation import MAX_FRAME_STEP_S
-from ccatp.estimation.seams import CrossingDetector, HeadingFix, HeadingGate, Transition
+from ccatp.estimation.seams import CrossingDetector, HeadingFix, HeadingGate, SensorTransition
 from ccatp.filters.base import Filter, FilterDiverged, Innovation
 from ccatp.mirror.mirror import Mirror
 
@@ -34,7 +34,7 @@ _IMPOSSIBLE = 2.0  # an estimate of this many times the wheels' largest rate is 
 _SELECT_HEADING = np.eye(STATES)[THETA : THETA + 1]
 
 
-class FourStateLocalizer(FrameReceiver[Stack]):
+class FourStateLocalizer(LocalizerBase[Stack]):
     """Estimates the pose (x, y, theta)_p (thesis 2.1, fig. 2.5).
 
     Each frame: the filter predicts over the time since the last frame and is updated with every usable sample at its
@@ -236,7 +236,7 @@ class FourStateLocalizer(FrameReceiver[Stack]):
         found = self._mirror.panel(panel)
         self._near_x_m, self._near_y_m = _NEAR_BORDER * found.half_x_m, _NEAR_BORDER * found.half_y_m
 
-    def _use_crossings(self, transitions: Sequence[Transition]) -> None:
+    def _use_crossings(self, transitions: Sequence[SensorTransition]) -> None:
         filter_ = self._filter
         theta = float(filter_.mean[THETA])
         seen = self._crossings.headings(transitions, self._odometer, self.pose, self.deck_pose, self.speed_m_s)

@@ -50,14 +50,14 @@ class Role(StrEnum):
     CLEAR = "clear"
 
 
-class Client(NamedTuple):
+class AuthorizedClient(NamedTuple):
     """One line of the list."""
 
     name: str
     role: Role
 
 
-Clients = Mapping[bytes, Client]
+Clients = Mapping[bytes, AuthorizedClient]
 """Clients by their public key, 32 bytes."""
 NOBODY: Clients = {}
 
@@ -99,7 +99,7 @@ def parse_clients(text: str) -> Clients:
     tables = tree.get("clients", {})
     if not isinstance(tables, dict):
         raise BadAccess("clients must be tables [clients.NAME]")
-    clients: dict[bytes, Client] = {}
+    clients: dict[bytes, AuthorizedClient] = {}
     for name, table in tables.items():
         key, client = _parse_client(name, table)
         if key in clients:
@@ -108,7 +108,7 @@ def parse_clients(text: str) -> Clients:
     return clients
 
 
-def _parse_client(name: str, table: Any) -> tuple[bytes, Client]:
+def _parse_client(name: str, table: Any) -> tuple[bytes, AuthorizedClient]:
     if not isinstance(table, dict) or table.keys() != {"public_key", "role"}:
         raise BadAccess(f"clients.{name} must have public_key and role, nothing else")
     if table["role"] not in Role.__members__.values():
@@ -117,7 +117,7 @@ def _parse_client(name: str, table: Any) -> tuple[bytes, Client]:
         key = decode_key(str(table["public_key"]))
     except BadAccess as error:
         raise BadAccess(f"clients.{name}.public_key: {error}") from error
-    return key, Client(name, Role(table["role"]))
+    return key, AuthorizedClient(name, Role(table["role"]))
 
 
 class Admission(NamedTuple):

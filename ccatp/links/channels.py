@@ -122,7 +122,7 @@ def parse_reply(frame: bytes) -> dict[str, Any]:
     return reply
 
 
-class EmergencyDesk(Protocol):
+class EmergencyHandler(Protocol):
     """What answers the observatory; ``ccatp.danger.DangerMonitor`` is one."""
 
     @property
@@ -140,7 +140,7 @@ class EmergencyDesk(Protocol):
 
 
 def answer_observatory(
-    frame: bytes, desk: EmergencyDesk, *, at_base_or_held: bool, age_s: float | None, may_clear: bool = True
+    frame: bytes, desk: EmergencyHandler, *, at_base_or_held: bool, age_s: float | None, may_clear: bool = True
 ) -> bytes:
     """Serve one request of the observatory channel.
 

@@ -32,7 +32,7 @@ from typing import Any, Literal, TypeVar
 
 import msgspec
 
-from ccatp.errors import CcatpError, ConfigError, ExitStatus, RefusedError, UnreachableError
+from ccatp.errors import CcatpError, ConfigError, DaemonUnreachableError, ExitStatus, RefusedError
 from ccatp.links.auth import read_pair, read_public
 from ccatp.links.rpc import CurveClient, RequestFailed, request
 from ccatp.links.runtime_dir import is_deserted, runtime_dir_path
@@ -75,11 +75,11 @@ class Pong(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Observatory:
+class ObservatoryClient:
     """The observatory channel of a daemon.
 
     Args:
-        endpoint: where it serves; ``Client.observatory`` knows that of a daemon on this machine.
+        endpoint: where it serves; ``OperatorClient.observatory`` knows that of a daemon on this machine.
         curve: the keys, where that is ``tcp://``; see ``connect``.
         timeout_s: longest wait for an answer.
     """
@@ -89,7 +89,7 @@ class Observatory:
     timeout_s: float = TIMEOUT_S
 
     @classmethod
-    def connect(cls, endpoint: str, server_key: Path, key: Path, timeout_s: float = TIMEOUT_S) -> "Observatory":
+    def connect(cls, endpoint: str, server_key: Path, key: Path, timeout_s: float = TIMEOUT_S) -> "ObservatoryClient":
         """A daemon on another machine.
 
         Args:
@@ -139,7 +139,7 @@ class Observatory:
         return exchange(self.endpoint, payload, self.timeout_s, self.curve, repeats=True)
 
 
-class Client:
+class OperatorClient:
     """The operator channel of a daemon on this machine.
 
     Args:
@@ -152,9 +152,9 @@ class Client:
         self.timeout_s = timeout_s
 
     @property
-    def observatory(self) -> Observatory:
+    def observatory(self) -> ObservatoryClient:
         """The observatory channel of the same daemon."""
-        return Observatory(self._endpoint("emergency"), timeout_s=self.timeout_s)
+        return ObservatoryClient(self._endpoint("emergency"), timeout_s=self.timeout_s)
 
     def status(self) -> MissionStatus:
         """Where the mission stands.
@@ -218,7 +218,7 @@ class Client:
             UnreachableError: no daemon has made it, or it is gone.
         """
         if not (self.runtime_dir / channel).exists() or is_deserted(self.runtime_dir):
-            raise UnreachableError(
+            raise DaemonUnreachableError(
                 f"no daemon in {self.runtime_dir}; start one with ccatp run, or name its folder with --runtime-dir"
             )
         return f"ipc://{self.runtime_dir / channel}"
@@ -349,13 +349,13 @@ class HttpClient:
                 raise RefusedError(f"{name} refused ({error.code}): {_message(error.read(MAX_BYTES))}") from error
         except (urllib.error.URLError, TimeoutError, ConnectionError) as error:
             why = getattr(error, "reason", error)
-            raise UnreachableError(f"no answer from {where}: {why}; is ccatp dashboard running there?") from error
+            raise DaemonUnreachableError(f"no answer from {where}: {why}; is ccatp dashboard running there?") from error
         try:
             found = json.loads(text)
         except ValueError as error:
-            raise UnreachableError(f"{where}: the answer is no JSON; is this a ccatp dashboard?") from error
+            raise DaemonUnreachableError(f"{where}: the answer is no JSON; is this a ccatp dashboard?") from error
         if not isinstance(found, dict):
-            raise UnreachableError(f"{where}: the answer is no object; is this a ccatp dashboard?")
+            raise DaemonUnreachableError(f"{where}: the answer is no object; is this a ccatp dashboard?")
         return found
 
 

@@ -5,7 +5,7 @@ Lines that are said again and again: which are of one kind, and how many of them
 
 import re
 
-from ccatp.links.topics import BY_NAME, Presence
+from ccatp.links.topics import BY_NAME, Heartbeat
 
 LOOPS = ("main", "danger")
 STALE_AFTER_S = min(BY_NAME[f"presence.{name}"].stale_after_s for name in LOOPS)
@@ -21,9 +21,9 @@ class Liveness:
     def __init__(self, stale_after_s: float = STALE_AFTER_S) -> None:
         """Nothing heard."""
         self._stale_after_s = stale_after_s
-        self._presences: dict[str, Presence] = {}
+        self._presences: dict[str, Heartbeat] = {}
 
-    def heard(self, presence: Presence) -> None:
+    def heard(self, presence: Heartbeat) -> None:
         """A loop is there. Its words are dated by its own clock, which is the machine's: waiting in line ages them."""
         self._presences[presence.process] = presence
 
@@ -62,7 +62,7 @@ def kind_of(text: str) -> str:
     return _NUMBER.sub("#", text)
 
 
-class LineBudget:
+class LogRateLimit:
     """So many lines in a period, and a count of those that were left out.
 
     Args:
@@ -86,7 +86,7 @@ class LineBudget:
         return left_out
 
 
-class Sparing:
+class RateLimitedLog:
     """Lines for a terminal: a few of each kind in a period, and how many like it were left out before.
 
     Args:
@@ -97,7 +97,7 @@ class Sparing:
     def __init__(self, lines: int, period_s: float) -> None:
         """Nothing said."""
         self._lines, self._period_s = lines, period_s
-        self._budgets: dict[str, LineBudget] = {}
+        self._budgets: dict[str, LogRateLimit] = {}
 
     def take(self, level: str, text: str, now_s: float) -> str | None:
         """The line as it is told; ``None`` where it is left out. Errors are all told.
@@ -109,7 +109,7 @@ class Sparing:
         """
         if level == "error":
             return text
-        budget = self._budgets.setdefault(f"{level} {kind_of(text)}", LineBudget(self._lines, self._period_s))
+        budget = self._budgets.setdefault(f"{level} {kind_of(text)}", LogRateLimit(self._lines, self._period_s))
         left_out = budget.take(now_s)
         if left_out is None:
             return None

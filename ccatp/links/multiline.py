@@ -15,7 +15,7 @@ CHANNEL_NUMBERS = range(1, 33)  # the vendor's instrument has up to 32 channels
 EOL = b"\r\n"
 
 
-class BadRequest(ValueError):
+class BadMultilineRequest(ValueError):
     """A line that is no request; ``reason`` goes into the error reply."""
 
     def __init__(self, reason: str) -> None:
@@ -27,7 +27,7 @@ class BadReply(ValueError):
     """A line that is no reply."""
 
 
-class LineTooLong(ValueError):
+class MultilineTooLong(ValueError):
     """A line longer than the cap; the connection that sent it is of no further use."""
 
 
@@ -42,7 +42,7 @@ class Command(StrEnum):
     STOP_MEASUREMENT = "stopmeasnogui"
 
 
-class Request(NamedTuple):
+class MultilineRequest(NamedTuple):
     """One request; ``channels`` only with ``LATEST_LENGTH_VALID``."""
 
     command: Command
@@ -164,7 +164,7 @@ class LineSplitter:
         end = self._buffer.find(b"\n", self._scanned)
         self._scanned = len(self._buffer) if end < 0 else end
         if self._scanned > self._limit:
-            raise LineTooLong(f"line of more than {self._limit} bytes")
+            raise MultilineTooLong(f"line of more than {self._limit} bytes")
         if end < 0:
             return None
         line = bytes(self._buffer[:end])
@@ -173,12 +173,12 @@ class LineSplitter:
         return line.rstrip(b"\r")
 
 
-def format_request(request: Request) -> bytes:
+def format_request(request: MultilineRequest) -> bytes:
     """The request as it goes over the wire."""
     return ",".join((request.command, *map(str, request.channels))).encode("ascii") + EOL
 
 
-def parse_request(line: bytes) -> Request:
+def parse_request(line: bytes) -> MultilineRequest:
     """Read one line of a client.
 
     Raises:
@@ -188,13 +188,13 @@ def parse_request(line: bytes) -> Request:
     try:
         command = Command(name)
     except ValueError:
-        raise BadRequest("unknown-request") from None
+        raise BadMultilineRequest("unknown-request") from None
     if bool(arguments) != (command is Command.LATEST_LENGTH_VALID):
-        raise BadRequest("bad-arguments")
+        raise BadMultilineRequest("bad-arguments")
     channels = tuple(int(text) for text in arguments if text.isascii() and text.isdigit() and len(text) <= 2)
     if len(set(channels) & set(CHANNEL_NUMBERS)) != len(arguments):
-        raise BadRequest("bad-channel")
-    return Request(command, channels)
+        raise BadMultilineRequest("bad-channel")
+    return MultilineRequest(command, channels)
 
 
 def format_reply(reply: Reply) -> bytes:

@@ -8,17 +8,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
-from ccatp.errors import ConfigError, UnreachableError
+from ccatp.errors import ConfigError, DaemonUnreachableError
 from ccatp.links.robot_codec import BadLine, decode_from_robot, encode, format_drive, format_permit, join_mac
 from ccatp.links.robot_messages import (
     AUTH_HMAC,
     PROTOCOL,
     BadLineCounter,
+    BadLineLimit,
     FromRobot,
     Hello,
     Join,
     Joined,
-    LineBudget,
     LineBuffer,
     LineTooLong,
     Refused,
@@ -38,7 +38,7 @@ FLOOD_FACTOR = 3.0
 LINUX_OPTIONS = {"TCP_USER_TIMEOUT": 1000, "TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 3}
 
 
-class RobotLinkError(UnreachableError):
+class RobotLinkError(DaemonUnreachableError):
     """The robot cannot be joined."""
 
 
@@ -135,7 +135,7 @@ class RobotLink(asyncio.Protocol):
         self._is_joined = self._is_closing = self._is_paused = False
         self._lines = LineBuffer()
         self._bad = BadLineCounter()
-        self._budget: LineBudget | None = None
+        self._budget: BadLineLimit | None = None
         self._last_seq = -1
         self._why = self._oddity = ""
 
@@ -253,7 +253,7 @@ class RobotLink(asyncio.Protocol):
             self._is_joined = True
             if not self._hello.lockstep:  # there it is we who set the pace
                 rate_hz = self._hello.frame_hz
-                self._budget = LineBudget(BACKLOG_S * rate_hz, FLOOD_FACTOR * rate_hz)
+                self._budget = BadLineLimit(BACKLOG_S * rate_hz, FLOOD_FACTOR * rate_hz)
             joining.set_result(self._hello)
             self._on_joined(self._hello)
         else:

@@ -200,7 +200,7 @@ class LineBuffer:
         return lines
 
 
-class LineBudget:
+class BadLineLimit:
     """So many lines at once, so many a second in the long run; more is a flood.
 
     Args:

@@ -18,7 +18,7 @@ import zmq
 import zmq.asyncio
 from zmq.utils.monitor import parse_monitor_message
 
-from ccatp.errors import CcatpError, ExitStatus, UnreachableError
+from ccatp.errors import CcatpError, DaemonUnreachableError, ExitStatus
 from ccatp.links.auth import Clients, KeyPair, answer_zap
 from ccatp.links.channels import BadRequest, format_error, parse_reply
 
@@ -46,7 +46,7 @@ class RouterError(CcatpError):
     exit_status = ExitStatus.USAGE
 
 
-class RequestFailed(UnreachableError):
+class RequestFailed(DaemonUnreachableError):
     """No usable answer within the deadline."""
 
 

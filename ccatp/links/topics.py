@@ -19,7 +19,7 @@ class Message(msgspec.Struct, kw_only=True):
     t_s: float
 
 
-class Presence(Message):
+class Heartbeat(Message):
     """A process is alive, before and while frames flow.
 
     ``phase``: starting, ready (may be joined to), joined, done. ``frame_age_s``: wall time since the process served its
@@ -32,7 +32,7 @@ class Presence(Message):
     frame_age_s: float | None = None
 
 
-class Estimate(Message):
+class EstimateMessage(Message):
     """The localizer's pose after frame ``seq``, deck frame, and what main had the wheels do.
 
     ``commanded``: lowest and highest set point of the right wheel, then of the left one, rad/s, over the drives sent
@@ -47,7 +47,7 @@ class Estimate(Message):
     commanded: tuple[float, float, float, float] | None = None
     drive_seq: int = -1
 
-    def following(self, missed: "Estimate") -> "Estimate":
+    def following(self, missed: "EstimateMessage") -> "EstimateMessage":
         """This estimate for one who has not looked at the one before: ``commanded`` spans the drives of both."""
         mine, its = self.commanded, missed.commanded
         if mine is None or its is None:
@@ -77,7 +77,7 @@ class MissionStatus(Message):
     left_out: dict[str, list[str]] = {}  # points skipped, or not measured any more, by the reason
 
 
-class Picture(Message):
+class DisplayState(Message):
     """The newest of everything that a display shows, told only while somebody has asked for it.
 
     Attributes:
@@ -98,7 +98,7 @@ class Picture(Message):
     line: msgspec.Raw
 
 
-class Shape(msgspec.Struct, omit_defaults=True):
+class RobotShape(msgspec.Struct, omit_defaults=True):
     """One thing on the map, in the plane of the pose.
 
     Attributes:
@@ -126,10 +126,10 @@ class Shape(msgspec.Struct, omit_defaults=True):
 class Scene(Message):
     """What is on the map besides the mirror and the robot; each message has all of it."""
 
-    shapes: list[Shape]
+    shapes: list[RobotShape]
 
 
-class Track(Message):
+class TrackMessage(Message):
     """A batch of estimates.
 
     Rows: seq, t_s, row and column of the panel, x_m, y_m, heading_rad (panel frame), sigma_m.
@@ -144,7 +144,7 @@ class SensorLines(Message):
     lines: list[msgspec.Raw]
 
 
-class Arrival(Message):
+class ArrivalMessage(Message):
     """The robot came to rest at a measurement point for the first time; ``error_mm`` is the estimated distance."""
 
     point: tuple[int, int, int]
@@ -199,7 +199,7 @@ class DangerEvent(Message):
     severity: int = 0
 
 
-class Log(Message):
+class LogMessage(Message):
     """One line for the operator's terminal."""
 
     level: str
@@ -213,7 +213,7 @@ class Timing(Message):
     tick_us: list[float]
 
 
-class Truth(Message):
+class TruthMessage(Message):
     """A batch of simulated truth (simulation only).
 
     Rows: seq, t_s, x_m, y_m, heading_rad (deck), X, Y, Z (surface point, deck, m), clearance of the worst edge sensor
@@ -241,7 +241,7 @@ class BeaconTrack(Message):
 BeaconEllipse = tuple[float, float, float, float, float]
 
 
-class BeaconMap(Message):
+class BeaconMapMessage(Message):
     """The map of a robot among beacons, for displays and reports; positions in m.
 
     Attributes:
@@ -319,27 +319,27 @@ class Topic:
 
 
 TOPICS: tuple[Topic, ...] = (
-    Topic("presence.main", Presence, "main", 10.0, 1.0, False),
-    Topic("presence.danger", Presence, "danger", 10.0, 1.0, False),
-    Topic("presence.dashboard", Presence, "dashboard", 2.0, 5.0, False),
-    Topic("picture", Picture, "main", 10.0, 0.8, False),
+    Topic("presence.main", Heartbeat, "main", 10.0, 1.0, False),
+    Topic("presence.danger", Heartbeat, "danger", 10.0, 1.0, False),
+    Topic("presence.dashboard", Heartbeat, "dashboard", 2.0, 5.0, False),
+    Topic("picture", DisplayState, "main", 10.0, 0.8, False),
     Topic("scene", Scene, "main", 2.0, 5.0, False),
-    Topic("estimate", Estimate, "main", 20.0, 0.15, False),
+    Topic("estimate", EstimateMessage, "main", 20.0, 0.15, False),
     Topic("verdict", Verdict, "danger", 100.0, 0.15, False),
     Topic("mission", MissionStatus, "main", 10.0, 1.0, True),
-    Topic("track", Track, "main", 1.0, 0.0, True),
+    Topic("track", TrackMessage, "main", 1.0, 0.0, True),
     Topic("sensors", SensorLines, "main", 1.0, 0.0, True),
-    Topic("arrival", Arrival, "main", 0.0, 0.0, True),
+    Topic("arrival", ArrivalMessage, "main", 0.0, 0.0, True),
     Topic("rest", Rest, "main", 0.0, 0.0, True),
     Topic("treatment", Treatment, "main", 0.0, 0.0, True),
     Topic("fix", FixMessage, "main", 0.0, 0.0, True),
     Topic("danger_event", DangerEvent, "danger", 0.0, 0.0, True),
-    Topic("log", Log, "main", 0.0, 0.0, True),
+    Topic("log", LogMessage, "main", 0.0, 0.0, True),
     Topic("timing", Timing, "main", 1.0, 0.0, False),
     Topic("misalignment", Misalignment, "dataloop", 0.0, 0.0, True),
-    Topic("truth", Truth, "dataloop", 1.0, 0.0, True),
+    Topic("truth", TruthMessage, "dataloop", 1.0, 0.0, True),
     Topic("beacon_track", BeaconTrack, "main", 1.0, 0.0, True),
-    Topic("beacon_map", BeaconMap, "main", 2.0, 2.0, True),
+    Topic("beacon_map", BeaconMapMessage, "main", 2.0, 2.0, True),
     Topic("beacon_arrival", BeaconArrival, "main", 0.0, 0.0, True),
     Topic("beacon_places", BeaconPlaces, "dataloop", 0.0, 0.0, True),
     Topic("beacon_truth", BeaconTruth, "dataloop", 1.0, 0.0, True),

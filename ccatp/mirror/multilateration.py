@@ -47,7 +47,7 @@ class TooFarFromExpected(MultilaterationError):
 
 
 @dataclass(frozen=True, slots=True)
-class Solution:
+class RangeSolution:
     """A multilaterated position, in the frame of the anchors.
 
     Attributes:
@@ -80,7 +80,7 @@ def multilaterate(
     *,
     max_iterations: int = 100,
     tolerance_m: float = 1e-9,
-) -> Solution:
+) -> RangeSolution:
     """Weighted least squares position from ranges.
 
     Minimises sum(((r_i - |x - a_i|) / sigma_i)^2) from ``expected_m`` on, by the steps
@@ -118,7 +118,7 @@ def multilaterate(
     weighted = directions / sigmas[:, None]
     covariance = np.linalg.solve(weighted.T @ weighted, np.eye(len(position)))
     residuals = ranges - distances
-    return Solution(
+    return RangeSolution(
         position_m=position,
         covariance_m2=0.5 * (covariance + covariance.T),
         dop=float(np.sqrt(np.sum(singular**-2.0))),
@@ -129,7 +129,7 @@ def multilaterate(
 
 
 def check_solution(
-    solution: Solution, expected_m: ArrayLike, *, max_residual_m: float, max_dop: float, max_distance_m: float
+    solution: RangeSolution, expected_m: ArrayLike, *, max_residual_m: float, max_dop: float, max_distance_m: float
 ) -> None:
     """Refuse a solution that cannot be trusted.
 

@@ -422,7 +422,7 @@ def mirror_wavefront(panels: Iterable[PanelWavefront]) -> MirrorWavefront | None
 SHAPE = slice(3, 6)
 
 
-class Shape(NamedTuple):
+class PanelShape(NamedTuple):
     """Curvatures of the displacement, D_xx, D_xy, D_yy.
 
     Attributes:
@@ -442,7 +442,7 @@ class Shape(NamedTuple):
     is_significant: bool
 
 
-class Plan(NamedTuple):
+class AdjusterPlan(NamedTuple):
     """Moves of the adjusters and what they make of the panel's half-wavefront error."""
 
     moves: Moves
@@ -473,10 +473,10 @@ class PanelResult:
     is_kept: BoolArray
     cos_i: float
     fit: ModeFit
-    shape: Shape | None
+    shape: PanelShape | None
     adjusters: tuple[str, ...]
-    rigid: Plan
-    bending: Plan | None
+    rigid: AdjusterPlan
+    bending: AdjusterPlan | None
 
     @property
     def outliers(self) -> tuple[PointId, ...]:
@@ -516,9 +516,9 @@ def panel_result(
     body = mirror.panel(panel)
     names, adjusters = adjuster_places(mirror, panel)
 
-    def plan(found: ModeFit, modes: Modes) -> Plan:
+    def plan(found: ModeFit, modes: Modes) -> AdjusterPlan:
         wavefront = panel_wavefront(body, cos_i, found, gram(modes, half_size_m(body)), sigmas)
-        return Plan(adjuster_moves(found, modes, adjusters), wavefront)
+        return AdjusterPlan(adjuster_moves(found, modes, adjusters), wavefront)
 
     bent = fit_modes(lever * adjustable(places), values, sigmas)
     full = fit_modes(lever * quadratic(places), values, sigmas)
@@ -535,10 +535,10 @@ def panel_result(
     )
 
 
-def _shape(fit: ModeFit, full: ModeFit, *, is_significant: bool) -> Shape:
+def _shape(fit: ModeFit, full: ModeFit, *, is_significant: bool) -> PanelShape:
     gain = fit.chi2 - full.chi2
     chance = float(chdtrc(3, max(gain, 0.0)))
-    return Shape(full.values[SHAPE], full.sigma[SHAPE], gain, chance, full.chi2, full.dof, is_significant)
+    return PanelShape(full.values[SHAPE], full.sigma[SHAPE], gain, chance, full.chi2, full.dof, is_significant)
 
 
 def displacement_m(panel: PanelResult, places_m: FloatArray) -> FloatArray:

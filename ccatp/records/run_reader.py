@@ -23,14 +23,14 @@ from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import (
     RECORD_FORMAT,
-    Arrival,
+    ArrivalMessage,
     BadMessage,
     FixMessage,
     Rest,
     SensorLines,
-    Track,
+    TrackMessage,
     Treatment,
-    Truth,
+    TruthMessage,
     unpack,
 )
 from ccatp.mirror.mirror import Mirror, deck_poses
@@ -290,12 +290,12 @@ class Recording:
             return [message]
         if isinstance(message, FixMessage):
             return [fix_given(message)]
-        if isinstance(message, Track):
+        if isinstance(message, TrackMessage):
             for seq, t_s, row, col, x_m, y_m, heading_rad, _ in message.rows:
                 self._track.add(seq, t_s, row, col, (x_m, y_m, heading_rad))
-        elif isinstance(message, Truth):
+        elif isinstance(message, TruthMessage):
             self._truth += message.rows
-        elif isinstance(message, Arrival):
+        elif isinstance(message, ArrivalMessage):
             self.arrivals.append(message.seq)
         return []
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ccatp.core import FloatArray
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult, Undetermined, point_text
-from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, Plan, mirror_wavefront
+from ccatp.mirror.panel_alignment import AdjusterPlan, MirrorWavefront, PanelResult, mirror_wavefront
 
 MICRO = 1e6
 _DECIMALS = 4
@@ -90,7 +90,7 @@ def _deviations(panel: PanelResult) -> Iterator[dict[str, Any]]:
         }
 
 
-def _own_wavefront(plan: Plan) -> dict[str, float | None]:
+def _own_wavefront(plan: AdjusterPlan) -> dict[str, float | None]:
     found = _wavefront(mirror_wavefront([plan.wavefront]))
     return {name: found[name] for name in ("rms_before_um", "rms_after_um")}
 

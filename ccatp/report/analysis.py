@@ -12,7 +12,7 @@ import numpy as np
 
 from ccatp.core import FloatArray, PointId, StopKind
 from ccatp.links.topics import MissionStatus
-from ccatp.report.record import WITHIN_MM, RunRecord, Session
+from ccatp.report.record import WITHIN_MM, RecordedSession, RunRecord
 from ccatp.survey.composition import plan_survey
 from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.route import ORDERS
@@ -79,7 +79,7 @@ def error_series(record: RunRecord) -> ErrorSeries | None:
     )
 
 
-def _errors_mm(session: Session) -> FloatArray:
+def _errors_mm(session: RecordedSession) -> FloatArray:
     errors = np.full(len(session.track.seq), np.nan)
     if session.truth is not None:
         _, i, j = np.intersect1d(session.track.seq, session.truth.seq, assume_unique=True, return_indices=True)
@@ -120,14 +120,14 @@ _NEVER_BEGUN = "idle"
 _ROUNDING_S = 1e-3  # of a status; a frame takes ten times as long
 
 
-class Spell(NamedTuple):
+class TimeSpan(NamedTuple):
     """The mission was in a state for some time."""
 
     state: str
     duration_s: float
 
 
-class TimeBudget(NamedTuple):
+class TimeBreakdown(NamedTuple):
     """Times of a run, s.
 
     Attributes:
@@ -160,9 +160,9 @@ class TimeBudget(NamedTuple):
         return None if self.least_s is None else sum(self.least_s.values())
 
 
-def time_budget(record: RunRecord) -> TimeBudget | None:
+def time_budget(record: RunRecord) -> TimeBreakdown | None:
     """The budget of a run; None where nothing tells its states."""
-    spells, is_exact = list[Spell](), True
+    spells, is_exact = list[TimeSpan](), True
     for session in record.sessions:
         exact = spells_of(session)
         is_exact = is_exact and exact is not None
@@ -171,10 +171,10 @@ def time_budget(record: RunRecord) -> TimeBudget | None:
         return None
     spent, visits = _booked(spells, record.cfg.etalon.measuring_time_s)
     least, covers = least_times(record)
-    return TimeBudget(spent, least, visits, is_exact, covers)
+    return TimeBreakdown(spent, least, visits, is_exact, covers)
 
 
-def spells_of(session: Session) -> list[Spell] | None:
+def spells_of(session: RecordedSession) -> list[TimeSpan] | None:
     """Spells between the changes that the log tells; None where it does not, or the frames are not known.
 
     What a main loop that died was at is not told; the time until its successor speaks counts as waiting, but for that
@@ -186,10 +186,11 @@ def spells_of(session: Session) -> list[Spell] | None:
     at = np.clip(np.searchsorted(track.seq, [change.seq for change in session.changes]), 0, len(track.seq) - 1)
     times = [float(track.t_s[0]), *track.t_s[at].tolist()]
     spells = [
-        Spell(change.before, end - start) for change, (start, end) in zip(session.changes, pairwise(times), strict=True)
+        TimeSpan(change.before, end - start)
+        for change, (start, end) in zip(session.changes, pairwise(times), strict=True)
     ]
     last = session.changes[-1].after
-    spells.append(Spell(last, float(track.t_s[-1]) - times[-1]))
+    spells.append(TimeSpan(last, float(track.t_s[-1]) - times[-1]))
     absent_s = sum(uncounted_s(one, later) for one, later in pairwise(_of_frames(session.statuses)))
     anew = [index for index, spell in enumerate(spells) if index and spell.state == _NEVER_BEGUN]
     # What its predecessor did last was not written down in time, so that it is not counted either.
@@ -197,7 +198,7 @@ def spells_of(session: Session) -> list[Spell] | None:
         part_s = min(spells[index].duration_s, absent_s)
         absent_s -= part_s
         spells[index] = spells[index]._replace(duration_s=spells[index].duration_s - part_s)
-        spells.append(Spell(START_ANEW, part_s))
+        spells.append(TimeSpan(START_ANEW, part_s))
     return [spell for spell in spells if spell.duration_s > 0.0 and spell.state != _OVER]
 
 
@@ -213,16 +214,16 @@ def _of_frames(statuses: Iterable[MissionStatus]) -> list[MissionStatus]:
     return [status for status in statuses if status.seq >= 0]
 
 
-def sampled_spells(session: Session) -> list[Spell]:
+def sampled_spells(session: RecordedSession) -> list[TimeSpan]:
     """Spells as the status shows them: each lasts until the next."""
     spells = []
     for one, later in pairwise(_of_frames(session.statuses)):
         absent_s = uncounted_s(one, later)
-        spells += [Spell(one.state, later.t_s - one.t_s - absent_s), Spell(START_ANEW, absent_s)]
+        spells += [TimeSpan(one.state, later.t_s - one.t_s - absent_s), TimeSpan(START_ANEW, absent_s)]
     return [spell for spell in spells if spell.state != _OVER and spell.duration_s > 0.0]
 
 
-def _booked(spells: Iterable[Spell], measuring_s: float) -> tuple[dict[str, float], dict[str, int]]:
+def _booked(spells: Iterable[TimeSpan], measuring_s: float) -> tuple[dict[str, float], dict[str, int]]:
     """Spells by kind. A measurement that takes longer than its time was repeated, or waited for the laser."""
     spent, visits = defaultdict[str, float](float), defaultdict[str, int](int)
     for state, duration_s in spells:

@@ -22,13 +22,13 @@ from ccatp.report.drawing import (
     SEAM,
     SERIES,
     Area,
-    Axis,
     Dots,
-    Line,
-    Picture,
+    Drawing,
     Plot,
+    PlotAxis,
+    PolyLine,
     Shape,
-    Text,
+    TextShape,
     envelope,
     legend,
     thinned,
@@ -53,7 +53,7 @@ class Curve(NamedTuple):
     dash: tuple[float, ...] = ()
 
 
-def beacon_error_figure(record: BeaconRecord, width: float) -> Picture:
+def beacon_error_figure(record: BeaconRecord, width: float) -> Drawing:
     """Error of the position, its three sigma, and what dead reckoning alone would err; mm, logarithmic."""
     track = record.track
     curves = []
@@ -67,7 +67,7 @@ def beacon_error_figure(record: BeaconRecord, width: float) -> Picture:
     return _logarithmic(curves, "mm", width, "localization error over time")
 
 
-def map_error_figure(record: BeaconRecord, width: float) -> Picture | None:
+def map_error_figure(record: BeaconRecord, width: float) -> Drawing | None:
     """Root of the mean square error of the beacons, expected and true, against time; None without a map."""
     times, expected, true = list[float](), list[float](), list[float]()
     for told in record.maps:
@@ -91,12 +91,12 @@ def map_error_figure(record: BeaconRecord, width: float) -> Picture | None:
     return _logarithmic(curves, "mm, rms of a place", width, "error of the map over time")
 
 
-def consistency_figure(record: BeaconRecord, width: float) -> Picture | None:
+def consistency_figure(record: BeaconRecord, width: float) -> Drawing | None:
     """NIS of the readings and NEES of the pose, each by its degrees of freedom: 1 is expected. None without either."""
     readings, nees = readings_of(record), pose_nees(record)
     if not readings and nees is None:
         return None
-    plot = _plot(width, *_span(record), Axis(0.0, _TOP, *_vertical(width)))
+    plot = _plot(width, *_span(record), PlotAxis(0.0, _TOP, *_vertical(width)))
     plot.frame("robot time, min", "for each degree of freedom")
     plot.level(1.0, QUIET)
     entries = []
@@ -117,7 +117,7 @@ def consistency_figure(record: BeaconRecord, width: float) -> Picture | None:
     return _with_legend(plot, entries, width, "consistency over time")
 
 
-def target_figure(record: BeaconRecord, width: float) -> Picture | None:
+def target_figure(record: BeaconRecord, width: float) -> Drawing | None:
     """Distance to the radio that is followed, by the estimate and in truth; None where none is followed."""
     if not record.cfg.follow.is_active:
         return None
@@ -137,7 +137,7 @@ def target_figure(record: BeaconRecord, width: float) -> Picture | None:
         return None
     safe_m = record.cfg.follow.safe_distance_m
     top = max(1.5 * safe_m, *(float(np.nanmax(curve.values)) for curve in curves))
-    plot = _plot(width, *_span(record), Axis(0.0, 1.05 * top, *_vertical(width)))
+    plot = _plot(width, *_span(record), PlotAxis(0.0, 1.05 * top, *_vertical(width)))
     plot.frame("robot time, min", "m")
     plot.level(safe_m, BAD)
     for curve in curves:
@@ -146,14 +146,14 @@ def target_figure(record: BeaconRecord, width: float) -> Picture | None:
     return _with_legend(plot, [*entries, ("to be kept", BAD)], width, "distance to the target over time")
 
 
-def _logarithmic(curves: Sequence[Curve], label: str, width: float, title: str) -> Picture:
+def _logarithmic(curves: Sequence[Curve], label: str, width: float, title: str) -> Drawing:
     values = np.concatenate([curve.values for curve in curves])
     values = values[np.isfinite(values) & (values > 0.0)]
     low, high = (float(np.percentile(values, 1)), float(values.max())) if len(values) else (1.0, 10.0)
     ends = 10.0 ** floor(log10(low)), 10.0 ** ceil(log10(high * 1.05))
     times = np.concatenate([curve.t_s for curve in curves])
     span = (float(times.min()), float(times.max())) if len(times) else (0.0, 60.0)
-    plot = _plot(width, *span, Axis(*ends, *_vertical(width), is_logarithmic=True))
+    plot = _plot(width, *span, PlotAxis(*ends, *_vertical(width), is_logarithmic=True))
     plot.frame("robot time, min", label)
     for curve in curves:
         known = np.isfinite(curve.values)
@@ -171,15 +171,15 @@ def _vertical(width: float) -> tuple[float, float]:
     return (260.0 if width > NARROW else 220.0), 10.0
 
 
-def _plot(width: float, begin_s: float, end_s: float, y: Axis) -> Plot:
+def _plot(width: float, begin_s: float, end_s: float, y: PlotAxis) -> Plot:
     left, right = 62.0, width - 12.0
-    x = Axis(begin_s / 60.0, max(end_s, begin_s + 1.0) / 60.0, left, right)
+    x = PlotAxis(begin_s / 60.0, max(end_s, begin_s + 1.0) / 60.0, left, right)
     return Plot(left, y.end, right, y.start, x, y, 11.5 if width > NARROW else 10.5)
 
 
-def _with_legend(plot: Plot, entries: Sequence[tuple[str, str]], width: float, title: str) -> Picture:
+def _with_legend(plot: Plot, entries: Sequence[tuple[str, str]], width: float, title: str) -> Drawing:
     shapes, height = legend(12.0, plot.bottom + 56.0, entries, plot.size, width - 24.0)
-    return Picture(width, plot.bottom + 48.0 + height, (*plot.shapes, *shapes), title)
+    return Drawing(width, plot.bottom + 48.0 + height, (*plot.shapes, *shapes), title)
 
 
 _MARGIN_M, _BEYOND_M = 0.25, 1.5  # around the room; of it what stands outside is still shown
@@ -220,9 +220,9 @@ class _Room:
         span = self.high - self.low
         left, right, top = 46.0, self.width - 12.0, 8.0
         scale = min((right - left) / span[0], _TALL * self.width / span[1])
-        x = Axis(float(self.low[0]), float(self.high[0]), left, left + scale * float(span[0]))
+        x = PlotAxis(float(self.low[0]), float(self.high[0]), left, left + scale * float(span[0]))
         bottom = top + scale * float(span[1])
-        y = Axis(float(self.low[1]), float(self.high[1]), bottom, top)
+        y = PlotAxis(float(self.low[1]), float(self.high[1]), bottom, top)
         self.plot = Plot(left, top, x.end, bottom, x, y, 11.5 if self.is_wide else 10.5)
 
     @property
@@ -237,8 +237,8 @@ class _Room:
         """A path with its key; where nothing is known of it, none."""
         if np.isfinite(points_m).all(axis=1).sum() < 2:
             return
-        self.shapes.append(Line(thinned(self.pixels(points_m), _TOLERANCE_PX), colour, width, dash))
-        self.keys.append((name, Line(_KEY_LINE, colour, width + 0.6, dash)))
+        self.shapes.append(PolyLine(thinned(self.pixels(points_m), _TOLERANCE_PX), colour, width, dash))
+        self.keys.append((name, PolyLine(_KEY_LINE, colour, width + 0.6, dash)))
 
     def dots(self, name: str, places_m: FloatArray, dots: Dots) -> None:
         """Marks with their key."""
@@ -248,15 +248,15 @@ class _Room:
         self.shapes.append(Dots(self.pixels(places_m), dots.radius, dots.colour, dots.mark, dots.titles, dots.edge))
         self.keys.append((name, one))
 
-    def finish(self, title: str) -> Picture:
+    def finish(self, title: str) -> Drawing:
         """Room behind, keys below."""
         self.plot.frame("x, m", "y, m")
         y = self.plot.bottom + 54.0
         keys, height = _legend(self.keys, y, self.plot.size, self.width)
-        return Picture(self.width, y + height, (*self.plot.shapes, *self.shapes, *keys), title)
+        return Drawing(self.width, y + height, (*self.plot.shapes, *self.shapes, *keys), title)
 
 
-def beacon_map_figure(record: BeaconRecord, width: float) -> Picture:
+def beacon_map_figure(record: BeaconRecord, width: float) -> Drawing:
     """Draw the map.
 
     Args:
@@ -323,7 +323,7 @@ def _draw_waypoints(room: _Room, record: BeaconRecord) -> None:
         titles = tuple(f"waypoint {at + 1}" for at in some)
         room.dots(name, waypoints[some], Dots(waypoints[some], 6.0, colour, "ring", titles if room.is_wide else ()))
     for at, (x, y) in enumerate(room.pixels(waypoints).tolist()):
-        room.shapes.append(Text(x + 8.0, y + 14.0, str(at + 1), room.plot.size, QUIET))
+        room.shapes.append(TextShape(x + 8.0, y + 14.0, str(at + 1), room.plot.size, QUIET))
 
 
 def _draw_beacons(room: _Room, record: BeaconRecord) -> None:
@@ -338,7 +338,7 @@ def _draw_beacons(room: _Room, record: BeaconRecord) -> None:
     for name, (x, y) in zip(beacons, room.pixels(places).tolist(), strict=True):
         is_left = x > room.plot.right - 60.0
         room.shapes.append(
-            Text(x + (-7.0 if is_left else 7.0), y - 6.0, name, room.plot.size, INK, "end" if is_left else "start")
+            TextShape(x + (-7.0 if is_left else 7.0), y - 6.0, name, room.plot.size, INK, "end" if is_left else "start")
         )
     target = record.maps[-1].target if record.maps else None
     if target is not None:
@@ -356,15 +356,15 @@ def _legend(keys: list[tuple[str, Shape]], y: float, size: float, width: float) 
         length = 26.0 + CHARACTER * size * len(name) + 12.0
         if at + length > width and at > 20.0:
             at, line = 20.0, line + 1.7 * size
-        shapes += [_moved(key, at, line - 0.35 * size), Text(at + 15.0, line, name, size, INK)]
+        shapes += [_moved(key, at, line - 0.35 * size), TextShape(at + 15.0, line, name, size, INK)]
         at += length
     return shapes, line - y + 1.8 * size
 
 
 def _moved(key: Shape, x: float, y: float) -> Shape:
     offset = np.array((x, y))
-    if isinstance(key, Line):
-        return Line(key.points + offset, key.colour, key.width, key.dash)
+    if isinstance(key, PolyLine):
+        return PolyLine(key.points + offset, key.colour, key.width, key.dash)
     if isinstance(key, Dots):
         return Dots(key.places + offset, key.radius, key.colour, key.mark, edge=key.edge)
     return key

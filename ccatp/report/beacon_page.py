@@ -15,12 +15,12 @@ from ccatp.report.beacon_figures import (
     map_error_figure,
     target_figure,
 )
-from ccatp.report.drawing import Picture
+from ccatp.report.drawing import Drawing
 from ccatp.report.html import WIDE, Section, chips, clock, facts, figure, foot, head, page, shown, table, text
 from ccatp.report.record import (
     COMPLETE,
     BeaconRecord,
-    Outcome,
+    PointOutcome,
     beacon_rows,
     pose_errors_m,
     pose_nees,
@@ -45,7 +45,7 @@ def beacon_page(record: BeaconRecord) -> str:
     return page(f"{record.name}: {record.cfg.system}", _head(record), sections, foot(record))
 
 
-def beacon_figures(record: BeaconRecord) -> dict[str, Picture]:
+def beacon_figures(record: BeaconRecord) -> dict[str, Drawing]:
     """The figures of the report, by the names of their files."""
     if not len(record.track.seq):
         return {}
@@ -97,16 +97,16 @@ def beacon_data(record: BeaconRecord) -> dict[str, Any]:
     }
 
 
-def outcome_of(record: BeaconRecord) -> Outcome:
+def outcome_of(record: BeaconRecord) -> PointOutcome:
     """How it ended, and why."""
     if record.summary is not None:
         outcome = str(record.summary.get("outcome") or "")
         cause = str(record.summary.get("cause") or "")
-        return Outcome(outcome or "ended before its goal", cause, outcome == COMPLETE)
+        return PointOutcome(outcome or "ended before its goal", cause, outcome == COMPLETE)
     last = record.statuses[-1] if record.statuses else None
     if last is None:
-        return Outcome("not known", "", False)
-    return Outcome(last.outcome or f"goes on, or was killed: {last.state}", last.cause, last.outcome == COMPLETE)
+        return PointOutcome("not known", "", False)
+    return PointOutcome(last.outcome or f"goes on, or was killed: {last.state}", last.cause, last.outcome == COMPLETE)
 
 
 def _head(record: BeaconRecord) -> str:
@@ -284,10 +284,10 @@ SECTIONS: tuple[Callable[[BeaconRecord], Section | None], ...] = (
 """In the order of the page. A section that a run has nothing for is left out."""
 
 
-def _certain(draw: Callable[[BeaconRecord, float], Picture | None], record: BeaconRecord, width: float) -> Picture:
+def _certain(draw: Callable[[BeaconRecord, float], Drawing | None], record: BeaconRecord, width: float) -> Drawing:
     """A figure that is known to be there."""
     picture = draw(record, width)
-    return Picture(width, 0.0, (), "") if picture is None else picture
+    return Drawing(width, 0.0, (), "") if picture is None else picture
 
 
 def _settled(record: BeaconRecord, values: FloatArray | None) -> FloatArray | None:

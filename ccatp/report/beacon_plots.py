@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from ccatp.beacons.slam.evaluation import Judgement, aligned_beacons, truth_at
+from ccatp.beacons.slam.evaluation import TrackEvaluation, aligned_beacons, truth_at
 from ccatp.beacons.slam.path_loss import LevelFix, LevelPair, PathLossFit
-from ccatp.beacons.slam.recording import BeaconFix, RecordedRun, Track, dead_reckoned
+from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun, dead_reckoned
 from ccatp.beacons.steering import Sugeno
 from ccatp.config.beacon_models import FuzzyConfig
 from ccatp.core import FloatArray
@@ -286,7 +286,7 @@ POSE_ELLIPSES = 24  # along the path
 _TRUTH, _PATH, _MAP, _RECKONED = "#8fa3b8", "#1d6fa5", "#d5703f", "#d9c9a8"
 
 
-def draw_slam(run: RecordedRun, track: Track, judged: Judgement, out: Path, title: str) -> None:
+def draw_slam(run: RecordedRun, track: EstimatedPath, judged: TrackEvaluation, out: Path, title: str) -> None:
     """Draw a track, laid on the truth if there is one, into an image file.
 
     Args:
@@ -349,7 +349,9 @@ def _frame(run: RecordedRun, path: FloatArray, beacons: dict[str, BeaconFix]) ->
     return 0.5 * (low + high), half
 
 
-def _draw_paths(axes: "Axes", run: RecordedRun, track: Track, judged: Judgement, path: FloatArray) -> None:
+def _draw_paths(
+    axes: "Axes", run: RecordedRun, track: EstimatedPath, judged: TrackEvaluation, path: FloatArray
+) -> None:
     reckoned = judged.alignment.moved(dead_reckoned(run.steps, run.first_pose)[:, :2])
     axes.plot(*reckoned.T, color=_RECKONED, linewidth=0.8, zorder=1, label="odometry alone")
     if run.truth is not None:
@@ -386,7 +388,7 @@ def _draw_beacons(axes: "Axes", run: RecordedRun, beacons: dict[str, BeaconFix])
         )
 
 
-def _draw_error(axes: "Axes", track: Track, judged: Judgement) -> None:
+def _draw_error(axes: "Axes", track: EstimatedPath, judged: TrackEvaluation) -> None:
     sigma = np.sqrt(np.trace(track.covariances[:, :2, :2], axis1=1, axis2=2))
     t = track.times_s - track.times_s[0]
     axes.fill_between(t, 0.0, SIGMAS * sigma, color=GRID, linewidth=0.0, label="3 sigma")
@@ -396,7 +398,7 @@ def _draw_error(axes: "Axes", track: Track, judged: Judgement) -> None:
     dress(axes)
 
 
-def _figures(judged: Judgement) -> str:
+def _figures(judged: TrackEvaluation) -> str:
     parts = []
     if judged.trajectory_rmse_m is not None:
         parts.append(f"path {judged.trajectory_rmse_m:.3f} m rms after one rigid alignment")

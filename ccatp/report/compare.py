@@ -15,7 +15,7 @@ from ccatp.core import FloatArray, PanelId
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, mirror_wavefront, on_grid_m
 from ccatp.report.analysis import KINDS, ErrorSeries
-from ccatp.report.drawing import INK, SERIES, Axis, Dots, Line, Picture, Plot, Shape, envelope, legend, thinned
+from ccatp.report.drawing import INK, SERIES, Dots, Drawing, Plot, PlotAxis, PolyLine, Shape, envelope, legend, thinned
 from ccatp.report.findings import Findings
 from ccatp.report.record import RunRecord
 from ccatp.report.run_figures import MapFrame, PanelCells, cells_figure, driven_path_m
@@ -91,7 +91,7 @@ _WAVEFRONT = "half_wavefront_um"
 _PERCENT = 100.0
 
 
-class Pair(NamedTuple):
+class RunPair(NamedTuple):
     """Two runs, called A and B as on the page, and what changed between them on one mirror."""
 
     a: Findings
@@ -129,9 +129,9 @@ class Pair(NamedTuple):
         return _over(self.a, common), _over(self.b, common)
 
 
-def pair_of(a: Findings, b: Findings) -> Pair:
+def pair_of(a: Findings, b: Findings) -> RunPair:
     """Put two runs beside each other."""
-    found = Pair(a, b, None)
+    found = RunPair(a, b, None)
     if not found.is_one_mirror or a.alignment is None or b.alignment is None:
         return found
     return found._replace(changes=panel_changes(a.alignment.panels, b.alignment.panels))
@@ -205,7 +205,7 @@ _WAVEFRONT_ROWS = (
 )
 
 
-def compared_figures(pair: Pair) -> list[Figure]:
+def compared_figures(pair: RunPair) -> list[Figure]:
     """The figures of both runs; those that neither knows are left out.
 
     Half-wavefront errors are of the panels that both have, and their names say so where these are not all.
@@ -238,11 +238,11 @@ _LEAST_MM = 1e-3
 _DASH = (4.0, 3.0)
 _TOLERANCE_PX = 0.6
 _KEY_LINE = np.array([(-9.0, 0.0), (9.0, 0.0)])
-Draw = Callable[[float], Picture]
+Draw = Callable[[float], Drawing]
 _CELLS = 8
 
 
-def distribution_figure(values: Mapping[str, FloatArray], label: str, width: float) -> Picture:
+def distribution_figure(values: Mapping[str, FloatArray], label: str, width: float) -> Drawing:
     """Share of the values below each number, for each run, on a logarithmic axis.
 
     Args:
@@ -254,8 +254,8 @@ def distribution_figure(values: Mapping[str, FloatArray], label: str, width: flo
     left, top, right, bottom = 62.0, 12.0, width - 12.0, 240.0
     everything = np.maximum(np.concatenate(list(values.values())), _LEAST_MM)
     low, high = 10.0 ** np.floor(np.log10(everything.min())), 10.0 ** np.ceil(np.log10(everything.max() * 1.001))
-    x = Axis(float(low), float(high), left, right, is_logarithmic=True)
-    plot = Plot(left, top, right, bottom, x, Axis(0.0, 100.0, bottom, top), 11.5 if is_wide else 10.5)
+    x = PlotAxis(float(low), float(high), left, right, is_logarithmic=True)
+    plot = Plot(left, top, right, bottom, x, PlotAxis(0.0, 100.0, bottom, top), 11.5 if is_wide else 10.5)
     plot.frame(label, "% of them below")
     for (_, some), colour in zip(values.items(), _COLOURS, strict=False):
         ordered = np.sort(np.maximum(some, _LEAST_MM))
@@ -265,7 +265,7 @@ def distribution_figure(values: Mapping[str, FloatArray], label: str, width: flo
     return _with_legend(plot, list(values), width, f"distribution of {label}")
 
 
-def errors_figure(series: Mapping[str, ErrorSeries], width: float) -> Picture:
+def errors_figure(series: Mapping[str, ErrorSeries], width: float) -> Drawing:
     """The largest localization error of each time, for each run, and three sigma of the estimate, dashed."""
     is_wide = width > 500.0
     left, top, right, bottom = 62.0, 10.0, width - 12.0, 280.0
@@ -273,14 +273,14 @@ def errors_figure(series: Mapping[str, ErrorSeries], width: float) -> Picture:
     everything = np.concatenate([*(values for _, values in shown.values()), *(f.sigma3_mm for f in series.values())])
     largest = max(float(everything.max()), 0.01)
     end = max(float(found.t_s[-1]) for found in series.values()) / 60.0
-    y = Axis(_LEAST_MM, 1.5 * largest, bottom, top, is_logarithmic=True)
-    plot = Plot(left, top, right, bottom, Axis(0.0, max(end, 0.1), left, right), y, 11.5 if is_wide else 10.5)
+    y = PlotAxis(_LEAST_MM, 1.5 * largest, bottom, top, is_logarithmic=True)
+    plot = Plot(left, top, right, bottom, PlotAxis(0.0, max(end, 0.1), left, right), y, 11.5 if is_wide else 10.5)
     plot.frame("robot time, min", "mm")
     intervals = max(1, int((right - left) / 2.0))
     for found, (t_s, values), colour in zip(series.values(), shown.values(), _COLOURS, strict=False):
         sigma, errors = envelope(found.t_s, found.sigma3_mm, intervals), envelope(t_s, values, intervals)
         places = np.column_stack([plot.x.pixels(sigma.x / 60.0), plot.y.pixels(sigma.high)])
-        plot.shapes.append(Line(places, colour, 0.9, _DASH, 0.7))
+        plot.shapes.append(PolyLine(places, colour, 0.9, _DASH, 0.7))
         plot.line(errors.x / 60.0, errors.high, colour, 1.4)
     names = [name if np.isfinite(found.error_mm).any() else f"{name} (3 \u03c3)" for name, found in series.items()]
     return _with_legend(plot, names, width, "largest localization error over time")
@@ -293,13 +293,13 @@ def _known(series: ErrorSeries) -> tuple[FloatArray, FloatArray]:
     return series.t_s, series.sigma3_mm
 
 
-def _with_legend(plot: Plot, names: Sequence[str], width: float, title: str) -> Picture:
+def _with_legend(plot: Plot, names: Sequence[str], width: float, title: str) -> Drawing:
     entries = list(zip(names, _COLOURS, strict=False))
     shapes, height = legend(12.0, plot.bottom + 56.0, entries, plot.size, width - 24.0)
-    return Picture(width, plot.bottom + 48.0 + height, (*plot.shapes, *shapes), title)
+    return Drawing(width, plot.bottom + 48.0 + height, (*plot.shapes, *shapes), title)
 
 
-def paths_figure(mirror: Mirror, records: Mapping[str, RunRecord], width: float) -> Picture:
+def paths_figure(mirror: Mirror, records: Mapping[str, RunRecord], width: float) -> Drawing:
     """The mirror with the paths of both runs, the later one above the earlier one."""
     frame = MapFrame(mirror, width)
     frame.draw_panels()
@@ -308,14 +308,14 @@ def paths_figure(mirror: Mirror, records: Mapping[str, RunRecord], width: float)
     for (name, record), colour, thick in zip(records.items(), _COLOURS, (2.6, 0.9), strict=False):
         path = driven_path_m(record)
         if len(path):
-            frame.shapes.append(Line(thinned(frame.pixels(path), _TOLERANCE_PX), colour, thick))
-            keys.append((name, Line(_KEY_LINE, colour, thick)))
+            frame.shapes.append(PolyLine(thinned(frame.pixels(path), _TOLERANCE_PX), colour, thick))
+            keys.append((name, PolyLine(_KEY_LINE, colour, thick)))
     frame.draw_base()
     keys.append(("base", Dots(np.zeros((1, 2)), 4.0, INK)))
     return frame.finish(None, "", keys, f"{mirror.name}: both paths")
 
 
-def change_figure(mirror: Mirror, before: Sequence[PanelResult], after: Sequence[PanelResult], width: float) -> Picture:
+def change_figure(mirror: Mirror, before: Sequence[PanelResult], after: Sequence[PanelResult], width: float) -> Drawing:
     """The mirror with what the later survey shows less the earlier one."""
     earlier = {panel.panel: panel for panel in before}
     cells = []

@@ -15,15 +15,15 @@ from ccatp.core import PanelId
 from ccatp.mirror.panel_alignment import PanelResult
 from ccatp.report.compare import (
     Draw,
-    Pair,
     PanelChange,
+    RunPair,
     change_figure,
     compared_figures,
     distribution_figure,
     errors_figure,
     paths_figure,
 )
-from ccatp.report.drawing import Picture
+from ccatp.report.drawing import Drawing
 from ccatp.report.findings import Findings
 from ccatp.report.html import NARROW, WIDE, Section, beside, figure, folded, gaps, page, shown, table, text
 from ccatp.report.record import changed_keys
@@ -35,19 +35,19 @@ _MICRO = 1e6
 _FEW = 12
 
 
-def paths_section(pair: Pair) -> Section | None:
+def paths_section(pair: RunPair) -> Section | None:
     """The mirror with both paths."""
     draw = paths_drawing(pair)
     return None if draw is None else Section("map", "Paths", figure(draw, "True paths where they are known."))
 
 
-def paths_drawing(pair: Pair) -> Draw | None:
+def paths_drawing(pair: RunPair) -> Draw | None:
     """What draws both paths; None where there are none, or of different mirrors."""
     records = {letter: found.record for letter, found in pair.named if found.record.sessions}
     return partial(paths_figure, pair.b.record.mirror, records) if pair.is_one_mirror and records else None
 
 
-def points_section(pair: Pair) -> Section | None:
+def points_section(pair: RunPair) -> Section | None:
     """Points that ended otherwise."""
     if not pair.is_one_mirror or not (pair.a.points and pair.b.points):
         return None
@@ -63,7 +63,7 @@ def points_section(pair: Pair) -> Section | None:
     return Section("points", "Points", only + (table(head, rows) if rows else "<p>All ended the same way.</p>"))
 
 
-def surfaces_section(pair: Pair) -> Section | None:
+def surfaces_section(pair: RunPair) -> Section | None:
     """Both surfaces in the same colours."""
     drawn = _surfaces(pair) if pair.is_one_mirror else []
     if not drawn:
@@ -71,7 +71,7 @@ def surfaces_section(pair: Pair) -> Section | None:
     return Section("surface", "Surfaces", beside(drawn) + "<p>Both in the same colours.</p>")
 
 
-def _surfaces(pair: Pair) -> list[tuple[str, Picture]]:
+def _surfaces(pair: RunPair) -> list[tuple[str, Drawing]]:
     mirror, known = pair.b.record.mirror, [(n, f.alignment.panels) for n, f in pair.named if f.alignment is not None]
     everything = [panel for _, panels in known for panel in panels]
     return [
@@ -81,7 +81,7 @@ def _surfaces(pair: Pair) -> list[tuple[str, Picture]]:
     ]
 
 
-def panels_section(pair: Pair) -> Section | None:
+def panels_section(pair: RunPair) -> Section | None:
     """Which panels have moved."""
     changes, draw = pair.changes, change_drawing(pair)
     if changes is None or draw is None:
@@ -103,14 +103,14 @@ def _change(panel: PanelChange) -> list[str]:
     return [f"{panel.panel.row}/{panel.panel.col}", *cells, shown(panel.chi2, 1), "moved" if panel.has_moved else ""]
 
 
-def change_drawing(pair: Pair) -> Draw | None:
+def change_drawing(pair: RunPair) -> Draw | None:
     """What draws the change of the surface."""
     if pair.changes is None or pair.a.alignment is None or pair.b.alignment is None:
         return None
     return partial(change_figure, pair.b.record.mirror, pair.a.alignment.panels, pair.b.alignment.panels)
 
 
-def adjusters_section(pair: Pair) -> Section | None:
+def adjusters_section(pair: RunPair) -> Section | None:
     """The moves that each survey asks for; those of B are still to be made."""
     if not pair.is_one_mirror:
         return None
@@ -154,7 +154,7 @@ def _few(head: list[str], rows: list[list[str]], kind: str = "") -> str:
 _MANY = 24
 
 
-def compare_page(pair: Pair) -> str:
+def compare_page(pair: RunPair) -> str:
     """The comparison as one HTML file."""
     names = f"{pair.a.record.name} and {pair.b.record.name}"
     head = f"<h1>{text(names)}</h1>{''.join(_introduced(*one) for one in pair.named)}"
@@ -173,7 +173,7 @@ def _introduced(letter: str, found: Findings) -> str:
     return f"<p>{survey_chips(found.record)} {name}, <span class='{kind}'>{text(outcome.text)}</span>{cause}</p>{boxes}"
 
 
-def _figures(pair: Pair) -> Section:
+def _figures(pair: RunPair) -> Section:
     rows = []
     for one in compared_figures(pair):
         values = (one.a, one.b, one.change)
@@ -181,7 +181,7 @@ def _figures(pair: Pair) -> Section:
     return Section("figures", "Figures", table(["", "A", "B", "B less A"], rows, "figures"))
 
 
-def _settings(pair: Pair) -> Section:
+def _settings(pair: RunPair) -> Section:
     a, b = (found.record.cfg.model_dump(mode="json") for found in (pair.a, pair.b))
     changes = changed_keys(a, b)
     rows = [[text(key), text(one), text(other)] for key, (one, other) in changes.items()]
@@ -190,31 +190,31 @@ def _settings(pair: Pair) -> Section:
     return Section("configuration", "Configuration", body)
 
 
-def _time(pair: Pair) -> Section | None:
+def _time(pair: RunPair) -> Section | None:
     draw = _time_figure(pair)
     return None if draw is None else Section("time", "Time budget", figure(draw, ""))
 
 
-def _time_figure(pair: Pair) -> Draw | None:
+def _time_figure(pair: RunPair) -> Draw | None:
     budgets = [(name, found.budget) for name, found in pair.named if found.budget is not None]
     if not budgets:
         return None
     return partial(time_figure, budgets, max(found.record.cfg.run.budget_s for found in (pair.a, pair.b)))
 
 
-def _errors(pair: Pair) -> Section | None:
+def _errors(pair: RunPair) -> Section | None:
     arrivals, series = _arrival_figure(pair), _error_figure(pair)
     body = "" if series is None else figure(series, "The largest error in each time; dashed 3 \u03c3.")
     body += "" if arrivals is None else figure(arrivals, "First arrivals, before any correction.")
     return Section("errors", "Errors", body) if body else None
 
 
-def _error_figure(pair: Pair) -> Draw | None:
+def _error_figure(pair: RunPair) -> Draw | None:
     series = {name: f.errors for name, f in pair.named if f.errors is not None}
     return partial(errors_figure, series) if series else None
 
 
-def _arrival_figure(pair: Pair) -> Draw | None:
+def _arrival_figure(pair: RunPair) -> Draw | None:
     values = {
         name: np.array([v.first_mm for v in found.points if v.first_mm is not None]) for name, found in pair.named
     }
@@ -222,7 +222,7 @@ def _arrival_figure(pair: Pair) -> Draw | None:
     return partial(distribution_figure, known, "distance at first arrival, mm") if known else None
 
 
-def _events(pair: Pair) -> Section | None:
+def _events(pair: RunPair) -> Section | None:
     told = [f"<h3>{letter}</h3>{events_body(found.record.log)}" for letter, found in pair.named if found.record.log]
     return Section("events", "Events", "".join(told)) if told else None
 
@@ -241,7 +241,7 @@ _SECTIONS = (
 )
 
 
-def compare_figures(pair: Pair) -> dict[str, Picture]:
+def compare_figures(pair: RunPair) -> dict[str, Drawing]:
     """The figures of the comparison, by the names of their files."""
     made = {
         "time": _time_figure(pair),
@@ -256,7 +256,7 @@ def compare_figures(pair: Pair) -> dict[str, Picture]:
 _WIDTH = 12
 
 
-def compare_lines(pair: Pair) -> Iterator[str]:
+def compare_lines(pair: RunPair) -> Iterator[str]:
     """A line for each figure that differs, then the panels that have moved."""
     if pair.warning:
         yield f"warning: {pair.warning}"
@@ -287,7 +287,7 @@ def _cell(value: float | None, decimals: int) -> str:
     return "-" if value is None else f"{value:.{decimals}f}"
 
 
-def compare_data(pair: Pair) -> dict[str, Any]:
+def compare_data(pair: RunPair) -> dict[str, Any]:
     """What ``ccatp compare --json`` tells."""
     changes, (a, b) = pair.changes, pair.wavefronts
     return {

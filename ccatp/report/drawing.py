@@ -24,7 +24,7 @@ Mark = Literal["disc", "ring", "cross"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Line:
+class PolyLine:
     """An open line.
 
     Attributes:
@@ -85,7 +85,7 @@ class Dots:
 
 
 @dataclass(frozen=True, slots=True)
-class Text:
+class TextShape:
     """One line of text, its baseline at (x, y); ``turn_deg`` counts anticlockwise."""
 
     x: float
@@ -98,11 +98,11 @@ class Text:
     turn_deg: float = 0.0
 
 
-Shape = Line | Area | Boxes | Dots | Text
+Shape = PolyLine | Area | Boxes | Dots | TextShape
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Picture:
+class Drawing:
     """Shapes, the later above the earlier.
 
     Attributes:
@@ -180,7 +180,7 @@ def ticks(low: float, high: float, most: int) -> list[float]:
 
 
 @dataclass(frozen=True, slots=True)
-class Axis:
+class PlotAxis:
     """One direction of a plot.
 
     Attributes:
@@ -234,8 +234,8 @@ class Plot:
     top: float
     right: float
     bottom: float
-    x: Axis
-    y: Axis
+    x: PlotAxis
+    y: PlotAxis
     size: float = 11.0
     shapes: list[Shape] = field(default_factory=list)
 
@@ -249,30 +249,30 @@ class Plot:
             y = self.y.pixel(value)
             text = number_text(value)
             widest = max(widest, len(text))
-            yield Line(np.array([[self.left, y], [self.right, y]]), FAINT, 0.8)
-            yield Text(self.left - 6.0, y + 0.35 * self.size, text, self.size, QUIET, "end")
+            yield PolyLine(np.array([[self.left, y], [self.right, y]]), FAINT, 0.8)
+            yield TextShape(self.left - 6.0, y + 0.35 * self.size, text, self.size, QUIET, "end")
         x = self.left - 12.0 - CHARACTER * self.size * widest
-        yield Text(x, (self.top + self.bottom) / 2.0, label, self.size, INK, "middle", turn_deg=90.0)
+        yield TextShape(x, (self.top + self.bottom) / 2.0, label, self.size, INK, "middle", turn_deg=90.0)
 
     def along(self, label: str) -> Iterator[Shape]:
         """The horizontal axis alone."""
-        yield Line(np.array([[self.left, self.bottom], [self.right, self.bottom]]), QUIET, 1.0)
+        yield PolyLine(np.array([[self.left, self.bottom], [self.right, self.bottom]]), QUIET, 1.0)
         for value in self.x.ticks():
             x = self.x.pixel(value)
-            yield Line(np.array([[x, self.bottom], [x, self.bottom + 4.0]]), QUIET, 1.0)
-            yield Text(x, self.bottom + 6.0 + self.size, number_text(value), self.size, QUIET, "middle")
+            yield PolyLine(np.array([[x, self.bottom], [x, self.bottom + 4.0]]), QUIET, 1.0)
+            yield TextShape(x, self.bottom + 6.0 + self.size, number_text(value), self.size, QUIET, "middle")
         place = (self.left + self.right) / 2.0
-        yield Text(place, self.bottom + 12.0 + 2.0 * self.size, label, self.size, INK, "middle")
+        yield TextShape(place, self.bottom + 12.0 + 2.0 * self.size, label, self.size, INK, "middle")
 
     def line(self, x: FloatArray, y: FloatArray, colour: str, width: float = 1.4, dash: tuple[float, ...] = ()) -> None:
         """A series as a line; NaN parts it."""
         points = np.column_stack([self.x.pixels(x), np.clip(self.y.pixels(y), self.top - 2.0, self.bottom + 2.0)])
-        self.shapes.append(Line(points, colour, width, dash))
+        self.shapes.append(PolyLine(points, colour, width, dash))
 
     def level(self, y: float, colour: str, dash: tuple[float, ...] = (6.0, 4.0)) -> None:
         """A number of the vertical axis, all the way across."""
         at = self.y.pixel(y)
-        self.shapes.append(Line(np.array([[self.left, at], [self.right, at]]), colour, 1.2, dash))
+        self.shapes.append(PolyLine(np.array([[self.left, at], [self.right, at]]), colour, 1.2, dash))
 
 
 def legend(
@@ -293,7 +293,7 @@ def legend(
         if at + width > x + most and at > x:
             at, line = x, line + 1.6 * size
         shapes.append(Boxes(np.array([[at, line - 0.8 * size, 0.9 * size, 0.9 * size]]), colour))
-        shapes.append(Text(at + 1.4 * size, line, name, size, INK))
+        shapes.append(TextShape(at + 1.4 * size, line, name, size, INK))
         at += width
     return shapes, line - y + 1.6 * size
 
@@ -309,27 +309,27 @@ def colour_bar(
         box = [left, top + length - end, thick, end - start] if is_upright else [left + start, top, end - start, thick]
         shapes.append(Boxes(np.array([box]), colour))
     start, end = (top + length, top) if is_upright else (left, left + length)
-    axis = Axis(scale.low, scale.high, start, end)
+    axis = PlotAxis(scale.low, scale.high, start, end)
     widest = 0
     for value in axis.ticks():
         at, text = axis.pixel(value), number_text(value)
         widest = max(widest, len(text))
         if is_upright:
-            shapes.append(Text(left + thick + 5.0, at + 0.35 * size, text, size, QUIET))
+            shapes.append(TextShape(left + thick + 5.0, at + 0.35 * size, text, size, QUIET))
         else:
-            shapes.append(Text(at, top + thick + 4.0 + size, text, size, QUIET, "middle"))
+            shapes.append(TextShape(at, top + thick + 4.0 + size, text, size, QUIET, "middle"))
     if is_upright:
         beside = left + thick + 16.0 + size + CHARACTER * size * widest
-        shapes.append(Text(beside, top + length / 2.0, label, size, INK, "middle", turn_deg=90.0))
+        shapes.append(TextShape(beside, top + length / 2.0, label, size, INK, "middle", turn_deg=90.0))
     else:
-        shapes.append(Text(left + length / 2.0, top + thick + 10.0 + 2.0 * size, label, size, INK, "middle"))
+        shapes.append(TextShape(left + length / 2.0, top + thick + 10.0 + 2.0 * size, label, size, INK, "middle"))
     return shapes
 
 
 FONT = "system-ui, 'Segoe UI', 'DejaVu Sans', Helvetica, Arial, sans-serif"
 
 
-def svg_of(picture: Picture, *, is_file: bool = False) -> str:
+def svg_of(picture: Drawing, *, is_file: bool = False) -> str:
     """The picture as an ``svg`` element that shrinks with its page; with ``is_file``, as a file of its own.
 
     Args:
@@ -348,7 +348,7 @@ def svg_of(picture: Picture, *, is_file: bool = False) -> str:
 
 
 def _shape(shape: Shape) -> str:
-    if isinstance(shape, Line):
+    if isinstance(shape, PolyLine):
         return _line(shape)
     if isinstance(shape, Area):
         inside, outline = shape.fill or "none", _stroke(shape.colour, shape.width)
@@ -361,7 +361,7 @@ def _shape(shape: Shape) -> str:
     return _text(shape)
 
 
-def _line(line: Line) -> str:
+def _line(line: PolyLine) -> str:
     pieces = "".join(f"M{_pairs(piece)}" for piece in _pieces(line.points))
     if not pieces:
         return ""
@@ -417,7 +417,7 @@ def _mark(dots: Dots, x: float, y: float, title: str) -> str:
     return f"<{element} {rest}>{title}</{element}>" if title else f"<{element} {rest}/>"
 
 
-def _text(text: Text) -> str:
+def _text(text: TextShape) -> str:
     x, y = _number(text.x), _number(text.y)
     turn = f' transform="rotate({_number(-text.turn_deg)} {x} {y})"' if text.turn_deg else ""
     anchor = f' text-anchor="{text.anchor}"' if text.anchor != "start" else ""

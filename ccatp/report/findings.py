@@ -16,8 +16,8 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult, compare, survey_result
 from ccatp.records.summary import arrival_error_m as true_arrival_error_m
 from ccatp.records.summary import puck_targets
-from ccatp.report.analysis import ErrorFigures, ErrorSeries, TimeBudget, error_figures, error_series, time_budget
-from ccatp.report.record import COMPLETE, WITHIN_MM, Outcome, RunRecord, Session
+from ccatp.report.analysis import ErrorFigures, ErrorSeries, TimeBreakdown, error_figures, error_series, time_budget
+from ccatp.report.record import COMPLETE, WITHIN_MM, PointOutcome, RecordedSession, RunRecord
 
 
 class Grade(StrEnum):
@@ -100,7 +100,7 @@ def first_arrivals_mm(record: RunRecord) -> dict[PointId, float]:
     return found
 
 
-def _from_truth(record: RunRecord, session: Session) -> dict[PointId, float]:
+def _from_truth(record: RunRecord, session: RecordedSession) -> dict[PointId, float]:
     truth, mirror, height_m = session.truth, record.mirror, record.cfg.robot.puck_height_m
     if truth is None or not len(truth.seq):
         return {}
@@ -116,7 +116,7 @@ def _from_truth(record: RunRecord, session: Session) -> dict[PointId, float]:
     return found
 
 
-def _from_fixes(record: RunRecord, session: Session) -> dict[PointId, float]:
+def _from_fixes(record: RunRecord, session: RecordedSession) -> dict[PointId, float]:
     """The first fix of a point belongs to its first arrival: corrections follow it."""
     found: dict[PointId, float] = {}
     for fix in session.fixes:
@@ -170,11 +170,11 @@ class Findings:
     """
 
     record: RunRecord
-    outcome: Outcome
+    outcome: PointOutcome
     points: list[PointVerdict]
     errors: ErrorSeries | None
     figures: ErrorFigures | None
-    budget: TimeBudget | None
+    budget: TimeBreakdown | None
     alignment: SurveyResult | None
     against: Comparison | None
 
@@ -213,15 +213,15 @@ def _alignment(record: RunRecord) -> SurveyResult | None:
     return survey_result(record.mirror, record.cfg.align, record.cfg.robot.puck_height_m, record.measured, planned)
 
 
-def outcome_of(record: RunRecord) -> Outcome:
+def outcome_of(record: RunRecord) -> PointOutcome:
     """How the run ended, from what main said last; a run without an end goes on or was killed."""
     status = record.last_status
     if status is None:
-        return Outcome("no mission", "main never said where the mission stood", is_good=False)
+        return PointOutcome("no mission", "main never said where the mission stood", is_good=False)
     if status.outcome:
-        return Outcome(status.outcome, status.cause, is_good=status.outcome == COMPLETE)
+        return PointOutcome(status.outcome, status.cause, is_good=status.outcome == COMPLETE)
     if status.exit_status >= 0:
-        return Outcome(f"ended with status {status.exit_status}, {status.state}", status.cause, is_good=False)
+        return PointOutcome(f"ended with status {status.exit_status}, {status.state}", status.cause, is_good=False)
     if record.summary is None:
-        return Outcome("no end is recorded", "the run goes on, or was killed", is_good=False)
-    return Outcome("interrupted", status.cause or f"while {status.state}", is_good=False)
+        return PointOutcome("no end is recorded", "the run goes on, or was killed", is_good=False)
+    return PointOutcome("interrupted", status.cause or f"while {status.state}", is_good=False)

@@ -49,7 +49,7 @@ class Quaternion(msgspec.Struct, frozen=True):
     w: float
 
 
-class Pose(msgspec.Struct, frozen=True):
+class FoxglovePose(msgspec.Struct, frozen=True):
     """Position and orientation."""
 
     position: Vector3
@@ -70,7 +70,7 @@ class PoseInFrame(msgspec.Struct, frozen=True):
 
     timestamp: Time
     frame_id: str
-    pose: Pose
+    pose: FoxglovePose
 
 
 class FrameTransform(msgspec.Struct, frozen=True):
@@ -83,11 +83,11 @@ class FrameTransform(msgspec.Struct, frozen=True):
     rotation: Quaternion
 
 
-class Line(msgspec.Struct, frozen=True):
+class LinePrimitive(msgspec.Struct, frozen=True):
     """``foxglove.LinePrimitive``; ``type`` is ``STRIP``, ``LOOP`` or ``LIST``."""
 
     type: int
-    pose: Pose
+    pose: FoxglovePose
     thickness: float
     scale_invariant: bool
     points: Sequence[Vector3]
@@ -97,15 +97,15 @@ class Line(msgspec.Struct, frozen=True):
 class Sphere(msgspec.Struct, frozen=True):
     """``foxglove.SpherePrimitive``; ``size`` holds diameters."""
 
-    pose: Pose
+    pose: FoxglovePose
     size: Vector3
     color: Color
 
 
-class Text(msgspec.Struct, frozen=True):
+class TextPrimitive(msgspec.Struct, frozen=True):
     """``foxglove.TextPrimitive``."""
 
-    pose: Pose
+    pose: FoxglovePose
     billboard: bool
     font_size: float
     scale_invariant: bool
@@ -130,8 +130,8 @@ class Entity(msgspec.Struct, frozen=True):
     lifetime: Time = Time(0, 0)
     metadata: Sequence[KeyValue] = ()
     spheres: Sequence[Sphere] = ()
-    lines: Sequence[Line] = ()
-    texts: Sequence[Text] = ()
+    lines: Sequence[LinePrimitive] = ()
+    texts: Sequence[TextPrimitive] = ()
 
 
 class Deletion(msgspec.Struct, frozen=True):
@@ -149,7 +149,7 @@ class SceneUpdate(msgspec.Struct, frozen=True):
     entities: Sequence[Entity]
 
 
-class Log(msgspec.Struct, frozen=True):
+class FoxgloveLog(msgspec.Struct, frozen=True):
     """``foxglove.Log``; ``level`` is one of ``LEVELS``."""
 
     timestamp: Time
@@ -167,7 +167,7 @@ def time_of(t_s: float) -> Time:
 
 DECK = "deck"
 NO_TURN = Quaternion(0.0, 0.0, 0.0, 1.0)
-NOWHERE = Pose(Vector3(0.0, 0.0, 0.0), NO_TURN)
+NOWHERE = FoxglovePose(Vector3(0.0, 0.0, 0.0), NO_TURN)
 GREY, DARK, RED = Color(0.62, 0.68, 0.74, 1.0), Color(0.25, 0.3, 0.36, 1.0), Color(0.84, 0.27, 0.27, 1.0)
 LOW, EVEN, HIGH = (0.07, 0.25, 0.65), (0.95, 0.95, 0.9), (0.75, 0.1, 0.1)
 FULL_SCALE_M = 2e-4  # deviations beyond it have the colour of the scale's end
@@ -181,7 +181,7 @@ def panel_scene(mirror: Mirror, timestamp: Time) -> SceneUpdate:
     """Every panel's outline and label, and the rim, deck frame."""
     panels = [_panel_entity(mirror, panel, timestamp) for panel in mirror.panels]
     rim = [_on_surface(mirror, float(x), float(y)) for x, y in mirror.rim.vertices]
-    outline = Entity(timestamp, DECK, "rim", False, lines=(Line(LOOP, NOWHERE, RIM_PIXELS, True, rim, RED),))
+    outline = Entity(timestamp, DECK, "rim", False, lines=(LinePrimitive(LOOP, NOWHERE, RIM_PIXELS, True, rim, RED),))
     return SceneUpdate((), (*panels, outline))
 
 
@@ -220,9 +220,11 @@ def _panel_entity(mirror: Mirror, panel: PanelId, timestamp: Time) -> Entity:
     corners = [
         (own.x_m + sx * own.half_x_m, own.y_m + sy * own.half_y_m) for sx, sy in ((-1, -1), (1, -1), (1, 1), (-1, 1))
     ]
-    outline = Line(LOOP, NOWHERE, EDGE_PIXELS, True, _edge(mirror, corners), GREY)
+    outline = LinePrimitive(LOOP, NOWHERE, EDGE_PIXELS, True, _edge(mirror, corners), GREY)
     x, y, z = own.origin
-    label = Text(Pose(Vector3(x, y, z), NO_TURN), True, LABEL_M, False, DARK, f"{panel.row}-{panel.col}")
+    label = TextPrimitive(
+        FoxglovePose(Vector3(x, y, z), NO_TURN), True, LABEL_M, False, DARK, f"{panel.row}-{panel.col}"
+    )
     return Entity(timestamp, DECK, f"panel {panel.row}-{panel.col}", False, lines=(outline,), texts=(label,))
 
 
@@ -241,7 +243,9 @@ def _on_surface(mirror: Mirror, x_m: float, y_m: float) -> Vector3:
 
 def _sphere(mirror: Mirror, point: PointId, deviation_m: float) -> Sphere:
     x, y = mirror.point_on_deck(point)
-    return Sphere(Pose(_on_surface(mirror, x, y), NO_TURN), Vector3(POINT_M, POINT_M, POINT_M), colour_of(deviation_m))
+    return Sphere(
+        FoxglovePose(_on_surface(mirror, x, y), NO_TURN), Vector3(POINT_M, POINT_M, POINT_M), colour_of(deviation_m)
+    )
 
 
 def robot_rotation(mirror: Mirror, pose: DeckPose) -> Quaternion:

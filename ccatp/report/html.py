@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from typing import NamedTuple
 
-from ccatp.report.drawing import Picture, svg_of
-from ccatp.report.record import Outcome, RunFiles
+from ccatp.report.drawing import Drawing, svg_of
+from ccatp.report.record import PointOutcome, RunFiles
 
 Cell = str | float | int | None
 DASH = "\u2013"
@@ -53,7 +53,7 @@ def facts(pairs: Mapping[str, str]) -> str:
     return "<dl>" + "".join(f"<div><dt>{text(k)}</dt><dd>{v}</dd></div>" for k, v in pairs.items()) + "</dl>"
 
 
-def figure(draw: Callable[[float], Picture], caption: str) -> str:
+def figure(draw: Callable[[float], Drawing], caption: str) -> str:
     """A picture in two layouts, of which the page shows one.
 
     Args:
@@ -67,7 +67,7 @@ def figure(draw: Callable[[float], Picture], caption: str) -> str:
     )
 
 
-def beside(pictures: Iterable[tuple[str, Picture]]) -> str:
+def beside(pictures: Iterable[tuple[str, Drawing]]) -> str:
     """Pictures beside each other, below each other where the page is too narrow, each with its name."""
     figures = (f"<figure>{svg_of(picture)}<figcaption>{text(name)}</figcaption></figure>" for name, picture in pictures)
     return f'<div class="beside">{"".join(figures)}</div>'
@@ -90,7 +90,7 @@ def clock(time_s: float) -> str:
 
 
 def head(
-    record: RunFiles, chip: str, title: str, outcome: Outcome, warnings: Sequence[str], headline: Mapping[str, str]
+    record: RunFiles, chip: str, title: str, outcome: PointOutcome, warnings: Sequence[str], headline: Mapping[str, str]
 ) -> str:
     """The head as markup.
 

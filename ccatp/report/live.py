@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import zmq
 
 from ccatp.errors import CcatpError, ExitStatus
-from ccatp.report.views import Shown
+from ccatp.report.views import ViewMessage
 
 _NS = 1e9
 # Some seconds of a run at its quickest; a viewer that is slower loses the newest.
@@ -26,12 +26,12 @@ class StreamError(CcatpError):
     exit_status = ExitStatus.USAGE
 
 
-class Stream(Protocol):
+class LiveStream(Protocol):
     """Where a run is streamed to."""
 
     where: str
 
-    def send(self, shown: Shown, *, is_latched: bool = False) -> None:
+    def send(self, shown: ViewMessage, *, is_latched: bool = False) -> None:
         """Pass on one message; never blocks."""
 
     def tend(self) -> None:
@@ -71,7 +71,7 @@ class PlotJugglerStream:
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], host: str, port: int) -> None:
         """Bind."""
-        self._latched: dict[str, Shown] = {}
+        self._latched: dict[str, ViewMessage] = {}
         self._socket = context.socket(zmq.XPUB)
         self._socket.setsockopt(zmq.SNDHWM, HIGH_WATER_MARK)
         self._socket.setsockopt(zmq.LINGER, LINGER_MS)
@@ -87,14 +87,14 @@ class PlotJugglerStream:
             ) from error
         self.where = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
-    def send(self, shown: Shown, *, is_latched: bool = False) -> None:
-        """As ``Stream.send``."""
+    def send(self, shown: ViewMessage, *, is_latched: bool = False) -> None:
+        """As ``LiveStream.send``."""
         if is_latched:
             self._latched[shown.topic] = shown
         self._socket.send_multipart((shown.topic.encode(), shown.payload, f"{shown.t_s:.6f}".encode()))
 
     def tend(self) -> None:
-        """As ``Stream.tend``; all subscribers get it again, which does no harm."""
+        """As ``LiveStream.tend``; all subscribers get it again, which does no harm."""
         wanted: set[str] = set()
         while self._socket.poll(0, zmq.POLLIN):
             change = self._socket.recv()
@@ -105,7 +105,7 @@ class PlotJugglerStream:
             self.send(self._latched[topic])
 
     def close(self) -> None:
-        """As ``Stream.close``."""
+        """As ``LiveStream.close``."""
         self._socket.close()
 
 
@@ -129,7 +129,7 @@ class FoxgloveStream:
             from foxglove.websocket import ServerListener  # noqa: PLC0415
         except ImportError as error:
             raise StreamError("Foxglove needs its SDK: install ccatp with its extra, ccatp[foxglove]") from error
-        self._latched: dict[str, Shown] = {}
+        self._latched: dict[str, ViewMessage] = {}
         # The server calls from a thread of its own.
         newcomers: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._newcomers = newcomers
@@ -152,8 +152,8 @@ class FoxgloveStream:
         }
         self.where = f"ws://{host}:{self._server.port}"
 
-    def send(self, shown: Shown, *, is_latched: bool = False) -> None:
-        """As ``Stream.send``."""
+    def send(self, shown: ViewMessage, *, is_latched: bool = False) -> None:
+        """As ``LiveStream.send``."""
         if is_latched:
             self._latched[shown.topic] = shown
         channel = self._channels.get(shown.topic)
@@ -161,7 +161,7 @@ class FoxgloveStream:
             channel.log(shown.payload, log_time=round(shown.t_s * _NS))
 
     def tend(self) -> None:
-        """As ``Stream.tend``."""
+        """As ``LiveStream.tend``."""
         wanted: set[str] = set()
         while not self._newcomers.empty():
             wanted.add(self._newcomers.get())
@@ -169,7 +169,7 @@ class FoxgloveStream:
             self.send(self._latched[topic])
 
     def close(self) -> None:
-        """As ``Stream.close``."""
+        """As ``LiveStream.close``."""
         self._server.stop()
         for channel in self._channels.values():
             channel.close()

@@ -51,10 +51,10 @@ from ccatp.report.drawing import (
     Area,
     Boxes,
     Dots,
-    Line,
-    Picture,
+    Drawing,
+    PolyLine,
     Shape,
-    Text,
+    TextShape,
     svg_of,
 )
 from ccatp.report.findings import arrival_error_m
@@ -135,7 +135,7 @@ _POINTS = 72.0 / PICTURE_DPI
 _ANCHORS = {"start": "left", "middle": "center", "end": "right"}
 
 
-def write_svg(picture: Picture, path: Path) -> None:
+def write_svg(picture: Drawing, path: Path) -> None:
     """Write a picture as SVG.
 
     Raises:
@@ -147,7 +147,7 @@ def write_svg(picture: Picture, path: Path) -> None:
         raise PictureError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def write_figures(picture: Picture, stem: Path) -> list[Path]:
+def write_figures(picture: Drawing, stem: Path) -> list[Path]:
     """Write a picture as ``stem.png``, at twice its size, and as ``stem.pdf``; returns the files.
 
     Raises:
@@ -160,15 +160,15 @@ def write_figures(picture: Picture, stem: Path) -> list[Path]:
     return paths
 
 
-def _figure(picture: Picture) -> "Figure":
+def _figure(picture: Drawing) -> "Figure":
     figure = new_figure(picture.width / PICTURE_DPI, picture.height / PICTURE_DPI, PICTURE_DPI, layout=None)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0.0, picture.width), ylim=(picture.height, 0.0))
     axes.axis("off")
     for order, shape in enumerate(picture.shapes):
-        if isinstance(shape, Text):
+        if isinstance(shape, TextShape):
             _add_text(axes, shape, order)
-        elif isinstance(shape, Line):
+        elif isinstance(shape, PolyLine):
             _add_line(axes, shape, order)
         else:
             for collection in _collections(axes, shape):
@@ -177,7 +177,7 @@ def _figure(picture: Picture) -> "Figure":
     return figure
 
 
-def _add_text(axes: "Axes", text: Text, order: int) -> None:
+def _add_text(axes: "Axes", text: TextShape, order: int) -> None:
     axes.text(
         text.x,
         text.y,
@@ -193,7 +193,7 @@ def _add_text(axes: "Axes", text: Text, order: int) -> None:
     )
 
 
-def _add_line(axes: "Axes", line: Line, order: int) -> None:
+def _add_line(axes: "Axes", line: PolyLine, order: int) -> None:
     width = line.width * _POINTS
     # Matplotlib counts dashes in line widths.
     dash: Any = (0.0, [length / line.width for length in line.dash]) if line.dash else "solid"

@@ -14,7 +14,7 @@ from ccatp.config.models import Config
 from ccatp.core import FloatArray, IntArray, PanelId, PointId, Vector3
 from ccatp.filters.metrics import nees
 from ccatp.links.beacon_messages import PoseTrack, PoseTruth, pose_errors
-from ccatp.links.topics import BeaconArrival, BeaconEllipse, BeaconMap, DangerEvent, FixMessage, MissionStatus
+from ccatp.links.topics import BeaconArrival, BeaconEllipse, BeaconMapMessage, DangerEvent, FixMessage, MissionStatus
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.records.state_log import LogLine, StateChange
@@ -23,7 +23,7 @@ COMPLETE = "complete"
 WITHIN_MM = 10.0  # the thesis's requirement on arrivals
 
 
-class Track(NamedTuple):
+class EstimatedTrack(NamedTuple):
     """Estimated poses after k frames, deck frame.
 
     Attributes:
@@ -41,8 +41,8 @@ class Track(NamedTuple):
     sigma_m: FloatArray
 
 
-class Truth(NamedTuple):
-    """True poses after k frames, deck frame: as in ``Track``; ``clearance_m`` of the worst edge sensor to the rim."""
+class TrueTrack(NamedTuple):
+    """True poses after k frames, as in ``EstimatedTrack``; ``clearance_m`` of the worst edge sensor to the rim."""
 
     seq: IntArray
     t_s: FloatArray
@@ -61,7 +61,7 @@ class Arrived(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Session:
+class RecordedSession:
     """One recording; a run that was resumed has several.
 
     Attributes:
@@ -74,8 +74,8 @@ class Session:
 
     name: str
     version: str
-    track: Track
-    truth: Truth | None
+    track: EstimatedTrack
+    truth: TrueTrack | None
     arrivals: tuple[Arrived, ...]
     fixes: tuple[FixMessage, ...]
     statuses: tuple[MissionStatus, ...]
@@ -96,7 +96,7 @@ class PlannedRow(NamedTuple):
     t_s: float | None
 
 
-class Outcome(NamedTuple):
+class PointOutcome(NamedTuple):
     """How a run ended, in a few words; why, where somebody said so; and whether that is as it should be."""
 
     text: str
@@ -146,7 +146,7 @@ class RunRecord(RunFiles):
 
     cfg: Config
     mirror: Mirror
-    sessions: tuple[Session, ...]
+    sessions: tuple[RecordedSession, ...]
     points: tuple[PlannedRow, ...] | None
     measured: tuple[Measured, ...]
     injected: Mapping[PanelId, Vector3] | None
@@ -195,7 +195,7 @@ class BeaconRecord(RunFiles):
     cfg: RadioConfig
     track: PoseTrack
     truth: PoseTruth | None
-    maps: tuple[BeaconMap, ...]
+    maps: tuple[BeaconMapMessage, ...]
     arrivals: tuple[BeaconArrival, ...]
     statuses: tuple[MissionStatus, ...]
     verdicts: tuple[DangerEvent, ...]
@@ -206,7 +206,7 @@ class BeaconRecord(RunFiles):
         """Those that stand, as the newest map has them."""
         return self.standing(self.maps[-1]) if self.maps else {}
 
-    def standing(self, told: BeaconMap) -> dict[str, BeaconEllipse]:
+    def standing(self, told: BeaconMapMessage) -> dict[str, BeaconEllipse]:
         """The beacons of a map without the radio that is followed."""
         moving = self.cfg.follow.target if self.cfg.follow.is_active else ""
         return {name: ellipse for name, ellipse in told.beacons.items() if name != moving}

@@ -23,10 +23,10 @@ from ccatp.config.models import Config
 from ccatp.core import FloatArray, PointId
 from ccatp.links.beacon_messages import TRACK_COLUMNS, TRUTH_COLUMNS, pose_track, pose_truth, table, truth_in
 from ccatp.links.topics import (
-    Arrival,
+    ArrivalMessage,
     BadMessage,
     BeaconArrival,
-    BeaconMap,
+    BeaconMapMessage,
     BeaconPlaces,
     BeaconTrack,
     BeaconTruth,
@@ -34,10 +34,10 @@ from ccatp.links.topics import (
     FixMessage,
     Message,
     MissionStatus,
+    TrackMessage,
+    TruthMessage,
     unpack,
 )
-from ccatp.links.topics import Track as TrackMessage
-from ccatp.links.topics import Truth as TruthMessage
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
 from ccatp.mirror.panel_alignment import Measured
 from ccatp.mirror.surface import MirrorError
@@ -47,7 +47,16 @@ from ccatp.records.state_log import ReadLine, StateChange, changes_of, read_log
 from ccatp.records.store import read_survey
 from ccatp.records.store_rows import StoreError, point_name
 from ccatp.records.survey_reader import STORE, read_truth
-from ccatp.report.record import Arrived, BeaconRecord, PlannedRow, RunRecord, Session, Track, Truth, changed_keys
+from ccatp.report.record import (
+    Arrived,
+    BeaconRecord,
+    EstimatedTrack,
+    PlannedRow,
+    RecordedSession,
+    RunRecord,
+    TrueTrack,
+    changed_keys,
+)
 
 TOPICS_READ = frozenset(("track", "truth", "arrival", "fix", "mission", "danger_event"))
 _TRACK_COLUMNS, _TRUTH_COLUMNS = 8, 11
@@ -70,7 +79,7 @@ class _Collected:
             self.track.append(np.array(message.rows, dtype=np.float64).reshape(-1, _TRACK_COLUMNS))
         elif isinstance(message, TruthMessage):
             self.truth.append(np.array(message.rows, dtype=np.float64).reshape(-1, _TRUTH_COLUMNS))
-        elif isinstance(message, Arrival):
+        elif isinstance(message, ArrivalMessage):
             self.arrivals.append(Arrived(PointId(*message.point), message.seq, message.t_s, message.error_mm))
         elif isinstance(message, FixMessage):
             self.fixes.append(message)
@@ -80,7 +89,7 @@ class _Collected:
             self.verdicts.append(message)
 
 
-def read_session(path: Path, mirror: Mirror, changes: Sequence[StateChange], warnings: list[str]) -> Session:
+def read_session(path: Path, mirror: Mirror, changes: Sequence[StateChange], warnings: list[str]) -> RecordedSession:
     """Read a recording up to its end or its first damage.
 
     Args:
@@ -105,7 +114,7 @@ def read_session(path: Path, mirror: Mirror, changes: Sequence[StateChange], war
     warnings += [damage_text(path, damage) for damage in damages]
     if lost:
         warnings.append(f"{path.name}: {len(lost)} messages cannot be read and are left out: {lost[0]}")
-    return Session(
+    return RecordedSession(
         name=path.name,
         version=metadata.get("ccatp", "unknown"),
         track=_track(found.track, mirror, path.name, warnings),
@@ -118,21 +127,21 @@ def read_session(path: Path, mirror: Mirror, changes: Sequence[StateChange], war
     )
 
 
-def _track(batches: Sequence[FloatArray], mirror: Mirror, name: str, warnings: list[str]) -> Track:
+def _track(batches: Sequence[FloatArray], mirror: Mirror, name: str, warnings: list[str]) -> EstimatedTrack:
     rows = _ordered(batches, _TRACK_COLUMNS)
     try:
         deck = deck_rows(mirror, rows[:, 2:4].astype(np.int64), rows[:, 4:7])
     except MirrorError as error:
         warnings.append(f"{name}: its estimates are not of this mirror and are left out: {error}")
         rows, deck = rows[:0], np.empty((0, 4))
-    return Track(rows[:, 0].astype(np.int64), rows[:, 1], deck[:, [0, 1, 3]], deck[:, 2], rows[:, 7])
+    return EstimatedTrack(rows[:, 0].astype(np.int64), rows[:, 1], deck[:, [0, 1, 3]], deck[:, 2], rows[:, 7])
 
 
-def _truth(batches: Sequence[FloatArray]) -> Truth | None:
+def _truth(batches: Sequence[FloatArray]) -> TrueTrack | None:
     if not batches:
         return None
     rows = _ordered(batches, _TRUTH_COLUMNS)
-    return Truth(rows[:, 0].astype(np.int64), rows[:, 1], rows[:, 5:8], rows[:, 4], rows[:, 8])
+    return TrueTrack(rows[:, 0].astype(np.int64), rows[:, 1], rows[:, 5:8], rows[:, 4], rows[:, 8])
 
 
 def _ordered(batches: Sequence[FloatArray], columns: int) -> FloatArray:
@@ -207,7 +216,7 @@ def _changed(cfg: Config) -> dict[str, tuple[object, object]]:
 
 def _sessions(
     run_dir: Path, mirror: Mirror, log: list[ReadLine], missing: list[str], warnings: list[str]
-) -> tuple[tuple[Session, ...], bool | None]:
+) -> tuple[tuple[RecordedSession, ...], bool | None]:
     paths = recordings(run_dir / TELEMETRY)
     if not paths:
         missing.append(f"{TELEMETRY}: path, estimates, arrivals and fixes over time")
@@ -332,7 +341,7 @@ class _BeaconReportReaderCollected:
         self.is_simulation: bool | None = None
         self.track: list[FloatArray] = []
         self.truth: list[FloatArray] = []
-        self.maps: list[BeaconMap] = []
+        self.maps: list[BeaconMapMessage] = []
         self.arrivals: list[BeaconArrival] = []
         self.statuses: list[MissionStatus] = []
         self.verdicts: list[DangerEvent] = []
@@ -366,7 +375,7 @@ class _BeaconReportReaderCollected:
             self.truth.append(table(message.rows, TRUTH_COLUMNS))
         elif isinstance(message, BeaconPlaces):
             self.places = message.places
-        elif isinstance(message, BeaconMap):
+        elif isinstance(message, BeaconMapMessage):
             self.maps.append(message)
         elif isinstance(message, BeaconArrival):
             self.arrivals.append(message)

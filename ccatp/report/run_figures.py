@@ -20,7 +20,7 @@ import numpy as np
 from ccatp.core import FloatArray, PointId
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.panel_alignment import PanelResult, on_grid_m
-from ccatp.report.analysis import KINDS, ErrorSeries, TimeBudget
+from ccatp.report.analysis import KINDS, ErrorSeries, TimeBreakdown
 from ccatp.report.drawing import (
     BAD,
     BELOW_TO_ABOVE,
@@ -35,16 +35,16 @@ from ccatp.report.drawing import (
     SERIES,
     SMALL_TO_LARGE,
     Area,
-    Axis,
     Boxes,
     ColourScale,
     Dots,
+    Drawing,
     Envelope,
-    Line,
-    Picture,
     Plot,
+    PlotAxis,
+    PolyLine,
     Shape,
-    Text,
+    TextShape,
     colour_bar,
     envelope,
     legend,
@@ -59,7 +59,7 @@ _HEIGHT_WIDE, _HEIGHT_NARROW = 300.0, 250.0
 _LEAST_MM = 1e-3  # a micrometre: less is of no interest, and of the noise of the laser
 
 
-def error_figure(series: ErrorSeries, width: float) -> Picture:
+def error_figure(series: ErrorSeries, width: float) -> Drawing:
     """Draw the series; where no truth is known, three sigma and the fixes alone.
 
     Args:
@@ -68,9 +68,9 @@ def error_figure(series: ErrorSeries, width: float) -> Picture:
     """
     is_wide = width > 500.0
     left, top, right, bottom = 62.0, 10.0, width - 12.0, _HEIGHT_WIDE if is_wide else _HEIGHT_NARROW
-    y = Axis(*_ends(series), bottom, top, is_logarithmic=True)
+    y = PlotAxis(*_ends(series), bottom, top, is_logarithmic=True)
     begin, end = float(series.t_s[0]), max(float(series.t_s[-1]), float(series.t_s[0]) + 1.0)
-    plot = Plot(left, top, right, bottom, Axis(begin / 60.0, end / 60.0, left, right), y, 11.5 if is_wide else 10.5)
+    plot = Plot(left, top, right, bottom, PlotAxis(begin / 60.0, end / 60.0, left, right), y, 11.5 if is_wide else 10.5)
     plot.frame("robot time, min", "mm")
     intervals = max(1, int((right - left) / 1.5))
     sigma = envelope(series.t_s, series.sigma3_mm, intervals)
@@ -83,12 +83,12 @@ def error_figure(series: ErrorSeries, width: float) -> Picture:
     entries += _draw_fixes(plot, series, is_wide)
     for at_s in series.breaks_s:
         x = plot.x.pixel(at_s / 60.0)
-        plot.shapes.append(Line(np.array([[x, top], [x, bottom]]), INK, 1.0, (2.0, 3.0)))
+        plot.shapes.append(PolyLine(np.array([[x, top], [x, bottom]]), INK, 1.0, (2.0, 3.0)))
     if y.high >= WITHIN_MM:
         plot.level(WITHIN_MM, BAD)
         entries.append(("10 mm", BAD))
     shapes, height = legend(12.0, bottom + 56.0, entries, plot.size, width - 24.0)
-    return Picture(width, bottom + 48.0 + height, (*plot.shapes, *shapes), "localization error over time")
+    return Drawing(width, bottom + 48.0 + height, (*plot.shapes, *shapes), "localization error over time")
 
 
 def _ends(series: ErrorSeries) -> tuple[float, float]:
@@ -110,7 +110,7 @@ def _band(plot: Plot, found: Envelope, colour: str) -> None:
             [np.column_stack([x[part], upper[part]]), np.column_stack([x[part], lower[part]])[::-1]]
         )
         plot.shapes.append(Area(outline, fill=colour, opacity=0.28))
-        plot.shapes.append(Line(np.column_stack([x[part], upper[part]]), colour, 1.2))
+        plot.shapes.append(PolyLine(np.column_stack([x[part], upper[part]]), colour, 1.2))
 
 
 def _runs(x: FloatArray) -> list[slice]:
@@ -143,7 +143,7 @@ _BAR = 26.0
 _OF_THE_BUDGET = 0.4  # a few panels are no matter of an hour
 
 
-def time_figure(budgets: Sequence[tuple[str, TimeBudget]], budget_s: float, width: float) -> Picture:
+def time_figure(budgets: Sequence[tuple[str, TimeBreakdown]], budget_s: float, width: float) -> Drawing:
     """Draw the bars.
 
     Args:
@@ -158,26 +158,26 @@ def time_figure(budgets: Sequence[tuple[str, TimeBudget]], budget_s: float, widt
     end = max(longest, budget_s) if longest > _OF_THE_BUDGET * budget_s else longest
     top, bottom = 10.0, 10.0 + (_BAR + 8.0) * len(bars)
     right = width - 16.0 - CHARACTER * size * 6
-    plot = Plot(left, top, right, bottom, Axis(0.0, end, left, right), Axis(0.0, 1.0, bottom, top), size)
+    plot = Plot(left, top, right, bottom, PlotAxis(0.0, end, left, right), PlotAxis(0.0, 1.0, bottom, top), size)
     if end >= budget_s:
         x = plot.x.pixel(budget_s)
         plot.shapes.append(Boxes(np.array([[x - 0.7, top, 1.4, bottom - top]]), BAD))
-        plot.shapes.append(Text(x - 4.0, bottom - 2.0, "budget", size, BAD, "end"))
+        plot.shapes.append(TextShape(x - 4.0, bottom - 2.0, "budget", size, BAD, "end"))
     for place, (name, parts) in enumerate(bars):
         _draw_bar(plot, name, parts, top + place * (_BAR + 8.0))
     plot.shapes += plot.along("time, s")
     used = [kind for kind in KINDS if any(kind in parts for _, parts in bars)]
     shapes, height = legend(12.0, bottom + 56.0, [(kind, _COLOURS[kind]) for kind in used], size, width - 24.0)
-    return Picture(width, bottom + 48.0 + height, (*plot.shapes, *shapes), "where the time went")
+    return Drawing(width, bottom + 48.0 + height, (*plot.shapes, *shapes), "where the time went")
 
 
-def _bars(name: str, found: TimeBudget) -> list[tuple[str, dict[str, float]]]:
+def _bars(name: str, found: TimeBreakdown) -> list[tuple[str, dict[str, float]]]:
     bars = [(name, found.spent_s)]
     return bars if found.least_s is None else [*bars, ("least", found.least_s)]
 
 
 def _draw_bar(plot: Plot, name: str, parts: dict[str, float], y: float) -> None:
-    plot.shapes.append(Text(plot.left - 6.0, y + _BAR / 2.0 + 4.0, name, plot.size, INK, "end"))
+    plot.shapes.append(TextShape(plot.left - 6.0, y + _BAR / 2.0 + 4.0, name, plot.size, INK, "end"))
     at_s = 0.0
     for kind in KINDS:
         if kind not in parts:
@@ -186,11 +186,11 @@ def _draw_bar(plot: Plot, name: str, parts: dict[str, float], y: float) -> None:
         plot.shapes.append(Boxes(np.array([[start, y, end - start, _BAR]]), _COLOURS[kind]))
         label = f"{parts[kind]:.0f}"
         if end - start > CHARACTER * plot.size * len(label) + 6.0:
-            plot.shapes.append(Text((start + end) / 2.0, y + _BAR / 2.0 + 4.0, label, plot.size, PAPER, "middle"))
+            plot.shapes.append(TextShape((start + end) / 2.0, y + _BAR / 2.0 + 4.0, label, plot.size, PAPER, "middle"))
         at_s += parts[kind]
     total, x = f"{at_s:.0f} s", plot.x.pixel(at_s) + 3.0
     plot.shapes.append(Boxes(np.array([[x, y + 4.0, CHARACTER * plot.size * (len(total) + 1), _BAR - 8.0]]), PAPER))
-    plot.shapes.append(Text(x + 3.0, y + _BAR / 2.0 + 4.0, total, plot.size, QUIET))
+    plot.shapes.append(TextShape(x + 3.0, y + _BAR / 2.0 + 4.0, total, plot.size, QUIET))
 
 
 _MARGIN_M = 0.04  # around the rim
@@ -278,20 +278,20 @@ class MapFrame:
         panels = self.mirror.panels.values()
         for col, x_m in {p.id.col: p.x_m for p in panels}.items():
             ((x, _),) = self.pixels(np.array([(x_m, 0.0)])).tolist()
-            self.shapes.append(Text(x, self.bottom + 4.0 + self.size, str(col), self.size, QUIET, "middle"))
+            self.shapes.append(TextShape(x, self.bottom + 4.0 + self.size, str(col), self.size, QUIET, "middle"))
         for row, y_m in {p.id.row: p.y_m for p in panels}.items():
             ((_, y),) = self.pixels(np.array([(0.0, y_m)])).tolist()
-            self.shapes.append(Text(self._left - 5.0, y + 0.35 * self.size, str(row), self.size, QUIET, "end"))
+            self.shapes.append(TextShape(self._left - 5.0, y + 0.35 * self.size, str(row), self.size, QUIET, "end"))
 
     def draw_base(self) -> None:
         """Where the robot starts, and its heading."""
         base = self.mirror.base_pose
         here = np.array([(base.x_m, base.y_m)])
         ahead = here + 0.2 * np.array([(cos(base.heading_rad), sin(base.heading_rad))])
-        self.shapes.append(Line(self.pixels(np.concatenate([here, ahead])), INK, 2.4))
+        self.shapes.append(PolyLine(self.pixels(np.concatenate([here, ahead])), INK, 2.4))
         self.shapes.append(Dots(self.pixels(here), 4.5 if self.is_wide else 3.0, INK, titles=("base",)))
 
-    def finish(self, scale: ColourScale | None, label: str, keys: list[tuple[str, Shape]], title: str) -> Picture:
+    def finish(self, scale: ColourScale | None, label: str, keys: list[tuple[str, Shape]], title: str) -> Drawing:
         """Colour bar and legend; then it is a picture.
 
         Args:
@@ -301,7 +301,7 @@ class MapFrame:
         """
         y = self.bottom + 2.2 * self.size + 12.0
         if scale is None:
-            return Picture(self.width, self._legend(keys, y) + 8.0, tuple(self.shapes), title)
+            return Drawing(self.width, self._legend(keys, y) + 8.0, tuple(self.shapes), title)
         if self.is_wide:
             length = min(420.0, 0.7 * self.bottom)
             top = (self.bottom - length) / 2.0
@@ -309,7 +309,7 @@ class MapFrame:
         else:
             self.shapes += colour_bar(scale, 30.0, y - 8.0, self.width - 60.0, label, self.size, is_upright=False)
             y += 58.0
-        return Picture(self.width, self._legend(keys, y) + 8.0, tuple(self.shapes), title)
+        return Drawing(self.width, self._legend(keys, y) + 8.0, tuple(self.shapes), title)
 
     def _legend(self, keys: list[tuple[str, Shape]], y: float) -> float:
         x = self._left
@@ -318,7 +318,7 @@ class MapFrame:
             if x + width > self.width and x > self._left:
                 x, y = self._left, y + 1.7 * self.size
             self.shapes.append(_moved(shape, x + 10.0, y - 0.35 * self.size))
-            self.shapes.append(Text(x + 26.0, y, name, self.size, INK))
+            self.shapes.append(TextShape(x + 26.0, y, name, self.size, INK))
             x += width
         return y
 
@@ -326,8 +326,8 @@ class MapFrame:
 def _moved(shape: Shape, x: float, y: float) -> Shape:
     if isinstance(shape, Dots):
         return Dots(shape.places + np.array((x, y)), shape.radius, shape.colour, shape.mark, (), shape.edge)
-    if isinstance(shape, Line):
-        return Line(shape.points + np.array((x, y)), shape.colour, shape.width, shape.dash)
+    if isinstance(shape, PolyLine):
+        return PolyLine(shape.points + np.array((x, y)), shape.colour, shape.width, shape.dash)
     raise TypeError(f"a legend shows dots and lines, no {type(shape).__name__}")
 
 
@@ -344,7 +344,7 @@ def driven_path_m(record: RunRecord) -> FloatArray:
     return np.concatenate(pieces) if pieces else np.empty((0, 2))
 
 
-def path_figure(record: RunRecord, verdicts: list[PointVerdict], width: float) -> Picture:
+def path_figure(record: RunRecord, verdicts: list[PointVerdict], width: float) -> Drawing:
     """Draw the map.
 
     Args:
@@ -358,8 +358,8 @@ def path_figure(record: RunRecord, verdicts: list[PointVerdict], width: float) -
     path = driven_path_m(record)
     keys: list[tuple[str, Shape]] = []
     if len(path):
-        frame.shapes.append(Line(thinned(frame.pixels(path), _TOLERANCE_PX), PATH, 1.0 if frame.is_wide else 0.7))
-        keys.append(("true path" if record.has_truth else "estimated path", Line(_KEY_LINE, PATH, 1.6)))
+        frame.shapes.append(PolyLine(thinned(frame.pixels(path), _TOLERANCE_PX), PATH, 1.0 if frame.is_wide else 0.7))
+        keys.append(("true path" if record.has_truth else "estimated path", PolyLine(_KEY_LINE, PATH, 1.6)))
     frame.draw_base()
     keys.append(("base", Dots(np.zeros((1, 2)), 4.0, INK)))
     scale = _scale(verdicts)
@@ -451,7 +451,7 @@ def surface_figure(
     title: str,
     width: float,
     scaled_as: Sequence[PanelResult] | None = None,
-) -> Picture:
+) -> Drawing:
     """Draw the map: dots show what was measured in the same colours, and vanish where the fit agrees with it.
 
     Args:
@@ -477,7 +477,7 @@ def surface_figure(
     return frame.finish(scale, _LABEL, keys, title)
 
 
-def cells_figure(mirror: Mirror, cells: Sequence[PanelCells], label: str, title: str, width: float) -> Picture:
+def cells_figure(mirror: Mirror, cells: Sequence[PanelCells], label: str, title: str, width: float) -> Drawing:
     """Draw values without measured points; ``label`` is what they are, with their unit, um."""
     frame = MapFrame(mirror, width)
     scale = _surface_figure_scale([one.values_m.ravel() for one in cells])

@@ -6,8 +6,8 @@ The figures of a report as data. Lengths in mm, times in s, unless a name says o
 from typing import Any
 
 from ccatp.mirror.panel_alignment import MirrorWavefront
-from ccatp.report.analysis import TimeBudget
-from ccatp.report.drawing import Picture
+from ccatp.report.analysis import TimeBreakdown
+from ccatp.report.drawing import Drawing
 from ccatp.report.findings import Findings, Grade
 from ccatp.report.html import WIDE, chips, foot, head, page, shown
 from ccatp.report.record import WITHIN_MM, RunRecord
@@ -60,7 +60,7 @@ def headline(found: Findings) -> dict[str, str]:
     return values
 
 
-def run_figures(found: Findings) -> dict[str, Picture]:
+def run_figures(found: Findings) -> dict[str, Drawing]:
     """The figures of the report, by the names of their files."""
     record = found.record
     figures = {"path": path_figure(record, found.points, WIDE)} if found.points or record.sessions else {}
@@ -98,7 +98,7 @@ def run_data(found: Findings) -> dict[str, Any]:
     }
 
 
-def budget_data(budget: TimeBudget) -> dict[str, Any]:
+def budget_data(budget: TimeBreakdown) -> dict[str, Any]:
     """A time budget: spent and least times by kind, and their sums."""
     return {
         "spent": _rounded(budget.spent_s),

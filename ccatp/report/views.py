@@ -13,13 +13,24 @@ import msgspec
 from msgspec import UNSET
 
 from ccatp.core import DeckPose, PanelId, PanelPose, PointId, wrap_pi
-from ccatp.links.topics import TOPICS, Estimate, FixMessage, Log, Message, SensorLines, Track, Truth, schema_of
+from ccatp.links.topics import (
+    TOPICS,
+    EstimateMessage,
+    FixMessage,
+    LogMessage,
+    Message,
+    SensorLines,
+    TrackMessage,
+    TruthMessage,
+    schema_of,
+)
 from ccatp.mirror.mirror import Mirror, deck_poses
 from ccatp.report.foxglove import (
     DECK,
     LEVELS,
+    FoxgloveLog,
+    FoxglovePose,
     FrameTransform,
-    Pose,
     PoseInFrame,
     SceneUpdate,
     Vector3,
@@ -30,7 +41,6 @@ from ccatp.report.foxglove import (
     robot_rotation,
     time_of,
 )
-from ccatp.report.foxglove import Log as FoxgloveLog
 
 WORLD, ROBOT, TRUE_ROBOT = "world", "robot", "true robot"
 EVERY_FRAMES = 10
@@ -85,7 +95,7 @@ class ErrorView(msgspec.Struct, frozen=True):
     heading_mrad: float
 
 
-class View(NamedTuple):
+class TopicView(NamedTuple):
     """One row of the table of views.
 
     Attributes:
@@ -101,7 +111,7 @@ class View(NamedTuple):
     is_latched: bool = False
 
 
-class Shown(NamedTuple):
+class ViewMessage(NamedTuple):
     """A message of a view: topic, robot time (s), JSON."""
 
     topic: str
@@ -110,16 +120,16 @@ class Shown(NamedTuple):
 
 
 VIEWS = (
-    View("view/frames", FrameTransform, "foxglove.FrameTransform", True),
-    View("view/panels", SceneUpdate, "foxglove.SceneUpdate", True),
-    View("view/points", SceneUpdate, "foxglove.SceneUpdate"),
-    View("view/robot_frame", FrameTransform, "foxglove.FrameTransform"),
-    View("view/pose", PoseInFrame, "foxglove.PoseInFrame"),
-    View("view/true_pose", PoseInFrame, "foxglove.PoseInFrame"),
-    View("view/log", FoxgloveLog, "foxglove.Log"),
-    View("view/robot", RobotView, "ccatp.Robot"),
-    View("view/sensors", SensorView, "ccatp.Sensors"),
-    View("view/error", ErrorView, "ccatp.Error"),
+    TopicView("view/frames", FrameTransform, "foxglove.FrameTransform", True),
+    TopicView("view/panels", SceneUpdate, "foxglove.SceneUpdate", True),
+    TopicView("view/points", SceneUpdate, "foxglove.SceneUpdate"),
+    TopicView("view/robot_frame", FrameTransform, "foxglove.FrameTransform"),
+    TopicView("view/pose", PoseInFrame, "foxglove.PoseInFrame"),
+    TopicView("view/true_pose", PoseInFrame, "foxglove.PoseInFrame"),
+    TopicView("view/log", FoxgloveLog, "foxglove.LogMessage"),
+    TopicView("view/robot", RobotView, "ccatp.Robot"),
+    TopicView("view/sensors", SensorView, "ccatp.Sensors"),
+    TopicView("view/error", ErrorView, "ccatp.Error"),
 )
 _encode = msgspec.json.Encoder().encode
 
@@ -175,7 +185,7 @@ class Views:
         self._points_told_s = 0.0
         self._has_begun = False
 
-    def begin(self, t_s: float = 0.0) -> Iterator[Shown]:
+    def begin(self, t_s: float = 0.0) -> Iterator[ViewMessage]:
         """What is latched: the world's frame and the panels' map."""
         self._has_begun = True
         mirror, now = self._mirror, time_of(t_s)
@@ -184,37 +194,37 @@ class Views:
         yield _shown("view/frames", t_s, FrameTransform(now, WORLD, DECK, origin, quaternion((x, y, z))))
         yield _shown("view/panels", t_s, panel_scene(mirror, now))
 
-    def of(self, message: Message) -> Iterator[Shown]:
+    def of(self, message: Message) -> Iterator[ViewMessage]:
         """The views of one message."""
         if not self._has_begun:
             yield from self.begin(max(message.t_s, 0.0))
-        if isinstance(message, Estimate):
+        if isinstance(message, EstimateMessage):
             yield from self._of_estimate(message)
-        elif isinstance(message, Track):
+        elif isinstance(message, TrackMessage):
             yield from self._of_track(message)
         elif isinstance(message, SensorLines):
             yield from _of_lines(message.lines)
-        elif isinstance(message, Truth):
+        elif isinstance(message, TruthMessage):
             yield from self._of_truth(message)
         elif isinstance(message, FixMessage):
             yield from self._of_fix(message)
-        elif isinstance(message, Log):
+        elif isinstance(message, LogMessage):
             log = FoxgloveLog(
                 time_of(max(message.t_s, 0.0)), LEVELS.get(message.level, 0), message.text, message.process
             )
             yield _shown("view/log", message.t_s, log)
 
-    def all_points(self, t_s: float) -> Iterator[Shown]:
+    def all_points(self, t_s: float) -> Iterator[ViewMessage]:
         """Every measured point so far."""
         panels = dict.fromkeys(point.panel for point in self._deviations_m)
         if panels:
             yield _shown("view/points", t_s, point_scene(self._mirror, panels, self._deviations_m, time_of(t_s)))
 
-    def _of_estimate(self, estimate: Estimate) -> Iterator[Shown]:
+    def _of_estimate(self, estimate: EstimateMessage) -> Iterator[ViewMessage]:
         pose = DeckPose(estimate.x_m, estimate.y_m, estimate.heading_rad)
         yield from self._of_pose(estimate.seq, estimate.t_s, pose, estimate.sigma_m)
 
-    def _of_track(self, track: Track) -> Iterator[Shown]:
+    def _of_track(self, track: TrackMessage) -> Iterator[ViewMessage]:
         rows = [row for row in track.rows if row[0] % EVERY_FRAMES == 0]
         if not rows:
             return
@@ -222,7 +232,7 @@ class Views:
         for row, place in zip(rows, deck_poses(self._mirror, poses).tolist(), strict=True):
             yield from self._of_pose(row[0], row[1], DeckPose(*place[:3]), row[7])
 
-    def _of_pose(self, seq: int, t_s: float, pose: DeckPose, sigma_m: float) -> Iterator[Shown]:
+    def _of_pose(self, seq: int, t_s: float, pose: DeckPose, sigma_m: float) -> Iterator[ViewMessage]:
         if seq % EVERY_FRAMES == 0:
             yield from self._compared(seq, t_s, self._estimates, pose)
         now, shown = time_of(t_s), self._pose_of(pose)
@@ -231,7 +241,7 @@ class Views:
         yield _shown("view/robot_frame", t_s, frame)
         yield _shown("view/robot", t_s, RobotView(t_s, seq, pose.x_m, pose.y_m, pose.heading_rad, sigma_m))
 
-    def _of_truth(self, truth: Truth) -> Iterator[Shown]:
+    def _of_truth(self, truth: TruthMessage) -> Iterator[ViewMessage]:
         for seq, t_s, x, y, heading, *_ in truth.rows:
             if seq % EVERY_FRAMES:
                 continue
@@ -239,7 +249,7 @@ class Views:
             yield _shown("view/true_pose", t_s, PoseInFrame(time_of(t_s), DECK, self._pose_of(pose)))
             yield from self._compared(seq, t_s, self._truths, pose)
 
-    def _compared(self, seq: int, t_s: float, own: dict[int, DeckPose], pose: DeckPose) -> Iterator[Shown]:
+    def _compared(self, seq: int, t_s: float, own: dict[int, DeckPose], pose: DeckPose) -> Iterator[ViewMessage]:
         """The error of a frame, once estimate and truth are both there."""
         own[seq] = pose
         if seq in self._estimates and seq in self._truths:
@@ -247,7 +257,7 @@ class Views:
         elif len(own) > _KEPT:
             del own[next(iter(own))]
 
-    def _of_fix(self, fix: FixMessage) -> Iterator[Shown]:
+    def _of_fix(self, fix: FixMessage) -> Iterator[ViewMessage]:
         if fix.point is None or not fix.is_fused:
             return
         point = PointId(*fix.point)
@@ -259,11 +269,13 @@ class Views:
         scene = point_scene(self._mirror, (point.panel,), self._deviations_m, time_of(fix.t_s))
         yield _shown("view/points", fix.t_s, scene)
 
-    def _pose_of(self, pose: DeckPose) -> Pose:
-        return Pose(Vector3(*self._mirror.surface_point(pose.x_m, pose.y_m)), robot_rotation(self._mirror, pose))
+    def _pose_of(self, pose: DeckPose) -> FoxglovePose:
+        return FoxglovePose(
+            Vector3(*self._mirror.surface_point(pose.x_m, pose.y_m)), robot_rotation(self._mirror, pose)
+        )
 
 
-def _of_lines(lines: Sequence[msgspec.Raw]) -> Iterator[Shown]:
+def _of_lines(lines: Sequence[msgspec.Raw]) -> Iterator[ViewMessage]:
     for raw in lines[::EVERY_FRAMES]:
         try:
             line = _line_decoder.decode(raw)
@@ -300,5 +312,5 @@ def _error(seq: int, t_s: float, estimate: DeckPose, truth: DeckPose) -> ErrorVi
     return ErrorView(t_s, seq, 1e3 * hypot(dx, dy), 1e3 * (c * dx + s * dy), 1e3 * (c * dy - s * dx), 1e3 * turn)
 
 
-def _shown(topic: str, t_s: float, message: msgspec.Struct) -> Shown:
-    return Shown(topic, max(t_s, 0.0), _encode(message))
+def _shown(topic: str, t_s: float, message: msgspec.Struct) -> ViewMessage:
+    return ViewMessage(topic, max(t_s, 0.0), _encode(message))

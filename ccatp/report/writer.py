@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.report.beacon_page import beacon_data, beacon_figures, beacon_page
-from ccatp.report.compare import Pair, pair_of
+from ccatp.report.compare import RunPair, pair_of
 from ccatp.report.compare_page import compare_figures, compare_page
-from ccatp.report.drawing import Picture
+from ccatp.report.drawing import Drawing
 from ccatp.report.findings import findings_of
 from ccatp.report.plots import PictureError, write_figures, write_svg
 from ccatp.report.record_reader import is_beacon_run, read_beacon_record, read_record
@@ -66,7 +66,7 @@ def report_run(run_dir: Path, out: Path | None = None, figures: Path | None = No
     return Report(path, data, warnings)
 
 
-def compare_runs(run_a: Path, run_b: Path, out: Path, figures: Path | None = None) -> Pair:
+def compare_runs(run_a: Path, run_b: Path, out: Path, figures: Path | None = None) -> RunPair:
     """Write two runs beside each other.
 
     Args:
@@ -98,7 +98,7 @@ def write_page(markup: str, path: Path) -> None:
         raise ReportError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def write_pictures(pictures: dict[str, Picture], folder: Path) -> None:
+def write_pictures(pictures: dict[str, Drawing], folder: Path) -> None:
     """Write figures as SVG, PNG and PDF.
 
     Raises:

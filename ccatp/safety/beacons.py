@@ -23,17 +23,17 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import EmergencyKind, EventCode, Severity, Verdict, wrap_pi
 from ccatp.links.beacon_messages import BeaconFrame
 from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import Estimate
-from ccatp.safety.emergency_latch import HEARD_AFTER_FRAMES, AbortLatch, is_at_base_or_held
+from ccatp.links.topics import EstimateMessage
+from ccatp.safety.emergency_latch import HEARD_AFTER_FRAMES, EmergencyLatch, is_at_base_or_held
 
 
-class _Echo(NamedTuple):
+class _Obstacle(NamedTuple):
     time_s: float
     x_m: float  # in the frame in which the robot stood when this memory began
     y_m: float
 
 
-class EchoMemory:
+class ObstacleBuffer:
     """Points in the frame of dead reckoning. Over its short memory that drifts by less than a sensor's noise.
 
     Args:
@@ -45,7 +45,7 @@ class EchoMemory:
     def __init__(self, sensors_rad: Sequence[float], reach_m: float, memory_s: float) -> None:
         """Nothing seen."""
         self._sensors_rad, self._reach_m, self._memory_s = tuple(sensors_rad), reach_m, memory_s
-        self._echoes: deque[_Echo] = deque()
+        self._echoes: deque[_Obstacle] = deque()
         self._x_m = self._y_m = self._heading_rad = self._steer_rad = 0.0
 
     def roll(self, way_m: float, course_rad: float, turn_rad: float) -> None:
@@ -69,7 +69,7 @@ class EchoMemory:
             if distance_m < self._reach_m:
                 at_rad = self._heading_rad + angle_rad
                 x_m, y_m = self._x_m + distance_m * cos(at_rad), self._y_m + distance_m * sin(at_rad)
-                self._echoes.append(_Echo(time_s, x_m, y_m))
+                self._echoes.append(_Obstacle(time_s, x_m, y_m))
 
     def nearest_m(self, course_rad: float, within_rad: float) -> float:
         """Distance to the nearest point within an angle of a course left of the heading; infinite without one."""
@@ -91,7 +91,7 @@ class EchoMemory:
 _NORMAL, _NEAR, _ABORTED = EventCode
 
 
-class BeaconDanger:
+class BeaconSafetyRules:
     """Judges frames. Call ``step`` once per frame, ``stale`` when no frame came in time.
 
     Args:
@@ -105,7 +105,7 @@ class BeaconDanger:
         """Nothing heard yet."""
         self._danger, self._follow, self._loss = cfg.danger, cfg.follow, cfg.path_loss
         self._avoidance, self._vehicle, self._radius_m = cfg.avoidance, cfg.vehicle, cfg.robot.wheel_radius_m
-        self.latch = AbortLatch()
+        self.latch = EmergencyLatch()
         self._denials: Counter[str] = Counter()
         self.reset()
 
@@ -114,7 +114,7 @@ class BeaconDanger:
         self._heard_s: float | None = None
         self._levels: deque[tuple[float, float]] = deque()
         avoidance = self._avoidance
-        self._echoes = EchoMemory(avoidance.sensors_rad, avoidance.influence_m, self._danger.memory_s)
+        self._echoes = ObstacleBuffer(avoidance.sensors_rad, avoidance.influence_m, self._danger.memory_s)
         self._rolled_to_s: float | None = None
         self._steer_rad = 0.0
         self._held_since_s: float | None = None
@@ -154,7 +154,7 @@ class BeaconDanger:
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
-    def step(self, sensors: Sensors, extras: BeaconFrame, estimate: Estimate | None) -> Verdict:
+    def step(self, sensors: Sensors, extras: BeaconFrame, estimate: EstimateMessage | None) -> Verdict:
         """The verdict on one frame.
 
         Args:
@@ -227,7 +227,7 @@ class BeaconDanger:
         if self._rolled_to_s is None:
             self._rolled_to_s = sensors.t
 
-    def _hold(self, t_s: float, estimate: Estimate | None) -> tuple[str, str, float, float] | None:
+    def _hold(self, t_s: float, estimate: EstimateMessage | None) -> tuple[str, str, float, float] | None:
         """Why nothing is permitted: cause, signal, value, limit."""
         danger = self._danger
         heard_s = t_s if self._heard_s is None else self._heard_s

@@ -146,7 +146,7 @@ MIN_SIDE_COSINE = 0.3
 LONG_ON = 10
 
 
-class Phase(Enum):
+class EdgePhase(Enum):
     """What is known of an episode."""
 
     FRESH = auto()  # the sensor has not moved since it went off
@@ -165,7 +165,7 @@ class Cause(StrEnum):
     SILENT_WHEELS = "off the panel while the wheels are not heard"
 
 
-class EpisodeLimits:
+class EdgeLimits:
     """The limits of the edge rule.
 
     Args:
@@ -187,7 +187,7 @@ class EpisodeLimits:
         self.debounce, self.clear = cfg.debounce_samples, cfg.clear_samples
 
 
-class Episode:
+class EdgeDetector:
     """A sensor's time off the panels. Places are in the odometry's frame unless called map places.
 
     Args:
@@ -207,7 +207,7 @@ class Episode:
 
     def __init__(
         self,
-        limits: EpisodeLimits,
+        limits: EdgeLimits,
         edge_map: EdgeMap,
         odometry: Odometry,
         sensor: tuple[Place, float],
@@ -243,7 +243,7 @@ class Episode:
         self._is_turn_spent = False
         self.retreat_m = 0.0
         self.is_doubted = False
-        self.phase = Phase.FRESH
+        self.phase = EdgePhase.FRESH
         self.cause: Cause | None = None
         self.value_m = self.limit_m = 0.0
 
@@ -255,7 +255,7 @@ class Episode:
     @property
     def needs_map(self) -> bool:
         """Whether the sensor still is where it went off, but without a place on the map."""
-        return self.phase is Phase.FRESH and self._map0 is None
+        return self.phase is EdgePhase.FRESH and self._map0 is None
 
     # -- samples --------------------------------------------------------------------------------------------------
 
@@ -266,7 +266,7 @@ class Episode:
         self._on_samples += 1
         if self._on_samples < self._limits.clear:
             return False
-        if self.phase is Phase.DECLARED or self._on_samples >= LONG_ON * self._limits.clear:
+        if self.phase is EdgePhase.DECLARED or self._on_samples >= LONG_ON * self._limits.clear:
             return True
         return hypot(place[0] - self._on_place[0], place[1] - self._on_place[1]) >= self._limits.no_map_m
 
@@ -281,7 +281,7 @@ class Episode:
         self._off_samples += 1
         self._on_samples = 0
         self._heading, self._place = odometry.heading_rad, place
-        if self.phase is Phase.DECLARED:
+        if self.phase is EdgePhase.DECLARED:
             self._watch_turn()
             self.retreat_m = hypot(place[0] - self._declared_place[0], place[1] - self._declared_place[1])
             return False
@@ -293,7 +293,7 @@ class Episode:
         self._moved = c * dx - s * dy, s * dx + c * dy
         dx, dy = odometry.x_m - robot0[0], odometry.y_m - robot0[1]
         robot = c * dx - s * dy, s * dx + c * dy
-        if self.phase is Phase.FRESH:
+        if self.phase is EdgePhase.FRESH:
             self._classify(robot)
         return self._judge(robot)
 
@@ -301,12 +301,12 @@ class Episode:
         """Rule (a) along the motion since the last call. Returns whether that declares an edge now."""
         dx, dy = self._moved[0] - self._recent[0], self._moved[1] - self._recent[1]
         length = hypot(dx, dy)
-        if self._on_samples or self._map0 is None or length < DIRECTION_TRAVEL_M or self.phase is Phase.FRESH:
+        if self._on_samples or self._map0 is None or length < DIRECTION_TRAVEL_M or self.phase is EdgePhase.FRESH:
             return False
         self._recent = self._moved
         if not self._is_rim((dx / length, dy / length)):
             return False
-        self.phase = Phase.RIM
+        self.phase = EdgePhase.RIM
         return self._off_samples >= self._limits.debounce and self._declare_rim()
 
     def trust(self) -> None:
@@ -321,7 +321,7 @@ class Episode:
     @property
     def permits_turn(self) -> bool:
         """Whether the robot may turn: back, out of an edge that it met in turning."""
-        return self.phase is not Phase.DECLARED or (self.is_from_turn and not self._is_turn_spent)
+        return self.phase is not EdgePhase.DECLARED or (self.is_from_turn and not self._is_turn_spent)
 
     # -- rules ----------------------------------------------------------------------------------------------------
 
@@ -334,15 +334,15 @@ class Episode:
         turned = self._heading - self._heading0
         self.is_from_turn = hypot(*robot) < abs(turned) * self._half_base_m
         self._turn_sign = 1.0 if turned >= 0.0 else -1.0
-        self.phase = Phase.NO_MAP
+        self.phase = EdgePhase.NO_MAP
         if self._map0 is None:
             return
         if self._is_rim(direction):
-            self.phase = Phase.RIM
+            self.phase = EdgePhase.RIM
             return
         seam = self._map.seam_at(self._map0, self._slack_m())
         if seam is not None:
-            self.phase = Phase.SEAM
+            self.phase = EdgePhase.SEAM
             self._set_seam(seam.axis)
 
     def _slack_m(self) -> float:
@@ -369,11 +369,11 @@ class Episode:
     def _judge(self, robot: Place) -> bool:
         if self._off_samples < self._limits.debounce:
             return False
-        if self.phase is Phase.RIM:
+        if self.phase is EdgePhase.RIM:
             return self._declare_rim()
-        if self.phase is Phase.NO_MAP:
+        if self.phase is EdgePhase.NO_MAP:
             return self._judge_no_map()
-        return self.phase is Phase.SEAM and self._judge_seam(robot)
+        return self.phase is EdgePhase.SEAM and self._judge_seam(robot)
 
     def _declare_rim(self) -> bool:
         return self._declare(Cause.RIM, hypot(*self._moved), 0.0)
@@ -429,7 +429,7 @@ class Episode:
         return True
 
     def _declare(self, cause: Cause, value_m: float, limit_m: float) -> bool:
-        self.phase = Phase.DECLARED
+        self.phase = EdgePhase.DECLARED
         self.cause, self.value_m, self.limit_m = cause, value_m, limit_m
         self._declared_heading = self._heading
         return True

@@ -30,7 +30,7 @@ from typing import Protocol
 from ccatp.config.models import DangerConfig, RobotConfig
 from ccatp.control.motion_checks import largest_rate_rad_s
 from ccatp.core import EdgeSample, WheelSample
-from ccatp.safety.edge_detector import EdgeMap, Episode, EpisodeLimits, Phase, RimMap
+from ccatp.safety.edge_detector import EdgeDetector, EdgeLimits, EdgeMap, EdgePhase, RimMap
 from ccatp.safety.wheel_odometry import Odometry, WheelTrack, pose_at
 
 SENSORS = 4
@@ -87,7 +87,7 @@ class EdgeRule:
         self.track = WheelTrack(
             robot.wheel_radius_m, robot.wheel_base_m, cfg.stale_after_s, reach_s, largest_rate_rad_s(robot)
         )
-        self._limits = EpisodeLimits(edge_map.gap_m, cfg)
+        self._limits = EdgeLimits(edge_map.gap_m, cfg)
         self._half_base_m = 0.5 * robot.wheel_base_m
         self._clear_samples, self._lifted_samples = cfg.clear_samples, cfg.lifted_samples
         self._worst_m_s = tuple(_fastest(robot, offset) for offset in robot.edge_sensors_m)
@@ -97,7 +97,7 @@ class EdgeRule:
     def reset(self) -> None:
         """Forget episodes, odometry and times: the robot's clock began anew."""
         self.track.reset()
-        self.episodes: tuple[Episode | None, ...] = (None, None, None, None)
+        self.episodes: tuple[EdgeDetector | None, ...] = (None, None, None, None)
         self._odometry: Odometry | None = None
         self._last_t_s: float | None = None
         self._all_off = self._all_on = 0
@@ -178,7 +178,7 @@ class EdgeRule:
         """
         limits = self._limits
         for i, episode in enumerate(self.episodes):
-            if episode is None or episode.phase is not Phase.DECLARED or episode.is_on:
+            if episode is None or episode.phase is not EdgePhase.DECLARED or episode.is_on:
                 continue
             place = self._map.place((estimate.x_m, estimate.y_m, estimate.heading_rad), self._offsets[i])
             aside_m = _HEADING_RAD * hypot(*self._offsets[i])
@@ -193,7 +193,7 @@ class EdgeRule:
 
     def _place(
         self,
-        episode: Episode,
+        episode: EdgeDetector,
         offset_m: tuple[float, float],
         odometry: Odometry,
         estimate: PoseEstimate,
@@ -203,17 +203,17 @@ class EdgeRule:
         pose = pose_at(self.track, odometry.t_s, estimate.t_s, known)
         episode.place_on_map(self._map.place(pose, offset_m), pose[2], estimate.sigma_m + more_sigma_m)
 
-    def _open(self, i: int, odometry: Odometry, dt_s: float, estimate: PoseEstimate | None) -> Episode:
+    def _open(self, i: int, odometry: Odometry, dt_s: float, estimate: PoseEstimate | None) -> EdgeDetector:
         ox, oy = self._offsets[i]
         moved_m = (abs(odometry.v_m_s) + abs(odometry.omega_rad_s) * hypot(ox, oy)) * dt_s
-        episode = Episode(self._limits, self._map, odometry, ((ox, oy), moved_m), self._half_base_m)
+        episode = EdgeDetector(self._limits, self._map, odometry, ((ox, oy), moved_m), self._half_base_m)
         if estimate is not None:
             self._place(episode, (ox, oy), odometry, estimate)
         self.opened[i] += 1
         self._replace(i, episode)
         return episode
 
-    def _replace(self, i: int, episode: Episode | None) -> None:
+    def _replace(self, i: int, episode: EdgeDetector | None) -> None:
         self.episodes = (*self.episodes[:i], episode, *self.episodes[i + 1 :])
 
     def _count_all(self, off: int) -> None:
@@ -232,7 +232,7 @@ class EdgeRule:
     def _look_ahead(self) -> None:
         """Rule (a) again, once per frame, for what is off and moves: a seam may lead to the rim."""
         for i, episode in enumerate(self.episodes):
-            if episode is not None and episode.phase is not Phase.DECLARED and episode.look_ahead():
+            if episode is not None and episode.phase is not EdgePhase.DECLARED and episode.look_ahead():
                 self.declared[i] += 1
 
 
@@ -257,7 +257,7 @@ LOOK_PERIOD_S = 0.1
 MOVING_RAD_S = 0.02
 
 
-class OriginRule:
+class CentreClearanceCheck:
     """Declares an edge when the centre drives at the rim and is closer to it than half the sensors' lead.
 
     A straight rim never gets that close: the sensors meet it first. Ends when the centre is ``map_margin_m`` further

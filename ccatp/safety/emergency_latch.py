@@ -29,7 +29,7 @@ def is_at_base_or_held(state: str) -> bool:
     return state in AT_BASE_OR_HELD
 
 
-class AbortLatch:
+class EmergencyLatch:
     """Code 2 holds while any emergency is active.
 
     Each id is raised once, repeated for nothing, and cleared once. A ``clear`` is the observatory's word that the cause

@@ -12,7 +12,7 @@ from ccatp.config.models import HealthConfig
 from ccatp.core import Severity
 
 
-class Finding(NamedTuple):
+class MonitorFinding(NamedTuple):
     """Something is wrong.
 
     Attributes:
@@ -36,7 +36,7 @@ class Finding(NamedTuple):
     patience_s: float | None = None
 
 
-class Alarm:
+class FindingLatch:
     """A finding that stays until there has been no evidence of it for a while.
 
     Args:
@@ -55,10 +55,10 @@ class Alarm:
 
     def reset(self) -> None:
         """Forget."""
-        self.finding: Finding | None = None
+        self.finding: MonitorFinding | None = None
         self._seen_s = -inf
 
-    def see(self, t_s: float, finding: Finding) -> None:
+    def see(self, t_s: float, finding: MonitorFinding) -> None:
         """There is evidence at ``t_s``. The first values are kept, unless it has become graver."""
         if self.finding is None or finding.severity > self.finding.severity:
             self.finding = finding
@@ -96,17 +96,17 @@ class Since:
 _DENYING = (Severity.PAUSE, Severity.HOLD, Severity.FAULT)
 
 
-def gravest(findings: Iterable[Finding]) -> Finding | None:
+def gravest(findings: Iterable[MonitorFinding]) -> MonitorFinding | None:
     """The finding that wins: the gravest, of equal ones the first."""
     return max(findings, key=lambda finding: finding.severity, default=None)
 
 
-def denies(findings: Iterable[Finding]) -> bool:
+def denies(findings: Iterable[MonitorFinding]) -> bool:
     """Whether any of the findings holds the wheels. Going home does not, but what else is found may."""
     return any(finding.severity in _DENYING for finding in findings)
 
 
-class Ladder:
+class SeverityEscalation:
     """Raises the severity of what lasts or comes back.
 
     A pause that lasts for longer than ``pause_limit_s`` is a hold, so that a fix is had before going on; a hold that
@@ -128,7 +128,7 @@ class Ladder:
         self._since_s.clear()
         self._held.clear()
 
-    def climb(self, t_s: float, findings: list[Finding]) -> list[Finding]:
+    def climb(self, t_s: float, findings: list[MonitorFinding]) -> list[MonitorFinding]:
         """The findings of a frame, raised where their time is up.
 
         Args:
@@ -142,7 +142,7 @@ class Ladder:
         self._since_s = now
         return [self._raised(t_s, finding) for finding in findings]
 
-    def _raised(self, t_s: float, finding: Finding) -> Finding:
+    def _raised(self, t_s: float, finding: MonitorFinding) -> MonitorFinding:
         cfg, lasted_s = self._cfg, t_s - self._since_s[finding.signal]
         if finding.severity is Severity.PAUSE:
             if lasted_s < cfg.pause_limit_s:
@@ -157,7 +157,7 @@ class Ladder:
             )
         return self._count(t_s, finding, is_new=lasted_s == 0.0)
 
-    def _count(self, t_s: float, finding: Finding, *, is_new: bool) -> Finding:
+    def _count(self, t_s: float, finding: MonitorFinding, *, is_new: bool) -> MonitorFinding:
         cfg, held = self._cfg, self._held.setdefault(finding.signal, deque())
         while held and t_s - held[0] > cfg.retry_window_s:
             held.popleft()

@@ -5,9 +5,9 @@ from math import hypot
 from typing import Protocol
 
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
-from ccatp.control.motion_checks import ImuGate, Moved, WheelMeans, Window
+from ccatp.control.motion_checks import ImuGate, MotionSum, SlidingWindow, WheelMeans
 from ccatp.core import EdgeSample, ImuSample, Severity, WheelSample
-from ccatp.safety.escalation import Alarm, Finding
+from ccatp.safety.escalation import FindingLatch, MonitorFinding
 from ccatp.safety.power_monitors import BatteryMonitor, FanMonitor, OwnFaults
 from ccatp.safety.sensor_monitors import FlickerMonitor, Ground, LatencyMonitor, RateMonitor, SeamMonitor
 from ccatp.safety.wheel_monitors import LATE_S, GyroscopeBias, WheelMonitor, YawMonitor, imu_finding
@@ -33,7 +33,7 @@ class Echo(Protocol):
         """The robot holds its wheels by its own rules."""
 
 
-class Frame(Protocol):
+class MonitorFrame(Protocol):
     """The part of a sensors frame that the monitors read."""
 
     @property
@@ -57,7 +57,7 @@ class Frame(Protocol):
         """What the robot reports of itself."""
 
 
-class Commanded(Protocol):
+class CommandedMotion(Protocol):
     """Main's estimate and commands."""
 
     @property
@@ -89,7 +89,7 @@ class Commanded(Protocol):
         """Number of the newest drive."""
 
 
-class HealthBoard:
+class HealthMonitor:
     """All monitors but the edge rule's.
 
     Args:
@@ -120,8 +120,8 @@ class HealthBoard:
         self._means = WheelMeans(robot)
         self._gate = ImuGate(cfg)
         self._bias = GyroscopeBias()
-        self._shortly, self._stalling = Window(cfg.runaway_time_s), Window(cfg.stall_time_s)
-        self._turning = Window(cfg.yaw_time_s)
+        self._shortly, self._stalling = SlidingWindow(cfg.runaway_time_s), SlidingWindow(cfg.stall_time_s)
+        self._turning = SlidingWindow(cfg.yaw_time_s)
         self._wheels, self._yaw = WheelMonitor(cfg, robot), YawMonitor(cfg, robot)
         self._rates, self._latency = RateMonitor(cfg), LatencyMonitor(cfg)
         self._fans, self._battery = FanMonitor(cfg, robot.fan_duty, overhang), BatteryMonitor(cfg)
@@ -129,8 +129,8 @@ class HealthBoard:
         fastest = robot.wheel_radius_m * robot.max_wheel_rad_s
         self.seams = SeamMonitor(cfg, ground, robot.edge_sensors_m, danger.map_sigmas, fastest)
         self.flicker = FlickerMonitor(cfg, is_explained)
-        self._clock, self._gap = Alarm(cfg.imu_quarantine_s), Alarm(cfg.imu_quarantine_s)
-        self._garbled = Alarm(cfg.retry_after_s)
+        self._clock, self._gap = FindingLatch(cfg.imu_quarantine_s), FindingLatch(cfg.imu_quarantine_s)
+        self._garbled = FindingLatch(cfg.retry_after_s)
         self._alarms = (
             self._wheels.alarm,
             self._yaw.alarm,
@@ -147,7 +147,7 @@ class HealthBoard:
     def reset(self) -> None:
         """Another boot of the robot."""
         self._t_s: float | None = None
-        self._sums = Moved(0.0, 0.0, 0.0, 0.0)
+        self._sums = MotionSum(0.0, 0.0, 0.0, 0.0)
         self._gate.reset()
         for window in (self._shortly, self._stalling, self._turning):
             window.reset()
@@ -163,22 +163,22 @@ class HealthBoard:
         self._counts = [0, 0, 0]
         self._is_free, self._is_held, self._is_late = True, True, False
         self._speed_m_s = 0.0
-        self.findings: list[Finding] = []
+        self.findings: list[MonitorFinding] = []
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
     def jumped(self, t_s: float, by_s: float) -> None:
         """The robot's clock has jumped before the frame at ``t_s``."""
         limit_s = self._cfg.clock_jump_s
-        self._clock.see(t_s, Finding(Severity.PAUSE, "the robot's clock has jumped", "clock", by_s, limit_s))
+        self._clock.see(t_s, MonitorFinding(Severity.PAUSE, "the robot's clock has jumped", "clock", by_s, limit_s))
         self._gate.reset()
         self.findings = self._found()
 
-    def garbled(self) -> Finding:
+    def garbled(self) -> MonitorFinding:
         """Too many lines that are no frames came since the last frame; what is found stays until frames come again."""
         cfg = self._cfg
         cause, lines = "lines of the robot were no frames", float(cfg.garbled_lines)
-        finding = Finding(Severity.HOLD, cause, "lines", lines, lines)
+        finding = MonitorFinding(Severity.HOLD, cause, "lines", lines, lines)
         self._garbled.see(self._t_s or 0.0, finding)
         self.findings = self._found()
         return finding
@@ -186,7 +186,7 @@ class HealthBoard:
     def step(
         self,
         t_s: float,
-        frame: Frame,
+        frame: MonitorFrame,
         wheels: Sequence[WheelSample],
         edges: Sequence[EdgeSample],
         *,
@@ -207,7 +207,7 @@ class HealthBoard:
         is_gap = dt_s > self._cfg.gap_s
         if is_gap:
             cause = "frames were lost: nobody saw where the robot went"
-            self._gap.see(t_s, Finding(Severity.HOLD, cause, "frames", dt_s, self._cfg.gap_s))
+            self._gap.see(t_s, MonitorFinding(Severity.HOLD, cause, "frames", dt_s, self._cfg.gap_s))
         imu = frame.imu
         self._means.take(wheels, dt_s)
         self._sums = self._added(imu, dt_s)
@@ -232,7 +232,7 @@ class HealthBoard:
                 self.flicker.step(t_s, edges, self._speed_m_s)
             self.findings = self._found()
 
-    def _judge(self, t_s: float, frame: Frame, wheels: Sequence[WheelSample]) -> None:
+    def _judge(self, t_s: float, frame: MonitorFrame, wheels: Sequence[WheelSample]) -> None:
         """What need not be looked at in every frame while nothing is wrong."""
         now = self._sums
         shortly, stalling = self._shortly.push(now), self._stalling.push(now)
@@ -268,7 +268,7 @@ class HealthBoard:
         if self._frames % _SLOW_LOOK_FRAMES < _LOOK_FRAMES:
             self._battery.step(t_s, frame.soc, "battery_low" in faults, self._home_m)
 
-    def _added(self, imu: Sequence[ImuSample], dt_s: float) -> Moved:
+    def _added(self, imu: Sequence[ImuSample], dt_s: float) -> MotionSum:
         """The sums with this frame's motion. What is not known of it is taken to be none, of all."""
         means, sums = self._means, self._sums
         right, left = means.right_rad_s, means.left_rad_s
@@ -276,7 +276,7 @@ class HealthBoard:
         t_s = self._t_s or 0.0
         if right is None or left is None:
             # Without one of them none is counted, so that they do not disagree about what is not known.
-            return Moved(t_s, *sums[1:])
+            return MotionSum(t_s, *sums[1:])
         rolled_m = self._radius_m * dt_s
         if usable:
             wz = usable[-1][2]
@@ -287,9 +287,9 @@ class HealthBoard:
                 turned = (wz - self._bias.rad_s) * dt_s
         else:
             turned = means.yaw_rad_s * dt_s
-        return Moved(t_s, sums[1] + right * rolled_m, sums[2] + left * rolled_m, sums[3] + turned)
+        return MotionSum(t_s, sums[1] + right * rolled_m, sums[2] + left * rolled_m, sums[3] + turned)
 
-    def hear(self, t_s: float, estimate: Commanded) -> None:
+    def hear(self, t_s: float, estimate: CommandedMotion) -> None:
         """Take what the wheels were told, from an estimate that may be too old for anything else.
 
         Args:
@@ -302,7 +302,7 @@ class HealthBoard:
         if estimate.commanded is not None:
             self._wheels.commands.push(t_s, estimate.commanded)
 
-    def learn(self, t_s: float, estimate: Commanded, opened: Sequence[int], is_off: Sequence[bool]) -> None:
+    def learn(self, t_s: float, estimate: CommandedMotion, opened: Sequence[int], is_off: Sequence[bool]) -> None:
         """Take an estimate of main's that is fresh; one that was taken already changes nothing.
 
         Args:
@@ -326,7 +326,7 @@ class HealthBoard:
         self.seams.step(t_s, (x, y, estimate.heading_rad), estimate.sigma_m)
         self._home_m = hypot(x - self._base_m[0], y - self._base_m[1])
 
-    def _found(self) -> list[Finding]:
+    def _found(self) -> list[MonitorFinding]:
         found = [alarm.finding for alarm in self._alarms if alarm.finding is not None]
         others = imu_finding(self._gate), self._rates.finding, self._battery.finding, self.seams.finding
         found += [finding for finding in others if finding is not None]

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from ccatp.config.models import HealthConfig
 from ccatp.core import Severity
-from ccatp.safety.escalation import Alarm, Finding, Since
+from ccatp.safety.escalation import FindingLatch, MonitorFinding, Since
 
 # A fan command is in force two delays of the link after it was sent, at the latest.
 _FIRST_COMMAND_S = 1.0
@@ -40,7 +40,7 @@ class FanMonitor:
         self._cfg, self._overhang = cfg, overhang
         self._enough = cfg.fan_early_share * duty[0], cfg.fan_early_share * duty[1]
         self._least = cfg.fan_share * duty[0], cfg.fan_share * duty[1]
-        self.alarm = Alarm(cfg.retry_after_s)
+        self.alarm = FindingLatch(cfg.retry_after_s)
         self.reset()
 
     def reset(self) -> None:
@@ -69,7 +69,7 @@ class FanMonitor:
             if self._weak.lasts(t_s, is_weak and is_due) >= self._cfg.fan_time_s - 1e-6:
                 k = 0 if fans[0] - self._enough[0] < fans[1] - self._enough[1] else 1
                 cause = f"the {('left', 'right')[k]} fan gets weak"
-                finding = Finding(Severity.RETURN, cause, _FANS[k], fans[k], self._enough[k], full_fans=True)
+                finding = MonitorFinding(Severity.RETURN, cause, _FANS[k], fans[k], self._enough[k], full_fans=True)
                 self.alarm.see(t_s, finding)
         for name in faults:
             if name in _FANS:
@@ -78,7 +78,7 @@ class FanMonitor:
 
     def _see(self, t_s: float, cause: str, signal: str, value: float, limit: float) -> None:
         severity = Severity.FAULT if self._overhang else Severity.INFORM
-        self.alarm.see(t_s, Finding(severity, cause, signal, value, limit, full_fans=self._overhang))
+        self.alarm.see(t_s, MonitorFinding(severity, cause, signal, value, limit, full_fans=self._overhang))
 
 
 class BatteryMonitor:
@@ -94,7 +94,7 @@ class BatteryMonitor:
     def __init__(self, cfg: HealthConfig) -> None:
         """Nothing found."""
         self._cfg = cfg
-        self.finding: Finding | None = None
+        self.finding: MonitorFinding | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -114,9 +114,11 @@ class BatteryMonitor:
         least = cfg.battery_reserve
         least += cfg.battery_margin * _DETOUR * home_m / cfg.slow_speed_m_s / cfg.battery_life_s
         if self._low.lasts(t_s, soc < least) >= cfg.battery_time_s:
-            self.finding = Finding(Severity.RETURN, "the battery has to last for the way home", "soc", soc, least)
+            self.finding = MonitorFinding(
+                Severity.RETURN, "the battery has to last for the way home", "soc", soc, least
+            )
         if self._told.lasts(t_s, is_told) >= cfg.battery_time_s:
-            self.finding = Finding(Severity.RETURN, "the robot reports a low battery", "battery_low", soc, least)
+            self.finding = MonitorFinding(Severity.RETURN, "the robot reports a low battery", "battery_low", soc, least)
 
 
 class OwnFaults:
@@ -132,7 +134,7 @@ class OwnFaults:
     def __init__(self, cfg: HealthConfig) -> None:
         """Nothing reported."""
         self._clear_s = cfg.retry_after_s
-        self.alarms: dict[str, Alarm] = {}
+        self.alarms: dict[str, FindingLatch] = {}
 
     def reset(self) -> None:
         """Forget."""
@@ -144,7 +146,9 @@ class OwnFaults:
             if name in _FANS or name == "battery_low":
                 continue
             severity, cause = _OWN.get(name, (Severity.INFORM, "the robot reports a fault that is not known here"))
-            self.alarms.setdefault(name, Alarm(self._clear_s)).see(t_s, Finding(severity, cause, name, 1.0, 0.0))
+            self.alarms.setdefault(name, FindingLatch(self._clear_s)).see(
+                t_s, MonitorFinding(severity, cause, name, 1.0, 0.0)
+            )
         for name, alarm in list(self.alarms.items()):
             alarm.settle(t_s)
             if alarm.finding is None:

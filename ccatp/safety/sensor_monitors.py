@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 
 from ccatp.config.models import HealthConfig
 from ccatp.core import Corner, EdgeSample, PanelId, Severity
-from ccatp.safety.escalation import Alarm, Finding
+from ccatp.safety.escalation import FindingLatch, MonitorFinding
 
 _CORNERS = tuple(corner.value for corner in Corner)
 # Slower than this nothing crosses an edge; vibration moves a sensor by less in a frame.
@@ -42,7 +42,7 @@ class FlickerMonitor:
     def __init__(self, cfg: HealthConfig, is_explained: Callable[[int], bool]) -> None:
         """All sensors on."""
         self._cfg, self._is_explained = cfg, is_explained
-        self.chatter, self.flash = Alarm(cfg.retry_after_s), Alarm(_CLEAR_S)
+        self.chatter, self.flash = FindingLatch(cfg.retry_after_s), FindingLatch(_CLEAR_S)
         self.reset()
 
     def reset(self) -> None:
@@ -80,9 +80,9 @@ class FlickerMonitor:
         self.chatter.settle(t_s)
         self.flash.settle(t_s)
 
-    def _chattering(self, i: int, count: int) -> Finding:
+    def _chattering(self, i: int, count: int) -> MonitorFinding:
         limit = self._cfg.chatter_transitions
-        return Finding(Severity.HOLD, "an edge sensor chatters", _CORNERS[i], count, limit)
+        return MonitorFinding(Severity.HOLD, "an edge sensor chatters", _CORNERS[i], count, limit)
 
     def _change(self, t_s: float, state: tuple[int, ...], *, is_still: bool) -> None:
         for i, (before, now) in enumerate(zip(self._last, state, strict=True)):
@@ -103,7 +103,7 @@ class FlickerMonitor:
         limit_s = self._cfg.pause_limit_s
         severity = Severity.PAUSE if longest_s < limit_s - _CLEAR_S else Severity.SLOW
         cause = "an edge sensor went off though nothing moved"
-        self.flash.see(t_s, Finding(severity, cause, _CORNERS[off[0]], len(off), 0.0))
+        self.flash.see(t_s, MonitorFinding(severity, cause, _CORNERS[off[0]], len(off), 0.0))
         if severity is Severity.SLOW and self.flash.finding is not None:
             self.flash.finding = self.flash.finding._replace(severity=Severity.SLOW)
 
@@ -131,7 +131,7 @@ class RateMonitor:
 
     def reset(self) -> None:
         """Learn anew."""
-        self.finding: Finding | None = None
+        self.finding: MonitorFinding | None = None
         self.are_encoders_sparse = False
         self._begin_s: float | None = None
         self._last_s = 0.0
@@ -167,7 +167,7 @@ class RateMonitor:
             self.finding = None
             return
         name = _SOURCES[shares.index(least)]
-        self.finding = Finding(Severity.SLOW, "a sensor gives too few samples", name, least, limit)
+        self.finding = MonitorFinding(Severity.SLOW, "a sensor gives too few samples", name, least, limit)
 
 
 class LatencyMonitor:
@@ -183,7 +183,7 @@ class LatencyMonitor:
     def __init__(self, cfg: HealthConfig) -> None:
         """Nothing found."""
         self._cfg = cfg
-        self.alarm = Alarm(cfg.rate_time_s)
+        self.alarm = FindingLatch(cfg.rate_time_s)
         self.reset()
 
     def reset(self) -> None:
@@ -205,14 +205,14 @@ class LatencyMonitor:
             latency_s, cfg = t_s - sent[1][1], self._cfg
             if latency_s > cfg.latency_pause_s:
                 cause = "drives reach the wheels too late"
-                self.alarm.see(t_s, Finding(Severity.PAUSE, cause, "latency", latency_s, cfg.latency_pause_s))
+                self.alarm.see(t_s, MonitorFinding(Severity.PAUSE, cause, "latency", latency_s, cfg.latency_pause_s))
             elif latency_s > cfg.latency_slow_s:
                 cause = "drives reach the wheels late"
-                self.alarm.see(t_s, Finding(Severity.SLOW, cause, "latency", latency_s, cfg.latency_slow_s))
+                self.alarm.see(t_s, MonitorFinding(Severity.SLOW, cause, "latency", latency_s, cfg.latency_slow_s))
         self.alarm.settle(t_s)
 
 
-class GarbledLines:
+class FramingErrorRate:
     """Counts them on any clock that runs on.
 
     Args:
@@ -299,7 +299,7 @@ class SeamMonitor:
         self._sigmas, self._fastest_m_s = sigmas, fastest_m_s
         self.missed = [0, 0, 0, 0]
         self.crossed = 0
-        self._blind = Alarm(cfg.retry_after_s)
+        self._blind = FindingLatch(cfg.retry_after_s)
         self.reset()
 
     def reset(self) -> None:
@@ -350,10 +350,10 @@ class SeamMonitor:
         if missed >= limit and self._pose is not None:
             # The pose may be wrong instead: the hold brings a fix, and one more seam shows which.
             cause = "an edge sensor sees no seams: blind"
-            self._blind.see(self._pose[0], Finding(Severity.HOLD, cause, _CORNERS[i], missed, limit, retries=0))
+            self._blind.see(self._pose[0], MonitorFinding(Severity.HOLD, cause, _CORNERS[i], missed, limit, retries=0))
 
     @property
-    def finding(self) -> Finding | None:
+    def finding(self) -> MonitorFinding | None:
         """What is thought of the sensor that has missed most seams in a row, if enough."""
         if self._blind.finding is not None:
             return self._blind.finding
@@ -361,4 +361,4 @@ class SeamMonitor:
         if most < limit:
             return None
         corner = _CORNERS[self.missed.index(most)]
-        return Finding(Severity.SLOW, "an edge sensor did not see a seam", corner, most, limit)
+        return MonitorFinding(Severity.SLOW, "an edge sensor did not see a seam", corner, most, limit)

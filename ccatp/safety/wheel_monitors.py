@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from ccatp.config.models import HealthConfig, RobotConfig
-from ccatp.control.motion_checks import ImuGate, Moved
+from ccatp.control.motion_checks import ImuGate, MotionSum
 from ccatp.core import Severity, WheelSample
-from ccatp.safety.escalation import Alarm, Finding, Since
+from ccatp.safety.escalation import FindingLatch, MonitorFinding, Since
 
 HOLD, FAULT = Severity.HOLD, Severity.FAULT
 # A servo of 0.1 s and a link of 40 ms have forgotten a command after this long, to within 2 %.
@@ -100,7 +100,7 @@ class WheelMonitor:
         """Nothing found."""
         self._cfg, self._base_m = cfg, robot.wheel_base_m
         self.commands = Commands(robot.wheel_radius_m)
-        self.alarm = Alarm(cfg.retry_after_s)
+        self.alarm = FindingLatch(cfg.retry_after_s)
         self.reset()
 
     def reset(self) -> None:
@@ -113,7 +113,7 @@ class WheelMonitor:
         self._held_since_s: float | None = None
         self._late_s: float | None = None
         self._sparse_s: float | None = None
-        self._stood: Moved | None = None
+        self._stood: MotionSum | None = None
         self._creeping = Since(), Since()
 
     def learn(self, t_s: float) -> None:
@@ -123,9 +123,9 @@ class WheelMonitor:
 
     def step(
         self,
-        now: Moved,
-        shortly: Moved | None,
-        stalling: Moved | None,
+        now: MotionSum,
+        shortly: MotionSum | None,
+        stalling: MotionSum | None,
         *,
         is_free: bool,
         is_held: bool,
@@ -177,7 +177,9 @@ class WheelMonitor:
         is_held = self._held_since_s is not None and t_s - self._held_since_s >= _MEMORY_S
         return Span(t_s, 0.0, 0.0, 0.0, 0.0) if is_held else None
 
-    def _find_runaway(self, t_s: float, moved: Moved, told: Span, samples: Sequence[WheelSample], limit: float) -> None:
+    def _find_runaway(
+        self, t_s: float, moved: MotionSum, told: Span, samples: Sequence[WheelSample], limit: float
+    ) -> None:
         right, left = moved.right_m / moved.t_s, moved.left_m / moved.t_s
         above = _excess(right, told.right_low, told.right_high), _excess(left, told.left_low, told.left_high)
         worst = max(above)
@@ -186,12 +188,12 @@ class WheelMonitor:
         k = 0 if above[0] >= above[1] else 1
         side = _SIDES[k]
         if broken := _what_is_broken(samples, k):
-            finding = Finding(HOLD, f"the {side} encoder {broken}", f"encoder_{side}", worst, limit)
+            finding = MonitorFinding(HOLD, f"the {side} encoder {broken}", f"encoder_{side}", worst, limit)
         else:
-            finding = Finding(HOLD, f"the {side} wheel runs away", f"{side}_wheel", worst, limit)
+            finding = MonitorFinding(HOLD, f"the {side} wheel runs away", f"{side}_wheel", worst, limit)
         self.alarm.see(t_s, finding)
 
-    def _find_stall(self, t_s: float, moved: Moved) -> None:
+    def _find_stall(self, t_s: float, moved: MotionSum) -> None:
         told, cfg = self._stall, self._cfg
         if told is None or (self._held_s is not None and t_s - self._held_s < cfg.stall_time_s + _LATENCY_S):
             return
@@ -211,13 +213,13 @@ class WheelMonitor:
             is_encoder = disagreement > _SAME_TURN_RAD
             what = f"the {side} encoder counts nothing" if is_encoder else f"the {side} wheel is blocked"
             signal = f"encoder_{side}" if is_encoder else f"{side}_wheel"
-        self.alarm.see(t_s, Finding(HOLD, what, signal, speed, cfg.stall_speed_m_s, retries=_STALL_RETRIES))
+        self.alarm.see(t_s, MonitorFinding(HOLD, what, signal, speed, cfg.stall_speed_m_s, retries=_STALL_RETRIES))
 
     def _is_told(self, low: float, high: float) -> bool:
         limit = self._cfg.stall_command_m_s
         return low >= limit or high <= -limit
 
-    def _find_creep(self, now: Moved, moved: Moved, told: Span, samples: Sequence[WheelSample]) -> None:
+    def _find_creep(self, now: MotionSum, moved: MotionSum, told: Span, samples: Sequence[WheelSample]) -> None:
         """Told to stand, and it does not. While the link stalls the robot goes on as told last, and then runs down."""
         runs_down_s = _MEMORY_S + self._cfg.stall_time_s
         is_running_down = self._late_s is not None and now.t_s - self._late_s < runs_down_s
@@ -239,16 +241,16 @@ class WheelMonitor:
                 continue
             if broken:
                 self._stood = now  # what it says it went, it did not
-                finding = Finding(
+                finding = MonitorFinding(
                     HOLD, f"the {side} encoder {broken}", f"encoder_{side}", speed_m_s, cfg.stop_speed_m_s
                 )
             elif creeps:
                 severity = FAULT if lasts_s >= _CREEP_FAULT_S else HOLD
                 cause = f"the {side} wheel turns while it is held"
-                finding = Finding(severity, cause, f"{side}_wheel", crept_m, cfg.creep_m, full_fans=True)
+                finding = MonitorFinding(severity, cause, f"{side}_wheel", crept_m, cfg.creep_m, full_fans=True)
             else:
                 cause = f"the {side} wheel turns though it shall stand"
-                finding = Finding(HOLD, cause, f"{side}_wheel", speed_m_s, cfg.stop_speed_m_s)
+                finding = MonitorFinding(HOLD, cause, f"{side}_wheel", speed_m_s, cfg.stop_speed_m_s)
             self.alarm.see(t_s, finding)
 
 
@@ -335,13 +337,13 @@ class YawMonitor:
     def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
         """Nothing found."""
         self._cfg, self._base_m = cfg, robot.wheel_base_m
-        self.alarm = Alarm(cfg.retry_after_s)
+        self.alarm = FindingLatch(cfg.retry_after_s)
 
     def reset(self) -> None:
         """Forget."""
         self.alarm.reset()
 
-    def step(self, t_s: float, moved: Moved) -> None:
+    def step(self, t_s: float, moved: MotionSum) -> None:
         """Judge a frame; ``moved`` is the change of the sums over ``yaw_time_s``, while the unit was believed."""
         cfg = self._cfg
         by_wheels = (moved.right_m - moved.left_m) / self._base_m
@@ -350,11 +352,11 @@ class YawMonitor:
         limit = cfg.yaw_limit_rad + cfg.yaw_share * max(abs(by_wheels), abs(by_gyroscope))
         if not -limit <= difference <= limit:
             cause = "gyroscope and wheels disagree about the turn: a wheel slips, or the gyroscope is off"
-            self.alarm.see(t_s, Finding(Severity.HOLD, cause, "imu_wz", difference, limit))
+            self.alarm.see(t_s, MonitorFinding(Severity.HOLD, cause, "imu_wz", difference, limit))
 
 
-def imu_finding(gate: ImuGate) -> Finding | None:
+def imu_finding(gate: ImuGate) -> MonitorFinding | None:
     """What the gate has against the inertial unit: it is left out, and the robot goes slowly by its wheels."""
     if not gate.cause:
         return None
-    return Finding(Severity.SLOW, f"{gate.cause}: left out", "imu", gate.value, gate.limit)
+    return MonitorFinding(Severity.SLOW, f"{gate.cause}: left out", "imu", gate.value, gate.limit)

@@ -24,10 +24,10 @@ from ccatp.links.beacon_messages import BeaconFrame, MoteBurst, RadioSample, Rad
 from ccatp.links.robot_codec import encode_sensors
 from ccatp.links.robot_messages import PROTOCOL, Hello, RobotData, VehicleData
 from ccatp.links.topics import BeaconPlaces, BeaconTruth
-from ccatp.sim.motes import RobotEars, TrueMotes, true_motes
-from ccatp.sim.radio import DriveCommand, Packet, Sighting, TruePose, WorldFrame
+from ccatp.sim.motes import MoteListener, TrueMotes, true_motes
+from ccatp.sim.radio import Packet, SimDriveCommand, TargetBearing, TruePose, WorldFrame
 from ccatp.sim.radio_world import RadioWorld
-from ccatp.sim.rules import Fans, MotionRules
+from ccatp.sim.rules import FanRules, MotionRules
 
 _CORNER = (0.0, 0.0)  # a robot without edge sensors has them where it is
 
@@ -51,11 +51,11 @@ class Surroundings(Protocol):
     def clearance_m(self) -> float:
         """Between the vehicle's body and the nearest obstacle."""
 
-    def step(self, command: DriveCommand, interval_s: float, *, static: bool, target: bool) -> WorldFrame:
+    def step(self, command: SimDriveCommand, interval_s: float, *, static: bool, target: bool) -> WorldFrame:
         """Drive on, then listen."""
 
 
-class MoteEars(Protocol):
+class MoteReceiver(Protocol):
     """What the robot hears of motes."""
 
     def hear(self, time_s: float, pose: TruePose) -> list[MoteBurst]:
@@ -78,11 +78,11 @@ class BeaconRobot:
         reboots: none.
     """
 
-    def __init__(self, cfg: RadioConfig, world: Surroundings, ears: MoteEars | None = None) -> None:
+    def __init__(self, cfg: RadioConfig, world: Surroundings, ears: MoteReceiver | None = None) -> None:
         self._cfg, self.world, self._ears = cfg, world, ears
         self.frame_s = cfg.run.step_s
         self.rules = MotionRules(cfg.sim.robot.ttl_s, cfg.robot.max_wheel_rad_s)
-        self.fans = Fans(0.0)
+        self.fans = FanRules(0.0)
         self.seq, self.t_s, self.reboots = 0, 0.0, 0
         self._steer_rad = 0.0
         self._line = b""
@@ -200,12 +200,12 @@ class BeaconRobot:
         )
         self._read(frame)
 
-    def _command(self, right_rad_s: float, left_rad_s: float) -> DriveCommand:
+    def _command(self, right_rad_s: float, left_rad_s: float) -> SimDriveCommand:
         radius_m, vehicle = self._cfg.robot.wheel_radius_m, self._cfg.vehicle
         speed_m_s = 0.5 * radius_m * (right_rad_s + left_rad_s)
         if vehicle.kind == "ackermann":
-            return DriveCommand(speed_m_s, self._steer_rad, 0.0)
-        return DriveCommand(speed_m_s, 0.0, radius_m * (right_rad_s - left_rad_s) / vehicle.track_m)
+            return SimDriveCommand(speed_m_s, self._steer_rad, 0.0)
+        return SimDriveCommand(speed_m_s, 0.0, radius_m * (right_rad_s - left_rad_s) / vehicle.track_m)
 
     def _read(self, frame: WorldFrame | None) -> None:
         t_s = self.t_s
@@ -234,7 +234,7 @@ class BeaconRobot:
         )
 
 
-def _sample(t_s: float, sighting: Sighting) -> RadioSample:
+def _sample(t_s: float, sighting: TargetBearing) -> RadioSample:
     return RadioSample(t_s, sighting.beacon, sighting.rssi_dbm, sighting.bearing_rad)
 
 
@@ -307,7 +307,7 @@ def build_beacon_robot(cfg: RadioConfig) -> BeaconRobot:
     if cfg.system != "cricket":
         return BeaconRobot(cfg, world)
     rng = np.random.default_rng([cfg.run.seed, _EARS])
-    return BeaconRobot(cfg, world, RobotEars(cfg.cricket, cfg.listener, _motes(cfg), rng))
+    return BeaconRobot(cfg, world, MoteListener(cfg.cricket, cfg.listener, _motes(cfg), rng))
 
 
 def motes_of(cfg: RadioConfig) -> dict[str, tuple[float, float]]:

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from ccatp.config.models import SimEtalonConfig
 from ccatp.core import Vector3
 from ccatp.links import multiline
-from ccatp.links.multiline import ChannelData, Command, Connected, LaserReady, Notice, Remark, Reply, Request
+from ccatp.links.multiline import ChannelData, Command, Connected, LaserReady, MultilineRequest, Notice, Remark, Reply
 from ccatp.sim.laser import EtalonModel, PuckTruth
 
 _MAX_REPLY_BYTES = 4096
@@ -40,7 +40,7 @@ class TruthUnavailable(Exception):
     """The position of the puck could not be had."""
 
 
-class TruthSource(Protocol):
+class PuckSource(Protocol):
     """Where the stand-in learns the position of the puck."""
 
     async def puck(self) -> PuckTruth:
@@ -136,7 +136,7 @@ _MAX_CLIENTS = 64
 _BUSY = Remark("error", "busy")
 
 
-class EtalonStandIn:
+class EtalonSimulator:
     """The server.
 
     Attributes:
@@ -151,7 +151,7 @@ class EtalonStandIn:
         cfg: SimEtalonConfig,
         mirror_channels: Sequence[int],
         collimators_m: NDArray[np.float64],
-        truth: TruthSource,
+        truth: PuckSource,
         rng: np.random.Generator,
         *,
         measuring_time_s: float,
@@ -221,7 +221,7 @@ class EtalonStandIn:
             await _Session(self, writer).run(reader)
         except* asyncio.CancelledError:
             pass  # by close(); asyncio logs a connection's task that ends cancelled as an error
-        except* multiline.LineTooLong:
+        except* multiline.MultilineTooLong:
             self.counts["oversized_lines"] += 1
         except* (ConnectionError, TimeoutError):
             self.counts["lost_clients"] += 1
@@ -256,7 +256,7 @@ class EtalonStandIn:
 class _Session:
     """One client."""
 
-    def __init__(self, server: EtalonStandIn, writer: asyncio.StreamWriter) -> None:
+    def __init__(self, server: EtalonSimulator, writer: asyncio.StreamWriter) -> None:
         self._server = server
         self._writer = writer
         self._push: asyncio.Task[None] | None = None
@@ -278,7 +278,7 @@ class _Session:
     async def _handle(self, line: bytes, group: asyncio.TaskGroup) -> None:
         try:
             request = multiline.parse_request(line)
-        except multiline.BadRequest as error:
+        except multiline.BadMultilineRequest as error:
             self._server.counts["bad_requests"] += 1
             await self._send(Remark("error", error.reason))
             return
@@ -288,7 +288,7 @@ class _Session:
         if reply is Notice.STARTED:
             self._push = group.create_task(self._stream())
 
-    async def _answer(self, request: Request) -> Reply:
+    async def _answer(self, request: MultilineRequest) -> Reply:
         server = self._server
         command = request.command
         reply: Reply = _BUSY

@@ -26,13 +26,13 @@ from ccatp.sim.fault_models import (
     Blocked,
     Delayed,
     Drift,
-    Fault,
     Garbage,
+    InjectedFault,
+    InjectionRecord,
     Intermittent,
     Kidnap,
     NonFinite,
     Off,
-    Record,
     Runaway,
     Saturated,
     Signal,
@@ -43,11 +43,11 @@ from ccatp.sim.fault_models import (
     Wrong,
 )
 from ccatp.sim.plant import BodyStep, Plant
-from ccatp.sim.rules import Fans
+from ccatp.sim.rules import FanRules
 from ccatp.sim.world import World
 
 
-class _Step:
+class _StepFault:
     """What one step of the world shall be like: right and left of each."""
 
     __slots__ = ("grip", "health", "rates_rad_s")
@@ -68,14 +68,16 @@ class BodyFaults:
         drifts: the disturbances of the plant among them.
     """
 
-    def __init__(self, faults: Iterable[Fault], mirror: Mirror) -> None:
-        self.records = [Record(fault) for fault in faults]
+    def __init__(self, faults: Iterable[InjectedFault], mirror: Mirror) -> None:
+        self.records = [InjectionRecord(fault) for fault in faults]
         self.drifts = [
-            _Gliding(record, record.fault, mirror) for record in self.records if isinstance(record.fault, Drift)
+            _DriftFault(record, record.fault, mirror) for record in self.records if isinstance(record.fault, Drift)
         ]
         self._has_weak_fan = any(isinstance(record.fault, Weak) for record in self.records)
 
-    def act(self, world: World, fans: Fans, t_s: float, set_points_rad_s: tuple[float, float]) -> tuple[float, float]:
+    def act(
+        self, world: World, fans: FanRules, t_s: float, set_points_rad_s: tuple[float, float]
+    ) -> tuple[float, float]:
         """Before a step of the world; what its wheels turn by, right and left.
 
         Args:
@@ -84,7 +86,7 @@ class BodyFaults:
             t_s: time at the start of the step.
             set_points_rad_s: what the robot wants of the right and of the left wheel.
         """
-        step = _Step(set_points_rad_s)
+        step = _StepFault(set_points_rad_s)
         for record in self.records:
             fault = record.fault
             if isinstance(fault, Kidnap):
@@ -98,14 +100,14 @@ class BodyFaults:
         return step.rates_rad_s[0], step.rates_rad_s[1]
 
 
-def _kidnap(record: Record, fault: Kidnap, world: World, t_s: float) -> None:
+def _kidnap(record: InjectionRecord, fault: Kidnap, world: World, t_s: float) -> None:
     """Once."""
     if fault.has_begun(t_s) and not record.injected.samples:
         world.displace(fault.dx_m, fault.dy_m, fault.dheading_rad)
         record.add(t_s)
 
 
-def _befall(record: Record, step: _Step, plant: Plant, fans: Fans, t_s: float) -> None:
+def _befall(record: InjectionRecord, step: _StepFault, plant: Plant, fans: FanRules, t_s: float) -> None:
     """Let one lasting fault act on the wheels or fans that it names, or on both."""
     fault, rates = record.fault, step.rates_rad_s
     sides = {"right": (0,), "left": (1,)}.get(fault.signal.partition("_")[0], (0, 1))
@@ -129,10 +131,10 @@ def _befall(record: Record, step: _Step, plant: Plant, fans: Fans, t_s: float) -
                 step.health[k] *= fault.share
 
 
-class _Gliding:
+class _DriftFault:
     """A disturbance of the plant: downhill while the wheels are held at zero."""
 
-    def __init__(self, record: Record, fault: Drift, mirror: Mirror) -> None:
+    def __init__(self, record: InjectionRecord, fault: Drift, mirror: Mirror) -> None:
         self._record, self._fault, self._downhill = record, fault, Downhill(mirror)
 
     def displace(
@@ -282,7 +284,7 @@ class _NonFinite(_Unseeing):
         return (self._mark,) * len(reading)
 
 
-def make_effect(fault: Fault, signal: Signal, rng: np.random.Generator) -> Effect:
+def make_effect(fault: InjectedFault, signal: Signal, rng: np.random.Generator) -> Effect:
     """The effect of a fault on a signal.
 
     Raises:
@@ -337,14 +339,14 @@ class SensorFault:
 
     __slots__ = ("_effect", "_fault", "_is_raw", "_last", "_sees_from_s", "_signal", "record", "rows_name")
 
-    def __init__(self, fault: Fault, rng: np.random.Generator) -> None:
+    def __init__(self, fault: InjectedFault, rng: np.random.Generator) -> None:
         self._fault, self._signal = fault, SIGNALS[fault.signal]
         self._effect: Effect = make_effect(fault, self._signal, rng)
         self._is_raw = not self._signal.is_binary or isinstance(fault, Garbage | NonFinite)
         self._last: Reading | None = None
         self._sees_from_s = fault.at_s - _MEMORY_S - (fault.by_s if isinstance(fault, Delayed) else 0.0)
         self.rows_name = self._signal.rows
-        self.record = Record(fault)
+        self.record = InjectionRecord(fault)
 
     def apply(self, rows: list[Row], now_s: float) -> list[Row]:
         """The rows as they come out.
@@ -398,7 +400,7 @@ class LateRows:
         self._fault = fault
         self._waiting: deque[Row] = deque()
         self.rows_name = SIGNALS[fault.signal].rows
-        self.record = Record(fault)
+        self.record = InjectionRecord(fault)
 
     def apply(self, rows: list[Row], now_s: float) -> list[Row]:
         """As ``SensorFault.apply``."""
@@ -416,7 +418,7 @@ class LateRows:
         return [waiting.popleft() for _ in range(min(due, len(waiting)))]
 
 
-def make_sensor_fault(fault: Fault, rng: np.random.Generator) -> SensorFault | LateRows:
+def make_sensor_fault(fault: InjectedFault, rng: np.random.Generator) -> SensorFault | LateRows:
     """A fault of a sensor's signal, ready to act."""
     # Fans and battery are told in every frame and have no time of their own: late they are old readings.
     if isinstance(fault, Delayed) and fault.stamps == "old" and fault.signal not in _ALWAYS:

@@ -23,17 +23,17 @@ from ccatp.sim.fault_models import (
     SENSOR_SIGNALS,
     Drop,
     Duplicate,
-    Fault,
     Injected,
+    InjectedFault,
+    InjectionRecord,
     Jump,
     Raise,
     Reboot,
-    Record,
     Reorder,
     Wrap,
 )
 from ccatp.sim.fault_plan import FaultPlan
-from ccatp.sim.rules import Frame, as_line
+from ccatp.sim.rules import RobotFrame, as_line
 
 _MARKS = [(msgspec.json.encode(mark), token.encode()) for token, mark in TOKENS.items()]
 
@@ -60,8 +60,8 @@ class Stamping:
         faults: jump, wrap and raise.
     """
 
-    def __init__(self, faults: Iterable[Fault]) -> None:
-        self.records = [Record(fault) for fault in faults]
+    def __init__(self, faults: Iterable[InjectedFault]) -> None:
+        self.records = [InjectionRecord(fault) for fault in faults]
 
     def stamp(self, t_s: float, at_s: float, *, is_frame: bool) -> float:
         """The time that is written for ``at_s``, where the clock of the faults says ``t_s``."""
@@ -99,12 +99,12 @@ class Delivery:
         faults: drop, duplicate and reorder.
     """
 
-    def __init__(self, faults: Iterable[Fault]) -> None:
-        self.records = [Record(fault) for fault in faults]
+    def __init__(self, faults: Iterable[InjectedFault]) -> None:
+        self.records = [InjectionRecord(fault) for fault in faults]
         self._counts = [0] * len(self.records)
         self._withheld = b""
 
-    def send(self, t_s: float, frame: Frame) -> Outgoing:
+    def send(self, t_s: float, frame: RobotFrame) -> Outgoing:
         """What leaves when ``frame`` is due.
 
         Args:
@@ -139,7 +139,7 @@ class Delivery:
         self._withheld = b""
 
 
-def _raw_line(frame: Frame) -> bytes:
+def _raw_line(frame: RobotFrame) -> bytes:
     line = as_line(frame)
     for mark, token in _MARKS:
         line = line.replace(mark, token)
@@ -182,7 +182,7 @@ class Injector:
         self.body = BodyFaults((f for f in faults if f.signal in _BODY_SIGNALS), mirror)
         self._stamping = Stamping(f for f in faults if isinstance(f, Jump | Wrap | Raise))
         self._delivery = Delivery(f for f in faults if isinstance(f, Drop | Duplicate | Reorder))
-        self._reboots = [Record(fault) for fault in faults if isinstance(fault, Reboot)]
+        self._reboots = [InjectionRecord(fault) for fault in faults if isinstance(fault, Reboot)]
         own = [*(one.record for one in self._sensing), *self.body.records, *self._stamping.records]
         own += [*self._delivery.records, *self._reboots]
         self._records = [next(record for record in own if record.fault is fault) for fault in faults]
@@ -212,7 +212,7 @@ class Injector:
         self._seq_0, self._boot_s = seq, t_s
         self._delivery.forget()
 
-    def sense(self, frame: Frame) -> Frame:
+    def sense(self, frame: RobotFrame) -> RobotFrame:
         """The frame as the robot reads it."""
         t_s, gravity = frame.t, frame.gravity
         rows: dict[str, list[Row]] = {
@@ -227,13 +227,13 @@ class Injector:
             rows[one.rows_name] = one.apply(rows[one.rows_name], t_s)
         return self._stamped(frame, rows)
 
-    def _stamped(self, frame: Frame, rows: dict[str, list[Row]]) -> Frame:
+    def _stamped(self, frame: RobotFrame, rows: dict[str, list[Row]]) -> RobotFrame:
         stamping, t_s, boot_s = self._stamping, frame.t, self._boot_s
         imu, enc, edge, gravity = (
             stamping.stamp_rows(t_s, rows[name], boot_s) for name in ("imu", "enc", "edge", "gravity")
         )
         _, *fans = rows["fans"][-1]
-        return Frame(
+        return RobotFrame(
             frame.seq - self._seq_0,
             stamping.stamp(t_s, t_s - boot_s, is_frame=True),
             imu,
@@ -246,6 +246,6 @@ class Injector:
             stamping.raised(t_s),
         )
 
-    def deliver(self, t_s: float, frame: Frame | None) -> None:
+    def deliver(self, t_s: float, frame: RobotFrame | None) -> None:
         """Let ``frame`` leave, if one is due."""
         self.outgoing = NOTHING if frame is None else self._delivery.send(t_s, frame)

@@ -30,7 +30,7 @@ FAULT_NAMES = (
 )  # fmt: skip
 
 
-class Fault(Model):
+class InjectedFault(Model):
     """A fault of the simulated robot.
 
     Attributes:
@@ -58,7 +58,7 @@ class Fault(Model):
         return t_s >= self.at_s - _SAME_TIME_S
 
 
-class LastingFault(Fault):
+class LastingFault(InjectedFault):
     """A fault that lasts for ``for_s``, or until the end."""
 
     for_s: Positive | None = None
@@ -144,7 +144,7 @@ class Weak(LastingFault):
     share: Share
 
 
-class Kidnap(Fault):
+class Kidnap(InjectedFault):
     """The body is put elsewhere, relative to where it stands: deck frame."""
 
     dx_m: float
@@ -196,11 +196,11 @@ class Raise(LastingFault):
     ], ...], Field(min_length=1)]  # fmt: skip
 
 
-class Reboot(Fault):
+class Reboot(InjectedFault):
     """The robot starts anew: boot number, clock, sequence numbers and fans; every session is lost."""
 
 
-_ON_SENSORS: dict[str, type[Fault]] = {
+_ON_SENSORS: dict[str, type[InjectedFault]] = {
     "off": Off,
     "stuck": Stuck,
     "garbage": Garbage,
@@ -211,10 +211,10 @@ _ON_SENSORS: dict[str, type[Fault]] = {
     "saturated": Saturated,
     "non_finite": NonFinite,
 }
-_ON_WHEELS: dict[str, type[Fault]] = {"blocked": Blocked, "runaway": Runaway, "slip": Slip}
-_ON_FANS: dict[str, type[Fault]] = {"weak": Weak}
+_ON_WHEELS: dict[str, type[InjectedFault]] = {"blocked": Blocked, "runaway": Runaway, "slip": Slip}
+_ON_FANS: dict[str, type[InjectedFault]] = {"weak": Weak}
 
-TYPES: dict[str, dict[str, type[Fault]]] = {
+TYPES: dict[str, dict[str, type[InjectedFault]]] = {
     **dict.fromkeys(SENSOR_SIGNALS, _ON_SENSORS),
     "right_wheel": _ON_WHEELS,
     "left_wheel": _ON_WHEELS,
@@ -360,7 +360,7 @@ class Injected(NamedTuple):
     changed: int
 
 
-class Record:
+class InjectionRecord:
     """The record of one fault while it is written.
 
     Args:
@@ -369,7 +369,7 @@ class Record:
 
     __slots__ = ("_changed", "_from_s", "_is_told", "_samples", "_until_s", "fault")
 
-    def __init__(self, fault: Fault) -> None:
+    def __init__(self, fault: InjectedFault) -> None:
         self.fault = fault
         self._from_s: float | None = None
         self._until_s: float | None = None

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 
 from ccatp.config.messages import choice_hint, faults_of, format_key, format_value, nearest
 from ccatp.errors import ConfigError
-from ccatp.sim.fault_models import LINK_TYPES, LOCKSTEP_TYPES, TYPES, Fault, LinkFault, Saturated, Wrong
+from ccatp.sim.fault_models import LINK_TYPES, LOCKSTEP_TYPES, TYPES, InjectedFault, LinkFault, Saturated, Wrong
 
 _SECTIONS = ("fault", "link")
 _Model = TypeVar("_Model", bound=BaseModel)
@@ -25,7 +25,7 @@ class FaultPlan(NamedTuple):
         link: of the robot link.
     """
 
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[InjectedFault, ...] = ()
     link: tuple[LinkFault, ...] = ()
 
 
@@ -84,7 +84,7 @@ class _Entry:
         self._name, self._text, self._section, self._index, self._row = name, text, section, index, row
         self.problems: list[str] = []
 
-    def fault(self) -> Fault | None:
+    def fault(self) -> InjectedFault | None:
         """The fault of the robot; ``None`` with problems."""
         types = self._choice("signal", TYPES)
         model = self._choice("type", types) if types is not None else None

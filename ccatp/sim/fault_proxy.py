@@ -13,7 +13,7 @@ from math import inf
 from typing import Literal, Self, cast
 
 from ccatp.sim.fault_models import Injected, LastingLinkFault, LinkFault, Reset
-from ccatp.sim.network_faults import Conduct, FloodLines, Pipe
+from ccatp.sim.network_faults import FloodLines, NetworkFaults, Pipe
 
 Direction = Literal["to_client", "to_server", "both"]
 OneWay = Literal["to_client", "to_server"]
@@ -73,7 +73,7 @@ class FaultProxy:
     def __init__(self, host: str, port: int, *, seed: int, listener: socket.socket | None = None) -> None:
         self._address, self._own_listener = (host, port), listener
         self._rng = random.Random(seed)
-        self._conducts: dict[OneWay, Conduct] = {way: Conduct() for way in _BOTH}
+        self._conducts: dict[OneWay, NetworkFaults] = {way: NetworkFaults() for way in _BOTH}
         self._connections: set[_Connection] = set()
         self._handlers: set[asyncio.Task[None]] = set()
         self._flooding: asyncio.Task[None] | None = None
@@ -178,7 +178,7 @@ class FaultProxy:
 
     def heal(self, direction: Direction = "both", fault: str | None = None) -> None:
         """End every fault that lasts, or one, named as its method."""
-        sound = Conduct()
+        sound = NetworkFaults()
         for way in _ways(direction):
             for name in _FIELDS[fault] if fault else [name for names in _FIELDS.values() for name in names]:
                 setattr(self._conducts[way], name, getattr(sound, name))

@@ -40,7 +40,7 @@ class TruthSource(Protocol):
         """The reply to a request."""
 
 
-class TruthOutlet:
+class GroundTruthPublisher:
     """Gives the truth away by ZeroMQ.
 
     Args:
@@ -97,7 +97,7 @@ PERIOD_FRAMES = 10
 _POSE, _CRC = Struct("<3d"), Struct("<I")
 
 
-class BodyFile:
+class SimPoseFile:
     """Keeps the true pose, ten times a second of its time.
 
     Args:

@@ -73,7 +73,7 @@ def _unit(mote: MotePlaceConfig) -> FloatArray:
 _ABSOLUTE_ZERO_C = -273.15
 
 
-class Heard(NamedTuple):
+class MotePulse(NamedTuple):
     """Readings of one pair.
 
     Attributes:
@@ -115,7 +115,7 @@ class MoteField:
         off = _off_axis(facings[transmitter], way), _off_axis(facings[listener], -way)
         return self._cfg.transducer.nearest_m <= distance_m <= usable_reach(self._cfg.transducer, *off)
 
-    def listen(self, pairs: Sequence[tuple[int, int]], repeats: int, rng: np.random.Generator) -> list[Heard]:
+    def listen(self, pairs: Sequence[tuple[int, int]], repeats: int, rng: np.random.Generator) -> list[MotePulse]:
         """Readings of pairs; a pair that hears nothing is left out.
 
         Args:
@@ -129,7 +129,7 @@ class MoteField:
                 continue
             delays_s = self._delays(transmitter, listener, repeats, rng)
             if delays_s.size:
-                heard.append(Heard(transmitter, listener, delays_s, float(self._temperatures_c[listener])))
+                heard.append(MotePulse(transmitter, listener, delays_s, float(self._temperatures_c[listener])))
         return heard
 
     def _delays(self, transmitter: int, listener: int, repeats: int, rng: np.random.Generator) -> FloatArray:
@@ -172,7 +172,7 @@ def _off_axis(facing: FloatArray, way: FloatArray) -> float:
 _DIGITS = 9  # of a delay on the link: a nanosecond is a third of a micrometre
 
 
-class RobotEars:
+class MoteListener:
     """Hears frame by frame.
 
     Args:

@@ -18,7 +18,7 @@ _GARBAGE_LINE_BYTES = 64
 
 
 @dataclass(slots=True)
-class Conduct:
+class NetworkFaults:
     """What is switched on in one direction, for the connections that are and for those to come.
 
     Attributes:
@@ -63,7 +63,7 @@ class LineStage:
         rng: draws bytes and places.
     """
 
-    def __init__(self, conduct: Conduct, counts: "Counter[str]", rng: random.Random) -> None:
+    def __init__(self, conduct: NetworkFaults, counts: "Counter[str]", rng: random.Random) -> None:
         self._conduct, self._counts, self._rng = conduct, counts, rng
         self._rest = self._withheld = b""
         self._seen: Counter[str] = Counter()
@@ -159,7 +159,7 @@ class Pipe:
         self,
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
-        conduct: Conduct,
+        conduct: NetworkFaults,
         counts: "Counter[str]",
         rng: random.Random,
         may_write: Callable[[bytes], bytes],

@@ -30,7 +30,7 @@ from ccatp.config.beacon_models import (
 from ccatp.core import bearing, wrap_pi
 
 
-class DriveCommand(NamedTuple):
+class SimDriveCommand(NamedTuple):
     """Set points until the next step.
 
     Attributes:
@@ -44,7 +44,7 @@ class DriveCommand(NamedTuple):
     turn_rate_rad_s: float
 
 
-HALT = DriveCommand(0.0, 0.0, 0.0)
+HALT = SimDriveCommand(0.0, 0.0, 0.0)
 
 
 class TruePose(NamedTuple):
@@ -72,7 +72,7 @@ class Packet(NamedTuple):
     rssi_dbm: float
 
 
-class Sighting(NamedTuple):
+class TargetBearing(NamedTuple):
     """A scan that comes as its result: one signal strength and one bearing, left of the heading."""
 
     beacon: str
@@ -94,7 +94,7 @@ class WorldFrame(NamedTuple):
     time_s: float
     wheels: WheelReading
     packets: tuple[Packet, ...]
-    sightings: tuple[Sighting, ...]
+    sightings: tuple[TargetBearing, ...]
     distances_m: tuple[float, ...]
 
 
@@ -268,14 +268,14 @@ class TrueRadio:
             found.append(Ray(_seen_from(pose, place_m), self._path_dbm(way_m) - loss_db))
         return found
 
-    def sight(self, pose: TruePose, sender_m: Point) -> Sighting | None:
+    def sight(self, pose: TruePose, sender_m: Point) -> TargetBearing | None:
         """The result of a scan, drawn: direction of the strongest ray with noise, to the nearest step; None if lost."""
         strongest = max(self.rays(pose, sender_m), key=lambda ray: ray.level_dbm)
         level_dbm = self._received(strongest.level_dbm)
         noisy_rad = strongest.direction_rad + self._cfg.bearing_sigma_rad * self._noise.standard_normal()
         if level_dbm is None:
             return None
-        return Sighting(self._name, level_dbm, wrap_pi(round(noisy_rad / self._step_rad) * self._step_rad))
+        return TargetBearing(self._name, level_dbm, wrap_pi(round(noisy_rad / self._step_rad) * self._step_rad))
 
     def scan(self, pose: TruePose, sender_m: Point) -> list[Packet]:
         """The packets of one turn of the reflector, in the order of its steps; lost ones are missing."""

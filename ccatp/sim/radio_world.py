@@ -9,11 +9,11 @@ import numpy as np
 
 from ccatp.config.beacon_models import RadioConfig, SimVehicleConfig, VehicleConfig
 from ccatp.sim.radio import (
-    DriveCommand,
     Incidents,
     MovingTarget,
     Packet,
-    Sighting,
+    SimDriveCommand,
+    TargetBearing,
     TruePose,
     TrueRadio,
     WheelReading,
@@ -45,7 +45,7 @@ class TrueVehicle:
         self._rng = rng
         self.pose = pose
 
-    def step(self, command: DriveCommand, interval_s: float) -> WheelReading:
+    def step(self, command: SimDriveCommand, interval_s: float) -> WheelReading:
         """Drive for an interval (s); what the odometry tells of it."""
         limits, truth = self._geometry, self._truth
         speed_m_s = _clamped(command.speed_m_s, limits.speed_max_m_s)
@@ -136,7 +136,7 @@ class RadioWorld:
         """Between the vehicle's body and the nearest obstacle; negative after a collision."""
         return clearance_m(self.pose, self.obstacles) - self._cfg.vehicle.radius_m
 
-    def step(self, command: DriveCommand, interval_s: float, *, static: bool, target: bool) -> WorldFrame:
+    def step(self, command: SimDriveCommand, interval_s: float, *, static: bool, target: bool) -> WorldFrame:
         """Drive on, then listen.
 
         Args:
@@ -157,7 +157,7 @@ class RadioWorld:
         packets, sightings = self._heard(static=static, target=target)
         return WorldFrame(self.time_s, wheels, packets, sightings, self._seen())
 
-    def _heard(self, *, static: bool, target: bool) -> tuple[tuple[Packet, ...], tuple[Sighting, ...]]:
+    def _heard(self, *, static: bool, target: bool) -> tuple[tuple[Packet, ...], tuple[TargetBearing, ...]]:
         places = dict(self.beacons_m) if static else {}
         if target and self.target_m is not None:
             places[self._cfg.follow.target] = self.target_m

@@ -32,11 +32,11 @@ import numpy as np
 from ccatp.config.models import Config
 from ccatp.core import DeckPose
 from ccatp.links.robot_messages import MAX_LINE_BYTES, PROTOCOL, CommandEcho, Hello, RobotData, Sensors
-from ccatp.links.topics import Misalignment, Truth
+from ccatp.links.topics import Misalignment, TruthMessage
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.fault_injector import Injector
 from ccatp.sim.fault_plan import FaultPlan
-from ccatp.sim.rules import Fans, Frame, MotionRules, as_line, as_message
+from ccatp.sim.rules import FanRules, MotionRules, RobotFrame, as_line, as_message
 from ccatp.sim.sensors import SensorSuite
 from ccatp.sim.world import TruthRow, World
 
@@ -53,7 +53,7 @@ class CommandDelay:
     __slots__ = ("_drives", "_duties", "_fans", "_frames", "_newest_drive", "_newest_duty", "_newest_permit",
                  "_permits", "_rules")  # fmt: skip
 
-    def __init__(self, rules: MotionRules, fans: Fans, frames: int) -> None:
+    def __init__(self, rules: MotionRules, fans: FanRules, frames: int) -> None:
         self._rules, self._fans, self._frames = rules, fans, frames
         # (frame in which it is due, what the rules or the fans take)
         self._drives: deque[tuple[int, int, float, float, float]] = deque()
@@ -172,7 +172,7 @@ class Robot:
         self._cfg = cfg
         self._floor = sim.fan_floor if mirror.overhang else 0.0
         self.rules = MotionRules(sim.ttl_s, cfg.robot.max_wheel_rad_s)
-        self.fans = Fans(self._floor)
+        self.fans = FanRules(self._floor)
         self.sensors_delay_frames = round(cfg.world.sensors_delay_s * sim.frame_hz)
         self.commands_delay_frames = round(cfg.world.commands_delay_s * sim.frame_hz)
         self._commands = CommandDelay(self.rules, self.fans, self.commands_delay_frames)
@@ -194,7 +194,7 @@ class Robot:
         self.world.watch(self._sensors.edges)
         self.seq, self.t_s = 0, 0.0
         # The newest frame last; the first is delivered once the deque is full.
-        self._frames: deque[Frame] = deque(maxlen=self.sensors_delay_frames + 1)
+        self._frames: deque[RobotFrame] = deque(maxlen=self.sensors_delay_frames + 1)
         self._delivered: Sensors | None = None
         self._line = b""
         self._read()
@@ -306,7 +306,7 @@ class Robot:
         sim, health = self._cfg.sim.robot, self.fans.health
         self.reboots += 1
         self.rules = MotionRules(sim.ttl_s, self._cfg.robot.max_wheel_rad_s, self.t_s)
-        self.fans = Fans(self._floor)
+        self.fans = FanRules(self._floor)
         self.fans.health = health
         self._commands = CommandDelay(self.rules, self.fans, self.commands_delay_frames)
         self._frames.clear()
@@ -336,7 +336,7 @@ class Robot:
         return self._delivered
 
     @property
-    def delivered_rows(self) -> Frame | None:
+    def delivered_rows(self) -> RobotFrame | None:
         """The same with plain tuples for samples, at no cost, before the faults of its delivery; leave it as it is."""
         frames = self._frames
         return frames[0] if len(frames) > self.sensors_delay_frames else None
@@ -362,7 +362,7 @@ class Robot:
         drive_seq, age_s, permit_age_s, is_held = self.rules.echo(t_s)
         is_held = is_held or self.world.is_fallen
         cmd = CommandEcho(drive_seq, round(age_s * 1e6) / 1e6, round(permit_age_s * 1e6) / 1e6, is_held)
-        frame = Frame(seq, t_s, imu, encoders, edges, gravity, self.fans.duty, 1.0, cmd, ())
+        frame = RobotFrame(seq, t_s, imu, encoders, edges, gravity, self.fans.duty, 1.0, cmd, ())
         injector = self.injector
         self._frames.append(frame if injector is None else injector.sense(frame))
         self._delivered, self._line = None, b""
@@ -421,13 +421,13 @@ class TruthLog:
         self._is_fallen = world.is_fallen
         return has_changed or len(self._rows) >= BATCH_ROWS
 
-    def take(self) -> Truth | None:
+    def take(self) -> TruthMessage | None:
         """The pending rows as a message of the topic table, or ``None`` without any."""
         rows, self._rows = self._rows, []
         self._taken += len(rows)
-        return Truth(seq=self._robot.seq, t_s=self._robot.t_s, rows=rows) if rows else None
+        return TruthMessage(seq=self._robot.seq, t_s=self._robot.t_s, rows=rows) if rows else None
 
-    def batch(self) -> tuple[str, Truth] | None:
+    def batch(self) -> tuple[str, TruthMessage] | None:
         """The same with its topic."""
         rows = self.take()
         return None if rows is None else ("truth", rows)

@@ -140,7 +140,7 @@ class MotionRules:
         return seq, max(now_s - self._drive_s, 0.0), max(now_s - self._permit_s, 0.0), self.is_held
 
 
-class Fans:
+class FanRules:
     """Fan duties: in force until changed by a newer command, never by time or by a lost session.
 
     Args:
@@ -180,7 +180,7 @@ class Fans:
 _Row = TypeVar("_Row", ImuSample, WheelSample, EdgeSample)
 
 
-class Frame(msgspec.Struct, frozen=True, gc=False):
+class RobotFrame(msgspec.Struct, frozen=True, gc=False):
     """A frame as it was read: what ``Sensors`` says, in the same places, with samples as plain tuples.
 
     Making named tuples of twenty samples takes as long as reading them, so it waits until somebody asks for names.
@@ -198,13 +198,13 @@ class Frame(msgspec.Struct, frozen=True, gc=False):
     faults: tuple[str, ...]
 
 
-def as_line(frame: Frame) -> bytes:
+def as_line(frame: RobotFrame) -> bytes:
     """The frame as a line with its LF."""
     seq, t_s, imu, encoders, edges, gravity, fans, soc, cmd, faults = msgspec.structs.astuple(frame)
     return encode_sensors(seq, t_s, imu, encoders, edges, gravity, fans, soc, msgspec.structs.astuple(cmd), faults)
 
 
-def as_message(frame: Frame) -> Sensors:
+def as_message(frame: RobotFrame) -> Sensors:
     """The message that a client decodes from the frame's line."""
     gravity = frame.gravity
     return Sensors(

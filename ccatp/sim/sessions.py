@@ -42,7 +42,7 @@ from ccatp.links.robot_messages import (
     Unknown,
 )
 from ccatp.links.robot_messages import Fans as FansMessage
-from ccatp.sim.rules import Fans, MotionRules
+from ccatp.sim.rules import FanRules, MotionRules
 
 JOIN_TIMEOUT_S = 2.0
 SILENCE_S = 5.0
@@ -73,7 +73,7 @@ class ServedRobot(Protocol):
     """
 
     rules: MotionRules
-    fans: Fans
+    fans: FanRules
     frame_s: float
     t_s: float
     reboots: int
@@ -125,7 +125,7 @@ class ServedRobot(Protocol):
         """Drive one frame and read the sensors."""
 
 
-class Session:
+class RobotSession:
     """One client.
 
     Attributes:
@@ -216,8 +216,8 @@ class RobotServer:
         self._is_lockstep, self._boot, self._key = lockstep, boot, key
         self._make_nonce, self._note, self._on_frame = make_nonce, note, on_frame
         self._boot_s = now_s
-        self._sessions: set[Session] = set()
-        self._holders: dict[Role, Session] = {}
+        self._sessions: set[RobotSession] = set()
+        self._holders: dict[Role, RobotSession] = {}
         self._last_session = 0
         self._is_drive_acked = self._is_permit_acked = False
         self._frame_wall_s = now_s
@@ -226,9 +226,9 @@ class RobotServer:
 
     # -- connections ----------------------------------------------------------------------------------------------
 
-    def accept(self, wire: Wire, now_s: float) -> Session:
+    def accept(self, wire: Wire, now_s: float) -> RobotSession:
         """A client connected."""
-        session = Session(self, wire, self._make_nonce(), now_s)
+        session = RobotSession(self, wire, self._make_nonce(), now_s)
         auth = AUTH_NONE if self._key is None else AUTH_HMAC
         hello = self.robot.hello(
             boot=self._boot + self._reboots, nonce=session.nonce, auth=auth, lockstep=self._is_lockstep
@@ -239,7 +239,7 @@ class RobotServer:
             self.refuse(session, "busy")
         return session
 
-    def lost(self, session: Session) -> None:
+    def lost(self, session: RobotSession) -> None:
         """The connection of a session is gone (or shall be forgotten): its role is free, the wheels are held."""
         session.is_open = False
         self._sessions.discard(session)
@@ -255,13 +255,13 @@ class RobotServer:
             self._is_permit_acked = False
         self._note(f"{role} lost: wheels held")
 
-    def drop(self, session: Session, why: str) -> None:
+    def drop(self, session: RobotSession, why: str) -> None:
         """Close a session."""
         self._note(f"{session.role or 'client'} dropped: {why}")
         self.lost(session)
         session.wire.close()
 
-    def refuse(self, session: Session, reason: RefusalReason) -> None:
+    def refuse(self, session: RobotSession, reason: RefusalReason) -> None:
         """Tell a client that it gets no role, and close."""
         self.counts["refused"] += 1
         session.wire.write(encode(Refused(reason=reason)))
@@ -281,7 +281,7 @@ class RobotServer:
 
     # -- roles ----------------------------------------------------------------------------------------------------
 
-    def join(self, session: Session, message: FromClient, now_s: float) -> None:
+    def join(self, session: RobotSession, message: FromClient, now_s: float) -> None:
         """A session that has no role yet sent its first message."""
         # The round of `check_time` may come later than this message: the limit holds all the same.
         if not isinstance(message, Join) or now_s - session.joined_s > JOIN_TIMEOUT_S:
@@ -305,7 +305,7 @@ class RobotServer:
         self._frame_wall_s, self._is_stall_noted = now_s, False
         self._begin(session, message.role)
 
-    def _begin(self, session: Session, role: Role) -> None:
+    def _begin(self, session: RobotSession, role: Role) -> None:
         robot = self.robot
         if role == "controller":
             robot.join_controller()
@@ -329,7 +329,7 @@ class RobotServer:
             self._on_frame()
             self._heed_reboot()
 
-    def command(self, session: Session, role: Role, message: FromClient, now_s: float) -> bool:
+    def command(self, session: RobotSession, role: Role, message: FromClient, now_s: float) -> bool:
         """A message of a session that has a role; false when it is not for this role."""
         robot_s = self._robot_time_s(now_s)
         robot = self.robot

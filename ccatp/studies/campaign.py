@@ -121,7 +121,7 @@ class Job:
         return sha256(dumps(whole, sort_keys=True).encode()).hexdigest()[:16]
 
 
-class Outcome(NamedTuple):
+class JobOutcome(NamedTuple):
     """What comes of a job, or of all jobs of a cell.
 
     Attributes:
@@ -176,8 +176,8 @@ class Study:
     name: str
     title: str
     cells: Callable[[], Sequence[Cell]]
-    run_job: Callable[[Job], Outcome]
-    combine: Callable[[Factors, Sequence[Outcome]], Outcome]
+    run_job: Callable[[Job], JobOutcome]
+    combine: Callable[[Factors, Sequence[JobOutcome]], JobOutcome]
     columns: Sequence[Column]
     draw: Callable[[Sequence[CellResult], Path], None]
     defaults: Mapping[str, object] = field(default_factory=dict)
@@ -363,7 +363,7 @@ LEAST = 1e-9  # anything smaller falls into the first bin
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class Histogram:
     """A histogram with logarithmic bins, empty ones left out.
 
     Attributes:
@@ -381,7 +381,7 @@ class Spread:
     within: int
 
     @classmethod
-    def of(cls, values: FloatArray, limit: float) -> "Spread":
+    def of(cls, values: FloatArray, limit: float) -> "Histogram":
         """The spread of values, shape (n,).
 
         Raises:
@@ -429,21 +429,21 @@ class Spread:
         return {f"{name}_bins": self.bins.astype(np.int32), f"{name}_counts": self.counts, f"{name}_figures": figures}
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, NDArray[np.generic]], name: str) -> "Spread":
+    def from_arrays(cls, arrays: dict[str, NDArray[np.generic]], name: str) -> "Histogram":
         """What ``to_arrays`` made."""
         total, largest, within = arrays[f"{name}_figures"].astype(np.float64).tolist()
         bins, counts = arrays[f"{name}_bins"].astype(np.int64), arrays[f"{name}_counts"].astype(np.int64)
         return cls(bins, counts, total, largest, int(within))
 
 
-def pooled(spreads: Sequence[Spread]) -> Spread:
+def pooled(spreads: Sequence[Histogram]) -> Histogram:
     """All of them in one."""
     places = np.concatenate([spread.bins for spread in spreads]) if spreads else np.empty(0, dtype=np.int64)
     counts = np.concatenate([spread.counts for spread in spreads]) if spreads else np.empty(0, dtype=np.int64)
     bins, where = np.unique(places, return_inverse=True)
     sums = np.zeros(len(bins), dtype=np.int64)
     np.add.at(sums, where, counts)
-    return Spread(
+    return Histogram(
         bins,
         sums,
         sum(spread.total for spread in spreads),

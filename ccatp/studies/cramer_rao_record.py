@@ -9,11 +9,11 @@ import numpy as np
 from ccatp.config.models import Config
 from ccatp.core import Fix, FloatArray, PanelId, PointId
 from ccatp.estimation.fixes import deck_foot
-from ccatp.estimation.seams import EdgeScanner, Transition
+from ccatp.estimation.seams import EdgeScanner, SensorTransition
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.mirror import Mirror
-from ccatp.studies.sil_models import Rehearsal
-from ccatp.studies.sil_run import Rehearsing
+from ccatp.studies.sil_models import SilResult
+from ccatp.studies.sil_run import SilRun
 
 T, X, Y, HX, HY, LX, LY, FX, FY, RIGHT, LEFT, RIGHT_SCALE, LEFT_SCALE, ORDERED = range(14)
 """Columns of the way.
@@ -78,14 +78,14 @@ class TrueRecord:
     base_m: float
 
 
-class RecordedRehearsing(Rehearsing):
+class RecordedSilRun(SilRun):
     """A rehearsal with its record; everything random stays as it is without."""
 
     def __init__(self, cfg: Config, *, with_track: bool = False) -> None:
         super().__init__(cfg, with_track=with_track)
         self._way = array("d")
         self._scanner = EdgeScanner()
-        self._transitions: list[Transition] = []
+        self._transitions: list[SensorTransition] = []
         self._fixes: list[StopFix] = []
 
     def record(self) -> TrueRecord:
@@ -120,14 +120,14 @@ class RecordedRehearsing(Rehearsing):
         super()._fuse(fix)
 
 
-def rehearse_recorded(cfg: Config, *, with_track: bool = False) -> tuple[Rehearsal, TrueRecord]:
+def rehearse_recorded(cfg: Config, *, with_track: bool = False) -> tuple[SilResult, TrueRecord]:
     """Survey the mirror of a configuration in its world, and keep the record.
 
     Args:
         cfg: the configuration; ``run.seed`` seeds everything.
         with_track: keep true and estimated pose of every frame.
     """
-    rehearsing = RecordedRehearsing(cfg, with_track=with_track)
+    rehearsing = RecordedSilRun(cfg, with_track=with_track)
     return rehearsing.run(), rehearsing.record()
 
 
@@ -135,7 +135,7 @@ def passes_of(
     mirror: Mirror,
     sensors_m: tuple[tuple[float, float], ...],
     way: FloatArray,
-    transitions: list[Transition],
+    transitions: list[SensorTransition],
     frame_s: float,
 ) -> tuple[SeamPass, ...]:
     """Which edges the transitions belong to, from the true way; those over the rim are left out.

@@ -13,7 +13,7 @@ import numpy as np
 from ccatp.config.load import load_radio_config
 from ccatp.report.drawing import INK, QUIET
 from ccatp.report.plots import dress, new_figure
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
+from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.figures import LIMIT, colour, save
 from ccatp.studies.mote_runs import look_ahead, run_batch, run_filter, simulate_field
 
@@ -162,7 +162,7 @@ CASES = {
 }
 
 
-def run_job(job: Job) -> Outcome:
+def run_job(job: Job) -> JobOutcome:
     """One field of one case."""
     case = CASES[str(job.factors["case"])]
     cfg = load_radio_config(None, {"system": "cricket", **case.keys}).cricket
@@ -192,10 +192,10 @@ def run_job(job: Job) -> Outcome:
         "positions_m": run.positions_m,
         "true_m": run.true_m,
     }
-    return Outcome(values, arrays)
+    return JobOutcome(values, arrays)
 
 
-def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
+def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """Median and 10 to 90 % of a case, and its traces."""
     case = CASES[str(factors["case"])]
     rms = np.array([outcome.values["rms_m"] for outcome in outcomes])
@@ -231,7 +231,7 @@ def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
         "positions_m": np.array([outcome.arrays["positions_m"] for outcome in outcomes]),
         "true_m": np.asarray(outcomes[0].arrays["true_m"]),
     }
-    return Outcome(values, arrays)
+    return JobOutcome(values, arrays)
 
 
 def draw(cells: Sequence[CellResult], out: Path) -> None:

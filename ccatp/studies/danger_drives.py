@@ -16,7 +16,7 @@ from ccatp.config.models import Config
 from ccatp.core import DeckPose, EdgeSample, EventCode, ImuSample, PanelId, WheelSample
 from ccatp.danger import DangerMonitor
 from ccatp.links.robot_messages import CommandEcho
-from ccatp.links.topics import Estimate, is_estimate_due
+from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.mirror.layout import Panel
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.plant import Plant
@@ -35,7 +35,7 @@ _BLIND_M = 0.4  # an edge that nobody saw by now is not going to be seen
 
 
 @dataclass(frozen=True, slots=True)
-class Errors:
+class EdgeErrors:
     """How wrong the estimate is that the rules get, drawn once per drive.
 
     Attributes:
@@ -47,7 +47,7 @@ class Errors:
     heading_rad: float
 
 
-class Frame(NamedTuple):
+class DriveFrame(NamedTuple):
     """The part of a sensors frame that the rules read."""
 
     seq: int
@@ -61,10 +61,10 @@ class Frame(NamedTuple):
     faults: Sequence[str] = ()
 
 
-class Rule(Protocol):
+class EdgeRuleUnderTest(Protocol):
     """Judges frame by frame."""
 
-    def judge(self, frame: Frame, estimate: Estimate) -> bool:
+    def judge(self, frame: DriveFrame, estimate: EstimateMessage) -> bool:
         """Whether there is an edge."""
 
 
@@ -79,7 +79,7 @@ class OffTimeRule:
         self._off_s = off_s
         self._since_s: list[float | None] = [None] * 4
 
-    def judge(self, frame: Frame, estimate: Estimate) -> bool:
+    def judge(self, frame: DriveFrame, estimate: EstimateMessage) -> bool:
         """Whether a sensor has been off for so long; once it is back on its time begins anew."""
         del estimate  # the rule knows no map
         found = False
@@ -106,12 +106,12 @@ class MapRule:
     def __init__(self, mirror: Mirror, cfg: Config) -> None:
         self._monitor = DangerMonitor(mirror, cfg.robot, cfg.danger)
 
-    def judge(self, frame: Frame, estimate: Estimate) -> bool:
+    def judge(self, frame: DriveFrame, estimate: EstimateMessage) -> bool:
         """Whether the verdict's code is that of an edge."""
         return self._monitor.step(frame, estimate).code is EventCode.NEAR_EDGE
 
 
-def build_rule(name: str, mirror: Mirror, cfg: Config, off_s: float) -> Rule:
+def build_rule(name: str, mirror: Mirror, cfg: Config, off_s: float) -> EdgeRuleUnderTest:
     """A rule by its name out of ``RULES``.
 
     Raises:
@@ -135,7 +135,9 @@ class Rig:
         rng: parent of every draw.
     """
 
-    def __init__(self, mirror: Mirror, cfg: Config, start: DeckPose, errors: Errors, rng: np.random.Generator) -> None:
+    def __init__(
+        self, mirror: Mirror, cfg: Config, start: DeckPose, errors: EdgeErrors, rng: np.random.Generator
+    ) -> None:
         slip_rng, error_rng, sensors_rng = rng.spawn(3)
         world, robot = cfg.world, cfg.robot
         self.plant = plant = Plant(
@@ -165,7 +167,7 @@ class Rig:
         self._sensors.enter(0)
         self._estimate = self._estimated()
 
-    def frame(self, right_rad_s: float, left_rad_s: float) -> tuple[Frame, Estimate]:
+    def frame(self, right_rad_s: float, left_rad_s: float) -> tuple[DriveFrame, EstimateMessage]:
         """Drive one frame on these set points; what is known at its end: the frame, and the estimate before it."""
         estimate, sensors, plant = self._estimate, self._sensors, self.plant
         t_s = self._seq * self._frame_s
@@ -176,16 +178,16 @@ class Rig:
         enc = named(WheelSample, sensors.read_encoders(plant))
         if is_estimate_due(self._seq):
             self._estimate = self._estimated()
-        return Frame(self._seq, self._seq * self._frame_s, enc, edge), estimate
+        return DriveFrame(self._seq, self._seq * self._frame_s, enc, edge), estimate
 
     @property
     def places(self) -> list[tuple[float, float]]:
         """Deck places of the edge sensors, m."""
         return self._sensors.edges.places
 
-    def _estimated(self) -> Estimate:
+    def _estimated(self) -> EstimateMessage:
         p, (dx, dy, turn) = self.plant, self._error
-        return Estimate(
+        return EstimateMessage(
             seq=self._seq,
             t_s=self._seq * self._frame_s,
             x_m=p.x_m + dx,
@@ -204,7 +206,7 @@ class Rig:
 
 
 def transit(
-    mirror: Mirror, cfg: Config, v_m_s: float, angle_rad: float | None, errors: Errors, rng: np.random.Generator
+    mirror: Mirror, cfg: Config, v_m_s: float, angle_rad: float | None, errors: EdgeErrors, rng: np.random.Generator
 ) -> tuple[bool, ...]:
     """Cross a seam between two columns, or turn by a quarter beside it; whether each rule took it for an edge.
 
@@ -264,7 +266,7 @@ class Overrun(NamedTuple):
 
 
 def drive_to_rim(
-    mirror: Mirror, cfg: Config, v_m_s: float, angle_rad: float, name: str, errors: Errors, rng: np.random.Generator
+    mirror: Mirror, cfg: Config, v_m_s: float, angle_rad: float, name: str, errors: EdgeErrors, rng: np.random.Generator
 ) -> Overrun:
     """Drive over the rim until a rule sees an edge; the set points are zero one frame and the link's delays later.
 

@@ -16,8 +16,8 @@ import numpy as np
 from ccatp.core import FloatArray
 from ccatp.mirror.mirror import build_mirror
 from ccatp.report.plots import dress, new_figure
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
-from ccatp.studies.danger_drives import RULES, Errors, drive_to_rim, transit
+from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
+from ccatp.studies.danger_drives import RULES, EdgeErrors, drive_to_rim, transit
 from ccatp.studies.figures import colour, save
 
 _TITLES = {"thesis": "off for 0.1 s (thesis)", "shipped": "travel against the map (ours)"}
@@ -120,7 +120,7 @@ CROSSINGS: tuple[int | str, ...] = (0, 15, 30, 45, 60, "turn")
 TURN = "turn"
 _DRIVES = 25  # of each kind in a job
 # What a good localizer gives the rules in a disturbed world.
-_ERRORS = Errors(position_m=1.5e-3, heading_rad=2e-3)
+_ERRORS = EdgeErrors(position_m=1.5e-3, heading_rad=2e-3)
 _TRANSITS, _RIM = 3, 4  # streams of random numbers of a seed
 _Z_95 = 1.96  # quantiles of the normal distribution
 _RESAMPLES = 2000
@@ -131,7 +131,7 @@ def cells() -> Sequence[Cell]:
     return [Cell({"speed_m_s": v_m_s, "crossing": way}) for v_m_s in SPEEDS_M_S for way in CROSSINGS]
 
 
-def run_job(job: Job) -> Outcome:
+def run_job(job: Job) -> JobOutcome:
     """So many transits, and as many drives to the rim for each rule."""
     cfg, v_m_s, way = job.cfg, float(job.factors["speed_m_s"]), job.factors["crossing"]
     mirror = build_mirror(cfg.mirror)
@@ -154,10 +154,10 @@ def run_job(job: Job) -> Outcome:
             ]
             values[name]["falls"] = sum(drive.has_fallen for drive in drives)
             arrays[f"{name}_overrun_m"] = np.array([drive.sensor_m for drive in drives])
-    return Outcome(values, arrays)
+    return JobOutcome(values, arrays)
 
 
-def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
+def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """Probability of a false edge per transit with its interval, and the distribution of the overrun."""
     del factors
     transits = sum(outcome.values["transits"] for outcome in outcomes)
@@ -178,7 +178,7 @@ def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
             arrays[key] = np.concatenate(kept)
             values[name] |= _overrun_figures(arrays[key])
             values[name]["falls"] = sum(outcome.values[name]["falls"] for outcome in outcomes)
-    return Outcome(values, arrays)
+    return JobOutcome(values, arrays)
 
 
 def wilson(hits: int, of: int) -> tuple[float, float]:

@@ -42,15 +42,15 @@ from ccatp.studies.campaign import (
     CellResult,
     ClusterUnreachable,
     Job,
+    JobOutcome,
     Load,
-    Outcome,
     Schedule,
     Shard,
     Study,
     cells_of,
     jobs_of,
 )
-from ccatp.studies.job_store import CampaignView, Ledger, write_results
+from ccatp.studies.job_store import CampaignView, JobStore, write_results
 
 
 def settle() -> None:
@@ -78,11 +78,11 @@ _CLUSTER_TIMEOUT_S = 5.0
 class Timed(NamedTuple):
     """What came of a job, and how long it took its worker."""
 
-    outcome: Outcome
+    outcome: JobOutcome
     took_s: float
 
 
-class Place(NamedTuple):
+class JobExecutor(NamedTuple):
     """Where jobs are sent.
 
     Attributes:
@@ -94,7 +94,7 @@ class Place(NamedTuple):
     room: Callable[[], int]
 
 
-class _Here(Executor):
+class _SerialExecutor(Executor):
     """Runs each job at once, in this process."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -107,7 +107,7 @@ class _Here(Executor):
         return future
 
 
-def timed(run_job: Callable[[Job], Outcome], job: Job) -> Timed:
+def timed(run_job: Callable[[Job], JobOutcome], job: Job) -> Timed:
     """Do a job."""
     settle()
     started_s = time.perf_counter()
@@ -116,7 +116,7 @@ def timed(run_job: Callable[[Job], Outcome], job: Job) -> Timed:
 
 
 @contextmanager
-def place_of(workers: int | None, cluster: str | None, jobs: int) -> Iterator[Place]:
+def place_of(workers: int | None, cluster: str | None, jobs: int) -> Iterator[JobExecutor]:
     """Where to run so many jobs.
 
     Args:
@@ -133,21 +133,21 @@ def place_of(workers: int | None, cluster: str | None, jobs: int) -> Iterator[Pl
         with _cluster(cluster) as place:
             yield place
     elif count == 1:
-        yield Place(_Here(), lambda: 1)
+        yield JobExecutor(_SerialExecutor(), lambda: 1)
     else:
         with _pool(count) as place:
             yield place
 
 
 @contextmanager
-def _pool(count: int) -> Iterator[Place]:
+def _pool(count: int) -> Iterator[JobExecutor]:
     """Processes of this machine; on an error they are ended in the middle of their jobs."""
     limit_threads()
     before = set(multiprocessing.active_children())
     context = multiprocessing.get_context("spawn")  # a fork would inherit threads and locks in any state
     executor = ProcessPoolExecutor(count, mp_context=context, initializer=prepare_worker)
     try:
-        yield Place(executor, lambda: count + 1)  # one more waits, so that no worker does
+        yield JobExecutor(executor, lambda: count + 1)  # one more waits, so that no worker does
     except BaseException:
         executor.shutdown(wait=False, cancel_futures=True)
         for child in set(multiprocessing.active_children()) - before:
@@ -171,7 +171,7 @@ def _end_with(sentinel: int) -> None:
 
 
 @contextmanager
-def _cluster(address: str) -> Iterator[Place]:
+def _cluster(address: str) -> Iterator[JobExecutor]:
     try:
         from distributed import Client  # noqa: PLC0415 - belongs to an extra
     except ImportError as error:
@@ -185,7 +185,7 @@ def _cluster(address: str) -> Iterator[Place]:
     with client:
         executor = client.get_executor(pure=False)  # type: ignore[no-untyped-call]
         try:
-            yield Place(executor, lambda: 2 * max(1, sum(client.nthreads().values())))  # type: ignore[no-untyped-call]
+            yield JobExecutor(executor, lambda: 2 * max(1, sum(client.nthreads().values())))  # type: ignore[no-untyped-call]
         finally:
             executor.shutdown(wait=False)
 
@@ -255,7 +255,7 @@ def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
     started_s = time.perf_counter()
     cells = cells_of(study, options.mirrors, options.only)
     plan = jobs_of(study, cells, load, options.settings, study.runs if options.runs is None else options.runs)
-    with Ledger(options.out, options.shard, options.others) as ledger:
+    with JobStore(options.out, options.shard, options.others) as ledger:
         jobs = [job for group in plan for job in group]
         own = set(range(options.shard.number - 1, len(jobs), options.shard.of))
         done = {job.key for job in jobs if ledger.outcome(job) is not None}
@@ -282,14 +282,14 @@ def _run(study: Study, load: Load, options: CampaignOptions) -> dict[str, Any]:
     return result
 
 
-def _cell(study: Study, jobs: Sequence[Job], outcomes: Sequence[Outcome | None]) -> CellResult:
+def _cell(study: Study, jobs: Sequence[Job], outcomes: Sequence[JobOutcome | None]) -> CellResult:
     there = [outcome for outcome in outcomes if outcome is not None]
-    values, arrays = study.combine(jobs[0].factors, there) if there else Outcome({})
+    values, arrays = study.combine(jobs[0].factors, there) if there else JobOutcome({})
     return CellResult(jobs[0].factors, {"runs": len(there), **values}, arrays)
 
 
 def _run_jobs(
-    study: Study, jobs: Sequence[Job], ledger: Ledger, view: CampaignView, options: CampaignOptions
+    study: Study, jobs: Sequence[Job], ledger: JobStore, view: CampaignView, options: CampaignOptions
 ) -> list[str]:
     """Do the jobs; what failed is told, a line each."""
     schedule = Schedule(jobs, ledger.durations_s)
@@ -318,7 +318,7 @@ def _run_jobs(
     return failures
 
 
-def _hand_out(study: Study, schedule: Schedule, place: Place, under_way: dict[Future[Timed], Job]) -> None:
+def _hand_out(study: Study, schedule: Schedule, place: JobExecutor, under_way: dict[Future[Timed], Job]) -> None:
     room = place.room()
     while schedule and len(under_way) < room:
         job = schedule.take()

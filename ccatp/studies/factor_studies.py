@@ -11,7 +11,7 @@ from pathlib import Path
 from ccatp.config.load import load_config
 from ccatp.config.models import WorldConfig
 from ccatp.studies.campaign import Cell, CellResult, Column, Study
-from ccatp.studies.figures import Row, draw_ranges
+from ccatp.studies.figures import FigureRow, draw_ranges
 from ccatp.studies.mission_study import combine_missions, run_mission
 
 _BASES = ("none", "all")
@@ -22,7 +22,7 @@ def draw_sensitivity(cells: Sequence[CellResult], out: Path) -> None:
     worlds = list(dict.fromkeys(cell.factors["world"] for cell in cells))
     for mirror in dict.fromkeys(str(cell.factors["mirror"]) for cell in cells):
         there = [cell for cell in cells if cell.factors["mirror"] == mirror]
-        rows = [Row(_name(c), c, worlds.index(c.factors["world"]), c.factors["group"] in _BASES) for c in there]
+        rows = [FigureRow(_name(c), c, worlds.index(c.factors["world"]), c.factors["group"] in _BASES) for c in there]
         draw_ranges(rows, f"What each disturbance costs on {mirror}", out / f"sensitivity-{mirror}")
 
 
@@ -148,7 +148,7 @@ def draw(results: Sequence[CellResult], out: Path) -> None:
     """Figures ``ablation-<mirror>-<world>``, the mission with everything as a line."""
     for mirror, world in dict.fromkeys((str(c.factors["mirror"]), str(c.factors["world"])) for c in results):
         there = [c for c in results if (c.factors["mirror"], c.factors["world"]) == (mirror, world)]
-        rows = [Row(_label(c), c, WORLDS.index(world), c.factors["without"] == ALL_ON) for c in there]
+        rows = [FigureRow(_label(c), c, WORLDS.index(world), c.factors["without"] == ALL_ON) for c in there]
         draw_ranges(rows, f"Without a technique, world {world} on {mirror}", out / f"ablation-{mirror}-{world}")
 
 

@@ -20,11 +20,11 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.report.plots import dress, new_figure
 from ccatp.sim.fault_models import SENSOR_SIGNALS, Injected
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
+from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.figures import LIMIT, colour, save
 from ccatp.studies.mission_study import dangers, times
-from ccatp.studies.sil_models import Rehearsal
-from ccatp.studies.sil_run import Rehearsing, rehearse
+from ccatp.studies.sil_models import SilResult
+from ccatp.studies.sil_run import SilRun, rehearse
 from ccatp.survey.composition import assemble
 
 _SPREAD = 0.3  # dots of a row lie beside each other
@@ -110,7 +110,7 @@ def _draw(rng: random.Random) -> tuple[str, str, str]:
 _LOST_FRAMES = 500  # without a frame for so long a mission is over
 
 
-class FaultyRehearsal(Rehearsing):
+class FaultySilRun(SilRun):
     """As the processes: a frame that nobody can take is passed over, and one that is not newer is answered with zeros.
 
     Args:
@@ -192,14 +192,14 @@ def cells() -> Sequence[Cell]:
     return [Cell({"faults": kind}) for kind in (NONE, RANDOM)]
 
 
-def run_job(job: Job) -> Outcome:
+def run_job(job: Job) -> JobOutcome:
     """One mission."""
     if job.factors["faults"] == NONE:
         about = {"injected": {"planned": 0, "acted": 0}, "is_recoverable": True, "weak_frames": 0}
         return _outcome(job, rehearse(job.cfg), about)
     parts = assemble(job.cfg)
     plan = random_plan(job.seed, FAULTS_PER_MISSION, parts.lower_bound_s)
-    rehearsal = FaultyRehearsal(job.cfg, plan)
+    rehearsal = FaultySilRun(job.cfg, plan)
     result = rehearsal.run()
     about = {
         # A fault that comes after the end, or between two readings of a slow sensor, does nothing.
@@ -215,7 +215,7 @@ def is_recoverable(plan: FaultPlan, mirror: Mirror) -> bool:
     return not (mirror.overhang and any(fault.signal == "fans" for fault in plan.faults))
 
 
-def _outcome(job: Job, rehearsal: Rehearsal, about: dict[str, Any]) -> Outcome:
+def _outcome(job: Job, rehearsal: SilResult, about: dict[str, Any]) -> JobOutcome:
     summary = rehearsal.summary
     values: dict[str, Any] = {
         "seed": job.seed,
@@ -225,10 +225,10 @@ def _outcome(job: Job, rehearsal: Rehearsal, about: dict[str, Any]) -> Outcome:
         **{name: summary[name] for name in ("points", "danger", "mission_time_s", "lower_bound_s", "within_budget")},
         "states_s": rehearsal.states_s,
     }
-    return Outcome(values, {})
+    return JobOutcome(values, {})
 
 
-def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
+def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """Sums over the missions; how those ended that were not completed."""
     values = [outcome.values for outcome in outcomes]
     ended = [f"seed {v['seed']} {v['outcome']}: {v['cause']}" for v in values if v["outcome"] != "complete"]
@@ -246,7 +246,7 @@ def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
         "time_ratio": np.array([v["mission_time_s"] / v["lower_bound_s"] for v in values]),
         "is_complete": np.array([float(v["outcome"] == "complete") for v in values]),
     }
-    return Outcome(figures, arrays)
+    return JobOutcome(figures, arrays)
 
 
 def _complete(values: Sequence[Any]) -> int:

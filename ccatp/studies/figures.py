@@ -42,7 +42,7 @@ _FIGURES = (
 )
 
 
-class Row(NamedTuple):
+class FigureRow(NamedTuple):
     """A line of the figure.
 
     Attributes:
@@ -58,7 +58,7 @@ class Row(NamedTuple):
     is_base: bool
 
 
-def draw_ranges(rows: Sequence[Row], title: str, stem: Path) -> None:
+def draw_ranges(rows: Sequence[FigureRow], title: str, stem: Path) -> None:
     """Mean as a dot, 99th percentile as the end of a bar."""
     figure = new_figure(10.5, 0.27 * len(rows) + 1.6)
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter  # noqa: PLC0415 - as in figures
@@ -81,7 +81,7 @@ def draw_ranges(rows: Sequence[Row], title: str, stem: Path) -> None:
     save(figure, stem)
 
 
-def _draw(axes: "Axes", rows: Sequence[Row], mean: tuple[str, ...], tail: tuple[str, ...] | None) -> None:
+def _draw(axes: "Axes", rows: Sequence[FigureRow], mean: tuple[str, ...], tail: tuple[str, ...] | None) -> None:
     for place, row in enumerate(rows):
         value = _value(row.cell, mean)
         if value is None:

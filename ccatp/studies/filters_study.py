@@ -13,7 +13,7 @@ from ccatp.core import FloatArray
 from ccatp.mirror.mirror import build_mirror
 from ccatp.report.drawing import INK, QUIET
 from ccatp.report.plots import GRID, dress, new_figure
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
+from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.cramer_rao import bounds_of
 from ccatp.studies.cramer_rao_record import rehearse_recorded
 from ccatp.studies.figures import LIMIT, colour, save
@@ -209,11 +209,11 @@ def cells() -> Sequence[Cell]:
     ]
 
 
-def run_job(job: Job) -> Outcome:
+def run_job(job: Job) -> JobOutcome:
     """One mission; of every fourth seed also the bounds along its true way: without and with the accelerometer."""
     if job.seed % _BOUND_EVERY != 1:
         values, arrays = mission_outcome(job.cfg, rehearse(job.cfg, with_track=True))
-        return Outcome(values, {**arrays, "bounds": np.empty((0, _BOUND_COLUMNS))})
+        return JobOutcome(values, {**arrays, "bounds": np.empty((0, _BOUND_COLUMNS))})
     rehearsal, record = rehearse_recorded(job.cfg, with_track=True)
     values, arrays = mission_outcome(job.cfg, rehearsal)
     mirror = build_mirror(job.cfg.mirror)
@@ -223,15 +223,15 @@ def run_job(job: Job) -> Outcome:
         for stop, more in zip(without, with_it, strict=True)
         if stop.point is not None
     ]
-    return Outcome(values, {**arrays, "bounds": np.array(bounds, dtype=np.float64).reshape(-1, _BOUND_COLUMNS)})
+    return JobOutcome(values, {**arrays, "bounds": np.array(bounds, dtype=np.float64).reshape(-1, _BOUND_COLUMNS)})
 
 
-def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
+def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """The missions pooled, and their stop errors beside the bound."""
     values, arrays = combine_missions(factors, outcomes)
     # At the first point of a run the start errors count: it says little about the filter.
     bounds = np.concatenate([outcome.arrays["bounds"][1:] for outcome in outcomes])
-    return Outcome({**values, "bound": bound_figures(bounds)}, {**arrays, "bounds": bounds})
+    return JobOutcome({**values, "bound": bound_figures(bounds)}, {**arrays, "bounds": bounds})
 
 
 def bound_figures(bounds: FloatArray) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ccatp.beacons.slam.batch_odometry import CALIBRATION, BatchSettings, Reckoning
 from ccatp.beacons.slam.batch_solver import place_by_distances
-from ccatp.beacons.slam.recording import BeaconFix, RecordedRun, Track
+from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError, ExitStatus
 
@@ -39,8 +39,8 @@ class Peers(NamedTuple):
         batch: of all readings.
     """
 
-    isam2: Track
-    batch: Track
+    isam2: EstimatedPath
+    batch: EstimatedPath
 
 
 def run_gtsam(run: RecordedRun, settings: BatchSettings, clock_s: Callable[[], float]) -> Peers:
@@ -184,8 +184,8 @@ class _Session:
     def _unwrapped(self, path: FloatArray) -> FloatArray:
         return np.column_stack([path[:, :2], np.unwrap(path[:, 2])])
 
-    def _track(self, path: FloatArray, beacons: dict[str, BeaconFix], update_s: FloatArray) -> Track:
-        return Track(
+    def _track(self, path: FloatArray, beacons: dict[str, BeaconFix], update_s: FloatArray) -> EstimatedPath:
+        return EstimatedPath(
             times_s=self._times,
             poses=path,
             covariances=np.broadcast_to(np.eye(3), (len(path), 3, 3)),

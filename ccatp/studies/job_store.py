@@ -23,7 +23,18 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from ccatp.studies.campaign import WHOLE, Arrays, CampaignError, CellResult, Column, Job, Outcome, Shard, Study, plain
+from ccatp.studies.campaign import (
+    WHOLE,
+    Arrays,
+    CampaignError,
+    CellResult,
+    Column,
+    Job,
+    JobOutcome,
+    Shard,
+    Study,
+    plain,
+)
 
 PATTERN = "jobs*.jsonl"
 
@@ -40,7 +51,7 @@ def make_out(out: Path) -> None:
         raise CampaignError(f"--out: cannot make {out}: {error.strerror or error}; choose another --out") from error
 
 
-class Ledger:
+class JobStore:
     """The finished jobs in a directory.
 
     Args:
@@ -57,7 +68,7 @@ class Ledger:
         """Open the shard's file and read all that is there."""
         make_out(out)
         name = "jobs.jsonl" if shard == WHOLE else f"jobs-{shard.number}of{shard.of}.jsonl"
-        self._done: dict[str, tuple[str, Path, Outcome]] = {}
+        self._done: dict[str, tuple[str, Path, JobOutcome]] = {}
         self._took_s: dict[str, float] = {}
         self._file: BinaryIO = (out / name).open("a+b")
         try:
@@ -69,13 +80,13 @@ class Ledger:
             self._file.close()
             raise
 
-    def __enter__(self) -> "Ledger":
+    def __enter__(self) -> "JobStore":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._file.close()
 
-    def outcome(self, job: Job) -> Outcome | None:
+    def outcome(self, job: Job) -> JobOutcome | None:
         """What came of a job, or None where it is still to do.
 
         Raises:
@@ -104,7 +115,7 @@ class Ledger:
             found.setdefault(key.rpartition(",seed=")[0], []).append(took_s)
         return found
 
-    def add(self, job: Job, outcome: Outcome, took_s: float = 0.0) -> None:
+    def add(self, job: Job, outcome: JobOutcome, took_s: float = 0.0) -> None:
         """Note a finished job and how long it took its worker, and return when it is on the disk."""
         record = {
             "key": job.key,
@@ -131,7 +142,7 @@ class Ledger:
                     raise CampaignError(f"{path}:{number}: is no finished job; remove the line") from error
 
     def _take(self, record: dict[str, Any], path: Path) -> None:
-        outcome = Outcome(record["values"], _unpacked(record["arrays"]))
+        outcome = JobOutcome(record["values"], _unpacked(record["arrays"]))
         self._done.setdefault(record["key"], (record["fingerprint"], path, outcome))
         self._took_s.setdefault(record["key"], float(record["took_s"]))
 

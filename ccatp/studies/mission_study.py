@@ -20,8 +20,8 @@ from ccatp.config.models import Config
 from ccatp.core import FloatArray, PointId, Vector3
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.records.summary import WITHIN_M, PuckTarget, puck_targets
-from ccatp.studies.campaign import Arrays, Factors, Job, Outcome, Spread, pooled
-from ccatp.studies.sil_models import Rehearsal, StopRow
+from ccatp.studies.campaign import Arrays, Factors, Histogram, Job, JobOutcome, pooled
+from ccatp.studies.sil_models import SilResult, StopRow
 from ccatp.studies.sil_run import rehearse
 
 # Columns of the array ``stops``: one row for each measurement, in the order they were taken. Errors are true minus
@@ -34,13 +34,13 @@ COLUMN = {name: index for index, name in enumerate(STOP_COLUMNS)}
 _T, _X, _Y, _HEADING, _EST_X, _EST_Y, _EST_HEADING = range(7)  # columns of a rehearsal's track
 
 
-def run_mission(job: Job) -> Outcome:
+def run_mission(job: Job) -> JobOutcome:
     """Survey the mirror of the job's configuration."""
     rehearsal = rehearse(job.cfg, with_track=True)
     return mission_outcome(job.cfg, rehearsal)
 
 
-def mission_outcome(cfg: Config, rehearsal: Rehearsal) -> Outcome:
+def mission_outcome(cfg: Config, rehearsal: SilResult) -> JobOutcome:
     """What a campaign keeps of a rehearsal that was run with its track."""
     summary, mirror = rehearsal.summary, build_mirror(cfg.mirror)
     track = rehearsal.track if rehearsal.track is not None else np.empty((0, 7))
@@ -64,11 +64,11 @@ def mission_outcome(cfg: Config, rehearsal: Rehearsal) -> Outcome:
         "states_s": rehearsal.states_s,
     }
     arrays = {
-        **Spread.of(errors_m, WITHIN_M).to_arrays("localization"),
-        **Spread.of(errors_m[is_later], WITHIN_M).to_arrays("localization_later"),
+        **Histogram.of(errors_m, WITHIN_M).to_arrays("localization"),
+        **Histogram.of(errors_m[is_later], WITHIN_M).to_arrays("localization_later"),
         "stops": stop_rows(mirror, cfg.robot.puck_height_m, rehearsal.stops, track),
     }
-    return Outcome(values, arrays)
+    return JobOutcome(values, arrays)
 
 
 def localization_errors_m(mirror: Mirror, track: FloatArray) -> FloatArray:
@@ -184,14 +184,14 @@ def chi_square_figures(values: FloatArray, freedom: int) -> dict[str, Any]:
     }
 
 
-def combine_missions(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
+def combine_missions(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """Figures of a cell out of its missions, see ``mission_job.mission_outcome``."""
     values = [outcome.values for outcome in outcomes]
     stops = np.concatenate([outcome.arrays["stops"] for outcome in outcomes])
     firsts = [first_arrivals(outcome.arrays["stops"]) for outcome in outcomes]
     arrivals, later = np.concatenate(firsts), np.concatenate([rows[1:] for rows in firsts])
     everywhere, afterwards = (
-        pooled([Spread.from_arrays(dict(outcome.arrays), name) for outcome in outcomes])
+        pooled([Histogram.from_arrays(dict(outcome.arrays), name) for outcome in outcomes])
         for name in ("localization", "localization_later")
     )
     figures: dict[str, Any] = {
@@ -220,7 +220,7 @@ def combine_missions(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
         **everywhere.to_arrays("localization"),
         **afterwards.to_arrays("localization_later"),
     }
-    return Outcome(figures, {**arrays, "stops": np.column_stack([_runs(outcomes), stops])})
+    return JobOutcome(figures, {**arrays, "stops": np.column_stack([_runs(outcomes), stops])})
 
 
 def first_arrivals(stops: FloatArray) -> FloatArray:
@@ -238,7 +238,7 @@ def of_values(errors_m: FloatArray) -> dict[str, Any]:
     return {**{name: _mm(value) for name, value in figures.items()}, "within_10mm_fraction": within}
 
 
-def of_spread(spread: Spread) -> dict[str, Any]:
+def of_spread(spread: Histogram) -> dict[str, Any]:
     """The same of a pooled spread."""
     if not spread.count:
         return of_values(np.empty(0))
@@ -298,7 +298,7 @@ def _last_of_each(stops: FloatArray) -> FloatArray:
     return stops[::-1][np.sort(backwards)]
 
 
-def _runs(outcomes: Sequence[Outcome]) -> FloatArray:
+def _runs(outcomes: Sequence[JobOutcome]) -> FloatArray:
     return np.repeat(np.arange(len(outcomes), dtype=np.float64), [len(outcome.arrays["stops"]) for outcome in outcomes])
 
 
@@ -315,6 +315,6 @@ def _mm(value_m: Any) -> float:
     return round(float(value_m) * 1e3, 4)
 
 
-def spread_of(arrays: Arrays, name: str) -> Spread:
+def spread_of(arrays: Arrays, name: str) -> Histogram:
     """A spread out of the arrays of a cell."""
-    return Spread.from_arrays(dict(arrays), name)
+    return Histogram.from_arrays(dict(arrays), name)

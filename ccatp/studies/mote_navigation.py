@@ -12,8 +12,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from ccatp.beacons.mission import DONE, TrackRow, assemble_beacons, track_row, wheel_rates
-from ccatp.beacons.navigation import SenseReader
-from ccatp.beacons.steering import HALT, Drive
+from ccatp.beacons.navigation import MeasurementReader
+from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import FloatArray, Verdict
 from ccatp.filters.metrics import nees
@@ -30,18 +30,18 @@ from ccatp.links.beacon_messages import (
 )
 from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import Estimate, is_estimate_due
+from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.records.beacon_summary import BeaconSummary, Reached, beacon_facts
 from ccatp.report.drawing import INK, QUIET
 from ccatp.report.plots import dress, new_figure
-from ccatp.safety.beacons import BeaconDanger
+from ccatp.safety.beacons import BeaconSafetyRules
 from ccatp.sim.beacon_robot import BeaconTruthLog, build_beacon_robot, motes_of
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
+from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.figures import LIMIT, colour, save
 
 
 @dataclass(slots=True)
-class BeaconRehearsal:
+class BeaconSilResult:
     """What a rehearsal leaves, one entry a frame where nothing else is said.
 
     Attributes:
@@ -70,7 +70,7 @@ class BeaconRehearsal:
         return pose_track(table(self.track, TRACK_COLUMNS)), pose_truth(table(self.truth, TRUTH_COLUMNS))
 
 
-class BeaconStage:
+class BeaconSilWorld:
     """Robot, danger rules and mission, frame by frame.
 
     Args:
@@ -86,11 +86,11 @@ class BeaconStage:
         """Both keys are in the robot's hands."""
         self._cfg = cfg
         self.robot = build_beacon_robot(cfg)
-        self.mission, self.danger = assemble_beacons(cfg), BeaconDanger(cfg)
-        self.found = BeaconRehearsal()
-        self._reader, self._log = SenseReader(cfg), BeaconTruthLog(self.robot, motes_of(cfg))
+        self.mission, self.danger = assemble_beacons(cfg), BeaconSafetyRules(cfg)
+        self.found = BeaconSilResult()
+        self._reader, self._log = MeasurementReader(cfg), BeaconTruthLog(self.robot, motes_of(cfg))
         self._book = BeaconSummary(beacon_facts(cfg, is_sim=True))
-        self._estimate: Estimate | None = None
+        self._estimate: EstimateMessage | None = None
         self._signal = ""
         self.robot.join_controller()
         self.robot.join_monitor()
@@ -117,14 +117,14 @@ class BeaconStage:
         if not self.is_over:
             self._drive(sensors.seq, verdict, drive)
 
-    def _drive(self, seq: int, verdict: Verdict, drive: Drive) -> None:
+    def _drive(self, seq: int, verdict: Verdict, drive: SteeringCommand) -> None:
         right, left, steer = wheel_rates(drive, self._cfg)
         self.robot.permit(seq + 1, verdict.forward, verdict.reverse, verdict.turn)
         self.robot.drive(seq + 1, right, left, None, steer)
         self.robot.advance()
         self._log.add()
 
-    def _note(self, sensors: Sensors, verdict: Verdict, drive: Drive) -> None:
+    def _note(self, sensors: Sensors, verdict: Verdict, drive: SteeringCommand) -> None:
         found, mission = self.found, self.mission
         if verdict.signal and verdict.signal != self._signal:
             self._book.add_danger(verdict.signal)
@@ -132,7 +132,7 @@ class BeaconStage:
         if is_estimate_due(sensors.seq):
             belief = mission.navigator.belief
             x_m, y_m, heading_rad = belief.pose
-            self._estimate = Estimate(
+            self._estimate = EstimateMessage(
                 seq=sensors.seq, t_s=sensors.t, x_m=x_m, y_m=y_m, heading_rad=heading_rad, sigma_m=belief.sigma_m,
                 state=str(mission.state),
             )  # fmt: skip
@@ -142,7 +142,7 @@ class BeaconStage:
         found.times_s.append(sensors.t)
         found.speeds_m_s.append(drive.speed_m_s)
 
-    def result(self) -> BeaconRehearsal:
+    def result(self) -> BeaconSilResult:
         """What there is to say at the end."""
         found, mission, book = self.found, self.mission, self._book
         batch = self._log.batch()
@@ -158,9 +158,9 @@ class BeaconStage:
         return found
 
 
-def rehearse_beacons(cfg: RadioConfig) -> BeaconRehearsal:
+def rehearse_beacons(cfg: RadioConfig) -> BeaconSilResult:
     """A mission from its first frame to its end, in virtual time; a function of configuration and seed."""
-    stage = BeaconStage(cfg)
+    stage = BeaconSilWorld(cfg)
     while not stage.is_over:
         stage.frame()
     return stage.result()
@@ -171,7 +171,7 @@ _STATES = 3  # x, y, heading
 _BAND = 0.95
 
 
-def run_job(job: Job) -> Outcome:
+def run_job(job: Job) -> JobOutcome:
     """One mission: its figures, and errors each second from the end of mapping on."""
     found = rehearse_beacons(job.radio)
     summary = found.summary
@@ -187,7 +187,7 @@ def run_job(job: Job) -> Outcome:
         "updates": summary["map"]["map_updates"],
     }
     begin_s = summary["map"]["map_time_s"]
-    return Outcome(values, seconds_of(*found.poses, begin_s))
+    return JobOutcome(values, seconds_of(*found.poses, begin_s))
 
 
 def seconds_of(track: PoseTrack, truth: PoseTruth, begin_s: float) -> dict[str, FloatArray]:
@@ -211,7 +211,7 @@ def seconds_of(track: PoseTrack, truth: PoseTruth, begin_s: float) -> dict[str, 
     }
 
 
-def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
+def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """The missions together: NEES at each second over all of them, against the band of its chi-squared sum."""
     del factors
     runs = [outcome.values for outcome in outcomes]
@@ -236,7 +236,7 @@ def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
         "map_expected_m": _root([run["map_expected_m"] for run in runs]),
     }
     arrays = {"nees": each, "error_m": np.sqrt((errors**2).mean(axis=0)), "sigma_m": np.sqrt((sigmas**2).mean(axis=0))}
-    return Outcome(values, arrays)
+    return JobOutcome(values, arrays)
 
 
 def band(runs: int) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, bound_rms_m, map_rms_m
+from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, bound_rms_m, map_rms_m
 from ccatp.beacons.cricket.mote_map import MoteMap, map_motes, pinned_map, plain_frame
 from ccatp.beacons.cricket.range_network import MappingError, MoteRange, RangeNetwork, build_network, pair_range
 from ccatp.beacons.cricket.rigidity import FoldOver, Freedom, find_fold_over, find_freedom, generic_state
@@ -27,7 +27,7 @@ from ccatp.beacons.cricket.trilateration import FirstMap, map_as_possible, map_b
 from ccatp.config.beacon_models import CricketConfig
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import aligned_rms_m, best_motion, rms_m
-from ccatp.sim.motes import Heard, MoteField, true_motes
+from ccatp.sim.motes import MoteField, MotePulse, true_motes
 
 _LAYOUT, _FIELD, _READINGS = 0, 1, 2  # streams of random numbers of one seed
 
@@ -86,7 +86,7 @@ def simulate_field(cfg: CricketConfig, seed: int) -> SimulatedField:
     return SimulatedField(plan, motes.positions_m, first, tuple(second))
 
 
-def _range(cfg: CricketConfig, plan: MotePlan, heard: Heard) -> MoteRange:
+def _range(cfg: CricketConfig, plan: MotePlan, heard: MotePulse) -> MoteRange:
     names = plan.names[heard.transmitter], plan.names[heard.listener]
     return pair_range(cfg, names, heard.delays_s, heard.temperature_c)
 
@@ -291,9 +291,9 @@ def batch_network(cfg: CricketConfig, field: SimulatedField) -> RangeNetwork:
     return field.network(with_second=cfg.batch.uses_phase2, with_shapes=cfg.batch.uses_shapes)
 
 
-def batch_settings(cfg: CricketConfig) -> BatchSettings:
+def batch_settings(cfg: CricketConfig) -> MapFitSettings:
     """How the batch fits."""
-    return BatchSettings(cfg.batch.robust_scale, cfg.batch.max_iterations)
+    return MapFitSettings(cfg.batch.robust_scale, cfg.batch.max_iterations)
 
 
 def look_ahead(cfg: CricketConfig, field: SimulatedField, method: str, updates: int | None = None) -> MoteOutlook:

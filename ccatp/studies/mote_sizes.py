@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, bound_rms_m
+from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, bound_rms_m
 from ccatp.beacons.cricket.mote_map import map_motes
 from ccatp.beacons.cricket.range_network import MoteRange, RangeNetwork, build_network, components
 from ccatp.beacons.cricket.rigidity import find_fold_over, find_freedom, generic_state
@@ -86,7 +86,7 @@ def _cell(size: int, seed: int) -> dict[str, Any]:
     folds = find_fold_over(network, rng)
     freedom = find_freedom(model, generic_state(model, rng))
     looked_s = time.perf_counter()
-    found = map_motes(network, BatchSettings(_ROBUST), mirrors=folds.mirrors)
+    found = map_motes(network, MapFitSettings(_ROBUST), mirrors=folds.mirrors)
     mapped_s = time.perf_counter()
     errors = np.linalg.norm(
         best_motion(found.positions_m, true_m, mirrors=True).moved(found.positions_m) - true_m, axis=1

@@ -11,13 +11,13 @@ import numpy as np
 from scipy.special import chdtri
 
 from ccatp.beacons.slam.beacon_loop import BeaconLoop
-from ccatp.beacons.slam.motion import Pose
+from ccatp.beacons.slam.motion import VehiclePose
 from ccatp.beacons.slam.settings import odometry_of, vehicle_of
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import FloatArray, wrap_pi
-from ccatp.sim.radio import DriveCommand
+from ccatp.sim.radio import SimDriveCommand
 from ccatp.sim.radio_world import RadioWorld
-from ccatp.studies.campaign import Column, Factors, Job, Outcome
+from ccatp.studies.campaign import Column, Factors, Job, JobOutcome
 
 
 @dataclass(slots=True)
@@ -57,15 +57,15 @@ class RadioRun:
 def run_radio(cfg: RadioConfig) -> RadioRun:
     """A whole run; a function of the configuration and its seed."""
     world, loop, run = RadioWorld(cfg), BeaconLoop(cfg), RadioRun()
-    reckoned, motion = Pose(cfg.start.x_m, cfg.start.y_m, cfg.start.heading_rad), vehicle_of(cfg)
+    reckoned, motion = VehiclePose(cfg.start.x_m, cfg.start.y_m, cfg.start.heading_rad), vehicle_of(cfg)
     drive = loop.first()
     for step in range(1, cfg.run.steps + 1):
         static, target = loop.listens(step)
-        frame = world.step(DriveCommand(*drive), cfg.run.step_s, static=static, target=target)
+        frame = world.step(SimDriveCommand(*drive), cfg.run.step_s, static=static, target=target)
         drive = loop.step(frame.time_s, frame.wheels, frame.packets, frame.sightings, frame.distances_m)
         states = np.zeros(motion.size)
         states[:3] = reckoned
-        reckoned = Pose(*motion.step(states, odometry_of(cfg, frame.time_s, frame.wheels)).mean[:3].tolist())
+        reckoned = VehiclePose(*motion.step(states, odometry_of(cfg, frame.time_s, frame.wheels)).mean[:3].tolist())
         _note(run, world, loop, reckoned, cfg.follow.target)
     truths = _true_places(world, cfg.follow.target)
     for name, estimate in loop.slam.beacons.items():
@@ -82,7 +82,7 @@ def _joint_nees(world: RadioWorld, loop: BeaconLoop) -> tuple[float, int]:
     return _nees(mean - truth, covariance), truth.size
 
 
-def _note(run: RadioRun, world: RadioWorld, loop: BeaconLoop, reckoned: Pose, target: str) -> None:
+def _note(run: RadioRun, world: RadioWorld, loop: BeaconLoop, reckoned: VehiclePose, target: str) -> None:
     true, pose = world.pose, loop.slam.pose
     error = (pose.x_m - true.x_m, pose.y_m - true.y_m, wrap_pi(pose.heading_rad - true.heading_rad))
     run.pose_errors.append(error)
@@ -142,12 +142,12 @@ TARGET_COLUMNS = (
 )
 
 
-def run_job(job: Job) -> Outcome:
+def run_job(job: Job) -> JobOutcome:
     """One run."""
     return outcome_of(job.radio, run_radio(job.radio))
 
 
-def outcome_of(cfg: RadioConfig, run: RadioRun) -> Outcome:
+def outcome_of(cfg: RadioConfig, run: RadioRun) -> JobOutcome:
     """Figures of a run, and its errors over time."""
     truth, estimates = np.array(run.truth), np.array(run.estimates)
     reckoned = truth + np.array(run.reckoned_errors)
@@ -172,10 +172,10 @@ def outcome_of(cfg: RadioConfig, run: RadioRun) -> Outcome:
     if run.targets:
         values |= _target_figures(cfg, run, turn, shift)
         arrays["target_m"] = _curve(_from_first(run.beacon_errors_m.get(cfg.follow.target, []), len(truth))[None])
-    return Outcome(values, arrays)
+    return JobOutcome(values, arrays)
 
 
-def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
+def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """The runs of a cell pooled: errors, coverage, consistency with the 95 % bands of their chi-squared sums."""
     del factors
     runs = [outcome.values for outcome in outcomes]
@@ -210,7 +210,7 @@ def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
             "nearest_m": min(run["nearest_m"] for run in runs),
         }
     arrays = {name: np.stack([o.arrays[name] for o in outcomes if name in o.arrays]) for name in outcomes[0].arrays}
-    return Outcome(values, arrays)
+    return JobOutcome(values, arrays)
 
 
 def rigid(points: FloatArray, onto: FloatArray) -> tuple[FloatArray, FloatArray]:

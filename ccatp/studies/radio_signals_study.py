@@ -21,7 +21,7 @@ from ccatp.core import wrap_pi
 from ccatp.report.drawing import INK, QUIET
 from ccatp.report.plots import dress, new_figure
 from ccatp.sim.radio import TruePose, TrueRadio
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
+from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.figures import LIMIT, colour, save
 
 _POINT_S = 1.0  # between the points of a curve: ten steps of 0.1 s
@@ -155,7 +155,7 @@ def cells() -> Sequence[Cell]:
     ]
 
 
-def run_job(job: Job) -> Outcome:
+def run_job(job: Job) -> JobOutcome:
     """So many turns of the reflector at one place, with shadowing and reflections of their own for each seed."""
     cfg, place = job.radio, str(job.factors["place"])
     at_m = CORNERS_M.get(place) or (ROBOT.x_m + float(place.removesuffix(" m")), ROBOT.y_m)
@@ -175,10 +175,10 @@ def run_job(job: Job) -> Outcome:
         "bearing_errors_deg": [degrees(error) for error in errors],
         "without_bearing": len(results) - len(errors),
     }
-    return Outcome(values, {})
+    return JobOutcome(values, {})
 
 
-def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
+def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """Means and spreads over the seeds, and what 2017 prints."""
     place = str(factors["place"])
     runs = [outcome.values for outcome in outcomes]
@@ -203,7 +203,7 @@ def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
         "bearing_median_deg": float(np.median(np.abs(errors))),
         "printed": printed,
     }
-    return Outcome(values)
+    return JobOutcome(values)
 
 
 def draw(results: Sequence[CellResult], out: Path) -> None:

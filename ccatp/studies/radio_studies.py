@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Outcome, Study
+from ccatp.studies.campaign import Cell, CellResult, Column, Factors, JobOutcome, Study
 from ccatp.studies.radio_runs import COLUMNS, TARGET_COLUMNS, combine, run_job
 from ccatp.studies.radio_signals_study import draw_cases, draw_errors
 
@@ -42,10 +42,10 @@ def case_cells() -> Sequence[Cell]:
     return [Cell({"case": case}, {**RADIO, "workspace.waypoints_m": path}) for case, path in PATHS.items()]
 
 
-def combine_cases(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
+def combine_cases(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """The runs pooled, and what 2017 prints."""
     values, arrays = combine(factors, outcomes)
-    return Outcome({**values, "printed": dict(zip(NAMES, CASES_PRINTED[str(factors["case"])], strict=True))}, arrays)
+    return JobOutcome({**values, "printed": dict(zip(NAMES, CASES_PRINTED[str(factors["case"])], strict=True))}, arrays)
 
 
 def draw_case_figures(results: Sequence[CellResult], out: Path) -> None:
@@ -117,12 +117,12 @@ def follow_cells() -> Sequence[Cell]:
     ]
 
 
-def combine_follow(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
+def combine_follow(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """The runs pooled, and what 2018 prints."""
     values, arrays = combine(factors, outcomes)
     is_printed = factors["condition"] == "as printed"
     printed: dict[str, Any] = dict(FOLLOW_PRINTED[str(factors["case"])]) if is_printed else {}
-    return Outcome({**values, "printed": printed}, arrays)
+    return JobOutcome({**values, "printed": printed}, arrays)
 
 
 def draw_follow_figures(results: Sequence[CellResult], out: Path) -> None:

@@ -18,7 +18,7 @@ Analysis: TypeAlias = "Callable[[Config, Path], dict[str, Any]]"
 """A study without runs: a configuration and a directory, to what ``result.json`` holds."""
 
 
-class Entry(NamedTuple):
+class StudyEntry(NamedTuple):
     """A row: the module, the name in it of a ``Study`` or of an ``Analysis``, one line for the help."""
 
     module: str
@@ -27,29 +27,35 @@ class Entry(NamedTuple):
 
 
 STUDIES = {
-    "thesis": Entry("ccatp.studies.thesis_study", "STUDY", "the thesis's own simulation again, under several readings"),
-    "filters": Entry("ccatp.studies.filters_study", "STUDY", "filters in four worlds, over whole missions"),
-    "time": Entry("ccatp.studies.time_study", "STUDY", "order, speed and measuring time against the hour"),
-    "sensitivity": Entry("ccatp.studies.factor_studies", "SENSITIVITY", "what each disturbance of a hard world costs"),
-    "ablation": Entry("ccatp.studies.factor_studies", "ABLATION", "what each technique gives, one off at a time"),
-    "danger": Entry("ccatp.studies.danger_study", "STUDY", "false edges and overrun of two edge rules"),
-    "faults": Entry("ccatp.studies.faults_study", "STUDY", "whole missions with random faults: falls, completion"),
-    "cricket": Entry(
+    "thesis": StudyEntry(
+        "ccatp.studies.thesis_study", "STUDY", "the thesis's own simulation again, under several readings"
+    ),
+    "filters": StudyEntry("ccatp.studies.filters_study", "STUDY", "filters in four worlds, over whole missions"),
+    "time": StudyEntry("ccatp.studies.time_study", "STUDY", "order, speed and measuring time against the hour"),
+    "sensitivity": StudyEntry(
+        "ccatp.studies.factor_studies", "SENSITIVITY", "what each disturbance of a hard world costs"
+    ),
+    "ablation": StudyEntry("ccatp.studies.factor_studies", "ABLATION", "what each technique gives, one off at a time"),
+    "danger": StudyEntry("ccatp.studies.danger_study", "STUDY", "false edges and overrun of two edge rules"),
+    "faults": StudyEntry("ccatp.studies.faults_study", "STUDY", "whole missions with random faults: falls, completion"),
+    "cricket": StudyEntry(
         "ccatp.studies.cricket_study", "STUDY", "self-mapping of motes: the published figures, better ways"
     ),
-    "mote-sizes": Entry("ccatp.studies.mote_sizes", "run", "time of self-mapping against the number of motes"),
-    "mote-navigation": Entry(
+    "mote-sizes": StudyEntry("ccatp.studies.mote_sizes", "run", "time of self-mapping against the number of motes"),
+    "mote-navigation": StudyEntry(
         "ccatp.studies.mote_navigation", "STUDY", "a robot guided by motes that mapped themselves"
     ),
-    "radio-signals": Entry(
+    "radio-signals": StudyEntry(
         "ccatp.studies.radio_signals_study", "STUDY", "levels and bearings of ZigBee radios, beside 2017"
     ),
-    "radio-slam": Entry(
+    "radio-slam": StudyEntry(
         "ccatp.studies.radio_studies", "RADIO_SLAM", "EKF-SLAM among ZigBee radios: rooms, slip, shadowing"
     ),
-    "radio-cases": Entry("ccatp.studies.radio_studies", "RADIO_CASES", "cases I to III of 2017 side by side with ours"),
-    "radio-follow": Entry("ccatp.studies.radio_studies", "RADIO_FOLLOW", "a moving radio followed, beside 2018"),
-    "loops": Entry("ccatp.studies.loops", "run", "Bode plots, margins and root loci of the controllers"),
+    "radio-cases": StudyEntry(
+        "ccatp.studies.radio_studies", "RADIO_CASES", "cases I to III of 2017 side by side with ours"
+    ),
+    "radio-follow": StudyEntry("ccatp.studies.radio_studies", "RADIO_FOLLOW", "a moving radio followed, beside 2018"),
+    "loops": StudyEntry("ccatp.studies.loops", "run", "Bode plots, margins and root loci of the controllers"),
 }
 
 

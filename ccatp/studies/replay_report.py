@@ -20,7 +20,7 @@ REPRODUCED = 1e-9
 """Largest difference, m and rad, with which a replay counts as the run again: rounding and nothing else."""
 
 
-class Errors(NamedTuple):
+class ReplayErrors(NamedTuple):
     """Differences of an estimate from its reference in the frames that both have.
 
     Attributes:
@@ -39,7 +39,7 @@ class Errors(NamedTuple):
     nees: FloatArray
 
 
-def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: IntArray) -> Errors:
+def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: IntArray) -> ReplayErrors:
     """Compare in the frames that both have.
 
     Args:
@@ -59,12 +59,12 @@ def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: Int
         solved = np.linalg.solve(covariance[is_usable], error[is_usable][:, :, None])[:, :, 0]
         nees[is_usable] = (error[is_usable] * solved).sum(axis=1)
     distance = np.linalg.norm(offset, axis=1)
-    return Errors(distance, turn, np.isin(seqs, moving), np.isin(seqs, arrivals), nees)
+    return ReplayErrors(distance, turn, np.isin(seqs, moving), np.isin(seqs, arrivals), nees)
 
 
-def joined(parts: Sequence[Errors]) -> Errors:
+def joined(parts: Sequence[ReplayErrors]) -> ReplayErrors:
     """The errors of all parts of a run."""
-    return Errors(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return ReplayErrors(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def fix_distances_m(estimate: Trace, feet: FloatArray, mirror: Mirror) -> FloatArray:
@@ -83,7 +83,7 @@ def fix_distances_m(estimate: Trace, feet: FloatArray, mirror: Mirror) -> FloatA
     return distances
 
 
-def figures(errors: Errors) -> dict[str, Any]:
+def figures(errors: ReplayErrors) -> dict[str, Any]:
     """The figures of a table: lengths in mm, angles in mrad; None where there is nothing to take them from."""
     distance_mm = 1e3 * errors.distance_m
     known = errors.nees[np.isfinite(errors.nees)]
@@ -99,7 +99,7 @@ def figures(errors: Errors) -> dict[str, Any]:
     }
 
 
-def difference(errors: Errors) -> dict[str, Any]:
+def difference(errors: ReplayErrors) -> dict[str, Any]:
     """How far replayed estimates are from the recorded ones, and whether that is only rounding."""
     distance, turn = errors.distance_m, np.abs(errors.turn_rad)
     is_same = bool(distance.size and max(distance.max(), turn.max()) <= REPRODUCED)
@@ -135,7 +135,7 @@ def _wrapped(turn: FloatArray) -> FloatArray:
     return wrapped
 
 
-class Judged(NamedTuple):
+class ReplayEvaluation(NamedTuple):
     """One recording and its replay.
 
     Attributes:
@@ -158,7 +158,7 @@ class Judged(NamedTuple):
         return self.recorded if self.truth is None else self.truth
 
 
-def judge(parts: Sequence[Judged]) -> dict[str, Any]:
+def judge(parts: Sequence[ReplayEvaluation]) -> dict[str, Any]:
     """Errors of recorded, replayed and smoothed estimates, and how far the replay is from the record.
 
     Errors are those against the truth where every recording has one, else against the run's own estimates: then there
@@ -184,11 +184,11 @@ def judge(parts: Sequence[Judged]) -> dict[str, Any]:
     }
 
 
-def _against(parts: Sequence[Judged], estimates: Sequence[Trace], has_truth: bool) -> dict[str, Any]:
+def _against(parts: Sequence[ReplayEvaluation], estimates: Sequence[Trace], has_truth: bool) -> dict[str, Any]:
     return figures(_errors(parts, estimates, has_truth=has_truth))
 
 
-def _errors(parts: Sequence[Judged], estimates: Sequence[Trace], *, has_truth: bool) -> Errors:
+def _errors(parts: Sequence[ReplayEvaluation], estimates: Sequence[Trace], *, has_truth: bool) -> ReplayErrors:
     return joined(
         [
             errors_of(estimate, part.reference if has_truth else part.recorded, part.replayed.moving, part.arrivals)
@@ -197,7 +197,7 @@ def _errors(parts: Sequence[Judged], estimates: Sequence[Trace], *, has_truth: b
     )
 
 
-def _fix_distances(parts: Sequence[Judged], estimates: Sequence[Trace]) -> FloatArray:
+def _fix_distances(parts: Sequence[ReplayEvaluation], estimates: Sequence[Trace]) -> FloatArray:
     return np.concatenate(
         [
             fix_distances_m(estimate, part.replayed.feet, part.mirror)
@@ -254,7 +254,7 @@ def _cell(value: float | None) -> str:
     return f"{value:.4f}" if value == 0.0 or abs(value) >= 1e-3 else f"{value:.1e}"
 
 
-def csv_lines(parts: Sequence[Judged]) -> Iterator[str]:
+def csv_lines(parts: Sequence[ReplayEvaluation]) -> Iterator[str]:
     """Poses of each frame, deck frame: replayed, smoothed, recorded and true; empty where there is none."""
     names = ("smoothed", "recorded", "true")
     yield ",".join((*HEADER, *(f"{name}_{key}" for name in names for key in HEADER[3:])))

@@ -25,15 +25,15 @@ from ccatp.records.summary import RunFacts, SummaryBuilder, puck_targets
 from ccatp.sim.laser import SEED_STREAM, EtalonModel, PuckTruth
 from ccatp.sim.robot import Robot
 from ccatp.sim.world import TruthRow
-from ccatp.survey.composition import Parts
+from ccatp.survey.composition import SurveyParts
 from ccatp.survey.mission import Mission
-from ccatp.survey.state import Approaches
+from ccatp.survey.state import ApproachCounter
 
 _BATCH = 1000  # frames that go to the summary at a time
 _RECENT = 64  # frames of truth at hand: more than any delay of the sensors
 
 
-class RunBook:
+class SilTrace:
     """Keeps rows as they come and converts a thousand at a time.
 
     Args:
@@ -44,7 +44,7 @@ class RunBook:
         builder: builds the summary.
     """
 
-    def __init__(self, parts: Parts, *, with_track: bool) -> None:
+    def __init__(self, parts: SurveyParts, *, with_track: bool) -> None:
         """Nothing has happened yet."""
         cfg, mirror = parts.cfg, parts.mirror
         facts = RunFacts(
@@ -154,7 +154,7 @@ class StopRow:
 
 
 @dataclass(slots=True)
-class Rehearsal:
+class SilResult:
     """What came of it.
 
     Attributes:
@@ -192,7 +192,7 @@ class Rehearsal:
 _MIN_FIXES = 3
 
 
-class LaserDesk:
+class SilLaser:
     """Measures the puck of a simulated robot and keeps what came of it.
 
     Args:
@@ -211,7 +211,7 @@ class LaserDesk:
         rng = np.random.default_rng([cfg.run.seed, SEED_STREAM])
         self._etalon = EtalonModel(cfg.sim.etalon, channels, collimators_m, rng)
         self._collimators_m = dict(zip(channels, collimators_m, strict=True))
-        self._approaches = Approaches(cfg.mission.correction_tolerance_m, cfg.mission.max_approaches)
+        self._approaches = ApproachCounter(cfg.mission.correction_tolerance_m, cfg.mission.max_approaches)
         self._fixes: dict[PanelId, list[Fix]] = {}
         self.stops: list[StopRow] = []
 

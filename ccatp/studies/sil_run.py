@@ -16,33 +16,33 @@ from ccatp.danger import DangerMonitor
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.links.robot_codec import set_point_on_wire
 from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import Estimate, is_estimate_due
+from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.localizer import Localizer
 from ccatp.mirror.multilateration import MultilaterationError
 from ccatp.safety.robot_clock import SteadyTime
 from ccatp.safety.wheel_monitors import CommandSpan
 from ccatp.sim.fault_plan import FaultPlan
 from ccatp.sim.robot import Robot
-from ccatp.studies.sil_models import LaserDesk, Rehearsal, RunBook
-from ccatp.survey.composition import Parts, assemble
-from ccatp.survey.route_follower import Motion
-from ccatp.survey.state import DONE, Outcome, State
+from ccatp.studies.sil_models import SilLaser, SilResult, SilTrace
+from ccatp.survey.composition import SurveyParts, assemble
+from ccatp.survey.route_follower import StateEstimate
+from ccatp.survey.state import DONE, MissionState, SurveyOutcome
 
 # A mission that takes this many times its bound hangs; the robot's own deadlines should have ended it long before.
 _ENDLESS = 6.0
 
 
-def rehearse(cfg: Config, *, with_track: bool = False) -> Rehearsal:
+def rehearse(cfg: Config, *, with_track: bool = False) -> SilResult:
     """Survey the mirror of a configuration in its world.
 
     Args:
         cfg: the configuration; ``run.seed`` seeds everything.
         with_track: keep true and estimated pose of every frame.
     """
-    return Rehearsing(cfg, with_track=with_track).run()
+    return SilRun(cfg, with_track=with_track).run()
 
 
-class Rehearsing:
+class SilRun:
     """The processes' parts side by side.
 
     A subclass may exchange parts before ``run``, or look on by overriding what happens in a frame.
@@ -56,18 +56,18 @@ class Rehearsing:
     def __init__(self, cfg: Config, *, with_track: bool, faults: FaultPlan | None = None) -> None:
         """The robot stands at base, and nobody has joined it."""
         self.cfg = cfg
-        parts: Parts = assemble(cfg)
+        parts: SurveyParts = assemble(cfg)
         self.parts, self.mirror = parts, parts.mirror
         self.localizer: Localizer = parts.localizer
         self.mission, self.gate = parts.mission, parts.gate
         self.robot = Robot(cfg, self.mirror, np.random.default_rng(cfg.run.seed), faults)
         self.monitor = DangerMonitor(self.mirror, cfg.robot, cfg.danger, cfg.health)
         self.predictor = CommandPredictor(cfg.robot.wheel_lag_s, self.robot.frame_s)
-        self.laser = LaserDesk(cfg, self.mirror, self.robot)
-        self.book = RunBook(parts, with_track=with_track)
-        self.states_s: defaultdict[State, float] = defaultdict(float)
+        self.laser = SilLaser(cfg, self.mirror, self.robot)
+        self.book = SilTrace(parts, with_track=with_track)
+        self.states_s: defaultdict[MissionState, float] = defaultdict(float)
         self.notices: list[str] = []
-        self._published: Estimate | None = None
+        self._published: EstimateMessage | None = None
         self._sigma_of = lambda: self.localizer.position_sigma_m
         self._code = EventCode.NORMAL
         self._drive_seq = 0
@@ -75,10 +75,10 @@ class Rehearsing:
         self._span = CommandSpan()
         self._time = SteadyTime(cfg.health.clock_jump_s)
         self._has_full_fans = False
-        self._state, self._state_s = State.IDLE, 0.0
+        self._state, self._state_s = MissionState.IDLE, 0.0
         self._wheels_m = cfg.robot.wheel_radius_m, cfg.robot.wheel_base_m
 
-    def run(self) -> Rehearsal:
+    def run(self) -> SilResult:
         """From the first frame to the end of the mission."""
         robot, mission = self.robot, self.mission
         robot.join_monitor()
@@ -149,12 +149,12 @@ class Rehearsing:
         robot.permit(number, verdict.forward, verdict.reverse, verdict.turn)
         robot.drive(number, set_point_on_wire(right), set_point_on_wire(left))
 
-    def _motion(self, frame: Sensors, dt_s: float) -> Motion:
+    def _motion(self, frame: Sensors, dt_s: float) -> StateEstimate:
         localizer, echo = self.localizer, frame.cmd
         pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
         here = pose.x_m, pose.y_m, pose.heading_rad
         ahead = self.predictor.ahead(here, v, omega, echo.seq, echo.age, echo.held, creep)
-        return Motion(
+        return StateEstimate(
             frame.t + self._time.offset_s, dt_s, pose, self.mirror.deck_pose, v, omega, creep, ahead, self._sigma_of
         )
 
@@ -164,17 +164,17 @@ class Rehearsing:
         twist = twist_of(right, left, *self._wheels_m)
         self.predictor.sent(number, twist.v_m_s, twist.omega_rad_s)
 
-    def _note_state(self, state: State) -> None:
+    def _note_state(self, state: MissionState) -> None:
         """Another state begins, or the mission is over in it."""
         self.states_s[self._state] = self._state_s
         self._state, self._state_s = state, self.states_s[state]
 
-    def _publish(self, seq: int, t_s: float, pose: PanelPose, state: State) -> None:
+    def _publish(self, seq: int, t_s: float, pose: PanelPose, state: MissionState) -> None:
         self.book.note_estimate(seq, t_s, pose)
         if is_estimate_due(seq):
             deck, sigma_m = self.localizer.deck_pose, self.localizer.position_sigma_m
             x_m, y_m, heading_rad = deck.x_m, deck.y_m, deck.heading_rad
-            self._published = Estimate(
+            self._published = EstimateMessage(
                 seq=seq,
                 t_s=t_s,
                 x_m=x_m,
@@ -218,15 +218,15 @@ class Rehearsing:
                 continue
             return
 
-    def _result(self, mission_time_s: float) -> Rehearsal:
+    def _result(self, mission_time_s: float) -> SilResult:
         mission, misalignments = self.mission, self.robot.world.misalignments
         self._note_state(self._state)
-        return Rehearsal(
+        return SilResult(
             summary=self.book.summary(mission, mission_time_s, self.laser.panel_fits(), misalignments),
             stops=self.laser.stops,
             corrections=mission.corrections,
             counts=dict(self.localizer.counts),
-            outcome=str(mission.outcome if mission.state is DONE else Outcome.STOPPED),
+            outcome=str(mission.outcome if mission.state is DONE else SurveyOutcome.STOPPED),
             cause=mission.cause,
             states_s={str(state): time_s for state, time_s in self.states_s.items()},
             track=self.book.track(),

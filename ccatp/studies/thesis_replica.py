@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from ccatp.config.models import Config
 from ccatp.core import EdgeSample, EventCode, Fix, GravitySample, ImuSample, Verdict, WheelSample
-from ccatp.danger import DangerMonitor, Estimate, SensorsFrame
+from ccatp.danger import DangerMonitor, PoseReport, SensorsFrame
 from ccatp.estimation.measurements import STATES, THETA
-from ccatp.estimation.seams import Transition
+from ccatp.estimation.seams import SensorTransition
 from ccatp.estimation.thesis_localizer import FourStateLocalizer
 from ccatp.filters import FILTERS
-from ccatp.studies.sil_models import Rehearsal
-from ccatp.studies.sil_run import Rehearsing
+from ccatp.studies.sil_models import SilResult
+from ccatp.studies.sil_run import SilRun
 from ccatp.survey.composition import assemble
 
 FRAME_HZ = 100.0
@@ -111,7 +111,7 @@ class ThesisLocalizer(FourStateLocalizer):
         """Fuse a fix; see ``FourStateLocalizer.fuse_fix``."""
         return super().fuse_fix(replace(fix, t_s=fix.t_s / self.period_factor))
 
-    def _use_crossings(self, transitions: Sequence[Transition]) -> None:
+    def _use_crossings(self, transitions: Sequence[SensorTransition]) -> None:
         """Thesis 2.1.5: the angle at the seam is the heading from now on."""
         filter_ = self._filter
         theta = float(filter_.mean[THETA])
@@ -128,13 +128,13 @@ class ThesisLocalizer(FourStateLocalizer):
 class _NoEdges(DangerMonitor):
     """Permits everything: far from the rim an edge that a rule sees is a false one, and would end the run."""
 
-    def step(self, sensors: SensorsFrame, estimate: Estimate | None) -> Verdict:
+    def step(self, sensors: SensorsFrame, estimate: PoseReport | None) -> Verdict:
         """The verdict that all is normal."""
         del estimate
         return Verdict(sensors.seq, sensors.t, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
 
 
-class _Replica(Rehearsing):
+class _Replica(SilRun):
     """A rehearsal of the block's waypoints that may have the period error; ``run.panels`` counts the block's."""
 
     def __init__(self, cfg: Config, period_error: float) -> None:
@@ -187,7 +187,7 @@ def run_replica(cfg: Config, *, period_error: float) -> ReplicaRun:
     return _figures(_Replica(cfg, period_error).run())
 
 
-def _figures(rehearsal: Rehearsal) -> ReplicaRun:
+def _figures(rehearsal: SilResult) -> ReplicaRun:
     track = rehearsal.track if rehearsal.track is not None else np.empty((0, 7))
     stops = [stop for stop in rehearsal.stops if stop.approach == 1]
     # The way back to base is not part of the thesis's runs.

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ccatp.report.drawing import INK, QUIET
 from ccatp.report.plots import dress, new_figure
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Spread, Study, pooled
+from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Histogram, Job, JobOutcome, Study, pooled
 from ccatp.studies.figures import LIMIT, colour, save
 from ccatp.studies.mission_study import of_spread, of_values
 from ccatp.studies.thesis_replica import LIMIT_M, NOISES, PANELS, POINTS, overrides_of, run_replica
@@ -76,7 +76,7 @@ def _draw_localization(results: Sequence[CellResult], published: Mapping[str, fl
     figure = new_figure(7.2, 5.2)
     axes = figure.subplots()
     for k, result in enumerate(results):
-        values, beyond = Spread.from_arrays(dict(result.arrays), "localization").exceedance()
+        values, beyond = Histogram.from_arrays(dict(result.arrays), "localization").exceedance()
         is_ours = result.factors["system"] == "ours"
         axes.semilogx(
             1e3 * values,
@@ -171,7 +171,7 @@ def _cell(system: str, noise: str, noise_is_variance: bool, period_error: float)
     )
 
 
-def run_job(job: Job) -> Outcome:
+def run_job(job: Job) -> JobOutcome:
     """One simulation run."""
     run = run_replica(job.cfg, period_error=float(job.factors["period_error"]))
     values = {
@@ -186,9 +186,9 @@ def run_job(job: Job) -> Outcome:
     arrays: dict[str, NDArray[Any]] = {
         "waypoint_m": run.waypoint_m,
         "track": run.track[::_TRACK_STEP].astype(np.float32),
-        **Spread.of(run.localization_m, LIMIT_M).to_arrays("localization"),
+        **Histogram.of(run.localization_m, LIMIT_M).to_arrays("localization"),
     }
-    return Outcome(values, arrays)
+    return JobOutcome(values, arrays)
 
 
 def _of_run(errors_m: NDArray[np.float64]) -> dict[str, float]:
@@ -201,11 +201,11 @@ def _of_run(errors_m: NDArray[np.float64]) -> dict[str, float]:
     }
 
 
-def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
+def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """Pooled figures, their scatter from run to run, and the published ones beside them."""
     values = [outcome.values for outcome in outcomes]
     waypoint_m = np.concatenate([outcome.arrays["waypoint_m"] for outcome in outcomes])
-    localization = pooled([Spread.from_arrays(dict(outcome.arrays), "localization") for outcome in outcomes])
+    localization = pooled([Histogram.from_arrays(dict(outcome.arrays), "localization") for outcome in outcomes])
     figures: dict[str, Any] = {
         "complete": sum(v["outcome"] == "complete" and v["waypoints"] == v["wanted"] for v in values),
         "causes": sorted({v["cause"] for v in values if v["cause"]}),
@@ -221,7 +221,7 @@ def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
         "track": outcomes[0].arrays["track"],
         **localization.to_arrays("localization"),
     }
-    return Outcome(figures, arrays)
+    return JobOutcome(figures, arrays)
 
 
 def _beside(published: Mapping[str, float], runs: Sequence[Mapping[str, float]], published_runs: int) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from ccatp.mirror.mirror import build_mirror
 from ccatp.report.drawing import INK, QUIET
 from ccatp.report.plots import dress, new_figure
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
+from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.figures import LIMIT, colour, save
 from ccatp.studies.mission_study import combine_missions, run_mission
 from ccatp.survey.planning.route import ORDERS
@@ -99,22 +99,22 @@ def cells() -> Sequence[Cell]:
     ]
 
 
-def run_job(job: Job) -> Outcome:
+def run_job(job: Job) -> JobOutcome:
     """One mission, and the least time of any tour through its points."""
     values, arrays = run_mission(job)
     cfg = job.cfg
     mirror = build_mirror(cfg.mirror)
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
     bound_s = tour_bound(mirror, points, cfg.limits, cfg.etalon.measuring_time_s)
-    return Outcome({**values, "tour_bound_s": round(bound_s, 3), "budget_s": cfg.run.budget_s}, arrays)
+    return JobOutcome({**values, "tour_bound_s": round(bound_s, 3), "budget_s": cfg.run.budget_s}, arrays)
 
 
-def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
+def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """The missions pooled, and the margin that the slowest leaves."""
     values, arrays = combine_missions(factors, outcomes)
     tour_s, budget_s = (float(outcomes[0].values[name]) for name in ("tour_bound_s", "budget_s"))
     mean_s, slowest_s = values["mission_time_s"], values["mission_time_max_s"]
-    return Outcome(
+    return JobOutcome(
         {
             **values,
             "tour_bound_s": tour_s,

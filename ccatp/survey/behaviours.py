@@ -13,8 +13,8 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.escape import is_on_drive
 from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.search import leg_time, turn_time
-from ccatp.survey.retreat import Step
-from ccatp.survey.route_follower import Journey, Motion
+from ccatp.survey.retreat import RetreatStep
+from ccatp.survey.route_follower import RouteFollower, StateEstimate
 from ccatp.survey.state import (
     BACKING_OFF,
     DRIVING,
@@ -22,14 +22,14 @@ from ccatp.survey.state import (
     RETURNING,
     SETTLING,
     TURNING,
-    Event,
-    Outcome,
+    MissionEvent,
     PlanHome,
     PlanPoints,
     PlanRest,
-    Standing,
+    SurveyOutcome,
+    SurveyState,
 )
-from ccatp.survey.stops import STAND, Homing, Order
+from ccatp.survey.stops import HOLD_POSITION, MissionCommand, ReturnToBase
 
 # Points of a panel that are measured when not all can be: corners and centre, then three that determine a plane.
 LEVELS = (frozenset((1, 3, 5, 7, 9)), frozenset((1, 3, 8)))
@@ -117,7 +117,7 @@ class TimeBudget:
         return left if len(thinned) == len(left) else thinned
 
 
-class Travels:
+class Behaviours:
     """One frame of whatever the state says.
 
     Args:
@@ -130,7 +130,7 @@ class Travels:
 
     def __init__(
         self,
-        standing: Standing,
+        standing: SurveyState,
         budget: TimeBudget | None,
         plan_home: PlanHome,
         plan_rest: PlanRest,
@@ -147,7 +147,7 @@ class Travels:
         stop = standing.survey.current
         return None if standing.is_lost or stop is None else stop.point
 
-    def step(self, motion: Motion, verdict: Verdict | None) -> Order:
+    def step(self, motion: StateEstimate, verdict: Verdict | None) -> MissionCommand:
         """One frame.
 
         Args:
@@ -156,7 +156,7 @@ class Travels:
         """
         state = self._standing.state
         if motion.t_s < self._standing.stands_until_s:
-            return STAND
+            return HOLD_POSITION
         if state is DRIVING or state is TURNING:
             return self._travel(motion)
         if state is MEASURING:
@@ -167,11 +167,11 @@ class Travels:
             return self._return(motion)
         if state is BACKING_OFF and verdict is not None:
             return self._back_off(motion, verdict)
-        return STAND
+        return HOLD_POSITION
 
     # -- legs -----------------------------------------------------------------------------------------------------
 
-    def _is_overdue(self, motion: Motion) -> bool:
+    def _is_overdue(self, motion: StateEstimate) -> bool:
         """Whether the leg takes so long that something must be wrong; that holds the robot."""
         journey = self._standing.journey
         stop = journey.current
@@ -181,12 +181,12 @@ class Travels:
         self._standing.fault(f"the leg to {where} is overdue: is a wheel blocked or slipping?")
         return True
 
-    def _travel(self, motion: Motion) -> Order:
+    def _travel(self, motion: StateEstimate) -> MissionCommand:
         standing = self._standing
         if standing.is_lost:
             return self._align(motion)
         if standing.is_review_due and self._is_out_of_time(motion):
-            return STAND
+            return HOLD_POSITION
         survey = standing.survey
         stop = survey.current
         if stop is not None and not standing.missed.follows_route(motion, stop, survey):
@@ -195,31 +195,31 @@ class Travels:
             return self._find_route(motion)
         if stop is None:
             standing.go_on()
-            return STAND
+            return HOLD_POSITION
         order = self._follow(survey, motion, stop)
         if order is not None:
             return order
         if stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) or self._is_vague(motion, stop):
-            standing.apply(Event.ARRIVED)
+            standing.apply(MissionEvent.ARRIVED)
             return self._settle(motion)
         survey.advance()
         standing.go_on()
         return self._travel(motion)
 
-    def _follow(self, journey: Journey, motion: Motion, stop: Stop) -> Order | None:
+    def _follow(self, journey: RouteFollower, motion: StateEstimate, stop: Stop) -> MissionCommand | None:
         """One frame of the leg to a stop; ``None`` when it is reached."""
         standing = self._standing
         twist = journey.follow(motion, stop)
         if self._is_overdue(motion):
-            return STAND
+            return HOLD_POSITION
         phase = standing.tracker.phase
         if phase is DONE:
             return None
         if (phase is DRIVE) is not (standing.state is DRIVING):
-            standing.apply(Event.TURNED if phase is DRIVE else Event.REALIGN)
-        return Order(twist)
+            standing.apply(MissionEvent.TURNED if phase is DRIVE else MissionEvent.REALIGN)
+        return MissionCommand(twist)
 
-    def _align(self, motion: Motion) -> Order:
+    def _align(self, motion: StateEstimate) -> MissionCommand:
         """One frame of a leg that shows the heading; a fix follows."""
         aligner = self._standing.aligner
         leg = aligner.leg(motion.deck)
@@ -228,21 +228,21 @@ class Travels:
         if order is not None:
             return order
         aligner.interrupt()
-        self._standing.apply(Event.ARRIVED)
+        self._standing.apply(MissionEvent.ARRIVED)
         return self._settle(motion)
 
-    def _is_vague(self, motion: Motion, stop: Stop) -> bool:
+    def _is_vague(self, motion: StateEstimate, stop: Stop) -> bool:
         """Whether to measure at a via point: they lie near the rim, and the next turn needs the room the route left."""
         return stop.kind is StopKind.VIA and motion.sigma_of() > self._standing.cfg.mission.via_sigma_m
 
-    def _find_route(self, motion: Motion) -> Order:
+    def _find_route(self, motion: StateEstimate) -> MissionCommand:
         """Plan anew from where the robot is; one frame of standing still, however long that takes."""
         standing, stop = self._standing, self._standing.survey.current
         deck = motion.deck
         if stop is not None and stop.kind is StopKind.CALIBRATE:
             if is_on_drive(standing.survey.stops, deck.x_m, deck.y_m):
                 standing.is_off_route = False  # what was measured of the drive is not lost, and the rest of it follows
-                return STAND
+                return HOLD_POSITION
             standing.wants_calibration = True
         due = standing.leftovers.chunk
         try:
@@ -252,12 +252,12 @@ class Travels:
                 standing.route = self._plan_rest(standing.route, deck, {*standing.done, *standing.skipped})
         except PlanError as error:
             standing.fault(f"no way on: {error}")
-            return STAND
+            return HOLD_POSITION
         standing.is_off_route = False
         standing.survey = standing.journey_along(standing.route.stops)
-        return STAND
+        return HOLD_POSITION
 
-    def _is_out_of_time(self, motion: Motion) -> bool:
+    def _is_out_of_time(self, motion: StateEstimate) -> bool:
         """Review the budget after a point: whether it is time to go home; what does not fit is left out."""
         standing, budget = self._standing, self._budget
         standing.is_review_due = False
@@ -277,56 +277,58 @@ class Travels:
 
     # -- standing -------------------------------------------------------------------------------------------------
 
-    def _settle(self, motion: Motion) -> Order:
+    def _settle(self, motion: StateEstimate) -> MissionCommand:
         standing = self._standing
         if standing.stopover.has_settled(motion):
-            standing.apply(Event.SETTLED)
-            return Order(STAND.twist, at_rest=True, arrived=standing.stopover.arrival_at(self.measuring_point))
+            standing.apply(MissionEvent.SETTLED)
+            return MissionCommand(
+                HOLD_POSITION.twist, at_rest=True, arrived=standing.stopover.arrival_at(self.measuring_point)
+            )
         self._check_rest(motion)
-        return STAND
+        return HOLD_POSITION
 
-    def _stand(self, motion: Motion) -> Order:
+    def _stand(self, motion: StateEstimate) -> MissionCommand:
         if self._standing.stopover.is_due(motion):
-            return Order(STAND.twist, measure=True)
+            return MissionCommand(HOLD_POSITION.twist, measure=True)
         self._check_rest(motion)
-        return STAND
+        return HOLD_POSITION
 
-    def _check_rest(self, motion: Motion) -> None:
+    def _check_rest(self, motion: StateEstimate) -> None:
         if self._standing.stopover.is_restless(motion.t_s):
             speeds = f"{motion.speed_m_s:.4f} m/s, {motion.rate_rad_s:.4f} rad/s"
             self._standing.fault(f"the robot does not come to rest: {speeds}")
 
     # -- edge and home --------------------------------------------------------------------------------------------
 
-    def _back_off(self, motion: Motion, verdict: Verdict) -> Order:
+    def _back_off(self, motion: StateEstimate, verdict: Verdict) -> MissionCommand:
         standing = self._standing
         retreat = standing.retreat
         if retreat is None:
             standing.go_on()
-            return STAND
+            return HOLD_POSITION
         twist = retreat.step(motion, verdict)
-        if retreat.step_at is Step.TURN_AWAY and standing.abort_cause is not None:
-            retreat.step_at = Step.OVER  # there is no route to turn to; the way home begins from here
-        if retreat.step_at is Step.STUCK:
+        if retreat.step_at is RetreatStep.TURN_AWAY and standing.abort_cause is not None:
+            retreat.step_at = RetreatStep.OVER  # there is no route to turn to; the way home begins from here
+        if retreat.step_at is RetreatStep.STUCK:
             standing.hold("stuck at the edge: no motion away from it is permitted, or none helps", by_hand=False)
             standing.stuck_s = motion.t_s
-            return STAND
-        if retreat.step_at is Step.OVER:
-            standing.apply(Event.FIND)
-            return STAND
-        return Order(twist)
+            return HOLD_POSITION
+        if retreat.step_at is RetreatStep.OVER:
+            standing.apply(MissionEvent.FIND)
+            return HOLD_POSITION
+        return MissionCommand(twist)
 
-    def _return(self, motion: Motion) -> Order:
+    def _return(self, motion: StateEstimate) -> MissionCommand:
         standing = self._standing
         if standing.home is None:
             try:
-                standing.home = Homing(standing.journey_along(self._plan_home(motion.deck)), standing.tracker)
+                standing.home = ReturnToBase(standing.journey_along(self._plan_home(motion.deck)), standing.tracker)
             except PlanError as error:
                 standing.fault(f"no way home: {error}")
-            return STAND
+            return HOLD_POSITION
         if standing.home.is_at_base:
-            standing.outcome = Outcome.AT_BASE
-            standing.apply(Event.FINISHED)
-            return Order(STAND.twist, at_rest=True)
+            standing.outcome = SurveyOutcome.AT_BASE
+            standing.apply(MissionEvent.FINISHED)
+            return MissionCommand(HOLD_POSITION.twist, at_rest=True)
         twist = standing.home.step(motion, standing.stopover.is_quiet(motion))
-        return STAND if self._is_overdue(motion) else Order(twist)
+        return HOLD_POSITION if self._is_overdue(motion) else MissionCommand(twist)

@@ -16,7 +16,7 @@ from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello
 from ccatp.localizer import FOUR_STATE, Localizer, build_doubting, build_localizer
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.survey.heading_recovery import Recovery
+from ccatp.survey.heading_recovery import TakeoverState
 from ccatp.survey.mission import Mission
 from ccatp.survey.planning.escape import plan_calibration
 from ccatp.survey.planning.route import ORDERS, Route, plan_rejoin, plan_route, with_prelude
@@ -31,7 +31,7 @@ SENSOR_TOLERANCE_M = 0.005
 
 
 @dataclass(frozen=True, slots=True)
-class Parts:
+class SurveyParts:
     """The pure parts of a main loop, and what a summary needs to know of the plan."""
 
     cfg: Config
@@ -44,7 +44,7 @@ class Parts:
     already_done: int
     lower_bound_s: float
     elapsed_s: float = 0.0
-    recovery: Recovery | None = None
+    recovery: TakeoverState | None = None
 
     @property
     def total_points(self) -> int:
@@ -58,7 +58,7 @@ class Parts:
             raise ConfigError(f"robot: the configuration is not of this robot: {'; '.join(problems)}")
 
 
-def assemble(cfg: Config, done: Collection[PointId] = (), recovery: Recovery | None = None) -> Parts:
+def assemble(cfg: Config, done: Collection[PointId] = (), recovery: TakeoverState | None = None) -> SurveyParts:
     """All pure parts of a main loop, the robot standing at base or where another main loop left it.
 
     Args:
@@ -79,7 +79,7 @@ def assemble(cfg: Config, done: Collection[PointId] = (), recovery: Recovery | N
     mission = Mission(cfg, mirror, route, *planners, heading_sigma_of)
     if recovery is not None:
         mission.take_over(recovery)
-    return Parts(
+    return SurveyParts(
         cfg=cfg,
         mirror=mirror,
         localizer=localizer,
@@ -160,7 +160,7 @@ def robot_problems(cfg: Config, mirror: Mirror, hello: Hello) -> list[str]:
     return problems
 
 
-def _build_localizer(cfg: Config, mirror: Mirror, recovery: Recovery | None) -> Localizer:
+def _build_localizer(cfg: Config, mirror: Mirror, recovery: TakeoverState | None) -> Localizer:
     if recovery is None:
         return build_localizer(cfg, mirror)
     return build_doubting(cfg, mirror, recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad))

@@ -27,7 +27,7 @@ _CONSISTENT = 3  # so many fixes that agree are right against any estimate
 _FAR = 4.0  # where the localizer has no gate of its own, this many times the limit asks for them
 
 
-class FixJudge:
+class FixPlausibility:
     """Judges the fixes of one standstill; ``begin`` starts the next.
 
     A fix off the surface is never believed. One that contradicts the estimate is believed once another of the same
@@ -226,7 +226,7 @@ def _name(matrix: FloatArray) -> str:
     return "(" + ", ".join(f"{'-' if sign < 0.0 else ''}{AXES[k]}" for sign, k in zip(signs, rows, strict=True)) + ")"
 
 
-class Finding(NamedTuple):
+class FixFinding(NamedTuple):
     """What was found: nothing where both are empty.
 
     Attributes:
@@ -238,7 +238,7 @@ class Finding(NamedTuple):
     refusal: str = ""
 
 
-class Scrutiny:
+class FixGate:
     """Looks at every fix of a mission before the localizer gets it.
 
     Args:
@@ -249,7 +249,7 @@ class Scrutiny:
     def __init__(self, mirror: Mirror, cfg: Config) -> None:
         """No fix seen."""
         gate = None if cfg.run.filter in FOUR_STATE else cfg.localizer.full_state.fix_gate_nis
-        self._judge = FixJudge(mirror, cfg.etalon, cfg.robot.puck_height_m, gate)
+        self._judge = FixPlausibility(mirror, cfg.etalon, cfg.robot.puck_height_m, gate)
         self._frame = FrameCheck(cfg.etalon)
         self._cfg = cfg.etalon
         self._collimators_m = dict(zip(mirror.channels, np.asarray(mirror.collimators_m), strict=True))
@@ -261,7 +261,7 @@ class Scrutiny:
 
     def review(
         self, fix: Fix, expected_m: Vector3, pose: DeckPose, covariance: FloatArray, *, is_lost: bool = False
-    ) -> Finding:
+    ) -> FixFinding:
         """Judge a fix.
 
         Args:
@@ -275,8 +275,8 @@ class Scrutiny:
         fault = None if is_lost else self._frame.look(fix.position_m, expected_m)
         if fault is not None and (is_first or fault.is_explained):
             where = "its base" if is_first else "the place it drove to"
-            return Finding(refusal=f"the laser system sees the robot {fault.distance_m:.2f} m from {where}: {fault}")
-        return Finding(doubt=self._judge.doubt(fix, pose, covariance))
+            return FixFinding(refusal=f"the laser system sees the robot {fault.distance_m:.2f} m from {where}: {fault}")
+        return FixFinding(doubt=self._judge.doubt(fix, pose, covariance))
 
     def refusal_of(self, lengths_m: Mapping[int, float], expected_m: Vector3) -> str:
         """Why lengths that gave no position speak against the laser system; empty once a fix has been right.

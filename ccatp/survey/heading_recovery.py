@@ -11,7 +11,7 @@ from ccatp.config.models import MissionConfig, RobotConfig
 from ccatp.core import DeckPose, PointId, Stop, StopKind
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.legs import build_body, course_of_heading
-from ccatp.survey.route_follower import Journey
+from ccatp.survey.route_follower import RouteFollower
 
 # There and back, twice: a filter of a heading that was far off needs more than one look.
 _MOST_LEGS = 4
@@ -26,7 +26,7 @@ _LEAVING = 0.5
 _LOST = 2.0
 
 
-class Aligner:
+class HeadingRecovery:
     """While the heading is in doubt: which leg shows more of it.
 
     Args:
@@ -46,7 +46,7 @@ class Aligner:
         robot: RobotConfig,
         cfg: MissionConfig,
         heading_sigma_of: Callable[[], float],
-        make_journey: Callable[[Sequence[Stop]], Journey],
+        make_journey: Callable[[Sequence[Stop]], RouteFollower],
     ) -> None:
         """Nothing is in doubt."""
         self._mirror, self._limit_rad, self._wanted_m = mirror, cfg.heading_doubt_rad, cfg.alignment_leg_m
@@ -55,7 +55,7 @@ class Aligner:
         self._sigma_of, self._make_journey = heading_sigma_of, make_journey
         self._legs_left = 0
         self._was_reverse = True
-        self.journey: Journey | None = None
+        self.journey: RouteFollower | None = None
 
     def doubt(self) -> None:
         """The robot may have turned while nobody looked."""
@@ -73,7 +73,7 @@ class Aligner:
             self._legs_left = 0
         return self._legs_left > 0
 
-    def leg(self, deck: DeckPose) -> Journey | None:
+    def leg(self, deck: DeckPose) -> RouteFollower | None:
         """The leg being driven, or a new one from a pose; ``None`` where there is no room for any."""
         if self.journey is None:
             stop = self._plan(deck)
@@ -123,7 +123,7 @@ _UNSEEN_S = 0.45
 _BEGUN_S = 0.1
 
 
-class Recovery(NamedTuple):
+class TakeoverState(NamedTuple):
     """Where and how to go on.
 
     Attributes:

@@ -10,13 +10,23 @@ from ccatp.control.gate import Purpose
 from ccatp.core import PointId, Severity, StopKind, Verdict
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey import reactions
-from ccatp.survey.behaviours import TimeBudget, Travels
-from ccatp.survey.heading_recovery import Recovery
+from ccatp.survey.behaviours import Behaviours, TimeBudget
+from ccatp.survey.heading_recovery import TakeoverState
 from ccatp.survey.planning.route import Route
-from ccatp.survey.reactions import Reactions
-from ccatp.survey.route_follower import Journey, Motion
-from ccatp.survey.state import MEASURING, SETTLING, Event, Outcome, PlanHome, PlanPoints, PlanRest, Standing, State
-from ccatp.survey.stops import Order
+from ccatp.survey.reactions import Failsafe
+from ccatp.survey.route_follower import RouteFollower, StateEstimate
+from ccatp.survey.state import (
+    MEASURING,
+    SETTLING,
+    MissionEvent,
+    MissionState,
+    PlanHome,
+    PlanPoints,
+    PlanRest,
+    SurveyOutcome,
+    SurveyState,
+)
+from ccatp.survey.stops import MissionCommand
 
 
 class FixResults:
@@ -27,7 +37,7 @@ class FixResults:
         has_budget: the time left is reviewed after each point.
     """
 
-    def __init__(self, standing: Standing, *, has_budget: bool) -> None:
+    def __init__(self, standing: SurveyState, *, has_budget: bool) -> None:
         """Nothing measured yet."""
         self._standing, self._has_budget = standing, has_budget
         self._failures = 0
@@ -41,7 +51,7 @@ class FixResults:
             return
         if point is None and standing.aligner.wants_leg:
             standing.interrupt_parts()
-            standing.apply(Event.GO_ON)
+            standing.apply(MissionEvent.GO_ON)
             return
         if point is None:
             # Found again, the robot stands where the route never led.
@@ -154,16 +164,16 @@ class Mission:
             self._budget = TimeBudget(cfg.run.budget_s, mirror, cfg.limits, cfg.etalon.measuring_time_s)
         self._is_steered_bare = not (cfg.control.predicts_delay and cfg.control.compensates_creep)
         has_planner = plan_points is not None
-        self._standing = standing = Standing(cfg, mirror, route, heading_sigma_of, has_planner=has_planner)
-        self._reactions = Reactions(standing)
-        self._travels = Travels(standing, self._budget, plan_home, plan_rest, plan_points)
+        self._standing = standing = SurveyState(cfg, mirror, route, heading_sigma_of, has_planner=has_planner)
+        self._reactions = Failsafe(standing)
+        self._travels = Behaviours(standing, self._budget, plan_home, plan_rest, plan_points)
         self._results = FixResults(standing, has_budget=self._budget is not None)
         # The measurement that was asked for last: taken, fused and stored; too far off its point; failed for good.
         self.fixed, self.again, self.not_fixed = self._results.fixed, self._results.again, self._results.not_fixed
         # Hold until an operator resumes; hold and go on with a fix; hold until frames and verdicts are fresh again.
         self.fault, self.recover, self.interrupt = standing.fault, standing.recover, standing.interrupt
 
-    def step(self, motion: Motion, verdict: Verdict | None) -> Order:
+    def step(self, motion: StateEstimate, verdict: Verdict | None) -> MissionCommand:
         """One frame: react to the verdict, then do what the state says.
 
         Args:
@@ -180,7 +190,7 @@ class Mission:
 
     # -- beginnings in mid-survey ---------------------------------------------------------------------------------
 
-    def take_over(self, recovery: Recovery) -> None:
+    def take_over(self, recovery: TakeoverState) -> None:
         """Go on with what another process began; before the first frame. The robot is found before it moves."""
         self.lose_sight()
         self._standing.skipped += recovery.skipped
@@ -203,7 +213,7 @@ class Mission:
 
     def pause(self, cause: str) -> str | None:
         """Hold until ``resume``."""
-        if self.state is State.DONE:
+        if self.state is MissionState.DONE:
             return "the mission is over"
         self._standing.hold(cause, by_hand=True)
         return None
@@ -211,7 +221,7 @@ class Mission:
     def resume(self) -> str | None:
         """Go on after a hold. What holds the robot must be gone."""
         standing = self._standing
-        if self.state is not State.HELD:
+        if self.state is not MissionState.HELD:
             return f"the mission is not held but {self.state}"
         if standing.bar or standing.is_shaking:
             return f"{standing.bar or reactions.EARTHQUAKE}: nothing moves until that is cleared"
@@ -228,21 +238,21 @@ class Mission:
 
     def stop(self) -> str | None:
         """Hold the wheels and end here."""
-        if self.state is State.DONE:
+        if self.state is MissionState.DONE:
             return "the mission is over"
-        self._standing.outcome = Outcome.STOPPED
-        self._standing.apply(Event.FINISHED)
+        self._standing.outcome = SurveyOutcome.STOPPED
+        self._standing.apply(MissionEvent.FINISHED)
         return None
 
     # -- how it stands --------------------------------------------------------------------------------------------
 
     @property
-    def state(self) -> State:
+    def state(self) -> MissionState:
         """What the mission is at."""
         return self._standing.state
 
     @property
-    def outcome(self) -> Outcome:
+    def outcome(self) -> SurveyOutcome:
         """How it ended."""
         return self._standing.outcome
 
@@ -270,7 +280,7 @@ class Mission:
     def left_out(self) -> dict[PointId, str]:
         """Points that are skipped, or that will not be measured any more, and why."""
         out = dict(self._standing.leftovers.causes)
-        if self.state is State.DONE:
+        if self.state is MissionState.DONE:
             why, over = self.cause or str(self.outcome), {*self.done, *out}
             out |= {point: why for point in self._points if point not in over}
         return out
@@ -288,12 +298,12 @@ class Mission:
     @property
     def is_held_by_hand(self) -> bool:
         """Held until somebody resumes."""
-        return self.state is State.HELD and self._standing.is_held_by_hand
+        return self.state is MissionState.HELD and self._standing.is_held_by_hand
 
     @property
     def is_paused(self) -> bool:
         """Held until somebody resumes, or says that an earthquake is over."""
-        return self.state is State.HELD and (self._standing.is_held_by_hand or bool(self._standing.bar))
+        return self.state is MissionState.HELD and (self._standing.is_held_by_hand or bool(self._standing.bar))
 
     @property
     def is_lost(self) -> bool:
@@ -340,19 +350,19 @@ class Mission:
         return self._travels.measuring_point
 
     @property
-    def survey(self) -> Journey:
+    def survey(self) -> RouteFollower:
         """The journey along the route."""
         return self._standing.survey
 
     @property
-    def journey(self) -> Journey:
+    def journey(self) -> RouteFollower:
         """The journey being made: the survey, the way home, or a leg that shows the heading."""
         return self._standing.journey
 
     @property
     def eta_s(self) -> float:
         """Least time that the rest of the survey takes, s; nothing is left of one that was given up or is over."""
-        if self.abort_cause or self.state is State.DONE:
+        if self.abort_cause or self.state is MissionState.DONE:
             return 0.0
         return self._standing.route.remaining_s(self.survey.index)
 

@@ -13,9 +13,20 @@ from statistics import median
 from ccatp.config.models import Config
 from ccatp.core import Corner, DeckPose, EventCode, Severity, Verdict
 from ccatp.mirror.mirror import Mirror
-from ccatp.survey.retreat import Retreat
-from ccatp.survey.route_follower import Motion
-from ccatp.survey.state import DRIVING, HELD, IDLE, MEASURING, RETURNING, SETTLING, TURNING, Event, Standing, State
+from ccatp.survey.retreat import EdgeRetreat
+from ccatp.survey.route_follower import StateEstimate
+from ccatp.survey.state import (
+    DRIVING,
+    HELD,
+    IDLE,
+    MEASURING,
+    RETURNING,
+    SETTLING,
+    TURNING,
+    MissionEvent,
+    MissionState,
+    SurveyState,
+)
 
 NEAR_EDGE, ABORTED = EventCode.NEAR_EDGE, EventCode.ABORTED
 NONE, SLOW, HOLD, RETURN, FAULT = Severity.NONE, Severity.SLOW, Severity.HOLD, Severity.RETURN, Severity.FAULT
@@ -25,28 +36,30 @@ _HEARD_S = 0.2
 EARTHQUAKE = "emergency: earthquake"
 
 
-def abort(standing: Standing, cause: str) -> str | None:
+def abort(standing: SurveyState, cause: str) -> str | None:
     """Return to base and end there; why that is refused, or ``None``."""
-    if standing.state is State.DONE:
+    if standing.state is MissionState.DONE:
         return "the mission is over"
     is_news = standing.abort_cause is None
     standing.abort_cause = standing.abort_cause or cause
     if standing.bar:
         return None  # home, but not before the robot may move
     # An edge outranks an abort: the retreat and its fix come first.
-    if standing.state is State.HELD or (is_news and standing.state is not State.BACKING_OFF and not standing.is_lost):
+    if standing.state is MissionState.HELD or (
+        is_news and standing.state is not MissionState.BACKING_OFF and not standing.is_lost
+    ):
         standing.go_on()
     return None
 
 
-class Reactions:
+class Failsafe:
     """Hears the verdict of each frame before anything moves.
 
     Args:
         standing: what the rooms of the survey share.
     """
 
-    def __init__(self, standing: Standing) -> None:
+    def __init__(self, standing: SurveyState) -> None:
         """No verdict yet."""
         self._standing = standing
         self._finding = ""
@@ -57,7 +70,7 @@ class Reactions:
         """Whatever is latched when the first verdict comes was acted on before."""
         self._raised = None
 
-    def react(self, motion: Motion, verdict: Verdict | None) -> None:
+    def react(self, motion: StateEstimate, verdict: Verdict | None) -> None:
         """Do what the verdict demands.
 
         Args:
@@ -97,7 +110,7 @@ class Reactions:
             standing.stands_until_s = t_s + _HEARD_S
         self._was_lost = standing.is_lost
 
-    def _stay(self, motion: Motion, verdict: Verdict | None) -> None:
+    def _stay(self, motion: StateEstimate, verdict: Verdict | None) -> None:
         """Not every motion is permitted, or there is no verdict."""
         standing = self._standing
         if verdict is None:
@@ -130,12 +143,12 @@ class Reactions:
     def _stand_fast(self) -> None:
         """Held, and home when it is over; a pose from before is not to be trusted then."""
         standing = self._standing
-        if standing.bar or standing.state is State.DONE:
+        if standing.bar or standing.state is MissionState.DONE:
             return
         standing.bar = EARTHQUAKE
         standing.abort_cause = standing.abort_cause or EARTHQUAKE
         standing.lose()
-        standing.hold(EARTHQUAKE, by_hand=standing.state is State.HELD and standing.is_held_by_hand)
+        standing.hold(EARTHQUAKE, by_hand=standing.state is MissionState.HELD and standing.is_held_by_hand)
 
     def _obey(self, verdict: Verdict) -> bool:
         """Do what a finding of the monitors demands; whether that is all for this frame."""
@@ -160,7 +173,7 @@ class Reactions:
     def _looks(self, cause: str) -> bool:
         """A sensor that stays off may be over a seam or the rim where the pose is wrong: one fix, at rest, tells."""
         standing = self._standing
-        if standing.state is State.DONE or (standing.state is HELD and standing.is_held_by_hand):
+        if standing.state is MissionState.DONE or (standing.state is HELD and standing.is_held_by_hand):
             return False
         if not self._has_looked:
             self._has_looked = True
@@ -191,15 +204,15 @@ class Reactions:
             standing.fault(standing.cause)
         return True
 
-    def _meet_edge(self, motion: Motion, verdict: Verdict) -> None:
+    def _meet_edge(self, motion: StateEstimate, verdict: Verdict) -> None:
         standing = self._standing
-        if standing.state in (State.BACKING_OFF, State.DONE):
+        if standing.state in (MissionState.BACKING_OFF, MissionState.DONE):
             return
         if standing.ignores_motion:
             standing.go_on()  # where the edge is, is not known before a fix; standing still for it is safe anywhere
         if standing.is_lost and standing.state in (SETTLING, MEASURING):
             return  # it stands, and a rim on the map is a matter of the pose that is being found
-        if standing.state is State.HELD and standing.is_held_by_hand:
+        if standing.state is MissionState.HELD and standing.is_held_by_hand:
             return
         if motion.t_s < standing.stands_until_s:
             return
@@ -217,14 +230,14 @@ class Reactions:
         standing.interrupt_parts()
         # An edge that the route did not foresee means that the pose is wrong: it is found again before moving on.
         standing.lose()
-        standing.apply(Event.EDGE)
-        standing.retreat = Retreat(mission, standing.tracker, verdict, motion.pose, motion.rate_rad_s)
+        standing.apply(MissionEvent.EDGE)
+        standing.retreat = EdgeRetreat(mission, standing.tracker, verdict, motion.pose, motion.rate_rad_s)
 
 
 _EARLY = 1.05  # from the decision to the first turn of a wheel some charge goes, too
 
 
-class Call(StrEnum):
+class ReminderCall(StrEnum):
     """What the vigil asks for."""
 
     NOTHING = ""
@@ -232,7 +245,7 @@ class Call(StrEnum):
     RETURN = "return"
 
 
-class Vigil:
+class UnattendedFaultTimer:
     """Watches over a fault.
 
     Args:
@@ -255,7 +268,7 @@ class Vigil:
         """There is no fault any more."""
         self._since_s = None
 
-    def watch(self, t_s: float, soc: float, home_s: float | None) -> Call:
+    def watch(self, t_s: float, soc: float, home_s: float | None) -> ReminderCall:
         """One frame of a fault.
 
         Args:
@@ -268,11 +281,11 @@ class Vigil:
         # Once: a return that failed may have failed for the reason of the fault.
         if self._falls and not self._has_returned and home_s is not None and self.is_low(soc, home_s):
             self._has_returned = True
-            return Call.RETURN
+            return ReminderCall.RETURN
         if t_s < self._remind_at_s:
-            return Call.NOTHING
+            return ReminderCall.NOTHING
         self._remind_at_s = t_s + self._alarm_period_s
-        return Call.REMIND
+        return ReminderCall.REMIND
 
     def is_low(self, soc: float, home_s: float) -> bool:
         """Whether the charge above the reserve is less than the way home may take."""

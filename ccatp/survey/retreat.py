@@ -4,10 +4,10 @@ from enum import StrEnum
 from math import copysign, hypot
 
 from ccatp.config.models import MissionConfig
-from ccatp.control.tracker import LegTracker, Phase
+from ccatp.control.tracker import LegPhase, LegTracker
 from ccatp.core import EventCode, PanelPose, Twist, Verdict, difference
 from ccatp.safety.edge_detector import Cause
-from ccatp.survey.route_follower import Motion
+from ccatp.survey.route_follower import StateEstimate
 
 STILL = Twist(0.0, 0.0)
 # A turn that met the rim is undone by at most this; more would sweep the next corner.
@@ -16,7 +16,7 @@ UNTURN_LIMIT_RAD = 0.8
 TIME_LIMIT_S = 15.0
 
 
-class Step(StrEnum):
+class RetreatStep(StrEnum):
     """What the retreat is at."""
 
     BACK = "back"
@@ -26,7 +26,7 @@ class Step(StrEnum):
     STUCK = "stuck"
 
 
-class Retreat:
+class EdgeRetreat:
     """One back-off: away from the edge along the track just driven, then a turn away from the side that hung over.
 
     A robot that met the edge backwards faces away from it, and does not turn.
@@ -55,16 +55,16 @@ class Retreat:
         # Turning is to the side that stands on the mirror; where both or none do, to the left.
         self._away = -cfg.turn_away_rad if left and not right else cfg.turn_away_rad
         self._direction = -1.0 if front else 1.0
-        self._after_back = Step.TURN_AWAY if front else Step.OVER
+        self._after_back = RetreatStep.TURN_AWAY if front else RetreatStep.OVER
         self._unturn = -copysign(1.0, rate_rad_s)
         if verdict.turn and not (front and rear):
-            self.step_at = Step.UNTURN
+            self.step_at = RetreatStep.UNTURN
         elif front != rear:
-            self.step_at = Step.BACK
+            self.step_at = RetreatStep.BACK
         else:
-            self.step_at = Step.STUCK
+            self.step_at = RetreatStep.STUCK
 
-    def step(self, motion: Motion, verdict: Verdict) -> Twist:
+    def step(self, motion: StateEstimate, verdict: Verdict) -> Twist:
         """The twist until the next frame; ``step_at`` tells what it is at."""
         pose = motion.pose
         if pose.panel == self._last.panel:
@@ -72,43 +72,43 @@ class Retreat:
             self._turned_rad += abs(difference(pose.heading_rad, self._last.heading_rad))
         self._last = pose
         self._time_s += motion.dt_s
-        if self._time_s > TIME_LIMIT_S and self.step_at is not Step.OVER:
-            self.step_at = Step.STUCK
+        if self._time_s > TIME_LIMIT_S and self.step_at is not RetreatStep.OVER:
+            self.step_at = RetreatStep.STUCK
         if not (verdict.forward or verdict.reverse or verdict.turn):
             return STILL  # data are missing, which passes by itself
         is_clear = verdict.code is not EventCode.NEAR_EDGE
-        if self.step_at is Step.BACK:
+        if self.step_at is RetreatStep.BACK:
             return self._back(is_clear, verdict)
-        if self.step_at is Step.UNTURN:
+        if self.step_at is RetreatStep.UNTURN:
             return self._undo_turn(is_clear, verdict)
-        if self.step_at is Step.TURN_AWAY:
+        if self.step_at is RetreatStep.TURN_AWAY:
             return self._turn_away(motion, is_clear, verdict)
         return STILL
 
     def _back(self, is_clear: bool, verdict: Verdict) -> Twist:
         if self._travel_m >= self._cfg.backoff_m or (is_clear and self._travel_m >= 0.5 * self._cfg.backoff_m):
-            self.step_at = self._after_back if is_clear else Step.STUCK
+            self.step_at = self._after_back if is_clear else RetreatStep.STUCK
             return STILL
         if not (verdict.reverse if self._direction < 0.0 else verdict.forward):
-            self.step_at = Step.STUCK
+            self.step_at = RetreatStep.STUCK
             return STILL
         return Twist(self._direction * self._cfg.backoff_speed_m_s, 0.0)
 
     def _undo_turn(self, is_clear: bool, verdict: Verdict) -> Twist:
         if is_clear:
-            self.step_at = Step.OVER
+            self.step_at = RetreatStep.OVER
             return STILL
         if self._turned_rad >= UNTURN_LIMIT_RAD or not verdict.turn:
-            self.step_at = Step.OVER if self._has_turned_away else Step.BACK
+            self.step_at = RetreatStep.OVER if self._has_turned_away else RetreatStep.BACK
             return STILL
         return Twist(0.0, self._unturn * self._cfg.turn_away_rad)
 
-    def _turn_away(self, motion: Motion, is_clear: bool, verdict: Verdict) -> Twist:
+    def _turn_away(self, motion: StateEstimate, is_clear: bool, verdict: Verdict) -> Twist:
         if not is_clear:
             # The turn sweeps a corner off the panels. Off the rim, back; off what may be a seam, the fix tells.
             self._has_turned_away = True
             self._unturn, self._turned_rad = -copysign(1.0, self._away), 0.0
-            self.step_at = Step.UNTURN if verdict.cause.startswith(Cause.RIM) else Step.OVER
+            self.step_at = RetreatStep.UNTURN if verdict.cause.startswith(Cause.RIM) else RetreatStep.OVER
             return STILL
         if self._away_rad is None:
             self._away_rad = motion.pose.heading_rad + self._away
@@ -116,6 +116,6 @@ class Retreat:
         state = motion.steered
         remaining = difference(self._away_rad, state.pose[2])
         twist = self._tracker.step_turn(remaining, motion.dt_s, state.omega_rad_s)
-        if self._tracker.phase is Phase.DONE:
-            self.step_at = Step.OVER
+        if self._tracker.phase is LegPhase.DONE:
+            self.step_at = RetreatStep.OVER
         return twist

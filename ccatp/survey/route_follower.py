@@ -18,7 +18,7 @@ from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.legs import build_body, course_of_heading, sensor_depths
 
 
-class PacedTracker(LegTracker):
+class SpeedLimitedTracker(LegTracker):
     """A leg tracker that plans with the reduced limits while ``is_slow``; a change counts from the next leg or turn.
 
     Args:
@@ -73,7 +73,7 @@ class PacedTracker(LegTracker):
 _SWEEP_RAD = 0.04
 
 
-class Aim(NamedTuple):
+class LegAim(NamedTuple):
     """Where a correction leads, in the frame of the panel on which the robot stands.
 
     Attributes:
@@ -88,7 +88,9 @@ class Aim(NamedTuple):
     turn_rad: float
 
 
-def plan_aim(pose: tuple[float, float, float], target: tuple[float, float], tolerance_m: float, margin: float) -> Aim:
+def plan_aim(
+    pose: tuple[float, float, float], target: tuple[float, float], tolerance_m: float, margin: float
+) -> LegAim:
     """The least motion that brings the robot within the tolerance.
 
     Straight along the heading, where the part beside it is at most ``margin`` of the tolerance; else by the smaller
@@ -105,11 +107,11 @@ def plan_aim(pose: tuple[float, float, float], target: tuple[float, float], tole
     c, s = cos(heading), sin(heading)
     ahead, beside = c * dx + s * dy, c * dy - s * dx
     if abs(beside) <= margin * tolerance_m:
-        return Aim(x + ahead * c, y + ahead * s, ahead < 0.0, 0.0)
+        return LegAim(x + ahead * c, y + ahead * s, ahead < 0.0, 0.0)
     turn = difference(atan2(dy, dx), heading)
     if abs(turn) <= 0.5 * pi:
-        return Aim(*target, False, turn)
-    return Aim(*target, True, difference(turn, pi))
+        return LegAim(*target, False, turn)
+    return LegAim(*target, True, difference(turn, pi))
 
 
 class Corrector:
@@ -126,7 +128,7 @@ class Corrector:
         self._mirror, self._cfg = mirror, cfg
         self._body = build_body(robot, cfg)
 
-    def aim(self, pose: PanelPose, target: tuple[float, float]) -> Aim | None:
+    def aim(self, pose: PanelPose, target: tuple[float, float]) -> LegAim | None:
         """The correction from ``pose`` to ``target``; ``None`` where it is too far or a sensor would pass the rim.
 
         Args:
@@ -164,7 +166,7 @@ class Corrector:
         return bool(depths.min() >= body.turn_clearance_m)
 
 
-class Motion(NamedTuple):
+class StateEstimate(NamedTuple):
     """What the localizer says about the present frame.
 
     ``creep`` is the drift (dx, dy) per metre of travel in the plane of ``pose``. ``ahead`` is where the robot will be,
@@ -201,9 +203,9 @@ class Motion(NamedTuple):
         """The pose in the deck frame."""
         return self.deck_of(self.pose)
 
-    def with_only(self, *, ahead: bool, creep: bool) -> "Motion":
+    def with_only(self, *, ahead: bool, creep: bool) -> "StateEstimate":
         """The same without what steering is not to use: the prediction, the drift."""
-        return Motion(
+        return StateEstimate(
             self.t_s,
             self.dt_s,
             self.pose,
@@ -216,7 +218,7 @@ class Motion(NamedTuple):
         )
 
 
-class Journey:
+class RouteFollower:
     """Keeps the current stop until all are exhausted, and drives the leg to it.
 
     Args:
@@ -239,7 +241,7 @@ class Journey:
         self._is_begun = False
         self._deadline_s = 0.0
         self._target: tuple[PanelId, Stop, tuple[float, float]] | None = None
-        self._aim: tuple[PanelId, Aim] | None = None
+        self._aim: tuple[PanelId, LegAim] | None = None
 
     @property
     def next_point(self) -> PointId | None:
@@ -256,11 +258,11 @@ class Journey:
         """The robot stopped on the way: the leg begins anew, from wherever it is then."""
         self._is_begun, self._aim = False, None
 
-    def correct(self, panel: PanelId, aim: Aim) -> None:
+    def correct(self, panel: PanelId, aim: LegAim) -> None:
         """The leg to the current stop is a correction, as long as the robot stays on the panel."""
         self._is_begun, self._aim = False, (panel, aim)
 
-    def follow(self, motion: Motion, stop: Stop) -> Twist:
+    def follow(self, motion: StateEstimate, stop: Stop) -> Twist:
         """One frame of the leg to ``stop``: the twist until the next frame."""
         state, panel = motion.steered, motion.pose.panel
         target, reverse = self.target_in(panel, stop), stop.reverse

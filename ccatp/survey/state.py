@@ -18,14 +18,14 @@ from ccatp.config.models import Config
 from ccatp.control.gate import Purpose
 from ccatp.core import DeckPose, PointId, Severity, Stop
 from ccatp.mirror.mirror import Mirror
-from ccatp.survey.heading_recovery import Aligner
+from ccatp.survey.heading_recovery import HeadingRecovery
 from ccatp.survey.planning.route import Route
-from ccatp.survey.retreat import Retreat
-from ccatp.survey.route_follower import Corrector, Journey, Motion, PacedTracker
-from ccatp.survey.stops import Homing, Stopover
+from ccatp.survey.retreat import EdgeRetreat
+from ccatp.survey.route_follower import Corrector, RouteFollower, SpeedLimitedTracker, StateEstimate
+from ccatp.survey.stops import ReturnToBase, SettleAndMeasure
 
 
-class State(StrEnum):
+class MissionState(StrEnum):
     """What the mission is at."""
 
     IDLE = "idle"
@@ -39,10 +39,10 @@ class State(StrEnum):
     DONE = "done"
 
 
-IDLE, TURNING, DRIVING, SETTLING, MEASURING, BACKING_OFF, RETURNING, HELD, DONE = State
+IDLE, TURNING, DRIVING, SETTLING, MEASURING, BACKING_OFF, RETURNING, HELD, DONE = MissionState
 
 
-class Event(StrEnum):
+class MissionEvent(StrEnum):
     """What can happen to it. Every event has a meaning in every state; where the table is silent it changes nothing."""
 
     GO_ON = "go on"  # the survey starts, or goes on to the next leg
@@ -57,7 +57,7 @@ class Event(StrEnum):
     FINISHED = "finished"  # all points done, at base after an abort, or stopped
 
 
-class Outcome(StrEnum):
+class SurveyOutcome(StrEnum):
     """How a mission ended."""
 
     NONE = ""
@@ -66,33 +66,39 @@ class Outcome(StrEnum):
     STOPPED = "stopped"
 
 
-_ANYWHERE = {Event.HOLD: State.HELD, Event.FINISHED: State.DONE}
-_SURVEYING = _ANYWHERE | {Event.EDGE: State.BACKING_OFF, Event.GO_HOME: State.RETURNING, Event.GO_ON: State.TURNING}
+_ANYWHERE = {MissionEvent.HOLD: MissionState.HELD, MissionEvent.FINISHED: MissionState.DONE}
+_SURVEYING = _ANYWHERE | {
+    MissionEvent.EDGE: MissionState.BACKING_OFF,
+    MissionEvent.GO_HOME: MissionState.RETURNING,
+    MissionEvent.GO_ON: MissionState.TURNING,
+}
 
 # (state, event) -> state. An edge outranks an abort: while backing off GO_HOME changes nothing. DONE is final.
 TRANSITIONS = MappingProxyType(
     {
-        State.IDLE: _ANYWHERE
+        MissionState.IDLE: _ANYWHERE
         | {
-            Event.GO_ON: State.TURNING,
-            Event.GO_HOME: State.RETURNING,
-            Event.EDGE: State.BACKING_OFF,
-            Event.FIND: State.SETTLING,
+            MissionEvent.GO_ON: MissionState.TURNING,
+            MissionEvent.GO_HOME: MissionState.RETURNING,
+            MissionEvent.EDGE: MissionState.BACKING_OFF,
+            MissionEvent.FIND: MissionState.SETTLING,
         },
-        State.TURNING: _SURVEYING | {Event.TURNED: State.DRIVING, Event.ARRIVED: State.SETTLING},
-        State.DRIVING: _SURVEYING | {Event.REALIGN: State.TURNING, Event.ARRIVED: State.SETTLING},
-        State.SETTLING: _SURVEYING | {Event.SETTLED: State.MEASURING},
-        State.MEASURING: _SURVEYING,
-        State.BACKING_OFF: _ANYWHERE | {Event.FIND: State.SETTLING},
-        State.RETURNING: _ANYWHERE | {Event.EDGE: State.BACKING_OFF},
-        State.HELD: _ANYWHERE
+        MissionState.TURNING: _SURVEYING
+        | {MissionEvent.TURNED: MissionState.DRIVING, MissionEvent.ARRIVED: MissionState.SETTLING},
+        MissionState.DRIVING: _SURVEYING
+        | {MissionEvent.REALIGN: MissionState.TURNING, MissionEvent.ARRIVED: MissionState.SETTLING},
+        MissionState.SETTLING: _SURVEYING | {MissionEvent.SETTLED: MissionState.MEASURING},
+        MissionState.MEASURING: _SURVEYING,
+        MissionState.BACKING_OFF: _ANYWHERE | {MissionEvent.FIND: MissionState.SETTLING},
+        MissionState.RETURNING: _ANYWHERE | {MissionEvent.EDGE: MissionState.BACKING_OFF},
+        MissionState.HELD: _ANYWHERE
         | {
-            Event.GO_ON: State.TURNING,
-            Event.GO_HOME: State.RETURNING,
-            Event.EDGE: State.BACKING_OFF,
-            Event.FIND: State.SETTLING,
+            MissionEvent.GO_ON: MissionState.TURNING,
+            MissionEvent.GO_HOME: MissionState.RETURNING,
+            MissionEvent.EDGE: MissionState.BACKING_OFF,
+            MissionEvent.FIND: MissionState.SETTLING,
         },
-        State.DONE: {},
+        MissionState.DONE: {},
     }
 )
 
@@ -100,20 +106,20 @@ TRANSITIONS = MappingProxyType(
 # What the last gate lets a state move for.
 PURPOSES = MappingProxyType(
     {
-        State.IDLE: Purpose.STAND,
-        State.TURNING: Purpose.SURVEY,
-        State.DRIVING: Purpose.SURVEY,
-        State.SETTLING: Purpose.STAND,
-        State.MEASURING: Purpose.STAND,
-        State.BACKING_OFF: Purpose.RETREAT,
-        State.RETURNING: Purpose.HOMEWARD,
-        State.HELD: Purpose.STAND,
-        State.DONE: Purpose.STAND,
+        MissionState.IDLE: Purpose.STAND,
+        MissionState.TURNING: Purpose.SURVEY,
+        MissionState.DRIVING: Purpose.SURVEY,
+        MissionState.SETTLING: Purpose.STAND,
+        MissionState.MEASURING: Purpose.STAND,
+        MissionState.BACKING_OFF: Purpose.RETREAT,
+        MissionState.RETURNING: Purpose.HOMEWARD,
+        MissionState.HELD: Purpose.STAND,
+        MissionState.DONE: Purpose.STAND,
     }
 )
 
 
-def next_state(state: State, event: Event) -> State:
+def next_state(state: MissionState, event: MissionEvent) -> MissionState:
     """The state after ``event``; total over all pairs."""
     return TRANSITIONS[state].get(event, state)
 
@@ -130,7 +136,7 @@ def by_reason(causes: Mapping[PointId, str]) -> dict[str, list[str]]:
     return named
 
 
-class Leftovers:
+class RetryQueue:
     """Keeps what is to be measured off the planned route.
 
     Attributes:
@@ -202,7 +208,7 @@ class MissedPoint:
         """The robot stopped, or goes on: wherever it is, it is not where it missed the point."""
         self._is_missed = False
 
-    def follows_route(self, motion: Motion, stop: Stop, journey: Journey) -> bool:
+    def follows_route(self, motion: StateEstimate, stop: Stop, journey: RouteFollower) -> bool:
         """Whether the leg to ``stop`` may be driven as planned, or as the correction that begins here.
 
         Args:
@@ -218,7 +224,7 @@ class MissedPoint:
         self._corrected = None
         return self._corrector.can_go_on(motion.deck, stop)
 
-    def _correct(self, motion: Motion, stop: Stop, journey: Journey) -> bool:
+    def _correct(self, motion: StateEstimate, stop: Stop, journey: RouteFollower) -> bool:
         panel = motion.pose.panel
         aim = self._corrector.aim(motion.pose, journey.target_in(panel, stop))
         if aim is None:
@@ -234,7 +240,7 @@ PlanRest = Callable[[Route, DeckPose, Collection[PointId]], Route]
 PlanPoints = Callable[[DeckPose, Sequence[PointId]], Route]
 
 
-class Standing:
+class SurveyState:
     """State, causes and parts of one survey.
 
     Args:
@@ -277,14 +283,14 @@ class Standing:
     ) -> None:
         """Idle at base."""
         self.cfg, self.mirror, self.route, self._has_planner = cfg, mirror, route, has_planner
-        self.tracker = PacedTracker(cfg.control, cfg.limits, cfg.health, cfg.robot.wheel_lag_s)
+        self.tracker = SpeedLimitedTracker(cfg.control, cfg.limits, cfg.health, cfg.robot.wheel_lag_s)
         self.survey = self.journey_along(route.stops)
-        self.home: Homing | None = None
-        self.stopover = Stopover(cfg.control, cfg.etalon.measuring_time_s)
+        self.home: ReturnToBase | None = None
+        self.stopover = SettleAndMeasure(cfg.control, cfg.etalon.measuring_time_s)
         self.missed = MissedPoint(Corrector(mirror, cfg.robot, cfg.mission))
-        self.aligner = Aligner(mirror, cfg.robot, cfg.mission, heading_sigma_of, self.journey_along)
-        self.leftovers = Leftovers()
-        self.state, self.outcome, self.cause = State.IDLE, Outcome.NONE, ""
+        self.aligner = HeadingRecovery(mirror, cfg.robot, cfg.mission, heading_sigma_of, self.journey_along)
+        self.leftovers = RetryQueue()
+        self.state, self.outcome, self.cause = MissionState.IDLE, SurveyOutcome.NONE, ""
         self.done: list[PointId] = []
         self.skipped: list[PointId] = []
         self.abort_cause: str | None = None
@@ -295,18 +301,18 @@ class Standing:
         self.is_lost = self.is_at_start = cfg.mission.fix_at_start
         self.is_off_route = self.is_review_due = self.doubts_pose = self.wants_full_fans = False
         self.wants_calibration = False
-        self.retreat: Retreat | None = None
+        self.retreat: EdgeRetreat | None = None
         self.stuck_s: float | None = None
         self.backoffs = 0
         self.waits_until_s = self.stands_until_s = -inf
         self._recoveries_s: list[float] = []
 
-    def journey_along(self, stops: Sequence[Stop]) -> Journey:
+    def journey_along(self, stops: Sequence[Stop]) -> RouteFollower:
         """A journey along stops."""
-        return Journey(self.mirror, self.tracker, self.cfg.control.leg_timeout_factor, stops)
+        return RouteFollower(self.mirror, self.tracker, self.cfg.control.leg_timeout_factor, stops)
 
     @property
-    def journey(self) -> Journey:
+    def journey(self) -> RouteFollower:
         """The journey being made: the survey, the way home, or a leg that shows the heading."""
         if self.aligner.journey is not None:
             return self.aligner.journey
@@ -320,16 +326,16 @@ class Standing:
     @property
     def purpose(self) -> Purpose:
         """What the last gate lets the robot move for: legs that show the heading may be part of the way home."""
-        if self.is_lost and self.abort_cause is not None and self.state in (State.TURNING, State.DRIVING):
+        if self.is_lost and self.abort_cause is not None and self.state in (MissionState.TURNING, MissionState.DRIVING):
             return Purpose.HOMEWARD
         return PURPOSES[self.state]
 
     @property
     def is_awaiting_fix(self) -> bool:
         """Whether the measurement asked for last is still wanted."""
-        return self.state is State.MEASURING and self.stopover.is_asked
+        return self.state is MissionState.MEASURING and self.stopover.is_asked
 
-    def apply(self, event: Event) -> None:
+    def apply(self, event: MissionEvent) -> None:
         """Something happened: the table says what state that makes."""
         self.state = next_state(self.state, event)
 
@@ -353,21 +359,21 @@ class Standing:
     def hold(self, cause: str, *, by_hand: bool) -> None:
         """Hold, until somebody resumes or until the cause is gone."""
         self.interrupt_parts()
-        self.apply(Event.HOLD)
+        self.apply(MissionEvent.HOLD)
         self.is_held_by_hand = by_hand
         self.is_hold_deaf = False
         self.cause = cause
 
     def interrupt(self, cause: str) -> bool:
         """Hold until frames and verdicts are fresh again; returns whether that was news."""
-        if self.state in (State.IDLE, State.HELD, State.DONE):
+        if self.state in (MissionState.IDLE, MissionState.HELD, MissionState.DONE):
             return False
         self.hold(cause, by_hand=False)
         return True
 
     def fault(self, cause: str, *, is_lost: bool = False) -> None:
         """Hold until an operator resumes, because something is wrong; where the pose is, a fix comes first then."""
-        if self.state is State.DONE:
+        if self.state is MissionState.DONE:
             return
         self.is_lost |= is_lost
         self.hold(cause, by_hand=True)
@@ -375,7 +381,7 @@ class Standing:
 
     def await_recovery(self, cause: str, *, is_pose_doubted: bool = False) -> None:
         """Hold until the cause is gone, and then find out where the robot is before moving on."""
-        if self.state is State.DONE or (self.state is HELD and self.is_held_by_hand):
+        if self.state is MissionState.DONE or (self.state is HELD and self.is_held_by_hand):
             return
         self.lose()
         was_deaf = self.ignores_motion
@@ -390,7 +396,7 @@ class Standing:
             cause: why.
             t_s: now.
         """
-        if self.state is State.DONE or (self.state is HELD and self.is_held_by_hand):
+        if self.state is MissionState.DONE or (self.state is HELD and self.is_held_by_hand):
             return
         health = self.cfg.health
         self._recoveries_s = [since_s for since_s in self._recoveries_s if t_s - since_s <= health.retry_window_s]
@@ -410,19 +416,19 @@ class Standing:
         self.doubts_pose |= self.ignores_motion
         self.is_faulted = False
         # Wherever a hold left the robot: the route's next turn may not be safe there.
-        self.is_off_route |= self.state is State.HELD
+        self.is_off_route |= self.state is MissionState.HELD
         if self.is_lost:
-            self.apply(Event.FIND)
+            self.apply(MissionEvent.FIND)
         elif self.abort_cause is not None:
             self.cause = self.abort_cause
             self.home = None  # planned anew from where the robot is now
-            self.apply(Event.GO_HOME)
+            self.apply(MissionEvent.GO_HOME)
         elif self.survey.current is None and not self._has_more():
-            self.outcome = Outcome.COMPLETE
-            self.apply(Event.FINISHED)
+            self.outcome = SurveyOutcome.COMPLETE
+            self.apply(MissionEvent.FINISHED)
         else:
             self.cause = ""
-            self.apply(Event.GO_ON)
+            self.apply(MissionEvent.GO_ON)
 
     def _has_more(self) -> bool:
         """Whether points are due away from the planned route: those that failed once, or a thinned rest."""
@@ -439,7 +445,7 @@ _GUARD_SIGMAS = 3.0
 _MOST_GUARD = 0.1  # of the tolerance
 
 
-class Approaches:
+class ApproachCounter:
     """Decides on a correction move after each fix.
 
     Args:

@@ -10,15 +10,15 @@ What the mission wants of a frame.
 import msgspec
 
 from ccatp.config.models import ControlConfig
-from ccatp.control.tracker import LegTracker, Phase
+from ccatp.control.tracker import LegPhase, LegTracker
 from ccatp.core import PointId, Stop, StopKind, Twist, difference
-from ccatp.survey.route_follower import Journey, Motion
+from ccatp.survey.route_follower import RouteFollower, StateEstimate
 
 # Sums of frame periods are not exact: half a nanosecond must not cost a frame.
 TIME_EPSILON_S = 5e-10
 
 
-class Stillness:
+class StandstillDetector:
     """At rest: both speeds, or both of their running means, have been below the limits for the settling time.
 
     Fans shake the body with a mean of zero; wheels that run down, or that creep, move the mean as well.
@@ -70,7 +70,7 @@ class Stillness:
 SETTLE_LIMIT_S = 10.0
 
 
-class Stopover:
+class SettleAndMeasure:
     """From the end of a leg to the request for a measurement.
 
     Args:
@@ -84,7 +84,7 @@ class Stopover:
 
     def __init__(self, control: ControlConfig, measuring_time_s: float) -> None:
         """Nothing asked yet."""
-        self._stillness = Stillness(control)
+        self._stillness = StandstillDetector(control)
         self._measuring_time_s = measuring_time_s
         self._rest_by_s: float | None = None
         self._measure_at_s = 0.0
@@ -99,11 +99,11 @@ class Stopover:
         self._stillness.reset()
         self._rest_by_s = None
 
-    def is_quiet(self, motion: Motion) -> bool:
+    def is_quiet(self, motion: StateEstimate) -> bool:
         """Take the speeds of a frame; whether the robot has been at rest for the settling time."""
         return self._stillness.is_rest(motion.t_s, motion.dt_s, motion.speed_m_s, motion.rate_rad_s)
 
-    def has_settled(self, motion: Motion) -> bool:
+    def has_settled(self, motion: StateEstimate) -> bool:
         """One frame of coming to rest; whether that is over, and the measuring time begins."""
         if self._rest_by_s is None:
             self._rest_by_s = motion.t_s + SETTLE_LIMIT_S
@@ -132,7 +132,7 @@ class Stopover:
         """The measurement failed: it is asked for once more, after another measuring time."""
         self.is_asked, self._is_anew = False, True
 
-    def is_due(self, motion: Motion) -> bool:
+    def is_due(self, motion: StateEstimate) -> bool:
         """Take a frame of the measuring time; whether to ask for the measurement now. True once at each stop.
 
         A robot that moves once more after all spoils the measurement, and one that is under way as well: the time
@@ -158,7 +158,7 @@ class Stopover:
 STILL = Twist(0.0, 0.0)
 
 
-class Homing:
+class ReturnToBase:
     """Drives a journey whose last stop is base.
 
     Args:
@@ -169,7 +169,7 @@ class Homing:
         journey: as given; exhausted once the robot stands at base.
     """
 
-    def __init__(self, journey: Journey, tracker: LegTracker) -> None:
+    def __init__(self, journey: RouteFollower, tracker: LegTracker) -> None:
         """Stand before the first leg."""
         self.journey, self._tracker = journey, tracker
         self._is_docking = False
@@ -184,7 +184,7 @@ class Homing:
         self._is_docking = False
         self.journey.interrupt()
 
-    def step(self, motion: Motion, is_quiet: bool) -> Twist:
+    def step(self, motion: StateEstimate, is_quiet: bool) -> Twist:
         """One frame of the way home.
 
         Args:
@@ -197,7 +197,7 @@ class Homing:
         if self._is_docking:
             return self._dock(motion, stop, is_quiet)
         twist = self.journey.follow(motion, stop)
-        if self._tracker.phase is not Phase.DONE:
+        if self._tracker.phase is not LegPhase.DONE:
             return twist
         if stop.kind is not StopKind.BASE:
             self.journey.advance()
@@ -207,8 +207,8 @@ class Homing:
             self._tracker.begin_turn(difference(stop.heading_rad, motion.deck.heading_rad))
         return STILL
 
-    def _dock(self, motion: Motion, stop: Stop, is_quiet: bool) -> Twist:
-        if stop.heading_rad is not None and self._tracker.phase is Phase.TURN:
+    def _dock(self, motion: StateEstimate, stop: Stop, is_quiet: bool) -> Twist:
+        if stop.heading_rad is not None and self._tracker.phase is LegPhase.TURN:
             remaining = difference(stop.heading_rad, motion.deck.heading_rad + motion.lead_rad)
             return self._tracker.step_turn(remaining, motion.dt_s, motion.steered.omega_rad_s)
         if is_quiet:
@@ -216,7 +216,7 @@ class Homing:
         return STILL
 
 
-class Order(msgspec.Struct, frozen=True):
+class MissionCommand(msgspec.Struct, frozen=True):
     """What the mission wants of the present frame.
 
     Attributes:
@@ -232,4 +232,4 @@ class Order(msgspec.Struct, frozen=True):
     measure: bool = False
 
 
-STAND = Order(STILL)
+HOLD_POSITION = MissionCommand(STILL)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ccatp.beacons.slam.beacon_map import BearingModel, RangeModel, SlamSettings, Trust
+from ccatp.beacons.slam.beacon_map import BearingModel, RangeModel, RobustLoss, SlamSettings
 from ccatp.beacons.slam.motion import DifferentialDrive, DifferentialNoise, Increment
 from ccatp.beacons.slam.range_slam import BeaconSlam
 from ccatp.beacons.slam.recording import RangeBearingReading, RangeReading, Reading
 from ccatp.core import wrap_pi
 
 NOISE = DifferentialNoise(0.02, 0.0, 0.01, 0.02, 0.0, 0.0)
-PLAIN = Trust(
+PLAIN = RobustLoss(
     1e3, 1e3, 0.0, 1.0, 10**9, 10**9, 0.3, 0.3, True
 )  # the textbook's filter: no gate, no knee, nothing learned
 BEACONS = {1: (4.0, 1.0), 2: (2.0, 6.0), 3: (-3.0, 4.0), 4: (-1.0, -2.0)}

@@ -14,8 +14,8 @@ from scipy.stats import chi2
 
 from ccatp.config.models import LocalizerConfig
 from ccatp.core import FloatArray, PanelId, PanelPose
-from ccatp.estimation.odometry import Block
-from ccatp.estimation.slip_prior import LegBook
+from ccatp.estimation.odometry import PreintegratedMotion
+from ccatp.estimation.slip_prior import SlipPrior
 from ccatp.estimation.state_filter import SurveyFilter
 from ccatp.estimation.state_model import BA, BG, KG, KL, PL, PR, PSI, SL, SR, STATES, A, C, V, W, X, Y
 from ccatp.estimation.wheel_angles import WheelAngle
@@ -104,7 +104,7 @@ def run(name: str, seed: int) -> Run:
         right.angle_rad, left.angle_rad = (x[[PR, PL]] + QUANTUM_RAD / sqrt(12.0) * rng.normal(size=2)).tolist()
         rate = (1.0 + x[KG]) * x[W] + x[BG] + sqrt(gyro / SAMPLES) * rng.normal()
         jumps = accelerometer / SAMPLES + full.acceleration_jump_m_s2**2
-        block = Block(DT_S, DT_S, float(rate), float(x[A] + x[BA] + sqrt(jumps) * rng.normal()), SAMPLES)
+        block = PreintegratedMotion(DT_S, DT_S, float(rate), float(x[A] + x[BA] + sqrt(jumps) * rng.normal()), SAMPLES)
         found.begin(k * DT_S, DT_S)
         found.move(block, right, left, (gyro, accelerometer))
         if k in FIX_STEPS:
@@ -119,7 +119,7 @@ def run(name: str, seed: int) -> Run:
 
 def scatters() -> tuple[float, float]:
     """Variances from leg to leg of a wheel's slip, twice that of the mean of two, and of the creep; not yet learned."""
-    slip, creep = LegBook(cfg().full_state).scatter
+    slip, creep = SlipPrior(cfg().full_state).scatter
     return 2.0 * slip * slip, creep * creep
 
 

@@ -21,7 +21,7 @@ from ccatp.daemon.process import Endpoints
 from ccatp.links.bus import Publisher
 from ccatp.links.channels import format_ok
 from ccatp.links.rpc import Router
-from ccatp.links.topics import MissionStatus, Picture, Presence
+from ccatp.links.topics import DisplayState, Heartbeat, MissionStatus
 
 DEADLINE_S = 20.0
 Handler = Callable[[bytes], Awaitable[bytes]]
@@ -71,7 +71,7 @@ class Rig:
         self._seq += 1
         now_s = time.monotonic()
         for publisher, name in ((self.main, "main"), (self.danger, "danger")):
-            known = Presence(seq=self._seq, t_s=now_s, process=name, pid=1, phase=phase, frame_age_s=0.01)
+            known = Heartbeat(seq=self._seq, t_s=now_s, process=name, pid=1, phase=phase, frame_age_s=0.01)
             publisher.send(f"presence.{name}", known)
         self.main.send("mission", mission(seq=self._seq))
         self.main.send("picture", picture(self._seq))
@@ -149,9 +149,9 @@ def mission(**fields: Any) -> MissionStatus:
     return MissionStatus(**(known | fields))
 
 
-def picture(seq: int) -> Picture:
+def picture(seq: int) -> DisplayState:
     """A pose."""
-    return Picture(
+    return DisplayState(
         seq=seq, t_s=0.1 * seq, x_m=1.0, y_m=-2.0, heading_rad=0.5, covariance_m2=(1e-6, 0.0, 1e-6),
         heading_sigma_rad=0.01, nis=2.0, size=2, line=msgspec.Raw(b"null"),
     )  # fmt: skip

@@ -40,7 +40,7 @@ from ccatp.links.rpc import (
     request,
     split_envelope,
 )
-from ccatp.safety.emergency_latch import AbortLatch
+from ccatp.safety.emergency_latch import EmergencyLatch
 
 ID = "3b241101-e2bb-4255-8caf-4136c566a962"
 DEADLINE_S = 5.0  # only a broken test waits so long
@@ -50,7 +50,7 @@ class Desk:
     """A latch with the code that the danger monitor would show."""
 
     def __init__(self) -> None:
-        self.latch = AbortLatch()
+        self.latch = EmergencyLatch()
 
     @property
     def code(self) -> EventCode:

@@ -19,7 +19,7 @@ from ccatp.links.robot_codec import join_mac
 from ccatp.links.robot_messages import BadLineCounter, Drive, LineBuffer
 from ccatp.links.robot_messages import Fans as FansMessage
 from ccatp.sim import sessions
-from ccatp.sim.rules import Fans, MotionRules
+from ccatp.sim.rules import FanRules, MotionRules
 from tests.contract.crooked import Crooked, Message, Middle, failures
 
 AT_ONCE = 8  # servers
@@ -67,7 +67,7 @@ def rules(**methods: Any) -> Callable[[DataLoop], None]:
 
 def fans(**methods: Any) -> Callable[[DataLoop], None]:
     """Other rules of the fans."""
-    return lambda loop: setattr(loop.robot.fans, "__class__", type("Other", (Fans,), {"__slots__": (), **methods}))
+    return lambda loop: setattr(loop.robot.fans, "__class__", type("Other", (FanRules,), {"__slots__": (), **methods}))
 
 
 # -- hello and join ---------------------------------------------------------------------------------------------------
@@ -262,10 +262,10 @@ def _take_permit(is_taken: Callable[[int, int], bool]) -> Any:
 
 
 def _take_fans(is_taken: Callable[[int, int], bool]) -> Any:
-    def command(self: Fans, seq: int, left: float, right: float) -> bool:
+    def command(self: FanRules, seq: int, left: float, right: float) -> bool:
         if is_taken(seq, self._seq):
             self._seq = -1
-        return Fans.command(self, seq, left, right)
+        return FanRules.command(self, seq, left, right)
 
     return fans(command=command)
 

@@ -19,11 +19,11 @@ from zmq.utils.monitor import parse_monitor_message
 from ccatp.cli import main
 from ccatp.config.models import ObservatoryConfig
 from ccatp.core import EventCode
-from ccatp.daemon.command_handlers import Observatory, ObservatoryDesk
+from ccatp.daemon.command_handlers import EmergencyCommandHandler, ObservatoryServer
 from ccatp.errors import ConfigError
-from ccatp.links.auth import Client, KeyPair, Role, decode_key, read_pair, write_pair
+from ccatp.links.auth import AuthorizedClient, KeyPair, Role, decode_key, read_pair, write_pair
 from ccatp.links.channels import format_ok, format_request, parse_reply
-from ccatp.links.liveness import LineBudget
+from ccatp.links.liveness import LogRateLimit
 from ccatp.links.rpc import (
     MAX_CONNECTIONS,
     ZAP_ENDPOINT,
@@ -35,7 +35,7 @@ from ccatp.links.rpc import (
     request,
     turn_away,
 )
-from ccatp.safety.emergency_latch import AbortLatch
+from ccatp.safety.emergency_latch import EmergencyLatch
 
 DEADLINE_S = 20.0
 ID = "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"
@@ -52,7 +52,7 @@ class Monitor:
     """A latch and a robot that is held."""
 
     def __init__(self) -> None:
-        self.latch = AbortLatch()
+        self.latch = EmergencyLatch()
         self.at_base_or_held = True
 
     @property
@@ -115,20 +115,20 @@ def site(tmp_path: Path) -> Site:
     return site
 
 
-def desk_of(site: Site) -> ObservatoryDesk:
+def desk_of(site: Site) -> EmergencyCommandHandler:
     def keep(_logger: object, _method: str, event: Any) -> Any:
         site.logged.append(dict(event))
         raise structlog.DropEvent
 
     log: structlog.typing.FilteringBoundLogger = structlog.wrap_logger(None, processors=[keep])
-    return ObservatoryDesk(site.monitor, lambda: 0.01, log)
+    return EmergencyCommandHandler(site.monitor, lambda: 0.01, log)
 
 
 @asynccontextmanager
 async def served(site: Site) -> AsyncIterator[zmq.asyncio.Context]:
     """The observatory channel of a danger process."""
     context = zmq.asyncio.Context()
-    observatory = Observatory(f"ipc://{site.folder}/emergency", site.config, desk_of(site))
+    observatory = ObservatoryServer(f"ipc://{site.folder}/emergency", site.config, desk_of(site))
     try:
         async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
             task = tasks.create_task(observatory.serve(context))
@@ -275,7 +275,7 @@ async def test_who_is_taken_off_the_list_loses_their_rights_while_connected(site
 async def test_without_its_handler_nobody_gets_in(site: Site) -> None:
     # Left to itself libzmq would let in everybody who knows the server's key.
     context = zmq.asyncio.Context()
-    listed = {decode_key(site.pair("observatory").public.decode()): Client("observatory", Role.CLEAR)}
+    listed = {decode_key(site.pair("observatory").public.decode()): AuthorizedClient("observatory", Role.CLEAR)}
     asked: list[str] = []
 
     def answer(_frame: bytes, user_id: str) -> bytes:
@@ -321,11 +321,11 @@ def test_what_cannot_be_served(site: Site) -> None:
     desk = desk_of(site)
     (site.folder / "clients.toml").write_text("")
     with pytest.raises(ConfigError, match=r"observatory\.clients_file: .*lists nobody"):
-        Observatory("ipc://x", site.config, desk)
+        ObservatoryServer("ipc://x", site.config, desk)
     site.enlist(weather="raise")
     (site.folder / "server.key_secret").chmod(0o644)
     with pytest.raises(ConfigError, match=r"observatory\.key_file: .*open to others"):
-        Observatory("ipc://x", site.config, desk)
+        ObservatoryServer("ipc://x", site.config, desk)
 
 
 async def test_keys_are_for_tcp(site: Site) -> None:
@@ -471,7 +471,7 @@ async def test_a_flood_of_requests_leaves_the_event_loop_its_turns(tmp_path: Pat
 
 
 def test_lines_of_the_log_have_a_budget() -> None:
-    budget = LineBudget(2, 60.0)
+    budget = LogRateLimit(2, 60.0)
     assert [budget.take(t) for t in (0.0, 1.0, 2.0, 59.0)] == [0, 0, None, None]
     assert [budget.take(t) for t in (60.0, 61.0, 62.0)] == [2, 0, None]
 

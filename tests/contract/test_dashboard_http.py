@@ -14,7 +14,7 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.links.channels import format_error, format_ok
-from ccatp.links.topics import Log
+from ccatp.links.topics import LogMessage
 from ccatp.report.dashboard.hub import IDLE_PERIOD_S
 from tests.contract.page_rig import DEADLINE_S, Rig, mission, page_rig
 from tests.unit.dashboard.prometheus import parse
@@ -235,7 +235,7 @@ async def test_a_page_begins_with_everything_and_goes_on_with_news(rig: Rig) -> 
         name, state = await first.event()
         assert name == "all"
         assert state["is_sim"] is True
-        rig.main.send("log", Log(seq=1, t_s=2.0, level="info", process="main", text="a line"))
+        rig.main.send("log", LogMessage(seq=1, t_s=2.0, level="info", process="main", text="a line"))
         name, state = await first.until(lambda _, state: bool(state["log"]))
         assert (name, state["log"]) == ("news", [[2.0, "info", "a line", 1, 1]])
         async with rig.page() as second:
@@ -346,7 +346,7 @@ async def test_who_takes_nothing_is_dropped(rig: Rig) -> None:
             while metrics != {"": 1.0}:
                 metrics = parse((await rig.ask("GET", "/metrics")).body.decode())["ccatp_dashboard_pages"].samples
             while metrics != {"": 0.0}:
-                rig.main.send("log", Log(seq=1, t_s=2.0, level="info", process="main", text=long))
+                rig.main.send("log", LogMessage(seq=1, t_s=2.0, level="info", process="main", text=long))
                 metrics = parse((await rig.ask("GET", "/metrics")).body.decode())["ccatp_dashboard_pages"].samples
 
 

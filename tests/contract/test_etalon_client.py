@@ -31,7 +31,7 @@ from ccatp.links.multiline import (
     Remark,
     format_reply,
 )
-from ccatp.sim.etalon_server import EtalonStandIn, FixedPuck
+from ccatp.sim.etalon_server import EtalonSimulator, FixedPuck
 
 CHANNELS = (1, 2, 3, 4, 5, 6, 7, 8)
 COLLIMATORS = np.array([[x, y, z] for x in (-4.0, 5.0) for y in (-5.0, 4.0) for z in (-3.0, 6.0)])
@@ -529,7 +529,7 @@ async def test_measurements_of_the_stand_in_scatter_as_the_fix_says() -> None:
         host="127.0.0.1", port=0, length_sigma_m=1e-6, length_sigma_per_m=2.5e-7, motion_tolerance_m=1e-4
     )
     puck = FixedPuck(PUCK, step_s=0.5)
-    standin = EtalonStandIn(sim, CHANNELS, COLLIMATORS, puck, np.random.default_rng(4), measuring_time_s=0.5)
+    standin = EtalonSimulator(sim, CHANNELS, COLLIMATORS, puck, np.random.default_rng(4), measuring_time_s=0.5)
     port = await standin.start("127.0.0.1", 0)
     nees = 0.0
     async with client_of(port) as client:
@@ -550,7 +550,7 @@ async def test_a_moving_puck_gives_no_fix() -> None:
         host="127.0.0.1", port=0, length_sigma_m=1e-6, length_sigma_per_m=2.5e-7, motion_tolerance_m=1e-4
     )
     puck = FixedPuck(PUCK, moved_m=2e-4)
-    standin = EtalonStandIn(sim, CHANNELS, COLLIMATORS, puck, np.random.default_rng(4), measuring_time_s=0.5)
+    standin = EtalonSimulator(sim, CHANNELS, COLLIMATORS, puck, np.random.default_rng(4), measuring_time_s=0.5)
     port = await standin.start("127.0.0.1", 0)
     async with client_of(port) as client:
         with pytest.raises(TooFewChannels, match=r"0 valid channels.*1: motion_tolerance_error"):

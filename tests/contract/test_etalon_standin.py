@@ -15,7 +15,7 @@ import zmq.asyncio
 from ccatp.config.models import SimEtalonConfig
 from ccatp.links.multiline import ChannelData, parse_reply
 from ccatp.sim import etalon_server as etalon_standin
-from ccatp.sim.etalon_server import EtalonStandIn, FixedPuck, TruthSource, TruthUnavailable, ZmqPuck
+from ccatp.sim.etalon_server import EtalonSimulator, FixedPuck, PuckSource, TruthUnavailable, ZmqPuck
 from ccatp.sim.laser import PuckTruth
 
 CHANNELS = (1, 2, 3, 4)
@@ -27,13 +27,13 @@ CLEAN = b"400,2000," + AIR + b",0,0,0,0,0,0,0,0,0,0"
 DEAD = b"0,0," + AIR + b",0,0,0,0,0,0,0,0,0,1"
 
 
-def standin(truth: TruthSource | None = None, cfg: SimEtalonConfig = QUIET, seed: int = 3) -> EtalonStandIn:
+def standin(truth: PuckSource | None = None, cfg: SimEtalonConfig = QUIET, seed: int = 3) -> EtalonSimulator:
     puck = truth or FixedPuck((0.0, 0.0, 0.0))
-    return EtalonStandIn(cfg, CHANNELS, COLLIMATORS, puck, np.random.default_rng(seed), measuring_time_s=0.5)
+    return EtalonSimulator(cfg, CHANNELS, COLLIMATORS, puck, np.random.default_rng(seed), measuring_time_s=0.5)
 
 
 @asynccontextmanager
-async def running(server: EtalonStandIn) -> AsyncIterator[int]:
+async def running(server: EtalonSimulator) -> AsyncIterator[int]:
     port = await server.start("127.0.0.1", 0)
     try:
         yield port

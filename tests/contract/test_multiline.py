@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from ccatp.links.multiline import (
     FLAGS,
+    BadMultilineRequest,
     BadReply,
-    BadRequest,
     ChannelData,
     ChannelRecord,
     Command,
@@ -20,11 +20,11 @@ from ccatp.links.multiline import (
     Environment,
     LaserReady,
     LineSplitter,
-    LineTooLong,
+    MultilineRequest,
+    MultilineTooLong,
     Notice,
     Remark,
     Reply,
-    Request,
     format_reply,
     format_request,
     parse_reply,
@@ -42,13 +42,13 @@ FIRST = ChannelRecord(1, 1234.5678, 100, 200, 22.5, 1013.25, 45.0)
 SECOND = ChannelRecord(2, 1234.6789, 150, 250, 22.5, 1013.25, 45.0)
 
 REQUESTS = [
-    (Request(Command.IS_CONNECTED), b"isconnected\r\n"),
-    (Request(Command.LASER_READY), b"laserready\r\n"),
-    (Request(Command.ENVIRONMENT_DATA), b"environmentdata\r\n"),
-    (Request(Command.LATEST_LENGTH_VALID, (3,)), b"latestlengthvalid,3\r\n"),
-    (Request(Command.LATEST_LENGTH_VALID, (1, 2, 32)), b"latestlengthvalid,1,2,32\r\n"),
-    (Request(Command.START_MEASUREMENT), b"startmeasnogui\r\n"),
-    (Request(Command.STOP_MEASUREMENT), b"stopmeasnogui\r\n"),
+    (MultilineRequest(Command.IS_CONNECTED), b"isconnected\r\n"),
+    (MultilineRequest(Command.LASER_READY), b"laserready\r\n"),
+    (MultilineRequest(Command.ENVIRONMENT_DATA), b"environmentdata\r\n"),
+    (MultilineRequest(Command.LATEST_LENGTH_VALID, (3,)), b"latestlengthvalid,3\r\n"),
+    (MultilineRequest(Command.LATEST_LENGTH_VALID, (1, 2, 32)), b"latestlengthvalid,1,2,32\r\n"),
+    (MultilineRequest(Command.START_MEASUREMENT), b"startmeasnogui\r\n"),
+    (MultilineRequest(Command.STOP_MEASUREMENT), b"stopmeasnogui\r\n"),
 ]
 
 REPLIES: list[tuple[Reply, bytes]] = [
@@ -132,7 +132,7 @@ BAD_REPLIES = [
 
 
 @pytest.mark.parametrize(("request_", "line"), REQUESTS)
-def test_requests_to_the_byte(request_: Request, line: bytes) -> None:
+def test_requests_to_the_byte(request_: MultilineRequest, line: bytes) -> None:
     assert format_request(request_) == line
     assert parse_request(line.rstrip(b"\r\n")) == request_
 
@@ -145,7 +145,7 @@ def test_replies_to_the_byte(reply: Reply, line: bytes) -> None:
 
 @pytest.mark.parametrize(("line", "reason"), BAD_REQUESTS)
 def test_a_line_that_is_no_request_is_refused_with_a_reason(line: bytes, reason: str) -> None:
-    with pytest.raises(BadRequest, match=f"not a MultiLine request: {reason}") as caught:
+    with pytest.raises(BadMultilineRequest, match=f"not a MultiLine request: {reason}") as caught:
         parse_request(line)
     assert caught.value.reason == reason
 
@@ -160,7 +160,7 @@ def test_a_line_that_is_no_reply_is_refused(line: bytes) -> None:
 def test_any_bytes_give_a_message_or_the_typed_error(line: bytes) -> None:
     with contextlib.suppress(BadReply):
         parse_reply(line)
-    with contextlib.suppress(BadRequest):
+    with contextlib.suppress(BadMultilineRequest):
         parse_request(line)
 
 
@@ -270,7 +270,7 @@ def split_one_by_one(stream: bytes, size: int) -> Iterator[bytes]:
 def test_a_line_over_the_limit_is_refused_after_the_lines_before_it(size: int) -> None:
     stream = b"ok\r\n" + b"x" * 65 + b"\r\nlater\r\n"
     lines: list[bytes] = []
-    with pytest.raises(LineTooLong, match="line of more than 64 bytes"):
+    with pytest.raises(MultilineTooLong, match="line of more than 64 bytes"):
         lines.extend(split_one_by_one(stream, size))
     assert lines == [b"ok"]
 
@@ -278,5 +278,5 @@ def test_a_line_over_the_limit_is_refused_after_the_lines_before_it(size: int) -
 def test_a_line_of_the_limit_passes() -> None:
     assert split([b"x" * 63 + b"\r\n"], limit=64) == [b"x" * 63]
     assert split([b"x" * 65536 + b"\n"]) == [b"x" * 65536]
-    with pytest.raises(LineTooLong, match="65536"):
+    with pytest.raises(MultilineTooLong, match="65536"):
         split([b"x" * 65537])

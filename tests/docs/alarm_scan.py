@@ -1,8 +1,7 @@
 """What the code can say when it holds the robot: every cause, found in the source, so that no list of them goes stale.
 
-A cause is the text given to ``Finding``, ``_Missing``, ``fault``, ``hold``, ``interrupt``, ``abort`` or ``recover``.
-Where that is a name its assignments in the same function are followed, where it is a parameter the calls of that
-function in the same file. What varies in a text is shown as an ellipsis.
+A cause is the text given to one of ``CAUSES``. Where that is a name its assignments in the same function are followed,
+where it is a parameter the calls of that function in the same file. What varies in a text is shown as an ellipsis.
 """
 
 import ast
@@ -13,7 +12,8 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[2]
 # Position of the cause among the arguments, by the name that is called.
 CAUSES = {
-    "Finding": 1, "_Missing": 1, "fault": 0, "hold": 0, "interrupt": 0, "abort": 0, "_ask_to_hold": 0, "recover": 0,
+    "MonitorFinding": 1, "FixFinding": 1, "_Missing": 1,
+    "fault": 0, "hold": 0, "interrupt": 0, "abort": 0, "_ask_to_hold": 0, "recover": 0,
 }  # fmt: skip
 # What the mission makes of a cause, by the name that is called; a finding has its severity with it.
 REACTIONS = {

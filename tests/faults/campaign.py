@@ -12,9 +12,9 @@ from ccatp.core import DeckPose, Severity, Verdict
 from ccatp.links.robot_messages import Sensors
 from ccatp.sim.fault_models import Injected
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
-from ccatp.studies.faults_study import FaultyRehearsal, random_plan
-from ccatp.studies.sil_models import Rehearsal
-from ccatp.survey.state import State
+from ccatp.studies.faults_study import FaultySilRun, random_plan
+from ccatp.studies.sil_models import SilResult
+from ccatp.survey.state import MissionState
 
 LAST_S = 80.0
 FAULTS_PER_MISSION = 4
@@ -25,7 +25,7 @@ class Seen(NamedTuple):
 
     t_s: float
     verdict: Verdict
-    state: State
+    state: MissionState
     cause: str
     drive: tuple[float, float]
     pose: DeckPose
@@ -40,7 +40,7 @@ class _Enough(Exception):
     """Seen what was to be seen."""
 
 
-class Watched(FaultyRehearsal):
+class Watched(FaultySilRun):
     """Keeps what happened frame by frame; ends as soon as somebody has seen enough."""
 
     def __init__(self, cfg: Config, plan: FaultPlan) -> None:
@@ -60,7 +60,7 @@ class Watched(FaultyRehearsal):
         if self.is_enough(now):
             raise _Enough
 
-    def watch(self, is_enough: Callable[[Seen], bool]) -> Rehearsal | None:
+    def watch(self, is_enough: Callable[[Seen], bool]) -> SilResult | None:
         """Run until it is enough, or to the end: then its result."""
         self.is_enough = is_enough
         try:
@@ -111,7 +111,7 @@ class Ending:
 
     plan: FaultPlan
     injected: tuple[Injected, ...]
-    result: Rehearsal
+    result: SilResult
 
     @property
     def line(self) -> str:
@@ -135,6 +135,6 @@ def single(fault: str) -> FaultPlan:
 def survey(seed: int, plan: FaultPlan) -> Ending:
     """One panel in the hard world with the extended filter."""
     cfg = load_config(overrides={"run.world": "hard", "run.filter": "ekf", "run.panels": 1, "run.seed": seed})
-    rehearsal = FaultyRehearsal(cfg, plan)
+    rehearsal = FaultySilRun(cfg, plan)
     result = rehearsal.run()
     return Ending(plan, rehearsal.injected, result)

@@ -21,9 +21,9 @@ from ccatp.daemon.process import EitherArgs, Endpoints, ProcessArgs
 from ccatp.dataloop import DataLoop
 from ccatp.links.robot_link import RobotLink
 from ccatp.mirror.mirror import build_mirror
-from ccatp.sim.etalon_server import EtalonStandIn, ZmqPuck
+from ccatp.sim.etalon_server import EtalonSimulator, ZmqPuck
 from ccatp.sim.fault_proxy import FaultProxy
-from ccatp.sim.ground_truth import TruthOutlet
+from ccatp.sim.ground_truth import GroundTruthPublisher
 from ccatp.sim.robot import TruthLog
 
 DEADLINE_S = 60.0
@@ -168,11 +168,11 @@ async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncI
         run_dir = Path(folder)
         endpoints = Endpoints(run_dir)
         robot = DataLoop(robot_cfg or cfg, False, cfg.run.seed)
-        robot.truth = outlet = TruthOutlet(TruthLog(robot.robot), endpoints.of("puck"), endpoints.of("truth"))
+        robot.truth = outlet = GroundTruthPublisher(TruthLog(robot.robot), endpoints.of("puck"), endpoints.of("truth"))
         port = await robot.start()
         mirror = build_mirror(cfg.mirror)
         puck = ZmqPuck(endpoints.of("puck"))
-        laser = EtalonStandIn(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, np.random.default_rng(1),
+        laser = EtalonSimulator(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, np.random.default_rng(1),
                               measuring_time_s=cfg.etalon.measuring_time_s)  # fmt: skip
         laser_port = await laser.start("127.0.0.1", 0)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()

@@ -17,15 +17,15 @@ from ccatp.config.models import Config
 from ccatp.core import DeckPose, EventCode, PanelId, Verdict
 from ccatp.danger import DangerMonitor
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.safety.edge_detector import EpisodeLimits
-from ccatp.studies.danger_drives import Errors, Rig
+from ccatp.safety.edge_detector import EdgeLimits
+from ccatp.studies.danger_drives import EdgeErrors, Rig
 
 MIRRORS = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
 SPACING_M = 0.01
 HEADINGS = range(0, 360, 5)
 SPEEDS_M_S = (0.005, 0.02, 0.05, 0.1, 0.15)
 TURNS_RAD_S = (-1.0, -0.2, 0.2, 1.0)
-ERRORS = Errors(position_m=1.5e-3, heading_rad=2e-3)
+ERRORS = EdgeErrors(position_m=1.5e-3, heading_rad=2e-3)
 OVERRUN_M = 0.020  # invariant I5
 SLOWEST_COSINE = cos(radians(85.5))  # a way that is closer to the rim's direction than this does not lead over it
 RUN_UP_M = 0.004  # of the first sensor to the rim: the rules have a track before it goes off
@@ -268,7 +268,7 @@ def turn_cases() -> int:
 def steepest_rad(name: str) -> float:
     """At what angle to its normal a seam may be crossed, by the rules: 60 deg, and more where it is narrow."""
     cfg, mirror = world(name)
-    return acos(EpisodeLimits(mirror.gap_m, cfg.danger).min_cosine)
+    return acos(EdgeLimits(mirror.gap_m, cfg.danger).min_cosine)
 
 
 def seam_case(number: int) -> tuple[str, Callable[[], Tally]]:

@@ -12,8 +12,8 @@ import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.core import Fix, PointId, Vector3
-from ccatp.daemon.fix_service import MeasuringDesk, Request
-from ccatp.daemon.telemetry import SurveyTeller
+from ccatp.daemon.fix_service import FixRequest, FixService
+from ccatp.daemon.telemetry import SurveyTelemetry
 from ccatp.estimation.fixes import FixRefused, deck_foot
 from ccatp.etalon_client import BadSolution, EtalonClient, EtalonError
 from ccatp.links.robot_messages import Sensors
@@ -21,8 +21,8 @@ from ccatp.mirror.multilateration import MultilaterationError
 from ccatp.records.store import MissionStore
 from ccatp.records.store_rows import PlannedPoint
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
-from ccatp.studies.faults_study import FaultyRehearsal
-from ccatp.survey.fix_gate import Scrutiny, nis_of
+from ccatp.studies.faults_study import FaultySilRun
+from ccatp.survey.fix_gate import FixGate, nis_of
 
 T = TypeVar("T")
 FULL = (1.0, 1.0)
@@ -108,7 +108,7 @@ def moved(fix: Fix, offset_m: Vector3) -> Fix:
     return Fix(fix.t_s, (x, y, z), fix.covariance_m2, fix.dop, fix.channels, fix.residual_rms_m)
 
 
-class DeskRehearsal(FaultyRehearsal):
+class DeskRehearsal(FaultySilRun):
     """A rehearsal that measures as the main loop does: desk, scrutiny, store.
 
     Attributes:
@@ -135,14 +135,14 @@ class DeskRehearsal(FaultyRehearsal):
             self._runner, self.store = runner, store
             self._over = asyncio.Event()
             teller = SimpleNamespace(fix=self._note_fix, say=lambda level, text: self.said.append(f"{level}: {text}"))
-            self.desk = MeasuringDesk(
+            self.desk = FixService(
                 self.cfg.mission,
                 cast(EtalonClient, SimpleNamespace(measure=self._ask)),
-                Scrutiny(self.mirror, self.cfg),
+                FixGate(self.mirror, self.cfg),
                 self.localizer,
                 self.mission,
                 patient(store),
-                cast(SurveyTeller, teller),
+                cast(SurveyTelemetry, teller),
                 self._over.set,
                 lambda: 0.5,
             )
@@ -164,11 +164,11 @@ class DeskRehearsal(FaultyRehearsal):
     def _measure(self, frame: Sensors) -> None:
         mission, pose = self.mission, self.localizer.deck_pose
         expected = self.mirror.puck_world(pose, self.cfg.robot.puck_height_m)
-        request = Request(mission.request, frame.t, mission.measuring_point, expected, pose)
+        request = FixRequest(mission.request, frame.t, mission.measuring_point, expected, pose)
         self._request = request
         self._runner.run(self._one(request))
 
-    async def _one(self, request: Request) -> None:
+    async def _one(self, request: FixRequest) -> None:
         self._over.clear()
         serving = asyncio.get_running_loop().create_task(self.desk.run())
         self.desk.begin(request)

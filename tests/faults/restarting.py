@@ -6,18 +6,18 @@ from ccatp.config.models import Config
 from ccatp.control.prediction import CommandPredictor
 from ccatp.core import DeckPose, PointId
 from ccatp.links.robot_messages import Sensors
-from ccatp.studies.sil_models import Rehearsal
-from ccatp.studies.sil_run import Rehearsing
+from ccatp.studies.sil_models import SilResult
+from ccatp.studies.sil_run import SilRun
 from ccatp.survey.composition import assemble
-from ccatp.survey.heading_recovery import Recovery, doubted
-from ccatp.survey.state import DRIVING, RETURNING, TURNING, State
+from ccatp.survey.heading_recovery import TakeoverState, doubted
+from ccatp.survey.state import DRIVING, RETURNING, TURNING, MissionState
 
-MOVING = (TURNING, DRIVING, RETURNING, State.BACKING_OFF)
+MOVING = (TURNING, DRIVING, RETURNING, MissionState.BACKING_OFF)
 RECORD_FRAMES = 10
 LONGEST_S = 900.0
 
 
-class RestartingRehearsal(Rehearsing):
+class RestartingRehearsal(SilRun):
     """A rehearsal in which the main loop is killed at given frames.
 
     Args:
@@ -29,13 +29,13 @@ class RestartingRehearsal(Rehearsing):
     def __init__(self, cfg: Config, kills: set[int], silent_frames: int = 150) -> None:
         super().__init__(cfg, with_track=False)
         self._kills, self._silent_frames = kills, silent_frames
-        self._records: list[tuple[DeckPose, tuple[float, float], tuple[float, float], State]] = []
+        self._records: list[tuple[DeckPose, tuple[float, float], tuple[float, float], MissionState]] = []
         self.done: list[PointId] = []
-        self.states: list[State] = []
+        self.states: list[MissionState] = []
         self.heading_errors_rad: list[float] = []
         self.first_moves_m: list[float] = []
 
-    def run(self) -> Rehearsal:
+    def run(self) -> SilResult:
         """As of a rehearsal, with whichever mission is the present one."""
         robot = self.robot
         robot.join_monitor()
@@ -47,7 +47,7 @@ class RestartingRehearsal(Rehearsing):
         robot.command_fans(1, *self.cfg.robot.fan_duty)
         first_s = robot.delivered.t
         last_s = first_s - robot.frame_s
-        while not (self.mission.state is State.DONE or self.mission.is_faulted or last_s - first_s > LONGEST_S):
+        while not (self.mission.state is MissionState.DONE or self.mission.is_faulted or last_s - first_s > LONGEST_S):
             frame = robot.delivered
             self._serve(frame, frame.t - last_s)
             last_s = frame.t
@@ -81,7 +81,7 @@ class RestartingRehearsal(Rehearsing):
         pose, sigmas, speeds, state = self._records[-1]
         limits = cfg.limits.a_max_m_s2, cfg.limits.alpha_max_rad_s2
         sigma_m, sigma_rad = doubted(sigmas, speeds, limits, stood=state not in MOVING)
-        recovery = Recovery(pose, sigma_m, sigma_rad, abort_cause=self.mission.abort_cause)
+        recovery = TakeoverState(pose, sigma_m, sigma_rad, abort_cause=self.mission.abort_cause)
         parts = assemble(cfg, self.done, recovery)
         truth = self.robot.world.plant
         self.first_moves_m.append(hypot(truth.x_m - pose.x_m, truth.y_m - pose.y_m) / sigma_m)

@@ -7,7 +7,7 @@ import pytest
 
 from ccatp.config.models import Config
 from ccatp.core import Severity
-from ccatp.survey.state import Outcome, State
+from ccatp.survey.state import MissionState, SurveyOutcome
 from tests.faults.campaign import Seen, short_survey, was_real, watched
 
 Measured = Callable[[str, float], None]
@@ -21,7 +21,7 @@ def held(one: Seen) -> bool:
 
 
 def holds(seen: list[Seen]) -> int:
-    return sum(a.state is not State.HELD and b.state is State.HELD for a, b in pairwise(seen))
+    return sum(a.state is not MissionState.HELD and b.state is MissionState.HELD for a, b in pairwise(seen))
 
 
 @pytest.mark.fault("F8")
@@ -105,9 +105,9 @@ def test_wheels_that_creep_while_they_are_held(speed_m_s: float, measured: Measu
 def test_a_low_battery_sends_the_robot_home(fault: str, measured: Measured) -> None:
     run = watched(f"signal = {fault}\nat_s = 3.0", HARD, lambda _: False)
     assert was_real(run.injected[0])
-    home = run.first(3.0, lambda one: one.state is State.RETURNING)
+    home = run.first(3.0, lambda one: one.state is MissionState.RETURNING)
     assert home.t_s - 3.0 < 5.5
-    assert run.mission.outcome is Outcome.AT_BASE
+    assert run.mission.outcome is SurveyOutcome.AT_BASE
     # The stand-in's charge stays what it was, so this is what is left at base, too.
     measured("F6", 100.0 * (0.2 if "soc" in fault else 1.0))
 

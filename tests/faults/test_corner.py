@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from ccatp.studies.faults_study import FaultyRehearsal
+from ccatp.studies.faults_study import FaultySilRun
 from tests.faults.campaign import short_survey, single, was_real
 from tests.faults.linking import Measured
 
@@ -12,7 +12,7 @@ from tests.faults.linking import Measured
 SEEDS = (0, 10, 22, 52, 62, 69)
 
 
-def carried_off(seed: int) -> FaultyRehearsal:
+def carried_off(seed: int) -> FaultySilRun:
     """A survey of the corner panel; somewhere on the way the robot is put elsewhere and turned."""
     rng = random.Random(seed)
     at_s, dx_m, dy_m, turn_rad = (
@@ -25,7 +25,7 @@ def carried_off(seed: int) -> FaultyRehearsal:
         f'signal = "body"\ntype = "kidnap"\nat_s = {at_s:.2f}\ndx_m = {dx_m:.3f}\ndy_m = {dy_m:.3f}\n'
         f"dheading_rad = {turn_rad:.3f}\n"
     )
-    return FaultyRehearsal(short_survey(run__filter="ekf", run__seed=seed), plan)
+    return FaultySilRun(short_survey(run__filter="ekf", run__seed=seed), plan)
 
 
 @pytest.mark.fault("S23")

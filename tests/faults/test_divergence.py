@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ccatp.links.robot_messages import Sensors
-from ccatp.survey.state import State
+from ccatp.survey.state import MissionState
 from tests.faults.laser import DeskRehearsal
 from tests.faults.test_operator import one_panel
 
@@ -60,7 +60,7 @@ class Broken(DeskRehearsal):
         self.drive = right, left
 
     def look(self, frame: Sensors) -> None:
-        if self.broken_at_s is None and self.mission.done and self.mission.state is State.DRIVING:
+        if self.broken_at_s is None and self.mission.done and self.mission.state is MissionState.DRIVING:
             self.broken_at_s = frame.t
             localizer: Any = self.localizer
             # The end of a block of frames: the filter is asked in this one.
@@ -73,7 +73,7 @@ class Broken(DeskRehearsal):
         if self.broken_at_s is not None and self.held_at_s is None and self.localizer.is_frozen:
             self.held_at_s = frame.t
             assert self.mission.cause.startswith("filter: ")
-            assert self.mission.state in (State.HELD, State.SETTLING)  # for a fix, and for nothing else
+            assert self.mission.state in (MissionState.HELD, MissionState.SETTLING)  # for a fix, and for nothing else
             assert self.mission.measuring_point is None
             assert self.drive == (0.0, 0.0)
             now = self.localizer.deck_pose

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ccatp.control.gate import FanGate
 from ccatp.core import Severity
-from ccatp.survey.state import State
+from ccatp.survey.state import MissionState
 from tests.faults.campaign import Seen, short_survey, was_real, watched
 
 Measured = Callable[[str, float], None]
@@ -58,7 +58,7 @@ def test_a_fan_that_gives_too_little_holds_with_full_fans(fault: str, measured: 
 def test_fans_that_get_weaker_send_the_robot_home_in_time(measured: Measured) -> None:
     run = watched(f'signal = "fans"\ntype = "wrong"\nat_s = {AT_S}\nfactor = 0.91', OVERHANG, a_little_later)
     assert was_real(run.injected[0])
-    assert run.seen[-1].state is State.RETURNING
+    assert run.seen[-1].state is MissionState.RETURNING
     assert run.robot.fans.duty == (1.0, 1.0)
     margin = 0.91 * OVERHANG.robot.fan_duty[0] / OVERHANG.sim.robot.fan_floor
     measured("F2", margin)

@@ -9,13 +9,13 @@ from scipy.stats import chi2
 
 from ccatp.config.load import load_config
 from ccatp.links.robot_messages import Sensors
-from ccatp.studies.sil_run import Rehearsing
+from ccatp.studies.sil_run import SilRun
 
 SEEDS = (1, 2, 3)
 TWO_DEGREES_M_S2 = 0.34  # of an attitude that is two degrees wrong; sixty times the sensor's noise
 
 
-class Leaking(Rehearsing):
+class Leaking(SilRun):
     """The robot's own attitude is wrong: a part of gravity along its heading stays in the acceleration."""
 
     largest_m_s2 = 0.0

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from ccatp.config.load import load_config
 from ccatp.core import Severity, Verdict
-from ccatp.daemon.subscribers import EstimateEar
+from ccatp.daemon.subscribers import EstimateSubscriber
 from ccatp.danger import DangerMonitor
-from ccatp.links.topics import Estimate, is_estimate_due
+from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.mirror.mirror import build_mirror
-from ccatp.safety.escalation import Finding, Ladder, denies, gravest
+from ccatp.safety.escalation import MonitorFinding, SeverityEscalation, denies, gravest
 from ccatp.safety.wheel_monitors import CommandSpan
 from ccatp.sim.robot import Robot
 
@@ -24,15 +24,15 @@ HEALTH = load_config().health
 DENYING = {Severity.PAUSE, Severity.HOLD, Severity.FAULT}
 
 
-def finding(severity: Severity, signal: str = "x") -> Finding:
-    return Finding(severity, str(severity), signal, 1.0, 0.0)
+def finding(severity: Severity, signal: str = "x") -> MonitorFinding:
+    return MonitorFinding(severity, str(severity), signal, 1.0, 0.0)
 
 
 FINDINGS = st.lists(st.builds(finding, st.sampled_from(list(Severity)[1:]), st.sampled_from(["a", "b", "c"])))
 
 
 @given(FINDINGS)
-def test_the_gravest_wins_and_any_hold_denies(findings: list[Finding]) -> None:
+def test_the_gravest_wins_and_any_hold_denies(findings: list[MonitorFinding]) -> None:
     top = gravest(findings)
     assert (top is None) == (not findings)
     if top is not None:
@@ -42,8 +42,8 @@ def test_the_gravest_wins_and_any_hold_denies(findings: list[Finding]) -> None:
 
 
 @given(st.lists(st.tuples(st.floats(0.01, 5.0), FINDINGS), max_size=20))
-def test_the_ladder_only_ever_raises(steps: list[tuple[float, list[Finding]]]) -> None:
-    ladder, t_s = Ladder(HEALTH), 0.0
+def test_the_ladder_only_ever_raises(steps: list[tuple[float, list[MonitorFinding]]]) -> None:
+    ladder, t_s = SeverityEscalation(HEALTH), 0.0
     for dt_s, findings in steps:
         t_s += dt_s
         for before, after in zip(findings, ladder.climb(t_s, findings), strict=True):
@@ -53,7 +53,7 @@ def test_the_ladder_only_ever_raises(steps: list[tuple[float, list[Finding]]]) -
 
 
 def test_a_pause_becomes_a_hold_and_a_hold_a_fault() -> None:
-    ladder, pause = Ladder(HEALTH), finding(Severity.PAUSE)
+    ladder, pause = SeverityEscalation(HEALTH), finding(Severity.PAUSE)
     ends = [(0.0, Severity.PAUSE), (HEALTH.pause_limit_s, Severity.HOLD), (HEALTH.hold_limit_s, Severity.FAULT)]
     assert [ladder.climb(t_s, [pause])[0].severity for t_s, _ in ends] == [severity for _, severity in ends]
     ladder.climb(40.0, [])
@@ -62,7 +62,7 @@ def test_a_pause_becomes_a_hold_and_a_hold_a_fault() -> None:
 
 @pytest.mark.parametrize(("gap_s", "last"), [(10.0, Severity.FAULT), (45.0, Severity.HOLD)])
 def test_what_comes_again_and_again_is_a_fault(gap_s: float, last: Severity) -> None:
-    ladder = Ladder(HEALTH)
+    ladder = SeverityEscalation(HEALTH)
     found = []
     for k in range(HEALTH.retries + 2):
         found.append(ladder.climb(k * gap_s, [finding(Severity.HOLD)])[0].severity)
@@ -78,7 +78,7 @@ def found_on_the_way(
     world: str,
     wanted: list[tuple[float, float]],
     seed: int,
-    heard: Callable[[list[Estimate], int], Estimate | None],
+    heard: Callable[[list[EstimateMessage], int], EstimateMessage | None],
     dv_m_s: float = 0.0025,
 ) -> list[Verdict]:
     """Verdicts that found something while a robot is driven, and nothing is wrong.
@@ -99,7 +99,7 @@ def found_on_the_way(
     robot._sensors.edges.place(robot.world.plant)
     robot.command_fans(1, *cfg.robot.fan_duty)
     monitor = DangerMonitor(mirror, cfg.robot, cfg.danger, cfg.health)
-    span, told, number, radius_m = CommandSpan(), list[Estimate](), 0, cfg.robot.wheel_radius_m
+    span, told, number, radius_m = CommandSpan(), list[EstimateMessage](), 0, cfg.robot.wheel_radius_m
     v = omega = 0.0
     driven = (0.0, 0.0)
     found: list[Verdict] = []
@@ -116,7 +116,7 @@ def found_on_the_way(
         omega += min(max(omega_wanted - omega, -0.025), 0.025)
         if is_estimate_due(frame.seq):
             pose = robot.world.plant.pose
-            told.append(Estimate(
+            told.append(EstimateMessage(
                 seq=frame.seq, t_s=frame.t, x_m=pose.x_m, y_m=pose.y_m, heading_rad=pose.heading_rad, sigma_m=1e-3,
                 state="driving", commanded=span.take(*driven), drive_seq=number,
             ))  # fmt: skip
@@ -142,9 +142,9 @@ class Waiting:
     """What main has published and the danger loop has not received yet."""
 
     def __init__(self, *_: object, **__: object) -> None:
-        self.messages: deque[Estimate] = deque()
+        self.messages: deque[EstimateMessage] = deque()
 
-    def receive(self) -> tuple[str, Estimate] | None:
+    def receive(self) -> tuple[str, EstimateMessage] | None:
         return ("estimate", self.messages.popleft()) if self.messages else None
 
 
@@ -163,12 +163,12 @@ def test_drives_that_the_danger_loop_hears_of_late_have_moved_the_wheels(
     """A robot that has stood for long drives on for a moment, and the estimates of that wait for the danger loop."""
     monkeypatch.setattr("ccatp.daemon.subscribers.Subscriber", Waiting)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    ear = EstimateEar(context, "inproc://main")
+    ear = EstimateSubscriber(context, "inproc://main")
     context.destroy()
-    waiting: deque[Estimate] = ear._subscriber.messages  # type: ignore[attr-defined]
+    waiting: deque[EstimateMessage] = ear._subscriber.messages  # type: ignore[attr-defined]
     arrived = 0
 
-    def heard(told: list[Estimate], k: int) -> Estimate | None:
+    def heard(told: list[EstimateMessage], k: int) -> EstimateMessage | None:
         nonlocal arrived
         while arrived < len(told) and told[arrived].seq <= heard_until(k):
             waiting.append(told[arrived])
@@ -194,7 +194,7 @@ def test_what_the_wheels_were_told_counts_however_old_the_estimate(seq: int, t_s
         robot.advance()
         if frame is not None and frame.seq < 99:
             monitor.step(frame, None)
-    estimate = Estimate(
+    estimate = EstimateMessage(
         seq=seq, t_s=t_s, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-3, state="driving",
         commanded=(0.0, 4.0, 0.0, 4.0), drive_seq=1,
     )  # fmt: skip

@@ -15,8 +15,8 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import Fix, PointId
-from ccatp.daemon.fix_service import MeasuringDesk, Request
-from ccatp.daemon.telemetry import SurveyTeller
+from ccatp.daemon.fix_service import FixRequest, FixService
+from ccatp.daemon.telemetry import SurveyTelemetry
 from ccatp.etalon_client import EtalonClient, EtalonError, EtalonTimeout, StaleLengths
 from ccatp.links import multiline
 from ccatp.localizer import build_localizer
@@ -24,10 +24,10 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.mirror.multilateration import MultilaterationError, solve_fix
 from ccatp.records.store import MissionStore
 from ccatp.records.store_rows import PlannedPoint
-from ccatp.sim.etalon_server import EtalonStandIn, FixedPuck
-from ccatp.survey.fix_gate import FrameCheck, Scrutiny, explain, signed_axes
+from ccatp.sim.etalon_server import EtalonSimulator, FixedPuck
+from ccatp.survey.fix_gate import FixGate, FrameCheck, explain, signed_axes
 from ccatp.survey.mission import Mission
-from ccatp.survey.state import State
+from ccatp.survey.state import MissionState
 from tests.contract.test_etalon_client import (
     CHANNELS,
     COLLIMATORS,
@@ -104,7 +104,7 @@ def test_three_points_in_a_row_hold_the_mission(tmp_path: Path) -> None:
     run = DeskRehearsal(one_panel(), tmp_path, failing_where(lambda m: m.point is not None and m.point.point < 7))
     result = run.run()
     assert run.mission.is_faulted
-    assert run.mission.state is State.HELD
+    assert run.mission.state is MissionState.HELD
     assert result.cause == "3 measurements in a row failed: no reply"
     assert (len(run.mission.done), len(run.mission.skipped)) == (3, 3)
 
@@ -136,14 +136,14 @@ class Desk:
         localizer = SimpleNamespace(
             fuse_fix=lambda _fix: 0.0, notices=[], pose=None, pose_covariance=np.eye(3), position_sigma_m=5e-6
         )
-        self.desk = MeasuringDesk(
+        self.desk = FixService(
             config.mission,
             client,
-            cast(Scrutiny, scrutiny),
+            cast(FixGate, scrutiny),
             cast(Any, localizer),
             cast(Mission, mission),
             patient(self.store),
-            cast(SurveyTeller, SimpleNamespace(fix=lambda *_, **__: None, say=lambda *_: None)),
+            cast(SurveyTelemetry, SimpleNamespace(fix=lambda *_, **__: None, say=lambda *_: None)),
             self.over.set,
             lambda: config.etalon.measuring_time_s,
         )
@@ -154,7 +154,7 @@ class Desk:
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
         serving = loop.create_task(self.desk.run())
-        self.desk.begin(Request(1, 1.0, POINT, EXPECTED, self.estimate))
+        self.desk.begin(FixRequest(1, 1.0, POINT, EXPECTED, self.estimate))
         await self.over.wait()
         took_s = loop.time() - begun_s
         serving.cancel()
@@ -192,7 +192,7 @@ def test_a_point_takes_ten_seconds_at_most(action: Any, config: Config, tmp_path
 @pytest.mark.fault("E10")
 def test_a_beam_that_is_free_again_costs_a_retry(config: Config, tmp_path: Path, measured: Note) -> None:
     async def story() -> tuple[float, list[PointId | None], dict[str, int]]:
-        standin = EtalonStandIn(
+        standin = EtalonSimulator(
             config.sim.etalon, CHANNELS, COLLIMATORS, FixedPuck(PUCK), np.random.default_rng(4), measuring_time_s=0.5
         )
         client = daemon_client(config, await standin.start("127.0.0.1", 0))
@@ -320,7 +320,7 @@ def test_mutilated_replies_are_bad_replies_and_nothing_else(measured: Note) -> N
                 reply = multiline.parse_reply(text)
                 if isinstance(reply, multiline.ChannelData):
                     multiline.valid_lengths(reply, CHANNELS)
-        except (multiline.BadReply, multiline.LineTooLong):
+        except (multiline.BadReply, multiline.MultilineTooLong):
             pass
         except Exception:
             surprises += 1
@@ -448,7 +448,7 @@ def refusal(
     """What the operator is told at the first fix of a laser system with these places and lengths, or empty."""
     places = dict(zip(mirror.channels, collimators_m, strict=True))
     puck = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m)
-    scrutiny = Scrutiny(mirror, cfg)
+    scrutiny = FixGate(mirror, cfg)
     scrutiny._collimators_m = places
     try:
         fix = solve_fix(cfg.etalon, 0.0, puck, lengths_m, places)
@@ -499,7 +499,7 @@ def test_a_mission_in_a_wrong_frame_does_not_begin(tmp_path: Path) -> None:
         "the laser system sees the robot 0.30 m from its base: no exchange of axes or units explains it; is it at "
         "base, and is this the mirror?"
     )
-    assert not run.states_s.get(State.DRIVING, 0.0)
+    assert not run.states_s.get(MissionState.DRIVING, 0.0)
     assert len(run.asked) == 1
 
 
@@ -539,39 +539,39 @@ def test_nothing_counts_that_was_measured_while_the_robot_moved(config: Config, 
             fuse_fix=fuse, notices=[], pose=localizer.pose, pose_covariance=np.eye(3), position_sigma_m=5e-6
         )
         with MissionStore.create(folder / "m.sqlite", mirror="x", seed=1, config_toml="", points=points) as store:
-            desk = MeasuringDesk(
+            desk = FixService(
                 cfg.mission.model_copy(update={"correction_tolerance_m": 1e3}),
                 cast(EtalonClient, SimpleNamespace(measure=measure)),
                 cast(
-                    Scrutiny,
+                    FixGate,
                     SimpleNamespace(begin=lambda: None, review=lambda *_, **__: SimpleNamespace(doubt="", refusal="")),
                 ),
                 cast(Any, stub),
                 story.mission,
                 patient(store),
-                cast(SurveyTeller, SimpleNamespace(fix=lambda *_, **__: None, say=lambda *_: None)),
+                cast(SurveyTelemetry, SimpleNamespace(fix=lambda *_, **__: None, say=lambda *_: None)),
                 lambda: None,
                 lambda: 0.0,
             )
             serving = loop.create_task(desk.run())
             done = 0
             for _ in range(6000):
-                if story.mission.state is State.DONE:
+                if story.mission.state is MissionState.DONE:
                     break
-                if story.mission.state is State.MEASURING and rng.random() < 0.012:
+                if story.mission.state is MissionState.MEASURING and rng.random() < 0.012:
                     story.v, bumps = 0.02, bumps + 1
                 if abs(story.v) > cfg.control.settle_speed_m_s:
                     motion_s.append(story.t)
                 order = story.frame(FREE)
                 if order.measure:
                     point = story.mission.measuring_point
-                    desk.begin(Request(story.mission.request, story.t, point, (0.0, 0.0, 0.0), story.motion().deck))
+                    desk.begin(FixRequest(story.mission.request, story.t, point, (0.0, 0.0, 0.0), story.motion().deck))
                 await asyncio.sleep(0.01)
                 if len(story.mission.done) > done:
                     done, counted = len(story.mission.done), counted + 1
                     begun_s, taken_s = fused[-1]
                     moving += any(begun_s - 0.2 <= t <= taken_s for t in motion_s)
-            assert story.mission.state is State.DONE
+            assert story.mission.state is MissionState.DONE
             serving.cancel()
             await asyncio.wait([serving])
 

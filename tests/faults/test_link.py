@@ -19,7 +19,7 @@ from ccatp.core import PanelPose
 from ccatp.dataloop import DataLoop
 from ccatp.links.robot_codec import decode_from_robot, encode, encode_sensors
 from ccatp.links.robot_link import BACKLOG_S, FLOOD_FACTOR, RobotLink, RobotTimeout, WrongProtocol
-from ccatp.links.robot_messages import PROTOCOL, Hello, LineBudget, LineBuffer, RobotData, Sensors
+from ccatp.links.robot_messages import PROTOCOL, BadLineLimit, Hello, LineBuffer, RobotData, Sensors
 from ccatp.mirror.mirror import build_mirror
 from ccatp.sim.robot import Robot
 from ccatp.sim.sessions import RobotServer
@@ -209,7 +209,7 @@ async def test_a_flood_takes_no_memory(measured: Measured) -> None:
 
 
 def test_what_piled_up_in_half_a_minute_is_no_flood() -> None:
-    budget = LineBudget(30.0 * 100.0, 3.0 * 100.0)
+    budget = BadLineLimit(30.0 * 100.0, 3.0 * 100.0)
     assert budget.take(2999, 100.0)  # at once, after a stall
     assert all(budget.take(1, 100.0 + 0.01 * k) for k in range(1000))
     assert all(budget.take(3, 110.0 + 0.01 * k) for k in range(3000))

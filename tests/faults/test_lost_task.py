@@ -14,12 +14,12 @@ from tests.faults.linking import Measured
 TASKS = (
     "ccatp.daemon.main_loop.MainLoop._beat",
     "ccatp.daemon.main_loop.MainLoop._watch",
-    "ccatp.daemon.fix_service.MeasuringDesk.run",
-    "ccatp.daemon.robot_session.LastingLink.serve",
+    "ccatp.daemon.fix_service.FixService.run",
+    "ccatp.daemon.robot_session.ReconnectingRobotLink.serve",
     "ccatp.links.rpc.Router.serve",
     "ccatp.daemon.danger_loop.DangerLoop._beat",
     "ccatp.daemon.danger_loop.DangerLoop._watch",
-    "ccatp.daemon.command_handlers.Observatory.serve",
+    "ccatp.daemon.command_handlers.ObservatoryServer.serve",
 )
 
 

@@ -23,19 +23,19 @@ from ccatp.links.channels import format_ok
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.rpc import REPEAT_S, RequestFailed, request
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.safety.emergency_latch import AbortLatch
+from ccatp.safety.emergency_latch import EmergencyLatch
 from ccatp.survey.behaviours import home_time_s
 from ccatp.survey.planning.search import path_time
 from ccatp.survey.planning.way_home import plan_way_home
-from ccatp.survey.reactions import Call, Vigil
-from ccatp.survey.state import State
-from ccatp.survey.stops import Order
+from ccatp.survey.reactions import ReminderCall, UnattendedFaultTimer
+from ccatp.survey.state import MissionState
+from ccatp.survey.stops import MissionCommand
 from tests.faults.campaign import single
 from tests.faults.laser import FULL, DeskRehearsal
 from tests.unit.test_mission import DT, FREE, FRONT_OFF, Story, from_first_leg
 
 Note = Callable[..., None]
-SURVEYING = (State.TURNING, State.DRIVING, State.SETTLING, State.MEASURING)
+SURVEYING = (MissionState.TURNING, MissionState.DRIVING, MissionState.SETTLING, MissionState.MEASURING)
 TABLE_ROWS = [(kind, level, held) for kind in EmergencyKind for level in (False, True) for held in (False, True)]
 
 
@@ -62,7 +62,7 @@ def story(config: Config, mirror: Mirror) -> Story:
 class Aborted(DeskRehearsal):
     """An emergency in a given state of the mission, and how long it took until the wheels were told to stand."""
 
-    def __init__(self, cfg: Config, folder: Path, state: State, kind: str, clear_after_s: float = inf) -> None:
+    def __init__(self, cfg: Config, folder: Path, state: MissionState, kind: str, clear_after_s: float = inf) -> None:
         super().__init__(cfg, folder)
         self._at, self._kind, self._clear_after_s = state, kind, clear_after_s
         self.raised_s = self.zero_s = self.cleared_s = inf
@@ -74,7 +74,7 @@ class Aborted(DeskRehearsal):
             assert self.monitor.emergency(self._kind, "e") is None
         if self.cleared_s == inf and frame.t - self.raised_s >= self._clear_after_s:
             self.cleared_s = frame.t
-            assert self.monitor.clear("e", at_base_or_held=self.mission.state is State.HELD) is None
+            assert self.monitor.clear("e", at_base_or_held=self.mission.state is MissionState.HELD) is None
 
     def _foresee(self, number: int, right: float, left: float) -> None:
         super()._foresee(number, right, left)
@@ -93,8 +93,8 @@ class Aborted(DeskRehearsal):
 
 
 @pytest.mark.fault("O1")
-@pytest.mark.parametrize("state", [State.DRIVING, State.TURNING, State.MEASURING])
-def test_a_fire_stops_the_wheels_and_leads_home(state: State, tmp_path: Path, measured: Note) -> None:
+@pytest.mark.parametrize("state", [MissionState.DRIVING, MissionState.TURNING, MissionState.MEASURING])
+def test_a_fire_stops_the_wheels_and_leads_home(state: MissionState, tmp_path: Path, measured: Note) -> None:
     run = Aborted(one_panel(), tmp_path, state, "fire")
     result = run.run()
     measured("O1", 1e3 * (run.zero_s - run.raised_s))
@@ -107,9 +107,9 @@ def test_a_fire_stops_the_wheels_and_leads_home(state: State, tmp_path: Path, me
 
 
 @pytest.mark.fault("O1")
-@pytest.mark.parametrize("state", [State.DRIVING, State.TURNING])
+@pytest.mark.parametrize("state", [MissionState.DRIVING, MissionState.TURNING])
 def test_an_earthquake_presses_on_holds_and_leads_home_when_it_is_over(
-    state: State, tmp_path: Path, measured: Note
+    state: MissionState, tmp_path: Path, measured: Note
 ) -> None:
     run = Aborted(one_panel(**{"run.mirror": "fyst-m2"}), tmp_path, state, "earthquake", clear_after_s=5.0)
     result = run.run()
@@ -138,13 +138,13 @@ def test_during_an_earthquake_nobody_resumes(story: Story) -> None:
         raised=1,
         is_shaking=True,
     )
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     story.frame(quake)
     assert story.mission.is_paused
     assert story.mission.resume() == "emergency: earthquake: nothing moves until that is cleared"
     assert story.mission.abort("operator") is None
-    assert story.mission.state is State.HELD
-    story.until_state(State.DONE)  # it is over
+    assert story.mission.state is MissionState.HELD
+    story.until_state(MissionState.DONE)  # it is over
     assert story.mission.done == []
 
 
@@ -157,47 +157,47 @@ def emergency(raised: int, kind: str = "fire", *, code: EventCode = EventCode.AB
 
 @pytest.mark.fault("O1", "O3")
 def test_an_emergency_that_is_new_outranks_a_pause_and_its_level_does_not(story: Story) -> None:
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     story.frame(emergency(1))
-    assert str(story.mission.state) == State.RETURNING
+    assert str(story.mission.state) == MissionState.RETURNING
     assert story.mission.pause("operator") is None
     for _ in range(50):
         story.frame(emergency(1))  # the level
         story.frame(emergency(1, "power"))  # one of two is cleared: what is left is the older one
-    assert str(story.mission.state) == State.HELD
+    assert str(story.mission.state) == MissionState.HELD
     story.frame()  # all cleared
-    assert str(story.mission.state) == State.HELD
+    assert str(story.mission.state) == MissionState.HELD
     story.frame(emergency(2))  # the same kind once more
-    assert str(story.mission.state) == State.RETURNING
+    assert str(story.mission.state) == MissionState.RETURNING
 
 
 @pytest.mark.fault("O1", "O2")
 def test_an_earthquake_at_an_edge_presses_the_robot_on_and_nobody_resumes(story: Story) -> None:
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     at_edge = replace(
         emergency(1, "earthquake", code=EventCode.NEAR_EDGE), off=(True, False, False, False), forward=False
     )
     story.frame(at_edge)
-    assert str(story.mission.state) == State.BACKING_OFF
+    assert str(story.mission.state) == MissionState.BACKING_OFF
     assert story.mission.wants_full_fans
     assert story.mission.pause("operator") is None
     assert story.mission.resume() == "emergency: earthquake: nothing moves until that is cleared"
     story.frame(emergency(1, "earthquake"))
-    assert (story.mission.state, story.mission.cause) == (State.HELD, "emergency: earthquake")
+    assert (story.mission.state, story.mission.cause) == (MissionState.HELD, "emergency: earthquake")
 
 
 @pytest.mark.fault("O1")
 def test_what_breaks_in_an_earthquake_waits_for_an_operator_when_it_is_over(story: Story) -> None:
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     story.frame(emergency(1, "earthquake"))
     broken = replace(emergency(1, "earthquake"), severity=Severity.FAULT, cause="a wheel runs away", signal="enc")
     story.frame(broken)
     assert story.mission.is_faulted
     for _ in range(50):
         story.frame()
-    assert (story.mission.state, story.mission.cause) == (State.HELD, "a wheel runs away")
+    assert (story.mission.state, story.mission.cause) == (MissionState.HELD, "a wheel runs away")
     assert story.mission.resume() is None
-    story.until_state(State.DONE)
+    story.until_state(MissionState.DONE)
     assert story.mission.done == []
 
 
@@ -208,9 +208,9 @@ def test_after_a_restart_with_nothing_latched_the_first_emergency_is_new(story: 
     story.mission.pause("operator")
     story.mission.know_emergency()
     story.frame()
-    assert str(story.mission.state) == State.HELD
+    assert str(story.mission.state) == MissionState.HELD
     story.frame(emergency(1))
-    assert str(story.mission.state) == State.RETURNING
+    assert str(story.mission.state) == MissionState.RETURNING
 
 
 @pytest.mark.fault("O1", "O7")
@@ -219,13 +219,13 @@ def test_what_was_latched_before_the_start_is_waited_for_at_base(story: Story) -
     story.mission.know_emergency()
     for _ in range(50):
         story.frame(emergency(4))
-    assert str(story.mission.state) == State.HELD
+    assert str(story.mission.state) == MissionState.HELD
     assert story.mission.resume() == "an emergency of before is latched: 'ccatp clear' it first"
     story.frame()
     assert story.mission.resume() is None
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     story.frame(emergency(5))
-    assert str(story.mission.state) == State.RETURNING
+    assert str(story.mission.state) == MissionState.RETURNING
 
 
 @pytest.mark.fault("O1")
@@ -253,7 +253,7 @@ def test_the_way_home_is_planned_before_the_robot_misses_it(measured: Note) -> N
 def test_an_abort_during_a_back_off_never_drives_forward_and_is_home_bound_soon(
     frames: int, story: Story, measured: Note
 ) -> None:
-    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    story.until(lambda: story.mission.state is MissionState.DRIVING and story.v > 0.09)
     story.frame(FRONT_OFF)
     for _ in range(frames):
         story.frame(FRONT_OFF)
@@ -261,15 +261,15 @@ def test_an_abort_during_a_back_off_never_drives_forward_and_is_home_bound_soon(
     begun_s, first = story.t, len(story.orders)
     for _ in range(20):
         story.frame(FRONT_OFF)
-    story.until_state(State.RETURNING)
+    story.until_state(MissionState.RETURNING)
     measured("O2", story.t - begun_s)
     assert story.t - begun_s <= 2.0
     assert all(order.twist.v_m_s <= 0.0 for order in story.orders[first:])
-    story.until_state(State.DONE)
+    story.until_state(MissionState.DONE)
     assert story.mission.done == []
 
 
-def drive(config: Config, mirror: Mirror, aborts: list[int]) -> list[Order]:
+def drive(config: Config, mirror: Mirror, aborts: list[int]) -> list[MissionCommand]:
     """A mission aborted in these frames, to its end."""
     story = Story(config, mirror)
     for k in range(900):
@@ -296,7 +296,7 @@ def test_an_abort_in_every_frame_is_one_abort(config: Config, mirror: Mirror, me
 @pytest.mark.fault("O3")
 @given(st.lists(st.tuples(st.sampled_from(["a", "b"]), st.sampled_from(["raise", "clear"])), max_size=12))
 def test_an_id_counts_once(events: list[tuple[str, str]]) -> None:
-    latch = AbortLatch()
+    latch = EmergencyLatch()
     raised, cleared = set(), set()
     for name, what in events:
         if what == "raise":
@@ -399,7 +399,7 @@ def test_what_must_not_be_asked_twice_is_asked_once() -> None:
 def test_a_clear_is_refused_with_a_reason_while_the_cause_persists(
     kind: EmergencyKind, level: bool, held: bool, measured: Note
 ) -> None:
-    latch = AbortLatch()
+    latch = EmergencyLatch()
     latch.raise_emergency(kind.value, "a")
     latch.set_level(kind, level)
     refusal = latch.clear("a", at_base_or_held=held)
@@ -420,9 +420,9 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
     home_s: float, story: Story, config: Config, measured: Note
 ) -> None:
     cfg = config.health
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     story.mission.fault("leg overdue")
-    vigil = Vigil(config, falls=True)
+    vigil = UnattendedFaultTimer(config, falls=True)
     reminders: list[float] = []
     soc, drain = 0.5, 1.0 / cfg.battery_life_s
     while story.mission.is_faulted:
@@ -430,14 +430,14 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
         soc -= 50.0 * DT * drain
         t_s = 50.0 * story.t
         call = vigil.watch(t_s, soc, home_s)
-        if call is Call.REMIND:
+        if call is ReminderCall.REMIND:
             reminders.append(t_s)
-        elif call is Call.RETURN:
+        elif call is ReminderCall.RETURN:
             story.mission.abort("nobody came")
     at_dock = soc - home_s * drain
     measured("O8", (soc - cfg.battery_reserve) / (home_s * drain))
     measured("F6", 100.0 * at_dock)
-    assert story.mission.state is State.RETURNING
+    assert story.mission.state is MissionState.RETURNING
     assert at_dock >= cfg.battery_reserve
     assert (soc - cfg.battery_reserve) / (home_s * drain) >= 1.5
     assert len(reminders) >= 20
@@ -446,21 +446,25 @@ def test_a_fault_on_the_overhang_reminds_every_minute_and_goes_home_in_time(
 
 @pytest.mark.fault("O8")
 def test_who_does_not_know_where_it_is_stays_and_reminds(config: Config) -> None:
-    vigil = Vigil(config, falls=True)
+    vigil = UnattendedFaultTimer(config, falls=True)
     calls = [vigil.watch(float(t), 0.01, None) for t in range(200)]
-    assert [t for t, call in enumerate(calls) if call is not Call.NOTHING] == [60, 120, 180]
-    assert set(calls) == {Call.NOTHING, Call.REMIND}
+    assert [t for t, call in enumerate(calls) if call is not ReminderCall.NOTHING] == [60, 120, 180]
+    assert set(calls) == {ReminderCall.NOTHING, ReminderCall.REMIND}
 
 
 @pytest.mark.fault("O8")
 def test_a_return_is_tried_once_and_only_where_the_robot_would_fall(config: Config) -> None:
-    vigil = Vigil(config, falls=True)
-    assert [vigil.watch(t, 0.1, 30.0) for t in (0.0, 1.0, 61.0)] == [Call.RETURN, Call.NOTHING, Call.REMIND]
+    vigil = UnattendedFaultTimer(config, falls=True)
+    assert [vigil.watch(t, 0.1, 30.0) for t in (0.0, 1.0, 61.0)] == [
+        ReminderCall.RETURN,
+        ReminderCall.NOTHING,
+        ReminderCall.REMIND,
+    ]
     vigil.over()
     assert vigil.held_s(100.0) == 0.0
-    assert vigil.watch(100.0, 0.1, 30.0) is Call.NOTHING
-    safe = Vigil(config, falls=False)
-    assert {safe.watch(float(t), 0.0, 30.0) for t in range(50)} == {Call.NOTHING}
+    assert vigil.watch(100.0, 0.1, 30.0) is ReminderCall.NOTHING
+    safe = UnattendedFaultTimer(config, falls=False)
+    assert {safe.watch(float(t), 0.0, 30.0) for t in range(50)} == {ReminderCall.NOTHING}
 
 
 # -- O9: the way home -------------------------------------------------------------------------------------------------

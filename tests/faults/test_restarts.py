@@ -9,7 +9,7 @@ from ccatp.config.models import Config
 from ccatp.control.gate import Denial
 from ccatp.core import Twist
 from ccatp.links.robot_messages import Sensors
-from ccatp.survey.state import State
+from ccatp.survey.state import MissionState
 from tests.faults.restarting import RestartingRehearsal
 
 MISSIONS = 30
@@ -57,7 +57,7 @@ class Burning(RestartingRehearsal):
 
     def _serve(self, frame: Sensors, dt_s: float) -> None:
         is_time = frame.seq > 1000 if self._is_before else bool(self.states)
-        if not self._is_raised and is_time and self.mission.state is State.DRIVING:
+        if not self._is_raised and is_time and self.mission.state is MissionState.DRIVING:
             assert self.monitor.emergency("fire", "a") is None
             self._is_raised = True
             self._kills |= {frame.seq + 60} if self._is_before else set()
@@ -69,7 +69,7 @@ class Burning(RestartingRehearsal):
 def test_whoever_takes_over_in_a_fire_finds_the_heading_and_goes_home(is_before: bool) -> None:
     run = Burning(config(1, **{"mission.calibration_length_m": 0.0}), is_before=is_before)
     result = run.run()
-    assert (run.states == [State.RETURNING]) is is_before
+    assert (run.states == [MissionState.RETURNING]) is is_before
     assert len(run.states) == 1
     assert (result.outcome, result.cause) == ("aborted, at base", "emergency: fire")
     assert run.gate.denied[Denial.ABORTED] == 0  # it drove to find its heading, too
@@ -104,5 +104,5 @@ class Watching(RestartingRehearsal):
 def test_nothing_moves_before_it_is_found() -> None:
     rehearsal = Watching(config(1, **{"mission.calibration_length_m": 0.0}), {350})
     check(rehearsal)
-    assert rehearsal.states[0] in (State.TURNING, State.DRIVING)
+    assert rehearsal.states[0] in (MissionState.TURNING, MissionState.DRIVING)
     assert rehearsal.early == []

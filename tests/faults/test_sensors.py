@@ -7,7 +7,7 @@ from math import hypot
 import pytest
 
 from ccatp.core import Severity
-from ccatp.survey.state import State
+from ccatp.survey.state import MissionState
 from tests.faults.campaign import Seen, Watched, short_survey, was_real, watched
 
 Measured = Callable[[str, float], None]
@@ -47,7 +47,7 @@ def steps_m(seen: list[Seen]) -> list[float]:
     return [hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(places)]
 
 
-def changes(seen: list[Seen], before: State, after_it: State) -> int:
+def changes(seen: list[Seen], before: MissionState, after_it: MissionState) -> int:
     """How often one state followed another."""
     return sum(a.state is before and b.state is after_it for a, b in pairwise(seen))
 
@@ -59,9 +59,9 @@ def falls(run: Watched) -> bool:
 def test_the_times_are_what_they_are_called() -> None:
     run = watched("", HARD, after(10.0))
     at = {t_s: run.first(t_s, lambda _: True) for t_s in (DRIVING_S, BRAKING_S, TURNING_S, STANDING_S)}
-    assert at[DRIVING_S].state is at[BRAKING_S].state is State.DRIVING
+    assert at[DRIVING_S].state is at[BRAKING_S].state is MissionState.DRIVING
     assert min(map(abs, at[DRIVING_S].drive)) > 3.0 > abs(at[BRAKING_S].drive[0]) > 0.5
-    assert at[TURNING_S].state is State.TURNING
+    assert at[TURNING_S].state is MissionState.TURNING
     assert at[STANDING_S].is_zero
     assert all(one.verdict.severity is Severity.NONE for one in run.since(0.1))
 
@@ -134,7 +134,7 @@ def test_numbers_that_are_none_never_reach_the_filter(token: str, measured: Meas
     assert first.is_zero
     assert first.verdict.severity is Severity.HOLD
     assert all(abs(x) < 10.0 for one in run.seen for x in one.estimate)
-    assert any(one.state is State.MEASURING for one in run.since(first.t_s))
+    assert any(one.state is MissionState.MEASURING for one in run.since(first.t_s))
     moved = [one.t_s for one in run.since(DRIVING_S) if one.t_s < first.t_s and not one.is_zero]
     measured("S4", 1e3 * (max(moved, default=DRIVING_S) - DRIVING_S))
 
@@ -150,7 +150,7 @@ def test_three_lines_that_are_no_frames_within_a_tenth_of_a_second_hold(measured
     first = run.first(DRIVING_S, held(Severity.HOLD))
     assert first.verdict.cause == "lines of the robot were no frames"
     assert first.is_zero
-    assert any(one.state is State.MEASURING for one in run.since(first.t_s))
+    assert any(one.state is MissionState.MEASURING for one in run.since(first.t_s))
     measured("S4", 1e3 * (run.denied_s[0] - DRIVING_S))
 
 
@@ -180,10 +180,10 @@ def test_a_wheel_that_slips_holds_and_a_fix_follows(factor: float, measured: Mea
     assert was_real(run.injected[0])
     first = run.first(DRIVING_S, held(Severity.HOLD))
     assert first.verdict.signal == "imu_wz"
-    assert any(one.state is State.MEASURING for one in run.since(first.t_s))
+    assert any(one.state is MissionState.MEASURING for one in run.since(first.t_s))
     assert run.way_m(DRIVING_S, first.t_s) < 0.05
     before = [one for one in run.since(DRIVING_S) if one.t_s < first.t_s]
-    measured("S6", float(changes(before, State.SETTLING, State.MEASURING)))
+    measured("S6", float(changes(before, MissionState.SETTLING, MissionState.MEASURING)))
 
 
 @pytest.mark.fault("S8")
@@ -216,7 +216,7 @@ def test_an_inertial_unit_that_repeats_itself_is_left_out(fault: str, measured: 
     first = run.first(DRIVING_S, slow)
     assert first.t_s - DRIVING_S <= 0.2 + 0.011  # and a frame on the link
     assert run.localizer.counts["imu_doubted"] > 50
-    driven = [one for one in run.since(DRIVING_S + 1.0) if one.state is State.DRIVING]
+    driven = [one for one in run.since(DRIVING_S + 1.0) if one.state is MissionState.DRIVING]
     assert all(0.015 * abs(sum(one.drive)) < 0.07 for one in driven)  # on it goes, slowly
     measured("S9", 1e3 * (first.t_s - DRIVING_S))
 
@@ -243,7 +243,7 @@ def test_a_clock_that_jumps(kind: str, at_s: float, measured: Measured) -> None:
     travelled = [hypot(b.pose.x_m - a.pose.x_m, b.pose.y_m - a.pose.y_m) for a, b in pairwise(near)]
     beyond = max(steps_m(near)) - max(travelled)
     assert beyond <= 0.001
-    assert any(one.state in (State.DRIVING, State.TURNING) for one in run.since(at_s + 0.5))  # it goes on
+    assert any(one.state in (MissionState.DRIVING, MissionState.TURNING) for one in run.since(at_s + 0.5))  # it goes on
     measured("S12", 1e3 * max(beyond, 0.0))
 
 
@@ -292,7 +292,14 @@ def test_an_edge_sensor_that_stays_off_is_no_edge(corner: str, measured: Measure
     first = run.first(DRIVING_S, held(Severity.HOLD))
     assert first.verdict.signal == corner
     assert first.t_s - DRIVING_S <= 3.0
-    assert sum(changes(run.seen, state, State.BACKING_OFF) for state in State if state is not State.BACKING_OFF) <= 2
+    assert (
+        sum(
+            changes(run.seen, state, MissionState.BACKING_OFF)
+            for state in MissionState
+            if state is not MissionState.BACKING_OFF
+        )
+        <= 2
+    )
     assert run.mission.is_faulted
     assert not falls(run)
     measured("S18", first.t_s - DRIVING_S)
@@ -351,7 +358,7 @@ def test_a_flash_of_light_aborts_nothing(at_s: float, measured: Measured) -> Non
     run = watched(lines(ALL, f'type = "stuck"\nat_s = {at_s}\nfor_s = 1.9\nvalue = 0.0'), HARD, after(at_s + 9.0))
     assert all(map(was_real, run.injected))
     assert not run.mission.is_faulted
-    assert any(one.state in (State.DRIVING, State.TURNING) for one in run.since(at_s + 2.0))
+    assert any(one.state in (MissionState.DRIVING, MissionState.TURNING) for one in run.since(at_s + 2.0))
     measured("S26", float(run.mission.is_faulted))
 
 
@@ -363,13 +370,13 @@ def test_a_robot_put_elsewhere_is_found_at_the_next_point(measured: Measured) ->
         after(25.0),
     )
     assert run.injected[0].samples == 1
-    points = len({one.estimate for one in run.seen if one.state is State.MEASURING})
+    points = len({one.estimate for one in run.seen if one.state is MissionState.MEASURING})
     assert points > 1
     found = run.first(
         DRIVING_S + 0.1, lambda one: hypot(one.estimate[0] - one.pose.x_m, one.estimate[1] - one.pose.y_m) < 0.005
     )
     before = [one for one in run.since(DRIVING_S) if one.t_s < found.t_s]
-    stops = changes(before, State.SETTLING, State.MEASURING)
+    stops = changes(before, MissionState.SETTLING, MissionState.MEASURING)
     assert stops <= 1
     measured("S28", float(stops))
 

@@ -20,15 +20,15 @@ import pytest
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, PointId
 from ccatp.daemon import fix_service as measuring
-from ccatp.daemon.fix_service import MeasuringDesk, Request
+from ccatp.daemon.fix_service import FixRequest, FixService
 from ccatp.daemon.process import LogStream, open_log
-from ccatp.daemon.telemetry import SurveyTeller
+from ccatp.daemon.telemetry import SurveyTelemetry
 from ccatp.etalon_client import EtalonClient
 from ccatp.localizer import Localizer
 from ccatp.records.recorder import Recorder, iter_messages
 from ccatp.records.store import MissionStore
 from ccatp.records.store_rows import PlannedPoint, StoreError, StoreEvent
-from ccatp.survey.fix_gate import Finding, Scrutiny
+from ccatp.survey.fix_gate import FixFinding, FixGate
 from ccatp.survey.mission import Mission
 
 Measured = Callable[[str, float], None]
@@ -186,16 +186,16 @@ class Desk:
         localizer = SimpleNamespace(
             fuse_fix=lambda fix: 0.0, notices=[], pose=None, pose_covariance=None, position_sigma_m=5e-6
         )
-        sure = SimpleNamespace(begin=lambda: None, review=lambda *_, **__: Finding())
+        sure = SimpleNamespace(begin=lambda: None, review=lambda *_, **__: FixFinding())
         teller = SimpleNamespace(fix=lambda *_, **__: None, say=lambda level, text: self.said.append(text))
-        self.desk = MeasuringDesk(
+        self.desk = FixService(
             config.mission,
             cast(EtalonClient, SimpleNamespace(measure=measure)),
-            cast(Scrutiny, sure),
+            cast(FixGate, sure),
             cast(Localizer, localizer),
             cast(Mission, mission),
             store,
-            cast(SurveyTeller, teller),
+            cast(SurveyTelemetry, teller),
             self.over.set,
             lambda: 0.0,
         )
@@ -206,7 +206,7 @@ class Desk:
 
     def begin(self, point: PointId) -> None:
         self.over.clear()
-        self.desk.begin(Request(1, 1.0, point, (0.0, 0.0, 0.0), POSE))
+        self.desk.begin(FixRequest(1, 1.0, point, (0.0, 0.0, 0.0), POSE))
 
 
 @pytest.mark.fault("P14")

@@ -64,9 +64,14 @@ def targets() -> list[Target]:
         Target("robot link, from the robot", _from_robot(), _robot, (robot.BadLine,)),
         Target("robot link, from a client", _from_client(), _client, (robot.BadLine,)),
         Target("robot link, lines", [SENSORS + b"\n" + HELLO + b"\n"], _lines, (LineTooLong,)),
-        Target("MultiLine, requests", [b"isconnected", b"latestlengthvalid,1,2,32"], _request, (multiline.BadRequest,)),
+        Target(
+            "MultiLine, requests",
+            [b"isconnected", b"latestlengthvalid,1,2,32"],
+            _request,
+            (multiline.BadMultilineRequest,),
+        ),
         Target("MultiLine, replies", _replies(), _reply, (multiline.BadReply,)),
-        Target("MultiLine, lines", [b"laserready_1\r\nmeasstarted\n"], _split, (multiline.LineTooLong,)),
+        Target("MultiLine, lines", [b"laserready_1\r\nmeasstarted\n"], _split, (multiline.MultilineTooLong,)),
         Target("observatory channel", _observatory(), _emergency, (channels.BadRequest,)),
         Target("operator channel", [b'{"cmd":"status"}', b'{"cmd":"abort"}'], _operator, (channels.BadRequest,)),
         Target("replies of both channels", [b'{"ok":true,"code":0}'], _channel_reply, (channels.BadRequest,)),
@@ -236,9 +241,11 @@ def _clients(data: bytes) -> Hashable:
 
 
 def _bus() -> list[bytes]:
-    presence = topics.Presence(seq=1, t_s=0.5, process="main", pid=7, phase="ready")
-    estimate = topics.Estimate(seq=5, t_s=0.05, x_m=1.0, y_m=2.0, heading_rad=0.5, sigma_m=0.001, state="driving")
-    track = topics.Track(seq=1, t_s=0.1, rows=[(1, 0.1, 1, 2, 0.1, 0.2, 0.3, 0.001)])
+    presence = topics.Heartbeat(seq=1, t_s=0.5, process="main", pid=7, phase="ready")
+    estimate = topics.EstimateMessage(
+        seq=5, t_s=0.05, x_m=1.0, y_m=2.0, heading_rad=0.5, sigma_m=0.001, state="driving"
+    )
+    track = topics.TrackMessage(seq=1, t_s=0.1, rows=[(1, 0.1, 1, 2, 0.1, 0.2, 0.3, 0.001)])
     return [
         topics.pack("presence.main", presence),
         topics.pack("estimate", estimate),

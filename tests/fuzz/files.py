@@ -13,7 +13,7 @@ import msgspec
 from ccatp.config.load import dump_config, load_config
 from ccatp.core import DeckPose, Fix, PointId
 from ccatp.errors import ConfigError
-from ccatp.links.topics import TOPICS, FixMessage, Rest, SensorLines, Track, pack, schema_of
+from ccatp.links.topics import TOPICS, FixMessage, Rest, SensorLines, TrackMessage, pack, schema_of
 from ccatp.records import store_rows
 from ccatp.records.recorder import Recorder, iter_messages
 from ccatp.records.run_reader import RunReadError, open_run
@@ -164,7 +164,7 @@ def sound_recording(folder: Path) -> bytes:
         "sensors": SensorLines(seq=12, t_s=0.12, lines=[msgspec.Raw(line) for line in raw]),
         "rest": Rest(seq=12, t_s=0.12),
         "fix": fix,
-        "track": Track(seq=12, t_s=0.12, rows=[(12, 0.12, 1, 1, 0.0, 0.0, 0.0, 0.001)]),
+        "track": TrackMessage(seq=12, t_s=0.12, rows=[(12, 0.12, 1, 1, 0.0, 0.0, 0.0, 0.001)]),
     }
     for name, message in messages.items():
         recorder.write(name, 0.12, pack(name, message).split(b" ", 1)[1])

@@ -7,8 +7,8 @@ import pytest
 
 from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.slam.batch_smoother import smooth
-from ccatp.beacons.slam.evaluation import Judgement, judge
-from ccatp.beacons.slam.recording import RecordedRun, Track
+from ccatp.beacons.slam.evaluation import TrackEvaluation, judge
+from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun
 from ccatp.beacons.slam.settings import batch_settings
 from ccatp.config.load import load_recordings_config
 
@@ -16,7 +16,7 @@ DATA = Path(__file__).parents[3] / "shared" / "data" / "radio"
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"the recorded radio data are not at {DATA}")
 
 
-def smoothed(path: str, robot: int | None = None) -> tuple[RecordedRun, Track, Judgement]:
+def smoothed(path: str, robot: int | None = None) -> tuple[RecordedRun, EstimatedPath, TrackEvaluation]:
     """A set through the smoother as it is configured."""
     run = read_run(DATA / path, None, robot)
     track = smooth(run, batch_settings(getattr(load_recordings_config(), run.kind)), time.perf_counter)

@@ -20,7 +20,7 @@ from ccatp.daemon.process import Endpoints
 from ccatp.links.bus import Publisher, Subscriber
 from ccatp.links.robot_link import RobotLink
 from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import DangerEvent, Estimate, Presence, Truth
+from ccatp.links.topics import DangerEvent, EstimateMessage, Heartbeat, TruthMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
 
 START_M = 0.20  # of the robot's origin inside the rim: all sensors stand on the mirror, whatever the heading
@@ -93,7 +93,7 @@ class RecklessMain:
 
     def presence(self) -> None:
         """Be seen by the danger loop."""
-        self._publisher.send("presence.main", Presence(seq=0, t_s=0.0, process="main", pid=0, phase="ready"))
+        self._publisher.send("presence.main", Heartbeat(seq=0, t_s=0.0, process="main", pid=0, phase="ready"))
 
     def on_sensors(self, link: RobotLink, sensors: Sensors) -> None:
         """Dead-reckon, claim the pose, drive on."""
@@ -116,7 +116,7 @@ class RecklessMain:
         pose = self._pose
         self._publisher.send(
             "estimate",
-            Estimate(
+            EstimateMessage(
                 seq=sensors.seq,
                 t_s=sensors.t,
                 x_m=pose.x_m,
@@ -205,7 +205,7 @@ async def _watch(
         main.presence()
         while (received := subscriber.receive()) is not None:
             message = received[1]
-            is_joined = is_joined or (isinstance(message, Presence) and message.phase == "joined")
+            is_joined = is_joined or (isinstance(message, Heartbeat) and message.phase == "joined")
         await asyncio.sleep(0.02)
     await link.connect(5.0)
     rows: dict[int, tuple[float, int]] = {}
@@ -220,7 +220,7 @@ async def _watch(
             await asyncio.sleep(0.2)  # what is on its way when the robot stands must be heard too
         while (received := subscriber.receive()) is not None:
             message = received[1]
-            if isinstance(message, Truth):
+            if isinstance(message, TruthMessage):
                 rows.update({row[0]: (row[8], row[9]) for row in message.rows})
             elif isinstance(message, DangerEvent) and message.code == 1 and declared_at is None:
                 declared_at = message.seq

@@ -7,7 +7,7 @@ import pytest
 
 from ccatp.config.load import load_config
 from ccatp.errors import RefusedError
-from ccatp.links.client import Client, HttpClient
+from ccatp.links.client import HttpClient, OperatorClient
 from tests.processes.conftest import Run
 
 
@@ -15,7 +15,7 @@ def test_a_survey_paused_resumed_and_called_home(start: Callable[..., Run], runt
     page = ("--set", "dashboard.enabled=true", "--set", "dashboard.port=0")
     run = start("--realtime", "--panels", "1", "--mirror", "thesis-m1", *page)
     run.until(lambda status: status["state"] in ("turning", "driving"))
-    daemon = Client(runtime_dir)
+    daemon = OperatorClient(runtime_dir)
     assert daemon.status().total == 9
     assert daemon.pause().state == "held"
     http = HttpClient(f"http://127.0.0.1:{load_config(run.run_dir / 'config.toml').dashboard.port}")

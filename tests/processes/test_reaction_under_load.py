@@ -26,9 +26,9 @@ import pytest
 from ccatp.config.load import dump_config, load_config
 from ccatp.dataloop import DataLoop
 from ccatp.mirror.mirror import build_mirror
-from ccatp.sim.etalon_server import EtalonStandIn, ZmqPuck
+from ccatp.sim.etalon_server import EtalonSimulator, ZmqPuck
 from ccatp.sim.fault_proxy import FaultProxy
-from ccatp.sim.ground_truth import TruthOutlet
+from ccatp.sim.ground_truth import GroundTruthPublisher
 from ccatp.sim.network_faults import Pipe
 from ccatp.sim.robot import TruthLog
 from tests.faults.linking import Measured
@@ -160,13 +160,13 @@ async def survey(folder: Path, runtime_dir: Path) -> AsyncIterator[Survey]:
     async with AsyncExitStack() as stack:
         robot = DataLoop(cfg, False, 1)
         puck_at = f"ipc://{runtime_dir / 'puck'}"
-        robot.truth = outlet = TruthOutlet(TruthLog(robot.robot), puck_at, None)
+        robot.truth = outlet = GroundTruthPublisher(TruthLog(robot.robot), puck_at, None)
         stack.callback(outlet.close)
         wire = Wire(robot)
         port = await robot.start()
         puck = ZmqPuck(puck_at)
         stack.callback(puck.close)
-        laser = EtalonStandIn(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, np.random.default_rng(1),
+        laser = EtalonSimulator(cfg.sim.etalon, mirror.channels, mirror.collimators_m, puck, np.random.default_rng(1),
                               measuring_time_s=cfg.etalon.measuring_time_s)  # fmt: skip
         laser_port = await laser.start("127.0.0.1", 0)
         stack.push_async_callback(laser.close)

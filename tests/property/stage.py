@@ -21,8 +21,8 @@ from ccatp.links.robot_codec import set_point_on_wire
 from ccatp.links.robot_messages import Sensors
 from ccatp.mirror.multilateration import MultilaterationError
 from ccatp.sim.robot import Robot
-from ccatp.studies.sil_models import LaserDesk
-from ccatp.studies.sil_run import Rehearsing
+from ccatp.studies.sil_models import SilLaser
+from ccatp.studies.sil_run import SilRun
 from ccatp.survey.state import BACKING_OFF, DONE, DRIVING, HELD, PURPOSES, RETURNING, TURNING
 
 FRESH_S = 0.15  # I10
@@ -59,13 +59,13 @@ class Trouble:
     fix_frames: int = 0  # until a fix is there
 
 
-class Stage(Rehearsing):
+class Stage(SilRun):
     """One mission; ``advance`` serves frames, the other methods are what the outside does."""
 
     def __init__(self, cfg: Config) -> None:
         super().__init__(cfg, with_track=False)
         self.robot: SpyRobot = SpyRobot(cfg, self.mirror, np.random.default_rng(cfg.run.seed))
-        self.laser = LaserDesk(cfg, self.mirror, self.robot)
+        self.laser = SilLaser(cfg, self.mirror, self.robot)
         self.fans = FanGate(self.cfg.sim.robot.fan_floor if self.mirror.overhang else 0.0)
         self.trouble = Trouble()
         self.acknowledged: list[PointId] = []

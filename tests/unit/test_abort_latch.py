@@ -3,13 +3,13 @@
 import pytest
 
 from ccatp.core import EmergencyKind
-from ccatp.safety.emergency_latch import AT_BASE_OR_HELD, MAX_ACTIVE, MAX_CLEARED, AbortLatch, is_at_base_or_held
-from ccatp.survey.state import State
+from ccatp.safety.emergency_latch import AT_BASE_OR_HELD, MAX_ACTIVE, MAX_CLEARED, EmergencyLatch, is_at_base_or_held
+from ccatp.survey.state import MissionState
 
 
 @pytest.mark.parametrize("kind", list(EmergencyKind))
 def test_each_kind_latches_until_cleared(kind: EmergencyKind) -> None:
-    latch = AbortLatch()
+    latch = EmergencyLatch()
     assert not latch.is_latched
     assert latch.newest is None
     assert latch.raise_emergency(kind.value, "a", "smoke") is None
@@ -21,7 +21,7 @@ def test_each_kind_latches_until_cleared(kind: EmergencyKind) -> None:
 
 
 def test_the_same_id_again_is_harmless_also_after_its_clear() -> None:
-    latch = AbortLatch()
+    latch = EmergencyLatch()
     latch.raise_emergency("fire", "a")
     assert latch.raise_emergency("power", "a", "retransmitted") is None
     assert latch.newest is not None
@@ -34,21 +34,21 @@ def test_the_same_id_again_is_harmless_also_after_its_clear() -> None:
 
 
 def test_unknown_kind_and_unknown_id_change_nothing() -> None:
-    latch = AbortLatch()
+    latch = EmergencyLatch()
     assert latch.raise_emergency("flood", "a") == "unknown kind 'flood'"
     assert latch.clear("a", at_base_or_held=True) == "no emergency with that id"
     assert not latch.is_latched
 
 
 def test_clear_is_refused_while_the_robot_is_out_on_the_mirror() -> None:
-    latch = AbortLatch()
+    latch = EmergencyLatch()
     latch.raise_emergency("fire", "a")
     assert latch.clear("a", at_base_or_held=False) == "the robot is neither at base nor held"
     assert latch.is_latched
 
 
 def test_clear_is_refused_while_the_cause_persists() -> None:
-    latch = AbortLatch()
+    latch = EmergencyLatch()
     latch.raise_emergency("fire", "a")
     latch.set_level(EmergencyKind.FIRE, True)
     latch.set_level(EmergencyKind.POWER, True)
@@ -59,7 +59,7 @@ def test_clear_is_refused_while_the_cause_persists() -> None:
 
 
 def test_the_latch_opens_with_the_last_emergency() -> None:
-    latch = AbortLatch()
+    latch = EmergencyLatch()
     latch.raise_emergency("fire", "a")
     latch.raise_emergency("power", "b")
     assert latch.newest is not None
@@ -72,7 +72,7 @@ def test_the_latch_opens_with_the_last_emergency() -> None:
 
 
 def test_a_flood_of_emergencies_is_bounded_and_stays_latched() -> None:
-    latch = AbortLatch()
+    latch = EmergencyLatch()
     for number in range(MAX_ACTIVE):
         assert latch.raise_emergency("weather", str(number)) is None
     assert latch.raise_emergency("weather", "one more") == (
@@ -85,7 +85,7 @@ def test_a_flood_of_emergencies_is_bounded_and_stays_latched() -> None:
 
 
 def test_an_id_is_that_of_one_emergency() -> None:
-    latch = AbortLatch()
+    latch = EmergencyLatch()
     assert latch.raise_emergency("weather", "a") is None
     assert latch.raise_emergency("weather", "a") is None
     assert latch.raise_emergency("fire", "a") is None
@@ -101,7 +101,7 @@ def test_an_id_is_that_of_one_emergency() -> None:
 
 
 def test_memory_of_cleared_ids_is_bounded() -> None:
-    latch = AbortLatch()
+    latch = EmergencyLatch()
     for number in range(MAX_CLEARED + 1):
         latch.raise_emergency("weather", str(number))
         assert latch.clear(str(number), at_base_or_held=True) is None
@@ -111,7 +111,7 @@ def test_memory_of_cleared_ids_is_bounded() -> None:
 
 
 def test_the_states_are_those_of_the_mission() -> None:
-    assert {state.value for state in (State.IDLE, State.HELD, State.DONE)} == AT_BASE_OR_HELD
+    assert {state.value for state in (MissionState.IDLE, MissionState.HELD, MissionState.DONE)} == AT_BASE_OR_HELD
     assert is_at_base_or_held("held")
     assert not is_at_base_or_held("driving")
     assert not is_at_base_or_held("")

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from zmq.utils import z85
 
-from ccatp.links.auth import Admission, BadAccess, Client, Role, answer_zap, decode_key, parse_clients
+from ccatp.links.auth import Admission, AuthorizedClient, BadAccess, Role, answer_zap, decode_key, parse_clients
 
 KEY = b"k" * 32
 TEXT = z85.encode(KEY).decode()
-LISTED = {KEY: Client("observatory", Role.RAISE)}
+LISTED = {KEY: AuthorizedClient("observatory", Role.RAISE)}
 REQUEST = [b"1.0", b"7", b"ccatp", b"10.0.0.1", b"", b"CURVE", KEY]
 
 
@@ -36,7 +36,7 @@ def test_a_list_of_clients() -> None:
     other = zmq.curve_keypair()[0].decode()
     text = f'[clients.a]\npublic_key = "{TEXT}"\nrole = "raise"\n[clients.b]\npublic_key = "{other}"\nrole = "clear"\n'
     clients = parse_clients(text)
-    assert clients == {KEY: Client("a", Role.RAISE), decode_key(other): Client("b", Role.CLEAR)}
+    assert clients == {KEY: AuthorizedClient("a", Role.RAISE), decode_key(other): AuthorizedClient("b", Role.CLEAR)}
     assert parse_clients("# nobody\n") == {}
 
 

@@ -7,7 +7,7 @@ import pytest
 import zmq
 
 from ccatp.links.bus import Publisher, Subscriber
-from ccatp.links.topics import Log, Presence
+from ccatp.links.topics import Heartbeat, LogMessage
 
 ENDPOINT = "inproc://bus"
 Context = zmq.Context[zmq.Socket[bytes]]
@@ -35,8 +35,8 @@ def bus() -> Iterator[Bus]:
     context.destroy(linger=0)
 
 
-def presence(seq: int) -> Presence:
-    return Presence(seq=seq, t_s=0.0, process="main", pid=1, phase="ready")
+def presence(seq: int) -> Heartbeat:
+    return Heartbeat(seq=seq, t_s=0.0, process="main", pid=1, phase="ready")
 
 
 def test_a_subscriber_gets_its_topics_only_in_order(bus: Bus) -> None:
@@ -44,7 +44,7 @@ def test_a_subscriber_gets_its_topics_only_in_order(bus: Bus) -> None:
     subscriber = bus.subscriber("presence.main")
     assert publisher.has_subscriber("presence.main")
     publisher.send("presence.main", presence(1))
-    publisher.send("log", Log(seq=0, t_s=0.0, level="info", process="main", text="not for you"))
+    publisher.send("log", LogMessage(seq=0, t_s=0.0, level="info", process="main", text="not for you"))
     publisher.send("presence.main", presence(2))
     assert subscriber.receive(1.0) == ("presence.main", presence(1))
     assert subscriber.receive(1.0) == ("presence.main", presence(2))
@@ -107,7 +107,7 @@ def test_of_what_waits_the_newest_is_kept(bus: Bus) -> None:
     while 199 not in seen:
         received = newest.receive(5.0)
         assert received is not None
-        assert isinstance(received[1], Presence)
+        assert isinstance(received[1], Heartbeat)
         seen.append(received[1].seq)
     assert len(seen) < 200
     assert newest.receive() is None

@@ -18,7 +18,7 @@ from ccatp.cli.common import parse_setting
 from ccatp.config.models import Config
 from ccatp.config.package import configs_dir
 from ccatp.daemon.run_dir import RunOptions
-from ccatp.errors import ConfigError, UnreachableError
+from ccatp.errors import ConfigError, DaemonUnreachableError
 from ccatp.links.runtime_dir import LOCK_FILE, TRUTH_LOCK_FILE, locked
 
 EMERGENCY_ID = "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"
@@ -217,7 +217,7 @@ def test_a_resumed_run_takes_the_configuration_of_its_directory(stub: Stub) -> N
     ("error", "status", "line"),
     [
         (ConfigError("a.toml:3: run.seed is odd"), 2, "ccatp: a.toml:3: run.seed is odd\n"),
-        (UnreachableError("robot 127.0.0.1:1 refuses"), 5, "ccatp: robot 127.0.0.1:1 refuses\n"),
+        (DaemonUnreachableError("robot 127.0.0.1:1 refuses"), 5, "ccatp: robot 127.0.0.1:1 refuses\n"),
         (KeyboardInterrupt(), 130, "ccatp: interrupted\n"),
     ],
 )

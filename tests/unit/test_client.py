@@ -10,8 +10,8 @@ import msgspec
 import pytest
 
 from ccatp.daemon.survey_collector import NO_STATUS
-from ccatp.errors import RefusedError, UnreachableError
-from ccatp.links.client import Client, Latched, Pong, StillWaiting
+from ccatp.errors import DaemonUnreachableError, RefusedError
+from ccatp.links.client import Latched, OperatorClient, Pong, StillWaiting
 from tests.unit.serving import serving
 
 
@@ -27,7 +27,7 @@ def status(**fields: object) -> dict[str, Any]:
 
 def test_commands_and_typed_answers(folder: Path) -> None:
     with serving(folder, "control", lambda request: status(state=request["cmd"], done=3)) as asked:
-        daemon = Client(folder)
+        daemon = OperatorClient(folder)
         for order in (daemon.status, daemon.pause, daemon.resume, daemon.abort, daemon.stop):
             found = order()
             assert (found.state, found.done) == (order.__name__, 3)
@@ -39,29 +39,29 @@ def test_a_refusal_says_why(folder: Path) -> None:
         serving(folder, "control", lambda _: {"ok": False, "error": "nothing is paused"}),
         pytest.raises(RefusedError, match="resume refused: nothing is paused"),
     ):
-        Client(folder).resume()
+        OperatorClient(folder).resume()
 
 
 def test_nobody_there(folder: Path) -> None:
-    with pytest.raises(UnreachableError, match=r"no daemon in .*; start one with ccatp run"):
-        Client(folder).status()
+    with pytest.raises(DaemonUnreachableError, match=r"no daemon in .*; start one with ccatp run"):
+        OperatorClient(folder).status()
     (folder / "control").touch()
-    with pytest.raises(UnreachableError, match=r"no answer from .* within 0\.1 s"):
-        Client(folder, timeout_s=0.1).status()
+    with pytest.raises(DaemonUnreachableError, match=r"no answer from .* within 0\.1 s"):
+        OperatorClient(folder, timeout_s=0.1).status()
 
 
 def test_an_answer_of_another_shape_is_told(folder: Path) -> None:
     with (
         serving(folder, "control", lambda _: {"ok": True, "status": {"state": 7}}),
-        pytest.raises(UnreachableError, match="not what was asked for"),
+        pytest.raises(DaemonUnreachableError, match="not what was asked for"),
     ):
-        Client(folder).status()
+        OperatorClient(folder).status()
 
 
 def test_waiting(folder: Path) -> None:
     done = iter(range(100))
     with serving(folder, "control", lambda _: status(done=next(done), total=9, state="driving")):
-        daemon = Client(folder)
+        daemon = OperatorClient(folder)
         assert daemon.wait(lambda found: found.done >= 3, timeout_s=20.0, period_s=0.001).done == 3
         begin = time.monotonic()
         with pytest.raises(StillWaiting, match=r"not within 0\.05 s: the mission is driving, \d+ points done"):
@@ -78,7 +78,7 @@ def test_observatory(folder: Path) -> None:
         return {"ok": True, "id": request["id"], "latched": True, "code": 2}
 
     with serving(folder, "emergency", answer) as asked:
-        observatory = Client(folder).observatory
+        observatory = OperatorClient(folder).observatory
         assert observatory.ping() == Pong(1, None)
         latched = observatory.emergency("fire", "smoke")
         assert latched == Latched(latched.id, 2)

@@ -15,8 +15,8 @@ from ccatp.core import Fix, PanelId, PointId
 from ccatp.localizer import Localizer
 from ccatp.mirror.misalignment import PanelMisalignment
 from ccatp.mirror.panel_alignment import Measured
-from ccatp.studies.sil_models import LaserDesk, StopRow
-from ccatp.studies.sil_run import Rehearsing
+from ccatp.studies.sil_models import SilLaser, StopRow
+from ccatp.studies.sil_run import SilRun
 from tests.unit.aligning.conftest import NAMES, exact_fix, load, misaligned, survey
 from tests.unit.run_folder import make_run
 
@@ -25,7 +25,7 @@ PANEL = PanelId(3, 7)
 LIES = PanelMisalignment(40e-6, -90e-6, 120e-6)
 
 
-class KeepingDesk(LaserDesk):
+class KeepingDesk(SilLaser):
     """Keeps the fix that counts for each point, as the daemon's database does."""
 
     def is_too_far(self, row: StopRow, point: PointId, fix: Fix, distance_m: float, localizer: Localizer) -> bool:
@@ -39,7 +39,7 @@ class KeepingDesk(LaserDesk):
 
 def surveyed(run_dir: Path, cfg: Config) -> Path:
     """The run directory of a survey in process."""
-    run = Rehearsing(cfg, with_track=False)
+    run = SilRun(cfg, with_track=False)
     run.laser = desk = KeepingDesk(cfg, run.mirror, run.robot)
     desk.kept = []
     assert run.run().outcome == "complete"

@@ -11,7 +11,7 @@ from ccatp.config.models import Config
 from ccatp.core import Corner, EdgeSample, EventCode, ImuSample, Verdict, WheelSample
 from ccatp.danger import CENTRE, DangerMonitor
 from ccatp.links.robot_messages import CommandEcho
-from ccatp.links.topics import Estimate
+from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.safety.edge_detector import Cause, EdgeMap
 from ccatp.safety.wheel_odometry import KNOTS_KEPT, Odometry, WheelTrack, pose_at
@@ -66,7 +66,7 @@ class Story:
         """One frame at that velocity; ``flags``: per sample 0 where the sensors named in ``off`` are off."""
         r, base = self.cfg.robot.wheel_radius_m, self.cfg.robot.wheel_base_m
         right, left = (v + 0.5 * omega * base) / r, (v - 0.5 * omega * base) / r
-        estimate = Estimate(
+        estimate = EstimateMessage(
             seq=self.seq, t_s=self.t, x_m=self.pose[0], y_m=self.pose[1], heading_rad=self.pose[2],
             sigma_m=self.sigma_m, state=self.state,
         )  # fmt: skip
@@ -409,7 +409,7 @@ def test_a_silent_wheel_permits_nothing_and_counts_as_fastest(on_panel: Story, b
     for k in range(1, 18):
         t_s = t + 0.01 * k
         enc = [WheelSample(t_s, bad, 0.0)]
-        estimate = Estimate(
+        estimate = EstimateMessage(
             seq=k, t_s=t_s, x_m=on_panel.pose[0], y_m=on_panel.pose[1], heading_rad=0.0, sigma_m=1e-4, state="driving"
         )
         verdict = monitor.step(Frame(100 + k, t_s, enc, [EdgeSample(t_s, 1, 1, 1, 1)]), estimate)
@@ -499,7 +499,7 @@ def test_an_estimate_that_is_not_finite_is_none(on_panel: Story, field_name: str
         "sigma_m": 1e-4,
         field_name: value,
     }
-    estimate = Estimate(seq=1, state="held", **fields)
+    estimate = EstimateMessage(seq=1, state="held", **fields)
     t_s = on_panel.t + 1e-3
     frame = Frame(9, t_s, [WheelSample(t_s, 0.0, 0.0)], [EdgeSample(t_s, 1, 1, 1, 1)])
     verdict = on_panel.monitor.step(frame, estimate)
@@ -513,7 +513,7 @@ def test_the_age_of_an_estimate(on_panel: Story, age_s: float, expected: tuple[b
     on_panel.run(20)
     x, y, heading = on_panel.pose
     t_s = on_panel.t + 1e-3
-    estimate = Estimate(seq=1, t_s=t_s - age_s, x_m=x, y_m=y, heading_rad=heading, sigma_m=1e-4, state="driving")
+    estimate = EstimateMessage(seq=1, t_s=t_s - age_s, x_m=x, y_m=y, heading_rad=heading, sigma_m=1e-4, state="driving")
     frame = Frame(99, t_s, [WheelSample(t_s, 0.0, 0.0)], [EdgeSample(t_s, 1, 1, 1, 1)])
     verdict = on_panel.monitor.step(frame, estimate)
     assert permits(verdict) == expected
@@ -531,14 +531,14 @@ def test_edge_samples_that_stay_away_permit_nothing(on_panel: Story) -> None:
     on_panel.run(1)
     for k in range(1, 18):
         t_s = on_panel.t + 0.01 * k
-        estimate = Estimate(seq=k, t_s=t_s, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-4, state="driving")
+        estimate = EstimateMessage(seq=k, t_s=t_s, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-4, state="driving")
         verdict = on_panel.monitor.step(Frame(100 + k, t_s, [WheelSample(t_s, 0.0, 0.0)], []), estimate)
     assert (verdict.cause, verdict.signal) == ("edge samples stale", "edge")
     assert permits(verdict) == NO_PERMIT
 
 
 def test_no_edge_sample_ever_permits_nothing(on_panel: Story) -> None:
-    estimate = Estimate(seq=0, t_s=0.0, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-4, state="driving")
+    estimate = EstimateMessage(seq=0, t_s=0.0, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-4, state="driving")
     verdict = on_panel.monitor.step(Frame(1, 0.01, [WheelSample(0.01, 0.0, 0.0)], []), estimate)
     assert (verdict.cause, verdict.value) == ("no edge samples", 0.15)
     assert permits(verdict) == NO_PERMIT

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ccatp.errors import CcatpError, ConfigError, ExitStatus, RefusedError, RuntimeDirError, UnreachableError
+from ccatp.errors import CcatpError, ConfigError, DaemonUnreachableError, ExitStatus, RefusedError, RuntimeDirError
 
 
 @pytest.mark.parametrize(
@@ -12,7 +12,7 @@ from ccatp.errors import CcatpError, ConfigError, ExitStatus, RefusedError, Runt
         (ConfigError("x"), ExitStatus.USAGE),
         (RuntimeDirError("x"), ExitStatus.USAGE),
         (RefusedError("x"), ExitStatus.REFUSED),
-        (UnreachableError("x"), ExitStatus.UNREACHABLE),
+        (DaemonUnreachableError("x"), ExitStatus.UNREACHABLE),
     ],
 )
 def test_each_error_has_its_exit_status(error: CcatpError, status: ExitStatus) -> None:

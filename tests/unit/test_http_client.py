@@ -8,7 +8,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 
-from ccatp.errors import ConfigError, RefusedError, UnreachableError
+from ccatp.errors import ConfigError, DaemonUnreachableError, RefusedError
 from ccatp.links.client import HttpClient
 
 Answer = Callable[[str, str, str | None], tuple[int, bytes]]
@@ -73,13 +73,13 @@ def test_a_refusal_says_why(body: bytes, told: str) -> None:
 
 
 def test_nobody_there(free_port: int) -> None:
-    with pytest.raises(UnreachableError, match="is ccatp dashboard running there"):
+    with pytest.raises(DaemonUnreachableError, match="is ccatp dashboard running there"):
         HttpClient(f"http://127.0.0.1:{free_port}").status()
 
 
 @pytest.mark.parametrize(("body", "told"), [(b"<html>", "is no JSON"), (b"[]", "is no object")])
 def test_another_server_is_told(body: bytes, told: str) -> None:
-    with page(lambda *_: (200, body)) as url, pytest.raises(UnreachableError, match=told):
+    with page(lambda *_: (200, body)) as url, pytest.raises(DaemonUnreachableError, match=told):
         HttpClient(url).status()
 
 

@@ -13,12 +13,12 @@ import zmq
 
 from ccatp.cli import main
 from ccatp.daemon.streaming import RUN, streamed_schemas
-from ccatp.report.live import FoxgloveStream, PlotJugglerStream, Stream, StreamError, check_host
-from ccatp.report.views import Shown
+from ccatp.report.live import FoxgloveStream, LiveStream, PlotJugglerStream, StreamError, check_host
+from ccatp.report.views import ViewMessage
 from tests.web_socket import WebSocket
 
-PANELS = Shown("view/panels", 0.0, b'{"deletions":[],"entities":[]}')
-ROBOT = Shown("view/robot", 1.25, b'{"t_s":1.25,"seq":125,"x_m":0.5,"y_m":0.0,"heading_rad":0.0,"sigma_m":0.001}')
+PANELS = ViewMessage("view/panels", 0.0, b'{"deletions":[],"entities":[]}')
+ROBOT = ViewMessage("view/robot", 1.25, b'{"t_s":1.25,"seq":125,"x_m":0.5,"y_m":0.0,"heading_rad":0.0,"sigma_m":0.001}')
 PROTOCOL = "foxglove.sdk.v1"
 
 
@@ -45,7 +45,7 @@ def foxglove() -> Iterator[FoxgloveStream]:
 class Tending:
     """Serves a stream in a thread, as the process would; messages may be sent meanwhile."""
 
-    def __init__(self, stream: Stream, *messages: Callable[[], None]) -> None:
+    def __init__(self, stream: LiveStream, *messages: Callable[[], None]) -> None:
         self._stream, self._is_over, self._todo = stream, False, list(messages)
         self._thread = threading.Thread(target=self._run)
 

@@ -16,7 +16,7 @@ from ccatp.config.models import Config
 from ccatp.core import DeckPose, EdgeSample, Fix, FloatArray, ImuSample, PanelId, PanelPose, WheelSample, difference
 from ccatp.estimation.fixes import FixRefused, PositionSigma
 from ccatp.estimation.measurements import ConstantAcceleration, MeasurementBuilder
-from ccatp.estimation.odometry import Odometer, Place, arc_step
+from ccatp.estimation.odometry import Odometer, OdometryPose, arc_step
 from ccatp.estimation.seams import HeadingFix, HeadingGate, heading_from_pair
 from ccatp.estimation.thesis_localizer import FourStateLocalizer as Localizer
 from ccatp.filters import FILTERS, FilterDiverged, FilterShapeError, Innovation, KalmanFilter
@@ -342,7 +342,7 @@ def test_entering_angle_for_every_edge_and_direction(normal: float, entering: fl
     places = []
     for b in (0.09, -0.09):
         s = -(0.09 * cos(e) - b * sin(e)) / cos(e)
-        places.append(Place(s * 1.0, 0.0, 0.0))  # the odometer's x axis is the heading
+        places.append(OdometryPose(s * 1.0, 0.0, 0.0))  # the odometer's x axis is the heading
     found, length, across = heading_from_pair(places[0], places[1], (0.09, 0.09), (0.09, -0.09), normal)
     assert (found - heading + pi / 2) % pi - pi / 2 == pytest.approx(0.0, abs=1e-12)  # rounding
     assert across == pytest.approx(0.18)
@@ -353,8 +353,8 @@ def test_entering_angle_for_every_edge_and_direction(normal: float, entering: fl
 
 def test_a_turn_between_the_two_sensors_is_taken_out() -> None:
     # The left sensor crosses with the robot at heading 0.10, the right one at 0.13; both stand on the line x = 1.
-    def place_on_line(heading: float, ahead: float, aside: float, y: float) -> Place:
-        return Place(1.0 - ahead * cos(heading) + aside * sin(heading), y, heading)
+    def place_on_line(heading: float, ahead: float, aside: float, y: float) -> OdometryPose:
+        return OdometryPose(1.0 - ahead * cos(heading) + aside * sin(heading), y, heading)
 
     left, right = place_on_line(0.10, 0.09, 0.09, 0.0), place_on_line(0.13, 0.09, -0.09, 0.002)
     heading, _, _ = heading_from_pair(left, right, (0.09, 0.09), (0.09, -0.09), 0.0)
@@ -526,7 +526,7 @@ def test_position_sigma() -> None:
 def test_odometer_keeps_the_standstill_and_forgets_the_rest() -> None:
     odometer = Odometer(0.2)
     assert odometer.oldest_s == inf
-    assert odometer.at(1.0) == Place(0.0, 0.0, 0.0)
+    assert odometer.at(1.0) == OdometryPose(0.0, 0.0, 0.0)
     odometer.start(0.0)
     for k in range(1, 1001):
         odometer.advance(0.01 * k, 1e-7, 0.0, 0.01)

@@ -25,9 +25,9 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.survey.mission import Mission
 from ccatp.survey.planning.legs import PlanError
 from ccatp.survey.planning.route import Route
-from ccatp.survey.route_follower import Corrector, Motion
-from ccatp.survey.state import Event, Outcome, State, next_state
-from ccatp.survey.stops import Order
+from ccatp.survey.route_follower import Corrector, StateEstimate
+from ccatp.survey.state import MissionEvent, MissionState, SurveyOutcome, next_state
+from ccatp.survey.stops import MissionCommand
 
 DT, LAG = 0.01, 0.08
 PANEL = PanelId(5, 5)
@@ -53,7 +53,7 @@ class Story:
         self.x, self.y, self.heading = pose.x_m, pose.y_m, pose.heading_rad
         self.v = self.omega = self.t = 0.0
         self.base = start
-        self.orders: list[Order] = []
+        self.orders: list[MissionCommand] = []
         self.auto_fix = True
 
     @staticmethod
@@ -68,11 +68,11 @@ class Story:
     def plan_home(self, _start: DeckPose) -> tuple[Stop, ...]:
         return (Stop(*self.base, StopKind.BASE, heading_rad=1.0),)
 
-    def motion(self) -> Motion:
+    def motion(self) -> StateEstimate:
         pose = PanelPose(PANEL, self.x, self.y, self.heading)
-        return Motion(self.t, DT, pose, self.mirror.deck_pose, self.v, self.omega)
+        return StateEstimate(self.t, DT, pose, self.mirror.deck_pose, self.v, self.omega)
 
-    def frame(self, verdict: Verdict | None = FREE) -> Order:
+    def frame(self, verdict: Verdict | None = FREE) -> MissionCommand:
         order = self.mission.step(self.motion(), verdict)
         self.orders.append(order)
         if order.measure and self.auto_fix:
@@ -98,7 +98,7 @@ class Story:
             self.frame(verdict)
         raise AssertionError(f"still {self.mission.state} ({self.mission.cause}) after {frames} frames")
 
-    def until_state(self, state: State, verdict: Verdict | None = FREE) -> None:
+    def until_state(self, state: MissionState, verdict: Verdict | None = FREE) -> None:
         self.until(lambda: self.mission.state is state, verdict)
 
 
@@ -123,22 +123,24 @@ def story(config: Config, mirror: Mirror) -> Story:
 
 
 def test_the_table_is_total_and_hold_is_one_event_away() -> None:
-    for state, event in product(State, Event):
-        assert next_state(state, event) in State
-    for state in set(State) - {State.DONE}:
-        assert next_state(state, Event.HOLD) is State.HELD
-    assert {next_state(State.DONE, event) for event in Event} == {State.DONE}
-    assert next_state(State.BACKING_OFF, Event.GO_HOME) is State.BACKING_OFF  # an edge outranks an abort
+    for state, event in product(MissionState, MissionEvent):
+        assert next_state(state, event) in MissionState
+    for state in set(MissionState) - {MissionState.DONE}:
+        assert next_state(state, MissionEvent.HOLD) is MissionState.HELD
+    assert {next_state(MissionState.DONE, event) for event in MissionEvent} == {MissionState.DONE}
+    assert (
+        next_state(MissionState.BACKING_OFF, MissionEvent.GO_HOME) is MissionState.BACKING_OFF
+    )  # an edge outranks an abort
 
 
 def test_every_state_can_meet_an_edge() -> None:
-    for state in set(State) - {State.BACKING_OFF, State.DONE}:
-        assert next_state(state, Event.EDGE) is State.BACKING_OFF
+    for state in set(MissionState) - {MissionState.BACKING_OFF, MissionState.DONE}:
+        assert next_state(state, MissionEvent.EDGE) is MissionState.BACKING_OFF
 
 
 def test_measures_every_point_once_and_is_complete(story: Story) -> None:
-    story.until_state(State.DONE)
-    assert story.mission.outcome is Outcome.COMPLETE
+    story.until_state(MissionState.DONE)
+    assert story.mission.outcome is SurveyOutcome.COMPLETE
     assert [p.point for p in story.mission.done] == [1, 2, 3]
     arrived = [order.arrived for order in story.orders if order.arrived is not None]
     assert [p.point for p in arrived] == [1, 2, 3]
@@ -149,7 +151,7 @@ def test_a_fix_at_the_start_comes_before_the_first_leg_and_costs_no_route(config
     story = Story(config.model_copy(update={"mission": first}), mirror)
     story.until(lambda: story.orders != [] and story.orders[-1].measure)
     assert (story.v, story.omega, story.mission.done) == (0.0, 0.0, [])
-    story.until_state(State.DONE)
+    story.until_state(MissionState.DONE)
     assert [p.point for p in story.mission.done] == [1, 2, 3]
     assert story.plans == []
 
@@ -162,33 +164,38 @@ def test_measures_only_after_the_measuring_time_at_rest(story: Story, config: Co
     assert all(order.twist == Twist(0.0, 0.0) for order in story.orders[at_rest : measured + 1])
 
 
-@pytest.mark.parametrize("state", [State.TURNING, State.DRIVING, State.SETTLING, State.MEASURING])
-def test_pause_and_resume_from_every_state(story: Story, state: State) -> None:
+@pytest.mark.parametrize(
+    "state", [MissionState.TURNING, MissionState.DRIVING, MissionState.SETTLING, MissionState.MEASURING]
+)
+def test_pause_and_resume_from_every_state(story: Story, state: MissionState) -> None:
     story.until_state(state)
     assert story.mission.pause("operator") is None
     for _ in range(100):
         assert story.frame().twist == Twist(0.0, 0.0)
-    assert story.mission.state is State.HELD
+    assert story.mission.state is MissionState.HELD
     assert story.mission.is_paused
     assert story.mission.resume() is None
-    story.until_state(State.DONE)
+    story.until_state(MissionState.DONE)
     assert [p.point for p in story.mission.done] == [1, 2, 3]
 
 
 def test_resume_is_refused_where_nothing_is_held(story: Story) -> None:
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     assert story.mission.resume() == "the mission is not held but driving"
 
 
-@pytest.mark.parametrize("state", [State.TURNING, State.DRIVING, State.SETTLING, State.MEASURING, State.HELD])
-def test_abort_goes_home_from_every_state(story: Story, state: State) -> None:
-    if state is State.HELD:
-        story.until_state(State.DRIVING)
+@pytest.mark.parametrize(
+    "state",
+    [MissionState.TURNING, MissionState.DRIVING, MissionState.SETTLING, MissionState.MEASURING, MissionState.HELD],
+)
+def test_abort_goes_home_from_every_state(story: Story, state: MissionState) -> None:
+    if state is MissionState.HELD:
+        story.until_state(MissionState.DRIVING)
         story.mission.pause("operator")
     else:
         story.until_state(state)
-    story.until_state(State.DONE, ABORT)
-    assert story.mission.outcome is Outcome.AT_BASE
+    story.until_state(MissionState.DONE, ABORT)
+    assert story.mission.outcome is SurveyOutcome.AT_BASE
     assert story.mission.cause == "fire"
     x, y = story.motion().deck.x_m, story.motion().deck.y_m
     assert hypot(x - story.base[0], y - story.base[1]) < 2e-3  # twice the arrival tolerance
@@ -196,43 +203,43 @@ def test_abort_goes_home_from_every_state(story: Story, state: State) -> None:
 
 
 def test_no_verdict_holds_and_comes_back_by_itself(story: Story) -> None:
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     assert story.frame(None).twist == Twist(0.0, 0.0)
-    assert story.mission.state is State.HELD
-    story.until_state(State.DONE)
+    assert story.mission.state is MissionState.HELD
+    story.until_state(MissionState.DONE)
     assert len(story.mission.done) == 3
 
 
 def test_withheld_permission_holds_with_its_cause(story: Story) -> None:
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     story.frame(replace(FREE, forward=False, reverse=False, turn=False, cause="estimate stale"))
-    assert story.mission.state is State.HELD
+    assert story.mission.state is MissionState.HELD
     assert story.mission.cause == "estimate stale"
 
 
 def test_edge_backs_off_at_most_60_mm_turns_away_fixes_and_resumes(story: Story, config: Config) -> None:
-    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    story.until(lambda: story.mission.state is MissionState.DRIVING and story.v > 0.09)
     start = (story.x, story.y)
     story.frame(FRONT_OFF)
     for _ in range(60):
         assert story.frame(FRONT_OFF).twist.v_m_s <= 0.0
     backed = len(story.orders)
     assert story.mission.cause == "rim"
-    story.until(lambda: story.mission.state is not State.BACKING_OFF)
+    story.until(lambda: story.mission.state is not MissionState.BACKING_OFF)
     assert all(-config.mission.backoff_speed_m_s <= o.twist.v_m_s <= 0.0 for o in story.orders[backed:])
     assert hypot(story.x - start[0], story.y - start[1]) <= config.mission.backoff_m + 0.01
-    assert story.mission.state is State.SETTLING
+    assert story.mission.state is MissionState.SETTLING
     story.until(lambda: story.orders[-1].measure)
     assert story.mission.done == []  # that fix was none of a point
-    story.until(lambda: story.mission.state is State.DRIVING)
+    story.until(lambda: story.mission.state is MissionState.DRIVING)
     assert len(story.plans) == 1  # the route goes on from where the robot really is
-    story.until_state(State.DONE)
+    story.until_state(MissionState.DONE)
     assert len(story.mission.done) == 3
 
 
 def test_an_edge_that_does_not_clear_faults(story: Story) -> None:
-    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
-    story.until_state(State.HELD, FRONT_OFF)
+    story.until(lambda: story.mission.state is MissionState.DRIVING and story.v > 0.09)
+    story.until_state(MissionState.HELD, FRONT_OFF)
     assert "stuck at the edge" in story.mission.cause
     assert not story.mission.is_faulted  # it may have been a flash of light
     story.until(lambda: story.mission.is_faulted, FRONT_OFF, frames=3100)
@@ -240,21 +247,21 @@ def test_an_edge_that_does_not_clear_faults(story: Story) -> None:
 
 
 def test_an_edge_that_clears_in_the_end_is_left_with_a_fix(story: Story) -> None:
-    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
-    story.until_state(State.HELD, FRONT_OFF)
+    story.until(lambda: story.mission.state is MissionState.DRIVING and story.v > 0.09)
+    story.until_state(MissionState.HELD, FRONT_OFF)
     story.frame(FREE)
-    assert story.mission.state is State.SETTLING
-    story.until_state(State.DONE)
+    assert story.mission.state is MissionState.SETTLING
+    story.until_state(MissionState.DONE)
     assert len(story.mission.done) == 3
 
 
 def found_at_the_edge(story: Story) -> None:
     """After a retreat and a fix the sensor is off still."""
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     story.frame(FRONT_OFF)
     for _ in range(12):
         story.frame(FRONT_OFF)
-    story.until_state(State.MEASURING)
+    story.until_state(MissionState.MEASURING)
     story.until(lambda: not story.mission.is_lost)
     story.orders.clear()
 
@@ -264,8 +271,8 @@ def test_found_at_an_edge_it_stands_until_the_danger_loop_knows_where(story: Sto
     for _ in range(19):
         story.frame(FRONT_OFF)
     assert not any(order.twist.v_m_s or order.twist.omega_rad_s for order in story.orders)
-    assert story.mission.state is not State.BACKING_OFF
-    story.until_state(State.DRIVING)
+    assert story.mission.state is not MissionState.BACKING_OFF
+    story.until_state(MissionState.DRIVING)
     story.until(lambda: len(story.mission.done) == 3)
 
 
@@ -273,18 +280,18 @@ def test_an_edge_that_the_danger_loop_still_sees_then_is_left_again(story: Story
     found_at_the_edge(story)
     for _ in range(22):
         story.frame(FRONT_OFF)
-    assert story.mission.state is State.BACKING_OFF
+    assert story.mission.state is MissionState.BACKING_OFF
 
 
 def test_a_sensor_that_stays_off_is_looked_at_with_one_fix(story: Story) -> None:
     stays_off = replace(
         FRONT_OFF, cause="an edge sensor stays off", signal="front_left", severity=Severity.HOLD, reverse=False
     )
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     measured = len(story.mission.done)
     for _ in range(300):
         story.frame(stays_off)
-    assert story.mission.state is State.HELD
+    assert story.mission.state is MissionState.HELD
     assert story.mission.cause == "an edge sensor stays off"
     assert sum(order.measure for order in story.orders[-300:]) == 1
     assert not any(order.twist.v_m_s or order.twist.omega_rad_s for order in story.orders[-300:])
@@ -294,37 +301,37 @@ def test_a_sensor_that_stays_off_is_looked_at_with_one_fix(story: Story) -> None
 
 def test_one_that_somebody_holds_is_left_alone_by_a_sensor_that_stays_off(story: Story) -> None:
     stays_off = replace(FRONT_OFF, cause="stays off", signal="front_left", severity=Severity.HOLD, reverse=False)
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     story.mission.pause("by hand")
     for _ in range(300):
         assert not story.frame(stays_off).measure
-    assert (story.mission.state, story.mission.is_paused) == (State.HELD, True)
+    assert (story.mission.state, story.mission.is_paused) == (MissionState.HELD, True)
 
 
 def test_after_the_end_a_sensor_that_stays_off_is_nothing(story: Story) -> None:
     stays_off = replace(FRONT_OFF, cause="stays off", signal="front_left", severity=Severity.HOLD, reverse=False)
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     story.mission.abort("fire")
-    story.until_state(State.DONE)
+    story.until_state(MissionState.DONE)
     for _ in range(100):
         assert not story.frame(stays_off).measure
-    assert (story.mission.state, story.mission.outcome) == (State.DONE, Outcome.AT_BASE)
+    assert (story.mission.state, story.mission.outcome) == (MissionState.DONE, SurveyOutcome.AT_BASE)
     assert story.mission.cause == "fire"
 
 
 def test_abort_during_back_off_waits_for_the_retreat(story: Story) -> None:
-    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    story.until(lambda: story.mission.state is MissionState.DRIVING and story.v > 0.09)
     story.frame(FRONT_OFF)
     story.mission.abort("operator")
-    assert story.mission.state is State.BACKING_OFF
+    assert story.mission.state is MissionState.BACKING_OFF
     for _ in range(30):
         assert story.frame(FRONT_OFF).twist.v_m_s <= 0.0
-    story.until_state(State.DONE, ABORT)
-    assert story.mission.outcome is Outcome.AT_BASE
+    story.until_state(MissionState.DONE, ABORT)
+    assert story.mission.outcome is SurveyOutcome.AT_BASE
 
 
 def test_pause_while_backing_off_holds_and_resume_finds_the_robot_first(story: Story) -> None:
-    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    story.until(lambda: story.mission.state is MissionState.DRIVING and story.v > 0.09)
     story.frame(FRONT_OFF)
     assert story.mission.pause("operator") is None
     for _ in range(50):
@@ -332,12 +339,12 @@ def test_pause_while_backing_off_holds_and_resume_finds_the_robot_first(story: S
     assert story.mission.resume() is None
     story.until(lambda: story.orders[-1].measure)  # nothing but a fix comes first
     assert all(order.twist == Twist(0.0, 0.0) for order in story.orders[-30:])
-    story.until_state(State.DONE)
+    story.until_state(MissionState.DONE)
     assert len(story.mission.done) == 3
 
 
 def test_a_retreat_without_an_end_is_a_fault(story: Story) -> None:
-    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    story.until(lambda: story.mission.state is MissionState.DRIVING and story.v > 0.09)
     x, y = story.x, story.y
     for _ in range(2000):
         story.frame(FRONT_OFF)
@@ -348,17 +355,17 @@ def test_a_retreat_without_an_end_is_a_fault(story: Story) -> None:
 
 
 def test_missing_data_during_a_back_off_only_pause_it(story: Story) -> None:
-    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    story.until(lambda: story.mission.state is MissionState.DRIVING and story.v > 0.09)
     story.frame(FRONT_OFF)
     for _ in range(20):
         assert story.frame(replace(FRONT_OFF, reverse=False)).twist == Twist(0.0, 0.0)
-    assert story.mission.state is State.BACKING_OFF
+    assert story.mission.state is MissionState.BACKING_OFF
     assert story.frame(FRONT_OFF).twist.v_m_s < 0.0
 
 
 def test_a_robot_that_cannot_be_found_does_not_drive(story: Story) -> None:
     story.auto_fix = False
-    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    story.until(lambda: story.mission.state is MissionState.DRIVING and story.v > 0.09)
     for _ in range(60):
         story.frame(FRONT_OFF)
     for _ in range(3):
@@ -377,30 +384,30 @@ def test_a_robot_that_cannot_be_found_does_not_drive(story: Story) -> None:
 
 
 def test_a_stale_verdict_while_being_found_does_not_make_it_forget(story: Story) -> None:
-    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    story.until(lambda: story.mission.state is MissionState.DRIVING and story.v > 0.09)
     for _ in range(60):
         story.frame(FRONT_OFF)
-    story.until_state(State.MEASURING)
+    story.until_state(MissionState.MEASURING)
     story.frame(None)
-    assert story.mission.state is State.HELD
+    assert story.mission.state is MissionState.HELD
     story.until(lambda: story.orders[-1].measure)
     assert story.mission.measuring_point is not None or story.mission.done == []
 
 
 def test_a_robot_that_stands_to_be_found_needs_no_permission(story: Story) -> None:
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     story.mission.fault("filter: not finite", is_lost=True)
     story.mission.resume()
     denied = replace(FREE, forward=False, reverse=False, turn=False, cause="estimate not finite")
     story.until(lambda: story.orders[-1].measure, denied)
     story.frame(denied)
-    assert story.mission.state is State.HELD  # found, and waits for the permission to move
-    story.until_state(State.DONE)
+    assert story.mission.state is MissionState.HELD  # found, and waits for the permission to move
+    story.until_state(MissionState.DONE)
     assert len(story.mission.done) == 3
 
 
 def test_a_robot_that_never_rests_is_a_fault(story: Story) -> None:
-    story.until_state(State.SETTLING)
+    story.until_state(MissionState.SETTLING)
     for _ in range(1100):
         story.v = 0.01
         story.frame()
@@ -410,13 +417,13 @@ def test_a_robot_that_never_rests_is_a_fault(story: Story) -> None:
 
 
 def test_resume_beside_the_stop_does_not_turn_to_it(story: Story) -> None:
-    story.until_state(State.MEASURING)
+    story.until_state(MissionState.MEASURING)
     story.x += 0.0004  # the bearing of a stop so near is noise
     story.mission.pause("operator")
     story.frame()
     story.mission.resume()
     before = len(story.orders)
-    story.until_state(State.MEASURING)
+    story.until_state(MissionState.MEASURING)
     assert all(order.twist == Twist(0.0, 0.0) for order in story.orders[before:])
 
 
@@ -431,7 +438,7 @@ def test_a_request_is_wanted_only_until_the_next(story: Story) -> None:
 
 
 def test_abort_after_a_hold_goes_home_all_the_same(story: Story) -> None:
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     story.mission.abort("operator")
     story.frame()
     story.mission.pause("operator")
@@ -442,7 +449,7 @@ def test_abort_after_a_hold_goes_home_all_the_same(story: Story) -> None:
         story.frame(ABORT)
         states.append(story.mission.state)
     # An emergency that is new outranks the pause; its level, repeated, does not.
-    assert states == [State.RETURNING, State.RETURNING, State.HELD]
+    assert states == [MissionState.RETURNING, MissionState.RETURNING, MissionState.HELD]
 
 
 def test_failed_measurements_are_skipped_and_three_in_a_row_hold(story: Story) -> None:
@@ -461,10 +468,10 @@ def test_a_fix_committed_during_a_pause_counts_once(story: Story) -> None:
     point = story.mission.measuring_point
     story.mission.pause("operator")
     story.mission.fixed(point)
-    assert story.mission.state is State.HELD
+    assert story.mission.state is MissionState.HELD
     story.auto_fix = True
     story.mission.resume()
-    story.until_state(State.DONE)
+    story.until_state(MissionState.DONE)
     assert [p.point for p in story.mission.done] == [1, 2, 3]
 
 
@@ -484,7 +491,7 @@ def test_a_fix_committed_after_the_way_was_planned_anew_counts_once(story: Story
     story.mission.fixed(point)
     assert story.mission.done == [point]
     asked = []
-    while story.mission.state is not State.DONE:
+    while story.mission.state is not MissionState.DONE:
         if story.frame().measure:
             asked.append(story.mission.measuring_point)
             story.mission.fixed(story.mission.measuring_point)
@@ -493,28 +500,28 @@ def test_a_fix_committed_after_the_way_was_planned_anew_counts_once(story: Story
 
 
 def test_a_leg_that_does_not_end_faults(story: Story) -> None:
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     x, y = story.x, story.y
     for _ in range(3000):
         story.frame()
         story.x, story.y = x, y  # the wheels spin
-        if story.mission.state is State.HELD:
+        if story.mission.state is MissionState.HELD:
             break
     assert story.mission.is_faulted
     assert "overdue" in story.mission.cause
 
 
 def test_stop_ends_where_the_robot_stands(story: Story) -> None:
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     story.mission.stop()
-    assert story.mission.outcome is Outcome.STOPPED
+    assert story.mission.outcome is SurveyOutcome.STOPPED
     assert story.frame().twist == Twist(0.0, 0.0)
     assert story.mission.pause("late") == "the mission is over"
     assert story.mission.abort("late") == "the mission is over"
 
 
 def test_interrupt_is_news_only_once(story: Story) -> None:
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     assert story.mission.interrupt("no frames")
     assert not story.mission.interrupt("no frames")
 
@@ -579,7 +586,7 @@ def test_a_point_missed_by_far_is_reached_by_a_new_route(story: Story) -> None:
 def test_a_corrected_point_has_arrived_once_and_the_survey_goes_on(story: Story) -> None:
     miss(story, 0.02, 0.0)
     story.auto_fix = True
-    story.until_state(State.DONE)
+    story.until_state(MissionState.DONE)
     arrived = [order.arrived for order in story.orders if order.arrived is not None]
     assert [p.point for p in arrived] == [1, 2, 3]
     assert [p.point for p in story.mission.done] == [1, 2, 3]
@@ -594,7 +601,7 @@ def test_a_correction_that_is_interrupted_ends_in_a_new_route(story: Story) -> N
     story.frame()
     story.mission.resume()
     story.auto_fix = True
-    story.until_state(State.DONE)
+    story.until_state(MissionState.DONE)
     assert len(story.plans) == 1
     assert len(story.mission.done) == 3
 
@@ -603,7 +610,7 @@ def test_a_miss_that_a_pause_overtakes_ends_in_a_new_route(story: Story) -> None
     miss(story, 0.03, 0.0)
     story.frame(None)
     story.auto_fix = True
-    story.until_state(State.DONE)
+    story.until_state(MissionState.DONE)
     assert len(story.plans) == 1
 
 
@@ -611,13 +618,13 @@ def test_after_a_correction_an_unsafe_turn_is_planned_anew(story: Story, monkeyp
     monkeypatch.setattr(Corrector, "can_go_on", lambda *_: False)
     miss(story, 0.02, 0.0)
     story.auto_fix = True
-    story.until_state(State.DONE)
+    story.until_state(MissionState.DONE)
     assert len(story.plans) == 1  # of the leg after the correction; the one after that is as planned
     assert len(story.mission.done) == 3
 
 
 def test_the_robot_is_steered_by_where_it_will_be_and_judged_by_where_it_is(story: Story) -> None:
-    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    story.until(lambda: story.mission.state is MissionState.DRIVING and story.v > 0.09)
     now = story.motion()
     x, y, heading = now.steered.pose
     assert (x, y, heading) == (story.x, story.y, story.heading)
@@ -631,7 +638,7 @@ def test_the_robot_is_steered_by_where_it_will_be_and_judged_by_where_it_is(stor
 def test_what_is_switched_off_does_not_steer(config: Config, mirror: Mirror, key: str) -> None:
     control = config.control.model_copy(update={key: False})
     story = Story(config.model_copy(update={"control": control}), mirror)
-    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    story.until(lambda: story.mission.state is MissionState.DRIVING and story.v > 0.09)
     now = story.motion()
     x, y, heading = now.steered.pose
     ahead = Predicted((x, y, heading + 0.05), story.v, story.omega)
@@ -641,12 +648,12 @@ def test_what_is_switched_off_does_not_steer(config: Config, mirror: Mirror, key
         else now._replace(creep=(-0.1 * sin(heading), 0.1 * cos(heading)))
     )
     with_it, without = (Story(config, mirror), story)
-    with_it.until(lambda: with_it.mission.state is State.DRIVING and with_it.v > 0.09)
+    with_it.until(lambda: with_it.mission.state is MissionState.DRIVING and with_it.v > 0.09)
     assert abs(without.mission.step(used, FREE).twist.omega_rad_s) < 1e-3  # all but on its line: little to steer
     assert abs(with_it.mission.step(used, FREE).twist.omega_rad_s) > 0.1
 
 
-def turned_ahead(story: Story, angle_rad: float) -> Motion:
+def turned_ahead(story: Story, angle_rad: float) -> StateEstimate:
     now = story.motion()
     x, y, heading = now.steered.pose
     return now._replace(ahead=Predicted((x, y, heading + angle_rad), now.speed_m_s, now.rate_rad_s))
@@ -655,14 +662,14 @@ def turned_ahead(story: Story, angle_rad: float) -> Motion:
 def test_the_turn_at_base_is_steered_by_where_the_robot_will_be(story: Story) -> None:
     story.mission.abort("operator")  # the story begins at base, and has only to turn there
     story.until(lambda: story.omega > 0.5)
-    assert story.mission.state is State.RETURNING
+    assert story.mission.state is MissionState.RETURNING
     rate = story.mission.step(story.motion(), FREE).twist.omega_rad_s
     ahead = story.mission.step(turned_ahead(story, 0.02), FREE).twist.omega_rad_s
     assert ahead < rate - 0.05  # proportional gain times 0.02 rad
 
 
 def test_the_turn_away_from_an_edge_is_steered_by_where_the_robot_will_be(story: Story) -> None:
-    story.until(lambda: story.mission.state is State.DRIVING and story.v > 0.09)
+    story.until(lambda: story.mission.state is MissionState.DRIVING and story.v > 0.09)
     for _ in range(60):
         story.frame(FRONT_OFF)
     story.until(lambda: story.omega > 0.5)
@@ -678,7 +685,7 @@ def test_no_way_on_and_no_way_home_are_faults(config: Config, mirror: Mirror) ->
         raise PlanError("walled in")
 
     story.mission = Mission(config, mirror, story.route(story.stops), refuse, refuse)  # type: ignore[arg-type]
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     story.mission.again()
     story.mission.pause("operator")
     story.mission.resume()
@@ -696,5 +703,5 @@ def test_eta_falls_as_stops_are_done(story: Story) -> None:
     assert story.mission.eta_s == 1.0
     story.mission.abort("operator")
     assert story.mission.eta_s == 0.0
-    story.until_state(State.DONE)
+    story.until_state(MissionState.DONE)
     assert story.mission.eta_s == 0.0

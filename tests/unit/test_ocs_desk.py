@@ -14,9 +14,9 @@ import msgspec
 import pytest
 
 from ccatp.daemon import ocs_plugin
-from ccatp.daemon.ocs_agent import OcsMissing, SurveyDesk, add_arguments, feed_fields, main, register, survey_command
+from ccatp.daemon.ocs_agent import OcsMissing, SurveyTask, add_arguments, feed_fields, main, register, survey_command
 from ccatp.daemon.survey_collector import NO_STATUS
-from ccatp.links.client import Client
+from ccatp.links.client import OperatorClient
 from tests.unit.serving import serving
 
 
@@ -42,9 +42,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ccatp.daemon.ocs_agent.PERIOD_S", 0.01)
 
 
-def desk_of(folder: Path, program: str = "") -> SurveyDesk:
+def desk_of(folder: Path, program: str = "") -> SurveyTask:
     command = [sys.executable, "-c", program]
-    return SurveyDesk(Client(folder, 5.0), command, {}, lambda _: None)
+    return SurveyTask(OperatorClient(folder, 5.0), command, {}, lambda _: None)
 
 
 def status(**fields: object) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ccatp.links.liveness import Sparing, kind_of
+from ccatp.links.liveness import RateLimitedLog, kind_of
 
 
 @pytest.mark.parametrize(
@@ -22,7 +22,7 @@ def test_kinds(one: str, other: str, is_same: bool) -> None:
 
 
 def test_a_few_of_each_kind_are_told_and_errors_all() -> None:
-    sparing = Sparing(2, 10.0)
+    sparing = RateLimitedLog(2, 10.0)
     told = [sparing.take("warning", f"held: {k} ms late", 0.1 * k) for k in range(50)]
     assert told == ["held: 0 ms late", "held: 1 ms late", *[None] * 48]
     assert sparing.take("warning", "going on: turning", 5.0) == "going on: turning"

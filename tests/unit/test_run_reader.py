@@ -12,7 +12,18 @@ from ccatp.config.load import dump_config, load_config
 from ccatp.filters import FilterDiverged
 from ccatp.links.robot_codec import encode_sensors
 from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import RECORD_FORMAT, TOPICS, Arrival, Message, Rest, SensorLines, Track, Truth, pack, schema_of
+from ccatp.links.topics import (
+    RECORD_FORMAT,
+    TOPICS,
+    ArrivalMessage,
+    Message,
+    Rest,
+    SensorLines,
+    TrackMessage,
+    TruthMessage,
+    pack,
+    schema_of,
+)
 from ccatp.mirror.mirror import build_mirror
 from ccatp.records.recorder import Recorder
 from ccatp.records.run_reader import RunReadError, Stood, open_run
@@ -29,9 +40,9 @@ def batch(*seqs: int) -> SensorLines:
     return SensorLines(seq=seqs[-1], t_s=0.01 * seqs[-1], lines=[msgspec.Raw(line_of(seq)) for seq in seqs])
 
 
-def track(*seqs: int) -> Track:
+def track(*seqs: int) -> TrackMessage:
     rows = [(seq, 0.01 * seq, 1, 2, 0.001 * seq, 0.0, 0.0, 1e-3) for seq in seqs]
-    return Track(seq=seqs[-1], t_s=0.01 * seqs[-1], rows=rows)
+    return TrackMessage(seq=seqs[-1], t_s=0.01 * seqs[-1], rows=rows)
 
 
 def record(run_dir: Path, messages: list[tuple[str, Message]], **metadata: str) -> Path:
@@ -51,12 +62,12 @@ def config_text() -> str:
 
 
 def test_what_a_recording_holds(tmp_path: Path, config_text: str) -> None:
-    truth = Truth(seq=0, t_s=0.0, rows=[(0, 0.0, 1.0, 2.0, 0.5, 1.0, 2.0, 3.0, 0.1, 0, 0)])
+    truth = TruthMessage(seq=0, t_s=0.0, rows=[(0, 0.0, 1.0, 2.0, 0.5, 1.0, 2.0, 3.0, 0.1, 0, 0)])
     record(
         tmp_path,
         [
             ("rest", Rest(seq=1, t_s=0.01)),
-            ("arrival", Arrival(seq=1, t_s=0.01, point=(1, 2, 3), error_mm=1.0)),
+            ("arrival", ArrivalMessage(seq=1, t_s=0.01, point=(1, 2, 3), error_mm=1.0)),
             ("track", track(0, 1)),
             ("sensors", batch(0, 1)),
             ("truth", truth),

@@ -11,7 +11,7 @@ from ccatp.links.topics import (
     ESTIMATE_FRAMES,
     TOPICS,
     BadMessage,
-    Estimate,
+    EstimateMessage,
     SensorLines,
     is_estimate_due,
     last_estimate_before,
@@ -20,7 +20,7 @@ from ccatp.links.topics import (
     unpack,
 )
 
-ESTIMATE = Estimate(seq=5, t_s=0.05, x_m=1.0, y_m=-2.0, heading_rad=0.5, sigma_m=1e-3, state="driving")
+ESTIMATE = EstimateMessage(seq=5, t_s=0.05, x_m=1.0, y_m=-2.0, heading_rad=0.5, sigma_m=1e-3, state="driving")
 
 
 def test_golden_frame() -> None:

@@ -3,7 +3,7 @@
 import pytest
 
 from ccatp.config.load import load_config
-from ccatp.control.motion_checks import Moved
+from ccatp.control.motion_checks import MotionSum
 from ccatp.safety.wheel_monitors import WheelMonitor
 
 FRAME_S = 0.01
@@ -19,8 +19,8 @@ def first_found_s(late_until_s: float) -> float | None:
         t_s = k * FRAME_S
         monitor.commands.push(t_s, (0.0, 0.0, 0.0, 0.0))
         monitor.learn(t_s)
-        now = Moved(t_s, ROLLS_M_S * t_s, 0.0, 0.0)
-        lately = Moved(over_s, ROLLS_M_S * over_s, 0.0, 0.0)
+        now = MotionSum(t_s, ROLLS_M_S * t_s, 0.0, 0.0)
+        lately = MotionSum(over_s, ROLLS_M_S * over_s, 0.0, 0.0)
         monitor.step(
             now, None, lately, is_free=True, is_held=False, is_late=t_s <= late_until_s, is_sparse=False, samples=()
         )
@@ -50,7 +50,7 @@ def test_where_main_is_silent_only_a_robot_that_holds_its_wheels_shall_stand(
     cfg = load_config()
     monitor = WheelMonitor(cfg.health, cfg.robot)
     over_s = cfg.health.stall_time_s
-    stands, rolls = Moved(over_s, 0.0, 0.0, 0.0), Moved(over_s, ROLLS_M_S * over_s, 0.0, 0.0)
+    stands, rolls = MotionSum(over_s, 0.0, 0.0, 0.0), MotionSum(over_s, ROLLS_M_S * over_s, 0.0, 0.0)
     rolled_m = 0.0
     for k in range(1, 300):
         t_s = k * FRAME_S
@@ -61,7 +61,7 @@ def test_where_main_is_silent_only_a_robot_that_holds_its_wheels_shall_stand(
         is_rolling = t_s > 1.11
         rolled_m += ROLLS_M_S * FRAME_S * is_rolling
         monitor.step(
-            Moved(t_s, rolled_m, 0.0, 0.0),
+            MotionSum(t_s, rolled_m, 0.0, 0.0),
             None,
             rolls if is_rolling else stands,
             is_free=not is_silent,

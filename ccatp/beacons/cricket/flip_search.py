@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri
 
-from ccatp.beacons.cricket.map_fit import BatchFit, BatchSettings, MapModel, MapState, fit_from_afar, fit_map
+from ccatp.beacons.cricket.map_fit import MapFit, MapFitSettings, MapModel, MapState, fit_from_afar, fit_map
 from ccatp.beacons.cricket.map_start import grown_starts
 from ccatp.beacons.cricket.range_network import RangeNetwork, components, graph_pairs
 from ccatp.core import FloatArray
@@ -47,13 +47,13 @@ class Unfolded(NamedTuple):
         doubtful: sets whose mirror image fits almost as well.
     """
 
-    fit: BatchFit
+    fit: MapFit
     turned: int
     doubtful: tuple[Fold, ...]
 
 
 def unfold(
-    model: MapModel, fit: BatchFit, settings: BatchSettings, mirrors: Sequence[tuple[Sequence[int], Sequence[int]]] = ()
+    model: MapModel, fit: MapFit, settings: MapFitSettings, mirrors: Sequence[tuple[Sequence[int], Sequence[int]]] = ()
 ) -> Unfolded:
     """Mirror motes one at a time, and sets of motes across the body or the pair that joins them to the rest.
 
@@ -79,8 +79,8 @@ def unfold(
 
 
 def _turn_singles(
-    model: MapModel, fit: BatchFit, settings: BatchSettings
-) -> tuple[BatchFit, int, dict[tuple[int, ...], float]]:
+    model: MapModel, fit: MapFit, settings: MapFitSettings
+) -> tuple[MapFit, int, dict[tuple[int, ...], float]]:
     """Mirror every loose mote across its partners, settle it with all others held, keep what lowers the cost."""
     network = model.network
     rows_of = _rows_by_mote(network)
@@ -154,8 +154,8 @@ class _Single:
 
 
 def _turn_sets(
-    model: MapModel, fit: BatchFit, settings: BatchSettings, mirrors: Sequence[tuple[Sequence[int], Sequence[int]]]
-) -> tuple[BatchFit, int, dict[tuple[int, ...], float]]:
+    model: MapModel, fit: MapFit, settings: MapFitSettings, mirrors: Sequence[tuple[Sequence[int], Sequence[int]]]
+) -> tuple[MapFit, int, dict[tuple[int, ...], float]]:
     turned, near = 0, dict[tuple[int, ...], float]()
     for trial, (separator, motes) in enumerate(_sets(model, fit, mirrors)):
         if trial >= _TRIALS:
@@ -180,7 +180,7 @@ def _moved_m(network: RangeNetwork, one_m: FloatArray, other_m: FloatArray) -> f
     return float(np.linalg.norm(one_m - other_m, axis=1).max())
 
 
-def _tried(model: MapModel, start: MapState, settings: BatchSettings, best: float) -> BatchFit:
+def _tried(model: MapModel, start: MapState, settings: MapFitSettings, best: float) -> MapFit:
     """A fit that is given up where its first steps do not bring it near the best cost so far."""
     sketch = fit_from_afar(model, start, settings._replace(max_iterations=_SKETCH_STEPS))
     if sketch.is_at_rest or sketch.cost > _HOPELESS * (best + CLOSE):
@@ -189,7 +189,7 @@ def _tried(model: MapModel, start: MapState, settings: BatchSettings, best: floa
 
 
 def _sets(
-    model: MapModel, fit: BatchFit, mirrors: Sequence[tuple[Sequence[int], Sequence[int]]]
+    model: MapModel, fit: MapFit, mirrors: Sequence[tuple[Sequence[int], Sequence[int]]]
 ) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
     """Separators and what they part: those known, then each group and every part of the graph without it."""
     network = model.network
@@ -207,7 +207,7 @@ def _sets(
         yield group, group
 
 
-def _groups(model: MapModel, fit: BatchFit) -> list[tuple[int, ...]]:
+def _groups(model: MapModel, fit: MapFit) -> list[tuple[int, ...]]:
     """Bodies; where the map contradicts its ranges, motes that stand close together, too.
 
     Seen from afar a few motes close together are one point: what is fixed to them turns about them almost freely.
@@ -261,10 +261,10 @@ class ScaledFit(NamedTuple):
 
     factor: float
     model: MapModel
-    fit: BatchFit
+    fit: MapFit
 
 
-def searched(model: MapModel, best: BatchFit, settings: BatchSettings) -> tuple[BatchFit, bool]:
+def searched(model: MapModel, best: MapFit, settings: MapFitSettings) -> tuple[MapFit, bool]:
     """The fit of least robust cost that grown maps lead to, or the one given; whether several of them led there.
 
     Least squares is drawn towards wrong ranges, and a robust fit from there stays among them.
@@ -284,7 +284,7 @@ def searched(model: MapModel, best: BatchFit, settings: BatchSettings) -> tuple[
     return best, False
 
 
-def scaled(model: MapModel, first: BatchFit, settings: BatchSettings) -> ScaledFit:
+def scaled(model: MapModel, first: MapFit, settings: MapFitSettings) -> ScaledFit:
     """The map with the least scale of its residuals, each fitted robustly with sigmas of that scale.
 
     Residuals of a fit that wrong ranges have bent are all too large, those of a robust fit are not: the scale follows
@@ -311,7 +311,7 @@ def scaled(model: MapModel, first: BatchFit, settings: BatchSettings) -> ScaledF
     return best
 
 
-def residual_scale(model: MapModel, fit: BatchFit) -> float:
+def residual_scale(model: MapModel, fit: MapFit) -> float:
     """Standard deviation of the residuals in sigmas, from their quantile (m + p + 1) / 2.
 
     Of m residuals p, the number of unknowns, may be nought by the fit alone: the median of the others (Rousseeuw 1984).
@@ -323,7 +323,7 @@ def residual_scale(model: MapModel, fit: BatchFit) -> float:
     return quantile / float(normal)
 
 
-def _settled(model: MapModel, fit: BatchFit, settings: BatchSettings) -> ScaledFit:
+def _settled(model: MapModel, fit: MapFit, settings: MapFitSettings) -> ScaledFit:
     """Fit and scale in turn until they agree; below the sigmas given, once."""
     factor, at = float("inf"), model
     for _ in range(_MAP_SEARCH_ROUNDS):
@@ -336,7 +336,7 @@ def _settled(model: MapModel, fit: BatchFit, settings: BatchSettings) -> ScaledF
     return ScaledFit(factor, at, fit)
 
 
-def _grown_fits(model: MapModel, best: BatchFit, settings: BatchSettings) -> Iterator[BatchFit]:
+def _grown_fits(model: MapModel, best: MapFit, settings: MapFitSettings) -> Iterator[MapFit]:
     """Fits from grown maps, of ranges corrected by the offset and the scale found so far."""
     offset_m, scale = best.state.offset_m, best.state.scale
     ranges_m = np.maximum((model.network.ranges_m - offset_m) / (1.0 + scale), 0.0)

@@ -203,7 +203,7 @@ _DENSE = 240  # unknowns up to which dense Cholesky is quicker than sparse LU
 _NULL = 1e-9  # eigenvalues below this share of the largest are directions that no range sees
 
 
-class BatchSettings(NamedTuple):
+class MapFitSettings(NamedTuple):
     """How to fit.
 
     Attributes:
@@ -217,7 +217,7 @@ class BatchSettings(NamedTuple):
     tolerance_m: float = 1e-8
 
 
-class BatchFit(NamedTuple):
+class MapFit(NamedTuple):
     """A fitted map.
 
     Attributes:
@@ -237,7 +237,7 @@ class BatchFit(NamedTuple):
     is_at_rest: bool
 
 
-def fit_map(model: MapModel, start: MapState, settings: BatchSettings) -> BatchFit:
+def fit_map(model: MapModel, start: MapState, settings: MapFitSettings) -> MapFit:
     """Minimise the loss of all ranges from a start.
 
     Steps (J^T W J + lambda D) dq = J^T W r (Levenberg 1944, Marquardt 1963) with W = w / sigma^2 and the weights
@@ -264,15 +264,15 @@ def fit_map(model: MapModel, start: MapState, settings: BatchSettings) -> BatchF
             state, residuals, cost, weights = trial, trial_residuals, trial_cost, trial_weights
             damping = max(damping * 0.2, 1e-12)
             if float(np.abs(step).max()) <= settings.tolerance_m or gain <= 1e-12 * cost:
-                return BatchFit(state, cost, weights, residuals, iteration, True)
+                return MapFit(state, cost, weights, residuals, iteration, True)
         else:
             damping *= 6.0
             if damping > 1e9:
-                return BatchFit(state, cost, weights, residuals, iteration, True)
-    return BatchFit(state, cost, weights, residuals, settings.max_iterations, False)
+                return MapFit(state, cost, weights, residuals, iteration, True)
+    return MapFit(state, cost, weights, residuals, settings.max_iterations, False)
 
 
-def fit_from_afar(model: MapModel, start: MapState, settings: BatchSettings) -> BatchFit:
+def fit_from_afar(model: MapModel, start: MapState, settings: MapFitSettings) -> MapFit:
     """The same from a start that may be metres off: by least squares first.
 
     To a robust loss all ranges of a mote that is far from its place are outliers, and nothing pulls it there.
@@ -284,7 +284,7 @@ def fit_from_afar(model: MapModel, start: MapState, settings: BatchSettings) -> 
     return fit._replace(iterations=near.iterations + fit.iterations)
 
 
-def position_covariance(model: MapModel, fit: BatchFit, *, variance_factor: float = 1.0) -> tuple[FloatArray, int]:
+def position_covariance(model: MapModel, fit: MapFit, *, variance_factor: float = 1.0) -> tuple[FloatArray, int]:
     """Covariance of all positions and how many directions of the unknowns no range sees.
 
     Where nothing pins the frame, the covariance is that of the map after the rigid motion that brings it nearest to the
@@ -360,7 +360,7 @@ def bound_rms_m(model: MapModel, true_m: FloatArray, motes: Sequence[int], *, al
     """
     state = model.state(true_m)
     count = len(model.network.ranges_m)
-    fit = BatchFit(state, 0.0, np.ones(count), np.zeros(count), 0, True)
+    fit = MapFit(state, 0.0, np.ones(count), np.zeros(count), 0, True)
     covariance, free = position_covariance(model, fit)
     if free > _frame_freedom(model):
         return None

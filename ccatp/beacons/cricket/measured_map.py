@@ -11,14 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtrc
 
-from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, bound_rms_m, fit_map, map_rms_m
+from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, bound_rms_m, fit_map, map_rms_m
 from ccatp.beacons.cricket.mote_map import MoteMap, map_motes, plain_frame
 from ccatp.beacons.cricket.range_network import (
     MappingError,
     MoteRange,
+    MoteUnderdetermined,
     RangeNetwork,
     RigidBody,
-    TooFewRanges,
     UnknownMote,
     build_network,
     list_names,
@@ -89,7 +89,7 @@ def doubts(found: MoteMap, network: RangeNetwork, factor: float) -> Iterator[str
         )
 
 
-def hidden_offset(found: MoteMap, network: RangeNetwork, settings: BatchSettings) -> Iterator[str]:
+def hidden_offset(found: MoteMap, network: RangeNetwork, settings: MapFitSettings) -> Iterator[str]:
     """A word on an offset that the ranges show, where none is estimated; outliers have little say in it.
 
     Args:
@@ -284,14 +284,14 @@ def _check_enough(model: MapModel, network: RangeNetwork) -> None:
     wanted = model.size - d * (d + 1) // 2
     measured = len(np.unique(np.sort(np.column_stack([network.first, network.second]), axis=1), axis=0))
     if network.count > 2 and measured < min(wanted, network.count):
-        raise TooFewRanges(
+        raise MoteUnderdetermined(
             f"{measured} pairs of {network.count} motes were measured, a map in {d} dimensions has {wanted} unknowns; "
             "measure more pairs"
         )
 
 
 def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Any) -> _Found:
-    settings = BatchSettings(cfg.batch.robust_scale, cfg.batch.max_iterations)
+    settings = MapFitSettings(cfg.batch.robust_scale, cfg.batch.max_iterations)
     found = map_motes(
         network,
         settings,

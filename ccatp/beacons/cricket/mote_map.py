@@ -9,8 +9,8 @@ import numpy as np
 
 from ccatp.beacons.cricket.flip_search import Fold, scaled, searched, unfold
 from ccatp.beacons.cricket.map_fit import (
-    BatchFit,
-    BatchSettings,
+    MapFit,
+    MapFitSettings,
     MapModel,
     MapState,
     fit_from_afar,
@@ -70,7 +70,7 @@ class MoteMap:
 
 def map_motes(
     network: RangeNetwork,
-    settings: BatchSettings,
+    settings: MapFitSettings,
     *,
     with_offset: bool = False,
     with_scale: bool = False,
@@ -107,11 +107,11 @@ def map_motes(
     return _unfolded_map(model, fits, settings, mirrors)
 
 
-def _all_fits(model: MapModel, start_m: FloatArray | None, settings: BatchSettings) -> list[BatchFit]:
+def _all_fits(model: MapModel, start_m: FloatArray | None, settings: MapFitSettings) -> list[MapFit]:
     """Fits from all starts that it takes, with an offset or a scale known better and better."""
     network = model.network
     fits = _fits(model, network, start_m, settings)
-    best: BatchFit | None = None
+    best: MapFit | None = None
     for _ in range(_CORRECTIONS if model.with_offset or model.with_scale else 0):
         before, best = best, min(fits, key=lambda fit: fit.cost)
         if _is_sure(model, best) or (before is not None and best.cost >= before.cost * (1.0 - _SAME)):
@@ -124,8 +124,8 @@ def _all_fits(model: MapModel, start_m: FloatArray | None, settings: BatchSettin
 
 def _unfolded_map(
     model: MapModel,
-    fits: list[BatchFit],
-    settings: BatchSettings,
+    fits: list[MapFit],
+    settings: MapFitSettings,
     mirrors: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...],
 ) -> MoteMap:
     """The best of some fits, looked through for folds, with its covariance."""
@@ -165,9 +165,9 @@ def _fits(
     model: MapModel,
     network: RangeNetwork,
     start_m: FloatArray | None,
-    settings: BatchSettings,
+    settings: MapFitSettings,
     at: MapState | None = None,
-) -> list[BatchFit]:
+) -> list[MapFit]:
     """Fits from one start after the other, until one is sure, or where there are many motes, came out twice.
 
     Args:
@@ -177,7 +177,7 @@ def _fits(
         settings: of the fits.
         at: offset and scale to begin with.
     """
-    fits: list[BatchFit] = []
+    fits: list[MapFit] = []
     offset_m, scale = (0.0, 0.0) if at is None else (at.offset_m, at.scale)
     for images in map_starts(network, start_m):
         ends = [fit_from_afar(model, model.state(image, offset_m, scale), settings) for image in images]
@@ -196,16 +196,16 @@ def _fits(
     return fits
 
 
-def _may_be_grown(network: RangeNetwork, settings: BatchSettings) -> bool:
+def _may_be_grown(network: RangeNetwork, settings: MapFitSettings) -> bool:
     """Whether growing is quick, and tells more than the shapes of bodies do."""
     return network.count <= FEW and not network.bodies and bool(np.isfinite(settings.robust_scale))
 
 
-def _is_sure(model: MapModel, fit: BatchFit) -> bool:
+def _is_sure(model: MapModel, fit: MapFit) -> bool:
     return fit.cost < _SURE * max(len(model.network.ranges_m) - model.size, 1)
 
 
-def _is_sound(model: MapModel, fit: BatchFit) -> bool:
+def _is_sound(model: MapModel, fit: MapFit) -> bool:
     """Whether the ranges fit but for a few outliers."""
     network = model.network
     return not agreement_of(fit, network.sigmas_m, len(network.ranges_m) - model.size).is_denied

@@ -129,7 +129,7 @@ class Disconnected(MappingError):
     """No chain of ranges leads from some motes to the others."""
 
 
-class TooFewRanges(MappingError):
+class MoteUnderdetermined(MappingError):
     """Fewer ranges than anything could be determined from."""
 
 
@@ -212,7 +212,9 @@ def build_network(
     for row in rows:
         _check_row(row, index)
     if len(names) < 2 or not rows:
-        raise TooFewRanges(f"{len(rows)} ranges among {len(names)} motes; a map needs two motes and a range at least")
+        raise MoteUnderdetermined(
+            f"{len(rows)} ranges among {len(names)} motes; a map needs two motes and a range at least"
+        )
     network = RangeNetwork(
         names=tuple(names),
         dimension=dimension,

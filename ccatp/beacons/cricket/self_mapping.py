@@ -440,7 +440,7 @@ def _surveyed(cfg: CricketConfig, count: int, heads: list[int]) -> FloatArray:
     return known
 
 
-class WholeMap(NamedTuple):
+class CompletedMap(NamedTuple):
     """All motes of all stands.
 
     Attributes:
@@ -460,7 +460,7 @@ def complete_stands(
     first_covariance_m2: FloatArray,
     heads_m: FloatArray,
     heads_covariance_m2: FloatArray,
-) -> WholeMap:
+) -> CompletedMap:
     """Patil et al., figure 8, last box: motes 2 and 3 of each stand with respect to mote 1; in the plane.
 
     Where a stand looks is what phase 1 found of its three motes, by the best turn of the known shape; its error is that
@@ -492,4 +492,6 @@ def complete_stands(
         block = slice(2 * row, 2 * (row + len(motes)))
         covariance[block, block] += variance * np.outer(turned, turned)
         row += len(motes)
-    return WholeMap(tuple(mote for network in plan.networks for mote in network), np.concatenate(places), covariance)
+    return CompletedMap(
+        tuple(mote for network in plan.networks for mote in network), np.concatenate(places), covariance
+    )

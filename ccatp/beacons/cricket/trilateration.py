@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, fit_map, position_covariance
+from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map, position_covariance
 from ccatp.beacons.cricket.range_network import (
     MappingError,
     MoteRange,
@@ -24,7 +24,7 @@ from ccatp.beacons.cricket.self_mapping import MotePlan
 from ccatp.beacons.cricket.unfolding import classical_scaling
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import RigidMotion, best_motion
-from ccatp.mirror.multilateration import MultilaterationError, Solution, multilaterate
+from ccatp.mirror.multilateration import MultilaterationError, RangeSolution, multilaterate
 
 _APART = 10.0  # sigmas between two solutions that are not the same one
 _ALIKE = 9.0  # difference of chi-squared up to which a mirror image may as well be the truth
@@ -38,7 +38,7 @@ class MissingRange(MappingError):
     """A step of phase 1 lacks a range."""
 
 
-class Step(NamedTuple):
+class TrilaterationStep(NamedTuple):
     """How one mote was placed.
 
     Attributes:
@@ -72,7 +72,7 @@ class Sketch:
         self.positions_m = np.full((count, dimension), np.nan)
         self.covariance_m2 = np.zeros((count * dimension, count * dimension))
         self._seen_m = np.full((count, dimension), np.nan)  # places at which derivatives are taken
-        self.steps: list[Step] = []
+        self.steps: list[TrilaterationStep] = []
         self._names, self._means, self._dimension, self._max_dop = names, means, dimension, max_dop
 
     def is_placed(self, mote: int) -> bool:
@@ -102,7 +102,7 @@ class Sketch:
         self.positions_m[axis] = self._seen_m[axis] = (0.0, range_m)
         at = self.coordinates(axis).start + 1
         self.covariance_m2[at, at] = sigma_m**2
-        self.steps += [Step(origin, (), 0.0, "axes"), Step(axis, (origin,), 1.0, "axes")]
+        self.steps += [TrilaterationStep(origin, (), 0.0, "axes"), TrilaterationStep(axis, (origin,), 1.0, "axes")]
 
     def add_by_cosines(self, mote: int, origin: int, axis: int) -> None:
         """A mote on the right of the axis from A to B, by the law of cosines.
@@ -136,14 +136,14 @@ class Sketch:
         inherited = np.zeros((2, len(self.covariance_m2)))
         inherited[:, self.coordinates(axis).start + 1] = jacobian[:, 2]
         self._insert(mote, np.array([x, y]), own @ own.T, inherited)
-        self.steps.append(Step(mote, (origin, axis), dop, "cosines"))
+        self.steps.append(TrilaterationStep(mote, (origin, axis), dop, "cosines"))
 
     def add_seed(self, motes: Sequence[int], places_m: FloatArray, covariance_m2: FloatArray) -> None:
         """Motes that begin a map together, with their covariance, shapes (k, d) and (k d, k d)."""
         at = np.concatenate([np.arange(len(self.covariance_m2))[self.coordinates(mote)] for mote in motes])
         self.positions_m[list(motes)] = self._seen_m[list(motes)] = places_m
         self.covariance_m2[np.ix_(at, at)] = covariance_m2
-        self.steps += [Step(mote, (), 0.0, "seed") for mote in motes]
+        self.steps += [TrilaterationStep(mote, (), 0.0, "seed") for mote in motes]
 
     def add_by_ranges(self, mote: int, references: Sequence[int]) -> None:
         """A mote by trilateration from motes that have places, with the solver of the laser system.
@@ -166,9 +166,9 @@ class Sketch:
             along[row, self.coordinates(reference)] = H[row]
         own = np.linalg.solve(H.T @ weighted, np.eye(self._dimension))
         self._insert(mote, solution.position_m, own, G @ along)
-        self.steps.append(Step(mote, tuple(references), dop, "trilateration"))
+        self.steps.append(TrilaterationStep(mote, tuple(references), dop, "trilateration"))
 
-    def _solve(self, mote: int, references: Sequence[int], ranges: Sequence[tuple[float, float]]) -> Solution:
+    def _solve(self, mote: int, references: Sequence[int], ranges: Sequence[tuple[float, float]]) -> RangeSolution:
         anchors = self.positions_m[list(references)]
         values, sigmas = np.array(ranges).T
         found, refusal = [], ""
@@ -255,7 +255,7 @@ class DrawnErrors(NamedTuple):
 
 def draw_errors(
     places_m: FloatArray,
-    steps: Sequence[Step],
+    steps: Sequence[TrilaterationStep],
     means: PairMeans,
     seed_covariance_m2: FloatArray,
     rng: np.random.Generator,
@@ -386,7 +386,7 @@ class FirstMap(NamedTuple):
     positions_m: FloatArray
     covariance_m2: FloatArray
     bias_m: FloatArray
-    steps: tuple[Step, ...]
+    steps: tuple[TrilaterationStep, ...]
     unplaced: tuple[int, ...]
 
 
@@ -505,7 +505,7 @@ def _seed(network: RangeNetwork, means: PairMeans, sketch: Sketch) -> None:
     rows = [MoteRange(names[a], names[b], *_between(means, best[a], best[b])) for a, b in combinations(range(d + 1), 2)]
     model = MapModel(build_network(rows, d, names))
     start = classical_scaling(_distances(means, best), d)
-    fit = fit_map(model, model.state(start), BatchSettings())
+    fit = fit_map(model, model.state(start), MapFitSettings())
     covariance, _ = position_covariance(model, fit)
     sketch.add_seed(best, fit.state.positions_m, covariance)
 

@@ -13,7 +13,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import shortest_path
 
-from ccatp.beacons.cricket.map_fit import BatchFit, BatchSettings, MapModel, fit_map
+from ccatp.beacons.cricket.map_fit import MapFit, MapFitSettings, MapModel, fit_map
 from ccatp.beacons.cricket.range_network import IndexArray, PairMeans, RangeNetwork, components
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import best_motion
@@ -196,7 +196,7 @@ class Agreement:
         return self.factor > _DENIED or 2 * self.outliers > self.dof > 0
 
 
-def agreement_of(fit: BatchFit, sigmas_m: FloatArray, dof: int) -> Agreement:
+def agreement_of(fit: MapFit, sigmas_m: FloatArray, dof: int) -> Agreement:
     """How the ranges fit a map.
 
     Args:
@@ -214,7 +214,7 @@ _LARGEST = 60  # motes of one place that is mapped anew
 _ROUNDS = 3
 
 
-def repaired(model: MapModel, fit: BatchFit, settings: BatchSettings) -> BatchFit:
+def repaired(model: MapModel, fit: MapFit, settings: MapFitSettings) -> MapFit:
     """A map whose contradictions were looked at one place at a time; bodies and known motes stay as they are.
 
     A few motes that are folded over together are a minimum of their own. Where ranges disagree with the map, the motes
@@ -242,7 +242,7 @@ def repaired(model: MapModel, fit: BatchFit, settings: BatchSettings) -> BatchFi
     return fit
 
 
-def _contradicted(network: RangeNetwork, fit: BatchFit) -> list[IndexArray]:
+def _contradicted(network: RangeNetwork, fit: MapFit) -> list[IndexArray]:
     """Suspects and their partners, each set that hangs together by itself."""
     bad = np.abs(fit.residuals_m) > _SUSPECT * network.sigmas_m
     if not bad.any():
@@ -256,7 +256,7 @@ def _contradicted(network: RangeNetwork, fit: BatchFit) -> list[IndexArray]:
     return [group for group in groups if len(group) <= _LARGEST]
 
 
-def _mapped_anew(network: RangeNetwork, fit: BatchFit, motes: IndexArray, settings: BatchSettings) -> FloatArray | None:
+def _mapped_anew(network: RangeNetwork, fit: MapFit, motes: IndexArray, settings: MapFitSettings) -> FloatArray | None:
     """All places with some motes unfolded between their partners; None where too little holds them."""
     d = network.dimension
     pairs = np.column_stack([network.first, network.second])

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ccatp.beacons.datasets.tables import GAP_S, long_pauses, plural
 from ccatp.beacons.datasets.truth import chords, guessed_between, turn_at, turning_factor, way_at
-from ccatp.beacons.slam.recording import Readings, RecordedRun, Steps, Truth
+from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
 from ccatp.core import FloatArray, IntArray
 
 MANY_SIGMA = 1.4826  # of a Gaussian, over its median absolute deviation
@@ -50,7 +50,7 @@ class _Seen(NamedTuple):
         return _Seen(self.times_s[rows], self.pose[rows], self.beacon[rows], self.range_m[rows], self.bearing_rad[rows])
 
 
-def readings_against(run: RecordedRun, truth: Truth) -> Iterator[str]:
+def readings_against(run: RecordedRun, truth: ReferencePath) -> Iterator[str]:
     """What looks wrong in readings where truth and places are known."""
     placed = np.array([run.beacon_truth_m.get(name, (np.nan, np.nan)) for name in run.beacon_ids]).reshape(-1, 2)
     r, t = run.readings, run.readings.times_s
@@ -270,7 +270,7 @@ def _signs(readings: Readings) -> Iterator[str]:
         yield f"{plural(positive, 'signal strength')} above 0 dBm: is the sign missing?"
 
 
-def _odometry_against(truth: Truth, steps: Steps) -> Iterator[str]:
+def _odometry_against(truth: ReferencePath, steps: Steps) -> Iterator[str]:
     rows = chords(truth, steps)
     if rows.size < FEW:
         return
@@ -290,7 +290,7 @@ def _odometry_against(truth: Truth, steps: Steps) -> Iterator[str]:
     yield from _turning_against(truth, steps, rows)
 
 
-def _standing(truth: Truth, steps: Steps) -> Iterator[str]:
+def _standing(truth: ReferencePath, steps: Steps) -> Iterator[str]:
     """One of the two drives, the other never moves."""
     inside = (truth.times_s >= steps.times_s[0]) & (truth.times_s <= steps.times_s[-1])
     extent_m = np.hypot(np.ptp(truth.x_m[inside]), np.ptp(truth.y_m[inside])) if inside.any() else 0.0
@@ -301,7 +301,7 @@ def _standing(truth: Truth, steps: Steps) -> Iterator[str]:
         yield f"the truth never moves ({extent_m:.2g} m) while the odometry travels {way_m:.3g} m: is it of this run?"
 
 
-def _copied_odometry(truth: Truth, steps: Steps) -> Iterator[str]:
+def _copied_odometry(truth: ReferencePath, steps: Steps) -> Iterator[str]:
     """Odometry that was made from the truth: single steps agree better than any wheel could tell."""
     x, y = (np.interp(steps.times_s, truth.times_s, column) for column in (truth.x_m, truth.y_m))
     inside = (steps.times_s >= truth.times_s[0]) & (steps.times_s <= truth.times_s[-1])
@@ -325,7 +325,7 @@ def _copied_odometry(truth: Truth, steps: Steps) -> Iterator[str]:
         yield "odometry turns equal the truth: they were made from it"
 
 
-def _turning_against(truth: Truth, steps: Steps, rows: npt.NDArray[np.int64]) -> Iterator[str]:
+def _turning_against(truth: ReferencePath, steps: Steps, rows: npt.NDArray[np.int64]) -> Iterator[str]:
     """Turns by the truth's heading over those of the odometry; by the shape of the path if the truth has none."""
     if not np.isfinite(truth.heading_rad).all():
         factor = turning_factor(truth, steps)

@@ -20,7 +20,7 @@ from ccatp.beacons.datasets.tables import (
     within,
 )
 from ccatp.beacons.datasets.truth import checked_heading, pose_of_truth
-from ccatp.beacons.slam.recording import Readings, RecordedRun, Steps, Truth
+from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
 
 # Columns after the event's name; those in parentheses may be missing. "beacon" is a name, all others are numbers.
 EVENTS = {
@@ -82,7 +82,7 @@ def read_events_csv(file: Path) -> RecordedRun:
                 f"{file.name}:{line}: {count} of truth without heading (the first here): no heading is used"
             )
         whole = np.unwrap(heading) if known.all() else np.full(len(t), np.nan)
-        truth = checked_heading(Truth(t, x, y, whole), steps, warnings)
+        truth = checked_heading(ReferencePath(t, x, y, whole), steps, warnings)
     return RecordedRun(
         name=file.name.split(".")[0],
         kind="csv",

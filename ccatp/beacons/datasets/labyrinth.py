@@ -16,7 +16,7 @@ from ccatp.beacons.datasets.tables import (
     within,
 )
 from ccatp.beacons.datasets.truth import checked_heading, pose_of_truth, turning_factor
-from ccatp.beacons.slam.recording import Readings, RecordedRun, Steps, Truth
+from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
 
 TRACK_WARNING = 0.2
 # The readme calls the wheel columns right, left and the fourth the distance between the wheels; the numbers say left,
@@ -62,7 +62,7 @@ def read_labyrinth(path: Path) -> RecordedRun:
     truth = None
     if "gt2" in tables:
         t, x, y = tables["gt2"].values.T
-        truth = checked_heading(Truth(t, x, y, np.full(len(t), np.nan)), steps, warnings)
+        truth = checked_heading(ReferencePath(t, x, y, np.full(len(t), np.nan)), steps, warnings)
         warnings += wheel_columns(truth, steps, float(np.median(tables["odom2diff"].values[:, 4])))
     nothing = np.full(len(ranges), np.nan)
     return RecordedRun(
@@ -82,7 +82,7 @@ def read_labyrinth(path: Path) -> RecordedRun:
     )
 
 
-def wheel_columns(truth: Truth, steps: Steps, half_track_m: float) -> list[str]:
+def wheel_columns(truth: ReferencePath, steps: Steps, half_track_m: float) -> list[str]:
     """What the truth says of the wheel columns, a line; nothing where it tells too little.
 
     Args:

@@ -18,7 +18,7 @@ from ccatp.beacons.datasets.tables import (
     without_gaps_in_numbers,
 )
 from ccatp.beacons.datasets.truth import checked_heading, pose_of_truth
-from ccatp.beacons.slam.recording import Readings, RecordedRun, Steps, Truth
+from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
 
 ROBOT_FILE = re.compile(r"Robot(\d+)_(Odometry|Measurement|Groundtruth)\.dat(\.gz)?$")
 LAST_ROBOT_SUBJECT = 5
@@ -131,9 +131,9 @@ def _landmarks(folder: Path, warnings: list[str]) -> dict[str, tuple[float, floa
     return {str(int(row[0])): (row[1], row[2]) for row in table.values.tolist()}
 
 
-def _truth(folder: Path, robot: int, steps: Steps, warnings: list[str]) -> Truth | None:
+def _truth(folder: Path, robot: int, steps: Steps, warnings: list[str]) -> ReferencePath | None:
     file = _file(folder, f"Robot{robot}_Groundtruth.dat")
     if file is None:
         return None
     t, x, y, heading = in_order(read_table(file, REFERENCE), warnings).values.T
-    return checked_heading(Truth(t, x, y, np.unwrap(heading)), steps, warnings)
+    return checked_heading(ReferencePath(t, x, y, np.unwrap(heading)), steps, warnings)

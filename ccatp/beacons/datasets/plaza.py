@@ -16,7 +16,7 @@ from ccatp.beacons.datasets.tables import (
     without_gaps_in_numbers,
 )
 from ccatp.beacons.datasets.truth import checked_heading, pose_of_truth
-from ccatp.beacons.slam.recording import Readings, RecordedRun, Steps, Truth
+from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
 
 COLUMNS = {
     "DR": ("time [s]", "distance [m]", "turn [rad]"),
@@ -129,7 +129,7 @@ def _run(name: str, file: Path, tables: dict[str, Table]) -> RecordedRun:
     truth = None
     if reference is not None:
         t, x, y, heading = reference.values.T
-        truth = checked_heading(Truth(t, x, y, np.unwrap(heading)), steps, warnings)
+        truth = checked_heading(ReferencePath(t, x, y, np.unwrap(heading)), steps, warnings)
     surveyed = without_gaps_in_numbers(tables["TL"], warnings).values.tolist() if "TL" in tables else []
     return RecordedRun(
         name=name,

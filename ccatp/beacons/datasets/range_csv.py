@@ -158,7 +158,7 @@ class BeaconFileError(MappingError):
     """A file of beacons that cannot be written or read."""
 
 
-class BeaconMap(NamedTuple):
+class BeaconPositions(NamedTuple):
     """Beacons with what is uncertain about them.
 
     Attributes:
@@ -204,7 +204,7 @@ def write_beacons(
         raise BeaconFileError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def read_beacons(path: Path) -> BeaconMap:
+def read_beacons(path: Path) -> BeaconPositions:
     """Read a map that ``write_beacons`` wrote.
 
     Raises:
@@ -223,4 +223,4 @@ def read_beacons(path: Path) -> BeaconMap:
         raise BeaconFileError(f"{path}: is no map of beacons: {error}") from error
     if positions.ndim != 2 or covariance.shape != (positions.size, positions.size):
         raise BeaconFileError(f"{path}: covariance of shape {covariance.shape} for {positions.size} coordinates")
-    return BeaconMap(names, positions, covariance, frame)
+    return BeaconPositions(names, positions, covariance, frame)

@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from ccatp.beacons.slam.recording import Steps, Truth, dead_reckoned
+from ccatp.beacons.slam.recording import ReferencePath, Steps, dead_reckoned
 from ccatp.core import FloatArray
 
 CHORD_M = 0.2
@@ -43,7 +43,7 @@ def guessed_between(steps: Steps, times_s: FloatArray) -> npt.NDArray[np.bool_]:
     return np.asarray(np.diff(total) > 0.0)
 
 
-def chords(truth: Truth, steps: Steps) -> npt.NDArray[np.int64]:
+def chords(truth: ReferencePath, steps: Steps) -> npt.NDArray[np.int64]:
     """Rows of the truth some ``CHORD_M`` of travel apart, within the span of the odometry."""
     inside = (truth.times_s >= steps.times_s[0]) & (truth.times_s <= steps.times_s[-1])
     rows = np.flatnonzero(inside)
@@ -54,7 +54,7 @@ def chords(truth: Truth, steps: Steps) -> npt.NDArray[np.int64]:
     return np.asarray(rows[np.unique(np.minimum(np.searchsorted(way, marks), rows.size - 1))])
 
 
-def checked_heading(truth: Truth, steps: Steps, warnings: list[str]) -> Truth:
+def checked_heading(truth: ReferencePath, steps: Steps, warnings: list[str]) -> ReferencePath:
     """The truth with its heading along the course, turned if it is not, and told.
 
     Course and heading of a vehicle that rolls differ by its sideslip; a large constant difference means that the
@@ -81,7 +81,7 @@ def checked_heading(truth: Truth, steps: Steps, warnings: list[str]) -> Truth:
     return truth._replace(heading_rad=truth.heading_rad + by)
 
 
-def turning_factor(truth: Truth, steps: Steps) -> float | None:
+def turning_factor(truth: ReferencePath, steps: Steps) -> float | None:
     """By what the turns of the odometry must be multiplied so that its path has the shape of the true one.
 
     The path is cut into pieces of some ``PIECE_S``; each is laid on the truth by its own rigid motion, and the factor
@@ -118,7 +118,7 @@ def turning_factor(truth: Truth, steps: Steps) -> float | None:
     return float(fine[int(np.argmin(fine_misfits))])
 
 
-def pose_of_truth(truth: Truth | None, steps: Steps, warnings: list[str]) -> tuple[float, float, float]:
+def pose_of_truth(truth: ReferencePath | None, steps: Steps, warnings: list[str]) -> tuple[float, float, float]:
     """The first pose: x_m, y_m, heading_rad at the first odometry time; the origin if there is no truth then.
 
     If the reference has positions alone, the heading is the one that lays the first metres of odometry on the first
@@ -141,7 +141,7 @@ def pose_of_truth(truth: Truth | None, steps: Steps, warnings: list[str]) -> tup
     return (x, y, _heading_of_first_way(truth, steps))
 
 
-def _heading_of_first_way(truth: Truth, steps: Steps) -> float:
+def _heading_of_first_way(truth: ReferencePath, steps: Steps) -> float:
     path = dead_reckoned(steps, (0.0, 0.0, 0.0))
     way = np.concatenate([[0.0], np.cumsum(np.abs(steps.distance_m))])
     end_s = steps.times_s[min(int(np.searchsorted(way, FIRST_WAY_M)), way.size - 1)]

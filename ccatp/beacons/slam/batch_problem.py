@@ -127,7 +127,7 @@ DB = 10.0 / np.log(10.0)
 
 
 @dataclass(slots=True)
-class State:
+class BatchState:
     """What is estimated.
 
     Attributes:
@@ -140,11 +140,11 @@ class State:
     shared: FloatArray
     beacons: FloatArray
 
-    def moved(self, poses: FloatArray, shared: FloatArray) -> "State":
+    def moved(self, poses: FloatArray, shared: FloatArray) -> "BatchState":
         """The state after a step, the shared part of it shape (10 + 4 b,)."""
         split = len(SHARED)
         beacons = self.beacons + shared[split:].reshape(-1, BEACON)
-        return State(self.poses + poses, self.shared + shared[:split], beacons)
+        return BatchState(self.poses + poses, self.shared + shared[:split], beacons)
 
 
 @dataclass(slots=True)
@@ -210,10 +210,10 @@ class BatchProblem:
         self.prior_information = np.where(self.free, 1.0 / np.where(self.free, sigmas, 1.0) ** 2, 0.0)
         self.prior_information[np.isinf(sigmas)] = 0.0
         p = settings.priors
-        self._last: tuple[State, tuple[Any, ...]] | None = None
+        self._last: tuple[BatchState, tuple[Any, ...]] | None = None
         self.first_information = np.array((p.pose_m**-2, p.pose_m**-2, p.heading_rad**-2))
 
-    def residuals(self, state: State) -> Residuals:
+    def residuals(self, state: BatchState) -> Residuals:
         """At a state."""
         return self._evaluated(state)[0]
 
@@ -222,7 +222,7 @@ class BatchProblem:
         variance: FloatArray = self.radio.range_sigma_m**2 + (self.radio.range_sigma_per_m * range_m) ** 2
         return variance
 
-    def distances(self, state: State, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+    def distances(self, state: BatchState, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         """What readings say of the distance, m, and its variance, m^2: by the range, or by the signal strength.
 
         Args:
@@ -240,13 +240,13 @@ class BatchProblem:
         rssi_variance = (distance * self.radio.rssi_sigma_db / (DB * exponent)) ** 2
         return distance, np.where(ranged, range_variance, rssi_variance)
 
-    def prior_cost(self, state: State) -> float:
+    def prior_cost(self, state: BatchState) -> float:
         """Half the sum of squares of the priors."""
         shared = np.concatenate([state.shared, state.beacons.ravel()])
         first = state.poses[0] - self.first_pose
         return float(0.5 * (shared**2 @ self.prior_information + first**2 @ self.first_information))
 
-    def normal_equations(self, state: State, weights: FloatArray, odometry_weights: FloatArray) -> ArrowSystem:
+    def normal_equations(self, state: BatchState, weights: FloatArray, odometry_weights: FloatArray) -> ArrowSystem:
         """Gauss-Newton at a state, readings and steps weighted, for the free unknowns.
 
         Args:
@@ -280,7 +280,7 @@ class BatchProblem:
         return whole
 
     def _evaluated(
-        self, state: State
+        self, state: BatchState
     ) -> tuple[Residuals, FloatArray, FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
         if self._last is not None and self._last[0] is state:
             return self._last[1]
@@ -289,7 +289,7 @@ class BatchProblem:
         return found
 
     def _linearised(
-        self, state: State
+        self, state: BatchState
     ) -> tuple[Residuals, FloatArray, FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
         increments = self.reckoning.increments(state.shared[: len(CALIBRATION)], self.odometry)
         a, b = state.poses[:-1], state.poses[1:]
@@ -336,7 +336,7 @@ class BatchProblem:
     def _add_odometry(
         self,
         system: ArrowSystem,
-        state: State,
+        state: BatchState,
         residuals: Residuals,
         increments: tuple[FloatArray, FloatArray],
         weights: FloatArray,

@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ccatp.beacons.slam.batch_odometry import CALIBRATION, BatchSettings, RadioNoise, Reckoning, carried_on, chained
-from ccatp.beacons.slam.batch_problem import BEACON, SHARED, BatchProblem, Factored, State
+from ccatp.beacons.slam.batch_problem import BEACON, SHARED, BatchProblem, BatchState, Factored
 from ccatp.beacons.slam.batch_solver import APART, Descent, descend, place_by_bearings, place_by_distances, t_weights
 from ccatp.beacons.slam.causal import beyond_priors
-from ccatp.beacons.slam.recording import BeaconFix, Calibrated, Readings, RecordedRun, Steps, Track
+from ccatp.beacons.slam.recording import BeaconFix, Calibrated, EstimatedPath, Readings, RecordedRun, Steps
 from ccatp.core import FloatArray
 
 FIRST = 40
@@ -43,7 +43,7 @@ class Start(NamedTuple):
         doubtful: those whose mirror image fits nearly as well, shape (b,).
     """
 
-    state: State
+    state: BatchState
     used: npt.NDArray[np.bool_]
     doubtful: npt.NDArray[np.bool_]
 
@@ -67,7 +67,7 @@ def grown(
         beacons: how many there are.
     """
     used, doubtful = np.zeros(beacons, dtype=bool), np.zeros(beacons, dtype=bool)
-    state = State(np.array([first_pose]), np.zeros(len(SHARED)), np.zeros((beacons, BEACON)))
+    state = BatchState(np.array([first_pose]), np.zeros(len(SHARED)), np.zeros((beacons, BEACON)))
     at = np.searchsorted(times_s, readings.times_s)
     whole = Reckoning(steps, times_s, delayed=False)
     n, known = len(times_s), 1
@@ -75,7 +75,9 @@ def grown(
         n_now = min(n, max(FIRST, int(known * GROWTH) + 1))
         now = readings.where(at < n_now)
         motion = whole.increments(state.shared[: len(CALIBRATION)], settings.odometry).motion[known - 1 : n_now - 1]
-        state = State(np.concatenate([state.poses[:-1], chained(state.poses[-1], motion)]), state.shared, state.beacons)
+        state = BatchState(
+            np.concatenate([state.poses[:-1], chained(state.poses[-1], motion)]), state.shared, state.beacons
+        )
         for _ in range(2):  # what is on the map draws the new poses right, then new beacons are placed by them
             problem = BatchProblem(steps, now, times_s[:n_now], first_pose, settings, used)
             state = _settled(problem, state, known)
@@ -86,7 +88,7 @@ def grown(
     return Start(state, used, doubtful)
 
 
-def _settled(problem: BatchProblem, state: State, known: int) -> State:
+def _settled(problem: BatchProblem, state: BatchState, known: int) -> BatchState:
     """The state after a few steps, soft with readings along the new poses, which may still be far off."""
     new = problem.at >= known
     counted = new & (problem.sizes > 0)
@@ -105,7 +107,7 @@ def _settled(problem: BatchProblem, state: State, known: int) -> State:
 
 def _join(
     problem: BatchProblem,
-    state: State,
+    state: BatchState,
     used: npt.NDArray[np.bool_],
     doubtful: npt.NDArray[np.bool_],
     *,
@@ -159,7 +161,7 @@ CORRECTING = ("distance_scale", "turn_scale")
 TOLD_AS = {"delay_s": "odometry_delay_s"}
 
 
-def smooth(run: RecordedRun, settings: BatchSettings, clock_s: Callable[[], float]) -> Track:
+def smooth(run: RecordedRun, settings: BatchSettings, clock_s: Callable[[], float]) -> EstimatedPath:
     """Estimate a whole run at once.
 
     Minimises the negative log posterior of poses at the instants of the readings, beacons and calibration by
@@ -195,7 +197,7 @@ def instants(run: RecordedRun) -> FloatArray:
     return np.union1d(run.readings.times_s, steps_s[first])
 
 
-def _anchored(state: State, first_pose: tuple[float, float, float]) -> State:
+def _anchored(state: BatchState, first_pose: tuple[float, float, float]) -> BatchState:
     """The state moved as a whole, so that it begins at the first pose: nothing but the prior of that is another."""
     x_m, y_m, heading_rad = state.poses[0].tolist()
     turn = first_pose[2] - heading_rad
@@ -206,10 +208,10 @@ def _anchored(state: State, first_pose: tuple[float, float, float]) -> State:
         return np.column_stack([first_pose[0] + c * dx - s * dy, first_pose[1] + s * dx + c * dy])
 
     poses = np.column_stack([moved(state.poses), state.poses[:, 2] + turn])
-    return State(poses, state.shared, np.column_stack([moved(state.beacons), state.beacons[:, 2:]]))
+    return BatchState(poses, state.shared, np.column_stack([moved(state.beacons), state.beacons[:, 2:]]))
 
 
-def _filled(problem: BatchProblem, state: State, known: npt.NDArray[np.int64]) -> State:
+def _filled(problem: BatchProblem, state: BatchState, known: npt.NDArray[np.int64]) -> BatchState:
     """The state with a pose at each instant of the problem: those between the known ones by odometry."""
     motion = problem.reckoning.increments(state.shared[: len(CALIBRATION)], problem.odometry).motion
     poses = np.empty((len(motion) + 1, 3))
@@ -218,10 +220,10 @@ def _filled(problem: BatchProblem, state: State, known: npt.NDArray[np.int64]) -
     is_known[known] = True
     for k in np.flatnonzero(~is_known).tolist():
         poses[k] = carried_on(poses[k - 1], motion[k - 1])
-    return State(poses, state.shared, state.beacons)
+    return BatchState(poses, state.shared, state.beacons)
 
 
-def _widened(problem: BatchProblem, state: State) -> RadioNoise:
+def _widened(problem: BatchProblem, state: BatchState) -> RadioNoise:
     """Noise of the readings, wider where the weighted residuals ask for it.
 
     The maximum-likelihood scale of Student's t is that of sum w e^2 / sigma^2 = number of readings.
@@ -249,7 +251,7 @@ def _track(
     start: Start,
     first_radio: RadioNoise,
     took_s: float,
-) -> Track:
+) -> EstimatedPath:
     state = found.state
     residuals = problem.residuals(state)
     weights = t_weights(residuals.chi2, problem.sizes, problem.radio.freedom)
@@ -261,7 +263,7 @@ def _track(
     updates = int(counted.sum())
     calibration = _calibration(problem, state, covariance)
     priors = {TOLD_AS.get(name, name): getattr(problem.settings.priors, name) for name in SHARED}
-    return Track(
+    return EstimatedPath(
         times_s=times_s,
         poses=state.poses,
         covariances=factored.pose_covariances(),
@@ -282,7 +284,7 @@ def _track(
     )
 
 
-def _beacons(run: RecordedRun, state: State, start: Start, covariance: FloatArray) -> dict[str, BeaconFix]:
+def _beacons(run: RecordedRun, state: BatchState, start: Start, covariance: FloatArray) -> dict[str, BeaconFix]:
     found = {}
     for k, name in enumerate(run.beacon_ids):
         if start.used[k]:
@@ -292,7 +294,7 @@ def _beacons(run: RecordedRun, state: State, start: Start, covariance: FloatArra
     return found
 
 
-def _calibration(problem: BatchProblem, state: State, covariance: FloatArray) -> dict[str, Calibrated]:
+def _calibration(problem: BatchProblem, state: BatchState, covariance: FloatArray) -> dict[str, Calibrated]:
     sigmas = np.sqrt(np.diag(covariance))
     ranged, pointed, heard = (bool(problem.there[:, k].any()) for k in range(3))
     told = {"range_scale": ranged, "range_offset_m": ranged, "bearing_offset_rad": pointed}

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError
 
-from ccatp.beacons.slam.batch_problem import BEARING_OFFSET, ArrowSystem, BatchProblem, Factored, Residuals, State
+from ccatp.beacons.slam.batch_problem import BEARING_OFFSET, ArrowSystem, BatchProblem, BatchState, Factored, Residuals
 from ccatp.core import FloatArray
 
 LEAST_DAMPING = 1e-9
@@ -27,7 +27,7 @@ class Descent(NamedTuple):
         converged: False where the steps ran out first.
     """
 
-    state: State
+    state: BatchState
     cost: float
     iterations: int
     converged: bool
@@ -49,7 +49,7 @@ def t_cost(chi2: FloatArray, sizes: FloatArray, freedom: float, softness: FloatA
 
 def descend(
     problem: BatchProblem,
-    state: State,
+    state: BatchState,
     most: int,
     softness: FloatArray | float = 1.0,
     odometry_freedom: float = np.inf,
@@ -67,7 +67,7 @@ def descend(
     """
     damping = 1e-6
 
-    def tried_cost(tried: State) -> float:
+    def tried_cost(tried: BatchState) -> float:
         return _cost(problem, tried, problem.residuals(tried), softness, odometry_freedom)
 
     residuals, cost = problem.residuals(state), tried_cost(state)
@@ -86,7 +86,7 @@ def descend(
     return Descent(state, cost, most, False)
 
 
-def _step(problem: BatchProblem, state: State, system: ArrowSystem, damping: float) -> State | None:
+def _step(problem: BatchProblem, state: BatchState, system: ArrowSystem, damping: float) -> BatchState | None:
     """The state a damped step further; None where the system is not positive definite."""
     try:
         poses, shared = Factored(system, damping).solution()
@@ -108,7 +108,11 @@ def _odometry_weights(residuals: Residuals, freedom: float) -> FloatArray:
 
 
 def _cost(
-    problem: BatchProblem, state: State, residuals: Residuals, softness: FloatArray | float, odometry_freedom: float
+    problem: BatchProblem,
+    state: BatchState,
+    residuals: Residuals,
+    softness: FloatArray | float,
+    odometry_freedom: float,
 ) -> float:
     chi2 = _odometry_chi2(residuals)
     odometry = (

@@ -4,10 +4,10 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from ccatp.beacons.pilot import BeaconPilot, TargetSight
-from ccatp.beacons.slam.range_slam import Learned
+from ccatp.beacons.slam.range_slam import BeaconInnovation
 from ccatp.beacons.slam.reflector import ScanPacket
-from ccatp.beacons.slam.settings import Seen, Wheels, new_slam, odometry_of, readings_of, scan_of
-from ccatp.beacons.steering import HALT, Drive
+from ccatp.beacons.slam.settings import SignalMeasurements, WheelAngles, new_slam, odometry_of, readings_of, scan_of
+from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.config.beacon_models import RadioConfig
 
 
@@ -39,7 +39,7 @@ class BeaconLoop:
         self._heard_s: float | None = None
         self.slam = new_slam(cfg)
         self.pilot = BeaconPilot(cfg)
-        self.learned: list[Learned] = []
+        self.learned: list[BeaconInnovation] = []
 
     def listens(self, step: int) -> Listening:
         """Whom to listen to at the end of a step, counted from 1."""
@@ -49,11 +49,11 @@ class BeaconLoop:
     def step(
         self,
         time_s: float,
-        wheels: Wheels,
+        wheels: WheelAngles,
         packets: Iterable[ScanPacket],
-        sightings: Iterable[Seen],
+        sightings: Iterable[SignalMeasurements],
         distances_m: Sequence[float],
-    ) -> Drive:
+    ) -> SteeringCommand:
         """Take the readings of a step; set points for the next.
 
         Args:
@@ -80,6 +80,6 @@ class BeaconLoop:
         return TargetSight((x_m, y_m), sigma_m, time_s - self._heard_s, velocity_m_s)
 
     @staticmethod
-    def first() -> Drive:
+    def first() -> SteeringCommand:
         """Set points before the first reading."""
         return HALT

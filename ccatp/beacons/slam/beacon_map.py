@@ -58,7 +58,7 @@ FURTHEST = 100.0
 
 
 @dataclass(frozen=True, slots=True)
-class Wander:
+class GaussMarkovBias:
     """An error of a beacon's readings that stays while the vehicle does: multipath, shadowing, a tilted camera.
 
     A Gauss-Markov process of each beacon by itself: correlation exp(-way / length_m - time / time_s).
@@ -90,7 +90,7 @@ class RangeModel:
     sigma_per_m: float
     scale_sigma: float
     offset_sigma_m: float
-    wander: Wander | None = None
+    wander: GaussMarkovBias | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,11 +122,11 @@ class RssiModel:
     reference_sigma_db: float
     exponent: float
     exponent_sigma: float
-    wander: Wander | None = None
+    wander: GaussMarkovBias | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Trust:
+class RobustLoss:
     """How far readings are believed.
 
     Attributes:
@@ -168,7 +168,7 @@ class SlamSettings:
     """
 
     motion: MotionModel
-    trust: Trust
+    trust: RobustLoss
     range: RangeModel | None = None
     bearing: BearingModel | None = None
     rssi: RssiModel | None = None
@@ -188,7 +188,7 @@ def is_place(block: BlockId) -> bool:
 
 
 @dataclass(slots=True)
-class Entry:
+class MapEntry:
     """A beacon on the map.
 
     Attributes:
@@ -221,7 +221,7 @@ class BeaconMap:
 
     def __init__(self, engine: EkfSlam, shared: slice) -> None:
         self._engine, self._shared = engine, shared
-        self._entries: dict[BeaconId, Entry] = {}
+        self._entries: dict[BeaconId, MapEntry] = {}
 
     def __contains__(self, beacon: BeaconId) -> bool:
         return beacon in self._entries
@@ -229,17 +229,17 @@ class BeaconMap:
     def __iter__(self) -> Iterator[BeaconId]:
         return iter(self._entries)
 
-    def __getitem__(self, beacon: BeaconId) -> Entry:
+    def __getitem__(self, beacon: BeaconId) -> MapEntry:
         return self._entries[beacon]
 
-    def get(self, beacon: BeaconId) -> Entry | None:
+    def get(self, beacon: BeaconId) -> MapEntry | None:
         """A beacon; None where it is not on the map."""
         return self._entries.get(beacon)
 
-    def join(self, beacon: BeaconId, mean: FloatArray, covariance: FloatArray) -> Entry:
+    def join(self, beacon: BeaconId, mean: FloatArray, covariance: FloatArray) -> MapEntry:
         """A beacon that is correlated with nothing yet: mean (b,), covariance (b, b)."""
         self._append(beacon, mean, covariance)
-        self._entries[beacon] = Entry(_NONE, mean.size)
+        self._entries[beacon] = MapEntry(_NONE, mean.size)
         self.renumber()
         return self._entries[beacon]
 
@@ -265,7 +265,7 @@ class BeaconMap:
                 entry.wander = parts[-1].start
             entry.columns = columns_of(*parts)
 
-    def wander_to(self, beacon: BeaconId, model: Wander, way_m: float, time_s: float) -> None:
+    def wander_to(self, beacon: BeaconId, model: GaussMarkovBias, way_m: float, time_s: float) -> None:
         """Bring a beacon's wandering error, in sigmas, to now: w <- phi w, variance <- phi^2 variance + 1 - phi^2."""
         entry = self._entries[beacon]
         if entry.wander < 0:
@@ -285,7 +285,7 @@ class BeaconMap:
 HEADING = 2
 
 
-class Transport:
+class HeadingTransport:
     """After a correction, P <- M P M^T with M = I + d e^T, e the heading and d = J (new - old) of every place.
 
     Nobody tells the heading of the whole map: a turn of everything about any point changes no reading. In the state it

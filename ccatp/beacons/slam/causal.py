@@ -15,18 +15,18 @@ import numpy as np
 
 from ccatp.beacons.slam.beacon_map import HEADING, SlamSettings
 from ccatp.beacons.slam.motion import Increment
-from ccatp.beacons.slam.range_slam import BeaconSlam, Learned
+from ccatp.beacons.slam.range_slam import BeaconInnovation, BeaconSlam
 from ccatp.beacons.slam.recording import (
     BeaconFix,
     BeaconId,
     Calibrated,
+    EstimatedPath,
     RangeBearingReading,
     RangeReading,
     Reading,
     RecordedRun,
     RssiReading,
     Steps,
-    Track,
 )
 from ccatp.core import FloatArray
 
@@ -77,7 +77,7 @@ OUTLIER = 25.0
 """What a reading may count at most against one of them."""
 
 
-class LostHeading:
+class HeadingRelocalizer:
     """One ``BeaconSlam``, or several that differ by their heading.
 
     A Gaussian whose heading is spread over the circle is split into ``HEADINGS`` narrow ones; each reading that all of
@@ -104,7 +104,7 @@ class LostHeading:
         if was_guessed and not self._is_guessed and self.best.pose_covariance[HEADING, HEADING] > LOST_RAD**2:
             self._split()
 
-    def observe(self, readings: Sequence[Reading]) -> list[Learned]:
+    def observe(self, readings: Sequence[Reading]) -> list[BeaconInnovation]:
         """Take readings; what they did to the best."""
         learned = self.best.observe(readings)
         if self._others:
@@ -124,7 +124,7 @@ class LostHeading:
         ]
         self._others, self._taken = slams[1:], 0
 
-    def _weigh(self, learned: Sequence[list[Learned]]) -> None:
+    def _weigh(self, learned: Sequence[list[BeaconInnovation]]) -> None:
         """Readings that not all have taken, because a beacon is not on every map, say nothing."""
         for each in learned:
             each.sort(key=lambda one: str(one.beacon))
@@ -154,7 +154,7 @@ DOUBTFUL_SHARE = 0.3
 
 def filter_run(
     run: RecordedRun, settings: SlamSettings, first_sigmas: tuple[float, float], clock_s: Callable[[], float]
-) -> Track:
+) -> EstimatedPath:
     """Run the filter over a recording; nothing of the truth is used but the first pose.
 
     Args:
@@ -164,7 +164,7 @@ def filter_run(
         clock_s: tells wall time, s.
     """
     position, heading = first_sigmas
-    search = LostHeading(BeaconSlam(settings, run.first_pose, np.diag((position**2, position**2, heading**2))))
+    search = HeadingRelocalizer(BeaconSlam(settings, run.first_pose, np.diag((position**2, position**2, heading**2))))
     times = np.union1d(_spaced(run.steps.times_s), run.readings.times_s)
     increments, readings = _increments(run.steps, times), _Heard(run)
     poses, covariances = np.empty((len(times), 3)), np.empty((len(times), 3, 3))
@@ -185,7 +185,7 @@ def filter_run(
     priors = dict(zip(slam.calibration, slam.prior_sigmas, strict=True))
     calibration = learned({name: Calibrated(*found) for name, found in slam.calibration.items()}, priors)
     lost = [name for name in run.beacon_ids if name not in slam.beacons]
-    return Track(
+    return EstimatedPath(
         times_s=times,
         poses=poses,
         covariances=covariances,
@@ -235,7 +235,7 @@ class _Book:
     update_s: list[float] = field(default_factory=list)
     scalar_s: list[float] = field(default_factory=list)
 
-    def observed(self, learned: Sequence[Learned], count: int, whole_s: float, update_s: float) -> None:
+    def observed(self, learned: Sequence[BeaconInnovation], count: int, whole_s: float, update_s: float) -> None:
         """``count`` readings of a moment were put into the filter."""
         self.update_s += [whole_s / count] * count
         if len(learned) == count:  # nothing that waits or joins: updates alone

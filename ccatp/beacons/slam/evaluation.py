@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccatp.beacons.slam.recording import BeaconFix, RecordedRun, Track, Truth
+from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun, ReferencePath
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import Consistency, RigidMotion, best_motion, consistency, nees, rms, wrapped
 
@@ -26,7 +26,7 @@ LEAST_KNOWN = 3
 """Instants with a truth: one always fits, and two but for their distance."""
 
 
-class Judgement(NamedTuple):
+class TrackEvaluation(NamedTuple):
     """Errors of a track; None where there is no truth to tell.
 
     Attributes:
@@ -51,7 +51,7 @@ class Judgement(NamedTuple):
     errors_m: FloatArray
 
 
-def judge(track: Track, run: RecordedRun) -> Judgement:
+def judge(track: EstimatedPath, run: RecordedRun) -> TrackEvaluation:
     """Compare a track with the truth of the run.
 
     One rigid motion without scale lays the positions on the truth; the beacons move with it. If only the beacons were
@@ -74,7 +74,7 @@ def judge(track: Track, run: RecordedRun) -> Judgement:
     headings = wrapped(track.poses[:, 2] + alignment.angle_rad - truth[:, 2])
     offsets = np.hypot(*(alignment.moved(places) - surveyed).T)
     measurable = known.any() or len(common) > 2  # two points always fit
-    return Judgement(
+    return TrackEvaluation(
         alignment=alignment,
         trajectory_rmse_m=rms(errors),
         heading_rmse_rad=rms(headings),
@@ -86,7 +86,7 @@ def judge(track: Track, run: RecordedRun) -> Judgement:
     )
 
 
-def truth_at(truth: Truth, times_s: FloatArray) -> FloatArray:
+def truth_at(truth: ReferencePath, times_s: FloatArray) -> FloatArray:
     """True x_m, y_m, heading_rad at some times, shape (n, 3); NaN outside the truth and in its gaps."""
     columns = [np.interp(times_s, truth.times_s, column) for column in truth[1:]]
     after = np.searchsorted(truth.times_s, times_s).clip(1, len(truth.times_s) - 1)
@@ -96,7 +96,7 @@ def truth_at(truth: Truth, times_s: FloatArray) -> FloatArray:
     return np.where(inside[:, None], np.column_stack(columns), np.nan)
 
 
-def aligned_beacons(track: Track, alignment: RigidMotion) -> dict[str, BeaconFix]:
+def aligned_beacons(track: EstimatedPath, alignment: RigidMotion) -> dict[str, BeaconFix]:
     """The map after an alignment."""
     moved = {}
     for name, fix in track.beacons.items():
@@ -112,7 +112,7 @@ def _begins_on_truth(run: RecordedRun) -> bool:
     return bool(run.truth.times_s[0] - FIRST_POSE_S <= run.steps.times_s[0] <= run.truth.times_s[-1])
 
 
-def _nees(track: Track, truth: FloatArray, known: np.ndarray) -> Consistency | None:
+def _nees(track: EstimatedPath, truth: FloatArray, known: np.ndarray) -> Consistency | None:
     if not known.any():
         return None
     size = 3 if np.isfinite(truth[known, 2]).all() else 2
@@ -126,7 +126,7 @@ SCALES = ("range_scale", "distance_scale", "turn_scale")
 """Told as factors: 1.07 for ranges that read 7 % too long."""
 
 
-def result_data(run: RecordedRun, filter_name: str, track: Track, judged: Judgement) -> dict[str, Any]:
+def result_data(run: RecordedRun, filter_name: str, track: EstimatedPath, judged: TrackEvaluation) -> dict[str, Any]:
     """The result as JSON has it; None where nothing is known."""
     beacons = aligned_beacons(track, judged.alignment)
     calibration = {name: (value + (name in SCALES), sigma) for name, (value, sigma) in track.calibration.items()}
@@ -224,7 +224,9 @@ COLUMNS = (
 AVERAGED = ("trajectory_rmse_m", "heading_rmse_rad", "beacon_rmse_m", "update_us_p50", "run_s")
 
 
-def row(run: RecordedRun, name: str, track: Track, run_s: float | None, *, peer: bool = False) -> dict[str, Any]:
+def row(
+    run: RecordedRun, name: str, track: EstimatedPath, run_s: float | None, *, peer: bool = False
+) -> dict[str, Any]:
     """The figures of one estimator on one run; a peer tells no covariance."""
     data = result_data(run, name, track, judge(track, run))
     found = {key: data.get(key) for _, key, _ in COLUMNS}

@@ -14,13 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.beacons.slam.beacon_map import BeaconMap, NoiseLevel
-from ccatp.beacons.slam.measurement_models import Row, Sensors, bearing_of, kind_of, strength_of
-from ccatp.beacons.slam.motion import POSE, Carried, DeadReckoning
+from ccatp.beacons.slam.measurement_models import MeasurementModels, MeasurementRow, bearing_of, kind_of, strength_of
+from ccatp.beacons.slam.motion import POSE, CarriedOdometry, DeadReckoning
 from ccatp.beacons.slam.recording import BeaconId, Reading
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.ekf_slam import BlockId, Columns, EkfSlam, Update, columns_of
 
-RowOf = Callable[[Reading, list[float], list[float], list[float]], Row]
+RowOf = Callable[[Reading, list[float], list[float], list[float]], MeasurementRow]
 
 MOST = 24
 """Readings of a beacon that are kept; beyond, every other one goes, and they are taken twice as far apart."""
@@ -55,7 +55,7 @@ FIT = 6.0
 (Birge's ratio): with less noise in the settings than there is, no beacon would ever join."""
 
 
-class Record(NamedTuple):
+class ReadingRecord(NamedTuple):
     """A reading that waits.
 
     Attributes:
@@ -85,7 +85,7 @@ class Candidate(NamedTuple):
     variances: FloatArray
 
 
-class Prior(NamedTuple):
+class LandmarkPrior(NamedTuple):
     """What is known of a beacon before its readings: all but nothing of its place.
 
     Attributes:
@@ -97,7 +97,7 @@ class Prior(NamedTuple):
     covariance: FloatArray
 
 
-class Clone(NamedTuple):
+class PoseClone(NamedTuple):
     """The vehicle's place as a function of the state.
 
     Attributes:
@@ -111,11 +111,11 @@ class Clone(NamedTuple):
     jacobian: FloatArray
 
 
-PriorAt = Callable[[float, float], Prior]
+PriorAt = Callable[[float, float], LandmarkPrior]
 
 
 @dataclass(slots=True)
-class Waiting:
+class PendingLandmark:
     """Readings of a beacon that is not on the map yet.
 
     The vehicle's place at each of them is kept in the state as a clone (Mourikis and Roumeliotis 2007), so that what
@@ -129,7 +129,7 @@ class Waiting:
     """
 
     beacon: BeaconId
-    records: list[Record] = field(default_factory=list)
+    records: list[ReadingRecord] = field(default_factory=list)
     candidates: list[Candidate] = field(default_factory=list)
     spacing_m: float = 0.0
     count: int = 0
@@ -139,7 +139,7 @@ class Waiting:
         """Whether there are enough readings to look for it."""
         return len(self.records) >= LEAST
 
-    def take(self, engine: EkfSlam, reading: Reading, place: Clone, range_m: float) -> bool:
+    def take(self, engine: EkfSlam, reading: Reading, place: PoseClone, range_m: float) -> bool:
         """Keep a reading, if the vehicle has moved since the last one that was kept."""
         x, y = place.mean.tolist()
         if not self.records:
@@ -151,7 +151,7 @@ class Waiting:
         block = ("place", self.beacon, self.count)
         self.count += 1
         engine.augment(block, place.mean, place.columns, place.jacobian)
-        self.records.append(Record(reading, block, range_m))
+        self.records.append(ReadingRecord(reading, block, range_m))
         if len(self.records) > MOST:
             self.spacing_m *= 2.0
             for record in self.records[1::2]:
@@ -176,10 +176,10 @@ class Waiting:
             reach_m: how far it is from the last place, roughly.
         """
         problem = _problem(engine, self.records, row_of, shared, reach_m)
-        starts: list[Prior] = []
+        starts: list[LandmarkPrior] = []
         for radius_m in {reach_m, self._usual_m(reach_m)}:
             starts += problem.around(prior_at, radius_m)
-        starts += [Prior(c.mean, prior_at(*c.mean[:2].tolist()).covariance) for c in self.candidates]
+        starts += [LandmarkPrior(c.mean, prior_at(*c.mean[:2].tolist()).covariance) for c in self.candidates]
         found = [candidate for candidate in map(problem.refine, starts) if candidate is not None]
         best = min(found, key=lambda c: c.cost, default=None)
         if best is not None:
@@ -229,7 +229,7 @@ class _Problem(NamedTuple):
     row_of: RowOf
     reach_m: float
 
-    def around(self, prior_at: PriorAt, radius_m: float) -> list[Prior]:
+    def around(self, prior_at: PriorAt, radius_m: float) -> list[LandmarkPrior]:
         """Where to begin: the best directions on a circle about the last place."""
         x, y = self.places[-1]
         angles = [2.0 * pi * k / STARTS for k in range(STARTS)]
@@ -245,7 +245,7 @@ class _Problem(NamedTuple):
         x, y = middle + 2.0 * along * along.dot(point - middle) - (point - middle)
         return float(x), float(y)
 
-    def rough(self, prior: Prior) -> float:
+    def rough(self, prior: LandmarkPrior) -> float:
         """How badly a guess fits, places and calibration as they are; a reading that is off counts little (Cauchy)."""
         b = prior.mean.tolist()
         cost = 0.0
@@ -254,7 +254,7 @@ class _Problem(NamedTuple):
             cost += log1p((z - row.expected) ** 2 / row.variance)
         return cost
 
-    def refine(self, prior: Prior) -> Candidate | None:
+    def refine(self, prior: LandmarkPrior) -> Candidate | None:
         """Gauss-Newton with weights; None where it leads nowhere."""
         b, W, stride = prior.mean.copy(), np.linalg.inv(prior.covariance), 0.5 * self.reach_m
         variances, A, cost = self.z, W, inf
@@ -307,7 +307,7 @@ def _weighed(e: FloatArray, S: FloatArray, R: FloatArray, step: int) -> tuple[Fl
     return R + np.where(is_out, OUT * e * e, 0.0), limit**2 * float(is_out.sum())
 
 
-def _problem(engine: EkfSlam, records: list[Record], row_of: RowOf, shared: slice, reach_m: float) -> _Problem:
+def _problem(engine: EkfSlam, records: list[ReadingRecord], row_of: RowOf, shared: slice, reach_m: float) -> _Problem:
     readings = [record.reading for record in records]
     z = np.array([strength_of(r) for r in readings])
     blocks = [engine.block(record.place) for record in records]
@@ -322,7 +322,7 @@ LINEARISATIONS = 8
 
 
 def settle_by_places(
-    engine: EkfSlam, records: list[Record], row_of: RowOf, shared: slice, block: slice, variances: FloatArray
+    engine: EkfSlam, records: list[ReadingRecord], row_of: RowOf, shared: slice, block: slice, variances: FloatArray
 ) -> Update:
     """Condition a beacon, the places where it was heard, the calibration and all else on the readings, iterated.
 
@@ -353,7 +353,7 @@ def settle_by_places(
     return engine.update_iterated(columns, linearise, variances, LINEARISATIONS)
 
 
-def derivatives(row: Row, at: Carried, *, delayed: bool) -> list[float]:
+def derivatives(row: MeasurementRow, at: CarriedOdometry, *, delayed: bool) -> list[float]:
     """Dh by the pose and the calibration of the state: a row at the pose that was carried to a reading's time."""
     hx, hy, turned = row.pose
     if not delayed and at.back_s == 0.0:
@@ -382,7 +382,7 @@ TRIAL = 2
 """Readings that must agree with the one that a beacon joined by: a misread name would put it anywhere."""
 
 
-class Newcomers:
+class LandmarkInitializer:
     """With a bearing a beacon joins at once, where range and bearing say; without one its readings wait.
 
     One that joined at once is on trial: if one of its next ``TRIAL`` readings is refused, it begins anew with that one.
@@ -403,7 +403,7 @@ class Newcomers:
     def __init__(
         self,
         engine: EkfSlam,
-        sensors: Sensors,
+        sensors: MeasurementModels,
         beacons: BeaconMap,
         clock: DeadReckoning,
         levels: dict[str, NoiseLevel],
@@ -413,7 +413,7 @@ class Newcomers:
         self._engine, self._sensors, self._map, self._clock = engine, sensors, beacons, clock
         self._levels, self._shared, self._delay = levels, shared, delay
         self._ranges = len(sensors.names)
-        self.waiting: dict[BeaconId, Waiting] = {}
+        self.waiting: dict[BeaconId, PendingLandmark] = {}
 
     def forget(self, beacon: BeaconId) -> bool:
         """Forget what waits of a beacon; False if nothing does."""
@@ -424,7 +424,7 @@ class Newcomers:
         self._map.renumber()
         return True
 
-    def carried(self, x: FloatArray, reading: Reading) -> Carried:
+    def carried(self, x: FloatArray, reading: Reading) -> CarriedOdometry:
         """The pose of a state x (n,) at a reading's time."""
         delay_s = float(x[self._delay]) if self._delay >= 0 else 0.0
         return self._clock.at(x[:POSE].tolist(), reading.time_s, delay_s)
@@ -443,7 +443,7 @@ class Newcomers:
             entry.on_trial = TRIAL
             self._settle(reading)
             return
-        waiting = self.waiting.setdefault(reading.beacon, Waiting(reading.beacon))
+        waiting = self.waiting.setdefault(reading.beacon, PendingLandmark(reading.beacon))
         is_kept = waiting.take(self._engine, reading, self._clone(reading), reach_m)
         if is_kept and waiting.is_ready:
             waiting.look(
@@ -452,7 +452,7 @@ class Newcomers:
             self._join_waiting(reading, waiting, reach_m)
         self._map.renumber()
 
-    def _join_waiting(self, reading: Reading, waiting: Waiting, reach_m: float) -> None:
+    def _join_waiting(self, reading: Reading, waiting: PendingLandmark, reach_m: float) -> None:
         found = waiting.found(self._engine)
         if found is None:
             return
@@ -488,18 +488,20 @@ class Newcomers:
         R = np.array((row.variance, bearing.variance * self._levels["bearing"].factor))
         self._engine.update_iterated(columns, linearise, R, LINEARISATIONS)
 
-    def _row_of(self, reading: Reading, pose: list[float], calibration: list[float], beacon: list[float]) -> Row:
+    def _row_of(
+        self, reading: Reading, pose: list[float], calibration: list[float], beacon: list[float]
+    ) -> MeasurementRow:
         """What a reading should be, with the noise as it was learned."""
         row = self._sensors.row(reading, pose, calibration[: self._ranges], beacon)
         level = self._levels[kind_of(reading)]
         return row._replace(variance=row.variance * level.factor)
 
-    def _prior(self, reading: Reading, reach_m: float, x_m: float, y_m: float) -> Prior:
+    def _prior(self, reading: Reading, reach_m: float, x_m: float, y_m: float) -> LandmarkPrior:
         extra = self._sensors.extra_prior(reading)
         sigmas = (FLAT * reach_m, FLAT * reach_m, *(sigma for _, sigma in extra))
-        return Prior(np.array((x_m, y_m, *(mean for mean, _ in extra))), np.diag(np.square(sigmas)))
+        return LandmarkPrior(np.array((x_m, y_m, *(mean for mean, _ in extra))), np.diag(np.square(sigmas)))
 
-    def _clone(self, reading: Reading) -> Clone:
+    def _clone(self, reading: Reading) -> PoseClone:
         """The vehicle's place when a reading was taken."""
         at = self.carried(self._engine.mean, reading)
         (x_heading, y_heading), by = at.by_heading(), at.by_delay()
@@ -508,4 +510,4 @@ class Newcomers:
             columns.append(self._delay)
             J[0].append(by[0])
             J[1].append(by[1])
-        return Clone(np.array(at.pose[:2]), columns_of(columns), np.array(J))
+        return PoseClone(np.array(at.pose[:2]), columns_of(columns), np.array(J))

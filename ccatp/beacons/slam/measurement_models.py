@@ -3,7 +3,7 @@
 from math import atan2, isnan, log, log10, sqrt
 from typing import NamedTuple
 
-from ccatp.beacons.slam.beacon_map import BearingModel, RangeModel, RssiModel, SlamSettings, Wander
+from ccatp.beacons.slam.beacon_map import BearingModel, GaussMarkovBias, RangeModel, RssiModel, SlamSettings
 from ccatp.beacons.slam.recording import RangeBearingReading, RangeReading, Reading, RssiReading
 
 LEAST_RANGE_M = 1e-3
@@ -11,11 +11,11 @@ LEAST_RANGE_M = 1e-3
 _DB = 10.0 / log(10.0)
 
 
-class SensorError(ValueError):
+class MeasurementError(ValueError):
     """A reading of a sensor that the settings do not describe."""
 
 
-class Row(NamedTuple):
+class MeasurementRow(NamedTuple):
     """One scalar of a reading.
 
     Attributes:
@@ -33,7 +33,7 @@ class Row(NamedTuple):
     variance: float
 
 
-def range_row(pose: list[float], calibration: list[float], beacon: list[float], model: RangeModel) -> Row:
+def range_row(pose: list[float], calibration: list[float], beacon: list[float], model: RangeModel) -> MeasurementRow:
     """Z = (1 + e) r + o; ``calibration`` begins with e and o, each where its prior is not zero; beacon (x_m, y_m)."""
     dx, dy = beacon[0] - pose[0], beacon[1] - pose[1]
     r = max(sqrt(dx * dx + dy * dy), LEAST_RANGE_M)
@@ -47,19 +47,19 @@ def range_row(pose: list[float], calibration: list[float], beacon: list[float], 
         by = (*by, 1.0)
     ux, uy = scale * dx / r, scale * dy / r
     variance = model.sigma_m**2 + (model.sigma_per_m * r) ** 2
-    return Row(scale * r + offset, (-ux, -uy, 0.0), by, (ux, uy), variance)
+    return MeasurementRow(scale * r + offset, (-ux, -uy, 0.0), by, (ux, uy), variance)
 
 
-def bearing_row(pose: list[float], shared: int, beacon: list[float], model: BearingModel) -> Row:
+def bearing_row(pose: list[float], shared: int, beacon: list[float], model: BearingModel) -> MeasurementRow:
     """Beta = atan2(dy, dx) - heading; ``shared``: how many calibration states ranges have."""
     dx, dy = beacon[0] - pose[0], beacon[1] - pose[1]
     q = max(dx * dx + dy * dy, LEAST_RANGE_M**2)
     across, tail = (-dy / q, dx / q), (0.0,) * (len(beacon) - 2)
     expected = atan2(dy, dx) - pose[2]
-    return Row(expected, (dy / q, -dx / q, -1.0), (0.0,) * shared, across + tail, model.sigma_rad**2)
+    return MeasurementRow(expected, (dy / q, -dx / q, -1.0), (0.0,) * shared, across + tail, model.sigma_rad**2)
 
 
-def rssi_row(pose: list[float], shared: int, beacon: list[float], model: RssiModel) -> Row:
+def rssi_row(pose: list[float], shared: int, beacon: list[float], model: RssiModel) -> MeasurementRow:
     """Z = P_ref - 10 eta log10 r; P_ref and eta stand behind x and y in the beacon, each where it is estimated."""
     dx, dy = beacon[0] - pose[0], beacon[1] - pose[1]
     q = max(dx * dx + dy * dy, LEAST_RANGE_M**2)
@@ -73,10 +73,10 @@ def rssi_row(pose: list[float], shared: int, beacon: list[float], model: RssiMod
         tail.append(-10.0 * decades)
     gx, gy = -_DB * exponent * dx / q, -_DB * exponent * dy / q
     expected = reference - 10.0 * exponent * decades
-    return Row(expected, (-gx, -gy, 0.0), (0.0,) * shared, (gx, gy, *tail), model.sigma_db**2)
+    return MeasurementRow(expected, (-gx, -gy, 0.0), (0.0,) * shared, (gx, gy, *tail), model.sigma_db**2)
 
 
-class Sensors:
+class MeasurementModels:
     """The radios of a run, as rows of measurement.
 
     Args:
@@ -90,7 +90,7 @@ class Sensors:
         self.names = tuple(name for name, sigma in priors if sigma > 0.0)
         self.prior_sigmas = tuple(sigma for _, sigma in priors if sigma > 0.0)
 
-    def row(self, reading: Reading, pose: list[float], calibration: list[float], beacon: list[float]) -> Row:
+    def row(self, reading: Reading, pose: list[float], calibration: list[float], beacon: list[float]) -> MeasurementRow:
         """The range or the signal strength.
 
         Raises:
@@ -100,17 +100,19 @@ class Sensors:
             return rssi_row(pose, len(self.names), beacon, self._rssi_model())
         return range_row(pose, calibration, beacon, self._range_model())
 
-    def bearing(self, pose: list[float], beacon: list[float]) -> Row:
+    def bearing(self, pose: list[float], beacon: list[float]) -> MeasurementRow:
         """The bearing.
 
         Raises:
             SensorError: the settings have no model of it.
         """
         if self._bearing is None:
-            raise SensorError("a reading has a bearing, the settings have no bearing model: give SlamSettings.bearing")
+            raise MeasurementError(
+                "a reading has a bearing, the settings have no bearing model: give SlamSettings.bearing"
+            )
         return bearing_row(pose, len(self.names), beacon, self._bearing)
 
-    def wander(self, reading: Reading) -> Wander | None:
+    def wander(self, reading: Reading) -> GaussMarkovBias | None:
         """The error that stays while the vehicle does."""
         return (self._rssi_model() if isinstance(reading, RssiReading) else self._range_model()).wander
 
@@ -131,12 +133,12 @@ class Sensors:
 
     def _range_model(self) -> RangeModel:
         if self._range is None:
-            raise SensorError("a reading has a range, the settings have no range model: give SlamSettings.range")
+            raise MeasurementError("a reading has a range, the settings have no range model: give SlamSettings.range")
         return self._range
 
     def _rssi_model(self) -> RssiModel:
         if self._rssi is None:
-            raise SensorError("a reading has an RSSI, the settings have no RSSI model: give SlamSettings.rssi")
+            raise MeasurementError("a reading has an RSSI, the settings have no RSSI model: give SlamSettings.rssi")
         return self._rssi
 
 

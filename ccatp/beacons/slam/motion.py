@@ -19,7 +19,7 @@ SMALL_RAD = 1e-3
 """Half a turn below which sin(a) / a is 1 - a^2 / 6 to the last digit."""
 
 
-class Pose(NamedTuple):
+class VehiclePose(NamedTuple):
     """Where a vehicle stands; the heading is continuous, it does not wrap."""
 
     x_m: float
@@ -70,7 +70,7 @@ class Steering:
 Odometry = Increment | Steering
 
 
-class RestReading(NamedTuple):
+class StationaryReading(NamedTuple):
     """What a vehicle at rest shows of its odometry's calibration.
 
     Attributes:
@@ -206,12 +206,12 @@ class DifferentialDrive:
         Q = self._spread(odometry, (c, s), (x_turn, y_turn), chord, 0.0 if is_at_rest else 1.0)
         return MotionStep(mean, F, Q)
 
-    def at_rest(self, odometry: Odometry) -> RestReading | None:
+    def at_rest(self, odometry: Odometry) -> StationaryReading | None:
         """At rest the turn that is told is the bias, by the gyroscope's angle random walk; None while it drives."""
         if self._bias < 0 or not isinstance(odometry, Increment) or not self._rests(odometry):
             return None
         dt = odometry.interval_s
-        return RestReading(self._bias, odometry.turn_rad / dt, self.noise.turn_per_sqrt_s**2 / dt)
+        return StationaryReading(self._bias, odometry.turn_rad / dt, self.noise.turn_per_sqrt_s**2 / dt)
 
     def _rests(self, odometry: Increment) -> bool:
         dt, noise = odometry.interval_s, self.noise
@@ -329,7 +329,7 @@ class WheelNoise:
     slip_sigma: float
 
 
-class _Turn(NamedTuple):
+class _TurnStep(NamedTuple):
     """How an interval turns the vehicle, with derivatives by the reading of steering or turn rate, speed and slip.
 
     Attributes:
@@ -399,17 +399,17 @@ class SlippingVehicle:
         L *= (0.0, 0.0) if stands else (self._noise.speed_sigma_m_s, self._noise.turn_sigma)
         return MotionStep(mean, F, L @ L.T)
 
-    def _steered(self, T: float, v: float, steer: float, drift: float, slip: float) -> _Turn:
+    def _steered(self, T: float, v: float, steer: float, drift: float, slip: float) -> _TurnStep:
         curve = T * sin(steer) / self._wheelbase_m
         d_steer = T * v * (1.0 - slip) * cos(steer) / self._wheelbase_m
         w = curve * v * (1.0 - slip) + T * drift
-        return _Turn(steer, w, (1.0, 0.0, 0.0), (d_steer, curve * (1.0 - slip), -curve * v))
+        return _TurnStep(steer, w, (1.0, 0.0, 0.0), (d_steer, curve * (1.0 - slip), -curve * v))
 
     @staticmethod
-    def _differential(T: float, _v: float, omega: float, drift: float, slip: float) -> _Turn:
+    def _differential(T: float, _v: float, omega: float, drift: float, slip: float) -> _TurnStep:
         w = T * omega * (1.0 - slip) + T * drift
         by_omega, by_slip = T * (1.0 - slip), -T * omega
-        return _Turn(0.5 * w, w, (0.5 * by_omega, 0.5 * by_slip, 0.5 * T), (by_omega, 0.0, by_slip))
+        return _TurnStep(0.5 * w, w, (0.5 * by_omega, 0.5 * by_slip, 0.5 * T), (by_omega, 0.0, by_slip))
 
     def _read(self, odometry: Odometry) -> tuple[float, float, float]:
         """Interval, speed, and steering angle or turn rate."""
@@ -430,7 +430,7 @@ SLIVER = 0.2
 STANDS = (0.0, 0.0, 0.0)
 
 
-class Carried(NamedTuple):
+class CarriedOdometry(NamedTuple):
     """The pose at a reading's time: pose(t) = pose - back_s (vx, vy, turn).
 
     Attributes:
@@ -501,18 +501,18 @@ class DeadReckoning:
             self._rates = ((dx * c + dy * s) / dt, (dy * c - dx * s) / dt, turn / dt)
         return hypot(dx, dy)
 
-    def at(self, pose: list[float], time_s: float, delay_s: float) -> Carried:
+    def at(self, pose: list[float], time_s: float, delay_s: float) -> CarriedOdometry:
         """The pose, the first of some states, at a reading's time, carried no further than an interval."""
         limit_s = self._interval_s
         back_s = self._until_s + delay_s - time_s
         back_s = max(-limit_s, min(limit_s, back_s)) if limit_s > 0.0 else 0.0
         if back_s == 0.0 and not self._is_delayed:
-            return Carried(pose[:POSE], STANDS, 0.0)  # its speed does not matter
+            return CarriedOdometry(pose[:POSE], STANDS, 0.0)  # its speed does not matter
         ahead, side, turn = self._rates
         heading = pose[2] - back_s * turn
         c, s = cos(heading), sin(heading)
         vx, vy = ahead * c - side * s, ahead * s + side * c
-        return Carried([pose[0] - back_s * vx, pose[1] - back_s * vy, heading], (vx, vy, turn), back_s)
+        return CarriedOdometry([pose[0] - back_s * vx, pose[1] - back_s * vy, heading], (vx, vy, turn), back_s)
 
 
 def _split(step: Odometry, part: float) -> tuple[Odometry, Odometry]:

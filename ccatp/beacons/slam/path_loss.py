@@ -87,7 +87,7 @@ _EXACT_DB = 1e-6
 _FAR_OFF = 3.5  # studentised residual of a place that wants a second look
 
 
-class CalibrationError(ValueError):
+class PathLossError(ValueError):
     """Pairs from which no path loss follows; the message carries the numbers."""
 
 
@@ -205,17 +205,17 @@ def fit_path_loss(pairs: Iterable[LevelPair]) -> PathLossFit:
     by_place: dict[tuple[float, tuple[float, float] | None], list[float]] = {}
     for pair in pairs:
         if not (0.0 < pair.distance_m < inf and abs(pair.level_dbm) < inf):
-            raise CalibrationError(f"pair of {pair.distance_m:g} m and {pair.level_dbm:g} dBm cannot be used")
+            raise PathLossError(f"pair of {pair.distance_m:g} m and {pair.level_dbm:g} dBm cannot be used")
         by_place.setdefault((pair.distance_m, pair.place), []).append(pair.level_dbm)
     distances = np.array([distance_m for distance_m, _ in by_place])
     if (different := np.unique(distances).size) < LEAST_PLACES:
-        raise CalibrationError(f"{different} different distances, at least {LEAST_PLACES} needed; measure at more")
+        raise PathLossError(f"{different} different distances, at least {LEAST_PLACES} needed; measure at more")
     levels = np.array([np.mean(group) for group in by_place.values()])
     rows = np.column_stack([np.ones(distances.size), -10.0 * np.log10(distances)])
     normal = np.linalg.inv(rows.T @ rows)
     found = normal @ rows.T @ levels
     if not found[1] >= LEAST_EXPONENT:
-        raise CalibrationError(
+        raise PathLossError(
             f"levels do not fall with distance (exponent {found[1]:.2f}): are they distances in m, then levels in dBm?"
         )
     residuals = levels - rows @ found

@@ -12,16 +12,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.beacons.slam.beacon_map import HEADING, BeaconMap, Entry, NoiseLevel, SlamSettings, Transport, Wander
-from ccatp.beacons.slam.landmark_init import Newcomers, derivatives
-from ccatp.beacons.slam.measurement_models import Sensors, bearing_of, is_direction, kind_of, strength_of
-from ccatp.beacons.slam.motion import POSE, DeadReckoning, DifferentialDrive, Increment, Odometry, Pose
+from ccatp.beacons.slam.beacon_map import (
+    HEADING,
+    BeaconMap,
+    GaussMarkovBias,
+    HeadingTransport,
+    MapEntry,
+    NoiseLevel,
+    SlamSettings,
+)
+from ccatp.beacons.slam.landmark_init import LandmarkInitializer, derivatives
+from ccatp.beacons.slam.measurement_models import MeasurementModels, bearing_of, is_direction, kind_of, strength_of
+from ccatp.beacons.slam.motion import POSE, DeadReckoning, DifferentialDrive, Increment, Odometry, VehiclePose
 from ccatp.beacons.slam.recording import BeaconId, Reading
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.ekf_slam import BlockError, EkfSlam, RowUpdate
 
 
-class Doubts:
+class RejectedReadings:
     """One reading that is not believed is an outlier. Several in a row, of whichever beacons, accuse the pose.
 
     Args:
@@ -44,7 +52,7 @@ class Doubts:
         return True
 
 
-class FreshNoise:
+class AddedPoseNoise:
     """N <- G N G^T + Q, N symmetric, G = dh(pose)/d(pose): the identity, but for the derivatives by the heading.
 
     Six numbers in place of an array of nine: an update of so small a one by NumPy takes longer than the rest.
@@ -88,7 +96,7 @@ class BeaconEstimate:
     covariance: FloatArray
 
 
-class Learned(NamedTuple):
+class BeaconInnovation(NamedTuple):
     """What one reading did: an ``Innovation`` with the beacon it came from.
 
     Attributes:
@@ -131,12 +139,12 @@ class BeaconSlam:
     def __init__(
         self,
         settings: SlamSettings,
-        pose0: Pose | Sequence[float],
+        pose0: VehiclePose | Sequence[float],
         P0: FloatArray,
         known: Mapping[BeaconId, BeaconEstimate] | None = None,
     ) -> None:
         self.settings = settings
-        self._motion, self._sensors, trust = settings.motion, Sensors(settings), settings.trust
+        self._motion, self._sensors, trust = settings.motion, MeasurementModels(settings), settings.trust
         delay = (settings.delay_sigma_s,) if settings.delay_sigma_s > 0.0 else ()
         own, shared = self._motion.prior_sigmas, (*self._sensors.prior_sigmas, *delay)
         v, self._ranges = POSE + len(own), len(self._sensors.names)
@@ -151,28 +159,28 @@ class BeaconSlam:
         self._names: tuple[str, ...] = (*self._motion.names, *self._sensors.names, *((DELAY,) if delay else ()))
         self._clock = DeadReckoning(is_delayed=bool(delay))
         self._map = BeaconMap(self.engine, self._shared)
-        self._transport = Transport(self.engine) if trust.transports else None
+        self._transport = HeadingTransport(self.engine) if trust.transports else None
         self.levels = {
             k: NoiseLevel(trust.learn_prior, trust.learn_memory) for k in ("range", "bearing", "rssi", "motion")
         }
         self._learns = trust.learn_memory > 0.0
-        self._fresh = FreshNoise()
+        self._fresh = AddedPoseNoise()
         self._gate, self._knee = trust.gate_sigmas**2, trust.knee_sigmas
-        self._doubts, self.jumps, self.unplaced = Doubts(trust.doubt_pose_after), 0, 0
+        self._doubts, self.jumps, self.unplaced = RejectedReadings(trust.doubt_pose_after), 0, 0
         self.moved: list[tuple[BeaconId, float]] = []
         self._way_m = 0.0
-        self._newcomers = Newcomers(
+        self._newcomers = LandmarkInitializer(
             self.engine, self._sensors, self._map, self._clock, self.levels, self._shared, self._delay
         )
         self.waiting = self._newcomers.waiting
-        self.learned: list[Learned] = []
+        self.learned: list[BeaconInnovation] = []
         for beacon, estimate in (known or {}).items():
             self._map.join(beacon, estimate.mean, estimate.covariance)
 
     @property
-    def pose(self) -> Pose:
+    def pose(self) -> VehiclePose:
         """The vehicle after the last odometry; the heading does not wrap."""
-        return Pose(*self.engine.mean[:POSE].tolist())
+        return VehiclePose(*self.engine.mean[:POSE].tolist())
 
     @property
     def pose_covariance(self) -> FloatArray:
@@ -219,7 +227,7 @@ class BeaconSlam:
             engine.update_row(np.array((rest.column,)), np.ones(1), residual, rest.variance)
             self._follow(corrected)
 
-    def observe(self, readings: Iterable[Reading]) -> list[Learned]:
+    def observe(self, readings: Iterable[Reading]) -> list[BeaconInnovation]:
         """Take readings of any beacons, one after the other; those of new ones begin their place on the map.
 
         Raises:
@@ -264,7 +272,7 @@ class BeaconSlam:
             raise BlockError(beacon, "is not on the map")
         self._map.leave(beacon)
 
-    def _update(self, reading: Reading, entry: Entry) -> Learned:
+    def _update(self, reading: Reading, entry: MapEntry) -> BeaconInnovation:
         """Bearing first, which says whether it is the beacon at all; then the range or strength, if any."""
         model = None if is_direction(reading) else self._sensors.wander(reading)
         if model is not None:
@@ -282,9 +290,11 @@ class BeaconSlam:
         if self._learns:
             self._fresh.clear()
         self._judge(reading, entry, accepted=found.accepted)
-        return Learned(reading.beacon, np.array(residuals), nis, len(residuals), found.accepted, nis + log(spread))
+        return BeaconInnovation(
+            reading.beacon, np.array(residuals), nis, len(residuals), found.accepted, nis + log(spread)
+        )
 
-    def _take(self, reading: Reading, entry: Entry, kind: str, z: float, model: Wander | None) -> RowUpdate:
+    def _take(self, reading: Reading, entry: MapEntry, kind: str, z: float, model: GaussMarkovBias | None) -> RowUpdate:
         """One scalar of a reading."""
         engine, level = self.engine, self.levels[kind]
         x: list[float] = engine.mean.take(entry.columns).tolist()
@@ -313,7 +323,7 @@ class BeaconSlam:
             self.levels["motion"].learn(found.nis, self._fresh.seen(h[0], h[1], h[2]) / found.spread)
         return found
 
-    def _judge(self, reading: Reading, entry: Entry, *, accepted: bool) -> None:
+    def _judge(self, reading: Reading, entry: MapEntry, *, accepted: bool) -> None:
         """Refusals accuse the pose, or a beacon that alone is refused: the one is loosened, the other begins anew."""
         if accepted:
             entry.refused = 0

@@ -60,7 +60,7 @@ class Readings(NamedTuple):
         )
 
 
-class Truth(NamedTuple):
+class ReferencePath(NamedTuple):
     """Where the vehicle was, world frame.
 
     Args:
@@ -99,7 +99,7 @@ class RecordedRun:
     readings: Readings
     beacon_ids: tuple[str, ...]
     beacon_truth_m: Mapping[str, tuple[float, float]]
-    truth: Truth | None
+    truth: ReferencePath | None
     first_pose: tuple[float, float, float]
     warnings: tuple[str, ...]
 
@@ -144,7 +144,7 @@ class Calibrated(NamedTuple):
     sigma: float
 
 
-class Track(NamedTuple):
+class EstimatedPath(NamedTuple):
     """An estimate of a run.
 
     Attributes:

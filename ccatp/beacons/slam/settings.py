@@ -10,15 +10,15 @@ import numpy as np
 from scipy.special import chdtri
 
 from ccatp.beacons.slam.batch_odometry import BatchPriors, BatchSettings, RadioNoise
-from ccatp.beacons.slam.beacon_map import BearingModel, RangeModel, RssiModel, SlamSettings, Trust, Wander
+from ccatp.beacons.slam.beacon_map import BearingModel, GaussMarkovBias, RangeModel, RobustLoss, RssiModel, SlamSettings
 from ccatp.beacons.slam.motion import (
     DifferentialDrive,
     DifferentialNoise,
     Increment,
     Odometry,
-    Pose,
     SlippingVehicle,
     Steering,
+    VehiclePose,
     WheelNoise,
 )
 from ccatp.beacons.slam.path_loss import PathLoss
@@ -52,7 +52,11 @@ def slam_settings(cfg: RecordingConfig, how: SlamFilterConfig) -> SlamSettings:
         rest_speed_m_s=how.rest_speed_m_s,
         rest_turn_rad_s=how.rest_turn_rad_s,
     )
-    wander = Wander(how.wander_share, how.wander_length_m, radio.correlation_s) if radio.correlation_s > 0.0 else None
+    wander = (
+        GaussMarkovBias(how.wander_share, how.wander_length_m, radio.correlation_s)
+        if radio.correlation_s > 0.0
+        else None
+    )
     return SlamSettings(
         motion=DifferentialDrive(noise),
         trust=_trust(how, radio.gate_sigmas),
@@ -76,8 +80,8 @@ def slam_settings(cfg: RecordingConfig, how: SlamFilterConfig) -> SlamSettings:
     )
 
 
-def _trust(how: SlamFilterConfig, gate_sigmas: float) -> Trust:
-    return Trust(
+def _trust(how: SlamFilterConfig, gate_sigmas: float) -> RobustLoss:
+    return RobustLoss(
         gate_sigmas=gate_sigmas,
         knee_sigmas=how.knee_sigmas,
         learn_memory=how.learn_memory,
@@ -90,7 +94,7 @@ def _trust(how: SlamFilterConfig, gate_sigmas: float) -> Trust:
     )
 
 
-class Wheels(Protocol):
+class WheelAngles(Protocol):
     """What the wheels tell of an interval."""
 
     @property
@@ -110,7 +114,7 @@ class Wheels(Protocol):
         """Turn rate to the left; of a differential drive."""
 
 
-class Seen(Protocol):
+class SignalMeasurements(Protocol):
     """The result of a scan as a radio tells it."""
 
     @property
@@ -130,7 +134,7 @@ def new_slam(cfg: RadioConfig) -> SignalSlam:
     """The filter of a configuration, at its believed start."""
     start = cfg.start
     variances = np.square((start.position_sigma_m, start.position_sigma_m, start.heading_sigma_rad))
-    return SignalSlam(signal_settings(cfg), Pose(start.x_m, start.y_m, start.heading_rad), np.diag(variances))
+    return SignalSlam(signal_settings(cfg), VehiclePose(start.x_m, start.y_m, start.heading_rad), np.diag(variances))
 
 
 def signal_settings(cfg: RadioConfig) -> SignalSettings:
@@ -187,7 +191,7 @@ def scan_of(cfg: RadioConfig) -> ReflectorScan:
     return ReflectorScan(scan.readings, scan.bearing_sigma_rad, scan.loss_tolerance)
 
 
-def odometry_of(cfg: RadioConfig, time_s: float, wheels: Wheels) -> Odometry:
+def odometry_of(cfg: RadioConfig, time_s: float, wheels: WheelAngles) -> Odometry:
     """What the wheels tell, as the motion model takes it."""
     interval_s = wheels.interval_s
     if cfg.vehicle.kind == "ackermann":
@@ -195,6 +199,6 @@ def odometry_of(cfg: RadioConfig, time_s: float, wheels: Wheels) -> Odometry:
     return Increment(time_s, interval_s, wheels.speed_m_s * interval_s, wheels.turn_rate_rad_s * interval_s)
 
 
-def readings_of(time_s: float, results: Iterable[Seen | ScanResult]) -> list[RssiReading]:
+def readings_of(time_s: float, results: Iterable[SignalMeasurements | ScanResult]) -> list[RssiReading]:
     """Scan results as readings of the filter."""
     return [RssiReading(time_s, seen.beacon, seen.rssi_dbm, seen.bearing_rad) for seen in results]

@@ -26,7 +26,7 @@ _DB_PER_NEPER = 10.0 / log(10.0)
 Linearise = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 
-class Sight(NamedTuple):
+class RadioModel(NamedTuple):
     """One reading, and where its states stand.
 
     Attributes:
@@ -42,7 +42,7 @@ class Sight(NamedTuple):
     level_variance: float
 
 
-class Rows(NamedTuple):
+class SignalRows(NamedTuple):
     """Rows of an update.
 
     Attributes:
@@ -56,7 +56,7 @@ class Rows(NamedTuple):
     variances: FloatArray
 
 
-def rows_of(sights: Sequence[Sight], radio: slice, path_loss: PathLoss, bearing_sigma_rad: float) -> Rows:
+def rows_of(sights: Sequence[RadioModel], radio: slice, path_loss: PathLoss, bearing_sigma_rad: float) -> SignalRows:
     """The rows of readings of one radio, taken at one pose or several.
 
     z = P_ref - 10 eta log10(r) + b,  beta = atan2(dy, dx) - heading (Auth and Hovey 2018, eqs 2.3 and 2.9).
@@ -85,11 +85,17 @@ def rows_of(sights: Sequence[Sight], radio: slice, path_loss: PathLoss, bearing_
             row = _fill(sight, values, at[sight.pose], first, path_loss, residuals, H, row)
         return residuals, H
 
-    return Rows(columns, linearise, np.array(variances))
+    return SignalRows(columns, linearise, np.array(variances))
 
 
 def _fill(
-    sight: Sight, values: FloatArray, pose: int, radio: int, path_loss: PathLoss, residuals: FloatArray, H: FloatArray,
+    sight: RadioModel,
+    values: FloatArray,
+    pose: int,
+    radio: int,
+    path_loss: PathLoss,
+    residuals: FloatArray,
+    H: FloatArray,
     row: int,
 ) -> int:  # fmt: skip
     """Residual and derivatives of one reading from a row on; the next free row."""
@@ -125,21 +131,21 @@ class PoseKey(NamedTuple):
     number: int
 
 
-class Record(NamedTuple):
+class SignalRecord(NamedTuple):
     """A reading that waits."""
 
     reading: RssiReading
     pose: PoseKey
 
 
-class Prior(NamedTuple):
+class SignalPrior(NamedTuple):
     """Of a radio before its first reading: mean and standard deviations of place and shadowing, shape (b,)."""
 
     mean: FloatArray
     sigmas: FloatArray
 
 
-class Guess(NamedTuple):
+class PositionHypothesis(NamedTuple):
     """What the waiting readings say of a radio: mean (b,) and covariance (b, b)."""
 
     mean: FloatArray
@@ -164,11 +170,11 @@ class _Share(NamedTuple):
     covariance: FloatArray
 
 
-RowsAt = Callable[[list[Record], Callable[[PoseKey], int], slice], Rows]
+RowsAt = Callable[[list[SignalRecord], Callable[[PoseKey], int], slice], SignalRows]
 """Records, where their poses begin in a state, where the radio stands in it, to the rows of an update."""
 
 
-class Newcomers:
+class SignalLandmarkInitializer:
     """Waiting readings of radios, and copies of the poses they belong to.
 
     A level of which the shadowing is unknown tells the range to a factor; an update that is linearised there is wrong
@@ -186,19 +192,19 @@ class Newcomers:
 
     def __init__(self, engine: EkfSlam) -> None:
         self._engine = engine
-        self._records: dict[BeaconId, list[Record]] = {}
+        self._records: dict[BeaconId, list[SignalRecord]] = {}
         self._count = 0
         self._keys: list[PoseKey] = []
         self._poses: FloatArray = np.empty(0)
         self._rows: FloatArray | None = None  # of the poses and, last, y; noise of unit variance
-        self.guesses: dict[BeaconId, Guess] = {}
+        self.guesses: dict[BeaconId, PositionHypothesis] = {}
 
     @property
     def names(self) -> list[BeaconId]:
         """Radios that wait."""
         return list(self._records)
 
-    def records(self, beacon: BeaconId) -> list[Record]:
+    def records(self, beacon: BeaconId) -> list[SignalRecord]:
         """What waits of a radio."""
         return self._records.get(beacon, [])
 
@@ -211,7 +217,7 @@ class Newcomers:
 
     def add(self, reading: RssiReading, pose: PoseKey) -> None:
         """A reading begins to wait."""
-        self._records.setdefault(reading.beacon, []).append(Record(reading, pose))
+        self._records.setdefault(reading.beacon, []).append(SignalRecord(reading, pose))
 
     def drop(self, beacon: BeaconId) -> None:
         """Forget what waits of a radio, and the poses that nothing else waits for."""
@@ -223,7 +229,7 @@ class Newcomers:
             if isinstance(block, PoseKey) and block not in used:
                 self._engine.remove(block)
 
-    def solve(self, priors: Mapping[BeaconId, Prior], rows_at: RowsAt) -> None:
+    def solve(self, priors: Mapping[BeaconId, SignalPrior], rows_at: RowsAt) -> None:
         """Find the most probable places of the radios from all that waits of them.
 
         Args:
@@ -255,7 +261,7 @@ class Newcomers:
         for beacon, share in shares.items():
             carried = share.gain @ share.H
             spread = share.covariance + carried @ covariance @ carried.T
-            self.guesses[beacon] = Guess(means[beacon], 0.5 * (spread + spread.T))
+            self.guesses[beacon] = PositionHypothesis(means[beacon], 0.5 * (spread + spread.T))
 
     def linearisation(self, beacon: BeaconId) -> FloatArray:
         """The whole state, the poses that are kept where the guesses have them, and a radio of the state likewise.
@@ -284,7 +290,7 @@ class Newcomers:
         return x + gain @ (y - H @ engine.mean.take(poses)), 0.5 * (P + P.T)
 
 
-def _eliminated(rows: Rows, poses: FloatArray, mean: FloatArray, prior: Prior) -> _Share:
+def _eliminated(rows: SignalRows, poses: FloatArray, mean: FloatArray, prior: SignalPrior) -> _Share:
     """The rows of one radio, linearised at poses and a place, with the radio taken out by its prior."""
     p = poses.size
     x = np.concatenate([poses, mean])
@@ -302,7 +308,7 @@ def _eliminated(rows: Rows, poses: FloatArray, mean: FloatArray, prior: Prior) -
 
 
 def _advance(
-    means: dict[BeaconId, FloatArray], shares: Mapping[BeaconId, _Share], priors: Mapping[BeaconId, Prior],
+    means: dict[BeaconId, FloatArray], shares: Mapping[BeaconId, _Share], priors: Mapping[BeaconId, SignalPrior],
     poses: FloatArray,
 ) -> float:  # fmt: skip
     """Move the radios to where they are most probable for the poses; the longest of their ways, m."""

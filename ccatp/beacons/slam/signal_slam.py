@@ -6,20 +6,20 @@ from math import cos, hypot, sin, sqrt
 
 import numpy as np
 
-from ccatp.beacons.slam.motion import POSE, MotionModel, Odometry, Pose
+from ccatp.beacons.slam.motion import POSE, MotionModel, Odometry, VehiclePose
 from ccatp.beacons.slam.path_loss import PathLoss
-from ccatp.beacons.slam.range_slam import BeaconEstimate, Learned
+from ccatp.beacons.slam.range_slam import BeaconEstimate, BeaconInnovation
 from ccatp.beacons.slam.recording import BeaconId, RssiReading
 from ccatp.beacons.slam.signal_landmarks import (
     PLACE,
     MovingRadio,
-    Newcomers,
     PoseKey,
-    Prior,
-    Record,
-    Rows,
+    RadioModel,
     ShadowingMap,
-    Sight,
+    SignalLandmarkInitializer,
+    SignalPrior,
+    SignalRecord,
+    SignalRows,
     rows_of,
 )
 from ccatp.core import FloatArray
@@ -75,7 +75,7 @@ class SignalSlam:
         P0: covariance of that, shape (3, 3).
     """
 
-    def __init__(self, settings: SignalSettings, pose0: Pose | Sequence[float], P0: FloatArray) -> None:
+    def __init__(self, settings: SignalSettings, pose0: VehiclePose | Sequence[float], P0: FloatArray) -> None:
         self.settings = settings
         sigmas = np.array(settings.motion.prior_sigmas)
         v = POSE + sigmas.size
@@ -83,13 +83,13 @@ class SignalSlam:
         mean[:POSE], P[:POSE, :POSE] = pose0, P0
         P[range(POSE, v), range(POSE, v)] = sigmas**2
         self.engine = EkfSlam(mean, P)
-        self.learned: list[Learned] = []
-        self.newcomers = Newcomers(self.engine)
+        self.learned: list[BeaconInnovation] = []
+        self.newcomers = SignalLandmarkInitializer(self.engine)
 
     @property
-    def pose(self) -> Pose:
+    def pose(self) -> VehiclePose:
         """The vehicle; the heading does not wrap."""
-        return Pose(*self.newcomers.conditioned(_POSE_COLUMNS)[0].tolist())
+        return VehiclePose(*self.newcomers.conditioned(_POSE_COLUMNS)[0].tolist())
 
     @property
     def pose_covariance(self) -> FloatArray:
@@ -122,7 +122,7 @@ class SignalSlam:
             travel_m = hypot(step.mean[0] - before[0], step.mean[1] - before[1])
             moving.predict(self.engine, odometry.interval_s, travel_m)
 
-    def observe(self, readings: Iterable[RssiReading]) -> list[Learned]:
+    def observe(self, readings: Iterable[RssiReading]) -> list[BeaconInnovation]:
         """Take readings of any radios, one after the other; new ones are placed when their readings suffice.
 
         A new radio of which no bearing is known is not used: a level alone is a circle.
@@ -134,7 +134,9 @@ class SignalSlam:
             if is_known or self._is_moving(reading.beacon):
                 found = self._update_moving(reading) if self._is_moving(reading.beacon) else self._update(reading)
                 if found is not None and is_known:
-                    self.learned.append(Learned(reading.beacon, found.residual, found.nis, found.size, found.accepted))
+                    self.learned.append(
+                        BeaconInnovation(reading.beacon, found.residual, found.nis, found.size, found.accepted)
+                    )
             else:
                 waiting.append(reading)
         self._wait(waiting)
@@ -199,7 +201,7 @@ class SignalSlam:
     def _is_moving(self, beacon: BeaconId) -> bool:
         return self.settings.moving is not None and beacon == self.settings.moving.beacon
 
-    def _prior(self, reading: RssiReading, bearing_rad: float, pose: Sequence[float]) -> Prior:
+    def _prior(self, reading: RssiReading, bearing_rad: float, pose: Sequence[float]) -> SignalPrior:
         """A radio at a range and bearing, spread so widely that readings alone place it."""
         settings = self.settings
         range_m = self.path_loss_of(reading.beacon).median_range_m(reading.rssi_dbm)
@@ -209,9 +211,9 @@ class SignalSlam:
             spread += [1.0] * settings.shadowing.size
         mean = np.zeros(len(spread))
         mean[:PLACE] = pose[0] + range_m * cos(way_rad), pose[1] + range_m * sin(way_rad)
-        return Prior(mean, np.array(spread))
+        return SignalPrior(mean, np.array(spread))
 
-    def _augment(self, beacon: BeaconId, prior: Prior) -> None:
+    def _augment(self, beacon: BeaconId, prior: SignalPrior) -> None:
         none: Columns = np.empty(0, dtype=np.intp)
         size = prior.mean.size
         self.engine.augment(beacon, prior.mean, none, np.zeros((size, 0)), np.eye(size), np.diag(prior.sigmas**2))
@@ -247,7 +249,7 @@ class SignalSlam:
         largest = float(np.linalg.eigvalsh(guess.covariance[:PLACE, :PLACE])[-1])
         return largest < (self.settings.placed_share * range_m) ** 2
 
-    def _settle(self, beacon: BeaconId, prior: Prior) -> None:
+    def _settle(self, beacon: BeaconId, prior: SignalPrior) -> None:
         """A radio joins the map with all that waits of it; the rest of the state learns from it, too.
 
         The model is linearised at the guess: from the prior the way there is long, and not safe without its damping.
@@ -279,21 +281,21 @@ class SignalSlam:
         path_loss = self.path_loss_of(reading.beacon)
         return moving.update(self.engine, reading, path_loss, settings.bearing_sigma_rad, settings.gates)
 
-    def _rows_at(self, records: list[Record], pose_at: Callable[[PoseKey], int], radio: slice) -> Rows:
+    def _rows_at(self, records: list[SignalRecord], pose_at: Callable[[PoseKey], int], radio: slice) -> SignalRows:
         sights = []
         for record in records:
             place = self.engine.block(record.pose).start
             sights.append(self._sight(record.reading, place)._replace(pose=pose_at(record.pose)))
         return self._rows(sights, records[0].reading.beacon, radio)
 
-    def _rows(self, sights: list[Sight], beacon: BeaconId, radio: slice) -> Rows:
+    def _rows(self, sights: list[RadioModel], beacon: BeaconId, radio: slice) -> SignalRows:
         return rows_of(sights, radio, self.path_loss_of(beacon), self.settings.bearing_sigma_rad)
 
-    def _sight(self, reading: RssiReading, pose: int) -> Sight:
+    def _sight(self, reading: RssiReading, pose: int) -> RadioModel:
         """A reading taken at the pose that begins at a column."""
         x_m, y_m = self.engine.mean[pose : pose + PLACE].tolist()
         shadow, rest_db2 = self._shadow(reading.beacon, x_m, y_m)
-        return Sight(reading, pose, shadow, self.path_loss_of(reading.beacon).sigma_db ** 2 + rest_db2)
+        return RadioModel(reading, pose, shadow, self.path_loss_of(reading.beacon).sigma_db ** 2 + rest_db2)
 
     def _shadow(self, beacon: BeaconId, x_m: float, y_m: float) -> tuple[FloatArray, float]:
         """Derivatives of a level by the shadowing states, which end a radio's block, and the variance of the rest."""

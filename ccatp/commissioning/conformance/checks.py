@@ -11,7 +11,7 @@ from ccatp.commissioning.conformance import rule_checks as stories_fans
 from ccatp.commissioning.conformance import rule_checks as stories_rules
 from ccatp.commissioning.conformance import session_checks as stories_input
 from ccatp.commissioning.conformance import session_checks as stories_session
-from ccatp.commissioning.conformance.connections import Stage
+from ccatp.commissioning.conformance.connections import CheckContext
 
 Need = Literal["motion", "real time", "lockstep", "hmac"]
 
@@ -30,7 +30,7 @@ class Check(NamedTuple):
     check_id: str
     promise: str
     method: str
-    story: Callable[[Stage], str]
+    story: Callable[[CheckContext], str]
     needs: tuple[Need, ...] = ()
 
 

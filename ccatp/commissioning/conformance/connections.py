@@ -14,8 +14,8 @@ from contextlib import suppress
 from typing import NamedTuple
 
 from ccatp.commissioning.conformance.judges import (
-    Broken,
-    Frame,
+    CheckedFrame,
+    CheckFailed,
     Message,
     NotApplicable,
     parse_frame,
@@ -32,7 +32,7 @@ _CHUNK_BYTES = 1 << 16
 _RESET = b"\x01\0\0\0\0\0\0\0"  # linger on, for 0 s: close sends RST
 
 
-class Link:
+class RawConnection:
     """A connection.
 
     Args:
@@ -97,7 +97,7 @@ class Link:
         return self._socket.fileno()
 
 
-def receive_any(links: Iterable[Link], wait_s: float) -> None:
+def receive_any(links: Iterable[RawConnection], wait_s: float) -> None:
     """Receive on all links that have something, waiting for the first at most so long."""
     reading = [link for link in links if link.is_open and not link.is_ended]
     if not reading:
@@ -136,7 +136,7 @@ class Facts(NamedTuple):
         return 1.0 / self.frame_hz
 
 
-class Stage:
+class CheckContext:
     """Connections of one check; ``clear`` before the next.
 
     Args:
@@ -152,23 +152,23 @@ class Stage:
     ) -> None:
         self._address, self.facts, self.key, self.timeout_s = address, facts, key, timeout_s
         self._seq = first_seq
-        self._links: list[Link] = []
+        self._links: list[RawConnection] = []
 
     def next_seq(self) -> int:
         """A number above all that were used."""
         self._seq += SEQ_STEP
         return self._seq
 
-    def connect(self) -> Link:
+    def connect(self) -> RawConnection:
         """A fresh connection.
 
         Raises:
             Broken: it is not accepted.
         """
         try:
-            link = Link(self._address, self.timeout_s)
+            link = RawConnection(self._address, self.timeout_s)
         except OSError as error:
-            raise Broken(f"connection not accepted: {error.strerror or error}") from error
+            raise CheckFailed(f"connection not accepted: {error.strerror or error}") from error
         self._links.append(link)
         return link
 
@@ -190,7 +190,7 @@ class Stage:
         """Receive for so long."""
         self.until(lambda: False, wait_s)
 
-    def line(self, link: Link, what: str, wait_s: float | None = None) -> bytes:
+    def line(self, link: RawConnection, what: str, wait_s: float | None = None) -> bytes:
         """The next line on a connection.
 
         Raises:
@@ -200,7 +200,7 @@ class Stage:
         require(bool(link.lines), f"{'connection closed' if link.is_ended else 'silence'} instead of {what}")
         return link.lines.popleft()
 
-    def message(self, link: Link, kind: str, wait_s: float | None = None) -> Message:
+    def message(self, link: RawConnection, kind: str, wait_s: float | None = None) -> Message:
         """The next message on a connection, which has to be of this type.
 
         Raises:
@@ -209,10 +209,10 @@ class Stage:
         line = self.line(link, kind, wait_s)
         message = read_message(line)
         if message is None or message.get("type") != kind:
-            raise Broken(f"{shorten(line)} instead of {kind}")
+            raise CheckFailed(f"{shorten(line)} instead of {kind}")
         return message
 
-    def greet(self) -> tuple[Link, Message]:
+    def greet(self) -> tuple[RawConnection, Message]:
         """A fresh connection and its hello.
 
         Raises:
@@ -233,7 +233,7 @@ class Stage:
             mac = join_mac(self.key, str(hello.get("nonce")), role)
         return encode(Join(role=role, client="conformance", mac=mac or ""))
 
-    def answer(self, link: Link) -> Message:
+    def answer(self, link: RawConnection) -> Message:
         """What the server says to a join, whatever frames come before it.
 
         Raises:
@@ -242,10 +242,10 @@ class Stage:
         line = self.line(link, "joined or refused")
         message = read_message(line)
         if message is None or message.get("type") not in {"joined", "refused"}:
-            raise Broken(f"{shorten(line)} instead of joined or refused")
+            raise CheckFailed(f"{shorten(line)} instead of joined or refused")
         return message
 
-    def join(self, role: Role, patience_s: float | None = None) -> Link:
+    def join(self, role: Role, patience_s: float | None = None) -> RawConnection:
         """A session. The one before may not have ended yet, so a role that is taken is asked for again.
 
         Args:
@@ -267,7 +267,7 @@ class Stage:
             require(answer.get("reason") == "role taken" and not is_over, f"{role} refused: {answer.get('reason')}")
             self.wait(POLL_S)
 
-    def is_closed(self, link: Link, wait_s: float | None = None) -> bool:
+    def is_closed(self, link: RawConnection, wait_s: float | None = None) -> bool:
         """Whether the server closes the connection in time."""
         return self.until(lambda: link.is_ended, wait_s)
 
@@ -292,7 +292,7 @@ NOTHING: Allowed = (False, False, False)
 PATIENCE_S = 2.0  # robot's time in which a command must have come into force
 
 
-class Pair:
+class ControllerAndMonitor:
     """Two sessions, played together.
 
     Args:
@@ -307,19 +307,19 @@ class Pair:
         raw: their lines.
     """
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: CheckContext) -> None:
         self.stage = stage
         self._join()
         self.rates: Rates | None = STILL
         self.allowed: Allowed | None = ALL
-        self.frames: list[Frame] = []
+        self.frames: list[CheckedFrame] = []
         self.messages: tuple[list[Message], list[Message]] = ([], [])
         self.raw: list[bytes] = []
 
     def _join(self) -> None:
         # The monitor first: from its join on the robot needs both keys, so it never waits for one alone.
-        self.monitor: Link = self.stage.join("monitor")
-        self.controller: Link = self.stage.join("controller")
+        self.monitor: RawConnection = self.stage.join("monitor")
+        self.controller: RawConnection = self.stage.join("controller")
         self._driven = self._permitted = -1
 
     def rejoin(self) -> None:
@@ -334,7 +334,7 @@ class Pair:
         self._join()
 
     @property
-    def newest(self) -> Frame:
+    def newest(self) -> CheckedFrame:
         """The newest frame."""
         return self.frames[-1]
 
@@ -364,7 +364,7 @@ class Pair:
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
-    def find(self, is_wanted: Callable[[Frame], bool], robot_s: float = PATIENCE_S) -> Frame | None:
+    def find(self, is_wanted: Callable[[CheckedFrame], bool], robot_s: float = PATIENCE_S) -> CheckedFrame | None:
         """Answer frames until one is wanted; ``None`` after so much of the robot's time, or silence.
 
         The wanted frame itself is not answered yet.
@@ -387,7 +387,7 @@ class Pair:
             if time.monotonic() - quiet_s > self.stage.timeout_s:
                 return None
 
-    def expect(self, is_wanted: Callable[[Frame], bool], otherwise: str) -> Frame:
+    def expect(self, is_wanted: Callable[[CheckedFrame], bool], otherwise: str) -> CheckedFrame:
         """Answer frames until one is wanted.
 
         Raises:
@@ -396,10 +396,10 @@ class Pair:
         frame = self.find(is_wanted)
         if frame is None:
             self._check_sessions()
-            raise Broken(otherwise)
+            raise CheckFailed(otherwise)
         return frame
 
-    def run(self, robot_s: float) -> list[Frame]:
+    def run(self, robot_s: float) -> list[CheckedFrame]:
         """Answer frames for so much of the robot's time; these frames.
 
         Raises:
@@ -412,10 +412,10 @@ class Pair:
         end_s = self.newest.t_s + robot_s
         if self.find(lambda frame: frame.t_s >= end_s, 2.0 * robot_s) is None:
             self._check_sessions()
-            raise Broken(f"no more frames after frame {self.newest.seq}")
+            raise CheckFailed(f"no more frames after frame {self.newest.seq}")
         return self.frames[start:]
 
-    def pause(self, wall_s: float) -> list[Frame]:
+    def pause(self, wall_s: float) -> list[CheckedFrame]:
         """Answer nothing for so much time of this machine; the frames that come all the same."""
         start = len(self.frames)
         end_s = time.monotonic() + wall_s
@@ -424,7 +424,7 @@ class Pair:
             self._take()
         return self.frames[start:]
 
-    def echoed(self, *seqs: int, otherwise: str) -> Frame:
+    def echoed(self, *seqs: int, otherwise: str) -> CheckedFrame:
         """Send nothing newer, until the robot echoes one of these drives.
 
         Where time waits for answers newer drives have to follow; there each is in force for a frame.
@@ -435,7 +435,7 @@ class Pair:
         self.rates = STILL if self.stage.facts.is_lockstep else None
         return self.expect(lambda frame: frame.drive_seq in seqs, otherwise)
 
-    def steady(self) -> Frame:
+    def steady(self) -> CheckedFrame:
         """Both keys turned: standing still by command, not held.
 
         Raises:
@@ -448,7 +448,7 @@ class Pair:
             "held in spite of a new drive and a new permit for each frame",
         )
 
-    def settle(self) -> list[Frame]:
+    def settle(self) -> list[CheckedFrame]:
         """Answer frames until all that was sent before is in force; these frames."""
         start = len(self.frames)
         mark = self.stage.next_seq()

@@ -25,7 +25,7 @@ from ccatp.links.robot_messages import AUTH_HMAC, AUTH_NONE, PROTOCOL
 Outcome = Literal["pass", "fail", "not applicable"]
 
 
-class Broken(Exception):
+class CheckFailed(Exception):
     """A promise of the page was not kept; the text says what was seen instead."""
 
 
@@ -53,13 +53,13 @@ def require(is_kept: bool, seen: str) -> None:
         Broken: it is not.
     """
     if not is_kept:
-        raise Broken(seen)
+        raise CheckFailed(seen)
 
 
 Message = dict[str, Any]
 
 
-class Frame(NamedTuple):
+class CheckedFrame(NamedTuple):
     """What the stories need of a sensors frame.
 
     Attributes:
@@ -112,7 +112,7 @@ def fault_of_line(line: bytes, limit_bytes: int) -> str | None:
     return None if isinstance(value, dict) else f"no object: {shorten(line)}"
 
 
-def parse_frame(message: Message) -> Frame:
+def parse_frame(message: Message) -> CheckedFrame:
     """The frame in a sensors message.
 
     Raises:
@@ -128,7 +128,7 @@ def parse_frame(message: Message) -> Frame:
     require(isinstance(held, bool), f"a sensors frame with cmd.held = {held!r}")
     require(is_numbers(fans, 2), f"a sensors frame with fans = {fans!r}")
     require(isinstance(enc, list), f"a sensors frame with enc = {enc!r}")
-    return Frame(
+    return CheckedFrame(
         seq,
         _number("t", message.get("t")),
         drive_seq,
@@ -455,7 +455,7 @@ LOST_S = 0.05
 EARLY_FRAMES, LATE_FRAMES = 2, 3  # a robot acts from frame to frame
 
 
-def judge_ttl(frames: Sequence[Frame], key: Key, ttl_s: float, frame_s: float) -> str:
+def judge_ttl(frames: Sequence[CheckedFrame], key: Key, ttl_s: float, frame_s: float) -> str:
     """Frames from the last drive or permit on, the other key being renewed all the while.
 
     Args:
@@ -485,7 +485,7 @@ def judge_ttl(frames: Sequence[Frame], key: Key, ttl_s: float, frame_s: float) -
     return f"held at a {key} age of {held_s:.3f} s, ttl_s {ttl_s:g}"
 
 
-def judge_lost(frames: Sequence[Frame], witness: Key, ttl_s: float, frame_s: float) -> str | None:
+def judge_lost(frames: Sequence[CheckedFrame], witness: Key, ttl_s: float, frame_s: float) -> str | None:
     """Frames after one session ended and the other sent a last message right behind.
 
     Args:
@@ -514,7 +514,7 @@ def judge_lost(frames: Sequence[Frame], witness: Key, ttl_s: float, frame_s: flo
     return f"held {max(0.0, 1e3 * (first.t_s - arrival_s)):.0f} ms after the end of the session"
 
 
-def judge_newest(frames: Sequence[Frame], newest: int, old: int) -> None:
+def judge_newest(frames: Sequence[CheckedFrame], newest: int, old: int) -> None:
     """Frames from when a drive and then an older one were sent.
 
     Raises:
@@ -524,7 +524,7 @@ def judge_newest(frames: Sequence[Frame], newest: int, old: int) -> None:
     require(any(frame.drive_seq == newest for frame in frames), f"drive {newest} never came into force")
 
 
-def judge_once(frames: Sequence[Frame], seq: int, frame_s: float) -> None:
+def judge_once(frames: Sequence[CheckedFrame], seq: int, frame_s: float) -> None:
     """Frames in which a drive was sent, and sent again under the same number.
 
     Raises:
@@ -538,7 +538,7 @@ def judge_once(frames: Sequence[Frame], seq: int, frame_s: float) -> None:
     require(spread_s <= 0.5 * frame_s, f"a second drive {seq} came into force {1e3 * spread_s:.0f} ms after the first")
 
 
-def judge_untouched(frames: Sequence[Frame], fans: tuple[float, float], tolerance: float, cause: str) -> None:
+def judge_untouched(frames: Sequence[CheckedFrame], fans: tuple[float, float], tolerance: float, cause: str) -> None:
     """Fan duties of all frames.
 
     Raises:
@@ -553,7 +553,7 @@ def is_duty(seen: tuple[float, float], wanted: tuple[float, float], tolerance: f
     return all(abs(a - b) <= tolerance for a, b in zip(seen, wanted, strict=True))
 
 
-def mean_rates(frames: Sequence[Frame]) -> tuple[float, float] | None:
+def mean_rates(frames: Sequence[CheckedFrame]) -> tuple[float, float] | None:
     """Mean (right, left) wheel rates of all encoder samples in the frames, rad/s; ``None`` without samples."""
     samples = [sample for frame in frames for sample in frame.enc]
     if not samples:
@@ -561,5 +561,5 @@ def mean_rates(frames: Sequence[Frame]) -> tuple[float, float] | None:
     return sum(wr for _, wr, _ in samples) / len(samples), sum(wl for _, _, wl in samples) / len(samples)
 
 
-def _arrival_s(frame: Frame, key: Key) -> float:
+def _arrival_s(frame: CheckedFrame, key: Key) -> float:
     return frame.drive_arrival_s if key == "drive" else frame.permit_arrival_s

@@ -10,10 +10,18 @@ from contextlib import contextmanager, suppress
 from itertools import pairwise
 from typing import NamedTuple
 
-from ccatp.commissioning.conformance.connections import ALL, STILL, Allowed, Facts, Pair, Rates, Stage
+from ccatp.commissioning.conformance.connections import (
+    ALL,
+    STILL,
+    Allowed,
+    CheckContext,
+    ControllerAndMonitor,
+    Facts,
+    Rates,
+)
 from ccatp.commissioning.conformance.judges import (
-    Broken,
-    Frame,
+    CheckedFrame,
+    CheckFailed,
     Message,
     NotApplicable,
     fault_of_line,
@@ -49,7 +57,7 @@ def extent(facts: Facts) -> Extent:
     return Extent(rate_rad_s, speed_m_s, time_s, speed_m_s * time_s, turn_rad)
 
 
-def direction(right: float, left: float, allowed: Allowed, denied: Allowed) -> Callable[[Stage], str]:
+def direction(right: float, left: float, allowed: Allowed, denied: Allowed) -> Callable[[CheckContext], str]:
     """A drive that is denied, then the same allowed.
 
     Args:
@@ -59,10 +67,10 @@ def direction(right: float, left: float, allowed: Allowed, denied: Allowed) -> C
         denied: the one that lacks just this.
     """
 
-    def story(stage: Stage) -> str:
+    def story(stage: CheckContext) -> str:
         rate_rad_s = _rate(stage.facts)
         rates = rate_rad_s * right, rate_rad_s * left
-        with _at_rest(Pair(stage)) as pair:
+        with _at_rest(ControllerAndMonitor(stage)) as pair:
             _stays(pair, rates, denied)
             pair.rates = STILL
             pair.settle()
@@ -72,18 +80,18 @@ def direction(right: float, left: float, allowed: Allowed, denied: Allowed) -> C
     return story
 
 
-def stops_after_ttl(stage: Stage) -> str:
+def stops_after_ttl(stage: CheckContext) -> str:
     """Wheels turn, then drives end."""
-    with _at_rest(Pair(stage)) as pair:
+    with _at_rest(ControllerAndMonitor(stage)) as pair:
         _moves(pair, _forward(stage), ALL)
         pair.rates = None
         pair.run(stage.facts.ttl_s)
         return _stopped(pair, "of the last drive's time-to-live")
 
 
-def stops_when_lost(stage: Stage) -> str:
+def stops_when_lost(stage: CheckContext) -> str:
     """Wheels turn, then the controller is gone."""
-    with _at_rest(Pair(stage)) as pair:
+    with _at_rest(ControllerAndMonitor(stage)) as pair:
         right, left = _forward(stage)
         _moves(pair, (-right, -left), ALL)
         pair.rates = None
@@ -92,7 +100,7 @@ def stops_when_lost(stage: Stage) -> str:
 
 
 @contextmanager
-def _at_rest(pair: Pair) -> Iterator[Pair]:
+def _at_rest(pair: ControllerAndMonitor) -> Iterator[ControllerAndMonitor]:
     """Wheels at rest before and after, whatever happens."""
     try:
         pair.steady()
@@ -102,12 +110,12 @@ def _at_rest(pair: Pair) -> Iterator[Pair]:
         yield pair
     finally:
         pair.rates = STILL
-        with suppress(Broken):
+        with suppress(CheckFailed):
             if not pair.controller.is_ended:
                 pair.steady()
 
 
-def _moves(pair: Pair, rates: Rates, allowed: Allowed) -> Rates:
+def _moves(pair: ControllerAndMonitor, rates: Rates, allowed: Allowed) -> Rates:
     """Drive until the encoders show it, then stop."""
     pair.rates, pair.allowed = rates, allowed
     first = len(pair.frames)
@@ -121,7 +129,7 @@ def _moves(pair: Pair, rates: Rates, allowed: Allowed) -> Rates:
     return seen
 
 
-def _stays(pair: Pair, rates: Rates, allowed: Allowed) -> None:
+def _stays(pair: ControllerAndMonitor, rates: Rates, allowed: Allowed) -> None:
     """Drive for a moment against the permit."""
     pair.allowed = allowed
     pair.settle()
@@ -134,7 +142,7 @@ def _stays(pair: Pair, rates: Rates, allowed: Allowed) -> None:
     require(_is_still(frames, _rate(pair.stage.facts)), f"wheels turn although only {_named(allowed)} is allowed")
 
 
-def _stopped(pair: Pair, end: str) -> str:
+def _stopped(pair: ControllerAndMonitor, end: str) -> str:
     pair.run(STOP_S)
     frames = pair.frames[-WINDOW:]
     seen = mean_rates(frames)
@@ -147,12 +155,12 @@ def _stopped(pair: Pair, end: str) -> str:
     return f"wheels at {seen[0]:.3f}, {seen[1]:.3f} rad/s {STOP_S:g} s after the end {end}"
 
 
-def _is_turning(frames: list[Frame], rates: Rates) -> bool:
+def _is_turning(frames: list[CheckedFrame], rates: Rates) -> bool:
     seen = mean_rates(frames)
     return seen is not None and all(a * b > SHARE * b * b or b == 0.0 for a, b in zip(seen, rates, strict=True))
 
 
-def _is_still(frames: list[Frame], rate_rad_s: float) -> bool:
+def _is_still(frames: list[CheckedFrame], rate_rad_s: float) -> bool:
     seen = mean_rates(frames)
     return seen is None or max(map(abs, seen)) < SHARE * rate_rad_s
 
@@ -161,7 +169,7 @@ def _rate(facts: Facts) -> float:
     return min(RATE_RAD_S, 0.25 * facts.max_wheel_rad_s)
 
 
-def _forward(stage: Stage) -> Rates:
+def _forward(stage: CheckContext) -> Rates:
     return _rate(stage.facts), _rate(stage.facts)
 
 
@@ -177,34 +185,34 @@ FRAMES = 40
 JoinedFrames = Sequence[Message]
 
 
-def judged(judge: Callable[[JoinedFrames], str]) -> Callable[[Stage], str]:
+def judged(judge: Callable[[JoinedFrames], str]) -> Callable[[CheckContext], str]:
     """A story: record a stretch, and judge what the controller got."""
 
-    def story(stage: Stage) -> str:
+    def story(stage: CheckContext) -> str:
         return judge(_record(stage).messages[0])
 
     return story
 
 
-def clocked(judge: Callable[[JoinedFrames, float], str]) -> Callable[[Stage], str]:
+def clocked(judge: Callable[[JoinedFrames, float], str]) -> Callable[[CheckContext], str]:
     """The same for a judge that asks for the rate of the frames."""
 
-    def story(stage: Stage) -> str:
+    def story(stage: CheckContext) -> str:
         return judge(_record(stage).messages[0], stage.facts.frame_hz)
 
     return story
 
 
-def compared(judge: Callable[[JoinedFrames, JoinedFrames], str]) -> Callable[[Stage], str]:
+def compared(judge: Callable[[JoinedFrames, JoinedFrames], str]) -> Callable[[CheckContext], str]:
     """The same for a judge of both sessions' frames."""
 
-    def story(stage: Stage) -> str:
+    def story(stage: CheckContext) -> str:
         return judge(*_record(stage).messages)
 
     return story
 
 
-def lines(stage: Stage) -> str:
+def lines(stage: CheckContext) -> str:
     """The lines as such."""
     pair = _record(stage)
     for line in pair.raw:
@@ -213,19 +221,19 @@ def lines(stage: Stage) -> str:
     return f"{len(pair.raw)} lines, the longest of {max(map(len, pair.raw))} bytes"
 
 
-def before_join(stage: Stage) -> str:
+def before_join(stage: CheckContext) -> str:
     """A client that does not join, beside two that have."""
     onlooker, _ = stage.greet()
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
     pair.run(10 * stage.facts.frame_s)
     require(not any(b'"sensors"' in line for line in onlooker.lines), "sensors frames before the join")
     return f"none in {len(pair.frames)} frames"
 
 
-def echo(stage: Stage) -> str:
+def echo(stage: CheckContext) -> str:
     """Drives one by one: each is echoed by its number."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
     frames = [*pair.run(20 * stage.facts.frame_s), *pair.settle()]
     for before, after in pairwise(frames):
@@ -235,8 +243,8 @@ def echo(stage: Stage) -> str:
     return f"drive {pair.newest.drive_seq} in force, age {ages_s[-1]:.3f} s"
 
 
-def _record(stage: Stage) -> Pair:
-    pair = Pair(stage)
+def _record(stage: CheckContext) -> ControllerAndMonitor:
+    pair = ControllerAndMonitor(stage)
     pair.run(FRAMES * stage.facts.frame_s)
     require(len(pair.messages[0]) > 2, "fewer than three frames for the controller")
     return pair
@@ -246,9 +254,9 @@ LOOK_S = 0.3  # wall time in which a frame would have come
 BEYOND_TTL_S = 0.2
 
 
-def waits_for_drive(stage: Stage) -> str:
+def waits_for_drive(stage: CheckContext) -> str:
     """A permit alone."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
     pair.permit()
     require(not pair.pause(LOOK_S), "a frame without a drive for the one before")
@@ -257,9 +265,9 @@ def waits_for_drive(stage: Stage) -> str:
     return "no frame on a permit alone, one on permit and drive"
 
 
-def waits_for_permit(stage: Stage) -> str:
+def waits_for_permit(stage: CheckContext) -> str:
     """A drive alone."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
     pair.drive()
     require(not pair.pause(LOOK_S), "a frame without a permit for the one before")
@@ -267,9 +275,9 @@ def waits_for_permit(stage: Stage) -> str:
     return "no frame on a drive alone, one on drive and permit"
 
 
-def waits_for_this_frame(stage: Stage) -> str:
+def waits_for_this_frame(stage: CheckContext) -> str:
     """Answers to the frame before."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
     pair.run(2 * stage.facts.frame_s)
     before = pair.newest.seq - 1
@@ -280,9 +288,9 @@ def waits_for_this_frame(stage: Stage) -> str:
     return "no frame on answers to an older one"
 
 
-def one_step(stage: Stage) -> str:
+def one_step(stage: CheckContext) -> str:
     """One frame for each pair of answers, one period on."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     before = pair.steady()
     require(not pair.pause(LOOK_S), "a second frame on one drive and one permit")
     pair.drive()
@@ -294,9 +302,9 @@ def one_step(stage: Stage) -> str:
     return f"one frame on one drive and one permit, {1e3 * step_s:.3g} ms on"
 
 
-def time_stands_still(stage: Stage) -> str:
+def time_stands_still(stage: CheckContext) -> str:
     """An answer held back for longer than it would live."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     before = pair.steady()
     wait_s = stage.facts.ttl_s + BEYOND_TTL_S
     require(not pair.pause(wait_s), "frames while the answer is held back")
@@ -310,6 +318,6 @@ def time_stands_still(stage: Stage) -> str:
     return f"{wait_s:.2f} s of waiting, the ages {frame.age_s:.3f} and {frame.permit_age_s:.3f} s"
 
 
-def _comes(pair: Pair, what: str) -> Frame:
+def _comes(pair: ControllerAndMonitor, what: str) -> CheckedFrame:
     newest = pair.newest.seq
     return pair.expect(lambda frame: frame.seq > newest, f"no frame on {what}")

@@ -7,11 +7,18 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Literal
 
-from ccatp.commissioning.conformance.connections import ALL, NOTHING, STILL, Link, Pair, Stage
+from ccatp.commissioning.conformance.connections import (
+    ALL,
+    NOTHING,
+    STILL,
+    CheckContext,
+    ControllerAndMonitor,
+    RawConnection,
+)
 from ccatp.commissioning.conformance.judges import (
     LATE_FRAMES,
-    Broken,
-    Frame,
+    CheckedFrame,
+    CheckFailed,
     Key,
     NotApplicable,
     is_duty,
@@ -31,25 +38,25 @@ ATTEMPTS = 6
 AHEAD = 1000
 
 
-def no_permit(stage: Stage) -> str:
+def no_permit(stage: CheckContext) -> str:
     """Drives, a monitor, and no permit."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.allowed = None
     return _always_held(pair, "no permit")
 
 
-def no_drive(stage: Stage) -> str:
+def no_drive(stage: CheckContext) -> str:
     """Permits and no drive."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.rates = None
     return _always_held(pair, "no drive")
 
 
-def ttl(key: Key) -> Callable[[Stage], str]:
+def ttl(key: Key) -> Callable[[CheckContext], str]:
     """Both keys, then one is no longer turned."""
 
-    def story(stage: Stage) -> str:
-        pair = Pair(stage)
+    def story(stage: CheckContext) -> str:
+        pair = ControllerAndMonitor(stage)
         pair.steady()
         _withhold(pair, key)
         frames = pair.run(stage.facts.ttl_s + AFTER_TTL_S)
@@ -58,9 +65,9 @@ def ttl(key: Key) -> Callable[[Stage], str]:
     return story
 
 
-def noise_is_no_drive(stage: Stage) -> str:
+def noise_is_no_drive(stage: CheckContext) -> str:
     """Both keys, then nothing but bad drives."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
     pair.rates = None
     first, begin_s = len(pair.frames), pair.newest.t_s
@@ -71,7 +78,7 @@ def noise_is_no_drive(stage: Stage) -> str:
     return judge_ttl(pair.frames[first:], "drive", stage.facts.ttl_s, stage.facts.frame_s)
 
 
-def lost(role: Key, ending: Ending) -> Callable[[Stage], str]:
+def lost(role: Key, ending: Ending) -> Callable[[CheckContext], str]:
     """Both keys, then the session of one ends, and the other sends a last message right behind.
 
     Args:
@@ -79,9 +86,9 @@ def lost(role: Key, ending: Ending) -> Callable[[Stage], str]:
         ending: how.
     """
 
-    def story(stage: Stage) -> str:
+    def story(stage: CheckContext) -> str:
         for _ in range(ATTEMPTS):
-            pair = Pair(stage)
+            pair = ControllerAndMonitor(stage)
             pair.steady()
             frames = _end(pair, role, ending)
             witness: Key = "permit" if role == "drive" else "drive"
@@ -94,9 +101,9 @@ def lost(role: Key, ending: Ending) -> Callable[[Stage], str]:
     return story
 
 
-def newest_drive(stage: Stage) -> str:
+def newest_drive(stage: CheckContext) -> str:
     """An older drive, and one with the same number."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
     newest = stage.next_seq()
     old = newest - 1
@@ -116,9 +123,9 @@ def newest_drive(stage: Stage) -> str:
     return f"drive {old} after {newest} and a second {again} dropped"
 
 
-def newest_permit(stage: Stage) -> str:
+def newest_permit(stage: CheckContext) -> str:
     """Older permits, and one with the same number: the age tells."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
     newest = stage.next_seq()
     pair.allowed = None
@@ -140,9 +147,9 @@ def newest_permit(stage: Stage) -> str:
     return f"permit {newest - 1} after {newest} and a second {newest} dropped"
 
 
-def wrong_role(stage: Stage) -> str:
+def wrong_role(stage: CheckContext) -> str:
     """A drive of the monitor, with the highest number of all."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
     seq = pair.newest.drive_seq + AHEAD  # once obeyed it stays the newest for a while
     pair.monitor.send(b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wl":0.0}\n' % (seq, pair.newest.seq))
@@ -154,7 +161,7 @@ def wrong_role(stage: Stage) -> str:
     return "a drive of the monitor does nothing"
 
 
-def _always_held(pair: Pair, why: str) -> str:
+def _always_held(pair: ControllerAndMonitor, why: str) -> str:
     facts = pair.stage.facts
     frames = pair.run(facts.ttl_s + AFTER_TTL_S)
     begin_s = frames[0].t_s + facts.ttl_s + LATE_FRAMES * facts.frame_s
@@ -164,14 +171,14 @@ def _always_held(pair: Pair, why: str) -> str:
     return f"held in {len(judged)} frames with {why}"
 
 
-def _withhold(pair: Pair, key: Key) -> None:
+def _withhold(pair: ControllerAndMonitor, key: Key) -> None:
     if key == "drive":
         pair.rates = None
     else:
         pair.allowed = None
 
 
-def _end(pair: Pair, role: Key, ending: Ending) -> Sequence[Frame]:
+def _end(pair: ControllerAndMonitor, role: Key, ending: Ending) -> Sequence[CheckedFrame]:
     """End one session, send a last message on the other, and watch."""
     first = len(pair.frames)
     link = pair.controller if role == "drive" else pair.monitor
@@ -188,14 +195,14 @@ def _end(pair: Pair, role: Key, ending: Ending) -> Sequence[Frame]:
     return pair.frames[first:]
 
 
-def _look(pair: Pair) -> None:
+def _look(pair: ControllerAndMonitor) -> None:
     """Give the robot time to take what was sent, then answer frames again."""
     pair.pause(SHORT_S)
     pair.rates, pair.allowed = STILL, ALL
     pair.settle()
 
 
-def _look_twice(pair: Pair, act: Callable[[], object]) -> None:
+def _look_twice(pair: ControllerAndMonitor, act: Callable[[], object]) -> None:
     """Give the robot time to take what was sent, act, and give it time again."""
     if pair.stage.facts.is_lockstep:
         _one_more(pair)
@@ -209,7 +216,7 @@ def _look_twice(pair: Pair, act: Callable[[], object]) -> None:
     _look(pair)
 
 
-def _one_more(pair: Pair) -> Frame:
+def _one_more(pair: ControllerAndMonitor) -> CheckedFrame:
     newest = pair.newest.seq
     return pair.expect(lambda frame: frame.seq > newest, "no frame after drive and permit for the one before")
 
@@ -219,17 +226,17 @@ STEP = 0.05
 TOLERANCE = 0.01  # a duty in eight bits
 
 
-def obeyed(stage: Stage) -> str:
+def obeyed(stage: CheckContext) -> str:
     """A new duty."""
-    with _changed(Pair(stage)) as (pair, duty):
+    with _changed(ControllerAndMonitor(stage)) as (pair, duty):
         pair.settle()
         judge_untouched(pair.settle(), duty, TOLERANCE, "by themselves")
         return f"fans at {_shown(duty)}"
 
 
-def newest(stage: Stage) -> str:
+def newest(stage: CheckContext) -> str:
     """An older command, and one with the same number."""
-    with _changed(Pair(stage)) as (pair, duty):
+    with _changed(ControllerAndMonitor(stage)) as (pair, duty):
         last = pair.fans(duty)
         pair.settle()
         other = _other(duty, stage.facts.fan_floor)
@@ -240,9 +247,9 @@ def newest(stage: Stage) -> str:
         return f"commands {last - 1} and {last} after {last} dropped"
 
 
-def of_the_monitor(stage: Stage) -> str:
+def of_the_monitor(stage: CheckContext) -> str:
     """A command of the wrong role."""
-    with _changed(Pair(stage)) as (pair, duty):
+    with _changed(ControllerAndMonitor(stage)) as (pair, duty):
         left, right = _other(duty, stage.facts.fan_floor)
         seq = stage.next_seq()
         pair.monitor.send(b'{"type":"fans","seq":%d,"duty":[%.3f,%.3f]}\n' % (seq, left, right))
@@ -251,27 +258,27 @@ def of_the_monitor(stage: Stage) -> str:
         return "a command of the monitor does nothing"
 
 
-def after_time_out(stage: Stage) -> str:
+def after_time_out(stage: CheckContext) -> str:
     """Neither drives nor permits for longer than they live."""
-    with _changed(Pair(stage)) as (pair, duty):
+    with _changed(ControllerAndMonitor(stage)) as (pair, duty):
         pair.rates = pair.allowed = None
         judge_untouched(pair.run(stage.facts.ttl_s + AFTER_TTL_S), duty, TOLERANCE, "by a time-out")
         return f"{_shown(duty)} over {stage.facts.ttl_s + AFTER_TTL_S:.2f} s without drive and permit"
 
 
-def after_stop(stage: Stage) -> str:
+def after_stop(stage: CheckContext) -> str:
     """A permit that allows nothing."""
-    with _changed(Pair(stage)) as (pair, duty):
+    with _changed(ControllerAndMonitor(stage)) as (pair, duty):
         pair.allowed = NOTHING
         judge_untouched(pair.run(10 * stage.facts.frame_s), duty, TOLERANCE, "by a permit that allows nothing")
         return f"{_shown(duty)} while nothing is allowed"
 
 
-def after_lost(ending: Ending) -> Callable[[Stage], str]:
+def after_lost(ending: Ending) -> Callable[[CheckContext], str]:
     """Both sessions end, one after the other, and come again."""
 
-    def story(stage: Stage) -> str:
-        with _changed(Pair(stage)) as (pair, duty):
+    def story(stage: CheckContext) -> str:
+        with _changed(ControllerAndMonitor(stage)) as (pair, duty):
             _stories_fans_end(pair.controller, ending)
             if not stage.facts.is_lockstep:  # there the monitor sees no frame without the controller
                 pair.rates = None
@@ -286,12 +293,12 @@ def after_lost(ending: Ending) -> Callable[[Stage], str]:
     return story
 
 
-def floor(stage: Stage) -> str:
+def floor(stage: CheckContext) -> str:
     """A duty a little below the floor."""
     lowest = stage.facts.fan_floor
     if lowest <= 0.0:
         raise NotApplicable("fan_floor 0")
-    with _changed(Pair(stage)) as (pair, _):
+    with _changed(ControllerAndMonitor(stage)) as (pair, _):
         below = max(0.0, lowest - STEP)
         pair.fans((below, below))
         frames = [*pair.settle(), *pair.run(2 * stage.facts.frame_s)]
@@ -304,7 +311,7 @@ def floor(stage: Stage) -> str:
 
 
 @contextmanager
-def _changed(pair: Pair) -> Iterator[tuple[Pair, Duty]]:
+def _changed(pair: ControllerAndMonitor) -> Iterator[tuple[ControllerAndMonitor, Duty]]:
     """Fans at another duty than they were found at; put back at the end."""
     found = pair.steady().fans
     duty = _other(found, pair.stage.facts.fan_floor)
@@ -313,7 +320,7 @@ def _changed(pair: Pair) -> Iterator[tuple[Pair, Duty]]:
         pair.expect(lambda frame: is_duty(frame.fans, duty, TOLERANCE), f"fans never went to {_shown(duty)}")
         yield pair, duty
     finally:
-        with suppress(Broken):
+        with suppress(CheckFailed):
             if pair.controller.is_ended or not pair.controller.is_open:
                 pair.rejoin()
             pair.steady()
@@ -321,7 +328,7 @@ def _changed(pair: Pair) -> Iterator[tuple[Pair, Duty]]:
             pair.expect(lambda frame: is_duty(frame.fans, found, TOLERANCE), "")
 
 
-def _stories_fans_end(link: Link, ending: Ending) -> None:
+def _stories_fans_end(link: RawConnection, ending: Ending) -> None:
     if ending == "RST":
         link.reset()
     else:

@@ -9,9 +9,16 @@ from contextlib import suppress
 from typing import Any
 
 from ccatp.commissioning.conformance.checks import CHECKS, Check, Need
-from ccatp.commissioning.conformance.connections import Facts, Link, Pair, Stage, auth_needs_mac, receive_any
+from ccatp.commissioning.conformance.connections import (
+    CheckContext,
+    ControllerAndMonitor,
+    Facts,
+    RawConnection,
+    auth_needs_mac,
+    receive_any,
+)
 from ccatp.commissioning.conformance.judges import (
-    Broken,
+    CheckFailed,
     Message,
     NotApplicable,
     Result,
@@ -24,7 +31,7 @@ from ccatp.commissioning.conformance.judges import (
     shorten,
 )
 from ccatp.commissioning.conformance.rule_checks import TOLERANCE, Duty
-from ccatp.errors import CcatpError, ExitStatus, UnreachableError
+from ccatp.errors import CcatpError, DaemonUnreachableError, ExitStatus
 
 _WHY: dict[Need, str] = {
     "motion": "--no-motion",
@@ -34,7 +41,7 @@ _WHY: dict[Need, str] = {
 }
 
 
-class NoRobot(UnreachableError):
+class NoRobot(DaemonUnreachableError):
     """Nothing there that speaks the robot link, or another program holds the robot."""
 
 
@@ -95,7 +102,7 @@ class Conformance:
                 self._leave(stage)
         return results
 
-    def _play(self, check: Check, stage: Stage | None, motion: bool) -> Result:
+    def _play(self, check: Check, stage: CheckContext | None, motion: bool) -> Result:
         lacking = None if stage is None else _lacking(check, stage.facts, motion)
         if stage is None and check.check_id not in {"hello", "hello-robot"}:
             return Result(check.check_id, check.promise, "not applicable", f"the hello is of no use: {self._why_unfit}")
@@ -103,7 +110,7 @@ class Conformance:
             return Result(check.check_id, check.promise, "not applicable", _WHY[lacking])
         try:
             seen = self._unfit(check) if stage is None else check.story(stage)
-        except Broken as broken:
+        except CheckFailed as broken:
             return Result(check.check_id, check.promise, "fail", str(broken))
         except NotApplicable as reason:
             return Result(check.check_id, check.promise, "not applicable", str(reason))
@@ -121,7 +128,7 @@ class Conformance:
     def _hello(self) -> Message:
         """What the server says first."""
         try:
-            link = Link(self._address, self._timeout_s)
+            link = RawConnection(self._address, self._timeout_s)
         except OSError as error:
             reason = error.strerror or str(error)
             raise NoRobot(f"no server at {self._where}: {reason}; start it first") from error
@@ -143,7 +150,7 @@ class Conformance:
         try:
             judge_fields(hello)
             judge_robot(hello)
-        except Broken as broken:
+        except CheckFailed as broken:
             self._why_unfit = str(broken)
         robot = robot if isinstance(robot, dict) else {}
         sizes: list[Any] = [robot.get(name) for name in ("wheel_radius_m", "wheel_base_m", "max_wheel_rad_s")]
@@ -157,28 +164,28 @@ class Conformance:
             robot["fan_floor"],
         )  # fmt: skip
 
-    def _stage(self, facts: Facts) -> Stage:
+    def _stage(self, facts: Facts) -> CheckContext:
         """See that nobody else holds the robot, and how the fans stand; a stage with numbers above those in use."""
-        stage = Stage(self._address, facts, self._key, self._timeout_s, 0)
+        stage = CheckContext(self._address, facts, self._key, self._timeout_s, 0)
         first_seq = 0
         try:
-            pair = Pair(stage)
+            pair = ControllerAndMonitor(stage)
             frame = pair.expect(lambda _: True, "no frame")
-        except Broken as broken:
+        except CheckFailed as broken:
             if "role taken" in str(broken):
                 raise NoRobot(f"another program drives the robot at {self._where}; end it first") from None
         else:
             self._fans, first_seq = frame.fans, max(frame.seq, frame.drive_seq, 0)
         finally:
             stage.clear()
-        return Stage(self._address, facts, self._key, self._timeout_s, first_seq)
+        return CheckContext(self._address, facts, self._key, self._timeout_s, first_seq)
 
-    def _leave(self, stage: Stage) -> None:
+    def _leave(self, stage: CheckContext) -> None:
         """Fans as they were found; then no session, so that the wheels are held."""
         stage.clear()
         fans = self._fans
-        with suppress(Broken, NotApplicable):
-            pair = Pair(stage)
+        with suppress(CheckFailed, NotApplicable):
+            pair = ControllerAndMonitor(stage)
             if fans is not None and not is_duty(pair.steady().fans, fans, TOLERANCE):
                 pair.fans(fans)
                 pair.settle()

@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 
 from ccatp.commissioning.conformance import judges as judge_hello
-from ccatp.commissioning.conformance.connections import ALL, STILL, Link, Pair, Stage
-from ccatp.commissioning.conformance.judges import Broken, NotApplicable, require
+from ccatp.commissioning.conformance.connections import ALL, STILL, CheckContext, ControllerAndMonitor, RawConnection
+from ccatp.commissioning.conformance.judges import CheckFailed, NotApplicable, require
 from ccatp.links.robot_codec import encode, format_drive, join_mac
 from ccatp.links.robot_messages import MAX_LINE_BYTES, Drive, Role
 
@@ -20,27 +20,27 @@ NOISE_S = 0.3  # between bad lines of a holder that says nothing else
 ROLES: tuple[Role, Role] = ("controller", "monitor")
 
 
-def hello_fields(stage: Stage) -> str:
+def hello_fields(stage: CheckContext) -> str:
     """One hello."""
     return judge_hello.judge_fields(stage.greet()[1])
 
 
-def hello_robot(stage: Stage) -> str:
+def hello_robot(stage: CheckContext) -> str:
     """What it says of the robot."""
     return judge_hello.judge_robot(stage.greet()[1])
 
 
-def nonces(stage: Stage) -> str:
+def nonces(stage: CheckContext) -> str:
     """Several connections."""
     return judge_hello.judge_nonces([stage.greet()[1] for _ in range(CONNECTIONS)])
 
 
-def boots(stage: Stage) -> str:
+def boots(stage: CheckContext) -> str:
     """Several connections."""
     return judge_hello.judge_boots([stage.greet()[1] for _ in range(CONNECTIONS)])
 
 
-def join_both(stage: Stage) -> str:
+def join_both(stage: CheckContext) -> str:
     """Each role, at once."""
     said = []
     for role in ROLES:
@@ -50,7 +50,7 @@ def join_both(stage: Stage) -> str:
     return "; ".join(said)
 
 
-def join_in_time(stage: Stage) -> str:
+def join_in_time(stage: CheckContext) -> str:
     """A client that takes its time."""
     link, hello = stage.greet()
     require(not stage.is_closed(link, IN_TIME_S), f"closed within {IN_TIME_S:g} s of the hello")
@@ -60,7 +60,7 @@ def join_in_time(stage: Stage) -> str:
     return f"joined {IN_TIME_S:g} s after the hello"
 
 
-def join_late(stage: Stage) -> str:
+def join_late(stage: CheckContext) -> str:
     """A client that takes too long."""
     began_s = time.monotonic()
     link, hello = stage.greet()
@@ -74,28 +74,28 @@ def join_late(stage: Stage) -> str:
     return f"{spent_s:.2f} s after the hello: {_refused(stage, link, ('bad join',))}"
 
 
-def join_unknown_role(stage: Stage) -> str:
+def join_unknown_role(stage: CheckContext) -> str:
     """A role that there is not."""
     link, _ = stage.greet()
     link.send(b'{"type":"join","role":"king","client":"conformance","mac":""}\n')
     return _refused(stage, link, ("bad join",))
 
 
-def join_without_client(stage: Stage) -> str:
+def join_without_client(stage: CheckContext) -> str:
     """A join with a key missing."""
     link, _ = stage.greet()
     link.send(b'{"type":"join","role":"controller"}\n')
     return _refused(stage, link, ("bad join",))
 
 
-def command_before_join(stage: Stage) -> str:
+def command_before_join(stage: CheckContext) -> str:
     """A drive as the first message."""
     link, _ = stage.greet()
     link.send(encode(Drive(seq=stage.next_seq(), ack=0, wr=0.0, wl=0.0)))
     return _refused(stage, link, ("bad join",))
 
 
-def role_taken(stage: Stage) -> str:
+def role_taken(stage: CheckContext) -> str:
     """A second client for each role."""
     holders = [stage.join(role) for role in ROLES]
     said = ""
@@ -108,9 +108,9 @@ def role_taken(stage: Stage) -> str:
     return said
 
 
-def refused_is_harmless(stage: Stage) -> str:
+def refused_is_harmless(stage: CheckContext) -> str:
     """Clients that are refused for every reason, while two others drive."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
     first = len(pair.frames)
     intruders = 0
@@ -134,7 +134,7 @@ def refused_is_harmless(stage: Stage) -> str:
     return f"{intruders} refused, {len(pair.frames) - first} frames of the holders go on"
 
 
-def mac_right(stage: Stage) -> str:
+def mac_right(stage: CheckContext) -> str:
     """The right mac."""
     _needs_key(stage)
     link, hello = stage.greet()
@@ -142,7 +142,7 @@ def mac_right(stage: Stage) -> str:
     return _joined(stage, link, "monitor")
 
 
-def mac_wrong(stage: Stage) -> str:
+def mac_wrong(stage: CheckContext) -> str:
     """A mac made with another key."""
     key = _needs_key(stage)
     link, hello = stage.greet()
@@ -150,7 +150,7 @@ def mac_wrong(stage: Stage) -> str:
     return _refused(stage, link, ("bad mac",))
 
 
-def mac_missing(stage: Stage) -> str:
+def mac_missing(stage: CheckContext) -> str:
     """No mac."""
     _needs_key(stage)
     link, _ = stage.greet()
@@ -158,7 +158,7 @@ def mac_missing(stage: Stage) -> str:
     return _refused(stage, link, ("bad mac", "bad join"))
 
 
-def mac_of_another(stage: Stage) -> str:
+def mac_of_another(stage: CheckContext) -> str:
     """A mac that was right on another connection."""
     _needs_key(stage)
     _, other = stage.greet()
@@ -167,7 +167,7 @@ def mac_of_another(stage: Stage) -> str:
     return _refused(stage, link, ("bad mac",))
 
 
-def mac_of_the_other_role(stage: Stage) -> str:
+def mac_of_the_other_role(stage: CheckContext) -> str:
     """A mac that is right for the other role."""
     key = _needs_key(stage)
     link, hello = stage.greet()
@@ -175,9 +175,9 @@ def mac_of_the_other_role(stage: Stage) -> str:
     return _refused(stage, link, ("bad mac",))
 
 
-def take_over(stage: Stage) -> str:
+def take_over(stage: CheckContext) -> str:
     """A holder that sends nothing but bad lines."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
     pair.rates = None
     silent_s = pair.newest.t_s
@@ -194,25 +194,27 @@ def take_over(stage: Stage) -> str:
     try:
         # Not for long: now the holder is silent altogether.
         link = stage.join("controller", patience_s=0.2 * SILENCE_S)
-    except Broken as broken:
-        raise Broken(f"{broken} after {pair.newest.t_s - silent_s:.2f} s without a valid line of its holder") from None
+    except CheckFailed as broken:
+        raise CheckFailed(
+            f"{broken} after {pair.newest.t_s - silent_s:.2f} s without a valid line of its holder"
+        ) from None
     return f"refused at {STILL_HELD_S:g} s of silence, joined at {TAKEN_S:g} s"
 
 
-def _be_noisy(pair: Pair, until_s: float) -> None:
+def _be_noisy(pair: ControllerAndMonitor, until_s: float) -> None:
     """Bad lines until the robot's clock shows ``until_s``."""
     while pair.newest.t_s < until_s:
         pair.controller.send(b'{"type":"drive","seq":\n')
         pair.run(NOISE_S)
 
 
-def _needs_key(stage: Stage) -> bytes:
+def _needs_key(stage: CheckContext) -> bytes:
     if stage.key is None:
         raise NotApplicable("no --key")
     return stage.key
 
 
-def _joined(stage: Stage, link: Link, role: Role) -> str:
+def _joined(stage: CheckContext, link: RawConnection, role: Role) -> str:
     answer = stage.answer(link)
     require(answer["type"] == "joined", f"{role} refused: {answer.get('reason')}")
     session = answer.get("session")
@@ -221,7 +223,7 @@ def _joined(stage: Stage, link: Link, role: Role) -> str:
     return f"{role} joined, session {session}"
 
 
-def _refused(stage: Stage, link: Link, reasons: tuple[str, ...]) -> str:
+def _refused(stage: CheckContext, link: RawConnection, reasons: tuple[str, ...]) -> str:
     """Wait for a refusal and the end of the connection; a close without a word is one where only time has run out."""
     answer = stage.answer(link)
     require(answer["type"] == "refused", f"{answer['type']} instead of refused: {' or '.join(reasons)}")
@@ -248,12 +250,12 @@ BAD_DRIVES: dict[str, bytes] = {
 }
 
 
-def dropped(kind: str) -> Callable[[Stage], str]:
+def dropped(kind: str) -> Callable[[CheckContext], str]:
     """A bad drive with the higher number in front of a good one: only if it is dropped does the good one count."""
     template = BAD_DRIVES[kind]
 
-    def story(stage: Stage) -> str:
-        pair = Pair(stage)
+    def story(stage: CheckContext) -> str:
+        pair = ControllerAndMonitor(stage)
         pair.steady()
         good = stage.next_seq()
         bad = good + 1
@@ -266,18 +268,18 @@ def dropped(kind: str) -> Callable[[Stage], str]:
     return story
 
 
-def unknown_key(stage: Stage) -> str:
+def unknown_key(stage: CheckContext) -> str:
     """A good drive with keys of its own."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
     line = b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wl":0.0,"colour":"red","more":{"x":[1,2,null]}}\n'
     _obeyed(pair, lambda seq, ack: line % (seq, ack), "a drive with unknown keys was not obeyed")
     return "a drive with unknown keys is obeyed"
 
 
-def unknown_type(stage: Stage) -> str:
+def unknown_type(stage: CheckContext) -> str:
     """More of them in a second than bad lines are allowed."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
     pair.controller.send(b'{"type":"dance","seq":7,"partner":null}\n' * STRANGERS)
     pair.run(5 * stage.facts.frame_s)
@@ -285,9 +287,9 @@ def unknown_type(stage: Stage) -> str:
     return f"{STRANGERS} lines of an unknown type, the session goes on"
 
 
-def few_bad_lines(stage: Stage) -> str:
+def few_bad_lines(stage: CheckContext) -> str:
     """As many as are allowed."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
     pair.controller.send(b"garbage\n" * TOLERATED)
     pair.run(5 * stage.facts.frame_s)
@@ -295,7 +297,7 @@ def few_bad_lines(stage: Stage) -> str:
     return f"{TOLERATED} bad lines at once, the session goes on"
 
 
-def many_bad_lines(stage: Stage) -> str:
+def many_bad_lines(stage: CheckContext) -> str:
     """One more, on a session that nobody needs."""
     link = stage.join("monitor")
     link.send(b"garbage\n" * (TOLERATED + 1))
@@ -303,7 +305,7 @@ def many_bad_lines(stage: Stage) -> str:
     return f"{TOLERATED + 1} bad lines at once close the session"
 
 
-def long_line(stage: Stage) -> str:
+def long_line(stage: CheckContext) -> str:
     """A line over the limit, with and without its end."""
     for end in (b"", b"\n"):
         link = stage.join("monitor")
@@ -312,9 +314,9 @@ def long_line(stage: Stage) -> str:
     return "closes the session"
 
 
-def longest_line(stage: Stage) -> str:
+def longest_line(stage: CheckContext) -> str:
     """A drive of just the limit, LF included."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
 
     def line(seq: int, ack: int) -> bytes:
@@ -325,7 +327,7 @@ def longest_line(stage: Stage) -> str:
     return f"a drive of {MAX_LINE_BYTES} bytes is obeyed"
 
 
-def single_bytes(stage: Stage) -> str:
+def single_bytes(stage: CheckContext) -> str:
     """A join and a drive, byte by byte."""
     link, hello = stage.greet()
     for byte in stage.join_line(hello, "monitor"):
@@ -333,7 +335,7 @@ def single_bytes(stage: Stage) -> str:
         time.sleep(BYTE_S)
     require(stage.answer(link)["type"] == "joined", "a join in single bytes is refused")
     stage.clear()
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
     seq = stage.next_seq()
     for byte in format_drive(seq, pair.newest.seq, 0.0, 0.0):
@@ -344,9 +346,9 @@ def single_bytes(stage: Stage) -> str:
     return "join and drive obeyed"
 
 
-def many_lines(stage: Stage) -> str:
+def many_lines(stage: CheckContext) -> str:
     """Drives in one segment: the last counts."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     pair.steady()
     before, first = pair.newest.seq - 1, stage.next_seq()
     last = first + CROWD - 1
@@ -359,9 +361,9 @@ def many_lines(stage: Stage) -> str:
     return f"the last of {CROWD} drives obeyed"
 
 
-def glued_lines(stage: Stage) -> str:
+def glued_lines(stage: CheckContext) -> str:
     """An unknown type, fans that change nothing, and a drive, in one segment."""
-    pair = Pair(stage)
+    pair = ControllerAndMonitor(stage)
     left, right = pair.steady().fans
     seq = stage.next_seq()
     fans = b'{"type":"fans","seq":%d,"duty":[%.6f,%.6f]}\n' % (stage.next_seq(), left, right)
@@ -370,7 +372,7 @@ def glued_lines(stage: Stage) -> str:
     return "a drive behind two other lines is obeyed"
 
 
-def _obeyed(pair: Pair, line: Callable[[int, int], bytes], otherwise: str) -> None:
+def _obeyed(pair: ControllerAndMonitor, line: Callable[[int, int], bytes], otherwise: str) -> None:
     """Send a drive as it is, and answer frames until it is echoed."""
     seq = pair.stage.next_seq()
     pair.controller.send(line(seq, pair.newest.seq))

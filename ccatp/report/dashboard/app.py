@@ -28,7 +28,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from ccatp.links.channels import BadRequest, OperatorCommand, format_request, parse_reply
 from ccatp.links.rpc import MAX_REPLY_BYTES
 from ccatp.report.dashboard.access import host_refusal, origin_refusal, token_refusal
-from ccatp.report.dashboard.hub import Hub, Stream
+from ccatp.report.dashboard.hub import EventStream, StateBroadcaster
 from ccatp.report.dashboard.metrics import CONTENT_TYPE, metrics_text
 
 FOLDER = Path(__file__).resolve().parent / "static"
@@ -63,14 +63,14 @@ COMMANDS = (OperatorCommand.PAUSE, OperatorCommand.RESUME, OperatorCommand.ABORT
 MOST = 8
 
 
-class Answer(NamedTuple):
+class RouteResponse(NamedTuple):
     """What became of a command: the HTTP status, and the refusal or nothing."""
 
     http_status: int
     refusal: str
 
 
-class CommandDesk:
+class CommandEndpoint:
     """Asks the main loop.
 
     Args:
@@ -85,20 +85,20 @@ class CommandDesk:
         self._endpoint, self._timeout_s = endpoint, timeout_s
         self._asking = 0
 
-    async def ask(self, command: OperatorCommand) -> Answer:
+    async def ask(self, command: OperatorCommand) -> RouteResponse:
         """Hand on one command; never raises for what the daemon does or does not."""
         if self._asking >= MOST:
-            return Answer(503, f"{command}: {MOST} commands wait for their answers already")
+            return RouteResponse(503, f"{command}: {MOST} commands wait for their answers already")
         self._asking += 1
         try:
             async with asyncio.timeout(self._timeout_s):
                 return await self._exchange(command)
         except TimeoutError:
-            return Answer(504, f"{command}: no answer from the main loop within {self._timeout_s:g} s")
+            return RouteResponse(504, f"{command}: no answer from the main loop within {self._timeout_s:g} s")
         finally:
             self._asking -= 1
 
-    async def _exchange(self, command: OperatorCommand) -> Answer:
+    async def _exchange(self, command: OperatorCommand) -> RouteResponse:
         with self._context.socket(zmq.DEALER) as peer:
             peer.setsockopt(zmq.LINGER, 0)
             peer.setsockopt(zmq.MAXMSGSIZE, MAX_REPLY_BYTES)
@@ -108,8 +108,10 @@ class CommandDesk:
         try:
             reply = parse_reply(frame)
         except BadRequest as error:
-            return Answer(502, f"{command}: the main loop answered with {error}")
-        return Answer(200, "") if reply["ok"] else Answer(409, f"{command}: {reply.get('error', 'refused')}")
+            return RouteResponse(502, f"{command}: the main loop answered with {error}")
+        return (
+            RouteResponse(200, "") if reply["ok"] else RouteResponse(409, f"{command}: {reply.get('error', 'refused')}")
+        )
 
 
 Note = Callable[[str, dict[str, object]], None]
@@ -133,7 +135,7 @@ _EVENTS = (
 )
 
 
-class Door:
+class HostCheckMiddleware:
     """Refuses who asks by a wrong name, and puts the page's headers on every answer.
 
     Args:
@@ -164,7 +166,7 @@ class Door:
 class Events:
     """The stream of the state, until the page goes or the dashboard ends."""
 
-    def __init__(self, hub: Hub) -> None:
+    def __init__(self, hub: StateBroadcaster) -> None:
         self._hub = hub
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -182,13 +184,13 @@ class Events:
         await send({"type": "http.response.body", "body": b"", "more_body": False})
 
 
-async def _wait_for_end(receive: Receive, stream: Stream) -> None:
+async def _wait_for_end(receive: Receive, stream: EventStream) -> None:
     while (await receive())["type"] != "http.disconnect":
         pass
     stream.end(b"")
 
 
-class Answers:
+class ReadRoutes:
     """What is answered to each question.
 
     Args:
@@ -196,7 +198,7 @@ class Answers:
         ground: what does not change, ``ccatp.report.dashboard.survey_view``.
     """
 
-    def __init__(self, hub: Hub, ground: Mapping[str, Any]) -> None:
+    def __init__(self, hub: StateBroadcaster, ground: Mapping[str, Any]) -> None:
         self._hub, self._ground = hub, ground
         self._ground_json, self._files = msgspec.json.encode(ground), read_static_files()
 
@@ -228,7 +230,7 @@ class Answers:
         return Response(text, headers={"content-type": CONTENT_TYPE, "cache-control": "no-store"})
 
 
-class Counter:
+class CommandRoutes:
     """Where commands are taken: from our own page, and with the token if there is one.
 
     Args:
@@ -237,7 +239,7 @@ class Counter:
         note: a line for the log, with its fields.
     """
 
-    def __init__(self, desk: CommandDesk, token: str | None, note: Note) -> None:
+    def __init__(self, desk: CommandEndpoint, token: str | None, note: Note) -> None:
         self._desk, self._token, self._note = desk, token, note
 
     async def obey(self, name: OperatorCommand, request: Request) -> Response:
@@ -266,8 +268,8 @@ class Counter:
 
 
 def build_app(
-    hub: Hub,
-    desk: CommandDesk,
+    hub: StateBroadcaster,
+    desk: CommandEndpoint,
     ground: Mapping[str, Any],
     *,
     host_names: Collection[str],
@@ -284,7 +286,7 @@ def build_app(
         token: that commands have to carry, or ``None``.
         note: a line for the log, with its fields.
     """
-    answers, counter = Answers(hub, ground), Counter(desk, token, note)
+    answers, counter = ReadRoutes(hub, ground), CommandRoutes(desk, token, note)
     routes = [
         Route("/", answers.page),
         Route("/static/{name}", answers.static),
@@ -295,7 +297,7 @@ def build_app(
         Route("/metrics", answers.metrics),
         *(counter.route(name) for name in COMMANDS),
     ]
-    door = Middleware(Door, names=host_names)
+    door = Middleware(HostCheckMiddleware, names=host_names)
     return Starlette(routes=routes, middleware=[door], exception_handlers={HTTPException: _refused})
 
 

@@ -7,11 +7,11 @@ from collections.abc import Iterable, Mapping
 from math import hypot, sqrt
 from typing import Any
 
-from ccatp.beacons.mission import State
+from ccatp.beacons.mission import BeaconState
 from ccatp.config.beacon_models import RadioConfig
-from ccatp.links.topics import BeaconArrival, BeaconEllipse, BeaconMap, BeaconPlaces, BeaconTrack, BeaconTruth
+from ccatp.links.topics import BeaconArrival, BeaconEllipse, BeaconMapMessage, BeaconPlaces, BeaconTrack, BeaconTruth
 from ccatp.report.dashboard.survey_view import MEASURED, PLANNED, Second, TruthCompare
-from ccatp.report.dashboard.view import View
+from ccatp.report.dashboard.view import RunStateView
 
 CODES = ["normal operation", "near something", "operation aborted"]
 TITLES = {"zigbee": "ZigBee beacons", "follow": "Following a radio", "cricket": "Ultrasonic motes"}
@@ -53,7 +53,7 @@ def beacon_ground(cfg: RadioConfig, *, is_sim: bool, needs_token: bool) -> dict[
         "wheel_base_m": cfg.vehicle.track_m,
         "arrival_tolerance_mm": 1e3 * cfg.control.arrival_radius_m,
         "rate_hz": cfg.dashboard.rate_hz,
-        "states": [str(state) for state in State],
+        "states": [str(state) for state in BeaconState],
         "codes": CODES,
         "plots": _plots(cfg),
         "hides": HIDDEN,
@@ -83,7 +83,7 @@ thing that a distance sensor sees (m)."""
 _DRAWN = frozenset(("robot", "trail", "waypoint"))
 
 
-class BeaconView(View):
+class BeaconView(RunStateView):
     """What a page shows of a mission among beacons.
 
     Args:
@@ -98,13 +98,13 @@ class BeaconView(View):
         self._states = [PLANNED] * len(beacon_waypoints(cfg))
         self._lap = 0
         self._changed: set[int] = set()
-        self._map: BeaconMap | None = None
+        self._map: BeaconMapMessage | None = None
         self._places: Mapping[str, tuple[float, float]] = {}
         self._truth = TruthCompare()
         self._sigma_second = -1
         self._takers |= {
             BeaconArrival: self._take_arrival,
-            BeaconMap: self._take_map,
+            BeaconMapMessage: self._take_map,
             BeaconPlaces: self._take_places,
             BeaconTrack: self._take_track,
             BeaconTruth: self._take_truth,
@@ -122,7 +122,7 @@ class BeaconView(View):
     def _take_places(self, places: BeaconPlaces, _now_s: float) -> None:
         self._places = places.places
 
-    def _take_map(self, message: BeaconMap, _now_s: float) -> None:
+    def _take_map(self, message: BeaconMapMessage, _now_s: float) -> None:
         before, self._map = self._map, message
         t_s = round(message.t_s, 2)
         self._trail.add(message.pose[0], message.pose[1])
@@ -158,7 +158,7 @@ class BeaconView(View):
         for second in seconds:
             self._series["error"].add(round(second.t_s, 2), round(second.error_mm, 3), round(second.three_sigma_mm, 3))
 
-    def _static(self, message: BeaconMap) -> dict[str, BeaconEllipse]:
+    def _static(self, message: BeaconMapMessage) -> dict[str, BeaconEllipse]:
         """The beacons that stand."""
         target = self._cfg.follow.target if self._cfg.follow.is_active else ""
         return {name: ellipse for name, ellipse in message.beacons.items() if name != target}

@@ -13,7 +13,7 @@ import msgspec
 import zmq
 
 from ccatp.links.bus import Subscriber
-from ccatp.report.dashboard.view import View
+from ccatp.report.dashboard.view import RunStateView
 
 
 class Wants(NamedTuple):
@@ -40,7 +40,7 @@ _OF_DANGER = ("presence.danger", "danger_event")
 MOST = 2_000
 
 
-class Feed:
+class BusReader:
     """Subscriptions of the dashboard.
 
     Nobody waits for them: a run begins when its own processes listen, whoever looks on.
@@ -57,7 +57,7 @@ class Feed:
         self,
         context: zmq.Context[zmq.Socket[bytes]],
         endpoint_of: Callable[[str], str],
-        view: View,
+        view: RunStateView,
         *,
         is_sim: bool,
         wants: Wants = SURVEY,
@@ -141,7 +141,7 @@ PICTURE_WAIT_S, PICTURE_LOOK_S = 0.3, 0.02
 _encoder = msgspec.json.Encoder()
 
 
-class Stream:
+class EventStream:
     """What one page is told; one that cannot follow is told everything anew when it can."""
 
     def __init__(self) -> None:
@@ -178,7 +178,7 @@ class Stream:
                 return
 
 
-class Hub:
+class StateBroadcaster:
     """Ticks while pages are open, and rests while none is.
 
     Args:
@@ -187,10 +187,10 @@ class Hub:
         rate_hz: of the state.
     """
 
-    def __init__(self, feed: Feed, view: View, rate_hz: float) -> None:
+    def __init__(self, feed: BusReader, view: RunStateView, rate_hz: float) -> None:
         """No page yet."""
         self._feed, self._view, self._period_s = feed, view, 1.0 / rate_hz
-        self._streams: set[Stream] = set()
+        self._streams: set[EventStream] = set()
         self._wake = asyncio.Event()
         self._glanced_s = float("-inf")
         self._is_over = False
@@ -201,9 +201,9 @@ class Hub:
         return len(self._streams)
 
     @contextmanager
-    def open(self) -> Iterator[Stream]:
+    def open(self) -> Iterator[EventStream]:
         """A page looks."""
-        stream = Stream()
+        stream = EventStream()
         if self._is_over:
             stream.end()
         self._streams.add(stream)

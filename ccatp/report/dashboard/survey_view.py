@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 from ccatp.config.models import Config
 from ccatp.core import PanelId, PanelPose, PointId, Vector3
-from ccatp.links.topics import Arrival, FixMessage, MissionStatus, Picture, Track, Truth
+from ccatp.links.topics import ArrivalMessage, DisplayState, FixMessage, MissionStatus, TrackMessage, TruthMessage
 from ccatp.mirror.mirror import Mirror, deck_poses
 from ccatp.mirror.surface import ConvergenceError
-from ccatp.report.dashboard.view import View
+from ccatp.report.dashboard.view import RunStateView
 from ccatp.survey.planning.route import ORDERS
-from ccatp.survey.state import State
+from ccatp.survey.state import MissionState
 
 CODES = ["normal operation", "near the mirror's edge", "operation aborted"]
 WORDS = {
@@ -72,7 +72,7 @@ def ground(mirror: Mirror, cfg: Config, *, is_sim: bool, needs_token: bool) -> d
         "wheel_base_m": cfg.robot.wheel_base_m,
         "arrival_tolerance_mm": 1e3 * cfg.mission.arrival_tolerance_m,
         "rate_hz": cfg.dashboard.rate_hz,
-        "states": [str(state) for state in State],
+        "states": [str(state) for state in MissionState],
         "codes": CODES,
         "plots": ["arrival", "error", "jump", "nis"],
         "hides": [],
@@ -145,7 +145,7 @@ SERIES = ("arrival", "jump", "nis", "error")
 of freedom; true error and three sigma of the position (mm), the latter alone where nobody knows the truth."""
 
 
-class SurveyView(View):
+class SurveyView(RunStateView):
     """What a page shows of a survey.
 
     Args:
@@ -167,10 +167,10 @@ class SurveyView(View):
         self._truth = TruthCompare()
         self._sigma_second = -1
         self._takers |= {
-            Arrival: self._take_arrival,
+            ArrivalMessage: self._take_arrival,
             FixMessage: self._take_fix,
-            Track: self._take_track,
-            Truth: self._take_truth,
+            TrackMessage: self._take_track,
+            TruthMessage: self._take_truth,
         }
 
     def begin_with(self, measured: Iterable[tuple[PointId, float, Vector3]], skipped: Iterable[PointId]) -> None:
@@ -193,13 +193,13 @@ class SurveyView(View):
                 if index is not None and self._states[index] != MEASURED:
                     self._mark(index, SKIPPED)
 
-    def _take_picture(self, picture: Picture, now_s: float) -> None:
+    def _take_picture(self, picture: DisplayState, now_s: float) -> None:
         before = self._picture
         super()._take_picture(picture, now_s)
         if picture.size and (before is None or picture.nis != before.nis):
             self._series["nis"].add(round(picture.t_s, 2), round(picture.nis, 3), picture.size)
 
-    def _take_arrival(self, arrival: Arrival, _now_s: float) -> None:
+    def _take_arrival(self, arrival: ArrivalMessage, _now_s: float) -> None:
         index = self._index.get(PointId(*arrival.point))
         if index is not None and self._states[index] != MEASURED:
             self._mark(index, ARRIVED)
@@ -228,7 +228,7 @@ class SurveyView(View):
         if not self.is_tracking:
             self._trail.add(x_m, y_m)
 
-    def _take_track(self, track: Track, _now_s: float) -> None:
+    def _take_track(self, track: TrackMessage, _now_s: float) -> None:
         rows = [row for row in track.rows if TruthCompare.is_compared(row[0])]
         if not rows:
             return
@@ -241,7 +241,7 @@ class SurveyView(View):
                 self._sigma_second = int(row[1])
                 self._series["error"].add(round(row[1], 2), None, round(3e3 * row[7], 3))
 
-    def _take_truth(self, truth: Truth, _now_s: float) -> None:
+    def _take_truth(self, truth: TruthMessage, _now_s: float) -> None:
         self._compared(self._truth.truth(row[:4] for row in truth.rows))
 
     def _compared(self, seconds: Iterable[Second]) -> None:

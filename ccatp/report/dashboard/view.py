@@ -14,7 +14,7 @@ import msgspec
 from ccatp.core import Verdict, danger_text
 from ccatp.links.liveness import Liveness, kind_of
 from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import BY_NAME, DangerEvent, Log, Message, MissionStatus, Picture, Presence, Scene
+from ccatp.links.topics import BY_NAME, DangerEvent, DisplayState, Heartbeat, LogMessage, Message, MissionStatus, Scene
 
 LOOPS = ("main", "danger")
 NAMES = {"main": "main loop", "danger": "danger loop"}
@@ -22,7 +22,7 @@ PICTURE_STALE_S = BY_NAME["picture"].stale_after_s
 STATUS_STALE_S = BY_NAME["mission"].stale_after_s
 
 
-class Link(NamedTuple):
+class LinkState(NamedTuple):
     """One end as the page shows it: its name, what it is at, seconds since its last word, and whether that is well."""
 
     name: str
@@ -54,14 +54,14 @@ class Links:
         """Nothing heard."""
         self._has_laser = has_laser
         self._liveness = Liveness()
-        self._presences: dict[str, Presence] = {}
+        self._presences: dict[str, Heartbeat] = {}
         self._cut_s: dict[str, float] = {}
         self._restarts: dict[str, int] = {}
         self._picture_s: float | None = None
         self.fix_s: float | None = None
         self.is_over = False
 
-    def presence(self, presence: Presence) -> None:
+    def presence(self, presence: Heartbeat) -> None:
         """A process is there."""
         name = presence.process
         before = self._presences.get(name)
@@ -108,7 +108,7 @@ class Links:
         losses = self.losses(now_s)
         return str(losses[0]) if losses else self._liveness.trouble(now_s)
 
-    def shown(self, now_s: float) -> list[Link]:
+    def shown(self, now_s: float) -> list[LinkState]:
         """All ends."""
         links = [self._loop(name, now_s) for name in LOOPS]
         links.append(self._robot(now_s))
@@ -150,25 +150,25 @@ class Links:
             return None
         return main.frame_age_s + now_s - main.t_s
 
-    def _loop(self, name: str, now_s: float) -> Link:
+    def _loop(self, name: str, now_s: float) -> LinkState:
         presence = self._presences.get(name)
         if name in self._cut_s:
-            return Link(NAMES[name], "gone", now_s - self._cut_s[name], False)
+            return LinkState(NAMES[name], "gone", now_s - self._cut_s[name], False)
         if presence is None:
-            return Link(NAMES[name], "not heard of", None, False)
-        return Link(NAMES[name], presence.phase, max(now_s - presence.t_s, 0.0), self._loss(name, now_s) is None)
+            return LinkState(NAMES[name], "not heard of", None, False)
+        return LinkState(NAMES[name], presence.phase, max(now_s - presence.t_s, 0.0), self._loss(name, now_s) is None)
 
-    def _robot(self, now_s: float) -> Link:
+    def _robot(self, now_s: float) -> LinkState:
         age_s = self._frame_age_s(now_s)
         if age_s is None:
-            return Link("robot", "no frame yet", None, False)
+            return LinkState("robot", "no frame yet", None, False)
         is_lost = self._robot_loss(now_s) is not None or self._loss("main", now_s) is not None
-        return Link("robot", "lost" if is_lost else "frames", max(age_s, 0.0), not is_lost)
+        return LinkState("robot", "lost" if is_lost else "frames", max(age_s, 0.0), not is_lost)
 
-    def _laser(self, now_s: float) -> Link:
+    def _laser(self, now_s: float) -> LinkState:
         if self.fix_s is None:
-            return Link("laser", "no fix yet", None, True)
-        return Link("laser", "last fix", now_s - self.fix_s, True)
+            return LinkState("laser", "no fix yet", None, True)
+        return LinkState("laser", "last fix", now_s - self.fix_s, True)
 
 
 Row = tuple[Any, ...]
@@ -275,7 +275,7 @@ MAX_PATH, MAX_SAMPLES, MAX_LINES = 12_000, 4_000, 200
 _line = msgspec.json.Decoder(Sensors)
 
 
-class View:
+class RunStateView:
     """Hears the bus, and tells a page what is new. Missions add what is theirs.
 
     Args:
@@ -296,7 +296,7 @@ class View:
         self.status: MissionStatus | None = None
         self.is_tracking = False
         self._status_s = self._verdict_s = float("-inf")
-        self._picture: Picture | None = None
+        self._picture: DisplayState | None = None
         self._sensors: Sensors | None = None
         self._verdict: Verdict | DangerEvent | None = None
         self._scene: Scene | None = None
@@ -306,13 +306,13 @@ class View:
         self._lines = Lines(MAX_LINES)
         self._ticks = 0
         self._takers: dict[type, Callable[[Any, float], None]] = {
-            Presence: self._take_presence,
+            Heartbeat: self._take_presence,
             MissionStatus: self._take_status,
-            Picture: self._take_picture,
+            DisplayState: self._take_picture,
             Verdict: self._take_verdict,
             DangerEvent: self._take_verdict,
             Scene: self._take_scene,
-            Log: self._take_log,
+            LogMessage: self._take_log,
         }
 
     # -- what comes in --------------------------------------------------------------------------------------------
@@ -328,14 +328,14 @@ class View:
         if taker is not None:
             taker(message, now_s)
 
-    def _take_presence(self, presence: Presence, _now_s: float) -> None:
+    def _take_presence(self, presence: Heartbeat, _now_s: float) -> None:
         self.links.presence(presence)
 
     def _take_status(self, status: MissionStatus, now_s: float) -> None:
         self.status, self._status_s = status, now_s
         self.links.status(status)
 
-    def _take_picture(self, picture: Picture, now_s: float) -> None:
+    def _take_picture(self, picture: DisplayState, now_s: float) -> None:
         self.links.picture(now_s)
         self._picture = picture
         try:
@@ -352,7 +352,7 @@ class View:
     def _take_scene(self, scene: Scene, _now_s: float) -> None:
         self._scene, self._is_scene_new = scene, True
 
-    def _take_log(self, log: Log, _now_s: float) -> None:
+    def _take_log(self, log: LogMessage, _now_s: float) -> None:
         self._lines.add(round(log.t_s, 2), log.level, log.text)
 
     def look_away(self) -> None:

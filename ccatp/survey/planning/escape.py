@@ -13,8 +13,15 @@ import numpy as np
 from ccatp.config.models import LimitsConfig, MissionConfig, RobotConfig
 from ccatp.core import DeckPose, FloatArray, Stop, StopKind
 from ccatp.mirror.mirror import Mirror
-from ccatp.survey.planning.legs import Body, Place, UnreachableError, build_body, course_of_heading, sensor_depths
-from ccatp.survey.planning.search import Arrival, leg_time, turn_time
+from ccatp.survey.planning.legs import (
+    Body,
+    LegPlace,
+    UnreachablePointError,
+    build_body,
+    course_of_heading,
+    sensor_depths,
+)
+from ccatp.survey.planning.search import SearchNode, leg_time, turn_time
 
 _TURNS_RAD = np.radians(np.arange(-180, 181, 2))
 _NO_TURN = len(_TURNS_RAD) // 2
@@ -26,7 +33,7 @@ _ROUNDING_M = 1e-6
 _MILLIMETRE_M = 1e-3
 
 
-def find_escape(mirror: Mirror, body: Body, start: Arrival, limits: LimitsConfig) -> Arrival:
+def find_escape(mirror: Mirror, body: Body, start: SearchNode, limits: LimitsConfig) -> SearchNode:
     """The best single turn and straight leg, forward or in reverse, to a place where the robot can turn freely.
 
     Best is what brings no sensor nearer to the rim than ``turn_clearance_m``, or than it is already; of those the
@@ -50,7 +57,7 @@ def find_escape(mirror: Mirror, body: Body, start: Arrival, limits: LimitsConfig
     sensors = sensor_depths(mirror, body, xs, ys, courses[:, None, None])
     least_sensors = np.minimum(np.minimum.accumulate(sensors, axis=2), _swept(sensors[:, 0, 0])[:, None, None])
     allowed_m = min(body.turn_clearance_m + _BETWEEN_TURNS_M, float(sensors[_NO_TURN, 0, 0])) - _ROUNDING_M
-    best: tuple[int, float, float, Arrival] | None = None
+    best: tuple[int, float, float, SearchNode] | None = None
     for turn, way in np.ndindex(ways.shape):
         free = depths[turn, way] >= body.turning_depth_m
         step = int(np.argmax(free))
@@ -61,12 +68,12 @@ def find_escape(mirror: Mirror, body: Body, start: Arrival, limits: LimitsConfig
         cost_s = turn_time(turn_rad, limits) + leg_time(float(_DISTANCES_M[step]), limits)
         if best is not None and (deficit_mm, cost_s, turn_rad) >= best[:3]:
             continue
-        place = Place(float(xs[turn, way, step]), float(ys[turn, way, step]), float(depths[turn, way, step]))
+        place = LegPlace(float(xs[turn, way, step]), float(ys[turn, way, step]), float(depths[turn, way, step]))
         # Never outward, not even past a re-entrant corner.
         if mirror.rim.segment_clearance_m(x0, y0, place.x_m, place.y_m) >= start.place.depth_m - _ROUNDING_M:
-            best = deficit_mm, cost_s, turn_rad, Arrival(place, float(courses[turn]), cost_s, way == 1, start)
+            best = deficit_mm, cost_s, turn_rad, SearchNode(place, float(courses[turn]), cost_s, way == 1, start)
     if best is None:
-        raise UnreachableError(
+        raise UnreachablePointError(
             f"no place to turn within 0.4 m of ({x0:.3f}, {y0:.3f}) m, {start.place.depth_m:.3f} m from the rim of "
             f"{mirror.name}"
         )
@@ -86,7 +93,7 @@ _SLANTS_RAD = np.radians([0, 2, -2, 4, -4, 6, -6, 8, -8, 10, -10, 12, -12, 14, -
 _COURSES_RAD = np.radians([0, 90, 180, 270])[:, None] + _SLANTS_RAD  # (sides, slants)
 
 
-def find_retreats(mirror: Mirror, body: Body, places: list[Place]) -> list[tuple[Place, ...]]:
+def find_retreats(mirror: Mirror, body: Body, places: list[LegPlace]) -> list[tuple[LegPlace, ...]]:
     """For each place where the robot cannot turn freely the nearest ones around it where it can.
 
     At most one to each side of the grid of panels, straight or slightly slanted: slanted where the place is in a
@@ -106,14 +113,14 @@ def find_retreats(mirror: Mirror, body: Body, places: list[Place]) -> list[tuple
     depths = mirror.rim.signed_distances_m(
         x0 + _RETREAT_M * np.cos(_COURSES_RAD)[..., None], y0 + _RETREAT_M * np.sin(_COURSES_RAD)[..., None]
     )
-    found: list[tuple[Place, ...]] = [()] * len(places)
+    found: list[tuple[LegPlace, ...]] = [()] * len(places)
     for k, sides in zip(near, depths, strict=True):
         nearest = [_nearest(places[k], body, *side) for side in zip(sides, _COURSES_RAD, strict=True)]
         found[k] = tuple(retreat for retreat in nearest if retreat is not None)
     return found
 
 
-def _nearest(place: Place, body: Body, depths: FloatArray, courses_rad: FloatArray) -> Place | None:
+def _nearest(place: LegPlace, body: Body, depths: FloatArray, courses_rad: FloatArray) -> LegPlace | None:
     """Nearest place to turn on one side, by the straightest of equally long moves."""
     faced = np.array([place.can_face(course) or place.can_face(course + pi) for course in courses_rad.tolist()])
     is_good = (depths >= body.turning_depth_m) & faced[:, None]
@@ -122,7 +129,9 @@ def _nearest(place: Place, body: Body, depths: FloatArray, courses_rad: FloatArr
     step = int(np.argmax(is_good.any(axis=0)))
     slant = int(np.argmax(is_good[:, step]))
     distance_m, course = float(_RETREAT_M[step]), float(courses_rad[slant])
-    return Place(place.x_m + distance_m * cos(course), place.y_m + distance_m * sin(course), float(depths[slant, step]))
+    return LegPlace(
+        place.x_m + distance_m * cos(course), place.y_m + distance_m * sin(course), float(depths[slant, step])
+    )
 
 
 _SHORTEST_M = 0.08  # a leg shorter than this teaches less than it costs

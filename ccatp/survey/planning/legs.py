@@ -67,7 +67,7 @@ class Stance:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
+class LegPlace:
     """A place on the deck.
 
     Attributes:
@@ -143,7 +143,7 @@ def sensor_depths(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray, co
     return np.asarray(mirror.rim.signed_distances_m(px, py).min(axis=-1), dtype=np.float64)
 
 
-def build_places(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray) -> list[Place]:
+def build_places(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray) -> list[LegPlace]:
     """Places at deck coordinates of shape (n,), m, each with its stance where it is near the rim."""
     depths = mirror.rim.signed_distances_m(xs, ys)
     near = np.flatnonzero(depths < body.turning_depth_m)
@@ -153,7 +153,7 @@ def build_places(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray) -> 
     )
     stances = {int(k): Stance(row) for k, row in zip(near, free, strict=True)}
     return [
-        Place(x, y, depth, stances.get(k))
+        LegPlace(x, y, depth, stances.get(k))
         for k, (x, y, depth) in enumerate(zip(xs.tolist(), ys.tolist(), depths.tolist(), strict=True))
     ]
 
@@ -197,7 +197,7 @@ class LegRules:
         self._explained_m = _LONGEST_CROSSING * mirror.gap_m
         self._beside_m = self._half_gap_m + _BESIDE_M
 
-    def clearance_m(self, a: Place, b: Place) -> float:
+    def clearance_m(self, a: LegPlace, b: LegPlace) -> float:
         """Clearance of the leg from ``a`` to ``b``: exact, or a lower bound that suffices for every rule, m."""
         # The distance from the rim changes by at most the distance driven.
         at_least = 0.5 * (a.depth_m + b.depth_m - hypot(b.x_m - a.x_m, b.y_m - a.y_m))
@@ -209,11 +209,11 @@ class LegRules:
         """Whether the robot's origin may pass the rim so near."""
         return clearance_m >= self._body.leg_clearance_m - _ROUNDING_M
 
-    def is_clear(self, a: Place, b: Place) -> bool:
+    def is_clear(self, a: LegPlace, b: LegPlace) -> bool:
         """Whether the robot's origin keeps the clearance of a leg from ``a`` to ``b``."""
         return self.is_enough(self.clearance_m(a, b))
 
-    def are_sensors_clear(self, a: Place, b: Place, course_rad: float, clearance_m: float) -> bool:
+    def are_sensors_clear(self, a: LegPlace, b: LegPlace, course_rad: float, clearance_m: float) -> bool:
         """Whether the sensors of a robot that faces ``course_rad`` all the way keep their clearance between the ends.
 
         Where no re-entrant corner is near, the mirror is convex, and a sensor is nearest to the rim at an end of its
@@ -238,7 +238,7 @@ class LegRules:
             for ox, oy in self._sensors
         )
 
-    def grazing(self, a: Place, b: Place, course_rad: float) -> Grazing:
+    def grazing(self, a: LegPlace, b: LegPlace, course_rad: float) -> Grazing:
         """Whether a sensor may run along a seam on the leg from ``a`` to ``b``, which looks like the mirror's edge.
 
         Args:
@@ -273,7 +273,7 @@ class LegRules:
         within = length if across == 0.0 else overlap / across * length
         return within > self._explained_m
 
-    def way_around(self, a: Place, b: Place) -> tuple[Place, ...]:
+    def way_around(self, a: LegPlace, b: LegPlace) -> tuple[LegPlace, ...]:
         """Best chain of places that leads from ``a`` around stepped corners to ``b``, ends left out.
 
         Dijkstra's algorithm on the visibility graph of the corners, inset by the clearance, and of the two elbows from
@@ -307,26 +307,26 @@ class LegRules:
             chain.append(places[k])
         return tuple(reversed(chain))
 
-    def elbows(self, sources: Iterable[Place], targets: Sequence[Place]) -> list[Place]:
+    def elbows(self, sources: Iterable[LegPlace], targets: Sequence[LegPlace]) -> list[LegPlace]:
         """Elbows between all places of two groups between which the straight leg is not good."""
         return [elbow for a in sources for b in targets if not self._is_good(a, b) for elbow in self._elbows(a, b)]
 
-    def _is_good(self, a: Place, b: Place) -> bool:
+    def _is_good(self, a: LegPlace, b: LegPlace) -> bool:
         return self.is_clear(a, b) and not self._grazing_facing(a, b)
 
-    def _grazing_facing(self, a: Place, b: Place) -> Grazing:
+    def _grazing_facing(self, a: LegPlace, b: LegPlace) -> Grazing:
         return self.grazing(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m))
 
-    def _elbows(self, a: Place, b: Place) -> list[Place]:
+    def _elbows(self, a: LegPlace, b: LegPlace) -> list[LegPlace]:
         """The corners of the rectangle over a and b at which the robot can turn."""
         places = []
         for x, y in ((a.x_m, b.y_m), (b.x_m, a.y_m)):
             depth = self._rim.signed_distance_m(x, y)
             if depth >= self._body.turning_depth_m:
-                places.append(Place(x, y, depth))
+                places.append(LegPlace(x, y, depth))
         return places
 
-    def _corner_distance_m(self, a: Place, b: Place) -> float:
+    def _corner_distance_m(self, a: LegPlace, b: LegPlace) -> float:
         return min((_segment_distance(corner, a, b) for corner in self._corners), default=inf)
 
 
@@ -343,7 +343,7 @@ def _seam_lines(mirror: Mirror) -> tuple[list[float], list[float]]:
     return sorted(xs), sorted(ys)
 
 
-def _reentrant_corners(mirror: Mirror, body: Body) -> tuple[list[tuple[float, float]], list[Place]]:
+def _reentrant_corners(mirror: Mirror, body: Body) -> tuple[list[tuple[float, float]], list[LegPlace]]:
     """Corners of the rim at which the mirror has 270 degrees, and for each the place inset by the clearance."""
     vertices = [(float(x), float(y)) for x, y in mirror.rim.vertices]
     corners, nodes = [], []
@@ -359,11 +359,11 @@ def _reentrant_corners(mirror: Mirror, body: Body) -> tuple[list[tuple[float, fl
         x, y = x1 + inset * (cos(before) + cos(after)), y1 + inset * (sin(before) + sin(after))
         depth = mirror.rim.signed_distance_m(x, y)
         if depth >= body.turning_depth_m:
-            nodes.append(Place(x, y, depth))
+            nodes.append(LegPlace(x, y, depth))
     return corners, nodes
 
 
-def _segment_distance(p: tuple[float, float], a: Place, b: Place) -> float:
+def _segment_distance(p: tuple[float, float], a: LegPlace, b: LegPlace) -> float:
     ux, uy = b.x_m - a.x_m, b.y_m - a.y_m
     wx, wy = p[0] - a.x_m, p[1] - a.y_m
     length2 = ux * ux + uy * uy
@@ -394,7 +394,7 @@ class OutsideMirrorError(PlanError):
     """A path was asked for from a place that is not on the mirror."""
 
 
-class UnreachableError(PlanError):
+class UnreachablePointError(PlanError):
     """No sequence of turns and straight legs leads there with the clearances of the configuration."""
 
     exit_status = ExitStatus.USAGE

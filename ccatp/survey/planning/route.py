@@ -19,13 +19,13 @@ from ccatp.survey.planning.escape import find_escape, find_retreats
 from ccatp.survey.planning.legs import (
     LegRules,
     OutsideMirrorError,
-    UnreachableError,
+    UnreachablePointError,
     build_body,
     build_places,
     course_of_heading,
     in_parts,
 )
-from ccatp.survey.planning.search import Arrival, Search, Target, leg_lengths, path_time, stop_times
+from ccatp.survey.planning.search import Search, SearchNode, Target, leg_lengths, path_time, stop_times
 
 _REPLANNED_POINTS = 4  # at least, before the old route is joined again
 
@@ -170,7 +170,7 @@ def _stops(
         )
     search = Search(LegRules(mirror, body), limits)
     retreats = find_retreats(mirror, body, places)
-    first = Arrival(places[0], course_of_heading(mirror, start), 0.0)
+    first = SearchNode(places[0], course_of_heading(mirror, start), 0.0)
     if places[0].stance is not None:  # too near the rim to turn: away from it first, as on the way home
         first, retreats[0] = find_escape(mirror, body, first, limits), ()
     arrivals, before = [first], 0
@@ -181,7 +181,7 @@ def _stops(
         elif out_of_reach is not None:
             out_of_reach.append(point)
         else:
-            raise UnreachableError(
+            raise UnreachablePointError(
                 f"mission: no safe way to point {point.row}-{point.col}-{point.point} of {mirror.name}, "
                 f"{places[k].depth_m:.3f} m from the rim, with leg_clearance_m = {mission.leg_clearance_m} and "
                 f"turn_clearance_m = {mission.turn_clearance_m}"

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from ccatp.config.models import LimitsConfig
 from ccatp.core import DeckPose, Stop, StopKind, bearing, difference
 from ccatp.mirror.mirror import Mirror
-from ccatp.survey.planning.legs import LegRules, Place, heading_of_course
+from ccatp.survey.planning.legs import LegPlace, LegRules, heading_of_course
 
 # A leg that begins within this of the heading is steered for on the way and needs no turn in place, by
 # control.straight_tolerance_rad; the points of a row, dropped on the curved surface, lie on a straight line to 10 mrad.
@@ -116,12 +116,12 @@ _GRAZING_S = (0.0, 3.0, 60.0)
 class Target(NamedTuple):
     """A place to be reached, and the places near it where the robot may turn before and after."""
 
-    place: Place
-    retreats: tuple[Place, ...] = ()
+    place: LegPlace
+    retreats: tuple[LegPlace, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Arrival:
+class SearchNode:
     """The robot has arrived at a place by the cheapest way that ends with this leg.
 
     Attributes:
@@ -132,13 +132,13 @@ class Arrival:
         before: the arrival before; ``None`` at the start.
     """
 
-    place: Place
+    place: LegPlace
     course_rad: float
     cost_s: float
     reverse: bool = False
-    before: "Arrival | None" = None
+    before: "SearchNode | None" = None
 
-    def path(self) -> list["Arrival"]:
+    def path(self) -> list["SearchNode"]:
         """The arrivals on the way here, the start left out."""
         path = []
         arrival = self
@@ -148,7 +148,7 @@ class Arrival:
         return path[::-1]
 
 
-Frontier = dict[Place, list[Arrival]]
+Frontier = dict[LegPlace, list[SearchNode]]
 
 
 class Search:
@@ -166,7 +166,9 @@ class Search:
         """Keep the rules."""
         self._rules, self._limits = rules, limits
 
-    def advance(self, arrivals: Sequence[Arrival], retreats: tuple[Place, ...], target: Target) -> list[Arrival]:
+    def advance(
+        self, arrivals: Sequence[SearchNode], retreats: tuple[LegPlace, ...], target: Target
+    ) -> list[SearchNode]:
         """All sensible ways on from one place to the next target; none where there is no way.
 
         Args:
@@ -188,7 +190,7 @@ class Search:
         frontier = _merged(frontier, self._extend(frontier, target.retreats))
         return self._extend(frontier, (target.place,)).get(target.place, [])
 
-    def _extend(self, frontier: Frontier, targets: Iterable[Place]) -> Frontier:
+    def _extend(self, frontier: Frontier, targets: Iterable[LegPlace]) -> Frontier:
         """One leg further: for each target, each place it is reached from and each direction the cheapest way."""
         reached: Frontier = {}
         for target in targets:
@@ -197,7 +199,7 @@ class Search:
                 reached[target] = ways
         return reached
 
-    def _legs(self, source: Place, arrivals: list[Arrival], target: Place) -> Iterator[Arrival]:
+    def _legs(self, source: LegPlace, arrivals: list[SearchNode], target: LegPlace) -> Iterator[SearchNode]:
         dx, dy = target.x_m - source.x_m, target.y_m - source.y_m
         clearance_m = self._rules.clearance_m(source, target)
         if not self._rules.is_enough(clearance_m):
@@ -212,10 +214,12 @@ class Search:
                 turned_s, arrival = best
                 total_s = turned_s + cost_s + (_REVERSE_S if reverse else 0.0)
                 total_s += _GRAZING_S[self._rules.grazing(source, target, course)]
-                yield Arrival(target, course, total_s, reverse, arrival)
+                yield SearchNode(target, course, total_s, reverse, arrival)
 
-    def _cheapest_turn(self, place: Place, arrivals: list[Arrival], course: float) -> tuple[float, Arrival] | None:
-        best: tuple[float, Arrival] | None = None
+    def _cheapest_turn(
+        self, place: LegPlace, arrivals: list[SearchNode], course: float
+    ) -> tuple[float, SearchNode] | None:
+        best: tuple[float, SearchNode] | None = None
         for arrival in arrivals:
             cost_s = arrival.cost_s + turn_time(difference(course, arrival.course_rad), self._limits)
             if (best is None or cost_s < best[0]) and place.can_turn(arrival.course_rad, course):

@@ -9,13 +9,13 @@ from ccatp.survey.planning.escape import find_escape, find_retreats
 from ccatp.survey.planning.legs import (
     LegRules,
     OutsideMirrorError,
-    UnreachableError,
+    UnreachablePointError,
     build_body,
     build_places,
     course_of_heading,
     in_parts,
 )
-from ccatp.survey.planning.search import Arrival, Search, Target, turn_time
+from ccatp.survey.planning.search import Search, SearchNode, Target, turn_time
 
 # About one stop per panel: there the robot points itself at base anew.
 _LONGEST_LEG_M = 0.75
@@ -51,13 +51,13 @@ def plan_way_home(
             f"no way home from ({start.x_m:.3f}, {start.y_m:.3f}) m: {-here.depth_m:.3f} m beyond the rim of "
             f"{mirror.name}"
         )
-    first = Arrival(here, course_of_heading(mirror, start), 0.0)
+    first = SearchNode(here, course_of_heading(mirror, start), 0.0)
     if here.stance is not None:
         first = find_escape(mirror, body, first, limits)
     search = Search(LegRules(mirror, body), limits)
     arrivals = search.advance([first], (), Target(goal, find_retreats(mirror, body, [goal])[0]))
     if not arrivals:
-        raise UnreachableError(
+        raise UnreachablePointError(
             f"no safe way to base at ({base.x_m:.3f}, {base.y_m:.3f}) m, {goal.depth_m:.3f} m from the rim of "
             f"{mirror.name}, with leg_clearance_m = {mission.leg_clearance_m} and "
             f"turn_clearance_m = {mission.turn_clearance_m}"
@@ -71,10 +71,10 @@ def plan_way_home(
     )
 
 
-def _best(arrivals: list[Arrival], course_rad: float, limits: LimitsConfig) -> Arrival:
+def _best(arrivals: list[SearchNode], course_rad: float, limits: LimitsConfig) -> SearchNode:
     """The cheapest way in, the turn to the final course included; one from which that turn is safe, if there is."""
 
-    def rank(arrival: Arrival) -> tuple[bool, float]:
+    def rank(arrival: SearchNode) -> tuple[bool, float]:
         turned_s = turn_time(difference(course_rad, arrival.course_rad), limits)
         return not arrival.place.can_turn(arrival.course_rad, course_rad), arrival.cost_s + turned_s
 

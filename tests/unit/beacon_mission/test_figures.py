@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ccatp.studies.mote_navigation import BeaconRehearsal, rehearse_beacons
+from ccatp.studies.mote_navigation import BeaconSilResult, rehearse_beacons
 from tests.unit.beacon_mission.stories import beacon_config, target_distances
 
 pytestmark = pytest.mark.xdist_group("beacon-missions")  # the missions by motes are driven once
@@ -18,7 +18,7 @@ def band(dof: int, sure: float = SURE) -> tuple[float, float]:
     return low, high
 
 
-def nees_at(found: BeaconRehearsal, t_s: float) -> float:
+def nees_at(found: BeaconSilResult, t_s: float) -> float:
     """e^T P^-1 e of the pose in the frame at a time."""
     frame = round(10 * t_s)
     row, true = np.array(found.track[frame], dtype=float), np.array(found.truth[frame][:5], dtype=float)
@@ -28,7 +28,7 @@ def nees_at(found: BeaconRehearsal, t_s: float) -> float:
 
 
 @pytest.fixture(scope="module")
-def by_motes() -> list[BeaconRehearsal]:
+def by_motes() -> list[BeaconSilResult]:
     return [rehearse_beacons(beacon_config("cricket", run__seed=seed)) for seed in range(1, 4)]
 
 
@@ -50,7 +50,7 @@ def test_slip_and_drift_are_seen_through() -> None:
     assert summary["position_error_m"]["rmse"] < 0.5 * summary["dead_reckoning_rmse_m"]
 
 
-def test_motes_map_themselves_first_and_then_carry_the_robot(by_motes: list[BeaconRehearsal]) -> None:
+def test_motes_map_themselves_first_and_then_carry_the_robot(by_motes: list[BeaconSilResult]) -> None:
     for found in by_motes:
         states = list(dict.fromkeys(found.states))
         assert states == ["mapping", "visiting", "done"]
@@ -62,7 +62,7 @@ def test_motes_map_themselves_first_and_then_carry_the_robot(by_motes: list[Beac
         assert summary["position_error_m"]["rmse"] < 0.02
 
 
-def test_navigation_by_motes_knows_how_good_it_is(by_motes: list[BeaconRehearsal]) -> None:
+def test_navigation_by_motes_knows_how_good_it_is(by_motes: list[BeaconSilResult]) -> None:
     times_s = (30.0, 45.0, 60.0, 75.0)  # apart enough: three ranges a frame forget the past within seconds
     low, high = band(3 * len(times_s) * len(by_motes))
     assert low < sum(nees_at(found, t_s) for found in by_motes for t_s in times_s) < high
@@ -72,7 +72,7 @@ def test_navigation_by_motes_knows_how_good_it_is(by_motes: list[BeaconRehearsal
         assert low < size * found.summary["consistency"]["nis_mean"] < high
 
 
-def test_a_map_taken_for_exact_would_be_found_out(by_motes: list[BeaconRehearsal]) -> None:
+def test_a_map_taken_for_exact_would_be_found_out(by_motes: list[BeaconSilResult]) -> None:
     sigmas = [found.summary["map"]["map_expected_m"] for found in by_motes]
     errors = [found.summary["beacons"]["rmse_m"] for found in by_motes]
     assert min(errors) > 0.1 * min(sigmas)  # the map has errors of the size that the filter has to account for

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.beacons.mission import Arrival, assemble_beacons, check_beacon_robot, permitted, wheel_rates
-from ccatp.beacons.navigation import Belief, SelfMap, SenseReader
-from ccatp.beacons.steering import HALT, Drive
+from ccatp.beacons.mission import WaypointArrival, assemble_beacons, check_beacon_robot, permitted, wheel_rates
+from ccatp.beacons.navigation import MeasurementReader, PoseBelief, SelfMap
+from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.beacons.store import BeaconStore, BeaconStoreError
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import EventCode, Verdict
@@ -17,7 +17,7 @@ from ccatp.links.beacon_messages import BeaconFrame, MoteBurst, RadioScan, decod
 from ccatp.links.robot_codec import BadLine, decode_from_robot
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.records.beacon_summary import BeaconSummary, beacon_facts
-from ccatp.safety.beacons import BeaconDanger, EchoMemory
+from ccatp.safety.beacons import BeaconSafetyRules, ObstacleBuffer
 from ccatp.sim.beacon_robot import BeaconRobot
 from ccatp.sim.radio_world import RadioWorld
 from tests.unit.beacon_mission.stories import beacon_config
@@ -42,30 +42,32 @@ def frame_of(robot: BeaconRobot) -> tuple[Sensors, BeaconFrame]:
 @pytest.mark.parametrize(
     ("wanted", "verdict", "sent"),
     [
-        (Drive(0.1, 0.2, 0.0), FREE, Drive(0.1, 0.2, 0.0)),
-        (Drive(0.1, 0.2, 0.0), NO_FORWARD, Drive(-0.05, 0.0, 0.0)),
-        (Drive(-0.1, 0.2, 0.0), NO_FORWARD, Drive(-0.1, 0.2, 0.0)),
-        (Drive(0.1, 0.2, 0.0), NOTHING, HALT),
-        (Drive(-0.1, 0.2, 0.0), NOTHING, HALT),
-        (Drive(0.0, 0.2, 0.3), NOTHING, Drive(0.0, 0.0, 0.0)),
-        (Drive(float("nan"), 0.0, 0.0), FREE, HALT),
+        (SteeringCommand(0.1, 0.2, 0.0), FREE, SteeringCommand(0.1, 0.2, 0.0)),
+        (SteeringCommand(0.1, 0.2, 0.0), NO_FORWARD, SteeringCommand(-0.05, 0.0, 0.0)),
+        (SteeringCommand(-0.1, 0.2, 0.0), NO_FORWARD, SteeringCommand(-0.1, 0.2, 0.0)),
+        (SteeringCommand(0.1, 0.2, 0.0), NOTHING, HALT),
+        (SteeringCommand(-0.1, 0.2, 0.0), NOTHING, HALT),
+        (SteeringCommand(0.0, 0.2, 0.3), NOTHING, SteeringCommand(0.0, 0.0, 0.0)),
+        (SteeringCommand(float("nan"), 0.0, 0.0), FREE, HALT),
     ],
 )
-def test_nothing_is_sent_that_is_not_permitted(wanted: Drive, verdict: Verdict, sent: Drive) -> None:
+def test_nothing_is_sent_that_is_not_permitted(
+    wanted: SteeringCommand, verdict: Verdict, sent: SteeringCommand
+) -> None:
     assert permitted(wanted, verdict, 0.05) == sent
 
 
 def test_wheel_rates_of_both_vehicles(cfg: RadioConfig) -> None:
     rate = 0.1 / cfg.robot.wheel_radius_m
-    assert wheel_rates(Drive(0.1, 0.2, 0.0), cfg) == (rate, rate, 0.2)
+    assert wheel_rates(SteeringCommand(0.1, 0.2, 0.0), cfg) == (rate, rate, 0.2)
     turning = cfg.model_copy(update={"vehicle": cfg.vehicle.model_copy(update={"kind": "differential"})})
-    right, left, steer = wheel_rates(Drive(0.1, 0.0, 0.5), turning)
+    right, left, steer = wheel_rates(SteeringCommand(0.1, 0.0, 0.5), turning)
     assert steer is None
     assert right - left == pytest.approx(0.5 * cfg.vehicle.track_m / cfg.robot.wheel_radius_m)
 
 
 def test_echoes_stay_where_they_are_while_the_robot_moves() -> None:
-    memory = EchoMemory((0.0, pi / 2), 1.0, 20.0)
+    memory = ObstacleBuffer((0.0, pi / 2), 1.0, 20.0)
     memory.see(0.0, (0.5, 3.0))
     assert memory.nearest_m(0.0, 0.1) == pytest.approx(0.5)
     memory.roll(0.2, 0.0, 0.0)
@@ -78,7 +80,7 @@ def test_echoes_stay_where_they_are_while_the_robot_moves() -> None:
 
 
 def test_the_course_of_a_steered_vehicle_is_where_its_front_wheel_points() -> None:
-    memory = EchoMemory((0.0,), 2.0, 20.0)
+    memory = ObstacleBuffer((0.0,), 2.0, 20.0)
     memory.see(0.0, (1.0,))
     memory.roll(1.0, pi / 2, 0.0)  # sideways, as wheels at a right angle would
     assert memory.nearest_m(-pi / 4, 0.01) == pytest.approx(2.0**0.5)
@@ -87,7 +89,7 @@ def test_the_course_of_a_steered_vehicle_is_where_its_front_wheel_points() -> No
 def test_wheels_steering_and_scans_are_read_from_the_link(cfg: RadioConfig) -> None:
     robot = BeaconRobot(cfg, RadioWorld(cfg))
     robot.join_controller()
-    reader = SenseReader(cfg)
+    reader = MeasurementReader(cfg)
     reader.read(*frame_of(robot))
     robot.drive(1, 1.0, 1.0, None, 0.3)
     robot.advance()
@@ -102,7 +104,7 @@ def test_a_scan_on_the_link_keeps_its_directions() -> None:
     world = RadioWorld(cfg)
     robot = BeaconRobot(cfg, world)
     robot.advance()
-    packets = SenseReader(cfg).read(*frame_of(robot)).packets
+    packets = MeasurementReader(cfg).read(*frame_of(robot)).packets
     assert len(packets) == 4 * cfg.scan.readings
     step = 2 * pi / cfg.scan.readings
     assert {round(packet.direction_rad / step, 6) % cfg.scan.readings for packet in packets} == set(range(40))
@@ -140,7 +142,7 @@ def test_extra_keys_out_of_range_are_a_bad_line(cfg: RadioConfig) -> None:
 
 def test_the_danger_rules_find_the_target_by_its_level() -> None:
     cfg = beacon_config("follow")
-    danger, robot = BeaconDanger(cfg), BeaconRobot(cfg, RadioWorld(cfg))
+    danger, robot = BeaconSafetyRules(cfg), BeaconRobot(cfg, RadioWorld(cfg))
     sensors, _ = frame_of(robot)
     for level_dbm, is_near in ((-36.0, False), (-28.0, True)):  # at 1 m, at 0.4 m
         scan = RadioScan(0.0, radians(9.0), {"target": [level_dbm, None], "beacon1": [-50.0]})
@@ -152,7 +154,7 @@ def test_the_danger_rules_find_the_target_by_its_level() -> None:
 
 
 def test_no_frame_means_no_permit(cfg: RadioConfig) -> None:
-    verdict = BeaconDanger(cfg).stale(7, 1.5)
+    verdict = BeaconSafetyRules(cfg).stale(7, 1.5)
     assert (verdict.forward, verdict.reverse, verdict.turn) == (False, False, False)
 
 
@@ -191,7 +193,7 @@ def test_the_store_keeps_what_was_reached(cfg: RadioConfig, tmp_path: Path) -> N
 
     path = tmp_path / "mission.sqlite"
     store = BeaconStore(path, {"system": "zigbee"}, cfg.workspace.waypoints_m, 2)
-    store.record_arrival(3.5, 5, Arrival(1, 1, (2.2, 0.8), Belief((2.1, 0.8, 0.0), np.eye(3))))
+    store.record_arrival(3.5, 5, WaypointArrival(1, 1, (2.2, 0.8), PoseBelief((2.1, 0.8, 0.0), np.eye(3))))
     store.record_event(4.0, "warning", "held: no radio is heard")
     store.close()
     with sqlite3.connect(path) as db:

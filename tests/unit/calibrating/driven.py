@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from ccatp.commissioning.calibration import Priors
-from ccatp.commissioning.calibration_drive import Drive, DriveBuilder
+from ccatp.commissioning.calibration_drive import DriveBuilder, RecordedDrive
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.core import Fix, FloatArray
@@ -15,7 +15,7 @@ from ccatp.links.robot_codec import encode
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import RECORD_FORMAT, TOPICS, FixMessage, SensorLines, pack, schema_of
 from ccatp.records.recorder import Recorder
-from ccatp.studies.sil_run import Rehearsing
+from ccatp.studies.sil_run import SilRun
 
 # A robot that is not what the configuration says, in a world without slip: thesis with these.
 OTHER_ROBOT = {
@@ -26,7 +26,7 @@ OTHER_ROBOT = {
 }
 
 
-class CalibrationDrive(Rehearsing):
+class CalibrationDrive(SilRun):
     """A mission of the calibration drive alone; keeps what a recording would hold."""
 
     def __init__(self, seed: int, world: str, rounds: int, changes: Mapping[str, object]) -> None:
@@ -47,7 +47,7 @@ class CalibrationDrive(Rehearsing):
         super()._fuse(fix)
 
     @property
-    def drive(self) -> Drive:
+    def drive(self) -> RecordedDrive:
         """As the calibration takes it."""
         builder, fixes = DriveBuilder(self.mirror, self.cfg.robot.puck_height_m), list(self.fixes)
         for frame in self.frames:

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from ccatp.cli import main
 from ccatp.commissioning.calibration import Calibration, CalibrationError, calibrate, check_usable, lines, rows
-from ccatp.commissioning.calibration_drive import Drive, Wheels, carry
+from ccatp.commissioning.calibration_drive import RecordedDrive, WheelParameters, carry
 from ccatp.core import FloatArray
 from tests.unit.calibrating.driven import OTHER_ROBOT, CalibrationDrive, priors, record
 
@@ -22,12 +22,12 @@ def driven() -> CalibrationDrive:
 
 
 @pytest.fixture(scope="module")
-def drive(driven: CalibrationDrive) -> Drive:
+def drive(driven: CalibrationDrive) -> RecordedDrive:
     return driven.drive
 
 
 @pytest.fixture(scope="module")
-def found(driven: CalibrationDrive, drive: Drive) -> Calibration:
+def found(driven: CalibrationDrive, drive: RecordedDrive) -> Calibration:
     return calibrate(driven.mirror, drive, priors(driven.cfg))
 
 
@@ -49,7 +49,7 @@ def test_the_true_robot_is_found(driven: CalibrationDrive, found: Calibration) -
     assert abs(found.radius_difference_m - difference_m) < 5.0 * found.radius_difference_sigma_m
 
 
-def test_a_drive_has_a_segment_for_each_leg(drive: Drive) -> None:
+def test_a_drive_has_a_segment_for_each_leg(drive: RecordedDrive) -> None:
     assert len(drive.segments) == 8  # two rounds of four legs
     assert len(drive.places) == 9
     assert drive.encoder_sigma_rad_s == pytest.approx(0.001, rel=0.1)  # of the world
@@ -63,10 +63,10 @@ def test_a_drive_has_a_segment_for_each_leg(drive: Drive) -> None:
     assert max(len(segment.motions) for segment in drive.segments) >= 2
 
 
-def test_derivatives_are_those_of_the_motion(driven: CalibrationDrive, drive: Drive) -> None:
+def test_derivatives_are_those_of_the_motion(driven: CalibrationDrive, drive: RecordedDrive) -> None:
     segment = max(drive.segments, key=lambda one: len(one.motions))
     start = np.array([drive.places[0].x_m, drive.places[0].y_m, 0.7])
-    wheels = Wheels(0.0301, 0.0299, 0.151, 0.01)
+    wheels = WheelParameters(0.0301, 0.0299, 0.151, 0.01)
     led = carry(driven.mirror, segment, start, wheels)
     for k, step in enumerate((1e-6, 1e-6, 1e-6, 1e-4)):
         up, down = (carry(driven.mirror, segment, start, wheels._replace(**{wheels._fields[k]: wheels[k] + s})).end
@@ -90,7 +90,7 @@ def test_slip_that_varies_widens_the_uncertainty(found: Calibration) -> None:
     assert result.creep == pytest.approx(world.creep_fraction, abs=5.0 * result.creep_sigma)
 
 
-def test_what_cannot_show_the_wheels_is_refused(driven: CalibrationDrive, drive: Drive) -> None:
+def test_what_cannot_show_the_wheels_is_refused(driven: CalibrationDrive, drive: RecordedDrive) -> None:
     before = priors(driven.cfg)
     few = replace(drive, segments=drive.segments[:3], places=drive.places[:4])
     with pytest.raises(CalibrationError, match="the drive has 3 legs with a fix at each end, 4 are needed"):

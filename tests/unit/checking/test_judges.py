@@ -8,9 +8,9 @@ import pytest
 
 from ccatp.commissioning.preflight import (
     ROBOT_NAMES,
-    Finding,
-    Heard,
-    Outcome,
+    CheckOutcome,
+    PreflightResult,
+    RobotReport,
     as_json,
     failed,
     has_failed,
@@ -34,7 +34,7 @@ from ccatp.sim.robot import Robot
 FRAMES = 300
 
 
-def stand(cfg: Config) -> tuple[Mirror, Heard]:
+def stand(cfg: Config) -> tuple[Mirror, RobotReport]:
     """What a robot that nobody drives says for three seconds."""
     mirror = build_mirror(cfg.mirror)
     robot = Robot(cfg, mirror, np.random.default_rng(cfg.run.seed))
@@ -49,7 +49,7 @@ def stand(cfg: Config) -> tuple[Mirror, Heard]:
         cfg.robot.max_wheel_rad_s, cfg.sim.robot.fan_floor if mirror.overhang else 0.0,
     )  # fmt: skip
     hello = Hello("ccatp-robot/1", 7, "0" * 32, "none", False, 100.0, 0.25, data)
-    return mirror, Heard(hello, frames, [0.01 * k for k in range(FRAMES)])
+    return mirror, RobotReport(hello, frames, [0.01 * k for k in range(FRAMES)])
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def cfg() -> Config:
 
 
 @pytest.fixture(scope="module")
-def stood(cfg: Config) -> tuple[Mirror, Heard]:
+def stood(cfg: Config) -> tuple[Mirror, RobotReport]:
     return stand(cfg)
 
 
@@ -67,7 +67,7 @@ def test_a_sound_robot_passes(mirror: str) -> None:
     cfg = load_config(None, {"run.mirror": mirror})
     found = judge_robot(cfg, *stand(cfg))
     assert [finding.name for finding in found] == list(ROBOT_NAMES)
-    assert {finding.outcome for finding in found} == {Outcome.PASS}, lines(found)
+    assert {finding.outcome for finding in found} == {CheckOutcome.PASS}, lines(found)
 
 
 Change = Callable[[Sensors], None]
@@ -104,53 +104,60 @@ def flat(frame: Sensors) -> None:
 @pytest.mark.parametrize(
     ("change", "name", "outcome", "told"),
     [
-        (every(faults=["fan_left"]), "faults", Outcome.FAIL, "reports fan_left"),
-        (every(enc=[]), "encoders", Outcome.FAIL, "right: 0 samples a second, 50 are needed"),
-        (turning, "encoders", Outcome.FAIL, "right wheel turns at 0.100 rad/s"),
-        (every(imu=[]), "inertial unit", Outcome.FAIL, "0 samples a second"),
-        (frozen, "inertial unit", Outcome.FAIL, "readings in a row are the same"),
-        (spinning, "inertial unit", Outcome.FAIL, "zero rate +0.1992"),
-        (every(edge=[]), "edge sensors", Outcome.FAIL, "0 samples a second"),
-        (edge(0, 1, 1, 0), "edge sensors", Outcome.FAIL, "front left and rear right see no panel"),
-        (flat, "gravity", Outcome.FAIL, "is this the right mirror"),
-        (every(gravity=None), "gravity", Outcome.WARN, "too few readings"),
-        (every(soc=0.1), "battery", Outcome.FAIL, "10%"),
-        (every(soc=0.5), "battery", Outcome.WARN, "50%, for 36 min"),
+        (every(faults=["fan_left"]), "faults", CheckOutcome.FAIL, "reports fan_left"),
+        (every(enc=[]), "encoders", CheckOutcome.FAIL, "right: 0 samples a second, 50 are needed"),
+        (turning, "encoders", CheckOutcome.FAIL, "right wheel turns at 0.100 rad/s"),
+        (every(imu=[]), "inertial unit", CheckOutcome.FAIL, "0 samples a second"),
+        (frozen, "inertial unit", CheckOutcome.FAIL, "readings in a row are the same"),
+        (spinning, "inertial unit", CheckOutcome.FAIL, "zero rate +0.1992"),
+        (every(edge=[]), "edge sensors", CheckOutcome.FAIL, "0 samples a second"),
+        (edge(0, 1, 1, 0), "edge sensors", CheckOutcome.FAIL, "front left and rear right see no panel"),
+        (flat, "gravity", CheckOutcome.FAIL, "is this the right mirror"),
+        (every(gravity=None), "gravity", CheckOutcome.WARN, "too few readings"),
+        (every(soc=0.1), "battery", CheckOutcome.FAIL, "10%"),
+        (every(soc=0.5), "battery", CheckOutcome.WARN, "50%, for 36 min"),
     ],
 )
 def test_what_is_wrong_is_found(
-    cfg: Config, stood: tuple[Mirror, Heard], change: Change, name: str, outcome: Outcome, told: str
+    cfg: Config, stood: tuple[Mirror, RobotReport], change: Change, name: str, outcome: CheckOutcome, told: str
 ) -> None:
     mirror, heard = stood
     frames = [msgspec.convert(msgspec.to_builtins(frame), Sensors) for frame in heard.frames]
     for frame in frames:
         change(frame)
     found = judge_robot(cfg, mirror, heard._replace(frames=frames))
-    (wrong,) = [finding for finding in found if finding.outcome is not Outcome.PASS]
+    (wrong,) = [finding for finding in found if finding.outcome is not CheckOutcome.PASS]
     assert (wrong.name, wrong.outcome) == (name, outcome)
     assert told in wrong.found
     assert wrong.todo
 
 
-def test_a_sensor_that_flickers_is_told(cfg: Config, stood: tuple[Mirror, Heard]) -> None:
+def test_a_sensor_that_flickers_is_told(cfg: Config, stood: tuple[Mirror, RobotReport]) -> None:
     mirror, heard = stood
     frames = [msgspec.convert(msgspec.to_builtins(frame), Sensors) for frame in heard.frames]
     edge(1, 0, 1, 1)(frames[5])
-    (wrong,) = [f for f in judge_robot(cfg, mirror, heard._replace(frames=frames)) if f.outcome is not Outcome.PASS]
+    (wrong,) = [
+        f for f in judge_robot(cfg, mirror, heard._replace(frames=frames)) if f.outcome is not CheckOutcome.PASS
+    ]
     assert "front right see the panel on and off" in wrong.found
 
 
 @pytest.mark.parametrize(
     ("arrived_s", "name", "outcome", "told"),
     [
-        ([0.02 * k for k in range(FRAMES)], "frames", Outcome.FAIL, "50.0 a second"),
-        ([0.01 * k + 0.2 * (k > 100) for k in range(FRAMES)], "frames", Outcome.FAIL, "longest gap 210 ms"),
-        ([0.01 * k + 0.06 * (k > 100) for k in range(FRAMES)], "frames", Outcome.WARN, "longest gap 70 ms"),
-        ([0.0105 * k for k in range(FRAMES)], "robot clock", Outcome.FAIL, "runs at 0.95"),
+        ([0.02 * k for k in range(FRAMES)], "frames", CheckOutcome.FAIL, "50.0 a second"),
+        ([0.01 * k + 0.2 * (k > 100) for k in range(FRAMES)], "frames", CheckOutcome.FAIL, "longest gap 210 ms"),
+        ([0.01 * k + 0.06 * (k > 100) for k in range(FRAMES)], "frames", CheckOutcome.WARN, "longest gap 70 ms"),
+        ([0.0105 * k for k in range(FRAMES)], "robot clock", CheckOutcome.FAIL, "runs at 0.95"),
     ],
 )
 def test_time_that_is_wrong_is_found(
-    cfg: Config, stood: tuple[Mirror, Heard], arrived_s: Sequence[float], name: str, outcome: Outcome, told: str
+    cfg: Config,
+    stood: tuple[Mirror, RobotReport],
+    arrived_s: Sequence[float],
+    name: str,
+    outcome: CheckOutcome,
+    told: str,
 ) -> None:
     mirror, heard = stood
     found = {f.name: f for f in judge_robot(cfg, mirror, heard._replace(arrived_s=arrived_s))}
@@ -158,19 +165,19 @@ def test_time_that_is_wrong_is_found(
     assert told in found[name].found
 
 
-def test_one_frame_is_not_enough(cfg: Config, stood: tuple[Mirror, Heard]) -> None:
+def test_one_frame_is_not_enough(cfg: Config, stood: tuple[Mirror, RobotReport]) -> None:
     mirror, heard = stood
     alone = heard._replace(frames=heard.frames[:1], arrived_s=heard.arrived_s[:1])
     assert judge_robot(cfg, mirror, alone)[1].found == "a single frame"
 
 
-def test_another_robot_and_lockstep_are_told(cfg: Config, stood: tuple[Mirror, Heard]) -> None:
+def test_another_robot_and_lockstep_are_told(cfg: Config, stood: tuple[Mirror, RobotReport]) -> None:
     mirror, heard = stood
     other = msgspec.structs.replace(heard.hello.robot, wheel_base_m=0.2)
     hello = msgspec.structs.replace(heard.hello, robot=other, lockstep=True)
     found = {f.name: f for f in judge_robot(cfg, mirror, heard._replace(hello=hello))}
     assert "wheel_base_m is 0.15 here and 0.2 there" in found["robot geometry"].found
-    assert found["robot clock"].outcome is Outcome.WARN
+    assert found["robot clock"].outcome is CheckOutcome.WARN
 
 
 def test_fans_below_the_floor_are_told() -> None:
@@ -185,26 +192,26 @@ def test_fans_below_the_floor_are_told() -> None:
 
 
 def test_lasers_and_air() -> None:
-    assert judge_lasers(connected=True, laser_ready=True).outcome is Outcome.PASS
+    assert judge_lasers(connected=True, laser_ready=True).outcome is CheckOutcome.PASS
     assert "no laser" in judge_lasers(connected=False, laser_ready=True).found
     assert "not warm" in judge_lasers(connected=True, laser_ready=False).found
-    assert judge_air(Environment(-5.0, 525.0, 30.0)).outcome is Outcome.PASS
+    assert judge_air(Environment(-5.0, 525.0, 30.0)).outcome is CheckOutcome.PASS
     for air in (Environment(99.0, 525.0, 30.0), Environment(-5.0, 52.5, 30.0), Environment(-5.0, 525.0, 130.0)):
         assert "not the air of any telescope" in judge_air(air).found
 
 
-def test_a_fix_is_where_a_robot_at_base_has_its_puck(cfg: Config, stood: tuple[Mirror, Heard]) -> None:
+def test_a_fix_is_where_a_robot_at_base_has_its_puck(cfg: Config, stood: tuple[Mirror, RobotReport]) -> None:
     mirror = stood[0]
     at_base = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m)
 
-    def fix(position_m: Vector3) -> Finding:
+    def fix(position_m: Vector3) -> PreflightResult:
         return judge_fix(cfg, mirror, Fix(0.0, position_m, (0.0,) * 9, 1.0, (1, 2, 3, 4), 1e-6))
 
-    assert fix(at_base).outcome is Outcome.PASS
+    assert fix(at_base).outcome is CheckOutcome.PASS
     high = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m + 0.01)
     assert "puck_height_m" in fix(high).todo
     assert "set the robot down at base" in fix((at_base[0] + 0.4, at_base[1], at_base[2])).todo
-    assert fix((1e3 * at_base[0], 1e3 * at_base[1], 1e3 * at_base[2])).outcome is Outcome.FAIL  # millimetres
+    assert fix((1e3 * at_base[0], 1e3 * at_base[1], 1e3 * at_base[2])).outcome is CheckOutcome.FAIL  # millimetres
 
 
 def test_the_table() -> None:

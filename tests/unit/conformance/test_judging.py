@@ -6,10 +6,10 @@ import pytest
 
 from ccatp.commissioning.conformance import judges as judge_frames
 from ccatp.commissioning.conformance import judges as judge_hello
-from ccatp.commissioning.conformance.connections import Facts, Stage
+from ccatp.commissioning.conformance.connections import CheckContext, Facts
 from ccatp.commissioning.conformance.judges import (
-    Broken,
-    Frame,
+    CheckedFrame,
+    CheckFailed,
     NotApplicable,
     Result,
     fault_of_line,
@@ -36,11 +36,13 @@ SENSORS: dict[str, Any] = {
 }
 
 
-def frame(t_s: float, age_s: float = 0.01, permit_age_s: float = 0.01, held: bool = False, seq: int = 1) -> Frame:
-    return Frame(round(100 * t_s), t_s, seq, age_s, permit_age_s, held, (0.0, 0.0), ())
+def frame(
+    t_s: float, age_s: float = 0.01, permit_age_s: float = 0.01, held: bool = False, seq: int = 1
+) -> CheckedFrame:
+    return CheckedFrame(round(100 * t_s), t_s, seq, age_s, permit_age_s, held, (0.0, 0.0), ())
 
 
-def ageing(held_from_s: float, until_s: float = 0.5) -> list[Frame]:
+def ageing(held_from_s: float, until_s: float = 0.5) -> list[CheckedFrame]:
     """A drive of t = 0 that gets older, held from some age on."""
     times_s = [k * FRAME_S for k in range(1, round(until_s / FRAME_S))]
     return [frame(t_s, age_s=t_s, held=t_s >= held_from_s) for t_s in times_s]
@@ -89,16 +91,16 @@ def test_a_frame() -> None:
     ],
 )
 def test_a_frame_of_no_use(change: dict[str, Any], seen: str) -> None:
-    with pytest.raises(Broken, match=seen):
+    with pytest.raises(CheckFailed, match=seen):
         parse_frame(SENSORS | change)
 
 
 def test_time_to_live() -> None:
     assert judge_ttl(ageing(0.26), "drive", TTL_S, FRAME_S) == "held at a drive age of 0.260 s, ttl_s 0.25"
     for held_from_s, seen in ((0.15, "held at a drive age of 0.150"), (0.4, "not held at a drive age of 0.290")):
-        with pytest.raises(Broken, match=seen):
+        with pytest.raises(CheckFailed, match=seen):
             judge_ttl(ageing(held_from_s), "drive", TTL_S, FRAME_S)
-    with pytest.raises(Broken, match=r"not held 0\.48 s after the last drive, its age said to be 0\.010 s"):
+    with pytest.raises(CheckFailed, match=r"not held 0\.48 s after the last drive, its age said to be 0\.010 s"):
         judge_ttl([frame(k * FRAME_S) for k in range(49)], "drive", TTL_S, FRAME_S)
 
 
@@ -108,11 +110,11 @@ def test_held_for_want_of_the_other_key_is_not_too_early() -> None:
 
 
 def test_a_lost_session() -> None:
-    def after(delay_s: float) -> list[Frame]:
+    def after(delay_s: float) -> list[CheckedFrame]:
         return [frame(t / 100, permit_age_s=t / 100 - 0.1, held=t / 100 > 0.1 + delay_s) for t in range(11, 30)]
 
     assert judge_lost(after(0.03), "permit", TTL_S, FRAME_S) == "held 40 ms after the end of the session"
-    with pytest.raises(Broken, match="not held 70 ms after the end of the session"):
+    with pytest.raises(CheckFailed, match="not held 70 ms after the end of the session"):
         judge_lost(after(0.08), "permit", TTL_S, FRAME_S)
     assert judge_lost(after(0.03)[:3], "permit", TTL_S, FRAME_S) is None  # no frame yet that tells
     with pytest.raises(NotApplicable, match=r"ttl_s 0\.08 holds the wheels as soon"):
@@ -121,12 +123,12 @@ def test_a_lost_session() -> None:
 
 def test_drives_that_come_into_force() -> None:
     judge_newest([frame(0.1, seq=9), frame(0.11, seq=12)], 9, 8)
-    with pytest.raises(Broken, match="drive 8 came into force after 9"):
+    with pytest.raises(CheckFailed, match="drive 8 came into force after 9"):
         judge_newest([frame(0.1, seq=9), frame(0.11, seq=8)], 9, 8)
-    with pytest.raises(Broken, match="drive 9 never came into force"):
+    with pytest.raises(CheckFailed, match="drive 9 never came into force"):
         judge_newest([frame(0.1, seq=12)], 9, 8)
     judge_once([frame(0.1, 0.01), frame(0.2, 0.11)], 1, FRAME_S)
-    with pytest.raises(Broken, match="a second drive 1 came into force 100 ms after the first"):
+    with pytest.raises(CheckFailed, match="a second drive 1 came into force 100 ms after the first"):
         judge_once([frame(0.1, 0.01), frame(0.2, 0.01)], 1, FRAME_S)
     assert mean_rates([frame(0.1)]) is None
 
@@ -134,18 +136,18 @@ def test_drives_that_come_into_force() -> None:
 def test_judges_of_frames_without_what_they_judge() -> None:
     with pytest.raises(NotApplicable, match="no edge samples"):
         judge_frames.judge_edges([{"edge": []}])
-    with pytest.raises(Broken, match="a frame without gravity"):
+    with pytest.raises(CheckFailed, match="a frame without gravity"):
         judge_frames.judge_gravity([{}])
-    with pytest.raises(Broken, match="frame 2 reached one session only"):
+    with pytest.raises(CheckFailed, match="frame 2 reached one session only"):
         judge_frames.judge_both([{"seq": k} for k in (1, 2, 3)], [{"seq": k} for k in (1, 3)])
-    with pytest.raises(Broken, match="t 1 after 1"):
+    with pytest.raises(CheckFailed, match="t 1 after 1"):
         judge_frames.judge_clock([{"seq": k, "t": 1} for k in range(3)], 100.0)
 
 
 def test_a_hello_without_robot() -> None:
-    with pytest.raises(Broken, match="robot = None"):
+    with pytest.raises(CheckFailed, match="robot = None"):
         judge_hello.judge_robot({})
-    with pytest.raises(Broken, match="no protocol"):
+    with pytest.raises(CheckFailed, match="no protocol"):
         judge_hello.judge_fields({})
 
 
@@ -165,10 +167,10 @@ def test_duties_to_change_to() -> None:
 def test_a_mac_without_a_key() -> None:
     facts = Facts(False, 100.0, TTL_S, True, 0.03, 0.15, 8.0, 0.0)
     with pytest.raises(NotApplicable, match="asks for a mac, and there is no key"):
-        Stage(("127.0.0.1", 1), facts, None, 1.0, 0).join_line({"nonce": "0"}, "monitor")
+        CheckContext(("127.0.0.1", 1), facts, None, 1.0, 0).join_line({"nonce": "0"}, "monitor")
 
 
 def test_a_server_that_accepts_no_more(free_port: int) -> None:
     facts = Facts(False, 100.0, TTL_S, False, 0.03, 0.15, 8.0, 0.0)
-    with pytest.raises(Broken, match="connection not accepted: Connection refused"):
-        Stage(("127.0.0.1", free_port), facts, None, 1.0, 0).greet()
+    with pytest.raises(CheckFailed, match="connection not accepted: Connection refused"):
+        CheckContext(("127.0.0.1", free_port), facts, None, 1.0, 0).greet()

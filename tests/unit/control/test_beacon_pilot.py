@@ -6,10 +6,10 @@ import pytest
 from numpy.random import default_rng
 
 from ccatp.beacons.pilot import BeaconPilot, FollowState, PilotState, TargetSight
-from ccatp.beacons.steering import HALT, Aim, Driver, WaypointList, aim_at
+from ccatp.beacons.steering import HALT, BearingToPoint, WaypointList, WaypointSteering, aim_at
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import load_radio_config
-from ccatp.sim.radio import DriveCommand, TruePose, clearance_m, seen_m
+from ccatp.sim.radio import SimDriveCommand, TruePose, clearance_m, seen_m
 from ccatp.sim.radio_world import TrueVehicle
 
 QUIET = {f"sim.vehicle.{name}": 0.0 for name in ("speed_sigma_m_s", "steer_sigma_rad", "turn_rate_sigma_rad_s")}
@@ -33,16 +33,16 @@ def test_a_loop_of_waypoints_is_visited(kind: str, mode: str) -> None:
         assert abs(drive.speed_m_s) <= cfg.vehicle.speed_max_m_s
         if pilot.state is PilotState.ARRIVED:
             break
-        robot.step(DriveCommand(*drive), 0.1)
+        robot.step(SimDriveCommand(*drive), 0.1)
     assert pilot.waypoints.reached == 4
     assert drive == HALT
 
 
 def test_steering_is_proportional_and_limited() -> None:
     cfg = config()
-    driver = Driver(cfg.control, cfg.vehicle)
-    assert driver.drive(Aim(1.0, 0.2), 0.1).steer_rad == pytest.approx(1.2 * 0.2)
-    assert driver.drive(Aim(1.0, -2.0), 0.1).steer_rad == -cfg.vehicle.steer_max_rad
+    driver = WaypointSteering(cfg.control, cfg.vehicle)
+    assert driver.drive(BearingToPoint(1.0, 0.2), 0.1).steer_rad == pytest.approx(1.2 * 0.2)
+    assert driver.drive(BearingToPoint(1.0, -2.0), 0.1).steer_rad == -cfg.vehicle.steer_max_rad
 
 
 def test_aim_is_seen_from_the_heading() -> None:
@@ -66,7 +66,7 @@ def follow(cfg: RadioConfig, start: tuple[float, float, float], path: list[tuple
     found = []
     for step, at_m in enumerate(path):
         drive = pilot.drive(0.1 * step, 0.1, robot.pose, TargetSight(at_m, 0.0, 0.0), ())
-        robot.step(DriveCommand(*drive), 0.1)
+        robot.step(SimDriveCommand(*drive), 0.1)
         found.append(hypot(at_m[0] - robot.pose.x_m, at_m[1] - robot.pose.y_m))
     return found
 
@@ -121,7 +121,7 @@ def test_an_obstacle_in_the_way_is_gone_round(side: float) -> None:
     nearest_m, states = 9.0, set()
     for step in range(3000):
         seen = [min(seen_m(robot.pose, a, cfg.sim.obstacles), 3.0) for a in cfg.avoidance.sensors_rad]
-        robot.step(DriveCommand(*pilot.drive(0.1 * step, 0.1, robot.pose, None, seen)), 0.1)
+        robot.step(SimDriveCommand(*pilot.drive(0.1 * step, 0.1, robot.pose, None, seen)), 0.1)
         nearest_m = min(nearest_m, clearance_m(robot.pose, cfg.sim.obstacles) - cfg.vehicle.radius_m)
         states.add(pilot.state)
         if pilot.state is PilotState.ARRIVED:
@@ -156,5 +156,5 @@ def test_backing_off_turns_the_vehicle_towards_the_target() -> None:
         robot = vehicle(cfg, (0.0, 0.0, 0.0))
         before = aim_at(robot.pose, (cos(0.5), sin(0.5))).error_rad
         for _ in range(20):
-            robot.step(DriveCommand(*Driver(cfg.control, cfg.vehicle).away(0.1, before)), 0.1)
+            robot.step(SimDriveCommand(*WaypointSteering(cfg.control, cfg.vehicle).away(0.1, before)), 0.1)
         assert robot.pose.heading_rad > 0.0

@@ -13,7 +13,7 @@ import pytest
 from ccatp.config.models import Config
 from ccatp.control.gate import Purpose
 from ccatp.control.prediction import CommandPredictor
-from ccatp.control.tracker import LegTracker, Phase
+from ccatp.control.tracker import LegPhase, LegTracker
 from ccatp.core import EventCode, Twist, Verdict, twist_of
 from ccatp.survey.composition import build_gate
 from ccatp.survey.planning.search import bang_bang_time
@@ -98,7 +98,7 @@ class Rig:
         """Drive a leg until the robot is at rest; returns the time taken."""
         start, pose = self.t, self.look()[0]
         self.tracker.begin(pose, target, reverse, self.creep)
-        while self.tracker.phase is not Phase.DONE:
+        while self.tracker.phase is not LegPhase.DONE:
             pose, twist = self.look()
             self.drive(self.tracker.step(pose, target, DT, twist, self.creep))
             assert self.t - start < 20.0, f"still {self.tracker.phase}"
@@ -172,7 +172,7 @@ def test_the_crab_angle_keeps_a_drifting_robot_on_its_line(config: Config) -> No
     rig = Rig(config, creep=(0.0, 0.05), heading=-0.05)
     beside = []
     rig.tracker.begin(rig.pose, (0.4, 0.0), False, rig.creep)
-    while rig.tracker.phase is not Phase.DONE:
+    while rig.tracker.phase is not LegPhase.DONE:
         rig.drive(rig.tracker.step(rig.pose, (0.4, 0.0), DT, rig.twist, rig.creep))
         beside.append(abs(rig.y))
     assert max(beside) < 1e-4  # the drift over the leg is 20 mm
@@ -182,7 +182,7 @@ def test_the_crab_angle_keeps_a_drifting_robot_on_its_line(config: Config) -> No
 def test_a_stop_moved_by_an_update_is_reached_all_the_same(config: Config) -> None:
     rig = Rig(config)
     rig.tracker.begin(rig.pose, (0.3, 0.0), False)
-    while rig.tracker.phase is not Phase.DONE:
+    while rig.tracker.phase is not LegPhase.DONE:
         rig.drive(rig.tracker.step(rig.pose, (0.3, 0.0), DT, rig.twist))
         if rig.t == pytest.approx(1.0):
             rig.x, rig.y = rig.x + 0.004, rig.y - 0.003
@@ -194,7 +194,7 @@ def test_a_stop_moved_by_an_update_is_reached_all_the_same(config: Config) -> No
 def test_an_error_beside_the_stop_is_not_chased_at_its_end(config: Config) -> None:
     rig = Rig(config)
     rig.tracker.begin(rig.pose, (0.3, 0.0), False)
-    while rig.tracker.phase is not Phase.DONE:
+    while rig.tracker.phase is not LegPhase.DONE:
         rig.drive(rig.tracker.step(rig.pose, (0.3, 0.0), DT, rig.twist))
         if rig.x > 0.295 and abs(rig.y) < 1e-3:
             rig.y += 0.003
@@ -210,4 +210,4 @@ def test_a_drive_that_cannot_end_stops_in_time_near_the_stop_and_goes_on_far_fro
         tracker.begin((0.0, 0.0, 0.0), (0.3, 0.0), False)
         for _ in range(round(budget_s / DT) + 2):
             tracker.step((0.3 - left_over_m, 0.0, 0.0), (0.3, 0.0), DT, Twist(0.0, 0.0))
-        assert (tracker.phase is Phase.DONE) is is_ended
+        assert (tracker.phase is LegPhase.DONE) is is_ended

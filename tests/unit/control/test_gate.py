@@ -11,8 +11,8 @@ from msgspec.structs import replace
 from ccatp.config.models import LimitsConfig
 from ccatp.control.gate import Denial, DriveGate, FanGate, Purpose
 from ccatp.core import EventCode, Twist, Verdict, twist_of, wheel_rates
-from ccatp.daemon.frame_service import GateWatch
-from ccatp.survey.state import PURPOSES, State
+from ccatp.daemon.frame_service import GateLog
+from ccatp.survey.state import PURPOSES, MissionState
 
 LIMITS = LimitsConfig(v_max_m_s=0.1, a_max_m_s2=0.2, omega_max_rad_s=0.8, alpha_max_rad_s2=2.0)
 FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
@@ -95,9 +95,9 @@ def test_denies_what_is_not_finite(bad: float) -> None:
 
 
 def test_every_state_has_a_purpose_and_those_that_stand_deny() -> None:
-    assert set(PURPOSES) == set(State)
+    assert set(PURPOSES) == set(MissionState)
     moving = {state for state, purpose in PURPOSES.items() if denial(SLOW, purpose=purpose) is None}
-    assert moving == {State.TURNING, State.DRIVING, State.BACKING_OFF, State.RETURNING}
+    assert moving == {MissionState.TURNING, MissionState.DRIVING, MissionState.BACKING_OFF, MissionState.RETURNING}
     assert denial(SLOW, purpose=Purpose.STAND) is Denial.STATE
 
 
@@ -223,7 +223,7 @@ def test_value_and_rate_are_limited(wanted: list[tuple[float, float]]) -> None:
 
 def test_denials_are_told_once_a_second_and_counted() -> None:
     under_test, told = gate(), []
-    watch = GateWatch(under_test, lambda level, text: told.append((level, text)))
+    watch = GateLog(under_test, lambda level, text: told.append((level, text)))
     for k in range(250):
         drive(under_test, SLOW, None)
         watch.look(0.01 * k)

@@ -5,11 +5,11 @@ from math import hypot, pi
 import pytest
 from numpy.random import default_rng
 
-from ccatp.beacons.pilot import BeaconPilot, Retreat, TargetSight
+from ccatp.beacons.pilot import BackOff, BeaconPilot, TargetSight
 from ccatp.beacons.steering import HALT
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import load_radio_config
-from ccatp.sim.radio import DriveCommand, TruePose, clearance_m, seen_m
+from ccatp.sim.radio import SimDriveCommand, TruePose, clearance_m, seen_m
 from ccatp.sim.radio_world import TrueVehicle
 
 STILL = (0.0, 0.0)
@@ -22,7 +22,7 @@ def config(**keys: object) -> RadioConfig:
 
 @pytest.mark.parametrize("kind", ["ackermann", "differential"])
 def test_it_goes_straight_away_where_nothing_stands(kind: str) -> None:
-    retreat = Retreat(config(vehicle__kind=kind))
+    retreat = BackOff(config(vehicle__kind=kind))
     ahead = retreat.drive(POSE, (2.0, 1.5), STILL, ())
     assert ahead.speed_m_s == -0.05
     assert (ahead.steer_rad, ahead.turn_rate_rad_s) == (0.0, 0.0)
@@ -31,24 +31,24 @@ def test_it_goes_straight_away_where_nothing_stands(kind: str) -> None:
 
 def test_where_the_target_goes_counts() -> None:
     beside = (1.5, 2.0)
-    assert Retreat(config()).drive(POSE, beside, (0.08, 0.0), ()).speed_m_s < 0.0
-    assert Retreat(config()).drive(POSE, beside, (-0.08, 0.0), ()).speed_m_s > 0.0
+    assert BackOff(config()).drive(POSE, beside, (0.08, 0.0), ()).speed_m_s < 0.0
+    assert BackOff(config()).drive(POSE, beside, (-0.08, 0.0), ()).speed_m_s > 0.0
 
 
 def test_what_stands_behind_is_not_touched_and_what_is_too_near_is_left() -> None:
     cfg = config()
     wall = [(1.1, 1.5 + 0.1 * k) for k in range(-6, 7)]  # 0.4 m behind
-    drive = Retreat(cfg).drive(POSE, (2.0, 1.2), STILL, wall)
+    drive = BackOff(cfg).drive(POSE, (2.0, 1.2), STILL, wall)
     assert drive.speed_m_s > 0.0  # past the target
-    touching = Retreat(cfg).drive(POSE, (1.9, 1.5), STILL, [(1.2, 1.5)])  # nearer than stop_m already
+    touching = BackOff(cfg).drive(POSE, (1.9, 1.5), STILL, [(1.2, 1.5)])  # nearer than stop_m already
     assert touching.speed_m_s >= 0.0
 
 
 def test_it_stands_where_no_way_is_free_and_at_the_wall_of_the_room() -> None:
     ring = [(1.5 + 0.36 * x, 1.5 + 0.36 * y) for x, y in ((1, 0), (0.7, 0.7), (0, 1), (-0.7, 0.7), (-1, 0))]
     ring += [(1.5 - 0.25, 1.5 - 0.25), (1.5, 1.14), (1.75, 1.25)]
-    assert Retreat(config()).drive(POSE, (2.1, 1.5), STILL, ring) == HALT
-    assert Retreat(config()).drive((0.0, 1.5, 0.0), (0.7, 1.5), STILL, ()).speed_m_s >= 0.0
+    assert BackOff(config()).drive(POSE, (2.1, 1.5), STILL, ring) == HALT
+    assert BackOff(config()).drive((0.0, 1.5, 0.0), (0.7, 1.5), STILL, ()).speed_m_s >= 0.0
 
 
 @pytest.mark.parametrize("kind", ["ackermann", "differential"])
@@ -66,7 +66,7 @@ def test_a_robot_between_an_obstacle_and_a_target_that_comes_gets_out(kind: str)
         x, y = x + 0.1 * vx, y + 0.1 * vy
         seen = [min(seen_m(robot.pose, a, cfg.sim.obstacles), 3.0) for a in cfg.avoidance.sensors_rad]
         drive = pilot.drive(0.1 * step, 0.1, robot.pose, TargetSight((x, y), 0.0, 0.0, (vx, vy)), seen)
-        robot.step(DriveCommand(*drive), 0.1)
+        robot.step(SimDriveCommand(*drive), 0.1)
         distances.append(d)
         clearances.append(clearance_m(robot.pose, cfg.sim.obstacles) - cfg.vehicle.radius_m)
     assert min(distances) > 0.45

@@ -6,7 +6,7 @@ from math import cos, exp, hypot, pi, sin
 import pytest
 
 from ccatp.config.models import Config
-from ccatp.control.tracker import LegTracker, Phase
+from ccatp.control.tracker import LegPhase, LegTracker
 from ccatp.core import Twist, difference
 
 DT, LAG = 0.01, 0.08
@@ -40,7 +40,7 @@ class Robot:
 def run_leg(tracker: LegTracker, robot: Robot, target: tuple[float, float], reverse: bool, limit_s: float) -> float:
     tracker.begin(robot.pose, target, reverse)
     t = 0.0
-    while tracker.phase is not Phase.DONE:
+    while tracker.phase is not LegPhase.DONE:
         robot.drive(tracker.step(robot.pose, target, DT))
         t += DT
         assert t < limit_s, f"still {tracker.phase} after {limit_s} s"
@@ -70,7 +70,7 @@ def test_arrives_in_nearly_the_bang_bang_time(tracker: LegTracker, bearing: floa
 def test_the_printed_argument_order_of_eq_3_2_would_turn_the_wrong_way(tracker: LegTracker) -> None:
     # arctan(x, y) as printed gives 0 for a target on the y axis, where the bearing is 90 degrees.
     tracker.begin((0.0, 0.0, 0.0), (0.0, 1.0), False)
-    assert tracker.phase is Phase.TURN
+    assert tracker.phase is LegPhase.TURN
     assert tracker.step((0.0, 0.0, 0.0), (0.0, 1.0), DT).omega_rad_s > 0.0
 
 
@@ -102,7 +102,7 @@ def test_turn_in_place_ends_within_tolerance(tracker: LegTracker) -> None:
     tracker.begin_turn(-1.2)
     for _ in range(400):
         robot.drive(tracker.step_turn(difference(-1.2, robot.heading), DT))
-        if tracker.phase is Phase.DONE:
+        if tracker.phase is LegPhase.DONE:
             break
     assert robot.heading == pytest.approx(-1.2, abs=0.01)  # heading tolerance
 
@@ -113,12 +113,12 @@ DRIFT = (0.0, -sin(0.25))
 
 def test_against_a_drift_it_points_beside_the_bearing(tracker: LegTracker) -> None:
     tracker.begin((0.0, 0.0, 0.25), (0.5, 0.0), False, DRIFT)
-    assert tracker.phase is Phase.DRIVE
+    assert tracker.phase is LegPhase.DRIVE
 
 
 def test_against_a_drift_it_turns_off_the_bearing(tracker: LegTracker) -> None:
     tracker.begin((0.0, 0.0, 0.0), (0.5, 0.0), False, DRIFT)
-    assert tracker.phase is Phase.TURN
+    assert tracker.phase is LegPhase.TURN
     assert tracker.step((0.0, 0.0, 0.0), (0.5, 0.0), DT, Twist(0.0, 0.0), DRIFT).omega_rad_s > 0.0
 
 
@@ -149,7 +149,7 @@ def test_a_turn_does_not_chase_the_bearing_of_a_stop_at_its_feet(tracker: LegTra
     carry(robot)
     tracker.begin(robot.pose, stop, reverse=False)
     planned_s, t = tracker.planned_s, 0.0
-    while tracker.phase is not Phase.DONE:
+    while tracker.phase is not LegPhase.DONE:
         robot.drive(tracker.step(robot.pose, stop, DT))
         carry(robot)
         t += DT

@@ -6,11 +6,19 @@ from typing import Any
 import msgspec
 import pytest
 
-from ccatp.beacons.mission import State
+from ccatp.beacons.mission import BeaconState
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import load_radio_config
 from ccatp.errors import ConfigError
-from ccatp.links.topics import BeaconArrival, BeaconMap, BeaconPlaces, BeaconTrack, BeaconTruth, Scene, Shape
+from ccatp.links.topics import (
+    BeaconArrival,
+    BeaconMapMessage,
+    BeaconPlaces,
+    BeaconTrack,
+    BeaconTruth,
+    RobotShape,
+    Scene,
+)
 from ccatp.report.dashboard.beacon_view import (
     BeaconView,
     beacon_ground,
@@ -33,14 +41,14 @@ def view() -> BeaconView:
     return BeaconView(config(), is_sim=True)
 
 
-def told_map(t_s: float = 1.0, **fields: Any) -> BeaconMap:
+def told_map(t_s: float = 1.0, **fields: Any) -> BeaconMapMessage:
     known: dict[str, Any] = {
         "seq": 10, "t_s": t_s, "system": "zigbee", "pose": (0.8, 0.8, 0.0), "pose_ellipse": ELLIPSE,
         "beacons": {"a": (0.3, 0.0, 0.03, 0.0, 0.01), "b": (3.0, 0.4, 0.02, 0.0, 0.02)}, "target": None,
         "obstacles": [], "waypoints": [(0.8, 0.8), (2.2, 0.8)], "next_waypoint": 1, "distances": [1.5, 0.7],
         "nis_sum": 0.0, "nis_size": 0, "refused": 0, "notes": {},
     }  # fmt: skip
-    return BeaconMap(**(known | fields))
+    return BeaconMapMessage(**(known | fields))
 
 
 def arrival(waypoint: int, lap: int = 0) -> BeaconArrival:
@@ -120,7 +128,7 @@ def test_without_a_truth_three_sigma_alone() -> None:
 def test_the_scene_without_what_the_page_draws_itself(view: BeaconView) -> None:
     kinds = ("robot", "trail", "waypoint", "beacon", "obstacle")
     view.hear(BeaconPlaces(seq=0, t_s=0.0, places={"a": (0.0, 1.0)}), 0.0)
-    view.hear(Scene(seq=1, t_s=1.0, shapes=[Shape(kind, kind, 1.0, 1.0) for kind in kinds]), 0.0)
+    view.hear(Scene(seq=1, t_s=1.0, shapes=[RobotShape(kind, kind, 1.0, 1.0) for kind in kinds]), 0.0)
     told = encoded(view.news(0.0))
     assert [shape["kind"] for shape in told["shapes"]] == ["true", "beacon", "obstacle"]
     assert told["shapes"][0]["y_m"] == 1.0
@@ -150,7 +158,7 @@ def test_the_ground(system: str) -> None:
     told = encoded(beacon_ground(cfg, is_sim=True, needs_token=True))
     assert told["needs_token"] is True
     assert told["rim"][2] == list(cfg.workspace.size_m)
-    assert told["states"] == [str(state) for state in State]
+    assert told["states"] == [str(state) for state in BeaconState]
     is_following = system == "follow"
     assert len(told["points"]) == (0 if is_following else len(cfg.workspace.waypoints_m))
     assert ("target" in told["plots"]) is is_following

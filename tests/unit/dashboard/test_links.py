@@ -2,12 +2,12 @@
 
 import pytest
 
-from ccatp.links.topics import MissionStatus, Presence
+from ccatp.links.topics import Heartbeat, MissionStatus
 from ccatp.report.dashboard.view import Links
 
 
-def presence(process: str, t_s: float, *, pid: int = 1, phase: str = "joined", age_s: float | None = 0.01) -> Presence:
-    return Presence(seq=0, t_s=t_s, process=process, pid=pid, phase=phase, frame_age_s=age_s)
+def presence(process: str, t_s: float, *, pid: int = 1, phase: str = "joined", age_s: float | None = 0.01) -> Heartbeat:
+    return Heartbeat(seq=0, t_s=t_s, process=process, pid=pid, phase=phase, frame_age_s=age_s)
 
 
 def status(exit_status: int) -> MissionStatus:

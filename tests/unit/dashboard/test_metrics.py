@@ -8,10 +8,10 @@ from ccatp.config.load import load_config
 from ccatp.mirror.mirror import build_mirror
 from ccatp.report.dashboard.metrics import metrics_text
 from ccatp.report.dashboard.survey_view import SurveyView
-from ccatp.survey.state import State
+from ccatp.survey.state import MissionState
 from tests.unit.dashboard.prometheus import parse
 
-GROUND = {"title": "fyst-m1", "states": [str(state) for state in State]}
+GROUND = {"title": "fyst-m1", "states": [str(state) for state in MissionState]}
 NOTHING: dict[str, Any] = {
     "is_sim": False, "trouble": "main was never heard of", "links": [], "restarts": {"main": 0, "danger": 2},
     "mission": None, "verdict": None, "robot": None, "pose": None,

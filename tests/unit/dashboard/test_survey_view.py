@@ -11,7 +11,18 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Severity, Verdict
-from ccatp.links.topics import Arrival, DangerEvent, FixMessage, Log, MissionStatus, Picture, Scene, Shape, Track, Truth
+from ccatp.links.topics import (
+    ArrivalMessage,
+    DangerEvent,
+    DisplayState,
+    FixMessage,
+    LogMessage,
+    MissionStatus,
+    RobotShape,
+    Scene,
+    TrackMessage,
+    TruthMessage,
+)
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.report.dashboard.survey_view import ARRIVED, MEASURED, SKIPPED, SurveyView, ground
 
@@ -45,8 +56,8 @@ def mission(**fields: Any) -> MissionStatus:
     return MissionStatus(**(known | fields))
 
 
-def picture(t_s: float = 1.5, nis: float = 2.0, line: bytes = LINE) -> Picture:
-    return Picture(
+def picture(t_s: float = 1.5, nis: float = 2.0, line: bytes = LINE) -> DisplayState:
+    return DisplayState(
         seq=5, t_s=t_s, x_m=1.0, y_m=-2.0, heading_rad=0.5, covariance_m2=(1e-6, 0.0, 4e-6), heading_sigma_rad=0.01,
         nis=nis, size=2, line=msgspec.Raw(line),
     )  # fmt: skip
@@ -110,7 +121,7 @@ def test_a_status_gets_stale(view: SurveyView) -> None:
 
 def test_a_point_from_arrival_to_measured(view: SurveyView, mirror: Mirror) -> None:
     point = view.points[0]
-    view.hear(Arrival(seq=8, t_s=2.0, point=(point.row, point.col, point.point), error_mm=0.3), 2.0)
+    view.hear(ArrivalMessage(seq=8, t_s=2.0, point=(point.row, point.col, point.point), error_mm=0.3), 2.0)
     assert view.news(2.0)["points"] == [[0, ARRIVED, None]]
     view.hear(fix_at(mirror, point, 0.004), 2.1)
     state = view.news(2.1)
@@ -120,7 +131,7 @@ def test_a_point_from_arrival_to_measured(view: SurveyView, mirror: Mirror) -> N
     assert error_mm == pytest.approx(4.0, abs=0.3)
     assert state["series"]["arrival"] == [(2.0, error_mm)]
     assert state["series"]["jump"] == [(2.0, 0.7)]
-    view.hear(Arrival(seq=8, t_s=2.2, point=(point.row, point.col, point.point), error_mm=0.3), 2.2)
+    view.hear(ArrivalMessage(seq=8, t_s=2.2, point=(point.row, point.col, point.point), error_mm=0.3), 2.2)
     assert view.news(2.2)["points"] == []  # measured stays measured
 
 
@@ -162,8 +173,8 @@ def test_the_path_as_it_is_driven_and_in_simulation_against_the_truth(view: Surv
         rows.append((k, 0.01 * k, 1, 2, -0.1 + 0.001 * k, 0.05, 0.0, 0.001))
         deck = mirror.deck_pose(PanelPose(PanelId(1, 2), rows[-1][4], 0.05, 0.0))
         truths.append((k, 0.01 * k, deck.x_m + 0.002, deck.y_m, 0.0, 0.0, 0.0, 0.0, 1.0, 0, 0))
-    view.hear(Track(seq=299, t_s=3.0, rows=rows), 3.0)
-    view.hear(Truth(seq=299, t_s=3.0, rows=truths), 3.0)
+    view.hear(TrackMessage(seq=299, t_s=3.0, rows=rows), 3.0)
+    view.hear(TruthMessage(seq=299, t_s=3.0, rows=truths), 3.0)
     state = encoded(view.news(3.0))
     path = np.array(state["path"])
     assert hypot(*(path[-1] - path[0])) == pytest.approx(0.28, abs=0.01)
@@ -174,7 +185,7 @@ def test_the_path_as_it_is_driven_and_in_simulation_against_the_truth(view: Surv
 def test_without_a_truth_sigma_alone_is_shown(mirror: Mirror, cfg: Config) -> None:
     view = SurveyView(mirror, cfg, is_sim=False)
     rows = [(k, 0.01 * k, 1, 2, 0.0, 0.0, 0.0, 0.002) for k in range(250)]
-    view.hear(Track(seq=249, t_s=2.5, rows=rows), 2.5)
+    view.hear(TrackMessage(seq=249, t_s=2.5, rows=rows), 2.5)
     assert view.news(2.5)["series"]["error"] == [(0.0, None, 6.0), (1.0, None, 6.0), (2.0, None, 6.0)]
 
 
@@ -228,14 +239,14 @@ def test_a_danger_event_is_a_line_as_well(view: SurveyView) -> None:
     assert state["verdict"]["code"] == 2
     assert "permits" not in state["verdict"]
     assert state["log"] == [(1.25, "warning", "danger: fire", 1, 1)]
-    view.hear(Log(seq=5, t_s=2.0, level="info", process="main", text="joined"), 2.0)
+    view.hear(LogMessage(seq=5, t_s=2.0, level="info", process="main", text="joined"), 2.0)
     assert view.news(2.0)["log"] == [(2.0, "info", "joined", 1, 2)]
 
 
 def test_other_things_on_the_map(view: SurveyView) -> None:
     assert "shapes" not in view.news(1.0)
-    beacon = Shape(id="b1", kind="beacon", x_m=1.0, y_m=2.0, covariance_m2=(0.1, 0.0, 0.1), label="b1")
-    wall = Shape(id="w", kind="obstacle", x_m=0.0, y_m=0.0, outline_m=[(0.0, 0.0), (1.0, 0.0), (0.0, 0.0)])
+    beacon = RobotShape(id="b1", kind="beacon", x_m=1.0, y_m=2.0, covariance_m2=(0.1, 0.0, 0.1), label="b1")
+    wall = RobotShape(id="w", kind="obstacle", x_m=0.0, y_m=0.0, outline_m=[(0.0, 0.0), (1.0, 0.0), (0.0, 0.0)])
     view.hear(Scene(seq=1, t_s=1.0, shapes=[beacon, wall]), 1.0)
     shapes = encoded(view.news(1.0))["shapes"]
     place = {"x_m": 1.0, "y_m": 2.0, "covariance_m2": [0.1, 0.0, 0.1]}

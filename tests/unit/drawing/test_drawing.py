@@ -9,15 +9,15 @@ import pytest
 from ccatp.report.drawing import (
     LEVELS,
     Area,
-    Axis,
     Boxes,
     ColourScale,
     Dots,
-    Line,
-    Picture,
+    Drawing,
     Plot,
+    PlotAxis,
+    PolyLine,
     Shape,
-    Text,
+    TextShape,
     colour_bar,
     envelope,
     legend,
@@ -31,14 +31,14 @@ from ccatp.report.plots import PictureError, write_figures, write_svg
 PIXEL_SHAPES: tuple[Shape, ...] = (
     Boxes(np.array([[0.0, 0.0, 50.0, 100.0]]), "#ff0000"),
     Area(np.array([[60.0, 10.0], [90.0, 10.0], [90.0, 40.0], [60.0, 40.0]]), "#0000ff", "#000000", 2.0),
-    Line(np.array([[55.0, 60.0], [95.0, 60.0], [np.nan, np.nan], [55.0, 70.0], [95.0, 70.0]]), "#00ff00", 6.0),
+    PolyLine(np.array([[55.0, 60.0], [95.0, 60.0], [np.nan, np.nan], [55.0, 70.0], [95.0, 70.0]]), "#00ff00", 6.0),
     Dots(np.array([[75.0, 90.0]]), 8.0, "#ff00ff", titles=("a < b",), edge="#ffffff"),
     Dots(np.array([[20.0, 20.0]]), 8.0, "#000000", "cross"),
     Dots(np.array([[20.0, 60.0]]), 8.0, "#000000", "ring"),
-    Line(np.array([[5.0, 95.0], [45.0, 95.0]]), "#000000", 2.0, dash=(4.0, 2.0), opacity=0.5),
-    Text(50.0, 50.0, "1 < 2 & $3", anchor="middle", is_bold=True, turn_deg=90.0),
+    PolyLine(np.array([[5.0, 95.0], [45.0, 95.0]]), "#000000", 2.0, dash=(4.0, 2.0), opacity=0.5),
+    TextShape(50.0, 50.0, "1 < 2 & $3", anchor="middle", is_bold=True, turn_deg=90.0),
 )  # fmt: skip
-PICTURE = Picture(100.0, 100.0, PIXEL_SHAPES, 'a "picture"')
+PICTURE = Drawing(100.0, 100.0, PIXEL_SHAPES, 'a "picture"')
 SVG = "{http://www.w3.org/2000/svg}"
 
 
@@ -56,9 +56,9 @@ def test_ticks_are_round(low: float, high: float, most: int, expected: list[floa
 
 
 def test_an_axis() -> None:
-    axis = Axis(0.0, 10.0, 100.0, 0.0)
+    axis = PlotAxis(0.0, 10.0, 100.0, 0.0)
     assert axis.pixels(np.array([0.0, 5.0, 10.0])) == pytest.approx([100.0, 50.0, 0.0])
-    log = Axis(0.01, 100.0, 0.0, 400.0, is_logarithmic=True)
+    log = PlotAxis(0.01, 100.0, 0.0, 400.0, is_logarithmic=True)
     assert log.pixels(np.array([0.001, 0.01, 1.0, 100.0])) == pytest.approx([0.0, 0.0, 200.0, 400.0])
     assert log.ticks() == pytest.approx([0.01, 0.1, 1.0, 10.0, 100.0])
     assert number_text(-0.5) == "\u22120.5"
@@ -119,20 +119,25 @@ def test_svg_is_sound_and_alone() -> None:
 
 def test_empty_shapes_leave_nothing() -> None:
     nothing = np.empty((0, 2))
-    shapes = (Line(nothing, "#000000"), Dots(nothing, 1.0, "#000000"), Boxes(np.empty((0, 4)), "#000000"))
-    assert svg_of(Picture(1.0, 1.0, shapes, "")).endswith('stroke-linejoin="round"></svg>')
+    shapes = (PolyLine(nothing, "#000000"), Dots(nothing, 1.0, "#000000"), Boxes(np.empty((0, 4)), "#000000"))
+    assert svg_of(Drawing(1.0, 1.0, shapes, "")).endswith('stroke-linejoin="round"></svg>')
 
 
 def test_a_plot_and_its_parts() -> None:
     plot = Plot(
-        40.0, 10.0, 300.0, 200.0, Axis(0.0, 10.0, 40.0, 300.0), Axis(0.1, 10.0, 200.0, 10.0, is_logarithmic=True)
+        40.0,
+        10.0,
+        300.0,
+        200.0,
+        PlotAxis(0.0, 10.0, 40.0, 300.0),
+        PlotAxis(0.1, 10.0, 200.0, 10.0, is_logarithmic=True),
     )
     plot.frame("time, s", "mm")
     plot.line(np.array([0.0, 10.0]), np.array([1.0, 1e9]), "#000000")
     plot.level(1.0, "#ff0000")
-    texts = [shape.text for shape in plot.shapes if isinstance(shape, Text)]
+    texts = [shape.text for shape in plot.shapes if isinstance(shape, TextShape)]
     assert {"time, s", "mm", "0.1", "1", "10"} <= set(texts)
-    series = next(shape for shape in plot.shapes if isinstance(shape, Line) and shape.width == 1.4)
+    series = next(shape for shape in plot.shapes if isinstance(shape, PolyLine) and shape.width == 1.4)
     assert series.points.tolist() == [[40.0, 105.0], [300.0, 8.0]]  # what is beyond the end stays at it
     shapes, height = legend(0.0, 10.0, [("one", "#000000"), ("another that is long", "#ffffff")], 10.0, 100.0)
     assert len(shapes) == 4

@@ -14,10 +14,10 @@ from ccatp.safety.edge_detector import (
     LONG_ON,
     Axis,
     Cause,
+    EdgeDetector,
+    EdgeLimits,
     EdgeMap,
-    Episode,
-    EpisodeLimits,
-    Phase,
+    EdgePhase,
     SeamNear,
 )
 from ccatp.safety.wheel_odometry import Odometry
@@ -69,12 +69,12 @@ class Sensor:
     turn: float = 0.0
     gap_m: float = GAP_M
     has_map: bool = True
-    episode: Episode = field(init=False)
+    episode: EdgeDetector = field(init=False)
 
     def __post_init__(self) -> None:
-        limits = EpisodeLimits(self.gap_m, self.cfg)
+        limits = EdgeLimits(self.gap_m, self.cfg)
         edge_map = cast(EdgeMap, self.map)
-        self.episode = Episode(limits, edge_map, self.odometry, (OFFSET, MOVED_M), HALF_BASE_M)
+        self.episode = EdgeDetector(limits, edge_map, self.odometry, (OFFSET, MOVED_M), HALF_BASE_M)
         if self.has_map:
             self.episode.place_on_map(MAP0, self.pose[2] + self.turn, SIGMA_M)
 
@@ -112,7 +112,7 @@ class Sensor:
 
 
 def test_the_limits_are_those_of_the_configuration(danger: DangerConfig) -> None:
-    limits = EpisodeLimits(GAP_M, danger)
+    limits = EdgeLimits(GAP_M, danger)
     width, angle = GAP_M + danger.gap_tolerance_m, danger.max_crossing_angle_rad
     assert width / cos(angle) > danger.slanted_crossing_m
     assert limits.min_cosine == cos(angle)
@@ -123,7 +123,7 @@ def test_the_limits_are_those_of_the_configuration(danger: DangerConfig) -> None
 def test_a_new_episode(danger: DangerConfig) -> None:
     sensor = Sensor(danger, Map(is_rim=True), has_map=False)
     episode = sensor.episode
-    assert episode.phase is Phase.FRESH
+    assert episode.phase is EdgePhase.FRESH
     assert episode.cause is None
     assert (episode.value_m, episode.limit_m) == (0.0, 0.0)
     assert not episode.is_from_turn
@@ -141,7 +141,7 @@ def test_a_new_episode(danger: DangerConfig) -> None:
 def test_an_episode_on_its_way_needs_no_map_any_more(danger: DangerConfig) -> None:
     sensor = Sensor(danger, Map(), has_map=False)
     sensor.off(0.001)
-    assert sensor.episode.phase is Phase.NO_MAP
+    assert sensor.episode.phase is EdgePhase.NO_MAP
     assert not sensor.episode.needs_map
 
 
@@ -178,7 +178,7 @@ def test_the_rim_counts_from_the_debounced_sample_on(danger: DangerConfig) -> No
     sensor = Sensor(danger, Map(is_rim=True))
     assert danger.debounce_samples == 2
     assert not sensor.off(0.001)
-    assert sensor.episode.phase is Phase.RIM
+    assert sensor.episode.phase is EdgePhase.RIM
     assert sensor.off(0.001)
     episode = sensor.episode
     assert (episode.cause, episode.limit_m) == (Cause.RIM, 0.0)
@@ -191,7 +191,7 @@ def test_without_a_map_the_travel_away_from_the_panel_counts(danger: DangerConfi
     for has_map in (False, True):
         sensor = Sensor(danger, Map(), has_map=has_map)
         assert not sensor.walk(limit - UM)
-        assert sensor.episode.phase is Phase.NO_MAP
+        assert sensor.episode.phase is EdgePhase.NO_MAP
         assert sensor.off(2 * UM)
         assert sensor.episode.cause is Cause.NO_MAP
         assert sensor.episode.value_m == pytest.approx(limit + UM)
@@ -234,7 +234,7 @@ def test_a_seam_allows_its_width_across(danger: DangerConfig, axis: Axis, k: int
     step[k] = sign
     sensor = Sensor(danger, Map(seams=(axis,)))
     assert not sensor.walk(step[0] * (limit - UM), step[1] * (limit - UM))
-    assert sensor.episode.phase is Phase.SEAM
+    assert sensor.episode.phase is EdgePhase.SEAM
     assert not sensor.episode.is_from_turn
     assert sensor.off(step[0] * 2 * UM, step[1] * 2 * UM)
     assert sensor.episode.cause is Cause.SEAM
@@ -259,7 +259,7 @@ def test_a_seam_allows_more_to_an_oblique_way(danger: DangerConfig, angle: float
 @pytest.mark.parametrize("gap_m", [0.0012, 0.004, 0.005, GAP_M, 0.020])
 def test_a_narrow_seam_may_be_crossed_at_a_greater_slant(danger: DangerConfig, gap_m: float) -> None:
     """Either the angle or the way across it bounds the slant, whichever allows more."""
-    limits = EpisodeLimits(gap_m, danger)
+    limits = EdgeLimits(gap_m, danger)
     width = gap_m + danger.gap_tolerance_m
     longest = max(danger.slanted_crossing_m, width / cos(danger.max_crossing_angle_rad))
     assert width / limits.min_cosine == pytest.approx(longest)
@@ -281,7 +281,7 @@ def test_back_over_the_seam_is_no_way_across(danger: DangerConfig) -> None:
     sensor = Sensor(danger, Map(seams=("x",)))
     assert not sensor.off(0.001)
     assert not sensor.walk(-0.1, steps=50)
-    assert sensor.episode.phase is Phase.SEAM
+    assert sensor.episode.phase is EdgePhase.SEAM
 
 
 def test_a_way_along_the_seam_has_a_limit_both_ways(danger: DangerConfig) -> None:
@@ -304,7 +304,7 @@ def test_the_side_is_told_by_a_way_that_is_steep_enough(danger: DangerConfig, co
 
 
 def test_more_than_both_chords_is_no_crossing(danger: DangerConfig) -> None:
-    crossing = EpisodeLimits(GAP_M, danger).crossing_m
+    crossing = EdgeLimits(GAP_M, danger).crossing_m
     sensor = Sensor(danger, Map(seams=("x", "y")))
     # Forth and back along the seam within its width: the way from the start is what counts.
     assert sensor.walk(0.001, crossing + 0.001, 60)
@@ -424,7 +424,7 @@ def test_looking_ahead_waits_for_the_debounced_sample(danger: DangerConfig) -> N
     sensor.off(0.001)
     sensor.map.is_rim = True
     assert not sensor.episode.look_ahead()
-    assert sensor.episode.phase is Phase.RIM
+    assert sensor.episode.phase is EdgePhase.RIM
     assert sensor.off(0.0)
 
 
@@ -482,7 +482,7 @@ def test_an_unknown_position_makes_every_seam_possible(danger: DangerConfig) -> 
     sensor.episode.place_on_map(MAP0, 0.0, inf)
     sensor.off(0.001)
     assert sensor.map.asked_seam[0][1] == inf
-    assert sensor.episode.phase is Phase.NO_MAP
+    assert sensor.episode.phase is EdgePhase.NO_MAP
 
 
 # -- what counts across, from both sides ------------------------------------------------------------------------------
@@ -558,7 +558,7 @@ def test_another_seam_is_asked_for_once_at_the_sensors_place(danger: DangerConfi
 def test_behind_a_switch_the_way_begins_anew_and_has_no_side(danger: DangerConfig) -> None:
     width = GAP_M + danger.gap_tolerance_m
     limit = width + danger.seam_extra_m
-    crossing = EpisodeLimits(GAP_M, danger).crossing_m
+    crossing = EdgeLimits(GAP_M, danger).crossing_m
     sensor = Sensor(danger, Map(seams=("x", "y")))
     sensor.off(0.001)
     assert not sensor.walk(limit, 0.0, 60)
@@ -573,7 +573,7 @@ def test_behind_a_switch_the_way_begins_anew_and_has_no_side(danger: DangerConfi
 
 
 def test_no_switch_beyond_the_crossing(danger: DangerConfig) -> None:
-    crossing = EpisodeLimits(GAP_M, danger).crossing_m
+    crossing = EdgeLimits(GAP_M, danger).crossing_m
     sensor = Sensor(danger, Map(seams=("x", "y")))
     sensor.off(0.001)
     assert sensor.off(0.0, crossing + 0.001)
@@ -618,7 +618,7 @@ def test_one_to_be_trusted_is_moved_back_from_where_it_is(danger: DangerConfig) 
     sensor.episode.is_doubted = True
     sensor.episode.trust()
     assert (sensor.episode.is_doubted, sensor.episode.retreat_m) == (False, 0.0)
-    assert sensor.episode.phase is Phase.DECLARED
+    assert sensor.episode.phase is EdgePhase.DECLARED
     sensor.off(0.0, 0.002)
     assert sensor.episode.retreat_m == pytest.approx(0.002)
 

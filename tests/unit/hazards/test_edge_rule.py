@@ -10,7 +10,7 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import EdgeSample, WheelSample
-from ccatp.safety.edge_detector import EdgeMap, Episode, Phase, SeamNear
+from ccatp.safety.edge_detector import EdgeDetector, EdgeMap, EdgePhase, SeamNear
 from ccatp.safety.edge_rule import EdgeRule, PoseEstimate
 
 MS = 1e-3
@@ -202,7 +202,7 @@ def test_a_reset_forgets_all_but_the_counts(rule: Rule) -> None:
 def test_put_back_the_episodes_begin_anew(rule: Rule) -> None:
     rule.feed([OFF_FL] * 80, v=0.1)
     assert rule.rule.episodes[0] is not None
-    assert rule.rule.episodes[0].phase is Phase.DECLARED
+    assert rule.rule.episodes[0].phase is EdgePhase.DECLARED
     rule.rule.reset_episodes()
     assert rule.rule.episodes == (None,) * 4
 
@@ -220,27 +220,27 @@ def test_an_edge_seen_ahead_is_counted_once(rule: Rule) -> None:
 # -- (e) a fix --------------------------------------------------------------------------------------------------------
 
 
-def declared(rule: Rule, sigma_m: float = 0.001) -> Episode:
+def declared(rule: Rule, sigma_m: float = 0.001) -> EdgeDetector:
     """An edge, and after it the sensor stays off while the robot is moved back and comes to rest."""
     rule.feed([OFF_FL] * 80, v=0.1, estimate=rule.estimate(sigma_m=sigma_m))
     rule.feed([OFF_FL] * 100, v=-0.1, estimate=rule.estimate(sigma_m=sigma_m))
     rule.feed([OFF_FL] * 10, estimate=rule.estimate(sigma_m=sigma_m))
     episode = rule.rule.episodes[0]
     assert episode is not None
-    assert episode.phase is Phase.DECLARED
+    assert episode.phase is EdgePhase.DECLARED
     rule.map.slacks_m.clear()
     rule.map.rims.clear()
     return episode
 
 
-def measured(rule: Rule, sigma_m: float, *, v: float = 0.0, omega: float = 0.0, flags: Any = OFF_FL) -> Episode:
+def measured(rule: Rule, sigma_m: float, *, v: float = 0.0, omega: float = 0.0, flags: Any = OFF_FL) -> EdgeDetector:
     rule.feed([flags] * 10, v=v, omega=omega, estimate=rule.estimate(sigma_m=sigma_m))
     episode = rule.rule.episodes[0]
     assert episode is not None
     return episode
 
 
-def phase_of(episode: Episode) -> Phase:
+def phase_of(episode: EdgeDetector) -> EdgePhase:
     """The phase as it is now: a checker of types would take it for what it was at the last look."""
     return episode.phase
 
@@ -250,14 +250,14 @@ def test_a_sensor_that_a_fix_shows_over_a_seam_begins_anew_there(rule: Rule) -> 
     rule.map.seam = SEAM
     anew = measured(rule, 4.9e-4)
     assert anew is not known
-    assert phase_of(anew) is Phase.FRESH
+    assert phase_of(anew) is EdgePhase.FRESH
     assert (rule.rule.opened[0], rule.rule.declared[0]) == (2, 1)
     # It is tied to the map by the fix, give or take 0.1 rad: the seam explains it, and so far only.
     rule.feed([OFF_FL] * 10, v=0.1)
-    assert phase_of(anew) is Phase.SEAM
+    assert phase_of(anew) is EdgePhase.SEAM
     rule.map.seam = None  # where it ends, no other crosses it
     rule.feed([OFF_FL] * 200, v=0.1)
-    assert phase_of(anew) is Phase.DECLARED
+    assert phase_of(anew) is EdgePhase.DECLARED
 
 
 def test_the_map_is_asked_with_the_slack_of_fix_and_heading(rule: Rule, cfg: Config) -> None:
@@ -273,7 +273,7 @@ def test_the_map_is_asked_with_the_slack_of_fix_and_heading(rule: Rule, cfg: Con
     anew = measured(rule, 4e-4, v=4e-4)  # how late it was noticed has no part in it
     rule.map.slacks_m.clear()
     rule.feed([OFF_FL] * 5, v=0.1)
-    assert anew.phase is Phase.SEAM
+    assert anew.phase is EdgePhase.SEAM
     extra_m = cfg.danger.gap_tolerance_m + cfg.danger.seam_extra_m
     assert rule.map.slacks_m == [pytest.approx(extra_m + slack_m)]
 
@@ -283,7 +283,7 @@ def test_one_that_a_fix_shows_at_the_rim_is_not_to_blame_for_staying_off(rule: R
     assert episode.retreat_m > 0.007
     episode.is_doubted = rule.map.is_rim = True
     assert measured(rule, 4.9e-4) is episode
-    assert (episode.phase, episode.is_doubted) == (Phase.DECLARED, False)
+    assert (episode.phase, episode.is_doubted) == (EdgePhase.DECLARED, False)
     # From here on the way back counts anew.
     assert episode.retreat_m == 0.0
     rule.feed([OFF_FL] * 50, v=-0.1)
@@ -318,7 +318,7 @@ def test_each_fix_counts_once(rule: Rule) -> None:
     measured(rule, 1e-5)
     rule.map.seam = SEAM
     episode = measured(rule, 1e-5)
-    assert episode.phase is Phase.DECLARED
+    assert episode.phase is EdgePhase.DECLARED
     assert measured(rule, 1e-5) is episode
 
 

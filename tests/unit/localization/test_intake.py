@@ -8,20 +8,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ccatp.core import ImuSample, WheelSample
-from ccatp.estimation.sample_validation import SampleIntake
+from ccatp.estimation.sample_validation import SampleValidator
 
 HISTORY_S = 0.2
 ONE = WheelSample(1.002, 1.0, 2.0)
 
 
-def intake() -> SampleIntake:
+def intake() -> SampleValidator:
     """One that has used samples up to 1.001 s."""
-    found = SampleIntake(HISTORY_S, Counter())
+    found = SampleValidator(HISTORY_S, Counter())
     assert found.columns(1.001, [WheelSample(1.0, 0.0, 0.0), WheelSample(1.001, 0.0, 0.0)]) is not None
     return found
 
 
-def counts(found: SampleIntake) -> dict[str, int]:
+def counts(found: SampleValidator) -> dict[str, int]:
     return {key: value for key, value in found._counts.items() if value}
 
 

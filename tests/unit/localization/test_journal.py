@@ -8,7 +8,7 @@ import pytest
 from ccatp.core import Fix, FloatArray
 from ccatp.estimation.fixes import FixRefused
 from ccatp.estimation.full_state import FullStateLocalizer
-from ccatp.estimation.replay_buffer import Journal, Step
+from ccatp.estimation.replay_buffer import ReplayBuffer, Step
 from ccatp.estimation.state_filter import SurveyFilter
 from ccatp.estimation.state_model import STATES, A, V, W
 from ccatp.filters import FILTERS, KalmanFilter
@@ -34,7 +34,7 @@ class Recorded:
     """A linear filter of two states and its journal; a step every 0.1 s."""
 
     def __init__(self, reach_s: float = 10.0) -> None:
-        self.filter, self.journal = KalmanFilter(np.zeros(2), np.eye(2)), Journal(reach_s)
+        self.filter, self.journal = KalmanFilter(np.zeros(2), np.eye(2)), ReplayBuffer(reach_s)
 
     def step(self, k: int) -> None:
         self.journal.begin(0.1 * k, 0.1, self.filter)

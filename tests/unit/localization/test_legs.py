@@ -8,18 +8,18 @@ import pytest
 
 from ccatp.config.models import FullStateConfig
 from ccatp.core import FloatArray
-from ccatp.estimation.slip_prior import LegBook, Population
+from ccatp.estimation.slip_prior import SlipPopulation, SlipPrior
 from ccatp.estimation.state_model import SL, SR, STATES, C
 
 DRAWN = [SR, SL, C]
 STEP = 2.0**0.5  # from one candidate for the scatter to the next
 
 
-def population() -> Population:
-    return Population([(0.015, 0.015)], 0.02)
+def population() -> SlipPopulation:
+    return SlipPopulation([(0.015, 0.015)], 0.02)
 
 
-def taught(scatter: float, legs: int, seed: int, sigma: float = 5e-4, mean: float = 0.03) -> Population:
+def taught(scatter: float, legs: int, seed: int, sigma: float = 5e-4, mean: float = 0.03) -> SlipPopulation:
     """After legs whose parameter is drawn from N(mean, scatter^2) and measured with ``sigma``."""
     rng, found = np.random.default_rng(seed), population()
     for _ in range(legs):
@@ -93,7 +93,7 @@ def state(mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatAr
 
 
 def test_the_first_leg_is_what_was_expected(full: FullStateConfig) -> None:
-    book = LegBook(full)
+    book = SlipPrior(full)
     mean, P = book.first()
     assert mean == pytest.approx([full.slip_mean, full.slip_mean, 0.0], abs=1e-15)
     means = TO_PARAMETERS.dot(P).dot(TO_PARAMETERS.T)
@@ -135,7 +135,7 @@ def update(x: FloatArray, P: FloatArray, row: FloatArray, z: float, noise: float
 
 def test_the_next_leg_is_given_what_bayes_gives_it(full: FullStateConfig) -> None:
     """Over four legs; creep, which scatters by a share of itself, only while that has not been learned."""
-    book = LegBook(full)
+    book = SlipPrior(full)
     x, P = state(*book.first())
     scatters = [value**2 for value in (book.scatter[0], 2.0 * book.scatter[0], book.scatter[1])]
     priors = ((full.slip_mean, full.slip_sigma), (0.0, full.slip_difference_sigma), (0.0, full.creep_sigma))
@@ -165,8 +165,8 @@ def test_a_leg_is_learned_from_without_what_was_expected_of_it(
     full: FullStateConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[tuple[list[tuple[float, float]], float]] = []
-    monkeypatch.setattr(Population, "learn", lambda _, samples, share: told.append((samples, share)))
-    book = LegBook(full)
+    monkeypatch.setattr(SlipPopulation, "learn", lambda _, samples, share: told.append((samples, share)))
+    book = SlipPrior(full)
     x, P = state(*book.first())
     for slip, z in ((SR, 0.05), (SL, 0.03)):
         x, P = update(x, P, np.eye(STATES)[slip], z, 4e-4)  # as much as the prior: the posterior is half of each
@@ -182,8 +182,8 @@ def test_what_wandered_within_a_leg_is_no_knowledge_lost(
 ) -> None:
     """The leg's own variance is that of its measurements; the wander counts with the scatter of which it is a share."""
     told: list[tuple[list[tuple[float, float]], float]] = []
-    monkeypatch.setattr(Population, "learn", lambda _, samples, share: told.append((samples, share)))
-    book = LegBook(full)
+    monkeypatch.setattr(SlipPopulation, "learn", lambda _, samples, share: told.append((samples, share)))
+    book = SlipPrior(full)
     x, P = state(*book.first())
     slip, creep = book.wander(2.0)
     P[[SR, SL, C], [SR, SL, C]] += slip, slip, creep
@@ -198,7 +198,7 @@ def test_what_wandered_within_a_leg_is_no_knowledge_lost(
 
 def test_the_deviation_from_what_was_expected_passes_through(full: FullStateConfig) -> None:
     """The redraw is affine in the state: the mean that it leaves is the book's whatever state it was made for."""
-    book = LegBook(full)
+    book = SlipPrior(full)
     x, P = state(*book.first())
     redraw = book.begin(x + 0.01, P)
     assert redraw.found == pytest.approx(x[DRAWN] + 0.01)
@@ -206,7 +206,7 @@ def test_the_deviation_from_what_was_expected_passes_through(full: FullStateConf
     assert np.linalg.eigvalsh(redraw.Q)[0] > 0.0
 
 
-def drive(book: LegBook, slips: list[tuple[float, float]], noise: float) -> None:
+def drive(book: SlipPrior, slips: list[tuple[float, float]], noise: float) -> None:
     """Legs of these slips (right, left), each seen with the variance ``noise`` and ended by a fix."""
     rng = np.random.default_rng(3)
     x, P = state(*book.first())
@@ -223,7 +223,7 @@ def drive(book: LegBook, slips: list[tuple[float, float]], noise: float) -> None
 
 
 def test_a_floor_on_which_all_legs_slip_alike(full: FullStateConfig) -> None:
-    book = LegBook(full)
+    book = SlipPrior(full)
     before = book.scatter[0]
     drive(book, [(0.04, 0.03)] * 30, 1e-7)
     assert book.scatter[0] < 0.1 * before
@@ -231,7 +231,7 @@ def test_a_floor_on_which_all_legs_slip_alike(full: FullStateConfig) -> None:
 
 @pytest.mark.parametrize("half_width", [0.01, 0.02])
 def test_a_floor_on_which_every_leg_slips_differently(full: FullStateConfig, half_width: float) -> None:
-    book, rng = LegBook(full), np.random.default_rng(4)
+    book, rng = SlipPrior(full), np.random.default_rng(4)
     drive(book, [tuple(rng.uniform(0.03 - half_width, 0.03 + half_width, 2).tolist()) for _ in range(150)], 1e-7)
     # A uniform distribution's sigma is its half width over sqrt(3), the mean of two wheels has 1/sqrt(2) of that. Of
     # the last 100 legs, which are remembered, 7 %.
@@ -240,7 +240,7 @@ def test_a_floor_on_which_every_leg_slips_differently(full: FullStateConfig, hal
 
 def test_wheels_that_slip_unlike_each_other_tell_how_much_legs_differ(full: FullStateConfig) -> None:
     """The mean of the two is the same in every leg, their difference is not."""
-    book, rng = LegBook(full), np.random.default_rng(5)
+    book, rng = SlipPrior(full), np.random.default_rng(5)
     halves = (0.01 / sqrt(2.0) * rng.normal(size=150)).tolist()
     drive(book, [(0.03 + half, 0.03 - half) for half in halves], 1e-7)
     # Half of the samples scatter by 0.01/sqrt(2), half by nothing.
@@ -249,7 +249,7 @@ def test_wheels_that_slip_unlike_each_other_tell_how_much_legs_differ(full: Full
 
 def test_only_a_leg_that_was_ended_by_a_fix_teaches_its_scatter(full: FullStateConfig) -> None:
     for is_told, is_learned in ((True, False), (False, True)):
-        book = LegBook(full)
+        book = SlipPrior(full)
         before = book._slip_scatter.scatter
         x, P = state(*book.first())
         x, P = update(x, P, np.eye(STATES)[SR], 0.05, 1e-8)
@@ -263,14 +263,14 @@ def test_only_a_leg_that_was_ended_by_a_fix_teaches_its_scatter(full: FullStateC
 
 
 def test_a_leg_that_showed_nothing_new_does_not_count(full: FullStateConfig) -> None:
-    book = LegBook(full)
+    book = SlipPrior(full)
     before = book._slip_scatter.scatter
     book.end(*state(*book.first()))
     assert book._slip_scatter.scatter == before
 
 
 def test_slip_and_creep_wander_within_a_leg(full: FullStateConfig) -> None:
-    book = LegBook(full)
+    book = SlipPrior(full)
     slip, creep = book.wander(0.5)
     share = full.wander_fraction**2 / full.wander_time_s * 0.5
     assert slip == pytest.approx(2.0 * share * book.scatter[0] ** 2)  # of a wheel: twice that of a mean of two

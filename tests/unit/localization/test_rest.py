@@ -7,7 +7,7 @@ import pytest
 
 from ccatp.config.models import FullStateConfig
 from ccatp.core import DeckPose, GravitySample, ImuSample, PanelPose, difference, wrap_pi
-from ccatp.estimation.measurements import NoiseFloor, RestWatch, heading_from_gravity
+from ccatp.estimation.measurements import NoiseFloor, ZeroVelocityDetector, heading_from_gravity
 from ccatp.estimation.state_model import BA, BG, PSI, A, Terrain, W
 from ccatp.mirror.mirror import Mirror
 from tests.unit.localization.drive import FRAME_S, STEEP, Errors, Frame, Robot, build, errors_of, run, trapeze
@@ -15,8 +15,8 @@ from tests.unit.localization.drive import FRAME_S, STEEP, Errors, Frame, Robot, 
 WINDOW = 15  # samples in a mean of the noise floor
 
 
-def watch() -> RestWatch:
-    return RestWatch(0.25, NoiseFloor(1e-4), NoiseFloor(1e-4))
+def watch() -> ZeroVelocityDetector:
+    return ZeroVelocityDetector(0.25, NoiseFloor(1e-4), NoiseFloor(1e-4))
 
 
 def test_rest_begins_after_its_time_and_only_once() -> None:

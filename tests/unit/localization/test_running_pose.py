@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ccatp.core import FloatArray, ImuSample
-from ccatp.estimation.odometry import Block, BlockBuilder, RunningPose
+from ccatp.estimation.odometry import PosePredictor, PreintegratedMotion, Preintegrator
 from ccatp.estimation.state_model import BG, KG, PL, PR, PSI, STATES, A, Slope, SurveyMotion, V, W, X, Y
 from tests.unit.localization.drive import config
 from tests.unit.localization.test_survey_model import LEVEL, slopes, states
@@ -16,8 +16,8 @@ from tests.unit.localization.test_survey_model import LEVEL, slopes, states
 R_M, BASE_M = config().robot.wheel_radius_m, config().robot.wheel_base_m
 
 
-def running() -> RunningPose:
-    return RunningPose(R_M, BASE_M, 0.3)
+def running() -> PosePredictor:
+    return PosePredictor(R_M, BASE_M, 0.3)
 
 
 @settings(max_examples=60, deadline=None)
@@ -49,7 +49,7 @@ def test_speed_and_rate_begin_with_the_filters() -> None:
     assert pose.v_m_s == 0.0
 
 
-def trusted(angle_variance: float, rate_variance: float = 1e-4, dt_s: float = 0.01) -> RunningPose:
+def trusted(angle_variance: float, rate_variance: float = 1e-4, dt_s: float = 0.01) -> PosePredictor:
     pose = running()
     pose.begin(np.zeros(STATES), LEVEL, 0.0)
     pose.trust(angle_variance, rate_variance, dt_s)
@@ -116,7 +116,7 @@ def test_the_noise_of_a_frame_sets_the_gain_anew() -> None:
 # -- blocks -----------------------------------------------------------------------------------------------------------
 
 
-def fill(builder: BlockBuilder, times: list[float], rate: float = 1.0, jerk: float = 1.0) -> Block:
+def fill(builder: Preintegrator, times: list[float], rate: float = 1.0, jerk: float = 1.0) -> PreintegratedMotion:
     """Frames of 10 ms that end at ``times``; the angular rate is ``rate t^1``, the acceleration ``jerk t``."""
     for t in times:
         builder.add(0.01, is_turning=True, imu=[ImuSample(t - 0.005, 9.0, 9.0), ImuSample(t, jerk * t, rate * t)])
@@ -124,7 +124,7 @@ def fill(builder: BlockBuilder, times: list[float], rate: float = 1.0, jerk: flo
 
 
 def test_means_over_a_block() -> None:
-    builder = BlockBuilder()
+    builder = Preintegrator()
     builder.stand([ImuSample(0.0, 0.0, 0.0)])
     first = fill(builder, [0.01, 0.02, 0.03, 0.04])
     assert (first.dt_s, first.turning_s) == pytest.approx((0.04, 0.04))
@@ -137,7 +137,7 @@ def test_means_over_a_block() -> None:
 
 
 def test_a_block_says_how_long_the_wheels_turned() -> None:
-    builder = BlockBuilder()
+    builder = Preintegrator()
     builder.add(0.01, is_turning=True, imu=[])
     builder.add(0.02, is_turning=False, imu=[])
     block = builder.take()
@@ -147,7 +147,7 @@ def test_a_block_says_how_long_the_wheels_turned() -> None:
 
 
 def test_the_first_sample_begins_a_trapezoid_and_a_gap_ends_it() -> None:
-    builder = BlockBuilder()
+    builder = Preintegrator()
     assert fill(builder, [0.01]).samples == 0
     assert fill(builder, [0.02]).rate_rad_s == pytest.approx(0.015, abs=1e-15)
     builder.add(0.01, is_turning=True, imu=[])
@@ -157,22 +157,22 @@ def test_the_first_sample_begins_a_trapezoid_and_a_gap_ends_it() -> None:
 
 
 def test_nothing_reaches_across_a_restart_or_a_rest() -> None:
-    for forget in (BlockBuilder.restart, lambda builder: builder.stand([])):
-        builder = BlockBuilder()
+    for forget in (Preintegrator.restart, lambda builder: builder.stand([])):
+        builder = Preintegrator()
         fill(builder, [0.01, 0.02])
         forget(builder)
         block = fill(builder, [5.01, 5.02])
         assert block.samples == 1
         assert block.rate_rad_s == pytest.approx(5.015, abs=1e-12)
         assert block.acceleration_m_s2 == block.rate_rad_s  # none of before is averaged in
-    builder = BlockBuilder()
+    builder = Preintegrator()
     builder.add(0.01, is_turning=True, imu=[])
     builder.restart()
     assert builder.take().dt_s == 0.0
 
 
 def test_the_mean_of_white_noise_has_the_variance_of_its_samples() -> None:
-    rng, builder, found = np.random.default_rng(1), BlockBuilder(), []
+    rng, builder, found = np.random.default_rng(1), Preintegrator(), []
     for _ in range(4000):
         for _ in range(4):
             builder.add(0.01, is_turning=True, imu=[ImuSample(0.0, 0.0, float(rng.normal()))])

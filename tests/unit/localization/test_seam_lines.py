@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ccatp.config.models import FullStateConfig
 from ccatp.core import DeckPose, FloatArray, PanelId, PanelPose
-from ccatp.estimation.seams import Edge, SeamLines, Transition
+from ccatp.estimation.seams import Edge, SeamLines, SensorTransition
 from ccatp.estimation.state_model import E0, E1, PSI, STATES, A, Slope, Terrain, V, W, X, Y
 from ccatp.mirror.mirror import Mirror
 from tests.unit.localization.drive import Rate, Robot, build, config, errors_of, mirror, run, trapeze
@@ -59,7 +59,7 @@ class Meeting:
             sx, sy = mirror().body_offset(DeckPose(x, y, psi), *SENSORS[corner])
             x, y = (x + self.edge_m - sx, y) if k == 0 else (x, y + self.edge_m - sy)
         self.truth = DeckPose(x, y, psi)
-        self.transition = Transition(0.0, INTERVAL_S, corner, is_on)
+        self.transition = SensorTransition(0.0, INTERVAL_S, corner, is_on)
         hx, hy, _, _ = mirror().body_axes(DeckPose(x, y, psi + 0.5 * w * late_s))
         self.state = np.zeros(STATES)
         self.state[[X, Y, PSI, V, W]] = x + v * late_s * hx, y + v * late_s * hy, psi + w * late_s, v, w

@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, fit_map
+from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
 from ccatp.beacons.cricket.range_network import RigidBody
 from ccatp.beacons.cricket.rigidity import find_fold_over
 from tests.unit.motes.fields import ADJACENT, ALL, HEADS, ZIGZAG, FloatArray, Pairs, near_pairs, network_of
@@ -39,7 +39,7 @@ def test_what_may_fold_does_fold_and_fits_as_well() -> None:
     offset = folded[list(motes)] - through[0]
     folded[list(motes)] = through[0] + 2.0 * np.outer(offset @ along, along) - offset
     model = MapModel(network)
-    fit = fit_map(model, model.state(folded), BatchSettings())
+    fit = fit_map(model, model.state(folded), MapFitSettings())
     assert np.abs(fit.residuals_m).max() < 1e-9
     assert np.abs(fit.state.positions_m - HEADS).max() > 1.0
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, fit_map, position_covariance
+from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map, position_covariance
 from ccatp.beacons.cricket.range_network import RigidBody
 from ccatp.filters.metrics import aligned_rms_m, best_motion
 from tests.unit.motes.fields import ALL, HEADS, SIGMA_M, FloatArray, near_pairs, network_of
 
-PLAIN = BatchSettings()
+PLAIN = MapFitSettings()
 
 
 def field_3d(rng: np.random.Generator) -> FloatArray:
@@ -79,7 +79,7 @@ def test_one_wrong_range_moves_a_robust_map_little() -> None:
     network.ranges_m[7] += 0.7
     model = MapModel(network)
     plain = fit_map(model, model.state(HEADS), PLAIN)
-    robust = fit_map(model, model.state(HEADS), BatchSettings(robust_scale=3.0))
+    robust = fit_map(model, model.state(HEADS), MapFitSettings(robust_scale=3.0))
     assert aligned_rms_m(plain.state.positions_m, HEADS) > 0.02
     assert aligned_rms_m(robust.state.positions_m, HEADS) < 0.001
     assert robust.weights[7] < 0.01
@@ -89,7 +89,7 @@ def test_one_wrong_range_moves_a_robust_map_little() -> None:
 def test_too_few_steps_are_told() -> None:
     model = MapModel(network_of(HEADS, ALL))
     fit = fit_map(
-        model, model.state(HEADS + np.random.default_rng(1).normal(size=(6, 2))), BatchSettings(max_iterations=2)
+        model, model.state(HEADS + np.random.default_rng(1).normal(size=(6, 2))), MapFitSettings(max_iterations=2)
     )
     assert not fit.is_at_rest
     assert fit.iterations == 2

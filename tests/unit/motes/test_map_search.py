@@ -5,7 +5,7 @@ import pytest
 from scipy.special import ndtri
 
 from ccatp.beacons.cricket.flip_search import residual_scale, scaled, searched
-from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, fit_from_afar, fit_map
+from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_from_afar, fit_map
 from ccatp.beacons.cricket.map_start import grown
 from ccatp.beacons.cricket.mote_map import map_motes
 from ccatp.beacons.cricket.range_network import PairMeans, RangeNetwork
@@ -13,7 +13,7 @@ from ccatp.beacons.cricket.unfolding import agreement_of
 from ccatp.filters.metrics import aligned_rms_m
 from tests.unit.motes.fields import SIGMA_M, FloatArray, near_pairs, network_of
 
-ROBUST = BatchSettings(robust_scale=4.0)
+ROBUST = MapFitSettings(robust_scale=4.0)
 ALL_HEAR = 1e3
 
 

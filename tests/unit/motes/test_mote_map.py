@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, bound_rms_m, fit_map, position_covariance
+from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, bound_rms_m, fit_map, position_covariance
 from ccatp.beacons.cricket.mote_map import map_motes, pinned_map, plain_frame
 from ccatp.beacons.cricket.range_network import RangeNetwork, RigidBody
 from ccatp.beacons.cricket.rigidity import find_fold_over
@@ -23,7 +23,7 @@ from tests.unit.motes.fields import (
     network_of,
 )
 
-ROBUST = BatchSettings(robust_scale=4.0)
+ROBUST = MapFitSettings(robust_scale=4.0)
 BODIES = [RigidBody(f"N{number}", tuple(range(3 * number, 3 * number + 3)), STAND) for number in range(6)]
 
 
@@ -149,7 +149,7 @@ def test_a_pinned_map_has_the_errors_of_its_frame() -> None:
     turn = np.array([[np.cos(0.1), -np.sin(0.1)], [np.sin(0.1), np.cos(0.1)]])
     for _ in range(200):
         model = MapModel(network_of(HEADS, ALL, rng))
-        fit = fit_map(model, model.state(HEADS), BatchSettings())
+        fit = fit_map(model, model.state(HEADS), MapFitSettings())
         found_m, free_covariance = fit.state.positions_m, position_covariance(model, fit)[0]
         motion = best_motion(found_m, HEADS)
         whole = np.kron(np.eye(6), turn @ motion.rotation)

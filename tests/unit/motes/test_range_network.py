@@ -7,9 +7,9 @@ from ccatp.beacons.cricket.range_network import (
     BadRange,
     Disconnected,
     MoteRange,
+    MoteUnderdetermined,
     PairMeans,
     RigidBody,
-    TooFewRanges,
     UnknownMote,
     build_network,
     graph_pairs,
@@ -50,7 +50,7 @@ def test_ranges_that_none_can_be(bad: MoteRange, what: str) -> None:
 
 
 def test_nothing_to_map() -> None:
-    with pytest.raises(TooFewRanges, match="0 ranges among 0 motes"):
+    with pytest.raises(MoteUnderdetermined, match="0 ranges among 0 motes"):
         build_network([], 2)
 
 

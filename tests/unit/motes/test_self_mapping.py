@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, fit_map
+from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
 from ccatp.beacons.cricket.range_network import MappingError
 from ccatp.beacons.cricket.self_mapping import MapperSettings, MoteMapper, conditioned, printed_prior, run_phase_two
 from tests.unit.motes.fields import ADJACENT, ALL, HEADS, SIGMA_M, ZIGZAG, FloatArray, Pairs, network_of
@@ -36,7 +36,7 @@ def test_the_filter_ends_where_the_batch_does() -> None:
     network = network_of(HEADS, [row[:2] for row in rows], known_m=KNOWN)
     network.ranges_m[:] = [row[2] for row in rows]
     model = MapModel(network)
-    batch = fit_map(model, model.state(start), BatchSettings())
+    batch = fit_map(model, model.state(start), MapFitSettings())
     assert filtered.positions_m == pytest.approx(batch.state.positions_m, abs=1e-5)  # of the wide prior
 
 

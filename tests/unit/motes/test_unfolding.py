@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.cricket.flip_search import unfold
-from ccatp.beacons.cricket.map_fit import BatchSettings, MapModel, fit_map
+from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
 from ccatp.beacons.cricket.map_start import stitched
 from ccatp.beacons.cricket.range_network import PairMeans, components
 from ccatp.beacons.cricket.unfolding import classical_scaling, completed, repaired, unfolded
 from ccatp.filters.metrics import aligned_rms_m
 from tests.unit.motes.fields import ALL, HEADS, FloatArray, near_pairs, network_of
 
-SETTINGS = BatchSettings(robust_scale=4.0)
+SETTINGS = MapFitSettings(robust_scale=4.0)
 
 
 def drawn(count: int, dimension: int, neighbours: float, seed: int) -> tuple[FloatArray, list[tuple[int, int]]]:
@@ -44,7 +44,7 @@ def test_unfolding_finds_maps_that_plain_descent_folds() -> None:
         means, model = PairMeans(network), MapModel(network)
         plain = classical_scaling(completed(30, means.pairs, means.ranges_m), 3)
         start = unfolded(30, means.pairs, means.ranges_m, means.sigmas_m, 3)
-        ends.append([fit_map(model, model.state(first), BatchSettings()).cost < 1e-6 for first in (plain, start)])
+        ends.append([fit_map(model, model.state(first), MapFitSettings()).cost < 1e-6 for first in (plain, start)])
     plain_found, found = np.sum(ends, axis=0)
     assert found > plain_found
 

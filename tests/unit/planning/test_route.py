@@ -12,16 +12,16 @@ from ccatp.core import DeckPose, PointId, Stop, StopKind
 from ccatp.mirror.mirror import build_mirror
 from ccatp.survey.planning.legs import (
     Grazing,
+    LegPlace,
     LegRules,
     OutsideMirrorError,
-    Place,
     PlanError,
-    UnreachableError,
+    UnreachablePointError,
     build_body,
     build_places,
 )
 from ccatp.survey.planning.route import Route, plan_route, thesis_order
-from ccatp.survey.planning.search import Arrival, Search, Target, path_time
+from ccatp.survey.planning.search import Search, SearchNode, Target, path_time
 from ccatp.survey.planning.way_home import plan_way_home
 
 STEPS_OF_THESIS_M1 = ((1, 2), (2, 3), (7, 8), (8, 9))  # rows of 7, 9, 11, ..., 11, 9, 7 panels
@@ -147,7 +147,9 @@ def test_points_too_near_the_rim(clearances: dict[str, float], thesis: Any) -> N
     cfg = thesis.cfg
     mission = cfg.mission.model_copy(update=clearances)
     points = thesis_order(thesis.mirror, 1)
-    with pytest.raises(UnreachableError, match=r"no safe way to point 1-3-1 of thesis-m1, 0\.115 m from the rim") as e:
+    with pytest.raises(
+        UnreachablePointError, match=r"no safe way to point 1-3-1 of thesis-m1, 0\.115 m from the rim"
+    ) as e:
         plan_route(thesis.mirror, points, cfg.robot, cfg.limits, mission, thesis.mirror.base_pose)
     assert isinstance(e.value, PlanError)
     for name, value in clearances.items():
@@ -207,7 +209,7 @@ def test_no_leg_whose_sensors_clip_a_re_entrant_corner(thesis: Any) -> None:
         assert rules.is_clear(a, b)
         assert a.can_face(course)
         assert b.can_face(course)
-        assert bool(search.advance([Arrival(a, course, 0.0)], (), Target(b))) == passes
+        assert bool(search.advance([SearchNode(a, course, 0.0)], (), Target(b))) == passes
 
 
 def test_no_sensor_runs_along_a_seam(thesis: Any) -> None:
@@ -239,7 +241,7 @@ def test_no_way_off_the_route_leads_along_a_seam(name: str, slanted: int) -> Non
         else:
             point = points[int(rng.integers(len(points)))]
             stops = plan_route(mirror, [point], cfg.robot, cfg.limits, cfg.mission, start).stops
-        places = [Place(x, y, 1.0), *(Place(stop.x_m, stop.y_m, 1.0) for stop in stops)]
+        places = [LegPlace(x, y, 1.0), *(LegPlace(stop.x_m, stop.y_m, 1.0) for stop in stops)]
         for (a, b), stop in zip(pairwise(places), stops, strict=True):
             if (b.x_m, b.y_m) != (a.x_m, a.y_m):
                 course = atan2(b.y_m - a.y_m, b.x_m - a.x_m) + (np.pi if stop.reverse else 0.0)

@@ -9,18 +9,18 @@ import pytest
 from ccatp.core import DeckPose, PanelId, PointId
 from ccatp.mirror.mirror import Mirror
 from ccatp.survey.planning.escape import find_retreats
-from ccatp.survey.planning.legs import Body, Place, Stance, build_body, build_places, sensor_depths
+from ccatp.survey.planning.legs import Body, LegPlace, Stance, build_body, build_places, sensor_depths
 
 
 def body_of(world: Any) -> Body:
     return build_body(world.cfg.robot, world.cfg.mission)
 
 
-def place(mirror: Mirror, body: Body, x: float, y: float) -> Place:
+def place(mirror: Mirror, body: Body, x: float, y: float) -> LegPlace:
     return build_places(mirror, body, np.array([x]), np.array([y]))[0]
 
 
-def at(mirror: Mirror, body: Body, point: PointId) -> Place:
+def at(mirror: Mirror, body: Body, point: PointId) -> LegPlace:
     return place(mirror, body, *mirror.point_on_deck(point))
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from ccatp.core import DeckPose, Stop, StopKind
-from ccatp.survey.planning.legs import OutsideMirrorError, UnreachableError
+from ccatp.survey.planning.legs import OutsideMirrorError, UnreachablePointError
 from ccatp.survey.planning.way_home import plan_way_home
 
 
@@ -79,10 +79,12 @@ def test_start_beyond_the_rim(x: float, y: float, thesis: Any) -> None:
 
 
 def test_base_in_the_clearance(thesis: Any) -> None:
-    with pytest.raises(UnreachableError, match=r"no safe way to base at \(3\.700, 0\.000\) m, 0\.035 m from the rim"):
+    with pytest.raises(
+        UnreachablePointError, match=r"no safe way to base at \(3\.700, 0\.000\) m, 0\.035 m from the rim"
+    ):
         go(thesis, DeckPose(0.0, 0.0, 0.0), DeckPose(3.7, 0.0, 0.0))
 
 
 def test_mirror_too_small_to_turn_on(small: Any) -> None:
-    with pytest.raises(UnreachableError, match=r"no place to turn within 0\.4 m of .* 0\.1\d\d m from the rim"):
+    with pytest.raises(UnreachablePointError, match=r"no place to turn within 0\.4 m of .* 0\.1\d\d m from the rim"):
         go(small, small.mirror.base_pose)

@@ -13,7 +13,7 @@ from ccatp.daemon.checkpoints import StoreUnusable, build_parts
 from ccatp.daemon.process import Endpoints, ProcessArgs
 from ccatp.errors import ConfigError
 from ccatp.links.robot_messages import Hello, RobotData
-from ccatp.survey.composition import Parts
+from ccatp.survey.composition import SurveyParts
 
 
 def args(config: Config, folder: Path) -> ProcessArgs:
@@ -22,7 +22,7 @@ def args(config: Config, folder: Path) -> ProcessArgs:
 
 
 @pytest.fixture
-def parts(tmp_path: Path) -> Parts:
+def parts(tmp_path: Path) -> SurveyParts:
     built, store = build_parts(args(load_config(None, {"run.panels": 1}), tmp_path))
     store.close()
     return built
@@ -41,14 +41,14 @@ def hello(config: Config, **changes: Any) -> Hello:
     return Hello("ccatp-robot/1", 1, "0" * 32, "none", True, 100.0, 0.25, RobotData(**{**fields, **changes}))
 
 
-def test_a_plan_measures_every_point_once(parts: Parts) -> None:
+def test_a_plan_measures_every_point_once(parts: SurveyParts) -> None:
     points = [stop.point for stop in parts.route.stops if stop.kind is StopKind.MEASURE]
     assert len(points) == len(set(points)) == parts.total_points == 9
     assert parts.already_done == 0
     assert 0.0 < parts.lower_bound_s < 100.0  # 40 s of it are the calibration drive
 
 
-def test_the_robot_of_the_configuration_is_accepted(parts: Parts, config: Config) -> None:
+def test_the_robot_of_the_configuration_is_accepted(parts: SurveyParts, config: Config) -> None:
     parts.check_robot(hello(config))
     parts.check_robot(hello(config, wheel_radius_m=config.robot.wheel_radius_m * 1.01))  # calibrated here
 
@@ -62,12 +62,12 @@ def test_the_robot_of_the_configuration_is_accepted(parts: Parts, config: Config
         ({"puck_m": (0.0, 0.02, 0.05)}, "the puck is at"),
     ],
 )
-def test_another_robot_is_refused(parts: Parts, config: Config, changes: dict[str, Any], why: str) -> None:
+def test_another_robot_is_refused(parts: SurveyParts, config: Config, changes: dict[str, Any], why: str) -> None:
     with pytest.raises(ConfigError, match=why):
         parts.check_robot(hello(config, **changes))
 
 
-def test_an_overhanging_mirror_needs_a_fan_floor(parts: Parts, config: Config) -> None:
+def test_an_overhanging_mirror_needs_a_fan_floor(parts: SurveyParts, config: Config) -> None:
     overhanging = load_config(None, {"run.mirror": "fyst-m2", "run.panels": 1})
     from ccatp.mirror.mirror import build_mirror
 

@@ -8,7 +8,7 @@ import pytest
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.daemon.robot_session import FIRST_DELAY_S, LONGEST_DELAY_S, LastingLink, delay_s
+from ccatp.daemon.robot_session import FIRST_DELAY_S, LONGEST_DELAY_S, ReconnectingRobotLink, delay_s
 from ccatp.dataloop import DataLoop
 from ccatp.links.robot_codec import encode
 from ccatp.links.robot_link import RobotTimeout
@@ -31,7 +31,7 @@ class Client:
         self.frames: list[int] = []
         self.losses: list[str] = []
         self.changed = asyncio.Event()
-        self.lasting = LastingLink(
+        self.lasting = ReconnectingRobotLink(
             cfg.robot,
             role="controller",
             client="test",

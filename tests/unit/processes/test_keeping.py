@@ -7,7 +7,7 @@ from ccatp.config.models import Config
 from ccatp.core import EventCode
 from ccatp.daemon.checkpoints import in_force_of
 from ccatp.mirror.mirror import build_mirror
-from ccatp.survey.state import State
+from ccatp.survey.state import MissionState
 from tests.unit.test_mission import ABORT, FREE, Story, from_first_leg
 
 QUAKE = replace(
@@ -20,7 +20,7 @@ QUAKE = replace(
 def driving(config: Config) -> Story:
     cfg = from_first_leg(config)
     story = Story(cfg, build_mirror(cfg.mirror))
-    story.until_state(State.DRIVING)
+    story.until_state(MissionState.DRIVING)
     return story
 
 
@@ -48,5 +48,5 @@ def test_what_was_stopped_on_its_way_home_goes_home_when_it_goes_on(driving: Sto
 
 
 def test_what_is_at_base_has_nothing_in_force(driving: Story) -> None:
-    driving.until_state(State.DONE, ABORT)
+    driving.until_state(MissionState.DONE, ABORT)
     assert in_force_of(driving.mission) == ("", "")

@@ -10,14 +10,14 @@ import pytest
 
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, PointId
-from ccatp.daemon.fix_service import MeasuringDesk, Request
-from ccatp.daemon.telemetry import SurveyTeller
+from ccatp.daemon.fix_service import FixRequest, FixService
+from ccatp.daemon.telemetry import SurveyTelemetry
 from ccatp.estimation.fixes import FixGated, FixRefused
 from ccatp.etalon_client import EtalonClient
 from ccatp.localizer import Localizer
 from ccatp.records.store import MissionStore
 from ccatp.records.store_rows import AlreadyMeasuredError
-from ccatp.survey.fix_gate import Finding, Scrutiny
+from ccatp.survey.fix_gate import FixFinding, FixGate
 from ccatp.survey.mission import Mission
 
 FIX = Fix(1.0, (0.0, 0.0, 0.0), (0.0,) * 9, 1.0, (1,), 0.0)
@@ -47,19 +47,19 @@ async def measured_once(
         return FIX
 
     over = asyncio.Event()
-    desk = MeasuringDesk(
+    desk = FixService(
         config.mission,
         cast(EtalonClient, SimpleNamespace(measure=measure)),
-        cast(Scrutiny, SimpleNamespace(begin=lambda: None, review=lambda *_, **__: Finding())),
+        cast(FixGate, SimpleNamespace(begin=lambda: None, review=lambda *_, **__: FixFinding())),
         cast(Localizer, localizer),
         cast(Mission, mission),
         cast(MissionStore, store),
-        cast(SurveyTeller, teller),
+        cast(SurveyTelemetry, teller),
         over.set,
         lambda: 0.0,
     )
     serving = asyncio.get_running_loop().create_task(desk.run())
-    desk.begin(Request(1, 1.0, point, (0.0, 0.0, 0.0), DeckPose(0.0, 0.0, 0.0)))
+    desk.begin(FixRequest(1, 1.0, point, (0.0, 0.0, 0.0), DeckPose(0.0, 0.0, 0.0)))
     async with asyncio.timeout(10.0):
         await over.wait()
     serving.cancel()

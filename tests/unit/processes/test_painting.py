@@ -5,9 +5,9 @@ from pathlib import Path
 import zmq
 
 from ccatp.config.models import Config
-from ccatp.daemon.telemetry import Painter, look_at_localizer
+from ccatp.daemon.telemetry import DisplayStatePublisher, look_at_localizer
 from ccatp.links.bus import Publisher, Subscriber
-from ccatp.links.topics import Picture
+from ccatp.links.topics import DisplayState
 from ccatp.localizer import build_localizer
 from ccatp.mirror.mirror import build_mirror
 
@@ -20,7 +20,7 @@ def test_a_picture_for_a_subscriber_only(config: Config, tmp_path: Path) -> None
     endpoint = f"ipc://{tmp_path}/main"
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     publisher = Publisher(context, endpoint)
-    painter = Painter(publisher, look_at_localizer)
+    painter = DisplayStatePublisher(publisher, look_at_localizer)
     subscriber = Subscriber(context, [endpoint], ["picture"], keeps_newest=True)
     try:
         while not publisher.has_subscriber("picture"):
@@ -30,11 +30,11 @@ def test_a_picture_for_a_subscriber_only(config: Config, tmp_path: Path) -> None
         painter.tell_if_wanted(2, 0.2)
         painter.tell_if_wanted(3, 0.3)
         received = subscriber.receive(5.0)
-        while received is not None and isinstance(received[1], Picture) and received[1].seq < 3:
+        while received is not None and isinstance(received[1], DisplayState) and received[1].seq < 3:
             received = subscriber.receive(5.0)
         assert received is not None
         picture = received[1]
-        assert isinstance(picture, Picture)
+        assert isinstance(picture, DisplayState)
         base = mirror.base_pose
         assert (picture.x_m, picture.y_m) == (base.x_m, base.y_m)
         assert bytes(picture.line) == LINE

@@ -7,9 +7,9 @@ import msgspec
 import structlog
 
 from ccatp.core import DeckPose, Fix, PanelId, PanelPose
-from ccatp.daemon.telemetry import BATCH_FRAMES, SurveyTeller
+from ccatp.daemon.telemetry import BATCH_FRAMES, SurveyTelemetry
 from ccatp.links.bus import Publisher
-from ccatp.links.topics import FixMessage, Message, SensorLines, Track
+from ccatp.links.topics import FixMessage, Message, SensorLines, TrackMessage
 from ccatp.localizer import Localizer
 
 
@@ -26,9 +26,9 @@ class Listener:
         return [message for topic, message in self.heard if topic == name]
 
 
-def teller() -> tuple[SurveyTeller, Listener]:
+def teller() -> tuple[SurveyTelemetry, Listener]:
     listener = Listener()
-    return SurveyTeller(cast(Publisher, listener), structlog.get_logger()), listener
+    return SurveyTelemetry(cast(Publisher, listener), structlog.get_logger()), listener
 
 
 def localizer() -> Localizer:
@@ -44,7 +44,7 @@ def test_a_frame_that_is_not_newer_is_recorded_without_an_estimate() -> None:
     tells.flush()
     (lines,), (track,) = listener.of("sensors"), listener.of("track")
     assert isinstance(lines, SensorLines)
-    assert isinstance(track, Track)
+    assert isinstance(track, TrackMessage)
     assert [msgspec.json.decode(line)["seq"] for line in lines.lines] == [7, 8, 9]
     assert [row[0] for row in track.rows] == [7, 9]
 

@@ -5,18 +5,18 @@ import asyncio
 import pytest
 
 from ccatp.daemon.process import unless_stopped
-from ccatp.errors import UnreachableError
+from ccatp.errors import DaemonUnreachableError
 
 
 async def refuse() -> None:
-    raise UnreachableError("nobody there")
+    raise DaemonUnreachableError("nobody there")
 
 
 def test_work_is_left_when_stopped_and_else_done() -> None:
     async def story() -> None:
         stop, never, before = asyncio.Event(), asyncio.Event(), asyncio.all_tasks()
         assert await unless_stopped(stop, asyncio.sleep(0))
-        with pytest.raises(UnreachableError, match="nobody there"):
+        with pytest.raises(DaemonUnreachableError, match="nobody there"):
             await unless_stopped(stop, refuse())
 
         async def wait_for_ever() -> None:

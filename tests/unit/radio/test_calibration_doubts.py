@@ -8,7 +8,7 @@ import pytest
 from ccatp.beacons.slam.batch_smoother import smooth
 from ccatp.beacons.slam.causal import filter_run
 from ccatp.beacons.slam.evaluation import judge, result_data
-from ccatp.beacons.slam.recording import RecordedRun, Track
+from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun
 from ccatp.beacons.slam.settings import batch_settings, slam_settings
 from ccatp.config.load import load_recordings_config
 from tests.unit.radio_data.sets import recorded, world
@@ -21,7 +21,7 @@ def no_clock() -> float:
     return 0.0
 
 
-def both(run: RecordedRun, **priors: float) -> list[Track]:
+def both(run: RecordedRun, **priors: float) -> list[EstimatedPath]:
     """The run by filter and smoother, with other priors."""
     wide = CONFIG.csv.priors.model_copy(update=priors)
     cfg = CONFIG.csv.model_copy(update={"priors": wide})

@@ -9,13 +9,13 @@ import pytest
 from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.slam.causal import filter_run
 from ccatp.beacons.slam.evaluation import judge
-from ccatp.beacons.slam.recording import Readings, RecordedRun, Track, Truth
+from ccatp.beacons.slam.recording import EstimatedPath, Readings, RecordedRun, ReferencePath
 from ccatp.beacons.slam.settings import slam_settings
 from ccatp.config.load import load_recordings_config
 from tests.unit.radio_data.sets import recorded, world
 
 
-def track_of(run: RecordedRun) -> Track:
+def track_of(run: RecordedRun) -> EstimatedPath:
     cfg = load_recordings_config(None, {})
     return filter_run(run, slam_settings(cfg.csv, cfg.filter), (0.05, 0.05), perf_counter)
 
@@ -96,7 +96,7 @@ def test_no_nees_where_the_truth_did_not_tell_the_first_pose() -> None:
     track = track_of(run)
     assert judge(track, run).nees is not None
     assert run.truth is not None
-    late = replace(run, truth=Truth(*(column[50:] for column in run.truth)))
+    late = replace(run, truth=ReferencePath(*(column[50:] for column in run.truth)))
     assert judge(track, late).nees is None
     assert judge(track, late).trajectory_rmse_m is not None
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from ccatp.beacons.slam.range_slam import FreshNoise
+from ccatp.beacons.slam.range_slam import AddedPoseNoise
 
 
 def test_it_is_that_of_the_matrices() -> None:
     rng = np.random.default_rng(3)
-    ours, N = FreshNoise(), np.zeros((3, 3))
+    ours, N = AddedPoseNoise(), np.zeros((3, 3))
     for _ in range(5):
         F, root = np.eye(4), rng.normal(size=(4, 4))
         F[:2, 2] = rng.normal(size=2)

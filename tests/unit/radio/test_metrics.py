@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.slam.evaluation import judge, truth_at
-from ccatp.beacons.slam.recording import BeaconFix, Track, Truth
+from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, ReferencePath
 from ccatp.filters.metrics import RigidMotion, consistency, nees, rms, wrapped
 from tests.unit.radio_data.sets import BEACONS, recorded, world
 
@@ -34,22 +34,25 @@ def test_squares_of_gaussian_errors_lie_in_the_band_and_others_do_not() -> None:
 
 def test_truth_is_unknown_outside_and_in_its_gaps() -> None:
     t = np.array([0.0, 0.4, 2.0, 2.4, 2.8])
-    found = truth_at(Truth(t, t, -t, 2.0 * t), np.array([-0.1, 0.2, 1.0, 2.2, 2.9]))
+    found = truth_at(ReferencePath(t, t, -t, 2.0 * t), np.array([-0.1, 0.2, 1.0, 2.2, 2.9]))
     assert np.isnan(found[[0, 2, 4]]).all()
     assert found[[1, 3]] == pytest.approx(np.array([(0.2, -0.2, 0.4), (2.2, -2.2, 4.4)]))
     slow = np.array([0.0, 1.0, 2.0, 3.0, 9.0])  # a reference of a hertz is no gap
-    assert np.isfinite(truth_at(Truth(slow, slow, slow, slow), np.array([0.5, 5.0]))[:, 0]).tolist() == [True, False]
+    assert np.isfinite(truth_at(ReferencePath(slow, slow, slow, slow), np.array([0.5, 5.0]))[:, 0]).tolist() == [
+        True,
+        False,
+    ]
 
 
 AWAY = RigidMotion(np.array(((np.cos(1.0), -np.sin(1.0)), (np.sin(1.0), np.cos(1.0)))), np.array((5.0, -3.0)))
 
 
-def track_of(turned: RigidMotion, *, beacons: bool = True) -> Track:
+def track_of(turned: RigidMotion, *, beacons: bool = True) -> EstimatedPath:
     """The truth of a simulated run, moved rigidly, with a beacon 0.3 m off."""
     w = world(seconds=20.0)
     places = turned.moved(np.array(list(BEACONS.values())) + np.array([[0.3, 0.0], [0, 0], [0, 0], [0, 0]]))
     poses = np.column_stack([turned.moved(w.poses[:, :2]), w.poses[:, 2] + turned.angle_rad])
-    return Track(
+    return EstimatedPath(
         times_s=w.times_s,
         poses=poses,
         covariances=np.broadcast_to(np.eye(3), (len(poses), 3, 3)),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ccatp.beacons.slam.path_loss import CalibrationError, LevelPair, PathLoss, fit_path_loss
+from ccatp.beacons.slam.path_loss import LevelPair, PathLoss, PathLossError, fit_path_loss
 
 
 def test_printed_ranges_of_2017_come_out() -> None:
@@ -95,7 +95,7 @@ def test_doubts_are_told() -> None:
 
 @pytest.mark.parametrize("slope_db_m", [0.0, 5.0])
 def test_levels_that_do_not_fall_are_no_path_loss(slope_db_m: float) -> None:
-    with pytest.raises(CalibrationError, match="levels do not fall with distance"):
+    with pytest.raises(PathLossError, match="levels do not fall with distance"):
         fit_path_loss([LevelPair(d, -60.0 + slope_db_m * d) for d in (1.0, 2.0, 3.0, 4.0)])
 
 
@@ -108,5 +108,5 @@ def test_levels_that_do_not_fall_are_no_path_loss(slope_db_m: float) -> None:
     ],
 )
 def test_pairs_without_a_path_loss_are_refused(pairs: list[tuple[float, float]], message: str) -> None:
-    with pytest.raises(CalibrationError, match=message):
+    with pytest.raises(PathLossError, match=message):
         fit_path_loss(LevelPair(*pair) for pair in pairs)

@@ -5,14 +5,14 @@ from math import log10, pi
 import numpy as np
 import pytest
 
-from ccatp.beacons.slam.beacon_map import BearingModel, RangeModel, RssiModel, SlamSettings, Trust
+from ccatp.beacons.slam.beacon_map import BearingModel, RangeModel, RobustLoss, RssiModel, SlamSettings
 from ccatp.beacons.slam.landmark_init import derivatives, wrapped
-from ccatp.beacons.slam.measurement_models import Row, SensorError, Sensors
+from ccatp.beacons.slam.measurement_models import MeasurementError, MeasurementModels, MeasurementRow
 from ccatp.beacons.slam.motion import DeadReckoning, DifferentialDrive, DifferentialNoise, Increment, Odometry
 from ccatp.beacons.slam.recording import RangeBearingReading, RangeReading, RssiReading
 from ccatp.core import FloatArray
 
-TRUST = Trust(5.0, 3.0, 0.0, 1.0, 3, 20, 0.3, 0.3, True)
+TRUST = RobustLoss(5.0, 3.0, 0.0, 1.0, 3, 20, 0.3, 0.3, True)
 MOTION = DifferentialDrive(DifferentialNoise(0.05, 0.0, 0.01, 0.0, 0.0, 0.0))
 SETTINGS = SlamSettings(
     MOTION, TRUST, RangeModel(0.1, 0.02, 0.1, 0.3), BearingModel(0.05), RssiModel(2.0, -40.0, 3.0, 2.0, 0.3)
@@ -24,7 +24,7 @@ READINGS: dict[str, RangeReading | RssiReading] = {
 }
 
 
-def row_at(sensors: Sensors, kind: str, x: FloatArray) -> Row:
+def row_at(sensors: MeasurementModels, kind: str, x: FloatArray) -> MeasurementRow:
     pose, calibration, beacon = x[:3].tolist(), x[3:5].tolist(), x[5:].tolist()
     if kind == "bearing":
         return sensors.bearing(pose, beacon)
@@ -33,7 +33,7 @@ def row_at(sensors: Sensors, kind: str, x: FloatArray) -> Row:
 
 @pytest.mark.parametrize("kind", ["range", "bearing", "rssi"])
 def test_jacobian_of_a_row(kind: str) -> None:
-    sensors, x = Sensors(SETTINGS), np.array((*POSE, *CALIBRATION, *BEACON))
+    sensors, x = MeasurementModels(SETTINGS), np.array((*POSE, *CALIBRATION, *BEACON))
     if kind == "range":
         x = x[:7]
     row = row_at(sensors, kind, x)
@@ -45,7 +45,7 @@ def test_jacobian_of_a_row(kind: str) -> None:
 
 
 def test_values_of_the_rows() -> None:
-    sensors, x = Sensors(SETTINGS), np.array((*POSE, *CALIBRATION, *BEACON))
+    sensors, x = MeasurementModels(SETTINGS), np.array((*POSE, *CALIBRATION, *BEACON))
     assert row_at(sensors, "range", x).expected == pytest.approx(1.06 * 5.0 - 0.1)
     assert row_at(sensors, "range", x).variance == pytest.approx(0.1**2 + (0.02 * 5.0) ** 2)
     assert row_at(sensors, "rssi", x).expected == pytest.approx(-37.0 - 22.0 * log10(5.0))
@@ -59,10 +59,10 @@ def test_an_angle_goes_the_short_way_round() -> None:
 
 @pytest.mark.parametrize("kind", ["range", "bearing"])
 def test_jacobian_through_the_delay(kind: str) -> None:
-    sensors, clock = Sensors(SETTINGS), DeadReckoning(is_delayed=True)
+    sensors, clock = MeasurementModels(SETTINGS), DeadReckoning(is_delayed=True)
     clock.took(Increment(1.0, 0.5, 0.0, 0.0), np.array((0.7, 1.6, 0.0)), np.array((1.0, 2.0, 0.4)))
 
-    def expected(x: FloatArray) -> Row:
+    def expected(x: FloatArray) -> MeasurementRow:
         at = clock.at(x[:3].tolist(), 1.1, float(x[5]))
         return row_at(sensors, kind, np.array((*at.pose, *x[3:5], *BEACON[:2])))
 
@@ -93,12 +93,12 @@ def test_a_pose_is_carried_no_further_than_a_step() -> None:
 
 
 def test_a_sensor_that_nobody_described_is_refused() -> None:
-    sensors = Sensors(SlamSettings(MOTION, TRUST))
-    with pytest.raises(SensorError, match=r"no range model: give SlamSettings\.range"):
+    sensors = MeasurementModels(SlamSettings(MOTION, TRUST))
+    with pytest.raises(MeasurementError, match=r"no range model: give SlamSettings\.range"):
         sensors.row(RangeReading(0.0, 1, 1.0), POSE, [], [0.0, 0.0])
-    with pytest.raises(SensorError, match=r"no RSSI model: give SlamSettings\.rssi"):
+    with pytest.raises(MeasurementError, match=r"no RSSI model: give SlamSettings\.rssi"):
         sensors.row(RssiReading(0.0, 1, -50.0), POSE, [], [0.0, 0.0])
-    with pytest.raises(SensorError, match=r"no bearing model: give SlamSettings\.bearing"):
+    with pytest.raises(MeasurementError, match=r"no bearing model: give SlamSettings\.bearing"):
         sensors.bearing(POSE, [0.0, 0.0])
     assert sensors.names == ()
     assert RangeBearingReading(0.0, 1, 1.0, 0.2).bearing_rad == 0.2

@@ -10,7 +10,7 @@ from ccatp.beacons.slam.motion import Increment, Odometry, SlippingVehicle, Stee
 from ccatp.beacons.slam.path_loss import PathLoss
 from ccatp.beacons.slam.recording import RssiReading
 from ccatp.beacons.slam.settings import new_slam, vehicle_of
-from ccatp.beacons.slam.signal_landmarks import MovingRadio, ShadowingMap, Sight, rows_of
+from ccatp.beacons.slam.signal_landmarks import MovingRadio, RadioModel, ShadowingMap, rows_of
 from ccatp.beacons.slam.signal_slam import SignalSlam
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import load_radio_config
@@ -71,8 +71,8 @@ def test_a_vehicle_takes_the_odometry_of_its_kind() -> None:
 def test_rows_have_the_derivatives_of_level_and_bearing() -> None:
     shadow = np.array((0.5, -0.3))
     sights = [
-        Sight(RssiReading(0.0, "b", -40.0, 0.4), 0, shadow, 4.0),
-        Sight(RssiReading(0.0, "b", -41.0, None), 3, shadow, 4.0),
+        RadioModel(RssiReading(0.0, "b", -40.0, 0.4), 0, shadow, 4.0),
+        RadioModel(RssiReading(0.0, "b", -41.0, None), 3, shadow, 4.0),
     ]
     x = np.array((0.1, 0.2, 0.3, 0.6, 0.1, 0.5, 2.0, 1.5, 0.7, -0.2))
     rows = rows_of(sights, slice(6, 10), PathLoss(-33.0, 2.0, 2.0), 0.3)

@@ -8,14 +8,22 @@ from statistics import median
 import numpy as np
 import pytest
 
-from ccatp.beacons.slam.beacon_map import BearingModel, NoiseLevel, RangeModel, RssiModel, SlamSettings, Trust, Wander
+from ccatp.beacons.slam.beacon_map import (
+    BearingModel,
+    GaussMarkovBias,
+    NoiseLevel,
+    RangeModel,
+    RobustLoss,
+    RssiModel,
+    SlamSettings,
+)
 from ccatp.beacons.slam.motion import DifferentialDrive, DifferentialNoise, Increment
 from ccatp.beacons.slam.range_slam import BeaconEstimate, BeaconSlam
 from ccatp.beacons.slam.recording import BeaconId, RangeBearingReading, RangeReading, Reading, RssiReading
 from ccatp.core import wrap_pi
 from ccatp.filters.ekf_slam import BlockError
 
-TRUST = Trust(6.0, 3.0, 100.0, 5.0, 3, 20, 0.3, 0.3, True)
+TRUST = RobustLoss(6.0, 3.0, 100.0, 5.0, 3, 20, 0.3, 0.3, True)
 MOTION = DifferentialNoise(0.01, 0.0, 0.005, 0.005, 0.0, 0.0)
 SETTINGS = SlamSettings(DifferentialDrive(MOTION), TRUST, RangeModel(0.05, 0.0, 0.0, 0.0), BearingModel(0.03))
 BEACONS: dict[BeaconId, tuple[float, float]] = {"a": (4.0, 1.0), "b": (2.0, 6.0), "c": (-3.0, 4.0), "d": (-1.0, -2.0)}
@@ -277,7 +285,7 @@ def test_removal() -> None:
 def test_errors_that_stay_while_the_vehicle_does_are_not_averaged_away() -> None:
     """A vehicle that hardly moves hears the same wrong range again and again: it believes in it none the more."""
     sigmas = []
-    for wander in (None, Wander(0.8, 0.5, 60.0)):
+    for wander in (None, GaussMarkovBias(0.8, 0.5, 60.0)):
         settings = replace(SETTINGS, range=RangeModel(0.05, 0.0, 0.0, 0.0, wander))
         world = start(replace(settings, trust=replace(TRUST, learn_memory=0.0)))
         world.drive(200, turn_rad=0.0, way_m=0.0005)

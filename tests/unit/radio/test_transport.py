@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ccatp.beacons.slam.beacon_map import Transport
+from ccatp.beacons.slam.beacon_map import HeadingTransport
 from ccatp.core import FloatArray
 from ccatp.filters.ekf_slam import EkfSlam
 
@@ -26,7 +26,7 @@ def a_map(heading_variance: float) -> EkfSlam:
 
 def test_a_turn_of_everything_stays_as_unknown_as_it_was() -> None:
     engine = a_map(0.04)
-    transport, before = Transport(engine), engine.mean.copy()
+    transport, before = HeadingTransport(engine), engine.mean.copy()
     moved: FloatArray = np.array((0.3, -0.2, 0.1, 0.5, 0.1, -0.4, 0.2, 0.7))
     engine.mean += moved
     transport.follow(before.copy())
@@ -46,7 +46,7 @@ def test_a_turn_of_everything_stays_as_unknown_as_it_was() -> None:
 
 def test_what_joined_since_is_left_alone_and_what_left_stops_it() -> None:
     engine = a_map(0.04)
-    transport, before = Transport(engine), engine.mean.copy()
+    transport, before = HeadingTransport(engine), engine.mean.copy()
     engine.augment("c", np.array((1.0, 1.0)), np.arange(2), np.eye(2))
     engine.mean[3] += 0.5
     transport.follow(before.copy())

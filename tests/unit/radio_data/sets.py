@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.io
 
-from ccatp.beacons.slam.recording import Readings, RecordedRun, Steps, Truth, dead_reckoned
+from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps, dead_reckoned
 
 FloatArray = npt.NDArray[np.float64]
 BEACONS = {"6": (0.5, 4.0), "7": (7.5, 5.5), "8": (6.0, -1.0), "9": (-1.0, -0.5)}
@@ -66,7 +66,7 @@ def recorded(w: World, *, bearings: bool = True) -> RecordedRun:
         readings=Readings(w.read_s, w.read_beacon, w.range_m, w.bearing_rad if bearings else nothing, nothing.copy()),
         beacon_ids=tuple(BEACONS),
         beacon_truth_m=dict(BEACONS),
-        truth=Truth(w.times_s, *w.poses.T),
+        truth=ReferencePath(w.times_s, *w.poses.T),
         first_pose=(x, y, heading),
         warnings=(),
     )

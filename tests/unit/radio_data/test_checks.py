@@ -8,7 +8,7 @@ import pytest
 
 from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.reader import read_run
-from ccatp.beacons.slam.recording import RecordedRun, Steps, Truth
+from ccatp.beacons.slam.recording import RecordedRun, ReferencePath, Steps
 from tests.unit.radio_data.sets import BEACONS, labyrinth_lines, plaza_tables, recorded, world, write_lines, write_plaza
 
 W = world(seconds=120.0)
@@ -185,7 +185,7 @@ def test_gaps() -> None:
     assert "readings: 1 gap, the longest of 20." in told(run)
     assert SOUND.truth is not None
     keep = (W.times_s < 30.0) | (W.times_s > 35.0)
-    run = replace(SOUND, truth=Truth(*(column[keep] for column in SOUND.truth)))
+    run = replace(SOUND, truth=ReferencePath(*(column[keep] for column in SOUND.truth)))
     assert "truth: 1 gap, the longest of 5." in told(run)
 
 

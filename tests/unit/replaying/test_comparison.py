@@ -12,7 +12,7 @@ from ccatp.records.run_reader import Trace
 from ccatp.studies.replay import Replayed
 from ccatp.studies.replay_report import (
     REPRODUCED,
-    Judged,
+    ReplayEvaluation,
     csv_lines,
     difference,
     errors_of,
@@ -96,14 +96,14 @@ def test_the_distance_of_a_fix_is_that_to_the_estimate_before_it(mirror: Mirror)
     assert found == pytest.approx([0.003, 0.0], abs=2e-5)  # the surface falls by less than that over 3 mm
 
 
-def judged(mirror: Mirror, *, has_truth: bool, is_smoothed: bool = True, first: int = 0) -> Judged:
+def judged(mirror: Mirror, *, has_truth: bool, is_smoothed: bool = True, first: int = 0) -> ReplayEvaluation:
     replayed = Replayed(
         trace([0.002, 0.002], first=first, covariance=np.eye(3)),
         np.array([first]),
         smoothed=trace([0.001, 0.0], first=first) if is_smoothed else None,
     )
     truth = trace([0.0, 0.0], first=first) if has_truth else None
-    return Judged(replayed, trace([0.004, 0.002], first=first), truth, NONE, mirror)
+    return ReplayEvaluation(replayed, trace([0.004, 0.002], first=first), truth, NONE, mirror)
 
 
 def test_with_a_truth_all_three_are_judged_by_it(mirror: Mirror) -> None:

@@ -10,7 +10,7 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import dump_radio_config, load_radio_config
 from ccatp.links.topics import (
     BeaconArrival,
-    BeaconMap,
+    BeaconMapMessage,
     BeaconPlaces,
     BeaconTrack,
     BeaconTruth,
@@ -39,7 +39,7 @@ def place(frame: int) -> tuple[float, float]:
     return 0.8 + 0.02 * frame, 0.8
 
 
-def beacon_map(frame: int, cfg: RadioConfig) -> BeaconMap:
+def beacon_map(frame: int, cfg: RadioConfig) -> BeaconMapMessage:
     """The map after a frame: beacon1 is 0.1 m off, beacon2 is right; each map adds 2 readings of NIS 3."""
     beacons = {"beacon1": (0.1, 0.0, 0.01, 0.0, 0.0025), "beacon2": (3.0, 3.0, 0.01, 0.002, 0.01)}
     target = None
@@ -47,7 +47,7 @@ def beacon_map(frame: int, cfg: RadioConfig) -> BeaconMap:
         target = (place(frame)[0] + 1.0, 0.8, 0.01, 0.0, 0.01)
         beacons["target"] = target
     told = frame // 5
-    return BeaconMap(
+    return BeaconMapMessage(
         seq=frame, t_s=PERIOD_S * frame, system=cfg.system, pose=(*place(frame), 0.0),
         pose_ellipse=(*place(frame), *ELLIPSE), beacons=beacons, target=target, obstacles=[(1.0, 2.0)],
         waypoints=[] if cfg.follow.is_active else list(cfg.workspace.waypoints_m), next_waypoint=1,

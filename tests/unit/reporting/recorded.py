@@ -11,17 +11,26 @@ from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, Fix, PanelPose, PointId
 from ccatp.links.robot_messages import Sensors
-from ccatp.links.topics import TOPICS, Arrival, FixMessage, Misalignment, MissionStatus, Track, Truth, schema_of
+from ccatp.links.topics import (
+    TOPICS,
+    ArrivalMessage,
+    FixMessage,
+    Misalignment,
+    MissionStatus,
+    TrackMessage,
+    TruthMessage,
+    schema_of,
+)
 from ccatp.records.recorder import Recorder
 from ccatp.records.store import MissionStore
 from ccatp.records.store_rows import PlannedPoint
-from ccatp.studies.sil_run import Rehearsing
-from ccatp.survey.state import State
+from ccatp.studies.sil_run import SilRun
+from ccatp.survey.state import MissionState
 
 BATCH = 100
 
 
-class RecordingRun(Rehearsing):
+class RecordingRun(SilRun):
     """A mission in process that leaves a run directory behind.
 
     Args:
@@ -51,7 +60,7 @@ class RecordingRun(Rehearsing):
         self.truth: list[tuple[Any, ...]] = []
         self.note_arrival = self.book.builder.add_arrival
         self.book.builder.add_arrival = self.arrive  # type: ignore[method-assign]
-        self.seq, self.t_s, self.seen = 0, 0.0, State.IDLE
+        self.seq, self.t_s, self.seen = 0, 0.0, MissionState.IDLE
 
     def leave(self) -> Path:
         """Drive it, and close everything as the daemon does at its end."""
@@ -88,9 +97,9 @@ class RecordingRun(Rehearsing):
 
     def flush(self) -> None:
         if self.track:
-            self.write("track", Track(seq=self.seq, t_s=self.t_s, rows=self.track))
+            self.write("track", TrackMessage(seq=self.seq, t_s=self.t_s, rows=self.track))
         if self.truth and self.is_simulation:
-            self.write("truth", Truth(seq=self.seq, t_s=self.t_s, rows=self.truth))
+            self.write("truth", TruthMessage(seq=self.seq, t_s=self.t_s, rows=self.truth))
         self.track, self.truth = [], []
         self.status()
 
@@ -98,7 +107,7 @@ class RecordingRun(Rehearsing):
         super()._note_truth()
         self.truth.append(tuple(self.book.truth_at(self.robot.seq)))
 
-    def _publish(self, seq: int, t_s: float, pose: PanelPose, state: State) -> None:
+    def _publish(self, seq: int, t_s: float, pose: PanelPose, state: MissionState) -> None:
         super()._publish(seq, t_s, pose, state)
         self.seq, self.t_s = seq, t_s
         row = (seq, t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, self.localizer.position_sigma_m)
@@ -123,7 +132,7 @@ class RecordingRun(Rehearsing):
     def arrive(self, point: PointId, seq: int) -> None:
         self.note_arrival(point, seq)
         error_mm = 1e3 * self.mission.survey.distance_m(self.localizer.pose)
-        self.write("arrival", Arrival(seq=seq, t_s=self.t_s, point=(*point,), error_mm=error_mm))
+        self.write("arrival", ArrivalMessage(seq=seq, t_s=self.t_s, point=(*point,), error_mm=error_mm))
 
     def _fuse(self, fix: Fix) -> None:
         self.newest = fix

@@ -9,7 +9,7 @@ import pytest
 from ccatp.links.topics import MissionStatus
 from ccatp.records.state_log import StateChange
 from ccatp.report.analysis import least_times, sampled_spells, spells_of, time_budget
-from ccatp.report.record import RunRecord, Session
+from ccatp.report.record import RecordedSession, RunRecord
 from ccatp.report.record_reader import read_record
 from ccatp.survey.composition import assemble
 
@@ -19,7 +19,7 @@ def record(recorded: Path) -> RunRecord:
     return read_record(recorded)
 
 
-def only(record: RunRecord) -> Session:
+def only(record: RunRecord) -> RecordedSession:
     (session,) = record.sessions
     return session
 
@@ -79,7 +79,7 @@ def test_a_main_loop_that_died_leaves_a_wait(record: RunRecord) -> None:
     assert [spell.duration_s for spell in spells] == pytest.approx([1.0, 2.0, 0.1])
 
 
-def started_anew(session: Session) -> tuple[MissionStatus, ...]:
+def started_anew(session: RecordedSession) -> tuple[MissionStatus, ...]:
     """Main was gone from 3 s to 7 s of robot time; its successor speaks first before it has seen a frame."""
     first = session.statuses[0]
     told = [(100, 1.0, 1.0, "driving"), (300, 3.0, 3.0, "driving"), (-1, 0.0, 3.0, "idle"), (710, 7.1, 3.1, "settling")]

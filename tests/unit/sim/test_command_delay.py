@@ -5,14 +5,14 @@ from math import inf, nan
 import pytest
 
 from ccatp.sim.robot import CommandDelay
-from ccatp.sim.rules import Fans, MotionRules
+from ccatp.sim.rules import FanRules, MotionRules
 
 DT_S = 0.01
 
 
 class Rig:
     def __init__(self, frames: int, ttl_s: float = 0.25) -> None:
-        self.rules, self.fans = MotionRules(ttl_s, 8.0), Fans(0.0)
+        self.rules, self.fans = MotionRules(ttl_s, 8.0), FanRules(0.0)
         self.delay = CommandDelay(self.rules, self.fans, frames)
 
     def moves(self, frame: int) -> bool:

@@ -7,7 +7,7 @@ import pytest
 
 from ccatp.config.beacon_models import CricketConfig
 from ccatp.config.load import load_radio_config
-from ccatp.sim.motes import Heard, MoteField, TrueMotes, true_motes, usable_reach
+from ccatp.sim.motes import MoteField, MotePulse, TrueMotes, true_motes, usable_reach
 
 
 def config(**keys: Any) -> CricketConfig:
@@ -22,7 +22,7 @@ def field(cfg: CricketConfig, places: list[list[float]], facings: list[list[floa
     return MoteField(cfg, motes, np.random.default_rng(1))
 
 
-def heard(cfg: CricketConfig, repeats: int = 1, distance_m: float = 5.0) -> Heard:
+def heard(cfg: CricketConfig, repeats: int = 1, distance_m: float = 5.0) -> MotePulse:
     (reading,) = field(cfg, [[0.0, 0.0], [distance_m, 0.0]]).listen([(0, 1)], repeats, np.random.default_rng(2))
     return reading
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ccatp.sim.rules import HELD, Fans, MotionRules
+from ccatp.sim.rules import HELD, FanRules, MotionRules
 
 TTL_S, FASTEST = 0.25, 8.0
 
@@ -116,7 +116,7 @@ def test_a_drive_that_is_too_fast_keeps_its_path() -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_numbers_that_are_not_finite_are_dropped(value: float) -> None:
-    r, fans = rules(), Fans(0.0)
+    r, fans = rules(), FanRules(0.0)
     r.drive(1, 3.0, 3.0, 0.0)
     assert not r.drive(2, value, 0.0, 0.1)
     assert not r.drive(2, 0.0, value, 0.1)
@@ -127,7 +127,7 @@ def test_numbers_that_are_not_finite_are_dropped(value: float) -> None:
 
 
 def test_fans_keep_their_floor_and_their_duty() -> None:
-    fans = Fans(0.6)
+    fans = FanRules(0.6)
     assert fans.duty == (0.6, 0.6)
     assert fans.command(1, 0.0, 0.9)
     assert fans.duty == (0.6, 0.9)

@@ -12,7 +12,7 @@ from ccatp.config.models import Config
 from ccatp.links.robot_codec import join_mac
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.sim.robot import Robot
-from ccatp.sim.sessions import MAX_LAG_S, MAX_SESSIONS, RobotServer, Session
+from ccatp.sim.sessions import MAX_LAG_S, MAX_SESSIONS, RobotServer, RobotSession
 
 JOIN = b'{"type":"join","role":"controller","client":"test"}\n'
 JOIN_MONITOR = b'{"type":"join","role":"monitor","client":"test"}\n'
@@ -72,7 +72,7 @@ class Client:
 
     def __init__(self, rig: Rig, first: bytes) -> None:
         self.rig, self.wire = rig, FakeWire()
-        self.session: Session = rig.server.accept(self.wire, rig.now_s)
+        self.session: RobotSession = rig.server.accept(self.wire, rig.now_s)
         if first:
             self.send(first)
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ccatp.records.summary import WITHIN_M
-from ccatp.studies.campaign import Outcome, Spread
+from ccatp.studies.campaign import Histogram, JobOutcome
 from ccatp.studies.mission_study import COLUMN, STOP_COLUMNS
 
 SIGMA_M, SIGMA_RAD = 1e-3, 2e-3
@@ -27,7 +27,7 @@ def stops_of(errors_m: list[float], approaches: list[int] | None = None) -> np.n
     return rows
 
 
-def mission(errors_m: list[float], approaches: list[int] | None = None, **changes: Any) -> Outcome:
+def mission(errors_m: list[float], approaches: list[int] | None = None, **changes: Any) -> JobOutcome:
     """A mission whose localization errors are those at its stops."""
     values = {
         "outcome": "complete",
@@ -48,9 +48,9 @@ def mission(errors_m: list[float], approaches: list[int] | None = None, **change
     }
     errors = np.array(errors_m)
     arrays = {
-        **Spread.of(errors, WITHIN_M).to_arrays("localization"),
-        **Spread.of(errors[1:], WITHIN_M).to_arrays("localization_later"),
+        **Histogram.of(errors, WITHIN_M).to_arrays("localization"),
+        **Histogram.of(errors[1:], WITHIN_M).to_arrays("localization_later"),
         "stops": stops_of(errors_m, approaches),
         "bounds": np.array([(k, 8e-6, 2e-6, e, 0.0) for k, e in enumerate(errors_m)]),
     }
-    return Outcome(values, arrays)
+    return JobOutcome(values, arrays)

@@ -9,14 +9,23 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import EdgeSample
-from ccatp.links.topics import Estimate
+from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.studies.campaign import CellResult, Job, Outcome
-from ccatp.studies.danger_drives import OFF_S, RULES, Errors, Frame, OffTimeRule, build_rule, drive_to_rim, transit
+from ccatp.studies.campaign import CellResult, Job, JobOutcome
+from ccatp.studies.danger_drives import (
+    OFF_S,
+    RULES,
+    DriveFrame,
+    EdgeErrors,
+    OffTimeRule,
+    build_rule,
+    drive_to_rim,
+    transit,
+)
 from ccatp.studies.danger_study import bootstrap, cells, combine, draw, run_job, wilson
 
-ERRORS = Errors(1e-3, 2e-3)
-NOWHERE = Estimate(seq=0, t_s=0.0, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-3, state="driving")
+ERRORS = EdgeErrors(1e-3, 2e-3)
+NOWHERE = EstimateMessage(seq=0, t_s=0.0, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-3, state="driving")
 
 
 def loaded(mirror: str, world: str = "thesis") -> tuple[Config, Mirror]:
@@ -28,7 +37,7 @@ def judged(pattern: str) -> bool:
     """The thesis's rule on the front-left sensor's values, one per millisecond."""
     rule = OffTimeRule(OFF_S)
     samples = [EdgeSample(1e-3 * k, int(value), 1, 1, 1) for k, value in enumerate(pattern)]
-    return any(rule.judge(Frame(k, s.t_s, [], [s]), NOWHERE) for k, s in enumerate(samples))
+    return any(rule.judge(DriveFrame(k, s.t_s, [], [s]), NOWHERE) for k, s in enumerate(samples))
 
 
 @pytest.mark.parametrize(
@@ -118,10 +127,10 @@ def test_the_interval_of_a_quantile_holds_it_and_is_reproducible() -> None:
     assert bootstrap(values, 0.95) == (low, high)
 
 
-def outcome(false_edges: int, overrun_m: list[float]) -> Outcome:
+def outcome(false_edges: int, overrun_m: list[float]) -> JobOutcome:
     figures = {"false_edges": false_edges, "falls": 1}
     arrays = {f"{name}_overrun_m": np.array(overrun_m) for name in RULES}
-    return Outcome({"transits": 10, **dict.fromkeys(RULES, figures)}, arrays)
+    return JobOutcome({"transits": 10, **dict.fromkeys(RULES, figures)}, arrays)
 
 
 def test_a_cell_pools_its_jobs() -> None:
@@ -151,7 +160,7 @@ def test_turns_have_no_overrun_and_every_cell_can_be_drawn(tmp_path: Path) -> No
     results = []
     for cell in cells():
         made = outcome(1, [0.01, 0.02])
-        pooled = combine(cell.factors, [Outcome(made.values) if cell.factors["crossing"] == "turn" else made])
+        pooled = combine(cell.factors, [JobOutcome(made.values) if cell.factors["crossing"] == "turn" else made])
         assert ("overrun_mean_mm" in pooled.values["thesis"]) is (cell.factors["crossing"] != "turn")
         results.append(CellResult({"mirror": "fyst-m1", **cell.factors}, pooled.values, pooled.arrays))
     draw(results, tmp_path)

@@ -9,7 +9,7 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.mirror.mirror import build_mirror
 from ccatp.studies import faults_study
-from ccatp.studies.campaign import CellResult, Job, Outcome, cells_of, plain
+from ccatp.studies.campaign import CellResult, Job, JobOutcome, cells_of, plain
 from ccatp.studies.faults_study import FIRST_S, LONGEST_S, is_recoverable, random_plan
 from ccatp.studies.job_store import table
 from tests.faults.campaign import single
@@ -17,7 +17,7 @@ from tests.faults.campaign import single
 DANGER = {"true_edges": 0, "false_edges": 1, "falls": 0, "max_overrun_mm": 2.0}
 
 
-def outcome(seed: int, how: str, **changes: Any) -> Outcome:
+def outcome(seed: int, how: str, **changes: Any) -> JobOutcome:
     values = {
         "seed": seed,
         "outcome": how,
@@ -32,7 +32,7 @@ def outcome(seed: int, how: str, **changes: Any) -> Outcome:
         "within_budget": True,
         "states_s": {"driving": 60.0},
     }
-    return Outcome(values | changes, {})
+    return JobOutcome(values | changes, {})
 
 
 def run(faults: str, seed: int = 5) -> Mapping[str, Any]:
@@ -73,7 +73,7 @@ def test_fans_that_seem_to_fail_on_an_overhang_wait_for_an_operator() -> None:
 
 
 def test_fans_below_their_floor_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ccatp.sim.rules.Fans.thrust", 0.0)
+    monkeypatch.setattr("ccatp.sim.rules.FanRules.thrust", 0.0)
     monkeypatch.setattr("ccatp.sim.world.World._fall", lambda self: None)
     assert run(faults_study.RANDOM)["weak_frames"] > 1000
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccatp.studies.campaign import CampaignError, Job, Outcome, Shard, cells_of, jobs_of
-from ccatp.studies.job_store import Ledger
+from ccatp.studies.campaign import CampaignError, Job, JobOutcome, Shard, cells_of, jobs_of
+from ccatp.studies.job_store import JobStore
 from tests.unit.studies.toy import STUDY, load
 
 
@@ -15,13 +15,13 @@ def jobs() -> list[Job]:
     return jobs_of(STUDY, cells_of(STUDY), load, {}, 3)[0]
 
 
-OUTCOME = Outcome({"value": 1.5, "lost": float("nan")}, {"values": np.arange(3.0)})
+OUTCOME = JobOutcome({"value": 1.5, "lost": float("nan")}, {"values": np.arange(3.0)})
 
 
 def test_a_finished_job_is_found_again(tmp_path: Path, jobs: list[Job]) -> None:
-    with Ledger(tmp_path / "new") as ledger:
+    with JobStore(tmp_path / "new") as ledger:
         ledger.add(jobs[0], OUTCOME, 2.5)
-    with Ledger(tmp_path / "new") as ledger:
+    with JobStore(tmp_path / "new") as ledger:
         found = ledger.outcome(jobs[0])
         assert found is not None
         assert found.values == {"value": 1.5, "lost": None}
@@ -32,12 +32,12 @@ def test_a_finished_job_is_found_again(tmp_path: Path, jobs: list[Job]) -> None:
 
 
 def test_a_torn_last_line_is_cut_and_the_rest_kept(tmp_path: Path, jobs: list[Job]) -> None:
-    with Ledger(tmp_path) as ledger:
+    with JobStore(tmp_path) as ledger:
         ledger.add(jobs[0], OUTCOME)
         ledger.add(jobs[1], OUTCOME)
     path = tmp_path / "jobs.jsonl"
     path.write_bytes(path.read_bytes()[:-40])
-    with Ledger(tmp_path) as ledger:
+    with JobStore(tmp_path) as ledger:
         assert ledger.outcome(jobs[0]) is not None
         assert ledger.outcome(jobs[1]) is None
         ledger.add(jobs[1], OUTCOME)
@@ -45,12 +45,12 @@ def test_a_torn_last_line_is_cut_and_the_rest_kept(tmp_path: Path, jobs: list[Jo
 
 
 def test_a_torn_last_line_of_another_shard_is_left_alone(tmp_path: Path, jobs: list[Job]) -> None:
-    with Ledger(tmp_path, Shard(1, 2)) as ledger:
+    with JobStore(tmp_path, Shard(1, 2)) as ledger:
         ledger.add(jobs[0], OUTCOME)
         ledger.add(jobs[1], OUTCOME)
     path = tmp_path / "jobs-1of2.jsonl"
     path.write_bytes(torn := path.read_bytes()[:-1])
-    with Ledger(tmp_path) as ledger:
+    with JobStore(tmp_path) as ledger:
         assert (ledger.outcome(jobs[0]) is not None, ledger.outcome(jobs[1])) == (True, None)
     assert path.read_bytes() == torn
 
@@ -58,16 +58,16 @@ def test_a_torn_last_line_of_another_shard_is_left_alone(tmp_path: Path, jobs: l
 def test_a_line_that_is_no_job_is_named(tmp_path: Path) -> None:
     (tmp_path / "jobs.jsonl").write_text('{"key": "a"}\n')
     with pytest.raises(CampaignError, match=r"jobs.jsonl:1: is no finished job; remove the line"):
-        Ledger(tmp_path)
+        JobStore(tmp_path)
 
 
 def test_two_campaigns_do_not_write_one_file(tmp_path: Path) -> None:
-    with Ledger(tmp_path), pytest.raises(CampaignError, match="another campaign writes there; wait for it or choose"):
-        Ledger(tmp_path)
-    with Ledger(tmp_path, Shard(1, 2)), Ledger(tmp_path, Shard(2, 2)):
+    with JobStore(tmp_path), pytest.raises(CampaignError, match="another campaign writes there; wait for it or choose"):
+        JobStore(tmp_path)
+    with JobStore(tmp_path, Shard(1, 2)), JobStore(tmp_path, Shard(2, 2)):
         pass
 
 
 def test_a_directory_that_is_not_there_cannot_be_taken_over(tmp_path: Path) -> None:
     with pytest.raises(CampaignError, match=r"nowhere: is no directory; name one that a campaign wrote"):
-        Ledger(tmp_path, others=[tmp_path / "nowhere"])
+        JobStore(tmp_path, others=[tmp_path / "nowhere"])

@@ -119,12 +119,12 @@ def test_every_set_of_gains_is_analysed(cfg: Config) -> None:
 
 
 def test_steering_is_the_regulator_on_the_line(cfg: Config) -> None:
-    from ccatp.control.tracker import Sight, line_rate
+    from ccatp.control.tracker import LegView, line_rate
 
     pid, v = loop_models.steering(cfg.limits, cfg.control), cfg.limits.v_max_m_s
     weights = cfg.control.cross_track_gain_rad_m2, cfg.control.heading_weight_1_s2
-    assert -line_rate(Sight(1.0, 0.0, 1.0, 1.0), v, *weights) == pytest.approx(pid.kp)
-    assert -line_rate(Sight(1.0, 1.0, 0.0, 1.0), v, *weights) * v == pytest.approx(pid.ki)
+    assert -line_rate(LegView(1.0, 0.0, 1.0, 1.0), v, *weights) == pytest.approx(pid.kp)
+    assert -line_rate(LegView(1.0, 1.0, 0.0, 1.0), v, *weights) * v == pytest.approx(pid.ki)
 
 
 def test_the_files(cfg: Config, tmp_path: Path) -> None:

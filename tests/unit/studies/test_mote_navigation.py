@@ -7,7 +7,7 @@ import pytest
 
 from ccatp.config.load import load_radio_config
 from ccatp.links.beacon_messages import PoseTrack, PoseTruth, pose_track, pose_truth
-from ccatp.studies.campaign import CellResult, Outcome
+from ccatp.studies.campaign import CellResult, JobOutcome
 from ccatp.studies.mote_navigation import STUDY, band, combine, draw, rehearse_beacons, seconds_of
 
 
@@ -29,13 +29,13 @@ def test_errors_by_the_second_from_the_map_on() -> None:
     assert found["sigma_m"] == pytest.approx(0.02 * 2**0.5)
 
 
-def outcome(nees: float) -> Outcome:
+def outcome(nees: float) -> JobOutcome:
     values = {
         "outcome": "complete", "reached": 6, "within": 5, "position_m": 0.004, "map_m": 0.002, "map_expected_m": 0.005,
         "nis_mean": 1.0, "readings": 100, "updates": 20.0,
     }  # fmt: skip
     seconds = np.full(4, 1.0)
-    return Outcome(values, {"nees": nees * seconds, "error_m": 0.004 * seconds, "sigma_m": 0.005 * seconds})
+    return JobOutcome(values, {"nees": nees * seconds, "error_m": 0.004 * seconds, "sigma_m": 0.005 * seconds})
 
 
 def test_missions_put_together_and_drawn(tmp_path: Path) -> None:

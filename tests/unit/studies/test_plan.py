@@ -15,7 +15,7 @@ from ccatp.studies.campaign import (
     CellResult,
     Factors,
     Job,
-    Outcome,
+    JobOutcome,
     Shard,
     Study,
     cells_of,
@@ -27,12 +27,12 @@ from ccatp.studies.campaign import (
 )
 
 
-def run_job(job: Job) -> Outcome:
-    return Outcome({"seed": job.seed})
+def run_job(job: Job) -> JobOutcome:
+    return JobOutcome({"seed": job.seed})
 
 
-def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
-    return Outcome({"level": factors["speed"], "sum": sum(outcome.values["seed"] for outcome in outcomes)})
+def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
+    return JobOutcome({"level": factors["speed"], "sum": sum(outcome.values["seed"] for outcome in outcomes)})
 
 
 def draw(cells: Sequence[CellResult], out: Path) -> None:

@@ -12,7 +12,7 @@ from ccatp.estimation.measurements import STATES
 from ccatp.estimation.seams import HeadingFix
 from ccatp.filters import FILTERS
 from ccatp.mirror.mirror import build_mirror
-from ccatp.studies.campaign import CellResult, Job, Outcome, Spread
+from ccatp.studies.campaign import CellResult, Histogram, Job, JobOutcome
 from ccatp.studies.thesis_replica import LIMIT_M, ThesisLocalizer, overrides_of, run_replica
 from ccatp.studies.thesis_study import PUBLISHED, cells, combine, draw, run_job
 
@@ -70,13 +70,13 @@ def test_the_cells_are_all_readings_of_both_systems() -> None:
         load_config(overrides=cell.overrides)
 
 
-def outcome(fraction: float, mean: float) -> Outcome:
+def outcome(fraction: float, mean: float) -> JobOutcome:
     figures = {"within_10mm_fraction": fraction, "mean": mean, "max": 20.0}
     values = {"outcome": "complete", "cause": "", "waypoints": 36, "wanted": 36, "time_s": 500.0}
-    localization = Spread.of(np.linspace(0.0, 0.02, 100), LIMIT_M).to_arrays("localization")
+    localization = Histogram.of(np.linspace(0.0, 0.02, 100), LIMIT_M).to_arrays("localization")
     track = np.tile(np.linspace(0.0, 1.0, 20, dtype=np.float32)[:, None], 5)
     arrays: dict[str, np.ndarray] = {"waypoint_m": np.linspace(0.0, 0.02, 36), "track": track, **localization}
-    return Outcome({**values, "localization": figures, "waypoint": figures}, arrays)
+    return JobOutcome({**values, "localization": figures, "waypoint": figures}, arrays)
 
 
 def test_a_published_figure_is_measured_in_scatters_of_a_run() -> None:

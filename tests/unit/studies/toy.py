@@ -8,17 +8,17 @@ import numpy as np
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, Outcome, Study
+from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 
 SPEEDS_M_S = (0.05, 0.1)
 FAULTS = "CCATP_TOY_FAULTS"  # key of a job=what it does instead of its work, in the environment
 
 
-def run_job(job: Job) -> Outcome:
+def run_job(job: Job) -> JobOutcome:
     """A number that depends on all of the job."""
     _go_wrong(job)
     value = job.cfg.run.seed * float(job.factors["speed_m_s"])
-    return Outcome({"value": value, "lost": float("nan")}, {"values": np.array([value])})
+    return JobOutcome({"value": value, "lost": float("nan")}, {"values": np.array([value])})
 
 
 def _go_wrong(job: Job) -> None:
@@ -34,10 +34,10 @@ def _go_wrong(job: Job) -> None:
             os._exit(9)
 
 
-def combine(factors: Factors, outcomes: Sequence[Outcome]) -> Outcome:
+def combine(factors: Factors, outcomes: Sequence[JobOutcome]) -> JobOutcome:
     """Mean and all values, in their order."""
     values = np.concatenate([outcome.arrays["values"] for outcome in outcomes])
-    return Outcome({"mean": float(values.mean()), "speed": factors["speed_m_s"]}, {"values": values})
+    return JobOutcome({"mean": float(values.mean()), "speed": factors["speed_m_s"]}, {"values": values})
 
 
 def draw(cells: Sequence[CellResult], out: Path) -> None:

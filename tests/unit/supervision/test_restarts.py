@@ -2,31 +2,31 @@
 
 import pytest
 
-from ccatp.daemon.child_processes import Fate, RestartPolicy, SilenceWatch
+from ccatp.daemon.child_processes import ProcessEnd, RestartPolicy, SilenceWatch
 
 
 @pytest.mark.fault("P18")
 def test_a_crash_loop_ends_and_rare_deaths_do_not() -> None:
     policy = RestartPolicy(3, 60.0)
-    assert [policy.died("main", -9, t).fate for t in (0.0, 1.0, 2.0)] == [Fate.RESTART] * 3
+    assert [policy.died("main", -9, t).fate for t in (0.0, 1.0, 2.0)] == [ProcessEnd.RESTART] * 3
     decision = policy.died("main", -9, 59.0)
     assert decision == (
-        Fate.HELD,
+        ProcessEnd.HELD,
         "process main was killed by SIGKILL, more than 3 times within 60 s: run ended, wheels held",
     )
-    assert policy.died("danger", 1, 59.0).fate is Fate.RESTART  # each counts for itself
+    assert policy.died("danger", 1, 59.0).fate is ProcessEnd.RESTART  # each counts for itself
     seldom = RestartPolicy(3, 60.0)
-    assert {seldom.died("main", -9, 21.0 * k).fate for k in range(50)} == {Fate.RESTART}
+    assert {seldom.died("main", -9, 21.0 * k).fate for k in range(50)} == {ProcessEnd.RESTART}
 
 
 @pytest.mark.parametrize("code", [2, 5])
 def test_what_would_be_said_again_is_not_tried_again(code: int) -> None:
-    assert RestartPolicy(3, 60.0).died("main", code, 0.0).fate is Fate.END
+    assert RestartPolicy(3, 60.0).died("main", code, 0.0).fate is ProcessEnd.END
 
 
 def test_the_robot_itself_has_no_substitute() -> None:
     decision = RestartPolicy(3, 60.0).died("dataloop", -11, 0.0, is_replaceable=False)
-    assert decision == (Fate.HELD, "process dataloop was killed by SIGSEGV: run ended, wheels held")
+    assert decision == (ProcessEnd.HELD, "process dataloop was killed by SIGSEGV: run ended, wheels held")
 
 
 def test_how_it_died_is_told() -> None:
@@ -61,6 +61,9 @@ def test_a_start_may_take_longer() -> None:
 def test_a_run_goes_on_without_what_it_does_not_need() -> None:
     policy = RestartPolicy(1, 60.0)
     again = policy.died("dashboard", -9, 0.0, is_needed=False)
-    assert again == (Fate.RESTART, "process dashboard was killed by SIGKILL: starting it anew, the survey goes on")
-    assert policy.died("dashboard", -9, 1.0, is_needed=False).fate is Fate.WITHOUT
-    assert policy.died("dashboard", 2, 99.0, is_needed=False).fate is Fate.WITHOUT
+    assert again == (
+        ProcessEnd.RESTART,
+        "process dashboard was killed by SIGKILL: starting it anew, the survey goes on",
+    )
+    assert policy.died("dashboard", -9, 1.0, is_needed=False).fate is ProcessEnd.WITHOUT
+    assert policy.died("dashboard", 2, 99.0, is_needed=False).fate is ProcessEnd.WITHOUT

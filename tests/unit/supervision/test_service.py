@@ -20,7 +20,7 @@ from ccatp.daemon import realtime
 from ccatp.daemon.service import Notifier, Service, take_from, watchdog_period_s
 from ccatp.daemon.survey_collector import NO_STATUS
 from ccatp.links.liveness import Liveness
-from ccatp.links.topics import Presence
+from ccatp.links.topics import Heartbeat
 
 ROOT = Path(__file__).parents[3]
 UNIT = ROOT / "packaging" / "ccatp.service"
@@ -51,8 +51,8 @@ def manager(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Ma
     manager.socket.close()
 
 
-def presence(name: str, t_s: float, phase: str = "joined", frame_age_s: float | None = 0.01) -> Presence:
-    return Presence(seq=0, t_s=t_s, process=name, pid=1, phase=phase, frame_age_s=frame_age_s)
+def presence(name: str, t_s: float, phase: str = "joined", frame_age_s: float | None = 0.01) -> Heartbeat:
+    return Heartbeat(seq=0, t_s=t_s, process=name, pid=1, phase=phase, frame_age_s=frame_age_s)
 
 
 def test_lines_reach_the_service_manager(manager: tuple[Manager, str]) -> None:
@@ -119,7 +119,7 @@ def test_both_loops_must_have_joined() -> None:
         (presence("main", 9.5), None, "danger was never heard of"),
     ],
 )
-def test_trouble(main: Presence, danger: Presence | None, trouble: str) -> None:
+def test_trouble(main: Heartbeat, danger: Heartbeat | None, trouble: str) -> None:
     liveness = Liveness(1.0)
     liveness.heard(main)
     if danger is not None:

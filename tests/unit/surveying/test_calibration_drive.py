@@ -6,7 +6,7 @@ from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import PointId, Stop, StopKind
 from ccatp.links.robot_messages import Sensors
-from ccatp.studies.sil_run import Rehearsing
+from ccatp.studies.sil_run import SilRun
 from ccatp.survey.planning.escape import is_on_drive
 
 DRIVE = (
@@ -26,7 +26,7 @@ def test_near_its_line_the_drive_goes_on(place: tuple[float, float], expected: b
     assert not is_on_drive(DRIVE[-1:], *place)
 
 
-class Paused(Rehearsing):
+class Paused(SilRun):
     """An operator holds the robot for a moment."""
 
     def __init__(self, cfg: Config, pause_s: float) -> None:

@@ -7,7 +7,7 @@ import pytest
 from ccatp.config.models import Config
 from ccatp.core import DeckPose, PanelId, PanelPose, Stop, StopKind
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.survey.route_follower import Aim, Corrector, plan_aim
+from ccatp.survey.route_follower import Corrector, LegAim, plan_aim
 
 POSE = (0.1, 0.2, 0.5)
 
@@ -32,7 +32,7 @@ def seen(ahead_m: float, left_m: float) -> tuple[float, float]:
 @pytest.mark.parametrize("left_m", [0.0069, -0.0069])
 def test_what_lies_nearly_along_the_heading_is_driven_to_without_a_turn(ahead_m: float, left_m: float) -> None:
     aim = plan_aim(POSE, seen(ahead_m, left_m), 0.010, 0.7)
-    assert aim == pytest.approx(Aim(*seen(ahead_m, 0.0), ahead_m < 0.0, 0.0))
+    assert aim == pytest.approx(LegAim(*seen(ahead_m, 0.0), ahead_m < 0.0, 0.0))
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_else_the_robot_turns_by_the_smaller_angle(
 ) -> None:
     target = seen(ahead_m, left_m)
     aim = plan_aim(POSE, target, 0.010, 0.7)
-    assert aim == pytest.approx(Aim(*target, reverse, turn_rad))
+    assert aim == pytest.approx(LegAim(*target, reverse, turn_rad))
     sign = -1.0 if aim.reverse else 1.0
     heading, distance = POSE[2] + aim.turn_rad, hypot(ahead_m, left_m)
     # Driven that far that way the robot is there.

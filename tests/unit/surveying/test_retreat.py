@@ -8,8 +8,8 @@ from ccatp.config.load import load_config
 from ccatp.control.tracker import LegTracker
 from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, Verdict
 from ccatp.safety.edge_detector import Cause
-from ccatp.survey.retreat import Retreat, Step
-from ccatp.survey.route_follower import Motion
+from ccatp.survey.retreat import EdgeRetreat, RetreatStep
+from ccatp.survey.route_follower import StateEstimate
 
 CFG = load_config()
 FRAME_S = 0.01
@@ -41,16 +41,16 @@ def deck_of(pose: PanelPose) -> DeckPose:
 
 def retreated(
     pose: Pose, *, may_turn: bool, blames: Four | None = None, cause: Cause = Cause.RIM
-) -> tuple[Pose, list[Step]]:
+) -> tuple[Pose, list[RetreatStep]]:
     """Where a retreat ends that begins with the sensors that are off there, or ``blames``; wheels follow at once."""
     tracker = LegTracker(CFG.control, CFG.limits, 0.0)
     first = verdict_of(blames or off_at(pose), may_turn=False)
-    retreat = Retreat(CFG.mission, tracker, first, PanelPose(PANEL, *pose), 0.0)
+    retreat = EdgeRetreat(CFG.mission, tracker, first, PanelPose(PANEL, *pose), 0.0)
     seen, rate_rad_s = [retreat.step_at], 0.0
     for k in range(1500):
-        if retreat.step_at in (Step.OVER, Step.STUCK):
+        if retreat.step_at in (RetreatStep.OVER, RetreatStep.STUCK):
             break
-        motion = Motion(k * FRAME_S, FRAME_S, PanelPose(PANEL, *pose), deck_of, 0.0, rate_rad_s)
+        motion = StateEstimate(k * FRAME_S, FRAME_S, PanelPose(PANEL, *pose), deck_of, 0.0, rate_rad_s)
         twist = retreat.step(motion, verdict_of(off_at(pose), may_turn=may_turn, cause=cause))
         rate_rad_s = twist.omega_rad_s
         x, y, heading = pose
@@ -67,7 +67,7 @@ def test_one_that_met_the_edge_backwards_drives_off_it_and_does_not_turn(y_m: fl
     start = (0.088, y_m, heading_rad)
     assert any(off_at(start)[2:])
     end, seen = retreated(start, may_turn=True)
-    assert seen == [Step.BACK, Step.OVER]
+    assert seen == [RetreatStep.BACK, RetreatStep.OVER]
     assert end[0] >= start[0] + 0.5 * CFG.mission.backoff_m * cos(heading_rad) - 1e-3
     assert end[2] == pytest.approx(heading_rad, abs=1e-3)
     assert not any(off_at(end))
@@ -78,7 +78,7 @@ def test_a_turn_away_that_sweeps_a_corner_over_the_rim_is_undone() -> None:
     start = (1.0, 0.1, 0.0)
     front_left = (True, False, False, False)
     end, seen = retreated(start, may_turn=True, blames=front_left)
-    assert seen == [Step.BACK, Step.TURN_AWAY, Step.UNTURN, Step.OVER]
+    assert seen == [RetreatStep.BACK, RetreatStep.TURN_AWAY, RetreatStep.UNTURN, RetreatStep.OVER]
     assert not any(off_at(end))
     turned = -end[2]
     assert 0.0 < turned < CFG.mission.turn_away_rad
@@ -87,19 +87,19 @@ def test_a_turn_away_that_sweeps_a_corner_over_the_rim_is_undone() -> None:
 def test_one_that_may_not_be_undone_ends_with_what_is_gained() -> None:
     start = (1.0, 0.1, 0.0)
     end, seen = retreated(start, may_turn=False, blames=(True, False, False, False))
-    assert seen == [Step.BACK, Step.TURN_AWAY, Step.UNTURN, Step.OVER]
+    assert seen == [RetreatStep.BACK, RetreatStep.TURN_AWAY, RetreatStep.UNTURN, RetreatStep.OVER]
     assert start[0] - end[0] == pytest.approx(0.5 * CFG.mission.backoff_m, abs=2e-3)
 
 
 @pytest.mark.parametrize("cause", [Cause.NO_MAP, Cause.SEAM])
 def test_off_what_may_be_a_seam_it_stands(cause: Cause) -> None:
     _, seen = retreated((1.0, 0.1, 0.0), may_turn=True, blames=(True, False, False, False), cause=cause)
-    assert seen == [Step.BACK, Step.TURN_AWAY, Step.OVER]
+    assert seen == [RetreatStep.BACK, RetreatStep.TURN_AWAY, RetreatStep.OVER]
 
 
 @pytest.mark.parametrize(("off", "sense"), [((True, False, False, False), -1.0), ((False, True, False, False), 1.0)])
 def test_where_there_is_room_it_turns_to_the_side_that_stands(off: Four, sense: float) -> None:
     end, seen = retreated((1.0, 1.0, 0.5 * pi), may_turn=True, blames=off)
-    assert seen == [Step.BACK, Step.TURN_AWAY, Step.OVER]
+    assert seen == [RetreatStep.BACK, RetreatStep.TURN_AWAY, RetreatStep.OVER]
     assert end[1] == pytest.approx(1.0 - 0.5 * CFG.mission.backoff_m, abs=2e-3)
     assert end[2] - 0.5 * pi == pytest.approx(sense * CFG.mission.turn_away_rad, abs=0.05)

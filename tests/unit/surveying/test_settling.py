@@ -6,13 +6,13 @@ from math import exp
 import pytest
 
 from ccatp.config.models import Config
-from ccatp.survey.stops import Stillness
+from ccatp.survey.stops import StandstillDetector
 
 DT = 0.01
 
 
 def first_rest(config: Config, speeds: Iterable[float], rates: Iterable[float]) -> int | None:
-    stillness = Stillness(config.control)
+    stillness = StandstillDetector(config.control)
     for k, (v, omega) in enumerate(zip(speeds, rates, strict=False)):
         if stillness.is_rest(k * DT, DT, v, omega):
             return k

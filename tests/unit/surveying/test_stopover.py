@@ -5,8 +5,8 @@ import pytest
 from ccatp.config.models import Config
 from ccatp.core import PanelId, PanelPose, PointId
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.survey.route_follower import Motion
-from ccatp.survey.stops import SETTLE_LIMIT_S, Stopover
+from ccatp.survey.route_follower import StateEstimate
+from ccatp.survey.stops import SETTLE_LIMIT_S, SettleAndMeasure
 
 DT, MEASURING_S = 0.01, 0.5
 POINT = PointId(5, 5, 1)
@@ -18,22 +18,22 @@ def mirror(config: Config) -> Mirror:
 
 
 @pytest.fixture
-def stopover(config: Config) -> Stopover:
-    return Stopover(config.control, MEASURING_S)
+def stopover(config: Config) -> SettleAndMeasure:
+    return SettleAndMeasure(config.control, MEASURING_S)
 
 
-def at(mirror: Mirror, frame: int, speed_m_s: float = 0.0) -> Motion:
-    return Motion(frame * DT, DT, PanelPose(PanelId(5, 5), 0.0, 0.0, 0.0), mirror.deck_pose, speed_m_s, 0.0)
+def at(mirror: Mirror, frame: int, speed_m_s: float = 0.0) -> StateEstimate:
+    return StateEstimate(frame * DT, DT, PanelPose(PanelId(5, 5), 0.0, 0.0, 0.0), mirror.deck_pose, speed_m_s, 0.0)
 
 
-def test_asks_once_and_only_after_the_measuring_time_at_rest(stopover: Stopover, mirror: Mirror) -> None:
+def test_asks_once_and_only_after_the_measuring_time_at_rest(stopover: SettleAndMeasure, mirror: Mirror) -> None:
     settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
     asked = [k for k in range(settled, settled + 200) if stopover.is_due(at(mirror, k))]
     assert asked == [settled + round(MEASURING_S / DT)]
     assert (stopover.request, stopover.is_asked) == (1, True)
 
 
-def test_an_interrupted_stop_begins_anew_and_asks_again(stopover: Stopover, mirror: Mirror) -> None:
+def test_an_interrupted_stop_begins_anew_and_asks_again(stopover: SettleAndMeasure, mirror: Mirror) -> None:
     for k in range(2):
         settled = next(j for j in range(1000 * k, 1000 * k + 100) if stopover.has_settled(at(mirror, j)))
         assert any(stopover.is_due(at(mirror, j)) for j in range(settled, settled + 60))
@@ -42,7 +42,9 @@ def test_an_interrupted_stop_begins_anew_and_asks_again(stopover: Stopover, mirr
     assert stopover.request == 2
 
 
-def test_the_measuring_time_begins_anew_where_the_robot_moves_once_more(stopover: Stopover, mirror: Mirror) -> None:
+def test_the_measuring_time_begins_anew_where_the_robot_moves_once_more(
+    stopover: SettleAndMeasure, mirror: Mirror
+) -> None:
     settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
     moves = range(settled + 20, settled + 30)
     asked = [k for k in range(settled, settled + 200) if stopover.is_due(at(mirror, k, speed_m_s=0.01 * (k in moves)))]
@@ -51,7 +53,7 @@ def test_the_measuring_time_begins_anew_where_the_robot_moves_once_more(stopover
 
 
 @pytest.mark.fault("E9")
-def test_who_moves_for_ever_is_never_measured_and_restless(stopover: Stopover, mirror: Mirror) -> None:
+def test_who_moves_for_ever_is_never_measured_and_restless(stopover: SettleAndMeasure, mirror: Mirror) -> None:
     settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
     frames = range(settled + 1, settled + 2000)
     assert [k for k in frames if stopover.is_due(at(mirror, k, speed_m_s=0.01))] == []
@@ -61,7 +63,7 @@ def test_who_moves_for_ever_is_never_measured_and_restless(stopover: Stopover, m
 
 
 @pytest.mark.fault("E9")
-def test_a_measurement_during_which_the_robot_moves_is_not_wanted(stopover: Stopover, mirror: Mirror) -> None:
+def test_a_measurement_during_which_the_robot_moves_is_not_wanted(stopover: SettleAndMeasure, mirror: Mirror) -> None:
     settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
     asked = next(k for k in range(settled, settled + 200) if stopover.is_due(at(mirror, k)))
     assert not stopover.is_due(at(mirror, asked + 1))
@@ -73,7 +75,7 @@ def test_a_measurement_during_which_the_robot_moves_is_not_wanted(stopover: Stop
     assert stopover.request == 2
 
 
-def test_who_never_rests_is_restless_after_the_limit(stopover: Stopover, mirror: Mirror) -> None:
+def test_who_never_rests_is_restless_after_the_limit(stopover: SettleAndMeasure, mirror: Mirror) -> None:
     frames = round(SETTLE_LIMIT_S / DT)
     for k in range(frames):
         assert not stopover.has_settled(at(mirror, k, speed_m_s=0.01))
@@ -81,7 +83,7 @@ def test_who_never_rests_is_restless_after_the_limit(stopover: Stopover, mirror:
     assert stopover.is_restless((frames + 1) * DT)
 
 
-def test_a_point_is_arrived_at_once(stopover: Stopover) -> None:
+def test_a_point_is_arrived_at_once(stopover: SettleAndMeasure) -> None:
     assert stopover.arrival_at(POINT) == POINT
     assert stopover.arrival_at(None) is None  # a fix that finds the robot again is no arrival
     assert stopover.arrival_at(POINT) is None

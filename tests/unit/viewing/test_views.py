@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from ccatp.config.load import load_config
 from ccatp.core import PanelId, PanelPose, PointId
-from ccatp.links.topics import FixMessage, Log, Message, SensorLines, Track, Truth
+from ccatp.links.topics import FixMessage, LogMessage, Message, SensorLines, TrackMessage, TruthMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.report.foxglove import quaternion
-from ccatp.report.views import POINTS_AGAIN_S, Shown, Views
+from ccatp.report.views import POINTS_AGAIN_S, ViewMessage, Views
 
 PUCK_M = 0.05
 
@@ -33,13 +33,13 @@ def views(mirror: Mirror) -> Views:
 def shown(views: Views, message: Message) -> dict[str, list[dict[str, Any]]]:
     found: dict[str, list[dict[str, Any]]] = {}
     for one in views.of(message):
-        assert isinstance(one, Shown)
+        assert isinstance(one, ViewMessage)
         found.setdefault(one.topic, []).append(json.loads(one.payload))
     return found
 
 
-def track(*rows: tuple[int, float, int, int, float, float, float, float]) -> Track:
-    return Track(seq=rows[-1][0], t_s=rows[-1][1], rows=list(rows))
+def track(*rows: tuple[int, float, int, int, float, float, float, float]) -> TrackMessage:
+    return TrackMessage(seq=rows[-1][0], t_s=rows[-1][1], rows=list(rows))
 
 
 def test_every_tenth_pose_is_shown_on_the_deck(views: Views, mirror: Mirror) -> None:
@@ -72,7 +72,7 @@ def test_the_deck_stands_in_the_world(mirror: Mirror) -> None:
 def test_the_error_is_that_of_the_same_frame(views: Views, mirror: Mirror, truth_first: bool) -> None:
     pose = mirror.deck_pose(PanelPose(PanelId(3, 4), 0.0, 0.0, 0.0))
     row = (100, 1.0, pose.x_m, pose.y_m, pose.heading_rad, 0.0, 0.0, 0.0, 0.1, 0, 0)
-    truth = Truth(seq=100, t_s=1.0, rows=[row])
+    truth = TruthMessage(seq=100, t_s=1.0, rows=[row])
     estimate = track((100, 1.0, 3, 4, 0.003, 0.004, 0.01, 0.001))
     first, second = (truth, estimate) if truth_first else (estimate, truth)
     assert "view/error" not in shown(views, first)
@@ -128,14 +128,14 @@ def test_a_fix_that_is_no_measurement_colours_nothing(views: Views, mirror: Mirr
 
 
 def test_a_line_for_the_operator_becomes_a_log(views: Views) -> None:
-    message = Log(seq=1, t_s=2.25, level="warning", process="main", text="held")
+    message = LogMessage(seq=1, t_s=2.25, level="warning", process="main", text="held")
     (log,) = shown(views, message)["view/log"]
     assert log["timestamp"] == {"sec": 2, "nsec": 250_000_000}
     assert (log["level"], log["name"], log["message"]) == (3, "main", "held")
 
 
 def test_a_run_that_was_not_begun_begins_with_its_first_message(mirror: Mirror) -> None:
-    message = Log(seq=1, t_s=2.0, level="info", process="main", text="x")
+    message = LogMessage(seq=1, t_s=2.0, level="info", process="main", text="x")
     assert list(shown(Views(mirror, PUCK_M), message)) == ["view/frames", "view/panels", "view/log"]
 
 

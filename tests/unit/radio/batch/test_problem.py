@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import LinAlgError
 
 from ccatp.beacons.slam.batch_odometry import CALIBRATION, BatchPriors, BatchSettings, RadioNoise, Reckoning, chained
-from ccatp.beacons.slam.batch_problem import BEACON, SHARED, BatchProblem, Factored, State, repeats
+from ccatp.beacons.slam.batch_problem import BEACON, SHARED, BatchProblem, BatchState, Factored, repeats
 from ccatp.beacons.slam.batch_solver import t_cost, t_weights
 from ccatp.beacons.slam.motion import DifferentialNoise
 from ccatp.beacons.slam.recording import Readings, Steps, dead_reckoned
@@ -33,7 +33,7 @@ def steps(n: int = 60, rng: np.random.Generator | None = None) -> Steps:
     return Steps(t, rng.uniform(0.0, 0.2, n), rng.uniform(-0.2, 0.3, n), rng.uniform(-0.05, 0.05, n))
 
 
-def problem() -> tuple[BatchProblem, State]:
+def problem() -> tuple[BatchProblem, BatchState]:
     """Six readings of two beacons, of all kinds, and a state off the minimum."""
     rng = np.random.default_rng(11)
     s = steps()
@@ -52,21 +52,23 @@ def problem() -> tuple[BatchProblem, State]:
     poses += 0.05 * rng.standard_normal(poses.shape)
     shared = 0.02 * rng.standard_normal(len(SHARED))
     beacons = np.column_stack([[2.0, -1.5], [3.0, 1.0], 0.02 * rng.standard_normal((2, 2))])
-    return made, State(poses, shared, beacons)
+    return made, BatchState(poses, shared, beacons)
 
 
-def flat(state: State) -> FloatArray:
+def flat(state: BatchState) -> FloatArray:
     """All unknowns in a row."""
     return np.concatenate([state.poses.ravel(), state.shared, state.beacons.ravel()])
 
 
-def unflat(x: FloatArray, like: State) -> State:
+def unflat(x: FloatArray, like: BatchState) -> BatchState:
     """And back."""
     n = like.poses.size
-    return State(x[:n].reshape(-1, 3), x[n : n + len(SHARED)], x[n + len(SHARED) :].reshape(-1, BEACON))
+    return BatchState(x[:n].reshape(-1, 3), x[n : n + len(SHARED)], x[n + len(SHARED) :].reshape(-1, BEACON))
 
 
-def half_squares(made: BatchProblem, x: FloatArray, like: State, weights: FloatArray, odometry: FloatArray) -> float:
+def half_squares(
+    made: BatchProblem, x: FloatArray, like: BatchState, weights: FloatArray, odometry: FloatArray
+) -> float:
     """Half the weighted sum of squares, from the residuals alone; noise of the odometry as at ``like``."""
     state = unflat(x, like)
     at_like, found = made.residuals(like), made.residuals(state)
@@ -75,7 +77,9 @@ def half_squares(made: BatchProblem, x: FloatArray, like: State, weights: FloatA
     return float(0.5 * (total + (weights * found.chi2).sum())) + made.prior_cost(state)
 
 
-def dense(made: BatchProblem, state: State, weights: FloatArray, odometry: FloatArray) -> tuple[FloatArray, FloatArray]:
+def dense(
+    made: BatchProblem, state: BatchState, weights: FloatArray, odometry: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """The normal equations as one full matrix and its right-hand side."""
     system = made.normal_equations(state, weights, odometry)
     n, m = len(system.diagonal), len(system.corner)

@@ -9,7 +9,7 @@ from ccatp.beacons.slam.batch_odometry import BatchSettings
 from ccatp.beacons.slam.batch_smoother import smooth
 from ccatp.beacons.slam.batch_solver import place_by_distances
 from ccatp.beacons.slam.evaluation import judge
-from ccatp.beacons.slam.recording import RecordedRun, Steps, Track
+from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun, Steps
 from ccatp.beacons.slam.settings import batch_settings
 from ccatp.config.load import load_recordings_config
 from tests.unit.radio_data.sets import BEACONS, changed, recorded, world
@@ -96,7 +96,7 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
     assert 57.2 < np.sum(maps) < 106.6  # chi-squared of 80 degrees of freedom
 
 
-def _nees(track: Track, name: str, place: tuple[float, float]) -> float:
+def _nees(track: EstimatedPath, name: str, place: tuple[float, float]) -> float:
     fix = track.beacons[name]
     e = np.array((fix.x_m - place[0], fix.y_m - place[1]))
     return float(e @ np.linalg.solve(fix.covariance, e))

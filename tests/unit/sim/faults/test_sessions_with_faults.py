@@ -10,7 +10,7 @@ from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.sim.fault_plan import parse_plan
 from ccatp.sim.robot import Robot
-from ccatp.sim.sessions import DEAF_S, RobotServer, Session
+from ccatp.sim.sessions import DEAF_S, RobotServer, RobotSession
 
 
 class Wire:
@@ -44,13 +44,13 @@ class Rig:
             on_frame=lambda: None,
         )
 
-    def join(self, role: str = "controller") -> tuple[Session, Wire]:
+    def join(self, role: str = "controller") -> tuple[RobotSession, Wire]:
         wire = Wire()
         session = self.server.accept(wire, self.now_s)
         session.receive(json.dumps({"type": "join", "role": role, "client": "test"}).encode() + b"\n", self.now_s)
         return session, wire
 
-    def answer(self, session: Session, wire: Wire, number: int) -> list[dict[str, Any]]:
+    def answer(self, session: RobotSession, wire: Wire, number: int) -> list[dict[str, Any]]:
         """What came since the last answer; the newest frame in it is answered."""
         lines, wire.sent = wire.sent.splitlines(), b""
         messages = [json.loads(line) for line in lines]

@@ -10,9 +10,9 @@ from ccatp.config.load import load_radio_config
 from ccatp.core import wrap_pi
 from ccatp.sim.radio import (
     HALT,
-    DriveCommand,
     MovingTarget,
     ShadowingField,
+    SimDriveCommand,
     TruePose,
     TrueRadio,
     clearance_m,
@@ -33,7 +33,7 @@ def radio(cfg: RadioConfig, obstacles: tuple[SimObstacleConfig, ...] = ()) -> Tr
     return TrueRadio("b", -33.0, cfg.sim.radio, (3.0, 3.0), obstacles, 40, *streams)
 
 
-def drive(cfg: RadioConfig, command: DriveCommand, steps: int) -> RadioWorld:
+def drive(cfg: RadioConfig, command: SimDriveCommand, steps: int) -> RadioWorld:
     world = RadioWorld(cfg)
     for _ in range(steps):
         world.step(command, 0.1, static=False, target=False)
@@ -44,14 +44,16 @@ EXACT = {"sim__vehicle__start_position_offset_m": 0.0, "sim__vehicle__start_head
 
 
 def test_ackermann_moves_as_printed() -> None:
-    world = drive(config(**EXACT), DriveCommand(0.1, 0.3, 0.0), 1)
+    world = drive(config(**EXACT), SimDriveCommand(0.1, 0.3, 0.0), 1)
     assert world.pose.x_m == pytest.approx(0.8 + 0.01 * np.cos(0.3))
     assert world.pose.y_m == pytest.approx(0.8 + 0.01 * np.sin(0.3))
     assert world.pose.heading_rad == pytest.approx(0.01 * np.sin(0.3) / 0.35)
 
 
 def test_differential_drive_goes_along_a_circle() -> None:
-    world = drive(config(vehicle__kind="differential", **EXACT), DriveCommand(0.1, 0.0, 0.5), round(2 * pi / 0.05) * 1)
+    world = drive(
+        config(vehicle__kind="differential", **EXACT), SimDriveCommand(0.1, 0.0, 0.5), round(2 * pi / 0.05) * 1
+    )
     centre = (0.8, 0.8 + 0.1 / 0.5)
     assert hypot(world.pose.x_m - centre[0], world.pose.y_m - centre[1]) == pytest.approx(0.2, abs=1e-6)
 
@@ -60,14 +62,14 @@ def test_slip_and_drift_are_not_in_the_odometry() -> None:
     quiet = {"sim__vehicle__speed_sigma_m_s": 0.0, "sim__vehicle__steer_sigma_rad": 0.0}
     cfg = config(**EXACT, **quiet, sim__vehicle__slip=0.05, sim__vehicle__heading_drift_rad_s=0.01)
     world = RadioWorld(cfg)
-    frame = world.step(DriveCommand(0.1, 0.0, 0.0), 0.1, static=False, target=False)
+    frame = world.step(SimDriveCommand(0.1, 0.0, 0.0), 0.1, static=False, target=False)
     assert world.pose.x_m == pytest.approx(0.8 + 0.01 * 0.95)
     assert world.pose.heading_rad == pytest.approx(0.001)
     assert frame.wheels.speed_m_s == 0.1
 
 
 def test_commands_beyond_the_limits_are_cut() -> None:
-    world = drive(config(**EXACT), DriveCommand(9.0, 0.0, 0.0), 1)
+    world = drive(config(**EXACT), SimDriveCommand(9.0, 0.0, 0.0), 1)
     assert world.pose.x_m == pytest.approx(0.8 + 0.015)
 
 
@@ -183,7 +185,7 @@ def test_a_seed_repeats_itself_and_listening_does_not_change_the_rest() -> None:
     cfg = load_radio_config(None, {"system": "follow"})
     worlds = [RadioWorld(cfg), RadioWorld(cfg)]
     frames = [
-        [world.step(DriveCommand(0.1, 0.1, 0.0), 0.1, static=listens, target=True) for _ in range(20)]
+        [world.step(SimDriveCommand(0.1, 0.1, 0.0), 0.1, static=listens, target=True) for _ in range(20)]
         for world, listens in zip(worlds, (True, False), strict=True)
     ]
     assert worlds[0].pose == worlds[1].pose
