@@ -95,12 +95,9 @@ class Fix:
     """A multilaterated position of the puck.
 
     Attributes:
-        t_s: robot time to which the position belongs.
         position_m: puck centre in the world frame, shape (3,).
         covariance_m2: 3 x 3 covariance in the world frame, row-major, length 9.
         dop: position dilution of precision, sqrt(trace((J^T J)^-1)), dimensionless.
-        channels: the laser channels that took part.
-        residual_rms_m: root mean square of the length residuals.
     """
 
     t_s: float
@@ -145,16 +142,11 @@ class Verdict(msgspec.Struct, frozen=True):
 
     Attributes:
         seq: the sensors frame judged.
-        t_s: its time.
-        code: event code.
         cause: why, in one short phrase; empty when normal.
         signal: the signal that gave cause (``"front_left"``, ``"estimate"``, ``"emergency:fire"``), or empty.
         value: the signal's value in the unit of ``limit``.
-        limit: the limit it passed.
-        forward, reverse, turn: the motion permitted until the next verdict.
         off: for each edge sensor whether it takes part in a declared edge.
         severity: how grave what gave cause is. An edge has none: what to do about it is in its code and permits.
-        full_fans: the fans shall give all they can.
         raised: how many emergencies have been raised so far, while one is latched; another number is another one.
         is_shaking: an earthquake is latched, whatever else gave code and cause.
     """
@@ -206,7 +198,6 @@ class Stop:
 
     Attributes:
         x_m, y_m: where the robot's origin shall stand, deck frame.
-        kind: what the stop is for.
         point: the measurement point, where ``kind`` is ``MEASURE``.
         reverse: the leg that ends here is driven backwards (the heading points away from the stop).
         heading_rad: deck heading to turn to after arriving, where one is asked for (at base).
@@ -266,8 +257,6 @@ def wheel_rates(twist: Twist, wheel_radius_m: float, wheel_base_m: float) -> tup
 
     Args:
         twist: forward speed (m/s) and angular rate (rad/s).
-        wheel_radius_m: r.
-        wheel_base_m: L, the distance between the wheels.
 
     Returns:
         (right, left) wheel rates, rad/s.
@@ -302,7 +291,6 @@ def danger_text(cause: str, signal: str, value: float, limit: float) -> str:
     """``estimate stale: 0.31 s (limit 0.15 s)``.
 
     Args:
-        cause: why, in one short phrase.
         signal: what gave cause; it is named where the cause does not.
         value, limit: in the unit of the signal; a limit of 0 is none.
     """

@@ -69,8 +69,6 @@ class SensorsFrame(MonitorFrame, Protocol):
 
 
 class _Shifted(NamedTuple):
-    """An estimate in steady time."""
-
     seq: int
     t_s: float
     x_m: float
@@ -94,9 +92,6 @@ class DangerMonitor:
     """Judges sensors frames. Call ``step`` once per frame, ``stale`` when no frame came in time.
 
     Args:
-        mirror: the map.
-        robot: wheels and sensor places.
-        cfg: the rules' limits.
         health: limits of the monitors; without them the rules of edges, ages and emergencies stand alone.
     """
 
@@ -316,7 +311,6 @@ class DangerMonitor:
         return self._ladder.climb(t_s, found)
 
     def _weigh(self, verdict: Verdict, found: list[MonitorFinding]) -> Verdict:
-        """The verdict of the rules with what was found."""
         top = gravest(found)
         if top is None:
             return verdict
@@ -338,7 +332,6 @@ class DangerMonitor:
 
         Args:
             seq: the last frame's number.
-            t_s: robot time as far as known, s.
         """
         limit_s = self._stale_after_s
         return self.latch.told(_denied(seq, t_s, self.code, _Missing("sensors", "no sensors frame", limit_s, limit_s)))
@@ -348,8 +341,6 @@ class DangerMonitor:
 
         Args:
             seq: the last frame's number.
-            t_s: robot time as far as known, s.
-            at_s: when it came, on any clock that runs on, s.
         """
         if self._board is None or not self._garbled.add(at_s):
             return None
@@ -388,7 +379,6 @@ class DangerMonitor:
     # -- arbitration ----------------------------------------------------------------------------------------------
 
     def _declared(self) -> EdgeDetector | None:
-        """The first sensor's episode that is a declared edge."""
         return next((e for e in self._edges.episodes if e is not None and e.phase is EdgePhase.DECLARED), None)
 
     def _arbitrate(self, seq: int, t_s: float, missing: _Missing | None) -> Verdict:

@@ -47,14 +47,9 @@ class RobotLinkServer:
     """The server of one robot.
 
     Args:
-        robot: just booted.
         address: host and port to listen on where no bound socket is given; port 0 = any free port.
         lockstep: simulated time waits for the clients; otherwise the wall clock paces it.
         key: key of the robot link, ``None`` for no authentication.
-        log: takes its lines.
-
-    Attributes:
-        server: the link without sockets.
     """
 
     def __init__(
@@ -165,8 +160,6 @@ class RobotLinkServer:
 
 
 class _Connection(asyncio.Protocol):
-    """Bytes in and out of one connection."""
-
     def __init__(self, owner: RobotLinkServer) -> None:
         self._owner = owner
         self._transport: asyncio.Transport | None = None
@@ -218,18 +211,12 @@ class DataLoop(RobotLinkServer):
     """The server.
 
     Args:
-        cfg: the configuration.
         lockstep: simulated time waits for the clients; otherwise the wall clock paces it.
-        seed: of every random draw.
         key: key of the robot link, ``None`` for no authentication.
-        log: takes its lines.
         faults: what shall go wrong with the robot; each is logged when it begins and with what it did.
         start: where the robot stands, if not at base.
 
     Attributes:
-        robot: the robot.
-        server: its link.
-        truth: who gives the truth away.
         link_faults: who rules the proxy before the link by the robot's clock.
     """
 
@@ -297,18 +284,9 @@ async def serve(
     """Run a DataLoop until ``stop`` is set.
 
     Args:
-        cfg: the configuration.
-        lockstep: simulated time waits for the clients.
-        seed: of every random draw.
-        stop: ends it.
-        listen_sock: a bound socket instead of the configured address.
-        truth_rep: endpoint of the truth's REP socket.
-        truth_pub: endpoint of the truth's PUB socket.
         key: key of the robot link, ``None`` for no authentication.
-        log: takes its lines.
         faults: what shall go wrong with the robot and its link; for the link a proxy listens in the robot's place.
         body_file: keeps where the robot stands while nobody simulates it.
-        is_resuming: the robot stands where the file says.
 
     Raises:
         OSError: the address cannot be had.
@@ -351,14 +329,8 @@ class BeaconRobotServer(RobotLinkServer):
     """The server.
 
     Args:
-        cfg: the configuration.
         lockstep: simulated time waits for the clients; otherwise the wall clock paces it.
         key: key of the robot link, ``None`` for no authentication.
-        log: takes its lines.
-
-    Attributes:
-        robot: the robot.
-        truth: who gives the truth away.
     """
 
     def __init__(self, cfg: RadioConfig, *, lockstep: bool, key: bytes | None, log: ServerLog | None) -> None:
@@ -391,14 +363,7 @@ async def serve_beacons(
     """Run a robot among beacons until ``stop`` is set.
 
     Args:
-        cfg: the configuration.
-        lockstep: simulated time waits for the clients.
-        stop: ends it.
-        listen_sock: a bound socket instead of the configured address.
-        truth_rep: endpoint of the truth's REP socket.
-        truth_pub: endpoint of the truth's PUB socket.
         key: key of the robot link, ``None`` for no authentication.
-        log: takes its lines.
 
     Raises:
         OSError: the address cannot be had.

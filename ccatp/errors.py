@@ -33,7 +33,6 @@ class ConfigError(CcatpError):
 
     Args:
         problems: one line each, ``file:line: key: what is wrong; what to do``. The first is the message.
-        shows_all: all of them are: no command lists them.
     """
 
     exit_status = ExitStatus.USAGE

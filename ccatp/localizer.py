@@ -107,8 +107,6 @@ def build_localizer(
     """The localizer for ``run.filter``, the robot standing at base or at ``start``.
 
     Args:
-        cfg: the configuration.
-        mirror: its mirror.
         wrap: what to put around the filter, for those who want to look on.
         start: where the robot stands, as well as ``localizer.start_..._sigma`` says.
     """
@@ -136,8 +134,6 @@ def build_doubting(
     """The localizer for ``run.filter``, the robot standing where it was seen last.
 
     Args:
-        cfg: the configuration.
-        mirror: its mirror.
         pose: where that was, deck frame.
         sigmas: standard deviations of place (m) and heading (rad).
         wrap: as in ``build_localizer``.

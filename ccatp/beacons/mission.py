@@ -48,15 +48,11 @@ class BeaconHold:
     """State and causes of the mission.
 
     Attributes:
-        state: where it stands.
-        outcome: how it ended.
-        cause: why it is held or returns.
         abort_cause: why it was given up, or empty.
         is_faulted: something is wrong, and an operator has to look after it.
     """
 
     def __init__(self) -> None:
-        """Idle."""
         self.state: BeaconState = IDLE
         self.outcome = SurveyOutcome.NONE
         self.cause = self.abort_cause = ""
@@ -177,11 +173,6 @@ def permitted(drive: SteeringCommand, verdict: Verdict, back_speed_m_s: float) -
 
     Where forward motion is wanted and denied, the robot backs off straight, if that is permitted: what it stands before
     stays there, and wheels that steer cannot turn on the spot.
-
-    Args:
-        drive: wanted.
-        verdict: in force.
-        back_speed_m_s: of backing off.
     """
     if not all(map(isfinite, drive)):
         return HALT
@@ -199,8 +190,6 @@ class WaypointArrival(NamedTuple):
 
     Attributes:
         waypoint, lap: its number in the loop and the lap, both from 0.
-        place_m: where it is.
-        belief: where the robot believes to be.
     """
 
     waypoint: int
@@ -216,16 +205,9 @@ class BeaconMission(BeaconHold):
 
     Args:
         cfg: the configuration; nothing of ``sim`` is used.
-        navigator: knows where the robot is.
-
-    Attributes:
-        navigator: the same.
-        pilot: who drives.
-        arrivals: waypoints reached, in order.
     """
 
     def __init__(self, cfg: RadioConfig, navigator: Navigator) -> None:
-        """Idle at the start."""
         super().__init__()
         self._cfg, self.navigator = cfg, navigator
         self.pilot = BeaconPilot(cfg)
@@ -257,7 +239,6 @@ class BeaconMission(BeaconHold):
 
         Args:
             senses: the frame.
-            interval_s: until the next one.
             verdict: the danger loop's, in force; ``None`` where there is none fresh enough.
         """
         self.navigator.take(senses)
@@ -323,7 +304,6 @@ class BeaconMission(BeaconHold):
 
 
 def _homing_pilot(cfg: RadioConfig) -> BeaconPilot:
-    """A pilot to where the robot started."""
     base = ((cfg.start.x_m, cfg.start.y_m),)
     workspace = cfg.workspace.model_copy(update={"waypoints_m": base, "loops": False})
     follow = cfg.follow.model_copy(update={"is_active": False})

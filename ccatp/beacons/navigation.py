@@ -39,12 +39,10 @@ class SelfMap:
         cfg: the motes, layout ``networks``; nothing of ``sim`` is used.
 
     Attributes:
-        names: of the motes on the map, the first of each stand.
         notes: errors that are expected after each phase, m; updates of phase 2.
     """
 
     def __init__(self, cfg: CricketConfig) -> None:
-        """Nothing heard."""
         self._cfg, self._plan = cfg, network_plan(cfg)
         names, heads = self._plan.names, self._plan.heads
         self._index = {name: mote for mote, name in enumerate(names)}
@@ -91,7 +89,6 @@ class SelfMap:
                 self._mapper = self._lay_out()
 
     def _lay_out(self) -> MoteMapper:
-        """Phase 1: trilateration; then the prior of phase 2."""
         cfg, plan = self._cfg, self._plan
         rows: list[MoteRange] = []
         for i, j in plan.phase1_pairs:
@@ -133,9 +130,6 @@ class WheelInterval(NamedTuple):
     """Odometry of an interval.
 
     Attributes:
-        end_s: its end, robot time.
-        interval_s: its length.
-        speed_m_s: mean speed.
         steer_rad: steering angle to the left; of a steered vehicle.
         turn_rate_rad_s: turn rate to the left; of a differential drive.
     """
@@ -167,12 +161,8 @@ class BeaconMeasurements(NamedTuple):
     """A frame as a mission takes it.
 
     Attributes:
-        t_s: its time.
         wheels: since the last frame, without gaps; empty where nothing is known of them.
-        packets: of a scan that is to be read.
-        sightings: scans that were read already.
         distances_m: of the distance sensors; empty without a reading.
-        motes: pulses heard.
     """
 
     t_s: float
@@ -189,11 +179,7 @@ class BeaconMeasurements(NamedTuple):
 
 
 class MeasurementReader:
-    """Reads one frame after the other.
-
-    Args:
-        cfg: wheels and vehicle.
-    """
+    """Reads one frame after the other."""
 
     def __init__(self, cfg: RadioConfig) -> None:
         """Before the first frame."""
@@ -281,8 +267,6 @@ class Score(NamedTuple):
     """How the readings agree with what was expected of them, all so far.
 
     Attributes:
-        nis_sum: sum of the normalised innovations squared.
-        nis_size: sum of their degrees of freedom.
         refused: readings that the gate refused; not in the sums.
     """
 
@@ -350,7 +334,6 @@ class RadioNavigator:
     is_mapping = False  # the map grows while the robot drives
 
     def __init__(self, cfg: RadioConfig) -> None:
-        """At the believed start."""
         self._cfg, self._scan = cfg, scan_of(cfg)
         self._target = cfg.follow.target
         self.slam = new_slam(cfg)
@@ -429,7 +412,6 @@ class MoteNavigator:
     """
 
     def __init__(self, cfg: RadioConfig) -> None:
-        """At the believed start, without a map."""
         start = cfg.start
         self._cfg, self._motion = cfg, vehicle_of(cfg)
         self._self_map = SelfMap(cfg.cricket)

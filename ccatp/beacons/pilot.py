@@ -39,14 +39,7 @@ class FollowState(StrEnum):
 
 
 class TargetSight(NamedTuple):
-    """What is believed of the target.
-
-    Attributes:
-        position_m: where it is.
-        sigma_m: standard deviation of its distance.
-        unheard_s: since it was last heard.
-        velocity_m_s: how it moves.
-    """
+    """What is believed of the target."""
 
     position_m: Point
     sigma_m: float
@@ -61,13 +54,6 @@ class Follower:
     stays away, and by what the target will have come nearer in a moment. It is a limit from below: a target that is
     nearer is backed off from until it is a band farther; one that is farther than two bands beyond is approached until
     it is one band beyond; in between the robot stands. So noise does not switch its state.
-
-    Attributes:
-        state: what it is doing.
-
-    Args:
-        cfg: distances and time-out.
-        driver: what turns an aim into set points.
     """
 
     def __init__(self, cfg: FollowConfig, driver: WaypointSteering) -> None:
@@ -136,9 +122,7 @@ class FreeHeading(NamedTuple):
     """What the obstacles leave of an aim.
 
     Attributes:
-        aim: changed where something stands in the way.
         speed_factor: 1 far from everything, 0 where nothing but standing is safe.
-        is_blocked: no heading is free.
         nearest_m: distance to the nearest obstacle that is remembered; infinite without one.
     """
 
@@ -154,10 +138,6 @@ class ObstacleAvoider:
     Echoes are kept as points in the room for a while, because a few sensors look past what stands between them. A point
     at distance d blocks the headings within asin((radius + margin) / d) of its own. Of the free ones that heading is
     taken whose distance from the aim, and a tenth of that from straight ahead, is least: that keeps to one side.
-
-    Args:
-        cfg: sensors and distances.
-        radius_m: of the circle round the vehicle's body.
     """
 
     def __init__(self, cfg: AvoidanceConfig, radius_m: float) -> None:
@@ -169,9 +149,7 @@ class ObstacleAvoider:
         """Remember what the sensors show, and forget what is old.
 
         Args:
-            time_s: now.
             pose: x m, y m, heading rad.
-            distances_m: in the order of the configured sensors.
         """
         while self._echoes and time_s - self._echoes[0].time_s > self._cfg.memory_s:
             self._echoes.popleft()
@@ -268,9 +246,6 @@ class BackOff:
 
         Args:
             pose: x m, y m, heading rad.
-            threat_m: where it is.
-            threat_velocity_m_s: how it moves.
-            obstacles_m: points in the room that the sensors have seen.
         """
         horizon_s = self._cfg.follow.retreat_s
         vx, vy = threat_velocity_m_s
@@ -299,7 +274,6 @@ class BackOff:
             yield self._straight(pose, wrap_pi(pi + k * tau / _COURSES), speed_m_s, horizon_s)
 
     def _places(self, pose: PlanarPose, drive: SteeringCommand, horizon_s: float) -> list[Point]:
-        """Along the arc of wheels that steer."""
         x_m, y_m, heading_rad = pose
         interval_s = horizon_s / _STEPS
         turn_rad = interval_s * drive.speed_m_s * sin(drive.steer_rad) / self._cfg.vehicle.wheelbase_m
@@ -356,11 +330,6 @@ class PilotState(StrEnum):
 class BeaconPilot:
     """Turns a pose, a target and the distance sensors into set points, step by step.
 
-    Attributes:
-        state: what it is doing.
-        waypoints: how far the loop of waypoints is.
-        follower: what it does about the target, where one is followed.
-
     Args:
         cfg: workspace, vehicle, control, follow and avoidance are used.
 
@@ -391,11 +360,8 @@ class BeaconPilot:
         """Set points for the next interval.
 
         Args:
-            time_s: now.
-            interval_s: the interval.
             pose: x m, y m, heading rad.
             target: what is believed of the target; None without one.
-            distances_m: of the distance sensors.
         """
         aim = self._aim(pose, target)
         if not self._cfg.avoidance.is_active:

@@ -111,7 +111,6 @@ class SteeringCommand(NamedTuple):
     """Set points until the next step.
 
     Attributes:
-        speed_m_s: forward speed.
         steer_rad: steering angle to the left; of an Ackermann vehicle.
         turn_rate_rad_s: turn rate to the left; of a differential drive.
     """
@@ -128,7 +127,6 @@ class BearingToPoint(NamedTuple):
     """Where to go, seen from the vehicle.
 
     Attributes:
-        distance_m: that is left.
         error_rad: of the heading: positive when the aim lies to the left.
     """
 
@@ -151,10 +149,6 @@ class WaypointSteering:
     * ``fuzzy``: of the distance and of the heading error's magnitude (2017).
     * ``pi``: of the distance, slower the more the heading is off (Auth and Hovey 2018, section 2.4).
     * ``constant``: always the same (2018, as built).
-
-    Args:
-        control: mode, gains, rules.
-        vehicle: kind and limits.
 
     Raises:
         FuzzyGapError: the rules leave a gap.
@@ -212,12 +206,7 @@ class WaypointSteering:
 class WaypointList:
     """Which waypoint is next.
 
-    Attributes:
-        reached: how many have been reached.
-
     Args:
-        waypoints_m: in their order.
-        arrival_radius_m: one is reached when it is nearer.
         loops: begin again after the last.
     """
 

@@ -30,8 +30,6 @@ class BeaconStore:
 
     Args:
         path: a file that does not exist.
-        meta: what the run is of.
-        waypoints: places, in the order of one lap.
         laps: how often they are visited; 0 where there are none to visit.
 
     Raises:

@@ -93,7 +93,6 @@ def run_command_line(group: click.Group, argv: Sequence[str] | None = None) -> i
     """Run a command line; expected errors become one line on standard error, never a traceback.
 
     Args:
-        group: the commands.
         argv: arguments without the program's name; those of the process if ``None``.
 
     Returns:
@@ -263,8 +262,6 @@ def ask_daemon(runtime_dir: Path | None, channel: str, payload: dict[str, object
     Args:
         runtime_dir: its runtime directory, if not the usual one.
         channel: ``control`` or ``emergency``.
-        payload: the request.
-        timeout_s: longest wait for the answer.
 
     Raises:
         UnreachableError: nobody listens there, or no answer came in time.
@@ -304,7 +301,6 @@ def _tell_rows(rows: Sequence[tuple[str, str]]) -> None:
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """``{"a": {"b": 1.5}}`` as ``a.b`` and ``1.5``."""
     for key, value in tree.items():
         if isinstance(value, Mapping):
             yield from _flat(value, f"{prefix}{key}.")

@@ -141,10 +141,6 @@ def _ask_over_tcp(
 
     Args:
         endpoint: ``tcp://HOST:PORT``.
-        server_key: file with the daemon's public key.
-        key: file with our own secret key.
-        payload: the request.
-        timeout_s: longest wait for the answer.
 
     Raises:
         ConfigError: a key file cannot be used.

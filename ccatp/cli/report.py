@@ -326,7 +326,6 @@ def _head(result: Mapping[str, Any]) -> list[str]:
 
 
 def _progress() -> Callable[[float], None] | None:
-    """Robot time on a terminal, now and then."""
     if not sys.stderr.isatty():
         return None
     told_s = float("-inf")

@@ -22,9 +22,6 @@ STOP_TIMEOUT_S = 5.0
 def stand_ins(cfg: Config) -> Iterator[Config]:
     """Start them, on any free ports and by the wall clock; stop them at the end.
 
-    Args:
-        cfg: the configuration.
-
     Yields:
         The configuration with their addresses.
 

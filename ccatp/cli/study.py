@@ -18,7 +18,6 @@ class _StudyCommand(click.Command):
     """A command whose help lists the studies, from their table, when it is asked for."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The studies, and the examples."""
         from ccatp.studies.registry import STUDIES
 
         with formatter.section("Studies"):

@@ -60,15 +60,9 @@ class Calibration:
     """What a drive shows.
 
     Attributes:
-        radius_m, base_m, bias_rad_s: mean of both radii, wheel base, gyroscope bias.
         covariance: of these three, shape (3, 3).
-        radius_difference_m: right minus left, and its standard deviation.
-        radius_difference_sigma_m: of it.
-        gyro_scale, gyro_scale_sigma: scale error of the gyroscope.
-        creep, creep_sigma: downhill drift, part of the way.
         slip_sigma: how much slip varies from motion to motion; 0 where nothing shows that it does.
         chi2, degrees: of all residuals, with ``slip_sigma`` as it is.
-        segments: how many.
     """
 
     radius_m: float
@@ -97,8 +91,6 @@ def calibrate(mirror: Mirror, drive: RecordedDrive, priors: Priors) -> Calibrati
     """Estimate the parameters.
 
     Args:
-        mirror: where the drive took place.
-        drive: the drive.
         priors: what is thought before it.
 
     Raises:
@@ -154,8 +146,6 @@ def _check(drive: RecordedDrive, priors: Priors) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Solution:
-    """Parameters and poses, covariance of the parameters."""
-
     x: FloatArray
     covariance: FloatArray
     chi2: float
@@ -163,13 +153,10 @@ class _Solution:
 
 
 class _Problem:
-    """The equations of one drive."""
-
     def __init__(self, mirror: Mirror, drive: RecordedDrive, priors: Priors) -> None:
         self._mirror, self._drive, self._priors = mirror, drive, priors
 
     def solve(self, x: FloatArray, slip_sigma: float) -> _Solution:
-        """Gauss-Newton from ``x``."""
         for _ in range(_ROUNDS):
             rows, residuals = self._whitened(x, self._carried(x), slip_sigma)
             step, *_ = np.linalg.lstsq(rows, residuals, rcond=None)
@@ -301,7 +288,6 @@ class CalibrationRow(NamedTuple):
     """One key of the configuration.
 
     Attributes:
-        key: dotted.
         configured, found, sigma: in the unit of the key.
     """
 

@@ -39,7 +39,6 @@ class FixedPlace:
     """Where a fix saw the robot, deck frame.
 
     Attributes:
-        x_m, y_m: foot of the puck.
         covariance_m2: of both, shape (2, 2).
     """
 
@@ -56,9 +55,6 @@ class Segment:
         right_rad, left_rad: what each wheel turned, frame by frame, shape (n,).
         motions: first and last (exclusive) frame of each motion; together all frames.
         gyro_rad: sum of the gyroscope's rates times their periods.
-        gyro_s: over this time.
-        gyro_samples: so many.
-        duration_s: from fix to fix.
     """
 
     right_rad: FloatArray
@@ -76,11 +72,8 @@ class RecordedDrive:
 
     Attributes:
         places: k + 1 fixes.
-        segments: k.
         encoder_sigma_rad_s: noise of a rate sample; 0 of a counter.
-        encoder_period_s: between two samples.
         quantum_rad: step of a counter; 0 where the rate itself is read.
-        gyro_sigma_rad_s: noise of a gyroscope sample.
     """
 
     places: tuple[FixedPlace, ...]
@@ -93,8 +86,6 @@ class RecordedDrive:
 
 @dataclass(slots=True)
 class _Open:
-    """The segment that is being driven."""
-
     right: list[float] = field(default_factory=list)
     left: list[float] = field(default_factory=list)
     gyro_rad: float = 0.0
@@ -104,12 +95,7 @@ class _Open:
 
 
 class DriveBuilder:
-    """Takes a drive as it comes: frames and fixes, in their order.
-
-    Args:
-        mirror: where it takes place.
-        puck_height_m: above the surface along its normal.
-    """
+    """Takes a drive as it comes: frames and fixes, in their order."""
 
     def __init__(self, mirror: Mirror, puck_height_m: float) -> None:
         self._mirror, self._puck_height_m = mirror, puck_height_m
@@ -247,13 +233,7 @@ STEP_FRAMES = 3
 
 
 class WheelParameters(NamedTuple):
-    """What turns wheel angles into motion.
-
-    Attributes:
-        right_m, left_m: radii.
-        base_m: distance of the wheels.
-        creep: downhill drift, part of the way.
-    """
+    """What turns wheel angles into motion."""
 
     right_m: float
     left_m: float
@@ -287,10 +267,7 @@ def carry(mirror: Mirror, segment: Segment, start: FloatArray, wheels: WheelPara
     turn - fy (fxx dx + fxy dy) / ((1 + fx^2) W).
 
     Args:
-        mirror: the surface.
-        segment: what the wheels turned.
         start: x, y (m), heading (rad), deck frame.
-        wheels: the parameters.
     """
     steps = np.array(wheels) * 1e-5
     steps[3] = 1e-3

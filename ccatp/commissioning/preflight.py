@@ -35,9 +35,6 @@ class PreflightResult(NamedTuple):
     """One check.
 
     Attributes:
-        name: what was looked at.
-        outcome: how it went.
-        found: what was seen.
         todo: what to do; empty where all is well.
     """
 
@@ -153,7 +150,6 @@ class RobotReport(NamedTuple):
     """What came from the robot.
 
     Attributes:
-        hello: its first line.
         frames: one after the other.
         arrived_s: when each came, by our monotonic clock.
     """

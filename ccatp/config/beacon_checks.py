@@ -97,7 +97,6 @@ def check_radio_config(cfg: RadioConfig, *, simulates: bool = True) -> list[Conf
     """Everything wrong with a configuration whose values are each in range.
 
     Args:
-        cfg: the configuration.
         simulates: whether the field of motes is simulated, or its ranges were measured.
     """
     return [

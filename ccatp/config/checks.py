@@ -39,11 +39,7 @@ _CORNERS = ((1, 1, "front-left"), (1, -1, "front-right"), (-1, 1, "rear-left"), 
 
 
 def check_config(cfg: Config) -> list[ConfigProblem]:
-    """Everything wrong with a configuration whose values are each in range.
-
-    Args:
-        cfg: the configuration.
-    """
+    """Everything wrong with a configuration whose values are each in range."""
     return [
         *_check_names(cfg),
         *_check_units(cfg),
@@ -235,7 +231,6 @@ def _check_panels(panels: PanelsConfig) -> Iterator[ConfigProblem]:
 
 
 def _check_grid(panels: PanelsConfig, axis: str, root: Key) -> Iterator[ConfigProblem]:
-    """Pitch and measurement points of one axis."""
     size, pitch = getattr(panels, f"size_{axis}_mm"), getattr(panels, f"pitch_{axis}_mm")
     size_key: Key = (*root, f"size_{axis}_mm")
     if abs(pitch - size - panels.gap_mm) > _PITCH_AGREEMENT_MM:

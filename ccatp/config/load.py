@@ -52,9 +52,7 @@ class ConfigSource:
     Attributes:
         name: file name as the user knows it, or ``command line``.
         text: the file's text; empty for the command line.
-        tree: what it says.
         root: the section of the configuration that ``tree`` is.
-        folder: what relative file names in it refer to.
     """
 
     name: str
@@ -129,10 +127,7 @@ def merged(
     """``above`` laid over ``below``, section by section; arrays are replaced whole.
 
     Args:
-        below: what the weaker source says.
-        above: what the stronger one says.
         whole: sections that are lists by name: they are replaced whole, too.
-        at: where in the configuration the two stand.
     """
     tree = dict(below)
     for name, value in above.items():
@@ -441,9 +436,7 @@ def with_values(text: str, values: Mapping[str, float], file: Path) -> str:
     added to its section.
 
     Args:
-        text: TOML.
         values: by dotted key, ``section.key``.
-        file: where the text is from, for errors.
 
     Raises:
         ConfigError: the text is not TOML, or a key stands where no key can be.

@@ -29,10 +29,6 @@ def find_line(text: str, key: Key) -> int | None:
     """Number (from 1) of the line that holds a key, or the nearest thing that encloses it.
 
     A key inside an inline table or an array is found at the line of its table or array.
-
-    Args:
-        text: TOML that parses.
-        key: path of the key.
     """
     path = _names(key)
     best, best_line = 0, None
@@ -110,7 +106,6 @@ def _section(data: Mapping[str, object], path: tuple[str, ...]) -> Iterator[str]
 
 
 def _folded(value: object) -> str:
-    """A long array with one element a line."""
     text = format_value(value)
     if len(text) <= _WIDTH or isinstance(value, str) or not isinstance(value, Sequence):
         return text
@@ -164,8 +159,6 @@ class ConfigProblem(NamedTuple):
     """One thing wrong with a configuration.
 
     Attributes:
-        key: the key.
-        what: a phrase that follows it.
         related: keys that contradict ``key``, any of which the user may have meant to change.
     """
 
@@ -199,12 +192,7 @@ def slip_hint(key: Key, value: float, limit: float = math.inf) -> str:
 
 
 def faults_of(errors: Iterable[Mapping[str, Any]], root: type[BaseModel] = Config) -> list[ConfigProblem]:
-    """The findings of ``ValidationError.errors()`` as faults, misspelt keys first: they also cause missing ones.
-
-    Args:
-        errors: the findings.
-        root: the model that was validated.
-    """
+    """The findings of ``ValidationError.errors()`` as faults, misspelt keys first: they also cause missing ones."""
     ordered = sorted(errors, key=lambda error: error["type"] != "extra_forbidden")
     return [ConfigProblem(tuple(error["loc"]), _what(error, root)) for error in ordered]
 

@@ -11,31 +11,19 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def build(root: Path = ROOT) -> str:
-    """``compiled`` where the frame path is machine code (``make fast``), else ``interpreted``.
-
-    Args:
-        root: the package's folder.
-    """
+    """``compiled`` where the frame path is machine code (``make fast``), else ``interpreted``."""
     is_machine_code = any((root / "survey" / f"mission{suffix}").is_file() for suffix in EXTENSION_SUFFIXES)
     return COMPILED if is_machine_code else INTERPRETED
 
 
 def configs_dir(root: Path = ROOT) -> Path:
-    """The folder of the configurations that come with ccatp: in the package once installed, beside it in a checkout.
-
-    Args:
-        root: the package's folder.
-    """
+    """The folder of the configurations that come with ccatp: in the package once installed, beside it in a checkout."""
     inside = root / "configs"
     return inside if inside.is_dir() else root.parent / "configs"
 
 
 def child_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    """The environment in which ``python -m ccatp...`` runs this package, whatever lies in the working directory.
-
-    Args:
-        environment: of this process.
-    """
+    """The environment in which ``python -m ccatp...`` runs this package, whatever lies in the working directory."""
     changed = {**environment, "PYTHONSAFEPATH": "1"}
     above = str(ROOT.parent)
     if above not in sys.path[1:]:  # neither installed nor in PYTHONPATH: it was found in the working directory

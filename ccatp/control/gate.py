@@ -52,10 +52,6 @@ class DriveGate:
     """Turns a wanted twist into wheel rates that are finite, limited and permitted, or into zero.
 
     Args:
-        limits: motion limits of the robot's origin.
-        wheel_radius_m: r.
-        wheel_base_m: L.
-        max_wheel_rad_s: the robot's own limit.
         wheel_lag_s: time constant of the wheel servo; the feed-forward may step the set point by T times the
             acceleration limit.
         verdict_timeout_s: a verdict that is this far from the frame in time is none.
@@ -76,7 +72,6 @@ class DriveGate:
         verdict_timeout_s: float,
         frame_timeout_s: float,
     ) -> None:
-        """Copy the limits; nothing has been driven yet."""
         self._v_max = HEADROOM * limits.v_max_m_s
         self._omega_max = HEADROOM * limits.omega_max_rad_s
         self._v_step = 2.0 * HEADROOM * limits.a_max_m_s2 * wheel_lag_s
@@ -99,12 +94,9 @@ class DriveGate:
         """Wheel rates (right, left), rad/s, for the wanted twist, as far as it may be driven.
 
         Args:
-            wanted: velocity asked for by the mission.
             verdict: the danger loop's verdict in force; ``None`` when there is none fresh enough.
-            dt_s: time since the last drive.
             t_s: robot time of the frame that is answered.
             age_s: how old that frame is.
-            purpose: what the mission's state moves for.
         """
         v, omega = wanted.v_m_s, wanted.omega_rad_s
         if v == 0.0 and omega == 0.0:
@@ -171,13 +163,9 @@ class FanGate:
 
     Args:
         floor: least duty of each fan where the mirror overhangs; 0 elsewhere.
-
-    Attributes:
-        refused: how many commands were refused.
     """
 
     def __init__(self, floor: float) -> None:
-        """Nothing refused yet."""
         self._floor = floor
         self.refused = 0
 

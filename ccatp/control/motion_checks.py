@@ -16,8 +16,6 @@ class MotionSum(NamedTuple):
     """Running sums since the start, at one time.
 
     Attributes:
-        t_s: the time.
-        right_m, left_m: travel of the wheels' rims.
         turned_rad: what the gyroscope has turned by, as far as it could be believed.
     """
 
@@ -28,16 +26,11 @@ class MotionSum(NamedTuple):
 
 
 class SlidingWindow:
-    """The change of running sums over a time.
-
-    Args:
-        span_s: that time.
-    """
+    """The change of running sums over a time."""
 
     __slots__ = ("_kept", "_span_s")
 
     def __init__(self, span_s: float) -> None:
-        """Empty."""
         self._span_s = span_s - 1e-6
         self._kept: deque[MotionSum] = deque()
 
@@ -60,9 +53,6 @@ class SlidingWindow:
 class WheelMeans:
     """The mean rates of the wheels over a frame, and the yaw rate that they mean, smoothed.
 
-    Args:
-        robot: wheels.
-
     Attributes:
         right_rad_s, left_rad_s: means over the last frame; ``None`` for a wheel that gave no sample.
         yaw_rad_s: smoothed over some frames, because a count of an encoder is a jump of its rate.
@@ -73,7 +63,6 @@ class WheelMeans:
     __slots__ = ("_limit_rad_s", "_per_base", "left_rad_s", "right_rad_s", "yaw_rad_s")
 
     def __init__(self, robot: RobotConfig) -> None:
-        """Standing still."""
         self._per_base = robot.wheel_radius_m / robot.wheel_base_m
         self._limit_rad_s = largest_rate_rad_s(robot)
         self.right_rad_s: float | None = 0.0
@@ -132,17 +121,12 @@ class ImuGate:
 
     After an impossible reading the unit stays out for the quarantine, because garbage is plausible now and then.
 
-    Args:
-        cfg: limits.
-
     Attributes:
         cause: why the unit is out, or empty.
-        value, limit: what of it passed which limit.
         out_since_s: since when; infinite while it is believed.
     """
 
     def __init__(self, cfg: HealthConfig) -> None:
-        """Believed, until it says something impossible."""
         self._rate, self._share = cfg.imu_rate_rad_s, cfg.imu_rate_share
         self._largest, self._jump = cfg.imu_largest_rad_s, cfg.imu_jump_rad_s
         self._acceleration, self._identical = cfg.imu_acceleration_m_s2, cfg.identical_samples
@@ -163,7 +147,6 @@ class ImuGate:
 
         Args:
             samples: of a frame, oldest first.
-            yaw_rad_s: what the wheels say.
         """
         limit = self._rate + self._share * (yaw_rad_s if yaw_rad_s >= 0.0 else -yaw_rad_s)
         is_good = True

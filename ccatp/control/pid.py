@@ -24,7 +24,6 @@ class Pid:
     """
 
     def __init__(self, gains: PidConfig, output_limit: float) -> None:
-        """Start at rest: no integral, no past error."""
         self._kp, self._ki, self._kd = gains.kp, gains.ki, gains.kd
         self._filter_s = gains.derivative_filter_s
         self._integral_limit = gains.integral_limit
@@ -41,7 +40,6 @@ class Pid:
         """One control step.
 
         Args:
-            error: set point minus measurement.
             dt_s: time since the last step, > 0.
 
         Returns:
@@ -71,12 +69,8 @@ class Profile(NamedTuple):
     It is the time-optimal motion under the two limits: accelerate, cruise where there is room, decelerate.
 
     Attributes:
-        distance: signed distance.
         peak: largest speed reached, with the sign of the distance.
-        acceleration: of the first ramp, with the sign of the distance.
-        ramp_s: duration of each ramp.
         cruise_s: duration at ``peak``.
-        duration_s: time from rest to rest.
     """
 
     distance: float
@@ -161,12 +155,10 @@ class BareAxis:
     """The PID of the remaining quantity itself, thesis eqs 3.1 to 3.4.
 
     Args:
-        gains: PID gains.
         v_max, a_max: limits, in the quantity's unit per s and per s^2; the second only for the bang-bang time.
     """
 
     def __init__(self, gains: PidConfig, v_max: float, a_max: float) -> None:
-        """Nothing to do."""
         self._pid = Pid(gains, v_max)
         self._v_max, self._a_max = v_max, a_max
         self.duration_s = self.overtime_s = 0.0
@@ -199,13 +191,10 @@ class ProfiledAxis:
 
     Args:
         gains: Kp and Kd of the shaped set; the derivative is the speed's own estimate, never a difference of poses.
-        cfg: slip and end of the motion.
         v_max, a_max: limits of the profile, in the quantity's unit per s and per s^2.
-        lag_s: time constant of the servo.
     """
 
     def __init__(self, gains: PidConfig, cfg: ControlConfig, v_max: float, a_max: float, lag_s: float) -> None:
-        """Nothing to do."""
         self._kp, self._kd = gains.kp, gains.kd
         self._v_max, self._a_max, self._lag_s = v_max, a_max, lag_s
         self._slip_gain = 1.0 / (v_max * v_max * cfg.slip_time_s)

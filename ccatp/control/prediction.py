@@ -25,16 +25,11 @@ class CommandPredictor:
         v(t) = u + (v - u) exp(-t/T),    mean = u + (v - u) (T/t) (1 - exp(-t/T)),
 
     and the body goes on along the mean heading, carried off by the drift per metre of travel.
-
-    Args:
-        wheel_lag_s: nominal time constant T of the wheel servo.
-        frame_s: period of the frames.
     """
 
     __slots__ = ("_frame", "_frame_s", "_lag_s", "_sent")
 
     def __init__(self, wheel_lag_s: float, frame_s: float) -> None:
-        """Nothing is on the way."""
         if frame_s <= 0.0:
             raise ValueError(f"frame_s = {frame_s}: the period of the frames must be positive")
         self._lag_s, self._frame_s = wheel_lag_s, frame_s
@@ -65,7 +60,6 @@ class CommandPredictor:
 
         Args:
             pose: (x, y, heading) at the time of the frame, m and rad, in any plane.
-            v_m_s, omega_rad_s: speeds then.
             echo_seq: number of the drive in force then; -1 = none.
             echo_age_s: how long it had been; less than a frame is still to act for the rest of one.
             is_held: the robot held its wheels by its own rules: they run down, whatever has been sent.

@@ -19,9 +19,7 @@ class LegView(NamedTuple):
     """The line as seen from the robot.
 
     Attributes:
-        ahead_m: what remains along the line.
         beside_m: how far to the left of the line the robot stands.
-        off_rad: its direction of motion minus the direction that keeps it on the line.
         gain: progress along the line per metre that the wheels drive.
     """
 
@@ -45,7 +43,6 @@ class LegLine:
     __slots__ = ("_cos", "_course_rad", "_lookahead_m", "_off_rad", "_reverse", "_sin", "_target")
 
     def __init__(self, lookahead_m: float) -> None:
-        """No line yet: ``begin`` lays it."""
         self._lookahead_m = lookahead_m
         self._target = (0.0, 0.0)
         self._off_rad = 0.0
@@ -68,8 +65,6 @@ class LegLine:
 
         Args:
             pose: (x, y, heading), m and rad.
-            target: the stop in the same plane.
-            creep: drift per metre in that plane.
         """
         x, y, heading = pose
         motion = heading + pi if self._reverse else heading
@@ -108,10 +103,7 @@ def line_rate(sight: LegView, v_m_s: float, cross_gain_rad_m2: float, heading_we
     The weight of e grows with the speed: a robot that has all but stopped cannot remove it, and would only turn.
 
     Args:
-        sight: the line.
-        v_m_s: planned speed along it.
         cross_gain_rad_m2: g; the error decays over about 1/sqrt(g) of travel.
-        heading_weight_1_s2: w.
     """
     gain = cross_gain_rad_m2 * v_m_s
     return -gain * sight.beside_m - sqrt(heading_weight_1_s2 + 2.0 * gain * v_m_s) * sight.off_rad
@@ -155,15 +147,9 @@ class LegTracker:
     All poses are in one plane (the panel frame); the frame may change from step to step as long as pose and target
     change together. A shaped set of gains drives along the line from where the drive begins; the thesis's heads for the
     stop itself.
-
-    Args:
-        control: tolerances and gains.
-        limits: motion limits.
-        wheel_lag_s: time constant of the wheel servo.
     """
 
     def __init__(self, control: ControlConfig, limits: LimitsConfig, wheel_lag_s: float) -> None:
-        """Pick the named set of gains."""
         gains = control.gain_sets[control.gains]
         self._control, self._shaped = control, gains.shaped
         self._position_tolerance_m = gains.position_tolerance_m
@@ -198,7 +184,6 @@ class LegTracker:
         Args:
             pose: (x, y, heading), m and rad.
             target: (x, y), m.
-            reverse: drive it backwards.
             creep: drift (dx, dy) per metre of travel.
         """
         self._reverse = reverse
@@ -222,13 +207,7 @@ class LegTracker:
         return self._angular.duration_s if self.phase is TURN else self._forward.duration_s
 
     def step_turn(self, remaining_rad: float, dt_s: float, rate_rad_s: float | None = None) -> Twist:
-        """One step of a turn in place; ``phase`` becomes DONE when it is over.
-
-        Args:
-            remaining_rad: what is left of it.
-            dt_s: time until the next step.
-            rate_rad_s: the present rate, where it is known.
-        """
+        """One step of a turn in place; ``phase`` becomes DONE when it is over."""
         if self._angular.is_over(remaining_rad, self._heading_tolerance_rad, rate_rad_s):
             self.phase = DONE
             return STILL
@@ -247,8 +226,6 @@ class LegTracker:
         Args:
             pose: (x, y, heading) when the twist will take effect, m and rad.
             target: (x, y) in the same plane, m.
-            dt_s: time until the next step.
-            speeds: those at that pose, where they are known.
             creep: drift (dx, dy) per metre of travel in the same plane.
         """
         if self.phase is TURN:

@@ -56,14 +56,7 @@ TRAIL = 400  # places of the robot, one in five frames
 
 
 class BeaconTelemetry(TelemetryPublisher):
-    """Publishes for a mission among beacons.
-
-    Args:
-        publisher: main's publisher.
-        log: the process's logger.
-        cfg: the configuration.
-        mission: what is told.
-    """
+    """Publishes for a mission among beacons."""
 
     def __init__(
         self,
@@ -72,7 +65,6 @@ class BeaconTelemetry(TelemetryPublisher):
         cfg: RadioConfig,
         mission: BeaconMission,
     ) -> None:
-        """Start with empty batches."""
         super().__init__(publisher, log)
         self._cfg, self._mission = cfg, mission
         self._painter = DisplayStatePublisher(publisher, look_at_navigator)
@@ -87,8 +79,6 @@ class BeaconTelemetry(TelemetryPublisher):
 
         Args:
             seq, t_s: the frame.
-            raw: its line.
-            distances_m: of the distance sensors.
             is_first: of a session; its estimate is always due, because the danger loop may wait for it.
         """
         self.seq, self.t_s = seq, t_s
@@ -215,15 +205,11 @@ class BeaconRunner:
 
     Args:
         cfg: the configuration; nothing of ``sim`` is used.
-        host: what the process has for it.
-        mission: the pure part.
-        store: the mission's database.
     """
 
     is_busy = False  # it waits for nobody
 
     def __init__(self, cfg: RadioConfig, host: RunnerContext, mission: BeaconMission, store: BeaconStore) -> None:
-        """Wire the parts."""
         self._cfg, self._host, self._mission, self._store = cfg, host, mission, store
         self._reader = MeasurementReader(cfg)
         self._teller = BeaconTelemetry(host.publisher, host.log, cfg, mission)

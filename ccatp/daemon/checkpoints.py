@@ -32,17 +32,9 @@ _STILL_M_S, _STILL_RAD_S = 0.002, 0.01
 
 
 class CheckpointWriter:
-    """Keeps the checkpoint up to date.
-
-    Args:
-        run_dir: where it is.
-        localizer: knows the pose.
-        mission: knows what is in force.
-        is_patient: simulated time waits for the writer.
-    """
+    """Keeps the checkpoint up to date."""
 
     def __init__(self, run_dir: Path, localizer: Localizer, mission: Mission, *, is_patient: bool) -> None:
-        """Number on from the last record there."""
         before = read_checkpoint(run_dir / FILE)
         self._count = 0 if before is None else before.count
         self._file = CheckpointFile(run_dir / FILE, is_patient=is_patient)
@@ -112,9 +104,7 @@ def recovery_from(
     """What a run directory says of a survey that goes on; ``None`` where nobody wrote anything down.
 
     Args:
-        run_dir: the run directory.
         limits: how quickly a robot can have begun to move.
-        skipped: points that stay given up.
         held_cause: why it begins held, if it does; a hold that is in force goes before.
 
     Raises:

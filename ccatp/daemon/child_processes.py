@@ -53,11 +53,9 @@ class RestartPolicy:
 
     Args:
         limit: each may be started anew so many times ...
-        window_s: ... in this time.
     """
 
     def __init__(self, limit: int, window_s: float) -> None:
-        """Nothing has died."""
         self._limit, self._window_s = limit, window_s
         self._restarts_s: defaultdict[str, deque[float]] = defaultdict(deque)
 
@@ -67,12 +65,7 @@ class RestartPolicy:
         """A process has died.
 
         Args:
-            name: of the process.
             code: exit status, or minus the number of the signal that killed it.
-            now_s: time of any monotonic clock.
-            is_replaceable: another one can take its place.
-            is_needed: a run without it is none.
-            why: why we killed it, if we did.
         """
         how = why or (f"was killed by {_signal(-code)}" if code < 0 else f"ended with status {code}")
         if code in FINAL:
@@ -101,15 +94,9 @@ def _signal(number: int) -> str:
 
 
 class SilenceWatch:
-    """For how long a process has said nothing while somebody listened.
-
-    Args:
-        start_timeout_s: until its first word.
-        hang_timeout_s: from word to word.
-    """
+    """For how long a process has said nothing while somebody listened."""
 
     def __init__(self, start_timeout_s: float, hang_timeout_s: float) -> None:
-        """It was started just now."""
         self._limit_s, self._hang_timeout_s = start_timeout_s, hang_timeout_s
         self._silent_s = 0.0
         self._looked_s: float | None = None
@@ -146,14 +133,12 @@ class ProcessSpec:
     """One row of the process table.
 
     Attributes:
-        name: as in logs.
         module: run with ``python -m``.
         is_stand_in: runs with ``--sim`` only.
         listens: the configuration section with the host and port of its listening socket, bound by the supervisor.
         is_replaceable: another one can take its place when it dies; the simulated robot has no other.
         is_loop: it tells its presence, and hangs when it does not.
         is_needed: the survey does not go on without it.
-        niceness: added to the supervisor's.
         patience_s: says nothing for this long before it hangs, where that is not ``run.hang_timeout_s``.
     """
 
@@ -193,7 +178,6 @@ class ProcessManager:
         command_of: Callable[[ProcessSpec, bool], tuple[list[str], tuple[int, ...]]],
         say: Say,
     ) -> None:
-        """None yet."""
         self._cfg, self._command_of, self._say = cfg, command_of, say
         self._policy = RestartPolicy(cfg.restart_limit, cfg.restart_window_s)
         self._children: dict[str, _Child] = {}
@@ -309,7 +293,6 @@ def listen(section: str, host: str, port: int) -> Iterator[socket.socket]:
     """A listening socket for a process that inherits it.
 
     Args:
-        section: of the configuration that names the address.
         host, port: the address; port 0 takes any that is free.
 
     Raises:

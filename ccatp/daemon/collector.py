@@ -59,15 +59,7 @@ class DerivedView(Protocol):
 
 
 class RunAccess(NamedTuple):
-    """How a run is reached by who listens to it.
-
-    Attributes:
-        context: ZeroMQ context of the process.
-        endpoints: where the processes publish.
-        run_dir: the recording is there, and the mission's database.
-        is_sim: the simulated truth can be asked for.
-        on_presence: told that a process is there.
-    """
+    """How a run is reached by who listens to it."""
 
     context: zmq.Context[zmq.Socket[bytes]]
     endpoints: Endpoints
@@ -77,15 +69,7 @@ class RunAccess(NamedTuple):
 
 
 class Collector(ABC):
-    """Listens to a run; what the summary is made of is the business of a class of its own for each kind of mission.
-
-    Args:
-        access: how the run is reached.
-        metadata: of the recording, beside its format and our version.
-
-    Attributes:
-        remarks: what an operator should know of the summary.
-    """
+    """Listens to a run; what the summary is made of is the business of a class of its own for each kind of mission."""
 
     def __init__(self, access: RunAccess, metadata: Mapping[str, str]) -> None:
         """Subscribe before anybody publishes."""
@@ -229,12 +213,7 @@ def _show(message: Message, view: DerivedView) -> None:
 
 
 class BeaconCollector(Collector):
-    """Listens to a mission among beacons from its start to its end.
-
-    Args:
-        access: how it is reached.
-        cfg: the run's configuration.
-    """
+    """Listens to a mission among beacons from its start to its end."""
 
     def __init__(self, access: RunAccess, cfg: RadioConfig) -> None:
         """Subscribe before anybody publishes."""

@@ -40,10 +40,7 @@ class OperatorCommandHandler:
     """Hands the commands of an operator to the mission.
 
     Args:
-        mission: obeys or refuses.
         say: tells the log and the terminal (level, text).
-        status: where the mission stands.
-        settled: waits until the robot is held at rest.
         on_change: called after a command changed the mission.
     """
 
@@ -55,7 +52,6 @@ class OperatorCommandHandler:
         settled: Callable[[], Awaitable[None]],
         on_change: Callable[[], None],
     ) -> None:
-        """Nothing asked yet."""
         self._mission, self._say, self._status = mission, say, status
         self._settled, self._on_change = settled, on_change
 
@@ -109,15 +105,12 @@ class EmergencyCommandHandler:
     """Hands the requests of the observatory to the danger rules, and tells the log.
 
     Args:
-        monitor: latches and clears.
         age_s: age of the last frame, ``None`` before the first.
-        log: the process's logger.
     """
 
     def __init__(
         self, monitor: EmergencyReceiver, age_s: Callable[[], float | None], log: structlog.typing.FilteringBoundLogger
     ) -> None:
-        """Nothing asked yet."""
         self._monitor, self._age_s, self._log = monitor, age_s, log
         self._accepted = LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)
         self._refused = LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)
@@ -155,17 +148,11 @@ class EmergencyCommandHandler:
 class ObservatoryServer:
     """The observatory channel: a unix socket, and TCP where it is configured.
 
-    Args:
-        local_endpoint: the unix socket.
-        cfg: TCP endpoint and its keys.
-        desk: what answers.
-
     Raises:
         ConfigError: the keys or the list of clients cannot be used.
     """
 
     def __init__(self, local_endpoint: str, cfg: ObservatoryConfig, desk: EmergencyCommandHandler) -> None:
-        """Read the keys; nothing is bound yet."""
         self._local_endpoint, self._cfg, self._desk = local_endpoint, cfg, desk
         self._keys = check_observatory(cfg)
         self._clients = ClientsFile(Path(cfg.clients_file), CLIENTS_FILE)

@@ -75,12 +75,7 @@ class SafetyMonitorConfig(NamedTuple):
     """What the process hosts.
 
     Attributes:
-        monitor: the rules.
         judge: the verdict on a frame, its line and main's newest estimate.
-        link: the robot link.
-        observatory: the channel of the observatory.
-        realtime_priority: of the process.
-        stale_after_s: no permit on frames that are older.
     """
 
     monitor: SafetyMonitor
@@ -143,7 +138,6 @@ class PersistentEmergencyLatch(EmergencyLatch):
     """
 
     def __init__(self, path: Path, log: structlog.typing.FilteringBoundLogger) -> None:
-        """Latched as the file says."""
         super().__init__()
         self._path, self._log = path, log
         self._new = path.with_name(f"{path.name}.new")
@@ -217,14 +211,9 @@ class DangerLoop:
     """Wires the monitor to the robot link, the bus and the observatory channel.
 
     A process that is started anew finds the latch as it was.
-
-    Args:
-        args: configuration and endpoints.
-        context: ZeroMQ context of the process.
     """
 
     def __init__(self, args: ProcessArgs | BeaconArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
-        """Build the pure part and bind the sockets."""
         self._duty = duty = duty_of(args.config)
         self._endpoints, self._context = args.endpoints, context
         self.log = open_log(args.run_dir / "log.jsonl", "danger")
@@ -346,7 +335,6 @@ class DangerLoop:
         self.log.info("verdict", seq=verdict.seq, t_s=verdict.t_s, **fields)
 
     async def _beat(self) -> None:
-        """Be seen alive."""
         while True:
             self._pulse.tell()
             await asyncio.sleep(PERIOD_S)

@@ -60,9 +60,7 @@ class Dashboard:
     Args:
         cfg: the run's configuration; ``dashboard`` holds the limits.
         run_dir: what was measured before is read from there.
-        endpoints: where the run's processes are.
         is_sim: robot and laser system are stand-ins.
-        log: of the process.
 
     Raises:
         ConfigError: the token cannot be read.
@@ -71,7 +69,6 @@ class Dashboard:
     def __init__(
         self, cfg: Config | RadioConfig, run_dir: Path, endpoints: Endpoints, *, is_sim: bool, log: Logger
     ) -> None:
-        """Subscribe."""
         self._cfg, self._log, self._endpoints = cfg, log, endpoints
         token = read_token(cfg.dashboard)
         view, ground, wants = _shown(cfg, run_dir, is_sim=is_sim, needs_token=token is not None)
@@ -88,13 +85,7 @@ class Dashboard:
         )
 
     async def run(self, listener: socket.socket, stop: asyncio.Event, *, has_pulse: bool) -> None:
-        """Serve until ``stop`` is set.
-
-        Args:
-            listener: a listening socket.
-            stop: the end.
-            has_pulse: tell the supervisor that we are there.
-        """
+        """Serve until ``stop`` is set."""
         told = asyncio.Event()
 
         async def tell() -> None:
@@ -141,7 +132,6 @@ async def run_dashboard(
 
 
 def _shown(cfg: Config | RadioConfig, run_dir: Path, *, is_sim: bool, needs_token: bool) -> ShownRun:
-    """THE table of missions for the page."""
     if isinstance(cfg, RadioConfig):
         ground = beacon_ground(cfg, is_sim=is_sim, needs_token=needs_token)
         return ShownRun(BeaconView(cfg, is_sim=is_sim), ground, BEACONS)
@@ -174,8 +164,6 @@ def _sparing(log: Logger) -> Callable[[str, dict[str, object]], None]:
 
 
 class _Handler(logging.Handler):
-    """Warnings of the HTTP server go where ours go."""
-
     def __init__(self, log: Logger) -> None:
         super().__init__(logging.WARNING)
         self._log, self._budget = log, LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)
@@ -215,7 +203,6 @@ class PageSocket(NamedTuple):
 
     Attributes:
         socket: it listens; ``None`` where there is no dashboard.
-        config: with the port that it has.
         level, text: what the operator is told; empty when there is nothing to tell.
     """
 
@@ -226,11 +213,7 @@ class PageSocket(NamedTuple):
 
 
 def open_page_socket(cfg: DashboardConfig) -> PageSocket:
-    """Listen at the configured address, or at another port when that one is in use; a survey goes on without a page.
-
-    Args:
-        cfg: address, and whether a page is wanted at all.
-    """
+    """Listen at the configured address, or at another port when that one is in use; a survey goes on without a page."""
     if not cfg.enabled:
         return PageSocket(None, cfg, "info", "")
     try:
@@ -276,7 +259,6 @@ def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callab
     Args:
         runtime_dir: of the daemon, if not the usual one.
         settings: keys of ``dashboard`` that are not those of the run.
-        say: tells where the page is.
 
     Raises:
         UnreachableError: no daemon runs there.
@@ -303,7 +285,6 @@ def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callab
 
 
 def _run_dir_of(runtime_dir: Path) -> Path:
-    """Where the daemon of a runtime directory writes."""
     try:
         run_dir = Path((runtime_dir / RUN_DIR_FILE).read_text(encoding="utf-8").strip())
     except OSError:

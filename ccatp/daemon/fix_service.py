@@ -45,12 +45,8 @@ class FixService:
 
     Args:
         cfg: how near the robot has to come, and how often it may try.
-        client: the laser system's client.
         scrutiny: looks at a fix before the localizer gets it.
-        localizer: takes the fix.
-        mission: is told the result.
         store: keeps it; a point counts only when it is committed.
-        teller: tells the others.
         on_over: called after each measurement, good or bad.
         between_s: how long to wait for new lengths before measuring again at the same place.
     """
@@ -67,7 +63,6 @@ class FixService:
         on_over: Callable[[], None],
         between_s: Callable[[], float],
     ) -> None:
-        """Nothing is wanted yet."""
         self._tolerance_m = cfg.arrival_tolerance_m
         self._approaches = ApproachCounter(cfg.correction_tolerance_m, cfg.max_approaches)
         self._client, self._localizer, self._mission = client, localizer, mission

@@ -36,17 +36,7 @@ class UnhandledError(CcatpError):
 class FrameService:
     """Serves the frames of the robot with the decisions of a mission.
 
-    Args:
-        cfg: the robot link.
-        work: the mission.
-        seat: where drives go out.
-        clock: of the frames.
-        ear: hears the danger loop.
-        pulse: shows that frames are served.
-        on_surprise: told of an error that ends the process.
-
     Attributes:
-        lag: how late frames are served.
         over: set when the mission is over, and no frame is served any more.
     """
 
@@ -176,15 +166,9 @@ Say = Callable[[str, str], None]
 
 
 class GateLog:
-    """Looks at the gate after each frame.
-
-    Args:
-        gate: main's gate.
-        say: takes a level and a line, for the log and the bus.
-    """
+    """Looks at the gate after each frame."""
 
     def __init__(self, gate: DriveGate, say: Say) -> None:
-        """Nothing denied yet."""
         self._gate, self._say = gate, say
         self._said_s: dict[Denial, float] = {}
 
@@ -213,10 +197,6 @@ class FanController:
     """Sends fan duties through the fans' gate.
 
     Args:
-        duty: of the configuration, left and right.
-        seat: sends them.
-        mission: held where they are refused.
-        teller: tells that.
         has_floor: the mirror overhangs, and the robot's own floor counts.
     """
 
@@ -229,7 +209,6 @@ class FanController:
         *,
         has_floor: bool,
     ) -> None:
-        """Nothing sent."""
         self._duty, self._seat, self._mission, self._teller = duty, seat, mission, teller
         self._has_floor, self._has_pressed_on = has_floor, False
         self._gate = FanGate(0.0)

@@ -37,14 +37,7 @@ FAREWELL_S = 5.0
 
 
 class MainLoop:
-    """The process around its mission: links, clock, commands, beginning and end.
-
-    Args:
-        args: endpoints and the run directory.
-        context: ZeroMQ context of the process.
-        hosting: what the process itself needs of the configuration.
-        make_work: makes the mission, given what the process has for it.
-    """
+    """The process around its mission: links, clock, commands, beginning and end."""
 
     def __init__(
         self,
@@ -53,7 +46,6 @@ class MainLoop:
         hosting: RunnerConfig,
         make_work: MakeWork,
     ) -> None:
-        """Bind the sockets and wire the parts."""
         self._hosting, self._endpoints, self._context = hosting, args.endpoints, context
         self._is_taking_over = args.is_taking_over
         self._publisher = Publisher(context, args.endpoints.of("main"))
@@ -199,7 +191,6 @@ class MainLoop:
     # -- beside the frames ----------------------------------------------------------------------------------------
 
     async def _beat(self) -> None:
-        """Be seen alive, and flush batches."""
         while True:
             self._pulse.tell()
             self._teller.flush_if_due()

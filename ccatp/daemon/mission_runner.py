@@ -32,7 +32,6 @@ class MissionClock:
 
     Attributes:
         seq: the newest frame.
-        t_s: its time, without jumps.
         has_begun: a frame was served, in this boot of the robot.
     """
 
@@ -66,8 +65,6 @@ class MissionClock:
         """Time of a frame and time since the last one, s; nothing is changed before ``serve``.
 
         Args:
-            seq: its number.
-            t_s: its time by the robot's clock.
             period_s: time since the frame before where there is none.
         """
         # What counts durations goes by a time that does not jump; everything else by the robot's own.
@@ -92,11 +89,8 @@ class RunnerConfig(NamedTuple):
     """What the process itself needs of a configuration.
 
     Attributes:
-        link: the robot link.
         realtime_priority: of the process; 0 = ordinary scheduling.
-        verdict_timeout_s: a verdict older than this is none.
         clock_jump_s: the robot's clock has jumped if a frame is further off.
-        frame_hz: of the frames, until the robot tells it.
     """
 
     link: LinkConfig
@@ -110,11 +104,8 @@ class TimedFrame(NamedTuple):
     """A frame as it is served.
 
     Attributes:
-        sensors: as the robot sent it.
-        raw: its line.
         t_s: its time, without jumps; that of the robot stands in ``sensors``.
         dt_s: since the frame before; not positive where the robot's clock or frames went back.
-        is_first: of a session.
     """
 
     sensors: Sensors
@@ -172,12 +163,6 @@ class RunnerContext:
     """What the process gives to its mission.
 
     Attributes:
-        run_dir: the run directory.
-        publisher: main's.
-        log: the process's logger.
-        seat: the controller's, at the robot.
-        clock: of the frames.
-        is_patient: simulated time waits for us.
         finish: ends the process with a status, once the last messages are out.
         answer: something changed between two frames: lockstep time may go on.
     """
@@ -270,7 +255,6 @@ class MissionRunner(CommandHandler, Protocol):
         """The drive that answers the frame.
 
         Args:
-            frame: the same.
             verdict: of the danger loop, ``None`` where there is none in force.
             lag_s: how late the frame is served.
         """

@@ -48,10 +48,7 @@ class SurveyTask:
     """Starts, follows and ends surveys.
 
     Attributes:
-        client: of the daemon.
         command: of a survey, ``ccatp run ...``.
-        environment: in which it runs.
-        log: tells the agent's log.
     """
 
     client: OperatorClient
@@ -121,8 +118,6 @@ class SurveyTask:
 
         Args:
             session: its ``data`` shows what was published last.
-            publish: takes a block of the feed.
-            period_s: between two blocks.
         """
         while session.status in ("starting", "running"):
             status = self._status()
@@ -235,7 +230,6 @@ def register(agent: Any, desk: SurveyTask, param: Any, period_s: float) -> None:
         agent: an ``ocs.ocs_agent.OCSAgent``.
         desk: what does the work, in threads of the agent.
         param: ``ocs.ocs_agent.param``.
-        period_s: between two blocks of the feed.
     """
 
     def stop(session: Any, params: Any) -> Answer:

@@ -28,7 +28,6 @@ class LogStream(io.TextIOBase):
     """Appends whole lines; several processes may share the file.
 
     Args:
-        path: the file.
         process: whose log it is, for the alarm on standard error when the first line is dropped.
 
     Attributes:
@@ -101,14 +100,10 @@ class ArgsOf(Generic[C]):
 
     Attributes:
         config: the run's exact configuration, from its run directory.
-        run_dir: the run directory.
-        endpoints: where the others are.
         listen_fd: an inherited listening socket, or ``None``.
-        is_realtime: stand-ins pace on the wall clock.
         is_resuming: go on with a mission that stands in the run directory.
         has_faults: a fault plan stands in the run directory; stand-ins only.
         is_restarted: another process of this run has died, and this one takes its place.
-        is_held: begin held, until an operator resumes.
         is_sim: robot and laser system are stand-ins.
     """
 
@@ -186,7 +181,6 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
 
 
 def _split(args: argparse.Namespace) -> tuple[Path, dict[str, Any]]:
-    """The run directory, and the fields behind it."""
     return args.run_dir, {
         "endpoints": Endpoints(args.runtime_dir),
         "listen_fd": args.listen_fd,

@@ -39,7 +39,6 @@ def enter(priority: int, log: structlog.typing.FilteringBoundLogger) -> None:
 
     Args:
         priority: of SCHED_FIFO; 0 leaves everything as it is.
-        log: the process's logger.
     """
     if not priority:
         return

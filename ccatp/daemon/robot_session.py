@@ -30,7 +30,6 @@ def delay_s(failures: int, share: float) -> float:
     """How long to wait before the next attempt: twice as long each time, spread so that two clients do not collide.
 
     Args:
-        failures: attempts that failed so far.
         share: random, 0 to 1.
     """
     return max(FIRST_DELAY_S, min(LONGEST_DELAY_S, FIRST_DELAY_S * 2.0 ** min(failures, 10)) * (0.5 + 0.5 * share))
@@ -40,16 +39,10 @@ class ReconnectingRobotLink:
     """Keeps a role at the robot.
 
     Args:
-        cfg: where it is, and for how long to try.
-        role: what to join as.
-        client: name of this client.
         on_sensors: called with each frame and its line; in lockstep a new session begins with the last frame again.
         on_lost: called with the reason when a session ends.
         on_joined: called with the robot's hello when a session begins, before its first frame.
         on_bad_line: called after each line that fails a check.
-
-    Attributes:
-        link: the present session, or the last one.
     """
 
     def __init__(
@@ -63,7 +56,6 @@ class ReconnectingRobotLink:
         on_joined: Callable[[Hello], None],
         on_bad_line: Callable[[], None] = lambda: None,
     ) -> None:
-        """Read the key; nothing is connected yet."""
         self._cfg, self._role, self._client = cfg, role, client
         self._key = read_key(cfg.key_file)
         self._on_sensors, self._on_lost, self._on_joined = on_sensors, on_lost, on_joined
@@ -164,18 +156,14 @@ class ControllerSession:
     """Sends drives and fans, and knows what the session is like.
 
     Args:
-        link: the link, with the controller's role.
         is_taking_over: somebody else sat here before.
-        frame_hz: rate of the frames, until the robot tells it.
 
     Attributes:
         on_drive: told of each drive that is sent: its number, and the rates of the right and the left wheel, rad/s.
-        is_lockstep: the robot's clock is simulated.
         is_new_session: no frame of this session has been served yet.
     """
 
     def __init__(self, link: ReconnectingRobotLink, *, is_taking_over: bool, frame_hz: float) -> None:
-        """Not joined."""
         self._link, self._is_taking_over, self._frame_hz = link, is_taking_over, frame_hz
         self._hello: Hello | None = None
         self._drive_seq = self._fans_seq = 0
@@ -219,18 +207,9 @@ class ControllerSession:
 
 
 class CommandHistory:
-    """Hears of each drive that is sent.
-
-    Args:
-        cfg: the robot.
-        frame_hz: rate of the frames, until the robot tells it.
-
-    Attributes:
-        predictor: of what is on its way.
-    """
+    """Hears of each drive that is sent."""
 
     def __init__(self, cfg: RobotConfig, frame_hz: float) -> None:
-        """Nothing sent."""
         self._cfg = cfg
         self._span = CommandSpan()
         self._newest, self._driven = 0, (0.0, 0.0)
@@ -268,13 +247,11 @@ class LatenessStatistics:
 
     Attributes:
         slips: frames served later than ``slip_s``.
-        worst_s: the largest lag so far, s.
     """
 
     __slots__ = ("_least_s", "_slip_s", "_t_s", "_wall_s", "slips", "worst_s")
 
     def __init__(self, slip_s: float) -> None:
-        """Nothing served yet."""
         self._slip_s = slip_s
         self._t_s, self._wall_s, self._least_s = _NEVER_S, 0.0, 0.0
         self.slips = 0

@@ -106,7 +106,6 @@ def take_over_emergencies(run_dir: Path) -> bool:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """All of it or nothing, and on the disk."""
     new = path.with_name(f"{path.name}.new")
     with new.open("wb") as file:
         file.write(data)
@@ -138,12 +137,10 @@ class RunOptions:
         realtime: pace the stand-ins on the wall clock instead of in lockstep.
         run_dir: where the run is written; ``None`` asks for ``default_run_dir``.
         resume: carry on with the mission in ``run_dir``.
-        held: begin held, until an operator resumes.
         recover: carry on, held, with the run that did not finish, or else begin one that may be recovered.
         json_output: the summary goes to standard output as JSON, and nothing else does.
         runtime_dir: folder of the unix sockets given on the command line, or ``None``.
         faults_file: plan of faults for the stand-ins, or ``None``; a copy goes into the run directory.
-        shows_summary: the summary goes to standard output at the end.
     """
 
     sim: bool
@@ -171,8 +168,6 @@ def default_run_dir(mirror: str, seed: int, now_utc: datetime, parent: Path = Pa
     Args:
         mirror: ``run.mirror``, a name or the path of a file.
         seed: ``run.seed``.
-        now_utc: the time, with its zone set to UTC.
-        parent: the folder of all runs.
     """
     return parent / f"{now_utc:%Y%m%dT%H%M%SZ}-{PurePath(mirror).stem}-s{seed}"
 

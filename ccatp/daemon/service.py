@@ -60,12 +60,10 @@ class Service:
     """Tells the service manager what the supervisor hears.
 
     Args:
-        notifier: to the service manager.
         watchdog_s: its watchdog's period, ``None`` without one.
     """
 
     def __init__(self, notifier: Notifier, watchdog_s: float | None) -> None:
-        """Nothing told yet."""
         self._notifier, self._watchdog_s = notifier, watchdog_s
         self._liveness = Liveness(min(STALE_AFTER_S, STALE_SHARE * (watchdog_s or STALE_AFTER_S / STALE_SHARE)))
         self._is_ready = self._is_troubled = False
@@ -80,8 +78,6 @@ class Service:
         """Tell what is due.
 
         Args:
-            now_s: time of the machine's monotonic clock.
-            status: where the mission stands, once it is known.
             is_recovering: the supervisor has just started a process anew; the manager is not to end all of it.
         """
         if not self._notifier.is_heard:

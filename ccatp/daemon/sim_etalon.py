@@ -69,9 +69,7 @@ def run_alone(cfg: Config, puck_world_m: Vector3 | None, truth: str | None) -> i
     """The stand-in alone, for other people's controllers; ends on SIGINT or SIGTERM.
 
     Args:
-        cfg: configuration.
         puck_world_m: a puck that stands still there, world frame; at base where neither this nor ``truth`` is given.
-        truth: ZeroMQ endpoint of a DataLoop that knows where the puck is.
     """
 
     async def run() -> None:

@@ -95,8 +95,6 @@ def run_alone(cfg: Config, lockstep: bool, faults: FaultPlan | None = None, runt
 
     Args:
         cfg: configuration; ``sim.robot`` holds the address.
-        lockstep: simulated time waits for the controller.
-        faults: what shall go wrong.
         runtime_dir: where its truth is, if not in the configured folder.
 
     Raises:
@@ -148,7 +146,6 @@ def run_beacons_alone(cfg: RadioConfig, lockstep: bool, runtime_dir: Path | None
 
 @contextmanager
 def _truth_outlet(runtime_dir: Path | None, configured: str) -> Iterator[str]:
-    """The endpoint of the truth, for this one alone."""
     folder = make_runtime_dir(str(runtime_dir or configured), os.environ)
     refusal = f"another simulated robot has its truth in {folder}; end it, or give this one its own --runtime-dir"
     with locked(folder / TRUTH_LOCK_FILE, refusal):

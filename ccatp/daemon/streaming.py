@@ -55,14 +55,7 @@ def streamed_schemas() -> list[tuple[str, dict[str, object]]]:
 
 
 class Streamer:
-    """Listens to the runs of a runtime directory.
-
-    Args:
-        context: ZeroMQ context of the process.
-        runtime_dir: where the runs are.
-        streams: where they are streamed to.
-        say: tells the user.
-    """
+    """Listens to the runs of a runtime directory."""
 
     def __init__(
         self,
@@ -71,7 +64,6 @@ class Streamer:
         streams: Sequence[LiveStream],
         say: Callable[[str], None],
     ) -> None:
-        """Listen for a run."""
         self._context, self._streams, self._say = context, streams, say
         self._runtime_dir, self._endpoints = runtime_dir, Endpoints(runtime_dir)
         self._ear = Subscriber(context, [self._endpoints.of("main")], ["presence.main"])
@@ -157,10 +149,8 @@ def serve(
 
     Args:
         runtime_dir: of the runs, if not the usual one.
-        host: where to listen.
         plotjuggler_port, foxglove_port: 0 takes any free one, ``None`` serves none.
         is_open: the host may be another one than this machine.
-        say: tells the user.
 
     Raises:
         StreamError: something cannot be served.

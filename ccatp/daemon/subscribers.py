@@ -27,9 +27,7 @@ def await_message(
     """Receive messages until the one that lockstep waits for; not for ever, and not for a process that is gone.
 
     Args:
-        subscriber: watches its publisher.
         is_it: takes each message; whether it was the one.
-        on_wait: called now and then meanwhile.
     """
     deadline = time.monotonic() + LOCKSTEP_WAIT_S
     while True:
@@ -47,9 +45,6 @@ class VerdictSubscriber:
     """Listens to the danger loop.
 
     Args:
-        context: ZeroMQ context of the process.
-        endpoint: where the danger loop publishes.
-        timeout_s: a verdict older than this is none.
         on_wait: called now and then while lockstep waits for a verdict.
     """
 
@@ -60,7 +55,6 @@ class VerdictSubscriber:
         timeout_s: float,
         on_wait: Callable[[], None] = lambda: None,
     ) -> None:
-        """Subscribe; the publisher may come up later."""
         self._subscriber = Subscriber(context, [endpoint], ["verdict", "presence.danger"], is_watching=True)
         self._timeout_s, self._on_wait = timeout_s, on_wait
         self._wall_s = 0.0
@@ -87,7 +81,6 @@ class VerdictSubscriber:
 
         Args:
             seq: the present frame.
-            frame_s: time between frames.
             is_lockstep: wait for the verdict on ``seq``.
         """
         newest = seq + MOST_AHEAD
@@ -120,8 +113,6 @@ class EstimateSubscriber:
     """Listens to main.
 
     Args:
-        context: ZeroMQ context of the process.
-        endpoint: where main publishes.
         on_wait: called now and then while lockstep waits for an estimate.
         is_taking_over: of the frame that it meets, a process that takes over may have missed the estimate.
     """
@@ -134,7 +125,6 @@ class EstimateSubscriber:
         *,
         is_taking_over: bool = False,
     ) -> None:
-        """Subscribe; the publisher may come up later."""
         self._subscriber = Subscriber(context, [endpoint], ["estimate", "presence.main"], is_watching=True)
         self._on_wait, self._is_taking_over = on_wait, is_taking_over
         self.forget()
@@ -198,17 +188,12 @@ PERIOD_S = 0.1
 class HeartbeatPublisher:
     """Tells the presence of one process.
 
-    Args:
-        publisher: the process's publisher.
-        process: its name.
-
     Attributes:
         phase: starting, ready, joined, rejoining (the robot is away), done.
         frame_s: time of the monotonic clock at which the newest frame was served, ``None`` before the first.
     """
 
     def __init__(self, publisher: Publisher, process: str) -> None:
-        """Starting."""
         self._publisher, self._topic, self._process = publisher, f"presence.{process}", process
         self.phase = "starting"
         self.frame_s: float | None = None

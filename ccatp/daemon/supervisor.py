@@ -87,8 +87,6 @@ class SurveyType:
     """The survey of a mirror.
 
     Args:
-        cfg: the configuration.
-        rows: of the process table.
         is_sim: robot and laser system are stand-ins.
     """
 
@@ -107,13 +105,7 @@ class SurveyType:
 
 
 class BeaconType:
-    """A mission among beacons.
-
-    Args:
-        cfg: the configuration.
-        rows: of the process table.
-        is_sim: the robot is a stand-in.
-    """
+    """A mission among beacons."""
 
     def __init__(self, cfg: RadioConfig, rows: tuple[ProcessSpec, ...], *, is_sim: bool) -> None:
         self._cfg, self._is_sim = cfg, is_sim
@@ -146,13 +138,7 @@ class SupervisedRun:
     """The children of one run and what is collected from them.
 
     Args:
-        options: what the command line asked for.
-        kind: which mission it is of.
-        run_dir: its folder, which holds its configuration.
-        endpoints: where the processes publish.
         sockets: at which stand-ins and dashboard listen, by the name of the process.
-        page: where the dashboard listens.
-        started_s: when it began, monotonic clock.
     """
 
     def __init__(
@@ -350,9 +336,6 @@ def run_beacons(options: RunOptions) -> int:
 
 def run_survey(options: RunOptions) -> int:
     """Run one survey to its end.
-
-    Args:
-        options: what the command line asked for.
 
     Returns:
         The exit status of ``cli.md``.

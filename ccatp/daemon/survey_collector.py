@@ -58,12 +58,7 @@ NO_STATUS = MissionStatus(
 
 
 class RunCollector(Collector):
-    """Listens to a survey from its start to its end.
-
-    Args:
-        access: how it is reached.
-        cfg: the run's configuration.
-    """
+    """Listens to a survey from its start to its end."""
 
     def __init__(self, access: RunAccess, cfg: Config) -> None:
         """Subscribe before anybody publishes."""
@@ -223,7 +218,6 @@ class RunCollector(Collector):
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """A summary; empty where there is none."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -31,13 +31,7 @@ from ccatp.survey.stops import HOLD_POSITION, MissionCommand
 
 
 class SurveyWatch:
-    """Tells states, reminds of faults, and sends a robot home that nobody comes for.
-
-    Args:
-        cfg: the configuration.
-        parts: the survey.
-        teller: tells it.
-    """
+    """Tells states, reminds of faults, and sends a robot home that nobody comes for."""
 
     def __init__(self, cfg: Config, parts: SurveyParts, teller: TelemetryPublisher) -> None:
         """Nothing to look after."""
@@ -90,17 +84,9 @@ EXIT_STATUS = {
 
 
 class SurveyRunner:
-    """A survey as the main-loop process hosts it.
-
-    Args:
-        cfg: the configuration.
-        host: what the process has for it.
-        parts: the pure parts, built from the configuration.
-        store: the mission's database.
-    """
+    """A survey as the main-loop process hosts it."""
 
     def __init__(self, cfg: Config, host: RunnerContext, parts: SurveyParts, store: MissionStore) -> None:
-        """Wire the parts."""
         self._cfg, self._host, self._parts, self._store = cfg, host, parts, store
         self._mirror, self._localizer, self._gate = parts.mirror, parts.localizer, parts.gate
         self._mission = mission = parts.mission

@@ -39,15 +39,9 @@ BATCH_WALL_S = 0.25
 
 
 class TelemetryPublisher:
-    """Publishes for the main loop; a mission adds its estimates by a class of its own.
-
-    Args:
-        publisher: main's publisher.
-        log: the process's logger.
-    """
+    """Publishes for the main loop; a mission adds its estimates by a class of its own."""
 
     def __init__(self, publisher: Publisher, log: structlog.typing.FilteringBoundLogger) -> None:
-        """Start with empty batches."""
         self._publisher, self.log = publisher, log
         self._lines: list[msgspec.Raw] = []
         self._tick_us: list[float] = []
@@ -123,15 +117,9 @@ Who = TypeVar("Who")
 
 
 class DisplayStatePublisher(Generic[Who]):
-    """Publishes ``DisplayState`` for the main loop.
-
-    Args:
-        publisher: main's publisher.
-        look: asks whoever knows the pose.
-    """
+    """Publishes ``DisplayState`` for the main loop."""
 
     def __init__(self, publisher: Publisher, look: Callable[[Who], PoseSnapshot]) -> None:
-        """Nothing seen yet."""
         self._publisher, self._look = publisher, look
         self._who: Who | None = None
         self._line = b"null"
@@ -153,15 +141,9 @@ class DisplayStatePublisher(Generic[Who]):
 
 
 class SurveyTelemetry(TelemetryPublisher):
-    """Publishes for a survey.
-
-    Args:
-        publisher: main's publisher.
-        log: the process's logger.
-    """
+    """Publishes for a survey."""
 
     def __init__(self, publisher: Publisher, log: structlog.typing.FilteringBoundLogger) -> None:
-        """Start with empty batches."""
         super().__init__(publisher, log)
         self._painter = DisplayStatePublisher(publisher, look_at_localizer)
         self._track: list[tuple[int, float, int, int, float, float, float, float]] = []
@@ -181,8 +163,6 @@ class SurveyTelemetry(TelemetryPublisher):
 
         Args:
             seq, t_s: the frame.
-            localizer: has the estimate.
-            state: of the mission.
             raw: the frame's line.
             told: span of the set points since the last estimate, rad/s, and the number of the newest drive.
             is_first: of a session; it is always due, because the danger loop may wait for it.
@@ -236,10 +216,6 @@ class SurveyTelemetry(TelemetryPublisher):
         """A fix was measured after the last frame; no point for one that only finds the robot.
 
         Args:
-            point: that was measured.
-            fix: as measured.
-            jump_m: of the estimate.
-            is_fused: the localizer took it.
             is_set_aside: the localizer was not given it.
         """
         message = FixMessage(

@@ -31,7 +31,6 @@ class _BufferedConsole(Console):
     """A terminal that may go away: the survey goes on without it."""
 
     def on_broken_pipe(self) -> None:
-        """Say nothing more."""
         self.quiet = True
 
     def _check_buffer(self) -> None:
@@ -45,14 +44,10 @@ class RunView:
     """Progress and messages on standard error; the summary on standard output.
 
     Args:
-        title: what runs.
-        is_sim: mark it visibly as a simulation.
-        run_dir: where the run is written.
         goals: what there are so many of to be done.
     """
 
     def __init__(self, title: str, *, is_sim: bool, run_dir: Path, goals: str = "points") -> None:
-        """Say what runs."""
         self._console: Console = _BufferedConsole(stderr=True, highlight=False)
         self._is_terminal = self._console.is_terminal
         self._sparing = RateLimitedLog(LINES_OF_A_KIND, LINES_PERIOD_S)
@@ -157,9 +152,7 @@ def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.Fi
     """Write the report of a run that has ended.
 
     Args:
-        run_dir: the run.
         status: what it ended with; an interrupted run gets none, because somebody is waiting for the end.
-        log: takes why there is none.
 
     Returns:
         Where it is, or why there is none.

@@ -47,7 +47,6 @@ class Foot(NamedTuple):
 
     Attributes:
         x_m, y_m: in the panel frame.
-        variance_m2: mean variance of the two.
         deviation_m: height of the surface there above the ideal one.
     """
 
@@ -124,7 +123,6 @@ def fix_row(z: FloatArray, mean: FloatArray, slope: Slope, late_s: float) -> tup
     Args:
         z: the robot's origin by the puck, deck, m, shape (2,).
         mean: the state, shape (n,).
-        slope: the ground under it.
         late_s: by how much the state is later than the position; V and W held meanwhile.
     """
     H = np.zeros((2, STATES))
@@ -162,7 +160,6 @@ def begun_anew(
         residual: of the position, shape (2,); see ``fix_row``.
         variance: covariance of the position, m^2, shape (2, 2).
         tilt_variance_m2: of what the panel's tilt does to the puck's place, each way.
-        heading_variance_rad2: what the heading's variance grows by.
         is_lost: the filter has stood still meanwhile; the speeds are not known either.
     """
     x, P = mean.copy(), covariance.copy()
@@ -186,10 +183,6 @@ class PositionSigma:
 
     Slip and a heading error last from one fix to the next, so their contributions grow with the travel, not with its
     root: sigma^2 = fix^2 + (slip_fraction s)^2 + (integral of sigma_theta ds)^2.
-
-    Args:
-        sigma_m: at the start, m.
-        slip_fraction: part of the travel by which the wheels may err.
     """
 
     def __init__(self, sigma_m: float, slip_fraction: float) -> None:

@@ -46,9 +46,6 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
 
     Args:
         filter_: an extended or unscented filter of ``STATES`` states; re-initialised here.
-        mirror: the mirror's geometry.
-        robot: wheel and sensor geometry.
-        cfg: noise model.
         start: pose at the first frame, at rest.
 
     Attributes:
@@ -247,7 +244,6 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
             raise FilterDiverged(f"{v:.3g} m/s and {w:.3g} rad/s are more than the wheels can do")
 
     def _carry_on(self, half_s: float) -> None:
-        """Dead reckoning begins again at the filter's state."""
         self._slope = self._estimate.slope()
         self._running.begin(self._estimate.mean, self._slope, half_s)
         if self._rest.is_resting:

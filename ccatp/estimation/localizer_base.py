@@ -26,7 +26,6 @@ class LocalizerBase(ABC, Generic[Taken]):
         history_s: samples older than this before their frame are refused.
 
     Attributes:
-        counts: what was refused or used, by name.
         hold_cause: why the mission should hold, or empty; stays until ``clear_hold``.
         is_frozen: the filter has diverged; the pose stands still until the next fix.
         notices: what an operator should read; whoever reads them empties the list.
@@ -141,12 +140,7 @@ _NEAR_BORDER = 0.95  # part of a panel's half size beyond which the cell under t
 
 
 class PanelFrame:
-    """The panel under the robot, and poses in its frame.
-
-    Args:
-        mirror: the mirror.
-        panel: where the robot is first.
-    """
+    """The panel under the robot, and poses in its frame."""
 
     def __init__(self, mirror: Mirror, panel: PanelId) -> None:
         self._mirror = mirror

@@ -52,7 +52,6 @@ class MeasurementBuilder:
     every sample counts at its own time. The approximation: all process noise of the interval enters at its beginning.
 
     Args:
-        robot: wheel radius r and wheel base L.
         cfg: standard deviations of single samples (thesis eq. 2.17 calls sigma a variance; its table 2.1 lists
             standard deviations).
     """
@@ -72,7 +71,6 @@ class MeasurementBuilder:
         The arrays are work space: they hold until the next call.
 
         Args:
-            t_s: time of the state, s.
             imu: accepted samples, (t, ax, wz).
             encoders: accepted samples, (t, right, left), no None.
         """
@@ -208,8 +206,6 @@ class ZeroVelocityReading(NamedTuple):
 
     Attributes:
         samples: of the inertial unit.
-        rate_rad_s, acceleration_m_s2: their means.
-        gravity_count: samples of gravity.
         bearing_rad: direction of gravity's part along the surface against the robot's x axis.
     """
 
@@ -228,7 +224,6 @@ class ZeroVelocityDetector:
 
     Args:
         rest_after_s: standstill of the wheels before it counts.
-        gyro, accelerometer: learn the sensors' noise.
     """
 
     def __init__(self, rest_after_s: float, gyro: NoiseFloor, accelerometer: NoiseFloor) -> None:
@@ -289,7 +284,6 @@ def heading_from_gravity(bearing_rad: float, slope: Slope) -> float:
     """Deck heading of a robot that sees the downhill direction at ``bearing_rad`` against its x axis.
 
     Args:
-        bearing_rad: as measured.
         slope: of the surface under it; its downhill direction must not be zero.
     """
     fx, fy = slope[0], slope[1]

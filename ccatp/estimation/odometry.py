@@ -40,7 +40,6 @@ def arc_step(v_m_s: float, heading_rad: float, turn_rad: float, dt_s: float) -> 
         v_m_s: mean forward speed, m/s.
         heading_rad: heading at the beginning, rad.
         turn_rad: turn over the step, rad.
-        dt_s: duration, s.
 
     Returns:
         (dx, dy), m, in the frame of the heading.
@@ -120,11 +119,6 @@ class PosePredictor:
 
     The speeds come from an observer of fixed gain: the filter's acceleration carries the speed on, the wheels' travel
     corrects it by as much as their resolution is worth; the rate is the mean of wheels and gyroscope by their noise.
-
-    Args:
-        wheel_radius_m: nominal.
-        wheel_base_m: nominal.
-        jerk_density_m2_s5: by how much the acceleration changes.
     """
 
     def __init__(self, wheel_radius_m: float, wheel_base_m: float, jerk_density_m2_s5: float) -> None:
@@ -195,11 +189,8 @@ class PreintegratedMotion(NamedTuple):
     """What some frames in a row say together.
 
     Attributes:
-        dt_s: their length.
-        turning_s: how long of it the wheels turned.
         rate_rad_s: mean of the inertial unit's angular rate over the block; None without samples.
         acceleration_m_s2: mean of its acceleration from the middle of the block before to the middle of this one.
-        samples: how many went into the means.
     """
 
     dt_s: float

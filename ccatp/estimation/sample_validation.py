@@ -68,11 +68,7 @@ class FrameTimeCheck:
 class SampleSource:
     """The time stamps of one sensor: each is used once, in increasing order.
 
-    Args:
-        name: of the sensor.
-
     Attributes:
-        newest_s: newest time used.
         backward_run: samples in a row that were older than the newest.
     """
 

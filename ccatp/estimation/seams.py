@@ -28,9 +28,7 @@ class SensorTransition(NamedTuple):
 
     Attributes:
         t_s: middle between the last sample of the old value and the first of the new one.
-        interval_s: time between those two samples.
         corner: index of the sensor: front-left, front-right, rear-left, rear-right.
-        is_on: the new value.
     """
 
     t_s: float
@@ -97,8 +95,6 @@ def heading_from_pair(
     reverse, whichever sensor is first. A turn between the two crossings is taken from the odometer.
 
     Args:
-        left: odometer place at the crossing of the left sensor.
-        right: odometer place at the crossing of the right sensor.
         left_xy: the left sensor in the robot frame, m.
         right_xy: the right sensor in the robot frame, m.
         normal_rad: phi, direction of the line's normal, either side.
@@ -137,11 +133,6 @@ class CrossingDetector:
 
     Both edges of a gap and both pairs count: up to four headings per seam. A heading is only taken where both sensors
     of a pair crossed the same seam in the same sense, and between the two the robot moved on in near-pure translation.
-
-    Args:
-        mirror: where the seams are.
-        robot: where the sensors are.
-        cfg: limits and timing of a crossing.
     """
 
     def __init__(self, mirror: Mirror, robot: RobotConfig, cfg: LocalizerConfig) -> None:
@@ -174,9 +165,7 @@ class CrossingDetector:
         Args:
             transitions: of this frame.
             odometer: advanced to this frame.
-            pose: estimated pose now.
             deck: the same in the deck frame; decides which seam a sensor crossed.
-            v_m_s: forward speed.
         """
         found = []
         for transition in transitions:
@@ -233,9 +222,6 @@ class HeadingGate:
     A single false crossing is one that nothing agrees with. Two in a row that agree with each other show that the
     estimate is wrong and its variance too small; without this a confident filter would refuse every true heading
     from then on.
-
-    Args:
-        gate_sigma: largest deviation in common standard deviations.
     """
 
     def __init__(self, gate_sigma: float) -> None:
@@ -243,12 +229,7 @@ class HeadingGate:
         self._refused: HeadingFix | None = None
 
     def extra_variance(self, seen: HeadingFix, prior_rad2: float) -> float | None:
-        """Variance (rad^2) by which the estimate has to be widened before it takes ``seen``; None = refused.
-
-        Args:
-            seen: heading against the estimate.
-            prior_rad2: variance of the estimate.
-        """
+        """Variance (rad^2) by which the estimate has to be widened before it takes ``seen``; None = refused."""
         if self._is_within(seen.innovation_rad, seen.variance_rad2 + prior_rad2):
             self._refused = None
             return 0.0
@@ -276,7 +257,6 @@ class Edge(NamedTuple):
 
     Attributes:
         k: the deck axis across it, 0 or 1.
-        position_m: where the map has it, along that axis.
         offset: index of the state that holds how far it lies from there.
         is_new: it was not crossed before, its offset is unknown.
     """
@@ -291,9 +271,7 @@ class PanelEdgeLine(NamedTuple):
     """One sensor over one edge: ``sensor - edge - offset = 0`` along one axis.
 
     Attributes:
-        residual_m: zero minus the expectation.
         H: row of the measurement model, shape (1, n).
-        variance_m2: of the sensor's place at the transition.
     """
 
     residual_m: float
@@ -307,10 +285,6 @@ class SeamLines:
     An edge lies some tenths of a millimetre from where the map has it, but all four sensors cross the same edge: its
     offset is a state, so that what they say *against each other* (heading, travel from front to rear) counts with the
     precision of the timing, and only what they say together with that of the map.
-
-    Args:
-        mirror: where the seams are.
-        robot: where the sensors are.
     """
 
     def __init__(self, mirror: Mirror, robot: RobotConfig) -> None:
@@ -329,10 +303,7 @@ class SeamLines:
         """Which edge a transition belongs to; None where no seam is near.
 
         Args:
-            transition: one sensor's.
-            t_s: time of the state, s.
             x: state, shape (n,).
-            slope: of the surface under the robot.
         """
         place, (along_x, along_y), _ = self._sensor(transition, t_s, x, slope)
         seam = self._mirror.nearest_seam(*place)

@@ -32,8 +32,6 @@ class SlipPopulation:
         largest: the largest scatter thought possible; candidates beyond it are left out.
 
     Attributes:
-        means: expectation of each parameter in the next leg.
-        mean_variances: how well they are known.
         scatter: the expectation of sigma^2, which is what the next leg will show of it.
     """
 

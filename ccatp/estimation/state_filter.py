@@ -55,9 +55,6 @@ class SurveyFilter:
 
     Args:
         filter_: an extended or unscented filter of ``STATES`` states.
-        mirror: the mirror's geometry.
-        robot: wheel and sensor geometry.
-        cfg: noise model.
         counts: of what was used and refused; counted on here.
         start: deck pose at the first frame, at rest.
     """
@@ -145,10 +142,7 @@ class SurveyFilter:
         """A block of frames: predict, then update with wheel angles, angular rate and acceleration.
 
         Args:
-            block: frames since the last step.
             right: the wheel's angle at its end; no reading where its last frame brought none.
-            left: likewise.
-            imu_variances: of single samples: angular rate, acceleration.
         """
         dt_s = block.dt_s
         if dt_s > 0.0:
@@ -171,7 +165,6 @@ class SurveyFilter:
         self._enter()
 
     def _enter(self) -> None:
-        """The tilt belongs to the panel under the robot."""
         panel = self._panel_below()
         if panel != self._panel:
             self._panel = panel
@@ -226,13 +219,7 @@ class SurveyFilter:
         self._filter.update(z, H, R)
 
     def calibrate(self, reading: ZeroVelocityReading, rested_s: float, imu_variances: tuple[float, float]) -> None:
-        """Biases from the inertial unit's means over a rest of ``rested_s``, heading from gravity.
-
-        Args:
-            reading: the means.
-            rested_s: how long the biases have wandered.
-            imu_variances: of single samples: angular rate, acceleration.
-        """
+        """Biases from the inertial unit's means over a rest of ``rested_s``, heading from gravity."""
         full, n = self._full, reading.samples
         Q = np.zeros((STATES, STATES))
         Q[BG, BG] = full.gyroscope_bias_walk_rad_s_sqrt_s**2 * rested_s

@@ -55,7 +55,6 @@ class Slope(NamedTuple):
     """First and second derivatives of the surface at a deck point, and the downhill unit tangent.
 
     Attributes:
-        fx, fy: slopes.
         fxx, fxy, fyy: second derivatives, 1/m.
         gx, gy: deck components of the downhill direction in the tangent plane; zero on level ground.
     """
@@ -70,11 +69,7 @@ class Slope(NamedTuple):
 
 
 class Terrain:
-    """Slopes where the robot is, at a fraction of the cost of the polynomial.
-
-    Args:
-        mirror: the ideal mirror.
-    """
+    """Slopes where the robot is, at a fraction of the cost of the polynomial."""
 
     def __init__(self, mirror: Mirror) -> None:
         self._surface = mirror.surface
@@ -160,10 +155,6 @@ class SurveyMotion:
 
     h and g are the deck components of the heading and of the downhill direction in the tangent plane. The noise of a
     step is an impulse at its beginning (see ``ConstantAcceleration``), so v', a and w hold for the whole of it.
-
-    Args:
-        wheel_radius_m: r, nominal.
-        wheel_base_m: L, nominal.
     """
 
     def __init__(self, wheel_radius_m: float, wheel_base_m: float) -> None:

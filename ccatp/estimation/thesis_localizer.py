@@ -45,9 +45,6 @@ class FourStateLocalizer(LocalizerBase[Stack]):
 
     Args:
         filter_: filter of the four states of eq. 2.1; re-initialised here.
-        mirror: the mirror's geometry.
-        robot: wheel and sensor geometry.
-        cfg: noise model.
         start: pose at the first frame, at rest.
 
     Attributes:

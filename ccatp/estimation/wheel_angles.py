@@ -23,10 +23,7 @@ class WheelAngle:
     the trapezoid rule sums it. Which one it is shows at rest, where a counter gives nothing but zeros.
 
     Attributes:
-        angle_rad: since the last rebase.
         is_fresh: the last frame brought samples.
-        is_counter: it is a counting encoder.
-        quantum_rad: its smallest step seen.
         noise_rad2_s2: variance of a rate sample at rest; None as long as it has not been seen at rest.
     """
 

@@ -130,11 +130,6 @@ class Admission(NamedTuple):
 def answer_zap(frames: Sequence[bytes], domain: str, clients: Clients) -> Admission:
     """Admit the listed clients of one domain, and nobody else.
 
-    Args:
-        frames: the request.
-        domain: what is guarded.
-        clients: who is listed.
-
     Returns:
         The reply, with the client's key in hexadecimal as its user id.
     """
@@ -233,14 +228,9 @@ def read_clients(path: Path, what: str) -> Clients:
 
 
 class ClientsFile:
-    """The list of clients as it stands now: read anew whenever the file has changed.
-
-    Attributes:
-        trouble: why nobody is listed, where that is so.
-    """
+    """The list of clients as it stands now: read anew whenever the file has changed."""
 
     def __init__(self, path: Path, what: str) -> None:
-        """Nothing read yet."""
         self._path, self._what = path, what
         self._stamp: tuple[int, ...] | None = None
         self._clients = NOBODY

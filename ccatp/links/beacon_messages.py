@@ -43,7 +43,6 @@ class RadioScan(msgspec.Struct, frozen=True):
     """One turn of a reflector.
 
     Attributes:
-        t: at its end.
         step: between two directions, rad; the first is straight ahead, they go to the left.
         levels: of each radio, dBm, one for each direction, ``None`` where a packet was lost.
     """
@@ -68,10 +67,7 @@ class BeaconFrame(msgspec.Struct, frozen=True):
 
     Attributes:
         steer: steering angles since the last frame.
-        radio: radios heard since then, one by one.
-        scan: turn of the reflector that ended since then.
         distances: of the distance sensors, m, in the order of the robot's ``hello``; empty where there was no reading.
-        motes: pulses heard since then.
     """
 
     steer: list[SteerSample] = []
@@ -99,12 +95,7 @@ def decode_beacon_frame(line: bytes) -> BeaconFrame:
 
 
 def with_extras(line: bytes, extras: BeaconFrame) -> bytes:
-    """A ``sensors`` line with the extra keys at its end.
-
-    Args:
-        line: with its LF.
-        extras: what is empty is left out.
-    """
+    """A ``sensors`` line with the extra keys at its end."""
     keys = {name: getattr(extras, name) for name in extras.__struct_fields__}
     more = _encoder.encode({name: value for name, value in keys.items() if value})
     return line if more == b"{}" else line.rstrip()[:-1] + b"," + more[1:] + b"\n"

@@ -20,15 +20,9 @@ SPIN_S = 5e-4
 
 
 class Publisher:
-    """Publishes topics on one endpoint; never blocks, drops the newest when a subscriber is too slow.
-
-    Args:
-        context: ZeroMQ context of the process.
-        endpoint: where to bind.
-    """
+    """Publishes topics on one endpoint; never blocks, drops the newest when a subscriber is too slow."""
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str) -> None:
-        """Bind the socket."""
         self._socket = context.socket(zmq.XPUB)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.SNDHWM, HIGH_WATER_MARK)
@@ -58,9 +52,7 @@ class Subscriber:
     """Receives topics from one or more publishers.
 
     Args:
-        context: ZeroMQ context of the process.
         endpoints: where to connect (a publisher may come up later).
-        topics: names of the topic table.
         is_watching: watch the connection, for ``is_cut``; of one publisher only.
         is_onlooking: a publisher that waits for its subscribers does not count this one (``has_subscriber``).
         keeps_newest: of messages that wait only the newest is kept, whatever its topic.
@@ -76,7 +68,6 @@ class Subscriber:
         is_onlooking: bool = False,
         keeps_newest: bool = False,
     ) -> None:
-        """Connect and subscribe."""
         self.socket = context.socket(zmq.SUB)
         self.socket.setsockopt(zmq.LINGER, 0)
         self.socket.setsockopt(zmq.RCVHWM, HIGH_WATER_MARK)

@@ -145,11 +145,7 @@ def answer_observatory(
     """Serve one request of the observatory channel.
 
     Args:
-        frame: the request as received.
-        desk: where emergencies are latched.
-        at_base_or_held: whether the robot is at base or held, by a fresh estimate.
         age_s: age of the last verdict, s; ``None`` before the first.
-        may_clear: whether this peer may end emergencies.
 
     Returns:
         The reply.

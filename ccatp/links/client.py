@@ -55,7 +55,6 @@ class Latched(msgspec.Struct, frozen=True):
 
     Attributes:
         id: what ``clear`` wants.
-        code: the event code.
     """
 
     id: str
@@ -81,7 +80,6 @@ class ObservatoryClient:
     Args:
         endpoint: where it serves; ``OperatorClient.observatory`` knows that of a daemon on this machine.
         curve: the keys, where that is ``tcp://``; see ``connect``.
-        timeout_s: longest wait for an answer.
     """
 
     endpoint: str
@@ -94,9 +92,7 @@ class ObservatoryClient:
 
         Args:
             endpoint: ``tcp://HOST:PORT``.
-            server_key: file with the daemon's public key.
             key: file with our own secret key, which the daemon lists.
-            timeout_s: longest wait for an answer.
 
         Raises:
             ConfigError: a key file cannot be used.
@@ -108,8 +104,6 @@ class ObservatoryClient:
         """Report an emergency: the robot goes to its base. Told again and again until it is answered.
 
         Args:
-            kind: what it is.
-            note: for the log.
             emergency_id: a UUID; the same one again is harmless. A new one if not given.
 
         Raises:
@@ -185,11 +179,6 @@ class OperatorClient:
     ) -> MissionStatus:
         """Poll the status until a condition holds.
 
-        Args:
-            is_there: the condition.
-            timeout_s: longest wait, s.
-            period_s: between two looks, s.
-
         Raises:
             StillWaiting: it does not hold in time; the daemon goes on.
             UnreachableError: the daemon is gone.
@@ -235,9 +224,6 @@ def exchange(
     """One request and its answer.
 
     Args:
-        endpoint: where it is served.
-        payload: the request.
-        timeout_s: longest wait, s.
         curve: the keys, where the endpoint is ``tcp://``.
         repeats: ask again and again until there is an answer; only for what may be asked twice.
 
@@ -360,7 +346,6 @@ class HttpClient:
 
 
 def _message(text: bytes) -> str:
-    """What the page says to a refusal."""
     try:
         found = json.loads(text)
         return str(found["message"])

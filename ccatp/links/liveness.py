@@ -19,7 +19,6 @@ class Liveness:
     """
 
     def __init__(self, stale_after_s: float = STALE_AFTER_S) -> None:
-        """Nothing heard."""
         self._stale_after_s = stale_after_s
         self._presences: dict[str, Heartbeat] = {}
 
@@ -33,11 +32,7 @@ class Liveness:
         return all(name in self._presences and self._presences[name].phase in ("joined", "done") for name in LOOPS)
 
     def trouble(self, now_s: float) -> str:
-        """What is wrong, or nothing.
-
-        Args:
-            now_s: time of the machine's monotonic clock.
-        """
+        """What is wrong, or nothing."""
         for name in LOOPS:
             presence = self._presences.get(name)
             if presence is None:
@@ -63,12 +58,7 @@ def kind_of(text: str) -> str:
 
 
 class LogRateLimit:
-    """So many lines in a period, and a count of those that were left out.
-
-    Args:
-        lines: at most so many ...
-        period_s: ... in this time.
-    """
+    """So many lines in a period, and a count of those that were left out."""
 
     def __init__(self, lines: int, period_s: float) -> None:
         self._lines, self._period_s = lines, period_s
@@ -87,15 +77,9 @@ class LogRateLimit:
 
 
 class RateLimitedLog:
-    """Lines for a terminal: a few of each kind in a period, and how many like it were left out before.
-
-    Args:
-        lines: of each kind ...
-        period_s: ... in this time.
-    """
+    """Lines for a terminal: a few of each kind in a period, and how many like it were left out before."""
 
     def __init__(self, lines: int, period_s: float) -> None:
-        """Nothing said."""
         self._lines, self._period_s = lines, period_s
         self._budgets: dict[str, LogRateLimit] = {}
 
@@ -103,8 +87,6 @@ class RateLimitedLog:
         """The line as it is told; ``None`` where it is left out. Errors are all told.
 
         Args:
-            level: of the line.
-            text: what it says.
             now_s: time of any clock that only goes forward.
         """
         if level == "error":

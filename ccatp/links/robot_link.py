@@ -69,7 +69,6 @@ def read_key(key_file: str, *, must_be_private: bool = False) -> bytes | None:
     """Key of the robot link: the file's bytes without white space around them; ``None`` when no file is named.
 
     Args:
-        key_file: path, or empty.
         must_be_private: refuse a file that others may read; the key of a stand-in is no secret.
 
     Raises:
@@ -98,11 +97,6 @@ class RobotLink(asyncio.Protocol):
     commands must never follow a stall.
 
     Args:
-        host: the robot's host.
-        port: its port.
-        role: what to join as.
-        client: name of this client.
-        key: of the HMAC, where the robot asks for it.
         on_sensors: called with each frame and its line (without LF), within the event loop's read.
         on_lost: called once with the reason when a joined session ends, unless ``close`` ended it.
         on_joined: called with the robot's hello when the session begins, before its first frame.
@@ -145,9 +139,6 @@ class RobotLink(asyncio.Protocol):
 
     async def connect(self, deadline_s: float) -> Hello:
         """Connect and join. A link is used once: for another session make another.
-
-        Args:
-            deadline_s: longest time for all of it.
 
         Raises:
             RobotTimeout: it took longer.

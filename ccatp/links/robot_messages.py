@@ -201,12 +201,7 @@ class LineBuffer:
 
 
 class BadLineLimit:
-    """So many lines at once, so many a second in the long run; more is a flood.
-
-    Args:
-        lines: taken at once.
-        rate_hz: at which lines may come in the long run.
-    """
+    """So many lines at once, so many a second in the long run; more is a flood."""
 
     __slots__ = ("_left", "_lines", "_rate_hz", "_then_s")
 
@@ -223,12 +218,7 @@ class BadLineLimit:
 
 
 class BadLineCounter:
-    """Counts bad lines and tells when there are too many of them in a window of time.
-
-    Args:
-        limit: this many within the window are tolerated.
-        window_s: length of the window, s.
-    """
+    """Counts bad lines and tells when there are too many of them in a window of time."""
 
     __slots__ = ("_limit", "_times_s", "_window_s", "total")
 

@@ -59,11 +59,9 @@ class Router:
     Args:
         endpoint: where to bind, ``ipc://`` or ``inproc://``. Plain ``tcp://`` is refused: it has no keys.
         handler: what answers. An exception that it raises ends ``serve``.
-        context: ZeroMQ context of the process.
 
     Attributes:
         refused: requests that never reached the handler.
-        turned_away: connections beyond the limit.
     """
 
     def __init__(self, endpoint: str, handler: Handler, context: zmq.asyncio.Context) -> None:
@@ -210,9 +208,6 @@ def split_envelope(frames: list[bytes]) -> tuple[list[bytes], bytes | None]:
 
     A REQ peer's request comes as identity, empty frame, request; a DEALER's as identity, request (or like a REQ's).
 
-    Args:
-        frames: as received, identity first.
-
     Returns:
         The envelope, and the request or ``None`` where it is not a single frame.
     """
@@ -238,8 +233,6 @@ def request(
 
     Args:
         endpoint: where a ``Router`` serves.
-        payload: the request.
-        timeout_s: how long to wait in all, s.
         curve: the keys, where the endpoint is ``tcp://``.
         repeats: ask again and again until there is an answer; only for what may be asked twice.
 
@@ -294,7 +287,6 @@ class ZapHandler:
 
     Args:
         context: ZeroMQ context of the process; there can be one handler in it.
-        clients: who is listed at the moment.
         on_refused: told why somebody was not let in.
     """
 
@@ -335,8 +327,6 @@ class CurveRouter(Router):
     Args:
         endpoint: ``tcp://ADDRESS:PORT``.
         handler: what answers; called with the request and the client's key in hexadecimal.
-        context: ZeroMQ context of the process.
-        keys: the server's pair.
     """
 
     def __init__(self, endpoint: str, handler: NamedHandler, context: zmq.asyncio.Context, keys: KeyPair) -> None:

@@ -31,7 +31,6 @@ def runtime_dir_path(configured: str, environ: Mapping[str, str]) -> Path:
 
     Args:
         configured: ``run.runtime_dir``; empty when nothing is configured.
-        environ: the environment.
 
     Raises:
         RuntimeDirError: the path is too long for a unix socket in it.
@@ -86,10 +85,6 @@ def make_runtime_dir(configured: str, environ: Mapping[str, str]) -> Path:
 @contextmanager
 def locked(path: Path, refusal: str) -> Iterator[None]:
     """Hold the lock of a file for as long as the block lasts; it ends with the process, whatever ends that.
-
-    Args:
-        path: the file, made when it is missing.
-        refusal: what to say where somebody else holds it.
 
     Raises:
         RefusedError: somebody else does.

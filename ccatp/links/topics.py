@@ -82,8 +82,6 @@ class DisplayState(Message):
 
     Attributes:
         x_m, y_m, heading_rad: pose, deck frame.
-        covariance_m2: of x and y: xx, xy, yy.
-        heading_sigma_rad: standard deviation of the heading.
         nis, size: normalised innovation squared of the filter's last update, and its degrees of freedom; 0 for none.
         line: the newest sensors line, as it came from the robot.
     """
@@ -104,12 +102,8 @@ class RobotShape(msgspec.Struct, omit_defaults=True):
     Attributes:
         id: the same thing has the same one in the next message.
         kind: how it looks: ``beacon``, ``obstacle``, ``target``, ``robot``, ``trail``; a display draws others plainly.
-        x_m, y_m: where it is.
         covariance_m2: of x and y: xx, xy, yy; drawn as its ellipse.
-        heading_rad: for what points somewhere.
-        radius_m: for what is round.
         outline_m: for what is neither: a line, closed where the first point comes again.
-        label: what is written beside it.
     """
 
     id: str
@@ -180,7 +174,6 @@ class Treatment(Message):
             standard deviations of place (m) and heading (rad); ``doubted``: after the samples of this frame its pose
             may be wrong by so much, m and rad; ``deaf``, ``hearing``: whatever wheels and inertial unit say, the robot
             stands, or not any more.
-        values: see there.
     """
 
     kind: TreatmentKind
@@ -245,14 +238,11 @@ class BeaconMapMessage(Message):
     """The map of a robot among beacons, for displays and reports; positions in m.
 
     Attributes:
-        system: zigbee, follow, cricket.
-        pose: x_m, y_m, heading_rad.
         pose_ellipse: x, y, and their covariance xx, xy, yy, m2.
         beacons: of each radio or mote on the map, the same.
         target: of the radio that is followed, the same; ``None`` before it was heard.
         obstacles: points in the room that the distance sensors saw lately.
         waypoints: all of them, in order; ``next_waypoint`` is the number of the one driven to, -1 for none.
-        distances: of the distance sensors, m.
         nis_sum, nis_size, refused: of all readings so far: normalised innovations squared, their degrees of freedom,
             and how many readings the gate refused.
         notes: what the mission has to say of the map: phases, errors expected.
@@ -303,8 +293,6 @@ class Topic:
 
     Attributes:
         name: as it stands before the JSON.
-        message: the type.
-        publisher: the process that publishes it.
         rate_hz: nominal rate; 0 for an event.
         stale_after_s: a level older than this must not be used; 0 for events and batches.
         recorded: goes to ``telemetry.mcap``.

@@ -23,7 +23,6 @@ class XbeeLevel(NamedTuple):
     Attributes:
         node: identifier: the text that the radio sends, or its NI.
         address: 64-bit serial number, or the 16-bit address where only that is known.
-        rssi_dbm: level.
     """
 
     node: str
@@ -36,9 +35,6 @@ class XbeeFrames:
 
     Bytes before a start, frames with a wrong checksum or an impossible length, and frames that tell no level are left
     out; the former two are counted.
-
-    Attributes:
-        bad: frames that were damaged.
 
     Args:
         escaped: API mode 2, in which 0x7E, 0x7D, 0x11 and 0x13 inside a frame are escaped.

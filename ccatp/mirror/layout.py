@@ -19,8 +19,6 @@ class Seam(NamedTuple):
 
     Attributes:
         axis: the deck coordinate that is constant along the seam.
-        position_m: its centre line.
-        distance_m: the point's coordinate minus the position.
     """
 
     axis: Literal["x", "y"]
@@ -32,11 +30,6 @@ class PanelGrid:
     """Cells of one pitch by one pitch, each with a panel in its middle, rows centred (deck plane, m).
 
     Centre of panel (r, c): ``x = (c - (cols+1)/2) pitch_x``, ``y = (r - (rows+1)/2) pitch_y + y_offset``.
-
-    Attributes:
-        rows, cols: size of the grid.
-        ids: the panels that exist, row by row.
-        half_x_m, half_y_m: half the size of a panel.
     """
 
     def __init__(self, cfg: PanelsConfig) -> None:
@@ -146,7 +139,6 @@ class Panel:
     """A panel and its frame (thesis fig. 2.2).
 
     Attributes:
-        id: row and column.
         x_m, y_m: centre in the deck plane.
         half_x_m, half_y_m: half the panel's size in the deck plane.
         origin: surface point at the centre, deck frame, m.
@@ -189,8 +181,6 @@ def build_panel(surface: Surface, panel: PanelId, centre: tuple[float, float], h
     """Panel whose frame is the tangent frame of the surface at ``centre``.
 
     Args:
-        surface: the mirror's surface.
-        panel: row and column.
         centre: (x, y) in the deck plane, m.
         half: half sizes along x and y in the deck plane, m.
     """

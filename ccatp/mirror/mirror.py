@@ -30,7 +30,6 @@ class MirrorFrames:
 
     Attributes:
         origin_m: origin of the mirror frame in the world, m.
-        c, s: cosine and sine of the rotation about x.
         drive_side: sign of the mirror frame's z on the robot's side.
     """
 
@@ -93,19 +92,12 @@ class Mirror:
     Points are ``Vector3`` in metres; the frames are those of ``ccatp.core``.
 
     Attributes:
-        name: name of the configuration.
-        overhang: the robot hangs and needs its fans.
         drive_side: sign of the mirror frame's z on the robot's side.
-        gap_m: nominal gap between panels.
-        rows, cols: size of the panel grid.
         surface: the ideal surface, deck frame.
-        grid: which panel lies where.
-        panels: every panel, rows then columns.
         rim: outline of the mirror, deck plane.
         frames: transforms between world, mirror and deck frame.
         channels: laser channels, (k,).
         collimators_m: their positions in the world frame, shape (k, 3).
-        base_panel_pose, base_pose: where the robot starts and returns to.
     """
 
     def __init__(self, cfg: MirrorConfig) -> None:
@@ -259,7 +251,6 @@ class Mirror:
 
         Args:
             world: the puck's centre, world frame, m.
-            height_m: its nominal height along the normal.
 
         Returns:
             (x, y, deviation), m; deviation > 0 means too high above the surface on the drive side.
@@ -336,10 +327,6 @@ _DROP_STEPS = 2
 def deck_poses(mirror: Mirror, poses: Sequence[PanelPose]) -> FloatArray:
     """``Mirror.deck_pose`` of many.
 
-    Args:
-        mirror: the mirror.
-        poses: k poses in panel frames.
-
     Returns:
         Rows of deck x, y (m), heading (rad) and height of the surface there (m), shape (k, 4).
     """
@@ -351,7 +338,6 @@ def deck_rows(mirror: Mirror, panels: NDArray[np.int64], places: FloatArray) -> 
     """The same of poses that are arrays already.
 
     Args:
-        mirror: the mirror.
         panels: row and column of each, shape (k, 2).
         places: x, y (m) and heading (rad) in the frames of these panels, shape (k, 3).
     """

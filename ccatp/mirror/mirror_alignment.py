@@ -45,7 +45,6 @@ class SurveyResult:
 
     Attributes:
         panels: those that could be fitted, rows then columns.
-        undetermined: the others, of the mission's.
         wavefront: of all fitted panels, with rigid moves; None without any.
         wavefront_bent: the same with moves that bend; None where a panel has too few points for them.
         price: of outliers and shapes.
@@ -70,10 +69,7 @@ def survey_result(
     """Fit every panel.
 
     Args:
-        mirror: the ideal mirror.
         cfg: section ``align``.
-        puck_height_m: nominal height of the puck along the normal.
-        measured: the fixes, one a point.
         planned: the mission's panels; one without enough fixes is told as not determined.
     """
     warnings: list[str] = []
@@ -152,10 +148,8 @@ class Comparison(NamedTuple):
     """Recovered minus injected, over all panels that could be fitted.
 
     Attributes:
-        panels: how many.
         piston_rms_m, tilt_rms_rad: of the differences; tip and tilt together.
         chi2: sum of ``e^T C^-1 e`` over the panels, e the three differences and C their covariance.
-        dof: three a panel.
         low, high: what chi2 stays between with 99 % probability where the stated covariances are right.
     """
 
@@ -177,7 +171,6 @@ def compare(panels: Sequence[PanelResult], injected: Mapping[PanelId, Vector3]) 
     """Compare; None without a panel of which both are known.
 
     Args:
-        panels: as fitted.
         injected: piston (m), tip and tilt (rad) as simulated.
     """
     known = [panel for panel in panels if panel.panel in injected]

@@ -45,8 +45,6 @@ class PanelFit:
     Attributes:
         piston_m, tip_rad, tilt_rad: as in ``PanelMisalignment``.
         sigma: standard deviations of piston (m), tip and tilt (rad), from the covariance of the positions.
-        chi2: weighted sum of squared residuals.
-        dof: points minus three.
     """
 
     piston_m: float
@@ -66,11 +64,7 @@ def misaligned_puck_world(
     with the panel: ``n' = n - (tilt x + tip y)`` of the panel's axes, to first order.
 
     Args:
-        mirror: the ideal mirror.
-        panel: the panel that carries the robot.
-        misalignment: its misalignment.
         p: deck pose of the robot's contact point, before the displacement.
-        height_m: height of the puck's centre along the normal.
 
     Raises:
         UnknownPanelError: for a panel that does not exist.
@@ -92,10 +86,8 @@ def panel_deviations(mirror: Mirror, panel: PanelId, points_world: FloatArray, p
     """Deviation of each puck along the local normal from the ideal surface where it actually stood.
 
     Args:
-        mirror: the ideal mirror.
         panel: the panel in whose frame the places are given.
         points_world: puck centres, world frame, m, shape (k, 3).
-        puck_height_m: nominal height of the puck along the normal.
 
     Returns:
         Rows (x_p, y_p, deviation), m, shape (k, 3).
@@ -116,11 +108,8 @@ def fit_panel(
     along the local normal n_k counts, because sideways errors move along the surface. Points are independent.
 
     Args:
-        mirror: the ideal mirror.
-        panel: the panel that was measured.
         points_world: puck centres, world frame, m, shape (k, 3), k >= 3.
         covariances: their covariances, world frame, m^2, shape (k, 3, 3).
-        puck_height_m: nominal height of the puck along the normal.
 
     Raises:
         PanelFitError: with fewer than three points, with points on one line to within 20 mm (rms), or with a

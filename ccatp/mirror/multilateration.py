@@ -56,7 +56,6 @@ class RangeSolution:
         dop: sqrt(trace((H^T H)^-1)), dimensionless.
         residuals_m: measured minus computed ranges, shape (m,).
         chi_squared: sum of the squared residuals over their variances; m - d degrees of freedom.
-        iterations: steps tried.
     """
 
     position_m: FloatArray
@@ -98,7 +97,6 @@ def multilaterate(
         expected_m: where to start, same frame as the anchors, shape (d,).
         max_iterations: steps to try at most. Three to five do where the ranges agree; ranges that contradict each other
             by much slow Gauss-Newton down.
-        tolerance_m: a step shorter than this ends the iteration.
 
     Raises:
         ValueError: shapes, numbers that are not finite, sigmas that are not positive.
@@ -136,9 +134,6 @@ def check_solution(
     Args:
         solution: what ``multilaterate`` gave.
         expected_m: where the position was expected, shape (d,).
-        max_residual_m: limit of the largest absolute residual.
-        max_dop: limit of the dilution of precision.
-        max_distance_m: limit of the distance from the expected position.
 
     Raises:
         ResidualTooLarge, DilutionTooLarge, TooFarFromExpected: in this order.
@@ -248,9 +243,7 @@ def solve_fix(
 
     Args:
         cfg: sigmas, and the limits of residual, dilution of precision and distance.
-        t_s: robot time for which the lengths hold.
         expected_m: where the puck should be, world frame, shape (3,).
-        lengths_m: length by channel, at least four.
         collimators_m: collimator by channel, world frame, shape (3,).
 
     Raises:

@@ -73,7 +73,6 @@ class Deviations(NamedTuple):
     """The measured points of one panel, in the order of their numbers.
 
     Attributes:
-        points: which they are, length k.
         places_m: (x, y) in the panel frame of the surface point under the puck, shape (k, 2).
         deck_m: (x, y) of the same in the deck frame, shape (k, 2).
         values_m: deviation along the local normal, > 0 towards the robot, shape (k,).
@@ -98,10 +97,6 @@ def deviations_of(
     The variance of a deviation is ``n^T C n + floor^2``: an error of the fix sideways moves along the surface.
 
     Args:
-        mirror: the ideal mirror.
-        panel: the panel.
-        measured: its points, at least one.
-        puck_height_m: nominal height of the puck along the normal.
         floor_m: standard deviation, point by point, of what the covariance of a fix does not know.
 
     Raises:
@@ -158,8 +153,6 @@ class ModeFit(NamedTuple):
         covariance: theirs, shape (m, m).
         residuals_m: what is left of the deviations, shape (k,).
         residual_variance_m2: mean square of the residuals that the points' own uncertainty makes one expect.
-        chi2: weighted sum of squared residuals.
-        dof: points minus coefficients.
     """
 
     values: FloatArray
@@ -209,7 +202,6 @@ def gram(modes: Modes, half_m: tuple[float, float]) -> FloatArray:
     """Mean of the products of the modes over a panel: ``c^T G c`` is the mean square of a displacement.
 
     Args:
-        modes: the modes.
         half_m: half the panel's size along x and y.
     """
     x, y = np.meshgrid(_NODES * half_m[0], _NODES * half_m[1])
@@ -251,8 +243,6 @@ def adjuster_moves(fit: ModeFit, modes: Modes, places_m: FloatArray) -> Moves:
     """Moves that take a fitted displacement away.
 
     Args:
-        fit: coefficients of the modes.
-        modes: the modes.
         places_m: of the adjusters, panel frame, shape (a, 2).
     """
     at = -modes(places_m)
@@ -283,8 +273,6 @@ def prices(false_alarm: float, points: int, panels: int) -> Prices:
 
     Args:
         false_alarm: probability that noise alone makes an outlier anywhere on the mirror, and as much for a shape.
-        points: measured points of the mirror.
-        panels: panels with measured points.
     """
     return Prices(
         float(chdtri(1, false_alarm / max(points, 1))), float(chdtri(_CURVATURES, false_alarm / max(panels, 1)))
@@ -333,9 +321,7 @@ class PanelWavefront(NamedTuple):
     """One panel's part.
 
     Attributes:
-        weight_m2: its area across the beam.
         fitted_m2: mean square of its half-wavefront error, as fitted.
-        uncertain_m2: the same of what uncertain moves leave of it.
         unexplained_m2: u, as half-wavefront error; may be negative by chance.
         noise_m2: mean square of its points' uncertainty, as half-wavefront error.
         mean_m: mean of the half-wavefront error before.
@@ -353,7 +339,6 @@ class MirrorWavefront(NamedTuple):
     """Root mean squares over all panels that could be fitted, m.
 
     Attributes:
-        before_m: against the ideal surface.
         before_level_m: the same without its mean over the beam, a path that all light shares.
         after_m: predicted, once the adjusters have been moved.
         noise_m: of a single point: what a survey after the moves shows is this and ``after_m``, added in squares.
@@ -388,11 +373,7 @@ def panel_wavefront(panel: Panel, cos_i: float, fit: ModeFit, gram: FloatArray, 
     """Half-wavefront error of one panel.
 
     Args:
-        panel: the panel.
-        cos_i: cosine of the angle of incidence.
-        fit: its displacement in the modes that the adjusters take away.
         gram: mean of the products of these modes over the panel.
-        sigmas_m: of the points that were fitted.
     """
     half_x, half_y = half_size_m(panel)
     square = cos_i * cos_i
@@ -428,9 +409,6 @@ class PanelShape(NamedTuple):
     Attributes:
         values_1_m, sigma_1_m: curvatures and standard deviations, shape (3,).
         gain: chi-square of the rigid fit minus that of the fit with curvatures.
-        probability: that noise alone gains as much.
-        chi2, dof: of the fit with curvatures.
-        is_significant: the panel is bent beyond what noise explains.
     """
 
     values_1_m: FloatArray
@@ -457,14 +435,9 @@ class PanelResult:
     away without bending the panel, and half as uncertain as beside three curvatures.
 
     Attributes:
-        panel: which.
-        deviations: of all its measured points.
         is_kept: points that count, shape (k,); the others are outliers.
-        cos_i: cosine of the angle of incidence.
         fit: piston (m), tip, tilt (rad).
         shape: curvatures; None with fewer points than it takes.
-        adjusters: their names, in the order of the moves.
-        rigid: moves on a plane.
         bending: moves that take twist and bowl away, too; None with fewer points than it takes.
     """
 
@@ -498,15 +471,7 @@ class PanelResult:
 def panel_result(
     mirror: Mirror, panel: PanelId, deviations: Deviations, explanation: Explanation, cos_i: float
 ) -> PanelResult | None:
-    """Fit a panel; None where its points do not determine piston, tip and tilt.
-
-    Args:
-        mirror: the mirror.
-        panel: the panel.
-        deviations: its measured points.
-        explanation: which of them count.
-        cos_i: cosine of the angle of incidence.
-    """
+    """Fit a panel; None where its points do not determine piston, tip and tilt."""
     kept = explanation.is_kept
     places, lever = deviations.places_m[kept], deviations.lever[kept, None]
     values, sigmas = deviations.values_m[kept], deviations.sigmas_m[kept]
@@ -545,7 +510,6 @@ def displacement_m(panel: PanelResult, places_m: FloatArray) -> FloatArray:
     """Along the panel's normal, with its curvatures where they are significant, shape (k,).
 
     Args:
-        panel: the panel.
         places_m: (x, y) in the panel frame, shape (k, 2).
     """
     found = rigid(places_m) @ panel.fit.values
@@ -558,11 +522,6 @@ def displacement_m(panel: PanelResult, places_m: FloatArray) -> FloatArray:
 
 def on_grid_m(mirror: Mirror, panel: PanelResult, cells: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The displacement in a grid of cells over a panel.
-
-    Args:
-        mirror: the mirror.
-        panel: the panel.
-        cells: along each side.
 
     Returns:
         Edges of the cells along deck x and deck y, shape (cells + 1,) each, and the displacement in their middles,

@@ -79,11 +79,7 @@ class Outline:
 
 
 class NearOutline:
-    """Signed distances of places that stay near each other for a while: only the edges around them are looked at.
-
-    Args:
-        outline: the whole outline.
-    """
+    """Signed distances of places that stay near each other for a while: only the edges around them are looked at."""
 
     __slots__ = ("_outline", "_part", "_x_m", "_y_m")
 
@@ -100,7 +96,6 @@ class NearOutline:
 
 
 def _outside(value: float, low: float, high: float) -> float:
-    """How far a value lies outside an interval."""
     return max(low - value, value - high, 0.0)
 
 
@@ -230,7 +225,6 @@ def _segment_distance(a: Point, b: Point, c: Point, d: Point) -> float:
 
 
 def _point_distance(p: Point, a: Point, b: Point) -> float:
-    """Distance of the point p from the segment ab."""
     ux, uy = b[0] - a[0], b[1] - a[1]
     wx, wy = p[0] - a[0], p[1] - a[1]
     length2 = ux * ux + uy * uy

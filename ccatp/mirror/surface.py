@@ -254,7 +254,6 @@ class SurfacePatch:
     height is off by less than 1e-12 m, a slope by less than 2e-10, a second derivative by less than 5e-8 1/m.
 
     Args:
-        surface: the surface.
         reach_m: how far in x and in y an expansion is used.
     """
 

@@ -25,13 +25,8 @@ class BeaconFacts(NamedTuple):
     """What a run is of.
 
     Attributes:
-        system: zigbee, follow, cricket.
-        seed: of the simulation.
-        waypoints: to be reached, over all laps.
         safe_distance_m: to be kept from the target; ``None`` without one.
-        target: name of the radio that is followed.
         settled_s: the least distance to the target counts from this time on.
-        has_truth: the run is simulated.
     """
 
     system: str
@@ -65,14 +60,9 @@ class Reached(NamedTuple):
 
 
 class BeaconSummary:
-    """Collects a run.
-
-    Args:
-        facts: what it is of.
-    """
+    """Collects a run."""
 
     def __init__(self, facts: BeaconFacts) -> None:
-        """Nothing yet."""
         self._facts = facts
         self._track: list[Sequence[float]] = []
         self._truth: list[Sequence[float | None]] = []

@@ -26,16 +26,10 @@ class Checkpoint(msgspec.Struct, kw_only=True):
     """What one main loop leaves to the next.
 
     Attributes:
-        count: number of the record.
         boot: the robot's boot; its clock counts from there.
         seq, t_s: the frame.
         x_m, y_m, heading_rad: pose, deck frame.
-        sigma_m, heading_sigma_rad: how well it is known.
-        speed_m_s, rate_rad_s: how the robot moves.
-        state: of the mission.
         abort_cause: why the survey was given up, or empty.
-        held_cause: why it waits for an operator, or empty.
-        elapsed_s: time that the mission has taken.
         last_fix: the point whose fix was the last one stored, or empty.
     """
 
@@ -86,7 +80,6 @@ class CheckpointFile:
 
         Args:
             record: the record; its count is one more than the last one's.
-            is_durable: synchronise it to the disk.
         """
         if self._is_patient and not is_durable:
             self._put(record)

@@ -70,10 +70,7 @@ class Condition:
     """What is wrong with a file, known when the scan has come to its end.
 
     Attributes:
-        size_bytes: of the file.
         lost: beginning and end of each stretch of bytes that holds no intact record.
-        is_complete: the file was closed in good order.
-        chunks: intact chunks.
     """
 
     size_bytes: int = 0
@@ -96,10 +93,6 @@ class Condition:
 
 def scan(path: Path, condition: Condition) -> Iterator[McapRecord]:
     """The intact records of a file, chunks broken up.
-
-    Args:
-        path: an MCAP file, in whatever state.
-        condition: told what is wrong with it.
 
     Raises:
         OSError: the file cannot be read.
@@ -260,12 +253,10 @@ class Recorder:
     An existing file at ``path`` is kept: it is renamed ``<stem>.<n><suffix>`` (see ``recordings``).
 
     Attributes:
-        path: the file.
         is_recording: False after ``close`` or a failure.
         dropped: messages not recorded: after a failure, of an unknown topic, or with a time that is none.
 
     Args:
-        path: the file to write.
         topics: name and JSON schema of each topic; the schema's title is what viewers know it by.
         is_simulation: marks the file and every channel as simulation, or as real.
         metadata: what tells runs apart (mirror, seed, ...), kept in the file.
@@ -281,7 +272,6 @@ class Recorder:
         metadata: Mapping[str, str] | None = None,
         on_failure: Callable[[str], None] | None = None,
     ) -> None:
-        """Make the file; a failure is reported like any later one."""
         self.path = path
         self.is_recording = False
         self.dropped = 0
@@ -304,9 +294,7 @@ class Recorder:
         """Record one message; never raises.
 
         Args:
-            topic: one of the recorder's topics.
             t_s: robot time, s since its boot; becomes the log time.
-            payload: JSON text of the topic's schema.
         """
         channel = self._channels.get(topic)
         if channel is None or not self.is_recording or not 0.0 <= t_s < _MAX_T_S:
@@ -447,12 +435,7 @@ def is_being_written(path: Path) -> bool:
 
 
 def damage_text(path: Path, damage: str) -> str:
-    """Why a recording could not be read to its end, for a reader of the run.
-
-    Args:
-        path: the recording.
-        damage: what the reader of its format says, with the path.
-    """
+    """Why a recording could not be read to its end, for a reader of the run."""
     if is_being_written(path):
         return f"{path.name}: still being written; what it holds so far is in this report"
     return f"{damage.replace(str(path), path.name)}; what came before it is in this report"

@@ -28,10 +28,7 @@ class TopicFacts:
     """What a recording holds of a topic.
 
     Attributes:
-        schema: name of its schema.
-        messages: how many.
         payload_bytes: of all of them, before compression.
-        first_s, last_s: times of the earliest and the latest.
     """
 
     schema: str
@@ -46,12 +43,7 @@ class RecordingFacts:
     """What a recording holds.
 
     Attributes:
-        path: the file.
-        condition: what is wrong with it.
-        metadata: what the recorder was told, by name of the record.
-        topics: by name.
         faults: what the format's own strict reader says against it.
-        is_being_written: by a run that goes on.
     """
 
     path: Path
@@ -179,10 +171,7 @@ class Saved:
     """A recording that was saved.
 
     Attributes:
-        path: the new file.
-        messages: how many it holds.
         end_s: time of the latest, ``None`` where there is none.
-        condition: what was wrong with the old file.
     """
 
     path: Path
@@ -196,7 +185,6 @@ def recover(path: Path, out: Path) -> Saved:
 
     Args:
         path: the old file; it is left as it is.
-        out: the new file.
 
     Raises:
         RecordingError: one cannot be read or written, or nothing in it is a recording.

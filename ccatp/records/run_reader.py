@@ -43,7 +43,6 @@ class Marked:
 
     Attributes:
         sensors: the frame.
-        at_rest: the mission took the robot to be at rest.
         begun: before the frame the localizer began anew, with these values of ``Treatment``.
         is_deaf: whatever wheels and inertial unit say, the robot stands.
         doubted: after the samples its pose was doubted by this much, m and rad.
@@ -61,8 +60,6 @@ class Fixed:
     """A fix was measured after the frame before it.
 
     Attributes:
-        fix: as measured.
-        was_fused: the localizer took it then.
         was_set_aside: the localizer never saw it: it was doubted, and measured again.
     """
 
@@ -223,8 +220,6 @@ class Recording:
     """One recording of a run; a run that was resumed has several, each from the robot's start at base.
 
     Attributes:
-        path: the file.
-        metadata: what the recorder was told.
         warnings: what is wrong with it; complete when ``messages`` has come to its end.
         arrivals: frames at which the robot stood at a point for the first time; complete likewise.
     """
@@ -280,7 +275,6 @@ class Recording:
             self.warnings.append(f"{self.path}: {missing} frames are missing in between")
 
     def _take(self, message: object) -> list[Message]:
-        """What a message holds for the localizer."""
         if isinstance(message, SensorLines):
             frames = [decode_from_robot(bytes(line)) for line in message.lines]
             return [frame for frame in frames if isinstance(frame, Sensors)]

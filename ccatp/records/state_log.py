@@ -38,8 +38,6 @@ class ReadLine(NamedTuple):
 
     Attributes:
         shown: what a reader is shown; None for what was said for debugging.
-        change: what it tells of the mission's state.
-        begins: a session begins with it.
     """
 
     shown: LogLine | None
@@ -147,10 +145,6 @@ def changes_of(lines: Iterable[ReadLine], sessions: int) -> list[tuple[StateChan
 
     They are numbered by the robot's frames. Where these count anew within a session, because the robot booted, or where
     the log does not hold as many sessions as there are recordings, their times are not known: then there are none.
-
-    Args:
-        lines: of the log.
-        sessions: recordings of the run.
     """
     parts: list[list[StateChange]] = []
     for line in lines:

@@ -51,7 +51,6 @@ class MissionStore:
     ``close`` wait for the writer thread.
 
     Attributes:
-        path: the file.
         meta: mirror, seed, config_sha256 and schema_version, as text.
         damaged: points whose stored fix did not pass its checksum at ``open``; they are planned again.
         failure: the error that ended all writing, if any.
@@ -91,12 +90,8 @@ class MissionStore:
 
         Args:
             path: a file that does not exist.
-            mirror: name of the mirror.
-            seed: seed of the run.
             config_toml: the run's exact configuration; its SHA-256 is kept.
-            points: the mission's points.
             on_failure: called once, from the writer thread, when writing has ended for good.
-            reserve_bytes: room taken on the disk in advance.
 
         Raises:
             StoreError: the file exists, or cannot be made.
@@ -110,7 +105,6 @@ class MissionStore:
         """Open the store of an earlier run to go on with it.
 
         Args:
-            path: the file.
             mirror: the mirror about to be surveyed; must be that of the file.
             on_failure: as for ``create``.
 
@@ -123,7 +117,6 @@ class MissionStore:
         """Store a fix and make its point measured, in one transaction.
 
         Args:
-            point: the point measured.
             fix: the puck in the world frame, with covariance.
             estimate: estimated deck pose at that time.
             remeasure: replace the fix of a point that has one; the old row stays in the table.
@@ -309,8 +302,6 @@ class StoredSurvey(NamedTuple):
     """What a mission database holds.
 
     Attributes:
-        points: all points, by row, column and number.
-        fixes: the fix of each measured point that is sound.
         damaged: points whose fix does not match its checksum.
     """
 
@@ -321,10 +312,6 @@ class StoredSurvey(NamedTuple):
 
 def read_survey(path: Path, mirror: str) -> StoredSurvey:
     """Read a mission database; the file is not changed.
-
-    Args:
-        path: the file.
-        mirror: the mirror that it has to be of.
 
     Raises:
         StoreError: no such file, not a mission store, another schema or mirror, or damaged.

@@ -48,10 +48,7 @@ def arrival_error_m(target: PuckTarget, place_m: FloatArray, normal: Vector3, pu
     """Distance of the puck from its target in the tangent plane of the target's panel, m.
 
     Args:
-        target: where the puck shall be.
         place_m: surface point under the robot, deck frame, shape (3,).
-        normal: of the surface there.
-        puck_height_m: puck centre above the surface.
     """
     offset, across = place_m + puck_height_m * np.array(normal) - target.position_m, np.array(target.normal)
     return float(np.linalg.norm(offset - (offset @ across) * across))
@@ -63,11 +60,7 @@ class RunFacts:
 
     Attributes:
         mirror, world, filter, seed: as configured; ``world`` is None on a real robot.
-        total_points: points of the mission.
         lower_bound_s: rest-to-rest time of the same path under the same limits, with the measuring.
-        budget_s: the mission's budget.
-        puck_height_m: puck centre above the surface.
-        has_truth: simulation.
     """
 
     mirror: str
@@ -88,7 +81,6 @@ class SummaryBuilder:
     forgotten but for their errors.
 
     Args:
-        facts: the run.
         targets: of every point, see ``puck_targets``.
         normal_at: normal of the surface at deck (x, y), deck frame (``mirror.surface.normal``).
     """
@@ -96,7 +88,6 @@ class SummaryBuilder:
     def __init__(
         self, facts: RunFacts, targets: Mapping[PointId, PuckTarget], normal_at: Callable[[float, float], Vector3]
     ) -> None:
-        """Nothing has happened yet."""
         self._facts, self._targets, self._normal_at = facts, targets, normal_at
         self._measured = self._skipped = 0
         self._left_out: Mapping[str, Sequence[str]] = {}

@@ -22,12 +22,7 @@ class Survey(NamedTuple):
     """A run's survey.
 
     Attributes:
-        cfg: its configuration.
-        planned: every point of the mission.
-        measured: those with a sound fix.
         injected: piston (m), tip and tilt (rad) of the simulated panels; None on a real robot or where nothing tells.
-        is_simulation: None where there is no recording to tell.
-        warnings: one line each.
     """
 
     cfg: Config
@@ -42,7 +37,6 @@ def read_run(run_dir: Path, overrides: Mapping[str, object]) -> Survey:
     """Read the survey of a run directory; nothing in it is changed.
 
     Args:
-        run_dir: of a run that is over, goes on or was interrupted.
         overrides: dotted keys of the configuration, stronger than the run's own.
 
     Raises:

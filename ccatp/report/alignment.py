@@ -150,9 +150,7 @@ def table_lines(result: SurveyResult, comparison: Comparison | None, puck_height
     """One line a panel, then the mirror.
 
     Args:
-        result: the alignment.
         comparison: against the simulated truth, if there is one.
-        puck_height_sigma_m: uncertainty that all pistons share.
     """
     if result.panels:
         yield from _panels(result.panels)

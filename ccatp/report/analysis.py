@@ -28,7 +28,6 @@ class ErrorSeries(NamedTuple):
         t_s: robot time since the start of the first session, shape (k,).
         sigma3_mm: three standard deviations of the estimated place, shape (k,).
         error_mm: distance of the true place from the estimated one, shape (k,); NaN where the truth is not known.
-        breaks_s: where a session ends and the next begins.
         fix_t_s, fix_mm, fix_fused: of fixes: how far each moved the estimate, or would have, and whether it was taken.
     """
 
@@ -135,7 +134,6 @@ class TimeBreakdown(NamedTuple):
         least_s: by kind, of the same way from rest to rest; None where the way is not known.
         visits: how often the robot turned, drove, settled, measured, ...
         is_exact: from the log, frame by frame; else sampled from the status.
-        covers: what the least time covers, for the reader.
     """
 
     spent_s: dict[str, float]
@@ -265,5 +263,4 @@ def least_times(record: RunRecord) -> tuple[dict[str, float] | None, str]:
 
 
 def _driven(points: Sequence[PointId | None], measured: set[PointId]) -> int:
-    """Stops up to the last measured one."""
     return max((i + 1 for i, point in enumerate(points) if point in measured), default=0)

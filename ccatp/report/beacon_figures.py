@@ -197,7 +197,6 @@ def ellipse_m(place_m: FloatArray, covariance_m2: FloatArray, sigmas: float = SI
     Args:
         place_m: shape (2,).
         covariance_m2: shape (2, 2).
-        sigmas: half axes in standard deviations.
     """
     values, vectors = np.linalg.eigh(covariance_m2)
     angles = np.linspace(0.0, 2.0 * np.pi, _CORNERS + 1)
@@ -241,7 +240,6 @@ class _Room:
         self.keys.append((name, PolyLine(_KEY_LINE, colour, width + 0.6, dash)))
 
     def dots(self, name: str, places_m: FloatArray, dots: Dots) -> None:
-        """Marks with their key."""
         if len(places_m) == 0:
             return
         one = Dots(np.zeros((1, 2)), min(dots.radius, 4.5), dots.colour, dots.mark, edge=dots.edge)
@@ -249,7 +247,6 @@ class _Room:
         self.keys.append((name, one))
 
     def finish(self, title: str) -> Drawing:
-        """Room behind, keys below."""
         self.plot.frame("x, m", "y, m")
         y = self.plot.bottom + 54.0
         keys, height = _legend(self.keys, y, self.plot.size, self.width)
@@ -257,12 +254,7 @@ class _Room:
 
 
 def beacon_map_figure(record: BeaconRecord, width: float) -> Drawing:
-    """Draw the map.
-
-    Args:
-        record: the mission.
-        width: of the picture, pixels.
-    """
+    """Draw the map."""
     room = _Room(width, *_bounds(record))
     _draw_room(room, record)
     _draw_paths(room, record)

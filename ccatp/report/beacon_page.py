@@ -285,7 +285,6 @@ SECTIONS: tuple[Callable[[BeaconRecord], Section | None], ...] = (
 
 
 def _certain(draw: Callable[[BeaconRecord, float], Drawing | None], record: BeaconRecord, width: float) -> Drawing:
-    """A figure that is known to be there."""
     picture = draw(record, width)
     return Drawing(width, 0.0, (), "") if picture is None else picture
 

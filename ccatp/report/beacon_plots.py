@@ -158,8 +158,6 @@ class MapPicture(NamedTuple):
         names, positions_m, covariance_m2: the map; drawn in its first two coordinates.
         true_m: where the motes are, shape (n, d), or None.
         pairs: measured pairs, indices, shape (e, 2).
-        doubtful: motes that may be elsewhere.
-        title: above the map.
     """
 
     names: Sequence[str]
@@ -177,8 +175,6 @@ class Traces(NamedTuple):
     Attributes:
         low_m, middle_m, high_m: 10, 50 and 90 %, shape (k,).
         expected_m: what the filter expects, median, shape (k,).
-        bound_m: Cramér-Rao bound, or None.
-        runs: how many.
     """
 
     low_m: FloatArray
@@ -193,8 +189,6 @@ def draw_mote_map(picture: MapPicture, traces: Traces | None, out: Path) -> None
     """Draw a map, and beside it the errors where there are some.
 
     Args:
-        picture: the map.
-        traces: errors against updates, or None.
         out: the file; its suffix tells the format (PNG, PDF, SVG).
 
     Raises:
@@ -290,11 +284,7 @@ def draw_slam(run: RecordedRun, track: EstimatedPath, judged: TrackEvaluation, o
     """Draw a track, laid on the truth if there is one, into an image file.
 
     Args:
-        run: the recording.
-        track: what was estimated.
-        judged: its errors and its alignment.
         out: the file; its suffix tells the format (PNG, PDF, SVG).
-        title: first line.
 
     Raises:
         PictureError: the file cannot be written.

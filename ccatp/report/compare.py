@@ -30,7 +30,6 @@ class PanelChange(NamedTuple):
     """One panel, the later survey less the earlier one.
 
     Attributes:
-        panel: which.
         values: piston (m), tip, tilt (rad), shape (3,).
         sigma: standard deviations of these, shape (3,).
         chi2: of no change at all, three degrees of freedom.
@@ -246,9 +245,7 @@ def distribution_figure(values: Mapping[str, FloatArray], label: str, width: flo
     """Share of the values below each number, for each run, on a logarithmic axis.
 
     Args:
-        values: by the name of the run, none of them empty.
         label: what they are, with their unit.
-        width: of the picture, pixels.
     """
     is_wide = width > 500.0
     left, top, right, bottom = 62.0, 12.0, width - 12.0, 240.0

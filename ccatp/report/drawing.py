@@ -29,8 +29,6 @@ class PolyLine:
 
     Attributes:
         points: shape (k, 2); rows of NaN part it.
-        colour: of the stroke.
-        width: of the stroke.
         dash: lengths of stroke and gap; empty for a full line.
         opacity: 0 to 1.
     """
@@ -69,11 +67,8 @@ class Dots:
 
     Attributes:
         places: centres, shape (k, 2).
-        radius: half their size.
         colour: of the inside of a disc, of the stroke of a ring or a cross.
-        mark: disc, ring or cross.
         titles: what each says when it is pointed at; empty or k texts.
-        edge: colour of a thin line around a disc.
     """
 
     places: FloatArray
@@ -106,8 +101,6 @@ class Drawing:
     """Shapes, the later above the earlier.
 
     Attributes:
-        width, height: of the whole.
-        shapes: what is on it.
         title: what it shows, in one line, for those who cannot see it and for file names.
     """
 
@@ -132,7 +125,6 @@ class ColourScale:
 
     Attributes:
         low, high: numbers at the ends, low < high.
-        stops: colours at equal distances.
     """
 
     low: float
@@ -185,8 +177,6 @@ class PlotAxis:
 
     Attributes:
         low, high: numbers at the ends; above 0 where logarithmic.
-        start, end: pixels there.
-        is_logarithmic: equal ratios are equal lengths.
     """
 
     low: float
@@ -221,14 +211,7 @@ def number_text(value: float) -> str:
 
 @dataclass(slots=True)
 class Plot:
-    """A rectangle with two axes, and the shapes on it, in pixels.
-
-    Attributes:
-        left, top, right, bottom: of the rectangle.
-        x, y: its axes.
-        size: of the numbers beside it.
-        shapes: what was drawn.
-    """
+    """A rectangle with two axes, and the shapes on it, in pixels."""
 
     left: float
     top: float
@@ -278,14 +261,7 @@ class Plot:
 def legend(
     x: float, y: float, entries: Sequence[tuple[str, str]], size: float, most: float
 ) -> tuple[list[Shape], float]:
-    """Coloured squares with names, in lines no longer than ``most``; returns them, and the height of them all.
-
-    Args:
-        x, y: left end and baseline of the first line.
-        entries: name and colour.
-        size: of the type.
-        most: pixels in a line.
-    """
+    """Coloured squares with names, in lines no longer than ``most``; returns them, and the height of them all."""
     shapes: list[Shape] = []
     at, line = x, y
     for name, colour in entries:
@@ -333,7 +309,6 @@ def svg_of(picture: Drawing, *, is_file: bool = False) -> str:
     """The picture as an ``svg`` element that shrinks with its page; with ``is_file``, as a file of its own.
 
     Args:
-        picture: what to write.
         is_file: a document of its own has a size and names its language.
     """
     name = escape(picture.title, quote=True)

@@ -34,11 +34,9 @@ class PointVerdict(NamedTuple):
     """One measurement point.
 
     Attributes:
-        point: which.
         place_m: deck x, y.
         first_mm: distance at the first arrival, before any correction; None where nobody knows.
         left_mm: distance where it was measured, as the laser saw it; None without a fix.
-        grade: pass or fail.
         why: why it was left out; empty where it was not, or nobody said.
     """
 
@@ -137,7 +135,6 @@ def _reasons(record: RunRecord) -> dict[PointId, str]:
 
 
 def _parsed(name: str) -> PointId | None:
-    """``row/column/number``, or the same with dashes."""
     parts = name.replace("-", "/").split("/")
     return PointId(*map(int, parts)) if len(parts) == 3 and all(part.isdecimal() for part in parts) else None
 
@@ -160,13 +157,7 @@ class Findings:
     """A run and what follows from it. What the run does not hold is None or empty.
 
     Attributes:
-        record: the run.
-        outcome: how it ended.
-        points: pass or fail of each.
         errors: localization error over time, and ``figures`` of its distribution.
-        budget: where the time went.
-        alignment: how the panels lie.
-        against: recovered against injected misalignment.
     """
 
     record: RunRecord

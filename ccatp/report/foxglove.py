@@ -191,10 +191,8 @@ def point_scene(
     """The measured points of some panels.
 
     Args:
-        mirror: where they lie.
         panels: each becomes an entity of its own, which replaces the older one.
         deviations_m: of each measured point from the ideal surface along the normal, m.
-        timestamp: of the entities.
     """
     entities = []
     for panel in panels:
@@ -254,11 +252,7 @@ def robot_rotation(mirror: Mirror, pose: DeckPose) -> Quaternion:
 
 
 def quaternion(axes: tuple[Sequence[float], Sequence[float], Sequence[float]]) -> Quaternion:
-    """The rotation that takes x, y, z to three right-handed unit vectors (Shepperd 1978: divide by the largest).
-
-    Args:
-        axes: where x, y and z come to lie.
-    """
+    """The rotation that takes x, y, z to three right-handed unit vectors (Shepperd 1978: divide by the largest)."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = axes
     trace = xx + yy + zz
     squares = (trace, 2.0 * xx - trace, 2.0 * yy - trace, 2.0 * zz - trace)
@@ -283,7 +277,6 @@ def plain_schema(schema: Mapping[str, Any], title: str) -> Schema:
 
     Args:
         schema: as ``msgspec.json.schema`` makes it.
-        title: its name.
     """
     return {**_resolved(schema, schema.get("$defs", {})), "title": title}
 

@@ -34,13 +34,7 @@ def shown(value: Cell, decimals: int = 2) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
-    """A table that scrolls sideways where the page is too narrow; the first cell of a row is its name.
-
-    Args:
-        head: names of the columns.
-        rows: cells, as markup already.
-        kind: class of the table.
-    """
+    """A table that scrolls sideways where the page is too narrow; the first cell of a row is its name."""
     top = "".join(f'<th scope="col">{text(name)}</th>' for name in head)
     body = "".join(
         f'<tr><th scope="row">{first}</th>{"".join(f"<td>{cell}</td>" for cell in rest)}</tr>' for first, *rest in rows
@@ -54,12 +48,7 @@ def facts(pairs: Mapping[str, str]) -> str:
 
 
 def figure(draw: Callable[[float], Drawing], caption: str) -> str:
-    """A picture in two layouts, of which the page shows one.
-
-    Args:
-        draw: draws it in a width, in pixels.
-        caption: markup already.
-    """
+    """A picture in two layouts, of which the page shows one."""
     wide, narrow = draw(WIDE), draw(NARROW)
     return (
         f'<figure><div class="wide">{svg_of(wide)}</div><div class="narrow">{svg_of(narrow)}</div>'
@@ -95,12 +84,7 @@ def head(
     """The head as markup.
 
     Args:
-        record: the run.
         chip: of ``chips``.
-        title: the heading.
-        outcome: how it ended.
-        warnings: one line each.
-        headline: figures by name, as markup.
     """
     began = next((line.wall[:19].replace("T", " ") + " UTC" for line in record.log if line.wall), "")
     cause = f": {text(outcome.cause)}" if outcome.cause else ""
@@ -113,12 +97,7 @@ def head(
 
 
 def chips(is_simulation: bool | None, simulated: str) -> str:
-    """What kind of run it was, so that nobody takes a simulation for the telescope.
-
-    Args:
-        is_simulation: None where no recording tells.
-        simulated: which simulation it was.
-    """
+    """What kind of run it was, so that nobody takes a simulation for the telescope."""
     if is_simulation:
         return f'<span class="chip sim">SIMULATION, {text(simulated)}</span>'
     known = "real robot" if is_simulation is False else "robot or simulation: no recording tells"
@@ -206,10 +185,7 @@ def page(title: str, head: str, sections: Sequence[Section], foot: str) -> str:
     """The whole file.
 
     Args:
-        title: of the window.
         head: what stands above the sections, as markup.
-        sections: in their order.
-        foot: the last line, as markup.
     """
     links = "".join(f'<a href="#{text(section.anchor)}">{text(section.title)}</a>' for section in sections)
     parts = "".join(

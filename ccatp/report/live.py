@@ -61,8 +61,6 @@ class PlotJugglerStream:
     """Messages of three frames: topic, JSON, time as ASCII seconds.
 
     Args:
-        context: ZeroMQ context of the process.
-        host: where to listen.
         port: 0 takes any free one.
 
     Raises:
@@ -70,7 +68,6 @@ class PlotJugglerStream:
     """
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], host: str, port: int) -> None:
-        """Bind."""
         self._latched: dict[str, ViewMessage] = {}
         self._socket = context.socket(zmq.XPUB)
         self._socket.setsockopt(zmq.SNDHWM, HIGH_WATER_MARK)
@@ -113,17 +110,13 @@ class FoxgloveStream:
     """A WebSocket server for Foxglove and Lichtblick; needs the extra ``foxglove``.
 
     Args:
-        name: what viewers show as the source.
-        host: where to listen.
         port: 0 takes any free one.
-        schemas: name and JSON schema of every topic.
 
     Raises:
         StreamError: the extra is not installed, or the port is taken.
     """
 
     def __init__(self, name: str, host: str, port: int, schemas: Iterable[tuple[str, Mapping[str, Any]]]) -> None:
-        """Advertise all topics."""
         try:
             import foxglove  # noqa: PLC0415 - belongs to an extra
             from foxglove.websocket import ServerListener  # noqa: PLC0415

@@ -84,8 +84,6 @@ def new_figure(
     """A figure that no window shows.
 
     Args:
-        width_in, height_in: its size, inches.
-        dpi: pixels an inch.
         layout: how matplotlib places what is in it; None where every place is given.
     """
     from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second
@@ -110,7 +108,6 @@ def save_figure(figure: "Figure", path: Path, dpi: float | None = None) -> None:
     """Write a figure; the same figure gives the same bytes on every day.
 
     Args:
-        figure: the figure.
         path: its suffix tells the format (PNG, PDF, SVG).
         dpi: pixels an inch, if not the figure's own.
 
@@ -238,9 +235,7 @@ def new_deck_map(mirror: Mirror, width_px: float, dpi: float) -> "tuple[Figure, 
     """A figure with the panels, their columns and rows, and the rim; both axes in metres, to the same scale.
 
     Args:
-        mirror: what is shown.
         width_px: of the picture; its height follows.
-        dpi: pixels an inch.
     """
     low, high = mirror.rim.vertices.min(axis=0) - _MARGIN_M, mirror.rim.vertices.max(axis=0) + _MARGIN_M
     width = width_px / dpi
@@ -330,11 +325,8 @@ def draw_run_map(
     """Draw the map of a run into an image file.
 
     Args:
-        mirror: where it took place.
         path_xy: driven path, deck frame, shape (n, 2), m; rows of NaN part it.
-        points: the measurement points.
         out: the file; its suffix tells the format (PNG, PDF, SVG).
-        title: first line: mirror, points, time.
         subtitle: second line: seed, world, errors.
 
     Raises:
@@ -445,8 +437,6 @@ def draw_plan(mirror: Mirror, plan: SurveyPlan, out: Path) -> None:
     """Draw a plan into an image file.
 
     Args:
-        mirror: where the survey would be.
-        plan: its plan.
         out: the file; its suffix tells the format (PNG, PDF, SVG).
 
     Raises:
@@ -506,11 +496,7 @@ def draw_alignment(mirror: Mirror, result: SurveyResult, out: Path, title: str, 
     measured at its place in the same colours, so that it vanishes where the fit agrees with it; a cross is an outlier.
 
     Args:
-        mirror: the mirror.
-        result: its alignment.
         out: the file; its suffix tells the format (PNG, PDF, SVG).
-        title: first line.
-        subtitle: second line.
 
     Raises:
         PictureError: the file cannot be written.

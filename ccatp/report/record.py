@@ -65,10 +65,7 @@ class RecordedSession:
     """One recording; a run that was resumed has several.
 
     Attributes:
-        name: of the file.
-        version: of the ccatp that recorded it.
         track, truth: poses; truth is None on a real robot.
-        arrivals, fixes, statuses, verdicts: messages in the order of recording.
         changes: of the mission's state, from the log; empty where the log does not tell them in order.
     """
 
@@ -109,15 +106,9 @@ class RunFiles:
     """What every run leaves behind, whatever its mission.
 
     Attributes:
-        name: how the reader called it: its directory.
-        config_text: its configuration file.
         changed: keys with another value than the shipped one: value of the run, and shipped value.
-        is_simulation: None where there is no recording to tell.
         summary: ``summary.json``; None where the run did not come to write one.
-        log: what the processes said, without what they said for debugging.
-        files: names and sizes in bytes.
         missing: what a complete run would hold and this one does not, one line each.
-        warnings: what is damaged, one line each.
     """
 
     name: str
@@ -136,11 +127,7 @@ class RunRecord(RunFiles):
     """A survey.
 
     Attributes:
-        cfg: configuration.
-        mirror: the mirror.
-        sessions: recordings, oldest first.
         points: of the mission database, by row, column and number; None where there is none.
-        measured: points with a sound fix.
         injected: piston (m), tip and tilt (rad) of the simulated panels.
     """
 
@@ -183,12 +170,7 @@ class BeaconRecord(RunFiles):
     """A mission among beacons.
 
     Attributes:
-        version: of the program that recorded it.
-        cfg: configuration.
-        track: estimates of all frames.
         truth: in the same frames, NaN where there is none; None on a real robot.
-        maps, arrivals, statuses, verdicts: messages in the order of recording.
-        places: where the beacons really are.
     """
 
     version: str
@@ -255,10 +237,6 @@ class WaypointRow(NamedTuple):
     Attributes:
         number: over all laps, from 1.
         lap, waypoint: from 1.
-        t_s: robot time.
-        place_m: where it is.
-        sigma_m: of the estimated place, worst direction.
-        estimate_off_m: distance of the estimated place from the waypoint.
         true_off_m: of the true place; None without a truth.
         error_m: distance of the estimated place from the true one.
         sigmas: the same in standard deviations, root(e^T P^-1 e).

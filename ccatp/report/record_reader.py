@@ -63,8 +63,6 @@ _TRACK_COLUMNS, _TRUTH_COLUMNS = 8, 11
 
 
 class _Collected:
-    """What a recording holds, sorted by kind."""
-
     def __init__(self) -> None:
         self.track: list[FloatArray] = []
         self.truth: list[FloatArray] = []
@@ -74,7 +72,6 @@ class _Collected:
         self.verdicts: list[DangerEvent] = []
 
     def take(self, message: object) -> None:
-        """Put one message where it belongs."""
         if isinstance(message, TrackMessage):
             self.track.append(np.array(message.rows, dtype=np.float64).reshape(-1, _TRACK_COLUMNS))
         elif isinstance(message, TruthMessage):
@@ -93,10 +90,7 @@ def read_session(path: Path, mirror: Mirror, changes: Sequence[StateChange], war
     """Read a recording up to its end or its first damage.
 
     Args:
-        path: the file.
-        mirror: to bring panel frames together.
         changes: of the mission's state in this session, from the log.
-        warnings: takes a line for each damage.
 
     Raises:
         OSError: it cannot be read at all.
@@ -290,9 +284,6 @@ BEACON_TOPICS_READ = frozenset(
 def read_beacon_record(run_dir: Path) -> BeaconRecord:
     """Everything that a report tells of a mission among beacons.
 
-    Args:
-        run_dir: a directory with the configuration of such a mission.
-
     Raises:
         ConfigError: its configuration cannot be used.
     """
@@ -334,8 +325,6 @@ def read_beacon_record(run_dir: Path) -> BeaconRecord:
 
 
 class _BeaconReportReaderCollected:
-    """What the recordings hold, sorted by kind."""
-
     def __init__(self) -> None:
         self.version = "unknown"
         self.is_simulation: bool | None = None
@@ -394,6 +383,5 @@ def _rows_of(batches: Sequence[FloatArray], columns: int) -> FloatArray:
 
 
 def _changed_keys(cfg: RadioConfig) -> dict[str, tuple[object, object]]:
-    """Keys other than as shipped with the same system."""
     shipped = load_radio_config(None, {"system": cfg.system})
     return changed_keys(cfg.model_dump(mode="json"), shipped.model_dump(mode="json"))

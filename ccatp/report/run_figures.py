@@ -60,12 +60,7 @@ _LEAST_MM = 1e-3  # a micrometre: less is of no interest, and of the noise of th
 
 
 def error_figure(series: ErrorSeries, width: float) -> Drawing:
-    """Draw the series; where no truth is known, three sigma and the fixes alone.
-
-    Args:
-        series: of the run.
-        width: of the picture, pixels.
-    """
+    """Draw the series; where no truth is known, three sigma and the fixes alone."""
     is_wide = width > 500.0
     left, top, right, bottom = 62.0, 10.0, width - 12.0, _HEIGHT_WIDE if is_wide else _HEIGHT_NARROW
     y = PlotAxis(*_ends(series), bottom, top, is_logarithmic=True)
@@ -114,7 +109,6 @@ def _band(plot: Plot, found: Envelope, colour: str) -> None:
 
 
 def _runs(x: FloatArray) -> list[slice]:
-    """Stretches without a gap."""
     if len(x) < 2:
         return []
     steps = np.diff(x)
@@ -147,9 +141,7 @@ def time_figure(budgets: Sequence[tuple[str, TimeBreakdown]], budget_s: float, w
     """Draw the bars.
 
     Args:
-        budgets: runs by name.
         budget_s: what a mission may take; marked where it is near.
-        width: of the picture, pixels.
     """
     size = 11.5 if width > 500.0 else 10.5
     bars = [bar for name, found in budgets for bar in _bars(name, found)]
@@ -198,13 +190,7 @@ _MARGIN_M = 0.04  # around the rim
 
 @dataclass(slots=True)
 class MapFrame:
-    """A map of a mirror, deck frame: x to the right, y up.
-
-    Attributes:
-        mirror: what is shown.
-        width: of the picture, pixels.
-        shapes: what was drawn.
-    """
+    """A map of a mirror, deck frame: x to the right, y up."""
 
     mirror: Mirror
     width: float
@@ -297,7 +283,6 @@ class MapFrame:
         Args:
             scale: of the colours, and ``label`` what they mean; None where they mean nothing.
             keys: names, each with a shape drawn around the origin.
-            title: what the picture shows.
         """
         y = self.bottom + 2.2 * self.size + 12.0
         if scale is None:
@@ -345,13 +330,7 @@ def driven_path_m(record: RunRecord) -> FloatArray:
 
 
 def path_figure(record: RunRecord, verdicts: list[PointVerdict], width: float) -> Drawing:
-    """Draw the map.
-
-    Args:
-        record: the run.
-        verdicts: of its points.
-        width: of the picture, pixels.
-    """
+    """Draw the map."""
     frame = MapFrame(record.mirror, width)
     frame.draw_panels()
     frame.draw_rim()
@@ -455,10 +434,6 @@ def surface_figure(
     """Draw the map: dots show what was measured in the same colours, and vanish where the fit agrees with it.
 
     Args:
-        mirror: the mirror.
-        panels: those that could be fitted.
-        title: what the picture shows.
-        width: of the picture, pixels.
         scaled_as: panels that the colours are to span; those shown if not given.
     """
     frame = MapFrame(mirror, width)
@@ -492,7 +467,6 @@ def _surface_figure_scale(values_m: Sequence[FloatArray]) -> ColourScale:
 
 
 def _draw_cells(frame: MapFrame, cells: Sequence[PanelCells], scale: ColourScale) -> None:
-    """Panels, their values in colour, seams and rim."""
     frame.draw_panels()
     corners, values = [np.empty((0, 4))], [np.empty(0)]
     for x, y, found in cells:

@@ -178,7 +178,6 @@ def _kind(kind: Gathered) -> list[str]:
 
 
 def _when(line: LogLine) -> str:
-    """Robot time where it is known."""
     return f"{shown(line.t_s)} s" if line.t_s is not None else text(line.wall[11:19]) or shown(None)
 
 
@@ -232,7 +231,6 @@ def _point_cell(verdict: PointVerdict | None) -> str:
 
 
 def _cells_with_classes(markup: str) -> str:
-    """``<td>@pass@0.05`` as a cell of that class."""
     for kind in (*_SECTIONS_CLASSES.values(), "open"):
         markup = markup.replace(f"<td>@{kind}@", f'<td class="{kind}">')
     return markup

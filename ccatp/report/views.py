@@ -99,9 +99,6 @@ class TopicView(NamedTuple):
     """One row of the table of views.
 
     Attributes:
-        name: the topic.
-        message: its type.
-        schema_name: what viewers know it by.
         is_latched: the last message holds until another one comes.
     """
 
@@ -168,15 +165,9 @@ def view_schemas() -> list[tuple[str, dict[str, Any]]]:
 
 
 class Views:
-    """Derives the views of one run.
-
-    Args:
-        mirror: where it takes place.
-        puck_height_m: above the surface along its normal.
-    """
+    """Derives the views of one run."""
 
     def __init__(self, mirror: Mirror, puck_height_m: float) -> None:
-        """Nothing seen yet."""
         self._mirror, self._puck_height_m = mirror, puck_height_m
         self._deviations_m: dict[PointId, float] = {}
         # Of one frame either may come first; what has no partner is not kept for ever.

@@ -24,13 +24,7 @@ class ReportError(CcatpError):
 
 
 class Report(NamedTuple):
-    """A report that was written.
-
-    Attributes:
-        path: of the page.
-        data: its figures.
-        warnings: what of the run is damaged, one line each.
-    """
+    """A report that was written."""
 
     path: Path
     data: dict[str, Any]
@@ -41,7 +35,6 @@ def report_run(run_dir: Path, out: Path | None = None, figures: Path | None = No
     """Write the report of a run.
 
     Args:
-        run_dir: its directory.
         out: the page; ``report.html`` in the run directory if not given.
         figures: a directory for the figures as SVG, PNG and PDF; none are written if not given.
 
@@ -70,8 +63,6 @@ def compare_runs(run_a: Path, run_b: Path, out: Path, figures: Path | None = Non
     """Write two runs beside each other.
 
     Args:
-        run_a, run_b: their directories.
-        out: the page.
         figures: a directory for the figures; none are written if not given.
 
     Raises:

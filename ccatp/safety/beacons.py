@@ -37,13 +37,10 @@ class ObstacleBuffer:
     """Points in the frame of dead reckoning. Over its short memory that drifts by less than a sensor's noise.
 
     Args:
-        sensors_rad: where the sensors look, left of the heading.
         reach_m: farther echoes are not kept.
-        memory_s: how long one is believed.
     """
 
     def __init__(self, sensors_rad: Sequence[float], reach_m: float, memory_s: float) -> None:
-        """Nothing seen."""
         self._sensors_rad, self._reach_m, self._memory_s = tuple(sensors_rad), reach_m, memory_s
         self._echoes: deque[_Obstacle] = deque()
         self._x_m = self._y_m = self._heading_rad = self._steer_rad = 0.0
@@ -52,9 +49,7 @@ class ObstacleBuffer:
         """The robot has moved.
 
         Args:
-            way_m: negative in reverse.
             course_rad: of the way, left of the heading before: the steering angle of a steered front wheel.
-            turn_rad: of the heading.
         """
         along_rad = self._heading_rad + course_rad
         self._x_m += way_m * cos(along_rad)
@@ -96,13 +91,9 @@ class BeaconSafetyRules:
 
     Args:
         cfg: the configuration; nothing of ``sim`` is used.
-
-    Attributes:
-        latch: of emergencies.
     """
 
     def __init__(self, cfg: RadioConfig) -> None:
-        """Nothing heard yet."""
         self._danger, self._follow, self._loss = cfg.danger, cfg.follow, cfg.path_loss
         self._avoidance, self._vehicle, self._radius_m = cfg.avoidance, cfg.vehicle, cfg.robot.wheel_radius_m
         self.latch = EmergencyLatch()
@@ -159,8 +150,6 @@ class BeaconSafetyRules:
 
         Args:
             sensors: the frame.
-            extras: its keys of a robot among beacons.
-            estimate: main's newest.
         """
         self._frame_seq = sensors.seq
         self._hear(sensors.t, extras)
@@ -228,7 +217,6 @@ class BeaconSafetyRules:
             self._rolled_to_s = sensors.t
 
     def _hold(self, t_s: float, estimate: EstimateMessage | None) -> tuple[str, str, float, float] | None:
-        """Why nothing is permitted: cause, signal, value, limit."""
         danger = self._danger
         heard_s = t_s if self._heard_s is None else self._heard_s
         if t_s - heard_s > danger.radio_timeout_s:

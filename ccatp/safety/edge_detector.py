@@ -74,7 +74,6 @@ class EdgeMap:
     """Look-ups of the edge rule in the deck plane, metres."""
 
     def __init__(self, mirror: MirrorMap) -> None:
-        """Keep the mirror."""
         self._mirror = mirror
         self._rim = mirror.rim
         self.gap_m = mirror.gap_m
@@ -91,8 +90,6 @@ class EdgeMap:
         Args:
             place: deck (x, y), m.
             direction: unit vector in the deck plane.
-            reach_m: how far ahead to look.
-            slack_m: uncertainty of the place in every direction.
         """
         x, y = place
         if self._rim.signed_distance_m(x, y) > reach_m + slack_m:
@@ -113,7 +110,6 @@ class EdgeMap:
 
         Args:
             place: deck (x, y), m.
-            slack_m: uncertainty of the place across the seam.
             not_axis: leave out the seams along which this coordinate is constant.
         """
         x, y = place
@@ -166,15 +162,9 @@ class Cause(StrEnum):
 
 
 class EdgeLimits:
-    """The limits of the edge rule.
-
-    Args:
-        gap_m: width of the seams.
-        cfg: the danger loop's configuration.
-    """
+    """The limits of the edge rule."""
 
     def __init__(self, gap_m: float, cfg: DangerConfig) -> None:
-        """Copy what the rule needs."""
         self.sigmas, self.margin_m = cfg.map_sigmas, cfg.map_margin_m
         self.gap_m, self.tolerance_m, self.extra_m = gap_m, cfg.gap_tolerance_m, cfg.seam_extra_m
         self.no_map_m, self.turn_m = cfg.no_map_travel_m, cfg.turn_travel_limit_m
@@ -191,18 +181,12 @@ class EdgeDetector:
     """A sensor's time off the panels. Places are in the odometry's frame unless called map places.
 
     Args:
-        limits: the rule's limits.
-        edge_map: the map.
-        odometry: the robot at the first off sample.
         sensor: its place in the robot frame, and how far it moves between two samples, which is how late it may have
             been noticed, m.
         half_base_m: half the wheel base; less translation than that per radian means turning in place.
 
     Attributes:
-        phase: what is known.
-        cause, value_m, limit_m: the declared edge: why, and the travel against its limit.
         retreat_m: how far the sensor has been moved since it was declared, while it stayed off.
-        is_doubted: the sensor is to blame, and no edge.
     """
 
     def __init__(
@@ -213,7 +197,6 @@ class EdgeDetector:
         sensor: tuple[Place, float],
         half_base_m: float,
     ) -> None:
-        """Open at the first off sample."""
         self._limits, self._map = limits, edge_map
         offset_m, moved_m = sensor
         self._radius_m, self._half_base_m, self._moved_m = hypot(*offset_m), half_base_m, moved_m
@@ -274,8 +257,6 @@ class EdgeDetector:
         """The sensor is off at ``place``. Returns whether that declares an edge now.
 
         Args:
-            odometry: the robot.
-            place: the sensor.
             worst_m: travel that wheels unheard may have added, rule (g).
         """
         self._off_samples += 1

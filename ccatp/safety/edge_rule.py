@@ -68,11 +68,6 @@ class PoseEstimate(Protocol):
 class EdgeRule:
     """The four sensors' episodes and what they declare.
 
-    Args:
-        edge_map: the mirror as the rule sees it.
-        robot: wheels and sensor places.
-        cfg: distances and counts.
-
     Attributes:
         episodes: one per sensor, in the order of the robot link.
         is_lifted: all four sensors have been off (rule h), and have not been back on for ``clear_samples``.
@@ -80,7 +75,6 @@ class EdgeRule:
     """
 
     def __init__(self, edge_map: EdgeMap, robot: RobotConfig, cfg: DangerConfig) -> None:
-        """All sensors on."""
         self._map = edge_map
         self._offsets = robot.edge_sensors_m
         reach_s = 2.0 * max(cfg.stale_after_s, cfg.estimate_stale_after_s)
@@ -165,7 +159,6 @@ class EdgeRule:
                 self._place(episode, self._offsets[i], odometry, estimate)
 
     def _has_fix(self, odometry: Odometry, sigma_m: float) -> bool:
-        """Whether the robot stands and has just been measured."""
         is_still = abs(odometry.v_m_s) + abs(odometry.omega_rad_s) * self._half_base_m < _STILL_M_S
         has_fix = is_still and sigma_m < _BY_A_FIX * self._vague_m
         self._vague_m = max(self._vague_m, sigma_m) if is_still and not has_fix else sigma_m
@@ -264,18 +257,14 @@ class CentreClearanceCheck:
     away than it takes to declare.
 
     Args:
-        rim: the mirror's outline.
-        robot: wheels and sensor places.
         cfg: sigmas and margin.
 
     Attributes:
         direction: 0, or the sign of the motion that is barred.
         clearance_m, limit_m: the centre's distance to the rim at the last look, and what it must not fall below.
-        declared: how often an edge was declared.
     """
 
     def __init__(self, rim: RimMap, robot: RobotConfig, cfg: DangerConfig) -> None:
-        """Nothing barred."""
         self._rim = rim
         self._lead_m = min(min(abs(x), abs(y)) for x, y in robot.edge_sensors_m)
         self._sigmas, self._margin_m = cfg.map_sigmas, cfg.map_margin_m
@@ -294,7 +283,6 @@ class CentreClearanceCheck:
 
         Args:
             t_s: time of the frame.
-            estimate: a fresh pose.
             wheels: the frame's encoder samples.
         """
         if t_s < self._look_at_s:

@@ -41,7 +41,6 @@ class EmergencyLatch:
     """
 
     def __init__(self) -> None:
-        """Nothing active."""
         self._active: dict[str, Emergency] = {}
         self._cleared: dict[str, None] = {}
         self._levels: set[EmergencyKind] = set()
@@ -100,10 +99,6 @@ class EmergencyLatch:
 
     def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
         """End one emergency.
-
-        Args:
-            emergency_id: the id it was raised with.
-            at_base_or_held: whether the robot is at base or held.
 
         Returns:
             Why it was refused, or None. Clearing a cleared id is harmless.

@@ -16,12 +16,7 @@ class MonitorFinding(NamedTuple):
     """Something is wrong.
 
     Attributes:
-        severity: what has to be done.
-        cause: why, in one short phrase.
-        signal: what gave cause.
         value: its value, in the unit of ``limit``.
-        limit: the limit that it passed.
-        full_fans: the fans shall give all they can.
         retries: how often it may come again before it is a fault; ``None``: as often as the configuration says.
         patience_s: a hold that lasts longer is a fault; ``None``: as the configuration says.
     """
@@ -39,9 +34,6 @@ class MonitorFinding(NamedTuple):
 class FindingLatch:
     """A finding that stays until there has been no evidence of it for a while.
 
-    Args:
-        clear_s: that while.
-
     Attributes:
         finding: the finding, or ``None``.
     """
@@ -49,7 +41,6 @@ class FindingLatch:
     __slots__ = ("_clear_s", "_seen_s", "finding")
 
     def __init__(self, clear_s: float) -> None:
-        """Nothing found."""
         self._clear_s = clear_s
         self.reset()
 
@@ -112,13 +103,9 @@ class SeverityEscalation:
     A pause that lasts for longer than ``pause_limit_s`` is a hold, so that a fix is had before going on; a hold that
     lasts for longer than its patience is a fault, because it does not pass by itself; a hold for the same signal that
     comes more than ``retries`` times again within ``retry_window_s`` is one, too.
-
-    Args:
-        cfg: these times.
     """
 
     def __init__(self, cfg: HealthConfig) -> None:
-        """Nothing found."""
         self._cfg = cfg
         self._since_s: dict[str, float] = {}
         self._held: dict[str, deque[float]] = {}

@@ -93,16 +93,9 @@ class HealthMonitor:
     """All monitors but the edge rule's.
 
     Args:
-        cfg: their limits.
         danger: sigmas of the map.
-        robot: wheels, sensors, fan duties.
-        ground: the map under the edge sensors.
         base_m: where base is, deck frame.
-        overhang: whether the robot falls without its fans.
         is_explained: whether the map has an edge of a panel near a sensor.
-
-    Attributes:
-        findings: everything found, as it is now.
     """
 
     def __init__(
@@ -115,7 +108,6 @@ class HealthMonitor:
         overhang: bool,
         is_explained: Callable[[int], bool],
     ) -> None:
-        """Nothing found."""
         self._cfg, self._radius_m, self._base_m = cfg, robot.wheel_radius_m, base_m
         self._means = WheelMeans(robot)
         self._gate = ImuGate(cfg)
@@ -196,10 +188,7 @@ class HealthMonitor:
         """Look at a frame.
 
         Args:
-            t_s: its steady time.
             frame: the frame.
-            wheels, edges: its samples with steady times.
-            is_permitted: the last verdict permitted every motion.
             is_any_off: an edge sensor is off, or has just been.
         """
         dt_s = 0.0 if self._t_s is None else t_s - self._t_s
@@ -293,7 +282,6 @@ class HealthMonitor:
         """Take what the wheels were told, from an estimate that may be too old for anything else.
 
         Args:
-            t_s: its steady time.
             estimate: the estimate; one that was heard already changes nothing.
         """
         if estimate.seq == self._heard_seq:
@@ -306,10 +294,7 @@ class HealthMonitor:
         """Take an estimate of main's that is fresh; one that was taken already changes nothing.
 
         Args:
-            t_s: its steady time.
-            estimate: the estimate.
             opened: how often each edge sensor left the panels so far.
-            is_off: for each whether it is off the panels.
         """
         if estimate.seq == self._estimate_seq:
             return

@@ -27,16 +27,10 @@ class FanMonitor:
     for the robot to report (``fan_left``, ``fan_right``).
 
     Args:
-        cfg: limits.
         duty: what main tells the fans, left and right; it never tells them less.
-        overhang: whether the robot falls without them.
-
-    Attributes:
-        alarm: what was found.
     """
 
     def __init__(self, cfg: HealthConfig, duty: tuple[float, float], overhang: bool) -> None:
-        """Nothing found."""
         self._cfg, self._overhang = cfg, overhang
         self._enough = cfg.fan_early_share * duty[0], cfg.fan_early_share * duty[1]
         self._least = cfg.fan_share * duty[0], cfg.fan_share * duty[1]
@@ -84,15 +78,11 @@ class FanMonitor:
 class BatteryMonitor:
     """Whether the charge still is enough for the way home.
 
-    Args:
-        cfg: limits.
-
     Attributes:
         alarm: what was found; stays, because a battery does not charge on the way.
     """
 
     def __init__(self, cfg: HealthConfig) -> None:
-        """Nothing found."""
         self._cfg = cfg
         self.finding: MonitorFinding | None = None
         self.reset()
@@ -105,10 +95,7 @@ class BatteryMonitor:
         """Judge a frame.
 
         Args:
-            t_s: its time.
             soc: charge, 0 to 1.
-            is_told: the robot itself reports a low battery.
-            home_m: distance to base as the crow flies.
         """
         cfg = self._cfg
         least = cfg.battery_reserve
@@ -122,17 +109,9 @@ class BatteryMonitor:
 
 
 class OwnFaults:
-    """Faults that the robot reports of itself, but those of fans and battery.
-
-    Args:
-        cfg: limits.
-
-    Attributes:
-        alarms: what was found, by name.
-    """
+    """Faults that the robot reports of itself, but those of fans and battery."""
 
     def __init__(self, cfg: HealthConfig) -> None:
-        """Nothing reported."""
         self._clear_s = cfg.retry_after_s
         self.alarms: dict[str, FindingLatch] = {}
 

@@ -27,12 +27,8 @@ class SteadyTime:
     between; further off than ``limit_s``, or backward, it has jumped, and counting goes on by the period. A real gap
     without frames whose numbers go on looks the same, and is left out likewise.
 
-    Args:
-        limit_s: a jump.
-
     Attributes:
         jump: the newest jump, ``None`` before the first.
-        offset_s: steady time less the robot's.
     """
 
     def __init__(self, limit_s: float) -> None:

@@ -32,15 +32,10 @@ class FlickerMonitor:
     Standing at an edge of a panel a sensor may chatter as it likes: vibration does that.
 
     Args:
-        cfg: limits.
         is_explained: whether the map, at the newest estimate, has an edge of a panel near a sensor (by its index).
-
-    Attributes:
-        chatter, flash: what was found.
     """
 
     def __init__(self, cfg: HealthConfig, is_explained: Callable[[int], bool]) -> None:
-        """All sensors on."""
         self._cfg, self._is_explained = cfg, is_explained
         self.chatter, self.flash = FindingLatch(cfg.retry_after_s), FindingLatch(_CLEAR_S)
         self.reset()
@@ -59,13 +54,7 @@ class FlickerMonitor:
         return self._last == (1, 1, 1, 1) and self.chatter.finding is None and self.flash.finding is None
 
     def step(self, t_s: float, samples: Sequence[EdgeSample], speed_m_s: float) -> None:
-        """Judge a frame.
-
-        Args:
-            t_s: its time.
-            samples: its edge samples, oldest first.
-            speed_m_s: of the faster wheel.
-        """
+        """Judge a frame."""
         since_s = t_s - self._cfg.chatter_time_s
         for sample in samples:
             state = sample[1:]
@@ -115,9 +104,6 @@ _LEARN_S = 0.5
 
 class RateMonitor:
     """Samples per time of each sensor against what was usual at the start.
-
-    Args:
-        cfg: limits.
 
     Attributes:
         finding: the sensor that lacks most, or ``None``.
@@ -171,17 +157,9 @@ class RateMonitor:
 
 
 class LatencyMonitor:
-    """How long a drive takes until its echo comes back: slower, so that the way to a stop stays what it was.
-
-    Args:
-        cfg: limits.
-
-    Attributes:
-        alarm: what was found.
-    """
+    """How long a drive takes until its echo comes back: slower, so that the way to a stop stays what it was."""
 
     def __init__(self, cfg: HealthConfig) -> None:
-        """Nothing found."""
         self._cfg = cfg
         self.alarm = FindingLatch(cfg.rate_time_s)
         self.reset()
@@ -217,13 +195,11 @@ class FramingErrorRate:
 
     Args:
         limit: so many within the window are too many.
-        window_s: the window, s.
     """
 
     __slots__ = ("_times_s", "_window_s")
 
     def __init__(self, limit: int, window_s: float) -> None:
-        """None yet."""
         self._times_s = deque([-inf] * limit, maxlen=limit)
         self._window_s = window_s
 
@@ -257,7 +233,6 @@ class Ground(NamedTuple):
     """The part of a mirror that the proof tests look at.
 
     Attributes:
-        panels: all panels.
         nearest: the panel nearest to a deck point.
         place: deck place of a point of the robot at a pose (x, y, heading).
     """
@@ -275,15 +250,8 @@ class SeamMonitor:
     it. Any off sample proves the sensor sound. A pose that jumps (a fix) is no motion, and begins anew.
 
     Args:
-        cfg: limits.
-        ground: the map.
         sensors_m: places of the sensors, robot frame.
         sigmas: how many sigmas of the estimate to allow for.
-        fastest_m_s: no sensor moves faster.
-
-    Attributes:
-        missed: seams in a row, per sensor.
-        crossed: seams crossed by all sensors.
     """
 
     def __init__(
@@ -294,7 +262,6 @@ class SeamMonitor:
         sigmas: float,
         fastest_m_s: float,
     ) -> None:
-        """No seam crossed."""
         self._cfg, self._ground, self._sensors_m = cfg, ground, sensors_m
         self._sigmas, self._fastest_m_s = sigmas, fastest_m_s
         self.missed = [0, 0, 0, 0]

@@ -47,14 +47,9 @@ class Span(NamedTuple):
 
 
 class Commands:
-    """What the wheels were told lately.
-
-    Args:
-        wheel_radius_m: of both wheels.
-    """
+    """What the wheels were told lately."""
 
     def __init__(self, wheel_radius_m: float) -> None:
-        """Nothing is known."""
         self._radius_m = wheel_radius_m
         self.reset()
 
@@ -87,17 +82,9 @@ class WheelMonitor:
 
     The rules know what the wheels were told as the lowest and highest set points of a while, so they need no model of
     the servo: a wheel that was told to go fast all the while and stands, or that is faster than anything it was told.
-
-    Args:
-        cfg: limits.
-        robot: wheels.
-
-    Attributes:
-        alarm: what was found.
     """
 
     def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
-        """Nothing found."""
         self._cfg, self._base_m = cfg, robot.wheel_base_m
         self.commands = Commands(robot.wheel_radius_m)
         self.alarm = FindingLatch(cfg.retry_after_s)
@@ -136,10 +123,8 @@ class WheelMonitor:
         """Judge a frame.
 
         Args:
-            now: the sums.
             shortly, stalling: their change over ``runaway_time_s`` and over ``stall_time_s``.
             is_free: the robot executed what it was told since the last look, and was permitted to go anywhere.
-            is_held: it held its wheels by itself all that time.
             is_late: it executed what it had been told long before.
             is_sparse: the encoders gave fewer samples than usual.
             samples: of the frame.
@@ -266,7 +251,6 @@ def _what_is_broken(samples: Sequence[WheelSample], side: int) -> str:
 
 
 def _excess(speed: float, low: float, high: float) -> float:
-    """How much faster than anything told, standing still included."""
     return max(speed - max(high, 0.0), min(low, 0.0) - speed)
 
 
@@ -276,7 +260,6 @@ class CommandSpan:
     __slots__ = ("_left_high", "_left_low", "_right_high", "_right_low")
 
     def __init__(self) -> None:
-        """Standing."""
         self._right_low = self._right_high = self._left_low = self._left_high = 0.0
 
     def add(self, right_rad_s: float, left_rad_s: float) -> None:
@@ -291,11 +274,7 @@ class CommandSpan:
             self._left_high = left_rad_s
 
     def take(self, right_rad_s: float, left_rad_s: float) -> tuple[float, float, float, float]:
-        """The span up to now; the next one begins with the drive in force.
-
-        Args:
-            right_rad_s, left_rad_s: that drive.
-        """
+        """The span up to now; the next one begins with the drive in force."""
         span = self._right_low, self._right_high, self._left_low, self._left_high
         self._right_low = self._right_high = right_rad_s
         self._left_low = self._left_high = left_rad_s
@@ -307,14 +286,9 @@ _LARGEST_BIAS_RAD_S = 0.35
 
 
 class GyroscopeBias:
-    """What the gyroscope shows at rest, from samples whose size is bounded: garbage must not move it far.
-
-    Attributes:
-        rad_s: the bias.
-    """
+    """What the gyroscope shows at rest, from samples whose size is bounded: garbage must not move it far."""
 
     def __init__(self) -> None:
-        """Unbiased."""
         self.rad_s = 0.0
 
     def stand(self, wz_rad_s: float, dt_s: float) -> None:
@@ -324,18 +298,9 @@ class GyroscopeBias:
 
 
 class YawMonitor:
-    """Compares the turn of the gyroscope with that of the wheels while the robot moves.
-
-    Args:
-        cfg: limits.
-        robot: wheels.
-
-    Attributes:
-        alarm: what was found.
-    """
+    """Compares the turn of the gyroscope with that of the wheels while the robot moves."""
 
     def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
-        """Nothing found."""
         self._cfg, self._base_m = cfg, robot.wheel_base_m
         self.alarm = FindingLatch(cfg.retry_after_s)
 

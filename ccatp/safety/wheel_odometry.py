@@ -28,9 +28,6 @@ class WheelTrack:
     ``push`` is all that a frame costs as long as nobody asks for motion; samples are read when ``update`` is called.
 
     Args:
-        wheel_radius_m: r.
-        wheel_base_m: L.
-        hold_s: a wheel's last sample is good for this long.
         reach_s: how far back ``update`` reads.
         limit_rad_s: no wheel is faster; what says so, or is not a number, is no sample.
     """
@@ -38,7 +35,6 @@ class WheelTrack:
     def __init__(
         self, wheel_radius_m: float, wheel_base_m: float, hold_s: float, reach_s: float, limit_rad_s: float = LARGEST
     ) -> None:
-        """Nothing known yet."""
         self._limit_rad_s = limit_rad_s
         self._half_radius_m = 0.5 * wheel_radius_m
         self._radius_per_base = wheel_radius_m / wheel_base_m
@@ -105,13 +101,7 @@ class WheelTrack:
 
 
 class Odometry:
-    """A pose carried along by wheel travel in a flat frame.
-
-    Attributes:
-        t_s: time of the pose.
-        x_m, y_m, heading_rad: the pose.
-        v_m_s, omega_rad_s: the velocity at that time.
-    """
+    """A pose carried along by wheel travel in a flat frame."""
 
     __slots__ = ("_next", "_track", "heading_rad", "omega_rad_s", "t_s", "v_m_s", "x_m", "y_m")
 

@@ -65,17 +65,9 @@ class MoteReceiver(Protocol):
 class BeaconRobot:
     """The robot from its boot on.
 
-    Args:
-        cfg: the configuration.
-        world: where it drives.
-        ears: for motes, where there are any.
-
     Attributes:
         rules, fans: what it enforces; the fans do nothing.
-        world: the truth.
         seq, t_s: newest frame and its time.
-        frame_s: period of the frames.
-        reboots: none.
     """
 
     def __init__(self, cfg: RadioConfig, world: Surroundings, ears: MoteReceiver | None = None) -> None:
@@ -162,10 +154,7 @@ class BeaconRobot:
         """Take a drive; false for an old or equal ``seq`` and for numbers not finite.
 
         Args:
-            seq: its number.
-            right_rad_s, left_rad_s: set points of the wheels.
             now_s: the robot's clock at its arrival; that of the newest frame by default.
-            steer_rad: of the steered wheel, straight ahead by default.
         """
         steer = 0.0 if steer_rad is None or self._cfg.vehicle.kind != "ackermann" else steer_rad
         if not isfinite(steer):
@@ -239,7 +228,6 @@ def _sample(t_s: float, sighting: TargetBearing) -> RadioSample:
 
 
 def _scan(t_s: float, packets: tuple[Packet, ...], readings: int) -> RadioScan | None:
-    """The packets of a turn, each in its place."""
     if not packets:
         return None
     step_rad = 6.283185307179586 / readings
@@ -258,10 +246,6 @@ class BeaconTruthLog:
 
     Requests, answered as JSON: ``b"flush"``: ``{"rows": n}``, the number of rows taken so far (the caller takes the
     pending ones first); anything else: ``{"error"}``.
-
-    Args:
-        robot: whose truth it is.
-        motes_m: where the motes are, by name.
     """
 
     def __init__(self, robot: BeaconRobot, motes_m: dict[str, tuple[float, float]]) -> None:

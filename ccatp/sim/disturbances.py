@@ -36,14 +36,7 @@ _SAME_STEP_S = 1e-9  # differences of frame times are equal to within rounding
 
 
 class NoiseStream:
-    """Standard normal numbers of one kind: a function of the seed only.
-
-    Args:
-        rng: the kind's own generator.
-
-    Attributes:
-        one: gives the next number.
-    """
+    """Standard normal numbers of one kind: a function of the seed only."""
 
     __slots__ = ("_numbers", "one")
 
@@ -97,10 +90,7 @@ class DriftingBias:
     """An offset drawn at boot that walks: ``b_k = b_(k-1) + walk sqrt(dt) n``.
 
     Args:
-        start: value at boot.
         walk: standard deviation of the change within one second; grows with the square root of the time.
-        step_s: dt, the time between two steps.
-        rng: the bias's own generator.
     """
 
     __slots__ = ("_kick", "_rng", "_value")
@@ -127,10 +117,7 @@ class TrueWheels(NamedTuple):
     """Measures of the true robot.
 
     Attributes:
-        radius_m: nominal radius.
         right_scale, left_scale: true over nominal radius of each wheel.
-        base_m: distance between the wheels.
-        lag_s: time constant of both servos.
     """
 
     radius_m: float
@@ -141,14 +128,7 @@ class TrueWheels(NamedTuple):
 
 
 def draw_wheels(robot: RobotConfig, lag_s: float, world: WorldConfig, rng: np.random.Generator) -> TrueWheels:
-    """Measures of the true robot: four draws, whatever is switched off.
-
-    Args:
-        robot: nominal radius and base.
-        lag_s: nominal lag.
-        world: relative errors.
-        rng: their generator.
-    """
+    """Measures of the true robot: four draws, whatever is switched off."""
     right, left, base = (float(n) for n in rng.standard_normal(3))
     lag = 2.0 * float(rng.random()) - 1.0
     return TrueWheels(
@@ -189,7 +169,6 @@ class WheelSlip:
 
         Args:
             t_s: time at the start of the frame.
-            dt_s: its length.
             is_ordered: a set point is not zero.
         """
         if is_ordered:
@@ -202,11 +181,7 @@ class WheelSlip:
 
 
 class Downhill:
-    """Where downhill is under the robot.
-
-    Args:
-        mirror: knows the direction of gravity.
-    """
+    """Where downhill is under the robot."""
 
     __slots__ = ("_gx", "_gy", "_gz")
 

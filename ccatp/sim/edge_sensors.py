@@ -131,7 +131,6 @@ class EdgeSensors:
 
         Args:
             plant: after its step.
-            times_s: when the sensors are read.
             fractions: the same, as fractions of the frame, ascending to at most 1.
         """
         if plant.is_moving:

@@ -78,7 +78,6 @@ class ZmqPuck:
     """Asks the robot's stand-in: request ``b"puck"``, reply ``{"t", "puck": [x, y, z], "moved_m"}``, SI, world."""
 
     def __init__(self, endpoint: str, timeout_s: float = 1.0) -> None:
-        """``timeout_s`` is the deadline of one request, waiting for a turn included."""
         self._endpoint = endpoint
         self._timeout_s = timeout_s
         self._context = zmq.asyncio.Context()
@@ -142,7 +141,6 @@ class EtalonSimulator:
     Attributes:
         model: lengths and flags; ``blocked``, ``flags`` and ``laser_ready`` may be changed at any time.
         connected: answer to ``isconnected``.
-        push_hz: rate of the push stream.
         counts: requests, bad_requests, oversized_lines, truth_failures, refused_clients, lost_clients.
     """
 
@@ -254,8 +252,6 @@ class EtalonSimulator:
 
 
 class _Session:
-    """One client."""
-
     def __init__(self, server: EtalonSimulator, writer: asyncio.StreamWriter) -> None:
         self._server = server
         self._writer = writer

@@ -57,16 +57,7 @@ class _StepFault:
 
 
 class BodyFaults:
-    """All faults of the body.
-
-    Args:
-        faults: those of wheels, fans and body.
-        mirror: knows where downhill is.
-
-    Attributes:
-        records: what they did.
-        drifts: the disturbances of the plant among them.
-    """
+    """All faults of the body."""
 
     def __init__(self, faults: Iterable[InjectedFault], mirror: Mirror) -> None:
         self.records = [InjectionRecord(fault) for fault in faults]
@@ -82,9 +73,6 @@ class BodyFaults:
 
         Args:
             world: the world; a kidnap moves its body, a slip takes its grip.
-            fans: their health is set.
-            t_s: time at the start of the step.
-            set_points_rad_s: what the robot wants of the right and of the left wheel.
         """
         step = _StepFault(set_points_rad_s)
         for record in self.records:
@@ -101,7 +89,6 @@ class BodyFaults:
 
 
 def _kidnap(record: InjectionRecord, fault: Kidnap, world: World, t_s: float) -> None:
-    """Once."""
     if fault.has_begun(t_s) and not record.injected.samples:
         world.displace(fault.dx_m, fault.dy_m, fault.dheading_rad)
         record.add(t_s)
@@ -171,8 +158,6 @@ class Effect(Protocol):
 
 
 class _Unseeing:
-    """An effect that needs no past."""
-
     def see(self, t_s: float, reading: Reading) -> None:
         """Nothing to remember."""
 
@@ -326,16 +311,7 @@ _LEAST_CATCH_UP = 10
 
 
 class SensorFault:
-    """A fault that changes readings.
-
-    Args:
-        fault: the fault.
-        rng: its own generator.
-
-    Attributes:
-        rows_name: the list that it acts on.
-        record: what it did.
-    """
+    """A fault that changes readings."""
 
     __slots__ = ("_effect", "_fault", "_is_raw", "_last", "_sees_from_s", "_signal", "record", "rows_name")
 
@@ -352,7 +328,6 @@ class SensorFault:
         """The rows as they come out.
 
         Args:
-            rows: as they come in.
             now_s: robot time of the frame.
         """
         if not rows or rows[0][0] >= self._fault.end_s or rows[-1][0] < self._sees_from_s:

@@ -54,11 +54,7 @@ NOTHING = Outgoing(b"", None)
 
 
 class Stamping:
-    """Faults of the clock, and names that the robot raises.
-
-    Args:
-        faults: jump, wrap and raise.
-    """
+    """Faults of the clock, and names that the robot raises."""
 
     def __init__(self, faults: Iterable[InjectedFault]) -> None:
         self.records = [InjectionRecord(fault) for fault in faults]
@@ -93,11 +89,7 @@ class Stamping:
 
 
 class Delivery:
-    """Frames on their way out.
-
-    Args:
-        faults: drop, duplicate and reorder.
-    """
+    """Frames on their way out."""
 
     def __init__(self, faults: Iterable[InjectedFault]) -> None:
         self.records = [InjectionRecord(fault) for fault in faults]
@@ -108,7 +100,6 @@ class Delivery:
         """What leaves when ``frame`` is due.
 
         Args:
-            t_s: robot time.
             frame: the frame.
         """
         line = _raw_line(frame)
@@ -163,12 +154,6 @@ class Injector:
 
     Args:
         plan: the plan; its faults of the link are none of the robot's.
-        mirror: the mirror.
-        rng: parent of one generator per fault.
-
-    Attributes:
-        body: the faults of the body.
-        outgoing: what leaves the robot at this instant.
     """
 
     def __init__(self, plan: FaultPlan, mirror: Mirror, rng: np.random.Generator) -> None:

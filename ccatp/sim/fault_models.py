@@ -34,8 +34,6 @@ class InjectedFault(Model):
     """A fault of the simulated robot.
 
     Attributes:
-        signal: what it befalls.
-        type: what happens to it.
         at_s: when it begins: robot time since the first boot.
     """
 
@@ -236,7 +234,6 @@ class LinkFault(Model):
     """A fault of the link.
 
     Attributes:
-        type: what happens.
         at_s: robot time at which it begins; or else
         after_lines, after_bytes: it begins once so much has gone to the clients, counted over all connections.
     """
@@ -344,10 +341,8 @@ class Injected(NamedTuple):
     """What became of one fault of the plan.
 
     Attributes:
-        signal, type: of the fault.
         at_s: when it was to begin; ``None`` for a fault of the link that waits for something else.
         from_s, until_s: the first and last sample, frame or step that it acted on, robot time; ``None``: none yet.
-        samples: how many it acted on.
         changed: how many of them came out different, or not at all.
     """
 
@@ -361,11 +356,7 @@ class Injected(NamedTuple):
 
 
 class InjectionRecord:
-    """The record of one fault while it is written.
-
-    Args:
-        fault: the fault.
-    """
+    """The record of one fault while it is written."""
 
     __slots__ = ("_changed", "_from_s", "_is_told", "_samples", "_until_s", "fault")
 
@@ -410,9 +401,7 @@ class Signal(NamedTuple):
     """Where a signal stands.
 
     Attributes:
-        rows: name of the list.
         columns: places in a row, the time being place 0.
-        low, high: range of each of its numbers.
         is_binary: it is 0 or 1.
     """
 

@@ -22,7 +22,6 @@ class FaultPlan(NamedTuple):
 
     Attributes:
         faults: of the simulated robot, in the order of the file, which is that of their application.
-        link: of the robot link.
     """
 
     faults: tuple[InjectedFault, ...] = ()
@@ -31,10 +30,6 @@ class FaultPlan(NamedTuple):
 
 def parse_plan(text: str, name: str) -> FaultPlan:
     """The plan in a text.
-
-    Args:
-        text: TOML.
-        name: of the file, for the messages.
 
     Raises:
         ConfigError: one line per problem with file, line, key, what is wrong and what to do.
@@ -85,7 +80,6 @@ class _Entry:
         self.problems: list[str] = []
 
     def fault(self) -> InjectedFault | None:
-        """The fault of the robot; ``None`` with problems."""
         types = self._choice("signal", TYPES)
         model = self._choice("type", types) if types is not None else None
         fault = self._validated(model) if model is not None else None
@@ -96,7 +90,6 @@ class _Entry:
         return fault
 
     def link(self) -> LinkFault | None:
-        """The fault of the link; ``None`` with problems."""
         model = self._choice("type", LINK_TYPES)
         fault = self._validated(model) if model is not None else None
         if fault is not None and [fault.at_s, fault.after_lines, fault.after_bytes].count(None) != 2:
@@ -110,7 +103,6 @@ class _Entry:
         return low < high and (low, high) != (-math.inf, math.inf)
 
     def _choice(self, key: str, choices: Mapping[str, Any]) -> Any:
-        """What ``choices`` hold under the value of a key."""
         value = self._row.get(key)
         if value is None:
             self._complain(key, f"is missing; {choice_hint('', choices)}")

@@ -58,16 +58,11 @@ class FaultProxy:
     ``heal``. ``reset`` and ``close`` act at once.
 
     Args:
-        host: of the server.
-        port: of the server.
-        seed: of every random draw.
         listener: a bound socket to listen on; any free port of 127.0.0.1 if not given.
 
     Attributes:
-        port: on which it listens, once it is started.
         counts: what was really done, by the names of the methods: lines hit, writes, bytes swallowed, connections
             ended; ``connections`` taken, ``refused`` because the server could not be reached.
-        passed_bytes, passed_lines: what went to the clients so far.
     """
 
     def __init__(self, host: str, port: int, *, seed: int, listener: socket.socket | None = None) -> None:
@@ -300,12 +295,7 @@ class _Watched:
 
 
 class LinkFaults:
-    """Faults of the link, ruled by the robot's clock.
-
-    Args:
-        plan: the faults.
-        proxy: what they are done by.
-    """
+    """Faults of the link, ruled by the robot's clock."""
 
     def __init__(self, plan: tuple[LinkFault, ...], proxy: FaultProxy) -> None:
         self._proxy = proxy

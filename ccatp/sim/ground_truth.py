@@ -41,13 +41,7 @@ class TruthSource(Protocol):
 
 
 class GroundTruthPublisher:
-    """Gives the truth away by ZeroMQ.
-
-    Args:
-        truth: what there is to give.
-        rep: endpoint of the REP socket, if any.
-        pub: endpoint of the PUB socket, if any.
-    """
+    """Gives the truth away by ZeroMQ."""
 
     def __init__(self, truth: TruthSource, rep: str | None, pub: str | None) -> None:
         self._truth = truth
@@ -138,7 +132,6 @@ def read_plan(file: Path, *, lockstep: bool) -> FaultPlan:
     """The plan in a file.
 
     Args:
-        file: TOML.
         lockstep: simulated time waits for the clients; not every fault of the link makes sense then.
 
     Raises:

@@ -29,7 +29,6 @@ class PuckTruth(NamedTuple):
     """Where the puck truly is.
 
     Attributes:
-        t_s: robot time.
         position_m: centre of the puck, world frame, shape (3,).
         moved_m: the furthest it was from there within the last measuring time.
     """
@@ -43,10 +42,8 @@ class EtalonModel:
     """Channels that look at the puck from known collimators.
 
     Attributes:
-        blocked: channels whose beam is interrupted.
         flags: further error flags to raise, names out of ``wire.multiline.FLAGS`` by channel.
         laser_ready: while false, each record carries ``laser_temp_error``.
-        environment: air that goes into each record.
     """
 
     def __init__(

@@ -25,7 +25,6 @@ class TrueMotes:
     """The motes as they are.
 
     Attributes:
-        names: anchors first, then stand by stand.
         positions_m: shape (n, d).
         facings: unit vectors, shape (n, d); zero where a mote is turned to whoever it talks to.
     """
@@ -39,7 +38,6 @@ def true_motes(cfg: CricketConfig, rng: np.random.Generator) -> TrueMotes:
     """The motes of a configuration.
 
     Args:
-        cfg: layout and its places.
         rng: draws the places of ``random``.
     """
     if cfg.layout == "networks":
@@ -77,9 +75,7 @@ class MotePulse(NamedTuple):
     """Readings of one pair.
 
     Attributes:
-        transmitter, listener: indices of the motes.
         delays_s: pulse after message, shape (k,); as many as were heard.
-        temperature_c: of the listener's thermometer.
     """
 
     transmitter: int
@@ -92,8 +88,6 @@ class MoteField:
     """Motes that range among themselves.
 
     Args:
-        cfg: transducer, air, the true faults.
-        motes: where they are.
         rng: draws the errors of the thermometers, once for each mote.
     """
 
@@ -116,13 +110,7 @@ class MoteField:
         return self._cfg.transducer.nearest_m <= distance_m <= usable_reach(self._cfg.transducer, *off)
 
     def listen(self, pairs: Sequence[tuple[int, int]], repeats: int, rng: np.random.Generator) -> list[MotePulse]:
-        """Readings of pairs; a pair that hears nothing is left out.
-
-        Args:
-            pairs: transmitter and listener of each.
-            repeats: pulses of each.
-            rng: noise, losses, echoes.
-        """
+        """Readings of pairs; a pair that hears nothing is left out."""
         heard = []
         for transmitter, listener in pairs:
             if not self.hears(transmitter, listener):
@@ -151,7 +139,6 @@ def usable_reach(transducer: TransducerConfig, off_transmitter_rad: float, off_l
 
     Args:
         transducer: the table of reaches; straight lines between its angles, nothing beyond.
-        off_transmitter_rad: angle a between the transmitter's axis and the way.
         off_listener_rad: angle b between the listener's axis and the way.
     """
     on_axis_m = transducer.reach_m[0]
@@ -176,10 +163,7 @@ class MoteListener:
     """Hears frame by frame.
 
     Args:
-        cfg: transducers, air, the true faults of ranging.
         listener: who the robot is to the motes, and how many send in a frame.
-        motes: where they are.
-        rng: of thermometers, noise, losses, echoes.
     """
 
     def __init__(

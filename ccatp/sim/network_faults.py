@@ -22,8 +22,6 @@ class NetworkFaults:
     """What is switched on in one direction, for the connections that are and for those to come.
 
     Attributes:
-        is_black_hole: what comes in disappears.
-        is_stalled: nothing goes out.
         delay_s, jitter_s: everything is late by so much, and by up to so much more.
         reorder_every, duplicate_every, corrupt_every: the n-th lines that are hit; 0: none.
         garbage_every, garbage_bytes: the n-th lines before which there is a line of so many random bytes.
@@ -55,13 +53,7 @@ class NetworkFaults:
 
 
 class LineStage:
-    """Cuts a stream into lines where the conduct asks for it, and does to them what it says.
-
-    Args:
-        conduct: what is switched on.
-        counts: of what was done, by the names of the methods of the proxy.
-        rng: draws bytes and places.
-    """
+    """Cuts a stream into lines where the conduct asks for it, and does to them what it says."""
 
     def __init__(self, conduct: NetworkFaults, counts: "Counter[str]", rng: random.Random) -> None:
         self._conduct, self._counts, self._rng = conduct, counts, rng
@@ -147,11 +139,6 @@ class Pipe:
     """One direction.
 
     Args:
-        reader: where bytes come from.
-        writer: where they go to.
-        conduct: how they are treated.
-        counts: of what was done.
-        rng: draws delays, bytes, places.
         may_write: is asked at every write what of it may go out; the rest never does.
     """
 

@@ -26,16 +26,7 @@ class Disturbance(Protocol):
     def displace(
         self, plant: "Plant", t_s: float, dt_s: float, forward_m: float, left_m: float, turn_rad: float
     ) -> BodyStep:
-        """Body displacement of one step after this disturbance, from the one before it.
-
-        Args:
-            plant: at the start of the step.
-            t_s: time at the start of the step.
-            dt_s: its length.
-            forward_m: displacement along robot x.
-            left_m: displacement along robot y.
-            turn_rad: rotation about robot z.
-        """
+        """Body displacement of one step after this disturbance, from the one before it."""
 
 
 class Plant:
@@ -44,12 +35,8 @@ class Plant:
     Attributes:
         x_m, y_m, z_m: robot origin on the surface, deck frame.
         heading_rad: deck heading (see ``DeckPose``), not wrapped.
-        right_rad_s, left_rad_s: wheel rates.
-        is_moving: the last step moved the body.
         are_wheels_still: the wheels did not turn in it.
         hx, hy, lx, ly: deck-plane components of the robot's x and y axes, as ``Mirror.body_axes``.
-        fx, fy: slopes of the surface under the robot.
-        forward_m, left_m, turn_rad: displacement of the last step.
         right_angle_rad, left_angle_rad: wheel angles at the end of the last step, since boot.
         right_scale, left_scale: travel of the body over travel of the nominal wheel; may be set before a step.
         shake_rate_rad_s, shake_acceleration_m_s2: what vibration adds to the readings of the inertial unit.
@@ -104,16 +91,6 @@ class Plant:
         wheel_lag_s: float,
         disturbances: Sequence[Disturbance] = (),
     ) -> None:
-        """Stand still at ``start``.
-
-        Args:
-            surface: the surface driven on.
-            start: first pose.
-            wheel_radius_m: radius of both wheels.
-            wheel_base_m: distance between them.
-            wheel_lag_s: time constant T of the servos, > 0.
-            disturbances: applied in this order to each step.
-        """
         self._jet = SurfacePatch(surface, _REACH_M).jet
         self._radius_m, self._half_base_m = wheel_radius_m, wheel_base_m / 2.0
         self.lag_s = wheel_lag_s
@@ -141,12 +118,6 @@ class Plant:
         Wheel travel is ``u dt + (w - u) T (1 - exp(-dt/T))``. With s the forward displacement and d the rotation,
         the deck displacement is s along ``h = cos(psi_m) e1 + sin(psi_m) e2`` at the middle of the step, and
         ``dpsi = d - fy (fxx dx + fxy dy) / ((1 + fx^2) W)``, the transport of the heading along the surface.
-
-        Args:
-            t_s: time at the start of the step.
-            dt_s: length of the step.
-            right_set_rad_s: set point of the right wheel.
-            left_set_rad_s: set point of the left wheel.
         """
         right, left = self.right_rad_s, self.left_rad_s
         self._right_0, self._left_0 = right, left
@@ -183,7 +154,6 @@ class Plant:
         return half_radius_m * (right_rad + left_rad), 0.0, half_radius_m * (right_rad - left_rad) / self._half_base_m
 
     def _move(self, forward_m: float, left_m: float, turn_rad: float) -> None:
-        """Displace the body by one midpoint step."""
         # Where the middle of the step will be, from the axes at its start: good to second order, which is all a
         # derivative of the surface there needs.
         x, y = self.x_m, self.y_m

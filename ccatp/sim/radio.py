@@ -34,7 +34,6 @@ class SimDriveCommand(NamedTuple):
     """Set points until the next step.
 
     Attributes:
-        speed_m_s: forward speed.
         steer_rad: steering angle to the left; of an Ackermann vehicle.
         turn_rate_rad_s: turn rate to the left; of a differential drive.
     """
@@ -84,8 +83,6 @@ class WorldFrame(NamedTuple):
     """All readings of one step.
 
     Attributes:
-        time_s: at the end of the step, since the start.
-        wheels: odometry of the step.
         packets: answers heard at its end while the reflector turned once; empty in steps without a scan.
         sightings: the same of worlds that draw the result of a scan.
         distances_m: of the distance sensors, in the order of the configuration; their range where they see nothing.
@@ -99,11 +96,7 @@ class WorldFrame(NamedTuple):
 
 
 class Incidents:
-    """Each lasts from ``at_s`` for ``for_s``.
-
-    Args:
-        plan: the incidents.
-    """
+    """Each lasts from ``at_s`` for ``for_s``."""
 
     def __init__(self, plan: Sequence[IncidentConfig]) -> None:
         self._losses = [one for one in plan if isinstance(one, RadioLossConfig)]
@@ -178,11 +171,6 @@ class ShadowingField:
     Its covariance is sigma^2 exp(-d_receiver / L) exp(-d_sender / L), the exponential law of Gudmundson (1991) at both
     ends. It is a sum of plane waves whose wave vectors are drawn from the spectrum of exp(-d / L) in the plane,
     proportional to (1 + (k L)^2)^(-3/2): the share of wave numbers below k is 1 - (1 + (k L)^2)^(-1/2).
-
-    Args:
-        sigma_db: standard deviation.
-        length_m: L.
-        rng: of the draw.
     """
 
     def __init__(self, sigma_db: float, length_m: float, rng: np.random.Generator) -> None:
@@ -212,7 +200,6 @@ class Ray(NamedTuple):
     """One way of a signal to the receiver.
 
     Attributes:
-        direction_rad: where it comes from, left of the heading.
         level_dbm: as an antenna without direction would receive it.
     """
 
@@ -233,14 +220,7 @@ class TrueRadio:
     loss of its own.
 
     Args:
-        name: of the sender.
         reference_dbm: P_ref of the sender, at 1 m.
-        cfg: propagation.
-        size_m: the room.
-        obstacles: in it.
-        readings: of one turn of the reflector.
-        places: draws what stays: shadowing and reflections.
-        noise: draws what does not.
     """
 
     def __init__(
@@ -325,12 +305,6 @@ class MovingTarget:
 
     At random: its course is a random walk, turned back by walls and obstacles as light is by mirrors. Along waypoints:
     straight from one to the next, from the last to the first, through whatever stands there.
-
-    Args:
-        cfg: motion, start, speed.
-        size_m: the room.
-        obstacles: in it.
-        rng: of the course.
     """
 
     def __init__(

@@ -29,12 +29,6 @@ class TrueVehicle:
     Ackermann, 2017 eq. 3 (x, y of the front axle): x += T v cos(theta + gamma), y += T v sin(theta + gamma),
     theta += T v sin(gamma) / l. Differential drive: the chord of a circular arc. The body makes (1 - slip) of the
     wheels' travel and turns with the drift besides; the odometry knows of neither and has white noise.
-
-    Args:
-        geometry: kind and limits.
-        truth: slip, drift and noise.
-        pose: at the start.
-        rng: of the noise.
     """
 
     def __init__(
@@ -87,13 +81,8 @@ _START, _WHEELS, _TARGET, _DISTANCES, _PLACES, _NOISE = range(6)
 class RadioWorld:
     """Vehicle, beacons, moving target, obstacles.
 
-    Attributes:
-        time_s: since the start.
-        obstacles: in the room now.
-
     Args:
         cfg: the configuration; ``sim`` holds the truth.
-        seed: in place of the configuration's.
     """
 
     def __init__(self, cfg: RadioConfig, seed: int | None = None) -> None:
@@ -137,14 +126,7 @@ class RadioWorld:
         return clearance_m(self.pose, self.obstacles) - self._cfg.vehicle.radius_m
 
     def step(self, command: SimDriveCommand, interval_s: float, *, static: bool, target: bool) -> WorldFrame:
-        """Drive on, then listen.
-
-        Args:
-            command: set points of the step.
-            interval_s: its length.
-            static: scan for the static radios at its end.
-            target: scan for the moving one.
-        """
+        """Drive on, then listen."""
         incidents = self._incidents
         self.obstacles[:] = (*self._cfg.sim.obstacles, *incidents.obstacles(self.time_s))
         wheels = self._vehicle.step(command, interval_s)
@@ -183,7 +165,6 @@ def _stream(seed: int, *name: int) -> np.random.Generator:
 
 
 def _true_start(cfg: RadioConfig, seed: int) -> TruePose:
-    """The believed start with an offset that is drawn."""
     x, y, turn = _stream(seed, _START).standard_normal(3).tolist()
     offset_m = cfg.sim.vehicle.start_position_offset_m
     return TruePose(

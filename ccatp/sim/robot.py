@@ -42,13 +42,7 @@ from ccatp.sim.world import TruthRow, World
 
 
 class CommandDelay:
-    """Takes commands and hands them to the rules and the fans when they are due.
-
-    Args:
-        rules: decides on drives and permits.
-        fans: decides on duties.
-        frames: length of the delay.
-    """
+    """Takes commands and hands them to the rules and the fans when they are due."""
 
     __slots__ = ("_drives", "_duties", "_fans", "_frames", "_newest_drive", "_newest_duty", "_newest_permit",
                  "_permits", "_rules")  # fmt: skip
@@ -135,13 +129,7 @@ class Robot:
     """The robot from one boot to the next.
 
     Attributes:
-        rules, fans: what it enforces, and its fan duties.
-        world: the truth.
         seq, t_s: newest frame and its time on the robot's clock.
-        frame_s: period of the frames.
-        sensors_delay_frames, commands_delay_frames: delays of the link.
-        injector: the plan at work, if there is one.
-        reboots: how often it started anew.
     """
 
     def __init__(
@@ -260,9 +248,6 @@ class Robot:
         """Take a drive; false for an old or equal ``seq`` and for numbers not finite. There is nothing to steer.
 
         Args:
-            seq: its number.
-            right_rad_s: set point of the right wheel.
-            left_rad_s: set point of the left wheel.
             now_s: the robot's clock at its arrival; that of the newest frame by default.
         """
         return self._commands.drive(self.seq, seq, right_rad_s, left_rad_s, self.t_s if now_s is None else now_s)
@@ -293,7 +278,6 @@ class Robot:
         self._read()
 
     def _act(self, injector: Injector, t_s: float, set_points_rad_s: tuple[float, float]) -> tuple[float, float]:
-        """Let the faults of the body act."""
         plant = self.world.plant
         before = plant.pose
         found = injector.body.act(self.world, self.fans, t_s, set_points_rad_s)
@@ -400,9 +384,6 @@ class TruthLog:
     * ``b"misalignment"``: ``{"panels": [[row, col, piston_m, tip_rad, tilt_rad], ...], "start": [x, y, heading]}``;
     * ``b"flush"``: ``{"rows": n}``, the number of rows taken so far (the caller takes the pending ones first);
     * anything else: ``{"error"}``.
-
-    Args:
-        robot: whose truth it is.
     """
 
     def __init__(self, robot: Robot) -> None:

@@ -30,12 +30,9 @@ class MotionRules:
     ``reverse``, wr != wl needs ``turn``. Sequence numbers count per kind and per session: a new session starts anew.
 
     Args:
-        ttl_s: time-to-live of drive and permit, s.
         max_wheel_rad_s: limit of a wheel; a faster drive is slowed down as a whole, so that its path stays the same.
-        boot_s: time of the boot, from which ages count.
 
     Attributes:
-        has_monitor_joined: at least once in this boot.
         is_held: the last ``set_points`` held the wheels.
     """
 
@@ -83,9 +80,6 @@ class MotionRules:
         """Take a drive that arrived at ``now_s``; false for an old or equal ``seq`` and for numbers not finite.
 
         Args:
-            seq: its number.
-            right_rad_s, left_rad_s: set points.
-            now_s: its arrival.
             is_steered: wheels beside these two make a turn of it.
         """
         if seq <= self._drive_seq:

@@ -40,8 +40,6 @@ class SampleTimes:
     """Instants ``n / hz`` that fall into the frames ``((k-1)/frame_hz, k/frame_hz]``.
 
     Args:
-        hz: rate of the sensor.
-        frame_hz: rate of the frames.
         lag_s: time constant of the wheel servo, for ``decays``.
 
     Attributes:
@@ -109,12 +107,7 @@ _BLOCK = 4096  # more than two wheels read in a frame
 
 
 class RateEncoders:
-    """Wheel rates with white noise, right and left independent.
-
-    Args:
-        sigma_rad_s: its standard deviation.
-        rng: the encoders' own generator.
-    """
+    """Wheel rates with white noise, right and left independent."""
 
     __slots__ = ("_next", "_noise", "_rng", "_sigma", "_still")
 
@@ -158,14 +151,7 @@ class RateEncoders:
 
 
 class CountingEncoders:
-    """Rates that are differences of counted angles.
-
-    Args:
-        world: counts in a turn.
-        hz: rate of the samples.
-        frame_s: period of the frames.
-        rng: two draws.
-    """
+    """Rates that are differences of counted angles."""
 
     __slots__ = ("_counts", "_frame_s", "_left_phase", "_per_rad", "_right_phase", "_unit")
 

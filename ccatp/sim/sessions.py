@@ -66,10 +66,7 @@ class ServedRobot(Protocol):
     """A robot that can be served; ``ccatp.sim.robot.Robot`` is one.
 
     Attributes:
-        rules, fans: what it enforces, and its fan duties.
-        frame_s: period of the frames.
         t_s: time of the newest frame, on the robot's clock.
-        reboots: how often it started anew.
     """
 
     rules: MotionRules
@@ -129,8 +126,6 @@ class RobotSession:
     """One client.
 
     Attributes:
-        wire, nonce: its connection, and the nonce of it.
-        role: what it joined as.
         joined_s, heard_s: when it came (wall clock) and when it last sent something valid (the robot's clock).
         is_open: not closed by us.
     """
@@ -181,21 +176,14 @@ class RobotServer:
     """The robot behind its link.
 
     Args:
-        robot: just booted.
-        lockstep: simulated time waits for the clients.
-        boot: number of this boot.
         key: of the HMAC, or ``None`` for no authentication.
         make_nonce: 32 fresh hex digits.
-        now_s: wall clock at boot.
-        note: takes one line for the log.
         on_frame: called after each frame that was driven.
 
     Attributes:
-        robot: the robot.
         counts: bad_lines, unknown_types, oversized_lines, refused, stale (drives, permits and fans not newer),
             slips (frames more than a period late).
         oldest_ack_frames: how many frames a drive that moves the robot was behind at most (not in lockstep).
-        fan_changes: how often the duties changed.
     """
 
     def __init__(

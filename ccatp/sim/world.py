@@ -36,12 +36,6 @@ class World:
     """Robot on mirror.
 
     Attributes:
-        mirror: the ideal mirror.
-        plant: body and wheels.
-        wheels: true measures of the robot.
-        misalignments: of each panel.
-        start_panel_pose, start_pose: where the robot really stands at boot.
-        is_fallen: it fell, for good.
         grip: share of its travel that each wheel gives to the body, right and left, besides its slip; may be set
             before a step.
     """
@@ -114,9 +108,6 @@ class World:
 
         Args:
             t_s: time at the start of the frame.
-            dt_s: its length.
-            right_rad_s: set point of the right wheel.
-            left_rad_s: set point of the left wheel.
             thrust: mean thrust of the fans during the frame, 0 to 1.
         """
         plant = self.plant

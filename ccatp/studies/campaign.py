@@ -66,7 +66,6 @@ class Cell:
 
     Attributes:
         factors: as they stand in the cell of ``result.json``.
-        overrides: dotted configuration keys that make the cell.
     """
 
     factors: Factors
@@ -126,7 +125,6 @@ class JobOutcome(NamedTuple):
 
     Attributes:
         values: what JSON can say; numbers that are not finite become null.
-        arrays: small ones, by name.
     """
 
     values: Mapping[str, Any]
@@ -146,7 +144,6 @@ class Column(NamedTuple):
 
     Attributes:
         heading: with unit.
-        key: dotted path into the cell.
         spec: format of numbers; empty leaves the value as it is.
     """
 
@@ -160,13 +157,9 @@ class Study:
     """A campaign that has a name.
 
     Attributes:
-        name: on the command line.
-        title: one line.
-        cells: builds the cells.
         run_job: a function of a module, which workers import by its name; a pure function of the job.
         combine: factors of a cell and the outcomes of its jobs in the order of their seeds, to figures and arrays.
         columns: of ``table.md``.
-        draw: writes figures into a directory.
         defaults: dotted keys of the study's own: stronger than the configuration file, weaker than the command line.
         mirrors: cells are crossed with these; empty where the study chooses the mirror in its cells.
         runs: seeds of each cell, unless told otherwise.
@@ -236,8 +229,6 @@ def cells_of(study: Study, mirrors: Sequence[str] = (), only: Mapping[str, Seque
     """The cells of a campaign.
 
     Args:
-        study: the study.
-        mirrors: in place of the study's.
         only: levels to keep, by factor; all of the others.
 
     Raises:
@@ -274,10 +265,6 @@ def jobs_of(
     """The jobs of each cell, seeds in their order.
 
     Args:
-        study: the study.
-        cells: its cells.
-        load: the loader of configurations.
-        settings: dotted keys of the command line.
         runs: seeds of each cell, from ``run.seed`` on.
 
     Raises:
@@ -312,7 +299,6 @@ class Schedule:
     1969: at most a third longer than the best plan).
 
     Args:
-        jobs: to do, in the order of the plan.
         past_s: durations of finished jobs by cell, from earlier parts of the campaign.
     """
 
@@ -369,9 +355,7 @@ class Histogram:
     Attributes:
         bins: indices of the bins, ascending, shape (k,). Bin i ends at ``LEAST * 10**(i / PER_DECADE)``.
         counts: in each of them, shape (k,).
-        total: sum of the values.
         largest: of the values; 0 where there are none.
-        within: how many are at most the limit.
     """
 
     bins: IntArray

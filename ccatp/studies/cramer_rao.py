@@ -53,10 +53,8 @@ class StopBound(NamedTuple):
     """The bound at one fix, before it is used.
 
     Attributes:
-        t_s: time.
         point: measured there, None where the fix was not for a point.
         covariance_m2: bound of the covariance of (x, y), shape (2, 2).
-        heading_sigma_rad: bound of the heading's standard deviation.
         error_m: what the estimator's error was there, (x, y).
     """
 
@@ -77,8 +75,6 @@ class BoundSummary:
     """All stops of a run.
 
     Attributes:
-        stops: their number.
-        median_bound_m, rms_bound_m: median and root mean square of the bounds.
         rms_error_m: root mean square of the estimator's errors.
         ratio: root mean square of the errors in units of their own bound: 1 for an efficient estimator, but for the
             scatter of a single run.
@@ -117,9 +113,6 @@ def bounds_of(cfg: Config, mirror: Mirror, record: TrueRecord, *, with_accelerom
 
     Args:
         cfg: the world's statistics and the robot's geometry.
-        mirror: the ideal mirror.
-        record: of the run.
-        with_accelerometer: count what it says of the slip, too.
     """
     return _Recursion(cfg, mirror, record, with_accelerometer).run()
 
@@ -136,8 +129,6 @@ class _Wheels(NamedTuple):
 
 
 class _Recursion:
-    """The covariance recursion along a record."""
-
     def __init__(self, cfg: Config, mirror: Mirror, record: TrueRecord, with_accelerometer: bool) -> None:
         world = cfg.world
         self._cfg, self._world, self._record, self._with_accelerometer = cfg, world, record, with_accelerometer

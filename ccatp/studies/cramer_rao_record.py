@@ -30,8 +30,6 @@ class SeamPass(NamedTuple):
 
     Attributes:
         frame: index of the row that ends the frame in which it did.
-        corner: index of the sensor.
-        interval_s: time between the two samples that differ.
         axis: deck axis across the edge, 0 or 1.
         edge: which edge: axis, panel, and whether it is the one on the high side.
     """
@@ -47,9 +45,7 @@ class StopFix(NamedTuple):
     """A fix at rest.
 
     Attributes:
-        frame: index of the row at the time of the fix.
         point: where it was taken; None where it was not for a point.
-        panel: that carried the robot.
         covariance_m2: of the foot (x, y), deck frame, from the lengths alone, shape (2, 2).
         error_m: true minus estimated position before the fix (x, y), m.
     """
@@ -67,9 +63,6 @@ class TrueRecord:
 
     Attributes:
         way: a row per frame from the boot on, columns as named above, shape (k, 14).
-        passes: seams crossed, oldest first.
-        fixes: oldest first.
-        base_m: true wheel base.
     """
 
     way: FloatArray
@@ -141,11 +134,8 @@ def passes_of(
     """Which edges the transitions belong to, from the true way; those over the rim are left out.
 
     Args:
-        mirror: the panels.
         sensors_m: places of the edge sensors, robot frame.
         way: as in ``TrueRecord``, its first row at t = 0.
-        transitions: of the sensors, oldest first.
-        frame_s: period of the rows.
     """
     found = []
     for transition in transitions:

@@ -115,7 +115,6 @@ class Case(NamedTuple):
     """A row of the study.
 
     Attributes:
-        figure: of the paper, or what is better.
         method: ``ekf`` or ``batch``.
         keys: of the configuration, over ``configs/cricket.toml``.
     """

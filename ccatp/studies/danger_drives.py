@@ -40,7 +40,6 @@ class EdgeErrors:
 
     Attributes:
         position_m: standard deviation in x and in y, also what the estimate says of itself.
-        heading_rad: standard deviation.
     """
 
     position_m: float
@@ -69,11 +68,7 @@ class EdgeRuleUnderTest(Protocol):
 
 
 class OffTimeRule:
-    """The thesis's rule (3.4.1): an edge where a sensor has been off for the time that the gap takes at 0.1 m/s.
-
-    Args:
-        off_s: that time.
-    """
+    """The thesis's rule (3.4.1): an edge where a sensor has been off for the time that the gap takes at 0.1 m/s."""
 
     def __init__(self, off_s: float) -> None:
         self._off_s = off_s
@@ -99,7 +94,6 @@ class MapRule:
     """The daemon's rule: travel against the map.
 
     Args:
-        mirror: the map.
         cfg: robot and danger sections.
     """
 
@@ -128,11 +122,7 @@ class Rig:
     """One robot on its way, with what it reads.
 
     Args:
-        mirror: the ideal mirror.
         cfg: robot, world, sim.
-        start: true pose at the beginning.
-        errors: of the estimate.
-        rng: parent of every draw.
     """
 
     def __init__(
@@ -211,12 +201,8 @@ def transit(
     """Cross a seam between two columns, or turn by a quarter beside it; whether each rule took it for an edge.
 
     Args:
-        mirror: the mirror.
         cfg: robot, world, sim, danger.
-        v_m_s: speed, in a turn that of the sensors.
         angle_rad: between the way and the seam's normal; None turns in place.
-        errors: of the estimate.
-        rng: draws the seam, the side, and everything of the rig.
 
     Returns:
         A flag for each of ``RULES``.
@@ -254,12 +240,7 @@ def transit(
 
 
 class Overrun(NamedTuple):
-    """Where a drive to the rim ended.
-
-    Attributes:
-        sensor_m: the furthest edge sensor beyond the rim.
-        has_fallen: the robot's origin went beyond it.
-    """
+    """Where a drive to the rim ended."""
 
     sensor_m: float
     has_fallen: bool
@@ -271,13 +252,7 @@ def drive_to_rim(
     """Drive over the rim until a rule sees an edge; the set points are zero one frame and the link's delays later.
 
     Args:
-        mirror: the mirror.
         cfg: robot, world, sim, danger.
-        v_m_s: speed.
-        angle_rad: between the way and the rim's normal.
-        name: of the rule.
-        errors: of the estimate.
-        rng: draws the place, and everything of the rig.
     """
     place_rng, rig_rng = rng.spawn(2)
     panel = _pick(place_rng, [p for p in mirror.panels.values() if _right_of(p) not in mirror.panels])

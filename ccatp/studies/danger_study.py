@@ -28,13 +28,7 @@ _MARGIN_M_S = 0.02
 def draw_danger(
     results: Sequence[CellResult], speeds_m_s: Sequence[float], crossings: Sequence[int | str], out: Path
 ) -> None:
-    """Draw ``danger_false_edges_<mirror>`` and ``danger_overrun_<mirror>``, one panel per rule.
-
-    Args:
-        results: cells.
-        speeds_m_s, crossings: levels of the factors, in the order of the axis and of the lines.
-        out: directory.
-    """
+    """Draw ``danger_false_edges_<mirror>`` and ``danger_overrun_<mirror>``, one panel per rule."""
     for mirror in dict.fromkeys(str(result.factors["mirror"]) for result in results):
         mine = {
             (result.factors["speed_m_s"], result.factors["crossing"]): result

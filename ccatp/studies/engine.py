@@ -86,7 +86,6 @@ class JobExecutor(NamedTuple):
     """Where jobs are sent.
 
     Attributes:
-        executor: takes them.
         room: how many it can have at a time; on a cluster workers come and go.
     """
 
@@ -95,10 +94,7 @@ class JobExecutor(NamedTuple):
 
 
 class _SerialExecutor(Executor):
-    """Runs each job at once, in this process."""
-
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Run it; Ctrl-C gets through."""
         future: Future[Any] = Future()
         try:
             future.set_result(fn(*args, **kwargs))
@@ -121,7 +117,6 @@ def place_of(workers: int | None, cluster: str | None, jobs: int) -> Iterator[Jo
 
     Args:
         workers: processes; None takes one for each core. One is this process.
-        cluster: address of a scheduler, instead.
         jobs: there are; more workers would idle.
 
     Raises:
@@ -200,16 +195,10 @@ class CampaignOptions:
     """How a campaign is run.
 
     Attributes:
-        out: directory of ledger and results.
         runs: seeds of each cell; None takes the study's.
         workers: processes; None takes one for each core.
-        cluster: address of a scheduler, in place of processes here.
-        shard: part of the jobs.
         others: directories whose finished jobs are taken over.
         mirrors, only: see ``cells_of``.
-        settings: dotted keys of the command line.
-        with_figures: draw.
-        is_quiet: no progress.
     """
 
     out: Path

@@ -60,8 +60,6 @@ def random_plan(seed: int, count: int, last_s: float) -> FaultPlan:
     """A function of its arguments alone.
 
     Args:
-        seed: of the plan.
-        count: how many faults.
         last_s: robot time by which all have begun; each lasts at most ``LONGEST_S``.
     """
     rng = random.Random(f"plan {seed}")
@@ -76,7 +74,6 @@ def random_plan(seed: int, count: int, last_s: float) -> FaultPlan:
 
 
 def _draw(rng: random.Random) -> tuple[str, str, str]:
-    """Signal, type and keys of a fault."""
     if rng.random() < 0.25:
         return rng.choice(
             [
@@ -114,8 +111,6 @@ class FaultySilRun(SilRun):
     """As the processes: a frame that nobody can take is passed over, and one that is not newer is answered with zeros.
 
     Args:
-        cfg: the configuration.
-        plan: what shall go wrong.
         with_track: keep true and estimated pose of every frame.
 
     Attributes:

@@ -46,9 +46,6 @@ class FigureRow(NamedTuple):
     """A line of the figure.
 
     Attributes:
-        label: beside it.
-        cell: its figures.
-        shade: index of its colour.
         is_base: others are compared with it: its mean is a line through all.
     """
 

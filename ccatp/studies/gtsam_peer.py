@@ -36,7 +36,6 @@ class Peers(NamedTuple):
 
     Attributes:
         isam2: each pose as it was estimated from readings up to it; the map at the end.
-        batch: of all readings.
     """
 
     isam2: EstimatedPath
@@ -62,8 +61,6 @@ def run_gtsam(run: RecordedRun, settings: BatchSettings, clock_s: Callable[[], f
 
 
 class _Session:
-    """The graph as it grows."""
-
     def __init__(self, gtsam: Any, run: RecordedRun, settings: BatchSettings) -> None:
         self._gtsam, self._run, self._settings = gtsam, run, settings
         self._times = np.union1d(run.readings.times_s, run.steps.times_s[:1])

@@ -56,7 +56,6 @@ class JobStore:
 
     Args:
         out: the campaign's directory; made if it is not there.
-        shard: whose file is written.
         others: directories whose jobs are taken over.
 
     Raises:
@@ -65,7 +64,6 @@ class JobStore:
     """
 
     def __init__(self, out: Path, shard: Shard = WHOLE, others: Iterable[Path] = ()) -> None:
-        """Open the shard's file and read all that is there."""
         make_out(out)
         name = "jobs.jsonl" if shard == WHOLE else f"jobs-{shard.number}of{shard.of}.jsonl"
         self._done: dict[str, tuple[str, Path, JobOutcome]] = {}
@@ -175,17 +173,9 @@ def _unpacked(text: str) -> Arrays:
 
 
 class CampaignView:
-    """Progress of a campaign.
-
-    Args:
-        name: of the study.
-        todo: jobs to do now.
-        kept: jobs that are done already.
-        is_quiet: show nothing.
-    """
+    """Progress of a campaign."""
 
     def __init__(self, name: str, todo: int, kept: int, is_quiet: bool) -> None:
-        """Say what is to do."""
         self._name, self._todo, self._count, self._told = name, todo, 0, 0
         self._console = Console(stderr=True, highlight=False, quiet=is_quiet)
         self._is_live = self._console.is_terminal and todo > 0
@@ -215,8 +205,6 @@ class CampaignView:
         """One more job is done.
 
         Args:
-            key: its name.
-            done_s: what all that are done took their workers.
             left_s: what those still to come are expected to take.
         """
         self._count += 1
@@ -256,11 +244,8 @@ def write_results(
     """Write all files of a result.
 
     Args:
-        study: the study.
         cells: its cells; those without a run are left out of table and figures.
-        out: directory.
         about: what else ``result.json`` says of the campaign: its wall time, jobs that are missing.
-        with_figures: draw.
 
     Returns:
         What ``result.json`` holds.

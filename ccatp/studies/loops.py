@@ -59,14 +59,10 @@ class Loop:
     """One open loop L(s) = C(s) P(s) exp(-s tau).
 
     Attributes:
-        gains: name of the set of gains.
         axis: ``forward`` (distance, m), ``angular`` (turn in place, rad) or ``steering`` (heading on a leg, rad).
         plant: ``printed``, 1/(T s + 1), or ``true``, 1/(s (T s + 1)): a speed command reaches the position by way of
             an integrator, which the thesis leaves out.
-        lag_s: T.
-        delay_frames: link delay there and back, frames.
         delay_s: tau, the same in seconds.
-        numerator, denominator: of C P, highest power first.
     """
 
     gains: str
@@ -86,9 +82,6 @@ class Margins(NamedTuple):
         gain_db: the gain may grow by this before the loop becomes unstable; negative if it has to shrink.
         phase_rad: least phase margin over all gain crossovers.
         modulus: least distance of L(j w) from -1.
-        gain_crossover_rad_s, phase_crossover_rad_s: where the phase and the gain margin are taken.
-        delay_s: further delay that uses up the phase margin.
-        is_stable: whether the closed loop is.
     """
 
     gain_db: float
@@ -246,7 +239,6 @@ def _half_turn(omega_rad_s: float, loop: Loop) -> float:
 
 
 def _changes(omega_rad_s: FloatArray, level: FloatArray) -> list[tuple[float, float]]:
-    """The intervals of the grid over which ``level`` changes."""
     at = np.flatnonzero(np.diff(level))
     return [(float(omega_rad_s[i]), float(omega_rad_s[i + 1])) for i in at]
 
@@ -256,12 +248,10 @@ def _root(loop: Loop, of: Callable[[float, Loop], float], low: float, high: floa
 
 
 def _wrapped(angle_rad: float) -> float:
-    """Into (-pi, pi]."""
     return -wrap_pi(-angle_rad)
 
 
 def _trimmed(coefficients: Coefficients) -> Coefficients:
-    """Without leading zeros."""
     first = next((i for i, c in enumerate(coefficients) if c != 0.0), len(coefficients) - 1)
     return coefficients[first:]
 

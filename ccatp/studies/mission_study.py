@@ -161,7 +161,6 @@ def chi_square_figures(values: FloatArray, freedom: int) -> dict[str, Any]:
 
     Args:
         values: shape (k,).
-        freedom: degrees of freedom.
 
     Returns:
         ``count``; ``mean`` and ``band_95``, in which that of a consistent filter lies; ``is_within_band``; ``p50``;
@@ -292,7 +291,6 @@ def dangers(values: Sequence[Any]) -> dict[str, Any]:
 
 
 def _last_of_each(stops: FloatArray) -> FloatArray:
-    """The last measurement of each point of one run."""
     names = stops[:, [COLUMN["row"], COLUMN["col"], COLUMN["point"]]]
     _, backwards = np.unique(names[::-1], axis=0, return_index=True)
     return stops[::-1][np.sort(backwards)]

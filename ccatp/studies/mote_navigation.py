@@ -46,12 +46,7 @@ class BeaconSilResult:
 
     Attributes:
         summary: as ``summary.json``.
-        states: of the mission.
-        verdicts: of the danger rules.
-        times_s: of the frames.
-        speeds_m_s: forward, as they were sent.
         track, truth: rows of ``beacon_track`` and ``beacon_truth``.
-        outcome, cause: how the mission ended.
     """
 
     summary: dict[str, Any] = field(default_factory=dict)
@@ -71,19 +66,9 @@ class BeaconSilResult:
 
 
 class BeaconSilWorld:
-    """Robot, danger rules and mission, frame by frame.
-
-    Args:
-        cfg: the configuration.
-
-    Attributes:
-        robot: the simulated one.
-        mission, danger: as in the daemon.
-        found: what it leaves.
-    """
+    """Robot, danger rules and mission, frame by frame."""
 
     def __init__(self, cfg: RadioConfig) -> None:
-        """Both keys are in the robot's hands."""
         self._cfg = cfg
         self.robot = build_beacon_robot(cfg)
         self.mission, self.danger = assemble_beacons(cfg), BeaconSafetyRules(cfg)
@@ -192,11 +177,6 @@ def run_job(job: Job) -> JobOutcome:
 
 def seconds_of(track: PoseTrack, truth: PoseTruth, begin_s: float) -> dict[str, FloatArray]:
     """Errors of the pose, once a second.
-
-    Args:
-        track: estimates.
-        truth: what was true.
-        begin_s: robot time of the first that counts.
 
     Returns:
         ``nees`` of the pose, ``error_m`` of the position, ``sigma_m``, root of the trace of its covariance.

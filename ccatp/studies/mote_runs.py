@@ -37,7 +37,6 @@ class SimulatedField:
     """What happened in one field.
 
     Attributes:
-        plan: what the operator knows.
         true_m: places of all motes, shape (n, d).
         first: ranges of phase 1, repeated as configured.
         second: single ranges in the order of phase 2, first, second, range_m, sigma_m.
@@ -63,10 +62,6 @@ class SimulatedField:
 
 def simulate_field(cfg: CricketConfig, seed: int) -> SimulatedField:
     """Draw the errors of one field and everything that its motes hear.
-
-    Args:
-        cfg: the motes.
-        seed: of everything that is drawn.
 
     Raises:
         MappingError: no pair of phase 2 hears each other.
@@ -102,13 +97,8 @@ class MoteRun:
         names, positions_m, covariance_m2, true_m: of the motes that were mapped; the truth in the same frame.
         rms_m: error; after the best rigid motion where ``is_aligned``.
         phase1_rms_m: the same of phase 1; None where it could not place all motes.
-        expected_rms_m: by the estimator's own covariance.
-        iterations: updates of the filter, or steps of the batch.
         trace_m: error after each update, phase 1 first; of the batch just both.
-        expected_trace_m: what the filter expected.
         is_aligned: whether the frame was free.
-        offset_m, scale: of the ranges, where they were estimated.
-        nis: of each update of the filter.
         doubtful: rows of motes whose mirror image fits as well, or that hang on too few ranges.
         whole: the map with all motes of the stands, by name; the same motes where there are no others.
     """
@@ -144,8 +134,6 @@ class MoteOutlook:
     """What the ranges can tell, said before anything is estimated.
 
     Attributes:
-        freedom: rank and free directions.
-        folds: who may fold over.
         bound_rms_m: Cramér-Rao bound at the true places; None where something stays free.
     """
 
@@ -214,7 +202,6 @@ def run_filter(cfg: CricketConfig, field: SimulatedField) -> MoteRun:
 
 
 def _whole(field: SimulatedField, first: FirstMap, mapper: MoteMapper) -> NamedMap:
-    """All motes of the stands, from their heads."""
     plan = field.plan
     if not plan.networks:
         return NamedMap(plan.names, mapper.positions_m, mapper.covariance_m2)
@@ -227,8 +214,6 @@ def run_batch(cfg: CricketConfig, field: SimulatedField, outlook: MoteOutlook | 
     """The batch over all ranges of both phases; its error after the best rigid motion.
 
     Args:
-        cfg: the motes.
-        field: the ranges.
         outlook: of the same graph, for the sets of motes that may fold.
 
     Raises:
@@ -303,7 +288,6 @@ def look_ahead(cfg: CricketConfig, field: SimulatedField, method: str, updates: 
     phase 1 measured too, unless the printed prior throws that away.
 
     Args:
-        cfg: the motes.
         field: the ranges; their values are not looked at.
         method: ``ekf`` or ``batch``.
         updates: ranges of phase 2 that count; all if ``None``.

@@ -45,7 +45,6 @@ def run(cfg: Config, out: Path) -> dict[str, Any]:
     """Map drawn fields of growing size, once each, and write ``result.json``, ``table.md`` and the figure.
 
     Args:
-        cfg: the seed.
         out: directory; made if it is not there.
 
     Raises:
@@ -147,9 +146,7 @@ class MoteCampaign(NamedTuple):
 
     Attributes:
         method: ``ekf`` or ``batch``.
-        runs: in the order of their seeds.
         outlook: of the first seed's graph, bounds at the median number of updates.
-        field: the first.
     """
 
     method: str
@@ -164,10 +161,7 @@ def run_campaign(
     """Map the motes once for each seed.
 
     Args:
-        cfg: the motes.
         method: ``ekf`` or ``batch``.
-        seeds: of the runs.
-        tell: called with the number of runs done.
 
     Raises:
         MappingError: a field of which no map can be made.
@@ -242,12 +236,7 @@ _LINED = 100  # motes up to which the measured pairs are drawn
 
 
 def pictured(campaign: MoteCampaign, seed: int) -> tuple[MapPicture, Traces | None]:
-    """The map of the first run, and of the filter the errors against updates.
-
-    Args:
-        campaign: the runs.
-        seed: of the first, for the title.
-    """
+    """The map of the first run, and of the filter the errors against updates."""
     run = campaign.runs[0]
     title = f"{campaign.method}, {len(run.names)} motes, seed {seed}, error {1e3 * run.rms_m:.3g} mm"
     positions_m, covariance_m2 = run.positions_m, run.covariance_m2

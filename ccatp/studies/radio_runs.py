@@ -30,11 +30,7 @@ class RadioRun:
         reckoned_errors: x_m and y_m of dead reckoning by the same odometry.
         beacon_errors_m: by name, from the first estimate on: distance of estimate and truth.
         beacon_nees: the same, with 2 degrees of freedom.
-        nis: of each reading, and its size.
-        distances_m: true distance to the target.
-        clearances_m: between body and nearest obstacle.
         truth, estimates, targets, believed: paths of the vehicle and of the target, x_m and y_m.
-        places: at the end, by name: estimate, covariance, truth.
         joint_nees: at the end, of the pose and all static radios on the map, and its degrees of freedom.
     """
 
@@ -245,7 +241,6 @@ def _length(vector: FloatArray) -> float:
 
 
 def _rms(errors: FloatArray) -> float:
-    """Root mean square length of rows, or of numbers."""
     squares = errors**2 if errors.ndim == 1 else np.sum(errors**2, axis=1)
     return float(np.sqrt(np.mean(squares)))
 

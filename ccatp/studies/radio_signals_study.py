@@ -32,10 +32,7 @@ def draw_errors(results: Sequence[CellResult], name: str, label: str, keys: Sequ
 
     Args:
         results: cells with the array ``name`` of shape (runs, points).
-        name: of the array.
-        label: of the axis.
         keys: factors that tell the cells apart; the first one makes the panels.
-        stem: file without suffix.
     """
     shown = [result for result in results if name in result.arrays]
     if not shown:

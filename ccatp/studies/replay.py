@@ -66,12 +66,6 @@ class RecordingFilter:
     its own (``transition_of_reset``).
 
     The record costs ``Smoother``'s memory, 9 kB a transition at 19 states.
-
-    Args:
-        filter_: does the work.
-
-    Attributes:
-        mean, covariance, transition: the filter's.
     """
 
     def __init__(self, filter_: Filter) -> None:
@@ -138,7 +132,6 @@ class RecordingFilter:
             self._settle()
 
     def _settle(self) -> None:
-        """Hand the oldest call to the smoother."""
         mean, covariance, step = self._past.popleft()
         if step is None:
             return
@@ -215,13 +208,11 @@ class Replayed:
 
     Attributes:
         trace: its estimates, each before the fix that was taken there.
-        moving: frames in which the wheels turned.
         smoothed: what the whole record says of the same poses, where it was asked for.
         feet: of the fixes taken then: frame before them, deck x, y of the robot's origin as they show it, shape (f, 3).
         fixes: measured; of them ``set_aside`` were kept from the localizer in the run, and are here, and ``refused``
             were not taken by this localizer.
         first_difference: the first fix of another fate than in the run: its time, and what the localizer said to it.
-        counts: the localizer's.
     """
 
     trace: Trace
@@ -251,8 +242,6 @@ def replay(
     """Run the localizer of a configuration over the events of a run, from its start at base.
 
     Args:
-        cfg: which filter, and its settings.
-        mirror: the mirror of the run.
         events: see ``in_order``.
         smooth: go back over the run with the smoother afterwards.
         on_frame: told the robot time of each frame, s.
@@ -315,7 +304,6 @@ class _Player:
         self._localizer = build_doubting(self._cfg, self._mirror, pose, (sigmas[0], sigmas[1]), self._wrap)
 
     def _take_frame(self, event: Marked) -> None:
-        """As the main loop does."""
         if event.begun is not None:
             self._begin(event.begun)
         localizer, sensors = self._localizer, event.sensors

@@ -43,9 +43,6 @@ def errors_of(estimate: Trace, reference: Trace, moving: IntArray, arrivals: Int
     """Compare in the frames that both have.
 
     Args:
-        estimate: what is judged.
-        reference: by what.
-        moving: frames in which the wheels turned.
         arrivals: frames at whose end the robot stood at a point for the first time.
     """
     seqs, i, j = np.intersect1d(estimate.seq, reference.seq, return_indices=True)
@@ -73,7 +70,6 @@ def fix_distances_m(estimate: Trace, feet: FloatArray, mirror: Mirror) -> FloatA
     Args:
         estimate: before each fix.
         feet: frame before the fix, deck x, y of the robot's origin as the fix shows it, shape (f, 3).
-        mirror: tells the height of the surface.
     """
     at = np.searchsorted(estimate.seq, feet[:, 0])
     x, y = feet[:, 1], feet[:, 2]
@@ -139,11 +135,7 @@ class ReplayEvaluation(NamedTuple):
     """One recording and its replay.
 
     Attributes:
-        replayed: what came of it.
-        recorded: what the run itself estimated.
-        truth: of the simulation, or None.
         arrivals: frames at which the robot stood at a point for the first time.
-        mirror: the mirror.
     """
 
     replayed: Replayed

@@ -37,15 +37,10 @@ class SilTrace:
     """Keeps rows as they come and converts a thousand at a time.
 
     Args:
-        parts: of the run.
         with_track: keep true and estimated pose of every frame.
-
-    Attributes:
-        builder: builds the summary.
     """
 
     def __init__(self, parts: SurveyParts, *, with_track: bool) -> None:
-        """Nothing has happened yet."""
         cfg, mirror = parts.cfg, parts.mirror
         facts = RunFacts(
             mirror=cfg.mirror.name,
@@ -108,10 +103,7 @@ class SilTrace:
         """The summary of the whole run.
 
         Args:
-            mission: at its end.
-            mission_time_s: robot time from start to end.
             fits: panels as fitted: piston (m), tip and tilt (rad).
-            misalignments: panels as they really are.
         """
         self._flush()
         injected = {panel: (m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in misalignments.items()}
@@ -133,8 +125,6 @@ class StopRow:
     """One measurement of a point, before its fix is fused.
 
     Attributes:
-        t_s: robot time.
-        point: row, column, number.
         approach: 1 at the first arrival.
         error: true minus estimated pose: x, y (deck, m), heading (rad).
         covariance: of the estimate of the three, shape (3, 3).
@@ -159,13 +149,8 @@ class SilResult:
 
     Attributes:
         summary: as in ``summary.json``.
-        stops: measurements in the order they were taken.
         corrections: moves after a fix that showed the robot too far from its point.
-        counts: the localizer's.
-        outcome, cause: how the mission ended.
-        states_s: time spent in each state of the mission.
         track: rows of t, true x, y, heading, estimated x, y, heading (deck), shape (k, 7), where it was asked for.
-        notices: what the localizer had to say to an operator.
     """
 
     summary: dict[str, Any]
@@ -197,15 +182,12 @@ class SilLaser:
 
     Args:
         cfg: the configuration; its seed seeds the lengths' noise.
-        mirror: the mirror.
-        robot: carries the puck.
 
     Attributes:
         stops: measurements whose fix was fused, in their order.
     """
 
     def __init__(self, cfg: Config, mirror: Mirror, robot: Robot) -> None:
-        """Nothing measured."""
         self._cfg, self._mirror, self._robot = cfg, mirror, robot
         channels, collimators_m = mirror.channels, mirror.collimators_m
         rng = np.random.default_rng([cfg.run.seed, SEED_STREAM])
@@ -220,7 +202,6 @@ class SilLaser:
 
         Args:
             t_s: time of the frame to which the fix belongs.
-            estimate: says where the puck is expected.
 
         Raises:
             MultilaterationError: no solution, or one past a limit.
@@ -251,10 +232,7 @@ class SilLaser:
 
         Args:
             row: the state before it.
-            point: where it was taken.
-            fix: the fix.
             distance_m: of the robot from the point, as the fix shows it.
-            localizer: has fused it.
         """
         row.fix_distance_m = distance_m
         if localizer.innovation is not None and localizer.innovation.size == 2:

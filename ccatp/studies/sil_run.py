@@ -48,13 +48,11 @@ class SilRun:
     A subclass may exchange parts before ``run``, or look on by overriding what happens in a frame.
 
     Args:
-        cfg: the configuration.
         with_track: keep true and estimated pose of every frame.
         faults: what shall go wrong with the robot; ``FaultyRehearsal`` can serve it.
     """
 
     def __init__(self, cfg: Config, *, with_track: bool, faults: FaultPlan | None = None) -> None:
-        """The robot stands at base, and nobody has joined it."""
         self.cfg = cfg
         parts: SurveyParts = assemble(cfg)
         self.parts, self.mirror = parts, parts.mirror

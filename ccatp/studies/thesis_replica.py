@@ -57,7 +57,6 @@ def overrides_of(
 
     Args:
         noise: a name out of ``NOISES``.
-        noise_is_variance: the table lists variances.
         period_error: by which part of the filter's step the loop takes longer.
         is_ours: the daemon's filter and control in the same set-up, all encoder samples included.
     """
@@ -129,7 +128,6 @@ class _NoEdges(DangerMonitor):
     """Permits everything: far from the rim an edge that a rule sees is a false one, and would end the run."""
 
     def step(self, sensors: SensorsFrame, estimate: PoseReport | None) -> Verdict:
-        """The verdict that all is normal."""
         del estimate
         return Verdict(sensors.seq, sensors.t, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
 
@@ -162,7 +160,6 @@ class ReplicaRun(NamedTuple):
         localization_m: distance of true and estimated position, every frame until the last stop, shape (k,).
         waypoint_m: distance of the robot's stop from its waypoint, shape (9 panels,) if all were reached.
         track: t, true x, y, estimated x, y, every tenth frame, shape (j, 5).
-        outcome, cause: how the mission ended.
     """
 
     localization_m: NDArray[np.float64]

@@ -41,9 +41,7 @@ def draw_thesis(
     * ``waypoints_<noise>``: the waypoint errors of all runs, and their histogram.
 
     Args:
-        results: cells.
         published: the thesis's figures by noise and quantity.
-        out: directory.
     """
     for noise, numbers in _NUMBERS.items():
         mine = [result for result in results if result.factors["noise"] == noise]

@@ -52,13 +52,9 @@ class TimeBudget:
 
     Args:
         budget_s: time from the first frame until the robot is home or the survey complete.
-        mirror: where the points are.
-        limits: motion limits.
-        measuring_time_s: standstill at each point.
     """
 
     def __init__(self, budget_s: float, mirror: Mirror, limits: LimitsConfig, measuring_time_s: float) -> None:
-        """The time begins with the first review."""
         self.budget_s = budget_s
         self._limits, self._measuring_s = limits, measuring_time_s
         self._place_of: Callable[[PointId], tuple[float, float]] = mirror.point_on_deck
@@ -89,7 +85,6 @@ class TimeBudget:
         """One point is done with: what to do with those that are left.
 
         Args:
-            t_s: robot time.
             pose: of the robot, deck.
             left: points, in the order in which they are to be measured.
 
@@ -121,9 +116,6 @@ class Behaviours:
     """One frame of whatever the state says.
 
     Args:
-        standing: what the rooms of the survey share.
-        budget: the time there is, if that is limited.
-        plan_home: gives the stops from a pose to base.
         plan_rest: gives the way back to a route from a pose, without the points that are done with.
         plan_points: gives a route through points from a pose, if there is such a planner.
     """
@@ -136,7 +128,6 @@ class Behaviours:
         plan_rest: PlanRest,
         plan_points: PlanPoints | None,
     ) -> None:
-        """Nothing driven yet."""
         self._standing, self._budget = standing, budget
         self._plan_home, self._plan_rest, self._plan_points = plan_home, plan_rest, plan_points
 
@@ -152,7 +143,6 @@ class Behaviours:
 
         Args:
             motion: time, pose and speed of the present frame.
-            verdict: the danger loop's verdict in force.
         """
         state = self._standing.state
         if motion.t_s < self._standing.stands_until_s:

@@ -62,8 +62,6 @@ def assemble(cfg: Config, done: Collection[PointId] = (), recovery: TakeoverStat
     """All pure parts of a main loop, the robot standing at base or where another main loop left it.
 
     Args:
-        cfg: the configuration.
-        done: points that are measured already.
         recovery: what the other one left, if there was one.
 
     Raises:
@@ -106,10 +104,6 @@ def plan_survey(
     """The route of a survey from base, with the calibration drive before it.
 
     Args:
-        cfg: the configuration.
-        mirror: its mirror.
-        points: in the order of measuring.
-        done: points that are measured already.
         out_of_reach: takes the points that cannot be reached, and the route goes without them.
         calibrates: drive a calibration first, where the localizer has a use for it.
 
@@ -201,9 +195,7 @@ class SurveyPlan:
         out_of_reach: no safe way leads there with the configured clearances; a run would be refused.
         stops: where the robot would stand, one after the other.
         times_s: since the start, when it stands at each stop, before what it measures there.
-        length_m: of the whole way.
         driving_s, turning_s, measuring_s: least times, rest to rest; their sum is the survey's lower bound.
-        any_order_s: no order of the points takes less.
     """
 
     points: tuple[PointId, ...]

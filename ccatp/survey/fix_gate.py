@@ -35,14 +35,10 @@ class FixPlausibility:
     that has such a gate keeps that count itself.
 
     Args:
-        mirror: the ideal surface.
-        cfg: the limits.
-        puck_height_m: of the puck above the robot's origin.
         gate_nis: the localizer's gate; ``None`` where it has none.
     """
 
     def __init__(self, mirror: Mirror, cfg: EtalonConfig, puck_height_m: float, gate_nis: float | None) -> None:
-        """No fix seen."""
         self._mirror, self._cfg, self._puck_height_m, self._gate_nis = mirror, cfg, puck_height_m, gate_nis
         self._seen: list[Vector3] = []
 
@@ -54,8 +50,6 @@ class FixPlausibility:
         """Why to measure again instead of using ``fix``, or empty.
 
         Args:
-            fix: as measured.
-            pose: the estimate for its time.
             covariance: of the estimate's (x, y, heading), shape (3, 3).
         """
         try:
@@ -83,8 +77,6 @@ def nis_of(foot: DeckFoot, pose: DeckPose, covariance: FloatArray) -> float:
     """Normalised innovation squared of a fix against an estimate, two degrees of freedom; NaN where there is none.
 
     Args:
-        foot: of the fix.
-        pose: the estimate.
         covariance: of its (x, y, heading), shape (3, 3).
     """
     residual = np.array((foot.x_m - pose.x_m, foot.y_m - pose.y_m))
@@ -143,7 +135,6 @@ class FrameCheck:
     """
 
     def __init__(self, cfg: EtalonConfig) -> None:
-        """Nothing seen."""
         self._limit_m = cfg.start_distance_m
         self._places: list[FloatArray] = []
         self.is_over = False
@@ -191,9 +182,7 @@ def explain_lengths(
     Empty where no such mistake does.
 
     Args:
-        cfg: limits of a solution.
         expected_m: where the puck must be, world frame.
-        lengths_m: by channel, as measured.
         collimators_m: by channel, world frame, as configured, shape (3,).
     """
     for name, factor in UNITS:
@@ -230,7 +219,6 @@ class FixFinding(NamedTuple):
     """What was found: nothing where both are empty.
 
     Attributes:
-        doubt: why to measure again.
         refusal: why this laser system must not be used for this mission.
     """
 
@@ -239,15 +227,9 @@ class FixFinding(NamedTuple):
 
 
 class FixGate:
-    """Looks at every fix of a mission before the localizer gets it.
-
-    Args:
-        mirror: the ideal surface.
-        cfg: the configuration.
-    """
+    """Looks at every fix of a mission before the localizer gets it."""
 
     def __init__(self, mirror: Mirror, cfg: Config) -> None:
-        """No fix seen."""
         gate = None if cfg.run.filter in FOUR_STATE else cfg.localizer.full_state.fix_gate_nis
         self._judge = FixPlausibility(mirror, cfg.etalon, cfg.robot.puck_height_m, gate)
         self._frame = FrameCheck(cfg.etalon)
@@ -265,11 +247,8 @@ class FixGate:
         """Judge a fix.
 
         Args:
-            fix: as measured.
             expected_m: of the puck, world frame, by the estimate.
-            pose: the estimate for the fix's time.
             covariance: of the estimate's (x, y, heading), shape (3, 3).
-            is_lost: the estimate is known to be wrong.
         """
         is_first, self._is_first = self._is_first, False
         fault = None if is_lost else self._frame.look(fix.position_m, expected_m)
@@ -282,7 +261,6 @@ class FixGate:
         """Why lengths that gave no position speak against the laser system; empty once a fix has been right.
 
         Args:
-            lengths_m: by channel, as measured.
             expected_m: where the puck must be, world frame.
         """
         if not self._is_first:

@@ -30,14 +30,8 @@ class HeadingRecovery:
     """While the heading is in doubt: which leg shows more of it.
 
     Args:
-        mirror: where there is room.
-        robot: where its sensors are.
         cfg: when a heading is in doubt, how long a leg is, how far it keeps from the rim.
         heading_sigma_of: how well the heading is known, rad.
-        make_journey: makes a journey of stops.
-
-    Attributes:
-        journey: the leg being driven, if any.
     """
 
     def __init__(
@@ -48,7 +42,6 @@ class HeadingRecovery:
         heading_sigma_of: Callable[[], float],
         make_journey: Callable[[Sequence[Stop]], RouteFollower],
     ) -> None:
-        """Nothing is in doubt."""
         self._mirror, self._limit_rad, self._wanted_m = mirror, cfg.heading_doubt_rad, cfg.alignment_leg_m
         # Whatever the heading, no sensor leaves the mirror.
         self._clearance_m = max(build_body(robot, cfg).turning_depth_m, cfg.leg_clearance_m)
@@ -130,7 +123,6 @@ class TakeoverState(NamedTuple):
         pose: where the robot was seen last, deck frame.
         position_sigma_m, heading_sigma_rad: how far it may be from there now.
         elapsed_s: time that the mission has taken so far.
-        skipped: points that were given up.
         abort_cause: why the robot is on its way home, or empty.
         held_cause: why an operator has to resume it, or empty.
     """

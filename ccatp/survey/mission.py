@@ -33,12 +33,10 @@ class FixResults:
     """Takes the outcome of each measurement.
 
     Args:
-        standing: what the rooms of the survey share.
         has_budget: the time left is reviewed after each point.
     """
 
     def __init__(self, standing: SurveyState, *, has_budget: bool) -> None:
-        """Nothing measured yet."""
         self._standing, self._has_budget = standing, has_budget
         self._failures = 0
 
@@ -137,10 +135,6 @@ class Mission:
     ``fixed`` or ``not_fixed``.
 
     Args:
-        cfg: the configuration.
-        mirror: the mirror surveyed.
-        route: the route of the survey.
-        plan_home: gives the stops from a pose to base.
         plan_rest: gives the way back to a route from a pose, without the points that are done with.
         plan_points: gives a route through points from a pose; without it what failed once is not tried again.
         heading_sigma_of: how well the heading is known, rad; asked after the robot was out of sight.
@@ -156,7 +150,6 @@ class Mission:
         plan_points: PlanPoints | None = None,
         heading_sigma_of: Callable[[], float] = float,
     ) -> None:
-        """Idle at base."""
         self._control = cfg.control
         self._points = tuple(stop.point for stop in route.stops if stop.point is not None)
         self._budget: TimeBudget | None = None

@@ -53,14 +53,9 @@ def abort(standing: SurveyState, cause: str) -> str | None:
 
 
 class Failsafe:
-    """Hears the verdict of each frame before anything moves.
-
-    Args:
-        standing: what the rooms of the survey share.
-    """
+    """Hears the verdict of each frame before anything moves."""
 
     def __init__(self, standing: SurveyState) -> None:
-        """No verdict yet."""
         self._standing = standing
         self._finding = ""
         self._raised: int | None = 0
@@ -254,7 +249,6 @@ class UnattendedFaultTimer:
     """
 
     def __init__(self, cfg: Config, *, falls: bool) -> None:
-        """No fault."""
         self._alarm_period_s, self._health, self._falls = cfg.mission.alarm_period_s, cfg.health, falls
         self._since_s: float | None = None
         self._remind_at_s = 0.0
@@ -272,7 +266,6 @@ class UnattendedFaultTimer:
         """One frame of a fault.
 
         Args:
-            t_s: robot time.
             soc: state of charge, 0 to 1.
             home_s: time of the way home; ``None`` where the robot does not know where it is.
         """
@@ -304,16 +297,12 @@ PATIENCE_S = 4.0
 class MirrorCheck:
     """Compares the slope that gravity shows with the map's. The heading plays no part, so that it need not be known.
 
-    Args:
-        mirror: the configured mirror.
-
     Attributes:
         contradiction: why the mirror cannot be this one; empty while nothing speaks against it.
         warning: what could not be checked.
     """
 
     def __init__(self, mirror: Mirror) -> None:
-        """Nothing heard."""
         self._mirror = mirror
         self._slopes_rad: list[float] = []
         self._first_s: float | None = None
@@ -325,7 +314,6 @@ class MirrorCheck:
         Args:
             t_s: time of the frame, s.
             gravity: time and direction of gravity in the robot frame, where the frame has a reading.
-            pose: where the robot is thought to stand.
         """
         if self._first_s is None:
             self._first_s = t_s

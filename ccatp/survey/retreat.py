@@ -30,19 +30,11 @@ class EdgeRetreat:
     """One back-off: away from the edge along the track just driven, then a turn away from the side that hung over.
 
     A robot that met the edge backwards faces away from it, and does not turn.
-
-    Args:
-        cfg: distances and speeds.
-        tracker: the leg tracker, borrowed for the turn.
-        verdict: the verdict that declared the edge.
-        pose: where the robot was then.
-        rate_rad_s: how it was turning then.
     """
 
     def __init__(
         self, cfg: MissionConfig, tracker: LegTracker, verdict: Verdict, pose: PanelPose, rate_rad_s: float
     ) -> None:
-        """Choose the way out from what the verdict permits."""
         self._cfg, self._tracker = cfg, tracker
         self._last = pose
         self._time_s = 0.0

@@ -19,20 +19,9 @@ from ccatp.survey.planning.legs import build_body, course_of_heading, sensor_dep
 
 
 class SpeedLimitedTracker(LegTracker):
-    """A leg tracker that plans with the reduced limits while ``is_slow``; a change counts from the next leg or turn.
-
-    Args:
-        control: tolerances and gains.
-        limits: the usual limits.
-        health: the reduced speeds.
-        wheel_lag_s: time constant of the wheel servo.
-
-    Attributes:
-        is_slow: plan the next motion at the reduced pace.
-    """
+    """A leg tracker that plans with the reduced limits while ``is_slow``; a change counts from the next leg or turn."""
 
     def __init__(self, control: ControlConfig, limits: LimitsConfig, health: HealthConfig, wheel_lag_s: float) -> None:
-        """At the usual pace."""
         slow = limits.model_copy(
             update={
                 "v_max_m_s": min(limits.v_max_m_s, health.slow_speed_m_s),
@@ -77,8 +66,6 @@ class LegAim(NamedTuple):
     """Where a correction leads, in the frame of the panel on which the robot stands.
 
     Attributes:
-        x_m, y_m: where the robot's origin shall stand.
-        reverse: it moves there backwards.
         turn_rad: turn in place before it.
     """
 
@@ -99,8 +86,6 @@ def plan_aim(
     Args:
         pose: (x, y, heading), m and rad.
         target: (x, y) in the same plane, m.
-        tolerance_m: how near the robot has to come.
-        margin: share of it that a straight move may leave.
     """
     x, y, heading = pose
     dx, dy = target[0] - x, target[1] - y
@@ -115,16 +100,9 @@ def plan_aim(
 
 
 class Corrector:
-    """Says where a correction leads, or that none is to be had; and whether a turn after it is safe.
-
-    Args:
-        mirror: gives the rim.
-        robot: gives the edge sensors.
-        cfg: tolerance, reach and clearances.
-    """
+    """Says where a correction leads, or that none is to be had; and whether a turn after it is safe."""
 
     def __init__(self, mirror: Mirror, robot: RobotConfig, cfg: MissionConfig) -> None:
-        """Nothing is kept but what is given."""
         self._mirror, self._cfg = mirror, cfg
         self._body = build_body(robot, cfg)
 
@@ -132,7 +110,6 @@ class Corrector:
         """The correction from ``pose`` to ``target``; ``None`` where it is too far or a sensor would pass the rim.
 
         Args:
-            pose: where the robot stands.
             target: (x, y) in the frame of its panel, m.
         """
         cfg = self._cfg
@@ -223,13 +200,10 @@ class RouteFollower:
 
     Args:
         mirror: gives the stops in the frame of the panel on which the robot is.
-        tracker: the leg tracker.
         timeout_factor: a motion that takes longer than this times its bang-bang time plus 5 s is overdue.
-        stops: the stops, in order.
 
     Attributes:
         current: the stop being tracked; ``None`` when all are exhausted.
-        index: its place among them.
     """
 
     def __init__(self, mirror: Mirror, tracker: LegTracker, timeout_factor: float, stops: Sequence[Stop]) -> None:

@@ -140,12 +140,10 @@ class RetryQueue:
     """Keeps what is to be measured off the planned route.
 
     Attributes:
-        causes: why a point was skipped.
         due: points to be measured in this order, away from the planned route.
     """
 
     def __init__(self) -> None:
-        """Nothing failed."""
         self.causes: dict[PointId, str] = {}
         self.due: list[PointId] = []
         self._tried_again: set[PointId] = set()
@@ -184,17 +182,9 @@ class RetryQueue:
 
 
 class MissedPoint:
-    """Keeps whether the current stop was missed, and at which one the last correction was made.
-
-    Args:
-        corrector: says where a correction leads.
-
-    Attributes:
-        corrections: correction moves begun.
-    """
+    """Keeps whether the current stop was missed, and at which one the last correction was made."""
 
     def __init__(self, corrector: Corrector) -> None:
-        """Nothing missed."""
         self._corrector = corrector
         self._is_missed = False
         self._corrected: Stop | None = None  # until the next leg
@@ -213,8 +203,6 @@ class MissedPoint:
 
         Args:
             motion: the present frame.
-            stop: the current one.
-            journey: its journey.
         """
         if self._is_missed:
             self._is_missed = False
@@ -244,36 +232,20 @@ class SurveyState:
     """State, causes and parts of one survey.
 
     Args:
-        cfg: the configuration.
-        mirror: the mirror surveyed.
-        route: the route of the survey.
         has_planner: points that failed once can be planned for.
         heading_sigma_of: how well the heading is known, rad.
 
     Attributes:
-        state, outcome, cause: as operators see them.
-        done, skipped: points, in the order in which that happened.
-        leftovers: the points that failed.
-        survey: the journey along the route.
-        home: the way home, once it is planned.
         abort_cause: why the survey was given up, or ``None``.
         bar: why nothing may move, an earthquake, or empty.
-        is_latched: an emergency is in force.
         is_shaking: there is an earthquake, though the robot may be leaving an edge first.
-        severity: of the newest verdict.
-        is_held_by_hand: somebody has to resume.
         is_faulted: something is wrong, and an operator has to look after it.
         is_hold_deaf: held because wheels or inertial unit are not to be believed.
         is_lost: a fix comes before the next move, because the pose is known to be wrong or (``is_at_start``) not
             confirmed yet.
-        is_off_route: the way back to the route has to be planned.
-        is_review_due: the time budget has to be looked at.
-        doubts_pose: the localizer shall doubt its pose.
         wants_calibration: the calibration drive was given up, too far from where it leads.
         wants_full_fans: the robot shall be pressed on with all that the fans have.
-        retreat: the retreat from an edge under way.
         stuck_s: when a retreat led nowhere, robot time.
-        backoffs: retreats since the last point.
         waits_until_s: a hold that goes on by itself lasts at least until then, robot time.
         stands_until_s: nothing moves before then, whatever the state, robot time.
     """
@@ -281,7 +253,6 @@ class SurveyState:
     def __init__(
         self, cfg: Config, mirror: Mirror, route: Route, heading_sigma_of: Callable[[], float], *, has_planner: bool
     ) -> None:
-        """Idle at base."""
         self.cfg, self.mirror, self.route, self._has_planner = cfg, mirror, route, has_planner
         self.tracker = SpeedLimitedTracker(cfg.control, cfg.limits, cfg.health, cfg.robot.wheel_lag_s)
         self.survey = self.journey_along(route.stops)
@@ -390,12 +361,7 @@ class SurveyState:
         self.is_hold_deaf = was_deaf or is_pose_doubted
 
     def recover(self, cause: str, t_s: float) -> None:
-        """Hold, and go on with a fix; what comes again and again is a fault.
-
-        Args:
-            cause: why.
-            t_s: now.
-        """
+        """Hold, and go on with a fix; what comes again and again is a fault."""
         if self.state is MissionState.DONE or (self.state is HELD and self.is_held_by_hand):
             return
         health = self.cfg.health
@@ -454,7 +420,6 @@ class ApproachCounter:
     """
 
     def __init__(self, tolerance_m: float, limit: int) -> None:
-        """No point approached yet."""
         self._tolerance_m, self._limit = tolerance_m, limit
         self._point: PointId | None = None
         self.count = 0
@@ -463,8 +428,6 @@ class ApproachCounter:
         """Whether ``point`` has to be approached again; call once for each fix taken there.
 
         Args:
-            point: that was measured.
-            error_m: distance of the puck from it, by the fix.
             sigma_m: standard deviation of the robot's place after the fix, along its worst direction.
         """
         self.count = self.count + 1 if point == self._point else 1

@@ -22,15 +22,11 @@ class StandstillDetector:
     """At rest: both speeds, or both of their running means, have been below the limits for the settling time.
 
     Fans shake the body with a mean of zero; wheels that run down, or that creep, move the mean as well.
-
-    Args:
-        cfg: limits and times.
     """
 
     __slots__ = ("_cfg", "_mean_rate_rad_s", "_mean_speed_m_s", "_since_s")
 
     def __init__(self, cfg: ControlConfig) -> None:
-        """Not known to rest."""
         self._cfg = cfg
         self.reset()
 
@@ -46,7 +42,6 @@ class StandstillDetector:
         Args:
             t_s: time of the frame.
             dt_s: time since the one before.
-            speed_m_s, rate_rad_s: the estimate.
         """
         cfg = self._cfg
         if self._mean_speed_m_s is None:
@@ -74,16 +69,10 @@ class SettleAndMeasure:
     """From the end of a leg to the request for a measurement.
 
     Args:
-        control: when the robot is at rest.
         measuring_time_s: it stands for this long before the lengths are read.
-
-    Attributes:
-        request: number of the measurement that was asked for last.
-        is_asked: it has been asked for at this stop.
     """
 
     def __init__(self, control: ControlConfig, measuring_time_s: float) -> None:
-        """Nothing asked yet."""
         self._stillness = StandstillDetector(control)
         self._measuring_time_s = measuring_time_s
         self._rest_by_s: float | None = None
@@ -160,10 +149,6 @@ STILL = Twist(0.0, 0.0)
 
 class ReturnToBase:
     """Drives a journey whose last stop is base.
-
-    Args:
-        journey: the stops.
-        tracker: the leg tracker of that journey, borrowed for the last turn.
 
     Attributes:
         journey: as given; exhausted once the robot stands at base.

@@ -30,7 +30,6 @@ class Fold(NamedTuple):
     """Motes whose mirror image fits almost as well.
 
     Attributes:
-        motes: their indices.
         cost_gap: by how much the cost of the whole map would rise.
     """
 
@@ -42,8 +41,6 @@ class Unfolded(NamedTuple):
     """A map that no mirroring of those tried betters.
 
     Attributes:
-        fit: the map.
-        turned: sets of motes that were mirrored on the way.
         doubtful: sets whose mirror image fits almost as well.
     """
 
@@ -61,9 +58,6 @@ def unfold(
     the wrong side stays there. A change is kept where it lowers the cost; the search ends when none does.
 
     Args:
-        model: network and unknowns.
-        fit: where to begin.
-        settings: of the fits.
         mirrors: (separator, motes) known to fold from the graph alone.
     """
     turned, doubtful = 0, dict[tuple[int, ...], float]()
@@ -125,7 +119,6 @@ class _Single:
         self._anchors, self._ranges, self._sigmas, self._c = anchors, ranges, sigmas, robust_scale
 
     def settled(self, place: FloatArray) -> _Settled:
-        """The nearest minimum from a place, by damped Gauss-Newton."""
         cost, gradient, normal = self._look(place)
         damping = 1e-3
         for _ in range(_LOCAL_STEPS):
@@ -256,7 +249,6 @@ class ScaledFit(NamedTuple):
     Attributes:
         factor: of the sigmas of the network that was asked about.
         model: of the network with the sigmas so multiplied.
-        fit: with these.
     """
 
     factor: float
@@ -268,11 +260,6 @@ def searched(model: MapModel, best: MapFit, settings: MapFitSettings) -> tuple[M
     """The fit of least robust cost that grown maps lead to, or the one given; whether several of them led there.
 
     Least squares is drawn towards wrong ranges, and a robust fit from there stays among them.
-
-    Args:
-        model: network and unknowns.
-        best: the best fit so far.
-        settings: of the fits, with a finite robust scale.
     """
     times = 0
     for fit in _grown_fits(model, best, settings):
@@ -293,8 +280,6 @@ def scaled(model: MapModel, first: MapFit, settings: MapFitSettings) -> ScaledFi
 
     Args:
         model: network with sigmas that are right up to a factor.
-        first: a fit.
-        settings: of the fits.
     """
     best = _settled(model, first, settings)
     # Shapes of bodies hold a map together by themselves.

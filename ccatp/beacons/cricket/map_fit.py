@@ -27,8 +27,6 @@ class MapState:
     Attributes:
         positions_m: of all motes, shape (n, d).
         rotations: of the bodies, world from body, shape (b, d, d).
-        offset_m: common offset of the ranges.
-        scale: common scale of the ranges, less one.
     """
 
     positions_m: FloatArray
@@ -42,11 +40,6 @@ class MapModel:
 
     The unknowns are the coordinates of loose motes that are not known, a place and a small rotation of each body, then
     o and s where they are asked for.
-
-    Args:
-        network: motes and ranges.
-        with_offset: estimate o.
-        with_scale: estimate s.
     """
 
     def __init__(self, network: RangeNetwork, *, with_offset: bool = False, with_scale: bool = False) -> None:
@@ -208,7 +201,6 @@ class MapFitSettings(NamedTuple):
 
     Attributes:
         robust_scale: Cauchy loss: residuals beyond this many sigmas weigh less and less; infinite for least squares.
-        max_iterations: steps at most.
         tolerance_m: a step whose largest part is shorter ends the iteration.
     """
 
@@ -221,11 +213,9 @@ class MapFit(NamedTuple):
     """A fitted map.
 
     Attributes:
-        state: the map.
         cost: sum of the loss, c^2 log(1 + (r / (c sigma))^2), or (r / sigma)^2.
         weights: what the loss left of each range, 0 to 1, shape (m,).
         residuals_m: shape (m,).
-        iterations: steps tried.
         is_at_rest: whether the steps had ended before ``max_iterations``.
     """
 
@@ -245,9 +235,7 @@ def fit_map(model: MapModel, start: MapState, settings: MapFitSettings) -> MapFi
     damping keeps it where it started.
 
     Args:
-        model: network and unknowns.
         start: where to begin; decides which of several folded maps is found.
-        settings: loss and end.
     """
     sigmas = model.network.sigmas_m
     state, damping = start, _FIRST_DAMPING
@@ -292,8 +280,6 @@ def position_covariance(model: MapModel, fit: MapFit, *, variance_factor: float 
     projection across all rigid motions. Directions without information count as known: look at the second value.
 
     Args:
-        model: network and unknowns.
-        fit: where.
         variance_factor: multiplies the covariance, where residuals tell that the sigmas were too small.
 
     Returns:
@@ -352,7 +338,6 @@ def bound_rms_m(model: MapModel, true_m: FloatArray, motes: Sequence[int], *, al
     Args:
         model: network, and what else is unknown: bodies and known coordinates lower the bound, an offset raises it.
         true_m: places of all motes, shape (n, d).
-        motes: those whose error counts.
         aligned: of the error after the rigid motion of these motes that makes it least, for maps without a frame.
 
     Returns:
@@ -373,7 +358,6 @@ def map_rms_m(covariance_m2: FloatArray, positions_m: FloatArray, motes: Sequenc
     Args:
         covariance_m2: shape (n d, n d).
         positions_m: shape (n, d).
-        motes: those whose error counts.
         aligned: after the best rigid motion of these motes.
     """
     d = positions_m.shape[1]

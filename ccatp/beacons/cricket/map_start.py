@@ -43,11 +43,9 @@ def grown(
     the least robust cost of all ranges to points with a place (consensus: Fischler and Bolles 1981).
 
     Args:
-        count: n.
         pairs: known distances, each pair once, shape (e, 2).
         distances_m: shape (e,).
         sigmas_m: shape (e,).
-        dimension: d.
         robust_scale: of the Cauchy loss, in sigmas.
         rng: draws the first points, and crossings where there are many.
     """
@@ -150,11 +148,6 @@ def stitched(count: int, means: PairMeans, dimension: int) -> FloatArray:
     against the other. The turns of all patches are the leading eigenvectors of the matrix of these relations
     (eigenvector synchronization over O(d): Cucuringu, Lipman and Singer 2012), and their shifts a linear least-squares
     problem. No patch decides for the others, so that errors do not grow with the way from a first one.
-
-    Args:
-        count: n.
-        means: the ranges.
-        dimension: d.
     """
     patches = [patch for mote in range(count) if (patch := _patch(mote, means, dimension)) is not None]
     places = np.full((count, dimension), np.nan)
@@ -327,7 +320,6 @@ def map_starts(network: RangeNetwork, given_m: FloatArray | None) -> Iterator[li
     """Places to begin, the most promising first; each with its mirror image, where bodies tell them apart.
 
     Args:
-        network: ranges, bodies, known places.
         given_m: what the caller has, shape (n, d), nan where nothing is known.
     """
     means = PairMeans(network)
@@ -349,7 +341,6 @@ def grown_starts(network: RangeNetwork, robust_scale: float) -> Iterator[list[Fl
     """Maps grown from drawn triangles, which a few wrong ranges do not bend; with their mirror images as before.
 
     Args:
-        network: ranges, bodies, known places.
         robust_scale: of the Cauchy loss, in sigmas.
     """
     means = PairMeans(network)

@@ -63,8 +63,6 @@ def doubts(found: MoteMap, network: RangeNetwork, factor: float) -> Iterator[str
     """Words on folds, contradictions, scatter and outliers of a batch map.
 
     Args:
-        found: the map.
-        network: its ranges.
         factor: of the sigmas, as the residuals told it.
     """
     for fold in found.folds[:_FOLDS]:
@@ -93,9 +91,7 @@ def hidden_offset(found: MoteMap, network: RangeNetwork, settings: MapFitSetting
     """A word on an offset that the ranges show, where none is estimated; outliers have little say in it.
 
     Args:
-        found: the map.
         network: its ranges, with the sigmas that they were found to have.
-        settings: of the fits.
     """
     model = MapModel(network, with_offset=True)
     dof = len(network.ranges_m) - model.size
@@ -138,7 +134,6 @@ def is_flat(error_m: float | None, places_m: FloatArray) -> bool:
     """Whether an error expected is larger than the map's least extent, root mean square.
 
     Args:
-        error_m: expected, by derivatives at the map.
         places_m: shape (n, d); of n motes, n - 1 extents count.
     """
     extents_m = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False) / np.sqrt(len(places_m))
@@ -163,9 +158,7 @@ class MeasuredRanges(NamedTuple):
     """Ranges as they were recorded.
 
     Attributes:
-        readings: in their order.
         groups: names of motes that move together, by the name of their pose: tags of a trolley that stood there.
-        tags: the tag that each of those motes is.
     """
 
     readings: tuple[MoteRange, ...]
@@ -210,9 +203,6 @@ def map_measured(
     Args:
         cfg: dimension, sigma, settings of filter and batch.
         method: ``ekf`` or ``batch``.
-        file: the ranges.
-        tags_m: places of tags on their trolley, where known.
-        truth_m: true places, where known, of any of the motes.
 
     Raises:
         MappingError: the ranges make no map, or the files do not fit each other.
@@ -317,7 +307,6 @@ def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Any) -> _Found:
 
 
 def _filter(cfg: CricketConfig, network: RangeNetwork) -> _Found:
-    """Trilateration, then every range once."""
     if network.bodies:
         raise MappingError("the filter knows no trolleys: leave --tags out, or take --method batch")
     first = map_as_possible(network, cfg.phase1.max_dop)

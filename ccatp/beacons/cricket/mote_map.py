@@ -33,17 +33,11 @@ class MoteMap:
     """A map of motes.
 
     Attributes:
-        names: of the n motes.
         positions_m: shape (n, d).
         covariance_m2: of all coordinates, shape (n d, n d); of the aligned map where nothing pins the frame.
-        offset_m: common offset of the ranges.
-        scale: common scale of the ranges, less one.
         cost: of all ranges, in units of chi-squared.
-        dof: ranges less unknowns that they determine.
         residuals_m: measured less computed ranges, shape (m,).
         sigma_m: median of the sigmas in the end.
-        iterations: steps of all fits.
-        agreement: of the ranges with the map.
         free: directions that no range sees, the frame's included.
         folds: sets of motes whose mirror image fits almost as well.
     """
@@ -86,10 +80,6 @@ def map_motes(
     other side are tried there (``unfold``).
 
     Args:
-        network: the ranges.
-        settings: of the fits.
-        with_offset: estimate a common offset.
-        with_scale: estimate a common scale.
         start_m: one more place to begin, shape (n, d), nan where unknown.
         mirrors: sets of motes that the graph lets fold, from ``find_fold_over``.
         finds_sigma: the sigmas are right up to a factor, which the residuals tell (``scaled``).
@@ -171,11 +161,7 @@ def _fits(
     """Fits from one start after the other, until one is sure, or where there are many motes, came out twice.
 
     Args:
-        model: what is fitted.
         network: what the starts are made of: the model's own, or with corrected ranges.
-        start_m: a start of the caller's.
-        settings: of the fits.
-        at: offset and scale to begin with.
     """
     fits: list[MapFit] = []
     offset_m, scale = (0.0, 0.0) if at is None else (at.offset_m, at.scale)
@@ -206,7 +192,6 @@ def _is_sure(model: MapModel, fit: MapFit) -> bool:
 
 
 def _is_sound(model: MapModel, fit: MapFit) -> bool:
-    """Whether the ranges fit but for a few outliers."""
     network = model.network
     return not agreement_of(fit, network.sigmas_m, len(network.ranges_m) - model.size).is_denied
 

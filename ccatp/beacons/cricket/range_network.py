@@ -34,7 +34,6 @@ class Air(NamedTuple):
 
     Attributes:
         sound_speed_m_s: at ``temperature_c``.
-        temperature_c: degrees Celsius.
     """
 
     sound_speed_m_s: float
@@ -42,13 +41,7 @@ class Air(NamedTuple):
 
 
 class MoteRange(NamedTuple):
-    """One distance between two motes.
-
-    Attributes:
-        first, second: names of the motes.
-        range_m: their distance.
-        sigma_m: its standard deviation.
-    """
+    """One distance between two motes."""
 
     first: str
     second: str
@@ -61,7 +54,6 @@ def sound_speed(air: Air, temperature_c: float) -> float:
 
     Args:
         air: c_0 and T_0.
-        temperature_c: degrees Celsius.
 
     Raises:
         TdoaError: no temperature of air.
@@ -75,9 +67,7 @@ def range_from_delay(air: Air, delay_s: float, temperature_c: float) -> float:
     """Distance d = c(T) (t_2 - t_1), Patil et al. eq. 1; the radio message takes no time.
 
     Args:
-        air: what is known of the speed of sound.
         delay_s: arrival of the pulse after that of the message.
-        temperature_c: as the listener's thermometer tells.
 
     Raises:
         TdoaError: a delay that is negative or not finite, or no temperature of air.
@@ -94,13 +84,6 @@ def range_sigma(
 
     sigma^2 = sigma_1^2 / n + (d sigma_T / (2 T))^2: repeating lessens the noise of a reading, not what a wrong
     thermometer does, dc/c = dT / (2 T).
-
-    Args:
-        sigma_m: of one reading.
-        range_m: the distance d.
-        temperature_sigma_c: of the thermometer.
-        temperature_c: T, in degrees Celsius.
-        repeats: n.
     """
     scale = temperature_sigma_c / (2.0 * (temperature_c - ABSOLUTE_ZERO_C))
     return sqrt(sigma_m**2 / repeats + (range_m * scale) ** 2)
@@ -138,8 +121,6 @@ class RigidBody:
     """Motes whose places relative to each other are known: a network on its stand, tags on a trolley.
 
     Attributes:
-        name: of the body.
-        motes: their indices, length k.
         local_m: their places in the body's own frame, shape (k, d).
     """
 
@@ -153,12 +134,10 @@ class RangeNetwork:
     """A graph of ranges.
 
     Attributes:
-        names: of the n motes.
         dimension: d, 2 or 3.
         first, second: ends of each of the m ranges, indices of motes, shape (m,).
         ranges_m: measured, shape (m,).
         sigmas_m: standard deviations, shape (m,).
-        bodies: no mote is in two of them.
         known_m: coordinates that are known, nan elsewhere, shape (n, d); none for motes of bodies.
     """
 
@@ -196,7 +175,6 @@ def build_network(
         readings: the ranges; those of one pair may be repeated.
         dimension: 2 or 3.
         names: the motes in their order; those of the readings, as they come, if ``None``.
-        bodies: motes that are rigidly joined.
         known_m: known coordinates, nan elsewhere, shape (n, d).
 
     Raises:
@@ -285,9 +263,6 @@ def _check_connected(network: RangeNetwork) -> None:
 class PairMeans:
     """Ranges by pair, r = sum(r_i / sigma_i^2) / sum(1 / sigma_i^2).
 
-    Args:
-        network: the ranges, those of a pair in either direction.
-
     Attributes:
         pairs: each once, the smaller index first, shape (e, 2).
         ranges_m: shape (e,).
@@ -338,9 +313,7 @@ def pair_range(
 
     Args:
         cfg: air, sigma of a reading, mean or median.
-        names: of transmitter and listener.
         delays_s: pulse after message, one for each reading, shape (k,), k >= 1.
-        temperature_c: of the listener's thermometer.
 
     Raises:
         TdoaError: a delay or a temperature that none can be.

@@ -26,8 +26,6 @@ class Freedom(NamedTuple):
     """Directions of the unknowns that no range sees, to first order.
 
     Attributes:
-        unknowns: their number.
-        rank: of the derivatives of the ranges by them.
         frame: names of rigid motions of the whole map that are free.
         flexes: which motes move against the others, one line for each free direction.
         untold: what of offset and scale cannot be told from the map.
@@ -219,7 +217,6 @@ class FoldOver(NamedTuple):
         is_unique: whether almost all places give a map that is the only one, up to a rigid motion and the mirror.
         mirrors: (separator, motes): these motes may be mirrored across the line (plane) through the separator.
         single_pairs: pairs whose range nothing else confirms, shape (k, 2): without it something moves.
-        warnings: the same in words.
     """
 
     is_unique: bool
@@ -235,10 +232,6 @@ def find_fold_over(network: RangeNetwork, rng: np.random.Generator) -> FoldOver:
     stress of a random framework has a stress matrix of rank n - d - 1 (Connelly 2005; Gortler, Healy and Thurston
     2010). In the plane that is: three-connected, and rigid without any one range (Jackson and Jordan 2005). The pairs
     of a body, and of motes whose places are known, count as measured.
-
-    Args:
-        network: the graph.
-        rng: for random places.
     """
     pairs = _all_pairs(network)
     count, d = network.count, network.dimension

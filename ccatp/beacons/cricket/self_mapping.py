@@ -76,7 +76,6 @@ class MoteMapper:
     Args:
         positions_m: of the motes, shape (n, d).
         covariance_m2: shape (n d, n d).
-        settings: see there.
         known_m: coordinates that are known, nan elsewhere, shape (n, d).
 
     Raises:
@@ -137,11 +136,6 @@ class MoteMapper:
     def observe(self, first: int, second: int, range_m: float, sigma_m: float) -> Update:
         """Condition the map on one distance.
 
-        Args:
-            first, second: indices of the motes.
-            range_m: between them.
-            sigma_m: its standard deviation.
-
         Raises:
             MappingError: the motes stand in one place.
         """
@@ -182,14 +176,7 @@ class MoteMapper:
 
 
 class _Rows:
-    """Distances of pairs as measurements: residuals and derivatives at a state.
-
-    Args:
-        dimension: d.
-        count: n.
-        pairs: indices of the motes.
-        ranges_m: measured, one for each pair.
-    """
+    """Distances of pairs as measurements: residuals and derivatives at a state."""
 
     def __init__(self, dimension: int, count: int, pairs: Sequence[tuple[int, int]], ranges_m: FloatArray) -> None:
         motes, places = np.unique(np.array(pairs), return_inverse=True)
@@ -257,8 +244,6 @@ class PhaseTwo(NamedTuple):
         positions_m: after each update, the first before any, shape (k + 1, n, d).
         expected_rms_m: likewise, shape (k + 1,).
         nis: of each update, shape (k,).
-        refused: updates that the gate refused.
-        reached: whether the target was.
     """
 
     positions_m: FloatArray
@@ -331,8 +316,6 @@ class MotePlan:
     """The motes of a configuration.
 
     Attributes:
-        names: of all motes, anchors first.
-        dimension: d.
         anchors: indices of A and B; empty where there are none.
         networks: indices of the motes of each stand, in the order of mapping; empty where there are none.
         bodies: the stands, whose shapes are known.
@@ -397,7 +380,6 @@ def loose_plan(cfg: CricketConfig, names: tuple[str, ...]) -> MotePlan:
 
     Args:
         cfg: layout ``motes`` or ``random``.
-        names: of the motes.
     """
     count, d = len(names), cfg.dimension
     pairs = tuple((i, j) for i in range(count) for j in range(i + 1, count))
@@ -409,7 +391,6 @@ def head_pairs(count: int, programme: str) -> list[tuple[int, int]]:
     """Pairs of stands that measure each other in phase 2.
 
     Args:
-        count: of stands.
         programme: ``zigzag``: each with the next; ``adjacent``: and with the one after it; ``all``.
     """
     if programme == "all":
@@ -444,7 +425,6 @@ class CompletedMap(NamedTuple):
     """All motes of all stands.
 
     Attributes:
-        motes: their indices in the plan.
         positions_m: shape (k, d).
         covariance_m2: shape (k d, k d).
     """
@@ -468,7 +448,6 @@ def complete_stands(
     of the heads, which phase 2 has placed far better than phase 1 had.
 
     Args:
-        plan: the stands.
         first_m: places of all motes after phase 1, shape (n, 2).
         first_covariance_m2: shape (2 n, 2 n).
         heads_m: places of the first motes after phase 2, shape (s, 2).

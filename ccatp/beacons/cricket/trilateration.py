@@ -42,9 +42,6 @@ class TrilaterationStep(NamedTuple):
     """How one mote was placed.
 
     Attributes:
-        mote: its index.
-        references: by whose places.
-        dop: dilution of precision of the step, dimensionless.
         how: ``axes``, ``cosines``, ``seed`` or ``trilateration``.
     """
 
@@ -61,9 +58,6 @@ class Sketch:
     dx = G (dr + U da), G = (H^T W H)^-1 H^T W, U da the errors of the references along the lines of sight.
 
     Args:
-        names: of the motes, for messages.
-        means: the ranges.
-        dimension: d.
         max_dop: a step with a larger dilution of precision is refused.
     """
 
@@ -271,10 +265,8 @@ def draw_errors(
     Args:
         places_m: where the motes might be, nan for those without a place, shape (n, d); A at the origin, B on the
             second axis, where the steps begin with these two.
-        steps: as they were made.
         means: the ranges, of which the sigmas alone are used.
         seed_covariance_m2: of the motes that began the map together, shape (n d, n d); those of axes need none.
-        rng: draws the errors.
         draws: how many times, far more often than there are coordinates.
     """
     count, d = places_m.shape
@@ -306,8 +298,6 @@ def draw_errors(
 
 
 class _Ranges:
-    """True ranges with drawn errors, each pair's drawn once."""
-
     def __init__(self, places_m: FloatArray, means: PairMeans, rng: np.random.Generator, draws: int) -> None:
         self._places_m, self._means = places_m, means
         self._errors = rng.normal(0.0, 1.0, (len(means.pairs), draws))
@@ -379,8 +369,6 @@ class FirstMap(NamedTuple):
         positions_m: nan for motes without a place, shape (n, d).
         covariance_m2: of all coordinates, zero for motes without a place, shape (n d, n d).
         bias_m: mean error of the places, as far as it is known, shape (n, d).
-        steps: in their order.
-        unplaced: motes that no step reached.
     """
 
     positions_m: FloatArray
@@ -446,7 +434,6 @@ def map_as_possible(network: RangeNetwork, max_dop: float, draws: int = 0) -> Fi
     Motes that cannot be placed well enough, from d + 1 others at least, are left out.
 
     Args:
-        network: the ranges.
         max_dop: dilution of precision that no step may exceed.
         draws: as of ``map_by_plan``.
 

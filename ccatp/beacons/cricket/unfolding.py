@@ -43,11 +43,9 @@ def unfolded(
     in d dimensions often has a way down through the spare ones.
 
     Args:
-        count: n.
         pairs: known distances, shape (e, 2), connected.
         distances_m: shape (e,).
         sigmas_m: shape (e,).
-        dimension: d.
         squeezes: weights of the spare dimensions one after the other, in units of the median weight of a distance.
         rng: draws the places to begin with, where those by classical scaling led astray.
     """
@@ -85,7 +83,6 @@ def classical_scaling(distances_m: FloatArray, dimension: int) -> FloatArray:
 
 
 def _turned(points: FloatArray) -> FloatArray:
-    """The points along their principal axes, the widest first."""
     centred = points - points.mean(axis=0)
     return np.asarray(centred @ np.linalg.svd(centred, full_matrices=False)[2].T)
 
@@ -168,8 +165,6 @@ class Agreement:
 
     Attributes:
         outlying: ranges of which the loss left less than half.
-        inlier_cost: chi-squared of the others.
-        dof: of all ranges.
     """
 
     outlying: tuple[int, ...]
@@ -200,9 +195,7 @@ def agreement_of(fit: MapFit, sigmas_m: FloatArray, dof: int) -> Agreement:
     """How the ranges fit a map.
 
     Args:
-        fit: the map.
         sigmas_m: of its ranges, shape (m,).
-        dof: ranges less unknowns that they determine.
     """
     is_out = fit.weights < 0.5
     cost = float(((fit.residuals_m / sigmas_m)[~is_out] ** 2).sum())
@@ -219,11 +212,6 @@ def repaired(model: MapModel, fit: MapFit, settings: MapFitSettings) -> MapFit:
 
     A few motes that are folded over together are a minimum of their own. Where ranges disagree with the map, the motes
     at their ends and all their partners are taken out and unfolded afresh between the motes that hold them.
-
-    Args:
-        model: network and unknowns.
-        fit: where to begin.
-        settings: of the fits.
     """
     network = model.network
     if network.bodies:

@@ -44,7 +44,6 @@ def is_events_csv(text: str) -> bool:
 
 
 def _cells(content: str) -> list[str]:
-    """The cells of a line, quoted or not."""
     return [cell.strip() for cell in next(csv.reader([content], skipinitialspace=True))]
 
 

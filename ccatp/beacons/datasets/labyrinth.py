@@ -40,9 +40,6 @@ def is_labyrinth(text: str) -> bool:
 def read_labyrinth(path: Path) -> RecordedRun:
     """Read a Labyrinth text, plain or gzipped.
 
-    Args:
-        path: the text, or a folder with one.
-
     Raises:
         RadioDataError: a line is not one of the set's, or there is no odometry or no range.
     """
@@ -86,9 +83,7 @@ def wheel_columns(truth: ReferencePath, steps: Steps, half_track_m: float) -> li
     """What the truth says of the wheel columns, a line; nothing where it tells too little.
 
     Args:
-        truth: positions.
         steps: odometry with the columns read as left, right, half the track.
-        half_track_m: as the text has it.
     """
     factor = turning_factor(truth, steps)
     if factor is None:

@@ -89,7 +89,6 @@ def _text(cell: ET.Element, shared: list[str]) -> str:
 
 
 def _column(letters: str) -> int:
-    """``A`` is 0, ``AA`` is 26."""
     number = 0
     for letter in letters:
         number = 26 * number + ord(letter) - ord("A") + 1
@@ -106,13 +105,7 @@ _LARGEST = 1e5  # of metres as of dBm
 
 @dataclass(frozen=True, slots=True)
 class LevelTable:
-    """Pairs of distance and level, and what was odd about them.
-
-    Attributes:
-        name: file, and sheet where there is one.
-        pairs: the readings.
-        warnings: a line each.
-    """
+    """Pairs of distance and level, and what was odd about them."""
 
     name: str
     pairs: tuple[LevelPair, ...]
@@ -225,7 +218,6 @@ def _read_folder(folder: Path, sheet: str | None, points: Path | None) -> LevelT
 
 
 def _read_rows(path: Path, sheet: str | None) -> tuple[str, list[list[str]]]:
-    """Name and rows, the head first."""
     if path.suffix.lower() != ".xlsx":
         text = read_text(path, "a CSV file or an .xlsx workbook with columns of levels")
         lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]

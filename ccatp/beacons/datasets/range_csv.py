@@ -36,10 +36,6 @@ def read_ranges(path: Path, sigma_m: float) -> MeasuredRanges:
     ``session,pos,deg,anchor,tag,n,mean_m,...``: a trolley with tags among anchors, one line for the mean range of an
     anchor to a tag while the trolley stood at a position with a heading; tags of one standstill move together.
 
-    Args:
-        path: the file.
-        sigma_m: of ranges without one of their own.
-
     Raises:
         RangeFileError: it cannot be read, or a line is no range.
     """
@@ -96,7 +92,6 @@ def _session(path: Path, rows: Iterable[tuple[int, Mapping[str, str]]], sigma_m:
 
 
 def _table(path: Path) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
-    """Header, and the lines with their numbers."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(_without_comments(file))
@@ -162,7 +157,6 @@ class BeaconPositions(NamedTuple):
     """Beacons with what is uncertain about them.
 
     Attributes:
-        names: of the n beacons.
         positions_m: shape (n, d).
         covariance_m2: of all coordinates, shape (n d, n d).
         frame: which frame they are in.
@@ -180,8 +174,6 @@ def write_beacons(
     """Write a map.
 
     Args:
-        path: the file.
-        names: of the beacons.
         positions_m: shape (n, d).
         covariance_m2: shape (n d, n d).
         frame: one line that says which frame this is.

@@ -22,9 +22,7 @@ def read_run(path: Path, data_format: str | None, robot: int | None) -> Recorded
     """Read and check a recorded run.
 
     Args:
-        path: file or folder of the data set.
         data_format: one of ``FORMATS``; found out from the files if ``None``.
-        robot: which robot, of a set of several.
 
     Raises:
         RadioDataError: it cannot be read, or is not what it claims to be.
@@ -66,7 +64,6 @@ def robots_of(path: Path, data_format: str | None = None) -> list[int | None]:
     """The robots of a set: numbers if it has several, ``[None]`` for the only one.
 
     Args:
-        path: file or folder of the data set.
         data_format: one of ``FORMATS``; found out from the files if ``None``.
 
     Raises:

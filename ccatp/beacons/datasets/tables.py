@@ -28,8 +28,6 @@ class RadioDataError(CcatpError):
     """A recorded data set that cannot be used.
 
     Args:
-        where: the file or folder.
-        problem: what is wrong and what to do about it.
         line: number of the line, from 1, where it is a line's fault.
     """
 
@@ -47,7 +45,6 @@ class Table(NamedTuple):
     """Rows of numbers and where they stood.
 
     Args:
-        file: where they were read.
         values: shape (n, columns).
         lines: number of the line of each row, from 1, shape (n,).
     """
@@ -59,10 +56,6 @@ class Table(NamedTuple):
 
 def read_text(file: Path, wanted: str = "a data set of the formats plaza, mrclam, labyrinth or csv") -> str:
     """The text of a file, unpacked if it is gzipped, whatever its name.
-
-    Args:
-        file: where it is.
-        wanted: what to give in place of a file that is no text.
 
     Raises:
         RadioDataError: it is missing, cannot be read, or is no text.
@@ -102,8 +95,6 @@ def read_table(file: Path, names: tuple[str, ...], *, more: bool = False) -> Tab
     """A table of numbers between white space or commas; a first line of words is a header.
 
     Args:
-        file: plain or gzipped text.
-        names: what the columns hold, for messages.
         more: further columns are allowed, and left out.
 
     Raises:
@@ -248,10 +239,6 @@ def bounded(run: RecordedRun, where: Path) -> RecordedRun:
 
     Odometry and truth are refused as a whole: without one of its steps a path leads elsewhere.
 
-    Args:
-        run: as read.
-        where: file or folder, for the message.
-
     Raises:
         RadioDataError: odometry or truth cannot be, or no reading is left.
     """
@@ -322,12 +309,7 @@ LOST_RAD = float(np.pi / np.sqrt(3.0))
 
 
 class _Guess(NamedTuple):
-    """Amount of a span, by the mean rate before it.
-
-    Attributes:
-        share: of that rate, by which the span goes on.
-        sigma: standard deviation of the amount.
-    """
+    """Amount of a span, by the mean rate before it."""
 
     share: float
     sigma: float
@@ -366,7 +348,6 @@ def bridged(steps: Steps) -> Steps:
 
 
 def _runs(marked: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First and end of each row of marks."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]])))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 

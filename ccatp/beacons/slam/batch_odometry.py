@@ -44,7 +44,6 @@ class Reckoning:
     """Steps of odometry, cut at given instants and put together between them.
 
     Args:
-        steps: of dead reckoning.
         times_s: the instants, shape (n + 1,), rising, within the steps.
         delayed: derivatives by the delay are wanted; they are zero otherwise.
     """
@@ -86,7 +85,6 @@ class Reckoning:
 
         Args:
             calibration: by ``CALIBRATION``, shape (5,).
-            noise: random walks of the odometry.
         """
         if calibration[4] != self._delay_s:
             self._cut(float(calibration[4]))
@@ -153,7 +151,6 @@ def _total(amounts: FloatArray) -> FloatArray:
 
 
 def _spaced(times_s: FloatArray) -> FloatArray:
-    """The first time of each span of ``FINEST_S``."""
     _, first = np.unique(np.floor(times_s / FINEST_S), return_index=True)
     return times_s[first]
 
@@ -180,10 +177,7 @@ class RadioNoise:
     """Noise of the readings.
 
     Attributes:
-        range_sigma_m: standard deviation of a range.
         range_sigma_per_m: what a metre of range adds to it, in squares: var = sigma^2 + (sigma_per_m r)^2.
-        bearing_sigma_rad: standard deviation of a bearing.
-        rssi_sigma_db: standard deviation of a signal strength.
         rssi_reference_dbm: signal strength at 1 m, P_ref.
         rssi_exponent: eta of the log-distance model z = P_ref - 10 eta log10(r / 1 m).
         freedom: degrees of freedom of Student's t, the law of the noise: few for outliers, many for Gaussian noise.
@@ -205,20 +199,11 @@ class BatchPriors:
     """Standard deviations, before any reading, of what is calibrated; 0: taken as zero, not estimated.
 
     Attributes:
-        distance_scale: relative error of distances.
-        turn_scale: relative error of turns.
         turn_per_m: turning of a vehicle that believes to go straight, rad/m.
-        turn_bias_rad_s: constant error of the turn rate.
         delay_s: by how much the vehicle does later what its odometry says.
-        range_scale: relative error that all ranges share.
-        range_offset_m: error that all ranges share.
-        bearing_offset_rad: error that all bearings share.
         rssi_reference_db: error of P_ref that all beacons share.
-        rssi_exponent: error of eta, which all beacons share.
         beacon_offset_m: error of a beacon's ranges beside the shared one.
         beacon_reference_db: error of a beacon's P_ref beside the shared one.
-        pose_m: of the first position.
-        heading_rad: of the first heading.
     """
 
     distance_scale: float
@@ -243,8 +228,6 @@ class BatchSettings:
 
     Attributes:
         odometry: random walks of the odometry (its priors are not used, ``priors`` holds them).
-        radio: noise of the readings, to begin with.
-        priors: of what is calibrated.
     """
 
     odometry: DifferentialNoise

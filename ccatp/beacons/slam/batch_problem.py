@@ -43,7 +43,6 @@ class Factored:
     """Cholesky factors of an arrow system: A by bands, then the Schur complement S = C - B^T A^-1 B.
 
     Args:
-        system: what is factored.
         damping: the diagonal is multiplied by 1 + damping (Levenberg and Marquardt).
 
     Raises:
@@ -174,12 +173,8 @@ class BatchProblem:
     """Odometry and readings of a run up to an instant.
 
     Args:
-        steps: of dead reckoning.
         readings: those whose time is one of ``times_s``.
         times_s: instants of the poses, the first one the first odometry time, shape (n,).
-        first_pose: x_m, y_m, heading_rad.
-        beacons: how many beacons there are.
-        settings: priors and noise.
         used: which beacons take part, shape (b,); readings of others count nothing.
     """
 
@@ -226,7 +221,6 @@ class BatchProblem:
         """What readings say of the distance, m, and its variance, m^2: by the range, or by the signal strength.
 
         Args:
-            state: its calibration is used.
             rows: readings, each with a range or a signal strength.
         """
         read, beacon = self.readings, state.beacons[self.readings.beacon[rows]]
@@ -250,7 +244,6 @@ class BatchProblem:
         """Gauss-Newton at a state, readings and steps weighted, for the free unknowns.
 
         Args:
-            state: where the residuals are linearised.
             weights: of each reading, shape (m,).
             odometry_weights: of each step, shape (n - 1,).
         """

@@ -38,7 +38,6 @@ class Start(NamedTuple):
     """Where the smoother begins.
 
     Attributes:
-        state: poses at every instant, calibration, beacons.
         used: which beacons have been placed, shape (b,).
         doubtful: those whose mirror image fits nearly as well, shape (b,).
     """
@@ -59,12 +58,7 @@ def grown(
     """Solve ever longer beginnings of the run.
 
     Args:
-        steps: of dead reckoning.
-        readings: in order of time.
         times_s: instants of the poses, shape (n,): the readings' and the first of all.
-        first_pose: x_m, y_m, heading_rad.
-        settings: priors and noise.
-        beacons: how many there are.
     """
     used, doubtful = np.zeros(beacons, dtype=bool), np.zeros(beacons, dtype=bool)
     state = BatchState(np.array([first_pose]), np.zeros(len(SHARED)), np.zeros((beacons, BEACON)))
@@ -167,11 +161,6 @@ def smooth(run: RecordedRun, settings: BatchSettings, clock_s: Callable[[], floa
     Minimises the negative log posterior of poses at the instants of the readings, beacons and calibration by
     Levenberg-Marquardt; noise of the readings by Student's t; its width grows if the residuals are wider. Nothing of
     the truth is used but the first pose.
-
-    Args:
-        run: odometry, readings, first pose.
-        settings: noise and priors.
-        clock_s: tells wall time, s.
     """
     begin_s, first_radio = clock_s(), settings.radio
     heard_s = np.union1d(run.readings.times_s, run.steps.times_s[:1])

@@ -21,10 +21,7 @@ class Descent(NamedTuple):
     """Where a descent ended.
 
     Attributes:
-        state: the minimum.
         cost: there, negative log posterior up to a constant.
-        iterations: steps taken.
-        converged: False where the steps ran out first.
     """
 
     state: BatchState
@@ -58,11 +55,7 @@ def descend(
     """Minimise the negative log posterior.
 
     Args:
-        problem: odometry, readings, priors.
-        state: where to begin.
-        most: iterations at most.
         softness: of each reading's law, shape (m,) or one for all.
-        odometry_freedom: degrees of freedom of the odometry's law.
         enough: relative gain below which the cost counts as converged.
     """
     damping = 1e-6
@@ -139,11 +132,8 @@ class Placement(NamedTuple):
     """A beacon's first place.
 
     Attributes:
-        x_m: best place.
-        y_m: best place.
         margin: by how much the next best place costs more (half a chi-squared); infinite if there is none.
         spread: largest standard deviation over the distance of the nearest reading.
-        cost: of the best place, per reading.
     """
 
     x_m: float

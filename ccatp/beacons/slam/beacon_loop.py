@@ -21,11 +21,6 @@ class Listening(NamedTuple):
 class BeaconLoop:
     """Filter and pilot of a robot among beacons.
 
-    Attributes:
-        slam: the filter.
-        pilot: who drives.
-        learned: innovations of the last step.
-
     Args:
         cfg: the configuration; nothing of ``sim`` is used.
 
@@ -54,15 +49,7 @@ class BeaconLoop:
         sightings: Iterable[SignalMeasurements],
         distances_m: Sequence[float],
     ) -> SteeringCommand:
-        """Take the readings of a step; set points for the next.
-
-        Args:
-            time_s: end of the step.
-            wheels: odometry of the step.
-            packets: of scans that are to be read.
-            sightings: scans that were read already.
-            distances_m: of the distance sensors.
-        """
+        """Take the readings of a step; set points for the next."""
         self.slam.predict(odometry_of(self._cfg, time_s, wheels))
         readings = readings_of(time_s, [*self._scan.results(packets), *sightings])
         self.learned = self.slam.observe(readings)

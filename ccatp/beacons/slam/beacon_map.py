@@ -112,7 +112,6 @@ class RssiModel:
         sigma_db: standard deviation of the noise; where it starts if the noise is learned.
         reference_dbm: P_ref at 1 m.
         reference_sigma_db: its prior, of each beacon by itself; 0: not estimated.
-        exponent: eta.
         exponent_sigma: its prior, of each beacon by itself; 0: not estimated.
         wander: of each beacon; None: there is none.
     """
@@ -133,11 +132,9 @@ class RobustLoss:
         gate_sigmas: innovations further off than that are refused.
         knee_sigmas: innovations beyond weigh no more than those at the knee (Huber).
         learn_memory: readings over which noise levels are learned; 0: the noise is as it is given.
-        learn_prior: readings that the given noise counts for.
         doubt_pose_after: refusals in a row, of any beacons, after which the pose is doubted.
         doubt_beacon_after: refusals in a row of one beacon, others being believed, after which it is placed anew.
         jump_m: what the pose may have jumped by when it is doubted, standard deviation of x and of y.
-        jump_rad: the same of the heading.
         transports: whether the covariance follows corrections of the map, so that its heading is never learned from
             linearising anew (``Transport``).
     """
@@ -158,8 +155,6 @@ class SlamSettings:
     """What a run of ``BeaconSlam`` needs to know.
 
     Attributes:
-        motion: the vehicle.
-        trust: of the readings.
         range: of range and range-bearing readings; None where there are none.
         bearing: of readings with a bearing; None where there are none.
         rssi: of RSSI readings; None where there are none.
@@ -193,7 +188,6 @@ class MapEntry:
 
     Attributes:
         columns: pose, calibration, beacon and its wandering error, shape (k,).
-        size: of the beacon's block.
         wander: column of the wandering error; -1: none.
         way_m, time_s: of the vehicle when the wandering error was last looked at.
         fresh: variance of what is new in the wandering error, in sigmas squared.
@@ -212,12 +206,7 @@ class MapEntry:
 
 
 class BeaconMap:
-    """The beacons' blocks of an ``EkfSlam``.
-
-    Args:
-        engine: the state.
-        shared: where its calibration stands.
-    """
+    """The beacons' blocks of an ``EkfSlam``."""
 
     def __init__(self, engine: EkfSlam, shared: slice) -> None:
         self._engine, self._shared = engine, shared
@@ -293,9 +282,6 @@ class HeadingTransport:
     so it changes with each correction, and a filter that leaves P as it was takes that change for knowledge. A
     covariance of errors that turn with the heading does not have to change (the invariant EKF: Barrau and Bonnabel
     2015; Zhang et al. 2017); this is that covariance, said of errors of x and y.
-
-    Args:
-        engine: the state: the pose first, then blocks.
     """
 
     def __init__(self, engine: EkfSlam) -> None:

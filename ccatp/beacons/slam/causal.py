@@ -42,7 +42,6 @@ def learned(calibration: Mapping[str, Calibrated], priors: Mapping[str, float]) 
     """Those that the readings told something of; a prior is no result.
 
     Args:
-        calibration: by name.
         priors: standard deviations before any reading, by name.
     """
     return {name: found for name, found in calibration.items() if found.sigma < UNCHANGED * priors[name]}
@@ -52,9 +51,7 @@ def beyond_priors(calibration: Mapping[str, Calibrated], priors: Mapping[str, fl
     """Values that their prior all but excludes, a line each: they would be further off still if it let them.
 
     Args:
-        calibration: by name.
         priors: standard deviations before any reading, about zero, by name.
-        kind: of the recording, as the configuration calls it.
     """
     for name, (value, _) in calibration.items():
         sigma = priors[name]
@@ -85,9 +82,6 @@ class HeadingRelocalizer:
 
     Args:
         slam: the filter before anything was lost.
-
-    Attributes:
-        best: the filter that the readings fit best so far.
     """
 
     def __init__(self, slam: BeaconSlam) -> None:
@@ -158,10 +152,7 @@ def filter_run(
     """Run the filter over a recording; nothing of the truth is used but the first pose.
 
     Args:
-        run: odometry, readings, first pose.
-        settings: of the filter.
         first_sigmas: of the first position, m, and the first heading, rad.
-        clock_s: tells wall time, s.
     """
     position, heading = first_sigmas
     search = HeadingRelocalizer(BeaconSlam(settings, run.first_pose, np.diag((position**2, position**2, heading**2))))
@@ -248,7 +239,6 @@ class _Book:
 
 
 def _doubts(nis: FloatArray, sizes: FloatArray, refused: int, jumps: int) -> Iterator[str]:
-    """What the innovations say against the assumptions."""
     if nis.size and nis.sum() > DOUBTFUL_NIS * sizes.sum():
         yield (
             f"innovations are {float(nis.sum() / sizes.sum()):.2f} times as large, in squares, as they should be: "
@@ -288,8 +278,6 @@ def _spaced(times_s: FloatArray) -> FloatArray:
 
 
 def _increments(steps: Steps, times_s: FloatArray) -> list[Increment]:
-    """Odometry between the times, steps cut where readings fall."""
-
     def shares(amounts: FloatArray | float) -> list[float]:
         total = np.concatenate([[0.0], np.cumsum(np.broadcast_to(amounts, steps.distance_m.shape))])
         shared: list[float] = np.diff(np.interp(times_s, steps.times_s, total)).tolist()

@@ -30,14 +30,8 @@ class TrackEvaluation(NamedTuple):
     """Errors of a track; None where there is no truth to tell.
 
     Attributes:
-        alignment: lays the track on the truth.
-        trajectory_rmse_m: of the aligned positions.
-        heading_rmse_rad: of the aligned headings.
-        beacon_rmse_m: of the beacons, moved by the same alignment.
-        beacon_errors_m: by name.
         nees: of the poses as they are, without alignment; positions alone if the truth has no headings; None where the
             first pose was not the truth's of that time.
-        nis: of the innovations.
         errors_m: of each aligned position, shape (n,); NaN where there is no truth.
     """
 

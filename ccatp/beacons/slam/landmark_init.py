@@ -59,9 +59,7 @@ class ReadingRecord(NamedTuple):
     """A reading that waits.
 
     Attributes:
-        reading: as it was taken.
         place: block of the state that holds the place (x_m, y_m) where it was taken.
-        distance_m: what it says of the distance, roughly.
     """
 
     reading: Reading
@@ -75,7 +73,6 @@ class Candidate(NamedTuple):
     Attributes:
         mean: states of the beacon, shape (b,).
         covariance: shape (b, b).
-        cost: chi-squared of the readings.
         variances: of the readings' noise, larger where they look too far off, shape (m,).
     """
 
@@ -123,8 +120,6 @@ class PendingLandmark:
     and calibration, S = H P H^T + R, each candidate minimises e^T S^-1 e.
 
     Attributes:
-        beacon: which one.
-        records: the readings, oldest first.
         candidates: where it may be, best first; two as long as a mirror image is possible.
     """
 
@@ -169,10 +164,7 @@ class PendingLandmark:
         """Look for the beacon: sets ``candidates``.
 
         Args:
-            engine: holds the places and the calibration.
             row_of: what a reading should be (the row without bearing).
-            shared: the calibration's place in the state.
-            prior_at: prior of a beacon at x_m, y_m.
             reach_m: how far it is from the last place, roughly.
         """
         problem = _problem(engine, self.records, row_of, shared, reach_m)
@@ -219,8 +211,6 @@ class PendingLandmark:
 
 
 class _Problem(NamedTuple):
-    """Find b in z = h(places, calibration, b)."""
-
     readings: list[Reading]
     z: FloatArray
     places: list[list[float]]
@@ -255,7 +245,6 @@ class _Problem(NamedTuple):
         return cost
 
     def refine(self, prior: LandmarkPrior) -> Candidate | None:
-        """Gauss-Newton with weights; None where it leads nowhere."""
         b, W, stride = prior.mean.copy(), np.linalg.inv(prior.covariance), 0.5 * self.reach_m
         variances, A, cost = self.z, W, inf
         for k in range(ITERATIONS):
@@ -328,10 +317,6 @@ def settle_by_places(
 
     Args:
         engine: holds the places, and the beacon with an all but flat prior at its candidate.
-        records: readings and their places.
-        row_of: what a reading should be.
-        shared: the calibration's place in the state.
-        block: the beacon's.
         variances: of the readings, shape (m,).
     """
     places = [engine.block(record.place) for record in records]
@@ -388,12 +373,6 @@ class LandmarkInitializer:
     One that joined at once is on trial: if one of its next ``TRIAL`` readings is refused, it begins anew with that one.
 
     Args:
-        engine: the state.
-        sensors: what readings should be.
-        beacons: the map.
-        clock: where the vehicle was at a reading.
-        levels: learned noise, by kind of reading.
-        shared: the calibration's place in the state.
         delay: column of the odometry's delay; -1: none.
 
     Attributes:
@@ -502,7 +481,6 @@ class LandmarkInitializer:
         return LandmarkPrior(np.array((x_m, y_m, *(mean for mean, _ in extra))), np.diag(np.square(sigmas)))
 
     def _clone(self, reading: Reading) -> PoseClone:
-        """The vehicle's place when a reading was taken."""
         at = self.carried(self._engine.mean, reading)
         (x_heading, y_heading), by = at.by_heading(), at.by_delay()
         columns, J = [0, 1, 2], [[1.0, 0.0, x_heading], [0.0, 1.0, y_heading]]

@@ -22,8 +22,6 @@ class MeasurementRow(NamedTuple):
         expected: h(x), in the reading's unit.
         pose: dh by x_m, y_m and heading_rad of the vehicle.
         calibration: dh by range_scale and range_offset_m, as far as they are estimated.
-        beacon: dh by the states of the beacon.
-        variance: of the noise.
     """
 
     expected: float
@@ -77,11 +75,7 @@ def rssi_row(pose: list[float], shared: int, beacon: list[float], model: RssiMod
 
 
 class MeasurementModels:
-    """The radios of a run, as rows of measurement.
-
-    Args:
-        settings: which there are.
-    """
+    """The radios of a run, as rows of measurement."""
 
     def __init__(self, settings: SlamSettings) -> None:
         self._range, self._bearing, self._rssi = settings.range, settings.bearing, settings.rssi

@@ -32,13 +32,8 @@ class Increment:
     """Odometry of an interval: what the wheels, or wheels and gyroscope, say was travelled.
 
     Attributes:
-        time_s: end of the interval.
-        interval_s: its length.
-        distance_m: along the arc.
-        turn_rad: change of heading, counter-clockwise.
         lateral_m: to the left; zero for wheels that do not slip.
         guess_m2: variance of x and of y at its end, because the odometry was silent and the way is guessed.
-        guess_rad2: the same of the turn.
     """
 
     time_s: float
@@ -52,14 +47,7 @@ class Increment:
 
 @dataclass(frozen=True, slots=True)
 class Steering:
-    """Odometry of a steered vehicle over an interval.
-
-    Attributes:
-        time_s: end of the interval.
-        interval_s: its length.
-        speed_m_s: of the wheel that the model refers to.
-        steer_rad: angle of the steered wheel, counter-clockwise.
-    """
+    """Odometry of a steered vehicle over an interval."""
 
     time_s: float
     interval_s: float
@@ -71,13 +59,7 @@ Odometry = Increment | Steering
 
 
 class StationaryReading(NamedTuple):
-    """What a vehicle at rest shows of its odometry's calibration.
-
-    Attributes:
-        column: of the state that it measures.
-        value: what it should be.
-        variance: of the value.
-    """
+    """What a vehicle at rest shows of its odometry's calibration."""
 
     column: int
     value: float
@@ -160,9 +142,6 @@ class DifferentialDrive:
 
     States behind the pose, each where its prior is not zero: turn_bias_rad_s (b), turn_scale (e_w), distance_scale
     (e_d): positive where the odometry reads too much. At rest the turn is nothing but the bias: the heading stays.
-
-    Args:
-        noise: of the odometry, and priors of its calibration.
     """
 
     def __init__(self, noise: DifferentialNoise) -> None:
@@ -256,12 +235,7 @@ class DifferentialDrive:
 
 @dataclass(frozen=True, slots=True)
 class AckermannNoise:
-    """Noise of a steered vehicle's odometry, of every interval anew.
-
-    Attributes:
-        speed_sigma_m_s: standard deviation of the speed.
-        steer_sigma_rad: of the steered wheel's angle.
-    """
+    """Noise of a steered vehicle's odometry, of every interval anew."""
 
     speed_sigma_m_s: float
     steer_sigma_rad: float
@@ -274,11 +248,6 @@ class Ackermann:
     y <- y + T v sin(heading + steer), heading <- heading + T v sin(steer) / l.
     Reference ``rear``: the same point on the rear axle, x <- x + T v cos(heading),
     heading <- heading + T v tan(steer) / l.
-
-    Args:
-        wheelbase_m: l.
-        noise: of speed and steering angle.
-        reference: which axle the pose and the speed belong to.
     """
 
     names: tuple[str, ...] = ()
@@ -317,7 +286,6 @@ class WheelNoise:
     """Noise of the odometry, of every interval anew, and priors of its constant errors.
 
     Attributes:
-        speed_sigma_m_s: standard deviation of the speed.
         turn_sigma: of the steering angle (rad), or of the turn rate (rad/s).
         drift_sigma_rad_s: prior of a constant drift of the heading; 0: not estimated.
         slip_sigma: prior of the share of the travel that is lost; 0: not estimated.
@@ -330,14 +298,7 @@ class WheelNoise:
 
 
 class _TurnStep(NamedTuple):
-    """How an interval turns the vehicle, with derivatives by the reading of steering or turn rate, speed and slip.
-
-    Attributes:
-        swing_rad: of the course against the heading at the start.
-        turn_rad: of the heading.
-        swing_by: the swing by the reading, by the slip and by the drift.
-        turn_by: the turn by the reading, by the speed and by the slip.
-    """
+    """How an interval turns the vehicle, with derivatives by the reading of steering or turn rate, speed and slip."""
 
     swing_rad: float
     turn_rad: float
@@ -358,8 +319,6 @@ class SlippingVehicle:
 
     Args:
         kind: ``ackermann`` takes ``Steering``, ``differential`` takes ``Increment``.
-        wheelbase_m: l.
-        noise: of the odometry.
     """
 
     def __init__(self, kind: Literal["ackermann", "differential"], wheelbase_m: float, noise: WheelNoise) -> None:
@@ -412,7 +371,6 @@ class SlippingVehicle:
         return _TurnStep(0.5 * w, w, (0.5 * by_omega, 0.5 * by_slip, 0.5 * T), (by_omega, 0.0, by_slip))
 
     def _read(self, odometry: Odometry) -> tuple[float, float, float]:
-        """Interval, speed, and steering angle or turn rate."""
         if self._is_steered:
             if not isinstance(odometry, Steering):
                 raise TypeError(f"a steered vehicle takes speed and steering angle, not {type(odometry).__name__}")
@@ -434,7 +392,6 @@ class CarriedOdometry(NamedTuple):
     """The pose at a reading's time: pose(t) = pose - back_s (vx, vy, turn).
 
     Attributes:
-        pose: x_m, y_m, heading_rad.
         velocity: vx_m_s, vy_m_s in the frame of the map, turn_rad_s.
         back_s: the time it was carried back by; negative: forwards.
     """
@@ -461,9 +418,6 @@ class DeadReckoning:
     negative delay, odometry that comes late, only an interval can be made up for. What is left, less than an interval,
     the pose is carried over at constant speed, and the derivative by the delay is that speed (Li and Mourikis 2014).
     So readings between two steps are taken at their own time even where no delay is asked for.
-
-    Args:
-        is_delayed: False: every step is due at once.
     """
 
     def __init__(self, *, is_delayed: bool) -> None:
@@ -516,7 +470,6 @@ class DeadReckoning:
 
 
 def _split(step: Odometry, part: float) -> tuple[Odometry, Odometry]:
-    """A step in two."""
     first_s, rest_s = part * step.interval_s, (1.0 - part) * step.interval_s
     first = replace(step, time_s=step.time_s - rest_s, interval_s=first_s)
     rest = replace(step, interval_s=rest_s)

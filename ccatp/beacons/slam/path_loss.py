@@ -32,7 +32,6 @@ class PathLoss:
 
     Attributes:
         reference_dbm: P_ref, at 1 m.
-        exponent: eta.
         sigma_db: sigma.
     """
 
@@ -67,7 +66,6 @@ class PathLoss:
 
         Args:
             level_dbm: the level, or the mean of several with independent noise.
-            count: of the levels in the mean.
 
         Raises:
             ValueError: no level at all.
@@ -95,8 +93,6 @@ class LevelPair(NamedTuple):
     """One reading.
 
     Attributes:
-        distance_m: from the radio.
-        level_dbm: what was heard.
         place: where; readings without a place belong to the place of their distance.
     """
 
@@ -110,14 +106,10 @@ class PathLossFit:
     """Path loss z = P_ref - 10 eta log10(r) with the confidence of its two parameters.
 
     Attributes:
-        reference_dbm: P_ref.
-        exponent: eta.
         covariance: of both, shape (2, 2).
         sigma_db: spread of the levels of places about the line, whatever makes it.
         white_sigma_db: of repeated readings at one place; NaN where nothing was repeated.
         shadowing_sigma_db: of what stays with a place, sigma without the white part; NaN likewise.
-        places: their number.
-        readings: of all of them.
         residuals_db: mean level minus line of each place, shape (places,).
         distances_m: of the places, shape (places,).
     """
@@ -251,13 +243,7 @@ _MOST_PERMUTED = 5  # names: 120 permutations
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """A rectangle in which the receiver is, searched on a grid.
-
-    Attributes:
-        low_m: its lower left corner.
-        high_m: its upper right corner.
-        spacing_m: of the grid.
-    """
+    """A rectangle in which the receiver is, searched on a grid."""
 
     low_m: tuple[float, float]
     high_m: tuple[float, float]
@@ -308,11 +294,6 @@ class LevelLocator:
     The level of a beacon at a place has Student's t about its path loss: the spread of its calibration, and the
     uncertainty of the two parameters. Over the room all places are as likely; the posterior is summed on a grid, so
     that nothing is linearised. Its mean is the position of least expected squared error.
-
-    Args:
-        beacons_m: places by name.
-        fits: path losses by name.
-        room: where the receiver is.
     """
 
     def __init__(
@@ -361,10 +342,6 @@ def likeliest_names(
 ) -> tuple[dict[str, str], float]:
     """Which names the beacons of a data set with known places should have.
 
-    Args:
-        locator: beacons and path losses.
-        heard: place and levels of each point.
-
     Returns:
         The likeliest permutation, from the name in the data to the beacon's, and how much its log-likelihood exceeds
         that of the names as they are.
@@ -385,6 +362,5 @@ def likeliest_names(
 
 
 def _log_density(level_dbm: float, mean: FloatArray, scale: FloatArray, freedom: int) -> FloatArray:
-    """Of Student's t, up to a constant."""
     square = ((level_dbm - mean) / scale) ** 2
     return np.asarray(-0.5 * (freedom + 1) * np.log1p(square / freedom) - np.log(scale))

@@ -30,11 +30,7 @@ from ccatp.filters.ekf_slam import BlockError, EkfSlam, RowUpdate
 
 
 class RejectedReadings:
-    """One reading that is not believed is an outlier. Several in a row, of whichever beacons, accuse the pose.
-
-    Args:
-        after: refusals in a row that accuse the pose.
-    """
+    """One reading that is not believed is an outlier. Several in a row, of whichever beacons, accuse the pose."""
 
     def __init__(self, after: int) -> None:
         self._after, self._refused = after, 0
@@ -100,7 +96,6 @@ class BeaconInnovation(NamedTuple):
     """What one reading did: an ``Innovation`` with the beacon it came from.
 
     Attributes:
-        beacon: which one.
         residual: z - h(x) of the bearing, if there is one, and of the range or the strength, shape (m,).
         nis: nu^T S^-1 nu, with the larger noise where a reading was beyond the knee.
         size: m; a reading whose bearing is refused has its range left out.
@@ -120,7 +115,6 @@ class BeaconSlam:
     """EKF-SLAM of a vehicle among beacons, by ``EkfSlam``; docs/slam.md has the models.
 
     Args:
-        settings: vehicle and radios.
         pose0: where the vehicle begins; it defines the frame of the map.
         P0: covariance of that, shape (3, 3).
         known: beacons with a prior: mean (b,) and covariance (b, b).
@@ -131,7 +125,6 @@ class BeaconSlam:
         waiting: beacons that were heard and are not on the map yet, with the candidates for their places.
         levels: what the noise of each sensor and of the motion is, relative to the settings, in variance.
         prior_sigmas: standard deviations of ``calibration`` before any reading, in its order.
-        jumps: how often the pose was doubted.
         unplaced: directions alone, of beacons that were not on the map then: they are not used.
         moved: beacons that had to be placed anew, each with the time_s of the reading that decided it.
     """
@@ -249,7 +242,6 @@ class BeaconSlam:
         return self.learned
 
     def _follow(self, before: FloatArray) -> None:
-        """The covariance follows a correction of the state."""
         if self._transport is not None:
             self._transport.follow(before)
 
@@ -295,7 +287,6 @@ class BeaconSlam:
         )
 
     def _take(self, reading: Reading, entry: MapEntry, kind: str, z: float, model: GaussMarkovBias | None) -> RowUpdate:
-        """One scalar of a reading."""
         engine, level = self.engine, self.levels[kind]
         x: list[float] = engine.mean.take(entry.columns).tolist()
         is_delayed, is_angle, shown = self._delay >= 0, kind == "bearing", self._shown

@@ -83,14 +83,10 @@ class RecordedRun:
     Attributes:
         name: of the data set, as in ``Plaza2``.
         kind: format that it was read from: plaza, mrclam, labyrinth or csv.
-        steps: of dead reckoning.
-        readings: what was heard of beacons.
         beacon_ids: name of each beacon as the data set gives it.
         beacon_truth_m: surveyed x, y by name, world frame, m; beacons that were not surveyed are missing.
-        truth: reference trajectory, or none.
         first_pose: x_m, y_m, heading_rad at the first odometry time, world frame: the one thing that an estimator may
             take from the truth; the origin if there is no truth.
-        warnings: what looks wrong in the set, a line each.
     """
 
     name: str
@@ -122,8 +118,6 @@ class BeaconFix(NamedTuple):
     """A beacon on the map.
 
     Attributes:
-        x_m: place.
-        y_m: place.
         covariance: of x_m, y_m, shape (2, 2).
     """
 
@@ -133,12 +127,7 @@ class BeaconFix(NamedTuple):
 
 
 class Calibrated(NamedTuple):
-    """A quantity found on the way.
-
-    Attributes:
-        value: positive where the sensor reads too much.
-        sigma: its standard deviation.
-    """
+    """A quantity found on the way."""
 
     value: float
     sigma: float
@@ -151,8 +140,6 @@ class EstimatedPath(NamedTuple):
         times_s: shape (n,), rising.
         poses: x_m, y_m, heading_rad, shape (n, 3).
         covariances: of the poses, shape (n, 3, 3).
-        beacons: the map, by name.
-        calibration: what was calibrated on the way, by name.
         nis: normalised innovations squared of the readings that were used, shape (u,); none from a smoother.
         nis_sizes: their degrees of freedom, shape (u,).
         refused: how many readings were refused, or weigh less than a tenth.
@@ -161,8 +148,6 @@ class EstimatedPath(NamedTuple):
         predict_s: wall time of each prediction, s; none from a smoother.
         scalar_s: wall time of each scalar of a reading of a beacon on the map, s, without prediction; none from a
             smoother.
-        updates: how many readings were used.
-        warnings: what is doubtful, a line each.
     """
 
     times_s: FloatArray
@@ -185,13 +170,7 @@ BeaconId = int | str
 
 @dataclass(frozen=True, slots=True)
 class RangeReading:
-    """A range to a beacon, as it was measured: scale error, offset and all.
-
-    Attributes:
-        time_s: when it was taken.
-        beacon: which one answered.
-        range_m: what was read, m.
-    """
+    """A range to a beacon, as it was measured: scale error, offset and all."""
 
     time_s: float
     beacon: BeaconId
@@ -203,8 +182,6 @@ class RangeBearingReading:
     """A range and a direction.
 
     Attributes:
-        time_s: when it was taken.
-        beacon: which one was seen.
         range_m: what was read, m; NaN where the direction alone was.
         bearing_rad: from the vehicle's heading, counter-clockwise.
     """
@@ -220,8 +197,6 @@ class RssiReading:
     """A signal strength, with the direction where it was strongest if an antenna turns.
 
     Attributes:
-        time_s: when it was taken.
-        beacon: which one was heard.
         rssi_dbm: received signal strength, dBm.
         bearing_rad: from the vehicle's heading, counter-clockwise; None without a directional antenna.
     """

@@ -30,12 +30,7 @@ class ScanResult(NamedTuple):
     """What a turn of the reflector says of one radio.
 
     Attributes:
-        beacon: node identifier.
-        rssi_dbm: mean level next to the bearing.
-        readings: in that mean.
         bearing_rad: left of the heading; None where the scan does not tell.
-        bearing_sigma_rad: of noise and steps together.
-        heard: share of the readings that arrived.
     """
 
     beacon: str
@@ -52,7 +47,6 @@ class ReflectorScan:
 
     Attributes:
         readings: of one turn; 40 are steps of 9 degrees (Hevrdejs and Knoll 2017).
-        bearing_sigma_rad: of the noise of a bearing, without the steps.
         loss_tolerance: a scan that lost a larger share of its packets gives no bearing.
     """
 

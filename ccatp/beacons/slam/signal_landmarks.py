@@ -30,8 +30,6 @@ class RadioModel(NamedTuple):
     """One reading, and where its states stand.
 
     Attributes:
-        reading: level, and bearing where there is one.
-        pose: first column of the pose it was taken at.
         shadow: derivatives of the level by the shadowing states, which end the radio's block, shape (k,).
         level_variance: of the level, dB^2.
     """
@@ -46,7 +44,6 @@ class SignalRows(NamedTuple):
     """Rows of an update.
 
     Attributes:
-        columns: of the state that they touch.
         linearise: state (n,) to residuals (m,) and derivatives (m, k).
         variances: of the noise, shape (m,).
     """
@@ -60,12 +57,6 @@ def rows_of(sights: Sequence[RadioModel], radio: slice, path_loss: PathLoss, bea
     """The rows of readings of one radio, taken at one pose or several.
 
     z = P_ref - 10 eta log10(r) + b,  beta = atan2(dy, dx) - heading (Auth and Hovey 2018, eqs 2.3 and 2.9).
-
-    Args:
-        sights: the readings.
-        radio: its block in the state.
-        path_loss: its calibration.
-        bearing_sigma_rad: noise and steps of a bearing.
     """
     poses = sorted({sight.pose for sight in sights})
     at = {pose: POSE * i for i, pose in enumerate(poses)}
@@ -182,12 +173,6 @@ class SignalLandmarkInitializer:
     poses in the state, until they place it. Meanwhile their most probable places are found beside the filter, by
     Gauss-Newton on poses and radios together with each radio eliminated in turn, and what that says of the rest of the
     state can be had without changing it.
-
-    Attributes:
-        guesses: the radios that wait, by name.
-
-    Args:
-        engine: the filter that holds the poses.
     """
 
     def __init__(self, engine: EkfSlam) -> None:
@@ -230,12 +215,7 @@ class SignalLandmarkInitializer:
                 self._engine.remove(block)
 
     def solve(self, priors: Mapping[BeaconId, SignalPrior], rows_at: RowsAt) -> None:
-        """Find the most probable places of the radios from all that waits of them.
-
-        Args:
-            priors: of the radios to place.
-            rows_at: makes the rows of an update.
-        """
+        """Find the most probable places of the radios from all that waits of them."""
         engine = self._engine
         records = [record for beacon in priors for record in self._records[beacon]]
         self._keys = sorted({record.pose for record in records})
@@ -328,7 +308,6 @@ def _stacked(shares: Iterable[_Share]) -> FloatArray:
 
 
 def _compressed(stack: FloatArray) -> FloatArray:
-    """No more rows than columns that say the same."""
     if stack.shape[0] <= stack.shape[1]:
         return stack
     return np.asarray(np.linalg.qr(stack, mode="r"), dtype=np.float64)
@@ -357,11 +336,7 @@ class MovingRadio:
     both: b <- c b with c = exp(-(d_vehicle + d_radio) / L), d_radio = sqrt(2) s t, and var(b) += sigma^2 (1 - c^2).
 
     Args:
-        beacon: which radio.
-        speed_sigma_m_s: s.
-        course_time_s: T.
         shadowing_sigma_db: sigma; 0: no such state.
-        shadowing_length_m: L.
         room_m: lengths of its walls; it never leaves the room.
     """
 
@@ -413,10 +388,6 @@ class MovingRadio:
         range (modified polar coordinates, Aidala and Hammel 1983).
 
         Args:
-            engine: the filter.
-            reading: level, and bearing where there is one.
-            path_loss: of the radio.
-            bearing_sigma_rad: noise and steps of a bearing.
             gates: largest normalised innovation squared that is used, of one row and of two.
         """
         self._to_polar(engine)
@@ -502,10 +473,8 @@ class ShadowingMap:
     w = R^-1 f with C = R R^T, so that a prior of them is the identity, and the row of a place is k^T R^-T.
 
     Args:
-        size_m: the room.
         spacing_m: between grid points; the outermost lie on the walls.
         sigma_db: sigma.
-        length_m: L.
     """
 
     def __init__(self, size_m: tuple[float, float], spacing_m: float, sigma_db: float, length_m: float) -> None:

@@ -36,10 +36,7 @@ class SignalSettings:
     """What ``SignalSlam`` is told.
 
     Attributes:
-        motion: the vehicle.
         path_loss: of each radio that has a calibration of its own; ``sigma_db`` is the white noise.
-        default: of all others.
-        bearing_sigma_rad: noise and steps of a bearing.
         shadowing_sigma_db: standard deviation of static shadowing; 0: none.
         shadowing: its map, for static radios; None: what there is of it counts as white noise.
         moving: the radio that moves; None without one.
@@ -70,7 +67,6 @@ class SignalSlam:
     is too large for one linearisation.
 
     Args:
-        settings: vehicle and radios.
         pose0: where the vehicle begins; it defines the frame of the map.
         P0: covariance of that, shape (3, 3).
     """

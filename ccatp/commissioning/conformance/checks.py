@@ -20,9 +20,6 @@ class Check(NamedTuple):
     """One row.
 
     Attributes:
-        check_id: its name.
-        promise: what the page promises.
-        method: how that is tested.
         story: plays it; what was seen, or ``Broken`` or ``NotApplicable``.
         needs: without these it is not applicable.
     """

@@ -36,12 +36,10 @@ class RawConnection:
     """A connection.
 
     Args:
-        address: host and port.
         timeout_s: longest wait for the connection, and for the server to take what is sent.
 
     Attributes:
         lines: received and not yet taken, without their LF.
-        is_ended: the server closed, or the connection broke.
 
     Raises:
         OSError: no connection.
@@ -113,13 +111,7 @@ SEQ_STEP = 10
 
 
 class Facts(NamedTuple):
-    """What the stories need of the server's hello.
-
-    Attributes:
-        is_lockstep, frame_hz, ttl_s: as in the hello.
-        needs_mac: a join needs a mac.
-        wheel_radius_m, wheel_base_m, max_wheel_rad_s, fan_floor: of the robot.
-    """
+    """What the stories need of the server's hello."""
 
     is_lockstep: bool
     frame_hz: float
@@ -140,10 +132,6 @@ class CheckContext:
     """Connections of one check; ``clear`` before the next.
 
     Args:
-        address: of the server.
-        facts: of its hello.
-        key: of the link, if any.
-        timeout_s: longest wait for an answer.
         first_seq: above every number used so far.
     """
 
@@ -249,7 +237,6 @@ class CheckContext:
         """A session. The one before may not have ended yet, so a role that is taken is asked for again.
 
         Args:
-            role: what to join as.
             patience_s: how long it is asked for; the time-out by default.
 
         Raises:
@@ -295,16 +282,10 @@ PATIENCE_S = 2.0  # robot's time in which a command must have come into force
 class ControllerAndMonitor:
     """Two sessions, played together.
 
-    Args:
-        stage: where they are.
-
     Attributes:
-        controller, monitor: the sessions.
         rates: (right, left) set points of the drive that answers each frame, rad/s; ``None`` sends none.
         allowed: (forward, reverse, turn) of the permit that answers each frame; ``None`` sends none.
-        frames: all so far.
         messages: the same as they came, of the controller and of the monitor.
-        raw: their lines.
     """
 
     def __init__(self, stage: CheckContext) -> None:

@@ -45,10 +45,6 @@ class Result(NamedTuple):
 def require(is_kept: bool, seen: str) -> None:
     """Go on if a promise is kept.
 
-    Args:
-        is_kept: whether it is.
-        seen: what was seen if it is not.
-
     Raises:
         Broken: it is not.
     """
@@ -63,12 +59,6 @@ class CheckedFrame(NamedTuple):
     """What the stories need of a sensors frame.
 
     Attributes:
-        seq: its number.
-        t_s: the robot's clock.
-        drive_seq: number of the drive in force.
-        age_s, permit_age_s: ages of drive and permit.
-        is_held: wheels held by the robot's own rules.
-        fans: duties, left and right.
         enc: samples (t, right, left) of the wheels, rad/s.
     """
 
@@ -458,12 +448,6 @@ EARLY_FRAMES, LATE_FRAMES = 2, 3  # a robot acts from frame to frame
 def judge_ttl(frames: Sequence[CheckedFrame], key: Key, ttl_s: float, frame_s: float) -> str:
     """Frames from the last drive or permit on, the other key being renewed all the while.
 
-    Args:
-        frames: of more than the time-to-live.
-        key: what is no longer sent.
-        ttl_s: the time-to-live.
-        frame_s: period of the frames.
-
     Raises:
         Broken: held too early, too late or never.
     """
@@ -491,8 +475,6 @@ def judge_lost(frames: Sequence[CheckedFrame], witness: Key, ttl_s: float, frame
     Args:
         frames: from the end of the session on, of some 0.2 s.
         witness: the message that the other session sent; its arrival is the moment at which the loss was there, too.
-        ttl_s: the time-to-live.
-        frame_s: period of the frames.
 
     Returns:
         What was seen; ``None`` if the frames do not reach over the time in question.

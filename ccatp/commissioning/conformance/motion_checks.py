@@ -58,14 +58,7 @@ def extent(facts: Facts) -> Extent:
 
 
 def direction(right: float, left: float, allowed: Allowed, denied: Allowed) -> Callable[[CheckContext], str]:
-    """A drive that is denied, then the same allowed.
-
-    Args:
-        right: sign of the right wheel, or its share of the rate.
-        left: of the left.
-        allowed: the permit that is just enough.
-        denied: the one that lacks just this.
-    """
+    """A drive that is denied, then the same allowed."""
 
     def story(stage: CheckContext) -> str:
         rate_rad_s = _rate(stage.facts)
@@ -116,7 +109,6 @@ def _at_rest(pair: ControllerAndMonitor) -> Iterator[ControllerAndMonitor]:
 
 
 def _moves(pair: ControllerAndMonitor, rates: Rates, allowed: Allowed) -> Rates:
-    """Drive until the encoders show it, then stop."""
     pair.rates, pair.allowed = rates, allowed
     first = len(pair.frames)
     pair.find(lambda _: len(pair.frames) - first > WINDOW and _is_turning(pair.frames[-WINDOW:], rates), MOVE_S)
@@ -130,7 +122,6 @@ def _moves(pair: ControllerAndMonitor, rates: Rates, allowed: Allowed) -> Rates:
 
 
 def _stays(pair: ControllerAndMonitor, rates: Rates, allowed: Allowed) -> None:
-    """Drive for a moment against the permit."""
     pair.allowed = allowed
     pair.settle()
     pair.rates = rates

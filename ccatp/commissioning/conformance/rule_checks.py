@@ -79,12 +79,7 @@ def noise_is_no_drive(stage: CheckContext) -> str:
 
 
 def lost(role: Key, ending: Ending) -> Callable[[CheckContext], str]:
-    """Both keys, then the session of one ends, and the other sends a last message right behind.
-
-    Args:
-        role: what the session that ends has sent.
-        ending: how.
-    """
+    """Both keys, then the session of one ends, and the other sends a last message right behind."""
 
     def story(stage: CheckContext) -> str:
         for _ in range(ATTEMPTS):

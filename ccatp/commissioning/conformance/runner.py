@@ -54,11 +54,6 @@ class KeyNeeded(CcatpError):
 class Conformance:
     """The checks of one server.
 
-    Args:
-        address: host and port.
-        key: of the link, if any.
-        timeout_s: longest wait for an answer.
-
     Attributes:
         facts: of the server's hello; ``None`` if it lacks what the checks need.
 
@@ -83,9 +78,7 @@ class Conformance:
         """Run the checks in the order of the table.
 
         Args:
-            motion: wheels may turn.
             only: names of the checks to run; all if empty.
-            tell: called with each result.
 
         Raises:
             NoRobot: another program holds the robot.
@@ -126,7 +119,6 @@ class Conformance:
     # -- before and after -----------------------------------------------------------------------------------------
 
     def _hello(self) -> Message:
-        """What the server says first."""
         try:
             link = RawConnection(self._address, self._timeout_s)
         except OSError as error:

@@ -202,7 +202,6 @@ def take_over(stage: CheckContext) -> str:
 
 
 def _be_noisy(pair: ControllerAndMonitor, until_s: float) -> None:
-    """Bad lines until the robot's clock shows ``until_s``."""
     while pair.newest.t_s < until_s:
         pair.controller.send(b'{"type":"drive","seq":\n')
         pair.run(NOISE_S)

@@ -28,7 +28,6 @@ def host_refusal(host: str | None, names: Collection[str]) -> str | None:
 
     Args:
         host: the header ``Host``.
-        names: of the configuration.
     """
     matched = _HOST.fullmatch(host or "")
     if matched is None:

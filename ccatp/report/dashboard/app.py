@@ -74,13 +74,10 @@ class CommandEndpoint:
     """Asks the main loop.
 
     Args:
-        context: ZeroMQ context of the process.
-        endpoint: the operator channel.
         timeout_s: longest wait for the answer, which comes when the command took effect.
     """
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, timeout_s: float) -> None:
-        """Nothing asked yet."""
         self._context: zmq.asyncio.Context = zmq.asyncio.Context.shadow(context)
         self._endpoint, self._timeout_s = endpoint, timeout_s
         self._asking = 0
@@ -136,12 +133,7 @@ _EVENTS = (
 
 
 class HostCheckMiddleware:
-    """Refuses who asks by a wrong name, and puts the page's headers on every answer.
-
-    Args:
-        app: what is behind it.
-        names: under which this machine may be asked.
-    """
+    """Refuses who asks by a wrong name, and puts the page's headers on every answer."""
 
     def __init__(self, app: ASGIApp, names: Collection[str]) -> None:
         self._app, self._names = app, names
@@ -194,7 +186,6 @@ class ReadRoutes:
     """What is answered to each question.
 
     Args:
-        hub: the state.
         ground: what does not change, ``ccatp.report.dashboard.survey_view``.
     """
 
@@ -234,9 +225,7 @@ class CommandRoutes:
     """Where commands are taken: from our own page, and with the token if there is one.
 
     Args:
-        desk: takes commands.
         token: that commands have to carry, or ``None``.
-        note: a line for the log, with its fields.
     """
 
     def __init__(self, desk: CommandEndpoint, token: str | None, note: Note) -> None:
@@ -279,12 +268,9 @@ def build_app(
     """The application.
 
     Args:
-        hub: the state.
-        desk: takes commands.
         ground: what does not change, ``ccatp.report.dashboard.survey_view``.
         host_names: under which the page may be asked for, besides localhost and addresses.
         token: that commands have to carry, or ``None``.
-        note: a line for the log, with its fields.
     """
     answers, counter = ReadRoutes(hub, ground), CommandRoutes(desk, token, note)
     routes = [

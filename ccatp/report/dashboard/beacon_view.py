@@ -33,8 +33,6 @@ def beacon_ground(cfg: RadioConfig, *, is_sim: bool, needs_token: bool) -> dict[
     """The ground for the page, lengths in m, in the frame of the room.
 
     Args:
-        cfg: the run's configuration.
-        is_sim: the robot is a stand-in.
         needs_token: commands must carry a token.
     """
     width_m, depth_m = cfg.workspace.size_m
@@ -84,15 +82,9 @@ _DRAWN = frozenset(("robot", "trail", "waypoint"))
 
 
 class BeaconView(RunStateView):
-    """What a page shows of a mission among beacons.
-
-    Args:
-        cfg: the run's configuration.
-        is_sim: the robot is a stand-in.
-    """
+    """What a page shows of a mission among beacons."""
 
     def __init__(self, cfg: RadioConfig, *, is_sim: bool) -> None:
-        """Nothing heard."""
         super().__init__(is_sim=is_sim, series=SERIES, has_laser=False)
         self._cfg = cfg
         self._states = [PLANNED] * len(beacon_waypoints(cfg))
@@ -159,7 +151,6 @@ class BeaconView(RunStateView):
             self._series["error"].add(round(second.t_s, 2), round(second.error_mm, 3), round(second.three_sigma_mm, 3))
 
     def _static(self, message: BeaconMapMessage) -> dict[str, BeaconEllipse]:
-        """The beacons that stand."""
         target = self._cfg.follow.target if self._cfg.follow.is_active else ""
         return {name: ellipse for name, ellipse in message.beacons.items() if name != target}
 
@@ -173,7 +164,6 @@ class BeaconView(RunStateView):
         return {"points": points, "facts": self._facts()}
 
     def _facts(self) -> list[tuple[str, str]]:
-        """What else there is to say, name and value."""
         message = self._map
         if message is None:
             return []

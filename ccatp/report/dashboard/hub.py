@@ -21,9 +21,6 @@ class Wants(NamedTuple):
 
     Attributes:
         main: what makes the page's history, and costs nothing to speak of; besides that of every mission.
-        track: of the estimates, while somebody looks.
-        truth: of the simulated truth, likewise.
-        once: of the simulated truth, what is told once.
     """
 
     main: tuple[str, ...]
@@ -44,13 +41,6 @@ class BusReader:
     """Subscriptions of the dashboard.
 
     Nobody waits for them: a run begins when its own processes listen, whoever looks on.
-
-    Args:
-        context: ZeroMQ context of the process.
-        endpoint_of: where main, danger and truth publish.
-        view: what hears it.
-        is_sim: there is a truth.
-        wants: what there is to hear of the mission.
     """
 
     def __init__(
@@ -62,7 +52,6 @@ class BusReader:
         is_sim: bool,
         wants: Wants = SURVEY,
     ) -> None:
-        """Subscribe to what is always received."""
         self._context, self._endpoint_of, self._view, self._is_sim = context, endpoint_of, view, is_sim
         self._wants = wants
         always = {"main": (*_OF_MAIN, *wants.main), "danger": _OF_DANGER}
@@ -100,11 +89,7 @@ class BusReader:
             _close(self._looking)
 
     def drain(self, now_s: float) -> None:
-        """Hand on what has come.
-
-        Args:
-            now_s: time of the machine's monotonic clock.
-        """
+        """Hand on what has come."""
         for name, subscriber in self._always.items():
             if subscriber.is_cut:
                 self._view.links.cut(name, now_s)
@@ -145,7 +130,6 @@ class EventStream:
     """What one page is told; one that cannot follow is told everything anew when it can."""
 
     def __init__(self) -> None:
-        """Just opened."""
         self._payload = b""
         self._is_full = asyncio.Event()
         self._is_over = False
@@ -179,16 +163,9 @@ class EventStream:
 
 
 class StateBroadcaster:
-    """Ticks while pages are open, and rests while none is.
-
-    Args:
-        feed: what comes in.
-        view: what it amounts to.
-        rate_hz: of the state.
-    """
+    """Ticks while pages are open, and rests while none is."""
 
     def __init__(self, feed: BusReader, view: RunStateView, rate_hz: float) -> None:
-        """No page yet."""
         self._feed, self._view, self._period_s = feed, view, 1.0 / rate_hz
         self._streams: set[EventStream] = set()
         self._wake = asyncio.Event()

@@ -32,7 +32,6 @@ def metrics_text(state: Mapping[str, Any], ground: Mapping[str, Any], pages: int
     Args:
         state: ``View.status_data``.
         ground: of the page: its title, and the states that the mission may have.
-        pages: open ones.
     """
     page = _Page()
     info = (

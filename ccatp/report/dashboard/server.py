@@ -24,7 +24,6 @@ class GuardedProtocol(H11Protocol):
     """One connection. Newcomers beyond the limit are turned away, those who are in stay.
 
     Attributes:
-        limit: connections at a time.
         slow_client_s: dropped is who has sent no whole request for this long, or takes nothing of an answer.
     """
 
@@ -92,7 +91,6 @@ def guarded(connections: int, silence_s: float) -> type[GuardedProtocol]:
     """The protocol with these limits.
 
     Args:
-        connections: at a time.
         silence_s: see ``GuardedProtocol``.
     """
 
@@ -120,10 +118,7 @@ async def serve(app: ASGIApp, listener: socket.socket, cfg: DashboardConfig, sto
     """Serve until ``stop`` is set; then within ``GRACE_S``, whoever is connected.
 
     Args:
-        app: the application.
         listener: a listening socket; it is closed in the end.
-        cfg: limits.
-        stop: the end.
     """
     logging.getLogger("uvicorn.access").disabled = True
     config = uvicorn.Config(

@@ -48,8 +48,6 @@ def ground(mirror: Mirror, cfg: Config, *, is_sim: bool, needs_token: bool) -> d
     """The ground for the page, lengths in m, deck frame.
 
     Args:
-        mirror: where the survey takes place.
-        cfg: the run's configuration.
         is_sim: robot and laser system are stand-ins.
         needs_token: commands must carry a token.
     """
@@ -98,7 +96,6 @@ class TruthCompare:
     """Joins what main estimated and what the stand-in knows; either may come first."""
 
     def __init__(self) -> None:
-        """Nothing came yet."""
         self._estimates: OrderedDict[int, tuple[float, float, float]] = OrderedDict()
         self._truths: OrderedDict[int, tuple[float, float, float]] = OrderedDict()
         self._second = -1
@@ -149,13 +146,10 @@ class SurveyView(RunStateView):
     """What a page shows of a survey.
 
     Args:
-        mirror: where it takes place.
-        cfg: the run's configuration.
         is_sim: robot and laser system are stand-ins.
     """
 
     def __init__(self, mirror: Mirror, cfg: Config, *, is_sim: bool) -> None:
-        """Nothing heard."""
         super().__init__(is_sim=is_sim, series=SERIES)
         self._mirror, self._puck_height_m = mirror, cfg.robot.puck_height_m
         self.points = survey_points(mirror, cfg)
@@ -178,7 +172,6 @@ class SurveyView(RunStateView):
 
         Args:
             measured: points with the time (s) and the puck (world frame, m) of their fixes, in any order.
-            skipped: points left out.
         """
         for point, t_s, position_m in sorted(measured, key=lambda row: row[1]):
             self._measured(point, t_s, position_m)

@@ -45,13 +45,9 @@ class Links:
     """Dates what comes from each process.
 
     Times called ``now_s`` are the machine's monotonic clock, by which processes date their presence as well.
-
-    Args:
-        has_laser: a laser system measures.
     """
 
     def __init__(self, *, has_laser: bool = True) -> None:
-        """Nothing heard."""
         self._has_laser = has_laser
         self._liveness = Liveness()
         self._presences: dict[str, Heartbeat] = {}
@@ -185,7 +181,6 @@ class Growing:
     """
 
     def __init__(self, limit: int) -> None:
-        """Empty."""
         self._limit = limit
         self._rows: list[Row] = []
         self._new: list[Row] = []
@@ -215,14 +210,9 @@ class Growing:
 
 
 class Trail:
-    """The driven path, as far as anybody looked; straight from stop to stop where nobody did.
-
-    Args:
-        limit: points kept.
-    """
+    """The driven path, as far as anybody looked; straight from stop to stop where nobody did."""
 
     def __init__(self, limit: int) -> None:
-        """Nowhere yet."""
         self.points = Growing(limit)
 
     def add(self, x_m: float, y_m: float) -> None:
@@ -236,13 +226,9 @@ class Lines:
     """The last lines told to the operator: of each kind the newest, and how often it was said.
 
     A row is the robot's time (s), the level, the text, how often lines of its kind were said, and the kind's number.
-
-    Args:
-        limit: so many kinds are kept.
     """
 
     def __init__(self, limit: int) -> None:
-        """None yet."""
         self._limit = limit
         self._rows: dict[tuple[str, str], Row] = {}
         self._new: dict[tuple[str, str], Row] = {}
@@ -278,19 +264,11 @@ _line = msgspec.json.Decoder(Sensors)
 class RunStateView:
     """Hears the bus, and tells a page what is new. Missions add what is theirs.
 
-    Args:
-        is_sim: the robot is a stand-in.
-        series: names of the plots.
-        has_laser: a laser system measures.
-
     Attributes:
-        links: who is heard of.
-        status: where the mission stands, once it is known.
         is_tracking: the path comes as it is driven; else only its stops are known.
     """
 
     def __init__(self, *, is_sim: bool, series: Iterable[str], has_laser: bool = True) -> None:
-        """Nothing heard."""
         self._is_sim = is_sim
         self.links = Links(has_laser=has_laser)
         self.status: MissionStatus | None = None
@@ -322,7 +300,6 @@ class RunStateView:
 
         Args:
             message: of the topic table; what the page does not show is ignored.
-            now_s: time of the machine's monotonic clock.
         """
         taker = self._takers.get(type(message))
         if taker is not None:
@@ -388,15 +365,12 @@ class RunStateView:
         return {**self._levels(now_s), "trouble": self.links.trouble(now_s)}
 
     def _own_news(self) -> dict[str, Any]:
-        """What of this mission's own is new."""
         return {"points": []}
 
     def _own_all(self) -> dict[str, Any]:
-        """All of this mission's own."""
         return {"points": []}
 
     def _next_point(self) -> str:
-        """Where the robot is bound for."""
         return "" if self.status is None else self.status.point
 
     def _levels(self, now_s: float) -> dict[str, Any]:

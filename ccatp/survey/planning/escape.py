@@ -39,12 +39,6 @@ def find_escape(mirror: Mirror, body: Body, start: SearchNode, limits: LimitsCon
     Best is what brings no sensor nearer to the rim than ``turn_clearance_m``, or than it is already; of those the
     fastest, with the smallest turn. Where a sensor has to come nearer, the one that brings it least far.
 
-    Args:
-        mirror: the mirror.
-        body: the robot and its clearances.
-        start: place on the mirror and what the robot faces there.
-        limits: motion limits.
-
     Raises:
         UnreachableError: if there is no such place within 0.4 m.
     """
@@ -99,11 +93,6 @@ def find_retreats(mirror: Mirror, body: Body, places: list[LegPlace]) -> list[tu
     At most one to each side of the grid of panels, straight or slightly slanted: slanted where the place is in a
     corner, or to move off along the rim.
 
-    Args:
-        mirror: the mirror.
-        body: the robot and its clearances.
-        places: where it may have to turn.
-
     Returns:
         The retreats of each place; none for one at which the robot can turn.
     """
@@ -148,10 +137,7 @@ def plan_calibration(mirror: Mirror, robot: RobotConfig, mission: MissionConfig,
     second round shows whether slip and creep are the same again.
 
     Args:
-        mirror: the mirror.
-        robot: where the sensors are.
         mission: clearances, the length wanted (0 = no calibration), and how many rounds.
-        base: where the robot stands.
 
     Returns:
         The stops; none where there is no room.
@@ -191,7 +177,6 @@ def is_on_drive(stops: Sequence[Stop], x_m: float, y_m: float) -> bool:
     """Whether a calibration drive can go on from a place: it lies on its line, where the robot may turn anywhere.
 
     Args:
-        stops: a route with the drive's stops.
         x_m, y_m: the place, deck frame.
     """
     ends = dict.fromkeys((stop.x_m, stop.y_m) for stop in stops if stop.kind is StopKind.CALIBRATE)

@@ -72,7 +72,6 @@ class LegPlace:
 
     Attributes:
         x_m, y_m: deck coordinates.
-        depth_m: distance to the rim.
         stance: what the robot can do there; ``None`` where it can turn as it likes.
     """
 
@@ -96,8 +95,6 @@ class Body(NamedTuple):
     Attributes:
         sensors_m: the sensors in the robot frame, shape (4, 2).
         reach_m: the largest distance of one from the robot's origin.
-        leg_clearance_m: what the origin keeps from the rim on a leg.
-        turn_clearance_m: what each sensor keeps from it, always.
     """
 
     sensors_m: FloatArray
@@ -124,8 +121,6 @@ def sensor_depths(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray, co
     g = fx c + fy s along it, ``h = (c, s, g)/sqrt(1 + g^2)`` and ``l = n x h``.
 
     Args:
-        mirror: the mirror.
-        body: the robot.
         xs, ys, courses_rad: arrays that broadcast against each other, m and rad.
 
     Returns:
@@ -180,15 +175,9 @@ _GRAZING_M = (0.0, 0.4, 4.0)  # what a way may be longer to be without
 
 
 class LegRules:
-    """Says which straight legs the robot may drive.
-
-    Args:
-        mirror: the mirror.
-        body: the robot and its clearances.
-    """
+    """Says which straight legs the robot may drive."""
 
     def __init__(self, mirror: Mirror, body: Body) -> None:
-        """Find the rim's re-entrant corners and the places from which the robot can drive around them."""
         self._rim, self._body = mirror.rim, body
         self._sensors: list[list[float]] = body.sensors_m.tolist()
         self._corners, self._nodes = _reentrant_corners(mirror, body)
@@ -220,8 +209,6 @@ class LegRules:
         straight track: the ends are the stances' affair.
 
         Args:
-            a, b: ends of the leg.
-            course_rad: what the robot faces.
             clearance_m: clearance of the leg itself, from ``clearance_m``.
         """
         body = self._body
@@ -239,12 +226,7 @@ class LegRules:
         )
 
     def grazing(self, a: LegPlace, b: LegPlace, course_rad: float) -> Grazing:
-        """Whether a sensor may run along a seam on the leg from ``a`` to ``b``, which looks like the mirror's edge.
-
-        Args:
-            a, b: ends of the leg.
-            course_rad: what the robot faces.
-        """
+        """Whether a sensor may run along a seam on the leg from ``a`` to ``b``, which looks like the mirror's edge."""
         dx, dy = b.x_m - a.x_m, b.y_m - a.y_m
         length = hypot(dx, dy)
         c, s = cos(course_rad), sin(course_rad)
@@ -405,8 +387,6 @@ def in_parts(x_m: float, y_m: float, stop: Stop, longest_m: float) -> list[Stop]
 
     Args:
         x_m, y_m: where the leg begins, deck frame.
-        stop: where it ends.
-        longest_m: no part is longer.
     """
     dx, dy = stop.x_m - x_m, stop.y_m - y_m
     parts = max(1, ceil(hypot(dx, dy) / longest_m))

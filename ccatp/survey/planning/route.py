@@ -71,11 +71,7 @@ def plan_route(
     straight way does not, stops are put in between.
 
     Args:
-        mirror: the mirror.
-        points: what to measure, in order.
-        robot, limits, mission: sensors, motion limits, clearances.
         start: pose of the robot, deck frame.
-        skip: points already measured.
         measuring_time_s: standstill at each point, for the remaining time only.
         out_of_reach: takes the points that cannot be reached, and the route goes without them.
 
@@ -122,11 +118,7 @@ def plan_rejoin(
     robot can turn freely, so that it does not matter how it arrives there.
 
     Args:
-        mirror: the mirror.
-        route: the route that was left.
-        robot, limits, mission: sensors, motion limits, clearances.
         start: pose of the robot, deck frame.
-        skip: points that are done with.
         measuring_time_s: standstill at each point, for the remaining time only.
 
     Raises:
@@ -231,7 +223,6 @@ def fastest_serpentine(mirror: Mirror, points: Sequence[PointId], limits: Limits
 
     Args:
         mirror: the mirror; its base pose is the start.
-        points: what to measure, in any order.
         limits: motion limits by which turns are weighed against ways.
 
     Returns:
@@ -241,11 +232,7 @@ def fastest_serpentine(mirror: Mirror, points: Sequence[PointId], limits: Limits
 
 
 def serpentines(points: Sequence[PointId]) -> Iterator[list[PointId]]:
-    """All eight serpentines: along the rows, along the columns; each from any of its corners.
-
-    Args:
-        points: in any order.
-    """
+    """All eight serpentines: along the rows, along the columns; each from any of its corners."""
     for split in (_on_row, _on_column):
         lines = _lines(points, split)
         for stacked in (lines, lines[::-1]):
@@ -305,7 +292,6 @@ def thesis_order(mirror: Mirror, panels: int = 0) -> list[PointId]:
     """Points of the mirror in the order of the thesis: panel by panel, odd rows towards +column, even rows back.
 
     Args:
-        mirror: the mirror.
         panels: take the first so many panels only; 0 = all.
 
     Returns:
@@ -325,7 +311,6 @@ def optimised_order(mirror: Mirror, panels: int = 0, limits: LimitsConfig = NOMI
     """The same points in whole lines across the panels, see ``fastest_serpentine``.
 
     Args:
-        mirror: the mirror.
         panels: take the points of the first so many panels of the thesis's order only; 0 = all.
         limits: motion limits by which turns are weighed against ways.
 

@@ -79,11 +79,7 @@ def path_time(
     """Least time to drive a path from rest to rest and to measure at its measurement points, s.
 
     Args:
-        stops: the path.
         start: pose before the first leg, deck frame.
-        limits: motion limits.
-        mirror: gives the surface on which the legs lie.
-        measuring_time_s: standstill at each measurement point.
     """
     measurements = sum(stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) for stop in stops)
     return sum(stop_times(stops, start, limits, mirror)) + measurements * measuring_time_s
@@ -125,10 +121,7 @@ class SearchNode:
     """The robot has arrived at a place by the cheapest way that ends with this leg.
 
     Attributes:
-        place: where it is.
         course_rad: what it faces, as a direction in the deck plane.
-        cost_s: time so far.
-        reverse: the leg was driven backwards.
         before: the arrival before; ``None`` at the start.
     """
 
@@ -156,26 +149,15 @@ class Search:
 
     Between two targets the robot may drive straight on, turn at a retreat of the first or of the second or of both,
     and has to drive around stepped corners; each leg forward or in reverse.
-
-    Args:
-        rules: which legs are allowed.
-        limits: motion limits.
     """
 
     def __init__(self, rules: LegRules, limits: LimitsConfig) -> None:
-        """Keep the rules."""
         self._rules, self._limits = rules, limits
 
     def advance(
         self, arrivals: Sequence[SearchNode], retreats: tuple[LegPlace, ...], target: Target
     ) -> list[SearchNode]:
-        """All sensible ways on from one place to the next target; none where there is no way.
-
-        Args:
-            arrivals: ways to the present place.
-            retreats: places near it where the robot may turn.
-            target: where to go.
-        """
+        """All sensible ways on from one place to the next target; none where there is no way."""
         here = arrivals[0].place
         frontier: Frontier = {here: list(arrivals)}
         frontier |= self._extend(frontier, retreats)

@@ -58,8 +58,6 @@ def tour_bound(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig, 
     Args:
         mirror: the mirror; its base pose is the start.
         points: what to measure; their order does not matter.
-        limits: motion limits.
-        measuring_time_s: standstill at each point.
     """
     if not points:
         return 0.0
@@ -88,7 +86,6 @@ def _headings(mirror: Mirror, x: float, y: float, xy: FloatArray) -> FloatArray:
 
 
 def _bang_bang_times(distances: FloatArray, v_max: float, a_max: float) -> FloatArray:
-    """As ``bang_bang_time``, of many."""
     short = distances * a_max < v_max * v_max
     return np.where(short, 2.0 * np.sqrt(distances / a_max), distances / v_max + v_max / a_max)
 

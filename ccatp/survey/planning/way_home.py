@@ -35,10 +35,8 @@ def plan_way_home(
     there on legs and turns keep the clearances of a survey.
 
     Args:
-        mirror: the mirror.
         start: where the robot is, deck frame; anywhere on the mirror, facing anything.
         base: where it shall end, deck frame.
-        robot, limits, mission: sensors, motion limits, clearances.
 
     Raises:
         OutsideMirrorError: if the start is not on the mirror.
