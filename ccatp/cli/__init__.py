@@ -19,7 +19,7 @@ COMMANDS = (
     *(run.run, operate.status, operate.pause, operate.resume, operate.abort, operate.stop),
     *(operate.emergency, operate.clear, run.dashboard, run.stream),
     # after a mission
-    *(report.report, report.compare, report.align, report.replay, report.draw_map, recording.log),
+    *(report.report, report.compare, report.align, report.replay, report.plot, recording.recording),
     # simulation and studies
     *(sim.sim, study.study, study.bench, sim.conformance, radio.radio, config.completion),
 )

@@ -16,6 +16,8 @@ from ccatp.config.package import configs_dir
 from ccatp.errors import CcatpError, ExitStatus
 
 Command = Callable[..., Any]
+# Former names of commands, and what they are called now.
+RENAMED_COMMANDS = {"log": "recording", "recover": "repair", "map": "plot"}
 # Longer than any answer takes; what libzmq waits for is an int of milliseconds.
 LONGEST_WAIT_S = 86_400.0
 
@@ -83,6 +85,9 @@ class SuggestingGroup(click.Group):
         """
         name = args[0]
         if self.get_command(ctx, name) is None and not name.startswith("-"):
+            new_name = RENAMED_COMMANDS.get(name)
+            if new_name is not None and self.get_command(ctx, new_name) is not None:
+                raise click.UsageError(f"the command {name!r} is now called {new_name!r}", ctx)
             near = difflib.get_close_matches(name, self.list_commands(ctx), n=1)
             hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(self.list_commands(ctx))}"
             raise click.UsageError(f"no command {name!r}; {hint}", ctx)
@@ -142,6 +147,23 @@ def options(*decorators: Callable[[Command], Command]) -> Callable[[Command], Co
         return command
 
     return decorate
+
+
+def renamed_flag(old: str, new: str) -> Callable[[Command], Command]:
+    """A hidden flag under its former name, which is refused with the present one."""
+
+    def refuse(ctx: click.Context, _param: click.Parameter, is_given: bool) -> None:
+        if is_given:
+            raise click.UsageError(f"{old} is now called {new}", ctx)
+
+    return click.option(
+        old,
+        f"former_{new.strip('-').replace('-', '_')}",
+        is_flag=True,
+        hidden=True,
+        expose_value=False,
+        callback=refuse,
+    )
 
 
 def parse_setting(text: str) -> tuple[str, object]:

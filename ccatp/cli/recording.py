@@ -1,4 +1,4 @@
-"""The commands ``ccatp log info`` and ``ccatp log recover``."""
+"""``ccatp recording info`` and ``ccatp recording repair``."""
 
 import json
 from pathlib import Path
@@ -12,19 +12,23 @@ if TYPE_CHECKING:
     from ccatp.records.recording_repair import RecordingFacts
 
 
-@click.group(cls=SuggestingGroup, epilog=example("ccatp log info runs/tonight", "ccatp log recover telemetry.mcap"))
-def log() -> None:
-    """Look into recordings and save damaged ones."""
+@click.group(
+    cls=SuggestingGroup, epilog=example("ccatp recording info runs/tonight", "ccatp recording repair telemetry.mcap")
+)
+def recording() -> None:
+    """Show what recordings hold and repair damaged ones."""
 
 
-@log.command(epilog=example("ccatp log info runs/tonight", "ccatp log info runs/tonight/telemetry.mcap --json"))
+@recording.command(
+    epilog=example("ccatp recording info runs/tonight", "ccatp recording info runs/tonight/telemetry.mcap --json")
+)
 @click.argument("path", metavar="FILE|RUN_DIR", type=click.Path(path_type=Path))
 @click.option("--json", "json_output", is_flag=True, help="As JSON on standard output, nothing else there.")
 def info(path: Path, json_output: bool) -> int:
-    """Tell what a recording holds, and whether every checksum in it is right.
+    """Show what a recording holds, and whether every checksum in it is right.
 
-    The status is 1 where a recording was cut off or is damaged; ccatp log recover saves what is intact. One that a run
-    still writes has no index yet, which is no damage.
+    The exit status is 1 if a recording was cut off or is damaged; ccatp recording repair saves what is intact. A
+    recording that a run still writes has no index yet; this is not damage.
     """
     from ccatp.records.recording_repair import read_facts, recording_files
 
@@ -37,20 +41,21 @@ def info(path: Path, json_output: bool) -> int:
     return int(not all(facts.is_in_order for facts in found))
 
 
-@log.command(epilog=example("ccatp log recover runs/tonight", "ccatp log recover telemetry.mcap --out saved.mcap"))
+@recording.command(
+    epilog=example("ccatp recording repair runs/tonight", "ccatp recording repair telemetry.mcap --out saved.mcap")
+)
 @click.argument("path", metavar="FILE|RUN_DIR", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="The new file; FILE.recovered.mcap if not given.")
 @click.option("--json", "json_output", is_flag=True, help="As JSON on standard output, nothing else there.")
-def recover(path: Path, out: Path | None, json_output: bool) -> int:
+def repair(path: Path, out: Path | None, json_output: bool) -> int:
     """Save what is intact of a recording that was cut off or damaged, as a new file with an index.
 
     The old file stays as it is. Of a run directory the newest recording is taken.
     """
-    from ccatp.records.recording_repair import recording_files
-    from ccatp.records.recording_repair import recover as save
+    from ccatp.records.recording_repair import recording_files, recover
 
     file = recording_files(path)[-1]
-    saved = save(file, out or file.with_name(f"{file.stem}.recovered{file.suffix}"))
+    saved = recover(file, out or file.with_name(f"{file.stem}.recovered{file.suffix}"))
     lost = saved.condition.lost_bytes
     if json_output:
         end_s = saved.end_s
@@ -92,4 +97,4 @@ def _tell(facts: "RecordingFacts") -> None:
         return
     for fault in facts.faults:
         click.echo(f"  {fault}")
-    click.echo(f"  save what is intact with: ccatp log recover {facts.path}")
+    click.echo(f"  save what is intact with: ccatp recording repair {facts.path}")

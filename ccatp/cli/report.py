@@ -1,11 +1,4 @@
-"""The commands ``ccatp report`` and ``ccatp compare``.
-
-The command ``ccatp map``.
-
-The command ``ccatp align``.
-
-The command ``ccatp replay``.
-"""
+"""What is done with a run afterwards: ``ccatp report``, ``compare``, ``plot``, ``align`` and ``replay``."""
 
 import json
 import os
@@ -81,12 +74,12 @@ def compare(run_a: Path, run_b: Path, out: Path | None, figures: Path | None, js
     return 0
 
 
-@click.command("map", epilog=example("ccatp map runs/20260101T000000Z-fyst-m1-s1 --out map.png"))
+@click.command(epilog=example("ccatp plot runs/20260101T000000Z-fyst-m1-s1 --out map.png"))
 @click.argument("run_dir", type=click.Path(path_type=Path))
 @click.option(
     "--out", type=OutputFile(".png", ".pdf", ".svg"), help="The picture; map.png in the run directory if not given."
 )
-def draw_map(run_dir: Path, out: Path | None) -> int:
+def plot(run_dir: Path, out: Path | None) -> int:
     """Draw the map of a run: panels, path, and each point coloured by its arrival error."""
     from ccatp.report.plots import draw_from_run_dir
 

@@ -1,9 +1,4 @@
-"""The command ``ccatp run``.
-
-The command ``ccatp dashboard``.
-
-The command ``ccatp stream``.
-"""
+"""``ccatp run``, ``dashboard`` and ``stream``: what runs until it is stopped."""
 
 import os
 from collections.abc import Mapping
@@ -20,6 +15,7 @@ from ccatp.cli.common import (
     configured_folder,
     example,
     overrides,
+    renamed_flag,
     settings_option,
 )
 
@@ -37,9 +33,13 @@ from ccatp.cli.common import (
 @click.option(
     "--run-dir", type=click.Path(path_type=Path), help="Where to write; runs/<time>-<mirror>-s<seed> if not given."
 )
-@click.option("--resume", is_flag=True, help="Carry on with the mission in --run-dir.")
-@click.option("--held", is_flag=True, help="With --resume: nothing moves until ccatp resume.")
-@click.option("--recover", is_flag=True, help="For services: carry on, held, with the run that did not finish, if any.")
+@click.option("--resume", is_flag=True, help="Resume the mission in --run-dir.")
+@click.option("--start-held", "held", is_flag=True, help="With --resume: nothing moves until ccatp resume.")
+@click.option(
+    "--resume-last", "recover", is_flag=True, help="For services: resume, held, the run that did not finish, if any."
+)
+@renamed_flag("--held", "--start-held")
+@renamed_flag("--recover", "--resume-last")
 @click.option("--json", "json_output", is_flag=True, help="Summary as JSON on standard output, nothing else there.")
 @FAULTS_OPTION
 @RUNTIME_DIR_OPTION
@@ -51,15 +51,13 @@ def run(
 ) -> int:  # fmt: skip
     """Survey the mirror of the configuration and end with a summary."""
     if faults_file is not None and not sim:
-        raise click.UsageError(
-            "--faults goes with --sim alone: faults are for the simulated robot, never for a real one"
-        )
+        raise click.UsageError("--faults needs --sim: faults are for the simulated robot, never for a real one")
     if held and not resume:
-        raise click.UsageError("--held goes with --resume; --recover holds by itself")
+        raise click.UsageError("--start-held needs --resume; --resume-last always starts held")
     if recover and (resume or run_dir is not None):
-        raise click.UsageError("--recover finds the run by itself: leave out --resume and --run-dir")
+        raise click.UsageError("--resume-last finds the run itself: leave out --resume and --run-dir")
     if resume and run_dir is None:
-        raise click.UsageError("--resume carries on in a run directory; name it with --run-dir")
+        raise click.UsageError("--resume needs a run directory; name it with --run-dir")
     if resume and config_file is None and run_dir is not None:
         config_file = run_dir / "config.toml"
     if not sim and config_file is None:
@@ -70,7 +68,7 @@ def run(
     if faults_file is not None:
         from ccatp.sim.ground_truth import read_plan
 
-        read_plan(faults_file, lockstep=not realtime)  # its mistakes are told before anything is started
+        read_plan(faults_file, lockstep=not realtime)  # mistakes are reported before anything is started
     named = {
         "run.mirror": mirror,
         "run.world": world,

@@ -304,7 +304,7 @@ def run(options: RunOptions) -> int:
 def run_beacons(options: RunOptions) -> int:
     """Run one mission among beacons to its end; arguments, status and errors as of ``run_survey``."""
     if options.resume or options.recover:
-        flag = "--resume" if options.resume else "--recover"
+        flag = "--resume" if options.resume else "--resume-last"
         raise ConfigError(f"{flag}: a mission among beacons has nothing to go on with, its map is not kept; begin anew")
     if options.faults_file is not None:
         raise ConfigError("--faults: plans are for surveys; sim.incidents of the configuration holds those of beacons")

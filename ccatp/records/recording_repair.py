@@ -215,7 +215,7 @@ def _rewrite(
     writer: Writer, records: list[Any], schemas: Mapping[int, Schema], channels: Mapping[int, Channel]
 ) -> tuple[int, float | None]:
     library = next((record.library for record in records if isinstance(record, Header)), "")
-    writer.start(library=f"ccatp log recover ({library})" if library else "ccatp log recover")
+    writer.start(library=f"ccatp recording repair ({library})" if library else "ccatp recording repair")
     new_schemas = {
         number: int(writer.register_schema(s.name, s.encoding, s.data)) for number, s in sorted(schemas.items())
     }

@@ -200,7 +200,7 @@ def test_a_service_that_is_started_anew_waits_for_an_operator(
     assert not alive
     done = len(fixes(run))
     again_s = time.monotonic()
-    again = begun(run, "--resume", "--held", "--panels", "1")
+    again = begun(run, "--resume", "--start-held", "--panels", "1")
     status = again.until(lambda status: status["seq"] >= 0)
     measured("P4", time.monotonic() - again_s)
     assert status["state"] == "held"

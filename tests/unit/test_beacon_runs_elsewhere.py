@@ -12,7 +12,7 @@ from ccatp.links.topics import schema_of
 from ccatp.records.recorder import Recorder, iter_messages
 
 
-@pytest.mark.parametrize("command", [["align"], ["map"], ["replay"], ["calibrate", "--from"]])
+@pytest.mark.parametrize("command", [["align"], ["plot"], ["replay"], ["calibrate", "--from"]])
 def test_a_run_among_beacons_is_named_as_such(
     command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -36,7 +36,7 @@ def test_the_check_is_of_surveys(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_map_of_a_run_without_points(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "config.toml").write_text(dump_config(load_config()))
-    assert main(["map", str(tmp_path)]) == 2
+    assert main(["plot", str(tmp_path)]) == 2
     err = capsys.readouterr().err
     assert f"{tmp_path}: no mission.sqlite there" in err
     assert "resume" not in err

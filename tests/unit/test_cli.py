@@ -96,11 +96,11 @@ def test_every_help_shows_an_example(path: tuple[str, ...], capsys: pytest.Captu
 
 
 def test_the_commands_are_those_of_the_contract_the_map_and_the_conformance() -> None:
-    assert {" ".join(path) for path in commands(cli) if path} - {"map", "conformance", "dashboard"} == {
+    assert {" ".join(path) for path in commands(cli) if path} - {"plot", "conformance", "dashboard"} == {
         "run", "status", "pause", "resume", "abort", "stop", "emergency",
         "sim", "sim robot", "sim etalon", "config", "config check", "config schema", "study", "replay", "bench",
         "keys", "keys generate", "keys show-public", "clear", "align", "plan", "report", "compare",
-        "log", "log info", "log recover", "stream", "calibrate", "check", "completion",
+        "recording", "recording info", "recording repair", "stream", "calibrate", "check", "completion",
         "radio", "radio slam", "radio compare", "radio calibrate", "radio fix", "radio fuzzy", "radio map",
     }  # fmt: skip
 
@@ -120,7 +120,7 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
         (["run"], "ccatp: name the robot's configuration with --config FILE, or add --sim; see ccatp run --help\n"),
         (
             ["run", "--sim", "--resume"],
-            "ccatp: --resume carries on in a run directory; name it with --run-dir; see ccatp run --help\n",
+            "ccatp: --resume needs a run directory; name it with --run-dir; see ccatp run --help\n",
         ),
         (["sim", "etalon", "--puck", "1", "2", "3", "--truth", "ipc://x"], "--puck and --truth exclude each other"),
         (["sim", "etalon", "--puck", "nan", "0", "0"], "each of X Y Z is a number of metres, at most 1000 from the"),
@@ -130,12 +130,17 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
         (["sim", "etalon", "--truth", "ipc://x", "--runtime-dir", "x"], "leave out --puck and --truth"),
         (["run", "--sim", "--miror", "x"], "Did you mean one of: '--mirror'"),
         (["run", "--sim", "--set", "seed"], "'seed' is not KEY=VALUE, as in run.seed=2"),
-        (["run", "--sim", "--held"], "--held goes with --resume; --recover holds by itself"),
-        (["run", "--sim", "--recover", "--resume"], "--recover finds the run by itself: leave out --resume"),
+        (["run", "--sim", "--start-held"], "--start-held needs --resume; --resume-last always starts held"),
+        (["run", "--sim", "--resume-last", "--resume"], "--resume-last finds the run itself: leave out --resume"),
+        (["run", "--sim", "--held"], "--held is now called --start-held"),
+        (["run", "--sim", "--recover"], "--recover is now called --resume-last"),
+        (["log", "info", "x"], "the command 'log' is now called 'recording'"),
+        (["recording", "recover", "x"], "the command 'recover' is now called 'repair'"),
+        (["map", "x"], "the command 'map' is now called 'plot'"),
         (["run", "--sim", "--seed", "one"], "'one' is not a valid integer"),
         (
             ["run", "--config", "telescope.toml", "--faults", "plan.toml"],
-            "--faults goes with --sim alone: faults are for the simulated robot, never for a real one",
+            "--faults needs --sim: faults are for the simulated robot, never for a real one",
         ),
         (
             ["run", "--sim", "--faults", "none.toml"],
@@ -398,7 +403,7 @@ def test_config_check_lists_every_problem(tmp_path: Path, capsys: pytest.Capture
 
 
 def test_a_map_of_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["map", str(tmp_path)]) == 2
+    assert main(["plot", str(tmp_path)]) == 2
     assert "no config.toml there" in capsys.readouterr().err
 
 

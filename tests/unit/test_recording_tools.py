@@ -162,21 +162,21 @@ def test_a_disk_that_garbles_is_noticed(path: Path, tmp_path: Path, monkeypatch:
 
 
 def test_commands(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["log", "info", str(tmp_path), "--json"]) == 0
+    assert main(["recording", "info", str(tmp_path), "--json"]) == 0
     (told,) = json.loads(capsys.readouterr().out)["recordings"]
     assert told["complete"]
-    assert main(["log", "info", str(path)]) == 0
+    assert main(["recording", "info", str(path)]) == 0
     text = capsys.readouterr().out
     assert "complete, every checksum right" in text
     assert "x.Track" in text
     path.write_bytes(path.read_bytes()[:50_000])
-    assert main(["log", "info", str(path)]) == 1
-    assert "save what is intact with: ccatp log recover" in capsys.readouterr().out
-    assert main(["log", "recover", str(tmp_path)]) == 0
+    assert main(["recording", "info", str(path)]) == 1
+    assert "save what is intact with: ccatp recording repair" in capsys.readouterr().out
+    assert main(["recording", "repair", str(tmp_path)]) == 0
     assert "telemetry.recovered.mcap: " in capsys.readouterr().out
-    assert main(["log", "recover", str(path), "--out", str(tmp_path / "b.mcap"), "--json"]) == 0
+    assert main(["recording", "repair", str(path), "--out", str(tmp_path / "b.mcap"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["was_complete"] is False
-    assert main(["log", "recover", str(path)]) == 2
+    assert main(["recording", "repair", str(path)]) == 2
     assert "exists already" in capsys.readouterr().err
 
 
@@ -271,19 +271,19 @@ def test_a_recording_that_is_being_written_is_not_damaged(tmp_path: Path, capsys
     for n in range(600):
         made.write("track", n / 100, payload(n))
     with locked(run_dir / RUN_LOCK, "taken"):
-        assert main(["log", "info", str(run_dir)]) == 0
+        assert main(["recording", "info", str(run_dir)]) == 0
         told = capsys.readouterr().out
         assert "telemetry.mcap: still being written, so without an index\n" in told
-        assert "log recover" not in told
+        assert "recording repair" not in told
         assert "beacon_map" not in told
         assert "  1 topic without messages\n" in told
         assert damage_text(run_dir / "telemetry.mcap", "x").startswith("telemetry.mcap: still being written")
     # Nobody writes it any more, and it has no end.
-    assert main(["log", "info", str(run_dir)]) == 1
+    assert main(["recording", "info", str(run_dir)]) == 1
     told = capsys.readouterr().out
     assert "telemetry.mcap: cut off or damaged\n" in told
     assert "  no index: it was not closed\n" in told
     assert "RecordLengthLimitExceeded" not in told
-    assert "log recover" in told
+    assert "recording repair" in told
     made.close()
-    assert main(["log", "info", str(run_dir)]) == 0
+    assert main(["recording", "info", str(run_dir)]) == 0

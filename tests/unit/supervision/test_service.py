@@ -335,6 +335,6 @@ def test_the_unit_grants_what_the_loops_ask_for() -> None:
     assert found["RuntimeDirectoryMode"] == ["0700"]
     assert "--runtime-dir /run/ccatp" in found["ExecStart"][0]
     # What is started anew begins held.
-    assert "--recover" in found["ExecStart"][0]
+    assert "--resume-last" in found["ExecStart"][0]
     assert found["Restart"] == ["on-failure"]
     assert found["RestartPreventExitStatus"] == ["1 2 4"]
