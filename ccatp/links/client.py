@@ -1,22 +1,17 @@
-"""A small client of a running daemon: operator and observatory channel, synchronous, typed, with deadlines.
+"""Synchronous clients of a running daemon with deadlines: its own channels, and HTTP by way of its dashboard.
 
-    from ccatp.links.client import Client
+    from ccatp.links.client import HttpClient, OperatorClient
 
-    daemon = Client()
+    daemon = OperatorClient()
     print(daemon.status().state)
     daemon.abort()
     daemon.wait(lambda status: status.exit_status >= 0, timeout_s=600.0)
 
-Every method raises ``UnreachableError`` where no answer comes in time and ``RefusedError`` where the daemon says no;
-both are ``ccatp.errors.CcatpError``, one line each.
+    page = HttpClient("http://127.0.0.1:7080")
+    print(page.status()["trouble"])
 
-The same small client over HTTP, for a daemon on another machine, by way of its dashboard.
-
-from ccatp.links.client import HttpClient
-
-page = HttpClient("http://127.0.0.1:7080")
-print(page.status()["trouble"])
-page.abort()
+Every request raises ``DaemonUnreachableError`` where no answer arrives in time and ``RefusedError`` where the daemon
+refuses; both are ``ccatp.errors.CcatpError``, with a message of one line.
 """
 
 import json
@@ -45,24 +40,20 @@ _T = TypeVar("_T")
 
 
 class StillWaiting(CcatpError):
-    """What was waited for did not come in time."""
+    """The awaited condition did not hold in time."""
 
     exit_status = ExitStatus.REFUSED
 
 
 class Latched(msgspec.Struct, frozen=True):
-    """An emergency that is in force.
-
-    Attributes:
-        id: what ``clear`` wants.
-    """
+    """An emergency that is in force; ``clear`` takes its ``id``."""
 
     id: str
     code: int
 
 
 class Pong(msgspec.Struct, frozen=True):
-    """The danger loop is there.
+    """State of the danger loop.
 
     Attributes:
         code: event code: 0 normal, 1 near an edge, 2 aborted.
@@ -77,9 +68,7 @@ class Pong(msgspec.Struct, frozen=True):
 class ObservatoryClient:
     """The observatory channel of a daemon.
 
-    Args:
-        endpoint: where it serves; ``OperatorClient.observatory`` knows that of a daemon on this machine.
-        curve: the keys, where that is ``tcp://``; see ``connect``.
+    ``OperatorClient.observatory`` makes one for a daemon on this machine, ``connect`` for one on another machine.
     """
 
     endpoint: str
@@ -88,11 +77,10 @@ class ObservatoryClient:
 
     @classmethod
     def connect(cls, endpoint: str, server_key: Path, key: Path, timeout_s: float = TIMEOUT_S) -> "ObservatoryClient":
-        """A daemon on another machine.
+        """A daemon on another machine, at ``tcp://HOST:PORT``.
 
         Args:
-            endpoint: ``tcp://HOST:PORT``.
-            key: file with our own secret key, which the daemon lists.
+            key: file with the client's own secret key, whose public half the daemon lists.
 
         Raises:
             ConfigError: a key file cannot be used.
@@ -101,35 +89,24 @@ class ObservatoryClient:
         return cls(endpoint, CurveClient(read_public(server_key, "server_key"), pair.public, pair.secret), timeout_s)
 
     def emergency(self, kind: EmergencyKind, note: str = "", emergency_id: str | None = None) -> Latched:
-        """Report an emergency: the robot goes to its base. Told again and again until it is answered.
+        """Report an emergency: the robot drives to its base. The request is repeated until it is answered.
 
         Args:
-            emergency_id: a UUID; the same one again is harmless. A new one if not given.
-
-        Raises:
-            UnreachableError, RefusedError: see the module.
+            emergency_id: a UUID, by default a new one; reporting the same one again has no effect.
         """
         payload = {"cmd": "emergency", "kind": kind, "id": emergency_id or str(uuid.uuid4()), "note": note}
         return _as(Latched, self.ask(payload))
 
     def clear(self, emergency_id: str) -> None:
-        """End an emergency whose cause is gone; the robot must be at base or held.
-
-        Raises:
-            UnreachableError, RefusedError: see the module.
-        """
+        """End an emergency whose cause is gone; the robot must be at base or held."""
         self.ask({"cmd": "clear", "id": emergency_id})
 
     def ping(self) -> Pong:
-        """Ask for the event code.
-
-        Raises:
-            UnreachableError, RefusedError: see the module.
-        """
+        """Request the event code."""
         return _as(Pong, self.ask({"cmd": "ping"}))
 
     def ask(self, payload: Mapping[str, object]) -> dict[str, Any]:
-        """One request as it is; the whole answer."""
+        """Send a request as it is; returns the whole answer."""
         return exchange(self.endpoint, payload, self.timeout_s, self.curve, repeats=True)
 
 
@@ -137,8 +114,8 @@ class OperatorClient:
     """The operator channel of a daemon on this machine.
 
     Args:
-        runtime_dir: its runtime directory, if not the usual one.
-        timeout_s: longest wait for an answer; a pause is answered when the robot is at rest.
+        runtime_dir: its runtime directory, if not the default one.
+        timeout_s: of an answer; a pause is answered when the robot is at rest.
     """
 
     def __init__(self, runtime_dir: Path | None = None, timeout_s: float = TIMEOUT_S) -> None:
@@ -151,11 +128,7 @@ class OperatorClient:
         return ObservatoryClient(self._endpoint("emergency"), timeout_s=self.timeout_s)
 
     def status(self) -> MissionStatus:
-        """Where the mission stands.
-
-        Raises:
-            UnreachableError, RefusedError: see the module.
-        """
+        """The status of the mission."""
         return self._order("status")
 
     def pause(self) -> MissionStatus:
@@ -163,11 +136,11 @@ class OperatorClient:
         return self._order("pause")
 
     def resume(self) -> MissionStatus:
-        """Carry on after ``pause``."""
+        """Continue after ``pause``."""
         return self._order("resume")
 
     def abort(self) -> MissionStatus:
-        """Give up the survey; the robot drives to its base."""
+        """End the survey; the robot drives to its base."""
         return self._order("abort")
 
     def stop(self) -> MissionStatus:
@@ -180,8 +153,7 @@ class OperatorClient:
         """Poll the status until a condition holds.
 
         Raises:
-            StillWaiting: it does not hold in time; the daemon goes on.
-            UnreachableError: the daemon is gone.
+            StillWaiting: it does not hold in time; the daemon continues.
         """
         deadline_s = time.monotonic() + timeout_s
         while not is_there(status := self.status()):
@@ -194,18 +166,13 @@ class OperatorClient:
         return status
 
     def ask(self, cmd: str) -> dict[str, Any]:
-        """One command as it is; the whole answer."""
+        """Send a command as it is; returns the whole answer."""
         return exchange(self._endpoint("control"), {"cmd": cmd}, self.timeout_s)
 
     def _order(self, cmd: str) -> MissionStatus:
         return _as(MissionStatus, self.ask(cmd).get("status"))
 
     def _endpoint(self, channel: str) -> str:
-        """Where a channel is served.
-
-        Raises:
-            UnreachableError: no daemon has made it, or it is gone.
-        """
         if not (self.runtime_dir / channel).exists() or is_deserted(self.runtime_dir):
             raise DaemonUnreachableError(
                 f"no daemon in {self.runtime_dir}; start one with ccatp run, or name its folder with --runtime-dir"
@@ -221,21 +188,16 @@ def exchange(
     *,
     repeats: bool = False,
 ) -> dict[str, Any]:
-    """One request and its answer.
-
-    Args:
-        curve: the keys, where the endpoint is ``tcp://``.
-        repeats: ask again and again until there is an answer; only for what may be asked twice.
+    """One request and its answer; ``curve`` and ``repeats`` as of ``ccatp.links.rpc.request``.
 
     Raises:
-        UnreachableError: nobody listens there, or no answer came in time.
-        RequestFailed: the answer to an emergency is not that this one is in force.
-        RefusedError: the daemon said no, and why.
+        RequestFailed: no answer in time, or the answer to an emergency does not confirm that it is in force.
+        RefusedError: the daemon refuses, with its reason.
     """
     reply = request(endpoint, json.dumps(payload).encode(), timeout_s, curve, repeats=repeats)
     if reply.get("ok") is not True:
         raise RefusedError(f"{payload.get('cmd')} refused: {reply.get('error', 'no reason given')}")
-    # Who reports a fire must not take any answer for the one that counts.
+    # Only an answer that names this emergency counts as its confirmation.
     if payload.get("cmd") == "emergency" and reply.get("id") == payload["id"] and reply.get("latched") is False:
         raise RequestFailed(
             "emergency not in force: the one with that id was cleared; report another with an id of its own"
@@ -261,12 +223,10 @@ MAX_BYTES = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class HttpClient:
-    """A dashboard.
+    """A dashboard at ``http://HOST:PORT``; ``token`` is that of ``dashboard.token_file``.
 
-    Attributes:
-        url: of the page, ``http://HOST:PORT``.
-        token: that commands have to carry where the page is open to a network.
-        timeout_s: longest wait for an answer; a pause is answered when the robot is at rest.
+    Raises:
+        ConfigError: the URL is not one of HTTP.
     """
 
     url: str
@@ -274,28 +234,15 @@ class HttpClient:
     timeout_s: float = TIMEOUT_S
 
     def __post_init__(self) -> None:
-        """Refuse what is no page.
-
-        Raises:
-            ConfigError: the URL is not one of HTTP.
-        """
         if not self.url.startswith(("http://", "https://")):
             raise ConfigError(f"{self.url!r} is no page; name it like http://127.0.0.1:7080")
 
     def status(self) -> dict[str, Any]:
-        """What the page shows.
-
-        Raises:
-            UnreachableError: nobody answers in time.
-        """
+        """The state that the page shows."""
         return self._ask("GET", "status")
 
     def is_healthy(self) -> bool:
-        """Whether the daemon is there and well.
-
-        Raises:
-            UnreachableError: not even the dashboard answers.
-        """
+        """Whether the daemon runs without a fault of its processes or its robot link."""
         try:
             self._ask("GET", "healthz")
         except RefusedError:
@@ -303,20 +250,15 @@ class HttpClient:
         return True
 
     def pause(self) -> None:
-        """Hold the robot where it is, until ``resume``; returns when it is at rest.
-
-        Raises:
-            RefusedError: the daemon said no, and why.
-            UnreachableError: nobody answers in time.
-        """
+        """Hold the robot where it is, until ``resume``; returns when it is at rest."""
         self._ask("POST", "pause")
 
     def resume(self) -> None:
-        """Carry on after ``pause``."""
+        """Continue after ``pause``."""
         self._ask("POST", "resume")
 
     def abort(self) -> None:
-        """Give up the survey; the robot drives to its base."""
+        """End the survey; the robot drives to its base."""
         self._ask("POST", "abort")
 
     def stop(self) -> None:

@@ -1,9 +1,7 @@
-"""Request and reply over ZeroMQ: a ROUTER in the event loop, and a client with a deadline.
+"""Request and reply over ZeroMQ: a ROUTER in the event loop, on a unix socket or on TCP with CURVE, and a client.
 
-Request and reply over TCP: a ROUTER with CURVE keys, and the ZAP handler that decides who gets in.
-
-It fails closed. libzmq lets anybody in who knows the server's key while no ZAP handler is bound, unless
-``ZAP_ENFORCE_DOMAIN`` is set; with it, no handler and a handler that does not answer both mean that nobody gets in.
+TCP fails closed. libzmq admits every client that knows the server's key while no ZAP handler is bound, unless
+``ZAP_ENFORCE_DOMAIN`` is set; with it, a missing handler and a handler that does not answer both admit no client.
 """
 
 import asyncio
@@ -16,10 +14,12 @@ from typing import Any, NamedTuple, Self
 
 import zmq
 import zmq.asyncio
+from zmq.auth.base import Authenticator
+from zmq.utils import z85
 from zmq.utils.monitor import parse_monitor_message
 
 from ccatp.errors import CcatpError, DaemonUnreachableError, ExitStatus
-from ccatp.links.auth import Clients, KeyPair, answer_zap
+from ccatp.links.auth import Clients, KeyPair
 from ccatp.links.channels import BadRequest, format_error, parse_reply
 
 Handler = Callable[[bytes], bytes | Awaitable[bytes]]
@@ -29,12 +29,12 @@ MAX_FRAME_BYTES = 1 << 13
 MAX_REPLY_BYTES = 1 << 20
 HIGH_WATER_MARK = 64
 MAX_PENDING = 32
-# Peers at a time; newcomers beyond are turned away, those who are in stay.
+# Connections at a time; one more is closed, the others stay.
 MAX_CONNECTIONS = 32
 BACKLOG = 16
-# Who has not shown by then that they speak the protocol, with their key where one is wanted, loses the connection.
+# A connection whose ZeroMQ handshake, with its key where one is required, takes longer is closed.
 HANDSHAKE_MS = 2000
-# An emergency is told again this often: where every other message is lost, fourteen times leave 1 in 10,000 unheard.
+# An emergency is sent again at this period: where every other message is lost, fourteen leave 1 in 10,000 unreported.
 REPEAT_S = 0.05
 BUSY = "too many requests are waiting for their answer"
 NOT_SINGLE = "a request is one frame"
@@ -54,14 +54,12 @@ class Router:
     """Serves single-frame requests of REQ and DEALER peers.
 
     Use as an async context manager around ``serve``, which runs until it is cancelled. The handler gets the frame and
-    returns the reply, or an awaitable of it for an answer that comes later; meanwhile others are served.
-
-    Args:
-        endpoint: where to bind, ``ipc://`` or ``inproc://``. Plain ``tcp://`` is refused: it has no keys.
-        handler: what answers. An exception that it raises ends ``serve``.
+    returns the reply, or an awaitable of a later reply; meanwhile others are served. An exception of the handler ends
+    ``serve``. The endpoint is ``ipc://`` or ``inproc://``; plain ``tcp://`` is refused because it has no keys.
 
     Attributes:
         refused: requests that never reached the handler.
+        turned_away: connections beyond ``MAX_CONNECTIONS``.
     """
 
     def __init__(self, endpoint: str, handler: Handler, context: zmq.asyncio.Context) -> None:
@@ -79,11 +77,7 @@ class Router:
         return self._bound
 
     async def __aenter__(self) -> Self:
-        """Bind.
-
-        Raises:
-            RouterError: if the endpoint may not or cannot be bound.
-        """
+        """Bind; ``RouterError`` where the endpoint may not or cannot be bound."""
         self._check_endpoint()
         router = self._context.socket(zmq.ROUTER)
         self._configure(router)
@@ -102,7 +96,6 @@ class Router:
             raise RouterError(f"{self._endpoint}: only ipc:// and inproc:// are served without keys")
 
     def _configure(self, router: zmq.asyncio.Socket) -> None:
-        """Limits, before binding."""
         router.setsockopt(zmq.LINGER, 0)
         router.setsockopt(zmq.RCVHWM, HIGH_WATER_MARK)
         router.setsockopt(zmq.SNDHWM, HIGH_WATER_MARK)
@@ -113,7 +106,7 @@ class Router:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close; what was not delivered is dropped."""
+        """Close; undelivered replies are dropped."""
         self._close()
 
     def _close(self) -> None:
@@ -144,19 +137,18 @@ class Router:
                         task = later.create_task(self._answer_later(envelope, answer))
                         self._pending.add(task)
                         task.add_done_callback(self._pending.discard)
-                # Where requests wait already, receiving never gives way: others have their turn here.
+                # Receiving never yields while requests are queued: other tasks run here.
                 await asyncio.sleep(0)
 
     async def _receive(self, router: zmq.asyncio.Socket) -> tuple[list[bytes], str]:
-        """The frames of the next message, and who sent it where that is known."""
+        """The frames of the next message, and the user id of its sender or an empty text."""
         return await router.recv_multipart(), ""
 
     def _ask(self, payload: bytes, user_id: str) -> bytes | Awaitable[bytes]:
-        del user_id  # whoever reaches a socket in the runtime directory is its owner
+        del user_id  # only its owner reaches a socket in the runtime directory
         return self._handler(payload)
 
     async def _limit_connections(self) -> None:
-        """Count the peers, and turn away those that are too many."""
         while (monitor := self._monitor) is not None:
             event = parse_monitor_message(await monitor.recv_multipart())
             if event["event"] == zmq.EVENT_DISCONNECTED:
@@ -175,20 +167,19 @@ class Router:
         await self._send(envelope, format_error(why))
 
     async def _send(self, envelope: list[bytes], reply: bytes) -> None:
-        # A ROUTER never waits for a peer: what a peer that is gone or too slow does not take is dropped.
+        # A ROUTER never blocks: a reply to a peer that is gone or too slow is dropped.
         if self._socket is not None:
             await self._socket.send_multipart([*envelope, reply])
 
 
 def turn_away(descriptor: int, endpoint: str) -> bool:
-    """End a connection that libzmq has accepted; libzmq takes it as one that the peer has ended.
+    """End a connection that libzmq has accepted at an endpoint, as if the peer had closed it; whether it was done.
 
     Args:
-        descriptor: its number, as the monitor told it. It may stand for something else by now, or for nothing.
-        endpoint: where it was accepted; what was not is left alone.
+        descriptor: from the socket monitor. It may be closed or reused by now; another endpoint's is left alone.
     """
-    with contextlib.suppress(OSError):  # it is gone, or no socket
-        own = os.dup(descriptor)  # this one stays the same thing until it is closed
+    with contextlib.suppress(OSError):  # closed, or not a socket
+        own = os.dup(descriptor)  # cannot be reused before it is closed
         try:
             connection = socket.socket(fileno=own)
         except OSError:
@@ -204,12 +195,9 @@ def turn_away(descriptor: int, endpoint: str) -> bool:
 
 
 def split_envelope(frames: list[bytes]) -> tuple[list[bytes], bytes | None]:
-    """Part a message of a ROUTER into the envelope that its reply needs and the request.
+    """Split a message of a ROUTER into the envelope of its reply and the request, ``None`` if not a single frame.
 
-    A REQ peer's request comes as identity, empty frame, request; a DEALER's as identity, request (or like a REQ's).
-
-    Returns:
-        The envelope, and the request or ``None`` where it is not a single frame.
+    A REQ peer's request arrives as identity, empty frame, request; a DEALER's as identity, request (or like a REQ's).
     """
     identity, *rest = frames
     envelope = [identity]
@@ -229,18 +217,14 @@ class CurveClient(NamedTuple):
 def request(
     endpoint: str, payload: bytes, timeout_s: float, curve: CurveClient | None = None, *, repeats: bool = False
 ) -> dict[str, Any]:
-    """Ask, and wait for the answer.
+    """Send a request to a ``Router`` and wait for its reply.
 
     Args:
-        endpoint: where a ``Router`` serves.
-        curve: the keys, where the endpoint is ``tcp://``.
-        repeats: ask again and again until there is an answer; only for what may be asked twice.
-
-    Returns:
-        The reply.
+        curve: the keys for a ``tcp://`` endpoint.
+        repeats: send it every ``REPEAT_S`` until a reply arrives; only for idempotent requests.
 
     Raises:
-        RequestFailed: no answer in time, an endpoint that cannot be, or an answer that is no reply.
+        RequestFailed: no reply in time, an invalid endpoint, or a malformed reply.
     """
     with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
         peer.setsockopt(zmq.LINGER, 0)
@@ -255,7 +239,7 @@ def request(
             raise RequestFailed(f"{endpoint}: {error.strerror}") from error
         period_s = min(REPEAT_S, timeout_s) if repeats else timeout_s
         for _ in range(max(1, round(timeout_s / period_s))):
-            # What a full queue does not take has been sent often enough already.
+            # A full queue holds enough copies already.
             with contextlib.suppress(zmq.Again):
                 peer.send_multipart([b"", payload], zmq.DONTWAIT)
             if peer.poll(max(1, round(period_s * 1000.0))):
@@ -272,61 +256,63 @@ def request(
         raise RequestFailed(f"{endpoint}: {error}") from error
 
 
-ZAP_ENDPOINT = "inproc://zeromq.zap.01"
 DOMAIN = "ccatp.observatory"
-# A peer that is gone without a word gives its place back.
+# A peer that is gone without closing its connection gives its place back.
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 5000, 15000
 
 NamedHandler = Callable[[bytes, str], bytes | Awaitable[bytes]]
 
 
-class ZapHandler:
-    """Decides which CURVE keys get in.
+class ZapHandler(Authenticator):
+    """Decides which CURVE keys are admitted (ZAP, ZeroMQ RFC 27); a context can have one handler.
 
     Use as an async context manager around ``serve``, and enter it before the ``CurveRouter`` of the same context.
-
-    Args:
-        context: ZeroMQ context of the process; there can be one handler in it.
-        on_refused: told why somebody was not let in.
+    pyzmq's ``AsyncioAuthenticator`` is not used: its own task would hide an exception, and refuse everybody afterwards.
     """
 
     def __init__(
         self, context: zmq.asyncio.Context, clients: Callable[[], Clients], on_refused: Callable[[str], None]
     ) -> None:
-        self._context, self._clients, self._on_refused = context, clients, on_refused
-        self._socket: zmq.asyncio.Socket | None = None
+        super().__init__(context)
+        self._clients, self._on_refused, self._address = clients, on_refused, ""
+        self.configure_curve_callback(DOMAIN, credentials_provider=self)
 
     async def __aenter__(self) -> Self:
         """Bind."""
-        socket = self._context.socket(zmq.REP)
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.bind(ZAP_ENDPOINT)
-        self._socket = socket
+        self.start()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close: from here on nobody gets in."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
+    async def __aexit__(self, *_: object) -> None:
+        """Close: from here on no client is admitted."""
+        self.stop()
 
     async def serve(self) -> None:
-        """Answer libzmq until cancelled."""
-        while self._socket is not None:
-            reply, refusal = answer_zap(await self._socket.recv_multipart(), DOMAIN, self._clients())
-            if refusal:
-                self._on_refused(refusal)
-            await self._socket.send_multipart(reply)
+        """Answer libzmq until cancelled; an exception of the list of clients ends it."""
+        poller = zmq.asyncio.Poller()
+        poller.register(self.zap_socket, zmq.POLLIN)
+        while True:
+            await poller.poll()
+            frames = self.zap_socket.recv_multipart()
+            self._address = frames[3].decode("ascii", "replace")
+            await self.handle_zap_message(frames)
+
+    def callback(self, _domain: str, key: bytes) -> bool:
+        """Whether a client with this public key (Z85) is admitted."""
+        raw = z85.decode(key)
+        if raw in self._clients():
+            return True
+        self._on_refused(f"{self._address}: key {raw.hex()} is not on the list")
+        return False
+
+    def curve_user_id(self, client_public_key: bytes) -> str:
+        """The key in hexadecimal."""
+        return client_public_key.hex()
 
 
 class CurveRouter(Router):
-    """As ``Router``, on ``tcp://`` for CURVE clients that a ``ZapHandler`` admits.
+    """A ``Router`` on ``tcp://ADDRESS:PORT`` for CURVE clients that a ``ZapHandler`` admits.
 
-    Args:
-        endpoint: ``tcp://ADDRESS:PORT``.
-        handler: what answers; called with the request and the client's key in hexadecimal.
+    The handler is called with the request and the client's public key in hexadecimal.
     """
 
     def __init__(self, endpoint: str, handler: NamedHandler, context: zmq.asyncio.Context, keys: KeyPair) -> None:

@@ -26,7 +26,6 @@ from ccatp.links.channels import format_ok, format_request, parse_reply
 from ccatp.links.liveness import LogRateLimit
 from ccatp.links.rpc import (
     MAX_CONNECTIONS,
-    ZAP_ENDPOINT,
     CurveClient,
     CurveRouter,
     Router,
@@ -298,7 +297,7 @@ async def test_without_its_handler_nobody_gets_in(site: Site) -> None:
                     await asyncio.wait([handling])
                 assert await is_locked_out(site.endpoint, keys)  # gone
                 with context.socket(zmq.REP) as dumb:
-                    dumb.bind(ZAP_ENDPOINT)
+                    dumb.bind("inproc://zeromq.zap.01")
                     assert await is_locked_out(site.endpoint, keys)  # there, and silent
                 serving.cancel()
         assert len(asked) == 1
@@ -310,7 +309,7 @@ async def test_a_handler_that_fails_takes_the_channel_with_it(site: Site, monkey
     def surprise(*_: object) -> None:
         raise LookupError("surprise")
 
-    monkeypatch.setattr("ccatp.links.rpc.answer_zap", surprise)
+    monkeypatch.setattr(ZapHandler, "callback", surprise)
     with pytest.raises(ExceptionGroup) as caught:
         async with served(site):
             await is_locked_out(site.endpoint, with_curve(site.client("observatory")))

@@ -1,6 +1,4 @@
-"""Keys, the list of clients, and whom ZAP admits."""
-
-import re
+"""Keys and the list of clients."""
 
 import pytest
 import zmq
@@ -8,12 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from zmq.utils import z85
 
-from ccatp.links.auth import Admission, AuthorizedClient, BadAccess, Role, answer_zap, decode_key, parse_clients
+from ccatp.links.auth import AuthorizedClient, BadAccess, Role, decode_key, parse_clients
 
 KEY = b"k" * 32
 TEXT = z85.encode(KEY).decode()
-LISTED = {KEY: AuthorizedClient("observatory", Role.RAISE)}
-REQUEST = [b"1.0", b"7", b"ccatp", b"10.0.0.1", b"", b"CURVE", KEY]
 
 
 @given(st.binary(min_size=32, max_size=32))
@@ -61,33 +57,3 @@ def test_a_list_of_clients() -> None:
 def test_lists_that_count_for_nothing(text: str, message: str) -> None:
     with pytest.raises(BadAccess, match=message):
         parse_clients(text)
-
-
-def test_the_listed_are_admitted_under_their_key() -> None:
-    reply = [b"1.0", b"7", b"200", b"OK", KEY.hex().encode(), b""]
-    assert answer_zap(REQUEST, "ccatp", LISTED) == Admission(reply, "")
-
-
-@pytest.mark.parametrize(
-    ("frames", "status", "why"),
-    [
-        ([*REQUEST[:6], b"x" * 32], b"400", "10.0.0.1: key 7878.* is not on the list"),
-        ([*REQUEST[:2], b"other", *REQUEST[3:]], b"400", "another domain"),
-        ([*REQUEST[:5], b"NULL", KEY], b"400", "no CURVE key"),
-        ([*REQUEST[:5], b"PLAIN", KEY], b"400", "no CURVE key"),
-        ([*REQUEST[:6], KEY[:-1]], b"400", "no CURVE key"),
-        ([*REQUEST[:6]], b"500", "not a request of ZAP"),
-        ([*REQUEST, b"more"], b"500", "not a request of ZAP"),
-        ([b"2.0", *REQUEST[1:]], b"500", "not a request of ZAP"),
-        ([], b"500", "not a request of ZAP"),
-    ],
-)
-def test_nobody_else_is(frames: list[bytes], status: bytes, why: str) -> None:
-    reply, refusal = answer_zap(frames, "ccatp", LISTED)
-    assert reply[2] == status
-    assert reply[4] == b""
-    assert re.search(why, refusal)
-
-
-def test_an_empty_list_admits_nobody() -> None:
-    assert answer_zap(REQUEST, "ccatp", {}).reply[2] == b"400"
