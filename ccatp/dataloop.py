@@ -117,7 +117,7 @@ class RobotLinkServer:
         if self._listener is not None:
             if self._log is not None:
                 counts = {"fan_changes": self.server.fan_changes, "oldest_ack_frames": self.server.oldest_ack_frames}
-                self._log.info("robot", **counts, **self.server.counts)
+                self._log.info("robot_statistics", **counts, **self.server.counts)
             await self._listener.wait_closed()
             self._listener = None
 
@@ -156,7 +156,7 @@ class RobotLinkServer:
 
     def _note(self, text: str) -> None:
         if self._log is not None:
-            self._log.info(text)
+            self._log.info("robot_session", text=text)
 
 
 class _Connection(asyncio.Protocol):
@@ -263,7 +263,7 @@ class DataLoop(RobotLinkServer):
 
     def _log_fault(self, what: str, injected: Injected) -> None:
         if self._log is not None:
-            self._log.info(f"fault {what}: {injected.signal} {injected.type}", **injected._asdict())
+            self._log.info(f"fault_{what}", **injected._asdict())
 
 
 async def serve(

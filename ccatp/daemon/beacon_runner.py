@@ -296,7 +296,7 @@ class BeaconRunner:
         if mission.state is before and mission.is_faulted is was_faulted:
             return
         self._state, self._was_faulted = mission.state, mission.is_faulted
-        self._teller.log.debug("state", seq=self._host.clock.seq, before=before, after=mission.state)
+        self._teller.log.debug("state_changed", seq=self._host.clock.seq, before=before, after=mission.state)
         if HELD in (mission.state, before) or mission.state is RETURNING:
             text = f"{mission.state}: {mission.cause}" if mission.cause else f"{mission.state}"
             self._teller.say("warning", text)
@@ -312,7 +312,9 @@ class BeaconRunner:
     def note_end(self) -> None:
         """How consistent it was."""
         score = self._mission.navigator.score
-        self._teller.log.info("readings", nis_sum=score.nis_sum, nis_size=score.nis_size, refused=score.refused)
+        self._teller.log.info(
+            "reading_statistics", nis_sum=score.nis_sum, nis_size=score.nis_size, refused=score.refused
+        )
 
     # -- the frame ------------------------------------------------------------------------------------------------
 
@@ -322,7 +324,7 @@ class BeaconRunner:
             extras = decode_beacon_frame(frame.raw)
         except BadLine as error:
             extras = NOTHING
-            self._teller.log.warning("bad extra keys", seq=frame.sensors.seq, error=str(error))
+            self._teller.log.warning("bad_extra_keys", seq=frame.sensors.seq, error=str(error))
         self._senses = self._reader.read(frame.sensors, extras)
 
     def decide(self, frame: TimedFrame, verdict: Verdict | None, _lag_s: float) -> DriveCommand:

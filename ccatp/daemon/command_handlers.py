@@ -131,14 +131,16 @@ class EmergencyCommandHandler:
             left_out = self._accepted.take(time.monotonic())
             if left_out is not None:
                 text = frame.decode("utf-8", "replace")
-                self._log.warning("observatory", client=client.name, request=text, code=told["code"], left_out=left_out)
+                self._log.warning(
+                    "observatory_request", client=client.name, request=text, code=told["code"], left_out=left_out
+                )
         return reply
 
     def refuse(self, client: str, why: str) -> None:
         """Note that somebody was refused."""
         left_out = self._refused.take(time.monotonic())
         if left_out is not None:
-            self._log.warning("observatory: refused", client=client, why=why, left_out=left_out)
+            self._log.warning("observatory_refused", client=client, why=why, left_out=left_out)
 
     def note(self, text: str, **fields: object) -> None:
         """A line for the log."""
@@ -171,7 +173,7 @@ class ObservatoryServer:
                 remote = CurveRouter(self._cfg.endpoint, self._answer_remote, context, self._keys)
                 work.append((await stack.enter_async_context(zap)).serve())
                 work.append((await stack.enter_async_context(remote)).serve())
-                self._desk.note("observatory channel", endpoint=remote.bound, clients=len(self._clients.clients))
+                self._desk.note("observatory_channel", endpoint=remote.bound, clients=len(self._clients.clients))
             async with asyncio.TaskGroup() as tasks:
                 for coroutine in work:
                     tasks.create_task(coroutine)

@@ -153,12 +153,12 @@ class PersistentEmergencyLatch(EmergencyLatch):
         except (OSError, ValueError, KeyError, TypeError) as error:
             # What it held is not known: the survey is aborted rather than driven on.
             unknown = str(uuid.uuid4())
-            what = f"{path} cannot be read: taken for an emergency; 'ccatp clear {unknown}' ends it"
-            log.error(what, error=str(error))
+            advice = f"taken for an emergency; 'ccatp clear {unknown}' ends it"
+            log.error("emergencies_unreadable", path=str(path), error=str(error), advice=advice)
             super().raise_emergency(EmergencyKind.OPERATOR, unknown, f"{path.name} cannot be read")
             self._save()
         if self._active:
-            log.warning("emergencies of before", active=sorted(self._active))
+            log.warning("emergencies_restored", active=sorted(self._active))
 
     def raise_emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
         """As ``EmergencyLatch``, and on the disk."""
@@ -194,7 +194,7 @@ class PersistentEmergencyLatch(EmergencyLatch):
             finally:
                 os.close(folder)
         except OSError as error:
-            self._log.error("emergencies cannot be kept: lost if this process dies", error=str(error))
+            self._log.error("emergencies_not_saved", error=str(error))
         with suppress(OSError):
             self._reserve()
 
@@ -266,7 +266,7 @@ class DangerLoop:
                 for task in served:
                     task.cancel()
                 self.lasting.close()
-        self.log.info("stopped", **self.monitor.counts)
+        self.log.info("danger_statistics", **self.monitor.counts)
 
     async def _wait_for_main(self, stop: asyncio.Event) -> None:
         """Join the robot only when messages get through, both ways: the first ones must not be lost."""
@@ -284,7 +284,7 @@ class DangerLoop:
             self._seq = -1
         self._lag.forget()
         self._pulse.phase, self._pulse.frame_s = "joined", time.monotonic()
-        self.log.info("joined", port=self._duty.link.port, lockstep=hello.lockstep, session=self.lasting.sessions)
+        self.log.info("robot_joined", port=self._duty.link.port, lockstep=hello.lockstep, session=self.lasting.sessions)
 
     def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
         """Judge one frame. In lockstep with a certain estimate of main's, so that the run is repeatable."""
@@ -295,7 +295,7 @@ class DangerLoop:
             verdict = self._duty.judge(sensors, raw, estimate)
         except Exception as error:
             # Without a verdict the robot's permit runs out: it holds by itself.
-            self.log.exception("surprise in a frame", seq=self._seq)
+            self.log.exception("unhandled_exception", seq=self._seq)
             print(f"ccatp danger: internal error: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
             self.lost.set()
             return
@@ -332,7 +332,7 @@ class DangerLoop:
             "severity": int(verdict.severity),
         }
         self._publisher.send("danger_event", DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, **fields))
-        self.log.info("verdict", seq=verdict.seq, t_s=verdict.t_s, **fields)
+        self.log.info("verdict_changed", seq=verdict.seq, t_s=verdict.t_s, **fields)
 
     async def _beat(self) -> None:
         while True:
@@ -355,12 +355,12 @@ class DangerLoop:
     def _declare_stale(self, age_s: float) -> None:
         if not self._is_stale:
             self._is_stale = True
-            self.log.warning("sensors stale", age_s=age_s)
+            self.log.warning("sensors_stale", age_s=age_s)
         self._give(self.monitor.stale(self._seq, self._t_s), self._seq)
 
     def _on_lost(self, reason: str) -> None:
         self._pulse.phase = "rejoining"
-        self.log.warning("robot link lost", reason=reason)
+        self.log.warning("robot_link_lost", reason=reason)
         self._give(self.monitor.stale(self._seq, self._t_s), -1)
 
     def close(self) -> None:

@@ -171,7 +171,13 @@ class _Handler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         left_out = self._budget.take(record.created)
         if left_out is not None:
-            self._log.log(record.levelno, record.getMessage().strip(), exc_info=record.exc_info, left_out=left_out)
+            self._log.log(
+                record.levelno,
+                "library_message",
+                text=record.getMessage().strip(),
+                exc_info=record.exc_info,
+                left_out=left_out,
+            )
 
 
 def _log_warnings(log: Logger) -> None:

@@ -78,7 +78,7 @@ class FrameService:
         try:
             self._serve(sensors, raw)
         except Exception as error:
-            self._teller.log.exception("surprise in a frame", seq=self._clock.seq)
+            self._teller.log.exception("unhandled_exception", seq=self._clock.seq)
             self._teller.say("error", f"internal error, wheels held: {type(error).__name__}: {error}; see log.jsonl")
             self._on_surprise(UnhandledError(f"internal error: {type(error).__name__}: {error}"))
 
@@ -126,7 +126,9 @@ class FrameService:
             verdict = None
             # Paused until frames are prompt again.
             if work.interrupt(f"a frame was served {1e3 * lag_s:.0f} ms late"):
-                self._teller.log.warning("late frame", seq=self._clock.seq, lag_s=lag_s, limit_s=limit_s)
+                self._teller.log.warning(
+                    "frame_late", seq=self._clock.seq, lateness_ms=1e3 * lag_s, limit_ms=1e3 * limit_s
+                )
         drive = work.decide(frame, verdict, lag_s)
         now_s = time.monotonic()
         is_slow, is_still = now_s - begun_s > self._seat.frame_period_s, drive == STILL

@@ -170,7 +170,7 @@ class MainLoop:
             async with asyncio.timeout(FAREWELL_S):
                 await stop.wait()
         except TimeoutError:
-            self._teller.log.warning("nobody acknowledged the end")
+            self._teller.log.warning("shutdown_not_acknowledged")
 
     def _hold_wheels(self) -> None:
         self._seat.drive(self._clock.seq, 0.0, 0.0)
@@ -235,8 +235,8 @@ class MainLoop:
             elapsed_s=round(self._clock.elapsed_s, 6),
             code=0 if self._ear.verdict is None else int(self._ear.verdict.code),
             exit_status=int(self.exit_status) if self.over.is_set() else -1,
-            slips=lag.slips,
-            lag_ms=round(1e3 * lag.worst_s, 3),
+            missed_deadlines=lag.missed_deadlines,
+            worst_lateness_ms=round(1e3 * lag.worst_s, 3),
             state=at.state,
             cause=at.cause,
             done=at.done,

@@ -159,7 +159,7 @@ def feed_fields(status: MissionStatus) -> dict[str, Any]:
         "eta_s": status.eta_s,
         "arrival_error_mm": status.error_mm,
         "danger_code": status.code,
-        "late_frames": status.slips,
+        "late_frames": status.missed_deadlines,
         "exit_status": status.exit_status,
     }
 

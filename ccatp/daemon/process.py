@@ -72,6 +72,9 @@ class LogStream(io.TextIOBase):
 
 
 PR_SET_PDEATHSIG = 1
+LEVELS = {"info": 20, "warning": 30, "error": 40}
+# The event of a line that the operator gets, too; the field ``text`` holds it.
+OPERATOR_MESSAGE = "operator_message"
 # The copy of the fault plan in the run directory.
 FAULTS_FILE = "faults.toml"
 # In the runtime directory: the run directory of the run that goes on there, or of the last one.
@@ -207,13 +210,13 @@ def open_log(path: Path, process: str) -> structlog.typing.FilteringBoundLogger:
     structlog.configure(
         processors=[
             structlog.processors.add_log_level,
-            structlog.processors.TimeStamper(fmt="iso", utc=True, key="wall"),
+            structlog.processors.TimeStamper(fmt="iso", utc=True, key="timestamp"),
             structlog.processors.dict_tracebacks,
             structlog.processors.JSONRenderer(),
         ],
         logger_factory=structlog.WriteLoggerFactory(file=stream),
     )
-    logger: structlog.typing.FilteringBoundLogger = structlog.get_logger().bind(process=process)
+    logger: structlog.typing.FilteringBoundLogger = structlog.get_logger().bind(logger=process)
     return logger
 
 

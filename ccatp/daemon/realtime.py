@@ -45,9 +45,9 @@ def enter(priority: int, log: structlog.typing.FilteringBoundLogger) -> None:
     reserve_heap(RESERVE_BYTES)
     missing = [reason for reason in (_schedule(priority), _lock_memory()) if reason]
     if missing:
-        log.warning("no real time", missing=missing, without=WITHOUT)
+        log.warning("realtime_scheduling_denied", missing=missing, without=WITHOUT)
     else:
-        log.info("real time", policy="SCHED_FIFO", priority=priority)
+        log.info("realtime_scheduling", policy="SCHED_FIFO", priority=priority)
 
 
 def reserve_heap(size: int) -> None:

@@ -243,18 +243,18 @@ class LatenessStatistics:
     drift of the clocks; whatever it is above that, the frame is late. What always takes the same time does not show.
 
     Args:
-        slip_s: a frame served later than this is a slip of the cycle.
+        late_after_s: a frame served later than this misses its deadline.
 
     Attributes:
-        slips: frames served later than ``slip_s``.
+        missed_deadlines: frames served later than ``late_after_s``.
     """
 
-    __slots__ = ("_least_s", "_slip_s", "_t_s", "_wall_s", "slips", "worst_s")
+    __slots__ = ("_late_after_s", "_least_s", "_t_s", "_wall_s", "missed_deadlines", "worst_s")
 
-    def __init__(self, slip_s: float) -> None:
-        self._slip_s = slip_s
+    def __init__(self, late_after_s: float) -> None:
+        self._late_after_s = late_after_s
         self._t_s, self._wall_s, self._least_s = _NEVER_S, 0.0, 0.0
-        self.slips = 0
+        self.missed_deadlines = 0
         self.worst_s = 0.0
 
     def forget(self) -> None:
@@ -275,7 +275,7 @@ class LatenessStatistics:
             self._least_s = min(offset_s, self._least_s + MAX_DRIFT * (wall_s - self._wall_s))
         self._t_s, self._wall_s = t_s, wall_s
         lag_s = offset_s - self._least_s
-        if lag_s > self._slip_s:
-            self.slips += 1
+        if lag_s > self._late_after_s:
+            self.missed_deadlines += 1
         self.worst_s = max(self.worst_s, lag_s)
         return lag_s

@@ -66,7 +66,7 @@ class Streamer:
     ) -> None:
         self._context, self._streams, self._say = context, streams, say
         self._runtime_dir, self._endpoints = runtime_dir, Endpoints(runtime_dir)
-        self._ear = Subscriber(context, [self._endpoints.of("main")], ["presence.main"])
+        self._ear = Subscriber(context, [self._endpoints.of("main")], ["heartbeat.main"])
         self._run: Subscriber | None = None
         self._views: Views | None = None
         self._pid = -1

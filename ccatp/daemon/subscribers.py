@@ -55,7 +55,7 @@ class VerdictSubscriber:
         timeout_s: float,
         on_wait: Callable[[], None] = lambda: None,
     ) -> None:
-        self._subscriber = Subscriber(context, [endpoint], ["verdict", "presence.danger"], is_watching=True)
+        self._subscriber = Subscriber(context, [endpoint], ["verdict", "heartbeat.danger"], is_watching=True)
         self._timeout_s, self._on_wait = timeout_s, on_wait
         self._wall_s = 0.0
         self.verdict: Verdict | None = None
@@ -125,7 +125,7 @@ class EstimateSubscriber:
         *,
         is_taking_over: bool = False,
     ) -> None:
-        self._subscriber = Subscriber(context, [endpoint], ["estimate", "presence.main"], is_watching=True)
+        self._subscriber = Subscriber(context, [endpoint], ["estimate", "heartbeat.main"], is_watching=True)
         self._on_wait, self._is_taking_over = on_wait, is_taking_over
         self.forget()
 
@@ -194,7 +194,7 @@ class HeartbeatPublisher:
     """
 
     def __init__(self, publisher: Publisher, process: str) -> None:
-        self._publisher, self._topic, self._process = publisher, f"presence.{process}", process
+        self._publisher, self._topic, self._process = publisher, f"heartbeat.{process}", process
         self.phase = "starting"
         self.frame_s: float | None = None
         self._count, self._told_s = 0, 0.0

@@ -36,7 +36,7 @@ from ccatp.daemon.child_processes import (
 from ccatp.daemon.collector import Collector, RunAccess
 from ccatp.daemon.command_handlers import check_observatory
 from ccatp.daemon.dashboard import PageSocket, open_page_socket
-from ccatp.daemon.process import FAULTS_FILE, RUN_DIR_FILE, Endpoints, open_log
+from ccatp.daemon.process import FAULTS_FILE, LEVELS, OPERATOR_MESSAGE, RUN_DIR_FILE, Endpoints, open_log
 from ccatp.daemon.run_dir import (
     RunOptions,
     default_run_dir,
@@ -161,7 +161,7 @@ class SupervisedRun:
 
     def go(self) -> int:
         """Start, watch, collect, stop; returns the exit status."""
-        self._log.info("run", **self._kind.facts)
+        self._log.info("run_started", **self._kind.facts)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         # A flag and no exception: a signal must not be lost in somebody's handler of exceptions, nor end the ending.
         previous = {n: signal.signal(n, self._interrupt) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
@@ -185,7 +185,7 @@ class SupervisedRun:
         for remark in collector.remarks:
             self._say("warning", remark)
         self._write(summary)
-        self._log.info("end", status=int(status))
+        self._log.info("run_finished", status=int(status))
         if self._options.shows_summary:
             view.show_summary(summary, as_json=self._options.json_output)
             view.show_report(write_run_report(self._run_dir, status, self._log))
@@ -234,7 +234,7 @@ class SupervisedRun:
         self._service.heard(presence)
 
     def _say(self, level: str, text: str) -> None:
-        self._log.log({"info": 20, "warning": 30, "error": 40}[level], text)
+        self._log.log(LEVELS[level], OPERATOR_MESSAGE, text=text)
         if self._view is not None:
             self._view.say(level, text)
 
@@ -256,7 +256,7 @@ class SupervisedRun:
         return [*arguments, "--listen-fd", str(fd)], (fd,)
 
     def _died(self, name: str, code: int, decision: RestartDecision) -> ExitStatus:
-        self._log.error("process died", name=name, code=code)
+        self._log.error("process_died", name=name, code=code)
         if decision.fate is ProcessEnd.END:
             return ExitStatus(code)  # it has said why
         self._say("error", f"{decision.text}; see {self._run_dir / 'log.jsonl'}")

@@ -5,7 +5,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from ccatp.config.load import dump_config
@@ -20,7 +19,7 @@ from ccatp.links.topics import (
     Timing,
     TrackMessage,
     TruthMessage,
-    unpack,
+    decode_recorded,
 )
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_poses
 from ccatp.mirror.misalignment import PanelFit, fit_panel
@@ -36,25 +35,6 @@ from ccatp.survey.planning.route import ORDERS
 MIN_FIXES = 3
 # What a summary is made of; a recording holds twenty times as much.
 SUMMARISED = {"mission", "track", "truth", "arrival", "danger_event"}
-
-
-NO_STATUS = MissionStatus(
-    seq=-1,
-    t_s=0.0,
-    state="",
-    cause="",
-    done=0,
-    skipped=0,
-    total=0,
-    point="",
-    elapsed_s=0.0,
-    eta_s=0.0,
-    error_mm=0.0,
-    code=0,
-    outcome="",
-    lower_bound_s=0.0,
-    exit_status=-1,
-)
 
 
 class RunCollector(Collector):
@@ -158,7 +138,7 @@ class RunCollector(Collector):
             # Main ended before it said where it stood: the mission's database says as much.
             standings = [] if survey is None else [point.status for point in survey.points]
             done, skipped = standings.count("measured"), standings.count("skipped")
-            status = msgspec.structs.replace(NO_STATUS, total=len(standings), done=done, skipped=skipped)
+            status = MissionStatus(seq=-1, t_s=0.0, state="", total=len(standings), done=done, skipped=skipped)
             builder = self._begin(status)
             self._add(builder, status)
         fits = {} if survey is None else self._fits(survey)
@@ -178,7 +158,7 @@ class RunCollector(Collector):
         for recorded in iter_messages(path):
             if recorded.topic not in SUMMARISED:
                 continue
-            _, _, message = unpack(recorded.topic.encode() + b" " + recorded.payload)
+            message = decode_recorded(recorded.topic, recorded.payload)
             if not isinstance(message, Message):
                 continue
             if builder is None and isinstance(message, MissionStatus):

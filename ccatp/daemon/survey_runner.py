@@ -56,7 +56,7 @@ class SurveyWatch:
         mission, teller = self._mission, self._teller
         if not mission.is_faulted:
             self._vigil.over()
-        teller.log.debug("state", seq=seq, before=before, after=mission.state, cause=mission.cause)
+        teller.log.debug("state_changed", seq=seq, before=before, after=mission.state, cause=mission.cause)
         if mission.state in (MissionState.HELD, MissionState.BACKING_OFF) or before is MissionState.HELD:
             teller.say("warning", state_text(mission.state, mission.cause))
         if mission.state is MissionState.RETURNING and before is not MissionState.BACKING_OFF:
@@ -116,7 +116,7 @@ class SurveyRunner:
         self._watch = SurveyWatch(cfg, parts, teller)
         self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
         self._recovery = parts.recovery
-        self._is_deaf = False
+        self._is_odometry_off = False
         self._state = MissionState.IDLE
         self._motion_now: StateEstimate | None = None
         self._has_told_calibration = False
@@ -189,7 +189,7 @@ class SurveyRunner:
             raise DaemonUnreachableError(str(error)) from error
 
     def _on_retry(self, error: EtalonError, tries_left: int) -> None:
-        self._teller.log.warning("laser system asked again", error=str(error), tries_left=tries_left)
+        self._teller.log.warning("etalon_retry", error=str(error), tries_left=tries_left)
 
     async def run(self) -> None:
         """Take measurements, for ever."""
@@ -225,7 +225,7 @@ class SurveyRunner:
 
     def note_end(self) -> None:
         """What the gates refused."""
-        self._teller.log.info("gate", denied=self._gate_watch.counts, fans_refused=self._fans.refused)
+        self._teller.log.info("gate_statistics", denied=self._gate_watch.counts, fans_refused=self._fans.refused)
 
     # -- the frame ------------------------------------------------------------------------------------------------
 
@@ -233,11 +233,11 @@ class SurveyRunner:
         """The frame's samples go to the localizer, or as much of them as is to be believed."""
         sensors, mission, localizer = frame.sensors, self._mission, self._localizer
         self._tell_beginning(sensors)
-        is_deaf = mission.ignores_motion
-        if is_deaf is not self._is_deaf:
-            self._is_deaf = is_deaf
-            self._teller.treatment(sensors.seq, sensors.t, "deaf" if is_deaf else "hearing")
-        imu, enc = ((), as_standing(sensors.enc)) if is_deaf else (sensors.imu, sensors.enc)
+        is_odometry_off = mission.ignores_motion
+        if is_odometry_off is not self._is_odometry_off:
+            self._is_odometry_off = is_odometry_off
+            self._teller.treatment(sensors.seq, sensors.t, "odometry_off" if is_odometry_off else "odometry_on")
+        imu, enc = ((), as_standing(sensors.enc)) if is_odometry_off else (sensors.imu, sensors.enc)
         localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
         if localizer.hold_requested:
             # A filter that diverged is frozen until it has a fix.

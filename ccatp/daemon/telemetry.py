@@ -13,6 +13,7 @@ import msgspec
 import structlog
 
 from ccatp.core import Fix, PointId
+from ccatp.daemon.process import LEVELS, OPERATOR_MESSAGE
 from ccatp.links.bus import Publisher
 from ccatp.links.topics import (
     ArrivalMessage,
@@ -97,7 +98,7 @@ class TelemetryPublisher:
 
     def say(self, level: str, text: str) -> None:
         """One line for the log file and for the operator's terminal."""
-        self.log.log({"info": 20, "warning": 30, "error": 40}[level], text, seq=self.seq, t_s=self.t_s)
+        self.log.log(LEVELS[level], OPERATOR_MESSAGE, text=text, seq=self.seq, t_s=self.t_s)
         self._publisher.send("log", LogMessage(seq=self.seq, t_s=self.t_s, level=level, process="main", text=text))
 
 
@@ -134,10 +135,12 @@ class DisplayStatePublisher(Generic[Who]):
         Args:
             seq, t_s: the newest frame.
         """
-        if self._who is None or not self._publisher.has_subscriber("picture"):
+        if self._who is None or not self._publisher.has_subscriber("display_state"):
             return
         look = self._look(self._who)
-        self._publisher.send("picture", DisplayState(seq=seq, t_s=t_s, line=msgspec.Raw(self._line), **look._asdict()))
+        self._publisher.send(
+            "display_state", DisplayState(seq=seq, t_s=t_s, line=msgspec.Raw(self._line), **look._asdict())
+        )
 
 
 class SurveyTelemetry(TelemetryPublisher):

@@ -170,7 +170,7 @@ def write_run_report(run_dir: Path, status: ExitStatus, log: structlog.typing.Fi
         return f"none; {error}"
     except Exception as error:
         # Whatever it is: the survey is done, and its record is on the disk.
-        log.error("report", error=f"{type(error).__name__}: {error}")
+        log.error("report_failed", error=f"{type(error).__name__}: {error}")
         return by_hand
 
 
@@ -215,8 +215,9 @@ def status_rows(status: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows.append(("arrival", f"{error_mm:.2f} mm from the last point, as estimated" if error_mm else "none yet"))
     code = int(status.get("code", 0))
     rows.append(("danger", f"{code} {CODES.get(code, '')}".strip()))
-    if slips := int(status.get("slips", 0)):
-        rows.append(("late frames", f"{slips}, the latest by {float(status.get('lag_ms', 0.0)):.0f} ms"))
+    if missed := int(status.get("missed_deadlines", 0)):
+        worst_ms = float(status.get("worst_lateness_ms", 0.0))
+        rows.append(("late frames", f"{missed}, the latest by {worst_ms:.0f} ms"))
     rows += [(f"left out: {why}", _named(points)) for why, points in dict(status.get("left_out", {})).items()]
     if (exit_status := int(status.get("exit_status", -1))) >= 0:
         rows.append(("over", f"with exit status {exit_status}"))

@@ -8,7 +8,7 @@ import re
 from ccatp.links.topics import BY_NAME, Heartbeat
 
 LOOPS = ("main", "danger")
-STALE_AFTER_S = min(BY_NAME[f"presence.{name}"].stale_after_s for name in LOOPS)
+STALE_AFTER_S = min(BY_NAME[f"heartbeat.{name}"].stale_after_s for name in LOOPS)
 
 
 class Liveness:

@@ -60,20 +60,20 @@ class MissionStatus(Message):
     """Mission state for operators."""
 
     state: str
-    cause: str
-    done: int
-    skipped: int
-    total: int
-    point: str
-    elapsed_s: float
-    eta_s: float
-    error_mm: float
-    code: int
-    outcome: str
-    lower_bound_s: float
-    exit_status: int  # what the run ends with; -1 while it goes on
-    slips: int = 0  # frames that were served late, in real time
-    lag_ms: float = 0.0  # ... the latest of them
+    cause: str = ""
+    done: int = 0
+    skipped: int = 0
+    total: int = 0
+    point: str = ""
+    elapsed_s: float = 0.0
+    eta_s: float = 0.0
+    error_mm: float = 0.0
+    code: int = 0
+    outcome: str = ""
+    lower_bound_s: float = 0.0
+    exit_status: int = -1  # what the run ends with; -1 while it goes on
+    missed_deadlines: int = 0  # frames that were served late, in real time
+    worst_lateness_ms: float = 0.0
     left_out: dict[str, list[str]] = {}  # points skipped, or not measured any more, by the reason
 
 
@@ -163,7 +163,7 @@ class Rest(Message):
     """The mission takes the robot to be at rest from frame ``seq`` on."""
 
 
-TreatmentKind = Literal["begun", "doubted", "deaf", "hearing"]
+TreatmentKind = Literal["begun", "doubted", "odometry_off", "odometry_on"]
 
 
 class Treatment(Message):
@@ -172,8 +172,8 @@ class Treatment(Message):
     Attributes:
         kind: ``begun``: it begins anew before this frame, values are x (m), y (m), heading (rad), deck frame, and the
             standard deviations of place (m) and heading (rad); ``doubted``: after the samples of this frame its pose
-            may be wrong by so much, m and rad; ``deaf``, ``hearing``: whatever wheels and inertial unit say, the robot
-            stands, or not any more.
+            may be wrong by so much, m and rad; ``odometry_off``: from here on wheels and inertial unit are not used,
+            the robot stands; ``odometry_on``: they are used again.
     """
 
     kind: TreatmentKind
@@ -307,10 +307,10 @@ class Topic:
 
 
 TOPICS: tuple[Topic, ...] = (
-    Topic("presence.main", Heartbeat, "main", 10.0, 1.0, False),
-    Topic("presence.danger", Heartbeat, "danger", 10.0, 1.0, False),
-    Topic("presence.dashboard", Heartbeat, "dashboard", 2.0, 5.0, False),
-    Topic("picture", DisplayState, "main", 10.0, 0.8, False),
+    Topic("heartbeat.main", Heartbeat, "main", 10.0, 1.0, False),
+    Topic("heartbeat.danger", Heartbeat, "danger", 10.0, 1.0, False),
+    Topic("heartbeat.dashboard", Heartbeat, "dashboard", 2.0, 5.0, False),
+    Topic("display_state", DisplayState, "main", 10.0, 0.8, False),
     Topic("scene", Scene, "main", 2.0, 5.0, False),
     Topic("estimate", EstimateMessage, "main", 20.0, 0.15, False),
     Topic("verdict", Verdict, "danger", 100.0, 0.15, False),
@@ -332,8 +332,13 @@ TOPICS: tuple[Topic, ...] = (
     Topic("beacon_places", BeaconPlaces, "dataloop", 0.0, 0.0, True),
     Topic("beacon_truth", BeaconTruth, "dataloop", 1.0, 0.0, True),
 )
-RECORD_FORMAT = 1
+RECORD_FORMAT = 2
 """Of a recording, kept in it; one more wherever an older reader would misunderstand what is recorded."""
+# In recordings of older formats: topic, text there, and the present one. A key or value, with its quotation marks.
+_OLD_TEXTS: dict[str, dict[bytes, bytes]] = {
+    "treatment": {b'"kind":"deaf"': b'"kind":"odometry_off"', b'"kind":"hearing"': b'"kind":"odometry_on"'},
+    "mission": {b'"slips":': b'"missed_deadlines":', b'"lag_ms":': b'"worst_lateness_ms":'},
+}
 BY_NAME = {topic.name: topic for topic in TOPICS}
 # Danger carries a pose on by the wheels itself: a pose in five frames is fresh enough and costs a fifth.
 ESTIMATE_FRAMES = 5
@@ -372,6 +377,13 @@ def unpack(frame: bytes) -> tuple[str, bytes, Message | Verdict]:
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise BadMessage(f"topic {name.decode()}: {error}") from error
     return name.decode(), body, message
+
+
+def decode_recorded(topic: str, payload: bytes) -> Message | Verdict:
+    """A recorded message, of this format or an older one; raises ``BadMessage``."""
+    for old, new in _OLD_TEXTS.get(topic, {}).items():
+        payload = payload.replace(old, new)
+    return unpack(topic.encode() + b" " + payload)[2]
 
 
 def schema_of(name: str) -> dict[str, Any]:

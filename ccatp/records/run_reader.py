@@ -31,7 +31,7 @@ from ccatp.links.topics import (
     TrackMessage,
     Treatment,
     TruthMessage,
-    unpack,
+    decode_recorded,
 )
 from ccatp.mirror.mirror import Mirror, deck_poses
 from ccatp.records.recorder import iter_messages, read_metadata, recordings
@@ -44,14 +44,14 @@ class Marked:
     Attributes:
         sensors: the frame.
         begun: before the frame the localizer began anew, with these values of ``Treatment``.
-        is_deaf: whatever wheels and inertial unit say, the robot stands.
+        is_odometry_off: whatever wheels and inertial unit say, the robot stands.
         doubted: after the samples its pose was doubted by this much, m and rad.
     """
 
     sensors: Sensors
     at_rest: bool
     begun: tuple[float, ...] | None = None
-    is_deaf: bool = False
+    is_odometry_off: bool = False
     doubted: tuple[float, ...] | None = None
 
 
@@ -114,7 +114,7 @@ def in_order(messages: Iterable[Message]) -> Iterator[Event]:
     """
     rests: set[int] = set()
     treatments: dict[tuple[int, str], tuple[float, ...]] = {}
-    is_deaf = False
+    is_odometry_off = False
     fixes: deque[FixGiven] = deque()
     last = -1
     for message in messages:
@@ -131,9 +131,9 @@ def in_order(messages: Iterable[Message]) -> Iterator[Event]:
             at_rest = last in rests
             rests.discard(last)
             begun = treatments.pop((last, "begun"), None)
-            if (last, "deaf") in treatments or (last, "hearing") in treatments or begun is not None:
-                is_deaf = (last, "deaf") in treatments
-            yield Marked(message, at_rest, begun, is_deaf, treatments.pop((last, "doubted"), None))
+            if (last, "odometry_off") in treatments or (last, "odometry_on") in treatments or begun is not None:
+                is_odometry_off = (last, "odometry_off") in treatments
+            yield Marked(message, at_rest, begun, is_odometry_off, treatments.pop((last, "doubted"), None))
     while fixes and fixes[0].seq <= last:
         yield Fixed(*fixes.popleft()[1:])
 
@@ -261,7 +261,7 @@ class Recording:
             if topic not in READ:
                 continue
             try:
-                found = self._take(unpack(topic.encode() + b" " + payload)[2])
+                found = self._take(decode_recorded(topic, payload))
             except (BadMessage, BadLine) as error:
                 self._lose(str(error))
                 continue

@@ -1,6 +1,7 @@
 """The log of a run, ``log.jsonl``: lines for a reader, and when the mission changed its state."""
 
 import json
+import re
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -9,7 +10,11 @@ from typing import Any, NamedTuple
 from ccatp.core import danger_text
 
 # Fields of every line; the others say more of what happened.
-_OWN = frozenset(("process", "event", "level", "wall", "seq", "t_s"))
+_OWN = frozenset(("logger", "process", "event", "level", "timestamp", "wall", "seq", "t_s"))
+# Names of events and keys in logs of older versions.
+_OLD_EVENTS = {"run": "run_started", "end": "run_finished", "state": "state_changed", "verdict": "verdict_changed"}
+_OLD_TIME, _OLD_LOGGER = "wall", "process"
+_EVENT_NAME = re.compile(r"[a-z0-9_]+")
 _DEBUG = "debug"
 # At the end of a field's name.
 _UNITS = frozenset(("s", "ms", "us", "m", "mm", "um", "rad", "mrad"))
@@ -76,15 +81,17 @@ def _parsed(text: str) -> ReadLine | None:
         return None
     if not isinstance(fields, dict) or not isinstance(fields.get("event"), str):
         return None
-    begins = fields["event"] == "run" and fields.get("process") == "supervisor"
+    process = str(fields.get("logger", fields.get(_OLD_LOGGER, "")))
+    fields["event"] = _OLD_EVENTS.get(fields["event"], fields["event"])
+    begins = fields["event"] == "run_started" and process == "supervisor"
     if fields.get("level") == _DEBUG:
         return ReadLine(None, _change(fields), begins)
     t_s = fields.get("t_s")
     line = LogLine(
-        wall=str(fields.get("wall", "")),
+        wall=str(fields.get("timestamp", fields.get(_OLD_TIME, ""))),
         t_s=float(t_s) if isinstance(t_s, int | float) else None,
         level=str(fields.get("level", "")),
-        process=str(fields.get("process", "")),
+        process=process,
         text=_text(fields),
     )
     return ReadLine(line, None, begins)
@@ -92,7 +99,7 @@ def _parsed(text: str) -> ReadLine | None:
 
 def _change(fields: dict[str, Any]) -> StateChange | None:
     seq, before, after = (fields.get(key) for key in ("seq", "before", "after"))
-    if fields["event"] != "state" or not isinstance(seq, int):
+    if fields["event"] != "state_changed" or not isinstance(seq, int):
         return None
     return StateChange(seq, str(before), str(after))
 
@@ -100,8 +107,12 @@ def _change(fields: dict[str, Any]) -> StateChange | None:
 def _text(fields: dict[str, Any]) -> str:
     """What happened, and what more the line says of it: names, values and units as a reader writes them."""
     event = str(fields["event"])
-    if event == "verdict":
+    if event == "verdict_changed":
         return _verdict(fields)
+    if event == "operator_message":
+        return str(fields.get("text", ""))
+    if _EVENT_NAME.fullmatch(event):  # older logs have sentences
+        event = event.replace("_", " ")
     more = [f"{_named(key)} {_shown(value)}{_unit(key)}" for key, value in fields.items() if _says(key, value)]
     return f"{event}: {', '.join(more)}" if more else event
 

@@ -36,7 +36,7 @@ from ccatp.links.topics import (
     MissionStatus,
     TrackMessage,
     TruthMessage,
-    unpack,
+    decode_recorded,
 )
 from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
 from ccatp.mirror.panel_alignment import Measured
@@ -101,7 +101,7 @@ def read_session(path: Path, mirror: Mirror, changes: Sequence[StateChange], war
         if topic not in TOPICS_READ:
             continue
         try:
-            message: Message | object = unpack(topic.encode() + b" " + payload)[2]
+            message: Message | object = decode_recorded(topic, payload)
             found.take(message)
         except (BadMessage, ValueError) as error:
             lost.append(str(error))
@@ -348,7 +348,7 @@ class _BeaconReportReaderCollected:
                 if topic not in BEACON_TOPICS_READ:
                     continue
                 try:
-                    self._take(unpack(topic.encode() + b" " + payload)[2])
+                    self._take(decode_recorded(topic, payload))
                 except (BadMessage, ValueError) as error:
                     lost.append(str(error))
         except OSError as error:

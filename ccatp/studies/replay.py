@@ -307,7 +307,7 @@ class _Player:
         if event.begun is not None:
             self._begin(event.begun)
         localizer, sensors = self._localizer, event.sensors
-        imu, enc = ((), as_standing(sensors.enc)) if event.is_deaf else (sensors.imu, sensors.enc)
+        imu, enc = ((), as_standing(sensors.enc)) if event.is_odometry_off else (sensors.imu, sensors.enc)
         localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
         if localizer.hold_requested:
             localizer.clear_hold()

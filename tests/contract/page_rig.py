@@ -72,9 +72,9 @@ class Rig:
         now_s = time.monotonic()
         for publisher, name in ((self.main, "main"), (self.danger, "danger")):
             known = Heartbeat(seq=self._seq, t_s=now_s, process=name, pid=1, phase=phase, frame_age_s=0.01)
-            publisher.send(f"presence.{name}", known)
+            publisher.send(f"heartbeat.{name}", known)
         self.main.send("mission", mission(seq=self._seq))
-        self.main.send("picture", picture(self._seq))
+        self.main.send("display_state", picture(self._seq))
 
     async def ask(self, method: str, path: str, host: str = "", **headers: str) -> Reply:
         """One request on a connection of its own; header names with _ for -."""

@@ -103,7 +103,7 @@ class Site:
         return await asyncio.to_thread(request, self.endpoint, payload, DEADLINE_S, self.client(name))
 
     def refusals(self) -> list[str]:
-        return [line["why"] for line in self.logged if line["event"] == "observatory: refused"]
+        return [line["why"] for line in self.logged if line["event"] == "observatory_refused"]
 
 
 @pytest.fixture

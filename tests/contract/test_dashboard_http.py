@@ -249,16 +249,16 @@ async def test_a_page_begins_with_everything_and_goes_on_with_news(rig: Rig) -> 
 async def test_nobody_waits_for_us_and_nobody_works_for_us_while_nobody_looks(rig: Rig) -> None:
     # A run begins when track, estimate and verdict have subscribers: those of the run itself.
     def subscribed() -> set[str]:
-        names = {"track", "estimate", "picture", "mission"}
+        names = {"track", "estimate", "display_state", "mission"}
         found = {name for name in names if rig.main.has_subscriber(name)}
         return found | ({"verdict"} if rig.danger.has_subscriber("verdict") else set())
 
     await rig.until("/ground", lambda reply: reply.code == 200)
     assert subscribed() == set()
     async with rig.page() as page:
-        while "picture" not in subscribed():
+        while "display_state" not in subscribed():
             await page.event()
-        assert subscribed() == {"picture"}
+        assert subscribed() == {"display_state"}
         rig.tell_alive()
         await page.until(lambda _, state: state["pose"] is not None)
     async with asyncio.timeout(DEADLINE_S):
@@ -281,7 +281,7 @@ async def test_a_dead_loop_shows_at_once(rig: Rig) -> None:
 async def test_a_silent_loop_shows(rig: Rig) -> None:
     await rig.until("/healthz", lambda reply: reply.code == 200)
     async with rig.page() as page:
-        while not rig.main.has_subscriber("picture"):
+        while not rig.main.has_subscriber("display_state"):
             await page.event()
         rig.tell_alive()
         _, state = await page.until(lambda _, state: bool(state["losses"]))

@@ -14,7 +14,7 @@ async def test_a_robot_on_another_mirror_is_refused(measured: Measured) -> None:
         duty = daemon.robot.robot.fans.duty
         await daemon.until(daemon.main.over.is_set)
         assert daemon.main.exit_status == ExitStatus.USAGE, tell(daemon)
-        (line,) = (entry["event"] for entry in daemon.log if "right mirror" in entry["event"])
+        (line,) = (entry["text"] for entry in daemon.log if "right mirror" in entry.get("text", ""))
         assert "fyst-m1 has one of 24.7 deg there" in line
         measured("P21", len(daemon.executed))
         assert daemon.main.status().exit_status == 2

@@ -247,7 +247,7 @@ def _bus() -> list[bytes]:
     )
     track = topics.TrackMessage(seq=1, t_s=0.1, rows=[(1, 0.1, 1, 2, 0.1, 0.2, 0.3, 0.001)])
     return [
-        topics.pack("presence.main", presence),
+        topics.pack("heartbeat.main", presence),
         topics.pack("estimate", estimate),
         topics.pack("track", track),
         topics.pack("verdict", VERDICT),

@@ -43,13 +43,13 @@ def log_of(run: Run) -> list[dict[str, Any]]:
 
 def wall_s(entry: dict[str, Any]) -> float:
     """Wall time of a line."""
-    return datetime.fromisoformat(entry["wall"]).timestamp()
+    return datetime.fromisoformat(entry["timestamp"]).timestamp()
 
 
 def first_after(run: Run, at_s: float, process: str, event: str) -> float:
     """Seconds from a wall time to the first line of a process that begins so."""
     for entry in log_of(run):
-        if entry["process"] == process and entry["event"].startswith(event):
+        if entry["logger"] == process and (entry["event"] == event or entry.get("text", "").startswith(event)):
             after_s = wall_s(entry) - at_s
             if after_s >= 0.0:
                 return after_s
@@ -58,4 +58,6 @@ def first_after(run: Run, at_s: float, process: str, event: str) -> float:
 
 def robot_record(run: Run) -> dict[str, Any]:
     """What the simulated robot counted."""
-    return next(entry for entry in log_of(run) if entry["process"] == "dataloop" and entry["event"] == "robot")
+    return next(
+        entry for entry in log_of(run) if entry["logger"] == "dataloop" and entry["event"] == "robot_statistics"
+    )

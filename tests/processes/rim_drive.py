@@ -93,7 +93,7 @@ class RecklessMain:
 
     def presence(self) -> None:
         """Be seen by the danger loop."""
-        self._publisher.send("presence.main", Heartbeat(seq=0, t_s=0.0, process="main", pid=0, phase="ready"))
+        self._publisher.send("heartbeat.main", Heartbeat(seq=0, t_s=0.0, process="main", pid=0, phase="ready"))
 
     def on_sensors(self, link: RobotLink, sensors: Sensors) -> None:
         """Dead-reckon, claim the pose, drive on."""
@@ -165,7 +165,7 @@ async def drive_off(case: RimCase, run_dir: Path, runtime_dir: Path) -> RimResul
     subscriber = Subscriber(
         context,
         [endpoints.of("truth"), endpoints.of("danger")],
-        ["truth", "danger_event", "presence.danger", "verdict"],
+        ["truth", "danger_event", "heartbeat.danger", "verdict"],
     )
     try:
         with processes(configure(case), case, run_dir, endpoints) as cfg:

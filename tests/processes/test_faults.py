@@ -30,10 +30,10 @@ def test_a_stuck_gyroscope_is_in_the_log_and_the_run_ends_as_defined(start: Star
     run = start("--panels", "1", *NO_CALIBRATION, "--faults", str(plan))
     assert run.wait() == 0, run.stderr
     assert "Traceback" not in run.stderr
-    told = [entry for entry in log_of(run) if entry["event"].startswith("fault ")]
-    events = [f"fault {what}: imu_wz stuck" for what in ("begins", "ended", "injected")]
-    assert [entry["event"] for entry in told] == events
-    assert {entry["process"] for entry in told} == {"dataloop"}
+    told = [entry for entry in log_of(run) if entry["event"].startswith("fault_")]
+    assert [entry["event"] for entry in told] == ["fault_begins", "fault_ended", "fault_injected"]
+    assert {(entry["signal"], entry["type"]) for entry in told} == {("imu_wz", "stuck")}
+    assert {entry["logger"] for entry in told} == {"dataloop"}
     last = told[-1]
     assert (last["at_s"], last["from_s"], last["until_s"], last["samples"]) == (6.0, 6.0, 6.49, 50)
     assert last["changed"] > 0
@@ -55,7 +55,7 @@ def test_a_survey_goes_on_through_resets_of_the_link_and_a_reboot_of_the_robot(s
     points = {"total": 9, "measured": 9, "first_arrival_within_10mm": 9, "skipped": 0}
     assert run.summary["points"] == points
     assert run.summary["danger"]["falls"] == 0
-    injected = [entry for entry in log_of(run) if entry["event"].startswith("fault injected: link")]
+    injected = [entry for entry in log_of(run) if entry["event"] == "fault_injected" and entry["signal"] == "link"]
     assert [(entry["signal"], entry["type"], entry["from_s"]) for entry in injected] == [
         ("link", "fragment", 0.5),
         ("link", "reset", 3.0),

@@ -90,7 +90,7 @@ def test_a_main_loop_that_is_stopped_and_goes_on_decides_nothing_by_old_frames(s
     assert record["oldest_ack_frames"] < 30
     assert run.summary["danger"]["falls"] == 0
     withheld = [
-        entry for entry in log_of(run) if entry["process"] == "danger" and entry["event"] == "verdict"
+        entry for entry in log_of(run) if entry["logger"] == "danger" and entry["event"] == "verdict_changed"
         and entry["cause"] == "estimate stale"
     ]  # fmt: skip
     assert withheld
@@ -167,9 +167,11 @@ def test_a_link_that_is_open_and_dead_is_joined_again(start: Start, tmp_path: Pa
     assert run.summary["points"]["measured"] == 9
     assert run.summary["danger"]["falls"] == 0
     log = log_of(run)
-    begun_s = next(wall_s(e) for e in log if e["event"].startswith("fault begins: link black_hole"))
-    noticed_s = next(wall_s(e) for e in log if e["process"] == "danger" and e["event"] == "sensors stale")
-    assert all(e["samples"] > 0 for e in log if e["event"].startswith("fault injected"))
+    begun_s = next(
+        wall_s(e) for e in log if e["event"] == "fault_begins" and (e["signal"], e["type"]) == ("link", "black_hole")
+    )
+    noticed_s = next(wall_s(e) for e in log if e["logger"] == "danger" and e["event"] == "sensors_stale")
+    assert all(e["samples"] > 0 for e in log if e["event"] == "fault_injected")
     measured("L2", 1e3 * (noticed_s - begun_s))
 
 

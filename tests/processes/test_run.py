@@ -57,7 +57,7 @@ def test_two_panels(start: Start, mirror: str) -> None:
     assert recorded - views - {"danger_event"} == of_surveys - {"danger_event", "treatment"}
     assert {"view/pose", "view/true_pose", "view/panels", "view/points", "view/log"} <= views
     log = [json.loads(line) for line in (run.run_dir / "log.jsonl").read_text().splitlines()]
-    assert {"main", "danger", "supervisor", "dataloop"} <= {entry["process"] for entry in log}
+    assert {"main", "danger", "supervisor", "dataloop"} <= {entry["logger"] for entry in log}
     assert "SIMULATION" in run.stderr
     # The run ends by naming its report, which is whole.
     assert run.stderr.rstrip().endswith(f"report  {run.run_dir / 'report.html'}")

@@ -47,7 +47,7 @@ def test_nothing_grows(start: Callable[..., Run], measured: Measured) -> None:
                 memory_mib = process.memory_info().rss / MIB
                 rows[name].append((time.monotonic() - begun_s, memory_mib, process.num_fds(), process.num_threads()))
         time.sleep(1.0)
-    slips = run.ask("status")["status"]["slips"]
+    slips = run.ask("status")["status"]["missed_deadlines"]
     run.end()
     for name, table in rows.items():
         times_s, memory_mib, descriptors, threads = np.array(table).T

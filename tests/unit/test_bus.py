@@ -41,13 +41,13 @@ def presence(seq: int) -> Heartbeat:
 
 def test_a_subscriber_gets_its_topics_only_in_order(bus: Bus) -> None:
     publisher = bus.publisher()
-    subscriber = bus.subscriber("presence.main")
-    assert publisher.has_subscriber("presence.main")
-    publisher.send("presence.main", presence(1))
+    subscriber = bus.subscriber("heartbeat.main")
+    assert publisher.has_subscriber("heartbeat.main")
+    publisher.send("heartbeat.main", presence(1))
     publisher.send("log", LogMessage(seq=0, t_s=0.0, level="info", process="main", text="not for you"))
-    publisher.send("presence.main", presence(2))
-    assert subscriber.receive(1.0) == ("presence.main", presence(1))
-    assert subscriber.receive(1.0) == ("presence.main", presence(2))
+    publisher.send("heartbeat.main", presence(2))
+    assert subscriber.receive(1.0) == ("heartbeat.main", presence(1))
+    assert subscriber.receive(1.0) == ("heartbeat.main", presence(2))
     assert subscriber.receive() is None
 
 
@@ -64,46 +64,46 @@ def test_a_publisher_knows_who_listens(bus: Bus) -> None:
 
 def test_a_topic_is_not_a_prefix(bus: Bus) -> None:
     publisher = bus.publisher()
-    subscriber = bus.subscriber("presence.main")
-    publisher.has_subscriber("presence.main")
-    publisher._socket.send(b"presence.mainframe {}")
+    subscriber = bus.subscriber("heartbeat.main")
+    publisher.has_subscriber("heartbeat.main")
+    publisher._socket.send(b"heartbeat.mainframe {}")
     assert subscriber.receive(0.05) is None
     assert subscriber.bad_messages == 0
 
 
 def test_bad_messages_are_counted_and_dropped(bus: Bus) -> None:
     publisher = bus.publisher()
-    subscriber = bus.subscriber("presence.main")
-    publisher.has_subscriber("presence.main")
-    publisher._socket.send(b"presence.main nonsense")
-    publisher.send("presence.main", presence(3))
-    assert subscriber.receive(1.0) == ("presence.main", presence(3))
+    subscriber = bus.subscriber("heartbeat.main")
+    publisher.has_subscriber("heartbeat.main")
+    publisher._socket.send(b"heartbeat.main nonsense")
+    publisher.send("heartbeat.main", presence(3))
+    assert subscriber.receive(1.0) == ("heartbeat.main", presence(3))
     assert subscriber.bad_messages == 1
 
 
 def test_nobody_waits_for_an_onlooker_who_gets_it_all_the_same(bus: Bus) -> None:
     publisher = bus.publisher()
-    onlooker = bus.subscriber("presence.main", is_onlooking=True)
+    onlooker = bus.subscriber("heartbeat.main", is_onlooking=True)
     other = bus.subscriber("log")
     while not publisher.has_subscriber("log"):
         pass
     received = None
     while received is None:  # until the other subscription has arrived as well
-        publisher.send("presence.main", presence(1))
+        publisher.send("heartbeat.main", presence(1))
         received = onlooker.receive(0.05)
-    assert received == ("presence.main", presence(1))
-    assert not publisher.has_subscriber("presence.main")
+    assert received == ("heartbeat.main", presence(1))
+    assert not publisher.has_subscriber("heartbeat.main")
     assert other.receive() is None
 
 
 def test_of_what_waits_the_newest_is_kept(bus: Bus) -> None:
     publisher = bus.publisher()
-    newest = bus.subscriber("presence.main", keeps_newest=True)
-    while not publisher.has_subscriber("presence.main"):
+    newest = bus.subscriber("heartbeat.main", keeps_newest=True)
+    while not publisher.has_subscriber("heartbeat.main"):
         pass
     seen: list[int] = []
     for seq in range(200):
-        publisher.send("presence.main", presence(seq))
+        publisher.send("heartbeat.main", presence(seq))
     while 199 not in seen:
         received = newest.receive(5.0)
         assert received is not None

@@ -9,10 +9,12 @@ from typing import Any
 import msgspec
 import pytest
 
-from ccatp.daemon.survey_collector import NO_STATUS
 from ccatp.errors import DaemonUnreachableError, RefusedError
 from ccatp.links.client import Latched, OperatorClient, Pong, StillWaiting
+from ccatp.links.topics import MissionStatus
 from tests.unit.serving import serving
+
+NO_STATUS = MissionStatus(seq=-1, t_s=0.0, state="")
 
 
 @pytest.fixture

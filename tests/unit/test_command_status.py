@@ -10,9 +10,11 @@ import msgspec
 import pytest
 
 from ccatp.cli import main
-from ccatp.daemon.survey_collector import NO_STATUS
 from ccatp.daemon.terminal import clock, share_done, status_line, status_rows
+from ccatp.links.topics import MissionStatus
 from tests.unit.serving import serving
+
+NO_STATUS = MissionStatus(seq=-1, t_s=0.0, state="")
 
 STATUS = {
     **msgspec.to_builtins(NO_STATUS),
@@ -36,7 +38,15 @@ def test_the_table() -> None:
         ("danger", "0 normal"),
     ]
     assert dict(status_rows({**STATUS, "error_mm": 0.0}))["arrival"] == "none yet"
-    held = {**STATUS, "state": "held", "point": "", "cause": "operator", "code": 2, "slips": 4, "lag_ms": 31.0}
+    held = {
+        **STATUS,
+        "state": "held",
+        "point": "",
+        "cause": "operator",
+        "code": 2,
+        "missed_deadlines": 4,
+        "worst_lateness_ms": 31.0,
+    }
     held |= {"left_out": {"out of time": ["1-2-3", "1-2-4"]}, "exit_status": 4, "outcome": "stopped"}
     found = dict(status_rows(held))
     assert found["cause"] == "operator"

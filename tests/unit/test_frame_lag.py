@@ -13,7 +13,7 @@ def serve(lag: LatenessStatistics, late_s: dict[int, float], frames: int = 100, 
 def test_prompt_frames_do_not_lag() -> None:
     lag = LatenessStatistics(0.02)
     assert max(serve(lag, {})) == pytest.approx(0.0, abs=1e-9)
-    assert lag.slips == 0
+    assert lag.missed_deadlines == 0
     assert lag.worst_s == pytest.approx(0.0, abs=1e-9)
 
 
@@ -23,7 +23,7 @@ def test_late_frames_are_as_late_as_they_are_and_slips_are_counted() -> None:
     assert [found[k] for k in (19, 20, 21, 22, 23, 40, 60)] == pytest.approx(
         [0.0, 0.3, 0.29, 0.28, 0.0, 0.019, 0.021], abs=1e-4
     )
-    assert lag.slips == 4
+    assert lag.missed_deadlines == 4
     assert lag.worst_s == pytest.approx(0.3, abs=1e-4)
 
 

@@ -15,9 +15,11 @@ import pytest
 
 from ccatp.daemon import ocs_plugin
 from ccatp.daemon.ocs_agent import OcsMissing, SurveyTask, add_arguments, feed_fields, main, register, survey_command
-from ccatp.daemon.survey_collector import NO_STATUS
 from ccatp.links.client import OperatorClient
+from ccatp.links.topics import MissionStatus
 from tests.unit.serving import serving
+
+NO_STATUS = MissionStatus(seq=-1, t_s=0.0, state="")
 
 
 class Session:

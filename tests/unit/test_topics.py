@@ -13,6 +13,7 @@ from ccatp.links.topics import (
     BadMessage,
     EstimateMessage,
     SensorLines,
+    decode_recorded,
     is_estimate_due,
     last_estimate_before,
     pack,
@@ -90,3 +91,22 @@ def test_danger_waits_for_an_estimate_that_main_publishes(seq: int) -> None:
     assert is_estimate_due(wanted)
     assert 0 < seq - wanted <= ESTIMATE_FRAMES
     assert last_estimate_before(0) < 0
+
+
+@pytest.mark.parametrize(
+    ("topic", "payload", "field", "value"),
+    [
+        ("treatment", b'{"seq":1,"t_s":0.1,"kind":"deaf","values":[]}', "kind", "odometry_off"),
+        ("treatment", b'{"seq":1,"t_s":0.1,"kind":"hearing"}', "kind", "odometry_on"),
+        ("treatment", b'{"seq":1,"t_s":0.1,"kind":"odometry_on"}', "kind", "odometry_on"),
+        ("mission", b'{"seq":1,"t_s":0.1,"state":"idle","slips":3,"lag_ms":21.5}', "missed_deadlines", 3),
+        ("mission", b'{"seq":1,"t_s":0.1,"state":"idle","slips":3,"lag_ms":21.5}', "worst_lateness_ms", 21.5),
+    ],
+)
+def test_recordings_of_older_formats_are_read(topic: str, payload: bytes, field: str, value: object) -> None:
+    assert getattr(decode_recorded(topic, payload), field) == value
+
+
+def test_a_recorded_message_of_no_format_is_refused() -> None:
+    with pytest.raises(BadMessage, match="topic treatment"):
+        decode_recorded("treatment", b'{"seq":1,"t_s":0.1,"kind":"numb"}')

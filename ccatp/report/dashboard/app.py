@@ -237,14 +237,14 @@ class CommandRoutes:
         told["client"] = request.client.host if request.client is not None else "?"
         refusal = origin_refusal(headers.get("origin"), headers.get("sec-fetch-site"), headers["host"])
         if refusal is not None:
-            self._note("refused", {**told, "why": refusal})
+            self._note("page_request_refused", {**told, "why": refusal})
             return _error(403, refusal)
         refusal = token_refusal(headers.get("authorization"), self._token)
         if refusal is not None:
-            self._note("refused", {**told, "why": refusal})
+            self._note("page_request_refused", {**told, "why": refusal})
             return _error(401, refusal, {"www-authenticate": "Bearer"})
         answer = await self._desk.ask(name)
-        self._note("command", {**told, "refusal": answer.refusal})
+        self._note("page_command", {**told, "refusal": answer.refusal})
         return _error(answer.http_status, answer.refusal) if answer.refusal else _json({"status": "ok"})
 
     def route(self, name: OperatorCommand) -> Route:

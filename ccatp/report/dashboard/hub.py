@@ -31,8 +31,8 @@ class Wants(NamedTuple):
 
 SURVEY = Wants(("arrival", "fix", "scene"), "track", "truth", ())
 BEACONS = Wants(("beacon_arrival", "beacon_map", "scene"), "beacon_track", "beacon_truth", ("beacon_places",))
-_OF_MAIN = ("presence.main", "mission", "log")
-_OF_DANGER = ("presence.danger", "danger_event")
+_OF_MAIN = ("heartbeat.main", "mission", "log")
+_OF_DANGER = ("heartbeat.danger", "danger_event")
 # Taken at a time: a publisher that never pauses must not keep the pages waiting.
 MOST = 2_000
 
@@ -69,7 +69,7 @@ class BusReader:
         if wanted and not self._glancing:
             self._glancing = [
                 # Main puts a picture together for those who ask; a verdict must not be waited for in our place.
-                Subscriber(self._context, [self._endpoint_of("main")], ["picture"], keeps_newest=True),
+                Subscriber(self._context, [self._endpoint_of("main")], ["display_state"], keeps_newest=True),
                 Subscriber(
                     self._context, [self._endpoint_of("danger")], ["verdict"], keeps_newest=True, is_onlooking=True
                 ),

@@ -81,8 +81,8 @@ def _put_mission(page: _Page, mission: Mapping[str, Any], known: Sequence[str]) 
     page.put("points", "gauge", "Measurement points, or waypoints.", counts)
     page.gauge("elapsed_seconds", "Of the mission, by the robot's clock.", mission["elapsed_s"])
     page.gauge("remaining_seconds", "Estimate of what is left.", mission["eta_s"])
-    page.put("late_frames_total", "counter", "Frames that were served late.", [((), mission["slips"])])
-    page.gauge("frame_lag_seconds", "How late the latest of them was.", 1e-3 * mission["lag_ms"])
+    page.put("late_frames_total", "counter", "Frames that were served late.", [((), mission["missed_deadlines"])])
+    page.gauge("frame_lag_seconds", "How late the latest of them was.", 1e-3 * mission["worst_lateness_ms"])
 
 
 _COUNTS = {"planned": "total", "measured": "done", "skipped": "skipped"}

@@ -18,7 +18,7 @@ from ccatp.links.topics import BY_NAME, DangerEvent, DisplayState, Heartbeat, Lo
 
 LOOPS = ("main", "danger")
 NAMES = {"main": "main loop", "danger": "danger loop"}
-PICTURE_STALE_S = BY_NAME["picture"].stale_after_s
+PICTURE_STALE_S = BY_NAME["display_state"].stale_after_s
 STATUS_STALE_S = BY_NAME["mission"].stale_after_s
 
 
@@ -125,7 +125,7 @@ class Links:
             return None
         age_s = now_s - presence.t_s
         picture_age_s = 0.0 if name != "main" or self._picture_s is None else now_s - self._picture_s
-        if age_s > BY_NAME[f"presence.{name}"].stale_after_s or picture_age_s > PICTURE_STALE_S:
+        if age_s > BY_NAME[f"heartbeat.{name}"].stale_after_s or picture_age_s > PICTURE_STALE_S:
             return Loss(f"the {NAMES[name]} has said nothing", max(age_s, picture_age_s))
         return None
 

@@ -23,8 +23,8 @@ ALL: dict[str, Any] = NOTHING | {
         {"name": "robot", "phase": "no frame yet", "age_s": None, "is_well": False},
     ],
     "mission": {
-        "state": "driving", "total": 693, "done": 12, "skipped": 1, "elapsed_s": 61.5, "eta_s": 3000.0, "slips": 2,
-        "lag_ms": 21.0,
+        "state": "driving", "total": 693, "done": 12, "skipped": 1, "elapsed_s": 61.5, "eta_s": 3000.0,
+        "missed_deadlines": 2, "worst_lateness_ms": 21.0,
     },
     "verdict": {"code": 1, "severity": 2},
     "robot": {

@@ -65,7 +65,7 @@ def test_a_disk_that_refuses_does_not_keep_an_emergency_from_being_latched(
     monkeypatch.setattr("os.fsync", refuse)
     assert latch.raise_emergency("fire", "a") is None
     assert latch.is_latched
-    assert "emergencies cannot be kept" in told.getvalue()
+    assert "emergencies_not_saved" in told.getvalue()
 
 
 @pytest.mark.fault("P13")

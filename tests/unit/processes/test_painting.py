@@ -21,9 +21,9 @@ def test_a_picture_for_a_subscriber_only(config: Config, tmp_path: Path) -> None
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     publisher = Publisher(context, endpoint)
     painter = DisplayStatePublisher(publisher, look_at_localizer)
-    subscriber = Subscriber(context, [endpoint], ["picture"], keeps_newest=True)
+    subscriber = Subscriber(context, [endpoint], ["display_state"], keeps_newest=True)
     try:
-        while not publisher.has_subscriber("picture"):
+        while not publisher.has_subscriber("display_state"):
             pass
         painter.tell_if_wanted(1, 0.1)  # nothing is seen yet
         painter.sees(localizer, LINE)
@@ -40,7 +40,7 @@ def test_a_picture_for_a_subscriber_only(config: Config, tmp_path: Path) -> None
         assert bytes(picture.line) == LINE
         assert picture.covariance_m2[0] > 0.0
         subscriber.close()
-        while publisher.has_subscriber("picture"):
+        while publisher.has_subscriber("display_state"):
             pass
         painter.tell_if_wanted(4, 0.4)  # nobody asked: nothing is sent, as the next subscriber finds
     finally:

@@ -64,7 +64,7 @@ class RecordingRun(SilRun):
 
     def leave(self) -> Path:
         """Drive it, and close everything as the daemon does at its end."""
-        self.say("supervisor", "run", mirror=self.cfg.mirror.name)
+        self.say("supervisor", "run_started", mirror=self.cfg.mirror.name)
         if self.is_simulation:
             lies = self.robot.world.misalignments
             panels = [(*panel, m.piston_m, m.tip_rad, m.tilt_rad) for panel, m in lies.items()]
@@ -74,13 +74,13 @@ class RecordingRun(SilRun):
         self.status(outcome=result.outcome, exit_status=0 if result.outcome == "complete" else 3)
         self.recorder.close()
         self.store.close()
-        self.say("supervisor", "end", status=0)
+        self.say("supervisor", "run_finished", status=0)
         self.log.close()
         (self.run_dir / "summary.json").write_text(json.dumps(result.summary), encoding="utf-8")
         return self.run_dir
 
     def say(self, process: str, event: str, level: str = "info", **fields: object) -> None:
-        line = {"process": process, **fields, "event": event, "level": level, "wall": "2026-01-01T12:00:00.5Z"}
+        line = {"logger": process, **fields, "event": event, "level": level, "timestamp": "2026-01-01T12:00:00.5Z"}
         self.log.write(json.dumps(line) + "\n")
 
     def write(self, topic: str, message: msgspec.Struct) -> None:
@@ -113,7 +113,7 @@ class RecordingRun(SilRun):
         row = (seq, t_s, *pose.panel, pose.x_m, pose.y_m, pose.heading_rad, self.localizer.position_sigma_m)
         self.track.append(row)
         if state is not self.seen:
-            self.say("main", "state", "debug", seq=seq, before=str(self.seen), after=str(state))
+            self.say("main", "state_changed", "debug", seq=seq, before=str(self.seen), after=str(state))
             self.seen = state
         if len(self.track) >= BATCH:
             self.flush()

@@ -31,7 +31,7 @@ def test_a_whole_run(recorded: Path) -> None:
     assert found.changed["run.panels"] == (1, 0)
     assert not [key for key in found.changed if key.startswith(("world", "mirror"))]
     assert found.injected is not None
-    assert [line.text for line in found.log][-1] == "end: status 0"
+    assert [line.text for line in found.log][-1] == "run finished: status 0"
 
 
 def test_the_track_is_on_the_deck(recorded: Path) -> None:
@@ -186,15 +186,18 @@ def lines(*texts: str) -> str:
     return "\n".join(texts) + "\n"
 
 
-STATE = '{"process":"main","seq":%d,"before":"%s","after":"%s","event":"state","level":"debug","wall":"w"}'
-RUN = '{"process":"supervisor","event":"run","level":"info","wall":"w"}'
+STATE = '{"logger":"main","seq":%d,"before":"%s","after":"%s","event":"state_changed","level":"debug","timestamp":"w"}'
+RUN = '{"logger":"supervisor","event":"run_started","level":"info","timestamp":"w"}'
+OLD_STATE = '{"process":"main","seq":%d,"before":"%s","after":"%s","event":"state","level":"debug","wall":"w"}'
+OLD_RUN = '{"process":"supervisor","event":"run","level":"info","wall":"w"}'
 
 
-def test_the_log_tells_states_by_session(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("run", "state"), [(RUN, STATE), (OLD_RUN, OLD_STATE)], ids=["now", "older"])
+def test_the_log_tells_states_by_session(tmp_path: Path, run: str, state: str) -> None:
     path = tmp_path / "log.jsonl"
     path.write_text(
         lines(
-            RUN, STATE % (3, "idle", "turning"), "torn {", RUN, STATE % (8, "idle", "held"), STATE % (5, "held", "idle")
+            run, state % (3, "idle", "turning"), "torn {", run, state % (8, "idle", "held"), state % (5, "held", "idle")
         )
     )
     warnings: list[str] = []
@@ -209,16 +212,30 @@ def test_the_log_tells_states_by_session(tmp_path: Path) -> None:
 def test_the_log_is_shown_without_what_is_for_debugging(tmp_path: Path) -> None:
     path = tmp_path / "log.jsonl"
     odd = {"process": "main", "event": "fault", "level": "warning", "wall": "w", "t_s": 3, "lag_s": 0.05, "why": ""}
-    path.write_text(lines(STATE % (1, "a", "b"), json.dumps(odd), "[]", json.dumps({"event": 3})))
+    new = {"logger": "main", "event": "frame_late", "level": "warning", "timestamp": "x", "lateness_ms": 51.0}
+    said = {"logger": "main", "event": "operator_message", "level": "info", "timestamp": "x", "text": "going on: 1_2"}
+    rest = map(json.dumps, (odd, new, said, {"event": 3}))
+    path.write_text(lines(STATE % (1, "a", "b"), "[]", *rest))
     read = list(read_log(path, []))
     shown = [line.shown for line in read if line.shown is not None]
-    assert [tuple(line) for line in shown] == [("w", 3.0, "warning", "main", "fault: lag 0.05 s")]
+    assert [tuple(line) for line in shown] == [
+        ("w", 3.0, "warning", "main", "fault: lag 0.05 s"),
+        ("x", None, "warning", "main", "frame late: lateness 51 ms"),
+        ("x", None, "info", "main", "going on: 1_2"),
+    ]
 
 
 def test_fields_of_the_log_are_words(tmp_path: Path) -> None:
     path = tmp_path / "log.jsonl"
-    verdict = {"process": "danger", "event": "verdict", "code": 0, "signal": "estimate", "value": 0.31, "limit": 0.15}
-    counts = {"process": "danger", "event": "stopped", "edges": {"front_left": 2}, "held": True, "denied": {}}
+    verdict = {
+        "logger": "danger",
+        "event": "verdict_changed",
+        "code": 0,
+        "signal": "estimate",
+        "value": 0.31,
+        "limit": 0.15,
+    }
+    counts = {"logger": "danger", "event": "danger_statistics", "edges": {"front_left": 2}, "held": True, "denied": {}}
     path.write_text(
         lines(
             json.dumps(verdict | {"cause": "estimate stale", "severity": 3}),
@@ -229,7 +246,7 @@ def test_fields_of_the_log_are_words(tmp_path: Path) -> None:
     assert [line.shown.text for line in read_log(path, []) if line.shown is not None] == [
         "danger: estimate stale: 0.31 s (limit 0.15 s), event code 0",
         "danger: all is well again",
-        "stopped: edges front left 2, held yes, names a, b",
+        "danger statistics: edges front left 2, held yes, names a, b",
     ]
 
 

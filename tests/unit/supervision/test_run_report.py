@@ -47,7 +47,7 @@ def test_whatever_goes_wrong_is_logged_and_no_more(run_dir: Path, monkeypatch: p
     log = open_log(run_dir / "log.jsonl", "supervisor")
     assert write_run_report(run_dir, ExitStatus.COMPLETE, log) == f"none; make it with: ccatp report {run_dir}"
     (line,) = (json.loads(text) for text in (run_dir / "log.jsonl").read_text().splitlines())
-    assert (line["event"], line["level"], line["error"]) == ("report", "error", "ZeroDivisionError: of nothing")
+    assert (line["event"], line["level"], line["error"]) == ("report_failed", "error", "ZeroDivisionError: of nothing")
 
 
 def test_the_run_ends_by_naming_it_on_standard_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,14 +5,14 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from ccatp.daemon.survey_collector import NO_STATUS
 from ccatp.daemon.survey_runner import state_text
 from ccatp.daemon.terminal import BeaconRunView, RunView
+from ccatp.links.topics import MissionStatus
 from ccatp.survey.state import MissionState
 
 
 def test_progress_with_and_without_a_point(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status = msgspec.structs.replace(NO_STATUS, state="driving", elapsed_s=61.0, eta_s=9.0, done=1, total=10)
+    status = MissionStatus(seq=-1, t_s=0.0, state="driving", elapsed_s=61.0, eta_s=9.0, done=1, total=10)
     view = RunView("x", is_sim=True, run_dir=tmp_path)
     view.status(status)
     assert capsys.readouterr().err.splitlines()[-1] == "10 %: 1 of 10 points, driving, 1:01 elapsed, 0:09 to go"

@@ -18,12 +18,13 @@ import structlog
 
 from ccatp.daemon import realtime
 from ccatp.daemon.service import Notifier, Service, take_from, watchdog_period_s
-from ccatp.daemon.survey_collector import NO_STATUS
 from ccatp.links.liveness import Liveness
-from ccatp.links.topics import Heartbeat
+from ccatp.links.topics import Heartbeat, MissionStatus
 
 ROOT = Path(__file__).parents[3]
 UNIT = ROOT / "packaging" / "ccatp.service"
+
+NO_STATUS = MissionStatus(seq=-1, t_s=0.0, state="")
 
 
 class Manager:

@@ -154,7 +154,7 @@ function showMission({ mission, losses }) {
   text("point", mission.next_point || "–");
   text("arrival", mission.done ? `${mission.error_mm.toFixed(2)} mm` : "–");
   text("skipped", String(Math.max(mission.skipped, mission.not_to_be_measured)));
-  text("slips", mission.slips ? `${mission.slips}, worst ${mission.lag_ms.toFixed(0)} ms` : "0");
+  text("slips", mission.missed_deadlines ? `${mission.missed_deadlines}, worst ${mission.worst_lateness_ms.toFixed(0)} ms` : "0");
 }
 
 // Name and value of what else a mission has to say.
