@@ -87,11 +87,15 @@ docs: $(VENV)/.installed-dev
 	@echo "ccatp: build/docs/index.html"
 
 # Both run on this machine: linear algebra rounds differently on another one. ARGS=--list shows the cases.
+RADIO_DATA ?= ../shared/data/radio
+GOLDEN_CACHE ?= build/golden
+GOLDEN = --data $(RADIO_DATA) --cache $(GOLDEN_CACHE)
+
 golden: $(VENV)/.installed-dev
-	@$(BIN)/python -m tests.golden $(ARGS)
+	@$(BIN)/python -m tests.golden $(GOLDEN) $(ARGS)
 
 golden-quick: $(VENV)/.installed-dev
-	@$(BIN)/python -m tests.golden --quick --reuse-base $(ARGS)
+	@$(BIN)/python -m tests.golden $(GOLDEN) --quick --reuse-base $(ARGS)
 
 metrics: $(VENV)/.installed-dev
 	@$(BIN)/python -m tests.metrics $(ARGS)

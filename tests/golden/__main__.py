@@ -1,13 +1,14 @@
 """``make golden``: this tree against a base commit, both run on this machine in one sitting, bit for bit.
 
-    make golden-quick                                a few cases, for each commit: about a minute
-    make golden                                      all cases, before a series of commits is delivered
-    make golden ARGS="--cases survey-fyst -j 2"      cases by a regular expression; --list shows them
-    make golden ARGS="--reuse-base"                  takes results of the base that this machine made before
-    make golden ARGS="--base COMMIT --data DIR"      another base; where recorded radio data is
+    make golden-quick                             a few cases, for each commit: about a minute, the base is run once
+    make golden                                   all cases, before a series of commits is delivered
+    make golden ARGS="--cases survey-fyst -j 2"   cases by a regular expression; --list shows them
+    make golden ARGS="--reuse-base"               takes results of the base that this machine made before
+    make golden ARGS="--base COMMIT"              another base; RADIO_DATA=DIR: where recorded radio data is
 
 A rename is a row in renames.toml. After a commit that changes results on purpose, that commit becomes the base there.
-What the cases left lies in build/golden (or --cache): streams of the robot link, run directories, outputs.
+What the cases left is kept in build/golden: streams of the robot link, run directories, outputs. The base and its
+results are there too, or in GOLDEN_CACHE=DIR, which several working trees may share.
 """
 
 import argparse
@@ -21,7 +22,7 @@ from pathlib import Path
 from tests.golden.cases import CASES, Case
 from tests.golden.comparison import Difference, Renames, compare
 from tests.golden.observation import observe
-from tests.golden.runs import HERE, ROOT, GoldenError, Runner, Side, base_side, this_side
+from tests.golden.runs import HERE, RESULTS, ROOT, GoldenError, Runner, Side, base_side, locked, this_side
 
 _DATA = ROOT.parent / "shared" / "data" / "radio"
 
@@ -44,8 +45,8 @@ def main() -> int:
     renames = Renames.read(HERE / "renames.toml")
     runner = Runner(data, reuse_base=options.reuse_base)
     try:
-        base = base_side(options.cache.resolve(), options.base or renames.base)
-        differing, failed = _compare_all(cases, (base, this_side(options.cache.resolve(), renames)), runner, options.j)
+        sides = base_side(options.cache.resolve(), options.base or renames.base), this_side(renames)
+        differing, failed = _compare_all(cases, sides, runner, options.j)
     except GoldenError as error:
         print(f"golden: {error}", file=sys.stderr)
         return 2
@@ -64,7 +65,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--base", default="", metavar="COMMIT", help="compare with this commit")
     parser.add_argument("--reuse-base", action="store_true", help="take earlier results of the base on this machine")
     parser.add_argument("--data", type=Path, default=_DATA, metavar="DIR", help="recorded radio data")
-    parser.add_argument("--cache", type=Path, default=ROOT / "build" / "golden", metavar="DIR", help="base and results")
+    parser.add_argument("--cache", type=Path, default=RESULTS, metavar="DIR", help="where the base is kept")
     parser.add_argument("-j", type=int, default=max(1, (os.cpu_count() or 1) // 2), help="runs at a time")
     return parser.parse_args()
 
@@ -96,14 +97,16 @@ def _compare_all(cases: list[Case], sides: tuple[Side, Side], runner: Runner, jo
 
 def _compare_case(case: Case, sides: tuple[Side, Side], runner: Runner) -> tuple[str, list[Difference]]:
     """Times of both sides, and what differs; they follow each other, so that they run under the same conditions."""
-    folders, times = [], []
+    observations, times = [], []
     for side in sides:
-        begun_s = time.monotonic()
-        folders.append(runner.run(side, case))
-        times.append(f"{side.name} {time.monotonic() - begun_s:.1f} s")
-    base, new = (observe(folder, only_results=case.only_results) for folder in folders)
-    if not base:
-        raise GoldenError(f"the base left nothing to compare in {folders[0]}")
+        with locked(side.results / case.name):
+            begun_s = time.monotonic()
+            folder = runner.run(side, case)
+            times.append(f"{side.name} {time.monotonic() - begun_s:.1f} s")
+            observations.append(observe(folder, only_results=case.only_results))
+        if not observations[0]:
+            raise GoldenError(f"the base left nothing to compare in {folder}")
+    base, new = observations
     return ", ".join(times), compare(base, new, sides[1].renames)
 
 

@@ -152,14 +152,12 @@ def _compare_rows(name: str, base: Row | None, new: Row | None, renames: Renames
 
 
 def _is_same(one: Any, other: Any) -> bool:
-    """Bit for bit, but for 0 and 0.0; a number that is not finite equals itself."""
-    if isinstance(one, float | int) and isinstance(other, float | int) and not isinstance(one, bool):
-        return repr(float(one)) == repr(float(other)) and not isinstance(other, bool)
+    """Bit for bit: 0.0 is not -0.0, and a number that is not finite equals itself."""
     if isinstance(one, list) and isinstance(other, list):
         return len(one) == len(other) and all(map(_is_same, one, other))
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(_is_same(one[key], other[key]) for key in one)
-    return bool(one == other) and type(one) is type(other)
+    return repr(one) == repr(other)
 
 
 def _shown_key(stream: str, key: tuple[int | str, ...]) -> str:

@@ -1,5 +1,6 @@
 """Runs golden cases in a source tree: the base in a copy and an environment of its own, this tree in its own."""
 
+import fcntl
 import hashlib
 import json
 import os
@@ -10,6 +11,8 @@ import sys
 import tarfile
 import tempfile
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -19,6 +22,7 @@ from tests.golden.comparison import Renames
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
+RESULTS = ROOT / "build" / "golden"
 _HOOK = HERE / "wire_hook"
 _TIMEOUT_S = 900.0
 _DONE = "done.json"
@@ -39,9 +43,9 @@ class Side:
     renames: Renames
 
 
-def this_side(cache: Path, renames: Renames) -> Side:
+def this_side(renames: Renames) -> Side:
     """The working tree, with the interpreter that runs this."""
-    return Side("new", ROOT, Path(sys.executable), cache / "new", renames)
+    return Side("new", ROOT, Path(sys.executable), RESULTS / "new", renames)
 
 
 def base_side(cache: Path, commit: str) -> Side:
@@ -59,10 +63,20 @@ def base_side(cache: Path, commit: str) -> Side:
     sha = done.stdout.strip()
     folder = cache / f"base-{sha[:12]}"
     root = folder / "tree"
-    if not root.exists():
-        _extract(sha, root)
-    _make_environment(root)
+    with locked(folder):
+        if not root.exists():
+            _extract(sha, root)
+        _make_environment(root)
     return Side("base", root, root / ".venv" / "bin" / "python", folder / "results", Renames())
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """One process at a time uses the folder: several working trees may share a base."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with folder.with_name(f"{folder.name}.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def _extract(sha: str, root: Path) -> None:
