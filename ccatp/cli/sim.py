@@ -166,8 +166,7 @@ def conformance(
 
     Wheels turn slowly and for a moment, unless --no-motion. In the end the robot is held, its fans as they were.
     """
-    from ccatp.commissioning.conformance.checks import check_ids
-    from ccatp.commissioning.conformance.runner import Conformance, as_json, last_line, table_line
+    from ccatp.commissioning.conformance.runner import Conformance, as_json, check_ids, last_line, table_line
 
     address = _address(server)
     _check_ids(only, check_ids())
@@ -177,7 +176,7 @@ def conformance(
     results = checks.run(
         motion=not no_motion,
         only=only,
-        tell=lambda result: None if json_output else click.echo(table_line(result)),
+        report=lambda result: None if json_output else click.echo(table_line(result)),
     )
     click.echo(json.dumps(as_json(server, results)) if json_output else last_line(results))
     return FAILED if any(result.outcome == "fail" for result in results) else 0
@@ -185,8 +184,8 @@ def conformance(
 
 def _announce(facts: "Facts | None", only: Sequence[str]) -> None:
     """Say that wheels will turn, and by how much at most."""
-    from ccatp.commissioning.conformance.checks import CHECKS
     from ccatp.commissioning.conformance.motion_checks import extent
+    from ccatp.commissioning.conformance.runner import CHECKS
 
     moving = [check for check in CHECKS if "motion" in check.needs and (not only or check.check_id in only)]
     if facts is None or not moving:

@@ -7,8 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from typing import Any, NamedTuple
 
-from ccatp.commissioning.conformance.judges import Result
-from ccatp.commissioning.conformance.runner import Conformance
+from ccatp.commissioning.conformance.runner import Conformance, Result
 from ccatp.config.models import Config
 from ccatp.dataloop import DataLoop, _Connection
 

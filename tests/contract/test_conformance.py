@@ -11,9 +11,7 @@ from pathlib import Path
 import pytest
 
 from ccatp.cli import main
-from ccatp.commissioning.conformance.checks import CHECKS, check_ids
-from ccatp.commissioning.conformance.judges import Result
-from ccatp.commissioning.conformance.runner import Conformance
+from ccatp.commissioning.conformance.runner import CHECKS, Conformance, Result, check_ids
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.dataloop import DataLoop

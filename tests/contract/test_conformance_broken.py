@@ -8,10 +8,9 @@ from typing import Any
 
 import pytest
 
-from ccatp.commissioning.conformance import motion_checks as stories_frames
-from ccatp.commissioning.conformance import session_checks as stories_session
-from ccatp.commissioning.conformance.checks import CHECKS
-from ccatp.commissioning.conformance.session_checks import BAD_DRIVES
+from ccatp.commissioning.conformance import frame_checks, session_checks
+from ccatp.commissioning.conformance.line_checks import BAD_DRIVES
+from ccatp.commissioning.conformance.runner import check_ids
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.dataloop import DataLoop
@@ -24,7 +23,7 @@ from tests.contract.crooked import Crooked, Message, Middle, failures
 
 AT_ONCE = 8  # servers
 KEY = b"secret"
-IDS = [check.check_id for check in CHECKS]
+IDS = check_ids()
 HELLO = tuple(IDS[: IDS.index("join")])
 JOIN = ("join", "join-role", "join-client", "join-first", "role-taken", "refused-harmless")
 MAC = tuple(name for name in IDS if name.startswith("mac"))
@@ -565,7 +564,7 @@ async def judge(config: Config, table: list[Crooked], *, lockstep: bool, key: by
 
 @pytest.mark.parametrize("table", [SESSIONS, STREAMS, COMMANDS, STEPS], ids=["sessions", "frames", "commands", "steps"])
 async def test_in_lockstep(config: Config, table: list[Crooked], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stories_frames, "FRAMES", 15)  # whatever is wrong with them is wrong with the first
+    monkeypatch.setattr(frame_checks, "FRAMES", 15)  # whatever is wrong with them is wrong with the first
     await judge(config, table, lockstep=True)
 
 
@@ -581,7 +580,7 @@ async def test_on_the_wall_clock(config: Config, monkeypatch: pytest.MonkeyPatch
     # Roles may be taken over after two seconds instead of five; that it is five the honest robot shows.
     monkeypatch.setattr(sessions, "SILENCE_S", 2.0)
     for name, value_s in (("SILENCE_S", 2.0), ("STILL_HELD_S", 0.8), ("TAKEN_S", 2.3)):
-        monkeypatch.setattr(stories_session, name, value_s)
+        monkeypatch.setattr(session_checks, name, value_s)
     await judge(config, REALTIME, lockstep=False)
 
 

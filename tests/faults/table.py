@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from ccatp.commissioning.conformance.checks import check_ids
+from ccatp.commissioning.conformance.runner import check_ids
 
 PATH = Path(__file__).with_name("table.toml")
 # Rows of each kind in the list that the project works from; a row may be added, none may be lost.

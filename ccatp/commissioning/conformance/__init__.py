@@ -1,4 +1,4 @@
 """Black-box checks of a robot-link server against the interface control document.
 
-``checks`` is the table, ``runner`` runs it against one server.
+``runner`` has the list of all checks and runs it against one server; ``checks`` says what a check is.
 """

@@ -1,9 +1,4 @@
-"""What the stories are played on: connections to the server under test, joined or not.
-
-One raw connection to the server under test.
-
-A controller and a monitor that answer every frame, as long as they are told to.
-"""
+"""Connections to the server under test: raw ones, and a controller with a monitor that answer every frame."""
 
 import select
 import socket
@@ -11,9 +6,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
-from ccatp.commissioning.conformance.judges import (
+from ccatp.commissioning.conformance.checks import (
     CheckedFrame,
     CheckFailed,
     Message,
@@ -24,22 +19,19 @@ from ccatp.commissioning.conformance.judges import (
     shorten,
 )
 from ccatp.links.robot_codec import encode, format_drive, format_permit, join_mac
-from ccatp.links.robot_messages import AUTH_HMAC, Fans, Join, LineBuffer, Role
+from ccatp.links.robot_messages import Fans, Join, LineBuffer, Role
 
-# Far over the page's 8192: a line of the server that is too long is for the judges, not for the buffer.
+# Far over the 8192 allowed: a line of the server that is too long fails a check, not the buffer.
 _LIMIT_BYTES = 1 << 20
 _CHUNK_BYTES = 1 << 16
+Ending = Literal["FIN", "RST"]
 _RESET = b"\x01\0\0\0\0\0\0\0"  # linger on, for 0 s: close sends RST
 
 
 class RawConnection:
-    """A connection.
+    """One connection; ``lines`` were received and not yet taken, without their LF.
 
-    Args:
-        timeout_s: longest wait for the connection, and for the server to take what is sent.
-
-    Attributes:
-        lines: received and not yet taken, without their LF.
+    ``timeout_s`` is the longest wait for the connection, and for the server to take what is sent.
 
     Raises:
         OSError: no connection.
@@ -75,16 +67,15 @@ class RawConnection:
             return
         self.lines.extend(self._buffer.feed(data))
 
-    def finish(self) -> None:
-        """Send FIN and go on reading. Closing instead would send RST while something is unread."""
+    def end(self, ending: Ending) -> None:
+        """End with FIN and go on reading (closing would send RST while something is unread), or close with RST."""
         with suppress(OSError):
-            self._socket.shutdown(socket.SHUT_WR)
-
-    def reset(self) -> None:
-        """Close with RST."""
-        with suppress(OSError):
+            if ending == "FIN":
+                self._socket.shutdown(socket.SHUT_WR)
+                return
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
-        self._socket.close()
+        if ending == "RST":
+            self._socket.close()
 
     def close(self) -> None:
         """Close."""
@@ -111,7 +102,7 @@ SEQ_STEP = 10
 
 
 class Facts(NamedTuple):
-    """What the stories need of the server's hello."""
+    """What the checks need of the server's hello."""
 
     is_lockstep: bool
     frame_hz: float
@@ -129,11 +120,7 @@ class Facts(NamedTuple):
 
 
 class CheckContext:
-    """Connections of one check; ``clear`` before the next.
-
-    Args:
-        first_seq: above every number used so far.
-    """
+    """Connections of one check; ``clear`` before the next. ``first_seq`` is above every number used so far."""
 
     def __init__(
         self, address: tuple[str, int], facts: Facts, key: bytes | None, timeout_s: float, first_seq: int
@@ -146,19 +133,6 @@ class CheckContext:
         """A number above all that were used."""
         self._seq += SEQ_STEP
         return self._seq
-
-    def connect(self) -> RawConnection:
-        """A fresh connection.
-
-        Raises:
-            Broken: it is not accepted.
-        """
-        try:
-            link = RawConnection(self._address, self.timeout_s)
-        except OSError as error:
-            raise CheckFailed(f"connection not accepted: {error.strerror or error}") from error
-        self._links.append(link)
-        return link
 
     def poll(self, wait_s: float = POLL_S) -> None:
         """Receive on all connections, waiting at most so long."""
@@ -174,47 +148,28 @@ class CheckContext:
             self.poll(min(left_s, POLL_S))
         return True
 
-    def wait(self, wait_s: float) -> None:
-        """Receive for so long."""
-        self.until(lambda: False, wait_s)
-
-    def line(self, link: RawConnection, what: str, wait_s: float | None = None) -> bytes:
-        """The next line on a connection.
-
-        Raises:
-            Broken: none comes; ``what`` says what it should have been.
-        """
-        self.until(lambda: bool(link.lines) or link.is_ended, wait_s)
-        require(bool(link.lines), f"{'connection closed' if link.is_ended else 'silence'} instead of {what}")
-        return link.lines.popleft()
-
-    def message(self, link: RawConnection, kind: str, wait_s: float | None = None) -> Message:
-        """The next message on a connection, which has to be of this type.
-
-        Raises:
-            Broken: it is not.
-        """
-        line = self.line(link, kind, wait_s)
+    def message(self, link: RawConnection, *kinds: str) -> Message:
+        """The next message on a connection; ``CheckFailed`` where it is not of one of these types."""
+        wanted = " or ".join(kinds)
+        self.until(lambda: bool(link.lines) or link.is_ended)
+        require(bool(link.lines), f"{'connection closed' if link.is_ended else 'silence'} instead of {wanted}")
+        line = link.lines.popleft()
         message = read_message(line)
-        if message is None or message.get("type") != kind:
-            raise CheckFailed(f"{shorten(line)} instead of {kind}")
+        if message is None or message.get("type") not in kinds:
+            raise CheckFailed(f"{shorten(line)} instead of {wanted}")
         return message
 
     def greet(self) -> tuple[RawConnection, Message]:
-        """A fresh connection and its hello.
-
-        Raises:
-            Broken: no hello.
-        """
-        link = self.connect()
+        """A new connection and its hello; ``CheckFailed`` where it is not accepted or there is no hello."""
+        try:
+            link = RawConnection(self._address, self.timeout_s)
+        except OSError as error:
+            raise CheckFailed(f"connection not accepted: {error.strerror or error}") from error
+        self._links.append(link)
         return link, self.message(link, "hello")
 
     def join_line(self, hello: Message, role: Role, mac: str | None = None) -> bytes:
-        """The right answer to a hello, or one with another mac.
-
-        Raises:
-            NotApplicable: a mac is needed and there is no key.
-        """
+        """The right answer to a hello, or one with another mac; ``NotApplicable`` without the key it needs."""
         if mac is None and self.facts.needs_mac:
             if self.key is None:
                 raise NotApplicable("the server asks for a mac, and there is no key")
@@ -222,27 +177,16 @@ class CheckContext:
         return encode(Join(role=role, client="conformance", mac=mac or ""))
 
     def answer(self, link: RawConnection) -> Message:
-        """What the server says to a join, whatever frames come before it.
+        """The server's answer to a join."""
+        return self.message(link, "joined", "refused")
 
-        Raises:
-            Broken: nothing in time, or neither joined nor refused.
+    def join(self, role: Role, retry_s: float | None = None) -> RawConnection:
+        """A session; ``CheckFailed`` if refused.
+
+        The session before may not have ended yet, so a role that is taken is requested again for ``retry_s`` (the
+        time-out by default).
         """
-        line = self.line(link, "joined or refused")
-        message = read_message(line)
-        if message is None or message.get("type") not in {"joined", "refused"}:
-            raise CheckFailed(f"{shorten(line)} instead of joined or refused")
-        return message
-
-    def join(self, role: Role, patience_s: float | None = None) -> RawConnection:
-        """A session. The one before may not have ended yet, so a role that is taken is asked for again.
-
-        Args:
-            patience_s: how long it is asked for; the time-out by default.
-
-        Raises:
-            Broken: refused.
-        """
-        deadline_s = time.monotonic() + (self.timeout_s if patience_s is None else patience_s)
+        deadline_s = time.monotonic() + (self.timeout_s if retry_s is None else retry_s)
         while True:
             link, hello = self.greet()
             link.send(self.join_line(hello, role))
@@ -252,23 +196,18 @@ class CheckContext:
             link.close()
             is_over = time.monotonic() > deadline_s
             require(answer.get("reason") == "role taken" and not is_over, f"{role} refused: {answer.get('reason')}")
-            self.wait(POLL_S)
+            self.until(lambda: False, POLL_S)
 
     def is_closed(self, link: RawConnection, wait_s: float | None = None) -> bool:
         """Whether the server closes the connection in time."""
         return self.until(lambda: link.is_ended, wait_s)
 
     def clear(self) -> None:
-        """Close everything."""
+        """Close all connections."""
         for link in self._links:
             with suppress(OSError):
                 link.close()
         self._links.clear()
-
-
-def auth_needs_mac(hello: Message) -> bool:
-    """Whether a hello asks for a mac."""
-    return hello.get("auth") == AUTH_HMAC
 
 
 Rates = tuple[float, float]
@@ -276,20 +215,20 @@ Allowed = tuple[bool, bool, bool]
 STILL: Rates = (0.0, 0.0)
 ALL: Allowed = (True, True, True)
 NOTHING: Allowed = (False, False, False)
-PATIENCE_S = 2.0  # robot's time in which a command must have come into force
+COMMAND_LIMIT_S = 2.0  # robot's time in which a command must have come into force
 
 
 class ControllerAndMonitor:
-    """Two sessions, played together.
+    """Two sessions that answer every frame.
 
     Attributes:
         rates: (right, left) set points of the drive that answers each frame, rad/s; ``None`` sends none.
         allowed: (forward, reverse, turn) of the permit that answers each frame; ``None`` sends none.
-        messages: the same as they came, of the controller and of the monitor.
+        messages: sensors messages as they came, of the controller and of the monitor.
     """
 
-    def __init__(self, stage: CheckContext) -> None:
-        self.stage = stage
+    def __init__(self, context: CheckContext) -> None:
+        self.context, self.facts = context, context.facts
         self._join()
         self.rates: Rates | None = STILL
         self.allowed: Allowed | None = ALL
@@ -299,16 +238,12 @@ class ControllerAndMonitor:
 
     def _join(self) -> None:
         # The monitor first: from its join on the robot needs both keys, so it never waits for one alone.
-        self.monitor: RawConnection = self.stage.join("monitor")
-        self.controller: RawConnection = self.stage.join("controller")
+        self.monitor: RawConnection = self.context.join("monitor")
+        self.controller: RawConnection = self.context.join("controller")
         self._driven = self._permitted = -1
 
     def rejoin(self) -> None:
-        """End both sessions, and begin new ones.
-
-        Raises:
-            Broken: refused.
-        """
+        """End both sessions, and begin new ones."""
         self._take()
         self.controller.close()
         self.monitor.close()
@@ -323,7 +258,7 @@ class ControllerAndMonitor:
 
     def drive(self, seq: int | None = None, rates: Rates = STILL, ack: int | None = None, before: bytes = b"") -> int:
         """Send a drive that answers the newest frame (or another), with other bytes in front; returns its number."""
-        seq = self.stage.next_seq() if seq is None else seq
+        seq = self.context.next_seq() if seq is None else seq
         self.controller.send(before + format_drive(seq, self.newest.seq if ack is None else ack, *rates))
         if ack is None:
             self.mark_driven()
@@ -331,7 +266,7 @@ class ControllerAndMonitor:
 
     def permit(self, seq: int | None = None, allowed: Allowed = ALL, ack: int | None = None) -> int:
         """Send a permit now that answers the newest frame (or another); returns its number."""
-        seq = self.stage.next_seq() if seq is None else seq
+        seq = self.context.next_seq() if seq is None else seq
         self.monitor.send(format_permit(seq, self.newest.seq if ack is None else ack, *allowed))
         if ack is None:
             self._permitted = self.newest.seq
@@ -339,13 +274,13 @@ class ControllerAndMonitor:
 
     def fans(self, duty: tuple[float, float], seq: int | None = None) -> int:
         """Send fan duties now; returns their number."""
-        seq = self.stage.next_seq() if seq is None else seq
+        seq = self.context.next_seq() if seq is None else seq
         self.controller.send(encode(Fans(seq=seq, duty=duty)))
         return seq
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
-    def find(self, is_wanted: Callable[[CheckedFrame], bool], robot_s: float = PATIENCE_S) -> CheckedFrame | None:
+    def find(self, is_wanted: Callable[[CheckedFrame], bool], robot_s: float = COMMAND_LIMIT_S) -> CheckedFrame | None:
         """Answer frames until one is wanted; ``None`` after so much of the robot's time, or silence.
 
         The wanted frame itself is not answered yet.
@@ -355,7 +290,7 @@ class ControllerAndMonitor:
         quiet_s = time.monotonic()
         while True:
             self._answer()
-            self.stage.poll()
+            self.context.poll()
             if self._take():
                 quiet_s = time.monotonic()
             for k in range(start, len(self.frames)):
@@ -365,15 +300,11 @@ class ControllerAndMonitor:
                 if self.frames[k].t_s - begin_s > robot_s:
                     return None
             start = len(self.frames)
-            if time.monotonic() - quiet_s > self.stage.timeout_s:
+            if time.monotonic() - quiet_s > self.context.timeout_s:
                 return None
 
     def expect(self, is_wanted: Callable[[CheckedFrame], bool], otherwise: str) -> CheckedFrame:
-        """Answer frames until one is wanted.
-
-        Raises:
-            Broken: none is; ``otherwise`` says so.
-        """
+        """Answer frames until one is wanted; ``CheckFailed`` with ``otherwise`` if none comes."""
         frame = self.find(is_wanted)
         if frame is None:
             self._check_sessions()
@@ -381,11 +312,7 @@ class ControllerAndMonitor:
         return frame
 
     def run(self, robot_s: float) -> list[CheckedFrame]:
-        """Answer frames for so much of the robot's time; these frames.
-
-        Raises:
-            Broken: no more frames come.
-        """
+        """Answer frames for so much of the robot's time; these frames."""
         start = len(self.frames)
         if not self.frames:
             self.expect(lambda _: True, "no frames after the join")
@@ -401,29 +328,22 @@ class ControllerAndMonitor:
         start = len(self.frames)
         end_s = time.monotonic() + wall_s
         while (left_s := end_s - time.monotonic()) > 0.0:
-            self.stage.poll(min(left_s, POLL_S))
+            self.context.poll(min(left_s, POLL_S))
             self._take()
         return self.frames[start:]
 
     def echoed(self, *seqs: int, otherwise: str) -> CheckedFrame:
         """Send nothing newer, until the robot echoes one of these drives.
 
-        Where time waits for answers newer drives have to follow; there each is in force for a frame.
-
-        Raises:
-            Broken: it echoes none; ``otherwise`` says so.
+        In lockstep newer drives have to follow; there each is in force for a frame.
         """
-        self.rates = STILL if self.stage.facts.is_lockstep else None
+        self.rates = STILL if self.facts.is_lockstep else None
         return self.expect(lambda frame: frame.drive_seq in seqs, otherwise)
 
     def steady(self) -> CheckedFrame:
-        """Both keys turned: standing still by command, not held.
-
-        Raises:
-            Broken: the robot holds all the same.
-        """
+        """Drive and permit in force: standing still by command, not held."""
         self.rates, self.allowed = STILL, ALL
-        first = self.stage.next_seq()
+        first = self.context.next_seq()
         return self.expect(
             lambda frame: not frame.is_held and frame.drive_seq > first,
             "held in spite of a new drive and a new permit for each frame",
@@ -432,7 +352,7 @@ class ControllerAndMonitor:
     def settle(self) -> list[CheckedFrame]:
         """Answer frames until all that was sent before is in force; these frames."""
         start = len(self.frames)
-        mark = self.stage.next_seq()
+        mark = self.context.next_seq()
         self.expect(lambda frame: frame.drive_seq > mark, "drives no longer come into force")
         return self.frames[start:]
 
@@ -441,7 +361,7 @@ class ControllerAndMonitor:
         self._driven = self.newest.seq
 
     def answer_again(self) -> None:
-        """Take the newest frame for unanswered: what was sent may have been dropped."""
+        """Regard the newest frame as unanswered: what was sent may have been dropped."""
         self._driven = self._permitted = -1
 
     def _check_sessions(self) -> None:
@@ -474,3 +394,10 @@ class ControllerAndMonitor:
                 if not self.frames or frame.seq > self.newest.seq:
                     self.frames.append(frame)
         return len(self.frames) > before
+
+
+def steady_pair(context: CheckContext) -> ControllerAndMonitor:
+    """Both sessions joined, with drive and permit in force."""
+    pair = ControllerAndMonitor(context)
+    pair.steady()
+    return pair

@@ -1,38 +1,39 @@
-"""Runs the checks against one server, from the first connection to the last.
-
-Results as JSON and as a table.
-"""
+"""The list of all checks; runs them against one server and gives the results as JSON and as a table."""
 
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
-from ccatp.commissioning.conformance.checks import CHECKS, Check, Need
+from ccatp.commissioning.conformance import frame_checks, line_checks, motion_checks, rule_checks, session_checks
+from ccatp.commissioning.conformance.checks import (
+    Check,
+    CheckFailed,
+    Duty,
+    Message,
+    Need,
+    NotApplicable,
+    is_duty,
+    is_number,
+    is_positive,
+    read_message,
+    shorten,
+)
 from ccatp.commissioning.conformance.connections import (
     CheckContext,
     ControllerAndMonitor,
     Facts,
     RawConnection,
-    auth_needs_mac,
     receive_any,
 )
-from ccatp.commissioning.conformance.judges import (
-    CheckFailed,
-    Message,
-    NotApplicable,
-    Result,
-    is_duty,
-    is_number,
-    is_positive,
-    judge_fields,
-    judge_robot,
-    read_message,
-    shorten,
-)
-from ccatp.commissioning.conformance.rule_checks import TOLERANCE, Duty
 from ccatp.errors import CcatpError, DaemonUnreachableError, ExitStatus
+from ccatp.links.robot_messages import AUTH_HMAC
 
+Outcome = Literal["pass", "fail", "not applicable"]
+_MODULES = (session_checks, frame_checks, rule_checks, line_checks, motion_checks)
+CHECKS: tuple[Check, ...] = tuple(check for module in _MODULES for check in module.CHECKS)
+# With a hello that lacks what the other checks need, these two are all that can run.
+_HELLO_CHECKS = {"hello": session_checks.check_fields, "hello-robot": session_checks.check_robot}
 _WHY: dict[Need, str] = {
     "motion": "--no-motion",
     "real time": "lockstep: time stands still while an answer is missing",
@@ -41,8 +42,22 @@ _WHY: dict[Need, str] = {
 }
 
 
+def check_ids() -> tuple[str, ...]:
+    """The names of all checks, in the order in which they run."""
+    return tuple(check.check_id for check in CHECKS)
+
+
+class Result(NamedTuple):
+    """One check's end: its identity, what the interface control document promises, how it ended, what was seen."""
+
+    check_id: str
+    promise: str
+    outcome: Outcome
+    detail: str
+
+
 class NoRobot(DaemonUnreachableError):
-    """Nothing there that speaks the robot link, or another program holds the robot."""
+    """No server of the robot link at the address, or another program holds the robot."""
 
 
 class KeyNeeded(CcatpError):
@@ -52,13 +67,10 @@ class KeyNeeded(CcatpError):
 
 
 class Conformance:
-    """The checks of one server.
-
-    Attributes:
-        facts: of the server's hello; ``None`` if it lacks what the checks need.
+    """The checks of one server; ``facts`` of its hello are ``None`` if it lacks what the checks need.
 
     Raises:
-        NoRobot: nothing there that says hello.
+        NoRobot: nothing at the address says hello.
         KeyNeeded: it asks for a key.
     """
 
@@ -68,55 +80,60 @@ class Conformance:
         self._fans: Duty | None = None
         hello = self._hello()
         self._why_unfit = ""
-        self.facts = self._facts(hello)
+        try:
+            for check in _HELLO_CHECKS.values():
+                check(hello)
+        except CheckFailed as failed:
+            self._why_unfit = str(failed)
+        self.facts = _facts(hello)
         if self.facts is not None and self.facts.needs_mac and key is None:
             raise KeyNeeded(f"the robot at {self._where} asks for a key: name its file with --key")
 
     def run(
-        self, *, motion: bool, only: Collection[str] = (), tell: Callable[[Result], object] = lambda _: None
+        self, *, motion: bool, only: Collection[str] = (), report: Callable[[Result], object] = lambda _: None
     ) -> list[Result]:
-        """Run the checks in the order of the table.
-
-        Args:
-            only: names of the checks to run; all if empty.
+        """Run the checks in their order, or only those named; ``report`` is called with each result.
 
         Raises:
             NoRobot: another program holds the robot.
         """
         results = []
-        stage = None if self.facts is None else self._stage(self.facts)
+        context = None if self.facts is None else self._begin(self.facts)
         try:
             for check in CHECKS:
                 if not only or check.check_id in only:
-                    results.append(self._play(check, stage, motion))
-                    tell(results[-1])
+                    outcome, detail = self._run_one(check, context, motion)
+                    results.append(Result(check.check_id, check.promise, outcome, detail))
+                    report(results[-1])
         finally:
-            if stage is not None:
-                self._leave(stage)
+            if context is not None:
+                self._restore(context)
         return results
 
-    def _play(self, check: Check, stage: CheckContext | None, motion: bool) -> Result:
-        lacking = None if stage is None else _lacking(check, stage.facts, motion)
-        if stage is None and check.check_id not in {"hello", "hello-robot"}:
-            return Result(check.check_id, check.promise, "not applicable", f"the hello is of no use: {self._why_unfit}")
-        if lacking is not None:
-            return Result(check.check_id, check.promise, "not applicable", _WHY[lacking])
+    def _run_one(self, check: Check, context: CheckContext | None, motion: bool) -> tuple[Outcome, str]:
         try:
-            seen = self._unfit(check) if stage is None else check.story(stage)
-        except CheckFailed as broken:
-            return Result(check.check_id, check.promise, "fail", str(broken))
+            if context is None:
+                if check.check_id not in _HELLO_CHECKS:
+                    return "not applicable", f"the hello is of no use: {self._why_unfit}"
+                return "pass", _HELLO_CHECKS[check.check_id](self._hello())
+            facts = context.facts
+            has: dict[Need, bool] = {
+                "motion": motion,
+                "real time": not facts.is_lockstep,
+                "lockstep": facts.is_lockstep,
+                "hmac": facts.needs_mac,
+            }
+            for need in check.needs:
+                if not has[need]:
+                    return "not applicable", _WHY[need]
+            return "pass", check.run(context)
+        except CheckFailed as failed:
+            return "fail", str(failed)
         except NotApplicable as reason:
-            return Result(check.check_id, check.promise, "not applicable", str(reason))
+            return "not applicable", str(reason)
         finally:
-            if stage is not None:
-                stage.clear()
-        return Result(check.check_id, check.promise, "pass", seen)
-
-    def _unfit(self, check: Check) -> str:
-        """The checks of a hello with which nothing else can begin."""
-        return (judge_fields if check.check_id == "hello" else judge_robot)(self._hello())
-
-    # -- before and after -----------------------------------------------------------------------------------------
+            if context is not None:
+                context.clear()
 
     def _hello(self) -> Message:
         try:
@@ -133,69 +150,50 @@ class Conformance:
             link.close()
         message = read_message(line)
         if message is None or message.get("type") != "hello":
-            said = f"says {shorten(line)!r}" if line else "says nothing"
-            raise NoRobot(f"no robot link at {self._where}: it {said} where a hello should be")
+            seen = f"says {shorten(line)!r}" if line else "says nothing"
+            raise NoRobot(f"no robot link at {self._where}: it {seen} where a hello should be")
         return message
 
-    def _facts(self, hello: Message) -> Facts | None:
-        robot = hello.get("robot")
-        try:
-            judge_fields(hello)
-            judge_robot(hello)
-        except CheckFailed as broken:
-            self._why_unfit = str(broken)
-        robot = robot if isinstance(robot, dict) else {}
-        sizes: list[Any] = [robot.get(name) for name in ("wheel_radius_m", "wheel_base_m", "max_wheel_rad_s")]
-        frame_hz, ttl_s, floor = hello.get("frame_hz"), hello.get("ttl_s"), robot.get("fan_floor")
-        is_fit = all(map(is_positive, (frame_hz, ttl_s, *sizes))) and is_number(floor)
-        if not is_fit or not isinstance(hello.get("lockstep"), bool):
-            return None
-        radius_m, base_m, most_rad_s = sizes
-        return Facts(
-            hello["lockstep"], hello["frame_hz"], hello["ttl_s"], auth_needs_mac(hello), radius_m, base_m, most_rad_s,
-            robot["fan_floor"],
-        )  # fmt: skip
-
-    def _stage(self, facts: Facts) -> CheckContext:
-        """See that nobody else holds the robot, and how the fans stand; a stage with numbers above those in use."""
-        stage = CheckContext(self._address, facts, self._key, self._timeout_s, 0)
+    def _begin(self, facts: Facts) -> CheckContext:
+        """Check that no other program holds the robot, note its fans; a context with numbers above those in use."""
+        context = CheckContext(self._address, facts, self._key, self._timeout_s, 0)
         first_seq = 0
         try:
-            pair = ControllerAndMonitor(stage)
-            frame = pair.expect(lambda _: True, "no frame")
-        except CheckFailed as broken:
-            if "role taken" in str(broken):
+            frame = ControllerAndMonitor(context).expect(lambda _: True, "no frame")
+        except CheckFailed as failed:
+            if "role taken" in str(failed):
                 raise NoRobot(f"another program drives the robot at {self._where}; end it first") from None
         else:
             self._fans, first_seq = frame.fans, max(frame.seq, frame.drive_seq, 0)
         finally:
-            stage.clear()
+            context.clear()
         return CheckContext(self._address, facts, self._key, self._timeout_s, first_seq)
 
-    def _leave(self, stage: CheckContext) -> None:
+    def _restore(self, context: CheckContext) -> None:
         """Fans as they were found; then no session, so that the wheels are held."""
-        stage.clear()
+        context.clear()
         fans = self._fans
         with suppress(CheckFailed, NotApplicable):
-            pair = ControllerAndMonitor(stage)
-            if fans is not None and not is_duty(pair.steady().fans, fans, TOLERANCE):
+            pair = ControllerAndMonitor(context)
+            if fans is not None and not is_duty(pair.steady().fans, fans):
                 pair.fans(fans)
                 pair.settle()
-        stage.clear()
+        context.clear()
 
 
-def _lacking(check: Check, facts: Facts, motion: bool) -> Need | None:
-    """What a check needs and does not have."""
-    has: dict[Need, bool] = {
-        "motion": motion,
-        "real time": not facts.is_lockstep,
-        "lockstep": facts.is_lockstep,
-        "hmac": facts.needs_mac,
-    }
-    return next((need for need in check.needs if not has[need]), None)
+def _facts(hello: Message) -> Facts | None:
+    robot: Any = hello.get("robot")
+    robot = robot if isinstance(robot, dict) else {}
+    sizes = {name: robot.get(name) for name in ("wheel_radius_m", "wheel_base_m", "max_wheel_rad_s")}
+    rates: dict[str, Any] = {name: hello.get(name) for name in ("frame_hz", "ttl_s")}
+    floor, is_lockstep = robot.get("fan_floor"), hello.get("lockstep")
+    is_fit = all(map(is_positive, (*rates.values(), *sizes.values()))) and is_number(floor)
+    if not is_fit or not isinstance(is_lockstep, bool):
+        return None
+    needs_mac = hello.get("auth") == AUTH_HMAC
+    return Facts(is_lockstep=is_lockstep, needs_mac=needs_mac, fan_floor=floor, **rates, **sizes)
 
 
-_ID_WIDTH, _OUTCOME_WIDTH = 21, 4
 _SHORT = {"pass": "ok", "fail": "FAIL", "not applicable": "-"}
 
 
@@ -207,23 +205,22 @@ def as_json(server: str, results: Sequence[Result]) -> dict[str, Any]:
             {"id": result.check_id, "promise": result.promise, "result": result.outcome, "detail": result.detail}
             for result in results
         ],
-        "passed": count(results, "pass"),
-        "failed": count(results, "fail"),
+        "passed": _count(results, "pass"),
+        "failed": _count(results, "fail"),
     }
 
 
 def table_line(result: Result) -> str:
-    """One result; a failure says what was promised, too."""
+    """One result; for a failure with the promise."""
     detail = f"seen: {result.detail}; promised: {result.promise}" if result.outcome == "fail" else result.detail
-    return f"{result.check_id:<{_ID_WIDTH}}{_SHORT[result.outcome]:<{_OUTCOME_WIDTH}}  {detail}"
+    return f"{result.check_id:<21}{_SHORT[result.outcome]:<4}  {detail}"
 
 
 def last_line(results: Sequence[Result]) -> str:
-    """How many ended how."""
-    passed, failed, idle = (count(results, outcome) for outcome in ("pass", "fail", "not applicable"))
+    """The number of results of each outcome."""
+    passed, failed, idle = (_count(results, outcome) for outcome in ("pass", "fail", "not applicable"))
     return f"{passed} passed, {failed} failed, {idle} not applicable"
 
 
-def count(results: Iterable[Result], outcome: str) -> int:
-    """Results that ended so."""
+def _count(results: Sequence[Result], outcome: str) -> int:
     return sum(result.outcome == outcome for result in results)

@@ -1,28 +1,22 @@
-"""The judges of frames and hellos, where no whole server is needed to see them fail."""
+"""The checks of frames and hellos, where no server is needed to see them fail."""
 
 from typing import Any
 
 import pytest
 
-from ccatp.commissioning.conformance import judges as judge_frames
-from ccatp.commissioning.conformance import judges as judge_hello
-from ccatp.commissioning.conformance.connections import CheckContext, Facts
-from ccatp.commissioning.conformance.judges import (
+from ccatp.commissioning.conformance import frame_checks, session_checks
+from ccatp.commissioning.conformance.checks import (
     CheckedFrame,
     CheckFailed,
     NotApplicable,
-    Result,
-    fault_of_line,
-    judge_lost,
-    judge_newest,
-    judge_once,
-    judge_ttl,
+    line_fault,
     mean_rates,
     parse_frame,
     read_message,
 )
-from ccatp.commissioning.conformance.rule_checks import _other as other_duty
-from ccatp.commissioning.conformance.runner import last_line, table_line
+from ccatp.commissioning.conformance.connections import CheckContext, Facts
+from ccatp.commissioning.conformance.rule_checks import check_lost, check_newest, check_once, check_ttl, other_duty
+from ccatp.commissioning.conformance.runner import Result, last_line, table_line
 
 TTL_S, FRAME_S = 0.25, 0.01
 CMD: dict[str, Any] = {"seq": 1, "age": 0.01, "permit_age": 0.02, "held": False}
@@ -63,7 +57,7 @@ def ageing(held_from_s: float, until_s: float = 0.5) -> list[CheckedFrame]:
     ],
 )
 def test_lines(line: bytes, fault: str | None) -> None:
-    found = fault_of_line(line, 100)
+    found = line_fault(line, 100)
     assert found is None if fault is None else fault in str(found)
 
 
@@ -96,59 +90,59 @@ def test_a_frame_of_no_use(change: dict[str, Any], seen: str) -> None:
 
 
 def test_time_to_live() -> None:
-    assert judge_ttl(ageing(0.26), "drive", TTL_S, FRAME_S) == "held at a drive age of 0.260 s, ttl_s 0.25"
+    assert check_ttl(ageing(0.26), "drive", TTL_S, FRAME_S) == "held at a drive age of 0.260 s, ttl_s 0.25"
     for held_from_s, seen in ((0.15, "held at a drive age of 0.150"), (0.4, "not held at a drive age of 0.290")):
         with pytest.raises(CheckFailed, match=seen):
-            judge_ttl(ageing(held_from_s), "drive", TTL_S, FRAME_S)
-    with pytest.raises(CheckFailed, match=r"not held 0\.48 s after the last drive, its age said to be 0\.010 s"):
-        judge_ttl([frame(k * FRAME_S) for k in range(49)], "drive", TTL_S, FRAME_S)
+            check_ttl(ageing(held_from_s), "drive", TTL_S, FRAME_S)
+    with pytest.raises(CheckFailed, match=r"not held 0\.48 s after the last drive, its reported age 0\.010 s"):
+        check_ttl([frame(k * FRAME_S) for k in range(49)], "drive", TTL_S, FRAME_S)
 
 
 def test_held_for_want_of_the_other_key_is_not_too_early() -> None:
     frames = [frame(0.1), frame(0.11, permit_age_s=0.3, held=True), *ageing(0.26)[12:]]
-    assert "held at" in judge_ttl(frames, "drive", TTL_S, FRAME_S)
+    assert "held at" in check_ttl(frames, "drive", TTL_S, FRAME_S)
 
 
 def test_a_lost_session() -> None:
     def after(delay_s: float) -> list[CheckedFrame]:
         return [frame(t / 100, permit_age_s=t / 100 - 0.1, held=t / 100 > 0.1 + delay_s) for t in range(11, 30)]
 
-    assert judge_lost(after(0.03), "permit", TTL_S, FRAME_S) == "held 40 ms after the end of the session"
+    assert check_lost(after(0.03), "permit", TTL_S, FRAME_S) == "held 40 ms after the end of the session"
     with pytest.raises(CheckFailed, match="not held 70 ms after the end of the session"):
-        judge_lost(after(0.08), "permit", TTL_S, FRAME_S)
-    assert judge_lost(after(0.03)[:3], "permit", TTL_S, FRAME_S) is None  # no frame yet that tells
+        check_lost(after(0.08), "permit", TTL_S, FRAME_S)
+    assert check_lost(after(0.03)[:3], "permit", TTL_S, FRAME_S) is None  # no frame yet that tells
     with pytest.raises(NotApplicable, match=r"ttl_s 0\.08 holds the wheels as soon"):
-        judge_lost(after(0.03), "permit", 0.08, FRAME_S)
+        check_lost(after(0.03), "permit", 0.08, FRAME_S)
 
 
 def test_drives_that_come_into_force() -> None:
-    judge_newest([frame(0.1, seq=9), frame(0.11, seq=12)], 9, 8)
+    check_newest([frame(0.1, seq=9), frame(0.11, seq=12)], 9, 8)
     with pytest.raises(CheckFailed, match="drive 8 came into force after 9"):
-        judge_newest([frame(0.1, seq=9), frame(0.11, seq=8)], 9, 8)
+        check_newest([frame(0.1, seq=9), frame(0.11, seq=8)], 9, 8)
     with pytest.raises(CheckFailed, match="drive 9 never came into force"):
-        judge_newest([frame(0.1, seq=12)], 9, 8)
-    judge_once([frame(0.1, 0.01), frame(0.2, 0.11)], 1, FRAME_S)
+        check_newest([frame(0.1, seq=12)], 9, 8)
+    check_once([frame(0.1, 0.01), frame(0.2, 0.11)], 1, FRAME_S)
     with pytest.raises(CheckFailed, match="a second drive 1 came into force 100 ms after the first"):
-        judge_once([frame(0.1, 0.01), frame(0.2, 0.01)], 1, FRAME_S)
+        check_once([frame(0.1, 0.01), frame(0.2, 0.01)], 1, FRAME_S)
     assert mean_rates([frame(0.1)]) is None
 
 
 def test_judges_of_frames_without_what_they_judge() -> None:
     with pytest.raises(NotApplicable, match="no edge samples"):
-        judge_frames.judge_edges([{"edge": []}])
+        frame_checks.check_edges([{"edge": []}])
     with pytest.raises(CheckFailed, match="a frame without gravity"):
-        judge_frames.judge_gravity([{}])
+        frame_checks.check_gravity([{}])
     with pytest.raises(CheckFailed, match="frame 2 reached one session only"):
-        judge_frames.judge_both([{"seq": k} for k in (1, 2, 3)], [{"seq": k} for k in (1, 3)])
+        frame_checks.check_both([{"seq": k} for k in (1, 2, 3)], [{"seq": k} for k in (1, 3)])
     with pytest.raises(CheckFailed, match="t 1 after 1"):
-        judge_frames.judge_clock([{"seq": k, "t": 1} for k in range(3)], 100.0)
+        frame_checks.check_clock([{"seq": k, "t": 1} for k in range(3)], 100.0)
 
 
 def test_a_hello_without_robot() -> None:
     with pytest.raises(CheckFailed, match="robot = None"):
-        judge_hello.judge_robot({})
+        session_checks.check_robot({})
     with pytest.raises(CheckFailed, match="no protocol"):
-        judge_hello.judge_fields({})
+        session_checks.check_fields({})
 
 
 def test_the_lines_of_a_table() -> None:
