@@ -34,10 +34,9 @@ from ccatp.records.recorder import read_metadata
 from ccatp.records.store import read_survey
 from ccatp.records.store_rows import StoreError
 from ccatp.report.dashboard.access import read_token
-from ccatp.report.dashboard.app import CommandEndpoint, build_app
+from ccatp.report.dashboard.app import CommandEndpoint, build_app, serve
 from ccatp.report.dashboard.beacon_view import BeaconView, beacon_ground
 from ccatp.report.dashboard.hub import BEACONS, SURVEY, BusReader, StateBroadcaster, Wants
-from ccatp.report.dashboard.server import serve
 from ccatp.report.dashboard.survey_view import SurveyView
 from ccatp.report.dashboard.survey_view import ground as survey_ground
 from ccatp.report.dashboard.view import RunStateView

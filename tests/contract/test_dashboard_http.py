@@ -7,9 +7,9 @@ import tempfile
 import time
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
+from prometheus_client import CONTENT_TYPE_LATEST
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
@@ -56,6 +56,7 @@ async def test_the_page_and_all_that_it_wants_come_from_here(rig: Rig) -> None:
         file = await rig.ask("GET", f"/static/{name}")
         assert file.code == 200, name
         assert len(file.body) > 100
+        assert file.headers["cache-control"] == "no-cache"
         again = await rig.ask("GET", f"/static/{name}", if_none_match=file.headers["etag"])
         assert (again.code, again.body) == (304, b"")
 
@@ -70,7 +71,8 @@ async def test_the_ground(rig: Rig) -> None:
     ("method", "path", "code", "message"),
     [
         ("GET", "/nothing", 404, "bad endpoint: /nothing"),
-        ("GET", "/static/uPlot.LICENSE", 404, "bad endpoint: /static/uPlot.LICENSE"),
+        ("GET", "/static/none.js", 404, "bad endpoint: /static/none.js"),
+        ("POST", "/static/page.js", 405, "method not GET"),
         ("GET", "/static/../app.py", 404, "bad endpoint: /static/../app.py"),
         ("GET", "/abort", 405, "method not POST"),
         ("POST", "/status", 405, "method not GET"),
@@ -115,10 +117,10 @@ async def test_the_first_status_has_a_pose(rig: Rig) -> None:
 async def test_metrics_are_what_prometheus_reads(rig: Rig) -> None:
     await rig.until("/healthz", lambda reply: reply.code == 200)
     reply = await rig.until("/metrics", lambda reply: b"position_sigma" in reply.body)
-    assert reply.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
+    assert reply.headers["content-type"] == CONTENT_TYPE_LATEST
     metrics = parse(reply.body.decode())
-    assert metrics["ccatp_up"].samples == {"": 1.0}
-    assert metrics["ccatp_points"].samples['state="measured"'] == 3.0
+    assert metrics["ccatp_up"] == {(): 1.0}
+    assert metrics["ccatp_points"]["measured",] == 3.0
 
 
 @pytest.mark.parametrize("command", ["pause", "resume", "abort", "stop"])
@@ -342,12 +344,12 @@ async def test_who_takes_nothing_is_dropped(rig: Rig) -> None:
         await loop.sock_sendall(lazy, f"GET /events HTTP/1.1\r\nhost: 127.0.0.1:{rig.port}\r\n\r\n".encode())
         long = "x" * 50_000
         async with asyncio.timeout(DEADLINE_S):
-            metrics: dict[str, Any] = {}
-            while metrics != {"": 1.0}:
-                metrics = parse((await rig.ask("GET", "/metrics")).body.decode())["ccatp_dashboard_pages"].samples
-            while metrics != {"": 0.0}:
+            metrics: dict[tuple[str, ...], float] = {}
+            while metrics != {(): 1.0}:
+                metrics = parse((await rig.ask("GET", "/metrics")).body.decode())["ccatp_dashboard_pages"]
+            while metrics != {(): 0.0}:
                 rig.main.send("log", LogMessage(seq=1, t_s=2.0, level="info", process="main", text=long))
-                metrics = parse((await rig.ask("GET", "/metrics")).body.decode())["ccatp_dashboard_pages"].samples
+                metrics = parse((await rig.ask("GET", "/metrics")).body.decode())["ccatp_dashboard_pages"]
 
 
 async def test_newcomers_beyond_the_limit_are_turned_away(cfg: Config, folder: Path) -> None:

@@ -1,33 +1,38 @@
-"""Who may ask, and who may command, over HTTP: host names, origins, tokens.
+"""Who may read and who may command over HTTP: host names, origins, the token.
 
-A page of some other site that the operator has open must neither command the robot (it can send requests anywhere, but
-the browser says from where) nor read its state (by a name of its own that suddenly means our address).
-
-The token that commands over HTTP have to carry.
+A page of another site that the operator has open must neither command the robot (it can send requests anywhere, but
+the browser states its origin) nor read its state (under a name of its own that resolves to this address).
 """
 
 import hmac
 import ipaddress
 import re
 import stat
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from ccatp.config.models import DashboardConfig
 from ccatp.errors import ConfigError
 
+# 128 bits in hexadecimal digits: nothing limits the attempts.
+MIN_CHARACTERS = 32
 _HOST = re.compile(r"(?P<name>\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+)(?::[0-9]{1,5})?")
-_SAME_SITE = ("same-origin", "none")
-_BEARER = "bearer "
+_MAKE = "make one with: (umask 077; openssl rand -hex 24 > FILE)"
+
+
+class CommandRefusal(NamedTuple):
+    """HTTP status and reason."""
+
+    http_status: int
+    message: str
 
 
 def host_refusal(host: str | None, names: Collection[str]) -> str | None:
-    """Why a request is not served by the name under which it was sent, or ``None``.
+    """Why a request with this header ``Host`` is not served, or ``None``.
 
-    Addresses cannot be bent to another machine, names can: only ``localhost`` and the configured ones are ours.
-
-    Args:
-        host: the header ``Host``.
+    A foreign name may resolve to this address, an address is always that of this machine: accepted are addresses,
+    ``localhost`` and the configured names.
     """
     matched = _HOST.fullmatch(host or "")
     if matched is None:
@@ -38,35 +43,23 @@ def host_refusal(host: str | None, names: Collection[str]) -> str | None:
     return f"this is not {name}; ask by address, or add the name to dashboard.host_names"
 
 
-def origin_refusal(origin: str | None, fetch_site: str | None, host: str) -> str | None:
-    """Why a command may not come from where the browser says that it comes from, or ``None``.
+def command_refusal(headers: Mapping[str, str], token: str | None) -> CommandRefusal | None:
+    """Why a command with these headers is refused: its origin (403) or its token (401); ``None`` if it is accepted.
 
-    Args:
-        origin: the header ``Origin``; programs that are no browsers send none.
-        fetch_site: the header ``Sec-Fetch-Site``, likewise.
-        host: the header ``Host``.
+    Browsers send ``Origin`` and ``Sec-Fetch-Site``, other programs need not.
     """
-    if origin is not None and origin.lower() not in (f"http://{host.lower()}", f"https://{host.lower()}"):
-        return f"commands from pages of {origin} are not taken"
-    if fetch_site is not None and fetch_site.lower() not in _SAME_SITE:
-        return f"commands from pages of other sites ({fetch_site}) are not taken"
-    return None
-
-
-def token_refusal(authorization: str | None, token: str | None) -> str | None:
-    """Why a command lacks its token, or ``None``.
-
-    Args:
-        authorization: the header ``Authorization``.
-        token: what it has to carry; ``None`` where there is none.
-    """
+    host, origin, site = headers["host"].lower(), headers.get("origin"), headers.get("sec-fetch-site", "none")
+    if origin is not None and origin.lower() not in (f"http://{host}", f"https://{host}"):
+        return CommandRefusal(403, f"commands from pages of {origin} are not taken")
+    if site.lower() not in ("same-origin", "none"):
+        return CommandRefusal(403, f"commands from pages of other sites ({site}) are not taken")
     if token is None:
         return None
-    if authorization is None or not authorization.lower().startswith(_BEARER):
-        return "commands need the token of dashboard.token_file: Authorization: Bearer TOKEN"
-    given = authorization[len(_BEARER) :].strip()
-    if not hmac.compare_digest(given.encode(), token.encode()):
-        return "the token is not that of dashboard.token_file"
+    scheme, space, given = headers.get("authorization", "").partition(" ")
+    if scheme.lower() != "bearer" or not space:
+        return CommandRefusal(401, "commands need the token of dashboard.token_file: Authorization: Bearer TOKEN")
+    if not hmac.compare_digest(given.strip().encode(), token.encode()):
+        return CommandRefusal(401, "the token is not that of dashboard.token_file")
     return None
 
 
@@ -76,11 +69,6 @@ def _is_address(name: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-# 128 bits in hexadecimal digits; whoever asks may try as often as they like.
-MIN_CHARACTERS = 32
-_MAKE = "make one with: (umask 077; openssl rand -hex 24 > FILE)"
 
 
 def read_token(cfg: DashboardConfig) -> str | None:

@@ -1,99 +1,92 @@
-"""The dashboard over HTTP: the page, its state, and commands in the shape of the telescope control system.
+"""The dashboard over HTTP: the page, its state, commands in the shape of the telescope control system, and the server.
 
-There, an answer is ``{"status": "ok"}`` or ``{"status": "error", "message": why}``, with an HTTP status that says the
-same: 409 for a refusal, 405 for a wrong method, 503 for what cannot be had now.
-
-The page's files, read once: the program brings all of them, and nothing is fetched from elsewhere.
-
-Hands the commands of a page to the operator channel, and its answer back.
+An answer is ``{"status": "ok"}`` or ``{"status": "error", "message": why}`` with a matching HTTP status: 409 for a
+refusal, 405 for a wrong method, 503 for what is not available now. All files of the page are part of the package.
 """
 
 import asyncio
-from collections.abc import Callable, Collection, Mapping
-from hashlib import sha256
+import contextlib
+import logging
+import socket
+from collections.abc import AsyncIterator, Callable, Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import msgspec
+import uvicorn
 import zmq
 import zmq.asyncio
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 from starlette.applications import Starlette
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import Response
-from starlette.routing import Route
+from starlette.responses import Response, StreamingResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from ccatp.config.models import DashboardConfig
 from ccatp.links.channels import BadRequest, OperatorCommand, format_request, parse_reply
 from ccatp.links.rpc import MAX_REPLY_BYTES
-from ccatp.report.dashboard.access import host_refusal, origin_refusal, token_refusal
-from ccatp.report.dashboard.hub import EventStream, StateBroadcaster
-from ccatp.report.dashboard.metrics import CONTENT_TYPE, metrics_text
+from ccatp.report.dashboard.access import command_refusal, host_refusal
+from ccatp.report.dashboard.hub import StateBroadcaster
+from ccatp.report.dashboard.metrics import StateCollector
 
-FOLDER = Path(__file__).resolve().parent / "static"
-TYPES = {
-    ".html": "text/html; charset=utf-8",
-    ".css": "text/css; charset=utf-8",
-    ".js": "text/javascript; charset=utf-8",
-    ".svg": "image/svg+xml",
-}
-
-
-class StaticFile(NamedTuple):
-    """A file as it is sent."""
-
-    body: bytes
-    media_type: str
-    etag: str
-
-
-def read_static_files(folder: Path = FOLDER) -> dict[str, StaticFile]:
-    """The files by their names; others in the folder, like licences, are not served."""
-    files = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix in TYPES:
-            body = path.read_bytes()
-            files[path.name] = StaticFile(body, TYPES[path.suffix], f'"{sha256(body).hexdigest()[:16]}"')
-    return files
-
-
+STATIC = Path(__file__).resolve().parent / "static"
 COMMANDS = (OperatorCommand.PAUSE, OperatorCommand.RESUME, OperatorCommand.ABORT, OperatorCommand.STOP)
 # Of all pages together; an operator has one at a time.
-MOST = 8
+MAX_COMMANDS = 8
+HEADERS = {
+    "content-security-policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+}
+# Unsent bytes of an answer in the kernel; more of them would hide for longer that a client does not read.
+SEND_BUFFER_BYTES = 65_536
+# For answers that are not complete at the end; event streams end before.
+GRACE_S = 1
+KEEP_ALIVE_S = 5
+MAX_REQUEST_BYTES = 16_384
+
+Note = Callable[[str, dict[str, object]], None]
 
 
 class RouteResponse(NamedTuple):
-    """What became of a command: the HTTP status, and the refusal or nothing."""
+    """HTTP status of a command, and the refusal or an empty text."""
 
     http_status: int
     refusal: str
 
 
 class CommandEndpoint:
-    """Asks the main loop.
-
-    Args:
-        timeout_s: longest wait for the answer, which comes when the command took effect.
-    """
+    """Passes commands of the page on to the operator channel; a command is answered when it took effect."""
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, timeout_s: float) -> None:
         self._context: zmq.asyncio.Context = zmq.asyncio.Context.shadow(context)
         self._endpoint, self._timeout_s = endpoint, timeout_s
-        self._asking = 0
+        self._pending = 0
 
     async def ask(self, command: OperatorCommand) -> RouteResponse:
-        """Hand on one command; never raises for what the daemon does or does not."""
-        if self._asking >= MOST:
-            return RouteResponse(503, f"{command}: {MOST} commands wait for their answers already")
-        self._asking += 1
+        """Send a command and wait for its answer; never raises for what the daemon does or does not."""
+        if self._pending >= MAX_COMMANDS:
+            return RouteResponse(503, f"{command}: {MAX_COMMANDS} commands wait for their answers already")
+        self._pending += 1
         try:
             async with asyncio.timeout(self._timeout_s):
                 return await self._exchange(command)
         except TimeoutError:
             return RouteResponse(504, f"{command}: no answer from the main loop within {self._timeout_s:g} s")
         finally:
-            self._asking -= 1
+            self._pending -= 1
 
     async def _exchange(self, command: OperatorCommand) -> RouteResponse:
         with self._context.socket(zmq.DEALER) as peer:
@@ -106,34 +99,16 @@ class CommandEndpoint:
             reply = parse_reply(frame)
         except BadRequest as error:
             return RouteResponse(502, f"{command}: the main loop answered with {error}")
-        return (
-            RouteResponse(200, "") if reply["ok"] else RouteResponse(409, f"{command}: {reply.get('error', 'refused')}")
-        )
-
-
-Note = Callable[[str, dict[str, object]], None]
-
-HEADERS = (
-    (
-        b"content-security-policy",
-        b"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
-        b"base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
-    ),
-    (b"x-content-type-options", b"nosniff"),
-    (b"x-frame-options", b"DENY"),
-    (b"referrer-policy", b"no-referrer"),
-    (b"cross-origin-opener-policy", b"same-origin"),
-    (b"cross-origin-resource-policy", b"same-origin"),
-)
-_EVENTS = (
-    (b"content-type", b"text/event-stream; charset=utf-8"),
-    (b"cache-control", b"no-store"),
-    (b"x-accel-buffering", b"no"),
-)
+        if reply["ok"]:
+            return RouteResponse(200, "")
+        return RouteResponse(409, f"{command}: {reply.get('error', 'refused')}")
 
 
 class HostCheckMiddleware:
-    """Refuses who asks by a wrong name, and puts the page's headers on every answer."""
+    """Refuses requests under a foreign host name, and adds the security headers to every answer.
+
+    Starlette's ``TrustedHostMiddleware`` refuses addresses and answers without a reason.
+    """
 
     def __init__(self, app: ASGIApp, names: Collection[str]) -> None:
         self._app, self._names = app, names
@@ -143,122 +118,19 @@ class HostCheckMiddleware:
 
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                message["headers"] = [*message.get("headers", ()), *HEADERS]
+                headers = MutableHeaders(scope=message)
+                headers.update(HEADERS)
+                headers.setdefault("cache-control", "no-cache" if "etag" in headers else "no-store")
             await send(message)
 
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-        host = dict(scope["headers"]).get(b"host")
-        refusal = host_refusal(host.decode("latin-1") if host is not None else None, self._names)
+        refusal = host_refusal(Headers(scope=scope).get("host"), self._names)
         app = self._app if refusal is None else _error(421, refusal)
         await app(scope, receive, send_with_headers)
 
 
-class Events:
-    """The stream of the state, until the page goes or the dashboard ends."""
-
-    def __init__(self, hub: StateBroadcaster) -> None:
-        self._hub = hub
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one page."""
-        if scope["method"] != "GET":
-            await _error(405, "method not GET")(scope, receive, send)
-            return
-        await send({"type": "http.response.start", "status": 200, "headers": list(_EVENTS)})
-        with self._hub.open() as stream:
-            async with asyncio.TaskGroup() as tasks:
-                gone = tasks.create_task(_wait_for_end(receive, stream))
-                async for payload in stream:
-                    await send({"type": "http.response.body", "body": payload, "more_body": True})
-                gone.cancel()
-        await send({"type": "http.response.body", "body": b"", "more_body": False})
-
-
-async def _wait_for_end(receive: Receive, stream: EventStream) -> None:
-    while (await receive())["type"] != "http.disconnect":
-        pass
-    stream.end(b"")
-
-
-class ReadRoutes:
-    """What is answered to each question.
-
-    Args:
-        ground: what does not change, ``ccatp.report.dashboard.survey_view``.
-    """
-
-    def __init__(self, hub: StateBroadcaster, ground: Mapping[str, Any]) -> None:
-        self._hub, self._ground = hub, ground
-        self._ground_json, self._files = msgspec.json.encode(ground), read_static_files()
-
-    async def page(self, request: Request) -> Response:
-        """The page itself."""
-        return _file(request, self._files["index.html"])
-
-    async def static(self, request: Request) -> Response:
-        """What the page is made of."""
-        found = self._files.get(request.path_params["name"])
-        return _error(404, f"bad endpoint: {request.url.path}") if found is None else _file(request, found)
-
-    async def ground(self, _request: Request) -> Response:
-        """What does not change."""
-        return _json_bytes(self._ground_json)
-
-    async def status(self, _request: Request) -> Response:
-        """The state as a whole."""
-        return _json({"status": "ok", **await self._hub.whole_state()})
-
-    async def healthz(self, _request: Request) -> Response:
-        """Whether all is well."""
-        trouble = self._hub.state()["trouble"]
-        return _error(503, trouble) if trouble else _json({"status": "ok"})
-
-    async def metrics(self, _request: Request) -> Response:
-        """The state in the text format of Prometheus."""
-        text = metrics_text(self._hub.state(), self._ground, self._hub.pages)
-        return Response(text, headers={"content-type": CONTENT_TYPE, "cache-control": "no-store"})
-
-
-class CommandRoutes:
-    """Where commands are taken: from our own page, and with the token if there is one.
-
-    Args:
-        token: that commands have to carry, or ``None``.
-    """
-
-    def __init__(self, desk: CommandEndpoint, token: str | None, note: Note) -> None:
-        self._desk, self._token, self._note = desk, token, note
-
-    async def obey(self, name: OperatorCommand, request: Request) -> Response:
-        """Pass a command on, or say why not."""
-        headers, told = request.headers, {"command": str(name)}
-        told["client"] = request.client.host if request.client is not None else "?"
-        refusal = origin_refusal(headers.get("origin"), headers.get("sec-fetch-site"), headers["host"])
-        if refusal is not None:
-            self._note("page_request_refused", {**told, "why": refusal})
-            return _error(403, refusal)
-        refusal = token_refusal(headers.get("authorization"), self._token)
-        if refusal is not None:
-            self._note("page_request_refused", {**told, "why": refusal})
-            return _error(401, refusal, {"www-authenticate": "Bearer"})
-        answer = await self._desk.ask(name)
-        self._note("page_command", {**told, "refusal": answer.refusal})
-        return _error(answer.http_status, answer.refusal) if answer.refusal else _json({"status": "ok"})
-
-    def route(self, name: OperatorCommand) -> Route:
-        """The way to it for one command."""
-
-        async def obey(request: Request) -> Response:
-            return await self.obey(name, request)
-
-        return Route(f"/{name}", obey, methods=["POST"])
-
-
 def build_app(
     hub: StateBroadcaster,
-    desk: CommandEndpoint,
+    commands: CommandEndpoint,
     ground: Mapping[str, Any],
     *,
     host_names: Collection[str],
@@ -268,47 +140,169 @@ def build_app(
     """The application.
 
     Args:
-        ground: what does not change, ``ccatp.report.dashboard.survey_view``.
-        host_names: under which the page may be asked for, besides localhost and addresses.
-        token: that commands have to carry, or ``None``.
+        ground: what does not change during a run, see ``survey_view.ground``.
+        host_names: names of the page besides localhost and addresses.
+        token: required with commands, unless ``None``.
+        note: writes a line to the log.
     """
-    answers, counter = ReadRoutes(hub, ground), CommandRoutes(desk, token, note)
-    routes = [
-        Route("/", answers.page),
-        Route("/static/{name}", answers.static),
-        Route("/ground", answers.ground),
-        Route("/events", Events(hub)),
-        Route("/status", answers.status),
-        Route("/healthz", answers.healthz),
-        Route("/metrics", answers.metrics),
-        *(counter.route(name) for name in COMMANDS),
-    ]
-    door = Middleware(HostCheckMiddleware, names=host_names)
-    return Starlette(routes=routes, middleware=[door], exception_handlers={HTTPException: _refused})
+    static = StaticFiles(directory=STATIC)
+    ground_json = msgspec.json.encode(ground)
+    registry = CollectorRegistry()
+    registry.register(StateCollector(hub, ground))
+
+    async def page(request: Request) -> Response:
+        return await static.get_response("index.html", request.scope)
+
+    async def send_ground(_request: Request) -> Response:
+        return Response(ground_json, media_type="application/json")
+
+    async def events(_request: Request) -> Response:
+        return StreamingResponse(_payloads(hub), media_type="text/event-stream", headers={"x-accel-buffering": "no"})
+
+    async def status(_request: Request) -> Response:
+        return _json({"status": "ok", **await hub.whole_state()})
+
+    async def healthz(_request: Request) -> Response:
+        trouble = hub.state()["trouble"]
+        return _error(503, trouble) if trouble else _json({"status": "ok"})
+
+    async def metrics(_request: Request) -> Response:
+        return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)
+
+    def command_route(name: OperatorCommand) -> Route:
+        async def run(request: Request) -> Response:
+            fields = {"command": str(name), "client": request.client.host if request.client is not None else "?"}
+            if (refused := command_refusal(request.headers, token)) is not None:
+                note("refused", {**fields, "why": refused.message})
+                headers = {"www-authenticate": "Bearer"} if refused.http_status == 401 else {}
+                return _error(*refused, headers)
+            answer = await commands.ask(name)
+            note("command", {**fields, "refusal": answer.refusal})
+            return _error(*answer) if answer.refusal else _json({"status": "ok"})
+
+        return Route(f"/{name}", run, methods=["POST"])
+
+    reads = {"/": page, "/ground": send_ground, "/events": events, "/status": status, "/healthz": healthz,
+             "/metrics": metrics}  # fmt: skip
+    return Starlette(
+        routes=[
+            *(Route(path, answer) for path, answer in reads.items()),
+            *map(command_route, COMMANDS),
+            Mount("/static", static),
+        ],
+        middleware=[Middleware(HostCheckMiddleware, names=host_names)],
+        exception_handlers={HTTPException: _http_error},
+    )
 
 
-async def _refused(request: Request, error: Exception) -> Response:
+async def _payloads(hub: StateBroadcaster) -> AsyncIterator[bytes]:
+    with hub.open() as stream:
+        async for payload in stream:
+            yield payload
+
+
+async def _http_error(request: Request, error: Exception) -> Response:
     code = error.status_code if isinstance(error, HTTPException) else 500
-    wanted = "POST" if request.url.path.strip("/") in COMMANDS else "GET"
-    texts = {404: f"bad endpoint: {request.url.path}", 405: f"method not {wanted}"}
-    headers = {"allow": wanted} if code == 405 else {}
-    return _error(code, texts.get(code, "internal error"), headers)
+    method = "POST" if request.url.path.strip("/") in COMMANDS else "GET"
+    texts = {404: f"bad endpoint: {request.url.path}", 405: f"method not {method}"}
+    return _error(code, texts.get(code, "internal error"), {"allow": method} if code == 405 else {})
 
 
 def _json(data: Mapping[str, Any], code: int = 200, headers: Mapping[str, str] | None = None) -> Response:
-    return _json_bytes(msgspec.json.encode(data) + b"\n", code, headers)
-
-
-def _json_bytes(body: bytes, code: int = 200, headers: Mapping[str, str] | None = None) -> Response:
-    return Response(body, code, {"content-type": "application/json", "cache-control": "no-store", **(headers or {})})
+    return Response(msgspec.json.encode(data) + b"\n", code, headers, media_type="application/json")
 
 
 def _error(code: int, message: str, headers: Mapping[str, str] | None = None) -> Response:
     return _json({"status": "error", "message": message}, code, headers)
 
 
-def _file(request: Request, file: StaticFile) -> Response:
-    headers = {"content-type": file.media_type, "cache-control": "no-cache", "etag": file.etag}
-    if request.headers.get("if-none-match") == file.etag:
-        return Response(status_code=304, headers={"etag": file.etag, "cache-control": "no-cache"})
-    return Response(file.body, headers=headers)
+class LimitedProtocol(H11Protocol):
+    """A connection with limits: beyond ``max_connections`` a new one is closed, the open ones stay.
+
+    One that for ``slow_client_s`` has sent no complete request, or accepted nothing of an answer, is closed, too.
+    uvicorn's ``limit_concurrency`` does not fit: at the limit it answers 503 on the open connections as well.
+    """
+
+    max_connections: ClassVar[int]
+    slow_client_s: ClassVar[float]
+    _timeout: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Close it if it is one too many."""
+        if len(self.connections) >= self.max_connections:
+            transport.abort()
+            return
+        transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+        super().connection_made(transport)
+        self._limit(True)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Also called for a connection that was one too many."""
+        self._limit(False)
+        if self.transport is not None:
+            super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Part of a request; the time runs until it is complete, uvicorn's keep-alive limit between requests."""
+        super().data_received(data)
+        if self.headers and not self.cycle.response_complete:
+            if not self.flow.write_paused:
+                self._limit(False)
+        elif self._timeout is None:
+            self._limit(True)
+
+    def pause_writing(self) -> None:
+        """The client accepts nothing."""
+        super().pause_writing()
+        self._limit(True)
+
+    def resume_writing(self) -> None:
+        """The client has accepted something."""
+        super().resume_writing()
+        self._limit(False)
+
+    def _limit(self, is_limited: bool) -> None:
+        if self._timeout is not None:
+            self._timeout.cancel()
+        self._timeout = self.loop.call_later(self.slow_client_s, self.transport.abort) if is_limited else None
+
+
+class _Server(uvicorn.Server):
+    """Without handlers of signals, which are those of the process."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+async def serve(app: ASGIApp, listener: socket.socket, cfg: DashboardConfig, stop: asyncio.Event) -> None:
+    """Serve at a listening socket until ``stop`` is set, then end within ``GRACE_S`` and close the socket."""
+
+    class Protocol(LimitedProtocol):
+        max_connections, slow_client_s = cfg.max_connections, cfg.slow_client_s
+
+    logging.getLogger("uvicorn.access").disabled = True
+    config = uvicorn.Config(
+        app,
+        http=Protocol,
+        ws="none",
+        loop="none",
+        lifespan="off",
+        log_config=None,
+        access_log=False,
+        proxy_headers=False,
+        server_header=False,
+        timeout_keep_alive=KEEP_ALIVE_S,
+        timeout_graceful_shutdown=GRACE_S,
+        h11_max_incomplete_event_size=MAX_REQUEST_BYTES,
+    )
+    server = _Server(config)
+
+    async def end() -> None:
+        await stop.wait()
+        server.should_exit = True
+
+    async with asyncio.TaskGroup() as tasks:
+        ending = tasks.create_task(end())
+        await server.serve(sockets=[listener])
+        ending.cancel()

@@ -1,109 +1,94 @@
-"""The state of a run in the text format that Prometheus reads (exposition format 0.0.4)."""
+"""The state of a run as metrics of Prometheus."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from math import sqrt
+from typing import Any, Protocol
+
+from prometheus_client import Metric
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+from prometheus_client.registry import Collector
 
 import ccatp
 
-CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-Labels = tuple[tuple[str, str], ...]
-Sample = tuple[Labels, float]
-_ESCAPES = str.maketrans({"\\": r"\\", '"': r"\"", "\n": r"\n"})
+State = Mapping[str, Any]
+Samples = Iterable[tuple[str, float | None]]
+# Name, help, part of the state, value; left out while that part is not known.
+GAUGES: tuple[tuple[str, str, str, Callable[[Any], float | None]], ...] = (
+    ("elapsed_seconds", "Of the mission, by the robot's clock.", "mission", lambda m: m["elapsed_s"]),
+    ("remaining_seconds", "Estimated time to the end of the mission.", "mission", lambda m: m["eta_s"]),
+    ("frame_lag_seconds", "Lateness of the last late frame.", "mission", lambda m: 1e-3 * m["lag_ms"]),
+    ("event_code", "Event code: 0 normal, 1 near the edge, 2 aborted.", "verdict", lambda v: v["code"]),
+    ("severity", "Severity of the cause, 0 none to 6 fault.", "verdict", lambda v: v["severity"]),
+    ("battery_charge_ratio", "Charge of the robot's battery, 0 to 1.", "robot", lambda r: r["charge"]),
+    ("wheels_held", "1 when the robot holds its wheels by its own rules.", "robot", lambda r: r["is_held"]),
+    ("drive_age_seconds", "Age of the drive in force, by the robot.", "robot", lambda r: r["drive_age_s"]),
+    ("permit_age_seconds", "Age of the permit in force, by the robot.", "robot", lambda r: r["permit_age_s"]),
+    ("robot_faults", "Faults that the robot reports.", "robot", lambda r: len(r["faults"])),
+    ("position_sigma_meters", "Root of the summed variances of x and y.", "pose", lambda p: _sigma_m(**p)),
+)  # fmt: skip
+POINT_COUNTS = {"planned": "total", "measured": "done", "skipped": "skipped"}
 
 
-class _Page:
-    """Metrics, one after the other; one without a sample is left out."""
+class StateSource(Protocol):
+    """The part of ``StateBroadcaster`` that is measured."""
 
-    def __init__(self) -> None:
-        self.lines: list[str] = []
+    @property
+    def pages(self) -> int:
+        """Open pages."""
 
-    def put(self, name: str, kind: str, help_text: str, samples: Iterable[Sample]) -> None:
-        rows = [f"ccatp_{name}{_labels(labels)} {_number(value)}" for labels, value in samples]
-        if rows:
-            self.lines += [f"# HELP ccatp_{name} {help_text}", f"# TYPE ccatp_{name} {kind}", *rows]
-
-    def gauge(self, name: str, help_text: str, value: float | None) -> None:
-        self.put(name, "gauge", help_text, [] if value is None else [((), value)])
+    def state(self) -> State:
+        """``RunStateView.status_data`` now."""
 
 
-def metrics_text(state: Mapping[str, Any], ground: Mapping[str, Any], pages: int) -> str:
-    """The metrics.
+class StateCollector(Collector):
+    """Collects the metrics of a run at each request; ``ground`` is that of the page."""
 
-    Args:
-        state: ``View.status_data``.
-        ground: of the page: its title, and the states that the mission may have.
-    """
-    page = _Page()
-    info = (
-        ("mirror", str(ground["title"])),
-        ("simulation", str(state["is_sim"]).lower()),
-        ("version", ccatp.__version__),
-    )
-    page.put("info", "gauge", "What runs.", [(info, 1.0)])
-    page.gauge("up", "1 when the run is well: both loops speak, and the robot sends frames.", not state["trouble"])
-    _put_links(page, state)
-    if (mission := state["mission"]) is not None:
-        _put_mission(page, mission, ground["states"])
-    if (verdict := state["verdict"]) is not None:
-        page.gauge("event_code", "Event code: 0 normal, 1 near the edge, 2 aborted.", verdict["code"])
-        page.gauge("severity", "Severity of what gave cause, 0 none to 6 fault.", verdict["severity"])
-    if (robot := state["robot"]) is not None:
-        _put_robot(page, robot)
-    if (pose := state["pose"]) is not None:
-        xx, _, yy = pose["covariance_m2"]
-        page.gauge("position_sigma_meters", "Root of the summed variances of x and y.", max(xx + yy, 0.0) ** 0.5)
-    page.gauge("dashboard_pages", "Open pages.", pages)
-    return "\n".join(page.lines) + "\n"
+    def __init__(self, hub: StateSource, ground: Mapping[str, Any]) -> None:
+        self._hub, self._ground = hub, ground
 
+    def collect(self) -> Iterator[Metric]:
+        """All metrics that have a value."""
+        return (metric for metric in self._all(self._hub.state()) if metric.samples)
 
-def _put_links(page: _Page, state: Mapping[str, Any]) -> None:
-    links = state["links"]
-    page.put(
-        "link_up",
-        "gauge",
-        "1 when that end is heard.",
-        [((("link", link["name"]),), float(link["is_well"])) for link in links],
-    )
-    page.put(
-        "link_age_seconds",
-        "gauge",
-        "Since the last word of that end.",
-        [((("link", link["name"]),), link["age_s"]) for link in links if link["age_s"] is not None],
-    )
-    restarts = [((("process", name),), count) for name, count in state["restarts"].items()]
-    page.put("process_restarts_total", "counter", "Times a process was started anew, as seen from here.", restarts)
+    def _all(self, state: State) -> Iterator[Metric]:
+        info = GaugeMetricFamily("ccatp_info", "What runs.", labels=("mirror", "simulation", "version"))
+        info.add_metric((str(self._ground["title"]), str(state["is_sim"]).lower(), ccatp.__version__), 1.0)
+        yield info
+        up = not state["trouble"]
+        yield _gauge("up", "1 when both loops report and the robot sends frames.", [("", up)])
+        yield _gauge("dashboard_pages", "Open pages.", [("", self._hub.pages)])
+        links = state["links"]
+        yield _gauge("link_up", "1 when that end reports.", [(link["name"], link["is_well"]) for link in links], "link")
+        ages = [(link["name"], link["age_s"]) for link in links]
+        yield _gauge("link_age_seconds", "Since the last message of that end.", ages, "link")
+        restarts = CounterMetricFamily(
+            "ccatp_process_restarts", "Restarts of a process that the dashboard has seen.", labels=("process",)
+        )
+        for process, count in state["restarts"].items():
+            restarts.add_metric((process,), count)
+        yield restarts
+        for name, text, part, value_of in GAUGES:
+            if state[part] is not None:
+                yield _gauge(name, text, [("", value_of(state[part]))])
+        if (mission := state["mission"]) is not None:
+            states = [(known, known == mission["state"]) for known in self._ground["states"]]
+            yield _gauge("mission_state", "1 for the state of the mission.", states, "state")
+            counts = [(name, mission[key]) for name, key in POINT_COUNTS.items()]
+            yield _gauge("points", "Measurement points, or waypoints.", counts, "state")
+            yield CounterMetricFamily("ccatp_late_frames", "Frames that were served late.", value=mission["slips"])
+        if (robot := state["robot"]) is not None:
+            fans = zip(("left", "right"), robot["fans"], strict=True)
+            yield _gauge("fan_duty_ratio", "Duty of the fans, as the robot echoes it, 0 to 1.", fans, "side")
 
 
-def _put_mission(page: _Page, mission: Mapping[str, Any], known: Sequence[str]) -> None:
-    states = [((("state", state),), float(state == mission["state"])) for state in known]
-    page.put("mission_state", "gauge", "1 for the state of the mission.", states)
-    counts = [((("state", name),), mission[key]) for name, key in _COUNTS.items()]
-    page.put("points", "gauge", "Measurement points, or waypoints.", counts)
-    page.gauge("elapsed_seconds", "Of the mission, by the robot's clock.", mission["elapsed_s"])
-    page.gauge("remaining_seconds", "Estimate of what is left.", mission["eta_s"])
-    page.put("late_frames_total", "counter", "Frames that were served late.", [((), mission["missed_deadlines"])])
-    page.gauge("frame_lag_seconds", "How late the latest of them was.", 1e-3 * mission["worst_lateness_ms"])
+def _gauge(name: str, text: str, samples: Samples, label: str = "") -> Metric:
+    gauge = GaugeMetricFamily(f"ccatp_{name}", text, labels=(label,) if label else ())
+    for value_of_label, value in samples:
+        if value is not None:
+            gauge.add_metric((value_of_label,) if label else (), float(value))
+    return gauge
 
 
-_COUNTS = {"planned": "total", "measured": "done", "skipped": "skipped"}
-
-
-def _put_robot(page: _Page, robot: Mapping[str, Any]) -> None:
-    page.gauge("battery_charge_ratio", "Charge of the robot's battery, 0 to 1.", robot["charge"])
-    fans = [((("side", side),), duty) for side, duty in zip(("left", "right"), robot["fans"], strict=True)]
-    page.put("fan_duty_ratio", "gauge", "Duty of the fans, as the robot echoes it, 0 to 1.", fans)
-    page.gauge("wheels_held", "1 when the robot holds its wheels by its own rules.", robot["is_held"])
-    page.gauge("drive_age_seconds", "Age of the drive in force, by the robot.", robot["drive_age_s"])
-    page.gauge("permit_age_seconds", "Age of the permit in force, by the robot.", robot["permit_age_s"])
-    page.gauge("robot_faults", "Faults that the robot reports.", len(robot["faults"]))
-
-
-def _labels(labels: Labels) -> str:
-    if not labels:
-        return ""
-    return "{" + ",".join(f'{name}="{value.translate(_ESCAPES)}"' for name, value in labels) + "}"
-
-
-def _number(value: float) -> str:
-    number = float(value)
-    return str(int(number)) if number.is_integer() and abs(number) < 1e15 else repr(number)
+def _sigma_m(covariance_m2: tuple[float, float, float], **_: float) -> float:
+    xx, _xy, yy = covariance_m2
+    return sqrt(max(xx + yy, 0.0))

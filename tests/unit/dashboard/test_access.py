@@ -2,7 +2,7 @@
 
 import pytest
 
-from ccatp.report.dashboard.access import host_refusal, origin_refusal, token_refusal
+from ccatp.report.dashboard.access import command_refusal, host_refusal
 
 TOKEN = "0123456789abcdef0123456789abcdef"
 
@@ -29,35 +29,55 @@ def test_what_is_no_host(host: str | None) -> None:
     assert host_refusal(host, []) == "the Host header is missing or no host"
 
 
-@pytest.mark.parametrize(
-    ("origin", "site"),
-    [(None, None), ("http://127.0.0.1:7080", "same-origin"), ("https://127.0.0.1:7080", None), (None, "none")],
-)
-def test_our_own_page_and_programs_command(origin: str | None, site: str | None) -> None:
-    assert origin_refusal(origin, site, "127.0.0.1:7080") is None
+HOST = {"host": "127.0.0.1:7080"}
+SITE = "sec-fetch-site"
 
 
 @pytest.mark.parametrize(
-    ("origin", "site", "why"),
+    "headers",
     [
-        ("http://evil.example", None, "commands from pages of http://evil.example are not taken"),
-        ("null", None, "commands from pages of null are not taken"),
-        ("http://127.0.0.1:9999", None, "commands from pages of http://127.0.0.1:9999 are not taken"),
-        ("http://127.0.0.1:7080.evil.org", None, "commands from pages of http://127.0.0.1:7080.evil.org are not taken"),
-        (None, "cross-site", "commands from pages of other sites (cross-site) are not taken"),
-        ("http://127.0.0.1:7080", "same-site", "commands from pages of other sites (same-site) are not taken"),
+        {},
+        {"origin": "http://127.0.0.1:7080", SITE: "same-origin"},
+        {"origin": "https://127.0.0.1:7080"},
+        {SITE: "none"},
     ],
-)  # fmt: skip
-def test_pages_of_others_do_not_command(origin: str | None, site: str | None, why: str) -> None:
-    assert origin_refusal(origin, site, "127.0.0.1:7080") == why
+)
+def test_the_own_page_and_programs_command(headers: dict[str, str]) -> None:
+    assert command_refusal(HOST | headers, None) is None
 
 
-def test_the_token() -> None:
-    assert token_refusal(None, None) is None
-    assert token_refusal(f"Bearer {TOKEN}", TOKEN) is None
-    assert token_refusal(f"bearer  {TOKEN} ", TOKEN) is None
-    for none in (None, "", TOKEN, f"Basic {TOKEN}"):
-        refusal = token_refusal(none, TOKEN)
-        assert refusal == "commands need the token of dashboard.token_file: Authorization: Bearer TOKEN"
-    for wrong in ("Bearer ", f"Bearer {TOKEN}x", f"Bearer {TOKEN[:-1]}", "Bearer é"):
-        assert token_refusal(wrong, TOKEN) == "the token is not that of dashboard.token_file"
+@pytest.mark.parametrize(
+    ("headers", "why"),
+    [
+        ({"origin": "http://evil.example"}, "commands from pages of http://evil.example are not taken"),
+        ({"origin": "null"}, "commands from pages of null are not taken"),
+        ({"origin": "http://127.0.0.1:9999"}, "commands from pages of http://127.0.0.1:9999 are not taken"),
+        ({"origin": "http://127.0.0.1:7080.evil.org"}, "pages of http://127.0.0.1:7080.evil.org are not taken"),
+        ({SITE: "cross-site"}, "commands from pages of other sites (cross-site) are not taken"),
+        ({"origin": "http://127.0.0.1:7080", SITE: "same-site"}, "other sites (same-site) are not taken"),
+    ],
+)
+def test_pages_of_others_do_not_command(headers: dict[str, str], why: str) -> None:
+    refusal = command_refusal(HOST | headers, None)
+    assert refusal is not None
+    assert refusal.http_status == 403
+    assert refusal.message.endswith(why)
+
+
+@pytest.mark.parametrize(
+    ("authorization", "why"),
+    [
+        *((none, "commands need the token") for none in ("", TOKEN, "bearer", f"Basic {TOKEN}")),
+        *((f"Bearer {wrong}", "the token is not that of") for wrong in ("", f"{TOKEN}x", TOKEN[:-1], "é")),
+    ],
+)
+def test_a_wrong_token(authorization: str, why: str) -> None:
+    refusal = command_refusal(HOST | {"authorization": authorization}, TOKEN)
+    assert refusal is not None
+    assert (refusal.http_status, refusal.message.startswith(why)) == (401, True)
+
+
+@pytest.mark.parametrize("authorization", [f"Bearer {TOKEN}", f"bearer  {TOKEN} "])
+def test_the_token(authorization: str) -> None:
+    assert command_refusal(HOST | {"authorization": authorization}, TOKEN) is None
+    assert command_refusal(HOST, TOKEN) is not None

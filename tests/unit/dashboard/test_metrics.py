@@ -3,15 +3,16 @@
 from typing import Any
 
 import pytest
+from prometheus_client import CollectorRegistry, generate_latest
 
 from ccatp.config.load import load_config
 from ccatp.mirror.mirror import build_mirror
-from ccatp.report.dashboard.metrics import metrics_text
+from ccatp.report.dashboard.metrics import StateCollector
 from ccatp.report.dashboard.survey_view import SurveyView
 from ccatp.survey.state import MissionState
 from tests.unit.dashboard.prometheus import parse
 
-GROUND = {"title": "fyst-m1", "states": [str(state) for state in MissionState]}
+GROUND: dict[str, Any] = {"title": "fyst-m1", "states": [str(state) for state in MissionState]}
 NOTHING: dict[str, Any] = {
     "is_sim": False, "trouble": "main was never heard of", "links": [], "restarts": {"main": 0, "danger": 2},
     "mission": None, "verdict": None, "robot": None, "pose": None,
@@ -35,50 +36,62 @@ ALL: dict[str, Any] = NOTHING | {
 }  # fmt: skip
 
 
-def test_all_of_it() -> None:
-    metrics = parse(metrics_text(ALL, GROUND, 3))
-    values = {name: metric.samples for name, metric in metrics.items()}
-    assert values["ccatp_up"] == {"": 1.0}
-    assert values["ccatp_points"] == {'state="planned"': 693.0, 'state="measured"': 12.0, 'state="skipped"': 1.0}
-    assert values["ccatp_mission_state"]['state="driving"'] == 1.0
-    assert sum(values["ccatp_mission_state"].values()) == 1.0
-    assert values["ccatp_link_up"] == {'link="main loop"': 1.0, 'link="robot"': 0.0}
-    assert values["ccatp_link_age_seconds"] == {'link="main loop"': 0.05}
-    assert values["ccatp_process_restarts_total"] == {'process="main"': 0.0, 'process="danger"': 2.0}
-    assert values["ccatp_fan_duty_ratio"] == {'side="left"': 0.8, 'side="right"': 0.75}
-    assert values["ccatp_position_sigma_meters"][""] == pytest.approx(0.005)
-    assert values["ccatp_frame_lag_seconds"] == {"": 0.021}
-    assert values["ccatp_wheels_held"] == {"": 1.0}
-    assert values["ccatp_dashboard_pages"] == {"": 3.0}
-    assert metrics["ccatp_late_frames_total"].kind == "counter"
+class Hub:
+    """A state, and open pages."""
+
+    def __init__(self, state: dict[str, Any], pages: int) -> None:
+        self._state, self.pages = state, pages
+
+    def state(self) -> dict[str, Any]:
+        return self._state
 
 
-def test_what_is_not_known_is_left_out() -> None:
-    metrics = parse(metrics_text(NOTHING, GROUND, 0))
+def metrics_of(state: dict[str, Any], pages: int = 0, **ground: Any) -> dict[str, dict[tuple[str, ...], float]]:
+    registry = CollectorRegistry()
+    registry.register(StateCollector(Hub(state, pages), GROUND | ground))
+    return parse(generate_latest(registry).decode())
+
+
+def test_all_metrics() -> None:
+    found = metrics_of(ALL, 3)
+    assert sum(found.pop("ccatp_mission_state").values()) == 1.0
+    (mirror, simulation, _) = next(iter(found.pop("ccatp_info")))
+    assert (mirror, simulation) == ("fyst-m1", "false")
+    assert found.pop("ccatp_position_sigma_meters")[()] == pytest.approx(0.005)
+    assert found == {
+        "ccatp_up": {(): 1.0},
+        "ccatp_points": {("planned",): 693.0, ("measured",): 12.0, ("skipped",): 1.0},
+        "ccatp_link_up": {("main loop",): 1.0, ("robot",): 0.0},
+        "ccatp_link_age_seconds": {("main loop",): 0.05},
+        "ccatp_process_restarts_total": {("main",): 0.0, ("danger",): 2.0},
+        "ccatp_elapsed_seconds": {(): 61.5},
+        "ccatp_remaining_seconds": {(): 3000.0},
+        "ccatp_late_frames_total": {(): 2.0},
+        "ccatp_frame_lag_seconds": {(): 0.021},
+        "ccatp_event_code": {(): 1.0},
+        "ccatp_severity": {(): 2.0},
+        "ccatp_battery_charge_ratio": {(): 0.93},
+        "ccatp_fan_duty_ratio": {("left",): 0.8, ("right",): 0.75},
+        "ccatp_wheels_held": {(): 1.0},
+        "ccatp_drive_age_seconds": {(): 0.01},
+        "ccatp_permit_age_seconds": {(): 0.02},
+        "ccatp_robot_faults": {(): 1.0},
+        "ccatp_dashboard_pages": {(): 3.0},
+    }
+
+
+def test_unknown_values_are_left_out() -> None:
+    metrics = metrics_of(NOTHING)
     assert set(metrics) == {"ccatp_info", "ccatp_up", "ccatp_process_restarts_total", "ccatp_dashboard_pages"}
-    assert metrics["ccatp_up"].samples == {"": 0.0}
+    assert metrics["ccatp_up"] == {(): 0.0}
 
 
-def test_a_name_with_everything_that_has_to_be_escaped() -> None:
-    labels = next(iter(parse(metrics_text(NOTHING, GROUND | {"title": 'a"b\\c\nd'}, 0))["ccatp_info"].samples))
-    assert labels.startswith(r'mirror="a\"b\\c\nd",')
+def test_a_name_is_escaped() -> None:
+    title = 'a"b\\c\nd'
+    assert next(iter(metrics_of(NOTHING, title=title)["ccatp_info"]))[0] == title
 
 
 def test_the_state_of_a_real_view() -> None:
     cfg = load_config(None, {"run.panels": 1})
     view = SurveyView(build_mirror(cfg.mirror), cfg, is_sim=True)
-    assert parse(metrics_text(view.status_data(1.0), GROUND, 0))["ccatp_up"].samples == {"": 0.0}
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "x 1", "x 1\n", "# TYPE x gauge\nx 1\n", "# HELP x y\n# TYPE x gauge\nx one\n",
-        "# HELP x y\n# TYPE x gauge\ny 1\n", '# HELP x y\n# TYPE x gauge\nx{a="b} 1\n',
-        "# HELP x y\n# TYPE x gauge\nx 1\nx 1\n", "# HELP x y\n# TYPE x counter\nx 1\n",
-        "# HELP x y\n# TYPE x thing\nx 1\n", "# HELP x y\n# TYPE x gauge\n",
-    ],
-)  # fmt: skip
-def test_the_reader_is_strict(text: str) -> None:
-    with pytest.raises(ValueError, match=r"help|type|sample|twice|counter|line|float"):
-        parse(text)
+    assert metrics_of(view.status_data(1.0))["ccatp_up"] == {(): 0.0}
