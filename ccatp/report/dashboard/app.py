@@ -173,11 +173,11 @@ def build_app(
         async def run(request: Request) -> Response:
             fields = {"command": str(name), "client": request.client.host if request.client is not None else "?"}
             if (refused := command_refusal(request.headers, token)) is not None:
-                note("refused", {**fields, "why": refused.message})
+                note("page_request_refused", {**fields, "why": refused.message})
                 headers = {"www-authenticate": "Bearer"} if refused.http_status == 401 else {}
                 return _error(*refused, headers)
             answer = await commands.ask(name)
-            note("command", {**fields, "refusal": answer.refusal})
+            note("page_command", {**fields, "refusal": answer.refusal})
             return _error(*answer) if answer.refusal else _json({"status": "ok"})
 
         return Route(f"/{name}", run, methods=["POST"])

@@ -16,7 +16,7 @@ Samples = Iterable[tuple[str, float | None]]
 GAUGES: tuple[tuple[str, str, str, Callable[[Any], float | None]], ...] = (
     ("elapsed_seconds", "Of the mission, by the robot's clock.", "mission", lambda m: m["elapsed_s"]),
     ("remaining_seconds", "Estimated time to the end of the mission.", "mission", lambda m: m["eta_s"]),
-    ("frame_lag_seconds", "Lateness of the last late frame.", "mission", lambda m: 1e-3 * m["lag_ms"]),
+    ("frame_lag_seconds", "Lateness of the last late frame.", "mission", lambda m: 1e-3 * m["worst_lateness_ms"]),
     ("event_code", "Event code: 0 normal, 1 near the edge, 2 aborted.", "verdict", lambda v: v["code"]),
     ("severity", "Severity of the cause, 0 none to 6 fault.", "verdict", lambda v: v["severity"]),
     ("battery_charge_ratio", "Charge of the robot's battery, 0 to 1.", "robot", lambda r: r["charge"]),
@@ -75,7 +75,9 @@ class StateCollector(Collector):
             yield _gauge("mission_state", "1 for the state of the mission.", states, "state")
             counts = [(name, mission[key]) for name, key in POINT_COUNTS.items()]
             yield _gauge("points", "Measurement points, or waypoints.", counts, "state")
-            yield CounterMetricFamily("ccatp_late_frames", "Frames that were served late.", value=mission["slips"])
+            yield CounterMetricFamily(
+                "ccatp_late_frames", "Frames that were served late.", value=mission["missed_deadlines"]
+            )
         if (robot := state["robot"]) is not None:
             fans = zip(("left", "right"), robot["fans"], strict=True)
             yield _gauge("fan_duty_ratio", "Duty of the fans, as the robot echoes it, 0 to 1.", fans, "side")
