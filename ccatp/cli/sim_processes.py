@@ -11,7 +11,7 @@ from pathlib import Path
 from ccatp.config.load import dump_config
 from ccatp.config.models import Config
 from ccatp.config.package import child_environment
-from ccatp.daemon.child_processes import ENVIRONMENT, listen, places_of, with_addresses
+from ccatp.daemon.child_processes import ENVIRONMENT, listen, simulator_addresses, with_addresses
 from ccatp.daemon.process import SUPERVISOR_PID
 from ccatp.daemon.supervisor import PROCESSES
 
@@ -28,12 +28,12 @@ def stand_ins(cfg: Config) -> Iterator[Config]:
     Raises:
         ConfigError: they cannot listen.
     """
-    processes = [process for process in PROCESSES if process.is_stand_in]
+    processes = [process for process in PROCESSES if process.is_simulator]
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ccatp-")))
         any_port = {part: getattr(cfg.sim, part).model_copy(update={"port": 0}) for part in ("robot", "etalon")}
         cfg = cfg.model_copy(update={"sim": cfg.sim.model_copy(update=any_port)})
-        places = places_of(cfg)
+        places = simulator_addresses(cfg)
         sockets = {p.name: stack.enter_context(listen(p.listens, *places[p.listens])) for p in processes}
         cfg = with_addresses(cfg, sockets)
         (folder / "config.toml").write_text(dump_config(cfg), encoding="utf-8")

@@ -30,7 +30,15 @@ from ccatp.beacons.steering import HALT
 from ccatp.beacons.store import BeaconStore
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import Verdict
-from ccatp.daemon.mission_runner import STILL, DriveCommand, MakeWork, Progress, RunnerConfig, RunnerContext, TimedFrame
+from ccatp.daemon.mission_runner import (
+    STILL,
+    DriveCommand,
+    Progress,
+    RunnerConfig,
+    RunnerContext,
+    RunnerFactory,
+    TimedFrame,
+)
 from ccatp.daemon.process import BeaconArgs
 from ccatp.daemon.telemetry import DisplayStatePublisher, PoseSnapshot, TelemetryPublisher
 from ccatp.errors import ExitStatus
@@ -67,14 +75,16 @@ class BeaconTelemetry(TelemetryPublisher):
     ) -> None:
         super().__init__(publisher, log)
         self._cfg, self._mission = cfg, mission
-        self._painter = DisplayStatePublisher(publisher, look_at_navigator)
+        self._display = DisplayStatePublisher(publisher, navigator_pose)
         self._track: list[TrackRow] = []
         self._echoes: deque[tuple[float, float]] = deque(maxlen=ECHO_MEMORY)
         self._trail: deque[tuple[float, float]] = deque(maxlen=TRAIL)
         self._distances: list[float] = []
         self._map_due_s = 0.0
 
-    def frame(self, seq: int, t_s: float, raw: bytes, distances_m: tuple[float, ...], *, is_first: bool) -> None:
+    def publish_frame(
+        self, seq: int, t_s: float, raw: bytes, distances_m: tuple[float, ...], *, is_first: bool
+    ) -> None:
         """Keep the estimate after frame ``seq`` and its line; publish the estimate and the map where they are due.
 
         Args:
@@ -83,7 +93,7 @@ class BeaconTelemetry(TelemetryPublisher):
         """
         self.seq, self.t_s = seq, t_s
         navigator = self._mission.navigator
-        self._painter.sees(navigator, raw)
+        self._display.update(navigator, raw)
         belief = navigator.belief
         x_m, y_m, heading_rad = belief.pose
         if is_first or is_estimate_due(seq):
@@ -97,8 +107,8 @@ class BeaconTelemetry(TelemetryPublisher):
         self._track.append(track_row(seq + self._frames_before, t_s, navigator))
         if t_s >= self._map_due_s:
             self._map_due_s = t_s + self._cfg.mission.map_period_s
-            self.tell_map()
-        self.keep(raw)
+            self.publish_map()
+        self.add_line(raw)
 
     def _see(self, pose: tuple[float, float, float], distances_m: tuple[float, ...]) -> None:
         self._distances = list(distances_m)
@@ -110,7 +120,7 @@ class BeaconTelemetry(TelemetryPublisher):
                 course = pose[2] + angle
                 self._echoes.append((pose[0] + distance_m * cos(course), pose[1] + distance_m * sin(course)))
 
-    def tell_map(self) -> None:
+    def publish_map(self) -> None:
         """Publish the map, and the same as a scene for displays."""
         cfg, mission, seq, t_s = self._cfg, self._mission, self.seq, self.t_s
         navigator = mission.navigator
@@ -156,12 +166,12 @@ class BeaconTelemetry(TelemetryPublisher):
         )
         return shapes
 
-    def status(self, message: MissionStatus) -> None:
+    def publish_status(self, message: MissionStatus) -> None:
         """Publish the mission's status, and a picture of all that is newest for whoever looks on."""
-        super().status(message)
-        self._painter.tell_if_wanted(self.seq, self.t_s)
+        super().publish_status(message)
+        self._display.publish_if_subscribed(self.seq, self.t_s)
 
-    def arrival(self, arrival: WaypointArrival) -> None:
+    def publish_arrival(self, arrival: WaypointArrival) -> None:
         """A waypoint is reached in the present frame."""
         message = BeaconArrival(
             seq=self.seq + self._frames_before,
@@ -183,8 +193,8 @@ def _kind(name: str, cfg: RadioConfig) -> tuple[str]:
     return ("target" if cfg.follow.is_active and name == cfg.follow.target else "beacon",)
 
 
-def look_at_navigator(navigator: Navigator) -> PoseSnapshot:
-    """The pose among beacons; how readings agree is told with the map, as a sum over many of them."""
+def navigator_pose(navigator: Navigator) -> PoseSnapshot:
+    """The pose among beacons; how readings agree is commands with the map, as a sum over many of them."""
     belief = navigator.belief
     x_m, y_m, *covariance = belief.ellipse
     xx, xy, yy = covariance
@@ -209,23 +219,23 @@ class BeaconRunner:
 
     is_busy = False  # it waits for nobody
 
-    def __init__(self, cfg: RadioConfig, host: RunnerContext, mission: BeaconMission, store: BeaconStore) -> None:
-        self._cfg, self._host, self._mission, self._store = cfg, host, mission, store
+    def __init__(self, cfg: RadioConfig, context: RunnerContext, mission: BeaconMission, store: BeaconStore) -> None:
+        self._cfg, self._context, self._mission, self._store = cfg, context, mission, store
         self._reader = MeasurementReader(cfg)
-        self._teller = BeaconTelemetry(host.publisher, host.log, cfg, mission)
-        self._senses: BeaconMeasurements | None = None
+        self._telemetry = BeaconTelemetry(context.publisher, context.log, cfg, mission)
+        self._measurements: BeaconMeasurements | None = None
         self._speed_m_s = 0.0
         self._state: BeaconState = IDLE
         self._was_faulted = False
-        self._told_arrivals = 0
+        self._published_arrivals = 0
         # An operator's commands are the mission's; so is what holds it.
         self.pause, self.resume, self.abort, self.stop = mission.pause, mission.resume, mission.abort, mission.stop
         self.interrupt = mission.interrupt
 
     @property
-    def teller(self) -> BeaconTelemetry:
+    def telemetry(self) -> BeaconTelemetry:
         """Tells the others."""
-        return self._teller
+        return self._telemetry
 
     @property
     def cause(self) -> str:
@@ -238,8 +248,8 @@ class BeaconRunner:
         return self._mission.is_paused
 
     @property
-    def is_quiet(self) -> bool:
-        """The robot is at rest; its wheels obey within a frame, so what they were told last is what counts."""
+    def is_at_rest(self) -> bool:
+        """The robot is at rest; its wheels obey within a frame, so what they were commands last is what counts."""
         return abs(self._speed_m_s) <= self._cfg.mission.settle_speed_m_s
 
     def progress(self) -> Progress:
@@ -279,84 +289,84 @@ class BeaconRunner:
     def begin_session(self, hello: Hello) -> None:
         """A session begins."""
 
-    def greet(self) -> None:
+    def begin_drives(self) -> None:
         """There are no fans."""
 
-    def lose_sight(self) -> None:
+    def on_tracking_gap(self) -> None:
         """The robot booted, or moved unseen: where it is nobody knows, and its map hangs on that."""
         self._reader.forget()
         self._mission.fault("the robot was out of sight: put it at its start and begin anew")
 
-    def keep(self) -> None:
+    def save_checkpoint(self) -> None:
         """Nobody takes over: the map would have to be kept, too."""
 
-    def settle(self) -> None:
+    def publish_state(self) -> None:
         """Tell a state that is new, and end where that is the end."""
         mission, before, was_faulted = self._mission, self._state, self._was_faulted
         if mission.state is before and mission.is_faulted is was_faulted:
             return
         self._state, self._was_faulted = mission.state, mission.is_faulted
-        self._teller.log.debug("state_changed", seq=self._host.clock.seq, before=before, after=mission.state)
+        self._telemetry.log.debug("state_changed", seq=self._context.clock.seq, before=before, after=mission.state)
         if HELD in (mission.state, before) or mission.state is RETURNING:
             text = f"{mission.state}: {mission.cause}" if mission.cause else f"{mission.state}"
-            self._teller.say("warning", text)
-            self._store.record_event(self._host.clock.t_s, "warning", text)
+            self._telemetry.notify_operator("warning", text)
+            self._store.record_event(self._context.clock.t_s, "warning", text)
         if mission.state is DONE:
-            self._teller.tell_map()
-            self._host.finish(EXIT_STATUS[mission.outcome])
-        elif mission.is_faulted and self._host.seat.is_lockstep:
+            self._telemetry.publish_map()
+            self._context.finish(EXIT_STATUS[mission.outcome])
+        elif mission.is_faulted and self._context.session.is_lockstep:
             # Nobody can be waited for while simulated time runs at many times the wall clock.
-            self._teller.tell_map()
-            self._host.finish(ExitStatus.HELD)
+            self._telemetry.publish_map()
+            self._context.finish(ExitStatus.HELD)
 
-    def note_end(self) -> None:
+    def log_statistics(self) -> None:
         """How consistent it was."""
         score = self._mission.navigator.score
-        self._teller.log.info(
+        self._telemetry.log.info(
             "reading_statistics", nis_sum=score.nis_sum, nis_size=score.nis_size, refused=score.refused
         )
 
     # -- the frame ------------------------------------------------------------------------------------------------
 
-    def listen(self, frame: TimedFrame) -> None:
+    def estimate(self, frame: TimedFrame) -> None:
         """Read the senses of the frame; damaged extra keys are as good as none."""
         try:
             extras = decode_beacon_frame(frame.raw)
         except BadLine as error:
             extras = NOTHING
-            self._teller.log.warning("bad_extra_keys", seq=frame.sensors.seq, error=str(error))
-        self._senses = self._reader.read(frame.sensors, extras)
+            self._telemetry.log.warning("bad_extra_keys", seq=frame.sensors.seq, error=str(error))
+        self._measurements = self._reader.read(frame.sensors, extras)
 
-    def decide(self, frame: TimedFrame, verdict: Verdict | None, _lag_s: float) -> DriveCommand:
+    def plan(self, frame: TimedFrame, verdict: Verdict | None, _lag_s: float) -> DriveCommand:
         """What the mission wants, as far as the verdict permits it."""
         mission = self._mission
-        if self._senses is None:
-            raise RuntimeError("decide comes after listen")
-        drive = mission.step(self._senses, self._host.seat.frame_period_s, verdict)
+        if self._measurements is None:
+            raise RuntimeError("plan comes after estimate")
+        drive = mission.step(self._measurements, self._context.session.frame_period_s, verdict)
         if mission.state is DONE:
             drive = HALT
         self._speed_m_s = drive.speed_m_s
         return DriveCommand(*wheel_rates(drive, self._cfg))
 
-    def stand(self, _frame: TimedFrame) -> DriveCommand:
+    def hold(self, _frame: TimedFrame) -> DriveCommand:
         """The robot stands, and nothing is decided in this frame."""
         self._speed_m_s = 0.0
         return STILL
 
-    def tell(self, frame: TimedFrame) -> None:
+    def publish(self, frame: TimedFrame) -> None:
         """The estimate, arrivals, a state that is new."""
         sensors, mission = frame.sensors, self._mission
-        distances = () if self._senses is None else self._senses.distances_m
-        self._teller.frame(sensors.seq, sensors.t, frame.raw, distances, is_first=frame.is_first)
-        for number in range(self._told_arrivals, len(mission.arrivals)):
+        distances = () if self._measurements is None else self._measurements.distances_m
+        self._telemetry.publish_frame(sensors.seq, sensors.t, frame.raw, distances, is_first=frame.is_first)
+        for number in range(self._published_arrivals, len(mission.arrivals)):
             arrival = mission.arrivals[number]
-            self._teller.arrival(arrival)
+            self._telemetry.publish_arrival(arrival)
             self._store.record_arrival(sensors.t, number, arrival)
-        self._told_arrivals = len(mission.arrivals)
-        self.settle()
+        self._published_arrivals = len(mission.arrivals)
+        self.publish_state()
 
 
-def hosting_of_beacons(cfg: RadioConfig) -> RunnerConfig:
+def beacon_runner_config(cfg: RadioConfig) -> RunnerConfig:
     """What the process needs of the configuration."""
     return RunnerConfig(
         cfg.robot, cfg.processes.realtime_priority, cfg.mission.verdict_timeout_s, 10.0 * cfg.run.step_s,
@@ -365,7 +375,7 @@ def hosting_of_beacons(cfg: RadioConfig) -> RunnerConfig:
 
 
 @contextmanager
-def open_beacons(args: BeaconArgs) -> Iterator[MakeWork]:
+def open_beacons(args: BeaconArgs) -> Iterator[RunnerFactory]:
     """The parts and the database of a mission among beacons; what makes the mission of them."""
     cfg = args.config
     mission = assemble_beacons(cfg)
@@ -373,6 +383,6 @@ def open_beacons(args: BeaconArgs) -> Iterator[MakeWork]:
     meta = {"system": cfg.system, "seed": str(cfg.run.seed)}
     store = BeaconStore(args.run_dir / "mission.sqlite", meta, cfg.workspace.waypoints_m, laps)
     try:
-        yield lambda host: BeaconRunner(cfg, host, mission, store)
+        yield lambda context: BeaconRunner(cfg, context, mission, store)
     finally:
         store.close()

@@ -44,13 +44,13 @@ class CheckpointWriter:
         self.boot = -1
         self._last_fix = "" if before is None else before.last_fix
 
-    def frame(self, seq: int, t_s: float, elapsed_s: float) -> None:
+    def write_if_due(self, seq: int, t_s: float, elapsed_s: float) -> None:
         """A frame was served; now and then it is written down."""
         self._left -= 1
         if self._left <= 0 or self._mission.state is HELD:
-            self.keep(seq, t_s, elapsed_s)
+            self.write(seq, t_s, elapsed_s)
 
-    def keep(self, seq: int, t_s: float, elapsed_s: float) -> None:
+    def write(self, seq: int, t_s: float, elapsed_s: float) -> None:
         """Write down where the robot is and what is in force; the latter for good, if it changed."""
         localizer, mission = self._localizer, self._mission
         self._left = PERIOD_FRAMES

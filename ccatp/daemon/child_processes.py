@@ -29,7 +29,7 @@ FINAL = (ExitStatus.USAGE, ExitStatus.UNREACHABLE)
 # As POSIX and Linux number them; what kills processes here.
 _SIGNALS = {2: "SIGINT", 3: "SIGQUIT", 6: "SIGABRT", 7: "SIGBUS", 9: "SIGKILL", 11: "SIGSEGV", 15: "SIGTERM"}
 # A supervisor that was itself held up for longer than this between two looks has not listened meanwhile.
-LONGEST_LOOK_S = 0.2
+MAX_POLL_GAP_S = 0.2
 
 
 class ProcessEnd(Enum):
@@ -44,7 +44,7 @@ class ProcessEnd(Enum):
 class RestartDecision(NamedTuple):
     """What becomes of the run, and a line for people."""
 
-    fate: ProcessEnd
+    end: ProcessEnd
     text: str
 
 
@@ -99,17 +99,17 @@ class SilenceWatch:
     def __init__(self, start_timeout_s: float, hang_timeout_s: float) -> None:
         self._limit_s, self._hang_timeout_s = start_timeout_s, hang_timeout_s
         self._silent_s = 0.0
-        self._looked_s: float | None = None
+        self._polled_s: float | None = None
 
-    def heard(self) -> None:
+    def reset(self) -> None:
         """It has said something."""
         self._limit_s, self._silent_s = self._hang_timeout_s, 0.0
 
     def is_hung(self, now_s: float) -> bool:
         """Look once more. Time in which the listener itself stood still does not count."""
-        if self._looked_s is not None:
-            self._silent_s += min(max(now_s - self._looked_s, 0.0), LONGEST_LOOK_S)
-        self._looked_s = now_s
+        if self._polled_s is not None:
+            self._silent_s += min(max(now_s - self._polled_s, 0.0), MAX_POLL_GAP_S)
+        self._polled_s = now_s
         return self._silent_s > self._limit_s
 
     @property
@@ -125,7 +125,7 @@ STOP_TIMEOUT_S = 4.0
 LEAST_STOP_S = 1.0
 # A loop that was started anew joins within this.
 RECOVERY_S = 5.0
-Say = Callable[[str, str], None]
+Notify = Callable[[str, str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,23 +134,23 @@ class ProcessSpec:
 
     Attributes:
         module: run with ``python -m``.
-        is_stand_in: runs with ``--sim`` only.
+        is_simulator: runs with ``--sim`` only.
         listens: the configuration section with the host and port of its listening socket, bound by the supervisor.
         is_replaceable: another one can take its place when it dies; the simulated robot has no other.
-        is_loop: it tells its presence, and hangs when it does not.
+        is_loop: it tells its heartbeat, and hangs when it does not.
         is_needed: the survey does not go on without it.
-        patience_s: says nothing for this long before it hangs, where that is not ``run.hang_timeout_s``.
+        hang_timeout_s: says nothing for this long before it hangs, where that is not ``run.hang_timeout_s``.
     """
 
     name: str
     module: str
-    is_stand_in: bool = False
+    is_simulator: bool = False
     listens: str = ""
     is_replaceable: bool = True
     is_loop: bool = False
     is_needed: bool = True
     niceness: int = 0
-    patience_s: float | None = None
+    hang_timeout_s: float | None = None
 
 
 @dataclass(slots=True)
@@ -169,16 +169,16 @@ class ProcessManager:
         cfg: when one hangs, and how often they are started anew.
         command_of: command line of a process, and the file descriptors that it inherits; told whether it takes the
             place of another one.
-        say: tells the operator (level, text).
+        notify_operator: tells the operator (level, text).
     """
 
     def __init__(
         self,
         cfg: ProcessesConfig,
         command_of: Callable[[ProcessSpec, bool], tuple[list[str], tuple[int, ...]]],
-        say: Say,
+        notify_operator: Notify,
     ) -> None:
-        self._cfg, self._command_of, self._say = cfg, command_of, say
+        self._cfg, self._command_of, self._notify_operator = cfg, command_of, notify_operator
         self._policy = RestartPolicy(cfg.restart_limit, cfg.restart_window_s)
         self._children: dict[str, _Child] = {}
         self._is_recovering_until_s = 0.0
@@ -208,17 +208,17 @@ class ProcessManager:
         pidfd = os.pidfd_open(process.pid) if hasattr(os, "pidfd_open") else -1
         if spec.niceness:
             _be_nice(process.pid, spec.niceness)
-        hang_timeout_s = spec.patience_s or self._cfg.hang_timeout_s
+        hang_timeout_s = spec.hang_timeout_s or self._cfg.hang_timeout_s
         watch = SilenceWatch(max(self._cfg.start_timeout_s, hang_timeout_s), hang_timeout_s) if spec.is_loop else None
         self._children[spec.name] = _Child(spec, process, pidfd, watch)
 
-    def heard(self, presence: Heartbeat) -> None:
-        """A process has told its presence; words of one that is dead do not count."""
-        child = self._children.get(presence.process)
-        if child is not None and child.watch is not None and child.process.pid == presence.pid:
-            child.watch.heard()
+    def on_heartbeat(self, heartbeat: Heartbeat) -> None:
+        """A process has told its heartbeat; words of one that is dead do not count."""
+        child = self._children.get(heartbeat.process)
+        if child is not None and child.watch is not None and child.process.pid == heartbeat.pid:
+            child.watch.reset()
 
-    def look(self, now_s: float) -> tuple[str, int, RestartDecision] | None:
+    def poll(self, now_s: float) -> tuple[str, int, RestartDecision] | None:
         """Bury the dead, kill who hangs, and start anew.
 
         Returns:
@@ -240,11 +240,11 @@ class ProcessManager:
                 is_needed=spec.is_needed,
                 why=child.why_killed,
             )
-            if decision.fate not in (ProcessEnd.RESTART, ProcessEnd.WITHOUT):
+            if decision.end not in (ProcessEnd.RESTART, ProcessEnd.WITHOUT):
                 return name, code, decision
-            self._say("warning", decision.text)
+            self._notify_operator("warning", decision.text)
             self._forget(child)
-            if decision.fate is ProcessEnd.WITHOUT:
+            if decision.end is ProcessEnd.WITHOUT:
                 del self._children[name]
                 continue
             self.restarts += 1
@@ -269,7 +269,9 @@ class ProcessManager:
             try:
                 process.wait(max(deadline_s - time.monotonic(), LEAST_STOP_S))
             except subprocess.TimeoutExpired:
-                self._say("error", f"process {name} did not stop within {STOP_TIMEOUT_S:g} s and was killed")
+                self._notify_operator(
+                    "error", f"process {name} did not stop within {STOP_TIMEOUT_S:g} s and was killed"
+                )
                 process.kill()
                 process.wait()
 
@@ -311,7 +313,7 @@ def listen(section: str, host: str, port: int) -> Iterator[socket.socket]:
         yield listener
 
 
-def places_of(cfg: Config) -> dict[str, tuple[str, int]]:
+def simulator_addresses(cfg: Config) -> dict[str, tuple[str, int]]:
     """Where the stand-ins shall listen, (host, port) by the section of the configuration."""
     robot, etalon = cfg.sim.robot, cfg.sim.etalon
     return {"sim.robot": (robot.host, robot.port), "sim.etalon": (etalon.host, etalon.port)}

@@ -48,7 +48,7 @@ ASK_TIMEOUT_S = 1.0
 class DerivedView(Protocol):
     """Where progress is shown."""
 
-    def say(self, level: str, text: str) -> None:
+    def show_message(self, level: str, text: str) -> None:
         """One line for the operator."""
 
     def pose(self, track: TrackMessage) -> None:
@@ -65,7 +65,7 @@ class RunAccess(NamedTuple):
     endpoints: Endpoints
     run_dir: Path
     is_sim: bool
-    on_presence: Callable[[Heartbeat], None]
+    on_heartbeat: Callable[[Heartbeat], None]
 
 
 class Collector(ABC):
@@ -74,7 +74,7 @@ class Collector(ABC):
     def __init__(self, access: RunAccess, metadata: Mapping[str, str]) -> None:
         """Subscribe before anybody publishes."""
         self._context, self._endpoints, self._is_sim = access.context, access.endpoints, access.is_sim
-        self._on_presence = access.on_presence
+        self._on_heartbeat = access.on_heartbeat
         names = ("main", "danger", "dashboard", *(("truth",) if access.is_sim else ()))
         self._subscriber = Subscriber(access.context, [access.endpoints.of(name) for name in names], RECEIVED)
         self._recorder = Recorder(
@@ -87,7 +87,7 @@ class Collector(ABC):
         self._view: DerivedView | None = None
         self._status: MissionStatus | None = None
         self._truth_rows = 0
-        self._has_views = True
+        self._records_views = True
         self.remarks: list[str] = []
 
     # -- of each kind of mission ----------------------------------------------------------------------------------
@@ -151,11 +151,11 @@ class Collector(ABC):
             if isinstance(message, Message):
                 self._take(name, body, message, view)
             received = self._subscriber.receive_raw()
-        self._recorder.tend()
+        self._recorder.flush_if_due()
 
     def _take(self, name: str, body: bytes, message: Message, view: DerivedView | None) -> None:
         if isinstance(message, Heartbeat):
-            self._on_presence(message)
+            self._on_heartbeat(message)
             return
         if name != "timing":
             self._recorder.write(name, max(message.t_s, 0.0), body)
@@ -170,18 +170,18 @@ class Collector(ABC):
 
     def _record_views(self, message: Message) -> None:
         """What viewers get beside the topics; nothing that goes wrong there may end the run."""
-        if not self._has_views:
+        if not self._records_views:
             return
         try:
             for shown in self.views_of(message):
                 self._recorder.write(*shown)
         except Exception as error:  # the raw topics hold all of it
-            self._has_views = False
+            self._records_views = False
             self._on_recorder_failure(f"views for Foxglove and PlotJuggler: {type(error).__name__}: {error}")
 
     def _on_recorder_failure(self, reason: str) -> None:
         if self._view is not None:
-            self._view.say("error", f"{reason}; the survey goes on")
+            self._view.show_message("error", f"{reason}; the survey goes on")
 
     def _collect_until_truth(self, rows: int) -> None:
         for _ in range(int(FINISH_TIMEOUT_S * 100)):
@@ -206,10 +206,10 @@ def _show(message: Message, view: DerivedView) -> None:
     elif isinstance(message, MissionStatus):
         view.status(message)
     elif isinstance(message, LogMessage):
-        view.say(message.level, message.text)
+        view.show_message(message.level, message.text)
     elif isinstance(message, DangerEvent) and message.code:
         text = danger_text(message.cause, message.signal, message.value, message.limit)
-        view.say("warning", f"danger: code {message.code}, {text}, at {message.t_s:.2f} s")
+        view.show_message("warning", f"danger: code {message.code}, {text}, at {message.t_s:.2f} s")
 
 
 class BeaconCollector(Collector):

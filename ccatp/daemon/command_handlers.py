@@ -40,19 +40,19 @@ class OperatorCommandHandler:
     """Hands the commands of an operator to the mission.
 
     Args:
-        say: tells the log and the terminal (level, text).
+        notify_operator: tells the log and the terminal (level, text).
         on_change: called after a command changed the mission.
     """
 
     def __init__(
         self,
         mission: CommandHandler,
-        say: Callable[[str, str], None],
+        notify_operator: Callable[[str, str], None],
         status: Callable[[], MissionStatus],
         settled: Callable[[], Awaitable[None]],
         on_change: Callable[[], None],
     ) -> None:
-        self._mission, self._say, self._status = mission, say, status
+        self._mission, self._notify_operator, self._status = mission, notify_operator, status
         self._settled, self._on_change = settled, on_change
 
     async def handle(self, frame: bytes) -> bytes:
@@ -63,10 +63,10 @@ class OperatorCommandHandler:
             return format_error(str(error))
         if command is OperatorCommand.STATUS:
             return format_ok(status=msgspec.to_builtins(self._status()))
-        refusal = self._obey(command)
+        refusal = self._apply(command)
         if refusal is not None:
             return format_error(refusal)
-        self._say("info", f"operator: {command}")
+        self._notify_operator("info", f"operator: {command}")
         self._on_change()
         try:
             if command in (OperatorCommand.PAUSE, OperatorCommand.STOP):
@@ -76,7 +76,7 @@ class OperatorCommandHandler:
             return format_error(f"{command}: accepted, but the robot is not at rest after {EFFECT_TIMEOUT_S:.0f} s")
         return format_ok(status=msgspec.to_builtins(self._status()))
 
-    def _obey(self, command: OperatorCommand) -> str | None:
+    def _apply(self, command: OperatorCommand) -> str | None:
         if command is OperatorCommand.PAUSE:
             return self._mission.pause(CAUSE)
         if command is OperatorCommand.RESUME:
@@ -94,7 +94,7 @@ LOGGED_LINES, LOGGED_PERIOD_S = 10, 60.0
 
 
 class EmergencyReceiver(EmergencyHandler, Protocol):
-    """What is asked and told; ``ccatp.danger.DangerMonitor`` is one."""
+    """What is asked and answer; ``ccatp.danger.DangerMonitor`` is one."""
 
     @property
     def at_base_or_held(self) -> bool:
@@ -124,25 +124,25 @@ class EmergencyCommandHandler:
             age_s=self._age_s(),
             may_clear=client.role is Role.CLEAR,
         )
-        told = parse_reply(reply)
-        if not told["ok"]:
-            self.refuse(client.name, told["error"])
-        elif "id" in told:
+        answer = parse_reply(reply)
+        if not answer["ok"]:
+            self.log_refusal(client.name, answer["error"])
+        elif "id" in answer:
             left_out = self._accepted.take(time.monotonic())
             if left_out is not None:
                 text = frame.decode("utf-8", "replace")
                 self._log.warning(
-                    "observatory_request", client=client.name, request=text, code=told["code"], left_out=left_out
+                    "observatory_request", client=client.name, request=text, code=answer["code"], left_out=left_out
                 )
         return reply
 
-    def refuse(self, client: str, why: str) -> None:
+    def log_refusal(self, client: str, why: str) -> None:
         """Note that somebody was refused."""
         left_out = self._refused.take(time.monotonic())
         if left_out is not None:
             self._log.warning("observatory_refused", client=client, why=why, left_out=left_out)
 
-    def note(self, text: str, **fields: object) -> None:
+    def log_event(self, text: str, **fields: object) -> None:
         """A line for the log."""
         self._log.info(text, **fields)
 
@@ -154,8 +154,8 @@ class ObservatoryServer:
         ConfigError: the keys or the list of clients cannot be used.
     """
 
-    def __init__(self, local_endpoint: str, cfg: ObservatoryConfig, desk: EmergencyCommandHandler) -> None:
-        self._local_endpoint, self._cfg, self._desk = local_endpoint, cfg, desk
+    def __init__(self, local_endpoint: str, cfg: ObservatoryConfig, handler: EmergencyCommandHandler) -> None:
+        self._local_endpoint, self._cfg, self._handler = local_endpoint, cfg, handler
         self._keys = check_observatory(cfg)
         self._clients = ClientsFile(Path(cfg.clients_file), CLIENTS_FILE)
 
@@ -166,14 +166,16 @@ class ObservatoryServer:
             RouterError: an endpoint cannot be bound.
         """
         async with AsyncExitStack() as stack:
-            local = await stack.enter_async_context(Router(self._local_endpoint, self._desk.answer, context))
+            local = await stack.enter_async_context(Router(self._local_endpoint, self._handler.answer, context))
             work = [local.serve()]
             if self._keys is not None:
-                zap = ZapHandler(context, lambda: self._clients.clients, self._on_locked_out)
+                zap = ZapHandler(context, lambda: self._clients.clients, self._on_refused_client)
                 remote = CurveRouter(self._cfg.endpoint, self._answer_remote, context, self._keys)
                 work.append((await stack.enter_async_context(zap)).serve())
                 work.append((await stack.enter_async_context(remote)).serve())
-                self._desk.note("observatory_channel", endpoint=remote.bound, clients=len(self._clients.clients))
+                self._handler.log_event(
+                    "observatory_channel", endpoint=remote.bound, clients=len(self._clients.clients)
+                )
             async with asyncio.TaskGroup() as tasks:
                 for coroutine in work:
                     tasks.create_task(coroutine)
@@ -182,12 +184,12 @@ class ObservatoryServer:
         """Whoever is taken off the list loses their rights at once, connected or not."""
         client = self._clients.clients.get(bytes.fromhex(user_id))
         if client is None:
-            self._on_locked_out(f"key {user_id} is not on the list any more")
+            self._on_refused_client(f"key {user_id} is not on the list any more")
             return format_error("this client is not on the list any more")
-        return self._desk.answer(frame, client)
+        return self._handler.answer(frame, client)
 
-    def _on_locked_out(self, why: str) -> None:
-        self._desk.refuse("unknown", f"{why}; {self._clients.trouble}" if self._clients.trouble else why)
+    def _on_refused_client(self, why: str) -> None:
+        self._handler.log_refusal("unknown", f"{why}; {self._clients.trouble}" if self._clients.trouble else why)
 
 
 def check_observatory(cfg: ObservatoryConfig) -> KeyPair | None:

@@ -86,10 +86,10 @@ class SafetyMonitorConfig(NamedTuple):
     stale_after_s: float
 
 
-def duty_of(cfg: Config | RadioConfig) -> SafetyMonitorConfig:
+def build_safety_monitor(cfg: Config | RadioConfig) -> SafetyMonitorConfig:
     """The rules that go with a configuration."""
     if isinstance(cfg, RadioConfig):
-        return _among_beacons(cfg)
+        return _beacon_monitor(cfg)
     monitor = DangerMonitor(build_mirror(cfg.mirror), cfg.robot, cfg.danger, cfg.health)
 
     def judge(sensors: Sensors, _raw: bytes, estimate: EstimateMessage | None) -> Verdict:
@@ -100,7 +100,7 @@ def duty_of(cfg: Config | RadioConfig) -> SafetyMonitorConfig:
     )
 
 
-def _among_beacons(cfg: RadioConfig) -> SafetyMonitorConfig:
+def _beacon_monitor(cfg: RadioConfig) -> SafetyMonitorConfig:
     monitor = BeaconSafetyRules(cfg)
 
     def judge(sensors: Sensors, raw: bytes, estimate: EstimateMessage | None) -> Verdict:
@@ -214,25 +214,27 @@ class DangerLoop:
     """
 
     def __init__(self, args: ProcessArgs | BeaconArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
-        self._duty = duty = duty_of(args.config)
+        self._cfg = cfg = build_safety_monitor(args.config)
         self._endpoints, self._context = args.endpoints, context
         self.log = open_log(args.run_dir / "log.jsonl", "danger")
-        self.monitor = duty.monitor
+        self.monitor = cfg.monitor
         self.monitor.latch = PersistentEmergencyLatch(args.run_dir / FILE, self.log)
         self._publisher = Publisher(context, args.endpoints.of("danger"))
-        self._pulse = HeartbeatPublisher(self._publisher, "danger")
+        self._heartbeat = HeartbeatPublisher(self._publisher, "danger")
         main, self._is_taking_over = args.endpoints.of("main"), args.is_taking_over
-        self._ear = EstimateSubscriber(context, main, self._pulse.tell_if_due, is_taking_over=self._is_taking_over)
-        self._told = (EventCode.NORMAL, "", Severity.NONE)
+        self._estimates = EstimateSubscriber(
+            context, main, self._heartbeat.publish_if_due, is_taking_over=self._is_taking_over
+        )
+        self._published = (EventCode.NORMAL, "", Severity.NONE)
         self._seq = -1
         self._bad_lines = 0
         self._permit_seq = 0
         self._t_s = 0.0
         self._is_stale = False
-        self._lag = LatenessStatistics(duty.link.slip_after_s)
+        self._lateness = LatenessStatistics(cfg.link.slip_after_s)
         self._hello: Hello | None = None
-        self.lasting = ReconnectingRobotLink(
-            duty.link,
+        self.link = ReconnectingRobotLink(
+            cfg.link,
             role="monitor",
             client="danger",
             on_sensors=self.on_sensors,
@@ -240,68 +242,68 @@ class DangerLoop:
             on_joined=self._on_joined,
             on_bad_line=self._on_bad_line,
         )
-        desk = EmergencyCommandHandler(
-            self.monitor, lambda: self._pulse.frame_age_s if self._seq >= 0 else None, self.log
+        handler = EmergencyCommandHandler(
+            self.monitor, lambda: self._heartbeat.frame_age_s if self._seq >= 0 else None, self.log
         )
-        self._observatory = ObservatoryServer(args.endpoints.of("emergency"), duty.observatory, desk)
-        self.lost = asyncio.Event()
+        self._observatory = ObservatoryServer(args.endpoints.of("emergency"), cfg.observatory, handler)
+        self.failed = asyncio.Event()
         self._is_lockstep = False
 
     async def run(self, stop: asyncio.Event) -> None:
         """Join the robot, then judge frames until ``stop`` is set or the link is lost."""
         shadow = zmq.asyncio.Context.shadow(self._context)
         async with asyncio.TaskGroup() as tasks:
-            work = self._observatory.serve(shadow), self._beat(), self._watch(), self.lasting.serve()
-            served = [tasks.create_task(one) for one in work]
+            services = self._observatory.serve(shadow), self._publish_heartbeat(), self._watch(), self.link.serve()
+            served = [tasks.create_task(service) for service in services]
             try:
                 await self._wait_for_main(stop)
-                joins = self.lasting.join(is_patient=self._is_taking_over)
+                joins = self.link.join(is_patient=self._is_taking_over)
                 if await unless_stopped(stop, joins) and not self._is_lockstep:
-                    realtime.enter(self._duty.realtime_priority, self.log)
-                waits = [tasks.create_task(stop.wait()), tasks.create_task(self.lost.wait())]
+                    realtime.enter(self._cfg.realtime_priority, self.log)
+                waits = [tasks.create_task(stop.wait()), tasks.create_task(self.failed.wait())]
                 await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
                 for wait in waits:
                     wait.cancel()
             finally:
                 for task in served:
                     task.cancel()
-                self.lasting.close()
+                self.link.close()
         self.log.info("danger_statistics", **self.monitor.counts)
 
     async def _wait_for_main(self, stop: asyncio.Event) -> None:
         """Join the robot only when messages get through, both ways: the first ones must not be lost."""
-        is_heard = False
-        while not stop.is_set() and not (is_heard and self._publisher.has_subscriber("verdict")):
+        has_received = False
+        while not stop.is_set() and not (has_received and self._publisher.has_subscriber("verdict")):
             await asyncio.sleep(WAIT_PERIOD_S)
-            is_heard = is_heard or self._ear.is_main_there()
+            has_received = has_received or self._estimates.has_received()
 
     def _on_joined(self, hello: Hello) -> None:
         """A session begins; its first frame comes next."""
         before, self._hello, self._is_lockstep = self._hello, hello, hello.lockstep
         if before is not None and before.boot != hello.boot:
             self.monitor.reset()
-            self._ear.forget()
+            self._estimates.reset()
             self._seq = -1
-        self._lag.forget()
-        self._pulse.phase, self._pulse.frame_s = "joined", time.monotonic()
-        self.log.info("robot_joined", port=self._duty.link.port, lockstep=hello.lockstep, session=self.lasting.sessions)
+        self._lateness.reset()
+        self._heartbeat.phase, self._heartbeat.frame_s = "joined", time.monotonic()
+        self.log.info("robot_joined", port=self._cfg.link.port, lockstep=hello.lockstep, session=self.link.sessions)
 
     def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
         """Judge one frame. In lockstep with a certain estimate of main's, so that the run is repeatable."""
-        self._seq, self._t_s, self._pulse.frame_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
+        self._seq, self._t_s, self._heartbeat.frame_s, self._is_stale = sensors.seq, sensors.t, time.monotonic(), False
         self._bad_lines = 0
-        estimate = self._ear.hear(sensors.seq, is_lockstep=self._is_lockstep)
+        estimate = self._estimates.latest(sensors.seq, is_lockstep=self._is_lockstep)
         try:
-            verdict = self._duty.judge(sensors, raw, estimate)
+            verdict = self._cfg.judge(sensors, raw, estimate)
         except Exception as error:
             # Without a verdict the robot's permit runs out: it holds by itself.
             self.log.exception("unhandled_exception", seq=self._seq)
             print(f"ccatp danger: internal error: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
-            self.lost.set()
+            self.failed.set()
             return
-        if not self._is_lockstep and self._lag.served(sensors.t, time.monotonic()) > self._duty.stale_after_s:
+        if not self._is_lockstep and self._lateness.add(sensors.t, time.monotonic()) > self._cfg.stale_after_s:
             verdict = self.monitor.stale(sensors.seq, sensors.t)  # it saw the past: no permit for the present
-        self._give(verdict, sensors.seq)
+        self._publish_verdict(verdict, sensors.seq)
 
     def _on_bad_line(self) -> None:
         """A line was no frame. In lockstep each stands for a frame's time, so that the run is repeatable."""
@@ -311,18 +313,18 @@ class DangerLoop:
         at_s = self._t_s + self._bad_lines / hello.frame_hz if hello and is_timed else time.monotonic()
         verdict = self.monitor.garbled(self._seq, self._t_s, at_s)
         if verdict is not None:
-            self._give(verdict, self._seq)
+            self._publish_verdict(verdict, self._seq)
 
-    def _give(self, verdict: Verdict, ack: int) -> None:
+    def _publish_verdict(self, verdict: Verdict, ack: int) -> None:
         if ack >= 0:  # the robot first: what it may do does not wait for anyone to read why
             self._permit_seq += 1
-            self.lasting.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
+            self.link.link.send_permit(self._permit_seq, ack, verdict.forward, verdict.reverse, verdict.turn)
         self._publisher.send("verdict", verdict)
-        if (verdict.code, verdict.cause, verdict.severity) != self._told:
-            self._announce(verdict)
+        if (verdict.code, verdict.cause, verdict.severity) != self._published:
+            self._publish_event(verdict)
 
-    def _announce(self, verdict: Verdict) -> None:
-        self._told = verdict.code, verdict.cause, verdict.severity
+    def _publish_event(self, verdict: Verdict) -> None:
+        self._published = verdict.code, verdict.cause, verdict.severity
         fields: dict[str, Any] = {
             "code": int(verdict.code),
             "cause": verdict.cause,
@@ -334,38 +336,38 @@ class DangerLoop:
         self._publisher.send("danger_event", DangerEvent(seq=verdict.seq, t_s=verdict.t_s, off=verdict.off, **fields))
         self.log.info("verdict_changed", seq=verdict.seq, t_s=verdict.t_s, **fields)
 
-    async def _beat(self) -> None:
+    async def _publish_heartbeat(self) -> None:
         while True:
-            self._pulse.tell()
+            self._heartbeat.publish()
             await asyncio.sleep(PERIOD_S)
 
     async def _watch(self) -> None:
         """Where frames stop coming, withhold the permit aloud; make a connection anew that is open and silent."""
         while True:
             await asyncio.sleep(WAIT_PERIOD_S)
-            self._ear.tend()
-            age_s = self._pulse.frame_age_s
-            if self._pulse.phase != "joined" or self._is_lockstep or age_s is None:
+            self._estimates.maintain()
+            age_s = self._heartbeat.frame_age_s
+            if self._heartbeat.phase != "joined" or self._is_lockstep or age_s is None:
                 continue
-            if age_s > self._duty.stale_after_s:
+            if age_s > self._cfg.stale_after_s:
                 self._declare_stale(age_s)
-            if age_s > self._duty.link.silence_timeout_s:
-                self.lasting.give_up(f"no sensors frame for {age_s:.2f} s")
+            if age_s > self._cfg.link.silence_timeout_s:
+                self.link.drop(f"no sensors frame for {age_s:.2f} s")
 
     def _declare_stale(self, age_s: float) -> None:
         if not self._is_stale:
             self._is_stale = True
             self.log.warning("sensors_stale", age_s=age_s)
-        self._give(self.monitor.stale(self._seq, self._t_s), self._seq)
+        self._publish_verdict(self.monitor.stale(self._seq, self._t_s), self._seq)
 
     def _on_lost(self, reason: str) -> None:
-        self._pulse.phase = "rejoining"
+        self._heartbeat.phase = "rejoining"
         self.log.warning("robot_link_lost", reason=reason)
-        self._give(self.monitor.stale(self._seq, self._t_s), -1)
+        self._publish_verdict(self.monitor.stale(self._seq, self._t_s), -1)
 
     def close(self) -> None:
         """Close the sockets."""
-        self._ear.close()
+        self._estimates.close()
         self._publisher.close()
 
 

@@ -104,7 +104,7 @@ class Dashboard:
         pulse.phase = "ready"
         try:
             while True:
-                pulse.tell()
+                pulse.publish()
                 await asyncio.sleep(PULSE_PERIOD_S)
         finally:
             publisher.close()

@@ -45,9 +45,9 @@ class FixService:
 
     Args:
         cfg: how near the robot has to come, and how often it may try.
-        scrutiny: looks at a fix before the localizer gets it.
+        fix_gate: looks at a fix before the localizer gets it.
         store: keeps it; a point counts only when it is committed.
-        on_over: called after each measurement, good or bad.
+        on_finished: called after each measurement, good or bad.
         between_s: how long to wait for new lengths before measuring again at the same place.
     """
 
@@ -55,19 +55,19 @@ class FixService:
         self,
         cfg: MissionConfig,
         client: EtalonClient,
-        scrutiny: FixGate,
+        fix_gate: FixGate,
         localizer: Localizer,
         mission: Mission,
         store: MissionStore,
-        teller: SurveyTelemetry,
-        on_over: Callable[[], None],
+        telemetry: SurveyTelemetry,
+        on_finished: Callable[[], None],
         between_s: Callable[[], float],
     ) -> None:
         self._tolerance_m = cfg.arrival_tolerance_m
         self._approaches = ApproachCounter(cfg.correction_tolerance_m, cfg.max_approaches)
         self._client, self._localizer, self._mission = client, localizer, mission
-        self._store, self._teller, self._on_over, self._between_s = store, teller, on_over, between_s
-        self._scrutiny = scrutiny
+        self._store, self._telemetry, self._on_finished, self._between_s = store, telemetry, on_finished, between_s
+        self._fix_gate = fix_gate
         self._timeout_s = cfg.measure_timeout_s
         self._wanted: FixRequest | None = None
         self._wakes = asyncio.Event()
@@ -90,7 +90,7 @@ class FixService:
                 await self._serve(request)
             if self._wanted is None:
                 self.is_busy = False
-                self._on_over()
+                self._on_finished()
 
     def _is_wanted(self, request: FixRequest) -> bool:
         """A pause or an edge in between means that the robot may have moved: the lengths are worth nothing then."""
@@ -98,7 +98,7 @@ class FixService:
 
     async def _serve(self, request: FixRequest) -> None:
         """Measure, again where the fix is doubted, all within the time that a point may take."""
-        self._scrutiny.begin()
+        self._fix_gate.begin()
         try:
             async with asyncio.timeout(self._timeout_s):
                 fix, doubt = await self._measure(request)
@@ -110,21 +110,23 @@ class FixService:
             await self._fail(request, str(error) or f"no fix within {self._timeout_s:g} s", error)
             return
         if not self._is_wanted(request):
-            self._teller.say("info", f"measurement of {_name(request.point)} discarded: the robot was interrupted")
+            self._telemetry.notify_operator(
+                "info", f"measurement of {_name(request.point)} discarded: the robot was interrupted"
+            )
         elif doubt:
             await self._fail(request, doubt, None)
         else:
-            await self._keep(request, fix)
+            await self._store_fix(request, fix)
 
     async def _measure(self, request: FixRequest) -> tuple[Fix, str]:
         """One fix, handed to the localizer if it is still wanted, and why it is doubted."""
         fix = await self._client.measure(request.t_s, request.expected_m)
-        return fix, self._try(request, fix) if self._is_wanted(request) else ""
+        return fix, self._fuse(request, fix) if self._is_wanted(request) else ""
 
-    def _try(self, request: FixRequest, fix: Fix) -> str:
+    def _fuse(self, request: FixRequest, fix: Fix) -> str:
         """Hand a fix to the localizer, unless it is doubted; why it is, or empty."""
         localizer = self._localizer
-        finding = self._scrutiny.review(
+        finding = self._fix_gate.review(
             fix, request.expected_m, request.estimate, localizer.pose_covariance, is_lost=self._mission.is_lost
         )
         doubt, jump_m = finding.doubt or finding.refusal, 0.0
@@ -134,44 +136,44 @@ class FixService:
                 jump_m = localizer.fuse_fix(fix)
             except FixRefused as refusal:
                 doubt = str(refusal)
-        self._teller.fix(request.point, fix, jump_m, is_fused=not doubt, is_set_aside=is_set_aside)
+        self._telemetry.publish_fix(request.point, fix, jump_m, is_fused=not doubt, is_set_aside=is_set_aside)
         if finding.refusal:
             raise FrameRefused(finding.refusal)
         if doubt:
-            self._teller.say("info", f"the fix at {_name(request.point)} is doubted: {doubt}")
+            self._telemetry.notify_operator("info", f"the fix at {_name(request.point)} is doubted: {doubt}")
             return doubt
         for notice in localizer.notices:
-            self._teller.say("warning", notice)
+            self._telemetry.notify_operator("warning", notice)
         localizer.notices.clear()
         if jump_m > self._tolerance_m:
-            self._teller.say(
+            self._telemetry.notify_operator(
                 "warning", f"the fix at {_name(request.point)} moved the estimate by {1e3 * jump_m:.1f} mm"
             )
         return ""
 
     async def _fail(self, request: FixRequest, why: str, error: Exception | None) -> None:
         if isinstance(error, BadSolution):
-            refusal = self._scrutiny.refusal_of(error.lengths_m, request.expected_m)
+            refusal = self._fix_gate.refusal_of(error.lengths_m, request.expected_m)
             error = FrameRefused(refusal) if refusal else error
         if isinstance(error, FrameRefused):
-            self._teller.say("error", str(error))
+            self._telemetry.notify_operator("error", str(error))
             if self._is_wanted(request):
                 self._mission.fault(str(error))
             return
-        self._teller.say("warning", f"measurement of {_name(request.point)} failed: {why}")
+        self._telemetry.notify_operator("warning", f"measurement of {_name(request.point)} failed: {why}")
         if self._is_wanted(request):
             await self._skip(request, why)
 
     async def _skip(self, request: FixRequest, cause: str) -> None:
         if request.point is not None:
             try:
-                await self._stored(self._store.record_skipped(request.point, request.t_s), request.point)
+                await self._await_commit(self._store.record_skipped(request.point, request.t_s), request.point)
             except StoreError as error:
                 self._mission.fault(f"that {_name(request.point)} is skipped cannot be stored: {error}")
                 return
         self._mission.not_fixed(request.point, cause)
 
-    async def _keep(self, request: FixRequest, fix: Fix) -> None:
+    async def _store_fix(self, request: FixRequest, fix: Fix) -> None:
         """The localizer has taken the fix: store it where the robot is near enough to the point."""
         if request.point is not None:
             self.arrival_error_m = self._mission.survey.distance_m(self._localizer.pose)
@@ -179,15 +181,17 @@ class FixService:
                 self._mission.again()
                 return
             try:
-                await self._stored(self._store.record_fix(request.point, fix, request.estimate), request.point)
+                await self._await_commit(self._store.record_fix(request.point, fix, request.estimate), request.point)
             except AlreadyMeasuredError as error:
-                self._teller.say("warning", str(error))  # nothing is lost, and nobody has to be waited for
+                self._telemetry.notify_operator(
+                    "warning", str(error)
+                )  # nothing is lost, and nobody has to be waited for
             except StoreError as error:
                 self._mission.fault(f"the fix of {_name(request.point)} cannot be stored: {error}")
                 return
         self._mission.fixed(request.point)
 
-    async def _stored(self, commit: "Future[Any]", point: PointId) -> None:
+    async def _await_commit(self, commit: "Future[Any]", point: PointId) -> None:
         """Wait for a commit. On a disk that stalls the robot stands here, and after a while is held for an operator.
 
         Raises:
@@ -197,11 +201,11 @@ class FixService:
         try:
             await asyncio.wait([waiting], timeout=SLOW_DISK_S)
             if not waiting.done():
-                self._teller.say("warning", f"the disk is slow: {_name(point)} waits for its commit")
+                self._telemetry.notify_operator("warning", f"the disk is slow: {_name(point)} waits for its commit")
                 await asyncio.wait([waiting], timeout=STALLED_DISK_S - SLOW_DISK_S)
             if not waiting.done():
                 self._mission.fault(f"the disk stalls: {_name(point)} is not stored after {STALLED_DISK_S:g} s")
-                self._on_over()
+                self._on_finished()
             await waiting
         finally:
             waiting.cancel()
@@ -211,9 +215,9 @@ class FixService:
         is_too_far = self._approaches.is_too_far(point, self.arrival_error_m, self._localizer.position_sigma_m)
         what = f"{1e3 * self.arrival_error_m:.2f} mm from {_name(point)}"
         if is_too_far:
-            self._teller.say("info", f"{what}: approaching it again")
+            self._telemetry.notify_operator("info", f"{what}: approaching it again")
         elif self.arrival_error_m > self._tolerance_m:
-            self._teller.say(
+            self._telemetry.notify_operator(
                 "warning", f"{what} after {self._approaches.count} approaches: measured there all the same"
             )
         return is_too_far

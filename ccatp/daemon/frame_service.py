@@ -43,33 +43,34 @@ class FrameService:
     def __init__(
         self,
         cfg: LinkConfig,
-        work: MissionRunner,
-        seat: ControllerSession,
+        runner: MissionRunner,
+        session: ControllerSession,
         clock: MissionClock,
-        ear: VerdictSubscriber,
-        pulse: HeartbeatPublisher,
+        verdicts: VerdictSubscriber,
+        heartbeat: HeartbeatPublisher,
         *,
-        on_surprise: Callable[[Exception], None],
+        on_error: Callable[[Exception], None],
     ) -> None:
         """No frame yet."""
-        self._cfg, self._work, self._seat, self._clock, self._ear, self._pulse = cfg, work, seat, clock, ear, pulse
-        self._teller, self._on_surprise = work.teller, on_surprise
-        self.lag = LatenessStatistics(cfg.slip_after_s)
+        self._cfg, self._runner, self._session, self._clock = cfg, runner, session, clock
+        self._verdicts, self._heartbeat = verdicts, heartbeat
+        self._telemetry, self._on_error = runner.telemetry, on_error
+        self.lateness = LatenessStatistics(cfg.slip_after_s)
         self.over = asyncio.Event()
         self._catches_up_until_s = -inf
-        self._was_quiet = False
+        self._was_at_rest = False
         self._unanswered: int | None = None
 
     def begin_session(self) -> None:
         """A session begins; its first frame comes next."""
-        self.lag.forget()
-        self._pulse.phase, self._pulse.frame_s = "joined", time.monotonic()
+        self.lateness.reset()
+        self._heartbeat.phase, self._heartbeat.frame_s = "joined", time.monotonic()
 
-    def lose(self) -> None:
+    def end_session(self) -> None:
         """The session is gone; held by the robot itself."""
         # What it did since the last frame shows in the next one, if that comes soon.
-        self._was_quiet = self._work.is_quiet
-        self._pulse.phase, self._unanswered = "rejoining", None
+        self._was_at_rest = self._runner.is_at_rest
+        self._heartbeat.phase, self._unanswered = "rejoining", None
 
     def on_sensors(self, sensors: Sensors, raw: bytes) -> None:
         """Serve one sensors frame. A surprise ends the process, held, and not just the connection."""
@@ -78,60 +79,64 @@ class FrameService:
         try:
             self._serve(sensors, raw)
         except Exception as error:
-            self._teller.log.exception("unhandled_exception", seq=self._clock.seq)
-            self._teller.say("error", f"internal error, wheels held: {type(error).__name__}: {error}; see log.jsonl")
-            self._on_surprise(UnhandledError(f"internal error: {type(error).__name__}: {error}"))
+            self._telemetry.log.exception("unhandled_exception", seq=self._clock.seq)
+            self._telemetry.notify_operator(
+                "error", f"internal error, wheels held: {type(error).__name__}: {error}; see log.jsonl"
+            )
+            self._on_error(UnhandledError(f"internal error: {type(error).__name__}: {error}"))
 
     def _serve(self, sensors: Sensors, raw: bytes) -> None:
         start = time.perf_counter()
-        seat, work = self._seat, self._work
-        steady_s, dt_s = self._clock.look(sensors.seq, sensors.t, seat.frame_period_s)
-        frame = TimedFrame(sensors, raw, steady_s, dt_s, seat.is_new_session)
-        is_unjudged = seat.is_unjudged
+        session, runner = self._session, self._runner
+        steady_s, dt_s = self._clock.time_of(sensors.seq, sensors.t, session.frame_period_s)
+        frame = TimedFrame(sensors, raw, steady_s, dt_s, session.is_new_session)
+        is_unjudged = session.may_lack_verdict
         if frame.is_first:
-            self._greet(dt_s)
-        self._clock.serve(sensors.seq, steady_s)
-        self._pulse.frame_s = time.monotonic()
-        work.listen(frame)
+            self._begin_drives(dt_s)
+        self._clock.advance(sensors.seq, steady_s)
+        self._heartbeat.frame_s = time.monotonic()
+        runner.estimate(frame)
         if dt_s <= 0.0:  # counted by the localizer; a controller cannot go back in time
-            self._teller.stale_frame(sensors.seq, raw)
+            self._telemetry.stale_frame(sensors.seq, raw)
             self._answer(sensors.seq, STILL)
             return
         waiting = time.perf_counter()
-        verdict = None if is_unjudged else self._hear(sensors.seq)
-        heard = time.perf_counter()
+        verdict = None if is_unjudged else self._latest_verdict(sensors.seq)
+        decided = time.perf_counter()
         drive = self._decide(frame, verdict)
         self._answer(sensors.seq, drive)
-        work.tell(frame)
-        self._teller.tick(1e6 * (time.perf_counter() - heard + waiting - start))
+        runner.publish(frame)
+        self._telemetry.add_tick(1e6 * (time.perf_counter() - decided + waiting - start))
 
-    def _hear(self, seq: int) -> Verdict | None:
-        return self._ear.hear(seq, self._seat.frame_period_s, is_lockstep=self._seat.is_lockstep)
+    def _latest_verdict(self, seq: int) -> Verdict | None:
+        return self._verdicts.latest(seq, self._session.frame_period_s, is_lockstep=self._session.is_lockstep)
 
-    def _greet(self, dt_s: float) -> None:
+    def _begin_drives(self, dt_s: float) -> None:
         """Before the first drive and not on joining, so that in lockstep the robot is told in a certain frame."""
-        self._seat.is_new_session = False
-        self._work.greet()
-        if self._clock.has_begun and dt_s > UNSEEN_S and not self._was_quiet:
-            self._teller.say("warning", f"the robot moved and was out of sight for {dt_s:.2f} s: it is found again")
-            self._work.lose_sight()
+        self._session.is_new_session = False
+        self._runner.begin_drives()
+        if self._clock.has_begun and dt_s > UNSEEN_S and not self._was_at_rest:
+            self._telemetry.notify_operator(
+                "warning", f"the robot moved and was out of sight for {dt_s:.2f} s: it is found again"
+            )
+            self._runner.on_tracking_gap()
 
     def _decide(self, frame: TimedFrame, verdict: Verdict | None) -> DriveCommand:
         """The drive that answers a frame. One that is too late moves nothing."""
-        work, limit_s, begun_s = self._work, self._cfg.lag_limit_s, time.monotonic()
-        lag_s = 0.0 if self._seat.is_lockstep else self.lag.served(frame.sensors.t, begun_s)
+        runner, limit_s, begun_s = self._runner, self._cfg.lag_limit_s, time.monotonic()
+        lag_s = 0.0 if self._session.is_lockstep else self.lateness.add(frame.sensors.t, begun_s)
         if lag_s > limit_s:
             if begun_s < self._catches_up_until_s:
-                return work.stand(frame)
+                return runner.hold(frame)
             verdict = None
             # Paused until frames are prompt again.
-            if work.interrupt(f"a frame was served {1e3 * lag_s:.0f} ms late"):
-                self._teller.log.warning(
+            if runner.interrupt(f"a frame was served {1e3 * lag_s:.0f} ms late"):
+                self._telemetry.log.warning(
                     "frame_late", seq=self._clock.seq, lateness_ms=1e3 * lag_s, limit_ms=1e3 * limit_s
                 )
-        drive = work.decide(frame, verdict, lag_s)
+        drive = runner.plan(frame, verdict, lag_s)
         now_s = time.monotonic()
-        is_slow, is_still = now_s - begun_s > self._seat.frame_period_s, drive == STILL
+        is_slow, is_still = now_s - begun_s > self._session.frame_period_s, drive == STILL
         # A hold for what planning cost would have to be planned away again, and so on for ever on a slow machine.
         self._catches_up_until_s = now_s + CATCH_UP_S if is_slow and is_still else -inf
         return drive
@@ -140,51 +145,51 @@ class FrameService:
 
     def _may_answer(self) -> bool:
         """In lockstep simulated time stands still while a peer is waited for, and all but still in a pause."""
-        if not self._seat.is_lockstep:
+        if not self._session.is_lockstep:
             return True
-        return not self._work.is_busy and not (self._work.is_paused and self._work.is_quiet)
+        return not self._runner.is_busy and not (self._runner.is_paused and self._runner.is_at_rest)
 
     def _answer(self, seq: int, drive: DriveCommand) -> None:
         if self._may_answer():
-            self._seat.drive(seq, *drive)
+            self._session.send_drive(seq, *drive)
         else:
             self._unanswered = seq
 
-    def answer_held(self) -> None:
+    def answer_if_allowed(self) -> None:
         """Answer the frame that waits, if nothing stands against it any more."""
         if self._may_answer():
-            self.release()
+            self.answer_held_frame()
 
-    def release(self) -> None:
+    def answer_held_frame(self) -> None:
         """Answer the frame that waits, standing."""
         seq, self._unanswered = self._unanswered, None
         if seq is not None:
-            self._seat.drive(seq, *STILL)
+            self._session.send_drive(seq, *STILL)
 
 
 REPEAT_S = 1.0
 
-Say = Callable[[str, str], None]
+Notify = Callable[[str, str], None]
 
 
 class GateLog:
     """Looks at the gate after each frame."""
 
-    def __init__(self, gate: DriveGate, say: Say) -> None:
-        self._gate, self._say = gate, say
-        self._said_s: dict[Denial, float] = {}
+    def __init__(self, gate: DriveGate, notify: Notify) -> None:
+        self._gate, self._notify = gate, notify
+        self._logged_s: dict[Denial, float] = {}
 
-    def look(self, t_s: float) -> None:
+    def update(self, t_s: float) -> None:
         """Tell of a drive denied in the frame of robot time ``t_s``."""
         denial = self._gate.denial
         if denial is None:
             return
-        said_s = self._said_s.get(denial)
+        logged_s = self._logged_s.get(denial)
         # A clock that went back must not silence it.
-        if said_s is not None and 0.0 <= t_s - said_s < REPEAT_S:
+        if logged_s is not None and 0.0 <= t_s - logged_s < REPEAT_S:
             return
-        self._said_s[denial] = t_s
-        self._say("warning", f"drive denied: {denial} ({self._gate.denied[denial]} so far)")
+        self._logged_s[denial] = t_s
+        self._notify("warning", f"drive denied: {denial} ({self._gate.denied[denial]} so far)")
 
     @property
     def counts(self) -> dict[str, int]:
@@ -205,14 +210,14 @@ class FanController:
     def __init__(
         self,
         duty: tuple[float, float],
-        seat: ControllerSession,
+        session: ControllerSession,
         mission: Mission,
-        teller: TelemetryPublisher,
+        telemetry: TelemetryPublisher,
         *,
         has_floor: bool,
     ) -> None:
-        self._duty, self._seat, self._mission, self._teller = duty, seat, mission, teller
-        self._has_floor, self._has_pressed_on = has_floor, False
+        self._duty, self._session, self._mission, self._telemetry = duty, session, mission, telemetry
+        self._has_floor, self._is_full = has_floor, False
         self._gate = FanGate(0.0)
 
     @property
@@ -224,18 +229,18 @@ class FanController:
         """A session begins with a robot that has this floor."""
         self._gate = FanGate(floor if self._has_floor else 0.0)
 
-    def press_on(self) -> None:
+    def set_full(self) -> None:
         """All that they can from now on; said once."""
-        if not self._has_pressed_on:
-            self._has_pressed_on = True
+        if not self._is_full:
+            self._is_full = True
             self.send()
 
     def send(self) -> None:
         """Send what is in force."""
-        duty = FULL_FANS if self._has_pressed_on else self._duty
+        duty = FULL_FANS if self._is_full else self._duty
         refusal = self._gate.refusal(*duty)
         if refusal is None:
-            self._seat.send_fans(duty)
+            self._session.send_fans(duty)
         else:
-            self._teller.say("error", refusal)
+            self._telemetry.notify_operator("error", refusal)
             self._mission.fault(refusal)

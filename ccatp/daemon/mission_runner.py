@@ -1,6 +1,6 @@
 """What a mission is to the main-loop process that hosts it: frames in, drives out, verdicts, commands, topics.
 
-The process keeps the links, the clock, the order of things and the end; the mission keeps everything that depends on
+The process keeps the links, the clock, the command of things and the end; the mission keeps everything that depends on
 what it is good for. A new kind of mission is a class with these methods and a row where missions are chosen.
 
 The time of the frames that a main loop serves: steady, from the first one on, over boots of the robot.
@@ -57,12 +57,12 @@ class MissionClock:
         """Our time less the robot's."""
         return self._steady.offset_s
 
-    def begin_with(self, elapsed_s: float) -> None:
+    def resume_at(self, elapsed_s: float) -> None:
         """So much of the mission was over before we came."""
         self._before_s = elapsed_s
 
-    def look(self, seq: int, t_s: float, period_s: float) -> tuple[float, float]:
-        """Time of a frame and time since the last one, s; nothing is changed before ``serve``.
+    def time_of(self, seq: int, t_s: float, period_s: float) -> tuple[float, float]:
+        """Time of a frame and time since the last one, s; nothing is changed before ``advance``.
 
         Args:
             period_s: time since the frame before where there is none.
@@ -71,7 +71,7 @@ class MissionClock:
         steady_s = self._steady.at(seq, t_s) if seq > self.seq else self.t_s
         return steady_s, steady_s - self.t_s if self._first_s is not None else period_s
 
-    def serve(self, seq: int, steady_s: float) -> bool:
+    def advance(self, seq: int, steady_s: float) -> bool:
         """The frame is served now; whether it is the first in this boot of the robot."""
         is_first = self._first_s is None
         if self._first_s is None:
@@ -79,7 +79,7 @@ class MissionClock:
         self.t_s, self.seq = steady_s, max(seq, self.seq)
         return is_first
 
-    def boot(self) -> None:
+    def reset(self) -> None:
         """The robot's frames and clock count anew."""
         self._before_s, self._first_s, self.seq = self.elapsed_s, None, -1
         self._steady = SteadyTime(self._jump_s)
@@ -170,7 +170,7 @@ class RunnerContext:
     run_dir: Path
     publisher: Publisher
     log: structlog.typing.FilteringBoundLogger
-    seat: ControllerSession
+    session: ControllerSession
     clock: MissionClock
     is_patient: bool
     finish: Callable[[ExitStatus], None]
@@ -181,7 +181,7 @@ class MissionRunner(CommandHandler, Protocol):
     """A mission in the main-loop process."""
 
     @property
-    def teller(self) -> TelemetryPublisher:
+    def telemetry(self) -> TelemetryPublisher:
         """Tells the others."""
 
     @property
@@ -197,7 +197,7 @@ class MissionRunner(CommandHandler, Protocol):
         """Waits for a peer: in lockstep time stands still."""
 
     @property
-    def is_quiet(self) -> bool:
+    def is_at_rest(self) -> bool:
         """The robot is at rest."""
 
     def progress(self) -> Progress:
@@ -228,30 +228,30 @@ class MissionRunner(CommandHandler, Protocol):
     def begin_session(self, hello: Hello) -> None:
         """A session begins; its first frame comes next."""
 
-    def greet(self) -> None:
+    def begin_drives(self) -> None:
         """The first frame of a session is here, and is answered next: what the robot has to be told once."""
 
-    def lose_sight(self) -> None:
+    def on_tracking_gap(self) -> None:
         """The robot booted, or moved while nobody looked."""
 
     def interrupt(self, cause: str) -> bool:
         """Hold until frames and verdicts are fresh again; returns whether that was news."""
 
-    def keep(self) -> None:
+    def save_checkpoint(self) -> None:
         """Write down what a successor needs."""
 
-    def settle(self) -> None:
+    def publish_state(self) -> None:
         """Something changed between two frames: tell it, and end where that is the end."""
 
-    def note_end(self) -> None:
+    def log_statistics(self) -> None:
         """The process ends: last words for the log."""
 
-    # -- the frame, in this order ---------------------------------------------------------------------------------
+    # -- the frame, in this command ---------------------------------------------------------------------------------
 
-    def listen(self, frame: TimedFrame) -> None:
+    def estimate(self, frame: TimedFrame) -> None:
         """Take what the robot says; the danger loop judges the same frame meanwhile."""
 
-    def decide(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
+    def plan(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
         """The drive that answers the frame.
 
         Args:
@@ -259,11 +259,11 @@ class MissionRunner(CommandHandler, Protocol):
             lag_s: how late the frame is served.
         """
 
-    def stand(self, frame: TimedFrame) -> DriveCommand:
-        """In place of ``decide``: the robot stands, and nothing is decided in this frame."""
+    def hold(self, frame: TimedFrame) -> DriveCommand:
+        """In place of ``plan``: the robot stands, and nothing is decided in this frame."""
 
-    def tell(self, frame: TimedFrame) -> None:
+    def publish(self, frame: TimedFrame) -> None:
         """The drive is on its way: publish the estimate, keep records."""
 
 
-MakeWork = Callable[[RunnerContext], MissionRunner]
+RunnerFactory = Callable[[RunnerContext], MissionRunner]

@@ -75,9 +75,9 @@ class ReconnectingRobotLink:
             role=self._role,
             client=self._client,
             key=self._key,
-            on_sensors=self._heed_frame,
-            on_lost=self._heed_loss,
-            on_joined=self._heed_join,
+            on_sensors=self._handle_frame,
+            on_lost=self._handle_loss,
+            on_joined=self._handle_join,
             on_bad_line=self._on_bad_line,
         )
 
@@ -128,21 +128,21 @@ class ReconnectingRobotLink:
             self._failures += 1
         raise RobotTimeout(f"the robot did not come back within {self._cfg.reconnect_timeout_s:g} s: {why}")
 
-    def _heed_frame(self, frame: Sensors, line: bytes) -> None:
+    def _handle_frame(self, frame: Sensors, line: bytes) -> None:
         self._failures, self._deadline_s = 0, None
         self._on_sensors(frame, line)
 
-    def _heed_join(self, hello: Hello) -> None:
+    def _handle_join(self, hello: Hello) -> None:
         self._is_joined = True
         self.sessions += 1
         self._on_joined(hello)
 
-    def _heed_loss(self, reason: str) -> None:
+    def _handle_loss(self, reason: str) -> None:
         self._is_joined = False
         self._lost.set()
         self._on_lost(reason)
 
-    def give_up(self, reason: str) -> None:
+    def drop(self, reason: str) -> None:
         """The connection is open and dead: begin anew."""
         if self._is_joined:
             self.link.abort(reason)
@@ -176,7 +176,7 @@ class ControllerSession:
         self.is_new_session = True
         return f"joined the robot at {where}{'' if before is None else ' again'}"
 
-    def has_booted(self, hello: Hello) -> bool:
+    def has_rebooted(self, hello: Hello) -> bool:
         """Whether the robot has started anew since the last session; to be asked before ``begin``."""
         return self._hello is not None and self._hello.boot != hello.boot
 
@@ -186,11 +186,11 @@ class ControllerSession:
         return 1.0 / (self._hello.frame_hz if self._hello is not None else self._frame_hz)
 
     @property
-    def is_unjudged(self) -> bool:
+    def may_lack_verdict(self) -> bool:
         """Danger may have judged the first frame before this session began, and does so once: the next one will do."""
         return self.is_new_session and (self._is_taking_over or self._link.sessions > 1)
 
-    def drive(self, ack: int, right: float, left: float, steer: float | None = None) -> None:
+    def send_drive(self, ack: int, right: float, left: float, steer: float | None = None) -> None:
         """Send wheel rates, rad/s, and the steering angle, rad, where there is one, computed from frame ``ack``."""
         self._drive_seq += 1
         self.on_drive(self._drive_seq, right, left)
@@ -219,14 +219,14 @@ class CommandHistory:
         """A session begins: nothing of the one before is on its way."""
         self.predictor = CommandPredictor(self._cfg.wheel_lag_s, 1.0 / frame_hz)
 
-    def sent(self, seq: int, right: float, left: float) -> None:
+    def add(self, seq: int, right: float, left: float) -> None:
         """Drive ``seq``, wheel rates in rad/s, is sent."""
         self._newest, self._driven = seq, (right, left)
         self._span.add(right, left)
         twist = twist_of(right, left, self._cfg.wheel_radius_m, self._cfg.wheel_base_m)
         self.predictor.sent(seq, twist.v_m_s, twist.omega_rad_s)
 
-    def told(self) -> tuple[tuple[float, float, float, float], int]:
+    def since_last_estimate(self) -> tuple[tuple[float, float, float, float], int]:
         """Span of the set points since it was asked for last, rad/s, and the number of the newest drive."""
         return self._span.take(*self._driven), self._newest
 
@@ -257,11 +257,11 @@ class LatenessStatistics:
         self.missed_deadlines = 0
         self.worst_s = 0.0
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Begin anew: another session, or another boot."""
         self._t_s = _NEVER_S
 
-    def served(self, t_s: float, wall_s: float) -> float:
+    def add(self, t_s: float, wall_s: float) -> float:
         """The lag of a frame, s.
 
         Args:

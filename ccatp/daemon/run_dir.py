@@ -27,7 +27,7 @@ LATCHED_FILE = Path("runs") / EMERGENCIES
 FINISHED = (ExitStatus.COMPLETE, ExitStatus.ABORTED)
 
 
-def find_unfinished() -> Path | None:
+def find_resumable() -> Path | None:
     """The directory of the run that did not finish, ``None`` where there is none with a mission in it.
 
     Raises:
@@ -54,7 +54,7 @@ def finished_summary(run_dir: Path) -> dict[str, Any] | None:
     return summary if is_finished else None
 
 
-def note_unfinished(run_dir: Path) -> None:
+def mark_resumable(run_dir: Path) -> None:
     """Note that a run has begun.
 
     Raises:
@@ -69,7 +69,7 @@ def note_unfinished(run_dir: Path) -> None:
         ) from error
 
 
-def forget_finished(status: int, run_dir: Path) -> None:
+def clear_finished(status: int, run_dir: Path) -> None:
     """Take the note away where the run has finished; emergencies that are in force then stay so in the next one.
 
     Raises:

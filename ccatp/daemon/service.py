@@ -23,11 +23,11 @@ class Notifier:
 
     def __init__(self, address: str) -> None:
         self._address = "\0" + address[1:] if address.startswith("@") else address
-        self.is_heard = address.startswith(("@", "/"))
+        self.has_listener = address.startswith(("@", "/"))
 
     def send(self, *lines: str) -> None:
         """Send one datagram. A service manager that is gone or does not read holds nobody up."""
-        if not self.is_heard:
+        if not self.has_listener:
             return
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as peer:
             peer.setblocking(False)
@@ -67,20 +67,20 @@ class Service:
         self._notifier, self._watchdog_s = notifier, watchdog_s
         self._liveness = Liveness(min(STALE_AFTER_S, STALE_SHARE * (watchdog_s or STALE_AFTER_S / STALE_SHARE)))
         self._is_ready = self._is_troubled = False
-        self._stroked_s = self._told_s = float("-inf")
+        self._stroked_s = self._sent_s = float("-inf")
         self._text = ""
 
-    def heard(self, presence: Heartbeat) -> None:
+    def on_heartbeat(self, heartbeat: Heartbeat) -> None:
         """A loop is there."""
-        self._liveness.heard(presence)
+        self._liveness.update(heartbeat)
 
-    def beat(self, now_s: float, status: MissionStatus | None, *, is_recovering: bool = False) -> None:
+    def update(self, now_s: float, status: MissionStatus | None, *, is_recovering: bool = False) -> None:
         """Tell what is due.
 
         Args:
             is_recovering: the supervisor has just started a process anew; the manager is not to end all of it.
         """
-        if not self._notifier.is_heard:
+        if not self._notifier.has_listener:
             return
         if not self._is_ready:
             if self._liveness.has_joined:
@@ -93,9 +93,9 @@ class Service:
             self._stroked_s = now_s
             self._notifier.send("WATCHDOG=1")
         has_turned, self._is_troubled = bool(trouble) != self._is_troubled, bool(trouble)
-        text = f"trouble: {trouble}" if trouble else _told(status)
-        if text != self._text and (has_turned or now_s - self._told_s >= STATUS_PERIOD_S):
-            self._text, self._told_s = text, now_s
+        text = f"trouble: {trouble}" if trouble else _status_text(status)
+        if text != self._text and (has_turned or now_s - self._sent_s >= STATUS_PERIOD_S):
+            self._text, self._sent_s = text, now_s
             self._notifier.send(f"STATUS={text}")
 
     def stopping(self) -> None:
@@ -103,7 +103,7 @@ class Service:
         self._notifier.send("STOPPING=1", "STATUS=holding the wheels and saving")
 
 
-def _told(status: MissionStatus | None) -> str:
+def _status_text(status: MissionStatus | None) -> str:
     if status is None:
         return "joined the robot"
     cause = f" ({status.cause})" if status.cause else ""

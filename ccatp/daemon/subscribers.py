@@ -1,6 +1,6 @@
 """What a loop hears of the other one: that it is there, and in lockstep what it has to wait for.
 
-A process is seen alive: its presence on the bus, also while it waits for another one.
+A process is seen alive: its heartbeat on the bus, also while it waits for another one.
 """
 
 import os
@@ -16,9 +16,9 @@ from ccatp.links.topics import EstimateMessage, Heartbeat, Message, last_estimat
 # In lockstep simulated time stands still while we wait; longer than this the other loop hangs.
 LOCKSTEP_WAIT_S = 10.0
 # How long to wait at a time: in between we are seen alive, and see whether the other one is gone.
-SLICE_S = 0.02
+WAIT_SLICE_S = 0.02
 # Danger is at most a few frames ahead of main: a number far beyond ours is of the robot's last boot.
-MOST_AHEAD = 100
+MAX_FRAMES_AHEAD = 100
 
 
 def await_message(
@@ -31,7 +31,7 @@ def await_message(
     """
     deadline = time.monotonic() + LOCKSTEP_WAIT_S
     while True:
-        received = subscriber.receive(SLICE_S)
+        received = subscriber.receive(WAIT_SLICE_S)
         if received is not None:
             if is_it(received[1]):
                 return
@@ -68,22 +68,22 @@ class VerdictSubscriber:
                 return True
         return False
 
-    def tend(self) -> None:
+    def maintain(self) -> None:
         """Keep the connection up where nothing is heard for long."""
-        self._subscriber.tend()
+        self._subscriber.maintain()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """The robot's frames count anew: the verdict in force is of another time."""
         self.verdict = None
 
-    def hear(self, seq: int, frame_s: float, *, is_lockstep: bool) -> Verdict | None:
+    def latest(self, seq: int, frame_s: float, *, is_lockstep: bool) -> Verdict | None:
         """The verdict in force: in lockstep that of this very frame, else the newest that is fresh.
 
         Args:
             seq: the present frame.
             is_lockstep: wait for the verdict on ``seq``.
         """
-        newest = seq + MOST_AHEAD
+        newest = seq + MAX_FRAMES_AHEAD
 
         def take(message: Message | Verdict) -> bool:
             if isinstance(message, Verdict) and message.seq <= newest:
@@ -127,22 +127,22 @@ class EstimateSubscriber:
     ) -> None:
         self._subscriber = Subscriber(context, [endpoint], ["estimate", "heartbeat.main"], is_watching=True)
         self._on_wait, self._is_taking_over = on_wait, is_taking_over
-        self.forget()
+        self.reset()
 
-    def is_main_there(self) -> bool:
+    def has_received(self) -> bool:
         """Whether anything was heard of it."""
         return self._subscriber.receive() is not None
 
-    def tend(self) -> None:
+    def maintain(self) -> None:
         """Keep the connection up where nothing is heard for long."""
-        self._subscriber.tend()
+        self._subscriber.maintain()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """The robot's frames count anew: what was heard is of another time."""
         self._newest: EstimateMessage | None = None
         self._judged_frame = self._judged = self._first_seq = -1
 
-    def hear(self, seq: int, *, is_lockstep: bool) -> EstimateMessage | None:
+    def latest(self, seq: int, *, is_lockstep: bool) -> EstimateMessage | None:
         """The estimate to judge a frame with: in lockstep always the same one, else the newest.
 
         Where several waited, after a stall, the newest counts, but the drives of each have moved the wheels:
@@ -155,7 +155,7 @@ class EstimateSubscriber:
 
         def take(message: Message | Verdict) -> bool:
             # One of a frame that we have not seen is of the robot's last boot.
-            if not isinstance(message, EstimateMessage) or message.seq > seq + MOST_AHEAD:
+            if not isinstance(message, EstimateMessage) or message.seq > seq + MAX_FRAMES_AHEAD:
                 return False
             missed = self._newest if self._newest_seq > self._judged else None
             self._newest = message if missed is None else message.following(missed)
@@ -186,7 +186,7 @@ PERIOD_S = 0.1
 
 
 class HeartbeatPublisher:
-    """Tells the presence of one process.
+    """Tells the heartbeat of one process.
 
     Attributes:
         phase: starting, ready, joined, rejoining (the robot is away), done.
@@ -197,17 +197,17 @@ class HeartbeatPublisher:
         self._publisher, self._topic, self._process = publisher, f"heartbeat.{process}", process
         self.phase = "starting"
         self.frame_s: float | None = None
-        self._count, self._told_s = 0, 0.0
+        self._count, self._published_s = 0, 0.0
 
     @property
     def frame_age_s(self) -> float | None:
         """Since the newest frame was served."""
         return None if self.frame_s is None else time.monotonic() - self.frame_s
 
-    def tell(self) -> None:
+    def publish(self) -> None:
         """Tell it now."""
-        self._told_s = now_s = time.monotonic()
-        presence = Heartbeat(
+        self._published_s = now_s = time.monotonic()
+        heartbeat = Heartbeat(
             seq=self._count,
             t_s=now_s,
             process=self._process,
@@ -215,10 +215,10 @@ class HeartbeatPublisher:
             phase=self.phase,
             frame_age_s=self.frame_age_s,
         )
-        self._publisher.send(self._topic, presence)
+        self._publisher.send(self._topic, heartbeat)
         self._count += 1
 
-    def tell_if_due(self) -> None:
+    def publish_if_due(self) -> None:
         """Tell it if it has been a while."""
-        if time.monotonic() - self._told_s >= PERIOD_S:
-            self.tell()
+        if time.monotonic() - self._published_s >= PERIOD_S:
+            self.publish()

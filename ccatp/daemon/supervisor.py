@@ -30,7 +30,7 @@ from ccatp.daemon.child_processes import (
     ProcessSpec,
     RestartDecision,
     listen,
-    places_of,
+    simulator_addresses,
     with_addresses,
 )
 from ccatp.daemon.collector import Collector, RunAccess
@@ -39,12 +39,12 @@ from ccatp.daemon.dashboard import PageSocket, open_page_socket
 from ccatp.daemon.process import FAULTS_FILE, LEVELS, OPERATOR_MESSAGE, RUN_DIR_FILE, Endpoints, open_log
 from ccatp.daemon.run_dir import (
     RunOptions,
+    clear_finished,
     default_run_dir,
-    find_unfinished,
+    find_resumable,
     finished_summary,
-    forget_finished,
+    mark_resumable,
     new_run_dir,
-    note_unfinished,
     own_runtime_dir,
     owned,
     survey_run_dir,
@@ -144,30 +144,30 @@ class SupervisedRun:
     def __init__(
         self,
         options: RunOptions,
-        kind: MissionType,
+        mission_type: MissionType,
         run_dir: Path,
         endpoints: Endpoints,
         sockets: Mapping[str, socket.socket],
         page: PageSocket | None,
         started_s: float,
     ) -> None:
-        self._options, self._kind, self._run_dir, self._endpoints = options, kind, run_dir, endpoints
+        self._options, self._mission_type, self._run_dir, self._endpoints = options, mission_type, run_dir, endpoints
         self._sockets, self._page, self._started_s = sockets, page, started_s
         self._view: RunView | None = None
-        self._children = ProcessManager(kind.processes, self._command_of, self._say)
+        self._children = ProcessManager(mission_type.processes, self._command_of, self._notify_operator)
         self._is_interrupted = False
         self._service = Service(*take_from(os.environ))
         self._log = open_log(run_dir / "log.jsonl", "supervisor")
 
-    def go(self) -> int:
+    def run(self) -> int:
         """Start, watch, collect, stop; returns the exit status."""
-        self._log.info("run_started", **self._kind.facts)
+        self._log.info("run_started", **self._mission_type.facts)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         # A flag and no exception: a signal must not be lost in somebody's handler of exceptions, nor end the ending.
         previous = {n: signal.signal(n, self._interrupt) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-        access = RunAccess(context, self._endpoints, self._run_dir, self._options.sim, self._heard)
-        collector = self._kind.collector(access)
-        self._view = view = self._kind.view(self._run_dir)
+        access = RunAccess(context, self._endpoints, self._run_dir, self._options.sim, self._on_heartbeat)
+        collector = self._mission_type.collector(access)
+        self._view = view = self._mission_type.view(self._run_dir)
         try:
             with collector, view:
                 status = self._watch(collector, view)
@@ -183,7 +183,7 @@ class SupervisedRun:
             self._children.kill_all()
             context.destroy(linger=0)
         for remark in collector.remarks:
-            self._say("warning", remark)
+            self._notify_operator("warning", remark)
         self._write(summary)
         self._log.info("run_finished", status=int(status))
         if self._options.shows_summary:
@@ -202,15 +202,17 @@ class SupervisedRun:
             with suppress(OSError):
                 new.unlink()
             reason = error.strerror or str(error)
-            self._say("error", f"{path}: cannot be written: {reason}; what was measured is in mission.sqlite")
+            self._notify_operator(
+                "error", f"{path}: cannot be written: {reason}; what was measured is in mission.sqlite"
+            )
 
     def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
         self._is_interrupted = True
 
     def _watch(self, collector: Collector, view: RunView) -> ExitStatus:
         if self._page is not None and self._page.text:
-            self._say(self._page.level, self._page.text)
-        for process in self._kind.rows:
+            self._notify_operator(self._page.level, self._page.text)
+        for process in self._mission_type.rows:
             # Who listens has a socket, if it is to run at all.
             if process.name in self._sockets or not process.listens:
                 self._children.start(process)
@@ -220,23 +222,23 @@ class SupervisedRun:
             collector.wait(POLL_MS, self._children.fds)
             collector.collect(0, view)
             now_s = time.monotonic()
-            self._service.beat(now_s, collector.status, is_recovering=self._children.is_recovering(now_s))
+            self._service.update(now_s, collector.status, is_recovering=self._children.is_recovering(now_s))
             # A death comes first: what the others say of it is its consequence.
-            if (end := self._children.look(now_s)) is not None:
+            if (end := self._children.poll(now_s)) is not None:
                 return self._died(*end)
             if collector.is_over:
                 return collector.exit_status
-        view.say("warning", "interrupted: holding the wheels and saving")
+        view.show_message("warning", "interrupted: holding the wheels and saving")
         return ExitStatus.INTERRUPTED
 
-    def _heard(self, presence: Heartbeat) -> None:
-        self._children.heard(presence)
-        self._service.heard(presence)
+    def _on_heartbeat(self, heartbeat: Heartbeat) -> None:
+        self._children.on_heartbeat(heartbeat)
+        self._service.on_heartbeat(heartbeat)
 
-    def _say(self, level: str, text: str) -> None:
+    def _notify_operator(self, level: str, text: str) -> None:
         self._log.log(LEVELS[level], OPERATOR_MESSAGE, text=text)
         if self._view is not None:
-            self._view.say(level, text)
+            self._view.show_message(level, text)
 
     def _command_of(self, process: ProcessSpec, is_restarted: bool) -> tuple[list[str], tuple[int, ...]]:
         options = self._options
@@ -247,7 +249,7 @@ class SupervisedRun:
             "--restarted": is_restarted,
             "--held": options.held and not is_restarted,
             "--sim": options.sim,
-            "--faults": process.is_stand_in and options.faults_file is not None,
+            "--faults": process.is_simulator and options.faults_file is not None,
         }
         arguments += [flag for flag, is_given in flags.items() if is_given]
         if process.name not in self._sockets:
@@ -257,9 +259,9 @@ class SupervisedRun:
 
     def _died(self, name: str, code: int, decision: RestartDecision) -> ExitStatus:
         self._log.error("process_died", name=name, code=code)
-        if decision.fate is ProcessEnd.END:
+        if decision.end is ProcessEnd.END:
             return ExitStatus(code)  # it has said why
-        self._say("error", f"{decision.text}; see {self._run_dir / 'log.jsonl'}")
+        self._notify_operator("error", f"{decision.text}; see {self._run_dir / 'log.jsonl'}")
         return ExitStatus.HELD
 
 
@@ -271,15 +273,15 @@ _DASHBOARD = ProcessSpec(
     is_loop=True,
     is_needed=False,
     niceness=15,
-    patience_s=60.0,
+    hang_timeout_s=60.0,
 )
 
 
 # In the order of starting; stopping is in the reverse order, so that main holds the wheels first.
 PROCESSES: tuple[ProcessSpec, ...] = (
     _DASHBOARD,
-    ProcessSpec("dataloop", "ccatp.daemon.sim_robot", is_stand_in=True, listens="sim.robot", is_replaceable=False),
-    ProcessSpec("etalon", "ccatp.daemon.sim_etalon", is_stand_in=True, listens="sim.etalon"),
+    ProcessSpec("dataloop", "ccatp.daemon.sim_robot", is_simulator=True, listens="sim.robot", is_replaceable=False),
+    ProcessSpec("etalon", "ccatp.daemon.sim_etalon", is_simulator=True, listens="sim.etalon"),
     ProcessSpec("danger", "ccatp.daemon.danger_loop", is_loop=True),
     ProcessSpec("main", "ccatp.daemon.main_loop", is_loop=True),
 )
@@ -288,7 +290,7 @@ PROCESSES: tuple[ProcessSpec, ...] = (
 # No laser system: what is measured is measured by radio. A main loop that dies takes the map with it: held, and over.
 BEACON_PROCESSES: tuple[ProcessSpec, ...] = (
     _DASHBOARD,
-    ProcessSpec("dataloop", "ccatp.daemon.sim_robot", is_stand_in=True, listens="sim.robot", is_replaceable=False),
+    ProcessSpec("dataloop", "ccatp.daemon.sim_robot", is_simulator=True, listens="sim.robot", is_replaceable=False),
     ProcessSpec("danger", "ccatp.daemon.danger_loop", is_loop=True),
     ProcessSpec("main", "ccatp.daemon.main_loop", is_loop=True, is_replaceable=False),
 )
@@ -330,8 +332,8 @@ def run_beacons(options: RunOptions) -> int:
         stack.enter_context(owned(run_dir / RUN_LOCK, "--run-dir"))
         (run_dir / "config.toml").write_text(dump_radio_config(cfg), encoding="utf-8")
         (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
-        kind = BeaconType(cfg, BEACON_PROCESSES, is_sim=options.sim)
-        return SupervisedRun(options, kind, run_dir, Endpoints(runtime_dir), sockets, page, started).go()
+        mission_type = BeaconType(cfg, BEACON_PROCESSES, is_sim=options.sim)
+        return SupervisedRun(options, mission_type, run_dir, Endpoints(runtime_dir), sockets, page, started).run()
 
 
 def run_survey(options: RunOptions) -> int:
@@ -355,8 +357,8 @@ def run_survey(options: RunOptions) -> int:
     with ExitStack() as stack:
         runtime_dir = make_runtime_dir(str(options.runtime_dir or cfg.run.runtime_dir), os.environ)
         own_runtime_dir(stack, runtime_dir, is_sim=options.sim)
-        stand_ins = [p for p in PROCESSES if p.is_stand_in and p.listens and options.sim]
-        places = places_of(cfg)
+        stand_ins = [p for p in PROCESSES if p.is_simulator and p.listens and options.sim]
+        places = simulator_addresses(cfg)
         sockets = {p.name: stack.enter_context(listen(p.listens, *places[p.listens])) for p in stand_ins}
         cfg = with_addresses(cfg, sockets) if options.sim else cfg
         page = open_page_socket(cfg.dashboard)
@@ -366,19 +368,19 @@ def run_survey(options: RunOptions) -> int:
         run_dir = survey_run_dir(options, cfg)
         stack.enter_context(owned(run_dir / RUN_LOCK, "--run-dir"))
         if options.resume and (done := finished_summary(run_dir)) is not None:
-            return _tell_finished(done, run_dir, as_json=options.json_output)
+            return _report_finished(done, run_dir, as_json=options.json_output)
         (run_dir / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
         (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
-        kind = SurveyType(cfg, PROCESSES, is_sim=options.sim)
-        return SupervisedRun(options, kind, run_dir, Endpoints(runtime_dir), sockets, page, started).go()
+        mission_type = SurveyType(cfg, PROCESSES, is_sim=options.sim)
+        return SupervisedRun(options, mission_type, run_dir, Endpoints(runtime_dir), sockets, page, started).run()
 
 
 def _recover(options: RunOptions) -> int:
     """Go on, held, with the run that did not finish; else begin a new one that may be recovered."""
     options = replace(options, recover=False)
-    found = find_unfinished()
+    found = find_resumable()
     if found is not None:
         options = replace(options, run_dir=found, resume=True, held=True)
     else:
@@ -386,14 +388,14 @@ def _recover(options: RunOptions) -> int:
         run_dir = default_run_dir(cfg.run.mirror, cfg.run.seed, datetime.now(UTC)).absolute()
         # What was latched when the last run ended stays so: the robot waits at its base until it is cleared.
         options = replace(options, run_dir=run_dir, held=take_over_emergencies(run_dir))
-        note_unfinished(run_dir)
+        mark_resumable(run_dir)
         found = run_dir
     status = run_survey(options)
-    forget_finished(status, found)
+    clear_finished(status, found)
     return status
 
 
-def _tell_finished(summary: dict[str, Any], run_dir: Path, *, as_json: bool) -> int:
+def _report_finished(summary: dict[str, Any], run_dir: Path, *, as_json: bool) -> int:
     """Nothing is left of a mission: what is known of it stays as it is."""
     if as_json:
         print(json.dumps(summary))

@@ -12,7 +12,15 @@ from ccatp.core import Verdict
 from ccatp.daemon.checkpoints import CheckpointWriter, build_parts
 from ccatp.daemon.fix_service import FixRequest, FixService
 from ccatp.daemon.frame_service import FanController, GateLog
-from ccatp.daemon.mission_runner import STILL, DriveCommand, MakeWork, Progress, RunnerConfig, RunnerContext, TimedFrame
+from ccatp.daemon.mission_runner import (
+    STILL,
+    DriveCommand,
+    Progress,
+    RunnerConfig,
+    RunnerContext,
+    RunnerFactory,
+    TimedFrame,
+)
 from ccatp.daemon.process import ProcessArgs
 from ccatp.daemon.robot_session import CommandHistory
 from ccatp.daemon.telemetry import SurveyTelemetry, TelemetryPublisher
@@ -33,34 +41,36 @@ from ccatp.survey.stops import HOLD_POSITION, MissionCommand
 class SurveyWatch:
     """Tells states, reminds of faults, and sends a robot home that nobody comes for."""
 
-    def __init__(self, cfg: Config, parts: SurveyParts, teller: TelemetryPublisher) -> None:
+    def __init__(self, cfg: Config, parts: SurveyParts, telemetry: TelemetryPublisher) -> None:
         """Nothing to look after."""
         self._limits, self._base = cfg.limits, parts.mirror.base_pose
-        self._mission, self._localizer, self._teller = parts.mission, parts.localizer, teller
-        self._vigil = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
+        self._mission, self._localizer, self._telemetry = parts.mission, parts.localizer, telemetry
+        self._fault_timer = UnattendedFaultTimer(cfg, falls=parts.mirror.overhang)
 
-    def keep_vigil(self, sensors: Sensors) -> None:
+    def check_unattended_fault(self, sensors: Sensors) -> None:
         """A fault that nobody looks after: an alarm now and then, and home before the battery is too low for it."""
-        mission, vigil, pose = self._mission, self._vigil, self._localizer.deck_pose
+        mission, timer, pose = self._mission, self._fault_timer, self._localizer.deck_pose
         knows_place = not (mission.is_lost or self._localizer.is_frozen)
         home_s = home_time_s(self._base, self._limits, pose.x_m, pose.y_m) if knows_place else None
-        call = vigil.watch(sensors.t, sensors.soc, home_s)
+        call = timer.watch(sensors.t, sensors.soc, home_s)
         if call is ReminderCall.REMIND:
-            held_s = vigil.held_s(sensors.t)
-            self._teller.say("error", f"held for {held_s:.0f} s, waiting for an operator: {mission.cause}")
+            held_s = timer.held_s(sensors.t)
+            self._telemetry.notify_operator(
+                "error", f"held for {held_s:.0f} s, waiting for an operator: {mission.cause}"
+            )
         elif call is ReminderCall.RETURN:
             mission.abort(f"nobody came, and the battery ({sensors.soc:.0%}) lasts for little more than the way home")
 
-    def tell_state(self, before: MissionState, seq: int) -> None:
+    def publish_state_change(self, before: MissionState, seq: int) -> None:
         """The mission's state is another one than before, in frame ``seq``."""
-        mission, teller = self._mission, self._teller
+        mission, telemetry = self._mission, self._telemetry
         if not mission.is_faulted:
-            self._vigil.over()
-        teller.log.debug("state_changed", seq=seq, before=before, after=mission.state, cause=mission.cause)
+            self._fault_timer.over()
+        telemetry.log.debug("state_changed", seq=seq, before=before, after=mission.state, cause=mission.cause)
         if mission.state in (MissionState.HELD, MissionState.BACKING_OFF) or before is MissionState.HELD:
-            teller.say("warning", state_text(mission.state, mission.cause))
+            telemetry.notify_operator("warning", state_text(mission.state, mission.cause))
         if mission.state is MissionState.RETURNING and before is not MissionState.BACKING_OFF:
-            teller.say("warning", f"returning to base: {mission.cause}")
+            telemetry.notify_operator("warning", f"returning to base: {mission.cause}")
 
 
 def state_text(state: MissionState, cause: str) -> str:
@@ -86,49 +96,49 @@ EXIT_STATUS = {
 class SurveyRunner:
     """A survey as the main-loop process hosts it."""
 
-    def __init__(self, cfg: Config, host: RunnerContext, parts: SurveyParts, store: MissionStore) -> None:
-        self._cfg, self._host, self._parts, self._store = cfg, host, parts, store
+    def __init__(self, cfg: Config, context: RunnerContext, parts: SurveyParts, store: MissionStore) -> None:
+        self._cfg, self._context, self._parts, self._store = cfg, context, parts, store
         self._mirror, self._localizer, self._gate = parts.mirror, parts.localizer, parts.gate
         self._mission = mission = parts.mission
-        self._seat, self._clock = host.seat, host.clock
-        self._clock.begin_with(parts.elapsed_s)
-        self._teller = teller = SurveyTelemetry(host.publisher, host.log)
-        self._gate_watch = GateLog(self._gate, teller.say)
+        self._session, self._clock = context.session, context.clock
+        self._clock.resume_at(parts.elapsed_s)
+        self._telemetry = telemetry = SurveyTelemetry(context.publisher, context.log)
+        self._gate_log = GateLog(self._gate, telemetry.notify_operator)
         self._fans = FanController(
-            cfg.robot.fan_duty, self._seat, mission, teller, has_floor=bool(parts.mirror.overhang)
+            cfg.robot.fan_duty, self._session, mission, telemetry, has_floor=bool(parts.mirror.overhang)
         )
-        self._commanded = CommandHistory(cfg.robot, cfg.sim.robot.frame_hz)
-        self._seat.on_drive = self._commanded.sent
+        self._commands = CommandHistory(cfg.robot, cfg.sim.robot.frame_hz)
+        self._session.on_drive = self._commands.add
         self._etalon = EtalonClient(cfg.etalon, parts.mirror.channels, parts.mirror.collimators_m, self._on_retry)
-        self._measuring = FixService(
+        self._fix_service = FixService(
             cfg.mission,
             self._etalon,
             FixGate(parts.mirror, cfg),
             parts.localizer,
             mission,
             store,
-            teller,
-            host.answer,
+            telemetry,
+            context.answer,
             # lockstep time stands still meanwhile
-            lambda: 0.0 if self._seat.is_lockstep else cfg.etalon.measuring_time_s,
+            lambda: 0.0 if self._session.is_lockstep else cfg.etalon.measuring_time_s,
         )
-        self._keeper = CheckpointWriter(host.run_dir, parts.localizer, mission, is_patient=host.is_patient)
-        self._watch = SurveyWatch(cfg, parts, teller)
+        self._checkpoint = CheckpointWriter(context.run_dir, parts.localizer, mission, is_patient=context.is_patient)
+        self._watch = SurveyWatch(cfg, parts, telemetry)
         self._mirror_check: MirrorCheck | None = MirrorCheck(parts.mirror)
         self._recovery = parts.recovery
         self._is_odometry_off = False
         self._state = MissionState.IDLE
-        self._motion_now: StateEstimate | None = None
-        self._has_told_calibration = False
-        self._told: tuple[tuple[float, float, float, float], int] | None = None
+        self._motion: StateEstimate | None = None
+        self._has_reported_calibration = False
+        self._sent_commands: tuple[tuple[float, float, float, float], int] | None = None
         # An operator's commands are the mission's; so is what holds it.
         self.pause, self.resume, self.abort, self.stop = mission.pause, mission.resume, mission.abort, mission.stop
-        self.interrupt, self.lose_sight = mission.interrupt, mission.lose_sight
+        self.interrupt, self.on_tracking_gap = mission.interrupt, mission.lose_sight
 
     @property
-    def teller(self) -> SurveyTelemetry:
+    def telemetry(self) -> SurveyTelemetry:
         """Tells the others."""
-        return self._teller
+        return self._telemetry
 
     @property
     def cause(self) -> str:
@@ -143,10 +153,10 @@ class SurveyRunner:
     @property
     def is_busy(self) -> bool:
         """A measurement is under way."""
-        return self._measuring.is_busy
+        return self._fix_service.is_busy
 
     @property
-    def is_quiet(self) -> bool:
+    def is_at_rest(self) -> bool:
         """The robot is at rest."""
         control = self._cfg.control
         return (
@@ -169,7 +179,7 @@ class SurveyRunner:
             total=self._parts.total_points,
             point=f"{point.row}-{point.col}-{point.point}" if point is not None else "",
             eta_s=mission.eta_s,
-            error_mm=1e3 * self._measuring.arrival_error_m,
+            error_mm=1e3 * self._fix_service.arrival_error_m,
             outcome=str(mission.outcome),
             lower_bound_s=self._parts.lower_bound_s,
             left_out=by_reason(mission.left_out),
@@ -189,15 +199,15 @@ class SurveyRunner:
             raise DaemonUnreachableError(str(error)) from error
 
     def _on_retry(self, error: EtalonError, tries_left: int) -> None:
-        self._teller.log.warning("etalon_retry", error=str(error), tries_left=tries_left)
+        self._telemetry.log.warning("etalon_retry", error=str(error), tries_left=tries_left)
 
     async def run(self) -> None:
         """Take measurements, for ever."""
-        await self._measuring.run()
+        await self._fix_service.run()
 
     async def close(self) -> None:
         """Close the files and the laser system."""
-        self._keeper.close()
+        self._checkpoint.close()
         await self._etalon.close()
 
     def check_robot(self, hello: Hello) -> None:
@@ -206,58 +216,60 @@ class SurveyRunner:
 
     def begin_session(self, hello: Hello) -> None:
         """A session begins."""
-        self._commanded.begin(hello.frame_hz)
-        self._keeper.boot = hello.boot
+        self._commands.begin(hello.frame_hz)
+        self._checkpoint.boot = hello.boot
         self._fans.begin(hello.robot.fan_floor)
 
-    def greet(self) -> None:
+    def begin_drives(self) -> None:
         """The fans, before the first drive."""
         self._fans.send()
 
-    def keep(self) -> None:
+    def save_checkpoint(self) -> None:
         """Write down what a successor needs."""
-        self._keeper.keep(self._clock.seq, self._clock.t_s, self._clock.elapsed_s)
+        self._checkpoint.write(self._clock.seq, self._clock.t_s, self._clock.elapsed_s)
 
-    def settle(self) -> None:
+    def publish_state(self) -> None:
         """Tell a state that is new, and end where that is the end."""
         if self._mission.state is not self._state:
-            self._on_state()
+            self._on_state_change()
 
-    def note_end(self) -> None:
+    def log_statistics(self) -> None:
         """What the gates refused."""
-        self._teller.log.info("gate_statistics", denied=self._gate_watch.counts, fans_refused=self._fans.refused)
+        self._telemetry.log.info("gate_statistics", denied=self._gate_log.counts, fans_refused=self._fans.refused)
 
     # -- the frame ------------------------------------------------------------------------------------------------
 
-    def listen(self, frame: TimedFrame) -> None:
+    def estimate(self, frame: TimedFrame) -> None:
         """The frame's samples go to the localizer, or as much of them as is to be believed."""
         sensors, mission, localizer = frame.sensors, self._mission, self._localizer
-        self._tell_beginning(sensors)
+        self._publish_beginning(sensors)
         is_odometry_off = mission.ignores_motion
         if is_odometry_off is not self._is_odometry_off:
             self._is_odometry_off = is_odometry_off
-            self._teller.treatment(sensors.seq, sensors.t, "odometry_off" if is_odometry_off else "odometry_on")
+            self._telemetry.publish_treatment(
+                sensors.seq, sensors.t, "odometry_off" if is_odometry_off else "odometry_on"
+            )
         imu, enc = ((), as_standing(sensors.enc)) if is_odometry_off else (sensors.imu, sensors.enc)
         localizer.step(sensors.t, imu, enc, sensors.edge, sensors.gravity)
         if localizer.hold_requested:
             # A filter that diverged is frozen until it has a fix.
             mission.recover(localizer.hold_cause, frame.t_s)
             localizer.clear_hold()
-        self._motion_now = self._motion(frame) if frame.dt_s > 0.0 else None
+        self._motion = self._state_estimate(frame) if frame.dt_s > 0.0 else None
 
-    def _tell_beginning(self, sensors: Sensors) -> None:
+    def _publish_beginning(self, sensors: Sensors) -> None:
         """Where the localizer of a loop that takes over begins: who replays the run has to know."""
         recovery, self._recovery = self._recovery, None
         if recovery is not None:
             pose, sigmas = recovery.pose, (recovery.position_sigma_m, recovery.heading_sigma_rad)
             values = (pose.x_m, pose.y_m, pose.heading_rad, *sigmas)
-            self._teller.treatment(sensors.seq, sensors.t, "begun", values)
+            self._telemetry.publish_treatment(sensors.seq, sensors.t, "begun", values)
 
-    def _motion(self, frame: TimedFrame) -> StateEstimate:
+    def _state_estimate(self, frame: TimedFrame) -> StateEstimate:
         localizer, echo = self._localizer, frame.sensors.cmd
         pose, v, omega, creep = localizer.pose, localizer.speed_m_s, localizer.rate_rad_s, localizer.creep
         place = pose.x_m, pose.y_m, pose.heading_rad
-        ahead = self._commanded.predictor.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
+        ahead = self._commands.predictor.ahead(place, v, omega, echo.seq, echo.age, echo.held, creep)
         return StateEstimate(
             frame.t_s, frame.dt_s, pose, self._mirror.deck_pose, v, omega, creep, ahead, self._position_sigma_m
         )
@@ -265,29 +277,29 @@ class SurveyRunner:
     def _position_sigma_m(self) -> float:
         return self._localizer.position_sigma_m
 
-    def decide(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
+    def plan(self, frame: TimedFrame, verdict: Verdict | None, lag_s: float) -> DriveCommand:
         """What the mission wants, as far as the gate lets it through."""
-        mission, motion = self._mission, self._motion_now
+        mission, motion = self._mission, self._motion
         if motion is None:
-            raise RuntimeError("decide comes after listen, and not for a stale frame")
-        order = mission.step(motion, verdict) if self._is_on_mirror(frame.sensors) else HOLD_POSITION
-        self._heed(frame.sensors)
-        right, left = self._gate.pass_through(order.twist, verdict, motion.dt_s, motion.t_s, lag_s, mission.purpose)
-        self._gate_watch.look(motion.t_s)
-        if order.at_rest or order.measure:
-            self._execute(order, motion)
-        self._note_told(frame)
+            raise RuntimeError("plan comes after estimate, and not for a stale frame")
+        command = mission.step(motion, verdict) if self._is_on_mirror(frame.sensors) else HOLD_POSITION
+        self._apply_requests(frame.sensors)
+        right, left = self._gate.pass_through(command.twist, verdict, motion.dt_s, motion.t_s, lag_s, mission.purpose)
+        self._gate_log.update(motion.t_s)
+        if command.at_rest or command.measure:
+            self._execute(command, motion)
+        self._note_commands(frame)
         return DriveCommand(right, left)
 
-    def stand(self, frame: TimedFrame) -> DriveCommand:
+    def hold(self, frame: TimedFrame) -> DriveCommand:
         """The robot stands, and nothing is decided in this frame."""
-        self._note_told(frame)
+        self._note_commands(frame)
         return STILL
 
-    def _note_told(self, frame: TimedFrame) -> None:
+    def _note_commands(self, frame: TimedFrame) -> None:
         """What the wheels were told since the last estimate, where one is due."""
         is_due = frame.is_first or is_estimate_due(frame.sensors.seq)
-        self._told = self._commanded.told() if is_due else None
+        self._sent_commands = self._commands.since_last_estimate() if is_due else None
 
     def _is_on_mirror(self, sensors: Sensors) -> bool:
         """Whether the robot may move, as far as gravity knows: it stands on the mirror of the configuration.
@@ -301,66 +313,66 @@ class SurveyRunner:
         if check.hear(sensors.t, sensors.gravity, self._localizer.deck_pose):
             self._mirror_check = None
             if check.warning:
-                self._teller.say("warning", check.warning)
+                self._telemetry.notify_operator("warning", check.warning)
         if check.contradiction:
-            self._teller.say("error", check.contradiction)
-            self._host.finish(ExitStatus.USAGE)
+            self._telemetry.notify_operator("error", check.contradiction)
+            self._context.finish(ExitStatus.USAGE)
             return False
-        return self._mirror_check is None or self._seat.is_lockstep
+        return self._mirror_check is None or self._session.is_lockstep
 
-    def _heed(self, sensors: Sensors) -> None:
+    def _apply_requests(self, sensors: Sensors) -> None:
         """What the mission wants besides the drive, before that is sent."""
         mission, health = self._mission, self._cfg.health
         if mission.doubts_pose:
             mission.doubts_pose = False
             doubt = health.doubt_position_m, health.doubt_heading_rad
             self._localizer.doubt(*doubt)
-            self._teller.treatment(sensors.seq, sensors.t, "doubted", doubt)
-        if mission.wants_calibration and not self._has_told_calibration:
-            self._has_told_calibration = True
-            self._teller.say("warning", GIVEN_UP)
+            self._telemetry.publish_treatment(sensors.seq, sensors.t, "doubted", doubt)
+        if mission.wants_calibration and not self._has_reported_calibration:
+            self._has_reported_calibration = True
+            self._telemetry.notify_operator("warning", GIVEN_UP)
         if mission.wants_full_fans:
-            self._fans.press_on()  # pressed on first, held then
+            self._fans.set_full()  # pressed on first, held then
         if mission.is_faulted:
-            self._watch.keep_vigil(sensors)
+            self._watch.check_unattended_fault(sensors)
 
-    def _execute(self, order: MissionCommand, motion: StateEstimate) -> None:
+    def _execute(self, command: MissionCommand, motion: StateEstimate) -> None:
         mission, seq = self._mission, self._clock.seq
-        if order.at_rest:
+        if command.at_rest:
             self._localizer.rest()
-            self._teller.rest(seq, motion.t_s)
-        if order.arrived is not None:
+            self._telemetry.publish_rest(seq, motion.t_s)
+        if command.arrived is not None:
             error_m = mission.survey.distance_m(motion.pose)
-            self._teller.arrival(seq, motion.t_s, order.arrived, error_m)
-            self._store.record_arrival(order.arrived, motion.t_s, error_m)
-        if order.measure:
+            self._telemetry.publish_arrival(seq, motion.t_s, command.arrived, error_m)
+            self._store.record_arrival(command.arrived, motion.t_s, error_m)
+        if command.measure:
             pose = self._localizer.deck_pose
             expected = self._mirror.puck_world(pose, self._cfg.robot.puck_height_m)
             # The localizer dates a fix by the robot's own clock.
             t_s = motion.t_s - self._clock.offset_s
-            self._measuring.begin(FixRequest(mission.request, t_s, mission.measuring_point, expected, pose))
+            self._fix_service.begin(FixRequest(mission.request, t_s, mission.measuring_point, expected, pose))
 
-    def tell(self, frame: TimedFrame) -> None:
+    def publish(self, frame: TimedFrame) -> None:
         """The estimate, the checkpoint, a state that is new."""
         seq, t_s = frame.sensors.seq, frame.sensors.t
-        self._teller.frame(
-            seq, t_s, self._localizer, self._mission.state, frame.raw, self._told, is_first=frame.is_first
+        self._telemetry.publish_frame(
+            seq, t_s, self._localizer, self._mission.state, frame.raw, self._sent_commands, is_first=frame.is_first
         )
-        self._keeper.frame(seq, t_s, self._clock.elapsed_s)
-        self.settle()
+        self._checkpoint.write_if_due(seq, t_s, self._clock.elapsed_s)
+        self.publish_state()
 
-    def _on_state(self) -> None:
+    def _on_state_change(self) -> None:
         mission = self._mission
         before, self._state = self._state, mission.state
-        self._watch.tell_state(before, self._clock.seq)
+        self._watch.publish_state_change(before, self._clock.seq)
         if mission.state is MissionState.DONE:
-            self._host.finish(EXIT_STATUS[mission.outcome])
-        elif mission.is_faulted and self._seat.is_lockstep:
+            self._context.finish(EXIT_STATUS[mission.outcome])
+        elif mission.is_faulted and self._session.is_lockstep:
             # Nobody can be waited for while simulated time runs at many times the wall clock.
-            self._host.finish(EXIT_STATUS[SurveyOutcome.STOPPED])
+            self._context.finish(EXIT_STATUS[SurveyOutcome.STOPPED])
 
 
-def hosting_of(cfg: Config) -> RunnerConfig:
+def survey_runner_config(cfg: Config) -> RunnerConfig:
     """What the process needs of the configuration of a survey."""
     return RunnerConfig(
         cfg.robot,
@@ -372,8 +384,8 @@ def hosting_of(cfg: Config) -> RunnerConfig:
 
 
 @contextmanager
-def open_survey(args: ProcessArgs) -> Iterator[MakeWork]:
+def open_survey(args: ProcessArgs) -> Iterator[RunnerFactory]:
     """The parts and the database of a survey, new or taken over; what makes the mission of them."""
     parts, store = build_parts(args)
     with store:
-        yield lambda host: SurveyRunner(args.config, host, parts, store)
+        yield lambda context: SurveyRunner(args.config, context, parts, store)

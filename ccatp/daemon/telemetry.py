@@ -51,22 +51,22 @@ class TelemetryPublisher:
         self.seq = -1
         self.t_s = 0.0
 
-    def count_on(self) -> None:
+    def continue_numbering(self) -> None:
         """The robot's frames count anew: what is recorded counts on, as far as we know how many there were."""
         self._frames_before += max(self.seq, 0)
 
     def stale_frame(self, seq: int, raw: bytes) -> None:
         """Keep the line of a frame that is not newer than the last one: the mission has seen it."""
         self.seq = seq
-        self.keep(raw)
+        self.add_line(raw)
 
-    def keep(self, raw: bytes) -> None:
+    def add_line(self, raw: bytes) -> None:
         """Keep a frame's line for the batch."""
         self._lines.append(msgspec.Raw(raw))
         if len(self._lines) >= BATCH_FRAMES:
             self.flush()
 
-    def tick(self, microseconds: float) -> None:
+    def add_tick(self, microseconds: float) -> None:
         """Note the wall time of a tick."""
         self._tick_us.append(microseconds)
 
@@ -92,11 +92,11 @@ class TelemetryPublisher:
         self._publisher.send("sensors", SensorLines(seq=seq, t_s=t_s, lines=self._lines))
         self._lines, self._tick_us = [], []
 
-    def status(self, message: MissionStatus) -> None:
+    def publish_status(self, message: MissionStatus) -> None:
         """Publish the mission's status."""
         self._publisher.send("mission", message)
 
-    def say(self, level: str, text: str) -> None:
+    def notify_operator(self, level: str, text: str) -> None:
         """One line for the log file and for the operator's terminal."""
         self.log.log(LEVELS[level], OPERATOR_MESSAGE, text=text, seq=self.seq, t_s=self.t_s)
         self._publisher.send("log", LogMessage(seq=self.seq, t_s=self.t_s, level=level, process="main", text=text))
@@ -114,32 +114,32 @@ class PoseSnapshot(NamedTuple):
     size: int
 
 
-Who = TypeVar("Who")
+Source = TypeVar("Source")
 
 
-class DisplayStatePublisher(Generic[Who]):
+class DisplayStatePublisher(Generic[Source]):
     """Publishes ``DisplayState`` for the main loop."""
 
-    def __init__(self, publisher: Publisher, look: Callable[[Who], PoseSnapshot]) -> None:
-        self._publisher, self._look = publisher, look
-        self._who: Who | None = None
+    def __init__(self, publisher: Publisher, snapshot_of: Callable[[Source], PoseSnapshot]) -> None:
+        self._publisher, self._snapshot_of = publisher, snapshot_of
+        self._source: Source | None = None
         self._line = b"null"
 
-    def sees(self, who: Who, line: bytes) -> None:
+    def update(self, source: Source, line: bytes) -> None:
         """A frame was served: who knows the pose, and its line. Called in every frame, so it only notes them."""
-        self._who, self._line = who, line
+        self._source, self._line = source, line
 
-    def tell_if_wanted(self, seq: int, t_s: float) -> None:
+    def publish_if_subscribed(self, seq: int, t_s: float) -> None:
         """Publish, if there are subscribers.
 
         Args:
             seq, t_s: the newest frame.
         """
-        if self._who is None or not self._publisher.has_subscriber("display_state"):
+        if self._source is None or not self._publisher.has_subscriber("display_state"):
             return
-        look = self._look(self._who)
+        snapshot = self._snapshot_of(self._source)
         self._publisher.send(
-            "display_state", DisplayState(seq=seq, t_s=t_s, line=msgspec.Raw(self._line), **look._asdict())
+            "display_state", DisplayState(seq=seq, t_s=t_s, line=msgspec.Raw(self._line), **snapshot._asdict())
         )
 
 
@@ -148,17 +148,17 @@ class SurveyTelemetry(TelemetryPublisher):
 
     def __init__(self, publisher: Publisher, log: structlog.typing.FilteringBoundLogger) -> None:
         super().__init__(publisher, log)
-        self._painter = DisplayStatePublisher(publisher, look_at_localizer)
+        self._display = DisplayStatePublisher(publisher, localizer_pose)
         self._track: list[tuple[int, float, int, int, float, float, float, float]] = []
 
-    def frame(
+    def publish_frame(
         self,
         seq: int,
         t_s: float,
         localizer: Localizer,
         state: str,
         raw: bytes,
-        told: tuple[tuple[float, float, float, float], int] | None = None,
+        commands: tuple[tuple[float, float, float, float], int] | None = None,
         *,
         is_first: bool = False,
     ) -> None:
@@ -167,16 +167,16 @@ class SurveyTelemetry(TelemetryPublisher):
         Args:
             seq, t_s: the frame.
             raw: the frame's line.
-            told: span of the set points since the last estimate, rad/s, and the number of the newest drive.
+            commands: span of the set points since the last estimate, rad/s, and the number of the newest drive.
             is_first: of a session; it is always due, because the danger loop may wait for it.
         """
         self.seq, self.t_s = seq, t_s
-        self._painter.sees(localizer, raw)
+        self._display.update(localizer, raw)
         pose, sigma = localizer.pose, localizer.position_sigma_m
         if is_first or is_estimate_due(seq):
             deck = localizer.deck_pose
             x, y, heading = deck.x_m, deck.y_m, deck.heading_rad
-            commanded, drive_seq = told if told is not None else (None, -1)
+            commanded, drive_seq = commands if commands is not None else (None, -1)
             message = EstimateMessage(
                 seq=seq,
                 t_s=t_s,
@@ -191,29 +191,29 @@ class SurveyTelemetry(TelemetryPublisher):
             self._publisher.send("estimate", message)
         row, col = pose.panel
         self._track.append((seq + self._frames_before, t_s, row, col, pose.x_m, pose.y_m, pose.heading_rad, sigma))
-        self.keep(raw)
+        self.add_line(raw)
 
     def take_estimates(self) -> tuple[str, Message] | None:
         """The pending rows of the track."""
         rows, self._track = self._track, []
         return ("track", TrackMessage(seq=self.seq, t_s=self.t_s, rows=rows)) if rows else None
 
-    def arrival(self, seq: int, t_s: float, point: PointId, error_m: float) -> None:
+    def publish_arrival(self, seq: int, t_s: float, point: PointId, error_m: float) -> None:
         """The robot came to rest in frame ``seq``, at a point for the first time."""
         message = ArrivalMessage(
             seq=seq + self._frames_before, t_s=t_s, point=(point.row, point.col, point.point), error_mm=1e3 * error_m
         )
         self._publisher.send("arrival", message)
 
-    def rest(self, seq: int, t_s: float) -> None:
+    def publish_rest(self, seq: int, t_s: float) -> None:
         """The mission takes the robot to be at rest from frame ``seq`` on."""
         self._publisher.send("rest", Rest(seq=seq, t_s=t_s))
 
-    def treatment(self, seq: int, t_s: float, kind: TreatmentKind, values: tuple[float, ...] = ()) -> None:
+    def publish_treatment(self, seq: int, t_s: float, kind: TreatmentKind, values: tuple[float, ...] = ()) -> None:
         """The localizer is treated in frame ``seq``; see ``Treatment``."""
         self._publisher.send("treatment", Treatment(seq=seq, t_s=t_s, kind=kind, values=values))
 
-    def fix(
+    def publish_fix(
         self, point: PointId | None, fix: Fix, jump_m: float, *, is_fused: bool, is_set_aside: bool = False
     ) -> None:
         """A fix was measured after the last frame; no point for one that only finds the robot.
@@ -236,13 +236,13 @@ class SurveyTelemetry(TelemetryPublisher):
         )
         self._publisher.send("fix", message)
 
-    def status(self, message: MissionStatus) -> None:
+    def publish_status(self, message: MissionStatus) -> None:
         """Publish the mission's status, and a picture of all that is newest for whoever looks on."""
-        super().status(message)
-        self._painter.tell_if_wanted(self.seq, self.t_s)
+        super().publish_status(message)
+        self._display.publish_if_subscribed(self.seq, self.t_s)
 
 
-def look_at_localizer(localizer: Localizer) -> PoseSnapshot:
+def localizer_pose(localizer: Localizer) -> PoseSnapshot:
     """The pose on the deck, and the filter's last update."""
     pose, covariance, innovation = localizer.deck_pose, localizer.pose_covariance, localizer.innovation
     return PoseSnapshot(

@@ -50,9 +50,9 @@ class RunView:
     def __init__(self, title: str, *, is_sim: bool, run_dir: Path, goals: str = "points") -> None:
         self._console: Console = _BufferedConsole(stderr=True, highlight=False)
         self._is_terminal = self._console.is_terminal
-        self._sparing = RateLimitedLog(LINES_OF_A_KIND, LINES_PERIOD_S)
+        self._rate_limit = RateLimitedLog(LINES_OF_A_KIND, LINES_PERIOD_S)
         self._has_pose = False
-        self._told_tenths = 0
+        self._shown_tenths = 0
         self._goals = goals
         self._console.print(f"{title}; writing {run_dir}", soft_wrap=True, markup=False)
         self._progress = Progress(
@@ -74,11 +74,11 @@ class RunView:
         if self._is_terminal:
             self._progress.stop()
 
-    def say(self, level: str, text: str) -> None:
+    def show_message(self, level: str, text: str) -> None:
         """One line for the operator; of those that come again and again a few. ``log.jsonl`` has them all."""
-        told = self._sparing.take(level, text, time.monotonic())
-        if told is not None:
-            self._console.print(f"{level}: {told}", style=STYLES[level], markup=False, soft_wrap=True)
+        shown = self._rate_limit.take(level, text, time.monotonic())
+        if shown is not None:
+            self._console.print(f"{level}: {shown}", style=STYLES[level], markup=False, soft_wrap=True)
 
     def pose(self, track: TrackMessage) -> None:
         """The first pose shows that the robot is there."""
@@ -86,7 +86,7 @@ class RunView:
             self._has_pose = True
             _, t_s, row, col, x, y, heading, _ = track.rows[-1]
             where = f"panel {row}-{col}, x {x:.4f} m, y {y:.4f} m, heading {heading:.4f} rad"
-            self.say("info", f"first pose at {t_s:.2f} s: {where}")
+            self.show_message("info", f"first pose at {t_s:.2f} s: {where}")
 
     def status(self, status: MissionStatus) -> None:
         """Points done, state, ETA, error."""
@@ -96,8 +96,8 @@ class RunView:
             self._progress.refresh()
             return
         tenths = 10 * status.done // max(status.total, 1)
-        if tenths > self._told_tenths:
-            self._told_tenths = tenths
+        if tenths > self._shown_tenths:
+            self._shown_tenths = tenths
             self._console.print(
                 f"{10 * tenths} %: {status.done} of {status.total} {self._goals}, {text}", soft_wrap=True
             )

@@ -54,7 +54,7 @@ class Subscriber:
     Args:
         endpoints: where to connect (a publisher may come up later).
         is_watching: watch the connection, for ``is_cut``; of one publisher only.
-        is_onlooking: a publisher that waits for its subscribers does not count this one (``has_subscriber``).
+        is_uncounted: a publisher that waits for its subscribers does not count this one (``has_subscriber``).
         keeps_newest: of messages that wait only the newest is kept, whatever its topic.
     """
 
@@ -65,7 +65,7 @@ class Subscriber:
         topics: Iterable[str],
         *,
         is_watching: bool = False,
-        is_onlooking: bool = False,
+        is_uncounted: bool = False,
         keeps_newest: bool = False,
     ) -> None:
         self.socket = context.socket(zmq.SUB)
@@ -81,7 +81,7 @@ class Subscriber:
             self.socket.setsockopt(zmq.CONFLATE, 1)
         for name in topics:
             # Every message is an object: with its brace the prefix fits as well, and is not the one that is waited for.
-            self.socket.setsockopt(zmq.SUBSCRIBE, BY_NAME[name].name.encode() + (b" {" if is_onlooking else b" "))
+            self.socket.setsockopt(zmq.SUBSCRIBE, BY_NAME[name].name.encode() + (b" {" if is_uncounted else b" "))
         for endpoint in endpoints:
             self.socket.connect(endpoint)
         self.bad_messages = 0
@@ -112,7 +112,7 @@ class Subscriber:
             except BadMessage:
                 self.bad_messages += 1
 
-    def tend(self) -> None:
+    def maintain(self) -> None:
         """To be called now and then where nothing is received for long: a publisher that is new learns what we want.
 
         The library tells it from the thread that owns the socket, and only when that calls.

@@ -140,7 +140,7 @@ class EmergencyHandler(Protocol):
 
 
 def answer_observatory(
-    frame: bytes, desk: EmergencyHandler, *, at_base_or_held: bool, age_s: float | None, may_clear: bool = True
+    frame: bytes, handler: EmergencyHandler, *, at_base_or_held: bool, age_s: float | None, may_clear: bool = True
 ) -> bytes:
     """Serve one request of the observatory channel.
 
@@ -155,19 +155,19 @@ def answer_observatory(
     except BadRequest as error:
         return format_error(str(error))
     if isinstance(request, PingRequest):
-        return format_ok(code=int(desk.code), age_s=age_s)
+        return format_ok(code=int(handler.code), age_s=age_s)
     key = str(UUID(request.id))  # one of many ways to write it
     if isinstance(request, EmergencyRequest):
-        refusal = desk.emergency(request.kind.value, key, request.note)
+        refusal = handler.emergency(request.kind.value, key, request.note)
         # An edge may hide the abort's code until the robot is off it; the answer is about the latch. What was cleared
         # before is not latched again: whoever means another emergency has to know.
-        is_held = desk.holds(key)
-        accepted = format_ok(id=request.id, latched=is_held, code=int(EventCode.ABORTED if is_held else desk.code))
+        is_held = handler.holds(key)
+        accepted = format_ok(id=request.id, latched=is_held, code=int(EventCode.ABORTED if is_held else handler.code))
     elif not may_clear:
         refusal, accepted = "this client may raise emergencies, not clear them", b""
     else:
-        refusal = desk.clear(key, at_base_or_held)
-        accepted = format_ok(id=request.id, code=int(desk.code))
+        refusal = handler.clear(key, at_base_or_held)
+        accepted = format_ok(id=request.id, code=int(handler.code))
     return accepted if refusal is None else format_error(refusal, id=request.id)
 
 

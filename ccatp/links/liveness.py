@@ -20,31 +20,31 @@ class Liveness:
 
     def __init__(self, stale_after_s: float = STALE_AFTER_S) -> None:
         self._stale_after_s = stale_after_s
-        self._presences: dict[str, Heartbeat] = {}
+        self._heartbeats: dict[str, Heartbeat] = {}
 
-    def heard(self, presence: Heartbeat) -> None:
+    def update(self, heartbeat: Heartbeat) -> None:
         """A loop is there. Its words are dated by its own clock, which is the machine's: waiting in line ages them."""
-        self._presences[presence.process] = presence
+        self._heartbeats[heartbeat.process] = heartbeat
 
     @property
     def has_joined(self) -> bool:
         """Whether both loops have said that they joined the robot."""
-        return all(name in self._presences and self._presences[name].phase in ("joined", "done") for name in LOOPS)
+        return all(name in self._heartbeats and self._heartbeats[name].phase in ("joined", "done") for name in LOOPS)
 
     def trouble(self, now_s: float) -> str:
         """What is wrong, or nothing."""
         for name in LOOPS:
-            presence = self._presences.get(name)
-            if presence is None:
+            heartbeat = self._heartbeats.get(name)
+            if heartbeat is None:
                 return f"{name} was never heard of"
-            age_s = now_s - presence.t_s
+            age_s = now_s - heartbeat.t_s
             if age_s > self._stale_after_s:
                 return f"{name} was last heard of {age_s:.1f} s ago"
-            if presence.phase == "joined":
-                if presence.frame_age_s is None:
+            if heartbeat.phase == "joined":
+                if heartbeat.frame_age_s is None:
                     return f"{name} has had no frame from the robot yet"
-                if presence.frame_age_s + age_s > self._stale_after_s:
-                    return f"{name} had its last frame from the robot {presence.frame_age_s + age_s:.1f} s ago"
+                if heartbeat.frame_age_s + age_s > self._stale_after_s:
+                    return f"{name} had its last frame from the robot {heartbeat.frame_age_s + age_s:.1f} s ago"
         return ""
 
 

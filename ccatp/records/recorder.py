@@ -313,7 +313,7 @@ class Recorder:
             self.dropped += 1
             self._fail(error)
 
-    def tend(self) -> None:
+    def flush_if_due(self) -> None:
         """To be called several times a second: what waits for a full chunk does not wait for long. Never raises."""
         if self._waiting_since_s is None or not self.is_recording:
             return

@@ -480,5 +480,5 @@ async def test_refusals_do_not_fill_the_log(site: Site) -> None:
     desk = desk_of(site)
     for _ in range(1000):
         desk.answer(b"nonsense")
-        desk.refuse("unknown", "no")
+        desk.log_refusal("unknown", "no")
     assert len(site.logged) == 10

@@ -84,7 +84,7 @@ def processes() -> str:
     """The process table."""
     lines = ["| process | module | runs | when it dies |", "|---|---|---|---|"]
     for process in PROCESSES:
-        runs = "with `--sim`" if process.is_stand_in else "always"
+        runs = "with `--sim`" if process.is_simulator else "always"
         dies = "started anew" if process.is_replaceable else "the run ends, held"
         lines.append(f"| {process.name} | `{process.module}` | {runs} | {dies} |")
     return "\n".join(lines)

@@ -16,7 +16,7 @@ import zmq
 from ccatp.config.load import dump_config, load_config
 from ccatp.config.models import Config
 from ccatp.daemon.danger_loop import DangerLoop
-from ccatp.daemon.main_loop import MainLoop, open_work
+from ccatp.daemon.main_loop import MainLoop, open_runner
 from ccatp.daemon.process import EitherArgs, Endpoints, ProcessArgs
 from ccatp.dataloop import DataLoop
 from ccatp.links.robot_link import RobotLink
@@ -149,8 +149,8 @@ def _logging_to(entries: list[dict[str, Any]]) -> Iterator[None]:
 
     logger = structlog.wrap_logger(None, processors=[structlog.processors.add_log_level, keep])
     with (
-        patch("ccatp.daemon.main_loop.open_log", lambda _, name: logger.bind(process=name)),
-        patch("ccatp.daemon.danger_loop.open_log", lambda _, name: logger.bind(process=name)),
+        patch("ccatp.daemon.main_loop.open_log", lambda _, name: logger.bind(logger=name)),
+        patch("ccatp.daemon.danger_loop.open_log", lambda _, name: logger.bind(logger=name)),
     ):
         yield
 
@@ -184,9 +184,9 @@ async def running_daemon(cfg: Config, robot_cfg: Config | None = None) -> AsyncI
                     for proxy in (one, two)
                 )
                 (run_dir / "config.toml").write_text(dump_config(main_args.config), encoding="utf-8")
-                hosting, opening = open_work(EitherArgs(main_args, None))
-                with opening as make_work:
-                    main = MainLoop(main_args, context, hosting, make_work)
+                runner_cfg, opening = open_runner(EitherArgs(main_args, None))
+                with opening as make_runner:
+                    main = MainLoop(main_args, context, runner_cfg, make_runner)
                     danger = DangerLoop(danger_args, context)
                     daemon = Daemon(main, danger, robot, (one, two))
                     daemon.log = entries

@@ -134,7 +134,9 @@ class DeskRehearsal(FaultySilRun):
         ):
             self._runner, self.store = runner, store
             self._over = asyncio.Event()
-            teller = SimpleNamespace(fix=self._note_fix, say=lambda level, text: self.said.append(f"{level}: {text}"))
+            teller = SimpleNamespace(
+                publish_fix=self._note_fix, notify_operator=lambda level, text: self.said.append(f"{level}: {text}")
+            )
             self.desk = FixService(
                 self.cfg.mission,
                 cast(EtalonClient, SimpleNamespace(measure=self._ask)),

@@ -173,7 +173,7 @@ def test_drives_that_the_danger_loop_hears_of_late_have_moved_the_wheels(
         while arrived < len(told) and told[arrived].seq <= heard_until(k):
             waiting.append(told[arrived])
             arrived += 1
-        return ear.hear(k, is_lockstep=False)
+        return ear.latest(k, is_lockstep=False)
 
     wanted = [(0.0, 0.0)] * 100 + [(0.1, 0.0)] * frames + [(0.0, 0.0)] * 188
     found = found_on_the_way("hard", wanted, seed, heard, dv_m_s)

@@ -143,7 +143,7 @@ class Desk:
             cast(Any, localizer),
             cast(Mission, mission),
             patient(self.store),
-            cast(SurveyTelemetry, SimpleNamespace(fix=lambda *_, **__: None, say=lambda *_: None)),
+            cast(SurveyTelemetry, SimpleNamespace(publish_fix=lambda *_, **__: None, notify_operator=lambda *_: None)),
             self.over.set,
             lambda: config.etalon.measuring_time_s,
         )
@@ -549,7 +549,9 @@ def test_nothing_counts_that_was_measured_while_the_robot_moved(config: Config, 
                 cast(Any, stub),
                 story.mission,
                 patient(store),
-                cast(SurveyTelemetry, SimpleNamespace(fix=lambda *_, **__: None, say=lambda *_: None)),
+                cast(
+                    SurveyTelemetry, SimpleNamespace(publish_fix=lambda *_, **__: None, notify_operator=lambda *_: None)
+                ),
                 lambda: None,
                 lambda: 0.0,
             )

@@ -12,12 +12,12 @@ from tests.faults.linking import Measured
 
 # Every task that the two loops serve, by the method that it runs.
 TASKS = (
-    "ccatp.daemon.main_loop.MainLoop._beat",
+    "ccatp.daemon.main_loop.MainLoop._publish_levels",
     "ccatp.daemon.main_loop.MainLoop._watch",
     "ccatp.daemon.fix_service.FixService.run",
     "ccatp.daemon.robot_session.ReconnectingRobotLink.serve",
     "ccatp.links.rpc.Router.serve",
-    "ccatp.daemon.danger_loop.DangerLoop._beat",
+    "ccatp.daemon.danger_loop.DangerLoop._publish_heartbeat",
     "ccatp.daemon.danger_loop.DangerLoop._watch",
     "ccatp.daemon.command_handlers.ObservatoryServer.serve",
 )
@@ -62,7 +62,7 @@ def test_the_tasks_are_those_that_the_loops_serve(method_names: Callable[[], set
 
 @pytest.fixture
 def method_names() -> Callable[[], set[str]]:
-    """The coroutines in the ``work`` of both loops, read from their source."""
+    """The coroutines in the ``services`` of both loops, read from their source."""
     import ast
     import inspect
     import textwrap
@@ -75,7 +75,7 @@ def method_names() -> Callable[[], set[str]]:
         for loop in (MainLoop, DangerLoop):
             tree = ast.parse(textwrap.dedent(inspect.getsource(loop.run)))
             for node in ast.walk(tree):
-                if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "work":
+                if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "services":
                     assert isinstance(node.value, ast.Tuple)
                     found |= {
                         call.func.attr

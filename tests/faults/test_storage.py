@@ -187,7 +187,9 @@ class Desk:
             fuse_fix=lambda fix: 0.0, notices=[], pose=None, pose_covariance=None, position_sigma_m=5e-6
         )
         sure = SimpleNamespace(begin=lambda: None, review=lambda *_, **__: FixFinding())
-        teller = SimpleNamespace(fix=lambda *_, **__: None, say=lambda level, text: self.said.append(text))
+        teller = SimpleNamespace(
+            publish_fix=lambda *_, **__: None, notify_operator=lambda level, text: self.said.append(text)
+        )
         self.desk = FixService(
             config.mission,
             cast(EtalonClient, SimpleNamespace(measure=measure)),

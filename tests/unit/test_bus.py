@@ -22,8 +22,8 @@ class Bus:
     def publisher(self) -> Publisher:
         return self._ends.enter_context(closing(Publisher(self._context, ENDPOINT)))
 
-    def subscriber(self, *topics: str, is_onlooking: bool = False, keeps_newest: bool = False) -> Subscriber:
-        made = Subscriber(self._context, [ENDPOINT], topics, is_onlooking=is_onlooking, keeps_newest=keeps_newest)
+    def subscriber(self, *topics: str, is_uncounted: bool = False, keeps_newest: bool = False) -> Subscriber:
+        made = Subscriber(self._context, [ENDPOINT], topics, is_uncounted=is_uncounted, keeps_newest=keeps_newest)
         return self._ends.enter_context(closing(made))
 
 
@@ -83,7 +83,7 @@ def test_bad_messages_are_counted_and_dropped(bus: Bus) -> None:
 
 def test_nobody_waits_for_an_onlooker_who_gets_it_all_the_same(bus: Bus) -> None:
     publisher = bus.publisher()
-    onlooker = bus.subscriber("heartbeat.main", is_onlooking=True)
+    onlooker = bus.subscriber("heartbeat.main", is_uncounted=True)
     other = bus.subscriber("log")
     while not publisher.has_subscriber("log"):
         pass

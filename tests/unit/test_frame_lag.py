@@ -7,7 +7,7 @@ from ccatp.daemon.robot_session import MAX_DRIFT, LatenessStatistics
 
 def serve(lag: LatenessStatistics, late_s: dict[int, float], frames: int = 100, drift: float = 0.0) -> list[float]:
     """Frames of 100 Hz that come 3 ms after they were taken, some of them later."""
-    return [lag.served(0.01 * k, 500.0 + (1.0 + drift) * 0.01 * k + 0.003 + late_s.get(k, 0.0)) for k in range(frames)]
+    return [lag.add(0.01 * k, 500.0 + (1.0 + drift) * 0.01 * k + 0.003 + late_s.get(k, 0.0)) for k in range(frames)]
 
 
 def test_prompt_frames_do_not_lag() -> None:
@@ -30,7 +30,7 @@ def test_late_frames_are_as_late_as_they_are_and_slips_are_counted() -> None:
 def test_a_first_frame_that_was_late_is_soon_no_measure() -> None:
     lag = LatenessStatistics(0.02)
     serve(lag, {0: 1.0})
-    assert lag.served(1.0, 501.003 + 0.03) == pytest.approx(0.03, abs=1e-3)
+    assert lag.add(1.0, 501.003 + 0.03) == pytest.approx(0.03, abs=1e-3)
 
 
 @pytest.mark.parametrize("drift", [-0.9 * MAX_DRIFT, 0.9 * MAX_DRIFT])
@@ -42,9 +42,9 @@ def test_clocks_may_drift_apart(drift: float) -> None:
 def test_a_clock_that_was_set_begins_anew() -> None:
     lag = LatenessStatistics(0.02)
     serve(lag, {})
-    assert lag.served(0.5, 501.1) == 0.0  # backwards
-    assert lag.served(0.51, 501.14) == pytest.approx(0.03, abs=1e-3)
-    lag.forget()
-    assert lag.served(0.52, 900.0) == 0.0
-    assert lag.served(7000.0, 900.01) == 0.0  # forwards
-    assert lag.served(7000.01, 900.05) == pytest.approx(0.03, abs=1e-3)
+    assert lag.add(0.5, 501.1) == 0.0  # backwards
+    assert lag.add(0.51, 501.14) == pytest.approx(0.03, abs=1e-3)
+    lag.reset()
+    assert lag.add(0.52, 900.0) == 0.0
+    assert lag.add(7000.0, 900.01) == 0.0  # forwards
+    assert lag.add(7000.01, 900.05) == pytest.approx(0.03, abs=1e-3)

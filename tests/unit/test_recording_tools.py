@@ -194,7 +194,7 @@ while True:
         recorder.write("track", time.monotonic(), b'{"n":%d,"x":"%s"}' % (n, rng.randbytes(60).hex().encode()))
         os.write(notes, b"%d %.4f\\n" % (n, time.monotonic()))
         n += 1
-    recorder.tend()
+    recorder.flush_if_due()
     os.write(notes, b"tend %.4f\\n" % time.monotonic())
     time.sleep(0.01)
 """
@@ -232,13 +232,13 @@ def test_nothing_waits_longer_than_a_moment(tmp_path: Path, monkeypatch: pytest.
     path = tmp_path / "telemetry.mcap"
     made = Recorder(path, [("track", {})], is_simulation=True)
     made.write("track", 0.5, b"{}")
-    made.tend()
+    made.flush_if_due()
     assert list(iter_messages(path)) == []
     now_s += HELD_BACK_S
-    made.tend()
+    made.flush_if_due()
     assert len(list(iter_messages(path))) == 1
     made.close()
-    made.tend()
+    made.flush_if_due()
 
 
 def test_a_full_disk_while_nothing_comes_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,7 +252,7 @@ def test_a_full_disk_while_nothing_comes_is_reported(tmp_path: Path, monkeypatch
 
     with monkeypatch.context() as patch:
         patch.setattr("ccatp.records.recorder.os.write", full)
-        made.tend()
+        made.flush_if_due()
     assert not made.is_recording
     assert "No space left" in told[0]
 

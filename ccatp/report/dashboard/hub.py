@@ -56,7 +56,7 @@ class BusReader:
         self._wants = wants
         always = {"main": (*_OF_MAIN, *wants.main), "danger": _OF_DANGER}
         self._always = {
-            name: Subscriber(context, [endpoint_of(name)], topics, is_watching=True, is_onlooking=True)
+            name: Subscriber(context, [endpoint_of(name)], topics, is_watching=True, is_uncounted=True)
             for name, topics in always.items()
         }
         if is_sim and wants.once:
@@ -71,7 +71,7 @@ class BusReader:
                 # Main puts a picture together for those who ask; a verdict must not be waited for in our place.
                 Subscriber(self._context, [self._endpoint_of("main")], ["display_state"], keeps_newest=True),
                 Subscriber(
-                    self._context, [self._endpoint_of("danger")], ["verdict"], keeps_newest=True, is_onlooking=True
+                    self._context, [self._endpoint_of("danger")], ["verdict"], keeps_newest=True, is_uncounted=True
                 ),
             ]
         elif not wanted and self._glancing:
@@ -108,7 +108,7 @@ class BusReader:
             subscriber.close()
 
     def _onlooker(self, publisher: str, *topics: str) -> Subscriber:
-        return Subscriber(self._context, [self._endpoint_of(publisher)], topics, is_onlooking=True)
+        return Subscriber(self._context, [self._endpoint_of(publisher)], topics, is_uncounted=True)
 
 
 def _close(subscribers: list[Subscriber]) -> None:

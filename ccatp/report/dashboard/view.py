@@ -67,7 +67,7 @@ class Links:
         if name in self._cut_s and (before is None or before.pid != presence.pid or presence.t_s > self._cut_s[name]):
             del self._cut_s[name]
         self._presences[name] = presence
-        self._liveness.heard(presence)
+        self._liveness.update(presence)
 
     def cut(self, name: str, now_s: float) -> None:
         """The connection to a process has ended: it is gone."""

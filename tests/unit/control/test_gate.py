@@ -226,17 +226,17 @@ def test_denials_are_told_once_a_second_and_counted() -> None:
     watch = GateLog(under_test, lambda level, text: told.append((level, text)))
     for k in range(250):
         drive(under_test, SLOW, None)
-        watch.look(0.01 * k)
+        watch.update(0.01 * k)
     assert [level for level, _ in told] == ["warning"] * 3
     assert told[1][1] == "drive denied: there is no verdict (101 so far)"
     drive(under_test, SLOW, purpose=Purpose.STAND)
-    watch.look(2.5)
+    watch.update(2.5)
     assert "state allows no motion" in told[3][1]
     drive(under_test, SLOW, None)
-    watch.look(0.0)  # the robot's clock began anew
+    watch.update(0.0)  # the robot's clock began anew
     assert len(told) == 5
     drive(under_test, SLOW)
-    watch.look(9.0)
+    watch.update(9.0)
     assert len(told) == 5
     assert watch.counts == {"no_verdict": 251, "state": 1}
 

@@ -75,7 +75,7 @@ async def test_a_lost_session_is_followed_by_another_one_with_the_same_frame() -
         assert client.frames == [0, 0, 0, 0]  # nobody answered: time stood still
         assert len(client.losses) == 3
         assert len({hello.nonce for hello in client.hellos}) == 4
-        client.lasting.give_up("silent")
+        client.lasting.drop("silent")
         await client.until(lambda: len(client.frames) == 5)
         assert client.losses[-1] == "silent"
         serving.cancel()

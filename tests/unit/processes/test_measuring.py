@@ -74,7 +74,7 @@ async def told_fixes(config: Config, *refusals: Exception) -> list[tuple[bool, b
     mission = SimpleNamespace(
         is_awaiting_fix=True, request=1, is_lost=True, fixed=lambda point: None, not_fixed=lambda point, cause: None
     )
-    teller = SimpleNamespace(fix=fix, say=lambda level, text: None)
+    teller = SimpleNamespace(publish_fix=fix, notify_operator=lambda level, text: None)
     await measured_once(config, Refusing(*refusals), mission, SimpleNamespace(), teller, None)
     return told
 
@@ -99,6 +99,6 @@ async def test_a_point_that_is_measured_already_is_done_and_nobody_has_to_be_wai
     refused.set_exception(AlreadyMeasuredError("point 1/2/4 has been measured; its fix is not replaced"))
     localizer = Refusing()
     localizer.pose = None  # type: ignore[attr-defined]
-    teller = SimpleNamespace(fix=lambda *_, **__: None, say=lambda level, text: said.append(level))
+    teller = SimpleNamespace(publish_fix=lambda *_, **__: None, notify_operator=lambda level, text: said.append(level))
     await measured_once(config, localizer, mission, SimpleNamespace(record_fix=lambda *_: refused), teller, point)
     assert (done, said) == ([point], ["warning"])

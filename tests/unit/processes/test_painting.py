@@ -5,7 +5,7 @@ from pathlib import Path
 import zmq
 
 from ccatp.config.models import Config
-from ccatp.daemon.telemetry import DisplayStatePublisher, look_at_localizer
+from ccatp.daemon.telemetry import DisplayStatePublisher, localizer_pose
 from ccatp.links.bus import Publisher, Subscriber
 from ccatp.links.topics import DisplayState
 from ccatp.localizer import build_localizer
@@ -20,15 +20,15 @@ def test_a_picture_for_a_subscriber_only(config: Config, tmp_path: Path) -> None
     endpoint = f"ipc://{tmp_path}/main"
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     publisher = Publisher(context, endpoint)
-    painter = DisplayStatePublisher(publisher, look_at_localizer)
+    painter = DisplayStatePublisher(publisher, localizer_pose)
     subscriber = Subscriber(context, [endpoint], ["display_state"], keeps_newest=True)
     try:
         while not publisher.has_subscriber("display_state"):
             pass
-        painter.tell_if_wanted(1, 0.1)  # nothing is seen yet
-        painter.sees(localizer, LINE)
-        painter.tell_if_wanted(2, 0.2)
-        painter.tell_if_wanted(3, 0.3)
+        painter.publish_if_subscribed(1, 0.1)  # nothing is seen yet
+        painter.update(localizer, LINE)
+        painter.publish_if_subscribed(2, 0.2)
+        painter.publish_if_subscribed(3, 0.3)
         received = subscriber.receive(5.0)
         while received is not None and isinstance(received[1], DisplayState) and received[1].seq < 3:
             received = subscriber.receive(5.0)
@@ -42,7 +42,7 @@ def test_a_picture_for_a_subscriber_only(config: Config, tmp_path: Path) -> None
         subscriber.close()
         while publisher.has_subscriber("display_state"):
             pass
-        painter.tell_if_wanted(4, 0.4)  # nobody asked: nothing is sent, as the next subscriber finds
+        painter.publish_if_subscribed(4, 0.4)  # nobody asked: nothing is sent, as the next subscriber finds
     finally:
         subscriber.close()
         publisher.close()

@@ -38,9 +38,9 @@ def localizer() -> Localizer:
 
 def test_a_frame_that_is_not_newer_is_recorded_without_an_estimate() -> None:
     tells, listener = teller()
-    tells.frame(7, 1.0, localizer(), "driving", b'{"seq":7}')
+    tells.publish_frame(7, 1.0, localizer(), "driving", b'{"seq":7}')
     tells.stale_frame(8, b'{"seq":8}')
-    tells.frame(9, 1.01, localizer(), "driving", b'{"seq":9}')
+    tells.publish_frame(9, 1.01, localizer(), "driving", b'{"seq":9}')
     tells.flush()
     (lines,), (track,) = listener.of("sensors"), listener.of("track")
     assert isinstance(lines, SensorLines)
@@ -60,9 +60,9 @@ def test_stale_frames_alone_are_no_batch_of_estimates() -> None:
 
 def test_a_fix_belongs_behind_the_last_frame_whatever_it_was() -> None:
     tells, listener = teller()
-    tells.frame(7, 1.0, localizer(), "measuring", b"{}")
+    tells.publish_frame(7, 1.0, localizer(), "measuring", b"{}")
     tells.stale_frame(8, b"{}")
-    tells.fix(None, Fix(1.0, (0.0, 0.0, 0.0), (0.0,) * 9, 1.0, (1,), 0.0), 0.0, is_fused=False)
+    tells.publish_fix(None, Fix(1.0, (0.0, 0.0, 0.0), (0.0,) * 9, 1.0, (1,), 0.0), 0.0, is_fused=False)
     (fix,) = listener.of("fix")
     assert isinstance(fix, FixMessage)
     assert (fix.seq, fix.is_fused) == (8, False)

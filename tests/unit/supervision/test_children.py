@@ -24,7 +24,7 @@ def run_until_told(children: ProcessManager, said: list[str], lines: int) -> obj
     """Look until so many lines were said, or an end."""
     deadline = time.monotonic() + 30.0
     while len(said) < lines and time.monotonic() < deadline:
-        if (end := children.look(time.monotonic())) is not None:
+        if (end := children.poll(time.monotonic())) is not None:
             return end
         time.sleep(0.01)
     return None
@@ -40,7 +40,7 @@ def test_it_is_started_anew_and_then_done_without(config: Config, monkeypatch: p
     assert said[0] == "process page ended with status 1: starting it anew, the survey goes on"
     assert said[-1].endswith("more than 3 times within 60 s: the survey goes on without it")
     assert children.fds == []
-    assert children.look(time.monotonic()) is None
+    assert children.poll(time.monotonic()) is None
     assert not children.is_recovering(time.monotonic())  # nobody waits for it
     children.stop_all()
 

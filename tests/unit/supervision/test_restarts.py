@@ -8,20 +8,20 @@ from ccatp.daemon.child_processes import ProcessEnd, RestartPolicy, SilenceWatch
 @pytest.mark.fault("P18")
 def test_a_crash_loop_ends_and_rare_deaths_do_not() -> None:
     policy = RestartPolicy(3, 60.0)
-    assert [policy.died("main", -9, t).fate for t in (0.0, 1.0, 2.0)] == [ProcessEnd.RESTART] * 3
+    assert [policy.died("main", -9, t).end for t in (0.0, 1.0, 2.0)] == [ProcessEnd.RESTART] * 3
     decision = policy.died("main", -9, 59.0)
     assert decision == (
         ProcessEnd.HELD,
         "process main was killed by SIGKILL, more than 3 times within 60 s: run ended, wheels held",
     )
-    assert policy.died("danger", 1, 59.0).fate is ProcessEnd.RESTART  # each counts for itself
+    assert policy.died("danger", 1, 59.0).end is ProcessEnd.RESTART  # each counts for itself
     seldom = RestartPolicy(3, 60.0)
-    assert {seldom.died("main", -9, 21.0 * k).fate for k in range(50)} == {ProcessEnd.RESTART}
+    assert {seldom.died("main", -9, 21.0 * k).end for k in range(50)} == {ProcessEnd.RESTART}
 
 
 @pytest.mark.parametrize("code", [2, 5])
 def test_what_would_be_said_again_is_not_tried_again(code: int) -> None:
-    assert RestartPolicy(3, 60.0).died("main", code, 0.0).fate is ProcessEnd.END
+    assert RestartPolicy(3, 60.0).died("main", code, 0.0).end is ProcessEnd.END
 
 
 def test_the_robot_itself_has_no_substitute() -> None:
@@ -39,7 +39,7 @@ def test_how_it_died_is_told() -> None:
 @pytest.mark.fault("P7")
 def test_silence_counts_while_somebody_listens() -> None:
     watch = SilenceWatch(30.0, 2.0)
-    watch.heard()
+    watch.reset()
     now_s = 0.0
     for _ in range(18):
         now_s += 0.1
@@ -47,7 +47,7 @@ def test_silence_counts_while_somebody_listens() -> None:
     now_s += 3600.0  # the supervisor itself was stopped
     assert not watch.is_hung(now_s)
     assert watch.is_hung(now_s + 0.2)
-    watch.heard()
+    watch.reset()
     assert not watch.is_hung(now_s + 0.3)
 
 
@@ -65,5 +65,5 @@ def test_a_run_goes_on_without_what_it_does_not_need() -> None:
         ProcessEnd.RESTART,
         "process dashboard was killed by SIGKILL: starting it anew, the survey goes on",
     )
-    assert policy.died("dashboard", -9, 1.0, is_needed=False).fate is ProcessEnd.WITHOUT
-    assert policy.died("dashboard", 2, 99.0, is_needed=False).fate is ProcessEnd.WITHOUT
+    assert policy.died("dashboard", -9, 1.0, is_needed=False).end is ProcessEnd.WITHOUT
+    assert policy.died("dashboard", 2, 99.0, is_needed=False).end is ProcessEnd.WITHOUT

@@ -91,7 +91,7 @@ def test_the_watchdog_is_for_the_process_it_names(environ: dict[str, str], perio
 def test_children_do_not_inherit_the_service_manager() -> None:
     environ = {"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "2000000", "PATH": "/bin"}
     notifier, period_s = take_from(environ)
-    assert (notifier.is_heard, period_s, environ) == (True, 2.0, {"PATH": "/bin"})
+    assert (notifier.has_listener, period_s, environ) == (True, 2.0, {"PATH": "/bin"})
 
 
 # -- what is alive ----------------------------------------------------------------------------------------------------
@@ -100,11 +100,11 @@ def test_children_do_not_inherit_the_service_manager() -> None:
 def test_both_loops_must_have_joined() -> None:
     liveness = Liveness(1.0)
     assert not liveness.has_joined
-    liveness.heard(presence("main", 0.0))
+    liveness.update(presence("main", 0.0))
     assert not liveness.has_joined
-    liveness.heard(presence("danger", 0.0, "starting"))
+    liveness.update(presence("danger", 0.0, "starting"))
     assert not liveness.has_joined
-    liveness.heard(presence("danger", 0.0))
+    liveness.update(presence("danger", 0.0))
     assert liveness.has_joined
 
 
@@ -122,9 +122,9 @@ def test_both_loops_must_have_joined() -> None:
 )
 def test_trouble(main: Heartbeat, danger: Heartbeat | None, trouble: str) -> None:
     liveness = Liveness(1.0)
-    liveness.heard(main)
+    liveness.update(main)
     if danger is not None:
-        liveness.heard(danger)
+        liveness.update(danger)
     found = liveness.trouble(10.0)
     assert re.fullmatch(trouble, found)
 
@@ -132,28 +132,28 @@ def test_trouble(main: Heartbeat, danger: Heartbeat | None, trouble: str) -> Non
 def test_a_service_from_its_start_to_its_end(manager: tuple[Manager, str]) -> None:
     ear, address = manager
     service = Service(Notifier(address), 2.0)
-    service.beat(0.0, None)
-    service.heard(presence("main", 0.0))
-    service.beat(0.1, None)
+    service.update(0.0, None)
+    service.on_heartbeat(presence("main", 0.0))
+    service.update(0.1, None)
     assert ear.heard() == []  # danger has not joined
-    service.heard(presence("danger", 0.1))
-    service.beat(0.2, None)
+    service.on_heartbeat(presence("danger", 0.1))
+    service.update(0.2, None)
     assert ear.heard() == ["READY=1"]
     for tick in range(3, 33):
         now_s = 0.1 * tick
         for name in ("main", "danger"):
-            service.heard(presence(name, now_s))
-        service.beat(now_s, NO_STATUS)
+            service.on_heartbeat(presence(name, now_s))
+        service.update(now_s, NO_STATUS)
     told = ear.heard()
     assert told.count("WATCHDOG=1") == 6  # every half second
     assert [line for line in told if line.startswith("STATUS")] == ["STATUS=, 0 of 0 points"]
-    service.heard(presence("main", 6.0))  # danger was last heard of at 3.2 s
-    service.beat(6.0, NO_STATUS)
-    service.beat(6.6, NO_STATUS)
+    service.on_heartbeat(presence("main", 6.0))  # danger was last heard of at 3.2 s
+    service.update(6.0, NO_STATUS)
+    service.update(6.6, NO_STATUS)
     assert ear.heard() == ["STATUS=trouble: danger was last heard of 2.8 s ago"]
     for name in ("main", "danger"):
-        service.heard(presence(name, 6.7))
-    service.beat(6.7, NO_STATUS)
+        service.on_heartbeat(presence(name, 6.7))
+    service.update(6.7, NO_STATUS)
     assert ear.heard() == ["WATCHDOG=1", "STATUS=, 0 of 0 points"]
     service.stopping()
     assert ear.heard() == ["STOPPING=1\nSTATUS=holding the wheels and saving"]
@@ -163,10 +163,10 @@ def test_silence_counts_well_before_a_short_watchdog_bites(manager: tuple[Manage
     ear, address = manager
     service = Service(Notifier(address), 0.4)
     for name in ("main", "danger"):
-        service.heard(presence(name, 0.0))
-    service.beat(0.0, None)
-    service.beat(0.19, None)
-    service.beat(0.3, None)
+        service.on_heartbeat(presence(name, 0.0))
+    service.update(0.0, None)
+    service.update(0.19, None)
+    service.update(0.3, None)
     assert ear.heard() == [
         "READY=1", "WATCHDOG=1", "STATUS=joined the robot", "STATUS=trouble: main was last heard of 0.3 s ago"
     ]  # fmt: skip
@@ -176,9 +176,9 @@ def test_without_a_watchdog_none_is_stroked(manager: tuple[Manager, str]) -> Non
     ear, address = manager
     service = Service(Notifier(address), None)
     for name in ("main", "danger"):
-        service.heard(presence(name, 0.0))
-    service.beat(0.0, None)
-    service.beat(0.5, None)
+        service.on_heartbeat(presence(name, 0.0))
+    service.update(0.0, None)
+    service.update(0.5, None)
     assert ear.heard() == ["READY=1", "STATUS=joined the robot"]
 
 

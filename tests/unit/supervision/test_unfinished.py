@@ -7,10 +7,10 @@ import pytest
 from ccatp.daemon.danger_loop import FILE as EMERGENCIES
 from ccatp.daemon.run_dir import (
     FILE,
-    find_unfinished,
+    clear_finished,
+    find_resumable,
     finished_summary,
-    forget_finished,
-    note_unfinished,
+    mark_resumable,
     take_over_emergencies,
 )
 from ccatp.errors import ConfigError, ExitStatus
@@ -25,18 +25,18 @@ def begin(tmp_path: Path) -> Path:
     run_dir = tmp_path / "runs" / "one"
     run_dir.mkdir(parents=True)
     (run_dir / "mission.sqlite").touch()
-    note_unfinished(run_dir)
+    mark_resumable(run_dir)
     return run_dir
 
 
 def test_a_run_is_found_until_it_has_finished(tmp_path: Path) -> None:
-    assert find_unfinished() is None
+    assert find_resumable() is None
     run_dir = begin(tmp_path)
     for status in (ExitStatus.HELD, ExitStatus.INTERRUPTED, ExitStatus.UNREACHABLE):
-        forget_finished(status, run_dir)
-        assert find_unfinished() == run_dir
-    forget_finished(ExitStatus.COMPLETE, run_dir)
-    assert find_unfinished() is None
+        clear_finished(status, run_dir)
+        assert find_resumable() == run_dir
+    clear_finished(ExitStatus.COMPLETE, run_dir)
+    assert find_resumable() is None
 
 
 @pytest.mark.fault("O7")
@@ -45,32 +45,32 @@ def test_an_emergency_outlives_the_run(tmp_path: Path, kept: str) -> None:
     first, second, third = begin(tmp_path), tmp_path / "runs" / "two", tmp_path / "runs" / "three"
     assert not take_over_emergencies(second)
     (first / EMERGENCIES).write_text(kept)
-    forget_finished(ExitStatus.ABORTED, first)
-    assert find_unfinished() is None
+    clear_finished(ExitStatus.ABORTED, first)
+    assert find_resumable() is None
     assert take_over_emergencies(second)
     assert (second / EMERGENCIES).read_text() == kept
     (second / EMERGENCIES).write_text('{"active": [], "cleared": ["a"]}')
-    forget_finished(ExitStatus.COMPLETE, second)
+    clear_finished(ExitStatus.COMPLETE, second)
     assert not take_over_emergencies(third)
 
 
 def test_a_run_that_never_began_is_none(tmp_path: Path) -> None:
     (begin(tmp_path) / "mission.sqlite").unlink()
-    assert find_unfinished() is None
+    assert find_resumable() is None
     FILE.write_text("")
-    assert find_unfinished() is None
+    assert find_resumable() is None
 
 
 def test_a_note_that_cannot_be_read_or_written(tmp_path: Path) -> None:
     FILE.parent.mkdir()
     FILE.mkdir()
     with pytest.raises(ConfigError, match="--recover: cannot read"):
-        find_unfinished()
+        find_resumable()
     FILE.rmdir()
     FILE.parent.rmdir()
     FILE.parent.write_text("")
     with pytest.raises(ConfigError, match="--recover: cannot write"):
-        note_unfinished(tmp_path)
+        mark_resumable(tmp_path)
 
 
 @pytest.mark.parametrize(
