@@ -1,16 +1,14 @@
-"""What viewers are shown of a run beside the raw topics: one table of views, and their derivation from messages.
+"""Topics for viewers, named ``view/...``, and their derivation from the messages of a run.
 
-A view is a topic of its own, named ``view/...``, at a tenth of the frame rate at most: a recording with views is little
-larger, and a live stream of them small. What stays as it is (frames, the panels' map) is latched: whoever comes late is
-told again.
+They have at most a tenth of the frame rate, so that they add little to a recording. Constant ones (frames, the map of
+panels) are latched: a late subscriber gets the last message.
 """
 
 from collections.abc import Iterator, Sequence
 from math import cos, hypot, sin
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NotRequired, TypedDict
 
 import msgspec
-from msgspec import UNSET
 
 from ccatp.core import DeckPose, PanelId, PanelPose, PointId, wrap_pi
 from ccatp.links.topics import (
@@ -25,26 +23,14 @@ from ccatp.links.topics import (
     schema_of,
 )
 from ccatp.mirror.mirror import Mirror, deck_poses
-from ccatp.report.foxglove import (
-    DECK,
-    LEVELS,
-    FoxgloveLog,
-    FoxglovePose,
-    FrameTransform,
-    PoseInFrame,
-    SceneUpdate,
-    Vector3,
-    panel_scene,
-    plain_schema,
-    point_scene,
-    quaternion,
-    robot_rotation,
-    time_of,
-)
+from ccatp.report import foxglove
+from ccatp.report.foxglove import DECK, panel_scene, plain_schema, point_scene, quaternion, robot_rotation, time_of
 
-WORLD, ROBOT, TRUE_ROBOT = "world", "robot", "true robot"
+WORLD, ROBOT = "world", "robot"
+WHEELS, INERTIAL = ("wheel_right_rad_s", "wheel_left_rad_s"), ("acceleration_m_s2", "yaw_rate_rad_s")
+EDGES = ("edge_front_left", "edge_front_right", "edge_rear_left", "edge_rear_right")
 EVERY_FRAMES = 10
-# All points are told again this often, for whoever jumps into the middle of a recording.
+# All points are published again at this period, for viewers that start in the middle of a recording.
 POINTS_AGAIN_S = 60.0
 _KEPT = 1000
 
@@ -60,27 +46,27 @@ class RobotView(msgspec.Struct, frozen=True):
     sigma_m: float
 
 
-class SensorView(msgspec.Struct, frozen=True):
+class SensorView(TypedDict):
     """Scalars to plot, of every tenth frame: the newest sample of each sensor; ages as the robot echoes them.
 
-    What a frame does not hold is left out: viewers plot no nulls.
+    Values that a frame does not hold are left out, because viewers do not plot null.
     """
 
     t_s: float
     seq: int
-    wheel_right_rad_s: float | msgspec.UnsetType
-    wheel_left_rad_s: float | msgspec.UnsetType
-    acceleration_m_s2: float | msgspec.UnsetType
-    yaw_rate_rad_s: float | msgspec.UnsetType
-    edge_front_left: int | msgspec.UnsetType
-    edge_front_right: int | msgspec.UnsetType
-    edge_rear_left: int | msgspec.UnsetType
-    edge_rear_right: int | msgspec.UnsetType
+    wheel_right_rad_s: NotRequired[float]
+    wheel_left_rad_s: NotRequired[float]
+    acceleration_m_s2: NotRequired[float]
+    yaw_rate_rad_s: NotRequired[float]
+    edge_front_left: NotRequired[int]
+    edge_front_right: NotRequired[int]
+    edge_rear_left: NotRequired[int]
+    edge_rear_right: NotRequired[int]
     fan_left: float
     fan_right: float
     battery: float
-    drive_age_s: float | msgspec.UnsetType
-    permit_age_s: float | msgspec.UnsetType
+    drive_age_s: NotRequired[float]
+    permit_age_s: NotRequired[float]
     held: bool
 
 
@@ -96,14 +82,10 @@ class ErrorView(msgspec.Struct, frozen=True):
 
 
 class TopicView(NamedTuple):
-    """One row of the table of views.
-
-    Attributes:
-        is_latched: the last message holds until another one comes.
-    """
+    """A row of the table of views; the last message of a latched one holds until the next."""
 
     name: str
-    message: type[msgspec.Struct]
+    message: Any
     schema_name: str
     is_latched: bool = False
 
@@ -117,13 +99,13 @@ class ViewMessage(NamedTuple):
 
 
 VIEWS = (
-    TopicView("view/frames", FrameTransform, "foxglove.FrameTransform", True),
-    TopicView("view/panels", SceneUpdate, "foxglove.SceneUpdate", True),
-    TopicView("view/points", SceneUpdate, "foxglove.SceneUpdate"),
-    TopicView("view/robot_frame", FrameTransform, "foxglove.FrameTransform"),
-    TopicView("view/pose", PoseInFrame, "foxglove.PoseInFrame"),
-    TopicView("view/true_pose", PoseInFrame, "foxglove.PoseInFrame"),
-    TopicView("view/log", FoxgloveLog, "foxglove.LogMessage"),
+    TopicView("view/frames", foxglove.FrameTransform, "foxglove.FrameTransform", True),
+    TopicView("view/panels", foxglove.SceneUpdate, "foxglove.SceneUpdate", True),
+    TopicView("view/points", foxglove.SceneUpdate, "foxglove.SceneUpdate"),
+    TopicView("view/robot_frame", foxglove.FrameTransform, "foxglove.FrameTransform"),
+    TopicView("view/pose", foxglove.PoseInFrame, "foxglove.PoseInFrame"),
+    TopicView("view/true_pose", foxglove.PoseInFrame, "foxglove.PoseInFrame"),
+    TopicView("view/log", foxglove.Log, "foxglove.Log"),
     TopicView("view/robot", RobotView, "ccatp.Robot"),
     TopicView("view/sensors", SensorView, "ccatp.Sensors"),
     TopicView("view/error", ErrorView, "ccatp.Error"),
@@ -138,7 +120,7 @@ class _Echo(msgspec.Struct):
 
 
 class _Line(msgspec.Struct):
-    """The part of a sensors line that is shown; what it lacks is no fault of ours to judge."""
+    """The published part of a sensors line; a line without it is skipped."""
 
     seq: int
     t: float
@@ -170,19 +152,19 @@ class Views:
     def __init__(self, mirror: Mirror, puck_height_m: float) -> None:
         self._mirror, self._puck_height_m = mirror, puck_height_m
         self._deviations_m: dict[PointId, float] = {}
-        # Of one frame either may come first; what has no partner is not kept for ever.
+        # Of one frame either may arrive first; at most _KEPT wait for their counterpart.
         self._estimates: dict[int, DeckPose] = {}
         self._truths: dict[int, DeckPose] = {}
-        self._points_told_s = 0.0
+        self._points_sent_s = 0.0
         self._has_begun = False
 
     def begin(self, t_s: float = 0.0) -> Iterator[ViewMessage]:
-        """What is latched: the world's frame and the panels' map."""
+        """The latched views: frame of the world and map of the panels."""
         self._has_begun = True
         mirror, now = self._mirror, time_of(t_s)
-        origin = Vector3(*mirror.world_from_deck((0.0, 0.0, 0.0)))
+        origin = foxglove.Vector(*mirror.world_from_deck((0.0, 0.0, 0.0)))
         x, y, z = (mirror.rotate_world_from_deck(axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
-        yield _shown("view/frames", t_s, FrameTransform(now, WORLD, DECK, origin, quaternion((x, y, z))))
+        yield _shown("view/frames", t_s, foxglove.FrameTransform(now, WORLD, DECK, origin, quaternion((x, y, z))))
         yield _shown("view/panels", t_s, panel_scene(mirror, now))
 
     def of(self, message: Message) -> Iterator[ViewMessage]:
@@ -200,13 +182,12 @@ class Views:
         elif isinstance(message, FixMessage):
             yield from self._of_fix(message)
         elif isinstance(message, LogMessage):
-            log = FoxgloveLog(
-                time_of(max(message.t_s, 0.0)), LEVELS.get(message.level, 0), message.text, message.process
-            )
+            level = foxglove.LEVELS.get(message.level, 0)
+            log = foxglove.Log(time_of(max(message.t_s, 0.0)), level, message.text, message.process)
             yield _shown("view/log", message.t_s, log)
 
     def all_points(self, t_s: float) -> Iterator[ViewMessage]:
-        """Every measured point so far."""
+        """All measured points so far."""
         panels = dict.fromkeys(point.panel for point in self._deviations_m)
         if panels:
             yield _shown("view/points", t_s, point_scene(self._mirror, panels, self._deviations_m, time_of(t_s)))
@@ -227,8 +208,8 @@ class Views:
         if seq % EVERY_FRAMES == 0:
             yield from self._compared(seq, t_s, self._estimates, pose)
         now, shown = time_of(t_s), self._pose_of(pose)
-        yield _shown("view/pose", t_s, PoseInFrame(now, DECK, shown))
-        frame = FrameTransform(now, DECK, ROBOT, shown.position, shown.orientation)
+        yield _shown("view/pose", t_s, foxglove.PoseInFrame(now, DECK, shown))
+        frame = foxglove.FrameTransform(now, DECK, ROBOT, shown.position, shown.orientation)
         yield _shown("view/robot_frame", t_s, frame)
         yield _shown("view/robot", t_s, RobotView(t_s, seq, pose.x_m, pose.y_m, pose.heading_rad, sigma_m))
 
@@ -237,11 +218,11 @@ class Views:
             if seq % EVERY_FRAMES:
                 continue
             pose = DeckPose(x, y, heading)
-            yield _shown("view/true_pose", t_s, PoseInFrame(time_of(t_s), DECK, self._pose_of(pose)))
+            yield _shown("view/true_pose", t_s, foxglove.PoseInFrame(time_of(t_s), DECK, self._pose_of(pose)))
             yield from self._compared(seq, t_s, self._truths, pose)
 
     def _compared(self, seq: int, t_s: float, own: dict[int, DeckPose], pose: DeckPose) -> Iterator[ViewMessage]:
-        """The error of a frame, once estimate and truth are both there."""
+        """The error of a frame when both its estimate and its truth have arrived."""
         own[seq] = pose
         if seq in self._estimates and seq in self._truths:
             yield _shown("view/error", t_s, _error(seq, t_s, self._estimates.pop(seq), self._truths.pop(seq)))
@@ -253,17 +234,16 @@ class Views:
             return
         point = PointId(*fix.point)
         *_, self._deviations_m[point] = self._mirror.foot_of_puck(fix.position_m, self._puck_height_m)
-        if fix.t_s - self._points_told_s >= POINTS_AGAIN_S:
-            self._points_told_s = fix.t_s
+        if fix.t_s - self._points_sent_s >= POINTS_AGAIN_S:
+            self._points_sent_s = fix.t_s
             yield from self.all_points(fix.t_s)
             return
         scene = point_scene(self._mirror, (point.panel,), self._deviations_m, time_of(fix.t_s))
         yield _shown("view/points", fix.t_s, scene)
 
-    def _pose_of(self, pose: DeckPose) -> FoxglovePose:
-        return FoxglovePose(
-            Vector3(*self._mirror.surface_point(pose.x_m, pose.y_m)), robot_rotation(self._mirror, pose)
-        )
+    def _pose_of(self, pose: DeckPose) -> Any:
+        place = foxglove.Vector(*self._mirror.surface_point(pose.x_m, pose.y_m))
+        return foxglove.Pose(place, robot_rotation(self._mirror, pose))
 
 
 def _of_lines(lines: Sequence[msgspec.Raw]) -> Iterator[ViewMessage]:
@@ -272,27 +252,14 @@ def _of_lines(lines: Sequence[msgspec.Raw]) -> Iterator[ViewMessage]:
             line = _line_decoder.decode(raw)
         except msgspec.MsgspecError:
             continue
-        _, right, left = line.enc[-1] if line.enc else (0.0, UNSET, UNSET)
-        _, acceleration, rate = line.imu[-1] if line.imu else (0.0, UNSET, UNSET)
-        edges: Sequence[int | msgspec.UnsetType] = line.edge[-1][1:] if line.edge else (UNSET,) * 4
-        view = SensorView(
-            t_s=line.t,
-            seq=line.seq,
-            wheel_right_rad_s=right,
-            wheel_left_rad_s=left,
-            acceleration_m_s2=acceleration,
-            yaw_rate_rad_s=rate,
-            edge_front_left=edges[0],
-            edge_front_right=edges[1],
-            edge_rear_left=edges[2],
-            edge_rear_right=edges[3],
-            fan_left=line.fans[0],
-            fan_right=line.fans[1],
-            battery=line.soc,
-            drive_age_s=UNSET if line.cmd.age is None else line.cmd.age,
-            permit_age_s=UNSET if line.cmd.permit_age is None else line.cmd.permit_age,
-            held=line.cmd.held,
-        )
+        left, right = line.fans
+        view = {"t_s": line.t, "seq": line.seq, "fan_left": left, "fan_right": right, "battery": line.soc,
+                "held": line.cmd.held}  # fmt: skip
+        for names, samples in ((WHEELS, line.enc), (INERTIAL, line.imu), (EDGES, line.edge)):
+            if samples:
+                view |= zip(names, samples[-1][1:], strict=True)
+        ages = {"drive_age_s": line.cmd.age, "permit_age_s": line.cmd.permit_age}
+        view |= {name: age for name, age in ages.items() if age is not None}
         yield _shown("view/sensors", line.t, view)
 
 
@@ -303,5 +270,5 @@ def _error(seq: int, t_s: float, estimate: DeckPose, truth: DeckPose) -> ErrorVi
     return ErrorView(t_s, seq, 1e3 * hypot(dx, dy), 1e3 * (c * dx + s * dy), 1e3 * (c * dy - s * dx), 1e3 * turn)
 
 
-def _shown(topic: str, t_s: float, message: msgspec.Struct) -> ViewMessage:
+def _shown(topic: str, t_s: float, message: object) -> ViewMessage:
     return ViewMessage(topic, max(t_s, 0.0), _encode(message))

@@ -12,7 +12,6 @@ from ccatp.config.load import load_config
 from ccatp.core import PanelId, PanelPose, PointId
 from ccatp.links.topics import FixMessage, LogMessage, Message, SensorLines, TrackMessage, TruthMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.report.foxglove import quaternion
 from ccatp.report.views import POINTS_AGAIN_S, ViewMessage, Views
 
 PUCK_M = 0.05
@@ -137,12 +136,3 @@ def test_a_line_for_the_operator_becomes_a_log(views: Views) -> None:
 def test_a_run_that_was_not_begun_begins_with_its_first_message(mirror: Mirror) -> None:
     message = LogMessage(seq=1, t_s=2.0, level="info", process="main", text="x")
     assert list(shown(Views(mirror, PUCK_M), message)) == ["view/frames", "view/panels", "view/log"]
-
-
-def test_quaternions_agree_with_scipy() -> None:
-    rng = np.random.default_rng(5)
-    turns = [*Rotation.random(200, rng=rng), *Rotation.from_rotvec(np.pi * np.eye(3)), Rotation.identity()]
-    for turn in turns:
-        x, y, z = turn.as_matrix().T.tolist()
-        q = quaternion((x, y, z))
-        assert abs(np.dot([q.x, q.y, q.z, q.w], turn.as_quat())) == pytest.approx(1.0, abs=1e-12)
