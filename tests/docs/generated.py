@@ -4,6 +4,7 @@ A marker is a comment: ``<!-- made: NAME -->``, and ``<!-- made -->`` at its end
 them with what the code says now.
 """
 
+import inspect
 import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
@@ -111,7 +112,7 @@ def _commands(group: click.Group, path: tuple[str, ...]) -> Iterator[str]:
             [*own, *(p.make_metavar(click.Context(command)) for p in command.params if isinstance(p, click.Argument))]
         )
         yield f"## `{usage}`\n"
-        paragraphs = (command.help or "").replace("\b", "").strip()
+        paragraphs = inspect.cleandoc(command.help or "").replace("\b", "").strip()
         yield f"{paragraphs}\n"
         for option in command.params:
             if isinstance(option, click.Option) and not option.hidden:
