@@ -287,7 +287,7 @@ async def test_a_silent_loop_shows(rig: Rig) -> None:
             await page.event()
         rig.tell_alive()
         _, state = await page.until(lambda _, state: bool(state["losses"]))
-        assert state["losses"][0][0] == "the main loop has said nothing"
+        assert state["losses"][0][0] == "the main loop has not reported"
         assert state["losses"][0][1] >= 0.8
 
 

@@ -1,7 +1,4 @@
-"""The page of a mission among beacons: waypoints, the map and what is known of it, errors against the truth.
-
-What does not change while a mission among beacons goes on: the room, the waypoints, the words of the page.
-"""
+"""The page of a mission among beacons: waypoints, the map of the beacons, errors against the simulated truth."""
 
 from collections.abc import Iterable, Mapping
 from math import hypot, sqrt
@@ -15,26 +12,22 @@ from ccatp.report.dashboard.view import RunStateView
 
 CODES = ["normal operation", "near something", "operation aborted"]
 TITLES = {"zigbee": "ZigBee beacons", "follow": "Following a radio", "cricket": "Ultrasonic motes"}
-# What a robot of a survey has and this one has not.
+# Elements of the page that only a survey has.
 HIDDEN = ["edges", "fans-row", "skipped-row", "eta-row"]
 
 
 def waypoint_name(number: int) -> str:
-    """A waypoint as the mission's status names it; its number is from 0."""
+    """Name of a waypoint in the mission's status; ``number`` counts from 0."""
     return f"waypoint {number + 1}"
 
 
 def beacon_waypoints(cfg: RadioConfig) -> list[tuple[float, float]]:
-    """Those of one lap; a robot that follows a radio has none."""
+    """Waypoints of one lap, m; none for a robot that follows a radio."""
     return [] if cfg.follow.is_active else list(cfg.workspace.waypoints_m)
 
 
 def beacon_ground(cfg: RadioConfig, *, is_sim: bool, needs_token: bool) -> dict[str, Any]:
-    """The ground for the page, lengths in m, in the frame of the room.
-
-    Args:
-        needs_token: commands must carry a token.
-    """
+    """What does not change during a mission, as of ``survey_view.ground``; lengths in m, frame of the room."""
     width_m, depth_m = cfg.workspace.size_m
     is_following = cfg.follow.is_active
     goals = "seconds" if is_following else "waypoints"
@@ -73,16 +66,16 @@ def _plots(cfg: RadioConfig) -> list[str]:
 
 
 SERIES = ("error", "map", "nis", "target", "clearance")
-"""Rows of robot time (s) and: true error and three sigma of the position (mm), the latter alone where nobody knows the
-truth; true error of the beacons and the standard deviation expected (both root mean square of a place, mm); NIS and
-degrees of freedom of the readings since the row before; distance to the target and the one to be kept (m); nearest
-thing that a distance sensor sees (m)."""
-# The page draws these itself, from what comes more often.
+"""Rows of robot time (s) and: true error and three sigma of the position (mm), without the truth only the latter; true
+error of the beacons and its expected standard deviation (both root mean square, mm); NIS and degrees of freedom of the
+readings since the row before; distance to the target and the one to be kept (m); smallest distance that a distance
+sensor measures (m)."""
+# The page draws these from more frequent messages.
 _DRAWN = frozenset(("robot", "trail", "waypoint"))
 
 
 class BeaconView(RunStateView):
-    """What a page shows of a mission among beacons."""
+    """The state of a mission among beacons."""
 
     def __init__(self, cfg: RadioConfig, *, is_sim: bool) -> None:
         super().__init__(is_sim=is_sim, series=SERIES, has_laser=False)
@@ -94,7 +87,7 @@ class BeaconView(RunStateView):
         self._places: Mapping[str, tuple[float, float]] = {}
         self._truth = TruthCompare()
         self._sigma_second = -1
-        self._takers |= {
+        self._handlers |= {
             BeaconArrival: self._take_arrival,
             BeaconMapMessage: self._take_map,
             BeaconPlaces: self._take_places,
@@ -103,7 +96,7 @@ class BeaconView(RunStateView):
         }
 
     def _take_arrival(self, arrival: BeaconArrival, _now_s: float) -> None:
-        if arrival.lap > self._lap:  # the round begins anew
+        if arrival.lap > self._lap:  # a new lap
             self._lap = arrival.lap
             self._states = [PLANNED] * len(self._states)
             self._changed.update(range(len(self._states)))
@@ -118,7 +111,7 @@ class BeaconView(RunStateView):
         before, self._map = self._map, message
         t_s = round(message.t_s, 2)
         self._trail.add(message.pose[0], message.pose[1])
-        if before is None or message.nis_size < before.nis_size:  # the first, or of another main loop
+        if before is None or message.nis_size < before.nis_size:  # the first, or of a restarted main loop
             return
         if message.nis_size > before.nis_size:
             nis = round(message.nis_sum - before.nis_sum, 3)
@@ -204,7 +197,7 @@ def expected_rms_m(beacons: Mapping[str, BeaconEllipse]) -> float | None:
 
 
 def true_rms_m(beacons: Mapping[str, BeaconEllipse], places: Mapping[str, tuple[float, float]]) -> float | None:
-    """Root of the mean square distance of the beacons from where they really are; None where nobody knows that."""
+    """Root of the mean square distance of the beacons from their true places; None where none is known."""
     squares = [
         (x - places[name][0]) ** 2 + (y - places[name][1]) ** 2
         for name, (x, y, *_) in beacons.items()
@@ -214,7 +207,7 @@ def true_rms_m(beacons: Mapping[str, BeaconEllipse], places: Mapping[str, tuple[
 
 
 def worst_sigma_m(xx: float, xy: float, yy: float) -> float:
-    """Standard deviation of a place in its worst direction."""
+    """Standard deviation of a position in its worst direction."""
     middle, spread = 0.5 * (xx + yy), hypot(0.5 * (xx - yy), xy)
     return sqrt(max(middle + spread, 0.0))
 

@@ -1,7 +1,4 @@
-"""Tells all open pages the same state, ten times a second, and one that begins all of it: server-sent events.
-
-What the dashboard receives: the rare messages always, the frequent ones only while somebody looks.
-"""
+"""Reads the bus, and sends the same state to all open pages as server-sent events."""
 
 import asyncio
 import time
@@ -17,11 +14,7 @@ from ccatp.report.dashboard.view import RunStateView
 
 
 class Wants(NamedTuple):
-    """The topics of one kind of mission.
-
-    Attributes:
-        main: what makes the page's history, and costs nothing to speak of; besides that of every mission.
-    """
+    """The topics of one kind of mission; ``main`` are the rare ones besides those of every mission."""
 
     main: tuple[str, ...]
     track: str
@@ -33,14 +26,14 @@ SURVEY = Wants(("arrival", "fix", "scene"), "track", "truth", ())
 BEACONS = Wants(("beacon_arrival", "beacon_map", "scene"), "beacon_track", "beacon_truth", ("beacon_places",))
 _OF_MAIN = ("heartbeat.main", "mission", "log")
 _OF_DANGER = ("heartbeat.danger", "danger_event")
-# Taken at a time: a publisher that never pauses must not keep the pages waiting.
-MOST = 2_000
+# At a time: a publisher that never pauses must not delay the pages.
+MAX_MESSAGES = 2_000
 
 
 class BusReader:
-    """Subscriptions of the dashboard.
+    """Subscriptions of the dashboard: rare topics always, the others on request.
 
-    Nobody waits for them: a run begins when its own processes listen, whoever looks on.
+    No publisher waits for them: a run starts when its own processes have subscribed.
     """
 
     def __init__(
@@ -60,54 +53,54 @@ class BusReader:
             for name, topics in always.items()
         }
         if is_sim and wants.once:
-            self._always["truth"] = self._onlooker("truth", *wants.once)
-        self._glancing: list[Subscriber] = []
-        self._looking: list[Subscriber] = []
+            self._always["truth"] = self._subscribe("truth", *wants.once)
+        self._levels: list[Subscriber] = []
+        self._tracks: list[Subscriber] = []
 
-    def glance(self, wanted: bool) -> None:
-        """Receive the levels, of which the newest counts, or do not any more."""
-        if wanted and not self._glancing:
-            self._glancing = [
-                # Main puts a picture together for those who ask; a verdict must not be waited for in our place.
+    def read_levels(self, wanted: bool) -> None:
+        """Subscribe to display state and verdict, of which only the newest counts, or end that."""
+        if wanted and not self._levels:
+            self._levels = [
+                # The main loop makes a display state only for counted subscribers; a run counts those of the verdict.
                 Subscriber(self._context, [self._endpoint_of("main")], ["display_state"], keeps_newest=True),
                 Subscriber(
                     self._context, [self._endpoint_of("danger")], ["verdict"], keeps_newest=True, is_uncounted=True
                 ),
             ]
-        elif not wanted and self._glancing:
-            _close(self._glancing)
+        elif not wanted and self._levels:
+            _close(self._levels)
             self._view.look_away()
 
-    def look(self, wanted: bool) -> None:
-        """Receive the path as it is driven and, in simulation, the truth, or do not any more."""
+    def read_track(self, wanted: bool) -> None:
+        """Subscribe to the path as it is driven and, in simulation, the truth, or end that."""
         self._view.is_tracking = wanted
-        if wanted and not self._looking:
-            self._looking = [self._onlooker("main", self._wants.track)]
+        if wanted and not self._tracks:
+            self._tracks = [self._subscribe("main", self._wants.track)]
             if self._is_sim:
-                self._looking.append(self._onlooker("truth", self._wants.truth))
-        elif not wanted and self._looking:
-            _close(self._looking)
+                self._tracks.append(self._subscribe("truth", self._wants.truth))
+        elif not wanted and self._tracks:
+            _close(self._tracks)
 
     def drain(self, now_s: float) -> None:
-        """Hand on what has come."""
+        """Pass the received messages on to the view."""
         for name, subscriber in self._always.items():
             if subscriber.is_cut:
                 self._view.links.cut(name, now_s)
-        for subscriber in (*self._always.values(), *self._glancing, *self._looking):
-            for _ in range(MOST):
+        for subscriber in (*self._always.values(), *self._levels, *self._tracks):
+            for _ in range(MAX_MESSAGES):
                 received = subscriber.receive()
                 if received is None:
                     break
-                self._view.hear(received[1], now_s)
+                self._view.receive(received[1], now_s)
 
     def close(self) -> None:
         """Close the sockets."""
-        for subscribers in (self._glancing, self._looking):
+        for subscribers in (self._levels, self._tracks):
             _close(subscribers)
         for subscriber in self._always.values():
             subscriber.close()
 
-    def _onlooker(self, publisher: str, *topics: str) -> Subscriber:
+    def _subscribe(self, publisher: str, *topics: str) -> Subscriber:
         return Subscriber(self._context, [self._endpoint_of(publisher)], topics, is_uncounted=True)
 
 
@@ -117,17 +110,17 @@ def _close(subscribers: list[Subscriber]) -> None:
     subscribers.clear()
 
 
-# Nobody looks: what has come is put away now and then.
+# Of reading the bus while no page is open.
 IDLE_PERIOD_S = 0.5
-# Whoever asked for the levels will ask again within this, or is gone.
-GLANCE_S = 35.0
-# Main tells a picture ten times a second, once it has been asked for one.
-PICTURE_WAIT_S, PICTURE_LOOK_S = 0.3, 0.02
+# After a request for the state the levels stay subscribed for this time.
+LEVELS_S = 35.0
+# The main loop publishes display states ten times a second while it has a subscriber.
+PICTURE_WAIT_S, PICTURE_POLL_S = 0.3, 0.02
 _encoder = msgspec.json.Encoder()
 
 
 class EventStream:
-    """What one page is told; one that cannot follow is told everything anew when it can."""
+    """The next payload for one page; a page that was too slow gets the whole state next."""
 
     def __init__(self) -> None:
         self._payload = b""
@@ -137,16 +130,16 @@ class EventStream:
 
     @property
     def has_taken(self) -> bool:
-        """Whether the last payload is on its way."""
+        """Whether the last payload has been taken."""
         return not self._is_full.is_set()
 
     def offer(self, payload: bytes) -> None:
-        """The next payload."""
+        """Set the next payload."""
         self._payload = payload
         self._is_full.set()
 
     def end(self, payload: bytes | None = None) -> None:
-        """No more after this, which replaces what was not taken."""
+        """End the stream after this payload, which replaces one that was not taken."""
         self._is_over = True
         self.offer(self._payload if payload is None else payload)
 
@@ -163,54 +156,54 @@ class EventStream:
 
 
 class StateBroadcaster:
-    """Ticks while pages are open, and rests while none is."""
+    """Sends the state to the open pages at a fixed rate, and idles while none is open."""
 
-    def __init__(self, feed: BusReader, view: RunStateView, rate_hz: float) -> None:
-        self._feed, self._view, self._period_s = feed, view, 1.0 / rate_hz
+    def __init__(self, reader: BusReader, view: RunStateView, rate_hz: float) -> None:
+        self._reader, self._view, self._period_s = reader, view, 1.0 / rate_hz
         self._streams: set[EventStream] = set()
         self._wake = asyncio.Event()
-        self._glanced_s = float("-inf")
+        self._requested_s = float("-inf")
         self._is_over = False
 
     @property
     def pages(self) -> int:
-        """Open ones."""
+        """Number of open pages."""
         return len(self._streams)
 
     @contextmanager
     def open(self) -> Iterator[EventStream]:
-        """A page looks."""
+        """Register a page."""
         stream = EventStream()
         if self._is_over:
             stream.end()
         self._streams.add(stream)
-        self._look()
+        self._subscribe()
         self._wake.set()
         try:
             yield stream
         finally:
             self._streams.discard(stream)
-            self._look()
+            self._subscribe()
 
     def state(self) -> dict[str, Any]:
-        """The levels, for a program that asks; the second time it asks they are all there."""
-        self._glanced_s = now_s = time.monotonic()
-        self._look()
-        self._feed.drain(now_s)
+        """The levels; pose and sensors are there from the second request on, see ``whole_state``."""
+        self._requested_s = now_s = time.monotonic()
+        self._subscribe()
+        self._reader.drain(now_s)
         return self._view.status_data(now_s)
 
     async def whole_state(self) -> dict[str, Any]:
-        """The same with the pose, for which main is waited for a little when nobody has looked before."""
+        """The levels with the pose, for which the main loop is given ``PICTURE_WAIT_S`` at the first request."""
         state, patience_s = self.state(), time.monotonic() + PICTURE_WAIT_S
         while state["pose"] is None and state["mission"] and not (state["is_over"] or state["losses"]):
             if time.monotonic() > patience_s:
                 break
-            await asyncio.sleep(PICTURE_LOOK_S)
+            await asyncio.sleep(PICTURE_POLL_S)
             state = self.state()
         return state
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Tell the pages until ``stop`` is set; then tell them that this is the end."""
+        """Send until ``stop`` is set; then end all streams."""
         due_s = time.monotonic()
         while not stop.is_set():
             self.tick()
@@ -218,16 +211,16 @@ class StateBroadcaster:
                 await self._rest(stop)
                 due_s = time.monotonic()
                 continue
-            # What was missed is not made up for: a page wants the present.
+            # Missed ticks are dropped: a page shows the present.
             due_s = max(due_s + self._period_s, time.monotonic())
             await _sleep_until(due_s, stop)
         self._is_over = True
         self.tick(is_last=True)
 
     def tick(self, *, is_last: bool = False) -> None:
-        """Take what came, and tell it."""
+        """Read the bus, and send the state."""
         now_s = time.monotonic()
-        self._feed.drain(now_s)
+        self._reader.drain(now_s)
         news = self._view.news(now_s)
         streams = [stream for stream in self._streams if is_last or stream.has_taken]
         if not streams:
@@ -237,21 +230,21 @@ class StateBroadcaster:
         everything = b""
         if is_last or any(stream.needs_all for stream in streams):
             everything = _event("end" if is_last else "all", self._view.everything(now_s))
-        told = _event("news", news)
+        payload = _event("news", news)
         for stream in streams:
             if is_last:
                 stream.end(everything)
             else:
-                stream.offer(everything if stream.needs_all else told)
+                stream.offer(everything if stream.needs_all else payload)
                 stream.needs_all = False
 
-    def _look(self) -> None:
+    def _subscribe(self) -> None:
         has_pages = bool(self._streams)
-        self._feed.look(has_pages)
-        self._feed.glance(has_pages or time.monotonic() - self._glanced_s < GLANCE_S)
+        self._reader.read_track(has_pages)
+        self._reader.read_levels(has_pages or time.monotonic() - self._requested_s < LEVELS_S)
 
     async def _rest(self, stop: asyncio.Event) -> None:
-        self._look()
+        self._subscribe()
         self._wake.clear()
         async with asyncio.TaskGroup() as tasks:
             waits = [tasks.create_task(self._wake.wait()), tasks.create_task(stop.wait())]

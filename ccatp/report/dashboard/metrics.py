@@ -24,7 +24,7 @@ GAUGES: tuple[tuple[str, str, str, Callable[[Any], float | None]], ...] = (
     ("drive_age_seconds", "Age of the drive in force, by the robot.", "robot", lambda r: r["drive_age_s"]),
     ("permit_age_seconds", "Age of the permit in force, by the robot.", "robot", lambda r: r["permit_age_s"]),
     ("robot_faults", "Faults that the robot reports.", "robot", lambda r: len(r["faults"])),
-    ("position_sigma_meters", "Root of the summed variances of x and y.", "pose", lambda p: _sigma_m(**p)),
+    ("position_sigma_meters", "Root of the summed variances of x and y.", "pose", lambda p: _sigma_m(*p.covariance_m2)),
 )  # fmt: skip
 POINT_COUNTS = {"planned": "total", "measured": "done", "skipped": "skipped"}
 
@@ -58,8 +58,8 @@ class StateCollector(Collector):
         yield _gauge("up", "1 when both loops report and the robot sends frames.", [("", up)])
         yield _gauge("dashboard_pages", "Open pages.", [("", self._hub.pages)])
         links = state["links"]
-        yield _gauge("link_up", "1 when that end reports.", [(link["name"], link["is_well"]) for link in links], "link")
-        ages = [(link["name"], link["age_s"]) for link in links]
+        yield _gauge("link_up", "1 when that end reports.", [(link.name, link.is_well) for link in links], "link")
+        ages = [(link.name, link.age_s) for link in links]
         yield _gauge("link_age_seconds", "Since the last message of that end.", ages, "link")
         restarts = CounterMetricFamily(
             "ccatp_process_restarts", "Restarts of a process that the dashboard has seen.", labels=("process",)
@@ -91,6 +91,5 @@ def _gauge(name: str, text: str, samples: Samples, label: str = "") -> Metric:
     return gauge
 
 
-def _sigma_m(covariance_m2: tuple[float, float, float], **_: float) -> float:
-    xx, _xy, yy = covariance_m2
+def _sigma_m(xx: float, _xy: float, yy: float) -> float:
     return sqrt(max(xx + yy, 0.0))

@@ -1,9 +1,4 @@
-"""The page of a survey: its points, the errors against laser and truth, the path.
-
-What does not change while a run goes on: the map on which things are drawn, and what the page may do.
-
-How far the estimate is from the simulated truth, frame by frame, and the worst of each second.
-"""
+"""The page of a survey: its points, arrival errors by the laser, errors against the simulated truth, the path."""
 
 from collections import OrderedDict
 from collections.abc import Iterable
@@ -29,9 +24,9 @@ WORDS = {
     "goal": "points",
     "reached": "measured",
 }
-"""What the page calls things: by the id of their place on it, and for its own sentences."""
+"""Terms of the page, by the id of their element or for its own sentences."""
 PLANNED, ARRIVED, MEASURED, SKIPPED = range(4)
-"""State of a point: planned, the robot came to rest there, measured, left out."""
+"""State of a point; arrived: the robot is at rest there."""
 
 
 def point_name(point: PointId) -> str:
@@ -45,12 +40,7 @@ def survey_points(mirror: Mirror, cfg: Config) -> list[PointId]:
 
 
 def ground(mirror: Mirror, cfg: Config, *, is_sim: bool, needs_token: bool) -> dict[str, Any]:
-    """The ground for the page, lengths in m, deck frame.
-
-    Args:
-        is_sim: robot and laser system are stand-ins.
-        needs_token: commands must carry a token.
-    """
+    """What does not change during a run: map and settings of the page; lengths in m, deck frame."""
     base = mirror.base_pose
     return {
         "title": mirror.name,
@@ -78,14 +68,14 @@ def ground(mirror: Mirror, cfg: Config, *, is_sim: bool, needs_token: bool) -> d
     }
 
 
-# Of every so many frames one is compared: ten a second.
+# Frames between two that are compared: ten a second are.
 EVERY = 10
-# Frames whose other half has not come: batches of a second, and some reserve.
+# Frames without a counterpart: batches of a second, and some reserve.
 WAITING = 500
 
 
 class Second(NamedTuple):
-    """The worst of one second: robot time (s), true error of the position and its three sigma (mm)."""
+    """The largest error of one second: robot time (s), true error of the position and its three sigma (mm)."""
 
     t_s: float
     error_mm: float
@@ -93,7 +83,7 @@ class Second(NamedTuple):
 
 
 class TruthCompare:
-    """Joins what main estimated and what the stand-in knows; either may come first."""
+    """Joins estimates with the simulated truth of the same frame; either may arrive first."""
 
     def __init__(self) -> None:
         self._estimates: OrderedDict[int, tuple[float, float, float]] = OrderedDict()
@@ -107,11 +97,11 @@ class TruthCompare:
         return seq % EVERY == 0
 
     def estimate(self, seq: int, x_m: float, y_m: float, sigma_m: float) -> list[Second]:
-        """Main's estimate after frame ``seq``, deck frame; returns the seconds that are complete by it."""
+        """Add the estimate after frame ``seq``, deck frame; returns the seconds that it completes."""
         return self._join(seq, self._estimates, (x_m, y_m, sigma_m))
 
     def truth(self, rows: Iterable[tuple[int, float, float, float]]) -> list[Second]:
-        """True places: rows of frame, time (s), x and y (m); returns the seconds that are complete by them."""
+        """Add rows of frame, time (s), true x and y (m); returns the seconds that they complete."""
         done = []
         for seq, t_s, x_m, y_m in rows:
             if self.is_compared(seq):
@@ -139,15 +129,11 @@ class TruthCompare:
 
 SERIES = ("arrival", "jump", "nis", "error")
 """Rows of robot time (s) and: arrival error by the laser (mm); how far a fix moved the estimate (mm); NIS and degrees
-of freedom; true error and three sigma of the position (mm), the latter alone where nobody knows the truth."""
+of freedom; true error and three sigma of the position (mm), without the truth only the latter."""
 
 
 class SurveyView(RunStateView):
-    """What a page shows of a survey.
-
-    Args:
-        is_sim: robot and laser system are stand-ins.
-    """
+    """The state of a survey."""
 
     def __init__(self, mirror: Mirror, cfg: Config, *, is_sim: bool) -> None:
         super().__init__(is_sim=is_sim, series=SERIES)
@@ -160,7 +146,7 @@ class SurveyView(RunStateView):
         self._changed: set[int] = set()
         self._truth = TruthCompare()
         self._sigma_second = -1
-        self._takers |= {
+        self._handlers |= {
             ArrivalMessage: self._take_arrival,
             FixMessage: self._take_fix,
             TrackMessage: self._take_track,
@@ -168,11 +154,7 @@ class SurveyView(RunStateView):
         }
 
     def begin_with(self, measured: Iterable[tuple[PointId, float, Vector3]], skipped: Iterable[PointId]) -> None:
-        """What was done before this process began.
-
-        Args:
-            measured: points with the time (s) and the puck (world frame, m) of their fixes, in any order.
-        """
+        """Take the points of the mission database; measured ones with time (s) and puck (world frame, m)."""
         for point, t_s, position_m in sorted(measured, key=lambda row: row[1]):
             self._measured(point, t_s, position_m)
         for point in skipped:
@@ -213,7 +195,7 @@ class SurveyView(RunStateView):
         try:
             x_m, y_m, _ = mirror.foot_of_puck(position_m, self._puck_height_m)
         except ConvergenceError:
-            return  # whatever it is a fix of, it is not on this mirror
+            return  # not on this mirror
         target = mirror.surface_point(*mirror.point_on_deck(point))
         error_mm = round(1e3 * dist(mirror.surface_point(x_m, y_m), target), 3)
         self._errors_mm[index] = error_mm
@@ -255,7 +237,7 @@ class SurveyView(RunStateView):
         return {"points": [[k, s, self._errors_mm[k]] for k, s in enumerate(self._states) if s != PLANNED]}
 
     def _next_point(self) -> str:
-        """On the way to a stop that is no point the mission names none; then it is the first to be done."""
+        # On the way to a stop that is not a point the mission has none; then it is the first planned one.
         if self.status is None or self.status.point or self.status.outcome or PLANNED not in self._states:
             return super()._next_point()
         return point_name(self.points[self._states.index(PLANNED)])

@@ -1,12 +1,7 @@
-"""What every page shows, from what came over the bus: links, mission, verdict, pose, messages, the map.
-
-Who is heard of, how long ago, and what is lost.
-
-What grows while a run goes on: samples of plots, the driven path, messages; bounded, and what of it is new.
-"""
+"""The state that every page shows, made from the messages of the bus: links, mission, verdict, pose, messages, map."""
 
 from collections.abc import Callable, Iterable
-from math import hypot
+from math import dist
 from typing import Any, NamedTuple
 
 import msgspec
@@ -22,8 +17,8 @@ PICTURE_STALE_S = BY_NAME["display_state"].stale_after_s
 STATUS_STALE_S = BY_NAME["mission"].stale_after_s
 
 
-class LinkState(NamedTuple):
-    """One end as the page shows it: its name, what it is at, seconds since its last word, and whether that is well."""
+class LinkState(msgspec.Struct, frozen=True):
+    """A process or a device: its phase, seconds since its last message, and whether the link is well."""
 
     name: str
     phase: str
@@ -32,7 +27,7 @@ class LinkState(NamedTuple):
 
 
 class Loss(NamedTuple):
-    """What is lost, and for how long, s."""
+    """A lost link, and for how long, s."""
 
     what: str
     for_s: float
@@ -42,10 +37,7 @@ class Loss(NamedTuple):
 
 
 class Links:
-    """Dates what comes from each process.
-
-    Times called ``now_s`` are the machine's monotonic clock, by which processes date their presence as well.
-    """
+    """Age of the last message of each process; ``now_s`` is the machine's monotonic clock, as are their time stamps."""
 
     def __init__(self, *, has_laser: bool = True) -> None:
         self._has_laser = has_laser
@@ -58,7 +50,7 @@ class Links:
         self.is_over = False
 
     def presence(self, presence: Heartbeat) -> None:
-        """A process is there."""
+        """Take the heartbeat of a process."""
         name = presence.process
         before = self._presences.get(name)
         if before is not None and before.pid != presence.pid:
@@ -70,52 +62,45 @@ class Links:
         self._liveness.update(presence)
 
     def cut(self, name: str, now_s: float) -> None:
-        """The connection to a process has ended: it is gone."""
+        """The connection to a process has ended."""
         self._cut_s.setdefault(name, now_s)
 
     def picture(self, now_s: float) -> None:
-        """Main has told its newest."""
+        """The main loop has published its display state."""
         self._picture_s = now_s
 
     def look_away(self) -> None:
-        """Nobody wants pictures any more, so that there are none means nothing."""
+        """No display states are requested any more: their absence is not a loss."""
         self._picture_s = None
 
     def status(self, status: MissionStatus) -> None:
-        """Main has told where the mission stands."""
+        """Take the status of the mission."""
         self.is_over = status.exit_status >= 0
 
     @property
     def restarts(self) -> dict[str, int]:
-        """How often a process was started anew, as far as seen from here."""
+        """Restarts of each process that were seen from here."""
         return {name: self._restarts.get(name, 0) for name in LOOPS}
 
     def losses(self, now_s: float) -> list[Loss]:
-        """What is lost, the gravest first; empty when all is well, and when the mission is over."""
+        """Lost links, the gravest first; none when the mission is over."""
         if self.is_over:
             return []
         losses = [self._loss(name, now_s) for name in LOOPS]
         return [loss for loss in (*losses, self._robot_loss(now_s)) if loss is not None]
 
     def trouble(self, now_s: float) -> str:
-        """Why the run is not well, or nothing; also while it is starting."""
+        """Why the run is not well, also while it starts; empty when it is well."""
         if self.is_over:
             return ""
         losses = self.losses(now_s)
         return str(losses[0]) if losses else self._liveness.trouble(now_s)
 
     def shown(self, now_s: float) -> list[LinkState]:
-        """All ends."""
+        """All links."""
         links = [self._loop(name, now_s) for name in LOOPS]
         links.append(self._robot(now_s))
         return [*links, self._laser(now_s)] if self._has_laser else links
-
-    def as_data(self, now_s: float) -> list[dict[str, Any]]:
-        """All ends, for the page."""
-        return [
-            {**link._asdict(), "age_s": None if link.age_s is None else round(link.age_s, 2)}
-            for link in self.shown(now_s)
-        ]
 
     def _loss(self, name: str, now_s: float) -> Loss | None:
         presence = self._presences.get(name)
@@ -126,7 +111,7 @@ class Links:
         age_s = now_s - presence.t_s
         picture_age_s = 0.0 if name != "main" or self._picture_s is None else now_s - self._picture_s
         if age_s > BY_NAME[f"heartbeat.{name}"].stale_after_s or picture_age_s > PICTURE_STALE_S:
-            return Loss(f"the {NAMES[name]} has said nothing", max(age_s, picture_age_s))
+            return Loss(f"the {NAMES[name]} has not reported", max(age_s, picture_age_s))
         return None
 
     def _robot_loss(self, now_s: float) -> Loss | None:
@@ -149,83 +134,70 @@ class Links:
     def _loop(self, name: str, now_s: float) -> LinkState:
         presence = self._presences.get(name)
         if name in self._cut_s:
-            return LinkState(NAMES[name], "gone", now_s - self._cut_s[name], False)
+            return LinkState(NAMES[name], "gone", _age_s(now_s - self._cut_s[name]), False)
         if presence is None:
-            return LinkState(NAMES[name], "not heard of", None, False)
-        return LinkState(NAMES[name], presence.phase, max(now_s - presence.t_s, 0.0), self._loss(name, now_s) is None)
+            return LinkState(NAMES[name], "no heartbeat yet", None, False)
+        age_s = _age_s(now_s - presence.t_s)
+        return LinkState(NAMES[name], presence.phase, age_s, self._loss(name, now_s) is None)
 
     def _robot(self, now_s: float) -> LinkState:
         age_s = self._frame_age_s(now_s)
         if age_s is None:
             return LinkState("robot", "no frame yet", None, False)
         is_lost = self._robot_loss(now_s) is not None or self._loss("main", now_s) is not None
-        return LinkState("robot", "lost" if is_lost else "frames", max(age_s, 0.0), not is_lost)
+        return LinkState("robot", "lost" if is_lost else "frames", _age_s(age_s), not is_lost)
 
     def _laser(self, now_s: float) -> LinkState:
         if self.fix_s is None:
             return LinkState("laser", "no fix yet", None, True)
-        return LinkState("laser", "last fix", now_s - self.fix_s, True)
+        return LinkState("laser", "last fix", _age_s(now_s - self.fix_s), True)
+
+
+def _age_s(age_s: float) -> float:
+    return round(max(age_s, 0.0), 2)
 
 
 Row = tuple[Any, ...]
 
-# Nobody sees less than this on a map of six metres.
+# Not visible on a map of six metres.
 PATH_STEP_M = 0.02
 
 
 class Growing:
-    """Rows in the order in which they came.
-
-    Args:
-        limit: when there are more, every second one of the older half is dropped.
-    """
+    """Rows in the order of their arrival, and the new ones; beyond ``limit`` the older half is thinned."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
-        self._rows: list[Row] = []
+        self.rows: list[Row] = []
         self._new: list[Row] = []
 
     def add(self, *row: Any) -> None:
-        """One more row."""
-        self._rows.append(row)
+        """Add a row."""
+        self.rows.append(row)
         self._new.append(row)
-        if len(self._rows) > self._limit:
+        if len(self.rows) > self._limit:
             half = self._limit // 2
-            self._rows[:half] = self._rows[:half:2]
-
-    @property
-    def rows(self) -> list[Row]:
-        """All that are kept."""
-        return self._rows
-
-    @property
-    def newest(self) -> Row | None:
-        """The last one."""
-        return self._rows[-1] if self._rows else None
+            self.rows[:half] = self.rows[:half:2]
 
     def take_new(self) -> list[Row]:
-        """Those since the last time; nobody who has no page is told, so they are bounded as well."""
+        """The rows since the last call, at most ``limit``."""
         new, self._new = self._new[-self._limit :], []
         return new
 
 
-class Trail:
-    """The driven path, as far as anybody looked; straight from stop to stop where nobody did."""
+class Trail(Growing):
+    """The driven path: rows of x and y, m, in steps of at least ``PATH_STEP_M``."""
 
-    def __init__(self, limit: int) -> None:
-        self.points = Growing(limit)
-
-    def add(self, x_m: float, y_m: float) -> None:
-        """The robot is, or was, here; what is nearer to the last point than anybody sees is left out."""
-        last = self.points.newest
-        if last is None or hypot(x_m - last[0], y_m - last[1]) >= PATH_STEP_M:
-            self.points.add(round(x_m, 3), round(y_m, 3))
+    def add(self, *row: float) -> None:
+        """Add the position of the robot, unless it is too near to the last row."""
+        if not self.rows or dist(row, self.rows[-1]) >= PATH_STEP_M:
+            super().add(*(round(value, 3) for value in row))
 
 
 class Lines:
-    """The last lines told to the operator: of each kind the newest, and how often it was said.
+    """The last messages to the operator: of each kind the newest, and how many of that kind there were.
 
-    A row is the robot's time (s), the level, the text, how often lines of its kind were said, and the kind's number.
+    A row is the robot's time (s), the level, the text, the number of messages of its kind, and the kind's number.
     """
 
     def __init__(self, limit: int) -> None:
@@ -235,7 +207,7 @@ class Lines:
         self._kinds = 0
 
     def add(self, t_s: float, level: str, text: str) -> None:
-        """One more line."""
+        """Add a message."""
         key = level, kind_of(text)
         before = self._rows.pop(key, None)
         self._new.pop(key, None)
@@ -248,24 +220,25 @@ class Lines:
 
     @property
     def rows(self) -> list[Row]:
-        """All that are kept, the newest last."""
+        """All rows, the newest last."""
         return list(self._rows.values())
 
     def take_new(self) -> list[Row]:
-        """Those since the last time."""
+        """The rows since the last call."""
         new, self._new = list(self._new.values()), {}
         return new
 
 
 MAX_PATH, MAX_SAMPLES, MAX_LINES = 12_000, 4_000, 200
+NO_LINE = msgspec.Raw(b"null")
 _line = msgspec.json.Decoder(Sensors)
 
 
 class RunStateView:
-    """Hears the bus, and tells a page what is new. Missions add what is theirs.
+    """Keeps the state of a run up to date, and returns what is new; a subclass adds that of its kind of mission.
 
     Attributes:
-        is_tracking: the path comes as it is driven; else only its stops are known.
+        is_tracking: the path arrives as it is driven; otherwise it has only the stops.
     """
 
     def __init__(self, *, is_sim: bool, series: Iterable[str], has_laser: bool = True) -> None:
@@ -283,30 +256,21 @@ class RunStateView:
         self._series = {name: Growing(MAX_SAMPLES) for name in series}
         self._lines = Lines(MAX_LINES)
         self._ticks = 0
-        self._takers: dict[type, Callable[[Any, float], None]] = {
-            Heartbeat: self._take_presence,
+        self._handlers: dict[type, Callable[[Any, float], None]] = {
+            Heartbeat: lambda heartbeat, _: self.links.presence(heartbeat),
             MissionStatus: self._take_status,
             DisplayState: self._take_picture,
             Verdict: self._take_verdict,
             DangerEvent: self._take_verdict,
             Scene: self._take_scene,
-            LogMessage: self._take_log,
+            LogMessage: lambda log, _: self._lines.add(round(log.t_s, 2), log.level, log.text),
         }
 
-    # -- what comes in --------------------------------------------------------------------------------------------
-
-    def hear(self, message: Message | Verdict, now_s: float) -> None:
-        """Take one message.
-
-        Args:
-            message: of the topic table; what the page does not show is ignored.
-        """
-        taker = self._takers.get(type(message))
-        if taker is not None:
-            taker(message, now_s)
-
-    def _take_presence(self, presence: Heartbeat, _now_s: float) -> None:
-        self.links.presence(presence)
+    def receive(self, message: Message | Verdict, now_s: float) -> None:
+        """Take a message of the bus; one that the page does not show is ignored."""
+        handler = self._handlers.get(type(message))
+        if handler is not None:
+            handler(message, now_s)
 
     def _take_status(self, status: MissionStatus, now_s: float) -> None:
         self.status, self._status_s = status, now_s
@@ -314,7 +278,7 @@ class RunStateView:
 
     def _take_picture(self, picture: DisplayState, now_s: float) -> None:
         self.links.picture(now_s)
-        self._picture = picture
+        self._picture = msgspec.structs.replace(picture, line=NO_LINE)
         try:
             self._sensors = _line.decode(picture.line)
         except msgspec.MsgspecError:
@@ -329,21 +293,16 @@ class RunStateView:
     def _take_scene(self, scene: Scene, _now_s: float) -> None:
         self._scene, self._is_scene_new = scene, True
 
-    def _take_log(self, log: LogMessage, _now_s: float) -> None:
-        self._lines.add(round(log.t_s, 2), log.level, log.text)
-
     def look_away(self) -> None:
-        """Levels will not come any more; old ones are not shown."""
+        """Display states are not requested any more; the old one is not shown."""
         self.links.look_away()
         self._picture = self._sensors = None
 
-    # -- what goes out --------------------------------------------------------------------------------------------
-
     def news(self, now_s: float) -> dict[str, Any]:
-        """All levels, and of what grows that which is new since the last time."""
+        """The levels, and the new rows of what grows."""
         self._ticks += 1
         state = self._levels(now_s) | self._own_news()
-        state["path"] = self._trail.points.take_new()
+        state["path"] = self._trail.take_new()
         state["series"] = {name: new for name, series in self._series.items() if (new := series.take_new())}
         state["log"] = self._lines.take_new()
         if self._is_scene_new:
@@ -352,16 +311,16 @@ class RunStateView:
         return state
 
     def everything(self, now_s: float) -> dict[str, Any]:
-        """All levels and all that has grown, for a page that begins. After ``news``, so that the two fit together."""
+        """The levels and all rows, for a new page; to be called after ``news``, so that no row is sent twice."""
         state = self._levels(now_s) | self._own_all()
-        state["path"] = self._trail.points.rows
+        state["path"] = self._trail.rows
         state["series"] = {name: series.rows for name, series in self._series.items()}
         state["log"] = self._lines.rows
         state["shapes"] = self._shapes()
         return state
 
     def status_data(self, now_s: float) -> dict[str, Any]:
-        """The levels with the run's trouble, for programs that ask."""
+        """The levels with the run's trouble, for ``/status``."""
         return {**self._levels(now_s), "trouble": self.links.trouble(now_s)}
 
     def _own_news(self) -> dict[str, Any]:
@@ -378,11 +337,11 @@ class RunStateView:
             "tick": self._ticks,
             "is_sim": self._is_sim,
             "is_over": self.links.is_over,
-            "losses": [[loss.what, round(loss.for_s, 1)] for loss in self.links.losses(now_s)],
-            "links": self.links.as_data(now_s),
+            "losses": self.links.losses(now_s),
+            "links": self.links.shown(now_s),
             "restarts": self.links.restarts,
             "mission": self._mission(now_s),
-            "pose": self._pose(),
+            "pose": self._picture,
             "verdict": self._shown_verdict(now_s),
             "robot": self._robot(),
         }
@@ -396,28 +355,13 @@ class RunStateView:
         shown["not_to_be_measured"] = sum(map(len, self.status.left_out.values()))
         return shown
 
-    def _pose(self) -> dict[str, Any] | None:
-        p = self._picture
-        if p is None:
-            return None
-        return {
-            "t_s": round(p.t_s, 2),
-            "x_m": round(p.x_m, 4),
-            "y_m": round(p.y_m, 4),
-            "heading_rad": round(p.heading_rad, 4),
-            "covariance_m2": p.covariance_m2,
-            "heading_sigma_rad": p.heading_sigma_rad,
-        }
-
     def _shown_verdict(self, now_s: float) -> dict[str, Any] | None:
         v = self._verdict
         if v is None:
             return None
-        shown: dict[str, Any] = {name: getattr(v, name) for name in ("cause", "signal", "value", "limit", "off")}
-        shown["code"], shown["severity"] = int(v.code), int(v.severity)
+        shown: dict[str, Any] = msgspec.to_builtins(v)
         shown["text"] = danger_text(v.cause, v.signal, v.value, v.limit)
         if isinstance(v, Verdict):
-            shown["permits"] = {"forward": v.forward, "reverse": v.reverse, "turn": v.turn}
             shown["is_stale"] = now_s - self._verdict_s > STATUS_STALE_S and not self.links.is_over
         return shown
 

@@ -62,33 +62,33 @@ def encoded(data: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_waypoints_are_done_one_after_the_other_and_anew_in_the_next_lap(view: BeaconView) -> None:
-    view.hear(arrival(0), 0.0)
-    view.hear(arrival(1), 0.0)
+    view.receive(arrival(0), 0.0)
+    view.receive(arrival(1), 0.0)
     assert view.news(0.0)["points"] == [[0, MEASURED, None], [1, MEASURED, None]]
     assert view.news(0.0)["points"] == []
-    view.hear(arrival(0, lap=1), 0.0)
+    view.receive(arrival(0, lap=1), 0.0)
     assert view.news(0.0)["points"] == [[0, MEASURED, None], *([k, PLANNED, None] for k in (1, 2, 3))]
     assert view.everything(0.0)["points"] == [[0, MEASURED, None]]
 
 
 def test_the_map_against_what_is_expected_and_what_is_true(view: BeaconView) -> None:
-    view.hear(BeaconPlaces(seq=0, t_s=0.0, places={"a": (0.0, 0.0), "b": (3.0, 0.0)}), 0.0)
-    view.hear(told_map(), 0.0)
-    view.hear(told_map(1.5, nis_sum=6.0, nis_size=4, refused=2), 0.0)
+    view.receive(BeaconPlaces(seq=0, t_s=0.0, places={"a": (0.0, 0.0), "b": (3.0, 0.0)}), 0.0)
+    view.receive(told_map(), 0.0)
+    view.receive(told_map(1.5, nis_sum=6.0, nis_size=4, refused=2), 0.0)
     series = view.news(0.0)["series"]
     # Root mean squares of 0.3 and 0.4 m, and of variances of 0.04 for each place, in mm.
     assert series["map"] == [(1.5, pytest.approx(353.55), pytest.approx(200.0))]
     assert series["nis"] == [(1.5, 6.0, 4)]
     assert series["clearance"] == [(1.5, 0.7)]
-    view.hear(told_map(2.0, nis_sum=7.0, nis_size=6, refused=2), 0.0)
+    view.receive(told_map(2.0, nis_sum=7.0, nis_size=6, refused=2), 0.0)
     assert view.news(0.0)["series"]["nis"] == [(2.0, 1.0, 2)]
-    view.hear(told_map(2.5), 0.0)  # of another main loop: it begins anew
+    view.receive(told_map(2.5), 0.0)  # of another main loop: it begins anew
     assert "nis" not in view.news(0.0)["series"]
 
 
 def test_facts(view: BeaconView) -> None:
     assert view.everything(0.0)["facts"] == []
-    view.hear(told_map(nis_sum=6.0, nis_size=4, refused=2), 0.0)
+    view.receive(told_map(nis_sum=6.0, nis_size=4, refused=2), 0.0)
     assert dict(view.everything(0.0)["facts"]) == {
         "beacons on the map": "2",
         "error of the map, expected": "200.0 mm",
@@ -103,7 +103,7 @@ def test_a_target_is_followed() -> None:
     view = BeaconView(config("follow"), is_sim=True)
     target = (1.8, 0.8, 0.01, 0.0, 0.01)
     for t_s in (1.0, 1.5):
-        view.hear(told_map(t_s, target=target, beacons={"target": target}, waypoints=[], next_waypoint=-1), 0.0)
+        view.receive(told_map(t_s, target=target, beacons={"target": target}, waypoints=[], next_waypoint=-1), 0.0)
     told = view.news(0.0)
     assert told["series"]["target"] == [(1.5, 1.0, 0.6)]
     assert "map" not in told["series"]  # the one that moves is none of the map
@@ -112,36 +112,36 @@ def test_a_target_is_followed() -> None:
 
 def test_the_error_against_the_truth_is_the_worst_of_each_second(view: BeaconView) -> None:
     rows: Any = [(k, 0.1 * k, 1.0, 2.0, 0.0, 4e-4, 0.0, 1e-4, 0.0, 0.0, 1e-4, 1.0, 2.0) for k in (10, 15, 20)]
-    view.hear(BeaconTrack(seq=20, t_s=2.0, rows=rows), 0.0)
+    view.receive(BeaconTrack(seq=20, t_s=2.0, rows=rows), 0.0)
     true: Any = [(k, 0.1 * k, 1.0, 2.01, 0.0, None, None, None) for k in (10, 15, 20)]
-    view.hear(BeaconTruth(seq=20, t_s=2.0, rows=true), 0.0)
+    view.receive(BeaconTruth(seq=20, t_s=2.0, rows=true), 0.0)
     assert view.news(0.0)["series"]["error"] == [(1.0, pytest.approx(10.0), pytest.approx(60.0))]
 
 
 def test_without_a_truth_three_sigma_alone() -> None:
     view = BeaconView(config(), is_sim=False)
     rows: Any = [(k, 0.1 * k, 1.0, 2.0, 0.0, 4e-4, 0.0, 1e-4, 0.0, 0.0, 1e-4, 1.0, 2.0) for k in (10, 20)]
-    view.hear(BeaconTrack(seq=20, t_s=2.0, rows=rows), 0.0)
+    view.receive(BeaconTrack(seq=20, t_s=2.0, rows=rows), 0.0)
     assert view.news(0.0)["series"]["error"] == [(1.0, None, 60.0), (2.0, None, 60.0)]
 
 
 def test_the_scene_without_what_the_page_draws_itself(view: BeaconView) -> None:
     kinds = ("robot", "trail", "waypoint", "beacon", "obstacle")
-    view.hear(BeaconPlaces(seq=0, t_s=0.0, places={"a": (0.0, 1.0)}), 0.0)
-    view.hear(Scene(seq=1, t_s=1.0, shapes=[RobotShape(kind, kind, 1.0, 1.0) for kind in kinds]), 0.0)
+    view.receive(BeaconPlaces(seq=0, t_s=0.0, places={"a": (0.0, 1.0)}), 0.0)
+    view.receive(Scene(seq=1, t_s=1.0, shapes=[RobotShape(kind, kind, 1.0, 1.0) for kind in kinds]), 0.0)
     told = encoded(view.news(0.0))
     assert [shape["kind"] for shape in told["shapes"]] == ["true", "beacon", "obstacle"]
     assert told["shapes"][0]["y_m"] == 1.0
 
 
 def test_there_is_no_laser(view: BeaconView) -> None:
-    assert [link["name"] for link in view.news(0.0)["links"]] == ["main loop", "danger loop", "robot"]
+    assert [link.name for link in view.news(0.0)["links"]] == ["main loop", "danger loop", "robot"]
 
 
 def test_the_path_comes_with_the_map(view: BeaconView) -> None:
-    view.hear(told_map(), 0.0)
-    view.hear(told_map(1.5, pose=(0.801, 0.8, 0.0)), 0.0)  # nobody sees so little
-    view.hear(told_map(2.0, pose=(0.9, 0.8, 0.0)), 0.0)
+    view.receive(told_map(), 0.0)
+    view.receive(told_map(1.5, pose=(0.801, 0.8, 0.0)), 0.0)  # nobody sees so little
+    view.receive(told_map(2.0, pose=(0.9, 0.8, 0.0)), 0.0)
     assert view.everything(0.0)["path"] == [(0.8, 0.8), (0.9, 0.8)]
 
 

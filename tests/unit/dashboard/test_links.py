@@ -33,7 +33,12 @@ def test_before_anybody_spoke_nothing_is_lost_but_it_is_not_well() -> None:
     links = Links()
     assert links.losses(10.0) == []
     assert links.trouble(10.0) == "main was never heard of"
-    assert [link.phase for link in links.shown(10.0)] == ["not heard of", "not heard of", "no frame yet", "no fix yet"]
+    assert [link.phase for link in links.shown(10.0)] == [
+        "no heartbeat yet",
+        "no heartbeat yet",
+        "no frame yet",
+        "no fix yet",
+    ]
 
 
 def test_all_is_well(links: Links) -> None:
@@ -49,15 +54,15 @@ def test_all_is_well(links: Links) -> None:
 def test_a_loop_that_says_nothing(links: Links) -> None:
     links.presence(presence("danger", 10.9))
     assert whats(links, 10.95) == []
-    assert whats(links, 11.05) == ["the main loop has said nothing"]
-    assert links.trouble(11.05) == "the main loop has said nothing for 1.1 s"
-    assert whats(links, 12.0) == ["the main loop has said nothing", "the danger loop has said nothing"]
+    assert whats(links, 11.05) == ["the main loop has not reported"]
+    assert links.trouble(11.05) == "the main loop has not reported for 1.1 s"
+    assert whats(links, 12.0) == ["the main loop has not reported", "the danger loop has not reported"]
 
 
 def test_pictures_that_were_wanted_and_do_not_come_show_it_sooner(links: Links) -> None:
     links.picture(10.0)
     assert whats(links, 10.75) == []
-    assert whats(links, 10.85) == ["the main loop has said nothing"]
+    assert whats(links, 10.85) == ["the main loop has not reported"]
     links.look_away()
     assert whats(links, 10.85) == []
 

@@ -6,9 +6,11 @@ import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 
 from ccatp.config.load import load_config
+from ccatp.links.topics import DisplayState
 from ccatp.mirror.mirror import build_mirror
 from ccatp.report.dashboard.metrics import StateCollector
 from ccatp.report.dashboard.survey_view import SurveyView
+from ccatp.report.dashboard.view import NO_LINE, LinkState
 from ccatp.survey.state import MissionState
 from tests.unit.dashboard.prometheus import parse
 
@@ -20,8 +22,8 @@ NOTHING: dict[str, Any] = {
 ALL: dict[str, Any] = NOTHING | {
     "trouble": "",
     "links": [
-        {"name": "main loop", "phase": "joined", "age_s": 0.05, "is_well": True},
-        {"name": "robot", "phase": "no frame yet", "age_s": None, "is_well": False},
+        LinkState("main loop", "joined", 0.05, True),
+        LinkState("robot", "no frame yet", None, False),
     ],
     "mission": {
         "state": "driving", "total": 693, "done": 12, "skipped": 1, "elapsed_s": 61.5, "eta_s": 3000.0,
@@ -32,7 +34,10 @@ ALL: dict[str, Any] = NOTHING | {
         "charge": 0.93, "fans": [0.8, 0.75], "is_held": True, "drive_age_s": 0.01, "permit_age_s": 0.02,
         "faults": ["stall"],
     },
-    "pose": {"covariance_m2": (9e-6, 0.0, 16e-6)},
+    "pose": DisplayState(
+        seq=0, t_s=0.0, x_m=1.0, y_m=-2.0, heading_rad=0.5, covariance_m2=(9e-6, 0.0, 16e-6), heading_sigma_rad=0.01,
+        nis=2.0, size=2, line=NO_LINE,
+    ),
 }  # fmt: skip
 
 

@@ -38,7 +38,7 @@ def test_the_trail_leaves_out_what_nobody_sees() -> None:
     trail = Trail(100)
     for k in range(101):
         trail.add(0.001 * k, 1.0)
-    steps_m = [b[0] - a[0] for a, b in pairwise(trail.points.rows)]
+    steps_m = [b[0] - a[0] for a, b in pairwise(trail.rows)]
     assert len(steps_m) >= 4
     assert min(steps_m) > 0.0199  # rounded to 1 mm
     assert max(steps_m) < 0.0221

@@ -87,8 +87,8 @@ def test_before_anything_was_heard(view: SurveyView) -> None:
 
 
 def test_levels_are_there_each_time(view: SurveyView) -> None:
-    view.hear(mission(), 1.0)
-    view.hear(picture(), 1.0)
+    view.receive(mission(), 1.0)
+    view.receive(picture(), 1.0)
     for _ in range(2):
         state = encoded(view.news(1.1))
         assert state["mission"]["state"] == "driving"
@@ -101,29 +101,29 @@ def test_levels_are_there_each_time(view: SurveyView) -> None:
 
 
 def test_the_next_point_is_known_on_the_way_to_other_stops_too(view: SurveyView, mirror: Mirror) -> None:
-    view.hear(mission(point="1-2-9"), 1.0)
+    view.receive(mission(point="1-2-9"), 1.0)
     assert view.news(1.0)["mission"]["next_point"] == "1-2-9"
-    view.hear(mission(point=""), 1.1)
+    view.receive(mission(point=""), 1.1)
     assert view.news(1.1)["mission"]["next_point"] == "1-2-7"
-    view.hear(fix_at(mirror, view.points[0], 0.0), 1.2)
+    view.receive(fix_at(mirror, view.points[0], 0.0), 1.2)
     assert view.news(1.2)["mission"]["next_point"] == "1-2-8"
-    view.hear(mission(point="", outcome="stopped"), 1.3)
+    view.receive(mission(point="", outcome="stopped"), 1.3)
     assert view.news(1.3)["mission"]["next_point"] == ""
 
 
 def test_a_status_gets_stale(view: SurveyView) -> None:
-    view.hear(mission(), 1.0)
+    view.receive(mission(), 1.0)
     assert not view.news(1.9)["mission"]["is_stale"]
     assert view.news(2.1)["mission"]["is_stale"]
-    view.hear(mission(exit_status=0), 2.2)
+    view.receive(mission(exit_status=0), 2.2)
     assert not view.news(9.0)["mission"]["is_stale"]
 
 
 def test_a_point_from_arrival_to_measured(view: SurveyView, mirror: Mirror) -> None:
     point = view.points[0]
-    view.hear(ArrivalMessage(seq=8, t_s=2.0, point=(point.row, point.col, point.point), error_mm=0.3), 2.0)
+    view.receive(ArrivalMessage(seq=8, t_s=2.0, point=(point.row, point.col, point.point), error_mm=0.3), 2.0)
     assert view.news(2.0)["points"] == [[0, ARRIVED, None]]
-    view.hear(fix_at(mirror, point, 0.004), 2.1)
+    view.receive(fix_at(mirror, point, 0.004), 2.1)
     state = view.news(2.1)
     (index, how, error_mm), *none = state["points"]
     assert (index, how, none) == (0, MEASURED, [])
@@ -131,19 +131,19 @@ def test_a_point_from_arrival_to_measured(view: SurveyView, mirror: Mirror) -> N
     assert error_mm == pytest.approx(4.0, abs=0.3)
     assert state["series"]["arrival"] == [(2.0, error_mm)]
     assert state["series"]["jump"] == [(2.0, 0.7)]
-    view.hear(ArrivalMessage(seq=8, t_s=2.2, point=(point.row, point.col, point.point), error_mm=0.3), 2.2)
+    view.receive(ArrivalMessage(seq=8, t_s=2.2, point=(point.row, point.col, point.point), error_mm=0.3), 2.2)
     assert view.news(2.2)["points"] == []  # measured stays measured
 
 
 def test_a_fix_that_is_refused_measures_nothing(view: SurveyView, mirror: Mirror) -> None:
-    view.hear(fix_at(mirror, view.points[0], 0.0, is_fused=False), 2.0)
+    view.receive(fix_at(mirror, view.points[0], 0.0, is_fused=False), 2.0)
     state = view.news(2.0)
     assert state["points"] == []
     assert state["series"] == {}
 
 
 def test_a_fix_without_a_point_finds_the_robot_only(view: SurveyView, mirror: Mirror) -> None:
-    view.hear(fix_at(mirror, None, 0.0), 2.0)
+    view.receive(fix_at(mirror, None, 0.0), 2.0)
     state = view.news(2.0)
     assert state["points"] == []
     assert set(state["series"]) == {"jump"}
@@ -151,16 +151,16 @@ def test_a_fix_without_a_point_finds_the_robot_only(view: SurveyView, mirror: Mi
 
 def test_a_fix_far_from_the_mirror_has_no_error(view: SurveyView, mirror: Mirror) -> None:
     fix = msgspec.structs.replace(fix_at(mirror, view.points[0], 0.0), position_m=(1e3, 1e3, 1e3))
-    view.hear(fix, 2.0)
+    view.receive(fix, 2.0)
     state = view.news(2.0)
     assert state["points"] == [[0, MEASURED, None]]
     assert "arrival" not in state["series"]
 
 
 def test_points_left_out(view: SurveyView, mirror: Mirror) -> None:
-    view.hear(fix_at(mirror, view.points[1], 0.0), 2.0)
+    view.receive(fix_at(mirror, view.points[1], 0.0), 2.0)
     names = [f"{p.row}-{p.col}-{p.point}" for p in view.points[:2]]
-    view.hear(mission(left_out={"no fix": names, "other": ["99-9-9"]}), 2.0)
+    view.receive(mission(left_out={"no fix": names, "other": ["99-9-9"]}), 2.0)
     news = view.news(2.0)
     assert [row[:2] for row in news["points"]] == [[0, SKIPPED], [1, MEASURED]]
     assert news["mission"]["not_to_be_measured"] == 3
@@ -173,8 +173,8 @@ def test_the_path_as_it_is_driven_and_in_simulation_against_the_truth(view: Surv
         rows.append((k, 0.01 * k, 1, 2, -0.1 + 0.001 * k, 0.05, 0.0, 0.001))
         deck = mirror.deck_pose(PanelPose(PanelId(1, 2), rows[-1][4], 0.05, 0.0))
         truths.append((k, 0.01 * k, deck.x_m + 0.002, deck.y_m, 0.0, 0.0, 0.0, 0.0, 1.0, 0, 0))
-    view.hear(TrackMessage(seq=299, t_s=3.0, rows=rows), 3.0)
-    view.hear(TruthMessage(seq=299, t_s=3.0, rows=truths), 3.0)
+    view.receive(TrackMessage(seq=299, t_s=3.0, rows=rows), 3.0)
+    view.receive(TruthMessage(seq=299, t_s=3.0, rows=truths), 3.0)
     state = encoded(view.news(3.0))
     path = np.array(state["path"])
     assert hypot(*(path[-1] - path[0])) == pytest.approx(0.28, abs=0.01)
@@ -185,28 +185,28 @@ def test_the_path_as_it_is_driven_and_in_simulation_against_the_truth(view: Surv
 def test_without_a_truth_sigma_alone_is_shown(mirror: Mirror, cfg: Config) -> None:
     view = SurveyView(mirror, cfg, is_sim=False)
     rows = [(k, 0.01 * k, 1, 2, 0.0, 0.0, 0.0, 0.002) for k in range(250)]
-    view.hear(TrackMessage(seq=249, t_s=2.5, rows=rows), 2.5)
+    view.receive(TrackMessage(seq=249, t_s=2.5, rows=rows), 2.5)
     assert view.news(2.5)["series"]["error"] == [(0.0, None, 6.0), (1.0, None, 6.0), (2.0, None, 6.0)]
 
 
 def test_stops_are_the_path_where_nobody_looked(view: SurveyView, mirror: Mirror) -> None:
     for k in (0, 1):
-        view.hear(fix_at(mirror, view.points[k], 0.0, t_s=float(k)), float(k))
+        view.receive(fix_at(mirror, view.points[k], 0.0, t_s=float(k)), float(k))
     assert len(view.news(2.0)["path"]) == 2
     view.is_tracking = True
-    view.hear(fix_at(mirror, view.points[2], 0.0), 3.0)
+    view.receive(fix_at(mirror, view.points[2], 0.0), 3.0)
     assert view.news(3.0)["path"] == []
 
 
 def test_innovations_are_told_when_they_change(view: SurveyView) -> None:
-    view.hear(picture(1.0, nis=2.0), 1.0)
-    view.hear(picture(1.1, nis=2.0), 1.1)
-    view.hear(picture(1.2, nis=3.5), 1.2)
+    view.receive(picture(1.0, nis=2.0), 1.0)
+    view.receive(picture(1.1, nis=2.0), 1.1)
+    view.receive(picture(1.2, nis=3.5), 1.2)
     assert view.news(1.2)["series"]["nis"] == [(1.0, 2.0, 2), (1.2, 3.5, 2)]
 
 
 def test_a_picture_before_the_first_frame(view: SurveyView) -> None:
-    view.hear(picture(line=b"null"), 1.0)
+    view.receive(picture(line=b"null"), 1.0)
     state = view.news(1.0)
     assert state["robot"] is None
     assert state["pose"] is not None
@@ -219,12 +219,10 @@ def test_the_verdict_and_its_cause(view: SurveyView) -> None:
         seq=4, t_s=1.0, code=EventCode.NEAR_EDGE, cause="edge", signal="front_left", value=0.006, limit=0.005,
         forward=False, reverse=True, turn=False, off=(True, False, False, False), severity=Severity.NONE,
     )  # fmt: skip
-    view.hear(verdict, 1.0)
+    view.receive(verdict, 1.0)
     shown = encoded(view.news(1.5))["verdict"]
-    assert shown == {
-        "cause": "edge", "signal": "front_left", "value": 0.006, "limit": 0.005, "off": [True, False, False, False],
-        "code": 1, "severity": 0, "text": "edge (front left): 0.006 (limit 0.005)",
-        "permits": {"forward": False, "reverse": True, "turn": False}, "is_stale": False,
+    assert shown == json.loads(msgspec.json.encode(verdict)) | {
+        "text": "edge (front left): 0.006 (limit 0.005)", "is_stale": False,
     }  # fmt: skip
     assert view.news(2.5)["verdict"]["is_stale"]
 
@@ -234,12 +232,12 @@ def test_a_danger_event_is_a_line_as_well(view: SurveyView) -> None:
         seq=4, t_s=1.25, code=2, cause="fire", signal="emergency:fire", value=1.0, limit=0.0, off=(False,) * 4,
         severity=5,
     )  # fmt: skip
-    view.hear(event, 1.0)
+    view.receive(event, 1.0)
     state = view.news(1.0)
     assert state["verdict"]["code"] == 2
-    assert "permits" not in state["verdict"]
+    assert "forward" not in state["verdict"]
     assert state["log"] == [(1.25, "warning", "danger: fire", 1, 1)]
-    view.hear(LogMessage(seq=5, t_s=2.0, level="info", process="main", text="joined"), 2.0)
+    view.receive(LogMessage(seq=5, t_s=2.0, level="info", process="main", text="joined"), 2.0)
     assert view.news(2.0)["log"] == [(2.0, "info", "joined", 1, 2)]
 
 
@@ -247,7 +245,7 @@ def test_other_things_on_the_map(view: SurveyView) -> None:
     assert "shapes" not in view.news(1.0)
     beacon = RobotShape(id="b1", kind="beacon", x_m=1.0, y_m=2.0, covariance_m2=(0.1, 0.0, 0.1), label="b1")
     wall = RobotShape(id="w", kind="obstacle", x_m=0.0, y_m=0.0, outline_m=[(0.0, 0.0), (1.0, 0.0), (0.0, 0.0)])
-    view.hear(Scene(seq=1, t_s=1.0, shapes=[beacon, wall]), 1.0)
+    view.receive(Scene(seq=1, t_s=1.0, shapes=[beacon, wall]), 1.0)
     shapes = encoded(view.news(1.0))["shapes"]
     place = {"x_m": 1.0, "y_m": 2.0, "covariance_m2": [0.1, 0.0, 0.1]}
     assert shapes[0] == {"id": "b1", "kind": "beacon", "label": "b1"} | place
@@ -261,7 +259,7 @@ def test_everything_is_the_sum_of_the_news(view: SurveyView, mirror: Mirror) -> 
     path: list[Any] = []
     arrivals: list[Any] = []
     for k in range(6):
-        view.hear(fix_at(mirror, view.points[k], 0.001 * k, t_s=float(k)), float(k))
+        view.receive(fix_at(mirror, view.points[k], 0.001 * k, t_s=float(k)), float(k))
         news = view.news(float(k))
         points |= {row[0]: row for row in news["points"]}
         path += news["path"]

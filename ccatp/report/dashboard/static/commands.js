@@ -18,7 +18,7 @@ export class Commands {
   }
 
   // What makes sense now; while the link is lost abort and stop may still get through.
-  hear({ mission, is_over }) {
+  receive({ mission, is_over }) {
     const state = mission?.state;
     const isOn = Boolean(mission) && !is_over;
     this.allow({

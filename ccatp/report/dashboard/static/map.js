@@ -59,7 +59,7 @@ export class MapView {
     this.draw();
   }
 
-  hear(state, isAll) {
+  receive(state, isAll) {
     if (isAll) this.clear();
     for (const [k, how, error] of state.points) {
       this.states[k] = how;

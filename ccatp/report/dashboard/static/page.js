@@ -1,4 +1,4 @@
-// The page: hears the state, shows it, and says when nothing is heard.
+// The page: receives the state, shows it, and reports when nothing arrives.
 import { Commands } from "./commands.js";
 import { MapView } from "./map.js";
 import { Plots } from "./plots.js";
@@ -29,7 +29,7 @@ const plots = new Plots((name) => $(`plot-${name}`));
 const commands = new Commands();
 
 let source = null;
-let heardAt = performance.now();
+let receivedAt = performance.now();
 let isEnded = false;
 let isDashboardGone = false;
 let isConnecting = false;
@@ -49,11 +49,11 @@ async function connect() {
     begin(await answer.json());
     source?.close();
     source = new EventSource("events");
-    source.addEventListener("all", (event) => hear(JSON.parse(event.data), true));
-    source.addEventListener("news", (event) => hear(JSON.parse(event.data), false));
+    source.addEventListener("all", (event) => receive(JSON.parse(event.data), true));
+    source.addEventListener("news", (event) => receive(JSON.parse(event.data), false));
     source.addEventListener("end", (event) => end(JSON.parse(event.data)));
     source.onerror = () => {
-      source.close(); // what is missed meanwhile is told anew
+      source.close(); // the next stream begins with the whole state
       setTimeout(connect, RETRY_MS);
     };
   } catch {
@@ -78,38 +78,38 @@ function begin(ground) {
   map.begin(ground);
 }
 
-function hear(state, isAll) {
-  heardAt = performance.now();
+function receive(state, isAll) {
+  receivedAt = performance.now();
   isEnded = isDashboardGone = false;
   $("ended").hidden = true;
   show(state, isAll);
 }
 
-// Of the survey only where main has said so: a robot that drives must not be taken for one that stands.
+// The survey has ended only where the main loop has reported it: a driving robot must not be taken for a standing one.
 function end(state) {
   source.close();
   show(state, true);
   commands.end();
   isEnded = state.is_over;
   isDashboardGone = !isEnded;
-  heardAt = performance.now();
-  if (isEnded) tellEnd(state.mission);
-  tellSilence();
+  receivedAt = performance.now();
+  if (isEnded) showEnd(state.mission);
+  showSilence();
   setTimeout(connect, RETRY_MS); // the next dashboard, or the next survey, may begin at the same place
 }
 
-function tellEnd({ outcome, state, done, total }) {
+function showEnd({ outcome, state, done, total }) {
   text("ended", `The daemon has ended: ${outcome || `while ${state}`}, ${done} of ${total} ${words.goal} ${words.reached}.`);
   $("ended").hidden = false;
 }
 
-function tellSilence() {
-  const silent = performance.now() - heardAt;
+function showSilence() {
+  const silent = performance.now() - receivedAt;
   if (isEnded || !(isDashboardGone || silent > SILENCE_MS)) return;
   const what = isDashboardGone ? "the dashboard has ended; the survey may go on" : "the dashboard does not answer";
   alarm([[what, silent / 1000]]);
 }
-setInterval(tellSilence, 100);
+setInterval(showSilence, 100);
 
 // -- what is shown ------------------------------------------------------------------------------------------------
 
@@ -130,9 +130,9 @@ function show(state, isAll) {
   showRobot(state.robot, state.pose);
   showLinks(state);
   showLog(state.log, isAll);
-  map.hear(state, isAll);
-  plots.hear(state.series, isAll);
-  commands.hear(state);
+  map.receive(state, isAll);
+  plots.receive(state.series, isAll);
+  commands.receive(state);
 }
 
 function showMission({ mission, losses }) {
@@ -157,7 +157,7 @@ function showMission({ mission, losses }) {
   text("slips", mission.missed_deadlines ? `${mission.missed_deadlines}, worst ${mission.worst_lateness_ms.toFixed(0)} ms` : "0");
 }
 
-// Name and value of what else a mission has to say.
+// Names and values of further facts of a mission.
 function showFacts(facts) {
   const list = $("facts");
   list.hidden = !facts?.length;
@@ -181,7 +181,7 @@ function showVerdict(verdict) {
   $("verdict").dataset.level = verdict.code === 2 || verdict.severity >= 4 ? "bad" : verdict.code || verdict.severity ? "warn" : "";
   $("verdict").classList.toggle("stale", Boolean(verdict.is_stale));
   for (const way of ["forward", "reverse", "turn"]) {
-    const is = verdict.permits?.[way];
+    const is = verdict[way];
     $(`permit-${way}`).dataset.on = is === undefined ? "" : is && !verdict.is_stale ? "yes" : "no";
   }
 }
@@ -191,8 +191,8 @@ function showRobot(robot, pose) {
   const names = ["front left", "front right", "rear left", "rear right"];
   names.forEach((name, k) => ($(`edge-${k}`).dataset.on = edges.length ? (edges[k] ? "yes" : "no") : ""));
   const off = names.filter((_, k) => edges.length && !edges[k]);
-  const said = !edges.length ? "Edge sensors: not known" : off.length ? `Edge sensors off the panel: ${off.join(", ")}` : "Edge sensors: all on a panel";
-  if ($("edges").getAttribute("aria-label") !== said) $("edges").setAttribute("aria-label", said);
+  const label = !edges.length ? "Edge sensors: not known" : off.length ? `Edge sensors off the panel: ${off.join(", ")}` : "Edge sensors: all on a panel";
+  if ($("edges").getAttribute("aria-label") !== label) $("edges").setAttribute("aria-label", label);
   text("fans", robot ? robot.fans.map((duty) => `${Math.round(100 * duty)} %`).join(", ") : "–");
   text("charge", robot ? `${Math.round(100 * robot.charge)} %` : "–");
   text("held", robot ? (robot.is_held ? "held by the robot" : "free") : "–");
@@ -217,7 +217,7 @@ function showLinks({ links, restarts }) {
     const again = link.name === "main loop" ? restarts.main : link.name === "danger loop" ? restarts.danger : 0;
     row.dataset.well = link.is_well ? "yes" : "no";
     row.children[0].textContent = link.name;
-    row.children[1].textContent = `${link.phase} ${age(link.age_s)}${again ? ` (started anew ${again}×)` : ""}`;
+    row.children[1].textContent = `${link.phase} ${age(link.age_s)}${again ? ` (restarted ${again}×)` : ""}`;
   });
 }
 

@@ -99,7 +99,7 @@ export class Plots {
     }
   }
 
-  hear(series, isAll) {
+  receive(series, isAll) {
     for (const name of this.names) {
       const news = (series[name] ?? []).map(SHAPE[name] ?? ((row) => row));
       if (isAll) this.rows[name] = news;
