@@ -19,7 +19,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
 .PHONY: help run test test-newest newest test-slow slow-tests new-examples sweep tried-in faults docs metrics lint format
-.PHONY: golden golden-quick fast lock clean
+.PHONY: mutants golden golden-quick fast lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -29,6 +29,7 @@ help:
 	@echo "make test-newest      lint, unit and contract tests and a small survey on the newest Python installed, in $(NEWEST_VENV)"
 	@echo "make test-slow        the tests that take minutes, and new random examples"
 	@echo "make sweep            the part of that which drives over every centimetre of every rim; goes on where it was stopped"
+	@echo "make mutants          small changes of the safety code that the tests noticed before: do they still? [TARGETS=...]"
 	@echo "make faults           docs/fault_table.md from what the last test runs showed and measured"
 	@echo "make docs             build/docs/index.html, and the parts of docs/ that are made from the code"
 	@echo "make golden           this tree against a base commit, both run here, bit for bit; make golden-quick: a few cases"
@@ -77,6 +78,9 @@ new-examples: $(VENV)/.installed-dev
 sweep: $(FAST_VENV)/.installed
 	@mkdir -p build/sweep && ln -sfn ../../tests build/sweep/tests
 	cd build/sweep && $(abspath $(FAST_VENV))/bin/python -m tests.faults.whole_sweep . --workers $(WORKERS)
+
+mutants: $(VENV)/.installed-dev
+	nice -n 19 $(BIN)/python -m tests.mutation $(TARGETS)
 
 faults: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.faults.page

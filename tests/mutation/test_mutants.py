@@ -1,6 +1,5 @@
-"""The tests of the last gate and of the edge rule notice every small change of their code."""
+"""The tests of the gate and of the edge rule notice every small change; the tool that says so finds moved mutants."""
 
-import json
 import os
 import subprocess
 import sys
@@ -10,64 +9,86 @@ from typing import Any
 
 import pytest
 
+from tests.mutation.mutants import mutants
+
 ROOT = Path(__file__).parents[2]
-EQUIVALENT = Path(__file__).with_name("equivalent.toml")
-# A story of a minute; the episodes' own tests hold what it shows.
-LONG = "--deselect=tests/unit/test_danger.py::test_standing_over_a_gap_is_no_edge_however_long"
-STORIES = ["--then", "tests/unit/test_danger.py", LONG]
-PARTS = 2
-HUNTS = [
-    pytest.param("ccatp.control.gate", ["tests/unit/control/test_gate.py"], part, id=f"gate {part}")
-    for part in range(PARTS)
-]
-HUNTS += [
-    pytest.param(f"ccatp.hazards.{name}", [f"tests/unit/hazards/test_{name}.py", *STORIES], part, id=f"{name} {part}")
-    for name in ("edge_episode", "edge_rule")
-    for part in range(PARTS)
-]
+STRICT = ["gate", "edge"]
 
 
-def hunt(module: str, tests: list[str], part: str) -> dict[str, Any]:
-    command = [sys.executable, "-m", "tests.mutation.hunt", part, module, *tests]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
-
-
-def equivalents() -> set[tuple[str, str]]:
-    listed = tomllib.loads(EQUIVALENT.read_text())["mutant"]
-    assert all(one["reason"] for one in listed)
-    return {(one["text"], one["what"]) for one in listed}
+def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "tests.mutation", *arguments]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(folder)])}
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("module", "tests", "part"), HUNTS)
-def test_every_mutant_is_noticed(module: str, tests: list[str], part: int) -> None:
-    found = hunt(module, tests, f"{part}/{PARTS}")
-    print(f"{module}: {found['mutants']} mutants, {len(found['alive'])} of them equivalent")
-    assert found["mutants"] > 50
-    known = equivalents()
-    assert not [one for one in found["alive"] if (one[1], one[2]) not in known]
+@pytest.mark.parametrize("target", STRICT)
+def test_every_mutant_is_noticed(target: str) -> None:
+    done = run(ROOT, "--strict", target)
+    assert done.returncode == 0, done.stderr
+    print(done.stderr)
+
+
+def test_what_the_table_names_is_there() -> None:
+    targets = tomllib.loads(Path(__file__).with_name("targets.toml").read_text()).values()
+    patterns = [pattern for target in targets for pattern in target["modules"] + target["tests"]]
+    assert not [pattern for pattern in patterns if not list(ROOT.glob(pattern))]
 
 
 def test_what_is_listed_as_equivalent_is_there() -> None:
     """A line that has changed needs a new look."""
-    source = "".join(
-        (ROOT / "ccatp" / path).read_text()
-        for path in ("control/gate.py", "safety/edge_detector.py", "safety/edge_rule.py")
-    )
-    assert all(text in source for text, _ in equivalents())
+    targets = tomllib.loads(Path(__file__).with_name("targets.toml").read_text())
+    listed = tomllib.loads(Path(__file__).with_name("equivalent.toml").read_text())["mutant"]
+    names = [one.name for one in mutants(ROOT / module for target in STRICT for module in targets[target]["modules"])]
+    assert all(one["reason"] for one in listed)
+    assert {(one["text"], one["what"]) for one in listed} <= {name.short() for name in names}
 
 
-@pytest.mark.slow
-def test_a_mutant_lives_without_a_test_and_dies_with_one(tmp_path: Path) -> None:
-    """The hunt on three mutants of the gate, once with tests that look and once with one that does not."""
-    blind = tmp_path / "test_blind.py"
-    blind.write_text("def test_nothing() -> None:\n    assert True\n")
-    alive = hunt("ccatp.control.gate", [str(blind)], "0/40")
-    assert alive["mutants"] == len(alive["alive"]) >= 3
-    seen = hunt("ccatp.control.gate", ["tests/unit/control/test_gate.py"], "0/40")
-    assert seen["mutants"] == alive["mutants"]
-    assert len(seen["alive"]) < len(alive["alive"])
+TABLE = """
+[it]
+modules = ["{module}.py"]
+tests = ["test_it.py"]
+sample = 0
+renames = {{ Ear = "{name}" }}
+"""
+MODULE = """
+LIMIT = 3
+
+class {name}:
+    def is_in(self, value):
+        if value < 0:
+            raise ValueError("{message}")
+        return value <= LIMIT
+"""
+TESTS = """
+import pytest
+from {module} import {name}
+
+def test_is_in():
+    assert {name}().is_in({value}) and not {name}().is_in(4) and {name}().is_in(0)
+    with pytest.raises(ValueError):
+        {name}().is_in(-1)
+"""
+
+
+def project(folder: Path, **words: Any) -> None:
+    """A class with a test, as the tool sees it."""
+    for name, text in ((f"{words['module']}.py", MODULE), ("test_it.py", TESTS), ("targets.toml", TABLE)):
+        (folder / name).write_text(text.format(**words))
+
+
+def test_mutants_are_found_after_a_move_and_a_lost_one_is_an_error(tmp_path: Path) -> None:
+    project(tmp_path, module="old", name="Ear", message="a message", value=3)
+    written = run(tmp_path, "--tables", ".", "--write")
+    assert "9 mutants; 9 of 9 killed" in written.stderr, written.stderr
+    moved = {"module": "new", "name": "Subscriber", "message": "another message"}
+    project(tmp_path, **moved, value=3)
+    same = run(tmp_path, "--tables", ".")
+    assert "9 of them found: 9 killed before, 9 now" in same.stderr, same.stderr
+    assert same.returncode == 0
+    project(tmp_path, **moved, value=2)
+    (tmp_path / "new.py").write_text(MODULE.format(**moved).replace("value < 0", "not value >= 0"))
+    weaker = run(tmp_path, "--tables", ".")
+    assert weaker.returncode == 1
+    assert "not found: Subscriber.is_in: value < 0: Lt -> LtE [0]" in weaker.stderr
+    assert "LIVES AND MUST NOT: new.py:8: value <= LIMIT: LtE -> Lt [0]" in weaker.stderr

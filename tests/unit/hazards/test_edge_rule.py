@@ -199,6 +199,14 @@ def test_a_reset_forgets_all_but_the_counts(rule: Rule) -> None:
     assert rule.rule.opened == [2, 2, 2, 2]
 
 
+def test_a_reset_forgets_the_wheels_of_the_clock_before(rule: Rule) -> None:
+    rule.feed([ON] * 200)
+    rule.rule.reset()
+    rule.t_s = 0.0
+    rule.feed([OFF_FL] * 70, v=0.1)
+    assert rule.rule.declared == [1, 0, 0, 0]
+
+
 def test_put_back_the_episodes_begin_anew(rule: Rule) -> None:
     rule.feed([OFF_FL] * 80, v=0.1)
     assert rule.rule.episodes[0] is not None
