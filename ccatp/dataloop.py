@@ -1,13 +1,9 @@
-"""The DataLoop: the virtual robot behind the robot link, and the outlets of its truth.
+"""The simulated robots behind the robot link: sockets, the wall clock or lockstep, and the true state beside the link.
 
-The sockets of the robot link carry what a real robot would say and nothing else. The truth leaves by ZeroMQ: a REP
-socket with the requests of ``ccatp.sim.robot``, and a PUB socket with batches of the topic ``truth``.
+The sockets of the robot link carry what a real robot would send and nothing else. The true state leaves by ZeroMQ: a
+REP socket with the requests of ``ccatp.sim.robot`` or ``ccatp.sim.beacon_robot``, and a PUB socket with batches of rows.
 
 Known limitations: the battery stays full, and nothing fails without a fault plan (``ccatp.sim.fault_injector``).
-
-A simulated robot behind the robot link: sockets, the wall clock or lockstep, the end of it.
-
-The simulated robot among beacons behind the robot link, and the outlet of its truth.
 """
 
 import asyncio
@@ -29,7 +25,8 @@ from ccatp.sim.fault_plan import FaultPlan
 from ccatp.sim.fault_proxy import FaultProxy, LinkFaults
 from ccatp.sim.ground_truth import GroundTruthPublisher, SimPoseFile
 from ccatp.sim.robot import Robot, TruthLog
-from ccatp.sim.sessions import RobotServer, RobotSession, ServedRobot
+from ccatp.sim.rules import SimulatedRobot
+from ccatp.sim.sessions import RobotServer, RobotSession
 
 HOUSEKEEPING_S = 0.25
 # A client that does not read gets no more frames once this much waits for it; it finds the newest when it reads on.
@@ -44,16 +41,20 @@ class ServerLog(Protocol):
 
 
 class RobotLinkServer:
-    """The server of one robot.
+    """The server of one simulated robot.
 
-    Args:
-        address: host and port to listen on where no bound socket is given; port 0 = any free port.
-        lockstep: simulated time waits for the clients; otherwise the wall clock paces it.
-        key: key of the robot link, ``None`` for no authentication.
+    It listens on ``address`` (port 0 = any free port) where no bound socket is given. In lockstep simulated time waits
+    for the clients; otherwise the wall clock paces it. Without a ``key`` there is no authentication.
     """
 
     def __init__(
-        self, robot: ServedRobot, address: tuple[str, int], *, lockstep: bool, key: bytes | None, log: ServerLog | None
+        self,
+        robot: SimulatedRobot,
+        address: tuple[str, int],
+        *,
+        lockstep: bool,
+        key: bytes | None,
+        log: ServerLog | None,
     ) -> None:
         self._served, self._address, self._is_lockstep = robot, address, lockstep
         self._key, self._log = key, log
@@ -62,6 +63,7 @@ class RobotLinkServer:
         self._timer: asyncio.TimerHandle | None = None
         self._connections: set[_Connection] = set()
         self._failure: asyncio.Future[None]
+        self.truth: GroundTruthPublisher | None = None
 
     async def start(self, sock: socket.socket | None = None) -> int:
         """Boot and listen on the configured address (port 0 = any free port) or on a bound socket; return the port.
@@ -122,10 +124,14 @@ class RobotLinkServer:
             self._listener = None
 
     def on_frame(self) -> None:
-        """A frame has been driven."""
+        """Record the true state after a frame."""
+        if self.truth is not None:
+            self.truth.add()
 
     def on_close(self) -> None:
-        """The last frame has been driven."""
+        """Publish the last true states."""
+        if self.truth is not None:
+            self.truth.flush()
 
     def _connection(self) -> "_Connection":
         return _Connection(self)
@@ -208,16 +214,10 @@ class _Connection(asyncio.Protocol):
 
 
 class DataLoop(RobotLinkServer):
-    """The server.
+    """The server of the survey robot, with a fault plan; each fault is logged when it begins and with what it did.
 
-    Args:
-        lockstep: simulated time waits for the clients; otherwise the wall clock paces it.
-        key: key of the robot link, ``None`` for no authentication.
-        faults: what shall go wrong with the robot; each is logged when it begins and with what it did.
-        start: where the robot stands, if not at base.
-
-    Attributes:
-        link_faults: who rules the proxy before the link by the robot's clock.
+    ``start`` is where the robot stands, if not at base. ``link_faults`` drive the proxy before the link by the robot's
+    clock.
     """
 
     def __init__(
@@ -233,13 +233,11 @@ class DataLoop(RobotLinkServer):
         self.robot = Robot(cfg, build_mirror(cfg.mirror), np.random.default_rng(seed), faults, start)
         super().__init__(self.robot, (cfg.sim.robot.host, cfg.sim.robot.port), lockstep=lockstep, key=key, log=log)
         self.body: SimPoseFile | None = None
-        self.truth: GroundTruthPublisher | None = None
         self.link_faults: LinkFaults | None = None
 
     def on_close(self) -> None:
-        """The last truth published, and what became of the faults."""
-        if self.truth is not None:
-            self.truth.flush()
+        """Publish the last true states; log what each fault did."""
+        super().on_close()
         if self.robot.injector is not None:
             for injected in self.robot.injector.injected:
                 self._log_fault("injected", injected)
@@ -249,11 +247,10 @@ class DataLoop(RobotLinkServer):
                 self._log_fault("injected", injected)
 
     def on_frame(self) -> None:
-        """Keep the pose and the truth; faults begin and end."""
+        """Keep the pose and the true state; faults begin and end."""
         if self.body is not None:
             self.body.keep(self.robot)
-        if self.truth is not None:
-            self.truth.add()
+        super().on_frame()
         if self.robot.injector is not None:
             for what, injected in self.robot.injector.news(self.robot.t_s):
                 self._log_fault(what, injected)
@@ -296,57 +293,15 @@ async def serve(
     start = body.read() if body is not None and is_resuming else None
     data_loop = DataLoop(cfg, lockstep, seed, key, log, faults, start)
     data_loop.body = body
-    data_loop.truth = outlet = GroundTruthPublisher(TruthLog(data_loop.robot), truth_rep, truth_pub)
     try:
         async with AsyncExitStack() as stack:
             if faults is not None and faults.link:
                 listen_sock = await _put_proxy_before(data_loop, faults, cfg, listen_sock, stack)
-            await data_loop.start(listen_sock)
-            async with asyncio.TaskGroup() as tasks:
-                answering = tasks.create_task(outlet.serve())
-                await data_loop.run(stop)
-                answering.cancel()
+            truth = GroundTruthPublisher(TruthLog(data_loop.robot), truth_rep, truth_pub)
+            await _serve(data_loop, truth, listen_sock, stop)
     finally:
-        outlet.close()
         if body is not None:
             body.close()
-
-
-async def _put_proxy_before(
-    data_loop: DataLoop, faults: FaultPlan, cfg: Config, listen_sock: socket.socket | None, stack: AsyncExitStack
-) -> socket.socket:
-    """Let a proxy listen where the robot was to; the socket on which the robot listens instead."""
-    behind = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
-    at = cfg.sim.robot
-    before = listen_sock or stack.enter_context(socket.create_server((at.host, at.port)))
-    proxy = FaultProxy(*behind.getsockname()[:2], seed=cfg.run.seed, listener=before)
-    await stack.enter_async_context(proxy)
-    data_loop.link_faults = LinkFaults(faults.link, proxy)
-    return behind
-
-
-class BeaconRobotServer(RobotLinkServer):
-    """The server.
-
-    Args:
-        lockstep: simulated time waits for the clients; otherwise the wall clock paces it.
-        key: key of the robot link, ``None`` for no authentication.
-    """
-
-    def __init__(self, cfg: RadioConfig, *, lockstep: bool, key: bytes | None, log: ServerLog | None) -> None:
-        self.robot = build_beacon_robot(cfg)
-        super().__init__(self.robot, (cfg.sim.robot.host, cfg.sim.robot.port), lockstep=lockstep, key=key, log=log)
-        self.truth: GroundTruthPublisher | None = None
-
-    def on_frame(self) -> None:
-        """Keep the truth."""
-        if self.truth is not None:
-            self.truth.add()
-
-    def on_close(self) -> None:
-        """The last truth published."""
-        if self.truth is not None:
-            self.truth.flush()
 
 
 async def serve_beacons(
@@ -360,22 +315,35 @@ async def serve_beacons(
     key: bytes | None = None,
     log: ServerLog | None = None,
 ) -> None:
-    """Run a robot among beacons until ``stop`` is set.
+    """The same with a robot among beacons."""
+    robot = build_beacon_robot(cfg)
+    server = RobotLinkServer(robot, (cfg.sim.robot.host, cfg.sim.robot.port), lockstep=lockstep, key=key, log=log)
+    truth = GroundTruthPublisher(BeaconTruthLog(robot, motes_of(cfg)), truth_rep, truth_pub)
+    await _serve(server, truth, listen_sock, stop)
 
-    Args:
-        key: key of the robot link, ``None`` for no authentication.
 
-    Raises:
-        OSError: the address cannot be had.
-        zmq.ZMQError: an endpoint cannot be had.
-    """
-    loop = BeaconRobotServer(cfg, lockstep=lockstep, key=key, log=log)
-    loop.truth = outlet = GroundTruthPublisher(BeaconTruthLog(loop.robot, motes_of(cfg)), truth_rep, truth_pub)
+async def _serve(
+    server: RobotLinkServer, truth: GroundTruthPublisher, listen_sock: socket.socket | None, stop: asyncio.Event
+) -> None:
+    server.truth = truth
     try:
-        await loop.start(listen_sock)
+        await server.start(listen_sock)
         async with asyncio.TaskGroup() as tasks:
-            answering = tasks.create_task(outlet.serve())
-            await loop.run(stop)
+            answering = tasks.create_task(truth.serve())
+            await server.run(stop)
             answering.cancel()
     finally:
-        outlet.close()
+        truth.close()
+
+
+async def _put_proxy_before(
+    data_loop: DataLoop, faults: FaultPlan, cfg: Config, listen_sock: socket.socket | None, stack: AsyncExitStack
+) -> socket.socket:
+    """Let a proxy listen where the robot was to; the socket on which the robot listens instead."""
+    behind = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+    at = cfg.sim.robot
+    before = listen_sock or stack.enter_context(socket.create_server((at.host, at.port)))
+    proxy = FaultProxy(*behind.getsockname()[:2], seed=cfg.run.seed, listener=before)
+    await stack.enter_async_context(proxy)
+    data_loop.link_faults = LinkFaults(faults.link, proxy)
+    return behind

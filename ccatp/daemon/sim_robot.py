@@ -1,80 +1,56 @@
-"""The DataLoop's process: the robot's stand-in behind the robot link."""
+"""The process of the simulated robot behind the robot link."""
 
 import asyncio
 import os
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import structlog
 
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config
-from ccatp.daemon import realtime as spinning
-from ccatp.daemon.process import (
-    FAULTS_FILE,
-    BeaconArgs,
-    Endpoints,
-    die_with_parent,
-    open_log,
-    parse_either,
-    stop_on_signals,
-)
-from ccatp.dataloop import serve
+from ccatp.daemon import realtime
+from ccatp.daemon.process import FAULTS_FILE, Endpoints, die_with_parent, open_log, parse_either, stop_on_signals
+from ccatp.dataloop import serve, serve_beacons
 from ccatp.errors import ConfigError
 from ccatp.links.robot_link import read_key
 from ccatp.links.runtime_dir import TRUTH_LOCK_FILE, locked, make_runtime_dir, remove_sockets
 from ccatp.sim.fault_plan import FaultPlan
 from ccatp.sim.ground_truth import FILE, read_plan
 
+Serve = Callable[..., Coroutine[Any, Any, None]]
+
 
 def main() -> int:
     """Entry of ``python -m ccatp.daemon.sim_robot``."""
     die_with_parent()
     either = parse_either()
+    args = either.survey or either.one_of_beacons
+    serve_robot: Serve
     if either.survey is None:
-        return _among_beacons(either.one_of_beacons)
-    args = either.survey
-    cfg = args.config
-    faults = read_plan(args.run_dir / FAULTS_FILE, lockstep=not args.is_realtime) if args.has_faults else None
-    if not args.is_realtime:
-        spinning.leave_a_core(os.getppid())
-
-    async def run() -> int:
-        stop = asyncio.Event()
-        stop_on_signals(stop)
-        await serve(
-            cfg,
-            lockstep=not args.is_realtime,
-            seed=cfg.run.seed,
-            stop=stop,
-            listen_sock=socket.socket(fileno=args.listen_fd),
-            truth_rep=args.endpoints.of("puck"),
-            truth_pub=args.endpoints.of("truth"),
-            key=read_key(cfg.robot.key_file),
-            log=open_log(args.run_dir / "log.jsonl", "dataloop"),
-            faults=faults,
+        serve_robot = partial(serve_beacons, either.one_of_beacons.config)
+    else:
+        survey = either.survey
+        serve_robot = partial(
+            serve,
+            survey.config,
+            seed=survey.config.run.seed,
+            faults=read_plan(args.run_dir / FAULTS_FILE, lockstep=not args.is_realtime) if survey.has_faults else None,
             body_file=args.run_dir / FILE,
-            is_resuming=args.is_resuming,
+            is_resuming=survey.is_resuming,
         )
-        return 0
-
-    return spinning.run(run(), is_spinning=not args.is_realtime)
-
-
-def _among_beacons(args: BeaconArgs) -> int:
-    from ccatp.dataloop import serve_beacons  # noqa: PLC0415 - a survey starts sooner without it
-
     if not args.is_realtime:
-        spinning.leave_a_core(os.getppid())
+        realtime.leave_a_core(os.getppid())
 
     async def run() -> int:
         stop = asyncio.Event()
         stop_on_signals(stop)
-        await serve_beacons(
-            args.config,
+        await serve_robot(
             lockstep=not args.is_realtime,
             stop=stop,
             listen_sock=socket.socket(fileno=args.listen_fd),
@@ -85,69 +61,49 @@ def _among_beacons(args: BeaconArgs) -> int:
         )
         return 0
 
-    return spinning.run(run(), is_spinning=not args.is_realtime)
+    return realtime.run(run(), is_spinning=not args.is_realtime)
 
 
 def run_alone(cfg: Config, lockstep: bool, faults: FaultPlan | None = None, runtime_dir: Path | None = None) -> int:
-    """The stand-in alone, for other people's controllers; ends on SIGINT or SIGTERM.
+    """The simulated robot alone, for other controllers; ends on SIGINT or SIGTERM.
 
-    Its truth is at ``puck`` in the runtime directory, for ``ccatp sim etalon --truth``.
-
-    Args:
-        cfg: configuration; ``sim.robot`` holds the address.
-        runtime_dir: where its truth is, if not in the configured folder.
+    It listens at the address in ``sim.robot``. Its true state is at ``puck`` in the runtime directory (the configured
+    one by default), for ``ccatp sim etalon --truth``.
 
     Raises:
-        RefusedError: another one has its truth there.
+        RefusedError: another simulated robot uses that directory.
     """
-
-    async def run(listener: socket.socket, truth: str) -> None:
-        stop = asyncio.Event()
-        stop_on_signals(stop)
-        await serve(
-            cfg,
-            lockstep=lockstep,
-            seed=cfg.run.seed,
-            stop=stop,
-            listen_sock=listener,
-            truth_rep=truth,
-            key=read_key(cfg.robot.key_file),
-            log=_plain_log(),
-            faults=faults,
-        )
-
-    with (
-        _truth_outlet(runtime_dir, cfg.run.runtime_dir) as truth,
-        _listener(cfg.sim.robot.host, cfg.sim.robot.port) as listener,
-    ):
-        _say_where(cfg.mirror.name, listener, truth)
-        asyncio.run(run(listener, truth))
-    return 0
+    serve_robot = partial(serve, cfg, seed=cfg.run.seed, faults=faults)
+    return _run_alone(serve_robot, cfg, cfg.mirror.name, lockstep, str(runtime_dir or cfg.run.runtime_dir))
 
 
 def run_beacons_alone(cfg: RadioConfig, lockstep: bool, runtime_dir: Path | None = None) -> int:
     """The same of a robot among beacons."""
-    from ccatp.dataloop import serve_beacons  # noqa: PLC0415 - a survey starts sooner without it
+    folder = str(runtime_dir or cfg.processes.runtime_dir)
+    return _run_alone(partial(serve_beacons, cfg), cfg, cfg.system, lockstep, folder)
 
+
+def _run_alone(serve_robot: Serve, cfg: Config | RadioConfig, what: str, lockstep: bool, runtime_dir: str) -> int:
     async def run(listener: socket.socket, truth: str) -> None:
         stop = asyncio.Event()
         stop_on_signals(stop)
-        key, log = read_key(cfg.robot.key_file), _plain_log()
-        await serve_beacons(cfg, lockstep=lockstep, stop=stop, listen_sock=listener, truth_rep=truth, key=key, log=log)
+        key, log = read_key(cfg.robot.key_file), structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
+        await serve_robot(lockstep=lockstep, stop=stop, listen_sock=listener, truth_rep=truth, key=key, log=log)
 
     with (
-        _truth_outlet(runtime_dir, cfg.processes.runtime_dir) as truth,
+        _truth_endpoint(runtime_dir) as truth,
         _listener(cfg.sim.robot.host, cfg.sim.robot.port) as listener,
     ):
-        _say_where(cfg.system, listener, truth)
+        host, port = listener.getsockname()[:2]
+        print(f"ccatp: simulated robot ({what}) on {host}:{port}, truth at {truth}", file=sys.stderr, flush=True)
         asyncio.run(run(listener, truth))
     return 0
 
 
 @contextmanager
-def _truth_outlet(runtime_dir: Path | None, configured: str) -> Iterator[str]:
-    folder = make_runtime_dir(str(runtime_dir or configured), os.environ)
-    refusal = f"another simulated robot has its truth in {folder}; end it, or give this one its own --runtime-dir"
+def _truth_endpoint(runtime_dir: str) -> Iterator[str]:
+    folder = make_runtime_dir(runtime_dir, os.environ)
+    refusal = f"another simulated robot uses {folder}; end it, or give this one its own --runtime-dir"
     with locked(folder / TRUTH_LOCK_FILE, refusal):
         try:
             yield Endpoints(folder).of("puck")
@@ -162,16 +118,6 @@ def _listener(host: str, port: int) -> socket.socket:
         raise ConfigError(
             f"sim.robot.port: cannot listen on {host}:{port}: {error.strerror}; choose another with --port"
         ) from error
-
-
-def _say_where(what: str, listener: socket.socket, truth: str) -> None:
-    host, port = listener.getsockname()[:2]
-    print(f"ccatp: robot stand-in ({what}) on {host}:{port}, truth at {truth}", file=sys.stderr, flush=True)
-
-
-def _plain_log() -> structlog.typing.FilteringBoundLogger:
-    log: structlog.typing.FilteringBoundLogger = structlog.wrap_logger(structlog.PrintLogger(sys.stderr))
-    return log
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A robot among beacons behind the robot link: its rules, its vehicle, what it hears. Time is an argument.
+"""The simulated robot among beacons: its vehicle, what it receives, its true state. Time is an argument.
 
 Choices the interface leaves open:
 
@@ -7,10 +7,6 @@ Choices the interface leaves open:
 * The wheels obey at once; the link has no delay; there are no fans; the battery stays full.
 * A steering angle turns the robot like wheels of unequal speed, so it needs the permit ``turn``; the echo is that of
   the wheels.
-
-What leaves the simulation of a robot among beacons by the truth's own sockets.
-
-The simulated robot among beacons of a configuration, and the world round it.
 """
 
 from math import isfinite
@@ -22,12 +18,12 @@ import numpy as np
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.links.beacon_messages import BeaconFrame, MoteBurst, RadioSample, RadioScan, SteerSample, with_extras
 from ccatp.links.robot_codec import encode_sensors
-from ccatp.links.robot_messages import PROTOCOL, Hello, RobotData, VehicleData
+from ccatp.links.robot_messages import RobotData, VehicleData
 from ccatp.links.topics import BeaconPlaces, BeaconTruth
 from ccatp.sim.motes import MoteListener, TrueMotes, true_motes
 from ccatp.sim.radio import Packet, SimDriveCommand, TargetBearing, TruePose, WorldFrame
 from ccatp.sim.radio_world import RadioWorld
-from ccatp.sim.rules import FanRules, MotionRules
+from ccatp.sim.rules import SimulatedRobot
 
 _CORNER = (0.0, 0.0)  # a robot without edge sensors has them where it is
 
@@ -56,35 +52,27 @@ class Surroundings(Protocol):
 
 
 class MoteReceiver(Protocol):
-    """What the robot hears of motes."""
+    """The receiver of the motes' pulses."""
 
-    def hear(self, time_s: float, pose: TruePose) -> list[MoteBurst]:
-        """Pulses heard since the last frame."""
+    def receive(self, time_s: float, pose: TruePose) -> list[MoteBurst]:
+        """Pulses received since the last frame."""
 
 
-class BeaconRobot:
-    """The robot from its boot on.
+class BeaconRobot(SimulatedRobot):
+    """The robot from its boot on; the fans have no effect."""
 
-    Attributes:
-        rules, fans: what it enforces; the fans do nothing.
-        seq, t_s: newest frame and its time.
-    """
-
-    def __init__(self, cfg: RadioConfig, world: Surroundings, ears: MoteReceiver | None = None) -> None:
-        self._cfg, self.world, self._ears = cfg, world, ears
-        self.frame_s = cfg.run.step_s
-        self.rules = MotionRules(cfg.sim.robot.ttl_s, cfg.robot.max_wheel_rad_s)
-        self.fans = FanRules(0.0)
-        self.seq, self.t_s, self.reboots = 0, 0.0, 0
+    def __init__(self, cfg: RadioConfig, world: Surroundings, motes: MoteReceiver | None = None) -> None:
+        self._cfg, self.world, self._motes = cfg, world, motes
+        limits = cfg.sim.robot.ttl_s, cfg.robot.max_wheel_rad_s, 0.0
+        super().__init__(limits, cfg.run.step_s, 1.0 / cfg.run.step_s)
         self._steer_rad = 0.0
         self._line = b""
         self._read(None)
 
-    def hello(self, *, boot: int, nonce: str, auth: str, lockstep: bool) -> Hello:
-        """The first message on a connection."""
-        cfg = self._cfg
-        vehicle = cfg.vehicle
-        data = RobotData(
+    def describe(self) -> RobotData:
+        """See ``SimulatedRobot``."""
+        cfg, vehicle = self._cfg, self._cfg.vehicle
+        return RobotData(
             wheel_radius_m=cfg.robot.wheel_radius_m,
             wheel_base_m=vehicle.track_m,
             edge_sensors_m=(_CORNER, _CORNER, _CORNER, _CORNER),
@@ -97,16 +85,6 @@ class BeaconRobot:
                 steer_max_rad=vehicle.steer_max_rad,
                 distance_sensors_rad=list(cfg.avoidance.sensors_rad),
             ),
-        )
-        return Hello(
-            protocol=PROTOCOL,
-            boot=boot,
-            nonce=nonce,
-            auth="hmac-sha256" if auth == "hmac-sha256" else "none",
-            lockstep=lockstep,
-            frame_hz=1.0 / self.frame_s,
-            ttl_s=cfg.sim.robot.ttl_s,
-            robot=data,
         )
 
     @property
@@ -124,25 +102,6 @@ class BeaconRobot:
         """The newest frame as a line with its LF."""
         return self._line
 
-    # -- commands -------------------------------------------------------------------------------------------------
-
-    def join_controller(self) -> None:
-        """A new session holds the controller's role."""
-        self.rules.join_controller()
-        self.fans.join_controller()
-
-    def join_monitor(self) -> None:
-        """A new session holds the monitor's role; from now on the second key is needed."""
-        self.rules.join_monitor()
-
-    def lose_controller(self) -> None:
-        """The controller's session is gone: hold."""
-        self.rules.lose_controller()
-
-    def lose_monitor(self) -> None:
-        """The monitor's session is gone: hold."""
-        self.rules.lose_monitor()
-
     def drive(
         self,
         seq: int,
@@ -151,11 +110,7 @@ class BeaconRobot:
         now_s: float | None = None,
         steer_rad: float | None = None,
     ) -> bool:
-        """Take a drive; false for an old or equal ``seq`` and for numbers not finite.
-
-        Args:
-            now_s: the robot's clock at its arrival; that of the newest frame by default.
-        """
+        """Take a drive; a steering angle other than zero makes a turn of it."""
         steer = 0.0 if steer_rad is None or self._cfg.vehicle.kind != "ackermann" else steer_rad
         if not isfinite(steer):
             return False
@@ -164,16 +119,6 @@ class BeaconRobot:
             return False
         self._steer_rad = steer
         return True
-
-    def permit(self, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float | None = None) -> bool:
-        """Take a permit; false for an old or equal ``seq``. ``now_s`` as for ``drive``."""
-        return self.rules.permit(seq, forward, reverse, turn, self.t_s if now_s is None else now_s)
-
-    def command_fans(self, seq: int, left: float, right: float) -> bool:
-        """Take fan duties, for nothing."""
-        return self.fans.command(seq, left, right)
-
-    # -- frames ---------------------------------------------------------------------------------------------------
 
     def advance(self) -> None:
         """Drive one frame and listen."""
@@ -219,7 +164,7 @@ class BeaconRobot:
             radio=[_sample(t_s, sighting) for sighting in frame.sightings],
             scan=_scan(t_s, frame.packets, self._cfg.scan.readings),
             distances=list(frame.distances_m),
-            motes=[] if self._ears is None else self._ears.hear(t_s, self.world.pose),
+            motes=[] if self._motes is None else self._motes.receive(t_s, self.world.pose),
         )
 
 
@@ -282,7 +227,7 @@ class BeaconTruthLog:
 
 
 # Streams of random numbers of a seed, apart from those of the world.
-_LAYOUT, _EARS = 20, 21
+_LAYOUT, _RECEIVER = 20, 21
 
 
 def build_beacon_robot(cfg: RadioConfig) -> BeaconRobot:
@@ -290,7 +235,7 @@ def build_beacon_robot(cfg: RadioConfig) -> BeaconRobot:
     world = RadioWorld(cfg)
     if cfg.system != "cricket":
         return BeaconRobot(cfg, world)
-    rng = np.random.default_rng([cfg.run.seed, _EARS])
+    rng = np.random.default_rng([cfg.run.seed, _RECEIVER])
     return BeaconRobot(cfg, world, MoteListener(cfg.cricket, cfg.listener, _motes(cfg), rng))
 
 

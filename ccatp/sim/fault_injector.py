@@ -33,7 +33,7 @@ from ccatp.sim.fault_models import (
     Wrap,
 )
 from ccatp.sim.fault_plan import FaultPlan
-from ccatp.sim.rules import RobotFrame, as_line
+from ccatp.sim.sensors import RobotFrame, as_line
 
 _MARKS = [(msgspec.json.encode(mark), token.encode()) for token, mark in TOKENS.items()]
 

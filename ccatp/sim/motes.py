@@ -177,7 +177,7 @@ class MoteListener:
         self._sound_m_s = cfg.air.sound_speed_m_s * sqrt(ratio)
         self._sent = 0
 
-    def hear(self, time_s: float, pose: TruePose) -> list[MoteBurst]:
+    def receive(self, time_s: float, pose: TruePose) -> list[MoteBurst]:
         """Pulses of the frame that ends now."""
         count = len(self._motes.names)
         heard: list[MoteBurst] = []

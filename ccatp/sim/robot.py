@@ -1,136 +1,42 @@
-"""The robot: its rules, its fans, its world and its sensors, one frame after the other. Time is an argument.
+"""The simulated survey robot: world and sensors, one frame after the other, and the log of its true state.
 
 Choices the interface leaves open:
 
 * The boot is frame 0 at t = 0, with one sample of each sensor.
-* A set point holds for a whole frame, so a key must last to the end of the frame for the frame to be driven.
+* A set point holds for a whole frame, so drive and permit must last to the end of the frame for it to be driven.
 * A drive over ``max_wheel_rad_s`` is slowed down as a whole; its path stays the same. Numbers not finite are dropped.
 * Without a drive in force the echo has seq -1; ages count from the arrival of what came into force last, at most from
   the boot.
 * The link's delays are whole frames. The frame read at t is delivered when the clock shows t + the sensors' delay,
-  the truth is that of the clock. Commands wait in ``ccatp.sim.robot``.
+  the truth is that of the clock. Commands wait in ``ccatp.sim.rules.CommandDelay``.
 * The battery stays full, ``faults`` stays empty, nothing fails without a fault plan (``ccatp.sim.fault_injector``).
 * A reboot by plan takes no time. On the link, clock and frames count from it; ``seq`` and ``t_s`` here, the truth and
   the times of the plan go on.
-
-The way of commands to the wheels: what arrives takes effect a whole number of frames later.
-
-A command that arrives while frame n is the newest takes effect in the frame that follows n + delay. Its age counts from
-its arrival, so the time-to-live covers the delay, too. Without a delay nothing waits. Whether a command is newer than
-the one before is judged when it arrives. Drives, permits and duties do not overtake their own kind, and no kind matters
-to another: each waits in a line of its own.
-
-What leaves the simulation by the truth's own sockets: rows in batches, and answers to requests.
 """
 
 from collections import deque
-from math import ceil, isfinite
+from math import ceil
 
 import msgspec
 import numpy as np
 
 from ccatp.config.models import Config
 from ccatp.core import DeckPose
-from ccatp.links.robot_messages import MAX_LINE_BYTES, PROTOCOL, CommandEcho, Hello, RobotData, Sensors
+from ccatp.links.robot_messages import MAX_LINE_BYTES, CommandEcho, RobotData, Sensors
 from ccatp.links.topics import Misalignment, TruthMessage
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.fault_injector import Injector
 from ccatp.sim.fault_plan import FaultPlan
-from ccatp.sim.rules import FanRules, MotionRules, RobotFrame, as_line, as_message
-from ccatp.sim.sensors import SensorSuite
+from ccatp.sim.rules import SimulatedRobot
+from ccatp.sim.sensors import RobotFrame, SensorSuite, as_line, as_message
 from ccatp.sim.world import TruthRow, World
-
-
-class CommandDelay:
-    """Takes commands and hands them to the rules and the fans when they are due."""
-
-    __slots__ = ("_drives", "_duties", "_fans", "_frames", "_newest_drive", "_newest_duty", "_newest_permit",
-                 "_permits", "_rules")  # fmt: skip
-
-    def __init__(self, rules: MotionRules, fans: FanRules, frames: int) -> None:
-        self._rules, self._fans, self._frames = rules, fans, frames
-        # (frame in which it is due, what the rules or the fans take)
-        self._drives: deque[tuple[int, int, float, float, float]] = deque()
-        self._permits: deque[tuple[int, int, tuple[bool, bool, bool], float]] = deque()
-        self._duties: deque[tuple[int, int, float, float]] = deque()
-        self._newest_drive = self._newest_permit = self._newest_duty = -1
-
-    def drive(self, frame: int, seq: int, right_rad_s: float, left_rad_s: float, now_s: float) -> bool:
-        """Take a drive; false for an old or equal ``seq`` and for numbers not finite."""
-        if not self._frames:
-            return self._rules.drive(seq, right_rad_s, left_rad_s, now_s)
-        if seq <= self._newest_drive or not (isfinite(right_rad_s) and isfinite(left_rad_s)):
-            return False
-        self._newest_drive = seq
-        self._drives.append((frame + self._frames, seq, right_rad_s, left_rad_s, now_s))
-        return True
-
-    def permit(self, frame: int, seq: int, allowed: tuple[bool, bool, bool], now_s: float) -> bool:
-        """Take a permit (forward, reverse, turn); false for an old or equal ``seq``."""
-        if not self._frames:
-            return self._rules.permit(seq, *allowed, now_s)
-        if seq <= self._newest_permit:
-            return False
-        self._newest_permit = seq
-        self._permits.append((frame + self._frames, seq, allowed, now_s))
-        return True
-
-    def fans(self, frame: int, seq: int, left: float, right: float) -> bool:
-        """Take fan duties; false for an old or equal ``seq`` and for numbers not finite."""
-        if not self._frames:
-            return self._fans.command(seq, left, right)
-        if seq <= self._newest_duty or not (isfinite(left) and isfinite(right)):
-            return False
-        self._newest_duty = seq
-        self._duties.append((frame + self._frames, seq, left, right))
-        return True
-
-    def release(self, frame: int) -> None:
-        """Hand on what is due when the step after ``frame`` begins."""
-        drives, permits, duties = self._drives, self._permits, self._duties
-        while drives and drives[0][0] <= frame:
-            _, seq, right_rad_s, left_rad_s, now_s = drives.popleft()
-            self._rules.drive(seq, right_rad_s, left_rad_s, now_s)
-        while permits and permits[0][0] <= frame:
-            _, seq, (forward, reverse, turn), now_s = permits.popleft()
-            self._rules.permit(seq, forward, reverse, turn, now_s)
-        while duties and duties[0][0] <= frame:
-            _, seq, left, right = duties.popleft()
-            self._fans.command(seq, left, right)
-
-    def join_controller(self) -> None:
-        """A new session: drives of the one before are forgotten; its fan duties, already accepted, come into force."""
-        self.lose_controller()
-        for _, seq, left, right in self._duties:
-            self._fans.command(seq, left, right)
-        self._duties.clear()
-        self._newest_duty = -1
-
-    def join_monitor(self) -> None:
-        """A new session: permits of the one before are forgotten."""
-        self.lose_monitor()
-
-    def lose_controller(self) -> None:
-        """Drives on their way are forgotten; fan duties are not."""
-        self._drives.clear()
-        self._newest_drive = -1
-
-    def lose_monitor(self) -> None:
-        """Permits on their way are forgotten."""
-        self._permits.clear()
-        self._newest_permit = -1
-
 
 # Worst case of a frame's line: fixed part, and bytes per sample of each list. Counted rates have all their digits.
 _FRAME_BYTES, _IMU_BYTES, _ENCODER_BYTES, _COUNTER_BYTES, _EDGE_BYTES = 420, 48, 44, 64, 26
 
 
-class Robot:
-    """The robot from one boot to the next.
-
-    Attributes:
-        seq, t_s: newest frame and its time on the robot's clock.
-    """
+class Robot(SimulatedRobot):
+    """The robot from one boot to the next."""
 
     def __init__(
         self,
@@ -155,17 +61,16 @@ class Robot:
         sim = cfg.sim.robot
         _check_rates(cfg)
         world_rng, sensors_rng = rng.spawn(2)
-        self.frame_s = 1.0 / sim.frame_hz
-        self._frame_hz = sim.frame_hz
         self._cfg = cfg
         self._floor = sim.fan_floor if mirror.overhang else 0.0
-        self.rules = MotionRules(sim.ttl_s, cfg.robot.max_wheel_rad_s)
-        self.fans = FanRules(self._floor)
         self.sensors_delay_frames = round(cfg.world.sensors_delay_s * sim.frame_hz)
-        self.commands_delay_frames = round(cfg.world.commands_delay_s * sim.frame_hz)
-        self._commands = CommandDelay(self.rules, self.fans, self.commands_delay_frames)
+        super().__init__(
+            (sim.ttl_s, cfg.robot.max_wheel_rad_s, self._floor),
+            1.0 / sim.frame_hz,
+            sim.frame_hz,
+            round(cfg.world.commands_delay_s * sim.frame_hz),
+        )
         self.injector = None if faults is None else Injector(faults, mirror, rng.spawn(1)[0])
-        self.reboots = 0
         window_frames = max(1, round(cfg.etalon.measuring_time_s * sim.frame_hz))
         pushes = () if self.injector is None else self.injector.body.drifts
         self.world = World(cfg, mirror, world_rng, window_frames, pushes, start)
@@ -180,17 +85,16 @@ class Robot:
         )
         self._sensors.edges.place(self.world.plant)
         self.world.watch(self._sensors.edges)
-        self.seq, self.t_s = 0, 0.0
         # The newest frame last; the first is delivered once the deque is full.
         self._frames: deque[RobotFrame] = deque(maxlen=self.sensors_delay_frames + 1)
         self._delivered: Sensors | None = None
         self._line = b""
         self._read()
 
-    def hello(self, *, boot: int, nonce: str, auth: str, lockstep: bool) -> Hello:
-        """The first message on a connection."""
+    def describe(self) -> RobotData:
+        """See ``SimulatedRobot``."""
         robot = self._cfg.robot
-        data = RobotData(
+        return RobotData(
             wheel_radius_m=robot.wheel_radius_m,
             wheel_base_m=robot.wheel_base_m,
             edge_sensors_m=robot.edge_sensors_m,
@@ -198,68 +102,11 @@ class Robot:
             max_wheel_rad_s=robot.max_wheel_rad_s,
             fan_floor=self._floor,
         )
-        return Hello(
-            protocol=PROTOCOL,
-            boot=boot,
-            nonce=nonce,
-            auth="hmac-sha256" if auth == "hmac-sha256" else "none",
-            lockstep=lockstep,
-            frame_hz=self._frame_hz,
-            ttl_s=self._cfg.sim.robot.ttl_s,
-            robot=data,
-        )
 
     @property
     def next_t_s(self) -> float:
         """Time of the next frame."""
         return (self.seq + 1) / self._frame_hz
-
-    # -- commands -------------------------------------------------------------------------------------------------
-
-    def join_controller(self) -> None:
-        """A new session holds the controller's role."""
-        self._commands.join_controller()
-        self.rules.join_controller()
-        self.fans.join_controller()
-
-    def join_monitor(self) -> None:
-        """A new session holds the monitor's role; from now on the second key is needed."""
-        self._commands.join_monitor()
-        self.rules.join_monitor()
-
-    def lose_controller(self) -> None:
-        """The controller's session is gone: hold."""
-        self._commands.lose_controller()
-        self.rules.lose_controller()
-
-    def lose_monitor(self) -> None:
-        """The monitor's session is gone: hold."""
-        self._commands.lose_monitor()
-        self.rules.lose_monitor()
-
-    def drive(
-        self,
-        seq: int,
-        right_rad_s: float,
-        left_rad_s: float,
-        now_s: float | None = None,
-        _steer_rad: float | None = None,
-    ) -> bool:
-        """Take a drive; false for an old or equal ``seq`` and for numbers not finite. There is nothing to steer.
-
-        Args:
-            now_s: the robot's clock at its arrival; that of the newest frame by default.
-        """
-        return self._commands.drive(self.seq, seq, right_rad_s, left_rad_s, self.t_s if now_s is None else now_s)
-
-    def permit(self, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float | None = None) -> bool:
-        """Take a permit; false for an old or equal ``seq``. ``now_s`` as for ``drive``."""
-        allowed = forward, reverse, turn
-        return self._commands.permit(self.seq, seq, allowed, self.t_s if now_s is None else now_s)
-
-    def command_fans(self, seq: int, left: float, right: float) -> bool:
-        """Take fan duties; false for an old or equal ``seq`` and for numbers not finite."""
-        return self._commands.fans(self.seq, seq, left, right)
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
@@ -286,13 +133,11 @@ class Robot:
         return found
 
     def _reboot(self, injector: Injector) -> None:
-        """Nothing of the boot before is known; the fans go to their floor."""
-        sim, health = self._cfg.sim.robot, self.fans.health
+        """No command of the boot before stays; the fans go to their floor."""
+        health = self.fans.health
         self.reboots += 1
-        self.rules = MotionRules(sim.ttl_s, self._cfg.robot.max_wheel_rad_s, self.t_s)
-        self.fans = FanRules(self._floor)
+        self._boot(self.t_s)
         self.fans.health = health
-        self._commands = CommandDelay(self.rules, self.fans, self.commands_delay_frames)
         self._frames.clear()
         injector.reboot(self.seq, self.t_s)
 

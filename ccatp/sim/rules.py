@@ -1,22 +1,14 @@
-"""What the robot enforces by itself, whatever its clients do: two keys, time-to-live, directions, newest only.
+"""The robot's side of the link, the same for every simulated robot; time is an argument.
 
-Deny by default: a set point reaches the wheels only through ``MotionRules.set_points``.
-
-A frame as the robot read it, as a line of the robot link and as the message that a client decodes from it.
+It enforces by itself, whatever its clients do: drive and permit, time-to-live, directions, newest only. Deny by
+default: a set point reaches the wheels only through ``MotionRules.set_points``.
 """
 
-from collections.abc import Iterable
-from itertools import repeat
+from abc import ABC, abstractmethod
+from collections import deque
 from math import isfinite
-from typing import TypeVar
 
-import msgspec
-
-from ccatp.core import EdgeSample, GravitySample, ImuSample, WheelSample
-from ccatp.links.robot_codec import encode_sensors
-from ccatp.links.robot_messages import CommandEcho, Sensors
-from ccatp.sim.edge_sensors import EdgeTuple
-from ccatp.sim.sensors import GravityTuple, ImuTuple, WheelTuple
+from ccatp.links.robot_messages import PROTOCOL, Hello, RobotData
 
 HELD = (0.0, 0.0)
 _EVERYTHING = (True, True, True)
@@ -27,7 +19,7 @@ class MotionRules:
 
     Wheels turn only while the newest drive is at most ``ttl_s`` old and, once a monitor has joined in this boot, the
     newest permit is at most ``ttl_s`` old and allows the direction: v = r (wr + wl)/2 > 0 needs ``forward``, < 0
-    ``reverse``, wr != wl needs ``turn``. Sequence numbers count per kind and per session: a new session starts anew.
+    ``reverse``, wr != wl needs ``turn``. Sequence numbers count per kind and per session: a new session begins again.
 
     Args:
         max_wheel_rad_s: limit of a wheel; a faster drive is slowed down as a whole, so that its path stays the same.
@@ -64,16 +56,16 @@ class MotionRules:
         self._drive, self._drive_seq = None, -1
 
     def join_monitor(self) -> None:
-        """A new session holds the monitor's role; from now on the second key is needed."""
+        """A new session holds the monitor's role; from now on its permit is needed."""
         self.has_monitor_joined = True
         self._permit, self._permit_seq = None, -1
 
     def lose_controller(self) -> None:
-        """The controller's session is gone: hold."""
+        """The controller's session has ended: hold."""
         self._drive = None
 
     def lose_monitor(self) -> None:
-        """The monitor's session is gone: hold."""
+        """The monitor's session has ended: hold."""
         self._permit = None
 
     def drive(self, seq: int, right_rad_s: float, left_rad_s: float, now_s: float, *, is_steered: bool = False) -> bool:
@@ -103,7 +95,7 @@ class MotionRules:
         return True
 
     def set_points(self, until_s: float) -> tuple[float, float]:
-        """(right, left) wheel set points of a step that ends at ``until_s``: both keys must last as long, rad/s."""
+        """(right, left) wheel set points, rad/s, of a step that ends at ``until_s``: drive and permit must last as long."""
         drive = self._drive
         if drive is None or not self._may_move(drive, until_s):
             self.is_held = True
@@ -154,7 +146,7 @@ class FanRules:
         self.health = (1.0, 1.0)
 
     def join_controller(self) -> None:
-        """A new session counts anew; the duties stay."""
+        """A new session counts from the start; the duties stay."""
         self._seq = -1
 
     def command(self, seq: int, left: float, right: float) -> bool:
@@ -171,50 +163,193 @@ class FanRules:
         return 0.5 * (self.duty[0] * self.health[0] + self.duty[1] * self.health[1])
 
 
-_Row = TypeVar("_Row", ImuSample, WheelSample, EdgeSample)
+class CommandDelay:
+    """The way of commands to the wheels: what arrives takes effect a whole number of frames later.
 
-
-class RobotFrame(msgspec.Struct, frozen=True, gc=False):
-    """A frame as it was read: what ``Sensors`` says, in the same places, with samples as plain tuples.
-
-    Making named tuples of twenty samples takes as long as reading them, so it waits until somebody asks for names.
+    A command that arrives while frame n is the newest takes effect in the frame that follows n + delay. Its age counts
+    from its arrival, so the time-to-live covers the delay, too. Whether a command is newer than the one before is
+    decided when it arrives. Drives, permits and duties do not overtake their own kind; the kinds are independent.
     """
 
-    seq: int
-    t: float
-    imu: list[ImuTuple]
-    enc: list[WheelTuple]
-    edge: list[EdgeTuple]
-    gravity: GravityTuple | None
-    fans: tuple[float, float]
-    soc: float
-    cmd: CommandEcho
-    faults: tuple[str, ...]
+    __slots__ = ("_drives", "_duties", "_fans", "_frames", "_newest_drive", "_newest_duty", "_newest_permit",
+                 "_permits", "_rules")  # fmt: skip
+
+    def __init__(self, rules: MotionRules, fans: FanRules, frames: int) -> None:
+        self._rules, self._fans, self._frames = rules, fans, frames
+        # (frame in which it is due, what the rules or the fans take)
+        self._drives: deque[tuple[int, int, float, float, float]] = deque()
+        self._permits: deque[tuple[int, int, tuple[bool, bool, bool], float]] = deque()
+        self._duties: deque[tuple[int, int, float, float]] = deque()
+        self._newest_drive = self._newest_permit = self._newest_duty = -1
+
+    def drive(self, frame: int, seq: int, right_rad_s: float, left_rad_s: float, now_s: float) -> bool:
+        """Take a drive; false for an old or equal ``seq`` and for numbers not finite."""
+        if not self._frames:
+            return self._rules.drive(seq, right_rad_s, left_rad_s, now_s)
+        if seq <= self._newest_drive or not (isfinite(right_rad_s) and isfinite(left_rad_s)):
+            return False
+        self._newest_drive = seq
+        self._drives.append((frame + self._frames, seq, right_rad_s, left_rad_s, now_s))
+        return True
+
+    def permit(self, frame: int, seq: int, allowed: tuple[bool, bool, bool], now_s: float) -> bool:
+        """Take a permit (forward, reverse, turn); false for an old or equal ``seq``."""
+        if not self._frames:
+            return self._rules.permit(seq, *allowed, now_s)
+        if seq <= self._newest_permit:
+            return False
+        self._newest_permit = seq
+        self._permits.append((frame + self._frames, seq, allowed, now_s))
+        return True
+
+    def fans(self, frame: int, seq: int, left: float, right: float) -> bool:
+        """Take fan duties; false for an old or equal ``seq`` and for numbers not finite."""
+        if not self._frames:
+            return self._fans.command(seq, left, right)
+        if seq <= self._newest_duty or not (isfinite(left) and isfinite(right)):
+            return False
+        self._newest_duty = seq
+        self._duties.append((frame + self._frames, seq, left, right))
+        return True
+
+    def release(self, frame: int) -> None:
+        """Hand on what is due when the step after ``frame`` begins."""
+        drives, permits, duties = self._drives, self._permits, self._duties
+        while drives and drives[0][0] <= frame:
+            _, seq, right_rad_s, left_rad_s, now_s = drives.popleft()
+            self._rules.drive(seq, right_rad_s, left_rad_s, now_s)
+        while permits and permits[0][0] <= frame:
+            _, seq, (forward, reverse, turn), now_s = permits.popleft()
+            self._rules.permit(seq, forward, reverse, turn, now_s)
+        while duties and duties[0][0] <= frame:
+            _, seq, left, right = duties.popleft()
+            self._fans.command(seq, left, right)
+
+    def join_controller(self) -> None:
+        """A new session: drives of the one before are forgotten; its fan duties, already accepted, come into force."""
+        self.lose_controller()
+        for _, seq, left, right in self._duties:
+            self._fans.command(seq, left, right)
+        self._duties.clear()
+        self._newest_duty = -1
+
+    def join_monitor(self) -> None:
+        """A new session: permits of the one before are forgotten."""
+        self.lose_monitor()
+
+    def lose_controller(self) -> None:
+        """Drives on their way are forgotten; fan duties are not."""
+        self._drives.clear()
+        self._newest_drive = -1
+
+    def lose_monitor(self) -> None:
+        """Permits on their way are forgotten."""
+        self._permits.clear()
+        self._newest_permit = -1
 
 
-def as_line(frame: RobotFrame) -> bytes:
-    """The frame as a line with its LF."""
-    seq, t_s, imu, encoders, edges, gravity, fans, soc, cmd, faults = msgspec.structs.astuple(frame)
-    return encode_sensors(seq, t_s, imu, encoders, edges, gravity, fans, soc, msgspec.structs.astuple(cmd), faults)
+class SimulatedRobot(ABC):
+    """The robot's side of the link that every simulated robot has: roles, commands, and the newest frame.
 
+    Attributes:
+        seq, t_s: newest frame and its time on the robot's clock.
+        reboots: power-ups since the start.
+    """
 
-def as_message(frame: RobotFrame) -> Sensors:
-    """The message that a client decodes from the frame's line."""
-    gravity = frame.gravity
-    return Sensors(
-        frame.seq,
-        frame.t,
-        named(ImuSample, frame.imu),
-        named(WheelSample, frame.enc),
-        named(EdgeSample, frame.edge),
-        None if gravity is None else GravitySample(*gravity),
-        frame.fans,
-        frame.soc,
-        frame.cmd,
-        list(frame.faults),
-    )
+    def __init__(
+        self, limits: tuple[float, float, float], frame_s: float, frame_hz: float, commands_delay_frames: int = 0
+    ) -> None:
+        self._limits = limits
+        self.frame_s, self._frame_hz = frame_s, frame_hz
+        self.commands_delay_frames = commands_delay_frames
+        self.seq, self.t_s, self.reboots = 0, 0.0, 0
+        self._boot(0.0)
 
+    def _boot(self, boot_s: float) -> None:
+        """Rules without any command; the fans at their floor."""
+        ttl_s, max_wheel_rad_s, fan_floor = self._limits
+        self.rules = MotionRules(ttl_s, max_wheel_rad_s, boot_s)
+        self.fans = FanRules(fan_floor)
+        self._commands = CommandDelay(self.rules, self.fans, self.commands_delay_frames)
 
-def named(kind: type[_Row], rows: Iterable[tuple[object, ...]]) -> list[_Row]:
-    """The rows as named tuples; five times as fast as calling the class for each."""
-    return list(map(tuple.__new__, repeat(kind), rows))
+    @abstractmethod
+    def describe(self) -> RobotData:
+        """What the hello says of the robot."""
+
+    @property
+    @abstractmethod
+    def next_t_s(self) -> float:
+        """Time of the next frame."""
+
+    @property
+    @abstractmethod
+    def delivered_seq(self) -> int:
+        """Number of the frame that reached the clients at this instant; -1 while none has, or a fault took it."""
+
+    @property
+    @abstractmethod
+    def delivered_line(self) -> bytes:
+        """That frame as a line with its LF; empty while none has reached the clients."""
+
+    @abstractmethod
+    def advance(self) -> None:
+        """Drive one frame and read the sensors."""
+
+    def hello(self, *, boot: int, nonce: str, auth: str, lockstep: bool) -> Hello:
+        """The first message on a connection."""
+        return Hello(
+            protocol=PROTOCOL,
+            boot=boot,
+            nonce=nonce,
+            auth="hmac-sha256" if auth == "hmac-sha256" else "none",
+            lockstep=lockstep,
+            frame_hz=self._frame_hz,
+            ttl_s=self._limits[0],
+            robot=self.describe(),
+        )
+
+    def join_controller(self) -> None:
+        """A new session holds the controller's role."""
+        self._commands.join_controller()
+        self.rules.join_controller()
+        self.fans.join_controller()
+
+    def join_monitor(self) -> None:
+        """A new session holds the monitor's role; from now on its permit is needed."""
+        self._commands.join_monitor()
+        self.rules.join_monitor()
+
+    def lose_controller(self) -> None:
+        """The controller's session has ended: hold."""
+        self._commands.lose_controller()
+        self.rules.lose_controller()
+
+    def lose_monitor(self) -> None:
+        """The monitor's session has ended: hold."""
+        self._commands.lose_monitor()
+        self.rules.lose_monitor()
+
+    def drive(
+        self,
+        seq: int,
+        right_rad_s: float,
+        left_rad_s: float,
+        now_s: float | None = None,
+        steer_rad: float | None = None,
+    ) -> bool:
+        """Take a drive; false for an old or equal ``seq`` and for numbers that are not finite.
+
+        ``now_s`` is the robot's clock at its arrival, by default the time of the newest frame. Without a steered wheel
+        ``steer_rad`` has no effect.
+        """
+        del steer_rad
+        return self._commands.drive(self.seq, seq, right_rad_s, left_rad_s, self.t_s if now_s is None else now_s)
+
+    def permit(self, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float | None = None) -> bool:
+        """Take a permit; false for an old or equal ``seq``. ``now_s`` as for ``drive``."""
+        allowed = forward, reverse, turn
+        return self._commands.permit(self.seq, seq, allowed, self.t_s if now_s is None else now_s)
+
+    def command_fans(self, seq: int, left: float, right: float) -> bool:
+        """Take fan duties; false for an old or equal ``seq`` and for numbers that are not finite."""
+        return self._commands.fans(self.seq, seq, left, right)

@@ -14,15 +14,19 @@ angle exactly, so nothing is rounded here. The place of the first count is drawn
 The inertial unit: acceleration along robot x and angular rate about the normal, with noise and offsets.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from itertools import chain, pairwise
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import chain, pairwise, repeat
 from math import exp, hypot, pi
+from typing import TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ccatp.config.models import PanelsConfig, SimRobotConfig, WorldConfig
-from ccatp.core import DeckPose, Vector3
+from ccatp.core import DeckPose, EdgeSample, GravitySample, ImuSample, Vector3, WheelSample
+from ccatp.links.robot_codec import encode_sensors
+from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.disturbances import BLOCK, WHOLE, DriftingBias, NoiseStream
 from ccatp.sim.edge_sensors import EdgeSensors, EdgeTuple, PanelEdges
@@ -339,3 +343,52 @@ class SensorSuite:
         gx, gy, gz = self._gravity_on_deck
         (hx, hy, hz), (lx, ly, lz), (nx, ny, nz) = self._mirror.robot_axes(pose)
         return hx * gx + hy * gy + hz * gz, lx * gx + ly * gy + lz * gz, nx * gx + ny * gy + nz * gz
+
+
+_Row = TypeVar("_Row", ImuSample, WheelSample, EdgeSample)
+
+
+class RobotFrame(msgspec.Struct, frozen=True, gc=False):
+    """A frame as it was read: what ``Sensors`` says, in the same places, with samples as plain tuples.
+
+    Making named tuples of twenty samples takes as long as reading them, so it waits until somebody asks for names.
+    """
+
+    seq: int
+    t: float
+    imu: list[ImuTuple]
+    enc: list[WheelTuple]
+    edge: list[EdgeTuple]
+    gravity: GravityTuple | None
+    fans: tuple[float, float]
+    soc: float
+    cmd: CommandEcho
+    faults: tuple[str, ...]
+
+
+def as_line(frame: RobotFrame) -> bytes:
+    """The frame as a line with its LF."""
+    seq, t_s, imu, encoders, edges, gravity, fans, soc, cmd, faults = msgspec.structs.astuple(frame)
+    return encode_sensors(seq, t_s, imu, encoders, edges, gravity, fans, soc, msgspec.structs.astuple(cmd), faults)
+
+
+def as_message(frame: RobotFrame) -> Sensors:
+    """The message that a client decodes from the frame's line."""
+    gravity = frame.gravity
+    return Sensors(
+        frame.seq,
+        frame.t,
+        named(ImuSample, frame.imu),
+        named(WheelSample, frame.enc),
+        named(EdgeSample, frame.edge),
+        None if gravity is None else GravitySample(*gravity),
+        frame.fans,
+        frame.soc,
+        frame.cmd,
+        list(frame.faults),
+    )
+
+
+def named(kind: type[_Row], rows: Iterable[tuple[object, ...]]) -> list[_Row]:
+    """The rows as named tuples; five times as fast as calling the class for each."""
+    return list(map(tuple.__new__, repeat(kind), rows))

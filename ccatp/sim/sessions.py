@@ -30,7 +30,6 @@ from ccatp.links.robot_messages import (
     BadLineCounter,
     Drive,
     FromClient,
-    Hello,
     Join,
     Joined,
     LineBuffer,
@@ -42,7 +41,7 @@ from ccatp.links.robot_messages import (
     Unknown,
 )
 from ccatp.links.robot_messages import Fans as FansMessage
-from ccatp.sim.rules import FanRules, MotionRules
+from ccatp.sim.rules import SimulatedRobot
 
 JOIN_TIMEOUT_S = 2.0
 SILENCE_S = 5.0
@@ -60,66 +59,6 @@ class Wire(Protocol):
 
     def close(self) -> None:
         """Close when everything is sent; nothing is received any more."""
-
-
-class ServedRobot(Protocol):
-    """A robot that can be served; ``ccatp.sim.robot.Robot`` is one.
-
-    Attributes:
-        t_s: time of the newest frame, on the robot's clock.
-    """
-
-    rules: MotionRules
-    fans: FanRules
-    frame_s: float
-    t_s: float
-    reboots: int
-
-    @property
-    def next_t_s(self) -> float:
-        """Time of the next frame."""
-
-    @property
-    def delivered_seq(self) -> int:
-        """Number of the frame that reached the clients at this instant; -1 while none has."""
-
-    @property
-    def delivered_line(self) -> bytes:
-        """That frame as a line with its LF."""
-
-    def hello(self, *, boot: int, nonce: str, auth: str, lockstep: bool) -> Hello:
-        """The first message on a connection."""
-
-    def join_controller(self) -> None:
-        """A new session holds the controller's role."""
-
-    def join_monitor(self) -> None:
-        """A new session holds the monitor's role."""
-
-    def lose_controller(self) -> None:
-        """The controller's session is gone."""
-
-    def lose_monitor(self) -> None:
-        """The monitor's session is gone."""
-
-    def drive(
-        self,
-        seq: int,
-        right_rad_s: float,
-        left_rad_s: float,
-        now_s: float | None = None,
-        steer_rad: float | None = None,
-    ) -> bool:
-        """Take a drive; false for one that is not newer."""
-
-    def permit(self, seq: int, forward: bool, reverse: bool, turn: bool, now_s: float | None = None) -> bool:
-        """Take a permit; false for one that is not newer."""
-
-    def command_fans(self, seq: int, left: float, right: float) -> bool:
-        """Take fan duties; false for those that are not newer."""
-
-    def advance(self) -> None:
-        """Drive one frame and read the sensors."""
 
 
 class RobotSession:
@@ -188,7 +127,7 @@ class RobotServer:
 
     def __init__(
         self,
-        robot: ServedRobot,
+        robot: SimulatedRobot,
         *,
         lockstep: bool,
         boot: int,

@@ -20,8 +20,7 @@ from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.mirror.layout import Panel
 from ccatp.mirror.mirror import Mirror
 from ccatp.sim.plant import Plant
-from ccatp.sim.rules import named
-from ccatp.sim.sensors import SensorSuite
+from ccatp.sim.sensors import SensorSuite, named
 
 RULES = ("thesis", "shipped")
 OFF_S = 0.1

@@ -350,7 +350,7 @@ def test_two_robots_alone_want_two_places(tmp_path: Path, capsys: pytest.Capture
         ):
             assert main([*command, "--runtime-dir", str(tmp_path)]) == 1
             err = capsys.readouterr().err
-            assert err.startswith(f"ccatp: another simulated robot has its truth in {tmp_path}; end it, or give this")
+            assert err.startswith(f"ccatp: another simulated robot uses {tmp_path}; end it, or give this")
             assert err.count("\n") == 1
         assert main(["run", "--sim", "--runtime-dir", str(tmp_path)]) == 1
         assert f"a simulated robot runs alone in {tmp_path}" in capsys.readouterr().err

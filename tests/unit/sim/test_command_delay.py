@@ -4,8 +4,7 @@ from math import inf, nan
 
 import pytest
 
-from ccatp.sim.robot import CommandDelay
-from ccatp.sim.rules import FanRules, MotionRules
+from ccatp.sim.rules import CommandDelay, FanRules, MotionRules
 
 DT_S = 0.01
 
