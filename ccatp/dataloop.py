@@ -1,7 +1,7 @@
 """The simulated robots behind the robot link: sockets, the wall clock or lockstep, and the true state beside the link.
 
 The sockets of the robot link carry what a real robot would send and nothing else. The true state leaves by ZeroMQ: a
-REP socket with the requests of ``ccatp.sim.robot`` or ``ccatp.sim.beacon_robot``, and a PUB socket with batches of rows.
+REP socket with the requests of ``ccatp.sim.robot`` or ``ccatp.sim.beacon_robot``, and a PUB socket with rows.
 
 Known limitations: the battery stays full, and nothing fails without a fault plan (``ccatp.sim.fault_injector``).
 """

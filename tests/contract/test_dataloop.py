@@ -80,7 +80,7 @@ class Notes:
         self._more = asyncio.Event()
 
     def info(self, event: str, **fields: object) -> None:
-        self.lines.append(event)
+        self.lines.append(str(fields.get("text", event)))
         self._more.set()
 
     async def until(self, line: str) -> None:

@@ -20,7 +20,7 @@ DEADLINE_S = 20.0
 
 
 class Log:
-    """Keeps what it is told."""
+    """Keeps the log lines."""
 
     def __init__(self) -> None:
         self.entries: list[tuple[str, dict[str, object]]] = []
@@ -29,7 +29,7 @@ class Log:
         self.entries.append((event, fields))
 
     def of(self, what: str) -> list[dict[str, object]]:
-        return [fields for event, fields in self.entries if event.startswith(f"fault {what}: link ")]
+        return [fields for event, fields in self.entries if event == f"fault_{what}" and fields["signal"] == "link"]
 
 
 class Client:
@@ -191,7 +191,5 @@ async def test_faults_of_robot_and_link_in_one_plan() -> None:
         plan + plan_of("fragment", "at_s = 0.1", TABLE["fragment"][0]), reached(60), lockstep=True
     )
     assert len(client.frames) == len(range(client.frames[-1] + 1)) - 5
-    assert [event for event, _ in log.entries if event.startswith("fault injected")] == [
-        "fault injected: frames drop",
-        "fault injected: link fragment",
-    ]
+    injected = [(fields["signal"], fields["type"]) for event, fields in log.entries if event == "fault_injected"]
+    assert injected == [("frames", "drop"), ("link", "fragment")]
