@@ -95,7 +95,7 @@ class MotionRules:
         return True
 
     def set_points(self, until_s: float) -> tuple[float, float]:
-        """(right, left) wheel set points, rad/s, for a step that ends at ``until_s``: drive and permit must last to it."""
+        """(right, left) wheel set points, rad/s, of a step to ``until_s``: drive and permit must last to its end."""
         drive = self._drive
         if drive is None or not self._may_move(drive, until_s):
             self.is_held = True
