@@ -1,14 +1,13 @@
 """The page of a mission among beacons: waypoints, the map of the beacons, errors against the simulated truth."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from math import hypot, sqrt
 from typing import Any
 
 from ccatp.beacons.mission import BeaconState
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.links.topics import BeaconArrival, BeaconEllipse, BeaconMapMessage, BeaconPlaces, BeaconTrack, BeaconTruth
-from ccatp.report.dashboard.survey_view import MEASURED, PLANNED, Second, TruthCompare
-from ccatp.report.dashboard.view import RunStateView
+from ccatp.report.dashboard.view import MEASURED, PLANNED, RunStateView, TruthCompare
 
 CODES = ["normal operation", "near something", "operation aborted"]
 TITLES = {"zigbee": "ZigBee beacons", "follow": "Following a radio", "cricket": "Ultrasonic motes"}
@@ -78,15 +77,11 @@ class BeaconView(RunStateView):
     """The state of a mission among beacons."""
 
     def __init__(self, cfg: RadioConfig, *, is_sim: bool) -> None:
-        super().__init__(is_sim=is_sim, series=SERIES, has_laser=False)
+        super().__init__(points=len(beacon_waypoints(cfg)), is_sim=is_sim, series=SERIES, has_laser=False)
         self._cfg = cfg
-        self._states = [PLANNED] * len(beacon_waypoints(cfg))
         self._lap = 0
-        self._changed: set[int] = set()
         self._map: BeaconMapMessage | None = None
         self._places: Mapping[str, tuple[float, float]] = {}
-        self._truth = TruthCompare()
-        self._sigma_second = -1
         self._handlers |= {
             BeaconArrival: self._take_arrival,
             BeaconMapMessage: self._take_map,
@@ -101,8 +96,7 @@ class BeaconView(RunStateView):
             self._states = [PLANNED] * len(self._states)
             self._changed.update(range(len(self._states)))
         if 0 <= arrival.waypoint < len(self._states):
-            self._states[arrival.waypoint] = MEASURED
-            self._changed.add(arrival.waypoint)
+            self._mark(arrival.waypoint, MEASURED)
 
     def _take_places(self, places: BeaconPlaces, _now_s: float) -> None:
         self._places = places.places
@@ -127,34 +121,18 @@ class BeaconView(RunStateView):
 
     def _take_track(self, track: BeaconTrack, _now_s: float) -> None:
         for seq, t_s, x_m, y_m, _, xx, xy, yy, *_ in track.rows:
-            if not TruthCompare.is_compared(seq):
-                continue
-            sigma_m = worst_sigma_m(xx, xy, yy)
-            if self._is_sim:
-                self._compared(self._truth.estimate(seq, x_m, y_m, sigma_m))
-            elif int(t_s) != self._sigma_second:
-                self._sigma_second = int(t_s)
-                self._series["error"].add(round(t_s, 2), None, round(3e3 * sigma_m, 3))
+            if TruthCompare.is_compared(seq):
+                self._take_estimate(seq, t_s, x_m, y_m, worst_sigma_m(xx, xy, yy))
 
     def _take_truth(self, truth: BeaconTruth, _now_s: float) -> None:
-        self._compared(self._truth.truth(row[:4] for row in truth.rows))
-
-    def _compared(self, seconds: Iterable[Second]) -> None:
-        for second in seconds:
-            self._series["error"].add(round(second.t_s, 2), round(second.error_mm, 3), round(second.three_sigma_mm, 3))
+        self._add_errors(self._truth.truth(row[:4] for row in truth.rows))
 
     def _static(self, message: BeaconMapMessage) -> dict[str, BeaconEllipse]:
         target = self._cfg.follow.target if self._cfg.follow.is_active else ""
         return {name: ellipse for name, ellipse in message.beacons.items() if name != target}
 
-    def _own_news(self) -> dict[str, Any]:
-        points = [[k, self._states[k], None] for k in sorted(self._changed)]
-        self._changed.clear()
-        return {"points": points, "facts": self._facts()}
-
-    def _own_all(self) -> dict[str, Any]:
-        points = [[k, state, None] for k, state in enumerate(self._states) if state != PLANNED]
-        return {"points": points, "facts": self._facts()}
+    def _own_levels(self) -> dict[str, Any]:
+        return {"facts": self._facts()}
 
     def _facts(self) -> list[tuple[str, str]]:
         message = self._map

@@ -1,16 +1,15 @@
 """The page of a survey: its points, arrival errors by the laser, errors against the simulated truth, the path."""
 
-from collections import OrderedDict
 from collections.abc import Iterable
-from math import dist, hypot
-from typing import Any, NamedTuple
+from math import dist
+from typing import Any
 
 from ccatp.config.models import Config
 from ccatp.core import PanelId, PanelPose, PointId, Vector3
 from ccatp.links.topics import ArrivalMessage, DisplayState, FixMessage, MissionStatus, TrackMessage, TruthMessage
 from ccatp.mirror.mirror import Mirror, deck_poses
 from ccatp.mirror.surface import ConvergenceError
-from ccatp.report.dashboard.view import RunStateView
+from ccatp.report.dashboard.view import ARRIVED, MEASURED, PLANNED, SKIPPED, RunStateView, TruthCompare
 from ccatp.survey.planning.route import ORDERS
 from ccatp.survey.state import MissionState
 
@@ -25,8 +24,6 @@ WORDS = {
     "reached": "measured",
 }
 """Terms of the page, by the id of their element or for its own sentences."""
-PLANNED, ARRIVED, MEASURED, SKIPPED = range(4)
-"""State of a point; arrived: the robot is at rest there."""
 
 
 def point_name(point: PointId) -> str:
@@ -68,65 +65,6 @@ def ground(mirror: Mirror, cfg: Config, *, is_sim: bool, needs_token: bool) -> d
     }
 
 
-# Frames between two that are compared: ten a second are.
-EVERY = 10
-# Frames without a counterpart: batches of a second, and some reserve.
-WAITING = 500
-
-
-class Second(NamedTuple):
-    """The largest error of one second: robot time (s), true error of the position and its three sigma (mm)."""
-
-    t_s: float
-    error_mm: float
-    three_sigma_mm: float
-
-
-class TruthCompare:
-    """Joins estimates with the simulated truth of the same frame; either may arrive first."""
-
-    def __init__(self) -> None:
-        self._estimates: OrderedDict[int, tuple[float, float, float]] = OrderedDict()
-        self._truths: OrderedDict[int, tuple[float, float, float]] = OrderedDict()
-        self._second = -1
-        self._worst: Second | None = None
-
-    @staticmethod
-    def is_compared(seq: int) -> bool:
-        """Whether a frame is one of those that are compared."""
-        return seq % EVERY == 0
-
-    def estimate(self, seq: int, x_m: float, y_m: float, sigma_m: float) -> list[Second]:
-        """Add the estimate after frame ``seq``, deck frame; returns the seconds that it completes."""
-        return self._join(seq, self._estimates, (x_m, y_m, sigma_m))
-
-    def truth(self, rows: Iterable[tuple[int, float, float, float]]) -> list[Second]:
-        """Add rows of frame, time (s), true x and y (m); returns the seconds that they complete."""
-        done = []
-        for seq, t_s, x_m, y_m in rows:
-            if self.is_compared(seq):
-                done += self._join(seq, self._truths, (t_s, x_m, y_m))
-        return done
-
-    def _join(
-        self, seq: int, own: OrderedDict[int, tuple[float, float, float]], value: tuple[float, float, float]
-    ) -> list[Second]:
-        own[seq] = value
-        if len(own) > WAITING:
-            own.popitem(last=False)
-        if seq not in self._estimates or seq not in self._truths:
-            return []
-        x_m, y_m, sigma_m = self._estimates.pop(seq)
-        t_s, true_x_m, true_y_m = self._truths.pop(seq)
-        here = Second(t_s, 1e3 * hypot(x_m - true_x_m, y_m - true_y_m), 3e3 * sigma_m)
-        if int(t_s) == self._second and self._worst is not None:
-            if here.error_mm > self._worst.error_mm:
-                self._worst = here
-            return []
-        done, self._second, self._worst = self._worst, int(t_s), here
-        return [] if done is None else [done]
-
-
 SERIES = ("arrival", "jump", "nis", "error")
 """Rows of robot time (s) and: arrival error by the laser (mm); how far a fix moved the estimate (mm); NIS and degrees
 of freedom; true error and three sigma of the position (mm), without the truth only the latter."""
@@ -136,16 +74,11 @@ class SurveyView(RunStateView):
     """The state of a survey."""
 
     def __init__(self, mirror: Mirror, cfg: Config, *, is_sim: bool) -> None:
-        super().__init__(is_sim=is_sim, series=SERIES)
-        self._mirror, self._puck_height_m = mirror, cfg.robot.puck_height_m
         self.points = survey_points(mirror, cfg)
+        super().__init__(points=len(self.points), is_sim=is_sim, series=SERIES)
+        self._mirror, self._puck_height_m = mirror, cfg.robot.puck_height_m
         self._index = {point: k for k, point in enumerate(self.points)}
         self._by_name = {point_name(point): k for k, point in enumerate(self.points)}
-        self._states = [PLANNED] * len(self.points)
-        self._errors_mm: list[float | None] = [None] * len(self.points)
-        self._changed: set[int] = set()
-        self._truth = TruthCompare()
-        self._sigma_second = -1
         self._handlers |= {
             ArrivalMessage: self._take_arrival,
             FixMessage: self._take_fix,
@@ -158,7 +91,8 @@ class SurveyView(RunStateView):
         for point, t_s, position_m in sorted(measured, key=lambda row: row[1]):
             self._measured(point, t_s, position_m)
         for point in skipped:
-            self._mark(self._index.get(point), SKIPPED)
+            if point in self._index:
+                self._mark(self._index[point], SKIPPED)
 
     def _take_status(self, status: MissionStatus, now_s: float) -> None:
         super()._take_status(status, now_s)
@@ -210,31 +144,10 @@ class SurveyView(RunStateView):
         poses = deck_poses(self._mirror, [PanelPose(PanelId(r[2], r[3]), r[4], r[5], r[6]) for r in rows])
         for row, (x_m, y_m) in zip(rows, poses[:, :2].tolist(), strict=True):
             self._trail.add(x_m, y_m)
-            if self._is_sim:
-                self._compared(self._truth.estimate(row[0], x_m, y_m, row[7]))
-            elif int(row[1]) != self._sigma_second:
-                self._sigma_second = int(row[1])
-                self._series["error"].add(round(row[1], 2), None, round(3e3 * row[7], 3))
+            self._take_estimate(row[0], row[1], x_m, y_m, row[7])
 
     def _take_truth(self, truth: TruthMessage, _now_s: float) -> None:
-        self._compared(self._truth.truth(row[:4] for row in truth.rows))
-
-    def _compared(self, seconds: Iterable[Second]) -> None:
-        for second in seconds:
-            self._series["error"].add(round(second.t_s, 2), round(second.error_mm, 3), round(second.three_sigma_mm, 3))
-
-    def _mark(self, index: int | None, state: int) -> None:
-        if index is not None:
-            self._states[index] = state
-            self._changed.add(index)
-
-    def _own_news(self) -> dict[str, Any]:
-        points = [[k, self._states[k], self._errors_mm[k]] for k in sorted(self._changed)]
-        self._changed.clear()
-        return {"points": points}
-
-    def _own_all(self) -> dict[str, Any]:
-        return {"points": [[k, s, self._errors_mm[k]] for k, s in enumerate(self._states) if s != PLANNED]}
+        self._add_errors(self._truth.truth(row[:4] for row in truth.rows))
 
     def _next_point(self) -> str:
         # On the way to a stop that is not a point the mission has none; then it is the first planned one.

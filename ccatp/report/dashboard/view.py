@@ -1,7 +1,8 @@
 """The state that every page shows, made from the messages of the bus: links, mission, verdict, pose, messages, map."""
 
+from collections import OrderedDict
 from collections.abc import Callable, Iterable
-from math import dist
+from math import dist, hypot
 from typing import Any, NamedTuple
 
 import msgspec
@@ -229,6 +230,67 @@ class Lines:
         return new
 
 
+# Frames between two that are compared: ten a second are.
+EVERY = 10
+# Frames without a counterpart: batches of a second, and some reserve.
+WAITING = 500
+
+
+class Second(NamedTuple):
+    """The largest error of one second: robot time (s), true error of the position and its three sigma (mm)."""
+
+    t_s: float
+    error_mm: float
+    three_sigma_mm: float
+
+
+class TruthCompare:
+    """Joins estimates with the simulated truth of the same frame; either may arrive first."""
+
+    def __init__(self) -> None:
+        self._estimates: OrderedDict[int, tuple[float, float, float]] = OrderedDict()
+        self._truths: OrderedDict[int, tuple[float, float, float]] = OrderedDict()
+        self._second = -1
+        self._worst: Second | None = None
+
+    @staticmethod
+    def is_compared(seq: int) -> bool:
+        """Whether a frame is one of those that are compared."""
+        return seq % EVERY == 0
+
+    def estimate(self, seq: int, x_m: float, y_m: float, sigma_m: float) -> list[Second]:
+        """Add the estimate after frame ``seq``, deck frame; returns the seconds that it completes."""
+        return self._join(seq, self._estimates, (x_m, y_m, sigma_m))
+
+    def truth(self, rows: Iterable[tuple[int, float, float, float]]) -> list[Second]:
+        """Add rows of frame, time (s), true x and y (m); returns the seconds that they complete."""
+        done = []
+        for seq, t_s, x_m, y_m in rows:
+            if self.is_compared(seq):
+                done += self._join(seq, self._truths, (t_s, x_m, y_m))
+        return done
+
+    def _join(
+        self, seq: int, own: OrderedDict[int, tuple[float, float, float]], value: tuple[float, float, float]
+    ) -> list[Second]:
+        own[seq] = value
+        if len(own) > WAITING:
+            own.popitem(last=False)
+        if seq not in self._estimates or seq not in self._truths:
+            return []
+        x_m, y_m, sigma_m = self._estimates.pop(seq)
+        t_s, true_x_m, true_y_m = self._truths.pop(seq)
+        here = Second(t_s, 1e3 * hypot(x_m - true_x_m, y_m - true_y_m), 3e3 * sigma_m)
+        if int(t_s) == self._second and self._worst is not None:
+            if here.error_mm > self._worst.error_mm:
+                self._worst = here
+            return []
+        done, self._second, self._worst = self._worst, int(t_s), here
+        return [] if done is None else [done]
+
+
+PLANNED, ARRIVED, MEASURED, SKIPPED = range(4)
+"""State of a point; arrived: the robot is at rest there."""
 MAX_PATH, MAX_SAMPLES, MAX_LINES = 12_000, 4_000, 200
 NO_LINE = msgspec.Raw(b"null")
 _line = msgspec.json.Decoder(Sensors)
@@ -241,7 +303,7 @@ class RunStateView:
         is_tracking: the path arrives as it is driven; otherwise it has only the stops.
     """
 
-    def __init__(self, *, is_sim: bool, series: Iterable[str], has_laser: bool = True) -> None:
+    def __init__(self, *, points: int, is_sim: bool, series: Iterable[str], has_laser: bool = True) -> None:
         self._is_sim = is_sim
         self.links = Links(has_laser=has_laser)
         self.status: MissionStatus | None = None
@@ -255,6 +317,11 @@ class RunStateView:
         self._trail = Trail(MAX_PATH)
         self._series = {name: Growing(MAX_SAMPLES) for name in series}
         self._lines = Lines(MAX_LINES)
+        self._states = [PLANNED] * points
+        self._errors_mm: list[float | None] = [None] * points
+        self._changed: set[int] = set()
+        self._truth = TruthCompare()
+        self._sigma_second = -1
         self._ticks = 0
         self._handlers: dict[type, Callable[[Any, float], None]] = {
             Heartbeat: lambda heartbeat, _: self.links.presence(heartbeat),
@@ -301,7 +368,9 @@ class RunStateView:
     def news(self, now_s: float) -> dict[str, Any]:
         """The levels, and the new rows of what grows."""
         self._ticks += 1
-        state = self._levels(now_s) | self._own_news()
+        state = self._levels(now_s) | self._own_levels()
+        state["points"] = [[k, self._states[k], self._errors_mm[k]] for k in sorted(self._changed)]
+        self._changed.clear()
         state["path"] = self._trail.take_new()
         state["series"] = {name: new for name, series in self._series.items() if (new := series.take_new())}
         state["log"] = self._lines.take_new()
@@ -312,7 +381,8 @@ class RunStateView:
 
     def everything(self, now_s: float) -> dict[str, Any]:
         """The levels and all rows, for a new page; to be called after ``news``, so that no row is sent twice."""
-        state = self._levels(now_s) | self._own_all()
+        state = self._levels(now_s) | self._own_levels()
+        state["points"] = [[k, s, self._errors_mm[k]] for k, s in enumerate(self._states) if s != PLANNED]
         state["path"] = self._trail.rows
         state["series"] = {name: series.rows for name, series in self._series.items()}
         state["log"] = self._lines.rows
@@ -323,11 +393,23 @@ class RunStateView:
         """The levels with the run's trouble, for ``/status``."""
         return {**self._levels(now_s), "trouble": self.links.trouble(now_s)}
 
-    def _own_news(self) -> dict[str, Any]:
-        return {"points": []}
+    def _own_levels(self) -> dict[str, Any]:
+        return {}
 
-    def _own_all(self) -> dict[str, Any]:
-        return {"points": []}
+    def _mark(self, index: int, state: int) -> None:
+        self._states[index] = state
+        self._changed.add(index)
+
+    def _take_estimate(self, seq: int, t_s: float, x_m: float, y_m: float, sigma_m: float) -> None:
+        if self._is_sim:
+            self._add_errors(self._truth.estimate(seq, x_m, y_m, sigma_m))
+        elif int(t_s) != self._sigma_second:
+            self._sigma_second = int(t_s)
+            self._series["error"].add(round(t_s, 2), None, round(3e3 * sigma_m, 3))
+
+    def _add_errors(self, seconds: Iterable[Second]) -> None:
+        for second in seconds:
+            self._series["error"].add(round(second.t_s, 2), round(second.error_mm, 3), round(second.three_sigma_mm, 3))
 
     def _next_point(self) -> str:
         return "" if self.status is None else self.status.point

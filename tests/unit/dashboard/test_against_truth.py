@@ -2,7 +2,7 @@
 
 import pytest
 
-from ccatp.report.dashboard.survey_view import WAITING, Second, TruthCompare
+from ccatp.report.dashboard.view import WAITING, Second, TruthCompare
 
 
 def test_the_worst_of_each_second_is_told_when_the_next_begins() -> None:

@@ -27,7 +27,7 @@ from ccatp.report.dashboard.beacon_view import (
     waypoint_name,
     worst_sigma_m,
 )
-from ccatp.report.dashboard.survey_view import MEASURED, PLANNED
+from ccatp.report.dashboard.view import MEASURED, PLANNED
 
 ELLIPSE = (0.8, 0.8, 4e-4, 0.0, 4e-4)
 

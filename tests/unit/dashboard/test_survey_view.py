@@ -24,7 +24,8 @@ from ccatp.links.topics import (
     TruthMessage,
 )
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.report.dashboard.survey_view import ARRIVED, MEASURED, SKIPPED, SurveyView, ground
+from ccatp.report.dashboard.survey_view import SurveyView, ground
+from ccatp.report.dashboard.view import ARRIVED, MEASURED, SKIPPED
 
 LINE = (
     b'{"type":"sensors","seq":5,"t":1.5,"imu":[],"enc":[],"edge":[[1.4,1,1,1,1],[1.5,1,0,1,1]],"gravity":null,'
