@@ -10,7 +10,7 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.sim.fault_effects import make_effect
+from ccatp.sim.fault_effects import make_sensor_fault
 from ccatp.sim.fault_models import SIGNALS, TYPES, Drift, Injected
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.sim.robot import Robot
@@ -55,7 +55,7 @@ def test_the_tables_are_complete() -> None:
 def test_an_effect_that_is_none_is_refused() -> None:
     drift = Drift(signal="body", type="drift", at_s=0.0, speed_m_s=0.1)
     with pytest.raises(TypeError, match="no effect on readings: Drift"):
-        make_effect(drift, SIGNALS["soc"], np.random.default_rng(1))
+        make_sensor_fault(drift, np.random.default_rng(1))
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
