@@ -147,7 +147,7 @@ class RobotLinkServer:
         self.server.lost(session)
 
     def fail(self, error: Exception) -> None:
-        """End ``run`` with an error that nobody foresaw."""
+        """End ``run`` with an unforeseen error."""
         if not self._failure.done():
             self._failure.set_exception(error)
 
@@ -252,7 +252,7 @@ class DataLoop(RobotLinkServer):
             self.body.keep(self.robot)
         super().on_frame()
         if self.robot.injector is not None:
-            for what, injected in self.robot.injector.news(self.robot.t_s):
+            for what, injected in self.robot.injector.changes(self.robot.t_s):
                 self._log_fault(what, injected)
         if self.link_faults is not None:
             for what, injected in self.link_faults.tick(self.robot.t_s):
@@ -283,7 +283,7 @@ async def serve(
     Args:
         key: key of the robot link, ``None`` for no authentication.
         faults: what shall go wrong with the robot and its link; for the link a proxy listens in the robot's place.
-        body_file: keeps where the robot stands while nobody simulates it.
+        body_file: keeps the true pose of the robot between runs.
 
     Raises:
         OSError: the address cannot be had.

@@ -2,10 +2,10 @@
 
 Unknown are the parameters and the pose at every fix. Known are, each with its covariance: the fixes; where the wheels
 lead from each pose to the next, right but for the noise of the encoders and the slip of each motion; the change of
-heading that the gyroscope felt. How much slip varies from motion to motion is not known beforehand: it is chosen so
+heading that the gyroscope measured. How much slip varies from motion to motion is not known beforehand: it is chosen so
 that the residuals are as large as they should be (chi^2 = degrees of freedom), and widens all uncertainties with it.
 
-A calibration as values of the configuration, as lines for the reader, as JSON.
+The result is written as values of the configuration, as lines of text and as JSON.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ _CONVERGED = 1e-4  # of a standard deviation
 # What the midpoint rule and the rounding of samples leave.
 _FLOOR_M, _FLOOR_RAD = 5e-7, 5e-7
 _LEAST_SLIP, _MOST_SLIP = 1e-6, 0.2
-_LEAST_WAY_RAD = 1e-3  # a wheel that hardly turned in a motion says nothing
+_LEAST_WAY_RAD = 1e-3  # a wheel that hardly turned in a motion gives no information
 
 
 class CalibrationError(CcatpError):

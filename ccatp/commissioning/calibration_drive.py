@@ -1,8 +1,6 @@
-"""A recorded drive, cut into segments from fix to fix: what the wheels turned and the gyroscope summed up.
+"""A recorded calibration drive, cut into segments from fix to fix: what the wheels turned and the gyroscope summed up.
 
-A segment driven again by its wheels alone, for several sets of parameters at once.
-
-The drive in a run directory, as the calibration takes it.
+A segment is driven again by its wheels alone, for several sets of parameters at once.
 """
 
 from dataclasses import dataclass, field
@@ -158,13 +156,13 @@ class DriveBuilder:
         self._segments.append(Segment(right, left, motions, done.gyro_rad, done.gyro_s, done.gyro_samples, duration_s))
 
     def _rest_rad(self) -> float:
-        if not self._scatters or self._wheels[0].is_counter:  # a counter at rest says nothing
+        if not self._scatters or self._wheels[0].is_counter:  # a counter at rest gives no scatter
             return REST_RAD
         noise_rad = median(self._scatters) * median(self._periods) * sqrt(self._samples)
         return max(REST_RAD, REST_SIGMAS * noise_rad)
 
     def _join(self, rest: _Open) -> None:
-        """A rest between two fixes at one place shows the gyroscope's bias like any other; no segment knows it."""
+        """A rest between two fixes at one place shows the gyroscope's bias like any other; no segment holds it."""
         self._open.gyro_rad, self._open.gyro_s = rest.gyro_rad, rest.gyro_s
         self._open.gyro_samples, self._open.begun_s = rest.gyro_samples, rest.begun_s
 
@@ -320,7 +318,7 @@ def _drive(
                 if motion_first <= begin < motion_last:
                     (right if (column - 6) % 2 == 0 else left)[column] *= 1.0 + _GRIP
             d, turn = 0.5 * (right + left), (right - left) / base_m
-            # In the middle of the step, as far as the last one tells.
+            # In the middle of the step, by the duration of the last one.
             fx, fy, fxx, fxy, _, gx, gy = terrain.at(float(x[0]) + 0.5 * dx0, float(y[0]) + 0.5 * dy0)
             s2 = 1.0 + fx * fx
             s, norm = s2**0.5, (s2 + fy * fy) ** 0.5

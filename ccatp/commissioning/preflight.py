@@ -1,9 +1,4 @@
-"""One line of the check before a mission, and all of them as a table.
-
-What the MultiLine server says, against the configuration.
-
-What the robot says of itself while it stands, against the configuration.
-"""
+"""Checks before a mission: findings as a table, and the rules for the laser server and the robot at rest."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from enum import StrEnum
@@ -26,9 +21,9 @@ class CheckOutcome(StrEnum):
     """How a check went."""
 
     PASS = "pass"  # noqa: S105 - no password
-    WARN = "warn"  # a mission is possible; somebody should know
+    WARN = "warn"  # a mission is possible; the operator should know
     FAIL = "fail"
-    SKIP = "skip"  # what it would look at is not there
+    SKIP = "skip"  # what it would check is not there
 
 
 class PreflightResult(NamedTuple):
@@ -60,7 +55,7 @@ def failed(name: str, found: str, todo: str) -> PreflightResult:
 
 
 def skipped(names: Iterable[str], why: str) -> list[PreflightResult]:
-    """What could not be looked at."""
+    """What could not be checked."""
     return [PreflightResult(name, CheckOutcome.SKIP, why) for name in names]
 
 
@@ -78,8 +73,8 @@ def lines(findings: Sequence[PreflightResult]) -> list[str]:
         if finding.todo:
             text.append(f"{'':4}  {'':{width}}  -> {finding.todo}")
     counts = {outcome: sum(f.outcome is outcome for f in findings) for outcome in CheckOutcome}
-    told = ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count)
-    return [*text, f"{'not ready' if has_failed(findings) else 'ready'}: {told}"]
+    summary = ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count)
+    return [*text, f"{'not ready' if has_failed(findings) else 'ready'}: {summary}"]
 
 
 def as_json(findings: Sequence[PreflightResult]) -> dict[str, Any]:
@@ -159,9 +154,9 @@ class RobotReport(NamedTuple):
     arrived_s: Sequence[float]
 
 
-def judge_robot(cfg: Config, mirror: Mirror, heard: RobotReport) -> list[PreflightResult]:
+def judge_robot(cfg: Config, mirror: Mirror, report: RobotReport) -> list[PreflightResult]:
     """All checks of a robot that stands at base."""
-    problems = robot_problems(cfg, mirror, heard.hello)
+    problems = robot_problems(cfg, mirror, report.hello)
     geometry = (
         failed("robot geometry", "; ".join(problems), "measure the robot and correct [robot], or run.mirror")
         if problems
@@ -169,15 +164,15 @@ def judge_robot(cfg: Config, mirror: Mirror, heard: RobotReport) -> list[Preflig
     )
     return [
         geometry,
-        _frames(cfg, heard),
-        _clock(heard),
-        _faults(heard.frames),
-        _encoders(heard.frames),
-        _inertial_unit(cfg, heard.frames),
-        _edge_sensors(heard.frames),
-        _gravity(mirror, heard.frames),
-        _fans(cfg, mirror, heard),
-        _battery(cfg, heard.frames),
+        _frames(cfg, report),
+        _clock(report),
+        _faults(report.frames),
+        _encoders(report.frames),
+        _inertial_unit(cfg, report.frames),
+        _edge_sensors(report.frames),
+        _gravity(mirror, report.frames),
+        _fans(cfg, mirror, report),
+        _battery(cfg, report.frames),
     ]
 
 
@@ -185,12 +180,12 @@ def _span_s(frames: Sequence[Sensors]) -> float:
     return frames[-1].t - frames[0].t
 
 
-def _frames(cfg: Config, heard: RobotReport) -> PreflightResult:
-    frames, nominal = heard.frames, heard.hello.frame_hz
-    span_s = heard.arrived_s[-1] - heard.arrived_s[0]
+def _frames(cfg: Config, report: RobotReport) -> PreflightResult:
+    frames, nominal = report.frames, report.hello.frame_hz
+    span_s = report.arrived_s[-1] - report.arrived_s[0]
     if span_s <= 0.0:
         return failed("frames", "a single frame", "is something between us and the robot that holds frames back?")
-    rate, gap_s = (len(frames) - 1) / span_s, max(b - a for a, b in pairwise(heard.arrived_s))
+    rate, gap_s = (len(frames) - 1) / span_s, max(b - a for a, b in pairwise(report.arrived_s))
     missing = sum(b.seq - a.seq - 1 for a, b in pairwise(frames))
     found = f"{rate:.1f} a second of {nominal:g}, longest gap {1e3 * gap_s:.0f} ms, {missing} missing"
     if gap_s > cfg.robot.sensors_timeout_s or rate < 0.9 * nominal:
@@ -200,11 +195,11 @@ def _frames(cfg: Config, heard: RobotReport) -> PreflightResult:
     return passed("frames", found)
 
 
-def _clock(heard: RobotReport) -> PreflightResult:
-    theirs_s, ours_s = _span_s(heard.frames), heard.arrived_s[-1] - heard.arrived_s[0]
+def _clock(report: RobotReport) -> PreflightResult:
+    theirs_s, ours_s = _span_s(report.frames), report.arrived_s[-1] - report.arrived_s[0]
     ratio = theirs_s / ours_s if ours_s > 0.0 else 0.0
-    found = f"runs at {ratio:.4f} of ours, {heard.frames[-1].t:.0f} s since boot {heard.hello.boot}"
-    if heard.hello.lockstep:
+    found = f"runs at {ratio:.4f} of ours, {report.frames[-1].t:.0f} s since boot {report.hello.boot}"
+    if report.hello.lockstep:
         return warned("robot clock", "simulated, in lockstep", "a real robot has a clock of its own")
     # What was under way at both ends blurs a short look.
     if abs(ratio - 1.0) > CLOCK_TOLERANCE + 0.05 / max(ours_s, 0.1):
@@ -213,9 +208,9 @@ def _clock(heard: RobotReport) -> PreflightResult:
 
 
 def _faults(frames: Sequence[Sensors]) -> PreflightResult:
-    told = sorted({fault for frame in frames for fault in frame.faults})
-    if told:
-        return failed("faults", f"the robot reports {', '.join(told)}", "see to it before anything moves")
+    reported = sorted({fault for frame in frames for fault in frame.faults})
+    if reported:
+        return failed("faults", f"the robot reports {', '.join(reported)}", "see to it before anything moves")
     return passed("faults", "the robot reports none")
 
 
@@ -286,14 +281,14 @@ def _gravity(mirror: Mirror, frames: Sequence[Sensors]) -> PreflightResult:
     return passed("gravity", f"the slope is that of {mirror.name} at base")
 
 
-def _fans(cfg: Config, mirror: Mirror, heard: RobotReport) -> PreflightResult:
-    least, floor = min(min(frame.fans) for frame in heard.frames), heard.hello.robot.fan_floor
+def _fans(cfg: Config, mirror: Mirror, report: RobotReport) -> PreflightResult:
+    least, floor = min(min(frame.fans) for frame in report.frames), report.hello.robot.fan_floor
     found = f"at least {least:.2f} of duty, the floor is {floor:g}"
     if mirror.overhang and least < floor:
         return failed("fans", found, "the robot would fall: keep a hand on it, and find out why the fans are weak")
     if mirror.overhang and min(cfg.robot.fan_duty) < floor:
-        told = f"robot.fan_duty {min(cfg.robot.fan_duty):g} is below the robot's floor {floor:g}"
-        return failed("fans", told, "raise robot.fan_duty")
+        found = f"robot.fan_duty {min(cfg.robot.fan_duty):g} is below the robot's floor {floor:g}"
+        return failed("fans", found, "raise robot.fan_duty")
     return passed("fans", found)
 
 

@@ -1,4 +1,4 @@
-"""Looks at robot, laser system and machine for the check before a mission; nothing moves, nothing changes."""
+"""Reads robot, laser system and machine for the check before a mission; nothing moves, nothing changes."""
 
 import asyncio
 import ctypes
@@ -34,24 +34,24 @@ _LOCAL = ("127.", "localhost", "::1")
 
 
 async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -> list[PreflightResult]:
-    """Join the robot as monitor, listen for a while, judge what it says.
+    """Join the robot as monitor, receive for a while, judge its frames.
 
-    A monitor that says nothing permits nothing: as long as it listens nobody can move the robot.
+    A monitor that sends no permit keeps the robot held.
     """
     frames: list[Sensors] = []
     arrived_s: list[float] = []
     hellos: list[Hello] = []
     lost: list[str] = []
-    has_news, is_lost = asyncio.Event(), asyncio.Event()
+    has_changed, is_lost = asyncio.Event(), asyncio.Event()
 
     def take(sensors: Sensors, _raw: bytes) -> None:
         frames.append(sensors)
         arrived_s.append(time.monotonic())
-        has_news.set()
+        has_changed.set()
 
     def lose(reason: str) -> None:
         lost.append(reason)
-        has_news.set()
+        has_changed.set()
         is_lost.set()
 
     try:
@@ -64,7 +64,7 @@ async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -
     )  # fmt: skip
     try:
         await link.connect(cfg.robot.connect_timeout_s)
-        await _listen(has_news, is_lost, listen_s)
+        await _listen(has_changed, is_lost, listen_s)
     except RobotLinkError as error:
         todo = "switch the robot on; check [robot] host, port and key_file; end what else drives it"
         return [failed("robot link", str(error), todo), *skipped(judge_robot.ROBOT_NAMES, "no robot link")]
@@ -79,11 +79,11 @@ async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -
     return [*found, *judge_robot.judge_robot(cfg, mirror, RobotReport(hello, frames, arrived_s))]
 
 
-async def _listen(has_news: asyncio.Event, is_lost: asyncio.Event, listen_s: float) -> None:
+async def _listen(has_changed: asyncio.Event, is_lost: asyncio.Event, listen_s: float) -> None:
     """Wait for the first frame and then for as long as is to be listened; no longer than the session lasts."""
     with suppress(TimeoutError):
         async with asyncio.timeout(FIRST_FRAME_S):
-            await has_news.wait()
+            await has_changed.wait()
         async with asyncio.timeout(listen_s):
             await is_lost.wait()
 
@@ -97,7 +97,7 @@ def _link_finding(cfg: Config, hello: Hello) -> PreflightResult:
 
 
 async def probe_laser(cfg: Config, mirror: Mirror) -> list[PreflightResult]:
-    """Ask the MultiLine server how it is, and where the puck is."""
+    """Request state and a fix of the puck from the MultiLine server."""
     quick = cfg.etalon.model_copy(update={"reconnect_for_s": 0.0})
     client = EtalonClient(quick, mirror.channels, mirror.collimators_m)
     name = "laser server"
@@ -142,18 +142,18 @@ def probe_keys(cfg: Config, *, sim: bool) -> PreflightResult:
 
 
 def _clock() -> PreflightResult:
-    """Whether somebody keeps the machine's time: logs and recordings are compared by it."""
+    """Whether the machine's time is synchronised: logs and recordings are compared by it."""
     name, year = "machine clock", time.gmtime().tm_year
-    told = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
+    found = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime())
     if year < 2025:
-        return failed(name, told, "set the clock; is its battery empty?")
+        return failed(name, found, "set the clock; is its battery empty?")
     if sys.platform != "linux":
-        return passed(name, told)
-    # struct timex is 208 bytes long; with its first field, the modes, zero it is only asked.
+        return passed(name, found)
+    # struct timex is 208 bytes long; with its first field, the modes, zero the state is only read.
     state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(256))
     if state in (-1, _TIME_ERROR):
-        return warned(name, f"{told}, kept by nobody", "logs may not fit those of others: start chrony or timesyncd")
-    return passed(name, f"{told}, synchronised")
+        return warned(name, f"{found}, not synchronised", "logs may not fit those of others: start chrony or timesyncd")
+    return passed(name, f"{found}, synchronised")
 
 
 def _disk(runs_dir: Path) -> Iterator[PreflightResult]:
@@ -207,14 +207,14 @@ def _runtime_dir(cfg: Config, runtime_dir: Path | None, environ: Mapping[str, st
         with (folder / "lock").open("a") as file:
             flock(file, LOCK_EX | LOCK_NB)
     except OSError:
-        return failed(name, f"a daemon runs in {folder}", "ask it with ccatp status; end it with ccatp stop")
+        return failed(name, f"a daemon runs in {folder}", "see it with ccatp status; end it with ccatp stop")
     return passed(name, str(folder))
 
 
 def _real_time(cfg: Config) -> PreflightResult:
     name, priority = "real time", cfg.run.realtime_priority
     if not priority:
-        return passed(name, "not asked for (run.realtime_priority = 0)")
+        return passed(name, "not requested (run.realtime_priority = 0)")
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0] if hasattr(resource, "RLIMIT_RTPRIO") else 0
     if os.geteuid() == 0 or limit in (-1, resource.RLIM_INFINITY) or limit >= priority:
         return passed(name, f"priority {priority} is permitted")

@@ -1,4 +1,4 @@
-"""The process of the Etalon stand-in: a MultiLine server over simulated lengths."""
+"""The process of the simulated MultiLine server."""
 
 import asyncio
 import os
@@ -35,7 +35,7 @@ async def _serve(cfg: Config, truth: PuckSource, listener: socket.socket | None,
             f"sim.etalon.port: cannot listen on {at}: {error.strerror}; choose another with --port"
         ) from error
     if listener is None:
-        print(f"ccatp: MultiLine stand-in on {cfg.sim.etalon.host}:{port}", file=sys.stderr, flush=True)
+        print(f"ccatp: simulated MultiLine server on {cfg.sim.etalon.host}:{port}", file=sys.stderr, flush=True)
     try:
         async with asyncio.TaskGroup() as tasks:
             serving = tasks.create_task(server.serve())
@@ -66,7 +66,7 @@ def main() -> int:
 
 
 def run_alone(cfg: Config, puck_world_m: Vector3 | None, truth: str | None) -> int:
-    """The stand-in alone, for other people's controllers; ends on SIGINT or SIGTERM.
+    """The simulated server alone, for other controllers; ends on SIGINT or SIGTERM.
 
     Args:
         puck_world_m: a puck that stands still there, world frame; at base where neither this nor ``truth`` is given.

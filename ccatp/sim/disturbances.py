@@ -1,17 +1,17 @@
-"""What keeps the body from doing what its wheels say: their true measures, slip, downhill creep, vibration.
+"""Disturbances of the body (true wheel measures, slip, downhill creep, vibration) and the random numbers of the world.
 
 Choices of the model:
 
 * Each wheel has a radius error of its own; the base and the lag have one each. The robot announces nominal values.
-* Slip is lost travel, ``body = (1 - s) wheel``, per wheel: a uniform part drawn anew at each leg and an
-  Ornstein-Uhlenbeck part. A leg begins when the wheels are told to turn after ``LEG_PAUSE_S`` of zero set points, so
+* Slip is lost travel, ``body = (1 - s) wheel``, per wheel: a uniform part drawn for each leg and an
+  Ornstein-Uhlenbeck part. A leg begins when the wheels get a set point after ``LEG_PAUSE_S`` of zero set points, so
   the turn and the drive that lead to one stop share their slip.
 * Creep goes along gravity's part in the tangent plane with a share of the forward speed that the wheels give; its
   change is too slow for the accelerometer, which does not see it.
 * Vibration while the fans thrust is jitter of place and heading, white from frame to frame and of constant size: its
   rates are differences, so their sum never grows. What the accelerometer reads of it is a difference, too.
 
-Random numbers of the simulated world: one stream per kind, each a function of the seed alone.
+Each kind of random number has its own stream, a function of the seed alone.
 """
 
 from collections.abc import Callable, Iterator

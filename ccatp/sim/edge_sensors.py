@@ -1,8 +1,7 @@
 """The edge sensors: whether there is panel material under each of them, sample by sample.
 
-Where the panels' edges truly lie: each one shifted along its normal, rigidly, as the panels were mounted.
-
-Only what the edge sensors see is shifted. The rim over which the robot falls stays the ideal one.
+The panels' true edges are shifted along their normals, rigidly, as the panels were mounted. The shift acts on the edge
+sensors alone. The rim over which the robot falls stays the ideal one.
 """
 
 from collections.abc import Sequence

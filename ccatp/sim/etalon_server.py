@@ -1,4 +1,4 @@
-"""TCP server that stands in for the MultiLine server: the same grammar over simulated lengths.
+"""The simulated MultiLine server: the same grammar over simulated lengths, by TCP.
 
 Known limitations (the sources of the grammar are silent on all of them):
 
@@ -12,7 +12,7 @@ Known limitations (the sources of the grammar are silent on all of them):
 * ``stopmeasnogui`` without a stream is answered ``measstopped``.
 * Channel groups, the measurement window, ``defanadata`` and ``measurementfinished`` are not simulated.
 
-The true position of the puck for the Etalon stand-in: held fixed, or asked from the robot's stand-in.
+The true position of the puck is fixed, or requested from the simulated robot.
 """
 
 import asyncio
@@ -41,7 +41,7 @@ class TruthUnavailable(Exception):
 
 
 class PuckSource(Protocol):
-    """Where the stand-in learns the position of the puck."""
+    """Source of the true position of the puck."""
 
     async def puck(self) -> PuckTruth:
         """The puck now.
@@ -75,7 +75,7 @@ class _TruthReply(msgspec.Struct):
 
 
 class ZmqPuck:
-    """Asks the robot's stand-in: request ``b"puck"``, reply ``{"t", "puck": [x, y, z], "moved_m"}``, SI, world."""
+    """From the simulated robot: request ``b"puck"``, reply ``{"t", "puck": [x, y, z], "moved_m"}``, SI, world."""
 
     def __init__(self, endpoint: str, timeout_s: float = 1.0) -> None:
         self._endpoint = endpoint
@@ -85,7 +85,7 @@ class ZmqPuck:
         self._turn = asyncio.Lock()
 
     async def puck(self) -> PuckTruth:
-        """The puck now; after a failure the socket is made anew, as a REQ socket that lost its reply is stuck.
+        """The puck now; after a failure the socket is replaced, as a REQ socket that lost its reply is stuck.
 
         Raises:
             TruthUnavailable: no reply in time, or one that is not of the form above.
@@ -189,7 +189,7 @@ class EtalonSimulator:
         return int(self._server.sockets[0].getsockname()[1])
 
     async def serve(self) -> None:
-        """Wait until closed. An error that nobody foresaw in a session ends it and is raised here."""
+        """Wait until closed. An unforeseen error in a session ends it and is raised here."""
         if self._end is None:
             raise RuntimeError("Etalon stand-in not started: call start first")
         await asyncio.shield(self._end)

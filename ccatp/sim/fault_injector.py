@@ -1,12 +1,11 @@
-"""The injector: applies a plan to what the body does, to what the sensors give and to what leaves the robot.
+"""Applies a fault plan to the body, to the sensors and to what leaves the robot.
 
-It draws from a generator of its own, so that a plan never changes what the world and the sensors draw: up to its first
-fault a run with a plan is the run without.
+It draws from its own generator, so that a plan never changes what the world and the sensors draw: up to its first fault
+a run with a plan is the run without.
 
-The last stage of a frame with faults: time stamps, its line, and frames lost, doubled or out of order.
-
-A line that no client may take (a token that is no number, a reading beyond the range of the link) goes out as it is,
-but counts as not delivered: in lockstep nobody can answer it, and simulated time must not wait.
+The last stage of a frame are its time stamps, its line, and lost, doubled or reordered frames. A line that no client
+may take (a token that is no number, a reading beyond the range of the link) goes out as it is, but counts as not
+delivered: in lockstep no client can answer it, and simulated time must not wait.
 """
 
 from collections.abc import Iterable, Iterator
@@ -60,7 +59,7 @@ class Stamping:
         self.records = [InjectionRecord(fault) for fault in faults]
 
     def stamp(self, t_s: float, at_s: float, *, is_frame: bool) -> float:
-        """The time that is written for ``at_s``, where the clock of the faults says ``t_s``."""
+        """The time that is written for ``at_s`` at the time ``t_s`` of the plan."""
         for record in self.records:
             fault = record.fault
             if not isinstance(fault, Jump | Wrap) or not fault.is_active(t_s):
@@ -126,7 +125,7 @@ class Delivery:
         return Outgoing(line + withheld, _taken(line))
 
     def forget(self) -> None:
-        """What was withheld is gone: the robot started anew."""
+        """Drop what was withheld: the robot rebooted."""
         self._withheld = b""
 
 
@@ -179,14 +178,14 @@ class Injector:
         """What became of each fault of the robot, in the order of the plan."""
         return tuple(record.injected for record in self._records)
 
-    def news(self, t_s: float) -> Iterator[tuple[str, Injected]]:
+    def changes(self, t_s: float) -> Iterator[tuple[str, Injected]]:
         """Faults that began or ended since the last call: ``begins`` or ``ended``, and the record."""
         for record in self._records:
-            if what := record.has_news(t_s):
+            if what := record.change(t_s):
                 yield what, record.injected
 
     def is_rebooting(self, t_s: float) -> bool:
-        """Whether the robot starts anew now; true once for each reboot."""
+        """Whether the robot reboots now; true once for each reboot."""
         due = [r for r in self._reboots if r.fault.has_begun(t_s) and not r.injected.samples]
         for record in due:
             record.add(t_s)

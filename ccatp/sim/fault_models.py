@@ -1,12 +1,7 @@
-"""The faults that a plan may hold: one model per type, and the tables of which type goes with which signal.
+"""The faults that a plan may hold, for the robot and for its link, and the record of what was injected.
 
-Keys that may be left out are ``None`` then; every other value has to be named, as in a configuration.
-
-The faults of the robot link that a plan may hold: what the proxy between robot and clients shall do.
-
-The record of what was injected: which fault, from when to when, and how many samples it changed.
-
-The signals of a frame: in which list they stand, in which places of its rows, and their ranges.
+There is one model per type, and tables of the types that go with each signal. Keys that may be left out are ``None``
+then; every other value has to be named, as in a configuration.
 """
 
 from typing import Annotated, Literal, NamedTuple
@@ -43,7 +38,7 @@ class InjectedFault(Model):
 
     @property
     def end_s(self) -> float:
-        """When it ends; infinite where nobody said."""
+        """When it ends; infinite without ``for_s``."""
         for_s = getattr(self, "for_s", None)
         return float("inf") if for_s is None else self.at_s + for_s
 
@@ -125,7 +120,7 @@ class Blocked(LastingFault):
 
 
 class Runaway(LastingFault):
-    """The wheel turns at ``rate_rad_s``, whatever it is told."""
+    """The wheel turns at ``rate_rad_s``, whatever its set point."""
 
     rate_rad_s: float
 
@@ -137,7 +132,7 @@ class Slip(LastingFault):
 
 
 class Weak(LastingFault):
-    """The fan gives the share ``share`` of its thrust; its echo knows nothing of it."""
+    """The fan gives the share ``share`` of its thrust; its echo does not show it."""
 
     share: Share
 
@@ -195,7 +190,7 @@ class Raise(LastingFault):
 
 
 class Reboot(InjectedFault):
-    """The robot starts anew: boot number, clock, sequence numbers and fans; every session is lost."""
+    """The robot reboots: boot number, clock, sequence numbers and fans; every session is lost."""
 
 
 _ON_SENSORS: dict[str, type[InjectedFault]] = {
@@ -260,7 +255,7 @@ class Close(LinkFault):
 
 
 class BlackHole(LastingLinkFault):
-    """What is sent disappears, and so does the news that a side has closed: a half-open connection."""
+    """What is sent disappears, and so does the end of a connection: a half-open connection."""
 
 
 class Stall(LastingLinkFault):
@@ -358,14 +353,14 @@ class Injected(NamedTuple):
 class InjectionRecord:
     """The record of one fault while it is written."""
 
-    __slots__ = ("_changed", "_from_s", "_is_told", "_samples", "_until_s", "fault")
+    __slots__ = ("_changed", "_from_s", "_reported", "_samples", "_until_s", "fault")
 
     def __init__(self, fault: InjectedFault) -> None:
         self.fault = fault
         self._from_s: float | None = None
         self._until_s: float | None = None
         self._samples = self._changed = 0
-        self._is_told = 0
+        self._reported = 0
 
     def add(self, t_s: float, *, is_changed: bool = True) -> None:
         """Count one sample, frame or step."""
@@ -377,18 +372,18 @@ class InjectionRecord:
 
     @property
     def injected(self) -> Injected:
-        """What it says so far."""
+        """The record so far."""
         fault = self.fault
         return Injected(fault.signal, fault.type, fault.at_s, self._from_s, self._until_s, self._samples, self._changed)
 
-    def has_news(self, t_s: float) -> str:
+    def change(self, t_s: float) -> str:
         """``begins`` or ``ended`` once each, else empty; a fault of an instant ends as it begins."""
-        if self._is_told == 0 and self._from_s is not None:
-            self._is_told = 1
+        if self._reported == 0 and self._from_s is not None:
+            self._reported = 1
             return "begins"
         is_over = t_s >= self.fault.end_s
-        if self._is_told == 1 and is_over:
-            self._is_told = 2
+        if self._reported == 1 and is_over:
+            self._reported = 2
             return "ended"
         return ""
 

@@ -1,6 +1,6 @@
-"""The proxy: it stands between clients and a server and passes everything on, until it is told to misbehave.
+"""A TCP proxy that passes everything on between clients and a server until a fault is switched on.
 
-The link's part of a fault plan: switches the proxy on and off by the robot's clock, and keeps the record.
+The faults of the link in a fault plan switch it by the robot's clock, and are recorded.
 """
 
 import asyncio
@@ -68,7 +68,7 @@ class FaultProxy:
     def __init__(self, host: str, port: int, *, seed: int, listener: socket.socket | None = None) -> None:
         self._address, self._own_listener = (host, port), listener
         self._rng = random.Random(seed)
-        self._conducts: dict[OneWay, NetworkFaults] = {way: NetworkFaults() for way in _BOTH}
+        self._faults: dict[OneWay, NetworkFaults] = {way: NetworkFaults() for way in _BOTH}
         self._connections: set[_Connection] = set()
         self._handlers: set[asyncio.Task[None]] = set()
         self._flooding: asyncio.Task[None] | None = None
@@ -130,7 +130,7 @@ class FaultProxy:
     # -- faults that last -----------------------------------------------------------------------------------------
 
     def black_hole(self, direction: Direction) -> None:
-        """What is sent disappears, and the news that the sender has closed: a half-open connection."""
+        """What is sent disappears, and so does the end of the connection: a half-open connection."""
         self._set(direction, is_black_hole=True)
 
     def stall(self, direction: Direction) -> None:
@@ -176,7 +176,7 @@ class FaultProxy:
         sound = NetworkFaults()
         for way in _ways(direction):
             for name in _FIELDS[fault] if fault else [name for names in _FIELDS.values() for name in names]:
-                setattr(self._conducts[way], name, getattr(sound, name))
+                setattr(self._faults[way], name, getattr(sound, name))
         self._wake()
 
     # -- connections ----------------------------------------------------------------------------------------------
@@ -184,7 +184,7 @@ class FaultProxy:
     def _set(self, direction: Direction, **values: object) -> None:
         for way in _ways(direction):
             for name, value in values.items():
-                setattr(self._conducts[way], name, value)
+                setattr(self._faults[way], name, value)
         self._wake()
 
     def _wake(self) -> None:
@@ -229,7 +229,7 @@ class FaultProxy:
 
     def _pipe(self, way: OneWay, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Pipe:
         may_write = self._passing if way == "to_client" else _everything
-        return Pipe(reader, writer, self._conducts[way], self.counts, random.Random(self._rng.random()), may_write)
+        return Pipe(reader, writer, self._faults[way], self.counts, random.Random(self._rng.random()), may_write)
 
     def _passing(self, data: bytes) -> bytes:
         """What of ``data`` may go to a client, and is counted as gone."""
@@ -247,11 +247,11 @@ class FaultProxy:
         owed = dict.fromkeys(_BOTH, 0.0)
         clock = asyncio.get_running_loop().time
         before_s = clock()
-        while any(conduct.flood_hz for conduct in self._conducts.values()):
+        while any(faults.flood_hz for faults in self._faults.values()):
             await asyncio.sleep(_FLOOD_PERIOD_S)
             now_s = clock()
             for way in _BOTH:
-                owed[way] += (now_s - before_s) * self._conducts[way].flood_hz
+                owed[way] += (now_s - before_s) * self._faults[way].flood_hz
                 lines, owed[way] = int(owed[way]), owed[way] % 1.0
                 for connection in self._connections if lines else ():
                     connection.pipes[way].flood(lines)

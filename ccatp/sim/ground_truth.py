@@ -1,9 +1,4 @@
-"""The truth of a simulation by ZeroMQ, apart from the robot link: requests, and batches of rows for recorders.
-
-Where the simulated robot stands while nobody simulates it: a real one stays where it is when its host dies.
-
-Reads a fault plan: what shall go wrong in a simulated run.
-"""
+"""The true state of a simulation beside the robot link: published by ZeroMQ, and kept in a file; reads fault plans."""
 
 import os
 import zlib
@@ -25,7 +20,7 @@ MAX_REQUEST_BYTES = 4096
 
 
 class TruthSource(Protocol):
-    """What there is to give."""
+    """The log of one simulated robot."""
 
     def add(self) -> bool:
         """Add the row of the newest frame; true when the batch should be taken."""
@@ -34,20 +29,20 @@ class TruthSource(Protocol):
         """The pending rows as a topic and its message, or ``None`` without any."""
 
     def preface(self) -> tuple[str, Message]:
-        """What a recorder has to know before the first batch, likewise."""
+        """What a recorder needs before the first batch, likewise."""
 
     def answer(self, request: bytes) -> bytes:
         """The reply to a request."""
 
 
 class GroundTruthPublisher:
-    """Gives the truth away by ZeroMQ."""
+    """Publishes the true state by ZeroMQ, and answers requests."""
 
     def __init__(self, truth: TruthSource, rep: str | None, pub: str | None) -> None:
         self._truth = truth
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._publisher = Publisher(self._context, pub) if pub else None
-        self._has_told = False
+        self._has_sent_preface = False
         self._rep = zmq.asyncio.Context.shadow(self._context).socket(zmq.REP) if rep else None
         if self._rep is not None and rep:
             self._rep.setsockopt(zmq.LINGER, 0)
@@ -64,8 +59,8 @@ class GroundTruthPublisher:
         batch = self._truth.batch()
         if batch is None or self._publisher is None:
             return
-        if not self._has_told:  # before the first batch: whoever records one has the other, however the run ends
-            self._has_told = True
+        if not self._has_sent_preface:  # before the first batch: a recorder of one has the other, however the run ends
+            self._has_sent_preface = True
             self._publisher.send(*self._truth.preface())
         self._publisher.send(*batch)
 
@@ -92,10 +87,9 @@ _POSE, _CRC = Struct("<3d"), Struct("<I")
 
 
 class SimPoseFile:
-    """Keeps the true pose, ten times a second of its time.
+    """Keeps the true pose, ten times a second of simulated time; a real robot stays where it is when its host dies.
 
-    Args:
-        path: the file; made with the first pose.
+    The file is made with the first pose.
     """
 
     def __init__(self, path: Path) -> None:

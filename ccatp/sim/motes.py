@@ -1,10 +1,7 @@
-"""Where the motes of a simulated field are, and where they look.
+"""The motes of a simulated field: where they are, which pulses they receive, and what the robot's listener receives.
 
-What motes hear of each other: usable region, flight of the pulse, echoes, losses, thermometers.
-
-What the robot's listener gets of motes: their pulses, and at first what they report of each other.
-
-The motes send one after the other, round by round; who hears a pulse hears it at once. Reports are not lost.
+A pulse has a usable region, a time of flight, echoes, losses and a temperature. The motes send one after the other,
+round by round; each receiver receives a pulse at once. Reports are not lost.
 """
 
 from collections.abc import Sequence
@@ -26,7 +23,7 @@ class TrueMotes:
 
     Attributes:
         positions_m: shape (n, d).
-        facings: unit vectors, shape (n, d); zero where a mote is turned to whoever it talks to.
+        facings: unit vectors, shape (n, d); zero where a mote is turned to its peer.
     """
 
     names: tuple[str, ...]
@@ -75,7 +72,7 @@ class MotePulse(NamedTuple):
     """Readings of one pair.
 
     Attributes:
-        delays_s: pulse after message, shape (k,); as many as were heard.
+        delays_s: pulse after message, shape (k,); as many as were received.
     """
 
     transmitter: int
@@ -99,7 +96,7 @@ class MoteField:
         ratio = (true.temperature_c - _ABSOLUTE_ZERO_C) / (cfg.air.temperature_c - _ABSOLUTE_ZERO_C)
         self._sound_m_s = cfg.air.sound_speed_m_s * sqrt(ratio)
 
-    def hears(self, transmitter: int, listener: int) -> bool:
+    def receives(self, transmitter: int, listener: int) -> bool:
         """Whether a mote is in the usable region of another, and the other in its own."""
         places, facings = self.motes.positions_m, self.motes.facings
         way = places[listener] - places[transmitter]
@@ -110,15 +107,15 @@ class MoteField:
         return self._cfg.transducer.nearest_m <= distance_m <= usable_reach(self._cfg.transducer, *off)
 
     def listen(self, pairs: Sequence[tuple[int, int]], repeats: int, rng: np.random.Generator) -> list[MotePulse]:
-        """Readings of pairs; a pair that hears nothing is left out."""
-        heard = []
+        """Readings of pairs; a pair without reception is left out."""
+        received = []
         for transmitter, listener in pairs:
-            if not self.hears(transmitter, listener):
+            if not self.receives(transmitter, listener):
                 continue
             delays_s = self._delays(transmitter, listener, repeats, rng)
             if delays_s.size:
-                heard.append(MotePulse(transmitter, listener, delays_s, float(self._temperatures_c[listener])))
-        return heard
+                received.append(MotePulse(transmitter, listener, delays_s, float(self._temperatures_c[listener])))
+        return received
 
     def _delays(self, transmitter: int, listener: int, repeats: int, rng: np.random.Generator) -> FloatArray:
         true = self._cfg.sim
@@ -133,7 +130,7 @@ class MoteField:
 
 
 def usable_reach(transducer: TransducerConfig, off_transmitter_rad: float, off_listener_rad: float) -> float:
-    """How far a pulse is heard, m: reach(a) reach(b) / reach(0).
+    """How far a pulse is received, m: reach(a) reach(b) / reach(0).
 
     Both transducers have the same directivity, and each takes its share of the reach on the axis.
 
@@ -160,7 +157,7 @@ _DIGITS = 9  # of a delay on the link: a nanosecond is a third of a micrometre
 
 
 class MoteListener:
-    """Hears frame by frame.
+    """Receives frame by frame.
 
     Args:
         listener: who the robot is to the motes, and how many send in a frame.
@@ -180,14 +177,14 @@ class MoteListener:
     def receive(self, time_s: float, pose: TruePose) -> list[MoteBurst]:
         """Pulses of the frame that ends now."""
         count = len(self._motes.names)
-        heard: list[MoteBurst] = []
+        received: list[MoteBurst] = []
         for _ in range(self._listener.pulses_per_frame):
             sender, round_number = self._sent % count, self._sent // count
             self._sent += 1
             if round_number < self._listener.mapping_rounds:
-                heard += self._reports(time_s, sender)
-            heard += self._own(time_s, pose, sender)
-        return heard
+                received += self._reports(time_s, sender)
+            received += self._own(time_s, pose, sender)
+        return received
 
     def _reports(self, time_s: float, sender: int) -> list[MoteBurst]:
         names = self._motes.names
@@ -199,7 +196,7 @@ class MoteListener:
         ]
 
     def _own(self, time_s: float, pose: TruePose, sender: int) -> list[MoteBurst]:
-        """The robot's listener hears all round; the mote has its cone."""
+        """The robot's listener receives all round; the mote has its cone."""
         true, rng, cfg = self._cfg.sim, self._rng, self._cfg
         dx, dy = pose.x_m - self._motes.positions_m[sender, 0], pose.y_m - self._motes.positions_m[sender, 1]
         way_m = hypot(dx, dy)

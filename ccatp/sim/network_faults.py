@@ -1,7 +1,4 @@
-"""One direction of one connection through the proxy: a reader, what waits, and a writer.
-
-How one direction of the proxy treats what passes: what is switched on, and what it does to lines.
-"""
+"""One direction of a connection through the fault proxy: reader, queue, writer, and the faults switched on in it."""
 
 import asyncio
 import contextlib
@@ -53,17 +50,17 @@ class NetworkFaults:
 
 
 class LineStage:
-    """Cuts a stream into lines where the conduct asks for it, and does to them what it says."""
+    """Cuts a stream into lines where a fault acts on lines, and applies the faults."""
 
-    def __init__(self, conduct: NetworkFaults, counts: "Counter[str]", rng: random.Random) -> None:
-        self._conduct, self._counts, self._rng = conduct, counts, rng
+    def __init__(self, faults: NetworkFaults, counts: "Counter[str]", rng: random.Random) -> None:
+        self._faults, self._counts, self._rng = faults, counts, rng
         self._rest = self._withheld = b""
         self._seen: Counter[str] = Counter()
         self._last = b""
 
     def feed(self, data: bytes) -> list[bytes]:
         """What goes on when ``data`` came in, in pieces; between two of them a line ends."""
-        if not self._conduct.acts_on_lines:
+        if not self._faults.acts_on_lines:
             found, self._rest, self._withheld = self._rest + data + self._withheld, b"", b""
             return [found]
         lines = _split(self._rest + data)
@@ -77,27 +74,27 @@ class LineStage:
 
     def flood_line(self) -> bytes:
         """One further line."""
-        if self._conduct.flood_lines == "copies" and self._last:
+        if self._faults.flood_lines == "copies" and self._last:
             return self._last
         return self._garbage(_GARBAGE_LINE_BYTES)
 
     def _treat(self, line: bytes) -> list[bytes]:
-        conduct = self._conduct
+        faults = self._faults
         self._last = line
         found: list[bytes] = []
-        if self._is_hit("garbage", conduct.garbage_every):
-            found.append(self._garbage(conduct.garbage_bytes))
-        if self._is_hit("corrupt", conduct.corrupt_every):
+        if self._is_hit("garbage", faults.garbage_every):
+            found.append(self._garbage(faults.garbage_bytes))
+        if self._is_hit("corrupt", faults.corrupt_every):
             line = self._corrupt(line)
         if self._withheld:
             found += [line, self._withheld]
             self._withheld = b""
-        elif self._is_hit("reorder", conduct.reorder_every):
+        elif self._is_hit("reorder", faults.reorder_every):
             self._withheld = line
             return found
         else:
             found.append(line)
-        if self._is_hit("duplicate", conduct.duplicate_every):
+        if self._is_hit("duplicate", faults.duplicate_every):
             found.append(line)
         return found
 
@@ -139,21 +136,21 @@ class Pipe:
     """One direction.
 
     Args:
-        may_write: is asked at every write what of it may go out; the rest never does.
+        may_write: returns the part of a write that may go out; the rest is dropped.
     """
 
     def __init__(
         self,
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
-        conduct: NetworkFaults,
+        faults: NetworkFaults,
         counts: "Counter[str]",
         rng: random.Random,
         may_write: Callable[[bytes], bytes],
     ) -> None:
-        self._reader, self._writer, self._conduct, self._counts, self._rng = reader, writer, conduct, counts, rng
+        self._reader, self._writer, self._faults, self._counts, self._rng = reader, writer, faults, counts, rng
         self._may_write = may_write
-        self._stage = LineStage(conduct, counts, rng)
+        self._stage = LineStage(faults, counts, rng)
         self._waiting: deque[tuple[float, bytes]] = deque()
         self._waiting_bytes = 0
         self._due_s = 0.0
@@ -161,15 +158,15 @@ class Pipe:
         self._changed = asyncio.Event()
 
     def wake(self) -> None:
-        """The conduct has changed."""
+        """The faults have changed."""
         self._changed.set()
 
     def put(self, data: bytes) -> None:
         """Let something wait for its time to go out; what is over the limit is lost."""
         if not data or self._is_shut or self._waiting_bytes + len(data) > 2 * MAX_WAITING_BYTES:
             return
-        conduct, now_s = self._conduct, asyncio.get_running_loop().time()
-        late_s = conduct.delay_s + conduct.jitter_s * self._rng.random() if conduct.jitter_s else conduct.delay_s
+        faults, now_s = self._faults, asyncio.get_running_loop().time()
+        late_s = faults.delay_s + faults.jitter_s * self._rng.random() if faults.jitter_s else faults.delay_s
         if late_s:
             self._counts["delay"] += 1
         self._due_s = max(self._due_s, now_s + late_s)
@@ -193,14 +190,14 @@ class Pipe:
     async def receive(self) -> None:
         """Take in until the sender ends or is gone."""
         while data := await self._read():
-            if self._conduct.is_black_hole:
+            if self._faults.is_black_hole:
                 self._counts["black_hole"] += len(data)
                 continue
             for piece in self._stage.feed(data):
                 self.put(piece)
             while self._waiting_bytes > MAX_WAITING_BYTES:
                 await self._change()
-        while self._conduct.is_black_hole and not self._writer.is_closing():
+        while self._faults.is_black_hole and not self._writer.is_closing():
             await self._change()
         self.put(self._stage.finish())
         self._is_at_end = True
@@ -218,7 +215,7 @@ class Pipe:
 
     def _send_end(self) -> None:
         if self._writer.can_write_eof() and not self._writer.is_closing():
-            with contextlib.suppress(OSError):  # it may be gone without us having heard
+            with contextlib.suppress(OSError):  # the peer may be gone already
                 self._writer.write_eof()
 
     async def _read(self) -> bytes:
@@ -235,7 +232,7 @@ class Pipe:
         """What is due, all of it in one piece; ``None`` at the end."""
         loop = asyncio.get_running_loop()
         while True:
-            if self._conduct.is_stalled or not self._waiting:
+            if self._faults.is_stalled or not self._waiting:
                 if self._is_at_end and not self._waiting:
                     return None
                 if self._waiting:
@@ -255,8 +252,8 @@ class Pipe:
 
     async def _write(self, data: bytes) -> None:
         while data and not self._is_shut:
-            conduct = self._conduct
-            size = 1 if conduct.bytes_per_s else conduct.write_bytes or len(data)
+            faults = self._faults
+            size = 1 if faults.bytes_per_s else faults.write_bytes or len(data)
             part = self._may_write(data[:size])
             try:
                 self._writer.write(part)
@@ -266,9 +263,9 @@ class Pipe:
             if len(part) < len(data[:size]):  # the rest never goes out: see ``FaultProxy.reset_after``
                 return
             data = data[size:]
-            if conduct.bytes_per_s:
+            if faults.bytes_per_s:
                 self._counts["slowloris"] += 1
-                await asyncio.sleep(1.0 / conduct.bytes_per_s)
-            elif conduct.write_bytes:
+                await asyncio.sleep(1.0 / faults.bytes_per_s)
+            elif faults.write_bytes:
                 self._counts["fragment"] += 1
                 await asyncio.sleep(0)

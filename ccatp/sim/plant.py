@@ -213,7 +213,7 @@ class Plant:
         return 0.5 * self._radius_m * difference / self._half_base_m + self.shake_rate_rad_s
 
     def place(self, x_m: float, y_m: float, heading_rad: float) -> None:
-        """Put the body elsewhere on the surface, deck frame; the wheels know nothing of it."""
+        """Put the body elsewhere on the surface, deck frame; the wheels do not turn."""
         self.x_m, self.y_m, self.heading_rad = x_m, y_m, heading_rad
         self.z_m, self.fx, self.fy, *_ = self._jet(x_m, y_m)
         self._turn_axes()

@@ -1,14 +1,8 @@
-"""What passes between the true world and whoever drives in it: commands down, readings up.
+"""Parts of the true world of a robot among beacons.
 
-What befalls a robot among beacons by plan: radios fall silent, things stand in its way, the target comes.
-
-Round obstacles: whether they stand in a line of sight, how far the distance sensors see, whom they touch.
-
-Static shadowing: the part of a signal strength that belongs to the places of both radios.
-
-True signal strengths: path loss, static shadowing, obstacles, reflected rays, a reflector's pattern, loss.
-
-The radio that moves: at random or along waypoints, at a steady speed, inside the room.
+Commands and readings; scheduled events (radios fall silent, obstacles and the target appear); round obstacles; static
+shadowing; signal strengths (path loss, shadowing, obstacles, reflected rays, a reflector's pattern, loss); the moving
+radio.
 """
 
 from collections.abc import Iterable, Sequence
@@ -55,7 +49,7 @@ class TruePose(NamedTuple):
 
 
 class WheelReading(NamedTuple):
-    """What the odometry tells of one step: mean speed, and steering angle or turn rate."""
+    """Odometry of one step: mean speed, and steering angle or turn rate."""
 
     interval_s: float
     speed_m_s: float
@@ -83,7 +77,7 @@ class WorldFrame(NamedTuple):
     """All readings of one step.
 
     Attributes:
-        packets: answers heard at its end while the reflector turned once; empty in steps without a scan.
+        packets: answers received at its end while the reflector turned once; empty in steps without a scan.
         sightings: the same of worlds that draw the result of a scan.
         distances_m: of the distance sensors, in the order of the configuration; their range where they see nothing.
     """
@@ -278,7 +272,7 @@ class TrueRadio:
         return -min(12.0 * off * off, self._cfg.front_to_back_db)
 
     def _received(self, level_dbm: float) -> float | None:
-        """What the receiver tells of a level; None if the packet is lost."""
+        """Reading of a level by the receiver; None if the packet is lost."""
         noisy_dbm = level_dbm + self._cfg.white_sigma_db * self._noise.standard_normal()
         is_lost = self._noise.random() < self._cfg.loss_probability or noisy_dbm < self._cfg.sensitivity_dbm
         if is_lost:

@@ -1,6 +1,6 @@
-"""The true vehicle: Ackermann or differential drive, wheels that slip, a heading that drifts, noisy odometry.
+"""The true world of a robot among radio beacons: one call a step, commands in, readings out.
 
-The true world of a robot among radio beacons: one call a step, commands in, readings out.
+The vehicle has Ackermann or differential drive, wheels that slip, a heading that drifts, and noisy odometry.
 """
 
 from math import cos, sin
@@ -28,7 +28,7 @@ class TrueVehicle:
 
     Ackermann, 2017 eq. 3 (x, y of the front axle): x += T v cos(theta + gamma), y += T v sin(theta + gamma),
     theta += T v sin(gamma) / l. Differential drive: the chord of a circular arc. The body makes (1 - slip) of the
-    wheels' travel and turns with the drift besides; the odometry knows of neither and has white noise.
+    wheels' travel and turns with the drift besides; the odometry measures neither and has white noise.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class TrueVehicle:
         self.pose = pose
 
     def step(self, command: SimDriveCommand, interval_s: float) -> WheelReading:
-        """Drive for an interval (s); what the odometry tells of it."""
+        """Drive for an interval (s); its odometry."""
         limits, truth = self._geometry, self._truth
         speed_m_s = _clamped(command.speed_m_s, limits.speed_max_m_s)
         travel_m = speed_m_s * (1.0 - truth.slip) * interval_s
@@ -74,7 +74,7 @@ def _clamped(value: float, limit: float) -> float:
 
 
 Point = tuple[float, float]
-# Streams of random numbers of a seed: what one of them draws does not depend on how often another is asked.
+# Streams of random numbers of a seed: what one of them draws does not depend on the use of another.
 _START, _WHEELS, _TARGET, _DISTANCES, _PLACES, _NOISE = range(6)
 
 

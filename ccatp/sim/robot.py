@@ -154,8 +154,8 @@ class Robot(SimulatedRobot):
     def delivered(self) -> Sensors | None:
         """The frame that reached the clients at this instant, ``None`` while none has.
 
-        Equal in every number to decoding ``delivered_line``. Made when first asked for and then shared: leave it as it
-        is.
+        Equal in every number to decoding ``delivered_line``. Made at the first use and then shared: do not change
+        it.
         """
         if self.injector is not None:
             return self.injector.outgoing.message

@@ -1,17 +1,12 @@
-"""The robot's sensors: what they read of the plant, at their own rates and with the world's errors.
+"""The robot's sensors: what they read of the plant, at their own rates and with the world's errors; frames of readings.
 
-Samples are plain tuples in the order of the robot link, rounded as a real sensor bus would. Every sensor draws from a
-stream of its own, so that its noise depends on the seed alone, not on the rates of the others.
+Samples are plain tuples in the order of the robot link, rounded as a real sensor bus would. Every sensor draws from its
+own stream, so that its noise depends on the seed alone, not on the rates of the others.
 
-When a sensor is read: instants at its own rate, sorted into frames.
-
-The wheel encoders: either rates with white noise, or angles that are counted.
-
-An encoder that counts floors the wheel's angle to whole counts at each sample and reports the change since the sample
-before as a rate, ``rate = counts (2 pi / counts_per_rev) hz``. The sum of rates times the sample period is the counted
-angle exactly, so nothing is rounded here. The place of the first count is drawn for each wheel.
-
-The inertial unit: acceleration along robot x and angular rate about the normal, with noise and offsets.
+Encoders give either rates with white noise, or angles that are counted. An encoder that counts floors the wheel's angle
+to whole counts at each sample and reports the change since the sample before as a rate,
+``rate = counts (2 pi / counts_per_rev) hz``. The sum of rates times the sample period is the counted angle exactly, so
+nothing is rounded here. The place of the first count is drawn for each wheel.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -349,9 +344,9 @@ _Row = TypeVar("_Row", ImuSample, WheelSample, EdgeSample)
 
 
 class RobotFrame(msgspec.Struct, frozen=True, gc=False):
-    """A frame as it was read: what ``Sensors`` says, in the same places, with samples as plain tuples.
+    """A frame as it was read: the fields of ``Sensors``, in the same places, with samples as plain tuples.
 
-    Making named tuples of twenty samples takes as long as reading them, so it waits until somebody asks for names.
+    Making named tuples of twenty samples takes as long as reading them, so it waits until names are needed.
     """
 
     seq: int

@@ -10,12 +10,12 @@ Choices the interface leaves open:
 * A message that does not belong to the sender's role is a bad line. Messages of unknown type keep no role alive.
 * The silence after which a role may be taken over is measured on the robot's clock: in lockstep, where a client may
   hold its answer back for as long as it likes, nobody is silent while simulated time stands still.
-* Sequence numbers start anew with each session.
+* Sequence numbers start again with each session.
 * In lockstep a delay of the sensors keeps its length: each answer to the newest frame delivered drives one frame, and
-  delivers the next. What a client knows is old by the delay, as it is on a wall clock. The frames before the first
+  delivers the next. What a client has is old by the delay, as it is on a wall clock. The frames before the first
   delivery run when the controller joins, held. Delays within the robot stand in for those of the whole link.
-* In lockstep a frame that a fault took away, or that no client may take, waits for nobody: simulated time goes on to
-  the next that can be answered, for at most ``DEAF_S``; then the sessions are closed.
+* In lockstep a frame that a fault took away, or that no client may take, is not waited for: simulated time goes on to
+  the next that can be answered, for at most ``NO_DELIVERY_S``; then the sessions are closed.
 * A reboot by plan closes every session.
 """
 
@@ -47,7 +47,7 @@ JOIN_TIMEOUT_S = 2.0
 SILENCE_S = 5.0
 STALL_S = 5.0
 MAX_LAG_S = 0.25
-DEAF_S = 60.0
+NO_DELIVERY_S = 60.0
 MAX_SESSIONS = 32
 
 
@@ -65,16 +65,16 @@ class RobotSession:
     """One client.
 
     Attributes:
-        joined_s, heard_s: when it came (wall clock) and when it last sent something valid (the robot's clock).
+        joined_s, received_s: when it came (wall clock) and when it last sent something valid (the robot's clock).
         is_open: not closed by us.
     """
 
-    __slots__ = ("_bad", "_lines", "_server", "heard_s", "is_open", "joined_s", "nonce", "role", "wire")
+    __slots__ = ("_bad", "_lines", "_server", "is_open", "joined_s", "nonce", "received_s", "role", "wire")
 
     def __init__(self, server: "RobotServer", wire: Wire, nonce: str, now_s: float) -> None:
         self._server, self.wire, self.nonce = server, wire, nonce
         self.role: Role | None = None
-        self.joined_s, self.heard_s = now_s, 0.0
+        self.joined_s, self.received_s = now_s, 0.0
         self.is_open = True
         self._lines = LineBuffer()
         self._bad = BadLineCounter()
@@ -189,7 +189,7 @@ class RobotServer:
         session.wire.close()
 
     def refuse(self, session: RobotSession, reason: RefusalReason) -> None:
-        """Tell a client that it gets no role, and close."""
+        """Refuse a role to a client, and close."""
         self.counts["refused"] += 1
         session.wire.write(encode(Refused(reason=reason)))
         self.drop(session, f"refused: {reason}")
@@ -220,12 +220,12 @@ class RobotServer:
         robot_s = self._robot_time_s(now_s)
         holder = self._holders.get(message.role)
         if holder is not None:
-            if robot_s - holder.heard_s <= SILENCE_S:
+            if robot_s - holder.received_s <= SILENCE_S:
                 self.refuse(session, "role taken")
                 return
             self.drop(holder, "silent, taken over")
         self._holders[message.role] = session
-        session.role, session.heard_s = message.role, robot_s
+        session.role, session.received_s = message.role, robot_s
         self._last_session += 1
         session.wire.write(encode(Joined(role=message.role, session=self._last_session)))
         self._note(f"{message.role} joined: {message.client}")
@@ -245,16 +245,16 @@ class RobotServer:
                 session.wire.write(robot.delivered_line)
 
     def _run_to_delivery(self) -> None:
-        """Nobody can answer what is still on its way, or lost: the frames until one arrives run by themselves."""
+        """No client can answer what is still on its way, or lost: the frames until one arrives run by themselves."""
         robot, since_s = self.robot, self.robot.t_s
         while robot.delivered_seq < 0 and "controller" in self._holders:
-            if robot.t_s - since_s > DEAF_S:
-                self._drop_all(f"no frame could be delivered for {DEAF_S:g} s")
+            if robot.t_s - since_s > NO_DELIVERY_S:
+                self._drop_all(f"no frame could be delivered for {NO_DELIVERY_S:g} s")
                 return
             self._send_frame()
             robot.advance()
             self._on_frame()
-            self._heed_reboot()
+            self._close_after_reboot()
 
     def command(self, session: RobotSession, role: Role, message: FromClient, now_s: float) -> bool:
         """A message of a session that has a role; false when it is not for this role."""
@@ -274,7 +274,7 @@ class RobotServer:
             self.fan_changes += robot.fans.duty != before
         else:
             return False
-        session.heard_s = robot_s
+        session.received_s = robot_s
         self.counts["stale"] += not taken
         has_permit = self._is_permit_acked or not robot.rules.has_monitor_joined
         if self._is_lockstep and self._is_drive_acked and has_permit:
@@ -311,12 +311,12 @@ class RobotServer:
         self._frame_wall_s, self._is_stall_noted = now_s, False
         self.robot.advance()
         self._on_frame()
-        self._heed_reboot()
+        self._close_after_reboot()
         if self._is_lockstep:
             self._run_to_delivery()
         self._send_frame()
 
-    def _heed_reboot(self) -> None:
+    def _close_after_reboot(self) -> None:
         if self.robot.reboots != self._reboots:
             self._reboots = self.robot.reboots
             self._drop_all("the robot rebooted")

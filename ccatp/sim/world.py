@@ -25,7 +25,7 @@ FAR_CLEARANCE_M = 1.0
 
 
 class Sensing(Protocol):
-    """Whoever knows where the edge sensors are."""
+    """Has the places of the edge sensors."""
 
     @property
     def places(self) -> Sequence[tuple[float, float]]:
@@ -160,7 +160,7 @@ class World:
         self.plant.stop_dead()
 
     def watch(self, sensors: Sensing) -> None:
-        """Take note of who knows the edge sensors' places, for the truth rows."""
+        """Set the source of the edge sensors' places, for the truth rows."""
         self._sensors = sensors
 
     def truth_row(self, seq: int, t_s: float) -> TruthRow:
@@ -173,7 +173,7 @@ class World:
         return seq, t_s, x, y, wrap_pi(p.heading_rad), x, y, p.z_m, self._clearance_m, fallen, self._off_mask
 
     def _look(self) -> None:
-        """Clearance and mask of the sensors: only when somebody asks, and only near the rim."""
+        """Clearance and mask of the sensors: only on request, and only near the rim."""
         self._has_looked = True
         self._clearance_m, self._off_mask = FAR_CLEARANCE_M, 0
         if self._rim_bound_m < NEAR_RIM_M:

@@ -71,7 +71,7 @@ def simulate_field(cfg: CricketConfig, seed: int) -> SimulatedField:
     field = MoteField(cfg, motes, np.random.default_rng((seed, _FIELD)))
     rng = np.random.default_rng((seed, _READINGS))
     first = tuple(_range(cfg, plan, heard) for heard in field.listen(plan.phase1_pairs, cfg.ranging.repeats, rng))
-    pairs = [pair for pair in plan.phase2_pairs if field.hears(*pair)]
+    pairs = [pair for pair in plan.phase2_pairs if field.receives(*pair)]
     if not pairs:
         raise MappingError("no pair of phase 2 hears each other; enlarge cricket.transducer or turn the motes")
     second = []

@@ -494,7 +494,7 @@ def _noise_refreshes(data: bytes, middle: Middle) -> bytes:
 
 
 def _noise_keeps_the_role(data: bytes, middle: Middle) -> bytes:
-    middle.session.heard_s = max(middle.session.heard_s, middle.owner.robot.t_s)
+    middle.session.received_s = max(middle.session.received_s, middle.owner.robot.t_s)
     return data
 
 
@@ -503,7 +503,7 @@ def _soon_taken_over(loop: DataLoop) -> None:
 
     def crooked(session: Any, role: Any, message: Any, now_s: float) -> bool:
         result = command(session, role, message, now_s)
-        session.heard_s -= 3.0
+        session.received_s -= 3.0
         return result
 
     loop.server.command = crooked  # type: ignore[method-assign]

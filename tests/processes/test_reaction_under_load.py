@@ -190,11 +190,11 @@ async def survey(folder: Path, runtime_dir: Path) -> AsyncIterator[Survey]:
 
 
 def _tapped(wire: Wire, proxy: FaultProxy) -> Callable[[Pipe], Awaitable[bytes]]:
-    read, to_server = Pipe._read, proxy._conducts["to_server"]
+    read, to_server = Pipe._read, proxy._faults["to_server"]
 
     async def tapped(pipe: Pipe) -> bytes:
         data = await read(pipe)
-        if pipe._conduct is to_server:
+        if pipe._faults is to_server:
             wire.heard(id(pipe), data)
         return data
 

@@ -83,12 +83,12 @@ def test_the_usable_region() -> None:
 def test_motes_hear_each_other_as_they_face() -> None:
     cfg = config(transducer__is_omnidirectional=False)
     facing = field(cfg, [[0.0, 0.0], [5.0, 0.0], [0.0, 3.5]], [[1.0, 0.0], [-1.0, 0.0], [1.0, 0.0]])
-    assert facing.hears(0, 1)
-    assert not facing.hears(0, 2)  # side by side, both looking across the field
-    assert facing.hears(1, 2) == facing.hears(2, 1) is True
+    assert facing.receives(0, 1)
+    assert not facing.receives(0, 2)  # side by side, both looking across the field
+    assert facing.receives(1, 2) == facing.receives(2, 1) is True
     near = field(cfg, [[0.0, 0.0], [0.05, 0.0], [11.0, 0.0]])
-    assert not near.hears(0, 1)
-    assert not near.hears(0, 2)
+    assert not near.receives(0, 1)
+    assert not near.receives(0, 2)
 
 
 def test_layouts() -> None:

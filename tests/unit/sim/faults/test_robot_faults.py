@@ -282,5 +282,5 @@ def test_news_tell_each_beginning_and_end_once(config: Config, mirror: Mirror) -
     heard = []
     for _ in range(100):
         robot.advance()
-        heard += [(what, robot.seq, injected.samples) for what, injected in robot.injector.news(robot.t_s)]
+        heard += [(what, robot.seq, injected.samples) for what, injected in robot.injector.changes(robot.t_s)]
     assert heard == [("begins", 50, 1), ("ended", 70, 20)]

@@ -10,7 +10,7 @@ from ccatp.config.models import Config
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.sim.fault_plan import parse_plan
 from ccatp.sim.robot import Robot
-from ccatp.sim.sessions import DEAF_S, RobotServer, RobotSession
+from ccatp.sim.sessions import NO_DELIVERY_S, RobotServer, RobotSession
 
 
 class Wire:
@@ -99,8 +99,8 @@ def test_a_robot_that_is_never_heard_again_ends_the_session(config: Config, mirr
     for number in range(1, 7):
         rig.answer(session, wire, number)
     assert wire.is_closed
-    assert f"controller dropped: no frame could be delivered for {DEAF_S:g} s" in rig.notes
-    assert rig.robot.t_s == pytest.approx(DEAF_S, abs=0.2)
+    assert f"controller dropped: no frame could be delivered for {NO_DELIVERY_S:g} s" in rig.notes
+    assert rig.robot.t_s == pytest.approx(NO_DELIVERY_S, abs=0.2)
     again, second = rig.join()
     assert second.is_closed
     assert not again.is_open
