@@ -21,7 +21,7 @@ from ccatp.estimation.state_model import BA, BG, KG, KL, PL, PR, PSI, SL, SR, ST
 from ccatp.estimation.wheel_angles import WheelAngle
 from ccatp.filters import FILTERS
 from ccatp.mirror.mirror import Mirror
-from tests.unit.localization.drive import config, mirror
+from tests.unit.estimation.drive import config, mirror
 
 SEEDS, STEPS, DT_S = 50, 50, 0.04
 FIX_STEPS, FIX_SIGMA_M = (20, 35, 50), 2e-5

@@ -42,7 +42,7 @@ from tests.contract.test_etalon_client import (
 )
 from tests.faults.campaign import single
 from tests.faults.laser import DeskRehearsal, Laser, Measured, failing, honest, moved, patient, run_virtual
-from tests.unit.test_mission import FREE, Story
+from tests.unit.survey.test_mission import FREE, Story
 
 Note = Callable[..., None]
 POINT = PointId(5, 5, 1)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from ccatp.core import EdgeSample, GravitySample, ImuSample, PanelPose, WheelSample, difference
 from ccatp.estimation.fixes import FixRefused
 from ccatp.estimation.full_state import FullStateLocalizer
-from tests.unit.localization.drive import STEEP, Errors, Frame, Robot, build, fix_at, run, trapeze
+from tests.unit.estimation.drive import STEEP, Errors, Frame, Robot, build, fix_at, run, trapeze
 
 FRAMES = 60
 WRONG = Errors(right_slip=0.02, left_slip=0.01, creep=0.02, gyro_bias=0.01, noise=1.0)

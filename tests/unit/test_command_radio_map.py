@@ -12,7 +12,7 @@ import pytest
 from ccatp.beacons.cricket.range_network import MappingError
 from ccatp.beacons.datasets.range_csv import BeaconFileError, read_beacons, read_places, read_ranges, write_beacons
 from ccatp.cli import main
-from tests.unit.motes.fields import ALL, HEADS
+from tests.unit.beacons.cricket.fields import ALL, HEADS
 
 SESSION = Path(__file__).parents[2].parent / "shared" / "data" / "radio" / "uwb_planar"
 CONTRACT = {"rms_m", "crlb_m", "rank_deficiency", "fold_over_risk", "phase1_rms_m", "iterations"}

@@ -10,7 +10,7 @@ import pytest
 
 from ccatp.beacons.datasets.range_csv import read_beacons
 from ccatp.cli import main
-from tests.unit.motes.fields import FloatArray
+from tests.unit.beacons.cricket.fields import FloatArray
 
 NOISE_M = 0.005
 FLAT = np.random.default_rng(1).uniform(0.0, 8.0, (8, 2))

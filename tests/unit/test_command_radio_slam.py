@@ -8,7 +8,7 @@ import pytest
 
 from ccatp.cli import main
 from ccatp.filters import FilterDiverged
-from tests.unit.radio_data.sets import (
+from tests.unit.beacons.datasets.sets import (
     BEACONS,
     csv_lines,
     labyrinth_lines,

@@ -1,9 +1,15 @@
 """The PID controller of eq. 3.4."""
 
-import pytest
+from math import cos, exp, sin
 
-from ccatp.config.models import PidConfig
-from ccatp.control.pid import Pid
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ccatp.config.models import Config, PidConfig
+from ccatp.control.pid import Pid, Profile, ProfiledAxis, lag_feed_forward
+from ccatp.control.prediction import CommandPredictor
+from ccatp.core import Predicted
 
 
 def gains(kp: float, ki: float, kd: float, integral_limit: float = 10.0, filter_s: float = 0.0) -> PidConfig:
@@ -62,3 +68,216 @@ def test_reset_forgets() -> None:
 def test_dt_must_be_positive() -> None:
     with pytest.raises(ValueError, match="dt of a control step must be positive"):
         Pid(gains(1.0, 0.0, 0.0), 1.0).step(1.0, 0.0)
+
+
+DT, LAG, V_MAX, A_MAX = 0.01, 0.08, 0.1, 0.2
+
+
+@pytest.fixture
+def axis(config: Config) -> ProfiledAxis:
+    gains = config.control.gain_sets["shipped"].forward
+    return ProfiledAxis(gains, config.control, V_MAX, A_MAX, LAG)
+
+
+def driven(axis: ProfiledAxis, lag_share: float) -> float:
+    """Along the plan by half of 0.2 m, with wheels of which only a share reaches the ground."""
+    axis.begin(0.2)
+    travelled = speed = output = 0.0
+    for _ in range(120):
+        output = axis.step(0.2 - travelled, DT, speed)
+        speed += (output * lag_share - speed) * DT / LAG
+        travelled += speed * DT
+    return output
+
+
+def test_on_its_plan_it_asks_for_the_plan_and_the_servos_lag(axis: ProfiledAxis) -> None:
+    axis.begin(0.2)
+    # T a on top of the speed, and half a frame of acceleration: (1 - exp(-dt/T))^-1 = T/dt + 1/2 + ...
+    assert axis.step(0.2, DT, 0.0) == pytest.approx(A_MAX * (LAG + 0.5 * DT), rel=1e-2)
+
+
+def test_behind_the_plan_or_slower_than_it_asks_for_more(axis: ProfiledAxis, config: Config) -> None:
+    gains = config.control.gain_sets["shipped"].forward
+    outputs = []
+    for remaining, speed in ((0.2, 0.0), (0.201, 0.0), (0.2, -0.01)):
+        axis.begin(0.2)
+        outputs.append(axis.step(remaining, DT, speed))
+    assert outputs[1] - outputs[0] == pytest.approx(gains.kp * 0.001)
+    assert outputs[2] - outputs[0] == pytest.approx(gains.kd * 0.01)
+
+
+def test_it_learns_the_share_that_is_lost(axis: ProfiledAxis) -> None:
+    assert driven(axis, 1.0) == pytest.approx(V_MAX, rel=0.01)
+    # Within 1.2 s the body comes nearly up to speed; the rest is feedback.
+    assert driven(axis, 0.95) == pytest.approx(V_MAX / 0.95, rel=0.015)
+
+
+def test_the_end_counts_what_the_wheels_still_run(axis: ProfiledAxis) -> None:
+    axis.begin(0.0)
+    assert axis.is_over(0.0008, 0.0002, 0.01)  # 10 mm/s for 80 ms
+    assert not axis.is_over(0.0, 0.0002, 0.01)
+    assert axis.is_over(0.0001, 0.0002, None)
+
+
+def test_an_end_far_off_is_followed_by_another_motion(axis: ProfiledAxis) -> None:
+    axis.begin(0.0)
+    axis.renew_if_far(0.001)
+    assert axis.duration_s == 0.0
+    axis.renew_if_far(-0.02)
+    assert axis.duration_s == pytest.approx(2.0 * (0.02 / A_MAX) ** 0.5)
+    axis.renew_if_far(0.05)  # not while one is under way
+    assert axis.duration_s == pytest.approx(2.0 * (0.02 / A_MAX) ** 0.5)
+
+
+def test_trapezoid_takes_the_bang_bang_time() -> None:
+    profile = Profile.rest_to_rest(0.22, 0.1, 0.2)
+    # d/v + v/a
+    assert profile.duration_s == pytest.approx(0.22 / 0.1 + 0.1 / 0.2, abs=1e-12)
+    assert profile.at(profile.duration_s) == (0.22, 0.0)
+
+
+def test_triangle_where_there_is_no_room_to_cruise() -> None:
+    profile = Profile.rest_to_rest(-0.01, 0.1, 0.2)
+    assert profile.cruise_s == pytest.approx(0.0, abs=1e-12)
+    assert profile.duration_s == pytest.approx(2.0 * (0.01 / 0.2) ** 0.5, abs=1e-12)
+    assert profile.at(0.5 * profile.duration_s)[0] == pytest.approx(-0.005, abs=1e-12)
+
+
+def test_nothing_to_do_takes_no_time() -> None:
+    assert Profile.rest_to_rest(0.0, 0.1, 0.2).duration_s == 0.0
+
+
+@pytest.mark.parametrize(("v", "a"), [(0.0, 1.0), (1.0, 0.0), (-1.0, 1.0)])
+def test_limits_must_be_positive(v: float, a: float) -> None:
+    with pytest.raises(ValueError, match="must be positive"):
+        Profile.rest_to_rest(1.0, v, a)
+
+
+@given(st.floats(-5.0, 5.0), st.floats(0.01, 1.0), st.floats(0.05, 4.0), st.floats(0.0, 1.0), st.floats(1e-4, 0.02))
+def test_limits_hold_and_velocity_is_the_derivative(d: float, v: float, a: float, part: float, h: float) -> None:
+    profile = Profile.rest_to_rest(d, v, a)
+    t = part * profile.duration_s
+    position, speed = profile.at(t)
+    assert abs(speed) <= v * (1.0 + 1e-12)
+    assert abs(position) <= abs(d) + 1e-12
+    later = profile.at(t + h)
+    # The speed changes by at most a h within h, so the mean speed lies within a h of the speed.
+    assert abs(later[1] - speed) <= a * h + 1e-12
+    assert abs((later[0] - position) / h - speed) <= a * h + 1e-9
+
+
+def test_feed_forward_inverts_the_servo_lag() -> None:
+    lag, dt, now, after = 0.08, 0.01, 0.04, 0.042
+    set_point = lag_feed_forward(now, after, dt, lag)
+    reached = set_point + (now - set_point) * exp(-dt / lag)
+    assert reached == pytest.approx(after, abs=1e-15)
+    assert lag_feed_forward(now, after, dt, 0.0) == after
+
+
+DT_PREDICTION, LAG_PREDICTION = 0.01, 0.08
+POSE = (0.1, -0.2, 0.7)
+
+
+def rolled(commands: list[tuple[float, float]], v: float, omega: float, steps: int = 1000) -> Predicted:
+    """Fine Euler steps of the same servo and body."""
+    x, y, heading = POSE
+    for v_set, omega_set in commands:
+        h = DT_PREDICTION / steps
+        for _ in range(steps):
+            x, y, heading = x + h * v * cos(heading), y + h * v * sin(heading), heading + h * omega
+            v, omega = v + h * (v_set - v) / LAG_PREDICTION, omega + h * (omega_set - omega) / LAG_PREDICTION
+    return Predicted((x, y, heading), v, omega)
+
+
+@pytest.fixture
+def predictor() -> CommandPredictor:
+    predictor = CommandPredictor(LAG_PREDICTION, DT_PREDICTION)
+    for seq in range(1, 7):
+        predictor.sent(seq, 0.01 * seq, 0.1 * seq)
+    return predictor
+
+
+def test_without_delay_the_estimate_is_returned_unchanged(predictor: CommandPredictor) -> None:
+    assert predictor.ahead(POSE, 0.05, 0.3, 6, DT_PREDICTION, False, (0.05, 0.05)) == Predicted(POSE, 0.05, 0.3)
+
+
+def test_commands_on_the_way_act_for_a_frame_each(predictor: CommandPredictor) -> None:
+    ahead = predictor.ahead(POSE, 0.05, 0.3, 3, DT_PREDICTION, False)
+    expected = rolled([(0.04, 0.4), (0.05, 0.5), (0.06, 0.6)], 0.05, 0.3)
+    # Steps of 10 us are good to 1e-6 of the 1.5 mm and 9 mrad travelled; the midpoint rule to less.
+    assert ahead.pose == pytest.approx(expected.pose, abs=1e-6)
+    assert (ahead.v_m_s, ahead.omega_rad_s) == pytest.approx((expected.v_m_s, expected.omega_rad_s), abs=1e-4)
+
+
+def test_an_echo_younger_than_a_frame_acts_for_the_rest_of_it(predictor: CommandPredictor) -> None:
+    fresh = predictor.ahead(POSE, 0.05, 0.3, 6, 0.0, False)
+    keep = exp(-DT_PREDICTION / LAG_PREDICTION)
+    assert fresh.v_m_s == pytest.approx(0.06 - 0.01 * keep)
+    assert predictor.ahead(POSE, 0.05, 0.3, 6, 0.4 * DT_PREDICTION, False).v_m_s < fresh.v_m_s
+
+
+def test_a_repeated_echo_leaves_more_on_the_way(predictor: CommandPredictor) -> None:
+    first = predictor.ahead(POSE, 0.0, 0.0, 5, DT_PREDICTION, False)
+    predictor.sent(7, 0.07, 0.0)
+    again = predictor.ahead(POSE, 0.0, 0.0, 5, 2 * DT_PREDICTION, False)
+    assert again.v_m_s > first.v_m_s > 0.0
+
+
+def test_a_lost_echo_or_command_is_passed_over(predictor: CommandPredictor) -> None:
+    predictor.ahead(POSE, 0.0, 0.0, 2, DT_PREDICTION, False)
+    # 3 and 4 never came: what counts is that 5 is in force.
+    assert predictor.ahead(POSE, 0.05, 0.0, 5, DT_PREDICTION, False).v_m_s == pytest.approx(
+        0.06 - 0.01 * exp(-DT_PREDICTION / LAG_PREDICTION)
+    )
+
+
+def test_nothing_in_force_means_that_all_is_on_the_way() -> None:
+    predictor = CommandPredictor(LAG_PREDICTION, DT_PREDICTION)
+    predictor.sent(1, 0.1, 0.0)
+    assert predictor.ahead(POSE, 0.0, 0.0, -1, 0.5, False).v_m_s == pytest.approx(
+        0.1 * (1.0 - exp(-DT_PREDICTION / LAG_PREDICTION))
+    )
+
+
+def test_held_wheels_run_down_whatever_was_sent(predictor: CommandPredictor) -> None:
+    assert predictor.ahead(POSE, 0.0, 0.0, 2, DT_PREDICTION, True) == Predicted(POSE, 0.0, 0.0)
+    assert predictor.ahead(POSE, 0.05, 0.0, 2, DT_PREDICTION, True).v_m_s == pytest.approx(
+        0.05 * exp(-4 * DT_PREDICTION / LAG_PREDICTION)
+    )
+
+
+def test_a_restart_forgets_what_was_sent(predictor: CommandPredictor) -> None:
+    predictor.sent(1, 0.0, 0.0)
+    assert predictor.ahead(POSE, 0.0, 0.0, -1, DT_PREDICTION, False) == Predicted(POSE, 0.0, 0.0)
+    predictor.sent(2, 0.1, 0.0)
+    predictor.reset()
+    assert predictor.ahead(POSE, 0.0, 0.0, -1, DT_PREDICTION, False) == Predicted(POSE, 0.0, 0.0)
+
+
+def test_the_reach_is_bounded() -> None:
+    predictor = CommandPredictor(LAG_PREDICTION, DT_PREDICTION)
+    for seq in range(1000):
+        predictor.sent(seq, 0.1, 0.0)
+    ahead = predictor.ahead((0.0, 0.0, 0.0), 0.1, 0.0, -1, 9.0, False)
+    assert ahead.pose[0] == pytest.approx(0.1 * 0.25)  # a quarter of a second: the time-to-live of a drive
+
+
+def test_drift_carries_the_body_along(predictor: CommandPredictor) -> None:
+    still = predictor.ahead(POSE, 0.05, 0.0, 4, DT_PREDICTION, False).pose
+    carried = predictor.ahead(POSE, 0.05, 0.0, 4, DT_PREDICTION, False, (0.1, -0.2)).pose
+    travel = ((still[0] - POSE[0]) ** 2 + (still[1] - POSE[1]) ** 2) ** 0.5
+    assert carried[0] - still[0] == pytest.approx(0.1 * travel, rel=1e-3)  # the path is an arc of 10 mrad
+    assert carried[1] - still[1] == pytest.approx(-0.2 * travel, rel=1e-3)
+
+
+def test_a_servo_without_lag_follows_at_once() -> None:
+    predictor = CommandPredictor(0.0, DT_PREDICTION)
+    predictor.sent(1, 0.1, 0.0)
+    assert predictor.ahead((0.0, 0.0, 0.0), 0.0, 0.0, 0, DT_PREDICTION, False) == Predicted(
+        (0.1 * DT_PREDICTION, 0.0, 0.0), 0.1, 0.0
+    )
+
+
+def test_a_frame_takes_time() -> None:
+    with pytest.raises(ValueError, match=r"frame_s = 0\.0: the period of the frames must be positive"):
+        CommandPredictor(LAG_PREDICTION, 0.0)

@@ -1,19 +1,45 @@
 """The studies of whole missions: their cells, the figures of a cell, what they draw."""
 
 from collections.abc import Mapping
+from math import nan
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ccatp.config.load import load_config
-from ccatp.studies import filters_study, time_study
-from ccatp.studies.campaign import CampaignError, CellResult, Job, Study, cells_of, jobs_of, plain
+from ccatp.config.models import Config
+from ccatp.core import EdgeSample, Fix, ImuSample, WheelSample
+from ccatp.estimation.measurements import STATES
+from ccatp.estimation.seams import HeadingFix
+from ccatp.filters import FILTERS
+from ccatp.mirror.mirror import build_mirror
+from ccatp.sim.world import TruthRow
+from ccatp.studies import faults_study, filters_study, time_study
+from ccatp.studies.campaign import (
+    CampaignError,
+    CellResult,
+    Histogram,
+    Job,
+    JobOutcome,
+    Study,
+    cells_of,
+    jobs_of,
+    plain,
+)
 from ccatp.studies.engine import CampaignOptions, run_campaign
 from ccatp.studies.factor_studies import ABLATION, GROUPS, SENSITIVITY, sensitivity_cells
+from ccatp.studies.faults_study import FIRST_S, LONGEST_S, is_recoverable, random_plan
 from ccatp.studies.job_store import table
+from ccatp.studies.mission_study import COLUMN, chi_square_figures, combine_missions, nees, run_mission
 from ccatp.studies.registry import STUDIES, find_study
-from tests.unit.studies.missions import mission
+from ccatp.studies.sil_models import SilTrace
+from ccatp.studies.thesis_replica import LIMIT_M, ThesisLocalizer, overrides_of, run_replica
+from ccatp.studies.thesis_study import PUBLISHED, cells, combine, draw, run_job
+from ccatp.survey.composition import SurveyParts, assemble
+from tests.faults.campaign import single
+from tests.unit.studies.missions import SIGMA_M, mission, stops_of
 
 CAMPAIGNS = (filters_study.STUDY, time_study.STUDY, SENSITIVITY, ABLATION)
 
@@ -135,3 +161,340 @@ def test_every_row_of_the_registry_leads_to_a_study() -> None:
 def test_a_job_has_a_name_that_tells_it_apart() -> None:
     job = Job("filters", {"world": "hard", "filter": "ekf"}, 3, load_config(None, {}))
     assert (job.cell, job.key) == ("world=hard,filter=ekf", "world=hard,filter=ekf,seed=3")
+
+
+def test_every_error_of_every_run_counts_once() -> None:
+    values, arrays = combine_missions({}, [mission([0.012, 0.001]), mission([0.002, 0.003, 0.004])])
+    errors = values["arrival_error_mm"]
+    assert (errors["mean"], errors["p50"], errors["max"]) == pytest.approx((4.4, 3.0, 12.0))
+    assert errors["within_10mm_fraction"] == 0.8
+    later = values["arrival_error_after_first_leg_mm"]
+    assert (later["mean"], later["max"]) == pytest.approx((8.0 / 3.0, 4.0), abs=1e-4)  # rounded to 0.1 um
+    localization = values["localization_error_mm"]
+    assert (localization["mean"], localization["max"]) == pytest.approx((4.4, 12.0))
+    assert localization["within_10mm_fraction"] == 0.8
+    assert values["localization_error_after_first_leg_mm"]["max"] == pytest.approx(4.0)
+    assert values["heading_error_mrad"]["rms"] == 2.0
+    assert values["stop_error_mm"]["rms"] == pytest.approx((174.0 / 5.0) ** 0.5, abs=1e-4)
+    assert arrays["stops"][:, 0].tolist() == [0.0, 0.0, 1.0, 1.0, 1.0]  # the run
+    assert values["panels"] == {"piston_rms_um": 3.0, "tilt_rms_urad": None}
+    assert values["danger"] == {"true_edges": 0, "false_edges": 2, "falls": 0, "max_overrun_mm": 0.5}
+    assert (values["counts"], values["points"]["measured"]) == ({"fixes": 18}, 18)
+
+
+def test_a_corrected_point_arrives_once_and_is_left_where_it_was_seen_last() -> None:
+    values, _ = combine_missions({}, [mission([0.012, 0.001, 0.003], [1, 2, 1])])
+    assert values["corrections"] == 1
+    assert values["arrival_error_mm"]["max"] == 12.0
+    assert values["nis"]["count"] == 3
+    assert values["nees"]["position"]["count"] == 2
+    assert values["after_correction_mm"] == {"max": 3.0, "true_max": 3.0}
+
+
+def test_times_are_those_of_complete_missions() -> None:
+    slow = mission([0.001], mission_time_s=130.0, states_s={"driving": 130.0})
+    held = mission([0.001], outcome="held", cause="lost", mission_time_s=1.0)
+    values, _ = combine_missions({}, [mission([0.001]), slow, held])
+    assert (values["complete"], values["causes"]) == (2, ["lost"])
+    assert (values["mission_time_s"], values["mission_time_max_s"]) == (120.0, 130.0)
+    assert (values["time_ratio"], values["within_budget"]) == (1.2, 2)
+    assert values["states_s"] == {"driving": 95.0, "turning": 25.0, "settling": 2.5, "measuring": 2.0}
+
+
+def test_a_mission_that_reached_nothing_has_no_figures() -> None:
+    values, _ = combine_missions({}, [mission([], outcome="held", cause="lost")])
+    assert values["arrival_error_mm"]["mean"] is None
+    assert values["time_ratio"] is None
+    assert values["nees"]["pose"]["band_95"] is None
+    assert values["after_correction_mm"] == {"max": None, "true_max": None}
+    assert values["stop_error_mm"] == {"rms": None, "p50": None, "after_first_leg": {"rms": None, "p50": None}}
+    plain(values)
+
+
+def test_normalised_errors_are_those_of_the_covariance() -> None:
+    rows = stops_of([2.0 * SIGMA_M, 0.0])
+    rows[1, [COLUMN["error_heading_rad"], COLUMN["p_hh"]]] = 0.3, 0.01
+    assert nees(rows, 3) == pytest.approx([4.0, 9.0])
+    assert nees(rows, 2) == pytest.approx([4.0, 0.0])
+    rows[0, COLUMN["p_xx"]] = -1.0
+    assert np.isnan(nees(rows, 3)[0])
+
+
+def test_the_band_holds_the_mean_of_a_consistent_filter() -> None:
+    rng = np.random.default_rng(1)
+    means = [chi_square_figures(rng.chisquare(3, 200), 3) for _ in range(400)]
+    share = np.mean([figures["is_within_band"] for figures in means])
+    assert share == pytest.approx(0.95, abs=0.03)  # 3 sigmas of 400 draws
+    half = 1.96 * (6.0 / 200) ** 0.5  # the normal distribution that chi-square with 600 degrees of freedom nearly is
+    assert means[0]["band_95"] == pytest.approx([3.0 - half, 3.0 + half], abs=0.02)
+    assert np.mean([figures["within_95_fraction"] for figures in means]) == pytest.approx(0.95, abs=0.01)
+    assert chi_square_figures(np.full(200, 4.0), 3)["is_within_band"] is False
+
+
+def test_a_real_mission_says_the_same_as_its_summary() -> None:
+    cfg = load_config(None, {"run.mirror": "thesis-m1", "run.panels": 1, "run.filter": "ekf", "run.world": "hard"})
+    outcome = run_mission(Job("trial", {}, cfg.run.seed, cfg))
+    values, _ = combine_missions({}, [outcome])
+    # A summary is rounded to 1 um. Between its stop and the end of the measurement the fans shake the robot: by 7 um
+    # rms at either time (1 mm/s over a frame), so by 10 um between the two, of which four sigmas are allowed.
+    for name, tolerance_mm in (("localization_error_mm", 1e-3), ("arrival_error_mm", 0.04)):
+        summary = outcome.values[name]
+        assert values[name]["mean"] == pytest.approx(summary["mean"], abs=tolerance_mm)
+        assert values[name]["max"] == pytest.approx(summary["max"], abs=tolerance_mm)
+    assert values["points"] == outcome.values["points"]
+
+
+FRAMES, DELAY = 2500, 3  # more than two batches; frames by which the estimates lag behind the truth
+
+
+@pytest.fixture(scope="module")
+def parts(config: Config) -> SurveyParts:
+    run = config.run.model_copy(update={"panels": 1})
+    return assemble(config.model_copy(update={"run": run}))
+
+
+def true_row(parts: SurveyParts, seq: int) -> TruthRow:
+    x_m, y_m = parts.mirror.base_pose.x_m + 1e-5 * seq, parts.mirror.base_pose.y_m
+    return seq, 0.01 * seq, x_m, y_m, 0.0, *parts.mirror.surface_point(x_m, y_m), 1.0, 0, 0
+
+
+def book_of(parts: SurveyParts, *, with_track: bool) -> SilTrace:
+    book = SilTrace(parts, with_track=with_track)
+    for seq in range(FRAMES):
+        book.note_truth(true_row(parts, seq))
+        if seq >= DELAY:
+            book.note_estimate(seq - DELAY, 0.01 * (seq - DELAY), parts.mirror.base_panel_pose)
+    return book
+
+
+def test_late_estimates_meet_their_truth_across_batches(parts: SurveyParts) -> None:
+    book = book_of(parts, with_track=True)
+    summary = book.summary(parts.mission, 25.0, {}, {})
+    track = book.track()
+    assert track is not None
+    assert track[:, 0] == pytest.approx(0.01 * np.arange(FRAMES - DELAY))
+    base = parts.mirror.base_pose
+    assert track[:, 1] - track[:, 4] == pytest.approx(1e-5 * np.arange(FRAMES - DELAY), abs=1e-12)  # rounding
+    assert track[:, 5] == pytest.approx(base.y_m, abs=1e-12)
+    assert summary["localization_error_mm"]["max"] == pytest.approx(1e-2 * (FRAMES - DELAY - 1), rel=0.02)  # slope
+
+
+def test_the_truth_of_a_late_frame_is_at_hand(parts: SurveyParts) -> None:
+    assert book_of(parts, with_track=False).truth_at(FRAMES - 1 - DELAY) == true_row(parts, FRAMES - 1 - DELAY)
+
+
+def test_no_track_where_none_was_asked_for(parts: SurveyParts) -> None:
+    book = book_of(parts, with_track=False)
+    book.summary(parts.mission, 25.0, {}, {})
+    assert book.track() is None
+
+
+@pytest.mark.parametrize(("noise", "table"), [("normal", 0.0087), ("twice", 0.0175)])
+@pytest.mark.parametrize("noise_is_variance", [False, True])
+def test_the_table_is_read_as_sigma_or_as_variance(noise: str, table: float, noise_is_variance: bool) -> None:
+    keys = overrides_of(noise, noise_is_variance=noise_is_variance, period_error=0.0)
+    cfg = load_config(overrides=keys)
+    expected = table**0.5 if noise_is_variance else table
+    assert cfg.world.gyroscope_sigma_rad_s == pytest.approx(expected)
+    assert cfg.localizer.gyroscope_sigma_rad_s == cfg.world.gyroscope_sigma_rad_s  # R follows, thesis 2.3.1
+
+
+def test_a_long_period_keeps_one_sample_per_frame() -> None:
+    sim = load_config(overrides=overrides_of("normal", noise_is_variance=True, period_error=0.013)).sim.robot
+    assert sim.frame_hz == pytest.approx(100.0 / 1.013)
+    assert sim.frame_hz == sim.imu_hz == sim.encoder_hz
+
+
+def test_a_fixed_step_believes_in_a_shorter_way() -> None:
+    cfg = load_config(overrides=overrides_of("normal", noise_is_variance=False, period_error=0.013))
+    mirror = build_mirror(cfg.mirror)
+    start = mirror.base_panel_pose
+    filter_ = FILTERS["kf"](np.zeros(STATES), np.eye(STATES))
+    localizer = ThesisLocalizer(filter_, mirror, cfg.robot, cfg.localizer, start)
+    localizer.period_factor = 1.013
+    period_s, rate = 0.01 * 1.013, 0.1 / cfg.robot.wheel_radius_m
+    for k in range(101):
+        t_s = k * period_s
+        localizer.step(t_s, [ImuSample(t_s, 0.0, 0.0)], [WheelSample(t_s, rate, rate)], [EdgeSample(t_s, 1, 1, 1, 1)])
+    pose = localizer.pose
+    way_m = np.hypot(pose.x_m - start.x_m, pose.y_m - start.y_m)
+    # 100 steps of 10 ms at 0.1 m/s, less what the filter needs to find the speed.
+    assert way_m == pytest.approx(0.1, abs=1e-3)
+    # A fix carries the true time; the localizer's own would be earlier than its path by now.
+    x, y, z = mirror.puck_world(localizer.deck_pose, cfg.robot.puck_height_m)
+    t_s = 100 * period_s
+    localizer.fuse_fix(Fix(t_s, (x, y, z), (1e-10, 0, 0, 0, 1e-10, 0, 0, 0, 1e-10), 1.0, (1, 2, 3, 4), 0.0))
+    assert localizer.counts["fixes"] == 1
+
+
+def test_only_a_filter_with_a_fixed_step_can_have_a_period_error() -> None:
+    cfg = load_config(overrides=overrides_of("normal", noise_is_variance=False, period_error=0.0, is_ours=True))
+    with pytest.raises(ValueError, match="'ekf' reads time stamps: only kf can have a period error"):
+        run_replica(cfg, period_error=0.013)
+
+
+def test_the_cells_are_all_readings_of_both_systems() -> None:
+    factors = [cell.factors for cell in cells()]
+    assert len(factors) == 14
+    assert sum(f["system"] == "thesis" for f in factors) == 10
+    assert not any(f["period_error"] for f in factors if f["system"] == "ours")
+    for cell in cells():
+        load_config(overrides=cell.overrides)
+
+
+def outcome(fraction: float, mean: float) -> JobOutcome:
+    figures = {"within_10mm_fraction": fraction, "mean": mean, "max": 20.0}
+    values = {"outcome": "complete", "cause": "", "waypoints": 36, "wanted": 36, "time_s": 500.0}
+    localization = Histogram.of(np.linspace(0.0, 0.02, 100), LIMIT_M).to_arrays("localization")
+    track = np.tile(np.linspace(0.0, 1.0, 20, dtype=np.float32)[:, None], 5)
+    arrays: dict[str, np.ndarray] = {"waypoint_m": np.linspace(0.0, 0.02, 36), "track": track, **localization}
+    return JobOutcome({**values, "localization": figures, "waypoint": figures}, arrays)
+
+
+def test_a_published_figure_is_measured_in_scatters_of_a_run() -> None:
+    values, _ = combine({"noise": "normal"}, [outcome(0.9, 3.0), outcome(1.0, 4.0)])
+    found = values["localization"]["within_10mm_fraction"]
+    assert found["mean"] == pytest.approx(0.95)
+    assert found["run_to_run"] == pytest.approx(0.1 / 2.0**0.5)
+    # One run there, two here.
+    assert found["published_minus_mean_in_scatters"] == pytest.approx(0.0121 / (0.1 / 2.0**0.5 * 1.5**0.5))
+    assert found["is_published_within"] is True
+    assert values["waypoint"]["mean"]["is_published_within"] is False  # 6.4 mm, 3.5 and 0.7
+    assert values["waypoint"]["max"]["is_published_within"] is None  # the largest of five runs is no mean
+    assert values["localization"]["is_published_within"] is False  # share and mean are, the largest is not
+    assert values["complete"] == 2
+
+
+def test_runs_that_agree_leave_no_room_for_another_figure() -> None:
+    values, _ = combine({"noise": "normal"}, [outcome(1.0, 3.4), outcome(1.0, 3.4)])
+    assert values["localization"]["within_10mm_fraction"]["is_published_within"] is False
+    assert values["localization"]["mean"]["is_published_within"] is True
+
+
+def test_one_run_has_no_scatter() -> None:
+    values, _ = combine({"noise": "twice"}, [outcome(0.9, 3.0)])
+    assert values["localization"]["mean"]["is_published_within"] is None
+    assert values["localization"]["is_published_within"] is None
+
+
+def test_a_run_that_went_nowhere_counts_as_not_complete() -> None:
+    lost = outcome(nan, nan)
+    lost.values["waypoints"] = 3  # type: ignore[index]  # the test's own dict
+    assert combine({"noise": "normal"}, [lost, outcome(0.9, 3.0)]).values["complete"] == 1
+
+
+def test_every_figure_of_the_thesis_is_drawn(tmp_path: Path) -> None:
+    results = []
+    for cell in cells():
+        values, arrays = combine(cell.factors, [outcome(0.9, 3.0), outcome(1.0, 4.0)])
+        results.append(CellResult(cell.factors, values, arrays))
+    draw(results, tmp_path)
+    stems = ("trajectory", "localization", "waypoints")
+    assert {path.name for path in tmp_path.glob("*.png")} == {f"{s}_{noise}.png" for s in stems for noise in PUBLISHED}
+
+
+def test_a_seam_replaces_the_heading(monkeypatch: pytest.MonkeyPatch) -> None:
+    cfg = load_config(overrides=overrides_of("normal", noise_is_variance=False, period_error=0.0))
+    mirror = build_mirror(cfg.mirror)
+    filter_ = FILTERS["kf"](np.zeros(STATES), np.eye(STATES))
+    localizer = ThesisLocalizer(filter_, mirror, cfg.robot, cfg.localizer, mirror.base_panel_pose)
+    localizer.step(0.0, [ImuSample(0.0, 0.0, 0.0)], [WheelSample(0.0, 0.0, 0.0)], [EdgeSample(0.0, 1, 1, 1, 1)])
+    before_rad = localizer.pose.heading_rad
+    monkeypatch.setattr(localizer._crossings, "scan", lambda *_: ["a transition"])
+    monkeypatch.setattr(localizer._crossings, "headings", lambda *_: [HeadingFix(0.3, 1e-6)])
+    localizer.step(0.01, [ImuSample(0.01, 0.0, 0.0)], [WheelSample(0.01, 0.0, 0.0)], [EdgeSample(0.01, 1, 1, 1, 1)])
+    # Thirty sigmas of the start heading: the daemon's localizer would not believe it.
+    assert localizer.pose.heading_rad - before_rad == pytest.approx(0.3, abs=1e-3)
+    assert localizer.heading_sigma_rad == pytest.approx(1e-3)
+
+
+@pytest.mark.slow
+def test_a_whole_run_reaches_all_waypoints() -> None:
+    keys = overrides_of("normal", noise_is_variance=False, period_error=0.0)
+    cfg = load_config(overrides={**keys, "run.seed": 1})
+    found = run_job(Job("thesis", {"period_error": 0.0}, 1, cfg))
+    assert (found.values["outcome"], found.values["waypoints"]) == ("complete", 36)
+    assert found.values["localization"]["mean"] < 1.0  # a quiet world: white noise of the table, no disturbance
+
+
+DANGER = {"true_edges": 0, "false_edges": 1, "falls": 0, "max_overrun_mm": 2.0}
+
+
+def faults_study_outcome(seed: int, how: str, **changes: Any) -> JobOutcome:
+    values = {
+        "seed": seed,
+        "outcome": how,
+        "cause": "" if how == "complete" else "held",
+        "injected": {"planned": 12, "acted": 11},
+        "is_recoverable": how == "complete",
+        "weak_frames": 0,
+        "points": {"measured": 9, "total": 9},
+        "danger": DANGER,
+        "mission_time_s": 110.0,
+        "lower_bound_s": 100.0,
+        "within_budget": True,
+        "states_s": {"driving": 60.0},
+    }
+    return JobOutcome(values | changes, {})
+
+
+def run(faults: str, seed: int = 5) -> Mapping[str, Any]:
+    keys = {"run.mirror": "fyst-m2", "run.panels": 1, "run.seed": seed, **faults_study.STUDY.defaults}
+    return faults_study.run_job(Job("faults", {"faults": faults}, seed, load_config(None, keys))).values
+
+
+def test_a_plan_lies_within_its_mission_and_is_of_its_seed() -> None:
+    plan = random_plan(7, 40, 500.0)
+    assert plan == random_plan(7, 40, 500.0) != random_plan(8, 40, 500.0)
+    assert len(plan.faults) == 40
+    assert all(FIRST_S <= fault.at_s <= 500.0 and fault.end_s - fault.at_s <= LONGEST_S for fault in plan.faults)
+    assert max(fault.at_s for fault in plan.faults) > 400.0
+
+
+@pytest.mark.parametrize("faults", [faults_study.NONE, faults_study.RANDOM])
+def test_a_real_job(faults: str) -> None:
+    values = run(faults)
+    assert values["outcome"] == "complete", values["cause"]
+    assert values["points"]["measured"] == values["points"]["total"] == 9
+    assert (values["danger"]["falls"], values["weak_frames"]) == (0, 0)
+    planned = faults_study.FAULTS_PER_MISSION if faults == faults_study.RANDOM else 0
+    assert values["injected"]["planned"] == planned
+    assert planned / 2 <= values["injected"]["acted"] <= planned
+
+
+def test_fans_that_seem_to_fail_on_an_overhang_wait_for_an_operator() -> None:
+    fans, other = (
+        single('signal = "fans"\ntype = "off"\nat_s = 5.0'),
+        single('signal = "soc"\ntype = "off"\nat_s = 5.0'),
+    )
+    upright, overhanging = (
+        build_mirror(load_config(None, {"run.mirror": name}).mirror) for name in ("fyst-m1", "fyst-m2")
+    )
+    assert not is_recoverable(fans, overhanging)
+    assert is_recoverable(fans, upright)
+    assert is_recoverable(other, overhanging)
+
+
+def test_fans_below_their_floor_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ccatp.sim.rules.FanRules.thrust", 0.0)
+    monkeypatch.setattr("ccatp.sim.world.World._fall", lambda self: None)
+    assert run(faults_study.RANDOM)["weak_frames"] > 1000
+
+
+def test_a_cell_says_who_was_not_completed_and_is_drawn(tmp_path: Path) -> None:
+    results = []
+    for cell in cells_of(faults_study.STUDY):
+        runs = [faults_study_outcome(1, "complete"), faults_study_outcome(2, "stopped", weak_frames=4)]
+        values, arrays = faults_study.STUDY.combine(cell.factors, runs)
+        results.append(CellResult(cell.factors, {"runs": 2, **values}, arrays))
+    first = results[0].values
+    assert (first["complete"], first["ended"]) == (1, ["seed 2 stopped: held"])
+    assert first["recoverable"] == {"runs": 1, "complete": 1}
+    assert (first["danger"]["false_edges"], first["weak_frames"]) == (2, 4)
+    assert (first["injected"]["acted"], first["points"]["total"], first["time_ratio"]) == (22, 18, 1.1)
+    lines = table([plain({**cell.factors, **cell.values}) for cell in results], faults_study.COLUMNS).splitlines()
+    assert len(lines) == 2 + 8
+    assert lines[3].startswith("| thesis-m1 | random | 2 | 1 |")
+    assert "seed 2 stopped: held" in lines[3]
+    faults_study.STUDY.draw(results, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"faults.png", "faults.pdf"}

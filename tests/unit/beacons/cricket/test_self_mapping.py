@@ -1,0 +1,310 @@
+"""Phase 2: the filter against the batch, repeats that teach nothing new, what is known, the stop, refusals."""
+
+import numpy as np
+import pytest
+
+from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
+from ccatp.beacons.cricket.range_network import (
+    Air,
+    BadRange,
+    Disconnected,
+    MappingError,
+    MoteRange,
+    MoteUnderdetermined,
+    PairMeans,
+    RigidBody,
+    TdoaError,
+    UnknownMote,
+    build_network,
+    graph_pairs,
+    list_names,
+    range_from_delay,
+    range_sigma,
+    sound_speed,
+)
+from ccatp.beacons.cricket.self_mapping import (
+    MapperSettings,
+    MoteMapper,
+    complete_stands,
+    conditioned,
+    loose_plan,
+    network_plan,
+    printed_prior,
+    run_phase_two,
+)
+from ccatp.config.load import load_radio_config
+from ccatp.errors import ExitStatus
+from ccatp.sim.motes import true_motes
+from tests.unit.beacons.cricket.fields import ADJACENT, ALL, HEADS, SIGMA_M, ZIGZAG, FloatArray, Pairs, network_of
+
+POOLED = MapperSettings(linearisations=10, pools=True, gate_probability=1.0, target_rms_m=0.0)
+PRINTED = MapperSettings(linearisations=1, pools=False, gate_probability=1.0, target_rms_m=0.0)
+KNOWN = np.full((6, 2), np.nan)
+KNOWN[0], KNOWN[1, 1] = HEADS[0], HEADS[1, 1]
+
+
+def readings(pairs: Pairs, times: int, rng: np.random.Generator | None) -> list[tuple[int, int, float, float]]:
+    found = []
+    for _ in range(times):
+        for i, j in pairs:
+            noise_m = 0.0 if rng is None else float(rng.normal(0.0, SIGMA_M))
+            found.append((i, j, float(np.linalg.norm(HEADS[i] - HEADS[j])) + noise_m, SIGMA_M))
+    return found
+
+
+def mapper(start: FloatArray, settings: MapperSettings = POOLED, sigma_m: float = 0.2) -> MoteMapper:
+    return MoteMapper(start, np.eye(12) * sigma_m**2, settings, KNOWN)
+
+
+def test_the_filter_ends_where_the_batch_does() -> None:
+    rng = np.random.default_rng(1)
+    rows = readings(ALL, 4, rng)
+    start = HEADS + rng.normal(0.0, 0.1, HEADS.shape)
+    filtered = mapper(start, sigma_m=10.0)  # so wide that it counts for nothing
+    run_phase_two(filtered, rows, 0.0)
+    network = network_of(HEADS, [row[:2] for row in rows], known_m=KNOWN)
+    network.ranges_m[:] = [row[2] for row in rows]
+    model = MapModel(network)
+    batch = fit_map(model, model.state(start), MapFitSettings())
+    assert filtered.positions_m == pytest.approx(batch.state.positions_m, abs=1e-5)  # of the wide prior
+
+
+def test_the_order_of_pairs_does_not_matter() -> None:
+    rng = np.random.default_rng(2)
+    rows = readings(ADJACENT, 3, rng)
+    one, other = mapper(HEADS + 0.05), mapper(HEADS + 0.05)
+    run_phase_two(one, rows, 0.0)
+    run_phase_two(other, [rows[at] for at in rng.permutation(len(rows))], 0.0)
+    assert one.positions_m == pytest.approx(other.positions_m, abs=1e-6)
+    assert one.covariance_m2 == pytest.approx(other.covariance_m2, rel=1e-4, abs=1e-12)
+
+
+def test_repeats_of_few_pairs_teach_their_lengths_alone() -> None:
+    """Five pairs see five of nine directions; a filter that linearises each anew believes in all nine."""
+    rng = np.random.default_rng(3)
+    start = HEADS + rng.normal(0.0, 0.2, HEADS.shape)
+    pooled, printed = mapper(start), mapper(start, PRINTED)
+    for one in (pooled, printed):
+        run_phase_two(one, readings(ZIGZAG, 60, rng), 0.0)
+    free = np.linalg.eigvalsh(pooled.covariance_m2)[-4:]
+    assert np.sqrt(free) == pytest.approx(np.full(4, 0.2), rel=1e-6)  # the prior, untouched in the other four
+    assert np.sqrt(np.linalg.eigvalsh(printed.covariance_m2)[-4:]).min() < 0.15
+
+
+def test_what_is_known_stays() -> None:
+    one = mapper(HEADS + 0.3)
+    run_phase_two(one, readings(ALL, 5, np.random.default_rng(4)), 0.0)
+    assert one.positions_m[0].tolist() == HEADS[0].tolist()
+    assert one.positions_m[1, 1] == HEADS[1, 1]
+    assert one.covariance_m2[:2].any() == one.covariance_m2[3].any() == False  # noqa: E712
+
+
+def test_knowing_moves_what_hangs_together() -> None:
+    covariance = np.array([[4.0, 3.0], [3.0, 4.0]])
+    mean, after = conditioned(np.zeros(2), covariance, np.array([1.0, np.nan]))
+    assert mean == pytest.approx([1.0, 0.75])
+    assert after == pytest.approx(np.array([[0.0, 0.0], [0.0, 4.0 - 9.0 / 4.0]]))
+
+
+def test_phase_two_stops_at_the_target() -> None:
+    one = mapper(HEADS + 0.02)
+    went = run_phase_two(one, readings(ALL, 40, np.random.default_rng(5)), 0.004)
+    assert went.reached
+    assert went.expected_rms_m[-1] <= 0.004 < went.expected_rms_m[-2]
+    assert len(went.nis) == len(went.positions_m) - 1 < 600
+    again = run_phase_two(mapper(HEADS), readings(ZIGZAG, 4, None), 0.004)
+    assert not again.reached
+
+
+def test_a_range_out_of_all_proportion_is_refused() -> None:
+    gated = POOLED._replace(gate_probability=0.9999)
+    one = mapper(HEADS, gated, sigma_m=0.05)
+    learned = one.observe(0, 5, 12.0, SIGMA_M)
+    assert not learned.accepted
+    assert one.positions_m == pytest.approx(HEADS)
+    assert one.observe(0, 5, float(np.linalg.norm(HEADS[5] - HEADS[0])), SIGMA_M).accepted
+
+
+def test_offset_and_scale_are_found_among_known_motes() -> None:
+    settings = POOLED._replace(offset_sigma_m=0.5, scale_sigma=0.05)
+    one = MoteMapper(HEADS, np.zeros((12, 12)), settings, HEADS)
+    for i, j, range_m, sigma_m in readings(ALL, 1, None):
+        one.observe(i, j, 1.02 * range_m + 0.1, sigma_m)
+    assert one.offset_m == pytest.approx(0.1, abs=1e-3)
+    assert one.scale == pytest.approx(0.02, abs=1e-4)
+
+
+def test_consistency_over_runs() -> None:
+    """NEES of nine coordinates over 60 runs: mean 9, of standard deviation sqrt(18 / 60)."""
+    rng, nees, nis = np.random.default_rng(6), [], []
+    free = np.isnan(KNOWN.ravel())
+    for _ in range(60):
+        start = HEADS + np.where(np.isnan(KNOWN), rng.normal(0.0, 0.1, HEADS.shape), 0.0)
+        one = mapper(start, sigma_m=0.1)
+        went = run_phase_two(one, readings(ADJACENT, 2, rng), 0.0)
+        error = (one.positions_m - HEADS).ravel()[free]
+        nees.append(error @ np.linalg.solve(one.covariance_m2[np.ix_(free, free)], error))
+        nis.append(went.nis.mean())
+    assert np.mean(nees) == pytest.approx(9.0, abs=1.65)  # three standard deviations
+    assert np.mean(nis) == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_printed_prior() -> None:
+    prior = printed_prior(6, 2, [0, 1, 3], 99.0)
+    assert prior.diagonal().tolist() == [0.0, 0.0, 99.0, 0.0, *[99.0] * 8]
+    assert np.count_nonzero(prior) == 9
+
+
+def test_refusals() -> None:
+    with pytest.raises(MappingError, match=r"covariance of shape \(3, 3\) for 6 motes in 2 dimensions"):
+        MoteMapper(HEADS, np.eye(3), POOLED)
+    with pytest.raises(MappingError, match="a mote has no place to begin with"):
+        MoteMapper(KNOWN, np.eye(12), POOLED)
+    one = MoteMapper(np.zeros((2, 2)), np.eye(4), POOLED)
+    with pytest.raises(MappingError, match="motes 0 and 1 stand in one place"):
+        one.observe(0, 1, 1.0, 0.1)
+
+
+CFG = load_radio_config(None, {"system": "cricket"}).cricket
+PLAN = network_plan(CFG)
+TRUE_M = true_motes(CFG, np.random.default_rng(0)).positions_m
+
+
+def test_the_plan_of_the_paper() -> None:
+    assert len(PLAN.names) == 20
+    assert PLAN.names[:4] == ("A", "B", "N1-1", "N1-2")
+    assert [PLAN.names[mote] for mote in PLAN.heads] == [f"N{number}-1" for number in range(1, 7)]
+    # A to B, both to three motes, 45 between stands
+    assert len(PLAN.phase1_pairs) == 1 + 6 + 45
+    assert np.isfinite(PLAN.surveyed_m).sum() == 3
+    assert PLAN.mapped == tuple(range(2, 20))
+
+
+def test_loose_motes_are_all_asked() -> None:
+    plan = loose_plan(CFG, ("a", "b", "c"))
+    assert plan.phase1_pairs == plan.phase2_pairs == ((0, 1), (0, 2), (1, 2))
+    assert plan.heads == plan.anchors == ()
+
+
+def test_exact_heads_and_turns_give_all_motes() -> None:
+    heads = list(PLAN.heads)
+    whole = complete_stands(PLAN, TRUE_M, np.zeros((40, 40)), TRUE_M[heads], np.zeros((12, 12)))
+    assert whole.positions_m == pytest.approx(TRUE_M[list(whole.motes)])
+    assert not whole.covariance_m2.any()
+
+
+def test_errors_of_a_stands_turn_reach_its_other_motes() -> None:
+    rng, sigma_m, found = np.random.default_rng(1), 0.01, []
+    heads, covariance = list(PLAN.heads), np.zeros((36, 36))
+    for _ in range(400):
+        first_m = TRUE_M + rng.normal(0.0, sigma_m, TRUE_M.shape)
+        heads_m = TRUE_M[heads] + rng.normal(0.0, 0.002, (6, 2))
+        whole = complete_stands(PLAN, first_m, np.eye(40) * sigma_m**2, heads_m, np.eye(12) * 0.002**2)
+        found.append((whole.positions_m - TRUE_M[list(whole.motes)]).ravel())
+        covariance = whole.covariance_m2
+    sample = np.cov(np.array(found).T)
+    # 400 runs: a standard deviation is known to 4 %
+    assert np.sqrt(sample.diagonal()) == pytest.approx(np.sqrt(covariance.diagonal()), rel=0.15)
+    assert np.sqrt(covariance[0, 0]) == pytest.approx(0.002)
+    assert np.sqrt(covariance[2:6, 2:6].trace()) > 2.0 * 0.002
+
+
+AIR = Air(344.0, 20.0)
+
+
+def test_the_printed_example() -> None:
+    assert range_from_delay(AIR, 0.006, 20.0) == pytest.approx(2.064, abs=1e-12)
+
+
+def test_sound_is_faster_in_warm_air() -> None:
+    # an ideal gas gains 0.6 m/s a kelvin at room temperature; c(0 C) = 344 sqrt(273.15 / 293.15)
+    assert sound_speed(AIR, 21.0) - sound_speed(AIR, 20.0) == pytest.approx(0.587, abs=1e-3)
+    assert sound_speed(AIR, 0.0) == pytest.approx(332.06, abs=0.01)
+
+
+def test_repeats_lessen_noise_but_not_the_thermometer() -> None:
+    assert range_sigma(0.006, 5.0, 0.0, 20.0, 9) == pytest.approx(0.002)
+    # one kelvin of 293.15: half a part in 293 of 5 m, however often it is repeated
+    assert range_sigma(0.006, 5.0, 1.0, 20.0, 10**9) == pytest.approx(5.0 / (2.0 * 293.15), rel=1e-4)
+
+
+@pytest.mark.parametrize("delay_s", [-1e-6, float("inf"), float("nan")])
+def test_impossible_delays(delay_s: float) -> None:
+    with pytest.raises(TdoaError, match="cannot arrive before the message"):
+        range_from_delay(AIR, delay_s, 20.0)
+
+
+def test_a_broken_thermometer() -> None:
+    with pytest.raises(TdoaError, match="temperature of 851 C is outside"):
+        sound_speed(AIR, 851.0)
+
+
+def row(first: str, second: str, range_m: float = 1.0, sigma_m: float = 0.01) -> MoteRange:
+    return MoteRange(first, second, range_m, sigma_m)
+
+
+def test_motes_come_as_they_are_named() -> None:
+    network = build_network([row("B", "A"), row("A", "C")], 2)
+    assert network.names == ("B", "A", "C")
+    assert network.first.tolist() == [0, 1]
+    assert network.loose == (0, 1, 2)
+
+
+def test_a_mote_that_is_none() -> None:
+    with pytest.raises(UnknownMote, match="range A to X: no mote 'X'; there are A, B") as caught:
+        build_network([row("A", "X")], 2, ["A", "B"])
+    assert caught.value.exit_status == ExitStatus.USAGE
+
+
+@pytest.mark.parametrize(
+    ("bad", "what"),
+    [
+        (row("A", "B", -0.1), r"A to B: -0.1 m is no distance"),
+        (row("A", "B", float("nan")), "nan m is no distance"),
+        (row("A", "B", 1.0, 0.0), "sigma of 0 m, must be positive"),
+        (row("A", "A"), "from a mote to itself"),
+    ],
+)
+def test_ranges_that_none_can_be(bad: MoteRange, what: str) -> None:
+    with pytest.raises(BadRange, match=what):
+        build_network([bad], 2)
+
+
+def test_nothing_to_map() -> None:
+    with pytest.raises(MoteUnderdetermined, match="0 ranges among 0 motes"):
+        build_network([], 2)
+
+
+def test_a_graph_in_two_parts() -> None:
+    with pytest.raises(Disconnected, match="into 2 parts with no range between them: C, D on one side"):
+        build_network([row("A", "B"), row("A", "E"), row("C", "D")], 2)
+
+
+def test_a_body_joins_its_motes() -> None:
+    body = RigidBody("stand", (1, 2), np.array([[0.0, 0.0], [0.3, 0.4]]))
+    network = build_network([row("A", "B"), row("C", "D")], 2, ["A", "B", "C", "D"], [body])
+    assert graph_pairs(network).tolist() == [[0, 1], [1, 2], [2, 3]]
+    assert network.loose == (0, 3)
+
+
+def test_parts_that_hang_on_known_places_are_no_error() -> None:
+    known = np.array([[0.0, 0.0], [1.0, 0.0], [np.nan, np.nan], [0.0, 5.0], [1.0, 5.0], [np.nan, np.nan]])
+    rows = [row("a", "c"), row("b", "c"), row("d", "f")]
+    assert build_network(rows, 2, list("abcdef"), (), known).count == 6
+    known[3] = np.nan
+    with pytest.raises(Disconnected, match="into 2 parts"):
+        build_network(rows, 2, list("abcdef"), (), known)
+
+
+def test_means_of_pairs_weigh_by_variance() -> None:
+    means = PairMeans(build_network([row("A", "B", 1.0, 0.1), row("B", "A", 2.0, 0.2), row("B", "C")], 2))
+    found = means.between(1, 0)
+    assert found is not None
+    assert found == pytest.approx((1.2, np.sqrt(1.0 / 125.0)))
+    assert means.between(0, 2) is None
+    assert means.partners(1) == [0, 2]
+    assert not means.are_all_linked([0, 1, 2])
+
+
+def test_long_lists_are_cut() -> None:
+    assert list_names([str(number) for number in range(9)]) == "0, 1, 2, 3, 4, 5 and 3 more"

@@ -1,0 +1,187 @@
+"""Root mean squares and consistency against what can be worked out by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ccatp.beacons.slam.evaluation import judge, truth_at
+from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, ReferencePath
+from ccatp.filters.metrics import (
+    RigidMotion,
+    aligned_rms_m,
+    best_motion,
+    consistency,
+    nees,
+    rigid_modes,
+    rms,
+    rms_m,
+    wrapped,
+)
+from tests.unit.beacons.datasets.sets import BEACONS, recorded, world
+
+
+def test_root_mean_square_leaves_out_what_is_not_finite() -> None:
+    assert rms(np.array([3.0, np.nan, -4.0])) == pytest.approx(np.sqrt(12.5))
+    assert rms(np.array([np.nan])) is None
+    assert wrapped(np.array([3.5, -3.5])) == pytest.approx([3.5 - 2 * np.pi, 2 * np.pi - 3.5])
+
+
+def test_squares_of_gaussian_errors_lie_in_the_band_and_others_do_not() -> None:
+    rng = np.random.default_rng(4)
+    P = np.array(((2.0, 0.3), (0.3, 0.5)))
+    errors = rng.multivariate_normal((0.0, 0.0), P, size=500)
+    squares = nees(errors, np.broadcast_to(P, (500, 2, 2)))
+    honest = consistency(squares, np.full(500, 2.0))
+    assert honest is not None
+    assert honest.low < honest.mean < honest.high
+    assert (honest.low, honest.high) == pytest.approx((0.914, 1.090), abs=0.002)  # tables of chi-squared, 1000 degrees
+    proud = consistency(squares * 1.5, np.full(500, 2.0))
+    assert proud is not None
+    assert proud.mean > proud.high
+    assert consistency(np.empty(0), np.empty(0)) is None
+
+
+def test_truth_is_unknown_outside_and_in_its_gaps() -> None:
+    t = np.array([0.0, 0.4, 2.0, 2.4, 2.8])
+    found = truth_at(ReferencePath(t, t, -t, 2.0 * t), np.array([-0.1, 0.2, 1.0, 2.2, 2.9]))
+    assert np.isnan(found[[0, 2, 4]]).all()
+    assert found[[1, 3]] == pytest.approx(np.array([(0.2, -0.2, 0.4), (2.2, -2.2, 4.4)]))
+    slow = np.array([0.0, 1.0, 2.0, 3.0, 9.0])  # a reference of a hertz is no gap
+    assert np.isfinite(truth_at(ReferencePath(slow, slow, slow, slow), np.array([0.5, 5.0]))[:, 0]).tolist() == [
+        True,
+        False,
+    ]
+
+
+AWAY = RigidMotion(np.array(((np.cos(1.0), -np.sin(1.0)), (np.sin(1.0), np.cos(1.0)))), np.array((5.0, -3.0)))
+
+
+def track_of(turned: RigidMotion, *, beacons: bool = True) -> EstimatedPath:
+    """The truth of a simulated run, moved rigidly, with a beacon 0.3 m off."""
+    w = world(seconds=20.0)
+    places = turned.moved(np.array(list(BEACONS.values())) + np.array([[0.3, 0.0], [0, 0], [0, 0], [0, 0]]))
+    poses = np.column_stack([turned.moved(w.poses[:, :2]), w.poses[:, 2] + turned.angle_rad])
+    return EstimatedPath(
+        times_s=w.times_s,
+        poses=poses,
+        covariances=np.broadcast_to(np.eye(3), (len(poses), 3, 3)),
+        beacons={n: BeaconFix(x, y, np.eye(2)) for n, (x, y) in zip(BEACONS, places.tolist(), strict=True)}
+        if beacons
+        else {},
+        calibration={},
+        nis=np.empty(0),
+        nis_sizes=np.empty(0),
+        refused=0,
+        update_s=np.empty(0),
+        predict_s=np.empty(0),
+        scalar_s=np.empty(0),
+        updates=0,
+        warnings=(),
+    )
+
+
+def test_a_track_is_judged_after_one_rigid_alignment() -> None:
+    judged = judge(track_of(AWAY), recorded(world(seconds=20.0)))
+    assert judged.trajectory_rmse_m == pytest.approx(0.0, abs=1e-9)
+    assert judged.heading_rmse_rad == pytest.approx(0.0, abs=1e-9)
+    assert judged.beacon_rmse_m == pytest.approx(0.15)  # sqrt(0.3^2 / 4)
+    assert judged.beacon_errors_m == pytest.approx({"6": 0.3, "7": 0.0, "8": 0.0, "9": 0.0}, abs=1e-9)
+    assert judged.nees is not None
+    assert judged.nees.mean > 1.0  # the poses as they are, not aligned
+    assert judged.nis is None
+
+
+def test_without_a_true_path_the_beacons_are_aligned_themselves() -> None:
+    run = replace(recorded(world(seconds=20.0)), truth=None)
+    judged = judge(track_of(AWAY), run)
+    assert judged.trajectory_rmse_m is None
+    assert judged.heading_rmse_rad is None
+    assert judged.nees is None
+    assert judged.beacon_rmse_m is not None
+    assert 0.0 < judged.beacon_rmse_m < 0.15
+    two = {name: BEACONS[name] for name in ("6", "7")}
+    assert judge(track_of(AWAY), replace(run, beacon_truth_m=two)).beacon_rmse_m is None
+    none = judge(track_of(RigidMotion(np.eye(2), np.zeros(2)), beacons=False), run)
+    assert none.beacon_rmse_m is None
+
+
+RNG = np.random.default_rng(3)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_motion_comes_back(dimension: int) -> None:
+    points = RNG.normal(size=(7, dimension))
+    turn = Rotation.from_rotvec([0.0, 0.0, 1.1] if dimension == 2 else [0.3, -0.5, 1.1]).as_matrix()
+    turn, shift = turn[:dimension, :dimension], np.arange(1.0, dimension + 1.0)
+    found = best_motion(points, points @ turn.T + shift)
+    assert found.rotation == pytest.approx(turn)
+    assert found.translation_m == pytest.approx(shift)
+
+
+def test_a_mirror_image_is_another_map_unless_told() -> None:
+    points = RNG.normal(size=(8, 2))
+    mirrored = points * (1.0, -1.0)
+    assert aligned_rms_m(mirrored, points) > 0.3
+    assert np.linalg.det(best_motion(mirrored, points).rotation) == pytest.approx(1.0)
+    assert aligned_rms_m(mirrored, points, mirrors=True) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_no_other_motion_is_better() -> None:
+    source, target = RNG.normal(size=(9, 2)), RNG.normal(size=(9, 2))
+    best = rms_m(best_motion(source, target).moved(source), target)
+    for angle in np.linspace(0.0, 2.0 * np.pi, 90):
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        turned = (source - source.mean(axis=0)) @ turn.T + target.mean(axis=0)
+        assert rms_m(turned, target) >= best - 1e-12
+
+
+def test_alignment_is_that_of_scipy_and_neither_scales_nor_reflects() -> None:
+    rng = np.random.default_rng(2)
+    p = rng.normal(size=(40, 2))
+    q = 1.5 * p * (1.0, -1.0) + rng.normal(scale=0.3, size=(40, 2))  # scaled, mirrored, noisy
+    found = best_motion(p, q)
+    planar = [np.column_stack([x - x.mean(axis=0), np.zeros(40)]) for x in (p, q)]
+    angles = np.linspace(-np.pi, np.pi, 20001)
+    misfits = [((Rotation.from_euler("z", a).apply(planar[0]) - planar[1]) ** 2).sum() for a in angles]
+    assert found.angle_rad == pytest.approx(angles[int(np.argmin(misfits))], abs=4e-4)
+    moved = found.moved(p)
+    assert np.ptp(moved, axis=0) != pytest.approx(np.ptp(q, axis=0), rel=0.1)
+    assert moved.mean(axis=0) == pytest.approx(q.mean(axis=0))
+
+
+def test_covariances_turn_with_the_points() -> None:
+    rng = np.random.default_rng(3)
+    points = rng.multivariate_normal((0.0, 0.0), ((4.0, 1.0), (1.0, 0.5)), size=200)
+    motion = RigidMotion(Rotation.from_euler("z", 0.7).as_matrix()[:2, :2], np.array((1.0, 2.0)))
+    assert motion.angle_rad == pytest.approx(0.7)
+    assert motion.turned(np.cov(points.T)) == pytest.approx(np.cov(motion.moved(points).T))
+    maps = rng.normal(size=(40, 3, 2))  # of three points each
+    together = np.cov(np.array([motion.moved(one).ravel() for one in maps]).T)
+    assert motion.turned_map(np.cov(maps.reshape(40, 6).T)) == pytest.approx(together)
+
+
+def test_a_single_point_fixes_no_turn() -> None:
+    found = best_motion(np.array([[1.0, 2.0]]), np.array([[4.0, 1.0]]))
+    assert found.rotation == pytest.approx(np.eye(2))
+    assert found.translation_m == pytest.approx([3.0, -1.0])
+
+
+def test_weights_move_the_fit_to_the_heavy_points() -> None:
+    source, target = RNG.normal(size=(5, 2)), RNG.normal(size=(5, 2))
+    weights = np.array([1e9, 1.0, 1.0, 1.0, 1.0])
+    moved = best_motion(source, target, weights=weights).moved(source)
+    assert moved[0] == pytest.approx(target[0], abs=1e-6)
+
+
+@pytest.mark.parametrize(("dimension", "count"), [(2, 3), (3, 6)])
+def test_modes_keep_all_distances(dimension: int, count: int) -> None:
+    points = RNG.normal(size=(6, dimension))
+    modes = rigid_modes(points)
+    assert modes.shape == (6 * dimension, count)
+    assert modes.T @ modes == pytest.approx(np.eye(count), abs=1e-12)
+    for mode in modes.T:
+        rates = mode.reshape(6, dimension)
+        ways, speeds = points[:, None] - points[None], rates[:, None] - rates[None]
+        assert np.abs(np.einsum("ijk,ijk->ij", ways, speeds)).max() < 1e-12

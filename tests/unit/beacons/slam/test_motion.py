@@ -1,0 +1,278 @@
+"""Motion models: Jacobians against differences, noise that adds up, calibration, rest."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import cos, pi, radians, sin
+from time import perf_counter
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from ccatp.beacons.datasets.checks import suspicions
+from ccatp.beacons.slam.causal import filter_run
+from ccatp.beacons.slam.evaluation import judge
+from ccatp.beacons.slam.motion import (
+    Ackermann,
+    AckermannNoise,
+    DifferentialDrive,
+    DifferentialNoise,
+    Increment,
+    Steering,
+)
+from ccatp.beacons.slam.recording import EstimatedPath, Readings, RecordedRun, ReferencePath
+from ccatp.beacons.slam.reflector import ReflectorScan, ScanResult
+from ccatp.beacons.slam.settings import slam_settings
+from ccatp.config.load import load_recordings_config
+from ccatp.core import FloatArray, wrap_pi
+from ccatp.sim.radio import Packet
+from tests.unit.beacons.datasets.sets import recorded, world
+
+NOISE = DifferentialNoise(0.05, 0.03, 0.01, 0.05, 0.002, 0.02, 0.02, 1e-4, 0.1, 0.1, 0.03, 0.03)
+
+
+def jacobian(of: Callable[[FloatArray], FloatArray], x: FloatArray, step: float = 1e-6) -> FloatArray:
+    return np.stack([(of(x + step * e) - of(x - step * e)) / (2.0 * step) for e in np.eye(x.size)], axis=1)
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 1e-4, 0.7, -2.0])
+@pytest.mark.parametrize("lateral_m", [0.0, 0.2])
+def test_jacobian_of_the_differential_drive(turn_rad: float, lateral_m: float) -> None:
+    drive, odometry = DifferentialDrive(NOISE), Increment(1.0, 0.5, 0.8, turn_rad, lateral_m)
+    x = np.array((1.0, -2.0, 2.5, 0.01, 0.05, -0.04))
+    F = drive.step(x, odometry).F.copy()
+    assert pytest.approx(jacobian(lambda y: drive.step(y, odometry).mean, x), abs=1e-8) == F
+
+
+@pytest.mark.parametrize("reference", ["front", "rear"])
+def test_jacobian_of_the_ackermann_vehicle(reference: Literal["front", "rear"]) -> None:
+    vehicle = Ackermann(0.35, AckermannNoise(0.01, 0.02), reference)
+    odometry, x = Steering(1.0, 0.1, 0.4, 0.3), np.array((1.0, 2.0, 0.5))
+    assert pytest.approx(jacobian(lambda y: vehicle.step(y, odometry).mean, x), abs=1e-8) == vehicle.step(x, odometry).F
+    inputs = np.array((0.4, 0.3))
+    L = jacobian(lambda u: vehicle.step(x, Steering(1.0, 0.1, u[0], u[1])).mean, inputs)
+    assert pytest.approx(L @ np.diag((1e-4, 4e-4)) @ L.T, abs=1e-12) == vehicle.step(x, odometry).Q
+
+
+def test_an_arc_ends_where_a_circle_does() -> None:
+    drive = DifferentialDrive(DifferentialNoise(0.1, 0.0, 0.0, 0.1, 0.0, 0.0))
+    end = drive.step(np.zeros(3), Increment(1.0, 1.0, pi, pi)).mean  # half a circle of radius 1
+    assert end == pytest.approx((0.0, 2.0, pi), abs=1e-12)
+
+
+def test_the_front_axle_goes_where_its_wheel_points() -> None:
+    vehicle = Ackermann(0.35, AckermannNoise(0.01, 0.02))
+    end = vehicle.step(np.zeros(3), Steering(0.1, 0.1, 0.15, 0.4)).mean
+    assert end == pytest.approx((0.015 * cos(0.4), 0.015 * sin(0.4), 0.015 * sin(0.4) / 0.35))
+
+
+def test_noise_of_a_way_does_not_depend_on_how_often_it_is_told() -> None:
+    drive = DifferentialDrive(DifferentialNoise(0.05, 0.0, 0.02, 0.0, 0.01, 0.0))
+
+    def told(steps: int) -> FloatArray:
+        x, P = np.zeros(3), np.zeros((3, 3))
+        for _ in range(steps):
+            x, F, Q = drive.step(x, Increment(0.0, 4.0 / steps, 2.0 / steps, 0.0))
+            P = F @ P @ F.T + Q
+        return P
+
+    assert told(400) == pytest.approx(told(40), rel=1e-2, abs=1e-9)  # midpoint and limit differ by 1 / steps^2
+    assert told(40)[0, 0] == pytest.approx(0.05**2 * 2.0)
+    assert told(40)[2, 2] == pytest.approx(0.02**2 * 2.0 + 0.01**2 * 4.0)
+
+
+def test_noise_is_the_spread_of_steps() -> None:
+    drive, rng = DifferentialDrive(DifferentialNoise(0.05, 0.02, 0.02, 0.05, 0.01, 0.04)), np.random.default_rng(3)
+    odometry = Increment(1.0, 1.0, 1.0, 0.6)
+    var_way, var_turn = 0.05**2 + 0.02**2 * 0.6, 0.02**2 + 0.05**2 * 0.6 + 0.01**2
+    noise = np.sqrt((var_way, var_turn, 0.04**2)) * rng.normal(size=(20000, 3))
+    x = np.array((0.0, 0.0, 0.4))
+    ends = np.array([drive.step(x, Increment(1.0, 1.0, 1.0 + d, 0.6 + t, s)).mean.copy() for d, t, s in noise])
+    assert pytest.approx(np.cov(ends.T), abs=2e-4) == drive.step(x, odometry).Q  # a tenth of the variances
+
+
+def test_a_turn_at_rest_is_the_bias_and_turns_nothing() -> None:
+    drive = DifferentialDrive(NOISE)
+    x = np.array((1.0, 2.0, 0.3, 0.0, 0.0, 0.0))
+    still = Increment(0.1, 0.1, 0.0, -7e-4)
+    assert drive.step(x, still).mean == pytest.approx(x)
+    shown = drive.at_rest(still)
+    assert shown is not None
+    assert shown.column == 3
+    assert shown.value == pytest.approx(-7e-3)
+    assert shown.variance == pytest.approx(0.002**2 / 0.1)
+    assert drive.at_rest(Increment(0.1, 0.1, 0.01, -7e-4)) is None
+
+
+def test_each_vehicle_takes_its_own_odometry() -> None:
+    with pytest.raises(TypeError, match="differential drive takes increments, not Steering"):
+        DifferentialDrive(NOISE).step(np.zeros(6), Steering(0.1, 0.1, 0.1, 0.1))
+    with pytest.raises(TypeError, match="speed and steering angle, not Increment"):
+        Ackermann(0.35, AckermannNoise(0.01, 0.02)).step(np.zeros(3), Increment(0.1, 0.1, 0.1, 0.1))
+
+
+def track_of(run: RecordedRun) -> EstimatedPath:
+    cfg = load_recordings_config(None, {})
+    return filter_run(run, slam_settings(cfg.csv, cfg.filter), (0.05, 0.05), perf_counter)
+
+
+def test_sound_data_raise_no_doubt_and_parts_are_timed() -> None:
+    run = recorded(world())
+    track = track_of(run)
+    assert track.warnings == ()
+    assert len(track.predict_s) == len(track.times_s) - 1
+    assert len(track.update_s) == len(run.readings.times_s)
+    joined = 4 * 2  # each beacon's first reading is no update of it
+    assert len(track.scalar_s) == 2 * len(run.readings.times_s) - joined
+    assert 0.0 < np.median(track.scalar_s) < np.median(track.update_s)
+
+
+def test_readings_of_another_time_are_told() -> None:
+    run = recorded(world(seconds=120.0))
+    late = run.readings.times_s + 4.0
+    shifted = replace(run, readings=run.readings._replace(times_s=late).where(late < run.steps.times_s[-1]))
+    assert any("innovations are" in w or "had to be doubted" in w for w in track_of(shifted).warnings)
+
+
+def test_beacons_that_are_misread_half_the_time_are_told() -> None:
+    run = recorded(world(seconds=120.0))
+    beacon = run.readings.beacon.copy()
+    rng = np.random.default_rng(2)
+    misread = rng.uniform(size=beacon.size) < 0.5
+    beacon[misread] = rng.integers(0, 4, int(misread.sum()))
+    told = track_of(replace(run, readings=run.readings._replace(beacon=beacon))).warnings
+    assert any("had to be doubted" in w for w in told)
+    assert any("readings were refused" in w for w in told)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_names_that_are_misread_now_and_then_do_not_cost_the_map(seed: int) -> None:
+    """The worst time for it is the first sight of a beacon: here the first four are all taken for others."""
+    run = recorded(world(seed, 120.0))
+    beacon, rng = run.readings.beacon.copy(), np.random.default_rng(seed)
+    misread = rng.uniform(size=beacon.size) < 0.05
+    misread[:4] = True
+    beacon[misread] = (beacon[misread] + rng.integers(1, 4, int(misread.sum()))) % 4
+    misnamed = replace(run, readings=run.readings._replace(beacon=beacon))
+    found = judge(track_of(misnamed), misnamed)
+    assert found.trajectory_rmse_m is not None
+    assert found.trajectory_rmse_m < 0.1
+    assert found.beacon_rmse_m is not None
+    assert found.beacon_rmse_m < 0.15
+
+
+def test_bearings_of_times_of_their_own_are_used_once_their_beacon_is_placed() -> None:
+    run = recorded(world(3, 120.0, range_sigma_m=0.3))
+    r = run.readings
+    nothing = np.full(len(r.times_s), np.nan)
+    both = Readings(
+        np.concatenate([r.times_s, r.times_s + 0.01]), np.tile(r.beacon, 2), np.concatenate([r.range_m, nothing]),
+        np.concatenate([nothing, r.bearing_rad]), np.tile(nothing, 2),
+    )  # fmt: skip
+    apart = replace(run, readings=both.where(np.argsort(both.times_s, kind="stable")))
+    ranges = replace(run, readings=r._replace(bearing_rad=nothing))
+    track, without = track_of(apart), track_of(ranges)
+    assert track.updates > 1.3 * without.updates
+    assert np.median(track.covariances[:, 2, 2]) < 0.5 * np.median(without.covariances[:, 2, 2])
+    found = judge(track, apart)
+    assert found.trajectory_rmse_m is not None
+    assert found.trajectory_rmse_m < 0.2
+    assert any("bearings had no range or strength of the same time and came before" in w for w in track.warnings)
+
+
+def test_a_beacon_of_which_only_bearings_were_heard_is_told_so() -> None:
+    run = recorded(world(3, 20.0))
+    blind = run.readings._replace(range_m=np.full(len(run.readings.times_s), np.nan))
+    told = track_of(replace(run, readings=blind)).warnings
+    assert "beacon 6 could not be placed: only bearings of it were heard, no range" in told
+
+
+def test_no_nees_where_the_truth_did_not_tell_the_first_pose() -> None:
+    run = recorded(world(seconds=20.0))
+    track = track_of(run)
+    assert judge(track, run).nees is not None
+    assert run.truth is not None
+    late = replace(run, truth=ReferencePath(*(column[50:] for column in run.truth)))
+    assert judge(track, late).nees is None
+    assert judge(track, late).trajectory_rmse_m is not None
+
+
+def test_beacons_that_are_exchanged_on_the_way_are_told() -> None:
+    run = recorded(world(seconds=120.0))
+    swap = np.where(run.readings.times_s > 60.0, np.array([1, 0, 2, 3])[run.readings.beacon], run.readings.beacon)
+    told = track_of(replace(run, readings=run.readings._replace(beacon=swap))).warnings
+    for name in ("6", "7"):
+        assert any(w.startswith(f"beacon {name} was placed anew at ") and "exchanged" in w for w in told)
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_a_wild_step_of_the_odometry_is_told(steps: int) -> None:
+    run = replace(recorded(world()), truth=None)
+    distance = run.steps.distance_m.copy()
+    distance[100 : 100 + steps] = 1e6
+    told = suspicions(replace(run, steps=run.steps._replace(distance_m=distance)))
+    assert any(
+        f"{steps} step{'s' * (steps > 1)} faster than 50 m/s, the first of 1e+06 m at 10.000 s" in w for w in told
+    )
+    assert not any("faster than" in w for w in suspicions(run))
+
+
+SCAN = ReflectorScan(readings=40, bearing_sigma_rad=radians(18.0), loss_tolerance=0.5)
+STEP = radians(9.0)
+
+
+def turn(levels: dict[int, float], lost: set[int] | None = None, floor_dbm: float = -70.0) -> list[Packet]:
+    return [
+        Packet("b", wrap_pi(k * STEP), levels.get(k, floor_dbm)) for k in range(40) if lost is None or k not in lost
+    ]
+
+
+def read(packets: list[Packet]) -> ScanResult:
+    (result,) = SCAN.results(packets)
+    return result
+
+
+def bearing(packets: list[Packet]) -> float:
+    found = read(packets).bearing_rad
+    assert found is not None
+    return found
+
+
+def test_bearing_is_that_of_the_strongest() -> None:
+    assert bearing(turn({7: -40.0, 8: -45.0, 30: -41.0})) == pytest.approx(7 * STEP)
+
+
+def test_neighbours_that_tie_give_their_middle_across_the_cut_too() -> None:
+    assert bearing(turn({7: -40.0, 8: -40.0})) == pytest.approx(7.5 * STEP)
+    assert abs(bearing(turn({20: -40.0, 21: -40.0, 19: -40.0}))) == pytest.approx(pi)
+
+
+def test_ties_that_lie_apart_give_no_bearing_but_a_level() -> None:
+    for levels in ({0: -40.0, 20: -40.0}, {0: -40.0, 12: -40.0}):
+        result = read(turn(levels))
+        assert result.bearing_rad is None
+        assert result.rssi_dbm == -40.0
+
+
+def test_level_is_the_mean_next_to_the_bearing() -> None:
+    result = read(turn({7: -40.0, 6: -42.0, 8: -44.0}))
+    assert result.rssi_dbm == pytest.approx(-42.0)
+    assert result.readings == 3
+
+
+def test_lost_packets_are_borne_up_to_the_tolerance() -> None:
+    some = read(turn({7: -40.0}, lost=set(range(20, 39))))
+    assert some.bearing_rad is not None
+    assert some.heard == pytest.approx(21 / 40)
+    most = read(turn({7: -40.0}, lost=set(range(10, 31))))
+    assert most.bearing_rad is None
+
+
+def test_variance_of_steps_is_in_the_bearing() -> None:
+    assert SCAN.sigma_rad**2 == pytest.approx(radians(18.0) ** 2 + STEP**2 / 12.0)
+
+
+def test_radios_are_kept_apart_by_their_identifier() -> None:
+    both = [*turn({3: -40.0}), *(p._replace(beacon="c") for p in turn({9: -50.0}))]
+    assert [(r.beacon, r.rssi_dbm > -65.0) for r in SCAN.results(both)] == [("b", True), ("c", True)]
+    assert SCAN.results([]) == []

@@ -1,0 +1,380 @@
+"""EKF-SLAM by levels and bearings: derivatives against differences, consistency over seeds, what waits, what moves."""
+
+from math import hypot, log
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from ccatp.beacons.slam.motion import Increment, Odometry, SlippingVehicle, Steering, WheelNoise
+from ccatp.beacons.slam.path_loss import (
+    LevelLocator,
+    LevelPair,
+    PathLoss,
+    PathLossError,
+    PathLossFit,
+    Room,
+    fit_path_loss,
+    likeliest_names,
+)
+from ccatp.beacons.slam.recording import RssiReading
+from ccatp.beacons.slam.settings import new_slam, vehicle_of
+from ccatp.beacons.slam.signal_landmarks import MovingRadio, RadioModel, ShadowingMap, rows_of
+from ccatp.beacons.slam.signal_slam import SignalSlam
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.load import load_radio_config
+from ccatp.filters.ekf_slam import BlockError, EkfSlam
+from ccatp.studies.radio_runs import run_radio
+
+NOISE = WheelNoise(0.01, 0.02, 0.01, 0.05)
+ODOMETRY: dict[str, Odometry] = {
+    "ackermann": Steering(0.1, 0.1, 0.15, 0.3),
+    "differential": Increment(0.1, 0.1, 0.015, 0.02),
+}
+
+
+def config(**keys: object) -> RadioConfig:
+    return load_radio_config(None, {name.replace("__", "."): value for name, value in keys.items()})
+
+
+@pytest.mark.parametrize("kind", ["ackermann", "differential"])
+def test_motion_has_the_derivatives_of_its_mean(kind: str) -> None:
+    model = SlippingVehicle("ackermann" if kind == "ackermann" else "differential", 0.35, NOISE)
+    assert model.names == ("heading_drift_rad_s", "slip")
+    x = np.array((1.0, 2.0, 0.7, 0.02, 0.06))
+    F = model.step(x, ODOMETRY[kind]).F
+    for k in range(5):
+        step = np.eye(5)[k] * 1e-6
+        slope = (model.step(x + step, ODOMETRY[kind]).mean - model.step(x - step, ODOMETRY[kind]).mean) / 2e-6
+        assert F[:, k] == pytest.approx(slope, abs=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["ackermann", "differential"])
+def test_motion_noise_is_that_of_its_readings(kind: str) -> None:
+    model = SlippingVehicle("ackermann" if kind == "ackermann" else "differential", 0.35, NOISE)
+    x, rng = np.array((1.0, 2.0, 0.7, 0.02, 0.06)), np.random.default_rng(1)
+    drawn = []
+    for speed, turn in rng.standard_normal((4000, 2)).tolist():
+        if kind == "ackermann":
+            odometry: Odometry = Steering(0.1, 0.1, 0.15 + 0.01 * speed, 0.3 + 0.02 * turn)
+        else:
+            odometry = Increment(0.1, 0.1, 0.1 * (0.15 + 0.01 * speed), 0.1 * (0.2 + 0.02 * turn))
+        drawn.append(model.step(x, odometry).mean[:3])
+    Q = model.step(x, ODOMETRY[kind]).Q[:3, :3]
+    assert np.sqrt(np.diag(Q)) == pytest.approx(np.std(drawn, axis=0), rel=0.06)
+
+
+def test_wheels_that_stand_have_no_noise() -> None:
+    step = SlippingVehicle("ackermann", 0.35, NOISE).step(np.zeros(5), Steering(0.1, 0.1, 0.0, 0.3))
+    assert not step.Q.any()
+
+
+def test_a_vehicle_takes_the_odometry_of_its_kind() -> None:
+    with pytest.raises(TypeError, match="takes speed and steering angle, not Increment"):
+        SlippingVehicle("ackermann", 0.35, NOISE).step(np.zeros(5), ODOMETRY["differential"])
+    with pytest.raises(TypeError, match="takes increments, not Steering"):
+        SlippingVehicle("differential", 0.35, NOISE).step(np.zeros(5), ODOMETRY["ackermann"])
+    assert vehicle_of(config()).names == ()
+
+
+def test_rows_have_the_derivatives_of_level_and_bearing() -> None:
+    shadow = np.array((0.5, -0.3))
+    sights = [
+        RadioModel(RssiReading(0.0, "b", -40.0, 0.4), 0, shadow, 4.0),
+        RadioModel(RssiReading(0.0, "b", -41.0, None), 3, shadow, 4.0),
+    ]
+    x = np.array((0.1, 0.2, 0.3, 0.6, 0.1, 0.5, 2.0, 1.5, 0.7, -0.2))
+    rows = rows_of(sights, slice(6, 10), PathLoss(-33.0, 2.0, 2.0), 0.3)
+    residual, H = rows.linearise(x)
+    assert residual.shape == (3,)
+    for k in range(10):
+        step = np.eye(10)[k] * 1e-6
+        slope = (rows.linearise(x + step)[0] - rows.linearise(x - step)[0]) / 2e-6
+        assert H[:, k] == pytest.approx(-slope, abs=1e-6)
+
+
+def test_shadowing_map_reproduces_its_points_and_its_variance() -> None:
+    grid = ShadowingMap((2.0, 1.0), 0.5, 5.0, 1.5)
+    assert grid.size == 15
+    row, rest = grid.row(0.5, 0.5)
+    assert float(row @ row) == pytest.approx(25.0)
+    assert rest == pytest.approx(0.0, abs=1e-6)
+    far, _ = grid.row(2.0, 0.5)
+    assert float(row @ far) == pytest.approx(25.0 * np.exp(-1.0))
+    between, rest = grid.row(0.75, 0.75)
+    assert float(between @ between) + rest == pytest.approx(25.0)
+    assert 1.0 < rest < 12.0
+
+
+def moving() -> tuple[EkfSlam, MovingRadio]:
+    engine = EkfSlam(np.array((1.0, 1.0, 0.5)), np.diag((0.01, 0.01, 0.001)))
+    radio = MovingRadio("t", 0.02, 20.0, 5.0, 1.5, (3.0, 3.0))
+    radio.join(engine, 0.2)
+    return engine, radio
+
+
+def test_many_levels_with_one_unknown_offset_do_not_tell_the_range() -> None:
+    engine, radio = moving()
+    loss = PathLoss(-33.0, 2.0, 2.0)
+    rng = np.random.default_rng(4)
+    for _ in range(300):
+        level_dbm = loss.level_dbm(1.5) - 6.0 + 2.0 * rng.standard_normal()
+        reading = RssiReading(0.0, "t", level_dbm, 0.2 + 0.3 * rng.standard_normal())
+        radio.update(engine, reading, loss, 0.32, (9e9, 9e9))
+    place = engine.block("t")
+    offset = engine.mean[place][:2] - engine.mean[:2]
+    r = float(np.hypot(*offset))
+    along = offset / r
+    sigma = float(np.sqrt(along @ engine.covariance[place, place][:2, :2] @ along)) / r
+    # prior of ln r (ln 2) and 5 dB of shadowing (0.576): together 0.443; three hundred levels add nothing to that
+    assert sigma == pytest.approx(1.0 / np.hypot(1.0 / log(2.0), 1.0 / 0.576), rel=0.05)
+
+
+def test_other_coordinates_change_nothing() -> None:
+    engine, radio = moving()
+    mean, covariance = engine.mean.copy(), engine.covariance.copy()
+    radio._to_polar(engine)
+    radio._to_plane(engine)
+    assert engine.mean == pytest.approx(mean)
+    assert engine.covariance == pytest.approx(covariance, abs=1e-9)
+
+
+def test_a_velocity_is_carried_into_the_place() -> None:
+    engine, radio = moving()
+    block = engine.block("t")
+    start = engine.mean[block][:2].copy()
+    engine.mean[block.start + 2 : block.start + 4] = (0.02, 0.0)
+    for _ in range(100):
+        radio.predict(engine, 0.1, 0.0)
+    # T (1 - exp(-t / T)) v after 10 s
+    assert engine.mean[block][0] - start[0] == pytest.approx(20.0 * (1.0 - np.exp(-0.5)) * 0.02)
+    assert float(np.linalg.eigvalsh(engine.covariance)[0]) > -1e-12
+
+
+def heard(slam_cfg: RadioConfig, scans: int) -> tuple[SignalSlam, float]:
+    slam = new_slam(slam_cfg)
+    loss = slam.path_loss_of("b")
+    for k in range(scans):
+        for _ in range(10):
+            slam.predict(Steering(0.0, 0.1, 0.15, 0.0))
+        pose = slam.engine.mean[:3].tolist()
+        level = loss.level_dbm(hypot(2.0 - pose[0], 2.0 - pose[1]))
+        slam.observe([RssiReading(k, "b", level, np.arctan2(2.0 - pose[1], 2.0 - pose[0]) - pose[2])])
+    estimate = slam.beacons["b"]
+    return slam, float(np.hypot(*(estimate.mean - 2.0)))
+
+
+def test_a_new_radio_waits_and_is_on_the_map_all_the_same() -> None:
+    slam, error_m = heard(config(), 1)
+    assert "b" not in slam.engine
+    assert error_m < 0.01
+    slam, error_m = heard(config(estimator__waiting_scans=4), 5)
+    assert "b" in slam.engine
+    assert error_m < 0.02
+    assert not [b for b in slam.engine.blocks if not isinstance(b, str)]
+
+
+def test_a_radio_without_a_bearing_is_not_placed_and_removal_forgets() -> None:
+    slam = new_slam(config())
+    slam.observe([RssiReading(0.0, "b", -40.0, None)])
+    assert slam.beacons == {}
+    slam.remove("b")
+    with pytest.raises(BlockError, match="is not in the state"):
+        slam.remove("b")
+
+
+SHADOW = {
+    "sim.radio.shadowing_sigma_db": 5.0,
+    "path_loss.shadowing_sigma_db": 5.0,
+    "estimator.shadowing": "map",
+}
+
+
+def test_white_noise_runs_are_consistent() -> None:
+    runs = [run_radio(load_radio_config(None, {"run.seed": seed, "run.steps": 450})) for seed in range(1, 7)]
+    nees, states = (sum(run.joint_nees[k] for run in runs) for k in (0, 1))
+    low, high = (float(chi2.ppf(share, states)) for share in (0.001, 0.999))
+    assert low < nees < high
+    rows = sum(size for run in runs for _, size in run.nis)
+    assert sum(nis for run in runs for nis, _ in run.nis) / rows == pytest.approx(1.0, abs=3.5 * (2.0 / rows) ** 0.5)
+
+
+def test_ignored_shadowing_is_overconfident_and_mapped_shadowing_is_not() -> None:
+    hits = {}
+    for mode in ("none", "map"):
+        keys = {**SHADOW, "estimator.shadowing": mode, "run.steps": 450}
+        runs = [run_radio(load_radio_config(None, {**keys, "run.seed": seed})) for seed in range(1, 4)]
+        hits[mode] = np.mean([run.beacon_nees[name][-1] < 4.605 for run in runs for name in run.places])
+    assert hits["none"] < 0.5
+    assert hits["map"] > 0.7
+
+
+def test_slip_is_found_and_the_pose_gains_by_it() -> None:
+    keys = {"sim.vehicle.slip": 0.05, "odometry.slip_sigma": 0.05, "observation.every_steps": 2}
+    run = run_radio(load_radio_config(None, keys))
+    squares = [
+        np.mean(np.array(errors)[:, :2] ** 2) for errors in (run.pose_errors, [e[:2] for e in run.reckoned_errors])
+    ]
+    assert squares[0] < 0.5 * squares[1]
+
+
+BEACONS = {"A": (0.0, 0.0), "B": (0.0, 4.0), "C": (4.0, 0.0)}
+ROOM = Room((0.0, 0.0), (4.0, 4.0), 0.1)
+Levels = dict[str, float]
+
+
+def scene(seed: int, sigma_db: float, points: int) -> tuple[LevelLocator, list[tuple[tuple[float, float], Levels]]]:
+    """A locator calibrated at 40 places, and points with levels from the same model."""
+    rng = np.random.default_rng(seed)
+
+    def level(place: tuple[float, float], name: str) -> float:
+        r = max(float(np.hypot(place[0] - BEACONS[name][0], place[1] - BEACONS[name][1])), 0.1)
+        return float(-45.0 - 25.0 * np.log10(r) + sigma_db * rng.standard_normal())
+
+    def draw() -> tuple[float, float]:
+        x, y = rng.uniform(0.0, 4.0, 2).tolist()
+        return x, y
+
+    fits: dict[str, PathLossFit] = {}
+    for name, at in BEACONS.items():
+        places = [draw() for _ in range(40)]
+        distances = [max(float(np.hypot(p[0] - at[0], p[1] - at[1])), 0.1) for p in places]
+        fits[name] = fit_path_loss(LevelPair(r, level(p, name), p) for r, p in zip(distances, places, strict=True))
+    heard = [(place, {name: level(place, name) for name in BEACONS}) for place in (draw() for _ in range(points))]
+    return LevelLocator(BEACONS, fits, ROOM), heard
+
+
+def test_good_levels_give_the_place() -> None:
+    locator, heard = scene(1, 0.3, 20)
+    for place, levels in heard:
+        assert np.hypot(*(locator.fix(levels).position_m - place)) < 0.3
+
+
+def test_ninety_per_cent_regions_hold_ninety_per_cent() -> None:
+    locator, heard = scene(2, 5.0, 300)
+    inside = np.mean([locator.fix(levels).holds(place, 0.9) for place, levels in heard])
+    assert inside == pytest.approx(0.9, abs=0.06)  # 3.5 sigma of 300 points
+
+
+def test_a_beacon_that_is_not_heard_is_left_out() -> None:
+    locator, heard = scene(3, 1.0, 1)
+    levels = heard[0][1]
+    fewer = locator.fix({"A": levels["A"]})
+    assert fewer.region(0.9).sum() > locator.fix(levels).region(0.9).sum()
+    with pytest.raises(ValueError, match="none of the beacons A, B, C was heard"):
+        locator.fix({"D": -50.0})
+
+
+def test_exchanged_names_are_found() -> None:
+    locator, heard = scene(4, 5.0, 12)
+    assert likeliest_names(locator, heard) == ({"A": "A", "B": "B", "C": "C"}, 0.0)
+    exchanged = [(place, {"A": z["A"], "B": z["C"], "C": z["B"]}) for place, z in heard]
+    names, gain = likeliest_names(locator, exchanged)
+    assert names == {"A": "A", "B": "C", "C": "B"}
+    assert gain > 7.0
+
+
+def test_printed_ranges_of_2017_come_out() -> None:
+    model = PathLoss(-33.0, 2.0, 2.0)
+    printed = [(-23.0, 0.3162), (-33.103, 1.0119), (-38.308, 1.8425), (-41.974, 2.81)]
+    for level_dbm, range_m in printed:
+        assert model.median_range_m(level_dbm) == pytest.approx(range_m, abs=6e-4)
+
+
+def test_range_is_without_bias_and_as_sure_as_it_says() -> None:
+    model = PathLoss(-40.0, 2.0, 5.0)
+    levels = model.level_dbm(3.0) + 5.0 * np.random.default_rng(1).standard_normal(20000)
+    ranges = np.array([model.range_from(level).range_m for level in levels.tolist()])
+    medians = np.array([model.median_range_m(level) for level in levels.tolist()])
+    assert np.mean(ranges) == pytest.approx(3.0, abs=0.05)
+    assert np.mean(medians) > 3.4  # exp(s^2 / 2) too long
+    longer_m = 3.0 * np.exp(0.5 * model.log_sigma**2)  # the level whose estimate is 3 m
+    assert np.std(ranges) == pytest.approx(model.range_from(model.level_dbm(longer_m)).sigma_m, rel=0.05)
+
+
+def test_a_mean_of_levels_has_less_bias_and_spread() -> None:
+    model = PathLoss(-40.0, 2.0, 5.0)
+    one, many = model.range_from(-50.0), model.range_from(-50.0, 100)
+    assert many.sigma_m == pytest.approx(one.sigma_m / 10.0, rel=0.25)
+    assert many.range_m == pytest.approx(model.median_range_m(-50.0), rel=0.01)
+
+
+def test_what_has_no_range_is_refused() -> None:
+    model = PathLoss(-40.0, 2.0, 5.0)
+    with pytest.raises(ValueError, match="must be positive"):
+        model.level_dbm(0.0)
+    with pytest.raises(ValueError, match="give at least one"):
+        model.range_from(-50.0, 0)
+
+
+def drawn(seed: int, places: int, repeats: int, static_db: float, white_db: float) -> list[LevelPair]:
+    rng = np.random.default_rng(seed)
+    found = []
+    for distance_m in np.geomspace(0.3, 6.0, places).tolist():
+        level = -45.0 - 25.0 * np.log10(distance_m) + static_db * rng.standard_normal()
+        found += [LevelPair(distance_m, level + white_db * rng.standard_normal()) for _ in range(repeats)]
+    return found
+
+
+def test_exact_pairs_give_the_model_back() -> None:
+    fit = fit_path_loss(drawn(0, 6, 1, 0.0, 0.0))
+    assert fit.reference_dbm == pytest.approx(-45.0)
+    assert fit.exponent == pytest.approx(2.5)
+    assert fit.sigma_db == pytest.approx(0.0, abs=1e-9)
+    assert np.isnan(fit.white_sigma_db)
+
+
+def test_confidence_intervals_hold_what_they_promise() -> None:
+    inside = np.zeros(3)
+    for seed in range(300):
+        fit = fit_path_loss(drawn(seed, 8, 1, 4.0, 0.0))
+        reference, exponent = fit.half_widths(0.9)
+        low, high = fit.sigma_interval_db(0.9)
+        inside += abs(fit.reference_dbm + 45.0) < reference, abs(fit.exponent - 2.5) < exponent, low < 4.0 < high
+    assert inside / 300 == pytest.approx(0.9, abs=0.055)  # 3.2 sigma of 300 trials
+
+
+def test_repeated_readings_tell_white_from_static() -> None:
+    fit = fit_path_loss(drawn(3, 40, 30, 4.0, 1.5))
+    assert fit.white_sigma_db == pytest.approx(1.5, rel=0.05)
+    assert fit.shadowing_sigma_db == pytest.approx(4.0, rel=0.3)
+    once = fit_path_loss(drawn(3, 40, 1, 4.0, 1.5))
+    assert fit.sigma_db == pytest.approx(once.sigma_db, rel=0.3)  # thirty readings of a place are one witness
+
+
+def test_places_at_the_same_distance_stay_places() -> None:
+    pairs = [LevelPair(d, -45.0 - d + s, (d, s)) for d in (1.0, 2.0, 4.0) for s in (-1.0, 1.0)]
+    assert fit_path_loss(pairs).places == 6
+    assert fit_path_loss([LevelPair(*pair[:2]) for pair in pairs]).places == 3
+
+
+def test_doubts_are_told() -> None:
+    good = drawn(1, 12, 1, 0.5, 0.0)
+    assert fit_path_loss(good).doubts() == []
+    off = [*good[:-1], LevelPair(good[-1].distance_m, good[-1].level_dbm + 20.0)]
+    assert any("off the line" in doubt for doubt in fit_path_loss(off).doubts())
+    flat = [LevelPair(d, -60.0 - 0.5 * d) for d in (1.0, 2.0, 3.0, 4.0)]
+    assert any("is outside 1 to 6" in doubt for doubt in fit_path_loss(flat).doubts())
+    far = [LevelPair(100.0 * pair.distance_m, pair.level_dbm) for pair in good]
+    assert any("is above -10 dBm" in doubt and "in metres" in doubt for doubt in fit_path_loss(far).doubts())
+    line = [LevelPair(r, -40.0 - 20.0 * np.log10(r)) for r in (1.0, 2.0, 4.0, 8.0)]
+    assert any("on a line exactly" in doubt for doubt in fit_path_loss(line).doubts())
+
+
+@pytest.mark.parametrize("slope_db_m", [0.0, 5.0])
+def test_levels_that_do_not_fall_are_no_path_loss(slope_db_m: float) -> None:
+    with pytest.raises(PathLossError, match="levels do not fall with distance"):
+        fit_path_loss([LevelPair(d, -60.0 + slope_db_m * d) for d in (1.0, 2.0, 3.0, 4.0)])
+
+
+@pytest.mark.parametrize(
+    ("pairs", "message"),
+    [
+        ([(1.0, -40.0), (2.0, -46.0), (2.0, -47.0)], "2 different distances, at least 3 needed"),
+        ([(1.0, -40.0), (0.0, -46.0), (2.0, -47.0)], "pair of 0 m and -46 dBm cannot be used"),
+        ([(1.0, -40.0), (3.0, float("nan")), (2.0, -47.0)], "cannot be used"),
+    ],
+)
+def test_pairs_without_a_path_loss_are_refused(pairs: list[tuple[float, float]], message: str) -> None:
+    with pytest.raises(PathLossError, match=message):
+        fit_path_loss(LevelPair(*pair) for pair in pairs)

@@ -1,0 +1,267 @@
+"""Driving among beacons, on a vehicle that does what it is told: arrives, follows, keeps away, goes round."""
+
+from math import cos, hypot, pi, sin
+
+import pytest
+from numpy.random import default_rng
+
+from ccatp.beacons.pilot import BackOff, BeaconPilot, FollowState, PilotState, TargetSight
+from ccatp.beacons.steering import HALT, BearingToPoint, FuzzyGapError, Sugeno, WaypointList, WaypointSteering, aim_at
+from ccatp.config.beacon_models import FuzzyConfig, RadioConfig
+from ccatp.config.load import load_radio_config
+from ccatp.sim.radio import SimDriveCommand, TruePose, clearance_m, seen_m
+from ccatp.sim.radio_world import TrueVehicle
+
+QUIET = {f"sim.vehicle.{name}": 0.0 for name in ("speed_sigma_m_s", "steer_sigma_rad", "turn_rate_sigma_rad_s")}
+
+
+def config(**keys: object) -> RadioConfig:
+    return load_radio_config(None, {**QUIET, **{name.replace("__", "."): value for name, value in keys.items()}})
+
+
+def vehicle(cfg: RadioConfig, pose: tuple[float, float, float]) -> TrueVehicle:
+    return TrueVehicle(cfg.vehicle, cfg.sim.vehicle, TruePose(*pose), default_rng(0))
+
+
+@pytest.mark.parametrize("kind", ["ackermann", "differential"])
+@pytest.mark.parametrize("mode", ["fuzzy", "pi", "constant"])
+def test_a_loop_of_waypoints_is_visited(kind: str, mode: str) -> None:
+    cfg = config(vehicle__kind=kind, control__speed_mode=mode, workspace__loops=False)
+    robot, pilot = vehicle(cfg, (0.8, 0.8, 0.0)), BeaconPilot(cfg)
+    for step in range(2000):
+        drive = pilot.drive(0.1 * step, 0.1, robot.pose, None, ())
+        assert abs(drive.speed_m_s) <= cfg.vehicle.speed_max_m_s
+        if pilot.state is PilotState.ARRIVED:
+            break
+        robot.step(SimDriveCommand(*drive), 0.1)
+    assert pilot.waypoints.reached == 4
+    assert drive == HALT
+
+
+def test_steering_is_proportional_and_limited() -> None:
+    cfg = config()
+    driver = WaypointSteering(cfg.control, cfg.vehicle)
+    assert driver.drive(BearingToPoint(1.0, 0.2), 0.1).steer_rad == pytest.approx(1.2 * 0.2)
+    assert driver.drive(BearingToPoint(1.0, -2.0), 0.1).steer_rad == -cfg.vehicle.steer_max_rad
+
+
+def test_aim_is_seen_from_the_heading() -> None:
+    aim = aim_at((1.0, 1.0, pi / 2), (1.0, 3.0))
+    assert aim.distance_m == pytest.approx(2.0)
+    assert aim.error_rad == pytest.approx(0.0)
+    assert aim_at((0.0, 0.0, 0.0), (0.0, 1.0)).error_rad == pytest.approx(pi / 2)
+
+
+def test_waypoints_begin_again_only_where_they_loop() -> None:
+    once = WaypointList([(0.0, 0.0)], 0.1, loops=False)
+    assert once.visit((0.0, 0.0, 0.0)) is None
+    again = WaypointList([(0.0, 0.0), (1.0, 0.0)], 0.1, loops=True)
+    assert again.visit((0.0, 0.0, 0.0)) == (1.0, 0.0)
+    assert again.visit((1.0, 0.0, 0.0)) == (0.0, 0.0)
+
+
+def follow(cfg: RadioConfig, start: tuple[float, float, float], path: list[tuple[float, float]]) -> list[float]:
+    """Distances while the target goes along a path, a point a step, and then stays."""
+    robot, pilot = vehicle(cfg, start), BeaconPilot(cfg)
+    found = []
+    for step, at_m in enumerate(path):
+        drive = pilot.drive(0.1 * step, 0.1, robot.pose, TargetSight(at_m, 0.0, 0.0), ())
+        robot.step(SimDriveCommand(*drive), 0.1)
+        found.append(hypot(at_m[0] - robot.pose.x_m, at_m[1] - robot.pose.y_m))
+    return found
+
+
+@pytest.mark.parametrize("kind", ["ackermann", "differential"])
+def test_a_target_is_approached_to_the_safe_distance_and_no_further(kind: str) -> None:
+    cfg = config(vehicle__kind=kind, follow__is_active=True)
+    distances = follow(cfg, (0.0, 0.0, 0.0), [(2.0, 1.0)] * 600)
+    safe_m, band_m = cfg.follow.safe_distance_m, cfg.follow.band_m
+    assert safe_m < distances[-1] < safe_m + 2.0 * band_m
+    assert min(distances) >= safe_m
+
+
+def test_a_target_that_comes_nearer_is_backed_off_from() -> None:
+    cfg = config(follow__is_active=True)
+    coming = [(1.0 - 0.002 * k, 0.0) for k in range(400)]  # 2 cm/s towards the robot
+    distances = follow(cfg, (0.0, 0.0, 0.0), coming + coming[-1:] * 200)
+    assert min(distances) > cfg.follow.safe_distance_m - 0.01  # it backs faster than the target comes, after a start
+
+
+def test_uncertainty_of_the_target_keeps_the_robot_away() -> None:
+    pilot = BeaconPilot(config(follow__is_active=True))
+    pilot.drive(0.0, 0.1, (0.0, 0.0, 0.0), TargetSight((0.8, 0.0), 0.0, 0.0), ())
+    states = [pilot.follower.state]
+    for sigma_m, velocity_m_s in ((0.05, 0.0), (0.25, 0.0), (0.0, -0.1)):  # surer; unsure; sure, but it comes
+        pilot.drive(0.1, 0.1, (0.0, 0.0, 0.0), TargetSight((0.81, 0.0), sigma_m, 0.0, (velocity_m_s, 0.0)), ())
+        states.append(pilot.follower.state)
+    approaching, backing = FollowState.APPROACHING, FollowState.BACKING
+    assert states == [approaching, approaching, backing, backing]
+
+
+def test_who_knows_nothing_of_the_target_goes_there_all_the_same() -> None:
+    pilot = BeaconPilot(config(follow__is_active=True))
+    pilot.drive(0.0, 0.1, (0.0, 0.0, 0.0), TargetSight((2.5, 0.0), 3.0, 0.0), ())
+    assert pilot.follower.state is FollowState.APPROACHING
+
+
+@pytest.mark.parametrize("target", [None, TargetSight((3.0, 0.0), 0.0, 11.0)])
+def test_a_lost_target_stops_the_robot(target: TargetSight | None) -> None:
+    pilot = BeaconPilot(config(follow__is_active=True))
+    assert pilot.drive(0.0, 0.1, (0.0, 0.0, 0.0), target, ()) == HALT
+    assert pilot.follower.state is FollowState.LOST
+
+
+@pytest.mark.parametrize("side", [-0.1, 0.0, 0.1])
+def test_an_obstacle_in_the_way_is_gone_round(side: float) -> None:
+    obstacle = [{"x_m": 1.5, "y_m": 1.5 + side, "radius_m": 0.15}]
+    cfg = config(
+        avoidance__is_active=True, workspace__waypoints_m=[[2.7, 1.5]], workspace__loops=False, sim__obstacles=obstacle
+    )
+    robot, pilot = vehicle(cfg, (0.3, 1.5, 0.0)), BeaconPilot(cfg)
+    nearest_m, states = 9.0, set()
+    for step in range(3000):
+        seen = [min(seen_m(robot.pose, a, cfg.sim.obstacles), 3.0) for a in cfg.avoidance.sensors_rad]
+        robot.step(SimDriveCommand(*pilot.drive(0.1 * step, 0.1, robot.pose, None, seen)), 0.1)
+        nearest_m = min(nearest_m, clearance_m(robot.pose, cfg.sim.obstacles) - cfg.vehicle.radius_m)
+        states.add(pilot.state)
+        if pilot.state is PilotState.ARRIVED:
+            break
+    assert pilot.state is PilotState.ARRIVED
+    assert PilotState.AVOIDING in states
+    assert nearest_m > 0.0
+
+
+def test_what_stands_too_near_ahead_is_escaped_from_backwards() -> None:
+    cfg = config(avoidance__is_active=True, workspace__waypoints_m=[[2.7, 1.5]])
+    seen = [0.2 if abs(angle) < 0.6 else 3.0 for angle in cfg.avoidance.sensors_rad]
+    pilot = BeaconPilot(cfg)
+    drive = pilot.drive(0.0, 0.1, (0.3, 1.5, 0.0), None, seen)
+    assert drive.speed_m_s < 0.0
+    assert pilot.state is PilotState.ESCAPING
+
+
+def test_nothing_is_backed_into_that_was_seen_before() -> None:
+    cfg = config(avoidance__is_active=True, follow__is_active=True)
+    pilot = BeaconPilot(cfg)
+    all_round = [0.3] * len(cfg.avoidance.sensors_rad)
+    pilot.drive(0.0, 0.1, (0.0, 0.0, pi), None, all_round)  # looks back
+    drive = pilot.drive(0.1, 0.1, (0.0, 0.0, 0.0), TargetSight((0.3, 0.0), 0.0, 0.0), [3.0] * len(all_round))
+    assert pilot.follower.state is FollowState.BACKING
+    assert drive.speed_m_s == 0.0
+
+
+def test_backing_off_turns_the_vehicle_towards_the_target() -> None:
+    for kind in ("ackermann", "differential"):
+        cfg = config(vehicle__kind=kind)
+        robot = vehicle(cfg, (0.0, 0.0, 0.0))
+        before = aim_at(robot.pose, (cos(0.5), sin(0.5))).error_rad
+        for _ in range(20):
+            robot.step(SimDriveCommand(*WaypointSteering(cfg.control, cfg.vehicle).away(0.1, before)), 0.1)
+        assert robot.pose.heading_rad > 0.0
+
+
+def two_terms(rules: list[dict[str, object]]) -> FuzzyConfig:
+    terms = {"low": (-1.0, -1.0, 0.0, 1.0), "high": (0.0, 1.0, 9.0, 9.0)}
+    inputs = {"a": {"terms": terms}, "b": {"terms": terms}}
+    return FuzzyConfig.model_validate({"inputs": inputs, "outputs": {"slow": 1.0, "fast": 3.0}, "rules": rules})
+
+
+FULL: list[dict[str, object]] = [
+    {"when": {"a": "low"}, "then": "slow"},
+    {"when": {"a": "high", "b": "low"}, "then": "fast"},
+    {"when": {"a": "high", "b": "high"}, "then": "slow"},
+]
+
+
+def test_one_rule_alone_gives_its_output() -> None:
+    assert Sugeno(two_terms(FULL)).evaluate((0.0, 0.5)) == 1.0
+    assert Sugeno(two_terms(FULL)).evaluate((1.0, 0.0)) == 3.0
+
+
+def test_output_is_the_mean_weighted_by_products() -> None:
+    # weights 0.75, 0.25 * 0.6, 0.25 * 0.4
+    expected = (0.75 * 1.0 + 0.15 * 3.0 + 0.10 * 1.0) / 1.0
+    assert Sugeno(two_terms(FULL)).evaluate((0.25, 0.4)) == pytest.approx(expected)
+
+
+def test_beyond_the_last_shoulder_an_input_counts_as_there() -> None:
+    sugeno = Sugeno(two_terms(FULL))
+    assert sugeno.evaluate((50.0, -50.0)) == 3.0
+    assert sugeno.memberships(0, 50.0) == [0.0, 1.0]
+
+
+def test_rules_with_a_gap_are_refused() -> None:
+    with pytest.raises(FuzzyGapError, match="no rule of the fuzzy controller fires at a = 1, b = 1; add a rule"):
+        Sugeno(two_terms(FULL[:2]))
+
+
+def test_the_shipped_speed_falls_with_the_error_and_rises_with_the_distance() -> None:
+    sugeno = Sugeno(load_radio_config().control.fuzzy)
+    assert sugeno.inputs == ("distance_m", "heading_error_rad")
+    by_error = [sugeno.evaluate((1.5, 0.1 * k)) for k in range(20)]
+    by_distance = [sugeno.evaluate((0.1 * k, 0.0)) for k in range(20)]
+    assert by_error == sorted(by_error, reverse=True)
+    assert by_distance == sorted(by_distance)
+    assert by_error[0] == by_distance[-1] == 0.15
+
+
+STILL = (0.0, 0.0)
+POSE = (1.5, 1.5, 0.0)
+
+
+def retreat_config(**keys: object) -> RadioConfig:
+    return load_radio_config(None, {"system": "follow", **{k.replace("__", "."): v for k, v in keys.items()}})
+
+
+@pytest.mark.parametrize("kind", ["ackermann", "differential"])
+def test_it_goes_straight_away_where_nothing_stands(kind: str) -> None:
+    retreat = BackOff(retreat_config(vehicle__kind=kind))
+    ahead = retreat.drive(POSE, (2.0, 1.5), STILL, ())
+    assert ahead.speed_m_s == -0.05
+    assert (ahead.steer_rad, ahead.turn_rate_rad_s) == (0.0, 0.0)
+    assert retreat.drive(POSE, (1.0, 1.5), STILL, ()).speed_m_s == 0.05
+
+
+def test_where_the_target_goes_counts() -> None:
+    beside = (1.5, 2.0)
+    assert BackOff(retreat_config()).drive(POSE, beside, (0.08, 0.0), ()).speed_m_s < 0.0
+    assert BackOff(retreat_config()).drive(POSE, beside, (-0.08, 0.0), ()).speed_m_s > 0.0
+
+
+def test_what_stands_behind_is_not_touched_and_what_is_too_near_is_left() -> None:
+    cfg = retreat_config()
+    wall = [(1.1, 1.5 + 0.1 * k) for k in range(-6, 7)]  # 0.4 m behind
+    drive = BackOff(cfg).drive(POSE, (2.0, 1.2), STILL, wall)
+    assert drive.speed_m_s > 0.0  # past the target
+    touching = BackOff(cfg).drive(POSE, (1.9, 1.5), STILL, [(1.2, 1.5)])  # nearer than stop_m already
+    assert touching.speed_m_s >= 0.0
+
+
+def test_it_stands_where_no_way_is_free_and_at_the_wall_of_the_room() -> None:
+    ring = [(1.5 + 0.36 * x, 1.5 + 0.36 * y) for x, y in ((1, 0), (0.7, 0.7), (0, 1), (-0.7, 0.7), (-1, 0))]
+    ring += [(1.5 - 0.25, 1.5 - 0.25), (1.5, 1.14), (1.75, 1.25)]
+    assert BackOff(retreat_config()).drive(POSE, (2.1, 1.5), STILL, ring) == HALT
+    assert BackOff(retreat_config()).drive((0.0, 1.5, 0.0), (0.7, 1.5), STILL, ()).speed_m_s >= 0.0
+
+
+@pytest.mark.parametrize("kind", ["ackermann", "differential"])
+def test_a_robot_between_an_obstacle_and_a_target_that_comes_gets_out(kind: str) -> None:
+    """Backing off straight alone, it stood at the obstacle until the target was 0.23 m away."""
+    quiet = {f"sim.vehicle.{name}": 0.0 for name in ("speed_sigma_m_s", "steer_sigma_rad", "turn_rate_sigma_rad_s")}
+    cfg = retreat_config(vehicle__kind=kind, **quiet)
+    robot = TrueVehicle(cfg.vehicle, cfg.sim.vehicle, TruePose(2.15, 1.5, 0.4), default_rng(0))
+    pilot, distances, clearances = BeaconPilot(cfg), [], []
+    x, y = 2.75, 1.8
+    for step in range(400):
+        dx, dy = robot.pose.x_m - x, robot.pose.y_m - y
+        d = hypot(dx, dy)
+        vx, vy = (0.03 * dx / d, 0.03 * dy / d) if step < 250 else (0.0, 0.0)
+        x, y = x + 0.1 * vx, y + 0.1 * vy
+        seen = [min(seen_m(robot.pose, a, cfg.sim.obstacles), 3.0) for a in cfg.avoidance.sensors_rad]
+        drive = pilot.drive(0.1 * step, 0.1, robot.pose, TargetSight((x, y), 0.0, 0.0, (vx, vy)), seen)
+        robot.step(SimDriveCommand(*drive), 0.1)
+        distances.append(d)
+        clearances.append(clearance_m(robot.pose, cfg.sim.obstacles) - cfg.vehicle.radius_m)
+    assert min(distances) > 0.45
+    assert min(clearances) > 0.03
+    assert abs(robot.pose.heading_rad) < 2.0 * pi

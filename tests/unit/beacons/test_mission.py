@@ -1,0 +1,385 @@
+"""An operator's commands to a mission among beacons, and what it does without verdicts."""
+
+from math import inf, pi, radians
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ccatp.beacons.mission import (
+    DONE,
+    HELD,
+    VISITING,
+    WaypointArrival,
+    assemble_beacons,
+    check_beacon_robot,
+    permitted,
+    wheel_rates,
+)
+from ccatp.beacons.navigation import MeasurementReader, PoseBelief, SelfMap
+from ccatp.beacons.steering import HALT, SteeringCommand
+from ccatp.beacons.store import BeaconStore, BeaconStoreError
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.core import EventCode, Severity, Verdict
+from ccatp.errors import ConfigError
+from ccatp.links.beacon_messages import BeaconFrame, MoteBurst, RadioScan, decode_beacon_frame, with_extras
+from ccatp.links.robot_codec import BadLine, decode_from_robot
+from ccatp.links.robot_messages import Hello, Sensors
+from ccatp.records.beacon_summary import BeaconSummary, beacon_facts
+from ccatp.safety.beacons import BeaconSafetyRules, ObstacleBuffer
+from ccatp.sim.beacon_robot import BeaconRobot
+from ccatp.sim.radio_world import RadioWorld
+from ccatp.studies.mote_navigation import BeaconSilWorld
+from tests.unit.beacons.stories import beacon_config, moved_m, play, target_distances
+
+FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
+DENIED = Verdict(0, 0.0, EventCode.NORMAL, "no radio", "radio", 8.0, 7.0, False, False, False, severity=Severity.HOLD)
+
+
+@pytest.fixture
+def stage() -> BeaconSilWorld:
+    return play(BeaconSilWorld(beacon_config("zigbee")), until_s=10.0)
+
+
+def test_pause_holds_until_resume(stage: BeaconSilWorld) -> None:
+    assert stage.mission.pause("operator") is None
+    play(stage, until_s=15.0)
+    assert stage.mission.is_paused
+    assert set(stage.found.speeds_m_s[101:]) == {0.0}
+    assert stage.mission.resume() is None
+    play(stage, until_s=16.0)
+    assert stage.mission.state is VISITING
+
+
+def test_abort_goes_to_the_start_also_out_of_a_pause(stage: BeaconSilWorld) -> None:
+    stage.mission.pause("operator")
+    assert stage.mission.abort("operator") is None
+    assert play(stage).result().outcome == "aborted, at base"
+
+
+def test_stop_ends_it_where_it_is(stage: BeaconSilWorld) -> None:
+    assert stage.mission.stop() is None
+    stage.frame()
+    assert stage.mission.state is DONE
+    assert stage.result().outcome == "stopped"
+
+
+def test_what_is_over_takes_no_commands(stage: BeaconSilWorld) -> None:
+    stage.mission.stop()
+    over = "the mission is over"
+    assert [stage.mission.pause(""), stage.mission.abort(""), stage.mission.stop()] == [over, over, over]
+
+
+def test_resume_is_refused_while_the_cause_is_there(stage: BeaconSilWorld) -> None:
+    assert stage.mission.resume() == "the mission is not held but visiting"
+    assert not stage.mission.react(DENIED)
+    assert stage.mission.state is HELD
+    assert stage.mission.resume() == "the cause persists: no radio"
+    assert stage.mission.react(FREE)
+
+
+def test_without_a_verdict_nothing_moves(stage: BeaconSilWorld) -> None:
+    assert not stage.mission.react(None)
+    assert stage.mission.cause == "no fresh verdict from the danger loop"
+    assert stage.mission.react(FREE)
+
+
+def test_a_fault_waits_for_an_operator(stage: BeaconSilWorld) -> None:
+    stage.mission.fault("lost")
+    assert stage.mission.is_faulted
+    assert not stage.mission.react(FREE)
+    assert stage.mission.resume() is None
+    assert stage.mission.react(FREE)
+
+
+NO_FORWARD = Verdict(0, 0.0, EventCode.NEAR_EDGE, "", "", 0.0, 0.0, False, True, True)
+NOTHING = Verdict(0, 0.0, EventCode.NEAR_EDGE, "", "", 0.0, 0.0, False, False, False)
+
+
+@pytest.fixture
+def cfg() -> RadioConfig:
+    return beacon_config("zigbee")
+
+
+def frame_of(robot: BeaconRobot) -> tuple[Sensors, BeaconFrame]:
+    line = robot.delivered_line.strip()
+    sensors = decode_from_robot(line)
+    assert isinstance(sensors, Sensors)
+    return sensors, decode_beacon_frame(line)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "verdict", "sent"),
+    [
+        (SteeringCommand(0.1, 0.2, 0.0), FREE, SteeringCommand(0.1, 0.2, 0.0)),
+        (SteeringCommand(0.1, 0.2, 0.0), NO_FORWARD, SteeringCommand(-0.05, 0.0, 0.0)),
+        (SteeringCommand(-0.1, 0.2, 0.0), NO_FORWARD, SteeringCommand(-0.1, 0.2, 0.0)),
+        (SteeringCommand(0.1, 0.2, 0.0), NOTHING, HALT),
+        (SteeringCommand(-0.1, 0.2, 0.0), NOTHING, HALT),
+        (SteeringCommand(0.0, 0.2, 0.3), NOTHING, SteeringCommand(0.0, 0.0, 0.0)),
+        (SteeringCommand(float("nan"), 0.0, 0.0), FREE, HALT),
+    ],
+)
+def test_nothing_is_sent_that_is_not_permitted(
+    wanted: SteeringCommand, verdict: Verdict, sent: SteeringCommand
+) -> None:
+    assert permitted(wanted, verdict, 0.05) == sent
+
+
+def test_wheel_rates_of_both_vehicles(cfg: RadioConfig) -> None:
+    rate = 0.1 / cfg.robot.wheel_radius_m
+    assert wheel_rates(SteeringCommand(0.1, 0.2, 0.0), cfg) == (rate, rate, 0.2)
+    turning = cfg.model_copy(update={"vehicle": cfg.vehicle.model_copy(update={"kind": "differential"})})
+    right, left, steer = wheel_rates(SteeringCommand(0.1, 0.0, 0.5), turning)
+    assert steer is None
+    assert right - left == pytest.approx(0.5 * cfg.vehicle.track_m / cfg.robot.wheel_radius_m)
+
+
+def test_echoes_stay_where_they_are_while_the_robot_moves() -> None:
+    memory = ObstacleBuffer((0.0, pi / 2), 1.0, 20.0)
+    memory.see(0.0, (0.5, 3.0))
+    assert memory.nearest_m(0.0, 0.1) == pytest.approx(0.5)
+    memory.roll(0.2, 0.0, 0.0)
+    assert memory.nearest_m(0.0, 0.1) == pytest.approx(0.3)
+    memory.roll(0.0, 0.0, pi)  # turned round: it is behind now
+    assert memory.nearest_m(0.0, 0.1) == inf
+    assert memory.behind_m(0.0, 0.1) == pytest.approx(0.3)
+    memory.see(20.5, (3.0, 3.0))
+    assert memory.behind_m(0.0, 0.1) == inf  # forgotten
+
+
+def test_the_course_of_a_steered_vehicle_is_where_its_front_wheel_points() -> None:
+    memory = ObstacleBuffer((0.0,), 2.0, 20.0)
+    memory.see(0.0, (1.0,))
+    memory.roll(1.0, pi / 2, 0.0)  # sideways, as wheels at a right angle would
+    assert memory.nearest_m(-pi / 4, 0.01) == pytest.approx(2.0**0.5)
+
+
+def test_wheels_steering_and_scans_are_read_from_the_link(cfg: RadioConfig) -> None:
+    robot = BeaconRobot(cfg, RadioWorld(cfg))
+    robot.join_controller()
+    reader = MeasurementReader(cfg)
+    reader.read(*frame_of(robot))
+    robot.drive(1, 1.0, 1.0, None, 0.3)
+    robot.advance()
+    (wheels,) = reader.read(*frame_of(robot)).wheels
+    assert wheels.interval_s == pytest.approx(0.1)
+    assert wheels.speed_m_s == pytest.approx(cfg.robot.wheel_radius_m, abs=5 * cfg.sim.vehicle.speed_sigma_m_s)
+    assert wheels.steer_rad == pytest.approx(0.3, abs=5 * cfg.sim.vehicle.steer_sigma_rad)
+
+
+def test_a_scan_on_the_link_keeps_its_directions() -> None:
+    cfg = beacon_config("zigbee", sim__radio__scan="reflector", observation__every_steps=1)
+    world = RadioWorld(cfg)
+    robot = BeaconRobot(cfg, world)
+    robot.advance()
+    packets = MeasurementReader(cfg).read(*frame_of(robot)).packets
+    assert len(packets) == 4 * cfg.scan.readings
+    step = 2 * pi / cfg.scan.readings
+    assert {round(packet.direction_rad / step, 6) % cfg.scan.readings for packet in packets} == set(range(40))
+    assert len(robot.delivered_line) < 8192
+
+
+def test_steering_needs_the_permit_to_turn(cfg: RadioConfig) -> None:
+    robot = BeaconRobot(cfg, RadioWorld(cfg))
+    robot.join_controller()
+    robot.join_monitor()
+    for seq, steer, turn, is_held in ((1, 0.2, True, False), (2, 0.2, False, True), (3, 0.0, False, False)):
+        robot.permit(seq, True, True, turn)
+        robot.drive(seq, 1.0, 1.0, None, steer)
+        robot.advance()
+        assert robot.rules.is_held is is_held
+
+
+def test_a_drive_outlives_its_time_to_live_by_nothing(cfg: RadioConfig) -> None:
+    robot = BeaconRobot(cfg, RadioWorld(cfg))
+    robot.join_controller()
+    robot.drive(1, 1.0, 1.0)
+    held = []
+    for _ in range(4):
+        robot.advance()
+        held.append(robot.rules.is_held)
+    assert held == [False, False, True, True]
+
+
+def test_extra_keys_out_of_range_are_a_bad_line(cfg: RadioConfig) -> None:
+    line = with_extras(BeaconRobot(cfg, RadioWorld(cfg)).delivered_line, BeaconFrame(distances=[1.0, 2.0]))
+    assert decode_beacon_frame(line.strip()).distances == [1.0, 2.0]
+    with pytest.raises(BadLine, match="distances"):
+        decode_beacon_frame(line.strip().replace(b"2.0", b"-2.0"))
+
+
+def test_the_danger_rules_find_the_target_by_its_level() -> None:
+    cfg = beacon_config("follow")
+    danger, robot = BeaconSafetyRules(cfg), BeaconRobot(cfg, RadioWorld(cfg))
+    sensors, _ = frame_of(robot)
+    for level_dbm, is_near in ((-36.0, False), (-28.0, True)):  # at 1 m, at 0.4 m
+        scan = RadioScan(0.0, radians(9.0), {"target": [level_dbm, None], "beacon1": [-50.0]})
+        danger.reset()
+        verdict = danger.step(sensors, BeaconFrame(scan=scan), None)
+        assert (verdict.signal == "target") is is_near
+        assert verdict.forward is not is_near
+        assert verdict.reverse
+
+
+def test_no_frame_means_no_permit(cfg: RadioConfig) -> None:
+    verdict = BeaconSafetyRules(cfg).stale(7, 1.5)
+    assert (verdict.forward, verdict.reverse, verdict.turn) == (False, False, False)
+
+
+def test_another_robot_is_refused(cfg: RadioConfig) -> None:
+    hello = BeaconRobot(cfg, RadioWorld(cfg)).hello(boot=1, nonce="0" * 32, auth="none", lockstep=True)
+    check_beacon_robot(cfg, hello)
+    other = beacon_config("zigbee", vehicle__wheelbase_m=0.5, vehicle__kind="differential")
+    with pytest.raises(ConfigError, match=r"vehicle.wheelbase_m is 0.5 here and 0.35 there.*kind is differential"):
+        check_beacon_robot(other, hello)
+    with pytest.raises(ConfigError, match="the distance sensors look elsewhere"):
+        check_beacon_robot(beacon_config("follow"), hello)
+
+
+def test_a_mirror_robot_is_no_beacon_robot(cfg: RadioConfig) -> None:
+    hello = BeaconRobot(cfg, RadioWorld(cfg)).hello(boot=1, nonce="0" * 32, auth="none", lockstep=True)
+    hello.robot.vehicle = None
+    assert isinstance(hello, Hello)
+    with pytest.raises(ConfigError, match="says nothing of its vehicle"):
+        check_beacon_robot(cfg, hello)
+
+
+def test_a_summary_without_truth_holds_what_needs_none(cfg: RadioConfig) -> None:
+    book = BeaconSummary(beacon_facts(cfg, is_sim=False))
+    navigator = assemble_beacons(cfg).navigator
+    book.set_map({"beacon1": (0.1, 0.2, 0.01, 0.0, 0.01)}, (2.0, 2, 0), navigator.notes)
+    summary = book.build(1.0)
+    assert summary["trajectory_rmse_m"] is None
+    assert summary["position_error_m"]["max"] is None
+    assert summary["beacons"]["rmse_m"] is None
+    assert summary["beacons"]["mapped"] == 1
+    assert summary["consistency"]["nis_mean"] == 1.0
+
+
+def test_the_store_keeps_what_was_reached(cfg: RadioConfig, tmp_path: Path) -> None:
+    import sqlite3
+
+    path = tmp_path / "mission.sqlite"
+    store = BeaconStore(path, {"system": "zigbee"}, cfg.workspace.waypoints_m, 2)
+    store.record_arrival(3.5, 5, WaypointArrival(1, 1, (2.2, 0.8), PoseBelief((2.1, 0.8, 0.0), np.eye(3))))
+    store.record_event(4.0, "warning", "held: no radio is heard")
+    store.close()
+    with sqlite3.connect(path) as db:
+        reached = db.execute("SELECT number, lap, waypoint, reached_s FROM waypoint WHERE reached_s NOTNULL").fetchall()
+        assert reached == [(5, 1, 1, 3.5)]
+        assert db.execute("SELECT count(*) FROM waypoint").fetchone() == (8,)
+        assert db.execute("SELECT text FROM event").fetchall() == [("held: no radio is heard",)]
+    db.close()
+    with pytest.raises(BeaconStoreError, match="holds a mission already"):
+        BeaconStore(path, {}, (), 0)
+    with pytest.raises(BeaconStoreError, match="cannot be made"):
+        BeaconStore(tmp_path / "nowhere" / "mission.sqlite", {}, (), 0)
+
+
+def test_pulses_of_unknown_motes_are_left_out() -> None:
+    own = SelfMap(beacon_config("cricket").cricket)
+    own.take(MoteBurst(0.0, "stranger", "N1-1", 20.0, [0.01]))
+    own.take(MoteBurst(0.0, "N1-1", "robot", 20.0, [0.01]))
+    assert own.places is None
+    assert not own.is_done
+
+
+SILENCE = {"type": "radio_loss", "at_s": 20.0, "for_s": 20.0, "beacons": []}
+THING = {"type": "obstacle", "at_s": 0.0, "for_s": 40.0, "x_m": 2.0, "y_m": 0.8, "radius_m": 0.15}
+COMING = {"type": "target_approach", "at_s": 30.0, "for_s": 6.0, "speed_m_s": 0.08}
+FASTER = {**COMING, "for_s": 8.0, "speed_m_s": 0.12}
+
+
+def test_silence_of_all_radios_holds_the_robot_until_they_are_heard_again() -> None:
+    cfg = beacon_config("zigbee", sim__incidents=[SILENCE])
+    found = play(BeaconSilWorld(cfg)).result()
+    held = [t_s for t_s, state in zip(found.times_s, found.states, strict=True) if state == "held"]
+    # The last scan before the silence is at 18 s, the first after it at 42 s.
+    assert held[0] == pytest.approx(18.0 + cfg.danger.radio_timeout_s, abs=0.2)
+    assert held[-1] == pytest.approx(42.0, abs=0.2)
+    assert moved_m(found, held[0] + 0.1, held[-1]) == 0.0
+    assert found.outcome == "complete"
+    assert found.summary["danger"] == {"radio": 1}
+
+
+def test_silence_that_lasts_needs_an_operator() -> None:
+    silence = {**SILENCE, "for_s": 1e4}
+    stage = play(BeaconSilWorld(beacon_config("zigbee", sim__incidents=[silence])))
+    assert stage.mission.is_faulted
+    assert stage.mission.cause.startswith("no radio is heard for 30 s")
+    assert stage.found.verdicts[-1].severity is Severity.FAULT
+
+
+def test_one_radio_less_is_no_silence() -> None:
+    silence = {**SILENCE, "beacons": ["beacon1"]}
+    found = play(BeaconSilWorld(beacon_config("zigbee", mission__laps=1, sim__incidents=[silence]))).result()
+    assert found.outcome == "complete"
+    assert found.summary["danger"] == {}
+
+
+def test_a_thing_in_the_way_is_not_run_into_without_avoidance() -> None:
+    cfg = beacon_config("zigbee", mission__laps=1, sim__incidents=[THING])
+    found = play(BeaconSilWorld(cfg)).result()
+    near = [verdict for verdict in found.verdicts if verdict.code is EventCode.NEAR_EDGE]
+    assert near
+    assert {verdict.signal for verdict in near} == {"obstacle"}
+    assert min(row[7] for row in found.truth if row[7] is not None) > 0.0
+    assert found.outcome == "complete"  # once it is taken away
+
+
+def test_a_thing_that_stays_ends_at_the_time_limit() -> None:
+    thing = {**THING, "for_s": 1e4}
+    cfg = beacon_config("zigbee", mission__laps=1, mission__time_limit_s=60.0, sim__incidents=[thing])
+    stage = play(BeaconSilWorld(cfg))
+    assert stage.mission.is_faulted
+    assert "mission.time_limit_s" in stage.mission.cause
+    assert not stage.result().summary["obstacles"]["touched"]
+
+
+def test_the_robot_backs_off_from_a_target_that_comes() -> None:
+    cfg = beacon_config("follow", mission__follow_s=45.0, sim__incidents=[COMING], sim__obstacles=[])
+    found = play(BeaconSilWorld(cfg)).result()
+    distances, speeds = target_distances(found), np.array(found.speeds_m_s)
+    during = (np.array(found.times_s) > 30.0) & (np.array(found.times_s) < 40.0)
+    assert cfg.danger.target_m < distances[during].min() < cfg.follow.safe_distance_m
+    assert speeds[during].min() == pytest.approx(-cfg.follow.back_speed_m_s)
+    assert "target" not in found.summary["danger"]  # it began early enough
+
+
+def test_no_motion_towards_a_target_that_comes_faster_than_the_robot_backs() -> None:
+    cfg = beacon_config("follow", mission__follow_s=45.0, sim__incidents=[FASTER], sim__obstacles=[])
+    found = play(BeaconSilWorld(cfg)).result()
+    distances, speeds = target_distances(found), np.array(found.speeds_m_s)
+    assert distances.min() < cfg.danger.target_m
+    assert "target" in found.summary["danger"]
+    assert (speeds[distances < 0.9 * cfg.danger.target_m] <= 0.0).all()
+
+
+def test_fire_sends_the_robot_to_its_start() -> None:
+    stage = play(BeaconSilWorld(beacon_config("zigbee")), until_s=30.0)
+    assert stage.danger.emergency("fire", "a") is None
+    found = play(stage).result()
+    assert found.outcome == "aborted, at base"
+    assert found.states[-2] == "returning"
+    start = stage.robot.world.pose
+    assert np.hypot(start.x_m - 0.8, start.y_m - 0.8) < 0.15 + 0.2  # arrival radius, and the pose's error
+
+
+def test_nothing_moves_in_an_earthquake_and_then_the_robot_returns() -> None:
+    stage = play(BeaconSilWorld(beacon_config("zigbee")), until_s=20.0)
+    stage.danger.emergency("earthquake", "a")
+    play(stage, until_s=30.0)
+    assert stage.mission.state == "held"
+    assert stage.mission.resume() == "emergency: earthquake: nothing moves until that is cleared"
+    assert stage.danger.clear("a", at_base_or_held=True) is None
+    found = play(stage).result()
+    assert moved_m(found, 20.3, 30.0) == 0.0
+    assert found.outcome == "aborted, at base"
+
+
+def test_a_pose_too_uncertain_holds_until_readings_help() -> None:
+    cfg = beacon_config("zigbee", start__position_sigma_m=0.6, danger__hold_limit_s=600.0)
+    stage = play(BeaconSilWorld(cfg), until_s=10.0)
+    assert stage.mission.state == "held"
+    assert stage.mission.cause == "the position is too uncertain"

@@ -1,0 +1,323 @@
+"""Reading the configuration: what is laid over what, and where a complaint points to."""
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ccatp.config.load import (
+    available,
+    dump_config,
+    dump_radio_config,
+    is_radio_file,
+    json_schema,
+    load_config,
+    load_radio_config,
+    shipped_config_dir,
+)
+from ccatp.config.models import Config
+from ccatp.errors import ConfigError
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("mirror", ["fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2"])
+@pytest.mark.parametrize("world", ["thesis", "thesis-x2", "hard", "extreme"])
+def test_every_shipped_mirror_and_world_is_valid(mirror: str, world: str) -> None:
+    cfg = load_config(overrides={"run.mirror": mirror, "run.world": world})
+    assert (cfg.mirror.name, cfg.world.name) == (mirror, world)
+
+
+def test_the_shipped_names_are_those_of_the_contract() -> None:
+    assert available("mirror") == ["fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2"]
+    assert available("world") == ["extreme", "hard", "thesis", "thesis-x2"]
+
+
+@pytest.mark.parametrize("world", ["thesis", "thesis-x2"])
+def test_the_worlds_of_the_thesis_have_no_disturbance(world: str) -> None:
+    values = load_config(overrides={"run.world": world}).world.model_dump()
+    noise = {key for key, value in values.items() if value and not key.endswith("_walk_time_s")}
+    assert noise == {
+        "name", "accelerometer_sigma_m_s2", "gyroscope_sigma_rad_s", "encoder_sigma_rad_s",
+        "start_position_sigma_m", "start_heading_sigma_rad",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("world", ["hard", "extreme"])
+def test_the_disturbed_worlds_have_every_disturbance(world: str) -> None:
+    values = load_config(overrides={"run.world": world}).world.model_dump()
+    assert [key for key, value in values.items() if not value] == ["encoder_sigma_rad_s"]  # counts are counted
+
+
+def test_a_file_needs_only_what_differs(tmp_path: Path, config: Config) -> None:
+    cfg = load_config(write(tmp_path / "mine.toml", "[limits]\nv_max_m_s = 0.05\n"))
+    assert cfg.limits.v_max_m_s == 0.05
+    assert cfg.model_copy(update={"limits": config.limits}) == config
+
+
+def test_the_command_line_is_stronger_than_the_file(tmp_path: Path) -> None:
+    file = write(tmp_path / "mine.toml", "[run]\nseed = 2\npanels = 3\n")
+    cfg = load_config(file, {"run.seed": 5, "run.panels": None})
+    assert (cfg.run.seed, cfg.run.panels) == (5, 3)
+
+
+def test_a_set_of_gains_may_be_added(tmp_path: Path) -> None:
+    pid = "{ kp = 1.0, ki = 0.0, kd = 0.0, derivative_filter_s = 0.0, integral_limit = 0.0 }"
+    text = (
+        '[control]\ngains = "mine"\n[control.gain_sets.mine]\nshaped = true\nposition_tolerance_m = 0.001\n'
+        f"heading_tolerance_rad = 0.01\nforward = {pid}\nangular = {pid}\n"
+    )
+    cfg = load_config(write(tmp_path / "mine.toml", text))
+    assert set(cfg.control.gain_sets) == {"mine", "shipped", "thesis"}
+    assert cfg.control.gain_sets["mine"].forward.kp == 1.0
+
+
+def test_single_keys_of_the_mirror_are_laid_over_the_named_one(tmp_path: Path) -> None:
+    file = write(tmp_path / "mine.toml", '[run]\nmirror = "fyst-m2"\n[mirror.base]\nrow = 2\n')
+    cfg = load_config(file)
+    assert cfg.mirror.base.row == 2
+    assert cfg.mirror.panels == load_config(overrides={"run.mirror": "fyst-m2"}).mirror.panels
+
+
+def test_a_mirror_may_be_a_file_beside_the_configuration(tmp_path: Path) -> None:
+    shipped = shipped_config_dir() / "mirrors" / "fyst-m1.toml"
+    write(tmp_path / "mine.toml", shipped.read_text(encoding="utf-8").replace('name = "fyst-m1"', 'name = "ours"'))
+    cfg = load_config(write(tmp_path / "config.toml", '[run]\nmirror = "mine.toml"\n'))
+    assert cfg.mirror.name == "ours"
+    assert cfg.mirror.panels.count == 77
+
+
+def test_a_fault_in_a_mirror_file_is_found_there(tmp_path: Path) -> None:
+    shipped = (shipped_config_dir() / "mirrors" / "fyst-m1.toml").read_text(encoding="utf-8")
+    mirror = write(tmp_path / "mine.toml", shipped.replace("count = 77", "count = 87"))
+    line = next(n for n, text in enumerate(shipped.splitlines(), start=1) if text.startswith("count = 77"))
+    with pytest.raises(ConfigError, match="panels_per_row adds up to 77") as caught:
+        load_config(overrides={"run.mirror": str(mirror)})
+    assert str(caught.value).startswith(f"{mirror}:{line}: mirror.panels.count = 87")
+
+
+@pytest.mark.parametrize("mirror", ["fyst-m1", "thesis-m2"])
+def test_what_is_written_loads_back_equal(tmp_path: Path, mirror: str) -> None:
+    cfg = load_config(overrides={"run.mirror": mirror, "run.seed": 7, "limits.v_max_m_s": 0.1 + 0.2 - 0.25})
+    assert load_config(write(tmp_path / "config.toml", dump_config(cfg))) == cfg
+
+
+def test_a_written_configuration_needs_no_mirror_file(tmp_path: Path) -> None:
+    shipped = shipped_config_dir() / "mirrors" / "fyst-m1.toml"
+    mirror = write(tmp_path / "gone.toml", shipped.read_text(encoding="utf-8"))
+    cfg = load_config(overrides={"run.mirror": str(mirror)})
+    file = write(tmp_path / "config.toml", dump_config(cfg))
+    mirror.unlink()
+    assert load_config(file) == cfg
+
+
+def test_another_mirror_replaces_the_one_written_in_full(tmp_path: Path, config: Config) -> None:
+    file = write(tmp_path / "config.toml", dump_config(config))
+    assert load_config(file, {"run.mirror": "fyst-m2"}).mirror.name == "fyst-m2"
+    assert load_config(file, {"run.mirror": "fyst-m1"}) == config
+
+
+def test_a_key_of_the_mirror_may_come_from_the_command_line(tmp_path: Path, config: Config) -> None:
+    file = write(tmp_path / "config.toml", dump_config(config))
+    assert load_config(file, {"mirror.base.row": 3}).mirror.base.row == 3
+    changed = load_config(file, {"run.mirror": "fyst-m2", "mirror.base.row": 3}).mirror
+    assert (changed.name, changed.base.row) == ("fyst-m2", 3)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "line"),
+    [
+        ({"run.mirror": "fyst-m"}, 'run.mirror = "fyst-m" is no mirror; did you mean'),
+        ({"run.sed": 2}, r"run.sed is unknown; did you mean run.seed\?"),
+        ({"robot.wheel_radius_m": 30}, r"robot.wheel_radius_m = 30 must be at most 0.2; looks like millimetres"),
+        ({"run": 3}, "run = 3 must be a section, not a value"),
+        ({"robot": 3, "robot.port": 4}, "robot.port: robot is given as a value already"),
+        ({"mirror": "fyst-m2"}, "mirror: must be a section; name a mirror with run.mirror"),
+    ],
+)
+def test_a_fault_of_the_command_line_names_it(overrides: dict[str, object], line: str) -> None:
+    with pytest.raises(ConfigError, match=f"^command line: {line}"):
+        load_config(overrides=overrides)
+
+
+def test_a_contradiction_points_to_what_the_user_wrote(tmp_path: Path) -> None:
+    file = write(tmp_path / "mine.toml", "[robot]\nwheel_radius_m = 0.01\n")
+    with pytest.raises(ConfigError, match=r"limits\.v_max_m_s = 0\.1 is more than the wheels give") as caught:
+        load_config(file)
+    assert str(caught.value).startswith(f"{file}:2: ")
+
+
+def test_several_faults_are_all_listed_and_the_first_one_told(tmp_path: Path) -> None:
+    file = write(tmp_path / "mine.toml", "[robot]\nport = -1\nwheel_radius = 0.03\n")
+    with pytest.raises(ConfigError, match=r"\(and 1 more: ccatp config check\)$") as caught:
+        load_config(file)
+    assert caught.value.problems == [
+        f"{file}:3: robot.wheel_radius is unknown; did you mean robot.wheel_radius_m?",
+        f"{file}:2: robot.port = -1 must be at least 0",
+    ]
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none.toml: no such file or directory; name a TOML file that exists"):
+        load_config(tmp_path / "none.toml")
+
+
+def test_a_folder_is_no_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="is a directory; name a TOML file"):
+        load_config(tmp_path)
+
+
+def test_a_file_in_another_encoding_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "latin.toml").write_bytes('[run]\nmirror = "Mirör"'.encode("latin-1"))
+    with pytest.raises(ConfigError, match=r"is not UTF-8 text \(byte 19\)"):
+        load_config(tmp_path / "latin.toml")
+
+
+def test_an_unfinished_file_points_to_its_end(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"mine.toml:2: is not TOML: "):
+        load_config(write(tmp_path / "mine.toml", "[run]\nseed ="))
+
+
+def test_the_schema_allows_what_the_loader_allows(tmp_path: Path) -> None:
+    schema = json_schema()
+    assert schema["title"] == "ccatp configuration"
+    assert schema["additionalProperties"] is False
+    assert set(schema["properties"]) == set(Config.model_fields)
+    assert "required" not in json.dumps(schema)  # a file needs only what differs
+    assert schema["$defs"]["RobotConfig"]["properties"]["wheel_radius_m"]["maximum"] == 0.2
+
+
+def test_the_default_file_says_unit_or_source_of_each_number() -> None:
+    text = (shipped_config_dir() / "ccatp.toml").read_text(encoding="utf-8")
+    assert tomllib.loads(text)["run"]["mirror"] == "fyst-m1"
+    assert "UNVERIFIED" in text
+
+
+@pytest.mark.parametrize("system", ["zigbee", "follow"])
+def test_shipped_files_are_valid_and_name_their_system(system: str) -> None:
+    file = shipped_config_dir() / f"{system}.toml"
+    assert load_radio_config(file).system == system
+    assert is_radio_file(file)
+    assert not is_radio_file(shipped_config_dir() / "ccatp.toml")
+
+
+def test_dump_loads_back_equal(tmp_path: Path) -> None:
+    cfg = load_radio_config(None, {"system": "follow", "run.seed": 7})
+    (tmp_path / "config.toml").write_text(dump_radio_config(cfg))
+    assert load_radio_config(tmp_path / "config.toml") == cfg
+
+
+def test_beacons_of_a_file_replace_all_and_one_of_the_command_line_is_moved(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text('system = "zigbee"\n[sim.beacons]\nsole = { x_m = 1.0, y_m = 2.0, reference_dbm = -40.0 }\n')
+    assert list(load_radio_config(file).sim.beacons) == ["sole"]
+    moved = load_radio_config(None, {"sim.beacons.beacon2.x_m": 0.5}).sim.beacons
+    assert len(moved) == 4
+    assert (moved["beacon2"].x_m, moved["beacon2"].y_m) == (0.5, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"run.sed": 3}, "run.sed is unknown; did you mean run.seed"),
+        ({"system": "zigbe"}, "is no system; did you mean zigbee"),
+        ({"vehicle.speed_max_m_s": -1.0}, "must be greater than 0"),
+        ({"workspace.waypoints_m": [[9.0, 1.0]]}, "lies outside the room of 3 by 3 m"),
+        ({"follow.band_m": 0.9}, "must be less than follow.safe_distance_m"),
+        ({"avoidance.stop_m": 0.9}, "must be less than avoidance.influence_m"),
+        ({"follow.is_active": True, "follow.target": "beacon1"}, "is also a static beacon"),
+        (
+            {"control.fuzzy.rules": [{"when": {"distance_m": "nigh"}, "then": "slow"}]},
+            "is no term of it; available: far, middle, near",
+        ),
+        ({"control.fuzzy.rules": [{"when": {"range": "near"}, "then": "slow"}]}, "no input"),
+        ({"control.fuzzy.rules": [{"when": {"distance_m": "near"}, "then": "crawl"}]}, "is no output"),
+        ({"control.fuzzy.inputs.distance_m.terms.near": [1.0, 0.0, 2.0, 3.0]}, "must rise"),
+    ],
+)
+def test_one_line_says_what_is_wrong(keys: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_radio_config(None, keys)
+
+
+def test_a_base_file_without_a_system_is_told(tmp_path: Path) -> None:
+    (tmp_path / "radio.toml").write_text("[run]\nseed = 1\n")
+    with pytest.raises(ConfigError, match="system is missing"):
+        load_radio_config(None, None, tmp_path)
+
+
+def problem(**keys: Any) -> str:
+    dotted = {f"cricket.{name.replace('__', '.')}": value for name, value in keys.items()}
+    with pytest.raises(ConfigError) as caught:
+        load_radio_config(None, {"system": "cricket", **dotted})
+    return str(caught.value)
+
+
+def test_the_shipped_field_comes_back_from_a_run(tmp_path: Path) -> None:
+    cfg = load_radio_config(None, {"system": "cricket"})
+    (tmp_path / "config.toml").write_text(dump_radio_config(cfg))
+    assert load_radio_config(tmp_path / "config.toml") == cfg
+    assert len(cfg.cricket.networks) == 6
+
+
+def test_a_file_with_networks_of_its_own_has_no_others(tmp_path: Path) -> None:
+    path = tmp_path / "hall.toml"
+    path.write_text(
+        'system = "cricket"\n[cricket.networks]\nP = { place_m = [0.0, 0.0], facing = [1.0, 0.0] }\n'
+        "Q = { place_m = [4.0, 0.0], facing = [-1.0, 0.0] }\n"
+    )
+    assert list(load_radio_config(path).cricket.networks) == ["P", "Q"]
+
+
+@pytest.mark.parametrize(
+    ("keys", "what"),
+    [
+        ({"dimension": 3}, 'cricket.dimension = 3 needs layout = "motes" or "random"; stands lie in a plane'),
+        ({"layout": "motes"}, "cricket.motes has 0; a map needs two"),
+        ({"stand_m": [[0.0, 0.0]]}, "cricket.stand_m has 1 motes; trilateration needs 3"),
+        ({"stand_m": [[0.0, 0.0, 0.0]] * 3}, "cricket.stand_m[0] has 3 coordinates, cricket.dimension = 2 asks for 2"),
+        ({"anchors": {"C": [0.0, 1.0]}}, "cricket.anchors has 3 motes, not 2: the origin and the axis"),
+        ({"anchors": {"A": [0.0, 1.0, 2.0]}}, "cricket.anchors.A has 3 coordinates"),
+        ({"layout": "random", "random__size_m": [1.0, 2.0, 3.0]}, "cricket.random.size_m has 3 coordinates"),
+        ({"networks__N1__facing": [0.0, 0.0]}, "cricket.networks.N1.facing is no direction: all its parts are 0"),
+        ({"networks__N1__place_m": [0.0, 0.0, 1.0]}, "cricket.networks.N1.place_m has 3 coordinates"),
+        ({"transducer__reach_m": [1.0, 2.0]}, "cricket.transducer.reach_m has 2 values for 5 angles"),
+        ({"transducer__off_axis_rad": [0.1, 0.2, 0.3, 0.4, 0.5]}, "must begin with 0 and rise"),
+        ({"phase2__pairs": "few"}, "cricket.phase2.pairs = \"few\" must be 'zigzag', 'adjacent' or 'all'"),
+    ],
+)
+def test_what_is_wrong_is_one_line(keys: dict[str, Any], what: str) -> None:
+    found = problem(**keys)
+    assert what in found
+    assert "\n" not in found
+
+
+def test_a_field_of_one_stand(tmp_path: Path) -> None:
+    path = tmp_path / "one.toml"
+    path.write_text('system = "cricket"\n[cricket.networks]\nP = { place_m = [0.0, 0.0], facing = [1.0, 0.0] }\n')
+    with pytest.raises(ConfigError, match="networks has 1; phase 1 goes from one network to the next"):
+        load_radio_config(path)
+
+
+FOLDER = Path(__file__).parents[2] / "configs"
+FILES = sorted(FOLDER.glob("*.toml"))
+
+
+def test_there_are_bad_configs() -> None:
+    assert len(FILES) > 50
+
+
+@pytest.mark.fault("P20")
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_the_fault_is_told_in_one_line(file: Path) -> None:
+    expected = file.read_text().splitlines()[0].removeprefix("# fault: ").replace("<folder>", str(FOLDER))
+    with pytest.raises(ConfigError) as caught:
+        load_config(file)
+    assert caught.value.problems[0] == f"{file}:{expected}"
+    assert "\n" not in str(caught.value)
+    assert caught.value.exit_status == 2

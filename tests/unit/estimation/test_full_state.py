@@ -1,0 +1,659 @@
+"""Pure. The full-state localizer: fixes that contradict it, divergence, time stamps, and each of its techniques."""
+
+from dataclasses import replace
+from math import hypot, inf, nan, sqrt
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ccatp.core import DeckPose, Fix, FloatArray, GravitySample, PanelId, PanelPose
+from ccatp.estimation.fixes import FixGated, FixRefused
+from ccatp.estimation.full_state import FullStateLocalizer
+from ccatp.estimation.sample_validation import MAX_FRAME_STEP_S
+from ccatp.estimation.state_model import BG, PSI, SL, SR, STATES, TX, A, V, W, X, Y
+from ccatp.filters import FILTERS, Filter, FilterDiverged
+from tests.unit.estimation.drive import (
+    FRAME_S,
+    STEEP,
+    Errors,
+    Frame,
+    Robot,
+    build,
+    config,
+    errors_of,
+    fix_at,
+    mirror,
+    run,
+    trapeze,
+)
+from tests.unit.estimation.test_seams import across_it, before_a_seam
+
+NOISY = Errors(right_slip=0.02, left_slip=0.01, creep=0.02, gyro_bias=0.01, noise=1.0)
+LEVEL = replace(NOISY, creep=0.0)
+COUNTING = replace(NOISY, counts_per_turn=1200)
+STRAIGHT = trapeze(0.5, 1.5, 0.1, 0.2)
+
+
+def rested(found: FullStateLocalizer, wrong: Errors = NOISY) -> Robot:
+    """A robot that has driven 0.1 m and stands, and its localizer knows where."""
+    robot = Robot(v=lambda t: STRAIGHT(t) + STRAIGHT(t - 3.0), errors=wrong)
+    run(found, robot.frames(2.6))
+    found.fuse_fix(robot.fix())
+    return robot
+
+
+# -- gating -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_fix_places_the_robot_and_shows_its_heading_after_a_way(filter_name: str) -> None:
+    """Two fixes are a base line: 0.15 m and 10 um are 0.1 mrad; a creep that were not known would look the same."""
+    found = build(filter_name, creep_sigma=1e-4)
+    robot = rested(found, wrong=LEVEL)
+    assert errors_of(found, robot.pose)[0] < 2e-5
+    assert found.innovation is not None
+    assert found.innovation.size == 2
+    run(found, robot.frames(2.9))
+    found.fuse_fix(robot.fix())
+    distance_m, heading_rad = errors_of(found, robot.pose)
+    assert distance_m < 2e-5
+    assert found.heading_sigma_rad < 2e-3
+    assert abs(heading_rad) < 4.0 * found.heading_sigma_rad
+    assert found.counts["fixes"] == 2
+
+
+def test_fixes_of_a_panel_share_its_tilt() -> None:
+    """A puck 0.1 mm off its place at both ends of a base line of 0.135 m turns nothing; chance would, 1 mrad."""
+    found = build(  # the wheels tell no heading, but they keep it
+        panel_tilt_sigma_rad=2e-3,
+        creep_sigma=1e-6,
+        slip_difference_sigma=1e-6,
+        slip_scatter_max=1e-6,
+        wheel_base_sigma=1e-6,
+    )
+    robot = Robot(v=lambda t: STRAIGHT(t) + STRAIGHT(t - 3.0), errors=Errors(noise=1.0))
+    run(found, robot.frames(2.6))
+    found.fuse_fix(robot.fix(sigma_m=1e-6, off_m=(1e-4, 1e-4)))
+    run(found, robot.frames(2.9))
+    found.fuse_fix(robot.fix(sigma_m=1e-6, off_m=(1e-4, 1e-4)))
+    assert found.heading_sigma_rad < 2e-4
+    assert abs(errors_of(found, robot.pose)[1]) < 4.0 * found.heading_sigma_rad
+    assert found.position_sigma_m == pytest.approx(1e-4, rel=0.2)  # the tilt itself cannot be told from the place
+
+
+def test_another_panel_has_a_tilt_of_its_own() -> None:
+    found = build(start=PanelPose(PanelId(2, 7), 0.25, 0.0, 0.0))
+    robot = Robot(PanelPose(PanelId(2, 7), 0.25, 0.0, 0.0), v=STRAIGHT)
+    prior = found.state[1][TX, TX]
+    run(found, robot.frames(0.4))
+    found.fuse_fix(robot.fix(sigma_m=1e-6))
+    assert abs(found.state[1][X, TX]) > 0.5 * prior  # the fix ties it to the place
+    run(found, robot.frames(2.2))
+    P = found.state[1]
+    assert found.pose.panel == PanelId(2, 8)
+    assert P[TX, TX] == pytest.approx(prior)
+    assert not np.delete(P[TX], TX).any()
+
+
+def test_how_far_the_fix_is_above_the_surface() -> None:
+    found = build()
+    robot = rested(found)
+    fix = robot.fix()
+    n = np.array(mirror().rotate_world_from_deck(mirror().surface.normal(robot.x_m, robot.y_m)))
+    lifted = Fix(fix.t_s, tuple((np.array(fix.position_m) + 2e-4 * n).tolist()), *list_of(fix)[2:])
+    found.fuse_fix(lifted)
+    assert found.fix_deviation_m == pytest.approx(2e-4, abs=1e-9)
+    assert errors_of(found, robot.pose)[0] < 2e-5
+
+
+def list_of(fix: Fix) -> list[Any]:
+    return [fix.t_s, fix.position_m, fix.covariance_m2, fix.dop, fix.channels, fix.residual_rms_m]
+
+
+def test_one_wild_fix_is_gated(filter_name: str) -> None:
+    found = build(filter_name)
+    robot = rested(found)
+    before = found.pose, found.state[0].copy(), found.state[1].copy()
+    with pytest.raises(FixGated, match=r"fix is 30\.0 mm from the estimate, sigma 0\.01 mm"):
+        found.fuse_fix(robot.fix(off_m=(0.03, 0.0)))
+    assert found.pose == before[0]
+    assert np.array_equal(found.state[0], before[1])
+    assert np.array_equal(found.state[1], before[2])
+    assert found.counts["fixes_gated"] == 1
+    assert found.fuse_fix(robot.fix()) < 1e-5
+    assert not found.notices
+
+
+@pytest.mark.parametrize("off_sigmas", [6.5, 7.5])
+def test_where_the_gate_is(off_sigmas: float) -> None:
+    """Seven sigmas: their square is a NIS of 50."""
+    found = build()
+    robot = rested(found)
+    x, P = found.state
+    sigma = sqrt(P[X, X] + P[TX, TX] + 2.0 * P[X, TX] + 1e-10)
+    fix = fix_at(robot.t_s, (float(x[X]) + off_sigmas * sigma, float(x[Y])))
+    if off_sigmas < sqrt(50.0):
+        found.fuse_fix(fix)
+    else:
+        with pytest.raises(FixGated):
+            found.fuse_fix(fix)
+
+
+def test_a_heavy_fix_is_not_refused_for_its_distance() -> None:
+    found = build()
+    robot = rested(found)
+    found.fuse_fix(robot.fix(sigma_m=0.02, off_m=(0.03, 0.0)))
+    assert errors_of(found, robot.pose)[0] < 1e-4  # it weighs (1e-5/0.02)^2
+
+
+OFF = (0.03, -0.02)
+NEARLY = [OFF, (0.031, -0.02), (0.03, -0.021)]
+
+
+def test_three_fixes_that_agree_are_right(filter_name: str, full: Any) -> None:
+    found = build(filter_name)
+    robot = rested(found)
+    heading, variance = found.deck_pose.heading_rad, float(found.state[1][PSI, PSI])
+    for off in NEARLY[:2]:
+        with pytest.raises(FixGated):
+            found.fuse_fix(robot.fix(off_m=off))
+    jump_m = found.fuse_fix(robot.fix(off_m=NEARLY[2]))
+    assert jump_m == pytest.approx(sqrt(0.03**2 + 0.021**2), abs=3e-5)
+    assert found.notices == ["3 fixes in a row say that the pose is 36.6 mm wrong: it begins anew"]
+    assert (found.counts["fixes_gated"], found.counts["reinitialised"], found.counts["fixes"]) == (3, 1, 2)
+    assert found.deck_pose.x_m == pytest.approx(robot.x_m + 0.03, abs=1e-9)
+    assert found.deck_pose.heading_rad == pytest.approx(heading, abs=1e-12)
+    assert found.state[1][PSI, PSI] == pytest.approx(variance + full.relocated_heading_sigma_rad**2)
+    assert found.position_sigma_m < 1.3e-5
+
+
+def begin_anew(found: FullStateLocalizer, robot: Robot, off_m: tuple[float, float]) -> None:
+    for _ in range(2):
+        with pytest.raises(FixGated):
+            found.fuse_fix(robot.fix(off_m=off_m))
+    found.fuse_fix(robot.fix(off_m=off_m))
+
+
+def test_a_leg_that_ended_elsewhere_puts_the_heading_in_doubt() -> None:
+    found = build()
+    robot = rested(found)
+    start = found.deck_pose
+    run(found, robot.frames(2.9))
+    end, before = found.deck_pose, float(found.state[1][PSI, PSI])
+    leg_m = hypot(end.x_m - start.x_m, end.y_m - start.y_m)
+    begin_anew(found, robot, (0.03, 0.03))
+    doubt_rad = sqrt(float(found.state[1][PSI, PSI]) - before)
+    assert doubt_rad == pytest.approx(hypot(0.03, 0.03) / leg_m, rel=0.02)  # the estimate is some 0.1 mm off
+
+
+def test_who_begins_anew_twice_in_a_row_forgets_what_was_learned() -> None:
+    found = build()
+    robot = rested(found)
+    run(found, robot.frames(2.9))
+    learned = found.state[1][BG, BG]
+    begin_anew(found, robot, (0.0, 0.03))
+    assert found.state[1][BG, BG] == pytest.approx(learned)
+    begin_anew(found, robot, (0.0, 0.06))
+    assert found.state[1][BG, BG] > 10.0 * learned
+    assert found.deck_pose.y_m == pytest.approx(robot.y_m + 0.06, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    "offs",
+    [
+        [OFF, (-0.03, 0.02), (0.03, 0.02)],
+        [OFF, (0.0335, -0.02), (0.03, -0.0235)],  # each 3.5 mm from the one before
+    ],
+)
+def test_three_fixes_that_do_not_agree_are_not(offs: list[tuple[float, float]]) -> None:
+    found = build()
+    robot = rested(found)
+    before = found.pose
+    for off in offs:
+        with pytest.raises(FixGated):
+            found.fuse_fix(robot.fix(off_m=off))
+    assert found.pose == before
+    assert (found.counts["fixes_gated"], found.counts["reinitialised"]) == (3, 0)
+
+
+def test_a_true_fix_in_between_ends_the_row() -> None:
+    found = build()
+    robot = rested(found)
+    for off in [OFF, OFF, None, OFF, OFF]:
+        if off is None:
+            found.fuse_fix(robot.fix())
+            continue
+        with pytest.raises(FixGated):
+            found.fuse_fix(robot.fix(off_m=off))
+    assert found.counts["reinitialised"] == 0
+
+
+def test_wild_fixes_between_those_that_agree_begin_the_row_anew() -> None:
+    found = build()
+    robot = rested(found)
+    for off in [OFF, OFF, (-0.05, 0.0), OFF, OFF]:
+        with pytest.raises(FixGated):
+            found.fuse_fix(robot.fix(off_m=off))
+    found.fuse_fix(robot.fix(off_m=OFF))
+    assert found.counts["reinitialised"] == 1
+
+
+def test_after_a_new_beginning_it_converges(filter_name: str) -> None:
+    """The robot was carried 50 mm and turned by 80 mrad; fixes at three stops tell all of it."""
+    found = build(filter_name, creep_sigma=1e-4)
+    robot = rested(found, LEVEL)
+    at = robot.pose
+    panel = mirror().panel_pose(STEEP.panel, DeckPose(at.x_m + 0.04, at.y_m - 0.03, at.heading_rad + 0.08))
+    leg = trapeze(0.0, 2.5, 0.1, 0.2)
+    carried = Robot(panel, v=lambda t: leg(t - 2.7) + leg(t - 5.9), errors=LEVEL)
+    carried.ticks = robot.ticks
+    for _ in range(2):
+        with pytest.raises(FixGated):
+            found.fuse_fix(carried.fix())
+    found.fuse_fix(carried.fix())
+    for _ in range(2):
+        run(found, carried.frames(3.2))
+        found.fuse_fix(carried.fix())
+    distance_m, heading_rad = errors_of(found, carried.pose)
+    assert distance_m < 2e-5
+    assert abs(heading_rad) < 4.0 * found.heading_sigma_rad < 8e-3
+    assert found.counts["reinitialised"] == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"t_s": nan}, "fix is not finite"),
+        ({"position_m": (0.0, nan, 0.0)}, r"fix is not finite: \(0.0, nan, 0.0\) m"),
+        ({"position_m": (0.0, inf, 0.0)}, "fix is not finite"),
+        ({"covariance_m2": (nan,) * 9}, "fix is not finite"),
+        ({"covariance_m2": (0.0,) * 9}, r"fix has the covariance .* along the surface"),
+        ({"covariance_m2": (-1e-10, 0.0, 0.0, 0.0, 1e-10, 0.0, 0.0, 0.0, 1e-10)}, "along the surface"),
+        ({"position_m": (40.0, -900.0, 300.0)}, "has no foot on the mirror"),
+        ({"t_s": 0.0}, "outside the known path"),
+    ],
+)
+def test_a_fix_that_says_nothing_is_refused(change: dict[str, Any], match: str) -> None:
+    found = build()
+    robot = rested(found)
+    run(found, robot.frames(2.8))
+    before = found.pose, found.state[0]
+    names = ("t_s", "position_m", "covariance_m2", "dop", "channels", "residual_rms_m")
+    good = dict(zip(names, list_of(robot.fix()), strict=True))
+    with pytest.raises(FixRefused, match=match) as refusal:
+        found.fuse_fix(Fix(**{**good, **change}))
+    assert not isinstance(refusal.value, FixGated)
+    assert found.pose == before[0]
+    assert np.array_equal(found.state[0], before[1])
+
+
+# -- divergence -------------------------------------------------------------------------------------------------------
+
+
+class Fragile:
+    """A filter that diverges when it is told to."""
+
+    def __init__(self, filter_: Filter) -> None:
+        self._filter = filter_
+        self.is_broken = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._filter, name)
+
+    def predict(self, F: Any, Q: FloatArray) -> None:
+        if self.is_broken:
+            raise FilterDiverged("for the sake of the test")
+        self._filter.predict(F, Q)
+
+
+def fragile() -> tuple[FullStateLocalizer, Fragile]:
+    filter_ = Fragile(FILTERS["ekf"](np.zeros(STATES), np.eye(STATES)))
+    cfg = config()
+    return FullStateLocalizer(filter_, mirror(), cfg.robot, cfg.localizer, STEEP), filter_
+
+
+def test_a_filter_that_diverges_freezes_the_pose_and_asks_to_hold() -> None:
+    found, filter_ = fragile()
+    robot = Robot(v=STRAIGHT, errors=NOISY)
+    run(found, robot.frames(1.2))
+    filter_.is_broken = True
+    run(found, robot.frames(0.1))
+    assert found.is_frozen
+    assert found.hold_requested
+    assert found.hold_cause == "filter: for the sake of the test"
+    assert found.counts["diverged"] == 1
+    before = found.pose
+    found.clear_hold()
+    run(found, robot.frames(0.5))
+    assert found.pose == before
+    assert not found.hold_requested  # told once
+
+
+def test_a_fix_revives_it() -> None:
+    """The filter breaks when the robot drives off and works again when it has been put back."""
+    found, filter_ = fragile()
+    robot = rested(found)
+    run(found, robot.frames(0.8))
+    filter_.is_broken = True
+    run(found, robot.frames(0.2))
+    assert found.is_frozen
+    filter_.is_broken = False
+    found.fuse_fix(robot.fix())
+    assert not found.is_frozen
+    assert errors_of(found, robot.pose)[0] < 1e-9
+
+
+def test_a_speed_that_no_wheel_can_give_is_a_divergence() -> None:
+    found, robot = build(), Robot(v=STRAIGHT, errors=NOISY)
+    run(found, robot.frames(1.2))
+    frame = robot.frame()
+    found.step(*frame._replace(encoders=[s._replace(right_rad_s=3e3, left_rad_s=3e3) for s in frame.encoders]))
+    run(found, robot.frames(0.1))
+    assert found.is_frozen
+    assert "more than the wheels can do" in found.hold_cause
+
+
+def spoilt(frame: Frame, value: float) -> Frame:
+    return frame._replace(
+        imu=[s._replace(ax_m_s2=value) for s in frame.imu],
+        encoders=[s._replace(right_rad_s=value) if k % 2 else s for k, s in enumerate(frame.encoders)],
+    )
+
+
+@pytest.mark.parametrize("value", [nan, inf, -inf])
+def test_samples_that_are_no_numbers_do_not_get_in(value: float) -> None:
+    found, robot = build(), Robot(v=STRAIGHT, errors=NOISY)
+    for k, frame in enumerate(robot.frames(2.5)):
+        found.step(*(spoilt(frame, value) if k % 7 == 0 else frame))
+    assert found.counts["nonfinite"] == 36 * 6
+    assert np.isfinite(found.state[0]).all()
+    assert not found.is_frozen
+    # 2 % of slip that is not known on 0.12 m, and some sigmas of it.
+    assert errors_of(found, robot.pose)[0] < 4e-3
+
+
+# -- time stamps ------------------------------------------------------------------------------------------------------
+
+
+def shifted(frame: Frame, by_s: float) -> Frame:
+    return Frame(
+        frame.t_s + by_s,
+        [s._replace(t_s=s.t_s + by_s) for s in frame.imu],
+        [s._replace(t_s=s.t_s + by_s) for s in frame.encoders],
+        [s._replace(t_s=s.t_s + by_s) for s in frame.edges],
+        None,
+    )
+
+
+def driven(found: FullStateLocalizer) -> Robot:
+    robot = Robot(v=trapeze(0.5, 9.0, 0.1, 0.2), errors=NOISY)
+    run(found, robot.frames(1.81))
+    return robot
+
+
+def at_constant_speed(before: DeckPose, after: DeckPose, way_m: float) -> bool:
+    """Within a millimetre; the slip that is not known makes 2 % of the way."""
+    hx, hy, _, _ = mirror().body_axes(before)
+    return abs(after.x_m - before.x_m - way_m * hx) < 1e-3 and abs(after.y_m - before.y_m - way_m * hy) < 1e-3
+
+
+@pytest.mark.parametrize("jump_s", [-500.0, -1.0, 0.5, 1e4])
+def test_when_the_clock_jumps_the_pose_does_not_step(jump_s: float) -> None:
+    found = build()
+    robot = driven(found)
+    before, variance, t_s = found.deck_pose, float(found.state[1][X, X]), found.t_s
+    found.step(*shifted(robot.frame(), jump_s))
+    assert (found.deck_pose, found.t_s) == (before, t_s)  # a frame from elsewhere changes nothing
+    assert found.counts["suspect_frames"] == 1
+    found.step(*shifted(robot.frame(), jump_s))
+    assert found.counts["resyncs"] == 1
+    assert found.t_s == pytest.approx(robot.t_s + jump_s)
+    assert at_constant_speed(before, found.deck_pose, 0.0)
+    # What may have happened meanwhile.
+    assert found.state[1][X, X] > variance + (0.09 * MAX_FRAME_STEP_S) ** 2
+    for frame in robot.frames(0.5):
+        found.step(*shifted(frame, jump_s))
+    assert not found.is_frozen
+    assert not found.hold_requested
+
+
+def test_a_gap_in_the_link_is_a_jump_too() -> None:
+    found = build()
+    robot = driven(found)
+    before = found.deck_pose
+    robot.frames(0.3)
+    run(found, [robot.frame(), robot.frame()])
+    assert found.counts["resyncs"] == 1
+    assert at_constant_speed(before, found.deck_pose, 0.0)
+    assert found.position_sigma_m > 0.0098
+
+
+def test_a_short_gap_is_bridged() -> None:
+    """Five frames get lost: the wheels' angle in between is told by its rates on both sides."""
+    found = build()
+    robot = driven(found)
+    before = found.deck_pose
+    robot.frames(0.05)
+    run(found, robot.frames(0.1))
+    assert found.counts["resyncs"] == 0
+    assert at_constant_speed(before, found.deck_pose, 0.015)
+
+
+def test_frames_that_come_twice_or_backward_change_nothing() -> None:
+    plain, found = build(), build()
+    robot = Robot(v=STRAIGHT, errors=NOISY)
+    frames = robot.frames(2.5)
+    for k, frame in enumerate(frames):
+        plain.step(*frame)
+        found.step(*frame)
+        for back in (0, 3) if k % 5 == 4 else ():
+            found.step(*frames[k - back])
+    assert found.pose == plain.pose
+    assert np.array_equal(found.state[0], plain.state[0])
+    assert found.counts["stale_frames"] == 100
+    assert not found.hold_requested
+
+
+def test_time_that_runs_backward_asks_to_hold() -> None:
+    found = build()
+    robot = driven(found)
+    frame = robot.frame()
+    found.step(*frame)
+    for k in range(4):
+        found.step(*shifted(frame, -0.01 * k))
+        assert not found.hold_requested
+    found.step(*shifted(frame, -0.05))
+    assert found.hold_cause == "time stamps of the frames run backward"
+
+
+def test_samples_that_run_backward_ask_to_hold() -> None:
+    found = build()
+    robot = driven(found)
+    for _ in range(5):
+        frame = robot.frame()
+        found.step(*frame._replace(imu=[s._replace(t_s=s.t_s - 0.05 - FRAME_S / 2.0) for s in frame.imu]))
+    assert found.hold_cause == "time stamps of the imu run backward"
+
+
+def test_at_rest_a_jump_of_the_clock_costs_nothing() -> None:
+    found = build()
+    robot = rested(found)
+    before, variance = found.pose, float(found.state[1][X, X])
+    for frame in robot.frames(0.3):
+        found.step(*shifted(frame, -2.0))
+    assert found.pose.x_m == pytest.approx(before.x_m, abs=1e-6)  # what a fix leaves of speed at rest
+    assert found.state[1][X, X] == pytest.approx(variance, rel=0.01)
+
+
+# -- techniques -------------------------------------------------------------------------------------------------------
+
+
+def both(name: str, frames: list[Frame], start: PanelPose = STEEP) -> tuple[FullStateLocalizer, FullStateLocalizer]:
+    """The same drive with a technique and without."""
+    found = build(start=start), build(start=start, use={name: False})
+    for localizer in found:
+        run(localizer, frames)
+    return found
+
+
+def test_zero_velocity_is_a_switch() -> None:
+    with_, without = both("zero_velocity", Robot(v=STRAIGHT, errors=COUNTING).frames(2.9))
+    full = config().localizer.full_state
+    sigmas = full.rest_speed_sigma_m_s, full.rest_acceleration_sigma_m_s2, full.rest_turn_sigma_rad_s
+    for state, sigma in zip((V, A, W), sigmas, strict=True):
+        assert sqrt(with_.state[1][state, state]) <= sigma
+        assert sqrt(without.state[1][state, state]) > 5.0 * sigma
+
+
+def test_rest_biases_is_a_switch() -> None:
+    with_, without = both("rest_biases", Robot(errors=NOISY).frames(3.3))
+    assert sqrt(with_.state[1][BG, BG]) < 1.2e-3
+    assert sqrt(without.state[1][BG, BG]) > 1.5e-3  # what the first quarter of a second showed
+    assert with_.state[0][BG] == pytest.approx(0.01, abs=4e-3)
+
+
+def test_seams_is_a_switch() -> None:
+    start = before_a_seam(0, True)
+    with_, without = both("seams", Robot(start, v=across_it(), has_edges=True).frames(4.2), start)
+    assert with_.counts["crossings_used"] == 8
+    assert without.counts["crossings_used"] == without.counts["crossings_gated"] == 0
+    assert with_.state[1][X, X] < 4e-8
+    assert without.state[1][X, X] > 1e-6
+
+
+def test_gravity_is_a_switch() -> None:
+    robot = Robot()
+    gravity = GravitySample(0.0, *mirror().gravity_in_robot(robot.pose))
+    with_, without = both("gravity", [f._replace(gravity=gravity) for f in robot.frames(5.3)])
+    assert with_.heading_sigma_rad < 0.85 * without.heading_sigma_rad
+    assert without.heading_sigma_rad == pytest.approx(0.01, rel=1e-2)
+
+
+def test_slip_per_leg_is_a_switch() -> None:
+    found = {}
+    for is_used in (True, False):
+        localizer = build(use={"slip_per_leg": is_used})
+        robot = rested(localizer)
+        run(localizer, robot.frames(0.7))
+        before = localizer.state[1][[SR, SL], [SR, SL]]
+        run(localizer, robot.frames(0.3))
+        found[is_used] = localizer.state[1][[SR, SL], [SR, SL]] / before
+    # 0.75 % of scatter from leg to leg against what the wheels' travel to the first fix left of 1.7 %.
+    assert (found[True] > 1.05).all()
+    assert (found[False] <= 1.0 + 1e-2).all()
+
+
+def test_the_accelerometer_is_a_switch() -> None:
+    with_, without = both("accelerometer", Robot(v=STRAIGHT, errors=COUNTING).frames(1.3))
+    assert with_.state[1][A, A] < 0.9 * without.state[1][A, A]  # 0.1 m/s^2 of jumps against some counts in 40 ms
+
+
+def test_a_robot_at_rest_does_not_crawl() -> None:
+    """The noise of the rates at rest adds up to nothing."""
+    found, robot = build(), Robot(errors=NOISY)
+    run(found, robot.frames(0.5))
+    before = found.pose
+    run(found, robot.frames(20.0))
+    now = found.pose
+    assert (now.x_m, now.y_m) == pytest.approx((before.x_m, before.y_m), abs=1e-9)  # rounding
+    # What is learned of the gyroscope's bias moves the heading with it, by next to nothing of its 10 mrad.
+    assert now.heading_rad == pytest.approx(before.heading_rad, abs=1e-6)
+    assert found.speed_m_s == found.rate_rad_s == 0.0
+
+
+# -- the whole drive --------------------------------------------------------------------------------------------------
+
+L_SHAPED = (lambda t: STRAIGHT(t) + STRAIGHT(t - 3.1), trapeze(2.05, 1.3, 0.8, 2.0))
+
+
+@pytest.mark.parametrize("wrong", [NOISY, COUNTING])
+def test_ekf_and_ukf_agree(wrong: Errors) -> None:
+    """What sigma points see of the bends is small against what is not known.
+
+    The gyroscope's scale error times the rate is the strongest of them: a percent of what is not known of the rate goes
+    to the bias at each turn.
+    """
+    robot = Robot(v=L_SHAPED[0], omega=L_SHAPED[1], errors=wrong)
+    found = build("ekf"), build("ukf")
+    for fix_after_s in (2.0, 3.6):
+        frames = robot.frames(fix_after_s)
+        for localizer in found:
+            run(localizer, frames)
+            localizer.fuse_fix(robot.fix())
+    (x, P), (y, S) = (localizer.state for localizer in found)
+    sigma = np.sqrt(P.diagonal())
+    assert np.max(np.abs(x - y) / (sigma + 1e-9)) < 0.25
+    assert np.sqrt(S.diagonal())[:13] == pytest.approx(sigma[:13], rel=0.06)
+    for localizer in found:
+        distance_m, heading_rad = errors_of(localizer, robot.pose)
+        assert distance_m < 2e-5
+        assert abs(heading_rad) < 4.0 * localizer.heading_sigma_rad
+
+
+def test_between_the_steps_of_the_filter_the_pose_is_carried_on() -> None:
+    """An all but perfect robot, known to be one: each frame's pose, whether the filter has stepped or not."""
+    robot = Robot(
+        v=L_SHAPED[0], omega=L_SHAPED[1], errors=Errors(noise=1e-3)
+    )  # exact zeros would be those of a counter
+    found = build(
+        slip_mean=0.0,
+        slip_sigma=1e-6,
+        slip_scatter_max=1e-6,
+        slip_difference_sigma=1e-6,
+        creep_sigma=1e-6,
+        wheel_base_sigma=1e-6,
+    )
+    for _ in range(500):
+        found.step(*robot.frame())
+        distance_m, heading_rad = errors_of(found, robot.pose)
+        # The wheels' noise of 1 urad/s, and what of it the gyroscope's 9 urad/s are trusted.
+        assert distance_m < 1e-6
+        assert abs(heading_rad) < 1e-5
+        assert found.t_s == robot.t_s
+
+
+def test_the_pose_is_told_in_the_frame_of_the_panel_under_the_robot() -> None:
+    start = before_a_seam(0, True)
+    robot, found = Robot(start, v=across_it()), build(start=start)
+    panels = []
+    for _ in range(420):
+        found.step(*robot.frame())
+        panels.append(found.pose.panel)
+        there = mirror().panel_pose(found.pose.panel, found.deck_pose)
+        assert (found.pose.x_m, found.pose.y_m) == pytest.approx((there.x_m, there.y_m), abs=1e-9)
+        assert found.pose.heading_rad == pytest.approx(there.heading_rad, abs=1e-6)  # the slope of up to 4 mm before
+    assert panels[0] == start.panel
+    assert panels[-1] == PanelId(start.panel.row, start.panel.col + 1)
+
+
+def test_creep_is_told_along_the_panels_axes() -> None:
+    found = build()
+    robot = rested(found)
+    run(found, robot.frames(2.9))
+    found.fuse_fix(robot.fix())
+    x = found.state[0]
+    slope_x, slope_y = found.creep
+    length = sqrt(slope_x**2 + slope_y**2)
+    assert length == pytest.approx(
+        abs(float(x[12])), rel=1e-3
+    )  # the downhill direction is a unit vector of the surface
+
+
+def test_sigmas_are_those_of_the_covariance() -> None:
+    found = build()
+    rested(found)
+    P = found.state[1]
+    assert np.array_equal(found.pose_covariance, P[:3, :3])
+    assert found.position_sigma_m == pytest.approx(sqrt(np.linalg.eigvalsh(P[:2, :2])[1]))
+    assert found.heading_sigma_rad == pytest.approx(sqrt(P[2, 2]))
+
+
+def test_a_word_of_the_mission_is_no_rest() -> None:
+    found = build()
+    robot = driven(found)
+    before = found.speed_m_s, found.state[0]
+    found.rest()
+    assert found.speed_m_s == before[0]
+    assert np.array_equal(found.state[0], before[1])
+    run(found, robot.frames(0.3))
+    assert not found.is_resting

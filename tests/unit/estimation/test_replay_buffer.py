@@ -1,0 +1,553 @@
+"""Pure. A measurement that comes late is taken at its own time, and what followed is done again."""
+
+from functools import cache, partial
+from math import cos
+
+import numpy as np
+import pytest
+
+from ccatp.core import DeckPose, Fix, FloatArray, PanelPose
+from ccatp.estimation.fixes import FixGated, FixRefused
+from ccatp.estimation.full_state import FullStateLocalizer
+from ccatp.estimation.replay_buffer import ReplayBuffer, Step
+from ccatp.estimation.state_filter import SurveyFilter
+from ccatp.estimation.state_model import PSI, STATES, A, V, W
+from ccatp.filters import FILTERS, KalmanFilter
+from tests.unit.estimation.drive import (
+    FRAME_S,
+    STEEP,
+    Errors,
+    Frame,
+    Rate,
+    Robot,
+    build,
+    config,
+    errors_of,
+    fix_at,
+    mirror,
+    run,
+    trapeze,
+)
+from tests.unit.estimation.test_full_state import NOISY, fragile, rested, shifted
+from tests.unit.estimation.test_full_state import STRAIGHT as RecoveriesSTRAIGHT
+from tests.unit.estimation.test_sample_validation import with_gravity
+from tests.unit.estimation.test_seams import across_it, before_a_seam
+
+F, Q = np.array([[1.0, 0.1], [0.0, 1.0]]), np.diag([1e-3, 2e-3])
+H, R = np.array([[1.0, 0.0]]), np.array([0.04])
+
+
+class Recorded:
+    """A linear filter of two states and its journal; a step every 0.1 s."""
+
+    def __init__(self, reach_s: float = 10.0) -> None:
+        self.filter, self.journal = KalmanFilter(np.zeros(2), np.eye(2)), ReplayBuffer(reach_s)
+
+    def step(self, k: int) -> None:
+        self.journal.begin(0.1 * k, 0.1, self.filter)
+        steps: tuple[Step, ...] = (lambda: self.filter.predict(F, Q), lambda: self.measure(0.3 * k, H))
+        for step in steps:
+            self.journal.add(step)
+            step()
+
+    def measure(self, z: float, row: FloatArray) -> None:
+        self.filter.update(np.array([z]), row, R)
+
+    def late(self, t_s: float, z: float) -> int:
+        return self.journal.take(t_s, lambda _: self.measure(z, np.array([[0.2, 1.0]])), self.filter)
+
+
+def same(one: Recorded, other: Recorded) -> None:
+    np.testing.assert_allclose(one.filter.mean, other.filter.mean, rtol=1e-13)  # rounding
+    np.testing.assert_allclose(one.filter.covariance, other.filter.covariance, rtol=1e-13)
+
+
+@pytest.mark.parametrize("back", [0, 1, 5, 9])
+def test_a_late_measurement_is_as_good_as_one_in_time(back: int) -> None:
+    in_time, late = Recorded(), Recorded()
+    for k in range(1, 11):
+        in_time.step(k)
+        late.step(k)
+        if k == 10 - back:
+            in_time.measure(2.0, np.array([[0.2, 1.0]]))
+    assert late.late(1.0 - 0.1 * back, 2.0) == back
+    same(late, in_time)
+
+
+@pytest.mark.parametrize("order", [(3, 6, 9), (9, 3, 6), (9, 6, 3), (6, 6, 3)])
+def test_late_measurements_in_any_order(order: tuple[int, ...]) -> None:
+    in_time, late = Recorded(), Recorded()
+    for k in range(1, 11):
+        in_time.step(k)
+        late.step(k)
+        for _ in range(order.count(k)):
+            in_time.measure(float(k), np.array([[0.2, 1.0]]))
+    for k in order:
+        late.late(0.1 * k, float(k))
+    same(late, in_time)
+
+
+def test_in_the_middle_of_a_step_it_is_told_by_how_much_it_is_late() -> None:
+    told: list[float] = []
+    found = Recorded()
+    for k in range(1, 4):
+        found.step(k)
+    for t_s in (0.13, 0.2, 0.3, 0.5):
+        found.journal.take(t_s, told.append, found.filter)
+    assert told == pytest.approx([0.07, 0.0, 0.0, 0.0], abs=1e-12)
+
+
+def test_of_a_standstill_before_a_step_nothing_is_lost() -> None:
+    found = Recorded()
+    told: list[float] = []
+    found.step(1)
+    found.journal.begin(5.0, 0.0, found.filter)
+    found.journal.begin(5.1, 0.1, found.filter)
+    found.journal.take(3.0, told.append, found.filter)
+    found.journal.take(5.02, told.append, found.filter)
+    assert told == pytest.approx([0.0, 0.08], abs=1e-12)
+
+
+def test_a_look_back_changes_nothing() -> None:
+    found, means = Recorded(), []
+    for k in range(1, 5):
+        found.step(k)
+        means.append(found.filter.mean)
+    for t_s, index, late_s in ((0.1, 0, 0.0), (0.15, 1, 0.05), (0.2, 1, 0.0), (0.4, 3, 0.0), (9.0, 3, 0.0)):
+        mean, _, late = found.journal.look(t_s, found.filter)
+        assert mean is means[index]
+        assert late == pytest.approx(late_s, abs=1e-12)
+    assert found.filter.mean is means[-1]
+
+
+def test_how_far_back_it_reaches() -> None:
+    found = Recorded(reach_s=0.5)
+    assert found.journal.oldest_s == -np.inf
+    for k in range(1, 21):
+        found.step(k)
+    # The first entry kept is the last one that ended before the reach.
+    assert found.journal.oldest_s == pytest.approx(1.4)
+    found.journal.restart()
+    assert found.journal.oldest_s == -np.inf
+
+
+def test_a_standstill_longer_than_the_reach_keeps_its_beginning() -> None:
+    found = Recorded(reach_s=0.5)
+    told: list[float] = []
+    found.step(1)
+    found.step(2)
+    found.journal.begin(9.0, 0.0, found.filter)
+    assert found.journal.oldest_s == pytest.approx(0.2)
+    found.journal.begin(9.1, 0.1, found.filter)  # it drives off
+    assert found.journal.oldest_s <= 9.0
+    found.journal.take(3.0, told.append, found.filter)
+    assert told == [0.0]
+
+
+@pytest.mark.parametrize("late_s", [0.01, 0.03])
+def test_the_row_of_a_late_fix_is_its_derivative(late_s: float) -> None:
+    found = SurveyFilter(
+        FILTERS["ekf"](np.zeros(STATES), np.eye(STATES)),
+        mirror(),
+        config().robot,
+        config().localizer,
+        {},
+        mirror().deck_pose(STEEP),
+    )
+    x, z, step = found.mean.copy(), found.mean[:2] + 1e-3, 1e-6
+    x[[V, W]] = 0.1, 0.5
+    _, row = found._fix_row(z, x, late_s)
+    residuals = [
+        [found._fix_row(z, x + sign * step * unit, late_s)[0] for sign in (-1.0, 1.0)] for unit in np.eye(STATES)
+    ]
+    numeric = np.array([(before - after) / (2.0 * step) for before, after in residuals]).T
+    # Rounding of metres over the step; that the slope under the robot moves with it is left out: f'' v late = 5e-5.
+    np.testing.assert_allclose(row, numeric, atol=1e-4)
+    assert abs(row[0, V]) > 0.9 * late_s * np.cos(0.3)
+
+
+# -- in the localizer -------------------------------------------------------------------------------------------------
+
+WRONG = Errors(right_slip=0.02, left_slip=0.01, creep=0.02, gyro_bias=0.01, noise=1.0)
+
+
+def twice(*rates: Rate) -> Rate:
+    return lambda t: sum(rate(t) for rate in rates)
+
+
+STRAIGHT = trapeze(0.5, 1.5, 0.1, 0.2)
+CORNER = trapeze(2.05, 1.3, 0.8, 2.0)
+DRIVES = {
+    "straight on": (trapeze(0.5, 9.0, 0.1, 0.2), lambda _: 0.0, 3.0),
+    "round a corner": (twice(STRAIGHT, trapeze(3.4, 9.0, 0.1, 0.2)), CORNER, 4.0),
+    "a rest in between": (twice(STRAIGHT, trapeze(4.2, 1.5, 0.1, 0.2)), CORNER, 6.0),
+}
+
+
+@cache
+def driven(name: str) -> tuple[list[Frame], list[Fix]]:
+    """The frames of a drive, and a fix at the end of each."""
+    v, omega, duration_s = DRIVES[name]
+    robot, frames, fixes = Robot(v=v, omega=omega, errors=WRONG), [], []
+    for _ in range(round(duration_s / FRAME_S)):
+        frames.append(robot.frame())
+        fixes.append(robot.fix())
+    return frames, fixes
+
+
+class Story:
+    """A drive that several localizers hear of.
+
+    Attributes:
+        ends: frames after which the filter has taken a step, or the robot stood.
+        fixes: for each frame, taken at its end.
+    """
+
+    def __init__(
+        self, name: str, filter_name: str = "ekf", use: dict[str, bool] | None = None, **changes: float
+    ) -> None:
+        self.frames, self.fixes = driven(name)
+        self._listener = partial(build, filter_name, STEEP, use, **changes)
+        self.ends: list[int] = []
+        listener = self._listener()
+        for k, frame in enumerate(self.frames):
+            before = listener.state[0]
+            listener.step(*frame)
+            if listener.state[0] is not before or listener.is_resting:
+                self.ends.append(k)
+
+    def end_after(self, t_s: float) -> int:
+        return next(k for k in self.ends if k * FRAME_S >= t_s)
+
+    def tell(self, deliveries: dict[int, list[Fix]]) -> FullStateLocalizer:
+        """What a localizer finds that gets fixes after these frames."""
+        found = self._listener()
+        for k, frame in enumerate(self.frames):
+            found.step(*frame)
+            for fix in deliveries.get(k, []):
+                found.fuse_fix(fix)
+        return found
+
+
+def apart(one: FullStateLocalizer, other: FullStateLocalizer) -> tuple[float, float]:
+    """Largest difference of mean and covariance, in standard deviations; speeds at rest are known to nothing."""
+    (x, P), (y, S) = one.state, other.state
+    sigma = np.sqrt(P.diagonal()) + 1e-9
+    return float(np.max(np.abs(x - y) / sigma)), float(np.max(np.abs(P - S) / np.outer(sigma, sigma)))
+
+
+@pytest.mark.parametrize(
+    ("name", "taken_s", "told_s"),
+    [
+        ("straight on", 1.5, 1.6),
+        ("straight on", 1.5, 2.9),
+        ("round a corner", 1.8, 3.7),
+        ("a rest in between", 3.0, 4.5),
+        ("a rest in between", 3.6, 4.5),
+    ],
+)
+def test_a_late_fix_is_as_good_as_one_in_time(filter_name: str, name: str, taken_s: float, told_s: float) -> None:
+    """Without what a leg passes on to the next, which was passed on before the fix was known."""
+    story = Story(name, filter_name, use={"slip_per_leg": False}, rewind_s=3.0)
+    taken, told = story.end_after(taken_s), story.end_after(told_s)
+    fix = story.fixes[taken]
+    in_time, late = story.tell({taken: [fix]}), story.tell({told: [fix]})
+    assert (in_time.counts["late_fixes"], late.counts["late_fixes"]) == (0, 1)
+    mean, covariance = apart(in_time, late)
+    # The ground is looked up where the filter thought it was: slopes off by 1e-7 in some hundred steps. Sigma points
+    # lose half the digits of a covariance whose smallest variances are 1e-12 of its largest.
+    assert mean < 1e-5
+    assert covariance < 1e-4
+
+
+def test_what_a_leg_passes_on_knows_little_of_a_late_fix() -> None:
+    story = Story("a rest in between")
+    taken, told = story.end_after(3.0), story.end_after(4.5)
+    in_time, late = (story.tell({k: [story.fixes[taken]]}) for k in (taken, told))
+    mean, covariance = apart(in_time, late)
+    # The mean of the slip is corrected, but not the scatter between the legs that the fix would have taught, by the
+    # mean of the two wheels' slips and by their difference.
+    assert mean < 0.01
+    assert covariance < 0.1
+
+
+def test_several_late_fixes_in_any_order() -> None:
+    story = Story("round a corner", rewind_s=3.0)
+    times = [story.end_after(t_s) for t_s in (1.2, 1.8, 2.6)]
+    told = story.end_after(3.7)
+    in_time = story.tell({k: [story.fixes[k]] for k in times})
+    for order in ((2, 0, 1), (1, 2, 0)):
+        late = story.tell({told: [story.fixes[times[k]] for k in order]})
+        mean, covariance = apart(in_time, late)
+        # Each is taken where the ones after it are not known yet: derivatives at means that are some 0.1 sigma apart.
+        assert mean < 1e-3
+        assert covariance < 1e-3
+
+
+@pytest.mark.parametrize("inside", [1, 2, 3])
+def test_a_fix_within_a_block_is_carried_to_its_end(inside: int) -> None:
+    """In time it ends the block, so the noise of the block is taken in other portions: that is what differs."""
+    story = Story("straight on")
+    end = story.end_after(1.8)
+    taken, told = end - inside, story.end_after(2.6)
+    in_time, late = (story.tell({k: [story.fixes[taken]]}) for k in (taken, told))
+    pose = [np.array([found.deck_pose.x_m, found.deck_pose.y_m]) for found in (in_time, late)]
+    # v times the time to the block's end would be 1 mm for each frame.
+    assert np.abs(pose[0] - pose[1]).max() < 5e-5
+    late_only = story.tell({})
+    assert np.abs(np.array([late_only.deck_pose.x_m, late_only.deck_pose.y_m]) - pose[0]).max() > 5e-4
+
+
+def test_in_time_within_a_block_it_is_where_it_says() -> None:
+    story = Story("straight on")
+    taken = story.end_after(1.8) - 2
+    found = build()
+    for frame in story.frames[: taken + 1]:
+        found.step(*frame)
+    jump_m = found.fuse_fix(story.fixes[taken])
+    robot_xy = story.fixes[taken]
+    assert jump_m > 1e-3
+    again = found.fuse_fix(robot_xy)
+    assert again < 1e-6  # a variance of 1e-10 against 1e-10: half of next to nothing
+
+
+def test_an_older_fix_than_the_path_is_refused() -> None:
+    story = Story("straight on", rewind_s=0.5)
+    found = story.tell({})
+    before = found.deck_pose, found.state[0]
+    with pytest.raises(FixRefused, match=r"fix of 2\.000 s is outside the known path, 2\.4\d0 s to 3\.100 s"):
+        found.fuse_fix(story.fixes[199])
+    assert found.deck_pose == before[0]
+    assert np.array_equal(found.state[0], before[1])
+    found.fuse_fix(story.fixes[280])
+
+
+def test_a_fix_from_the_future_is_refused() -> None:
+    story = Story("straight on")
+    found = story.tell({})
+    x_m, y_m = found.deck_pose.x_m, found.deck_pose.y_m
+    with pytest.raises(FixRefused, match=r"fix of 3\.110 s is outside the known path, \S+ s to 3\.100 s"):
+        found.fuse_fix(fix_at(3.11, (x_m, y_m)))
+    found.fuse_fix(fix_at(3.09, (x_m, y_m)))  # clocks may differ by a frame or ten
+
+
+def test_before_the_first_frame_there_is_no_path() -> None:
+    with pytest.raises(FixRefused, match="outside the known path"):
+        build().fuse_fix(Robot().fix())
+
+
+def test_a_fix_at_rest_leaves_the_robot_at_rest() -> None:
+    robot, found = Robot(v=STRAIGHT, errors=WRONG), build()
+    for frame in robot.frames(2.6):
+        found.step(*frame)
+    found.fuse_fix(robot.fix())
+    # What remains of the uncertainty at the stop.
+    assert found.state[0][[V, A, W]] == pytest.approx([0.0, 0.0, 0.0], abs=4e-3)
+    found.step(*robot.frame())
+    assert found.is_resting
+
+
+def test_a_standstill_however_long_does_not_grow_and_takes_a_measurement_of_its_beginning() -> None:
+    reach_s, walked = 2.0, 5
+    recorded = Recorded(reach_s)
+    for k in range(1, walked + 1):
+        recorded.step(k)
+    stood_s, z = 0.1 * walked, 0.7
+    row = np.array([[0.0, 1.0]])
+    for k in range(1000):
+        recorded.journal.begin(stood_s + 0.1 * (k + 1), 0.0, recorded.filter)
+        step = partial(recorded.measure, 0.0, row)
+        recorded.journal.add(step)
+        step()
+        kept = sum(len(entry.steps) for entry in recorded.journal._entries)
+        assert kept <= 2 * walked + reach_s / 0.1 + 1
+    assert len(recorded.journal._entries) == 2
+    # Taken in the standstill or at its first instant, it is a measurement of today's state.
+    for t_s in (stood_s + 0.05, stood_s):
+        assert recorded.journal.oldest_s <= t_s
+        today = Recorded()
+        today.filter.reset(recorded.filter.mean, recorded.filter.covariance)
+        today.measure(z, np.array([[0.2, 1.0]]))
+        recorded.late(t_s, z)
+        same(recorded, today)
+
+
+def at(fix: Fix, t_s: float) -> Fix:
+    return Fix(t_s, fix.position_m, fix.covariance_m2, fix.dop, fix.channels, fix.residual_rms_m)
+
+
+def test_a_revived_filter_stays_alive() -> None:
+    """The wheels went on while the filter stood; that way is not taken for one of the first block."""
+    found, filter_ = fragile()
+    robot = Robot(v=RecoveriesSTRAIGHT, errors=NOISY)
+    run(found, robot.frames(1.0))
+    filter_.is_broken = True
+    run(found, robot.frames(1.5))
+    assert found.is_frozen
+    filter_.is_broken = False
+    found.fuse_fix(robot.fix())
+    found.clear_hold()
+    run(found, robot.frames(1.0))
+    assert not found.hold_requested
+    assert errors_of(found, robot.pose)[0] < 1e-6  # it stands
+    assert found.is_resting
+
+
+def test_a_robot_that_never_stopped_is_followed_again() -> None:
+    found, filter_ = fragile()
+    robot = Robot(v=trapeze(0.5, 9.0, 0.1, 0.2), errors=NOISY)
+    run(found, robot.frames(1.3))
+    filter_.is_broken = True
+    run(found, robot.frames(0.2))
+    filter_.is_broken = False
+    found.fuse_fix(robot.fix())
+    run(found, robot.frames(1.0))
+    assert not found.is_frozen
+    # 2 % of slip that are not known, on 0.1 m, and the first block, whose speed is not known.
+    assert errors_of(found, robot.pose)[0] < 5e-3
+    assert found.speed_m_s == pytest.approx(0.1, abs=5e-3)
+
+
+def test_a_filter_that_diverges_at_a_fix_begins_anew_with_it() -> None:
+    found, filter_ = fragile()
+    robot = Robot(v=RecoveriesSTRAIGHT, errors=NOISY)
+    run(found, robot.frames(1.03))
+    filter_.is_broken = True
+    found.fuse_fix(robot.fix())
+    assert found.counts["diverged"] == 1
+    assert found.hold_cause == "filter: for the sake of the test"
+    assert not found.is_frozen
+    assert errors_of(found, robot.pose)[0] < 1e-9
+
+
+@pytest.mark.parametrize("jump_s", [-500.0, 1e4])
+@pytest.mark.parametrize("before_s", [1.81, 1.83])
+def test_after_a_jump_of_the_clock_it_measures_the_same_speed(jump_s: float, before_s: float) -> None:
+    """What the wheels did in the frame that begins the new time base belongs to the gap."""
+    found, robot = build(), Robot(v=trapeze(0.5, 9.0, 0.1, 0.2), errors=NOISY)
+    run(found, robot.frames(before_s))
+    for _ in range(2):
+        found.step(*shifted(robot.frame(), jump_s))
+    before, true = found.deck_pose, robot.pose
+    for frame in robot.frames(0.5):
+        found.step(*shifted(frame, jump_s))
+    assert found.speed_m_s == pytest.approx(0.1, abs=2e-3)  # 2 % of slip
+    after, now = found.deck_pose, robot.pose
+    assert after.x_m - before.x_m == pytest.approx(now.x_m - true.x_m, abs=2e-3)
+
+
+@pytest.mark.parametrize("before_s", [2.01, 2.02, 2.03, 2.04])
+def test_after_a_reboot_fixes_are_taken(before_s: float) -> None:
+    """Wherever in a block it was: nothing of the old time base decides about a fix."""
+    found, robot = build(), Robot(v=trapeze(0.5, 9.0, 0.1, 0.2))
+    for frame in robot.frames(before_s):
+        found.step(*shifted(frame, 500.0))
+    base_s = robot.t_s
+    for frame in robot.frames(0.5):
+        found.step(*shifted(frame, -base_s))
+    found.fuse_fix(at(robot.fix(), robot.t_s - base_s))
+    assert errors_of(found, robot.pose)[0] < 3e-5
+
+
+def test_silent_encoders_are_no_rest() -> None:
+    found, robot = build(), Robot(v=trapeze(0.5, 9.0, 0.1, 0.2))
+    for k, frame in enumerate(robot.frames(3.0)):
+        found.step(*(frame._replace(encoders=[]) if 150 <= k < 180 else frame))
+        assert not found.is_resting or k < 60
+    assert errors_of(found, robot.pose)[0] < 4.0 * found.position_sigma_m
+
+
+def test_at_rest_a_fix_may_come_late() -> None:
+    """A standstill is one moment, however long: nothing has changed since its beginning."""
+    found, robot = build(), Robot(v=RecoveriesSTRAIGHT)
+    run(found, robot.frames(2.6))
+    fix = robot.fix()
+    run(found, robot.frames(6.0))
+    found.fuse_fix(fix)
+    assert errors_of(found, robot.pose)[0] < 2e-5
+
+
+@pytest.mark.parametrize("within", [0, 1, 2, 3])
+def test_a_new_beginning_while_it_drives(within: int) -> None:
+    """The third of three fixes that agree, of some frames ago: the robot has gone on, and the wheels tell how fast."""
+    story = Story("straight on")
+    end = story.end_after(1.8)
+    found = build()
+    for frame in story.frames[: end + 1]:
+        found.step(*frame)
+    here, speed = found.deck_pose, found.speed_m_s
+    true = fix_at(story.fixes[end - within].t_s, (here.x_m + 0.06, here.y_m))
+    for _ in range(2):
+        with pytest.raises(FixGated):
+            found.fuse_fix(true)
+    assert found.deck_pose == here
+    found.fuse_fix(true)
+    assert found.deck_pose.x_m - here.x_m - 0.06 == pytest.approx(1e-3 * within * cos(0.3), abs=5e-5)  # 2 % of slip
+    assert found.speed_m_s == pytest.approx(speed, abs=1e-3)
+    for frame in story.frames[end + 1 : end + 61]:
+        found.step(*frame)
+    assert found.deck_pose.x_m - here.x_m - 0.06 == pytest.approx((1e-3 * within + 0.06) * cos(0.3), abs=3e-3)
+
+
+def test_what_is_learned_at_rest_is_told() -> None:
+    robot, found = Robot(), build(start_heading_sigma_rad=0.3)
+    turned = DeckPose(robot.x_m, robot.y_m, robot.pose.heading_rad + 0.2)
+    run(found, with_gravity(robot.frames(3.3), mirror(), turned))
+    assert found.deck_pose.heading_rad == pytest.approx(float(found.state[0][PSI]), abs=1e-12)
+    assert found.deck_pose.heading_rad == pytest.approx(turned.heading_rad, abs=0.01)  # as good as three chunks
+
+
+def test_a_fix_at_rest_leaves_no_speed() -> None:
+    found = build()
+    rested(found)
+    assert found.is_resting
+    assert found.speed_m_s == 0.0
+    assert found.rate_rad_s == 0.0
+
+
+def test_what_is_done_again_does_not_count_again() -> None:
+    start = before_a_seam(0, True)
+    robot, found = Robot(start, v=across_it(), has_edges=True), build(start=start, rewind_s=5.0)
+    frames = robot.frames(1.4)
+    fix = robot.fix()
+    run(found, frames + robot.frames(2.8))
+    found.fuse_fix(fix)
+    assert found.counts["crossings_used"] == 8
+    assert found.counts["late_fixes"] == 1
+
+
+def test_the_innovation_is_that_of_the_last_fix() -> None:
+    """Of the one that came last, not of the one that was taken last, which is done again after it."""
+    story = Story("straight on")
+    early, later = story.end_after(1.2), story.end_after(2.0)
+    alone = story.tell({later: [story.fixes[early]]}).innovation
+    found = build()
+    for frame in story.frames[: later + 1]:
+        found.step(*frame)
+    found.fuse_fix(story.fixes[later - 4])
+    found.fuse_fix(story.fixes[early])
+    assert found.innovation is not None
+    assert alone is not None
+    assert found.innovation.residual == pytest.approx(alone.residual, abs=1e-9)
+
+
+def test_a_new_beginning_has_no_innovation() -> None:
+    found = build()
+    robot = rested(found)
+    assert found.innovation is not None
+    for _ in range(2):
+        with pytest.raises(FixGated):
+            found.fuse_fix(robot.fix(off_m=(0.05, 0.0)))
+    found.fuse_fix(robot.fix(off_m=(0.05, 0.0)))
+    assert found.innovation is None
+
+
+def test_a_new_beginning_keeps_what_was_learned_of_the_sensors() -> None:
+    found = build(start=PanelPose(STEEP.panel, 0.0, 0.0, 0.3))
+    robot = rested(found)
+    before = found.state[0][6:13].copy()
+    for _ in range(2):
+        with pytest.raises(FixGated):
+            found.fuse_fix(robot.fix(off_m=(0.05, 0.0)))
+    found.fuse_fix(robot.fix(off_m=(0.05, 0.0)))
+    assert np.array_equal(found.state[0][6:13], before)

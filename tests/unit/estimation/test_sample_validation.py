@@ -1,0 +1,381 @@
+"""Pure. Which samples are used: the quick way for clean frames and the slow way for the others agree."""
+
+from collections import Counter
+from math import inf, nan, pi, sin, sqrt
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ccatp.config.models import FullStateConfig
+from ccatp.core import DeckPose, GravitySample, ImuSample, PanelPose, WheelSample, difference, wrap_pi
+from ccatp.estimation.measurements import NoiseFloor, ZeroVelocityDetector, heading_from_gravity
+from ccatp.estimation.sample_validation import SampleValidator
+from ccatp.estimation.state_model import BA, BG, PSI, A, Terrain, W
+from ccatp.mirror.mirror import Mirror
+from tests.unit.estimation.drive import FRAME_S, STEEP, Errors, Frame, Robot, build, errors_of, run, trapeze
+
+HISTORY_S = 0.2
+ONE = WheelSample(1.002, 1.0, 2.0)
+
+
+def intake() -> SampleValidator:
+    """One that has used samples up to 1.001 s."""
+    found = SampleValidator(HISTORY_S, Counter())
+    assert found.columns(1.001, [WheelSample(1.0, 0.0, 0.0), WheelSample(1.001, 0.0, 0.0)]) is not None
+    return found
+
+
+def counts(found: SampleValidator) -> dict[str, int]:
+    return {key: value for key, value in found._counts.items() if value}
+
+
+def test_clean_samples_are_columns() -> None:
+    columns = intake().columns(1.01, [ONE, WheelSample(1.003, 3.0, 4.0)])
+    assert columns == ((1.002, 1.003), (1.0, 3.0), (2.0, 4.0))
+
+
+DIRTY = {
+    "a wheel without a sample": [WheelSample(1.002, None, 2.0)],
+    "the other": [ONE, WheelSample(1.003, 2.0, None)],
+    "a rate that is no number": [WheelSample(1.002, nan, 2.0)],
+    "an infinite rate": [WheelSample(1.002, 1.0, inf)],
+    "two that cancel": [WheelSample(1.002, inf, -inf)],
+    "a time that is no number": [ONE, WheelSample(nan, 1.0, 2.0), WheelSample(1.004, 1.0, 2.0)],
+    "the same at the end": [ONE, WheelSample(nan, 1.0, 2.0)],
+    "twice": [ONE, ONE],
+    "used before": [WheelSample(1.001, 1.0, 2.0), ONE],
+    "backward": [WheelSample(1.003, 1.0, 2.0), ONE],
+    "older than all": [WheelSample(1.0005, 1.0, 2.0)],
+    "ahead": [ONE, WheelSample(1.02, 1.0, 2.0)],
+    "late": [WheelSample(0.8, 1.0, 2.0)],
+}
+
+
+@pytest.mark.parametrize("name", DIRTY)
+def test_dirty_samples_are_not(name: str) -> None:
+    assert intake().columns(1.01, DIRTY[name]) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "right", "left", "refused"),
+    [
+        ("a wheel without a sample", [], [1.002], {}),
+        ("the other", [1.002, 1.003], [1.002], {}),
+        ("a rate that is no number", [], [], {"nonfinite": 1}),
+        ("an infinite rate", [], [], {"nonfinite": 1}),
+        ("two that cancel", [], [], {"nonfinite": 1}),
+        ("a time that is no number", [1.002, 1.004], [1.002, 1.004], {"nonfinite": 1}),
+        ("twice", [1.002], [1.002], {"duplicate": 2}),
+        ("used before", [1.002], [1.002], {"duplicate": 2}),
+        ("backward", [1.003], [1.003], {"backward": 2}),
+        ("older than all", [], [], {"backward": 2}),
+        ("ahead", [1.002], [1.002], {"ahead": 2}),
+        ("late", [], [], {"late": 2}),
+    ],
+)
+def test_dirty_samples_are_judged_one_by_one(
+    name: str, right: list[float], left: list[float], refused: dict[str, int]
+) -> None:
+    found = intake()
+    one, other = found.wheels(1.01, DIRTY[name])
+    assert [t for t, _ in one] == right
+    assert [t for t, _ in other] == left
+    assert counts(found) == refused  # each wheel counts for itself
+
+
+times = st.integers(0, 30).map(lambda k: 0.98 + 0.002 * k)
+rates = st.one_of(st.none(), st.sampled_from([0.0, 1.0, -2.5, nan, inf]))
+ordered = st.lists(times, max_size=6, unique=True).map(sorted)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.lists(
+        st.one_of(
+            st.lists(st.tuples(times, rates, rates), max_size=5),
+            ordered.map(lambda found: [(t, 1.0, t) for t in found]),
+        ),
+        max_size=5,
+    )
+)
+def test_quick_and_slow_use_and_count_the_same(frames: list[list[tuple[float, float | None, float | None]]]) -> None:
+    quick, slow = intake(), intake()
+    for k, rows in enumerate(frames):
+        frame_s, samples = 1.01 + 0.01 * k, [WheelSample(*row) for row in rows]
+        columns = quick.columns(frame_s, samples) if samples else ((), (), ())
+        if columns is None:
+            right, left = quick.wheels(frame_s, samples)
+        else:
+            right, left = list(zip(*columns[:2], strict=True)), list(zip(columns[0], columns[2], strict=True))
+        assert (right, left) == slow.wheels(frame_s, samples)
+        assert counts(quick) == counts(slow)
+        assert quick.backward_source == slow.backward_source
+
+
+def test_five_backward_samples_in_a_row_name_the_sensor() -> None:
+    found = intake()
+    for k in range(4):
+        found.wheels(1.01, [WheelSample(0.99 - 0.001 * k, 1.0, None)])
+    assert found.backward_source == ""
+    found.wheels(1.01, [WheelSample(0.9, 1.0, None)])
+    assert found.backward_source == "right encoder"
+
+
+def test_a_good_sample_ends_the_row() -> None:
+    found = intake()
+    for k in range(4):
+        found.wheels(1.01, [WheelSample(0.99 - 0.001 * k, 1.0, 1.0)])
+    found.wheels(1.01, [ONE])
+    found.wheels(1.01, [WheelSample(0.9, 1.0, 1.0)])
+    assert found.backward_source == ""
+
+
+IMU = {
+    "nonfinite": ImuSample(1.002, nan, 0.0),
+    "ahead": ImuSample(1.02, 0.0, 0.0),
+    "late": ImuSample(0.7, 0.0, 0.0),
+    "duplicate": ImuSample(1.001, 0.0, 0.0),
+    "backward": ImuSample(0.999, 0.0, 0.0),
+}
+
+
+@pytest.mark.parametrize("reason", IMU)
+def test_unusable_samples_of_the_inertial_unit(reason: str) -> None:
+    found, good = intake(), ImuSample(1.003, 0.0, 0.0)
+    found.imu(1.001, [ImuSample(1.001, 0.0, 0.0)])
+    assert list(found.imu(1.01, [IMU[reason], good])) == [good]
+    assert counts(found) == {reason: 1}
+
+
+def test_a_jump_of_the_clock_forgets_all_times() -> None:
+    found = intake()
+    found.restart()
+    assert found.columns(0.01, [WheelSample(0.005, 1.0, 2.0)]) is not None
+
+
+WINDOW = 15  # samples in a mean of the noise floor
+
+
+def watch() -> ZeroVelocityDetector:
+    return ZeroVelocityDetector(0.25, NoiseFloor(1e-4), NoiseFloor(1e-4))
+
+
+def test_rest_begins_after_its_time_and_only_once() -> None:
+    found = watch()
+    begun = [found.stood(0.05) for _ in range(8)]
+    assert begun == [False] * 4 + [True] + [False] * 3
+    assert found.is_resting
+
+
+def test_motion_begins_the_count_anew() -> None:
+    found = watch()
+    found.stood(0.24)
+    found.moved()
+    assert not found.stood(0.24)
+    assert found.stood(0.01)
+    found.moved()
+    assert not found.is_resting
+
+
+def test_means_over_a_rest() -> None:
+    found = watch()
+    for k in range(4):
+        found.add([ImuSample(0.0, 1.0 + k, 10.0 * k)], GravitySample(0.0, 3.0, 4.0, 9.0) if k else None)
+    assert found.count == 4
+    reading = found.take()
+    assert reading[:4] == (4, 15.0, 2.5, 3)
+    assert reading.bearing_rad == pytest.approx(np.arctan2(4.0, 3.0))
+    assert found.take()[:4] == (0, 0.0, 0.0, 0)
+
+
+def test_what_was_collected_before_a_motion_is_forgotten() -> None:
+    found = watch()
+    found.add([ImuSample(0.0, 1.0, 1.0)], GravitySample(0.0, 1.0, 0.0, 0.0))
+    found.moved()
+    assert found.take()[:4] == (0, 0.0, 0.0, 0)
+
+
+# -- the noise that counts --------------------------------------------------------------------------------------------
+
+
+def learned(samples: np.ndarray, expected: float = 1.0) -> float:
+    floor = NoiseFloor(expected)
+    for sample in samples.tolist():
+        floor.add(sample)
+    return floor.variance
+
+
+@pytest.mark.parametrize("sigma", [0.1, 1.0, 10.0])
+def test_of_white_noise_the_variance_is_learned(sigma: float) -> None:
+    rng = np.random.default_rng(1)
+    found = [learned(5.0 + sigma * rng.normal(size=6000)) for _ in range(40)]
+    # Remembered are 2/0.03 = 67 squares of one degree of freedom; neighbours share a mean, which makes it 3/2 of that.
+    scatter = sqrt(2.0 / 67.0 * 1.5)
+    assert np.mean(found) == pytest.approx(sigma**2, rel=4.0 * scatter / sqrt(40))
+    assert np.std(found) < 1.5 * scatter * sigma**2
+
+
+def test_what_was_expected_holds_until_something_is_learned() -> None:
+    floor = NoiseFloor(0.5)
+    for k in range(2 * WINDOW - 1):
+        floor.add(float(k % 7))
+    assert floor.variance == 0.5
+    floor.add(0.0)
+    assert floor.variance != 0.5
+
+
+def test_a_vibration_counts_for_what_its_integral_feels() -> None:
+    """A sine of 0.2 rad/s and 23 Hz: 0.02 (rad/s)^2 of power, of which a mean of 15 samples keeps little."""
+    t, rng = 0.01 * np.arange(6000), np.random.default_rng(2)
+    white = 0.0087 * rng.normal(size=t.size)
+    found = learned(0.2 * np.sin(2.0 * pi * 23.0 * t) + white, 1e-4)
+    means = (0.2 * np.sin(2.0 * pi * 23.0 * t)).reshape(-1, WINDOW).mean(axis=1)
+    kept = WINDOW * float(np.var(means)) + 0.0087**2
+    # Neighbours that alternate differ by twice what white noise would make of them; 13 % of scatter as above.
+    assert 0.7 * kept < found < 2.0 * 1.3 * kept
+    assert found < 0.02 / 3.0
+
+
+def test_a_bias_is_no_noise_and_a_restart_drops_half_a_mean() -> None:
+    floor = NoiseFloor(1.0)
+    for _ in range(100 * WINDOW):
+        floor.add(3.0)
+    assert floor.variance == pytest.approx(0.97**99, rel=1e-9)
+    before = floor.variance
+    for _ in range(WINDOW - 1):
+        floor.add(1e3)  # what a motion leaves
+    floor.restart()
+    for _ in range(WINDOW):
+        floor.add(3.0)
+    assert floor.variance == pytest.approx(0.97 * before, rel=1e-9)
+
+
+# -- gravity ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("psi", [*np.linspace(-3.1, 3.1, 9).tolist(), pi, -pi + 1e-9, 7.0])
+def test_heading_from_gravity(mirror: Mirror, psi: float) -> None:
+    at = mirror.deck_pose(STEEP)
+    gx, gy, _ = mirror.gravity_in_robot(DeckPose(at.x_m, at.y_m, psi))
+    found = heading_from_gravity(float(np.arctan2(gy, gx)), Terrain(mirror).at(at.x_m, at.y_m))
+    assert abs(difference(found, psi)) < 1e-13  # rounding
+
+
+# -- at rest in the localizer -----------------------------------------------------------------------------------------
+
+
+def with_gravity(frames: list[Frame], mirror: Mirror, pose: DeckPose, sigma: float = 0.0) -> list[Frame]:
+    rng = np.random.default_rng(7)
+    g = np.array(mirror.gravity_in_robot(pose))
+    return [
+        frame._replace(gravity=GravitySample(frame.t_s, *(g + sigma * rng.normal(size=3)).tolist())) for frame in frames
+    ]
+
+
+def test_the_localizer_rests_when_the_wheels_have_stood_long_enough(full: FullStateConfig) -> None:
+    robot, found = Robot(v=trapeze(0.0, 0.5, 0.05, 0.2)), build()
+    begun_s = None
+    for frame in robot.frames(1.2):
+        found.step(*frame)
+        if found.is_resting and begun_s is None:
+            begun_s = frame.t_s
+    # At 0.2 m/s^2 the wheel is slower than 0.1 mm/s in the last half millisecond only; then whole frames.
+    assert begun_s == pytest.approx(0.5 + full.rest_after_s, abs=FRAME_S + 1e-9)
+    assert found.speed_m_s == found.rate_rad_s == 0.0
+
+
+def test_a_robot_that_drives_on_slowly_never_rests() -> None:
+    robot, found = Robot(v=lambda _: 0.0002), build()
+    for frame in robot.frames(1.0):
+        found.step(*frame)
+        assert not found.is_resting
+
+
+@pytest.mark.parametrize("counts_per_turn", [0, 1200])
+def test_biases_show_at_rest(filter_name: str, counts_per_turn: int) -> None:
+    wrong = Errors(gyro_bias=0.02, accelerometer_bias=-0.3, noise=1.0, counts_per_turn=counts_per_turn)
+    robot, found = Robot(errors=wrong), build(filter_name)
+    run(found, robot.frames(0.25 + 8 * 1.0))
+    mean, P = found.state
+    gyro, accelerometer = sqrt(P[BG, BG]), sqrt(P[BA, BA])
+    # 800 samples, and what is not known of rate and acceleration at the stop; both are small against the prior.
+    assert gyro == pytest.approx(sqrt(0.0087**2 / 800 + P[W, W]), rel=0.3)  # the noise itself is learned, within 20 %
+    assert accelerometer < 1.5e-3
+    assert abs(mean[BG] - 0.02) < 4.0 * gyro
+    assert abs(mean[BA] + 0.3) < 4.0 * accelerometer
+
+
+def test_what_is_not_known_of_the_stop_is_not_taken_for_a_bias() -> None:
+    """Counts leave 1 mrad/s at the stop, which the gyroscope cannot tell from its bias: their sum is known."""
+    robot = Robot(v=trapeze(0.0, 1.5, 0.1, 0.2), errors=Errors(noise=1.0, counts_per_turn=1200))
+    found = build()
+    run(found, robot.frames(1.5 + 8.3))
+    P = found.state[1]
+    for bias, speed in ((BG, W), (BA, A)):
+        together = P[bias, bias] + 2.0 * P[bias, speed] + P[speed, speed]
+        assert together < 0.5 * P[bias, bias]
+
+
+def test_a_rest_is_used_when_the_robot_drives_off() -> None:
+    """Half a second at rest, less than fills a chunk."""
+    robot, found = Robot(v=trapeze(0.75, 1.0, 0.1, 0.2), errors=Errors(gyro_bias=0.02)), build()
+    run(found, robot.frames(0.74))
+    before = found.state[1][BG, BG]
+    run(found, robot.frames(0.06))
+    # Some 50 samples against the 20 of the frames before the rest was certain.
+    assert found.state[1][BG, BG] < 0.5 * before
+    assert found.state[0][BG] == pytest.approx(0.02, abs=1e-4)  # no noise: what is left of a prior of 17 mrad/s
+
+
+def test_gravity_shows_the_heading_of_a_robot_at_rest(mirror: Mirror, filter_name: str) -> None:
+    robot, found = Robot(), build(filter_name, start_heading_sigma_rad=0.3)
+    turned = DeckPose(robot.x_m, robot.y_m, robot.pose.heading_rad + 0.2)
+    run(found, with_gravity(robot.frames(6.3), mirror, turned))
+    # Six chunks, each as good as the floor of 30 mrad and its noise; and what the prior of 0.3 rad pulls.
+    assert found.state[0][PSI] == pytest.approx(turned.heading_rad, abs=0.2 * 0.03)
+    assert found.heading_sigma_rad == pytest.approx(0.034 / sqrt(6.0), rel=0.1)
+    assert found.counts["gravity_gated"] == 0
+
+
+@pytest.mark.parametrize("beyond", [0.02, -0.02])
+def test_gravity_across_the_cut_of_the_angle(mirror: Mirror, full: FullStateConfig, beyond: float) -> None:
+    """The heading is within 20 mrad of pi, gravity says that it is on the other side."""
+    start = PanelPose(STEEP.panel, 0.0, 0.0, pi + beyond)
+    robot, found = Robot(start), build(start=start, start_heading_sigma_rad=0.1)
+    truth = DeckPose(robot.x_m, robot.y_m, wrap_pi(robot.pose.heading_rad - 2.0 * beyond))
+    assert abs(found.deck_pose.heading_rad - truth.heading_rad) > 6.0
+    run(found, with_gravity(robot.frames(1.3), mirror, truth))
+    gx, gy, _ = mirror.gravity_in_robot(truth)
+    variance = (full.gravity_sigma_rad**2 / (gx * gx + gy * gy)) / 100 + full.gravity_floor_rad**2
+    left = difference(float(found.state[0][PSI]), truth.heading_rad)
+    assert left == pytest.approx(2.0 * beyond * variance / (variance + 0.1**2), rel=1e-3)  # the frames before the rest
+
+
+def test_gravity_that_contradicts_is_gated(mirror: Mirror) -> None:
+    robot, found = Robot(), build()
+    before = float(found.state[0][PSI])
+    run(found, with_gravity(robot.frames(1.3), mirror, DeckPose(robot.x_m, robot.y_m, before + 0.5)))
+    assert found.counts["gravity_gated"] == 1
+    assert found.state[0][PSI] == pytest.approx(before, abs=1e-12)
+
+
+def test_the_tilt_against_the_least(mirror: Mirror) -> None:
+    """Gravity counts by the sine of the angle between the surface and the horizontal."""
+    pose = mirror.deck_pose(STEEP)
+    gx, gy, _ = mirror.gravity_in_robot(pose)
+    tilt = float(np.hypot(gx, gy))
+    for least, is_used in ((1.001 * tilt, False), (0.999 * tilt, True)):
+        robot, found = Robot(), build(gravity_least_tilt=least)
+        run(found, with_gravity(robot.frames(1.3), mirror, DeckPose(pose.x_m, pose.y_m, pose.heading_rad + 0.02)))
+        assert bool(found.state[0][PSI] - pose.heading_rad > 1e-4) is is_used
+        assert found.counts["gravity_gated"] == 0
+
+
+def test_the_samples_of_a_moving_robot_do_not_count(mirror: Mirror) -> None:
+    robot, found = Robot(v=lambda t: 0.05 * sin(2.0 * t)), build()
+    run(found, with_gravity(robot.frames(1.5), mirror, DeckPose(robot.x_m, robot.y_m, 2.0)))
+    assert found.counts["gravity_gated"] == 0
+    assert found.speed_m_s == pytest.approx(0.05 * sin(3.0), abs=1e-3)  # a frame of the acceleration
+    assert abs(errors_of(found, robot.pose)[1]) < 1e-4  # no noise: what the wheels' slip may make of 25 mm

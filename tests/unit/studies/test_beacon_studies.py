@@ -1,0 +1,151 @@
+"""The studies of self-mapping: published figures on few seeds, files, a field that hears too little, sizes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ccatp.beacons.cricket.range_network import MappingError
+from ccatp.config.load import load_radio_config
+from ccatp.config.models import Config
+from ccatp.links.beacon_messages import PoseTrack, PoseTruth, pose_track, pose_truth
+from ccatp.studies import mote_sizes
+from ccatp.studies.campaign import Cell, CellResult, Job, JobOutcome
+from ccatp.studies.cricket_study import CASES, STUDY, combine, draw, run_job
+from ccatp.studies.mote_navigation import STUDY as MoteNavigationSTUDY
+from ccatp.studies.mote_navigation import band, rehearse_beacons, seconds_of
+from ccatp.studies.mote_navigation import combine as mote_navigation_combine
+from ccatp.studies.mote_navigation import draw as mote_navigation_draw
+from ccatp.studies.mote_runs import run_batch, run_filter, simulate_field
+
+
+def result(config: Config, case: str, seeds: int) -> CellResult:
+    factors = Cell({"case": case}).factors
+    outcomes = [run_job(Job("cricket", factors, config.run.seed + number, config)) for number in range(seeds)]
+    combined = combine(factors, outcomes)
+    return CellResult(factors, {"runs": seeds, **combined.values}, combined.arrays)
+
+
+@pytest.fixture(scope="module")
+def cells(config: Config) -> dict[str, CellResult]:
+    runs = {"zigzag-printed": 8, "zigzag-p0-99": 4, "all-printed": 8, "batch-45": 2}
+    return {case: result(config, case, seeds) for case, seeds in runs.items()}
+
+
+def test_few_measurements_stay_poor(cells: dict[str, CellResult]) -> None:
+    cell = cells["zigzag-printed"]
+    assert (cell.values["rank_deficiency"], cell.values["is_unique"]) == (4, False)
+    assert 0.08 < cell.values["rms_m"]["p50"] < 0.22  # 0.15 published; eight seeds of a wide distribution
+    trace = cell.arrays["trace_m"][1]
+    assert trace.shape == (301,)
+    assert abs(trace[300] - trace[30]) < 0.05  # as figure 12: more iterations change little
+
+
+def test_the_printed_prior_makes_it_worse(cells: dict[str, CellResult]) -> None:
+    printed, prior = cells["zigzag-p0-99"].values, cells["zigzag-printed"].values
+    assert printed["rms_m"]["p50"] > 1.5 * printed["phase1_rms_m"]
+    assert printed["rms_m"]["p50"] > 1.5 * prior["rms_m"]["p50"]
+
+
+def test_many_measurements_are_good_within_thirty_updates(cells: dict[str, CellResult]) -> None:
+    cell = cells["all-printed"].values
+    assert (cell["rank_deficiency"], cell["is_unique"]) == (0, True)
+    assert cell["rms_at_30_m"] < 0.006
+    assert cell["coordinate_rms_at_30_m"] < 0.005
+    assert cell["ratio"] < 1.4  # eight seeds
+
+
+def test_better_from_the_same_ranges(cells: dict[str, CellResult]) -> None:
+    assert cells["batch-45"].values["rms_m"]["p50"] < 0.012
+
+
+def test_the_figures(cells: dict[str, CellResult], tmp_path: Path) -> None:
+    draw(list(cells.values()), tmp_path)
+    stems = ("figure_11_12", "figure_14", "figure_9_10_13", "ways")
+    assert {path.name for path in tmp_path.iterdir()} == {f"{stem}.{kind}" for stem in stems for kind in ("png", "pdf")}
+
+
+def test_every_case_is_a_configuration() -> None:
+    assert [cell.factors["case"] for cell in STUDY.cells()] == list(CASES)
+    for case in CASES.values():
+        load_radio_config(None, {"system": "cricket", **case.keys})
+
+
+def test_a_field_whose_motes_cannot_be_laid_out() -> None:
+    keys = {
+        "system": "cricket",
+        "cricket.layout": "random",
+        "cricket.random.count": 40,
+        "cricket.random.size_m": [15.0, 15.0],
+    }
+    cfg = load_radio_config(None, {**keys, "cricket.random.reach_m": 4.0}).cricket
+    field = simulate_field(cfg, 3)
+    with pytest.raises(MappingError, match=r"phase 1 cannot place M\d+ \(and \d+ more\); the batch"):
+        run_filter(cfg, field)
+    assert np.median(np.linalg.norm(run_batch(cfg, field).positions_m, axis=1)) > 0.0
+
+
+def test_sizes(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mote_sizes, "SIZES", (30, 60))
+    found = mote_sizes.run(config, tmp_path)
+    assert [cell["ranges"] > cell["motes"] for cell in found["cells"]] == [True, True]
+    assert (tmp_path / "mote_sizes.png").exists()
+    assert len((tmp_path / "table.md").read_text().splitlines()) == 4
+    for cell in found["cells"]:
+        assert cell["cost_per_dof"] < 2.0
+        assert cell["bound_m"] is None or cell["rms_of_others_m"] < 3.0 * cell["bound_m"]
+
+
+def poses(frames: int) -> tuple[PoseTrack, PoseTruth]:
+    """Estimates with sigmas of 0.02, 0.02 m and 0.1 rad, and a truth 0.04 m and a turn of 0.2 rad away from them."""
+    track, truth = np.zeros((frames, 13)), np.zeros((frames, 8))
+    track[:, 0] = truth[:, 0] = np.arange(frames)
+    track[:, 1] = truth[:, 1] = 0.1 * np.arange(frames)
+    track[:, [5, 7]], track[:, 10] = 4e-4, 1e-2
+    truth[:, 2], truth[:, 4] = 0.04, 2.0 * np.pi - 0.2
+    return pose_track(track), pose_truth(truth)
+
+
+def test_errors_by_the_second_from_the_map_on() -> None:
+    found = seconds_of(*poses(60), 2.0)
+    assert {name: len(values) for name, values in found.items()} == {"nees": 4, "error_m": 4, "sigma_m": 4}
+    assert found["nees"] == pytest.approx(8.0)  # (0.04 / 0.02)^2 + (0.2 / 0.1)^2: the turn is wrapped
+    assert found["error_m"] == pytest.approx(0.04)
+    assert found["sigma_m"] == pytest.approx(0.02 * 2**0.5)
+
+
+def outcome(nees: float) -> JobOutcome:
+    values = {
+        "outcome": "complete", "reached": 6, "within": 5, "position_m": 0.004, "map_m": 0.002, "map_expected_m": 0.005,
+        "nis_mean": 1.0, "readings": 100, "updates": 20.0,
+    }  # fmt: skip
+    seconds = np.full(4, 1.0)
+    return JobOutcome(values, {"nees": nees * seconds, "error_m": 0.004 * seconds, "sigma_m": 0.005 * seconds})
+
+
+def test_missions_put_together_and_drawn(tmp_path: Path) -> None:
+    found = mote_navigation_combine({}, [outcome(2.0), outcome(5.0)])
+    assert found.values["nees"] == pytest.approx(3.5 / 3)
+    assert found.values["in_band"] == 1.0
+    assert (found.values["complete"], found.values["waypoints"], found.values["within_3_sigma"]) == (2, 12, 10)
+    assert mote_navigation_combine({}, [outcome(30.0), outcome(30.0)]).values["in_band"] == 0.0
+    mote_navigation_draw([CellResult({"case": "route"}, found.values, found.arrays)], tmp_path)
+    assert (tmp_path / "mote_navigation.png").stat().st_size > 10_000
+
+
+def test_the_band_narrows() -> None:
+    few, many = band(2), band(50)
+    assert few[0] < many[0] < 1.0 < many[1] < few[1]
+    assert many == pytest.approx((0.787, 1.239), abs=1e-3)
+    assert MoteNavigationSTUDY.runs == 50
+
+
+@pytest.mark.slow
+def test_missions_are_consistent() -> None:
+    each = []
+    for seed in range(1, 13):
+        run = rehearse_beacons(load_radio_config(None, {"system": "cricket", "run.seed": seed}))
+        assert run.outcome == "complete"
+        each.append(seconds_of(*run.poses, run.summary["map"]["map_time_s"])["nees"].mean() / 3.0)
+    low, high = band(len(each))  # of single seconds: a mean over a mission's varies less
+    assert low < np.mean(each) < high

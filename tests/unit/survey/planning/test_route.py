@@ -1,0 +1,440 @@
+"""Pure. Stops between the points, remaining time, refusals."""
+
+from collections.abc import Callable
+from itertools import pairwise
+from math import atan2, hypot
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ccatp.config.load import load_config
+from ccatp.config.models import LimitsConfig
+from ccatp.core import DeckPose, PanelId, PointId, Stop, StopKind
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.survey.planning.legs import (
+    Grazing,
+    LegPlace,
+    LegRules,
+    OutsideMirrorError,
+    PlanError,
+    UnreachablePointError,
+    build_body,
+    build_places,
+)
+from ccatp.survey.planning.route import (
+    NOMINAL_LIMITS,
+    ORDERS,
+    Route,
+    fastest_serpentine,
+    optimised_order,
+    panel_order,
+    plan_route,
+    serpentines,
+    thesis_order,
+)
+from ccatp.survey.planning.search import Search, SearchNode, Target, path_time
+from ccatp.survey.planning.way_home import plan_way_home
+
+STEPS_OF_THESIS_M1 = ((1, 2), (2, 3), (7, 8), (8, 9))  # rows of 7, 9, 11, ..., 11, 9, 7 panels
+
+
+def plan(world: Any, points: list[PointId], **options: Any) -> Route:
+    cfg = world.cfg
+    return plan_route(world.mirror, points, cfg.robot, cfg.limits, cfg.mission, world.mirror.base_pose, **options)
+
+
+def bare(world: Any, points: list[PointId]) -> tuple[Stop, ...]:
+    return tuple(Stop(x, y, StopKind.MEASURE) for x, y in map(world.mirror.point_on_deck, points))
+
+
+def test_straight_legs_at_stepped_corners_come_too_near_the_rim(thesis: Any) -> None:
+    mirror = thesis.mirror
+    failing = [
+        (a.row, b.row)
+        for a, b in pairwise(thesis_order(mirror))
+        if mirror.rim.segment_clearance_m(*mirror.point_on_deck(a), *mirror.point_on_deck(b))
+        < thesis.cfg.mission.leg_clearance_m
+    ]
+    assert failing == list(STEPS_OF_THESIS_M1)
+    stops = plan(thesis, thesis_order(mirror)).stops
+    for low, high in STEPS_OF_THESIS_M1:
+        last = max(k for k, stop in enumerate(stops) if stop.point and stop.point.row == low)
+        first = min(k for k, stop in enumerate(stops) if stop.point and stop.point.row == high)
+        assert first > last + 1
+        assert all(stop.kind is StopKind.VIA for stop in stops[last + 1 : first])
+
+
+def test_some_straight_legs_leave_the_mirror(thesis: Any) -> None:
+    mirror = thesis.mirror
+    a, b = PointId(7, 11, 9), PointId(8, 10, 9)
+    assert mirror.rim.segment_clearance_m(*mirror.point_on_deck(a), *mirror.point_on_deck(b)) < 0.0
+
+
+def test_whole_surveys_fit_into_the_hour(world: Any) -> None:
+    points = thesis_order(world.mirror)
+    route = plan(world, points, measuring_time_s=0.5)
+    straight_s = path_time(bare(world, points), world.mirror.base_pose, world.cfg.limits, world.mirror, 0.5)
+    settled_s = route.remaining_s(0) + 0.15 * len(route.stops)  # the servo's lag and settling, each stop
+    assert settled_s < world.cfg.run.budget_s
+    # Measured: 1.020 to 1.041. On the ways around corners no sensor runs along a seam.
+    assert straight_s < route.remaining_s(0) < 1.045 * straight_s
+
+
+def test_largest_leg_of_thesis_m1(thesis: Any) -> None:
+    points, cfg = thesis_order(thesis.mirror), thesis.cfg
+
+    def legs_of(longest_m: float) -> list[float]:
+        mission = cfg.mission.model_copy(update={"longest_leg_m": longest_m})
+        route = plan_route(thesis.mirror, points, cfg.robot, cfg.limits, mission, thesis.mirror.base_pose)
+        ends = [(stop.x_m, stop.y_m) for stop in route.stops]
+        return sorted(hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(ends))
+
+    legs = legs_of(2.0)
+    # Around the stepped corners straight up and across: on the diagonals, shorter by 0.3 m, a sensor runs along a seam.
+    assert legs[-1] == pytest.approx(0.733, abs=0.002)  # the retreats before and after lie on a grid of 5 mm
+    assert legs[-9] == pytest.approx(0.254, abs=0.012)  # else 744 - 490 mm, between two rows; a retreat may slant it
+    assert legs_of(cfg.mission.longest_leg_m)[-1] <= cfg.mission.longest_leg_m
+
+
+def test_points_of_a_row_need_no_stops_between(thesis: Any) -> None:
+    points = [point for point in thesis_order(thesis.mirror) if (point.row, point.col) in {(5, 5), (5, 6)}]
+    stops = plan(thesis, points).stops
+    first = next(k for k, stop in enumerate(stops) if stop.kind is StopKind.MEASURE)
+    assert len(stops[first:]) == 18
+
+
+def test_done_points_are_left_out(thesis: Any) -> None:
+    points = thesis_order(thesis.mirror, 2)
+    route = plan(thesis, points, skip=points[3:12])
+    assert [stop.point for stop in route.stops if stop.point] == points[:3] + points[12:]
+    assert plan(thesis, points, skip=points) == Route((), (0.0,), (0.0,))
+    assert plan(thesis, []).remaining_s(0) == 0.0
+
+
+def test_remaining_time_and_way(thesis: Any) -> None:
+    points = thesis_order(thesis.mirror, 1)
+    route = plan(thesis, points, measuring_time_s=0.5)
+    base, cfg, mirror = thesis.mirror.base_pose, thesis.cfg, thesis.mirror
+    assert route.remaining_s(0) == pytest.approx(path_time(route.stops, base, cfg.limits, mirror, 0.5), rel=1e-12)
+    way = sum(
+        hypot(b[0] - a[0], b[1] - a[1])
+        for a, b in pairwise([(base.x_m, base.y_m), *((stop.x_m, stop.y_m) for stop in route.stops)])
+    )
+    assert route.remaining_m(0) == pytest.approx(way, rel=2e-3)  # slopes of 0.045 add a thousandth
+    last = len(route.stops) - 1
+    assert 0.5 < route.remaining_s(last) < 10.0
+    assert route.remaining_s(last + 1) == route.remaining_m(last + 1) == 0.0
+
+
+def test_the_route_is_the_same_every_time(thesis: Any) -> None:
+    points = thesis_order(thesis.mirror, 9)
+    assert plan(thesis, points) == plan(thesis, points)
+
+
+def test_start_beyond_the_rim(thesis: Any) -> None:
+    cfg = thesis.cfg
+    with pytest.raises(OutsideMirrorError, match=r"start \(9\.000, 0\.000\) m is 5\.\d+ m beyond the rim of thesis-m1"):
+        plan_route(thesis.mirror, [], cfg.robot, cfg.limits, cfg.mission, DeckPose(9.0, 0.0, 0.0))
+
+
+def test_points_out_of_reach_may_be_left_out(thesis: Any) -> None:
+    cfg, mirror = thesis.cfg, thesis.mirror
+    mission = cfg.mission.model_copy(update={"leg_clearance_m": 0.13})
+    points = thesis_order(mirror, 1)
+    lost: list[PointId] = []
+    x, y = mirror.point_on_deck(PointId(1, 3, 5))
+    start = DeckPose(x, y, 0.0)
+    route = plan_route(mirror, points, cfg.robot, cfg.limits, mission, start, (), 0.0, lost)
+    # The panel in the lower left corner: a point is 115 mm from either side of it that is a rim.
+    assert sorted(point.point for point in lost) == [1, 2, 3, 4, 7]
+    reached = [stop.point for stop in route.stops if stop.point is not None]
+    assert reached == [point for point in points if point not in lost]
+    # The way is that of a survey of the others alone.
+    assert route == plan_route(mirror, reached, cfg.robot, cfg.limits, mission, start)
+
+
+@pytest.mark.parametrize("clearances", [{"leg_clearance_m": 0.13}, {"turn_clearance_m": 0.04}])
+def test_points_too_near_the_rim(clearances: dict[str, float], thesis: Any) -> None:
+    cfg = thesis.cfg
+    mission = cfg.mission.model_copy(update=clearances)
+    points = thesis_order(thesis.mirror, 1)
+    with pytest.raises(
+        UnreachablePointError, match=r"no safe way to point 1-3-1 of thesis-m1, 0\.115 m from the rim"
+    ) as e:
+        plan_route(thesis.mirror, points, cfg.robot, cfg.limits, mission, thesis.mirror.base_pose)
+    assert isinstance(e.value, PlanError)
+    for name, value in clearances.items():
+        assert f"{name} = {value}" in str(e.value)
+
+
+def test_way_around_several_corners(thesis: Any) -> None:
+    mirror, body = thesis.mirror, build_body(thesis.cfg.robot, thesis.cfg.mission)
+    rules = LegRules(mirror, body)
+    xs, ys = np.array([3.4, 2.2, -3.4, 0.0]), np.array([1.6, 3.2, -1.6, 0.0])
+    upper, top, lower, middle = build_places(mirror, body, xs, ys)
+    chain = [upper, *rules.way_around(upper, top), top]
+    assert len(chain) == 3  # by the elbow, along rows and columns
+    assert all(rules.is_clear(a, b) for a, b in pairwise(chain))
+    slanted = [lower, *rules.way_around(lower, middle), middle]
+    assert len(slanted) == 3  # clear, but at 25 degrees it would lead a sensor along the seams between rows
+    assert rules.is_clear(lower, middle)
+
+
+def test_no_way_to_a_place_in_the_clearance(thesis: Any) -> None:
+    mirror, body = thesis.mirror, build_body(thesis.cfg.robot, thesis.cfg.mission)
+    inner, near = build_places(mirror, body, np.array([0.0, 3.7]), np.array([0.0, 0.0]))
+    assert near.depth_m < 0.1
+    assert LegRules(mirror, body).way_around(inner, near) == ()
+
+
+def test_sensors_at_a_re_entrant_corner(thesis: Any) -> None:
+    """A leg that ends beside a stepped corner passes it at 0.1 m with its origin, but not with a sensor."""
+    mirror, body = thesis.mirror, build_body(thesis.cfg.robot, thesis.cfg.mission)
+    rules = LegRules(mirror, body)
+    corner_x, corner_y = 2.375, -2.599  # upper right corner of panel 1-9, below panel 2-10
+    assert mirror.rim.signed_distance_m(corner_x, corner_y) == pytest.approx(0.0, abs=1e-9)
+    a, b, deep = build_places(
+        mirror,
+        body,
+        np.array([corner_x - 0.09, corner_x - 0.09, corner_x - 0.30]),
+        np.array([corner_y - 0.40, corner_y - 0.05, corner_y - 0.05]),
+    )
+    clearance = rules.clearance_m(a, b)
+    upward = float(np.pi / 2.0)
+    assert not rules.are_sensors_clear(a, b, upward, clearance)
+    assert rules.are_sensors_clear(a, deep, upward, 1.0)
+    assert rules.are_sensors_clear(deep, deep, upward, rules.clearance_m(deep, deep))
+
+
+def test_no_leg_whose_sensors_clip_a_re_entrant_corner(thesis: Any) -> None:
+    """Slanting past the corner at 0.1002 m: all sensors are clear at both ends, the right front one is not between."""
+    mirror, body = thesis.mirror, build_body(thesis.cfg.robot, thesis.cfg.mission)
+    rules = LegRules(mirror, body)
+    search = Search(rules, thesis.cfg.limits)
+    course = float(np.pi / 4.0)
+    along, right = np.array((1.0, 1.0)) / np.sqrt(2.0), np.array((1.0, -1.0)) / np.sqrt(2.0)
+    for beside, passes in ((0.0868, False), (0.0960, True)):  # a sensor runs 0.09 m beside the origin, and keeps 5 mm
+        end = np.array((2.375, -2.599)) - 0.05 * along - beside * right
+        ends = np.stack((end - 0.3 * along, end))
+        a, b = build_places(mirror, body, ends[:, 0], ends[:, 1])
+        assert rules.is_clear(a, b)
+        assert a.can_face(course)
+        assert b.can_face(course)
+        assert bool(search.advance([SearchNode(a, course, 0.0)], (), Target(b))) == passes
+
+
+def test_no_sensor_runs_along_a_seam(thesis: Any) -> None:
+    """A robot a few millimetres beside its way would take the seam for the rim."""
+    body = build_body(thesis.cfg.robot, thesis.cfg.mission)
+    rules = LegRules(thesis.mirror, body)
+    stops = plan(thesis, thesis_order(thesis.mirror)).stops
+    places = build_places(thesis.mirror, body, *np.array([(stop.x_m, stop.y_m) for stop in stops]).T)
+    grazing = [
+        (stop.x_m, stop.y_m)
+        for (a, b), stop in zip(pairwise(places), stops[1:], strict=True)
+        if rules.grazing(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m))
+    ]
+    assert grazing == []
+
+
+@pytest.mark.parametrize(("name", "slanted"), [("thesis-m1", 11), ("fyst-m1", 28), ("fyst-m2", 28)])
+def test_no_way_off_the_route_leads_along_a_seam(name: str, slanted: int) -> None:
+    """Home from anywhere, or to a point at the other end of the mirror: straight there, a slanted way would."""
+    cfg = load_config(overrides={"run.mirror": name})
+    mirror = build_mirror(cfg.mirror)
+    rules, points = LegRules(mirror, build_body(cfg.robot, cfg.mission)), thesis_order(mirror)
+    rng, straight, found = np.random.default_rng(1), 0, []
+    for k in range(60):
+        x, y = next(p for p in rng.uniform(-3.0, 3.0, (99, 2)).tolist() if mirror.rim.signed_distance_m(*p) > 0.2)
+        start = DeckPose(x, y, float(rng.uniform(-np.pi, np.pi)))
+        if k % 2:
+            stops = plan_way_home(mirror, start, mirror.base_pose, cfg.robot, cfg.limits, cfg.mission)
+        else:
+            point = points[int(rng.integers(len(points)))]
+            stops = plan_route(mirror, [point], cfg.robot, cfg.limits, cfg.mission, start).stops
+        places = [LegPlace(x, y, 1.0), *(LegPlace(stop.x_m, stop.y_m, 1.0) for stop in stops)]
+        for (a, b), stop in zip(pairwise(places), stops, strict=True):
+            if (b.x_m, b.y_m) != (a.x_m, a.y_m):
+                course = atan2(b.y_m - a.y_m, b.x_m - a.x_m) + (np.pi if stop.reverse else 0.0)
+                found.append(rules.grazing(a, b, course))
+        a, b = places[0], places[-1]
+        straight += rules.grazing(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m)) is Grazing.ALONG
+    assert straight >= slanted
+    assert Grazing.ALONG not in found
+
+
+@pytest.mark.parametrize(
+    ("from_m", "to_m", "grazes"),
+    [
+        ((-0.34, 0.0), (-0.34, 0.2), Grazing.NONE),  # far beside it: the sensors at -0.25 and -0.43, the seam at -0.34
+        ((-0.26, 0.0), (-0.26, 0.2), Grazing.BESIDE),  # the left sensors 10 mm from its middle: the gap begins at 5
+        ((-0.25, 0.0), (-0.25, 0.2), Grazing.ALONG),  # the left sensors over it all the way
+        ((-0.27, 0.0), (-0.23, 0.2), Grazing.ALONG),  # across it, but so slanted that they stay over it for long
+        ((-0.40, 0.0), (-0.28, 0.02), Grazing.NONE),  # straight across
+    ],
+)
+def test_which_legs_graze_a_seam(
+    thesis: Any, from_m: tuple[float, float], to_m: tuple[float, float], grazes: Grazing
+) -> None:
+    body = build_body(thesis.cfg.robot, thesis.cfg.mission)
+    rules = LegRules(thesis.mirror, body)
+    seam = thesis.mirror.nearest_seam(-0.34, 0.05)
+    shift = seam.position_m + 0.34
+    a, b = build_places(
+        thesis.mirror, body, np.array([from_m[0] + shift, to_m[0] + shift]), np.array([from_m[1], to_m[1]])
+    )
+    assert seam.axis == "x"
+    assert rules.grazing(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m)) is grazes
+
+
+LONGEST_STEP_M = 0.27  # neighbours on one line are 220 to 254 mm apart
+
+
+def bends(mirror: Mirror, order: list[PointId]) -> int:
+    """Points of an order at which it turns by more than 10 degrees, driven either way."""
+    xy = [mirror.point_on_deck(point) for point in order]
+    steps = [(bx - ax, by - ay) for (ax, ay), (bx, by) in pairwise(xy)]
+    sines = [(ax * by - ay * bx) / hypot(ax, ay) / hypot(bx, by) for (ax, ay), (bx, by) in pairwise(steps)]
+    return sum(abs(sine) > 0.17 for sine in sines)
+
+
+def bare_time(world: Any, order: list[PointId]) -> float:
+    stops = [Stop(x, y, StopKind.MEASURE) for x, y in map(world.mirror.point_on_deck, order)]
+    return path_time(stops, world.mirror.base_pose, world.cfg.limits, world.mirror, 0.5)
+
+
+def test_one_straight_run_per_line(world: Any) -> None:
+    """27 lines of points lie over 9 rows of panels: two quarter turns from each to the next, and no others."""
+    assert bends(world.mirror, optimised_order(world.mirror)) == 2 * 26
+    assert bends(world.mirror, thesis_order(world.mirror)) > 250  # four or so on each panel
+
+
+def test_only_the_ends_of_lines_are_further_apart(world: Any) -> None:
+    xy = [world.mirror.point_on_deck(point) for point in optimised_order(world.mirror)]
+    lengths = [hypot(bx - ax, by - ay) for (ax, ay), (bx, by) in pairwise(xy)]
+    assert sum(length > LONGEST_STEP_M for length in lengths) <= 4  # the steps of the outline
+    assert max(lengths) < 0.8
+
+
+def test_eight_serpentines_of_one_panel(thesis: Any) -> None:
+    found = [tuple(point.point for point in order) for order in serpentines(thesis_order(thesis.mirror, 1))]
+    assert found == [
+        (1, 2, 3, 6, 5, 4, 7, 8, 9),
+        (3, 2, 1, 4, 5, 6, 9, 8, 7),
+        (7, 8, 9, 6, 5, 4, 1, 2, 3),
+        (9, 8, 7, 4, 5, 6, 3, 2, 1),
+        (1, 4, 7, 8, 5, 2, 3, 6, 9),
+        (7, 4, 1, 2, 5, 8, 9, 6, 3),
+        (3, 6, 9, 8, 5, 2, 1, 4, 7),
+        (9, 6, 3, 2, 5, 8, 7, 4, 1),
+    ]
+
+
+def test_the_fastest_is_taken(world: Any) -> None:
+    points = thesis_order(world.mirror)
+    times = [bare_time(world, order) for order in serpentines(points)]
+    assert bare_time(world, fastest_serpentine(world.mirror, points, world.cfg.limits)) == min(times)
+    assert max(times) > min(times) + 60.0  # the choice counts: from 2 % of a mirror up
+
+
+def test_a_robot_that_turns_slowly_takes_the_longer_lines(thesis: Any) -> None:
+    """Two panels side by side: three lines of six points, or six of three."""
+    slow = LimitsConfig(v_max_m_s=0.1, a_max_m_s2=0.2, omega_max_rad_s=0.05, alpha_max_rad_s2=2.0)
+    points = thesis_order(thesis.mirror, 2)
+    order = fastest_serpentine(thesis.mirror, points, slow)
+    assert bends(thesis.mirror, order) == 4  # three rows; along the columns there would be ten
+    assert fastest_serpentine(thesis.mirror, [], slow) == []
+
+
+def test_the_order_of_the_points_given_does_not_matter(thesis: Any) -> None:
+    points = thesis_order(thesis.mirror, 12)
+    expected = fastest_serpentine(thesis.mirror, points, NOMINAL_LIMITS)
+    assert fastest_serpentine(thesis.mirror, points[::-1], NOMINAL_LIMITS) == expected
+    assert ORDERS["optimised"](thesis.mirror, 12) == expected
+
+
+def test_nominal_limits_are_the_shipped_ones(world: Any) -> None:
+    assert world.cfg.limits == NOMINAL_LIMITS
+
+
+def test_negative_number_of_panels(thesis: Any) -> None:
+    with pytest.raises(ValueError, match=r"panels = -1: .* 0 \(= all\)"):
+        optimised_order(thesis.mirror, -1)
+
+
+def test_few_stops_on_the_way(world: Any) -> None:
+    """At most two at each change of line, and one on the way into the mirror; long legs left whole."""
+    cfg, mirror = world.cfg, world.mirror
+    mission = cfg.mission.model_copy(update={"longest_leg_m": 2.0})
+    route = plan_route(mirror, optimised_order(mirror), cfg.robot, cfg.limits, mission, mirror.base_pose)
+    assert sum(stop.kind is StopKind.VIA for stop in route.stops) <= 2 * 26 + 1
+    # In reverse it leaves the rim, and at most every third line whole.
+    assert sum(stop.reverse for stop in route.stops) < len(route.stops) / 3
+
+
+@pytest.mark.parametrize(
+    ("panel", "numbers"),
+    [
+        (PanelId(3, 5), (1, 2, 3, 6, 5, 4, 7, 8, 9)),  # order 1: odd row, odd column
+        (PanelId(3, 6), (7, 8, 9, 6, 5, 4, 1, 2, 3)),  # order 4: odd row, even column
+        (PanelId(4, 5), (3, 2, 1, 4, 5, 6, 9, 8, 7)),  # order 2: even row, odd column
+        (PanelId(4, 6), (9, 8, 7, 4, 5, 6, 3, 2, 1)),  # order 3: even row, even column
+    ],
+)
+def test_orders_of_table_3_1(panel: PanelId, numbers: tuple[int, ...], thesis: Any) -> None:
+    assert panel_order(panel) == numbers
+    order = [point.point for point in thesis_order(thesis.mirror) if point.panel == panel]
+    assert tuple(order) == numbers
+
+
+@pytest.mark.parametrize(
+    ("panel", "first", "last"),
+    [
+        (PanelId(3, 5), ("left", "lower"), ("right", "upper")),
+        (PanelId(3, 6), ("left", "upper"), ("right", "lower")),
+        (PanelId(4, 5), ("right", "lower"), ("left", "upper")),
+        (PanelId(4, 6), ("right", "upper"), ("left", "lower")),
+    ],
+)
+def test_where_an_order_begins_and_ends(
+    panel: PanelId, first: tuple[str, str], last: tuple[str, str], thesis: Any
+) -> None:
+    mirror: Mirror = thesis.mirror
+    points = [point for point in thesis_order(mirror) if point.panel == panel]
+    for point, (side, height) in ((points[0], first), (points[-1], last)):
+        x, y = mirror.point_on_deck(point)
+        centre = mirror.panels[panel]
+        assert (x < centre.x_m - 0.2) == (side == "left")
+        assert (y < centre.y_m - 0.2) == (height == "lower")
+
+
+def test_odd_rows_run_towards_plus_column_and_even_rows_back(world: Any) -> None:
+    panels = list(dict.fromkeys(point.panel for point in thesis_order(world.mirror)))
+    for row in range(1, world.mirror.rows + 1):
+        cols = [panel.col for panel in panels if panel.row == row]
+        assert cols == sorted(cols, reverse=row % 2 == 0)
+    assert [panel.row for panel in panels] == sorted(panel.row for panel in panels)
+
+
+def test_within_a_panel_each_point_is_next_to_the_last(world: Any) -> None:
+    points = thesis_order(world.mirror)
+    for a, b in pairwise(points):
+        if a.panel == b.panel:
+            (ya, xa), (yb, xb) = divmod(a.point - 1, 3), divmod(b.point - 1, 3)
+            assert abs(ya - yb) + abs(xa - xb) == 1
+
+
+def test_first_panels(load: Callable[[str], Any]) -> None:
+    mirror = load("fyst-m1").mirror
+    assert thesis_order(mirror, 3) == thesis_order(mirror)[:27]
+    assert thesis_order(mirror, 1000) == thesis_order(mirror)
+
+
+def test_registry(thesis: Any) -> None:
+    assert ORDERS["thesis"](thesis.mirror, 1) == thesis_order(thesis.mirror, 1)
+
+
+def test_negative_number_of_panels_of_traversal(thesis: Any) -> None:
+    with pytest.raises(ValueError, match=r"panels = -1: .* 0 \(= all\)"):
+        thesis_order(thesis.mirror, -1)

@@ -1,0 +1,259 @@
+"""From the end of a leg to the request for a measurement."""
+
+from collections.abc import Callable, Iterable
+from math import cos, exp, hypot, pi, sin
+
+import numpy as np
+import pytest
+
+from ccatp.config.models import Config
+from ccatp.core import DeckPose, PanelId, PanelPose, PointId, Stop, StopKind
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.survey.route_follower import Corrector, LegAim, StateEstimate, plan_aim
+from ccatp.survey.state import ApproachCounter
+from ccatp.survey.stops import SETTLE_LIMIT_S, SettleAndMeasure, StandstillDetector
+
+DT, MEASURING_S = 0.01, 0.5
+POINT = PointId(5, 5, 1)
+
+
+@pytest.fixture(scope="module")
+def mirror(config: Config) -> Mirror:
+    return build_mirror(config.mirror)
+
+
+@pytest.fixture
+def stopover(config: Config) -> SettleAndMeasure:
+    return SettleAndMeasure(config.control, MEASURING_S)
+
+
+def at(mirror: Mirror, frame: int, speed_m_s: float = 0.0) -> StateEstimate:
+    return StateEstimate(frame * DT, DT, PanelPose(PanelId(5, 5), 0.0, 0.0, 0.0), mirror.deck_pose, speed_m_s, 0.0)
+
+
+def test_asks_once_and_only_after_the_measuring_time_at_rest(stopover: SettleAndMeasure, mirror: Mirror) -> None:
+    settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
+    asked = [k for k in range(settled, settled + 200) if stopover.is_due(at(mirror, k))]
+    assert asked == [settled + round(MEASURING_S / DT)]
+    assert (stopover.request, stopover.is_asked) == (1, True)
+
+
+def test_an_interrupted_stop_begins_anew_and_asks_again(stopover: SettleAndMeasure, mirror: Mirror) -> None:
+    for k in range(2):
+        settled = next(j for j in range(1000 * k, 1000 * k + 100) if stopover.has_settled(at(mirror, j)))
+        assert any(stopover.is_due(at(mirror, j)) for j in range(settled, settled + 60))
+        stopover.interrupt()
+        assert not stopover.is_asked
+    assert stopover.request == 2
+
+
+def test_the_measuring_time_begins_anew_where_the_robot_moves_once_more(
+    stopover: SettleAndMeasure, mirror: Mirror
+) -> None:
+    settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
+    moves = range(settled + 20, settled + 30)
+    asked = [k for k in range(settled, settled + 200) if stopover.is_due(at(mirror, k, speed_m_s=0.01 * (k in moves)))]
+    assert len(asked) == 1
+    assert asked[0] > moves[-1] + round(MEASURING_S / DT)  # the mean speed takes its time to forget the motion
+
+
+@pytest.mark.fault("E9")
+def test_who_moves_for_ever_is_never_measured_and_restless(stopover: SettleAndMeasure, mirror: Mirror) -> None:
+    settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
+    frames = range(settled + 1, settled + 2000)
+    assert [k for k in frames if stopover.is_due(at(mirror, k, speed_m_s=0.01))] == []
+    limit = settled + round(SETTLE_LIMIT_S / DT)
+    assert not stopover.is_restless((limit - 1) * DT)
+    assert stopover.is_restless((limit + 1) * DT)
+
+
+@pytest.mark.fault("E9")
+def test_a_measurement_during_which_the_robot_moves_is_not_wanted(stopover: SettleAndMeasure, mirror: Mirror) -> None:
+    settled = next(k for k in range(100) if stopover.has_settled(at(mirror, k)))
+    asked = next(k for k in range(settled, settled + 200) if stopover.is_due(at(mirror, k)))
+    assert not stopover.is_due(at(mirror, asked + 1))
+    assert stopover.is_asked
+    stopover.is_due(at(mirror, asked + 2, speed_m_s=0.01))
+    assert not stopover.is_asked
+    again = next(k for k in range(asked + 3, asked + 400) if stopover.is_due(at(mirror, k)))
+    assert again > asked + 2 + round(MEASURING_S / DT)
+    assert stopover.request == 2
+
+
+def test_who_never_rests_is_restless_after_the_limit(stopover: SettleAndMeasure, mirror: Mirror) -> None:
+    frames = round(SETTLE_LIMIT_S / DT)
+    for k in range(frames):
+        assert not stopover.has_settled(at(mirror, k, speed_m_s=0.01))
+    assert not stopover.is_restless((frames - 1) * DT)
+    assert stopover.is_restless((frames + 1) * DT)
+
+
+def test_a_point_is_arrived_at_once(stopover: SettleAndMeasure) -> None:
+    assert stopover.arrival_at(POINT) == POINT
+    assert stopover.arrival_at(None) is None  # a fix that finds the robot again is no arrival
+    assert stopover.arrival_at(POINT) is None
+    assert stopover.arrival_at(POINT._replace(point=2)) == POINT._replace(point=2)
+
+
+DT_SETTLING = 0.01
+
+
+def first_rest(config: Config, speeds: Iterable[float], rates: Iterable[float]) -> int | None:
+    stillness = StandstillDetector(config.control)
+    for k, (v, omega) in enumerate(zip(speeds, rates, strict=False)):
+        if stillness.is_rest(k * DT_SETTLING, DT_SETTLING, v, omega):
+            return k
+    return None
+
+
+def test_at_rest_after_the_settling_time_below_both_limits(config: Config) -> None:
+    control = config.control
+    speeds = [0.1, 0.02] + [0.9 * control.settle_speed_m_s] * 10
+    rates = [0.0, 0.0, 0.0] + [0.9 * control.settle_rate_rad_s] * 10
+    assert first_rest(config, speeds, rates) == 2 + round(control.settle_time_s / DT_SETTLING)
+
+
+@pytest.mark.parametrize("speed", [lambda c: 1.1 * c.settle_speed_m_s, lambda c: -1.1 * c.settle_speed_m_s])
+def test_a_robot_that_creeps_never_rests(config: Config, speed: Callable[[object], float]) -> None:
+    assert first_rest(config, [speed(config.control)] * 1000, [0.0] * 1000) is None
+
+
+def test_a_robot_that_goes_on_turning_never_rests(config: Config) -> None:
+    assert first_rest(config, [0.0] * 1000, [1.1 * config.control.settle_rate_rad_s] * 1000) is None
+
+
+def test_fans_that_shake_it_do_not_keep_it_from_resting(config: Config) -> None:
+    # A bounded jitter: 0.02 rad/s to and fro, never below the limit and without a mean.
+    rates = [0.02 * (-1.0) ** k for k in range(200)]
+    rested = first_rest(config, [0.0] * 200, rates)
+    assert rested is not None
+    assert rested < 50  # half a second
+
+
+def test_wheels_that_run_down_rest_when_they_are_slow_and_no_earlier(config: Config) -> None:
+    speeds = [0.05 * exp(-k * DT_SETTLING / 0.08) for k in range(200)]
+    slow = next(k for k, v in enumerate(speeds) if v <= config.control.settle_speed_m_s)
+    rested = first_rest(config, speeds, [0.0] * 200)
+    assert rested == slow + round(config.control.settle_time_s / DT_SETTLING)
+
+
+POSE = (0.1, 0.2, 0.5)
+
+
+@pytest.fixture
+def corrector(config: Config, mirror: Mirror) -> Corrector:
+    return Corrector(mirror, config.robot, config.mission)
+
+
+def seen(ahead_m: float, left_m: float) -> tuple[float, float]:
+    x, y, heading = POSE
+    c, s = cos(heading), sin(heading)
+    return x + c * ahead_m - s * left_m, y + s * ahead_m + c * left_m
+
+
+@pytest.mark.parametrize("ahead_m", [0.02, -0.02])
+@pytest.mark.parametrize("left_m", [0.0069, -0.0069])
+def test_what_lies_nearly_along_the_heading_is_driven_to_without_a_turn(ahead_m: float, left_m: float) -> None:
+    aim = plan_aim(POSE, seen(ahead_m, left_m), 0.010, 0.7)
+    assert aim == pytest.approx(LegAim(*seen(ahead_m, 0.0), ahead_m < 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("ahead_m", "left_m", "reverse", "turn_rad"),
+    [
+        (0.01, 0.01, False, pi / 4),
+        (0.01, -0.01, False, -pi / 4),
+        (-0.01, 0.01, True, -pi / 4),
+        (-0.01, -0.01, True, pi / 4),
+    ],
+)
+def test_else_the_robot_turns_by_the_smaller_angle(
+    ahead_m: float, left_m: float, reverse: bool, turn_rad: float
+) -> None:
+    target = seen(ahead_m, left_m)
+    aim = plan_aim(POSE, target, 0.010, 0.7)
+    assert aim == pytest.approx(LegAim(*target, reverse, turn_rad))
+    sign = -1.0 if aim.reverse else 1.0
+    heading, distance = POSE[2] + aim.turn_rad, hypot(ahead_m, left_m)
+    # Driven that far that way the robot is there.
+    assert POSE[0] + sign * distance * cos(heading) == pytest.approx(target[0])
+    assert POSE[1] + sign * distance * sin(heading) == pytest.approx(target[1])
+
+
+def test_beyond_its_reach_there_is_no_correction(corrector: Corrector, config: Config) -> None:
+    pose = PanelPose(PanelId(5, 5), 0.0, 0.0, 0.0)
+    reach = config.mission.correction_reach_m
+    assert corrector.aim(pose, (0.99 * reach, 0.0)) is not None
+    assert corrector.aim(pose, (1.01 * reach, 0.0)) is None
+
+
+def at_the_rim(mirror: Mirror, depth_m: float) -> PanelPose:
+    """On the last panel of the middle row, ``depth_m`` from the rim at its right, heading along it."""
+    y = mirror.deck_pose(PanelPose(PanelId(5, 5), 0.0, 0.0, 0.0)).y_m
+    x = max(float(vx) for vx, _ in mirror.rim.vertices) - depth_m
+    col = max(panel.col for panel in mirror.panels if panel.row == 5)
+    return mirror.panel_pose(PanelId(5, col), DeckPose(x, y, pi / 2))
+
+
+def test_no_sensor_may_pass_the_rim_on_the_way(corrector: Corrector, mirror: Mirror) -> None:
+    # Sensors 0.09 m beside the robot stand 15 mm inside the rim; turning they reach out to 0.127 m.
+    pose = at_the_rim(mirror, 0.105)
+    along = (pose.x_m, pose.y_m + 0.03)
+    assert corrector.aim(pose, along) is not None
+    for depth_m, is_safe in ((0.105, False), (0.2, True)):
+        pose = at_the_rim(mirror, depth_m)  # it would have to turn
+        assert (corrector.aim(pose, (pose.x_m - 0.03, pose.y_m + 0.001)) is not None) is is_safe
+
+
+def test_no_correction_ends_with_a_sensor_beyond_the_rim(corrector: Corrector, mirror: Mirror) -> None:
+    outward = at_the_rim(mirror, 0.105)
+    facing = PanelPose(outward.panel, outward.x_m, outward.y_m, outward.heading_rad - pi / 2)
+    assert corrector.aim(facing, (facing.x_m + 0.004, facing.y_m)) is not None
+    assert corrector.aim(facing, (facing.x_m + 0.012, facing.y_m)) is None
+
+
+def test_after_a_correction_a_turn_at_the_rim_is_looked_at(corrector: Corrector, mirror: Mirror) -> None:
+    for depth_m, is_safe in ((0.105, False), (0.2, True)):
+        pose = mirror.deck_pose(at_the_rim(mirror, depth_m))
+        assert corrector.can_go_on(pose, Stop(pose.x_m, pose.y_m + 0.2, StopKind.MEASURE))
+        assert corrector.can_go_on(pose, Stop(pose.x_m - 0.2, pose.y_m, StopKind.MEASURE)) is is_safe
+        assert corrector.can_go_on(pose, Stop(pose.x_m, pose.y_m - 0.2, StopKind.MEASURE, reverse=True))
+
+
+HERE, THERE = PointId(1, 2, 3), PointId(1, 2, 4)
+
+
+def test_a_point_is_approached_again_where_it_may_be_further_off_than_allowed() -> None:
+    approaches = ApproachCounter(3e-3, 3)
+    assert not approaches.is_too_far(HERE, 2.98e-3, 5e-6)
+    assert approaches.is_too_far(THERE, 2.99e-3, 5e-6)  # 3 sigma are 15 um
+    assert not approaches.is_too_far(HERE, 2.99e-3, 0.0)
+
+
+def test_a_laser_system_of_little_precision_takes_a_tenth_of_the_tolerance_at_most() -> None:
+    approaches = ApproachCounter(3e-3, 3)
+    for sigma_m in (1e-3, float("inf")):
+        assert not approaches.is_too_far(HERE, 2.69e-3, sigma_m)
+        assert approaches.is_too_far(THERE, 2.71e-3, sigma_m)
+
+
+def test_the_last_approach_counts_wherever_it_ends_and_each_point_has_its_own() -> None:
+    approaches = ApproachCounter(3e-3, 3)
+    assert [approaches.is_too_far(HERE, 5e-3, 0.0) for _ in range(3)] == [True, True, False]
+    assert approaches.count == 3
+    assert approaches.is_too_far(THERE, 5e-3, 0.0)
+    assert approaches.count == 1
+
+
+@pytest.mark.parametrize("sigma_m", [2e-6, 2e-5])
+def test_what_counts_as_near_enough_is_so_in_truth(sigma_m: float) -> None:
+    # Distances that end just inside and just outside; what lets a puck pass that is outside needs an error of 3 sigma.
+    rng = np.random.default_rng(1)
+    true_m = 3e-3 + rng.uniform(-2e-4, 2e-4, 20_000)
+    measured_m = true_m + sigma_m * rng.standard_normal(true_m.size)
+    passed = np.array(
+        [not ApproachCounter(3e-3, 3).is_too_far(HERE, error_m, sigma_m) for error_m in measured_m.tolist()]
+    )
+    assert 0.2 < passed.mean() < 0.5
+    assert (true_m[passed] > 3e-3).sum() <= 1e-4 * passed.sum()
+    assert true_m[passed].max() < 3e-3 + sigma_m
