@@ -87,7 +87,7 @@ LASER_NAMES = ("lasers", "air", "laser fix")
 TEMPERATURE_C, PRESSURE_HPA, HUMIDITY_PCT = (-40.0, 50.0), (400.0, 1100.0), (0.0, 100.0)
 
 
-def judge_lasers(*, connected: bool, laser_ready: bool) -> PreflightResult:
+def check_lasers(*, connected: bool, laser_ready: bool) -> PreflightResult:
     """Are the lasers there, and warm?"""
     if not connected:
         return failed("lasers", "the server has no laser", "switch the laser unit on and connect it to its server")
@@ -96,7 +96,7 @@ def judge_lasers(*, connected: bool, laser_ready: bool) -> PreflightResult:
     return passed("lasers", "connected and warm")
 
 
-def judge_air(air: Environment) -> PreflightResult:
+def check_air(air: Environment) -> PreflightResult:
     """Can the air be what the server takes it for? Lengths are corrected by it."""
     found = f"{air.temperature_c:.1f} degC, {air.pressure_hpa:.0f} hPa, {air.humidity_pct:.0f} %"
     for value, (low, high) in (
@@ -110,7 +110,7 @@ def judge_air(air: Environment) -> PreflightResult:
     return passed("air", found)
 
 
-def judge_fix(cfg: Config, mirror: Mirror, fix: Fix) -> PreflightResult:
+def check_fix(cfg: Config, mirror: Mirror, fix: Fix) -> PreflightResult:
     """Is the puck where a robot at base has it?"""
     expected = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m)
     off_m = dist(fix.position_m, expected)
@@ -154,7 +154,7 @@ class RobotReport(NamedTuple):
     arrived_s: Sequence[float]
 
 
-def judge_robot(cfg: Config, mirror: Mirror, report: RobotReport) -> list[PreflightResult]:
+def check_robot(cfg: Config, mirror: Mirror, report: RobotReport) -> list[PreflightResult]:
     """All checks of a robot that stands at base."""
     problems = robot_problems(cfg, mirror, report.hello)
     geometry = (

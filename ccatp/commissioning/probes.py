@@ -13,9 +13,20 @@ from contextlib import suppress
 from fcntl import LOCK_EX, LOCK_NB, flock
 from pathlib import Path
 
-from ccatp.commissioning import preflight as judge_laser
-from ccatp.commissioning import preflight as judge_robot
-from ccatp.commissioning.preflight import PreflightResult, RobotReport, failed, passed, skipped, warned
+from ccatp.commissioning.preflight import (
+    LASER_NAMES,
+    ROBOT_NAMES,
+    PreflightResult,
+    RobotReport,
+    check_air,
+    check_fix,
+    check_lasers,
+    check_robot,
+    failed,
+    passed,
+    skipped,
+    warned,
+)
 from ccatp.config.models import Config
 from ccatp.errors import CcatpError
 from ccatp.etalon_client import EtalonClient, EtalonError, EtalonUnreachable
@@ -57,7 +68,7 @@ async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -
     try:
         key = read_key(cfg.robot.key_file)
     except CcatpError as error:
-        return [failed("robot link", str(error), "see ccatp keys"), *skipped(judge_robot.ROBOT_NAMES, "no robot link")]
+        return [failed("robot link", str(error), "see ccatp keys"), *skipped(ROBOT_NAMES, "no robot link")]
     link = RobotLink(
         host=cfg.robot.host, port=cfg.robot.port, role="monitor", client="check", key=key,
         on_sensors=take, on_lost=lose, on_joined=hellos.append,
@@ -67,7 +78,7 @@ async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -
         await _listen(has_changed, is_lost, listen_s)
     except RobotLinkError as error:
         todo = "switch the robot on; check [robot] host, port and key_file; end what else drives it"
-        return [failed("robot link", str(error), todo), *skipped(judge_robot.ROBOT_NAMES, "no robot link")]
+        return [failed("robot link", str(error), todo), *skipped(ROBOT_NAMES, "no robot link")]
     finally:
         link.close()
     hello = hellos[0]
@@ -75,8 +86,8 @@ async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -
     if lost or not frames:
         why = lost[0] if lost else f"no sensors frame within {FIRST_FRAME_S:g} s"
         lost_link = failed("robot link", why, "look at the robot's own log")
-        return [lost_link, *skipped(judge_robot.ROBOT_NAMES, "no frames")]
-    return [*found, *judge_robot.judge_robot(cfg, mirror, RobotReport(hello, frames, arrived_s))]
+        return [lost_link, *skipped(ROBOT_NAMES, "no frames")]
+    return [*found, *check_robot(cfg, mirror, RobotReport(hello, frames, arrived_s))]
 
 
 async def _listen(has_changed: asyncio.Event, is_lost: asyncio.Event, listen_s: float) -> None:
@@ -106,11 +117,11 @@ async def probe_laser(cfg: Config, mirror: Mirror) -> list[PreflightResult]:
             readiness = await client.isready()
         except EtalonError as error:
             todo = "start the MultiLine server; check [etalon] host and port"
-            return [failed(name, str(error), todo), *skipped(judge_laser.LASER_NAMES, "no laser server")]
+            return [failed(name, str(error), todo), *skipped(LASER_NAMES, "no laser server")]
         found = [
             passed(name, f"{cfg.etalon.host}:{cfg.etalon.port}"),
-            judge_laser.judge_lasers(connected=readiness.connected, laser_ready=readiness.laser_ready),
-            judge_laser.judge_air(readiness.environment),
+            check_lasers(connected=readiness.connected, laser_ready=readiness.laser_ready),
+            check_air(readiness.environment),
         ]
         try:
             await asyncio.sleep(cfg.etalon.measuring_time_s)
@@ -120,7 +131,7 @@ async def probe_laser(cfg: Config, mirror: Mirror) -> list[PreflightResult]:
         except EtalonError as error:
             todo = "set the robot down at base, with a free view for the beams"
             return [*found, failed("laser fix", str(error), todo)]
-        return [*found, judge_laser.judge_fix(cfg, mirror, fix)]
+        return [*found, check_fix(cfg, mirror, fix)]
     finally:
         await client.close()
 

@@ -191,7 +191,7 @@ class EtalonSimulator:
     async def serve(self) -> None:
         """Wait until closed. An unforeseen error in a session ends it and is raised here."""
         if self._end is None:
-            raise RuntimeError("Etalon stand-in not started: call start first")
+            raise RuntimeError("simulated MultiLine server not started: call start first")
         await asyncio.shield(self._end)
 
     async def close(self) -> None:

@@ -12,12 +12,12 @@ from ccatp.commissioning.preflight import (
     PreflightResult,
     RobotReport,
     as_json,
+    check_air,
+    check_fix,
+    check_lasers,
+    check_robot,
     failed,
     has_failed,
-    judge_air,
-    judge_fix,
-    judge_lasers,
-    judge_robot,
     lines,
     passed,
     skipped,
@@ -65,7 +65,7 @@ def stood(cfg: Config) -> tuple[Mirror, RobotReport]:
 @pytest.mark.parametrize("mirror", ["fyst-m1", "fyst-m2", "thesis-m1"])
 def test_a_sound_robot_passes(mirror: str) -> None:
     cfg = load_config(None, {"run.mirror": mirror})
-    found = judge_robot(cfg, *stand(cfg))
+    found = check_robot(cfg, *stand(cfg))
     assert [finding.name for finding in found] == list(ROBOT_NAMES)
     assert {finding.outcome for finding in found} == {CheckOutcome.PASS}, lines(found)
 
@@ -121,11 +121,11 @@ def flat(frame: Sensors) -> None:
 def test_what_is_wrong_is_found(
     cfg: Config, stood: tuple[Mirror, RobotReport], change: Change, name: str, outcome: CheckOutcome, told: str
 ) -> None:
-    mirror, heard = stood
-    frames = [msgspec.convert(msgspec.to_builtins(frame), Sensors) for frame in heard.frames]
+    mirror, report = stood
+    frames = [msgspec.convert(msgspec.to_builtins(frame), Sensors) for frame in report.frames]
     for frame in frames:
         change(frame)
-    found = judge_robot(cfg, mirror, heard._replace(frames=frames))
+    found = check_robot(cfg, mirror, report._replace(frames=frames))
     (wrong,) = [finding for finding in found if finding.outcome is not CheckOutcome.PASS]
     assert (wrong.name, wrong.outcome) == (name, outcome)
     assert told in wrong.found
@@ -133,11 +133,11 @@ def test_what_is_wrong_is_found(
 
 
 def test_a_sensor_that_flickers_is_told(cfg: Config, stood: tuple[Mirror, RobotReport]) -> None:
-    mirror, heard = stood
-    frames = [msgspec.convert(msgspec.to_builtins(frame), Sensors) for frame in heard.frames]
+    mirror, report = stood
+    frames = [msgspec.convert(msgspec.to_builtins(frame), Sensors) for frame in report.frames]
     edge(1, 0, 1, 1)(frames[5])
     (wrong,) = [
-        f for f in judge_robot(cfg, mirror, heard._replace(frames=frames)) if f.outcome is not CheckOutcome.PASS
+        f for f in check_robot(cfg, mirror, report._replace(frames=frames)) if f.outcome is not CheckOutcome.PASS
     ]
     assert "front right see the panel on and off" in wrong.found
 
@@ -159,45 +159,45 @@ def test_time_that_is_wrong_is_found(
     outcome: CheckOutcome,
     told: str,
 ) -> None:
-    mirror, heard = stood
-    found = {f.name: f for f in judge_robot(cfg, mirror, heard._replace(arrived_s=arrived_s))}
+    mirror, report = stood
+    found = {f.name: f for f in check_robot(cfg, mirror, report._replace(arrived_s=arrived_s))}
     assert found[name].outcome is outcome
     assert told in found[name].found
 
 
 def test_one_frame_is_not_enough(cfg: Config, stood: tuple[Mirror, RobotReport]) -> None:
-    mirror, heard = stood
-    alone = heard._replace(frames=heard.frames[:1], arrived_s=heard.arrived_s[:1])
-    assert judge_robot(cfg, mirror, alone)[1].found == "a single frame"
+    mirror, report = stood
+    alone = report._replace(frames=report.frames[:1], arrived_s=report.arrived_s[:1])
+    assert check_robot(cfg, mirror, alone)[1].found == "a single frame"
 
 
 def test_another_robot_and_lockstep_are_told(cfg: Config, stood: tuple[Mirror, RobotReport]) -> None:
-    mirror, heard = stood
-    other = msgspec.structs.replace(heard.hello.robot, wheel_base_m=0.2)
-    hello = msgspec.structs.replace(heard.hello, robot=other, lockstep=True)
-    found = {f.name: f for f in judge_robot(cfg, mirror, heard._replace(hello=hello))}
+    mirror, report = stood
+    other = msgspec.structs.replace(report.hello.robot, wheel_base_m=0.2)
+    hello = msgspec.structs.replace(report.hello, robot=other, lockstep=True)
+    found = {f.name: f for f in check_robot(cfg, mirror, report._replace(hello=hello))}
     assert "wheel_base_m is 0.15 here and 0.2 there" in found["robot geometry"].found
     assert found["robot clock"].outcome is CheckOutcome.WARN
 
 
 def test_fans_below_the_floor_are_told() -> None:
     cfg = load_config(None, {"run.mirror": "fyst-m2"})
-    mirror, heard = stand(cfg)
-    frames = [msgspec.convert(msgspec.to_builtins(frame), Sensors) for frame in heard.frames]
+    mirror, report = stand(cfg)
+    frames = [msgspec.convert(msgspec.to_builtins(frame), Sensors) for frame in report.frames]
     frames[7].fans = (0.6, 0.3)
-    found = {f.name: f for f in judge_robot(cfg, mirror, heard._replace(frames=frames))}
+    found = {f.name: f for f in check_robot(cfg, mirror, report._replace(frames=frames))}
     assert "the robot would fall" in found["fans"].todo
     weak = load_config(None, {"run.mirror": "fyst-m2", "robot.fan_duty": [0.5, 0.8]})
-    assert "raise robot.fan_duty" in {f.name: f for f in judge_robot(weak, mirror, heard)}["fans"].todo
+    assert "raise robot.fan_duty" in {f.name: f for f in check_robot(weak, mirror, report)}["fans"].todo
 
 
 def test_lasers_and_air() -> None:
-    assert judge_lasers(connected=True, laser_ready=True).outcome is CheckOutcome.PASS
-    assert "no laser" in judge_lasers(connected=False, laser_ready=True).found
-    assert "not warm" in judge_lasers(connected=True, laser_ready=False).found
-    assert judge_air(Environment(-5.0, 525.0, 30.0)).outcome is CheckOutcome.PASS
+    assert check_lasers(connected=True, laser_ready=True).outcome is CheckOutcome.PASS
+    assert "no laser" in check_lasers(connected=False, laser_ready=True).found
+    assert "not warm" in check_lasers(connected=True, laser_ready=False).found
+    assert check_air(Environment(-5.0, 525.0, 30.0)).outcome is CheckOutcome.PASS
     for air in (Environment(99.0, 525.0, 30.0), Environment(-5.0, 52.5, 30.0), Environment(-5.0, 525.0, 130.0)):
-        assert "not the air of any telescope" in judge_air(air).found
+        assert "not the air of any telescope" in check_air(air).found
 
 
 def test_a_fix_is_where_a_robot_at_base_has_its_puck(cfg: Config, stood: tuple[Mirror, RobotReport]) -> None:
@@ -205,7 +205,7 @@ def test_a_fix_is_where_a_robot_at_base_has_its_puck(cfg: Config, stood: tuple[M
     at_base = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m)
 
     def fix(position_m: Vector3) -> PreflightResult:
-        return judge_fix(cfg, mirror, Fix(0.0, position_m, (0.0,) * 9, 1.0, (1, 2, 3, 4), 1e-6))
+        return check_fix(cfg, mirror, Fix(0.0, position_m, (0.0,) * 9, 1.0, (1, 2, 3, 4), 1e-6))
 
     assert fix(at_base).outcome is CheckOutcome.PASS
     high = mirror.puck_world(mirror.base_pose, cfg.robot.puck_height_m + 0.01)
