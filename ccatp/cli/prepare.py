@@ -56,7 +56,7 @@ def plan(
     geometry = build_mirror(cfg.mirror)
     found = make_plan(cfg, geometry)
     if figure_file is not None:
-        from ccatp.report.plots import draw_plan
+        from ccatp.report.mirror_map import draw_plan
 
         draw_plan(geometry, found, figure_file)
     for line in [json.dumps(plan_data(cfg, found))] if json_output else plan_lines(cfg, found):

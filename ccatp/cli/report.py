@@ -59,7 +59,7 @@ def report(run_dir: Path, out: Path | None, figures: Path | None, json_output: b
 def compare(run_a: Path, run_b: Path, out: Path | None, figures: Path | None, json_output: bool) -> int:
     """Put two runs beside each other: figures, configuration, time, errors, and which panels have moved."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from ccatp.report.compare_page import compare_data, compare_lines
+    from ccatp.report.compare import compare_data, compare_lines
     from ccatp.report.writer import COMPARISON, compare_runs
 
     path = out or run_b / COMPARISON
@@ -81,7 +81,7 @@ def compare(run_a: Path, run_b: Path, out: Path | None, figures: Path | None, js
 )
 def plot(run_dir: Path, out: Path | None) -> int:
     """Draw the map of a run: panels, path, and each point coloured by its arrival error."""
-    from ccatp.report.plots import draw_from_run_dir
+    from ccatp.report.mirror_map import draw_from_run_dir
 
     picture = out or run_dir / "map.png"
     draw_from_run_dir(run_dir, picture)
@@ -138,7 +138,7 @@ def align(
     if csv_file is not None:
         _write(csv_file, csv_lines(result))
     if figure_file is not None:
-        from ccatp.report.plots import draw_alignment
+        from ccatp.report.mirror_map import draw_alignment
 
         draw_alignment(mirror, result, figure_file, f"{mirror.name}: {len(result.panels)} panels", str(run_dir))
     if json_output:

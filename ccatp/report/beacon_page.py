@@ -1,8 +1,8 @@
-"""The report of a mission among beacons: head, sections, figures by name, and the figures of it as data."""
+"""The report of a beacon mission: sections of the page, figures by the names of their files, and its values as data."""
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -15,8 +15,20 @@ from ccatp.report.beacon_figures import (
     map_error_figure,
     target_figure,
 )
-from ccatp.report.drawing import Drawing
-from ccatp.report.html import WIDE, Section, chips, clock, facts, figure, foot, head, page, shown, table, text
+from ccatp.report.html import (
+    MILLI,
+    Fact,
+    PageFigure,
+    Section,
+    Table,
+    clock_text,
+    events_of,
+    inline,
+    number_text,
+    page_figure,
+    render,
+)
+from ccatp.report.plots import NARROW, WIDE
 from ccatp.report.record import (
     COMPLETE,
     BeaconRecord,
@@ -27,9 +39,10 @@ from ccatp.report.record import (
     readings_of,
     waypoint_rows,
 )
-from ccatp.report.sections import changes_body, events_body
 
-_MILLI = 1e3
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 _SIGMAS = 3.0
 _BAND = 0.95
 TITLES = {
@@ -42,10 +55,13 @@ TITLES = {
 def beacon_page(record: BeaconRecord) -> str:
     """The report as one HTML file."""
     sections = [section for make in SECTIONS if (section := make(record)) is not None]
-    return page(f"{record.name}: {record.cfg.system}", _head(record), sections, foot(record))
+    return render(
+        "beacons.html", f"{record.name}: {record.cfg.system}", sections, record=record, outcome=outcome_of(record),
+        heading=TITLES[record.cfg.system], headline=_headline(record),
+    )  # fmt: skip
 
 
-def beacon_figures(record: BeaconRecord) -> dict[str, Drawing]:
+def beacon_figures(record: BeaconRecord) -> "dict[str, Figure]":
     """The figures of the report, by the names of their files."""
     if not len(record.track.seq):
         return {}
@@ -59,7 +75,7 @@ def beacon_figures(record: BeaconRecord) -> dict[str, Drawing]:
 
 
 def beacon_data(record: BeaconRecord) -> dict[str, Any]:
-    """What ``ccatp report --json`` tells of it; lengths in m, null is not known."""
+    """What ``ccatp report --json`` prints; lengths in m, null is not known."""
     outcome = outcome_of(record)
     errors = _settled(record, pose_errors_m(record))
     rows = waypoint_rows(record)
@@ -109,54 +125,46 @@ def outcome_of(record: BeaconRecord) -> PointOutcome:
     return PointOutcome(last.outcome or f"goes on, or was killed: {last.state}", last.cause, last.outcome == COMPLETE)
 
 
-def _head(record: BeaconRecord) -> str:
-    chip = chips(record.is_simulation, f"seed {record.cfg.run.seed}")
-    return head(record, chip, TITLES[record.cfg.system], outcome_of(record), record.warnings, _headline(record))
+# -- sections ---------------------------------------------------------------------------------------------------------
 
 
-def _headline(record: BeaconRecord) -> dict[str, str]:
-    values: dict[str, str] = {}
+def _headline(record: BeaconRecord) -> list[Fact]:
+    values = []
     rows = waypoint_rows(record)
     if not record.cfg.follow.is_active:
         total = record.cfg.mission.laps * len(record.cfg.workspace.waypoints_m)
-        values["waypoints reached"] = f"{len(rows)} <small>of {total}</small>"
+        values.append(Fact("waypoints reached", f"{len(rows)}", f"of {total}"))
         known = [row for row in rows if row.sigmas is not None]
         if known:
             within = sum((row.sigmas or 0.0) <= _SIGMAS for row in known)
-            values["position there within 3 \u03c3"] = f"{within} <small>of {len(known)}</small>"
+            values.append(Fact("position there within 3 \u03c3", f"{within}", f"of {len(known)}"))
     errors = _settled(record, pose_errors_m(record))
     if errors is not None:
-        values["position error"] = (
-            f"{_MILLI * _rms(errors):.0f} <small>mm rms, {_MILLI * errors.max():.0f} largest</small>"
-        )
+        largest = f"mm rms, {MILLI * errors.max():.0f} largest"
+        values.append(Fact("position error", f"{MILLI * _rms(errors):.0f}", largest))
     beacons = [row.error_m for row in beacon_rows(record) if row.error_m is not None]
     if beacons:
         rms_m = float(np.sqrt(np.mean(np.square(beacons))))
-        values["error of the map"] = f"{_MILLI * rms_m:.1f} <small>mm rms of {len(beacons)} beacons</small>"
+        values.append(Fact("error of the map", f"{MILLI * rms_m:.1f}", f"mm rms of {len(beacons)} beacons"))
     target = (record.summary or {}).get("target") or {}
     if target.get("distance_mean_m") is not None:
-        kept = f"<small>m mean, {record.cfg.follow.safe_distance_m:g} to be kept</small>"
-        values["distance to the target"] = f"{target['distance_mean_m']:.2f} {kept}"
+        kept = f"m mean, {record.cfg.follow.safe_distance_m:g} to be kept"
+        values.append(Fact("distance to the target", f"{target['distance_mean_m']:.2f}", kept))
     if record.statuses:
-        values["time"] = clock(record.statuses[-1].elapsed_s)
+        values.append(Fact("time", clock_text(record.statuses[-1].elapsed_s)))
     return values
-
-
-# -- sections ---------------------------------------------------------------------------------------------------------
 
 
 def _map_section(record: BeaconRecord) -> Section | None:
     if not len(record.track.seq):
         return None
-    caption = "Ellipses are of three standard deviations. The path carries some, at equal distances of time."
     rows = []
     for row in beacon_rows(record):
-        place = f"{shown(row.place_m[0], 3)}, {shown(row.place_m[1], 3)}"
-        error = None if row.error_m is None else _MILLI * row.error_m
-        rows.append([text(row.name), place, shown(_MILLI * row.sigma_m, 1), shown(error, 1), shown(row.nees, 2)])
+        place = f"{number_text(row.place_m[0], 3)}, {number_text(row.place_m[1], 3)}"
+        rows.append([row.name, place, _mm(row.sigma_m), _mm(row.error_m), number_text(row.nees, 2)])
     head = ["beacon", "x, y, m", "\u03c3 in its worst direction, mm", "true error, mm", "NEES (2 is expected)"]
-    body = figure(partial(beacon_map_figure, record), caption)
-    return Section("map", "Path and map", body + (table(head, rows) if rows else "<p>No beacon came on the map.</p>"))
+    values = {"figure": page_figure(partial(beacon_map_figure, record)), "beacons": Table(head, rows)}
+    return Section("map", "Path and map", values)
 
 
 def _waypoint_section(record: BeaconRecord) -> Section | None:
@@ -171,29 +179,26 @@ def _waypoint_section(record: BeaconRecord) -> Section | None:
         [
             str(row.number),
             f"{row.lap}, {row.waypoint}",
-            shown(row.t_s, 1),
-            f"{shown(row.place_m[0], 2)}, {shown(row.place_m[1], 2)}",
-            shown(_MILLI * row.sigma_m, 1),
-            shown(_MILLI * row.estimate_off_m, 0),
-            shown(_millis(row.true_off_m), 0),
-            shown(_millis(row.error_m), 1),
-            shown(row.sigmas, 2),
+            number_text(row.t_s, 1),
+            f"{number_text(row.place_m[0], 2)}, {number_text(row.place_m[1], 2)}",
+            _mm(row.sigma_m),
+            _mm(row.estimate_off_m, 0),
+            _mm(row.true_off_m, 0),
+            _mm(row.error_m),
+            number_text(row.sigmas, 2),
         ]
         for row in rows
     ]
-    radius = f"{_MILLI * record.cfg.control.arrival_radius_m:.0f} mm"
-    lead = (
-        f"<p>A waypoint is reached when the estimate is within {radius} of it. The last two columns need the truth.</p>"
-    )
-    return Section("waypoints", "Waypoints", lead + table(head, cells))
+    return Section("waypoints", "Waypoints", {"waypoints": Table(head, cells)})
 
 
 def _target_section(record: BeaconRecord) -> Section | None:
-    if target_figure(record, WIDE) is None:
+    picture = _drawn(target_figure, record)
+    if picture is None:
         return None
     found = (record.summary or {}).get("target") or {}
-    values = {
-        name: f"{found[key]:.3f} <small>m</small>"
+    facts = [
+        Fact(name, f"{found[key]:.3f}", "m")
         for name, key in (
             ("mean distance", "distance_mean_m"),
             ("least distance", "distance_min_m"),
@@ -201,75 +206,69 @@ def _target_section(record: BeaconRecord) -> Section | None:
             ("error of its place at the end", "final_error_m"),
         )
         if found.get(key) is not None
-    }
-    draw = partial(_certain, target_figure, record)
-    return Section("target", "Target", (facts(values) if values else "") + figure(draw, "Between the two origins."))
+    ]
+    return Section("target", "Target", {"figure": picture, "facts": facts})
 
 
 def _error_section(record: BeaconRecord) -> Section | None:
     if not len(record.track.seq):
         return None
-    values: dict[str, str] = {}
+    facts = []
     all_errors = pose_errors_m(record)
     errors = _settled(record, all_errors)
     ratios = _settled(record, None if all_errors is None else all_errors / record.track.sigma_m)
     if errors is not None and ratios is not None:
-        values = {
-            "rms": f"{_MILLI * _rms(errors):.1f} <small>mm</small>",
-            "99th percentile": f"{_MILLI * float(np.percentile(errors, 99)):.1f} <small>mm</small>",
-            "largest": f"{_MILLI * float(errors.max()):.1f} <small>mm</small>",
-            "within 3 \u03c3": f"{100.0 * float((ratios <= _SIGMAS).mean()):.1f} <small>% of the frames</small>",
-        }
-    note = "" if values else "<p>The true pose is not known: three sigma alone.</p>"
-    body = facts(values) + note + figure(partial(beacon_error_figure, record), "Distance of the places.")
-    if map_error_figure(record, WIDE) is not None:
-        caption = "Of the beacons on the map, which become more; the dashed line is what the filter expects."
-        body += "<h3>The map</h3>" + figure(partial(_certain, map_error_figure, record), caption)
-    return Section("localization", "Errors over time", body)
+        facts = [
+            Fact("rms", f"{MILLI * _rms(errors):.1f}", "mm"),
+            Fact("99th percentile", f"{MILLI * float(np.percentile(errors, 99)):.1f}", "mm"),
+            Fact("largest", f"{MILLI * float(errors.max()):.1f}", "mm"),
+            Fact("within 3 \u03c3", f"{100.0 * float((ratios <= _SIGMAS).mean()):.1f}", "% of the frames"),
+        ]
+    values = {
+        "facts": facts,
+        "figure": page_figure(partial(beacon_error_figure, record)),
+        "map_figure": _drawn(map_error_figure, record),
+    }
+    return Section("localization", "Errors over time", values)
 
 
 def _consistency_section(record: BeaconRecord) -> Section | None:
-    if consistency_figure(record, WIDE) is None:
+    picture = _drawn(consistency_figure, record)
+    if picture is None:
         return None
-    values: dict[str, str] = {}
+    facts = []
     readings = readings_of(record)
     if readings:
         size = sum(reading.size for reading in readings)
         mean = sum(reading.nis for reading in readings) / size
         low, high = (float(bound) / size for bound in (chdtri(size, at) for at in (0.5 + _BAND / 2, 0.5 - _BAND / 2)))
-        band = f"<small>95 % band {low:.3f} to {high:.3f} of {size} readings</small>"
-        values["mean NIS"] = f"{mean:.3f} {band}"
-        values["readings refused"] = text(record.maps[-1].refused)
+        facts.append(Fact("mean NIS", f"{mean:.3f}", f"95 % band {low:.3f} to {high:.3f} of {size} readings"))
+        facts.append(Fact("readings refused", str(record.maps[-1].refused)))
     nees = _settled(record, pose_nees(record))
     if nees is not None:
-        values["mean NEES of the pose"] = f"{nees.mean():.2f} <small>3 is expected of many runs</small>"
+        facts.append(Fact("mean NEES of the pose", f"{nees.mean():.2f}", "3 is expected of many runs"))
     beacons = [row.nees for row in beacon_rows(record) if row.nees is not None]
     if beacons:
-        values["mean NEES of the beacons"] = f"{np.mean(beacons):.2f} <small>2 is expected of many runs</small>"
-    caption = "Each dot: the readings between two maps. What lies above the edge is drawn on it."
-    return Section(
-        "consistency", "Consistency", facts(values) + figure(partial(_certain, consistency_figure, record), caption)
-    )
+        facts.append(Fact("mean NEES of the beacons", f"{np.mean(beacons):.2f}", "2 is expected of many runs"))
+    return Section("consistency", "Consistency", {"figure": picture, "facts": facts})
 
 
 def _events_section(record: BeaconRecord) -> Section | None:
     counts = ((record.summary or {}).get("danger") or {}).items()
-    told = ", ".join(f"{name} {times}\u00d7" for name, times in counts)
-    lead = f"<p>The danger loop denied motion for: {text(told)}.</p>" if told else ""
-    return Section("events", "Events", lead + events_body(record.log)) if record.log else None
+    denials = ", ".join(f"{name} {times}\u00d7" for name, times in counts)
+    return Section("events", "Events", {"events": events_of(record.log), "denials": denials}) if record.log else None
 
 
 def _configuration_section(record: BeaconRecord) -> Section:
     cfg = record.cfg
-    values = {
-        "system": text(cfg.system),
-        "seed": text(cfg.run.seed) if record.is_simulation else shown(None),
-        "vehicle": text(cfg.vehicle.kind),
-        "speed": text(cfg.control.speed_mode),
-        "ccatp": text(record.version),
-    }
-    body = facts(values) + changes_body(record.changed, record.config_text, record.files)
-    return Section("configuration", "Configuration", body)
+    facts = [
+        Fact("system", cfg.system),
+        Fact("seed", str(cfg.run.seed) if record.is_simulation else number_text(None)),
+        Fact("vehicle", str(cfg.vehicle.kind)),
+        Fact("speed", str(cfg.control.speed_mode)),
+        Fact("ccatp", record.version),
+    ]
+    return Section("configuration", "Configuration", {"facts": facts})
 
 
 SECTIONS: tuple[Callable[[BeaconRecord], Section | None], ...] = (
@@ -284,9 +283,9 @@ SECTIONS: tuple[Callable[[BeaconRecord], Section | None], ...] = (
 """In the order of the page. A section that a run has nothing for is left out."""
 
 
-def _certain(draw: Callable[[BeaconRecord, float], Drawing | None], record: BeaconRecord, width: float) -> Drawing:
-    picture = draw(record, width)
-    return Drawing(width, 0.0, (), "") if picture is None else picture
+def _drawn(draw: "Callable[[BeaconRecord, float], Figure | None]", record: BeaconRecord) -> PageFigure | None:
+    wide, narrow = draw(record, WIDE), draw(record, NARROW)
+    return None if wide is None or narrow is None else PageFigure(inline(wide), inline(narrow))
 
 
 def _settled(record: BeaconRecord, values: FloatArray | None) -> FloatArray | None:
@@ -301,5 +300,5 @@ def _rms(errors: FloatArray) -> float:
     return round(float(np.sqrt(np.mean(errors**2))), 6)
 
 
-def _millis(value_m: float | None) -> float | None:
-    return None if value_m is None else _MILLI * value_m
+def _mm(value_m: float | None, decimals: int = 1) -> str:
+    return number_text(None if value_m is None else MILLI * value_m, decimals)

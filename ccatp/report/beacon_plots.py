@@ -1,14 +1,6 @@
-"""Figures of signal strengths: path loss with its confidence, fixes with their regions, the fuzzy speed.
+"""Pictures of beacon work: path loss, fixes by signal strength, the fuzzy speed, maps of motes, recorded runs.
 
-Imports matplotlib, which takes a second, only when something is drawn.
-
-A map of motes as a picture: places with their ellipses, and the error after each update.
-
-Imports matplotlib, which takes a second, only when something is drawn.
-
-Map and path of a recorded run as a picture: beacons with their ellipses, the path on the truth, the error.
-
-Imports matplotlib, which takes a second, only when something is drawn.
+matplotlib takes a second to import, so that it is imported only where something is drawn.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,8 +17,7 @@ from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun, 
 from ccatp.beacons.steering import Sugeno
 from ccatp.config.beacon_models import FuzzyConfig
 from ccatp.core import FloatArray
-from ccatp.report.drawing import INK, QUIET
-from ccatp.report.plots import GRID, dress, new_figure, save_figure
+from ccatp.report.plots import GRID, INK, QUIET, dress, ellipse_outline, new_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -317,20 +308,11 @@ def draw_slam(run: RecordedRun, track: EstimatedPath, judged: TrackEvaluation, o
     save_figure(figure, out)
 
 
-def ellipse(covariance: FloatArray, sigmas: float) -> FloatArray:
-    """Outline of the region within ``sigmas`` standard deviations of the origin, shape (61, 2)."""
-    values, vectors = np.linalg.eigh(covariance)
-    angle = np.linspace(0.0, 2.0 * np.pi, 61)
-    circle = np.column_stack([np.cos(angle), np.sin(angle)])
-    outline: FloatArray = sigmas * (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return outline
-
-
 def _frame(run: RecordedRun, path: FloatArray, beacons: dict[str, BeaconFix]) -> tuple[FloatArray, FloatArray]:
     """Centre and half size of what is shown: path and beacons, wherever dead reckoning went."""
     places = [(fix.x_m, fix.y_m) for fix in beacons.values()]
     places += [run.beacon_truth_m[name] for name in beacons if name in run.beacon_truth_m]
-    outlines = [np.array((fix.x_m, fix.y_m)) + ellipse(fix.covariance, SIGMAS) for fix in beacons.values()]
+    outlines = [np.array((fix.x_m, fix.y_m)) + ellipse_outline(fix.covariance, SIGMAS) for fix in beacons.values()]
     points = np.vstack([path, np.array(places).reshape(-1, 2), *outlines])
     low, high = points.min(axis=0), points.max(axis=0)
     half = 0.5 * (high - low) + 0.06 * float((high - low).max()) + 1e-3
@@ -350,7 +332,7 @@ def _draw_paths(
     marks = np.unique(np.linspace(0, len(path) - 1, POSE_ELLIPSES).astype(int))
     covariances = judged.alignment.turned(track.covariances[marks, :2, :2])
     for k, (place, covariance) in enumerate(zip(path[marks], covariances, strict=True)):
-        outline = place + ellipse(covariance, SIGMAS)
+        outline = place + ellipse_outline(covariance, SIGMAS)
         label = "3 sigma of the path" if k == 0 else "_"
         axes.plot(*outline.T, color=_PATH, linewidth=0.7, alpha=0.6, zorder=4, label=label)
 
@@ -371,7 +353,7 @@ def _draw_beacons(axes: "Axes", run: RecordedRun, beacons: dict[str, BeaconFix])
     for k, (name, fix) in enumerate(beacons.items()):
         label = "beacon, 3 sigma" if k == 0 else "_"
         axes.plot(fix.x_m, fix.y_m, "o", color=_MAP, markersize=4.5, zorder=7, label=label)
-        outline = np.array((fix.x_m, fix.y_m)) + ellipse(fix.covariance, SIGMAS)
+        outline = np.array((fix.x_m, fix.y_m)) + ellipse_outline(fix.covariance, SIGMAS)
         axes.plot(*outline.T, color=_MAP, linewidth=1.0, zorder=5)
         axes.annotate(
             name, (fix.x_m, fix.y_m), xytext=(6, 5), textcoords="offset points", fontsize=8, color=INK, zorder=8

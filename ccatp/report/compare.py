@@ -1,25 +1,37 @@
-"""Two runs, called A and B, and their figures beside each other: what each is called, and how it is written.
+"""Two surveys beside each other, called A and B: what changed on the mirror, the page, lines for a terminal, data."""
 
-How the panels lie in one survey against another: which have moved by more than both are uncertain.
-
-Figures of two runs beside each other.
-"""
-
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from markupsafe import Markup
 from scipy.special import chdtrc, chdtri
 
 from ccatp.core import FloatArray, PanelId
-from ccatp.mirror.mirror import Mirror
-from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, mirror_wavefront, on_grid_m
-from ccatp.report.analysis import KINDS, ErrorSeries
-from ccatp.report.drawing import INK, SERIES, Dots, Drawing, Plot, PlotAxis, PolyLine, Shape, envelope, legend, thinned
+from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, mirror_wavefront
+from ccatp.report.analysis import KINDS
 from ccatp.report.findings import Findings
-from ccatp.report.record import RunRecord
-from ccatp.report.run_figures import MapFrame, PanelCells, cells_figure, driven_path_m
-from ccatp.report.run_page import run_data, wavefront_data
+from ccatp.report.html import (
+    MICRO,
+    Draw,
+    Section,
+    Table,
+    events_of,
+    inline,
+    micro_text,
+    number_text,
+    page_figure,
+    render,
+)
+from ccatp.report.mirror_map import change_figure, paths_figure, surface_figure
+from ccatp.report.plots import NARROW, WIDE
+from ccatp.report.record import changed_keys
+from ccatp.report.run_figures import distribution_figure, errors_figure, time_figure
+from ccatp.report.run_page import point_text, run_data, wavefront_data
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _MODES = 3
 BAND = 0.99
@@ -232,93 +244,226 @@ def _at(data: Any, row: _Row) -> float | None:
     return None if data is None else row.scale * float(data)
 
 
-_COLOURS = (SERIES[0], SERIES[1])
-_LEAST_MM = 1e-3
-_DASH = (4.0, 3.0)
-_TOLERANCE_PX = 0.6
-_KEY_LINE = np.array([(-9.0, 0.0), (9.0, 0.0)])
-Draw = Callable[[float], Drawing]
-_CELLS = 8
+# -- the page ---------------------------------------------------------------------------------------------------------
 
 
-def distribution_figure(values: Mapping[str, FloatArray], label: str, width: float) -> Drawing:
-    """Share of the values below each number, for each run, on a logarithmic axis.
-
-    Args:
-        label: what they are, with their unit.
-    """
-    is_wide = width > 500.0
-    left, top, right, bottom = 62.0, 12.0, width - 12.0, 240.0
-    everything = np.maximum(np.concatenate(list(values.values())), _LEAST_MM)
-    low, high = 10.0 ** np.floor(np.log10(everything.min())), 10.0 ** np.ceil(np.log10(everything.max() * 1.001))
-    x = PlotAxis(float(low), float(high), left, right, is_logarithmic=True)
-    plot = Plot(left, top, right, bottom, x, PlotAxis(0.0, 100.0, bottom, top), 11.5 if is_wide else 10.5)
-    plot.frame(label, "% of them below")
-    for (_, some), colour in zip(values.items(), _COLOURS, strict=False):
-        ordered = np.sort(np.maximum(some, _LEAST_MM))
-        share = 100.0 * np.arange(1, len(ordered) + 1) / len(ordered)
-        # A step at each value.
-        plot.line(np.repeat(ordered, 2)[1:], np.repeat(share, 2)[:-1], colour, 1.8)
-    return _with_legend(plot, list(values), width, f"distribution of {label}")
+def compare_page(pair: RunPair) -> str:
+    """The comparison as one HTML file."""
+    names = f"{pair.a.record.name} and {pair.b.record.name}"
+    sections = [section for make in _SECTIONS if (section := make(pair)) is not None]
+    return render("compare.html", names, sections, pair=pair)
 
 
-def errors_figure(series: Mapping[str, ErrorSeries], width: float) -> Drawing:
-    """The largest localization error of each time, for each run, and three sigma of the estimate, dashed."""
-    is_wide = width > 500.0
-    left, top, right, bottom = 62.0, 10.0, width - 12.0, 280.0
-    shown = {name: _known(found) for name, found in series.items()}
-    everything = np.concatenate([*(values for _, values in shown.values()), *(f.sigma3_mm for f in series.values())])
-    largest = max(float(everything.max()), 0.01)
-    end = max(float(found.t_s[-1]) for found in series.values()) / 60.0
-    y = PlotAxis(_LEAST_MM, 1.5 * largest, bottom, top, is_logarithmic=True)
-    plot = Plot(left, top, right, bottom, PlotAxis(0.0, max(end, 0.1), left, right), y, 11.5 if is_wide else 10.5)
-    plot.frame("robot time, min", "mm")
-    intervals = max(1, int((right - left) / 2.0))
-    for found, (t_s, values), colour in zip(series.values(), shown.values(), _COLOURS, strict=False):
-        sigma, errors = envelope(found.t_s, found.sigma3_mm, intervals), envelope(t_s, values, intervals)
-        places = np.column_stack([plot.x.pixels(sigma.x / 60.0), plot.y.pixels(sigma.high)])
-        plot.shapes.append(PolyLine(places, colour, 0.9, _DASH, 0.7))
-        plot.line(errors.x / 60.0, errors.high, colour, 1.4)
-    names = [name if np.isfinite(found.error_mm).any() else f"{name} (3 \u03c3)" for name, found in series.items()]
-    return _with_legend(plot, names, width, "largest localization error over time")
+def _figures_section(pair: RunPair) -> Section:
+    rows = [
+        [one.name, *(number_text(value, one.decimals) for value in (one.a, one.b, one.change))]
+        for one in compared_figures(pair)
+    ]
+    return Section("figures", "Figures", {"figures": Table(["", "A", "B", "B less A"], rows)})
 
 
-def _known(series: ErrorSeries) -> tuple[FloatArray, FloatArray]:
-    is_known = np.isfinite(series.error_mm)
-    if is_known.any():
-        return series.t_s[is_known], series.error_mm[is_known]
-    return series.t_s, series.sigma3_mm
+def _configuration_section(pair: RunPair) -> Section:
+    a, b = (found.record.cfg.model_dump(mode="json") for found in (pair.a, pair.b))
+    rows = [[key, str(one), str(other)] for key, (one, other) in changed_keys(a, b).items()]
+    return Section("configuration", "Configuration", {"changes": Table(["key", "A", "B"], rows)})
 
 
-def _with_legend(plot: Plot, names: Sequence[str], width: float, title: str) -> Drawing:
-    entries = list(zip(names, _COLOURS, strict=False))
-    shapes, height = legend(12.0, plot.bottom + 56.0, entries, plot.size, width - 24.0)
-    return Drawing(width, plot.bottom + 48.0 + height, (*plot.shapes, *shapes), title)
+def _paths_section(pair: RunPair) -> Section | None:
+    draw = _drawings(pair).get("paths")
+    return None if draw is None else Section("map", "Paths", {"figure": page_figure(draw)})
 
 
-def paths_figure(mirror: Mirror, records: Mapping[str, RunRecord], width: float) -> Drawing:
-    """The mirror with the paths of both runs, the later one above the earlier one."""
-    frame = MapFrame(mirror, width)
-    frame.draw_panels()
-    frame.draw_rim()
-    keys: list[tuple[str, Shape]] = []
-    for (name, record), colour, thick in zip(records.items(), _COLOURS, (2.6, 0.9), strict=False):
-        path = driven_path_m(record)
-        if len(path):
-            frame.shapes.append(PolyLine(thinned(frame.pixels(path), _TOLERANCE_PX), colour, thick))
-            keys.append((name, PolyLine(_KEY_LINE, colour, thick)))
-    frame.draw_base()
-    keys.append(("base", Dots(np.zeros((1, 2)), 4.0, INK)))
-    return frame.finish(None, "", keys, f"{mirror.name}: both paths")
+def _time_section(pair: RunPair) -> Section | None:
+    draw = _drawings(pair).get("time")
+    return None if draw is None else Section("time", "Time budget", {"figure": page_figure(draw)})
 
 
-def change_figure(mirror: Mirror, before: Sequence[PanelResult], after: Sequence[PanelResult], width: float) -> Drawing:
-    """The mirror with what the later survey shows less the earlier one."""
-    earlier = {panel.panel: panel for panel in before}
-    cells = []
-    for panel in after:
-        if panel.panel in earlier:
-            x, y, later = on_grid_m(mirror, panel, _CELLS)
-            cells.append(PanelCells(x, y, later - on_grid_m(mirror, earlier[panel.panel], _CELLS)[2]))
-    label = "change along the normal, \u00b5m (> 0 towards the robot)"
-    return cells_figure(mirror, cells, label, f"{mirror.name}: change of the surface", width)
+def _errors_section(pair: RunPair) -> Section | None:
+    drawings = _drawings(pair)
+    found = {name: page_figure(drawings[name]) for name in ("localization", "arrivals") if name in drawings}
+    return Section("errors", "Errors", {"localization": None, "arrivals": None, **found}) if found else None
+
+
+def _points_section(pair: RunPair) -> Section | None:
+    if not pair.is_one_mirror or not (pair.a.points and pair.b.points):
+        return None
+    a = {verdict.point: verdict for verdict in pair.a.points}
+    both = [(a[verdict.point], verdict) for verdict in pair.b.points if verdict.point in a]
+    rows = [
+        [
+            point_text(one.point),
+            str(one.grade),
+            str(other.grade),
+            number_text(one.first_mm),
+            number_text(other.first_mm),
+        ]
+        for one, other in both
+        if one.grade is not other.grade
+    ]
+    head = ["point", "A", "B", "first in A, mm", "first in B, mm"]
+    return Section("points", "Points", {"common": len(both), "changes": Table(head, rows)})
+
+
+def _surfaces_section(pair: RunPair) -> Section | None:
+    known = [(n, f.alignment.panels) for n, f in pair.named if f.alignment is not None and f.alignment.panels]
+    if not pair.is_one_mirror or not known:
+        return None
+    mirror = pair.b.record.mirror
+    everything = [panel for _, panels in known for panel in panels]
+    surfaces = [
+        (name, inline(surface_figure(mirror, panels, f"{mirror.name}: surface of {name}", NARROW, everything)))
+        for name, panels in known
+    ]
+    return Section("surface", "Surfaces", {"surfaces": surfaces})
+
+
+def _panels_section(pair: RunPair) -> Section | None:
+    draw = _drawings(pair).get("change")
+    if pair.changes is None or draw is None:
+        return None
+    rows = []
+    for panel in sorted(pair.changes.panels, key=lambda panel: -panel.chi2):
+        values = zip(panel.values.tolist(), panel.sigma.tolist(), strict=True)
+        cells = [f"{micro_text(value)} ± {micro_text(sigma)}" for value, sigma in values]
+        moved = "moved" if panel.has_moved else ""
+        rows.append([f"{panel.panel.row}/{panel.panel.col}", *cells, number_text(panel.chi2, 1), moved])
+    head = ["panel", "piston, µm", "tip, µrad", "tilt, µrad", "χ² (3)", ""]
+    moved_count = sum(panel.has_moved for panel in pair.changes.panels)
+    values_shown = {"figure": page_figure(draw), "changes": Table(head, rows), "moved": moved_count}
+    return Section("panels", "Panels, B less A", values_shown)
+
+
+def _adjusters_section(pair: RunPair) -> Section | None:
+    """The moves that each survey asks for; those of B are still to be made."""
+    if not pair.is_one_mirror:
+        return None
+    a, b = ({p.panel: p for p in (f.alignment.panels if f.alignment else ())} for _, f in pair.named)
+    panels = sorted({*a, *b}, key=lambda panel: (-_largest_move_m(b.get(panel)), panel))
+    if not panels:
+        return None
+    names = next(iter((b or a).values())).adjusters
+    rows = []
+    for panel in panels:
+        moves = zip(_moves(a.get(panel), len(names)), _moves(b.get(panel), len(names)), strict=True)
+        cells = [Markup("{} → <strong>{}</strong>").format(first, then) for first, then in moves]
+        rows.append([f"{panel.row}/{panel.col}", *cells])
+    return Section("adjusters", "Adjuster moves", {"moves": Table(["panel", *names], rows)})
+
+
+def _largest_move_m(panel: PanelResult | None) -> float:
+    return 0.0 if panel is None else float(abs(panel.rigid.moves.values_m).max())
+
+
+def _moves(panel: PanelResult | None, count: int) -> list[str]:
+    return [number_text(None)] * count if panel is None else [micro_text(move) for move in panel.rigid.moves.values_m]
+
+
+def _events_section(pair: RunPair) -> Section | None:
+    found = [(letter, events_of(one.record.log)) for letter, one in pair.named if one.record.log]
+    return Section("events", "Events", {"events": found}) if found else None
+
+
+_SECTIONS = (
+    _figures_section,
+    _configuration_section,
+    _paths_section,
+    _time_section,
+    _errors_section,
+    _points_section,
+    _surfaces_section,
+    _panels_section,
+    _adjusters_section,
+    _events_section,
+)
+
+
+def compare_figures(pair: RunPair) -> "dict[str, Figure]":
+    """The figures of the comparison, by the names of their files."""
+    return {name: draw(WIDE) for name, draw in _drawings(pair).items()}
+
+
+def _drawings(pair: RunPair) -> dict[str, Draw]:
+    """What draws each figure; those that neither run holds anything for are left out."""
+    found: dict[str, Draw] = {}
+    budgets = [(name, one.budget) for name, one in pair.named if one.budget is not None]
+    if budgets:
+        found["time"] = partial(time_figure, budgets, max(one.record.cfg.run.budget_s for one in (pair.a, pair.b)))
+    series = {name: one.errors for name, one in pair.named if one.errors is not None}
+    if series:
+        found["localization"] = partial(errors_figure, series)
+    first = {name: np.array([v.first_mm for v in one.points if v.first_mm is not None]) for name, one in pair.named}
+    arrivals = {name: some for name, some in first.items() if len(some)}
+    if arrivals:
+        found["arrivals"] = partial(distribution_figure, arrivals, "distance at first arrival, mm")
+    mirror = pair.b.record.mirror
+    if pair.changes is not None and pair.a.alignment is not None and pair.b.alignment is not None:
+        found["change"] = partial(change_figure, mirror, pair.a.alignment.panels, pair.b.alignment.panels)
+    records = {letter: one.record for letter, one in pair.named if one.record.sessions}
+    if pair.is_one_mirror and records:
+        found["paths"] = partial(paths_figure, mirror, records)
+    return found
+
+
+# -- terminal and data ------------------------------------------------------------------------------------------------
+
+_WIDTH = 12
+
+
+def compare_lines(pair: RunPair) -> Iterator[str]:
+    """A line for each figure that differs, then the panels that have moved."""
+    if pair.warning:
+        yield f"warning: {pair.warning}"
+    rows = [(_ascii(one.name), one) for one in compared_figures(pair) if one.change != 0.0]
+    width = max((len(name) for name, _ in rows), default=0) + 2
+    yield f"{'':<{width}}{'A':>{_WIDTH}}{'B':>{_WIDTH}}{'B less A':>{_WIDTH}}"
+    for name, one in rows:
+        cells = "".join(f"{_cell(value, one.decimals):>{_WIDTH}}" for value in (one.a, one.b, one.change))
+        yield f"{name:<{width}}{cells}"
+    changes = pair.changes
+    if changes is None:
+        return
+    verdict = "the surveys agree" if changes.agree else "the surveys differ"
+    chi2 = f"chi2 of no change {changes.chi2:.1f} for {changes.dof} degrees of freedom"
+    yield f"{verdict}: {chi2}, {changes.high:.1f} at most by noise alone"
+    for panel in changes.panels:
+        if panel.has_moved:
+            piston, tip, tilt = (MICRO * value for value in panel.values)
+            where = f"panel {panel.panel.row}/{panel.panel.col} has moved"
+            yield f"{where}: piston {piston:+.1f} um, tip {tip:+.1f} urad, tilt {tilt:+.1f} urad"
+
+
+def _ascii(name: str) -> str:
+    return name.replace("\u00b5", "u").replace("\u03c3", "sigma")
+
+
+def _cell(value: float | None, decimals: int) -> str:
+    return "-" if value is None else f"{value:.{decimals}f}"
+
+
+def compare_data(pair: RunPair) -> dict[str, Any]:
+    """What ``ccatp compare --json`` prints."""
+    changes, (a, b) = pair.changes, pair.wavefronts
+    return {
+        "a": run_data(pair.a),
+        "b": run_data(pair.b),
+        "one_mirror": pair.is_one_mirror,
+        "half_wavefront_common_um": {"a": wavefront_data(a), "b": wavefront_data(b)},
+        "panels": None if changes is None else [_panel(panel) for panel in changes.panels],
+        "chi2": None if changes is None else round(changes.chi2, 4),
+        "dof": None if changes is None else changes.dof,
+        "agree": None if changes is None else changes.agree,
+    }
+
+
+def _panel(panel: PanelChange) -> dict[str, Any]:
+    piston, tip, tilt = (round(MICRO * value, 4) for value in panel.values.tolist())
+    return {
+        "row": panel.panel.row,
+        "col": panel.panel.col,
+        "piston_um": piston,
+        "tip_urad": tip,
+        "tilt_urad": tilt,
+        "sigma": [round(MICRO * value, 4) for value in panel.sigma.tolist()],
+        "chi2": round(panel.chi2, 4),
+        "has_moved": panel.has_moved,
+    }

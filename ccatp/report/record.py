@@ -121,6 +121,11 @@ class RunFiles:
     missing: tuple[str, ...]
     warnings: tuple[str, ...]
 
+    @property
+    def began(self) -> str:
+        """Wall clock of the first line of the log, UTC; empty where it has none."""
+        return next((line.wall[:19].replace("T", " ") + " UTC" for line in self.log if line.wall), "")
+
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RunRecord(RunFiles):

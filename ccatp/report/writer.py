@@ -1,19 +1,21 @@
-"""Writes the report of a run, and the one of two runs beside each other: a page, and figures where asked for."""
+"""Writes the report of a run, and the comparison of two: a page, and figures where asked for."""
 
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.report.beacon_page import beacon_data, beacon_figures, beacon_page
-from ccatp.report.compare import RunPair, pair_of
-from ccatp.report.compare_page import compare_figures, compare_page
-from ccatp.report.drawing import Drawing
+from ccatp.report.compare import RunPair, compare_figures, compare_page, pair_of
 from ccatp.report.findings import findings_of
-from ccatp.report.plots import PictureError, write_figures, write_svg
+from ccatp.report.plots import PictureError, save_figure
 from ccatp.report.record_reader import is_beacon_run, read_beacon_record, read_record
 from ccatp.report.run_page import run_data, run_figures, run_page
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_DPI = 192.0  # of PNG files: two pixels for each of the page
 REPORT, COMPARISON = "report.html", "compare.html"
 
 
@@ -89,7 +91,7 @@ def write_page(markup: str, path: Path) -> None:
         raise ReportError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def write_pictures(pictures: dict[str, Drawing], folder: Path) -> None:
+def write_pictures(pictures: "dict[str, Figure]", folder: Path) -> None:
     """Write figures as SVG, PNG and PDF.
 
     Raises:
@@ -100,5 +102,5 @@ def write_pictures(pictures: dict[str, Drawing], folder: Path) -> None:
     except OSError as error:
         raise PictureError(f"{folder}: cannot be made: {error.strerror or error}") from error
     for name, picture in pictures.items():
-        write_svg(picture, folder / f"{name}.svg")
-        write_figures(picture, folder / name)
+        for suffix in (".svg", ".png", ".pdf"):
+            save_figure(picture, folder / f"{name}{suffix}", _DPI)

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ccatp.config.load import load_radio_config
-from ccatp.report.drawing import INK, QUIET
-from ccatp.report.plots import dress, new_figure
+from ccatp.report.plots import INK, QUIET, dress, new_figure
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.figures import LIMIT, colour, save
 from ccatp.studies.mote_runs import look_ahead, run_batch, run_filter, simulate_field

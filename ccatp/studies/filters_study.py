@@ -11,8 +11,7 @@ import numpy as np
 
 from ccatp.core import FloatArray
 from ccatp.mirror.mirror import build_mirror
-from ccatp.report.drawing import INK, QUIET
-from ccatp.report.plots import GRID, dress, new_figure
+from ccatp.report.plots import GRID, INK, QUIET, dress, new_figure
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.cramer_rao import bounds_of
 from ccatp.studies.cramer_rao_record import rehearse_recorded

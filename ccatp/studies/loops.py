@@ -28,8 +28,7 @@ from scipy.optimize import brentq
 from ccatp.config.models import Config, ControlConfig, LimitsConfig, PidConfig
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.errors import CcatpError, ExitStatus
-from ccatp.report.drawing import INK, QUIET
-from ccatp.report.plots import dress, new_figure
+from ccatp.report.plots import INK, QUIET, dress, new_figure
 from ccatp.studies.figures import save
 
 if TYPE_CHECKING:

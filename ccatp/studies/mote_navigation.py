@@ -32,8 +32,7 @@ from ccatp.links.robot_codec import decode_from_robot
 from ccatp.links.robot_messages import Sensors
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.records.beacon_summary import BeaconSummary, Reached, beacon_facts
-from ccatp.report.drawing import INK, QUIET
-from ccatp.report.plots import dress, new_figure
+from ccatp.report.plots import INK, QUIET, dress, new_figure
 from ccatp.safety.beacons import BeaconSafetyRules
 from ccatp.sim.beacon_robot import BeaconTruthLog, build_beacon_robot, motes_of
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study

@@ -22,8 +22,7 @@ from ccatp.config.models import Config
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import aligned_rms_m, best_motion, rms_m
 from ccatp.report.beacon_plots import MapPicture, Traces
-from ccatp.report.drawing import INK
-from ccatp.report.plots import dress, new_figure
+from ccatp.report.plots import INK, dress, new_figure
 from ccatp.studies.figures import colour, save
 from ccatp.studies.mote_runs import (
     MoteOutlook,

@@ -18,8 +18,7 @@ from ccatp.beacons.slam.reflector import ScanResult
 from ccatp.beacons.slam.settings import scan_of
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import wrap_pi
-from ccatp.report.drawing import INK, QUIET
-from ccatp.report.plots import dress, new_figure
+from ccatp.report.plots import INK, QUIET, dress, new_figure
 from ccatp.sim.radio import TruePose, TrueRadio
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.figures import LIMIT, colour, save

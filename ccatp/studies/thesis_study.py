@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ccatp.report.drawing import INK, QUIET
-from ccatp.report.plots import dress, new_figure
+from ccatp.report.plots import INK, QUIET, dress, new_figure
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Histogram, Job, JobOutcome, Study, pooled
 from ccatp.studies.figures import LIMIT, colour, save
 from ccatp.studies.mission_study import of_spread, of_values

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ccatp.mirror.mirror import build_mirror
-from ccatp.report.drawing import INK, QUIET
-from ccatp.report.plots import dress, new_figure
+from ccatp.report.plots import INK, QUIET, dress, new_figure
 from ccatp.studies.campaign import Cell, CellResult, Column, Factors, Job, JobOutcome, Study
 from ccatp.studies.figures import LIMIT, colour, save
 from ccatp.studies.mission_study import combine_missions, run_mission
