@@ -184,7 +184,7 @@ def beacon_map_figure(record: BeaconRecord, width_px: float) -> "Figure":
     """The room: estimated and true path, dead reckoning, beacons with their ellipses, waypoints."""
     low, high = _bounds(record)
     span = high - low
-    left, right, below, above = 0.5, 0.12, 0.5, 0.08
+    left, right, below, above = 0.62, 0.12, 0.5, 0.08
     rows = 2 if is_wide(width_px) else 5
     width = width_px / PX_PER_IN
     scale = min((width - left - right) / span[0], _TALL * width / span[1])
@@ -282,10 +282,10 @@ def _draw_beacons(axes: "Axes", record: BeaconRecord, right_m: float) -> None:
             label = "_" if index else "beacon as mapped, 3 \u03c3"
             (dot,) = axes.plot(*place, "o", color=_BEACON, label=label, **look)
             add_tooltips(dot, [name])
-    for name, place in zip(beacons, places, strict=True):
-        is_left = place[0] > right_m
+    for name, (x, y) in zip(beacons, places.tolist(), strict=True):
+        is_left = x > right_m
         axes.annotate(
-            name, place, xytext=(-6 if is_left else 6, 5), textcoords="offset points", fontsize=8, color=INK, zorder=8,
+            name, (x, y), xytext=(-6 if is_left else 6, 5), textcoords="offset points", fontsize=8, color=INK, zorder=8,
             ha="right" if is_left else "left", parse_math=False,
         )  # fmt: skip
     target = record.maps[-1].target if record.maps else None

@@ -157,8 +157,8 @@ def _over(found: Findings, panels: set[PanelId]) -> MirrorWavefront | None:
     return mirror_wavefront([panel.rigid.wavefront for panel in fitted if panel.panel in panels])
 
 
-class Figure(NamedTuple):
-    """One figure of both runs: its name with its unit, the decimals it is written with, and the values."""
+class ComparedValue(NamedTuple):
+    """One value of both runs: its name with its unit, the decimals it is written with, and the values."""
 
     name: str
     decimals: int
@@ -216,7 +216,7 @@ _WAVEFRONT_ROWS = (
 )
 
 
-def compared_figures(pair: RunPair) -> list[Figure]:
+def compared_figures(pair: RunPair) -> list[ComparedValue]:
     """The figures of both runs; those that neither knows are left out.
 
     Half-wavefront errors are of the panels that both have, and their names say so where these are not all.
@@ -231,11 +231,11 @@ def compared_figures(pair: RunPair) -> list[Figure]:
     return [*found, *(one._replace(is_of_one=pair.is_one_mirror) for one in whole)]
 
 
-def _figures(rows: Sequence[_Row], data: Sequence[Mapping[str, Any] | None], suffix: str) -> Iterator[Figure]:
+def _figures(rows: Sequence[_Row], data: Sequence[Mapping[str, Any] | None], suffix: str) -> Iterator[ComparedValue]:
     for row in rows:
         a, b = (_at(one, row) for one in data)
         if a is not None or b is not None:
-            yield Figure(row.name + suffix, row.decimals, a, b)
+            yield ComparedValue(row.name + suffix, row.decimals, a, b)
 
 
 def _at(data: Any, row: _Row) -> float | None:
@@ -280,8 +280,9 @@ def _time_section(pair: RunPair) -> Section | None:
 
 def _errors_section(pair: RunPair) -> Section | None:
     drawings = _drawings(pair)
-    found = {name: page_figure(drawings[name]) for name in ("localization", "arrivals") if name in drawings}
-    return Section("errors", "Errors", {"localization": None, "arrivals": None, **found}) if found else None
+    names = ("localization", "arrivals")
+    found = {name: page_figure(drawings[name]) if name in drawings else None for name in names}
+    return Section("errors", "Errors", dict(found)) if any(found.values()) else None
 
 
 def _points_section(pair: RunPair) -> Section | None:

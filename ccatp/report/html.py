@@ -77,12 +77,12 @@ def inline(figure: "Figure") -> Markup:
 
 def render(template: str, title: str, sections: Sequence[Section], **values: Any) -> str:
     """The page as one HTML file that needs nothing from outside."""
-    page = _environment().get_template(template)
+    page = environment().get_template(template)
     return page.render(title=title, sections=sections, **values)
 
 
 @cache
-def _environment() -> Environment:
+def environment() -> Environment:
     found = Environment(
         loader=PackageLoader("ccatp.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True,

@@ -102,7 +102,7 @@ class MirrorMap:
             bar_axes = self.figure.add_axes(box)
             orientation = "vertical" if self.is_wide else "horizontal"
             bar = self.figure.colorbar(drawn, cax=bar_axes, orientation=orientation, **bar_look)
-            bar.outline.set_visible(False)  # type: ignore[operator]
+            bar.outline.set_visible(False)
             bar.ax.tick_params(labelsize=8, color=QUIET, labelcolor=INK)
             bar.set_label(label, fontsize=8.5, color=INK)
             if bar.solids is not None:
@@ -428,10 +428,9 @@ def surface_figure(
     kept = [np.column_stack([p.deviations.deck_m, p.deviations.values_m * _MICRO])[p.is_kept] for p in panels]
     if kept:
         x, y, heights = np.concatenate(kept).T
-        frame.axes.scatter(
-            x, y, c=heights, cmap=drawn.cmap, norm=drawn.norm, s=size, edgecolors=QUIET, linewidths=0.3, zorder=5,
-            label="measured point",
-        )  # fmt: skip
+        colours: dict[str, Any] = {"c": heights, "cmap": drawn.cmap, "norm": drawn.norm}
+        look: dict[str, Any] = {"s": size, "edgecolors": QUIET, "linewidths": 0.3, "zorder": 5}
+        frame.axes.scatter(x, y, **colours, **look, label="measured point")
     outliers = [panel.deviations.deck_m[~panel.is_kept] for panel in panels if not panel.is_kept.all()]
     if outliers:
         x, y = np.concatenate(outliers).T

@@ -157,9 +157,9 @@ def svg_of(figure: "Figure", *, is_file: bool = False) -> str:
     from matplotlib import rc_context  # noqa: PLC0415
 
     title = str(figure.get_label())
-    look = {"svg.fonttype": "none", "svg.hashsalt": f"{title} {figure.get_figwidth():g}"}
+    salt = f"{title} {figure.get_figwidth():g}"
     text = StringIO()
-    with rc_context(look):
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": salt}):
         figure.savefig(
             text, format="svg", dpi=_RASTER_DPI, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
         )

@@ -76,7 +76,7 @@ def _ends_mm(series: ErrorSeries) -> tuple[float, float]:
 def _draw_band(axes: "Axes", found: Envelope, colour: str, label: str, low: float) -> None:
     """From the least to the largest of each interval; parted where there is nothing for a long time."""
     steps = np.diff(found.x)
-    gaps = np.flatnonzero(steps > 10.0 * np.median(steps)) + 1 if len(steps) else []
+    gaps = 1 + np.flatnonzero(steps > 10.0 * np.median(steps)) if len(steps) else np.empty(0, dtype=np.int64)
     x, least, largest = (np.insert(values, gaps, np.nan) for values in found[:3])
     axes.fill_between(x, np.maximum(least, low), np.maximum(largest, low), color=colour, alpha=0.28, linewidth=0.0)
     axes.plot(x, largest, color=colour, linewidth=1.0, label=label)

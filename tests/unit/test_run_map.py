@@ -14,9 +14,10 @@ from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.records.recorder import Recorder
 from ccatp.records.store import MissionStore
 from ccatp.records.store_rows import PlannedPoint
-from ccatp.report import plots as run_map
+from ccatp.report import mirror_map as run_map
 from ccatp.report.findings import arrival_error_m
-from ccatp.report.plots import MapPoint, PictureError, draw_from_run_dir, draw_run_map
+from ccatp.report.mirror_map import MapPoint, draw_from_run_dir, draw_run_map
+from ccatp.report.plots import PictureError
 
 PNG = b"\x89PNG\r\n\x1a\n"
 POINTS = [PointId(5, 5, n) for n in range(1, 10)]

@@ -2,7 +2,7 @@
 
 from html.parser import HTMLParser
 
-FETCHED = {"src", "href", "srcset", "action", "data", "poster"}
+FETCHED = {"src", "href", "xlink:href", "srcset", "action", "data", "poster"}
 VOID = {"meta", "link", "rect", "br"}
 
 

@@ -11,12 +11,11 @@ from ccatp.records.run_reader import RunReadError
 from ccatp.report.beacon_figures import (
     beacon_map_figure,
     consistency_figure,
-    ellipse_m,
     map_error_figure,
     target_figure,
 )
 from ccatp.report.beacon_page import beacon_data, beacon_figures, beacon_page
-from ccatp.report.html import NARROW, WIDE
+from ccatp.report.plots import NARROW, PX_PER_IN, WIDE, ellipse_outline
 from ccatp.report.record import beacon_rows, pose_errors_m, pose_nees, readings_of, waypoint_rows
 from ccatp.report.record_reader import read_beacon_record
 from ccatp.report.writer import report_run
@@ -82,12 +81,12 @@ def test_its_figures_are_drawn_for_screens_and_telephones(run_dir: Path) -> None
             beacon_map_figure(record, width), consistency_figure(record, width), map_error_figure(record, width)
         ):  # fmt: skip
             assert picture is not None
-            assert picture.width == width
-            assert picture.height > 200.0
+            assert picture.get_figwidth() * PX_PER_IN == pytest.approx(width)
+            assert picture.get_figheight() * PX_PER_IN > 200.0
 
 
 def test_an_ellipse_of_three_sigma() -> None:
-    outline = ellipse_m(np.array([1.0, 2.0]), np.array(((0.04, 0.0), (0.0, 0.01))))
+    outline = np.array([1.0, 2.0]) + ellipse_outline(np.array(((0.04, 0.0), (0.0, 0.01))), 3.0)
     assert outline.min(axis=0) == pytest.approx((0.4, 1.7), abs=2e-3)
     assert outline.max(axis=0) == pytest.approx((1.6, 2.3), abs=2e-3)
 

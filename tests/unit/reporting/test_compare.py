@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from ccatp.cli import main
-from ccatp.report.compare import compared_figures, pair_of
-from ccatp.report.compare_page import compare_lines, compare_page
+from ccatp.report.compare import compare_lines, compare_page, compared_figures, pair_of
 from ccatp.report.findings import findings_of
 from ccatp.report.record_reader import read_record
 from ccatp.report.writer import compare_runs
@@ -54,7 +53,6 @@ def test_panels_that_moved_are_found(recorded: Path, tmp_path: Path, capsys: pyt
 
 
 def test_figures_of_two_runs(recorded: Path, other: Path, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
     compare_runs(recorded, other, tmp_path / "c.html", tmp_path / "figures")
     names = ("time", "localization", "arrivals", "change", "paths")
     expected = {f"{name}.{suffix}" for name in names for suffix in ("svg", "png", "pdf")}

@@ -1,7 +1,12 @@
-"""What the processes said, on the page: floods are one row, and what matters comes first."""
+"""The log on the page: floods are one row, and what matters comes first."""
 
 from ccatp.records.state_log import LogLine
-from ccatp.report.sections import events_body, gathered
+from ccatp.report.html import environment, events_of, gathered
+
+
+def events_body(lines: list[LogLine]) -> str:
+    macros = environment().get_template("macros.html").module
+    return str(macros.log_events(events_of(lines)))  # type: ignore[attr-defined]
 
 
 def line(text: str, level: str = "warning", t_s: float | None = 1.0, process: str = "main") -> LogLine:

@@ -1,0 +1,184 @@
+"""Figures: what is drawn, shorter series, SVG for a page, files."""
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ccatp.config.load import load_config
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.report.analysis import ErrorSeries, TimeBreakdown
+from ccatp.report.mirror_map import MapPoint, run_map
+from ccatp.report.plots import (
+    NARROW,
+    SVG,
+    WIDE,
+    PictureError,
+    add_legend,
+    add_tooltips,
+    distinct,
+    envelope,
+    new_plot,
+    save_figure,
+    svg_of,
+    thinned,
+)
+from ccatp.report.run_figures import distribution_figure, error_figure, time_figure
+
+
+@pytest.fixture(scope="module")
+def mirror() -> Mirror:
+    return build_mirror(load_config().mirror)
+
+
+def test_a_thinned_line_stays_near() -> None:
+    t = np.linspace(0.0, 20.0, 5001)
+    line = np.column_stack([40.0 * t, 100.0 * np.sin(t)])
+    line[2500] = np.nan
+    short = thinned(line, 0.5)
+    assert len(short) < 400
+    assert np.isnan(short).any(axis=1).sum() == 1
+    assert (short[0] == line[0]).all()
+    assert (short[-1] == line[-1]).all()
+    good = short[~np.isnan(short).any(axis=1)]
+    # Sampled ten times finer than a pixel, so that linear interpolation is as good as the sine.
+    assert np.abs(np.interp(line[:, 0], good[:, 0], good[:, 1]) - line[:, 1])[~np.isnan(line[:, 0])].max() < 1.5
+    assert len(thinned(np.empty((0, 2)), 1.0)) == 0
+    assert len(thinned(np.full((2, 2), np.nan), 1.0)) == 0
+
+
+def test_a_robot_that_stands_adds_nothing() -> None:
+    standing = np.vstack([np.tile([[1.0, 1.0]], (1000, 1)), [[5.0, 1.0]], np.tile([[9.0, 1.0]], (1000, 1))])
+    assert thinned(standing, 0.5).tolist() == [[1.0, 1.0], [9.0, 1.0]]
+
+
+def test_an_envelope() -> None:
+    x = np.arange(1000.0)
+    y = np.where(x == 500.0, 99.0, x % 2)
+    y[3] = np.nan
+    found = envelope(x, y, 10)
+    assert len(found.x) == 10
+    assert found.low.tolist() == [0.0] * 10
+    assert found.high.tolist() == [1.0] * 5 + [99.0] + [1.0] * 4
+    assert found.mean[0] == pytest.approx(49 / 99)
+    assert len(envelope(np.empty(0), np.empty(0), 10).x) == 0
+    assert envelope(np.array([3.0]), np.array([2.0]), 10).high.tolist() == [2.0]
+
+
+def test_marks_on_one_pixel_are_one() -> None:
+    x, y = distinct(np.array([0.0, 0.01, 100.0, 50.0]), np.array([1.0, 1.0, 2.0, 1.5]), 100.0)
+    assert (x.tolist(), y.tolist()) == ([0.0, 100.0, 50.0], [1.0, 2.0, 1.5])
+    assert len(distinct(np.empty(0), np.empty(0), 100.0)[0]) == 0
+
+
+@pytest.mark.parametrize("width_px", [WIDE, NARROW])
+def test_svg_is_alone_small_and_has_tooltips(width_px: float) -> None:
+    figure, axes = new_plot(width_px, 'a "picture"')
+    (marks,) = axes.plot([0.0, 1.0], [2.0, 3.0], "o", label="1 < 2")
+    add_tooltips(marks, ["a < b", "c|d"])
+    add_legend(axes)
+    text = svg_of(figure)
+    root = ET.fromstring(text)
+    assert (root.tag, root.get("aria-label"), root.get("role")) == (f"{{{SVG}}}svg", 'a "picture"', "img")
+    assert root.get("width") is None
+    assert root.get("viewBox", "").split()[2] == f"{0.75 * width_px:g}"
+    assert [title.text for title in root.iter(f"{{{SVG}}}title")] == ["a < b", "c/d"]
+    assert "1 < 2" in [element.text for element in root.iter(f"{{{SVG}}}text")]
+    references = [value for element in root.iter() for name, value in element.attrib.items() if name.endswith("href")]
+    ids = [element.get("id") for element in root.iter() if element.get("id")]
+    assert references
+    assert all(value.startswith("#") and value[1:] in ids for value in references)
+    assert len(ids) == len(set(ids))
+    assert not {"metadata", "style"} & {element.tag.partition("}")[2] for element in root.iter()}
+    assert svg_of(figure) == text
+    assert ET.fromstring(svg_of(figure, is_file=True)).get("width") is not None
+
+
+def test_ids_of_two_figures_differ() -> None:
+    ids = []
+    for title in ("one", "two"):
+        figure, axes = new_plot(WIDE, title)
+        axes.plot([0.0, 1.0], [2.0, 3.0], "o")
+        ids.append({element.get("id") for element in ET.fromstring(svg_of(figure)).iter()} - {None})
+    assert not ids[0] & ids[1]
+
+
+def test_files(tmp_path: Path) -> None:
+    figure, axes = new_plot(WIDE, "title")
+    axes.plot([0.0, 1.0], [2.0, 3.0])
+    for suffix, start in ((".png", b"\x89PNG"), (".pdf", b"%PDF"), (".svg", b"<svg ")):
+        one, other = tmp_path / f"one{suffix}", tmp_path / f"other{suffix}"
+        save_figure(figure, one)
+        save_figure(figure, other)
+        assert one.read_bytes().startswith(start)
+        assert one.read_bytes() == other.read_bytes()
+        with pytest.raises(PictureError, match=rf"no/a\{suffix}: cannot be written: No such file or directory"):
+            save_figure(figure, tmp_path / "no" / f"a{suffix}")
+
+
+def test_a_map_of_a_run_shows_what_it_is_given(mirror: Mirror) -> None:
+    points = [
+        MapPoint(0.0, 0.0, 1.0, title="5/5/1: pass"),
+        MapPoint(0.5, 0.0, 55.0, has_failed=True, title="5/5/2: fail"),
+        MapPoint(0.0, 0.5, is_skipped=True, title="5/5/3: skipped"),
+        MapPoint(0.5, 0.5, title="5/5/4: not measured"),
+    ]
+    path_m = np.array([(0.0, 0.0), (0.5, 0.0), (np.nan, np.nan), (1.0, 1.0), (2.0, 1.0)])
+    figure = run_map(mirror, path_m, points, WIDE, "title")
+    axes, bar = figure.axes
+    labels = axes.get_legend_handles_labels()[1]
+    assert labels == ["driven path", "base", "beyond 10 mm", "skipped", "not measured"]
+    np.testing.assert_array_equal(axes.lines[0].get_xydata(), path_m)
+    errors = axes.collections[-1]
+    assert errors.get_array().tolist() == [1.0, 55.0]  # type: ignore[union-attr]
+    assert (errors.norm.vmin, errors.norm.vmax) == (0.0, 10.0)
+    assert bar.get_ylabel() == "arrival error, mm"
+    low, high = mirror.rim.vertices.min(axis=0), mirror.rim.vertices.max(axis=0)
+    assert axes.get_xlim()[0] < low[0] < high[0] < axes.get_xlim()[1]
+    shown = {title.text for title in ET.fromstring(svg_of(figure)).iter(f"{{{SVG}}}title")}
+    assert shown == {point.title for point in points}
+    phone = ET.fromstring(svg_of(run_map(mirror, path_m, points, NARROW, "title")))
+    assert not list(phone.iter(f"{{{SVG}}}title"))
+
+
+def series(error_mm: float) -> ErrorSeries:
+    t_s = np.arange(600.0)
+    fixes = np.array([100.0, 200.0])
+    return ErrorSeries(t_s, t_s * 0 + 3.0, t_s * 0 + error_mm, (300.0,), fixes, fixes / 100.0, np.array([True, False]))
+
+
+@pytest.mark.parametrize(
+    ("error_mm", "known", "limit"),
+    [
+        (1.0, ["true error, least to largest"], []),
+        (20.0, ["true error, least to largest"], ["10 mm"]),
+        (np.nan, [], []),
+    ],
+)
+def test_errors_over_time(error_mm: float, known: list[str], limit: list[str]) -> None:
+    (axes,) = error_figure(series(error_mm), WIDE).axes
+    labels = axes.get_legend_handles_labels()[1]
+    assert labels == [*known, "3 \u03c3 of the estimate", "fix: correction", "fix, not taken", *limit]
+    assert axes.get_xlim() == pytest.approx((0.0, 599.0 / 60.0))
+    assert axes.get_yscale() == "log"
+    assert [5.0, 5.0] in [list(line.get_xdata()) for line in axes.lines]  # a new session
+
+
+def test_where_the_time_went() -> None:
+    budget = TimeBreakdown({"turn": 40.0, "drive": 60.0}, {"turn": 30.0, "drive": 50.0}, {}, True, "all")
+    (axes,) = time_figure([("this run", budget)], 3600.0, WIDE).axes
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["this run", "least"]
+    widths = [[bar.get_width() for bar in bars] for bars in axes.containers]  # type: ignore[attr-defined]
+    assert widths == [[40.0, 30.0], [60.0, 50.0]]
+    assert {"100 s", "80 s", "60"} <= {text.get_text() for text in axes.texts}
+    assert "budget" not in axes.get_legend_handles_labels()[1]
+    (axes,) = time_figure([("this run", budget)], 120.0, WIDE).axes
+    assert "budget" in axes.get_legend_handles_labels()[1]
+
+
+def test_a_distribution() -> None:
+    (axes,) = distribution_figure({"A": np.array([2.0, 1.0]), "B": np.array([0.5])}, "error, mm", NARROW).axes
+    assert [line.get_label() for line in axes.lines] == ["A", "B"]
+    assert axes.lines[0].get_xydata().tolist() == [[1.0, 50.0], [2.0, 100.0]]  # type: ignore[union-attr]
+    assert axes.get_xlim() == pytest.approx((0.1, 10.0))
