@@ -83,6 +83,7 @@ def render(template: str, title: str, sections: Sequence[Section], **values: Any
 
 @cache
 def environment() -> Environment:
+    """The templates of this package, every text escaped, with the filters of this module."""
     found = Environment(
         loader=PackageLoader("ccatp.report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True,

@@ -14,6 +14,7 @@ class Markup(HTMLParser):
         self.open: list[str] = []
         self.outside: list[str] = []
         self.anchors: list[str] = []
+        self.ids: set[str | None] = set()
         self.headings: list[str] = []
         self.feed(page)
         self.close()
@@ -26,7 +27,10 @@ class Markup(HTMLParser):
             if name in FETCHED and not (value or "").startswith(("#", "data:")):
                 self.outside.append(f"{tag} {name}={value}")
             if name == "id":
-                self.anchors.append(value or "")
+                assert value not in self.ids
+                self.ids.add(value)
+                if tag == "section":
+                    self.anchors.append(value or "")
             assert not name.startswith("on"), f"a script: {name}"
         assert tag not in {"script", "iframe", "object", "embed", "img"}
 
