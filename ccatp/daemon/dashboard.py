@@ -1,8 +1,6 @@
-"""The dashboard's process: of a run, at the socket that it inherits, or alone, attached to a running daemon.
+"""The dashboard process: of a run, at a socket that the supervisor has bound, or beside a daemon (``ccatp dashboard``).
 
-Where the dashboard listens: bound by the supervisor, so that one that is started anew is found there again.
-
-A dashboard beside a daemon that runs already: ``ccatp dashboard``.
+The supervisor binds the socket, so that a restarted dashboard has the same address.
 """
 
 import asyncio
@@ -42,24 +40,17 @@ from ccatp.report.dashboard.survey_view import ground as survey_ground
 from ccatp.report.dashboard.view import RunStateView
 
 Logger = structlog.typing.FilteringBoundLogger
-PULSE_PERIOD_S = 0.5
-
-
-class ShownRun(NamedTuple):
-    """What a page shows of one kind of mission: its view, its ground, and the topics that make them."""
-
-    view: RunStateView
-    ground: dict[str, Any]
-    wants: Wants
+HEARTBEAT_PERIOD_S = 0.5
+BACKLOG = 64
+ROOT = "dashboard."
 
 
 class Dashboard:
     """The parts of a dashboard, put together.
 
     Args:
-        cfg: the run's configuration; ``dashboard`` holds the limits.
-        run_dir: what was measured before is read from there.
-        is_sim: robot and laser system are stand-ins.
+        run_dir: points that were measured before are read from its database.
+        is_sim: robot and laser system are simulated.
 
     Raises:
         ConfigError: the token cannot be read.
@@ -68,90 +59,91 @@ class Dashboard:
     def __init__(
         self, cfg: Config | RadioConfig, run_dir: Path, endpoints: Endpoints, *, is_sim: bool, log: Logger
     ) -> None:
-        self._cfg, self._log, self._endpoints = cfg, log, endpoints
+        self._cfg, self._endpoints = cfg, endpoints
         token = read_token(cfg.dashboard)
-        view, ground, wants = _shown(cfg, run_dir, is_sim=is_sim, needs_token=token is not None)
+        view, ground, wants = _view_of(cfg, run_dir, is_sim=is_sim, needs_token=token is not None)
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._feed = BusReader(self._context, endpoints.of, view, is_sim=is_sim, wants=wants)
-        self._hub = StateBroadcaster(self._feed, view, cfg.dashboard.rate_hz)
+        self._reader = BusReader(self._context, endpoints.of, view, is_sim=is_sim, wants=wants)
+        self._hub = StateBroadcaster(self._reader, view, cfg.dashboard.rate_hz)
         self._app = build_app(
             self._hub,
             CommandEndpoint(self._context, endpoints.of("control"), cfg.dashboard.command_timeout_s),
             ground,
             host_names=cfg.dashboard.host_names,
             token=token,
-            note=_sparing(log),
+            note=_rate_limited(log),
         )
 
-    async def run(self, listener: socket.socket, stop: asyncio.Event, *, has_pulse: bool) -> None:
-        """Serve until ``stop`` is set."""
-        told = asyncio.Event()
+    async def run(self, listener: socket.socket, stop: asyncio.Event, *, has_heartbeat: bool) -> None:
+        """Serve until ``stop`` is set and the open pages have got the last state."""
+        is_over = asyncio.Event()
 
-        async def tell() -> None:
+        async def broadcast() -> None:
             await self._hub.run(stop)
-            told.set()  # the pages know that this is the end
+            is_over.set()
 
         async with asyncio.TaskGroup() as tasks:
-            pulse = tasks.create_task(self._beat()) if has_pulse else None
-            tasks.create_task(tell())
-            await serve(self._app, listener, self._cfg.dashboard, told)
-            if pulse is not None:
-                pulse.cancel()
+            heartbeat = tasks.create_task(self._send_heartbeats()) if has_heartbeat else None
+            tasks.create_task(broadcast())
+            await serve(self._app, listener, self._cfg.dashboard, is_over)
+            if heartbeat is not None:
+                heartbeat.cancel()
 
-    async def _beat(self) -> None:
+    async def _send_heartbeats(self) -> None:
         publisher = Publisher(self._context, self._endpoints.of("dashboard"))
-        pulse = HeartbeatPublisher(publisher, "dashboard")
-        pulse.phase = "ready"
+        heartbeat = HeartbeatPublisher(publisher, "dashboard")
+        heartbeat.phase = "ready"
         try:
             while True:
-                pulse.publish()
-                await asyncio.sleep(PULSE_PERIOD_S)
+                heartbeat.publish()
+                await asyncio.sleep(HEARTBEAT_PERIOD_S)
         finally:
             publisher.close()
 
     def close(self) -> None:
         """Close the sockets."""
-        self._feed.close()
+        self._reader.close()
         self._context.destroy(linger=0)
 
 
 async def run_dashboard(
     cfg: Config | RadioConfig, run_dir: Path, endpoints: Endpoints, listener: socket.socket, *, is_sim: bool,
-    log: Logger, has_pulse: bool,
+    log: Logger, has_heartbeat: bool,
 ) -> None:  # fmt: skip
-    """A dashboard from its beginning to SIGTERM or SIGINT; arguments as of ``Dashboard`` and its ``run``."""
+    """Serve a dashboard until SIGTERM or SIGINT; arguments as of ``Dashboard`` and its ``run``."""
     stop = asyncio.Event()
     stop_on_signals(stop)
     _log_warnings(log)
     dashboard = Dashboard(cfg, run_dir, endpoints, is_sim=is_sim, log=log)
     try:
-        await dashboard.run(listener, stop, has_pulse=has_pulse)
+        await dashboard.run(listener, stop, has_heartbeat=has_heartbeat)
     finally:
         dashboard.close()
 
 
-def _shown(cfg: Config | RadioConfig, run_dir: Path, *, is_sim: bool, needs_token: bool) -> ShownRun:
+def _view_of(
+    cfg: Config | RadioConfig, run_dir: Path, *, is_sim: bool, needs_token: bool
+) -> tuple[RunStateView, dict[str, Any], Wants]:
     if isinstance(cfg, RadioConfig):
         ground = beacon_ground(cfg, is_sim=is_sim, needs_token=needs_token)
-        return ShownRun(BeaconView(cfg, is_sim=is_sim), ground, BEACONS)
+        return BeaconView(cfg, is_sim=is_sim), ground, BEACONS
     mirror = build_mirror(cfg.mirror)
     view = SurveyView(mirror, cfg, is_sim=is_sim)
-    _remember(view, run_dir, mirror.name)
-    return ShownRun(view, survey_ground(mirror, cfg, is_sim=is_sim, needs_token=needs_token), SURVEY)
+    _load_points(view, run_dir, mirror.name)
+    return view, survey_ground(mirror, cfg, is_sim=is_sim, needs_token=needs_token), SURVEY
 
 
-def _remember(view: SurveyView, run_dir: Path, mirror: str) -> None:
-    """What stands in the mission's database is on the page, whoever measured it; without one there is nothing yet."""
+def _load_points(view: SurveyView, run_dir: Path, mirror: str) -> None:
     try:
         survey = read_survey(run_dir / "mission.sqlite", mirror)
     except StoreError:
-        return
+        return  # nothing has been measured yet
     measured = [(stored.point, stored.fix.t_s, stored.fix.position_m) for stored in survey.fixes]
     view.begin_with(measured, [stored.point for stored in survey.points if stored.status == "skipped"])
 
 
-def _sparing(log: Logger) -> Callable[[str, dict[str, object]], None]:
-    """Lines for the log, at most so many in a minute: whoever reaches the port can cause them."""
+def _rate_limited(log: Logger) -> Callable[[str, dict[str, object]], None]:
+    # Everybody who reaches the port can cause these lines.
     budget = LogRateLimit(LOGGED_LINES, LOGGED_PERIOD_S)
 
     def note(text: str, fields: dict[str, object]) -> None:
@@ -195,21 +187,15 @@ def main() -> int:
     log = open_log(args.run_dir / "log.jsonl", "dashboard")
     listener = socket.socket(fileno=args.listen_fd)
     asyncio.run(
-        run_dashboard(args.config, args.run_dir, args.endpoints, listener, is_sim=args.is_sim, log=log, has_pulse=True)
+        run_dashboard(
+            args.config, args.run_dir, args.endpoints, listener, is_sim=args.is_sim, log=log, has_heartbeat=True
+        )
     )
     return 0
 
 
-BACKLOG = 64
-
-
 class PageSocket(NamedTuple):
-    """What came of the wish to listen.
-
-    Attributes:
-        socket: it listens; ``None`` where there is no dashboard.
-        level, text: what the operator is told; empty when there is nothing to tell.
-    """
+    """The listening socket, ``None`` without a dashboard, and the message for the operator, which may be empty."""
 
     socket: socket.socket | None
     config: DashboardConfig
@@ -218,7 +204,7 @@ class PageSocket(NamedTuple):
 
 
 def open_page_socket(cfg: DashboardConfig) -> PageSocket:
-    """Listen at the configured address, or at another port when that one is in use; a survey goes on without a page."""
+    """Listen at the configured address, or at another port if that one is in use; a survey runs without a page, too."""
     if not cfg.enabled:
         return PageSocket(None, cfg, "info", "")
     try:
@@ -227,12 +213,12 @@ def open_page_socket(cfg: DashboardConfig) -> PageSocket:
         if error.errno != errno.EADDRINUSE:
             return PageSocket(None, cfg, "warning", _without(cfg, error))
     else:
-        return _told(listener, cfg, "info", "dashboard: ")
+        return _listening(listener, cfg, "info", "dashboard: ")
     try:
         listener = _listen(cfg.host, 0)
     except OSError as error:
         return PageSocket(None, cfg, "warning", _without(cfg, error))
-    return _told(listener, cfg, "warning", f"dashboard: port {cfg.port} is in use, so it is at ")
+    return _listening(listener, cfg, "warning", f"dashboard: port {cfg.port} is in use, so it is at ")
 
 
 def page_url(host: str, port: int) -> str:
@@ -245,29 +231,26 @@ def _listen(host: str, port: int) -> socket.socket:
     return socket.create_server((host, port), family=family, backlog=BACKLOG)
 
 
-def _told(listener: socket.socket, cfg: DashboardConfig, level: str, before: str) -> PageSocket:
+def _listening(listener: socket.socket, cfg: DashboardConfig, level: str, before: str) -> PageSocket:
     port = listener.getsockname()[1]
     return PageSocket(listener, cfg.model_copy(update={"port": port}), level, before + page_url(cfg.host, port))
 
 
 def _without(cfg: DashboardConfig, error: OSError) -> str:
-    why = str(error.strerror).partition(" (while")[0]  # Python appends the address once more
+    why = str(error.strerror).partition(" (while")[0]  # Python appends the address again
     return f"no dashboard: cannot listen on {cfg.host}:{cfg.port}: {why}; choose another dashboard.host"
 
 
-ROOT = "dashboard."
-
-
 def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callable[[str], None]) -> int:
-    """Serve until SIGINT or SIGTERM.
+    """Serve a dashboard beside a running daemon until SIGINT or SIGTERM.
 
     Args:
-        runtime_dir: of the daemon, if not the usual one.
-        settings: keys of ``dashboard`` that are not those of the run.
+        runtime_dir: of the daemon, if not the default one.
+        settings: keys of ``dashboard`` that replace those of the run.
 
     Raises:
-        UnreachableError: no daemon runs there.
-        ConfigError: a setting that is none of the page's, a token that cannot be read, or no address to listen on.
+        DaemonUnreachableError: no daemon runs there.
+        ConfigError: a key outside ``dashboard``, a token that cannot be read, or no address to listen on.
     """
     for key in settings:
         if not key.startswith(ROOT):
@@ -284,7 +267,7 @@ def attach(runtime_dir: Path | None, settings: Mapping[str, object], say: Callab
     with page.socket:
         say(page.text)
         asyncio.run(
-            run_dashboard(cfg, run_dir, Endpoints(folder), page.socket, is_sim=is_sim, log=log, has_pulse=False)
+            run_dashboard(cfg, run_dir, Endpoints(folder), page.socket, is_sim=is_sim, log=log, has_heartbeat=False)
         )
     return 0
 

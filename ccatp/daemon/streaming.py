@@ -1,8 +1,6 @@
-"""Streams the runs of a runtime directory live, one after the other, beside whatever else goes on there.
+"""``ccatp stream``: streams the runs of a runtime directory live, one after the other.
 
-It only listens, and it subscribes once the loops have joined the robot: nobody waits for it or counts on it.
-
-``ccatp stream`` from its options to its end.
+It subscribes when the loops have joined the robot; no process waits for it or counts it.
 """
 
 import json
@@ -29,16 +27,17 @@ from ccatp.report.foxglove import plain_schema
 from ccatp.report.live import FoxgloveStream, LiveStream, PlotJugglerStream, check_host
 from ccatp.report.views import VIEWS, ViewMessage, Views, view_schemas
 
-# What is shown of the topics themselves; batches are shown as their views.
+# Topics that are streamed as they are; batches are streamed as their views.
 PASSED_ON = ("mission", "arrival", "rest", "treatment", "fix", "danger_event")
 TURNED_INTO_VIEWS = ("estimate", "sensors", "fix", "truth", "log")
 LATCHED = frozenset(view.name for view in VIEWS if view.is_latched)
 RUN = "run"
 PERIOD_MS = 20
+NICENESS = 10
 
 
 class RunFact(msgspec.Struct):
-    """What runs: the first thing that a viewer wants to know."""
+    """The run that is streamed; the first message of a stream."""
 
     mirror: str
     world: str
@@ -55,7 +54,7 @@ def streamed_schemas() -> list[tuple[str, dict[str, object]]]:
 
 
 class Streamer:
-    """Listens to the runs of a runtime directory."""
+    """Passes the messages of the runs of a runtime directory on to the streams."""
 
     def __init__(
         self,
@@ -66,21 +65,21 @@ class Streamer:
     ) -> None:
         self._context, self._streams, self._say = context, streams, say
         self._runtime_dir, self._endpoints = runtime_dir, Endpoints(runtime_dir)
-        self._ear = Subscriber(context, [self._endpoints.of("main")], ["heartbeat.main"])
+        self._heartbeats = Subscriber(context, [self._endpoints.of("main")], ["heartbeat.main"])
         self._run: Subscriber | None = None
         self._views: Views | None = None
         self._pid = -1
 
     def step(self) -> None:
-        """Wait for a moment and pass on what came."""
-        sockets = [self._ear.socket, *([] if self._run is None else [self._run.socket])]
+        """Wait for ``PERIOD_MS`` at most, and pass on the messages that have arrived."""
+        sockets = [self._heartbeats.socket, *([] if self._run is None else [self._run.socket])]
         poller = zmq.Poller()
         for socket in sockets:
             poller.register(socket, zmq.POLLIN)
         poller.poll(PERIOD_MS)
-        while (received := self._ear.receive()) is not None:
+        while (received := self._heartbeats.receive()) is not None:
             if isinstance(received[1], Heartbeat):
-                self._heed(received[1])
+                self._on_heartbeat(received[1])
         while self._run is not None and (raw := self._run.receive_raw()) is not None:
             if isinstance(raw[2], Message):
                 self._pass_on(raw[0], raw[1], raw[2])
@@ -88,14 +87,14 @@ class Streamer:
             stream.tend()
 
     def close(self) -> None:
-        """Stop listening."""
-        self._ear.close()
-        self._forget()
+        """Close the sockets."""
+        self._heartbeats.close()
+        self._close_run()
 
-    def _heed(self, presence: Heartbeat) -> None:
+    def _on_heartbeat(self, presence: Heartbeat) -> None:
         if presence.pid == self._pid or presence.phase != "joined":
             return
-        self._forget()
+        self._close_run()
         try:
             run_dir = Path((self._runtime_dir / RUN_DIR_FILE).read_text(encoding="utf-8").strip())
             cfg = load_config(run_dir / "config.toml")
@@ -127,13 +126,10 @@ class Streamer:
             for stream in self._streams:
                 stream.send(shown, is_latched=shown.topic == RUN or shown.topic in LATCHED)
 
-    def _forget(self) -> None:
+    def _close_run(self) -> None:
         if self._run is not None:
             self._run.close()
             self._run = None
-
-
-NICENESS = 10
 
 
 def serve(
@@ -148,12 +144,12 @@ def serve(
     """Stream until SIGINT or SIGTERM.
 
     Args:
-        runtime_dir: of the runs, if not the usual one.
+        runtime_dir: of the runs, if not the default one.
         plotjuggler_port, foxglove_port: 0 takes any free one, ``None`` serves none.
-        is_open: the host may be another one than this machine.
+        is_open: the host may be an address of the network.
 
     Raises:
-        StreamError: something cannot be served.
+        StreamError: a stream cannot be served.
     """
     check_host(host, is_open=is_open)
     folder = runtime_dir_path(str(runtime_dir or ""), os.environ)

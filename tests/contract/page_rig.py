@@ -192,7 +192,7 @@ async def page_rig(cfg: Config, folder: Path, *, has_daemon: bool = True) -> Asy
     dashboard = Dashboard(cfg, folder, endpoints, is_sim=True, log=cast(structlog.typing.FilteringBoundLogger, log))
     try:
         async with asyncio.TaskGroup() as tasks:
-            served = tasks.create_task(dashboard.run(listener, stop, has_pulse=True))
+            served = tasks.create_task(dashboard.run(listener, stop, has_heartbeat=True))
             if has_daemon:
                 async with Router(endpoints.of("control"), rig.handle, zmq.asyncio.Context.shadow(context)) as router:
                     answering = tasks.create_task(router.serve())
