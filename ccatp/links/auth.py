@@ -163,7 +163,7 @@ def read_clients(path: Path, what: str) -> Clients:
     except BadAccess as error:
         raise ConfigError(f"{what}: {path}: {error}") from error
     if not clients:
-        raise ConfigError(f"{what}: {path} lists nobody; add a table [clients.NAME] with public_key and role")
+        raise ConfigError(f"{what}: {path} lists no client; add a table [clients.NAME] with public_key and role")
     return clients
 
 

@@ -319,7 +319,7 @@ async def test_a_handler_that_fails_takes_the_channel_with_it(site: Site, monkey
 def test_what_cannot_be_served(site: Site) -> None:
     desk = desk_of(site)
     (site.folder / "clients.toml").write_text("")
-    with pytest.raises(ConfigError, match=r"observatory\.clients_file: .*lists nobody"):
+    with pytest.raises(ConfigError, match=r"observatory\.clients_file: .*lists no client"):
         ObservatoryServer("ipc://x", site.config, desk)
     site.enlist(weather="raise")
     (site.folder / "server.key_secret").chmod(0o644)

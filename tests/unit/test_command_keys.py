@@ -186,11 +186,11 @@ def test_secret_files_that_are_refused(folder: Path) -> None:
 def test_the_list_is_read_anew_and_a_bad_one_names_nobody(folder: Path) -> None:
     assert generate(folder) == 0
     path = folder / "ccatp-clients.toml"
-    with pytest.raises(ConfigError, match="lists nobody; add a table"):
+    with pytest.raises(ConfigError, match="lists no client; add a table"):
         read_clients(path, "observatory.clients_file")
     listed = ClientsFile(path, "observatory.clients_file")
     assert not listed.clients
-    assert "lists nobody" in listed.trouble
+    assert "lists no client" in listed.trouble
     key = read_public(folder / "ccatp.key", "x").decode()
     path.write_text(f'[clients.a]\npublic_key = "{key}"\nrole = "clear"\n')
     assert [client.name for client in listed.clients.values()] == ["a"]
