@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.core import FloatArray
-from ccatp.filters.block_kernel import spread
 from ccatp.mirror.mirror import Mirror
 
 
@@ -262,11 +261,9 @@ class SurveyMotion:
             drift: variances that enter at its end, shape (n,).
         """
         G = self.at(x)[1].take(_NOISY, axis=1)
-        Q = spread(G, impulses, drift)
-        if Q is None:
-            G *= np.sqrt(impulses)
-            Q = G.dot(G.T)
-            Q.reshape(-1)[:: STATES + 1] += drift
+        G *= np.sqrt(impulses)
+        Q: FloatArray = G.dot(G.T)
+        Q.reshape(-1)[:: STATES + 1] += drift
         return Q
 
 

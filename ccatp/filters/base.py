@@ -1,11 +1,11 @@
-"""What every filter offers: the ``Filter`` protocol, the innovation of an update, its typed refusals."""
+"""What every filter offers: the ``Filter`` protocol, the innovation of an update, typed refusals."""
 
-from typing import NamedTuple, Protocol
+from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from ccatp.core import FloatArray
 
 
 class FilterError(Exception):
@@ -13,7 +13,7 @@ class FilterError(Exception):
 
 
 class FilterShapeError(FilterError):
-    """An array does not fit the state: carries its name, its shape and the shape that was asked for."""
+    """An array does not fit the state: carries its name and its shape; the message has the shape wanted."""
 
     def __init__(self, name: str, shape: tuple[int, ...], wanted: str) -> None:
         super().__init__(f"{name} has shape {shape}, wanted {wanted}")
@@ -31,41 +31,38 @@ class FilterModelError(FilterError):
 
 
 class FilterDiverged(FilterError):
-    """A mean, a covariance or a noise is no longer a finite Gaussian: what is wrong stands in the message."""
+    """A mean, a covariance or a noise is not a finite Gaussian: the message says which."""
 
 
-class Innovation(Protocol):
-    """What one update learned."""
+class Innovation:
+    """What an update found.
+
+    Attributes:
+        nis: normalised innovation squared nu^T (H P H^T + R)^-1 nu of all rows, chi-squared with m degrees of freedom
+            when the filter is consistent.
+    """
+
+    __slots__ = ("_residual", "nis")
+
+    def __init__(self, residual: Sequence[float] | FloatArray, nis: float) -> None:
+        self._residual, self.nis = residual, nis  # a list costs a third of an array, which few ask for
 
     @property
     def residual(self) -> FloatArray:
-        """Z - H x with the predicted state, shape (m,)."""
-
-    @property
-    def nis(self) -> float:
-        """Normalised innovation squared nu^T (H P H^T + R)^-1 nu of all rows.
-
-        Chi-squared with ``size`` degrees of freedom when the filter is consistent.
-        """
+        """Nu = z - H x with the predicted state, shape (m,)."""
+        return np.array(self._residual, dtype=np.float64)
 
     @property
     def size(self) -> int:
         """m, the number of measurement rows."""
-
-
-class Learned(NamedTuple):
-    """An ``Innovation`` that is at hand."""
-
-    residual: FloatArray
-    nis: float
-    size: int
+        return len(self._residual)
 
 
 class Transition(Protocol):
     """A nonlinear process model x <- f(x).
 
-    Angles are continuous in the state: nothing wraps. The arrays that come back are the model's work space: they hold
-    until its next call, and a filter neither changes nor keeps them.
+    Angles are continuous in the state: nothing wraps. The returned arrays are the model's work space: they hold until
+    its next call, and a filter neither changes nor keeps them.
     """
 
     def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -76,7 +73,7 @@ class Transition(Protocol):
 
 
 class Observation(Protocol):
-    """A nonlinear measurement model z = h(x) + noise; its arrays are work space as those of ``Transition``.
+    """A nonlinear measurement model z = h(x) + noise; its arrays are work space like those of ``Transition``.
 
     It is prepared so that z - h(x) needs no wrapping for any x that the filter may try.
     """
@@ -89,10 +86,10 @@ class Observation(Protocol):
 
 
 class Filter(Protocol):
-    """A Gaussian filter of n states, thesis fig. 2.8: the localizer is composed with one.
+    """A Gaussian filter of n states, thesis fig. 2.8.
 
-    Each call replaces the arrays of ``mean`` and ``covariance`` and changes none in place: who keeps them keeps the
-    state.
+    ``mean`` and ``covariance`` return arrays that later calls do not change: a caller that keeps them keeps the state.
+    Between two calls they return the same arrays again.
     """
 
     @property
@@ -101,18 +98,18 @@ class Filter(Protocol):
 
     @property
     def covariance(self) -> FloatArray:
-        """Its covariance, shape (n, n), symmetric positive semidefinite."""
+        """Its covariance, shape (n, n), positive semidefinite, symmetric to the last bit."""
 
     @property
     def transition(self) -> FloatArray:
-        """F of the last prediction, shape (n, n): what a smoother goes back by.
+        """F of the last prediction, shape (n, n), as a smoother needs it.
 
         The matrix given, the Jacobian used, or the regression of f(x) on x by sigma points; the identity before the
         first prediction and after a reset.
         """
 
     def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
-        """Advance the state by x <- F x, P <- F P F^T + Q (thesis eqs 2.5, 2.6), or by x <- f(x) and what it does to P.
+        """Advance the state: x <- F x, P <- F P F^T + Q (thesis eqs 2.5, 2.6), or the same with a nonlinear f.
 
         Args:
             F: transition, shape (n, n), or a nonlinear model.

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg.blas import daxpy, dscal
+from scipy.linalg.blas import daxpy, dscal, dtrsm, dtrsv
+from scipy.linalg.lapack import dposv, dpotrf
 
 from ccatp.core import FloatArray
 from ccatp.filters.base import HUGE, FilterDiverged, FilterError, FilterShapeError, checked_gaussian
@@ -108,6 +109,7 @@ class EkfSlam:
         v = self.vehicle_size
         self.mean, self.covariance = mean, covariance
         self._rows, self._columns, self._vehicle = covariance[:v], covariance[:, :v], mean[:v]
+        self._product = np.empty_like(covariance)
 
     def __deepcopy__(self, memo: dict[int, object]) -> "EkfSlam":
         """A filter of its own, its views upon its own state."""
@@ -214,7 +216,8 @@ class EkfSlam:
         dscal(1.0 / root, cross)
         if s < STRONG * r:
             # P stays symmetric exactly; BLAS's rank-one update fuses some products with the sum and rounds others.
-            self.covariance -= cross[:, None] * cross
+            np.multiply(cross[:, None], cross, self._product)
+            np.subtract(self.covariance, self._product, self.covariance)
         else:
             self._joseph(columns, h[None, :], cross[:, None] / root, np.array(((r,),)))
         daxpy(cross, self.mean, a=residual / root)
@@ -237,17 +240,17 @@ class EkfSlam:
         R = _checked_rows(columns, H, residual, R)
         cross, S = self._moments(columns, H, R)
         root = _root(S, residual)
-        y = np.linalg.solve(root, residual)
+        y = dtrsv(root, residual, 1, 0, 1)
         nis = float(y.dot(y))
         learned = Update(residual, nis, residual.size, nis <= gate, S.diagonal().copy())
         if not learned.accepted:
             return learned
-        V = np.linalg.solve(root, cross.T).T
+        V = dtrsm(1.0, root, cross, 1, 1, 1)
         self.mean += V.dot(y)
         if bool((S.diagonal() < STRONG * R.diagonal()).all()):
             self.covariance -= V.dot(V.T)
         else:
-            self._joseph(columns, H, np.linalg.solve(root.T, V.T).T, R)
+            self._joseph(columns, H, dtrsm(1.0, root, V, 1, 1), R)
         return learned
 
     def update_iterated(
@@ -273,7 +276,7 @@ class EkfSlam:
             rows = _checked_rows(columns, H, residual, R)
             cross, S = self._moments(columns, H, rows)
             nu = residual + H.dot((x - prior)[columns])
-            new = prior + cross.dot(np.linalg.solve(S, nu))
+            new = prior + cross.dot(dposv(S, nu, 1)[1])
             moved = np.abs(new - x) / (np.sqrt(self.covariance.diagonal()) + 1e-12)
             x = new
             residual, H = linearise(x)
@@ -389,8 +392,8 @@ def _root(S: FloatArray, residual: FloatArray) -> FloatArray:
     """
     if not float(np.vdot(S, S) + np.vdot(residual, residual)) < HUGE:
         raise FilterDiverged(f"update is not finite: residuals {residual.tolist()}")
-    try:
-        root = np.linalg.cholesky(S).astype(np.float64, copy=False)
-    except np.linalg.LinAlgError:
-        raise FilterDiverged("update is not finite, or H P H^T + R is not positive definite") from None
+    root: FloatArray
+    root, info = dpotrf(S, 1, 1)
+    if info:
+        raise FilterDiverged("update is not finite, or H P H^T + R is not positive definite")
     return root

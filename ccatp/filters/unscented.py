@@ -1,18 +1,25 @@
 """Unscented Kalman filter: nonlinear models by sigma points, matrices as in ``KalmanFilter``."""
 
 import numpy as np
-from numpy import vdot
+from scipy.linalg.blas import ddot, dgemm, dsyrk
+from scipy.linalg.lapack import dpotrf
 
 from ccatp.core import FloatArray
-from ccatp.filters.base import HUGE, FilterDiverged, FilterShapeError, Innovation, Learned, Observation, Transition
-from ccatp.filters.kalman import KalmanFilter
-from ccatp.filters.square_root import square_root
+from ccatp.filters.base import (
+    HUGE,
+    FilterDiverged,
+    FilterShapeError,
+    Innovation,
+    Observation,
+    Transition,
+)
+from ccatp.filters.kalman import KalmanFilter, noise_root, square_root
 
 ALPHA = 1.0
 """Spread of the points. 1 keeps every weight at or above zero: small values put a mean of weight -1/alpha^2 against the
-others, which costs as many digits and may leave a covariance that is none."""
+others, which costs as many digits and may leave a matrix that is no covariance."""
 BETA = 2.0
-"""What is known of the fourth moment: 2 is best for a Gaussian."""
+"""Weight of the fourth moment: 2 is best for a Gaussian."""
 KURTOSIS = 3.0
 """n + kappa of a Gaussian in one dimension: kappa = max(3 - n, 0)."""
 
@@ -28,89 +35,96 @@ class UnscentedKalmanFilter(KalmanFilter):
     update:   nu = z - sum W_i Y_i,  S = sum W_i dY_i dY_i^T + R,  C = sum W_i dX_i dY_i^T,
               W = C S^-1,  x = x + W nu,  P = P - W S W^T
 
-    Points are drawn anew for the update. A matrix in place of a model is taken as the linear filter takes it: the
+    The update draws its points again. A matrix in place of a model is taken as the linear filter takes it: the
     transform is exact there. ``transition`` of a nonlinear prediction is C^T P^-1 of its points, the statistical
     linearisation; along a direction of no variance it is zero.
     """
 
     def __init__(self, mean: FloatArray, covariance: FloatArray) -> None:
         super().__init__(mean, covariance)
-        n = self._shape[0]
+        n = self._n
         scale = ALPHA**2 * (n + max(KURTOSIS - n, 0.0))
         self._spread = float(np.sqrt(scale))
-        self._mean_weights = np.full(2 * n + 1, 0.5 / scale)
-        self._mean_weights[0] = (scale - n) / scale
-        self._weights = self._mean_weights.copy()
-        self._weights[0] += 1.0 - ALPHA**2 + BETA
+        self._weights = np.full(2 * n + 1, 0.5 / scale)
+        self._weights[0] = (scale - n) / scale
+        covariance_weights = self._weights.copy()
+        covariance_weights[0] += 1.0 - ALPHA**2 + BETA
+        self._roots = np.sqrt(covariance_weights)[:, None]
+        self._offsets = np.zeros((2 * n + 1, n))
+        self._predicted: tuple[FloatArray, FloatArray] | None = None
+
+    @property
+    def transition(self) -> FloatArray:
+        """F of the last prediction, or the regression of its points, shape (n, n); see ``Filter.transition``."""
+        if self._predicted is not None:
+            cross, L = self._predicted
+            # A with A P = cross^T by least squares, because P = L L^T may be singular.
+            half = np.linalg.lstsq(L, cross, rcond=None)[0]
+            self._F_rows[:] = np.linalg.lstsq(L.T, half, rcond=None)[0].T
+            self._predicted = None
+        return super().transition
+
+    def reset(self, mean: FloatArray, covariance: FloatArray) -> None:
+        """Re-initialise with copies of ``mean`` (n,) and ``covariance`` (n, n); see ``Filter.reset``."""
+        super().reset(mean, covariance)
+        self._predicted = None
 
     def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
         """Advance by F, a matrix (n, n) or a model, and Q (n, n); see ``Filter.predict``."""
         if isinstance(F, np.ndarray):
             super().predict(F, Q)
+            self._predicted = None
             return
-        n = self.mean.size
-        offsets, L = self._offsets()
-        images = F.through(self.mean + offsets)
+        n = self._n
+        L = self._draw()
+        images = F.through(self.mean + self._offsets)
         if images.shape != (2 * n + 1, n):
             raise FilterShapeError("f(X)", images.shape, f"({2 * n + 1}, {n})")
         if Q.shape != (n, n):
             raise FilterShapeError("Q", Q.shape, str((n, n)))
-        if not vdot(images, images) < HUGE:
-            raise FilterDiverged(f"prediction is not finite: images of the points {images.tolist()}")
-        x, deviations, P = self._moments(images)
-        P += Q
-        self._take_prediction(x, 0.5 * (P + P.T))
-        cross = self._cross(offsets, deviations)
-        self._transition = lambda: _regression(cross, L)
+        if not np.vdot(images, images) + np.vdot(Q, Q) < HUGE:
+            raise FilterDiverged(f"prediction is not finite: images of the points {images.tolist()}, or Q")
+        mean = self._weights.dot(images)
+        deviations = (images - mean) * self._roots
+        self._P_rows[:] = dsyrk(1.0, deviations.T, 1.0, Q.T, 0, 0).T
+        np.negative(mean, self._minus_x)
+        self._mean = self._covariance = None
+        self._predicted = dgemm(1.0, (self._offsets * self._roots).T, deviations.T, 0.0, None, 0, 1), L
 
     def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
         """Condition on z (m,) with H, a matrix (m, n) or a model, and R (m,) or (m, m); see ``Filter.update``."""
         if isinstance(H, np.ndarray):
             return super().update(z, H, R)
         m = z.size
-        offsets, _ = self._offsets()
-        images = H.through(self.mean + offsets)
-        if z.ndim != 1 or images.shape != (offsets.shape[0], m):
-            raise FilterShapeError("h(X)", images.shape, f"({offsets.shape[0]}, m) with z of shape {z.shape}")
+        self._draw()
+        images = H.through(self.mean + self._offsets)
+        if z.ndim != 1 or images.shape != (len(self._offsets), m):
+            raise FilterShapeError("h(X)", images.shape, f"({len(self._offsets)}, m) with z of shape {z.shape}")
         if R.shape not in ((m,), (m, m)):
             raise FilterShapeError("R", R.shape, f"({m},) or ({m}, {m})")
         if m == 0:
-            return Learned(np.empty(0), 0.0, 0)
-        noise = R if R.ndim == 2 else np.diag(R)
-        if not (vdot(images, images) < HUGE and vdot(z, z) < HUGE and vdot(R, R) < HUGE):
+            return Innovation(np.empty(0), 0.0)
+        if not np.vdot(images, images) + ddot(z, z) + np.vdot(R, R) < HUGE:
             raise FilterDiverged(f"update is not finite: readings {z.tolist()}, or their expectation or noise")
-        _check_noise(R)
-        expected, deviations, S = self._moments(images)
-        S += noise
-        residual, cross = z - expected, self._cross(offsets, deviations)
-        return self._take(residual, self._conditioner.on_moments(self.covariance, residual, cross, S))
+        if R.ndim == 2:
+            noise_root(R)  # refuses what is no covariance
+        elif not min(R.tolist()) > 0.0:
+            raise FilterDiverged(f"R is not positive definite: least variance {min(R.tolist()):.3g}")
+        expected = self._weights.dot(images)
+        deviations = (images - expected) * self._roots
+        rows = self._rows.get(z.shape) or self._new_rows(m)
+        rows.V[: self._n] = (self._offsets * self._roots).T.dot(deviations)
+        np.subtract(z, expected, rows.residual)
+        rows.S_rows[:] = R if R.ndim == 2 else np.diag(R)
+        dsyrk(1.0, deviations.T, 1.0, rows.S, 0, 1, 1)
+        if dpotrf(*rows.factor)[1]:
+            raise FilterDiverged("update is not finite, or the covariance of the measurement is not positive definite")
+        return self._subtract(rows, rows.residual.tolist())
 
-    def _offsets(self) -> tuple[FloatArray, FloatArray]:
-        """Points less the mean, shape (2 n + 1, n), and the root L (n, n) that they are made of."""
-        n = self.mean.size
+    def _draw(self) -> FloatArray:
+        """Set the points less the mean, shape (2 n + 1, n), and return the root L (n, n) that they are made of."""
+        n = self._n
         L = square_root(self.covariance)
-        offsets = np.zeros((2 * n + 1, n))
-        offsets[1 : n + 1] = self._spread * L.T
-        offsets[n + 1 :] = -offsets[1 : n + 1]
-        return offsets, L
-
-    def _moments(self, images: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        mean = self._mean_weights.dot(images)
-        deviations = images - mean
-        return mean, deviations, (deviations.T * self._weights).dot(deviations)
-
-    def _cross(self, offsets: FloatArray, deviations: FloatArray) -> FloatArray:
-        cross: FloatArray = (offsets.T * self._weights).dot(deviations)
-        return cross
-
-
-def _regression(cross: FloatArray, L: FloatArray) -> FloatArray:
-    """A (k, n) with A P = cross^T, cross (n, k) = cov(x, y), P = L L^T: least squares, so that P may be singular."""
-    half = np.linalg.lstsq(L, cross, rcond=None)[0]
-    return np.array(np.linalg.lstsq(L.T, half, rcond=None)[0].T, dtype=np.float64)
-
-
-def _check_noise(R: FloatArray) -> None:
-    least = float(R.min()) if R.ndim == 1 else float(np.linalg.eigvalsh(R)[0])
-    if not least > 0.0:
-        raise FilterDiverged(f"R is not positive definite: least variance {least:.3g}")
+        np.multiply(L.T, self._spread, self._offsets[1 : n + 1])
+        np.negative(self._offsets[1 : n + 1], self._offsets[n + 1 :])
+        return L

@@ -1,7 +1,7 @@
 """Build a wheel of ccatp whose frame path is machine code: `python build.py SOURCE WHEELS`, see docs/speed.md.
 
 The source is copied beside the wheels first, so that nothing compiled ever lies in it. `modules.txt` names what mypyc
-compiles; the filters' matrix steps come from `block_kernel.c`.
+compiles.
 """
 
 import os
@@ -54,7 +54,6 @@ def copy_of(source: Path, tree: Path) -> dict[str, Any]:
     shutil.rmtree(tree, ignore_errors=True)
     shutil.copytree(source / "ccatp", tree / "ccatp", ignore=IGNORED)
     shutil.copytree(source / "configs", tree / "ccatp" / "configs", ignore=IGNORED)
-    shutil.copy(HERE / "block_kernel.c", tree)
     (tree / "mypy.ini").write_text(MYPY, encoding="utf-8")
     project: dict[str, Any] = tomllib.loads((source / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     return project
@@ -68,9 +67,8 @@ def build(source: Path, wheels: Path) -> None:
     os.chdir(tree)
     sys.path.insert(0, str(tree))  # the plugin of the models, and nothing installed elsewhere
 
-    import numpy as np  # noqa: PLC0415 - the tools are looked for after what they need
-    from mypyc.build import mypycify  # noqa: PLC0415
-    from setuptools import Extension, find_packages, setup  # noqa: PLC0415
+    from mypyc.build import mypycify  # noqa: PLC0415 - the tools are looked for after what they need
+    from setuptools import find_packages, setup  # noqa: PLC0415
     from setuptools.command.build_ext import build_ext  # noqa: PLC0415
 
     class BuildOnAllCores(build_ext):
@@ -90,9 +88,6 @@ def build(source: Path, wheels: Path) -> None:
     modules = mypycify(
         ["--config-file", "mypy.ini", *module_paths(tree)], opt_level="2", debug_level="0", multi_file=True
     )
-    kernel = Extension(
-        "ccatp.filters._kernel", ["block_kernel.c"], include_dirs=[np.get_include()], extra_compile_args=["-O3", "-g0"]
-    )
     setup(
         name=project["name"],
         version=version.group(1) if version else "0",
@@ -101,7 +96,7 @@ def build(source: Path, wheels: Path) -> None:
         packages=find_packages(include=["ccatp", "ccatp.*"]),
         package_data={"": ["py.typed", "*.pyi", "configs/**/*", "static/*"]},
         entry_points={"console_scripts": [f"{name} = {at}" for name, at in project["scripts"].items()]},
-        ext_modules=[*modules, kernel],
+        ext_modules=modules,
         cmdclass={"build_ext": BuildOnAllCores},
         script_args=["--quiet", "bdist_wheel", "--dist-dir", str(wheels)],
     )

@@ -1,7 +1,12 @@
-"""Pure. The Kalman filter's own promises: shapes, refusals, symmetry, the empty update, the innovation."""
+"""The Kalman filter's own promises: shapes, refusals, symmetry, the empty update, the innovation."""
+
+import tracemalloc
+from typing import Any, Literal
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from ccatp.core import FloatArray
 from ccatp.filters import FILTERS, FilterDiverged, FilterShapeError, KalmanFilter
@@ -94,17 +99,16 @@ def test_what_is_not_finite_is_refused_and_leaves_the_state(bad: float) -> None:
     np.testing.assert_array_equal(kf.covariance, before[1])
 
 
-def test_a_poisoned_covariance_is_noticed() -> None:
+@pytest.mark.parametrize("H", [np.array([[0.0, 1.0]]), np.array([[0.3, 1.0], [0.0, 1.0]])])
+@pytest.mark.parametrize("least", [-1.5, -1e9])
+def test_a_noise_that_is_no_covariance_is_found_out_where_it_is_measured(H: FloatArray, least: float) -> None:
     kf = make()
-    kf.covariance[0, 0] = np.nan
-    with pytest.raises(FilterDiverged, match="not finite"):
-        kf.update(np.ones(1), np.ones((1, 2)), np.ones(1))
-    kf.covariance = np.array([[-1.0, np.nan], [np.nan, 1.0]])
-    with pytest.raises(FilterDiverged, match="covariance is not finite"):
-        kf.update(np.ones(1), np.ones((1, 2)), np.ones(1))
-    kf.covariance = np.diag([1.0, -1.0])
+    kf.predict(EYE, np.diag([0.0, least]))
+    before = state(kf)
     with pytest.raises(FilterDiverged, match="covariance is not positive semidefinite"):
-        kf.update(np.ones(1), np.ones((1, 2)), np.ones(1))
+        kf.update(np.ones(len(H)), H, np.full(len(H), 2.0))
+    np.testing.assert_array_equal(kf.mean, before[0])
+    np.testing.assert_array_equal(kf.covariance, before[1])
 
 
 @pytest.mark.parametrize("variance", [0.0, -1.0, np.nan])
@@ -196,3 +200,128 @@ def test_a_state_known_exactly_stays_so_beside_large_ones() -> None:
     assert kf.mean[1] == 0.0
     assert not kf.covariance[1].any()
     assert not kf.covariance[:, 1].any()
+
+
+def shipped(n: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Covariance, F, Q, H and R: the thesis's four states; or as many, some of which no noise drives."""
+    if n == 4:
+        F = np.eye(4)
+        F[0, 1] = F[2, 3] = 0.01
+        Q = F @ np.diag([0.0, 0.01, 0.0, 0.02]) @ F.T
+        H = np.array([[0.0, 1, 0, 0], [33.3, 0, 0, 2.5], [33.3, 0, 0, -2.5], [0, 0, 0, 1]])
+        return np.diag([1e-4, 1e-2, 1e-4, 1e-2]), F, Q, H, np.array([3.5e-5, 1e-6, 1e-6, 7.6e-5])
+    rng = np.random.default_rng(n)
+    F = np.eye(n)
+    F[: n // 2, n // 2 :] = 0.01 * rng.normal(size=(n // 2, n - n // 2))
+    Q = np.diag(np.where(np.arange(n) % 3, 0.0, 1e-6))
+    return np.diag(10.0 ** rng.uniform(-6.0, 0.0, n)), F, Q, rng.normal(size=(6, n)), np.full(6, 1e-4)
+
+
+def check_a_long_run(n: int, steps: int) -> None:
+    """Any subset of the rows arrives; now and then the pose is lost and found."""
+    covariance, F, Q, H, R = shipped(n)
+    rng = np.random.default_rng(n)
+    subsets = [rng.permutation(len(R))[: rng.integers(1, len(R) + 1)] for _ in range(50)]
+    rows = [(rng.normal(size=s.size) * np.sqrt(R[s]), H[s], R[s]) for s in subsets]
+    kf, lost = KalmanFilter(np.zeros(n), covariance), np.diag(np.full(n, 1e4))
+    for k in range(steps):
+        kf.predict(F, lost if k % 1009 == 1008 else Q)
+        kf.update(*rows[k % 50])
+        if k % 97 == 0:
+            P = kf.covariance
+            np.testing.assert_array_equal(P, P.T)
+            sigma = np.sqrt(P.diagonal())
+            assert np.linalg.eigvalsh(P / np.outer(sigma, sigma))[0] > 0.0
+    assert np.isfinite(kf.mean).all()
+
+
+@pytest.mark.parametrize("n", [4, 19])
+def test_covariance_stays_symmetric_positive_definite(n: int) -> None:
+    check_a_long_run(n, 5000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [4, 19])
+def test_covariance_stays_symmetric_positive_definite_over_a_million_steps(n: int) -> None:
+    check_a_long_run(n, 1_000_000)
+
+
+@pytest.mark.parametrize("is_strong", [False, True])
+def test_no_matrix_is_allocated_in_steady_state(is_strong: bool) -> None:
+    covariance, F, Q, H, R = shipped(40)
+    R = R * (1e-9 if is_strong else 1.0)
+    kf, z = KalmanFilter(np.zeros(40), covariance), np.zeros(6)
+
+    def step() -> None:
+        kf.predict(F, Q)
+        kf.update(z, H, R)
+
+    step()
+    tracemalloc.start()
+    try:
+        step()
+        before = tracemalloc.get_traced_memory()[0]
+        tracemalloc.reset_peak()
+        for _ in range(100):
+            step()
+        after, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak - before < 40 * 40 * 8 / 2  # half of P: lists of six numbers, the innovation, an iterator of numpy
+    assert after - before < 1000
+
+
+def test_what_was_handed_out_keeps_its_numbers() -> None:
+    kf = make()
+    kf.predict(np.array([[1.0, 0.1], [0.0, 1.0]]), 0.01 * EYE)
+    mean, covariance, transition = kf.mean, kf.covariance, kf.transition
+    assert (kf.mean is mean, kf.covariance is covariance) == (True, True)
+    kept = mean.copy(), covariance.copy(), transition.copy()
+    z, H, R = np.array([1.0, 2.0]), np.array([[1.0, 0.0], [0.5, 1.0]]), np.ones(2)
+    innovation = kf.update(z, H, R)
+    residual = z - H @ kept[0]
+    for array in (z, H, R):
+        array[:] = 9.0
+    kf.predict(2.0 * EYE, EYE)
+    kf.update(np.zeros(2), EYE, np.ones(2))
+    for now, then in zip((mean, covariance, transition), kept, strict=True):
+        np.testing.assert_array_equal(now, then)
+    assert innovation.residual == pytest.approx(residual, abs=1e-15)  # the same subtraction
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_any_layout_and_type_of_arrays(order: Literal["C", "F"]) -> None:
+    covariance, F, Q, H, R = shipped(4)
+    one, other = KalmanFilter(np.zeros(4), covariance), KalmanFilter(np.zeros(4), covariance)
+    z, H = np.array([1.0, 2.0, 3.0, 4.0]), np.rint(H)
+    one.predict(F, Q)
+    other.predict(np.array(F, order=order), np.array(Q, order=order))
+    one.update(z, H, R)
+    whole: Any = np.array(H, order=order).astype(np.int64)
+    other.update(np.repeat(z, 2).astype(np.float32)[::2].astype(np.float64), whole, np.repeat(R, 3)[::3])
+    np.testing.assert_array_equal(one.mean, other.mean)
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), ratio=st.sampled_from([1.0, 1e4, 1e8, 1e12]), m=st.integers(1, 40))
+def test_symmetric_positive_and_any_order_at_any_ratio(seed: int, ratio: float, m: int) -> None:
+    """Rows repeat each other, so that their order would count if it could."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(4, 4)) + 2.0 * np.eye(4)
+    prior = root @ root.T
+    H = rng.normal(size=(3, 4))[rng.integers(0, 3, m)]
+    R = rng.uniform(0.5, 2.0, m) / ratio
+    z = H @ rng.multivariate_normal(np.zeros(4), prior) + np.sqrt(R) * rng.normal(size=m)
+    order = rng.permutation(m)
+    found = []
+    for index in (np.arange(m), order):
+        kf = KalmanFilter(np.zeros(4), prior)
+        assert kf.update(z[index], H[index], R[index]).nis >= 0.0
+        np.testing.assert_array_equal(kf.covariance, kf.covariance.T)
+        assert np.linalg.eigvalsh(kf.covariance)[0] > -1e-15 * np.abs(prior).max()  # what writing P rounds away
+        found.append((kf.mean, kf.covariance))
+    sigma = np.sqrt(prior.diagonal())
+    # 1e-16 of the prior, times the root of the ratio for the mean: a residual of that many sigmas is weighted.
+    np.testing.assert_allclose(found[0][0] / sigma, found[1][0] / sigma, atol=1e-14 * (100.0 + np.sqrt(ratio)))
+    np.testing.assert_allclose(found[0][1] / np.outer(sigma, sigma), found[1][1] / np.outer(sigma, sigma), atol=1e-13)

@@ -13,7 +13,6 @@ from ccatp.filters import (
     KalmanFilter,
     Smoother,
     SmootherEmpty,
-    UnscentedKalmanFilter,
 )
 
 BOTH = pytest.mark.parametrize("name", ["ekf", "ukf"])
@@ -82,12 +81,6 @@ def test_what_is_not_finite_leaves_the_state(name: str, bad: float) -> None:
 def test_noise_without_a_variance(name: str, R: FloatArray) -> None:
     with pytest.raises(FilterDiverged, match=r"least variance|R is not positive definite"):
         make(name).update(np.zeros(1), Bent(1), R)
-
-
-def test_moments_that_contradict_each_other() -> None:
-    ukf = UnscentedKalmanFilter(np.zeros(2), EYE)
-    with pytest.raises(FilterDiverged, match="covariance of the measurement is not positive definite"):
-        ukf._conditioner.on_moments(EYE, np.zeros(1), np.ones((2, 1)), -np.ones((1, 1)))
 
 
 @BOTH
