@@ -1,6 +1,6 @@
-"""The alignment as data and as CSV. Micrometres and microradians; moves and deviations > 0 towards the robot.
+"""The alignment of the panels as data, as CSV and as text for a terminal.
 
-The alignment as text for a terminal.
+Micrometres and microradians; moves and deviations > 0 towards the robot.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,7 +18,7 @@ _WAVEFRONT = ("rms_before_um", "rms_before_level_um", "rms_after_um", "point_noi
 
 
 def result_data(result: SurveyResult, comparison: Comparison | None) -> dict[str, Any]:
-    """What ``ccatp align --json`` tells of the panels and the mirror."""
+    """What ``ccatp align --json`` prints of the panels and the mirror."""
     return {
         "panels": [_panel(panel) for panel in result.panels],
         "undetermined": [

@@ -1,7 +1,4 @@
-"""How well the robot knew where it was: true against estimated place in every frame, and its own three sigma.
-
-Where the time of a run went - turning, driving, settling, measuring, waiting - against the least it takes.
-"""
+"""Localization error of a run frame by frame, and where its time went against the least that it takes."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -159,7 +156,7 @@ class TimeBreakdown(NamedTuple):
 
 
 def time_budget(record: RunRecord) -> TimeBreakdown | None:
-    """The budget of a run; None where nothing tells its states."""
+    """The budget of a run; None where its states are not recorded."""
     spells, is_exact = list[TimeSpan](), True
     for session in record.sessions:
         exact = spells_of(session)
@@ -173,10 +170,10 @@ def time_budget(record: RunRecord) -> TimeBreakdown | None:
 
 
 def spells_of(session: RecordedSession) -> list[TimeSpan] | None:
-    """Spells between the changes that the log tells; None where it does not, or the frames are not known.
+    """Spells between the state changes in the log; None where it holds none, or the frames are not known.
 
-    What a main loop that died was at is not told; the time until its successor speaks counts as waiting, but for that
-    in which there was none.
+    The last state of a main loop that died is not logged; the time until the first status of its successor counts as
+    waiting, but for that in which there was none.
     """
     track = session.track
     if not session.changes or not len(track.seq):
@@ -201,7 +198,7 @@ def spells_of(session: RecordedSession) -> list[TimeSpan] | None:
 
 
 def uncounted_s(one: MissionStatus, later: MissionStatus) -> float:
-    """Robot time between two words of main that no mission counted: it was started anew in between."""
+    """Robot time between two statuses of main that no mission counted: it was restarted in between."""
     passed_s = later.t_s - one.t_s
     missing_s = passed_s - (later.elapsed_s - one.elapsed_s)
     return missing_s if passed_s > 0.0 and missing_s > _ROUNDING_S else 0.0

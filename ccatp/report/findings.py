@@ -1,7 +1,4 @@
-"""Everything that is thought out about a run, once, for the page, the figures and the data alike.
-
-Pass or fail of each measurement point: how near the robot came, first and when it was measured.
-"""
+"""What follows from a recorded survey, computed once for page, figures and data: points, errors, times, alignment."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -35,9 +32,9 @@ class PointVerdict(NamedTuple):
 
     Attributes:
         place_m: deck x, y.
-        first_mm: distance at the first arrival, before any correction; None where nobody knows.
+        first_mm: distance at the first arrival, before any correction; None where it is not known.
         left_mm: distance where it was measured, as the laser saw it; None without a fix.
-        why: why it was left out; empty where it was not, or nobody said.
+        why: why it was left out; empty where it was not, or no reason is recorded.
     """
 
     point: PointId
@@ -181,7 +178,7 @@ class Findings:
 
 
 def findings_of(record: RunRecord) -> Findings:
-    """Think about a run."""
+    """Everything that follows from a recorded run."""
     errors = error_series(record)
     alignment = _alignment(record)
     known = alignment is not None and record.injected is not None
@@ -205,7 +202,7 @@ def _alignment(record: RunRecord) -> SurveyResult | None:
 
 
 def outcome_of(record: RunRecord) -> PointOutcome:
-    """How the run ended, from what main said last; a run without an end goes on or was killed."""
+    """How the run ended, from the last status; a run without an end goes on or was killed."""
     status = record.last_status
     if status is None:
         return PointOutcome("no mission", "main never said where the mission stood", is_good=False)

@@ -1,7 +1,4 @@
-"""What a run left behind, as a report needs it. Whatever a run does not hold is empty or None.
-
-What a mission among beacons left behind, as a report needs it. Whatever it does not hold is empty or None.
-"""
+"""What a survey or a beacon mission left behind, as a report needs it; what it does not hold is empty or None."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -94,7 +91,7 @@ class PlannedRow(NamedTuple):
 
 
 class PointOutcome(NamedTuple):
-    """How a run ended, in a few words; why, where somebody said so; and whether that is as it should be."""
+    """How a run ended, in a few words; why, where that is recorded; and whether that is as it should be."""
 
     text: str
     cause: str
@@ -145,7 +142,7 @@ class RunRecord(RunFiles):
 
     @property
     def last_status(self) -> MissionStatus | None:
-        """What main said last of the mission."""
+        """The last status of the mission."""
         said = [status for session in self.sessions for status in session.statuses]
         return said[-1] if said else None
 
@@ -205,14 +202,14 @@ class BeaconRecord(RunFiles):
 
 
 def pose_errors_m(record: BeaconRecord) -> FloatArray | None:
-    """Distance of the estimated place from the true one, shape (k,); None where nobody knows the truth."""
+    """Distance of the estimated place from the true one, shape (k,); None where the truth is not known."""
     if record.truth is None:
         return None
     return np.asarray(np.hypot(*(record.track.place_m - record.truth.place_m).T))
 
 
 def pose_nees(record: BeaconRecord) -> FloatArray | None:
-    """e^T P^-1 e of x, y and heading, shape (k,); 3 is expected. None where nobody knows the truth."""
+    """e^T P^-1 e of x, y and heading, shape (k,); 3 is expected. None where the truth is not known."""
     if record.truth is None:
         return None
     return nees(pose_errors(record.track, record.truth), record.track.covariance)

@@ -1,13 +1,7 @@
-"""Reads a run directory for a report: a run that is complete, goes on, was killed, resumed or is of a real robot.
+"""Reads the run directory of a survey or a beacon mission for a report: a run that is complete, running or killed.
 
-What cannot be read is told and left out; only a directory that is no run at all, or a configuration that this program
-cannot use, is refused. Nothing is written.
-
-One recording of a run, as a report needs it: poses, truth, arrivals, fixes and what main said of the mission.
-
-The raw samples of the sensors, nine tenths of a recording, are not looked at.
-
-Reads the run directory of a mission among beacons for a report; whatever is missing or damaged is told.
+What cannot be read is reported and left out; only a directory without a run, or a configuration that this program
+cannot use, is refused. Nothing is written. Raw sensor samples, nine tenths of a recording, are not read.
 """
 
 import json
@@ -139,7 +133,7 @@ def _truth(batches: Sequence[FloatArray]) -> TrueTrack | None:
 
 
 def _ordered(batches: Sequence[FloatArray], columns: int) -> FloatArray:
-    """One table, the frames growing: a frame that was told twice counts once."""
+    """One table, the frames growing: a frame that was recorded twice counts once."""
     rows = np.concatenate(batches) if batches else np.empty((0, columns))
     rows = rows[np.isfinite(rows).all(axis=1)]
     _, first = np.unique(rows[:, 0], return_index=True)
@@ -150,7 +144,7 @@ SUMMARY, LOG = "summary.json", "log.jsonl"
 
 
 def read_record(run_dir: Path) -> RunRecord:
-    """Everything that a report tells of a run.
+    """Everything that a report shows of a run.
 
     Raises:
         RunReadError: no such directory, no run in it, or none of a survey.
@@ -282,7 +276,7 @@ BEACON_TOPICS_READ = frozenset(
 
 
 def read_beacon_record(run_dir: Path) -> BeaconRecord:
-    """Everything that a report tells of a mission among beacons.
+    """Everything that a report shows of a mission among beacons.
 
     Raises:
         ConfigError: its configuration cannot be used.
@@ -293,7 +287,7 @@ def read_beacon_record(run_dir: Path) -> BeaconRecord:
     log = list(read_log(run_dir / LOG, warnings))
     if not log:
         missing.append(f"{LOG}: what the processes said")
-    found = _BeaconReportReaderCollected()
+    found = _BeaconMessages()
     paths = recordings(run_dir / TELEMETRY)
     if not paths:
         missing.append(f"{TELEMETRY}: path, map and readings over time")
@@ -324,7 +318,7 @@ def read_beacon_record(run_dir: Path) -> BeaconRecord:
     )
 
 
-class _BeaconReportReaderCollected:
+class _BeaconMessages:
     def __init__(self) -> None:
         self.version = "unknown"
         self.is_simulation: bool | None = None
@@ -375,7 +369,7 @@ class _BeaconReportReaderCollected:
 
 
 def _rows_of(batches: Sequence[FloatArray], columns: int) -> FloatArray:
-    """One table, the frames growing: a frame that was told twice counts once."""
+    """One table, the frames growing: a frame that was recorded twice counts once."""
     rows = np.concatenate(batches) if batches else np.empty((0, columns))
     rows = rows[np.isfinite(rows[:, :5]).all(axis=1)]
     _, first = np.unique(rows[:, 0], return_index=True)
