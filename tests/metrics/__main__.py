@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from tests.metrics.frame_calls import MAIN_LOOP, measure
+from tests.metrics.frame_calls import MAIN_LOOP, MeasurementError, measure
 from tests.metrics.sizes import (
     SMALL_FILE_LINES,
     duplicate_classes,
@@ -72,7 +72,11 @@ def main() -> int:
     parser.add_argument("--process", default=MAIN_LOOP, help="command line of the main loop, a regular expression")
     options = parser.parse_args()
     roots: list[Path] = [root.resolve() for root in options.root or [_HERE]]
-    columns = [size_rows(root) | ({} if options.no_frame else frame_rows(root, options.process)) for root in roots]
+    try:
+        columns = [size_rows(root) | ({} if options.no_frame else frame_rows(root, options.process)) for root in roots]
+    except MeasurementError as error:
+        print(f"metrics: {error}", file=sys.stderr)
+        return 2
     if len(roots) > 1:
         print(*(f"{chr(ord('A') + k)}: {root}" for k, root in enumerate(roots)), sep="\n")
     for name in columns[0]:

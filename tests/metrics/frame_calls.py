@@ -12,6 +12,11 @@ _HOOK = Path(__file__).with_name("frame_hook")
 MAIN_LOOP = r"\bmain_loop\b"
 _LEAST_FRAMES = 1000
 _LOG_LINES = 10
+_PORTS = ("sim.robot", "sim.etalon", "dashboard")  # others may run on this machine
+
+
+class MeasurementError(Exception):
+    """The calls could not be counted; says why."""
 
 
 class FrameCalls(NamedTuple):
@@ -36,7 +41,7 @@ def measure(root: Path, python: Path, process: str = MAIN_LOOP) -> FrameCalls:
         process: regular expression for the command line of the process to be measured.
 
     Raises:
-        RuntimeError: the run failed, or no process matched.
+        MeasurementError: the run failed, or no process matched.
     """
     with tempfile.TemporaryDirectory(prefix="ccatp-metrics-") as folder:
         counts = Path(folder) / "counts"
@@ -50,11 +55,14 @@ def measure(root: Path, python: Path, process: str = MAIN_LOOP) -> FrameCalls:
         }
         command = [str(python), "-m", "ccatp", "run", "--sim", "--panels", "1"]
         command += ["--run-dir", f"{folder}/run", "--runtime-dir", f"{folder}/sockets"]
+        command += [word for place in _PORTS for word in ("--set", f"{place}.port=0")]
         done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             tail = "\n".join(done.stderr.splitlines()[-_LOG_LINES:])
-            raise RuntimeError(f"{' '.join(command)} ended with {done.returncode}:\n{tail}")
+            raise MeasurementError(f"{' '.join(command)} ended with {done.returncode}:\n{tail}")
         rows = [row for file in counts.iterdir() for row in json.loads(file.read_text())]
     if len(rows) < _LEAST_FRAMES:
-        raise RuntimeError(f"{len(rows)} frames in processes that match {process!r}; expected {_LEAST_FRAMES} or more")
+        raise MeasurementError(
+            f"{len(rows)} frames in processes that match {process!r}; expected {_LEAST_FRAMES} or more"
+        )
     return FrameCalls(len(rows), *(round(statistics.median(column)) for column in zip(*rows, strict=True)))
