@@ -1,7 +1,4 @@
-"""A mission among beacons in the main-loop process: senses, mission, wheel rates, store.
-
-What the main loop tells of a mission among beacons: estimates, the map, arrivals.
-"""
+"""A mission among beacons in the main-loop process: measurements, mission, wheel rates, store, telemetry."""
 
 import asyncio
 from collections import deque
@@ -33,7 +30,6 @@ from ccatp.core import Verdict
 from ccatp.daemon.mission_runner import (
     STILL,
     DriveCommand,
-    Progress,
     RunnerConfig,
     RunnerContext,
     RunnerFactory,
@@ -252,22 +248,20 @@ class BeaconRunner:
         """The robot is at rest; its wheels obey within a frame, so what they were commands last is what counts."""
         return abs(self._speed_m_s) <= self._cfg.mission.settle_speed_m_s
 
-    def progress(self) -> Progress:
-        """How far it is."""
+    def status(self) -> MissionStatus:
+        """Progress of the mission."""
         mission = self._mission
         at = mission.next_waypoint
-        return Progress(
+        return MissionStatus(
+            seq=self._context.clock.seq,
+            t_s=self._context.clock.t_s,
             state=str(mission.state),
             cause=mission.cause,
             done=mission.done,
-            skipped=0,
             total=mission.total,
             point=f"waypoint {at + 1}" if at >= 0 else "",
-            eta_s=0.0,
             error_mm=1e3 * mission.navigator.belief.sigma_m,
             outcome=str(mission.outcome),
-            lower_bound_s=0.0,
-            left_out={},
         )
 
     # -- beside the frames ----------------------------------------------------------------------------------------
@@ -295,7 +289,7 @@ class BeaconRunner:
     def on_tracking_gap(self) -> None:
         """The robot booted, or moved unseen: where it is nobody knows, and its map hangs on that."""
         self._reader.forget()
-        self._mission.fault("the robot was out of sight: put it at its start and begin anew")
+        self._mission.fault("no frames while the robot moved: put it at its start and start a new mission")
 
     def save_checkpoint(self) -> None:
         """Nobody takes over: the map would have to be kept, too."""

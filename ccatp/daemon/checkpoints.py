@@ -1,7 +1,4 @@
-"""What the main loop writes down for a successor, and what it takes over from a predecessor.
-
-The main loop's parts and the mission's database, new, resumed, or taken over from a main loop that died.
-"""
+"""What a main loop saves for its successor, and its parts and database: new, resumed, or taken over."""
 
 import math
 from collections.abc import Sequence
@@ -175,7 +172,7 @@ def _recovery(
 def _why_held(done: int, left: Sequence[PointId]) -> str:
     goes_on = f"goes on with point {left[0].row}-{left[0].col}-{left[0].point}" if left else "ends it"
     measured = f"{done} points are measured and will be left out, {len(left)} are to do"
-    return f"started anew: {measured}; 'ccatp resume' {goes_on}"
+    return f"restarted: {measured}; 'ccatp resume' {goes_on}"
 
 
 def _open_store(args: ProcessArgs, mirror: str, points: Sequence[PointId]) -> MissionStore:

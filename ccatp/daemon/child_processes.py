@@ -1,9 +1,4 @@
-"""The child processes of a run: started, watched by file descriptors of the kernel, started anew, stopped.
-
-Whether a process that died, or hangs, is started anew: what it ended with, and how often it has happened.
-
-Where the stand-ins listen: bound by the supervisor, so that nobody else can have the place meanwhile.
-"""
+"""The child processes of a run: start, supervision by pidfd and heartbeat, restart policy, stop, listening sockets."""
 
 import contextlib
 import os
@@ -52,7 +47,7 @@ class RestartPolicy:
     """Decides over the processes of one run.
 
     Args:
-        limit: each may be started anew so many times ...
+        limit: each may be restarted so many times ...
     """
 
     def __init__(self, limit: int, window_s: float) -> None:
@@ -86,7 +81,7 @@ class RestartPolicy:
             return RestartDecision(ProcessEnd.HELD, f"process {name} {how}, {often}: run ended, wheels held")
         restarts_s.append(now_s)
         meanwhile = "wheels held meanwhile" if is_needed else "the survey goes on"
-        return RestartDecision(ProcessEnd.RESTART, f"process {name} {how}: starting it anew, {meanwhile}")
+        return RestartDecision(ProcessEnd.RESTART, f"process {name} {how}: restarting it, {meanwhile}")
 
 
 def _signal(number: int) -> str:
@@ -115,7 +110,7 @@ class SilenceWatch:
     @property
     def text(self) -> str:
         """What is said of one that hangs."""
-        return f"has said nothing for {self._limit_s:g} s and was killed"
+        return f"sent no heartbeat for {self._limit_s:g} s and was killed"
 
 
 # The matrices are 4 x 4: threads of the linear algebra would only fight the processes for the cores.
@@ -123,7 +118,7 @@ ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 STOP_TIMEOUT_S = 4.0
 # Whoever comes last has this long, even where others have used up the time.
 LEAST_STOP_S = 1.0
-# A loop that was started anew joins within this.
+# A loop that was restarted joins within this.
 RECOVERY_S = 5.0
 Notify = Callable[[str, str], None]
 
@@ -166,7 +161,7 @@ class ProcessManager:
     """The processes of one run.
 
     Args:
-        cfg: when one hangs, and how often they are started anew.
+        cfg: when one hangs, and how often they are restarted.
         command_of: command line of a process, and the file descriptors that it inherits; told whether it takes the
             place of another one.
         notify_operator: tells the operator (level, text).
@@ -190,7 +185,7 @@ class ProcessManager:
         return [child.pidfd for child in self._children.values() if child.pidfd >= 0]
 
     def is_recovering(self, now_s: float) -> bool:
-        """Whether one was started anew a short while ago."""
+        """Whether one was restarted a short while ago."""
         return now_s < self._is_recovering_until_s
 
     def start(self, spec: ProcessSpec, *, is_restarted: bool = False) -> None:

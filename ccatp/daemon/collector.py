@@ -1,7 +1,4 @@
-"""Listens to a run from its start to its end: recording, progress, how the mission stands.
-
-Collects a mission among beacons from the bus for its summary.
-"""
+"""Receives a run's messages from start to end: recording, progress, mission status, summary."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence

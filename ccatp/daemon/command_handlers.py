@@ -1,6 +1,6 @@
-"""Answers the operator channel: each command is answered after it took effect or was refused.
+"""Handlers of the operator channel and of the observatory channel (unix socket, and TCP for listed clients).
 
-Answers the observatory: at the unix socket, and over TCP for those who are listed.
+A command is answered after it took effect or was refused.
 """
 
 import asyncio

@@ -1,8 +1,7 @@
-"""The danger-loop process: judges every sensors frame, gives the robot its permit and main its verdict.
+"""The danger-loop process: judges every sensors frame and publishes permit and verdict.
 
-What a danger loop has to judge by the configuration of its run: a survey, or a mission among beacons.
-
-The latch of emergencies in a file: a danger loop that is started anew knows what the last one was told.
+The safety monitor follows from the configuration. The emergency latch is kept in a file, so that a restarted process
+has the emergencies of the one before.
 """
 
 import asyncio
@@ -24,7 +23,6 @@ from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.models import Config, LinkConfig, ObservatoryConfig
 from ccatp.core import EmergencyKind, EventCode, Severity, Verdict
 from ccatp.daemon import realtime
-from ccatp.daemon import realtime as spinning
 from ccatp.daemon.command_handlers import EmergencyCommandHandler, EmergencyReceiver, ObservatoryServer
 from ccatp.daemon.process import (
     BeaconArgs,
@@ -32,14 +30,13 @@ from ccatp.daemon.process import (
     die_with_parent,
     open_log,
     parse_either,
-    report,
-    stop_on_signals,
+    run_process,
     unless_stopped,
 )
 from ccatp.daemon.robot_session import LatenessStatistics, ReconnectingRobotLink
 from ccatp.daemon.subscribers import PERIOD_S, EstimateSubscriber, HeartbeatPublisher
 from ccatp.danger import DangerMonitor
-from ccatp.errors import CcatpError
+from ccatp.errors import ExitStatus
 from ccatp.links.beacon_messages import decode_beacon_frame
 from ccatp.links.bus import Publisher
 from ccatp.links.robot_codec import BadLine
@@ -210,7 +207,7 @@ WAIT_PERIOD_S = 0.02
 class DangerLoop:
     """Wires the monitor to the robot link, the bus and the observatory channel.
 
-    A process that is started anew finds the latch as it was.
+    A process that is restarted finds the latch as it was.
     """
 
     def __init__(self, args: ProcessArgs | BeaconArgs, context: zmq.Context[zmq.Socket[bytes]]) -> None:
@@ -371,32 +368,22 @@ class DangerLoop:
         self._publisher.close()
 
 
-async def run(args: ProcessArgs | BeaconArgs) -> int:
-    """The process, from its arguments to its exit status."""
-    stop = asyncio.Event()
-    stop_on_signals(stop)
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    loop: DangerLoop | None = None
-    status = 0
-    try:
-        loop = DangerLoop(args, context)
-        await loop.run(stop)
-    except* CcatpError as group:
-        status = report("danger", group)
-    finally:
-        if loop is not None:
-            loop.close()
-        context.destroy(linger=0)
-    return status or (0 if stop.is_set() else 4)
-
-
 def main() -> int:
     """Entry of ``python -m ccatp.daemon.danger_loop``."""
     die_with_parent()
     args = parse_either()
     if not args.is_realtime:
-        spinning.leave_a_core(os.getppid())
-    return spinning.run(run(args.one), is_spinning=not args.is_realtime)
+        realtime.leave_a_core(os.getppid())
+
+    async def serve(context: zmq.Context[zmq.Socket[bytes]], stop: asyncio.Event) -> int:
+        loop = DangerLoop(args.one, context)
+        try:
+            await loop.run(stop)
+        finally:
+            loop.close()
+        return 0 if stop.is_set() else int(ExitStatus.HELD)
+
+    return realtime.run(run_process("danger", serve), is_spinning=not args.is_realtime)
 
 
 if __name__ == "__main__":

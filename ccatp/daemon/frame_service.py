@@ -1,9 +1,4 @@
-"""One sensors frame after the other, in the order that lockstep needs: listen, hear, decide, drive.
-
-Tells when the last gate denies a drive, and why: at most one line per reason and second.
-
-The fans that press the robot on: sent once a session, and again when they shall give all they can.
-"""
+"""Serves one sensors frame after the other: estimate, verdict, plan, drive; with the gate's log and the fans."""
 
 import asyncio
 import time
@@ -28,7 +23,7 @@ CATCH_UP_S = 0.5
 
 
 class UnhandledError(CcatpError):
-    """An error that nobody foresaw; the log has it all. The process is started anew."""
+    """An error that nobody foresaw; the log has it all. The process is restarted."""
 
     exit_status = ExitStatus.HELD
 
@@ -117,7 +112,7 @@ class FrameService:
         self._runner.begin_drives()
         if self._clock.has_begun and dt_s > UNSEEN_S and not self._was_at_rest:
             self._telemetry.notify_operator(
-                "warning", f"the robot moved and was out of sight for {dt_s:.2f} s: it is found again"
+                "warning", f"the robot moved and sent no frame for {dt_s:.2f} s: relocalizing"
             )
             self._runner.on_tracking_gap()
 

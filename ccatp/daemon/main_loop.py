@@ -1,4 +1,4 @@
-"""The main-loop process: hosts a mission behind the robot link, the bus and the operator channel."""
+"""The main-loop process: serves a mission's frames between robot link, bus and operator channel."""
 
 import asyncio
 import os
@@ -8,7 +8,6 @@ import zmq
 import zmq.asyncio
 
 from ccatp.daemon import realtime
-from ccatp.daemon import realtime as spinning
 from ccatp.daemon.command_handlers import OperatorCommandHandler
 from ccatp.daemon.frame_service import FrameService
 from ccatp.daemon.mission_runner import MissionClock, RunnerConfig, RunnerContext, RunnerFactory
@@ -19,13 +18,12 @@ from ccatp.daemon.process import (
     die_with_parent,
     open_log,
     parse_either,
-    report,
-    stop_on_signals,
+    run_process,
     unless_stopped,
 )
 from ccatp.daemon.robot_session import ControllerSession, ReconnectingRobotLink
 from ccatp.daemon.subscribers import PERIOD_S, HeartbeatPublisher, VerdictSubscriber
-from ccatp.errors import CcatpError, ConfigError, ExitStatus
+from ccatp.errors import ConfigError, ExitStatus
 from ccatp.links.bus import Publisher
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.rpc import Router
@@ -144,7 +142,7 @@ class MainLoop:
         self._frames.begin_session()
         self._telemetry.notify_operator("info", text)
         if has_booted:
-            self._telemetry.notify_operator("warning", "the robot has started anew: it is found again before it moves")
+            self._telemetry.notify_operator("warning", "the robot restarted: relocalizing before it moves")
             self._verdicts.reset()
             self._telemetry.continue_numbering()
             self._clock.reset()
@@ -158,7 +156,7 @@ class MainLoop:
             return
         self._frames.end_session()
         self._runner.interrupt(f"robot link lost: {reason}")
-        self._telemetry.notify_operator("warning", f"robot link lost: {reason}; joining again")
+        self._telemetry.notify_operator("warning", f"robot link lost: {reason}; reconnecting")
 
     def _fail(self, error: Exception) -> None:
         """End this process, held; who starts it anew is the supervisor's business."""
@@ -240,27 +238,13 @@ class MainLoop:
 
     def status(self) -> MissionStatus:
         """Where the mission stands."""
-        at, lateness = self._runner.progress(), self._frames.lateness
-        return MissionStatus(
-            seq=self._clock.seq,
-            t_s=self._clock.t_s,
-            elapsed_s=round(self._clock.elapsed_s, 6),
-            code=0 if self._verdicts.verdict is None else int(self._verdicts.verdict.code),
-            exit_status=int(self.exit_status) if self.over.is_set() else -1,
-            missed_deadlines=lateness.missed_deadlines,
-            worst_lateness_ms=round(1e3 * lateness.worst_s, 3),
-            state=at.state,
-            cause=at.cause,
-            done=at.done,
-            skipped=at.skipped,
-            total=at.total,
-            point=at.point,
-            eta_s=round(at.eta_s, 3),
-            error_mm=at.error_mm,
-            outcome=at.outcome,
-            lower_bound_s=at.lower_bound_s,
-            left_out=dict(at.left_out),
-        )
+        status, lateness = self._runner.status(), self._frames.lateness
+        status.elapsed_s = round(self._clock.elapsed_s, 6)
+        status.code = 0 if self._verdicts.verdict is None else int(self._verdicts.verdict.code)
+        status.exit_status = int(self.exit_status) if self.over.is_set() else -1
+        status.missed_deadlines = lateness.missed_deadlines
+        status.worst_lateness_ms = round(1e3 * lateness.worst_s, 3)
+        return status
 
 
 def open_runner(args: EitherArgs) -> tuple[RunnerConfig, AbstractContextManager[RunnerFactory]]:
@@ -277,34 +261,27 @@ def open_runner(args: EitherArgs) -> tuple[RunnerConfig, AbstractContextManager[
     return beacon_runner_config(args.one_of_beacons.config), open_beacons(args.one_of_beacons)
 
 
-async def run(args: EitherArgs, core: int | None) -> int:
-    """The process, from its arguments to its exit status; ``core`` is for the main thread alone."""
-    stop = asyncio.Event()
-    stop_on_signals(stop)
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    status = 0
-    loop: MainLoop | None = None
-    try:
-        cfg, opening = open_runner(args)
-        with opening as make_runner:
-            loop = MainLoop(args.one, context, cfg, make_runner)
-            spinning.take_core(core)  # now that the threads of ZeroMQ and of the store have been started elsewhere
-            await loop.run(stop)
-    except* CcatpError as group:
-        status = report("main", group)
-    finally:
-        if loop is not None:
-            loop.close()
-        context.destroy(linger=0)
-    return status or int(loop.exit_status if loop is not None else ExitStatus.HELD)
-
-
 def main() -> int:
     """Entry of ``python -m ccatp.daemon.main_loop``."""
     die_with_parent()
     args = parse_either()
-    core = None if args.is_realtime else spinning.leave_a_core(os.getppid())
-    return spinning.run(run(args, core), is_spinning=not args.is_realtime)
+    # The core is for the main thread alone.
+    core = None if args.is_realtime else realtime.leave_a_core(os.getppid())
+
+    async def serve(context: zmq.Context[zmq.Socket[bytes]], stop: asyncio.Event) -> int:
+        cfg, opening = open_runner(args)
+        loop: MainLoop | None = None
+        try:
+            with opening as make_runner:
+                loop = MainLoop(args.one, context, cfg, make_runner)
+                realtime.take_core(core)  # now that the threads of ZeroMQ and of the store have been started elsewhere
+                await loop.run(stop)
+        finally:
+            if loop is not None:  # last, so that the last messages leave while the store commits
+                loop.close()
+        return int(loop.exit_status)
+
+    return realtime.run(run_process("main", serve), is_spinning=not args.is_realtime)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,10 @@
-"""What a mission is to the main-loop process that hosts it: frames in, drives out, verdicts, commands, topics.
+"""The interface between the main-loop process and the mission that it runs, and the clock of the frames.
 
-The process keeps the links, the clock, the command of things and the end; the mission keeps everything that depends on
-what it is good for. A new kind of mission is a class with these methods and a row where missions are chosen.
-
-The time of the frames that a main loop serves: steady, from the first one on, over boots of the robot.
+The process keeps links, clock, order and end; the mission keeps everything that depends on its kind. A new kind of
+mission is a class with these methods and a row in ``main_loop.open_runner``.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -20,6 +18,7 @@ from ccatp.daemon.telemetry import TelemetryPublisher
 from ccatp.errors import ExitStatus
 from ccatp.links.bus import Publisher
 from ccatp.links.robot_messages import Hello, Sensors
+from ccatp.links.topics import MissionStatus
 from ccatp.safety.robot_clock import SteadyTime
 
 
@@ -126,22 +125,6 @@ class DriveCommand(NamedTuple):
 STILL = DriveCommand(0.0, 0.0)
 
 
-class Progress(NamedTuple):
-    """How far a mission is, as ``MissionStatus`` tells it."""
-
-    state: str
-    cause: str
-    done: int
-    skipped: int
-    total: int
-    point: str
-    eta_s: float
-    error_mm: float
-    outcome: str
-    lower_bound_s: float
-    left_out: Mapping[str, list[str]]
-
-
 class CommandHandler(Protocol):
     """Takes the commands of an operator; each returns why it was refused, or ``None``."""
 
@@ -200,8 +183,8 @@ class MissionRunner(CommandHandler, Protocol):
     def is_at_rest(self) -> bool:
         """The robot is at rest."""
 
-    def progress(self) -> Progress:
-        """How far it is."""
+    def status(self) -> MissionStatus:
+        """Progress of the mission; the process adds times, verdict code, lateness and exit status."""
 
     # -- beside the frames ----------------------------------------------------------------------------------------
 

@@ -1,9 +1,7 @@
-"""The agent of the observatory control system (extra ``ocs``): surveys as its process, orders as its tasks.
+"""The agent of the observatory control system (extra ``ocs``): surveys as its process, commands as its tasks.
 
-What the agent of the observatory control system does, without its framework.
-
-A survey is a process of its own, started here or by somebody else (systemd, an operator); this side asks it and follows
-it. When the agent dies the survey goes on, and an agent that is started anew follows it again.
+A survey is a process of its own, started here or elsewhere (systemd, an operator); the agent follows it by the operator
+channel. A survey outlives its agent, and a restarted agent follows it again.
 """
 
 import argparse

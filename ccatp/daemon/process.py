@@ -1,6 +1,6 @@
-"""What every process does at its start: arguments, log file, dying with its parent, orderly signals.
+"""What every process does at its start: arguments, log file, end with its parent, signals.
 
-The log file as something that never fails: what the disk does not take is dropped and counted.
+Writing a log line never fails: what the disk does not take is dropped and counted.
 """
 
 import argparse
@@ -10,13 +10,14 @@ import io
 import os
 import signal
 import sys
-from collections.abc import Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TextIO, TypeVar, cast
 
 import structlog
+import zmq
 
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.load import is_radio_file, load_config, load_radio_config
@@ -239,6 +240,27 @@ async def unless_stopped(stop: asyncio.Event, work: Coroutine[Any, Any, None]) -
         working.cancel()
         stopping.cancel()
         await asyncio.gather(working, stopping, return_exceptions=True)
+
+
+async def run_process(
+    name: str, serve: Callable[["zmq.Context[zmq.Socket[bytes]]", asyncio.Event], Awaitable[int]]
+) -> int:
+    """Run ``serve(context, stop)`` to its end; ``stop`` is set by SIGTERM and SIGINT.
+
+    Returns:
+        Its exit status, or that of the gravest error that ended it, which is printed.
+    """
+    stop = asyncio.Event()
+    stop_on_signals(stop)
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    status = 0
+    try:
+        status = await serve(context, stop)
+    except* CcatpError as group:
+        status = report(name, group)
+    finally:
+        context.destroy(linger=0)
+    return status
 
 
 def report(process: str, group: BaseExceptionGroup[CcatpError]) -> int:

@@ -1,13 +1,11 @@
-"""Real-time scheduling and locked memory for the loops, where the system permits it.
+"""Real-time scheduling and locked memory, and the busy-polling event loop of lockstep.
 
-The bounds on reaction times hold under load only with it: a loop that shares its core with others waits for its turn,
-and a page that was swapped out waits for the disk. Only for robots that go by the wall clock: in
-lockstep the loops spin.
+The bounds on reaction times hold under load only with real-time scheduling: a loop that shares its core waits for its
+turn, and a page that was swapped out waits for the disk. It is for robots that go by the wall clock.
 
-How lockstep gets its speed: an event loop that spins politely before it sleeps, and a core for main alone.
-
-In lockstep a peer answers within microseconds, and a frame passes five doors between processes. Waking a sleeping
-process costs some 30 microseconds, and a process that takes turns with others on one core computes at half its speed.
+In lockstep a peer answers within microseconds and a frame passes five sockets between processes. Waking a sleeping
+process costs some 30 microseconds, and two processes that take turns on one core run at half speed: so the loop polls
+before it sleeps, and main has a core for itself.
 """
 
 import asyncio

@@ -1,11 +1,4 @@
-"""A link to the robot that lasts: joined, lost, joined again, until the robot stays away for too long.
-
-The controller's seat at the robot: the session, its numbers, its clock.
-
-The drives of a differential drive on their way: what will come of them, and what main had the wheels do.
-
-How late frames are served: what a blocked event loop, a busy machine or a slow link costs.
-"""
+"""The controller's session at the robot: reconnecting link, numbered commands, command history, lateness of frames."""
 
 import asyncio
 import random
@@ -112,7 +105,7 @@ class ReconnectingRobotLink:
         elif self._failures:
             await asyncio.sleep(delay_s(self._failures, random.random()))
         self._failures += 1
-        why: DaemonUnreachableError | str = "it lets join, and sends no frame that is one"
+        why: DaemonUnreachableError | str = "it accepts the session and sends no valid frame"
         while (left_s := self._deadline_s - loop.time()) > 0.0:
             self._lost.clear()
             self.link = self._make()
@@ -177,7 +170,7 @@ class ControllerSession:
         return f"joined the robot at {where}{'' if before is None else ' again'}"
 
     def has_rebooted(self, hello: Hello) -> bool:
-        """Whether the robot has started anew since the last session; to be asked before ``begin``."""
+        """Whether the robot has restarted since the last session; to be asked before ``begin``."""
         return self._hello is not None and self._hello.boot != hello.boot
 
     @property

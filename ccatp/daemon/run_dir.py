@@ -1,9 +1,4 @@
-"""The folders of a run: its own, made or taken up again, and that of its sockets; each for one daemon alone.
-
-The run that has not finished, by name: what a service that is started again goes on with.
-
-What ``ccatp run`` was asked to do.
-"""
+"""Run directory and runtime directory, each locked by one daemon; the resumable run; the options of ``ccatp run``."""
 
 import json
 import os

@@ -1,7 +1,4 @@
-"""The daemon as a service: ready when the loops have joined, the watchdog stroked while all is well, an end.
-
-Tells the service manager how the daemon fares: the datagrams of ``sd_notify(3)``.
-"""
+"""The daemon as a systemd service: readiness, watchdog and status by the datagrams of ``sd_notify(3)``."""
 
 import contextlib
 import os

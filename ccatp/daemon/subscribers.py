@@ -1,7 +1,4 @@
-"""What a loop hears of the other one: that it is there, and in lockstep what it has to wait for.
-
-A process is seen alive: its heartbeat on the bus, also while it waits for another one.
-"""
+"""Heartbeats, and what each loop receives of the other one; in lockstep it waits for the message of its frame."""
 
 import os
 import time

@@ -1,9 +1,4 @@
-"""THE process table: what runs, in which order it starts and stops; and how a run of it begins.
-
-What differs between a survey and a mission among beacons for the supervisor that runs it.
-
-One run from the start of its children to its summary.
-"""
+"""THE process table, and one run of it: start of the children, supervision, summary."""
 
 import json
 import os
@@ -11,13 +6,13 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 import zmq
 
@@ -61,72 +56,50 @@ from ccatp.records.recorder import RUN_LOCK
 from ccatp.report.dashboard.access import read_token
 
 
-class MissionType(Protocol):
-    """One kind of run."""
+class MissionType(NamedTuple):
+    """What differs between the kinds of missions.
 
-    @property
-    def rows(self) -> tuple[ProcessSpec, ...]:
-        """Of the process table."""
-
-    @property
-    def processes(self) -> ProcessesConfig:
-        """When one hangs, and how often they are started anew."""
-
-    @property
-    def facts(self) -> dict[str, object]:
-        """Of the run, for the log."""
-
-    def collector(self, access: RunAccess) -> Collector:
-        """Who listens to it."""
-
-    def view(self, run_dir: Path) -> RunView:
-        """Who shows it."""
-
-
-class SurveyType:
-    """The survey of a mirror.
-
-    Args:
-        is_sim: robot and laser system are stand-ins.
+    Attributes:
+        rows: of the process table.
+        processes: time-outs and restart limits.
+        facts: of the run, for the log.
+        make_view: given the run directory.
     """
 
-    def __init__(self, cfg: Config, rows: tuple[ProcessSpec, ...], *, is_sim: bool) -> None:
-        self._cfg, self._is_sim = cfg, is_sim
-        self.rows, self.processes = rows, cfg.run
-        self.facts: dict[str, object] = {"mirror": cfg.mirror.name, "seed": cfg.run.seed, "sim": is_sim}
-
-    def collector(self, access: RunAccess) -> Collector:
-        """Who listens to it."""
-        return RunCollector(access, self._cfg)
-
-    def view(self, run_dir: Path) -> RunView:
-        """Who shows it."""
-        return RunView(survey_title(self._cfg, is_sim=self._is_sim), is_sim=self._is_sim, run_dir=run_dir)
+    rows: tuple[ProcessSpec, ...]
+    processes: ProcessesConfig
+    facts: dict[str, object]
+    make_collector: Callable[[RunAccess], Collector]
+    make_view: Callable[[Path], RunView]
 
 
-class BeaconType:
-    """A mission among beacons."""
+def survey_type(cfg: Config, *, is_sim: bool) -> MissionType:
+    """The survey of a mirror, simulated or real."""
+    title = survey_title(cfg, is_sim=is_sim)
+    return MissionType(
+        PROCESSES,
+        cfg.run,
+        {"mirror": cfg.mirror.name, "seed": cfg.run.seed, "sim": is_sim},
+        lambda access: RunCollector(access, cfg),
+        lambda run_dir: RunView(title, is_sim=is_sim, run_dir=run_dir),
+    )
 
-    def __init__(self, cfg: RadioConfig, rows: tuple[ProcessSpec, ...], *, is_sim: bool) -> None:
-        self._cfg, self._is_sim = cfg, is_sim
-        self.rows, self.processes = rows, cfg.processes
-        self.facts: dict[str, object] = {"system": cfg.system, "seed": cfg.run.seed, "sim": is_sim}
 
-    def collector(self, access: RunAccess) -> Collector:
-        """Who listens to it."""
-        # A survey starts a fifth of a second sooner without the statistics that come along.
-        from ccatp.daemon.collector import BeaconCollector  # noqa: PLC0415
+def beacon_type(cfg: RadioConfig, *, is_sim: bool) -> MissionType:
+    """A mission among beacons, simulated or real."""
+    # A survey starts a fifth of a second sooner without the statistics that come along.
+    from ccatp.daemon.collector import BeaconCollector  # noqa: PLC0415
 
-        return BeaconCollector(access, self._cfg)
-
-    def view(self, run_dir: Path) -> RunView:
-        """Who shows it."""
-        cfg = self._cfg
-        what = "follow a radio" if cfg.follow.is_active else "visit waypoints"
-        seed = f", seed {cfg.run.seed}" if self._is_sim else ""
-        title = f"ccatp {'SIMULATION' if self._is_sim else 'mission'} among beacons: {cfg.system}, {what}{seed}"
-        goals = "seconds" if cfg.follow.is_active else "waypoints"
-        return BeaconRunView(title, is_sim=self._is_sim, run_dir=run_dir, goals=goals)
+    what, goals = ("follow a radio", "seconds") if cfg.follow.is_active else ("visit waypoints", "waypoints")
+    seed = f", seed {cfg.run.seed}" if is_sim else ""
+    title = f"ccatp {'SIMULATION' if is_sim else 'mission'} among beacons: {cfg.system}, {what}{seed}"
+    return MissionType(
+        BEACON_PROCESSES,
+        cfg.processes,
+        {"system": cfg.system, "seed": cfg.run.seed, "sim": is_sim},
+        lambda access: BeaconCollector(access, cfg),
+        lambda run_dir: BeaconRunView(title, is_sim=is_sim, run_dir=run_dir, goals=goals),
+    )
 
 
 POLL_MS = 20
@@ -166,8 +139,8 @@ class SupervisedRun:
         # A flag and no exception: a signal must not be lost in somebody's handler of exceptions, nor end the ending.
         previous = {n: signal.signal(n, self._interrupt) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
         access = RunAccess(context, self._endpoints, self._run_dir, self._options.sim, self._on_heartbeat)
-        collector = self._mission_type.collector(access)
-        self._view = view = self._mission_type.view(self._run_dir)
+        collector = self._mission_type.make_collector(access)
+        self._view = view = self._mission_type.make_view(self._run_dir)
         try:
             with collector, view:
                 status = self._watch(collector, view)
@@ -307,7 +280,9 @@ def run_beacons(options: RunOptions) -> int:
     """Run one mission among beacons to its end; arguments, status and errors as of ``run_survey``."""
     if options.resume or options.recover:
         flag = "--resume" if options.resume else "--resume-last"
-        raise ConfigError(f"{flag}: a mission among beacons has nothing to go on with, its map is not kept; begin anew")
+        raise ConfigError(
+            f"{flag}: a mission among beacons has nothing to go on with, its map is not kept; start a new one"
+        )
     if options.faults_file is not None:
         raise ConfigError("--faults: plans are for surveys; sim.incidents of the configuration holds those of beacons")
     cfg = load_radio_config(options.config_file, dict(options.overrides))
@@ -332,7 +307,7 @@ def run_beacons(options: RunOptions) -> int:
         stack.enter_context(owned(run_dir / RUN_LOCK, "--run-dir"))
         (run_dir / "config.toml").write_text(dump_radio_config(cfg), encoding="utf-8")
         (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
-        mission_type = BeaconType(cfg, BEACON_PROCESSES, is_sim=options.sim)
+        mission_type = beacon_type(cfg, is_sim=options.sim)
         return SupervisedRun(options, mission_type, run_dir, Endpoints(runtime_dir), sockets, page, started).run()
 
 
@@ -373,7 +348,7 @@ def run_survey(options: RunOptions) -> int:
         (runtime_dir / RUN_DIR_FILE).write_text(f"{run_dir}\n", encoding="utf-8")
         if options.faults_file is not None:
             (run_dir / FAULTS_FILE).write_bytes(options.faults_file.read_bytes())
-        mission_type = SurveyType(cfg, PROCESSES, is_sim=options.sim)
+        mission_type = survey_type(cfg, is_sim=options.sim)
         return SupervisedRun(options, mission_type, run_dir, Endpoints(runtime_dir), sockets, page, started).run()
 
 

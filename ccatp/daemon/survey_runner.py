@@ -1,7 +1,4 @@
-"""The survey of a mirror in the main-loop process: localizer, mission, gate, laser system, fans, store.
-
-What operators are told of a survey's states, and who looks after one that is held for long.
-"""
+"""The survey of a mirror in the main-loop process: localizer, mission, gate, laser system, fans, store."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +12,6 @@ from ccatp.daemon.frame_service import FanController, GateLog
 from ccatp.daemon.mission_runner import (
     STILL,
     DriveCommand,
-    Progress,
     RunnerConfig,
     RunnerContext,
     RunnerFactory,
@@ -27,7 +23,7 @@ from ccatp.daemon.telemetry import SurveyTelemetry, TelemetryPublisher
 from ccatp.errors import DaemonUnreachableError, ExitStatus
 from ccatp.etalon_client import EtalonClient, EtalonError
 from ccatp.links.robot_messages import Hello, Sensors
-from ccatp.links.topics import is_estimate_due
+from ccatp.links.topics import MissionStatus, is_estimate_due
 from ccatp.records.store import MissionStore
 from ccatp.survey.behaviours import home_time_s
 from ccatp.survey.composition import SurveyParts
@@ -59,7 +55,7 @@ class SurveyWatch:
                 "error", f"held for {held_s:.0f} s, waiting for an operator: {mission.cause}"
             )
         elif call is ReminderCall.RETURN:
-            mission.abort(f"nobody came, and the battery ({sensors.soc:.0%}) lasts for little more than the way home")
+            mission.abort(f"unattended fault: the battery ({sensors.soc:.0%}) lasts for little more than the way home")
 
     def publish_state_change(self, before: MissionState, seq: int) -> None:
         """The mission's state is another one than before, in frame ``seq``."""
@@ -164,25 +160,27 @@ class SurveyRunner:
             and abs(self._localizer.rate_rad_s) <= control.settle_rate_rad_s
         )
 
-    def progress(self) -> Progress:
-        """How far it is."""
+    def status(self) -> MissionStatus:
+        """Progress of the mission."""
         mission = self._mission
         stop = mission.journey.current
         point = stop.point if stop is not None else None
         if mission.is_paused:
             point = mission.survey.next_point
-        return Progress(
+        return MissionStatus(
+            seq=self._clock.seq,
+            t_s=self._clock.t_s,
             state=str(mission.state),
             cause=mission.cause,
             done=len(mission.done) + self._parts.already_done,
             skipped=len(mission.skipped),
             total=self._parts.total_points,
             point=f"{point.row}-{point.col}-{point.point}" if point is not None else "",
-            eta_s=mission.eta_s,
+            eta_s=round(mission.eta_s, 3),
             error_mm=1e3 * self._fix_service.arrival_error_m,
             outcome=str(mission.outcome),
             lower_bound_s=self._parts.lower_bound_s,
-            left_out=by_reason(mission.left_out),
+            left_out=dict(by_reason(mission.left_out)),
         )
 
     # -- beside the frames ----------------------------------------------------------------------------------------

@@ -1,9 +1,4 @@
-"""What the main loop tells of any mission: lines and times in batches, its status, and what operators read.
-
-The newest of everything that a display shows, put together only while somebody looks on.
-
-What the main loop tells of a survey: estimates, arrivals, fixes, how the localizer is treated.
-"""
+"""What the main loop publishes: lines, tracks and times in batches, status, messages, display state, survey events."""
 
 import time
 from collections.abc import Callable

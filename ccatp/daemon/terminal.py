@@ -1,9 +1,4 @@
-"""What a run shows on the terminal: progress where there is one, plain lines where there is none.
-
-The report at the end of a run. It never fails the run, and nobody who asked for the end waits for it.
-
-Where a mission stands, for the terminal: a table, and one line.
-"""
+"""What a run shows on the terminal: progress, messages, summary, status table, and the report at its end."""
 
 import json
 import sys

@@ -1,7 +1,4 @@
-"""Whether a run is alive: both loops are heard of, have joined the robot, and get its frames.
-
-Lines that are said again and again: which are of one kind, and how many of them are told.
-"""
+"""Liveness of a run (both loops publish, have joined the robot, and get its frames), and rate limits of log lines."""
 
 import re
 
@@ -36,10 +33,10 @@ class Liveness:
         for name in LOOPS:
             heartbeat = self._heartbeats.get(name)
             if heartbeat is None:
-                return f"{name} was never heard of"
+                return f"{name} has sent no heartbeat"
             age_s = now_s - heartbeat.t_s
             if age_s > self._stale_after_s:
-                return f"{name} was last heard of {age_s:.1f} s ago"
+                return f"{name} sent its last heartbeat {age_s:.1f} s ago"
             if heartbeat.phase == "joined":
                 if heartbeat.frame_age_s is None:
                     return f"{name} has had no frame from the robot yet"

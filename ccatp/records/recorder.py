@@ -1,15 +1,11 @@
-"""Telemetry of a run as an MCAP file: JSON messages, a JSON schema for every channel.
+"""Telemetry of a run as an MCAP file: JSON messages with a JSON schema for every channel; and its readers.
 
-Chunks are small, none is held back for long, and the file is not buffered, so a ``kill -9`` costs the last moment at
-most; the reader takes a file that ends anywhere. Recording never disturbs a mission: the first write that fails ends
+Chunks are small, none is held back for long, and the file is not buffered, so that a ``kill -9`` costs the last moment
+at most; the reader takes a file that ends anywhere. Recording never disturbs a mission: the first write that fails ends
 it, with one report.
 
-Every intact record of an MCAP file, whatever lies between them: for looking into recordings and saving them.
-
-A chunk carries a checksum, so one that is damaged is known and left out. Where the lengths themselves are damaged, the
-next chunk is found by how it begins, and taken if its checksum is right.
-
-Whether a recording is still being written: then that it has no end yet is no damage.
+``scan`` yields every intact record of a damaged file. A chunk carries a checksum, so a damaged one is left out. Where
+the lengths are damaged, the next chunk is found by how it begins, and taken if its checksum is right.
 """
 
 import json

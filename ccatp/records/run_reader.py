@@ -1,9 +1,4 @@
-"""A run directory as something that can be replayed: each recording with its configuration and its messages.
-
-What happened to the localizer in a run, and in which order.
-
-Poses of a robot, frame by frame.
-"""
+"""Reads a run directory for replay: each recording with its configuration, its events in order, and its poses."""
 
 import tempfile
 from array import array

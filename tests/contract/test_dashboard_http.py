@@ -91,7 +91,7 @@ async def test_what_there_is_not_is_told_as_the_telescope_does(
 async def test_status_and_health(rig: Rig) -> None:
     sick = await rig.ask("GET", "/healthz")
     assert sick.code == 503
-    assert sick.data == {"status": "error", "message": "main was never heard of"}
+    assert sick.data == {"status": "error", "message": "main has sent no heartbeat"}
     well = await rig.until("/healthz", lambda reply: reply.code == 200)
     assert well.data == {"status": "ok"}
     status = (await rig.until("/status", lambda reply: reply.data["pose"] is not None)).data

@@ -86,7 +86,7 @@ def processes() -> str:
     lines = ["| process | module | runs | when it dies |", "|---|---|---|---|"]
     for process in PROCESSES:
         runs = "with `--sim`" if process.is_simulator else "always"
-        dies = "started anew" if process.is_replaceable else "the run ends, held"
+        dies = "restarted" if process.is_replaceable else "the run ends, held"
         lines.append(f"| {process.name} | `{process.module}` | {runs} | {dies} |")
     return "\n".join(lines)
 

@@ -215,7 +215,7 @@ def test_after_a_restart_with_nothing_latched_the_first_emergency_is_new(story: 
 
 @pytest.mark.fault("O1", "O7")
 def test_what_was_latched_before_the_start_is_waited_for_at_base(story: Story) -> None:
-    story.mission.pause("started anew")
+    story.mission.pause("restarted")
     story.mission.know_emergency()
     for _ in range(50):
         story.frame(emergency(4))

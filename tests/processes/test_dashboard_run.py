@@ -74,7 +74,7 @@ def dashboard_of(run: Run, not_pid: int = 0) -> psutil.Process:
     raise AssertionError("no dashboard")
 
 
-def test_it_dies_and_is_started_anew_while_the_survey_goes_on(start: Start) -> None:
+def test_it_dies_and_is_restarted_while_the_survey_goes_on(start: Start) -> None:
     run = start("--panels", "1", "--realtime", *WITH_PAGE)
     run.until(lambda status: status["state"] == "driving")
     port = page_port(run)
@@ -92,7 +92,7 @@ def test_it_dies_and_is_started_anew_while_the_survey_goes_on(start: Start) -> N
     code, _ = ask(port, "POST", "/stop")
     assert code == 200
     assert run.wait() == 4
-    assert "process dashboard was killed by SIGKILL: starting it anew, the survey goes on" in run.stderr
+    assert "process dashboard was killed by SIGKILL: restarting it, the survey goes on" in run.stderr
     assert "Traceback" not in run.stderr
 
 

@@ -50,7 +50,7 @@ def test_a_survey_goes_on_through_resets_of_the_link_and_a_reboot_of_the_robot(s
     run = start("--panels", "1", *NO_CALIBRATION, "--faults", str(plan))
     assert run.wait() == 0, run.stderr
     assert run.stderr.count("robot link lost") >= 3
-    assert "the robot has started anew: it is found again before it moves" in run.stderr
+    assert "the robot restarted: relocalizing before it moves" in run.stderr
     assert "Traceback" not in run.stderr
     points = {"total": 9, "measured": 9, "first_arrival_within_10mm": 9, "skipped": 0}
     assert run.summary["points"] == points

@@ -104,7 +104,7 @@ def test_a_main_loop_that_hangs_is_killed_and_another_one_goes_on(start: Start) 
     pid, _ = send(run, "main", signal.SIGSTOP)
     until_another(run, "main", pid)
     assert run.wait() == 0, run.stderr
-    assert "process main has said nothing for 2 s and was killed: starting it anew" in run.stderr
+    assert "process main sent no heartbeat for 2 s and was killed: restarting it" in run.stderr
     assert run.summary["points"]["measured"] == 9
 
 
@@ -190,7 +190,7 @@ def begun(start: Start, tmp_path: Path) -> Iterator[Callable[..., Run]]:
 
 
 @pytest.mark.fault("P4", "P5", "P17")
-def test_a_service_that_is_started_anew_waits_for_an_operator(
+def test_a_service_that_is_restarted_waits_for_an_operator(
     start: Start, begun: Callable[..., Run], measured: Measured
 ) -> None:
     run = start("--panels", "1", *NO_CALIBRATION)
@@ -207,9 +207,7 @@ def test_a_service_that_is_started_anew_waits_for_an_operator(
     measured("P4", time.monotonic() - again_s)
     assert status["state"] == "held"
     assert status["done"] == done
-    text = (
-        f"started anew: {done} points are measured and will be left out, {9 - done} are to do; 'ccatp resume' goes on"
-    )
+    text = f"restarted: {done} points are measured and will be left out, {9 - done} are to do; 'ccatp resume' goes on"
     assert status["cause"].startswith(text)
     assert status["point"]
     time.sleep(0.3)

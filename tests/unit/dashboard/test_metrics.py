@@ -16,7 +16,7 @@ from tests.unit.dashboard.prometheus import parse
 
 GROUND: dict[str, Any] = {"title": "fyst-m1", "states": [str(state) for state in MissionState]}
 NOTHING: dict[str, Any] = {
-    "is_sim": False, "trouble": "main was never heard of", "links": [], "restarts": {"main": 0, "danger": 2},
+    "is_sim": False, "trouble": "main has sent no heartbeat", "links": [], "restarts": {"main": 0, "danger": 2},
     "mission": None, "verdict": None, "robot": None, "pose": None,
 }  # fmt: skip
 ALL: dict[str, Any] = NOTHING | {

@@ -34,7 +34,7 @@ def whats(links: Links, now_s: float) -> list[str]:
 def test_before_anybody_spoke_nothing_is_lost_but_it_is_not_well() -> None:
     links = Links()
     assert links.losses(10.0) == []
-    assert links.trouble(10.0) == "main was never heard of"
+    assert links.trouble(10.0) == "main has sent no heartbeat"
     assert [link.phase for link in links.shown(10.0)] == [
         "no heartbeat yet",
         "no heartbeat yet",

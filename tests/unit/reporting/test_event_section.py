@@ -15,7 +15,7 @@ def line(text: str, level: str = "warning", t_s: float | None = 1.0, process: st
 
 LATE = [line(f"late frame: lag {0.05 + 0.001 * k:.3f} s, limit 0.05 s", t_s=1.0 * k) for k in range(300)]
 GRAVE = (
-    line("process main was killed by SIGKILL: starting it anew, wheels held meanwhile", t_s=None, process="supervisor"),
+    line("process main was killed by SIGKILL: restarting it, wheels held meanwhile", t_s=None, process="supervisor"),
     line("operator: abort", level="info", t_s=350.0),
     line("held for 30 s, waiting for an operator: stuck", level="error", t_s=360.0),
 )

@@ -79,7 +79,7 @@ def test_a_main_loop_that_died_leaves_a_wait(record: RunRecord) -> None:
     assert [spell.duration_s for spell in spells] == pytest.approx([1.0, 2.0, 0.1])
 
 
-def started_anew(session: RecordedSession) -> tuple[MissionStatus, ...]:
+def restarted(session: RecordedSession) -> tuple[MissionStatus, ...]:
     """Main was gone from 3 s to 7 s of robot time; its successor speaks first before it has seen a frame."""
     first = session.statuses[0]
     told = [(100, 1.0, 1.0, "driving"), (300, 3.0, 3.0, "driving"), (-1, 0.0, 3.0, "idle"), (710, 7.1, 3.1, "settling")]
@@ -89,15 +89,15 @@ def started_anew(session: RecordedSession) -> tuple[MissionStatus, ...]:
     )
 
 
-def test_what_passed_while_main_was_started_anew_is_a_row(record: RunRecord) -> None:
+def test_what_passed_while_main_was_restarted_is_a_row(record: RunRecord) -> None:
     session = only(record)
     changes = said((100, "idle", "driving"), (690, "idle", "settling"), (710, "settling", "done"))
-    found = time_budget(replace(record, sessions=(replace(session, changes=changes, statuses=started_anew(session)),)))
+    found = time_budget(replace(record, sessions=(replace(session, changes=changes, statuses=restarted(session)),)))
     assert found is not None
     assert found.spent_s["start anew"] == pytest.approx(4.0)
     assert found.mission_s == pytest.approx(found.total_s - 4.0)
     assert found.total_s == pytest.approx(7.1)
-    sampled = sampled_spells(replace(session, statuses=started_anew(session)))
+    sampled = sampled_spells(replace(session, statuses=restarted(session)))
     assert [(spell.state, round(spell.duration_s, 6)) for spell in sampled] == [
         ("driving", 2.0), ("driving", 0.1), ("start anew", 4.0),
     ]  # fmt: skip

@@ -31,13 +31,13 @@ def run_until_told(children: ProcessManager, said: list[str], lines: int) -> obj
 
 
 @pytest.mark.usefixtures("child")
-def test_it_is_started_anew_and_then_done_without(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_is_restarted_and_then_done_without(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     monkeypatch.setenv("STATUS", "1")
     children = ProcessManager(config.run, lambda _spec, _is_restarted: ([], ()), lambda _level, text: said.append(text))
     children.start(SPEC)
     assert run_until_told(children, said, config.run.restart_limit + 1) is None
-    assert said[0] == "process page ended with status 1: starting it anew, the survey goes on"
+    assert said[0] == "process page ended with status 1: restarting it, the survey goes on"
     assert said[-1].endswith("more than 3 times within 60 s: the survey goes on without it")
     assert children.fds == []
     assert children.poll(time.monotonic()) is None

@@ -1,4 +1,4 @@
-"""Whether a process that died, or hangs, is started anew."""
+"""Whether a process that died, or hangs, is restarted."""
 
 import pytest
 
@@ -55,7 +55,7 @@ def test_a_start_may_take_longer() -> None:
     watch = SilenceWatch(1.0, 0.3)
     assert not any(watch.is_hung(0.1 * k) for k in range(10))
     assert watch.is_hung(1.1)
-    assert watch.text == "has said nothing for 1 s and was killed"
+    assert watch.text == "sent no heartbeat for 1 s and was killed"
 
 
 def test_a_run_goes_on_without_what_it_does_not_need() -> None:
@@ -63,7 +63,7 @@ def test_a_run_goes_on_without_what_it_does_not_need() -> None:
     again = policy.died("dashboard", -9, 0.0, is_needed=False)
     assert again == (
         ProcessEnd.RESTART,
-        "process dashboard was killed by SIGKILL: starting it anew, the survey goes on",
+        "process dashboard was killed by SIGKILL: restarting it, the survey goes on",
     )
     assert policy.died("dashboard", -9, 1.0, is_needed=False).end is ProcessEnd.WITHOUT
     assert policy.died("dashboard", 2, 99.0, is_needed=False).end is ProcessEnd.WITHOUT

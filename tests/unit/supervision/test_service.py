@@ -112,12 +112,12 @@ def test_both_loops_must_have_joined() -> None:
     ("main", "danger", "trouble"),
     [
         (presence("main", 9.5), presence("danger", 9.5), ""),
-        (presence("main", 8.9), presence("danger", 9.5), "main was last heard of 1.1 s ago"),
-        (presence("main", 9.5), presence("danger", 8.0), "danger was last heard of 2.0 s ago"),
+        (presence("main", 8.9), presence("danger", 9.5), "main sent its last heartbeat 1.1 s ago"),
+        (presence("main", 9.5), presence("danger", 8.0), "danger sent its last heartbeat 2.0 s ago"),
         (presence("main", 9.5, frame_age_s=0.6), presence("danger", 9.5), "main had its last frame .* 1.1 s ago"),
         (presence("main", 9.5), presence("danger", 9.5, frame_age_s=None), "danger has had no frame .*"),
         (presence("main", 9.5, "done", 7.0), presence("danger", 9.5), ""),
-        (presence("main", 9.5), None, "danger was never heard of"),
+        (presence("main", 9.5), None, "danger has sent no heartbeat"),
     ],
 )
 def test_trouble(main: Heartbeat, danger: Heartbeat | None, trouble: str) -> None:
@@ -150,7 +150,7 @@ def test_a_service_from_its_start_to_its_end(manager: tuple[Manager, str]) -> No
     service.on_heartbeat(presence("main", 6.0))  # danger was last heard of at 3.2 s
     service.update(6.0, NO_STATUS)
     service.update(6.6, NO_STATUS)
-    assert ear.heard() == ["STATUS=trouble: danger was last heard of 2.8 s ago"]
+    assert ear.heard() == ["STATUS=trouble: danger sent its last heartbeat 2.8 s ago"]
     for name in ("main", "danger"):
         service.on_heartbeat(presence(name, 6.7))
     service.update(6.7, NO_STATUS)
@@ -168,7 +168,7 @@ def test_silence_counts_well_before_a_short_watchdog_bites(manager: tuple[Manage
     service.update(0.19, None)
     service.update(0.3, None)
     assert ear.heard() == [
-        "READY=1", "WATCHDOG=1", "STATUS=joined the robot", "STATUS=trouble: main was last heard of 0.3 s ago"
+        "READY=1", "WATCHDOG=1", "STATUS=joined the robot", "STATUS=trouble: main sent its last heartbeat 0.3 s ago"
     ]  # fmt: skip
 
 
@@ -335,7 +335,7 @@ def test_the_unit_grants_what_the_loops_ask_for() -> None:
     assert found["RestrictRealtime"] == ["no"]
     assert found["RuntimeDirectoryMode"] == ["0700"]
     assert "--runtime-dir /run/ccatp" in found["ExecStart"][0]
-    # What is started anew begins held.
+    # What is restarted begins held.
     assert "--resume-last" in found["ExecStart"][0]
     assert found["Restart"] == ["on-failure"]
     assert found["RestartPreventExitStatus"] == ["1 2 4"]
