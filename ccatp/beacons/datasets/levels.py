@@ -1,23 +1,23 @@
-"""Levels by distance or by place: CSV, sheets of a workbook, and folders of XBee logs ("Node A: -56").
-
-Sheets of an .xlsx workbook as rows of text, by the standard library alone (ECMA-376 part 1).
-"""
+"""Signal strengths by distance or by place: CSV, sheets of a workbook, and folders of XBee logs ("Node A: -56")."""
 
 import csv
 import re
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree import ElementTree as ET
 
 from ccatp.beacons.datasets.tables import RadioDataError, read_text
 from ccatp.beacons.slam.path_loss import LevelPair
 
-_MAIN = "{http://schemas.openxmlformats.org/spreadsheetml/2006/main}"
-_RELATION = "{http://schemas.openxmlformats.org/officeDocument/2006/relationships}id"
-_LARGEST_PART = 50_000_000  # bytes: a table that people measured is smaller, a bomb is not
-_CELL = re.compile(r"([A-Z]{1,3})\d+")
+_LARGEST_PART = 50_000_000  # bytes: a table that people measured is smaller, a decompression bomb is not
+
+# What zipfile, zlib, the XML parser and openpyxl raise on damaged files.
+_DAMAGE = (
+    OSError, EOFError, LookupError, NotImplementedError, RuntimeError, SyntaxError, TypeError, ValueError,
+    zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 
 Sheets = dict[str, list[list[str]]]
 
@@ -28,71 +28,31 @@ def read_workbook(file: Path) -> Sheets:
     Raises:
         RadioDataError: it is missing or no workbook.
     """
+    from openpyxl import load_workbook  # noqa: PLC0415 - the other formats do not wait for it
+
     try:
         with zipfile.ZipFile(file) as archive:
-            shared = _shared_text(file, archive)
-            targets = {r.get("Id"): r.get("Target") or "" for r in _part(file, archive, "xl/_rels/workbook.xml.rels")}
-            sheets: Sheets = {}
-            for sheet in _part(file, archive, "xl/workbook.xml").iter(f"{_MAIN}sheet"):
-                part = "xl/" + targets.get(sheet.get(_RELATION), "").removeprefix("/xl/")
-                sheets[sheet.get("name") or part] = _rows(_part(file, archive, part), shared)
+            for part in archive.infolist():
+                if part.file_size > _LARGEST_PART:
+                    raise RadioDataError(
+                        file, f"{part.filename} in it has {part.file_size} bytes; save the sheet as CSV"
+                    )
+                if part.filename.endswith(".xml") and b"<!ENTITY" in archive.read(part):
+                    raise RadioDataError(file, f"{part.filename} in it defines entities, which no workbook does")
+        book = load_workbook(file, read_only=True, data_only=True)
+        try:
+            return {
+                sheet.title: [["" if cell is None else str(cell) for cell in row] for row in sheet.values]
+                for sheet in book.worksheets
+            }
+        finally:
+            book.close()
     except FileNotFoundError as error:
         raise RadioDataError(file, "no such file") from error
-    except (OSError, zipfile.BadZipFile) as error:
-        raise RadioDataError(file, f"is no .xlsx workbook: {error}; save it as one, or as CSV") from error
-    return sheets
-
-
-def _part(file: Path, archive: zipfile.ZipFile, name: str) -> ET.Element:
-    try:
-        size = archive.getinfo(name).file_size
-        if size > _LARGEST_PART:
-            raise RadioDataError(file, f"{name} in it has {size} bytes; save the sheet as CSV")
-        data = archive.read(name)
-        if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-            raise RadioDataError(file, f"{name} in it defines entities, which no workbook does; save it anew")
-        return ET.fromstring(data)  # noqa: S314 - no entity gets here, and the size is limited
-    except (KeyError, ET.ParseError) as error:
-        raise RadioDataError(file, f"is no .xlsx workbook: {name} is missing or damaged; save it anew") from error
-
-
-def _shared_text(file: Path, archive: zipfile.ZipFile) -> list[str]:
-    name = "xl/sharedStrings.xml"
-    if name not in archive.namelist():
-        return []
-    items = _part(file, archive, name).findall(f"{_MAIN}si")
-    return ["".join(text.text or "" for text in item.iter(f"{_MAIN}t")) for item in items]
-
-
-def _rows(sheet: ET.Element, shared: list[str]) -> list[list[str]]:
-    rows = []
-    for row in sheet.iter(f"{_MAIN}row"):
-        cells: list[str] = []
-        for cell in row.findall(f"{_MAIN}c"):
-            place = _CELL.fullmatch(cell.get("r") or "")
-            column = _column(place[1]) if place else len(cells)
-            cells += [""] * (column + 1 - len(cells))
-            cells[column] = _text(cell, shared)
-        rows.append(cells)
-    return rows
-
-
-def _text(cell: ET.Element, shared: list[str]) -> str:
-    value = cell.findtext(f"{_MAIN}v")
-    if cell.get("t") == "inlineStr":
-        return "".join(text.text or "" for text in cell.iter(f"{_MAIN}t"))
-    if value is None:
-        return ""
-    if cell.get("t") == "s":
-        return shared[int(value)] if value.isdecimal() and int(value) < len(shared) else ""
-    return value
-
-
-def _column(letters: str) -> int:
-    number = 0
-    for letter in letters:
-        number = 26 * number + ord(letter) - ord("A") + 1
-    return number - 1
+    except _DAMAGE as error:
+        raise RadioDataError(
+            file, f"is no .xlsx workbook: {' '.join(str(error).split())}; save it again, or as CSV"
+        ) from error
 
 
 _LOG_LINE = re.compile(r"Node\s+(?P<node>\S+?)\s*:\s*(?P<level>[-+]?\d+(?:\.\d+)?)")
