@@ -29,7 +29,6 @@ STRONGEST = 3e3
 same number bounds what rows that nearly repeat each other cost. Beyond it a QR factorisation does the update."""
 MANY = 32
 """Rows beyond which a QR factorisation costs less than one of S."""
-ROUNDED_UP = 1.0 + 1e-9
 
 
 class _Rows:
@@ -125,7 +124,8 @@ class KalmanFilter:
     def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
         """Advance by F (n, n) and Q (n, n), thesis eqs 2.5 and 2.6; see ``Filter.predict``."""
         if not isinstance(F, ndarray):
-            raise FilterModelError("KalmanFilter", F)
+            self._predict_model(F, Q)
+            return
         if F.shape != self._shape:
             raise FilterShapeError("F", F.shape, str(self._shape))
         if Q.shape != self._shape:
@@ -147,9 +147,10 @@ class KalmanFilter:
     def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
         """Condition on z (m,) with H (m, n) and R (m,) or (m, m), thesis eqs 2.7 to 2.10; see ``Filter.update``."""
         if not isinstance(H, ndarray):
-            raise FilterModelError("KalmanFilter", H)
-        rows = self._rows.get(z.shape)
-        if rows is None or H.shape != rows.H_shape or R.shape not in (z.shape, rows.S_shape):
+            return self._update_model(z, H, R)
+        shape = z.shape
+        rows = self._rows.get(shape)
+        if rows is None or H.shape != rows.H_shape or not (R.shape == shape or R.shape == rows.S_shape):  # noqa: PLR1714
             check_rows(z, H, R, self._n)
             if not z.size:
                 return Innovation(np.empty(0), 0.0)
@@ -157,8 +158,14 @@ class KalmanFilter:
         rows.H_rows[...] = H
         dsymm(*rows.project)
         n = self._n
-        daxpy(z, rows.V_flat, z.size, 1.0, 0, 1, n, n + 1)
+        daxpy(z, rows.V_flat, shape[0], 1.0, 0, 1, n, n + 1)
         return self._condition(rows, R)
+
+    def _predict_model(self, f: Transition, Q: FloatArray) -> None:
+        raise FilterModelError("KalmanFilter", f)
+
+    def _update_model(self, z: FloatArray, h: Observation, R: FloatArray) -> Innovation:
+        raise FilterModelError("KalmanFilter", h)
 
     def _start(self, mean: FloatArray, covariance: FloatArray) -> None:
         self._minus_x[:], self._P_rows[:] = -mean, covariance
@@ -183,7 +190,7 @@ class KalmanFilter:
                 np.add(rows.S_rows, R, rows.S_rows)
             for s, r in zip(rows.S_diagonal.tolist(), noise):  # noqa: B905 - of one length; checking that takes longer
                 # The first comparison fails where P is no covariance, each where a number is not finite.
-                if not (r <= s * ROUNDED_UP and s < STRONGEST * r):
+                if not r <= s < STRONGEST * r:
                     break
             else:
                 if not dpotrf(*rows.factor)[1]:
@@ -253,26 +260,19 @@ class ExtendedKalmanFilter(KalmanFilter):
     Arrays are taken as the linear filter takes them, and cost and result are the same.
     """
 
-    def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
-        """Advance by F, a matrix (n, n) or a model, and Q (n, n); see ``Filter.predict``."""
-        if isinstance(F, ndarray):
-            super().predict(F, Q)
-            return
-        x, jacobian = F.at(self.mean)
+    def _predict_model(self, f: Transition, Q: FloatArray) -> None:
+        x, jacobian = f.at(self.mean)
         if x.shape != self._shape[:1]:
             raise FilterShapeError("f(x)", x.shape, str(self._shape[:1]))
         if jacobian.shape != self._shape:
             raise FilterShapeError("df/dx", jacobian.shape, str(self._shape))
         if not ddot(x, x) < HUGE:
             raise FilterDiverged(f"prediction is not finite: mean {x.tolist()}")
-        super().predict(jacobian, Q)
+        self.predict(jacobian, Q)
         np.negative(x, self._minus_x)
 
-    def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
-        """Condition on z (m,) with H, a matrix (m, n) or a model, and R (m,) or (m, m); see ``Filter.update``."""
-        if isinstance(H, ndarray):
-            return super().update(z, H, R)
-        expected, jacobian = H.at(self.mean)
+    def _update_model(self, z: FloatArray, h: Observation, R: FloatArray) -> Innovation:
+        expected, jacobian = h.at(self.mean)
         m = z.size
         if z.ndim != 1 or expected.shape != z.shape:
             raise FilterShapeError("z", z.shape, f"{expected.shape} of h(x)")

@@ -71,13 +71,13 @@ class UnscentedKalmanFilter(KalmanFilter):
 
     def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
         """Advance by F, a matrix (n, n) or a model, and Q (n, n); see ``Filter.predict``."""
-        if isinstance(F, np.ndarray):
-            super().predict(F, Q)
-            self._predicted = None
-            return
+        self._predicted = None
+        super().predict(F, Q)
+
+    def _predict_model(self, f: Transition, Q: FloatArray) -> None:
         n = self._n
         L = self._draw()
-        images = F.through(self.mean + self._offsets)
+        images = f.through(self.mean + self._offsets)
         if images.shape != (2 * n + 1, n):
             raise FilterShapeError("f(X)", images.shape, f"({2 * n + 1}, {n})")
         if Q.shape != (n, n):
@@ -91,13 +91,10 @@ class UnscentedKalmanFilter(KalmanFilter):
         self._mean = self._covariance = None
         self._predicted = dgemm(1.0, (self._offsets * self._roots).T, deviations.T, 0.0, None, 0, 1), L
 
-    def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
-        """Condition on z (m,) with H, a matrix (m, n) or a model, and R (m,) or (m, m); see ``Filter.update``."""
-        if isinstance(H, np.ndarray):
-            return super().update(z, H, R)
+    def _update_model(self, z: FloatArray, h: Observation, R: FloatArray) -> Innovation:
         m = z.size
         self._draw()
-        images = H.through(self.mean + self._offsets)
+        images = h.through(self.mean + self._offsets)
         if z.ndim != 1 or images.shape != (len(self._offsets), m):
             raise FilterShapeError("h(X)", images.shape, f"({len(self._offsets)}, m) with z of shape {z.shape}")
         if R.shape not in ((m,), (m, m)):
