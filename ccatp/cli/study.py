@@ -143,10 +143,9 @@ def bench(
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import tempfile
 
-    from ccatp.bench.report import markdown as page
-    from ccatp.bench.report import terminal_lines
-    from ccatp.bench.suite import run_bench
     from ccatp.config.load import dump_config, load_config
+    from ccatp.studies.bench import markdown as page
+    from ccatp.studies.bench import run_bench, terminal_lines
 
     named = {"run.mirror": mirror, "run.world": world, "run.seed": seed}
     cfg = load_config(config_file, overrides(settings, named))

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
-from ccatp.bench.machine import CPU_INFO, cpu_model, machine
+from ccatp.studies.bench import CPU_INFO, cpu_model, machine
 from tests.faults.realtime import is_realtime_permitted
 
 NAME = ".faults.json"

@@ -8,8 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ccatp.config.load import load_config
 from ccatp.core import FloatArray
 from ccatp.filters import FILTERS
+from ccatp.studies.bench_cases import survey_problem
 from tests.oracle.exact_filter import ExactFilter
 
 Step = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
@@ -195,6 +197,21 @@ def test_a_state_known_exactly_beside_large_ones(name: str, noise: float, m: int
     filter_.update(np.ones(m), H, np.full(m, noise))
     assert filter_.mean[1] == 0.0
     assert not filter_.covariance[1].any()
+
+
+@pytest.mark.parametrize("name", ["ekf", "ukf"])
+def test_the_full_state_model(name: str) -> None:
+    problem = survey_problem(load_config())
+    filter_ = FILTERS[name](problem.mean, problem.covariance)
+    exact = ExactFilter(problem.mean, problem.covariance, unscented=name == "ukf")
+    scale = np.maximum(np.sqrt(problem.covariance.diagonal()), np.abs(problem.mean))
+    for z in problem.readings[:4]:
+        filter_.predict(problem.F, problem.Q)
+        exact.predict(problem.F, problem.Q)
+        filter_.update(z, problem.H, problem.variances)
+        exact.update(z, problem.H, problem.variances)
+        assert np.all(np.abs(filter_.mean - exact.mean) <= TOLERANCE * scale)
+        assert np.all(np.abs(filter_.covariance - exact.covariance) <= TOLERANCE * np.outer(scale, scale))
 
 
 def test_the_oracle_on_a_case_done_by_hand() -> None:

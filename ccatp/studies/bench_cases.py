@@ -1,0 +1,499 @@
+"""What is raced: problems drawn from a seed, this project's parts and their peers as contenders that solve them.
+
+filterpy and Stone Soup belong to the extra ``peers`` and are imported when a race is set up, models are built before
+the clock starts. What the peers compute has to be what this project computes: the race checks it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import cos, hypot, sin, sqrt, tau
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from ccatp.config.models import Config
+from ccatp.core import DeckPose, FloatArray
+from ccatp.estimation.state_model import (
+    BA,
+    BG,
+    E0,
+    E1,
+    KG,
+    KL,
+    PL,
+    PR,
+    PSI,
+    SL,
+    SR,
+    STATES,
+    TX,
+    TY,
+    A,
+    C,
+    SensorRows,
+    SurveyMotion,
+    Terrain,
+    V,
+    W,
+    X,
+    Y,
+)  # fmt: skip
+from ccatp.filters import FILTERS, Observation, Transition
+from ccatp.filters.ekf_slam import Columns, EkfSlam, columns_of
+from ccatp.filters.unscented import ALPHA, BETA, KURTOSIS
+from ccatp.mirror.mirror import build_mirror
+from ccatp.mirror.multilateration import multilaterate
+
+STEPS, DT_S, SEED = 50, 0.01, 1
+MILDER = 1e4
+"""Factor on the noise of the four states' readings. As it is shipped, an encoder's sigma of 0.001 rad/s against what a
+frame leaves unknown costs forms with an inverse and (I - W H) P half their digits: nothing could be compared."""
+_SURVEY_START = (0.3, -0.4, 0.5, 0.05, 0.1)  # on the mirror, under way and turning: X, Y, PSI, V, W
+_ANGLE_RAD2, _POSITION_M2, _HEADING_RAD2 = 1e-6, 1e-8, 1e-4  # variances of a wheel's angle, a fix, a heading
+Result = tuple[FloatArray, FloatArray]
+"""Mean (n,) and covariance (n, n)."""
+
+
+class Contender(NamedTuple):
+    """Something that is timed.
+
+    Attributes:
+        reset: begin again; not timed.
+        step: work on reading number i; timed.
+        result: what it has come to.
+    """
+
+    reset: Callable[[], None]
+    step: Callable[[int], object]
+    result: Callable[[], Result]
+
+
+@dataclass(frozen=True, slots=True)
+class FilterProblem:
+    """Predict, and update with each reading.
+
+    Attributes:
+        mean, covariance: prior, shapes (n,) and (n, n).
+        F, H: the models: matrices (n, n) and (m, n), or nonlinear ones.
+        Q: process noise of a step, shape (n, n).
+        variances: of the independent rows, shape (m,).
+        readings: shape (k, m).
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+    F: Any
+    H: Any
+    Q: FloatArray
+    variances: FloatArray
+    readings: FloatArray
+
+
+def thesis_problem(cfg: Config, rows: int) -> FilterProblem:
+    """Thesis eqs 2.11 and 2.12: n = 4, ``rows`` = 2 k + 2 with k samples of each wheel."""
+    robot, noise, k = cfg.robot, cfg.localizer, (rows - 2) // 2
+    H = np.zeros((rows, 4))
+    H[: 2 * k, 0] = 1.0 / robot.wheel_radius_m
+    H[: 2 * k, 3] = np.repeat((0.5, -0.5), k) * robot.wheel_base_m / robot.wheel_radius_m
+    H[2 * k, 1] = H[2 * k + 1, 3] = 1.0
+    sigma = np.full(rows, noise.encoder_sigma_rad_s)
+    sigma[2 * k :] = noise.accelerometer_sigma_m_s2, noise.gyroscope_sigma_rad_s
+    F = np.eye(4)
+    F[0, 1] = F[2, 3] = DT_S
+    impulse = np.array([0.0, noise.jerk_density_m2_s5, 0.0, noise.angular_acceleration_density_rad2_s3]) * DT_S
+    mean, covariance = np.array([0.05, 0.0, 0.2, 0.1]), np.diag([1e-4, 1e-2, 1e-4, 1e-2])
+    return linear_problem(mean, covariance, F, H, F @ np.diag(impulse) @ F.T, MILDER * sigma**2)
+
+
+def linear_problem(
+    mean: FloatArray, covariance: FloatArray, F: FloatArray, H: FloatArray, Q: FloatArray, variances: FloatArray
+) -> FilterProblem:
+    """A linear problem with readings drawn from its own model."""
+    rng = np.random.default_rng((SEED, *H.shape))
+    x, readings = rng.multivariate_normal(mean, covariance), np.empty((STEPS, len(H)))
+    for i in range(STEPS):
+        x = F @ x + rng.multivariate_normal(np.zeros(len(F)), Q, method="svd")
+        readings[i] = H @ x + np.sqrt(variances) * rng.normal(size=len(H))
+    return FilterProblem(mean, covariance, F, H, Q, variances, readings)
+
+
+def survey_problem(cfg: Config) -> FilterProblem:
+    """The full-state localizer's problem with its own models: n = 19, both wheels' angles, rate and acceleration."""
+    rng = np.random.default_rng((SEED, STATES))
+    robot, full = cfg.robot, cfg.localizer.full_state
+    mean, sigma = np.zeros(STATES), np.zeros(STATES)
+    mean[[X, Y, PSI, V, W]] = _SURVEY_START
+    sigma[[X, Y]], sigma[PSI] = cfg.localizer.start_position_sigma_m, cfg.localizer.start_heading_sigma_rad
+    sigma[[V, A, W]] = 0.01, 0.05, 0.02
+    sigma[BG], sigma[KG] = full.gyroscope_bias_sigma_rad_s, full.gyroscope_scale_sigma
+    sigma[BA], sigma[KL] = full.accelerometer_bias_sigma_m_s2, full.wheel_base_sigma
+    sigma[[SR, SL]], sigma[C], sigma[[E0, E1]] = full.slip_sigma, full.creep_sigma, full.edge_sigma_m
+    sigma[[PR, PL]], sigma[[TX, TY]] = sqrt(_ANGLE_RAD2), robot.puck_height_m * full.panel_tilt_sigma_rad
+    slope = Terrain(build_mirror(cfg.mirror)).at(float(mean[X]), float(mean[Y]))
+    motion = SurveyMotion(robot.wheel_radius_m, robot.wheel_base_m).over(DT_S, slope)
+    slip = (full.slip_scatter_max * DT_S) ** 2
+    impulses = np.array(
+        (full.jerk_density_m2_s5 * DT_S, full.angular_acceleration_density_rad2_s3 * DT_S, slip, slip, slip)
+    )
+    drift = np.zeros(STATES)
+    drift[[PR, PL]] = cfg.localizer.encoder_sigma_rad_s**2 * full.encoder_period_s * DT_S
+    Q = motion.noise(mean, impulses, drift)
+    gyroscope, accelerometer = cfg.localizer.gyroscope_sigma_rad_s**2, cfg.localizer.accelerometer_sigma_m_s2**2
+    sight = SensorRows().take((0.0, 0.0, _ANGLE_RAD2), (0.0, gyroscope), (0.0, accelerometer))
+    x, readings = mean + 0.5 * sigma * rng.normal(size=STATES), np.empty((STEPS, sight.R.size))
+    for i in range(STEPS):
+        x = motion.at(x)[0] + rng.multivariate_normal(np.zeros(STATES), Q, method="svd")
+        readings[i] = sight.at(x)[0] + np.sqrt(sight.R) * rng.normal(size=sight.R.size)
+    return FilterProblem(mean, np.diag(sigma**2), motion, sight, Q, sight.R, readings)
+
+
+def linearised_problem(cfg: Config, rows: int) -> FilterProblem:
+    """The same with its Jacobians at the start as matrices, so that the filter is timed and not the models.
+
+    Rows are the four sensors; with a fix of both coordinates (6); with ten samples of each and a heading (23).
+    """
+    problem = survey_problem(cfg)
+    F, sensors = problem.F.at(problem.mean)[1].copy(), problem.H.at(problem.mean)[1].copy()
+    fix, heading = np.eye(STATES)[[X, Y]], np.eye(STATES)[[PSI]]
+    H, variances = {
+        4: (sensors, problem.variances),
+        6: (np.vstack([sensors, fix]), np.append(problem.variances, [_POSITION_M2] * 2)),
+        23: (
+            np.vstack([np.repeat(sensors[1:3], 10, axis=0), sensors[[0, 3]], heading]),
+            np.concatenate([np.full(20, _ANGLE_RAD2), problem.variances[[0, 3]], [_HEADING_RAD2]]),
+        ),
+    }[rows]
+    return linear_problem(problem.mean, problem.covariance, F, H, problem.Q, variances)
+
+
+def our_filter(name: str, problem: FilterProblem) -> Contender:
+    """A filter of ``FILTERS``."""
+    ours, (F, H, Q, R) = FILTERS[name](problem.mean, problem.covariance), _models(problem)
+    readings = list(problem.readings)
+
+    def step(i: int) -> None:
+        ours.predict(F, Q)
+        ours.update(readings[i], H, R)
+
+    return Contender(lambda: ours.reset(problem.mean, problem.covariance), step, lambda: (ours.mean, ours.covariance))
+
+
+def _models(problem: FilterProblem) -> tuple[Any, Any, FloatArray, FloatArray]:
+    return problem.F, problem.H, problem.Q, problem.variances
+
+
+def printed_filter(problem: FilterProblem) -> Contender:
+    """Thesis eq. 2.13 with its inverse and its (I - W H) P in bare numpy, without a check."""
+    (F, H, Q, variances), identity = _models(problem), np.eye(problem.mean.size)
+    x, P, R = problem.mean, problem.covariance, np.diag(variances)
+
+    def reset() -> None:
+        nonlocal x, P
+        x, P = problem.mean, problem.covariance
+
+    def step(i: int) -> None:
+        nonlocal x, P
+        x = F @ x
+        P = F @ P @ F.T + Q
+        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+        x = x + K @ (problem.readings[i] - H @ x)
+        P = (identity - K @ H) @ P
+
+    return Contender(reset, step, lambda: (x, P))
+
+
+def filterpy_linear(problem: FilterProblem) -> Contender:
+    """``filterpy.kalman.KalmanFilter``."""
+    from filterpy.kalman import KalmanFilter  # noqa: PLC0415 - belongs to an extra
+
+    peer = KalmanFilter(dim_x=problem.mean.size, dim_z=problem.variances.size)
+    peer.F, peer.H, peer.Q, variances = _models(problem)
+    peer.R = np.diag(variances)
+    columns = [reading[:, None] for reading in problem.readings]
+
+    def reset() -> None:
+        peer.x, peer.P = problem.mean[:, None].copy(), problem.covariance.copy()
+
+    def step(i: int) -> None:
+        peer.predict()
+        peer.update(columns[i])
+
+    return Contender(reset, step, lambda: (peer.x[:, 0], peer.P))
+
+
+def sigma_points(problem: FilterProblem) -> dict[str, float]:
+    """The parameters of our sigma points, by the names that both peers give them."""
+    return {"alpha": ALPHA, "beta": BETA, "kappa": max(KURTOSIS - problem.mean.size, 0.0)}
+
+
+def filterpy_unscented(problem: FilterProblem) -> Contender:
+    """``filterpy.kalman.UnscentedKalmanFilter`` with the scaled points of Merwe."""
+    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter  # noqa: PLC0415 - belongs to an extra
+
+    n, (motion, sight, Q, variances) = problem.mean.size, _models(problem)
+    points = MerweScaledSigmaPoints(n, **sigma_points(problem))
+    peer = UnscentedKalmanFilter(
+        n, variances.size, DT_S, points=points,
+        hx=lambda x: sight.through(x[None])[0], fx=lambda x, _dt: motion.through(x[None])[0],
+    )  # fmt: skip
+    peer.Q, peer.R = Q, np.diag(variances)
+
+    def reset() -> None:
+        peer.x, peer.P = problem.mean.copy(), problem.covariance.copy()
+
+    def step(i: int) -> None:
+        peer.predict()
+        peer.update(problem.readings[i])
+
+    return Contender(reset, step, lambda: (peer.x, peer.P))
+
+
+def stonesoup(problem: FilterProblem) -> Contender:
+    """Predictor and updater of Stone Soup: Kalman's for matrices, the unscented ones for models."""
+    import stonesoup.predictor.kalman as predictors  # noqa: PLC0415 - belongs to an extra
+    import stonesoup.updater.kalman as updaters  # noqa: PLC0415
+    from stonesoup.types.detection import Detection  # noqa: PLC0415
+    from stonesoup.types.hypothesis import SingleHypothesis  # noqa: PLC0415
+    from stonesoup.types.state import GaussianState  # noqa: PLC0415
+
+    is_linear = isinstance(problem.F, np.ndarray)
+    kind, points = ("Kalman", {}) if is_linear else ("UnscentedKalman", sigma_points(problem))
+    transition, measurement = _stonesoup_linear(problem) if is_linear else _stonesoup_nonlinear(problem)
+    predictor = getattr(predictors, kind + "Predictor")(transition, **points)
+    updater = getattr(updaters, kind + "Updater")(measurement, **points)
+    detections = [Detection(reading[:, None]) for reading in problem.readings]
+    state: Any = None
+
+    def reset() -> None:
+        nonlocal state
+        state = GaussianState(problem.mean[:, None].copy(), problem.covariance.copy())
+
+    def step(i: int) -> None:
+        nonlocal state
+        state = updater.update(SingleHypothesis(predictor.predict(state), detections[i]))
+
+    def result() -> Result:
+        return np.array(state.state_vector, dtype=np.float64)[:, 0], np.array(state.covar, dtype=np.float64)
+
+    return Contender(reset, step, result)
+
+
+def _stonesoup_linear(problem: FilterProblem) -> tuple[Any, Any]:
+    from stonesoup.models.measurement.linear import LinearGaussian  # noqa: PLC0415 - belongs to an extra
+    from stonesoup.models.transition.linear import LinearGaussianTimeInvariantTransitionModel  # noqa: PLC0415
+
+    n = problem.mean.size
+
+    class Rows(LinearGaussian):  # type: ignore[misc] # Stone Soup has no types
+        ndim_meas = problem.variances.size
+
+        def matrix(self, **_: object) -> Any:
+            return problem.H
+
+    transition = LinearGaussianTimeInvariantTransitionModel(transition_matrix=problem.F, covariance_matrix=problem.Q)
+    return transition, Rows(ndim_state=n, mapping=tuple(range(n)), noise_covar=np.diag(problem.variances))
+
+
+def _stonesoup_nonlinear(problem: FilterProblem) -> tuple[Any, Any]:
+    from stonesoup.models.base import TimeInvariantModel  # noqa: PLC0415 - belongs to an extra
+    from stonesoup.models.measurement.nonlinear import NonLinearGaussianMeasurement  # noqa: PLC0415
+    from stonesoup.models.transition.nonlinear import GaussianTransitionModel  # noqa: PLC0415
+    from stonesoup.types.array import StateVectors  # noqa: PLC0415
+
+    n = problem.mean.size
+
+    def mapped(model: Transition | Observation, state: Any) -> Any:
+        return StateVectors(model.through(np.asarray(state.state_vector, dtype=np.float64).T).T)
+
+    class Motion(GaussianTransitionModel, TimeInvariantModel):  # type: ignore[misc] # Stone Soup has no types
+        ndim_state = n
+
+        def covar(self, **_: object) -> FloatArray:
+            return problem.Q
+
+        def function(self, state: Any, noise: object = False, **_: object) -> Any:
+            return mapped(problem.F, state)
+
+    class Sight(NonLinearGaussianMeasurement):  # type: ignore[misc] # Stone Soup has no types
+        ndim_meas = problem.variances.size
+
+        def function(self, state: Any, noise: object = False, **_: object) -> Any:
+            return mapped(problem.H, state)
+
+    noise = np.diag(problem.variances)
+    return Motion(), Sight(ndim_state=n, mapping=tuple(range(n)), noise_covar=noise)
+
+
+# -- range SLAM: a vehicle on an arc receives one beacon a step -------------------------------------------------------
+
+_VEHICLE, _SHARED, _BLOCK = 3, 2, 2  # pose; scale and offset of ranges; place of a beacon
+_RANGE_SIGMA_M, _STEP_M, _TURN_RAD = 0.1, 0.05, 0.02
+_SLAM_NOISE = np.diag((1e-4, 1e-4, 1e-5))
+
+
+@dataclass(frozen=True, slots=True)
+class SlamProblem:
+    """Pose, range scale and offset, and beacons: mean (n,), covariance (n, n); a range a step, of each in turn."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    ranges_m: FloatArray
+
+    @property
+    def beacons(self) -> int:
+        """How many there are."""
+        return (self.mean.size - _VEHICLE - _SHARED) // _BLOCK
+
+
+def slam_problem(beacons: int) -> SlamProblem:
+    """Beacons about the vehicle at 3 to 8 m, known to 0.3 m."""
+    rng = np.random.default_rng((SEED, beacons))
+    angles, radii = tau * np.arange(beacons) / beacons, rng.uniform(3.0, 8.0, beacons)
+    places = np.column_stack([radii * np.cos(angles), radii * np.sin(angles)])
+    mean = np.concatenate([np.zeros(_VEHICLE + _SHARED), places.ravel()])
+    sigmas = np.array((0.05, 0.05, 0.02, 0.05, 0.1, *[0.3] * (_BLOCK * beacons)))
+    true, ranges = mean + sigmas * rng.normal(size=sigmas.size), np.empty(STEPS)
+    for i in range(STEPS):
+        true[:_VEHICLE] = _moved(true[:_VEHICLE])[0]
+        ranges[i] = _range(true[_touched(i % beacons)].tolist())[0] + _RANGE_SIGMA_M * rng.normal()
+    return SlamProblem(mean, np.diag(sigmas**2), ranges)
+
+
+def our_slam(problem: SlamProblem) -> Contender:
+    """Blocks and sparse rows."""
+    ours: EkfSlam
+    shared = slice(_VEHICLE, _VEHICLE + _SHARED)
+    columns: list[Columns] = [columns_of(_touched(beacon)) for beacon in range(problem.beacons)]
+
+    def reset() -> None:
+        nonlocal ours
+        x, P = problem.mean, problem.covariance
+        ours = EkfSlam(x[:_VEHICLE], P[:_VEHICLE, :_VEHICLE], x[shared], P[shared, shared])
+        for beacon in range(problem.beacons):
+            at, none = slice(_touched(beacon)[-2], _touched(beacon)[-1] + 1), np.empty(0, dtype=np.intp)
+            ours.augment(beacon, x[at], none, np.zeros((_BLOCK, 0)), np.eye(_BLOCK), P[at, at])
+
+    def step(i: int) -> None:
+        new, F = _moved(ours.mean[:_VEHICLE])
+        ours.predict(new, F, _SLAM_NOISE)
+        touched = columns[i % problem.beacons]
+        expected, h = _range(ours.mean.take(touched).tolist())
+        ours.update_row(touched, np.array(h), problem.ranges_m[i] - expected, _RANGE_SIGMA_M**2)
+
+    return Contender(reset, step, lambda: (ours.mean.copy(), ours.covariance.copy()))
+
+
+def dense_slam(problem: SlamProblem) -> Contender:
+    """The same by F P F^T + Q and (I - K H) P of the whole state, in bare numpy."""
+    x, P = problem.mean, problem.covariance
+    n = x.size
+    identity, Q = np.eye(n), np.zeros((n, n))
+    Q[:_VEHICLE, :_VEHICLE] = _SLAM_NOISE
+
+    def reset() -> None:
+        nonlocal x, P
+        x, P = problem.mean.copy(), problem.covariance
+
+    def step(i: int) -> None:
+        nonlocal x, P
+        F, H = np.eye(n), np.zeros(n)
+        x[:_VEHICLE], F[:_VEHICLE, :_VEHICLE] = _moved(x[:_VEHICLE])
+        P = F @ P @ F.T + Q
+        touched = _touched(i % problem.beacons)
+        expected, H[touched] = _range(x[touched].tolist())
+        K = P @ H / (H @ P @ H + _RANGE_SIGMA_M**2)
+        x += K * (problem.ranges_m[i] - expected)
+        P = (identity - np.outer(K, H)) @ P
+
+    return Contender(reset, step, lambda: (x, P))
+
+
+def _touched(beacon: int) -> list[int]:
+    """States that a range to a beacon depends on."""
+    at = _VEHICLE + _SHARED + _BLOCK * beacon
+    return [*range(_VEHICLE + _SHARED), at, at + 1]
+
+
+def _moved(pose: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The pose a step on, and its Jacobian."""
+    x, y, heading = pose.tolist()
+    dx, dy = _STEP_M * cos(heading), _STEP_M * sin(heading)
+    F = np.array(((1.0, 0.0, -dy), (0.0, 1.0, dx), (0.0, 0.0, 1.0)))
+    return np.array((x + dx, y + dy, heading + _TURN_RAD)), F
+
+
+def _range(states: list[float]) -> tuple[float, list[float]]:
+    """(1 + scale) r + offset, and its derivatives by pose, scale, offset and place."""
+    x, y, _, scale, offset, bx, by = states
+    dx, dy = bx - x, by - y
+    r = hypot(dx, dy)
+    ux, uy = (1.0 + scale) * dx / r, (1.0 + scale) * dy / r
+    return (1.0 + scale) * r + offset, [-ux, -uy, 0.0, r, 1.0, ux, uy]
+
+
+# -- a puck's position out of its lengths -----------------------------------------------------------------------------
+
+
+class RangeProblem(NamedTuple):
+    """Anchors (m, 3); lengths and their sigmas (k, m) of k pucks; where each is looked for (k, 3); all m."""
+
+    anchors_m: FloatArray
+    ranges_m: FloatArray
+    sigmas_m: FloatArray
+    expected_m: FloatArray
+
+
+def range_problem(cfg: Config) -> RangeProblem:
+    """Pucks at the first stops of the mirror, looked for some millimetres off."""
+    rng = np.random.default_rng((SEED, 3))
+    mirror = build_mirror(cfg.mirror)
+    anchors = 1e-3 * np.array(cfg.mirror.collimators.positions_world_mm)
+    points = [point for panel in sorted(mirror.panels) for point in mirror.point_ids(panel)][:STEPS]
+    poses = [DeckPose(*mirror.point_on_deck(point), 0.0) for point in points]
+    pucks = np.array([mirror.puck_world(pose, cfg.robot.puck_height_m) for pose in poses])
+    true_m = np.linalg.norm(pucks[:, None, :] - anchors[None, :, :], axis=2)
+    sigmas = cfg.etalon.length_sigma_m + cfg.etalon.length_sigma_per_m * true_m
+    ranges = true_m + sigmas * rng.normal(size=true_m.shape)
+    return RangeProblem(anchors, ranges, sigmas, pucks + 2e-3 * rng.normal(size=pucks.shape))
+
+
+def our_position(problem: RangeProblem) -> Contender:
+    """``multilaterate``."""
+    solution: Result = (np.zeros(3), np.eye(3))
+
+    def step(i: int) -> None:
+        nonlocal solution
+        found = multilaterate(problem.anchors_m, problem.ranges_m[i], problem.sigmas_m[i], problem.expected_m[i])
+        solution = found.position_m, found.covariance_m2
+
+    return Contender(lambda: None, step, lambda: solution)
+
+
+def scipy_position(problem: RangeProblem) -> Contender:
+    """The same weighted least squares by SciPy's Levenberg-Marquardt, and the covariance out of its Jacobian."""
+    solution: Result = (np.zeros(3), np.eye(3))
+    tolerance = sqrt(np.finfo(np.float64).eps)  # quadratic convergence squares it
+
+    def step(i: int) -> None:
+        nonlocal solution
+        ranges, sigmas = problem.ranges_m[i], problem.sigmas_m[i]
+
+        def residuals(x: FloatArray) -> FloatArray:
+            offsets = x - problem.anchors_m
+            seen: FloatArray = (np.sqrt((offsets * offsets).sum(axis=1)) - ranges) / sigmas
+            return seen
+
+        def jacobian(x: FloatArray) -> FloatArray:
+            offsets = x - problem.anchors_m
+            slopes: FloatArray = offsets / (np.sqrt((offsets * offsets).sum(axis=1)) * sigmas)[:, None]
+            return slopes
+
+        found = least_squares(
+            residuals, problem.expected_m[i], jac=jacobian, method="lm",
+            xtol=tolerance, ftol=tolerance, gtol=tolerance,
+        )  # fmt: skip
+        slopes = np.asarray(found.jac, dtype=np.float64)
+        solution = np.asarray(found.x), np.linalg.inv(slopes.T @ slopes).astype(np.float64)
+
+    return Contender(lambda: None, step, lambda: solution)
