@@ -62,8 +62,8 @@ def test_ready_strokes_loops_that_hang_and_the_end(start: Callable[..., Run], ma
     for _ in range(3):
         manager.until("WATCHDOG=1")
     for module, trouble in (
-        ("danger_loop", "danger sent its last heartbeat"),
-        ("main_loop", "main sent its last heartbeat"),
+        ("danger_loop", "danger (sent|had) its last"),
+        ("main_loop", "main (sent|had) its last"),
     ):
         pid = child(run, module).pid
         os.kill(pid, signal.SIGSTOP)
