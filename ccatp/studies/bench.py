@@ -148,9 +148,10 @@ def step_case(name: str, ours: Contender, peer_name: str, peer: Contender | None
 
 
 def race(ours: Contender, peer: Contender | None, rounds: int, steps: int = STEPS) -> Times:
-    """Time every step of both, ours and the peer's by turns, who begins by turns as well.
+    """Time every step of both, a round of steps each by turns, who begins by turns as well.
 
-    So a machine that slows down for a while slows both. A round begins with a reset; one round before them warms up.
+    So a machine that slows down for a while slows both, and neither runs on caches that the other one has filled. A
+    round begins with a reset; one round before them warms up.
     """
     both = [ours] if peer is None else [ours, peer]
     taken = np.zeros((len(both), rounds, steps))
@@ -158,11 +159,10 @@ def race(ours: Contender, peer: Contender | None, rounds: int, steps: int = STEP
     gc.disable()
     try:
         for turn in range(-1, rounds):
-            for contender in both:
-                contender.reset()
-            for i in range(steps):
-                for which in range(len(both)) if (turn + i) % 2 else reversed(range(len(both))):
-                    step = both[which].step
+            for which in range(len(both)) if turn % 2 else reversed(range(len(both))):
+                both[which].reset()
+                step = both[which].step
+                for i in range(steps):
                     start_ns = time.perf_counter_ns()
                     step(i)
                     spent_ns = time.perf_counter_ns() - start_ns
@@ -289,7 +289,7 @@ OPENBLAS_NUM_THREADS=1 ccatp bench --markdown
 ```
 
 on a machine that does nothing else. A filter step is a prediction and an update, called from Python. Ours and the peer
-take turns step by step, and who begins by turns as well: each finds the caches as the other left them.
+take turns in rounds of fifty steps, and who begins by turns as well.
 Ratio = ours / peer: below 1 ours is faster.
 
 All compute the same: *difference* is the largest one between any entry of the two means and covariances after any of
