@@ -12,8 +12,10 @@ import pytest
 from _pytest.nodeid import coerce_node_id
 from hypothesis import settings
 
-from ccatp.config.load import load_config
 from ccatp.config.models import Config
+from ccatp.mirror.mirror import Mirror
+from tests.support.runs import RecordedRun, record_once
+from tests.support.scenario import config_of, mirror_of
 
 pytest_plugins = ["pytester", "tests.faults.linking"]
 
@@ -100,4 +102,16 @@ def free_port() -> int:
 @pytest.fixture(scope="session")
 def config() -> Config:
     """The default configuration (frozen, so one serves all)."""
-    return load_config()
+    return config_of()
+
+
+@pytest.fixture(scope="session")
+def mirror() -> Mirror:
+    """The default mirror."""
+    return mirror_of()
+
+
+@pytest.fixture(scope="session")
+def recorded_run(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
+    """Two panels surveyed by the real processes, recorded once per session for all workers; only to read from."""
+    return record_once(tmp_path_factory)

@@ -1,8 +1,7 @@
 """Missions in process with the daemon's own measuring desk, its store, and a laser system that does as a test says."""
 
 import asyncio
-import selectors
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from concurrent.futures import Future, wait
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,44 +22,10 @@ from ccatp.records.store_rows import PlannedPoint
 from ccatp.sim.fault_plan import FaultPlan, parse_plan
 from ccatp.studies.faults_study import FaultySilRun
 from ccatp.survey.fix_gate import FixGate, nis_of
+from tests.support.virtual_time import VirtualLoop
 
 T = TypeVar("T")
 FULL = (1.0, 1.0)
-# What lies in a socket of this machine is there after this wall time.
-SOCKET_S = 0.002
-
-
-class VirtualSelector(selectors.DefaultSelector):
-    """Waits for sockets a moment, for anything else by moving the clock on."""
-
-    now_s = 0.0
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        found = super().select(0)
-        if found or timeout == 0:
-            return found
-        found = super().select(SOCKET_S if timeout is not None else None)
-        if not found and timeout is not None:
-            self.now_s += timeout
-        return found
-
-
-class VirtualLoop(asyncio.SelectorEventLoop):
-    """An event loop on whose clock nobody waits."""
-
-    def __init__(self) -> None:
-        self.virtual = VirtualSelector()
-        super().__init__(self.virtual)
-
-    def time(self) -> float:
-        return self.virtual.now_s
-
-
-def run_virtual(work: Coroutine[Any, Any, T]) -> tuple[T, float]:
-    """The result of a coroutine, and the virtual time it took."""
-    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-        result = runner.run(work)
-        return result, runner.get_loop().time()
 
 
 class PatientStore:

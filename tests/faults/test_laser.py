@@ -41,8 +41,9 @@ from tests.contract.test_etalon_client import (
     silence,
 )
 from tests.faults.campaign import single
-from tests.faults.laser import DeskRehearsal, Laser, Measured, failing, honest, moved, patient, run_virtual
-from tests.unit.survey.test_mission import FREE, Story
+from tests.faults.laser import DeskRehearsal, Laser, Measured, failing, honest, moved, patient
+from tests.support.mission_story import FREE, Story
+from tests.support.virtual_time import run_virtual
 
 Note = Callable[..., None]
 POINT = PointId(5, 5, 1)

@@ -32,7 +32,7 @@ from ccatp.survey.state import MissionState
 from ccatp.survey.stops import MissionCommand
 from tests.faults.campaign import single
 from tests.faults.laser import FULL, DeskRehearsal
-from tests.unit.survey.test_mission import DT, FREE, FRONT_OFF, Story, from_first_leg
+from tests.support.mission_story import DT, FREE, FRONT_OFF, Story, from_first_leg
 
 Note = Callable[..., None]
 SURVEYING = (MissionState.TURNING, MissionState.DRIVING, MissionState.SETTLING, MissionState.MEASURING)

@@ -8,7 +8,7 @@ from ccatp.core import EventCode
 from ccatp.daemon.checkpoints import in_force_of
 from ccatp.mirror.mirror import build_mirror
 from ccatp.survey.state import MissionState
-from tests.unit.survey.test_mission import ABORT, FREE, Story, from_first_leg
+from tests.support.mission_story import ABORT, FREE, Story, from_first_leg
 
 QUAKE = replace(
     FREE, code=EventCode.ABORTED, cause="emergency: earthquake", forward=False, reverse=False, turn=False, raised=1,

@@ -1,0 +1,9 @@
+"""Shared by all tests; look here before writing a rig, a story or a helper of your own.
+
+* Fixtures of `tests/conftest.py`: `config` and `mirror` (the defaults, one object per session), `free_port`.
+* `scenario`: `config_of("fyst-m2", run__panels=1)`, `mirror_of`, `one_panel`, `fault_plan` (rows of a plan); the
+  simulated robot: `boot`, `sensors_of`, `drive`, `ServedRobot` (behind its server, with scripted clients and clock).
+* `mission_story`: the mission with an ideal robot on one panel and scripted verdicts (`FREE`, `FRONT_OFF`, `ABORT`).
+* `virtual_time`: `run_virtual(coroutine)` runs asyncio code, sockets included, on a clock on which nothing waits.
+* `runs`: real processes (`Run`), and `recorded_run()`: one two-panel run, recorded once per test session, to read from.
+"""

@@ -1,0 +1,92 @@
+"""The mission in virtual time: an ideal robot on one panel, verdicts as scripted."""
+
+from collections.abc import Callable, Collection
+from math import cos, exp, sin
+
+from msgspec.structs import replace
+
+from ccatp.config.models import Config
+from ccatp.core import DeckPose, EventCode, PanelId, PanelPose, PointId, Stop, StopKind, Twist, Verdict
+from ccatp.mirror.mirror import Mirror
+from ccatp.survey.mission import Mission
+from ccatp.survey.planning.route import Route
+from ccatp.survey.route_follower import StateEstimate
+from ccatp.survey.state import MissionState
+from ccatp.survey.stops import MissionCommand
+
+DT, LAG = 0.01, 0.08
+PANEL = PanelId(5, 5)
+FREE = Verdict(0, 0.0, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
+FRONT_OFF = replace(
+    FREE, code=EventCode.NEAR_EDGE, cause="rim", forward=False, turn=False, off=(True, True, False, False)
+)
+ABORT = replace(FREE, code=EventCode.ABORTED, cause="fire", raised=1)
+
+
+class Story:
+    """A mission, an ideal robot, and what was ordered so far."""
+
+    def __init__(self, config: Config, mirror: Mirror) -> None:
+        self.config, self.mirror = config, mirror
+        self.stops = tuple(
+            Stop(*mirror.point_on_deck(PointId(5, 5, k)), StopKind.MEASURE, PointId(5, 5, k)) for k in (1, 2, 3)
+        )
+        self.mission = Mission(config, mirror, self.route(self.stops), self.plan_home, self.plan_rest)
+        self.plans: list[DeckPose] = []
+        start = mirror.point_on_deck(PointId(5, 5, 4))
+        pose = mirror.panel_pose(PANEL, DeckPose(*start, 0.0))
+        self.x, self.y, self.heading = pose.x_m, pose.y_m, pose.heading_rad
+        self.v = self.omega = self.t = 0.0
+        self.base = start
+        self.orders: list[MissionCommand] = []
+        self.auto_fix = True
+
+    @staticmethod
+    def route(stops: tuple[Stop, ...]) -> Route:
+        left = tuple(float(len(stops) - k) for k in range(len(stops) + 1))
+        return Route(stops, left, left)
+
+    def plan_rest(self, _route: Route, start: DeckPose, skip: Collection[PointId]) -> Route:
+        self.plans.append(start)
+        return self.route(tuple(stop for stop in self.stops if stop.point not in skip))
+
+    def plan_home(self, _start: DeckPose) -> tuple[Stop, ...]:
+        return (Stop(*self.base, StopKind.BASE, heading_rad=1.0),)
+
+    def motion(self) -> StateEstimate:
+        pose = PanelPose(PANEL, self.x, self.y, self.heading)
+        return StateEstimate(self.t, DT, pose, self.mirror.deck_pose, self.v, self.omega)
+
+    def frame(self, verdict: Verdict | None = FREE) -> MissionCommand:
+        order = self.mission.step(self.motion(), verdict)
+        self.orders.append(order)
+        if order.measure and self.auto_fix:
+            self.mission.fixed(self.mission.measuring_point)
+        self._drive(order.twist)
+        return order
+
+    def _drive(self, twist: Twist) -> None:
+        keep = exp(-DT / LAG)
+        v, omega = twist.v_m_s, twist.omega_rad_s
+        middle = self.heading + 0.5 * self.omega * DT
+        mean = v + (self.v - v) * LAG * (1.0 - keep) / DT
+        self.x += mean * DT * cos(middle)
+        self.y += mean * DT * sin(middle)
+        self.heading += (omega + (self.omega - omega) * LAG * (1.0 - keep) / DT) * DT
+        self.v, self.omega = v + (self.v - v) * keep, omega + (self.omega - omega) * keep
+        self.t += DT
+
+    def until(self, is_there: Callable[[], bool], verdict: Verdict | None = FREE, frames: int = 3000) -> None:
+        for _ in range(frames):
+            if is_there():
+                return
+            self.frame(verdict)
+        raise AssertionError(f"still {self.mission.state} ({self.mission.cause}) after {frames} frames")
+
+    def until_state(self, state: MissionState, verdict: Verdict | None = FREE) -> None:
+        self.until(lambda: self.mission.state is state, verdict)
+
+
+def from_first_leg(config: Config) -> Config:
+    """Stories begin with the first leg, not with the fix before it."""
+    return config.model_copy(update={"mission": config.mission.model_copy(update={"fix_at_start": False})})

@@ -1,0 +1,155 @@
+"""Configurations, mirrors, and the simulated robot, as most tests want them."""
+
+import json
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from ccatp.config.load import load_config
+from ccatp.config.models import Config
+from ccatp.links.robot_codec import decode_from_robot
+from ccatp.links.robot_messages import Sensors
+from ccatp.mirror.mirror import Mirror, build_mirror
+from ccatp.sim.fault_plan import FaultPlan, parse_plan
+from ccatp.sim.robot import Robot
+from ccatp.sim.sessions import RobotServer, RobotSession
+
+
+def config_of(mirror: str = "fyst-m1", **overrides: object) -> Config:
+    """The default configuration with changes; `run__seed=3` is the key `run.seed`."""
+    dotted = {key.replace("__", "."): value for key, value in overrides.items()}
+    return load_config(overrides={"run.mirror": mirror, **dotted})
+
+
+@cache
+def mirror_of(name: str = "fyst-m1") -> Mirror:
+    """A shipped mirror; one object for all tests."""
+    return build_mirror(config_of(name).mirror)
+
+
+def one_panel(**overrides: object) -> Config:
+    """A survey of one panel without the calibration drive."""
+    return config_of(**{"mirror": "fyst-m1", "run__panels": 1, "mission__calibration_length_m": 0.0, **overrides})  # type: ignore[arg-type]
+
+
+def fault_plan(*rows: dict[str, object], section: str = "fault") -> FaultPlan:
+    """A plan of these faults, or with `section="link"` of these faults of the link."""
+    text = [
+        f"[[{section}]]\n" + "\n".join(f"{key} = {json.dumps(value)}" for key, value in row.items()) for row in rows
+    ]
+    return parse_plan("\n".join(text), "plan")
+
+
+def boot(config: Config, mirror: Mirror, seed: int = 1, plan: FaultPlan | None = None) -> Robot:
+    """A simulated robot at base that has just been switched on."""
+    return Robot(config, mirror, np.random.default_rng(seed), plan)
+
+
+def sensors_of(robot: Robot) -> Sensors:
+    """The frame that it delivers, decoded."""
+    message = decode_from_robot(robot.delivered_line[:-1])
+    assert isinstance(message, Sensors)
+    return message
+
+
+def drive(robot: Robot, right_rad_s: float, left_rad_s: float, frames: int) -> list[dict[str, Any]]:
+    """Drive for so many frames; the JSON lines that it delivered meanwhile."""
+    lines = b""
+    for _ in range(frames):
+        robot.rules.drive(robot.seq + 1, right_rad_s, left_rad_s, robot.t_s)
+        robot.advance()
+        lines += robot.delivered_line
+    return [json.loads(line) for line in lines.splitlines()]
+
+
+class Wire:
+    """The server's side of a connection: keeps what is sent."""
+
+    def __init__(self) -> None:
+        self.sent = b""
+        self.is_closed = False
+
+    def write(self, data: bytes) -> None:
+        assert not self.is_closed
+        self.sent += data
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+class Client:
+    """One end of a connection to a `ServedRobot`."""
+
+    def __init__(self, server: RobotServer, now_s: Callable[[], float]) -> None:
+        self.wire, self._now_s = Wire(), now_s
+        self.session: RobotSession = server.accept(self.wire, now_s())
+
+    def send(self, data: bytes) -> None:
+        self.session.receive(data, self._now_s())
+
+    def join(self, role: str = "controller") -> None:
+        self.send(json.dumps({"type": "join", "role": role, "client": "test"}).encode() + b"\n")
+
+    def drive(self, seq: int, ack: int, right: float = 3.0, left: float = 3.0) -> None:
+        self.send(b'{"type":"drive","seq":%d,"ack":%d,"wr":%f,"wl":%f}\n' % (seq, ack, right, left))
+
+    def permit(self, seq: int, ack: int, allowed: bytes = b"true") -> None:
+        line = b'{"type":"permit","seq":%d,"ack":%d,"forward":%b,"reverse":%b,"turn":%b}\n'
+        self.send(line % (seq, ack, allowed, allowed, allowed))
+
+    @property
+    def messages(self) -> list[dict[str, Any]]:
+        """Everything received since the last call."""
+        lines, self.wire.sent = self.wire.sent.splitlines(), b""
+        return [json.loads(line) for line in lines]
+
+    @property
+    def kinds(self) -> list[str]:
+        return [m["type"] if m["type"] != "sensors" else str(m["seq"]) for m in self.messages]
+
+
+class ServedRobot:
+    """A robot server on a clock of its own, and its clients; nothing waits."""
+
+    def __init__(
+        self,
+        config: Config,
+        mirror: Mirror,
+        *,
+        lockstep: bool = True,
+        key: bytes | None = None,
+        plan: FaultPlan | None = None,
+    ) -> None:
+        self.now_s = 1000.0
+        self.notes: list[str] = []
+        self.frames = 0
+        self.robot = boot(config, mirror, plan=plan)
+        self.server = RobotServer(
+            self.robot,
+            lockstep=lockstep,
+            boot=417,
+            key=key,
+            make_nonce=lambda: "0123456789abcdef" * 2,
+            now_s=self.now_s,
+            note=self.notes.append,
+            on_frame=self._count,
+        )
+
+    def _count(self) -> None:
+        self.frames += 1
+
+    def client(self, first: bytes = b"") -> Client:
+        client = Client(self.server, lambda: self.now_s)
+        if first:
+            client.send(first)
+        return client
+
+    def run(self, seconds: float) -> None:
+        """Let the wall clock go on."""
+        end = self.now_s + seconds
+        while self.server.next_frame_s <= end:
+            self.now_s = self.server.next_frame_s
+            self.server.tick(self.now_s)
+        self.now_s = end
