@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 _EMERGENCY_ID = "6f1c3c1e-5a0f-4d0e-9f2b-0c8f5b6a7d11"
-_SETTLING_S = 0.5  # what the other processes write in the background is on the disk by then
+_SETTLING_S = 3.0  # the recorder writes after a second at the latest; what is written survives the end by ``kill -9``
 _REPLY_S = 10.0
 _PAUSE_S = 1.0  # the reply comes when the robot is at rest, which takes frames: longer than it takes to be received
 
