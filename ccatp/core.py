@@ -80,7 +80,7 @@ class PanelPose(msgspec.Struct, frozen=True):
 
 
 class DeckPose(msgspec.Struct, frozen=True):
-    """Pose in the deck frame: (x, y) of the robot's origin and its heading.
+    """Pose of the robot's origin in the deck frame.
 
     ``heading_rad`` is measured in the local tangent plane from the tangent of the line y = const (towards +x).
     """
@@ -92,12 +92,9 @@ class DeckPose(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """A multilaterated position of the puck.
+    """A multilaterated position of the puck, world frame.
 
-    Attributes:
-        position_m: puck centre in the world frame, shape (3,).
-        covariance_m2: 3 x 3 covariance in the world frame, row-major, length 9.
-        dop: position dilution of precision, sqrt(trace((J^T J)^-1)), dimensionless.
+    ``covariance_m2`` is 3 x 3, row-major; ``dop`` is sqrt(trace((J^T J)^-1)), dimensionless.
     """
 
     t_s: float
@@ -141,13 +138,11 @@ class Verdict(msgspec.Struct, frozen=True):
     """What the danger loop says about one sensor frame.
 
     Attributes:
-        seq: the sensors frame judged.
-        cause: why, in one short phrase; empty when normal.
-        signal: the signal that gave cause (``"front_left"``, ``"estimate"``, ``"emergency:fire"``), or empty.
+        signal: what gave ``cause`` (``"front_left"``, ``"estimate"``, ``"emergency:fire"``), or empty.
         value: the signal's value in the unit of ``limit``.
         off: for each edge sensor whether it takes part in a declared edge.
-        severity: how grave what gave cause is. An edge has none: what to do about it is in its code and permits.
-        raised: how many emergencies have been raised so far, while one is latched; another number is another one.
+        severity: of what gave cause; NONE for an edge, whose reaction is in code and permits.
+        raised: number of emergencies raised so far while one is latched.
         is_shaking: an earthquake is latched, whatever else gave code and cause.
     """
 
@@ -194,13 +189,9 @@ class StopKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """One stop of a path.
+    """One stop of a path: where the robot's origin shall stand, deck frame.
 
-    Attributes:
-        x_m, y_m: where the robot's origin shall stand, deck frame.
-        point: the measurement point, where ``kind`` is ``MEASURE``.
-        reverse: the leg that ends here is driven backwards (the heading points away from the stop).
-        heading_rad: deck heading to turn to after arriving, where one is asked for (at base).
+    ``reverse``: the leg that ends here is driven backwards. ``heading_rad``: deck heading to turn to after arriving.
     """
 
     x_m: float
@@ -222,14 +213,7 @@ class EmergencyKind(StrEnum):
 
 
 def wrap_pi(angle_rad: float) -> float:
-    """Wrap an angle to [-pi, pi).
-
-    Args:
-        angle_rad: any finite angle, rad.
-
-    Returns:
-        The same direction in [-pi, pi), rad.
-    """
+    """The same direction in [-pi, pi), rad."""
     return (angle_rad + pi) % tau - pi
 
 
@@ -253,14 +237,7 @@ def rotate(x_m: float, y_m: float, angle_rad: float) -> tuple[float, float]:
 
 
 def wheel_rates(twist: Twist, wheel_radius_m: float, wheel_base_m: float) -> tuple[float, float]:
-    """Inverse kinematics, eq. 3.3: wheel angular rates for a velocity of the robot's origin.
-
-    Args:
-        twist: forward speed (m/s) and angular rate (rad/s).
-
-    Returns:
-        (right, left) wheel rates, rad/s.
-    """
+    """Inverse kinematics, eq. 3.3: wheel rates (right, left), rad/s, for a velocity of the robot's origin."""
     half = 0.5 * wheel_base_m * twist.omega_rad_s
     return (twist.v_m_s + half) / wheel_radius_m, (twist.v_m_s - half) / wheel_radius_m
 
@@ -288,11 +265,9 @@ _UNITS = {
 
 
 def danger_text(cause: str, signal: str, value: float, limit: float) -> str:
-    """``estimate stale: 0.31 s (limit 0.15 s)``.
+    """One line such as ``estimate stale: 0.31 s (limit 0.15 s)``.
 
-    Args:
-        signal: what gave cause; it is named where the cause does not.
-        value, limit: in the unit of the signal; a limit of 0 is none.
+    A limit of 0 is none, a signal that ``cause`` names is left out.
     """
     named = signal.replace("_", " ")
     where = "" if not named or named in cause or signal.startswith("emergency") else f" ({named})"

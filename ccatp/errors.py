@@ -17,10 +17,7 @@ class ExitStatus(IntEnum):
 
 
 class CcatpError(Exception):
-    """An expected end: ``str(error)`` is one line that says what is wrong and what to do.
-
-    Subclasses set ``exit_status``.
-    """
+    """An expected end with an ``exit_status``: ``str(error)`` is one line that says what is wrong and what to do."""
 
     exit_status: int = ExitStatus.HELD
 
@@ -29,11 +26,7 @@ class CcatpError(Exception):
 
 
 class ConfigError(CcatpError):
-    """A configuration that cannot be used.
-
-    Args:
-        problems: one line each, ``file:line: key: what is wrong; what to do``. The first is the message.
-    """
+    """An unusable configuration; ``problems``: one line each, ``file:line: key: what is wrong; what to do``."""
 
     exit_status = ExitStatus.USAGE
 

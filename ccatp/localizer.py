@@ -104,11 +104,9 @@ def build_localizer(
     wrap: Callable[[Filter], Filter] = lambda filter_: filter_,
     start: PanelPose | None = None,
 ) -> Localizer:
-    """The localizer for ``run.filter``, the robot standing at base or at ``start``.
+    """The localizer for ``run.filter``, the robot at base or at ``start``; ``wrap`` is put around the filter.
 
-    Args:
-        wrap: what to put around the filter, for those who want to look on.
-        start: where the robot stands, as well as ``localizer.start_..._sigma`` says.
+    ``start`` is as well known as ``localizer.start_..._sigma`` says.
     """
     name = cfg.run.filter
     start = mirror.base_panel_pose if start is None else start
@@ -131,13 +129,7 @@ def build_doubting(
     sigmas: tuple[float, float],
     wrap: Callable[[Filter], Filter] = lambda filter_: filter_,
 ) -> Localizer:
-    """The localizer for ``run.filter``, the robot standing where it was seen last.
-
-    Args:
-        pose: where that was, deck frame.
-        sigmas: standard deviations of place (m) and heading (rad).
-        wrap: as in ``build_localizer``.
-    """
+    """The localizer for ``run.filter`` at a deck ``pose`` seen last, with sigmas of place (m) and heading (rad)."""
     start = {"start_position_sigma_m": sigmas[0], "start_heading_sigma_rad": sigmas[1]}
     doubting = cfg.model_copy(update={"localizer": cfg.localizer.model_copy(update=start)})
     return build_localizer(doubting, mirror, wrap, mirror.panel_pose(mirror.nearest_panel(pose.x_m, pose.y_m), pose))

@@ -1,4 +1,1 @@
-"""Waypoint tracking of the survey robot: profiles, PID, the leg tracker, and the velocity gate before the wheels.
-
-All functions are pure; time is an argument. Exports ``LegTracker``, ``DriveGate``, ``CommandPredictor``.
-"""
+"""Waypoint tracking of the survey robot: profiles, PID, leg tracker, velocity gate. Pure; time is an argument."""

@@ -1,10 +1,7 @@
-"""The last gate before the wheels: every drive goes through it; it denies by default.
+"""The last gates before the wheels and the fans; they deny by default.
 
-What stands in the way is told by a reason. The danger loop denies for its own reasons by its permit; the gate trusts
-neither the mission nor the verdict's flags alone: a verdict that names an edge sensor bars that direction whatever its
-permits say, and a survey moves under a normal verdict only.
-
-The last gate before the fans: on an overhanging mirror no command below the floor gets out.
+The velocity gate trusts neither the mission nor the verdict's flags alone: a verdict that names an edge sensor bars
+that direction whatever its permits say, and a survey moves under a normal verdict only.
 """
 
 from enum import Enum, StrEnum
@@ -51,15 +48,9 @@ class Denial(StrEnum):
 class DriveGate:
     """Turns a wanted twist into wheel rates that are finite, limited and permitted, or into zero.
 
-    Args:
-        wheel_lag_s: time constant of the wheel servo; the feed-forward may step the set point by T times the
-            acceleration limit.
-        verdict_timeout_s: a verdict that is this far from the frame in time is none.
-        frame_timeout_s: no decision is made on a frame older than this.
-
-    Attributes:
-        denied: how often each reason stood in the way.
-        denial: the reason of the last call; None where the drive was passed or nothing was wanted.
+    ``wheel_lag_s`` is the time constant T of the wheel servo: the feed-forward may step the set point by T times the
+    acceleration limit. No decision is made on a verdict or a frame older than its timeout. ``denied`` counts each
+    reason; ``denial`` is that of the last call, None where the drive was passed or nothing was wanted.
     """
 
     def __init__(
@@ -91,12 +82,10 @@ class DriveGate:
     def pass_through(
         self, wanted: Twist, verdict: Verdict | None, dt_s: float, t_s: float, age_s: float, purpose: Purpose
     ) -> tuple[float, float]:
-        """Wheel rates (right, left), rad/s, for the wanted twist, as far as it may be driven.
+        """Permitted wheel rates (right, left), rad/s, for the wanted twist.
 
-        Args:
-            verdict: the danger loop's verdict in force; ``None`` when there is none fresh enough.
-            t_s: robot time of the frame that is answered.
-            age_s: how old that frame is.
+        ``t_s`` is the robot time of the answered frame, ``age_s`` its age; ``verdict`` is None when there is no fresh
+        one.
         """
         v, omega = wanted.v_m_s, wanted.omega_rad_s
         if v == 0.0 and omega == 0.0:
@@ -159,11 +148,7 @@ def _slewed(last: float, wanted: float, step: float, limit: float) -> float:
 
 
 class FanGate:
-    """Refuses duties that are none, or that would drop the robot.
-
-    Args:
-        floor: least duty of each fan where the mirror overhangs; 0 elsewhere.
-    """
+    """Refuses duties that are not numbers, or below ``floor``, the least duty where the mirror overhangs."""
 
     def __init__(self, floor: float) -> None:
         self._floor = floor

@@ -1,7 +1,4 @@
-"""A frame as the monitors look at it: how far wheels and gyroscope say that the robot moved, and since when.
-
-Which readings of the inertial unit can be believed: range, agreement with the wheels, noise.
-"""
+"""Motion sums of wheels and gyroscope over frames, and which readings of the inertial unit are plausible."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -13,11 +10,7 @@ from ccatp.core import ImuSample, WheelSample
 
 
 class MotionSum(NamedTuple):
-    """Running sums since the start, at one time.
-
-    Attributes:
-        turned_rad: what the gyroscope has turned by, as far as it could be believed.
-    """
+    """Running sums since the start; ``turned_rad`` is the turn by the gyroscope, where it was plausible."""
 
     t_s: float
     right_m: float
@@ -51,11 +44,9 @@ class SlidingWindow:
 
 
 class WheelMeans:
-    """The mean rates of the wheels over a frame, and the yaw rate that they mean, smoothed.
+    """Mean wheel rates over a frame (``None`` for a wheel without samples), and the smoothed yaw rate.
 
-    Attributes:
-        right_rad_s, left_rad_s: means over the last frame; ``None`` for a wheel that gave no sample.
-        yaw_rad_s: smoothed over some frames, because a count of an encoder is a jump of its rate.
+    The yaw rate is smoothed over some frames, because a count of an encoder is a jump of its rate.
     """
 
     _SMOOTH_S = 0.05
@@ -112,18 +103,15 @@ _STILL_RAD_S = 0.02  # yaw rate of wheels that stand
 
 
 class ImuGate:
-    """Leaves out the inertial unit while its readings are impossible.
+    """Leaves out the inertial unit while its readings are impossible, and for a quarantine afterwards.
 
     * An acceleration or an angular rate beyond what the robot can do.
-    * An angular rate that jumps away from what the wheels do. One that glides away from it, or has been elsewhere all
-      along, may be right, and the wheels' encoders wrong: that is for ``ccatp.safety.wheel_monitors`` to find.
+    * An angular rate that jumps away from the wheels'. One that drifts away from it, or was different all along, may be
+      right and the encoders wrong: ``ccatp.safety.wheel_monitors`` decides that.
     * A reading that repeats itself exactly: a unit that has shown noise at rest never does. One without noise may.
 
-    After an impossible reading the unit stays out for the quarantine, because garbage is plausible now and then.
-
-    Attributes:
-        cause: why the unit is out, or empty.
-        out_since_s: since when; infinite while it is believed.
+    The quarantine is needed because garbage is plausible now and then. ``cause`` is empty and ``out_since_s`` infinite
+    while the unit is used.
     """
 
     def __init__(self, cfg: HealthConfig) -> None:
@@ -143,11 +131,7 @@ class ImuGate:
         self.out_since_s = inf
 
     def admit(self, samples: Sequence[ImuSample], yaw_rad_s: float) -> Sequence[ImuSample]:
-        """The samples that can be believed.
-
-        Args:
-            samples: of a frame, oldest first.
-        """
+        """The usable ones of a frame's samples, oldest first: all or none."""
         limit = self._rate + self._share * (yaw_rad_s if yaw_rad_s >= 0.0 else -yaw_rad_s)
         is_good = True
         for t_s, ax, wz in samples:
@@ -171,7 +155,6 @@ class ImuGate:
         return samples if is_good else ()
 
     def _compare(self, ax: float, wz: float, yaw_rad_s: float) -> None:
-        """Learn at rest whether the unit has noise."""
         if -_STILL_RAD_S < yaw_rad_s < _STILL_RAD_S and ax != self._ax and wz != self._wz:
             self._different += 1
             self._is_noisy = self._is_noisy or self._different >= self._identical

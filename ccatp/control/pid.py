@@ -1,9 +1,4 @@
-"""One quantity brought to zero: along a profile with feed-forward, or by the thesis's bare PID.
-
-PID controller, thesis eq. 3.4, in seconds.
-
-Rest-to-rest set points of bounded speed and acceleration; time is an argument.
-"""
+"""One quantity brought to zero: along a profile with feed-forward, or by the thesis's PID (eq. 3.4, in seconds)."""
 
 from math import copysign, exp, sqrt
 from typing import NamedTuple, Protocol
@@ -17,10 +12,6 @@ class Pid:
     Departures from the thesis: the gains act on SI units and seconds (the thesis does not give its unit of time), the
     derivative is low-pass filtered (``derivative_filter_s``), and the integral neither grows past its own limit nor
     while the output is saturated in its direction (anti-windup by conditional integration).
-
-    Args:
-        gains: Kp (1/s for a distance), Ki, Kd and the limits.
-        output_limit: largest magnitude of the output, in its unit.
     """
 
     def __init__(self, gains: PidConfig, output_limit: float) -> None:
@@ -37,14 +28,7 @@ class Pid:
         self._last_error: float | None = None
 
     def step(self, error: float, dt_s: float) -> float:
-        """One control step.
-
-        Args:
-            dt_s: time since the last step, > 0.
-
-        Returns:
-            The output, within the output limit.
-        """
+        """The output within its limit, ``dt_s`` > 0 after the last step."""
         if dt_s <= 0.0:
             raise ValueError(f"dt of a control step must be positive, got {dt_s} s")
         if self._kd and self._last_error is not None:
@@ -64,13 +48,9 @@ class Pid:
 
 
 class Profile(NamedTuple):
-    """Trapezoidal profile from rest to rest over a signed distance (m or rad).
+    """Trapezoidal profile from rest to rest over a signed distance (m or rad), time-optimal under both limits.
 
-    It is the time-optimal motion under the two limits: accelerate, cruise where there is room, decelerate.
-
-    Attributes:
-        peak: largest speed reached, with the sign of the distance.
-        cruise_s: duration at ``peak``.
+    ``peak`` is the largest speed, signed as the distance; ``cruise_s`` the duration at it.
     """
 
     distance: float
@@ -152,11 +132,7 @@ class ControlAxis(Protocol):
 
 
 class BareAxis:
-    """The PID of the remaining quantity itself, thesis eqs 3.1 to 3.4.
-
-    Args:
-        v_max, a_max: limits, in the quantity's unit per s and per s^2; the second only for the bang-bang time.
-    """
+    """PID of the remaining quantity, thesis eqs 3.1 to 3.4; ``a_max`` only serves the bang-bang time."""
 
     def __init__(self, gains: PidConfig, v_max: float, a_max: float) -> None:
         self._pid = Pid(gains, v_max)
@@ -187,11 +163,7 @@ class ProfiledAxis:
     ff takes the servo's lag T out, so that the error obeys T e'' + (1 + Kd) e' + Kp e = 0. s is the share by which the
     wheels travel further than the body: it acts in proportion to the planned speed and is gone at the end, where an
     ordinary integral would still have to unwind. Kp e is bounded; where a plan ends further off than that brings home
-    in time, a second motion follows.
-
-    Args:
-        gains: Kp and Kd of the shaped set; the derivative is the speed's own estimate, never a difference of poses.
-        v_max, a_max: limits of the profile, in the quantity's unit per s and per s^2.
+    in time, a second motion follows. The derivative is the speed's own estimate, never a difference of poses.
     """
 
     def __init__(self, gains: PidConfig, cfg: ControlConfig, v_max: float, a_max: float, lag_s: float) -> None:

@@ -1,6 +1,6 @@
 """Where the robot will be when a command sent now takes effect.
 
-The delay is counted in the sequence numbers of the drives; no clock takes part.
+The delay is counted in drive numbers, not by a clock.
 """
 
 from collections import deque
@@ -17,10 +17,10 @@ REACH_S = 0.25
 
 
 class CommandPredictor:
-    """Rolls a frame's estimate forward over the commands that are still on their way to the wheels.
+    """Carries a frame's estimate forward over the commands that are on their way to the wheels.
 
-    A frame tells which drive was in force last and for how long. The drives sent after it follow one per frame. Each
-    wheel is a first-order servo, so with a set point u over t
+    The echo tells which drive was in force last and for how long; those sent after it follow one per frame. Each wheel
+    is a first-order servo, so with a set point u over t
 
         v(t) = u + (v - u) exp(-t/T),    mean = u + (v - u) (T/t) (1 - exp(-t/T)),
 
@@ -58,12 +58,9 @@ class CommandPredictor:
     ) -> Predicted:
         """The state in which the next command will find the robot.
 
-        Args:
-            pose: (x, y, heading) at the time of the frame, m and rad, in any plane.
-            echo_seq: number of the drive in force then; -1 = none.
-            echo_age_s: how long it had been; less than a frame is still to act for the rest of one.
-            is_held: the robot held its wheels by its own rules: they run down, whatever has been sent.
-            creep: drift per metre of travel in the plane of ``pose``.
+        ``pose`` is (x, y, heading) in any plane, ``creep`` the drift per metre in it. ``echo_seq`` is the drive in
+        force (-1: none) and ``echo_age_s`` its age; ``is_held``: the robot holds its wheels whatever was sent, and they
+        run down.
         """
         sent, frame_s = self._sent, self._frame_s
         while len(sent) > 1 and sent[1][0] <= echo_seq:

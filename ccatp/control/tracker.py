@@ -1,7 +1,4 @@
-"""Turn-and-move waypoint tracking, thesis 3.3.1 and fig. 3.3.
-
-The line of a leg: where the robot stands beside it, and the rate that brings it back.
-"""
+"""Turn-and-move waypoint tracking, thesis 3.3.1 and fig. 3.3."""
 
 from enum import StrEnum
 from math import asin, atan2, cos, hypot, pi, sin, sqrt
@@ -18,9 +15,8 @@ CREEP_LIMIT = 0.3
 class LegView(NamedTuple):
     """The line as seen from the robot.
 
-    Attributes:
-        beside_m: how far to the left of the line the robot stands.
-        gain: progress along the line per metre that the wheels drive.
+    ``beside_m``: how far the robot stands to the left of it; ``gain``: progress along it per metre that the wheels
+    drive.
     """
 
     ahead_m: float
@@ -30,14 +26,11 @@ class LegView(NamedTuple):
 
 
 class LegLine:
-    """The straight line through the stop along which a leg is driven.
+    """The straight line through the stop along which a leg is driven, held by its course alone.
 
-    It is held by its course alone, so it passes through the stop wherever an update moves that. A stop whose
-    coordinates change is one seen in another frame: from afar the line is then laid anew from the robot to the stop;
-    near by it keeps its angle to the robot, because the bearing of a near stop is noise.
-
-    Args:
-        lookahead_m: nearer than this a stop's bearing is not to be trusted.
+    So it passes through the stop wherever an update moves that. A stop whose coordinates change is one seen in another
+    frame: from afar the line is laid again from the robot to the stop; nearer than ``lookahead_m`` it keeps its angle
+    to the robot, because the bearing of a near stop is noise.
     """
 
     __slots__ = ("_cos", "_course_rad", "_lookahead_m", "_off_rad", "_reverse", "_sin", "_target")
@@ -58,13 +51,10 @@ class LegLine:
     def look(
         self, pose: tuple[float, float, float], target: tuple[float, float], creep: tuple[float, float]
     ) -> LegView:
-        """Where the robot stands.
+        """Where the robot at ``pose`` = (x, y, heading) stands.
 
         The body moves along its axis m and drifts by c per metre: (m + c) lies along the line when the part of m across
         it cancels that of c, ``sin(crab) = -c_across``; progress is ``cos(crab) + c_along``.
-
-        Args:
-            pose: (x, y, heading), m and rad.
         """
         x, y, heading = pose
         motion = heading + pi if self._reverse else heading
@@ -100,10 +90,8 @@ def line_rate(sight: LegView, v_m_s: float, cross_gain_rad_m2: float, heading_we
 
         omega = -g v e - sqrt(w + 2 g v^2) theta.
 
-    The weight of e grows with the speed: a robot that has all but stopped cannot remove it, and would only turn.
-
-    Args:
-        cross_gain_rad_m2: g; the error decays over about 1/sqrt(g) of travel.
+    The weight of e grows with the speed: a robot that has all but stopped cannot remove it, and would only turn. With
+    g = ``cross_gain_rad_m2`` the error decays over about 1/sqrt(g) of travel.
     """
     gain = cross_gain_rad_m2 * v_m_s
     return -gain * sight.beside_m - sqrt(heading_weight_1_s2 + 2.0 * gain * v_m_s) * sight.off_rad
@@ -144,9 +132,9 @@ class Speeds(Protocol):
 class LegTracker:
     """Drives one leg: turn in place to the bearing of the target, then move to it, forward or in reverse.
 
-    All poses are in one plane (the panel frame); the frame may change from step to step as long as pose and target
-    change together. A shaped set of gains drives along the line from where the drive begins; the thesis's heads for the
-    stop itself.
+    Pose, target and creep (drift per metre of travel) are in one plane, usually the panel frame, which may change from
+    step to step. A shaped set of gains drives along the line from where the drive begins; the thesis's heads for the
+    stop.
     """
 
     def __init__(self, control: ControlConfig, limits: LimitsConfig, wheel_lag_s: float) -> None:
@@ -179,13 +167,7 @@ class LegTracker:
         reverse: bool,
         creep: tuple[float, float] = NO_CREEP,
     ) -> None:
-        """Start a leg.
-
-        Args:
-            pose: (x, y, heading), m and rad.
-            target: (x, y), m.
-            creep: drift (dx, dy) per metre of travel.
-        """
+        """Start a leg from ``pose`` = (x, y, heading)."""
         self._reverse = reverse
         if hypot(target[0] - pose[0], target[1] - pose[1]) <= self._position_tolerance_m:
             self.phase = DONE  # it is there, and the bearing of a stop so near is noise
@@ -221,13 +203,7 @@ class LegTracker:
         speeds: Speeds | None = None,
         creep: tuple[float, float] = NO_CREEP,
     ) -> Twist:
-        """One step of the leg: the twist for the next ``dt_s``; ``phase`` tells what it is at.
-
-        Args:
-            pose: (x, y, heading) when the twist will take effect, m and rad.
-            target: (x, y) in the same plane, m.
-            creep: drift (dx, dy) per metre of travel in the same plane.
-        """
+        """Twist for the next ``dt_s``; ``pose`` is that at which it will take effect."""
         if self.phase is TURN:
             angle = self._bearing_error(pose, target, creep)
             rate = None if speeds is None else speeds.omega_rad_s
@@ -247,10 +223,7 @@ class LegTracker:
         self._angular.begin(angle_rad)
 
     def _has_run_away(self, pose: tuple[float, float, float], target: tuple[float, float], angle_rad: float) -> bool:
-        """Whether a stop that is all but reached lies on another bearing than the one that the turn began for.
-
-        In another frame there is another aim.
-        """
+        """Whether a stop that is all but reached lies on another bearing than the turn began for (same frame)."""
         if hypot(target[0] - pose[0], target[1] - pose[1]) > ALL_BUT_THERE_M:
             return False
         aimed_at, heading_rad = self._aim
@@ -284,7 +257,6 @@ class LegTracker:
         speeds: Speeds | None,
         creep: tuple[float, float],
     ) -> Twist:
-        """Along the line; at its end the along-track remainder is corrected for a bounded time, and no other."""
         control, axis = self._control, self._along
         sight = self._line.look(pose, target, creep)
         sign = -1.0 if self._reverse else 1.0

@@ -1,4 +1,1 @@
-"""Estimation of the robot's pose on the mirror: the thesis's localizer and the full-state estimator.
-
-``ccatp.localizer`` chooses between them. Imports nothing of ``ccatp.safety``: the two processes must not share a fault.
-"""
+"""The robot's pose on the mirror: thesis localizer and full-state estimator. Imports nothing of ``ccatp.safety``."""

@@ -1,9 +1,4 @@
-"""What a fix of the puck says about the robot: its position in a panel frame and how well it is known.
-
-What a fix of the puck says of the full state, and the state that begins anew from one.
-
-How well the position is known: one standard deviation for every direction on the surface.
-"""
+"""What a fix of the puck says about the robot's position and the full state, and how well the position is known."""
 
 from math import isfinite, sqrt
 from typing import NamedTuple
@@ -28,12 +23,9 @@ class FixGated(FixRefused):
 
 
 class DeckFoot(NamedTuple):
-    """Where the robot's origin stood when a fix was taken.
+    """Where the robot's origin stood when a fix was taken, deck frame; covariance (2, 2).
 
-    Attributes:
-        x_m, y_m: deck frame.
-        covariance_m2: of the two, shape (2, 2).
-        deviation_m: height of the surface there above the ideal one.
+    Deviation from the ideal height.
     """
 
     x_m: float
@@ -43,12 +35,7 @@ class DeckFoot(NamedTuple):
 
 
 class Foot(NamedTuple):
-    """Where the robot's origin stood when a fix was taken.
-
-    Attributes:
-        x_m, y_m: in the panel frame.
-        deviation_m: height of the surface there above the ideal one.
-    """
+    """Where the robot's origin stood when a fix was taken, panel frame; deviation from the ideal height."""
 
     x_m: float
     y_m: float
@@ -57,11 +44,7 @@ class Foot(NamedTuple):
 
 
 def check_fix(fix: Fix, oldest_s: float, newest_s: float) -> None:
-    """Refuse a fix that is not finite or of a time for which the robot's path is not known.
-
-    Raises:
-        FixRefused: with the numbers.
-    """
+    """Raises ``FixRefused`` for a fix that is not finite or of a time for which the robot's path is not known."""
     if not all(isfinite(v) for v in (fix.t_s, *fix.position_m, *fix.covariance_m2)):
         raise FixRefused(f"fix is not finite: {fix.position_m} m at {fix.t_s} s")
     if not oldest_s <= fix.t_s <= newest_s:
@@ -72,10 +55,8 @@ def foot_of_fix(mirror: Mirror, fix: Fix, puck_height_m: float, panel: PanelId) 
     """Foot of the puck on the surface, in the frame of ``panel``.
 
     The puck stands ``puck_height_m`` above the robot's origin along the surface normal. Of the fix's covariance only
-    the part along the surface counts: half its trace without the normal's share.
-
-    Raises:
-        FixRefused: the position is far from the mirror, or its covariance has no positive part along the surface.
+    the part along the surface counts: half its trace without the normal's share. Raises ``FixRefused`` far from the
+    mirror, or where the covariance has no positive part along the surface.
     """
     try:
         x, y, deviation = mirror.foot_of_puck(fix.position_m, puck_height_m)
@@ -94,10 +75,7 @@ def deck_foot(mirror: Mirror, fix: Fix, puck_height_m: float) -> DeckFoot:
     """Foot of the puck on the surface, deck frame, with its whole covariance along the surface.
 
     An error along the normal leaves the foot where it is, so the fix's covariance is projected along the normal on the
-    deck plane: ``J = [[1, 0, -nx/nz], [0, 1, -ny/nz]]``, ``J R^T C R J^T``.
-
-    Raises:
-        FixRefused: the position is far from the mirror, or its covariance has no positive part along the surface.
+    deck plane: ``J = [[1, 0, -nx/nz], [0, 1, -ny/nz]]``, ``J R^T C R J^T``. Raises ``FixRefused`` as ``foot_of_fix``.
     """
     try:
         x, y, deviation = mirror.foot_of_puck(fix.position_m, puck_height_m)
@@ -118,12 +96,11 @@ _UNKNOWN_SPEEDS = 0.1**2, 0.5**2, 1.0**2  # variances of v, a, w of a robot of w
 
 
 def fix_row(z: FloatArray, mean: FloatArray, slope: Slope, late_s: float) -> tuple[FloatArray, FloatArray]:
-    """Residual (2,) and row of the measurement model (2, n) of a position.
+    """Residual (2,) and row (2, n) of the measurement model of a deck position ``z`` (2,), m.
 
-    Args:
-        z: the robot's origin by the puck, deck, m, shape (2,).
-        mean: the state, shape (n,).
-        late_s: by how much the state is later than the position; V and W held meanwhile.
+    The state is ``late_s`` later.
+
+    V and W are taken as constant meanwhile.
     """
     H = np.zeros((2, STATES))
     H[0, X] = H[1, Y] = H[0, TX] = H[1, TY] = 1.0
@@ -151,16 +128,10 @@ def begun_anew(
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (n,) and covariance (n, n) of a state whose position was wrong; wheel angles count from here.
 
-    The heading loses its certainty, not its value. The way since the position was measured is taken from the estimate
-    that was wrong: wrong about where it began, not about what the wheels did.
-
-    Args:
-        mean: the wrong state, shape (n,).
-        covariance: of it, shape (n, n).
-        residual: of the position, shape (2,); see ``fix_row``.
-        variance: covariance of the position, m^2, shape (2, 2).
-        tilt_variance_m2: of what the panel's tilt does to the puck's place, each way.
-        is_lost: the filter has stood still meanwhile; the speeds are not known either.
+    The heading loses its certainty, not its value. The way since the position was measured is taken from the wrong
+    estimate: wrong about where it began, not about what the wheels did. ``residual`` (2,) and ``variance`` (2, 2), m^2,
+    are of the position; ``tilt_variance_m2`` is what the panel's tilt does to the puck's place, each way; ``is_lost``:
+    the filter has stood still meanwhile, and the speeds are not known either.
     """
     x, P = mean.copy(), covariance.copy()
     heading_rad2 = float(P[PSI, PSI]) + heading_variance_rad2

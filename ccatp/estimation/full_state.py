@@ -29,27 +29,18 @@ _SHORTEST_LEG_M, _LARGEST_DOUBT_RAD = 0.02, 0.5  # of a heading, from where a le
 
 
 class _Moved(NamedTuple):
-    """Usable samples of a frame: of the inertial unit, and the rates of the right and of the left wheel."""
-
     imu: Sequence[ImuSample]
     rates_rad_s: tuple[Sequence[float], Sequence[float]]
 
 
 class FullStateLocalizer(LocalizerBase[_Moved]):
-    """Estimates pose, speeds, sensor errors, slip and creep with one filter (``survey_model``), deck frame.
+    """Estimates pose, speeds, sensor errors, slip and creep with one filter of ``STATES`` states, deck frame.
 
     Frames are gathered into blocks; the filter takes a block in one step, and dead reckoning carries the pose from
     frame to frame in between. A transition of an edge sensor ends a block and is a line at a panel's edge; a fix of the
     puck is a position. Both correct the whole state through its covariance, so two fixes in a row give the heading. At
     true rest the speeds are zero and the inertial unit shows its biases. When the robot drives off, slip and creep are
-    drawn from what the legs so far showed.
-
-    Args:
-        filter_: an extended or unscented filter of ``STATES`` states; re-initialised here.
-        start: pose at the first frame, at rest.
-
-    Attributes:
-        fix_deviation_m: how far the last fix was above the ideal surface.
+    drawn from what the legs so far showed. ``fix_deviation_m``: height of the last fix above the ideal surface.
     """
 
     def __init__(
@@ -174,7 +165,6 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
         self._turned = (0.0, 0.0)
 
     def _take_wheels(self, t_s: float, encoders: Sequence[WheelSample]) -> tuple[Sequence[float], Sequence[float]]:
-        """Add up the wheels' angles; the rates that went into them, right and left."""
         columns = self._intake.columns(t_s, encoders) if encoders else ((), (), ())
         if columns is not None:
             times, right, left = columns
@@ -189,7 +179,6 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
         return rates
 
     def _stay(self, t_s: float, dt_s: float, taken: _Moved, gravity: GravitySample | None) -> None:
-        """A frame at rest."""
         imu = taken.imu
         for wheel, found in zip((self._right, self._left), taken.rates_rad_s, strict=True):
             wheel.rest(found)
@@ -203,7 +192,6 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
     def _go(
         self, t_s: float, dt_s: float, imu: Sequence[ImuSample], edges: Sequence[EdgeSample], *, is_still: bool
     ) -> None:
-        """A frame in motion, or not yet at rest for certain."""
         rest = self._rest
         if rest.is_resting:
             self._use_rest(t_s - dt_s)
@@ -266,17 +254,10 @@ class FullStateLocalizer(LocalizerBase[_Moved]):
     # -- fixes --------------------------------------------------------------------------------------------------------
 
     def fuse_fix(self, fix: Fix) -> float:
-        """Fuse a position of the puck at the time it was taken.
+        """Fuse a position of the puck at the time it was taken; returns how far the pose jumped, m.
 
-        Args:
-            fix: position and covariance of the puck, world frame.
-
-        Returns:
-            How far the pose jumped, m.
-
-        Raises:
-            FixGated: it contradicts the estimate, and not yet often enough to be right all the same.
-            FixRefused: not finite, too old, from the future, or far from the mirror. The pose is unchanged by both.
+        Raises ``FixGated``: it contradicts the estimate, and not often enough yet to be used all the same;
+        ``FixRefused``: not finite, too old, from the future, or far from the mirror. The pose is unchanged by both.
         """
         estimate, t_s = self._estimate, self._clock.t_s
         check_fix(fix, estimate.journal.oldest_s, t_s + MAX_FRAME_STEP_S)

@@ -1,7 +1,4 @@
-"""What every localizer does with a frame before it looks inside: order of time, holds, divergence.
-
-The panel under the robot, and poses in its frame.
-"""
+"""What every localizer does with a frame: order of time, holds, divergence, the panel under the robot."""
 
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -20,15 +17,11 @@ Taken = TypeVar("Taken")
 
 
 class LocalizerBase(ABC, Generic[Taken]):
-    """Admits frames in their order, asks to hold where they or the filter go wrong.
+    """Admits frames in order of time, and asks to hold when time or the filter go wrong.
 
-    Args:
-        history_s: samples older than this before their frame are refused.
-
-    Attributes:
-        hold_cause: why the mission should hold, or empty; stays until ``clear_hold``.
-        is_frozen: the filter has diverged; the pose stands still until the next fix.
-        notices: what an operator should read; whoever reads them empties the list.
+    ``hold_cause`` stays until ``clear_hold``; ``is_frozen``: the filter has diverged, and the pose stands still until
+    the next fix; ``notices`` for the operator are removed by their reader. Samples older than ``history_s`` are
+    refused.
     """
 
     def __init__(self, history_s: float) -> None:
@@ -67,17 +60,11 @@ class LocalizerBase(ABC, Generic[Taken]):
         edges: Sequence[EdgeSample],
         gravity: GravitySample | None = None,
     ) -> None:
-        """Take one sensors frame.
+        """Take one sensors frame of robot time ``t_s``, to which the pose belongs afterwards.
 
         Any number of samples of each kind, each with its own time, oldest first. Unusable ones are dropped and counted;
-        a frame that is not newer than the last one changes nothing.
-
-        Args:
-            t_s: the frame's time, robot clock, s; the pose belongs to it afterwards.
-            imu: samples of the inertial unit since the last frame.
-            encoders: samples of the wheel encoders since the last frame.
-            edges: samples of the edge sensors since the last frame.
-            gravity: direction of gravity in the robot frame, where it was read; the thesis's localizer does without.
+        a frame that is not newer than the last one changes nothing. ``gravity``: its direction in the robot frame,
+        where it was read.
         """
         last_s, kind = self._clock.t_s, self._clock.admit(t_s)
         dt_s = t_s - last_s if kind is FrameKind.NEXT else 0.0
@@ -126,8 +113,7 @@ class LocalizerBase(ABC, Generic[Taken]):
         """Go on in a new time base that begins at ``t_s``; ``last_s`` is the end of the old one, -inf at the start."""
 
     @abstractmethod
-    def _take(self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample]) -> Taken:
-        """The usable samples of a frame; wheels are counted even while the filter is frozen."""
+    def _take(self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample]) -> Taken: ...
 
     @abstractmethod
     def _use(

@@ -1,9 +1,4 @@
-"""The measurement vector and model of thesis eqs 2.4 and 2.12, for exactly the samples that arrived.
-
-The noise of a sensor that the filter should count with, learned while the robot stands.
-
-True rest: when the wheels really stand, and what the inertial unit says meanwhile.
-"""
+"""Measurement vector and model of thesis eqs 2.4 and 2.12, process model, noise learned at rest, true rest."""
 
 from collections.abc import Sequence
 from math import atan2, sqrt
@@ -48,12 +43,9 @@ class MeasurementBuilder:
     Eq. 2.3 and 2.4 print theta_z with a row that picks theta; a gyroscope measures a rate, so omega_z of 2.12 holds.
 
     A sample taken at t_i belongs to the state q(t_i), not to q(t) at the frame's time t. Within a frame acceleration
-    and rate are taken as constant, so q(t_i) = F(t_i - t) q(t) with F of eq. 2.11 and a row h becomes h F(t_i - t):
-    every sample counts at its own time. The approximation: all process noise of the interval enters at its beginning.
-
-    Args:
-        cfg: standard deviations of single samples (thesis eq. 2.17 calls sigma a variance; its table 2.1 lists
-            standard deviations).
+    and rate are taken as constant, so q(t_i) = F(t_i - t) q(t) with F of eq. 2.11 and a row h becomes h F(t_i - t). The
+    approximation: all process noise of the interval enters at its beginning. ``cfg`` has standard deviations of single
+    samples (thesis eq. 2.17 calls sigma a variance; its table 2.1 lists standard deviations).
     """
 
     def __init__(self, robot: RobotConfig, cfg: LocalizerConfig) -> None:
@@ -68,11 +60,9 @@ class MeasurementBuilder:
     def from_pairs(self, t_s: float, imu: Sequence[ImuSample], encoders: Sequence[WheelSample]) -> Stack:
         """Stack of a frame in which every encoder sample holds both wheels, finite.
 
-        The arrays are work space: they hold until the next call.
+        Imu (t, ax, wz), encoders (t, right, left).
 
-        Args:
-            imu: accepted samples, (t, ax, wz).
-            encoders: accepted samples, (t, right, left), no None.
+        The arrays are work space: they hold until the next call.
         """
         k = len(encoders)
         stack = self._template(k, k, len(imu))
@@ -139,10 +129,8 @@ class ConstantAcceleration:
     to the end, gives q dt [[dt^2, dt], [dt, 1]] for (v, a) and for (theta, omega). The heading then moves by omega dt
     with the rate measured *during* the interval, the midpoint rule. Noise spread over the interval
     (q [[dt^3/3, dt^2/2], [dt^2/2, dt]]) would contradict those rows: the heading would lag by half a frame in a turn,
-    and its variance would grow by q dt^3/12 per frame however well the rate is measured. The thesis gives no Q.
-
-    Args:
-        cfg: densities of the jerk, (m/s^3)^2 s, and of the angular acceleration, (rad/s^2)^2 s.
+    and its variance would grow by q dt^3/12 per frame however well the rate is measured. The thesis gives no Q; the
+    densities are in (m/s^3)^2 s and (rad/s^2)^2 s.
     """
 
     def __init__(self, cfg: LocalizerConfig) -> None:
@@ -172,9 +160,6 @@ class NoiseFloor:
 
     A vibration does not drift: within a block it averages out faster than white noise does. So the variance of block
     means, times the block's length, is the part that the integral of the signal will feel.
-
-    Args:
-        variance: expected of a single sample, before anything is learned.
     """
 
     def __init__(self, variance: float) -> None:
@@ -202,12 +187,7 @@ class NoiseFloor:
 
 
 class ZeroVelocityReading(NamedTuple):
-    """Means over a rest.
-
-    Attributes:
-        samples: of the inertial unit.
-        bearing_rad: direction of gravity's part along the surface against the robot's x axis.
-    """
+    """Means over a rest; ``bearing_rad``: direction of gravity's part along the surface against the robot's x axis."""
 
     samples: int
     rate_rad_s: float
@@ -219,11 +199,8 @@ class ZeroVelocityReading(NamedTuple):
 class ZeroVelocityDetector:
     """Counts frames without wheel motion and collects the inertial unit's samples at rest.
 
-    Slow is not still: a servo that coasts to its set point passes every threshold long before it stands. Only after
-    ``rest_after_s`` without motion, several of its time constants, the robot counts as resting.
-
-    Args:
-        rest_after_s: standstill of the wheels before it counts.
+    A servo that coasts to its set point passes every threshold long before it stands. Only after ``rest_after_s``
+    without motion, several of its time constants, the robot counts as resting.
     """
 
     def __init__(self, rest_after_s: float, gyro: NoiseFloor, accelerometer: NoiseFloor) -> None:
@@ -281,11 +258,7 @@ class ZeroVelocityDetector:
 
 
 def heading_from_gravity(bearing_rad: float, slope: Slope) -> float:
-    """Deck heading of a robot that sees the downhill direction at ``bearing_rad`` against its x axis.
-
-    Args:
-        slope: of the surface under it; its downhill direction must not be zero.
-    """
+    """Deck heading of a robot that sees the downhill direction, not zero, at ``bearing_rad`` against its x axis."""
     fx, fy = slope[0], slope[1]
     s2 = 1.0 + fx * fx
     s, norm = sqrt(s2), sqrt(s2 + fy * fy)

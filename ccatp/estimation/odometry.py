@@ -1,11 +1,7 @@
-"""Dead reckoning: the arc driven in one step, and the path driven lately.
+"""Dead reckoning: the arc of one step, the path driven lately, the pose between filter steps, preintegration.
 
 The odometer's frame is arbitrary but rigid: neither a fix nor a hand-over between panels moves it, so displacements
 and turns between two recent times can be read off it whatever happened to the pose in between.
-
-The pose between two steps of the filter, carried on frame by frame from what the wheels do.
-
-Frames gathered into one step of the filter.
 """
 
 from collections import deque
@@ -30,19 +26,11 @@ class OdometryPose(NamedTuple):
 
 
 def arc_step(v_m_s: float, heading_rad: float, turn_rad: float, dt_s: float) -> tuple[float, float]:
-    """Displacement over one step at constant speed and rate.
+    """Displacement (dx, dy), m, over one step at constant speed and rate from ``heading_rad`` on.
 
     The chord of the arc: v dt sinc(turn/2) in the direction heading + turn/2. For a small step it becomes
     (v dt cos theta, v dt sin theta), which is what thesis eq. 2.14 means; the thesis prints ``v cos(theta dt)``, with
     the time step inside the cosine and missing on the speed.
-
-    Args:
-        v_m_s: mean forward speed, m/s.
-        heading_rad: heading at the beginning, rad.
-        turn_rad: turn over the step, rad.
-
-    Returns:
-        (dx, dy), m, in the frame of the heading.
     """
     half = 0.5 * turn_rad
     # Below _SMALL_RAD the series 1 - half^2/6 is exact to the last digit, and 0/0 is avoided.
@@ -54,9 +42,6 @@ class Odometer:
     """The path of the last ``history_s``, and the whole of the standstill before it.
 
     A standstill keeps two entries however long it lasts, so a fix that took its time is still found.
-
-    Args:
-        history_s: how far back the path is kept while the robot moves.
     """
 
     def __init__(self, history_s: float) -> None:
@@ -114,8 +99,7 @@ def _between(early: tuple[float, OdometryPose], late: tuple[float, OdometryPose]
 class PosePredictor:
     """Deck pose and speeds at the present frame: the filter's state at its last step, and dead reckoning since.
 
-    Same motion as ``SurveyMotion``, with slip, scale errors and ground as the filter knew them at its last step; a few
-    hundredths of a second later nothing else is worth knowing.
+    Same motion as ``SurveyMotion``, with slip, scale errors and ground as the filter knew them at its last step.
 
     The speeds come from an observer of fixed gain: the filter's acceleration carries the speed on, the wheels' travel
     corrects it by as much as their resolution is worth; the rate is the mean of wheels and gyroscope by their noise.
@@ -186,11 +170,9 @@ class PosePredictor:
 
 
 class PreintegratedMotion(NamedTuple):
-    """What some frames in a row say together.
+    """What consecutive frames say together.
 
-    Attributes:
-        rate_rad_s: mean of the inertial unit's angular rate over the block; None without samples.
-        acceleration_m_s2: mean of its acceleration from the middle of the block before to the middle of this one.
+    Mean angular rate, and mean acceleration from the middle of the block before.
     """
 
     dt_s: float
@@ -201,12 +183,11 @@ class PreintegratedMotion(NamedTuple):
 
 
 class Preintegrator:
-    """Gathers frames.
+    """Gathers frames into blocks.
 
-    Wheel angles are exact over any time, and a mean of n rates tells as much as n rates, so nothing is lost by taking
-    several frames in one step as long as the path between them is an arc. V and W are means over a step: the mean rate
-    is that of the samples by the trapezoid rule, the difference of two mean speeds is the mean acceleration from middle
-    to middle.
+    Wheel angles are exact over any time, and a mean of n rates tells as much as n rates, so nothing is lost as long as
+    the path is an arc. V and W are means over a step: the mean rate is that of the samples by the trapezoid rule, the
+    difference of two mean speeds is the mean acceleration from middle to middle.
     """
 
     def __init__(self) -> None:

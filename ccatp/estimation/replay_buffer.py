@@ -29,12 +29,9 @@ class _Entry:
 
 
 class ReplayBuffer:
-    """Rewind and replay.
+    """Rewind and replay of late measurements, at most ``reach_s`` back.
 
     A filter replaces its arrays and never changes them, so keeping a state costs a reference.
-
-    Args:
-        reach_s: how far back a measurement may be taken.
     """
 
     def __init__(self, reach_s: float) -> None:
@@ -95,10 +92,9 @@ class ReplayBuffer:
         return count, min(max(home.t_s - t_s, 0.0), home.dt_s)
 
     def take(self, t_s: float, step: LateStep, filter_: Filter) -> int:
-        """Do ``step`` to the first state not before ``t_s``, and everything later again.
+        """Do ``step`` to the first state not before ``t_s`` and everything later again.
 
-        Returns:
-            how many entries were done again.
+        Returns the number of repeated entries.
         """
         entries = self._entries
         count, late_s = self._home(t_s)

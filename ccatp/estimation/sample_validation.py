@@ -1,7 +1,4 @@
-"""Which frames and samples are used: time stamps backward, twice, late, jumping or not finite.
-
-Nothing here looks at a clock: all times are the robot's, as delivered.
-"""
+"""Which frames and samples are used: time stamps backward, repeated, late, jumping or not finite; robot time only."""
 
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -66,11 +63,7 @@ class FrameTimeCheck:
 
 
 class SampleSource:
-    """The time stamps of one sensor: each is used once, in increasing order.
-
-    Attributes:
-        backward_run: samples in a row that were older than the newest.
-    """
+    """The time stamps of one sensor: each is used once, in increasing order."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -79,10 +72,7 @@ class SampleSource:
         self._used: deque[Sequence[float]] = deque()
 
     def use(self, times_s: Sequence[float], oldest_s: float) -> None:
-        """Note the times of a batch of used samples, oldest first, not empty; forget those before ``oldest_s``.
-
-        Samples that old are refused anyway. Two may go where one comes, so the memory does not grow.
-        """
+        """Note the times of a batch of used samples, oldest first, not empty; forget those before ``oldest_s``."""
         used = self._used
         self.newest_s = times_s[-1]
         self.backward_run = 0
@@ -107,17 +97,11 @@ class SampleSource:
 
 
 class SampleValidator:
-    """Picks the usable IMU and encoder samples of a frame and counts the others.
+    """Picks the usable IMU and encoder samples of a frame and counts the others by reason in ``counts``.
 
-    Args:
-        history_s: samples older than this before their frame are refused.
-        counts: where refusals are counted, by reason: ahead, late, duplicate, backward, nonfinite
-            (or larger than any sensor can show), too_fast.
-
-    Attributes:
-        largest_rate_rad_s: no wheel is faster; a sample that says so is refused.
-        backward_source: name of a sensor that has sent ``BACKWARD_LIMIT`` backward time stamps in a row, or empty;
-            stays until someone empties it.
+    The reasons: ahead, late (older than ``history_s``), duplicate, backward, nonfinite (or larger than any sensor can
+    show), too_fast. ``backward_source`` names a sensor that has sent ``BACKWARD_LIMIT`` backward time stamps in a row,
+    until it is emptied.
     """
 
     def __init__(self, history_s: float, counts: dict[str, int]) -> None:

@@ -1,7 +1,4 @@
-"""Heading from panel crossings, thesis 2.1.5: the entering angle seen by a pair of edge sensors.
-
-Seams as position measurements: where an edge sensor changes its value, it stands over a panel's edge.
-"""
+"""Crossed seams: heading of an edge sensor pair (thesis 2.1.5), and each transition as a position measurement."""
 
 from collections.abc import Sequence
 from math import atan2, cos, hypot, inf, pi, sin, sqrt
@@ -24,11 +21,9 @@ _UNIFORM = 1.0 / 12.0  # variance of a uniform distribution over one interval
 
 
 class SensorTransition(NamedTuple):
-    """One edge sensor changed its value.
+    """One edge sensor changed its value, between two samples whose middle is ``t_s``.
 
-    Attributes:
-        t_s: middle between the last sample of the old value and the first of the new one.
-        corner: index of the sensor: front-left, front-right, rear-left, rear-right.
+    ``corner`` as in ``core.Corner``.
     """
 
     t_s: float
@@ -82,7 +77,7 @@ def heading_from_pair(
     right_xy: tuple[float, float],
     normal_rad: float,
 ) -> tuple[float, float, float]:
-    """Heading of the robot when two of its sensors have crossed the same straight line.
+    """Heading of the robot when two of its sensors (robot frame, m) have crossed the same straight line.
 
     Both sensors stood on the line, so the vector between the two crossings, the sensors' own offset included, lies
     along it. In the robot frame at the right sensor's crossing that vector is
@@ -94,14 +89,8 @@ def heading_from_pair(
     2.15 and 2.16 with a sign: positive travel is forward, so one formula holds for every edge, driven forward or in
     reverse, whichever sensor is first. A turn between the two crossings is taken from the odometer.
 
-    Args:
-        left_xy: the left sensor in the robot frame, m.
-        right_xy: the right sensor in the robot frame, m.
-        normal_rad: phi, direction of the line's normal, either side.
-
-    Returns:
-        heading at the right sensor's crossing, rad, in the frame of ``normal_rad``, known modulo pi; |u|, m; and the
-        component of u across the robot, m.
+    Returns the heading at the right sensor's crossing, rad, in the frame of ``normal_rad``, modulo pi; |u|, m; and the
+    component of u across the robot, m.
     """
     turn = left.heading_rad - right.heading_rad
     dx, dy = rotate(left.x_m - right.x_m, left.y_m - right.y_m, -right.heading_rad)
@@ -160,13 +149,7 @@ class CrossingDetector:
     def headings(
         self, transitions: Sequence[SensorTransition], odometer: Odometer, pose: PanelPose, deck: DeckPose, v_m_s: float
     ) -> list[HeadingFix]:
-        """Headings completed by these transitions.
-
-        Args:
-            transitions: of this frame.
-            odometer: advanced to this frame.
-            deck: the same in the deck frame; decides which seam a sensor crossed.
-        """
+        """Headings completed by a frame's transitions; odometer and deck pose belong to this frame."""
         found = []
         for transition in transitions:
             mark = self._mark(transition, odometer, deck)
@@ -217,11 +200,10 @@ class CrossingDetector:
 
 
 class HeadingGate:
-    """Refuses a heading that does not fit the estimate, unless a second one bears it out.
+    """Refuses a heading that does not fit the estimate, unless a second one confirms it.
 
-    A single false crossing is one that nothing agrees with. Two in a row that agree with each other show that the
-    estimate is wrong and its variance too small; without this a confident filter would refuse every true heading
-    from then on.
+    Two in a row that agree with each other show that the estimate is wrong and its variance too small; without this a
+    confident filter would refuse every true heading from then on.
     """
 
     def __init__(self, gate_sigma: float) -> None:
@@ -255,10 +237,7 @@ _TIMING_FLOOR_M2 = 1e-10  # (10 um)^2: the sensor's own repeatability, UNVERIFIE
 class Edge(NamedTuple):
     """A panel's edge that a sensor has crossed.
 
-    Attributes:
-        k: the deck axis across it, 0 or 1.
-        offset: index of the state that holds how far it lies from there.
-        is_new: it was not crossed before, its offset is unknown.
+    Deck axis ``k`` across it, index ``offset`` of the state of its displacement.
     """
 
     k: int
@@ -268,11 +247,7 @@ class Edge(NamedTuple):
 
 
 class PanelEdgeLine(NamedTuple):
-    """One sensor over one edge: ``sensor - edge - offset = 0`` along one axis.
-
-    Attributes:
-        H: row of the measurement model, shape (1, n).
-    """
+    """One sensor over one edge: ``sensor - edge - offset = 0`` along one axis; H is the row (1, n) of the model."""
 
     residual_m: float
     H: FloatArray
@@ -300,11 +275,7 @@ class SeamLines:
         self._edges.clear()
 
     def meet(self, transition: SensorTransition, t_s: float, x: FloatArray, slope: Slope) -> Edge | None:
-        """Which edge a transition belongs to; None where no seam is near.
-
-        Args:
-            x: state, shape (n,).
-        """
+        """Which edge a transition belongs to, by the state x (n,); None where no seam is near."""
         place, (along_x, along_y), _ = self._sensor(transition, t_s, x, slope)
         seam = self._mirror.nearest_seam(*place)
         if seam is None or abs(seam.distance_m) > self._reach_m:

@@ -1,7 +1,4 @@
-"""The book of legs: what the legs driven so far say of the slip and the creep of the next one.
-
-What the legs driven so far tell about the next one: means and scatter of what each leg draws anew.
-"""
+"""Slip and creep of the next leg from the legs driven so far: means and scatter of what each leg draws again."""
 
 from collections.abc import Sequence
 from math import exp, log
@@ -20,19 +17,13 @@ _LEAST = 1e-14
 
 
 class SlipPopulation:
-    """Bayes for parameters that are drawn anew for each leg from N(mu_j, sigma^2): sigma common, all unknown.
+    """Bayes for parameters drawn for each leg from N(mu_j, sigma^2): sigma common, all unknown.
 
     After a leg its estimate y_j with variance R_j is one sample: y_j ~ N(mu_j, sigma^2 + R_j). Given sigma, the means
     follow by the Kalman equations; each candidate of a grid of sigmas has means of its own and the weight that its
     predictions have earned. So one set of constants serves a floor on which wheels never slip and one on which each leg
-    slips differently: what the mixture expects of the next leg is what the filter is given.
-
-    Args:
-        expected: of each parameter, mean and standard deviation of mu before the first leg.
-        largest: the largest scatter thought possible; candidates beyond it are left out.
-
-    Attributes:
-        scatter: the expectation of sigma^2, which is what the next leg will show of it.
+    slips differently. ``expected``: mean and standard deviation of each mu before the first leg; ``scatter``: the
+    expectation of sigma^2.
     """
 
     def __init__(self, expected: Sequence[tuple[float, float]], largest: float) -> None:
@@ -48,12 +39,11 @@ class SlipPopulation:
         self._mix()
 
     def learn(self, samples: Sequence[tuple[float, float] | None], share: float = 1.0) -> None:
-        """Take what a leg says of its parameters.
+        """Take a leg's estimate of each parameter and its variance without the prior.
 
-        Args:
-            samples: of each parameter the estimate, and the variance that the leg's own measurements give it, without
-                the prior; None where the leg says nothing of it.
-            share: of sigma^2 in them: more than one where the parameters also wander within the leg.
+        None where the leg says nothing of it.
+
+        ``share``: of sigma^2 in them, more than one where the parameters also wander within the leg.
         """
         self._logs = [_FORGETTING * likelihood for likelihood in self._logs]
         for sample, means, variances in zip(samples, self._means, self._variances, strict=True):
@@ -98,11 +88,7 @@ _WHERE = [SR, SL, C]
 class Redraw(NamedTuple):
     """Transition of (right slip, left slip, creep) from one leg to the next: ``s' = F (s - found) + mean + e``.
 
-    Attributes:
-        found: the last leg's expectation, shape (3,).
-        F: what the next leg keeps of the deviations, shape (3, 3).
-        mean: the next leg's expectation, shape (3,).
-        Q: covariance of e, shape (3, 3).
+    ``found`` and ``mean`` (3,) are the expectations of both legs; F (3, 3); Q (3, 3) is the covariance of e.
     """
 
     found: FloatArray
@@ -144,10 +130,7 @@ class SlipPrior:
     Right and left slip are taken apart into their mean (what the distance shows) and their difference (what the
     heading shows). Both wheels draw from one population, so both tell how much legs differ. Where legs hardly differ,
     the next leg keeps the state and all its correlations; where each leg slips differently, it begins with the mean of
-    all legs. How much they differ is learned (``Population``); creep varies by a share of itself.
-
-    Args:
-        cfg: what is expected before the first leg.
+    all legs. How much they differ is learned (``SlipPopulation``); creep varies by a share of itself.
     """
 
     def __init__(self, cfg: FullStateConfig) -> None:

@@ -49,15 +49,7 @@ _WHERE_DRAWN = np.ix_(_DRAWN, _DRAWN)
 
 
 class SurveyFilter:
-    """The filter, the model and the journal. Each public method but the questions is one thing that happens to it.
-
-    Everything that changes the filter goes through ``_do``, which notes it for the replay after a late fix.
-
-    Args:
-        filter_: an extended or unscented filter of ``STATES`` states.
-        counts: of what was used and refused; counted on here.
-        start: deck pose at the first frame, at rest.
-    """
+    """The filter of ``STATES`` states, the model and the journal of steps for the replay after a late fix (``_do``)."""
 
     def __init__(
         self,
@@ -123,7 +115,6 @@ class SurveyFilter:
         return self._terrain.height_m(x_m, y_m)
 
     def _count(self, what: str) -> None:
-        """Count something, once: not when it is done again."""
         self._counts[what] += not self._is_again
 
     def begin(self, t_s: float, dt_s: float) -> None:
@@ -139,10 +130,9 @@ class SurveyFilter:
     def move(
         self, block: PreintegratedMotion, right: WheelAngle, left: WheelAngle, imu_variances: tuple[float, float]
     ) -> None:
-        """A block of frames: predict, then update with wheel angles, angular rate and acceleration.
+        """A block of frames.
 
-        Args:
-            right: the wheel's angle at its end; no reading where its last frame brought none.
+        Predict, then update with wheel angles, angular rate and acceleration, where they were read.
         """
         dt_s = block.dt_s
         if dt_s > 0.0:
@@ -306,8 +296,7 @@ class SurveyFilter:
     def fix(self, t_s: float, z: FloatArray, variance: FloatArray) -> int:
         """The robot's origin at ``t_s``, deck, m (2,), and its covariance (2, 2).
 
-        Returns:
-            how many steps were done again after it.
+        Returns how many steps were repeated after it.
         """
         found: list[Innovation] = []
 
@@ -354,13 +343,11 @@ class SurveyFilter:
         turn_rad: float = 0.0,
         again: bool = False,
     ) -> None:
-        """Begin anew from a position (2,) measured at ``t_s``, and its covariance (2, 2); see ``begun_anew``.
+        """Begin again from a position (2,) measured at ``t_s``, and its covariance (2, 2); see ``begun_anew``.
 
         The heading is doubted by ``turn_rad``, and never by less than a set angle. ``again``: what was learned of the
-        sensors and of slip has led astray since it began anew the last time, and is forgotten, too.
-
-        Raises:
-            FilterDiverged: the state is not finite.
+        sensors and of slip since the last time was misleading, and is forgotten, too. Raises ``FilterDiverged``: not
+        finite.
         """
         residual = self.fix_residual(t_s, z)
         mean, P = self._filter.mean, self._filter.covariance

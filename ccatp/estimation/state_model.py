@@ -1,12 +1,8 @@
 """The full-state model: how pose, speeds and the sensors' errors move on, and what the sensors see of them.
 
-One model for every nonlinear filter. The pose is kept in the deck frame, on the curved surface, so no panel change
-touches the state. The wheel angles are states: the encoders' counts measure them with an error that never grows, which
-is what makes a counting encoder worth more than its rate (a rate out of counts jumps by 0.5 rad/s per 10 ms).
-
-An affine transition of a filter's state.
-
-The mirror's surface around the robot, from one exact evaluation carried on by Taylor's theorem.
+The pose is kept in the deck frame, on the curved surface, so no panel change touches the state. The wheel angles are
+states: the encoders' counts measure them with an error that never grows, which is what makes a counting encoder worth
+more than its rate (a rate out of counts jumps by 0.5 rad/s per 10 ms).
 """
 
 from math import cos, sin, sqrt
@@ -19,12 +15,7 @@ from ccatp.mirror.mirror import Mirror
 
 
 class Affine:
-    """x <- F x + b, as a ``Transition`` for the nonlinear filters.
-
-    Args:
-        F: shape (n, n).
-        b: shape (n,).
-    """
+    """x <- F x + b, F (n, n), b (n,), as a ``Transition`` for the nonlinear filters."""
 
     def __init__(self, F: FloatArray, b: FloatArray) -> None:
         self._F, self._b = F, b
@@ -51,12 +42,7 @@ _LEVEL = 1e-3
 
 
 class Slope(NamedTuple):
-    """First and second derivatives of the surface at a deck point, and the downhill unit tangent.
-
-    Attributes:
-        fxx, fxy, fyy: second derivatives, 1/m.
-        gx, gy: deck components of the downhill direction in the tangent plane; zero on level ground.
-    """
+    """Second derivatives of the surface at a deck point, 1/m, and the downhill unit tangent (gx, gy), deck frame."""
 
     fx: float
     fy: float
@@ -253,12 +239,10 @@ class SurveyMotion:
         return after
 
     def noise(self, x: FloatArray, impulses: FloatArray, drift: FloatArray) -> FloatArray:
-        """Covariance (n, n) of a step's noise.
+        """Covariance (n, n) of a step's noise from the state x (n,) before it.
 
-        Args:
-            x: the state before it, shape (n,).
-            impulses: variances of the impulses on A, W, SR, SL, C at its beginning, shape (5,).
-            drift: variances that enter at its end, shape (n,).
+        ``impulses`` (5,): variances of the impulses on A, W, SR, SL, C at its beginning; ``drift`` (n,): those at its
+        end.
         """
         G = self.at(x)[1].take(_NOISY, axis=1)
         G *= np.sqrt(impulses)
@@ -274,8 +258,7 @@ class SensorRows:
 
         counts_R = phi_R,   counts_L = phi_L,   omega_z = (1 + kg) w + bg,   a_x = a + ba
 
-    Attributes:
-        z, R: measurements and variances of the rows taken, shape (m,).
+    ``z`` and ``R`` (variances) are of the rows taken, shape (m,).
     """
 
     def __init__(self) -> None:
@@ -291,10 +274,7 @@ class SensorRows:
     ) -> "SensorRows":
         """Set the rows.
 
-        Args:
-            counts: angles of right and left wheel, rad, and the variance of each, rad^2.
-            rate: angular rate, rad/s, and its variance.
-            acceleration: m/s^2, and its variance.
+        Wheel angles right, left, rad, and rate, rad/s, and acceleration, m/s^2, each with its variance.
         """
         z: list[float] = []
         R: list[float] = []

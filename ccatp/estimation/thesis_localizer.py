@@ -41,15 +41,8 @@ class FourStateLocalizer(LocalizerBase[Stack]):
     own time (``MeasurementBuilder``); speed and heading move the position (eq. 2.14); a seam crossed by a pair of edge
     sensors updates the heading. Where the robot's origin enters another cell, pose and heading continue in the frame of
     that panel. Departure: the thesis overwrites the heading at a crossing; here it is a measurement of theta with the
-    variance of its timing, so that state and covariance stay consistent.
-
-    Args:
-        filter_: filter of the four states of eq. 2.1; re-initialised here.
-        start: pose at the first frame, at rest.
-
-    Attributes:
-        innovation: of the last filter update with samples, or None.
-        fix_deviation_m: how far the last fix was above the ideal surface.
+    variance of its timing, so that state and covariance stay consistent. ``fix_deviation_m``: height of the last fix
+    above the ideal surface.
     """
 
     def __init__(
@@ -134,14 +127,11 @@ class FourStateLocalizer(LocalizerBase[Stack]):
             self._use_crossings(transitions)
 
     def reset_filter(self, mu: FloatArray, sigma: FloatArray) -> None:
-        """Re-initialise the filter, the thesis's ``resetFilter``.
+        """Re-initialise the state (v, a, theta, omega), theta in the panel frame.
 
-        Args:
-            mu: state (v, a, theta, omega), shape (4,), theta in the panel frame.
-            sigma: its covariance, shape (4, 4).
+        The thesis's ``resetFilter(mu, Sigma)``.
 
-        Raises:
-            FilterError: not a Gaussian of four states.
+        Raises ``FilterError``: not a Gaussian of four states.
         """
         self._filter.reset(mu, sigma)
         if self.is_frozen:
@@ -160,19 +150,10 @@ class FourStateLocalizer(LocalizerBase[Stack]):
             self._reset_at_rest(float(mean[THETA]), float(covariance[THETA, THETA]))
 
     def fuse_fix(self, fix: Fix) -> float:
-        """Fuse a multilaterated position of the puck (thesis 2.1.3).
+        """Fuse a position of the puck (thesis 2.1.3) at the time it was taken; returns how far the pose jumped, m.
 
-        The fix belongs to ``fix.t_s``: what the robot has moved since then is added. Position and fix are weighted by
-        their variances.
-
-        Args:
-            fix: position and covariance of the puck, world frame.
-
-        Returns:
-            How far the pose jumped, m.
-
-        Raises:
-            FixRefused: not finite, too old, from the future, or far from the mirror; the pose is unchanged.
+        Position and fix are weighted by their variances. Raises ``FixRefused``: not finite, too old, from the future,
+        or far from the mirror; the pose is unchanged.
         """
         check_fix(fix, self._odometer.oldest_s, self._clock.t_s + MAX_FRAME_STEP_S)
         foot = foot_of_fix(self._mirror, fix, self._puck_height_m, self._panel)

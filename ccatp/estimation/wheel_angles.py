@@ -21,10 +21,7 @@ class WheelAngle:
     A counting encoder gives the counts of a sampling period over its length: the sum of rate times period is the
     counted angle, exact to a count however long the drive. An analogue one gives a rate with white noise at an instant:
     the trapezoid rule sums it. Which one it is shows at rest, where a counter gives nothing but zeros.
-
-    Attributes:
-        is_fresh: the last frame brought samples.
-        noise_rad2_s2: variance of a rate sample at rest; None as long as it has not been seen at rest.
+    ``noise_rad2_s2``: variance of a rate sample at rest, None until it was seen at rest.
     """
 
     __slots__ = (

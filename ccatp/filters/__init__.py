@@ -1,7 +1,4 @@
-"""Gaussian filters on arrays: Kalman, extended, unscented, a smoother, EKF-SLAM.
-
-Pure algebra that knows no robot. ``FILTERS`` has the constructors by the name under which ``run.filter`` selects them.
-"""
+"""Gaussian filters on arrays: Kalman, extended, unscented, smoother, EKF-SLAM. ``FILTERS``: by ``run.filter``."""
 
 from collections.abc import Callable
 

@@ -37,9 +37,8 @@ class FilterDiverged(FilterError):
 class Innovation:
     """What an update found.
 
-    Attributes:
-        nis: normalised innovation squared nu^T (H P H^T + R)^-1 nu of all rows, chi-squared with m degrees of freedom
-            when the filter is consistent.
+    ``nis`` is nu^T (H P H^T + R)^-1 nu of all rows, chi-squared with m degrees of freedom when the filter is
+    consistent.
     """
 
     __slots__ = ("_residual", "nis")
@@ -59,10 +58,10 @@ class Innovation:
 
 
 class Transition(Protocol):
-    """A nonlinear process model x <- f(x).
+    """A nonlinear process model x <- f(x); angles are continuous in the state, nothing wraps.
 
-    Angles are continuous in the state: nothing wraps. The returned arrays are the model's work space: they hold until
-    its next call, and a filter neither changes nor keeps them.
+    The returned arrays are the model's work space: they hold until its next call, and a filter does not change or keep
+    them.
     """
 
     def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -73,9 +72,9 @@ class Transition(Protocol):
 
 
 class Observation(Protocol):
-    """A nonlinear measurement model z = h(x) + noise; its arrays are work space like those of ``Transition``.
+    """A nonlinear measurement model z = h(x) + noise; z - h(x) needs no wrapping.
 
-    It is prepared so that z - h(x) needs no wrapping for any x that the filter may try.
+    Arrays are work space as in ``Transition``.
     """
 
     def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -102,54 +101,35 @@ class Filter(Protocol):
 
     @property
     def transition(self) -> FloatArray:
-        """F of the last prediction, shape (n, n), as a smoother needs it.
+        """F of the last prediction, shape (n, n): matrix, Jacobian, or regression by sigma points.
 
-        The matrix given, the Jacobian used, or the regression of f(x) on x by sigma points; the identity before the
-        first prediction and after a reset.
+        At first the identity.
         """
 
     def predict(self, F: FloatArray | Transition, Q: FloatArray) -> None:
         """Advance the state: x <- F x, P <- F P F^T + Q (thesis eqs 2.5, 2.6), or the same with a nonlinear f.
 
-        Args:
-            F: transition, shape (n, n), or a nonlinear model.
-            Q: covariance of the process noise, shape (n, n).
-
-        Raises:
-            FilterShapeError: a shape does not fit.
-            FilterModelError: the model is nonlinear and the filter takes none.
-            FilterDiverged: the prediction is not finite.
+        F and Q have shape (n, n). Raises ``FilterShapeError``, ``FilterDiverged`` (not finite), and
+        ``FilterModelError`` where the filter takes no nonlinear model.
         """
 
     def update(self, z: FloatArray, H: FloatArray | Observation, R: FloatArray) -> Innovation:
         """Condition the state on z = H x + noise (thesis eqs 2.7 to 2.10), or on z = h(x) + noise.
 
-        Args:
-            z: measurements, shape (m,); m = 0 leaves the prediction.
-            H: measurement model, shape (m, n), or a nonlinear model.
-            R: variances of independent rows, shape (m,), or their covariance, shape (m, m).
-
-        Raises:
-            FilterShapeError: a shape does not fit.
-            FilterModelError: the model is nonlinear and the filter takes none.
-            FilterDiverged: the posterior is not finite, P is not positive semidefinite or R is not positive definite.
+        z (m,), m = 0 leaves the prediction; H (m, n) or a model; R variances (m,) or covariance (m, m). Raises
+        ``FilterShapeError``, ``FilterModelError``, and ``FilterDiverged``: posterior not finite, P or R not positive
+        definite.
         """
 
     def reset(self, mean: FloatArray, covariance: FloatArray) -> None:
         """Re-initialise with copies of a mean (n,) and a covariance (n, n), the thesis's resetFilter(mu, Sigma).
 
-        Raises:
-            FilterShapeError: a shape does not fit.
-            FilterDiverged: not finite, not symmetric or not positive semidefinite.
+        Raises ``FilterShapeError``, and ``FilterDiverged``: not finite, not symmetric or not positive semidefinite.
         """
 
 
 def check_rows(z: FloatArray, H: FloatArray, R: FloatArray, states: int) -> None:
-    """Refuse z (m,), H (m, n), R (m,) or (m, m) that do not fit each other or n ``states``.
-
-    Raises:
-        FilterShapeError: a shape does not fit.
-    """
+    """Raises ``FilterShapeError`` where z (m,), H (m, n), R (m,) or (m, m) do not fit each other or n ``states``."""
     m = z.size
     if z.ndim != 1:
         raise FilterShapeError("z", z.shape, "(m,)")
@@ -160,11 +140,9 @@ def check_rows(z: FloatArray, H: FloatArray, R: FloatArray, states: int) -> None
 
 
 def checked_gaussian(mean: FloatArray, covariance: FloatArray, shape: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
-    """Copies of a mean (n,) and a covariance (n, n), symmetric to the last bit; ``shape`` is (n, n).
+    """Copies of a mean (n,) and a covariance of ``shape`` (n, n), symmetric to the last bit.
 
-    Raises:
-        FilterShapeError: a shape does not fit.
-        FilterDiverged: not finite, not symmetric or not positive semidefinite.
+    Raises as ``Filter.reset``.
     """
     mean, covariance = np.array(mean, dtype=np.float64), np.array(covariance, dtype=np.float64)
     if mean.ndim != 1 or mean.size == 0:

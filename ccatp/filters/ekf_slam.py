@@ -30,14 +30,10 @@ class BlockError(FilterError):
 
 
 class Update(NamedTuple):
-    """An ``Innovation``, and whether it was used.
+    """An ``Innovation``, and whether it was used; the state is unchanged where the gate refused it.
 
-    Attributes:
-        residual: z - h(x) as it was given, shape (m,).
-        nis: nu^T S^-1 nu.
-        size: m.
-        accepted: False where the gate refused it; the state is then unchanged.
-        spread: diagonal of S with the noise as it was given, shape (m,).
+    ``residual``: z - h(x), (m,); ``nis``: nu^T S^-1 nu; ``size``: m; ``spread``: diagonal of S with the given noise,
+    (m,).
     """
 
     residual: FloatArray
@@ -48,14 +44,7 @@ class Update(NamedTuple):
 
 
 class RowUpdate(NamedTuple):
-    """What one row did, as ``Update`` has it: numbers, because arrays of one take longer than the algebra.
-
-    Attributes:
-        residual: z - h(x) as it was given.
-        nis: nu^2 / S.
-        accepted: False where the gate refused it; the state is then unchanged.
-        spread: S with the noise as it was given.
-    """
+    """An ``Update`` of one row as numbers, because arrays of one take longer than the algebra."""
 
     residual: float
     nis: float
@@ -70,19 +59,12 @@ class EkfSlam:
     update:   S = H P H^T + R,  K = P H^T S^-1,  x <- x + K nu,  P <- P - K S K^T
     augment:  b = g(x, z):  P_bx = G_x P,  P_bb = G_x P G_x^T + G_z R G_z^T
 
-    Hevrdejs and Knoll 2017, eqs 1 and 2. H is sparse: a row names the columns that it touches, so an update costs one
-    product with those columns and one rank-m subtraction: n^2. The next call changes ``mean`` and ``covariance``, or
-    puts others in their place.
+    Hevrdejs and Knoll 2017, eqs 1 and 2. H is sparse: a row names its columns, so an update costs one product with
+    those columns and one rank-m subtraction: n^2. The next call changes or replaces ``mean`` and ``covariance``.
 
-    Args:
-        vehicle_mean: shape (v,).
-        vehicle_covariance: shape (v, v).
-        calibration_mean: shape (c,); empty where nothing is shared.
-        calibration_covariance: shape (c, c).
-
-    Raises:
-        FilterShapeError: a shape does not fit.
-        FilterDiverged: not finite, not symmetric or not positive semidefinite.
+    Vehicle mean (v,), covariance (v, v); calibration (c,), (c, c). A shape that does not fit raises
+    ``FilterShapeError``; what is not finite or not positive (semi)definite raises ``FilterDiverged``, here and in all
+    methods.
     """
 
     def __init__(
@@ -105,7 +87,6 @@ class EkfSlam:
         self._take(mean, covariance)
 
     def _take(self, mean: FloatArray, covariance: FloatArray) -> None:
-        """Another state."""
         v = self.vehicle_size
         self.mean, self.covariance = mean, covariance
         self._rows, self._columns, self._vehicle = covariance[:v], covariance[:, :v], mean[:v]
@@ -133,23 +114,14 @@ class EkfSlam:
         return block in self._blocks
 
     def block(self, block: BlockId) -> slice:
-        """Where a landmark stands in the state; it moves when one before it is removed.
-
-        Raises:
-            BlockError: there is none.
-        """
+        """Where a landmark stands in the state (it moves when one before it is removed); raises ``BlockError``."""
         try:
             return self._blocks[block]
         except KeyError:
             raise BlockError(block, "is not in the state") from None
 
     def predict(self, vehicle_mean: FloatArray, F: FloatArray, Q: FloatArray) -> None:
-        """Advance the vehicle: its new mean (v,), F = d(new)/d(old) (v, v), and Q (v, v).
-
-        Raises:
-            FilterShapeError: a shape does not fit.
-            FilterDiverged: the prediction is not finite.
-        """
+        """Advance the vehicle: its new mean (v,), F = d(new)/d(old) (v, v), and Q (v, v)."""
         v = self.vehicle_size
         if vehicle_mean.shape != (v,) or F.shape != (v, v) or Q.shape != (v, v):
             raise _misfit(v, vehicle_mean, F, Q)
@@ -171,13 +143,7 @@ class EkfSlam:
         return float(h.dot(self.covariance[np.ix_(columns, columns)]).dot(h))
 
     def relax(self, index: int, factor: float, variance: float) -> None:
-        """One state forgets: x <- factor x + noise, as a Gauss-Markov process does that nothing else depends on.
-
-        Args:
-            index: of the state.
-            factor: 0 to 1.
-            variance: of what comes anew.
-        """
+        """One state forgets: x <- factor x + noise, a Gauss-Markov process; ``factor`` 0 to 1."""
         P = self.covariance
         self.mean[index] *= factor
         P[index] *= factor
@@ -187,19 +153,13 @@ class EkfSlam:
     def update_row(
         self, columns: Columns, h: FloatArray, residual: float, r: float, gate: float = inf, knee: float = inf
     ) -> RowUpdate:
-        """Condition on one row.
+        """Condition on one row: ``columns`` (k,), each once; derivatives ``h`` (k,); residual z - h(x).
 
-        Args:
-            columns: of the state that it touches, shape (k,), each once.
-            h: its derivatives by them, shape (k,).
-            residual: z - h(x), wrapped where it is an angle.
-            r: variance of its noise.
-            gate: largest normalised innovation squared that is used.
-            knee: innovations beyond that many sigmas get a noise so much larger that they weigh as those at the knee
-                (Huber's loss, by one step of reweighting). The NIS is then that with the larger noise.
+        Noise variance ``r``.
 
-        Raises:
-            FilterDiverged: the update is not finite, or the noise is not positive.
+        ``gate``: largest normalised innovation squared that is used. ``knee``: innovations beyond that many sigmas get
+        a noise so much larger that they weigh as those at the knee (Huber's loss, one step of reweighting); the NIS is
+        with that noise.
         """
         cross = h.dot(self.covariance.take(columns, axis=0))
         s = given = float(h.dot(cross.take(columns))) + r
@@ -224,18 +184,9 @@ class EkfSlam:
         return RowUpdate(residual, nis, True, given)
 
     def update(self, columns: Columns, H: FloatArray, residual: FloatArray, R: FloatArray, gate: float = inf) -> Update:
-        """Condition on m rows at once.
+        """Condition on m rows at once: ``columns`` (k,), each once; H (m, k); residual (m,).
 
-        Args:
-            columns: of the state that they touch, shape (k,), each once.
-            H: shape (m, k).
-            residual: shape (m,), wrapped where it is an angle.
-            R: covariance of the noise, shape (m, m), or variances (m,).
-            gate: largest normalised innovation squared that is used.
-
-        Raises:
-            FilterShapeError: a shape does not fit.
-            FilterDiverged: the update is not finite, or H P H^T + R is not positive definite.
+        R (m, m) or variances (m,).
         """
         R = _checked_rows(columns, H, residual, R)
         cross, S = self._moments(columns, H, R)
@@ -256,18 +207,10 @@ class EkfSlam:
     def update_iterated(
         self, columns: Columns, linearise: Linearise, R: FloatArray, iterations: int, gate: float = inf
     ) -> Update:
-        """Condition on m rows, linearised anew at each estimate: Gauss-Newton on the posterior (Bell and Cathey 1993).
+        """Condition on m rows, linearised again at each estimate: Gauss-Newton on the posterior (Bell and Cathey 1993).
 
-        Args:
-            columns: of the state that they touch, shape (k,), each once.
-            linearise: x (n,) -> (z - h(x), shape (m,), wrapped where it is an angle; H at x, shape (m, k)).
-            R: covariance of the noise, shape (m, m), or variances (m,).
-            iterations: most linearisations.
-            gate: largest normalised innovation squared, at the last linearisation, that is used.
-
-        Raises:
-            FilterShapeError: a shape does not fit.
-            FilterDiverged: the update is not finite, or H P H^T + R is not positive definite.
+        ``linearise``: x (n,) -> (z - h(x), shape (m,); H at x, shape (m, k)). The gate applies at the last
+        linearisation.
         """
         prior = self.mean.copy()
         x = prior
@@ -293,20 +236,10 @@ class EkfSlam:
         J_z: FloatArray | None = None,
         R: FloatArray | None = None,
     ) -> None:
-        """A landmark joins by the inverse measurement model b = g(x, z).
+        """A landmark joins by the inverse measurement model b = g(x, z): ``mean`` is g, shape (b,).
 
-        Args:
-            block: its identifier.
-            mean: g, shape (b,).
-            columns: of the state that g touches, shape (k,).
-            J_state: dg/dx over them, shape (b, k).
-            J_z: dg/dz, shape (b, m); None where nothing was measured (a copy of states).
-            R: covariance of z, shape (m, m).
-
-        Raises:
-            BlockError: the landmark is there already.
-            FilterShapeError: a shape does not fit.
-            FilterDiverged: the landmark is not finite.
+        ``J_state``: dg/dx over ``columns``, (b, k); ``J_z``: dg/dz, (b, m), None where nothing was measured (a copy of
+        states); R (m, m). Raises ``BlockError`` where the landmark exists.
         """
         if block in self._blocks:
             raise BlockError(block, "is in the state already")
@@ -329,11 +262,7 @@ class EkfSlam:
         self._take(grown, P)
 
     def remove(self, block: BlockId) -> None:
-        """Forget a landmark: its rows and columns go, which is what marginalising it means.
-
-        Raises:
-            BlockError: there is none.
-        """
+        """Marginalise a landmark: its rows and columns go; raises ``BlockError``."""
         gone = self.block(block)
         n, b = self.size, gone.stop - gone.start
         keep = np.r_[0 : gone.start, gone.stop : n]
@@ -364,18 +293,12 @@ def columns_of(*parts: slice | Sequence[int]) -> Columns:
 
 
 def _misfit(v: int, vehicle_mean: FloatArray, F: FloatArray, Q: FloatArray) -> FilterShapeError:
-    """Which of a prediction's arrays does not fit."""
     wanted = (("vehicle_mean", vehicle_mean, (v,)), ("F", F, (v, v)), ("Q", Q, (v, v)))
     name, array, shape = next(each for each in wanted if each[1].shape != each[2])
     return FilterShapeError(name, array.shape, str(shape))
 
 
 def _checked_rows(columns: Columns, H: FloatArray, residual: FloatArray, R: FloatArray) -> FloatArray:
-    """R as a matrix (m, m).
-
-    Raises:
-        FilterShapeError: a shape does not fit.
-    """
     m = residual.size
     if H.shape != (m, columns.size):
         raise FilterShapeError("H", H.shape, f"({m}, {columns.size})")
@@ -385,11 +308,6 @@ def _checked_rows(columns: Columns, H: FloatArray, residual: FloatArray, R: Floa
 
 
 def _root(S: FloatArray, residual: FloatArray) -> FloatArray:
-    """Lower Cholesky factor of S.
-
-    Raises:
-        FilterDiverged: not finite or not positive definite.
-    """
     if not float(np.vdot(S, S) + np.vdot(residual, residual)) < HUGE:
         raise FilterDiverged(f"update is not finite: residuals {residual.tolist()}")
     root: FloatArray

@@ -1,8 +1,7 @@
 """Linear and extended Kalman filter, thesis eqs 2.5 to 2.13, for any number of states and measurements.
 
-Matrices are small, so a step is a dozen calls of BLAS and LAPACK into buffers that are kept. Arguments are given by
-position, in the order of ``scipy.linalg.blas``, and those that never change are kept as tuples: keywords cost three
-times what a product of 4 x 4 costs.
+Matrices are small: a step is a dozen calls of BLAS and LAPACK into buffers that are kept, with positional arguments in
+the order of ``scipy.linalg.blas``: keywords cost three times what a product of 4 x 4 costs.
 """
 
 import numpy as np
@@ -177,7 +176,6 @@ class KalmanFilter:
         return rows
 
     def _condition(self, rows: _Rows, R: FloatArray) -> Innovation:
-        """Condition on m >= 1 rows: H^T, and P H^T above the residual, are in ``rows``."""
         residual = rows.residual.tolist()
         m = len(residual)
         if m <= MANY:
@@ -254,9 +252,6 @@ class KalmanFilter:
 class ExtendedKalmanFilter(KalmanFilter):
     """The Kalman filter with F = df/dx and H = dh/dx at the mean (thesis eqs 2.5 to 2.10 with f and h in place).
 
-    predict:  x = f(x),  P = F P F^T + Q
-    update:   nu = z - h(x), the rest as in 2.8 to 2.10
-
     Arrays are taken as the linear filter takes them, and cost and result are the same.
     """
 
@@ -290,10 +285,9 @@ class ExtendedKalmanFilter(KalmanFilter):
 
 
 def square_root(P: FloatArray) -> FloatArray:
-    """L with L L^T = P, shape (n, n): the lower Cholesky factor, or by eigenvectors where P is only semidefinite.
+    """L (n, n) with L L^T = P: lower Cholesky factor, or by eigenvectors.
 
-    Raises:
-        FilterDiverged: P is not finite or not positive semidefinite.
+    Raises ``FilterDiverged`` where P is not semidefinite.
     """
     L: FloatArray
     L, info = dpotrf(P, 1, 1)
@@ -312,11 +306,7 @@ def square_root(P: FloatArray) -> FloatArray:
 
 
 def noise_root(R: FloatArray) -> FloatArray:
-    """Lower Cholesky factor of the noise R (m, m).
-
-    Raises:
-        FilterDiverged: R is not positive definite.
-    """
+    """Lower Cholesky factor of R (m, m); raises ``FilterDiverged`` where R is not positive definite."""
     factor: FloatArray
     factor, info = dpotrf(R, 1, 1)
     if info != 0:

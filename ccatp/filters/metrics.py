@@ -1,7 +1,4 @@
-"""How good an estimate is: root mean squares, consistency with its own covariance.
-
-The rigid motion that brings one set of points nearest to another, and the error that is left.
-"""
+"""How good an estimate is: root mean squares, consistency, and the error after the best rigid motion."""
 
 from typing import NamedTuple
 
@@ -24,12 +21,9 @@ def wrapped(angles_rad: FloatArray) -> FloatArray:
 
 
 class Consistency(NamedTuple):
-    """Mean normalised square of errors or innovations, per degree of freedom: 1 if the covariance is honest.
+    """Mean normalised square per degree of freedom: 1 if the covariance is honest.
 
-    Attributes:
-        mean: sum of the squares over sum of the degrees of freedom.
-        low: of the 95 % band that independent Gaussian errors would leave it in.
-        high: its upper end.
+    ``low`` and ``high`` bound the 95 % band of independent Gaussian errors.
     """
 
     mean: float
@@ -38,11 +32,9 @@ class Consistency(NamedTuple):
 
 
 def consistency(squares: FloatArray, sizes: FloatArray) -> Consistency | None:
-    """Mean of normalised squares against the chi-squared law (Bar-Shalom, Li, Kirubarajan 2001, section 5.4).
+    """Mean of NIS or NEES ``squares`` (n,) with degrees of freedom ``sizes`` (n,) against the chi-squared law.
 
-    Args:
-        squares: normalised innovations (NIS) or errors (NEES) squared, shape (n,).
-        sizes: degrees of freedom of each, shape (n,).
+    Bar-Shalom, Li, Kirubarajan 2001, section 5.4.
     """
     finite = np.isfinite(squares)
     freedom = float(sizes[finite].sum())
@@ -60,12 +52,7 @@ def nees(errors: FloatArray, covariances: FloatArray) -> FloatArray:
 
 
 class RigidMotion(NamedTuple):
-    """x -> R x + t.
-
-    Attributes:
-        rotation: R, orthogonal, shape (d, d).
-        translation_m: t, shape (d,).
-    """
+    """x -> R x + t: rotation R, orthogonal, shape (d, d); translation t, m, shape (d,)."""
 
     rotation: FloatArray
     translation_m: FloatArray
@@ -97,11 +84,9 @@ def best_motion(
 ) -> RigidMotion:
     """The motion that minimises sum(w |R a + t - b|^2) (Kabsch 1976, Umeyama 1991), without a scale.
 
-    Args:
-        source_m: points a, shape (n, d).
-        target_m: points b, shape (n, d).
-        mirrors: whether R may be a reflection: ranges alone do not tell a map from its mirror image.
-        weights: w, shape (n,); equal if ``None``.
+    A, b of shape (n, d).
+
+    With ``mirrors`` R may be a reflection: ranges alone do not tell a map from its mirror image.
     """
     w = np.ones(len(source_m)) if weights is None else weights
     w = w / w.sum()
@@ -115,13 +100,7 @@ def best_motion(
 
 
 def aligned_rms_m(found_m: FloatArray, true_m: FloatArray, *, mirrors: bool = False) -> float:
-    """Root mean square distance of points from the truth after the best rigid motion, sqrt(mean |e|^2).
-
-    Args:
-        found_m: shape (n, d).
-        true_m: shape (n, d).
-        mirrors: whether a mirror image counts as the same map.
-    """
+    """Root mean square distance of points (n, d) from the truth after the best rigid motion, sqrt(mean |e|^2)."""
     moved = best_motion(found_m, true_m, mirrors=mirrors).moved(found_m)
     return rms_m(moved, true_m)
 

@@ -35,8 +35,7 @@ class Smoother:
     """Records a filter's predictions and goes back over them.
 
     Before each prediction the filtered mean x and covariance P are kept, with F, the predicted mean x' and what the
-    prediction added, Q = P' - F P F^T; updates between predictions need no record: the next prediction finds their
-    result. Backward from the last filtered state (Rauch, Tung, Striebel 1965),
+    prediction added, Q = P' - F P F^T. Backward from the last filtered state (Rauch, Tung, Striebel 1965),
 
         G = P F^T P'^-1,   x_s = x + G (x_s' - x'),   P_s = P + G (P_s' - P') G^T
 
@@ -47,19 +46,12 @@ class Smoother:
     and, where F is invertible, G = F^-1 (I - Q P'^-1): a state without noise is then carried back by F^-1 itself,
     however singular P' is. P'^-1 is the pseudo-inverse in units of the states' own sigmas.
 
-    A nonlinear prediction is recorded with the Jacobian it used or with the regression of its sigma points
-    (``Filter.transition``); Q is then what that line does not explain.
+    A nonlinear prediction is recorded with ``Filter.transition``; Q is then what that line does not explain. A change
+    of the state that no prediction made (a reset, another frame of reference) is recorded as one, with its F and the
+    variance it added; otherwise the way back passes over it as if it were information.
 
-    A change of the state that no prediction made (a reset, another frame of reference) is recorded as one, with its F
-    and the variance it added; otherwise the way back passes over it as if it were information.
-
-    Memory: 8 (3 n^2 + 2 n) bytes a step, 3.6 kB at n = 12, so 1.4 GB for 400,000 steps; half of that in single
-    precision (``np.float32``), which leaves the covariances about 6 digits. ``smooth`` adds the result, 8 (n^2 + n)
-    bytes for each step asked for.
-
-    Args:
-        n: number of states.
-        dtype: precision of the record.
+    Memory: 8 (3 n^2 + 2 n) bytes a step, 3.6 kB at n = 12; half of that with ``dtype`` np.float32, which leaves the
+    covariances about 6 digits. ``smooth`` adds 8 (n^2 + n) bytes for each step asked for.
     """
 
     def __init__(self, n: int, dtype: type[np.float64] | type[np.float32] = np.float64) -> None:
@@ -88,17 +80,9 @@ class Smoother:
     def record(
         self, mean: FloatArray, covariance: FloatArray, F: FloatArray, predicted: FloatArray, Q: FloatArray
     ) -> None:
-        """Keep one prediction.
+        """Keep one prediction: x (n,), P and F (n, n) before it, x' (n,) after it, Q (n, n).
 
-        Args:
-            mean: x before it, shape (n,).
-            covariance: P before it, shape (n, n).
-            F: transition or its linearisation, shape (n, n).
-            predicted: x' after it, shape (n,).
-            Q: P' - F P F^T, shape (n, n).
-
-        Raises:
-            FilterShapeError: a shape does not fit.
+        Raises ``FilterShapeError``.
         """
         n = self._n
         given = (("mean", mean), ("covariance", covariance), ("F", F), ("predicted", predicted), ("Q", Q))
@@ -113,15 +97,12 @@ class Smoother:
         self._count += 1
 
     def smooth(self, filter_: Filter, first: int = 0) -> Smoothed:
-        """States at the recorded steps, oldest first, and last the filter's own.
+        """States at the recorded steps from ``first`` on, oldest first, and last the filter's own.
 
-        Args:
-            filter_: the filter that was recorded, at its last state.
-            first: the step to end at on the way back; the result has len(self) - first + 1 states.
+        Len(self) - first + 1.
 
-        Raises:
-            SmootherEmpty: nothing is recorded, or less than ``first``.
-            FilterDiverged: a smoothed state is not finite.
+        Raises ``SmootherEmpty``: nothing is recorded, or less than ``first``; ``FilterDiverged``: a state is not
+        finite.
         """
         if not 0 <= first < self._count:
             raise SmootherEmpty(f"step {first} of {self._count} recorded: record predictions before smoothing")
@@ -141,7 +122,6 @@ class Smoother:
 def _backward(
     xs: FloatArray, Ps: FloatArray, x: FloatArray, P: FloatArray, F: FloatArray, x1: FloatArray, Q: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """One step back, from the smoothed state after a prediction to the one before it."""
     predicted = F.dot(P).dot(F.T) + Q
     G = _gain(P, F, Q, 0.5 * (predicted + predicted.T))
     left = np.eye(x.size) - G.dot(F)

@@ -119,7 +119,6 @@ class UnscentedKalmanFilter(KalmanFilter):
         return self._subtract(rows, rows.residual.tolist())
 
     def _draw(self) -> FloatArray:
-        """Set the points less the mean, shape (2 n + 1, n), and return the root L (n, n) that they are made of."""
         n = self._n
         L = square_root(self.covariance)
         np.multiply(L.T, self._spread, self._offsets[1 : n + 1])

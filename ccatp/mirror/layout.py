@@ -1,7 +1,4 @@
-"""The grid of panels in the deck plane: which panel, seam or gap lies under a point.
-
-One panel: its place on the mirror and its frame; the nine measurement points' numbering.
-"""
+"""The grid of panels in the deck plane, each panel's frame, and the numbering of its nine measurement points."""
 
 from dataclasses import dataclass
 from math import hypot
@@ -15,11 +12,7 @@ GAP_AGREEMENT_MM = 0.1  # the fitted pitches of the telescope exceed size + gap 
 
 
 class Seam(NamedTuple):
-    """A seam between two panels near a point.
-
-    Attributes:
-        axis: the deck coordinate that is constant along the seam.
-    """
+    """A seam between two panels near a point; ``axis``: the deck coordinate that is constant along it."""
 
     axis: Literal["x", "y"]
     position_m: float
@@ -33,11 +26,6 @@ class PanelGrid:
     """
 
     def __init__(self, cfg: PanelsConfig) -> None:
-        """Lay out the panels.
-
-        Raises:
-            LayoutError: if counts, sizes and rows contradict each other.
-        """
         _check_layout(cfg)
         self.rows, self.cols = len(cfg.panels_per_row), cfg.cols
         self.half_x_m, self.half_y_m = cfg.size_x_mm * 5e-4, cfg.size_y_mm * 5e-4
@@ -136,13 +124,10 @@ POINTS_PER_ROW = 3
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A panel and its frame (thesis fig. 2.2).
+    """A panel and its frame (thesis fig. 2.2): centre and half sizes in the deck plane, m.
 
-    Attributes:
-        x_m, y_m: centre in the deck plane.
-        half_x_m, half_y_m: half the panel's size in the deck plane.
-        origin: surface point at the centre, deck frame, m.
-        axes: the panel's x, y, z axes as unit vectors in the deck frame; z is the surface normal at the centre.
+    ``origin``: surface point at the centre, deck frame, m; ``axes``: the panel's x, y, z as unit vectors in the deck
+    frame.
     """
 
     id: PanelId
@@ -178,11 +163,6 @@ class Panel:
 
 
 def build_panel(surface: Surface, panel: PanelId, centre: tuple[float, float], half: tuple[float, float]) -> Panel:
-    """Panel whose frame is the tangent frame of the surface at ``centre``.
-
-    Args:
-        centre: (x, y) in the deck plane, m.
-        half: half sizes along x and y in the deck plane, m.
-    """
+    """Panel whose frame is the tangent frame of the surface at ``centre``; both arguments in the deck plane, m."""
     x, y = centre
     return Panel(panel, x, y, half[0], half[1], surface.point(x, y), surface.axes(x, y))

@@ -1,9 +1,4 @@
-"""The mirror as the robot meets it: one object that joins surface, frames, panels, rim and poses.
-
-Rigid transforms between the world, the mirror and the deck frame of one mirror.
-
-Many poses at once, for those who keep track of a robot: the same transforms on arrays.
-"""
+"""The mirror as the robot meets it: surface, frames, panels, rim and poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,10 +22,6 @@ class MirrorFrames:
 
     ``p_mirror = R (p_world - origin)`` with ``R = [[1, 0, 0], [0, c, s], [0, -s, c]]``; the deck frame is the mirror
     frame turned by pi about its y axis where ``drive_side`` is -1, and the mirror frame itself where it is +1.
-
-    Attributes:
-        origin_m: origin of the mirror frame in the world, m.
-        drive_side: sign of the mirror frame's z on the robot's side.
     """
 
     origin_m: Vector3
@@ -87,25 +78,13 @@ _MIN_CHANNELS = 4
 
 
 class Mirror:
-    """A telescope mirror: geometry only, without state.
+    """A telescope mirror: geometry only, without state. Points are in metres.
 
-    Points are ``Vector3`` in metres; the frames are those of ``ccatp.core``.
-
-    Attributes:
-        drive_side: sign of the mirror frame's z on the robot's side.
-        surface: the ideal surface, deck frame.
-        rim: outline of the mirror, deck plane.
-        frames: transforms between world, mirror and deck frame.
-        channels: laser channels, (k,).
-        collimators_m: their positions in the world frame, shape (k, 3).
+    ``surface`` is in the deck frame, ``rim`` in the deck plane, ``collimators_m`` (k, 3) of the laser ``channels`` in
+    the world frame; ``drive_side`` is the sign of the mirror frame's z on the robot's side.
     """
 
     def __init__(self, cfg: MirrorConfig) -> None:
-        """Build the geometry.
-
-        Raises:
-            LayoutError: if the configuration contradicts itself.
-        """
         self.name, self.overhang = cfg.name, cfg.overhang
         self.drive_side: int = cfg.frame.reflecting_side_sign
         self.gap_m = cfg.panels.gap_mm * 1e-3
@@ -137,11 +116,7 @@ class Mirror:
         self.base_pose = self.deck_pose(self.base_panel_pose)
 
     def panel(self, panel: PanelId) -> Panel:
-        """The panel of that row and column.
-
-        Raises:
-            UnknownPanelError: if the mirror has none there.
-        """
+        """The panel of that row and column; raises ``UnknownPanelError``."""
         try:
             return self.panels[panel]
         except KeyError:
@@ -156,13 +131,10 @@ class Mirror:
         return self.surface.point(x, y)
 
     def point_on_deck(self, pid: PointId) -> tuple[float, float]:
-        """Deck (x, y) of a measurement point, m.
+        """Deck (x, y) of a measurement point, m; raises ``UnknownPanelError``, also for a number outside 1 to 9.
 
         The nominal offset in the panel's tangent plane is dropped on the surface along the panel's normal. Points are
         numbered row by row from the panel's lower left (thesis fig. 2.2).
-
-        Raises:
-            UnknownPanelError: for a panel that does not exist or a number outside 1 to 9.
         """
         if not 1 <= pid.point <= POINTS_PER_PANEL:
             raise UnknownPanelError(f"measurement point {pid.point} of panel {pid[:2]}: numbers run from 1 to 9")
@@ -179,11 +151,7 @@ class Mirror:
         return {name: self._dropped(p, x, y) for name, (x, y) in self._adjusters.items()}
 
     def deck_pose(self, p: PanelPose) -> DeckPose:
-        """Deck pose of a pose in a panel frame.
-
-        Raises:
-            UnknownPanelError: for a panel that does not exist.
-        """
+        """Deck pose of a pose in a panel frame; raises ``UnknownPanelError``."""
         panel = self.panel(p.panel)
         x, y = self._dropped(panel, p.x_m, p.y_m)
         e1, e2, n = self.surface.axes(x, y)
@@ -196,11 +164,7 @@ class Mirror:
         return DeckPose(x, y, atan2(_dot(h, e2), _dot(h, e1)))
 
     def panel_pose(self, panel: PanelId, p: DeckPose) -> PanelPose:
-        """Pose in the frame of ``panel`` (which need not be the one under the robot).
-
-        Raises:
-            UnknownPanelError: for a panel that does not exist.
-        """
+        """Pose in the frame of ``panel``, which need not be the one under the robot; raises ``UnknownPanelError``."""
         found = self.panel(panel)
         x, y, _ = found.from_deck(self.surface.point(p.x_m, p.y_m))
         hx, hy, _ = found.rotate_from_deck(self.robot_axes(p)[0])
@@ -247,16 +211,9 @@ class Mirror:
         return self.world_from_deck((x + height_m * nx, y + height_m * ny, z + height_m * nz))
 
     def foot_of_puck(self, world: Vector3, height_m: float) -> tuple[float, float, float]:
-        """Deck foot of a puck and its deviation from the ideal surface.
+        """Deck foot (x, y) of a puck at ``world`` and its height above the ideal surface on the drive side, m.
 
-        Args:
-            world: the puck's centre, world frame, m.
-
-        Returns:
-            (x, y, deviation), m; deviation > 0 means too high above the surface on the drive side.
-
-        Raises:
-            ConvergenceError: for a point far from the mirror.
+        Raises ``ConvergenceError`` far from the mirror.
         """
         x, y, distance = self.surface.foot(self.deck_from_world(world))
         return x, y, distance - height_m
@@ -265,10 +222,7 @@ class Mirror:
         """Angle in the frame of ``panel`` of the normal of a seam line through the deck point (x, y), rad.
 
         The seam line is the curve ``axis`` = const on the surface. Its normal is its tangent, (0, 1, fy) or (1, 0, fx),
-        turned within the panel plane to the side on which ``axis`` grows.
-
-        Raises:
-            UnknownPanelError: for a panel that does not exist.
+        turned within the panel plane to the side on which ``axis`` grows. Raises ``UnknownPanelError``.
         """
         fx, fy = self.surface.gradient(x, y)
         tangent = (0.0, 1.0, fy) if axis == "x" else (1.0, 0.0, fx)
@@ -291,11 +245,7 @@ def _dot(a: Vector3, b: Vector3) -> float:
 
 
 def build_mirror(cfg: MirrorConfig) -> Mirror:
-    """Geometry of a configured mirror.
-
-    Raises:
-        LayoutError: if the configuration contradicts itself.
-    """
+    """Geometry of a configured mirror; raises ``LayoutError`` where the configuration contradicts itself."""
     return Mirror(cfg)
 
 
@@ -325,22 +275,13 @@ _DROP_STEPS = 2
 
 
 def deck_poses(mirror: Mirror, poses: Sequence[PanelPose]) -> FloatArray:
-    """``Mirror.deck_pose`` of many.
-
-    Returns:
-        Rows of deck x, y (m), heading (rad) and height of the surface there (m), shape (k, 4).
-    """
+    """``Mirror.deck_pose`` of many: rows of deck x, y (m), heading (rad) and surface height there (m), shape (k, 4)."""
     places = np.array([[p.x_m for p in poses], [p.y_m for p in poses], [p.heading_rad for p in poses]]).T
     return _by_runs(mirror, [p.panel for p in poses], places)
 
 
 def deck_rows(mirror: Mirror, panels: NDArray[np.int64], places: FloatArray) -> FloatArray:
-    """The same of poses that are arrays already.
-
-    Args:
-        panels: row and column of each, shape (k, 2).
-        places: x, y (m) and heading (rad) in the frames of these panels, shape (k, 3).
-    """
+    """``deck_poses`` of row and column (k, 2), and x, y (m), heading (rad) in the frames of these panels (k, 3)."""
     return _by_runs(mirror, [PanelId(row, col) for row, col in panels.tolist()], places)
 
 

@@ -1,7 +1,4 @@
-"""The alignment of a whole mirror, from its fixes.
-
-Recovered misalignment against the one that was simulated: does the stated uncertainty hold?
-"""
+"""The alignment of a whole mirror from its fixes, and its comparison with the simulated misalignment."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -41,14 +38,10 @@ class Undetermined(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurveyResult:
-    """How the panels of a mirror lie.
+    """How the panels of a mirror lie, rows then columns.
 
-    Attributes:
-        panels: those that could be fitted, rows then columns.
-        wavefront: of all fitted panels, with rigid moves; None without any.
-        wavefront_bent: the same with moves that bend; None where a panel has too few points for them.
-        price: of outliers and shapes.
-        warnings: what a reader should know, one line each.
+    ``wavefront`` is with rigid moves (None without a fitted panel), ``wavefront_bent`` with moves that bend (None where
+    a panel has too few points for them); ``price`` of outliers and shapes.
     """
 
     panels: tuple[PanelResult, ...]
@@ -66,12 +59,7 @@ def survey_result(
     measured: Iterable[Measured],
     planned: Iterable[PanelId],
 ) -> SurveyResult:
-    """Fit every panel.
-
-    Args:
-        cfg: section ``align``.
-        planned: the mission's panels; one without enough fixes is told as not determined.
-    """
+    """Fit every panel; a ``planned`` one without enough fixes is listed as not determined."""
     warnings: list[str] = []
     by_panel: dict[PanelId, list[Measured]] = {panel: [] for panel in sorted(set(planned))}
     for one in measured:
@@ -103,7 +91,6 @@ def survey_result(
 def _usable(
     mirror: Mirror, cfg: AlignConfig, puck_height_m: float, by_panel: Mapping[PanelId, Sequence[Measured]]
 ) -> tuple[dict[PanelId, Deviations], list[Undetermined]]:
-    """Deviations of the panels with enough fixes, and the other panels."""
     usable: dict[PanelId, Deviations] = {}
     others: list[Undetermined] = []
     for panel, some in by_panel.items():
@@ -145,12 +132,10 @@ BAND = 0.99
 
 
 class Comparison(NamedTuple):
-    """Recovered minus injected, over all panels that could be fitted.
+    """Recovered minus injected, over all panels that could be fitted; tip and tilt together.
 
-    Attributes:
-        piston_rms_m, tilt_rms_rad: of the differences; tip and tilt together.
-        chi2: sum of ``e^T C^-1 e`` over the panels, e the three differences and C their covariance.
-        low, high: what chi2 stays between with 99 % probability where the stated covariances are right.
+    ``chi2``: sum of ``e^T C^-1 e`` over the panels, e the three differences and C their covariance; ``low`` and
+    ``high`` bound it with 99 % probability where the stated covariances are right.
     """
 
     panels: int
@@ -168,11 +153,7 @@ class Comparison(NamedTuple):
 
 
 def compare(panels: Sequence[PanelResult], injected: Mapping[PanelId, Vector3]) -> Comparison | None:
-    """Compare; None without a panel of which both are known.
-
-    Args:
-        injected: piston (m), tip and tilt (rad) as simulated.
-    """
+    """Compare with the simulated misalignment; None without a panel of which both are known."""
     known = [panel for panel in panels if panel.panel in injected]
     if not known:
         return None

@@ -1,8 +1,8 @@
 """Misalignment of panels: the model, the puck on a misaligned panel, and the fit from measured positions.
 
-The model, used by the simulated truth and by the fit alike: a panel is a rigid body, displaced along its own normal by
-``D(x_p, y_p) = piston + tilt x_p + tip y_p`` with (x_p, y_p) the panel coordinates of the surface point. Angles are
-small (100 urad), so the sideways motion of second order is left out.
+A panel is a rigid body, displaced along its own normal by ``D(x_p, y_p) = piston + tilt x_p + tip y_p`` with (x_p, y_p)
+the panel coordinates of the surface point. Angles are small (100 urad), so the sideways motion of second order is
+left out.
 """
 
 from dataclasses import dataclass
@@ -21,12 +21,9 @@ _MIN_SPREAD_M = 0.02
 
 @dataclass(frozen=True, slots=True)
 class PanelMisalignment:
-    """Rigid misalignment of a panel against the ideal surface.
+    """Rigid misalignment of a panel against the ideal surface, in the panel frame.
 
-    Attributes:
-        piston_m: displacement of the panel's centre along its normal, > 0 towards the robot.
-        tip_rad: slope of the displacement along the panel's y axis.
-        tilt_rad: slope of the displacement along the panel's x axis.
+    ``piston_m`` > 0 towards the robot; ``tip_rad`` and ``tilt_rad``: slope of the displacement along y and along x.
     """
 
     piston_m: float
@@ -40,12 +37,7 @@ class PanelMisalignment:
 
 @dataclass(frozen=True, slots=True)
 class PanelFit:
-    """Misalignment of a panel as measured.
-
-    Attributes:
-        piston_m, tip_rad, tilt_rad: as in ``PanelMisalignment``.
-        sigma: standard deviations of piston (m), tip and tilt (rad), from the covariance of the positions.
-    """
+    """Measured misalignment; ``sigma``: standard deviations of piston (m), tip and tilt (rad)."""
 
     piston_m: float
     tip_rad: float
@@ -58,16 +50,10 @@ class PanelFit:
 def misaligned_puck_world(
     mirror: Mirror, panel: PanelId, misalignment: PanelMisalignment, p: DeckPose, height_m: float
 ) -> Vector3:
-    """World position of the puck's centre while the robot stands on a misaligned panel.
+    """World position of the puck's centre while the robot stands on a misaligned panel, ``p`` before the displacement.
 
     The surface point moves by D along the panel's normal z, and the surface normal n on which the puck stands turns
-    with the panel: ``n' = n - (tilt x + tip y)`` of the panel's axes, to first order.
-
-    Args:
-        p: deck pose of the robot's contact point, before the displacement.
-
-    Raises:
-        UnknownPanelError: for a panel that does not exist.
+    with the panel: ``n' = n - (tilt x + tip y)`` of the panel's axes, to first order. Raises ``UnknownPanelError``.
     """
     body = mirror.panel(panel)
     point = mirror.surface.point(p.x_m, p.y_m)
@@ -83,18 +69,9 @@ def misaligned_puck_world(
 
 
 def panel_deviations(mirror: Mirror, panel: PanelId, points_world: FloatArray, puck_height_m: float) -> FloatArray:
-    """Deviation of each puck along the local normal from the ideal surface where it actually stood.
+    """Rows (x_p, y_p, deviation along the local normal), m, shape (k, 3), of puck centres in the world frame (k, 3).
 
-    Args:
-        panel: the panel in whose frame the places are given.
-        points_world: puck centres, world frame, m, shape (k, 3).
-
-    Returns:
-        Rows (x_p, y_p, deviation), m, shape (k, 3).
-
-    Raises:
-        UnknownPanelError: for a panel that does not exist.
-        ConvergenceError: for a point far from the mirror.
+    Raises ``UnknownPanelError``, and ``ConvergenceError`` far from the mirror.
     """
     return np.array([_deviation(mirror, panel, p, puck_height_m) for p in _as_points(points_world)]).reshape(-1, 3)
 
@@ -102,20 +79,13 @@ def panel_deviations(mirror: Mirror, panel: PanelId, points_world: FloatArray, p
 def fit_panel(
     mirror: Mirror, panel: PanelId, points_world: FloatArray, covariances: FloatArray, puck_height_m: float
 ) -> PanelFit:
-    """Weighted least squares of piston, tip and tilt from measured puck positions on one panel.
+    """Weighted least squares of piston, tip and tilt from puck positions (k, 3), world frame, k >= 3, on one panel.
 
     Solves ``d_k = (piston + tilt x_k + tip y_k) (n_k . z) + e_k`` with ``var(e_k) = n_k^T C_k n_k``: only the error
     along the local normal n_k counts, because sideways errors move along the surface. Points are independent.
 
-    Args:
-        points_world: puck centres, world frame, m, shape (k, 3), k >= 3.
-        covariances: their covariances, world frame, m^2, shape (k, 3, 3).
-
-    Raises:
-        PanelFitError: with fewer than three points, with points on one line to within 20 mm (rms), or with a
-            covariance that is not positive.
-        UnknownPanelError: for a panel that does not exist.
-        ConvergenceError: for a point far from the mirror.
+    Raises ``PanelFitError`` with fewer than three points, points on one line to within 20 mm (rms) or a covariance (k,
+    3, 3) that is not positive; ``UnknownPanelError``; ``ConvergenceError`` far from the mirror.
     """
     points = np.asarray(points_world, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < _PARAMETERS:
@@ -142,7 +112,6 @@ def fit_panel(
 
 
 def _weighted_fit(design: FloatArray, deviations: FloatArray, sigmas: FloatArray) -> PanelFit:
-    """Least squares by QR of the whitened design; columns piston, tip, tilt."""
     whitened = design / sigmas[:, None]
     q, r = np.linalg.qr(whitened)
     target = deviations / sigmas

@@ -1,7 +1,4 @@
-"""Position from ranges to known anchors: damped Gauss-Newton, covariance, dilution of precision.
-
-From valid lengths to the fix of the puck.
-"""
+"""Position from ranges to known anchors: damped Gauss-Newton, covariance, dilution of precision; fix of the puck."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -48,14 +45,10 @@ class TooFarFromExpected(MultilaterationError):
 
 @dataclass(frozen=True, slots=True)
 class RangeSolution:
-    """A multilaterated position, in the frame of the anchors.
+    """A multilaterated position (d,), m, in the frame of the anchors.
 
-    Attributes:
-        position_m: shape (d,).
-        covariance_m2: (H^T W H)^-1, shape (d, d).
-        dop: sqrt(trace((H^T H)^-1)), dimensionless.
-        residuals_m: measured minus computed ranges, shape (m,).
-        chi_squared: sum of the squared residuals over their variances; m - d degrees of freedom.
+    Covariance (H^T W H)^-1 (d, d); ``dop``: sqrt(trace((H^T H)^-1)), dimensionless; residuals measured minus computed
+    (m,); ``chi_squared`` has m - d degrees of freedom.
     """
 
     position_m: FloatArray
@@ -80,27 +73,19 @@ def multilaterate(
     max_iterations: int = 100,
     tolerance_m: float = 1e-9,
 ) -> RangeSolution:
-    """Weighted least squares position from ranges.
+    """Weighted least squares position from ranges (m,) to anchors (m, d), d = 2 or 3, m >= d + 1.
 
-    Minimises sum(((r_i - |x - a_i|) / sigma_i)^2) from ``expected_m`` on, by the steps
+    Minimises sum(((r_i - |x - a_i|) / sigma_i)^2) from ``expected_m`` on by the steps
     (H^T W H + lambda I) dx = H^T W (r - |x - a|), H_i = (x - a_i)^T / |x - a_i|, W = diag(1 / sigma^2); lambda falls
-    tenfold after a step that lessens the sum and rises tenfold after one that does not (Levenberg 1944).
+    tenfold after a step that lessens the sum and rises tenfold after one that does not (Levenberg 1944). Three to five
+    steps do where the ranges agree.
 
     Anchors that lie in one plane (in two dimensions: on one line) see two mirror images of the position equally well.
     The expected position then selects the side: the image on its side of the plane is returned. An expected position
     in that plane selects none and gives ``DegenerateGeometry``.
 
-    Args:
-        anchors_m: shape (m, d), d = 2 or 3, m >= d + 1.
-        ranges_m: shape (m,).
-        sigmas_m: standard deviations of the ranges, shape (m,), > 0.
-        expected_m: where to start, same frame as the anchors, shape (d,).
-        max_iterations: steps to try at most. Three to five do where the ranges agree; ranges that contradict each other
-            by much slow Gauss-Newton down.
-
-    Raises:
-        ValueError: shapes, numbers that are not finite, sigmas that are not positive.
-        TooFewRanges, DegenerateGeometry, NoConvergence: see there.
+    Raises ``ValueError`` (shapes, numbers that are not finite, sigmas that are not positive), ``TooFewRanges``,
+    ``DegenerateGeometry``, ``NoConvergence``.
     """
     problem = _checked(anchors_m, ranges_m, sigmas_m, expected_m)
     anchors, ranges, sigmas, start = problem
@@ -131,12 +116,7 @@ def check_solution(
 ) -> None:
     """Refuse a solution that cannot be trusted.
 
-    Args:
-        solution: what ``multilaterate`` gave.
-        expected_m: where the position was expected, shape (d,).
-
-    Raises:
-        ResidualTooLarge, DilutionTooLarge, TooFarFromExpected: in this order.
+    Raises ``ResidualTooLarge``, ``DilutionTooLarge``, ``TooFarFromExpected``, in this order.
     """
     residual_m = float(np.max(np.abs(solution.residuals_m)))
     if not residual_m <= max_residual_m:
@@ -177,7 +157,7 @@ def _checked(anchors_m: ArrayLike, ranges_m: ArrayLike, sigmas_m: ArrayLike, exp
 
 
 def _geometry(anchors: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distances (m,) and unit vectors from the anchors to the position, shape (m, d): the Jacobian H."""
+    """Distances (m,) and unit vectors (m, d) from the anchors to the position: the Jacobian H."""
     offsets = position - anchors
     distances = np.sqrt(np.einsum("ij,ij->i", offsets, offsets))
     # At an anchor the direction is undefined: a zero row leaves that range out of this step.
@@ -241,13 +221,7 @@ def solve_fix(
 ) -> Fix:
     """Multilaterate the puck, each length with sigma = length_sigma_m + length_sigma_per_m * length, and check it.
 
-    Args:
-        cfg: sigmas, and the limits of residual, dilution of precision and distance.
-        expected_m: where the puck should be, world frame, shape (3,).
-        collimators_m: collimator by channel, world frame, shape (3,).
-
-    Raises:
-        MultilaterationError: no solution, or one past a limit.
+    World frame throughout. Raises ``MultilaterationError``: no solution, or one past a limit.
     """
     ranges_m = np.array(tuple(lengths_m.values()))
     sigmas_m = cfg.length_sigma_m + cfg.length_sigma_per_m * ranges_m

@@ -1,49 +1,34 @@
-"""The alignment of one panel, from its deviations.
+"""The alignment of one panel: deviations, modes, adjuster moves, outliers and shape, half-wavefront error.
 
-Deviation of each measured point from the ideal surface, along the normal where the puck really stood.
-
-What a panel can do: displacements along its normal as polynomials of the place on it, and their least squares.
-
-The displacement is ``D(x, y) = sum c_i m_i(x, y)`` with the modes
+The displacement along a panel's normal is ``D(x, y) = sum c_i m_i(x, y)`` with the modes
 
 * ``RIGID``: 1, y, x: piston, tip, tilt, as in ``ccatp.mirror.misalignment``;
 * ``QUADRATIC``: these and x^2/2, x y, y^2/2: the coefficients are the curvatures D_xx, D_xy, D_yy;
 * ``ADJUSTABLE``: the rigid ones and what five adjusters in the corners and the centre can bend besides: x y, a twist,
   and (x^2 + y^2)/2, a bowl. How a panel bends between its adjusters is taken to be this.
 
-Moves of the vertical adjusters that bring a panel back, and their uncertainty.
+An adjuster moves its place along the panel's normal, > 0 towards the robot. Moving the adjusters at (X_j, Y_j) by
+``a_j = -sum c_i m_i(X_j, Y_j)`` adds ``-D`` to the panel, D being the fitted displacement. For the rigid modes the
+moves lie on a plane: they turn and shift the panel and do not bend it, so no stiffness needs to be known.
 
-An adjuster moves its place on the panel along the panel's normal, > 0 towards the robot. Moving the adjusters at
-(X_j, Y_j) by ``a_j = -sum c_i m_i(X_j, Y_j)`` adds ``-D`` to the panel, D being the displacement that was fitted in the
-modes m. For the rigid modes the moves lie on a plane: they turn and shift the panel and do not bend it, and among the
-moves that take the fitted plane away they are the ones of which five adjusters need no stiffness to be known. With
-``modes.adjustable`` they take twist and bowl away as well.
-
-Outliers among the points of a panel, and whether it is bent: the cheapest explanation of its deviations.
-
-Each explanation is a fit, rigid or with curvatures, to all points but a few. It costs its chi-square, and besides a
-price for every point left out and a price for the curvatures; the cheapest one holds. Leaving a point out is the same
-as giving it a shift of its own (mean-shift model), so its price is the chi-square of one degree of freedom that noise
-reaches only with the agreed probability, shared by all points of the mirror. Baarda's data snooping asks the same of
-one point at a time; a bent panel would make it throw good points away.
-
-Half-wavefront error of a mirror, before and after its adjusters are moved.
+Each explanation of the deviations is a fit, rigid or with curvatures, to all points but a few. It costs its
+chi-square, a price for every point left out and a price for the curvatures; the cheapest one holds. Leaving a point out
+is the same as giving it a shift of its own (mean-shift model), so its price is the chi-square of one degree of freedom
+that noise reaches only with the agreed probability, shared by all points of the mirror. Baarda's data snooping asks the
+same of one point at a time; a bent panel would make it throw good points away.
 
 A surface that is off by d along its normal changes the path of a ray that meets it at the angle of incidence i by
 ``2 d cos(i)``, to first order in d; half of it, ``d cos(i)``, is the half-wavefront error. For a paraboloid in axial
 light this is Ruze's effective tolerance (J. Ruze, Antenna tolerance theory - a review, Proc. IEEE 54 (1966) 633), as
 cos(i) = 1 / sqrt(1 + (r/2f)^2) there. The root mean square is taken over the beam: a panel counts with its area times
-cos(i).
-
-For one panel, with the fitted coefficients c, their covariance C, and G the panel's mean of the products of the modes,
+cos(i). For one panel, with the fitted coefficients c, their covariance C, and G the panel's mean of the products of
+the modes,
 
     before^2 = cos(i)^2 (c^T G c + u)        after^2 = cos(i)^2 (tr(C G) + u)
 
 where u is the mean square of the residuals beyond what the uncertainty of the points explains (shape that the moves
 cannot take away), and tr(C G) what the uncertain moves leave. Noise makes the u of a panel without shape negative as
 often as positive, so the mean over the mirror is taken first, and cut off at zero then.
-
-The displacement of a panel as it was fitted, at any place on it.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -74,7 +59,7 @@ class Deviations(NamedTuple):
 
     Attributes:
         places_m: (x, y) in the panel frame of the surface point under the puck, shape (k, 2).
-        deck_m: (x, y) of the same in the deck frame, shape (k, 2).
+        deck_m: the same in the deck frame, shape (k, 2).
         values_m: deviation along the local normal, > 0 towards the robot, shape (k,).
         sigmas_m: standard deviation of each, shape (k,).
         lever: local normal times the panel's, shape (k,): a displacement D along the panel's normal is a deviation of
@@ -92,16 +77,10 @@ class Deviations(NamedTuple):
 def deviations_of(
     mirror: Mirror, panel: PanelId, measured: Sequence[Measured], puck_height_m: float, floor_m: float
 ) -> Deviations:
-    """Deviations of the points of a panel.
+    """Deviations of the points of a panel; their variance is ``n^T C n + floor^2``.
 
-    The variance of a deviation is ``n^T C n + floor^2``: an error of the fix sideways moves along the surface.
-
-    Args:
-        floor_m: standard deviation, point by point, of what the covariance of a fix does not know.
-
-    Raises:
-        UnknownPanelError: for a panel that does not exist.
-        ConvergenceError: for a fix far from the mirror.
+    An error of the fix sideways moves along the surface. ``floor_m`` is what the covariance of a fix does not know,
+    point by point. Raises ``UnknownPanelError``, and ``ConvergenceError`` far from the mirror.
     """
     chosen = sorted(measured, key=lambda one: one.point)
     body = mirror.panel(panel)
@@ -146,13 +125,9 @@ def adjustable(places_m: FloatArray) -> FloatArray:
 
 
 class ModeFit(NamedTuple):
-    """Coefficients by weighted least squares.
+    """Coefficients (m,) by weighted least squares, in m, rad and 1/m, with their covariance (m, m) and residuals (k,).
 
-    Attributes:
-        values: coefficients, shape (m,), m and rad and 1/m.
-        covariance: theirs, shape (m, m).
-        residuals_m: what is left of the deviations, shape (k,).
-        residual_variance_m2: mean square of the residuals that the points' own uncertainty makes one expect.
+    ``residual_variance_m2``: mean square of the residuals that the points' own uncertainty makes one expect.
     """
 
     values: FloatArray
@@ -176,10 +151,7 @@ class ModeFit(NamedTuple):
 def fit_modes(design: FloatArray, values_m: FloatArray, sigmas_m: FloatArray) -> ModeFit | None:
     """Weighted least squares by QR; None where the points do not determine the coefficients.
 
-    Args:
-        design: modes at the points, each row times the point's lever, shape (k, m).
-        values_m: deviations, shape (k,).
-        sigmas_m: their standard deviations, shape (k,), > 0.
+    ``design`` (k, m): modes at the points, each row times the point's lever; deviations and sigmas > 0 of shape (k,).
     """
     count, modes = design.shape
     if count < modes:
@@ -199,10 +171,9 @@ def fit_modes(design: FloatArray, values_m: FloatArray, sigmas_m: FloatArray) ->
 
 
 def gram(modes: Modes, half_m: tuple[float, float]) -> FloatArray:
-    """Mean of the products of the modes over a panel: ``c^T G c`` is the mean square of a displacement.
+    """Mean G of the products of the modes over a panel of half sizes ``half_m``.
 
-    Args:
-        half_m: half the panel's size along x and y.
+    ``c^T G c`` is the mean square of D.
     """
     x, y = np.meshgrid(_NODES * half_m[0], _NODES * half_m[1])
     weights = np.outer(_NODE_WEIGHTS, _NODE_WEIGHTS).ravel() / 4.0
@@ -211,12 +182,7 @@ def gram(modes: Modes, half_m: tuple[float, float]) -> FloatArray:
 
 
 class Moves(NamedTuple):
-    """Moves in the order of the adjusters' names.
-
-    Attributes:
-        values_m: moves, shape (a,).
-        covariance_m2: theirs, shape (a, a); of the rank of the modes.
-    """
+    """Moves (a,) in the order of the adjusters' names; covariance (a, a), of the rank of the modes."""
 
     values_m: FloatArray
     covariance_m2: FloatArray
@@ -230,8 +196,7 @@ class Moves(NamedTuple):
 def adjuster_places(mirror: Mirror, panel: PanelId) -> tuple[tuple[str, ...], FloatArray]:
     """Names of a panel's adjusters and their (x, y) in the panel frame, shape (a, 2), m.
 
-    Raises:
-        UnknownPanelError: for a panel that does not exist.
+    Raises ``UnknownPanelError``.
     """
     body = mirror.panel(panel)
     found = mirror.adjusters_on_deck(panel)
@@ -240,11 +205,7 @@ def adjuster_places(mirror: Mirror, panel: PanelId) -> tuple[tuple[str, ...], Fl
 
 
 def adjuster_moves(fit: ModeFit, modes: Modes, places_m: FloatArray) -> Moves:
-    """Moves that take a fitted displacement away.
-
-    Args:
-        places_m: of the adjusters, panel frame, shape (a, 2).
-    """
+    """Moves that take a fitted displacement away, of adjusters at (x, y) in the panel frame, shape (a, 2), m."""
     at = -modes(places_m)
     return Moves(at @ fit.values, at @ fit.covariance @ at.T)
 
@@ -269,10 +230,9 @@ class Explanation(NamedTuple):
 
 
 def prices(false_alarm: float, points: int, panels: int) -> Prices:
-    """What an explanation costs.
+    """What an explanation costs; ``false_alarm``.
 
-    Args:
-        false_alarm: probability that noise alone makes an outlier anywhere on the mirror, and as much for a shape.
+    Probability of an outlier by noise on the whole mirror, likewise of a shape.
     """
     return Prices(
         float(chdtri(1, false_alarm / max(points, 1))), float(chdtri(_CURVATURES, false_alarm / max(panels, 1)))
@@ -318,13 +278,9 @@ def _chi2(whitened: FloatArray, target: FloatArray) -> float:
 
 
 class PanelWavefront(NamedTuple):
-    """One panel's part.
+    """One panel's part: mean squares of the half-wavefront error as fitted, unexplained (u, may be < 0) and of noise.
 
-    Attributes:
-        fitted_m2: mean square of its half-wavefront error, as fitted.
-        unexplained_m2: u, as half-wavefront error; may be negative by chance.
-        noise_m2: mean square of its points' uncertainty, as half-wavefront error.
-        mean_m: mean of the half-wavefront error before.
+    ``mean_m``: mean of the half-wavefront error before the moves.
     """
 
     weight_m2: float
@@ -338,10 +294,8 @@ class PanelWavefront(NamedTuple):
 class MirrorWavefront(NamedTuple):
     """Root mean squares over all panels that could be fitted, m.
 
-    Attributes:
-        before_level_m: the same without its mean over the beam, a path that all light shares.
-        after_m: predicted, once the adjusters have been moved.
-        noise_m: of a single point: what a survey after the moves shows is this and ``after_m``, added in squares.
+    ``before_level_m`` is without the mean over the beam, a path that all light shares; ``after_m`` is predicted;
+    ``noise_m`` is of a single point: a survey after the moves shows this and ``after_m``, added in squares.
     """
 
     before_m: float
@@ -370,11 +324,7 @@ def half_size_m(panel: Panel) -> tuple[float, float]:
 
 
 def panel_wavefront(panel: Panel, cos_i: float, fit: ModeFit, gram: FloatArray, sigmas_m: FloatArray) -> PanelWavefront:
-    """Half-wavefront error of one panel.
-
-    Args:
-        gram: mean of the products of these modes over the panel.
-    """
+    """Half-wavefront error of one panel; ``gram`` is of the fitted modes."""
     half_x, half_y = half_size_m(panel)
     square = cos_i * cos_i
     return PanelWavefront(
@@ -404,11 +354,9 @@ SHAPE = slice(3, 6)
 
 
 class PanelShape(NamedTuple):
-    """Curvatures of the displacement, D_xx, D_xy, D_yy.
+    """Curvatures D_xx, D_xy, D_yy of the displacement and their standard deviations, 1/m, shape (3,).
 
-    Attributes:
-        values_1_m, sigma_1_m: curvatures and standard deviations, shape (3,).
-        gain: chi-square of the rigid fit minus that of the fit with curvatures.
+    ``gain``: chi-square of the rigid fit minus that of the fit with curvatures.
     """
 
     values_1_m: FloatArray
@@ -429,16 +377,11 @@ class AdjusterPlan(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PanelResult:
-    """How a panel lies.
+    """How a panel lies: rigid fit (piston, m; tip, tilt, rad), also where the panel is bent.
 
-    Piston, tip and tilt are those of the rigid fit, also where the panel is bent: they are what the adjusters can take
-    away without bending the panel, and half as uncertain as beside three curvatures.
-
-    Attributes:
-        is_kept: points that count, shape (k,); the others are outliers.
-        fit: piston (m), tip, tilt (rad).
-        shape: curvatures; None with fewer points than it takes.
-        bending: moves that take twist and bowl away, too; None with fewer points than it takes.
+    These are what the adjusters can take away without bending the panel, and half as uncertain as beside three
+    curvatures. ``is_kept`` (k,): the points that are not outliers. ``shape`` and ``bending`` (moves that take twist and
+    bowl away, too) are None with fewer points than they take.
     """
 
     panel: PanelId
@@ -507,11 +450,7 @@ def _shape(fit: ModeFit, full: ModeFit, *, is_significant: bool) -> PanelShape:
 
 
 def displacement_m(panel: PanelResult, places_m: FloatArray) -> FloatArray:
-    """Along the panel's normal, with its curvatures where they are significant, shape (k,).
-
-    Args:
-        places_m: (x, y) in the panel frame, shape (k, 2).
-    """
+    """Along the panel's normal at panel places (k, 2), m, with curvatures where they are significant, shape (k,)."""
     found = rigid(places_m) @ panel.fit.values
     if panel.shape is not None and panel.shape.is_significant:
         # The rigid fit has taken the mean of the curvatures' part away; so does what is drawn.
@@ -521,11 +460,9 @@ def displacement_m(panel: PanelResult, places_m: FloatArray) -> FloatArray:
 
 
 def on_grid_m(mirror: Mirror, panel: PanelResult, cells: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The displacement in a grid of cells over a panel.
+    """The displacement in a grid of cells.
 
-    Returns:
-        Edges of the cells along deck x and deck y, shape (cells + 1,) each, and the displacement in their middles,
-        rows along x, shape (cells, cells).
+    Edges along deck x and deck y (cells + 1,), values (cells, cells), rows along x.
     """
     body = mirror.panel(panel.panel)
     x = np.linspace(body.x_m - body.half_x_m, body.x_m + body.half_x_m, cells + 1)

@@ -1,6 +1,6 @@
-"""The rim: outline of the union of the panels with the seams filled, as a signed distance in the deck plane.
+"""The rim: outline of the union of the panels with the seams filled, as a signed distance in the deck plane, m.
 
-A rectilinear outline, mirror-symmetric about x = 0, and the few of its edges that count near a place.
+The outline is rectilinear and mirror-symmetric about x = 0; only a few of its edges count near a place.
 """
 
 from collections.abc import Sequence
@@ -20,11 +20,9 @@ _BOX_M = 0.25  # half the side of the square for which edges are picked at a tim
 
 
 class Outline:
-    """Upright and level edges of the right half of an outline, deck plane, m.
+    """Upright edges (x, low y, high y), with the slabs on their left, and level ones (y, low x, high x), m.
 
-    Args:
-        upright: (x, low y, high y) of edges and of the slabs that they bound on the right.
-        level: (y, low x, high x).
+    Of the right half of an outline in the deck plane.
     """
 
     __slots__ = ("_level", "_upright")
@@ -106,22 +104,15 @@ _CLEARANCE_TOLERANCE_M = 1e-9
 
 
 class Rim(Outline):
-    """Outline with stepped corners of a whole mirror, deck plane, m.
+    """Outline with stepped corners of a whole mirror along the panels' outer edges; distances > 0 on the mirror.
 
-    It runs along the panels' own outer edges. Positive distances lie on the mirror.
-
-    Attributes:
-        vertices: corners counter-clockwise, shape (n, 2), m.
+    ``vertices``: corners counter-clockwise, shape (n, 2), deck plane, m.
     """
 
     __slots__ = ("_boxes", "_edges", "vertices")
 
     def __init__(self, slabs: Sequence[Span]) -> None:
-        """Build the outline from stacked slabs.
-
-        Args:
-            slabs: (half width, low y, high y) from low to high y; each slab begins where the one before ends.
-        """
+        """Slabs (half width, low y, high y) from low to high y; each begins where the one before ends."""
         widths = [0.0, *(half for half, _, _ in slabs), 0.0]
         levels = [slabs[0][1], *(high for _, _, high in slabs)]
         steps = zip(levels, pairwise(widths), strict=True)
@@ -150,10 +141,7 @@ class Rim(Outline):
         """Least signed distance along the straight segment from (x0, y0) to (x1, y1), m, to 1 nm.
 
         On the mirror this is the distance between the segment and the outline. Where the segment leaves the mirror it
-        is minus the largest distance beyond the rim.
-
-        Raises:
-            MirrorError: if a coordinate is not finite.
+        is minus the largest distance beyond the rim. Raises ``MirrorError`` for a coordinate that is not finite.
         """
         if not isfinite(x0 + y0 + x1 + y1):
             raise MirrorError(f"segment from ({x0}, {y0}) to ({x1}, {y1}) is not finite")

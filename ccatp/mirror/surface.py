@@ -1,9 +1,4 @@
-"""The polynomial surface of a mirror in the deck frame, thesis eq. 1.1, with its derivatives and its normal.
-
-Typed refusals of the mirror's geometry; each message carries its numbers.
-
-A mirror's surface around a place that moves slowly: one exact expansion, carried on by Taylor's theorem.
-"""
+"""The polynomial surface of a mirror in the deck frame, thesis eq. 1.1; derivatives, normal, expansion, refusals."""
 
 from math import inf, sqrt
 
@@ -44,22 +39,18 @@ _NEWTON_STEP_M = 1e-12  # Newton converges quadratically: a step this small leav
 
 
 class Surface:
-    """Height of the ideal mirror over the deck plane, ``f(x, y) = sum c_ij x^i y^j`` (thesis eq. 1.1, deck frame).
+    """Height of the ideal mirror over the deck plane, ``f(x, y) = sum c_ij x^i y^j`` (thesis eq. 1.1, deck frame, m).
 
-    All arguments and results are metres in the deck frame. The scalar methods are nested Horner schemes in plain
-    floats, because they run several times per control frame; the methods in the plural take arrays.
+    Scalar methods are nested Horner schemes in plain floats, because they run several times per control frame; the
+    methods in the plural take arrays.
     """
 
     __slots__ = ("_coefficients", "_rows")
 
     def __init__(self, coefficients: FloatArray) -> None:
-        """Keep the coefficients.
+        """``coefficients``: c_ij in m^(1-i-j), shape (powers of x, powers of y).
 
-        Args:
-            coefficients: ``c_ij``, shape (powers of x, powers of y), in m^(1-i-j), deck frame.
-
-        Raises:
-            ValueError: if the array is not two-dimensional.
+        Raises ``ValueError`` for another dimension.
         """
         if coefficients.ndim != 2:
             raise ValueError(f"surface coefficients need shape (i, j), got {coefficients.shape}")
@@ -168,8 +159,7 @@ class Surface:
     def drop(self, start: Vector3, direction: Vector3) -> Vector3:
         """Point where the line ``start + s direction`` meets the surface near s = 0, deck frame, m.
 
-        Raises:
-            ConvergenceError: if Newton's iteration does not settle.
+        Raises ``ConvergenceError``.
         """
         x0, y0, z0 = start
         ux, uy, uz = direction
@@ -184,19 +174,12 @@ class Surface:
         raise ConvergenceError(f"no surface point on the line through {start} along {direction}")
 
     def foot(self, p: Vector3) -> tuple[float, float, float]:
-        """Foot of the perpendicular from ``p`` on the surface and the signed distance along the normal.
+        """Foot (x, y) of the perpendicular from ``p`` and the distance d along the normal, > 0 on the drive side.
+
+        Deck frame, m.
 
         Solves ``p = S(x, y) + d n(x, y)`` by Newton's iteration; unique while |d| is small against the radius of
-        curvature (more than 30 m on these mirrors).
-
-        Args:
-            p: point in the deck frame, m.
-
-        Returns:
-            (x, y, d), m; d > 0 on the drive side.
-
-        Raises:
-            ConvergenceError: if the iteration does not settle.
+        curvature (more than 30 m on these mirrors). Raises ``ConvergenceError``.
         """
         px, py, pz = p
         x, y = px, py
@@ -226,14 +209,9 @@ class Surface:
 
 
 def build_surface(cfg: SurfaceConfig, drive_side: int) -> Surface:
-    """Surface of a mirror in its deck frame.
+    """Surface of a mirror in its deck frame: ``f_deck(x, y) = s f_mirror(s x, y)`` with s = ``drive_side``, +1 or -1.
 
-    The deck frame is the mirror frame turned by pi about y where the robot drives on the -z side, so that
-    ``f_deck(x, y) = s f_mirror(s x, y)`` with s = +1 or -1.
-
-    Args:
-        cfg: coefficients a_ij in mm over the normalisation radius, mirror frame (thesis eq. 1.1).
-        drive_side: sign of the mirror frame's z on the side of the robot.
+    ``cfg`` has coefficients a_ij in mm over the normalisation radius, mirror frame (thesis eq. 1.1).
     """
     size_x = 1 + max((i for i, _, _ in cfg.terms), default=0)
     size_y = 1 + max((j for _, j, _ in cfg.terms), default=0)
@@ -251,10 +229,8 @@ class SurfacePatch:
     """Height, slopes and curvatures to third order in the way from the last expansion, at a quarter of the price.
 
     What is left out belongs to the fourth derivatives, which stay below 1e-3 1/m^3 on these mirrors: within 5 mm a
-    height is off by less than 1e-12 m, a slope by less than 2e-10, a second derivative by less than 5e-8 1/m.
-
-    Args:
-        reach_m: how far in x and in y an expansion is used.
+    height is off by less than 1e-12 m, a slope by less than 2e-10, a second derivative by less than 5e-8 1/m. An
+    expansion is used within ``reach_m`` in x and in y.
     """
 
     __slots__ = ("_jet", "_reach_m", "_surface", "_third", "_x_m", "_y_m")

@@ -1,7 +1,4 @@
-"""One edge sensor off the panels: where it went off, how far it has moved since, and when that is an edge.
-
-What the map says about a place where an edge sensor went off: rim ahead, seam, or neither.
-"""
+"""One edge sensor off the panels: where it went off, how far it has moved since, and when that is an edge."""
 
 from enum import Enum, StrEnum, auto
 from math import cos, hypot, inf, sin, sqrt
@@ -85,12 +82,7 @@ class EdgeMap:
     def is_rim_ahead(
         self, place: tuple[float, float], direction: tuple[float, float], reach_m: float, slack_m: float
     ) -> bool:
-        """Whether a sensor at ``place`` that moves along the unit vector ``direction`` meets the rim.
-
-        Args:
-            place: deck (x, y), m.
-            direction: unit vector in the deck plane.
-        """
+        """Whether a sensor at deck ``place`` that moves along the deck unit vector ``direction`` meets the rim."""
         x, y = place
         if self._rim.signed_distance_m(x, y) > reach_m + slack_m:
             return False
@@ -106,11 +98,9 @@ class EdgeMap:
         return self._rim.signed_distance_m(*place) <= slack_m or self.seam_at(place, slack_m) is not None
 
     def seam_at(self, place: tuple[float, float], slack_m: float, not_axis: Axis | None = None) -> SeamNear | None:
-        """The nearest interior seam whose gap, widened by ``slack_m`` on both sides, holds the place.
+        """The nearest interior seam whose gap, widened by ``slack_m`` on both sides, holds the deck place.
 
-        Args:
-            place: deck (x, y), m.
-            not_axis: leave out the seams along which this coordinate is constant.
+        Seams along which the coordinate ``not_axis`` is constant are left out.
         """
         x, y = place
         panel = self._mirror.panels[self._mirror.nearest_panel(x, y)]
@@ -180,13 +170,9 @@ class EdgeLimits:
 class EdgeDetector:
     """A sensor's time off the panels. Places are in the odometry's frame unless called map places.
 
-    Args:
-        sensor: its place in the robot frame, and how far it moves between two samples, which is how late it may have
-            been noticed, m.
-        half_base_m: half the wheel base; less translation than that per radian means turning in place.
-
-    Attributes:
-        retreat_m: how far the sensor has been moved since it was declared, while it stayed off.
+    ``sensor``: its place in the robot frame, and how far it moves between two samples, which is how late it may have
+    been noticed, m. Less translation than ``half_base_m`` per radian means turning in place. ``retreat_m``: how far the
+    sensor has been moved since it was declared, while it stayed off.
     """
 
     def __init__(
@@ -256,8 +242,7 @@ class EdgeDetector:
     def see_off(self, odometry: Odometry, place: Place, worst_m: float) -> bool:
         """The sensor is off at ``place``. Returns whether that declares an edge now.
 
-        Args:
-            worst_m: travel that wheels unheard may have added, rule (g).
+        ``worst_m``: travel that wheels without samples may have added, rule (g).
         """
         self._off_samples += 1
         self._on_samples = 0
@@ -307,7 +292,6 @@ class EdgeDetector:
     # -- rules ----------------------------------------------------------------------------------------------------
 
     def _classify(self, robot: Place) -> None:
-        """Once the sensor has moved: rules (a), (b) or (c)?"""
         length = hypot(*self._moved)
         if length < DIRECTION_TRAVEL_M:
             return

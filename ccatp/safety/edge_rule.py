@@ -9,18 +9,17 @@ b. the map has a seam there: an edge when the sensor cannot be over the gap any 
 c. the map has neither, or there is no estimate: an edge after ``no_map_travel_m``;
 d. standing still the episode is frozen, for ever; going back to where the sensor was on adds nothing;
 e. an edge may have been declared by a wrong pose: a sensor that a fix at rest shows over a seam with no rim near begins
-   anew there, and one that it shows at the rim is not to blame for staying off;
-g. wheels unheard: the fastest that the sensor can move, times the time;
+   again there, and one that it shows at the rim is not to blame for staying off;
+g. wheels without samples: the fastest that the sensor can move, times the time;
 h. all four off: lifted or fallen.
 
 An episode ends when the sensor has stood on a panel for ``clear_samples`` samples and has moved on by
-``no_map_travel_m``, so that a sensor that chatters does not begin anew again and again.
+``no_map_travel_m``, so that a sensor that chatters does not begin again and again.
 
-The robot's centre and the rim on the map: a notch's tip passes between the edge sensors unseen.
-
-At an inner corner of the stepped rim the empty quadrant points at the robot like a wedge. Driven at along its bisector,
-the front sensors, 180 mm apart, leave the panels only when its tip has come under the centre. Where the position is
-known, the map sees it coming; where it is not, four corner sensors cannot.
+The robot's centre and the rim on the map: a notch's tip passes between the edge sensors unseen. At an inner corner of
+the stepped rim the empty quadrant points at the robot like a wedge. Along its bisector the front sensors, 180 mm apart,
+leave the panels only when its tip has come under the centre. The map shows it where the position is known; where it is
+not, four corner sensors cannot.
 """
 
 from collections.abc import Sequence
@@ -68,10 +67,8 @@ class PoseEstimate(Protocol):
 class EdgeRule:
     """The four sensors' episodes and what they declare.
 
-    Attributes:
-        episodes: one per sensor, in the order of the robot link.
-        is_lifted: all four sensors have been off (rule h), and have not been back on for ``clear_samples``.
-        opened, declared: episodes opened and edges declared per sensor since the start.
+    ``is_lifted``: all four sensors have been off (rule h), and have not been back on for ``clear_samples``. ``opened``
+    and ``declared`` count episodes and edges per sensor since the start.
     """
 
     def __init__(self, edge_map: EdgeMap, robot: RobotConfig, cfg: DangerConfig) -> None:
@@ -104,11 +101,9 @@ class EdgeRule:
         return self._odometry is None
 
     def step(self, samples: list[EdgeSample], estimate: PoseEstimate | None) -> None:
-        """Judge a frame's samples, oldest first. The frame's encoder samples must have been pushed to ``track``.
+        """Judge a frame's samples, oldest first; those that go back in time are dropped.
 
-        Args:
-            samples: edge samples; those that go back in time are dropped.
-            estimate: the newest pose, already found fresh and finite; None without one.
+        The frame's encoder samples must have been pushed to ``track``; ``estimate`` is fresh and finite, or None.
         """
         if not samples:
             return
@@ -153,7 +148,6 @@ class EdgeRule:
         self._count_all(off)
 
     def _tie_to_map(self, odometry: Odometry, estimate: PoseEstimate | None) -> None:
-        """Give a sensor that has stood off a panel since before the first estimate its place on the map."""
         for i, episode in enumerate(self.episodes):
             if episode is not None and episode.needs_map and estimate is not None:
                 self._place(episode, self._offsets[i], odometry, estimate)
@@ -165,7 +159,7 @@ class EdgeRule:
         return has_fix
 
     def _look_again(self, odometry: Odometry, estimate: PoseEstimate) -> None:
-        """An edge was declared where the robot was not. A sensor that a fix shows over a seam begins anew there.
+        """A sensor that a fix shows over a seam begins again there: the edge was declared where the robot was not.
 
         One that it shows at the rim is not to blame for staying off, however far it was moved along there.
         """
@@ -230,7 +224,6 @@ class EdgeRule:
 
 
 def _are_all_on(samples: list[EdgeSample]) -> bool:
-    """Whether every sensor is on in every sample; anything but a clear 1 is off."""
     for _, front_left, front_right, rear_left, rear_right in samples:
         if not (front_left == 1 and front_right == 1 and rear_left == 1 and rear_right == 1):
             return False
@@ -254,14 +247,8 @@ class CentreClearanceCheck:
     """Declares an edge when the centre drives at the rim and is closer to it than half the sensors' lead.
 
     A straight rim never gets that close: the sensors meet it first. Ends when the centre is ``map_margin_m`` further
-    away than it takes to declare.
-
-    Args:
-        cfg: sigmas and margin.
-
-    Attributes:
-        direction: 0, or the sign of the motion that is barred.
-        clearance_m, limit_m: the centre's distance to the rim at the last look, and what it must not fall below.
+    away than it takes to declare. ``direction``: 0, or the sign of the barred motion; ``clearance_m`` at the last look
+    must not fall below ``limit_m``.
     """
 
     def __init__(self, rim: RimMap, robot: RobotConfig, cfg: DangerConfig) -> None:
@@ -279,12 +266,7 @@ class CentreClearanceCheck:
         self._look_at_s = -inf
 
     def step(self, t_s: float, estimate: PoseEstimate, wheels: Sequence[WheelSample]) -> None:
-        """Look up the clearance, where it may have come near the limit.
-
-        Args:
-            t_s: time of the frame.
-            wheels: the frame's encoder samples.
-        """
+        """Look up the clearance, where it may have come near the limit."""
         if t_s < self._look_at_s:
             return
         x, y = estimate.x_m, estimate.y_m

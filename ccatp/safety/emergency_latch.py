@@ -32,12 +32,9 @@ def is_at_base_or_held(state: str) -> bool:
 class EmergencyLatch:
     """Code 2 holds while any emergency is active.
 
-    Each id is raised once, repeated for nothing, and cleared once. A ``clear`` is the observatory's word that the cause
-    of that id is gone; it is refused while a level input says that the cause persists (``set_level``), while the robot
-    is neither at base nor held, and for an id that was never raised. The latch opens with the last one cleared.
-
-    Attributes:
-        raised: how many emergencies have been latched so far.
+    Each id is raised once, repeated without effect, and cleared once. A ``clear`` reports that the cause of that id is
+    gone; it is refused while a level input says that the cause persists (``set_level``), while the robot is neither at
+    base nor held, and for an id that was never raised. ``raised`` counts the emergencies latched so far.
     """
 
     def __init__(self) -> None:
@@ -76,10 +73,9 @@ class EmergencyLatch:
         (self._levels.add if active else self._levels.discard)(kind)
 
     def raise_emergency(self, kind: str, emergency_id: str, note: str = "") -> str | None:
-        """Latch an emergency; the same id again is harmless, and after its clear latches nothing (``holds``).
+        """Latch an emergency; returns why it was refused, or None.
 
-        Returns:
-            Why it was refused, or None.
+        The same id again, also after its clear, has no effect.
         """
         if emergency_id in self._cleared:
             return None
@@ -98,11 +94,7 @@ class EmergencyLatch:
         return None
 
     def clear(self, emergency_id: str, at_base_or_held: bool) -> str | None:
-        """End one emergency.
-
-        Returns:
-            Why it was refused, or None. Clearing a cleared id is harmless.
-        """
+        """End one emergency; returns why it was refused, or None. Clearing a cleared id has no effect."""
         if emergency_id in self._cleared:
             return None
         emergency = self._active.get(emergency_id)

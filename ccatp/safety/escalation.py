@@ -1,7 +1,4 @@
-"""The ladder: the gravest finding wins, and what does not pass in time, or comes again and again, gets graver.
-
-What a monitor finds, and how long a finding stays after its evidence is gone.
-"""
+"""Findings of the monitors: how long they stay, which one wins, and when they become graver."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -13,12 +10,10 @@ from ccatp.core import Severity
 
 
 class MonitorFinding(NamedTuple):
-    """Something is wrong.
+    """Something is wrong; ``value`` is in the unit of ``limit``.
 
-    Attributes:
-        value: its value, in the unit of ``limit``.
-        retries: how often it may come again before it is a fault; ``None``: as often as the configuration says.
-        patience_s: a hold that lasts longer is a fault; ``None``: as the configuration says.
+    ``retries``: how often it may come again before it is a fault; ``patience_s``: a hold that lasts longer is a fault;
+    ``None``: as the configuration says.
     """
 
     severity: Severity
@@ -32,11 +27,7 @@ class MonitorFinding(NamedTuple):
 
 
 class FindingLatch:
-    """A finding that stays until there has been no evidence of it for a while.
-
-    Attributes:
-        finding: the finding, or ``None``.
-    """
+    """A finding that stays until there has been no evidence of it for a while."""
 
     __slots__ = ("_clear_s", "_seen_s", "finding")
 
@@ -62,11 +53,7 @@ class FindingLatch:
 
 
 class Since:
-    """Since when something has been so without interruption.
-
-    Attributes:
-        t_s: since then; ``None`` while it is not so.
-    """
+    """Since when something has been so without interruption (``None`` while it is not so)."""
 
     __slots__ = ("t_s",)
 
@@ -100,7 +87,7 @@ def denies(findings: Iterable[MonitorFinding]) -> bool:
 class SeverityEscalation:
     """Raises the severity of what lasts or comes back.
 
-    A pause that lasts for longer than ``pause_limit_s`` is a hold, so that a fix is had before going on; a hold that
+    A pause that lasts for longer than ``pause_limit_s`` is a hold, so that a fix is taken before going on; a hold that
     lasts for longer than its patience is a fault, because it does not pass by itself; a hold for the same signal that
     comes more than ``retries`` times again within ``retry_window_s`` is one, too.
     """
@@ -116,12 +103,7 @@ class SeverityEscalation:
         self._held.clear()
 
     def climb(self, t_s: float, findings: list[MonitorFinding]) -> list[MonitorFinding]:
-        """The findings of a frame, raised where their time is up.
-
-        Args:
-            t_s: time of the frame.
-            findings: all there are; an empty list ends every count of duration.
-        """
+        """All findings of a frame, raised where their time is up; an empty list ends every count of duration."""
         since = self._since_s
         now: dict[str, float] = {}
         for finding in findings:

@@ -1,4 +1,4 @@
-"""The board: every monitor, frame by frame, and what they find together."""
+"""All monitors of the danger loop but the edge rule, frame by frame, and what they find together."""
 
 from collections.abc import Callable, Sequence
 from math import hypot
@@ -90,12 +90,9 @@ class CommandedMotion(Protocol):
 
 
 class HealthMonitor:
-    """All monitors but the edge rule's.
+    """All monitors but the edge rule's; ``base_m`` in the deck frame.
 
-    Args:
-        danger: sigmas of the map.
-        base_m: where base is, deck frame.
-        is_explained: whether the map has an edge of a panel near a sensor.
+    ``is_explained``: whether the map has an edge of a panel near a sensor, by its index.
     """
 
     def __init__(
@@ -185,12 +182,7 @@ class HealthMonitor:
         is_permitted: bool,
         is_any_off: bool,
     ) -> None:
-        """Look at a frame.
-
-        Args:
-            frame: the frame.
-            is_any_off: an edge sensor is off, or has just been.
-        """
+        """Look at a frame; ``is_any_off``: an edge sensor is off, or has just been."""
         dt_s = 0.0 if self._t_s is None else t_s - self._t_s
         self._t_s = t_s
         is_gap = dt_s > self._cfg.gap_s
@@ -222,7 +214,6 @@ class HealthMonitor:
             self.findings = self._found()
 
     def _judge(self, t_s: float, frame: MonitorFrame, wheels: Sequence[WheelSample]) -> None:
-        """What need not be looked at in every frame while nothing is wrong."""
         now = self._sums
         shortly, stalling = self._shortly.push(now), self._stalling.push(now)
         turning = self._turning.push(now)
@@ -279,10 +270,9 @@ class HealthMonitor:
         return MotionSum(t_s, sums[1] + right * rolled_m, sums[2] + left * rolled_m, sums[3] + turned)
 
     def hear(self, t_s: float, estimate: CommandedMotion) -> None:
-        """Take what the wheels were told, from an estimate that may be too old for anything else.
+        """Take the set points from an estimate that may be too old for anything else.
 
-        Args:
-            estimate: the estimate; one that was heard already changes nothing.
+        A repeated one changes nothing.
         """
         if estimate.seq == self._heard_seq:
             return
@@ -291,10 +281,9 @@ class HealthMonitor:
             self._wheels.commands.push(t_s, estimate.commanded)
 
     def learn(self, t_s: float, estimate: CommandedMotion, opened: Sequence[int], is_off: Sequence[bool]) -> None:
-        """Take an estimate of main's that is fresh; one that was taken already changes nothing.
+        """Take a fresh estimate of main's; a repeated one changes nothing.
 
-        Args:
-            opened: how often each edge sensor left the panels so far.
+        ``opened``: how often each edge sensor went off.
         """
         if estimate.seq == self._estimate_seq:
             return

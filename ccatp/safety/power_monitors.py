@@ -21,13 +21,10 @@ _FANS = ("fan_left", "fan_right")
 
 
 class FanMonitor:
-    """The echo of the fans' duties against what they were told, where the robot hangs on them.
+    """The echo of the fans' duties against the commanded ``duty`` (left, right), where the robot hangs on them.
 
     The echo is a set point. Thrust and rotation are on no wire: a fan that fails without its controller's notice is
     for the robot to report (``fan_left``, ``fan_right``).
-
-    Args:
-        duty: what main tells the fans, left and right; it never tells them less.
     """
 
     def __init__(self, cfg: HealthConfig, duty: tuple[float, float], overhang: bool) -> None:
@@ -78,8 +75,7 @@ class FanMonitor:
 class BatteryMonitor:
     """Whether the charge still is enough for the way home.
 
-    Attributes:
-        alarm: what was found; stays, because a battery does not charge on the way.
+    A finding stays, because a battery does not charge on the way.
     """
 
     def __init__(self, cfg: HealthConfig) -> None:
@@ -92,11 +88,7 @@ class BatteryMonitor:
         self._low, self._told = Since(), Since()
 
     def step(self, t_s: float, soc: float, is_told: bool, home_m: float) -> None:
-        """Judge a frame.
-
-        Args:
-            soc: charge, 0 to 1.
-        """
+        """Judge a frame; ``soc`` from 0 to 1."""
         cfg = self._cfg
         least = cfg.battery_reserve
         least += cfg.battery_margin * _DETOUR * home_m / cfg.slow_speed_m_s / cfg.battery_life_s

@@ -9,30 +9,21 @@ _Sample = TypeVar("_Sample", ImuSample, WheelSample, EdgeSample, GravitySample)
 
 
 class ClockJump(NamedTuple):
-    """The robot's clock jumped before a frame.
-
-    Attributes:
-        seq: the first frame of the new time base.
-        by_s: how much it is off what was expected; < 0 backward.
-    """
+    """The robot's clock jumped before frame ``seq``, by so much against what was expected; < 0 backward."""
 
     seq: int
     by_s: float
 
 
 class SteadyTime:
-    """Gives each frame a time that never jumps.
+    """Gives each frame a time that never jumps; ``jump`` is the newest jump, ``None`` before the first.
 
     From frame to frame the robot's clock has to go on by the frames' period, times the frames that were lost in
     between; further off than ``limit_s``, or backward, it has jumped, and counting goes on by the period. A real gap
     without frames whose numbers go on looks the same, and is left out likewise.
-
-    Attributes:
-        jump: the newest jump, ``None`` before the first.
     """
 
     def __init__(self, limit_s: float) -> None:
-        """No frame yet."""
         self._limit_s = limit_s
         self.reset()
 
@@ -65,11 +56,9 @@ class SteadyTime:
         return t_s + (self._before_s if is_before else self.offset_s)
 
     def of_samples(self, samples: Sequence[_Sample], t_s: float) -> list[_Sample]:
-        """Samples of the newest frame with steady times.
+        """Samples of the newest frame, of steady time ``t_s``, with steady times.
 
-        Args:
-            samples: as they came. A sample that is far nearer to the frame in the time base before belongs to that.
-            t_s: the frame's steady time.
+        A sample that is far nearer to the frame in the time base before belongs to that.
         """
         now_s, before_s, limit_s = self.offset_s, self._before_s, self._limit_s
         found = []

@@ -1,11 +1,4 @@
-"""Edge sensors that change where the map has nothing to see: chatter, flashes of light.
-
-The flow of frames and samples: gaps, sensors that got slow, latency of the link.
-
-Lines of the robot that are no frames: how many there may be within a while.
-
-Every seam is a proof test of the edge sensors: one that crosses it and sees nothing may be blind.
-"""
+"""Edge sensors that chatter, flash or are blind at seams; sample rates, latency of the link, framing errors."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -27,12 +20,10 @@ class FlickerMonitor:
 
     * More transitions than allowed in a short time where the map has no edge of a panel: chatter, a hold.
     * A sensor that goes off while the wheels stand where the map has no edge: a pause until it is on again, for at
-      most ``pause_limit_s``; then the edge rule has the last word, and the robot goes slowly.
+      most ``pause_limit_s``; then the edge rule decides, and the robot goes slowly.
 
-    Standing at an edge of a panel a sensor may chatter as it likes: vibration does that.
-
-    Args:
-        is_explained: whether the map, at the newest estimate, has an edge of a panel near a sensor (by its index).
+    Standing at an edge of a panel a sensor may chatter as it likes: vibration does that. ``is_explained``: whether the
+    map, at the newest estimate, has an edge of a panel near a sensor (by its index).
     """
 
     def __init__(self, cfg: HealthConfig, is_explained: Callable[[int], bool]) -> None:
@@ -103,15 +94,9 @@ _LEARN_S = 0.5
 
 
 class RateMonitor:
-    """Samples per time of each sensor against what was usual at the start.
-
-    Attributes:
-        finding: the sensor that lacks most, or ``None``.
-        are_encoders_sparse: since the last step they gave less than they usually do.
-    """
+    """Samples per time of each sensor against what was usual at the start; ``finding``: the sensor that lacks most."""
 
     def __init__(self, cfg: HealthConfig) -> None:
-        """Rates are not known yet."""
         self._cfg = cfg
         self.reset()
 
@@ -191,11 +176,7 @@ class LatencyMonitor:
 
 
 class FramingErrorRate:
-    """Counts them on any clock that runs on.
-
-    Args:
-        limit: so many within the window are too many.
-    """
+    """Whether ``limit`` lines that are not frames came within ``window_s``, on any monotonic clock."""
 
     __slots__ = ("_times_s", "_window_s")
 
@@ -230,11 +211,9 @@ class PanelPlace(Protocol):
 
 
 class Ground(NamedTuple):
-    """The part of a mirror that the proof tests look at.
+    """The part of a mirror that the proof tests use.
 
-    Attributes:
-        nearest: the panel nearest to a deck point.
-        place: deck place of a point of the robot at a pose (x, y, heading).
+    Panels, the nearest to a deck point, the deck place of a robot point.
     """
 
     panels: dict[PanelId, PanelPlace]
@@ -243,15 +222,13 @@ class Ground(NamedTuple):
 
 
 class SeamMonitor:
-    """Counts the seams that each sensor crossed without going off.
+    """Counts the seams that each sensor (places in the robot frame) crossed without going off.
+
+    Every seam is a proof test.
 
     A sensor is on a panel for certain where the map has it further inside than the estimate may be wrong. When it is
     for certain on another panel than before, it has crossed a seam; if it has not been off in between, it has missed
-    it. Any off sample proves the sensor sound. A pose that jumps (a fix) is no motion, and begins anew.
-
-    Args:
-        sensors_m: places of the sensors, robot frame.
-        sigmas: how many sigmas of the estimate to allow for.
+    it. Any off sample proves the sensor sound. A pose that jumps (a fix) is no motion, and begins again.
     """
 
     def __init__(

@@ -1,9 +1,4 @@
-"""Wheels and encoders against what they were told, and against the gyroscope.
-
-What main had the wheels do between two estimates, for the monitors that compare it with what they did.
-
-The gyroscope against the wheels: a bias that jumped, a wrong sign or scale, or wheels that slip.
-"""
+"""Wheels and encoders against the commanded set points, and against the gyroscope."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -80,8 +75,8 @@ class Commands:
 class WheelMonitor:
     """Runaway, stall, dead and frozen encoders, wheels that creep.
 
-    The rules know what the wheels were told as the lowest and highest set points of a while, so they need no model of
-    the servo: a wheel that was told to go fast all the while and stands, or that is faster than anything it was told.
+    The rules use the lowest and highest set points of a while, so they need no model of the servo: a wheel that was
+    commanded to go fast all the while and stands, or that is faster than any set point.
     """
 
     def __init__(self, cfg: HealthConfig, robot: RobotConfig) -> None:
@@ -120,14 +115,12 @@ class WheelMonitor:
         is_sparse: bool,
         samples: Sequence[WheelSample],
     ) -> None:
-        """Judge a frame.
+        """Judge a frame; ``shortly`` and ``stalling``.
 
-        Args:
-            shortly, stalling: their change over ``runaway_time_s`` and over ``stall_time_s``.
-            is_free: the robot executed what it was told since the last look, and was permitted to go anywhere.
-            is_late: it executed what it had been told long before.
-            is_sparse: the encoders gave fewer samples than usual.
-            samples: of the frame.
+        Change of the sums over ``runaway_time_s`` and over ``stall_time_s``.
+
+        Since the last look, ``is_free``: the robot executed its commands, and was permitted to go anywhere;
+        ``is_late``: it executed an old command; ``is_sparse``: the encoders gave fewer samples than usual.
         """
         t_s = now.t_s
         if not is_free:

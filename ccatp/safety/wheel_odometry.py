@@ -24,12 +24,9 @@ class Knot(NamedTuple):
 class WheelTrack:
     """The velocity of the robot over the last frames.
 
-    ``v = r (wr + wl) / 2``, ``omega = r (wr - wl) / L`` (inverse of thesis eq. 3.3), linear between samples.
-    ``push`` is all that a frame costs as long as nobody asks for motion; samples are read when ``update`` is called.
-
-    Args:
-        reach_s: how far back ``update`` reads.
-        limit_rad_s: no wheel is faster; what says so, or is not a number, is no sample.
+    ``v = r (wr + wl) / 2``, ``omega = r (wr - wl) / L`` (inverse of thesis eq. 3.3), linear between samples. ``push``
+    is all that a frame costs as long as no motion is asked for; samples are read, as far back as ``reach_s``, when
+    ``update`` is called. A rate above ``limit_rad_s``, or not a number, is no sample.
     """
 
     def __init__(
@@ -62,10 +59,7 @@ class WheelTrack:
         self._heard_t_s = max(self._heard_t_s, t_s)
 
     def update(self, t_s: float) -> None:
-        """Read the frames pushed since the last call, as far back from ``t_s`` as the reach.
-
-        Samples that go back in time or are not finite are dropped.
-        """
+        """Read the frames pushed since the last call; samples that go back in time or are not finite are dropped."""
         frames, since_s = self._frames, t_s - self._reach_s
         while frames:
             samples = frames.popleft()
@@ -92,7 +86,7 @@ class WheelTrack:
     def silence_s(self, t_s: float) -> float:
         """How long at ``t_s`` one of the wheels has been without a usable sample; 0 while the last one is held.
 
-        Never heard counts since the robot's boot, and as silent from the first.
+        A wheel without any sample yet is silent since the robot's boot.
         """
         if self._heard_t_s == -inf:
             return max(t_s, self._hold_s)

@@ -1,4 +1,4 @@
-"""The survey of a mirror: mission states, reactions to verdicts, behaviours, the fix gate, and route planning.
+"""The survey of a mirror: states, reactions to verdicts, behaviours, fix gate, route planning.
 
-``mission.Mission`` is the entry point; time is an argument.
+See ``mission.Mission``.
 """

@@ -1,7 +1,4 @@
-"""What the robot does in each state of a survey: legs, coming to rest, standing, the retreat, the way home.
-
-The time budget of a mission: what is left out so that the robot is home when the time is over.
-"""
+"""What the robot does in each state of a survey, and the time budget of the mission."""
 
 from collections.abc import Callable, Sequence
 from math import hypot, pi
@@ -48,11 +45,7 @@ def home_time_s(base: DeckPose, limits: LimitsConfig, x_m: float, y_m: float) ->
 
 
 class TimeBudget:
-    """Compares what is left to do with the time that is left.
-
-    Args:
-        budget_s: time from the first frame until the robot is home or the survey complete.
-    """
+    """Compares what is left to do with what is left of ``budget_s``, first frame until home or complete."""
 
     def __init__(self, budget_s: float, mirror: Mirror, limits: LimitsConfig, measuring_time_s: float) -> None:
         self.budget_s = budget_s
@@ -82,14 +75,9 @@ class TimeBudget:
         return total_s
 
     def review(self, t_s: float, pose: DeckPose, left: Sequence[PointId]) -> Sequence[PointId] | None:
-        """One point is done with: what to do with those that are left.
+        """After a point: those of the ``left`` ones, in order, to go on with (``left`` itself: all).
 
-        Args:
-            pose: of the robot, deck.
-            left: points, in the order in which they are to be measured.
-
-        Returns:
-            The points to go on with, ``left`` itself where there is time for all; None to go home now.
+        None to go home now.
         """
         elapsed_s = t_s - (self._begun_s if self._begun_s is not None else t_s)
         self._planned_s += self._next_s
@@ -115,9 +103,8 @@ class TimeBudget:
 class Behaviours:
     """One frame of whatever the state says.
 
-    Args:
-        plan_rest: gives the way back to a route from a pose, without the points that are done with.
-        plan_points: gives a route through points from a pose, if there is such a planner.
+    ``plan_rest`` gives the way back to a route from a pose, without the points that are done with; ``plan_points`` a
+    route through points from a pose, if there is such a planner.
     """
 
     def __init__(
@@ -139,11 +126,7 @@ class Behaviours:
         return None if standing.is_lost or stop is None else stop.point
 
     def step(self, motion: StateEstimate, verdict: Verdict | None) -> MissionCommand:
-        """One frame.
-
-        Args:
-            motion: time, pose and speed of the present frame.
-        """
+        """One frame."""
         state = self._standing.state
         if motion.t_s < self._standing.stands_until_s:
             return HOLD_POSITION
@@ -162,7 +145,6 @@ class Behaviours:
     # -- legs -----------------------------------------------------------------------------------------------------
 
     def _is_overdue(self, motion: StateEstimate) -> bool:
-        """Whether the leg takes so long that something must be wrong; that holds the robot."""
         journey = self._standing.journey
         stop = journey.current
         if stop is None or not journey.is_overdue(motion.t_s):
@@ -197,7 +179,6 @@ class Behaviours:
         return self._travel(motion)
 
     def _follow(self, journey: RouteFollower, motion: StateEstimate, stop: Stop) -> MissionCommand | None:
-        """One frame of the leg to a stop; ``None`` when it is reached."""
         standing = self._standing
         twist = journey.follow(motion, stop)
         if self._is_overdue(motion):
@@ -210,7 +191,6 @@ class Behaviours:
         return MissionCommand(twist)
 
     def _align(self, motion: StateEstimate) -> MissionCommand:
-        """One frame of a leg that shows the heading; a fix follows."""
         aligner = self._standing.aligner
         leg = aligner.leg(motion.deck)
         stop = None if leg is None else leg.current
@@ -226,7 +206,6 @@ class Behaviours:
         return stop.kind is StopKind.VIA and motion.sigma_of() > self._standing.cfg.mission.via_sigma_m
 
     def _find_route(self, motion: StateEstimate) -> MissionCommand:
-        """Plan anew from where the robot is; one frame of standing still, however long that takes."""
         standing, stop = self._standing, self._standing.survey.current
         deck = motion.deck
         if stop is not None and stop.kind is StopKind.CALIBRATE:
@@ -248,7 +227,6 @@ class Behaviours:
         return HOLD_POSITION
 
     def _is_out_of_time(self, motion: StateEstimate) -> bool:
-        """Review the budget after a point: whether it is time to go home; what does not fit is left out."""
         standing, budget = self._standing, self._budget
         standing.is_review_due = False
         if budget is None:

@@ -1,7 +1,4 @@
-"""Assembles the parts of a main loop from a configuration, for the daemon and for rehearsals alike.
-
-A survey before anything moves: its order, way, least time, and the points that cannot be reached.
-"""
+"""Assembles the parts of a main loop from a configuration; a survey's plan before anything moves."""
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -59,13 +56,9 @@ class SurveyParts:
 
 
 def assemble(cfg: Config, done: Collection[PointId] = (), recovery: TakeoverState | None = None) -> SurveyParts:
-    """All pure parts of a main loop, the robot standing at base or where another main loop left it.
+    """All pure parts of a main loop, the robot at base or where ``recovery`` says.
 
-    Args:
-        recovery: what the other one left, if there was one.
-
-    Raises:
-        PlanError: a point cannot be reached.
+    Raises ``PlanError`` (unreachable point).
     """
     mirror = build_mirror(cfg.mirror)
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
@@ -101,14 +94,10 @@ def plan_survey(
     *,
     calibrates: bool = True,
 ) -> Route:
-    """The route of a survey from base, with the calibration drive before it.
+    """The route of a survey from base, with the calibration drive before it where the localizer uses one.
 
-    Args:
-        out_of_reach: takes the points that cannot be reached, and the route goes without them.
-        calibrates: drive a calibration first, where the localizer has a use for it.
-
-    Raises:
-        PlanError: a point cannot be reached and there is no ``out_of_reach``, or base is not on the mirror.
+    ``out_of_reach`` takes the points that cannot be reached; without it they raise ``PlanError``, as does a base that
+    is not on the mirror.
     """
     limits, start, measuring_s = cfg.limits, mirror.base_pose, cfg.etalon.measuring_time_s
     route = plan_route(mirror, points, cfg.robot, limits, cfg.mission, start, done, measuring_s, out_of_reach)
@@ -188,14 +177,10 @@ _SHOWN = 10
 
 @dataclass(frozen=True, slots=True)
 class SurveyPlan:
-    """What a survey would do.
+    """What a survey would do: points in the order of measuring, those out of reach included, and stops.
 
-    Attributes:
-        points: in the order of measuring, those out of reach included.
-        out_of_reach: no safe way leads there with the configured clearances; a run would be refused.
-        stops: where the robot would stand, one after the other.
-        times_s: since the start, when it stands at each stop, before what it measures there.
-        driving_s, turning_s, measuring_s: least times, rest to rest; their sum is the survey's lower bound.
+    ``times_s``: since the start, when it stands at each stop, before what it measures there. Driving, turning and
+    measuring are least times, rest to rest; their sum is the survey's lower bound.
     """
 
     points: tuple[PointId, ...]
@@ -217,8 +202,7 @@ class SurveyPlan:
 def make_plan(cfg: Config, mirror: Mirror) -> SurveyPlan:
     """Plan the survey of a configuration as a run would.
 
-    Raises:
-        PlanError: base is not on the mirror, or the robot cannot get away from there.
+    Raises ``PlanError`` where base is not on the mirror or a dead end.
     """
     points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
     out_of_reach: list[PointId] = []

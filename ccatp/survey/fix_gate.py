@@ -1,12 +1,8 @@
-"""What is asked of a fix before it is used: our frame and unit, on the surface, repeated where it is doubted.
+"""Checks of a fix before it is used: frame and unit of the laser system, on the surface, repeated where it is doubted.
 
-Doubts about a fix: off the surface, far from the estimate, or not repeated by the next.
-
-Whether the laser system measures in our frame and in our unit: asked of the first fixes of a mission.
-
-The collimators' surveyed places may be written down with other axes, another hand or another unit than the mirror's;
-the lengths may come in another unit. The lengths then fit all the same, or a place far off. So the first fixes are
-compared with where the robot must be, and what does not fit is explained, as far as one mistake explains it.
+The collimators' surveyed places may be written down with other axes, handedness or unit than the mirror's; the lengths
+may come in another unit. The lengths then fit all the same, or a place far off. So the first fixes are compared with
+where the robot must be, and what does not fit is explained, as far as one mistake explains it.
 """
 
 from collections.abc import Mapping
@@ -30,12 +26,9 @@ _FAR = 4.0  # where the localizer has no gate of its own, this many times the li
 class FixPlausibility:
     """Judges the fixes of one standstill; ``begin`` starts the next.
 
-    A fix off the surface is never believed. One that contradicts the estimate is believed once another of the same
-    standstill agrees with it; one that contradicts it beyond the localizer's own gate once two others do. A localizer
+    A fix off the surface is never used. One that contradicts the estimate is used once another of the same standstill
+    agrees with it; one that contradicts it beyond the localizer's own gate ``gate_nis`` once two others do. A localizer
     that has such a gate keeps that count itself.
-
-    Args:
-        gate_nis: the localizer's gate; ``None`` where it has none.
     """
 
     def __init__(self, mirror: Mirror, cfg: EtalonConfig, puck_height_m: float, gate_nis: float | None) -> None:
@@ -49,8 +42,7 @@ class FixPlausibility:
     def doubt(self, fix: Fix, pose: DeckPose, covariance: FloatArray) -> str:
         """Why to measure again instead of using ``fix``, or empty.
 
-        Args:
-            covariance: of the estimate's (x, y, heading), shape (3, 3).
+        Covariance of the estimate's (x, y, heading), (3, 3).
         """
         try:
             foot = deck_foot(self._mirror, fix, self._puck_height_m)
@@ -74,11 +66,7 @@ class FixPlausibility:
 
 
 def nis_of(foot: DeckFoot, pose: DeckPose, covariance: FloatArray) -> float:
-    """Normalised innovation squared of a fix against an estimate, two degrees of freedom; NaN where there is none.
-
-    Args:
-        covariance: of its (x, y, heading), shape (3, 3).
-    """
+    """Normalised innovation squared of a fix against an estimate, two degrees of freedom; NaN where there is none."""
     residual = np.array((foot.x_m - pose.x_m, foot.y_m - pose.y_m))
     spread = covariance[:2, :2] + foot.covariance_m2
     if not np.isfinite(spread).all():
@@ -107,11 +95,9 @@ _SIGNED_AXES = signed_axes()
 
 
 class FrameFault(NamedTuple):
-    """What is wrong with the first fixes.
+    """What is wrong with the first fixes: distance from where the robot must be.
 
-    Attributes:
-        distance_m: how far the fix is from where the robot must be.
-        explanation: the one mistake that would explain it; empty where none does.
+    The one mistake that explains it, or empty.
     """
 
     distance_m: float
@@ -128,11 +114,7 @@ class FrameFault(NamedTuple):
 
 
 class FrameCheck:
-    """Looks at the first fixes of a mission, until they have shown enough.
-
-    Args:
-        cfg: how far off a first fix may be.
-    """
+    """Looks at the first fixes of a mission, until they have shown enough."""
 
     def __init__(self, cfg: EtalonConfig) -> None:
         self._limit_m = cfg.start_distance_m
@@ -140,10 +122,9 @@ class FrameCheck:
         self.is_over = False
 
     def look(self, measured_m: Vector3, expected_m: Vector3) -> FrameFault | None:
-        """One of the first fixes; what is wrong with it, or None.
+        """What is wrong with one of the first fixes, or None.
 
-        Args:
-            measured_m, expected_m: of the puck, world frame, the robot standing still.
+        Puck positions in the world frame, the robot standing still.
         """
         if self.is_over:
             return None
@@ -177,13 +158,9 @@ def explain(measured_m: Vector3, expected_m: Vector3, limit_m: float) -> str:
 def explain_lengths(
     cfg: EtalonConfig, expected_m: Vector3, lengths_m: Mapping[int, float], collimators_m: Mapping[int, FloatArray]
 ) -> str:
-    """What turns lengths that give no position near the expected one into ones that do: axes or unit.
+    """What turns lengths without a position near the expected one (world frame) into ones with it.
 
-    Empty where no such mistake does.
-
-    Args:
-        expected_m: where the puck must be, world frame.
-        collimators_m: by channel, world frame, as configured, shape (3,).
+    Axes or unit, or empty.
     """
     for name, factor in UNITS:
         scaled = {channel: factor * length for channel, length in lengths_m.items()}
@@ -216,10 +193,9 @@ def _name(matrix: FloatArray) -> str:
 
 
 class FixFinding(NamedTuple):
-    """What was found: nothing where both are empty.
+    """What was found: nothing where both are empty; ``refusal``.
 
-    Attributes:
-        refusal: why this laser system must not be used for this mission.
+    Why this laser system must not be used for this mission.
     """
 
     doubt: str = ""
@@ -244,11 +220,9 @@ class FixGate:
     def review(
         self, fix: Fix, expected_m: Vector3, pose: DeckPose, covariance: FloatArray, *, is_lost: bool = False
     ) -> FixFinding:
-        """Judge a fix.
+        """Judge a fix against the puck expected by the estimate, world frame.
 
-        Args:
-            expected_m: of the puck, world frame, by the estimate.
-            covariance: of the estimate's (x, y, heading), shape (3, 3).
+        Covariance of its (x, y, heading), (3, 3).
         """
         is_first, self._is_first = self._is_first, False
         fault = None if is_lost else self._frame.look(fix.position_m, expected_m)
@@ -258,11 +232,7 @@ class FixGate:
         return FixFinding(doubt=self._judge.doubt(fix, pose, covariance))
 
     def refusal_of(self, lengths_m: Mapping[int, float], expected_m: Vector3) -> str:
-        """Why lengths that gave no position speak against the laser system; empty once a fix has been right.
-
-        Args:
-            expected_m: where the puck must be, world frame.
-        """
+        """Why lengths that gave no position speak against the laser system; empty once a fix has been right."""
         if not self._is_first:
             return ""
         why = explain_lengths(self._cfg, expected_m, lengths_m, self._collimators_m)

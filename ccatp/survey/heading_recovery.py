@@ -1,7 +1,4 @@
-"""Finding a doubtful heading: short legs, straight ahead or back, with a fix at each end.
-
-What a main loop that takes over from another one starts with, and how much of it is a guess.
-"""
+"""Finding a doubtful heading by short legs with a fix at each end; what a takeover starts with."""
 
 from collections.abc import Callable, Sequence
 from math import cos, hypot, sin
@@ -27,12 +24,7 @@ _LOST = 2.0
 
 
 class HeadingRecovery:
-    """While the heading is in doubt: which leg shows more of it.
-
-    Args:
-        cfg: when a heading is in doubt, how long a leg is, how far it keeps from the rim.
-        heading_sigma_of: how well the heading is known, rad.
-    """
+    """While the heading is in doubt: which leg, straight ahead or back, shows more of it."""
 
     def __init__(
         self,
@@ -93,7 +85,6 @@ class HeadingRecovery:
         return Stop(deck.x_m + room_m * cx, deck.y_m + room_m * cy, StopKind.CALIBRATE, reverse=is_reverse)
 
     def _room_m(self, deck: DeckPose, way: tuple[float, float]) -> float:
-        """How far a leg may go, up to the length wanted, with the robot somewhere beside it."""
         rim, spread = self._mirror.rim, _SIGMAS * self._sigma_of()
         room_m, wanted_m = 0.0, self._wanted_m
         depth_m = rim.signed_distance_m(deck.x_m, deck.y_m)
@@ -117,14 +108,9 @@ _BEGUN_S = 0.1
 
 
 class TakeoverState(NamedTuple):
-    """Where and how to go on.
+    """Where and how to go on after a takeover: deck pose seen last, and how far the robot may be from it now.
 
-    Attributes:
-        pose: where the robot was seen last, deck frame.
-        position_sigma_m, heading_sigma_rad: how far it may be from there now.
-        elapsed_s: time that the mission has taken so far.
-        abort_cause: why the robot is on its way home, or empty.
-        held_cause: why an operator has to resume it, or empty.
+    ``abort_cause``: why the robot is on its way home; ``held_cause``: why an operator has to resume it; or empty.
     """
 
     pose: DeckPose
@@ -139,16 +125,9 @@ class TakeoverState(NamedTuple):
 def doubted(
     sigmas: tuple[float, float], speeds: tuple[float, float], accelerations: tuple[float, float], *, stood: bool
 ) -> tuple[float, float]:
-    """How well a pose is known of a robot that nobody has watched since.
+    """Standard deviations of position (m) and heading (rad) of a robot that was not observed since ``sigmas``.
 
-    Args:
-        sigmas: of position (m) and heading (rad) when it was seen last.
-        speeds: forward (m/s) and angular (rad/s) then.
-        accelerations: the largest, m/s^2 and rad/s^2.
-        stood: it stood then and was not to move.
-
-    Returns:
-        Standard deviations of position (m) and heading (rad).
+    Speeds then and largest accelerations in m/s, rad/s, m/s^2, rad/s^2; ``stood``: it stood and was not to move.
     """
     way, turn = (
         0.0 if stood else _UNSEEN_S * (abs(speed) + _BEGUN_S * largest)

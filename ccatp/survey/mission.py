@@ -1,7 +1,4 @@
-"""The survey: from the pose and the danger loop's verdict to the velocity wanted next. Time is an argument.
-
-What becomes of a survey by the measurement that it asked for: a point done, skipped, approached again.
-"""
+"""The survey: from the pose and the danger loop's verdict to the velocity wanted next. Time is an argument."""
 
 from collections.abc import Callable
 
@@ -30,11 +27,7 @@ from ccatp.survey.stops import MissionCommand
 
 
 class FixResults:
-    """Takes the outcome of each measurement.
-
-    Args:
-        has_budget: the time left is reviewed after each point.
-    """
+    """Takes the outcome of each measurement; with ``has_budget`` the time left is reviewed after each point."""
 
     def __init__(self, standing: SurveyState, *, has_budget: bool) -> None:
         self._standing, self._has_budget = standing, has_budget
@@ -131,13 +124,9 @@ class FixResults:
 class Mission:
     """A survey of the points of a route, with retreat from edges and the way home.
 
-    Call ``step`` once per sensors frame. The caller executes the order and reports the measurement it asked for by
-    ``fixed`` or ``not_fixed``.
-
-    Args:
-        plan_rest: gives the way back to a route from a pose, without the points that are done with.
-        plan_points: gives a route through points from a pose; without it what failed once is not tried again.
-        heading_sigma_of: how well the heading is known, rad; asked after the robot was out of sight.
+    Call ``step`` once per sensors frame. The caller executes the command and reports the measurement it asked for by
+    ``fixed`` or ``not_fixed``. Planners as in ``Behaviours``; without ``plan_points`` what failed once is not tried
+    again.
     """
 
     def __init__(
@@ -167,12 +156,7 @@ class Mission:
         self.fault, self.recover, self.interrupt = standing.fault, standing.recover, standing.interrupt
 
     def step(self, motion: StateEstimate, verdict: Verdict | None) -> MissionCommand:
-        """One frame: react to the verdict, then do what the state says.
-
-        Args:
-            motion: time, pose and speed of the present frame.
-            verdict: the danger loop's verdict in force, ``None`` where there is none fresh enough.
-        """
+        """One frame: react to the verdict in force (``None``: none fresh enough), then do what the state says."""
         if self._is_steered_bare:
             control = self._control
             motion = motion.with_only(ahead=control.predicts_delay, creep=control.compensates_creep)

@@ -1,9 +1,4 @@
-"""How a survey reacts to the danger loop's verdict: holds, retreats from edges, ways home, waiting.
-
-Nobody resumes a faulted robot: a reminder every minute, and home before the battery no longer lasts for it.
-
-Before the first motion: does gravity agree with the slope of the configured mirror where the robot stands?
-"""
+"""How a survey reacts to the danger loop's verdict, an unattended fault, and a mirror that contradicts gravity."""
 
 from collections.abc import Sequence
 from enum import StrEnum
@@ -66,12 +61,7 @@ class Failsafe:
         self._raised = None
 
     def react(self, motion: StateEstimate, verdict: Verdict | None) -> None:
-        """Do what the verdict demands.
-
-        Args:
-            motion: the present frame.
-            verdict: in force, ``None`` where there is none fresh enough.
-        """
+        """Do what the verdict in force demands (``None``: none fresh enough)."""
         standing = self._standing
         if verdict is not None and self._raised is None:
             self._raised = verdict.raised
@@ -106,7 +96,6 @@ class Failsafe:
         self._was_lost = standing.is_lost
 
     def _stay(self, motion: StateEstimate, verdict: Verdict | None) -> None:
-        """Not every motion is permitted, or there is no verdict."""
         standing = self._standing
         if verdict is None:
             standing.interrupt("no fresh verdict from the danger loop")
@@ -146,7 +135,6 @@ class Failsafe:
         standing.hold(EARTHQUAKE, by_hand=standing.state is MissionState.HELD and standing.is_held_by_hand)
 
     def _obey(self, verdict: Verdict) -> bool:
-        """Do what a finding of the monitors demands; whether that is all for this frame."""
         standing, severity = self._standing, verdict.severity
         standing.wants_full_fans |= verdict.full_fans
         is_denied = not (verdict.forward or verdict.reverse or verdict.turn)
@@ -241,11 +229,9 @@ class ReminderCall(StrEnum):
 
 
 class UnattendedFaultTimer:
-    """Watches over a fault.
+    """A reminder while no operator resumes a faulted robot, and home before the battery no longer lasts for it.
 
-    Args:
-        cfg: period of the alarm; life, reserve and margin of the battery.
-        falls: without fans the robot falls off this mirror: only there it is worth moving without an operator.
+    ``falls``: without fans the robot falls off this mirror; only there it is worth moving without an operator.
     """
 
     def __init__(self, cfg: Config, *, falls: bool) -> None:
@@ -263,11 +249,9 @@ class UnattendedFaultTimer:
         self._since_s = None
 
     def watch(self, t_s: float, soc: float, home_s: float | None) -> ReminderCall:
-        """One frame of a fault.
+        """One frame of a fault; state of charge 0 to 1.
 
-        Args:
-            soc: state of charge, 0 to 1.
-            home_s: time of the way home; ``None`` where the robot does not know where it is.
+        ``home_s`` is None where the robot does not know where it is.
         """
         if self._since_s is None or t_s < self._since_s:
             self._since_s, self._remind_at_s = t_s, t_s + self._alarm_period_s
@@ -295,11 +279,9 @@ PATIENCE_S = 4.0
 
 
 class MirrorCheck:
-    """Compares the slope that gravity shows with the map's. The heading plays no part, so that it need not be known.
+    """Before the first motion: does gravity agree with the slope of the configured mirror? The heading plays no part.
 
-    Attributes:
-        contradiction: why the mirror cannot be this one; empty while nothing speaks against it.
-        warning: what could not be checked.
+    ``contradiction``: why the mirror cannot be this one, or empty; ``warning``: what could not be checked.
     """
 
     def __init__(self, mirror: Mirror) -> None:
@@ -309,11 +291,9 @@ class MirrorCheck:
         self.contradiction = self.warning = ""
 
     def hear(self, t_s: float, gravity: Sequence[float] | None, pose: DeckPose) -> bool:
-        """Take a frame; true once all is known that will be.
+        """Take a frame and gravity's direction in the robot frame, where it was read.
 
-        Args:
-            t_s: time of the frame, s.
-            gravity: time and direction of gravity in the robot frame, where the frame has a reading.
+        True once the check is complete.
         """
         if self._first_s is None:
             self._first_s = t_s

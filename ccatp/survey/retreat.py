@@ -27,7 +27,7 @@ class RetreatStep(StrEnum):
 
 
 class EdgeRetreat:
-    """One back-off: away from the edge along the track just driven, then a turn away from the side that hung over.
+    """One back-off along the track just driven, then a turn away from the side that hung over.
 
     A robot that met the edge backwards faces away from it, and does not turn.
     """

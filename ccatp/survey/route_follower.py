@@ -1,9 +1,4 @@
-"""A series of stops and the leg being driven: the path planner of thesis 3.2 as the mission uses it.
-
-The leg tracker at two paces: the usual one, and the reduced one while something is not quite right.
-
-The short move that brings a robot standing beside its point onto it, in place of a new route.
-"""
+"""A series of stops and the leg being driven (thesis 3.2), at the usual or the reduced speed; short corrections."""
 
 from collections.abc import Callable, Sequence
 from math import atan2, ceil, cos, hypot, pi, sin
@@ -49,7 +44,6 @@ class SpeedLimitedTracker(LegTracker):
         super().begin_turn(angle_rad)
 
     def _change_pace(self) -> None:
-        """Take over the axes of the other tracker: they hold the limits."""
         if self.is_slow is self._was_slow:
             return
         self._was_slow = self.is_slow
@@ -63,11 +57,7 @@ _SWEEP_RAD = 0.04
 
 
 class LegAim(NamedTuple):
-    """Where a correction leads, in the frame of the panel on which the robot stands.
-
-    Attributes:
-        turn_rad: turn in place before it.
-    """
+    """Where a correction leads, in the frame of the panel on which the robot stands, after a turn in place."""
 
     x_m: float
     y_m: float
@@ -78,14 +68,10 @@ class LegAim(NamedTuple):
 def plan_aim(
     pose: tuple[float, float, float], target: tuple[float, float], tolerance_m: float, margin: float
 ) -> LegAim:
-    """The least motion that brings the robot within the tolerance.
+    """The least motion from (x, y, heading) that brings the robot within the tolerance of (x, y) in the same plane.
 
     Straight along the heading, where the part beside it is at most ``margin`` of the tolerance; else by the smaller
     turn that points head or tail at the target.
-
-    Args:
-        pose: (x, y, heading), m and rad.
-        target: (x, y) in the same plane, m.
     """
     x, y, heading = pose
     dx, dy = target[0] - x, target[1] - y
@@ -107,10 +93,9 @@ class Corrector:
         self._body = build_body(robot, cfg)
 
     def aim(self, pose: PanelPose, target: tuple[float, float]) -> LegAim | None:
-        """The correction from ``pose`` to ``target``; ``None`` where it is too far or a sensor would pass the rim.
+        """The correction to a target in its panel's frame, m.
 
-        Args:
-            target: (x, y) in the frame of its panel, m.
+        ``None`` where it is too far or a sensor would pass the rim.
         """
         cfg = self._cfg
         distance_m = hypot(target[0] - pose.x_m, target[1] - pose.y_m)
@@ -196,18 +181,12 @@ class StateEstimate(NamedTuple):
 
 
 class RouteFollower:
-    """Keeps the current stop until all are exhausted, and drives the leg to it.
+    """Keeps the current stop (``None`` when all are exhausted) and drives the leg to it.
 
-    Args:
-        mirror: gives the stops in the frame of the panel on which the robot is.
-        timeout_factor: a motion that takes longer than this times its bang-bang time plus 5 s is overdue.
-
-    Attributes:
-        current: the stop being tracked; ``None`` when all are exhausted.
+    A motion that takes longer than ``timeout_factor`` times its bang-bang time plus 5 s is overdue.
     """
 
     def __init__(self, mirror: Mirror, tracker: LegTracker, timeout_factor: float, stops: Sequence[Stop]) -> None:
-        """Stand before the first leg."""
         self._mirror, self._tracker, self._timeout_factor = mirror, tracker, timeout_factor
         self.stops = tuple(stops)
         self.index = 0

@@ -1,13 +1,4 @@
-"""Where a survey stands: what its rooms share, and the few moves between the states that all of them make.
-
-The mission as a total state machine: states, events, and the table of transitions.
-
-Points whose measurement failed: why, and each of them once more when the others are done.
-
-Leaving a point that a fix showed to be missed: by a correction, and then by the route, where that is safe.
-
-How often a point was approached, and whether it has to be approached again.
-"""
+"""State of a survey: states, events and transitions; shared flags; failed and missed points; approaches."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from enum import StrEnum
@@ -137,10 +128,9 @@ def by_reason(causes: Mapping[PointId, str]) -> dict[str, list[str]]:
 
 
 class RetryQueue:
-    """Keeps what is to be measured off the planned route.
+    """Points that are due, in this order, away from the planned route.
 
-    Attributes:
-        due: points to be measured in this order, away from the planned route.
+    Each failed one once more when the others are done.
     """
 
     def __init__(self) -> None:
@@ -199,11 +189,7 @@ class MissedPoint:
         self._is_missed = False
 
     def follows_route(self, motion: StateEstimate, stop: Stop, journey: RouteFollower) -> bool:
-        """Whether the leg to ``stop`` may be driven as planned, or as the correction that begins here.
-
-        Args:
-            motion: the present frame.
-        """
+        """Whether the leg to ``stop`` may be driven as planned, or as the correction that begins here."""
         if self._is_missed:
             self._is_missed = False
             return self._correct(motion, stop, journey)
@@ -231,20 +217,15 @@ PlanPoints = Callable[[DeckPose, Sequence[PointId]], Route]
 class SurveyState:
     """State, causes and parts of one survey.
 
-    Args:
-        has_planner: points that failed once can be planned for.
-        heading_sigma_of: how well the heading is known, rad.
-
     Attributes:
         abort_cause: why the survey was given up, or ``None``.
         bar: why nothing may move, an earthquake, or empty.
         is_shaking: there is an earthquake, though the robot may be leaving an edge first.
-        is_faulted: something is wrong, and an operator has to look after it.
-        is_hold_deaf: held because wheels or inertial unit are not to be believed.
-        is_lost: a fix comes before the next move, because the pose is known to be wrong or (``is_at_start``) not
-            confirmed yet.
+        is_faulted: an operator has to look after it.
+        is_hold_deaf: held because wheels or inertial unit are not trusted.
+        is_lost: a fix comes before the next move: the pose is known to be wrong or (``is_at_start``) not confirmed yet.
         wants_calibration: the calibration drive was given up, too far from where it leads.
-        wants_full_fans: the robot shall be pressed on with all that the fans have.
+        wants_full_fans: the robot shall be pressed on with full fans.
         stuck_s: when a retreat led nowhere, robot time.
         waits_until_s: a hold that goes on by itself lasts at least until then, robot time.
         stands_until_s: nothing moves before then, whatever the state, robot time.
@@ -412,11 +393,9 @@ _MOST_GUARD = 0.1  # of the tolerance
 
 
 class ApproachCounter:
-    """Decides on a correction move after each fix.
+    """Decides on a correction move after each fix that is further than ``tolerance_m`` from its point.
 
-    Args:
-        tolerance_m: a puck further than this from its point has to come nearer.
-        limit: approaches of one point before it is measured wherever the robot stands.
+    After ``limit`` approaches a point is measured wherever the robot stands.
     """
 
     def __init__(self, tolerance_m: float, limit: int) -> None:
@@ -427,8 +406,7 @@ class ApproachCounter:
     def is_too_far(self, point: PointId, error_m: float, sigma_m: float) -> bool:
         """Whether ``point`` has to be approached again; call once for each fix taken there.
 
-        Args:
-            sigma_m: standard deviation of the robot's place after the fix, along its worst direction.
+        ``sigma_m``: standard deviation of the robot's place after the fix, along its worst direction.
         """
         self.count = self.count + 1 if point == self._point else 1
         self._point = point

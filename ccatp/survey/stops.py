@@ -1,11 +1,4 @@
-"""Standing at a stop: coming to rest, then the time that the laser system needs, then the measurement.
-
-Standing still: when the speeds that the localizer gives mean that the robot is at rest.
-
-The way home: stops to base, the turn to its heading, standing still there.
-
-What the mission wants of a frame.
-"""
+"""Standing at a stop until the measurement, the way home, and what the mission wants of a frame."""
 
 import msgspec
 
@@ -37,12 +30,7 @@ class StandstillDetector:
         self._mean_rate_rad_s = 0.0
 
     def is_rest(self, t_s: float, dt_s: float, speed_m_s: float, rate_rad_s: float) -> bool:
-        """Take the speeds of a frame; whether the robot is at rest.
-
-        Args:
-            t_s: time of the frame.
-            dt_s: time since the one before.
-        """
+        """Take the speeds of a frame, ``dt_s`` after the one before; whether the robot is at rest."""
         cfg = self._cfg
         if self._mean_speed_m_s is None:
             self._mean_speed_m_s, self._mean_rate_rad_s = speed_m_s, rate_rad_s
@@ -66,11 +54,7 @@ SETTLE_LIMIT_S = 10.0
 
 
 class SettleAndMeasure:
-    """From the end of a leg to the request for a measurement.
-
-    Args:
-        measuring_time_s: it stands for this long before the lengths are read.
-    """
+    """From the end of a leg to the request for a measurement, after standing for ``measuring_time_s``."""
 
     def __init__(self, control: ControlConfig, measuring_time_s: float) -> None:
         self._stillness = StandstillDetector(control)
@@ -102,7 +86,6 @@ class SettleAndMeasure:
         return True
 
     def _begin(self, t_s: float) -> None:
-        """The measuring time begins, and with it the time until which the robot has to stand still."""
         self._measure_at_s = t_s + self._measuring_time_s - TIME_EPSILON_S
         self._rest_by_s = t_s + SETTLE_LIMIT_S
 
@@ -124,8 +107,7 @@ class SettleAndMeasure:
     def is_due(self, motion: StateEstimate) -> bool:
         """Take a frame of the measuring time; whether to ask for the measurement now. True once at each stop.
 
-        A robot that moves once more after all spoils the measurement, and one that is under way as well: the time
-        begins anew, and what was asked for is not wanted any more.
+        Motion spoils the measurement, also one in progress: the time begins again, and what was asked for is dropped.
         """
         t_s = motion.t_s
         if self._is_anew:
@@ -148,14 +130,9 @@ STILL = Twist(0.0, 0.0)
 
 
 class ReturnToBase:
-    """Drives a journey whose last stop is base.
-
-    Attributes:
-        journey: as given; exhausted once the robot stands at base.
-    """
+    """Drives a route whose last stop is base; ``journey`` is exhausted once the robot stands there."""
 
     def __init__(self, journey: RouteFollower, tracker: LegTracker) -> None:
-        """Stand before the first leg."""
         self.journey, self._tracker = journey, tracker
         self._is_docking = False
 
@@ -170,12 +147,7 @@ class ReturnToBase:
         self.journey.interrupt()
 
     def step(self, motion: StateEstimate, is_quiet: bool) -> Twist:
-        """One frame of the way home.
-
-        Args:
-            motion: the present frame.
-            is_quiet: the robot has been at rest for the settling time.
-        """
+        """One frame of the way home; ``is_quiet``: the robot has been at rest for the settling time."""
         stop = self.journey.current
         if stop is None:
             return STILL

@@ -1,4 +1,1 @@
-"""Route planning: the order of the points, drivable legs between them, the way home, and time bounds.
-
-``route`` and ``way_home`` are used by the survey, ``plan`` by ``ccatp plan``.
-"""
+"""Route planning: the order of the points, drivable legs between them, the way home, and time bounds."""

@@ -1,9 +1,4 @@
-"""The first move away from the rim, from wherever the robot happens to stand and whatever it faces.
-
-Places to turn near a measurement point at the rim, each one short straight move away from it.
-
-The calibration drive: back and forth at base with a fix at each end, before the survey begins.
-"""
+"""The first move away from the rim, places to turn near a point at the rim, and the calibration drive at base."""
 
 from collections.abc import Sequence
 from math import ceil, cos, hypot, pi, sin
@@ -37,10 +32,8 @@ def find_escape(mirror: Mirror, body: Body, start: SearchNode, limits: LimitsCon
     """The best single turn and straight leg, forward or in reverse, to a place where the robot can turn freely.
 
     Best is what brings no sensor nearer to the rim than ``turn_clearance_m``, or than it is already; of those the
-    fastest, with the smallest turn. Where a sensor has to come nearer, the one that brings it least far.
-
-    Raises:
-        UnreachableError: if there is no such place within 0.4 m.
+    fastest, with the smallest turn. Where a sensor has to come nearer, the one that brings it least far. Raises
+    ``UnreachableError`` if there is no such place within 0.4 m.
     """
     x0, y0 = start.place.x_m, start.place.y_m
     courses = start.course_rad + _TURNS_RAD
@@ -90,11 +83,10 @@ _COURSES_RAD = np.radians([0, 90, 180, 270])[:, None] + _SLANTS_RAD  # (sides, s
 def find_retreats(mirror: Mirror, body: Body, places: list[LegPlace]) -> list[tuple[LegPlace, ...]]:
     """For each place where the robot cannot turn freely the nearest ones around it where it can.
 
+    None where it can turn.
+
     At most one to each side of the grid of panels, straight or slightly slanted: slanted where the place is in a
     corner, or to move off along the rim.
-
-    Returns:
-        The retreats of each place; none for one at which the robot can turn.
     """
     near = [k for k, place in enumerate(places) if place.stance is not None]
     x0 = np.array([places[k].x_m for k in near]).reshape(-1, 1, 1, 1)
@@ -110,7 +102,6 @@ def find_retreats(mirror: Mirror, body: Body, places: list[LegPlace]) -> list[tu
 
 
 def _nearest(place: LegPlace, body: Body, depths: FloatArray, courses_rad: FloatArray) -> LegPlace | None:
-    """Nearest place to turn on one side, by the straightest of equally long moves."""
     faced = np.array([place.can_face(course) or place.can_face(course + pi) for course in courses_rad.tolist()])
     is_good = (depths >= body.turning_depth_m) & faced[:, None]
     if not is_good.any():
@@ -134,13 +125,7 @@ def plan_calibration(mirror: Mirror, robot: RobotConfig, mission: MissionConfig,
     There and back along one line, once driven with the same heading and once with the opposite one: a wrong heading
     shifts the two ends against each other, creep shifts both downhill, slip shortens both legs, and two half turns tell
     a wrong wheel base from a wrong gyroscope. So the first leg of the survey is driven with errors that are known. A
-    second round shows whether slip and creep are the same again.
-
-    Args:
-        mission: clearances, the length wanted (0 = no calibration), and how many rounds.
-
-    Returns:
-        The stops; none where there is no room.
+    second round shows whether slip and creep are the same again. No stops where there is no room.
     """
     depth_m = max(build_body(robot, mission).turning_depth_m, mission.leg_clearance_m)
     course = course_of_heading(mirror, base)
@@ -174,10 +159,9 @@ def _room_m(mirror: Mirror, base: DeckPose, cx: float, cy: float, depth_m: float
 
 
 def is_on_drive(stops: Sequence[Stop], x_m: float, y_m: float) -> bool:
-    """Whether a calibration drive can go on from a place: it lies on its line, where the robot may turn anywhere.
+    """Whether a calibration drive can go on from a deck place.
 
-    Args:
-        x_m, y_m: the place, deck frame.
+    It lies on its line, where the robot may turn anywhere.
     """
     ends = dict.fromkeys((stop.x_m, stop.y_m) for stop in stops if stop.kind is StopKind.CALIBRATE)
     if len(ends) != 2:

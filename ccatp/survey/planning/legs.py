@@ -1,12 +1,6 @@
-"""Straight legs against the rim, and the way around a stepped corner.
+"""Straight legs against the rim, the way around a stepped corner, where the robot can stand and turn.
 
-Where the robot can stand and which way it can face and turn there without a sensor passing the rim.
-
-Courses and headings: a direction in the deck plane, and the angle in the tangent plane that projects on it.
-
-Typed refusals of the path planner; each message carries its numbers.
-
-A long leg in parts: the stops between them are where the robot points itself at the next one anew.
+A course is a direction in the deck plane; a heading is the angle in the tangent plane that projects on it.
 """
 
 from collections.abc import Iterable, Sequence
@@ -39,10 +33,9 @@ class Stance:
     __slots__ = ("_blocked",)
 
     def __init__(self, free: BoolArray) -> None:
-        """Keep the running number of blocked courses over four turns: any arc is one difference.
+        """``free`` (360,): whether all sensors keep their clearance on the course of k degrees.
 
-        Args:
-            free: whether all sensors keep their clearance on the course of k degrees, shape (360,).
+        The running number of blocked courses is kept over four turns: any arc is one difference.
         """
         self._blocked: list[int] = [0, *accumulate(np.tile(~free, 4).astype(int).tolist())]
 
@@ -68,12 +61,7 @@ class Stance:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LegPlace:
-    """A place on the deck.
-
-    Attributes:
-        x_m, y_m: deck coordinates.
-        stance: what the robot can do there; ``None`` where it can turn as it likes.
-    """
+    """A place on the deck; ``stance``: what the robot can do there, ``None`` where it can turn freely."""
 
     x_m: float
     y_m: float
@@ -90,12 +78,7 @@ class LegPlace:
 
 
 class Body(NamedTuple):
-    """The robot as its edge sensors see it.
-
-    Attributes:
-        sensors_m: the sensors in the robot frame, shape (4, 2).
-        reach_m: the largest distance of one from the robot's origin.
-    """
+    """The robot as its edge sensors see it: their places in the robot frame, (4, 2), and the largest distance, m."""
 
     sensors_m: FloatArray
     reach_m: float
@@ -115,16 +98,12 @@ def build_body(robot: RobotConfig, mission: MissionConfig) -> Body:
 
 
 def sensor_depths(mirror: Mirror, body: Body, xs: FloatArray, ys: FloatArray, courses_rad: FloatArray) -> FloatArray:
-    """Distance to the rim of the sensor nearest to it, of a robot that stands at (x, y) facing a course.
+    """Distance to the rim of the sensor nearest to it, m (< 0 beyond), of a robot at (x, y) facing a course.
+
+    Arrays broadcast.
 
     The robot lies in the tangent plane; its sensors are projected on the deck: with the course u = (c, s) and the rise
     g = fx c + fy s along it, ``h = (c, s, g)/sqrt(1 + g^2)`` and ``l = n x h``.
-
-    Args:
-        xs, ys, courses_rad: arrays that broadcast against each other, m and rad.
-
-    Returns:
-        The common shape, m; negative where a sensor is beyond the rim.
     """
     x, y, course = np.broadcast_arrays(xs, ys, courses_rad)
     fx, fy = mirror.surface.gradients(x, y)
@@ -203,13 +182,10 @@ class LegRules:
         return self.is_enough(self.clearance_m(a, b))
 
     def are_sensors_clear(self, a: LegPlace, b: LegPlace, course_rad: float, clearance_m: float) -> bool:
-        """Whether the sensors of a robot that faces ``course_rad`` all the way keep their clearance between the ends.
+        """Whether the sensors of a robot that faces ``course_rad`` all the way keep ``clearance_m`` between the ends.
 
         Where no re-entrant corner is near, the mirror is convex, and a sensor is nearest to the rim at an end of its
-        straight track: the ends are the stances' affair.
-
-        Args:
-            clearance_m: clearance of the leg itself, from ``clearance_m``.
+        straight track, which the stances check.
         """
         body = self._body
         if clearance_m >= body.reach_m + body.turn_clearance_m:
@@ -259,10 +235,8 @@ class LegRules:
         """Best chain of places that leads from ``a`` around stepped corners to ``b``, ends left out.
 
         Dijkstra's algorithm on the visibility graph of the corners, inset by the clearance, and of the two elbows from
-        which both ends lie along the panels' rows and columns: on such legs no sensor runs along a seam.
-
-        Returns:
-            The places between; none where the straight leg is good, and where there is no way.
+        which both ends lie along the panels' rows and columns: on such legs no sensor runs along a seam. Empty where
+        the straight leg is good, and where there is no way.
         """
         if self._is_good(a, b):
             return ()
@@ -300,7 +274,6 @@ class LegRules:
         return self.grazing(a, b, atan2(b.y_m - a.y_m, b.x_m - a.x_m))
 
     def _elbows(self, a: LegPlace, b: LegPlace) -> list[LegPlace]:
-        """The corners of the rectangle over a and b at which the robot can turn."""
         places = []
         for x, y in ((a.x_m, b.y_m), (b.x_m, a.y_m)):
             depth = self._rim.signed_distance_m(x, y)
@@ -383,11 +356,7 @@ class UnreachablePointError(PlanError):
 
 
 def in_parts(x_m: float, y_m: float, stop: Stop, longest_m: float) -> list[Stop]:
-    """The straight leg to a stop as equal parts, the stop itself the last.
-
-    Args:
-        x_m, y_m: where the leg begins, deck frame.
-    """
+    """The straight leg from a deck place to a stop as equal parts, the stop itself the last."""
     dx, dy = stop.x_m - x_m, stop.y_m - y_m
     parts = max(1, ceil(hypot(dx, dy) / longest_m))
     between = (

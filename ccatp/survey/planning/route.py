@@ -1,9 +1,4 @@
-"""The route of a survey: measurement points in their order and the stops that lead from each to the next.
-
-The points of all panels as one serpentine over whole lines, upright or level, from the best of its starts.
-
-In which order the measurement points are visited: the thesis's, table 3.1 and fig. 3.2, and a faster one.
-"""
+"""The route of a survey: measurement points in their order and the stops that lead from each to the next."""
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -32,13 +27,7 @@ _REPLANNED_POINTS = 4  # at least, before the old route is joined again
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """The stops of a survey.
-
-    Attributes:
-        stops: in order; points to measure and stops on the way.
-        times_s: least time from before stop k to the end, shape (stops + 1,); the last is 0.
-        lengths_m: way from before stop k to the end, likewise.
-    """
+    """The stops of a survey, with the least time and the way from before stop k to the end, shape (stops + 1,)."""
 
     stops: tuple[Stop, ...]
     times_s: tuple[float, ...]
@@ -64,20 +53,13 @@ def plan_route(
     measuring_time_s: float = 0.0,
     out_of_reach: list[PointId] | None = None,
 ) -> Route:
-    """The fastest drivable sequence of stops through the points.
+    """The fastest drivable sequence of stops through the points from a deck pose.
 
     The robot turns in place and moves straight, forward or in reverse. On every leg its origin keeps
     ``leg_clearance_m`` from the rim and all its edge sensors ``turn_clearance_m``, during turns too; where the thesis's
-    straight way does not, stops are put in between.
+    straight way does not, stops are put in between. ``measuring_time_s`` counts for the remaining time only.
 
-    Args:
-        start: pose of the robot, deck frame.
-        measuring_time_s: standstill at each point, for the remaining time only.
-        out_of_reach: takes the points that cannot be reached, and the route goes without them.
-
-    Raises:
-        OutsideMirrorError: if the start is not on the mirror.
-        UnreachableError: if a point cannot be reached with the clearances, and there is no ``out_of_reach``.
+    Raises ``OutsideMirrorError`` (start); ``UnreachableError`` for a point, unless ``out_of_reach`` takes it.
     """
     left = set(points).difference(skip)
     wanted = [point for point in points if point in left]
@@ -112,18 +94,12 @@ def plan_rejoin(
     skip: Collection[PointId],
     measuring_time_s: float = 0.0,
 ) -> Route:
-    """The way from ``start`` back to a route: its next points planned anew, the rest as it was.
+    """The way from a deck pose back to a route: its next points planned again, the rest as it was.
 
-    Planning a whole mirror anew takes longer than the robot's frames may wait. The new part ends at a point where the
+    Raises as ``plan_route``.
+
+    Planning a whole mirror again takes longer than the robot's frames may wait. The new part ends at a point where the
     robot can turn freely, so that it does not matter how it arrives there.
-
-    Args:
-        start: pose of the robot, deck frame.
-        measuring_time_s: standstill at each point, for the remaining time only.
-
-    Raises:
-        OutsideMirrorError: if the start is not on the mirror.
-        UnreachableError: if a point cannot be reached with the clearances.
     """
     body = build_body(robot, mission)
     left = [k for k, stop in enumerate(route.stops) if stop.point is not None and stop.point not in skip]
@@ -220,13 +196,6 @@ def fastest_serpentine(mirror: Mirror, points: Sequence[PointId], limits: Limits
 
     On a line nothing has to be turned for, so that quarter turns remain at the ends of the lines only. Compared are
     the least times of the straight legs from point to point, turns included; of equals the first of ``serpentines``.
-
-    Args:
-        mirror: the mirror; its base pose is the start.
-        limits: motion limits by which turns are weighed against ways.
-
-    Returns:
-        The same points.
     """
     return min(serpentines(points), key=lambda order: _straight_time(mirror, order, limits))
 
@@ -289,16 +258,11 @@ def panel_order(panel: PanelId) -> tuple[int, ...]:
 
 
 def thesis_order(mirror: Mirror, panels: int = 0) -> list[PointId]:
-    """Points of the mirror in the order of the thesis: panel by panel, odd rows towards +column, even rows back.
+    """Points in the order of the thesis (table 3.1, fig.
 
-    Args:
-        panels: take the first so many panels only; 0 = all.
+    3.2): panel by panel, odd rows towards +column, even rows back.
 
-    Returns:
-        Nine points per panel, each exactly once.
-
-    Raises:
-        ValueError: if ``panels`` is negative.
+    ``panels``: the first so many only, 0 = all; raises ``ValueError`` if negative.
     """
     if panels < 0:
         raise ValueError(f"panels = {panels}: a survey takes 0 (= all) or more panels")
@@ -310,15 +274,7 @@ def thesis_order(mirror: Mirror, panels: int = 0) -> list[PointId]:
 def optimised_order(mirror: Mirror, panels: int = 0, limits: LimitsConfig = NOMINAL_LIMITS) -> list[PointId]:
     """The same points in whole lines across the panels, see ``fastest_serpentine``.
 
-    Args:
-        panels: take the points of the first so many panels of the thesis's order only; 0 = all.
-        limits: motion limits by which turns are weighed against ways.
-
-    Returns:
-        Nine points per panel, each exactly once.
-
-    Raises:
-        ValueError: if ``panels`` is negative.
+    Raises ``ValueError`` as ``thesis_order``.
     """
     return fastest_serpentine(mirror, thesis_order(mirror, panels), limits)
 

@@ -1,7 +1,4 @@
-"""The cheapest sequence of turns and straight legs through given places: dynamic programming along the order.
-
-Bang-bang times: the least time that a path takes under the motion limits, turning in place at every stop.
-"""
+"""The cheapest sequence of turns and straight legs through given places, by dynamic programming; bang-bang times."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,17 +17,9 @@ STRAIGHT_RAD = 0.05
 
 
 def bang_bang_time(distance: float, v_max: float, a_max: float) -> float:
-    """Least time from rest to rest under bounded speed and acceleration, s.
+    """Least time from rest to rest under bounded speed and acceleration, s; raises ``ValueError`` for a limit <= 0.
 
-    ``2 sqrt(d/a)`` while the peak stays below v (d < v^2/a), else ``d/v + v/a``.
-
-    Args:
-        distance: m or rad, sign ignored.
-        v_max: speed limit, m/s or rad/s.
-        a_max: acceleration limit, m/s^2 or rad/s^2.
-
-    Raises:
-        ValueError: if a limit is not positive.
+    ``2 sqrt(d/a)`` while the peak stays below v (d < v^2/a), else ``d/v + v/a``; d in m or rad, sign ignored.
     """
     if v_max <= 0.0 or a_max <= 0.0:
         raise ValueError(f"limits must be positive, got v_max={v_max}, a_max={a_max}")
@@ -76,20 +65,13 @@ def stop_times(stops: Sequence[Stop], start: DeckPose, limits: LimitsConfig, mir
 def path_time(
     stops: Sequence[Stop], start: DeckPose, limits: LimitsConfig, mirror: Mirror, measuring_time_s: float
 ) -> float:
-    """Least time to drive a path from rest to rest and to measure at its measurement points, s.
-
-    Args:
-        start: pose before the first leg, deck frame.
-    """
+    """Least time to drive a path from a deck pose, rest to rest, and to measure at its measurement points, s."""
     measurements = sum(stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) for stop in stops)
     return sum(stop_times(stops, start, limits, mirror)) + measurements * measuring_time_s
 
 
 def leg_lengths(stops: Sequence[Stop], start: DeckPose, mirror: Mirror) -> list[float]:
-    """Length of the leg to each stop on the surface, m.
-
-    It is the chord between the surface points, which falls short of the arc by less than 0.1 mm in a metre.
-    """
+    """Length of the leg to each stop on the surface, m, as a chord: short of the arc by less than 0.1 mm in a metre."""
     first = mirror.surface_point(start.x_m, start.y_m)
     points = [first, *(mirror.surface_point(stop.x_m, stop.y_m) for stop in stops)]
     return [dist(a, b) for a, b in pairwise(points)]
@@ -118,11 +100,9 @@ class Target(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchNode:
-    """The robot has arrived at a place by the cheapest way that ends with this leg.
+    """The cheapest arrival at a place with this leg, facing the deck direction ``course_rad``; ``before``.
 
-    Attributes:
-        course_rad: what it faces, as a direction in the deck plane.
-        before: the arrival before; ``None`` at the start.
+    None at the start.
     """
 
     place: LegPlace
@@ -173,7 +153,6 @@ class Search:
         return self._extend(frontier, (target.place,)).get(target.place, [])
 
     def _extend(self, frontier: Frontier, targets: Iterable[LegPlace]) -> Frontier:
-        """One leg further: for each target, each place it is reached from and each direction the cheapest way."""
         reached: Frontier = {}
         for target in targets:
             ways = [way for source, arrivals in frontier.items() for way in self._legs(source, arrivals, target)]

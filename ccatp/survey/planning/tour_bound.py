@@ -54,10 +54,6 @@ def tour_bound(mirror: Mirror, points: Sequence[PointId], limits: LimitsConfig, 
     values of the linear programme in which each place mixes its choices such that both ends of a leg agree about it;
     should the solver stop early the bound gets lower, not wrong. Legs that are not near have no price and turn for
     nothing, which makes choices cheaper only.
-
-    Args:
-        mirror: the mirror; its base pose is the start.
-        points: what to measure; their order does not matter.
     """
     if not points:
         return 0.0
@@ -139,7 +135,6 @@ def _of_base(legs_s: FloatArray, turns_s: FloatArray, is_near: NDArray[np.bool_]
 
 
 def _of_point(place: int, near: IntArray, halves_s: FloatArray, turns_s: FloatArray, far_s: FloatArray) -> _Choices:
-    """Two near legs; a near and a far one; two far ones; one leg only, where the tour ends: near, far."""
     first, second = np.triu_indices(len(near), 1)
     none = np.full(len(near), _NONE)
     joined = np.r_[

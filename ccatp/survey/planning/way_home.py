@@ -29,18 +29,11 @@ def plan_way_home(
     limits: LimitsConfig,
     mission: MissionConfig,
 ) -> tuple[Stop, ...]:
-    """Stops from ``start`` to base; the last is base itself, with its heading.
+    """Stops from a deck pose anywhere on the mirror to base; the last is base itself, with its heading.
 
     Near the rim the first stop leads straight away from it, forward or in reverse, to where the robot can turn. From
-    there on legs and turns keep the clearances of a survey.
-
-    Args:
-        start: where the robot is, deck frame; anywhere on the mirror, facing anything.
-        base: where it shall end, deck frame.
-
-    Raises:
-        OutsideMirrorError: if the start is not on the mirror.
-        UnreachableError: if base itself lies where the clearances allow no way.
+    there on legs and turns keep the clearances of a survey. Raises ``OutsideMirrorError`` (start), and
+    ``UnreachableError`` if base lies where the clearances allow no way.
     """
     body = build_body(robot, mission)
     here, goal = build_places(mirror, body, np.array([start.x_m, base.x_m]), np.array([start.y_m, base.y_m]))
