@@ -11,7 +11,7 @@ WORKERS ?= 2
 
 # Small matrices: threads of the linear algebra would only fight each other for the cores.
 export OPENBLAS_NUM_THREADS := 1
-# Some containers forbid it; every process of every test would compile every module anew.
+# Some containers forbid it; every process of every test would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
 BIN := $(VENV)/bin
@@ -37,7 +37,7 @@ help:
 	@echo "make lint             lint, types, import contract"
 	@echo "make format           format the code"
 	@echo "make fast             a compiled build beside it, for campaigns: $(FAST_VENV)/bin/ccatp; needs a C compiler"
-	@echo "make lock             pin the dependencies anew (needs uv)"
+	@echo "make lock             pin the dependencies again (needs uv)"
 	@echo "make clean            remove the environment and every cache; runs/ stays"
 
 run: $(VENV)/.installed

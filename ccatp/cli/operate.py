@@ -112,7 +112,7 @@ def clear(
 ) -> None:  # fmt: skip
     """End the emergency ID, whose cause is gone.
 
-    ID is what ccatp emergency told. The robot must be at base or held; over TCP, our key needs the role clear.
+    ID is what ccatp emergency printed. The robot must be at base or held; over TCP, our key needs the role clear.
     """
     payload: dict[str, object] = {"cmd": "clear", "id": str(emergency_id)}
     folder = configured_folder(config_file, runtime_dir)

@@ -110,7 +110,7 @@ def sim_etalon(
     seed: int | None, settings: Mapping[str, object],
     puck_world_m: tuple[float, float, float] | None, truth: str | None, runtime_dir: Path | None,
 ) -> int:  # fmt: skip
-    """Run the simulated MultiLine server; the puck stands at the base unless told otherwise."""
+    """Run the simulated MultiLine server; the puck stands at the base unless set otherwise."""
     from ccatp.config.load import load_config
     from ccatp.daemon.sim_etalon import run_alone
 

@@ -22,7 +22,7 @@ DOCS = ROOT / "docs"
 MARKED = re.compile(r"(<!-- made: (\w+) -->\n).*?(<!-- made -->)", re.DOTALL)
 REACTIONS = {
     "none": "nothing",
-    "inform": "told",
+    "inform": "reported",
     "slow": "half the speed",
     "pause": "pause: wheels held, goes on by itself",
     "hold": "hold: wheels held, a fix, then on by itself",

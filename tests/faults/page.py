@@ -23,7 +23,7 @@ HEAD = """# The fault table
 
 What can break, how it shows, what then happens and by when. `tests/faults/table.toml` is the table; each row is shown
 by the tests that are marked for it, and a run of all tests fails if one is not. *Measured* is the worst case of those
-tests{where}. `make test`, `make test-slow` and then `make faults` make this page anew. What a row says of the robot
+tests{where}. `make test`, `make test-slow` and then `make faults` write this page. What a row says of the robot
 itself, `ccatp conformance HOST:PORT` asks of any robot.
 """
 COLUMNS = (
