@@ -78,7 +78,7 @@ class MissionStatus(Message):
 
 
 class DisplayState(Message):
-    """The newest of everything that a display shows, told only while somebody has asked for it.
+    """The newest of everything that a display shows, published only while a client has asked for it.
 
     Attributes:
         x_m, y_m, heading_rad: pose, deck frame.
