@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ccatp.core import FloatArray
+from ccatp.links.topics import BeaconEllipse
 from ccatp.report.plots import (
     BAD,
     GOOD,
@@ -72,14 +73,16 @@ def beacon_error_figure(record: BeaconRecord, width_px: float) -> "Figure":
     return _logarithmic(curves, "mm", width_px, "localization error over time")
 
 
-def map_error_figure(record: BeaconRecord, width_px: float) -> "Figure | None":
-    """Root of the mean square error of the beacons, expected and true, against time; None without a map."""
-    times, expected, true = list[float](), list[float](), list[float]()
-    for message in record.maps:
-        beacons = record.standing(message)
-        if not beacons:
-            continue
-        times.append(message.t_s)
+def standing_maps(record: BeaconRecord) -> list[tuple[float, dict[str, BeaconEllipse]]]:
+    """Robot time (s) and beacons of each map that holds any."""
+    return [(one.t_s, beacons) for one in record.maps if (beacons := record.standing(one))]
+
+
+def map_error_figure(record: BeaconRecord, width_px: float) -> "Figure":
+    """Root of the mean square error of the beacons, expected and true, against time."""
+    expected, true = list[float](), list[float]()
+    maps = standing_maps(record)
+    for _, beacons in maps:
         expected.append(float(np.mean([xx + yy for _, _, xx, _, yy in beacons.values()])) ** 0.5)
         squares = [
             (x - record.places[name][0]) ** 2 + (y - record.places[name][1]) ** 2
@@ -87,20 +90,16 @@ def map_error_figure(record: BeaconRecord, width_px: float) -> "Figure | None":
             if name in record.places
         ]
         true.append(float(np.mean(squares)) ** 0.5 if squares else float("nan"))
-    if len(times) < 2:
-        return None
-    t_s = np.array(times)
+    t_s = np.array([t_s for t_s, _ in maps])
     curves = [Curve("expected", t_s, _MILLI * np.array(expected), SERIES[1], "--")]
     if np.isfinite(true).any():
         curves.append(Curve("true error", t_s, _MILLI * np.array(true), SERIES[0]))
     return _logarithmic(curves, "mm, rms of a place", width_px, "error of the map over time")
 
 
-def consistency_figure(record: BeaconRecord, width_px: float) -> "Figure | None":
-    """NIS of the readings and NEES of the pose, each by its degrees of freedom: 1 is expected. None without either."""
+def consistency_figure(record: BeaconRecord, width_px: float) -> "Figure":
+    """NIS of the readings and NEES of the pose, each by its degrees of freedom: 1 is expected."""
     readings, nees = readings_of(record), pose_nees(record)
-    if not readings and nees is None:
-        return None
     figure, axes = new_plot(width_px, "consistency over time", _HEIGHTS_PX)
     axes.axhline(1.0, color=QUIET, linewidth=1.0, linestyle="--")
     if readings:
@@ -120,11 +119,9 @@ def consistency_figure(record: BeaconRecord, width_px: float) -> "Figure | None"
     return figure
 
 
-def target_figure(record: BeaconRecord, width_px: float) -> "Figure | None":
-    """Distance to the followed radio, by the estimate and in truth; None where none is followed."""
-    curves = _target_curves(record)
-    if not curves:
-        return None
+def target_figure(record: BeaconRecord, width_px: float) -> "Figure":
+    """Distance to the followed radio, by the estimate and in truth."""
+    curves = target_curves(record)
     figure, axes = new_plot(width_px, "distance to the target over time", _HEIGHTS_PX)
     safe_m = record.cfg.follow.safe_distance_m
     top = max(1.5 * safe_m, *(float(np.nanmax(curve.values)) for curve in curves))
@@ -138,7 +135,8 @@ def target_figure(record: BeaconRecord, width_px: float) -> "Figure | None":
     return figure
 
 
-def _target_curves(record: BeaconRecord) -> list[Curve]:
+def target_curves(record: BeaconRecord) -> list[Curve]:
+    """Distance to the followed radio; empty where none is followed."""
     if not record.cfg.follow.is_active:
         return []
     curves = []

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.core import Fix, PanelId, PointId
+from ccatp.core import Fix, PointId
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult, compare, survey_result
 from ccatp.records.summary import arrival_error_m as true_arrival_error_m
@@ -43,6 +43,11 @@ class PointVerdict(NamedTuple):
     left_mm: float | None
     grade: Grade
     why: str
+
+    @property
+    def shown_mm(self) -> float | None:
+        """The first distance that is known."""
+        return self.left_mm if self.first_mm is None else self.first_mm
 
 
 def arrival_error_m(mirror: Mirror, point: PointId, fix: Fix, puck_height_m: float) -> float:
@@ -136,19 +141,6 @@ def _parsed(name: str) -> PointId | None:
     return PointId(*map(int, parts)) if len(parts) == 3 and all(part.isdecimal() for part in parts) else None
 
 
-def by_panel(verdicts: list[PointVerdict]) -> dict[PanelId, dict[int, PointVerdict]]:
-    """The same by panel and number."""
-    found: dict[PanelId, dict[int, PointVerdict]] = {}
-    for verdict in verdicts:
-        found.setdefault(verdict.point.panel, {})[verdict.point.point] = verdict
-    return found
-
-
-def counted(verdicts: list[PointVerdict]) -> dict[Grade, int]:
-    """How many there are of each grade, those without any left out."""
-    return {grade: count for grade in Grade if (count := sum(verdict.grade is grade for verdict in verdicts))}
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Findings:
     """A run and what follows from it. What the run does not hold is None or empty.
@@ -172,9 +164,9 @@ class Findings:
         return self.record.warnings + (self.alignment.warnings if self.alignment is not None else ())
 
     @property
-    def has_failed(self) -> bool:
-        """A point was measured too far from its place."""
-        return any(verdict.grade is Grade.FAIL for verdict in self.points)
+    def counts(self) -> dict[Grade, int]:
+        """How many points there are of each grade, those without any left out."""
+        return {grade: count for grade in Grade if (count := sum(one.grade is grade for one in self.points))}
 
 
 def findings_of(record: RunRecord) -> Findings:

@@ -1,7 +1,7 @@
 """The page around the sections of a report: templates, numbers as text, figures in two layouts, lines of the log."""
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DASH = "\u2013"
-MICRO, MILLI = 1e6, 1e3
+MICRO = 1e6
 # Nothing is loaded, run, sent or embedded; what the page shows stands in it.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
 _FEW_LINES = 40
@@ -28,46 +28,11 @@ _GRAVE = re.compile(
 _TOKEN = re.compile(r"\d+(?:[-/:.]\d+){2,}|\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 Draw = Callable[[float], "Figure"]
-Cell = str | tuple[str, str]  # a text, or a text and its class
 
 
-class Section(NamedTuple):
-    """A part of the page: its anchor, its heading, and what its template shows."""
-
-    anchor: str
-    title: str
-    values: dict[str, Any]
-
-
-class Table(NamedTuple):
-    """A table; the first cell of a row is its name."""
-
-    head: Sequence[str]
-    cells: Sequence[Sequence[Cell]]
-
-    def first(self, count: int) -> "Table":
-        """The first rows."""
-        return Table(self.head, self.cells[:count])
-
-
-class Fact(NamedTuple):
-    """One value of a run with its name, and its unit or what else is said of it in small print."""
-
-    name: str
-    value: str
-    unit: str = ""
-
-
-class PageFigure(NamedTuple):
-    """A picture in two layouts, of which the page shows one."""
-
-    wide: Markup
-    narrow: Markup
-
-
-def page_figure(draw: Draw) -> PageFigure:
-    """Draw a picture for a screen and for a phone."""
-    return PageFigure(inline(draw(WIDE)), inline(draw(NARROW)))
+def page_figures(drawings: Mapping[str, Draw]) -> dict[str, tuple[Markup, Markup]]:
+    """Each picture in two layouts, for a screen and for a phone; the page shows one of them."""
+    return {name: (inline(draw(WIDE)), inline(draw(NARROW))) for name, draw in drawings.items()}
 
 
 def inline(figure: "Figure") -> Markup:
@@ -75,10 +40,10 @@ def inline(figure: "Figure") -> Markup:
     return Markup(svg_of(figure))  # noqa: S704 - matplotlib and ElementTree escape every text in it
 
 
-def render(template: str, title: str, sections: Sequence[Section], **values: Any) -> str:
-    """The page as one HTML file that needs nothing from outside."""
-    page = environment().get_template(template)
-    return page.render(title=title, sections=sections, **values)
+def render(template: str, title: str, sections: Iterable[tuple[str, str, object]], **values: Any) -> str:
+    """The page as one HTML file that needs nothing from outside; ``sections``: anchor, heading, whether it is shown."""
+    shown = [(anchor, heading) for anchor, heading, is_shown in sections if is_shown]
+    return environment().get_template(template).render(title=title, sections=shown, **values)
 
 
 @cache

@@ -1,19 +1,16 @@
 """Writes the report of a run, and the comparison of two: a page, and figures where asked for."""
 
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from ccatp.errors import CcatpError, ExitStatus
-from ccatp.report.beacon_page import beacon_data, beacon_figures, beacon_page
-from ccatp.report.compare import RunPair, compare_figures, compare_page, pair_of
+from ccatp.report.beacon_page import beacon_data, beacon_drawings, beacon_page
+from ccatp.report.compare import RunPair, compare_drawings, compare_page, pair_of
 from ccatp.report.findings import findings_of
-from ccatp.report.plots import PictureError, save_figure
+from ccatp.report.html import Draw
+from ccatp.report.plots import WIDE, PictureError, save_figure
 from ccatp.report.record_reader import is_beacon_run, read_beacon_record, read_record
-from ccatp.report.run_page import run_data, run_figures, run_page
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from ccatp.report.run_page import run_data, run_drawings, run_page
 
 _DPI = 192.0  # of PNG files: two pixels for each of the page
 REPORT, COMPARISON = "report.html", "compare.html"
@@ -49,15 +46,15 @@ def report_run(run_dir: Path, out: Path | None = None, figures: Path | None = No
     path = out or run_dir / REPORT
     if is_beacon_run(run_dir):
         record = read_beacon_record(run_dir)
-        markup, data, pictures = beacon_page(record), beacon_data(record), partial(beacon_figures, record)
+        markup, data, pictures = beacon_page(record), beacon_data(record), beacon_drawings(record)
         warnings = record.warnings
     else:
         found = findings_of(read_record(run_dir))
-        markup, data, pictures = run_page(found), run_data(found), partial(run_figures, found)
+        markup, data, pictures = run_page(found), run_data(found), run_drawings(found)
         warnings = found.record.warnings
     write_page(markup, path)
     if figures is not None:
-        write_pictures(pictures(), figures)
+        write_pictures(pictures, figures)
     return Report(path, data, warnings)
 
 
@@ -73,7 +70,7 @@ def compare_runs(run_a: Path, run_b: Path, out: Path, figures: Path | None = Non
     pair = pair_of(findings_of(read_record(run_a)), findings_of(read_record(run_b)))
     write_page(compare_page(pair), out)
     if figures is not None:
-        write_pictures(compare_figures(pair), figures)
+        write_pictures(compare_drawings(pair), figures)
     return pair
 
 
@@ -91,7 +88,7 @@ def write_page(markup: str, path: Path) -> None:
         raise ReportError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def write_pictures(pictures: "dict[str, Figure]", folder: Path) -> None:
+def write_pictures(drawings: dict[str, Draw], folder: Path) -> None:
     """Write figures as SVG, PNG and PDF.
 
     Raises:
@@ -101,6 +98,7 @@ def write_pictures(pictures: "dict[str, Figure]", folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise PictureError(f"{folder}: cannot be made: {error.strerror or error}") from error
-    for name, picture in pictures.items():
+    for name, draw in drawings.items():
+        picture = draw(WIDE)
         for suffix in (".svg", ".png", ".pdf"):
             save_figure(picture, folder / f"{name}{suffix}", _DPI)
