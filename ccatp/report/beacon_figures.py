@@ -8,6 +8,7 @@ import numpy as np
 
 from ccatp.core import FloatArray
 from ccatp.links.topics import BeaconEllipse
+from ccatp.report.beacon_record import BeaconRecord, pose_errors_m, pose_nees, readings_of
 from ccatp.report.plots import (
     BAD,
     GOOD,
@@ -31,7 +32,6 @@ from ccatp.report.plots import (
     set_log_axis,
     thinned,
 )
-from ccatp.report.record import BeaconRecord, pose_errors_m, pose_nees, readings_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -16,17 +16,9 @@ from ccatp.report.beacon_figures import (
     target_curves,
     target_figure,
 )
+from ccatp.report.beacon_record import BeaconRecord, beacon_rows, pose_errors_m, pose_nees, readings_of, waypoint_rows
 from ccatp.report.html import Draw, events_of, page_figures, render
-from ccatp.report.record import (
-    COMPLETE,
-    BeaconRecord,
-    PointOutcome,
-    beacon_rows,
-    pose_errors_m,
-    pose_nees,
-    readings_of,
-    waypoint_rows,
-)
+from ccatp.report.record import COMPLETE, PointOutcome
 
 _SIGMAS = 3.0
 _BAND = 0.95

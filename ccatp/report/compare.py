@@ -9,8 +9,7 @@ from scipy.special import chdtrc, chdtri
 
 from ccatp.core import FloatArray, PanelId
 from ccatp.mirror.panel_alignment import MirrorWavefront, PanelResult, mirror_wavefront
-from ccatp.report.analysis import KINDS
-from ccatp.report.findings import Findings
+from ccatp.report.findings import KINDS, Findings
 from ccatp.report.html import MICRO, Draw, events_of, inline, page_figures, render
 from ccatp.report.mirror_map import change_figure, paths_figure, surface_figure
 from ccatp.report.plots import NARROW
@@ -194,21 +193,21 @@ def _compared(
     rows: Sequence[_Row], data: Sequence[Mapping[str, Any] | None], suffix: str = ""
 ) -> Iterator[ComparedValue]:
     for path, name, decimals in rows:
-        values = []
+        values: list[float | None] = []
         for found in data:
             value: Any = found
             for key in path.split("."):
                 value = None if value is None else value.get(key)
             values.append(None if value is None else (100.0 if name.endswith("%") else 1.0) * float(value))
         if values != [None, None]:
-            yield ComparedValue(name + suffix, decimals, *values)
+            yield ComparedValue(name + suffix, decimals, a=values[0], b=values[1])
 
 
 def compare_page(pair: RunPair) -> str:
     """The comparison as one HTML file. A section that the runs hold nothing for is left out."""
     figures = page_figures(compare_drawings(pair))
     mirror, (a, b) = pair.b.record.mirror, pair.panels
-    changed = changed_keys(*(found.record.cfg.model_dump(mode="json") for found in (pair.a, pair.b)))
+    ours, others = (found.record.cfg.model_dump(mode="json") for found in (pair.a, pair.b))
     earlier = {verdict.point: verdict for verdict in pair.a.points}
     fitted = [(name, panels) for name, panels in (("A", a), ("B", b)) if panels and pair.is_one_mirror]
     everything = [panel for _, panels in fitted for panel in panels.values()]
@@ -240,7 +239,7 @@ def compare_page(pair: RunPair) -> str:
         pair=pair,
         figures=figures,
         compared=compared_figures(pair),
-        changed=changed,
+        changed=changed_keys(ours, others),
         points=[(earlier[verdict.point], verdict) for verdict in pair.b.points if verdict.point in earlier],
         surfaces=surfaces,
         adjusters=next(iter((b or a).values())).adjusters if moved else (),

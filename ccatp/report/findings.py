@@ -1,20 +1,28 @@
 """What follows from a recorded survey, computed once for page, figures and data: points, errors, times, alignment."""
 
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from math import dist, inf
+from itertools import pairwise
+from math import dist
 from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.core import Fix, PointId
+from ccatp.core import FloatArray, PointId, StopKind, Vector3
+from ccatp.links.topics import MissionStatus
 from ccatp.mirror.mirror import Mirror
 from ccatp.mirror.mirror_alignment import Comparison, SurveyResult, compare, survey_result
 from ccatp.records.summary import arrival_error_m as true_arrival_error_m
 from ccatp.records.summary import puck_targets
-from ccatp.report.analysis import ErrorFigures, ErrorSeries, TimeBreakdown, error_figures, error_series, time_budget
 from ccatp.report.record import COMPLETE, WITHIN_MM, PointOutcome, RecordedSession, RunRecord
+from ccatp.survey.composition import plan_survey
+from ccatp.survey.planning.legs import PlanError
+from ccatp.survey.planning.route import ORDERS
+from ccatp.survey.planning.search import leg_lengths, leg_time, stop_times
+
+SIGMAS = 3.0
 
 
 class Grade(StrEnum):
@@ -50,42 +58,32 @@ class PointVerdict(NamedTuple):
         return self.left_mm if self.first_mm is None else self.first_mm
 
 
-def arrival_error_m(mirror: Mirror, point: PointId, fix: Fix, puck_height_m: float) -> float:
-    """Distance on the surface from the foot of a measured puck to its measurement point, m."""
-    return _foot_distance_m(mirror, point, fix.position_m, puck_height_m)
-
-
-def _foot_distance_m(mirror: Mirror, point: PointId, puck_m: tuple[float, float, float], puck_height_m: float) -> float:
+def arrival_error_m(mirror: Mirror, point: PointId, puck_m: Vector3, puck_height_m: float) -> float:
+    """Distance on the surface from the foot of a measured puck (world frame) to its measurement point, m."""
     x, y, _ = mirror.foot_of_puck(puck_m, puck_height_m)
     return dist(mirror.surface_point(x, y), mirror.surface_point(*mirror.point_on_deck(point)))
 
 
 def point_verdicts(record: RunRecord) -> list[PointVerdict]:
     """Every point of the mission, by row, column and number; empty where the run holds no mission."""
-    first = first_arrivals_mm(record)
-    height_m = record.cfg.robot.puck_height_m
-    left = {one.point: 1e3 * arrival_error_m(record.mirror, one.point, one.fix, height_m) for one in record.measured}
-    reasons = _reasons(record)
-    return [
-        PointVerdict(
-            row.point,
-            record.mirror.point_on_deck(row.point),
-            first.get(row.point),
-            left.get(row.point),
-            _grade(row.status, first.get(row.point), left.get(row.point)),
-            reasons.get(row.point, ""),
-        )
-        for row in record.points or ()
-    ]
-
-
-def _grade(status: str, first_mm: float | None, left_mm: float | None) -> Grade:
-    if left_mm is not None:
-        if left_mm > WITHIN_MM:
-            return Grade.FAIL
-        # Where nobody saw the first arrival the fix has to do.
-        return Grade.GOOD if (left_mm if first_mm is None else first_mm) <= WITHIN_MM else Grade.CORRECTED
-    return Grade.SKIPPED if status == "skipped" else Grade.OPEN
+    first, reasons = first_arrivals_mm(record), _reasons(record)
+    mirror, height_m = record.mirror, record.cfg.robot.puck_height_m
+    left = {
+        one.point: 1e3 * arrival_error_m(mirror, one.point, one.fix.position_m, height_m) for one in record.measured
+    }
+    found = []
+    for row in record.points or ():
+        first_mm, left_mm = first.get(row.point), left.get(row.point)
+        if left_mm is None:
+            grade = Grade.SKIPPED if row.status == "skipped" else Grade.OPEN
+        elif left_mm > WITHIN_MM:
+            grade = Grade.FAIL
+        else:
+            # Where the first arrival is not known the fix has to do.
+            grade = Grade.GOOD if (left_mm if first_mm is None else first_mm) <= WITHIN_MM else Grade.CORRECTED
+        place_m = mirror.point_on_deck(row.point)
+        found.append(PointVerdict(row.point, place_m, first_mm, left_mm, grade, reasons.get(row.point, "")))
+    return found
 
 
 def first_arrivals_mm(record: RunRecord) -> dict[PointId, float]:
@@ -95,8 +93,7 @@ def first_arrivals_mm(record: RunRecord) -> dict[PointId, float]:
     """
     found: dict[PointId, float] = {}
     for session in record.sessions:
-        known = _from_truth(record, session) if session.truth is not None else _from_fixes(record, session)
-        found.update({point: error for point, error in known.items() if point not in found})
+        found = (_from_fixes if session.truth is None else _from_truth)(record, session) | found
     return found
 
 
@@ -104,7 +101,7 @@ def _from_truth(record: RunRecord, session: RecordedSession) -> dict[PointId, fl
     truth, mirror, height_m = session.truth, record.mirror, record.cfg.robot.puck_height_m
     if truth is None or not len(truth.seq):
         return {}
-    first = {arrived.point: arrived.seq for arrived in reversed(session.arrivals)}
+    first = {PointId(*arrival.point): arrival.seq for arrival in reversed(session.arrivals)}
     targets = puck_targets(mirror, first, height_m)
     found = {}
     for point, seq in first.items():
@@ -118,14 +115,9 @@ def _from_truth(record: RunRecord, session: RecordedSession) -> dict[PointId, fl
 
 def _from_fixes(record: RunRecord, session: RecordedSession) -> dict[PointId, float]:
     """The first fix of a point belongs to its first arrival: corrections follow it."""
-    found: dict[PointId, float] = {}
-    for fix in session.fixes:
-        if fix.point is None or PointId(*fix.point) in found:
-            continue
-        point = PointId(*fix.point)
-        error_m = _foot_distance_m(record.mirror, point, fix.position_m, record.cfg.robot.puck_height_m)
-        found[point] = 1e3 * error_m if error_m < inf else inf
-    return found
+    height_m = record.cfg.robot.puck_height_m
+    first = {PointId(*fix.point): fix.position_m for fix in reversed(session.fixes) if fix.point is not None}
+    return {point: 1e3 * arrival_error_m(record.mirror, point, puck_m, height_m) for point, puck_m in first.items()}
 
 
 def _reasons(record: RunRecord) -> dict[PointId, str]:
@@ -133,12 +125,239 @@ def _reasons(record: RunRecord) -> dict[PointId, str]:
     by_reason: Mapping[str, list[str]] = {} if status is None else status.left_out
     if not by_reason and record.summary is not None:
         by_reason = (record.summary.get("points") or {}).get("left_out") or {}
-    return {found: why for why, names in by_reason.items() for name in names if (found := _parsed(name)) is not None}
+    parsed = [(name.replace("-", "/").split("/"), why) for why, names in by_reason.items() for name in names]
+    return {
+        PointId(*map(int, parts)): why
+        for parts, why in parsed
+        if len(parts) == 3 and all(part.isdecimal() for part in parts)
+    }
 
 
-def _parsed(name: str) -> PointId | None:
-    parts = name.replace("-", "/").split("/")
-    return PointId(*map(int, parts)) if len(parts) == 3 and all(part.isdecimal() for part in parts) else None
+# -- localization error -----------------------------------------------------------------------------------------------
+
+
+class ErrorSeries(NamedTuple):
+    """Over the time of all sessions, one after the other.
+
+    Attributes:
+        t_s: robot time since the start of the first session, shape (k,).
+        sigma3_mm: three standard deviations of the estimated place, shape (k,).
+        error_mm: distance of the true place from the estimated one, shape (k,); NaN where the truth is not known.
+        fix_t_s, fix_mm, fix_fused: of fixes: how far each moved the estimate, or would have, and whether it was taken.
+    """
+
+    t_s: FloatArray
+    sigma3_mm: FloatArray
+    error_mm: FloatArray
+    breaks_s: tuple[float, ...]
+    fix_t_s: FloatArray
+    fix_mm: FloatArray
+    fix_fused: "np.ndarray[tuple[int, ...], np.dtype[np.bool_]]"
+
+
+class ErrorFigures(NamedTuple):
+    """Localization error over all frames with a truth, mm; the share within three sigma and within 10 mm."""
+
+    mean_mm: float
+    p50_mm: float
+    p99_mm: float
+    max_mm: float
+    within_sigma3: float
+    within_limit: float
+
+
+def error_series(record: RunRecord) -> ErrorSeries | None:
+    """The series; None without an estimate."""
+    sessions = [session for session in record.sessions if len(session.track.seq)]
+    if not sessions:
+        return None
+    times, errors, breaks = list[FloatArray](), list[FloatArray](), list[float]()
+    fixes = list[tuple[float, float, bool]]()
+    start_s = 0.0
+    for session in sessions:
+        offset_s = start_s - float(session.track.t_s[0])
+        times.append(session.track.t_s + offset_s)
+        errors.append(_errors_mm(session))
+        fixes += [(fix.t_s + offset_s, fix.jump_mm, fix.is_fused) for fix in session.fixes]
+        start_s += session.span_s
+        breaks.append(start_s)
+    table = np.array(fixes, dtype=np.float64).reshape(-1, 3)
+    return ErrorSeries(
+        t_s=np.concatenate(times),
+        sigma3_mm=1e3 * SIGMAS * np.concatenate([session.track.sigma_m for session in sessions]),
+        error_mm=np.concatenate(errors),
+        breaks_s=tuple(breaks[:-1]),
+        fix_t_s=table[:, 0],
+        fix_mm=table[:, 1],
+        fix_fused=table[:, 2] > 0.0,
+    )
+
+
+def _errors_mm(session: RecordedSession) -> FloatArray:
+    errors = np.full(len(session.track.seq), np.nan)
+    if session.truth is not None:
+        _, i, j = np.intersect1d(session.track.seq, session.truth.seq, assume_unique=True, return_indices=True)
+        errors[i] = 1e3 * np.linalg.norm(session.track.place_m[i] - session.truth.place_m[j], axis=1)
+    return errors
+
+
+def error_figures(series: ErrorSeries) -> ErrorFigures | None:
+    """The distribution of the errors; None where no truth is known."""
+    is_known = np.isfinite(series.error_mm)
+    errors = series.error_mm[is_known]
+    if not len(errors):
+        return None
+    p50, p99 = np.percentile(errors, (50, 99)).tolist()
+    within_sigma3 = float(np.mean(errors <= series.sigma3_mm[is_known]))
+    within_limit = float(np.mean(errors <= WITHIN_MM))
+    return ErrorFigures(float(errors.mean()), p50, p99, float(errors.max()), within_sigma3, within_limit)
+
+
+# -- time budget ------------------------------------------------------------------------------------------------------
+
+START_ANEW = "start anew"
+KINDS = ("turn", "drive", "settle", "measure", "wait", "back off", "home", START_ANEW)
+_KIND_OF = {
+    "turning": "turn", "driving": "drive", "settling": "settle", "measuring": "measure", "backing off": "back off",
+    "returning": "home", START_ANEW: START_ANEW,
+}  # fmt: skip
+_OVER = "done"
+_NEVER_BEGUN = "idle"
+_ROUNDING_S = 1e-3  # of a status; a frame takes ten times as long
+
+TimeSpan = tuple[str, float]  # a state of the mission, and for how long, s
+
+
+class TimeBreakdown(NamedTuple):
+    """Times of a run, s.
+
+    Attributes:
+        spent_s: by kind, in the order of ``KINDS``; kinds that did not occur are left out.
+        least_s: by kind, of the same way from rest to rest; None where the way is not known.
+        visits: how often the robot turned, drove, settled, measured, ...
+        is_exact: from the log, frame by frame; else sampled from the status.
+    """
+
+    spent_s: dict[str, float]
+    least_s: dict[str, float] | None
+    visits: dict[str, int]
+    is_exact: bool
+    covers: str
+
+    @property
+    def total_s(self) -> float:
+        """Robot time from the beginning to the end."""
+        return sum(self.spent_s.values())
+
+    @property
+    def mission_s(self) -> float:
+        """Without the time in which no main loop counted it: ``mission_time_s`` of ``summary.json``."""
+        return self.total_s - self.spent_s.get(START_ANEW, 0.0)
+
+    @property
+    def bound_s(self) -> float | None:
+        """The least time of the same way."""
+        return None if self.least_s is None else sum(self.least_s.values())
+
+
+def time_budget(record: RunRecord) -> TimeBreakdown | None:
+    """The budget of a run; None where its states are not recorded.
+
+    A measurement that takes longer than its time was repeated, or waited for the laser: the rest is waiting.
+    """
+    measuring_s = record.cfg.etalon.measuring_time_s
+    exact = [spells_of(session) for session in record.sessions]
+    spells = [
+        sampled_spells(session) if found is None else found
+        for session, found in zip(record.sessions, exact, strict=True)
+    ]
+    spent, visits = defaultdict[str, float](float), defaultdict[str, int](int)
+    for state, duration_s in (spell for found in spells for spell in found):
+        kind = _KIND_OF.get(state, "wait")
+        visits[kind] += state != _NEVER_BEGUN
+        waited_s = duration_s - measuring_s if kind == "measure" and duration_s > measuring_s else 0.0
+        spent["wait"] += waited_s
+        spent[kind] += measuring_s if waited_s else duration_s
+    if not any(spells):
+        return None
+    least, covers = least_times(record)
+    # Sums of a hundredth of a second do not come out at 0.
+    kinds = [kind for kind in KINDS if spent[kind] > 1e-6]
+    by_kind, counts = {kind: spent[kind] for kind in kinds}, {kind: visits[kind] for kind in kinds}
+    return TimeBreakdown(by_kind, least, counts, None not in exact, covers)
+
+
+def spells_of(session: RecordedSession) -> list[TimeSpan] | None:
+    """Spells between the state changes in the log; None where it holds none, or the frames are not known.
+
+    The last state of a main loop that died is not logged; the time until the first status of its successor counts as
+    waiting, but for that in which there was none.
+    """
+    track = session.track
+    if not session.changes or not len(track.seq):
+        return None
+    at = np.clip(np.searchsorted(track.seq, [change.seq for change in session.changes]), 0, len(track.seq) - 1)
+    times = [float(track.t_s[0]), *track.t_s[at].tolist(), float(track.t_s[-1])]
+    states = [*(change.before for change in session.changes), session.changes[-1].after]
+    spells = [(state, end - start) for state, (start, end) in zip(states, pairwise(times), strict=True)]
+    absent_s = sum(uncounted_s(one, later) for one, later in pairwise(_of_frames(session.statuses)))
+    restarts = [index for index, state in enumerate(states) if index and state == _NEVER_BEGUN]
+    # What its predecessor did last was not written down in time, so that it is not counted either.
+    for index in (place for last in restarts for place in (last, last - 1)):
+        state, duration_s = spells[index]
+        part_s = min(duration_s, absent_s)
+        absent_s -= part_s
+        spells[index] = state, duration_s - part_s
+        spells.append((START_ANEW, part_s))
+    return [(state, duration_s) for state, duration_s in spells if duration_s > 0.0 and state != _OVER]
+
+
+def uncounted_s(one: MissionStatus, later: MissionStatus) -> float:
+    """Robot time between two statuses of main that no mission counted: it was restarted in between."""
+    passed_s = later.t_s - one.t_s
+    missing_s = passed_s - (later.elapsed_s - one.elapsed_s)
+    return missing_s if passed_s > 0.0 and missing_s > _ROUNDING_S else 0.0
+
+
+def _of_frames(statuses: Iterable[MissionStatus]) -> list[MissionStatus]:
+    """Those of a main loop that has received a frame."""
+    return [status for status in statuses if status.seq >= 0]
+
+
+def sampled_spells(session: RecordedSession) -> list[TimeSpan]:
+    """Spells as the status shows them: each lasts until the next."""
+    spells = []
+    for one, later in pairwise(_of_frames(session.statuses)):
+        absent_s = uncounted_s(one, later)
+        spells += [(one.state, later.t_s - one.t_s - absent_s), (START_ANEW, absent_s)]
+    return [(state, duration_s) for state, duration_s in spells if state != _OVER and duration_s > 0.0]
+
+
+def least_times(record: RunRecord) -> tuple[dict[str, float] | None, str]:
+    """Least times of the planned way, up to the last point that was measured, and what that covers.
+
+    Bang-bang times from rest to rest, turning in place at every stop (``ccatp.survey.planning.search``), as
+    ``lower_bound_s`` of ``summary.json``, which is their sum for a mission that is complete and was not resumed.
+    """
+    cfg, mirror = record.cfg, record.mirror
+    points = ORDERS[cfg.run.order](mirror, cfg.run.panels)
+    try:
+        stops = plan_survey(cfg, mirror, points, (), []).stops
+    except PlanError:
+        return None, ""
+    measured = {one.point for one in record.measured}
+    stops = stops[: max((i + 1 for i, stop in enumerate(stops) if stop.point in measured), default=0)]
+    if not stops:
+        return None, ""
+    legs_s = sum(leg_time(length, cfg.limits) for length in leg_lengths(stops, mirror.base_pose, mirror))
+    times_s = sum(stop_times(stops, mirror.base_pose, cfg.limits, mirror))
+    measurements = sum(stop.kind in (StopKind.MEASURE, StopKind.CALIBRATE) for stop in stops)
+    least = {"turn": times_s - legs_s, "drive": legs_s, "measure": measurements * cfg.etalon.measuring_time_s}
+    whole = len(measured) >= len(points)
+    return least, "the whole mission" if whole else "the planned way to the last measured point"
+
+
+# -- all of it --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,9 +390,12 @@ class Findings:
 
 def findings_of(record: RunRecord) -> Findings:
     """Everything that follows from a recorded run."""
-    errors = error_series(record)
-    alignment = _alignment(record)
-    known = alignment is not None and record.injected is not None
+    errors, cfg = error_series(record), record.cfg
+    alignment = against = None
+    if record.measured:
+        planned = {row.point.panel for row in record.points or ()}
+        alignment = survey_result(record.mirror, cfg.align, cfg.robot.puck_height_m, record.measured, planned)
+        against = compare(alignment.panels, record.injected) if record.injected else None
     return Findings(
         record=record,
         outcome=outcome_of(record),
@@ -182,15 +404,8 @@ def findings_of(record: RunRecord) -> Findings:
         figures=None if errors is None else error_figures(errors),
         budget=time_budget(record),
         alignment=alignment,
-        against=compare(alignment.panels, record.injected) if known and alignment and record.injected else None,
+        against=against,
     )
-
-
-def _alignment(record: RunRecord) -> SurveyResult | None:
-    if not record.measured:
-        return None
-    planned = {row.point.panel for row in record.points or ()}
-    return survey_result(record.mirror, record.cfg.align, record.cfg.robot.puck_height_m, record.measured, planned)
 
 
 def outcome_of(record: RunRecord) -> PointOutcome:

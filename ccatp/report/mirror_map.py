@@ -327,7 +327,7 @@ def _stored_points(database: Path, mirror: Mirror, puck_height_m: float) -> list
     points = []
     for row in rows:
         fix = fixes.get(row.point)
-        error_mm = None if fix is None else 1e3 * arrival_error_m(mirror, row.point, fix, puck_height_m)
+        error_mm = None if fix is None else 1e3 * arrival_error_m(mirror, row.point, fix.position_m, puck_height_m)
         points.append(MapPoint(*mirror.point_on_deck(row.point), error_mm, row.status == "skipped"))
     return points
 

@@ -1,23 +1,35 @@
-"""What a survey or a beacon mission left behind, as a report needs it; what it does not hold is empty or None."""
+"""A recorded survey as its report needs it, and its reader: a run that is complete, running or killed.
 
-from collections.abc import Mapping
+What cannot be read is reported and left out; only a directory without a run, or a configuration that this program
+cannot use, is refused. Nothing is written. Raw sensor samples, nine tenths of a recording, are not read.
+"""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.load import is_radio_file, load_config
 from ccatp.config.models import Config
-from ccatp.core import FloatArray, IntArray, PanelId, PointId, Vector3
-from ccatp.filters.metrics import nees
-from ccatp.links.beacon_messages import PoseTrack, PoseTruth, pose_errors
-from ccatp.links.topics import BeaconArrival, BeaconEllipse, BeaconMapMessage, DangerEvent, FixMessage, MissionStatus
-from ccatp.mirror.mirror import Mirror
+from ccatp.core import FloatArray, IntArray, PanelId, Vector3
+from ccatp.links.topics import ArrivalMessage, BadMessage, FixMessage, MissionStatus, decode_recorded
+from ccatp.mirror.mirror import Mirror, build_mirror, deck_rows
 from ccatp.mirror.panel_alignment import Measured
-from ccatp.records.state_log import LogLine, StateChange
+from ccatp.mirror.surface import MirrorError
+from ccatp.records.recorder import damage_text, iter_messages, read_metadata, recordings
+from ccatp.records.run_reader import CONFIG, TELEMETRY, RunReadError
+from ccatp.records.state_log import LogLine, ReadLine, StateChange, changes_of, read_log
+from ccatp.records.store import read_survey
+from ccatp.records.store_rows import StoredPoint, StoreError, point_name
+from ccatp.records.survey_reader import STORE, read_truth
 
 COMPLETE = "complete"
 WITHIN_MM = 10.0  # the thesis's requirement on arrivals
+SUMMARY, LOG = "summary.json", "log.jsonl"
+TOPICS_READ = frozenset(("track", "truth", "arrival", "fix", "mission"))
 
 
 class EstimatedTrack(NamedTuple):
@@ -39,22 +51,10 @@ class EstimatedTrack(NamedTuple):
 
 
 class TrueTrack(NamedTuple):
-    """True poses after k frames, as in ``EstimatedTrack``; ``clearance_m`` of the worst edge sensor to the rim."""
+    """True places after k frames, as in ``EstimatedTrack``."""
 
     seq: IntArray
-    t_s: FloatArray
     place_m: FloatArray
-    heading_rad: FloatArray
-    clearance_m: FloatArray
-
-
-class Arrived(NamedTuple):
-    """The robot came to rest at a point for the first time, as it took it."""
-
-    point: PointId
-    seq: int
-    t_s: float
-    estimated_error_mm: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,32 +62,23 @@ class RecordedSession:
     """One recording; a run that was resumed has several.
 
     Attributes:
-        track, truth: poses; truth is None on a real robot.
-        changes: of the mission's state, from the log; empty where the log does not tell them in order.
+        truth: None on a real robot.
+        changes: of the mission's state, from the log; empty where the log does not hold them in order.
     """
 
     name: str
     version: str
     track: EstimatedTrack
     truth: TrueTrack | None
-    arrivals: tuple[Arrived, ...]
+    arrivals: tuple[ArrivalMessage, ...]
     fixes: tuple[FixMessage, ...]
     statuses: tuple[MissionStatus, ...]
-    verdicts: tuple[DangerEvent, ...]
     changes: tuple[StateChange, ...]
 
     @property
     def span_s(self) -> float:
         """Robot time from the first frame to the last one."""
         return float(self.track.t_s[-1] - self.track.t_s[0]) if len(self.track.t_s) else 0.0
-
-
-class PlannedRow(NamedTuple):
-    """A point of the mission: planned, measured or skipped; robot time of the latter two."""
-
-    point: PointId
-    status: str
-    t_s: float | None
 
 
 class PointOutcome(NamedTuple):
@@ -105,6 +96,7 @@ class RunFiles:
     Attributes:
         changed: keys with another value than the shipped one: value of the run, and shipped value.
         summary: ``summary.json``; None where the run did not come to write one.
+        files: names and sizes in bytes.
         missing: what a complete run would hold and this one does not, one line each.
     """
 
@@ -136,21 +128,69 @@ class RunRecord(RunFiles):
     cfg: Config
     mirror: Mirror
     sessions: tuple[RecordedSession, ...]
-    points: tuple[PlannedRow, ...] | None
+    points: tuple[StoredPoint, ...] | None
     measured: tuple[Measured, ...]
     injected: Mapping[PanelId, Vector3] | None
 
     @property
     def last_status(self) -> MissionStatus | None:
         """The last status of the mission."""
-        said = [status for session in self.sessions for status in session.statuses]
-        return said[-1] if said else None
+        statuses = [status for session in self.sessions for status in session.statuses]
+        return statuses[-1] if statuses else None
 
     @property
     def has_truth(self) -> bool:
         """Every recording with frames holds the simulated truth."""
         driven = [session for session in self.sessions if len(session.track.seq)]
         return bool(driven) and all(session.truth is not None for session in driven)
+
+
+def read_record(run_dir: Path) -> RunRecord:
+    """Everything that a report shows of a run.
+
+    Raises:
+        RunReadError: no such directory, no run in it, or none of a survey.
+        ConfigError: its configuration cannot be used.
+    """
+    if is_beacon_run(run_dir):
+        raise RunReadError(f"{run_dir}: a mission among beacons; this is for surveys, ccatp report takes both")
+    cfg = load_config(run_dir / CONFIG)
+    mirror = build_mirror(cfg.mirror)
+    missing: list[str] = []
+    warnings: list[str] = []
+    log = list(read_log(run_dir / LOG, warnings))
+    if not log:
+        missing.append(f"{LOG}: what the processes said, and when the mission changed its state")
+    sessions, is_simulation = _sessions(run_dir, mirror, log, missing, warnings)
+    points, measured = _survey(run_dir, mirror, missing, warnings)
+    injected, _ = read_truth(run_dir, warnings)
+    # Mirror and world have names of their own.
+    ours, shipped = (one.model_dump(mode="json", exclude={"mirror", "world"}) for one in (cfg, load_config()))
+    return RunRecord(
+        cfg=cfg,
+        mirror=mirror,
+        sessions=sessions,
+        points=points,
+        measured=measured,
+        injected=injected,
+        is_simulation=is_simulation,
+        changed=changed_keys(ours, shipped),
+        **common_fields(run_dir, log, missing, warnings),
+    )
+
+
+def is_beacon_run(run_dir: Path) -> bool:
+    """Whether a run is a mission among beacons.
+
+    Raises:
+        RunReadError: no such directory, or no run in it.
+        ConfigError: its configuration cannot be read.
+    """
+    if not run_dir.is_dir():
+        raise RunReadError(f"{run_dir}: no such directory; name the directory of a run")
+    if not (run_dir / CONFIG).is_file():
+        raise RunReadError(f"{run_dir}: no {CONFIG} there; name the directory of a run")
+    return is_radio_file(run_dir / CONFIG)
 
 
 def changed_keys(
@@ -167,141 +207,149 @@ def changed_keys(
     return found
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class BeaconRecord(RunFiles):
-    """A mission among beacons.
-
-    Attributes:
-        truth: in the same frames, NaN where there is none; None on a real robot.
-    """
-
-    version: str
-    cfg: RadioConfig
-    track: PoseTrack
-    truth: PoseTruth | None
-    maps: tuple[BeaconMapMessage, ...]
-    arrivals: tuple[BeaconArrival, ...]
-    statuses: tuple[MissionStatus, ...]
-    verdicts: tuple[DangerEvent, ...]
-    places: Mapping[str, tuple[float, float]]
-
-    @property
-    def beacons(self) -> dict[str, BeaconEllipse]:
-        """Those that stand, as the newest map has them."""
-        return self.standing(self.maps[-1]) if self.maps else {}
-
-    def standing(self, told: BeaconMapMessage) -> dict[str, BeaconEllipse]:
-        """The beacons of a map without the radio that is followed."""
-        moving = self.cfg.follow.target if self.cfg.follow.is_active else ""
-        return {name: ellipse for name, ellipse in told.beacons.items() if name != moving}
-
-    @property
-    def settled_s(self) -> float:
-        """Robot time from which on the pose counts: a robot whose motes map themselves stands until then."""
-        return self.maps[-1].notes.get("map_time_s", 0.0) if self.maps else 0.0
+def common_fields(run_dir: Path, log: Iterable[ReadLine], missing: list[str], warnings: list[str]) -> dict[str, Any]:
+    """Fields of ``RunFiles`` that are read in the same way for every mission; completes ``missing``."""
+    return {
+        "name": run_dir.resolve().name,
+        "config_text": (run_dir / CONFIG).read_text(encoding="utf-8", errors="replace"),
+        "summary": _read_summary(run_dir / SUMMARY, missing, warnings),
+        "log": tuple(line.shown for line in log if line.shown is not None),
+        # The report is no part of the run: it is the same when it is made again.
+        "files": {
+            path.name: path.stat().st_size
+            for path in sorted(run_dir.iterdir())
+            if path.is_file() and not path.name.startswith(".") and path.suffix != ".html"
+        },
+        "missing": tuple(missing),
+        "warnings": tuple(warnings),
+    }
 
 
-def pose_errors_m(record: BeaconRecord) -> FloatArray | None:
-    """Distance of the estimated place from the true one, shape (k,); None where the truth is not known."""
-    if record.truth is None:
+def _read_summary(path: Path, missing: list[str], warnings: list[str]) -> Mapping[str, Any] | None:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        missing.append(f"{path.name}: the run goes on, or was killed before its end")
         return None
-    return np.asarray(np.hypot(*(record.track.place_m - record.truth.place_m).T))
-
-
-def pose_nees(record: BeaconRecord) -> FloatArray | None:
-    """e^T P^-1 e of x, y and heading, shape (k,); 3 is expected. None where the truth is not known."""
-    if record.truth is None:
+    except (OSError, ValueError) as error:
+        warnings.append(f"{path.name}: cannot be read: {error}")
         return None
-    return nees(pose_errors(record.track, record.truth), record.track.covariance)
-
-
-class Reading(NamedTuple):
-    """NIS of the readings between two maps, their degrees of freedom, and the robot time of the later one."""
-
-    t_s: float
-    nis: float
-    size: int
-
-
-def readings_of(record: BeaconRecord) -> list[Reading]:
-    """How the readings agreed with what was expected of them, from map to map."""
-    found = []
-    for before, after in zip(record.maps, record.maps[1:], strict=False):
-        size = after.nis_size - before.nis_size
-        if size > 0:
-            found.append(Reading(after.t_s, after.nis_sum - before.nis_sum, size))
+    if not isinstance(found, dict):
+        warnings.append(f"{path.name}: is no summary")
+        return None
     return found
 
 
-class WaypointRow(NamedTuple):
-    """A waypoint that was reached.
+class Recording(NamedTuple):
+    """The messages of a recording by topic, what made it, and whether that was a simulation (None if not known)."""
 
-    Attributes:
-        number: over all laps, from 1.
-        lap, waypoint: from 1.
-        true_off_m: of the true place; None without a truth.
-        error_m: distance of the estimated place from the true one.
-        sigmas: the same in standard deviations, root(e^T P^-1 e).
+    messages: dict[str, list[Any]]
+    version: str
+    is_simulation: bool | None
+
+
+def read_recording(
+    path: Path, topics: Iterable[str], columns: Mapping[str, int], warnings: list[str]
+) -> Recording | None:
+    """Read a recording up to its end or its first damage; None if it cannot be read at all.
+
+    Args:
+        columns: of the topics that hold tables, whose messages become arrays of shape (k, columns).
     """
-
-    number: int
-    lap: int
-    waypoint: int
-    t_s: float
-    place_m: tuple[float, float]
-    sigma_m: float
-    estimate_off_m: float
-    true_off_m: float | None
-    error_m: float | None
-    sigmas: float | None
-
-
-def waypoint_rows(record: BeaconRecord) -> list[WaypointRow]:
-    """The waypoints in the order in which they were reached."""
-    index = {int(seq): row for row, seq in enumerate(record.track.seq.tolist())}
-    rows = []
-    for number, arrival in enumerate(record.arrivals, start=1):
-        x, y, xx, xy, yy = arrival.estimate
-        P = np.array(((xx, xy), (xy, yy)))
-        true = None
-        if record.truth is not None and arrival.seq in index:
-            true = record.truth.place_m[index[arrival.seq]]
-            true = true if np.isfinite(true).all() else None
-        off = None if true is None else np.array((x, y)) - true
-        rows.append(
-            WaypointRow(
-                number=number,
-                lap=arrival.lap + 1,
-                waypoint=arrival.waypoint + 1,
-                t_s=arrival.t_s,
-                place_m=arrival.place,
-                sigma_m=float(np.sqrt(max(np.linalg.eigvalsh(P)[-1], 0.0))),
-                estimate_off_m=float(np.hypot(x - arrival.place[0], y - arrival.place[1])),
-                true_off_m=None if true is None else float(np.hypot(*(true - arrival.place))),
-                error_m=None if off is None else float(np.hypot(*off)),
-                sigmas=None if off is None else float(np.sqrt(off @ np.linalg.solve(P, off))),
-            )
-        )
-    return rows
+    found: dict[str, list[Any]] = {topic: [] for topic in topics}
+    damages, lost = list[str](), list[str]()
+    try:
+        metadata = read_metadata(path)
+        for topic, _, payload in iter_messages(path, damages.append):
+            if topic not in found:
+                continue
+            try:
+                message: Any = decode_recorded(topic, payload)
+                if topic in columns:
+                    message = np.array(message.rows, dtype=np.float64).reshape(-1, columns[topic])
+                found[topic].append(message)
+            except (BadMessage, ValueError) as error:
+                lost.append(str(error))
+    except OSError as error:
+        warnings.append(f"{path.name}: cannot be read: {error.strerror or error}")
+        return None
+    warnings += [damage_text(path, damage) for damage in damages]
+    if lost:
+        warnings.append(f"{path.name}: {len(lost)} messages cannot be read and are left out: {lost[0]}")
+    is_simulation = {"true": True, "false": False}.get(metadata.get("simulation", ""))
+    return Recording(found, metadata.get("ccatp", "unknown"), is_simulation)
 
 
-class BeaconRow(NamedTuple):
-    """A beacon on the last map: place, standard deviation in its worst direction, true error, NEES (2 is expected)."""
+def joined(batches: Sequence[FloatArray], columns: int, needed: int) -> FloatArray:
+    """One table, the frames growing: a frame that was recorded twice counts once.
 
-    name: str
-    place_m: tuple[float, float]
-    sigma_m: float
-    error_m: float | None
-    nees: float | None
+    Args:
+        needed: so many first columns must be finite, otherwise the row is left out.
+    """
+    rows = np.concatenate(batches) if batches else np.empty((0, columns))
+    rows = rows[np.isfinite(rows[:, :needed]).all(axis=1)]
+    _, first = np.unique(rows[:, 0], return_index=True)
+    return np.asarray(rows[first])
 
 
-def beacon_rows(record: BeaconRecord) -> list[BeaconRow]:
-    """The beacons that stand, by name."""
-    rows = []
-    for name, (x, y, xx, xy, yy) in sorted(record.beacons.items()):
-        P = np.array(((xx, xy), (xy, yy)))
-        off = None if name not in record.places else np.subtract((x, y), record.places[name])
-        sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(P)[-1], 0.0)))
-        nees = None if off is None else float(off @ np.linalg.pinv(P) @ off)
-        rows.append(BeaconRow(name, (x, y), sigma_m, None if off is None else float(np.hypot(*off)), nees))
-    return rows
+_COLUMNS = {"track": 8, "truth": 11}
+
+
+def _sessions(
+    run_dir: Path, mirror: Mirror, log: list[ReadLine], missing: list[str], warnings: list[str]
+) -> tuple[tuple[RecordedSession, ...], bool | None]:
+    paths = recordings(run_dir / TELEMETRY)
+    if not paths:
+        missing.append(f"{TELEMETRY}: path, estimates, arrivals and fixes over time")
+        return (), None
+    sessions, is_simulation = [], None
+    for path, changes in zip(paths, changes_of(log, len(paths)), strict=True):
+        found = read_recording(path, TOPICS_READ, _COLUMNS, warnings)
+        if found is not None:
+            is_simulation = is_simulation if found.is_simulation is None else found.is_simulation
+            sessions.append(_session(path.name, found, mirror, changes, warnings))
+    if log and not all(session.changes for session in sessions):
+        missing.append("the frames of each change of state: the time budget is taken from the status, which is coarser")
+    if is_simulation and not any(session.truth for session in sessions):
+        missing.append("the simulated truth: errors are those that the laser saw")
+    return tuple(sessions), is_simulation
+
+
+def _session(
+    name: str, found: Recording, mirror: Mirror, changes: Sequence[StateChange], warnings: list[str]
+) -> RecordedSession:
+    messages = found.messages
+    track, truth = (joined(messages[topic], count, count) for topic, count in _COLUMNS.items())
+    try:
+        deck = deck_rows(mirror, track[:, 2:4].astype(np.int64), track[:, 4:7])
+    except MirrorError as error:
+        warnings.append(f"{name}: its estimates are not of this mirror and are left out: {error}")
+        track, deck = track[:0], np.empty((0, 4))
+    return RecordedSession(
+        name=name,
+        version=found.version,
+        track=EstimatedTrack(track[:, 0].astype(np.int64), track[:, 1], deck[:, [0, 1, 3]], deck[:, 2], track[:, 7]),
+        truth=TrueTrack(truth[:, 0].astype(np.int64), truth[:, 5:8]) if messages["truth"] else None,
+        arrivals=tuple(messages["arrival"]),
+        fixes=tuple(messages["fix"]),
+        statuses=tuple(messages["mission"]),
+        changes=tuple(changes),
+    )
+
+
+def _survey(
+    run_dir: Path, mirror: Mirror, missing: list[str], warnings: list[str]
+) -> tuple[tuple[StoredPoint, ...] | None, tuple[Measured, ...]]:
+    if not (run_dir / STORE).is_file():
+        missing.append(f"{STORE}: points, their fixes, and how the panels lie")
+        return None, ()
+    try:
+        stored = read_survey(run_dir / STORE, mirror.name)
+    except StoreError as error:
+        warnings.append(str(error).replace(f"{run_dir}/", ""))
+        return None, ()
+    warnings += [
+        f"point {point_name(point)}: its stored fix is damaged and left out; measure it again"
+        for point in stored.damaged
+    ]
+    return tuple(stored.points), tuple(Measured(one.point, one.fix) for one in stored.fixes)

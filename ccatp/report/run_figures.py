@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ccatp.core import FloatArray
-from ccatp.report.analysis import KINDS, ErrorSeries, TimeBreakdown
+from ccatp.report.findings import KINDS, ErrorSeries, TimeBreakdown
 from ccatp.report.plots import (
     BAD,
     INK,

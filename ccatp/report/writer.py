@@ -5,11 +5,12 @@ from typing import Any, NamedTuple
 
 from ccatp.errors import CcatpError, ExitStatus
 from ccatp.report.beacon_page import beacon_data, beacon_drawings, beacon_page
+from ccatp.report.beacon_record import read_beacon_record
 from ccatp.report.compare import RunPair, compare_drawings, compare_page, pair_of
 from ccatp.report.findings import findings_of
 from ccatp.report.html import Draw
 from ccatp.report.plots import WIDE, PictureError, save_figure
-from ccatp.report.record_reader import is_beacon_run, read_beacon_record, read_record
+from ccatp.report.record import is_beacon_run, read_record
 from ccatp.report.run_page import run_data, run_drawings, run_page
 
 _DPI = 192.0  # of PNG files: two pixels for each of the page

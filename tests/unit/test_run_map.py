@@ -99,9 +99,9 @@ def test_arrival_error_is_the_distance_of_foot_and_point(mirror: Mirror) -> None
     point = mirror.point_ids(PanelId(2, 3))[7]
     x, y = mirror.point_on_deck(point)
     # foot_of_puck converges to 1e-10 m
-    assert arrival_error_m(mirror, point, fix_at(mirror, x, y), HEIGHT_M) == pytest.approx(0.0, abs=1e-9)
+    assert arrival_error_m(mirror, point, fix_at(mirror, x, y).position_m, HEIGHT_M) == pytest.approx(0.0, abs=1e-9)
     rise = mirror.surface.height_m(x + 2e-3, y) - mirror.surface.height_m(x, y)
-    moved = arrival_error_m(mirror, point, fix_at(mirror, x + 2e-3, y), HEIGHT_M)
+    moved = arrival_error_m(mirror, point, fix_at(mirror, x + 2e-3, y).position_m, HEIGHT_M)
     assert moved == pytest.approx(hypot(2e-3, rise), abs=1e-9)
 
 

@@ -12,12 +12,17 @@ from ccatp.report.beacon_figures import (
     beacon_map_figure,
     consistency_figure,
     map_error_figure,
-    target_figure,
 )
-from ccatp.report.beacon_page import beacon_data, beacon_figures, beacon_page
+from ccatp.report.beacon_page import beacon_data, beacon_drawings, beacon_page
+from ccatp.report.beacon_record import (
+    beacon_rows,
+    pose_errors_m,
+    pose_nees,
+    read_beacon_record,
+    readings_of,
+    waypoint_rows,
+)
 from ccatp.report.plots import NARROW, PX_PER_IN, WIDE, ellipse_outline
-from ccatp.report.record import beacon_rows, pose_errors_m, pose_nees, readings_of, waypoint_rows
-from ccatp.report.record_reader import read_beacon_record
 from ccatp.report.writer import report_run
 from tests.unit.reporting.beacon_recorded import FRAMES, OFF_M, SIGMA_M, beacon_config, record_beacons
 from tests.unit.reporting.markup import Markup
@@ -74,8 +79,7 @@ def test_the_page(run_dir: Path) -> None:
 
 def test_its_figures_are_drawn_for_screens_and_telephones(run_dir: Path) -> None:
     record = read_beacon_record(run_dir)
-    assert set(beacon_figures(record)) == {"map", "localization", "consistency", "beacons"}
-    assert target_figure(record, WIDE) is None
+    assert set(beacon_drawings(record)) == {"map", "localization", "consistency", "beacons"}
     for width in (WIDE, NARROW):
         for picture in (
             beacon_map_figure(record, width), consistency_figure(record, width), map_error_figure(record, width)
@@ -94,7 +98,7 @@ def test_an_ellipse_of_three_sigma() -> None:
 def test_a_robot_that_follows(tmp_path: Path) -> None:
     record = read_beacon_record(record_beacons(tmp_path / "run", beacon_config("follow")))
     assert set(record.beacons) == {"beacon1", "beacon2"}  # the one that moves is none of the map
-    assert target_figure(record, WIDE) is not None
+    assert "target" in beacon_drawings(record)
     markup = Markup(beacon_page(record))
     assert "target" in markup.anchors
     assert "waypoints" not in markup.anchors
@@ -125,7 +129,7 @@ def test_a_run_that_was_killed_says_what_it_lacks(tmp_path: Path) -> None:
         (run_dir / name).unlink()
     record = read_beacon_record(run_dir)
     assert {line.partition(":")[0] for line in record.missing} == {"telemetry.mcap", "log.jsonl", "summary.json"}
-    assert beacon_figures(record) == {}
+    assert beacon_drawings(record) == {}
     assert Markup(beacon_page(record)).anchors == ["configuration"]
 
 

@@ -14,8 +14,8 @@ from ccatp.records.state_log import LogLine
 from ccatp.report.compare import compare_page, pair_of
 from ccatp.report.findings import findings_of, outcome_of
 from ccatp.report.html import POLICY, clock_text, number_text
-from ccatp.report.record_reader import read_record
-from ccatp.report.run_page import SECTIONS, run_page
+from ccatp.report.record import read_record
+from ccatp.report.run_page import run_page
 from ccatp.report.writer import ReportError, report_run
 from tests.unit.reporting.markup import Markup
 from tests.unit.reporting.recorded import record
@@ -119,11 +119,6 @@ def test_numbers_of_a_page() -> None:
     cells = [number_text(value) for value in (None, -0.001, 1.005, -2.5, 3, "<")]
     assert cells == ["\u2013", "0.00", "1.00", "\u22122.50", "3", "<"]
     assert [clock_text(value) for value in (3.4, 59.6, 3091.4)] == ["3 s", "1 min 00 s", "51 min 31 s"]
-
-
-def test_each_section_takes_any_run(recorded: Path, without: Callable[..., Path]) -> None:
-    found = findings_of(read_record(without("telemetry.mcap", "mission.sqlite", "log.jsonl", "summary.json")))
-    assert [make(found) is None for make in SECTIONS] == [True] * (len(SECTIONS) - 1) + [False]
 
 
 # -- the commands -----------------------------------------------------------------------------------------------------

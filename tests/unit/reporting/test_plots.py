@@ -8,7 +8,7 @@ import pytest
 
 from ccatp.config.load import load_config
 from ccatp.mirror.mirror import Mirror, build_mirror
-from ccatp.report.analysis import ErrorSeries, TimeBreakdown
+from ccatp.report.findings import ErrorSeries, TimeBreakdown
 from ccatp.report.mirror_map import MapPoint, run_map
 from ccatp.report.plots import (
     NARROW,

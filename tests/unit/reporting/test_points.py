@@ -11,10 +11,9 @@ import pytest
 from ccatp.core import PointId, Vector3
 from ccatp.links.topics import FixMessage
 from ccatp.mirror.panel_alignment import Measured
-from ccatp.report.analysis import error_figures, error_series
-from ccatp.report.findings import Grade, counted, first_arrivals_mm, point_verdicts
-from ccatp.report.record import PlannedRow, RunRecord, changed_keys
-from ccatp.report.record_reader import read_record
+from ccatp.records.store_rows import StoredPoint
+from ccatp.report.findings import Grade, error_figures, error_series, first_arrivals_mm, point_verdicts
+from ccatp.report.record import RunRecord, changed_keys, read_record
 
 
 @pytest.fixture
@@ -48,7 +47,7 @@ def test_grades(record: RunRecord) -> None:
     x, y, z = far.fix.position_m
     measured = (fixes[points[0]], replace_fix(far, (x + 0.02, y, z)), fixes[points[2]])
     statuses = ("measured", "measured", "measured", "skipped", "planned")
-    rows = [PlannedRow(point, status, None) for point, status in zip(points, statuses, strict=True)]
+    rows = [StoredPoint(point, 0.0, 0.0, status, None, None) for point, status in zip(points, statuses, strict=True)]
     (session,) = record.sessions
     status = session.statuses[-1]
     told = msgspec.structs.replace(status, left_out={"no fix: too few channels": ["1-2-4"]})
@@ -59,7 +58,7 @@ def test_grades(record: RunRecord) -> None:
     ]  # fmt: skip
     assert found[2].first_mm == pytest.approx(20.0, abs=5.0)
     assert found[3].why == "no fix: too few channels"
-    assert counted(found) == dict.fromkeys(Grade, 1)
+    assert len({verdict.grade for verdict in found}) == len(Grade)
 
 
 def replace_fix(one: Measured, position_m: Vector3) -> Measured:

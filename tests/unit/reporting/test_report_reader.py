@@ -13,7 +13,7 @@ from ccatp.records.recorder import iter_messages
 from ccatp.records.run_reader import RunReadError
 from ccatp.records.state_log import changes_of, read_log
 from ccatp.report.findings import findings_of
-from ccatp.report.record_reader import read_record
+from ccatp.report.record import read_record
 from tests.unit.reporting.recorded import record
 
 
@@ -25,7 +25,7 @@ def test_a_whole_run(recorded: Path) -> None:
     assert session.version == "0.0.test"
     assert session.truth is not None
     assert len(session.track.seq) == len(set(session.track.seq.tolist())) > 1000
-    assert [arrived.point.point for arrived in session.arrivals] == [7, 8, 9, 6, 5, 4, 1, 2, 3]
+    assert [arrived.point[2] for arrived in session.arrivals] == [7, 8, 9, 6, 5, 4, 1, 2, 3]
     assert found.points is not None
     assert [row.status for row in found.points] == ["measured"] * 9
     assert found.changed["run.panels"] == (1, 0)
@@ -176,7 +176,7 @@ def test_recordings_that_cannot_be_opened_are_told(run_dir: Path, monkeypatch: p
     def refuse(path: Path) -> dict[str, str]:
         raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr("ccatp.report.record_reader.read_metadata", refuse)
+    monkeypatch.setattr("ccatp.report.record.read_metadata", refuse)
     found = read_record(run_dir)
     assert found.sessions == ()
     assert "telemetry.mcap: cannot be read: Permission denied" in found.warnings
@@ -252,7 +252,7 @@ def test_fields_of_the_log_are_words(tmp_path: Path) -> None:
 
 def test_every_topic_that_is_read_is_recorded(recorded: Path) -> None:
     from ccatp.links.topics import BY_NAME
-    from ccatp.report.record_reader import TOPICS_READ
+    from ccatp.report.record import TOPICS_READ
 
     assert all(BY_NAME[name].recorded for name in TOPICS_READ)
     assert {message.topic for message in iter_messages(recorded / "telemetry.mcap")} >= TOPICS_READ - {"danger_event"}

@@ -8,9 +8,8 @@ import pytest
 
 from ccatp.links.topics import MissionStatus
 from ccatp.records.state_log import StateChange
-from ccatp.report.analysis import least_times, sampled_spells, spells_of, time_budget
-from ccatp.report.record import RecordedSession, RunRecord
-from ccatp.report.record_reader import read_record
+from ccatp.report.findings import least_times, sampled_spells, spells_of, time_budget
+from ccatp.report.record import RecordedSession, RunRecord, read_record
 from ccatp.survey.composition import assemble
 
 
@@ -75,8 +74,8 @@ def test_a_main_loop_that_died_leaves_a_wait(record: RunRecord) -> None:
     changes = said((100, "idle", "driving"), (300, "idle", "settling"), (310, "settling", "done"))
     spells = spells_of(replace(session, changes=changes))
     assert spells is not None
-    assert [spell.state for spell in spells] == ["idle", "idle", "settling"]
-    assert [spell.duration_s for spell in spells] == pytest.approx([1.0, 2.0, 0.1])
+    assert [state for state, _ in spells] == ["idle", "idle", "settling"]
+    assert [duration_s for _, duration_s in spells] == pytest.approx([1.0, 2.0, 0.1])
 
 
 def restarted(session: RecordedSession) -> tuple[MissionStatus, ...]:
@@ -98,7 +97,7 @@ def test_what_passed_while_main_was_restarted_is_a_row(record: RunRecord) -> Non
     assert found.mission_s == pytest.approx(found.total_s - 4.0)
     assert found.total_s == pytest.approx(7.1)
     sampled = sampled_spells(replace(session, statuses=restarted(session)))
-    assert [(spell.state, round(spell.duration_s, 6)) for spell in sampled] == [
+    assert [(state, round(duration_s, 6)) for state, duration_s in sampled] == [
         ("driving", 2.0), ("driving", 0.1), ("start anew", 4.0),
     ]  # fmt: skip
 
@@ -106,7 +105,7 @@ def test_what_passed_while_main_was_restarted_is_a_row(record: RunRecord) -> Non
 def test_the_status_tells_coarsely(record: RunRecord) -> None:
     session = only(record)
     sampled = sampled_spells(session)
-    assert sum(spell.duration_s for spell in sampled) == pytest.approx(session.span_s, abs=2.0)  # a batch at each end
+    assert sum(duration_s for _, duration_s in sampled) == pytest.approx(session.span_s, abs=2.0)  # a batch at each end
     found = time_budget(replace(record, sessions=(replace(session, changes=()),)))
     assert found is not None
     assert not found.is_exact

@@ -1,0 +1,202 @@
+"""A recorded mission among beacons as its report needs it, its reader, and its errors against the truth."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ccatp.config.beacon_models import RadioConfig
+from ccatp.config.load import load_radio_config
+from ccatp.core import FloatArray
+from ccatp.filters.metrics import nees
+from ccatp.links.beacon_messages import (
+    TRACK_COLUMNS,
+    TRUTH_COLUMNS,
+    PoseTrack,
+    PoseTruth,
+    pose_errors,
+    pose_track,
+    pose_truth,
+    truth_in,
+)
+from ccatp.links.topics import BeaconArrival, BeaconEllipse, BeaconMapMessage, MissionStatus
+from ccatp.records.recorder import recordings
+from ccatp.records.run_reader import CONFIG, TELEMETRY
+from ccatp.records.state_log import read_log
+from ccatp.report.record import LOG, RunFiles, changed_keys, common_fields, joined, read_recording
+
+_COLUMNS = {"beacon_track": TRACK_COLUMNS, "beacon_truth": TRUTH_COLUMNS}
+BEACON_TOPICS_READ = frozenset((*_COLUMNS, "beacon_map", "beacon_arrival", "beacon_places", "mission"))
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class BeaconRecord(RunFiles):
+    """A mission among beacons.
+
+    Attributes:
+        truth: in the same frames, NaN where there is none; None on a real robot.
+    """
+
+    version: str
+    cfg: RadioConfig
+    track: PoseTrack
+    truth: PoseTruth | None
+    maps: tuple[BeaconMapMessage, ...]
+    arrivals: tuple[BeaconArrival, ...]
+    statuses: tuple[MissionStatus, ...]
+    places: Mapping[str, tuple[float, float]]
+
+    @property
+    def beacons(self) -> dict[str, BeaconEllipse]:
+        """Those that stand, as the newest map has them."""
+        return self.standing(self.maps[-1]) if self.maps else {}
+
+    def standing(self, message: BeaconMapMessage) -> dict[str, BeaconEllipse]:
+        """The beacons of a map without the radio that is followed."""
+        moving = self.cfg.follow.target if self.cfg.follow.is_active else ""
+        return {name: ellipse for name, ellipse in message.beacons.items() if name != moving}
+
+    @property
+    def settled_s(self) -> float:
+        """Robot time from which on the pose counts: a robot whose motes map themselves stands until then."""
+        return self.maps[-1].notes.get("map_time_s", 0.0) if self.maps else 0.0
+
+
+def read_beacon_record(run_dir: Path) -> BeaconRecord:
+    """Everything that a report shows of a mission among beacons.
+
+    Raises:
+        ConfigError: its configuration cannot be used.
+    """
+    cfg = load_radio_config(run_dir / CONFIG)
+    shipped = load_radio_config(None, {"system": cfg.system})
+    missing: list[str] = []
+    warnings: list[str] = []
+    log = list(read_log(run_dir / LOG, warnings))
+    if not log:
+        missing.append(f"{LOG}: what the processes said")
+    paths = recordings(run_dir / TELEMETRY)
+    if not paths:
+        missing.append(f"{TELEMETRY}: path, map and readings over time")
+    parts = [part for path in paths if (part := read_recording(path, BEACON_TOPICS_READ, _COLUMNS, warnings))]
+    found = {topic: [one for part in parts for one in part.messages[topic]] for topic in BEACON_TOPICS_READ}
+    is_simulation = next((part.is_simulation for part in reversed(parts) if part.is_simulation is not None), None)
+    if is_simulation and not found["beacon_truth"]:
+        missing.append("the simulated truth: errors are not known")
+    track, truth = (joined(found[topic], count, needed=5) for topic, count in _COLUMNS.items())
+    return BeaconRecord(
+        cfg=cfg,
+        version=parts[-1].version if parts else "unknown",
+        is_simulation=is_simulation,
+        changed=changed_keys(cfg.model_dump(mode="json"), shipped.model_dump(mode="json")),
+        track=pose_track(track),
+        truth=truth_in(pose_truth(truth), track[:, 0]) if found["beacon_truth"] else None,
+        maps=tuple(found["beacon_map"]),
+        arrivals=tuple(found["beacon_arrival"]),
+        statuses=tuple(found["mission"]),
+        places=found["beacon_places"][-1].places if found["beacon_places"] else {},
+        **common_fields(run_dir, log, missing, warnings),
+    )
+
+
+def pose_errors_m(record: BeaconRecord) -> FloatArray | None:
+    """Distance of the estimated place from the true one, shape (k,); None where the truth is not known."""
+    if record.truth is None:
+        return None
+    return np.asarray(np.hypot(*(record.track.place_m - record.truth.place_m).T))
+
+
+def pose_nees(record: BeaconRecord) -> FloatArray | None:
+    """e^T P^-1 e of x, y and heading, shape (k,); 3 is expected. None where the truth is not known."""
+    if record.truth is None:
+        return None
+    return nees(pose_errors(record.track, record.truth), record.track.covariance)
+
+
+class Reading(NamedTuple):
+    """NIS of the readings between two maps, their degrees of freedom, and the robot time of the later one."""
+
+    t_s: float
+    nis: float
+    size: int
+
+
+def readings_of(record: BeaconRecord) -> list[Reading]:
+    """How the readings agreed with what was expected of them, from map to map."""
+    pairs = zip(record.maps, record.maps[1:], strict=False)
+    found = [Reading(later.t_s, later.nis_sum - one.nis_sum, later.nis_size - one.nis_size) for one, later in pairs]
+    return [reading for reading in found if reading.size > 0]
+
+
+class WaypointRow(NamedTuple):
+    """A waypoint that was reached.
+
+    Attributes:
+        number: over all laps, from 1.
+        lap, waypoint: from 1.
+        true_off_m: of the true place; None without a truth.
+        error_m: distance of the estimated place from the true one.
+        sigmas: the same in standard deviations, root(e^T P^-1 e).
+    """
+
+    number: int
+    lap: int
+    waypoint: int
+    t_s: float
+    place_m: tuple[float, float]
+    sigma_m: float
+    estimate_off_m: float
+    true_off_m: float | None
+    error_m: float | None
+    sigmas: float | None
+
+
+def waypoint_rows(record: BeaconRecord) -> list[WaypointRow]:
+    """The waypoints in the order in which they were reached."""
+    index = {int(seq): row for row, seq in enumerate(record.track.seq.tolist())}
+    rows = []
+    for number, arrival in enumerate(record.arrivals, start=1):
+        x, y, *ellipse = arrival.estimate
+        P, sigma_m = _covariance(*ellipse)
+        true_off_m = error_m = sigmas = None
+        if record.truth is not None and arrival.seq in index:
+            true = record.truth.place_m[index[arrival.seq]]
+            if np.isfinite(true).all():
+                off = np.array((x, y)) - true
+                true_off_m, error_m = float(np.hypot(*(true - arrival.place))), float(np.hypot(*off))
+                sigmas = float(np.sqrt(off @ np.linalg.solve(P, off)))
+        off_m = float(np.hypot(x - arrival.place[0], y - arrival.place[1]))
+        where = (number, arrival.lap + 1, arrival.waypoint + 1, arrival.t_s, arrival.place)
+        rows.append(WaypointRow(*where, sigma_m, off_m, true_off_m, error_m, sigmas))
+    return rows
+
+
+class BeaconRow(NamedTuple):
+    """A beacon on the last map: place, standard deviation in its worst direction, true error, NEES (2 is expected)."""
+
+    name: str
+    place_m: tuple[float, float]
+    sigma_m: float
+    error_m: float | None
+    nees: float | None
+
+
+def beacon_rows(record: BeaconRecord) -> list[BeaconRow]:
+    """The beacons that stand, by name."""
+    rows = []
+    for name, (x, y, *ellipse) in sorted(record.beacons.items()):
+        P, sigma_m = _covariance(*ellipse)
+        error_m = ratio = None
+        if name in record.places:
+            off = np.subtract((x, y), record.places[name])
+            error_m, ratio = float(np.hypot(*off)), float(off @ np.linalg.pinv(P) @ off)
+        rows.append(BeaconRow(name, (x, y), sigma_m, error_m, ratio))
+    return rows
+
+
+def _covariance(xx: float, xy: float, yy: float) -> tuple[FloatArray, float]:
+    """As a matrix, and the standard deviation in its worst direction."""
+    P = np.array(((xx, xy), (xy, yy)))
+    return P, float(np.sqrt(max(np.linalg.eigvalsh(P)[-1], 0.0)))
