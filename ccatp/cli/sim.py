@@ -28,7 +28,7 @@ from ccatp.cli.common import (
 from ccatp.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ccatp.commissioning.conformance.connections import Facts
+    from ccatp.commissioning.conformance.harness import Facts
 
 
 # No laser reaches farther.

@@ -177,7 +177,7 @@ def test_the_table(broken: str, capsys: pytest.CaptureFixture[str]) -> None:
     boot, faults, last = captured.out.splitlines()
     assert re.fullmatch(r"boot +ok +boot \d+ on 8 connections", boot)
     promised = "promised: faults holds names out of the page's list"
-    assert re.fullmatch(rf"frames-faults +FAIL +seen: fault 'on_fire'; {promised}", faults)
+    assert re.fullmatch(rf"frames-faults +FAIL +seen: faults\[0\] = 'on_fire'; {promised}", faults)
     assert last == "1 passed, 1 failed, 0 not applicable"
     assert captured.err == ""
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from ccatp.commissioning.conformance import frame_checks, session_checks
-from ccatp.commissioning.conformance.line_checks import BAD_DRIVES
+from ccatp.commissioning.conformance import server_checks
+from ccatp.commissioning.conformance.command_checks import BAD_DRIVES
 from ccatp.commissioning.conformance.runner import check_ids
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
@@ -564,7 +564,7 @@ async def judge(config: Config, table: list[Crooked], *, lockstep: bool, key: by
 
 @pytest.mark.parametrize("table", [SESSIONS, STREAMS, COMMANDS, STEPS], ids=["sessions", "frames", "commands", "steps"])
 async def test_in_lockstep(config: Config, table: list[Crooked], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_checks, "FRAMES", 15)  # whatever is wrong with them is wrong with the first
+    monkeypatch.setattr(server_checks, "FRAMES", 15)  # whatever is wrong with them is wrong with the first
     await judge(config, table, lockstep=True)
 
 
@@ -580,7 +580,7 @@ async def test_on_the_wall_clock(config: Config, monkeypatch: pytest.MonkeyPatch
     # Roles may be taken over after two seconds instead of five; that it is five the honest robot shows.
     monkeypatch.setattr(sessions, "SILENCE_S", 2.0)
     for name, value_s in (("SILENCE_S", 2.0), ("STILL_HELD_S", 0.8), ("TAKEN_S", 2.3)):
-        monkeypatch.setattr(session_checks, name, value_s)
+        monkeypatch.setattr(server_checks, name, value_s)
     await judge(config, REALTIME, lockstep=False)
 
 

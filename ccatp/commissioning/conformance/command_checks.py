@@ -1,0 +1,520 @@
+"""Checks of what the robot does with commands: drive and permit, newest only, lost sessions, fans, odd lines.
+
+The wheels stand still by command. Fan duties change by a few hundredths, below the floor in ``fan_floor`` alone.
+The ages in a frame say on the robot's clock when a message arrived, so a slow network or a stalled client is never
+taken for a fault of the robot.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
+
+from ccatp.commissioning.conformance.harness import (
+    ALL,
+    DUTY_TOLERANCE,
+    NOTHING,
+    STILL,
+    CheckContext,
+    CheckFailed,
+    CheckList,
+    ControllerAndMonitor,
+    Ending,
+    Frame,
+    Key,
+    NotApplicable,
+    Pair,
+    require,
+    steady_pair,
+)
+from ccatp.links.robot_codec import format_drive
+from ccatp.links.robot_messages import MAX_LINE_BYTES
+
+CHECKS = CheckList()
+check = CHECKS.add
+AFTER_TTL_S = 0.3  # watched beyond the time-to-live
+SHORT_S = 0.12  # wall time in which a message on loopback or a local network has arrived, below every useful ttl_s
+NOISE_S = 0.08  # between bad lines: fewer than 20 a second
+ATTEMPTS = 6
+AHEAD = 1000
+LOST_S = 0.05
+EARLY_FRAMES, LATE_FRAMES = 2, 3  # a robot acts from frame to frame
+FAN_STEP = 0.05
+ENDINGS: tuple[Ending, Ending] = ("FIN", "RST")
+TOLERATED = 20  # bad lines in a second
+CROWD = 150  # drives in one segment, some 8 KiB
+STRANGERS = 40
+BYTE_S = 0.002  # between single bytes
+
+# -- drive and permit -------------------------------------------------------------------------------------------------
+
+
+def _always_held(key: Key, context: CheckContext) -> str:
+    pair = ControllerAndMonitor(context)
+    pair.withhold(key)
+    facts = context.facts
+    frames = pair.run(facts.ttl_s + AFTER_TTL_S)
+    begin_s = frames[0].t + facts.ttl_s + LATE_FRAMES * facts.frame_s
+    late = [frame for frame in frames if frame.t > begin_s]
+    require(bool(late), "no frames")
+    require(all(frame.cmd.held for frame in late), f"not held with no {key} for {late[-1].t - frames[0].t:.2f} s")
+    return f"held in {len(late)} frames with no {key}"
+
+
+def _ttl(key: Key, context: CheckContext) -> str:
+    pair = steady_pair(context)
+    pair.withhold(key)
+    frames = pair.run(context.facts.ttl_s + AFTER_TTL_S)
+    return check_ttl(frames, key, context.facts.ttl_s, context.facts.frame_s)
+
+
+check("no-permit", "once a monitor has joined, wheels are held without its permit", "real time")(
+    partial(_always_held, "permit")
+)
+check("no-drive", "wheels are held without a drive", "real time")(partial(_always_held, "drive"))
+check("ttl-drive", "a drive is in force for ttl_s", "real time")(partial(_ttl, "drive"))
+check("ttl-permit", "a permit is in force for ttl_s", "real time")(partial(_ttl, "permit"))
+
+
+@check("ttl-noise", "a bad line never refreshes a time-out", "real time")
+def _noise_is_no_drive(context: CheckContext) -> str:
+    pair = steady_pair(context)
+    facts = context.facts
+    pair.rates = None
+    first, begin_s = len(pair.frames), pair.newest.t
+    while pair.newest.t < begin_s + facts.ttl_s + AFTER_TTL_S:
+        seq, ack = context.next_seq(), pair.newest.seq
+        pair.controller.send(b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wl":"0"}\n' % (seq, ack))
+        pair.run(NOISE_S)
+    return check_ttl(pair.frames[first:], "drive", facts.ttl_s, facts.frame_s)
+
+
+def check_ttl(frames: Sequence[Frame], key: Key, ttl_s: float, frame_s: float) -> str:
+    """Held in time, in frames from the last drive or permit on, while the other is renewed in each frame."""
+    held_s: float | None = None
+    has_moved, age_s = False, 0.0
+    for frame in frames:
+        age_s = frame.age_s(key)
+        seen = f"held at a {key} age of {age_s:.3f} s, ttl_s {ttl_s:g}"
+        if frame.cmd.held:
+            is_due = max(frame.cmd.age, frame.cmd.permit_age) >= ttl_s - EARLY_FRAMES * frame_s
+            require(is_due or not has_moved, seen)
+            held_s = age_s if held_s is None else held_s
+        else:
+            has_moved, held_s = True, None
+            require(age_s <= ttl_s + LATE_FRAMES * frame_s, f"not {seen}")
+    span_s = frames[-1].t - frames[0].t
+    require(held_s is not None, f"not held {span_s:.2f} s after the last {key}, its reported age {age_s:.3f} s")
+    return f"held at a {key} age of {held_s:.3f} s, ttl_s {ttl_s:g}"
+
+
+@check("newest-drive", "a drive with an older or equal seq is dropped")
+def _newest_drive(context: CheckContext) -> str:
+    pair = steady_pair(context)
+    is_lockstep = context.facts.lockstep
+    newest = context.next_seq()
+    old = newest - 1
+    pair.rates = None
+    first = len(pair.frames)
+    if is_lockstep:
+        pair.allowed = None  # the frame waits until both have arrived
+    pair.drive(newest)
+    pair.drive(old)
+    _pause_and_settle(pair)
+    check_newest(pair.frames[first:], newest, old)
+    again, first = context.next_seq(), len(pair.frames)
+    pair.rates = None
+    pair.drive(again)
+    if is_lockstep:
+        _answered_frame(pair)
+        pair.drive(again)
+        pair.permit()
+    else:
+        pair.run(SHORT_S)
+        pair.drive(again)
+    pair.pause(SHORT_S)
+    pair.answer_again()
+    _pause_and_settle(pair)
+    check_once(pair.frames[first:], again, context.facts.frame_s)
+    return f"drive {old} after {newest} and a second {again} dropped"
+
+
+def _pause_and_settle(pair: ControllerAndMonitor) -> None:
+    """Wait until the robot has taken what was sent, then answer frames again."""
+    pair.pause(SHORT_S)
+    pair.rates, pair.allowed = STILL, ALL
+    pair.settle()
+
+
+def _answered_frame(pair: ControllerAndMonitor) -> Frame:
+    return pair.next_frame("no frame after drive and permit for the one before")
+
+
+def check_newest(frames: Sequence[Frame], newest: int, old: int) -> None:
+    """The newer came into force and the older did not, in frames from when a drive and then an older one were sent."""
+    require(all(frame.cmd.seq != old for frame in frames), f"drive {old} came into force after {newest}")
+    require(any(frame.cmd.seq == newest for frame in frames), f"drive {newest} never came into force")
+
+
+def check_once(frames: Sequence[Frame], seq: int, frame_s: float) -> None:
+    """The age does not start again, in frames in which a drive was sent, and sent again under the same number."""
+    in_force = [frame for frame in frames if frame.cmd.seq == seq]
+    require(bool(in_force), f"drive {seq} never came into force")
+    # A robot that makes up for late frames reports 0 for what arrived after their time: that gives no arrival.
+    arrivals_s = [frame.arrival_s("drive") for frame in in_force if frame.cmd.age > 0.0]
+    spread_s = max(arrivals_s) - min(arrivals_s) if arrivals_s else 0.0
+    require(spread_s <= 0.5 * frame_s, f"a second drive {seq} came into force {1e3 * spread_s:.0f} ms after the first")
+
+
+@check("newest-permit", "a permit with an older or equal seq is dropped")
+def _newest_permit(context: CheckContext) -> str:
+    pair = steady_pair(context)
+    newest = context.next_seq()
+    pair.allowed = None
+    pair.permit(newest)
+    if context.facts.lockstep:
+        in_force = _answered_frame(pair)
+    else:
+        pair.run(SHORT_S)
+        in_force = pair.expect(lambda frame: frame.cmd.permit_age > 0.0, "permits do not age")
+    # The age shows which permit is in force.
+    latest_s = in_force.arrival_s("permit") + 0.5 * context.facts.frame_s
+    for seq in (newest - 1, newest):
+        if context.facts.lockstep:
+            pair.drive()
+        pair.permit(seq)
+        is_dropped = all(frame.arrival_s("permit") <= latest_s for frame in pair.pause(SHORT_S))
+        require(is_dropped, f"permit {seq} came into force after {newest}")
+    pair.answer_again()
+    pair.steady()
+    return f"permit {newest - 1} after {newest} and a second {newest} dropped"
+
+
+@check("role-drive", "drives are the controller's")
+def _wrong_role(context: CheckContext) -> str:
+    pair = steady_pair(context)
+    seq = pair.newest.cmd.seq + AHEAD  # once obeyed it stays the newest for a while
+    pair.monitor.send(b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wl":0.0}\n' % (seq, pair.newest.seq))
+    pair.find(lambda frame: frame.cmd.seq == seq, 10 * context.facts.frame_s)
+    require(pair.newest.cmd.seq != seq, f"drive {seq} of the monitor came into force")
+    context.last_seq = max(context.last_seq, seq)
+    pair.settle()
+    return "a drive of the monitor does nothing"
+
+
+# -- lost sessions ----------------------------------------------------------------------------------------------------
+
+
+def _lost(key: Key, ending: Ending, context: CheckContext) -> str:
+    """The session that sends one of the two ends, and the other sends a last message right behind."""
+    witness: Key = "permit" if key == "drive" else "drive"
+    for _ in range(ATTEMPTS):
+        frames = _end(steady_pair(context), key, witness, ending)
+        seen = check_lost(frames, witness, context.facts.ttl_s, context.facts.frame_s)
+        if seen is not None:
+            return seen
+        context.clear()
+    raise NotApplicable("the server or this machine is too slow to tell")
+
+
+def _end(pair: ControllerAndMonitor, key: Key, witness: Key, ending: Ending) -> Sequence[Frame]:
+    first = len(pair.frames)
+    pair.rates = pair.allowed = None
+    if key == "drive":
+        pair.controller.end(ending)
+        pair.permit()
+    else:
+        pair.monitor.end(ending)
+        pair.drive()
+    enough_s = 0.7 * pair.facts.ttl_s
+    pair.run(enough_s)
+    # A robot that makes up for late frames may be behind: watch until the last message is old enough by its own clock.
+    pair.find(lambda frame: frame.age_s(witness) >= enough_s)
+    return pair.frames[first:]
+
+
+def check_lost(frames: Sequence[Frame], witness: Key, ttl_s: float, frame_s: float) -> str | None:
+    """Held in time after one session ended and the other sent a last message right behind.
+
+    The arrival of that message, the witness, is the moment at which the loss was there, too. ``frames`` reach from the
+    end of the session over some 0.2 s; ``None`` if they do not reach over the time in question. ``NotApplicable`` where
+    the time-to-live is so short that it would hold the wheels as soon.
+    """
+    if ttl_s < LOST_S + 4 * frame_s:
+        raise NotApplicable(f"ttl_s {ttl_s:g} holds the wheels as soon")
+    arrival_s = max(frame.arrival_s(witness) for frame in frames)
+    due_s, expiry_s = arrival_s + LOST_S + frame_s, arrival_s + ttl_s - frame_s
+    due = [frame for frame in frames if due_s < frame.t < expiry_s]
+    for frame in due:
+        require(frame.cmd.held, f"not held {1e3 * (frame.t - arrival_s):.0f} ms after the end of the session")
+    first = next((frame for frame in frames if frame.cmd.held), None)
+    if not due or first is None:
+        return None
+    return f"held {max(0.0, 1e3 * (first.t - arrival_s)):.0f} ms after the end of the session"
+
+
+def _add_lost(role: str, key: Key) -> None:
+    for ending in ENDINGS:
+        promise = f"the {role}'s lost session holds the wheels within 50 ms"
+        check(f"lost-{role}-{ending.lower()}", promise, "real time")(partial(_lost, key, ending))
+
+
+_add_lost("controller", "drive")
+_add_lost("monitor", "permit")
+
+# -- fans -------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _changed_fans(context: CheckContext) -> Iterator[tuple[ControllerAndMonitor, Pair]]:
+    """Fans at another duty than they were found at; put back at the end."""
+    pair = ControllerAndMonitor(context)
+    left, right = pair.steady().fans
+    duty = other_duty((left, right), context.facts.robot.fan_floor)
+    try:
+        pair.fans(duty)
+        pair.expect(lambda frame: frame.has_fans(duty), f"fans never went to {_shown(duty)}")
+        yield pair, duty
+    finally:
+        with suppress(CheckFailed):
+            if pair.controller.is_ended or not pair.controller.is_open:
+                pair.rejoin()
+            pair.steady()
+            pair.fans((left, right))
+            pair.expect(lambda frame: frame.has_fans((left, right)), "")
+
+
+def other_duty(duty: Pair, lowest: float) -> Pair:
+    """Duties that differ from these, and are allowed; ``NotApplicable`` where there are none."""
+    if lowest > 1.0 - FAN_STEP:
+        raise NotApplicable(f"a floor of {lowest:g} leaves no room")
+    left, right = (value + FAN_STEP if value <= 1.0 - FAN_STEP else value - FAN_STEP for value in duty)
+    return left, right
+
+
+def _check_unchanged(frames: Sequence[Frame], fans: Pair, cause: str) -> None:
+    for frame in frames:
+        require(frame.has_fans(fans), f"fans went from {list(fans)} to {frame.fans} {cause}")
+
+
+def _shown(duty: Sequence[float]) -> str:
+    return f"[{duty[0]:.3g}, {duty[1]:.3g}]"
+
+
+@check("fans", "duties stay in force until changed")
+def _fans_obeyed(context: CheckContext) -> str:
+    with _changed_fans(context) as (pair, duty):
+        pair.settle()
+        _check_unchanged(pair.settle(), duty, "by themselves")
+        return f"fans at {_shown(duty)}"
+
+
+@check("newest-fans", "a fans command with an older or equal seq is dropped")
+def _newest_fans(context: CheckContext) -> str:
+    with _changed_fans(context) as (pair, duty):
+        last = pair.fans(duty)
+        pair.settle()
+        other = other_duty(duty, context.facts.robot.fan_floor)
+        for seq in (last - 1, last):
+            pair.fans(other, seq)
+            _check_unchanged([*pair.settle(), *pair.run_frames(2)], duty, f"by command {seq} after {last}")
+        return f"commands {last - 1} and {last} after {last} dropped"
+
+
+@check("role-fans", "fans are the controller's")
+def _fans_of_the_monitor(context: CheckContext) -> str:
+    with _changed_fans(context) as (pair, duty):
+        left, right = other_duty(duty, context.facts.robot.fan_floor)
+        pair.monitor.send(b'{"type":"fans","seq":%d,"duty":[%.3f,%.3f]}\n' % (context.next_seq(), left, right))
+        _check_unchanged([*pair.run_frames(10), *pair.settle()], duty, "by a command of the monitor")
+        return "a command of the monitor does nothing"
+
+
+@check("fans-ttl", "fans are never changed by a time-out", "real time")
+def _fans_after_time_out(context: CheckContext) -> str:
+    silence_s = context.facts.ttl_s + AFTER_TTL_S
+    with _changed_fans(context) as (pair, duty):
+        pair.rates = pair.allowed = None
+        _check_unchanged(pair.run(silence_s), duty, "by a time-out")
+        return f"{_shown(duty)} over {silence_s:.2f} s without drive and permit"
+
+
+@check("fans-stop", "fans are never changed by a stop")
+def _fans_after_stop(context: CheckContext) -> str:
+    with _changed_fans(context) as (pair, duty):
+        pair.allowed = NOTHING
+        _check_unchanged(pair.run_frames(10), duty, "by a permit that allows nothing")
+        return f"{_shown(duty)} while nothing is allowed"
+
+
+def _fans_after_lost(ending: Ending, context: CheckContext) -> str:
+    """Both sessions end, one after the other, and join again."""
+    with _changed_fans(context) as (pair, duty):
+        pair.controller.end(ending)
+        if not context.facts.lockstep:  # there the monitor sees no frame without the controller
+            pair.rates = None
+            _check_unchanged(pair.run_frames(10), duty, f"by a lost controller ({ending})")
+        pair.monitor.end(ending)
+        pair.rejoin()
+        first = len(pair.frames)
+        pair.steady()
+        _check_unchanged(pair.frames[first:], duty, f"by lost sessions ({ending})")
+        return f"{_shown(duty)} after {ending}"
+
+
+check("fans-fin", "fans are never changed by a lost session")(partial(_fans_after_lost, "FIN"))
+check("fans-rst", "fans are never changed by a lost session")(partial(_fans_after_lost, "RST"))
+
+
+@check("fan-floor", "a duty below fan_floor is clamped to it, without a fault")
+def _fan_floor(context: CheckContext) -> str:
+    lowest = context.facts.robot.fan_floor
+    if lowest <= 0.0:
+        raise NotApplicable("fan_floor 0")
+    with _changed_fans(context) as (pair, _):
+        below = max(0.0, lowest - FAN_STEP)
+        pair.fans((below, below))
+        for frame in [*pair.settle(), *pair.run_frames(2)]:
+            require(min(frame.fans) >= lowest - DUTY_TOLERANCE, f"fans at {_shown(frame.fans)}, floor {lowest:g}")
+        require(pair.newest.has_fans((lowest, lowest)), f"fans at {_shown(pair.newest.fans)}")
+        faults = pair.messages[0][-1].get("faults", [])
+        require("fan_left" not in faults and "fan_right" not in faults, f"faults {faults} for a duty below the floor")
+        return f"duty {below:g} clamped to {lowest:g}"
+
+
+# -- lines ------------------------------------------------------------------------------------------------------------
+
+# Drives with one thing wrong each; %d is the number, then the frame.
+BAD_DRIVES: dict[str, tuple[str, bytes]] = {
+    "no-json": ("a line that is no JSON is dropped", b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wl":0.0\n'),
+    "key-twice": ("a key that stands twice makes a bad line",
+                  b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wr":0.0,"wl":0.0}\n'),
+    "nan": ("numbers are finite", b'{"type":"drive","seq":%d,"ack":%d,"wr":NaN,"wl":0.0}\n'),
+    "infinity": ("numbers are finite", b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wl":Infinity}\n'),
+    "overflow": ("numbers are finite", b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wl":1e999}\n'),
+    "key-missing": ("a line that fails a check is dropped", b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0}\n'),
+    "text-for-number": ("a line that fails a check is dropped",
+                        b'{"type":"drive","seq":%d,"ack":%d,"wr":"0.0","wl":0.0}\n'),
+    "no-utf-8": ("lines are UTF-8", b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wl":0.0,"note":"\xff"}\n'),
+}  # fmt: skip
+
+
+def _dropped(template: bytes, context: CheckContext) -> str:
+    """A bad drive with the higher number in front of a good one: only if it is dropped does the good one count."""
+    pair = steady_pair(context)
+    good = context.next_seq()
+    bad = good + 1
+    pair.drive(good, before=template % (bad, pair.newest.seq))
+    frame = pair.echoed(good, bad, otherwise="the good drive behind it was not obeyed")
+    require(frame.cmd.seq == good, "it came into force")
+    pair.steady()
+    return "dropped, the drive behind it obeyed"
+
+
+for _check_id, (_promise, _template) in BAD_DRIVES.items():
+    check(_check_id, _promise)(partial(_dropped, _template))
+
+
+@check("unknown-key", "unknown keys are ignored")
+def _unknown_key(context: CheckContext) -> str:
+    line = b'{"type":"drive","seq":%d,"ack":%d,"wr":0.0,"wl":0.0,"colour":"red","more":{"x":[1,2,null]}}\n'
+    _check_obeyed(context, lambda seq, ack: line % (seq, ack), "a drive with unknown keys was not obeyed")
+    return "a drive with unknown keys is obeyed"
+
+
+@check("unknown-type", "an unknown type is ignored, and no bad line")
+def _unknown_type(context: CheckContext) -> str:
+    # More lines at once than bad ones are allowed in a second.
+    _check_tolerated(context, b'{"type":"dance","seq":7,"partner":null}\n' * STRANGERS)
+    return f"{STRANGERS} lines of an unknown type, the session goes on"
+
+
+@check("bad-lines-few", "20 bad lines in a second do not close the session")
+def _few_bad_lines(context: CheckContext) -> str:
+    _check_tolerated(context, b"garbage\n" * TOLERATED)
+    return f"{TOLERATED} bad lines at once, the session goes on"
+
+
+@check("bad-lines-many", "more than 20 bad lines in a second close the session")
+def _many_bad_lines(context: CheckContext) -> str:
+    monitor = context.join("monitor")
+    monitor.send(b"garbage\n" * (TOLERATED + 1))
+    require(context.is_closed(monitor), f"{TOLERATED + 1} bad lines at once, and the session is not closed")
+    return f"{TOLERATED + 1} bad lines at once close the session"
+
+
+@check("line-longest", "a line holds up to 8192 bytes")
+def _longest_line(context: CheckContext) -> str:
+    def line(seq: int, ack: int) -> bytes:
+        head = format_drive(seq, ack, 0.0, 0.0)[:-2] + b',"note":"'
+        return head + b"x" * (MAX_LINE_BYTES - len(head) - 3) + b'"}\n'
+
+    _check_obeyed(context, line, f"a drive of {MAX_LINE_BYTES} bytes was not obeyed")
+    return f"a drive of {MAX_LINE_BYTES} bytes is obeyed"
+
+
+@check("line-too-long", "a line over 8192 bytes closes the session")
+def _long_line(context: CheckContext) -> str:
+    for end in (b"", b"\n"):
+        monitor = context.join("monitor")
+        monitor.send(b'{"type":"dance","note":"' + b"x" * MAX_LINE_BYTES + b'"}' + end)
+        require(context.is_closed(monitor), f"a line over {MAX_LINE_BYTES} bytes, and the session is not closed")
+    return "closes the session"
+
+
+@check("single-bytes", "one object a line, however TCP chops it")
+def _single_bytes(context: CheckContext) -> str:
+    connection, hello = context.greet()
+    for byte in context.join_line(hello, "monitor"):
+        connection.send(bytes((byte,)))
+        time.sleep(BYTE_S)
+    require(context.answer(connection)["type"] == "joined", "a join in single bytes is refused")
+    context.clear()
+    pair = steady_pair(context)
+    seq = context.next_seq()
+    for byte in format_drive(seq, pair.newest.seq, 0.0, 0.0):
+        pair.controller.send(bytes((byte,)))
+        pair.pause(BYTE_S)
+    pair.mark_driven()
+    pair.echoed(seq, otherwise="a drive in single bytes was not obeyed")
+    return "join and drive obeyed"
+
+
+@check("many-lines", "one object a line, however many come at once")
+def _many_lines(context: CheckContext) -> str:
+    pair = steady_pair(context)
+    before, first = pair.newest.seq - 1, context.next_seq()
+    last = context.last_seq = first + CROWD - 1
+    # Only the last answers the newest frame: where time waits for that, it waits for all of them.
+    crowd = b"".join(format_drive(seq, before, 0.0, 0.0) for seq in range(first, last))
+    pair.drive(last, before=crowd)
+    pair.echoed(last, otherwise=f"the last of {CROWD} drives in one segment was not obeyed")
+    return f"the last of {CROWD} drives obeyed"
+
+
+@check("glued-lines", "one object a line, however TCP glues them")
+def _glued_lines(context: CheckContext) -> str:
+    pair = steady_pair(context)
+    left, right = pair.newest.fans
+    seq = context.next_seq()
+    fans = b'{"type":"fans","seq":%d,"duty":[%.6f,%.6f]}\n' % (context.next_seq(), left, right)
+    pair.drive(seq, before=b'{"type":"dance"}\n' + fans)
+    pair.echoed(seq, otherwise="a drive behind two other lines was not obeyed")
+    return "a drive behind two other lines is obeyed"
+
+
+def _check_obeyed(context: CheckContext, line: Callable[[int, int], bytes], otherwise: str) -> None:
+    """Send a drive as it is, and answer frames until it is echoed."""
+    pair = steady_pair(context)
+    seq = context.next_seq()
+    pair.controller.send(line(seq, pair.newest.seq))
+    pair.mark_driven()
+    pair.echoed(seq, otherwise=otherwise)
+
+
+def _check_tolerated(context: CheckContext, lines: bytes) -> None:
+    """Send lines that change nothing, and go on."""
+    pair = steady_pair(context)
+    pair.controller.send(lines)
+    pair.run_frames(5)
+    pair.settle()

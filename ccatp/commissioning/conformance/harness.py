@@ -1,0 +1,551 @@
+"""What every check uses: the list of checks, messages as types, and clients of the server under test.
+
+Messages are read leniently, so that a check can go on; ``parse`` judges the parts that a check or all of them need.
+"""
+
+import json
+import select
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from ccatp.config.messages import format_key
+from ccatp.links.robot_codec import encode, format_drive, format_permit, join_mac
+from ccatp.links.robot_messages import AUTH_HMAC, Fans, Join, LineBuffer, Role
+
+Need = Literal["motion", "real time", "lockstep", "hmac"]
+Key = Literal["drive", "permit"]
+Ending = Literal["FIN", "RST"]
+Message = dict[str, Any]
+Pair = tuple[float, float]
+Allowed = tuple[bool, bool, bool]
+STILL: Pair = (0.0, 0.0)
+ALL: Allowed = (True, True, True)
+NOTHING: Allowed = (False, False, False)
+POLL_S = 0.05
+COMMAND_LIMIT_S = 2.0  # robot's time in which a command must have come into force
+DUTY_TOLERANCE = 0.01  # a duty in eight bits
+# Numbers between two of these are free for messages that must be older or newer than others.
+SEQ_STEP = 10
+# Far over the 8192 allowed: a line of the server that is too long fails a check, not the buffer.
+_LIMIT_BYTES = 1 << 20
+_CHUNK_BYTES = 1 << 16
+_RESET = b"\x01\0\0\0\0\0\0\0"  # linger on, for 0 s: close sends RST
+
+
+class CheckFailed(AssertionError):
+    """The server does not do what the interface control document promises; the text says what was seen instead."""
+
+
+class NotApplicable(Exception):
+    """The server promises nothing here, or nothing that can be seen; the text says why."""
+
+
+Run = Callable[["CheckContext"], str]
+
+
+class Check(NamedTuple):
+    """One check: ``run`` returns what was seen, or raises ``CheckFailed`` or ``NotApplicable``."""
+
+    check_id: str
+    promise: str
+    run: Run
+    needs: tuple[Need, ...] = ()
+
+
+class CheckList(list[Check]):
+    """Checks in the order in which they run."""
+
+    def add(self, check_id: str, promise: str, *needs: Need) -> Callable[[Run], Run]:
+        """Decorator: append a function. Without what it needs a check is not applicable."""
+
+        def append(run: Run) -> Run:
+            self.append(Check(check_id, promise, run, needs))
+            return run
+
+        return append
+
+
+def require(is_kept: bool, seen: str) -> None:
+    """Raise ``CheckFailed`` with what was seen unless a promise is kept."""
+    if not is_kept:
+        raise CheckFailed(seen)
+
+
+# -- messages -----------------------------------------------------------------------------------------------------
+
+
+class Part(BaseModel):
+    """Part of a message; strict: finite numbers, no booleans or text in their place. Further keys are ignored."""
+
+    model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False)
+
+
+PartT = TypeVar("PartT", bound=Part)
+Positive = Annotated[float, Field(gt=0.0)]
+Two = Annotated[list[float], Field(min_length=2, max_length=2)]
+Three = Annotated[list[float], Field(min_length=3, max_length=3)]
+
+
+def parse(model: type[PartT], message: Message, where: str = "") -> PartT:
+    """A part of a message; ``CheckFailed`` with the first key that is missing or wrong."""
+    try:
+        return model.model_validate(message)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        name = format_key(first["loc"])
+        raise CheckFailed(
+            where + (f"no {name}" if first["type"] == "missing" else f"{name} = {first['input']!r}")
+        ) from None
+
+
+class Timing(Part):
+    """Clock of the robot, as its hello tells it."""
+
+    lockstep: bool
+    frame_hz: Positive
+    ttl_s: Positive
+
+    @property
+    def frame_s(self) -> float:
+        """Period of the frames."""
+        return 1.0 / self.frame_hz
+
+
+class Body(Part):
+    """Sizes of the robot that the checks need."""
+
+    wheel_radius_m: Positive
+    wheel_base_m: Positive
+    max_wheel_rad_s: Positive
+    fan_floor: float
+
+
+class Facts(Timing):
+    """What the checks need of the server's hello."""
+
+    auth: Any = None
+    robot: Body
+
+    @property
+    def needs_mac(self) -> bool:
+        """Whether a join needs a mac."""
+        return bool(self.auth == AUTH_HMAC)
+
+
+class Echo(Part):
+    """The command echo of a frame."""
+
+    seq: int
+    age: float
+    permit_age: float
+    held: bool
+
+
+class Frame(Part):
+    """What the checks need of a sensors frame; ``enc`` holds samples (t, right, left) of the wheels, s and rad/s."""
+
+    seq: int
+    t: float
+    fans: Two
+    enc: list[Any]
+    cmd: Echo
+
+    def age_s(self, key: Key) -> float:
+        """Age of the drive in force or of the newest permit."""
+        return self.cmd.age if key == "drive" else self.cmd.permit_age
+
+    def arrival_s(self, key: Key) -> float:
+        """When that drive or permit arrived, robot's clock."""
+        return self.t - self.age_s(key)
+
+    def has_fans(self, wanted: Sequence[float]) -> bool:
+        """Whether the fan duties are those wanted, within ``DUTY_TOLERANCE``."""
+        return all(abs(a - b) <= DUTY_TOLERANCE for a, b in zip(self.fans, wanted, strict=True))
+
+
+def whole_samples(samples: object, size: int) -> list[list[float]]:
+    """The samples of a list that are so many numbers; of others ``frames-samples`` tells."""
+    whole = [one for one in samples if isinstance(one, list) and len(one) == size] if isinstance(samples, list) else []
+    return [one for one in whole if all(isinstance(value, int | float) for value in one)]
+
+
+def read_message(line: bytes) -> Message | None:
+    """The object in a line, ``None`` if there is none. Lenient: the same key twice, NaN and the like pass."""
+    try:
+        value = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return value if isinstance(value, dict) else None
+
+
+def shorten(line: bytes, most: int = 60) -> str:
+    """A line for a message."""
+    text = line[:most].decode("utf-8", "backslashreplace")
+    return text if len(line) <= most else text + "..."
+
+
+# -- clients ------------------------------------------------------------------------------------------------------
+
+
+class RawConnection:
+    """One connection; ``lines`` were received and not yet taken, without their LF.
+
+    ``timeout_s`` is the longest wait for the connection, and for the server to take what is sent.
+
+    Raises:
+        OSError: no connection.
+    """
+
+    def __init__(self, address: tuple[str, int], timeout_s: float) -> None:
+        self._socket = socket.create_connection(address, timeout_s)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._buffer = LineBuffer(_LIMIT_BYTES)
+        self.lines: deque[bytes] = deque()
+        self.is_ended = False
+
+    @property
+    def is_open(self) -> bool:
+        """Whether this side has not closed."""
+        return self._socket.fileno() >= 0
+
+    def fileno(self) -> int:
+        """For ``select``."""
+        return self._socket.fileno()
+
+    def send(self, data: bytes) -> None:
+        """Send; what the server no longer takes is lost, and the connection ended."""
+        try:
+            self._socket.sendall(data)
+        except OSError:
+            self.is_ended = True
+
+    def receive(self) -> None:
+        """Take what is there; to be called when there is something."""
+        try:
+            data = self._socket.recv(_CHUNK_BYTES)
+        except OSError:
+            data = b""
+        self.is_ended = self.is_ended or not data
+        self.lines.extend(self._buffer.feed(data))
+
+    def end(self, ending: Ending) -> None:
+        """End with FIN and go on reading (closing would send RST while something is unread), or close with RST."""
+        with suppress(OSError):
+            if ending == "FIN":
+                self._socket.shutdown(socket.SHUT_WR)
+                return
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+        if ending == "RST":
+            self._socket.close()
+
+    def close(self) -> None:
+        """Close."""
+        with suppress(OSError):
+            self._socket.close()
+
+
+class CheckContext:
+    """Clients of one check; ``clear`` before the next. ``last_seq`` is the highest sequence number used so far."""
+
+    facts: Facts
+
+    def __init__(self, address: tuple[str, int], key: bytes | None, timeout_s: float) -> None:
+        self._address, self.key, self.timeout_s = address, key, timeout_s
+        self.last_seq = 0
+        self._connections: list[RawConnection] = []
+
+    def next_seq(self) -> int:
+        """A number above all that were used."""
+        self.last_seq += SEQ_STEP
+        return self.last_seq
+
+    def connect(self) -> RawConnection:
+        """A new connection.
+
+        Raises:
+            OSError: it is not accepted.
+        """
+        self._connections.append(RawConnection(self._address, self.timeout_s))
+        return self._connections[-1]
+
+    def poll(self, wait_s: float = POLL_S) -> None:
+        """Receive on all connections that have something, waiting for the first at most so long."""
+        reading = [one for one in self._connections if one.is_open and not one.is_ended]
+        for one in select.select(reading, [], [], wait_s)[0]:
+            one.receive()
+
+    def until(self, is_done: Callable[[], bool], wait_s: float | None = None) -> bool:
+        """Receive until something is done; false when it is not within ``wait_s`` (the time-out by default)."""
+        deadline_s = time.monotonic() + (self.timeout_s if wait_s is None else wait_s)
+        while not is_done():
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0.0:
+                return False
+            self.poll(min(left_s, POLL_S))
+        return True
+
+    def is_closed(self, connection: RawConnection, wait_s: float | None = None) -> bool:
+        """Whether the server closes a connection in time."""
+        return self.until(lambda: connection.is_ended, wait_s)
+
+    def message(self, connection: RawConnection, *kinds: str) -> Message:
+        """The next message on a connection; ``CheckFailed`` where it is not of one of these types."""
+        wanted = " or ".join(kinds)
+        self.until(lambda: bool(connection.lines) or connection.is_ended)
+        seen = "connection closed" if connection.is_ended else "silence"
+        require(bool(connection.lines), f"{seen} instead of {wanted}")
+        line = connection.lines.popleft()
+        message = read_message(line)
+        if message is None or message.get("type") not in kinds:
+            raise CheckFailed(f"{shorten(line)} instead of {wanted}")
+        return message
+
+    def greet(self) -> tuple[RawConnection, Message]:
+        """A new connection and its hello; ``CheckFailed`` where it is not accepted or there is no hello."""
+        try:
+            connection = self.connect()
+        except OSError as error:
+            raise CheckFailed(f"connection not accepted: {error.strerror or error}") from error
+        return connection, self.message(connection, "hello")
+
+    def join_line(self, hello: Message, role: Role, mac: str | None = None) -> bytes:
+        """The right answer to a hello, or one with another mac; ``NotApplicable`` without the key it needs."""
+        if mac is None and self.facts.needs_mac:
+            if self.key is None:
+                raise NotApplicable("the server asks for a mac, and there is no key")
+            mac = join_mac(self.key, str(hello.get("nonce")), role)
+        return encode(Join(role=role, client="conformance", mac=mac or ""))
+
+    def request(self, role: Role) -> tuple[RawConnection, Message]:
+        """A new connection that requests a role, and the server's answer."""
+        connection, hello = self.greet()
+        connection.send(self.join_line(hello, role))
+        return connection, self.answer(connection)
+
+    def answer(self, connection: RawConnection) -> Message:
+        """The server's answer to a join."""
+        return self.message(connection, "joined", "refused")
+
+    def join(self, role: Role, retry_s: float | None = None) -> RawConnection:
+        """A session; ``CheckFailed`` if refused.
+
+        The session before may not have ended yet, so a role that is taken is requested again for ``retry_s`` (the
+        time-out by default).
+        """
+        deadline_s = time.monotonic() + (self.timeout_s if retry_s is None else retry_s)
+        while True:
+            connection, answer = self.request(role)
+            if answer["type"] == "joined":
+                return connection
+            connection.close()
+            is_over = time.monotonic() > deadline_s
+            require(answer.get("reason") == "role taken" and not is_over, f"{role} refused: {answer.get('reason')}")
+            self.until(lambda: False, POLL_S)
+
+    def clear(self) -> None:
+        """Close all connections."""
+        for connection in self._connections:
+            connection.close()
+        self._connections.clear()
+
+
+class ControllerAndMonitor:
+    """Two sessions that answer every frame.
+
+    Attributes:
+        rates: (right, left) set points of the drive that answers each frame, rad/s; ``None`` sends none.
+        allowed: (forward, reverse, turn) of the permit that answers each frame; ``None`` sends none.
+        messages: sensors messages as they came, of the controller and of the monitor.
+    """
+
+    def __init__(self, context: CheckContext) -> None:
+        self.context, self.facts = context, context.facts
+        self._join()
+        self.rates: Pair | None = STILL
+        self.allowed: Allowed | None = ALL
+        self.frames: list[Frame] = []
+        self.messages: tuple[list[Message], list[Message]] = ([], [])
+        self.raw: list[bytes] = []
+
+    def _join(self) -> None:
+        # The monitor first: from its join on the robot needs both keys, so it never waits for one alone.
+        self.monitor = self.context.join("monitor")
+        self.controller = self.context.join("controller")
+        self.answer_again()
+
+    def rejoin(self) -> None:
+        """End both sessions, and begin new ones."""
+        self._take()
+        self.controller.close()
+        self.monitor.close()
+        self._join()
+
+    @property
+    def newest(self) -> Frame:
+        """The newest frame."""
+        return self.frames[-1]
+
+    # -- commands -------------------------------------------------------------------------------------------------
+
+    def drive(self, seq: int | None = None, rates: Pair = STILL, ack: int | None = None, before: bytes = b"") -> int:
+        """Send a drive that answers the newest frame (or another), with other bytes in front; returns its number."""
+        seq = self.context.next_seq() if seq is None else seq
+        self.controller.send(before + format_drive(seq, self.newest.seq if ack is None else ack, *rates))
+        if ack is None:
+            self.mark_driven()
+        return seq
+
+    def permit(self, seq: int | None = None, allowed: Allowed = ALL, ack: int | None = None) -> int:
+        """Send a permit that answers the newest frame (or another); returns its number."""
+        seq = self.context.next_seq() if seq is None else seq
+        self.monitor.send(format_permit(seq, self.newest.seq if ack is None else ack, *allowed))
+        if ack is None:
+            self._permitted = self.newest.seq
+        return seq
+
+    def fans(self, duty: Pair, seq: int | None = None) -> int:
+        """Send fan duties; returns their number."""
+        seq = self.context.next_seq() if seq is None else seq
+        self.controller.send(encode(Fans(seq=seq, duty=duty)))
+        return seq
+
+    def withhold(self, key: Key) -> None:
+        """Answer frames without drives, or without permits."""
+        if key == "drive":
+            self.rates = None
+        else:
+            self.allowed = None
+
+    def mark_driven(self) -> None:
+        """The newest frame has been answered by a drive."""
+        self._driven = self.newest.seq
+
+    def answer_again(self) -> None:
+        """Regard the newest frame as unanswered: what was sent may have been dropped."""
+        self._driven = self._permitted = -1
+
+    # -- frames ---------------------------------------------------------------------------------------------------
+
+    def find(self, is_wanted: Callable[[Frame], bool], robot_s: float = COMMAND_LIMIT_S) -> Frame | None:
+        """Answer frames until one is wanted; ``None`` after so much of the robot's time, or silence.
+
+        The wanted frame itself is not answered yet.
+        """
+        start = len(self.frames)
+        begin_s: float | None = None  # of the first frame that comes: before it may have been a long pause
+        quiet_s = time.monotonic()
+        while True:
+            self._answer()
+            self.context.poll()
+            if self._take():
+                quiet_s = time.monotonic()
+            for frame in self.frames[start:]:
+                begin_s = frame.t if begin_s is None else begin_s
+                if is_wanted(frame):
+                    return frame
+                if frame.t - begin_s > robot_s:
+                    return None
+            start = len(self.frames)
+            if time.monotonic() - quiet_s > self.context.timeout_s:
+                return None
+
+    def expect(self, is_wanted: Callable[[Frame], bool], otherwise: str) -> Frame:
+        """Answer frames until one is wanted; ``CheckFailed`` with ``otherwise`` if none comes."""
+        frame = self.find(is_wanted)
+        if frame is None:
+            self._check_sessions()
+            raise CheckFailed(otherwise)
+        return frame
+
+    def next_frame(self, otherwise: str) -> Frame:
+        """Answer frames until a newer one comes."""
+        newest = self.newest.seq
+        return self.expect(lambda frame: frame.seq > newest, otherwise)
+
+    def run(self, robot_s: float) -> list[Frame]:
+        """Answer frames for so much of the robot's time; these frames."""
+        start = len(self.frames)
+        if not self.frames:
+            self.expect(lambda _: True, "no frames after the join")
+        self._take()
+        end_s = self.newest.t + robot_s
+        if self.find(lambda frame: frame.t >= end_s, 2.0 * robot_s) is None:
+            self._check_sessions()
+            raise CheckFailed(f"no more frames after frame {self.newest.seq}")
+        return self.frames[start:]
+
+    def run_frames(self, count: int) -> list[Frame]:
+        """Answer so many frames; these frames."""
+        return self.run(count * self.facts.frame_s)
+
+    def pause(self, wall_s: float) -> list[Frame]:
+        """Answer nothing for so much time of this machine; the frames that come all the same."""
+        start = len(self.frames)
+        end_s = time.monotonic() + wall_s
+        while (left_s := end_s - time.monotonic()) > 0.0:
+            self.context.poll(min(left_s, POLL_S))
+            self._take()
+        return self.frames[start:]
+
+    def echoed(self, *seqs: int, otherwise: str) -> Frame:
+        """Send nothing newer, until the robot echoes one of these drives.
+
+        In lockstep newer drives have to follow; there each is in force for a frame.
+        """
+        self.rates = STILL if self.facts.lockstep else None
+        return self.expect(lambda frame: frame.cmd.seq in seqs, otherwise)
+
+    def steady(self) -> Frame:
+        """Drive and permit in force: standing still by command, not held."""
+        self.rates, self.allowed = STILL, ALL
+        first = self.context.next_seq()
+        return self.expect(
+            lambda frame: not frame.cmd.held and frame.cmd.seq > first,
+            "held in spite of a new drive and a new permit for each frame",
+        )
+
+    def settle(self) -> list[Frame]:
+        """Answer frames until all that was sent before is in force; these frames."""
+        start = len(self.frames)
+        mark = self.context.next_seq()
+        self.expect(lambda frame: frame.cmd.seq > mark, "drives no longer come into force")
+        return self.frames[start:]
+
+    def _check_sessions(self) -> None:
+        for name, connection in (("controller", self.controller), ("monitor", self.monitor)):
+            require(not (connection.is_open and connection.is_ended), f"the {name}'s session was closed")
+
+    def _answer(self) -> None:
+        if self.frames and self.rates is not None and self._driven < self.newest.seq:
+            self.drive(rates=self.rates)
+        if self.frames and self.allowed is not None and self._permitted < self.newest.seq:
+            self.permit(allowed=self.allowed)
+
+    def _take(self) -> bool:
+        """Read what came; whether any of it is a new frame."""
+        before = len(self.frames)
+        for connection, messages in zip((self.controller, self.monitor), self.messages, strict=True):
+            while connection.lines:
+                line = connection.lines.popleft()
+                self.raw.append(line)
+                message = read_message(line)
+                if message is None or message.get("type") != "sensors":
+                    continue
+                messages.append(message)
+                frame = parse(Frame, message, "a sensors frame with ")
+                if not self.frames or frame.seq > self.newest.seq:
+                    self.frames.append(frame)
+        return len(self.frames) > before
+
+
+def steady_pair(context: CheckContext) -> ControllerAndMonitor:
+    """Both sessions joined, with drive and permit in force."""
+    pair = ControllerAndMonitor(context)
+    pair.steady()
+    return pair
