@@ -1,25 +1,33 @@
 """What every command shares: suggestions, one-line errors, exit statuses, options, talk with a running daemon."""
 
 import difflib
-import json
 import math
 import os
 import sys
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
 from ccatp.config.package import configs_dir
-from ccatp.errors import CcatpError, ExitStatus
+from ccatp.errors import CcatpError, ConfigError, ExitStatus
 
 Command = Callable[..., Any]
 # Former names of commands, and what they are called now.
 RENAMED_COMMANDS = {"log": "recording", "recover": "repair", "map": "plot"}
 # Longer than any answer takes; what libzmq waits for is an int of milliseconds.
 LONGEST_WAIT_S = 86_400.0
+
+
+PATH = click.Path(path_type=Path)
+
+
+def nearest_hint(name: str, names: Iterable[str]) -> str:
+    """``did you mean run?``, or else what there is."""
+    near = difflib.get_close_matches(name, list(names), n=1)
+    return f"did you mean {near[0]}?" if near else f"there are {', '.join(names)}"
 
 
 class NearestChoice(click.Choice[str]):
@@ -50,10 +58,9 @@ class WaitingTime(click.ParamType[float]):
 
 
 class OutputFile(click.Path):
-    """A file to be written: what cannot be is told before the work, not after it.
+    """A file to be written: what cannot be is refused before the work, not after it.
 
-    Args:
-        formats: how its name may end; however it likes, if none is given.
+    Its name must end in one of ``formats``; however it likes, if none is given.
     """
 
     def __init__(self, *formats: str) -> None:
@@ -88,21 +95,18 @@ class SuggestingGroup(click.Group):
             new_name = RENAMED_COMMANDS.get(name)
             if new_name is not None and self.get_command(ctx, new_name) is not None:
                 raise click.UsageError(f"the command {name!r} is now called {new_name!r}", ctx)
-            near = difflib.get_close_matches(name, self.list_commands(ctx), n=1)
-            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(self.list_commands(ctx))}"
-            raise click.UsageError(f"no command {name!r}; {hint}", ctx)
+            raise click.UsageError(f"no command {name!r}; {nearest_hint(name, self.list_commands(ctx))}", ctx)
         return super().resolve_command(ctx, args)
 
 
 def run_command_line(group: click.Group, argv: Sequence[str] | None = None) -> int:
-    """Run a command line; expected errors become one line on standard error, never a traceback.
+    """Run a command line (that of the process if ``None``) and return the exit status.
 
-    Args:
-        argv: arguments without the program's name; those of the process if ``None``.
-
-    Returns:
-        The exit status.
+    Expected errors become one line on standard error, never a traceback.
     """
+    # Matrices are small: threads would compete for the cores, and another number of them may round differently.
+    # Set before numpy is imported.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         status = group.main(args=argv, prog_name="ccatp", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -120,10 +124,10 @@ def run_command_line(group: click.Group, argv: Sequence[str] | None = None) -> i
     except BrokenPipeError:  # the reader of our output has seen enough; keep the interpreter from flushing into it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ExitStatus.REFUSED
-    except OSError as error:  # a path that nobody foresaw: too long a name, a folder that is not ours
+    except OSError as error:  # too long a name, a folder that is not ours
         if error.filename is None:
             raise
-        return complain(f"{error.filename}: {error.strerror}; give another path, or mend this one", ExitStatus.USAGE)
+        return complain(f"{error.filename}: {error.strerror}; give another path, or correct this one", ExitStatus.USAGE)
     return int(status or 0)
 
 
@@ -131,6 +135,31 @@ def complain(message: str, status: int) -> int:
     """One line on standard error; returns ``status``."""
     click.echo(f"ccatp: {' '.join(message.split())}", err=True)
     return int(status)
+
+
+def warn(warnings: Iterable[str]) -> None:
+    """A line on standard error for each warning."""
+    for warning in warnings:
+        complain(f"warning: {warning}", 0)
+
+
+def tell(lines: Iterable[str]) -> None:
+    """Lines on standard output."""
+    for line in lines:
+        click.echo(line)
+
+
+def write_lines(option: str, path: Path, lines: Iterable[str]) -> None:
+    """Write the text file that an option names.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
+    try:
+        with path.open("w", encoding="utf-8") as file:
+            file.writelines(line + "\n" for line in lines)
+    except OSError as error:
+        raise ConfigError(f"{option}: cannot write {path}: {error.strerror or error}") from error
 
 
 def example(*lines: str) -> str:
@@ -156,14 +185,8 @@ def renamed_flag(old: str, new: str) -> Callable[[Command], Command]:
         if is_given:
             raise click.UsageError(f"{old} is now called {new}", ctx)
 
-    return click.option(
-        old,
-        f"former_{new.strip('-').replace('-', '_')}",
-        is_flag=True,
-        hidden=True,
-        expose_value=False,
-        callback=refuse,
-    )
+    former = f"former_{new.strip('-').replace('-', '_')}"
+    return click.option(old, former, is_flag=True, hidden=True, expose_value=False, callback=refuse)
 
 
 def parse_setting(text: str) -> tuple[str, object]:
@@ -182,11 +205,29 @@ def parse_setting(text: str) -> tuple[str, object]:
         return key, value.strip()
 
 
-def _settings(_ctx: click.Context, _param: click.Parameter, values: Iterable[str]) -> dict[str, object]:
+def _changes(ctx: click.Context) -> dict[str, object]:
+    """What this command line says of the configuration, by dotted key."""
+    changes: dict[str, object] = ctx.meta.setdefault("ccatp.changes", {})
+    return changes
+
+
+def _take_settings(ctx: click.Context, _param: click.Parameter, values: Iterable[str]) -> dict[str, object]:
+    changes = _changes(ctx)
     try:
-        return dict(parse_setting(value) for value in values)
+        changes.update(parse_setting(value) for value in values)
     except ValueError as error:
         raise click.BadParameter(str(error)) from error
+    return changes
+
+
+def key_option(flag: str, key: str, **attributes: Any) -> Callable[[Command], Command]:
+    """An option that stands for a key of the configuration: part of ``settings``, where ``--set`` is stronger."""
+
+    def take(ctx: click.Context, _param: click.Parameter, value: object) -> None:
+        if value is not None:
+            _changes(ctx).setdefault(key, value)
+
+    return click.option(flag, expose_value=False, callback=take, **attributes)
 
 
 def names_of(folder: str) -> Callable[[click.Context, click.Parameter, str], list[str]]:
@@ -199,70 +240,58 @@ def names_of(folder: str) -> Callable[[click.Context, click.Parameter, str], lis
     return complete
 
 
-CONFIG_OPTION = click.option("--config", "config_file", type=click.Path(path_type=Path), help="Configuration (TOML).")
-TIMEOUT_OPTION = click.option(
-    "--timeout", "timeout_s", type=WaitingTime(), default=10.0, show_default=True, metavar="SECONDS",
-    help="Seconds to wait.",
-)  # fmt: skip
-RUNTIME_DIR_OPTION = click.option(
-    "--runtime-dir", type=click.Path(path_type=Path), help="Folder of the sockets, if not the usual one."
-)
-FAULTS_OPTION = click.option(
-    "--faults", "faults_file", type=click.Path(path_type=Path), help="Fault plan (TOML) for the simulated robot."
-)
-
-JSON_OPTION = click.option(
-    "--json", "json_output", is_flag=True, help="Result as JSON on standard output, nothing else there."
-)
+def json_option(help_text: str) -> Callable[[Command], Command]:
+    """``--json``."""
+    return click.option("--json", "json_output", is_flag=True, help=help_text)
 
 
 def figure_option(what: str) -> Callable[[Command], Command]:
     """``--figure FILE``; ``what`` says what is drawn."""
-    return click.option(
-        "--figure", "figure_file", type=OutputFile(".png", ".pdf", ".svg"),
-        help=f"{what} (PNG, PDF or SVG).",
-    )  # fmt: skip
+    formats = OutputFile(".png", ".pdf", ".svg")
+    return click.option("--figure", "figure_file", type=formats, help=f"{what} (PNG, PDF or SVG).")
 
 
 def settings_option(which: str) -> Callable[[Command], Command]:
-    """``--set KEY=VALUE``; ``which`` tells what keys there are."""
+    """``--set KEY=VALUE`` as ``settings``, with what other options say; ``which`` tells what keys there are."""
     return click.option(
-        "--set", "settings", multiple=True, callback=_settings, metavar="KEY=VALUE", help=f"{which} May be repeated."
+        "--set", "settings", multiple=True, callback=_take_settings, metavar="KEY=VALUE",
+        help=f"{which} May be repeated.",
+    )  # fmt: skip
+
+
+JSON_OPTION = json_option("Result as JSON on standard output, nothing else there.")
+CONFIG_OPTION = click.option("--config", "config_file", type=PATH, help="Configuration (TOML).")
+TIMEOUT_OPTION = click.option(
+    "--timeout", "timeout_s", type=WaitingTime(), default=10.0, show_default=True, metavar="SECONDS",
+    help="Seconds to wait.",
+)  # fmt: skip
+RUNTIME_DIR_OPTION = click.option("--runtime-dir", type=PATH, help="Folder of the sockets, if not the usual one.")
+FAULTS_OPTION = click.option("--faults", "faults_file", type=PATH, help="Fault plan (TOML) for the simulated robot.")
+SETTINGS_OPTION = settings_option("Any key of the configuration, as in limits.v_max_m_s=0.05.")
+PANELS_OPTION = key_option(
+    "--panels", "run.panels", type=int, metavar="N", help="Only the first N panels of the traversal; 0 takes all."
+)
+WORLD_OPTIONS = options(
+    CONFIG_OPTION,
+    key_option("--mirror", "run.mirror", metavar="NAME", shell_complete=names_of("mirrors"),
+               help="fyst-m1, fyst-m2, thesis-m1, thesis-m2, or a .toml file."),
+    key_option("--world", "run.world", metavar="NAME", shell_complete=names_of("worlds"),
+               help="Simulated world: thesis, thesis-x2, hard, extreme, or a .toml file."),
+    key_option("--seed", "run.seed", type=int, metavar="N", help="Seed of every random draw."),
+    SETTINGS_OPTION,
+)  # fmt: skip
+
+
+def address_options(section: str) -> Callable[[Command], Command]:
+    """``--host`` and ``--port`` of a section of the configuration."""
+    return options(
+        key_option("--host", f"{section}.host", help="Address to listen on."),
+        key_option("--port", f"{section}.port", type=int, help="Port to listen on; 0 takes any free one."),
     )
 
 
-SETTINGS_OPTION = settings_option("Any key of the configuration, as in limits.v_max_m_s=0.05.")
-WORLD_OPTIONS = options(
-    CONFIG_OPTION,
-    click.option(
-        "--mirror",
-        metavar="NAME",
-        shell_complete=names_of("mirrors"),
-        help="fyst-m1, fyst-m2, thesis-m1, thesis-m2, or a .toml file.",
-    ),
-    click.option(
-        "--world",
-        metavar="NAME",
-        shell_complete=names_of("worlds"),
-        help="Simulated world: thesis, thesis-x2, hard, extreme, or a .toml file.",
-    ),
-    click.option("--seed", type=int, metavar="N", help="Seed of every random draw."),
-    SETTINGS_OPTION,
-)
-DAEMON_OPTIONS = options(
-    CONFIG_OPTION,
-    RUNTIME_DIR_OPTION,
-    TIMEOUT_OPTION,
-    click.option("--json", "json_output", is_flag=True, help="The daemon's answer as JSON on standard output."),
-)
-ADDRESS_OPTIONS = options(
-    click.option("--host", help="Address to listen on."),
-    click.option("--port", type=int, help="Port to listen on; 0 takes any free one."),
-)
-
-
 def overrides(settings: Mapping[str, object], named: Mapping[str, object]) -> dict[str, object]:
-    """Command-line values by dotted key: the options that were given, and ``--set`` on top."""
+    """Values by dotted key: those that are given, and ``--set`` on top."""
     return {**{key: value for key, value in named.items() if value is not None}, **settings}
 
 
@@ -273,58 +302,5 @@ def configured_folder(config_file: Path | None, runtime_dir: Path | None) -> Pat
 
         among_beacons = is_radio_file(config_file)
         processes = load_radio_config(config_file).processes if among_beacons else load_config(config_file).run
-        configured = processes.runtime_dir
-        return Path(configured) if configured else None
+        return Path(processes.runtime_dir) if processes.runtime_dir else None
     return runtime_dir
-
-
-def ask_daemon(runtime_dir: Path | None, channel: str, payload: dict[str, object], timeout_s: float) -> dict[str, Any]:
-    """One request to a running daemon.
-
-    Args:
-        runtime_dir: its runtime directory, if not the usual one.
-        channel: ``control`` or ``emergency``.
-
-    Raises:
-        UnreachableError: nobody listens there, or no answer came in time.
-        RefusedError: the daemon said no, and why.
-    """
-    from ccatp.links.client import OperatorClient
-
-    daemon = OperatorClient(runtime_dir, timeout_s)
-    return daemon.ask(str(payload["cmd"])) if channel == "control" else daemon.observatory.ask(payload)
-
-
-def tell(reply: Mapping[str, Any], json_output: bool) -> None:
-    """A daemon's answer on standard output."""
-    if json_output:
-        click.echo(json.dumps(reply))
-        return
-    _tell_rows([(k, v) for k, v in _flat({key: value for key, value in reply.items() if key != "ok"}) if v])
-
-
-def tell_status(reply: Mapping[str, Any], json_output: bool) -> None:
-    """An answer of the operator channel on standard output: where the mission stands."""
-    status = reply.get("status")
-    if json_output or not isinstance(status, Mapping):
-        tell(reply, json_output)
-        return
-    from ccatp.daemon.terminal import status_rows
-
-    _tell_rows(status_rows(status))
-
-
-def _tell_rows(rows: Sequence[tuple[str, str]]) -> None:
-    width = max((len(name) for name, _ in rows), default=0)
-    for name, value in rows:
-        click.echo(f"{name:<{width}}  {value}")
-    if not rows:
-        click.echo("ok")
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, f"{value:.6g}" if isinstance(value, float) else "-" if value is None else str(value)

@@ -1,21 +1,15 @@
-"""The commands ``ccatp config check`` and ``ccatp config schema``.
-
-``ccatp keys``: makes the keys of the observatory channel and of the robot link, and shows the public ones.
-
-The command ``ccatp completion``: the lines that teach a shell our commands, options and names.
-"""
+"""``ccatp config check`` and ``schema``, ``ccatp keys``, ``ccatp completion``."""
 
 import json
 import re
 import shutil
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
-from ccatp.cli.common import NearestChoice, SuggestingGroup, complain, example
+from ccatp.cli.common import PATH, NearestChoice, SuggestingGroup, complain, example, json_option, tell
 from ccatp.errors import ConfigError
 
 
@@ -27,11 +21,10 @@ def config() -> None:
 
 
 @config.command("check", epilog=example("ccatp config check telescope.toml"))
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("file", type=PATH)
 def config_check(file: Path) -> int:
     """Check a configuration; each problem is one line with file, line and key."""
     from ccatp.config.load import is_radio_file, load_config, load_radio_config
-    from ccatp.errors import ConfigError
 
     try:
         if is_radio_file(file):
@@ -62,18 +55,14 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}")
 
 
 def _name(_ctx: click.Context, _param: click.Parameter, name: str | None) -> str | None:
-    """A name that stands in file names and in tables of TOML as it is.
-
-    Raises:
-        click.BadParameter: it does not.
-    """
+    """A name that stands in file names and in tables of TOML as it is."""
     if name is not None and not _NAME.fullmatch(name):
         raise click.BadParameter(f"{name!r}: letters, digits, - and _ only, at most 63")
     return name
 
 
 DIR_OPTION = click.option(
-    "--dir", "folder", type=click.Path(path_type=Path), default=DEFAULT_DIR, show_default=True,
+    "--dir", "folder", type=PATH, default=DEFAULT_DIR, show_default=True,
     help="Folder of the keys, for its owner alone.",
 )  # fmt: skip
 
@@ -99,16 +88,13 @@ def generate(folder: Path, name: str, is_client: bool, force: bool) -> None:
     """Make a CURVE pair for the observatory channel and a key for the robot link."""
     from ccatp.links import auth as files
 
-    suffixes: Sequence[str] = (files.PUBLIC_SUFFIX, files.SECRET_SUFFIX)
-    if not is_client:
-        suffixes = (*suffixes, files.LINK_SUFFIX)
+    suffixes = [files.PUBLIC_SUFFIX, files.SECRET_SUFFIX, *([] if is_client else [files.LINK_SUFFIX])]
     if not force and (there := files.files_in_the_way(folder, name, suffixes)):
         raise ConfigError(f"--dir: {there[0]} exists; choose another --name, or replace it with --force")
     folder = folder.absolute()
     files.make_key_dir(folder)
     public, secret = files.write_pair(folder, name, is_replacing=force)
-    _say(public, "public, for the peers")
-    _say(secret, "secret, stays here")
+    tell([f"{public}  (public, for the peers)", f"{secret}  (secret, stays here)"])
     if is_client:
         key = files.read_public(public, "--dir").decode()
         click.echo(f'\nAdd to the list of clients at the daemon (or role = "clear"):\n\n[clients.{name}]')
@@ -116,9 +102,8 @@ def generate(folder: Path, name: str, is_client: bool, force: bool) -> None:
         click.echo(f"\nThen: ccatp emergency KIND --endpoint tcp://HOST:PORT --server-key ccatp.key --key {secret}")
         return
     link = files.write_link_key(folder, name, is_replacing=force)
-    _say(link, "secret, the same file at the robot")
     clients = files.write_clients(folder, name)
-    _say(clients, "who gets in, nobody so far")
+    tell([f"{link}  (secret, the same file at the robot)", f"{clients}  (clients that get in, none so far)"])
     click.echo("\nAdd to the configuration, and clients to the list (ccatp keys generate --client, at theirs):\n")
     click.echo(f'[robot]\nkey_file = "{link}"\n\n[observatory]\nendpoint = "tcp://ADDRESS:7020"')
     click.echo(f'key_file = "{secret}"\nclients_file = "{clients}"')
@@ -127,7 +112,7 @@ def generate(folder: Path, name: str, is_client: bool, force: bool) -> None:
 @keys.command("show-public", epilog=example("ccatp keys show-public --dir /etc/ccatp/keys"))
 @DIR_OPTION
 @click.option("--name", callback=_name, default=None, help="One of them; all if not given.")
-@click.option("--json", "json_output", is_flag=True, help="As JSON: names and keys.")
+@json_option("As JSON: names and keys.")
 def show_public(folder: Path, name: str | None, json_output: bool) -> None:
     """Show the public keys in a folder."""
     from ccatp.links import auth as files
@@ -141,12 +126,7 @@ def show_public(folder: Path, name: str | None, json_output: bool) -> None:
         click.echo(json.dumps(shown))
         return
     width = max(map(len, shown))
-    for key, value in shown.items():
-        click.echo(f"{key:<{width}}  {value}")
-
-
-def _say(path: Path, what: str) -> None:
-    click.echo(f"{path}  ({what})")
+    tell(f"{key:<{width}}  {value}" for key, value in shown.items())
 
 
 SHELLS = ("bash", "zsh", "fish")
@@ -169,17 +149,12 @@ def completion(context: click.Context, shell: str) -> int:
     """
     from click.shell_completion import get_completion_class
 
-    root = context.find_root().command
-    kind = get_completion_class(shell)
-    if kind is None:  # click knows all of SHELLS
-        raise click.UsageError(f"no completion for {shell}")
-    sys.stdout.write(_source(kind, root, shell))
-    return 0
-
-
-def _source(kind: Any, root: click.Command, shell: str) -> str:
-    """The script; click asks bash for its version first, which is of no use where there is none to ask."""
-    script = kind(root, {}, "ccatp", VARIABLE)
+    kind: Any = get_completion_class(shell)
+    script = kind(context.find_root().command, {}, "ccatp", VARIABLE)
     if shell == "bash" and shutil.which("bash") is None:
-        return str(script.source_template % script.source_vars()) + "\n"
-    return str(script.source()) + "\n"
+        # click asks bash for its version first, which is of no use where there is none to ask.
+        text = script.source_template % script.source_vars()
+    else:
+        text = script.source()
+    sys.stdout.write(f"{text}\n")
+    return 0

@@ -1,21 +1,27 @@
-"""The command ``ccatp plan``.
-
-The command ``ccatp check``.
-
-The command ``ccatp calibrate``.
-"""
+"""What is done before a mission: ``ccatp plan``, ``ccatp check`` and ``ccatp calibrate``."""
 
 import json
-import os
 import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from ccatp.cli.common import JSON_OPTION, RUNTIME_DIR_OPTION, WORLD_OPTIONS, complain, example, figure_option, overrides
+from ccatp.cli.common import (
+    JSON_OPTION,
+    PANELS_OPTION,
+    PATH,
+    RUNTIME_DIR_OPTION,
+    WORLD_OPTIONS,
+    complain,
+    example,
+    figure_option,
+    json_option,
+    key_option,
+    tell,
+)
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
 
 if TYPE_CHECKING:
@@ -32,15 +38,11 @@ if TYPE_CHECKING:
     )
 )
 @WORLD_OPTIONS
-@click.option("--panels", type=int, metavar="N", help="Only the first N panels of the traversal; 0 takes all.")
-@click.option("--filter", "filter_name", metavar="NAME", help="State estimator: some drive a calibration first.")
+@PANELS_OPTION
+@key_option("--filter", "run.filter", metavar="NAME", help="State estimator: some drive a calibration first.")
 @figure_option("Draw the way")
 @JSON_OPTION
-def plan(
-    config_file: Path | None, mirror: str | None, world: str | None, seed: int | None,
-    settings: Mapping[str, object], panels: int | None, filter_name: str | None,
-    figure_file: Path | None, json_output: bool,
-) -> int:  # fmt: skip
+def plan(config_file: Path | None, settings: Mapping[str, object], figure_file: Path | None, json_output: bool) -> int:
     """Tell what a survey would do, without moving anything: order, way, least time, points out of reach.
 
     The exit status is 2 where points are out of reach: a run would be refused.
@@ -49,23 +51,19 @@ def plan(
     from ccatp.mirror.mirror import build_mirror
     from ccatp.survey.composition import make_plan, plan_data, plan_lines
 
-    named = {
-        "run.mirror": mirror, "run.world": world, "run.seed": seed, "run.panels": panels, "run.filter": filter_name,
-    }  # fmt: skip
-    cfg = load_config(config_file, overrides(settings, named))
+    cfg = load_config(config_file, settings)
     geometry = build_mirror(cfg.mirror)
     found = make_plan(cfg, geometry)
     if figure_file is not None:
         from ccatp.report.mirror_map import draw_plan
 
         draw_plan(geometry, found, figure_file)
-    for line in [json.dumps(plan_data(cfg, found))] if json_output else plan_lines(cfg, found):
-        click.echo(line)
+    tell([json.dumps(plan_data(cfg, found))] if json_output else plan_lines(cfg, found))
     if found.out_of_reach:
-        count = len(found.out_of_reach)
         return complain(
-            f"{count} points are out of reach with mission.leg_clearance_m = {cfg.mission.leg_clearance_m:g} and "
-            f"turn_clearance_m = {cfg.mission.turn_clearance_m:g}; a run would be refused",
+            f"{len(found.out_of_reach)} points are out of reach with mission.leg_clearance_m = "
+            f"{cfg.mission.leg_clearance_m:g} and turn_clearance_m = {cfg.mission.turn_clearance_m:g}; "
+            "a run would be refused",
             ExitStatus.USAGE,
         )
     return 0
@@ -77,29 +75,25 @@ STYLES = {"pass": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}
 @click.command(epilog=example("ccatp check --config telescope.toml", "ccatp check --sim", "ccatp check --sim --json"))
 @click.option("--sim", is_flag=True, help="Start the stand-ins of robot and laser system, and check those.")
 @WORLD_OPTIONS
-@click.option(
-    "--runs-dir", type=click.Path(path_type=Path), default="runs", show_default=True, help="Of the recordings."
-)
-@click.option("--json", "json_output", is_flag=True, help="As JSON on standard output, nothing else there.")
+@click.option("--runs-dir", type=PATH, default="runs", show_default=True, help="Of the recordings.")
+@json_option("As JSON on standard output, nothing else there.")
 @RUNTIME_DIR_OPTION
 def check(
-    sim: bool, config_file: Path | None, mirror: str | None, world: str | None, seed: int | None,
-    settings: Mapping[str, object], runs_dir: Path, json_output: bool, runtime_dir: Path | None,
+    sim: bool, config_file: Path | None, settings: Mapping[str, object], runs_dir: Path, json_output: bool,
+    runtime_dir: Path | None,
 ) -> int:  # fmt: skip
     """Look at everything a mission needs before it begins: robot, laser system, sensors, clock, disk, keys.
 
     The robot stands at base. Nothing moves. The status is 1 where something fails, with what to do beside it.
     """
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if not sim and config_file is None:
         raise click.UsageError("name the robot's configuration with --config FILE, or add --sim")
     from ccatp.commissioning.preflight import as_json, failed, has_failed
+    from ccatp.commissioning.probes import probe_all
     from ccatp.config.load import NotASurvey, load_config
 
-    named = {"run.mirror": mirror, "run.world": world, "run.seed": seed}
     try:
-        cfg = load_config(config_file, overrides(settings, named))
-        found = _findings(cfg, config_file, runs_dir, runtime_dir, sim=sim)
+        found = probe_all(load_config(config_file, settings), config_file, runs_dir, runtime_dir, sim=sim)
     except NotASurvey:
         raise
     except ConfigError as error:
@@ -111,58 +105,11 @@ def check(
     return int(ExitStatus.REFUSED if has_failed(found) else ExitStatus.COMPLETE)
 
 
-def _findings(
-    cfg: "Config", config_file: Path | None, runs_dir: Path, runtime_dir: Path | None, *, sim: bool
-) -> "list[PreflightResult]":
-    import asyncio
-    import logging
-    from contextlib import ExitStack
-
-    import structlog
-
-    from ccatp.cli.sim_processes import stand_ins
-    from ccatp.commissioning.preflight import passed
-    from ccatp.commissioning.probes import probe_keys, probe_laser, probe_machine, probe_robot
-    from ccatp.mirror.mirror import build_mirror
-
-    mirror = build_mirror(cfg.mirror)
-    where = config_file or "the default one"
-    found = [passed("configuration", f"{where}: mirror {mirror.name}, {len(mirror.panels)} panels")]
-    found += [*probe_machine(cfg, runs_dir, runtime_dir, os.environ), probe_keys(cfg, sim=sim), _observatory(cfg)]
-
-    async def probe() -> "list[PreflightResult]":
-        robot, laser = await asyncio.gather(probe_robot(cfg, mirror), probe_laser(cfg, mirror))
-        return [*robot, *laser]
-
-    with ExitStack() as stack:
-        # What the clients would log belongs to a daemon; here it would stand in the way of the result.
-        stack.callback(lambda before: structlog.configure(**before), structlog.get_config())
-        structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
-        if sim:
-            cfg = stack.enter_context(stand_ins(cfg))
-        return [*found, *asyncio.run(probe())]
-
-
-def _observatory(cfg: "Config") -> "PreflightResult":
-    from ccatp.commissioning.preflight import failed, passed
-    from ccatp.daemon.command_handlers import check_observatory
-
-    name = "observatory keys"
-    try:
-        keys = check_observatory(cfg.observatory)
-    except ConfigError as error:
-        return failed(name, str(error), "make them with ccatp keys generate")
-    if keys is None:
-        return passed(name, "served at the unix socket alone")
-    return passed(name, f"{cfg.observatory.endpoint}, listed in {cfg.observatory.clients_file}")
-
-
 def _show(found: "Sequence[PreflightResult]") -> None:
     from ccatp.commissioning.preflight import lines
 
     if not sys.stdout.isatty():
-        for line in lines(found):
-            click.echo(line)
+        tell(lines(found))
         return
     from rich.console import Console
     from rich.table import Table
@@ -200,27 +147,40 @@ class DriveFailed(CcatpError):
 @click.option(
     "--length", "length_m", type=click.FloatRange(0.08, 0.5), default=0.2, show_default=True, help="Of a leg, m."
 )
-@click.option("--from", "from_dir", type=click.Path(path_type=Path), help="Do not drive: take the drive of this run.")
-@click.option("--run-dir", type=click.Path(path_type=Path), help="Where to record the drive.")
+@click.option("--from", "from_dir", type=PATH, help="Do not drive: take the drive of this run.")
+@click.option("--run-dir", type=PATH, help="Where to record the drive.")
 @click.option("--dry-run", is_flag=True, help="Drive and tell, but write nothing into the configuration.")
 @JSON_OPTION
 @RUNTIME_DIR_OPTION
 def calibrate(
-    sim: bool, config_file: Path | None, mirror: str | None, world: str | None, seed: int | None,
-    settings: Mapping[str, object], rounds: int, length_m: float, from_dir: Path | None, run_dir: Path | None,
-    dry_run: bool, json_output: bool, runtime_dir: Path | None,
+    sim: bool, config_file: Path | None, settings: Mapping[str, object], rounds: int, length_m: float,
+    from_dir: Path | None, run_dir: Path | None, dry_run: bool, json_output: bool, runtime_dir: Path | None,
 ) -> int:  # fmt: skip
     """Find wheel radius, wheel base and gyroscope bias by a short drive at base, and write them into --config.
 
     The robot goes back and forth at its base and is measured at each end, under the same rules as in a survey.
     """
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if not sim and config_file is None and from_dir is None:
         raise click.UsageError("name the robot's configuration with --config FILE, or add --sim")
-    named = {"run.mirror": mirror, "run.world": world, "run.seed": seed}
-    changes = {**overrides(settings, named), **_drive_settings(rounds, length_m)}
     if from_dir is None:
-        from_dir = _drive(sim, config_file, changes, run_dir, runtime_dir)
+        from ccatp.daemon.run_dir import RunOptions
+        from ccatp.daemon.supervisor import run_survey
+
+        changes = {
+            **settings,
+            "run.order": "calibration",
+            "run.filter": "ekf",  # the four states have no use for the drive and plan none
+            "mission.fix_at_start": True,
+            "mission.calibration_rounds": rounds,
+            "mission.calibration_length_m": length_m,
+        }
+        from_dir = run_dir or Path("runs") / f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-calibration"
+        options = RunOptions(
+            sim=sim, config_file=config_file, overrides=changes, run_dir=from_dir, runtime_dir=runtime_dir,
+            shows_summary=False,
+        )  # fmt: skip
+        if status := run_survey(options):
+            raise DriveFailed(status, from_dir)
     from ccatp.commissioning.calibration import Priors, as_json, check_usable, lines, rows
     from ccatp.commissioning.calibration import calibrate as estimate
     from ccatp.commissioning.calibration_drive import read_drive
@@ -231,8 +191,7 @@ def calibrate(
     found = estimate(on_mirror, drive, priors)
     table = rows(_replaced(config_file, cfg), found)
     if not json_output:
-        for line in lines(table, found):
-            click.echo(line)
+        tell(lines(table, found))
     check_usable(table)
     written, difference = _write(config_file, table, dry_run=dry_run)
     if json_output:
@@ -263,43 +222,11 @@ def _replaced(config_file: Path | None, driven: "Config") -> "Config":
     return cfg
 
 
-def _drive_settings(rounds: int, length_m: float) -> dict[str, object]:
-    return {
-        "run.order": "calibration",
-        "run.filter": "ekf",  # the four states have no use for the drive and plan none
-        "mission.fix_at_start": True,
-        "mission.calibration_rounds": rounds,
-        "mission.calibration_length_m": length_m,
-    }
-
-
-def _drive(
-    sim: bool, config_file: Path | None, changes: Mapping[str, object], run_dir: Path | None, runtime_dir: Path | None
-) -> Path:
-    from ccatp.daemon.run_dir import RunOptions
-    from ccatp.daemon.supervisor import run_survey
-
-    folder = run_dir or Path("runs") / f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-calibration"
-    status = run_survey(
-        RunOptions(
-            sim=sim,
-            config_file=config_file,
-            overrides=changes,
-            run_dir=folder,
-            runtime_dir=runtime_dir,
-            shows_summary=False,
-        )
-    )
-    if status:
-        raise DriveFailed(status, folder)
-    return folder
-
-
 def _write(config_file: Path | None, table: "tuple[CalibrationRow, ...]", *, dry_run: bool) -> tuple[str | None, str]:
     """The file written, if one was, and what changes in it."""
     from ccatp.config.load import difference, load_config, with_values, write_in_place
 
-    values: dict[str, Any] = {row.key: row.rounded for row in table}
+    values = {row.key: row.rounded for row in table}
     if config_file is None:
         return None, "".join(f"{key} = {value}\n" for key, value in values.items())
     load_config(config_file, values)  # what would be refused later is refused now

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ccatp.cli.common import SuggestingGroup, example
+from ccatp.cli.common import PATH, SuggestingGroup, example, json_option
 
 if TYPE_CHECKING:
     from ccatp.records.recording_repair import RecordingFacts
@@ -22,8 +22,8 @@ def recording() -> None:
 @recording.command(
     epilog=example("ccatp recording info runs/tonight", "ccatp recording info runs/tonight/telemetry.mcap --json")
 )
-@click.argument("path", metavar="FILE|RUN_DIR", type=click.Path(path_type=Path))
-@click.option("--json", "json_output", is_flag=True, help="As JSON on standard output, nothing else there.")
+@click.argument("path", metavar="FILE|RUN_DIR", type=PATH)
+@json_option("As JSON on standard output, nothing else there.")
 def info(path: Path, json_output: bool) -> int:
     """Show what a recording holds, and whether every checksum in it is right.
 
@@ -44,9 +44,9 @@ def info(path: Path, json_output: bool) -> int:
 @recording.command(
     epilog=example("ccatp recording repair runs/tonight", "ccatp recording repair telemetry.mcap --out saved.mcap")
 )
-@click.argument("path", metavar="FILE|RUN_DIR", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), help="The new file; FILE.recovered.mcap if not given.")
-@click.option("--json", "json_output", is_flag=True, help="As JSON on standard output, nothing else there.")
+@click.argument("path", metavar="FILE|RUN_DIR", type=PATH)
+@click.option("--out", type=PATH, help="The new file; FILE.recovered.mcap if not given.")
+@json_option("As JSON on standard output, nothing else there.")
 def repair(path: Path, out: Path | None, json_output: bool) -> int:
     """Save what is intact of a recording that was cut off or damaged, as a new file with an index.
 

@@ -1,16 +1,29 @@
 """What is done with a run afterwards: ``ccatp report``, ``compare``, ``plot``, ``align`` and ``replay``."""
 
 import json
-import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ccatp.cli.common import JSON_OPTION, OutputFile, complain, example, figure_option, overrides, settings_option
+from ccatp.cli.common import (
+    JSON_OPTION,
+    PATH,
+    OutputFile,
+    complain,
+    example,
+    figure_option,
+    json_option,
+    key_option,
+    settings_option,
+    tell,
+    warn,
+    write_lines,
+)
 from ccatp.errors import CcatpError, ConfigError, ExitStatus
 
 if TYPE_CHECKING:
@@ -24,13 +37,13 @@ if TYPE_CHECKING:
 _FILE = click.Path(path_type=Path, dir_okay=False)
 _FOLDER = click.Path(path_type=Path, file_okay=False)
 _FIGURES = click.option("--figures", type=_FOLDER, metavar="DIR", help="Also write the figures there: SVG, PNG, PDF.")
-_JSON = click.option("--json", "json_output", is_flag=True, help="The figures of it as JSON on standard output.")
+_JSON = json_option("The figures of it as JSON on standard output.")
 
 
 @click.command(
     epilog=example("ccatp report runs/tonight", "ccatp report runs/tonight --out tonight.html --figures figs")
 )
-@click.argument("run_dir", type=click.Path(path_type=Path))
+@click.argument("run_dir", type=PATH)
 @click.option("--out", type=_FILE, metavar="FILE", help="The page; report.html in the run directory if not given.")
 @_FIGURES
 @_JSON
@@ -40,42 +53,36 @@ def report(run_dir: Path, out: Path | None, figures: Path | None, json_output: b
     Map, errors, how the panels lie, where the time went, events. It takes runs that are over, go on, were killed or
     resumed, and says what is missing.
     """
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads would only fight over them
     from ccatp.report.writer import report_run
 
     path, data, warnings = report_run(run_dir, out, figures)
-    for warning in warnings:
-        complain(f"warning: {warning}", 0)
+    warn(warnings)
     click.echo(json.dumps({"report": str(path), **data}) if json_output else path)
     return 0
 
 
 @click.command(epilog=example("ccatp compare runs/before runs/after", "ccatp compare runs/a runs/b --json"))
-@click.argument("run_a", type=click.Path(path_type=Path))
-@click.argument("run_b", type=click.Path(path_type=Path))
+@click.argument("run_a", type=PATH)
+@click.argument("run_b", type=PATH)
 @click.option("--out", type=_FILE, metavar="FILE", help="The page; compare.html in RUN_B if not given.")
 @_FIGURES
 @_JSON
 def compare(run_a: Path, run_b: Path, out: Path | None, figures: Path | None, json_output: bool) -> int:
     """Put two runs beside each other: figures, configuration, time, errors, and which panels have moved."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from ccatp.report.compare import compare_data, compare_lines
     from ccatp.report.writer import COMPARISON, compare_runs
 
     path = out or run_b / COMPARISON
     pair = compare_runs(run_a, run_b, path, figures)
     for found in (pair.a, pair.b):
-        for warning in found.record.warnings:
-            complain(f"warning: {found.record.name}: {warning}", 0)
-    for line in [json.dumps({"report": str(path), **compare_data(pair)})] if json_output else compare_lines(pair):
-        click.echo(line)
-    if not json_output:
-        click.echo(path)
+        warn(f"{found.record.name}: {warning}" for warning in found.record.warnings)
+    data = {"report": str(path), **compare_data(pair)}
+    tell([json.dumps(data)] if json_output else [*compare_lines(pair), str(path)])
     return 0
 
 
 @click.command(epilog=example("ccatp plot runs/20260101T000000Z-fyst-m1-s1 --out map.png"))
-@click.argument("run_dir", type=click.Path(path_type=Path))
+@click.argument("run_dir", type=PATH)
 @click.option(
     "--out", type=OutputFile(".png", ".pdf", ".svg"), help="The picture; map.png in the run directory if not given."
 )
@@ -93,12 +100,6 @@ def plot(run_dir: Path, out: Path | None) -> int:
 ALIGN_KEYS = ("align.", "robot.puck_height_m", "mirror.")
 
 
-class AlignError(CcatpError):
-    """A result that cannot be written."""
-
-    exit_status = ExitStatus.USAGE
-
-
 @click.command(
     epilog=example(
         "ccatp align runs/tonight",
@@ -106,7 +107,7 @@ class AlignError(CcatpError):
         "ccatp align runs/tonight --json --set align.point_floor_m=2e-6",
     )
 )
-@click.argument("run_dir", type=click.Path(path_type=Path))
+@click.argument("run_dir", type=PATH)
 @settings_option("A key of align or mirror, or robot.puck_height_m, as in align.point_floor_m=2e-6.")
 @click.option("--csv", "csv_file", type=OutputFile(), help="Write a line a panel (CSV).")
 @figure_option("Draw deviations and moves")
@@ -115,17 +116,14 @@ def align(
     run_dir: Path, settings: Mapping[str, object], csv_file: Path | None, figure_file: Path | None, json_output: bool
 ) -> int:
     """Tell how the panels lie and how to turn their adjusters, from the fixes of a run."""
-    # Matrices are small; threads would only fight over them.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from ccatp.mirror.mirror import build_mirror
     from ccatp.mirror.mirror_alignment import compare, survey_result
     from ccatp.records.survey_reader import read_run
     from ccatp.report.alignment import csv_lines, head_lines, result_data, table_lines
 
-    changes = overrides(settings, {})
-    if idle := [key for key in changes if not key.startswith(ALIGN_KEYS)]:
+    if idle := [key for key in settings if not key.startswith(ALIGN_KEYS)]:
         raise ConfigError(f"command line: {idle[0]}: has no effect on the alignment; what has: {', '.join(ALIGN_KEYS)}")
-    survey = read_run(run_dir, changes)
+    survey = read_run(run_dir, settings)
     cfg = survey.cfg
     mirror = build_mirror(cfg.mirror)
     planned = {point.panel for point in survey.planned}
@@ -133,19 +131,17 @@ def align(
     comparison = None if survey.injected is None else compare(result.panels, survey.injected)
     facts = _facts(run_dir, survey, result)
     warnings = [*survey.warnings, *result.warnings]
-    for warning in warnings:
-        complain(f"warning: {warning}", 0)
+    warn(warnings)
     if csv_file is not None:
-        _write(csv_file, csv_lines(result))
+        write_lines("--csv", csv_file, csv_lines(result))
     if figure_file is not None:
         from ccatp.report.mirror_map import draw_alignment
 
         draw_alignment(mirror, result, figure_file, f"{mirror.name}: {len(result.panels)} panels", str(run_dir))
     if json_output:
-        click.echo(json.dumps({**facts, **result_data(result, comparison), "warnings": warnings}))
-        return 0
-    for line in (*head_lines(facts), *table_lines(result, comparison, cfg.align.puck_height_sigma_m)):
-        click.echo(line)
+        tell([json.dumps({**facts, **result_data(result, comparison), "warnings": warnings})])
+    else:
+        tell([*head_lines(facts), *table_lines(result, comparison, cfg.align.puck_height_sigma_m)])
     return 0
 
 
@@ -166,14 +162,6 @@ def _facts(run_dir: Path, survey: "Survey", result: "SurveyResult") -> dict[str,
     }
 
 
-def _write(path: Path, lines: Iterable[str]) -> None:
-    try:
-        with path.open("w", encoding="utf-8") as file:
-            file.writelines(line + "\n" for line in lines)
-    except OSError as error:
-        raise AlignError(f"--csv: cannot write {path}: {error.strerror or error}") from error
-
-
 # The sections of the configuration that a localizer is built from. Everything else has acted on the run already.
 REPLAY_ACTING = ("localizer.", "robot.", "mirror.", "run.filter")
 PROGRESS_S = 50.0
@@ -192,45 +180,37 @@ class ReplayError(CcatpError):
         "ccatp replay runs/tonight --set localizer.full_state.fix_gate_nis=20 --out track.csv",
     )
 )
-@click.argument("run_dir", type=click.Path(path_type=Path))
-@click.option("--filter", "filter_name", metavar="NAME", help="State estimator, if not that of the run: kf, ekf, ukf.")
+@click.argument("run_dir", type=PATH)
+@key_option("--filter", "run.filter", metavar="NAME", help="State estimator, if not that of the run: kf, ekf, ukf.")
 @settings_option("A key of localizer, robot or mirror, as in localizer.full_state.fix_gate_nis=20.")
 @click.option("--smooth", is_flag=True, help="Go back over the run with the smoother, too (not with kf).")
 @click.option("--out", type=OutputFile(), help="Write the estimates of all frames (CSV).")
 @JSON_OPTION
-def replay(
-    run_dir: Path, filter_name: str | None, settings: Mapping[str, object], smooth: bool, out: Path | None,
-    json_output: bool,
-) -> int:  # fmt: skip
+def replay(run_dir: Path, settings: Mapping[str, object], smooth: bool, out: Path | None, json_output: bool) -> int:
     """Run an estimator again over the recorded samples of a run, as it was or with other settings."""
-    # As in the run itself: matrices are small, and another number of threads may round differently.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from ccatp.records.run_reader import open_run
     from ccatp.studies.replay_report import csv_lines, judge, table_lines
 
-    changes = overrides(settings, {"run.filter": filter_name})
     recordings = open_run(run_dir)
-    configs = [_config(recording, changes, smooth) for recording in recordings]
+    configs = [_config(recording, settings, smooth) for recording in recordings]
     started = time.monotonic()
     parts = [_judged(recording, cfg, smooth) for recording, cfg in zip(recordings, configs, strict=True)]
     result = {
         "run_dir": str(run_dir),
-        **_replay_facts(recordings, configs, parts, changes),
+        **_replay_facts(recordings, configs, parts, settings),
         **judge(parts),
         "warnings": [warning for recording in recordings for warning in recording.warnings],
         "wall": {"time_s": round(time.monotonic() - started, 3)},
     }
-    for warning in result["warnings"]:
-        complain(f"warning: {warning}", 0)
+    warn(result["warnings"])
     if out is not None:
-        _replay_write(out, csv_lines(parts))
+        write_lines("--out", out, csv_lines(parts))
     is_as_it_was = result["difference"]["reproduced"]
-    may_differ = bool(changes or result["warnings"])
+    may_differ = bool(settings or result["warnings"])
     lines = [*_head(result), *table_lines(result)]
     if is_as_it_was or may_differ:
         lines.append(f"the replay {'reproduces' if is_as_it_was else 'differs from'} the recorded estimates")
-    for line in [json.dumps(result)] if json_output else lines:
-        click.echo(line)
+    tell([json.dumps(result)] if json_output else lines)
     if is_as_it_was or may_differ:
         return ExitStatus.COMPLETE
     why = "was the run made by another version, or on another CPU?"
@@ -273,6 +253,9 @@ def _replay_facts(
 ) -> dict[str, Any]:  # fmt: skip
     traces = [part.replayed.trace for part in parts]
     outcomes = [part.replayed for part in parts]
+    counts: Counter[str] = Counter()
+    for outcome in outcomes:
+        counts.update(outcome.counts)
     first = next((outcome.first_difference for outcome in outcomes if outcome.first_difference), None)
     return {
         "mirror": configs[-1].mirror.name,
@@ -289,16 +272,8 @@ def _replay_facts(
             "set_aside": sum(outcome.set_aside for outcome in outcomes),
             "first_difference": None if first is None else {"t_s": first[0], "said": first[1]},
         },
-        "counts": _summed([outcome.counts for outcome in outcomes]),
+        "counts": dict(counts),
     }
-
-
-def _summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    total: dict[str, int] = {}
-    for one in counts:
-        for name, number in one.items():
-            total[name] = total.get(name, 0) + number
-    return total
 
 
 def _head(result: Mapping[str, Any]) -> list[str]:
@@ -321,20 +296,12 @@ def _head(result: Mapping[str, Any]) -> list[str]:
 def _progress() -> Callable[[float], None] | None:
     if not sys.stderr.isatty():
         return None
-    told_s = float("-inf")
+    shown_s = float("-inf")
 
-    def tell(t_s: float) -> None:
-        nonlocal told_s
-        if t_s - told_s >= PROGRESS_S:
-            told_s = t_s
+    def show(t_s: float) -> None:
+        nonlocal shown_s
+        if t_s - shown_s >= PROGRESS_S:
+            shown_s = t_s
             click.echo(f"\rreplayed {t_s:.0f} s \r", nl=False, err=True)
 
-    return tell
-
-
-def _replay_write(path: Path, lines: Iterable[str]) -> None:
-    try:
-        with path.open("w", encoding="utf-8") as file:
-            file.writelines(line + "\n" for line in lines)
-    except OSError as error:
-        raise ReplayError(f"--out: cannot write {path}: {error.strerror or error}") from error
+    return show

@@ -1,23 +1,28 @@
 """``ccatp run``, ``dashboard`` and ``stream``: what runs until it is stopped."""
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
 import click
 
 from ccatp.cli.common import (
-    ADDRESS_OPTIONS,
     CONFIG_OPTION,
     FAULTS_OPTION,
+    PANELS_OPTION,
+    PATH,
     RUNTIME_DIR_OPTION,
     WORLD_OPTIONS,
+    address_options,
     configured_folder,
     example,
-    overrides,
+    json_option,
+    key_option,
     renamed_flag,
     settings_option,
 )
+
+PLOTJUGGLER_PORT = 9872
+FOXGLOVE_PORT = 8765
 
 
 @click.command(
@@ -27,12 +32,10 @@ from ccatp.cli.common import (
 )
 @click.option("--sim", is_flag=True, help="Simulate robot and laser system on this machine.")
 @WORLD_OPTIONS
-@click.option("--panels", type=int, metavar="N", help="Only the first N panels of the traversal; 0 takes all.")
-@click.option("--filter", "filter_name", metavar="NAME", help="State estimator: kf, ekf or ukf.")
+@PANELS_OPTION
+@key_option("--filter", "run.filter", metavar="NAME", help="State estimator: kf, ekf or ukf.")
 @click.option("--realtime", is_flag=True, help="Pace the simulation on the wall clock.")
-@click.option(
-    "--run-dir", type=click.Path(path_type=Path), help="Where to write; runs/<time>-<mirror>-s<seed> if not given."
-)
+@click.option("--run-dir", type=PATH, help="Where to write; runs/<time>-<mirror>-s<seed> if not given.")
 @click.option("--resume", is_flag=True, help="Resume the mission in --run-dir.")
 @click.option("--start-held", "held", is_flag=True, help="With --resume: nothing moves until ccatp resume.")
 @click.option(
@@ -40,14 +43,12 @@ from ccatp.cli.common import (
 )
 @renamed_flag("--held", "--start-held")
 @renamed_flag("--recover", "--resume-last")
-@click.option("--json", "json_output", is_flag=True, help="Summary as JSON on standard output, nothing else there.")
+@json_option("Summary as JSON on standard output, nothing else there.")
 @FAULTS_OPTION
 @RUNTIME_DIR_OPTION
 def run(
-    sim: bool, config_file: Path | None, mirror: str | None, world: str | None, seed: int | None,
-    settings: Mapping[str, object], panels: int | None, filter_name: str | None, realtime: bool,
-    run_dir: Path | None, resume: bool, held: bool, recover: bool, json_output: bool,
-    faults_file: Path | None, runtime_dir: Path | None,
+    sim: bool, config_file: Path | None, settings: Mapping[str, object], realtime: bool, run_dir: Path | None,
+    resume: bool, held: bool, recover: bool, json_output: bool, faults_file: Path | None, runtime_dir: Path | None,
 ) -> int:  # fmt: skip
     """Survey the mirror of the configuration and end with a summary."""
     if faults_file is not None and not sim:
@@ -69,30 +70,11 @@ def run(
         from ccatp.sim.ground_truth import read_plan
 
         read_plan(faults_file, lockstep=not realtime)  # mistakes are reported before anything is started
-    named = {
-        "run.mirror": mirror,
-        "run.world": world,
-        "run.seed": seed,
-        "run.panels": panels,
-        "run.filter": filter_name,
-    }
-    return int(
-        run_to_the_end(
-            RunOptions(
-                sim=sim,
-                config_file=config_file,
-                overrides=overrides(settings, named),
-                realtime=realtime,
-                run_dir=run_dir,
-                resume=resume,
-                held=held,
-                recover=recover,
-                json_output=json_output,
-                runtime_dir=runtime_dir,
-                faults_file=faults_file,
-            )
-        )
-    )
+    options = RunOptions(
+        sim=sim, config_file=config_file, overrides=settings, realtime=realtime, run_dir=run_dir, resume=resume,
+        held=held, recover=recover, json_output=json_output, runtime_dir=runtime_dir, faults_file=faults_file,
+    )  # fmt: skip
+    return int(run_to_the_end(options))
 
 
 @click.command(
@@ -100,33 +82,20 @@ def run(
         "ccatp dashboard", "ccatp dashboard --port 8080", "ccatp dashboard --host 0.0.0.0 --token-file page.token"
     )
 )
-@ADDRESS_OPTIONS
-@click.option("--token-file", type=click.Path(path_type=Path), help="File with the token that commands have to carry.")
+@address_options("dashboard")
+@key_option(
+    "--token-file", "dashboard.token_file", type=click.Path(), help="File with the token that commands have to carry."
+)
 @RUNTIME_DIR_OPTION
 @settings_option("A key of dashboard, as in dashboard.rate_hz=5.")
-def dashboard(
-    host: str | None,
-    port: int | None,
-    token_file: Path | None,
-    runtime_dir: Path | None,
-    settings: Mapping[str, object],
-) -> int:
+def dashboard(runtime_dir: Path | None, settings: Mapping[str, object]) -> int:
     """Show a running daemon on a web page, and command it from there; Ctrl-C ends the page and nothing else.
 
     A run has a page of its own unless dashboard.enabled is false.
     """
     from ccatp.daemon.dashboard import attach
 
-    named = {
-        "dashboard.host": host,
-        "dashboard.port": port,
-        "dashboard.token_file": None if token_file is None else str(token_file),
-    }
-    return attach(runtime_dir, overrides(settings, named), click.echo)
-
-
-PLOTJUGGLER_PORT = 9872
-FOXGLOVE_PORT = 8765
+    return attach(runtime_dir, settings, click.echo)
 
 
 @click.command(
@@ -139,9 +108,7 @@ FOXGLOVE_PORT = 8765
 @click.option("--port", type=click.IntRange(0, 65535), default=PLOTJUGGLER_PORT, show_default=True, help="Its port.")
 @click.option("--foxglove", is_flag=True, help="Serve Foxglove and Lichtblick by WebSocket (extra foxglove).")
 @click.option(
-    "--foxglove-port",
-    type=click.IntRange(0, 65535),
-    help=f"Its port, else {FOXGLOVE_PORT}; implies --foxglove.",
+    "--foxglove-port", type=click.IntRange(0, 65535), help=f"Its port, else {FOXGLOVE_PORT}; implies --foxglove."
 )
 @click.option("--open-to-network", is_flag=True, help="Let --host be another address than this machine's own.")
 def stream(
@@ -152,7 +119,6 @@ def stream(
 
     It may be started and ended at any time; runs do not notice. A viewer that comes late gets the panels' map at once.
     """
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from ccatp.daemon.streaming import serve
 
     foxglove_port = FOXGLOVE_PORT if foxglove and foxglove_port is None else foxglove_port

@@ -1,43 +1,35 @@
-"""The commands ``ccatp sim robot`` and ``ccatp sim etalon``.
+"""The commands ``ccatp sim robot``, ``ccatp sim etalon`` and ``ccatp conformance``."""
 
-The command ``ccatp conformance``.
-"""
-
-import difflib
 import json
 import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from ccatp.cli.common import (
-    ADDRESS_OPTIONS,
     FAULTS_OPTION,
     JSON_OPTION,
+    PATH,
     RUNTIME_DIR_OPTION,
     WORLD_OPTIONS,
     SuggestingGroup,
     WaitingTime,
+    address_options,
     complain,
     example,
-    overrides,
+    nearest_hint,
 )
 from ccatp.errors import ConfigError
 
-if TYPE_CHECKING:
-    from ccatp.commissioning.conformance.harness import Facts
-
-
 # No laser reaches farther.
 FARTHEST_PUCK_M = 1000.0
+FAILED = 1
+Place = tuple[float, float, float]
 
 
-def _finite(
-    _ctx: click.Context, _param: click.Parameter, place: tuple[float, float, float] | None
-) -> tuple[float, float, float] | None:
+def _finite(_ctx: click.Context, _param: click.Parameter, place: Place | None) -> Place | None:
     if place is not None and not all(abs(value) <= FARTHEST_PUCK_M for value in place):
         raise click.BadParameter(f"each of X Y Z is a number of metres, at most {FARTHEST_PUCK_M:g} from the origin")
     return place
@@ -57,14 +49,13 @@ def sim() -> None:
 @sim.command(
     "robot", epilog=example("ccatp sim robot --port 7010 --mirror fyst-m2", "ccatp sim robot --lockstep --seed 3")
 )
-@ADDRESS_OPTIONS
+@address_options("sim.robot")
 @WORLD_OPTIONS
 @click.option("--realtime/--lockstep", default=True, show_default=True, help="Wall clock, or wait for each command.")
 @FAULTS_OPTION
 @RUNTIME_DIR_OPTION
 def sim_robot(
-    host: str | None, port: int | None, config_file: Path | None, mirror: str | None, world: str | None,
-    seed: int | None, settings: Mapping[str, object], realtime: bool, faults_file: Path | None,
+    config_file: Path | None, settings: Mapping[str, object], realtime: bool, faults_file: Path | None,
     runtime_dir: Path | None,
 ) -> int:  # fmt: skip
     """Run the simulated robot behind the robot link, for any controller."""
@@ -72,43 +63,31 @@ def sim_robot(
     from ccatp.daemon.sim_robot import run_alone
     from ccatp.sim.ground_truth import read_plan
 
-    named = {"sim.robot.host": host, "sim.robot.port": port, "run.mirror": mirror, "run.world": world, "run.seed": seed}
     if config_file is not None and is_radio_file(config_file):
         from ccatp.daemon.sim_robot import run_beacons_alone
 
-        among_beacons = load_radio_config(config_file, overrides(settings, named))
+        among_beacons = load_radio_config(config_file, settings)
         return int(run_beacons_alone(among_beacons, lockstep=not realtime, runtime_dir=runtime_dir))
-    cfg = load_config(config_file, overrides(settings, named))
+    cfg = load_config(config_file, settings)
     plan = None if faults_file is None else read_plan(faults_file, lockstep=not realtime)
     return int(run_alone(cfg, lockstep=not realtime, faults=plan, runtime_dir=runtime_dir))
 
 
 @sim.command("etalon", epilog=example("ccatp sim etalon --port 2001 --puck 0.1 -0.5 3.4"))
-@ADDRESS_OPTIONS
+@address_options("sim.etalon")
 @WORLD_OPTIONS
 @click.option(
-    "--puck",
-    "puck_world_m",
-    type=(float, float, float),
-    callback=_finite,
-    metavar="X Y Z",
+    "--puck", "puck_world_m", type=(float, float, float), callback=_finite, metavar="X Y Z",
     help="Where the puck stands: world frame, metres.",
-)
+)  # fmt: skip
 @click.option(
-    "--truth",
-    callback=_endpoint,
-    metavar="ENDPOINT",
+    "--truth", callback=_endpoint, metavar="ENDPOINT",
     help="Follow the true puck that a simulated robot publishes there.",
-)
-@click.option(
-    "--runtime-dir",
-    type=click.Path(path_type=Path),
-    help="Follow the true puck of the simulated robot that has this folder.",
-)
+)  # fmt: skip
+@click.option("--runtime-dir", type=PATH, help="Follow the true puck of the simulated robot that has this folder.")
 def sim_etalon(
-    host: str | None, port: int | None, config_file: Path | None, mirror: str | None, world: str | None,
-    seed: int | None, settings: Mapping[str, object],
-    puck_world_m: tuple[float, float, float] | None, truth: str | None, runtime_dir: Path | None,
+    config_file: Path | None, settings: Mapping[str, object], puck_world_m: Place | None, truth: str | None,
+    runtime_dir: Path | None,
 ) -> int:  # fmt: skip
     """Run the simulated MultiLine server; the puck stands at the base unless set otherwise."""
     from ccatp.config.load import load_config
@@ -122,17 +101,7 @@ def sim_etalon(
         from ccatp.links.runtime_dir import runtime_dir_path
 
         truth = f"ipc://{runtime_dir_path(str(runtime_dir), {})}/puck"
-    named = {
-        "sim.etalon.host": host,
-        "sim.etalon.port": port,
-        "run.mirror": mirror,
-        "run.world": world,
-        "run.seed": seed,
-    }
-    return int(run_alone(load_config(config_file, overrides(settings, named)), puck_world_m, truth))
-
-
-FAILED = 1
+    return int(run_alone(load_config(config_file, settings), puck_world_m, truth))
 
 
 @click.command(
@@ -150,14 +119,9 @@ FAILED = 1
 @click.option("--no-motion", is_flag=True, help="Leave out the checks that turn wheels.")
 @click.option("--only", multiple=True, metavar="ID", help="Run only this check. May be repeated.")
 @click.option(
-    "--timeout",
-    "timeout_s",
-    type=WaitingTime(),
-    metavar="SECONDS",
-    default=3.0,
-    show_default=True,
+    "--timeout", "timeout_s", type=WaitingTime(), metavar="SECONDS", default=3.0, show_default=True,
     help="Seconds to wait for an answer.",
-)
+)  # fmt: skip
 @JSON_OPTION
 def conformance(
     server: str, key_file: str | None, no_motion: bool, only: Sequence[str], timeout_s: float, json_output: bool
@@ -166,13 +130,30 @@ def conformance(
 
     Wheels turn slowly and for a moment, unless --no-motion. In the end the robot is held, its fans as they were.
     """
-    from ccatp.commissioning.conformance.runner import Conformance, as_json, check_ids, last_line, table_line
+    from ccatp.commissioning.conformance.motion_checks import extent
+    from ccatp.commissioning.conformance.runner import CHECKS, Conformance, as_json, check_ids, last_line, table_line
+    from ccatp.links.robot_link import read_key
 
-    address = _address(server)
-    _check_ids(only, check_ids())
-    checks = Conformance(address, _key(key_file), timeout_s)
-    if not no_motion:
-        _announce(checks.facts, only)
+    host, _, port = server.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")
+    if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
+        raise click.UsageError(f"{server!r} is not HOST:PORT, as in 127.0.0.1:7010")
+    if unknown := [name for name in only if name not in check_ids()]:
+        raise click.UsageError(f"--only: no check {unknown[0]!r}; {nearest_hint(unknown[0], check_ids())}")
+    try:
+        key = read_key(key_file or "")
+    except ConfigError as error:
+        raise ConfigError(str(error).replace("robot.key_file", "--key", 1)) from error
+    checks = Conformance((host, int(port)), key, timeout_s)
+    moving = [check for check in CHECKS if "motion" in check.needs and (not only or check.check_id in only)]
+    if moving and not no_motion and checks.facts is not None:
+        most = extent(checks.facts)
+        complain(
+            f"wheels will turn in {len(moving)} checks, each at most {most.rate_rad_s:g} rad/s "
+            f"({1e3 * most.speed_m_s:.0f} mm/s) for {most.time_s:.2f} s: {1e3 * most.way_m:.0f} mm, "
+            f"{math.degrees(most.turn_rad):.0f} degrees; --no-motion leaves them out",
+            0,
+        )
     results = checks.run(
         motion=not no_motion,
         only=only,
@@ -180,45 +161,3 @@ def conformance(
     )
     click.echo(json.dumps(as_json(server, results)) if json_output else last_line(results))
     return FAILED if any(result.outcome == "fail" for result in results) else 0
-
-
-def _announce(facts: "Facts | None", only: Sequence[str]) -> None:
-    """Say that wheels will turn, and by how much at most."""
-    from ccatp.commissioning.conformance.motion_checks import extent
-    from ccatp.commissioning.conformance.runner import CHECKS
-
-    moving = [check for check in CHECKS if "motion" in check.needs and (not only or check.check_id in only)]
-    if facts is None or not moving:
-        return
-    most = extent(facts)
-    complain(
-        f"wheels will turn in {len(moving)} checks, each at most {most.rate_rad_s:g} rad/s "
-        f"({1e3 * most.speed_m_s:.0f} mm/s) for {most.time_s:.2f} s: {1e3 * most.way_m:.0f} mm, "
-        f"{math.degrees(most.turn_rad):.0f} degrees; --no-motion leaves them out",
-        0,
-    )
-
-
-def _address(server: str) -> tuple[str, int]:
-    host, _, port = server.rpartition(":")
-    host = host.removeprefix("[").removesuffix("]")
-    if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
-        raise click.UsageError(f"{server!r} is not HOST:PORT, as in 127.0.0.1:7010")
-    return host, int(port)
-
-
-def _check_ids(only: Sequence[str], known: Sequence[str]) -> None:
-    for name in only:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
-            raise click.UsageError(f"--only: no check {name!r}; {hint}")
-
-
-def _key(key_file: str | None) -> bytes | None:
-    from ccatp.links.robot_link import read_key
-
-    try:
-        return read_key(key_file or "")
-    except ConfigError as error:
-        raise ConfigError(str(error).replace("robot.key_file", "--key", 1)) from error

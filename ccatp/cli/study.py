@@ -1,17 +1,23 @@
-"""The command ``ccatp study``.
-
-The command ``ccatp bench``.
-"""
+"""The commands ``ccatp study`` and ``ccatp bench``."""
 
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
-from ccatp.cli.common import CONFIG_OPTION, JSON_OPTION, SETTINGS_OPTION, WORLD_OPTIONS, example, overrides
+from ccatp.cli.common import (
+    CONFIG_OPTION,
+    JSON_OPTION,
+    PANELS_OPTION,
+    PATH,
+    SETTINGS_OPTION,
+    WORLD_OPTIONS,
+    example,
+    key_option,
+    tell,
+)
 
 
 class _StudyCommand(click.Command):
@@ -35,11 +41,9 @@ class _StudyCommand(click.Command):
 )
 @click.argument("name", metavar="NAME")
 @click.option(
-    "--out",
-    type=click.Path(path_type=Path, file_okay=False),
-    metavar="DIR",
+    "--out", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
     help="Where to write, studies/NAME if not given; a campaign that was stopped goes on there.",
-)
+)  # fmt: skip
 @click.option(
     "--runs", type=click.IntRange(min=1), metavar="N", help="Seeds of each cell; else the study's own number."
 )
@@ -47,25 +51,21 @@ class _StudyCommand(click.Command):
 @click.option("--cluster", metavar="ADDRESS", help="Scheduler of dask.distributed that does the jobs instead.")
 @click.option("--shard", metavar="I/N", help="Only every N-th job, from the I-th on; without it all are put together.")
 @click.option(
-    "--from",
-    "others",
-    multiple=True,
-    type=click.Path(path_type=Path),
-    metavar="DIR",
+    "--from", "others", multiple=True, type=PATH, metavar="DIR",
     help="Take over the jobs that are done there. May be repeated.",
-)
+)  # fmt: skip
 @click.option("--only", multiple=True, metavar="FACTOR=LEVEL[,LEVEL]", help="Only these cells. May be repeated.")
 @click.option("--mirror", "mirrors", multiple=True, metavar="NAME", help="In place of the study's. May be repeated.")
-@click.option("--panels", type=int, metavar="N", help="Only the first N panels of the traversal; 0 takes all.")
-@click.option("--seed", type=int, metavar="N", help="Seed of the first run.")
+@PANELS_OPTION
+@key_option("--seed", "run.seed", type=int, metavar="N", help="Seed of the first run.")
 @CONFIG_OPTION
 @SETTINGS_OPTION
 @click.option("--no-figures", is_flag=True, help="Tables only.")
 @JSON_OPTION
 def study(
     name: str, out: Path | None, runs: int | None, workers: int | None, cluster: str | None, shard: str | None,
-    others: Sequence[Path], only: Sequence[str], mirrors: Sequence[str], panels: int | None, seed: int | None,
-    config_file: Path | None, settings: Mapping[str, object], no_figures: bool, json_output: bool,
+    others: Sequence[Path], only: Sequence[str], mirrors: Sequence[str], config_file: Path | None,
+    settings: Mapping[str, object], no_figures: bool, json_output: bool,
 ) -> int:  # fmt: skip
     """Run the study NAME: many missions or an analysis, with tables, figures and a machine-readable result."""
     from ccatp.studies.engine import limit_threads
@@ -77,21 +77,13 @@ def study(
     from ccatp.studies.registry import find_study
 
     out = out or Path("studies") / name
-    given = overrides(settings, {"run.panels": panels, "run.seed": seed})
     found = find_study(name)
     if isinstance(found, Study):
         options = CampaignOptions(
-            out=out,
-            runs=runs,
-            workers=workers,
-            cluster=cluster,
-            shard=parse_shard(shard) if shard else WHOLE,
-            others=tuple(others),
-            mirrors=tuple(mirrors),
-            only=dict(parse_choice(text) for text in only),
-            settings=given,
-            with_figures=not no_figures,
-        )
+            out=out, runs=runs, workers=workers, cluster=cluster, shard=parse_shard(shard) if shard else WHOLE,
+            others=tuple(others), mirrors=tuple(mirrors), only=dict(parse_choice(text) for text in only),
+            settings=settings, with_figures=not no_figures,
+        )  # fmt: skip
         load = load_radio_config if found.is_radio else load_config
         result = run_campaign(found, lambda keys: load(config_file, keys), options)
     else:
@@ -100,8 +92,8 @@ def study(
             raise CampaignError(f"study {name} has no runs to hand out; leave {surplus[0]} out")
         if runs or workers:
             click.echo(f"ccatp: study {name} is one analysis: --runs and --workers change nothing", err=True)
-        result = _analysed(found, load_config(config_file, given), out)
-    _tell(result, out, json_output)
+        result = _analysed(found, load_config(config_file, settings), out)
+    tell([json.dumps(result) if json_output else (out / "table.md").read_text(encoding="utf-8").rstrip()])
     return 0
 
 
@@ -113,13 +105,8 @@ def _analysed(analysis: Callable[[Any, Path], dict[str, Any]], cfg: Any, out: Pa
     try:
         return analysis(cfg, out)
     except OSError as error:
-        raise CampaignFailed(
-            f"{error.filename or out}: {error.strerror or error}; make room or choose another --out"
-        ) from error
-
-
-def _tell(result: dict[str, Any], out: Path, json_output: bool) -> None:
-    click.echo(json.dumps(result) if json_output else (out / "table.md").read_text(encoding="utf-8").rstrip())
+        what = f"{error.filename or out}: {error.strerror or error}"
+        raise CampaignFailed(f"{what}; make room or choose another --out") from error
 
 
 PAGE = "docs/bench.md"
@@ -135,26 +122,22 @@ PAGE = "docs/bench.md"
 )  # fmt: skip
 @JSON_OPTION
 def bench(
-    config_file: Path | None, mirror: str | None, world: str | None, seed: int | None, settings: Mapping[str, object],
-    quick: bool, steps_only: bool, markdown: Path | None, json_output: bool,
+    config_file: Path | None, settings: Mapping[str, object], quick: bool, steps_only: bool, markdown: Path | None,
+    json_output: bool,
 ) -> int:  # fmt: skip
     """Time this project's parts against peers that compute the same, by turns in one run."""
-    # Matrices are small: threads of the linear algebra would be timed instead. Set before numpy is imported.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import tempfile
 
     from ccatp.config.load import dump_config, load_config
     from ccatp.studies.bench import markdown as page
     from ccatp.studies.bench import run_bench, terminal_lines
 
-    named = {"run.mirror": mirror, "run.world": world, "run.seed": seed}
-    cfg = load_config(config_file, overrides(settings, named))
+    cfg = load_config(config_file, settings)
     with tempfile.TemporaryDirectory(prefix="ccatp-bench-") as folder:
         exact = Path(folder) / "config.toml"
         exact.write_text(dump_config(cfg), encoding="utf-8")
         result = run_bench(cfg, quick=quick, run_args=("--config", str(exact)), missions=not steps_only)
     if markdown is not None:
         markdown.write_text(page(result), encoding="utf-8")
-    for line in [json.dumps(result)] if json_output else terminal_lines(result):
-        click.echo(line)
+    tell([json.dumps(result)] if json_output else terminal_lines(result))
     return 0

@@ -2,16 +2,20 @@
 
 import asyncio
 import ctypes
+import logging
 import os
 import resource
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
 from fcntl import LOCK_EX, LOCK_NB, flock
 from pathlib import Path
+
+import structlog
 
 from ccatp.commissioning.preflight import (
     LASER_NAMES,
@@ -27,13 +31,19 @@ from ccatp.commissioning.preflight import (
     skipped,
     warned,
 )
+from ccatp.config.load import dump_config
 from ccatp.config.models import Config
-from ccatp.errors import CcatpError
+from ccatp.config.package import child_environment
+from ccatp.daemon.child_processes import ENVIRONMENT, listen, simulator_addresses, with_addresses
+from ccatp.daemon.command_handlers import check_observatory
+from ccatp.daemon.process import SUPERVISOR_PID
+from ccatp.daemon.supervisor import PROCESSES
+from ccatp.errors import CcatpError, ConfigError
 from ccatp.etalon_client import EtalonClient, EtalonError, EtalonUnreachable
 from ccatp.links.robot_link import RobotLink, RobotLinkError, read_key
 from ccatp.links.robot_messages import Hello, Sensors
 from ccatp.links.runtime_dir import make_runtime_dir
-from ccatp.mirror.mirror import Mirror
+from ccatp.mirror.mirror import Mirror, build_mirror
 
 LISTEN_S = 3.0
 FIRST_FRAME_S = 2.0
@@ -41,7 +51,69 @@ FIRST_FRAME_S = 2.0
 FREE_BYTES = 2_000_000_000
 WRITES, SLOW_WRITE_S = 20, 0.1
 _TIME_ERROR = 5
+STOP_TIMEOUT_S = 5.0
 _LOCAL = ("127.", "localhost", "::1")
+
+
+def probe_all(
+    cfg: Config, config_file: Path | None, runs_dir: Path, runtime_dir: Path | None, *, sim: bool
+) -> list[PreflightResult]:
+    """Everything a mission needs; with ``sim`` on stand-ins of robot and laser system, which are started for it.
+
+    Raises:
+        ConfigError: the stand-ins cannot listen.
+    """
+    mirror = build_mirror(cfg.mirror)
+    where = config_file or "the default one"
+    found = [passed("configuration", f"{where}: mirror {mirror.name}, {len(mirror.panels)} panels")]
+    found += [*probe_machine(cfg, runs_dir, runtime_dir, os.environ), probe_keys(cfg, sim=sim), _observatory(cfg)]
+
+    async def probe() -> list[PreflightResult]:
+        robot, laser = await asyncio.gather(probe_robot(cfg, mirror), probe_laser(cfg, mirror))
+        return [*robot, *laser]
+
+    with ExitStack() as stack:
+        # What the clients would log belongs to a daemon; here it would stand in the way of the result.
+        stack.callback(lambda before: structlog.configure(**before), structlog.get_config())
+        structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
+        if sim:
+            cfg = stack.enter_context(_stand_ins(cfg))
+        return [*found, *asyncio.run(probe())]
+
+
+@contextmanager
+def _stand_ins(cfg: Config) -> Iterator[Config]:
+    """Start the stand-ins, on any free ports and by the wall clock; yields the configuration with their addresses."""
+    processes = [process for process in PROCESSES if process.is_simulator]
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ccatp-")))
+        any_port = {part: getattr(cfg.sim, part).model_copy(update={"port": 0}) for part in ("robot", "etalon")}
+        cfg = cfg.model_copy(update={"sim": cfg.sim.model_copy(update=any_port)})
+        places = simulator_addresses(cfg)
+        sockets = {p.name: stack.enter_context(listen(p.listens, *places[p.listens])) for p in processes}
+        cfg = with_addresses(cfg, sockets)
+        (folder / "config.toml").write_text(dump_config(cfg), encoding="utf-8")
+        for process in processes:
+            fd = sockets[process.name].fileno()
+            command = [sys.executable, "-m", process.module, "--run-dir", str(folder), "--runtime-dir", str(folder)]
+            child = subprocess.Popen(
+                [*command, "--realtime", "--listen-fd", str(fd)],
+                stdin=subprocess.DEVNULL,
+                stdout=sys.stderr,
+                pass_fds=(fd,),
+                env={**child_environment(os.environ), **ENVIRONMENT, SUPERVISOR_PID: str(os.getpid())},
+            )
+            stack.callback(_end, child)
+        yield cfg
+
+
+def _end(child: "subprocess.Popen[bytes]") -> None:
+    child.terminate()
+    try:
+        child.wait(STOP_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        child.kill()
+        child.wait()
 
 
 async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -> list[PreflightResult]:
@@ -65,46 +137,36 @@ async def probe_robot(cfg: Config, mirror: Mirror, listen_s: float = LISTEN_S) -
         has_changed.set()
         is_lost.set()
 
+    name = "robot link"
     try:
         key = read_key(cfg.robot.key_file)
     except CcatpError as error:
-        return [failed("robot link", str(error), "see ccatp keys"), *skipped(ROBOT_NAMES, "no robot link")]
+        return [failed(name, str(error), "see ccatp keys"), *skipped(ROBOT_NAMES, "no robot link")]
     link = RobotLink(
         host=cfg.robot.host, port=cfg.robot.port, role="monitor", client="check", key=key,
         on_sensors=take, on_lost=lose, on_joined=hellos.append,
     )  # fmt: skip
     try:
         await link.connect(cfg.robot.connect_timeout_s)
-        await _listen(has_changed, is_lost, listen_s)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(FIRST_FRAME_S):
+                await has_changed.wait()
+            async with asyncio.timeout(listen_s):
+                await is_lost.wait()
     except RobotLinkError as error:
         todo = "switch the robot on; check [robot] host, port and key_file; end what else drives it"
-        return [failed("robot link", str(error), todo), *skipped(ROBOT_NAMES, "no robot link")]
+        return [failed(name, str(error), todo), *skipped(ROBOT_NAMES, "no robot link")]
     finally:
         link.close()
-    hello = hellos[0]
-    found = [_link_finding(cfg, hello)]
     if lost or not frames:
         why = lost[0] if lost else f"no sensors frame within {FIRST_FRAME_S:g} s"
-        lost_link = failed("robot link", why, "look at the robot's own log")
-        return [lost_link, *skipped(ROBOT_NAMES, "no frames")]
-    return [*found, *check_robot(cfg, mirror, RobotReport(hello, frames, arrived_s))]
-
-
-async def _listen(has_changed: asyncio.Event, is_lost: asyncio.Event, listen_s: float) -> None:
-    """Wait for the first frame and then for as long as is to be listened; no longer than the session lasts."""
-    with suppress(TimeoutError):
-        async with asyncio.timeout(FIRST_FRAME_S):
-            await has_changed.wait()
-        async with asyncio.timeout(listen_s):
-            await is_lost.wait()
-
-
-def _link_finding(cfg: Config, hello: Hello) -> PreflightResult:
-    found = f"{cfg.robot.host}:{cfg.robot.port}, {hello.protocol}, auth {hello.auth}"
+        return [failed(name, why, "look at the robot's own log"), *skipped(ROBOT_NAMES, "no frames")]
+    hello = hellos[0]
+    found = passed(name, f"{cfg.robot.host}:{cfg.robot.port}, {hello.protocol}, auth {hello.auth}")
     if hello.auth == "none" and not cfg.robot.host.startswith(_LOCAL):
         todo = "anybody on that network can drive it: give it a key (ccatp keys generate, robot.key_file)"
-        return warned("robot link", found, todo)
-    return passed("robot link", found)
+        found = warned(name, found.found, todo)
+    return [found, *check_robot(cfg, mirror, RobotReport(hello, frames, arrived_s))]
 
 
 async def probe_laser(cfg: Config, mirror: Mirror) -> list[PreflightResult]:
@@ -150,6 +212,17 @@ def probe_keys(cfg: Config, *, sim: bool) -> PreflightResult:
     except CcatpError as error:
         return failed("robot key", str(error), "make one with ccatp keys generate, and give the robot the same")
     return passed("robot key", f"{cfg.robot.key_file}" if key else "none configured")
+
+
+def _observatory(cfg: Config) -> PreflightResult:
+    name = "observatory keys"
+    try:
+        keys = check_observatory(cfg.observatory)
+    except ConfigError as error:
+        return failed(name, str(error), "make them with ccatp keys generate")
+    if keys is None:
+        return passed(name, "served at the unix socket alone")
+    return passed(name, f"{cfg.observatory.endpoint}, listed in {cfg.observatory.clients_file}")
 
 
 def _clock() -> PreflightResult:
