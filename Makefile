@@ -3,7 +3,6 @@
 
 PYTHON ?= python3
 VENV ?= .venv
-FAST_VENV ?= .venv-fast
 NEWEST_VENV ?= .venv-newest
 ARGS ?=
 PYTEST_ARGS ?=
@@ -19,7 +18,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --no-input
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
 .PHONY: help run test test-newest newest test-slow slow-tests new-examples sweep tried-in faults docs metrics lint format
-.PHONY: mutants golden golden-quick fast lock clean
+.PHONY: mutants golden golden-quick lock clean
 .DELETE_ON_ERROR:
 .SUFFIXES:
 
@@ -36,7 +35,6 @@ help:
 	@echo "make metrics          size of the code base, calls and files per frame; ARGS=--names lists them"
 	@echo "make lint             lint, types, import contract"
 	@echo "make format           format the code"
-	@echo "make fast             a compiled build beside it, for campaigns: $(FAST_VENV)/bin/ccatp; needs a C compiler"
 	@echo "make lock             pin the dependencies again (needs uv)"
 	@echo "make clean            remove the environment and every cache; runs/ stays"
 
@@ -74,10 +72,8 @@ slow-tests: $(VENV)/.installed-dev
 new-examples: $(VENV)/.installed-dev
 	$(PYTEST) tests/property tests/oracle --hypothesis-profile=explore
 
-# Beside the link to the tests there is no source that would hide the compiled build.
-sweep: $(FAST_VENV)/.installed
-	@mkdir -p build/sweep && ln -sfn ../../tests build/sweep/tests
-	cd build/sweep && $(abspath $(FAST_VENV))/bin/python -m tests.faults.whole_sweep . --workers $(WORKERS)
+sweep: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.faults.whole_sweep build/sweep --workers $(WORKERS)
 
 mutants: $(VENV)/.installed-dev
 	nice -n 19 $(BIN)/python -m tests.mutation $(TARGETS)
@@ -116,12 +112,12 @@ format: $(VENV)/.installed-dev
 
 # The environment. Each stamp is younger than what it was made from; the package itself is installed editable, without
 # its dependencies, by the build backend out of the same lock file: nothing unpinned is downloaded.
-$(BIN)/python $(FAST_VENV)/bin/python:
+$(BIN)/python:
 	@command -v $(PYTHON) >/dev/null || { echo "ccatp: no $(PYTHON); install Python 3.11 or later, or name one: make PYTHON=/path/to/python3" >&2; exit 2; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "ccatp: $(PYTHON) is $$($(PYTHON) -V 2>&1); Python 3.11 or later is needed, name one: make PYTHON=python3.12" >&2; exit 2; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "ccatp: $(PYTHON) cannot make virtual environments; on Debian: apt install python3-venv" >&2; exit 2; }
-	@echo "ccatp: making $(@:/bin/python=)"
-	@$(PYTHON) -m venv --clear $(@:/bin/python=)
+	@echo "ccatp: making $(VENV)"
+	@$(PYTHON) -m venv --clear $(VENV)
 
 $(VENV)/.installed: requirements.lock pyproject.toml | $(BIN)/python
 	@echo "ccatp: installing the pinned dependencies into $(VENV)"
@@ -134,23 +130,6 @@ $(VENV)/.installed-dev: requirements-dev.lock $(VENV)/.installed
 	@$(PIP) install --require-hashes --no-deps --prefer-binary -r requirements-dev.lock
 	@touch $@
 
-# The compiled build in an environment of its own: nothing compiled lies in the source, nothing edited is shadowed.
-FAST_PIP = $(FAST_VENV)/bin/python -m pip --disable-pip-version-check --quiet --no-input
-FAST_SOURCES := $(shell find ccatp configs packaging/compiled -type f -not -name '*.pyc')
-
-fast: $(FAST_VENV)/.installed
-
-$(FAST_VENV)/.installed: requirements-compiled.lock pyproject.toml $(FAST_SOURCES) | $(FAST_VENV)/bin/python
-	@echo "ccatp: installing the pinned dependencies into $(FAST_VENV)"
-	@$(FAST_PIP) install --require-hashes --no-deps --prefer-binary -r requirements-compiled.lock
-	@echo "ccatp: compiling, which takes some minutes"
-	@rm -rf build/compiled && mkdir -p build/compiled
-	@$(FAST_VENV)/bin/python packaging/compiled/build.py . build/compiled >build/compiled/log 2>&1 || \
-		{ grep '^ccatp:' build/compiled/log >&2 || tail -n 20 build/compiled/log >&2; exit 2; }
-	@$(FAST_PIP) install --no-deps --force-reinstall build/compiled/*.whl
-	@touch $@
-	@$(FAST_VENV)/bin/ccatp --version
-
 # `make lock` keeps the versions that still fit; `make lock LOCK_ARGS=--upgrade` takes the newest. One version of each
 # package for all Pythons (--fork-strategy fewest), so that types are checked against and numbers come from the same numpy.
 UV ?= uv
@@ -161,8 +140,7 @@ UV_COMPILE = $(UV) pip compile --quiet --universal --generate-hashes --no-emit-i
 lock:
 	$(UV_COMPILE) --output-file requirements.lock
 	$(UV_COMPILE) --group dev --all-extras --constraint requirements.lock --output-file requirements-dev.lock
-	$(UV_COMPILE) --group compiled --extra tune --extra cluster --extra peers --constraint requirements-dev.lock --output-file requirements-compiled.lock
 
 clean:
-	rm -rf $(VENV) $(FAST_VENV) $(NEWEST_VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(NEWEST_VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find ccatp tests -name __pycache__ -type d -prune -exec rm -rf {} +

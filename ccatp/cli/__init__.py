@@ -10,7 +10,6 @@ import click
 import ccatp
 from ccatp.cli import config, operate, prepare, radio, recording, report, run, sim, study
 from ccatp.cli.common import SuggestingGroup, example, run_command_line
-from ccatp.config.package import COMPILED, build
 
 COMMANDS = (
     # before a mission
@@ -35,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     epilog=example("ccatp run --sim", "ccatp run --sim --mirror fyst-m2 --seed 2", "ccatp status --json"),
 )
-@click.version_option(ccatp.__version__, message="ccatp %(version)s" + (" compiled" if build() == COMPILED else ""))
+@click.version_option(ccatp.__version__, message="ccatp %(version)s")
 def cli() -> None:
     """Survey telescope mirrors with a laser-tracked robot."""
 

@@ -1,19 +1,11 @@
-"""This package: which build of it runs, and how a child process gets the very same."""
+"""Where the shipped configurations are, and how a child process runs this very package."""
 
 import os
 import sys
 from collections.abc import Mapping
-from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
-COMPILED, INTERPRETED = "compiled", "interpreted"
 ROOT = Path(__file__).resolve().parents[1]
-
-
-def build(root: Path = ROOT) -> str:
-    """``compiled`` where the frame path is machine code (``make fast``), else ``interpreted``."""
-    is_machine_code = any((root / "survey" / f"mission{suffix}").is_file() for suffix in EXTENSION_SUFFIXES)
-    return COMPILED if is_machine_code else INTERPRETED
 
 
 def configs_dir(root: Path = ROOT) -> Path:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.config.package import build, child_environment
+from ccatp.config.package import child_environment
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError
 from ccatp.studies.bench_cases import (
@@ -255,7 +255,6 @@ def machine(cpu_info: Path = CPU_INFO) -> dict[str, object]:
         "cpu": cpu_model(cpu_info),
         "cores": cores,
         "python": platform.python_version(),
-        "build": build(),
         **{name: _version(name) for name in PACKAGES},
         "blas_threads": os.environ.get("OPENBLAS_NUM_THREADS"),
     }
@@ -339,8 +338,7 @@ def terminal_lines(result: Mapping[str, Any]) -> list[str]:
 def machine_line(machine: Mapping[str, Any]) -> str:
     """The machine in one line."""
     packages = [f"{name} {machine[name]}" for name in PACKAGES[1:] if machine[name]]
-    build = f"ccatp {machine['build']}"
-    return ", ".join([machine["cpu"], f"{machine['cores']} cores", f"Python {machine['python']}", build, *packages])
+    return ", ".join([machine["cpu"], f"{machine['cores']} cores", f"Python {machine['python']}", *packages])
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

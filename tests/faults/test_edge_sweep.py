@@ -1,7 +1,7 @@
 """The rim of all four mirrors, centimetre by centimetre, and ways over the seams: nobody falls, no false edge.
 
-One part of 96 is swept by the slow tests, which measure for the fault table. All of it, 4 million drives, takes the
-compiled build some three hours of one core: ``make sweep``, which ``make test-slow`` ends with.
+One part of 96 is swept by the slow tests, which measure for the fault table. All of it, 4 million drives, takes
+five to nine hours of one core: ``make sweep``, which ``make test-slow`` ends with.
 """
 
 import json

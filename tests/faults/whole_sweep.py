@@ -1,7 +1,7 @@
 """The whole edge sweep, in blocks: every drive over the rim, every turn beside it, 300,000 ways over seams.
 
-``make sweep`` runs it with the compiled build. Each block is a line of ``blocks.jsonl``. A stopped sweep goes on
-there; what another build swept does not count.
+``make sweep`` runs it, five to nine hours of one core. Each block is a line of ``blocks.jsonl``. A stopped sweep
+goes on there; what another build swept does not count.
 """
 
 import argparse

@@ -1,23 +1,14 @@
-"""Which build runs, and that children run the same."""
+"""Children run the package of their parent."""
 
 import os
 import subprocess
 import sys
-from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
 import pytest
 
 import ccatp
 from ccatp.config import package
-
-
-def test_a_machine_code_mission_makes_the_build_compiled(tmp_path: Path) -> None:
-    (tmp_path / "survey").mkdir()
-    (tmp_path / "survey" / "mission.py").touch()
-    assert package.build(tmp_path) == "interpreted"
-    (tmp_path / "survey" / f"mission{EXTENSION_SUFFIXES[0]}").touch()
-    assert package.build(tmp_path) == "compiled"
 
 
 @pytest.mark.parametrize("is_installed", [True, False])
