@@ -11,104 +11,51 @@ outranks normal operation (0). The cause is that of the rule that takes the most
 * an emergency: code 2, latched, motion permitted, because the robot shall drive home
   (``ccatp.safety.emergency_latch``); in an earthquake nothing is permitted until it is cleared.
 
-The monitors of ``ccatp.safety.monitor`` check every frame. Each finding has a severity; the gravest wins and
-gives the verdict its cause, and any finding that holds the wheels withholds the permit, whatever else is going on. An
-edge that is to be left keeps its code and its cause as long as nothing holds the wheels.
+The monitors of ``ccatp.safety.monitor`` check every frame. Each finding has a severity; the gravest wins and gives the
+verdict its cause, and any finding that holds the wheels withholds the permit. An edge that is to be left keeps its code
+and its cause as long as nothing holds the wheels.
 """
 
 from collections.abc import Sequence
 from math import isfinite
-from typing import NamedTuple, Protocol
+
+import msgspec
 
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
 from ccatp.core import Corner, EdgeSample, EmergencyKind, EventCode, Severity, Verdict, WheelSample
-from ccatp.safety.edge_detector import EdgeDetector, EdgeMap, EdgePhase, MirrorMap
-from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule, PoseEstimate
+from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import EstimateMessage
+from ccatp.mirror.mirror import Mirror
+from ccatp.safety.edge_detector import EdgeDetector, EdgeMap, EdgePhase
+from ccatp.safety.edge_rule import CentreClearanceCheck, EdgeRule
 from ccatp.safety.emergency_latch import HEARD_AFTER_FRAMES, EmergencyLatch, is_at_base_or_held
 from ccatp.safety.escalation import MonitorFinding, SeverityEscalation, denies, gravest
-from ccatp.safety.monitor import CommandedMotion, HealthMonitor, MonitorFrame
+from ccatp.safety.monitor import HealthMonitor
 from ccatp.safety.robot_clock import SteadyTime
-from ccatp.safety.sensor_monitors import FramingErrorRate, Ground
+from ccatp.safety.sensor_monitors import FramingErrorRate
 
 CORNERS = tuple(Corner)
 CLOCK_JUMP_S = 0.1
 CENTRE = "the robot's centre is close to the rim on the map"
-NOWHERE = (False, False, False, False)
 EVERYWHERE = (True, True, True, True)
-_STALE = Severity.PAUSE
 _NORMAL = EventCode.NORMAL  # a member looked up on its class in every frame costs more than the verdict made of it
-
-
-class _Missing(NamedTuple):
-    """Data without which nothing is permitted: what, how old, against what age."""
-
-    signal: str
-    cause: str
-    age_s: float
-    limit_s: float
-
-
-class SensorsFrame(MonitorFrame, Protocol):
-    """The part of a sensors frame that the rules read."""
-
-    @property
-    def seq(self) -> int:
-        """Number of the frame."""
-
-    @property
-    def t(self) -> float:
-        """Robot time, s."""
-
-    @property
-    def enc(self) -> Sequence[WheelSample]:
-        """Encoder samples, oldest first."""
-
-    @property
-    def edge(self) -> list[EdgeSample]:
-        """Edge samples, oldest first."""
-
-
-class _Shifted(NamedTuple):
-    seq: int
-    t_s: float
-    x_m: float
-    y_m: float
-    heading_rad: float
-    sigma_m: float
-    state: str
-    commanded: tuple[float, float, float, float] | None
-    drive_seq: int
-
-
-class PoseReport(PoseEstimate, CommandedMotion, Protocol):
-    """Main's estimate: pose, the state of the mission, what the wheels were told."""
-
-    @property
-    def state(self) -> str:
-        """Mission state."""
 
 
 class DangerMonitor:
     """Judges sensors frames. Call ``step`` once per frame, ``stale`` when no frame came in time.
 
-    Args:
-        health: limits of the monitors; without them the rules of edges, ages and emergencies stand alone.
+    Without ``health`` there are no monitors: only the rules of edges, ages and emergencies.
     """
 
     def __init__(
-        self, mirror: MirrorMap, robot: RobotConfig, cfg: DangerConfig, health: HealthConfig | None = None
+        self, mirror: Mirror, robot: RobotConfig, cfg: DangerConfig, health: HealthConfig | None = None
     ) -> None:
-        """No frame judged yet: nothing is permitted until the first."""
         self._cfg, self._sensors_m, self._health = cfg, robot.edge_sensors_m, health
         self._map = EdgeMap(mirror)
         self._edges = EdgeRule(self._map, robot, cfg)
         self._board: HealthMonitor | None = None
         if health is not None:
-            base = mirror.base_pose
-            ground = Ground(dict(mirror.panels), mirror.nearest_panel, self._map.place)
-            self._board = HealthMonitor(
-                health, cfg, robot, ground, (base.x_m, base.y_m), mirror.overhang, self._is_explained
-            )
+            self._board = HealthMonitor(health, cfg, robot, mirror, self._is_explained)
             self._ladder = SeverityEscalation(health)
             self._garbled = FramingErrorRate(health.garbled_lines, health.garbled_window_s)
         self._time = SteadyTime(CLOCK_JUMP_S if health is None else health.clock_jump_s)
@@ -118,12 +65,12 @@ class DangerMonitor:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a new session with the robot (its clock and numbers begin anew). Emergencies stay latched."""
+        """Begin a new session with the robot (its clock and numbers start again). Emergencies stay latched."""
         self._edges.reset()
         self._origin.reset()
         self._edge_t_s: float | None = None
         self._state = ""
-        self._known: PoseReport | None = None
+        self._known: EstimateMessage | None = None
         self._raised_seq = -HEARD_AFTER_FRAMES - 1  # the frame in which the newest emergency was raised
         self._time.reset()
         self._is_climbing = False
@@ -156,10 +103,7 @@ class DangerMonitor:
 
     @property
     def at_base_or_held(self) -> bool:
-        """Whether main's newest estimate, if it was fresh in the last frame, says so.
-
-        What main said before it heard of the newest emergency does not count.
-        """
+        """Whether main's newest estimate says so, if it is fresh and knows of the newest emergency."""
         known = self._known
         if known is None or known.seq <= self._raised_seq + HEARD_AFTER_FRAMES:
             return False
@@ -189,16 +133,8 @@ class DangerMonitor:
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
-    def step(self, sensors: SensorsFrame, estimate: PoseReport | None) -> Verdict:
-        """The verdict on a frame.
-
-        Args:
-            sensors: the frame. One that is not newer than the last one judged changes nothing.
-            estimate: main's newest, usually that of the frame before; ``None`` without one.
-
-        Returns:
-            The verdict; for a frame that is not new, the last verdict again.
-        """
+    def step(self, sensors: Sensors, estimate: EstimateMessage | None) -> Verdict:
+        """The verdict on a frame, with main's newest estimate; a frame that is not new gets the last verdict again."""
         seq = sensors.seq
         wheels: Sequence[WheelSample] = sensors.enc
         samples = sensors.edge
@@ -208,7 +144,8 @@ class DangerMonitor:
         t_s = time.at(seq, sensors.t)
         if time.offset_s or time.jump is not None:
             wheels, samples = time.of_samples(wheels, t_s), time.of_samples(samples, t_s)
-            estimate = self._shifted(estimate)
+            if estimate is not None:
+                estimate = msgspec.structs.replace(estimate, t_s=time.of(estimate.seq, estimate.t_s))
         edges.track.push(wheels)
         self._known = known = estimate if estimate is not None and self._is_fresh(estimate, t_s) else None
         if known is not None:
@@ -234,18 +171,11 @@ class DangerMonitor:
             self.verdict = verdict = self.latch.told(verdict)
         return verdict
 
-    def _shifted(self, estimate: PoseReport | None) -> PoseReport | None:
-        if estimate is None:
-            return None
-        e, t_s = estimate, self._time.of(estimate.seq, estimate.t_s)
-        return _Shifted(e.seq, t_s, e.x_m, e.y_m, e.heading_rad, e.sigma_m, e.state, e.commanded, e.drive_seq)
-
     # -- monitors -------------------------------------------------------------------------------------------------
 
     def _look(
-        self, sensors: SensorsFrame, t_s: float, wheels: Sequence[WheelSample], samples: list[EdgeSample]
+        self, sensors: Sensors, t_s: float, wheels: Sequence[WheelSample], samples: list[EdgeSample]
     ) -> Sequence[MonitorFinding]:
-        """What the monitors find in the frame."""
         board, known, jump = self._board, self._known, self._time.jump
         if board is None:
             return ()
@@ -269,13 +199,11 @@ class DangerMonitor:
         slack_m = cfg.gap_tolerance_m + cfg.seam_extra_m + cfg.map_sigmas * known.sigma_m
         return self._map.has_edge_near(self._map.place(pose, self._sensors_m[sensor]), slack_m)
 
-    def _own_findings(self, missing: _Missing | None) -> list[MonitorFinding]:
-        """Findings of the rules here: data that are missing, the robot lifted, a sensor off for no reason."""
+    def _own_findings(self, missing: MonitorFinding | None) -> list[MonitorFinding]:
         found = []
         if missing is not None:
-            # Without its wheels nobody knows where the robot went meanwhile.
-            severity = Severity.HOLD if missing.signal == "enc" else _STALE
-            found.append(MonitorFinding(severity, missing.cause, missing.signal, missing.age_s, missing.limit_s))
+            # Without its wheels it is not known where the robot went meanwhile.
+            found.append(missing._replace(severity=Severity.HOLD) if missing.signal == "enc" else missing)
         if self._health is None:
             return found
         if self._edges.is_lifted:
@@ -299,7 +227,6 @@ class DangerMonitor:
         return episode.is_doubted
 
     def _is_over_rim(self, sensor: int) -> bool:
-        """Whether a sensor is beyond the rim by the map, so that being off is what it should be."""
         known = self._known
         if known is None:
             return False
@@ -320,7 +247,7 @@ class DangerMonitor:
         is_kept = verdict.code is EventCode.NEAR_EDGE or (
             verdict.code is EventCode.ABORTED and top.severity < Severity.RETURN
         )
-        if not verdict.cause or not is_kept or (holds and top.severity > _STALE):
+        if not verdict.cause or not is_kept or (holds and top.severity > Severity.PAUSE):
             shown = top.cause, top.signal, float(top.value), float(top.limit)
         return Verdict(
             verdict.seq, verdict.t_s, verdict.code, *shown, forward, reverse, turn, verdict.off,
@@ -328,71 +255,61 @@ class DangerMonitor:
         )  # fmt: skip
 
     def stale(self, seq: int, t_s: float) -> Verdict:
-        """The verdict when no sensors frame came for ``stale_after_s``: nothing permitted.
-
-        Args:
-            seq: the last frame's number.
-        """
+        """The verdict when no sensors frame came for ``stale_after_s`` after frame ``seq``: nothing permitted."""
         limit_s = self._stale_after_s
-        return self.latch.told(_denied(seq, t_s, self.code, _Missing("sensors", "no sensors frame", limit_s, limit_s)))
+        return self._denied(seq, t_s, _missing("sensors", "no sensors frame", limit_s, limit_s))
 
     def garbled(self, seq: int, t_s: float, at_s: float) -> Verdict | None:
-        """A line of the robot was no frame. The verdict where there were too many: nothing permitted.
-
-        Args:
-            seq: the last frame's number.
-        """
+        """A line after frame ``seq`` was no frame. The verdict where there were too many: nothing permitted."""
         if self._board is None or not self._garbled.add(at_s):
             return None
-        finding = self._board.garbled()
-        denied = _Missing(finding.signal, finding.cause, finding.value, finding.limit)
-        return self.latch.told(_denied(seq, t_s, self.code, denied, finding.severity))
+        return self._denied(seq, t_s, self._board.garbled())
 
-    def _is_fresh(self, estimate: PoseReport, t_s: float) -> bool:
+    def _denied(self, seq: int, t_s: float, finding: MonitorFinding) -> Verdict:
+        return self.latch.told(_verdict(seq, t_s, self.code, finding))
+
+    def _is_fresh(self, estimate: EstimateMessage, t_s: float) -> bool:
         # Written so that a time that is not a number is not fresh.
         return abs(t_s - estimate.t_s) <= self._estimate_stale_after_s and isfinite(
             estimate.x_m + estimate.y_m + estimate.heading_rad + estimate.sigma_m
         )
 
-    def _missing(self, t_s: float, estimate: PoseReport | None, is_known: bool) -> _Missing | None:
+    def _missing(self, t_s: float, estimate: EstimateMessage | None, is_known: bool) -> MonitorFinding | None:
         limit_s = self._stale_after_s
         if self._edge_t_s is None:
-            return _Missing("edge", "no edge samples", limit_s, limit_s)
+            return _missing("edge", "no edge samples", limit_s, limit_s)
         age_s = abs(t_s - self._edge_t_s)
         if not age_s <= limit_s:
-            return _Missing("edge", "edge samples stale", age_s, limit_s)
+            return _missing("edge", "edge samples stale", age_s, limit_s)
         silent_s = self._edges.track.silence_s(t_s)
         if silent_s > 0.0:
-            return _Missing("enc", "encoder samples stale", silent_s, limit_s)
+            return _missing("enc", "encoder samples stale", silent_s, limit_s)
         return None if is_known else self._estimate_missing(t_s, estimate)
 
-    def _estimate_missing(self, t_s: float, estimate: PoseReport | None) -> _Missing:
+    def _estimate_missing(self, t_s: float, estimate: EstimateMessage | None) -> MonitorFinding:
         # The values go out as JSON: an age that is not finite is no number there.
         limit_s = self._estimate_stale_after_s
         if estimate is None:
-            return _Missing("estimate", "no estimate", limit_s, limit_s)
+            return _missing("estimate", "no estimate", limit_s, limit_s)
         age_s = abs(t_s - estimate.t_s)
         if isfinite(age_s) and age_s > limit_s:
-            return _Missing("estimate", "estimate stale", age_s, limit_s)
-        return _Missing("estimate", "estimate not finite", limit_s, limit_s)
+            return _missing("estimate", "estimate stale", age_s, limit_s)
+        return _missing("estimate", "estimate not finite", limit_s, limit_s)
 
     # -- arbitration ----------------------------------------------------------------------------------------------
 
     def _declared(self) -> EdgeDetector | None:
         return next((e for e in self._edges.episodes if e is not None and e.phase is EdgePhase.DECLARED), None)
 
-    def _arbitrate(self, seq: int, t_s: float, missing: _Missing | None) -> Verdict:
+    def _arbitrate(self, seq: int, t_s: float, missing: MonitorFinding | None) -> Verdict:
         if self._edges.is_lifted:
-            return Verdict(
-                seq, t_s, EventCode.NEAR_EDGE, "lifted or fallen", "edge", 4.0, 3.0, False, False, False, EVERYWHERE
-            )
+            lifted = _missing("edge", "lifted or fallen", 4.0, 3.0, Severity.NONE)
+            return _verdict(seq, t_s, EventCode.NEAR_EDGE, lifted, off=EVERYWHERE)
         declared = self._declared()
-        if declared is not None:
+        if declared is not None or self._origin.direction:
             return self._edge_verdict(seq, t_s, declared, missing)
-        if self._origin.direction:
-            return self._origin_verdict(seq, t_s, missing)
         if missing is not None:
-            return _denied(seq, t_s, self.code, missing)
+            return _verdict(seq, t_s, self.code, missing)
         newest = self.latch.newest
         if newest is None:
             return Verdict(seq, t_s, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
@@ -401,39 +318,38 @@ class DangerMonitor:
         cause, signal = f"emergency: {kind}", f"emergency:{kind}"
         return Verdict(seq, t_s, EventCode.ABORTED, cause, signal, 1.0, 0.0, may_move, may_move, may_move)
 
-    def _edge_verdict(self, seq: int, t_s: float, episode: EdgeDetector, missing: _Missing | None) -> Verdict:
-        front_left, front_right, rear_left, rear_right = off = self._declared_sensors()
-        turn = all(e is None or e.permits_turn for e in self._edges.episodes)
-        known, barred = missing is None, self._origin.direction
-        return Verdict(
-            seq,
-            t_s,
-            EventCode.NEAR_EDGE,
-            str(episode.cause) if missing is None else f"{episode.cause}; {missing.cause}",
-            CORNERS[off.index(True)].value,
-            episode.value_m,
-            episode.limit_m,
-            known and barred <= 0 and not (front_left or front_right),
-            known and barred >= 0 and not (rear_left or rear_right),
-            known and turn and not barred,
-            off,
-        )
-
-    def _origin_verdict(self, seq: int, t_s: float, missing: _Missing | None) -> Verdict:
-        known, origin = missing is None, self._origin
-        front, rear = origin.direction > 0, origin.direction < 0
-        cause = CENTRE if missing is None else f"{CENTRE}; {missing.cause}"
-        off = front, front, rear, rear
-        values = origin.clearance_m, origin.limit_m
-        return Verdict(
-            seq, t_s, EventCode.NEAR_EDGE, cause, "estimate", *values, known and rear, known and front, False, off
-        )
-
-    def _declared_sensors(self) -> tuple[bool, bool, bool, bool]:
-        a, b, c, d = (e is not None and e.phase is EdgePhase.DECLARED for e in self._edges.episodes)
-        return a, b, c, d
+    def _edge_verdict(
+        self, seq: int, t_s: float, declared: EdgeDetector | None, missing: MonitorFinding | None
+    ) -> Verdict:
+        origin, barred = self._origin, self._origin.direction
+        if declared is not None:
+            a, b, c, d = (e is not None and e.phase is EdgePhase.DECLARED for e in self._edges.episodes)
+            off, turn = (a, b, c, d), not barred and all(e is None or e.permits_turn for e in self._edges.episodes)
+            cause, signal = str(declared.cause), CORNERS[off.index(True)].value
+            value, limit = declared.value_m, declared.limit_m
+        else:
+            off, turn = (barred > 0, barred > 0, barred < 0, barred < 0), False
+            cause, signal, value, limit = CENTRE, "estimate", origin.clearance_m, origin.limit_m
+        forward, reverse = barred <= 0 and not (off[0] or off[1]), barred >= 0 and not (off[2] or off[3])
+        permits = (forward, reverse, turn)
+        if missing is not None:
+            cause, permits = f"{cause}; {missing.cause}", (False, False, False)
+        why = _missing(signal, cause, value, limit, Severity.NONE)
+        return _verdict(seq, t_s, EventCode.NEAR_EDGE, why, permits, off)
 
 
-def _denied(seq: int, t_s: float, code: EventCode, missing: _Missing, severity: Severity = _STALE) -> Verdict:
-    signal, cause, age_s, limit_s = missing
-    return Verdict(seq, t_s, code, cause, signal, age_s, limit_s, False, False, False, NOWHERE, severity)
+def _missing(
+    signal: str, cause: str, value: float, limit: float, severity: Severity = Severity.PAUSE
+) -> MonitorFinding:
+    return MonitorFinding(severity, cause, signal, value, limit)
+
+
+def _verdict(
+    seq: int,
+    t_s: float,
+    code: EventCode,
+    why: MonitorFinding,
+    permits: tuple[bool, bool, bool] = (False, False, False),
+    off: tuple[bool, bool, bool, bool] = (False, False, False, False),
+) -> Verdict:
+    return Verdict(seq, t_s, code, why.cause, why.signal, why.value, why.limit, *permits, off, why.severity)

@@ -2,62 +2,14 @@
 
 from enum import Enum, StrEnum, auto
 from math import cos, hypot, inf, sin, sqrt
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 from ccatp.config.models import DangerConfig
 from ccatp.core import DeckPose, PanelId
-from ccatp.mirror.layout import Panel
+from ccatp.mirror.mirror import Mirror
 from ccatp.safety.wheel_odometry import Odometry
 
 Axis = Literal["x", "y"]
-
-
-class RimMap(Protocol):
-    """The outline of a mirror."""
-
-    def signed_distance_m(self, x: float, y: float) -> float:
-        """Distance to the rim, > 0 inside."""
-
-    def segment_clearance_m(self, x0: float, y0: float, x1: float, y1: float) -> float:
-        """Least signed distance along a segment."""
-
-
-class MirrorMap(Protocol):
-    """The part of a mirror that the danger rules look at."""
-
-    @property
-    def gap_m(self) -> float:
-        """Width of a seam."""
-
-    @property
-    def panels(self) -> dict[PanelId, Panel]:
-        """All panels."""
-
-    @property
-    def rim(self) -> RimMap:
-        """The outline."""
-
-    @property
-    def overhang(self) -> bool:
-        """The robot hangs and needs its fans."""
-
-    @property
-    def base_pose(self) -> DeckPose:
-        """Where the robot starts and returns to."""
-
-    @property
-    def nearest_panel(self) -> "NearestPanel":
-        """The panel whose cell is nearest to a deck point."""
-
-    def body_offset(self, p: DeckPose, ox: float, oy: float) -> tuple[float, float]:
-        """Deck place of a point of the robot."""
-
-
-class NearestPanel(Protocol):
-    """Call signature of ``MirrorMap.nearest_panel``."""
-
-    def __call__(self, x: float, y: float) -> PanelId:
-        """The panel nearest to the deck point."""
 
 
 class SeamNear(NamedTuple):
@@ -70,7 +22,7 @@ class SeamNear(NamedTuple):
 class EdgeMap:
     """Look-ups of the edge rule in the deck plane, metres."""
 
-    def __init__(self, mirror: MirrorMap) -> None:
+    def __init__(self, mirror: Mirror) -> None:
         self._mirror = mirror
         self._rim = mirror.rim
         self.gap_m = mirror.gap_m

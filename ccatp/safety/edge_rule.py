@@ -24,12 +24,13 @@ not, four corner sensors cannot.
 
 from collections.abc import Sequence
 from math import cos, hypot, inf, sin
-from typing import Protocol
 
 from ccatp.config.models import DangerConfig, RobotConfig
 from ccatp.control.motion_checks import largest_rate_rad_s
 from ccatp.core import EdgeSample, WheelSample
-from ccatp.safety.edge_detector import EdgeDetector, EdgeLimits, EdgeMap, EdgePhase, RimMap
+from ccatp.links.topics import EstimateMessage
+from ccatp.mirror.rim import Rim
+from ccatp.safety.edge_detector import EdgeDetector, EdgeLimits, EdgeMap, EdgePhase
 from ccatp.safety.wheel_odometry import Odometry, WheelTrack, pose_at
 
 SENSORS = 4
@@ -38,30 +39,6 @@ _STILL_M_S = 5e-4
 _BY_A_FIX = 0.5
 # A fix shows where the robot is, but not at once what it faces: an estimate that was wrong mostly is so in its heading.
 _HEADING_RAD = 0.1
-
-
-class PoseEstimate(Protocol):
-    """The localizer's pose, deck frame."""
-
-    @property
-    def t_s(self) -> float:
-        """Robot time of the pose."""
-
-    @property
-    def x_m(self) -> float:
-        """Deck x."""
-
-    @property
-    def y_m(self) -> float:
-        """Deck y."""
-
-    @property
-    def heading_rad(self) -> float:
-        """Deck heading."""
-
-    @property
-    def sigma_m(self) -> float:
-        """Standard deviation of the position."""
 
 
 class EdgeRule:
@@ -100,7 +77,7 @@ class EdgeRule:
         """No episode is open, nor is the robot lifted."""
         return self._odometry is None
 
-    def step(self, samples: list[EdgeSample], estimate: PoseEstimate | None) -> None:
+    def step(self, samples: list[EdgeSample], estimate: EstimateMessage | None) -> None:
         """Judge a frame's samples, oldest first; those that go back in time are dropped.
 
         The frame's encoder samples must have been pushed to ``track``; ``estimate`` is fresh and finite, or None.
@@ -124,7 +101,7 @@ class EdgeRule:
         if not any(self.episodes) and not self.is_lifted:
             self._odometry = None
 
-    def _sample(self, sample: EdgeSample, odometry: Odometry, estimate: PoseEstimate | None) -> None:
+    def _sample(self, sample: EdgeSample, odometry: Odometry, estimate: EstimateMessage | None) -> None:
         t_s = sample[0]
         dt_s = 0.0 if self._last_t_s is None else t_s - self._last_t_s
         odometry.advance_to(t_s)
@@ -147,7 +124,7 @@ class EdgeRule:
                 self.declared[i] += 1
         self._count_all(off)
 
-    def _tie_to_map(self, odometry: Odometry, estimate: PoseEstimate | None) -> None:
+    def _tie_to_map(self, odometry: Odometry, estimate: EstimateMessage | None) -> None:
         for i, episode in enumerate(self.episodes):
             if episode is not None and episode.needs_map and estimate is not None:
                 self._place(episode, self._offsets[i], odometry, estimate)
@@ -158,7 +135,7 @@ class EdgeRule:
         self._vague_m = max(self._vague_m, sigma_m) if is_still and not has_fix else sigma_m
         return has_fix
 
-    def _look_again(self, odometry: Odometry, estimate: PoseEstimate) -> None:
+    def _look_again(self, odometry: Odometry, estimate: EstimateMessage) -> None:
         """A sensor that a fix shows over a seam begins again there: the edge was declared where the robot was not.
 
         One that it shows at the rim is not to blame for staying off, however far it was moved along there.
@@ -183,14 +160,14 @@ class EdgeRule:
         episode: EdgeDetector,
         offset_m: tuple[float, float],
         odometry: Odometry,
-        estimate: PoseEstimate,
+        estimate: EstimateMessage,
         more_sigma_m: float = 0.0,
     ) -> None:
         known = estimate.x_m, estimate.y_m, estimate.heading_rad
         pose = pose_at(self.track, odometry.t_s, estimate.t_s, known)
         episode.place_on_map(self._map.place(pose, offset_m), pose[2], estimate.sigma_m + more_sigma_m)
 
-    def _open(self, i: int, odometry: Odometry, dt_s: float, estimate: PoseEstimate | None) -> EdgeDetector:
+    def _open(self, i: int, odometry: Odometry, dt_s: float, estimate: EstimateMessage | None) -> EdgeDetector:
         ox, oy = self._offsets[i]
         moved_m = (abs(odometry.v_m_s) + abs(odometry.omega_rad_s) * hypot(ox, oy)) * dt_s
         episode = EdgeDetector(self._limits, self._map, odometry, ((ox, oy), moved_m), self._half_base_m)
@@ -251,7 +228,7 @@ class CentreClearanceCheck:
     must not fall below ``limit_m``.
     """
 
-    def __init__(self, rim: RimMap, robot: RobotConfig, cfg: DangerConfig) -> None:
+    def __init__(self, rim: Rim, robot: RobotConfig, cfg: DangerConfig) -> None:
         self._rim = rim
         self._lead_m = min(min(abs(x), abs(y)) for x, y in robot.edge_sensors_m)
         self._sigmas, self._margin_m = cfg.map_sigmas, cfg.map_margin_m
@@ -265,7 +242,7 @@ class CentreClearanceCheck:
         self.clearance_m, self.limit_m = inf, 0.0
         self._look_at_s = -inf
 
-    def step(self, t_s: float, estimate: PoseEstimate, wheels: Sequence[WheelSample]) -> None:
+    def step(self, t_s: float, estimate: EstimateMessage, wheels: Sequence[WheelSample]) -> None:
         """Look up the clearance, where it may have come near the limit."""
         if t_s < self._look_at_s:
             return
@@ -279,7 +256,7 @@ class CentreClearanceCheck:
         elif clearance > limit + self._margin_m:
             self.direction = 0
 
-    def _judge(self, estimate: PoseEstimate, wheels: Sequence[WheelSample]) -> None:
+    def _judge(self, estimate: EstimateMessage, wheels: Sequence[WheelSample]) -> None:
         _, right, left = wheels[-1] if wheels else (0.0, None, None)
         if right is None or left is None:
             return

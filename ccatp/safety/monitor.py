@@ -2,14 +2,16 @@
 
 from collections.abc import Callable, Sequence
 from math import hypot
-from typing import Protocol
 
 from ccatp.config.models import DangerConfig, HealthConfig, RobotConfig
 from ccatp.control.motion_checks import ImuGate, MotionSum, SlidingWindow, WheelMeans
 from ccatp.core import EdgeSample, ImuSample, Severity, WheelSample
+from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import EstimateMessage
+from ccatp.mirror.mirror import Mirror
 from ccatp.safety.escalation import FindingLatch, MonitorFinding
 from ccatp.safety.power_monitors import BatteryMonitor, FanMonitor, OwnFaults
-from ccatp.safety.sensor_monitors import FlickerMonitor, Ground, LatencyMonitor, RateMonitor, SeamMonitor
+from ccatp.safety.sensor_monitors import FlickerMonitor, LatencyMonitor, RateMonitor, SeamMonitor
 from ccatp.safety.wheel_monitors import LATE_S, GyroscopeBias, WheelMonitor, YawMonitor, imu_finding
 
 _STANDS_RAD_S = 0.02  # a wheel's mean over a frame below which it stands: 0.6 mm/s
@@ -17,80 +19,8 @@ _LOOK_FRAMES = 2  # the monitors judge one frame in so many while nothing is wro
 _SLOW_LOOK_FRAMES = 10  # what changes slowly is looked at this often
 
 
-class Echo(Protocol):
-    """The robot's word on the drive in force."""
-
-    @property
-    def seq(self) -> int:
-        """Its number."""
-
-    @property
-    def age(self) -> float:
-        """How long ago it arrived, s."""
-
-    @property
-    def held(self) -> bool:
-        """The robot holds its wheels by its own rules."""
-
-
-class MonitorFrame(Protocol):
-    """The part of a sensors frame that the monitors read."""
-
-    @property
-    def imu(self) -> Sequence[ImuSample]:
-        """Inertial samples, oldest first."""
-
-    @property
-    def fans(self) -> tuple[float, float]:
-        """Fan duties as the robot says."""
-
-    @property
-    def soc(self) -> float:
-        """Charge."""
-
-    @property
-    def cmd(self) -> Echo:
-        """Command echo."""
-
-    @property
-    def faults(self) -> Sequence[str]:
-        """What the robot reports of itself."""
-
-
-class CommandedMotion(Protocol):
-    """Main's estimate and commands."""
-
-    @property
-    def seq(self) -> int:
-        """The frame of the estimate."""
-
-    @property
-    def x_m(self) -> float:
-        """Deck x."""
-
-    @property
-    def y_m(self) -> float:
-        """Deck y."""
-
-    @property
-    def heading_rad(self) -> float:
-        """Deck heading."""
-
-    @property
-    def sigma_m(self) -> float:
-        """Standard deviation of the place."""
-
-    @property
-    def commanded(self) -> tuple[float, float, float, float] | None:
-        """Span of the set points since the estimate before; ``None`` where they are not told."""
-
-    @property
-    def drive_seq(self) -> int:
-        """Number of the newest drive."""
-
-
 class HealthMonitor:
-    """All monitors but the edge rule's; ``base_m`` in the deck frame.
+    """All monitors but the edge rule's.
 
     ``is_explained``: whether the map has an edge of a panel near a sensor, by its index.
     """
@@ -100,12 +30,10 @@ class HealthMonitor:
         cfg: HealthConfig,
         danger: DangerConfig,
         robot: RobotConfig,
-        ground: Ground,
-        base_m: tuple[float, float],
-        overhang: bool,
+        mirror: Mirror,
         is_explained: Callable[[int], bool],
     ) -> None:
-        self._cfg, self._radius_m, self._base_m = cfg, robot.wheel_radius_m, base_m
+        self._cfg, self._radius_m, self._base = cfg, robot.wheel_radius_m, mirror.base_pose
         self._means = WheelMeans(robot)
         self._gate = ImuGate(cfg)
         self._bias = GyroscopeBias()
@@ -113,23 +41,16 @@ class HealthMonitor:
         self._turning = SlidingWindow(cfg.yaw_time_s)
         self._wheels, self._yaw = WheelMonitor(cfg, robot), YawMonitor(cfg, robot)
         self._rates, self._latency = RateMonitor(cfg), LatencyMonitor(cfg)
-        self._fans, self._battery = FanMonitor(cfg, robot.fan_duty, overhang), BatteryMonitor(cfg)
+        self._fans, self._battery = FanMonitor(cfg, robot.fan_duty, mirror.overhang), BatteryMonitor(cfg)
         self._own = OwnFaults(cfg)
-        fastest = robot.wheel_radius_m * robot.max_wheel_rad_s
-        self.seams = SeamMonitor(cfg, ground, robot.edge_sensors_m, danger.map_sigmas, fastest)
+        self.seams = SeamMonitor(cfg, mirror, robot, danger.map_sigmas)
         self.flicker = FlickerMonitor(cfg, is_explained)
         self._clock, self._gap = FindingLatch(cfg.imu_quarantine_s), FindingLatch(cfg.imu_quarantine_s)
         self._garbled = FindingLatch(cfg.retry_after_s)
+        # Of findings that are equally grave the first one counts.
         self._alarms = (
-            self._wheels.alarm,
-            self._yaw.alarm,
-            self._fans.alarm,
-            self._latency.alarm,
-            self._clock,
-            self._gap,
-            self._garbled,
-            self.flicker.chatter,
-            self.flicker.flash,
+            *(self._wheels.alarm, self._yaw.alarm, self._fans.alarm, self._latency.alarm),
+            *(self._clock, self._gap, self._garbled, self.flicker.chatter, self.flicker.flash),
         )
         self.reset()
 
@@ -137,14 +58,12 @@ class HealthMonitor:
         """Another boot of the robot."""
         self._t_s: float | None = None
         self._sums = MotionSum(0.0, 0.0, 0.0, 0.0)
-        self._gate.reset()
-        for window in (self._shortly, self._stalling, self._turning):
-            window.reset()
-        for monitor in (
-            self._wheels, self._yaw, self._rates, self._latency, self._fans, self._battery, self._own,
-            self.seams, self.flicker, self._clock, self._gap, self._garbled,
-        ):  # fmt: skip
-            monitor.reset()
+        for part in (
+            *(self._gate, self._shortly, self._stalling, self._turning, self._wheels, self._yaw, self._rates),
+            *(self._latency, self._fans, self._battery, self._own, self.seams, self.flicker),
+            *(self._clock, self._gap, self._garbled),
+        ):
+            part.reset()
         self._estimate_seq = self._heard_seq = -1
         self._opened = (0, 0, 0, 0)
         self._home_m = 0.0
@@ -175,7 +94,7 @@ class HealthMonitor:
     def step(
         self,
         t_s: float,
-        frame: MonitorFrame,
+        frame: Sensors,
         wheels: Sequence[WheelSample],
         edges: Sequence[EdgeSample],
         *,
@@ -213,22 +132,18 @@ class HealthMonitor:
                 self.flicker.step(t_s, edges, self._speed_m_s)
             self.findings = self._found()
 
-    def _judge(self, t_s: float, frame: MonitorFrame, wheels: Sequence[WheelSample]) -> None:
+    def _judge(self, t_s: float, frame: Sensors, wheels: Sequence[WheelSample]) -> None:
         now = self._sums
         shortly, stalling = self._shortly.push(now), self._stalling.push(now)
         turning = self._turning.push(now)
         self._rates.step(t_s, *self._counts)
         self._counts = [0, 0, 0]
-        is_sparse = self._rates.are_encoders_sparse
         self._wheels.step(
-            now,
-            shortly,
-            stalling,
+            *(now, shortly, stalling, wheels),
             is_free=self._is_free,
             is_held=self._is_held,
             is_late=self._is_late,
-            is_sparse=is_sparse,
-            samples=wheels,
+            is_sparse=self._rates.are_encoders_sparse,
         )
         self._is_free, self._is_held, self._is_late = True, True, False
         self._speed_m_s = 0.0
@@ -269,7 +184,7 @@ class HealthMonitor:
             turned = means.yaw_rad_s * dt_s
         return MotionSum(t_s, sums[1] + right * rolled_m, sums[2] + left * rolled_m, sums[3] + turned)
 
-    def hear(self, t_s: float, estimate: CommandedMotion) -> None:
+    def hear(self, t_s: float, estimate: EstimateMessage) -> None:
         """Take the set points from an estimate that may be too old for anything else.
 
         A repeated one changes nothing.
@@ -280,7 +195,7 @@ class HealthMonitor:
         if estimate.commanded is not None:
             self._wheels.commands.push(t_s, estimate.commanded)
 
-    def learn(self, t_s: float, estimate: CommandedMotion, opened: Sequence[int], is_off: Sequence[bool]) -> None:
+    def learn(self, t_s: float, estimate: EstimateMessage, opened: Sequence[int], is_off: Sequence[bool]) -> None:
         """Take a fresh estimate of main's; a repeated one changes nothing.
 
         ``opened``: how often each edge sensor went off.
@@ -298,7 +213,7 @@ class HealthMonitor:
         self._opened = (opened[0], opened[1], opened[2], opened[3])
         x, y = estimate.x_m, estimate.y_m
         self.seams.step(t_s, (x, y, estimate.heading_rad), estimate.sigma_m)
-        self._home_m = hypot(x - self._base_m[0], y - self._base_m[1])
+        self._home_m = hypot(x - self._base.x_m, y - self._base.y_m)
 
     def _found(self) -> list[MonitorFinding]:
         found = [alarm.finding for alarm in self._alarms if alarm.finding is not None]

@@ -3,10 +3,10 @@
 from collections import deque
 from collections.abc import Callable, Sequence
 from math import hypot, inf
-from typing import NamedTuple, Protocol
 
-from ccatp.config.models import HealthConfig
-from ccatp.core import Corner, EdgeSample, PanelId, Severity
+from ccatp.config.models import HealthConfig, RobotConfig
+from ccatp.core import Corner, DeckPose, EdgeSample, PanelId, Severity
+from ccatp.mirror.mirror import Mirror
 from ccatp.safety.escalation import FindingLatch, MonitorFinding
 
 _CORNERS = tuple(corner.value for corner in Corner)
@@ -190,37 +190,6 @@ class FramingErrorRate:
         return at_s - self._times_s[0] <= self._window_s
 
 
-class PanelPlace(Protocol):
-    """The place of a panel, deck frame."""
-
-    @property
-    def x_m(self) -> float:
-        """Centre."""
-
-    @property
-    def y_m(self) -> float:
-        """Centre."""
-
-    @property
-    def half_x_m(self) -> float:
-        """Half the extent along x."""
-
-    @property
-    def half_y_m(self) -> float:
-        """Half the extent along y."""
-
-
-class Ground(NamedTuple):
-    """The part of a mirror that the proof tests use.
-
-    Panels, the nearest to a deck point, the deck place of a robot point.
-    """
-
-    panels: dict[PanelId, PanelPlace]
-    nearest: Callable[[float, float], PanelId]
-    place: Callable[[tuple[float, float, float], tuple[float, float]], tuple[float, float]]
-
-
 class SeamMonitor:
     """Counts the seams that each sensor (places in the robot frame) crossed without going off.
 
@@ -231,16 +200,9 @@ class SeamMonitor:
     it. Any off sample proves the sensor sound. A pose that jumps (a fix) is no motion, and begins again.
     """
 
-    def __init__(
-        self,
-        cfg: HealthConfig,
-        ground: Ground,
-        sensors_m: tuple[tuple[float, float], ...],
-        sigmas: float,
-        fastest_m_s: float,
-    ) -> None:
-        self._cfg, self._ground, self._sensors_m = cfg, ground, sensors_m
-        self._sigmas, self._fastest_m_s = sigmas, fastest_m_s
+    def __init__(self, cfg: HealthConfig, mirror: Mirror, robot: RobotConfig, sigmas: float) -> None:
+        self._cfg, self._mirror, self._sensors_m, self._sigmas = cfg, mirror, robot.edge_sensors_m, sigmas
+        self._fastest_m_s = robot.wheel_radius_m * robot.max_wheel_rad_s
         self.missed = [0, 0, 0, 0]
         self.crossed = 0
         self._blind = FindingLatch(cfg.retry_after_s)
@@ -268,14 +230,14 @@ class SeamMonitor:
             if hypot(x - before[1], y - before[2]) > reach_m:
                 self._panels = [None, None, None, None]
         for i, offset_m in enumerate(self._sensors_m):
-            panel = self._panel_under(self._ground.place(pose, offset_m), margin_m)
+            panel = self._panel_under(self._mirror.body_offset(DeckPose(*pose), *offset_m), margin_m)
             if panel is not None and panel != self._panels[i]:
                 self._enter(i, panel)
 
     def _panel_under(self, place: tuple[float, float], margin_m: float) -> PanelId | None:
         x, y = place
-        found = self._ground.nearest(x, y)
-        panel = self._ground.panels[found]
+        found = self._mirror.nearest_panel(x, y)
+        panel = self._mirror.panels[found]
         dx, dy = x - panel.x_m, y - panel.y_m
         is_inside = abs(dx) < panel.half_x_m - margin_m and abs(dy) < panel.half_y_m - margin_m
         return found if is_inside else None

@@ -108,12 +108,12 @@ class WheelMonitor:
         now: MotionSum,
         shortly: MotionSum | None,
         stalling: MotionSum | None,
+        samples: Sequence[WheelSample],
         *,
         is_free: bool,
         is_held: bool,
         is_late: bool,
         is_sparse: bool,
-        samples: Sequence[WheelSample],
     ) -> None:
         """Judge a frame; ``shortly`` and ``stalling``.
 

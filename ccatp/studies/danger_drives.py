@@ -13,9 +13,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, EdgeSample, EventCode, ImuSample, PanelId, WheelSample
+from ccatp.core import DeckPose, EdgeSample, EventCode, PanelId, WheelSample
 from ccatp.danger import DangerMonitor
-from ccatp.links.robot_messages import CommandEcho
+from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import EstimateMessage, is_estimate_due
 from ccatp.mirror.layout import Panel
 from ccatp.mirror.mirror import Mirror
@@ -45,24 +45,15 @@ class EdgeErrors:
     heading_rad: float
 
 
-class DriveFrame(NamedTuple):
-    """The part of a sensors frame that the rules read."""
-
-    seq: int
-    t: float
-    enc: list[WheelSample]
-    edge: list[EdgeSample]
-    imu: Sequence[ImuSample] = ()
-    fans: tuple[float, float] = (0.0, 0.0)
-    soc: float = 1.0
-    cmd: CommandEcho = CommandEcho(0, 0.0, 0.0, False)
-    faults: Sequence[str] = ()
+def drive_frame(seq: int, t_s: float, enc: list[WheelSample], edge: list[EdgeSample]) -> Sensors:
+    """A sensors frame with what the rules read."""
+    return Sensors(seq, t_s, [], enc, edge, None, (0.0, 0.0), 1.0, CommandEcho(0, 0.0, 0.0, False), [])
 
 
 class EdgeRuleUnderTest(Protocol):
     """Judges frame by frame."""
 
-    def judge(self, frame: DriveFrame, estimate: EstimateMessage) -> bool:
+    def judge(self, frame: Sensors, estimate: EstimateMessage) -> bool:
         """Whether there is an edge."""
 
 
@@ -73,7 +64,7 @@ class OffTimeRule:
         self._off_s = off_s
         self._since_s: list[float | None] = [None] * 4
 
-    def judge(self, frame: DriveFrame, estimate: EstimateMessage) -> bool:
+    def judge(self, frame: Sensors, estimate: EstimateMessage) -> bool:
         """Whether a sensor has been off for so long; once it is back on its time begins anew."""
         del estimate  # the rule knows no map
         found = False
@@ -99,7 +90,7 @@ class MapRule:
     def __init__(self, mirror: Mirror, cfg: Config) -> None:
         self._monitor = DangerMonitor(mirror, cfg.robot, cfg.danger)
 
-    def judge(self, frame: DriveFrame, estimate: EstimateMessage) -> bool:
+    def judge(self, frame: Sensors, estimate: EstimateMessage) -> bool:
         """Whether the verdict's code is that of an edge."""
         return self._monitor.step(frame, estimate).code is EventCode.NEAR_EDGE
 
@@ -156,7 +147,7 @@ class Rig:
         self._sensors.enter(0)
         self._estimate = self._estimated()
 
-    def frame(self, right_rad_s: float, left_rad_s: float) -> tuple[DriveFrame, EstimateMessage]:
+    def frame(self, right_rad_s: float, left_rad_s: float) -> tuple[Sensors, EstimateMessage]:
         """Drive one frame on these set points; what is known at its end: the frame, and the estimate before it."""
         estimate, sensors, plant = self._estimate, self._sensors, self.plant
         t_s = self._seq * self._frame_s
@@ -167,7 +158,7 @@ class Rig:
         enc = named(WheelSample, sensors.read_encoders(plant))
         if is_estimate_due(self._seq):
             self._estimate = self._estimated()
-        return DriveFrame(self._seq, self._seq * self._frame_s, enc, edge), estimate
+        return drive_frame(self._seq, self._seq * self._frame_s, enc, edge), estimate
 
     @property
     def places(self) -> list[tuple[float, float]]:

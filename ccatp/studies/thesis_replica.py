@@ -19,11 +19,13 @@ from numpy.typing import NDArray
 
 from ccatp.config.models import Config
 from ccatp.core import EdgeSample, EventCode, Fix, GravitySample, ImuSample, Verdict, WheelSample
-from ccatp.danger import DangerMonitor, PoseReport, SensorsFrame
+from ccatp.danger import DangerMonitor
 from ccatp.estimation.measurements import STATES, THETA
 from ccatp.estimation.seams import SensorTransition
 from ccatp.estimation.thesis_localizer import FourStateLocalizer
 from ccatp.filters import FILTERS
+from ccatp.links.robot_messages import Sensors
+from ccatp.links.topics import EstimateMessage
 from ccatp.studies.sil_models import SilResult
 from ccatp.studies.sil_run import SilRun
 from ccatp.survey.composition import assemble
@@ -127,7 +129,7 @@ class ThesisLocalizer(FourStateLocalizer):
 class _NoEdges(DangerMonitor):
     """Permits everything: far from the rim an edge that a rule sees is a false one, and would end the run."""
 
-    def step(self, sensors: SensorsFrame, estimate: PoseReport | None) -> Verdict:
+    def step(self, sensors: Sensors, estimate: EstimateMessage | None) -> Verdict:
         del estimate
         return Verdict(sensors.seq, sensors.t, EventCode.NORMAL, "", "", 0.0, 0.0, True, True, True)
 

@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.core import DeckPose, EdgeSample, EventCode, ImuSample, PanelId, PointId, Verdict, WheelSample
+from ccatp.core import DeckPose, EdgeSample, EventCode, PanelId, PointId, Verdict, WheelSample
 from ccatp.danger import DangerMonitor
-from ccatp.links.robot_messages import CommandEcho
+from ccatp.links.robot_messages import CommandEcho, Sensors
+from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
 
 MIRRORS = ("fyst-m1", "fyst-m2", "thesis-m1", "thesis-m2")
@@ -35,30 +36,8 @@ def world(name: str) -> tuple[Config, Mirror]:
     return cfg, build_mirror(cfg.mirror)
 
 
-@dataclass(slots=True)
-class Frame:
-    seq: int
-    t: float
-    enc: list[WheelSample]
-    edge: list[EdgeSample]
-    imu: list[ImuSample] = field(default_factory=list)
-    fans: tuple[float, float] = (0.8, 0.8)
-    soc: float = 1.0
-    cmd: CommandEcho = field(default_factory=lambda: CommandEcho(0, 0.0, 0.0, False))
-    faults: list[str] = field(default_factory=list)
-
-
-@dataclass(slots=True)
-class Pose:
-    seq: int
-    t_s: float
-    x_m: float
-    y_m: float
-    heading_rad: float
-    sigma_m: float
-    state: str = "driving"
-    commanded: tuple[float, float, float, float] | None = None
-    drive_seq: int = -1
+def frame_of(seq: int, t: float, enc: list[WheelSample], edge: list[EdgeSample]) -> Sensors:
+    return Sensors(seq, t, [], enc, edge, None, (0.8, 0.8), 1.0, CommandEcho(0, 0.0, 0.0, False), [])
 
 
 @dataclass
@@ -85,7 +64,7 @@ class Robot:
         cfg, self.mirror = world(self.name)
         self.cfg = cfg.robot
         self.monitor = DangerMonitor(self.mirror, cfg.robot, cfg.danger)
-        self.estimate: Pose | None = None
+        self.estimate: EstimateMessage | None = None
         self._answers: deque[tuple[tuple[float, float], Verdict | None]] = deque([((0.0, 0.0), None)] * LATENCY_FRAMES)
         self._at_declaration: tuple[float, tuple[float, ...]] | None = None
         self.frame()  # the first estimate exists before the robot is told to move
@@ -110,7 +89,7 @@ class Robot:
             enc.append(WheelSample(self.t, *self.wheels))
             edge.append(EdgeSample(self.t, on[0], on[1], on[2], on[3]))
         self.seq += 1
-        verdict = self.monitor.step(Frame(self.seq, self.t, enc, edge), self.estimate)
+        verdict = self.monitor.step(frame_of(self.seq, self.t, enc, edge), self.estimate)
         self.verdicts.append(verdict)
         self._answers.append((self.command, verdict))
         self._watch(verdict)
@@ -118,7 +97,9 @@ class Robot:
             self.estimate = None
         else:
             x, y, heading = (a + b for a, b in zip(self.pose, self.error, strict=True))
-            self.estimate = Pose(self.seq, self.t, x, y, heading, self.sigma_m)
+            self.estimate = EstimateMessage(
+                seq=self.seq, t_s=self.t, x_m=x, y_m=y, heading_rad=heading, sigma_m=self.sigma_m, state="driving"
+            )
         return verdict
 
     def run(self, duration_s: float) -> Verdict:

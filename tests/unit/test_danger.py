@@ -8,9 +8,9 @@ import pytest
 
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
-from ccatp.core import Corner, EdgeSample, EventCode, ImuSample, Verdict, WheelSample
+from ccatp.core import Corner, EdgeSample, EventCode, Verdict, WheelSample
 from ccatp.danger import CENTRE, DangerMonitor
-from ccatp.links.robot_messages import CommandEcho
+from ccatp.links.robot_messages import CommandEcho, Sensors
 from ccatp.links.topics import EstimateMessage
 from ccatp.mirror.mirror import Mirror, build_mirror
 from ccatp.safety.edge_detector import Cause, EdgeMap
@@ -21,17 +21,8 @@ FRONT, ALL = FL + FR, FL + FR + RL + RR
 NO_PERMIT, ANY_PERMIT = (False, False, False), (True, True, True)
 
 
-@dataclass(slots=True)
-class Frame:
-    seq: int
-    t: float
-    enc: list[WheelSample]
-    edge: list[EdgeSample]
-    imu: list[ImuSample] = field(default_factory=list)
-    fans: tuple[float, float] = (0.8, 0.8)
-    soc: float = 1.0
-    cmd: CommandEcho = field(default_factory=lambda: CommandEcho(0, 0.0, 0.0, False))
-    faults: list[str] = field(default_factory=list)
+def frame_of(seq: int, t: float, enc: list[WheelSample], edge: list[EdgeSample]) -> Sensors:
+    return Sensors(seq, t, [], enc, edge, None, (0.8, 0.8), 1.0, CommandEcho(0, 0.0, 0.0, False), [])
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +74,7 @@ class Story:
         moved = Odometry(track, self.t - 0.01, self.pose)
         moved.advance_to(self.t)
         self.pose = moved.x_m, moved.y_m, moved.heading_rad
-        frame = Frame(self.seq, self.t, enc if self.has_wheels else [], edge)
+        frame = frame_of(self.seq, self.t, enc if self.has_wheels else [], edge)
         return self.monitor.step(frame, estimate if self.has_estimate else None)
 
     def run(self, frames: int, v: float = 0.0, omega: float = 0.0, off: tuple[str, ...] = ()) -> Verdict:
@@ -412,14 +403,16 @@ def test_a_silent_wheel_permits_nothing_and_counts_as_fastest(on_panel: Story, b
         estimate = EstimateMessage(
             seq=k, t_s=t_s, x_m=on_panel.pose[0], y_m=on_panel.pose[1], heading_rad=0.0, sigma_m=1e-4, state="driving"
         )
-        verdict = monitor.step(Frame(100 + k, t_s, enc, [EdgeSample(t_s, 1, 1, 1, 1)]), estimate)
+        verdict = monitor.step(frame_of(100 + k, t_s, enc, [EdgeSample(t_s, 1, 1, 1, 1)]), estimate)
         if k <= 14:
             assert permits(verdict) == ANY_PERMIT  # the last sample is held for 150 ms
     assert (verdict.code, verdict.cause, verdict.signal) == (EventCode.NORMAL, "encoder samples stale", "enc")
     assert permits(verdict) == NO_PERMIT
     assert verdict.value == pytest.approx(0.17, abs=1e-9)  # s; sums of time steps
     t_s += 0.001
-    verdict = monitor.step(Frame(200, t_s, [], [EdgeSample(t_s, 0, 1, 1, 1), EdgeSample(t_s + 1e-3, 0, 1, 1, 1)]), None)
+    verdict = monitor.step(
+        frame_of(200, t_s, [], [EdgeSample(t_s, 0, 1, 1, 1), EdgeSample(t_s + 1e-3, 0, 1, 1, 1)]), None
+    )
     assert verdict.code is EventCode.NEAR_EDGE
     assert verdict.cause.startswith(Cause.SILENT_WHEELS)
     assert verdict.value > 0.06  # m: 0.17 s at the 0.41 m/s of a corner sensor with one wheel against the other
@@ -501,7 +494,7 @@ def test_an_estimate_that_is_not_finite_is_none(on_panel: Story, field_name: str
     }
     estimate = EstimateMessage(seq=1, state="held", **fields)
     t_s = on_panel.t + 1e-3
-    frame = Frame(9, t_s, [WheelSample(t_s, 0.0, 0.0)], [EdgeSample(t_s, 1, 1, 1, 1)])
+    frame = frame_of(9, t_s, [WheelSample(t_s, 0.0, 0.0)], [EdgeSample(t_s, 1, 1, 1, 1)])
     verdict = on_panel.monitor.step(frame, estimate)
     assert (verdict.cause, verdict.value) == ("estimate not finite", 0.15)
     assert permits(verdict) == NO_PERMIT
@@ -514,7 +507,7 @@ def test_the_age_of_an_estimate(on_panel: Story, age_s: float, expected: tuple[b
     x, y, heading = on_panel.pose
     t_s = on_panel.t + 1e-3
     estimate = EstimateMessage(seq=1, t_s=t_s - age_s, x_m=x, y_m=y, heading_rad=heading, sigma_m=1e-4, state="driving")
-    frame = Frame(99, t_s, [WheelSample(t_s, 0.0, 0.0)], [EdgeSample(t_s, 1, 1, 1, 1)])
+    frame = frame_of(99, t_s, [WheelSample(t_s, 0.0, 0.0)], [EdgeSample(t_s, 1, 1, 1, 1)])
     verdict = on_panel.monitor.step(frame, estimate)
     assert permits(verdict) == expected
     assert verdict.cause == ("" if expected[0] else "estimate stale")
@@ -522,7 +515,7 @@ def test_the_age_of_an_estimate(on_panel: Story, age_s: float, expected: tuple[b
 
 def test_every_value_is_finite_before_anything_is_heard(on_panel: Story) -> None:
     edge = [EdgeSample(1e-3 * k, 0, 0, 0, 1) for k in range(1, 4)]
-    verdict = on_panel.monitor.step(Frame(1, 0.003, [], edge), None)
+    verdict = on_panel.monitor.step(frame_of(1, 0.003, [], edge), None)
     assert verdict.cause == f"{Cause.SILENT_WHEELS}; encoder samples stale"
     assert verdict.value == pytest.approx(0.061, abs=1e-3)  # m: 0.15 s at 0.41 m/s
 
@@ -532,14 +525,14 @@ def test_edge_samples_that_stay_away_permit_nothing(on_panel: Story) -> None:
     for k in range(1, 18):
         t_s = on_panel.t + 0.01 * k
         estimate = EstimateMessage(seq=k, t_s=t_s, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-4, state="driving")
-        verdict = on_panel.monitor.step(Frame(100 + k, t_s, [WheelSample(t_s, 0.0, 0.0)], []), estimate)
+        verdict = on_panel.monitor.step(frame_of(100 + k, t_s, [WheelSample(t_s, 0.0, 0.0)], []), estimate)
     assert (verdict.cause, verdict.signal) == ("edge samples stale", "edge")
     assert permits(verdict) == NO_PERMIT
 
 
 def test_no_edge_sample_ever_permits_nothing(on_panel: Story) -> None:
     estimate = EstimateMessage(seq=0, t_s=0.0, x_m=0.0, y_m=0.0, heading_rad=0.0, sigma_m=1e-4, state="driving")
-    verdict = on_panel.monitor.step(Frame(1, 0.01, [WheelSample(0.01, 0.0, 0.0)], []), estimate)
+    verdict = on_panel.monitor.step(frame_of(1, 0.01, [WheelSample(0.01, 0.0, 0.0)], []), estimate)
     assert (verdict.cause, verdict.value) == ("no edge samples", 0.15)
     assert permits(verdict) == NO_PERMIT
 
@@ -558,7 +551,7 @@ def test_a_frame_that_is_not_new_changes_nothing(at_rim: Story) -> None:
     at_rim.run(2)
     last = at_rim.monitor.verdict
     t_s = at_rim.t
-    again = Frame(2, t_s, [WheelSample(t_s, 9.0, 9.0)], [EdgeSample(t_s + 1e-3 * k, 0, 0, 0, 0) for k in range(5)])
+    again = frame_of(2, t_s, [WheelSample(t_s, 9.0, 9.0)], [EdgeSample(t_s + 1e-3 * k, 0, 0, 0, 0) for k in range(5)])
     assert at_rim.monitor.step(again, None) is last
     assert at_rim.monitor._edges.is_idle
 
@@ -567,7 +560,7 @@ def test_edge_samples_that_go_back_in_time_are_dropped(on_panel: Story) -> None:
     on_panel.run(2)
     t_s = on_panel.t
     old = [EdgeSample(t_s - 5e-3, 0, 0, 0, 0), EdgeSample(t_s - 4e-3, 0, 0, 0, 0)]
-    frame = Frame(9, t_s + 1e-3, [WheelSample(t_s + 1e-3, 0.0, 0.0)], [*old, EdgeSample(t_s + 1e-3, 1, 1, 1, 1)])
+    frame = frame_of(9, t_s + 1e-3, [WheelSample(t_s + 1e-3, 0.0, 0.0)], [*old, EdgeSample(t_s + 1e-3, 1, 1, 1, 1)])
     assert on_panel.monitor.step(frame, None).code is EventCode.NORMAL
     assert on_panel.monitor.episodes_opened == dict.fromkeys(Corner, 0)
 
@@ -575,7 +568,7 @@ def test_edge_samples_that_go_back_in_time_are_dropped(on_panel: Story) -> None:
 def test_a_value_that_is_neither_0_nor_1_counts_as_off(on_panel: Story) -> None:
     on_panel.run(1)
     t_s = on_panel.t + 1e-3
-    on_panel.monitor.step(Frame(9, t_s, [WheelSample(t_s, 0.0, 0.0)], [EdgeSample(t_s, 2, 1, 1, 1)]), None)
+    on_panel.monitor.step(frame_of(9, t_s, [WheelSample(t_s, 0.0, 0.0)], [EdgeSample(t_s, 2, 1, 1, 1)]), None)
     assert on_panel.monitor.episodes_opened[Corner.FRONT_LEFT] == 1
 
 

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 from math import cos, hypot, sin
-from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -10,8 +9,9 @@ import pytest
 from ccatp.config.load import load_config
 from ccatp.config.models import Config
 from ccatp.core import EdgeSample, WheelSample
+from ccatp.links.topics import EstimateMessage
 from ccatp.safety.edge_detector import EdgeDetector, EdgeMap, EdgePhase, SeamNear
-from ccatp.safety.edge_rule import EdgeRule, PoseEstimate
+from ccatp.safety.edge_rule import EdgeRule
 
 MS = 1e-3
 OFF_FL = (0, 1, 1, 1)
@@ -68,9 +68,10 @@ class Rule:
         self.rule.track.push(wheels)
         self.rule.step(samples, rest.get("estimate"))
 
-    def estimate(self, age_s: float = 0.0, sigma_m: float = 0.001) -> PoseEstimate:
-        pose = SimpleNamespace(t_s=self.t_s - age_s, x_m=1.0, y_m=2.0, heading_rad=0.5, sigma_m=sigma_m)
-        return cast(PoseEstimate, pose)
+    def estimate(self, age_s: float = 0.0, sigma_m: float = 0.001) -> EstimateMessage:
+        return EstimateMessage(
+            seq=0, t_s=self.t_s - age_s, x_m=1.0, y_m=2.0, heading_rad=0.5, sigma_m=sigma_m, state="driving"
+        )
 
 
 @pytest.fixture

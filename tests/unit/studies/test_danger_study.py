@@ -15,10 +15,10 @@ from ccatp.studies.campaign import CellResult, Job, JobOutcome
 from ccatp.studies.danger_drives import (
     OFF_S,
     RULES,
-    DriveFrame,
     EdgeErrors,
     OffTimeRule,
     build_rule,
+    drive_frame,
     drive_to_rim,
     transit,
 )
@@ -37,7 +37,7 @@ def judged(pattern: str) -> bool:
     """The thesis's rule on the front-left sensor's values, one per millisecond."""
     rule = OffTimeRule(OFF_S)
     samples = [EdgeSample(1e-3 * k, int(value), 1, 1, 1) for k, value in enumerate(pattern)]
-    return any(rule.judge(DriveFrame(k, s.t_s, [], [s]), NOWHERE) for k, s in enumerate(samples))
+    return any(rule.judge(drive_frame(k, s.t_s, [], [s]), NOWHERE) for k, s in enumerate(samples))
 
 
 @pytest.mark.parametrize(
