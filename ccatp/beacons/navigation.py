@@ -315,13 +315,7 @@ class Navigator(Protocol):
 
 def ellipse_of(mean: FloatArray, covariance: FloatArray) -> Ellipse:
     """x, y and their covariance of a place, shapes (2+,) and (2+, 2+)."""
-    return (
-        float(mean[0]),
-        float(mean[1]),
-        float(covariance[0, 0]),
-        float(covariance[0, 1]),
-        float(covariance[1, 1]),
-    )
+    return (float(mean[0]), float(mean[1]), float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1]))
 
 
 class RadioNavigator:

@@ -165,10 +165,7 @@ def test_eight_surveyed_anchors(with_tags: bool, tmp_path: Path, capsys: pytest.
         ("session,pos,deg,anchor,tag,mean_m\n", "has no ranges, only a header"),
         ("a,b,c\n1,2,3\n", ":1: columns a,b,c; wanted first,second,range_m"),
         ("first,second,range_m\nA,B,1.0\nC,D,1.0\n", "the motes fall into 2 parts"),
-        (
-            "first,second,range_m\nA,B,1.0\nB,C,1.0\nC,D,1.0\n",
-            "3 pairs of 4 motes were measured, a map in 2",
-        ),
+        ("first,second,range_m\nA,B,1.0\nB,C,1.0\nC,D,1.0\n", "3 pairs of 4 motes were measured, a map in 2"),
     ],
 )
 def test_ranges_that_make_no_map(text: str, what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

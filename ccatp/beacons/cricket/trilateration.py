@@ -351,11 +351,7 @@ def _look(
     distances = np.maximum(np.sqrt((ways**2).sum(axis=2)), 1e-9)
     J = ways / (distances * sigmas)[:, :, None]
     residuals = (lengths - distances) / sigmas
-    return (
-        (residuals**2).sum(axis=1),
-        np.einsum("nk,nkd->nd", residuals, J),
-        np.einsum("nki,nkj->nij", J, J),
-    )
+    return ((residuals**2).sum(axis=1), np.einsum("nk,nkd->nd", residuals, J), np.einsum("nki,nkj->nij", J, J))
 
 
 _FLAT = 4.0  # of range errors that may make a flat beginning look high

@@ -183,11 +183,7 @@ def test_a_radio_without_a_bearing_is_not_placed_and_removal_forgets() -> None:
         slam.remove("b")
 
 
-SHADOW = {
-    "sim.radio.shadowing_sigma_db": 5.0,
-    "path_loss.shadowing_sigma_db": 5.0,
-    "estimator.shadowing": "map",
-}
+SHADOW = {"sim.radio.shadowing_sigma_db": 5.0, "path_loss.shadowing_sigma_db": 5.0, "estimator.shadowing": "map"}
 
 
 def test_white_noise_runs_are_consistent() -> None:
