@@ -163,7 +163,6 @@ class BeaconHold:
         self.state, self.cause, self._is_by_hand = HELD, cause, by_hand
 
     def _go_on(self) -> None:
-        """What is next is found in the next frame."""
         self.state, self.cause = IDLE, self.abort_cause
         self._is_by_hand = self.is_faulted = False
 
@@ -298,7 +297,6 @@ class BeaconMission(BeaconHold):
         return drive
 
     def _distances(self, senses: BeaconMeasurements) -> tuple[float, ...]:
-        """Of sensors that told nothing in this frame, that they see nothing: what they saw before is remembered."""
         avoidance = self._cfg.avoidance
         return senses.distances_m or (avoidance.range_max_m,) * len(avoidance.sensors_rad)
 

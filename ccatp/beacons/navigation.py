@@ -109,7 +109,6 @@ class SelfMap:
         return mapper
 
     def _refine(self, mapper: MoteMapper, pair: frozenset[int], burst: MoteBurst) -> None:
-        """Phase 2: each distance between first motes of two stands corrects the places of both."""
         if pair not in self._second:
             return
         i, j = sorted(pair)
@@ -486,7 +485,6 @@ class MoteNavigator:
             self._self_map.notes["map_time_s"] = senses.t_s
 
     def _join(self, positions_m: FloatArray, covariance_m2: FloatArray) -> None:
-        """The map becomes part of the state, as one block; nothing ties it to the robot yet."""
         none = np.empty(0, dtype=np.intp)
         size = positions_m.size
         self._filter.augment("map", positions_m.ravel(), none, np.zeros((size, 0)), np.eye(size), covariance_m2)

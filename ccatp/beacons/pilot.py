@@ -103,7 +103,6 @@ class Follower:
 
 
 def _closing_m_s(pose: PlanarPose, target: TargetSight) -> float:
-    """How fast the target comes nearer by its own motion; 0 if it goes away."""
     dx_m, dy_m = pose[0] - target.position_m[0], pose[1] - target.position_m[1]
     vx, vy = target.velocity_m_s
     return max(0.0, (vx * dx_m + vy * dy_m) / max(hypot(dx_m, dy_m), _NEAREST_M))
@@ -204,7 +203,6 @@ class ObstacleAvoider:
         return min(free, key=lambda h: abs(wrap_pi(h - wanted_rad)) + 0.1 * abs(h), default=None)
 
     def _speed_factor(self, near: Sequence[tuple[float, float]]) -> float:
-        """Of what lies ahead: 1 at the edge of influence, 0 at the distance to stop."""
         cfg = self._cfg
         ahead_m = min((d for d, angle_rad in near if abs(wrap_pi(angle_rad)) < _AHEAD_RAD), default=cfg.influence_m)
         return max(0.0, min(1.0, (ahead_m - cfg.stop_m) / (cfg.influence_m - cfg.stop_m)))
@@ -287,7 +285,6 @@ class BackOff:
         return places
 
     def _straight(self, pose: PlanarPose, course_rad: float, speed_m_s: float, horizon_s: float) -> _Arc:
-        """A turn on the spot and then straight on, forwards or backwards, by which the turn is less."""
         is_back = abs(course_rad) > pi / 2.0
         error_rad = wrap_pi(course_rad - pi) if is_back else course_rad
         most_rad_s = self._cfg.vehicle.turn_rate_max_rad_s
@@ -403,7 +400,6 @@ class BeaconPilot:
         return found._replace(speed_m_s=found.speed_m_s * way.speed_factor)
 
     def _held(self, pose: PlanarPose, drive: SteeringCommand) -> SteeringCommand:
-        """No motion towards something that stands too near in its direction."""
         if not drive.speed_m_s:
             return drive
         clear_m = self._avoider.clear_m(pose, 0.0 if drive.speed_m_s > 0.0 else pi)

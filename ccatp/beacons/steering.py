@@ -81,7 +81,6 @@ class Sugeno:
         return [_grade(min(max(value, low), high), term) for term in self._terms[index]]
 
     def _check_gaps(self) -> None:
-        """Memberships are linear between corners: no rule is silent between two places that have one in common."""
         axes = []
         for (low, high), terms in zip(self._spans, self._terms, strict=True):
             corners = sorted({min(max(corner, low), high) for term in terms for corner in term})
@@ -92,7 +91,6 @@ class Sugeno:
 
 
 def _grade(value: float, term: _Trapezoid) -> float:
-    """Membership of a value in a trapezoid (left foot, left shoulder, right shoulder, right foot)."""
     left_foot, left_shoulder, right_shoulder, right_foot = term
     if left_shoulder <= value <= right_shoulder:
         return 1.0

@@ -334,7 +334,6 @@ def _write(path: Path, names: tuple[str, ...], positions_m: Any, covariance_m2: 
 
 
 def _progress(total: int) -> Callable[[int], None]:
-    """A counter on a terminal, a line for each tenth elsewhere, on standard error; nothing for a single run."""
     is_live = sys.stderr.isatty()
 
     def tell(done: int) -> None:

@@ -207,7 +207,6 @@ def _check_reach(option: str, values_m: Sequence[float]) -> None:
 
 
 def _room(text: str | None, places_m: dict[str, tuple[float, float]], spacing_m: float) -> "Room":
-    """The given room, or the rectangle round the beacons and a quarter of its longer side more."""
     from ccatp.beacons.slam.path_loss import Room
 
     x0, y0, x1, y1 = _sides(text, places_m)
@@ -260,7 +259,6 @@ def _fits(
     path: Path, fingerprints: Path | None, path_loss: Path | None, places_m: dict[str, tuple[float, float]],
     sheet: str | None,
 ) -> "tuple[Fits, bool]":  # fmt: skip
-    """A function of the fingerprint to leave out (or None) to the path losses by beacon; whether to leave out."""
     from ccatp.beacons.datasets.levels import read_levels, read_places
     from ccatp.beacons.slam.path_loss import PathLossError, fit_path_loss
 
@@ -283,7 +281,6 @@ def _fits(
 
 
 def _pairs(places: "Sequence[HeardPlace]", name: str, beacon_m: tuple[float, float]) -> "Iterator[LevelPair]":
-    """Distances and levels of a beacon; each fingerprint is a place of its own."""
     from ccatp.beacons.slam.path_loss import LevelPair
 
     for heard in places:

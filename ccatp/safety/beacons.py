@@ -198,7 +198,6 @@ class BeaconSafetyRules:
             self._levels.popleft()
 
     def _roll(self, sensors: Sensors, extras: BeaconFrame) -> None:
-        """Carry the echoes on by the wheels; each sample stands for the time since the one before."""
         steering, vehicle = {sample.t_s: sample.steer_rad for sample in extras.steer}, self._vehicle
         for t_s, right, left in sensors.enc:
             before_s = sensors.t if self._rolled_to_s is None else self._rolled_to_s

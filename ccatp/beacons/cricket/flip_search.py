@@ -75,7 +75,6 @@ def unfold(
 def _turn_singles(
     model: MapModel, fit: MapFit, settings: MapFitSettings
 ) -> tuple[MapFit, int, dict[tuple[int, ...], float]]:
-    """Mirror every loose mote across its partners, settle it with all others held, keep what lowers the cost."""
     network = model.network
     rows_of = _rows_by_mote(network)
     places = fit.state.positions_m.copy()
@@ -113,8 +112,6 @@ class _Settled(NamedTuple):
 
 
 class _Single:
-    """The loss of one mote's ranges while all others stay."""
-
     def __init__(self, anchors: FloatArray, ranges: FloatArray, sigmas: FloatArray, robust_scale: float) -> None:
         self._anchors, self._ranges, self._sigmas, self._c = anchors, ranges, sigmas, robust_scale
 
@@ -167,14 +164,12 @@ def _turn_sets(
 
 
 def _moved_m(network: RangeNetwork, one_m: FloatArray, other_m: FloatArray) -> float:
-    """The largest distance between two maps once one is laid on the other, as its own frame allows."""
     if np.isnan(network.known_m).all():
         one_m = best_motion(one_m, other_m, mirrors=not network.bodies).moved(one_m)
     return float(np.linalg.norm(one_m - other_m, axis=1).max())
 
 
 def _tried(model: MapModel, start: MapState, settings: MapFitSettings, best: float) -> MapFit:
-    """A fit that is given up where its first steps do not bring it near the best cost so far."""
     sketch = fit_from_afar(model, start, settings._replace(max_iterations=_SKETCH_STEPS))
     if sketch.is_at_rest or sketch.cost > _HOPELESS * (best + CLOSE):
         return sketch
@@ -184,7 +179,6 @@ def _tried(model: MapModel, start: MapState, settings: MapFitSettings, best: flo
 def _sets(
     model: MapModel, fit: MapFit, mirrors: Sequence[tuple[Sequence[int], Sequence[int]]]
 ) -> Iterator[tuple[Sequence[int], Sequence[int]]]:
-    """Separators and what they part: those known, then each group and every part of the graph without it."""
     network = model.network
     yield from ((separator, motes) for separator, motes in mirrors if len(separator) >= network.dimension)
     pairs = graph_pairs(network)
@@ -201,10 +195,6 @@ def _sets(
 
 
 def _groups(model: MapModel, fit: MapFit) -> list[tuple[int, ...]]:
-    """Bodies; where the map contradicts its ranges, motes that stand close together, too.
-
-    Seen from afar a few motes close together are one point: what is fixed to them turns about them almost freely.
-    """
     network = model.network
     groups = [body.motes for body in network.bodies]
     if fit.cost < _CONTRADICTED * max(len(network.ranges_m) - model.size, 1):
@@ -218,7 +208,6 @@ def _groups(model: MapModel, fit: MapFit) -> list[tuple[int, ...]]:
 
 
 def _images(points: FloatArray, through: FloatArray) -> Iterator[FloatArray]:
-    """Mirror images of points across the flattest plane (line) through some others, and across the next."""
     centre = through.mean(axis=0)
     axes = np.linalg.svd(through - centre)[2]
     for normal in axes[::-1][:2]:
@@ -309,7 +298,6 @@ def residual_scale(model: MapModel, fit: MapFit) -> float:
 
 
 def _settled(model: MapModel, fit: MapFit, settings: MapFitSettings) -> ScaledFit:
-    """Fit and scale in turn until they agree; below the sigmas given, once."""
     factor, at = float("inf"), model
     for _ in range(_MAP_SEARCH_ROUNDS):
         before, factor = factor, max(residual_scale(model, fit), _LEAST)
@@ -322,7 +310,6 @@ def _settled(model: MapModel, fit: MapFit, settings: MapFitSettings) -> ScaledFi
 
 
 def _grown_fits(model: MapModel, best: MapFit, settings: MapFitSettings) -> Iterator[MapFit]:
-    """Fits from grown maps, of ranges corrected by the offset and the scale found so far."""
     offset_m, scale = best.state.offset_m, best.state.scale
     ranges_m = np.maximum((model.network.ranges_m - offset_m) / (1.0 + scale), 0.0)
     wide = settings._replace(robust_scale=_WIDER * settings.robust_scale, max_iterations=_FIRST_STEPS)

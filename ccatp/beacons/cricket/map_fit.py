@@ -127,7 +127,6 @@ class MapModel:
         return coo_array((values, (rows, cols)), shape=shape).tocsr()
 
     def _position_blocks(self, state: MapState) -> Iterator[tuple[tuple[IndexArray, IndexArray], FloatArray]]:
-        """Rows, columns and values of dp/dq: of all loose motes, then of each body."""
         yield (self._loose_at, np.arange(self._bodies_from)), np.ones(self._bodies_from)
         for number, (body, at) in enumerate(zip(self.network.bodies, self._body_at, strict=True)):
             block = _body_block(body.local_m @ state.rotations[number].T)
@@ -309,7 +308,6 @@ def _loss(scaled: FloatArray, robust_scale: float) -> tuple[float, FloatArray]:
 def _normal(
     model: MapModel, state: MapState, residuals: FloatArray, weights: FloatArray
 ) -> tuple[csr_array | FloatArray, FloatArray]:
-    """J^T W J, a full array where the map is small, and J^T W r."""
     W = weights / model.network.sigmas_m**2
     if model.size <= _DENSE:
         J = model.dense_jacobian(state)
@@ -371,6 +369,5 @@ def map_rms_m(covariance_m2: FloatArray, positions_m: FloatArray, motes: Sequenc
 
 
 def _frame_freedom(model: MapModel) -> int:
-    """Rigid motions that no known coordinate excludes, where there are none at all or enough of them."""
     d = model.network.dimension
     return d * (d + 1) // 2 if np.isnan(model.network.known_m).all() else 0

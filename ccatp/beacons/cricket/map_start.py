@@ -75,7 +75,6 @@ def grown(
 def _seed(
     table: FloatArray, scale: FloatArray, dimension: int, rng: np.random.Generator
 ) -> tuple[list[int], FloatArray] | None:
-    """Points that all know their distances, not flat, and their places."""
     for _ in range(_SEEDS):
         chosen = [int(rng.integers(len(table)))]
         while len(chosen) <= dimension:
@@ -97,7 +96,6 @@ def _seed(
 def _crossing(
     anchors: FloatArray, ranges_m: FloatArray, scales_m: FloatArray, rng: np.random.Generator
 ) -> tuple[float, FloatArray]:
-    """How many ranges meet at the best crossing of d spheres, and where that is."""
     count, d = anchors.shape
     drawn = np.array(
         list(combinations(range(count), d))
@@ -161,7 +159,6 @@ def stitched(count: int, means: PairMeans, dimension: int) -> FloatArray:
 
 
 def _patch(centre: int, means: PairMeans, dimension: int) -> Patch | None:
-    """The motes around one that hold together by d + 1 ranges each, mapped; None where they are too few or fold."""
     motes = {centre, *means.partners(centre)}
     while True:
         weak = {mote for mote in motes if len(motes.intersection(means.partners(mote))) <= dimension}
@@ -193,7 +190,6 @@ def _patch(centre: int, means: PairMeans, dimension: int) -> Patch | None:
 
 
 def _turns(patches: list[Patch], count: int, dimension: int) -> list[FloatArray | None]:
-    """Orthogonal matrices that bring the patches into one frame; None for patches that hang on no other."""
     relations = _relations(patches, count, dimension)
     size = len(patches)
     turns: list[FloatArray | None] = [None] * size
@@ -254,7 +250,6 @@ def _leading(matrix: csr_array, half: FloatArray, dimension: int) -> FloatArray:
 
 
 def _relations(patches: list[Patch], count: int, dimension: int) -> list[tuple[int, int, FloatArray, float]]:
-    """For patches a < b that share d + 1 motes: the turn from b's frame to a's, and how far it is to be trusted."""
     holders: list[list[int]] = [[] for _ in range(count)]
     for number, patch in enumerate(patches):
         for mote in patch.motes.tolist():
@@ -275,7 +270,6 @@ def _relations(patches: list[Patch], count: int, dimension: int) -> list[tuple[i
 
 
 def _relation(first: Patch, second: Patch, dimension: int) -> tuple[FloatArray, float] | None:
-    """The turn, and as its weight how much better it fits than its mirror image; None where both fit alike."""
     _, at_first, at_second = np.intersect1d(first.motes, second.motes, assume_unique=True, return_indices=True)
     target, source = first.places_m[at_first], second.places_m[at_second]
     centred, other = source - source.mean(axis=0), target - target.mean(axis=0)
@@ -296,7 +290,6 @@ def _largest_group(relations: list[tuple[int, int, FloatArray, float]], size: in
 
 
 def _shifted(patches: list[Patch], turns: FloatArray, count: int, dimension: int) -> FloatArray:
-    """Places x and shifts t of x_i = O_k p_ik + t_k, by least squares over all motes of all patches."""
     motes = np.concatenate([patch.motes for patch in patches])
     owner = np.repeat(np.arange(len(patches)), [len(patch.motes) for patch in patches])
     turned = np.concatenate([patch.places_m @ turn.T for patch, turn in zip(patches, turns, strict=True)])
@@ -353,7 +346,6 @@ def grown_starts(network: RangeNetwork, robust_scale: float) -> Iterator[list[Fl
 
 
 def _images(network: RangeNetwork, places_m: FloatArray) -> list[FloatArray]:
-    """Places in the frame of known motes, or with their mirror image."""
     known = np.isfinite(network.known_m).all(axis=1)
     if known.sum() > network.dimension:
         return [best_motion(places_m[known], network.known_m[known], mirrors=True).moved(places_m)]
@@ -365,7 +357,6 @@ def _images(network: RangeNetwork, places_m: FloatArray) -> list[FloatArray]:
 
 
 def _filled(places_m: FloatArray, means: PairMeans) -> FloatArray:
-    """Places with those that are missing put where their partners are on the average."""
     places = places_m.copy()
     for _ in range(len(places)):
         missing = np.flatnonzero(np.isnan(places[:, 0]))
@@ -381,7 +372,6 @@ def _filled(places_m: FloatArray, means: PairMeans) -> FloatArray:
 
 
 def _with_bodies(network: RangeNetwork, means: PairMeans) -> tuple[IndexArray, FloatArray, FloatArray]:
-    """Pairs, distances and sigmas, the pairs of bodies among them as ranges of the best sigma there is."""
     pairs, distances, sigmas = [means.pairs], [means.ranges_m], [means.sigmas_m]
     for body in network.bodies:
         motes = np.array(body.motes, dtype=np.intp)

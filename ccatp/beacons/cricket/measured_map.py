@@ -345,7 +345,6 @@ def _phase1_error_m(
 
 
 def _framed(found: _Found, motes: list[int], true_m: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-    """The motes that count, moved onto the truth or into a frame of their own."""
     d = found.positions_m.shape[1]
     places = found.positions_m[motes]
     at = (np.array(motes)[:, None] * d + np.arange(d)).ravel()

@@ -98,7 +98,6 @@ def map_motes(
 
 
 def _all_fits(model: MapModel, start_m: FloatArray | None, settings: MapFitSettings) -> list[MapFit]:
-    """Fits from all starts that it takes, with an offset or a scale known better and better."""
     network = model.network
     fits = _fits(model, network, start_m, settings)
     best: MapFit | None = None
@@ -158,11 +157,6 @@ def _fits(
     settings: MapFitSettings,
     at: MapState | None = None,
 ) -> list[MapFit]:
-    """Fits from one start after the other, until one is sure, or where there are many motes, came out twice.
-
-    Args:
-        network: what the starts are made of: the model's own, or with corrected ranges.
-    """
     fits: list[MapFit] = []
     offset_m, scale = (0.0, 0.0) if at is None else (at.offset_m, at.scale)
     for images in map_starts(network, start_m):
@@ -254,7 +248,6 @@ def plain_frame(positions_m: FloatArray) -> RigidMotion:
 
 
 def _onto(positions_m: FloatArray, known_m: FloatArray, first: int, second: int, axis: int) -> RigidMotion:
-    """Turn about the first mote until the second has its known coordinate, by the lesser of both angles."""
     way = positions_m[second] - positions_m[first]
     length, bearing = float(np.hypot(*way)), float(np.arctan2(way[1], way[0]))
     wanted = float(np.clip((known_m[second, axis] - known_m[first, axis]) / length, -1.0, 1.0))

@@ -121,7 +121,6 @@ def rigid_parts(moves: FloatArray, points: FloatArray, extra: int) -> tuple[tupl
 
 
 def _clique(holds: NDArray[np.bool_], first: int, second: int) -> list[int]:
-    """Motes that keep all their distances, two given ones among them: in space two alone do not tell the others."""
     left, chosen = holds[first] & holds[second], [first, second]
     while (rest := np.setdiff1d(np.flatnonzero(left), chosen)).size:
         chosen.append(int(rest[0]))
@@ -141,7 +140,6 @@ def _null_space(model: MapModel, state: MapState) -> FloatArray:
 
 
 def _frame(moves: FloatArray, points: FloatArray) -> tuple[str, ...]:
-    """Which rigid motions of all motes are among some directions."""
     if moves.shape[1] == 0:
         return ()
     basis = np.linalg.qr(moves)[0]
@@ -164,7 +162,6 @@ def _frame(moves: FloatArray, points: FloatArray) -> tuple[str, ...]:
 def _flexes(
     moves: FloatArray, points: FloatArray, parts: Sequence[tuple[int, ...]], network: RangeNetwork
 ) -> tuple[str, ...]:
-    """The motes that move in each direction when the largest part is held."""
     count, d = points.shape
     base = list(parts[0])
     at = (np.array(base)[:, None] * d + np.arange(d)).ravel()
@@ -182,14 +179,12 @@ def _flexes(
 
 
 def _steps_from(base: Sequence[int], network: RangeNetwork) -> FloatArray:
-    """How many ranges lead from a set of motes to each."""
     pairs = graph_pairs(network)
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(network.count, network.count)).tocsr()
     return np.asarray(dijkstra(graph, directed=False, unweighted=True, indices=list(base), min_only=True))
 
 
 def _echelon(rows: FloatArray, steps: FloatArray, d: int) -> list[FloatArray]:
-    """Directions by elimination, motes near the base first: each row moves fewer motes than the one before."""
     order = (np.argsort(steps, kind="stable")[:, None] * d + np.arange(d)).ravel()
     left = [row.copy() for row in rows]
     found = []
@@ -257,14 +252,12 @@ def _all_pairs(network: RangeNetwork) -> IndexArray:
 
 
 def _measured(network: RangeNetwork, pairs: IndexArray) -> IndexArray:
-    """Those of some pairs that have a range of their own."""
     ends = np.sort(np.column_stack([network.first, network.second]), axis=1)
     measured = set(map(tuple, ends.tolist()))
     return np.array([pair for pair in pairs.tolist() if tuple(pair) in measured], dtype=np.intp).reshape(-1, 2)
 
 
 def _stress(pairs: IndexArray, points: FloatArray, rng: np.random.Generator) -> tuple[IndexArray, int]:
-    """Pairs that bear no stress in any equilibrium, and the rank of the stress matrix of a random one."""
     count, d = points.shape
     i, j = pairs[:, 0], pairs[:, 1]
     ways = points[i] - points[j]
@@ -295,7 +288,6 @@ def _stress(pairs: IndexArray, points: FloatArray, rng: np.random.Generator) -> 
 
 
 def _mirrors(pairs: IndexArray, count: int, d: int) -> Iterator[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """Motes with too few partners, and in the plane all that hangs on two motes."""
     partners = [set[int]() for _ in range(count)]
     for i, j in pairs.tolist():
         partners[i].add(j)
@@ -314,7 +306,6 @@ def _mirrors(pairs: IndexArray, count: int, d: int) -> Iterator[tuple[tuple[int,
 def _sides(
     pairs: IndexArray, count: int, separator: tuple[int, int]
 ) -> Iterator[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """All but the largest part of what is left without two motes; single motes are named already."""
     kept = ~np.isin(pairs, separator).any(axis=1)
     labels = components(count, pairs[kept])
     labels[list(separator)] = -1

@@ -152,7 +152,6 @@ class MoteMapper:
         return learned
 
     def _pool(self) -> None:
-        """The posterior of the prior and all mean ranges, linearised where the map is now."""
         totals, weights = np.array(list(self._pairs.values())).T
         rows = _Rows(self._dimension, self._count, list(self._pairs), totals / weights)
         for _ in range(_CURVED):
@@ -176,8 +175,6 @@ class MoteMapper:
 
 
 class _Rows:
-    """Distances of pairs as measurements: residuals and derivatives at a state."""
-
     def __init__(self, dimension: int, count: int, pairs: Sequence[tuple[int, int]], ranges_m: FloatArray) -> None:
         motes, places = np.unique(np.array(pairs), return_inverse=True)
         self._at = (motes[:, None] * dimension + np.arange(dimension)).ravel()
@@ -223,8 +220,6 @@ class _Rows:
 
 
 class _From:
-    """Rows whose first linearisation is at a better place than the prior."""
-
     def __init__(self, rows: _Rows, start: FloatArray) -> None:
         self._rows, self._start, self._is_first = rows, start, True
 
@@ -402,7 +397,6 @@ def head_pairs(count: int, programme: str) -> list[tuple[int, int]]:
 
 
 def _phase1_pairs(anchors: tuple[int, ...], networks: tuple[tuple[int, ...], ...]) -> Pairs:
-    """A to B, both to the first network, then all of a network to all of the next."""
     first, second = anchors
     pairs = [(first, second)]
     pairs += [(anchor, mote) for anchor in anchors for mote in networks[0]]

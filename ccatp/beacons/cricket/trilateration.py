@@ -214,11 +214,6 @@ class Sketch:
 
 
 def _starts(anchors: FloatArray, ranges: FloatArray) -> list[FloatArray]:
-    """Where to begin: the solution of the differences of squared ranges, on both sides of the references.
-
-    The differences tell little of the height above references that are nearly flat; the mean of the squared ranges
-    tells how much is missing.
-    """
     centre = anchors.mean(axis=0)
     offsets = anchors - centre
     arms = (offsets**2).sum(axis=1)
@@ -346,7 +341,6 @@ def _trilaterated(anchors: FloatArray, lengths: FloatArray, sigmas: FloatArray, 
 def _look(
     points: FloatArray, anchors: FloatArray, lengths: FloatArray, sigmas: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Cost (draws,), negative half gradient (draws, d) and normal matrix (draws, d, d)."""
     ways = points[:, None] - anchors
     distances = np.maximum(np.sqrt((ways**2).sum(axis=2)), 1e-9)
     J = ways / (distances * sigmas)[:, :, None]
@@ -409,7 +403,6 @@ def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: in
 
 
 def _shaped(plan: MotePlan, found_m: FloatArray) -> FloatArray:
-    """Places with the stands as they are known to be."""
     places = found_m.copy()
     for stand in plan.bodies:
         motes = list(stand.motes)
@@ -494,13 +487,11 @@ def _seed(network: RangeNetwork, means: PairMeans, sketch: Sketch) -> None:
 
 
 def _height(means: PairMeans, motes: tuple[int, ...]) -> float:
-    """Least width of a simplex, m: its smallest extent along a principal axis."""
     points = classical_scaling(_distances(means, motes), len(motes) - 1)
     return float(np.linalg.svd(points, compute_uv=False)[-1])
 
 
 def _sides(means: PairMeans, motes: tuple[int, ...]) -> list[tuple[float, float]]:
-    """Range and sigma of every two of some motes."""
     return [_between(means, a, b) for a, b in combinations(motes, 2)]
 
 

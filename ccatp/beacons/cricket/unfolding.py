@@ -88,8 +88,6 @@ def _turned(points: FloatArray) -> FloatArray:
 
 
 class _Stress:
-    """sum w (d - |p_i - p_j|)^2 + squeeze |spare coordinates|^2, and the Gauss-Newton step down from it."""
-
     def __init__(
         self,
         count: int,
@@ -231,7 +229,6 @@ def repaired(model: MapModel, fit: MapFit, settings: MapFitSettings) -> MapFit:
 
 
 def _contradicted(network: RangeNetwork, fit: MapFit) -> list[IndexArray]:
-    """Suspects and their partners, each set that hangs together by itself."""
     bad = np.abs(fit.residuals_m) > _SUSPECT * network.sigmas_m
     if not bad.any():
         return []
@@ -245,7 +242,6 @@ def _contradicted(network: RangeNetwork, fit: MapFit) -> list[IndexArray]:
 
 
 def _mapped_anew(network: RangeNetwork, fit: MapFit, motes: IndexArray, settings: MapFitSettings) -> FloatArray | None:
-    """All places with some motes unfolded between their partners; None where too little holds them."""
     d = network.dimension
     pairs = np.column_stack([network.first, network.second])
     rows = np.flatnonzero(np.isin(pairs, motes).any(axis=1))

@@ -75,7 +75,6 @@ def unit_slip(scale: float, units: tuple[tuple[str, float], ...]) -> str:
 
 
 def _ranges(seen: _Seen, placed: FloatArray, strange: list[int]) -> Iterator[str]:
-    """Slope and offset over true distances; of beacons that are not in their place nothing follows."""
     sound = ~np.isin(seen.beacon, strange)
     if sound.sum() >= FEW:
         seen = seen.where(sound)
@@ -90,7 +89,6 @@ def _ranges(seen: _Seen, placed: FloatArray, strange: list[int]) -> Iterator[str
 
 
 def _bearings(seen: _Seen, placed: FloatArray) -> tuple[list[str], float | None]:
-    """What is told of bearings, and their constant error, rad; None where they tell no place."""
     to = placed[seen.beacon] - seen.pose[:, :2]
     expected = np.arctan2(to[:, 1], to[:, 0]) - seen.pose[:, 2]
     known = np.isfinite(seen.bearing_rad + expected)
@@ -108,7 +106,6 @@ def _bearings(seen: _Seen, placed: FloatArray) -> tuple[list[str], float | None]
 
 
 def _robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
-    """Slope and offset of y over x, outliers left out by and by."""
     keep = np.ones(x.size, dtype=bool)
     slope, offset = 1.0, 0.0
     for _ in range(5):
@@ -122,7 +119,6 @@ def _robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
 def _misplaced(
     names: tuple[str, ...], placed: FloatArray, seen: _Seen, off_rad: float | None
 ) -> Generator[str, None, list[int]]:
-    """Beacons that do not fit their surveyed place, all along or for a part of the run; returns them."""
     whole = _unlike(names, _misses(placed, seen), _misses(placed, seen, off_rad))
     explained = {k for line, beacons in whole.items() if FITS in line for k in beacons}
     edges = np.linspace(seen.times_s[0], seen.times_s[-1], PIECES + 1)
@@ -163,7 +159,6 @@ def _misses(placed: FloatArray, seen: _Seen, off_rad: float | None = None) -> Fl
 
 
 def _unlike(names: tuple[str, ...], miss: FloatArray, pointed: FloatArray) -> dict[str, tuple[int, ...]]:
-    """Lines on beacons whose readings do not fit their surveyed place, each with those beacons."""
     if not np.isfinite(np.diag(miss)).any():
         return {}
     own, usual = _own_and_usual(pointed)
@@ -190,7 +185,6 @@ def _unlike(names: tuple[str, ...], miss: FloatArray, pointed: FloatArray) -> di
 
 
 def _own_and_usual(miss: FloatArray) -> tuple[FloatArray, float]:
-    """What each misses its own place by, and what is usual: most may be wrong."""
     own = np.diag(miss)
     return own, float(np.nanquantile(own, 0.25))
 
@@ -291,7 +285,6 @@ def _odometry_against(truth: ReferencePath, steps: Steps) -> Iterator[str]:
 
 
 def _standing(truth: ReferencePath, steps: Steps) -> Iterator[str]:
-    """One of the two drives, the other never moves."""
     inside = (truth.times_s >= steps.times_s[0]) & (truth.times_s <= steps.times_s[-1])
     extent_m = np.hypot(np.ptp(truth.x_m[inside]), np.ptp(truth.y_m[inside])) if inside.any() else 0.0
     way_m = float(np.abs(steps.distance_m).sum() + np.abs(steps.lateral_m).sum())
@@ -302,7 +295,6 @@ def _standing(truth: ReferencePath, steps: Steps) -> Iterator[str]:
 
 
 def _copied_odometry(truth: ReferencePath, steps: Steps) -> Iterator[str]:
-    """Odometry that was made from the truth: single steps agree better than any wheel could tell."""
     x, y = (np.interp(steps.times_s, truth.times_s, column) for column in (truth.x_m, truth.y_m))
     inside = (steps.times_s >= truth.times_s[0]) & (steps.times_s <= truth.times_s[-1])
     inside = inside[:-1] & inside[1:]

@@ -96,7 +96,6 @@ def read_events_csv(file: Path) -> RecordedRun:
 
 
 def _tables(file: Path, names: dict[str, float]) -> dict[str, Table]:
-    """A table for each kind of event; ``names`` gets a number for each beacon."""
     rows: dict[str, list[list[float]]] = {}
     lines: dict[str, list[int]] = {}
     for line, content in content_lines(read_text(file)):
@@ -130,7 +129,6 @@ def _row(file: Path, line: int, kind: str, words: Sequence[str], names: dict[str
 
 
 def _surveyed(table: Table | None, beacon_ids: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Places by name; a beacon that is told twice must stand at the same place."""
     places: dict[str, tuple[float, float]] = {}
     if table is None:
         return places
@@ -142,7 +140,6 @@ def _surveyed(table: Table | None, beacon_ids: Sequence[str]) -> dict[str, tuple
 
 
 def _steps(odometry: Table) -> Steps:
-    """Each row tells the way since the row before; of the first row only its time counts."""
     t, distance, turn, lateral = odometry.values.T
     if len(t) < 3:
         raise RadioDataError(odometry.file, f"{len(t)} events odom: too few for a run")
@@ -155,7 +152,6 @@ def _steps(odometry: Table) -> Steps:
 def _readings(
     tables: dict[str, Table], steps: Steps, beacon_ids: Sequence[str], warnings: list[str]
 ) -> tuple[Readings, tuple[str, ...]]:
-    """What was heard, range, bearing and strength of the same time and beacon in one row."""
     merged: dict[tuple[float, float], list[float]] = {}
     span_s = (float(steps.times_s[0]), float(steps.times_s[-1]))
     extra: list[tuple[float, float, list[float]]] = []

@@ -121,7 +121,6 @@ def _tables(file: Path) -> dict[str, Table]:
 
 
 def _steps(odometry: Table) -> Steps:
-    """Speeds hold from their own line to the next; turn rate = (right - left) / track."""
     t, left, right, side, half_track = odometry.values[:, :5].T
     if len(t) < 3:
         raise RadioDataError(odometry.file, f"{len(t)} lines odom2diff: too few for a run")

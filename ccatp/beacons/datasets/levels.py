@@ -215,7 +215,6 @@ def _number(path: Path, line: int, row: Sequence[str], column: int) -> float:
 
 
 def _signed(levels: list[float]) -> tuple[list[float], list[str]]:
-    """Levels in dBm: a set of positive numbers only leaves the sign out."""
     if levels and min(levels) > 0.0:
         return [-level for level in levels], ["all levels are positive: taken for dBm without their sign"]
     return levels, []

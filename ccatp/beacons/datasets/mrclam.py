@@ -21,8 +21,7 @@ from ccatp.beacons.datasets.truth import checked_heading, pose_of_truth
 from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
 
 ROBOT_FILE = re.compile(r"Robot(\d+)_(Odometry|Measurement|Groundtruth)\.dat(\.gz)?$")
-LAST_ROBOT_SUBJECT = 5
-"""Subjects 1 to 5 are robots, those above it are landmarks (Leung et al., IJRR 2011)."""
+LAST_ROBOT_SUBJECT = 5  # subjects 1 to 5 are robots, those above it are landmarks (Leung et al., IJRR 2011)
 ODOMETRY = ("time [s]", "forward velocity [m/s]", "angular velocity [rad/s]")
 MEASUREMENT = ("time [s]", "barcode", "range [m]", "bearing [rad]")
 REFERENCE = ("time [s]", "x [m]", "y [m]", "heading [rad]")
@@ -97,7 +96,6 @@ def _run(folder: Path, robot: int) -> RecordedRun:
 
 
 def _steps(odometry: Table) -> Steps:
-    """A row's velocities hold until the next row; over a gap of the recording they are guessed."""
     t, speed, rate = odometry.values.T
     if len(t) < 3:
         raise RadioDataError(odometry.file, f"{len(t)} rows: too few for a run")
@@ -109,7 +107,6 @@ def _steps(odometry: Table) -> Steps:
 
 
 def _subjects(folder: Path, barcodes: np.ndarray, warnings: list[str]) -> np.ndarray:
-    """Subject of each reading; 0 where the barcode is nobody's."""
     file = _needed(folder, "Barcodes.dat", "readings name barcodes, and it tells whose they are")
     table = read_table(file, ("subject", "barcode"))
     subject_of = {int(barcode): int(subject) for subject, barcode in table.values.tolist()}

@@ -145,7 +145,6 @@ def _run(name: str, file: Path, tables: dict[str, Table]) -> RecordedRun:
 
 
 def _steps(file: Path, odometry: Table, truth_start_s: float | None) -> Steps:
-    """Each row tells the way since the row before; the first since the truth's first pose."""
     t, distance, turn = odometry.values.T
     if len(t) < 3:
         raise RadioDataError(file, f"{len(t)} odometry rows: too few for a run")

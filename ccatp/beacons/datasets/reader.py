@@ -50,7 +50,6 @@ def _read(path: Path, data_format: str, robot: int | None) -> RecordedRun:
 
 
 def _with_reference(run: RecordedRun) -> RecordedRun:
-    """The run without a truth of too few rows, of which only the first pose is left."""
     if run.truth is None or len(run.truth.times_s) >= LEAST_TRUTH:
         return run
     rows = plural(len(run.truth.times_s), "row")

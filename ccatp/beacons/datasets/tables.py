@@ -169,7 +169,6 @@ def in_order(table: Table, warnings: list[str], columns: int | None = None) -> T
 
 
 def _first_of_each(values: FloatArray) -> npt.NDArray[np.bool_]:
-    """Rows that repeat no other row of the same time (rows are sorted by time)."""
     keep = np.ones(len(values), dtype=bool)
     same_time = np.flatnonzero(np.diff(values[:, 0]) == 0.0) + 1
     for row in same_time.tolist():
@@ -275,7 +274,6 @@ def _refuse(
 
 
 def _sensible(readings: Readings, warnings: list[str]) -> Readings:
-    """Readings without the values that cannot be, and without rows that had no other."""
     columns = {}
     for field, what, most, unit in (
         ("range_m", "range", LONGEST_RANGE_M, "m"),
@@ -300,17 +298,12 @@ def _sensible(readings: Readings, warnings: list[str]) -> Readings:
     return cleaned.where(known)
 
 
-BEFORE_S = 1.0
-"""Over so long the speed before a gap is taken."""
-WINDOWS = 1000
-"""Spans of the run by which speeds are compared with those before."""
-LOST_RAD = float(np.pi / np.sqrt(3.0))
-"""Standard deviation of a heading that is anything: more cannot be unknown."""
+BEFORE_S = 1.0  # over so long the speed before a gap is taken
+WINDOWS = 1000  # spans of the run by which speeds are compared with those before
+LOST_RAD = float(np.pi / np.sqrt(3.0))  # standard deviation of a heading that is anything: more cannot be unknown
 
 
 class _Guess(NamedTuple):
-    """Amount of a span, by the mean rate before it."""
-
     share: float
     sigma: float
 
@@ -353,7 +346,6 @@ def _runs(marked: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def _rate_before(times_s: FloatArray, total: FloatArray, at_s: float) -> float:
-    """Mean rate in the ``BEFORE_S`` before a time of what was added up; 0 at the beginning."""
     from_s = max(at_s - BEFORE_S, float(times_s[0]))
     if at_s <= from_s:
         return 0.0
@@ -362,7 +354,6 @@ def _rate_before(times_s: FloatArray, total: FloatArray, at_s: float) -> float:
 
 
 def _guessed(times_s: FloatArray, total: FloatArray, span_s: float) -> _Guess:
-    """How the amount of a span follows from the rate before it; a span of half the run at most is looked at."""
     whole_s = float(times_s[-1] - times_s[0])
     before_s, seen_s = min(BEFORE_S, 0.25 * whole_s), min(span_s, 0.5 * whole_s)
     t = np.linspace(times_s[0] + before_s, times_s[-1] - seen_s, WINDOWS)

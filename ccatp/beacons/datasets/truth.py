@@ -6,22 +6,16 @@ import numpy.typing as npt
 from ccatp.beacons.slam.recording import ReferencePath, Steps, dead_reckoned
 from ccatp.core import FloatArray
 
+# Travel over which a course is told from positions: well above the centimetres of GNSS and camera references.
 CHORD_M = 0.2
-"""Travel over which a course is told from positions: well above the centimetres of GNSS and camera references."""
-LONGEST_WAY_M = 1e6
-"""Longer ways are no vehicle's; they are not cut into chords."""
-AGREEMENT = 0.8
-"""Length of the mean vector of (course - heading) above which the two differ by a constant."""
-LARGEST_SIDESLIP_RAD = 0.3
-"""A constant difference below it is the vehicle's own; above it is the reference's frame."""
-PIECE_S = 10.0
-"""Long enough for a turn or two, short enough for odometry."""
+LONGEST_WAY_M = 1e6  # longer ways are no vehicle's; they are not cut into chords
+AGREEMENT = 0.8  # length of the mean vector of (course - heading) above which the two differ by a constant
+LARGEST_SIDESLIP_RAD = 0.3  # a constant difference below it is the vehicle's own; above it is the reference's frame
+PIECE_S = 10.0  # long enough for a turn or two, short enough for odometry
 PIECE_POINTS = 40
 LEAST_PIECES = 4
-TELLING = 0.5
-"""A turning factor is believed if it halves the misfit of a straight path."""
-FIRST_WAY_M = 2.0
-"""Way whose shape gives the first heading if the reference has positions alone."""
+TELLING = 0.5  # a turning factor is believed if it halves the misfit of a straight path
+FIRST_WAY_M = 2.0  # way whose shape gives the first heading if the reference has positions alone
 
 
 def way_at(steps: Steps, times_s: FloatArray) -> FloatArray:

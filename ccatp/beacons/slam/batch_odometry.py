@@ -12,18 +12,15 @@ from ccatp.beacons.slam.motion import DifferentialNoise
 from ccatp.beacons.slam.recording import Steps
 from ccatp.core import FloatArray
 
+# What odometry is calibrated by: d = (1 + distance_scale) d_o, w = (1 + turn_scale) w_o + turn_per_m d_o - bias t.
+# Scales are what corrects, not what the odometry reads too much; ``turn_per_m`` is what wheels of unequal size do;
+# ``delay_s`` is by how much the vehicle does later what its odometry says (commands that are taken for odometry).
 CALIBRATION = ("distance_scale", "turn_scale", "turn_per_m", "turn_bias_rad_s", "delay_s")
-"""What odometry is calibrated by: d = (1 + distance_scale) d_o, w = (1 + turn_scale) w_o + turn_per_m d_o - bias t.
-
-Scales are what corrects, not what the odometry reads too much; ``turn_per_m`` is what wheels of unequal size do;
-``delay_s`` is by how much the vehicle does later what its odometry says (commands that are taken for odometry).
-"""
-STILL_M = 1e-4
-"""Standard deviation of what happens in any interval, even at rest: keeps the covariance regular."""
+STILL_M = 1e-4  # standard deviation of what happens in any interval, even at rest: keeps the covariance regular
 STILL_RAD = 1e-4
 DELAY_STEP_S = 0.05
+# Steps shorter than that are put together: within it a vehicle turns so little that the chord is the arc.
 FINEST_S = 0.1
-"""Steps shorter than that are put together: within it a vehicle turns so little that the chord is the arc."""
 
 
 class Increments(NamedTuple):
@@ -64,7 +61,6 @@ class Reckoning:
         self._cut(0.0)
 
     def _cut(self, delay_s: float) -> None:
-        """The odometry of each fine step if the vehicle lags by ``delay_s``."""
         self._delay_s = delay_s
         self.distance_m, self.turn_rad, self.lateral_m = (self._shares(total, delay_s) for total in self._totals)
         self._guess_m2, self._guess_rad2 = (self._shares(total, delay_s) for total in self._guess_totals)
@@ -74,7 +70,6 @@ class Reckoning:
         return shares
 
     def _by_delay(self, total: FloatArray) -> FloatArray:
-        """What a second more of delay adds to each fine step, by differences wide enough to see across commands."""
         later, sooner = (self._shares(total, self._delay_s + sign * DELAY_STEP_S) for sign in (1.0, -1.0))
         return (later - sooner) / (2.0 * DELAY_STEP_S)
 

@@ -86,7 +86,6 @@ class Factored:
 
 
 def _banded(system: ArrowSystem, damping: float) -> FloatArray:
-    """The lower bands of A as LAPACK wants them: row i holds the i-th band below the diagonal."""
     n = len(system.diagonal)
     band = np.zeros((BAND + 1, n, BLOCK))
     for column in range(BLOCK):
@@ -105,7 +104,6 @@ def _band_solve(factor: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def _diagonal_of_inverse(system: ArrowSystem) -> FloatArray:
-    """Diagonal blocks of A^-1: (left_k + right_k - A_kk)^-1, the Schur complements of what lies on either side."""
     A, below = system.diagonal, system.below
     n = len(A)
     left, right = A.copy(), A.copy()
@@ -117,8 +115,8 @@ def _diagonal_of_inverse(system: ArrowSystem) -> FloatArray:
 
 
 OF_READINGS = ("range_scale", "range_offset_m", "bearing_offset_rad", "rssi_reference_db", "rssi_exponent")
+# Unknowns that are neither pose nor beacon, in the order of the state: corrections, zero where all is as it should.
 SHARED = (*CALIBRATION, *OF_READINGS)
-"""Unknowns that are neither pose nor beacon, in the order of the state: corrections, zero where all is as it should."""
 RANGE_SCALE, RANGE_OFFSET, BEARING_OFFSET, RSSI_REFERENCE, RSSI_EXPONENT = (SHARED.index(name) for name in OF_READINGS)
 BEACON = 4  # x_m, y_m, the offset of its ranges, m, and of its P_ref, dB
 LEAST_RANGE_M = 1e-3

@@ -17,21 +17,15 @@ from ccatp.beacons.slam.causal import beyond_priors
 from ccatp.beacons.slam.recording import BeaconFix, Calibrated, EstimatedPath, Readings, RecordedRun, Steps
 from ccatp.core import FloatArray
 
-FIRST = 40
-"""Instants solved at first."""
-GROWTH = 1.2
-"""Ratio of the instants solved from one time to the next."""
+FIRST = 40  # instants solved at first
+GROWTH = 1.2  # ratio of the instants solved from one time to the next
 GROWING_ITERATIONS = 6
-ROUGHLY = 1e-3
-"""Relative gain of the cost that is good enough for a beginning of the run."""
-SURE_MARGIN = 8.0
-"""Half a chi-squared by which a beacon's best place must beat the next one before it joins."""
-LEAST_READINGS = 4
-"""Of a beacon that joins without bearings."""
+ROUGHLY = 1e-3  # relative gain of the cost that is good enough for a beginning of the run
+SURE_MARGIN = 8.0  # half a chi-squared by which a beacon's best place must beat the next one before it joins
+LEAST_READINGS = 4  # of a beacon that joins without bearings
+# Between the places of a beacon's readings without bearings: from a single place it may lie anywhere on a circle.
 LEAST_WAY_M = 0.01
-"""Between the places of a beacon's readings without bearings: from a single place it may lie anywhere on a circle."""
-SURE_SPREAD = 0.15
-"""Largest standard deviation of a beacon that joins, over its distance."""
+SURE_SPREAD = 0.15  # largest standard deviation of a beacon that joins, over its distance
 
 
 class Start(NamedTuple):
@@ -83,7 +77,6 @@ def grown(
 
 
 def _settled(problem: BatchProblem, state: BatchState, known: int) -> BatchState:
-    """The state after a few steps, soft with readings along the new poses, which may still be far off."""
     new = problem.at >= known
     counted = new & (problem.sizes > 0)
     for forgiving in (True, False):
@@ -107,7 +100,6 @@ def _join(
     *,
     last: bool,
 ) -> bool:
-    """Place what can be placed; also put right what is better placed elsewhere. Whether anything changed."""
     changed = False
     readings = problem.readings
     for beacon in range(len(used)):
@@ -140,18 +132,14 @@ def _join(
     return changed
 
 
-SPACING_S = 0.5
-"""There is a pose at least that often, whether something was heard or not."""
+SPACING_S = 0.5  # there is a pose at least that often, whether something was heard or not
 ITERATIONS = 40
 WIDENINGS = 8
-WIDER = 1.05
-"""Noise is widened where the residuals are larger than it by that factor."""
-NOISY = 4.0
-"""How many times the noise may have been widened without being told."""
-LITTLE = 0.1
-"""A reading that weighs less counts as refused."""
+WIDER = 1.05  # noise is widened where the residuals are larger than it by that factor
+NOISY = 4.0  # how many times the noise may have been widened without being told
+LITTLE = 0.1  # a reading that weighs less counts as refused
+# Unknowns that multiply the odometry; what is told is what it reads too much, as the filter does.
 CORRECTING = ("distance_scale", "turn_scale")
-"""Unknowns that multiply the odometry; what is told is what it reads too much, as the filter does."""
 TOLD_AS = {"delay_s": "odometry_delay_s"}
 
 
@@ -201,7 +189,6 @@ def _anchored(state: BatchState, first_pose: tuple[float, float, float]) -> Batc
 
 
 def _filled(problem: BatchProblem, state: BatchState, known: npt.NDArray[np.int64]) -> BatchState:
-    """The state with a pose at each instant of the problem: those between the known ones by odometry."""
     motion = problem.reckoning.increments(state.shared[: len(CALIBRATION)], problem.odometry).motion
     poses = np.empty((len(motion) + 1, 3))
     poses[known] = state.poses
@@ -213,10 +200,6 @@ def _filled(problem: BatchProblem, state: BatchState, known: npt.NDArray[np.int6
 
 
 def _widened(problem: BatchProblem, state: BatchState) -> RadioNoise:
-    """Noise of the readings, wider where the weighted residuals ask for it.
-
-    The maximum-likelihood scale of Student's t is that of sum w e^2 / sigma^2 = number of readings.
-    """
     residuals, radio = problem.residuals(state), problem.radio
     weights = t_weights(residuals.chi2, problem.sizes, radio.freedom)
     squares = weights[:, None] * residuals.readings**2 * residuals.information
@@ -297,13 +280,11 @@ def _calibration(problem: BatchProblem, state: BatchState, covariance: FloatArra
 
 
 def _read(correction: Calibrated) -> Calibrated:
-    """What the odometry reads too much, e with d = d_o / (1 + e), of a correction s with d = (1 + s) d_o."""
     scale = 1.0 + correction.value
     return Calibrated(1.0 / scale - 1.0, correction.sigma / scale**2)
 
 
 def _noisy(radio: RadioNoise, first: RadioNoise) -> Iterator[str]:
-    """Noise that had to be widened beyond what is told of such radios."""
     for what in ("range", "bearing", "rssi"):
         name = {"range": "range_sigma_m", "bearing": "bearing_sigma_rad", "rssi": "rssi_sigma_db"}[what]
         ratio = getattr(radio, name) / getattr(first, name)

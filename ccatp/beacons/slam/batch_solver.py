@@ -13,8 +13,7 @@ from ccatp.core import FloatArray
 
 LEAST_DAMPING = 1e-9
 MOST_DAMPING = 1e9
-CONVERGED = 1e-5
-"""Relative gain below which a cost has converged."""
+CONVERGED = 1e-5  # relative gain below which a cost has converged
 
 
 class Descent(NamedTuple):
@@ -80,7 +79,6 @@ def descend(
 
 
 def _step(problem: BatchProblem, state: BatchState, system: ArrowSystem, damping: float) -> BatchState | None:
-    """The state a damped step further; None where the system is not positive definite."""
     try:
         poses, shared = Factored(system, damping).solution()
     except LinAlgError:
@@ -117,15 +115,11 @@ def _cost(
     return problem.prior_cost(state) + odometry + readings
 
 
-STARTS = 48
-"""Directions, around the place of a range's reading, from which a beacon is sought."""
+STARTS = 48  # directions, around the place of a range's reading, from which a beacon is sought
 PLACING_ITERATIONS = 20
-FREEDOM = 4.0
-"""Of Student's t by which outliers are bounded."""
-MOST_READINGS = 200
-"""Of one beacon; more are thinned, since first places need no more."""
-APART = 0.1
-"""Two minima are different places if they lie further apart than that part of the beacon's distance."""
+FREEDOM = 4.0  # of Student's t by which outliers are bounded
+MOST_READINGS = 200  # of one beacon; more are thinned, since first places need no more
+APART = 0.1  # two minima are different places if they lie further apart than that part of the beacon's distance
 
 
 class Placement(NamedTuple):

@@ -51,10 +51,9 @@ class NoiseLevel:
         self.factor = factor
 
 
-LARGEST = 0.3
-"""Most that one innovation may change the logarithm of the factor."""
+LARGEST = 0.3  # most that one innovation may change the logarithm of the factor
+# Largest factor, and one over the least: a sensor ten times worse than promised is not one to be believed.
 FURTHEST = 100.0
-"""Largest factor, and one over the least: a sensor ten times worse than promised is not one to be believed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,8 +172,7 @@ class SlamSettings:
 _NONE = np.empty(0, dtype=np.intp)
 
 
-WANDER = "wander"
-"""First part of the name of a block that holds a wandering error."""
+WANDER = "wander"  # first part of the name of a block that holds a wandering error
 
 
 def is_place(block: BlockId) -> bool:
@@ -318,7 +316,6 @@ class HeadingTransport:
         dger(-0.5, less, less, a=P.T, overwrite_a=1)
 
     def _look(self, P: FloatArray) -> None:
-        """Which states are x and y of a place: each with its partner and the sign of the quarter turn."""
         engine = self._engine
         self._seen = P
         x = np.array([0, *(engine.block(block).start for block in engine.blocks if is_place(block))])

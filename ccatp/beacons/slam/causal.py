@@ -30,12 +30,9 @@ from ccatp.beacons.slam.recording import (
 )
 from ccatp.core import FloatArray
 
-FAR = 3.0
-"""Standard deviations of the prior beyond which a value is told."""
-UNCHANGED = 0.999
-"""Of the prior's standard deviation: what is left of it where no reading told anything."""
-KEYS = {"odometry_delay_s": "delay_s"}
-"""Keys under ``priors`` that are called otherwise than the quantity."""
+FAR = 3.0  # standard deviations of the prior beyond which a value is told
+UNCHANGED = 0.999  # of the prior's standard deviation: what is left of it where no reading told anything
+KEYS = {"odometry_delay_s": "delay_s"}  # keys under ``priors`` that are called otherwise than the quantity
 
 
 def learned(calibration: Mapping[str, Calibrated], priors: Mapping[str, float]) -> dict[str, Calibrated]:
@@ -62,16 +59,11 @@ def beyond_priors(calibration: Mapping[str, Calibrated], priors: Mapping[str, fl
             )
 
 
-HEADINGS = 8
-"""Followed at once; within an eighth of a circle the filter finds its way."""
-LOST_RAD = pi / HEADINGS
-"""Standard deviation of a heading beyond which it is looked for."""
-WORSE = 30.0
-"""Twice the log-likelihood by which one falls behind the best and is given up: more than two outliers make."""
-LONGEST = 400
-"""Readings after which the best is taken."""
-OUTLIER = 25.0
-"""What a reading may count at most against one of them."""
+HEADINGS = 8  # followed at once; within an eighth of a circle the filter finds its way
+LOST_RAD = pi / HEADINGS  # standard deviation of a heading beyond which it is looked for
+WORSE = 30.0  # twice the log-likelihood by which one falls behind the best and is given up: more than two outliers make
+LONGEST = 400  # readings after which the best is taken
+OUTLIER = 25.0  # what a reading may count at most against one of them
 
 
 class HeadingRelocalizer:
@@ -136,14 +128,11 @@ class HeadingRelocalizer:
         self.best, *self._others = (slams[k] for _, k in kept)
 
 
-FINEST_S = 0.1
-"""Steps of odometry shorter than that are put together."""
+FINEST_S = 0.1  # steps of odometry shorter than that are put together
+# Mean square of normalised innovations, per degree of freedom, that is told: of learned noise it is one.
 DOUBTFUL_NIS = 1.3
-"""Mean square of normalised innovations, per degree of freedom, that is told: of learned noise it is one."""
-DOUBTFUL_JUMPS = 0.003
-"""How often the pose has to be doubted, for each reading, that it is told."""
-DOUBTFUL_SHARE = 0.3
-"""Share of refused readings that is told."""
+DOUBTFUL_JUMPS = 0.003  # how often the pose has to be doubted, for each reading, that it is told
+DOUBTFUL_SHARE = 0.3  # share of refused readings that is told
 
 
 def filter_run(
@@ -202,8 +191,6 @@ def filter_run(
 
 
 class _Heard:
-    """The readings of a run, handed out in order of time."""
-
     def __init__(self, run: RecordedRun) -> None:
         self._all, self._next = list(_readings(run)), 0
 
@@ -217,8 +204,6 @@ class _Heard:
 
 @dataclass(slots=True)
 class _Book:
-    """What the readings said, and what each step cost, s: of a prediction, of a reading with it, of a scalar alone."""
-
     nis: list[float] = field(default_factory=list)
     sizes: list[int] = field(default_factory=list)
     refused: int = 0
@@ -251,7 +236,6 @@ def _doubts(nis: FloatArray, sizes: FloatArray, refused: int, jumps: int) -> Ite
 
 
 def _lost(run: RecordedRun, names: Sequence[str]) -> Iterator[str]:
-    """Beacons that are not on the map, and why, a line each."""
     r = run.readings
     ranged = {run.beacon_ids[k] for k in np.unique(r.beacon[np.isfinite(r.range_m) | np.isfinite(r.rssi_dbm)])}
     for name in names:
@@ -265,14 +249,12 @@ def _unplaced(count: int) -> Iterator[str]:
 
 
 def _moved(moved: Sequence[tuple[BeaconId, float]]) -> Iterator[str]:
-    """Beacons that were placed anew, a line each: the map holds their last place."""
     for beacon in dict.fromkeys(beacon for beacon, _ in moved):
         times = ", ".join(f"{time_s:.1f}" for name, time_s in moved if name == beacon)
         yield f"beacon {beacon} was placed anew at {times} s: was it moved, or exchanged for another?"
 
 
 def _spaced(times_s: FloatArray) -> FloatArray:
-    """The first time, the last, and between them the first of each span of ``FINEST_S``."""
     _, first = np.unique(np.floor((times_s - times_s[0]) / FINEST_S), return_index=True)
     return np.union1d(times_s[first], times_s[-1:])
 
@@ -289,7 +271,6 @@ def _increments(steps: Steps, times_s: FloatArray) -> list[Increment]:
 
 
 def _readings(run: RecordedRun) -> Iterator[Reading]:
-    """In order of time; a range goes before a signal strength of the same moment."""
     r = run.readings
     for time_s, beacon, range_m, bearing_rad, rssi_dbm in zip(*(column.tolist() for column in r), strict=True):
         name = run.beacon_ids[beacon]

@@ -15,15 +15,11 @@ from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun, 
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import Consistency, RigidMotion, best_motion, consistency, nees, rms, wrapped
 
-LONGEST_GAP_S = 0.5
-"""The truth is taken as known between two of its rows that lie no further apart,"""
-USUAL_GAPS = 3.0
-"""or no further than that many of its usual intervals."""
+LONGEST_GAP_S = 0.5  # the truth is taken as known between two of its rows that lie no further apart,
+USUAL_GAPS = 3.0  # or no further than that many of its usual intervals
 
-FIRST_POSE_S = 1.0
-"""The truth's first row tells the first pose if it comes no later than that."""
-LEAST_KNOWN = 3
-"""Instants with a truth: one always fits, and two but for their distance."""
+FIRST_POSE_S = 1.0  # the truth's first row tells the first pose if it comes no later than that
+LEAST_KNOWN = 3  # instants with a truth: one always fits, and two but for their distance
 
 
 class TrackEvaluation(NamedTuple):
@@ -100,7 +96,6 @@ def aligned_beacons(track: EstimatedPath, alignment: RigidMotion) -> dict[str, B
 
 
 def _begins_on_truth(run: RecordedRun) -> bool:
-    """Whether the truth told the first pose: else track and truth are of two frames."""
     if run.truth is None:
         return False
     return bool(run.truth.times_s[0] - FIRST_POSE_S <= run.steps.times_s[0] <= run.truth.times_s[-1])
@@ -116,8 +111,7 @@ def _nees(track: EstimatedPath, truth: FloatArray, known: np.ndarray) -> Consist
     return consistency(squares, np.full(squares.size, float(size)))
 
 
-SCALES = ("range_scale", "distance_scale", "turn_scale")
-"""Told as factors: 1.07 for ranges that read 7 % too long."""
+SCALES = ("range_scale", "distance_scale", "turn_scale")  # told as factors: 1.07 for ranges that read 7 % too long
 
 
 def result_data(run: RecordedRun, filter_name: str, track: EstimatedPath, judged: TrackEvaluation) -> dict[str, Any]:

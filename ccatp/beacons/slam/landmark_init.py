@@ -22,37 +22,27 @@ from ccatp.filters.ekf_slam import BlockId, Columns, EkfSlam, Update, columns_of
 
 RowOf = Callable[[Reading, list[float], list[float], list[float]], MeasurementRow]
 
-MOST = 24
-"""Readings of a beacon that are kept; beyond, every other one goes, and they are taken twice as far apart."""
-LEAST = 8
-"""Readings without which a beacon is not looked for: what its place needs, four times over."""
-SPACING = 0.01
-"""Way between readings that are kept, at first, relative to the range."""
-STARTS = 24
-"""Directions about the vehicle in which a beacon is looked for."""
-TIGHT = 0.1
-"""Largest standard deviation, across the line of sight, of a beacon that joins, relative to its distance."""
+MOST = 24  # readings of a beacon that are kept; beyond, every other one goes, and they are taken twice as far apart
+LEAST = 8  # readings without which a beacon is not looked for: what its place needs, four times over
+SPACING = 0.01  # way between readings that are kept, at first, relative to the range
+STARTS = 24  # directions about the vehicle in which a beacon is looked for
+TIGHT = 0.1  # largest standard deviation, across the line of sight, of a beacon that joins, relative to its distance
+# How many times that is borne at last, in proportion to the readings: the vehicle strays while beacons wait.
 LOOSEST = 2.5
-"""How many times that is borne at last, in proportion to the readings: the vehicle strays while beacons wait."""
-DEEP = 0.3
-"""The same along it, where ranges are all but linear: a scale that all share may be that uncertain."""
-APART = 0.05
-"""Places nearer to each other than that, relative to the distance, are one."""
+DEEP = 0.3  # the same along it, where ranges are all but linear: a scale that all share may be that uncertain
+APART = 0.05  # places nearer to each other than that, relative to the distance, are one
+# Residuals beyond that many sigmas first weigh no more than those at it (Huber), at last nothing: readings round a
+# corner are too long. Each then costs what one at the knee does, so that places can be compared.
 KNEE = 3.0
-"""Residuals beyond that many sigmas first weigh no more than those at it (Huber), at last nothing: readings round a
-corner are too long. Each then costs what one at the knee does, so that places can be compared."""
-MEDIAN_TO_SIGMA = 1.4826
-"""Standard deviation of a Gaussian over the median of its absolute value."""
-OUT = 100.0
-"""What a residual squared is taken times for the variance of a reading that is left out."""
-PLAIN, ROBUST, ITERATIONS = 3, 7, 14
-"""Steps of Gauss-Newton without weights, until those of Huber end, and at most."""
+MEDIAN_TO_SIGMA = 1.4826  # standard deviation of a Gaussian over the median of its absolute value
+OUT = 100.0  # what a residual squared is taken times for the variance of a reading that is left out
+PLAIN, ROBUST, ITERATIONS = 3, 7, 14  # steps of Gauss-Newton without weights, until those of Huber end, and at most
+# How much worse the second best place must be, chi-squared, so that the best is no mirror image: odds of a thousand
+# to one, though two readings were off.
 MARGIN = 14.0 + 2.0 * KNEE**2
-"""How much worse the second best place must be, chi-squared, so that the best is no mirror image: odds of a thousand to
-one, though two readings were off."""
+# Sigmas by which chi-squared may exceed its expectation; if it stays beyond, the noise is taken for that much larger
+# (Birge's ratio): with less noise in the settings than there is, no beacon would ever join.
 FIT = 6.0
-"""Sigmas by which chi-squared may exceed its expectation; if it stays beyond, the noise is taken for that much larger
-(Birge's ratio): with less noise in the settings than there is, no beacon would ever join."""
 
 
 class ReadingRecord(NamedTuple):
@@ -185,7 +175,6 @@ class PendingLandmark:
         self.candidates = apart[:2]
 
     def _usual_m(self, reach_m: float) -> float:
-        """Median distance that the readings tell: the last one may have gone round a corner."""
         return median([record.distance_m for record in self.records]) if self.records else reach_m
 
     def found(self, engine: EkfSlam) -> Candidate | None:
@@ -306,8 +295,7 @@ def _problem(engine: EkfSlam, records: list[ReadingRecord], row_of: RowOf, share
     return _Problem(readings, z, places, engine.mean[shared].tolist(), P, row_of, reach_m)
 
 
-LINEARISATIONS = 8
-"""At most; Gauss-Newton on readings that a beacon joined by comes to rest within five."""
+LINEARISATIONS = 8  # at most; Gauss-Newton on readings that a beacon joined by comes to rest within five
 
 
 def settle_by_places(
@@ -361,10 +349,9 @@ def pose_columns(shared: slice, block: slice) -> Columns:
     return columns_of(slice(0, POSE), shared, block)
 
 
+# Standard deviation of a beacon's place before its readings, relative to its distance: they alone place it.
 FLAT = 100.0
-"""Standard deviation of a beacon's place before its readings, relative to its distance: they alone place it."""
-TRIAL = 2
-"""Readings that must agree with the one that a beacon joined by: a misread name would put it anywhere."""
+TRIAL = 2  # readings that must agree with the one that a beacon joined by: a misread name would put it anywhere
 
 
 class LandmarkInitializer:
@@ -444,7 +431,6 @@ class LandmarkInitializer:
         del self.waiting[reading.beacon]
 
     def _settle(self, reading: Reading) -> None:
-        """Condition a beacon that has just joined at range and bearing on them."""
         block = self._engine.block(reading.beacon)
         columns = pose_columns(self._shared, block)
 
@@ -470,7 +456,6 @@ class LandmarkInitializer:
     def _row_of(
         self, reading: Reading, pose: list[float], calibration: list[float], beacon: list[float]
     ) -> MeasurementRow:
-        """What a reading should be, with the noise as it was learned."""
         row = self._sensors.row(reading, pose, calibration[: self._ranges], beacon)
         level = self._levels[kind_of(reading)]
         return row._replace(variance=row.variance * level.factor)

@@ -6,8 +6,7 @@ from typing import NamedTuple
 from ccatp.beacons.slam.beacon_map import BearingModel, GaussMarkovBias, RangeModel, RssiModel, SlamSettings
 from ccatp.beacons.slam.recording import RangeBearingReading, RangeReading, Reading, RssiReading
 
-LEAST_RANGE_M = 1e-3
-"""Nearer than that a range has no direction: derivatives are taken there."""
+LEAST_RANGE_M = 1e-3  # nearer than that a range has no direction: derivatives are taken there
 _DB = 10.0 / log(10.0)
 
 

@@ -15,8 +15,7 @@ import numpy as np
 from ccatp.core import FloatArray
 
 POSE = 3  # x_m, y_m, heading_rad: the first states of a vehicle
-SMALL_RAD = 1e-3
-"""Half a turn below which sin(a) / a is 1 - a^2 / 6 to the last digit."""
+SMALL_RAD = 1e-3  # half a turn below which sin(a) / a is 1 - a^2 / 6 to the last digit
 
 
 class VehiclePose(NamedTuple):
@@ -199,7 +198,6 @@ class DifferentialDrive:
         )
 
     def _turn(self, values: list[float], odometry: Increment) -> tuple[float, float, float]:
-        """The corrected turn, and its derivatives by the bias and by the relative error of turns."""
         scaled = 1.0 + values[self._turn_scale] if self._turn_scale >= 0 else 1.0
         turn, dt = odometry.turn_rad / scaled, odometry.interval_s
         bias = values[self._bias] if self._bias >= 0 else 0.0
@@ -298,8 +296,6 @@ class WheelNoise:
 
 
 class _TurnStep(NamedTuple):
-    """How an interval turns the vehicle, with derivatives by the reading of steering or turn rate, speed and slip."""
-
     swing_rad: float
     turn_rad: float
     swing_by: tuple[float, float, float]
@@ -381,8 +377,7 @@ class SlippingVehicle:
         return T, odometry.distance_m / T, odometry.turn_rad / T
 
 
-SLIVER = 0.2
-"""Part of an interval that is not worth a step of its own: the pose is carried over it."""
+SLIVER = 0.2  # part of an interval that is not worth a step of its own: the pose is carried over it
 
 
 STANDS = (0.0, 0.0, 0.0)

@@ -176,7 +176,6 @@ class PathLossFit:
         return found
 
     def _studentised(self) -> FloatArray:
-        """Residuals over their deviations, each place left out of its own sigma."""
         rows = np.column_stack([np.ones(self.places), -10.0 * np.log10(self.distances_m)])
         leverage = np.einsum("ij,ji->i", rows, np.linalg.pinv(rows))
         square = self.residuals_db**2 / np.maximum(1.0 - leverage, 1e-9)

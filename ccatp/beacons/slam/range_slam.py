@@ -265,7 +265,6 @@ class BeaconSlam:
         self._map.leave(beacon)
 
     def _update(self, reading: Reading, entry: MapEntry) -> BeaconInnovation:
-        """Bearing first, which says whether it is the beacon at all; then the range or strength, if any."""
         model = None if is_direction(reading) else self._sensors.wander(reading)
         if model is not None:
             self._map.wander_to(reading.beacon, model, self._way_m, reading.time_s)
@@ -315,7 +314,6 @@ class BeaconSlam:
         return found
 
     def _judge(self, reading: Reading, entry: MapEntry, *, accepted: bool) -> None:
-        """Refusals accuse the pose, or a beacon that alone is refused: the one is loosened, the other begins anew."""
         if accepted:
             entry.refused = 0
             entry.on_trial = max(entry.on_trial - 1, 0)
@@ -338,7 +336,6 @@ class BeaconSlam:
 
 
 def _with_guess(Q: FloatArray, odometry: Increment) -> FloatArray:
-    """The noise of a step whose way is guessed, which tells nothing of the noise of odometry."""
     Q = Q.copy()
     Q[range(POSE), range(POSE)] += odometry.guess_m2, odometry.guess_m2, odometry.guess_rad2
     return Q

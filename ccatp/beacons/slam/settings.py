@@ -165,7 +165,6 @@ def _map(cfg: RadioConfig, sigma_db: float) -> ShadowingMap:
 
 
 def _moving(cfg: RadioConfig, sigma_db: float) -> MovingRadio:
-    """The radio that moves; in a room without one the name is never heard."""
     estimator = cfg.estimator
     return MovingRadio(
         cfg.follow.target,

@@ -89,7 +89,6 @@ def _fill(
     H: FloatArray,
     row: int,
 ) -> int:  # fmt: skip
-    """Residual and derivatives of one reading from a row on; the next free row."""
     x, y, heading = values[pose : pose + POSE].tolist()
     dx, dy = (values[radio : radio + PLACE] - (x, y)).tolist()
     r = max(hypot(dx, dy), _NEAREST_M)
@@ -161,8 +160,8 @@ class _Share(NamedTuple):
     covariance: FloatArray
 
 
+# Records, where their poses begin in a state, where the radio stands in it, to the rows of an update.
 RowsAt = Callable[[list[SignalRecord], Callable[[PoseKey], int], slice], SignalRows]
-"""Records, where their poses begin in a state, where the radio stands in it, to the rows of an update."""
 
 
 class SignalLandmarkInitializer:
@@ -271,7 +270,6 @@ class SignalLandmarkInitializer:
 
 
 def _eliminated(rows: SignalRows, poses: FloatArray, mean: FloatArray, prior: SignalPrior) -> _Share:
-    """The rows of one radio, linearised at poses and a place, with the radio taken out by its prior."""
     p = poses.size
     x = np.concatenate([poses, mean])
     residual, sparse = rows.linearise(x)
@@ -291,7 +289,6 @@ def _advance(
     means: dict[BeaconId, FloatArray], shares: Mapping[BeaconId, _Share], priors: Mapping[BeaconId, SignalPrior],
     poses: FloatArray,
 ) -> float:  # fmt: skip
-    """Move the radios to where they are most probable for the poses; the longest of their ways, m."""
     farthest_m = 0.0
     for beacon, share in shares.items():
         step = priors[beacon].mean + share.gain @ (share.y - share.H @ poses) - means[beacon]
@@ -408,7 +405,6 @@ class MovingRadio:
         return found
 
     def _to_polar(self, engine: EkfSlam) -> None:
-        """Direction and log range from the vehicle in place of x_m and y_m."""
         start = engine.block(self.beacon).start
         dx, dy = (engine.mean[start : start + PLACE] - engine.mean[:PLACE]).tolist()
         r = max(hypot(dx, dy), _NEAREST_M)
@@ -458,7 +454,6 @@ class MovingRadio:
 def _transformed(
     engine: EkfSlam, start: int, by_place: FloatArray, by_vehicle: FloatArray, place: tuple[float, float]
 ) -> None:
-    """Other coordinates of a radio's place: the state is the same, said otherwise."""
     P, rows = engine.covariance, slice(start, start + PLACE)
     P[rows] = by_place @ P[rows] + by_vehicle @ P[:PLACE]
     P[:, rows] = P[:, rows] @ by_place.T + P[:, :PLACE] @ by_vehicle.T

@@ -198,7 +198,6 @@ class SignalSlam:
         return self.settings.moving is not None and beacon == self.settings.moving.beacon
 
     def _prior(self, reading: RssiReading, bearing_rad: float, pose: Sequence[float]) -> SignalPrior:
-        """A radio at a range and bearing, spread so widely that readings alone place it."""
         settings = self.settings
         range_m = self.path_loss_of(reading.beacon).median_range_m(reading.rssi_dbm)
         way_rad = pose[2] + bearing_rad
@@ -215,7 +214,6 @@ class SignalSlam:
         self.engine.augment(beacon, prior.mean, none, np.zeros((size, 0)), np.eye(size), np.diag(prior.sigmas**2))
 
     def _wait(self, readings: list[RssiReading]) -> None:
-        """Readings of static radios that are not on the map yet."""
         if not readings:
             return
         pose = self.newcomers.keep_pose()
@@ -237,7 +235,6 @@ class SignalSlam:
             self.newcomers.solve(left, self._rows_at)
 
     def _is_ready(self, beacon: BeaconId) -> bool:
-        """Whether a place is so sure that its error does not bend the model, or enough waits."""
         if len(self.newcomers.records(beacon)) >= self.settings.waiting_scans:
             return True
         guess, pose = self.newcomers.guesses[beacon], self.engine.mean
@@ -246,10 +243,6 @@ class SignalSlam:
         return largest < (self.settings.placed_share * range_m) ** 2
 
     def _settle(self, beacon: BeaconId, prior: SignalPrior) -> None:
-        """A radio joins the map with all that waits of it; the rest of the state learns from it, too.
-
-        The model is linearised at the guess: from the prior the way there is long, and not safe without its damping.
-        """
         self._augment(beacon, prior)
         rows = self._rows_at(
             self.newcomers.records(beacon), lambda key: self.engine.block(key).start, self.engine.block(beacon)
@@ -288,7 +281,6 @@ class SignalSlam:
         return rows_of(sights, radio, self.path_loss_of(beacon), self.settings.bearing_sigma_rad)
 
     def _sight(self, reading: RssiReading, pose: int) -> RadioModel:
-        """A reading taken at the pose that begins at a column."""
         x_m, y_m = self.engine.mean[pose : pose + PLACE].tolist()
         shadow, rest_db2 = self._shadow(reading.beacon, x_m, y_m)
         return RadioModel(reading, pose, shadow, self.path_loss_of(reading.beacon).sigma_db ** 2 + rest_db2)
