@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ccatp.beacons.datasets.tables import GAP_S, long_pauses, plural
-from ccatp.beacons.datasets.truth import chords, guessed_between, turn_at, turning_factor, way_at
+from ccatp.beacons.datasets.trajectory import amount_at, chords, turning_factor
 from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
 from ccatp.core import FloatArray, IntArray
 
@@ -270,11 +270,11 @@ def _odometry_against(truth: ReferencePath, steps: Steps) -> Iterator[str]:
         return
     yield from _copied_odometry(truth, steps)
     t = truth.times_s[rows]
-    way = np.diff(way_at(steps, t))
+    way = np.diff(amount_at(steps, steps.distance_m, t))
     true_way = np.hypot(np.diff(truth.x_m[rows]), np.diff(truth.y_m[rows]))
-    half_turn = np.minimum(0.5 * np.abs(np.diff(turn_at(steps, t))), 1.0)
+    half_turn = np.minimum(0.5 * np.abs(np.diff(amount_at(steps, steps.turn_rad, t))), 1.0)
     chord = np.abs(way) * np.sinc(half_turn / np.pi)  # of the arc
-    told = ~guessed_between(steps, t)
+    told = np.diff(amount_at(steps, steps.guess_m2, t)) <= 0.0
     true_way, chord = true_way[told], chord[told]
     if chord.sum() > 0.0:
         scale = float(true_way.sum() / chord.sum())
@@ -325,7 +325,7 @@ def _turning_against(truth: ReferencePath, steps: Steps, rows: npt.NDArray[np.in
             yield from _turns(factor, 1.0)
         return
     t = truth.times_s[rows]
-    x, y = np.diff(turn_at(steps, t)), np.diff(truth.heading_rad[rows])
+    x, y = np.diff(amount_at(steps, steps.turn_rad, t)), np.diff(truth.heading_rad[rows])
     if float(x @ x) < LEAST_TURNING_RAD2 or y.std() == 0.0:
         return
     yield from _turns(float(x @ y) / float(x @ x), float(np.corrcoef(x, y)[0, 1]))

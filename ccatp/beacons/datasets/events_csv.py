@@ -1,7 +1,7 @@
 """The CSV of our own: an event a line, for recordings of any vehicle among any beacons."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,17 +9,17 @@ import numpy as np
 from ccatp.beacons.datasets.tables import (
     RadioDataError,
     Table,
-    bridged,
     content_lines,
     in_order,
     is_number,
     number,
     plural,
     read_text,
+    tables_of,
     with_unknown_ways,
     within,
 )
-from ccatp.beacons.datasets.truth import checked_heading, pose_of_truth
+from ccatp.beacons.datasets.trajectory import bridged, checked_heading, recorded_run
 from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
 
 # Columns after the event's name; those in parentheses may be missing. "beacon" is a name, all others are numbers.
@@ -33,6 +33,7 @@ EVENTS = {
 }
 HEARD = ("range", "bearing", "rssi")
 HEADER = "event"
+NEEDED = {kind: sum(not column.startswith("(") for column in columns) for kind, columns in EVENTS.items()}
 
 
 def is_events_csv(text: str) -> bool:
@@ -51,13 +52,15 @@ def read_events_csv(file: Path) -> RecordedRun:
     """Read a run from a CSV of events (docs/radio_data.md), plain or gzipped.
 
     Raises:
-        RadioDataError: a line is no event, or there is no odometry or nothing heard.
+        RadioDataError: a line is no event, or there is no odometry or no reading of a beacon.
     """
+    if file.is_dir():
+        raise RadioDataError(file, "is a folder: name the CSV file in it")
     names: dict[str, float] = {}
     warnings: list[str] = []
-    tables = _tables(file, names)
+    tables = tables_of(file, _rows(file, names))
     surveyed = tables.pop("beacon", None)
-    needed = {kind: sum(not column.startswith("(") for column in columns) for kind, columns in EVENTS.items()}
+    needed = dict(NEEDED)
     if "odom" in tables:
         tables["odom"], needed["odom"] = with_unknown_ways(tables["odom"], warnings), 1
     tables = {kind: in_order(table, warnings, needed[kind]) for kind, table in tables.items()}
@@ -70,51 +73,41 @@ def read_events_csv(file: Path) -> RecordedRun:
     readings, heard_ids = _readings(tables, steps, beacon_ids, warnings)
     if not heard_ids:
         raise RadioDataError(file, "nothing was heard of beacons within the time of the odometry")
-    truth = None
-    if "truth" in tables:
-        t, x, y, heading = tables["truth"].values.T
-        known = np.isfinite(heading)
-        if known.any() and not known.all():
-            line = int(tables["truth"].lines[np.flatnonzero(~known)[0]])
-            count = plural(int((~known).sum()), "row")
-            warnings.append(
-                f"{file.name}:{line}: {count} of truth without heading (the first here): no heading is used"
-            )
-        whole = np.unwrap(heading) if known.all() else np.full(len(t), np.nan)
-        truth = checked_heading(ReferencePath(t, x, y, whole), steps, warnings)
-    return RecordedRun(
-        name=file.name.split(".")[0],
-        kind="csv",
-        steps=steps,
-        readings=readings,
-        beacon_ids=heard_ids,
-        beacon_truth_m=_surveyed(surveyed, beacon_ids),
-        truth=truth,
-        first_pose=pose_of_truth(truth, steps, warnings),
-        warnings=tuple(warnings),
-    )
+    truth = _truth(tables["truth"], steps, warnings) if "truth" in tables else None
+    places_m = _surveyed(surveyed, beacon_ids)
+    return recorded_run(file.name.split(".")[0], "csv", steps, readings, heard_ids, places_m, truth, warnings)
 
 
-def _tables(file: Path, names: dict[str, float]) -> dict[str, Table]:
-    rows: dict[str, list[list[float]]] = {}
-    lines: dict[str, list[int]] = {}
+def _truth(table: Table, steps: Steps, warnings: list[str]) -> ReferencePath:
+    t, x, y, heading = table.values.T
+    known = np.isfinite(heading)
+    if known.any() and not known.all():
+        count = plural(int((~known).sum()), "row")
+        warnings.append(
+            f"{table.file.name}:{table.first_line(~known)}: {count} of truth without heading (the first here): no "
+            "heading is used"
+        )
+    whole = np.unwrap(heading) if known.all() else np.full(len(t), np.nan)
+    return checked_heading(ReferencePath(t, x, y, whole), steps, warnings)
+
+
+def _rows(file: Path, names: dict[str, float]) -> Iterator[tuple[str, int, list[float]]]:
+    is_first = True
     for line, content in content_lines(read_text(file)):
         kind, *words = _cells(content)
-        if kind == HEADER or (not rows and kind not in EVENTS and not any(is_number(word) for word in words)):
+        if kind == HEADER or (is_first and kind not in EVENTS and not any(is_number(word) for word in words)):
             continue
         if kind not in EVENTS:
             raise RadioDataError(file, f"no event {kind!r}; there are {', '.join(EVENTS)}", line)
-        rows.setdefault(kind, []).append(_row(file, line, kind, words, names))
-        lines.setdefault(kind, []).append(line)
-    return {kind: Table(file, np.array(rows[kind]), np.array(lines[kind])) for kind in rows}
+        yield kind, line, _row(file, line, kind, words, names)
+        is_first = False
 
 
 def _row(file: Path, line: int, kind: str, words: Sequence[str], names: dict[str, float]) -> list[float]:
     columns = EVENTS[kind]
     while words and not words[-1] and len(words) > 1:
         words = words[:-1]  # empty cells at the end, as spreadsheets write them
-    least = sum(not column.startswith("(") for column in columns)
-    if not least <= len(words) <= len(columns):
+    if not NEEDED[kind] <= len(words) <= len(columns):
         raise RadioDataError(file, f"{len(words)} values after {kind}, wanted {', '.join(columns)}", line)
     if "beacon" in columns and not words[columns.index("beacon")]:
         raise RadioDataError(file, f"{kind} has no name of a beacon", line)
@@ -140,9 +133,9 @@ def _surveyed(table: Table | None, beacon_ids: Sequence[str]) -> dict[str, tuple
 
 
 def _steps(odometry: Table) -> Steps:
+    # Each row is the way since the row before; of the first row only its time counts.
     t, distance, turn, lateral = odometry.values.T
-    if len(t) < 3:
-        raise RadioDataError(odometry.file, f"{len(t)} events odom: too few for a run")
+    odometry.check_steps("events odom")
     if (np.diff(t) <= 0.0).any():
         line = int(odometry.lines[1:][np.diff(t) <= 0.0][0])
         raise RadioDataError(odometry.file, "two events odom at the same time say different things", line)
@@ -152,24 +145,21 @@ def _steps(odometry: Table) -> Steps:
 def _readings(
     tables: dict[str, Table], steps: Steps, beacon_ids: Sequence[str], warnings: list[str]
 ) -> tuple[Readings, tuple[str, ...]]:
+    """Readings, with range, bearing and strength of the same time and beacon in one row, and the beacons' names."""
     merged: dict[tuple[float, float], list[float]] = {}
-    span_s = (float(steps.times_s[0]), float(steps.times_s[-1]))
     extra: list[tuple[float, float, list[float]]] = []
     for place, kind in enumerate(HEARD):
         if kind not in tables:
             continue
         values = tables[kind].values
-        for t, who, value in values[within(values[:, 0], span_s, kind, warnings)].tolist():
+        for t, who, value in values[within(values[:, 0], steps.times_s, kind, warnings)].tolist():
             row = merged.setdefault((t, who), [np.nan] * len(HEARD))
             if np.isnan(row[place]):
                 row[place] = value
-            else:  # heard twice at the same time
+            else:  # twice at the same time
                 extra.append((t, who, [value if k == place else np.nan for k in range(len(HEARD))]))
     rows = sorted([(t, who, row) for (t, who), row in merged.items()] + extra, key=lambda item: item[:2])
-    heard = sorted({int(who) for _, who, _ in rows})
-    index = {who: k for k, who in enumerate(heard)}
+    heard, index = np.unique([int(who) for _, who, _ in rows], return_inverse=True)
     data = np.array([row for _, _, row in rows]).reshape(-1, len(HEARD))
-    readings = Readings(
-        np.array([t for t, _, _ in rows]), np.array([index[int(who)] for _, who, _ in rows]), *data.T.copy()
-    )
-    return readings, tuple(beacon_ids[who] for who in heard)
+    readings = Readings(np.array([t for t, _, _ in rows]), index.astype(np.int64), *data.T.copy())
+    return readings, tuple(beacon_ids[int(who)] for who in heard)

@@ -1,6 +1,5 @@
-"""One door to all formats of recorded radio data: which one it is, and what looks wrong in it."""
+"""Reads a recorded run of any format: which format it is, numbers that cannot be, and what looks wrong in it."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,14 +7,22 @@ import numpy as np
 
 from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.events_csv import is_events_csv, read_events_csv
-from ccatp.beacons.datasets.labyrinth import is_labyrinth, read_labyrinth
-from ccatp.beacons.datasets.mrclam import ROBOT_FILE, read_mrclam, robots_in
-from ccatp.beacons.datasets.plaza import is_plaza, read_plaza
-from ccatp.beacons.datasets.tables import RadioDataError, bounded, content_lines, plural, read_text
-from ccatp.beacons.slam.recording import RecordedRun
+from ccatp.beacons.datasets.formats import (
+    ROBOT_FILE,
+    is_labyrinth,
+    is_plaza,
+    read_labyrinth,
+    read_mrclam,
+    read_plaza,
+    robots_in,
+)
+from ccatp.beacons.datasets.tables import RadioDataError, content_lines, plural, read_text
+from ccatp.beacons.slam.recording import Readings, RecordedRun
+from ccatp.core import FloatArray
 
 LEAST_TRUTH = 2  # rows: one fits any path
-FORMATS: Sequence[str] = ("plaza", "mrclam", "labyrinth", "csv")
+READERS = {"plaza": read_plaza, "labyrinth": read_labyrinth, "csv": read_events_csv}
+FORMATS = ("plaza", "mrclam", "labyrinth", "csv")
 
 
 def read_run(path: Path, data_format: str | None, robot: int | None) -> RecordedRun:
@@ -33,30 +40,15 @@ def read_run(path: Path, data_format: str | None, robot: int | None) -> Recorded
     if robot is not None and data_format != "mrclam":
         raise RadioDataError(path, f"a {data_format} set has one vehicle: leave out --robot")
     with np.errstate(all="ignore"):  # numbers that overflow are refused below
-        run = _with_reference(bounded(_read(path, data_format, robot), path))
+        run = read_mrclam(path, robot) if data_format == "mrclam" else READERS[data_format](path)
+        run = bounded(run, path)
+    if run.truth is not None and len(run.truth.times_s) < LEAST_TRUTH:
+        warning = (
+            f"no reference trajectory: the truth has {plural(len(run.truth.times_s), 'row')}, good for the first pose "
+            "alone; errors of the path stay unknown"
+        )
+        run = replace(run, truth=None, warnings=(*run.warnings, warning))
     return replace(run, warnings=(*run.warnings, *suspicions(run)))
-
-
-def _read(path: Path, data_format: str, robot: int | None) -> RecordedRun:
-    if data_format == "mrclam":
-        return read_mrclam(path, robot)
-    if data_format == "plaza":
-        return read_plaza(path)
-    if data_format == "labyrinth":
-        return read_labyrinth(path)
-    if path.is_dir():
-        raise RadioDataError(path, "is a folder: name the CSV file in it")
-    return read_events_csv(path)
-
-
-def _with_reference(run: RecordedRun) -> RecordedRun:
-    if run.truth is None or len(run.truth.times_s) >= LEAST_TRUTH:
-        return run
-    rows = plural(len(run.truth.times_s), "row")
-    told = (
-        f"no reference trajectory: the truth has {rows}, good for the first pose alone; errors of the path stay unknown"
-    )
-    return replace(run, truth=None, warnings=(*run.warnings, told))
 
 
 def robots_of(path: Path, data_format: str | None = None) -> list[int | None]:
@@ -104,3 +96,77 @@ def _format_of_folder(folder: Path) -> str | None:
         return "plaza"
     texts = [file for file in files if ".txt" in file.suffixes]
     return "labyrinth" if any(is_labyrinth(read_text(file)) for file in texts) else None
+
+
+LONGEST_RUN_S = 1e8  # three years
+LONGEST_STEP_M = 1e3  # between two rows of odometry
+LARGEST_TURN_RAD = 1e4  # likewise; degrees for radians stay far below it, and are told elsewhere
+LONGEST_RANGE_M = 1e6
+LARGEST_BEARING_RAD = 1e4
+LARGEST_LEVEL_DBM = 1e3
+FARTHEST_M = 1e8  # of coordinates; those of maps reach 1e7
+
+
+def bounded(run: RecordedRun, where: Path) -> RecordedRun:
+    """The run without readings and surveyed places that cannot be; each kind that was left out makes a warning.
+
+    Odometry and truth are refused as a whole: without one of its steps a path leads elsewhere.
+
+    Raises:
+        RadioDataError: odometry or truth cannot be, or no reading is left.
+    """
+    steps, truth = run.steps, run.truth
+    _refuse(where, "time of odometry", steps.times_s - steps.times_s[0], LONGEST_RUN_S, "s after its first row")
+    for what, column in (("forward", steps.distance_m), ("to the left", steps.lateral_m)):
+        _refuse(where, f"odometry: a step {what}", column, LONGEST_STEP_M, "m", steps.times_s[1:])
+    _refuse(where, "odometry: a turn", steps.turn_rad, LARGEST_TURN_RAD, "rad", steps.times_s[1:])
+    if truth is not None:
+        for name, column in (("x", truth.x_m), ("y", truth.y_m)):
+            _refuse(where, f"truth: {name}", column, FARTHEST_M, "m", truth.times_s)
+    warnings = list(run.warnings)
+    readings = _sensible(run.readings, warnings)
+    if not len(readings.times_s):
+        raise RadioDataError(where, f"none of its readings can be ({'; '.join(warnings[len(run.warnings) :])})")
+    placed = {
+        name: place_m
+        for name, place_m in run.beacon_truth_m.items()
+        if all(abs(axis_m) <= FARTHEST_M for axis_m in place_m)
+    }
+    if lost := [name for name in run.beacon_truth_m if name not in placed]:
+        warnings.append(f"surveyed place of {', '.join(lost)}: is no place within {FARTHEST_M:g} m, left out")
+    return replace(run, readings=readings, beacon_truth_m=placed, warnings=tuple(warnings))
+
+
+def _refuse(
+    where: Path, what: str, values: FloatArray, most: float, unit: str, times_s: FloatArray | None = None
+) -> None:
+    beyond = np.flatnonzero(~(np.abs(values) <= most))
+    if beyond.size:
+        first = int(beyond[0])
+        at = "" if times_s is None else f" at {times_s[first]:.6g} s"
+        raise RadioDataError(where, f"{what} of {values[first]:.3g} {unit}{at} cannot be; at most {most:g} is taken")
+
+
+def _sensible(readings: Readings, warnings: list[str]) -> Readings:
+    columns = {}
+    for field, what, most, unit in (
+        ("range_m", "range", LONGEST_RANGE_M, "m"),
+        ("bearing_rad", "bearing", LARGEST_BEARING_RAD, "rad"),
+        ("rssi_dbm", "signal strength", LARGEST_LEVEL_DBM, "dBm"),
+    ):
+        column: FloatArray = getattr(readings, field)
+        beyond = ~(np.abs(column) <= most) & ~np.isnan(column)
+        if beyond.any():
+            first = int(np.flatnonzero(beyond)[0])
+            warnings.append(
+                f"{plural(int(beyond.sum()), what)} beyond {most:g} {unit}, the first {column[first]:.3g} {unit} at "
+                f"{readings.times_s[first]:.6g} s, left out"
+            )
+            columns[field] = np.where(beyond, np.nan, column)
+    if not columns:
+        return readings
+    cleaned = readings._replace(**columns)
+    known = np.asarray(
+        np.isfinite(np.column_stack([cleaned.range_m, cleaned.bearing_rad, cleaned.rssi_dbm])).any(axis=1)
+    )
+    return cleaned.where(known)

@@ -100,18 +100,22 @@ class RecordedRun:
     warnings: tuple[str, ...]
 
 
+def running_total(amounts: FloatArray) -> FloatArray:
+    """0, and the sums of the first amounts (n,), shape (n + 1,)."""
+    return np.concatenate([[0.0], np.cumsum(amounts)])
+
+
 def dead_reckoned(steps: Steps, first_pose: tuple[float, float, float]) -> FloatArray:
     """Poses x_m, y_m, heading_rad at ``steps.times_s`` by odometry alone, shape (n + 1, 3).
 
     Each step is a chord at the mean heading: x <- x + d cos(heading + turn / 2), thesis eq. 2.14 as it is meant.
     """
     x_m, y_m, heading_rad = first_pose
-    headings = heading_rad + np.concatenate([[0.0], np.cumsum(steps.turn_rad)])
+    headings = heading_rad + running_total(steps.turn_rad)
     middle = headings[:-1] + 0.5 * steps.turn_rad
     c, s = np.cos(middle), np.sin(middle)
     dx, dy = steps.distance_m * c - steps.lateral_m * s, steps.distance_m * s + steps.lateral_m * c
-    x, y = x_m + np.concatenate([[0.0], np.cumsum(dx)]), y_m + np.concatenate([[0.0], np.cumsum(dy)])
-    return np.column_stack([x, y, headings])
+    return np.column_stack([x_m + running_total(dx), y_m + running_total(dy), headings])
 
 
 class BeaconFix(NamedTuple):

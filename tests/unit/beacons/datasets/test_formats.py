@@ -13,7 +13,8 @@ from openpyxl import Workbook
 from ccatp.beacons.datasets.events_csv import EVENTS
 from ccatp.beacons.datasets.levels import read_levels, read_log, read_places, read_workbook
 from ccatp.beacons.datasets.reader import found_format, read_run
-from ccatp.beacons.datasets.tables import LOST_RAD, RadioDataError, bridged
+from ccatp.beacons.datasets.tables import RadioDataError
+from ccatp.beacons.datasets.trajectory import LOST_RAD, bridged
 from ccatp.beacons.slam.recording import RecordedRun, Steps, dead_reckoned
 from ccatp.cli import main
 from ccatp.core import FloatArray

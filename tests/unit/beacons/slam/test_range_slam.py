@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.datasets.checks import suspicions
-from ccatp.beacons.datasets.tables import bridged
+from ccatp.beacons.datasets.trajectory import bridged
 from ccatp.beacons.slam.batch_smoother import smooth
 from ccatp.beacons.slam.beacon_map import (
     BearingModel,

@@ -1,0 +1,328 @@
+"""The published sets of recorded radio data: Plaza (CMU), MRCLAM (UTIAS), Labyrinth (TU Chemnitz)."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ccatp.beacons.datasets.tables import (
+    RadioDataError,
+    Table,
+    content_lines,
+    in_order,
+    listed,
+    names_of,
+    number,
+    plural,
+    read_table,
+    read_text,
+    tables_of,
+    with_unknown_ways,
+    within,
+    without_gaps_in_numbers,
+)
+from ccatp.beacons.datasets.trajectory import bridged, checked_heading, recorded_run, steps_of_speeds, turning_factor
+from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
+from ccatp.core import FloatArray, IntArray
+
+PLAZA = {
+    "DR": ("time [s]", "distance [m]", "turn [rad]"),
+    "TD": ("time [s]", "sender", "beacon", "range [m]"),
+    "GT": ("time [s]", "x [m]", "y [m]", "heading [rad]"),
+    "TL": ("beacon", "x [m]", "y [m]"),
+}
+PLAZA_NEEDED = ("DR", "TD")
+
+
+def _ranges(times_s: FloatArray, beacon: IntArray, range_m: FloatArray) -> Readings:
+    return Readings(times_s, beacon, range_m, np.full(len(times_s), np.nan), np.full(len(times_s), np.nan))
+
+
+def is_plaza(file: Path) -> bool:
+    """Whether the file's name is one of a Plaza set."""
+    return file.suffix == ".mat" or any(f"_{kind}.txt" in file.name for kind in PLAZA)
+
+
+def read_plaza(path: Path) -> RecordedRun:
+    """Read a Plaza set (Djugash, Hamner, Roth, JFR 2009): odometry (DR), ranges (TD), beacons (TL) and truth (GT).
+
+    Args:
+        path: the ``.mat``; or one of the texts ``NAME_DR.txt``, ``NAME_TD.txt``, ``NAME_GT.txt``, ``NAME_TL.txt``
+            (plain or gzipped; the last two may be missing); or a folder with one set, whose ``.mat`` goes before texts.
+
+    Raises:
+        RadioDataError: a file is missing or is not what it should be.
+    """
+    file = _plaza_file(path) if path.is_dir() else path
+    tables = _mat_tables(file) if file.suffix == ".mat" else _text_tables(file)
+    warnings: list[str] = []
+    odometry = in_order(with_unknown_ways(tables["DR"], warnings), warnings, 1)
+    ranges = in_order(tables["TD"], warnings)
+    reference = in_order(tables["GT"], warnings) if "GT" in tables else None
+    steps = _plaza_steps(file, odometry, None if reference is None else float(reference.values[0, 0]))
+    heard = ranges.values[within(ranges.values[:, 0], steps.times_s, "range", warnings)]
+    if not len(heard):
+        raise RadioDataError(file, "no range within the time of the odometry")
+    beacon_ids, beacon = names_of(heard[:, 2])
+    truth = None if reference is None else _truth_with_heading(reference, steps, warnings)
+    surveyed = without_gaps_in_numbers(tables["TL"], warnings).values.tolist() if "TL" in tables else []
+    name = file.name.split(".")[0]
+    for kind in PLAZA:
+        name = name.removesuffix(f"_{kind}")
+    places_m = {str(int(i)): (x, y) for i, x, y in surveyed}
+    readings = _ranges(heard[:, 0], beacon, heard[:, 3])
+    return recorded_run(name.rstrip("_"), "plaza", steps, readings, beacon_ids, places_m, truth, warnings)
+
+
+def _truth_with_heading(reference: Table, steps: Steps, warnings: list[str]) -> ReferencePath:
+    t, x, y, heading = reference.values.T
+    return checked_heading(ReferencePath(t, x, y, np.unwrap(heading)), steps, warnings)
+
+
+def _plaza_file(folder: Path) -> Path:
+    for pattern in ("*.mat", "*_DR.txt*"):
+        files = sorted(folder.glob(pattern))
+        if len(files) > 1:
+            raise RadioDataError(folder, f"holds {len(files)} sets: name one, as in {folder / files[0].name}")
+        if files:
+            return files[0]
+    raise RadioDataError(folder, "holds no Plaza set: neither NAME.mat nor NAME_DR.txt")
+
+
+def _mat_tables(file: Path) -> dict[str, Table]:
+    from scipy.io import loadmat  # noqa: PLC0415 -- slow to import, and texts need none of it
+    from scipy.io.matlab import MatReadError  # noqa: PLC0415
+
+    try:
+        found = loadmat(file, variable_names=[*PLAZA])
+    except FileNotFoundError as error:
+        raise RadioDataError(file, "no such file") from error
+    except (MatReadError, NotImplementedError, ValueError, TypeError, OSError, EOFError, IndexError) as error:
+        raise RadioDataError(file, f"is no MATLAB file that can be read: {error}") from error
+    tables: dict[str, Table] = {}
+    for kind, columns in PLAZA.items():
+        if kind not in found:
+            if kind in PLAZA_NEEDED:
+                raise RadioDataError(file, f"has no variable {kind} ({', '.join(columns)})")
+            continue
+        try:
+            values = np.asarray(found[kind], dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise RadioDataError(file, f"variable {kind} does not hold numbers") from error
+        if values.ndim != 2 or values.shape[1] != len(columns) or not len(values):
+            wanted = f"(n, {len(columns)}): {', '.join(columns)}"
+            raise RadioDataError(file, f"variable {kind} has shape {values.shape}, wanted {wanted}")
+        tables[kind] = Table(Path(f"{file.name} {kind}"), values, np.arange(1, len(values) + 1))
+    return tables
+
+
+def _text_tables(file: Path) -> dict[str, Table]:
+    kind = next((kind for kind in PLAZA if f"_{kind}.txt" in file.name), None)
+    if kind is None:
+        raise RadioDataError(file, "is no file of a Plaza set: those are NAME.mat, NAME_DR.txt, NAME_TD.txt")
+    tables: dict[str, Table] = {}
+    for other, columns in PLAZA.items():
+        name = file.name.replace(f"_{kind}.txt", f"_{other}.txt").removesuffix(".gz")
+        there = _plain_or_gzipped(file.parent, name)
+        if there is not None:
+            tables[other] = read_table(there, columns)
+        elif other in PLAZA_NEEDED:
+            raise RadioDataError(file.with_name(name), f"no such file; it goes with {file.name}")
+    return tables
+
+
+def _plain_or_gzipped(folder: Path, name: str) -> Path | None:
+    return next((file for file in (folder / name, folder / f"{name}.gz") if file.is_file()), None)
+
+
+def _plaza_steps(file: Path, odometry: Table, truth_start_s: float | None) -> Steps:
+    # Each row is the way since the row before; the first since the truth's first pose.
+    t, distance, turn = odometry.values.T
+    odometry._replace(file=file).check_steps("odometry rows")
+    usual_s = float(np.median(np.diff(t)))
+    start_s = t[0] - usual_s
+    if truth_start_s is not None and t[0] - 2.0 * usual_s < truth_start_s < t[0]:
+        start_s = truth_start_s
+    return bridged(Steps(np.concatenate([[start_s], t]), distance, turn, np.zeros(len(t))))
+
+
+ROBOT_FILE = re.compile(r"Robot(\d+)_(Odometry|Measurement|Groundtruth)\.dat(\.gz)?$")
+LAST_ROBOT_SUBJECT = 5  # subjects 1 to 5 are robots, those above it are landmarks (Leung et al., IJRR 2011)
+ODOMETRY = ("time [s]", "forward velocity [m/s]", "angular velocity [rad/s]")
+MEASUREMENT = ("time [s]", "barcode", "range [m]", "bearing [rad]")
+REFERENCE = ("time [s]", "x [m]", "y [m]", "heading [rad]")
+
+
+def robots_in(folder: Path) -> list[int]:
+    """Numbers of the robots whose MRCLAM odometry is in the folder."""
+    matches = (ROBOT_FILE.search(file.name) for file in folder.iterdir() if file.is_file())
+    return sorted({int(match[1]) for match in matches if match and match[2] == "Odometry"})
+
+
+def read_mrclam(path: Path, robot: int | None) -> RecordedRun:
+    """Read one robot's run: odometry and a camera that sees barcodes on landmarks and robots.
+
+    Args:
+        path: the folder, or one of its ``RobotN_...`` files (which then names the robot); plain or gzipped.
+        robot: number of the robot; the first that is there if ``None``.
+
+    Raises:
+        RadioDataError: there is no such robot, a file is missing or is not what it should be.
+    """
+    folder = path
+    if path.is_file():
+        folder = path.parent
+        if robot is None and (match := ROBOT_FILE.search(path.name)):
+            robot = int(match[1])
+    there = robots_in(folder)
+    if not there:
+        raise RadioDataError(folder, "holds no MRCLAM set: no file RobotN_Odometry.dat")
+    robot = there[0] if robot is None else robot
+    if robot not in there:
+        raise RadioDataError(folder, f"has no odometry of robot {robot}; there are {listed([str(r) for r in there])}")
+    warnings: list[str] = []
+    odometry_file = _needed(folder, f"Robot{robot}_Odometry.dat", "the robot's odometry")
+    odometry = in_order(read_table(odometry_file, ODOMETRY), warnings)
+    odometry.check_steps("rows")
+    t, speed, rate = odometry.values.T
+    steps = steps_of_speeds(t, speed, rate, np.zeros(len(t)))
+    seen_file = _needed(folder, f"Robot{robot}_Measurement.dat", "what the robot saw")
+    seen = in_order(read_table(seen_file, MEASUREMENT), warnings).values
+    seen = seen[within(seen[:, 0], steps.times_s, "reading", warnings)]
+    subjects = _subjects(folder, seen[:, 1], warnings)
+    kept = subjects > LAST_ROBOT_SUBJECT
+    if not kept.any():
+        raise RadioDataError(seen_file, "no reading of a landmark within the time of the odometry")
+    beacon_ids, beacon = names_of(subjects[kept])
+    reference = _plain_or_gzipped(folder, f"Robot{robot}_Groundtruth.dat")
+    truth = None
+    if reference is not None:
+        truth = _truth_with_heading(in_order(read_table(reference, REFERENCE), warnings), steps, warnings)
+    places_m = _landmarks(folder, warnings)
+    readings = _ranges(seen[kept, 0], beacon, seen[kept, 2])._replace(bearing_rad=seen[kept, 3])
+    name = f"{folder.resolve().name} robot {robot}"
+    return recorded_run(name, "mrclam", steps, readings, beacon_ids, places_m, truth, warnings)
+
+
+def _needed(folder: Path, name: str, what: str) -> Path:
+    file = _plain_or_gzipped(folder, name)
+    if file is None:
+        raise RadioDataError(folder / name, f"no such file (nor gzipped): {what}")
+    return file
+
+
+def _subjects(folder: Path, barcodes: FloatArray, warnings: list[str]) -> FloatArray:
+    """Subject of each reading, 0 where the barcode is not listed; shape (m,)."""
+    file = _needed(folder, "Barcodes.dat", "readings name barcodes, and it tells whose they are")
+    table = read_table(file, ("subject", "barcode"))
+    subject_of = {int(barcode): int(subject) for subject, barcode in table.values.tolist()}
+    subjects = np.array([subject_of.get(int(code), 0) for code in barcodes.tolist()], dtype=np.float64)
+    unknown = subjects == 0
+    if unknown.any():
+        codes = listed([str(int(code)) for code in np.unique(barcodes[unknown])])
+        count = plural(int(unknown.sum()), "reading")
+        warnings.append(f"{count} of barcodes that {file.name} does not list ({codes}), left out")
+    return subjects
+
+
+def _landmarks(folder: Path, warnings: list[str]) -> dict[str, tuple[float, float]]:
+    file = _plain_or_gzipped(folder, "Landmark_Groundtruth.dat")
+    if file is None:
+        warnings.append("no Landmark_Groundtruth.dat: errors of the landmarks stay unknown")
+        return {}
+    table = without_gaps_in_numbers(read_table(file, ("subject", "x [m]", "y [m]"), more=True), warnings)
+    return {str(int(row[0])): (row[1], row[2]) for row in table.values.tolist()}
+
+
+TRACK_WARNING = 0.2
+# The readme calls the wheel columns right, left and the fourth the distance between the wheels; the numbers say left,
+# right, and half that distance (see ``wheel_columns``).
+LABYRINTH = {
+    "range2": ("time [s]", "range [m]", "sigma [m]", "anchor x [m]", "anchor y [m]", "anchor"),
+    "odom2diff": (
+        "time [s]", "speed of the left wheel [m/s]", "speed of the right wheel [m/s]", "speed sideways [m/s]",
+        "half the track [m]", "sigma left [m/s]", "sigma right [m/s]", "sigma sideways [m/s]",
+    ),
+    "gt2": ("time [s]", "x [m]", "y [m]"),
+}  # fmt: skip
+
+
+def is_labyrinth(text: str) -> bool:
+    """Whether the text's first line is one of the set's."""
+    lines = content_lines(text[:4096])
+    return bool(lines) and lines[0][1].split()[0] in LABYRINTH
+
+
+def read_labyrinth(path: Path) -> RecordedRun:
+    """Read a Labyrinth text, plain or gzipped: UWB ranges, wheel speeds and positions, a line each.
+
+    Raises:
+        RadioDataError: a line is not one of the set's, or there is no odometry or no range.
+    """
+    file = _labyrinth_file(path) if path.is_dir() else path
+    warnings: list[str] = []
+    tables = {kind: in_order(table, warnings) for kind, table in tables_of(file, _labyrinth_rows(file)).items()}
+    for kind in ("odom2diff", "range2"):
+        if kind not in tables:
+            raise RadioDataError(file, f"no line {kind} ({', '.join(LABYRINTH[kind])})")
+    odometry = tables["odom2diff"]
+    odometry.check_steps("lines odom2diff")
+    t, left, right, side, half_track = odometry.values[:, :5].T
+    if (half_track <= 0.0).any():
+        line = odometry.first_line(half_track <= 0.0)
+        raise RadioDataError(file, "the distance between the wheels is not positive", line)
+    steps = steps_of_speeds(t, 0.5 * (left + right), (right - left) / (2.0 * half_track), side)
+    ranges = tables["range2"].values
+    ranges = ranges[within(ranges[:, 0], steps.times_s, "range", warnings)]
+    if not len(ranges):
+        raise RadioDataError(file, "no range within the time of the odometry")
+    beacon_ids, beacon = names_of(ranges[:, 5])
+    truth = None
+    if "gt2" in tables:
+        t, x, y = tables["gt2"].values.T
+        truth = checked_heading(ReferencePath(t, x, y, np.full(len(t), np.nan)), steps, warnings)
+        warnings += wheel_columns(truth, steps, float(np.median(half_track)))
+    places_m = {}
+    for k, name in enumerate(beacon_ids):
+        x_m, y_m = np.median(ranges[beacon == k, 3:5], axis=0).tolist()
+        places_m[name] = (x_m, y_m)
+    readings = _ranges(ranges[:, 0], beacon, ranges[:, 1])
+    return recorded_run(file.name.split(".")[0], "labyrinth", steps, readings, beacon_ids, places_m, truth, warnings)
+
+
+def wheel_columns(truth: ReferencePath, steps: Steps, half_track_m: float) -> list[str]:
+    """What the truth says of the wheel columns, a line; nothing where it tells too little.
+
+    Args:
+        steps: odometry with the columns read as left, right, half the track.
+    """
+    factor = turning_factor(truth, steps)
+    if factor is None:
+        return []
+    order, read_m = "left, right" if factor > 0.0 else "right, left", 2.0 * half_track_m
+    track_m = read_m / abs(factor)
+    found = f"wheel columns by the shape of the true path: {order}, track {track_m:.3f} m"
+    if factor > 0.0 and abs(factor - 1.0) < TRACK_WARNING:
+        return [f"{found} (the readme says right, left and {half_track_m:.4f} m); read as left, right, {read_m:.4f} m"]
+    return [f"{found}; they were read as left, right and {read_m:.4f} m, so that the odometry is wrong"]
+
+
+def _labyrinth_file(folder: Path) -> Path:
+    files = [file for file in sorted(folder.glob("*.txt*")) if is_labyrinth(read_text(file))]
+    if len(files) != 1:
+        what = f"holds {len(files)} Labyrinth texts: name one" if files else "holds no Labyrinth text"
+        raise RadioDataError(folder, what)
+    return files[0]
+
+
+def _labyrinth_rows(file: Path) -> Iterator[tuple[str, int, list[float]]]:
+    for line, content in content_lines(read_text(file)):
+        kind, *words = content.split()
+        if kind not in LABYRINTH:
+            raise RadioDataError(file, f"{kind!r} is none of {', '.join(LABYRINTH)}", line)
+        names = LABYRINTH[kind]
+        if len(words) != len(names):
+            wanted = ", ".join(names)
+            raise RadioDataError(file, f"{len(words)} values after {kind}, wanted {len(names)}: {wanted}", line)
+        yield kind, line, [number(file, line, word, name) for word, name in zip(words, names, strict=True)]

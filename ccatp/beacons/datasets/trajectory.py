@@ -1,0 +1,209 @@
+"""Odometry and reference trajectory of a recorded run: gaps guessed, contradictions put right, the first pose."""
+
+import numpy as np
+import numpy.typing as npt
+
+from ccatp.beacons.datasets.tables import long_pauses
+from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps, dead_reckoned, running_total
+from ccatp.core import FloatArray
+
+BEFORE_S = 1.0  # over so long the speed before a gap is taken
+WINDOWS = 1000  # spans of the run by which speeds are compared with those before
+LOST_RAD = float(np.pi / np.sqrt(3.0))  # standard deviation of a heading that is anything: more cannot be unknown
+# Travel over which a course is told from positions: well above the centimetres of GNSS and camera references.
+CHORD_M = 0.2
+LONGEST_WAY_M = 1e6  # longer ways are no vehicle's; they are not cut into chords
+AGREEMENT = 0.8  # length of the mean vector of (course - heading) above which the two differ by a constant
+LARGEST_SIDESLIP_RAD = 0.3  # a constant difference below it is the vehicle's own; above it is the reference's frame
+PIECE_S = 10.0  # long enough for a turn or two, short enough for odometry
+PIECE_POINTS = 40
+LEAST_PIECES = 4
+TELLING = 0.5  # a turning factor is believed if it halves the misfit of a straight path
+FIRST_WAY_M = 2.0  # way whose shape gives the first heading if the reference has positions alone
+
+
+def amount_at(steps: Steps, amounts: FloatArray | float, times_s: FloatArray) -> FloatArray:
+    """What odometry adds up to at each time of amounts by step (n,); the shape of ``times_s``."""
+    total = running_total(np.broadcast_to(amounts, steps.distance_m.shape))
+    found: FloatArray = np.interp(times_s, steps.times_s, total)
+    return found
+
+
+def steps_of_speeds(t: FloatArray, speed: FloatArray, rate: FloatArray, side: FloatArray) -> Steps:
+    """Speeds, m/s and rad/s, that hold from their row to the next, of rows with one time the last; each shape (n,)."""
+    interval_s = np.diff(t)
+    later = interval_s > 0.0
+    distance, turn, lateral = ((column[:-1] * interval_s)[later] for column in (speed, rate, side))
+    return bridged(Steps(np.concatenate([t[:-1][later], t[-1:]]), distance, turn, lateral))
+
+
+def bridged(steps: Steps) -> Steps:
+    """Steps without gaps: ways and turns that are NaN, or span a pause of the recording, are guessed.
+
+    A vehicle goes on as it did. How much so, and how far that is off, follows from the run: by the least-squares ratio,
+    over all spans as long as the gap, of what was travelled to the rate in the ``BEFORE_S`` before. If the heading is
+    lost by sigma, the mean of the way is shorter by exp(-sigma^2 / 2), and the rest of it is spread about that.
+    """
+    interval_s = np.diff(steps.times_s)
+    unknown = np.isnan(steps.distance_m + steps.turn_rad + steps.lateral_m)
+    unknown[long_pauses(steps.times_s)] = True
+    if not unknown.any() or unknown.all():
+        return steps
+    known_s = running_total(interval_s[~unknown])
+    way, turn = (running_total(column[~unknown]) for column in (steps.distance_m, steps.turn_rad))
+    distance_m, turn_rad, lateral_m = steps.distance_m.copy(), steps.turn_rad.copy(), steps.lateral_m.copy()
+    guess_m2, guess_rad2 = np.zeros(unknown.size), np.zeros(unknown.size)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], unknown, [False]]))).tolist()
+    for first, stop in zip(edges[::2], edges[1::2], strict=True):
+        gap = slice(first, stop)
+        span_s = float(interval_s[gap].sum())
+        begin_s = float(interval_s[:first][~unknown[:first]].sum())
+        way_share, way_sigma = _guessed(known_s, way, span_s)
+        turn_share, turn_sigma = _guessed(known_s, turn, span_s)
+        lost_rad = min(turn_sigma, LOST_RAD)
+        kept = float(np.exp(-0.5 * lost_rad**2))
+        went_m = way_share * _rate_before(known_s, way, begin_s) * span_s
+        part = interval_s[gap] / span_s
+        distance_m[gap] = kept * went_m * part
+        turn_rad[gap] = turn_share * _rate_before(known_s, turn, begin_s) * span_s * part
+        lateral_m[gap] = 0.0
+        guess_m2[gap] = (way_sigma * way_sigma + went_m * went_m * (1.0 - kept * kept)) * part
+        guess_rad2[gap] = lost_rad**2 * part
+    return Steps(steps.times_s, distance_m, turn_rad, lateral_m, guess_m2, guess_rad2)
+
+
+def _rate_before(times_s: FloatArray, total: FloatArray, at_s: float) -> float:
+    from_s = max(at_s - BEFORE_S, float(times_s[0]))
+    if at_s <= from_s:
+        return 0.0
+    begin, end = np.interp((from_s, at_s), times_s, total).tolist()
+    return float((end - begin) / (at_s - from_s))
+
+
+def _guessed(times_s: FloatArray, total: FloatArray, span_s: float) -> tuple[float, float]:
+    """Share and standard deviation of a span's amount, by the mean rate before it; over half the run at most."""
+    whole_s = float(times_s[-1] - times_s[0])
+    before_s, seen_s = min(BEFORE_S, 0.25 * whole_s), min(span_s, 0.5 * whole_s)
+    t = np.linspace(times_s[0] + before_s, times_s[-1] - seen_s, WINDOWS)
+    at, later, sooner = (np.interp(t + shift, times_s, total) for shift in (0.0, seen_s, -before_s))
+    rate, went = (at - sooner) / before_s, (later - at) / seen_s
+    square = float(rate @ rate)
+    share = float(rate @ went) / square if square > 0.0 else 0.0
+    return share, float(np.sqrt(np.mean((went - share * rate) ** 2))) * span_s
+
+
+def chords(truth: ReferencePath, steps: Steps) -> npt.NDArray[np.int64]:
+    """Rows of the truth some ``CHORD_M`` of travel apart, within the span of the odometry."""
+    inside = (truth.times_s >= steps.times_s[0]) & (truth.times_s <= steps.times_s[-1])
+    rows = np.flatnonzero(inside)
+    way = running_total(np.hypot(np.diff(truth.x_m[rows]), np.diff(truth.y_m[rows])))
+    if not rows.size or not CHORD_M <= way[-1] <= LONGEST_WAY_M:
+        return rows[:0]
+    marks = np.arange(0.0, way[-1], CHORD_M)
+    return np.asarray(rows[np.unique(np.minimum(np.searchsorted(way, marks), rows.size - 1))])
+
+
+def checked_heading(truth: ReferencePath, steps: Steps, warnings: list[str]) -> ReferencePath:
+    """The truth with its heading along the course, turned with a warning if it is not.
+
+    Course and heading of a vehicle that rolls differ by its sideslip; a large constant difference means that the
+    reference counts the heading from elsewhere.
+    """
+    if not np.isfinite(truth.heading_rad).any():
+        return truth
+    rows = chords(truth, steps)
+    if rows.size < 4:
+        return truth
+    course = np.arctan2(np.diff(truth.y_m[rows]), np.diff(truth.x_m[rows]))
+    heading = 0.5 * (truth.heading_rad[rows[1:]] + truth.heading_rad[rows[:-1]])
+    way = np.diff(amount_at(steps, steps.distance_m, truth.times_s[rows]))
+    rolls = np.abs(way) > 0.5 * CHORD_M  # by odometry too, so that it is no jump of the reference
+    if rolls.sum() < 4:
+        return truth
+    vector = np.mean(np.exp(1j * (course - heading))[rolls] * np.sign(way[rolls]))
+    turned = float(np.angle(vector))
+    if abs(vector) < AGREEMENT or abs(turned) < LARGEST_SIDESLIP_RAD:
+        return truth
+    by = float(np.copysign(np.pi, turned)) if abs(turned) > np.pi - LARGEST_SIDESLIP_RAD else turned
+    what = "pi" if abs(by) == np.pi else f"{by:.3f} rad"
+    warnings.append(f"truth heading is turned by {what} against the course; it was turned back")
+    return truth._replace(heading_rad=truth.heading_rad + by)
+
+
+def turning_factor(truth: ReferencePath, steps: Steps) -> float | None:
+    """By what the turns of the odometry must be multiplied so that its path has the shape of the true one.
+
+    The path is cut into pieces of some ``PIECE_S``; each is laid on the truth by its own rigid motion, and the factor
+    with the least median misfit is taken. Needs no heading of the truth. None where no factor is much better than not
+    turning at all, or the vehicle hardly moves.
+    """
+    start_s, end_s = max(steps.times_s[0], truth.times_s[0]), min(steps.times_s[-1], truth.times_s[-1])
+    pieces = int((end_s - start_s) / PIECE_S)
+    if pieces < LEAST_PIECES:
+        return None
+    t = np.linspace(start_s, start_s + pieces * PIECE_S, pieces * PIECE_POINTS)
+
+    def cut(times_s: FloatArray, x_m: FloatArray, y_m: FloatArray) -> npt.NDArray[np.complex128]:
+        points = (np.interp(t, times_s, x_m) + 1j * np.interp(t, times_s, y_m)).reshape(pieces, PIECE_POINTS)
+        return np.asarray(points - points.mean(axis=1, keepdims=True))
+
+    true = cut(*truth[:3])
+
+    def misfit(factor: float) -> float:
+        path = dead_reckoned(steps._replace(turn_rad=factor * steps.turn_rad), (0.0, 0.0, 0.0))
+        own = cut(steps.times_s, path[:, 0], path[:, 1])
+        turned = (own.conj() * true).sum(axis=1)
+        turned /= np.maximum(np.abs(turned), 1e-12)
+        return float(np.median(np.sqrt((np.abs(own * turned[:, None] - true) ** 2).mean(axis=1))))
+
+    sizes = np.geomspace(1.0 / 64.0, 64.0, 85)
+    factors = np.concatenate([-sizes, sizes])
+    misfits = np.array([misfit(float(factor)) for factor in factors])
+    best = float(factors[int(np.argmin(misfits))])
+    fine = best * np.linspace(0.9, 1.1, 41)
+    fine_misfits = np.array([misfit(float(factor)) for factor in fine])
+    moved = float(np.median(np.abs(true).max(axis=1)))
+    if moved < CHORD_M or fine_misfits.min() > TELLING * misfit(0.0):
+        return None
+    return float(fine[int(np.argmin(fine_misfits))])
+
+
+def pose_of_truth(truth: ReferencePath | None, steps: Steps, warnings: list[str]) -> tuple[float, float, float]:
+    """The first pose: x_m, y_m, heading_rad at the first odometry time; the origin if there is no truth then.
+
+    If the reference has positions alone, the heading is the one that lays the first metres of odometry on the first
+    metres of truth, by the least-squares rotation between the two.
+    """
+    if truth is None:
+        warnings.append("no reference trajectory: the first pose is the origin, errors of the path stay unknown")
+        return (0.0, 0.0, 0.0)
+    start_s = float(steps.times_s[0])
+    if not truth.times_s[0] - 1.0 <= start_s <= truth.times_s[-1]:
+        warnings.append(
+            f"the truth (from {truth.times_s[0]:.3f} to {truth.times_s[-1]:.3f} s) does not cover the first odometry "
+            f"({start_s:.3f} s): the first pose is the truth's nearest"
+        )
+    x = float(np.interp(start_s, truth.times_s, truth.x_m))
+    y = float(np.interp(start_s, truth.times_s, truth.y_m))
+    if np.isfinite(truth.heading_rad[0]):
+        known = np.isfinite(truth.heading_rad)
+        return (x, y, float(np.interp(start_s, truth.times_s[known], truth.heading_rad[known])))
+    path = dead_reckoned(steps, (0.0, 0.0, 0.0))
+    way = running_total(np.abs(steps.distance_m))
+    end_s = steps.times_s[min(int(np.searchsorted(way, FIRST_WAY_M)), way.size - 1)]
+    rows = (truth.times_s >= start_s) & (truth.times_s <= end_s)
+    if rows.sum() < 3:
+        return (x, y, 0.0)
+    t = truth.times_s[rows]
+    p = np.interp(t, steps.times_s, path[:, 0]) + 1j * np.interp(t, steps.times_s, path[:, 1])
+    q = truth.x_m[rows] + 1j * truth.y_m[rows]
+    return (x, y, float(np.angle(np.vdot(p - p.mean(), q - q.mean()))))
+
+
+def recorded_run(
+    name: str, kind: str, steps: Steps, readings: Readings, beacon_ids: tuple[str, ...],
+    places_m: dict[str, tuple[float, float]], truth: ReferencePath | None, warnings: list[str],
+) -> RecordedRun:  # fmt: skip
+    """A run with the first pose of its truth."""
+    first_pose = pose_of_truth(truth, steps, warnings)
+    return RecordedRun(name, kind, steps, readings, beacon_ids, places_m, truth, first_pose, tuple(warnings))
