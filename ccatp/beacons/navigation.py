@@ -1,17 +1,8 @@
-"""Where a robot among beacons believes to be: what its mission asks of whatever estimates that.
-
-The map that motes make of themselves before a robot drives by it: phase 1, phase 2, then what it is worth.
-
-What a frame of the link tells a robot among beacons: intervals of the wheels, scans, distances, pulses.
-
-Navigation by radios that are mapped on the way: EKF-SLAM on levels and bearings.
-
-Navigation by ultrasonic motes: they map themselves, then ranges to them carry the robot; one joint state.
-"""
+"""Where a robot among beacons is: radios mapped on the way, or ultrasonic motes that map themselves first."""
 
 from collections.abc import Mapping
 from math import hypot
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -20,8 +11,9 @@ from ccatp.beacons.cricket.range_network import MoteRange, build_network, pair_r
 from ccatp.beacons.cricket.self_mapping import MoteMapper, mapper_settings, network_plan, printed_prior
 from ccatp.beacons.cricket.trilateration import map_by_plan
 from ccatp.beacons.pilot import TargetSight
-from ccatp.beacons.slam.motion import POSE, VehiclePose
-from ccatp.beacons.slam.settings import new_slam, odometry_of, readings_of, scan_of, vehicle_of
+from ccatp.beacons.slam.motion import POSE, Increment, Odometry, Steering
+from ccatp.beacons.slam.recording import RssiReading
+from ccatp.beacons.slam.settings import new_slam, scan_of, vehicle_of
 from ccatp.config.beacon_models import CricketConfig, RadioConfig
 from ccatp.core import FloatArray, WheelSample
 from ccatp.filters.ekf_slam import EkfSlam, columns_of
@@ -30,7 +22,7 @@ from ccatp.links.robot_messages import Sensors
 
 
 class SelfMap:
-    """Collects what motes report of each other until the map is good enough.
+    """Collects the pulses between motes until their map is good enough.
 
     Phase 1 begins when every pair of its plan has been read as often as configured, phase 2 takes the readings after
     that one by one (Patil et al., figure 8).
@@ -125,73 +117,47 @@ class SelfMap:
 _EPSILON_S = 1e-9  # an interval shorter than this is none
 
 
-class WheelInterval(NamedTuple):
-    """Odometry of an interval.
-
-    Attributes:
-        steer_rad: steering angle to the left; of a steered vehicle.
-        turn_rate_rad_s: turn rate to the left; of a differential drive.
-    """
-
-    end_s: float
-    interval_s: float
-    speed_m_s: float
-    steer_rad: float
-    turn_rate_rad_s: float
-
-
-class ScanReading(NamedTuple):
-    """One answer of a radio while the reflector pointed somewhere."""
-
-    beacon: str
-    direction_rad: float
-    rssi_dbm: float
-
-
-class RadioSighting(NamedTuple):
-    """A radio heard from somewhere."""
-
-    beacon: str
-    rssi_dbm: float
-    bearing_rad: float | None
-
-
 class BeaconMeasurements(NamedTuple):
     """A frame as a mission takes it.
 
     Attributes:
-        wheels: since the last frame, without gaps; empty where nothing is known of them.
+        wheels: odometry since the last frame, without gaps; empty where nothing is known of it.
+        packets: answers of radios: name, direction of the reflector left of the heading (rad), level (dBm).
+        sightings: results of scans: radio, level (dBm), bearing left of the heading (rad; None where not known).
         distances_m: of the distance sensors; empty without a reading.
     """
 
     t_s: float
-    wheels: tuple[WheelInterval, ...]
-    packets: tuple[ScanReading, ...]
-    sightings: tuple[RadioSighting, ...]
+    wheels: tuple[Odometry, ...]
+    packets: tuple[tuple[str, float, float], ...]
+    sightings: tuple[tuple[str, float, float | None], ...]
     distances_m: tuple[float, ...]
-    motes: tuple[MoteBurst, ...]
+    motes: tuple[MoteBurst, ...] = ()
 
-    @property
-    def heard(self) -> frozenset[str]:
-        """Radios of which anything was heard."""
-        return frozenset([*(one.beacon for one in self.packets), *(one.beacon for one in self.sightings)])
+
+def odometry_of(
+    cfg: RadioConfig, end_s: float, interval_s: float, speed_m_s: float, steer_rad: float, turn_rate_rad_s: float
+) -> Odometry:
+    """Odometry of an interval, as the motion model of the vehicle takes it; angle and rate to the left."""
+    if cfg.vehicle.kind == "ackermann":
+        return Steering(end_s, interval_s, speed_m_s, steer_rad)
+    return Increment(end_s, interval_s, speed_m_s * interval_s, turn_rate_rad_s * interval_s)
 
 
 class MeasurementReader:
     """Reads one frame after the other."""
 
     def __init__(self, cfg: RadioConfig) -> None:
-        """Before the first frame."""
-        self._radius_m, self._track_m = cfg.robot.wheel_radius_m, cfg.vehicle.track_m
+        self._cfg = cfg
         self._read_to_s: float | None = None
         self._steer_rad = 0.0
 
     def forget(self) -> None:
-        """The robot's clock counts anew."""
+        """The robot's clock starts again."""
         self._read_to_s = None
 
     def read(self, sensors: Sensors, extras: BeaconFrame) -> BeaconMeasurements:
-        """The senses of a frame; each wheel sample stands for the time since the one before."""
+        """The readings of a frame; each wheel sample stands for the time since the one before."""
         if self._read_to_s is None:
             self._read_to_s = sensors.t
         steering = {sample.t_s: sample.steer_rad for sample in extras.steer}
@@ -200,12 +166,12 @@ class MeasurementReader:
             sensors.t,
             tuple(one for one in wheels if one is not None),
             _packets(extras.scan),
-            tuple(RadioSighting(one.beacon, one.rssi_dbm, one.bearing_rad) for one in extras.radio),
+            tuple((one.beacon, one.rssi_dbm, one.bearing_rad) for one in extras.radio),
             tuple(extras.distances),
             tuple(extras.motes),
         )
 
-    def _interval(self, sample: WheelSample, steering: dict[float, float]) -> WheelInterval | None:
+    def _interval(self, sample: WheelSample, steering: dict[float, float]) -> Odometry | None:
         self._steer_rad = steering.get(sample.t_s, self._steer_rad)
         right, left = sample.right_rad_s, sample.left_rad_s
         before_s = sample.t_s if self._read_to_s is None else self._read_to_s
@@ -213,25 +179,21 @@ class MeasurementReader:
         if right is None or left is None or interval_s < _EPSILON_S:
             return None  # the next sample stands for this time, too
         self._read_to_s = sample.t_s
-        speed_m_s = 0.5 * self._radius_m * (right + left)
-        rate_rad_s = self._radius_m * (right - left) / self._track_m
-        return WheelInterval(sample.t_s, interval_s, speed_m_s, self._steer_rad, rate_rad_s)
+        radius_m = self._cfg.robot.wheel_radius_m
+        speed_m_s = 0.5 * radius_m * (right + left)
+        rate_rad_s = radius_m * (right - left) / self._cfg.vehicle.track_m
+        return odometry_of(self._cfg, sample.t_s, interval_s, speed_m_s, self._steer_rad, rate_rad_s)
 
 
-def _packets(scan: RadioScan | None) -> tuple[ScanReading, ...]:
+def _packets(scan: RadioScan | None) -> tuple[tuple[str, float, float], ...]:
     if scan is None:
         return ()
     return tuple(
-        ScanReading(beacon, index * scan.step, level)
+        (beacon, index * scan.step, level)
         for beacon, levels in scan.levels.items()
         for index, level in enumerate(levels)
         if level is not None
     )
-
-
-def distance_m(a: tuple[float, ...], b: tuple[float, ...]) -> float:
-    """Between two places (x, y, ...)."""
-    return hypot(a[0] - b[0], a[1] - b[1])
 
 
 Ellipse = tuple[float, float, float, float, float]
@@ -274,51 +236,28 @@ class Score(NamedTuple):
     refused: int
 
 
-class Navigator(Protocol):
-    """Estimates pose and beacons."""
-
-    @property
-    def is_mapping(self) -> bool:
-        """It needs the robot to stand: there is no map yet to drive by."""
-
-    @property
-    def belief(self) -> PoseBelief:
-        """Of the robot."""
-
-    @property
-    def reckoned_m(self) -> tuple[float, float]:
-        """Where dead reckoning alone would see it."""
-
-    @property
-    def beacons(self) -> Mapping[str, Ellipse]:
-        """The map."""
-
-    @property
-    def score(self) -> Score:
-        """Consistency so far."""
-
-    @property
-    def notes(self) -> Mapping[str, float]:
-        """What there is to say of the map."""
-
-    def target(self, t_s: float) -> TargetSight | None:
-        """What is believed of the radio that is followed, at a time; ``None`` before it was heard."""
-
-    def take(self, senses: BeaconMeasurements) -> None:
-        """Take the readings of a frame.
-
-        Raises:
-            CcatpError: they make no map, and never will.
-        """
-
-
 def ellipse_of(mean: FloatArray, covariance: FloatArray) -> Ellipse:
     """x, y and their covariance of a place, shapes (2+,) and (2+, 2+)."""
     return (float(mean[0]), float(mean[1]), float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1]))
 
 
-class RadioNavigator:
-    """Hosts ``SignalSlam``.
+class _DeadReckoning:
+    """Where the robot would be by odometry alone, and how the readings agree with what was expected of them."""
+
+    def __init__(self, cfg: RadioConfig) -> None:
+        self._cfg, self._motion = cfg, vehicle_of(cfg)
+        self._reckoned = np.zeros(self._motion.size)
+        self._reckoned[:POSE] = cfg.start.x_m, cfg.start.y_m, cfg.start.heading_rad
+        self.score = Score(0.0, 0, 0)
+
+    @property
+    def reckoned_m(self) -> tuple[float, float]:
+        """Where dead reckoning alone would see it."""
+        return float(self._reckoned[0]), float(self._reckoned[1])
+
+
+class RadioNavigator(_DeadReckoning):
+    """EKF-SLAM on levels and bearings of radios that are mapped on the way.
 
     Args:
         cfg: the configuration; nothing of ``sim`` is used.
@@ -327,25 +266,15 @@ class RadioNavigator:
     is_mapping = False  # the map grows while the robot drives
 
     def __init__(self, cfg: RadioConfig) -> None:
-        self._cfg, self._scan = cfg, scan_of(cfg)
-        self._target = cfg.follow.target
+        super().__init__(cfg)
+        self._scan, self._target = scan_of(cfg), cfg.follow.target
         self.slam = new_slam(cfg)
-        self._motion = vehicle_of(cfg)
-        self._reckoned = np.zeros(self._motion.size)
-        self._reckoned[:POSE] = VehiclePose(cfg.start.x_m, cfg.start.y_m, cfg.start.heading_rad)
         self._heard_s: float | None = None
-        self._score = Score(0.0, 0, 0)
 
     @property
     def belief(self) -> PoseBelief:
         """Of the robot."""
-        x_m, y_m, heading_rad = self.slam.pose
-        return PoseBelief((x_m, y_m, heading_rad), self.slam.pose_covariance)
-
-    @property
-    def reckoned_m(self) -> tuple[float, float]:
-        """Where dead reckoning alone would see it."""
-        return float(self._reckoned[0]), float(self._reckoned[1])
+        return PoseBelief(self.slam.pose, self.slam.pose_covariance)
 
     @property
     def beacons(self) -> Mapping[str, Ellipse]:
@@ -353,17 +282,12 @@ class RadioNavigator:
         return {str(name): ellipse_of(found.mean, found.covariance) for name, found in self.slam.beacons.items()}
 
     @property
-    def score(self) -> Score:
-        """Consistency so far."""
-        return self._score
-
-    @property
     def notes(self) -> Mapping[str, float]:
-        """What the vehicle's calibration is believed to be."""
+        """Calibration of the vehicle."""
         return {name: mean for name, (mean, _) in self.slam.calibration.items()}
 
     def target(self, t_s: float) -> TargetSight | None:
-        """What is believed of the radio that is followed."""
+        """The radio that is followed, at a time; ``None`` before its first reading."""
         estimate = self.slam.beacons.get(self._target)
         if estimate is None or self._heard_s is None:
             return None
@@ -371,29 +295,31 @@ class RadioNavigator:
         sigma_m = self.slam.distance(self._target)[1]
         return TargetSight((x_m, y_m), sigma_m, t_s - self._heard_s, self.slam.moving_velocity_m_s)
 
-    def take(self, senses: BeaconMeasurements) -> None:
-        """Predict over the wheels' intervals, then take what was heard."""
-        for wheels in senses.wheels:
-            odometry = odometry_of(self._cfg, wheels.end_s, wheels)
+    def take(self, measurements: BeaconMeasurements) -> None:
+        """Predict over the wheels' intervals, then take the readings of the frame."""
+        for odometry in measurements.wheels:
             self.slam.predict(odometry)
-            self._reckoned[:POSE] = self._motion.step(self._reckoned, odometry).mean[:POSE]
-        readings = readings_of(senses.t_s, [*self._scan.results(senses.packets), *senses.sightings])
+            self._reckoned = self._motion.step(self._reckoned, odometry).mean
+        t_s = measurements.t_s
+        results = self._scan.results(measurements.packets)
+        readings = [RssiReading(t_s, one.beacon, one.rssi_dbm, one.bearing_rad) for one in results]
+        readings += [RssiReading(t_s, *sighting) for sighting in measurements.sightings]
         learned = self.slam.observe(readings)
         used = [one for one in learned if one.accepted]
-        self._score = Score(
-            self._score.nis_sum + sum(one.nis for one in used),
-            self._score.nis_size + sum(one.size for one in used),
-            self._score.refused + len(learned) - len(used),
+        self.score = Score(
+            self.score.nis_sum + sum(one.nis for one in used),
+            self.score.nis_size + sum(one.size for one in used),
+            self.score.refused + len(learned) - len(used),
         )
         if any(reading.beacon == self._target for reading in readings):
-            self._heard_s = senses.t_s
+            self._heard_s = t_s
 
 
 _PLACE = 2
 _NEAREST_M = 0.02  # nearer than that a range has no direction
 
 
-class MoteNavigator:
+class MoteNavigator(_DeadReckoning):
     """An EKF over the robot and all motes of the map.
 
     State: pose and its calibration, then the motes. The map joins with the joint covariance that its self-mapping left,
@@ -405,23 +331,19 @@ class MoteNavigator:
     """
 
     def __init__(self, cfg: RadioConfig) -> None:
+        super().__init__(cfg)
         start = cfg.start
-        self._cfg, self._motion = cfg, vehicle_of(cfg)
         self._self_map = SelfMap(cfg.cricket)
         self._gate = float(chdtri(1, 1.0 - cfg.listener.gate_probability))
-        v = self._motion.size
-        mean, sigmas = np.zeros(v), np.zeros(v)
-        mean[:POSE] = VehiclePose(start.x_m, start.y_m, start.heading_rad)
+        sigmas = np.zeros(self._motion.size)
         sigmas[:POSE] = start.position_sigma_m, start.position_sigma_m, start.heading_sigma_rad
         sigmas[POSE:] = self._motion.prior_sigmas
-        self._filter = EkfSlam(mean, np.diag(sigmas**2))
-        self._reckoned = mean.copy()
+        self._filter = EkfSlam(self._reckoned.copy(), np.diag(sigmas**2))
         self._place_of: dict[str, int] = {}
-        self._score = Score(0.0, 0, 0)
 
     @property
     def is_mapping(self) -> bool:
-        """The motes have no map of themselves yet."""
+        """The robot has to stand: the motes have no map of themselves yet."""
         return not self._place_of
 
     @property
@@ -431,13 +353,8 @@ class MoteNavigator:
         return PoseBelief((x_m, y_m, heading_rad), self._filter.covariance[:POSE, :POSE].copy())
 
     @property
-    def reckoned_m(self) -> tuple[float, float]:
-        """Where dead reckoning alone would see it."""
-        return float(self._reckoned[0]), float(self._reckoned[1])
-
-    @property
     def beacons(self) -> Mapping[str, Ellipse]:
-        """The map; before the robot has one, what the motes have of it."""
+        """The map; before the robot has one, that of the motes."""
         if self._place_of:
             mean, P, at = self._filter.mean, self._filter.covariance, self._place_of
         else:
@@ -449,11 +366,6 @@ class MoteNavigator:
         return {name: ellipse_of(mean[i : i + _PLACE], P[i : i + _PLACE, i : i + _PLACE]) for name, i in at.items()}
 
     @property
-    def score(self) -> Score:
-        """Consistency of the robot's ranges so far."""
-        return self._score
-
-    @property
     def notes(self) -> Mapping[str, float]:
         """How well the map is known."""
         return self._self_map.notes
@@ -462,31 +374,30 @@ class MoteNavigator:
         """Nothing is followed."""
         return None
 
-    def take(self, senses: BeaconMeasurements) -> None:
-        """Predict over the wheels' intervals, then take what was heard.
+    def take(self, measurements: BeaconMeasurements) -> None:
+        """Predict over the wheels' intervals, then take the readings of the frame.
 
         Raises:
             MappingError: the motes cannot be mapped.
             TdoaError: a delay or a temperature that none can be.
         """
-        motion, state = self._motion, self._filter
-        for wheels in senses.wheels:
-            odometry = odometry_of(self._cfg, wheels.end_s, wheels)
-            step = motion.step(state.mean[: state.vehicle_size], odometry)
+        state = self._filter
+        for odometry in measurements.wheels:
+            step = self._motion.step(state.mean[: state.vehicle_size], odometry)
             state.predict(step.mean, step.F, step.Q)
-            self._reckoned = motion.step(self._reckoned, odometry).mean
-        for burst in senses.motes:
+            self._reckoned = self._motion.step(self._reckoned, odometry).mean
+        for burst in measurements.motes:
             if burst.listener == self._cfg.listener.name:
                 self._range(burst)
             elif self.is_mapping:
                 self._self_map.take(burst)
         if self.is_mapping and self._self_map.is_done and self._self_map.places is not None:
             self._join(*self._self_map.places)
-            self._self_map.notes["map_time_s"] = senses.t_s
+            self._self_map.notes["map_time_s"] = measurements.t_s
 
     def _join(self, positions_m: FloatArray, covariance_m2: FloatArray) -> None:
-        none = np.empty(0, dtype=np.intp)
-        size = positions_m.size
+        # One block; nothing ties it to the robot yet.
+        none, size = np.empty(0, dtype=np.intp), positions_m.size
         self._filter.augment("map", positions_m.ravel(), none, np.zeros((size, 0)), np.eye(size), covariance_m2)
         start = self._filter.block("map").start
         self._place_of = {name: start + _PLACE * row for row, name in enumerate(self._self_map.names)}
@@ -500,11 +411,13 @@ class MoteNavigator:
         x, y, mx, my = self._filter.mean.take(columns).tolist()
         r = max(hypot(x - mx, y - my), _NEAREST_M)
         ux, uy = (x - mx) / r, (y - my) / r
-        found = self._filter.update_row(
-            columns, np.array((ux, uy, -ux, -uy)), reading.range_m - r, reading.sigma_m**2, self._gate
-        )
-        nis_sum, nis_size, refused = self._score
+        h = np.array((ux, uy, -ux, -uy))
+        found = self._filter.update_row(columns, h, reading.range_m - r, reading.sigma_m**2, self._gate)
+        nis_sum, nis_size, refused = self.score
         if found.accepted:
-            self._score = Score(nis_sum + found.nis, nis_size + 1, refused)
+            self.score = Score(nis_sum + found.nis, nis_size + 1, refused)
         else:
-            self._score = Score(nis_sum, nis_size, refused + 1)
+            self.score = Score(nis_sum, nis_size, refused + 1)
+
+
+Navigator = RadioNavigator | MoteNavigator

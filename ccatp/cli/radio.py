@@ -69,14 +69,14 @@ def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) 
 def _estimated(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) -> "EstimatedPath":
     from time import perf_counter
 
-    from ccatp.beacons.slam.settings import batch_settings, slam_settings
+    from ccatp.beacons.slam.settings import slam_settings
     from ccatp.config.recording_models import RecordingConfig
 
     cfg: RecordingConfig = getattr(assumed, run.kind)
     if filter_name == "smoother":
         from ccatp.beacons.slam.batch_smoother import smooth
 
-        return smooth(run, batch_settings(cfg), perf_counter)
+        return smooth(run, cfg, perf_counter)
     from ccatp.beacons.slam.causal import filter_run
 
     first_sigmas = (cfg.priors.pose_m, cfg.priors.heading_rad)
@@ -88,7 +88,6 @@ def compared(run: "RecordedRun", assumed: "RecordingsConfig", peers: bool) -> li
     from time import perf_counter
 
     from ccatp.beacons.slam.evaluation import row
-    from ccatp.beacons.slam.settings import batch_settings
 
     rows = []
     for name in FILTERS:
@@ -98,7 +97,7 @@ def compared(run: "RecordedRun", assumed: "RecordingsConfig", peers: bool) -> li
     if peers:
         from ccatp.studies.gtsam_peer import run_gtsam
 
-        found = run_gtsam(run, batch_settings(getattr(assumed, run.kind)), perf_counter)
+        found = run_gtsam(run, getattr(assumed, run.kind), perf_counter)
         rows.append(row(run, "GTSAM iSAM2", found.isam2, float(found.isam2.update_s.sum()), peer=True))
         # it starts from what iSAM2 ended with, so that its time is not a run's
         rows.append(row(run, "GTSAM batch", found.batch, None, peer=True))

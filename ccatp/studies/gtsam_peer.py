@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ccatp.beacons.slam.batch_odometry import CALIBRATION, BatchSettings, Reckoning
-from ccatp.beacons.slam.batch_solver import place_by_distances
+from ccatp.beacons.slam.batch_odometry import CALIBRATION, Reckoning
+from ccatp.beacons.slam.batch_smoother import place_by_distances
 from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun
+from ccatp.config.recording_models import RecordingConfig
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError, ExitStatus
 
@@ -42,7 +43,7 @@ class Peers(NamedTuple):
     batch: EstimatedPath
 
 
-def run_gtsam(run: RecordedRun, settings: BatchSettings, clock_s: Callable[[], float]) -> Peers:
+def run_gtsam(run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[], float]) -> Peers:
     """Both estimates of a run.
 
     Raises:
@@ -61,7 +62,7 @@ def run_gtsam(run: RecordedRun, settings: BatchSettings, clock_s: Callable[[], f
 
 
 class _Session:
-    def __init__(self, gtsam: Any, run: RecordedRun, settings: BatchSettings) -> None:
+    def __init__(self, gtsam: Any, run: RecordedRun, settings: RecordingConfig) -> None:
         self._gtsam, self._run, self._settings = gtsam, run, settings
         self._times = np.union1d(run.readings.times_s, run.steps.times_s[:1])
         reckoning = Reckoning(run.steps, self._times, delayed=False)
@@ -188,12 +189,8 @@ class _Session:
             covariances=np.broadcast_to(np.eye(3), (len(path), 3, 3)),
             beacons=beacons,
             calibration={},
-            nis=np.empty(0),
-            nis_sizes=np.empty(0),
             refused=0,
             update_s=update_s,
-            predict_s=np.empty(0),
-            scalar_s=np.empty(0),
             updates=len(self._at),
             warnings=(),
         )

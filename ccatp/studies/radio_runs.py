@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from ccatp.beacons.slam.beacon_loop import BeaconLoop
-from ccatp.beacons.slam.motion import VehiclePose
-from ccatp.beacons.slam.settings import odometry_of, vehicle_of
+from ccatp.beacons.navigation import BeaconMeasurements, RadioNavigator, odometry_of
+from ccatp.beacons.pilot import BeaconPilot
+from ccatp.beacons.steering import HALT
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.sim.radio import SimDriveCommand
@@ -52,51 +52,52 @@ class RadioRun:
 
 def run_radio(cfg: RadioConfig) -> RadioRun:
     """A whole run; a function of the configuration and its seed."""
-    world, loop, run = RadioWorld(cfg), BeaconLoop(cfg), RadioRun()
-    reckoned, motion = VehiclePose(cfg.start.x_m, cfg.start.y_m, cfg.start.heading_rad), vehicle_of(cfg)
-    drive = loop.first()
+    world, navigator, pilot, run = RadioWorld(cfg), RadioNavigator(cfg), BeaconPilot(cfg), RadioRun()
+    drive, observation = HALT, cfg.observation
     for step in range(1, cfg.run.steps + 1):
-        static, target = loop.listens(step)
+        static, target = step % observation.every_steps == 0, step % observation.target_every_steps == 0
         frame = world.step(SimDriveCommand(*drive), cfg.run.step_s, static=static, target=target)
-        drive = loop.step(frame.time_s, frame.wheels, frame.packets, frame.sightings, frame.distances_m)
-        states = np.zeros(motion.size)
-        states[:3] = reckoned
-        reckoned = VehiclePose(*motion.step(states, odometry_of(cfg, frame.time_s, frame.wheels)).mean[:3].tolist())
-        _note(run, world, loop, reckoned, cfg.follow.target)
+        t_s, distances_m = frame.time_s, frame.distances_m
+        wheels = (odometry_of(cfg, t_s, *frame.wheels),)
+        navigator.take(BeaconMeasurements(t_s, wheels, frame.packets, frame.sightings, distances_m))
+        pose = navigator.slam.pose
+        drive = pilot.drive(t_s, frame.wheels.interval_s, pose, navigator.target(t_s), distances_m)
+        _note(run, world, navigator, cfg.follow.target)
     truths = _true_places(world, cfg.follow.target)
-    for name, estimate in loop.slam.beacons.items():
+    for name, estimate in navigator.slam.beacons.items():
         run.places[str(name)] = (estimate.mean, estimate.covariance, np.array(truths[str(name)]))
-    run.joint_nees = _joint_nees(world, loop)
+    run.joint_nees = _joint_nees(world, navigator)
     return run
 
 
-def _joint_nees(world: RadioWorld, loop: BeaconLoop) -> tuple[float, int]:
+def _joint_nees(world: RadioWorld, navigator: RadioNavigator) -> tuple[float, int]:
     """Of what is on the map: radios whose readings still wait are left out."""
-    placed = [name for name in world.beacons_m if name in loop.slam.engine]
-    mean, covariance = loop.slam.joint(placed)
+    placed = [name for name in world.beacons_m if name in navigator.slam.engine]
+    mean, covariance = navigator.slam.joint(placed)
     truth = np.concatenate([world.pose, *(world.beacons_m[name] for name in placed)])
     return _nees(mean - truth, covariance), truth.size
 
 
-def _note(run: RadioRun, world: RadioWorld, loop: BeaconLoop, reckoned: VehiclePose, target: str) -> None:
-    true, pose = world.pose, loop.slam.pose
+def _note(run: RadioRun, world: RadioWorld, navigator: RadioNavigator, target: str) -> None:
+    true, slam = world.pose, navigator.slam
+    pose, (reckoned_x_m, reckoned_y_m) = slam.pose, navigator.reckoned_m
     error = (pose.x_m - true.x_m, pose.y_m - true.y_m, wrap_pi(pose.heading_rad - true.heading_rad))
     run.pose_errors.append(error)
-    run.pose_nees.append(_nees(np.array(error), loop.slam.pose_covariance))
-    run.reckoned_errors.append((reckoned.x_m - true.x_m, reckoned.y_m - true.y_m))
-    run.nis += [(learned.nis, learned.size) for learned in loop.learned]
+    run.pose_nees.append(_nees(np.array(error), slam.pose_covariance))
+    run.reckoned_errors.append((reckoned_x_m - true.x_m, reckoned_y_m - true.y_m))
+    run.nis += [(learned.nis, learned.size) for learned in slam.learned]
     run.clearances_m.append(world.clearance_m)
     run.truth.append(true[:2])
     run.estimates.append(pose[:2])
     truths = _true_places(world, target)
-    for name, estimate in loop.slam.beacons.items():
+    for name, estimate in slam.beacons.items():
         off = estimate.mean - truths[str(name)]
         run.beacon_errors_m.setdefault(str(name), []).append(float(np.hypot(*off)))
         run.beacon_nees.setdefault(str(name), []).append(_nees(off, estimate.covariance))
     if world.target_m is not None:
         run.targets.append(world.target_m)
         run.distances_m.append(float(np.hypot(world.target_m[0] - true.x_m, world.target_m[1] - true.y_m)))
-        believed = loop.slam.beacons.get(target)
+        believed = slam.beacons.get(target)
         run.believed.append((np.nan, np.nan) if believed is None else (believed.mean[0], believed.mean[1]))
 
 

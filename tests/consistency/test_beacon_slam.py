@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ccatp.beacons.slam.beacon_map import BearingModel, RangeModel, RobustLoss, SlamSettings
+from ccatp.beacons.slam.beacon_map import RangeModel, RobustLoss, SlamSettings
 from ccatp.beacons.slam.motion import DifferentialDrive, DifferentialNoise, Increment
 from ccatp.beacons.slam.range_slam import BeaconSlam
-from ccatp.beacons.slam.recording import RangeBearingReading, RangeReading, Reading
+from ccatp.beacons.slam.recording import RangeReading, Reading
 from ccatp.core import wrap_pi
 
 NOISE = DifferentialNoise(0.02, 0.0, 0.01, 0.02, 0.0, 0.0)
@@ -38,7 +38,7 @@ def drive(slam: BeaconSlam, seed: int, steps: int, *, bearings: bool) -> tuple[f
             range_m = hypot(bx - x, by - y) + SIGMA_M * rng.normal()
             if bearings:
                 bearing = wrap_pi(atan2(by - y, bx - x) - heading + SIGMA_RAD * rng.normal())
-                readings.append(RangeBearingReading(time_s, beacon, range_m, bearing))
+                readings.append(RangeReading(time_s, beacon, range_m, bearing))
             else:
                 readings.append(RangeReading(time_s, beacon, range_m))
         for learned in slam.observe(readings):
@@ -48,9 +48,7 @@ def drive(slam: BeaconSlam, seed: int, steps: int, *, bearings: bool) -> tuple[f
 
 
 def check_consistent(seeds: int, steps: int, *, bearings: bool) -> None:
-    settings = SlamSettings(
-        DifferentialDrive(NOISE), PLAIN, RangeModel(SIGMA_M, 0.0, 0.0, 0.0), BearingModel(SIGMA_RAD)
-    )
+    settings = SlamSettings(DifferentialDrive(NOISE), PLAIN, RangeModel(SIGMA_M, 0.0, 0.0, 0.0), SIGMA_RAD)
     nees, nis, size = 0.0, 0.0, 0
     for seed in range(seeds):
         slam = BeaconSlam(settings, (0.0, 0.0, 0.0), P0)
@@ -69,9 +67,7 @@ def test_range_and_bearing_over_fifty_seeds() -> None:
 
 def test_a_filter_that_believes_too_much_is_found_out() -> None:
     """The band is narrow enough: a tenth less noise than there is falls out of it."""
-    settings = SlamSettings(
-        DifferentialDrive(NOISE), PLAIN, RangeModel(0.9 * SIGMA_M, 0.0, 0.0, 0.0), BearingModel(0.9 * SIGMA_RAD)
-    )
+    settings = SlamSettings(DifferentialDrive(NOISE), PLAIN, RangeModel(0.9 * SIGMA_M, 0.0, 0.0, 0.0), 0.9 * SIGMA_RAD)
     nis, size = 0.0, 0
     for seed in range(10):
         found = drive(BeaconSlam(settings, (0.0, 0.0, 0.0), P0), seed, 60, bearings=True)

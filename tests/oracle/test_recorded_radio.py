@@ -9,7 +9,6 @@ from ccatp.beacons.datasets.reader import read_run
 from ccatp.beacons.slam.batch_smoother import smooth
 from ccatp.beacons.slam.evaluation import TrackEvaluation, judge
 from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun
-from ccatp.beacons.slam.settings import batch_settings
 from ccatp.config.load import load_recordings_config
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "radio"
@@ -19,7 +18,7 @@ pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"the recorded radio d
 def smoothed(path: str, robot: int | None = None) -> tuple[RecordedRun, EstimatedPath, TrackEvaluation]:
     """A set through the smoother as it is configured."""
     run = read_run(DATA / path, None, robot)
-    track = smooth(run, batch_settings(getattr(load_recordings_config(), run.kind)), time.perf_counter)
+    track = smooth(run, getattr(load_recordings_config(), run.kind), time.perf_counter)
     return run, track, judge(track, run)
 
 

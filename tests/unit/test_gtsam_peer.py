@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from ccatp.beacons.slam.evaluation import judge, markdown, with_means
-from ccatp.beacons.slam.settings import batch_settings
 from ccatp.cli import main
 from ccatp.config.load import load_recordings_config
 from ccatp.studies.gtsam_peer import PeerError, run_gtsam
 from tests.unit.beacons.datasets.sets import BEACONS, csv_lines, recorded, world, write_lines, write_mrclam
 
-SETTINGS = batch_settings(load_recordings_config().csv)
+SETTINGS = load_recordings_config().csv
 
 
 def no_clock() -> float:

@@ -1,15 +1,11 @@
-"""Odometry between the instants of readings: the increment, what calibration does to it, its noise.
+"""Odometry between the instants of readings: the increment, what calibration does to it, its noise."""
 
-What the batch smoother needs to know of a vehicle and its radios; nothing about a place.
-"""
-
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from ccatp.beacons.slam.motion import DifferentialNoise
-from ccatp.beacons.slam.recording import Steps
+from ccatp.beacons.slam.recording import Steps, running_total
+from ccatp.config.recording_models import OdometryNoiseConfig
 from ccatp.core import FloatArray
 
 # What odometry is calibrated by: d = (1 + distance_scale) d_o, w = (1 + turn_scale) w_o + turn_per_m d_o - bias t.
@@ -48,22 +44,23 @@ class Reckoning:
     def __init__(self, steps: Steps, times_s: FloatArray, *, delayed: bool = True) -> None:
         self._delayed = delayed
         inside = (steps.times_s > times_s[0]) & (steps.times_s < times_s[-1])
-        fine_s = np.union1d(_spaced(steps.times_s[inside]), times_s)
+        inner_s = steps.times_s[inside]
+        _, first = np.unique(np.floor(inner_s / FINEST_S), return_index=True)
+        fine_s = np.union1d(inner_s[first], times_s)
         self._starts = np.searchsorted(fine_s, times_s)[:-1]
         self._lengths = np.diff(np.append(self._starts, fine_s.size - 1))
         self.interval_s = np.diff(fine_s)
 
         self._fine_s, self._steps_s = fine_s, steps.times_s
-        amounts = (steps.distance_m, steps.turn_rad, steps.lateral_m)
-        self._totals = [_total(amount) for amount in amounts]
         guesses = (np.broadcast_to(guess, steps.distance_m.shape) for guess in (steps.guess_m2, steps.guess_rad2))
-        self._guess_totals = [_total(guess) for guess in guesses]
+        amounts = (steps.distance_m, steps.turn_rad, steps.lateral_m, *guesses)
+        self._totals = [running_total(amount) for amount in amounts]
         self._cut(0.0)
 
     def _cut(self, delay_s: float) -> None:
         self._delay_s = delay_s
-        self.distance_m, self.turn_rad, self.lateral_m = (self._shares(total, delay_s) for total in self._totals)
-        self._guess_m2, self._guess_rad2 = (self._shares(total, delay_s) for total in self._guess_totals)
+        shares = (self._shares(total, delay_s) for total in self._totals)
+        self.distance_m, self.turn_rad, self.lateral_m, self._guess_m2, self._guess_rad2 = shares
 
     def _shares(self, total: FloatArray, delay_s: float) -> FloatArray:
         shares: FloatArray = np.diff(np.interp(self._fine_s - delay_s, self._steps_s, total))
@@ -73,7 +70,7 @@ class Reckoning:
         later, sooner = (self._shares(total, self._delay_s + sign * DELAY_STEP_S) for sign in (1.0, -1.0))
         return (later - sooner) / (2.0 * DELAY_STEP_S)
 
-    def increments(self, calibration: FloatArray, noise: DifferentialNoise) -> Increments:
+    def increments(self, calibration: FloatArray, noise: OdometryNoiseConfig) -> Increments:
         """Motion of each interval, with the lever by which each of its steps moves the interval's end.
 
         A turn error e at a step swings the rest of the interval: d(x, y) = e (-(y_end - y), x_end - x).
@@ -87,14 +84,14 @@ class Reckoning:
         turn = (
             (1.0 + calibration[1]) * self.turn_rad + calibration[2] * self.distance_m - calibration[3] * self.interval_s
         )
-        before = np.concatenate([[0.0], np.cumsum(turn)])
+        before = running_total(turn)
         heading = before[:-1] + 0.5 * turn - np.repeat(before[self._starts], self._lengths)
         c, s = np.cos(heading), np.sin(heading)
         dx, dy = way * c - side * s, way * s + side * c
         end_x, end_y = self._sum(dx), self._sum(dy)
         x, y = np.cumsum(dx) - 0.5 * dx, np.cumsum(dy) - 0.5 * dy  # middles of the steps
-        start_x = np.concatenate([[0.0], np.cumsum(dx)])[self._starts]
-        start_y = np.concatenate([[0.0], np.cumsum(dy)])[self._starts]
+        start_x = running_total(dx)[self._starts]
+        start_y = running_total(dy)[self._starts]
         lever_x = -(np.repeat(end_y + start_y, self._lengths) - y)
         lever_y = np.repeat(end_x + start_x, self._lengths) - x
         motion = np.stack([end_x, end_y, self._sum(turn)], axis=1)
@@ -105,7 +102,7 @@ class Reckoning:
             by[:, 1, k] = self._sum(lever_y * amount)
             by[:, 2, k] = self._sum(amount)
         if self._delayed:
-            way_by, turn_by, side_by = (self._by_delay(total) for total in self._totals)
+            way_by, turn_by, side_by = (self._by_delay(total) for total in self._totals[:3])
             turn_by = (1.0 + calibration[1]) * turn_by + calibration[2] * way_by
             way_by = (1.0 + calibration[0]) * way_by
             by[:, 0, 4] = self._sum(way_by * c - side_by * s + lever_x * turn_by)
@@ -114,7 +111,7 @@ class Reckoning:
         return Increments(motion, by, self._covariance(noise, (c, s), (lever_x, lever_y)))
 
     def _covariance(
-        self, noise: DifferentialNoise, direction: tuple[FloatArray, FloatArray], lever: tuple[FloatArray, FloatArray]
+        self, noise: OdometryNoiseConfig, direction: tuple[FloatArray, FloatArray], lever: tuple[FloatArray, FloatArray]
     ) -> FloatArray:
         way, turned = np.hypot(self.distance_m, self.lateral_m), np.abs(self.turn_rad)
         var_way = noise.distance_per_sqrt_m**2 * way + noise.distance_per_sqrt_rad**2 * turned
@@ -141,15 +138,6 @@ class Reckoning:
         return total
 
 
-def _total(amounts: FloatArray) -> FloatArray:
-    return np.concatenate([[0.0], np.cumsum(amounts)])
-
-
-def _spaced(times_s: FloatArray) -> FloatArray:
-    _, first = np.unique(np.floor(times_s / FINEST_S), return_index=True)
-    return times_s[first]
-
-
 def carried_on(pose: FloatArray, motion: FloatArray) -> FloatArray:
     """Poses after one increment each, shape (..., 3)."""
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
@@ -160,71 +148,8 @@ def carried_on(pose: FloatArray, motion: FloatArray) -> FloatArray:
 
 def chained(first: FloatArray, motion: FloatArray) -> FloatArray:
     """Poses from the first one on, shape (n + 1, 3), by increments (n, 3)."""
-    heading = first[2] + np.concatenate([[0.0], np.cumsum(motion[:, 2])])
+    heading = first[2] + running_total(motion[:, 2])
     c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
-    x = first[0] + np.concatenate([[0.0], np.cumsum(c * motion[:, 0] - s * motion[:, 1])])
-    y = first[1] + np.concatenate([[0.0], np.cumsum(s * motion[:, 0] + c * motion[:, 1])])
+    x = first[0] + running_total(c * motion[:, 0] - s * motion[:, 1])
+    y = first[1] + running_total(s * motion[:, 0] + c * motion[:, 1])
     return np.column_stack([x, y, heading])
-
-
-@dataclass(frozen=True, slots=True)
-class RadioNoise:
-    """Noise of the readings.
-
-    Attributes:
-        range_sigma_per_m: what a metre of range adds to it, in squares: var = sigma^2 + (sigma_per_m r)^2.
-        rssi_reference_dbm: signal strength at 1 m, P_ref.
-        rssi_exponent: eta of the log-distance model z = P_ref - 10 eta log10(r / 1 m).
-        freedom: degrees of freedom of Student's t, the law of the noise: few for outliers, many for Gaussian noise.
-        correlation_s: readings of a beacon within it share their error: together they count as one.
-    """
-
-    range_sigma_m: float
-    range_sigma_per_m: float
-    bearing_sigma_rad: float
-    rssi_sigma_db: float
-    rssi_reference_dbm: float
-    rssi_exponent: float
-    freedom: float
-    correlation_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class BatchPriors:
-    """Standard deviations, before any reading, of what is calibrated; 0: taken as zero, not estimated.
-
-    Attributes:
-        turn_per_m: turning of a vehicle that believes to go straight, rad/m.
-        delay_s: by how much the vehicle does later what its odometry says.
-        rssi_reference_db: error of P_ref that all beacons share.
-        beacon_offset_m: error of a beacon's ranges beside the shared one.
-        beacon_reference_db: error of a beacon's P_ref beside the shared one.
-    """
-
-    distance_scale: float
-    turn_scale: float
-    turn_per_m: float
-    turn_bias_rad_s: float
-    delay_s: float
-    range_scale: float
-    range_offset_m: float
-    bearing_offset_rad: float
-    rssi_reference_db: float
-    rssi_exponent: float
-    beacon_offset_m: float
-    beacon_reference_db: float
-    pose_m: float
-    heading_rad: float
-
-
-@dataclass(frozen=True, slots=True)
-class BatchSettings:
-    """All of it.
-
-    Attributes:
-        odometry: random walks of the odometry (its priors are not used, ``priors`` holds them).
-    """
-
-    odometry: DifferentialNoise
-    radio: RadioNoise
-    priors: BatchPriors

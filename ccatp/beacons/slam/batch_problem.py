@@ -1,26 +1,27 @@
-"""The least-squares problem of a run: residuals, Jacobians, normal equations of odometry and readings.
-
-Normal equations of a chain of poses that all see a few shared unknowns: block tridiagonal with an arrow.
-"""
+"""The least-squares problem of a run: residuals, Jacobians, normal equations of odometry and readings."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import cho_factor, cho_solve, cholesky_banded, solve_triangular
 
-from ccatp.beacons.slam.batch_odometry import CALIBRATION, BatchPriors, BatchSettings, RadioNoise, Reckoning
+from ccatp.beacons.slam.batch_odometry import CALIBRATION, Reckoning
 from ccatp.beacons.slam.recording import Readings, Steps
+from ccatp.config.recording_models import PriorsConfig, RecordingConfig
 from ccatp.core import FloatArray, IntArray
 
-BLOCK = 3  # x_m, y_m, heading_rad
-BAND = 2 * BLOCK - 1
+OF_READINGS = ("range_scale", "range_offset_m", "bearing_offset_rad", "rssi_reference_db", "rssi_exponent")
+# Unknowns that are neither pose nor beacon, in the order of the state: corrections, zero where all is as it should.
+SHARED = (*CALIBRATION, *OF_READINGS)
+RANGE_SCALE, RANGE_OFFSET, BEARING_OFFSET, RSSI_REFERENCE, RSSI_EXPONENT = (SHARED.index(name) for name in OF_READINGS)
+BEACON = 4  # x_m, y_m, the offset of its ranges, m, and of its P_ref, dB
+LEAST_RANGE_M = 1e-3
+DB = 10.0 / np.log(10.0)
 
 
 @dataclass(slots=True)
 class ArrowSystem:
-    """The symmetric positive definite matrix [[A, B], [B^T, C]] and the right-hand side (a, c).
+    """Normal equations: a matrix [[A, B], [B^T, C]], A of the chain of poses, and the right-hand side (a, c).
 
     Attributes:
         diagonal: of A, shape (n, 3, 3).
@@ -37,90 +38,6 @@ class ArrowSystem:
     corner: FloatArray
     pose_side: FloatArray
     shared_side: FloatArray
-
-
-class Factored:
-    """Cholesky factors of an arrow system: A by bands, then the Schur complement S = C - B^T A^-1 B.
-
-    Args:
-        damping: the diagonal is multiplied by 1 + damping (Levenberg and Marquardt).
-
-    Raises:
-        LinAlgError: not positive definite.
-    """
-
-    def __init__(self, system: ArrowSystem, damping: float = 0.0) -> None:
-        self.system = system
-        n, m = len(system.diagonal), len(system.corner)
-        band = _banded(system, damping)
-        self._factor = cholesky_banded(band, lower=True, check_finite=False)
-        right = np.concatenate([system.border.reshape(n * BLOCK, m), system.pose_side.reshape(-1, 1)], axis=1)
-        solved = _band_solve(self._factor, right)
-        self._border_solved, self._pose_solved = solved[:, :m], solved[:, m]
-        corner = system.corner + damping * np.diag(np.diag(system.corner))
-        S = corner - system.border.reshape(n * BLOCK, m).T @ self._border_solved
-        self._schur = cho_factor(0.5 * (S + S.T), lower=True, check_finite=False)
-
-    def solution(self) -> tuple[FloatArray, FloatArray]:
-        """Unknowns of the poses (n, 3) and the shared ones (m,)."""
-        system = self.system
-        n, m = len(system.diagonal), len(system.corner)
-        side = system.shared_side - system.border.reshape(n * BLOCK, m).T @ self._pose_solved
-        shared = cho_solve(self._schur, side, check_finite=False)
-        return (self._pose_solved - self._border_solved @ shared).reshape(n, BLOCK), shared
-
-    def log_determinant(self) -> float:
-        """Of the whole matrix."""
-        return float(2.0 * (np.log(self._factor[0]).sum() + np.log(np.diag(self._schur[0])).sum()))
-
-    def shared_covariance(self) -> FloatArray:
-        """Inverse's block of the shared unknowns, shape (m, m)."""
-        return np.asarray(cho_solve(self._schur, np.eye(len(self.system.corner)), check_finite=False))
-
-    def pose_covariances(self) -> FloatArray:
-        """Inverse's diagonal block of each pose, shape (n, 3, 3): (A^-1)_kk + W_k W_k^T, W = A^-1 B chol(S)^-T."""
-        n, m = len(self.system.diagonal), len(self.system.corner)
-        root = np.tril(self._schur[0])
-        W = solve_triangular(root, self._border_solved.T, lower=True, check_finite=False).T.reshape(n, BLOCK, m)
-        return _diagonal_of_inverse(self.system) + W @ W.transpose(0, 2, 1)
-
-
-def _banded(system: ArrowSystem, damping: float) -> FloatArray:
-    n = len(system.diagonal)
-    band = np.zeros((BAND + 1, n, BLOCK))
-    for column in range(BLOCK):
-        for row in range(column, BLOCK):
-            band[row - column, :, column] = system.diagonal[:, row, column]
-        band[0, :, column] *= 1.0 + damping
-        for row in range(BLOCK):
-            band[BLOCK + row - column, :-1, column] = system.below[:, row, column]
-    return band.reshape(BAND + 1, n * BLOCK)
-
-
-def _band_solve(factor: FloatArray, right: FloatArray) -> FloatArray:
-    from scipy.linalg import cho_solve_banded  # noqa: PLC0415
-
-    return np.asarray(cho_solve_banded((factor, True), right, check_finite=False))
-
-
-def _diagonal_of_inverse(system: ArrowSystem) -> FloatArray:
-    A, below = system.diagonal, system.below
-    n = len(A)
-    left, right = A.copy(), A.copy()
-    for k in range(1, n):
-        left[k] -= below[k - 1] @ np.linalg.solve(left[k - 1], below[k - 1].T)
-    for k in range(n - 2, -1, -1):
-        right[k] -= below[k].T @ np.linalg.solve(right[k + 1], below[k])
-    return np.asarray(np.linalg.inv(left + right - A))
-
-
-OF_READINGS = ("range_scale", "range_offset_m", "bearing_offset_rad", "rssi_reference_db", "rssi_exponent")
-# Unknowns that are neither pose nor beacon, in the order of the state: corrections, zero where all is as it should.
-SHARED = (*CALIBRATION, *OF_READINGS)
-RANGE_SCALE, RANGE_OFFSET, BEARING_OFFSET, RSSI_REFERENCE, RSSI_EXPONENT = (SHARED.index(name) for name in OF_READINGS)
-BEACON = 4  # x_m, y_m, the offset of its ranges, m, and of its P_ref, dB
-LEAST_RANGE_M = 1e-3
-DB = 10.0 / np.log(10.0)
 
 
 @dataclass(slots=True)
@@ -146,25 +63,41 @@ class BatchState:
 
 @dataclass(slots=True)
 class Residuals:
-    """What remains at a state; readings as rows of (range, bearing, signal strength), zero where there is none.
+    """What remains at a state, and its derivatives.
+
+    Readings are rows of (range, bearing, signal strength), zero where there is none.
 
     Attributes:
-        odometry: shape (n - 1, 3).
+        local: motion by the poses, in the vehicle's frame before it, shape (n - 1, 3).
+        odometry: what remains of it, shape (n - 1, 3).
         odometry_information: shape (n - 1, 3, 3).
+        by_calibration: of the odometry's motion, shape (n - 1, 3, 5).
         readings: predicted less read, shape (m, 3).
         information: of each, zero where there is no reading, shape (m, 3).
+        by_pose: shape (m, 3, 3).
+        by_rest: by ``OF_READINGS`` and the beacon, shape (m, 3, 5 + 4).
     """
 
+    local: FloatArray
     odometry: FloatArray
     odometry_information: FloatArray
+    by_calibration: FloatArray
     readings: FloatArray
     information: FloatArray
+    by_pose: FloatArray
+    by_rest: FloatArray
 
     @property
     def chi2(self) -> FloatArray:
         """Of each reading, shape (m,)."""
         total: FloatArray = (self.readings**2 * self.information).sum(axis=1)
         return total
+
+    @property
+    def odometry_chi2(self) -> FloatArray:
+        """Of each step, shape (n - 1,)."""
+        chi2: FloatArray = np.einsum("ki,kij,kj->k", self.odometry, self.odometry_information, self.odometry)
+        return chi2
 
 
 class BatchProblem:
@@ -182,16 +115,14 @@ class BatchProblem:
         readings: Readings,
         times_s: FloatArray,
         first_pose: tuple[float, float, float],
-        settings: BatchSettings,
+        settings: RecordingConfig,
         used: npt.NDArray[np.bool_],
     ) -> None:
         self.reckoning = Reckoning(steps, times_s, delayed=settings.priors.delay_s > 0.0)
         self.readings = readings
         self.at: IntArray = np.searchsorted(times_s, readings.times_s)
         self.first_pose = np.array(first_pose)
-        self.settings = settings
-        self.radio: RadioNoise = settings.radio
-        self.odometry = settings.odometry
+        self.radio, self.odometry, self.priors = settings.radio, settings.odometry, settings.priors
         self.used = used
         read = np.column_stack([readings.range_m, readings.bearing_rad, readings.rssi_dbm])
         self.there = np.isfinite(read) & used[readings.beacon][:, None]
@@ -202,13 +133,14 @@ class BatchProblem:
         self.free = sigmas > 0.0
         self.prior_information = np.where(self.free, 1.0 / np.where(self.free, sigmas, 1.0) ** 2, 0.0)
         self.prior_information[np.isinf(sigmas)] = 0.0
-        p = settings.priors
-        self._last: tuple[BatchState, tuple[Any, ...]] | None = None
-        self.first_information = np.array((p.pose_m**-2, p.pose_m**-2, p.heading_rad**-2))
+        self._last: tuple[BatchState, Residuals] | None = None
+        self.first_information = np.array((self.priors.pose_m**-2, self.priors.pose_m**-2, self.priors.heading_rad**-2))
 
     def residuals(self, state: BatchState) -> Residuals:
-        """At a state."""
-        return self._evaluated(state)[0]
+        """At a state; kept until another state is asked for."""
+        if self._last is None or self._last[0] is not state:
+            self._last = (state, self._linearised(state))
+        return self._last[1]
 
     def range_variance(self, range_m: FloatArray) -> FloatArray:
         """Of ranges, m^2."""
@@ -238,21 +170,16 @@ class BatchProblem:
         first = state.poses[0] - self.first_pose
         return float(0.5 * (shared**2 @ self.prior_information + first**2 @ self.first_information))
 
-    def normal_equations(self, state: BatchState, weights: FloatArray, odometry_weights: FloatArray) -> ArrowSystem:
-        """Gauss-Newton at a state, readings and steps weighted, for the free unknowns.
-
-        Args:
-            weights: of each reading, shape (m,).
-            odometry_weights: of each step, shape (n - 1,).
-        """
-        residuals, by_pose, by_shared, by_beacon, increments = self._evaluated(state)
+    def normal_equations(self, state: BatchState, weights: FloatArray) -> ArrowSystem:
+        """Gauss-Newton at a state with weights of the readings, shape (m,), for the free unknowns."""
+        residuals = self.residuals(state)
         n, size = len(state.poses), self.free.size
         system = ArrowSystem(
             np.zeros((n, 3, 3)), np.zeros((n - 1, 3, 3)), np.zeros((n, 3, size)), np.zeros((size, size)),
             np.zeros((n, 3)), np.zeros(size),
         )  # fmt: skip
-        self._add_odometry(system, state, residuals, increments, odometry_weights)
-        self._add_readings(system, residuals, (by_pose, by_shared, by_beacon), weights)
+        _add_odometry(system, state, residuals)
+        self._add_readings(system, residuals, weights)
         shared = np.concatenate([state.shared, state.beacons.ravel()])
         system.corner[range(size), range(size)] += self.prior_information
         system.shared_side -= self.prior_information * shared
@@ -270,18 +197,7 @@ class BatchProblem:
         whole[self.free] = shared
         return whole
 
-    def _evaluated(
-        self, state: BatchState
-    ) -> tuple[Residuals, FloatArray, FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
-        if self._last is not None and self._last[0] is state:
-            return self._last[1]
-        found = self._linearised(state)
-        self._last = (state, found)
-        return found
-
-    def _linearised(
-        self, state: BatchState
-    ) -> tuple[Residuals, FloatArray, FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
+    def _linearised(self, state: BatchState) -> Residuals:
         increments = self.reckoning.increments(state.shared[: len(CALIBRATION)], self.odometry)
         a, b = state.poses[:-1], state.poses[1:]
         c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
@@ -321,49 +237,14 @@ class BatchProblem:
         variances[:, 0] = self.range_variance(self._read[:, 0])
         variances[:, 1:] = self.radio.bearing_sigma_rad**2, self.radio.rssi_sigma_db**2
         information: FloatArray = self.there / (variances * self.repeats[:, None])
-        found = Residuals(odometry, np.asarray(odometry_information), errors, information)
-        return found, by_pose, by_shared, by_beacon, (local, increments.by_calibration)
+        by_rest = np.concatenate([by_shared, by_beacon], axis=2)
+        return Residuals(
+            local, odometry, np.asarray(odometry_information), increments.by_calibration, errors, information, by_pose,
+            by_rest,
+        )  # fmt: skip
 
-    def _add_odometry(
-        self,
-        system: ArrowSystem,
-        state: BatchState,
-        residuals: Residuals,
-        increments: tuple[FloatArray, FloatArray],
-        weights: FloatArray,
-    ) -> None:
-        local, by_calibration = increments
-        n = len(local)
-        c, s = np.cos(state.poses[:-1, 2]), np.sin(state.poses[:-1, 2])
-        Ja, Jb = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
-        Jb[:, 0, 0] = Jb[:, 1, 1] = c
-        Jb[:, 0, 1], Jb[:, 1, 0], Jb[:, 2, 2] = s, -s, 1.0
-        Ja[:] = -Jb
-        Ja[:, 0, 2], Ja[:, 1, 2] = local[:, 1], -local[:, 0]
-        W = residuals.odometry_information * weights[:, None, None]
-        WJa, WJb, WJc = W @ Ja, W @ Jb, W @ -by_calibration
-        We = np.einsum("kij,kj->ki", W, residuals.odometry)
-        JaT, JbT, JcT = Ja.transpose(0, 2, 1), Jb.transpose(0, 2, 1), -by_calibration.transpose(0, 2, 1)
-        k = len(CALIBRATION)
-        system.diagonal[:-1] += JaT @ WJa
-        system.diagonal[1:] += JbT @ WJb
-        system.below += JbT @ WJa
-        system.border[:-1, :, :k] += JaT @ WJc
-        system.border[1:, :, :k] += JbT @ WJc
-        system.corner[:k, :k] += (JcT @ WJc).sum(axis=0)
-        system.pose_side[:-1] -= np.einsum("kij,kj->ki", JaT, We)
-        system.pose_side[1:] -= np.einsum("kij,kj->ki", JbT, We)
-        system.shared_side[:k] -= np.einsum("kij,kj->i", JcT, We)
-
-    def _add_readings(
-        self,
-        system: ArrowSystem,
-        residuals: Residuals,
-        jacobians: tuple[FloatArray, FloatArray, FloatArray],
-        weights: FloatArray,
-    ) -> None:
-        by_pose, by_shared, by_beacon = jacobians
-        by_rest = np.concatenate([by_shared, by_beacon], axis=2)  # (m, 3, 5 + 4)
+    def _add_readings(self, system: ArrowSystem, residuals: Residuals, weights: FloatArray) -> None:
+        by_pose, by_rest = residuals.by_pose, residuals.by_rest
         W = residuals.information * weights[:, None]
         WJp, WJr, We = by_pose * W[:, :, None], by_rest * W[:, :, None], residuals.readings * W
         own = np.arange(len(CALIBRATION), len(SHARED))
@@ -376,6 +257,31 @@ class BatchProblem:
         np.add.at(system.corner, (columns[:, :, None], columns[:, None, :]), JrT @ WJr)
         np.add.at(system.pose_side, self.at, -np.einsum("kij,kj->ki", JpT, We))
         np.add.at(system.shared_side, columns, -np.einsum("kij,kj->ki", JrT, We))
+
+
+def _add_odometry(system: ArrowSystem, state: BatchState, residuals: Residuals) -> None:
+    local, n = residuals.local, len(residuals.local)
+    c, s = np.cos(state.poses[:-1, 2]), np.sin(state.poses[:-1, 2])
+    Ja, Jb = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
+    Jb[:, 0, 0] = Jb[:, 1, 1] = c
+    Jb[:, 0, 1], Jb[:, 1, 0], Jb[:, 2, 2] = s, -s, 1.0
+    Ja[:] = -Jb
+    Ja[:, 0, 2], Ja[:, 1, 2] = local[:, 1], -local[:, 0]
+    Jc = -residuals.by_calibration
+    W = residuals.odometry_information
+    WJa, WJb, WJc = W @ Ja, W @ Jb, W @ Jc
+    We = np.einsum("kij,kj->ki", W, residuals.odometry)
+    JaT, JbT, JcT = Ja.transpose(0, 2, 1), Jb.transpose(0, 2, 1), Jc.transpose(0, 2, 1)
+    k = len(CALIBRATION)
+    system.diagonal[:-1] += JaT @ WJa
+    system.diagonal[1:] += JbT @ WJb
+    system.below += JbT @ WJa
+    system.border[:-1, :, :k] += JaT @ WJc
+    system.border[1:, :, :k] += JbT @ WJc
+    system.corner[:k, :k] += (JcT @ WJc).sum(axis=0)
+    system.pose_side[:-1] -= np.einsum("kij,kj->ki", JaT, We)
+    system.pose_side[1:] -= np.einsum("kij,kj->ki", JbT, We)
+    system.shared_side[:k] -= np.einsum("kij,kj->i", JcT, We)
 
 
 def repeats(readings: Readings, correlation_s: float) -> FloatArray:
@@ -393,13 +299,9 @@ def repeats(readings: Readings, correlation_s: float) -> FloatArray:
     return counts
 
 
-def _prior_sigmas(priors: BatchPriors, used: npt.NDArray[np.bool_]) -> FloatArray:
+def _prior_sigmas(priors: PriorsConfig, used: npt.NDArray[np.bool_]) -> FloatArray:
     """Of the shared unknowns and the beacons, shape (10 + 4 b,): 0 fixes one, infinity tells nothing of it."""
-    p = priors
-    shared = (
-        p.distance_scale, p.turn_scale, p.turn_per_m, p.turn_bias_rad_s, p.delay_s, p.range_scale, p.range_offset_m,
-        p.bearing_offset_rad, p.rssi_reference_db, p.rssi_exponent,
-    )  # fmt: skip
+    shared = [getattr(priors, name) for name in SHARED]
     beacons = np.zeros((len(used), BEACON))
-    beacons[used] = (np.inf, np.inf, p.beacon_offset_m, p.beacon_reference_db)
+    beacons[used] = (np.inf, np.inf, priors.beacon_offset_m, priors.beacon_reference_db)
     return np.concatenate([shared, beacons.ravel()])

@@ -1,22 +1,27 @@
 """The smoother of recorded runs: path, beacons and calibration that fit all odometry and all readings best.
 
-A start for the smoother: ever longer beginnings of the run, which beacons join as they can be placed.
+It starts from ever longer beginnings of the run, which beacons join as they can be placed.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from ccatp.beacons.slam.batch_odometry import CALIBRATION, BatchSettings, RadioNoise, Reckoning, carried_on, chained
-from ccatp.beacons.slam.batch_problem import BEACON, SHARED, BatchProblem, BatchState, Factored
-from ccatp.beacons.slam.batch_solver import APART, Descent, descend, place_by_bearings, place_by_distances, t_weights
+from ccatp.beacons.slam.batch_odometry import CALIBRATION, Reckoning, carried_on, chained
+from ccatp.beacons.slam.batch_problem import BEACON, BEARING_OFFSET, SHARED, BatchProblem, BatchState
+from ccatp.beacons.slam.batch_solver import Descent, Factored, descend, t_weights
 from ccatp.beacons.slam.causal import beyond_priors
-from ccatp.beacons.slam.recording import BeaconFix, Calibrated, EstimatedPath, Readings, RecordedRun, Steps
+from ccatp.beacons.slam.recording import BeaconFix, Calibrated, EstimatedPath, RecordedRun
+from ccatp.config.recording_models import RadioNoiseConfig, RecordingConfig
 from ccatp.core import FloatArray
 
+STARTS = 48  # directions, around the place of a range's reading, from which a beacon is sought
+PLACING_ITERATIONS = 20
+FREEDOM = 4.0  # of Student's t by which outliers are bounded
+MOST_READINGS = 200  # of one beacon; more are thinned, since first places need no more
+APART = 0.1  # two minima are different places if they lie further apart than that part of the beacon's distance
 FIRST = 40  # instants solved at first
 GROWTH = 1.2  # ratio of the instants solved from one time to the next
 GROWING_ITERATIONS = 6
@@ -26,6 +31,88 @@ LEAST_READINGS = 4  # of a beacon that joins without bearings
 # Between the places of a beacon's readings without bearings: from a single place it may lie anywhere on a circle.
 LEAST_WAY_M = 0.01
 SURE_SPREAD = 0.15  # largest standard deviation of a beacon that joins, over its distance
+SPACING_S = 0.5  # there is a pose at least that often, whether something was heard or not
+ITERATIONS = 40
+WIDENINGS = 8
+WIDER = 1.05  # noise is widened where the residuals are larger than it by that factor
+NOISY = 4.0  # how many times the noise may have been widened without a warning
+LITTLE = 0.1  # a reading that weighs less counts as refused
+# Unknowns s that multiply the odometry, d = (1 + s) d_o; shown is what it reads too much, e with d = d_o / (1 + e).
+CORRECTING = ("distance_scale", "turn_scale")
+SHOWN_AS = {"delay_s": "odometry_delay_s"}
+
+
+class Placement(NamedTuple):
+    """A beacon's first place.
+
+    Attributes:
+        margin: by how much the next best place costs more (half a chi-squared); infinite if there is none.
+        spread: largest standard deviation over the distance of the nearest reading.
+    """
+
+    x_m: float
+    y_m: float
+    margin: float
+    spread: float
+
+
+def place_by_bearings(
+    poses: FloatArray, distance_m: FloatArray, bearing_rad: FloatArray, shared: FloatArray
+) -> tuple[float, float]:
+    """Median of the places that distances with bearings point at.
+
+    Args:
+        poses: of the readings, shape (m, 3).
+        distance_m: to one beacon, shape (m,).
+        bearing_rad: of the same readings, shape (m,).
+        shared: calibration by ``problem.SHARED``.
+    """
+    way = poses[:, 2] + bearing_rad - shared[BEARING_OFFSET]
+    x, y = poses[:, 0] + distance_m * np.cos(way), poses[:, 1] + distance_m * np.sin(way)
+    return float(np.median(x)), float(np.median(y))
+
+
+def place_by_distances(poses: FloatArray, distance_m: FloatArray, variance: FloatArray) -> Placement:
+    """Best of the minima of the robust cost of distances, sought from all around the nearest reading.
+
+    A straight path leaves two mirror images that cost the same; ``margin`` tells.
+
+    Args:
+        poses: of the readings, shape (m, 3).
+        distance_m: to one beacon, shape (m,).
+        variance: of the distances, m^2, shape (m,).
+    """
+    thin = max(1, -(-len(distance_m) // MOST_READINGS))
+    x, y, distance, information = poses[::thin, 0], poses[::thin, 1], distance_m[::thin], 1.0 / variance[::thin]
+    nearest = int(np.argmin(distance))
+    angle = 2.0 * np.pi * np.arange(STARTS) / STARTS
+    bx = x[nearest] + distance[nearest] * np.cos(angle)
+    by = y[nearest] + distance[nearest] * np.sin(angle)
+    reach = float(distance.max())
+    xx = yy = xy = np.ones(STARTS)
+    for _ in range(PLACING_ITERATIONS):
+        dx, dy = bx[:, None] - x, by[:, None] - y
+        r = np.maximum(np.hypot(dx, dy), 1e-3)
+        e, ux, uy = r - distance, dx / r, dy / r
+        w = information * (FREEDOM + 1.0) / (FREEDOM + e * e * information)
+        xx, yy, xy = (w * ux * ux).sum(1), (w * uy * uy).sum(1), (w * ux * uy).sum(1)
+        little = 1e-3 * (xx + yy)  # a straight path that points at the beacon says nothing across
+        xx, yy = xx + little, yy + little
+        gx, gy = (w * ux * e).sum(1), (w * uy * e).sum(1)
+        determinant = xx * yy - xy * xy
+        sx, sy = (yy * gx - xy * gy) / determinant, (xx * gy - xy * gx) / determinant
+        size = np.hypot(sx, sy)
+        short = np.minimum(1.0, 0.3 * reach / np.maximum(size, 1e-12))
+        bx, by = bx - short * sx, by - short * sy
+    e = np.hypot(bx[:, None] - x, by[:, None] - y) - distance
+    cost = (0.5 * (FREEDOM + 1.0) * np.log1p(e * e * information / FREEDOM)).sum(1)
+    best = int(np.argmin(cost))
+    others = np.hypot(bx - bx[best], by - by[best]) > APART * reach
+    margin = float(cost[others].min() - cost[best]) if others.any() else np.inf
+    half_trace, d = 0.5 * (xx[best] + yy[best]), xx[best] * yy[best] - xy[best] ** 2
+    least = half_trace - np.sqrt(max(half_trace**2 - d, 0.0))
+    spread = float(1.0 / np.sqrt(max(least, 1e-12)) / distance[nearest])
+    return Placement(float(bx[best]), float(by[best]), margin, spread)
 
 
 class Start(NamedTuple):
@@ -41,21 +128,15 @@ class Start(NamedTuple):
     doubtful: npt.NDArray[np.bool_]
 
 
-def grown(
-    steps: Steps,
-    readings: Readings,
-    times_s: FloatArray,
-    first_pose: tuple[float, float, float],
-    settings: BatchSettings,
-    beacons: int,
-) -> Start:
+def grown(run: RecordedRun, times_s: FloatArray, settings: RecordingConfig) -> Start:
     """Solve ever longer beginnings of the run.
 
     Args:
         times_s: instants of the poses, shape (n,): the readings' and the first of all.
     """
+    steps, readings, beacons = run.steps, run.readings, len(run.beacon_ids)
     used, doubtful = np.zeros(beacons, dtype=bool), np.zeros(beacons, dtype=bool)
-    state = BatchState(np.array([first_pose]), np.zeros(len(SHARED)), np.zeros((beacons, BEACON)))
+    state = BatchState(np.array([run.first_pose]), np.zeros(len(SHARED)), np.zeros((beacons, BEACON)))
     at = np.searchsorted(times_s, readings.times_s)
     whole = Reckoning(steps, times_s, delayed=False)
     n, known = len(times_s), 1
@@ -67,7 +148,7 @@ def grown(
             np.concatenate([state.poses[:-1], chained(state.poses[-1], motion)]), state.shared, state.beacons
         )
         for _ in range(2):  # what is on the map draws the new poses right, then new beacons are placed by them
-            problem = BatchProblem(steps, now, times_s[:n_now], first_pose, settings, used)
+            problem = BatchProblem(steps, now, times_s[:n_now], run.first_pose, settings, used)
             state = _settled(problem, state, known)
             joined = _join(problem, state, used, doubtful, last=n_now == n)
             if not joined:
@@ -132,18 +213,7 @@ def _join(
     return changed
 
 
-SPACING_S = 0.5  # there is a pose at least that often, whether something was heard or not
-ITERATIONS = 40
-WIDENINGS = 8
-WIDER = 1.05  # noise is widened where the residuals are larger than it by that factor
-NOISY = 4.0  # how many times the noise may have been widened without being told
-LITTLE = 0.1  # a reading that weighs less counts as refused
-# Unknowns that multiply the odometry; what is told is what it reads too much, as the filter does.
-CORRECTING = ("distance_scale", "turn_scale")
-TOLD_AS = {"delay_s": "odometry_delay_s"}
-
-
-def smooth(run: RecordedRun, settings: BatchSettings, clock_s: Callable[[], float]) -> EstimatedPath:
+def smooth(run: RecordedRun, settings: RecordingConfig, clock_s: Callable[[], float]) -> EstimatedPath:
     """Estimate a whole run at once.
 
     Minimises the negative log posterior of poses at the instants of the readings, beacons and calibration by
@@ -152,7 +222,7 @@ def smooth(run: RecordedRun, settings: BatchSettings, clock_s: Callable[[], floa
     """
     begin_s, first_radio = clock_s(), settings.radio
     heard_s = np.union1d(run.readings.times_s, run.steps.times_s[:1])
-    start = grown(run.steps, run.readings, heard_s, run.first_pose, settings, len(run.beacon_ids))
+    start = grown(run, heard_s, settings)
     times_s = instants(run)
     problem = BatchProblem(run.steps, run.readings, times_s, run.first_pose, settings, start.used)
     filled = _filled(problem, _anchored(start.state, run.first_pose), np.searchsorted(times_s, heard_s))
@@ -161,7 +231,7 @@ def smooth(run: RecordedRun, settings: BatchSettings, clock_s: Callable[[], floa
         radio = _widened(problem, found.state)
         if radio == problem.radio:
             break
-        settings = replace(settings, radio=radio)
+        settings = settings.model_copy(update={"radio": radio})
         problem = BatchProblem(run.steps, run.readings, times_s, run.first_pose, settings, start.used)
         found = descend(problem, found.state, ITERATIONS)
     return _track(run, problem, times_s, found, start, first_radio, clock_s() - begin_s)
@@ -199,54 +269,53 @@ def _filled(problem: BatchProblem, state: BatchState, known: npt.NDArray[np.int6
     return BatchState(poses, state.shared, state.beacons)
 
 
-def _widened(problem: BatchProblem, state: BatchState) -> RadioNoise:
+def _widened(problem: BatchProblem, state: BatchState) -> RadioNoiseConfig:
+    """Noise of the readings, wider where the weighted residuals ask for it.
+
+    The maximum-likelihood scale of Student's t is that of sum w e^2 / sigma^2 = number of readings.
+    """
     residuals, radio = problem.residuals(state), problem.radio
     weights = t_weights(residuals.chi2, problem.sizes, radio.freedom)
     squares = weights[:, None] * residuals.readings**2 * residuals.information
     counts = problem.there.sum(axis=0)
     factors = np.sqrt(squares.sum(axis=0) / np.maximum(counts, 1))
     by_range, by_bearing, by_rssi = np.where((factors > WIDER) & (counts > 0), factors, 1.0).tolist()
-    return replace(
-        radio,
-        range_sigma_m=radio.range_sigma_m * by_range,
-        range_sigma_per_m=radio.range_sigma_per_m * by_range,
-        bearing_sigma_rad=radio.bearing_sigma_rad * by_bearing,
-        rssi_sigma_db=radio.rssi_sigma_db * by_rssi,
-    )
+    wider = {
+        "range_sigma_m": radio.range_sigma_m * by_range,
+        "range_sigma_per_m": radio.range_sigma_per_m * by_range,
+        "bearing_sigma_rad": radio.bearing_sigma_rad * by_bearing,
+        "rssi_sigma_db": radio.rssi_sigma_db * by_rssi,
+    }
+    return radio.model_copy(update=wider)
 
 
 def _track(
-    run: RecordedRun,
-    problem: BatchProblem,
-    times_s: FloatArray,
-    found: Descent,
-    start: Start,
-    first_radio: RadioNoise,
-    took_s: float,
-) -> EstimatedPath:
+    run: RecordedRun, problem: BatchProblem, times_s: FloatArray, found: Descent, start: Start,
+    first_radio: RadioNoiseConfig, took_s: float,
+) -> EstimatedPath:  # fmt: skip
     state = found.state
-    residuals = problem.residuals(state)
-    weights = t_weights(residuals.chi2, problem.sizes, problem.radio.freedom)
-    factored = Factored(problem.normal_equations(state, weights, np.ones(len(state.poses) - 1)))
+    weights = t_weights(problem.residuals(state).chi2, problem.sizes, problem.radio.freedom)
+    factored = Factored(problem.normal_equations(state, weights))
     size = problem.free.size
     covariance = np.zeros((size, size))
     covariance[np.ix_(problem.free, problem.free)] = factored.shared_covariance()
     counted = problem.sizes > 0
     updates = int(counted.sum())
-    calibration = _calibration(problem, state, covariance)
-    priors = {TOLD_AS.get(name, name): getattr(problem.settings.priors, name) for name in SHARED}
+    beacons = {}
+    for k in np.flatnonzero(start.used).tolist():
+        place = slice(len(SHARED) + BEACON * k, len(SHARED) + BEACON * k + 2)
+        x_m, y_m = state.beacons[k, :2].tolist()
+        beacons[run.beacon_ids[k]] = BeaconFix(x_m, y_m, covariance[place, place])
+    calibration = _calibration(problem, state, np.sqrt(np.diag(covariance)))
+    priors = {SHOWN_AS.get(name, name): getattr(problem.priors, name) for name in SHARED}
     return EstimatedPath(
         times_s=times_s,
         poses=state.poses,
         covariances=factored.pose_covariances(),
-        beacons=_beacons(run, state, start, covariance),
+        beacons=beacons,
         calibration=calibration,
-        nis=np.empty(0),
-        nis_sizes=np.empty(0),
         refused=int((weights[counted] < LITTLE).sum()),
         update_s=np.array([took_s / max(updates, 1)]),
-        predict_s=np.empty(0),
-        scalar_s=np.empty(0),
         updates=updates,
         warnings=(
             *_warnings(run, start, found.converged),
@@ -256,49 +325,33 @@ def _track(
     )
 
 
-def _beacons(run: RecordedRun, state: BatchState, start: Start, covariance: FloatArray) -> dict[str, BeaconFix]:
+def _calibration(problem: BatchProblem, state: BatchState, sigmas: FloatArray) -> dict[str, Calibrated]:
+    ranged, pointed, heard = (bool(problem.there[:, k].any()) for k in range(3))
+    shown = {"range_scale": ranged, "range_offset_m": ranged, "bearing_offset_rad": pointed}
+    shown |= {"rssi_reference_db": heard, "rssi_exponent": heard}
     found = {}
-    for k, name in enumerate(run.beacon_ids):
-        if start.used[k]:
-            place = slice(len(SHARED) + BEACON * k, len(SHARED) + BEACON * k + 2)
-            x_m, y_m = state.beacons[k, :2].tolist()
-            found[name] = BeaconFix(x_m, y_m, covariance[place, place])
+    for k, name in enumerate(SHARED):
+        if problem.free[k] and shown.get(name, True):
+            value, sigma = float(state.shared[k]), float(sigmas[k])
+            if name in CORRECTING:
+                scale = 1.0 + value
+                value, sigma = 1.0 / scale - 1.0, sigma / scale**2
+            found[SHOWN_AS.get(name, name)] = Calibrated(value, sigma)
     return found
 
 
-def _calibration(problem: BatchProblem, state: BatchState, covariance: FloatArray) -> dict[str, Calibrated]:
-    sigmas = np.sqrt(np.diag(covariance))
-    ranged, pointed, heard = (bool(problem.there[:, k].any()) for k in range(3))
-    told = {"range_scale": ranged, "range_offset_m": ranged, "bearing_offset_rad": pointed}
-    told |= {"rssi_reference_db": heard, "rssi_exponent": heard}
-    found = {
-        name: Calibrated(float(state.shared[k]), float(sigmas[k]))
-        for k, name in enumerate(SHARED)
-        if problem.free[k] and told.get(name, True)
-    }
-    return {TOLD_AS.get(name, name): _read(one) if name in CORRECTING else one for name, one in found.items()}
-
-
-def _read(correction: Calibrated) -> Calibrated:
-    scale = 1.0 + correction.value
-    return Calibrated(1.0 / scale - 1.0, correction.sigma / scale**2)
-
-
-def _noisy(radio: RadioNoise, first: RadioNoise) -> Iterator[str]:
-    for what in ("range", "bearing", "rssi"):
-        name = {"range": "range_sigma_m", "bearing": "bearing_sigma_rad", "rssi": "rssi_sigma_db"}[what]
+def _noisy(radio: RadioNoiseConfig, first: RadioNoiseConfig) -> Iterator[str]:
+    for what, name in (("range", "range_sigma_m"), ("bearing", "bearing_sigma_rad"), ("rssi", "rssi_sigma_db")):
         ratio = getattr(radio, name) / getattr(first, name)
         if ratio > NOISY:
             yield f"{what} readings are {ratio:.1f} times as noisy as assumed: beacons exchanged or moved on the way?"
 
 
-def _warnings(run: RecordedRun, start: Start, converged: bool) -> tuple[str, ...]:
-    lines = []
+def _warnings(run: RecordedRun, start: Start, converged: bool) -> Iterator[str]:
     for k, name in enumerate(run.beacon_ids):
         if not start.used[k]:
-            lines.append(f"beacon {name} could not be placed: too few readings of it, or all from one place")
+            yield f"beacon {name} could not be placed: too few readings of it, or all from one place"
         elif start.doubtful[k]:
-            lines.append(f"beacon {name} may lie at its mirror image: the path tells too little of its side")
+            yield f"beacon {name} may lie at its mirror image: the path tells too little of its side"
     if not converged:
-        lines.append(f"the smoother stopped after {ITERATIONS} iterations before it had converged")
-    return tuple(lines)
+        yield f"the smoother stopped after {ITERATIONS} iterations before it had converged"

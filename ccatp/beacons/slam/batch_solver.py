@@ -1,19 +1,83 @@
-"""Levenberg-Marquardt over a batch problem whose noise follows Student's t: reweighted least squares.
-
-First places of beacons from readings taken along a known path: the best one, and how sure it is.
-"""
+"""Levenberg-Marquardt over a batch problem whose noise follows Student's t; Cholesky of its arrow-shaped system."""
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import LinAlgError
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solve_triangular
 
-from ccatp.beacons.slam.batch_problem import BEARING_OFFSET, ArrowSystem, BatchProblem, BatchState, Factored, Residuals
+from ccatp.beacons.slam.batch_problem import ArrowSystem, BatchProblem, BatchState
 from ccatp.core import FloatArray
 
+BLOCK = 3  # x_m, y_m, heading_rad
+BAND = 2 * BLOCK - 1
 LEAST_DAMPING = 1e-9
 MOST_DAMPING = 1e9
 CONVERGED = 1e-5  # relative gain below which a cost has converged
+
+
+class Factored:
+    """Cholesky factors of an arrow system: A by bands, then the Schur complement S = C - B^T A^-1 B.
+
+    Args:
+        damping: the diagonal is multiplied by 1 + damping (Levenberg and Marquardt).
+
+    Raises:
+        LinAlgError: not positive definite.
+    """
+
+    def __init__(self, system: ArrowSystem, damping: float = 0.0) -> None:
+        self.system = system
+        n, m = len(system.diagonal), len(system.corner)
+        band = _banded(system, damping)
+        self._factor = cholesky_banded(band, lower=True, check_finite=False)
+        right = np.concatenate([system.border.reshape(n * BLOCK, m), system.pose_side.reshape(-1, 1)], axis=1)
+        solved = np.asarray(cho_solve_banded((self._factor, True), right, check_finite=False))
+        self._border_solved, self._pose_solved = solved[:, :m], solved[:, m]
+        corner = system.corner + damping * np.diag(np.diag(system.corner))
+        S = corner - system.border.reshape(n * BLOCK, m).T @ self._border_solved
+        self._schur = cho_factor(0.5 * (S + S.T), lower=True, check_finite=False)
+
+    def solution(self) -> tuple[FloatArray, FloatArray]:
+        """Unknowns of the poses (n, 3) and the shared ones (m,)."""
+        system = self.system
+        n, m = len(system.diagonal), len(system.corner)
+        side = system.shared_side - system.border.reshape(n * BLOCK, m).T @ self._pose_solved
+        shared = cho_solve(self._schur, side, check_finite=False)
+        return (self._pose_solved - self._border_solved @ shared).reshape(n, BLOCK), shared
+
+    def shared_covariance(self) -> FloatArray:
+        """Inverse's block of the shared unknowns, shape (m, m)."""
+        return np.asarray(cho_solve(self._schur, np.eye(len(self.system.corner)), check_finite=False))
+
+    def pose_covariances(self) -> FloatArray:
+        """Inverse's diagonal block of each pose, shape (n, 3, 3): (A^-1)_kk + W_k W_k^T, W = A^-1 B chol(S)^-T."""
+        n, m = len(self.system.diagonal), len(self.system.corner)
+        root = np.tril(self._schur[0])
+        W = solve_triangular(root, self._border_solved.T, lower=True, check_finite=False).T.reshape(n, BLOCK, m)
+        return _diagonal_of_inverse(self.system) + W @ W.transpose(0, 2, 1)
+
+
+def _banded(system: ArrowSystem, damping: float) -> FloatArray:
+    n = len(system.diagonal)
+    band = np.zeros((BAND + 1, n, BLOCK))
+    for column in range(BLOCK):
+        for row in range(column, BLOCK):
+            band[row - column, :, column] = system.diagonal[:, row, column]
+        band[0, :, column] *= 1.0 + damping
+        for row in range(BLOCK):
+            band[BLOCK + row - column, :-1, column] = system.below[:, row, column]
+    return band.reshape(BAND + 1, n * BLOCK)
+
+
+def _diagonal_of_inverse(system: ArrowSystem) -> FloatArray:
+    A, below = system.diagonal, system.below
+    n = len(A)
+    left, right = A.copy(), A.copy()
+    for k in range(1, n):
+        left[k] -= below[k - 1] @ np.linalg.solve(left[k - 1], below[k - 1].T)
+    for k in range(n - 2, -1, -1):
+        right[k] -= below[k].T @ np.linalg.solve(right[k + 1], below[k])
+    return np.asarray(np.linalg.inv(left + right - A))
 
 
 class Descent(NamedTuple):
@@ -48,7 +112,6 @@ def descend(
     state: BatchState,
     most: int,
     softness: FloatArray | float = 1.0,
-    odometry_freedom: float = np.inf,
     enough: float = CONVERGED,
 ) -> Descent:
     """Minimise the negative log posterior.
@@ -59,18 +122,20 @@ def descend(
     """
     damping = 1e-6
 
-    def tried_cost(tried: BatchState) -> float:
-        return _cost(problem, tried, problem.residuals(tried), softness, odometry_freedom)
+    def cost_of(tried: BatchState) -> float:
+        residuals = problem.residuals(tried)
+        readings = t_cost(residuals.chi2, problem.sizes, problem.radio.freedom, softness)
+        return problem.prior_cost(tried) + 0.5 * float(residuals.odometry_chi2.sum()) + readings
 
-    residuals, cost = problem.residuals(state), tried_cost(state)
+    residuals, cost = problem.residuals(state), cost_of(state)
     for iteration in range(1, most + 1):
         weights = t_weights(residuals.chi2, problem.sizes, problem.radio.freedom, softness)
-        system = problem.normal_equations(state, weights, _odometry_weights(residuals, odometry_freedom))
-        while (tried := _step(problem, state, system, damping)) is None or tried_cost(tried) > cost:
+        system = problem.normal_equations(state, weights)
+        while (tried := _step(problem, state, system, damping)) is None or cost_of(tried) > cost:
             damping = max(damping, LEAST_DAMPING) * 10.0
             if damping > MOST_DAMPING:
                 return Descent(state, cost, iteration, True)
-        gain, state = cost - tried_cost(tried), tried
+        gain, state = cost - cost_of(tried), tried
         residuals, cost = problem.residuals(state), cost - gain
         damping = max(damping * 0.1, LEAST_DAMPING)
         if gain <= enough * max(abs(cost), 1.0):
@@ -82,115 +147,5 @@ def _step(problem: BatchProblem, state: BatchState, system: ArrowSystem, damping
     try:
         poses, shared = Factored(system, damping).solution()
     except LinAlgError:
-        return None
+        return None  # not positive definite
     return state.moved(poses, problem.spread(shared))
-
-
-def _odometry_chi2(residuals: Residuals) -> FloatArray:
-    chi2: FloatArray = np.einsum("ki,kij,kj->k", residuals.odometry, residuals.odometry_information, residuals.odometry)
-    return chi2
-
-
-def _odometry_weights(residuals: Residuals, freedom: float) -> FloatArray:
-    chi2 = _odometry_chi2(residuals)
-    if np.isinf(freedom):
-        return np.ones_like(chi2)
-    return t_weights(chi2, np.full(chi2.size, 3.0), freedom)
-
-
-def _cost(
-    problem: BatchProblem,
-    state: BatchState,
-    residuals: Residuals,
-    softness: FloatArray | float,
-    odometry_freedom: float,
-) -> float:
-    chi2 = _odometry_chi2(residuals)
-    odometry = (
-        0.5 * float(chi2.sum())
-        if np.isinf(odometry_freedom)
-        else t_cost(chi2, np.full(chi2.size, 3.0), odometry_freedom)
-    )
-    readings = t_cost(residuals.chi2, problem.sizes, problem.radio.freedom, softness)
-    return problem.prior_cost(state) + odometry + readings
-
-
-STARTS = 48  # directions, around the place of a range's reading, from which a beacon is sought
-PLACING_ITERATIONS = 20
-FREEDOM = 4.0  # of Student's t by which outliers are bounded
-MOST_READINGS = 200  # of one beacon; more are thinned, since first places need no more
-APART = 0.1  # two minima are different places if they lie further apart than that part of the beacon's distance
-
-
-class Placement(NamedTuple):
-    """A beacon's first place.
-
-    Attributes:
-        margin: by how much the next best place costs more (half a chi-squared); infinite if there is none.
-        spread: largest standard deviation over the distance of the nearest reading.
-    """
-
-    x_m: float
-    y_m: float
-    margin: float
-    spread: float
-    cost: float
-
-
-def place_by_bearings(
-    poses: FloatArray, distance_m: FloatArray, bearing_rad: FloatArray, shared: FloatArray
-) -> tuple[float, float]:
-    """Median of the places that distances with bearings point at.
-
-    Args:
-        poses: of the readings, shape (m, 3).
-        distance_m: to one beacon, shape (m,).
-        bearing_rad: of the same readings, shape (m,).
-        shared: calibration by ``problem.SHARED``.
-    """
-    way = poses[:, 2] + bearing_rad - shared[BEARING_OFFSET]
-    x, y = poses[:, 0] + distance_m * np.cos(way), poses[:, 1] + distance_m * np.sin(way)
-    return float(np.median(x)), float(np.median(y))
-
-
-def place_by_distances(poses: FloatArray, distance_m: FloatArray, variance: FloatArray) -> Placement:
-    """Best of the minima of the robust cost of distances, sought from all around the nearest reading.
-
-    A straight path leaves two mirror images that cost the same; ``margin`` tells.
-
-    Args:
-        poses: of the readings, shape (m, 3).
-        distance_m: to one beacon, shape (m,).
-        variance: of the distances, m^2, shape (m,).
-    """
-    thin = max(1, -(-len(distance_m) // MOST_READINGS))
-    x, y, distance, information = poses[::thin, 0], poses[::thin, 1], distance_m[::thin], 1.0 / variance[::thin]
-    nearest = int(np.argmin(distance))
-    angle = 2.0 * np.pi * np.arange(STARTS) / STARTS
-    bx = x[nearest] + distance[nearest] * np.cos(angle)
-    by = y[nearest] + distance[nearest] * np.sin(angle)
-    reach = float(distance.max())
-    xx = yy = xy = np.ones(STARTS)
-    for _ in range(PLACING_ITERATIONS):
-        dx, dy = bx[:, None] - x, by[:, None] - y
-        r = np.maximum(np.hypot(dx, dy), 1e-3)
-        e, ux, uy = r - distance, dx / r, dy / r
-        w = information * (FREEDOM + 1.0) / (FREEDOM + e * e * information)
-        xx, yy, xy = (w * ux * ux).sum(1), (w * uy * uy).sum(1), (w * ux * uy).sum(1)
-        little = 1e-3 * (xx + yy)  # a straight path that points at the beacon says nothing across
-        xx, yy = xx + little, yy + little
-        gx, gy = (w * ux * e).sum(1), (w * uy * e).sum(1)
-        determinant = xx * yy - xy * xy
-        sx, sy = (yy * gx - xy * gy) / determinant, (xx * gy - xy * gx) / determinant
-        size = np.hypot(sx, sy)
-        short = np.minimum(1.0, 0.3 * reach / np.maximum(size, 1e-12))
-        bx, by = bx - short * sx, by - short * sy
-    e = np.hypot(bx[:, None] - x, by[:, None] - y) - distance
-    cost = (0.5 * (FREEDOM + 1.0) * np.log1p(e * e * information / FREEDOM)).sum(1)
-    best = int(np.argmin(cost))
-    others = np.hypot(bx - bx[best], by - by[best]) > APART * reach
-    margin = float(cost[others].min() - cost[best]) if others.any() else np.inf
-    half_trace, d = 0.5 * (xx[best] + yy[best]), xx[best] * yy[best] - xy[best] ** 2
-    least = half_trace - np.sqrt(max(half_trace**2 - d, 0.0))
-    spread = float(1.0 / np.sqrt(max(least, 1e-12)) / distance[nearest])
-    return Placement(float(bx[best]), float(by[best]), margin, spread, float(cost[best] / len(distance)))

@@ -1,11 +1,4 @@
-"""Where beacons stand in the state: their columns, the error of each that wanders, joining and leaving.
-
-The noise of a sensor, learned from what its innovations leave.
-
-What ``BeaconSlam`` is told of its vehicle and of its radios; nothing about a place.
-
-What is not known of a heading stays unknown: the covariance follows the map when the map is corrected.
-"""
+"""Beacons as blocks of the filter's state, the settings of the filter, and how it learns the noise of its sensors."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,7 +7,7 @@ from math import exp
 import numpy as np
 from scipy.linalg.blas import daxpy, dger
 
-from ccatp.beacons.slam.motion import POSE, MotionModel
+from ccatp.beacons.slam.motion import POSE, DifferentialDrive
 from ccatp.beacons.slam.recording import BeaconId
 from ccatp.core import FloatArray
 from ccatp.filters.ekf_slam import BlockId, Columns, EkfSlam, columns_of
@@ -93,17 +86,6 @@ class RangeModel:
 
 
 @dataclass(frozen=True, slots=True)
-class BearingModel:
-    """A direction finder.
-
-    Attributes:
-        sigma_rad: standard deviation of the noise; where it starts if the noise is learned.
-    """
-
-    sigma_rad: float
-
-
-@dataclass(frozen=True, slots=True)
 class RssiModel:
     """Signal strength by the log-distance model z = P_ref - 10 eta log10(r / 1 m) + noise (Hevrdejs and Knoll, eq. 4).
 
@@ -155,16 +137,16 @@ class SlamSettings:
 
     Attributes:
         range: of range and range-bearing readings; None where there are none.
-        bearing: of readings with a bearing; None where there are none.
+        bearing_sigma_rad: of readings with a bearing, at the start if the noise is learned; None where there are none.
         rssi: of RSSI readings; None where there are none.
         delay_sigma_s: prior of the time after which the vehicle has done what its odometry tells, by the stamps of the
             readings: commands that take a while to be followed, stamps that come late; 0: not estimated.
     """
 
-    motion: MotionModel
+    motion: DifferentialDrive
     trust: RobustLoss
     range: RangeModel | None = None
-    bearing: BearingModel | None = None
+    bearing_sigma_rad: float | None = None
     rssi: RssiModel | None = None
     delay_sigma_s: float = 0.0
 

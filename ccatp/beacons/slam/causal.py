@@ -21,7 +21,6 @@ from ccatp.beacons.slam.recording import (
     BeaconId,
     Calibrated,
     EstimatedPath,
-    RangeBearingReading,
     RangeReading,
     Reading,
     RecordedRun,
@@ -105,7 +104,7 @@ class HeadingRelocalizer:
         step_rad = 2.0 * pi / HEADINGS
         slams = [self.best, *(deepcopy(self.best) for _ in range(HEADINGS - 1))]
         self._scores = [
-            slam.told_heading(((k + HEADINGS // 2) % HEADINGS - HEADINGS // 2) * step_rad, step_rad / sqrt(12.0))
+            slam.correct_heading(((k + HEADINGS // 2) % HEADINGS - HEADINGS // 2) * step_rad, step_rad / sqrt(12.0))
             for k, slam in enumerate(slams)
         ]
         self._others, self._taken = slams[1:], 0
@@ -276,11 +275,8 @@ def _readings(run: RecordedRun) -> Iterator[Reading]:
         name = run.beacon_ids[beacon]
         bearing = None if math.isnan(bearing_rad) else bearing_rad
         if not math.isnan(range_m):
-            if bearing is None:
-                yield RangeReading(time_s, name, range_m)
-            else:
-                yield RangeBearingReading(time_s, name, range_m, bearing)
+            yield RangeReading(time_s, name, range_m, bearing)
         elif not math.isnan(rssi_dbm):
             yield RssiReading(time_s, name, rssi_dbm, bearing)
         elif bearing is not None:
-            yield RangeBearingReading(time_s, name, math.nan, bearing)
+            yield RangeReading(time_s, name, math.nan, bearing)

@@ -1,11 +1,6 @@
-"""Beacons that are heard and are not on the map yet: how they get there.
+"""How beacons join the map: at once by range and bearing; without a bearing their readings wait until they suffice."""
 
-Beacons whose direction nobody hears: readings wait, with where they were taken, until they say where.
-
-A beacon that has just joined, conditioned on what was heard of it, at the places where that was heard.
-"""
-
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import cos, hypot, inf, isfinite, log1p, pi, sin, sqrt
 from statistics import median
@@ -14,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ccatp.beacons.slam.beacon_map import BeaconMap, NoiseLevel
-from ccatp.beacons.slam.measurement_models import MeasurementModels, MeasurementRow, bearing_of, kind_of, strength_of
+from ccatp.beacons.slam.measurement_models import MeasurementModels, MeasurementRow, kind_of, strength_of
 from ccatp.beacons.slam.motion import POSE, CarriedOdometry, DeadReckoning
-from ccatp.beacons.slam.recording import BeaconId, Reading
+from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
 from ccatp.core import FloatArray, wrap_pi
-from ccatp.filters.ekf_slam import BlockId, Columns, EkfSlam, Update, columns_of
+from ccatp.filters.ekf_slam import BlockId, Columns, EkfSlam, columns_of
 
 RowOf = Callable[[Reading, list[float], list[float], list[float]], MeasurementRow]
 
@@ -43,6 +38,9 @@ MARGIN = 14.0 + 2.0 * KNEE**2
 # Sigmas by which chi-squared may exceed its expectation; if it stays beyond, the noise is taken for that much larger
 # (Birge's ratio): with less noise in the settings than there is, no beacon would ever join.
 FIT = 6.0
+LINEARISATIONS = 8  # at most; Gauss-Newton on readings that a beacon joined by comes to rest within five
+FLAT = 100.0  # standard deviation of a beacon's place before its readings, relative to its distance
+TRIAL = 2  # readings that must agree with the one that a beacon joined by: a misread name would put it anywhere
 
 
 class ReadingRecord(NamedTuple):
@@ -72,33 +70,7 @@ class Candidate(NamedTuple):
     variances: FloatArray
 
 
-class LandmarkPrior(NamedTuple):
-    """What is known of a beacon before its readings: all but nothing of its place.
-
-    Attributes:
-        mean: x_m, y_m and what else is estimated of it, shape (b,).
-        covariance: shape (b, b).
-    """
-
-    mean: FloatArray
-    covariance: FloatArray
-
-
-class PoseClone(NamedTuple):
-    """The vehicle's place as a function of the state.
-
-    Attributes:
-        mean: x_m, y_m, shape (2,).
-        columns: of the state that it depends on, shape (k,).
-        jacobian: shape (2, k).
-    """
-
-    mean: FloatArray
-    columns: Columns
-    jacobian: FloatArray
-
-
-PriorAt = Callable[[float, float], LandmarkPrior]
+PriorAt = Callable[[float, float], BeaconEstimate]
 
 
 @dataclass(slots=True)
@@ -119,14 +91,16 @@ class PendingLandmark:
     spacing_m: float = 0.0
     count: int = 0
 
-    @property
-    def is_ready(self) -> bool:
-        """Whether there are enough readings to look for it."""
-        return len(self.records) >= LEAST
+    def take(
+        self, engine: EkfSlam, reading: Reading, place: FloatArray, by: tuple[Columns, FloatArray], range_m: float
+    ) -> bool:
+        """Keep a reading, if the vehicle has moved since the last one that was kept.
 
-    def take(self, engine: EkfSlam, reading: Reading, place: PoseClone, range_m: float) -> bool:
-        """Keep a reading, if the vehicle has moved since the last one that was kept."""
-        x, y = place.mean.tolist()
+        Args:
+            place: x_m, y_m of the vehicle then, shape (2,).
+            by: columns (k,) of the state that it depends on, and its derivatives, shape (2, k).
+        """
+        x, y = place.tolist()
         if not self.records:
             self.spacing_m = SPACING * range_m
         else:
@@ -135,7 +109,7 @@ class PendingLandmark:
                 return False
         block = ("place", self.beacon, self.count)
         self.count += 1
-        engine.augment(block, place.mean, place.columns, place.jacobian)
+        engine.augment(block, place, *by)
         self.records.append(ReadingRecord(reading, block, range_m))
         if len(self.records) > MOST:
             self.spacing_m *= 2.0
@@ -158,10 +132,11 @@ class PendingLandmark:
             reach_m: how far it is from the last place, roughly.
         """
         problem = _problem(engine, self.records, row_of, shared, reach_m)
-        starts: list[LandmarkPrior] = []
-        for radius_m in {reach_m, self._usual_m(reach_m)}:
+        starts: list[BeaconEstimate] = []
+        # The last distance may have gone round a corner: the usual one is tried, too.
+        for radius_m in {reach_m, median([record.distance_m for record in self.records])}:
             starts += problem.around(prior_at, radius_m)
-        starts += [LandmarkPrior(c.mean, prior_at(*c.mean[:2].tolist()).covariance) for c in self.candidates]
+        starts += [BeaconEstimate(c.mean, prior_at(*c.mean[:2].tolist()).covariance) for c in self.candidates]
         found = [candidate for candidate in map(problem.refine, starts) if candidate is not None]
         best = min(found, key=lambda c: c.cost, default=None)
         if best is not None:
@@ -173,9 +148,6 @@ class PendingLandmark:
             if all(hypot(*(candidate.mean - c.mean)[:2].tolist()) > APART * reach_m for c in apart):
                 apart.append(candidate)
         self.candidates = apart[:2]
-
-    def _usual_m(self, reach_m: float) -> float:
-        return median([record.distance_m for record in self.records]) if self.records else reach_m
 
     def found(self, engine: EkfSlam) -> Candidate | None:
         """The beacon's place, if there is only one, well enough known to be linearised at, and the readings agree."""
@@ -208,7 +180,7 @@ class _Problem(NamedTuple):
     row_of: RowOf
     reach_m: float
 
-    def around(self, prior_at: PriorAt, radius_m: float) -> list[LandmarkPrior]:
+    def around(self, prior_at: PriorAt, radius_m: float) -> list[BeaconEstimate]:
         """Where to begin: the best directions on a circle about the last place."""
         x, y = self.places[-1]
         angles = [2.0 * pi * k / STARTS for k in range(STARTS)]
@@ -224,7 +196,7 @@ class _Problem(NamedTuple):
         x, y = middle + 2.0 * along * along.dot(point - middle) - (point - middle)
         return float(x), float(y)
 
-    def rough(self, prior: LandmarkPrior) -> float:
+    def rough(self, prior: BeaconEstimate) -> float:
         """How badly a guess fits, places and calibration as they are; a reading that is off counts little (Cauchy)."""
         b = prior.mean.tolist()
         cost = 0.0
@@ -233,7 +205,7 @@ class _Problem(NamedTuple):
             cost += log1p((z - row.expected) ** 2 / row.variance)
         return cost
 
-    def refine(self, prior: LandmarkPrior) -> Candidate | None:
+    def refine(self, prior: BeaconEstimate) -> Candidate | None:
         b, W, stride = prior.mean.copy(), np.linalg.inv(prior.covariance), 0.5 * self.reach_m
         variances, A, cost = self.z, W, inf
         for k in range(ITERATIONS):
@@ -254,15 +226,22 @@ class _Problem(NamedTuple):
         return Candidate(b, np.linalg.inv(A), cost, variances)
 
     def _linear(self, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        m, c = self.z.size, len(self.calibration)
-        H, G, e, R = np.zeros((m, 2 * m + c)), np.zeros((m, b.size)), np.zeros(m), np.zeros(m)
-        values = b.tolist()
-        for i, (reading, place) in enumerate(zip(self.readings, self.places, strict=True)):
-            row = self.row_of(reading, [*place, 0.0], self.calibration, values)
-            H[i, 2 * i : 2 * i + 2] = row.pose[:2]
-            H[i, 2 * m : 2 * m + len(row.calibration)] = row.calibration
-            G[i], R[i], e[i] = row.beacon, row.variance, self.z[i] - row.expected
-        return H, G, e, R
+        return _stacked(self.readings, self.z.tolist(), self.places, self.calibration, b.tolist(), self.row_of)
+
+
+def _stacked(
+    readings: Sequence[Reading], z: Sequence[float], places: Sequence[list[float]], calibration: list[float],
+    beacon: list[float], row_of: RowOf,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Derivatives by places and calibration (m, 2 m + c) and by the beacon (m, b), residuals and variances (m,)."""
+    m, c = len(z), len(calibration)
+    H, G, e, R = np.zeros((m, 2 * m + c)), np.zeros((m, len(beacon))), np.zeros(m), np.zeros(m)
+    for i, (reading, place) in enumerate(zip(readings, places, strict=True)):
+        row = row_of(reading, [*place, 0.0], calibration, beacon)
+        H[i, 2 * i : 2 * i + 2] = row.pose[:2]
+        H[i, 2 * m : 2 * m + len(row.calibration)] = row.calibration
+        G[i], R[i], e[i] = row.beacon, row.variance, z[i] - row.expected
+    return H, G, e, R
 
 
 def _weighed(e: FloatArray, S: FloatArray, R: FloatArray, step: int) -> tuple[FloatArray, float]:
@@ -295,37 +274,6 @@ def _problem(engine: EkfSlam, records: list[ReadingRecord], row_of: RowOf, share
     return _Problem(readings, z, places, engine.mean[shared].tolist(), P, row_of, reach_m)
 
 
-LINEARISATIONS = 8  # at most; Gauss-Newton on readings that a beacon joined by comes to rest within five
-
-
-def settle_by_places(
-    engine: EkfSlam, records: list[ReadingRecord], row_of: RowOf, shared: slice, block: slice, variances: FloatArray
-) -> Update:
-    """Condition a beacon, the places where it was heard, the calibration and all else on the readings, iterated.
-
-    Args:
-        engine: holds the places, and the beacon with an all but flat prior at its candidate.
-        variances: of the readings, shape (m,).
-    """
-    places = [engine.block(record.place) for record in records]
-    columns = columns_of(*places, shared, block)
-    z = [strength_of(record.reading) for record in records]
-    m, c = len(z), shared.stop - shared.start
-
-    def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        residual, H = np.zeros(m), np.zeros((m, columns.size))
-        calibration, beacon = x[shared].tolist(), x[block].tolist()
-        for i, (record, place) in enumerate(zip(records, places, strict=True)):
-            row = row_of(record.reading, [*x[place].tolist(), 0.0], calibration, beacon)
-            residual[i] = z[i] - row.expected
-            H[i, 2 * i : 2 * i + 2] = row.pose[:2]
-            H[i, 2 * m : 2 * m + len(row.calibration)] = row.calibration
-            H[i, 2 * m + c :] = row.beacon
-        return residual, H
-
-    return engine.update_iterated(columns, linearise, variances, LINEARISATIONS)
-
-
 def derivatives(row: MeasurementRow, at: CarriedOdometry, *, delayed: bool) -> list[float]:
     """Dh by the pose and the calibration of the state: a row at the pose that was carried to a reading's time."""
     hx, hy, turned = row.pose
@@ -339,138 +287,122 @@ def derivatives(row: MeasurementRow, at: CarriedOdometry, *, delayed: bool) -> l
     return found
 
 
-def wrapped(z: float, expected: float, *, is_angle: bool) -> float:
-    """Residual z - h(x), the short way round for angles."""
-    return wrap_pi(z - expected) if is_angle else z - expected
-
-
-def pose_columns(shared: slice, block: slice) -> Columns:
-    """Columns of pose, calibration and a beacon."""
-    return columns_of(slice(0, POSE), shared, block)
-
-
-# Standard deviation of a beacon's place before its readings, relative to its distance: they alone place it.
-FLAT = 100.0
-TRIAL = 2  # readings that must agree with the one that a beacon joined by: a misread name would put it anywhere
-
-
+@dataclass(slots=True)
 class LandmarkInitializer:
     """With a bearing a beacon joins at once, where range and bearing say; without one its readings wait.
 
-    One that joined at once is on trial: if one of its next ``TRIAL`` readings is refused, it begins anew with that one.
-
-    Args:
-        delay: column of the odometry's delay; -1: none.
+    One that joined at once is on trial: if one of its next ``TRIAL`` readings is refused, it begins again with that
+    one.
 
     Attributes:
-        waiting: beacons that were heard, with what was, and the candidates for their places.
+        delay: column of the odometry's delay; -1: none.
+        waiting: beacons that are not on the map, with their readings and the candidates for their places.
     """
 
-    def __init__(
-        self,
-        engine: EkfSlam,
-        sensors: MeasurementModels,
-        beacons: BeaconMap,
-        clock: DeadReckoning,
-        levels: dict[str, NoiseLevel],
-        shared: slice,
-        delay: int,
-    ) -> None:
-        self._engine, self._sensors, self._map, self._clock = engine, sensors, beacons, clock
-        self._levels, self._shared, self._delay = levels, shared, delay
-        self._ranges = len(sensors.names)
-        self.waiting: dict[BeaconId, PendingLandmark] = {}
+    engine: EkfSlam
+    sensors: MeasurementModels
+    beacons: BeaconMap
+    clock: DeadReckoning
+    levels: dict[str, NoiseLevel]
+    shared: slice
+    delay: int
+    waiting: dict[BeaconId, PendingLandmark] = field(default_factory=dict)
 
     def forget(self, beacon: BeaconId) -> bool:
         """Forget what waits of a beacon; False if nothing does."""
         waiting = self.waiting.pop(beacon, None)
         if waiting is None:
             return False
-        waiting.drop(self._engine)
-        self._map.renumber()
+        waiting.drop(self.engine)
+        self.beacons.renumber()
         return True
 
     def carried(self, x: FloatArray, reading: Reading) -> CarriedOdometry:
         """The pose of a state x (n,) at a reading's time."""
-        delay_s = float(x[self._delay]) if self._delay >= 0 else 0.0
-        return self._clock.at(x[:POSE].tolist(), reading.time_s, delay_s)
+        delay_s = float(x[self.delay]) if self.delay >= 0 else 0.0
+        return self.clock.at(x[:POSE].tolist(), reading.time_s, delay_s)
 
-    def meet(self, reading: Reading) -> None:
+    def add(self, reading: Reading) -> None:
         """A reading of a beacon that is not on the map."""
-        bearing = bearing_of(reading)
-        reach_m = self._sensors.distance_m(reading)
-        if bearing is not None:
-            pose = self.carried(self._engine.mean, reading).pose
-            way = pose[2] + bearing
-            entry = self._map.join(
-                reading.beacon,
-                *self._prior(reading, reach_m, pose[0] + reach_m * cos(way), pose[1] + reach_m * sin(way)),
-            )
+        reach_m = self.sensors.distance_m(reading)
+        at = self.carried(self.engine.mean, reading)
+        if reading.bearing_rad is not None:
+            way = at.pose[2] + reading.bearing_rad
+            x_m, y_m = at.pose[0] + reach_m * cos(way), at.pose[1] + reach_m * sin(way)
+            entry = self.beacons.join(reading.beacon, *self._prior(reading, reach_m, x_m, y_m))
             entry.on_trial = TRIAL
-            self._settle(reading)
+            self._settle(reading, reading.bearing_rad)
             return
         waiting = self.waiting.setdefault(reading.beacon, PendingLandmark(reading.beacon))
-        is_kept = waiting.take(self._engine, reading, self._clone(reading), reach_m)
-        if is_kept and waiting.is_ready:
-            waiting.look(
-                self._engine, self._row_of, self._shared, lambda x, y: self._prior(reading, reach_m, x, y), reach_m
-            )
+        is_kept = waiting.take(self.engine, reading, np.array(at.pose[:2]), self._by_state(at), reach_m)
+        if is_kept and len(waiting.records) >= LEAST:
+
+            def prior_at(x_m: float, y_m: float) -> BeaconEstimate:
+                return self._prior(reading, reach_m, x_m, y_m)
+
+            waiting.look(self.engine, self._row_of, self.shared, prior_at, reach_m)
             self._join_waiting(reading, waiting, reach_m)
-        self._map.renumber()
+        self.beacons.renumber()
 
     def _join_waiting(self, reading: Reading, waiting: PendingLandmark, reach_m: float) -> None:
-        found = waiting.found(self._engine)
+        """Condition the beacon, the places of its readings, the calibration and all else on them, iterated."""
+        engine, shared, found = self.engine, self.shared, waiting.found(self.engine)
         if found is None:
             return
         prior = self._prior(reading, reach_m, *found.mean[:2].tolist())
         prior.mean[:2] = found.mean[:2]
-        self._map.join(reading.beacon, *prior)
-        block = self._engine.block(reading.beacon)
-        settle_by_places(self._engine, waiting.records, self._row_of, self._shared, block, found.variances)
-        waiting.drop(self._engine)
-        del self.waiting[reading.beacon]
-
-    def _settle(self, reading: Reading) -> None:
-        block = self._engine.block(reading.beacon)
-        columns = pose_columns(self._shared, block)
+        self.beacons.join(reading.beacon, *prior)
+        block = engine.block(reading.beacon)
+        places = [engine.block(record.place) for record in waiting.records]
+        readings = [record.reading for record in waiting.records]
+        z = [strength_of(one) for one in readings]
 
         def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-            at = self.carried(x, reading)
-            beacon = x[block].tolist()
-            rows = (
-                self._row_of(reading, at.pose, x[self._shared].tolist(), beacon),
-                self._sensors.bearing(at.pose, beacon),
-            )
-            z = (strength_of(reading), bearing_of(reading) or 0.0)
-            residual = [wrapped(z[k], rows[k].expected, is_angle=k == 1) for k in range(2)]
-            H = [[*derivatives(row, at, delayed=self._delay >= 0), *row.beacon] for row in rows]
+            at = [x[place].tolist() for place in places]
+            H, G, residual, _ = _stacked(readings, z, at, x[shared].tolist(), x[block].tolist(), self._row_of)
+            return residual, np.hstack([H, G])
+
+        engine.update_iterated(columns_of(*places, shared, block), linearise, found.variances, LINEARISATIONS)
+        waiting.drop(engine)
+        del self.waiting[reading.beacon]
+
+    def _settle(self, reading: Reading, bearing_rad: float) -> None:
+        # Condition a beacon that has just joined at range and bearing on them.
+        engine, shared = self.engine, self.shared
+        block = engine.block(reading.beacon)
+
+        def rows_at(x: FloatArray) -> tuple[CarriedOdometry, MeasurementRow, MeasurementRow]:
+            at, beacon = self.carried(x, reading), x[block].tolist()
+            row = self._row_of(reading, at.pose, x[shared].tolist(), beacon)
+            return at, row, self.sensors.bearing(at.pose, beacon)
+
+        def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+            at, *rows = rows_at(x)
+            residual = strength_of(reading) - rows[0].expected, wrap_pi(bearing_rad - rows[1].expected)
+            H = [[*derivatives(row, at, delayed=self.delay >= 0), *row.beacon] for row in rows]
             return np.array(residual), np.array(H)
 
-        pose = self.carried(self._engine.mean, reading).pose
-        x = self._engine.mean
-        row = self._row_of(reading, pose, x[self._shared].tolist(), x[block].tolist())
-        bearing = self._sensors.bearing(pose, x[block].tolist())
-        R = np.array((row.variance, bearing.variance * self._levels["bearing"].factor))
-        self._engine.update_iterated(columns, linearise, R, LINEARISATIONS)
+        _, row, bearing = rows_at(engine.mean)
+        R = np.array((row.variance, bearing.variance * self.levels["bearing"].factor))
+        engine.update_iterated(columns_of(slice(0, POSE), shared, block), linearise, R, LINEARISATIONS)
 
     def _row_of(
         self, reading: Reading, pose: list[float], calibration: list[float], beacon: list[float]
     ) -> MeasurementRow:
-        row = self._sensors.row(reading, pose, calibration[: self._ranges], beacon)
-        level = self._levels[kind_of(reading)]
-        return row._replace(variance=row.variance * level.factor)
+        row = self.sensors.row(reading, pose, calibration[: len(self.sensors.names)], beacon)
+        return row._replace(variance=row.variance * self.levels[kind_of(reading)].factor)
 
-    def _prior(self, reading: Reading, reach_m: float, x_m: float, y_m: float) -> LandmarkPrior:
-        extra = self._sensors.extra_prior(reading)
+    def _prior(self, reading: Reading, reach_m: float, x_m: float, y_m: float) -> BeaconEstimate:
+        extra = self.sensors.extra_prior(reading)
         sigmas = (FLAT * reach_m, FLAT * reach_m, *(sigma for _, sigma in extra))
-        return LandmarkPrior(np.array((x_m, y_m, *(mean for mean, _ in extra))), np.diag(np.square(sigmas)))
+        return BeaconEstimate(np.array((x_m, y_m, *(mean for mean, _ in extra))), np.diag(np.square(sigmas)))
 
-    def _clone(self, reading: Reading) -> PoseClone:
-        at = self.carried(self._engine.mean, reading)
+    def _by_state(self, at: CarriedOdometry) -> tuple[Columns, FloatArray]:
+        """Columns (k,) of the state that a carried place depends on, and its derivatives, shape (2, k)."""
         (x_heading, y_heading), by = at.by_heading(), at.by_delay()
         columns, J = [0, 1, 2], [[1.0, 0.0, x_heading], [0.0, 1.0, y_heading]]
-        if self._delay >= 0:
-            columns.append(self._delay)
+        if self.delay >= 0:
+            columns.append(self.delay)
             J[0].append(by[0])
             J[1].append(by[1])
-        return PoseClone(np.array(at.pose[:2]), columns_of(columns), np.array(J))
+        return columns_of(columns), np.array(J)

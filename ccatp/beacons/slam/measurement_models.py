@@ -3,8 +3,9 @@
 from math import atan2, isnan, log, log10, sqrt
 from typing import NamedTuple
 
-from ccatp.beacons.slam.beacon_map import BearingModel, GaussMarkovBias, RangeModel, RssiModel, SlamSettings
-from ccatp.beacons.slam.recording import RangeBearingReading, RangeReading, Reading, RssiReading
+from ccatp.beacons.slam.beacon_map import GaussMarkovBias, RangeModel, RssiModel, SlamSettings
+from ccatp.beacons.slam.motion import estimated
+from ccatp.beacons.slam.recording import RangeReading, Reading, RssiReading
 
 LEAST_RANGE_M = 1e-3  # nearer than that a range has no direction: derivatives are taken there
 _DB = 10.0 / log(10.0)
@@ -47,15 +48,6 @@ def range_row(pose: list[float], calibration: list[float], beacon: list[float], 
     return MeasurementRow(scale * r + offset, (-ux, -uy, 0.0), by, (ux, uy), variance)
 
 
-def bearing_row(pose: list[float], shared: int, beacon: list[float], model: BearingModel) -> MeasurementRow:
-    """Beta = atan2(dy, dx) - heading; ``shared``: how many calibration states ranges have."""
-    dx, dy = beacon[0] - pose[0], beacon[1] - pose[1]
-    q = max(dx * dx + dy * dy, LEAST_RANGE_M**2)
-    across, tail = (-dy / q, dx / q), (0.0,) * (len(beacon) - 2)
-    expected = atan2(dy, dx) - pose[2]
-    return MeasurementRow(expected, (dy / q, -dx / q, -1.0), (0.0,) * shared, across + tail, model.sigma_rad**2)
-
-
 def rssi_row(pose: list[float], shared: int, beacon: list[float], model: RssiModel) -> MeasurementRow:
     """Z = P_ref - 10 eta log10 r; P_ref and eta stand behind x and y in the beacon, each where it is estimated."""
     dx, dy = beacon[0] - pose[0], beacon[1] - pose[1]
@@ -77,36 +69,39 @@ class MeasurementModels:
     """The radios of a run, as rows of measurement."""
 
     def __init__(self, settings: SlamSettings) -> None:
-        self._range, self._bearing, self._rssi = settings.range, settings.bearing, settings.rssi
+        self._range, self._bearing_sigma_rad, self._rssi = settings.range, settings.bearing_sigma_rad, settings.rssi
         r = settings.range
-        priors = () if r is None else (("range_scale", r.scale_sigma), ("range_offset_m", r.offset_sigma_m))
-        self.names = tuple(name for name, sigma in priors if sigma > 0.0)
-        self.prior_sigmas = tuple(sigma for _, sigma in priors if sigma > 0.0)
+        priors = {} if r is None else {"range_scale": r.scale_sigma, "range_offset_m": r.offset_sigma_m}
+        self.names, self.prior_sigmas = estimated(priors)
 
     def row(self, reading: Reading, pose: list[float], calibration: list[float], beacon: list[float]) -> MeasurementRow:
         """The range or the signal strength.
 
         Raises:
-            SensorError: the settings have no model of it.
+            MeasurementError: the settings have no model of it.
         """
         if isinstance(reading, RssiReading):
             return rssi_row(pose, len(self.names), beacon, self._rssi_model())
         return range_row(pose, calibration, beacon, self._range_model())
 
     def bearing(self, pose: list[float], beacon: list[float]) -> MeasurementRow:
-        """The bearing.
+        """The bearing, beta = atan2(dy, dx) - heading.
 
         Raises:
-            SensorError: the settings have no model of it.
+            MeasurementError: the settings have no model of it.
         """
-        if self._bearing is None:
+        if self._bearing_sigma_rad is None:
             raise MeasurementError(
-                "a reading has a bearing, the settings have no bearing model: give SlamSettings.bearing"
+                "a reading has a bearing, the settings have no bearing model: give SlamSettings.bearing_sigma_rad"
             )
-        return bearing_row(pose, len(self.names), beacon, self._bearing)
+        dx, dy = beacon[0] - pose[0], beacon[1] - pose[1]
+        q = max(dx * dx + dy * dy, LEAST_RANGE_M**2)
+        across, tail = (-dy / q, dx / q), (0.0,) * (len(beacon) - 2)
+        expected, shared = atan2(dy, dx) - pose[2], (0.0,) * len(self.names)
+        return MeasurementRow(expected, (dy / q, -dx / q, -1.0), shared, across + tail, self._bearing_sigma_rad**2)
 
     def wander(self, reading: Reading) -> GaussMarkovBias | None:
-        """The error that stays while the vehicle does."""
+        """The model of the error that stays while the vehicle does."""
         return (self._rssi_model() if isinstance(reading, RssiReading) else self._range_model()).wander
 
     def distance_m(self, reading: Reading) -> float:
@@ -135,14 +130,9 @@ class MeasurementModels:
         return self._rssi
 
 
-def bearing_of(reading: Reading) -> float | None:
-    """The bearing of a reading, rad; None where it has none."""
-    return None if isinstance(reading, RangeReading) else reading.bearing_rad
-
-
 def is_direction(reading: Reading) -> bool:
     """Whether it has a bearing and nothing else."""
-    return isinstance(reading, RangeBearingReading) and isnan(reading.range_m)
+    return isinstance(reading, RangeReading) and isnan(reading.range_m)
 
 
 def strength_of(reading: Reading) -> float:

@@ -1,14 +1,10 @@
-"""How a vehicle moves between two readings: differential drive and Ackermann, with Jacobian and noise.
-
-Motion of a vehicle whose wheels slip and whose heading drifts, both estimated on the way.
-
-The clock of odometry beside that of readings: what is due, and where the vehicle was at a reading.
-"""
+"""How a vehicle moves between two readings, with Jacobian and noise; where it was at the time of a reading."""
 
 from collections import deque
-from dataclasses import dataclass, replace
-from math import cos, hypot, nan, sin, tan
-from typing import Literal, NamedTuple, Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import cos, hypot, nan, sin
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -57,14 +53,6 @@ class Steering:
 Odometry = Increment | Steering
 
 
-class StationaryReading(NamedTuple):
-    """What a vehicle at rest shows of its odometry's calibration."""
-
-    column: int
-    value: float
-    variance: float
-
-
 class MotionStep(NamedTuple):
     """A prediction of the vehicle's states.
 
@@ -79,23 +67,10 @@ class MotionStep(NamedTuple):
     Q: FloatArray
 
 
-class MotionModel(Protocol):
-    """What ``BeaconSlam`` asks of a vehicle; its states are the pose and the odometry's calibration behind it."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the calibration states."""
-
-    @property
-    def prior_sigmas(self) -> tuple[float, ...]:
-        """Of the calibration states."""
-
-    def step(self, states: FloatArray, odometry: Odometry) -> MotionStep:
-        """The states (v,) after the interval.
-
-        Raises:
-            TypeError: the odometry is of another kind of vehicle.
-        """
+def estimated(priors: Mapping[str, float]) -> tuple[tuple[str, ...], tuple[float, ...]]:
+    """Names and prior standard deviations of the quantities whose prior is not zero."""
+    kept = {name: sigma for name, sigma in priors.items() if sigma > 0.0}
+    return tuple(kept), tuple(kept.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,22 +120,19 @@ class DifferentialDrive:
 
     def __init__(self, noise: DifferentialNoise) -> None:
         self.noise = noise
-        priors = (
-            ("turn_bias_rad_s", noise.turn_bias_sigma_rad_s),
-            ("turn_scale", noise.turn_scale_sigma),
-            ("distance_scale", noise.distance_scale_sigma),
-        )
-        self.names = tuple(name for name, sigma in priors if sigma > 0.0)
-        self.prior_sigmas = tuple(sigma for _, sigma in priors if sigma > 0.0)
+        priors = {
+            "turn_bias_rad_s": noise.turn_bias_sigma_rad_s,
+            "turn_scale": noise.turn_scale_sigma,
+            "distance_scale": noise.distance_scale_sigma,
+        }
+        self.names, self.prior_sigmas = estimated(priors)
         place = {name: POSE + i for i, name in enumerate(self.names)}
-        self._bias, self._turn_scale, self._way_scale = (place.get(name, -1) for name, _ in priors)
+        self._bias, self._turn_scale, self._way_scale = (place.get(name, -1) for name in priors)
         size = POSE + len(self.names)
         self._F, self._Q = np.eye(size), np.zeros((size, size))
 
-    def step(self, states: FloatArray, odometry: Odometry) -> MotionStep:
-        """See ``MotionModel.step``; takes an ``Increment``."""
-        if not isinstance(odometry, Increment):
-            raise TypeError(f"a differential drive takes increments, not {type(odometry).__name__}")
+    def step(self, states: FloatArray, odometry: Increment) -> MotionStep:
+        """The states, shape (v,), after the interval."""
         values: list[float] = states.tolist()
         scaled = 1.0 + values[self._way_scale] if self._way_scale >= 0 else 1.0
         way, side = odometry.distance_m / scaled, odometry.lateral_m / scaled
@@ -184,12 +156,15 @@ class DifferentialDrive:
         Q = self._spread(odometry, (c, s), (x_turn, y_turn), chord, 0.0 if is_at_rest else 1.0)
         return MotionStep(mean, F, Q)
 
-    def at_rest(self, odometry: Odometry) -> StationaryReading | None:
-        """At rest the turn that is told is the bias, by the gyroscope's angle random walk; None while it drives."""
-        if self._bias < 0 or not isinstance(odometry, Increment) or not self._rests(odometry):
+    def at_rest(self, odometry: Increment) -> tuple[int, float, float] | None:
+        """Column, value and variance of the bias, which is the turn read at rest; None while the vehicle drives.
+
+        Its noise is the gyroscope's angle random walk.
+        """
+        if self._bias < 0 or not self._rests(odometry):
             return None
         dt = odometry.interval_s
-        return StationaryReading(self._bias, odometry.turn_rad / dt, self.noise.turn_per_sqrt_s**2 / dt)
+        return self._bias, odometry.turn_rad / dt, self.noise.turn_per_sqrt_s**2 / dt
 
     def _rests(self, odometry: Increment) -> bool:
         dt, noise = odometry.interval_s, self.noise
@@ -232,54 +207,6 @@ class DifferentialDrive:
 
 
 @dataclass(frozen=True, slots=True)
-class AckermannNoise:
-    """Noise of a steered vehicle's odometry, of every interval anew."""
-
-    speed_sigma_m_s: float
-    steer_sigma_rad: float
-
-
-class Ackermann:
-    """A steered vehicle.
-
-    Reference ``front`` (Hevrdejs and Knoll 2017, eq. 3): x <- x + T v cos(heading + steer),
-    y <- y + T v sin(heading + steer), heading <- heading + T v sin(steer) / l.
-    Reference ``rear``: the same point on the rear axle, x <- x + T v cos(heading),
-    heading <- heading + T v tan(steer) / l.
-    """
-
-    names: tuple[str, ...] = ()
-    prior_sigmas: tuple[float, ...] = ()
-
-    def __init__(
-        self, wheelbase_m: float, noise: AckermannNoise, reference: Literal["front", "rear"] = "front"
-    ) -> None:
-        self.wheelbase_m = wheelbase_m
-        self.noise = noise
-        self.reference = reference
-
-    def step(self, states: FloatArray, odometry: Odometry) -> MotionStep:
-        """See ``MotionModel.step``; takes a ``Steering``."""
-        if not isinstance(odometry, Steering):
-            raise TypeError(f"an Ackermann vehicle takes speed and steering angle, not {type(odometry).__name__}")
-        x, y, heading = states.tolist()
-        t, steer = odometry.interval_s, odometry.steer_rad
-        way = t * odometry.speed_m_s
-        if self.reference == "front":
-            c, s = cos(heading + steer), sin(heading + steer)
-            curve, d_curve, swing = sin(steer) / self.wheelbase_m, cos(steer) / self.wheelbase_m, 1.0
-        else:
-            c, s = cos(heading), sin(heading)
-            curve, d_curve, swing = tan(steer) / self.wheelbase_m, (1.0 + tan(steer) ** 2) / self.wheelbase_m, 0.0
-        mean = np.array((x + way * c, y + way * s, heading + way * curve))
-        F = np.array(((1.0, 0.0, -way * s), (0.0, 1.0, way * c), (0.0, 0.0, 1.0)))
-        L = np.array(((t * c, -way * s * swing), (t * s, way * c * swing), (t * curve, way * d_curve)))
-        L[:, 0] *= self.noise.speed_sigma_m_s
-        L[:, 1] *= self.noise.steer_sigma_rad
-        return MotionStep(mean, F, L.dot(L.T))
-
-
-@dataclass(frozen=True, slots=True)
 class WheelNoise:
     """Noise of the odometry, of every interval anew, and priors of its constant errors.
 
@@ -293,13 +220,6 @@ class WheelNoise:
     turn_sigma: float
     drift_sigma_rad_s: float
     slip_sigma: float
-
-
-class _TurnStep(NamedTuple):
-    swing_rad: float
-    turn_rad: float
-    swing_by: tuple[float, float, float]
-    turn_by: tuple[float, float, float]
 
 
 class SlippingVehicle:
@@ -321,28 +241,41 @@ class SlippingVehicle:
         self._is_steered = kind == "ackermann"
         self._wheelbase_m = wheelbase_m
         self._noise = noise
-        priors = (("heading_drift_rad_s", noise.drift_sigma_rad_s), ("slip", noise.slip_sigma))
-        self.names = tuple(name for name, sigma in priors if sigma > 0.0)
-        self.prior_sigmas = tuple(sigma for _, sigma in priors if sigma > 0.0)
+        self.names, self.prior_sigmas = estimated(
+            {"heading_drift_rad_s": noise.drift_sigma_rad_s, "slip": noise.slip_sigma}
+        )
         self._drift = POSE if noise.drift_sigma_rad_s > 0.0 else None
         self._slip = POSE + (self._drift is not None) if noise.slip_sigma > 0.0 else None
         self.size = POSE + len(self.names)
 
     def step(self, states: FloatArray, odometry: Odometry) -> MotionStep:
-        """See ``MotionModel.step``."""
+        """The states, shape (v,), after the interval.
+
+        Raises:
+            TypeError: the odometry is of the other kind of vehicle.
+        """
         T, v, reading = self._read(odometry)
         values: list[float] = states.tolist()
         drift = 0.0 if self._drift is None else values[self._drift]
         slip = 0.0 if self._slip is None else values[self._slip]
-        turn = (self._steered if self._is_steered else self._differential)(T, v, reading, drift, slip)
+        # Derivatives of swing and turn are by the reading of steering or turn rate, speed or drift, and slip.
+        if self._is_steered:
+            curve = T * sin(reading) / self._wheelbase_m
+            swing, turn = reading, curve * v * (1.0 - slip) + T * drift
+            swing_by_reading, swing_by_slip, swing_by_drift = 1.0, 0.0, 0.0
+            turn_by_reading = T * v * (1.0 - slip) * cos(reading) / self._wheelbase_m
+            turn_by_speed, turn_by_slip = curve * (1.0 - slip), -curve * v
+        else:
+            turn = T * reading * (1.0 - slip) + T * drift
+            swing = 0.5 * turn
+            turn_by_reading, turn_by_speed, turn_by_slip = T * (1.0 - slip), 0.0, -T * reading
+            swing_by_reading, swing_by_slip, swing_by_drift = 0.5 * turn_by_reading, 0.5 * turn_by_slip, 0.5 * T
         d = T * v * (1.0 - slip)
-        c, s = cos(values[2] + turn.swing_rad), sin(values[2] + turn.swing_rad)
+        c, s = cos(values[2] + swing), sin(values[2] + swing)
         mean = states.copy()
-        mean[:POSE] = values[0] + d * c, values[1] + d * s, values[2] + turn.turn_rad
+        mean[:POSE] = values[0] + d * c, values[1] + d * s, values[2] + turn
         F = np.eye(self.size)
         F[0, 2], F[1, 2] = -d * s, d * c
-        swing_by_reading, swing_by_slip, swing_by_drift = turn.swing_by
-        turn_by_reading, turn_by_speed, turn_by_slip = turn.turn_by
         if self._drift is not None:
             F[:POSE, self._drift] = -d * s * swing_by_drift, d * c * swing_by_drift, T
         if self._slip is not None:
@@ -353,18 +286,6 @@ class SlippingVehicle:
         stands = v == 0.0 and (self._is_steered or reading == 0.0)
         L *= (0.0, 0.0) if stands else (self._noise.speed_sigma_m_s, self._noise.turn_sigma)
         return MotionStep(mean, F, L @ L.T)
-
-    def _steered(self, T: float, v: float, steer: float, drift: float, slip: float) -> _TurnStep:
-        curve = T * sin(steer) / self._wheelbase_m
-        d_steer = T * v * (1.0 - slip) * cos(steer) / self._wheelbase_m
-        w = curve * v * (1.0 - slip) + T * drift
-        return _TurnStep(steer, w, (1.0, 0.0, 0.0), (d_steer, curve * (1.0 - slip), -curve * v))
-
-    @staticmethod
-    def _differential(T: float, _v: float, omega: float, drift: float, slip: float) -> _TurnStep:
-        w = T * omega * (1.0 - slip) + T * drift
-        by_omega, by_slip = T * (1.0 - slip), -T * omega
-        return _TurnStep(0.5 * w, w, (0.5 * by_omega, 0.5 * by_slip, 0.5 * T), (by_omega, 0.0, by_slip))
 
     def _read(self, odometry: Odometry) -> tuple[float, float, float]:
         if self._is_steered:
@@ -378,9 +299,6 @@ class SlippingVehicle:
 
 
 SLIVER = 0.2  # part of an interval that is not worth a step of its own: the pose is carried over it
-
-
-STANDS = (0.0, 0.0, 0.0)
 
 
 class CarriedOdometry(NamedTuple):
@@ -406,7 +324,7 @@ class CarriedOdometry(NamedTuple):
 
 
 class DeadReckoning:
-    """Odometry that tells what the vehicle will have done after a delay, which may be an estimate.
+    """Odometry that says what the vehicle will have done after a delay, which may be an estimate.
 
     Commanded speeds run ahead of the wheels; stamps of readings may come late or early. Steps wait until they are due:
     the state is the pose at t - delay by odometry's clock, which is the pose at t by that of the readings. Of a
@@ -417,11 +335,11 @@ class DeadReckoning:
 
     def __init__(self, *, is_delayed: bool) -> None:
         self._is_delayed = is_delayed
-        self._steps: deque[Odometry] = deque()
+        self._steps: deque[Increment] = deque()
         self._until_s, self._interval_s = nan, 0.0
         self._rates = (0.0, 0.0, 0.0)  # forwards, to the left, turn
 
-    def due(self, odometry: Odometry, delay_s: float) -> list[Odometry]:
+    def due(self, odometry: Increment, delay_s: float) -> list[Increment]:
         """The steps, or parts of one, to be taken when ``odometry`` arrives."""
         if not self._is_delayed:
             return [odometry]
@@ -438,7 +356,7 @@ class DeadReckoning:
                 found.append(done)
         return found
 
-    def took(self, odometry: Odometry, before: FloatArray, after: FloatArray) -> float:
+    def took(self, odometry: Increment, before: FloatArray, after: FloatArray) -> float:
         """A step was taken, from one state to another; its length, m."""
         self._until_s, dt = odometry.time_s, odometry.interval_s
         self._interval_s = dt
@@ -456,7 +374,7 @@ class DeadReckoning:
         back_s = self._until_s + delay_s - time_s
         back_s = max(-limit_s, min(limit_s, back_s)) if limit_s > 0.0 else 0.0
         if back_s == 0.0 and not self._is_delayed:
-            return CarriedOdometry(pose[:POSE], STANDS, 0.0)  # its speed does not matter
+            return CarriedOdometry(pose[:POSE], (0.0, 0.0, 0.0), 0.0)  # its speed does not matter
         ahead, side, turn = self._rates
         heading = pose[2] - back_s * turn
         c, s = cos(heading), sin(heading)
@@ -464,21 +382,14 @@ class DeadReckoning:
         return CarriedOdometry([pose[0] - back_s * vx, pose[1] - back_s * vy, heading], (vx, vy, turn), back_s)
 
 
-def _split(step: Odometry, part: float) -> tuple[Odometry, Odometry]:
-    first_s, rest_s = part * step.interval_s, (1.0 - part) * step.interval_s
-    first = replace(step, time_s=step.time_s - rest_s, interval_s=first_s)
-    rest = replace(step, interval_s=rest_s)
-    if isinstance(first, Increment) and isinstance(rest, Increment):
-        return _scaled(first, part), _scaled(rest, 1.0 - part)
-    return first, rest
+def _split(step: Increment, part: float) -> tuple[Increment, Increment]:
+    rest_s = (1.0 - part) * step.interval_s
+    first = _scaled(step, part, step.time_s - rest_s, part * step.interval_s)
+    return first, _scaled(step, 1.0 - part, step.time_s, rest_s)
 
 
-def _scaled(step: Increment, part: float) -> Increment:
-    return replace(
-        step,
-        distance_m=part * step.distance_m,
-        turn_rad=part * step.turn_rad,
-        lateral_m=part * step.lateral_m,
-        guess_m2=part * step.guess_m2,
-        guess_rad2=part * step.guess_rad2,
-    )
+def _scaled(step: Increment, part: float, time_s: float, interval_s: float) -> Increment:
+    return Increment(
+        time_s, interval_s, part * step.distance_m, part * step.turn_rad, part * step.lateral_m,
+        part * step.guess_m2, part * step.guess_rad2,
+    )  # fmt: skip

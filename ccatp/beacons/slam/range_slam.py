@@ -1,12 +1,6 @@
-"""A vehicle among beacons that places them on a map while it finds itself on it: EKF-SLAM over readings.
-
-Refused readings, counted: whether they accuse the pose or a beacon.
-
-What the motion has added to the covariance of the pose since something was last heard.
-"""
+"""EKF-SLAM over readings: a vehicle among beacons places them on a map while it finds itself on it."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from math import log, sqrt
 from typing import NamedTuple
 
@@ -22,30 +16,11 @@ from ccatp.beacons.slam.beacon_map import (
     SlamSettings,
 )
 from ccatp.beacons.slam.landmark_init import LandmarkInitializer, derivatives
-from ccatp.beacons.slam.measurement_models import MeasurementModels, bearing_of, is_direction, kind_of, strength_of
-from ccatp.beacons.slam.motion import POSE, DeadReckoning, DifferentialDrive, Increment, Odometry, VehiclePose
-from ccatp.beacons.slam.recording import BeaconId, Reading
+from ccatp.beacons.slam.measurement_models import MeasurementModels, is_direction, kind_of, strength_of
+from ccatp.beacons.slam.motion import POSE, DeadReckoning, Increment, VehiclePose
+from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, Reading
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.ekf_slam import BlockError, EkfSlam, RowUpdate
-
-
-class RejectedReadings:
-    """One reading that is not believed is an outlier. Several in a row, of whichever beacons, accuse the pose."""
-
-    def __init__(self, after: int) -> None:
-        self._after, self._refused = after, 0
-
-    def clear(self) -> None:
-        """A reading was believed."""
-        self._refused = 0
-
-    def refuse(self) -> bool:
-        """A reading was not believed; True if the pose is to be doubted now."""
-        self._refused += 1
-        if self._refused < self._after:
-            return False
-        self._refused = 0
-        return True
 
 
 class AddedPoseNoise:
@@ -79,21 +54,8 @@ class AddedPoseNoise:
 DELAY = "odometry_delay_s"
 
 
-@dataclass(frozen=True, slots=True)
-class BeaconEstimate:
-    """A beacon on the map.
-
-    Attributes:
-        mean: x_m, y_m and, where they are estimated, reference_dbm and exponent, shape (b,).
-        covariance: shape (b, b).
-    """
-
-    mean: FloatArray
-    covariance: FloatArray
-
-
 class BeaconInnovation(NamedTuple):
-    """What one reading did: an ``Innovation`` with the beacon it came from.
+    """What one reading did.
 
     Attributes:
         residual: z - h(x) of the bearing, if there is one, and of the range or the strength, shape (m,).
@@ -159,13 +121,13 @@ class BeaconSlam:
         self._learns = trust.learn_memory > 0.0
         self._fresh = AddedPoseNoise()
         self._gate, self._knee = trust.gate_sigmas**2, trust.knee_sigmas
-        self._doubts, self.jumps, self.unplaced = RejectedReadings(trust.doubt_pose_after), 0, 0
+        self._refused, self.jumps, self.unplaced = 0, 0, 0
         self.moved: list[tuple[BeaconId, float]] = []
         self._way_m = 0.0
-        self._newcomers = LandmarkInitializer(
+        self._candidates = LandmarkInitializer(
             self.engine, self._sensors, self._map, self._clock, self.levels, self._shared, self._delay
         )
-        self.waiting = self._newcomers.waiting
+        self.waiting = self._candidates.waiting
         self.learned: list[BeaconInnovation] = []
         for beacon, estimate in (known or {}).items():
             self._map.join(beacon, estimate.mean, estimate.covariance)
@@ -192,39 +154,36 @@ class BeaconSlam:
         mean, variances = self.engine.mean.tolist(), self.engine.covariance.diagonal().tolist()
         return {name: (mean[POSE + i], sqrt(variances[POSE + i])) for i, name in enumerate(self._names)}
 
-    def predict(self, odometry: Odometry) -> None:
-        """Carry the vehicle on.
-
-        Raises:
-            TypeError: the odometry is of another kind of vehicle.
-        """
+    def predict(self, odometry: Increment) -> None:
+        """Carry the vehicle on."""
         delay_s = float(self.engine.mean[self._delay]) if self._delay >= 0 else 0.0
         for step in self._clock.due(odometry, delay_s):
             self._step(step)
 
-    def _step(self, odometry: Odometry) -> None:
+    def _step(self, odometry: Increment) -> None:
         engine = self.engine
         before = engine.mean[: engine.vehicle_size].copy()
         mean, F, Q = self._motion.step(before, odometry)
         if self._learns:
             Q = Q * self.levels["motion"].factor
             self._fresh.step(F, Q)
-        if isinstance(odometry, Increment) and odometry.guess_m2 > 0.0:
-            Q = _with_guess(Q, odometry)
+        if odometry.guess_m2 > 0.0:  # a guessed way says nothing of the noise of odometry
+            Q = Q.copy()
+            Q[range(POSE), range(POSE)] += odometry.guess_m2, odometry.guess_m2, odometry.guess_rad2
         engine.predict(mean, F, Q)
         self._way_m += self._clock.took(odometry, before, mean)
-        rest = self._motion.at_rest(odometry) if isinstance(self._motion, DifferentialDrive) else None
+        rest = self._motion.at_rest(odometry)
         if rest is not None:
-            residual = rest.value - float(engine.mean[rest.column])
+            column, bias, variance = rest
             corrected = engine.mean.copy()
-            engine.update_row(np.array((rest.column,)), np.ones(1), residual, rest.variance)
+            engine.update_row(np.array((column,)), np.ones(1), bias - float(engine.mean[column]), variance)
             self._follow(corrected)
 
     def observe(self, readings: Iterable[Reading]) -> list[BeaconInnovation]:
         """Take readings of any beacons, one after the other; those of new ones begin their place on the map.
 
         Raises:
-            SensorError: the settings have no model of a reading.
+            MeasurementError: the settings have no model of a reading.
         """
         self.learned = []
         for reading in readings:
@@ -232,12 +191,12 @@ class BeaconSlam:
             if entry is None and is_direction(reading):
                 self.unplaced += 1  # it may lie anywhere along it
             elif entry is None:
-                self._newcomers.meet(reading)
+                self._candidates.add(reading)
             else:
                 self.learned.append(self._update(reading, entry))
                 if entry.on_trial and reading.beacon not in self._map and not is_direction(reading):
                     before = self.engine.mean.copy()
-                    self._newcomers.meet(reading)
+                    self._candidates.add(reading)
             self._follow(before)
         return self.learned
 
@@ -245,8 +204,8 @@ class BeaconSlam:
         if self._transport is not None:
             self._transport.follow(before)
 
-    def told_heading(self, off_rad: float, sigma_rad: float) -> float:
-        """Take a heading that is ``off_rad`` from the one that is thought, and tells the NIS of that."""
+    def correct_heading(self, off_rad: float, sigma_rad: float) -> float:
+        """Take a heading that is ``off_rad`` from the estimated one; returns the NIS of that."""
         before = self.engine.mean.copy()
         found = self.engine.update_row(np.array((HEADING,)), np.ones(1), off_rad, sigma_rad**2)
         self._follow(before)
@@ -258,7 +217,7 @@ class BeaconSlam:
         Raises:
             BlockError: nothing was heard of it.
         """
-        if self._newcomers.forget(beacon):
+        if self._candidates.forget(beacon):
             return
         if beacon not in self._map:
             raise BlockError(beacon, "is not on the map")
@@ -268,7 +227,7 @@ class BeaconSlam:
         model = None if is_direction(reading) else self._sensors.wander(reading)
         if model is not None:
             self._map.wander_to(reading.beacon, model, self._way_m, reading.time_s)
-        bearing = bearing_of(reading)
+        bearing = reading.bearing_rad
         residuals, nis, spread, found = [], 0.0, 1.0, None
         if bearing is not None:
             found = self._take(reading, entry, "bearing", bearing, model)
@@ -317,14 +276,16 @@ class BeaconSlam:
         if accepted:
             entry.refused = 0
             entry.on_trial = max(entry.on_trial - 1, 0)
-            self._doubts.clear()
+            self._refused = 0
             return
         if entry.on_trial:
             self._map.leave(reading.beacon)
             return
         entry.refused += 1
+        self._refused += 1
         trust = self.settings.trust
-        if self._doubts.refuse():
+        if self._refused >= trust.doubt_pose_after:
+            self._refused = 0
             v = self.engine.vehicle_size
             jump = np.zeros(v)
             jump[:POSE] = trust.jump_m, trust.jump_m, trust.jump_rad
@@ -333,9 +294,3 @@ class BeaconSlam:
         if entry.refused >= trust.doubt_beacon_after:
             self._map.leave(reading.beacon)
             self.moved.append((reading.beacon, reading.time_s))
-
-
-def _with_guess(Q: FloatArray, odometry: Increment) -> FloatArray:
-    Q = Q.copy()
-    Q[range(POSE), range(POSE)] += odometry.guess_m2, odometry.guess_m2, odometry.guess_rad2
-    return Q

@@ -1,9 +1,4 @@
-"""A recorded run in the units and the order that estimators want: odometry, readings, truth if there is one.
-
-What an estimator says of a recorded run: the path, the map, the calibration, each with its uncertainty.
-
-What a radio tells of a beacon: ranges, bearings and signal strengths, each with its own time.
-"""
+"""Recorded runs and readings in the units and the order that estimators want, and what estimators make of them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -144,9 +139,9 @@ class EstimatedPath(NamedTuple):
         times_s: shape (n,), rising.
         poses: x_m, y_m, heading_rad, shape (n, 3).
         covariances: of the poses, shape (n, 3, 3).
+        refused: how many readings were refused, or weigh less than a tenth.
         nis: normalised innovations squared of the readings that were used, shape (u,); none from a smoother.
         nis_sizes: their degrees of freedom, shape (u,).
-        refused: how many readings were refused, or weigh less than a tenth.
         update_s: wall time of each reading, the prediction to it included, s; of a smoother its whole time shared among
             the readings.
         predict_s: wall time of each prediction, s; none from a smoother.
@@ -159,14 +154,14 @@ class EstimatedPath(NamedTuple):
     covariances: FloatArray
     beacons: Mapping[str, BeaconFix]
     calibration: Mapping[str, Calibrated]
-    nis: FloatArray
-    nis_sizes: FloatArray
     refused: int
-    update_s: FloatArray
-    predict_s: FloatArray
-    scalar_s: FloatArray
     updates: int
     warnings: tuple[str, ...]
+    nis: FloatArray = np.empty(0)
+    nis_sizes: FloatArray = np.empty(0)
+    update_s: FloatArray = np.empty(0)
+    predict_s: FloatArray = np.empty(0)
+    scalar_s: FloatArray = np.empty(0)
 
 
 BeaconId = int | str
@@ -174,34 +169,24 @@ BeaconId = int | str
 
 @dataclass(frozen=True, slots=True)
 class RangeReading:
-    """A range to a beacon, as it was measured: scale error, offset and all."""
-
-    time_s: float
-    beacon: BeaconId
-    range_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class RangeBearingReading:
-    """A range and a direction.
+    """A range to a beacon as it was measured, scale error, offset and all, with a direction where that is known.
 
     Attributes:
-        range_m: what was read, m; NaN where the direction alone was.
+        range_m: NaN where the direction alone was read.
         bearing_rad: from the vehicle's heading, counter-clockwise.
     """
 
     time_s: float
     beacon: BeaconId
     range_m: float
-    bearing_rad: float
+    bearing_rad: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class RssiReading:
-    """A signal strength, with the direction where it was strongest if an antenna turns.
+    """A received signal strength, with the direction where it was strongest if an antenna turns.
 
     Attributes:
-        rssi_dbm: received signal strength, dBm.
         bearing_rad: from the vehicle's heading, counter-clockwise; None without a directional antenna.
     """
 
@@ -211,4 +196,16 @@ class RssiReading:
     bearing_rad: float | None = None
 
 
-Reading = RangeReading | RangeBearingReading | RssiReading
+Reading = RangeReading | RssiReading
+
+
+class BeaconEstimate(NamedTuple):
+    """A beacon on the map, or what is known of it before its readings.
+
+    Attributes:
+        mean: x_m, y_m and what else is estimated of it (reference_dbm, exponent, shadowing), shape (b,).
+        covariance: shape (b, b).
+    """
+
+    mean: FloatArray
+    covariance: FloatArray

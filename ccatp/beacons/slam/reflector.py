@@ -3,31 +3,15 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import atan2, cos, hypot, pi, sin, tau
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from ccatp.core import wrap_pi
 
 _APART_RAD = pi / 2.0  # strongest readings further apart than this are two directions, not one
 
 
-class ScanPacket(Protocol):
-    """One answer of a radio while the reflector points somewhere."""
-
-    @property
-    def beacon(self) -> str:
-        """Node identifier."""
-
-    @property
-    def direction_rad(self) -> float:
-        """Where the reflector pointed, left of the heading."""
-
-    @property
-    def rssi_dbm(self) -> float:
-        """How strong."""
-
-
 class ScanResult(NamedTuple):
-    """What a turn of the reflector says of one radio.
+    """Level and bearing of one radio after a turn of the reflector.
 
     Attributes:
         bearing_rad: left of the heading; None where the scan does not tell.
@@ -64,11 +48,15 @@ class ReflectorScan:
         """Of a bearing: noise, and a direction that may lie anywhere within a step (variance step^2 / 12)."""
         return hypot(self.bearing_sigma_rad, self.step_rad / 12.0**0.5)
 
-    def results(self, packets: Iterable[ScanPacket]) -> list[ScanResult]:
-        """One result for each radio that was heard, in the order of their first packets."""
+    def results(self, packets: Iterable[tuple[str, float, float]]) -> list[ScanResult]:
+        """One result for each radio, in the order of their first packets.
+
+        Args:
+            packets: radio, direction of the reflector left of the heading (rad), level (dBm).
+        """
         by_beacon: dict[str, list[tuple[float, float]]] = {}
-        for packet in packets:
-            by_beacon.setdefault(packet.beacon, []).append((packet.direction_rad, packet.rssi_dbm))
+        for beacon, direction_rad, level_dbm in packets:
+            by_beacon.setdefault(beacon, []).append((direction_rad, level_dbm))
         return [self._result(beacon, readings) for beacon, readings in by_beacon.items()]
 
     def _result(self, beacon: str, readings: Sequence[tuple[float, float]]) -> ScanResult:

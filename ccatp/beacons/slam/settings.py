@@ -1,43 +1,18 @@
-"""From the configuration of a recording's format to the settings of the estimators.
+"""From the configuration to the settings of the estimators."""
 
-From the configuration to the filter, and from wheels and scans to its odometry and readings.
-"""
-
-from collections.abc import Iterable
-from typing import Protocol
+from dataclasses import fields
 
 import numpy as np
 from scipy.special import chdtri
 
-from ccatp.beacons.slam.batch_odometry import BatchPriors, BatchSettings, RadioNoise
-from ccatp.beacons.slam.beacon_map import BearingModel, GaussMarkovBias, RangeModel, RobustLoss, RssiModel, SlamSettings
-from ccatp.beacons.slam.motion import (
-    DifferentialDrive,
-    DifferentialNoise,
-    Increment,
-    Odometry,
-    SlippingVehicle,
-    Steering,
-    VehiclePose,
-    WheelNoise,
-)
+from ccatp.beacons.slam.beacon_map import GaussMarkovBias, RangeModel, RobustLoss, RssiModel, SlamSettings
+from ccatp.beacons.slam.motion import DifferentialDrive, DifferentialNoise, SlippingVehicle, VehiclePose, WheelNoise
 from ccatp.beacons.slam.path_loss import PathLoss
-from ccatp.beacons.slam.recording import RssiReading
-from ccatp.beacons.slam.reflector import ReflectorScan, ScanResult
+from ccatp.beacons.slam.reflector import ReflectorScan
 from ccatp.beacons.slam.signal_landmarks import MovingRadio, ShadowingMap
 from ccatp.beacons.slam.signal_slam import SignalSettings, SignalSlam
 from ccatp.config.beacon_models import RadioConfig
 from ccatp.config.recording_models import RecordingConfig, SlamFilterConfig
-
-
-def batch_settings(cfg: RecordingConfig) -> BatchSettings:
-    """Of the smoother."""
-    radio = {name: value for name, value in cfg.radio.model_dump().items() if name != "gate_sigmas"}
-    return BatchSettings(
-        odometry=DifferentialNoise(**cfg.odometry.model_dump()),
-        radio=RadioNoise(**radio),
-        priors=BatchPriors(**cfg.priors.model_dump()),
-    )
 
 
 def slam_settings(cfg: RecordingConfig, how: SlamFilterConfig) -> SlamSettings:
@@ -52,82 +27,28 @@ def slam_settings(cfg: RecordingConfig, how: SlamFilterConfig) -> SlamSettings:
         rest_speed_m_s=how.rest_speed_m_s,
         rest_turn_rad_s=how.rest_turn_rad_s,
     )
-    wander = (
-        GaussMarkovBias(how.wander_share, how.wander_length_m, radio.correlation_s)
-        if radio.correlation_s > 0.0
-        else None
-    )
+    wander = None
+    if radio.correlation_s > 0.0:
+        wander = GaussMarkovBias(how.wander_share, how.wander_length_m, radio.correlation_s)
+    trust = how.model_dump(include={field.name for field in fields(RobustLoss)})
+    reference_sigma_db = (priors.rssi_reference_db**2 + priors.beacon_reference_db**2) ** 0.5
     return SlamSettings(
         motion=DifferentialDrive(noise),
-        trust=_trust(how, radio.gate_sigmas),
+        trust=RobustLoss(gate_sigmas=radio.gate_sigmas, **trust),
         range=RangeModel(
-            sigma_m=radio.range_sigma_m,
-            sigma_per_m=radio.range_sigma_per_m,
-            scale_sigma=priors.range_scale,
-            offset_sigma_m=priors.range_offset_m,
-            wander=wander,
+            radio.range_sigma_m, radio.range_sigma_per_m, priors.range_scale, priors.range_offset_m, wander
         ),
-        bearing=BearingModel(sigma_rad=radio.bearing_sigma_rad),
+        bearing_sigma_rad=radio.bearing_sigma_rad,
         rssi=RssiModel(
             sigma_db=radio.rssi_sigma_db,
             reference_dbm=radio.rssi_reference_dbm,
-            reference_sigma_db=(priors.rssi_reference_db**2 + priors.beacon_reference_db**2) ** 0.5,
+            reference_sigma_db=reference_sigma_db,
             exponent=radio.rssi_exponent,
             exponent_sigma=priors.rssi_exponent,
             wander=wander,
         ),
         delay_sigma_s=priors.delay_s,
     )
-
-
-def _trust(how: SlamFilterConfig, gate_sigmas: float) -> RobustLoss:
-    return RobustLoss(
-        gate_sigmas=gate_sigmas,
-        knee_sigmas=how.knee_sigmas,
-        learn_memory=how.learn_memory,
-        learn_prior=how.learn_prior,
-        doubt_pose_after=how.doubt_pose_after,
-        doubt_beacon_after=how.doubt_beacon_after,
-        jump_m=how.jump_m,
-        jump_rad=how.jump_rad,
-        transports=how.transports,
-    )
-
-
-class WheelAngles(Protocol):
-    """What the wheels tell of an interval."""
-
-    @property
-    def interval_s(self) -> float:
-        """Its length."""
-
-    @property
-    def speed_m_s(self) -> float:
-        """Mean speed."""
-
-    @property
-    def steer_rad(self) -> float:
-        """Steering angle to the left; of a steered vehicle."""
-
-    @property
-    def turn_rate_rad_s(self) -> float:
-        """Turn rate to the left; of a differential drive."""
-
-
-class SignalMeasurements(Protocol):
-    """The result of a scan as a radio tells it."""
-
-    @property
-    def beacon(self) -> str:
-        """Node identifier."""
-
-    @property
-    def rssi_dbm(self) -> float:
-        """Level."""
-
-    @property
-    def bearing_rad(self) -> float | None:
-        """Left of the heading; None where it is not known."""
 
 
 def new_slam(cfg: RadioConfig) -> SignalSlam:
@@ -138,10 +59,14 @@ def new_slam(cfg: RadioConfig) -> SignalSlam:
 
 
 def signal_settings(cfg: RadioConfig) -> SignalSettings:
-    """What the filter is told of vehicle and radios."""
-    loss = cfg.path_loss
-    sigma_db = loss.shadowing_sigma_db if cfg.estimator.shadowing != "none" else 0.0
-    quantile = cfg.estimator.gate_probability
+    """Vehicle and radios of the filter of levels."""
+    loss, estimator, room_m = cfg.path_loss, cfg.estimator, cfg.workspace.size_m
+    sigma_db = loss.shadowing_sigma_db if estimator.shadowing != "none" else 0.0
+    shadowing = None
+    if estimator.shadowing == "map" and sigma_db > 0.0:
+        shadowing = ShadowingMap(room_m, estimator.shadowing_grid_m, sigma_db, loss.shadowing_length_m)
+    speed_sigma_m_s, course_time_s = estimator.target_speed_sigma_m_s, estimator.target_course_time_s
+    quantile = estimator.gate_probability
     return SignalSettings(
         motion=vehicle_of(cfg),
         path_loss={
@@ -151,28 +76,14 @@ def signal_settings(cfg: RadioConfig) -> SignalSettings:
         default=PathLoss(loss.reference_dbm, loss.exponent, loss.white_sigma_db),
         bearing_sigma_rad=scan_of(cfg).sigma_rad,
         shadowing_sigma_db=sigma_db,
-        shadowing=_map(cfg, sigma_db) if cfg.estimator.shadowing == "map" and sigma_db > 0.0 else None,
-        moving=_moving(cfg, sigma_db),
-        placed_share=cfg.estimator.placed_share,
-        waiting_scans=cfg.estimator.waiting_scans,
+        shadowing=shadowing,
+        # In a room without a radio that moves, its name is never received.
+        moving=MovingRadio(
+            cfg.follow.target, speed_sigma_m_s, course_time_s, sigma_db, loss.shadowing_length_m, room_m
+        ),
+        placed_share=estimator.placed_share,
+        waiting_scans=estimator.waiting_scans,
         gates=(float(chdtri(1, 1.0 - quantile)), float(chdtri(2, 1.0 - quantile))),
-    )
-
-
-def _map(cfg: RadioConfig, sigma_db: float) -> ShadowingMap:
-    spacing_m, length_m = cfg.estimator.shadowing_grid_m, cfg.path_loss.shadowing_length_m
-    return ShadowingMap(cfg.workspace.size_m, spacing_m, sigma_db, length_m)
-
-
-def _moving(cfg: RadioConfig, sigma_db: float) -> MovingRadio:
-    estimator = cfg.estimator
-    return MovingRadio(
-        cfg.follow.target,
-        estimator.target_speed_sigma_m_s,
-        estimator.target_course_time_s,
-        sigma_db,
-        cfg.path_loss.shadowing_length_m,
-        cfg.workspace.size_m,
     )
 
 
@@ -188,16 +99,3 @@ def scan_of(cfg: RadioConfig) -> ReflectorScan:
     """How the scans of a configuration are read."""
     scan = cfg.scan
     return ReflectorScan(scan.readings, scan.bearing_sigma_rad, scan.loss_tolerance)
-
-
-def odometry_of(cfg: RadioConfig, time_s: float, wheels: WheelAngles) -> Odometry:
-    """What the wheels tell, as the motion model takes it."""
-    interval_s = wheels.interval_s
-    if cfg.vehicle.kind == "ackermann":
-        return Steering(time_s, interval_s, wheels.speed_m_s, wheels.steer_rad)
-    return Increment(time_s, interval_s, wheels.speed_m_s * interval_s, wheels.turn_rate_rad_s * interval_s)
-
-
-def readings_of(time_s: float, results: Iterable[SignalMeasurements | ScanResult]) -> list[RssiReading]:
-    """Scan results as readings of the filter."""
-    return [RssiReading(time_s, seen.beacon, seen.rssi_dbm, seen.bearing_rad) for seen in results]

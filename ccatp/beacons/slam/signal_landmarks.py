@@ -1,13 +1,7 @@
-"""Static radios that are not on the map yet: their readings wait, with the poses they were taken at.
-
-What levels and bearings should be, with their derivatives by pose, place of the radio and shadowing.
-
-The radio that moves: how its place, its velocity and its shadowing go on between two readings.
-
-Static shadowing as a filter can hold it: values at the points of a grid, and how a place follows from them.
-"""
+"""Radios of ``SignalSlam``: rows of their readings, those that wait for a place, the one that moves, shadowing."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from math import atan2, cos, exp, hypot, log, log10, pi, sin, sqrt
 from typing import NamedTuple
 
@@ -15,7 +9,7 @@ import numpy as np
 
 from ccatp.beacons.slam.motion import POSE
 from ccatp.beacons.slam.path_loss import PathLoss
-from ccatp.beacons.slam.recording import BeaconId, RssiReading
+from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, RssiReading
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.ekf_slam import Columns, EkfSlam, Update, columns_of
 
@@ -73,41 +67,27 @@ def rows_of(sights: Sequence[RadioModel], radio: slice, path_loss: PathLoss, bea
         residuals, H = np.zeros(len(variances)), np.zeros((len(variances), columns.size))
         row = 0
         for sight in sights:
-            row = _fill(sight, values, at[sight.pose], first, path_loss, residuals, H, row)
+            pose, shadow = at[sight.pose], sight.shadow
+            x_m, y_m, heading = values[pose : pose + POSE].tolist()
+            dx, dy = (values[first : first + PLACE] - (x_m, y_m)).tolist()
+            r = max(hypot(dx, dy), _NEAREST_M)
+            q = r * r
+            states = values[values.size - shadow.size :]
+            expected = path_loss.reference_dbm - 10.0 * path_loss.exponent * log10(r) + float(shadow @ states)
+            residuals[row] = sight.reading.rssi_dbm - expected
+            slope = _DB_PER_NEPER * path_loss.exponent / q
+            H[row, pose : pose + PLACE] = slope * dx, slope * dy
+            H[row, first : first + PLACE] = -slope * dx, -slope * dy
+            H[row, H.shape[1] - shadow.size :] = shadow
+            row += 1
+            if sight.reading.bearing_rad is not None:
+                residuals[row] = wrap_pi(sight.reading.bearing_rad - (atan2(dy, dx) - heading))
+                H[row, pose : pose + POSE] = dy / q, -dx / q, -1.0
+                H[row, first : first + PLACE] = -dy / q, dx / q
+                row += 1
         return residuals, H
 
     return SignalRows(columns, linearise, np.array(variances))
-
-
-def _fill(
-    sight: RadioModel,
-    values: FloatArray,
-    pose: int,
-    radio: int,
-    path_loss: PathLoss,
-    residuals: FloatArray,
-    H: FloatArray,
-    row: int,
-) -> int:  # fmt: skip
-    x, y, heading = values[pose : pose + POSE].tolist()
-    dx, dy = (values[radio : radio + PLACE] - (x, y)).tolist()
-    r = max(hypot(dx, dy), _NEAREST_M)
-    q = r * r
-    shadow = sight.shadow
-    states = values[values.size - shadow.size :]
-    expected = path_loss.reference_dbm - 10.0 * path_loss.exponent * log10(r) + float(shadow @ states)
-    residuals[row] = sight.reading.rssi_dbm - expected
-    slope = _DB_PER_NEPER * path_loss.exponent / q
-    H[row, pose : pose + PLACE] = slope * dx, slope * dy
-    H[row, radio : radio + PLACE] = -slope * dx, -slope * dy
-    H[row, H.shape[1] - shadow.size :] = shadow
-    bearing_rad = sight.reading.bearing_rad
-    if bearing_rad is None:
-        return row + 1
-    residuals[row + 1] = wrap_pi(bearing_rad - (atan2(dy, dx) - heading))
-    H[row + 1, pose : pose + POSE] = dy / q, -dx / q, -1.0
-    H[row + 1, radio : radio + PLACE] = -dy / q, dx / q
-    return row + 2
 
 
 _ITERATIONS = 12
@@ -135,13 +115,6 @@ class SignalPrior(NamedTuple):
     sigmas: FloatArray
 
 
-class PositionHypothesis(NamedTuple):
-    """What the waiting readings say of a radio: mean (b,) and covariance (b, b)."""
-
-    mean: FloatArray
-    covariance: FloatArray
-
-
 class _Share(NamedTuple):
     """What one radio says of the poses, once it is eliminated: y = H c + noise of covariance S.
 
@@ -167,30 +140,25 @@ RowsAt = Callable[[list[SignalRecord], Callable[[PoseKey], int], slice], SignalR
 class SignalLandmarkInitializer:
     """Waiting readings of radios, and copies of the poses they belong to.
 
-    A level of which the shadowing is unknown tells the range to a factor; an update that is linearised there is wrong
-    later, when bearings from elsewhere have told the range. So the readings of a new radio wait, with copies of the
+    A level of unknown shadowing gives the range up to a factor; an update that is linearised there is wrong later, when
+    bearings from elsewhere have given the range. So the readings of a new radio wait, with copies of the
     poses in the state, until they place it. Meanwhile their most probable places are found beside the filter, by
     Gauss-Newton on poses and radios together with each radio eliminated in turn, and what that says of the rest of the
     state can be had without changing it.
+
+    Attributes:
+        records: what waits, by radio.
+        guesses: the most probable places of the radios that wait.
     """
 
     def __init__(self, engine: EkfSlam) -> None:
         self._engine = engine
-        self._records: dict[BeaconId, list[SignalRecord]] = {}
+        self.records: dict[BeaconId, list[SignalRecord]] = {}
         self._count = 0
         self._keys: list[PoseKey] = []
         self._poses: FloatArray = np.empty(0)
         self._rows: FloatArray | None = None  # of the poses and, last, y; noise of unit variance
-        self.guesses: dict[BeaconId, PositionHypothesis] = {}
-
-    @property
-    def names(self) -> list[BeaconId]:
-        """Radios that wait."""
-        return list(self._records)
-
-    def records(self, beacon: BeaconId) -> list[SignalRecord]:
-        """What waits of a radio."""
-        return self._records.get(beacon, [])
+        self.guesses: dict[BeaconId, BeaconEstimate] = {}
 
     def keep_pose(self) -> PoseKey:
         """Copy the vehicle's pose into the state."""
@@ -199,16 +167,12 @@ class SignalLandmarkInitializer:
         self._engine.augment(key, self._engine.mean[:POSE].copy(), columns_of(range(POSE)), np.eye(POSE))
         return key
 
-    def add(self, reading: RssiReading, pose: PoseKey) -> None:
-        """A reading begins to wait."""
-        self._records.setdefault(reading.beacon, []).append(SignalRecord(reading, pose))
-
     def drop(self, beacon: BeaconId) -> None:
         """Forget what waits of a radio, and the poses that nothing else waits for."""
-        self._records.pop(beacon, None)
+        self.records.pop(beacon, None)
         self.guesses.pop(beacon, None)
         self._rows = None
-        used = {record.pose for records in self._records.values() for record in records}
+        used = {record.pose for records in self.records.values() for record in records}
         for block in self._engine.blocks:
             if isinstance(block, PoseKey) and block not in used:
                 self._engine.remove(block)
@@ -216,13 +180,13 @@ class SignalLandmarkInitializer:
     def solve(self, priors: Mapping[BeaconId, SignalPrior], rows_at: RowsAt) -> None:
         """Find the most probable places of the radios from all that waits of them."""
         engine = self._engine
-        records = [record for beacon in priors for record in self._records[beacon]]
+        records = [record for beacon in priors for record in self.records[beacon]]
         self._keys = sorted({record.pose for record in records})
         columns = columns_of(*(engine.block(key) for key in self._keys))
         c, P = engine.mean.take(columns), engine.covariance[np.ix_(columns, columns)]
         place = {key: POSE * i for i, key in enumerate(self._keys)}
         rows = {
-            beacon: rows_at(self._records[beacon], place.__getitem__, slice(c.size, c.size + prior.mean.size))
+            beacon: rows_at(self.records[beacon], place.__getitem__, slice(c.size, c.size + prior.mean.size))
             for beacon, prior in priors.items()
         }
         means = {b: self.guesses[b].mean if b in self.guesses else prior.mean for b, prior in priors.items()}
@@ -236,11 +200,13 @@ class SignalLandmarkInitializer:
         stack = _stacked(shares.values())
         poses, covariance = _conditioned(c, P, stack)
         _advance(means, shares, priors, poses)
-        self._poses, self._rows = poses, _compressed(stack)
+        self._poses, self._rows = poses, stack
+        if stack.shape[0] > stack.shape[1]:
+            self._rows = np.asarray(np.linalg.qr(stack, mode="r"), dtype=np.float64)
         for beacon, share in shares.items():
             carried = share.gain @ share.H
             spread = share.covariance + carried @ covariance @ carried.T
-            self.guesses[beacon] = PositionHypothesis(means[beacon], 0.5 * (spread + spread.T))
+            self.guesses[beacon] = BeaconEstimate(means[beacon], 0.5 * (spread + spread.T))
 
     def linearisation(self, beacon: BeaconId) -> FloatArray:
         """The whole state, the poses that are kept where the guesses have them, and a radio of the state likewise.
@@ -304,12 +270,6 @@ def _stacked(shares: Iterable[_Share]) -> FloatArray:
     return np.asarray(np.vstack(parts), dtype=np.float64)
 
 
-def _compressed(stack: FloatArray) -> FloatArray:
-    if stack.shape[0] <= stack.shape[1]:
-        return stack
-    return np.asarray(np.linalg.qr(stack, mode="r"), dtype=np.float64)
-
-
 def _conditioned(c: FloatArray, P: FloatArray, stack: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Poses and their covariance after y = H c + noise of unit variance."""
     H, y = stack[:, :-1], stack[:, -1]
@@ -322,6 +282,7 @@ _TYPICAL = 0.4  # mean distance of two places in a square over its diagonal: 0.5
 _STATES = 4  # x_m, y_m, and the velocity
 
 
+@dataclass(frozen=True, slots=True)
 class MovingRadio:
     """A point whose velocity is a stationary process: v has the spread s by axis and forgets it over a time T.
 
@@ -332,26 +293,19 @@ class MovingRadio:
     (Singer 1970 with the velocity in place of the acceleration). Shadowing at both ends decorrelates with the ways of
     both: b <- c b with c = exp(-(d_vehicle + d_radio) / L), d_radio = sqrt(2) s t, and var(b) += sigma^2 (1 - c^2).
 
-    Args:
+    Attributes:
+        speed_sigma_m_s: s.
+        course_time_s: T.
         shadowing_sigma_db: sigma; 0: no such state.
         room_m: lengths of its walls; it never leaves the room.
     """
 
-    def __init__(
-        self,
-        beacon: BeaconId,
-        speed_sigma_m_s: float,
-        course_time_s: float,
-        shadowing_sigma_db: float,
-        shadowing_length_m: float,
-        room_m: tuple[float, float],
-    ) -> None:
-        self.beacon = beacon
-        self._speed_sigma_m_s = speed_sigma_m_s
-        self._course_time_s = course_time_s
-        self._shadowing_sigma_db = shadowing_sigma_db
-        self._shadowing_length_m = shadowing_length_m
-        self._room_m = room_m
+    beacon: BeaconId
+    speed_sigma_m_s: float
+    course_time_s: float
+    shadowing_sigma_db: float
+    shadowing_length_m: float
+    room_m: tuple[float, float]
 
     def join(self, engine: EkfSlam, bearing_rad: float) -> None:
         """Begin in the direction of a first bearing, anywhere in the room; the reading itself is to follow.
@@ -359,10 +313,10 @@ class MovingRadio:
         In polar coordinates about the vehicle: the direction is spread over the circle, and the distance as between
         two places in the room, by a factor of two about 0.4 of its diagonal.
         """
-        direction, log_range = float(engine.mean[2]) + bearing_rad, log(_TYPICAL * hypot(*self._room_m))
-        behind = [self._speed_sigma_m_s] * 2
-        if self._shadowing_sigma_db > 0.0:
-            behind.append(self._shadowing_sigma_db)
+        direction, log_range = float(engine.mean[2]) + bearing_rad, log(_TYPICAL * hypot(*self.room_m))
+        behind = [self.speed_sigma_m_s] * 2
+        if self.shadowing_sigma_db > 0.0:
+            behind.append(self.shadowing_sigma_db)
         spread = np.array([pi, log(2.0), *behind])
         mean = np.zeros(spread.size)
         mean[:PLACE] = direction, log_range
@@ -371,17 +325,13 @@ class MovingRadio:
         self._to_plane(engine)
 
     def update(
-        self,
-        engine: EkfSlam,
-        reading: RssiReading,
-        path_loss: PathLoss,
-        bearing_sigma_rad: float,
+        self, engine: EkfSlam, reading: RssiReading, path_loss: PathLoss, bearing_sigma_rad: float,
         gates: Sequence[float],
-    ) -> Update:
+    ) -> Update:  # fmt: skip
         """Condition on a reading, in polar coordinates about the vehicle.
 
         There level and bearing are linear: z = P_ref - (10 eta / ln 10) ln r + b, beta = direction - heading. In the
-        plane a level has another slope at each estimate, and many levels with one unknown b would seem to tell the
+        plane a level has another slope at each estimate, and many levels with one unknown b would seem to give the
         range (modified polar coordinates, Aidala and Hammel 1983).
 
         Args:
@@ -393,7 +343,7 @@ class MovingRadio:
         columns = columns_of((2,), block)
         x = engine.mean.take(columns)
         H = np.zeros((1 if reading.bearing_rad is None else 2, columns.size))
-        H[0, 2], H[0, 1 + _STATES :] = -slope, self.shadowing_row
+        H[0, 2], H[0, 1 + _STATES :] = -slope, 1.0  # the shadowing state, if there is one
         residual = np.array([reading.rssi_dbm - path_loss.reference_dbm - float(H[0] @ x)])
         variances = [path_loss.sigma_db**2]
         if reading.bearing_rad is not None:
@@ -418,37 +368,28 @@ class MovingRadio:
         x, y = engine.mean[:PLACE].tolist()
         _transformed(engine, start, np.array(((-dy, dx), (dx, dy))), np.eye(PLACE), (x + dx, y + dy))
 
-    @property
-    def shadowing_row(self) -> FloatArray:
-        """Derivative of a level by the shadowing state; empty without one."""
-        return np.ones(1) if self._shadowing_sigma_db > 0.0 else np.empty(0)
-
     def predict(self, engine: EkfSlam, interval_s: float, travel_m: float) -> None:
         """Carry the radio's block on over an interval in which the vehicle travelled so far."""
         block = engine.block(self.beacon)
-        F, Q = self._step(interval_s, travel_m)
-        P, x = engine.covariance, engine.mean
-        x[block] = F @ x[block]
-        P[block] = F @ P[block]
-        P[:, block] = P[:, block] @ F.T
-        P[block, block] += Q
-
-    def _step(self, t: float, travel_m: float) -> tuple[FloatArray, FloatArray]:
-        s2, T = self._speed_sigma_m_s**2, self._course_time_s
-        a = exp(-t / T)
-        size = _STATES + self.shadowing_row.size
+        s2, T = self.speed_sigma_m_s**2, self.course_time_s
+        a = exp(-interval_s / T)
+        size = block.stop - block.start
         F, Q = np.eye(size), np.zeros((size, size))
         for p, v in ((0, 2), (1, 3)):
             F[p, v], F[v, v] = T * (1.0 - a), a
             Q[v, v] = s2 * (1.0 - a * a)
             Q[p, v] = Q[v, p] = s2 * T * (1.0 - a) ** 2
-            Q[p, p] = s2 * T * (2.0 * t - T * (1.0 - a) * (3.0 - a))
+            Q[p, p] = s2 * T * (2.0 * interval_s - T * (1.0 - a) * (3.0 - a))
         if size > _STATES:
-            way_m = travel_m + sqrt(2.0) * self._speed_sigma_m_s * t
-            c = exp(-way_m / self._shadowing_length_m)
+            way_m = travel_m + sqrt(2.0) * self.speed_sigma_m_s * interval_s
+            c = exp(-way_m / self.shadowing_length_m)
             F[_STATES, _STATES] = c
-            Q[_STATES, _STATES] = self._shadowing_sigma_db**2 * (1.0 - c * c)
-        return F, Q
+            Q[_STATES, _STATES] = self.shadowing_sigma_db**2 * (1.0 - c * c)
+        P, x = engine.covariance, engine.mean
+        x[block] = F @ x[block]
+        P[block] = F @ P[block]
+        P[:, block] = P[:, block] @ F.T
+        P[block, block] += Q
 
 
 def _transformed(

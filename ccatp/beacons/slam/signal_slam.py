@@ -1,4 +1,4 @@
-"""EKF-SLAM among radios of which levels and bearings are heard: static shadowing on the map, one that moves."""
+"""EKF-SLAM by levels and bearings of radios: static shadowing on the map, one radio that moves."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -6,10 +6,10 @@ from math import cos, hypot, sin, sqrt
 
 import numpy as np
 
-from ccatp.beacons.slam.motion import POSE, MotionModel, Odometry, VehiclePose
+from ccatp.beacons.slam.motion import POSE, Odometry, SlippingVehicle, VehiclePose
 from ccatp.beacons.slam.path_loss import PathLoss
-from ccatp.beacons.slam.range_slam import BeaconEstimate, BeaconInnovation
-from ccatp.beacons.slam.recording import BeaconId, RssiReading
+from ccatp.beacons.slam.range_slam import BeaconInnovation
+from ccatp.beacons.slam.recording import BeaconEstimate, BeaconId, RssiReading
 from ccatp.beacons.slam.signal_landmarks import (
     PLACE,
     MovingRadio,
@@ -23,7 +23,7 @@ from ccatp.beacons.slam.signal_landmarks import (
     rows_of,
 )
 from ccatp.core import FloatArray
-from ccatp.filters.ekf_slam import Columns, EkfSlam, Update, columns_of
+from ccatp.filters.ekf_slam import EkfSlam, Update, columns_of
 
 _POSE_COLUMNS = columns_of(range(POSE))
 _ITERATIONS = 4
@@ -45,7 +45,7 @@ class SignalSettings:
         gates: largest normalised innovation squared that is used, of one row and of two.
     """
 
-    motion: MotionModel
+    motion: SlippingVehicle
     path_loss: Mapping[BeaconId, PathLoss]
     default: PathLoss
     bearing_sigma_rad: float
@@ -80,24 +80,24 @@ class SignalSlam:
         P[range(POSE, v), range(POSE, v)] = sigmas**2
         self.engine = EkfSlam(mean, P)
         self.learned: list[BeaconInnovation] = []
-        self.newcomers = SignalLandmarkInitializer(self.engine)
+        self.waiting = SignalLandmarkInitializer(self.engine)
 
     @property
     def pose(self) -> VehiclePose:
         """The vehicle; the heading does not wrap."""
-        return VehiclePose(*self.newcomers.conditioned(_POSE_COLUMNS)[0].tolist())
+        return VehiclePose(*self.waiting.conditioned(_POSE_COLUMNS)[0].tolist())
 
     @property
     def pose_covariance(self) -> FloatArray:
         """Of x_m, y_m, heading_rad, shape (3, 3)."""
-        return self.newcomers.conditioned(_POSE_COLUMNS)[1]
+        return self.waiting.conditioned(_POSE_COLUMNS)[1]
 
     @property
     def beacons(self) -> dict[BeaconId, BeaconEstimate]:
         """The map: places alone, x_m and y_m."""
         found = {
             beacon: BeaconEstimate(guess.mean[:PLACE], guess.covariance[:PLACE, :PLACE])
-            for beacon, guess in self.newcomers.guesses.items()
+            for beacon, guess in self.waiting.guesses.items()
         }
         return found | {beacon: self._place(beacon) for beacon in self._names()}
 
@@ -144,8 +144,8 @@ class SignalSlam:
         Raises:
             BlockError: it is not on the map.
         """
-        if beacon in self.newcomers.names:
-            self.newcomers.drop(beacon)
+        if beacon in self.waiting.records:
+            self.waiting.drop(beacon)
             return
         self.engine.remove(beacon)
 
@@ -157,7 +157,7 @@ class SignalSlam:
         """
         start = self.engine.block(beacon).start
         columns = columns_of(range(PLACE), range(start, start + PLACE))
-        mean, covariance = self.newcomers.conditioned(columns)
+        mean, covariance = self.waiting.conditioned(columns)
         x, y, bx, by = mean.tolist()
         r = max(hypot(bx - x, by - y), _NEAREST_M)
         h = np.array((x - bx, y - by, bx - x, by - y)) / r
@@ -181,7 +181,7 @@ class SignalSlam:
         """
         starts = [self.engine.block(beacon).start for beacon in beacons]
         columns = columns_of(range(POSE), *(range(start, start + PLACE) for start in starts))
-        return self.newcomers.conditioned(columns)
+        return self.waiting.conditioned(columns)
 
     def path_loss_of(self, beacon: BeaconId) -> PathLoss:
         """The calibration of a radio."""
@@ -192,7 +192,7 @@ class SignalSlam:
 
     def _place(self, beacon: BeaconId) -> BeaconEstimate:
         start = self.engine.block(beacon).start
-        return BeaconEstimate(*self.newcomers.conditioned(columns_of(range(start, start + PLACE))))
+        return BeaconEstimate(*self.waiting.conditioned(columns_of(range(start, start + PLACE))))
 
     def _is_moving(self, beacon: BeaconId) -> bool:
         return self.settings.moving is not None and beacon == self.settings.moving.beacon
@@ -208,53 +208,50 @@ class SignalSlam:
         mean[:PLACE] = pose[0] + range_m * cos(way_rad), pose[1] + range_m * sin(way_rad)
         return SignalPrior(mean, np.array(spread))
 
-    def _augment(self, beacon: BeaconId, prior: SignalPrior) -> None:
-        none: Columns = np.empty(0, dtype=np.intp)
-        size = prior.mean.size
-        self.engine.augment(beacon, prior.mean, none, np.zeros((size, 0)), np.eye(size), np.diag(prior.sigmas**2))
-
     def _wait(self, readings: list[RssiReading]) -> None:
         if not readings:
             return
-        pose = self.newcomers.keep_pose()
+        pose = self.waiting.keep_pose()
         for reading in readings:
-            self.newcomers.add(reading, pose)
+            self.waiting.records.setdefault(reading.beacon, []).append(SignalRecord(reading, pose))
         priors = {}
-        for beacon in self.newcomers.names:
-            with_bearing = (r for r in self.newcomers.records(beacon) if r.reading.bearing_rad is not None)
+        for beacon in self.waiting.records:
+            with_bearing = (r for r in self.waiting.records[beacon] if r.reading.bearing_rad is not None)
             if first := next(with_bearing, None):  # a level alone is a circle
                 at = self.engine.mean[self.engine.block(first.pose)].tolist()
                 priors[beacon] = self._prior(first.reading, first.reading.bearing_rad or 0.0, at)
         if not priors:
             return
-        self.newcomers.solve(priors, self._rows_at)
+        self.waiting.solve(priors, self._rows_at)
         ready = [beacon for beacon in priors if self._is_ready(beacon)]
         for beacon in ready:
             self._settle(beacon, priors[beacon])
         if left := {beacon: prior for beacon, prior in priors.items() if beacon not in ready and ready}:
-            self.newcomers.solve(left, self._rows_at)
+            self.waiting.solve(left, self._rows_at)
 
     def _is_ready(self, beacon: BeaconId) -> bool:
-        if len(self.newcomers.records(beacon)) >= self.settings.waiting_scans:
+        if len(self.waiting.records[beacon]) >= self.settings.waiting_scans:
             return True
-        guess, pose = self.newcomers.guesses[beacon], self.engine.mean
+        guess, pose = self.waiting.guesses[beacon], self.engine.mean
         range_m = hypot(guess.mean[0] - pose[0], guess.mean[1] - pose[1])
         largest = float(np.linalg.eigvalsh(guess.covariance[:PLACE, :PLACE])[-1])
         return largest < (self.settings.placed_share * range_m) ** 2
 
     def _settle(self, beacon: BeaconId, prior: SignalPrior) -> None:
-        self._augment(beacon, prior)
+        none, size = np.empty(0, dtype=np.intp), prior.mean.size
+        self.engine.augment(beacon, prior.mean, none, np.zeros((size, 0)), np.eye(size), np.diag(prior.sigmas**2))
         rows = self._rows_at(
-            self.newcomers.records(beacon), lambda key: self.engine.block(key).start, self.engine.block(beacon)
+            self.waiting.records[beacon], lambda key: self.engine.block(key).start, self.engine.block(beacon)
         )
-        x = self.newcomers.linearisation(beacon)
+        x = self.waiting.linearisation(beacon)
         residual, H = rows.linearise(x)
         off = residual + H @ (x - self.engine.mean)[rows.columns]
         self.engine.update(rows.columns, H, off, rows.variances)
-        self.newcomers.drop(beacon)
+        self.waiting.drop(beacon)
 
     def _update(self, reading: RssiReading) -> Update:
-        rows = self._rows([self._sight(reading, 0)], reading.beacon, self.engine.block(reading.beacon))
+        radio, path_loss = self.engine.block(reading.beacon), self.path_loss_of(reading.beacon)
+        rows = rows_of([self._sight(reading, 0)], radio, path_loss, self.settings.bearing_sigma_rad)
         gate = self.settings.gates[rows.variances.size - 1]
         return self.engine.update_iterated(rows.columns, rows.linearise, rows.variances, _ITERATIONS, gate)
 
@@ -275,19 +272,12 @@ class SignalSlam:
         for record in records:
             place = self.engine.block(record.pose).start
             sights.append(self._sight(record.reading, place)._replace(pose=pose_at(record.pose)))
-        return self._rows(sights, records[0].reading.beacon, radio)
-
-    def _rows(self, sights: list[RadioModel], beacon: BeaconId, radio: slice) -> SignalRows:
-        return rows_of(sights, radio, self.path_loss_of(beacon), self.settings.bearing_sigma_rad)
+        path_loss = self.path_loss_of(records[0].reading.beacon)
+        return rows_of(sights, radio, path_loss, self.settings.bearing_sigma_rad)
 
     def _sight(self, reading: RssiReading, pose: int) -> RadioModel:
         x_m, y_m = self.engine.mean[pose : pose + PLACE].tolist()
-        shadow, rest_db2 = self._shadow(reading.beacon, x_m, y_m)
+        shadow, rest_db2 = np.empty(0), self.settings.shadowing_sigma_db**2
+        if self.settings.shadowing is not None:
+            shadow, rest_db2 = self.settings.shadowing.row(x_m, y_m)
         return RadioModel(reading, pose, shadow, self.path_loss_of(reading.beacon).sigma_db ** 2 + rest_db2)
-
-    def _shadow(self, beacon: BeaconId, x_m: float, y_m: float) -> tuple[FloatArray, float]:
-        """Derivatives of a level by the shadowing states, which end a radio's block, and the variance of the rest."""
-        settings = self.settings
-        if settings.shadowing is None:
-            return np.empty(0), settings.shadowing_sigma_db**2
-        return settings.shadowing.row(x_m, y_m)

@@ -17,6 +17,7 @@ from ccatp.beacons.mission import (
     wheel_rates,
 )
 from ccatp.beacons.navigation import MeasurementReader, PoseBelief, SelfMap
+from ccatp.beacons.slam.motion import Steering
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.beacons.store import BeaconStore, BeaconStoreError
 from ccatp.config.beacon_models import RadioConfig
@@ -163,6 +164,7 @@ def test_wheels_steering_and_scans_are_read_from_the_link(cfg: RadioConfig) -> N
     robot.drive(1, 1.0, 1.0, None, 0.3)
     robot.advance()
     (wheels,) = reader.read(*frame_of(robot)).wheels
+    assert isinstance(wheels, Steering)
     assert wheels.interval_s == pytest.approx(0.1)
     assert wheels.speed_m_s == pytest.approx(cfg.robot.wheel_radius_m, abs=5 * cfg.sim.vehicle.speed_sigma_m_s)
     assert wheels.steer_rad == pytest.approx(0.3, abs=5 * cfg.sim.vehicle.steer_sigma_rad)
@@ -176,7 +178,7 @@ def test_a_scan_on_the_link_keeps_its_directions() -> None:
     packets = MeasurementReader(cfg).read(*frame_of(robot)).packets
     assert len(packets) == 4 * cfg.scan.readings
     step = 2 * pi / cfg.scan.readings
-    assert {round(packet.direction_rad / step, 6) % cfg.scan.readings for packet in packets} == set(range(40))
+    assert {round(direction_rad / step, 6) % cfg.scan.readings for _, direction_rad, _ in packets} == set(range(40))
     assert len(robot.delivered_line) < 8192
 
 

@@ -71,12 +71,7 @@ def track_of(turned: RigidMotion, *, beacons: bool = True) -> EstimatedPath:
         if beacons
         else {},
         calibration={},
-        nis=np.empty(0),
-        nis_sizes=np.empty(0),
         refused=0,
-        update_s=np.empty(0),
-        predict_s=np.empty(0),
-        scalar_s=np.empty(0),
         updates=0,
         warnings=(),
     )

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from math import atan2, cos, hypot, log10, pi, sin
+from math import atan2, cos, hypot, log10, sin
 from statistics import median
 from time import perf_counter
 
@@ -13,7 +13,6 @@ from ccatp.beacons.datasets.checks import suspicions
 from ccatp.beacons.datasets.trajectory import bridged
 from ccatp.beacons.slam.batch_smoother import smooth
 from ccatp.beacons.slam.beacon_map import (
-    BearingModel,
     GaussMarkovBias,
     HeadingTransport,
     NoiseLevel,
@@ -24,21 +23,21 @@ from ccatp.beacons.slam.beacon_map import (
 )
 from ccatp.beacons.slam.causal import filter_run
 from ccatp.beacons.slam.evaluation import judge, result_data
-from ccatp.beacons.slam.landmark_init import derivatives, wrapped
+from ccatp.beacons.slam.landmark_init import derivatives
 from ccatp.beacons.slam.measurement_models import MeasurementError, MeasurementModels, MeasurementRow
-from ccatp.beacons.slam.motion import DeadReckoning, DifferentialDrive, DifferentialNoise, Increment, Odometry
-from ccatp.beacons.slam.range_slam import AddedPoseNoise, BeaconEstimate, BeaconSlam
+from ccatp.beacons.slam.motion import DeadReckoning, DifferentialDrive, DifferentialNoise, Increment
+from ccatp.beacons.slam.range_slam import AddedPoseNoise, BeaconSlam
 from ccatp.beacons.slam.recording import (
+    BeaconEstimate,
     BeaconId,
     EstimatedPath,
-    RangeBearingReading,
     RangeReading,
     Reading,
     RecordedRun,
     RssiReading,
     Steps,
 )
-from ccatp.beacons.slam.settings import batch_settings, slam_settings
+from ccatp.beacons.slam.settings import slam_settings
 from ccatp.config.load import load_recordings_config
 from ccatp.core import FloatArray, wrap_pi
 from ccatp.filters.ekf_slam import BlockError, EkfSlam
@@ -46,7 +45,7 @@ from tests.unit.beacons.datasets.sets import recorded, world
 
 TRUST = RobustLoss(6.0, 3.0, 100.0, 5.0, 3, 20, 0.3, 0.3, True)
 MOTION = DifferentialNoise(0.01, 0.0, 0.005, 0.005, 0.0, 0.0)
-SETTINGS = SlamSettings(DifferentialDrive(MOTION), TRUST, RangeModel(0.05, 0.0, 0.0, 0.0), BearingModel(0.03))
+SETTINGS = SlamSettings(DifferentialDrive(MOTION), TRUST, RangeModel(0.05, 0.0, 0.0, 0.0), 0.03)
 BEACONS: dict[BeaconId, tuple[float, float]] = {"a": (4.0, 1.0), "b": (2.0, 6.0), "c": (-3.0, 4.0), "d": (-1.0, -2.0)}
 P0 = np.diag((1e-6, 1e-6, 1e-6))
 Sense = Callable[[float, "World", BeaconId], Reading]
@@ -95,7 +94,7 @@ def ranges(time_s: float, world: World, beacon: BeaconId) -> Reading:
 def both(time_s: float, world: World, beacon: BeaconId) -> Reading:
     range_m = world.range_m(beacon) + 0.05 * world.rng.normal()
     bearing_rad = wrap_pi(world.bearing_rad(beacon) + 0.03 * world.rng.normal())
-    return RangeBearingReading(time_s, beacon, range_m, bearing_rad)
+    return RangeReading(time_s, beacon, range_m, bearing_rad)
 
 
 def start(settings: SlamSettings = SETTINGS, sense: Sense = both) -> World:
@@ -116,7 +115,7 @@ def test_range_and_bearing_join_at_once_and_any_may_be_missing() -> None:
 
 
 def test_the_first_covariance_is_that_of_range_and_bearing() -> None:
-    world = start(sense=lambda t, w, b: RangeBearingReading(t, b, w.range_m(b), w.bearing_rad(b)))
+    world = start(sense=lambda t, w, b: RangeReading(t, b, w.range_m(b), w.bearing_rad(b)))
     world.drive(1, turn_rad=0.0)
     range_m, angle = world.range_m("a"), world.bearing_rad("a")
     turn = np.array(((cos(angle), -sin(angle)), (sin(angle), cos(angle))))
@@ -227,7 +226,7 @@ def test_an_outlier_is_refused_and_long_readings_weigh_little() -> None:
     world.drive(100)
     before = world.slam.pose
     bearing = world.bearing_rad("a")
-    learned = world.slam.observe([RangeBearingReading(world.time_s, "a", world.range_m("a") + 3.0, bearing)])
+    learned = world.slam.observe([RangeReading(world.time_s, "a", world.range_m("a") + 3.0, bearing)])
     assert not learned[0].accepted
     assert learned[0].nis > 36.0
     assert hypot(world.slam.pose.x_m - before.x_m, world.slam.pose.y_m - before.y_m) < 0.01
@@ -362,7 +361,7 @@ SETTINGS_SIGHTINGS = SlamSettings(
     MOTION_SIGHTINGS,
     TRUST_SIGHTINGS,
     RangeModel(0.1, 0.02, 0.1, 0.3),
-    BearingModel(0.05),
+    0.05,
     RssiModel(2.0, -40.0, 3.0, 2.0, 0.3),
 )
 POSE, CALIBRATION, BEACON = [1.0, 2.0, 0.4], [0.06, -0.1], [4.0, 6.0, -37.0, 2.2]
@@ -400,11 +399,6 @@ def test_values_of_the_rows() -> None:
     assert row_at(sensors, "bearing", x).expected == pytest.approx(np.arctan2(4.0, 3.0) - 0.4)
 
 
-def test_an_angle_goes_the_short_way_round() -> None:
-    assert wrapped(pi - 0.1, -pi + 0.1, is_angle=True) == pytest.approx(-0.2)
-    assert wrapped(7.0, 0.5, is_angle=False) == 6.5
-
-
 @pytest.mark.parametrize("kind", ["range", "bearing"])
 def test_jacobian_through_the_delay(kind: str) -> None:
     sensors, clock = MeasurementModels(SETTINGS_SIGHTINGS), DeadReckoning(is_delayed=True)
@@ -423,12 +417,11 @@ def test_jacobian_through_the_delay(kind: str) -> None:
 
 def test_steps_wait_until_they_are_due() -> None:
     clock = DeadReckoning(is_delayed=True)
-    done: list[Odometry] = []
+    done: list[Increment] = []
     for k in range(10):
         done += clock.due(Increment(0.1 * (k + 1), 0.1, 0.05, 0.02), 0.25)
-    steps = [step for step in done if isinstance(step, Increment)]
-    assert sum(step.distance_m for step in steps) == pytest.approx(0.05 * 7.5)
-    assert sum(step.turn_rad for step in steps) == pytest.approx(0.02 * 7.5)
+    assert sum(step.distance_m for step in done) == pytest.approx(0.05 * 7.5)
+    assert sum(step.turn_rad for step in done) == pytest.approx(0.02 * 7.5)
     assert done[-1].time_s == pytest.approx(0.75)
 
 
@@ -449,7 +442,7 @@ def test_a_sensor_that_nobody_described_is_refused() -> None:
     with pytest.raises(MeasurementError, match=r"no bearing model: give SlamSettings\.bearing"):
         sensors.bearing(POSE, [0.0, 0.0])
     assert sensors.names == ()
-    assert RangeBearingReading(0.0, 1, 1.0, 0.2).bearing_rad == 0.2
+    assert RangeReading(0.0, 1, 1.0, 0.2).bearing_rad == 0.2
 
 
 CONFIG = load_recordings_config(None, {})
@@ -478,7 +471,7 @@ def test_the_filter_finds_itself_again(begin_s: float, bearings: bool) -> None:
 
 def test_the_smoother_joins_both_ends() -> None:
     run = with_gap(60.0, 15.0, bearings=False)
-    found = judge(smooth(run, batch_settings(CONFIG.csv), perf_counter), run)
+    found = judge(smooth(run, CONFIG.csv, perf_counter), run)
     assert found.trajectory_rmse_m is not None
     assert found.trajectory_rmse_m < 0.3
     assert found.beacon_rmse_m is not None
@@ -557,7 +550,7 @@ def calibration_doubts_both(run: RecordedRun, **priors: float) -> list[Estimated
     cfg = CONFIG.csv.model_copy(update={"priors": wide})
     return [
         filter_run(run, slam_settings(cfg, CONFIG.filter), (0.05, 0.05), no_clock),
-        smooth(run, batch_settings(cfg), no_clock),
+        smooth(run, cfg, no_clock),
     ]
 
 
@@ -596,5 +589,5 @@ def test_a_value_that_its_prior_excludes_is_told_with_the_key(filter_name: str) 
 def test_names_that_mean_nothing_show_in_the_noise_of_the_smoother() -> None:
     run = recorded(world(3, 12.0), bearings=False)
     beacon = np.random.default_rng(1).integers(0, 4, run.readings.beacon.size)
-    told = smooth(replace(run, readings=run.readings._replace(beacon=beacon)), batch_settings(CONFIG.csv), no_clock)
+    told = smooth(replace(run, readings=run.readings._replace(beacon=beacon)), CONFIG.csv, no_clock)
     assert any("range readings are" in w and "times as noisy as assumed" in w for w in told.warnings)

@@ -1,6 +1,6 @@
 """EKF-SLAM by levels and bearings: derivatives against differences, consistency over seeds, what waits, what moves."""
 
-from math import hypot, log
+from math import cos, hypot, log, sin
 
 import numpy as np
 import pytest
@@ -62,6 +62,12 @@ def test_motion_noise_is_that_of_its_readings(kind: str) -> None:
         drawn.append(model.step(x, odometry).mean[:3])
     Q = model.step(x, ODOMETRY[kind]).Q[:3, :3]
     assert np.sqrt(np.diag(Q)) == pytest.approx(np.std(drawn, axis=0), rel=0.06)
+
+
+def test_the_front_axle_goes_where_its_wheel_points() -> None:
+    vehicle = SlippingVehicle("ackermann", 0.35, WheelNoise(0.01, 0.02, 0.0, 0.0))
+    end = vehicle.step(np.zeros(3), Steering(0.1, 0.1, 0.15, 0.4)).mean
+    assert end == pytest.approx((0.015 * cos(0.4), 0.015 * sin(0.4), 0.015 * sin(0.4) / 0.35))
 
 
 def test_wheels_that_stand_have_no_noise() -> None:

@@ -1,29 +1,44 @@
 """The batch problem against independent arithmetic: derivatives by differences, matrices by dense algebra."""
 
-from dataclasses import replace
-
 import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.linalg import LinAlgError
 
-from ccatp.beacons.slam.batch_odometry import CALIBRATION, BatchPriors, BatchSettings, RadioNoise, Reckoning, chained
-from ccatp.beacons.slam.batch_problem import BEACON, SHARED, BatchProblem, BatchState, Factored, repeats
-from ccatp.beacons.slam.batch_solver import t_cost, t_weights
-from ccatp.beacons.slam.motion import DifferentialNoise
+from ccatp.beacons.slam.batch_odometry import CALIBRATION, Reckoning, chained
+from ccatp.beacons.slam.batch_problem import BEACON, SHARED, BatchProblem, BatchState, repeats
+from ccatp.beacons.slam.batch_solver import Factored, t_cost, t_weights
 from ccatp.beacons.slam.recording import Readings, Steps, dead_reckoned
+from ccatp.config.recording_models import OdometryNoiseConfig, PriorsConfig, RadioNoiseConfig, RecordingConfig
 
 FloatArray = npt.NDArray[np.float64]
 DELAY = CALIBRATION.index("delay_s")
-ODOMETRY = DifferentialNoise(0.02, 0.01, 0.02, 0.05, 0.01, 0.015)
-RADIO = RadioNoise(0.1, 0.02, 0.03, 3.0, -40.0, 2.2, 5.0, 0.0)
-PRIORS = BatchPriors(0.1, 0.1, 0.05, 0.02, 0.2, 0.1, 0.3, 0.02, 5.0, 0.4, 0.1, 2.0, 0.05, 0.03)
-NO_PRIORS = replace(
-    PRIORS, distance_scale=0.0, turn_scale=0.0, turn_per_m=0.0, turn_bias_rad_s=0.0, delay_s=0.0, range_scale=0.0,
-    range_offset_m=0.0, bearing_offset_rad=0.0, rssi_reference_db=0.0, rssi_exponent=0.0, beacon_offset_m=0.0,
-    beacon_reference_db=0.0,
+ODOMETRY = OdometryNoiseConfig(
+    distance_per_sqrt_m=0.02,
+    distance_per_sqrt_rad=0.01,
+    turn_per_sqrt_m=0.02,
+    turn_per_sqrt_rad=0.05,
+    turn_per_sqrt_s=0.01,
+    lateral_per_sqrt_m=0.015,
+)
+RADIO = RadioNoiseConfig(
+    range_sigma_m=0.1,
+    range_sigma_per_m=0.02,
+    bearing_sigma_rad=0.03,
+    rssi_sigma_db=3.0,
+    rssi_reference_dbm=-40.0,
+    rssi_exponent=2.2,
+    freedom=5.0,
+    correlation_s=0.0,
+    gate_sigmas=5.0,
+)
+NO_PRIORS = PriorsConfig(**dict.fromkeys(PriorsConfig.model_fields, 0.0) | {"pose_m": 0.05, "heading_rad": 0.03})
+PRIORS = PriorsConfig(
+    distance_scale=0.1, turn_scale=0.1, turn_per_m=0.05, turn_bias_rad_s=0.02, delay_s=0.2, range_scale=0.1,
+    range_offset_m=0.3, bearing_offset_rad=0.02, rssi_reference_db=5.0, rssi_exponent=0.4, beacon_offset_m=0.1,
+    beacon_reference_db=2.0, pose_m=0.05, heading_rad=0.03,
 )  # fmt: skip
-SETTINGS = BatchSettings(ODOMETRY, RADIO, PRIORS)
+SETTINGS = RecordingConfig(odometry=ODOMETRY, radio=RADIO, priors=PRIORS)
 
 
 def steps(n: int = 60, rng: np.random.Generator | None = None) -> Steps:
@@ -66,22 +81,18 @@ def unflat(x: FloatArray, like: BatchState) -> BatchState:
     return BatchState(x[:n].reshape(-1, 3), x[n : n + len(SHARED)], x[n + len(SHARED) :].reshape(-1, BEACON))
 
 
-def half_squares(
-    made: BatchProblem, x: FloatArray, like: BatchState, weights: FloatArray, odometry: FloatArray
-) -> float:
+def half_squares(made: BatchProblem, x: FloatArray, like: BatchState, weights: FloatArray) -> float:
     """Half the weighted sum of squares, from the residuals alone; noise of the odometry as at ``like``."""
     state = unflat(x, like)
     at_like, found = made.residuals(like), made.residuals(state)
     W = at_like.odometry_information
-    total = np.einsum("k,ki,kij,kj->", odometry, found.odometry, W, found.odometry)
+    total = np.einsum("ki,kij,kj->", found.odometry, W, found.odometry)
     return float(0.5 * (total + (weights * found.chi2).sum())) + made.prior_cost(state)
 
 
-def dense(
-    made: BatchProblem, state: BatchState, weights: FloatArray, odometry: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def dense(made: BatchProblem, state: BatchState, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The normal equations as one full matrix and its right-hand side."""
-    system = made.normal_equations(state, weights, odometry)
+    system = made.normal_equations(state, weights)
     n, m = len(system.diagonal), len(system.corner)
     A = np.zeros((3 * n + m, 3 * n + m))
     for k in range(n):
@@ -97,15 +108,15 @@ def dense(
 
 def test_the_gradient_is_that_of_the_cost() -> None:
     made, state = problem()
-    weights, odometry = np.linspace(0.5, 1.5, 6), np.linspace(0.8, 1.2, len(state.poses) - 1)
-    _, side = dense(made, state, weights, odometry)
+    weights = np.linspace(0.5, 1.5, 6)
+    _, side = dense(made, state, weights)
     x = flat(state)
     h = 1e-6
     for k in range(x.size):
         step = np.zeros_like(x)
         step[k] = h
-        up = half_squares(made, x + step, state, weights, odometry)
-        down = half_squares(made, x - step, state, weights, odometry)
+        up = half_squares(made, x + step, state, weights)
+        down = half_squares(made, x - step, state, weights)
         if k != DELAY + state.poses.size:  # its derivative is taken across 50 ms: below
             assert -side[k] == pytest.approx((up - down) / (2.0 * h), rel=1e-4, abs=1e-4), k
 
@@ -126,8 +137,7 @@ def test_increments_by_the_delay() -> None:
 def test_the_matrix_is_that_of_the_residuals() -> None:
     """J^T W J by differences of the residuals."""
     made, state = problem()
-    ones, odometry = np.ones(6), np.ones(len(state.poses) - 1)
-    A, _ = dense(made, state, ones, odometry)
+    A, _ = dense(made, state, np.ones(6))
     found = made.residuals(state)
     roots = np.linalg.cholesky(found.odometry_information).transpose(0, 2, 1)
 
@@ -147,14 +157,13 @@ def test_the_matrix_is_that_of_the_residuals() -> None:
     assert A[np.ix_(keep, keep)] == pytest.approx(expected[np.ix_(keep, keep)], rel=1e-4, abs=1e-3)
 
 
-def test_factors_solution_determinant_and_covariance_are_those_of_the_full_matrix() -> None:
+def test_solution_and_covariances_are_those_of_the_full_matrix() -> None:
     made, state = problem()
-    A, side = dense(made, state, np.ones(6), np.ones(len(state.poses) - 1))
-    factored = Factored(made.normal_equations(state, np.ones(6), np.ones(len(state.poses) - 1)))
+    A, side = dense(made, state, np.ones(6))
+    factored = Factored(made.normal_equations(state, np.ones(6)))
     n = state.poses.size
     poses, shared = factored.solution()
     assert np.concatenate([poses.ravel(), shared]) == pytest.approx(np.linalg.solve(A, side), rel=1e-8)
-    assert factored.log_determinant() == pytest.approx(np.linalg.slogdet(A)[1])
     C = np.linalg.inv(A)
     assert factored.shared_covariance() == pytest.approx(C[n:, n:], rel=1e-6, abs=1e-12)
     for k, covariance in enumerate(factored.pose_covariances()):
@@ -163,16 +172,15 @@ def test_factors_solution_determinant_and_covariance_are_those_of_the_full_matri
 
 def test_damping_multiplies_the_diagonal() -> None:
     made, state = problem()
-    ones = np.ones(len(state.poses) - 1)
-    A, side = dense(made, state, np.ones(6), ones)
-    poses, shared = Factored(made.normal_equations(state, np.ones(6), ones), damping=0.5).solution()
+    A, side = dense(made, state, np.ones(6))
+    poses, shared = Factored(made.normal_equations(state, np.ones(6)), damping=0.5).solution()
     expected = np.linalg.solve(A + 0.5 * np.diag(np.diag(A)), side)
     assert np.concatenate([poses.ravel(), shared]) == pytest.approx(expected, rel=1e-8)
 
 
 def test_a_matrix_that_is_not_positive_definite_is_refused() -> None:
     made, state = problem()
-    system = made.normal_equations(state, np.ones(6), np.ones(len(state.poses) - 1))
+    system = made.normal_equations(state, np.ones(6))
     system.diagonal[2] *= -1.0
     with pytest.raises(LinAlgError, match="not positive definite"):
         Factored(system)
@@ -182,7 +190,7 @@ def test_what_has_no_prior_is_not_estimated() -> None:
     made, state = problem()
     fixed = BatchProblem(
         steps(), made.readings, np.union1d(steps().times_s[:1], made.readings.times_s), (0.1, -0.2, 0.3),
-        BatchSettings(ODOMETRY, RADIO, NO_PRIORS), np.array([True, False]),
+        RecordingConfig(odometry=ODOMETRY, radio=RADIO, priors=NO_PRIORS), np.array([True, False]),
     )  # fmt: skip
     assert np.flatnonzero(fixed.free).tolist() == [len(SHARED), len(SHARED) + 1]  # x and y of the first beacon
     assert fixed.residuals(state).information[1::2].sum() == 0.0  # readings of the other one count nothing

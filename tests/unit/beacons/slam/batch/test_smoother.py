@@ -5,21 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ccatp.beacons.slam.batch_odometry import BatchSettings
-from ccatp.beacons.slam.batch_smoother import smooth
-from ccatp.beacons.slam.batch_solver import place_by_distances
+from ccatp.beacons.slam.batch_smoother import place_by_distances, smooth
 from ccatp.beacons.slam.evaluation import judge
 from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun, Steps
-from ccatp.beacons.slam.settings import batch_settings
 from ccatp.config.load import load_recordings_config
+from ccatp.config.recording_models import RecordingConfig
 from tests.unit.beacons.datasets.sets import BEACONS, changed, recorded, world
 
-SETTINGS = batch_settings(load_recordings_config().csv)
+SETTINGS = load_recordings_config().csv
 
 
 def no_clock() -> float:
     """Time stands still."""
     return 0.0
+
+
+def with_priors(**priors: float) -> RecordingConfig:
+    return SETTINGS.model_copy(update={"priors": SETTINGS.priors.model_copy(update=priors)})
 
 
 def noisy(run: RecordedRun, seed: int, distance_scale: float = 1.0, bias_rad_s: float = 0.0) -> RecordedRun:
@@ -75,8 +77,7 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
     for seed in range(10):
         run = run_of(100 + seed, bearings=True, seconds=60.0)
         # priors that the simulation draws from: what is exact must be known as exact
-        tight = replace(
-            SETTINGS.priors,
+        tight = with_priors(
             distance_scale=0.0,
             turn_scale=0.0,
             turn_per_m=0.0,
@@ -85,9 +86,9 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
             range_offset_m=0.0,
             pose_m=1e-3,
             heading_rad=1e-3,
-        )
-        gaussian = replace(SETTINGS.radio, freedom=1e6, range_sigma_per_m=0.0)
-        track = smooth(run, BatchSettings(SETTINGS.odometry, gaussian, tight), no_clock)
+        ).priors
+        gaussian = SETTINGS.radio.model_copy(update={"freedom": 1e6, "range_sigma_per_m": 0.0})
+        track = smooth(run, SETTINGS.model_copy(update={"radio": gaussian, "priors": tight}), no_clock)
         judged = judge(track, run)
         assert judged.nees is not None
         paths.append(judged.nees.mean)
@@ -116,8 +117,7 @@ def test_outliers_hardly_move_it() -> None:
 
 
 def test_noise_wider_than_assumed_widens_the_covariance() -> None:
-    priors = replace(SETTINGS.priors, range_scale=0.0, range_offset_m=0.0, pose_m=1e-3, heading_rad=1e-3)
-    settings = replace(SETTINGS, priors=priors)
+    settings = with_priors(range_scale=0.0, range_offset_m=0.0, pose_m=1e-3, heading_rad=1e-3)
     run = noisy(recorded(world(6, 60.0, range_sigma_m=0.5, bearing_sigma_rad=0.25)), 6)
     usual = smooth(run_of(6, bearings=True, seconds=60.0), settings, no_clock)
     track = smooth(run, settings, no_clock)
@@ -151,7 +151,7 @@ def test_commands_that_the_vehicle_follows_late() -> None:
     )  # fmt: skip
     inside = lagged.readings.times_s < steps.times_s[-1]
     lagged = replace(lagged, steps=steps, readings=lagged.readings.where(inside))
-    settings = replace(SETTINGS, priors=replace(SETTINGS.priors, delay_s=0.3))
+    settings = with_priors(delay_s=0.3)
     delay, sigma = smooth(lagged, settings, no_clock).calibration["odometry_delay_s"]
     assert delay == pytest.approx(0.25, abs=max(4.0 * sigma, 0.02))
 
