@@ -1,9 +1,4 @@
-"""The map that fits all ranges best: sparse damped least squares with a robust loss, and its covariance.
-
-What the ranges of a network depend on: places of loose motes, poses of bodies, an offset and a scale.
-
-The Cramér-Rao bound of a map: the least error that any unbiased estimator can have from some ranges.
-"""
+"""The map that fits all ranges best: model, sparse damped least squares with a robust loss, covariance, least error."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +10,7 @@ from scipy.sparse import coo_array, csr_array, diags_array, hstack
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from ccatp.beacons.cricket.range_network import IndexArray, RangeNetwork
+from ccatp.beacons.cricket.range_network import IndexArray, RangeNetwork, coordinates_of
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import best_motion, rigid_modes
 
@@ -51,9 +46,7 @@ class MapModel:
         rows, axes = np.nonzero(is_free)
         self._loose_at: IndexArray = loose[rows] * d + axes  # flat coordinate of each unknown of a loose mote
         self.body_size = d + d * (d - 1) // 2
-        self._body_at = [
-            (np.array(body.motes, dtype=np.intp)[:, None] * d + np.arange(d)).ravel() for body in network.bodies
-        ]
+        self._body_at = [coordinates_of(body.motes, d) for body in network.bodies]
         self._bodies_from = len(self._loose_at)
         self.coordinates = self._bodies_from + self.body_size * len(network.bodies)
         self.size = self.coordinates + int(with_offset) + int(with_scale)
@@ -271,15 +264,12 @@ def fit_from_afar(model: MapModel, start: MapState, settings: MapFitSettings) ->
     return fit._replace(iterations=near.iterations + fit.iterations)
 
 
-def position_covariance(model: MapModel, fit: MapFit, *, variance_factor: float = 1.0) -> tuple[FloatArray, int]:
+def position_covariance(model: MapModel, fit: MapFit) -> tuple[FloatArray, int]:
     """Covariance of all positions and how many directions of the unknowns no range sees.
 
     Where nothing pins the frame, the covariance is that of the map after the rigid motion that brings it nearest to the
     truth (inner constraints of a free network): C = S B N^+ B^T S^T with B = dp/dq, N the normal matrix and S the
     projection across all rigid motions. Directions without information count as known: look at the second value.
-
-    Args:
-        variance_factor: multiplies the covariance, where residuals tell that the sigmas were too small.
 
     Returns:
         Covariance (n d, n d), and the number of directions without information, the frame's included.
@@ -294,7 +284,7 @@ def position_covariance(model: MapModel, fit: MapFit, *, variance_factor: float 
     if np.isnan(model.network.known_m).all():
         modes = rigid_modes(fit.state.positions_m)
         at_positions = at_positions - modes @ (modes.T @ at_positions)
-    return variance_factor * (at_positions @ at_positions.T), int((~is_seen).sum())
+    return at_positions @ at_positions.T, int((~is_seen).sum())
 
 
 def _loss(scaled: FloatArray, robust_scale: float) -> tuple[float, FloatArray]:
@@ -345,7 +335,8 @@ def bound_rms_m(model: MapModel, true_m: FloatArray, motes: Sequence[int], *, al
     count = len(model.network.ranges_m)
     fit = MapFit(state, 0.0, np.ones(count), np.zeros(count), 0, True)
     covariance, free = position_covariance(model, fit)
-    if free > _frame_freedom(model):
+    d = model.network.dimension
+    if free > (d * (d + 1) // 2 if np.isnan(model.network.known_m).all() else 0):
         return None
     return map_rms_m(covariance, state.positions_m, motes, aligned=aligned)
 
@@ -354,20 +345,14 @@ def map_rms_m(covariance_m2: FloatArray, positions_m: FloatArray, motes: Sequenc
     """Root mean square error that a covariance of all coordinates (n d, n d) expects of some motes.
 
     Args:
-        covariance_m2: shape (n d, n d).
         positions_m: shape (n, d).
         aligned: after the best rigid motion of these motes.
     """
     d = positions_m.shape[1]
-    at = (np.array(motes, dtype=np.intp)[:, None] * d + np.arange(d)).ravel()
+    at = coordinates_of(motes, d)
     part = covariance_m2[np.ix_(at, at)]
     if aligned:
         modes = rigid_modes(positions_m[list(motes)])
         part = part - modes @ (modes.T @ part)
         part = part - (part @ modes) @ modes.T
     return float(np.sqrt(max(float(np.trace(part)), 0.0) / len(motes)))
-
-
-def _frame_freedom(model: MapModel) -> int:
-    d = model.network.dimension
-    return d * (d + 1) // 2 if np.isnan(model.network.known_m).all() else 0

@@ -1,11 +1,7 @@
-"""A map from measured ranges: graph, outlook, filter or batch, and the error where the truth is known.
-
-What is said about a map of measured ranges: doubts, contradictions, and what may be behind them.
-
-The result of a self-mapping in words.
-"""
+"""A map from measured ranges: filter or batch, doubts about it, its error where the truth is known, a report."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +17,7 @@ from ccatp.beacons.cricket.range_network import (
     RigidBody,
     UnknownMote,
     build_network,
+    coordinates_of,
     list_names,
 )
 from ccatp.beacons.cricket.rigidity import find_fold_over, find_freedom, generic_state
@@ -39,9 +36,8 @@ _IN_SPACE = ", or the motes are not in a plane: --dimension 3 maps them in space
 
 
 def disagreeing(network: RangeNetwork) -> Iterator[str]:
-    """A word on the pair whose own ranges contradict each other most, more than chance would have them."""
-    pairs = np.sort(np.column_stack([network.first, network.second]), axis=1)
-    found, place = np.unique(pairs, axis=0, return_inverse=True)
+    """A warning of the pair whose own ranges contradict each other most, more than by chance."""
+    found, place = np.unique(network.pairs, axis=0, return_inverse=True)
     place = place.ravel()
     weights = network.sigmas_m**-2.0
     means = np.bincount(place, weights * network.ranges_m) / np.bincount(place, weights)
@@ -60,10 +56,10 @@ def disagreeing(network: RangeNetwork) -> Iterator[str]:
 
 
 def doubts(found: MoteMap, network: RangeNetwork, factor: float) -> Iterator[str]:
-    """Words on folds, contradictions, scatter and outliers of a batch map.
+    """Warnings of folds, contradictions, scatter and outliers of a batch map.
 
     Args:
-        factor: of the sigmas, as the residuals told it.
+        factor: of the sigmas, by the residuals.
     """
     for fold in found.folds[:_FOLDS]:
         motes = list_names([network.names[mote] for mote in fold.motes])
@@ -88,7 +84,7 @@ def doubts(found: MoteMap, network: RangeNetwork, factor: float) -> Iterator[str
 
 
 def hidden_offset(found: MoteMap, network: RangeNetwork, settings: MapFitSettings) -> Iterator[str]:
-    """A word on an offset that the ranges show, where none is estimated; outliers have little say in it.
+    """A warning of an offset that the ranges show, where none is estimated.
 
     Args:
         network: its ranges, with the sigmas that they were found to have.
@@ -113,15 +109,10 @@ def hidden_offset(found: MoteMap, network: RangeNetwork, settings: MapFitSetting
         )
 
 
-def untold(name: str) -> str:
-    """A word on an offset or a scale that was to be estimated and cannot be."""
-    return f"no {name} can be told from these ranges: the map takes it up, and its own size is free; leave --{name} out"
-
-
 def left_out_heights(
     option: str, places_m: Mapping[str, tuple[float, ...]], dimension: int, least_m: float
 ) -> Iterator[str]:
-    """A word on third coordinates that a map in the plane has no use for, where they differ by more than so much."""
+    """A warning of third coordinates that a map in the plane leaves out, where they differ by more than so much."""
     heights_m = [place[2] for place in places_m.values() if len(place) > dimension]
     if heights_m and (spread_m := max(heights_m) - min(heights_m)) > least_m:
         yield (
@@ -139,14 +130,6 @@ def is_flat(error_m: float | None, places_m: FloatArray) -> bool:
     extents_m = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False) / np.sqrt(len(places_m))
     extents_m = extents_m[: len(places_m) - 1]
     return error_m is not None and bool(extents_m.size) and error_m > float(extents_m[-1])
-
-
-def flat(dimension: int) -> str:
-    """A word on a map whose motes lie in fewer dimensions than it has."""
-    return (
-        f"the motes lie {'in a line' if dimension == 2 else 'in a plane'}, or nearly: the ranges do not tell how far "
-        "each is off it"
-    )
 
 
 _WIDER = 1e4  # of variances: what a range that is used twice adds by its first use is then a ten-thousandth
@@ -228,10 +211,15 @@ def map_measured(
         if given
         for word in left_out_heights(option, given, network.dimension, cfg.ranging.sigma_m)
     ]
-    warnings += [*disagreeing(network), *folds.warnings, *found.warnings, *map(untold, freedom.untold)]
+    warnings += [*disagreeing(network), *folds.warnings, *found.warnings]
+    warnings += [
+        f"no {name} can be told from these ranges: the map takes it up, and its own size is free; leave --{name} out"
+        for name in freedom.untold
+    ]
     # Derivatives at a place where they vanish: what comes out is large, and means that nothing is known.
     if is_thin := is_flat(bound_m, places) or (found.is_trusted and is_flat(expected_m, places)):
-        warnings.append(flat(network.dimension))
+        shape = "in a line" if network.dimension == 2 else "in a plane"
+        warnings.append(f"the motes lie {shape}, or nearly: the ranges do not tell how far each is off it")
     is_known = found.is_trusted and bound_m is not None and not is_thin
     data = {
         "rms_m": {"p10": error_m, "p50": error_m, "p90": error_m},
@@ -272,7 +260,7 @@ def _network(cfg: CricketConfig, file: MeasuredRanges, tags_m: Places | None) ->
 def _check_enough(model: MapModel, network: RangeNetwork) -> None:
     d = network.dimension
     wanted = model.size - d * (d + 1) // 2
-    measured = len(np.unique(np.sort(np.column_stack([network.first, network.second]), axis=1), axis=0))
+    measured = len(np.unique(network.pairs, axis=0))
     if network.count > 2 and measured < min(wanted, network.count):
         raise MoteUnderdetermined(
             f"{measured} pairs of {network.count} motes were measured, a map in {d} dimensions has {wanted} unknowns; "
@@ -291,10 +279,7 @@ def _batch(cfg: CricketConfig, network: RangeNetwork, mirrors: Any) -> _Found:
         finds_sigma=len(network.ranges_m) > 2 * network.count * network.dimension,
     )
     factor = found.sigma_m / float(np.median(network.sigmas_m))
-    scaled = RangeNetwork(
-        network.names, network.dimension, network.first, network.second,
-        network.ranges_m, network.sigmas_m * factor, network.bodies, network.known_m,
-    )  # fmt: skip
+    scaled = replace(network, sigmas_m=network.sigmas_m * factor)
     warnings = [*hidden_offset(found, scaled, settings)] if not cfg.batch.estimates_offset else []
     warnings += doubts(found, network, factor)
     is_denied = found.agreement.is_denied
@@ -314,17 +299,10 @@ def _filter(cfg: CricketConfig, network: RangeNetwork) -> _Found:
         lost = list_names([network.names[mote] for mote in first.unplaced])
         raise MappingError(f"trilateration cannot place {lost}; take --method batch, which needs no such start")
     # The ranges have made the first map already: its shape is a start, and its covariance, taken wide, hardly counts.
-    settings = MapperSettings(
-        cfg.phase2.linearisations, cfg.phase2.pools, cfg.phase2.gate_probability, cfg.phase2.target_rms_m
-    )
+    settings = MapperSettings(cfg.phase2.linearisations, cfg.phase2.pools, cfg.phase2.gate_probability)
     mapper = MoteMapper(first.positions_m, _WIDER * first.covariance_m2, settings)
-    rows = zip(
-        network.first.tolist(),
-        network.second.tolist(),
-        network.ranges_m.tolist(),
-        network.sigmas_m.tolist(),
-        strict=True,
-    )
+    columns = (network.first, network.second, network.ranges_m, network.sigmas_m)
+    rows = zip(*(column.tolist() for column in columns), strict=True)
     went = run_phase_two(mapper, rows, 0.0)
     warnings = (f"{went.refused} of {len(went.nis)} ranges were refused by the gate",) if went.refused else ()
     return _Found(mapper.positions_m, mapper.covariance_m2, network, 0.0, 0.0, len(went.nis), True, warnings)
@@ -347,7 +325,7 @@ def _phase1_error_m(
 def _framed(found: _Found, motes: list[int], true_m: FloatArray | None) -> tuple[FloatArray, FloatArray]:
     d = found.positions_m.shape[1]
     places = found.positions_m[motes]
-    at = (np.array(motes)[:, None] * d + np.arange(d)).ravel()
+    at = coordinates_of(motes, d)
     motion = plain_frame(places) if true_m is None else best_motion(places, true_m, mirrors=True)
     return motion.moved(places), motion.turned_map(found.covariance_m2[np.ix_(at, at)])
 

@@ -1,11 +1,4 @@
-"""Motes and the ranges between them: what a self-mapping starts from, checked.
-
-Range from the time between a radio message and an ultrasonic pulse, with the air's temperature in it.
-
-One range for each pair of motes: the weighted mean of all that were measured between them.
-
-From delays that motes heard to ranges of pairs.
-"""
+"""Motes and the ranges between them, checked; ranges from delays of ultrasonic pulses; one mean range for each pair."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -17,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from ccatp.config.beacon_models import CricketConfig
+from ccatp.config.beacon_models import AirConfig, CricketConfig
 from ccatp.core import FloatArray
 from ccatp.errors import CcatpError, ExitStatus
 
@@ -29,17 +22,6 @@ class TdoaError(ValueError):
     """A delay or a temperature that no range can be made of."""
 
 
-class Air(NamedTuple):
-    """The speed of sound, known at one temperature.
-
-    Attributes:
-        sound_speed_m_s: at ``temperature_c``.
-    """
-
-    sound_speed_m_s: float
-    temperature_c: float
-
-
 class MoteRange(NamedTuple):
     """One distance between two motes."""
 
@@ -49,11 +31,8 @@ class MoteRange(NamedTuple):
     sigma_m: float
 
 
-def sound_speed(air: Air, temperature_c: float) -> float:
+def sound_speed(air: AirConfig, temperature_c: float) -> float:
     """Speed of sound c = c_0 sqrt(T / T_0), T in kelvin: that of an ideal gas.
-
-    Args:
-        air: c_0 and T_0.
 
     Raises:
         TdoaError: no temperature of air.
@@ -63,7 +42,7 @@ def sound_speed(air: Air, temperature_c: float) -> float:
     return air.sound_speed_m_s * sqrt((temperature_c - ABSOLUTE_ZERO_C) / (air.temperature_c - ABSOLUTE_ZERO_C))
 
 
-def range_from_delay(air: Air, delay_s: float, temperature_c: float) -> float:
+def range_from_delay(air: AirConfig, delay_s: float, temperature_c: float) -> float:
     """Distance d = c(T) (t_2 - t_1), Patil et al. eq. 1; the radio message takes no time.
 
     Args:
@@ -156,6 +135,11 @@ class RangeNetwork:
         return len(self.names)
 
     @property
+    def pairs(self) -> IndexArray:
+        """Ends of each range, the smaller index first, shape (m, 2)."""
+        return np.sort(np.column_stack([self.first, self.second]), axis=1)
+
+    @property
     def loose(self) -> tuple[int, ...]:
         """Motes that are in no body."""
         bound = {mote for body in self.bodies for mote in body.motes}
@@ -172,15 +156,13 @@ def build_network(
     """The graph of some ranges, checked.
 
     Args:
-        readings: the ranges; those of one pair may be repeated.
-        dimension: 2 or 3.
         names: the motes in their order; those of the readings, as they come, if ``None``.
         known_m: known coordinates, nan elsewhere, shape (n, d).
 
     Raises:
         UnknownMote: a range names a mote that is not among ``names``.
         BadRange: negative or not finite, without a positive sigma, or from a mote to itself.
-        TooFewRanges: there is none, or there are fewer than two motes.
+        MoteUnderdetermined: there is none, or there are fewer than two motes.
         Disconnected: the motes fall apart.
     """
     rows = list(readings)
@@ -209,13 +191,19 @@ def build_network(
 
 def graph_pairs(network: RangeNetwork) -> IndexArray:
     """Pairs whose distance is known or measured, each once and in order, shape (e, 2): ranges, and pairs of a body."""
-    pairs = [np.column_stack([network.first, network.second])]
-    for body in network.bodies:
-        motes = np.array(body.motes, dtype=np.intp)
-        upper = np.triu_indices(len(motes), 1)
-        pairs.append(np.column_stack([motes[upper[0]], motes[upper[1]]]))
-    together = np.sort(np.concatenate(pairs), axis=1)
-    return np.unique(together, axis=0)
+    bodies = [every_pair(np.array(body.motes, dtype=np.intp)) for body in network.bodies]
+    return np.unique(np.sort(np.concatenate([network.pairs, *bodies]), axis=1), axis=0)
+
+
+def every_pair(motes: IndexArray) -> IndexArray:
+    """All pairs of some motes (k,), each once, shape (k (k - 1) / 2, 2)."""
+    a, b = np.triu_indices(len(motes), 1)
+    return np.column_stack([motes[a], motes[b]])
+
+
+def coordinates_of(motes: Sequence[int] | IndexArray, dimension: int) -> IndexArray:
+    """Where the coordinates of some motes (k,) stand among those of all, shape (k d,)."""
+    return (np.asarray(motes, dtype=np.intp)[:, None] * dimension + np.arange(dimension)).ravel()
 
 
 def components(count: int, pairs: IndexArray) -> IndexArray:
@@ -270,9 +258,8 @@ class PairMeans:
     """
 
     def __init__(self, network: RangeNetwork) -> None:
-        pairs = np.sort(np.column_stack([network.first, network.second]), axis=1)
         self.pairs: IndexArray
-        self.pairs, place = np.unique(pairs, axis=0, return_inverse=True)
+        self.pairs, place = np.unique(network.pairs, axis=0, return_inverse=True)
         weights = 1.0 / network.sigmas_m**2
         total = np.bincount(place.ravel(), weights)
         self.ranges_m: FloatArray = np.bincount(place.ravel(), weights * network.ranges_m) / total
@@ -286,7 +273,22 @@ class PairMeans:
     def between(self, first: int, second: int) -> tuple[float, float] | None:
         """Range and sigma of a pair in either order, or None."""
         row = self._index.get((min(first, second), max(first, second)))
-        return None if row is None else (float(self.ranges_m[row]), float(self.sigmas_m[row]))
+        return None if row is None else self.values(row)
+
+    def row(self, first: int, second: int) -> int:
+        """Which of the pairs these two are, in either order.
+
+        Raises:
+            MappingError: they have no range.
+        """
+        row = self._index.get((min(first, second), max(first, second)))
+        if row is None:
+            raise MappingError(f"no range between motes {first} and {second}")
+        return row
+
+    def values(self, row: int) -> tuple[float, float]:
+        """Range and sigma of one of the pairs."""
+        return float(self.ranges_m[row]), float(self.sigmas_m[row])
 
     def partners(self, mote: int) -> list[int]:
         """The motes that have a range to this one."""
@@ -301,25 +303,19 @@ class PairMeans:
 _MEDIAN_COST = np.sqrt(np.pi / 2.0)  # of the median's standard deviation against the mean's, for normal noise
 
 
-def air_of(cfg: CricketConfig) -> Air:
-    """What the motes know of the speed of sound."""
-    return Air(cfg.air.sound_speed_m_s, cfg.air.temperature_c)
-
-
 def pair_range(
     cfg: CricketConfig, names: tuple[str, str], delays_s: FloatArray | Sequence[float], temperature_c: float
 ) -> MoteRange:
     """The range of a pair from its readings.
 
     Args:
-        cfg: air, sigma of a reading, mean or median.
         delays_s: pulse after message, one for each reading, shape (k,), k >= 1.
 
     Raises:
         TdoaError: a delay or a temperature that none can be.
     """
     delay_s = float(np.median(delays_s) if cfg.ranging.combine == "median" else np.mean(delays_s))
-    range_m = range_from_delay(air_of(cfg), delay_s, temperature_c)
+    range_m = range_from_delay(cfg.air, delay_s, temperature_c)
     count = len(delays_s)
     sigma_m = range_sigma(cfg.ranging.sigma_m, range_m, cfg.ranging.thermometer_sigma_c, temperature_c, count)
     if cfg.ranging.combine == "median" and count > 2:

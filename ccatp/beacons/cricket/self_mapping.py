@@ -1,11 +1,6 @@
-"""Phase 2 of self-mapping: an extended Kalman filter over distances between motes, in any order.
+"""Phase 2 of self-mapping: an extended Kalman filter over distances between motes; the plan of who maps whom."""
 
-What the operator knows before anything is measured: motes, stands, who maps whom, which pairs are asked.
-
-The end of phase 2: the other motes of each stand, from its first one and the stand's known shape.
-"""
-
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -13,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from ccatp.beacons.cricket.range_network import MappingError, RigidBody
+from ccatp.beacons.cricket.range_network import MappingError, RigidBody, coordinates_of
 from ccatp.config.beacon_models import CricketConfig
 from ccatp.core import FloatArray
 from ccatp.filters.ekf_slam import EkfSlam, Update
@@ -35,7 +30,6 @@ class MapperSettings(NamedTuple):
         linearisations: of each update; 1 is the EKF, more the iterated one.
         pools: keep the prior and one mean range for each pair, and linearise all pairs at one place after each reading.
         gate_probability: a range less likely than this is not used; 1 uses all.
-        target_rms_m: ends phase 2.
         offset_sigma_m: of a common offset of the ranges; 0 where there is none.
         scale_sigma: of their common scale; 0 where there is none.
     """
@@ -43,7 +37,6 @@ class MapperSettings(NamedTuple):
     linearisations: int
     pools: bool
     gate_probability: float
-    target_rms_m: float
     offset_sigma_m: float = 0.0
     scale_sigma: float = 0.0
 
@@ -54,7 +47,6 @@ def mapper_settings(cfg: CricketConfig) -> MapperSettings:
         cfg.phase2.linearisations,
         cfg.phase2.pools,
         cfg.phase2.gate_probability,
-        cfg.phase2.target_rms_m,
         _OFFSET_SIGMA_M if cfg.batch.estimates_offset else 0.0,
         _SCALE_SIGMA if cfg.batch.estimates_scale else 0.0,
     )
@@ -103,19 +95,18 @@ class MoteMapper:
         self._filter = self._at_prior()
         self._settings = settings
         self._gate = float(chdtri(1, 1.0 - settings.gate_probability))
-        self._count = count
+        self._count, self._size = count, positions_m.size
         self._pairs: dict[tuple[int, int], tuple[float, float]] = {}  # sum of z / sigma^2, sum of 1 / sigma^2
 
     @property
     def positions_m(self) -> FloatArray:
         """Places, shape (n, d)."""
-        return self._filter.mean[: self._count * self._dimension].reshape(self._count, self._dimension).copy()
+        return self._filter.mean[: self._size].reshape(self._count, self._dimension).copy()
 
     @property
     def covariance_m2(self) -> FloatArray:
         """Covariance of the places, shape (n d, n d)."""
-        size = self._count * self._dimension
-        return self._filter.covariance[:size, :size].copy()
+        return self._filter.covariance[: self._size, : self._size].copy()
 
     @property
     def offset_m(self) -> float:
@@ -130,8 +121,7 @@ class MoteMapper:
     @property
     def expected_rms_m(self) -> float:
         """Root mean square of the errors that the filter expects, sqrt(tr P / n)."""
-        size = self._count * self._dimension
-        return float(np.sqrt(np.trace(self._filter.covariance[:size, :size]) / self._count))
+        return float(np.sqrt(np.trace(self._filter.covariance[: self._size, : self._size]) / self._count))
 
     def observe(self, first: int, second: int, range_m: float, sigma_m: float) -> Update:
         """Condition the map on one distance.
@@ -141,7 +131,11 @@ class MoteMapper:
         """
         rows = _Rows(self._dimension, self._count, [(first, second)], np.array([range_m]))
         R = np.array([sigma_m**2])
-        learned = self._update(rows, R, self._gate)
+        if self._settings.linearisations == 1:
+            residual, H = rows(self._filter.mean)
+            learned = self._filter.update(rows.columns, H, residual, R, self._gate)
+        else:
+            learned = self._filter.update_iterated(rows.columns, rows, R, self._settings.linearisations, self._gate)
         if not (learned.accepted and self._settings.pools):
             return learned
         pair = min(first, second), max(first, second)
@@ -159,15 +153,9 @@ class MoteMapper:
             curvature = rows.curvature(start, self._filter.covariance)
             R = np.diag(1.0 / weights) + curvature
             self._filter = self._at_prior()
-            self._filter.update_iterated(rows.columns, _From(rows, start), R, self._settings.linearisations)
+            self._filter.update_iterated(rows.columns, rows.starting_at(start), R, self._settings.linearisations)
             if float((curvature.diagonal() * weights).max()) < _STRAIGHT:
                 break
-
-    def _update(self, rows: "_Rows", R: FloatArray, gate: float) -> Update:
-        if self._settings.linearisations == 1:
-            residual, H = rows(self._filter.mean)
-            return self._filter.update(rows.columns, H, residual, R, gate)
-        return self._filter.update_iterated(rows.columns, rows, R, self._settings.linearisations, gate)
 
     def _at_prior(self) -> EkfSlam:
         mean, covariance, calibration = self._prior
@@ -177,7 +165,7 @@ class MoteMapper:
 class _Rows:
     def __init__(self, dimension: int, count: int, pairs: Sequence[tuple[int, int]], ranges_m: FloatArray) -> None:
         motes, places = np.unique(np.array(pairs), return_inverse=True)
-        self._at = (motes[:, None] * dimension + np.arange(dimension)).ravel()
+        self._at = coordinates_of(motes, dimension)
         size = count * dimension
         self.columns = np.concatenate([self._at, (size, size + 1)]).astype(np.intp)
         self._ends = places.reshape(-1, 2)
@@ -185,9 +173,7 @@ class _Rows:
 
     def __call__(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         d = self._dimension
-        points = x[self._at].reshape(-1, d)
-        ways = points[self._ends[:, 0]] - points[self._ends[:, 1]]
-        distances = np.sqrt((ways**2).sum(axis=1))
+        ways, distances = self._ways(x)
         if float(distances.min()) < _DIRECTION_M:
             first, second = self._pairs[int(distances.argmin())]
             raise MappingError(f"motes {first} and {second} stand in one place: no direction to correct them along")
@@ -200,36 +186,41 @@ class _Rows:
         H[:, -2], H[:, -1] = 1.0, distances
         return self._ranges_m - scale * distances - offset_m, H
 
+    def starting_at(self, start: FloatArray) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+        """The rows with their first linearisation at a better place than the prior."""
+        is_first = True
+
+        def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+            nonlocal is_first
+            if not is_first:
+                return self(x)
+            is_first = False
+            residual, H = self(start)
+            # As if linearised at x: what lies between is taken along the same lines of sight.
+            return residual + H @ (start - x)[self.columns], H
+
+        return linearise
+
     def curvature(self, x: FloatArray, P: FloatArray) -> FloatArray:
         """Covariance of what the rows leave out of second order, tr(A_k P_kl A_l P_lk) / 2, shape (m, m).
 
         P_kl is the covariance of the ways of two pairs; A, the second derivative of a distance, is (1 - u u^T) / r
         across the line of sight u (Jazwinski 1970, section 9.3). Measuring a pair more often does not lessen it.
         """
-        d = self._dimension
-        points = x[self._at].reshape(-1, d)
-        ways = points[self._ends[:, 0]] - points[self._ends[:, 1]]
-        distances = np.sqrt((ways**2).sum(axis=1))
+        d, count = self._dimension, self._at.size // self._dimension
+        ways, distances = self._ways(x)
         u = ways / distances[:, None]
         A = (np.eye(d) - u[:, :, None] * u[:, None, :]) / distances[:, None, None]
-        C = P[np.ix_(self._at, self._at)].reshape(len(points), d, len(points), d)
+        C = P[np.ix_(self._at, self._at)].reshape(count, d, count, d)
         i, j = self._ends[:, :1], self._ends[:, 1:]
         ways_ways = C[i, :, i.T] - C[i, :, j.T] - C[j, :, i.T] + C[j, :, j.T]  # of pairs k and l, shape (m, m, d, d)
         left = np.einsum("kab,klbc->klac", A, ways_ways)
         return np.asarray(0.5 * np.einsum("klac,lcd,klad->kl", left, A, ways_ways))
 
-
-class _From:
-    def __init__(self, rows: _Rows, start: FloatArray) -> None:
-        self._rows, self._start, self._is_first = rows, start, True
-
-    def __call__(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        if not self._is_first:
-            return self._rows(x)
-        self._is_first = False
-        residual, H = self._rows(self._start)
-        # As if linearised at x: what lies between is taken along the same lines of sight.
-        return residual + H @ (self._start - x)[self._rows.columns], H
+    def _ways(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        points = x[self._at].reshape(-1, self._dimension)
+        ways = points[self._ends[:, 0]] - points[self._ends[:, 1]]
+        return ways, np.sqrt((ways**2).sum(axis=1))
 
 
 class PhaseTwo(NamedTuple):
@@ -260,16 +251,15 @@ def run_phase_two(
     """
     places, expected, nis = [mapper.positions_m], [mapper.expected_rms_m], []
     refused = 0
-    for first, second, range_m, sigma_m in readings:
+    for reading in readings:
         if expected[-1] <= target_rms_m:
             break
-        learned = mapper.observe(first, second, range_m, sigma_m)
+        learned = mapper.observe(*reading)
         refused += not learned.accepted
         nis.append(learned.nis)
         places.append(mapper.positions_m)
         expected.append(mapper.expected_rms_m)
-    reached = expected[-1] <= target_rms_m
-    return PhaseTwo(np.array(places), np.array(expected), np.array(nis), refused, reached)
+    return PhaseTwo(np.array(places), np.array(expected), np.array(nis), refused, expected[-1] <= target_rms_m)
 
 
 def conditioned(mean: FloatArray, covariance: FloatArray, known: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -357,6 +347,16 @@ def network_plan(cfg: CricketConfig) -> MotePlan:
     places = np.array(list(cfg.anchors.values()), dtype=np.float64)
     local_m = np.array(cfg.stand_m, dtype=np.float64)
     heads = [network[0] for network in networks]
+    first, second = anchors
+    # A to B, both to the first network, then all of a network to all of the next.
+    phase1_pairs = [(first, second), *((anchor, mote) for anchor in anchors for mote in networks[0])]
+    for before, after in pairwise(networks):
+        phase1_pairs += [(old, new) for old in before for new in after]
+    surveyed_m = np.full((len(names), cfg.dimension), np.nan)
+    if cfg.phase2.frame == "surveyed":  # place of the first head and y of the second: the zeros of Patil et al. eq. 25
+        origin, along = list(cfg.networks.values())[:2]
+        surveyed_m[heads[0]] = origin.place_m
+        surveyed_m[heads[1], 1] = along.place_m[1]
     return MotePlan(
         names=names,
         dimension=cfg.dimension,
@@ -364,9 +364,9 @@ def network_plan(cfg: CricketConfig) -> MotePlan:
         networks=networks,
         bodies=tuple(RigidBody(name, motes, local_m) for name, motes in zip(cfg.networks, networks, strict=True)),
         axes_m=np.array([places[0], places[1] - places[0]]),
-        phase1_pairs=_phase1_pairs(anchors, networks),
+        phase1_pairs=tuple(phase1_pairs),
         phase2_pairs=tuple((heads[i], heads[j]) for i, j in head_pairs(len(heads), cfg.phase2.pairs)),
-        surveyed_m=_surveyed(cfg, len(names), heads),
+        surveyed_m=surveyed_m,
     )
 
 
@@ -396,25 +396,6 @@ def head_pairs(count: int, programme: str) -> list[tuple[int, int]]:
     return pairs
 
 
-def _phase1_pairs(anchors: tuple[int, ...], networks: tuple[tuple[int, ...], ...]) -> Pairs:
-    first, second = anchors
-    pairs = [(first, second)]
-    pairs += [(anchor, mote) for anchor in anchors for mote in networks[0]]
-    for before, after in pairwise(networks):
-        pairs += [(old, new) for old in before for new in after]
-    return tuple(pairs)
-
-
-def _surveyed(cfg: CricketConfig, count: int, heads: list[int]) -> FloatArray:
-    """Place of the first head and y of the second, as the zeros of Patil et al. eq. 25 say."""
-    known = np.full((count, cfg.dimension), np.nan)
-    if cfg.phase2.frame == "surveyed":
-        first, second = list(cfg.networks.values())[:2]
-        known[heads[0]] = first.place_m
-        known[heads[1], 1] = second.place_m[1]
-    return known
-
-
 class CompletedMap(NamedTuple):
     """All motes of all stands.
 
@@ -429,12 +410,9 @@ class CompletedMap(NamedTuple):
 
 
 def complete_stands(
-    plan: MotePlan,
-    first_m: FloatArray,
-    first_covariance_m2: FloatArray,
-    heads_m: FloatArray,
+    plan: MotePlan, first_m: FloatArray, first_covariance_m2: FloatArray, heads_m: FloatArray,
     heads_covariance_m2: FloatArray,
-) -> CompletedMap:
+) -> CompletedMap:  # fmt: skip
     """Patil et al., figure 8, last box: motes 2 and 3 of each stand with respect to mote 1; in the plane.
 
     Where a stand looks is what phase 1 found of its three motes, by the best turn of the known shape; its error is that
@@ -449,7 +427,7 @@ def complete_stands(
     """
     sizes = [len(network) for network in plan.networks]
     heads = np.repeat(np.arange(len(sizes)), sizes)
-    at_heads = (heads[:, None] * 2 + np.arange(2)).ravel()
+    at_heads = coordinates_of(heads, 2)
     covariance = heads_covariance_m2[np.ix_(at_heads, at_heads)].copy()
     places, row = [], 0
     for stand, body in enumerate(plan.bodies):
@@ -459,12 +437,11 @@ def complete_stands(
         places.append(heads_m[stand] + arms)
         middle = (body.local_m - body.local_m.mean(axis=0)) @ rotation.T
         lever = np.column_stack([-middle[:, 1], middle[:, 0]]).ravel() / float((middle**2).sum())
-        at = (np.array(motes)[:, None] * 2 + np.arange(2)).ravel()
+        at = coordinates_of(motes, 2)
         variance = float(lever @ first_covariance_m2[np.ix_(at, at)] @ lever)
         turned = np.column_stack([-arms[:, 1], arms[:, 0]]).ravel()
         block = slice(2 * row, 2 * (row + len(motes)))
         covariance[block, block] += variance * np.outer(turned, turned)
         row += len(motes)
-    return CompletedMap(
-        tuple(mote for network in plan.networks for mote in network), np.concatenate(places), covariance
-    )
+    motes_of_all = tuple(mote for network in plan.networks for mote in network)
+    return CompletedMap(motes_of_all, np.concatenate(places), covariance)

@@ -1,9 +1,4 @@
-"""Phase 1 of self-mapping: two axes, the law of cosines, then mote after mote by trilateration.
-
-The errors of a trilateration, drawn: its steps made again on ranges with errors, all draws at once.
-
-A first map by trilateration: stand after stand as a plan says, or mote after mote as the ranges allow.
-"""
+"""Phase 1 of self-mapping: a first map by trilateration, by a plan or as the ranges allow, and its drawn errors."""
 
 from collections.abc import Sequence
 from itertools import combinations, pairwise
@@ -18,6 +13,7 @@ from ccatp.beacons.cricket.range_network import (
     PairMeans,
     RangeNetwork,
     build_network,
+    coordinates_of,
     list_names,
 )
 from ccatp.beacons.cricket.self_mapping import MotePlan
@@ -230,18 +226,6 @@ _REST_M = 1e-5
 _DAMPING = 1e-6  # of the trace of the normal matrix: references of a draw may come to lie in line
 
 
-class DrawnErrors(NamedTuple):
-    """What a trilateration is worth.
-
-    Attributes:
-        bias_m: mean error of each place, shape (n, d).
-        covariance_m2: of all coordinates, shape (n d, n d).
-    """
-
-    bias_m: FloatArray
-    covariance_m2: FloatArray
-
-
 def draw_errors(
     places_m: FloatArray,
     steps: Sequence[TrilaterationStep],
@@ -249,8 +233,8 @@ def draw_errors(
     seed_covariance_m2: FloatArray,
     rng: np.random.Generator,
     draws: int,
-) -> DrawnErrors:
-    """Mean and covariance of the errors of a trilateration, by the parametric bootstrap (Efron 1979).
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (n, d) and covariance (n d, n d) of the errors of a trilateration, by the parametric bootstrap (Efron 1979).
 
     At places close to those that were found, ranges with errors as they are expected are drawn, and the same steps made
     of them. Derivatives tell the size of the errors as well, but not how they hang together: from a small stand errors
@@ -266,47 +250,36 @@ def draw_errors(
     """
     count, d = places_m.shape
     drawn = np.broadcast_to(places_m, (draws, count, d)).copy()
-    ranges = _Ranges(places_m, means, rng, draws)
+    errors_of = rng.normal(0.0, 1.0, (len(means.pairs), draws))
+
+    def ranges_of(first: int, second: int) -> FloatArray:
+        row = means.row(first, second)
+        true = float(np.linalg.norm(places_m[first] - places_m[second]))
+        return np.asarray(true + float(means.sigmas_m[row]) * errors_of[row])
+
     seeds = [step.mote for step in steps if step.how == "seed"]
     if seeds:
-        at = (np.array(seeds)[:, None] * d + np.arange(d)).ravel()
+        at = coordinates_of(seeds, d)
         errors = rng.multivariate_normal(np.zeros(at.size), seed_covariance_m2[np.ix_(at, at)], draws, method="eigh")
         drawn[:, seeds] += errors.reshape(draws, len(seeds), d)
     for step in steps:
         if step.how == "axes":
             drawn[:, step.mote] = 0.0
             if step.references:
-                drawn[:, step.mote, 1] = ranges.of(step.references[0], step.mote)
+                drawn[:, step.mote, 1] = ranges_of(step.references[0], step.mote)
         elif step.how == "cosines":
             origin, axis = step.references
-            a, b, c = (ranges.of(*pair) for pair in ((origin, step.mote), (axis, step.mote), (origin, axis)))
+            a, b, c = (ranges_of(*pair) for pair in ((origin, step.mote), (axis, step.mote), (origin, axis)))
             y = (a * a + c * c - b * b) / (2.0 * c)
             drawn[:, step.mote] = np.column_stack([np.sqrt(np.maximum(a * a - y * y, 0.0)), y])
         elif step.how == "trilateration":
-            lengths = np.column_stack([ranges.of(reference, step.mote) for reference in step.references])
-            sigmas = np.array([ranges.sigma(reference, step.mote) for reference in step.references])
+            lengths = np.column_stack([ranges_of(reference, step.mote) for reference in step.references])
+            sigmas = np.array([means.sigmas_m[means.row(reference, step.mote)] for reference in step.references])
             drawn[:, step.mote] = _trilaterated(drawn[:, list(step.references)], lengths, sigmas, places_m[step.mote])
     errors = np.nan_to_num(drawn - places_m)
     bias = errors.mean(axis=0)
     flat = (errors - bias).reshape(draws, -1)
-    return DrawnErrors(bias, flat.T @ flat / (draws - 1))
-
-
-class _Ranges:
-    def __init__(self, places_m: FloatArray, means: PairMeans, rng: np.random.Generator, draws: int) -> None:
-        self._places_m, self._means = places_m, means
-        self._errors = rng.normal(0.0, 1.0, (len(means.pairs), draws))
-        self._row_of = {(int(i), int(j)): row for row, (i, j) in enumerate(means.pairs)}
-
-    def sigma(self, first: int, second: int) -> float:
-        return float(self._means.sigmas_m[self._row(first, second)])
-
-    def of(self, first: int, second: int) -> FloatArray:
-        true = float(np.linalg.norm(self._places_m[first] - self._places_m[second]))
-        return np.asarray(true + self.sigma(first, second) * self._errors[self._row(first, second)])
-
-    def _row(self, first: int, second: int) -> int:
-        return self._row_of[(min(first, second), max(first, second))]
+    return bias, flat.T @ flat / (draws - 1)
 
 
 def _trilaterated(anchors: FloatArray, lengths: FloatArray, sigmas: FloatArray, start: FloatArray) -> FloatArray:
@@ -396,23 +369,19 @@ def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: in
             sketch.add_by_ranges(mote, before)
     up = plan.axes_m[1] / np.linalg.norm(plan.axes_m[1])
     field_from_map = np.column_stack([(up[1], -up[0]), up])
-    errors = _errors(sketch, _shaped(plan, sketch.positions_m), means, draws)
-    motion = RigidMotion(field_from_map, plan.axes_m[0])
-    positions, covariance = motion.moved(sketch.positions_m), motion.turned_map(errors.covariance_m2)
-    return FirstMap(positions, covariance, errors.bias_m @ field_from_map.T, tuple(sketch.steps), ())
-
-
-def _shaped(plan: MotePlan, found_m: FloatArray) -> FloatArray:
-    places = found_m.copy()
+    shaped = sketch.positions_m.copy()  # with the stands as they are known to be
     for stand in plan.bodies:
         motes = list(stand.motes)
-        places[motes] = best_motion(stand.local_m, found_m[motes]).moved(stand.local_m)
-    return places
+        shaped[motes] = best_motion(stand.local_m, sketch.positions_m[motes]).moved(stand.local_m)
+    bias, covariance = _errors(sketch, shaped, means, draws)
+    motion = RigidMotion(field_from_map, plan.axes_m[0])
+    positions, covariance = motion.moved(sketch.positions_m), motion.turned_map(covariance)
+    return FirstMap(positions, covariance, bias @ field_from_map.T, tuple(sketch.steps), ())
 
 
-def _errors(sketch: Sketch, places_m: FloatArray, means: PairMeans, draws: int) -> DrawnErrors:
+def _errors(sketch: Sketch, places_m: FloatArray, means: PairMeans, draws: int) -> tuple[FloatArray, FloatArray]:
     if draws == 0:
-        return DrawnErrors(np.zeros_like(places_m), sketch.covariance_m2)
+        return np.zeros_like(places_m), sketch.covariance_m2
     # The same draws for every map: the same ranges give the same one.
     return draw_errors(places_m, sketch.steps, means, sketch.covariance_m2, np.random.default_rng(0), draws)
 
@@ -449,8 +418,8 @@ def map_as_possible(network: RangeNetwork, max_dop: float, draws: int = 0) -> Fi
         except DegenerateStep:
             refused.add(mote)
     unplaced = tuple(mote for mote in range(network.count) if not sketch.is_placed(mote))
-    errors = _errors(sketch, sketch.positions_m, means, draws)
-    return FirstMap(sketch.positions_m, errors.covariance_m2, errors.bias_m, tuple(sketch.steps), unplaced)
+    bias, covariance = _errors(sketch, sketch.positions_m, means, draws)
+    return FirstMap(sketch.positions_m, covariance, bias, tuple(sketch.steps), unplaced)
 
 
 def _seed(network: RangeNetwork, means: PairMeans, sketch: Sketch) -> None:
@@ -473,12 +442,14 @@ def _seed(network: RangeNetwork, means: PairMeans, sketch: Sketch) -> None:
     names = [network.names[mote] for mote in best]
     longest_m = float(_distances(means, best).max())
     # A simplex that is flat looks as high as this by the errors of its ranges alone.
-    if best_height_m**2 < _FLAT * longest_m * max(sigma for _, sigma in _sides(means, best)):
+    sides = [means.row(a, b) for a, b in combinations(best, 2)]
+    if best_height_m**2 < _FLAT * longest_m * max(means.sigmas_m[sides].tolist()):
         raise DegenerateStep(
             f"{', '.join(names)}: the best motes to begin with lie {'in a line' if d == 2 else 'in a plane'}, or "
             "nearly: trilateration has no beginning"
         )
-    rows = [MoteRange(names[a], names[b], *_between(means, best[a], best[b])) for a, b in combinations(range(d + 1), 2)]
+    at = zip(combinations(range(d + 1), 2), sides, strict=True)
+    rows = [MoteRange(names[a], names[b], *means.values(row)) for (a, b), row in at]
     model = MapModel(build_network(rows, d, names))
     start = classical_scaling(_distances(means, best), d)
     fit = fit_map(model, model.state(start), MapFitSettings())
@@ -487,23 +458,13 @@ def _seed(network: RangeNetwork, means: PairMeans, sketch: Sketch) -> None:
 
 
 def _height(means: PairMeans, motes: tuple[int, ...]) -> float:
+    # Least width of a simplex, m: its smallest extent along a principal axis.
     points = classical_scaling(_distances(means, motes), len(motes) - 1)
     return float(np.linalg.svd(points, compute_uv=False)[-1])
-
-
-def _sides(means: PairMeans, motes: tuple[int, ...]) -> list[tuple[float, float]]:
-    return [_between(means, a, b) for a, b in combinations(motes, 2)]
 
 
 def _distances(means: PairMeans, motes: tuple[int, ...]) -> FloatArray:
     matrix = np.zeros((len(motes), len(motes)))
     for a, b in combinations(range(len(motes)), 2):
-        matrix[a, b] = matrix[b, a] = _between(means, motes[a], motes[b])[0]
+        matrix[a, b] = matrix[b, a] = means.ranges_m[means.row(motes[a], motes[b])]
     return matrix
-
-
-def _between(means: PairMeans, first: int, second: int) -> tuple[float, float]:
-    found = means.between(first, second)
-    if found is None:
-        raise MappingError(f"no range between motes {first} and {second}")
-    return found

@@ -144,7 +144,7 @@ def listed(names: Sequence[str], most: int = 8) -> str:
 
 def without_gaps_in_numbers(table: Table, warnings: list[str], columns: int | None = None) -> Table:
     """Rows that are finite in the first ``columns``, all if not given; the others are left out with a warning."""
-    finite = np.isfinite(table.values[:, :columns]).all(axis=1)
+    finite = np.asarray(np.isfinite(table.values[:, :columns]).all(axis=1))
     if not finite.all():
         left_out = plural(int((~finite).sum()), "row")
         line = table.first_line(~finite)

@@ -5,7 +5,6 @@ import pytest
 
 from ccatp.beacons.cricket.map_fit import MapFitSettings, MapModel, fit_map
 from ccatp.beacons.cricket.range_network import (
-    Air,
     BadRange,
     Disconnected,
     MappingError,
@@ -32,13 +31,14 @@ from ccatp.beacons.cricket.self_mapping import (
     printed_prior,
     run_phase_two,
 )
+from ccatp.config.beacon_models import AirConfig
 from ccatp.config.load import load_radio_config
 from ccatp.errors import ExitStatus
 from ccatp.sim.motes import true_motes
 from tests.unit.beacons.cricket.fields import ADJACENT, ALL, HEADS, SIGMA_M, ZIGZAG, FloatArray, Pairs, network_of
 
-POOLED = MapperSettings(linearisations=10, pools=True, gate_probability=1.0, target_rms_m=0.0)
-PRINTED = MapperSettings(linearisations=1, pools=False, gate_probability=1.0, target_rms_m=0.0)
+POOLED = MapperSettings(linearisations=10, pools=True, gate_probability=1.0)
+PRINTED = MapperSettings(linearisations=1, pools=False, gate_probability=1.0)
 KNOWN = np.full((6, 2), np.nan)
 KNOWN[0], KNOWN[1, 1] = HEADS[0], HEADS[1, 1]
 
@@ -209,7 +209,7 @@ def test_errors_of_a_stands_turn_reach_its_other_motes() -> None:
     assert np.sqrt(covariance[2:6, 2:6].trace()) > 2.0 * 0.002
 
 
-AIR = Air(344.0, 20.0)
+AIR = AirConfig(sound_speed_m_s=344.0, temperature_c=20.0)
 
 
 def test_the_printed_example() -> None:
