@@ -1,7 +1,4 @@
-"""Looks for maps that fit better, or as well, when some motes are mirrored across what holds them.
-
-The robust minimum and the honest sigma, where a map contradicts its ranges.
-"""
+"""Maps that fit better, or as well, when motes are mirrored across what holds them; the robust minimum, its sigma."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -76,26 +73,26 @@ def _turn_singles(
     model: MapModel, fit: MapFit, settings: MapFitSettings
 ) -> tuple[MapFit, int, dict[tuple[int, ...], float]]:
     network = model.network
-    rows_of = _rows_by_mote(network)
     places = fit.state.positions_m.copy()
     turned, near = 0, dict[tuple[int, ...], float]()
     if network.count <= network.dimension + 1 and np.isnan(network.known_m).all():
         return fit, 0, near  # a triangle (tetrahedron) with one corner mirrored is all of it mirrored: the same map
     for mote in network.loose:
-        rows = rows_of[mote]
+        rows = np.flatnonzero((network.first == mote) | (network.second == mote))
         if np.isfinite(network.known_m[mote]).any() or len(rows) < network.dimension:
             continue
         partners = np.where(network.first[rows] == mote, network.second[rows], network.first[rows])
         ranges = (network.ranges_m[rows] - fit.state.offset_m) / (1.0 + fit.state.scale)
-        cost = _Single(places[partners], ranges, network.sigmas_m[rows], settings.robust_scale)
-        now = cost.settled(places[mote])
+        own = (places[partners], ranges, network.sigmas_m[rows], settings.robust_scale)
+        now_m, now_cost = _settled_single(*own, places[mote])
         for image in _images(places[mote][None], places[partners]):
-            other = cost.settled(image[0])
-            if np.linalg.norm(other.place_m - now.place_m) < 3.0 * float(network.sigmas_m[rows].max()):
+            other_m, other_cost = _settled_single(*own, image[0])
+            if np.linalg.norm(other_m - now_m) < 3.0 * float(network.sigmas_m[rows].max()):
                 continue
-            gap = other.cost - now.cost
+            gap = other_cost - now_cost
             if gap < 0.0:
-                now, places[mote] = other, other.place_m
+                now_m, now_cost = other_m, other_cost
+                places[mote] = other_m
                 turned += 1
             elif gap < CLOSE:
                 near[(mote,)] = gap
@@ -106,41 +103,36 @@ def _turn_singles(
     return fit, 0, near
 
 
-class _Settled(NamedTuple):
-    place_m: FloatArray
-    cost: float
+def _settled_single(
+    anchors: FloatArray, ranges: FloatArray, sigmas: FloatArray, robust_scale: float, place: FloatArray
+) -> tuple[FloatArray, float]:
+    # Place and cost of one mote while all others stay.
 
-
-class _Single:
-    def __init__(self, anchors: FloatArray, ranges: FloatArray, sigmas: FloatArray, robust_scale: float) -> None:
-        self._anchors, self._ranges, self._sigmas, self._c = anchors, ranges, sigmas, robust_scale
-
-    def settled(self, place: FloatArray) -> _Settled:
-        cost, gradient, normal = self._look(place)
-        damping = 1e-3
-        for _ in range(_LOCAL_STEPS):
-            step = np.linalg.solve(normal + damping * np.trace(normal) * np.eye(len(place)), gradient)
-            trial = place + step
-            seen = self._look(trial)
-            if seen[0] <= cost:
-                place, (cost, gradient, normal), damping = trial, seen, damping * 0.2
-                if float(np.abs(step).max()) < 1e-6:
-                    break
-            else:
-                damping *= 8.0
-        return _Settled(place, cost)
-
-    def _look(self, place: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        ways = place - self._anchors
+    def look(place: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        ways = place - anchors
         lengths = np.maximum(np.sqrt((ways**2).sum(axis=1)), 1e-9)
-        scaled = (self._ranges - lengths) / self._sigmas
-        if np.isfinite(self._c):
-            ratio = (scaled / self._c) ** 2
-            cost, weights = float(self._c**2 * np.log1p(ratio).sum()), 1.0 / (1.0 + ratio)
+        scaled = (ranges - lengths) / sigmas
+        if np.isfinite(robust_scale):
+            ratio = (scaled / robust_scale) ** 2
+            cost, weights = float(robust_scale**2 * np.log1p(ratio).sum()), 1.0 / (1.0 + ratio)
         else:
             cost, weights = float(scaled @ scaled), np.ones(len(scaled))
-        J = ways / (lengths * self._sigmas)[:, None]
+        J = ways / (lengths * sigmas)[:, None]
         return cost, J.T @ (weights * scaled), (J * weights[:, None]).T @ J + 1e-12 * np.eye(len(place))
+
+    cost, gradient, normal = look(place)
+    damping = 1e-3
+    for _ in range(_LOCAL_STEPS):
+        step = np.linalg.solve(normal + damping * np.trace(normal) * np.eye(len(place)), gradient)
+        trial = place + step
+        seen = look(trial)
+        if seen[0] <= cost:
+            place, (cost, gradient, normal), damping = trial, seen, damping * 0.2
+            if float(np.abs(step).max()) < 1e-6:
+                break
+        else:
+            damping *= 8.0
+    return place, cost
 
 
 def _turn_sets(
@@ -195,6 +187,7 @@ def _sets(
 
 
 def _groups(model: MapModel, fit: MapFit) -> list[tuple[int, ...]]:
+    # Seen from afar a few motes close together are one point: what is fixed to them turns about them almost freely.
     network = model.network
     groups = [body.motes for body in network.bodies]
     if fit.cost < _CONTRADICTED * max(len(network.ranges_m) - model.size, 1):
@@ -213,14 +206,6 @@ def _images(points: FloatArray, through: FloatArray) -> Iterator[FloatArray]:
     for normal in axes[::-1][:2]:
         heights = (points - centre) @ normal
         yield points - 2.0 * heights[:, None] * normal
-
-
-def _rows_by_mote(network: RangeNetwork) -> list[list[int]]:
-    rows: list[list[int]] = [[] for _ in range(network.count)]
-    for row, (i, j) in enumerate(zip(network.first.tolist(), network.second.tolist(), strict=True)):
-        rows[i].append(row)
-        rows[j].append(row)
-    return rows
 
 
 _WIDER = 8.0  # times the robust scale of the first steps from a grown map, whose places are off by several sigmas

@@ -1,9 +1,4 @@
-"""Places for a fit to begin with: unfolded, stitched from patches, trilaterated, drawn.
-
-Maps grown mote by mote from a drawn triangle, each mote where most ranges meet: starts among wrong ranges.
-
-A first map of hundreds of motes: small maps around each mote, turned and shifted to agree, all at once.
-"""
+"""Places for a fit to begin with: unfolded, stitched from patches, trilaterated, drawn, or grown mote by mote."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -12,10 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
-from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import lsqr, splu
 
-from ccatp.beacons.cricket.range_network import IndexArray, MappingError, PairMeans, RangeNetwork
+from ccatp.beacons.cricket.range_network import (
+    IndexArray,
+    MappingError,
+    PairMeans,
+    RangeNetwork,
+    components,
+    every_pair,
+)
 from ccatp.beacons.cricket.trilateration import map_as_possible
 from ccatp.beacons.cricket.unfolding import classical_scaling, unfolded
 from ccatp.core import FloatArray
@@ -28,14 +29,9 @@ _FLAT = 0.05  # height over length of a triangle that is too flat to begin with
 
 
 def grown(
-    count: int,
-    pairs: IndexArray,
-    distances_m: FloatArray,
-    sigmas_m: FloatArray,
-    dimension: int,
-    robust_scale: float,
+    count: int, pairs: IndexArray, distances_m: FloatArray, sigmas_m: FloatArray, dimension: int, robust_scale: float,
     rng: np.random.Generator,
-) -> FloatArray | None:
+) -> FloatArray | None:  # fmt: skip
     """Places of n points, nan where d ranges do not reach, shape (n, d); None where there is no triangle to begin with.
 
     Least squares lets a wrong range bend the whole map. Here no range is used that is not drawn: d + 1 points that all
@@ -148,14 +144,10 @@ def stitched(count: int, means: PairMeans, dimension: int) -> FloatArray:
     problem. No patch decides for the others, so that errors do not grow with the way from a first one.
     """
     patches = [patch for mote in range(count) if (patch := _patch(mote, means, dimension)) is not None]
-    places = np.full((count, dimension), np.nan)
     if not patches:
-        return places
-    turns = _turns(patches, count, dimension)
-    kept = [number for number in range(len(patches)) if turns[number] is not None]
-    return _shifted(
-        [patches[number] for number in kept], np.array([turns[number] for number in kept]), count, dimension
-    )
+        return np.full((count, dimension), np.nan)
+    group, turns = _turns(patches, count, dimension)
+    return _shifted([patches[number] for number in group], turns, count, dimension)
 
 
 def _patch(centre: int, means: PairMeans, dimension: int) -> Patch | None:
@@ -189,15 +181,15 @@ def _patch(centre: int, means: PairMeans, dimension: int) -> Patch | None:
     return Patch(np.array(members, dtype=np.intp), best) if len(best) else None
 
 
-def _turns(patches: list[Patch], count: int, dimension: int) -> list[FloatArray | None]:
+def _turns(patches: list[Patch], count: int, dimension: int) -> tuple[list[int], FloatArray]:
+    """The largest group of patches that hang together, and their turns into one frame, shape (p, d, d)."""
     relations = _relations(patches, count, dimension)
     size = len(patches)
-    turns: list[FloatArray | None] = [None] * size
     if not relations:
         largest = max(range(size), key=lambda number: len(patches[number].motes))
-        turns[largest] = np.eye(dimension)
-        return turns
-    group = _largest_group(relations, size)
+        return [largest], np.eye(dimension)[None]
+    labels = components(size, np.array([(a, b) for a, b, _, _ in relations], dtype=np.intp))
+    group = np.flatnonzero(labels == np.bincount(labels).argmax()).tolist()
     row_of = {number: row for row, number in enumerate(group)}
     linked = [(row_of[a], row_of[b], turn, weight) for a, b, turn, weight in relations if a in row_of]
     ends = np.array([(i, j) for i, j, _, _ in linked], dtype=np.intp)
@@ -211,9 +203,7 @@ def _turns(patches: list[Patch], count: int, dimension: int) -> list[FloatArray 
         wanted = np.einsum("kji,kjl->kil", found[ends[:, 0]], found[ends[:, 1]])
         apart = ((wanted - blocks) ** 2).sum(axis=(1, 2))
         weights = trust / (1.0 + apart / _AGREE**2) + 1e-9
-    for number, turn in zip(group, found, strict=True):
-        turns[number] = turn
-    return turns
+    return group, found
 
 
 def _synchronised(ends: IndexArray, blocks: FloatArray, weights: FloatArray, size: int) -> FloatArray:
@@ -281,12 +271,6 @@ def _relation(first: Patch, second: Patch, dimension: int) -> tuple[FloatArray, 
     if gap <= 4.0 * error:
         return None
     return motion.rotation, float(np.sqrt(gap / (gap + error)) * np.sqrt(len(at_first) - dimension))
-
-
-def _largest_group(relations: list[tuple[int, int, FloatArray, float]], size: int) -> list[int]:
-    a, b = np.array([relation[0] for relation in relations]), np.array([relation[1] for relation in relations])
-    labels = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(size, size)), directed=False)[1]
-    return [int(number) for number in np.flatnonzero(labels == np.bincount(labels).argmax())]
 
 
 def _shifted(patches: list[Patch], turns: FloatArray, count: int, dimension: int) -> FloatArray:
@@ -374,9 +358,8 @@ def _filled(places_m: FloatArray, means: PairMeans) -> FloatArray:
 def _with_bodies(network: RangeNetwork, means: PairMeans) -> tuple[IndexArray, FloatArray, FloatArray]:
     pairs, distances, sigmas = [means.pairs], [means.ranges_m], [means.sigmas_m]
     for body in network.bodies:
-        motes = np.array(body.motes, dtype=np.intp)
-        a, b = np.triu_indices(len(motes), 1)
-        pairs.append(np.column_stack([motes[a], motes[b]]))
+        a, b = every_pair(np.arange(len(body.motes))).T
+        pairs.append(every_pair(np.array(body.motes, dtype=np.intp)))
         distances.append(np.linalg.norm(body.local_m[a] - body.local_m[b], axis=1))
         sigmas.append(np.full(len(a), float(means.sigmas_m.min())))
     return np.concatenate(pairs), np.concatenate(distances), np.concatenate(sigmas)

@@ -1,9 +1,4 @@
-"""A first map of a few dozen motes: multidimensional scaling, unfolded in more dimensions than there are.
-
-Whether a map and its ranges agree: which ranges are outliers, and how well the others fit.
-
-Maps anew, with all around them held, the places of a map where ranges contradict it.
-"""
+"""A first map of a few dozen motes, unfolded in more dimensions; whether a map and its ranges agree; local repairs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import shortest_path
 
 from ccatp.beacons.cricket.map_fit import MapFit, MapFitSettings, MapModel, fit_map
-from ccatp.beacons.cricket.range_network import IndexArray, PairMeans, RangeNetwork, components
+from ccatp.beacons.cricket.range_network import IndexArray, PairMeans, RangeNetwork, components, every_pair
 from ccatp.core import FloatArray
 from ccatp.filters.metrics import best_motion
 
@@ -59,7 +54,8 @@ def unfolded(
     weights = np.minimum(weights / np.median(weights), 25.0)
     for squeeze in squeezes:
         points = _relaxed(points, pairs, distances_m, weights, squeeze, dimension)
-        points = _turned(points)
+        centred = points - points.mean(axis=0)
+        points = np.asarray(centred @ np.linalg.svd(centred, full_matrices=False)[2].T)
     return np.ascontiguousarray(points[:, :dimension])
 
 
@@ -82,66 +78,42 @@ def classical_scaling(distances_m: FloatArray, dimension: int) -> FloatArray:
     return points
 
 
-def _turned(points: FloatArray) -> FloatArray:
-    centred = points - points.mean(axis=0)
-    return np.asarray(centred @ np.linalg.svd(centred, full_matrices=False)[2].T)
-
-
-class _Stress:
-    def __init__(
-        self,
-        count: int,
-        wide: int,
-        pairs: IndexArray,
-        distances_m: FloatArray,
-        weights: FloatArray,
-        penalty: FloatArray,
-    ) -> None:
-        self._i, self._j = pairs[:, 0], pairs[:, 1]
-        self._distances_m, self._weights, self._penalty = distances_m, weights, penalty
-        self._count, self._wide, self._size = count, wide, count * wide
-        frame = np.arange(wide)
-        at = np.concatenate([self._i[:, None] * wide + frame, self._j[:, None] * wide + frame], axis=1)
-        self._at = at.ravel()
-        self._cells = (at[:, :, None] * self._size + at[:, None, :]).ravel()
-
-    def look(self, places: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Cost, errors of the distances (e,), and unit vectors (e, wide)."""
-        ways = places[self._i] - places[self._j]
-        lengths = np.sqrt(np.einsum("ij,ij->i", ways, ways))
-        errors = self._distances_m - lengths
-        cost = float(self._weights @ errors**2 + self._penalty @ (places**2).sum(axis=0))
-        return cost, errors, ways / np.maximum(lengths, 1e-9)[:, None]
-
-    def step(self, places: FloatArray, errors: FloatArray, units: FloatArray, damping: float) -> FloatArray:
-        """The damped step, shape (n, wide)."""
-        rows = np.concatenate([units, -units], axis=1)
-        weighted = self._weights[:, None] * rows
-        blocks = weighted[:, :, None] * rows[:, None, :]
-        summed = np.asarray(np.bincount(self._cells, blocks.ravel(), self._size**2), dtype=np.float64)
-        normal = summed.reshape(self._size, self._size)
-        pull = np.bincount(self._at, (errors[:, None] * weighted).ravel(), self._size)
-        normal[np.diag_indices_from(normal)] += np.tile(self._penalty, self._count) + damping
-        gradient = pull - (places * self._penalty).ravel()
-        return np.asarray(
-            cho_solve(cho_factor(normal, check_finite=False), gradient, check_finite=False).reshape(
-                self._count, self._wide
-            )
-        )
-
-
 def _relaxed(
     points: FloatArray, pairs: IndexArray, distances_m: FloatArray, weights: FloatArray, squeeze: float, dimension: int
 ) -> FloatArray:
-    """Points after some damped Gauss-Newton steps (Levenberg 1944) down the stress."""
+    """Points after some damped Gauss-Newton steps (Levenberg 1944) down the stress.
+
+    It is sum w (d - |p_i - p_j|)^2 + squeeze |spare coordinates|^2.
+    """
     count, wide = points.shape
+    size = count * wide
+    i, j = pairs.T
     penalty = np.where(np.arange(wide) < dimension, 0.0, squeeze)
-    stress = _Stress(count, wide, pairs, distances_m, weights, penalty)
-    cost, errors, units = stress.look(points)
+    frame = np.arange(wide)
+    at = np.concatenate([i[:, None] * wide + frame, j[:, None] * wide + frame], axis=1)
+    cells = (at[:, :, None] * size + at[:, None, :]).ravel()
+
+    def look(places: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Cost, errors of the distances (e,), and unit vectors (e, wide)."""
+        ways = places[i] - places[j]
+        lengths = np.sqrt(np.einsum("ij,ij->i", ways, ways))
+        errors = distances_m - lengths
+        cost = float(weights @ errors**2 + penalty @ (places**2).sum(axis=0))
+        return cost, errors, ways / np.maximum(lengths, 1e-9)[:, None]
+
+    cost, errors, units = look(points)
     damping = 1e-2
     for _ in range(_STEPS):
-        trial = points + stress.step(points, errors, units, damping)
-        seen = stress.look(trial)
+        rows = np.concatenate([units, -units], axis=1)
+        weighted = weights[:, None] * rows
+        blocks = weighted[:, :, None] * rows[:, None, :]
+        normal = np.asarray(np.bincount(cells, blocks.ravel(), size**2), dtype=np.float64).reshape(size, size)
+        pull = np.bincount(at.ravel(), (errors[:, None] * weighted).ravel(), size)
+        normal[np.diag_indices_from(normal)] += np.tile(penalty, count) + damping
+        gradient = pull - (points * penalty).ravel()
+        step = cho_solve(cho_factor(normal, check_finite=False), gradient, check_finite=False)
+        trial = points + step.reshape(count, wide)
+        seen = look(trial)
         if seen[0] < cost:
             gain = cost - seen[0]
             points, (cost, errors, units), damping = trial, seen, max(0.3 * damping, 1e-6)
@@ -232,7 +204,7 @@ def _contradicted(network: RangeNetwork, fit: MapFit) -> list[IndexArray]:
     bad = np.abs(fit.residuals_m) > _SUSPECT * network.sigmas_m
     if not bad.any():
         return []
-    pairs = np.column_stack([network.first, network.second])
+    pairs = network.pairs
     suspects = np.unique(pairs[bad])
     near = np.unique(pairs[np.isin(pairs, suspects).any(axis=1)])
     inside = np.isin(pairs, near).all(axis=1)
@@ -243,19 +215,18 @@ def _contradicted(network: RangeNetwork, fit: MapFit) -> list[IndexArray]:
 
 def _mapped_anew(network: RangeNetwork, fit: MapFit, motes: IndexArray, settings: MapFitSettings) -> FloatArray | None:
     d = network.dimension
-    pairs = np.column_stack([network.first, network.second])
+    pairs = network.pairs
     rows = np.flatnonzero(np.isin(pairs, motes).any(axis=1))
     members = np.unique(pairs[rows])
     ring = np.setdiff1d(members, motes)
     if len(ring) < d + 1:
         return None
-    index = {int(mote): place for place, mote in enumerate(members)}
     known = np.where(np.isin(members, ring)[:, None], fit.state.positions_m[members], np.nan)
     part = RangeNetwork(
         names=tuple(network.names[mote] for mote in members),
         dimension=d,
-        first=np.array([index[int(mote)] for mote in network.first[rows]], dtype=np.intp),
-        second=np.array([index[int(mote)] for mote in network.second[rows]], dtype=np.intp),
+        first=np.searchsorted(members, network.first[rows]),
+        second=np.searchsorted(members, network.second[rows]),
         ranges_m=(network.ranges_m[rows] - fit.state.offset_m) / (1.0 + fit.state.scale),
         sigmas_m=network.sigmas_m[rows],
         bodies=(),
@@ -263,13 +234,13 @@ def _mapped_anew(network: RangeNetwork, fit: MapFit, motes: IndexArray, settings
     )
     means = PairMeans(part)
     at = np.flatnonzero(np.isfinite(known[:, 0]))
-    a, b = np.triu_indices(len(at), 1)
-    held = np.linalg.norm(known[at[a]] - known[at[b]], axis=1)
+    held = every_pair(at)
+    held_m = np.linalg.norm(known[held[:, 0]] - known[held[:, 1]], axis=1)
     start = unfolded(
         len(members),
-        np.concatenate([means.pairs, np.column_stack([at[a], at[b]])]),
-        np.concatenate([means.ranges_m, held]),
-        np.concatenate([means.sigmas_m, np.full(len(a), float(means.sigmas_m.min()))]),
+        np.concatenate([means.pairs, held]),
+        np.concatenate([means.ranges_m, held_m]),
+        np.concatenate([means.sigmas_m, np.full(len(held), float(means.sigmas_m.min()))]),
         d,
     )
     start = best_motion(start[at], known[at], mirrors=True).moved(start)

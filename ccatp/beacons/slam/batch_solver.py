@@ -54,7 +54,7 @@ class Factored:
         n, m = len(self.system.diagonal), len(self.system.corner)
         root = np.tril(self._schur[0])
         W = solve_triangular(root, self._border_solved.T, lower=True, check_finite=False).T.reshape(n, BLOCK, m)
-        return _diagonal_of_inverse(self.system) + W @ W.transpose(0, 2, 1)
+        return np.asarray(_diagonal_of_inverse(self.system) + W @ W.transpose(0, 2, 1))
 
 
 def _banded(system: ArrowSystem, damping: float) -> FloatArray:
