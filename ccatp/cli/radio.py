@@ -1,13 +1,4 @@
-"""The commands ``ccatp radio``: systems of radio beacons.
-
-A recorded run through one estimator, or through all of them.
-
-The command ``ccatp radio slam``.
-
-The command ``ccatp radio compare``.
-
-The command ``ccatp radio map``.
-"""
+"""The commands ``ccatp radio``: recorded runs through estimators, maps of motes from their ranges, signal levels."""
 
 import json
 import os
@@ -35,7 +26,7 @@ from ccatp.errors import CcatpError, ExitStatus
 if TYPE_CHECKING:
     from ccatp.beacons.slam.recording import EstimatedPath, RecordedRun
     from ccatp.config.beacon_models import CricketConfig
-    from ccatp.config.recording_models import RecordingsConfig
+    from ccatp.config.recording_models import RecordingConfig, RecordingsConfig
 
 
 FORMATS = ("plaza", "mrclam", "labyrinth", "csv")
@@ -54,33 +45,25 @@ def estimate(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) 
     Raises:
         SlamCommandError: the data drove the estimator beyond finite numbers, or leave it without an answer.
     """
+    from time import perf_counter
+
     from numpy.linalg import LinAlgError
 
+    from ccatp.beacons.slam.batch_smoother import smooth
+    from ccatp.beacons.slam.causal import filter_run
+    from ccatp.beacons.slam.settings import slam_settings
     from ccatp.filters.base import FilterError
 
+    cfg: RecordingConfig = getattr(assumed, run.kind)
     try:
-        return _estimated(run, assumed, filter_name)
+        if filter_name == "smoother":
+            return smooth(run, cfg, perf_counter)
+        first_sigmas = (cfg.priors.pose_m, cfg.priors.heading_rad)
+        return filter_run(run, slam_settings(cfg, assumed.filter), first_sigmas, perf_counter)
     except (FilterError, LinAlgError) as error:
         raise SlamCommandError(
             f"{run.name}: {filter_name} finds no finite map for these data ({str(error)[:80]}); look at its warnings"
         ) from error
-
-
-def _estimated(run: "RecordedRun", assumed: "RecordingsConfig", filter_name: str) -> "EstimatedPath":
-    from time import perf_counter
-
-    from ccatp.beacons.slam.settings import slam_settings
-    from ccatp.config.recording_models import RecordingConfig
-
-    cfg: RecordingConfig = getattr(assumed, run.kind)
-    if filter_name == "smoother":
-        from ccatp.beacons.slam.batch_smoother import smooth
-
-        return smooth(run, cfg, perf_counter)
-    from ccatp.beacons.slam.causal import filter_run
-
-    first_sigmas = (cfg.priors.pose_m, cfg.priors.heading_rad)
-    return filter_run(run, slam_settings(cfg, assumed.filter), first_sigmas, perf_counter)
 
 
 def compared(run: "RecordedRun", assumed: "RecordingsConfig", peers: bool) -> list[dict[str, Any]]:
@@ -133,7 +116,7 @@ def slam(
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small; threads would only fight over them
     from ccatp.beacons.datasets.reader import read_run
-    from ccatp.beacons.slam.evaluation import judge, result_data, table_lines
+    from ccatp.beacons.slam.evaluation import judge, markdown, result_data, table_lines
     from ccatp.config.load import load_recordings_config
 
     assumed = load_recordings_config(config_file, overrides(settings, {}))
@@ -154,13 +137,8 @@ def slam(
     if json_output:
         click.echo(json.dumps(data, allow_nan=False))
         return 0
-    for line in table_lines(run, data):
+    for line in (*table_lines(run, data), *(("", *markdown(data["peers"])) if peers else ())):
         click.echo(line)
-    if peers:
-        from ccatp.beacons.slam.evaluation import markdown
-
-        for line in ("", *markdown(data["peers"])):
-            click.echo(line)
     return 0
 
 
@@ -292,12 +270,9 @@ def _simulated(
 
 
 def _measured(
-    cfg: "CricketConfig",
-    method: str,
-    files: tuple[Path, Path | None, Path | None],
-    out_file: Path | None,
+    cfg: "CricketConfig", method: str, files: tuple[Path, Path | None, Path | None], out_file: Path | None,
     figure_file: Path | None,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     import numpy as np
 
     from ccatp.beacons.cricket.measured_map import map_measured
@@ -305,13 +280,9 @@ def _measured(
     from ccatp.report.beacon_plots import MapPicture, draw_mote_map
 
     ranges_file, tags_file, truth_file = files
-    found = map_measured(
-        cfg,
-        method,
-        read_ranges(ranges_file, cfg.ranging.sigma_m),
-        None if tags_file is None else read_places(tags_file),
-        None if truth_file is None else read_places(truth_file),
-    )
+    ranges = read_ranges(ranges_file, cfg.ranging.sigma_m)
+    tags_m, truth_m = (None if file is None else read_places(file) for file in (tags_file, truth_file))
+    found = map_measured(cfg, method, ranges, tags_m, truth_m)
     if out_file is not None:
         _write(out_file, found.names, found.positions_m, found.covariance_m2, "measured")
     if figure_file is not None:
@@ -335,7 +306,7 @@ def _write(path: Path, names: tuple[str, ...], positions_m: Any, covariance_m2: 
 def _progress(total: int) -> Callable[[int], None]:
     is_live = sys.stderr.isatty()
 
-    def tell(done: int) -> None:
+    def show(done: int) -> None:
         if total == 1:
             return
         if is_live:
@@ -343,7 +314,7 @@ def _progress(total: int) -> Callable[[int], None]:
         elif 10 * done // total > 10 * (done - 1) // total:
             complain(f"{done} of {total} runs", 0)
 
-    return tell
+    return show
 
 
 @click.group(cls=SuggestingGroup, epilog=example("ccatp radio slam recordings/Plaza2_.mat"))
@@ -351,9 +322,5 @@ def radio() -> None:
     """Robots among radio beacons: mapping them, finding the way by them."""
 
 
-radio.add_command(slam)
-radio.add_command(calibrate)
-radio.add_command(fix)
-radio.add_command(fuzzy)
-radio.add_command(radio_map)
-radio.add_command(compare)
+for command in (slam, calibrate, fix, fuzzy, radio_map, compare):
+    radio.add_command(command)

@@ -1,14 +1,9 @@
-"""The command ``ccatp radio fix``.
-
-The command ``ccatp radio calibrate``, and the options that it shares.
-
-The command ``ccatp radio fuzzy``.
-"""
+"""The commands ``ccatp radio calibrate``, ``fix`` and ``fuzzy``: path loss, positions from levels, the speed rules."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from math import hypot, isfinite
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +13,11 @@ from ccatp.cli.common import JSON_OPTION, SETTINGS_OPTION, complain, example, fi
 from ccatp.errors import CcatpError, ExitStatus
 
 if TYPE_CHECKING:
-    from ccatp.beacons.datasets.levels import HeardPlace, PlaceTable
-    from ccatp.beacons.slam.path_loss import LevelFix, LevelLocator, LevelPair, PathLossFit, Room
+    from ccatp.beacons.datasets.levels import PlaceTable
+    from ccatp.beacons.slam.level_fix import LevelLocator, Room
+    from ccatp.beacons.slam.path_loss import PathLossFit
+
+    Fits = Callable[[int | None], Mapping[str, PathLossFit]]
 
 
 CONFIDENCE = 0.95
@@ -62,36 +60,14 @@ def calibrate(path: Path, sheet: str | None, points: Path | None, figure_file: P
 
         draw_path_loss(fit, table.pairs, table.name, figure_file)
     if json_output:
-        click.echo(json.dumps({"data": table.name, **fit_data(fit), "warnings": warnings}))
+        click.echo(json.dumps({"data": table.name, **fit.data(CONFIDENCE), "warnings": warnings}))
         return 0
-    _tell_fit(table.name, fit)
+    _show_fit(table.name, fit)
     return 0
 
 
-def fit_data(fit: "PathLossFit") -> dict[str, Any]:
-    """A calibration as JSON says it."""
-    reference, exponent = fit.half_widths(CONFIDENCE)
-    low, high = fit.sigma_interval_db(CONFIDENCE)
-    is_repeated = fit.white_sigma_db == fit.white_sigma_db  # not NaN
-    return {
-        "reference_dbm": round(fit.reference_dbm, 4),
-        "reference_half_width_db": round(reference, 4),
-        "exponent": round(fit.exponent, 5),
-        "exponent_half_width": round(exponent, 5),
-        "sigma_db": round(fit.sigma_db, 4),
-        "sigma_low_db": round(low, 4),
-        "sigma_high_db": round(high, 4),
-        "white_sigma_db": round(fit.white_sigma_db, 4) if is_repeated else None,
-        "shadowing_sigma_db": round(fit.shadowing_sigma_db, 4) if is_repeated else None,
-        "range_log_sigma": round(fit.path_loss.log_sigma, 5),
-        "confidence": CONFIDENCE,
-        "places": fit.places,
-        "readings": fit.readings,
-    }
-
-
-def _tell_fit(name: str, fit: "PathLossFit") -> None:
-    found = fit_data(fit)
+def _show_fit(name: str, fit: "PathLossFit") -> None:
+    found = fit.data(CONFIDENCE)
     is_repeated = found["white_sigma_db"] is not None
     low_db, high_db = found["sigma_low_db"], found["sigma_high_db"]
     s = fit.path_loss.log_sigma
@@ -117,14 +93,10 @@ def _tell_fit(name: str, fit: "PathLossFit") -> None:
     click.echo("\n".join(lines))
 
 
-if TYPE_CHECKING:
-    Fits = Callable[[int | None], Mapping[str, PathLossFit]]
-
 REGION = 0.9
 _CLEARLY = 6.9  # of log-likelihood: a thousand to one
 _LARGEST_M = 1e4  # of coordinates: levels reach no further than that
 _MOST_POINTS = 250_000  # of the grid: a few megabytes for each beacon
-_NEAREST_M = 0.1  # nearer than this the log-distance model is not believed
 
 
 @click.command(
@@ -151,7 +123,7 @@ def fix(
 ) -> int:  # fmt: skip
     """Find each place of PATH from one level of each beacon, and judge the errors and the 90 % regions."""
     from ccatp.beacons.datasets.levels import read_places
-    from ccatp.beacons.slam.path_loss import LevelLocator
+    from ccatp.beacons.slam.level_fix import LevelLocator, judged
 
     places_m = _beacons(beacons)
     if len(places_m) < 2:
@@ -167,7 +139,8 @@ def fix(
     for index, heard in enumerate(table.places):
         own = LevelLocator(places_m, fits(index), area) if leave_out else locator
         found.append(own.fix(heard.levels_dbm))
-    result = {"data": table.name, "leave_one_out": leave_out, **_judged(found, table.places), "warnings": warnings}
+    figures = judged(found, table.places, REGION)
+    result = {"data": table.name, "leave_one_out": leave_out, **figures, "warnings": warnings}
     if figure_file is not None:
         from ccatp.report.beacon_plots import draw_fixes
 
@@ -175,30 +148,25 @@ def fix(
     if json_output:
         click.echo(json.dumps(result))
         return 0
-    _tell_fixes(result)
+    _show_fixes(result)
     return 0
 
 
 def _beacons(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
     places_m: dict[str, tuple[float, float]] = {}
     for text in texts:
-        name, place_m = _beacon(text)
+        name, _, place = text.partition("=")
+        try:
+            x_m, y_m = (float(part) for part in place.split(","))
+        except ValueError as error:
+            raise CalibrateError(f"--beacon {text}: is not NAME=X,Y in metres, as in A=0,4") from error
+        if not (name := name.strip()):
+            raise CalibrateError(f"--beacon {text}: has no name; it is NAME=X,Y in metres, as in A=0,4")
+        _check_reach(f"--beacon {text}", (x_m, y_m))
         if name in places_m:
             raise CalibrateError(f"--beacon {text}: {name} was given before; each beacon has one place")
-        places_m[name] = place_m
+        places_m[name] = (x_m, y_m)
     return places_m
-
-
-def _beacon(text: str) -> tuple[str, tuple[float, float]]:
-    name, _, place = text.partition("=")
-    try:
-        x_m, y_m = (float(part) for part in place.split(","))
-    except ValueError as error:
-        raise CalibrateError(f"--beacon {text}: is not NAME=X,Y in metres, as in A=0,4") from error
-    if not (name := name.strip()):
-        raise CalibrateError(f"--beacon {text}: has no name; it is NAME=X,Y in metres, as in A=0,4")
-    _check_reach(f"--beacon {text}", (x_m, y_m))
-    return name, (x_m, y_m)
 
 
 def _check_reach(option: str, values_m: Sequence[float]) -> None:
@@ -207,7 +175,7 @@ def _check_reach(option: str, values_m: Sequence[float]) -> None:
 
 
 def _room(text: str | None, places_m: dict[str, tuple[float, float]], spacing_m: float) -> "Room":
-    from ccatp.beacons.slam.path_loss import Room
+    from ccatp.beacons.slam.level_fix import Room
 
     x0, y0, x1, y1 = _sides(text, places_m)
     longest_m, most = max(x1 - x0, y1 - y0), _MOST_POINTS
@@ -248,11 +216,7 @@ def _exchanged(table: "PlaceTable", exchange: str | None) -> "PlaceTable":
         known = ", ".join(table.places[0].levels_dbm)
         raise CalibrateError(f"--exchange {exchange}: is not two beacons of the data, which has {known}")
     new = {pair[0]: pair[1], pair[1]: pair[0]}
-    places = tuple(
-        replace(heard, levels_dbm={new.get(n, n): level for n, level in heard.levels_dbm.items()})
-        for heard in table.places
-    )
-    return replace(table, places=places)
+    return replace(table, places=tuple(heard.renamed(new) for heard in table.places))
 
 
 def _fits(
@@ -260,6 +224,7 @@ def _fits(
     sheet: str | None,
 ) -> "tuple[Fits, bool]":  # fmt: skip
     from ccatp.beacons.datasets.levels import read_levels, read_places
+    from ccatp.beacons.slam.level_fix import fingerprint_fits
     from ccatp.beacons.slam.path_loss import PathLossError, fit_path_loss
 
     if (fingerprints is None) == (path_loss is None):
@@ -269,65 +234,24 @@ def _fits(
             common = fit_path_loss(read_levels(path_loss, sheet).pairs)
             return lambda _index: dict.fromkeys(places_m, common), False
         heard_at = read_places(fingerprints or path, sheet).places
-
-        def fits(left_out: int | None) -> "dict[str, PathLossFit]":
-            used = [heard for index, heard in enumerate(heard_at) if index != left_out]
-            return {name: fit_path_loss(_pairs(used, name, at)) for name, at in places_m.items()}
-
-        fits(None)
+        fingerprint_fits(heard_at, places_m)
     except PathLossError as error:
         raise CalibrateError(f"{fingerprints or path_loss}: {error}") from error
-    return fits, fingerprints is not None and fingerprints.resolve() == path.resolve()
-
-
-def _pairs(places: "Sequence[HeardPlace]", name: str, beacon_m: tuple[float, float]) -> "Iterator[LevelPair]":
-    from ccatp.beacons.slam.path_loss import LevelPair
-
-    for heard in places:
-        if name in heard.levels_dbm:
-            distance_m = hypot(heard.place_m[0] - beacon_m[0], heard.place_m[1] - beacon_m[1])
-            yield LevelPair(max(distance_m, _NEAREST_M), heard.levels_dbm[name], heard.place_m)
+    is_same = fingerprints is not None and fingerprints.resolve() == path.resolve()
+    return lambda left_out: fingerprint_fits(heard_at, places_m, left_out), is_same
 
 
 def _names_doubt(locator: "LevelLocator", table: "PlaceTable") -> list[str]:
-    from ccatp.beacons.slam.path_loss import likeliest_names
+    from ccatp.beacons.slam.level_fix import likeliest_names
 
-    names, gain = likeliest_names(locator, [(heard.place_m, heard.levels_dbm) for heard in table.places])
+    names, gain = likeliest_names(locator, table.places)
     moved = [f"{old} is {new}" for old, new in names.items() if old != new]
     if gain < _CLEARLY or not moved:
         return []
     return [f"beacons look exchanged: {', '.join(moved)} is e^{gain:.0f} times as likely; see --exchange"]
 
 
-def _judged(found: Sequence["LevelFix"], places: Sequence["HeardPlace"]) -> dict[str, Any]:
-    import numpy as np
-
-    points: list[dict[str, Any]] = []
-    for fix_found, heard in zip(found, places, strict=True):
-        error_m = float(np.hypot(*(fix_found.position_m - heard.place_m)))
-        sigmas = np.sqrt(np.diag(fix_found.covariance_m2))
-        points.append(
-            {
-                "true_m": list(heard.place_m),
-                "fix_m": [round(float(v), 4) for v in fix_found.position_m],
-                "sigma_m": [round(float(v), 4) for v in sigmas],
-                "error_m": round(error_m, 4),
-                "in_region": fix_found.holds(heard.place_m, REGION),
-            }
-        )
-    errors = [point["error_m"] for point in points]
-    return {
-        "points": points,
-        "mean_error_m": round(float(np.mean(errors)), 4),
-        "median_error_m": round(float(np.median(errors)), 4),
-        "largest_error_m": max(errors),
-        "region": REGION,
-        "in_region": sum(bool(point["in_region"]) for point in points),
-        "coverage": round(float(np.mean([point["in_region"] for point in points])), 4),
-    }
-
-
-def _tell_fixes(result: dict[str, Any]) -> None:
+def _show_fixes(result: dict[str, Any]) -> None:
     how = ", each by the calibration of the others" if result["leave_one_out"] else ""
     click.echo(f"{result['data']}: {len(result['points'])} places, one level of each beacon{how}")
     for index, point in enumerate(result["points"], 1):

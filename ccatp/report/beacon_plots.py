@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from ccatp.beacons.slam.evaluation import TrackEvaluation, aligned_beacons, truth_at
-from ccatp.beacons.slam.path_loss import LevelFix, LevelPair, PathLossFit
+from ccatp.beacons.slam.level_fix import LevelFix
+from ccatp.beacons.slam.path_loss import LevelPair, PathLossFit
 from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun, dead_reckoned
 from ccatp.beacons.steering import Sugeno
 from ccatp.config.beacon_models import FuzzyConfig

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ccatp.beacons.datasets.tables import RadioDataError, read_text
+from ccatp.beacons.slam.level_fix import HeardPlace
 from ccatp.beacons.slam.path_loss import LevelPair
 
 _LARGEST_PART = 50_000_000  # bytes: a table that people measured is smaller, a decompression bomb is not
@@ -70,14 +71,6 @@ class LevelTable:
     name: str
     pairs: tuple[LevelPair, ...]
     warnings: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class HeardPlace:
-    """A place, and the levels heard there by node."""
-
-    place_m: tuple[float, float]
-    levels_dbm: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True)

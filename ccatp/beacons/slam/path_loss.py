@@ -1,15 +1,9 @@
-"""Calibration of the log-distance model from pairs of distance and level, with confidence.
+"""The log-distance model of signal strength, and its calibration from pairs of distance and level."""
 
-The log-distance model of signal strength: levels from distances, distances from levels, with their spread.
-
-A position from one level of each beacon: the posterior over a room, its mean and its 90 % region.
-"""
-
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import permutations
-from math import exp, expm1, inf, log, log10, nan, sqrt
-from typing import NamedTuple
+from math import inf, isnan, log, log10, nan, sqrt
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtri, stdtrit
@@ -17,13 +11,6 @@ from scipy.special import chdtri, stdtrit
 from ccatp.core import FloatArray
 
 _NEPER_PER_DB = log(10.0) / 10.0
-
-
-class RangeEstimate(NamedTuple):
-    """A distance with its standard deviation, both m."""
-
-    range_m: float
-    sigma_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,24 +44,6 @@ class PathLoss:
     def log_sigma(self) -> float:
         """Standard deviation s of ln r from one level: sigma ln(10) / (10 eta)."""
         return self.sigma_db * _NEPER_PER_DB / self.exponent
-
-    def range_from(self, level_dbm: float, count: int = 1) -> RangeEstimate:
-        """Distance from a level, without bias.
-
-        Noise that is normal in dB is log-normal in m: the inverse of the model is too long by exp(s^2 / 2) on the
-        average. That factor is taken off; what is left has the variance r^2 (exp(s^2) - 1).
-
-        Args:
-            level_dbm: the level, or the mean of several with independent noise.
-
-        Raises:
-            ValueError: no level at all.
-        """
-        if count < 1:
-            raise ValueError(f"mean of {count} levels has no range; give at least one")
-        s2 = self.log_sigma**2 / count
-        range_m = self.median_range_m(level_dbm) * exp(-0.5 * s2)
-        return RangeEstimate(range_m, range_m * sqrt(expm1(s2)))
 
 
 LEAST_EXPONENT = 0.1  # free space has 2; levels that hardly fall tell no distance
@@ -147,6 +116,27 @@ class PathLossFit:
         square = self.freedom * self.sigma_db**2
         return sqrt(square / low), sqrt(square / high)
 
+    def data(self, confidence: float) -> dict[str, Any]:
+        """The calibration for JSON, with confidence intervals; None where nothing was repeated."""
+        reference, exponent = self.half_widths(confidence)
+        low, high = self.sigma_interval_db(confidence)
+        is_repeated = not isnan(self.white_sigma_db)
+        return {
+            "reference_dbm": round(self.reference_dbm, 4),
+            "reference_half_width_db": round(reference, 4),
+            "exponent": round(self.exponent, 5),
+            "exponent_half_width": round(exponent, 5),
+            "sigma_db": round(self.sigma_db, 4),
+            "sigma_low_db": round(low, 4),
+            "sigma_high_db": round(high, 4),
+            "white_sigma_db": round(self.white_sigma_db, 4) if is_repeated else None,
+            "shadowing_sigma_db": round(self.shadowing_sigma_db, 4) if is_repeated else None,
+            "range_log_sigma": round(self.path_loss.log_sigma, 5),
+            "confidence": confidence,
+            "places": self.places,
+            "readings": self.readings,
+        }
+
     def predicted(self, distances_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean and scale of the level of a new place at distances (n,): Student's t with ``freedom``, both (n,)."""
         rows = np.column_stack([np.ones(distances_m.size), -10.0 * np.log10(distances_m)])
@@ -187,10 +177,10 @@ def fit_path_loss(pairs: Iterable[LevelPair]) -> PathLossFit:
     """Least squares line of level over -10 log10(distance).
 
     Every place counts once, with the mean of its readings: what is off at a place is off for all of them, so a hundred
-    readings at one place are no hundred witnesses.
+    readings at one place do not count as a hundred.
 
     Raises:
-        CalibrationError: fewer than three distances, one that is not positive, one that is not finite, or levels that
+        PathLossError: fewer than three distances, one that is not positive, one that is not finite, or levels that
             do not fall with distance.
     """
     by_place: dict[tuple[float, tuple[float, float] | None], list[float]] = {}
@@ -234,132 +224,3 @@ def _parts(groups: list[list[float]], variance_db2: float) -> tuple[float, float
     within = sum(float(np.var(group)) * len(group) for group in groups) / freedom
     in_means = within * float(np.mean([1.0 / len(group) for group in groups]))
     return sqrt(within), sqrt(max(variance_db2 - in_means, 0.0))
-
-
-_NEAREST_M = 0.1  # nearer than this the log-distance model is not believed
-_MOST_PERMUTED = 5  # names: 120 permutations
-
-
-@dataclass(frozen=True, slots=True)
-class Room:
-    """A rectangle in which the receiver is, searched on a grid."""
-
-    low_m: tuple[float, float]
-    high_m: tuple[float, float]
-    spacing_m: float
-
-    def points(self) -> FloatArray:
-        """Grid points, shape (n, 2)."""
-        axes = [
-            np.linspace(low, high, max(2, round((high - low) / self.spacing_m) + 1))
-            for low, high in zip(self.low_m, self.high_m, strict=True)
-        ]
-        return np.column_stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
-
-
-@dataclass(frozen=True, slots=True)
-class LevelFix:
-    """A position.
-
-    Attributes:
-        position_m: mean of the posterior, shape (2,).
-        covariance_m2: of the posterior, shape (2, 2).
-        points_m: the grid, shape (n, 2).
-        weights: posterior of the grid points, shape (n,).
-    """
-
-    position_m: FloatArray
-    covariance_m2: FloatArray
-    points_m: FloatArray
-    weights: FloatArray
-
-    def region(self, probability: float) -> "np.ndarray[tuple[int], np.dtype[np.bool_]]":
-        """The grid points of the smallest region that holds a probability, as a mask of shape (n,)."""
-        order = np.argsort(-self.weights)
-        before = np.cumsum(self.weights[order]) - self.weights[order]
-        mask = np.zeros(self.weights.size, dtype=np.bool_)
-        mask[order[before < probability]] = True
-        return mask
-
-    def holds(self, place_m: Sequence[float], probability: float) -> bool:
-        """Whether the smallest region of a probability holds a place."""
-        nearest = int(np.argmin(np.hypot(*(self.points_m - np.asarray(place_m)).T)))
-        return bool(self.region(probability)[nearest])
-
-
-class LevelLocator:
-    """Positions from levels, with beacons whose places and path losses are known.
-
-    The level of a beacon at a place has Student's t about its path loss: the spread of its calibration, and the
-    uncertainty of the two parameters. Over the room all places are as likely; the posterior is summed on a grid, so
-    that nothing is linearised. Its mean is the position of least expected squared error.
-    """
-
-    def __init__(
-        self, beacons_m: Mapping[str, tuple[float, float]], fits: Mapping[str, PathLossFit], room: Room
-    ) -> None:
-        self.names = tuple(beacons_m)
-        self.points_m = room.points()
-        self._beacons_m = np.array(list(beacons_m.values()))
-        self._fits = [fits[name] for name in self.names]
-        self._predicted = [self._predict(self.points_m, i) for i in range(len(self.names))]
-
-    def fix(self, levels_dbm: Mapping[str, float]) -> LevelFix:
-        """The position of a receiver that hears these levels; beacons that it does not hear are left out.
-
-        Raises:
-            ValueError: it hears none.
-        """
-        if not any(name in levels_dbm for name in self.names):
-            raise ValueError(f"none of the beacons {', '.join(self.names)} was heard; a fix needs one at least")
-        log_weights = np.zeros(len(self.points_m))
-        for i, name in enumerate(self.names):
-            if name in levels_dbm:
-                log_weights += _log_density(levels_dbm[name], *self._predicted[i], self._fits[i].freedom)
-        weights = np.exp(log_weights - log_weights.max())
-        weights /= weights.sum()
-        mean = weights @ self.points_m
-        off = self.points_m - mean
-        return LevelFix(mean, (off * weights[:, None]).T @ off, self.points_m, weights)
-
-    def log_likelihood(self, place_m: Sequence[float], levels_dbm: Mapping[str, float]) -> float:
-        """Of levels heard at a known place."""
-        at = np.asarray(place_m, dtype=np.float64)[None, :]
-        return sum(
-            float(_log_density(levels_dbm[name], *self._predict(at, i), self._fits[i].freedom)[0])
-            for i, name in enumerate(self.names)
-            if name in levels_dbm
-        )
-
-    def _predict(self, points_m: FloatArray, beacon: int) -> tuple[FloatArray, FloatArray]:
-        distances = np.hypot(*(points_m - self._beacons_m[beacon]).T)
-        return self._fits[beacon].predicted(np.maximum(distances, _NEAREST_M))
-
-
-def likeliest_names(
-    locator: LevelLocator, heard: Sequence[tuple[Sequence[float], Mapping[str, float]]]
-) -> tuple[dict[str, str], float]:
-    """Which names the beacons of a data set with known places should have.
-
-    Returns:
-        The likeliest permutation, from the name in the data to the beacon's, and how much its log-likelihood exceeds
-        that of the names as they are.
-    """
-    names = locator.names
-    if len(names) > _MOST_PERMUTED:
-        return {name: name for name in names}, 0.0
-
-    def score(order: Sequence[str]) -> float:
-        new = dict(zip(names, order, strict=True))
-        return sum(
-            locator.log_likelihood(place, {new.get(n, n): level for n, level in levels.items()})
-            for place, levels in heard
-        )
-
-    best = max(permutations(names), key=score)
-    return dict(zip(names, best, strict=True)), score(best) - score(names)
-
-
-def _log_density(level_dbm: float, mean: FloatArray, scale: FloatArray, freedom: int) -> FloatArray:
-    square = ((level_dbm - mean) / scale) ** 2
-    return np.asarray(-0.5 * (freedom + 1) * np.log1p(square / freedom) - np.log(scale))

@@ -1,0 +1,193 @@
+"""A position from one level of each beacon: the posterior over a room, its mean and its regions."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import permutations
+from math import hypot
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ccatp.beacons.slam.path_loss import LevelPair, PathLossFit, fit_path_loss
+from ccatp.core import FloatArray
+
+_NEAREST_M = 0.1  # nearer than this the log-distance model is not believed
+_MOST_PERMUTED = 5  # names: 120 permutations
+
+
+class HeardPlace(NamedTuple):
+    """A known place, and the levels received there by beacon."""
+
+    place_m: tuple[float, float]
+    levels_dbm: dict[str, float]
+
+    def renamed(self, names: Mapping[str, str]) -> "HeardPlace":
+        """With other names of beacons, from old to new."""
+        return HeardPlace(self.place_m, {names.get(name, name): level for name, level in self.levels_dbm.items()})
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """A rectangle in which the receiver is, searched on a grid."""
+
+    low_m: tuple[float, float]
+    high_m: tuple[float, float]
+    spacing_m: float
+
+    def points(self) -> FloatArray:
+        """Grid points, shape (n, 2)."""
+        axes = [
+            np.linspace(low, high, max(2, round((high - low) / self.spacing_m) + 1))
+            for low, high in zip(self.low_m, self.high_m, strict=True)
+        ]
+        return np.column_stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
+
+
+@dataclass(frozen=True, slots=True)
+class LevelFix:
+    """A position.
+
+    Attributes:
+        position_m: mean of the posterior, shape (2,).
+        covariance_m2: of the posterior, shape (2, 2).
+        points_m: the grid, shape (n, 2).
+        weights: posterior of the grid points, shape (n,).
+    """
+
+    position_m: FloatArray
+    covariance_m2: FloatArray
+    points_m: FloatArray
+    weights: FloatArray
+
+    def region(self, probability: float) -> npt.NDArray[np.bool_]:
+        """The grid points of the smallest region that holds a probability, as a mask of shape (n,)."""
+        order = np.argsort(-self.weights)
+        before = np.cumsum(self.weights[order]) - self.weights[order]
+        mask = np.zeros(self.weights.size, dtype=np.bool_)
+        mask[order[before < probability]] = True
+        return mask
+
+    def holds(self, place_m: Sequence[float], probability: float) -> bool:
+        """Whether the smallest region of a probability holds a place."""
+        nearest = int(np.argmin(np.hypot(*(self.points_m - np.asarray(place_m)).T)))
+        return bool(self.region(probability)[nearest])
+
+
+class LevelLocator:
+    """Positions from levels of beacons whose places and path losses are known.
+
+    The level of a beacon at a place has Student's t about its path loss: the spread of its calibration, and the
+    uncertainty of the two parameters. Over the room all places are as likely; the posterior is summed on a grid, so
+    that nothing is linearised. Its mean is the position of least expected squared error.
+    """
+
+    def __init__(
+        self, beacons_m: Mapping[str, tuple[float, float]], fits: Mapping[str, PathLossFit], room: Room
+    ) -> None:
+        self.names = tuple(beacons_m)
+        self.points_m = room.points()
+        self._beacons_m = np.array(list(beacons_m.values()))
+        self._fits = [fits[name] for name in self.names]
+        self._predicted = [self._predict(self.points_m, i) for i in range(len(self.names))]
+
+    def fix(self, levels_dbm: Mapping[str, float]) -> LevelFix:
+        """The position of a receiver that hears these levels; beacons that it does not hear are left out.
+
+        Raises:
+            ValueError: it hears none.
+        """
+        if not any(name in levels_dbm for name in self.names):
+            raise ValueError(f"none of the beacons {', '.join(self.names)} was heard; a fix needs one at least")
+        log_weights = np.zeros(len(self.points_m))
+        for i, name in enumerate(self.names):
+            if name in levels_dbm:
+                log_weights += _log_density(levels_dbm[name], *self._predicted[i], self._fits[i].freedom)
+        weights = np.exp(log_weights - log_weights.max())
+        weights /= weights.sum()
+        mean = weights @ self.points_m
+        off = self.points_m - mean
+        return LevelFix(mean, (off * weights[:, None]).T @ off, self.points_m, weights)
+
+    def log_likelihood(self, place_m: Sequence[float], levels_dbm: Mapping[str, float]) -> float:
+        """Of levels heard at a known place."""
+        at = np.asarray(place_m, dtype=np.float64)[None, :]
+        return sum(
+            float(_log_density(levels_dbm[name], *self._predict(at, i), self._fits[i].freedom)[0])
+            for i, name in enumerate(self.names)
+            if name in levels_dbm
+        )
+
+    def _predict(self, points_m: FloatArray, beacon: int) -> tuple[FloatArray, FloatArray]:
+        distances = np.hypot(*(points_m - self._beacons_m[beacon]).T)
+        return self._fits[beacon].predicted(np.maximum(distances, _NEAREST_M))
+
+
+def likeliest_names(locator: LevelLocator, places: Sequence[HeardPlace]) -> tuple[dict[str, str], float]:
+    """Which names the beacons of a data set with known places should have.
+
+    Returns:
+        The likeliest permutation, from the name in the data to the beacon's, and how much its log-likelihood exceeds
+        that of the names as they are.
+    """
+    names = locator.names
+    if len(names) > _MOST_PERMUTED:
+        return {name: name for name in names}, 0.0
+
+    def score(order: Sequence[str]) -> float:
+        new = dict(zip(names, order, strict=True))
+        return sum(locator.log_likelihood(one.place_m, one.renamed(new).levels_dbm) for one in places)
+
+    best = max(permutations(names), key=score)
+    return dict(zip(names, best, strict=True)), score(best) - score(names)
+
+
+def fingerprint_fits(
+    places: Sequence[HeardPlace], beacons_m: Mapping[str, tuple[float, float]], left_out: int | None = None
+) -> dict[str, PathLossFit]:
+    """Path loss of each beacon from its levels at known places, but for one of them.
+
+    Raises:
+        PathLossError: no path loss follows from them.
+    """
+    used = [heard for index, heard in enumerate(places) if index != left_out]
+    found = {}
+    for name, beacon_m in beacons_m.items():
+        pairs = []
+        for heard in used:
+            if name in heard.levels_dbm:
+                distance_m = hypot(heard.place_m[0] - beacon_m[0], heard.place_m[1] - beacon_m[1])
+                pairs.append(LevelPair(max(distance_m, _NEAREST_M), heard.levels_dbm[name], heard.place_m))
+        found[name] = fit_path_loss(pairs)
+    return found
+
+
+def judged(fixes: Sequence[LevelFix], places: Sequence[HeardPlace], probability: float) -> dict[str, Any]:
+    """Errors of fixes, and how many of the places their regions of a probability hold, for JSON."""
+    points: list[dict[str, Any]] = []
+    for found, heard in zip(fixes, places, strict=True):
+        error_m = float(np.hypot(*(found.position_m - heard.place_m)))
+        points.append(
+            {
+                "true_m": list(heard.place_m),
+                "fix_m": [round(float(v), 4) for v in found.position_m],
+                "sigma_m": [round(float(v), 4) for v in np.sqrt(np.diag(found.covariance_m2))],
+                "error_m": round(error_m, 4),
+                "in_region": found.holds(heard.place_m, probability),
+            }
+        )
+    errors = [point["error_m"] for point in points]
+    return {
+        "points": points,
+        "mean_error_m": round(float(np.mean(errors)), 4),
+        "median_error_m": round(float(np.median(errors)), 4),
+        "largest_error_m": max(errors),
+        "region": probability,
+        "in_region": sum(bool(point["in_region"]) for point in points),
+        "coverage": round(float(np.mean([point["in_region"] for point in points])), 4),
+    }
+
+
+def _log_density(level_dbm: float, mean: FloatArray, scale: FloatArray, freedom: int) -> FloatArray:
+    square = ((level_dbm - mean) / scale) ** 2
+    return np.asarray(-0.5 * (freedom + 1) * np.log1p(square / freedom) - np.log(scale))
