@@ -1,15 +1,4 @@
-"""A mission among beacons: from readings and the danger loop's verdict to set points. Time is an argument.
-
-States of a mission among beacons.
-
-When a mission among beacons stands, and why: commands of an operator, verdicts of the danger loop, faults.
-
-The last gate of a robot among beacons: nothing is sent that the verdict does not permit.
-
-Set points of a vehicle as wheel rates of the robot link, and a steering angle where there is one.
-
-Assembles the parts of a mission among beacons from a configuration, for the daemon and rehearsals alike.
-"""
+"""A mission among beacons: from readings and the verdict of the danger loop to set points. Time is an argument."""
 
 from enum import StrEnum
 from math import isfinite
@@ -44,15 +33,58 @@ MOVING = (VISITING, FOLLOWING, RETURNING)
 EARTHQUAKE = "emergency: earthquake"
 
 
-class BeaconHold:
-    """State and causes of the mission.
+def permitted(drive: SteeringCommand, verdict: Verdict, back_speed_m_s: float) -> SteeringCommand:
+    """What is left of a drive.
+
+    Where forward motion is wanted and denied, the robot backs off straight, if that is permitted: what it stands before
+    stays there, and wheels that steer cannot turn on the spot.
+    """
+    if not all(map(isfinite, drive)):
+        return HALT
+    if drive.speed_m_s > 0.0 and not verdict.forward:
+        return SteeringCommand(-back_speed_m_s, 0.0, 0.0) if verdict.reverse else HALT
+    if drive.speed_m_s < 0.0 and not verdict.reverse:
+        return HALT
+    if not verdict.turn:
+        return SteeringCommand(drive.speed_m_s, 0.0, 0.0)
+    return drive
+
+
+class WaypointArrival(NamedTuple):
+    """A waypoint is reached.
+
+    Attributes:
+        waypoint, lap: its number in the loop and the lap, both from 0.
+    """
+
+    waypoint: int
+    lap: int
+    place_m: tuple[float, float]
+    belief: PoseBelief
+
+
+class BeaconMission:
+    """Maps and visits waypoints, or follows a radio, and returns to its start when it is given up.
+
+    Call ``step`` once per frame. The robot stands at its believed start.
+
+    Args:
+        cfg: the configuration; nothing of ``sim`` is used.
 
     Attributes:
         abort_cause: why it was given up, or empty.
         is_faulted: something is wrong, and an operator has to look after it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, cfg: RadioConfig) -> None:
+        self._cfg = cfg
+        self.navigator: Navigator = MoteNavigator(cfg) if cfg.system == "cricket" else RadioNavigator(cfg)
+        self.pilot = BeaconPilot(cfg)
+        self._homing: BeaconPilot | None = None
+        self.arrivals: list[WaypointArrival] = []
+        self._begun_s: float | None = None
+        self._followed_s = 0.0
+        self._is_following = cfg.follow.is_active
         self.state: BeaconState = IDLE
         self.outcome = SurveyOutcome.NONE
         self.cause = self.abort_cause = ""
@@ -166,55 +198,7 @@ class BeaconHold:
         self.state, self.cause = IDLE, self.abort_cause
         self._is_by_hand = self.is_faulted = False
 
-
-def permitted(drive: SteeringCommand, verdict: Verdict, back_speed_m_s: float) -> SteeringCommand:
-    """What is left of a drive.
-
-    Where forward motion is wanted and denied, the robot backs off straight, if that is permitted: what it stands before
-    stays there, and wheels that steer cannot turn on the spot.
-    """
-    if not all(map(isfinite, drive)):
-        return HALT
-    if drive.speed_m_s > 0.0 and not verdict.forward:
-        return SteeringCommand(-back_speed_m_s, 0.0, 0.0) if verdict.reverse else HALT
-    if drive.speed_m_s < 0.0 and not verdict.reverse:
-        return HALT
-    if not verdict.turn:
-        return SteeringCommand(drive.speed_m_s, 0.0, 0.0)
-    return drive
-
-
-class WaypointArrival(NamedTuple):
-    """A waypoint is reached.
-
-    Attributes:
-        waypoint, lap: its number in the loop and the lap, both from 0.
-    """
-
-    waypoint: int
-    lap: int
-    place_m: tuple[float, float]
-    belief: PoseBelief
-
-
-class BeaconMission(BeaconHold):
-    """Maps and visits waypoints, or follows a radio, and returns to its start when it is given up.
-
-    Call ``step`` once per frame.
-
-    Args:
-        cfg: the configuration; nothing of ``sim`` is used.
-    """
-
-    def __init__(self, cfg: RadioConfig, navigator: Navigator) -> None:
-        super().__init__()
-        self._cfg, self.navigator = cfg, navigator
-        self.pilot = BeaconPilot(cfg)
-        self._homing: BeaconPilot | None = None
-        self.arrivals: list[WaypointArrival] = []
-        self._begun_s: float | None = None
-        self._followed_s = 0.0
-        self._is_following = cfg.follow.is_active
+    # -- frames ---------------------------------------------------------------------------------------------------
 
     @property
     def total(self) -> int:
@@ -233,15 +217,14 @@ class BeaconMission(BeaconHold):
         is_visiting = not self._is_following and len(self.arrivals) < self.total
         return len(self.arrivals) % len(self._cfg.workspace.waypoints_m) if is_visiting else -1
 
-    def step(self, senses: BeaconMeasurements, interval_s: float, verdict: Verdict | None) -> SteeringCommand:
+    def step(self, measurements: BeaconMeasurements, interval_s: float, verdict: Verdict | None) -> SteeringCommand:
         """One frame: take its readings, react to the verdict, drive on as far as it permits.
 
         Args:
-            senses: the frame.
             verdict: the danger loop's, in force; ``None`` where there is none fresh enough.
         """
-        self.navigator.take(senses)
-        t_s = senses.t_s
+        self.navigator.take(measurements)
+        t_s = measurements.t_s
         if self._begun_s is None:
             self._begun_s = t_s
         if not self.react(verdict) or verdict is None:
@@ -249,10 +232,10 @@ class BeaconMission(BeaconHold):
         if t_s - self._begun_s > self._cfg.mission.time_limit_s and self.state is not IDLE and not self.abort_cause:
             self.fault(f"the mission takes longer than mission.time_limit_s = {self._cfg.mission.time_limit_s:g}")
             return HALT
-        drive = self._wanted(senses, interval_s)
+        drive = self._wanted(measurements, interval_s)
         return permitted(drive, verdict, self._cfg.avoidance.back_speed_m_s)
 
-    def _wanted(self, senses: BeaconMeasurements, interval_s: float) -> SteeringCommand:
+    def _wanted(self, measurements: BeaconMeasurements, interval_s: float) -> SteeringCommand:
         if self.state is HELD:
             return HALT
         if self.navigator.is_mapping:
@@ -261,10 +244,13 @@ class BeaconMission(BeaconHold):
             else:
                 self.state = MAPPING
             return HALT
+        t_s, avoidance = measurements.t_s, self._cfg.avoidance
+        # Sensors without a reading in this frame count as seeing nothing: what they saw before is remembered.
+        distances_m = measurements.distances_m or (avoidance.range_max_m,) * len(avoidance.sensors_rad)
         if self.abort_cause:
-            return self._return(senses, interval_s)
-        pose, target = self.navigator.belief.pose, self.navigator.target(senses.t_s)
-        drive = self.pilot.drive(senses.t_s, interval_s, pose, target, self._distances(senses))
+            return self._return(t_s, interval_s, distances_m)
+        pose, target = self.navigator.belief.pose, self.navigator.target(t_s)
+        drive = self.pilot.drive(t_s, interval_s, pose, target, distances_m)
         if self._is_following:
             self._follow(interval_s)
         else:
@@ -286,26 +272,19 @@ class BeaconMission(BeaconHold):
         if len(self.arrivals) >= self.total:
             self.finish(SurveyOutcome.COMPLETE)
 
-    def _return(self, senses: BeaconMeasurements, interval_s: float) -> SteeringCommand:
+    def _return(self, t_s: float, interval_s: float, distances_m: tuple[float, ...]) -> SteeringCommand:
         self.state = RETURNING
         if self._homing is None:
-            self._homing = _homing_pilot(self._cfg)
-        drive = self._homing.drive(senses.t_s, interval_s, self.navigator.belief.pose, None, self._distances(senses))
+            cfg = self._cfg
+            home = {"waypoints_m": ((cfg.start.x_m, cfg.start.y_m),), "loops": False}
+            workspace = cfg.workspace.model_copy(update=home)
+            follow = cfg.follow.model_copy(update={"is_active": False})
+            self._homing = BeaconPilot(cfg.model_copy(update={"workspace": workspace, "follow": follow}))
+        drive = self._homing.drive(t_s, interval_s, self.navigator.belief.pose, None, distances_m)
         if self._homing.waypoints.current_m is None:
             self.finish(SurveyOutcome.AT_BASE)
             return HALT
         return drive
-
-    def _distances(self, senses: BeaconMeasurements) -> tuple[float, ...]:
-        avoidance = self._cfg.avoidance
-        return senses.distances_m or (avoidance.range_max_m,) * len(avoidance.sensors_rad)
-
-
-def _homing_pilot(cfg: RadioConfig) -> BeaconPilot:
-    base = ((cfg.start.x_m, cfg.start.y_m),)
-    workspace = cfg.workspace.model_copy(update={"waypoints_m": base, "loops": False})
-    follow = cfg.follow.model_copy(update={"is_active": False})
-    return BeaconPilot(cfg.model_copy(update={"workspace": workspace, "follow": follow}))
 
 
 class WheelRates(NamedTuple):
@@ -329,16 +308,6 @@ def wheel_rates(drive: SteeringCommand, cfg: RadioConfig) -> WheelRates:
 # The configuration may be calibrated, the robot's own figures are nominal: this much apart they describe two robots.
 TOLERANCE = 0.05
 TrackRow = tuple[int, float, float, float, float, float, float, float, float, float, float, float, float]
-
-
-def assemble_beacons(cfg: RadioConfig) -> BeaconMission:
-    """The mission of a configuration, the robot standing at its believed start."""
-    return BeaconMission(cfg, build_navigator(cfg))
-
-
-def build_navigator(cfg: RadioConfig) -> Navigator:
-    """What finds the robot: radios mapped on the way, or motes that map themselves first."""
-    return MoteNavigator(cfg) if cfg.system == "cricket" else RadioNavigator(cfg)
 
 
 def track_row(seq: int, t_s: float, navigator: Navigator) -> TrackRow:

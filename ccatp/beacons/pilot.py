@@ -1,16 +1,9 @@
-"""Who decides where a robot among beacons drives next: waypoints or the target, round the obstacles.
-
-Following a moving target at a safe distance: approach, hold, back off, and what to do when it is lost.
-
-Going round obstacles: a short memory of what the distance sensors saw; the free heading nearest to the aim.
-
-Getting away from what comes near without touching what stands about: the best of a fan of short arcs.
-"""
+"""Where a robot among beacons drives next: to waypoints or behind the target, round obstacles, away from a threat."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence
 from enum import StrEnum
-from math import asin, cos, hypot, inf, pi, sin, tau
+from math import asin, cos, dist, hypot, inf, pi, sin, tau
 from typing import NamedTuple
 
 from ccatp.beacons.steering import (
@@ -75,7 +68,9 @@ class Follower:
             return None
         self._sight = aim_at(pose, target.position_m)
         cfg = self._cfg
-        closing_m = cfg.foresight_s * _closing_m_s(pose, target)
+        dx_m, dy_m = pose[0] - target.position_m[0], pose[1] - target.position_m[1]
+        vx, vy = target.velocity_m_s  # only what comes nearer counts
+        closing_m = cfg.foresight_s * max(0.0, (vx * dx_m + vy * dy_m) / max(hypot(dx_m, dy_m), _NEAREST_M))
         # at most as much again: who stays away from what he does not know learns nothing of it
         margin_m = min(cfg.margin_sigmas * target.sigma_m, cfg.safe_distance_m)
         left_m = self._sight.distance_m - cfg.safe_distance_m - margin_m - closing_m
@@ -102,12 +97,6 @@ class Follower:
         return FollowState.HOLDING
 
 
-def _closing_m_s(pose: PlanarPose, target: TargetSight) -> float:
-    dx_m, dy_m = pose[0] - target.position_m[0], pose[1] - target.position_m[1]
-    vx, vy = target.velocity_m_s
-    return max(0.0, (vx * dx_m + vy * dy_m) / max(hypot(dx_m, dy_m), _NEAREST_M))
-
-
 _AHEAD_RAD = pi / 3.0  # what lies within this of the course is in the way of the body
 
 
@@ -122,13 +111,11 @@ class FreeHeading(NamedTuple):
 
     Attributes:
         speed_factor: 1 far from everything, 0 where nothing but standing is safe.
-        nearest_m: distance to the nearest obstacle that is remembered; infinite without one.
     """
 
     aim: BearingToPoint
     speed_factor: float
     is_blocked: bool
-    nearest_m: float
 
 
 class ObstacleAvoider:
@@ -161,15 +148,13 @@ class ObstacleAvoider:
 
     def way(self, pose: PlanarPose, aim: BearingToPoint) -> FreeHeading:
         """What is left of an aim at a pose."""
-        near = list(self._near(pose))
-        nearest_m = min((distance_m for distance_m, _ in near), default=inf)
         # What stands behind the aim is not in the way to it.
-        near = [echo for echo in near if echo[0] - self._reach_m < aim.distance_m]
+        near = [echo for echo in self._near(pose) if echo[0] - self._reach_m < aim.distance_m]
         blocked = [(wrap_pi(angle_rad), asin(min(1.0, self._reach_m / max(d, 1e-6)))) for d, angle_rad in near]
         error_rad = self._free_heading(aim.error_rad, blocked)
         if error_rad is None:
-            return FreeHeading(aim, 0.0, True, nearest_m)
-        return FreeHeading(BearingToPoint(aim.distance_m, error_rad), self._speed_factor(near), False, nearest_m)
+            return FreeHeading(aim, 0.0, True)
+        return FreeHeading(BearingToPoint(aim.distance_m, error_rad), self._speed_factor(near), False)
 
     def clear_m(self, pose: PlanarPose, direction_rad: float) -> float:
         """Distance to the nearest remembered obstacle in the way of a body that moves in a direction, m.
@@ -216,11 +201,6 @@ _STRAIGHT_RAD = 0.3  # ... and goes when less is left
 _KEEPING = 0.03  # metres that an arc in the direction of the last one may gain less than another
 
 
-class _Arc(NamedTuple):
-    drive: SteeringCommand
-    places: list[Point]
-
-
 class BackOff:
     """A dynamic window over arcs forwards and backwards (Fox, Burgard, Thrun 1997).
 
@@ -247,26 +227,26 @@ class BackOff:
         """
         horizon_s = self._cfg.follow.retreat_s
         vx, vy = threat_velocity_m_s
-        path = [(threat_m[0] + vx * t_s, threat_m[1] + vy * t_s) for t_s in _times_s(horizon_s)]
-        best, gain_m = HALT, _far(pose[:2], path[-1])
-        for arc in self._arcs(pose, horizon_s):
-            if not self._is_free(pose[:2], arc.places, obstacles_m):
+        threat_then_m = threat_m[0] + vx * horizon_s, threat_m[1] + vy * horizon_s
+        best, gain_m = HALT, dist(pose[:2], threat_then_m)
+        for drive, places in self._arcs(pose, horizon_s):
+            if not self._is_free(pose[:2], places, obstacles_m):
                 continue
-            far_m = _far(arc.places[-1], path[-1])
-            if arc.drive.speed_m_s * self._last > 0.0:
+            far_m = dist(places[-1], threat_then_m)
+            if drive.speed_m_s * self._last > 0.0:
                 far_m += _KEEPING
             if far_m > gain_m:
-                best, gain_m = arc.drive, far_m
+                best, gain_m = drive, far_m
         self._last = best.speed_m_s
         return best
 
-    def _arcs(self, pose: PlanarPose, horizon_s: float) -> Iterator[_Arc]:
+    def _arcs(self, pose: PlanarPose, horizon_s: float) -> Iterator[tuple[SteeringCommand, list[Point]]]:
         speed_m_s = min(self._cfg.follow.back_speed_m_s, self._cfg.vehicle.speed_max_m_s)
         if self._cfg.vehicle.kind == "ackermann":
             for signed_m_s in (-speed_m_s, speed_m_s):
                 for curve in _CURVES:
                     drive = SteeringCommand(signed_m_s, curve * self._cfg.vehicle.steer_max_rad, 0.0)
-                    yield _Arc(drive, self._places(pose, drive, horizon_s))
+                    yield drive, self._places(pose, drive, horizon_s)
             return
         for k in range(_COURSES):
             yield self._straight(pose, wrap_pi(pi + k * tau / _COURSES), speed_m_s, horizon_s)
@@ -284,7 +264,9 @@ class BackOff:
             places.append((x_m, y_m))
         return places
 
-    def _straight(self, pose: PlanarPose, course_rad: float, speed_m_s: float, horizon_s: float) -> _Arc:
+    def _straight(
+        self, pose: PlanarPose, course_rad: float, speed_m_s: float, horizon_s: float
+    ) -> tuple[SteeringCommand, list[Point]]:
         is_back = abs(course_rad) > pi / 2.0
         error_rad = wrap_pi(course_rad - pi) if is_back else course_rad
         most_rad_s = self._cfg.vehicle.turn_rate_max_rad_s
@@ -292,26 +274,19 @@ class BackOff:
         rate_rad_s = max(-most_rad_s, min(most_rad_s, error_rad / _TURN_S))
         goes = abs(error_rad) < _STRAIGHT_RAD
         along_rad = pose[2] + course_rad
-        ways_m = [speed_m_s * max(0.0, t_s - delay_s) for t_s in _times_s(horizon_s)]
+        times_s = [horizon_s * (k + 1) / _STEPS for k in range(_STEPS)]
+        ways_m = [speed_m_s * max(0.0, t_s - delay_s) for t_s in times_s]
         places = [(pose[0] + way_m * cos(along_rad), pose[1] + way_m * sin(along_rad)) for way_m in ways_m]
-        return _Arc(SteeringCommand((-speed_m_s if is_back else speed_m_s) * goes, 0.0, rate_rad_s), places)
+        return SteeringCommand((-speed_m_s if is_back else speed_m_s) * goes, 0.0, rate_rad_s), places
 
     def _is_free(self, start_m: Point, places: Sequence[Point], obstacles_m: Sequence[Point]) -> bool:
         margin_m = self._cfg.avoidance.stop_m
-        nearest_m = min((_far(start_m, obstacle) for obstacle in obstacles_m), default=inf)
+        nearest_m = min((dist(start_m, obstacle) for obstacle in obstacles_m), default=inf)
         for place in places:
-            if any(_far(place, obstacle) < min(margin_m, nearest_m) for obstacle in obstacles_m):
+            if any(dist(place, obstacle) < min(margin_m, nearest_m) for obstacle in obstacles_m):
                 return False
         size = self._cfg.workspace.size_m
         return all(min(0.0, start_m[k]) <= places[-1][k] <= max(size[k], start_m[k]) for k in range(2))
-
-
-def _times_s(horizon_s: float) -> list[float]:
-    return [horizon_s * (k + 1) / _STEPS for k in range(_STEPS)]
-
-
-def _far(a: Point, b: Point) -> float:
-    return hypot(a[0] - b[0], a[1] - b[1])
 
 
 class PilotState(StrEnum):
@@ -347,13 +322,9 @@ class BeaconPilot:
         self.state = PilotState.VISITING
 
     def drive(
-        self,
-        time_s: float,
-        interval_s: float,
-        pose: PlanarPose,
-        target: TargetSight | None,
+        self, time_s: float, interval_s: float, pose: PlanarPose, target: TargetSight | None,
         distances_m: Sequence[float],
-    ) -> SteeringCommand:
+    ) -> SteeringCommand:  # fmt: skip
         """Set points for the next interval.
 
         Args:
@@ -375,7 +346,10 @@ class BeaconPilot:
         if way.is_blocked or way.speed_factor <= 0.0:
             self._escapes_until_s = time_s + self._cfg.avoidance.back_time_s
             return self._held(pose, self._escape())
-        return self._round(aim, way, interval_s)
+        if way.aim.error_rad != aim.error_rad:
+            self.state = PilotState.AVOIDING
+        found = self._driver.drive(way.aim, interval_s)
+        return found._replace(speed_m_s=found.speed_m_s * way.speed_factor)
 
     def _aim(self, pose: PlanarPose, target: TargetSight | None) -> BearingToPoint | None:
         if self._cfg.follow.is_active:
@@ -392,12 +366,6 @@ class BeaconPilot:
         if aim is not None:
             return self._driver.drive(aim, interval_s)
         return self.follower.stay() if self._cfg.follow.is_active else HALT
-
-    def _round(self, aim: BearingToPoint, way: FreeHeading, interval_s: float) -> SteeringCommand:
-        if way.aim.error_rad != aim.error_rad:
-            self.state = PilotState.AVOIDING
-        found = self._driver.drive(way.aim, interval_s)
-        return found._replace(speed_m_s=found.speed_m_s * way.speed_factor)
 
     def _held(self, pose: PlanarPose, drive: SteeringCommand) -> SteeringCommand:
         if not drive.speed_m_s:

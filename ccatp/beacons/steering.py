@@ -1,7 +1,4 @@
-"""Driving to a point: P control of the steering, fuzzy, PI or constant speed; and a loop of such points.
-
-Zero-order Sugeno controller: trapezoid memberships, rules, and the weighted mean of what they say.
-"""
+"""Driving to a point, its speed fuzzy, by PI control or constant; a zero-order Sugeno controller; a loop of points."""
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise, product
@@ -60,10 +57,7 @@ class Sugeno:
         Raises:
             FuzzyGapError: no rule fires.
         """
-        grades = [
-            [_grade(min(max(value, low), high), term) for term in terms]
-            for value, (low, high), terms in zip(values, self._spans, self._terms, strict=True)
-        ]
+        grades = [self.memberships(index, value) for index, value in enumerate(values)]
         total = weighted = 0.0
         for conditions, output in self._rules:
             weight = 1.0

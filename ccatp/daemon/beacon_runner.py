@@ -17,7 +17,6 @@ from ccatp.beacons.mission import (
     BeaconState,
     TrackRow,
     WaypointArrival,
-    assemble_beacons,
     check_beacon_robot,
     track_row,
     wheel_rates,
@@ -372,7 +371,7 @@ def beacon_runner_config(cfg: RadioConfig) -> RunnerConfig:
 def open_beacons(args: BeaconArgs) -> Iterator[RunnerFactory]:
     """The parts and the database of a mission among beacons; what makes the mission of them."""
     cfg = args.config
-    mission = assemble_beacons(cfg)
+    mission = BeaconMission(cfg)
     laps = 0 if cfg.follow.is_active else cfg.mission.laps
     meta = {"system": cfg.system, "seed": str(cfg.run.seed)}
     store = BeaconStore(args.run_dir / "mission.sqlite", meta, cfg.workspace.waypoints_m, laps)

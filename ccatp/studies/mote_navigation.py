@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from ccatp.beacons.mission import DONE, TrackRow, assemble_beacons, track_row, wheel_rates
+from ccatp.beacons.mission import DONE, BeaconMission, TrackRow, track_row, wheel_rates
 from ccatp.beacons.navigation import MeasurementReader
 from ccatp.beacons.steering import HALT, SteeringCommand
 from ccatp.config.beacon_models import RadioConfig
@@ -70,7 +70,7 @@ class BeaconSilWorld:
     def __init__(self, cfg: RadioConfig) -> None:
         self._cfg = cfg
         self.robot = build_beacon_robot(cfg)
-        self.mission, self.danger = assemble_beacons(cfg), BeaconSafetyRules(cfg)
+        self.mission, self.danger = BeaconMission(cfg), BeaconSafetyRules(cfg)
         self.found = BeaconSilResult()
         self._reader, self._log = MeasurementReader(cfg), BeaconTruthLog(self.robot, motes_of(cfg))
         self._book = BeaconSummary(beacon_facts(cfg, is_sim=True))

@@ -1,10 +1,6 @@
-"""What looks wrong in a recorded run, a line each: for the reader's eyes, nothing of it reaches an estimator.
-
-What readings say against truth and survey, a line each: scale, sign, beacons that are not in their place.
-"""
+"""What looks wrong in a recorded run, a line each: units, gaps, readings and odometry against truth and survey."""
 
 from collections.abc import Generator, Iterator
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +8,7 @@ import numpy.typing as npt
 from ccatp.beacons.datasets.tables import GAP_S, long_pauses, plural
 from ccatp.beacons.datasets.trajectory import amount_at, chords, turning_factor
 from ccatp.beacons.slam.recording import Readings, RecordedRun, ReferencePath, Steps
-from ccatp.core import FloatArray, IntArray
+from ccatp.core import FloatArray
 
 MANY_SIGMA = 1.4826  # of a Gaussian, over its median absolute deviation
 SCALE_WARNING = 0.03
@@ -27,27 +23,7 @@ CLOSE = 0.9  # the same, of bearings that tell places
 PIECES = 4  # of the run, looked at one by one
 FEW = 20
 FITS = " fit "  # in a line that says whose place it is
-
-
-class _Seen(NamedTuple):
-    """Readings with truth and surveyed place.
-
-    Attributes:
-        times_s: shape (m,).
-        pose: true x_m, y_m, heading_rad, shape (m, 3).
-        beacon: shape (m,).
-        range_m: shape (m,).
-        bearing_rad: shape (m,); NaN where none was read.
-    """
-
-    times_s: FloatArray
-    pose: FloatArray
-    beacon: IntArray
-    range_m: FloatArray
-    bearing_rad: FloatArray
-
-    def where(self, rows: npt.NDArray[np.bool_]) -> "_Seen":
-        return _Seen(self.times_s[rows], self.pose[rows], self.beacon[rows], self.range_m[rows], self.bearing_rad[rows])
+LENGTHS = (("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048))
 
 
 def readings_against(run: RecordedRun, truth: ReferencePath) -> Iterator[str]:
@@ -61,25 +37,24 @@ def readings_against(run: RecordedRun, truth: ReferencePath) -> Iterator[str]:
     pose = np.column_stack([np.interp(t[inside], truth.times_s, column) for column in truth[1:]])
     if not np.isfinite(truth.heading_rad).all():
         pose[:, 2] = np.nan
-    seen = _Seen(t[inside], pose, r.beacon[inside], r.range_m[inside], r.bearing_rad[inside])
-    told, off_rad = _bearings(seen, placed)
-    strange = yield from _misplaced(run.beacon_ids, placed, seen, off_rad)
-    yield from _ranges(seen, placed, strange)
-    yield from told
+    seen = r.where(inside)
+    lines, off_rad = _bearings(seen, pose, placed)
+    strange = yield from _misplaced(run.beacon_ids, placed, seen, pose, off_rad)
+    yield from _ranges(seen, pose, placed, strange)
+    yield from lines
 
 
-def unit_slip(scale: float, units: tuple[tuple[str, float], ...]) -> str:
-    """The question whether they are in that unit, for a scale that is near one's."""
+def _unit_slip(scale: float, units: tuple[tuple[str, float], ...] = LENGTHS) -> str:
     near = [name for name, factor in units if abs(scale / factor - 1.0) < 0.15]
     return f": are they in {near[0]}?" if near else ""
 
 
-def _ranges(seen: _Seen, placed: FloatArray, strange: list[int]) -> Iterator[str]:
+def _ranges(seen: Readings, pose: FloatArray, placed: FloatArray, strange: list[int]) -> Iterator[str]:
     sound = ~np.isin(seen.beacon, strange)
     if sound.sum() >= FEW:
-        seen = seen.where(sound)
-    scale, offset = _robust_line(np.hypot(*(placed[seen.beacon] - seen.pose[:, :2]).T), seen.range_m)
-    unit = unit_slip(1.0 / scale if scale else 0.0, (("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048)))
+        seen, pose = seen.where(sound), pose[sound]
+    scale, offset = _robust_line(np.hypot(*(placed[seen.beacon] - pose[:, :2]).T), seen.range_m)
+    unit = _unit_slip(1.0 / scale if scale else 0.0)
     if unit:
         yield f"ranges read {scale:.4g} times the truth{unit}"
     elif abs(scale - 1.0) > SCALE_WARNING:
@@ -88,9 +63,9 @@ def _ranges(seen: _Seen, placed: FloatArray, strange: list[int]) -> Iterator[str
         yield f"ranges read {offset:+.2f} m off (fit to the truth)"
 
 
-def _bearings(seen: _Seen, placed: FloatArray) -> tuple[list[str], float | None]:
-    to = placed[seen.beacon] - seen.pose[:, :2]
-    expected = np.arctan2(to[:, 1], to[:, 0]) - seen.pose[:, 2]
+def _bearings(seen: Readings, pose: FloatArray, placed: FloatArray) -> tuple[list[str], float | None]:
+    to = placed[seen.beacon] - pose[:, :2]
+    expected = np.arctan2(to[:, 1], to[:, 0]) - pose[:, 2]
     known = np.isfinite(seen.bearing_rad + expected)
     if known.sum() < FEW:
         return [], None
@@ -117,16 +92,17 @@ def _robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
 
 
 def _misplaced(
-    names: tuple[str, ...], placed: FloatArray, seen: _Seen, off_rad: float | None
+    names: tuple[str, ...], placed: FloatArray, seen: Readings, pose: FloatArray, off_rad: float | None
 ) -> Generator[str, None, list[int]]:
-    whole = _unlike(names, _misses(placed, seen), _misses(placed, seen, off_rad))
+    whole = _unlike(names, _misses(placed, seen, pose), _misses(placed, seen, pose, off_rad))
     explained = {k for line, beacons in whole.items() if FITS in line for k in beacons}
     edges = np.linspace(seen.times_s[0], seen.times_s[-1], PIECES + 1)
     parts: dict[str, list[int]] = {}
     partly: set[int] = set()
     for piece in range(PIECES):
-        now = seen.where((seen.times_s >= edges[piece]) & (seen.times_s <= edges[piece + 1]))
-        for line, beacons in _unlike(names, _misses(placed, now), _misses(placed, now, off_rad)).items():
+        rows = (seen.times_s >= edges[piece]) & (seen.times_s <= edges[piece + 1])
+        now, there = seen.where(rows), pose[rows]
+        for line, beacons in _unlike(names, _misses(placed, now, there), _misses(placed, now, there, off_rad)).items():
             if FITS in line and not explained.intersection(beacons):  # a few readings may all be off: no misses
                 parts.setdefault(line.split(" (by ")[0], []).append(piece)
                 partly.update(beacons)
@@ -136,15 +112,15 @@ def _misplaced(
     return sorted(partly.union(*whole.values()))
 
 
-def _misses(placed: FloatArray, seen: _Seen, off_rad: float | None = None) -> FloatArray:
+def _misses(placed: FloatArray, seen: Readings, pose: FloatArray, off_rad: float | None = None) -> FloatArray:
     """Median miss, m, of the readings of one beacon at the place of another, shape (n, n); NaN where there are few.
 
     With the constant error of the bearings it is that of the place where they point, else that of the range.
     """
     count = len(placed)
     miss = np.full((count, count), np.nan)
-    way = seen.bearing_rad - (off_rad or 0.0) + seen.pose[:, 2]
-    pointed = seen.pose[:, :2] + seen.range_m[:, None] * np.column_stack([np.cos(way), np.sin(way)])
+    way = seen.bearing_rad - (off_rad or 0.0) + pose[:, 2]
+    pointed = pose[:, :2] + seen.range_m[:, None] * np.column_stack([np.cos(way), np.sin(way)])
     for k in range(count):
         rows = seen.beacon == k
         if rows.sum() < FEW:
@@ -153,7 +129,7 @@ def _misses(placed: FloatArray, seen: _Seen, off_rad: float | None = None) -> Fl
             if off_rad is not None and np.isfinite(pointed[rows]).all():
                 off = np.hypot(*(placed[other] - pointed[rows]).T)
             else:
-                off = np.abs(seen.range_m[rows] - np.hypot(*(placed[other] - seen.pose[rows, :2]).T))
+                off = np.abs(seen.range_m[rows] - np.hypot(*(placed[other] - pose[rows, :2]).T))
             miss[k, other] = np.median(off)
     return miss
 
@@ -196,7 +172,6 @@ STANDS = 0.01  # of what the other moves
 STANDS_M = 0.2
 LIKE = 0.3
 LEAST_TURNING_RAD2 = 0.1
-DEGREES = 180.0 / np.pi
 FASTEST_TURN_RAD_S = 10.0  # faster turning is a unit's fault
 FASTEST_M_S = 50.0
 
@@ -279,8 +254,7 @@ def _odometry_against(truth: ReferencePath, steps: Steps) -> Iterator[str]:
     if chord.sum() > 0.0:
         scale = float(true_way.sum() / chord.sum())
         if abs(scale - 1.0) > SCALE_WARNING:
-            unit = unit_slip(scale, (("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048)))
-            yield f"odometry distance: true ways are {scale:.3g} times it{unit}"
+            yield f"odometry distance: true ways are {scale:.3g} times it{_unit_slip(scale)}"
     yield from _turning_against(truth, steps, rows)
 
 
@@ -337,7 +311,7 @@ def _turns(scale: float, likeness: float) -> Iterator[str]:
     elif likeness < LIKE:
         yield f"odometry turns have little to do with the truth (correlation {likeness:.2f})"
     elif abs(scale - 1.0) > TURN_WARNING:
-        unit = unit_slip(scale, (("degrees", 1.0 / DEGREES),))
+        unit = _unit_slip(scale, (("degrees", np.pi / 180.0),))
         yield f"odometry turns: true turns are {scale:.3g} times them{unit or ' (track of the wheels?)'}"
 
 

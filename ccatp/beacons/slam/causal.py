@@ -1,14 +1,10 @@
-"""``BeaconSlam`` over a recorded run: what is known at each instant from readings up to it.
-
-Calibration against what was assumed of it: what no reading told, and what lies beyond its prior.
-
-After a gap in the odometry the heading may be anything: several are followed until the beacons tell which.
-"""
+"""``BeaconSlam`` over a recorded run: what is known at each instant from readings up to it."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
+from itertools import pairwise
 from math import inf, pi, sqrt
 
 import numpy as np
@@ -18,7 +14,6 @@ from ccatp.beacons.slam.motion import Increment
 from ccatp.beacons.slam.range_slam import BeaconInnovation, BeaconSlam
 from ccatp.beacons.slam.recording import (
     BeaconFix,
-    BeaconId,
     Calibrated,
     EstimatedPath,
     RangeReading,
@@ -145,16 +140,17 @@ def filter_run(
     position, heading = first_sigmas
     search = HeadingRelocalizer(BeaconSlam(settings, run.first_pose, np.diag((position**2, position**2, heading**2))))
     times = np.union1d(_spaced(run.steps.times_s), run.readings.times_s)
-    increments, readings = _increments(run.steps, times), _Heard(run)
+    increments, readings = _increments(run.steps, times), list(_readings(run))
+    ends = np.searchsorted([reading.time_s for reading in readings], times, side="right").tolist()
     poses, covariances = np.empty((len(times), 3)), np.empty((len(times), 3, 3))
     book = _Book()
-    for k, time_s in enumerate(times.tolist()):
+    for k, (first, end) in enumerate(pairwise((0, *ends))):
         begin_s = clock_s()
         if k:
             search.predict(increments[k - 1])
         predicted_s = clock_s()
         book.predict_s.append(predicted_s - begin_s)
-        if now := readings.until(time_s):
+        if now := readings[first:end]:
             taken = search.observe(now)
             end_s = clock_s()
             book.observed(taken, len(now), end_s - begin_s, end_s - predicted_s)
@@ -163,7 +159,6 @@ def filter_run(
     nis, sizes = np.array(book.nis), np.array(book.sizes, dtype=np.float64)
     priors = dict(zip(slam.calibration, slam.prior_sigmas, strict=True))
     calibration = learned({name: Calibrated(*found) for name, found in slam.calibration.items()}, priors)
-    lost = [name for name in run.beacon_ids if name not in slam.beacons]
     return EstimatedPath(
         times_s=times,
         poses=poses,
@@ -180,25 +175,11 @@ def filter_run(
         scalar_s=np.array(book.scalar_s),
         updates=len(book.nis),
         warnings=(
-            *_lost(run, lost),
-            *_unplaced(slam.unplaced),
+            *_unplaced(run, slam),
             *beyond_priors(calibration, priors, run.kind),
-            *_moved(slam.moved),
-            *_doubts(nis, sizes, book.refused, slam.jumps),
+            *_doubts(slam, nis, sizes, book.refused),
         ),
     )
-
-
-class _Heard:
-    def __init__(self, run: RecordedRun) -> None:
-        self._all, self._next = list(_readings(run)), 0
-
-    def until(self, time_s: float) -> list[Reading]:
-        """Those up to ``time_s`` that were not handed out before."""
-        first = self._next
-        while self._next < len(self._all) and self._all[self._next].time_s <= time_s:
-            self._next += 1
-        return self._all[first : self._next]
 
 
 @dataclass(slots=True)
@@ -222,35 +203,36 @@ class _Book:
         self.sizes += [one.size for one in accepted]
 
 
-def _doubts(nis: FloatArray, sizes: FloatArray, refused: int, jumps: int) -> Iterator[str]:
+def _doubts(slam: BeaconSlam, nis: FloatArray, sizes: FloatArray, refused: int) -> Iterator[str]:
+    for beacon in dict.fromkeys(beacon for beacon, _ in slam.moved):
+        times = ", ".join(f"{time_s:.1f}" for name, time_s in slam.moved if name == beacon)
+        yield f"beacon {beacon} was placed anew at {times} s: was it moved, or exchanged for another?"
     if nis.size and nis.sum() > DOUBTFUL_NIS * sizes.sum():
         yield (
             f"innovations are {float(nis.sum() / sizes.sum()):.2f} times as large, in squares, as they should be: "
             "clocks apart, scales beyond what the configuration allows, or beacons exchanged on the way?"
         )
-    if jumps > DOUBTFUL_JUMPS * (nis.size + refused):
-        yield f"the pose had to be doubted {jumps} times: pushed, beacons misread, or odometry that misses something?"
+    if slam.jumps > DOUBTFUL_JUMPS * (nis.size + refused):
+        times = f"{slam.jumps} times"
+        yield f"the pose had to be doubted {times}: pushed, beacons misread, or odometry that misses something?"
     if refused > DOUBTFUL_SHARE * (nis.size + refused):
         yield f"{refused} of {nis.size + refused} readings were refused: do they belong to this odometry?"
 
 
-def _lost(run: RecordedRun, names: Sequence[str]) -> Iterator[str]:
+def _unplaced(run: RecordedRun, slam: BeaconSlam) -> Iterator[str]:
     r = run.readings
     ranged = {run.beacon_ids[k] for k in np.unique(r.beacon[np.isfinite(r.range_m) | np.isfinite(r.rssi_dbm)])}
-    for name in names:
-        why = "its readings leave two places or none" if name in ranged else "only bearings of it were heard, no range"
-        yield f"beacon {name} could not be placed: {why}"
-
-
-def _unplaced(count: int) -> Iterator[str]:
-    if count:
-        yield f"{count} bearings had no range or strength of the same time and came before their beacon was placed"
-
-
-def _moved(moved: Sequence[tuple[BeaconId, float]]) -> Iterator[str]:
-    for beacon in dict.fromkeys(beacon for beacon, _ in moved):
-        times = ", ".join(f"{time_s:.1f}" for name, time_s in moved if name == beacon)
-        yield f"beacon {beacon} was placed anew at {times} s: was it moved, or exchanged for another?"
+    for name in run.beacon_ids:
+        if name not in slam.beacons:
+            why = (
+                "its readings leave two places or none"
+                if name in ranged
+                else "only bearings of it were heard, no range"
+            )
+            yield f"beacon {name} could not be placed: {why}"
+    if slam.unplaced:
+        early = f"{slam.unplaced} bearings"
+        yield f"{early} had no range or strength of the same time and came before their beacon was placed"
 
 
 def _spaced(times_s: FloatArray) -> FloatArray:

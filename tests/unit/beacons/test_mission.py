@@ -10,8 +10,8 @@ from ccatp.beacons.mission import (
     DONE,
     HELD,
     VISITING,
+    BeaconMission,
     WaypointArrival,
-    assemble_beacons,
     check_beacon_robot,
     permitted,
     wheel_rates,
@@ -249,7 +249,7 @@ def test_a_mirror_robot_is_no_beacon_robot(cfg: RadioConfig) -> None:
 
 def test_a_summary_without_truth_holds_what_needs_none(cfg: RadioConfig) -> None:
     book = BeaconSummary(beacon_facts(cfg, is_sim=False))
-    navigator = assemble_beacons(cfg).navigator
+    navigator = BeaconMission(cfg).navigator
     book.set_map({"beacon1": (0.1, 0.2, 0.01, 0.0, 0.01)}, (2.0, 2, 0), navigator.notes)
     summary = book.build(1.0)
     assert summary["trajectory_rmse_m"] is None
