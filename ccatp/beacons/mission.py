@@ -67,13 +67,6 @@ class BeaconMission:
     """Maps and visits waypoints, or follows a radio, and returns to its start when it is given up.
 
     Call ``step`` once per frame. The robot stands at its believed start.
-
-    Args:
-        cfg: the configuration; nothing of ``sim`` is used.
-
-    Attributes:
-        abort_cause: why it was given up, or empty.
-        is_faulted: something is wrong, and an operator has to look after it.
     """
 
     def __init__(self, cfg: RadioConfig) -> None:

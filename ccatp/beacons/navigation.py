@@ -27,9 +27,6 @@ class SelfMap:
     Phase 1 begins when every pair of its plan has been read as often as configured, phase 2 takes the readings after
     that one by one (Patil et al., figure 8).
 
-    Args:
-        cfg: the motes, layout ``networks``; nothing of ``sim`` is used.
-
     Attributes:
         notes: errors that are expected after each phase, m; updates of phase 2.
     """
@@ -124,7 +121,6 @@ class BeaconMeasurements(NamedTuple):
         wheels: odometry since the last frame, without gaps; empty where nothing is known of it.
         packets: answers of radios: name, direction of the reflector left of the heading (rad), level (dBm).
         sightings: results of scans: radio, level (dBm), bearing left of the heading (rad; None where not known).
-        distances_m: of the distance sensors; empty without a reading.
     """
 
     t_s: float
@@ -225,11 +221,7 @@ class PoseBelief(NamedTuple):
 
 
 class Score(NamedTuple):
-    """How the readings agree with what was expected of them, all so far.
-
-    Attributes:
-        refused: readings that the gate refused; not in the sums.
-    """
+    """How the readings agree with what was expected of them, all so far."""
 
     nis_sum: float
     nis_size: int
@@ -257,11 +249,7 @@ class _DeadReckoning:
 
 
 class RadioNavigator(_DeadReckoning):
-    """EKF-SLAM on levels and bearings of radios that are mapped on the way.
-
-    Args:
-        cfg: the configuration; nothing of ``sim`` is used.
-    """
+    """EKF-SLAM on levels and bearings of radios that are mapped on the way."""
 
     is_mapping = False  # the map grows while the robot drives
 
@@ -325,9 +313,6 @@ class MoteNavigator(_DeadReckoning):
     State: pose and its calibration, then the motes. The map joins with the joint covariance that its self-mapping left,
     so that its errors, which hang together, count as such: ranges correct the robot as far as the map is known, and
     the map as far as the robot is. A range is z = |p - m| + noise.
-
-    Args:
-        cfg: the configuration; nothing of ``sim`` is used.
     """
 
     def __init__(self, cfg: RadioConfig) -> None:

@@ -56,12 +56,7 @@ class Follower:
         self._sight: BearingToPoint | None = None
 
     def aim(self, pose: PlanarPose, target: TargetSight | None) -> BearingToPoint | None:
-        """What is left to go, and decides what to do; None while nothing is to be approached.
-
-        Args:
-            pose: x m, y m, heading rad.
-            target: what is believed of it; None before it was first heard.
-        """
+        """What is left to go, and decides what to do; None while nothing is to be approached."""
         self._sight = None
         if target is None or target.unheard_s > self._cfg.lost_after_s:
             self.state = FollowState.LOST
@@ -132,11 +127,7 @@ class ObstacleAvoider:
         self._echoes: deque[_Obstacle] = deque()
 
     def see(self, time_s: float, pose: PlanarPose, distances_m: Sequence[float]) -> None:
-        """Remember what the sensors show, and forget what is old.
-
-        Args:
-            pose: x m, y m, heading rad.
-        """
+        """Remember what the sensors show, and forget what is old."""
         while self._echoes and time_s - self._echoes[0].time_s > self._cfg.memory_s:
             self._echoes.popleft()
         for direction_rad, distance_m in zip(self._cfg.sensors_rad, distances_m, strict=True):
@@ -160,7 +151,6 @@ class ObstacleAvoider:
         """Distance to the nearest remembered obstacle in the way of a body that moves in a direction, m.
 
         Args:
-            pose: x m, y m, heading rad.
             direction_rad: of the motion, left of the heading: 0 forwards, pi backwards.
         """
         in_way = (d for d, angle_rad in self._near(pose) if abs(wrap_pi(angle_rad - direction_rad)) < _AHEAD_RAD)
@@ -208,9 +198,6 @@ class BackOff:
     room, and keeps ``avoidance.stop_m`` from everything that the sensors have seen or, where it is nearer already, does
     not come nearer. Of these it takes the one after which the threat, going on as it goes, is farthest; where none
     gains anything it stands.
-
-    Args:
-        cfg: vehicle, workspace, follow and avoidance are used.
     """
 
     def __init__(self, cfg: RadioConfig) -> None:
@@ -220,11 +207,7 @@ class BackOff:
     def drive(
         self, pose: PlanarPose, threat_m: Point, threat_velocity_m_s: Point, obstacles_m: Sequence[Point]
     ) -> SteeringCommand:
-        """Set points for the next interval.
-
-        Args:
-            pose: x m, y m, heading rad.
-        """
+        """Set points for the next interval."""
         horizon_s = self._cfg.follow.retreat_s
         vx, vy = threat_velocity_m_s
         threat_then_m = threat_m[0] + vx * horizon_s, threat_m[1] + vy * horizon_s
@@ -302,9 +285,6 @@ class PilotState(StrEnum):
 class BeaconPilot:
     """Turns a pose, a target and the distance sensors into set points, step by step.
 
-    Args:
-        cfg: workspace, vehicle, control, follow and avoidance are used.
-
     Raises:
         FuzzyGapError: the rules leave a gap.
     """
@@ -325,12 +305,7 @@ class BeaconPilot:
         self, time_s: float, interval_s: float, pose: PlanarPose, target: TargetSight | None,
         distances_m: Sequence[float],
     ) -> SteeringCommand:  # fmt: skip
-        """Set points for the next interval.
-
-        Args:
-            pose: x m, y m, heading rad.
-            target: what is believed of the target; None without one.
-        """
+        """Set points for the next interval."""
         aim = self._aim(pose, target)
         if not self._cfg.avoidance.is_active:
             return self._without_obstacles(aim, interval_s)

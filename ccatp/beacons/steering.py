@@ -27,9 +27,6 @@ class Sugeno:
     Memberships are trapezoids. Beyond its first and last shoulder an input counts as standing there, so a rule base
     without a gap between its corners has none anywhere.
 
-    Args:
-        cfg: inputs with their terms, outputs, rules.
-
     Raises:
         FuzzyGapError: a combination of corners, or a place halfway between two, where no rule fires.
     """
@@ -50,9 +47,6 @@ class Sugeno:
 
     def evaluate(self, values: Sequence[float]) -> float:
         """The output.
-
-        Args:
-            values: of the inputs, in the order of ``inputs``.
 
         Raises:
             FuzzyGapError: no rule fires.
@@ -95,17 +89,12 @@ def _grade(value: float, term: _Trapezoid) -> float:
     return (right_foot - value) / (right_foot - right_shoulder)
 
 
-PlanarPose = tuple[float, float, float]
+PlanarPose = tuple[float, float, float]  # x m, y m, heading rad
 Point = tuple[float, float]
 
 
 class SteeringCommand(NamedTuple):
-    """Set points until the next step.
-
-    Attributes:
-        steer_rad: steering angle to the left; of an Ackermann vehicle.
-        turn_rate_rad_s: turn rate to the left; of a differential drive.
-    """
+    """Set points until the next step."""
 
     speed_m_s: float
     steer_rad: float
@@ -196,11 +185,7 @@ class WaypointSteering:
 
 
 class WaypointList:
-    """Which waypoint is next.
-
-    Args:
-        loops: begin again after the last.
-    """
+    """Which waypoint is next."""
 
     def __init__(self, waypoints_m: Sequence[Point], arrival_radius_m: float, *, loops: bool) -> None:
         self._waypoints_m = tuple(waypoints_m)

@@ -29,7 +29,6 @@ class BeaconStore:
     """The database of one run.
 
     Args:
-        path: a file that does not exist.
         laps: how often they are visited; 0 where there are none to visit.
 
     Raises:

@@ -87,11 +87,7 @@ _NORMAL, _NEAR, _ABORTED = EventCode
 
 
 class BeaconSafetyRules:
-    """Judges frames. Call ``step`` once per frame, ``stale`` when no frame came in time.
-
-    Args:
-        cfg: the configuration; nothing of ``sim`` is used.
-    """
+    """Judges frames. Call ``step`` once per frame, ``stale`` when no frame came in time."""
 
     def __init__(self, cfg: RadioConfig) -> None:
         self._danger, self._follow, self._loss = cfg.danger, cfg.follow, cfg.path_loss
@@ -146,11 +142,7 @@ class BeaconSafetyRules:
     # -- frames ---------------------------------------------------------------------------------------------------
 
     def step(self, sensors: Sensors, extras: BeaconFrame, estimate: EstimateMessage | None) -> Verdict:
-        """The verdict on one frame.
-
-        Args:
-            sensors: the frame.
-        """
+        """The verdict on one frame."""
         self._frame_seq = sensors.seq
         self._hear(sensors.t, extras)
         self._roll(sensors, extras)

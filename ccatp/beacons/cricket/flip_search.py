@@ -35,11 +35,7 @@ class Fold(NamedTuple):
 
 
 class Unfolded(NamedTuple):
-    """A map that no mirroring of those tried betters.
-
-    Attributes:
-        doubtful: sets whose mirror image fits almost as well.
-    """
+    """A map that no mirroring of those tried betters."""
 
     fit: MapFit
     turned: int
@@ -53,9 +49,6 @@ def unfold(
 
     Ranges see a mote whose partners stand nearly in line almost equally well on both sides of it; a fit that began on
     the wrong side stays there. A change is kept where it lowers the cost; the search ends when none does.
-
-    Args:
-        mirrors: (separator, motes) known to fold from the graph alone.
     """
     turned, doubtful = 0, dict[tuple[int, ...], float]()
     for _ in range(_ROUNDS):

@@ -225,9 +225,6 @@ def fit_map(model: MapModel, start: MapState, settings: MapFitSettings) -> MapFi
     Steps (J^T W J + lambda D) dq = J^T W r (Levenberg 1944, Marquardt 1963) with W = w / sigma^2 and the weights
     w = 1 / (1 + (r / (c sigma))^2) of the Cauchy loss. A network without known coordinates may shift and turn: the
     damping keeps it where it started.
-
-    Args:
-        start: where to begin; decides which of several folded maps is found.
     """
     sigmas = model.network.sigmas_m
     state, damping = start, _FIRST_DAMPING
@@ -324,9 +321,7 @@ def bound_rms_m(model: MapModel, true_m: FloatArray, motes: Sequence[int], *, al
     """sqrt(tr C / n) of some motes, C = (J^T Sigma^-1 J)^-1 at the true places.
 
     Args:
-        model: network, and what else is unknown: bodies and known coordinates lower the bound, an offset raises it.
         true_m: places of all motes, shape (n, d).
-        aligned: of the error after the rigid motion of these motes that makes it least, for maps without a frame.
 
     Returns:
         The bound in metres; None where the ranges leave the map free to move.
@@ -346,7 +341,6 @@ def map_rms_m(covariance_m2: FloatArray, positions_m: FloatArray, motes: Sequenc
 
     Args:
         positions_m: shape (n, d).
-        aligned: after the best rigid motion of these motes.
     """
     d = positions_m.shape[1]
     at = coordinates_of(motes, d)

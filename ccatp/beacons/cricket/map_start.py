@@ -42,8 +42,6 @@ def grown(
         pairs: known distances, each pair once, shape (e, 2).
         distances_m: shape (e,).
         sigmas_m: shape (e,).
-        robust_scale: of the Cauchy loss, in sigmas.
-        rng: draws the first points, and crossings where there are many.
     """
     table, scale = np.full((2, count, count), np.nan)
     for i, j in (pairs.T, pairs.T[::-1]):
@@ -315,11 +313,7 @@ def map_starts(network: RangeNetwork, given_m: FloatArray | None) -> Iterator[li
 
 
 def grown_starts(network: RangeNetwork, robust_scale: float) -> Iterator[list[FloatArray]]:
-    """Maps grown from drawn triangles, which a few wrong ranges do not bend; with their mirror images as before.
-
-    Args:
-        robust_scale: of the Cauchy loss, in sigmas.
-    """
+    """Maps grown from drawn triangles, which a few wrong ranges do not bend; with their mirror images as before."""
     means = PairMeans(network)
     pairs, distances_m, sigmas_m = _with_bodies(network, means)
     for draw in range(_DRAWS if network.count <= FEW else _FEW_DRAWS):

@@ -153,7 +153,6 @@ class MeasuredMap(NamedTuple):
     """A map of real motes.
 
     Attributes:
-        names, positions_m, covariance_m2: the map; moved onto the truth where that is known.
         true_m: shape (n, d), or None.
         data: as ``ccatp radio map --json`` prints it.
     """
@@ -184,7 +183,6 @@ def map_measured(
     Places of a trolley that stood somewhere are mapped along with the anchors, which are what the result is about.
 
     Args:
-        cfg: dimension, sigma, settings of filter and batch.
         method: ``ekf`` or ``batch``.
 
     Raises:

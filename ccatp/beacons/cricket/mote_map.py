@@ -39,7 +39,6 @@ class MoteMap:
         residuals_m: measured less computed ranges, shape (m,).
         sigma_m: median of the sigmas in the end.
         free: directions that no range sees, the frame's included.
-        folds: sets of motes whose mirror image fits almost as well.
     """
 
     names: tuple[str, ...]
@@ -81,7 +80,6 @@ def map_motes(
 
     Args:
         start_m: one more place to begin, shape (n, d), nan where unknown.
-        mirrors: sets of motes that the graph lets fold, from ``find_fold_over``.
         finds_sigma: the sigmas are right up to a factor, which the residuals tell (``scaled``).
     """
     model = MapModel(network, with_offset=with_offset, with_scale=with_scale)

@@ -45,9 +45,6 @@ def sound_speed(air: AirConfig, temperature_c: float) -> float:
 def range_from_delay(air: AirConfig, delay_s: float, temperature_c: float) -> float:
     """Distance d = c(T) (t_2 - t_1), Patil et al. eq. 1; the radio message takes no time.
 
-    Args:
-        delay_s: arrival of the pulse after that of the message.
-
     Raises:
         TdoaError: a delay that is negative or not finite, or no temperature of air.
     """

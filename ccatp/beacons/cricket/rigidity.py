@@ -27,9 +27,7 @@ class Freedom(NamedTuple):
 
     Attributes:
         frame: names of rigid motions of the whole map that are free.
-        flexes: which motes move against the others, one line for each free direction.
         untold: what of offset and scale cannot be told from the map.
-        parts: motes that hold together, largest first; a mote in two parts is a hinge.
     """
 
     unknowns: int
@@ -69,12 +67,7 @@ def generic_state(model: MapModel, rng: np.random.Generator) -> MapState:
 
 
 def find_freedom(model: MapModel, state: MapState) -> Freedom:
-    """Rank and free directions at a state.
-
-    Args:
-        model: network and unknowns, offset and scale among them where they are estimated.
-        state: where; ``generic_state`` before anything is known, an estimate to see what its geometry adds.
-    """
+    """Rank and free directions at a state."""
     network = model.network
     null = _null_space(model, state)
     moves = np.asarray(model.position_jacobian(state) @ null[: model.coordinates])
@@ -97,7 +90,6 @@ def rigid_parts(moves: FloatArray, points: FloatArray, extra: int) -> tuple[tupl
     Args:
         moves: free directions, shape (n d, k).
         points: shape (n, d).
-        extra: how many of the directions are no rigid motions; with none, everything is one part.
     """
     count, d = points.shape
     if extra <= 0:

@@ -245,7 +245,6 @@ def run_phase_two(
     """Observe one distance after the other until the expected error is small enough, or there are no more.
 
     Args:
-        mapper: with its prior; holds the map afterwards.
         readings: first, second, range_m, sigma_m.
         target_rms_m: of ``MoteMapper.expected_rms_m``.
     """
@@ -301,7 +300,6 @@ class MotePlan:
     """The motes of a configuration.
 
     Attributes:
-        anchors: indices of A and B; empty where there are none.
         networks: indices of the motes of each stand, in the order of mapping; empty where there are none.
         bodies: the stands, whose shapes are known.
         axes_m: where A stands and the direction towards B, shape (2, d): what takes the map's frame to the field's.
@@ -332,11 +330,7 @@ class MotePlan:
 
 
 def network_plan(cfg: CricketConfig) -> MotePlan:
-    """The plan of stands of motes (Patil et al., section 3): each stand is mapped by the one before it.
-
-    Args:
-        cfg: layout ``networks``.
-    """
+    """The plan of stands of motes (Patil et al., section 3): each stand is mapped by the one before it."""
     size = len(cfg.stand_m)
     anchors = tuple(range(len(cfg.anchors)))
     networks = tuple(
@@ -371,11 +365,7 @@ def network_plan(cfg: CricketConfig) -> MotePlan:
 
 
 def loose_plan(cfg: CricketConfig, names: tuple[str, ...]) -> MotePlan:
-    """The plan of motes by themselves: every pair that is heard is measured and used.
-
-    Args:
-        cfg: layout ``motes`` or ``random``.
-    """
+    """The plan of motes by themselves: every pair that is heard is measured and used."""
     count, d = len(names), cfg.dimension
     pairs = tuple((i, j) for i in range(count) for j in range(i + 1, count))
     nowhere = np.full((count, d), np.nan)

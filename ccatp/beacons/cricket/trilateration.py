@@ -52,9 +52,6 @@ class Sketch:
 
     Each place depends on the ranges of its step and on the places it is measured from, whose errors it inherits:
     dx = G (dr + U da), G = (H^T W H)^-1 H^T W, U da the errors of the references along the lines of sight.
-
-    Args:
-        max_dop: a step with a larger dilution of precision is refused.
     """
 
     def __init__(self, names: Sequence[str], means: PairMeans, dimension: int, max_dop: float) -> None:
@@ -244,9 +241,7 @@ def draw_errors(
     Args:
         places_m: where the motes might be, nan for those without a place, shape (n, d); A at the origin, B on the
             second axis, where the steps begin with these two.
-        means: the ranges, of which the sigmas alone are used.
         seed_covariance_m2: of the motes that began the map together, shape (n d, n d); those of axes need none.
-        draws: how many times, far more often than there are coordinates.
     """
     count, d = places_m.shape
     drawn = np.broadcast_to(places_m, (draws, count, d)).copy()
@@ -345,13 +340,8 @@ def map_by_plan(plan: MotePlan, network: RangeNetwork, max_dop: float, draws: in
     """Phase 1 of Patil et al., figure 8, in the field's frame.
 
     A is the origin, B on the second axis, the first stand follows by the law of cosines, every other one by
-    trilateration from all motes of the stand before it.
-
-    Args:
-        plan: anchors, stands, the frame.
-        network: ranges of ``plan.phase1_pairs``.
-        max_dop: dilution of precision that no step may exceed.
-        draws: of the errors, for bias and covariance; 0 for a covariance by derivatives, and no bias.
+    trilateration from all motes of the stand before it. Bias and covariance of the errors are drawn; without draws the
+    covariance is by derivatives.
 
     Raises:
         MissingRange, DegenerateStep: a step that cannot be made; the message names its motes.
@@ -390,10 +380,6 @@ def map_as_possible(network: RangeNetwork, max_dop: float, draws: int = 0) -> Fi
     """A trilateration without a plan: a good triangle (tetrahedron) of motes begins, whoever has most ranges follows.
 
     Motes that cannot be placed well enough, from d + 1 others at least, are left out.
-
-    Args:
-        max_dop: dilution of precision that no step may exceed.
-        draws: as of ``map_by_plan``.
 
     Raises:
         DegenerateStep: there is no triangle (tetrahedron) to begin with.

@@ -42,7 +42,6 @@ def unfolded(
         distances_m: shape (e,).
         sigmas_m: shape (e,).
         squeezes: weights of the spare dimensions one after the other, in units of the median weight of a distance.
-        rng: draws the places to begin with, where those by classical scaling led astray.
     """
     wide = dimension + _SPARE
     if rng is None:

@@ -83,12 +83,7 @@ class PlaceTable:
 
 
 def read_levels(path: Path, sheet: str | None = None, points: Path | None = None) -> LevelTable:
-    """Pairs of distance and level.
-
-    Args:
-        path: CSV or workbook with a column of distances (m) and one of levels (dBm), or a folder of XBee logs.
-        sheet: of a workbook, the first one if not given.
-        points: of a folder: CSV or workbook with the distance of each log, in a column ``point``.
+    """Pairs of distance (m) and level (dBm) of a CSV, a workbook, or XBee logs with a table of their ``points``.
 
     Raises:
         RadioDataError: it cannot be read, or has no such columns.

@@ -159,7 +159,6 @@ class BeaconPositions(NamedTuple):
     Attributes:
         positions_m: shape (n, d).
         covariance_m2: of all coordinates, shape (n d, n d).
-        frame: which frame they are in.
     """
 
     names: tuple[str, ...]
@@ -176,7 +175,6 @@ def write_beacons(
     Args:
         positions_m: shape (n, d).
         covariance_m2: shape (n d, n d).
-        frame: one line that says which frame this is.
 
     Raises:
         BeaconFileError: the file cannot be written.

@@ -38,7 +38,6 @@ class Reckoning:
 
     Args:
         times_s: the instants, shape (n + 1,), rising, within the steps.
-        delayed: derivatives by the delay are wanted; they are zero otherwise.
     """
 
     def __init__(self, steps: Steps, times_s: FloatArray, *, delayed: bool = True) -> None:

@@ -104,7 +104,6 @@ class BatchProblem:
     """Odometry and readings of a run up to an instant.
 
     Args:
-        readings: those whose time is one of ``times_s``.
         times_s: instants of the poses, the first one the first odometry time, shape (n,).
         used: which beacons take part, shape (b,); readings of others count nothing.
     """
@@ -148,11 +147,7 @@ class BatchProblem:
         return variance
 
     def distances(self, state: BatchState, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """What readings say of the distance, m, and its variance, m^2: by the range, or by the signal strength.
-
-        Args:
-            rows: readings, each with a range or a signal strength.
-        """
+        """What readings say of the distance, m, and its variance, m^2: by the range, or by the signal strength."""
         read, beacon = self.readings, state.beacons[self.readings.beacon[rows]]
         scale, exponent = 1.0 + state.shared[RANGE_SCALE], self.radio.rssi_exponent + state.shared[RSSI_EXPONENT]
         reference = self.radio.rssi_reference_dbm + state.shared[RSSI_REFERENCE] + beacon[:, 3]

@@ -81,11 +81,7 @@ def _diagonal_of_inverse(system: ArrowSystem) -> FloatArray:
 
 
 class Descent(NamedTuple):
-    """Where a descent ended.
-
-    Attributes:
-        cost: there, negative log posterior up to a constant.
-    """
+    """Where a descent ended."""
 
     state: BatchState
     cost: float
@@ -118,7 +114,6 @@ def descend(
 
     Args:
         softness: of each reading's law, shape (m,) or one for all.
-        enough: relative gain below which the cost counts as converged.
     """
     damping = 1e-6
 

@@ -30,20 +30,12 @@ KEYS = {"odometry_delay_s": "delay_s"}  # keys under ``priors`` that are called 
 
 
 def learned(calibration: Mapping[str, Calibrated], priors: Mapping[str, float]) -> dict[str, Calibrated]:
-    """Those that the readings told something of; a prior is no result.
-
-    Args:
-        priors: standard deviations before any reading, by name.
-    """
+    """Those that the readings told something of; a prior is no result."""
     return {name: found for name, found in calibration.items() if found.sigma < UNCHANGED * priors[name]}
 
 
 def beyond_priors(calibration: Mapping[str, Calibrated], priors: Mapping[str, float], kind: str) -> Iterator[str]:
-    """Values that their prior all but excludes, a line each: they would be further off still if it let them.
-
-    Args:
-        priors: standard deviations before any reading, about zero, by name.
-    """
+    """Values that their prior all but excludes, a line each: they would be further off still if it let them."""
     for name, (value, _) in calibration.items():
         sigma = priors[name]
         if abs(value) > FAR * sigma:
@@ -65,9 +57,6 @@ class HeadingRelocalizer:
 
     A Gaussian whose heading is spread over the circle is split into ``HEADINGS`` narrow ones; each reading that all of
     them take is held against each (a Gaussian sum: Alspach and Sorenson 1972).
-
-    Args:
-        slam: the filter before anything was lost.
     """
 
     def __init__(self, slam: BeaconSlam) -> None:

@@ -125,12 +125,7 @@ class PendingLandmark:
         self.records = []
 
     def look(self, engine: EkfSlam, row_of: RowOf, shared: slice, prior_at: PriorAt, reach_m: float) -> None:
-        """Look for the beacon: sets ``candidates``.
-
-        Args:
-            row_of: what a reading should be (the row without bearing).
-            reach_m: how far it is from the last place, roughly.
-        """
+        """Look for the beacon: sets ``candidates``."""
         problem = _problem(engine, self.records, row_of, shared, reach_m)
         starts: list[BeaconEstimate] = []
         # The last distance may have gone round a corner: the usual one is tried, too.
@@ -251,7 +246,6 @@ def _weighed(e: FloatArray, S: FloatArray, R: FloatArray, step: int) -> tuple[Fl
         e: residuals, shape (m,).
         S: their variances by all that is unknown, shape (m,).
         R: those of the readings, shape (m,).
-        step: how many went before.
     """
     if step < PLAIN:
         return R, 0.0

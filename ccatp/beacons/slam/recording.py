@@ -76,9 +76,7 @@ class RecordedRun:
     """One vehicle's run among beacons.
 
     Attributes:
-        name: of the data set, as in ``Plaza2``.
         kind: format that it was read from: plaza, mrclam, labyrinth or csv.
-        beacon_ids: name of each beacon as the data set gives it.
         beacon_truth_m: surveyed x, y by name, world frame, m; beacons that were not surveyed are missing.
         first_pose: x_m, y_m, heading_rad at the first odometry time, world frame: the one thing that an estimator may
             take from the truth; the origin if there is no truth.

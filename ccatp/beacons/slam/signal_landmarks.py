@@ -145,10 +145,6 @@ class SignalLandmarkInitializer:
     poses in the state, until they place it. Meanwhile their most probable places are found beside the filter, by
     Gauss-Newton on poses and radios together with each radio eliminated in turn, and what that says of the rest of the
     state can be had without changing it.
-
-    Attributes:
-        records: what waits, by radio.
-        guesses: the most probable places of the radios that wait.
     """
 
     def __init__(self, engine: EkfSlam) -> None:
@@ -333,9 +329,6 @@ class MovingRadio:
         There level and bearing are linear: z = P_ref - (10 eta / ln 10) ln r + b, beta = direction - heading. In the
         plane a level has another slope at each estimate, and many levels with one unknown b would seem to give the
         range (modified polar coordinates, Aidala and Hammel 1983).
-
-        Args:
-            gates: largest normalised innovation squared that is used, of one row and of two.
         """
         self._to_polar(engine)
         block = engine.block(self.beacon)
