@@ -30,7 +30,6 @@ from ccatp.report.plots import (
     new_figure,
     new_plot,
     set_log_axis,
-    thinned,
 )
 
 if TYPE_CHECKING:
@@ -44,7 +43,6 @@ _TOP = 6.0  # of the figure of consistency: what lies above is drawn at its edge
 _HEIGHTS_PX = (340.0, 300.0)
 _MARGIN_M, _BEYOND_M = 0.25, 1.5  # around the room; of it what stands outside is still shown
 _ELLIPSES = 14  # along the path
-_TOLERANCE_PX = 0.5
 _TALL = 0.95  # most height for the width
 _BEACON, _TARGET, _ESTIMATE, _RECKONED = SERIES[0], BAD, SERIES[1], SERIES[4]
 
@@ -181,25 +179,19 @@ def _set_time(axes: "Axes", t_s: FloatArray) -> None:
 def beacon_map_figure(record: BeaconRecord, width_px: float) -> "Figure":
     """The room: estimated and true path, dead reckoning, beacons with their ellipses, waypoints."""
     low, high = _bounds(record)
-    span = high - low
-    left, right, below, above = 0.62, 0.12, 0.5, 0.08
-    rows = 2 if is_wide(width_px) else 5
     width = width_px / PX_PER_IN
-    scale = min((width - left - right) / span[0], _TALL * width / span[1])
-    map_width, map_height = scale * span
-    height = map_height + below + above + 0.19 * rows
-    figure = new_figure(width, height, PX_PER_IN, layout=None)
+    legend = 0.4 if is_wide(width_px) else 1.0
+    height = min((width - 0.75) * float((high[1] - low[1]) / (high[0] - low[0])), _TALL * width)
+    figure = new_figure(width, height + legend + 0.6, PX_PER_IN)
     figure.set_label(f"{record.cfg.system}: path and map of beacons")
-    bottom = below + 0.19 * rows
-    axes = figure.add_axes((left / width, bottom / height, map_width / width, map_height / height))
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x, m", ylabel="y, m")
+    axes = figure.subplots()
     dress(axes)
     _draw_room(axes, record)
-    _draw_paths(axes, record, width_px, tolerance_m=_TOLERANCE_PX / (scale * PX_PER_IN))
+    _draw_paths(axes, record, width_px)
     _draw_waypoints(axes, record, width_px)
-    _draw_beacons(axes, record, high[0] - 0.55 / scale)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    add_legend(axes, (0.01, (bottom - 0.42) / height))
+    _draw_beacons(axes, record, high[0] - 60.0 / width_px * float(high[0] - low[0]))
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x, m", ylabel="y, m")
+    add_legend(axes)
     return figure
 
 
@@ -230,7 +222,7 @@ def _draw_room(axes: "Axes", record: BeaconRecord) -> None:
         axes.add_patch(Circle(centre, obstacle.radius_m, facecolor=SEAM, edgecolor=QUIET, zorder=1, label=label))
 
 
-def _draw_paths(axes: "Axes", record: BeaconRecord, width_px: float, tolerance_m: float) -> None:
+def _draw_paths(axes: "Axes", record: BeaconRecord, width_px: float) -> None:
     track = record.track
     thick = 1.2 if is_wide(width_px) else 0.8
     lines = [("dead reckoning alone", track.reckoned_m, _RECKONED, 0.8 * thick, ":")]
@@ -240,8 +232,7 @@ def _draw_paths(axes: "Axes", record: BeaconRecord, width_px: float, tolerance_m
     lines.append(("estimated path", track.place_m, _ESTIMATE, thick, "-"))
     for name, points_m, colour, width, style in lines:
         if np.isfinite(points_m).all(axis=1).sum() >= 2:
-            points = thinned(points_m, tolerance_m)
-            axes.plot(*points.T, style, color=colour, linewidth=width, label=name, zorder=2)
+            axes.plot(*points_m.T, style, color=colour, linewidth=width, label=name, zorder=2)
     step = max(1, ceil(len(track.seq) / _ELLIPSES))
     for row in range(0, len(track.seq), step):
         outline = track.place_m[row] + ellipse_outline(track.covariance[row, :2, :2], SIGMAS)

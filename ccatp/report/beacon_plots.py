@@ -18,7 +18,16 @@ from ccatp.beacons.slam.recording import BeaconFix, EstimatedPath, RecordedRun, 
 from ccatp.beacons.steering import Sugeno
 from ccatp.config.beacon_models import FuzzyConfig
 from ccatp.core import FloatArray
-from ccatp.report.plots import GRID, INK, QUIET, dress, ellipse_outline, new_figure, save_figure
+from ccatp.report.plots import (
+    GRID,
+    INK,
+    QUIET,
+    add_legend,
+    dress,
+    ellipse_outline,
+    new_figure,
+    save_figure,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -286,26 +295,20 @@ def draw_slam(run: RecordedRun, track: EstimatedPath, judged: TrackEvaluation, o
     centre, half = _frame(run, path, beacons)
     width = WIDTH_PX / DPI
     known = bool(np.isfinite(judged.errors_m).any())
-    map_height = (width - 1.3) * float(half[1] / half[0])
-    below = 1.9 if known else 0.6
-    height = map_height + below + 1.3
-    figure = new_figure(width, height, DPI, layout=None)
-    axes = figure.add_axes((0.75 / width, (below + 0.3) / height, (width - 1.3) / width, map_height / height))
+    heights = [(width - 0.8) * float(half[1] / half[0]), *([1.1] if known else [])]
+    figure = new_figure(width, sum(heights) + 1.8, DPI)
+    figure.suptitle(title, x=0.02, ha="left", fontsize=14, color=INK)
+    panels = figure.subplots(len(heights), height_ratios=heights, squeeze=False)[:, 0]
+    axes = panels[0]
+    axes.set_title(_figures(judged), loc="left", color=QUIET)
     _draw_paths(axes, run, track, judged, path)
     _draw_beacons(axes, run, beacons)
     axes.set(xlim=(centre[0] - half[0], centre[0] + half[0]), ylim=(centre[1] - half[1], centre[1] + half[1]))
     axes.set(xlabel="x, m", ylabel="y, m", aspect="equal")
-    dress(axes)
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="upper left", bbox_to_anchor=(0.68 / width, 1.0 - 0.62 / height), ncols=len(labels),
-        fontsize=8, frameon=False, labelcolor=INK, columnspacing=1.4, handletextpad=0.5,
-    )  # fmt: skip
-    figure.text(0.75 / width, 1.0 - 0.32 / height, title, fontsize=14, color=INK)
-    figure.text(0.75 / width, 1.0 - 0.58 / height, _figures(judged), fontsize=9, color=QUIET)
+    dress(*panels)
+    add_legend(axes)
     if known:
-        error_axes = figure.add_axes((0.75 / width, 0.55 / height, (width - 1.3) / width, 1.1 / height))
-        _draw_error(error_axes, track, judged)
+        _draw_error(panels[1], track, judged)
     save_figure(figure, out)
 
 
@@ -341,16 +344,7 @@ def _draw_paths(
 def _draw_beacons(axes: "Axes", run: RecordedRun, beacons: dict[str, BeaconFix]) -> None:
     surveyed = np.array([run.beacon_truth_m[name] for name in beacons if name in run.beacon_truth_m]).reshape(-1, 2)
     if surveyed.size:
-        axes.scatter(
-            surveyed[:, 0],
-            surveyed[:, 1],
-            marker="x",
-            s=46,
-            linewidths=1.6,
-            color=INK,
-            zorder=6,
-            label="surveyed beacon",
-        )
+        axes.scatter(*surveyed.T, marker="x", s=46, linewidths=1.6, color=INK, zorder=6, label="surveyed beacon")
     for k, (name, fix) in enumerate(beacons.items()):
         label = "beacon, 3 sigma" if k == 0 else "_"
         axes.plot(fix.x_m, fix.y_m, "o", color=_MAP, markersize=4.5, zorder=7, label=label)
@@ -368,7 +362,6 @@ def _draw_error(axes: "Axes", track: EstimatedPath, judged: TrackEvaluation) -> 
     axes.plot(t, judged.errors_m, color=_PATH, linewidth=0.8, label="error")
     top = float(np.nanmax(judged.errors_m))
     axes.set(xlim=(0.0, t[-1]), ylim=(0.0, 1.15 * max(top, 1e-6)), xlabel="time, s", ylabel="error, m")
-    dress(axes)
 
 
 def _figures(judged: TrackEvaluation) -> str:

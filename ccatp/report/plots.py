@@ -45,13 +45,11 @@ class PictureError(CcatpError):
 # -- layout -----------------------------------------------------------------------------------------------------------
 
 
-def new_figure(
-    width_in: float, height_in: float, dpi: float = 160.0, layout: Literal["constrained"] | None = "constrained"
-) -> "Figure":
-    """A figure that no window shows; without ``layout`` every axes is placed by its maker."""
+def new_figure(width_in: float, height_in: float, dpi: float = 160.0) -> "Figure":
+    """A figure that no window shows."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - takes a second
 
-    return Figure(figsize=(width_in, height_in), dpi=dpi, facecolor="white", layout=layout)
+    return Figure(figsize=(width_in, height_in), dpi=dpi, facecolor="white", layout="constrained")
 
 
 def dress(*panels: "Axes", grid: Literal["major", "both"] = "major") -> None:
@@ -96,19 +94,16 @@ def set_log_axis(axes: "Axes", which: Literal["x", "y"]) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def add_legend(axes: "Axes", place: Sequence[float] | None = None) -> None:
-    """The labels of what is drawn, below the plot; at ``place`` (parts of the figure) where there is no layout."""
+def add_legend(axes: "Axes") -> None:
+    """The labels of what is drawn, below the plot."""
     figure = axes.get_figure()
     handles, labels = axes.get_legend_handles_labels()
     if figure is None or not handles:
         return
     columns = min(len(labels), 5) if is_wide(figure.bbox.width / figure.dpi * PX_PER_IN) else 2
-    where: dict[str, Any] = {"loc": "outside lower left"}
-    if place is not None:
-        where = {"loc": "upper left", "bbox_to_anchor": tuple(place)}
     figure.legend(
         handles, labels, ncols=columns, frameon=False, fontsize=8, labelcolor=INK, columnspacing=1.2,
-        handlelength=1.6, borderpad=0.2, **where,
+        handlelength=1.6, borderpad=0.2, loc="outside lower left",
     )  # fmt: skip
 
 
@@ -211,49 +206,6 @@ def _add_titles(group: ET.Element, titles: Sequence[str]) -> None:
 
 
 # -- shorter series without a visible change --------------------------------------------------------------------------
-
-
-def thinned(points: FloatArray, tolerance: float) -> FloatArray:
-    """A line with fewer points that stays within ``tolerance`` of the given one (Ramer, Douglas and Peucker).
-
-    Args:
-        points: shape (k, 2); rows of NaN part the line, and stay.
-        tolerance: in the unit of the points.
-    """
-    ends = [*np.flatnonzero(np.isnan(points).any(axis=1)).tolist(), len(points)]
-    pieces: list[FloatArray] = []
-    for start, end in zip([0, *(end + 1 for end in ends)], ends, strict=False):
-        if end > start:
-            pieces += [_thinned_piece(points[start:end], tolerance), np.full((1, 2), np.nan)]
-    return np.concatenate(pieces[:-1]) if pieces else points[:0]
-
-
-def _thinned_piece(points: FloatArray, tolerance: float) -> FloatArray:
-    # First without what hardly differs from the point before it: a robot stands still for most of the time.
-    cells = np.floor(points / (0.5 * tolerance))
-    is_new = np.ones(len(points), dtype=np.bool_)
-    is_new[1:-1] = (cells[1:-1] != cells[:-2]).any(axis=1)
-    points = points[is_new]
-    keep = np.zeros(len(points), dtype=np.bool_)
-    keep[[0, -1]] = True
-    open_spans = [(0, len(points) - 1)]
-    while open_spans:
-        first, last = open_spans.pop()
-        if last - first < 2:
-            continue
-        distances = _distances(points[first + 1 : last], points[first], points[last])
-        worst = int(np.argmax(distances))
-        if distances[worst] > 0.5 * tolerance:
-            keep[first + 1 + worst] = True
-            open_spans += [(first, first + 1 + worst), (first + 1 + worst, last)]
-    return points[keep]
-
-
-def _distances(points: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
-    along, offset = end - start, points - start
-    if (length2 := float(along @ along)) > 0.0:
-        offset = offset - np.clip(offset @ along / length2, 0.0, 1.0)[:, None] * along
-    return np.asarray(np.hypot(offset[:, 0], offset[:, 1]))
 
 
 class Envelope(NamedTuple):
